@@ -1,0 +1,73 @@
+"""Unified Inverse Depth (Montiel, Civera, Davison, RSS 2006): a ray from its first camera.
+
+Parameters: (C, θ, φ, ρ), spatial, or (C, θ, ρ), planar (P1–P4): the position C of the camera
+that saw the point first, the ray's azimuth θ and elevation φ, and the inverse distance ρ along
+the ray. The point is `C + m(θ, φ)/ρ`.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from jaxslam.landmarks.parametrization import Parametrization
+
+
+def initialise(bearing, inverse_depth, focal):
+    """C = 0 and the ray of the pixel; `ρ = (1/z)/|(x/z, y/z, 1)|`.
+
+    The prior speaks of inverse depth 1/z, the same for every parametrization; ρ is the inverse
+    distance that belongs to it. `focal` is not used.
+    """
+    del focal
+    ray = jnp.append(bearing, 1.0)
+    inverse_distance = inverse_depth / jnp.linalg.norm(ray)
+    return _pack(jnp.zeros_like(ray), _angles(ray), inverse_distance)
+
+
+def transform(T_ab, landmark):
+    """`C' = R C + t`, `m(θ', φ') = R m(θ, φ)`, `ρ' = ρ`. Singular where the ray is vertical."""
+    anchor, angles, inverse_distance = _unpack(landmark)
+    ray = T_ab.rotation() @ _ray(angles)
+    return _pack(T_ab @ anchor, _angles(ray), inverse_distance)
+
+
+def homogeneous(landmark):
+    """`(ρ C + m(θ, φ), ρ)` (P4)."""
+    anchor, angles, inverse_distance = _unpack(landmark)
+    return inverse_distance * anchor + _ray(angles), inverse_distance
+
+
+def _pack(anchor, angles, inverse_distance):
+    return jnp.concatenate([anchor, angles, inverse_distance[None]])
+
+
+def _unpack(landmark):
+    n = landmark.size // 2
+    return landmark[:n], landmark[n:-1], landmark[-1]
+
+
+def _ray(angles):
+    """`m = (cos φ sin θ, −sin φ, cos φ cos θ)`; planar `(sin θ, cos θ)`."""
+    if angles.size == 1:
+        return jnp.stack([jnp.sin(angles[0]), jnp.cos(angles[0])])
+    theta, phi = angles
+    return jnp.stack(
+        [jnp.cos(phi) * jnp.sin(theta), -jnp.sin(phi), jnp.cos(phi) * jnp.cos(theta)]
+    )
+
+
+def _angles(ray):
+    """`θ = atan2(x, z)`, `φ = atan2(−y, √(x² + z²))`, the inverse of `_ray`."""
+    theta = jnp.atan2(ray[0], ray[-1])
+    if ray.size == 2:
+        return theta[None]
+    return jnp.stack([theta, jnp.atan2(-ray[1], jnp.hypot(ray[0], ray[-1]))])
+
+
+INVERSE_DEPTH = Parametrization(
+    name="inverse_depth",
+    size=lambda n: 2 * n,
+    initialise=initialise,
+    transform=transform,
+    homogeneous=homogeneous,
+)

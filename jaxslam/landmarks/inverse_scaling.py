@@ -1,0 +1,36 @@
+"""Inverse Scaling (Marzorati et al., BMVC 2008): a homogeneous point (x, y, z, ω) in pixels."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from jaxslam.landmarks.parametrization import Parametrization
+
+
+def initialise(bearing, inverse_depth, focal):
+    """`(x, y, z, ω) = f (K⁻¹(u, v, 1), 1/d)` (P22–P26), that is (u − cx, v − cy, f, f/d).
+
+    ω is written with the same f as (x, y, z), so that the depth z/ω = d that the prior speaks of
+    does not depend on the focal length.
+    """
+    return focal * jnp.append(bearing, jnp.array([1.0, inverse_depth]))
+
+
+def transform(T_ab, landmark):
+    """`X' = R X + ω t`, `ω' = ω` (P20): linear in the landmark."""
+    point, omega = homogeneous(landmark)
+    return jnp.append(T_ab.rotation() @ point + omega * T_ab.translation(), omega)
+
+
+def homogeneous(landmark):
+    """The parameters themselves (P5)."""
+    return landmark[:-1], landmark[-1]
+
+
+INVERSE_SCALING = Parametrization(
+    name="inverse_scaling",
+    size=lambda n: n + 1,
+    initialise=initialise,
+    transform=transform,
+    homogeneous=homogeneous,
+)

@@ -1,0 +1,29 @@
+"""What a landmark parametrization is: four pure functions on one landmark, and its size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from jaxtyping import Array, Float
+
+from jaxslam.geometry import Pose
+
+Parameters = Float[Array, " d"]
+Homogeneous = tuple[Float[Array, " n"], Float[Array, ""]]
+
+
+@dataclass(frozen=True)
+class Parametrization:
+    """A way to write a point with d numbers, for points of n = 2 (planar) or 3 coordinates."""
+
+    name: str
+    size: Callable[[int], int]
+    """`size(n)`: how many parameters a landmark has."""
+    initialise: Callable[[Float[Array, " n-1"], Float[Array, ""], Float[Array, ""]], Parameters]
+    """`initialise(bearing, inverse_depth, focal)`: parameters in the camera frame of the point at
+    normalised image coordinates `bearing`, 1/z = `inverse_depth`; `focal` in pixels."""
+    transform: Callable[[Pose, Parameters], Parameters]
+    """`transform(T_ab, parameters_in_b)`: the same point in frame a."""
+    homogeneous: Callable[[Parameters], Homogeneous]
+    """`(X, ω)` such that the point is X/ω; ω may be 0 (a point at infinity) or negative."""

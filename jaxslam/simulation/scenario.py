@@ -1,0 +1,278 @@
+"""Scenarios: every number of a simulated world, its camera and its noise, as plain data.
+
+A scenario is built in (`scenario("circle")`), read from a TOML file with the same fields, or
+either with some fields replaced. All are checked by one function, which names the field.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jaxslam.filters import CALIBRATIONS
+from jaxslam.geometry import GEOMETRIES, Geometry
+
+Numbers = tuple[float, ...]
+
+TRUE_CALIBRATIONS = ("nominal", "white", "constant")
+PLACEMENTS = ("prior", "ring")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A simulated experiment. SI units, radians, pixels; per axis x, (y,) z, then rotation."""
+
+    name: str
+    geometry: str = "planar"
+    """`planar` or `spatial`."""
+    rate: float = 30.0
+    """Frames per second."""
+    steps: int = 60
+    """Filter steps after frame 0, in which the first landmarks are seen."""
+    velocity: Numbers = (1.2, 0.0, 0.0)
+    """Nominal velocity in the camera frame, m/s and rad/s: the mean that the filter starts with."""
+    velocity_sigma: Numbers = (0.01, 0.01, 0.01)
+    """σ of the true initial velocity around the nominal one, and of the filter's."""
+    acceleration_sigma: Numbers = (0.1, 0.1, 0.1)
+    """σ of the true white acceleration, and of the filter's, m/s² and rad/s²."""
+    placement: str = "prior"
+    """`prior`: every landmark seen in frame 0, at a uniform pixel and an inverse depth from the
+    filter's prior. `ring`: evenly on a horizontal circle around the centre of the nominal path."""
+    landmarks: int = 12
+    first_pixels: tuple[Numbers, ...] = ((20.0, 620.0),)
+    """`prior`: the interval of each pixel coordinate in frame 0."""
+    ring_radius: float = 8.0
+    """`ring`: its radius, m."""
+    nearest_depth: float = 3.0
+    """d_min, m: the filter's prior on 1/z is N(1/(2 d_min), (1/(4 d_min))²)."""
+    least_inverse_depth: float = 0.001
+    """`prior`: truth is drawn from the prior truncated above this, 1/m."""
+    visible_depth: float = 0.1
+    """A point nearer than this along the optical axis is not seen, m."""
+    image: Numbers = (640.0,)
+    """Size of the picture, pixels."""
+    focal: Numbers = (650.0,)
+    centre: Numbers = (320.0,)
+    focal_sigma: float = 3.0
+    """σ of each focal length, pixels."""
+    centre_sigma: float = 2.0
+    """σ of each coordinate of the principal point, pixels."""
+    pixel_sigma: float = 0.3
+    """σ of a measured pixel coordinate."""
+    calibration: str = "known"
+    """How the filter treats its calibration, unless told otherwise."""
+    true_calibration: str = "nominal"
+    """The true intrinsics: `nominal`, or drawn `white` (every frame) or `constant` (every run)."""
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+    @property
+    def world(self) -> Geometry:
+        """Planar or spatial geometry."""
+        return GEOMETRIES[self.geometry]
+
+
+def scenario(
+    name: str | Path = "circle", overrides: Mapping[str, Any] | None = None, **fields: Any
+) -> Scenario:
+    """A built-in scenario or one from a TOML file, with fields replaced.
+
+    A TOML file may name a built-in scenario to start from: `base = "circle"`.
+    Raises ValueError for an unknown name or field and for a value that makes no sense.
+    """
+    if str(name) in BUILT_IN:
+        chosen = BUILT_IN[str(name)]
+    elif str(name).endswith(".toml"):
+        chosen = _read(Path(name))
+    else:
+        raise ValueError(
+            f"unknown scenario {str(name)!r}{_meant(str(name), BUILT_IN)}; known: "
+            f"{', '.join(BUILT_IN)}, or a .toml file"
+        )
+    return _replaced(chosen, {**(overrides or {}), **fields})
+
+
+def parse_override(text: str) -> tuple[str, Any]:
+    """`field=value` with the value as in TOML; a bare word is a string."""
+    field, sign, value = text.partition("=")
+    if not sign or not field.strip():
+        raise ValueError(f"{text!r} is not of the form field=value")
+    try:
+        return field.strip(), tomllib.loads(f"value = {value.strip()}")["value"]
+    except tomllib.TOMLDecodeError:
+        return field.strip(), value.strip()
+
+
+def _read(path: Path) -> Scenario:
+    try:
+        fields = tomllib.loads(path.read_text())
+    except FileNotFoundError:
+        raise ValueError(f"scenario file {path} does not exist") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ValueError(f"scenario file {path}: {error}") from None
+    base = fields.pop("base", None)
+    if base is not None and base not in BUILT_IN:
+        raise ValueError(f"{path}: unknown base {base!r}; known: {', '.join(BUILT_IN)}")
+    start = BUILT_IN[base] if base else Scenario(name=path.stem)
+    return _replaced(start, {"name": path.stem, **fields})
+
+
+def _replaced(chosen: Scenario, fields: Mapping[str, Any]) -> Scenario:
+    known = {field.name: getattr(chosen, field.name) for field in dataclasses.fields(Scenario)}
+    for field, value in fields.items():
+        if field not in known:
+            raise ValueError(
+                f"unknown scenario field {field!r}{_meant(field, known)}; known: {', '.join(known)}"
+            )
+        known[field] = _coerced(field, value, known[field])
+    return Scenario(**known)
+
+
+def _coerced(field: str, value: Any, like: Any) -> Any:
+    """`value` in the type of the field; a single number stands for a list of one."""
+
+    def wrong(wanted: str) -> ValueError:
+        return ValueError(f"scenario field {field} must be {wanted}, not {value!r}")
+
+    if isinstance(like, str):
+        if not isinstance(value, str):
+            raise wrong("a word")
+        return value
+    if isinstance(like, tuple) and isinstance(like[0], tuple):
+        if not isinstance(value, list | tuple):
+            raise wrong("a list of [low, high] pairs")
+        return tuple(_coerced(field, pair, like[0]) for pair in value)
+    if isinstance(like, tuple):
+        values = value if isinstance(value, list | tuple) else [value]
+        return tuple(_coerced(field, number, 0.0) for number in values)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise wrong("a number")
+    if isinstance(like, int) and value != int(value if math.isfinite(value) else 0):
+        raise wrong("a whole number")
+    return type(like)(value)
+
+
+def _check(s: Scenario) -> None:
+    """Raise ValueError, naming the field, unless the scenario can be simulated."""
+    for field, known in (
+        ("geometry", tuple(GEOMETRIES)),
+        ("placement", PLACEMENTS),
+        ("calibration", CALIBRATIONS),
+        ("true_calibration", TRUE_CALIBRATIONS),
+    ):
+        if getattr(s, field) not in known:
+            raise ValueError(
+                f"scenario field {field} is {getattr(s, field)!r}; known: {', '.join(known)}"
+            )
+    t, p = s.world.tangent_dim, s.world.pixel_dim
+    lengths = {
+        "velocity": t, "velocity_sigma": t, "acceleration_sigma": t,
+        "image": p, "focal": p, "centre": p, "first_pixels": p,
+    }  # fmt: skip
+    for field, length in lengths.items():
+        if len(getattr(s, field)) != length:
+            raise ValueError(
+                f"scenario field {field} needs {length} values in a {s.geometry} world, "
+                f"not {len(getattr(s, field))}"
+            )
+    for field in dataclasses.fields(s):
+        _check_numbers(field.name, getattr(s, field.name))
+    if any(len(pair) != 2 or pair[0] >= pair[1] for pair in s.first_pixels):
+        raise ValueError(f"scenario field first_pixels needs [low, high] pairs: {s.first_pixels}")
+    if s.placement == "ring" and s.velocity[-1] == 0:
+        raise ValueError("placement ring needs a nominal path that turns: velocity[-1] is 0")
+
+
+_POSITIVE = (
+    "rate", "steps", "landmarks", "ring_radius", "nearest_depth", "image", "focal",
+    "pixel_sigma", "least_inverse_depth", "visible_depth", "acceleration_sigma",
+)  # fmt: skip
+_NOT_NEGATIVE = ("velocity_sigma", "focal_sigma", "centre_sigma")
+
+
+def _check_numbers(field: str, value: Any) -> None:
+    if isinstance(value, str):
+        return
+    if isinstance(value, tuple):
+        for element in value:
+            _check_numbers(field, element)
+        return
+    if not math.isfinite(value):
+        raise ValueError(f"scenario field {field} holds {value}; it must be finite")
+    if field in _POSITIVE and value <= 0:
+        raise ValueError(f"scenario field {field} must be positive, not {value}")
+    if field in _NOT_NEGATIVE and value < 0:
+        raise ValueError(f"scenario field {field} must not be negative, not {value}")
+
+
+def _meant(word: str, known: Any) -> str:
+    close = difflib.get_close_matches(word, list(known), n=1)
+    return f" (did you mean {close[0]}?)" if close else ""
+
+
+_PLANAR_NOISE = {
+    # acceleration σ, initial velocity σ
+    "-tight": ((0.02,) * 3, (0.002,) * 3),
+    "": ((0.1,) * 3, (0.01,) * 3),
+    "-loose": ((0.5, 0.5, 0.3), (0.1, 0.1, 0.05)),
+    "-very-loose": ((3.0, 3.0, 1.0), (0.1, 0.1, 0.05)),
+}
+_SPATIAL_NOISE = {
+    "-tight": ((0.02,) * 6, (0.002,) * 6),
+    "": ((0.1,) * 6, (0.01,) * 6),
+    "-loose": ((0.5,) * 3 + (0.3,) * 3, (0.1,) * 3 + (0.05,) * 3),
+    "-very-loose": ((3.0,) * 3 + (1.0,) * 3, (0.1,) * 3 + (0.05,) * 3),
+}
+_CIRCLE_NOISE = {
+    "-tight": _PLANAR_NOISE["-tight"],
+    "": _PLANAR_NOISE[""],
+    "-loose": ((0.3, 0.3, 0.5), (0.05, 0.05, 0.1)),
+}
+
+
+def _family(family: str, noises: Mapping[str, tuple[Numbers, Numbers]], **fields: Any):
+    for suffix, (acceleration, velocity) in noises.items():
+        yield Scenario(
+            name=family + suffix,
+            acceleration_sigma=acceleration,
+            velocity_sigma=velocity,
+            **fields,
+        )
+
+
+def _built_in():
+    yield from _family("matched", _PLANAR_NOISE)
+    towards = {suffix: _PLANAR_NOISE[suffix] for suffix in ("", "-loose")}
+    yield from _family("matched-forward", towards, velocity=(0.0, 1.2, 0.0))
+    yield from _family("matched-turn", towards, velocity=(0.0, 1.2, 0.3))
+    yield from _family(
+        "matched-6dof",
+        _SPATIAL_NOISE,
+        geometry="spatial",
+        velocity=(1.2, 0.0, 0.0, 0.0, 0.0, 0.0),
+        landmarks=30,
+        first_pixels=((20.0, 620.0), (20.0, 460.0)),
+        image=(640.0, 480.0),
+        focal=(650.0, 650.0),
+        centre=(320.0, 240.0),
+    )
+    yield from _family(
+        "circle",
+        _CIRCLE_NOISE,
+        steps=200,
+        velocity=(0.0, 1.2, 0.3),
+        placement="ring",
+        landmarks=36,
+        calibration="white",
+        true_calibration="white",
+    )
+
+
+BUILT_IN: dict[str, Scenario] = {s.name: s for s in _built_in()}
