@@ -58,9 +58,7 @@ def bearing(camera: Camera, pixel: Float[Array, " p"]) -> Float[Array, " p"]:
     return undistort((pixel - camera.centre) / camera.focal, camera.distortion)
 
 
-def distort(
-    ideal: Float[Array, " p"], distortion: Float[Array, " 5"] | None
-) -> Float[Array, " p"]:
+def distort(ideal: Float[Array, " p"], distortion: Float[Array, " 5"] | None) -> Float[Array, " p"]:
     """OpenCV's radial-tangential model on normalised coordinates (x/z, y/z)."""
     if distortion is None:
         return ideal

@@ -1,9 +1,10 @@
 """The extended Kalman filter on a core and many landmarks, its Jacobians assembled from blocks.
 
-Every model is a function of the core and ONE landmark, so that `jax.jacfwd` only ever sees
-c + d inputs; the blocks are put into place by slices, gathers and scatters. Nothing here knows
-what a pose, a camera or a parametrization is: a `Model` supplies the functions, and the core is
-any pytree of poses and vectors.
+Every model is a function of ONE landmark and of a *view*, the few quantities of the core that a
+landmark depends on (the relative pose of the camera, its calibration). `jax.jacfwd` sees v + d
+inputs for a landmark and c once for the view; the chain rule and the blocks' places are slices,
+gathers and scatters. Nothing here knows what a pose, a camera or a parametrization is: a `Model`
+supplies the functions, and core and view are any pytrees of poses and vectors.
 
 The steps are the paper's: `augment` (P10, P11, P15), `update` (P16, P17), `compose` (P18–P21),
 `initialise` (P22–P26), and `remove`.
@@ -13,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +25,15 @@ from jaxslam.filters.state import Features, Innovation, State
 from jaxslam.geometry import difference, retract, tangent_dim
 
 
-Blocks = tuple[Float[Array, "m k c"], Float[Array, "m k d"]]
-"""Jacobians of one quantity of k numbers for m landmarks, by the core and by the landmark."""
+class Blocks(NamedTuple):
+    """Jacobian of k numbers for each of m landmarks; row block j touches the core and slot j.
+
+    The whole matrix is J = [by_view · view_by_core, …, by_landmark at its slot, …].
+    """
+
+    view_by_core: Float[Array, "v c"]
+    by_view: Float[Array, "m k v"]
+    by_landmark: Float[Array, "m k d"]
 
 
 class Model(Protocol):
@@ -40,15 +48,19 @@ class Model(Protocol):
         """The core after the motion."""
         ...
 
-    def compose_landmark(self, core: Any, landmark: Array, context: Any) -> Array:
-        """One landmark after the motion, given the core before it; where `moves_landmarks`."""
+    def view(self, core: Any, context: Any) -> Any:
+        """What the functions below need of the core."""
         ...
 
-    def observe(self, core: Any, landmark: Array, context: Any) -> tuple[Array, Array]:
+    def compose_landmark(self, view: Any, landmark: Array, context: Any) -> Array:
+        """One landmark after the motion, seen from before it; where `moves_landmarks`."""
+        ...
+
+    def observe(self, view: Any, landmark: Array, context: Any) -> tuple[Array, Array]:
         """The predicted measurement, and whether one is possible (in front of the camera)."""
         ...
 
-    def initialise(self, core: Any, pixel: Array, inverse_depth: Array, context: Any) -> Array:
+    def initialise(self, view: Any, pixel: Array, inverse_depth: Array, context: Any) -> Array:
         """A landmark from its first measurement and its prior."""
         ...
 
@@ -84,16 +96,16 @@ def update(
 
     P, slots = state.covariance, features.slots
     R = _noise_matrix(noise, used)
-    PHt = _times_transpose(P, H, slots)
-    S = _times_transpose(PHt.T, H, slots) + R
+    HP = _rows(H, slots, P)
+    S = _rows(H, slots, HP.T) + R
     factor = jnp.linalg.cholesky(S)
-    K = cho_solve((factor, True), PHt.T).T
+    K = cho_solve((factor, True), HP).T
     whitened = solve_triangular(factor, residual.ravel(), lower=True)
 
     # Joseph's (I - KH) P (I - KH)ᵀ + K R Kᵀ, multiplied out from the left: two products of
     # rank m, and none of n × n matrices.
-    left = P - K @ PHt.T
-    covariance = left + (K @ R - _times_transpose(left, H, slots)) @ K.T
+    left = P - K @ HP
+    covariance = left + (K @ R - _rows(H, slots, left.T).T) @ K.T
     state = _shifted(state, K @ residual.ravel())
     state = replace(state, covariance=(covariance + covariance.T) / 2)
     return state, Innovation(predicted, residual, S, used, whitened @ whitened)
@@ -120,34 +132,24 @@ def compose(model: Model, state: State, context: Any) -> State:
     def move_core(core):
         return model.compose_core(core, context)
 
-    def move_landmark(core, landmark):
-        return model.compose_landmark(core, landmark, context), None
+    def move_landmark(view, landmark):
+        return model.compose_landmark(view, landmark, context), None
 
-    core = move_core(state.core)
-    J_core = core_jacobian(move_core, state.core)
+    core, J_core = move_core(state.core), core_jacobian(move_core, state.core)
     c = state.core_dim
     if not model.moves_landmarks:
-
-        def rows(P):
-            return jnp.concatenate([J_core @ P[:c], P[c:]])
-
-        return replace(state, core=core, covariance=rows(rows(state.covariance).T))
-
-    landmarks, _, J = _local_jacobians(move_landmark, state.core, state.landmarks)
-    J_lc, J_ll = _masked(J, state.active)
+        J, landmarks = None, state.landmarks
+    else:
+        everyone = jnp.arange(state.active.size)
+        moved, _, J = _local_jacobians(model, move_landmark, state, everyone, context)
+        J = _masked(J, state.active)
+        landmarks = jnp.where(state.active[:, None], moved, state.landmarks)
 
     def rows(P):
-        moved = jnp.einsum("idc,cn->idn", J_lc, P[:c]) + jnp.einsum(
-            "ide,ien->idn", J_ll, P[c:].reshape(*landmarks.shape, -1)
-        )
-        return jnp.concatenate([J_core @ P[:c], moved.reshape(P[c:].shape)])
+        below = P[c:] if J is None else _rows(J, everyone, P)
+        return jnp.concatenate([J_core @ P[:c], below])
 
-    return replace(
-        state,
-        core=core,
-        landmarks=jnp.where(state.active[:, None], landmarks, state.landmarks),
-        covariance=rows(rows(state.covariance).T),
-    )
+    return replace(state, core=core, landmarks=landmarks, covariance=rows(rows(state.covariance).T))
 
 
 def initialise(
@@ -169,23 +171,25 @@ def initialise(
     c, (capacity, d) = state.core_dim, state.landmarks.shape
     mean, sigma = inverse_depth
 
+    view, view_by_core = _view(model, state.core, context)
+
     def one(pixel):
         def landmark(delta, pixel, depth):
-            value = model.initialise(retract(state.core, delta), pixel, depth, context)
+            value = model.initialise(retract(view, delta), pixel, depth, context)
             return value, value
 
-        (J_core, J_pixel, J_depth), value = jax.jacfwd(
-            landmark, argnums=(0, 1, 2), has_aux=True
-        )(jnp.zeros(c, pixel.dtype), pixel, mean)
+        (J_view, J_pixel, J_depth), value = jax.jacfwd(landmark, argnums=(0, 1, 2), has_aux=True)(
+            _zero_tangent(view), pixel, mean
+        )
         own = J_pixel @ noise @ J_pixel.T + sigma**2 * jnp.outer(J_depth, J_depth)
-        return value, J_core, own
+        return value, J_view, own
 
-    new, J_core, own = jax.vmap(one)(features.pixels)
+    new, J_view, own = jax.vmap(one)(features.pixels)
     slots = jnp.where(features.valid, features.slots, capacity)  # out of bounds: dropped
     index = c + slots[:, None] * d + jnp.arange(d)
 
     def with_rows(P):
-        rows = J_core @ P[:c]
+        rows = J_view @ (view_by_core @ P[:c])
         return P.at[index.ravel()].set(rows.reshape(index.size, -1), mode="drop")
 
     covariance = with_rows(with_rows(state.covariance).T)
@@ -206,13 +210,15 @@ def remove(state: State, gone: Bool[Array, " capacity"]) -> State:
 
 
 def landmark_covariance(
-    function: Callable[[Any, Array], Array], state: State, slots: Int[Array, " m"]
+    model: Model,
+    function: Callable[[Any, Array], Array],
+    state: State,
+    slots: Int[Array, " m"],
+    context: Any,
 ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
-    """Values and first-order covariances of a function of the core and one landmark."""
+    """Values and first-order covariances of a function of the view and one landmark."""
     value, _, J = _local_jacobians(
-        lambda core, landmark: (function(core, landmark), None),
-        state.core,
-        state.landmarks[slots],
+        model, lambda view, landmark: (function(view, landmark), None), state, slots, context
     )
     return value, _local_covariance(state, J, slots)
 
@@ -238,31 +244,45 @@ def _zero_tangent(core):
 
 
 def _observe(model, state, slots, context):
-    def function(core, landmark):
-        return model.observe(core, landmark, context)
+    def function(view, landmark):
+        return model.observe(view, landmark, context)
 
-    return _local_jacobians(function, state.core, state.landmarks[slots])
+    return _local_jacobians(model, function, state, slots, context)
 
 
-def _local_jacobians(function, core, landmarks) -> tuple[Array, Any, Blocks]:
-    """Values, auxiliary outputs and blocks of `function(core, landmark) → (value, auxiliary)`."""
+def _view(model, core, context):
+    """The view and its Jacobian by the core."""
+
+    def function(core):
+        return model.view(core, context)
+
+    return function(core), core_jacobian(function, core)
+
+
+def _local_jacobians(model, function, state, slots, context) -> tuple[Array, Any, Blocks]:
+    """Values, auxiliary outputs and blocks of `function(view, landmark) → (value, auxiliary)`."""
+    view, view_by_core = _view(model, state.core, context)
 
     def one(landmark):
         def moved(delta, landmark):
-            value, auxiliary = function(retract(core, delta), landmark)
+            value, auxiliary = function(retract(view, delta), landmark)
             return value, (value, auxiliary)
 
         J, (value, auxiliary) = jax.jacfwd(moved, argnums=(0, 1), has_aux=True)(
-            _zero_tangent(core), landmark
+            _zero_tangent(view), landmark
         )
         return value, auxiliary, J
 
-    return jax.vmap(one)(landmarks)
+    value, auxiliary, (by_view, by_landmark) = jax.vmap(one)(state.landmarks[slots])
+    return value, auxiliary, Blocks(view_by_core, by_view, by_landmark)
 
 
-def _masked(blocks: Blocks, mask: Bool[Array, " m"]) -> Blocks:
-    J_core, J_landmark = (jnp.where(mask[:, None, None], block, 0.0) for block in blocks)
-    return J_core, J_landmark
+def _masked(J: Blocks, mask: Bool[Array, " m"]) -> Blocks:
+    mask = mask[:, None, None]
+    return J._replace(
+        by_view=jnp.where(mask, J.by_view, 0.0),
+        by_landmark=jnp.where(mask, J.by_landmark, 0.0),
+    )
 
 
 def _noise_matrix(noise, used):
@@ -273,30 +293,28 @@ def _noise_matrix(noise, used):
     return R.at[jnp.arange(m), :, jnp.arange(m), :].set(blocks).reshape(m * p, m * p)
 
 
-def _times_transpose(B: Float[Array, "r n"], H: Blocks, slots) -> Float[Array, "r mk"]:
-    """`B Hᵀ` for the sparse H of which each row touches the core and one landmark."""
-    H_core, H_landmark = H
-    c, d = H_core.shape[-1], H_landmark.shape[-1]
-    B_landmarks = B[:, c:].reshape(B.shape[0], -1, d)[:, slots]
-    product = jnp.einsum("rc,mkc->rmk", B[:, :c], H_core) + jnp.einsum(
-        "rmd,mkd->rmk", B_landmarks, H_landmark
-    )
-    return product.reshape(B.shape[0], -1)
+def _rows(J: Blocks, slots, B: Float[Array, "n r"]) -> Float[Array, "mk r"]:
+    """`J B` for the sparse J of which each row touches the core and one landmark."""
+    c, d = J.view_by_core.shape[1], J.by_landmark.shape[-1]
+    B_landmarks = B[c:].reshape(-1, d, B.shape[1])[slots]
+    product = J.by_view @ (J.view_by_core @ B[:c]) + J.by_landmark @ B_landmarks
+    return product.reshape(-1, B.shape[1])
 
 
 def _local_covariance(state: State, J: Blocks, slots) -> Float[Array, "m k k"]:
     """`J P Jᵀ` of every landmark's own rows: the diagonal blocks only."""
     c, (capacity, d) = state.core_dim, state.landmarks.shape
     P = state.covariance
-    P_lc = P[c:, :c].reshape(capacity, d, c)[slots]
-    P_ll = P[c:, c:].reshape(capacity, d, capacity, d)[slots, :, slots, :]
+    P_view = J.view_by_core @ P[:c, :c] @ J.view_by_core.T
+    P_cross = (P[c:, :c] @ J.view_by_core.T).reshape(capacity, d, -1)[slots]
+    P_landmark = P[c:, c:].reshape(capacity, d, capacity, d)[slots, :, slots, :]
 
-    def one(J_core, J_landmark, P_lc, P_ll):
-        cross = J_landmark @ P_lc @ J_core.T
-        own = J_landmark @ P_ll @ J_landmark.T
-        return J_core @ P[:c, :c] @ J_core.T + cross + cross.T + own
+    def one(by_view, by_landmark, P_cross, P_landmark):
+        cross = by_landmark @ P_cross @ by_view.T
+        own = by_landmark @ P_landmark @ by_landmark.T
+        return by_view @ P_view @ by_view.T + cross + cross.T + own
 
-    return jax.vmap(one)(*J, P_lc, P_ll)
+    return jax.vmap(one)(J.by_view, J.by_landmark, P_cross, P_landmark)
 
 
 def _shifted(state: State, delta: Float[Array, " n"]) -> State:

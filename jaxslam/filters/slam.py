@@ -107,6 +107,20 @@ class Context:
     """Seconds of motion between the map frame and the camera; 0 once it is composed."""
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class View:
+    """What a landmark depends on beside itself."""
+
+    map_from_camera: Pose
+    """T_AC(k), the current camera in the map frame."""
+    calibration: Float[Array, " k"]
+
+    def camera(self, context: Context) -> Camera:
+        """The camera with the calibration error of this step."""
+        return context.parameters.camera.perturbed(self.calibration)
+
+
 @dataclass(frozen=True)
 class SlamModel:
     """The one-landmark functions that `jaxslam.filters.ekf` asks for."""
@@ -122,8 +136,10 @@ class SlamModel:
     def _displacement(self, core: Core, context: Context) -> Pose:
         return displacement(self.geometry, core.velocity, core.acceleration, context.dt)
 
-    def _map_from_camera(self, core: Core, context: Context) -> Pose:
-        return self.frame.map_from_camera(core.pose, self._displacement(core, context))
+    def view(self, core: Core, context: Context) -> View:
+        """All that a landmark depends on."""
+        T_AC = self.frame.map_from_camera(core.pose, self._displacement(core, context))
+        return View(T_AC, core.calibration)
 
     def compose_core(self, core: Core, context: Context) -> Core:
         """P18, P19. The acceleration has been used: it is marginalised."""
@@ -135,34 +151,32 @@ class SlamModel:
             acceleration=jnp.zeros_like(core.acceleration),
         )
 
-    def compose_landmark(self, core: Core, landmark: Array, context: Context) -> Array:
+    def compose_landmark(self, view: View, landmark: Array, context: Context) -> Array:
         """P20: the landmark in the new camera frame."""
-        return self.landmark.transform(self._map_from_camera(core, context).inverse(), landmark)
+        del context
+        return self.landmark.transform(view.map_from_camera.inverse(), landmark)
 
-    def observe(self, core: Core, landmark: Array, context: Context) -> tuple[Array, Array]:
+    def observe(self, view: View, landmark: Array, context: Context) -> tuple[Array, Array]:
         """`h = proj(K T_AC⁻¹ X)` (P12, P14), on the homogeneous numerator."""
-        point, _ = self.camera_point(core, landmark, context)
-        camera = context.parameters.camera.perturbed(core.calibration)
-        return project(camera, point), point[-1] > 0
+        point, _ = self.camera_point(view, landmark)
+        return project(view.camera(context), point), point[-1] > 0
 
-    def camera_point(self, core: Core, landmark: Array, context: Context) -> tuple[Array, Array]:
+    def camera_point(self, view: View, landmark: Array) -> tuple[Array, Array]:
         """The landmark in the current camera as a homogeneous point (X, ω)."""
         point, omega = self.landmark.homogeneous(landmark)
-        T_CA = self._map_from_camera(core, context).inverse()
+        T_CA = view.map_from_camera.inverse()
         return T_CA.rotation() @ point + omega * T_CA.translation(), omega
 
-    def chart(self, core: Core, landmark: Array, context: Context) -> Array:
+    def chart(self, view: View, landmark: Array) -> Array:
         """(x/z, y/z, 1/z) in the current camera: where parametrizations can be compared."""
-        point, omega = self.camera_point(core, landmark, context)
+        point, omega = self.camera_point(view, landmark)
         return jnp.append(point[:-1], omega) / point[-1]
 
-    def initialise(
-        self, core: Core, pixel: Array, inverse_depth: Array, context: Context
-    ) -> Array:
+    def initialise(self, view: View, pixel: Array, inverse_depth: Array, context: Context) -> Array:
         """P22–P26: a landmark in the map frame from its first pixel and the prior on depth."""
-        camera = context.parameters.camera.perturbed(core.calibration)
+        camera = view.camera(context)
         seen = self.landmark.initialise(bearing(camera, pixel), inverse_depth, camera.focal[0])
-        return self.landmark.transform(self._map_from_camera(core, context), seen)
+        return self.landmark.transform(view.map_from_camera, seen)
 
 
 @dataclass(frozen=True)
@@ -223,7 +237,9 @@ class SlamFilter:
         t = self.geometry.tangent_dim
         state = ekf.augment(state, 2 * t, jnp.diag(parameters.acceleration_sigma**2))
         state = self._with_calibration(state, parameters)
-        return ekf.compose(self.model, state, Context(parameters, dt)) if self.compose_first else state
+        return (
+            ekf.compose(self.model, state, Context(parameters, dt)) if self.compose_first else state
+        )
 
     def update(
         self, state: State, parameters: Parameters, dt: Float[Array, ""], features: Features
@@ -237,9 +253,7 @@ class SlamFilter:
     ) -> tuple[Float[Array, "m p"], Float[Array, "m p p"], Bool[Array, " m"]]:
         """Search ellipses of a predicted state: pixels, innovation covariances, in front."""
         context = self._context(parameters, dt)
-        return ekf.predict_features(
-            self.model, state, slots, parameters.pixel_covariance, context
-        )
+        return ekf.predict_features(self.model, state, slots, parameters.pixel_covariance, context)
 
     def compose(self, state: State, parameters: Parameters, dt: Float[Array, ""]) -> State:
         """Move into the new camera frame, after the update (P18–P21)."""
@@ -286,17 +300,14 @@ class SlamFilter:
 
     def camera_pose(self, state: State) -> tuple[Pose, Float[Array, "t t"]]:
         """T_BC and its covariance in the right tangent: position in camera axes, orientation."""
-        return ekf.core_covariance(
-            lambda core: self.model.frame.pose_from_camera(core.pose), state
-        )
+        return ekf.core_covariance(lambda core: self.model.frame.pose_from_camera(core.pose), state)
 
     def landmarks_in_camera(
         self, state: State, parameters: Parameters, slots: Array
     ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
         """(x/z, y/z, 1/z) of landmarks in the current camera, with covariances."""
-        context = _composed(parameters)
         return ekf.landmark_covariance(
-            lambda core, landmark: self.model.chart(core, landmark, context), state, slots
+            self.model, self.model.chart, state, slots, _composed(parameters)
         )
 
     def _with_calibration(self, state: State, parameters: Parameters) -> State:

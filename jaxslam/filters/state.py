@@ -36,7 +36,7 @@ class State:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Features:
-    """Image points of landmarks: pixel j belongs to slot `slots[j]`, and counts where `valid[j]`."""
+    """Image points of landmarks: pixel j belongs to `slots[j]`, and counts where `valid[j]`."""
 
     slots: Int[Array, " m"]
     pixels: Float[Array, "m p"]

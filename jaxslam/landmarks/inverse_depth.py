@@ -51,9 +51,7 @@ def _ray(angles):
     if angles.size == 1:
         return jnp.stack([jnp.sin(angles[0]), jnp.cos(angles[0])])
     theta, phi = angles
-    return jnp.stack(
-        [jnp.cos(phi) * jnp.sin(theta), -jnp.sin(phi), jnp.cos(phi) * jnp.cos(theta)]
-    )
+    return jnp.stack([jnp.cos(phi) * jnp.sin(theta), -jnp.sin(phi), jnp.cos(phi) * jnp.cos(theta)])
 
 
 def _angles(ray):

@@ -147,9 +147,7 @@ def _from_prior(scenario: Scenario, truth: Parameters, key: Array) -> Float[Arra
     pixel_key, depth_key = jax.random.split(key)
     dtype, count = truth.pixel_sigma.dtype, scenario.landmarks
     low, high = jnp.asarray(scenario.first_pixels, dtype).T
-    pixels = jax.random.uniform(
-        pixel_key, (count, low.size), dtype, minval=low, maxval=high
-    )
+    pixels = jax.random.uniform(pixel_key, (count, low.size), dtype, minval=low, maxval=high)
     lower = (scenario.least_inverse_depth - truth.inverse_depth) / truth.inverse_depth_sigma
     draws = jax.random.truncated_normal(depth_key, lower, jnp.inf, (count,), dtype)
     inverse_depths = truth.inverse_depth + truth.inverse_depth_sigma * draws

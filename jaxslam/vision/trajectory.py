@@ -1,0 +1,186 @@
+"""Trajectories as text (TUM format) and their error against a reference, by `evo`."""
+
+import os
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+# A pose and a reference pose further apart in time than this (s) are not compared; evo's default.
+MAX_TIME_DIFFERENCE = 0.01
+
+
+class TrajectoryError(TypedDict):
+    """What `absolute_trajectory_error` returns; lengths in the reference's unit."""
+
+    alignment: str
+    rmse: float
+    path_length: float
+    extent: float
+    matched: int
+
+
+@contextmanager
+def write_atomically(path: str | Path) -> Generator[Path, None, None]:
+    """Yield a temporary name beside `path`; what was written there becomes `path` at the end.
+
+    After an exception the temporary file is removed and an older `path` stays as it was. The
+    temporary name ends like `path`, since many writers choose the format by it.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")
+    try:
+        yield temporary
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def poses(translation: ArrayLike, quaternion: ArrayLike) -> Float[np.ndarray, "n 4 4"]:
+    """Poses from positions (n, 3) and quaternions x, y, z, w (n, 4), which get normalised."""
+    rotation = Rotation.from_quat(np.asarray(quaternion, dtype=float).reshape(-1, 4))
+    result = np.tile(np.eye(4), (len(rotation), 1, 1))
+    result[:, :3, :3] = rotation.as_matrix()
+    result[:, :3, 3] = translation
+    return result
+
+
+def read_tum(path: str | Path) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 4 4"]]:
+    """Times (n,) in seconds and poses T_wc (n, 4, 4) from lines `t tx ty tz qx qy qz qw`.
+
+    Empty lines and those that start with # are skipped. Raises `ValueError`, naming the file and
+    the line, for anything else that is not eight finite numbers with a non-zero quaternion.
+    """
+    path = Path(path)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise ValueError(f"{path}: cannot read the trajectory ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: not a text file") from None
+    rows = [
+        _tum_row(path, number, line)
+        for number, line in enumerate(lines, start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not rows:
+        raise ValueError(f"{path}: holds no poses; lines of t tx ty tz qx qy qz qw are accepted")
+    table = np.array(rows)
+    return table[:, 0], poses(table[:, 1:4], table[:, 4:])
+
+
+def write_tum(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> None:
+    """Write times (n,) in seconds and poses (n, 4, 4) in TUM format, whole or not at all.
+
+    Quaternions are normalised, w comes last and is not negative.
+    """
+    times = np.asarray(times, dtype=float)
+    T_wc = np.asarray(T_wc, dtype=float).reshape(-1, 4, 4)
+    if times.shape != (len(T_wc),):
+        raise ValueError(f"{len(times)} times for {len(T_wc)} poses; as many of each are accepted")
+    table = np.empty((len(times), 7))
+    table[:, :3] = T_wc[:, :3, 3]
+    if len(times):  # Rotation refuses an empty stack
+        table[:, 3:] = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True)
+    with write_atomically(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write("# t tx ty tz qx qy qz qw (s; camera in the world frame)\n")
+        for time, row in zip(times, table, strict=True):
+            file.write(f"{time:.9f} " + " ".join(f"{value:.9f}" for value in row) + "\n")
+
+
+def absolute_trajectory_error(
+    estimate_times: ArrayLike,
+    estimate: ArrayLike,
+    reference_times: ArrayLike,
+    reference: ArrayLike,
+) -> TrajectoryError:
+    """The absolute trajectory error of the positions after a Sim(3) alignment, by `evo`.
+
+    Times (n,) and (m,) in seconds, poses (n, 4, 4) and (m, 4, 4). `evo` pairs poses by their
+    times (`MAX_TIME_DIFFERENCE`) and aligns the estimate with scale (Umeyama's method).
+    `path_length` is the reference's over the paired poses, `extent` the diagonal of the box
+    around them, `matched` their number. Raises `ValueError` where fewer than three poses pair
+    up or all positions of one trajectory coincide.
+    """
+    from evo.core import lie_algebra, metrics, sync
+    from evo.core.geometry import GeometryException
+    from evo.core.trajectory import PoseTrajectory3D
+
+    def evo_trajectory(times: ArrayLike, T_wc: ArrayLike) -> PoseTrajectory3D:
+        T_wc = np.asarray(T_wc, dtype=float)
+        # evo reads the scalar first; poses_se3 alone would make it check float32 too strictly.
+        x, y, z, w = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat().T
+        return PoseTrajectory3D(T_wc[:, :3, 3], np.stack([w, x, y, z], 1), np.asarray(times, float))
+
+    try:
+        paired_reference, paired = sync.associate_trajectories(
+            evo_trajectory(reference_times, reference),
+            evo_trajectory(estimate_times, estimate),
+            max_diff=MAX_TIME_DIFFERENCE,
+        )
+    except sync.SyncException:
+        raise ValueError(_too_few(0)) from None
+    if paired.num_poses < 3:
+        raise ValueError(_too_few(paired.num_poses))
+    try:
+        paired.align(paired_reference, correct_scale=True)
+    except GeometryException:  # a straight line, about which evo leaves the roll open: see below
+        rotation, translation, scale = _line_alignment(
+            paired.positions_xyz, paired_reference.positions_xyz
+        )
+        paired.scale(scale)
+        paired.transform(lie_algebra.se3(rotation, translation))
+    error = metrics.APE(metrics.PoseRelation.translation_part)
+    error.process_data((paired_reference, paired))
+    return {
+        "alignment": "sim3",
+        "rmse": float(error.get_statistic(metrics.StatisticsType.rmse)),
+        "path_length": float(paired_reference.path_length),
+        "extent": float(np.linalg.norm(np.ptp(paired_reference.positions_xyz, axis=0))),
+        "matched": int(paired.num_poses),
+    }
+
+
+def _line_alignment(
+    estimate: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"], float]:
+    """Umeyama's rotation, translation and scale without the test that the rank is two.
+
+    On a straight line the rotation about it is arbitrary, but no position depends on it where
+    the reference is the line, so that the error is the smallest one all the same.
+    """
+    mean_estimate, mean_reference = estimate.mean(0), reference.mean(0)
+    centred, target = estimate - mean_estimate, reference - mean_reference
+    left, singular, right = np.linalg.svd(target.T @ centred)
+    if singular[0] <= 1e-12 * np.sum(target**2) or not np.any(target):
+        raise ValueError("all poses of a trajectory are in one place; a Sim(3) needs a motion")
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    rotation = left @ np.diag(signs) @ right
+    scale = float(singular @ signs / np.sum(centred**2))
+    return rotation, mean_reference - scale * rotation @ mean_estimate, scale
+
+
+def _tum_row(path: Path, number: int, line: str) -> list[float]:
+    try:
+        row = [float(word) for word in line.replace(",", " ").split()]
+    except ValueError:
+        row = []
+    if len(row) != 8 or not np.all(np.isfinite(row)):
+        raise ValueError(
+            f"{path}, line {number}: eight finite numbers t tx ty tz qx qy qz qw are accepted"
+        )
+    if not any(row[4:]):
+        raise ValueError(f"{path}, line {number}: the quaternion is zero")
+    return row
+
+
+def _too_few(count: int) -> str:
+    return (
+        f"{count} poses of the trajectory are within {MAX_TIME_DIFFERENCE} s of one of the "
+        "reference's; at least three are needed"
+    )

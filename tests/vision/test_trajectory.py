@@ -1,0 +1,137 @@
+"""Trajectories as text, and the absolute trajectory error where its value is known."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxslam.vision.trajectory import (
+    absolute_trajectory_error,
+    poses,
+    read_tum,
+    write_atomically,
+    write_tum,
+)
+
+
+def wave(n=60, seed=0):
+    """Times and poses of a smooth path with turning camera."""
+    times = np.arange(n) / 30
+    position = np.stack([np.sin(times), 0.3 * np.cos(2 * times), times**2], axis=1)
+    turn = Rotation.from_rotvec(np.random.default_rng(seed).normal(0, 1, (n, 3)))
+    return times, poses(position, turn.as_quat())
+
+
+def similar(T_wc, scale, rotvec, shift):
+    """The same trajectory in another world frame and another unit."""
+    rotation = Rotation.from_rotvec(rotvec).as_matrix()
+    moved = T_wc.copy()
+    moved[:, :3, 3] = scale * T_wc[:, :3, 3] @ rotation.T + shift
+    moved[:, :3, :3] = rotation @ T_wc[:, :3, :3]
+    return moved
+
+
+def test_written_poses_are_read_back(tmp_path):
+    times, T_wc = wave()
+    write_tum(tmp_path / "t.txt", times, T_wc)
+    read_times, read = read_tum(tmp_path / "t.txt")
+    np.testing.assert_allclose(read_times, times, atol=1e-9)
+    np.testing.assert_allclose(read, T_wc, atol=1e-8)
+    quaternions = np.loadtxt(tmp_path / "t.txt")[:, 4:]
+    np.testing.assert_allclose(np.linalg.norm(quaternions, axis=1), 1, atol=1e-8)
+    assert np.all(quaternions[:, 3] >= 0)
+
+
+def test_quaternion_order_is_w_last_and_need_not_be_normalised(tmp_path):
+    (tmp_path / "t.txt").write_text("# comment\n\n0.5 1 2 3 0 0 2 2\n")
+    times, T_wc = read_tum(tmp_path / "t.txt")
+    assert times.tolist() == [0.5]
+    quarter_turn = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    np.testing.assert_allclose(T_wc[0], quarter_turn, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("0 0 0 0 0 0 0 1\n1 2 3\n", "line 2: eight finite"),
+        ("0 0 0 nan 0 0 0 1\n", "line 1: eight finite"),
+        ("0 0 0 zero 0 0 0 1\n", "line 1: eight finite"),
+        ("0 0 0 0 0 0 0 0\n", "line 1: the quaternion is zero"),
+        ("# nothing\n", "holds no poses"),
+    ],
+)
+def test_bad_trajectories_are_refused_naming_file_and_line(tmp_path, text, words):
+    path = tmp_path / "bad.txt"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=words) as caught:
+        read_tum(path)
+    assert str(path) in str(caught.value)
+
+
+def test_missing_trajectory_and_unequal_lengths_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="cannot read the trajectory"):
+        read_tum(tmp_path / "none.txt")
+    with pytest.raises(ValueError, match="2 times for 1 poses"):
+        write_tum(tmp_path / "t.txt", [0, 1], np.eye(4)[None])
+
+
+def test_interrupted_write_keeps_the_old_file(tmp_path):
+    path = tmp_path / "t.txt"
+    path.write_text("old")
+
+    def interrupted():
+        with write_atomically(path) as temporary:
+            temporary.write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_error_ignores_frame_and_scale_and_measures_the_reference():
+    times, reference = wave()
+    estimate = similar(reference, 0.2, [0.3, -0.5, 1.0], [1.0, 2.0, 3.0])
+    result = absolute_trajectory_error(times + 0.004, estimate, times, reference)
+    steps = np.diff(reference[:, :3, 3], axis=0)
+    box = np.ptp(reference[:, :3, 3], axis=0)
+    assert result["alignment"] == "sim3"
+    assert result["rmse"] == pytest.approx(0, abs=1e-9)
+    assert result["path_length"] == pytest.approx(np.linalg.norm(steps, axis=1).sum())
+    assert result["extent"] == pytest.approx(np.linalg.norm(box))
+    assert result["matched"] == len(times)
+
+
+def test_error_has_the_size_of_the_noise():
+    times, reference = wave(2000)
+    estimate = reference.copy()
+    noise = np.random.default_rng(1).normal(0, 0.02, (2000, 3))
+    estimate[:, :3, 3] += noise
+    result = absolute_trajectory_error(times, estimate, times, reference)
+    # Seven parameters of the alignment take up next to nothing of 6000 numbers.
+    assert result["rmse"] == pytest.approx(np.sqrt(np.mean(np.sum(noise**2, 1))), rel=0.01)
+
+
+def test_straight_reference_is_aligned_though_its_roll_is_open():
+    times = np.arange(50) / 25
+    line = poses(np.outer(times, [1.0, 2.0, -0.5]), np.tile([0, 0, 0, 1], (50, 1)))
+    estimate = similar(line, 3.0, [0.1, 0.7, -0.4], [5.0, 0.0, 1.0])
+    perfect = absolute_trajectory_error(times, estimate, times, line)
+    assert perfect["rmse"] == pytest.approx(0, abs=1e-9)
+    # Zigzag across the line, which no alignment takes away.
+    across = np.array([2.0, -1.0, 0.0]) / np.sqrt(5)
+    estimate = line.copy()
+    estimate[:, :3, 3] += np.outer(np.where(np.arange(50) % 2, 0.1, -0.1), across)
+    bent = absolute_trajectory_error(times, estimate, times, line)
+    assert bent["rmse"] == pytest.approx(0.1, rel=0.02)
+
+
+def test_trajectories_that_cannot_be_compared_are_refused():
+    times, reference = wave()
+    with pytest.raises(ValueError, match="0 poses"):
+        absolute_trajectory_error(times + 100, reference, times, reference)
+    with pytest.raises(ValueError, match="2 poses"):
+        absolute_trajectory_error(times[:2], reference[:2], times, reference)
+    still = np.tile(np.eye(4), (len(times), 1, 1))
+    with pytest.raises(ValueError, match="in one place"):
+        absolute_trajectory_error(times, still, times, reference)
