@@ -310,6 +310,23 @@ class SlamFilter:
             self.model, self.model.chart, state, slots, _composed(parameters)
         )
 
+    def landmarks_from_above(
+        self, state: State, parameters: Parameters, slots: Array
+    ) -> tuple[Float[Array, "m 2"], Float[Array, "m 2 2"]]:
+        """Azimuth (from z towards x, axes of B) and inverse horizontal distance from the camera.
+
+        A map seen from above: the point is `(sin θ, cos θ)/ρ` from the camera, and a Gaussian in
+        (θ, ρ) is drawn as the bent region that it is. The camera's pose is taken as known.
+        """
+        rotation = self.camera_pose(state)[0].rotation()
+
+        def above(view, landmark):
+            point, omega = self.model.camera_point(view, landmark)
+            x, z = (rotation @ point)[jnp.array([0, -1])]
+            return jnp.stack([jnp.atan2(x, z), omega / jnp.hypot(x, z)])
+
+        return ekf.landmark_covariance(self.model, above, state, slots, _composed(parameters))
+
     def _with_calibration(self, state: State, parameters: Parameters) -> State:
         if self.calibration == "known":
             return state

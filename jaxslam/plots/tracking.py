@@ -1,18 +1,16 @@
 """The map of a tracked video: trajectory, reference and landmarks with their uncertainty."""
 
-import os
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
-from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-# Okabe and Ito's colours, distinct to the colour-blind.
-_TRAJECTORY, _REFERENCE, _LANDMARKS = "#0072B2", "#D55E00", "#009E73"
+from jaxslam.plots.style import COLOURS, new_figure, save
+
+_TRAJECTORY, _REFERENCE, _LANDMARKS = COLOURS[:3]
 _CHI2_95 = 5.991  # 95 % quantile of chi-squared with two degrees of freedom
 _MARGIN = 0.12  # around what is shown, as a share of its size
 
@@ -44,8 +42,7 @@ def plot_map(
         lines.append(("reference", reference, _REFERENCE, "--"))
     low, high = _view(np.concatenate([line for _, line, _, _ in lines]), points)
     inside = np.all((points >= low) & (points <= high), axis=1)
-    figure = Figure(figsize=(11, 5.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(11, 5.2)
     axes = figure.subplots(1, 2)
     for axis, (across, up), title in zip(
         axes, [(0, 2), (0, 1)], ["from above", "from behind"], strict=True
@@ -65,7 +62,7 @@ def plot_map(
         axis.grid(alpha=0.25, lw=0.5)
     axes[1].invert_yaxis()  # y points down
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    _save(figure, Path(path))
+    save(figure, path)
 
 
 def _counts(inside: np.ndarray, hidden: int) -> str:
@@ -118,13 +115,3 @@ def _draw_landmarks(
     )  # fmt: skip
     axis.plot(*points.T, ".", color=_LANDMARKS, ms=3.5, label="landmarks, 95 % ellipses")
     return int((~shown).sum())
-
-
-def _save(figure: Figure, path: Path) -> None:
-    """Save by a temporary name, so that an interruption leaves no half of a picture."""
-    temporary = path.with_name(f".{os.getpid()}.{path.name}")
-    try:
-        figure.savefig(temporary, dpi=130)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)

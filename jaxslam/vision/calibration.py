@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.vision.trajectory import write_atomically
+from jaxslam.files import write_atomically
 
 MODEL = "pinhole"
 _KEYS = ("width", "height", "fx", "fy", "cx", "cy")

@@ -1,8 +1,5 @@
 """Trajectories as text (TUM format) and their error against a reference, by `evo`."""
 
-import os
-from collections.abc import Generator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TypedDict
 
@@ -10,6 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
+
+from jaxslam.files import write_atomically
 
 # A pose and a reference pose further apart in time than this (s) are not compared; evo's default.
 MAX_TIME_DIFFERENCE = 0.01
@@ -23,22 +22,6 @@ class TrajectoryError(TypedDict):
     path_length: float
     extent: float
     matched: int
-
-
-@contextmanager
-def write_atomically(path: str | Path) -> Generator[Path, None, None]:
-    """Yield a temporary name beside `path`; what was written there becomes `path` at the end.
-
-    After an exception the temporary file is removed and an older `path` stays as it was. The
-    temporary name ends like `path`, since many writers choose the format by it.
-    """
-    path = Path(path)
-    temporary = path.with_name(f".{os.getpid()}.{path.name}")
-    try:
-        yield temporary
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def poses(translation: ArrayLike, quaternion: ArrayLike) -> Float[np.ndarray, "n 4 4"]:

@@ -1,0 +1,54 @@
+"""The command line: a thin layer over the library, one file a command."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from typing import Annotated
+
+import tyro
+
+from jaxslam.cli.consistency import ConsistencyOptions
+from jaxslam.cli.track import TrackOptions
+
+Command = (
+    Annotated[
+        ConsistencyOptions,
+        tyro.conf.subcommand(
+            "consistency", description="Simulate many runs of filters: are they consistent?"
+        ),
+    ]
+    | Annotated[
+        TrackOptions,
+        tyro.conf.subcommand(
+            "track", description="Track a camera through a video: trajectory, map, overlay."
+        ),
+    ]
+)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run a command. A mistake of the user's ends with exit status 2 and one line."""
+    options = tyro.cli(
+        Command,  # ty: ignore[invalid-argument-type]
+        args=arguments,
+        prog="jaxslam",
+        description="Monocular EKF-SLAM whose uncertainty can be believed.",
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.HelptextFromCommentsOff),
+    )
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        options.run()
+    except ValueError as error:
+        _fail(2, str(error))
+    except KeyboardInterrupt as interrupt:
+        _fail(130, f"interrupted{f': {interrupt}' if str(interrupt) else ''}")
+
+
+def _interrupt(*_) -> None:
+    raise KeyboardInterrupt
+
+
+def _fail(status: int, message: str) -> None:
+    print(f"jaxslam: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(status)

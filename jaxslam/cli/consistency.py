@@ -1,0 +1,130 @@
+"""`jaxslam consistency`: many simulated runs of every chosen filter on the same worlds."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+LAYOUT = 1
+"""Version of the records on disk, so that `--resume` never mixes two."""
+
+
+@dataclass(frozen=True)
+class ConsistencyOptions:
+    """Options of the command; every field is an option."""
+
+    scenario: str = "circle"
+    """Built-in scenario, or a TOML file with the same fields."""
+    landmarks: tuple[str, ...] = ("inverse_scaling", "inverse_depth")
+    """Landmark parametrizations: inverse_scaling, inverse_depth, cartesian."""
+    filters: tuple[str, ...] = ("robocentric",)
+    """Filters: robocentric, world."""
+    calibration: str | None = None
+    """How filters treat the camera's calibration: white or known. The scenario's by default."""
+    runs: int = 1000
+    """Independent runs of every filter."""
+    steps: int | None = None
+    """Filter steps of a run. The scenario's by default."""
+    seed: int = 0
+    """Run i draws from this seed and i alone."""
+    dtype: str = "float64"
+    """Precision: float64 or float32."""
+    chunk: int = 100
+    """Runs in one batch; memory grows with it, results do not depend on it."""
+    resume: bool = False
+    """Go on from what an interrupted run left in --out."""
+    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FIELD=VALUE …")] = field(
+        default_factory=tuple
+    )
+    """Override scenario fields, for instance pixel_sigma=1 or velocity=[1.2,0,0]."""
+    out: Path = Path("results")
+    """Folder for consistency.json, consistency.png and the records of all runs."""
+
+    def run(self) -> None:
+        """Run the study, print its table, write its files."""
+        from jaxslam.consistency import summarise, table
+        from jaxslam.files import write_atomically
+        from jaxslam.plots.consistency import plot_consistency
+
+        study = self._study()
+        summary = summarise(study)
+        with write_atomically(self.out / "consistency.json") as path:
+            path.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
+        plot_consistency(study, summary, self.out / "consistency.png")
+        print(table(summary))
+        print(f"wrote {self.out / 'consistency.json'} and {self.out / 'consistency.png'}")
+
+    def _study(self):
+        from tqdm import tqdm
+
+        from jaxslam.consistency import FolderStore, monte_carlo
+        from jaxslam.consistency.montecarlo import check_sizes
+
+        check_sizes(self.runs, self.seed, self.dtype, self.chunk)
+        scenario, filters = self._scenario(), self._filters()
+        manifest = {
+            "layout": LAYOUT,
+            "scenario": dataclasses.asdict(scenario),
+            "calibration": {name: f.calibration for name, f in filters.items()},
+            "seed": self.seed,
+            "dtype": self.dtype,
+            "chunk": self.chunk,
+        }
+        store = FolderStore(self.out / "runs", manifest, resume=self.resume)
+        with tqdm(total=self.runs * len(filters), unit="run", disable=None) as bar:
+
+            def progress(name: str, done: int) -> None:
+                bar.set_description(name, refresh=False)
+                bar.update(done)
+
+            return monte_carlo(
+                scenario,
+                filters,
+                runs=self.runs,
+                seed=self.seed,
+                dtype=self.dtype,
+                chunk=self.chunk,
+                store=store,
+                progress=progress,
+            )
+
+    def _scenario(self):
+        from jaxslam.simulation.scenario import parse_override, scenario
+
+        overrides: dict[str, Any] = dict(parse_override(text) for text in self.set)
+        if self.steps is not None:
+            overrides["steps"] = self.steps
+        return scenario(self.scenario, overrides)
+
+    def _filters(self):
+        from jaxslam.filters import FILTERS
+        from jaxslam.landmarks import LANDMARKS
+
+        scenario = self._scenario()
+        calibration = self.calibration or scenario.calibration
+        landmarks = _chosen("landmarks", self.landmarks, LANDMARKS)
+        filters = _chosen("filters", self.filters, FILTERS)
+        return {
+            f"{name}/{landmark.name}": make(scenario.world, landmark, calibration)
+            for name, make in filters.items()
+            for landmark in landmarks.values()
+        }
+
+
+def _chosen(option: str, names: Iterable[str], known: Mapping[str, Any]) -> dict[str, Any]:
+    for name in names:
+        if name not in known:
+            close = difflib.get_close_matches(name, known, n=1)
+            meant = f" (did you mean {close[0]}?)" if close else ""
+            raise ValueError(f"unknown --{option} {name!r}{meant}; known: {', '.join(known)}")
+    chosen = {name: known[name] for name in names}
+    if not chosen:
+        raise ValueError(f"--{option} needs at least one name; known: {', '.join(known)}")
+    return chosen

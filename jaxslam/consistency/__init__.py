@@ -1,0 +1,20 @@
+"""Is a filter consistent? Monte Carlo runs, NEES and NIS with exact bounds, and their summary."""
+
+from jaxslam.consistency.montecarlo import CHUNK, DTYPES, Study, monte_carlo
+from jaxslam.consistency.statistics import lost_threshold, mean_band, normalised_squared
+from jaxslam.consistency.store import FolderStore, MemoryStore
+from jaxslam.consistency.summary import summarise, table
+
+__all__ = [
+    "CHUNK",
+    "DTYPES",
+    "FolderStore",
+    "MemoryStore",
+    "Study",
+    "lost_threshold",
+    "mean_band",
+    "monte_carlo",
+    "normalised_squared",
+    "summarise",
+    "table",
+]

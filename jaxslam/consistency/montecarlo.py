@@ -1,0 +1,241 @@
+"""Monte Carlo: many simulated runs of many filters on the same worlds, batched by `vmap`.
+
+Run i draws from `fold_in(key(seed), i)`, so that it is the same in every chunk, for every filter,
+and whatever the number of runs. Memory is bounded by the chunk: each chunk's records go to a
+`Store`, and the summary reads them back chunk by chunk.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from jaxslam.consistency.statistics import normalised_squared
+from jaxslam.consistency.store import MemoryStore, Records, Store
+from jaxslam.filters import Parameters, SlamFilter, State
+from jaxslam.geometry import Pose
+from jaxslam.simulation import (
+    Run,
+    Scenario,
+    Sightings,
+    features,
+    parameters,
+    sightings,
+    simulate,
+)
+
+DTYPES = ("float64", "float32")
+CHUNK = 100
+"""Runs in one batch: enough to fill vector units, few enough to stay in the cache."""
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """Wall time of one filter over all its runs."""
+
+    compile: float
+    run: float
+
+
+@dataclass(frozen=True)
+class Study:
+    """Finished runs: where their records are, and what is needed to read them."""
+
+    scenario: Scenario
+    filters: Mapping[str, SlamFilter]
+    runs: int
+    seed: int
+    dtype: str
+    chunks: tuple[range, ...]
+    store: Store
+    seconds: Mapping[str, Seconds]
+    device: str
+
+
+def monte_carlo(
+    scenario: Scenario,
+    filters: Mapping[str, SlamFilter],
+    *,
+    runs: int = 1000,
+    seed: int = 0,
+    dtype: str = "float64",
+    chunk: int = CHUNK,
+    store: Store | None = None,
+    progress: Callable[[str, int], None] = lambda name, done: None,
+) -> Study:
+    """Run every filter on the same simulated runs.
+
+    `progress(filter name, finished runs)` is called after every chunk. Chunks that `store`
+    already has are not run again. Raises ValueError for sizes that make no sense.
+    """
+    if not filters:
+        raise ValueError("no filter to run: name at least one")
+    check_sizes(runs, seed, dtype, chunk)
+    store = MemoryStore() if store is None else store
+    chunks = tuple(range(i, min(i + chunk, runs)) for i in range(0, runs, chunk))
+    seconds = {}
+    with jax.enable_x64(dtype == "float64"):
+        simulator = _Simulator(scenario, seed, dtype, min(chunk, runs))
+        missing = {name: [c for c in chunks if not store.has(name, c)] for name in filters}
+        capacity = simulator.capacity(chunks) if any(missing.values()) else None
+        for name, slam_filter in filters.items():
+            seconds[name] = _run_filter(
+                name, slam_filter, simulator, capacity, missing[name], store, progress
+            )
+        device = jax.devices()[0].device_kind
+    return Study(scenario, filters, runs, seed, dtype, chunks, store, seconds, device)
+
+
+class _Simulator:
+    """Draws chunks of runs, all of one shape, so that everything compiles once."""
+
+    def __init__(self, scenario: Scenario, seed: int, dtype: str, size: int) -> None:
+        self.scenario, self.dtype, self.size = scenario, jnp.dtype(dtype), size
+        self.parameters = parameters(scenario, self.dtype)
+        self._key = jax.random.key(seed)
+        self._draw = jax.jit(jax.vmap(self._one, in_axes=(None, 0)))
+
+    def _one(self, key: Array, index: Int[Array, ""]) -> tuple[Run, Sightings]:
+        run = simulate(self.scenario, jax.random.fold_in(key, index), self.dtype)
+        return run, sightings(run)
+
+    def __call__(self, chunk: range) -> tuple[Run, Sightings]:
+        """The chunk's runs, padded to `size` by the runs that follow."""
+        return self._draw(self._key, chunk.start + jnp.arange(self.size))
+
+    def capacity(self, chunks: tuple[range, ...]) -> Sightings:
+        """What holds every run of the study, as Python integers."""
+        seen = [jax.tree.map(np.max, jax.device_get(self(chunk)[1])) for chunk in chunks]
+        return jax.tree.map(lambda *counts: max(1, int(max(counts))), *seen)
+
+
+def _run_filter(name, slam_filter, simulator, capacity, chunks, store, progress) -> Seconds:
+    if not chunks:
+        return Seconds(0.0, 0.0)
+    start = time.perf_counter()
+    batch, _ = simulator(chunks[0])
+    compiled = (
+        jax.jit(partial(_filter_batch, slam_filter, simulator.scenario, capacity))
+        .lower(simulator.parameters, batch)
+        .compile()
+    )
+    compiled_at = time.perf_counter()
+    for chunk in chunks:
+        batch, _ = simulator(chunk)
+        records, sample = jax.device_get(compiled(simulator.parameters, batch))
+        records = {key: np.asarray(value)[: len(chunk)] for key, value in records.items()}
+        store.save(name, chunk, {**records, **{f"sample_{k}": v for k, v in sample.items()}})
+        progress(name, len(chunk))
+    return Seconds(compiled_at - start, time.perf_counter() - compiled_at)
+
+
+def _filter_batch(
+    slam_filter: SlamFilter,
+    scenario: Scenario,
+    capacity: Sightings,
+    parameters: Parameters,
+    runs: Run,
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Records of a batch of runs, and the map and the path of its first run."""
+    one = partial(filter_run, slam_filter, scenario, capacity, parameters)
+    records, path, state = jax.vmap(one)(runs)
+    first = partial(jax.tree.map, lambda x: x[0])
+    state, run = first(state), first(runs)
+    slots = jnp.arange(capacity.landmarks)
+    landmarks, covariance = slam_filter.landmarks_from_above(state, parameters, slots)
+    return records, {
+        "path": jax.vmap(lambda pose: pose.as_matrix())(first(path)),
+        "true_path": jax.vmap(lambda pose: pose.as_matrix())(run.poses),
+        "points": run.points,
+        "landmarks": landmarks,
+        "landmarks_covariance": covariance,
+        "active": state.active,
+    }
+
+
+def filter_run(
+    slam_filter: SlamFilter,
+    scenario: Scenario,
+    capacity: Sightings,
+    parameters: Parameters,
+    run: Run,
+) -> tuple[Records, Pose, State]:
+    """One filter on one simulated run: records of every step, estimated path, final state.
+
+    The records hold, per step: `nees` of the pose; `nis` and `nis_dof`; `error` and `variance`
+    of the camera's position (in camera axes) and orientation; the mean `landmark_nees` of the
+    landmarks seen, in the chart (x/z, y/z, 1/z) of the current camera, and their number.
+    """
+    dtype = parameters.pixel_sigma.dtype
+    dt = jnp.asarray(1 / scenario.rate, dtype)
+    first, seen, new = features(run, capacity)
+    state = slam_filter.start(
+        parameters,
+        capacity.landmarks,
+        jnp.asarray(scenario.velocity, dtype),
+        jnp.asarray(scenario.velocity_sigma, dtype),
+    )
+    state = slam_filter.first(state, parameters, first)
+
+    def step(state, data):
+        seen, new, T_BC = data
+        state, innovation = slam_filter.step(state, parameters, dt, seen, new)
+        estimate, covariance = slam_filter.camera_pose(state)
+        landmark_nees, landmark_count = _landmark_nees(
+            slam_filter, state, parameters, seen, T_BC, run.points
+        )
+        records = {
+            "nees": normalised_squared(*slam_filter.pose_error(state, T_BC)),
+            "nis": innovation.nis,
+            "nis_dof": innovation.nis_dof.astype(dtype),
+            "error": _camera_error(estimate, T_BC),
+            "variance": jnp.diagonal(covariance),
+            "landmark_nees": landmark_nees,
+            "landmark_count": landmark_count,
+        }
+        return state, (records, estimate)
+
+    later = jax.tree.map(lambda x: x[1:], run.poses)
+    state, (records, path) = jax.lax.scan(step, state, (seen, new, later))
+    return records, path, state
+
+
+def _camera_error(estimate: Pose, truth: Pose) -> Array:
+    """Position error in the estimated camera's axes, then `Log(R_est⁻¹ R_true)`."""
+    rotation = estimate.rotation().inverse()
+    return jnp.concatenate(
+        [
+            rotation @ (truth.translation() - estimate.translation()),
+            (rotation @ truth.rotation()).log(),
+        ]
+    )
+
+
+def _landmark_nees(slam_filter, state, parameters, seen, T_BC, points):
+    """Mean over the landmarks seen, and how many; where none is seen, 0 of 0."""
+    truth = jax.vmap(T_BC.inverse().apply)(points[seen.slots])
+    ones = jnp.ones_like(truth[:, :1])
+    truth = jnp.concatenate([truth[:, :-1], ones], axis=1) / truth[:, -1:]
+    chart, covariance = slam_filter.landmarks_in_camera(state, parameters, seen.slots)
+    nees = jax.vmap(normalised_squared)(truth - chart, covariance)
+    count = jnp.sum(seen.valid)
+    total = jnp.sum(jnp.where(seen.valid, nees, 0.0))
+    return total / jnp.maximum(count, 1), count.astype(nees.dtype)
+
+
+def check_sizes(runs: int, seed: int, dtype: str, chunk: int) -> None:
+    """Raise ValueError for sizes that make no sense."""
+    for name, value in (("runs", runs), ("chunk", chunk)):
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, not {value}")
+    if seed < 0:
+        raise ValueError(f"seed must not be negative, not {seed}")
+    if dtype not in DTYPES:
+        raise ValueError(f"unknown dtype {dtype!r}; known: {', '.join(DTYPES)}")

@@ -1,0 +1,89 @@
+"""Where the records of simulated runs are kept: in memory, or in a folder to resume from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from jaxslam.files import write_atomically
+
+Records = dict[str, np.ndarray]
+
+
+class Store(Protocol):
+    """Records by filter and chunk; a chunk is the range of its runs."""
+
+    def has(self, filter_name: str, chunk: range) -> bool: ...
+    def save(self, filter_name: str, chunk: range, records: Records) -> None: ...
+    def load(
+        self, filter_name: str, chunk: range, names: Iterable[str] | None = None
+    ) -> Records: ...
+
+
+class MemoryStore:
+    """Keeps everything: for notebooks and small studies."""
+
+    def __init__(self) -> None:
+        self._records: dict[tuple[str, range], Records] = {}
+
+    def has(self, filter_name: str, chunk: range) -> bool:
+        return (filter_name, chunk) in self._records
+
+    def save(self, filter_name: str, chunk: range, records: Records) -> None:
+        self._records[filter_name, chunk] = records
+
+    def load(self, filter_name: str, chunk: range, names: Iterable[str] | None = None) -> Records:
+        records = self._records[filter_name, chunk]
+        return {name: records[name] for name in (records if names is None else names)}
+
+
+class FolderStore:
+    """One file a chunk, written whole or not at all, beside a manifest of what made them.
+
+    `manifest` holds whatever decides a run's result. A folder made with another manifest is
+    refused when `resume` is set, and emptied of its chunks otherwise.
+    """
+
+    def __init__(self, folder: Path, manifest: dict[str, Any], *, resume: bool) -> None:
+        self.folder = folder
+        path = folder / "manifest.json"
+        wanted = json.loads(json.dumps(manifest))
+        if resume and path.exists():
+            _check_same(path, json.loads(path.read_text()), wanted)
+        else:
+            for old in folder.glob("*/*.npz"):
+                old.unlink()
+            folder.mkdir(parents=True, exist_ok=True)
+            with write_atomically(path) as temporary:
+                temporary.write_text(json.dumps(wanted, indent=1) + "\n")
+
+    def has(self, filter_name: str, chunk: range) -> bool:
+        return self._path(filter_name, chunk).exists()
+
+    def save(self, filter_name: str, chunk: range, records: Records) -> None:
+        path = self._path(filter_name, chunk)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with write_atomically(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, allow_pickle=False, **records)
+
+    def load(self, filter_name: str, chunk: range, names: Iterable[str] | None = None) -> Records:
+        with np.load(self._path(filter_name, chunk)) as file:
+            return {name: file[name] for name in (file.files if names is None else names)}
+
+    def _path(self, filter_name: str, chunk: range) -> Path:
+        name = f"{chunk.start:07d}-{chunk.stop - 1:07d}.npz"
+        return self.folder / filter_name.replace("/", "-") / name
+
+
+def _check_same(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
+    different = [key for key in wanted if found.get(key) != wanted[key]]
+    if different:
+        key = different[0]
+        raise ValueError(
+            f"cannot resume: {path} was made with another {key} "
+            f"({found.get(key)!r}, now {wanted[key]!r}); use another --out or leave --resume out"
+        )

@@ -1,0 +1,166 @@
+"""What a study says: per step and per filter, the numbers of `consistency.json` and its table."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from jaxslam.consistency.montecarlo import Study
+from jaxslam.consistency.statistics import lost_threshold, mean_band
+from jaxslam.consistency.store import Records
+
+SCHEMA = 1
+_STEPS_AT_ONCE = 50
+"""Steps of which the median holds all runs in memory."""
+
+
+def summarise(study: Study) -> dict[str, Any]:
+    """The content of `consistency.json`, ready for `json.dumps`.
+
+    Means are over the runs that did not diverge; a run diverges when its NEES is not finite, or
+    its covariance not positive definite, at any step. `lost` counts diverged runs as lost.
+    """
+    from jaxslam import __version__
+
+    return {
+        "schema": SCHEMA,
+        "version": __version__,
+        "scenario": dataclasses.asdict(study.scenario),
+        "runs": study.runs,
+        "steps": study.scenario.steps,
+        "seed": study.seed,
+        "dtype": study.dtype,
+        "device": study.device,
+        "time": [round((i + 1) / study.scenario.rate, 6) for i in range(study.scenario.steps)],
+        "filters": {name: _summarise_filter(study, name) for name in study.filters},
+    }
+
+
+def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
+    geometry = study.scenario.world
+    dof, n = geometry.tangent_dim, geometry.point_dim
+    sums = _sums(study, name, dof)
+    healthy = study.runs - sums["diverged"]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = sums["nees"] / healthy
+        kept = sums["kept_nees"] / sums["kept"]
+        error, variance = sums["squared_error"] / healthy, sums["variance"] / healthy
+        landmark = sums["landmark_nees"] / sums["landmark_count"]
+        nis, nis_dof = sums["nis"] / healthy, sums["nis_dof"] / healthy
+    low, high = mean_band(dof, max(healthy, 1))
+
+    def by_part(per_axis):
+        return {
+            "position": _numbers(np.sqrt(per_axis[:, :n].sum(axis=1))),
+            "orientation": _numbers(np.sqrt(per_axis[:, n:].sum(axis=1))),
+        }
+
+    seconds = study.seconds[name]
+    return {
+        "dof": dof,
+        "calibration": study.filters[name].calibration,
+        "band95": [low, high],
+        "nees": _numbers(mean),
+        "nees_median": _numbers(_median(study, name)),
+        "nees_not_lost": _numbers(kept),
+        "lost": _numbers((sums["lost"] + sums["diverged"]) / study.runs),
+        "inside": float(np.mean((mean >= low) & (mean <= high))),
+        "nis": _numbers(nis),
+        "nis_dof": _numbers(nis_dof),
+        "rmse": by_part(error),
+        "sigma": by_part(variance),
+        "landmark_nees": _numbers(landmark),
+        "landmark_dof": n,
+        "diverged": int(sums["diverged"]),
+        "seconds": {"compile": seconds.compile, "run": seconds.run},
+    }
+
+
+def _sums(study: Study, name: str, dof: int) -> dict[str, Any]:
+    """Sums over the runs that did not diverge, chunk by chunk."""
+    threshold, total = lost_threshold(dof), {}
+    for records in _chunks(study, name):
+        healthy = _healthy(records)
+        good = {k: v[healthy] for k, v in records.items() if not k.startswith("sample_")}
+        with np.errstate(invalid="ignore"):
+            kept = good["nees"] <= threshold
+        seen = np.where(np.isfinite(good["landmark_nees"]), good["landmark_count"], 0.0)
+        part = {
+            "diverged": np.sum(~healthy),
+            "nees": good["nees"].sum(axis=0),
+            "kept": kept.sum(axis=0),
+            "kept_nees": np.where(kept, good["nees"], 0.0).sum(axis=0),
+            "lost": (~kept).sum(axis=0),
+            "nis": good["nis"].sum(axis=0),
+            "nis_dof": good["nis_dof"].sum(axis=0),
+            "squared_error": (good["error"] ** 2).sum(axis=0),
+            "variance": good["variance"].sum(axis=0),
+            "landmark_nees": (np.nan_to_num(good["landmark_nees"], posinf=0.0) * seen).sum(axis=0),
+            "landmark_count": seen.sum(axis=0),
+        }
+        total = {key: total.get(key, 0) + value for key, value in part.items()}
+    return total
+
+
+def _median(study: Study, name: str) -> np.ndarray:
+    """Median over all runs, diverged ones above everything."""
+    medians = []
+    for start in range(0, study.scenario.steps, _STEPS_AT_ONCE):
+        part = slice(start, start + _STEPS_AT_ONCE)
+        columns = [
+            np.where(_healthy(records)[:, None], records["nees"], np.inf)[:, part]
+            for records in _chunks(study, name, ("nees",))
+        ]
+        medians.append(np.median(np.concatenate(columns), axis=0))
+    return np.concatenate(medians)
+
+
+def _healthy(records: Records) -> np.ndarray:
+    return np.isfinite(records["nees"]).all(axis=1)
+
+
+def _chunks(study: Study, name: str, names: tuple[str, ...] | None = None) -> Iterator[Records]:
+    for chunk in study.chunks:
+        yield study.store.load(name, chunk, names)
+
+
+def _numbers(values: np.ndarray) -> list[float | None]:
+    """For JSON, which has no NaN."""
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+def table(summary: dict[str, Any]) -> str:
+    """The summary's last step as text, one filter a line."""
+    header = (
+        f"{'filter/landmarks':<32}{'NEES mean':>10}{'median':>8}{'95 % band':>14}{'inside':>8}"
+        f"{'lost':>7}{'diverged':>9}{'NIS/dof':>8}{'RMSE m':>8}{'σ m':>8}{'seconds':>9}"
+    )
+    lines = [header]
+    for name, f in summary["filters"].items():
+        nis = np.nansum(np.array(f["nis"], float)) / np.nansum(np.array(f["nis_dof"], float))
+        band = f"{f['band95'][0]:.3f}–{f['band95'][1]:.3f}"
+        lines.append(
+            f"{name:<32}{_last(f['nees'], 10, 3)}{_last(f['nees_median'], 8, 2)}{band:>14}"
+            f"{f['inside']:>7.0%} {_share(f['lost'][-1]):>6}{f['diverged']:>9d}{nis:>8.3f}"
+            f"{_last(f['rmse']['position'], 8, 3)}{_last(f['sigma']['position'], 8, 3)}"
+            f"{f['seconds']['compile'] + f['seconds']['run']:>9.1f}"
+        )
+    lines.append(
+        f"last of {summary['steps']} steps, {summary['runs']} runs; a consistent filter has mean "
+        f"NEES {next(iter(summary['filters'].values()))['dof']}; inside: share of steps in band"
+    )
+    return "\n".join(lines)
+
+
+def _last(values: list[float | None], width: int, digits: int) -> str:
+    value = values[-1]
+    if value is None:
+        return f"{'–':>{width}}"
+    return f"{value:>{width}.{digits}f}" if abs(value) < 1e4 else f"{value:>{width}.2g}"
+
+
+def _share(value: float | None) -> str:
+    return "–" if value is None else f"{value:.1%}"

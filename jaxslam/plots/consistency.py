@@ -1,0 +1,146 @@
+"""The figure of a consistency study: mean NEES with its band, a sample run's errors, its map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+
+from jaxslam.consistency import Study, summarise
+from jaxslam.consistency.statistics import chi2_quantile
+from jaxslam.plots.style import GREY, line_style, new_figure, save
+
+_FARTHEST = 1 / 60
+"""Least inverse distance that the map draws, 1/m."""
+
+
+def plot_consistency(
+    study: Study, summary: dict[str, Any] | None = None, path: str | Path | None = None
+) -> Figure:
+    """Draw a study; `summary` is `summarise(study)`, made here if it is not given.
+
+    Above: the mean NEES of every filter with its exact 95 % band, and the map of run 0 at its
+    end. Below: the error of run 0 with ±3σ, axis by axis. Written to `path` where one is given.
+    """
+    summary = summarise(study) if summary is None else summary
+    geometry = study.scenario.world
+    rows = geometry.tangent_dim // 3
+    figure = new_figure(12.5, 5.2 + 2.2 * rows)
+    grid = figure.add_gridspec(1 + rows, 6, height_ratios=[2.1, *[1] * rows])
+    _plot_nees(figure.add_subplot(grid[0, :4]), summary)
+    samples = {name: study.store.load(name, study.chunks[0]) for name in study.filters}
+    _plot_map(figure.add_subplot(grid[0, 4:]), samples)
+    axes = [
+        figure.add_subplot(grid[1 + r, 2 * c : 2 * c + 2]) for r in range(rows) for c in range(3)
+    ]
+    _plot_errors(axes, samples, np.array(summary["time"]), geometry.point_dim)
+    if path is not None:
+        save(figure, path)
+    return figure
+
+
+def _plot_nees(axes: Axes, summary: dict[str, Any]) -> None:
+    time = np.array(summary["time"])
+    first = next(iter(summary["filters"].values()))
+    low, high = first["band95"]
+    axes.axhspan(low, high, color=GREY, alpha=0.25, lw=0, label="exact 95 % band of the mean")
+    axes.axhline(first["dof"], color=GREY, lw=0.8)
+    for i, (name, f) in enumerate(summary["filters"].items()):
+        style = line_style(i)
+        inside = f"{f['inside']:.0%} of steps in the band"
+        lost = f", {f['lost'][-1]:.1%} lost at the end" if f["lost"][-1] > 0.001 else ""
+        axes.plot(
+            time, np.array(f["nees"], float), lw=1.8, label=f"{name}: {inside}{lost}", **style
+        )
+        axes.plot(
+            time, np.array(f["nees_median"], float), color=style["color"], lw=0.9, ls=(0, (1, 2))
+        )
+    axes.plot(
+        [], [], color=GREY, lw=0.9, ls=(0, (1, 2)), label="median (2.37 for χ²₃, 5.35 for χ²₆)"
+    )
+    axes.set_yscale("log")
+    bottom, top = axes.get_ylim()
+    axes.set_ylim(min(bottom, first["dof"] / 2), max(top, first["dof"] * 2.5))
+    if axes.get_ylim()[1] < 100:
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+        axes.yaxis.set_major_formatter(ScalarFormatter())
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlim(0, time[-1])
+    axes.set_xlabel("time, s")
+    axes.set_ylabel(f"pose NEES (ideal {first['dof']})")
+    scenario = summary["scenario"]["name"]
+    axes.set_title(f"{scenario}: mean of {summary['runs']} runs, seed {summary['seed']}")
+    axes.legend(fontsize=8, loc="upper left")
+    axes.grid(alpha=0.25, which="major")
+
+
+def _plot_errors(axes: list[Axes], samples: dict[str, Any], time: np.ndarray, n: int) -> None:
+    positions = ["x", "z"] if n == 2 else ["x", "y", "z"]
+    rotations = ["θ"] if n == 2 else ["about x", "about y", "about z"]
+    for axis, ax in enumerate(axes):
+        position = axis < n
+        scale = 1.0 if position else 180 / np.pi
+        for i, records in enumerate(samples.values()):
+            style = line_style(i)
+            error = records["error"][0, :, axis] * scale
+            bound = 3 * np.sqrt(records["variance"][0, :, axis]) * scale
+            ax.fill_between(time, -bound, bound, color=style["color"], alpha=0.12, lw=0)
+            ax.plot(time, bound, time, -bound, lw=0.8, alpha=0.8, **style)
+            ax.plot(time, error, lw=1.5, **style)
+        label = positions[axis] if position else rotations[axis - n]
+        ax.set_title(f"run 0: error in {label} with ±3σ", fontsize=9)
+        ax.set_ylabel("m" if position else "degrees")
+        ax.set_xlim(0, time[-1])
+        ax.grid(alpha=0.25)
+        if axis >= len(axes) - 3:
+            ax.set_xlabel("time, s")
+
+
+def _plot_map(axes: Axes, samples: dict[str, Any]) -> None:
+    first = next(iter(samples.values()))
+    truth = first["sample_true_path"][:, :-1, -1]
+    seen = first["sample_active"].nonzero()[0]
+    points = first["sample_points"]
+    axes.plot(truth[:, 0], truth[:, -1], color="black", lw=1.2, label="truth")
+    axes.plot(points[:, 0], points[:, -1], "k+", ms=6, mew=1, label="landmarks")
+    for i, (name, records) in enumerate(samples.items()):
+        style = line_style(i)
+        path = records["sample_path"][:, :-1, -1]
+        axes.plot(path[:, 0], path[:, -1], lw=1.5, label=name, **style)
+        for slot in records["sample_active"].nonzero()[0]:
+            region = _region(
+                records["sample_landmarks"][slot], records["sample_landmarks_covariance"][slot]
+            )
+            axes.plot(*(path[-1, [0, -1], None] + region), lw=0.8, alpha=0.8, **style)
+    _set_view(axes, np.concatenate([truth, points[seen]])[:, [0, -1]])
+    axes.set_xlabel("x, m")
+    axes.set_ylabel("z, m")
+    axes.set_title("run 0 from above: 95 % regions, relative to the camera", fontsize=9)
+    axes.legend(fontsize=7, loc="best")
+    axes.grid(alpha=0.25)
+
+
+def _set_view(axes: Axes, shown: np.ndarray) -> None:
+    """Show the path and the landmarks seen, but none of the very far ones."""
+    centre = np.median(shown, axis=0)
+    distance = np.linalg.norm(shown - centre, axis=1)
+    near = shown[distance <= 4 * np.median(distance) + 1e-9]
+    low, high = near.min(axis=0), near.max(axis=0)
+    margin = 0.12 * (high - low).max()
+    axes.set_xlim(low[0] - margin, high[0] + margin)
+    axes.set_ylim(low[1] - margin, high[1] + margin)
+    axes.set_aspect("equal", adjustable="datalim")
+
+
+def _region(mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """The 95 % ellipse of azimuth and inverse distance, bent into the plane; (2, points)."""
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.linspace(0, 2 * np.pi, 181)
+    circle = np.sqrt(chi2_quantile(0.95, 2)) * np.stack([np.cos(angle), np.sin(angle)])
+    azimuth, inverse = mean[:, None] + vectors @ (np.sqrt(np.maximum(values, 0))[:, None] * circle)
+    distance = 1 / np.maximum(inverse, _FARTHEST)
+    return distance * np.stack([np.sin(azimuth), np.cos(azimuth)])

@@ -1,0 +1,34 @@
+"""Colours and file writing that all figures share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from jaxslam.files import write_atomically
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+"""Okabe and Ito's colours, distinct to the colour-blind."""
+DASHES = ("-", "--", "-.", ":")
+GREY = "#666666"
+
+
+def line_style(index: int) -> dict[str, str]:
+    """Colour and dash of the i-th line: all colours, then the next dash."""
+    dash = DASHES[index // len(COLOURS) % len(DASHES)]
+    return {"color": COLOURS[index % len(COLOURS)], "linestyle": dash}
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """A figure in inches, outside pyplot's global state."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save(figure: Figure, path: str | Path) -> None:
+    """Write the figure whole or not at all."""
+    with write_atomically(path) as temporary:
+        figure.savefig(temporary, dpi=150)
