@@ -111,6 +111,18 @@ def update(
     return state, Innovation(predicted, residual, S, used, whitened @ whitened)
 
 
+def update_mean(
+    model: Model, state: State, features: Features, noise: Float[Array, "p p"], context: Any
+) -> State:
+    """The mean that `update` would give, with the covariance left as it is."""
+    predicted, _, H = _observe(model, state, features.slots, context)
+    H = _masked(H, features.valid)
+    residual = jnp.where(features.valid[:, None], features.pixels - predicted, 0.0)
+    HP = _rows(H, features.slots, state.covariance)
+    S = _rows(H, features.slots, HP.T) + _noise_matrix(noise, features.valid)
+    return _shifted(state, HP.T @ jnp.linalg.solve(S, residual.ravel()))
+
+
 def predict_features(
     model: Model, state: State, slots: Int[Array, " m"], noise: Float[Array, "p p"], context: Any
 ) -> tuple[Float[Array, "m p"], Float[Array, "m p p"], Bool[Array, " m"]]:
@@ -132,6 +144,9 @@ def compose(model: Model, state: State, context: Any) -> State:
     def move_core(core):
         return model.compose_core(core, context)
 
+    def view(core):
+        return model.view(core, context)
+
     def move_landmark(view, landmark):
         return model.compose_landmark(view, landmark, context), None
 
@@ -141,7 +156,7 @@ def compose(model: Model, state: State, context: Any) -> State:
         J, landmarks = None, state.landmarks
     else:
         everyone = jnp.arange(state.active.size)
-        moved, _, J = _local_jacobians(model, move_landmark, state, everyone, context)
+        moved, _, J = _local_jacobians(view, move_landmark, state, everyone)
         J = _masked(J, state.active)
         landmarks = jnp.where(state.active[:, None], moved, state.landmarks)
 
@@ -171,7 +186,8 @@ def initialise(
     c, (capacity, d) = state.core_dim, state.landmarks.shape
     mean, sigma = inverse_depth
 
-    view, view_by_core = _view(model, state.core, context)
+    view = model.view(state.core, context)
+    view_by_core = core_jacobian(lambda core: model.view(core, context), state.core)
 
     def one(pixel):
         def landmark(delta, pixel, depth):
@@ -210,15 +226,14 @@ def remove(state: State, gone: Bool[Array, " capacity"]) -> State:
 
 
 def landmark_covariance(
-    model: Model,
+    view: Callable[[Any], Any],
     function: Callable[[Any, Array], Array],
     state: State,
     slots: Int[Array, " m"],
-    context: Any,
 ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
-    """Values and first-order covariances of a function of the view and one landmark."""
+    """Values and first-order covariances of `function(view(core), landmark)`, slot by slot."""
     value, _, J = _local_jacobians(
-        model, lambda view, landmark: (function(view, landmark), None), state, slots, context
+        view, lambda view, landmark: (function(view, landmark), None), state, slots
     )
     return value, _local_covariance(state, J, slots)
 
@@ -244,24 +259,17 @@ def _zero_tangent(core):
 
 
 def _observe(model, state, slots, context):
-    def function(view, landmark):
-        return model.observe(view, landmark, context)
-
-    return _local_jacobians(model, function, state, slots, context)
-
-
-def _view(model, core, context):
-    """The view and its Jacobian by the core."""
-
-    def function(core):
-        return model.view(core, context)
-
-    return function(core), core_jacobian(function, core)
+    return _local_jacobians(
+        lambda core: model.view(core, context),
+        lambda view, landmark: model.observe(view, landmark, context),
+        state,
+        slots,
+    )
 
 
-def _local_jacobians(model, function, state, slots, context) -> tuple[Array, Any, Blocks]:
+def _local_jacobians(view, function, state, slots) -> tuple[Array, Any, Blocks]:
     """Values, auxiliary outputs and blocks of `function(view, landmark) → (value, auxiliary)`."""
-    view, view_by_core = _view(model, state.core, context)
+    view_by_core, view = core_jacobian(view, state.core), view(state.core)
 
     def one(landmark):
         def moved(delta, landmark):

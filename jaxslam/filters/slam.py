@@ -248,6 +248,22 @@ class SlamFilter:
         context = self._context(parameters, dt)
         return ekf.update(self.model, state, features, parameters.pixel_covariance, context)
 
+    def update_mean(
+        self, state: State, parameters: Parameters, dt: Float[Array, ""], features: Features
+    ) -> State:
+        """`update` without its covariance: cheap enough to try many hypotheses."""
+        context = self._context(parameters, dt)
+        return ekf.update_mean(self.model, state, features, parameters.pixel_covariance, context)
+
+    def project(
+        self, state: State, parameters: Parameters, dt: Float[Array, ""], slots: Array
+    ) -> tuple[Float[Array, "m p"], Bool[Array, " m"]]:
+        """Pixels of landmarks in the current camera, and whether they are in front of it."""
+        context = self._context(parameters, dt)
+        view = self.model.view(state.core, context)
+        observe = jax.vmap(self.model.observe, in_axes=(None, 0, None))
+        return observe(view, state.landmarks[slots], context)
+
     def predict_features(
         self, state: State, parameters: Parameters, dt: Float[Array, ""], slots: Array
     ) -> tuple[Float[Array, "m p"], Float[Array, "m p p"], Bool[Array, " m"]]:
@@ -307,7 +323,7 @@ class SlamFilter:
     ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
         """(x/z, y/z, 1/z) of landmarks in the current camera, with covariances."""
         return ekf.landmark_covariance(
-            self.model, self.model.chart, state, slots, _composed(parameters)
+            self._composed_view(parameters), self.model.chart, state, slots
         )
 
     def landmarks_from_above(
@@ -325,7 +341,41 @@ class SlamFilter:
             x, z = (rotation @ point)[jnp.array([0, -1])]
             return jnp.stack([jnp.atan2(x, z), omega / jnp.hypot(x, z)])
 
-        return ekf.landmark_covariance(self.model, above, state, slots, _composed(parameters))
+        return ekf.landmark_covariance(self._composed_view(parameters), above, state, slots)
+
+    def landmarks_in_world(
+        self, state: State, parameters: Parameters, slots: Array
+    ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
+        """Points in B and their covariances, the camera's uncertainty included.
+
+        Not finite for a landmark at infinity; far from Gaussian for one of unknown depth.
+        """
+        camera_view = self._composed_view(parameters)
+
+        def view(core):
+            return camera_view(core), self.model.frame.pose_from_camera(core.pose)
+
+        def point(view, landmark):
+            (camera_view, T_BC) = view
+            seen, omega = self.model.camera_point(camera_view, landmark)
+            return T_BC @ (seen / omega)
+
+        return ekf.landmark_covariance(view, point, state, slots)
+
+    def predicted_camera(
+        self, state: State, parameters: Parameters, dt: Float[Array, ""], slots: Array
+    ) -> tuple[Pose, Float[Array, "m n"], Float[Array, " m"]]:
+        """T_BC of a predicted state, and the landmarks in that camera as (X, ω)."""
+        context = self._context(parameters, dt)
+        view = self.model.view(state.core, context)
+        core = self.model.compose_core(state.core, context)
+        points, omegas = jax.vmap(self.model.camera_point, in_axes=(None, 0))(
+            view, state.landmarks[slots]
+        )
+        return self.model.frame.pose_from_camera(core.pose), points, omegas
+
+    def _composed_view(self, parameters: Parameters) -> Callable[[Core], View]:
+        return lambda core: self.model.view(core, _composed(parameters))
 
     def _with_calibration(self, state: State, parameters: Parameters) -> State:
         if self.calibration == "known":

@@ -1,0 +1,159 @@
+"""Track a whole video and write its files: trajectory, map, overlay, summary."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxslam import __version__
+from jaxslam.files import write_atomically
+from jaxslam.plots.tracking import plot_map
+from jaxslam.vision.overlay import OverlayWriter, draw_overlay, overlay_size
+from jaxslam.vision.pointcloud import write_ply
+from jaxslam.vision.settings import TrackerSettings
+from jaxslam.vision.sources import Frame, Source
+from jaxslam.vision.tracker import Tracked, Tracker
+from jaxslam.vision.trajectory import absolute_trajectory_error, write_tum
+
+SCHEMA = 1
+_WARM_UP = 3
+"""Frames in which functions are compiled; they count in `seconds.start`, not in the quantiles."""
+_KNOWN_DEPTH = 0.3
+"""A point is put into the map where its σ is below this share of its distance."""
+
+
+def track(
+    source: Source,
+    out: str | Path,
+    settings: TrackerSettings | None = None,
+    *,
+    progress: Callable[[int], None] = lambda frames: None,
+) -> dict[str, Any]:
+    """Track `source`, write `trajectory.txt`, `map.ply`, `map.png`, `overlay.mp4` and
+    `summary.json` into the folder `out`, and return the summary.
+
+    An interruption (KeyboardInterrupt) or an unreadable frame (ValueError) leaves all of them for
+    the frames so far, and is raised again.
+    """
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    tracker = Tracker(source.calibration, settings or TrackerSettings())
+    history: list[Tracked] = []
+    seconds: list[float] = []
+    try:
+        _track_frames(source, tracker, out / "overlay.mp4", history, seconds, progress)
+    except BaseException:
+        if history:
+            _write(source, tracker, history, seconds, out)
+        raise
+    return _write(source, tracker, history, seconds, out)
+
+
+def _track_frames(
+    source: Source,
+    tracker: Tracker,
+    video: Path,
+    history: list[Tracked],
+    seconds: list[float],
+    progress: Callable[[int], None],
+) -> None:
+    size = overlay_size(source.calibration.width, source.calibration.height)
+    with OverlayWriter(video, size, _rate(source.times)) as writer:
+        start = time.perf_counter()
+        for frame in source:
+            result = tracker.track(frame)
+            writer.write(_overlay(frame, result))
+            history.append(result)
+            now = time.perf_counter()
+            seconds.append(now - start)
+            start = now
+            progress(1)
+
+
+def _rate(times: np.ndarray) -> float:
+    """Frames per second."""
+    return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 30.0
+
+
+def _overlay(frame: Frame, result: Tracked) -> np.ndarray:
+    new = result.created
+    nothing = np.full((len(new), 2), np.nan)
+    return draw_overlay(
+        frame.image,
+        predicted=np.concatenate([result.predicted, nothing]),
+        covariances=np.concatenate([result.search, np.full((len(new), 2, 2), np.nan)]),
+        matched=np.concatenate([result.matched, new]),
+        status=[*result.status, *["new"] * len(new)],
+        index=result.index,
+        time=result.time,
+    )
+
+
+def _write(
+    source: Source, tracker: Tracker, history: list[Tracked], seconds: list[float], out: Path
+) -> dict[str, Any]:
+    times = np.array([result.time for result in history])
+    T_wc = np.stack([result.T_wc for result in history])
+    write_tum(out / "trajectory.txt", times, T_wc)
+    numbers, points, covariances = _mapped(tracker, T_wc)
+    write_ply(out / "map.ply", points, covariances, numbers)
+    plot_map(T_wc, points, covariances, path=out / "map.png", unit="map units")
+    summary = _summary(source, tracker, history, seconds)
+    with write_atomically(out / "summary.json") as path:
+        path.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    return summary
+
+
+def _mapped(tracker: Tracker, T_wc: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The landmarks whose depth became known, with their covariances."""
+    numbers, points, covariances = tracker.points()
+    away = points[:, None] - T_wc[None, :, :3, 3]
+    distance = np.linalg.norm(away, axis=2).min(axis=1, initial=np.inf)
+    with np.errstate(invalid="ignore"):
+        sigma = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+        known = np.isfinite(sigma) & (sigma < _KNOWN_DEPTH * distance)
+    return numbers[known], points[known], covariances[known]
+
+
+def _summary(
+    source: Source, tracker: Tracker, history: list[Tracked], seconds: list[float]
+) -> dict[str, Any]:
+    lost = sum(result.lost for result in history)
+    updates = history[1:]
+    dof = sum(result.nis_dof for result in updates)
+    count = max(len(updates), 1)
+    later = seconds[_WARM_UP:] or seconds
+    summary = {
+        "schema": SCHEMA,
+        "version": __version__,
+        "source": source.name,
+        "settings": dataclasses.asdict(tracker.settings),
+        "frames": len(history),
+        "tracked": len(history) - lost,
+        "lost": lost,
+        "restarts": tracker.restarts,
+        "landmarks": {
+            "mean": float(np.mean([len(result.status) for result in updates] or [0])),
+            "created": tracker.created,
+            "deleted": tracker.deleted,
+        },
+        "matches_per_frame": sum(result.nis_dof for result in updates) / 2 / count,
+        "nis": {"mean": sum(result.nis for result in updates) / count, "dof": dof / count},
+        "seconds": {
+            "total": sum(seconds),
+            "start": sum(seconds[:_WARM_UP]),
+            "per_frame_median": float(np.median(later)),
+            "per_frame_p99": float(np.quantile(later, 0.99)),
+        },
+    }
+    if source.reference is not None:
+        times = np.array([result.time for result in history])
+        T_wc = np.stack([result.T_wc for result in history])
+        summary["ate"] = absolute_trajectory_error(times, T_wc, *source.reference)
+    return summary

@@ -1,0 +1,354 @@
+"""The tracker: a filter fed with pictures, frame by frame, by active search."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.filters import FILTERS, Features, Parameters, SlamFilter, State
+from jaxslam.filters.ekf import remove
+from jaxslam.filters.ransac import inliers
+from jaxslam.geometry import SPATIAL
+from jaxslam.landmarks import LANDMARKS
+from jaxslam.vision.calibration import Calibration
+from jaxslam.vision.patches import Match, Patch, detect_corners, match_patches
+from jaxslam.vision.settings import TrackerSettings
+from jaxslam.vision.sources import Frame
+
+LEAST_INLIERS = 4
+"""Fewer matches than this do not count as having tracked a frame."""
+
+
+class _Prediction(NamedTuple):
+    """What the filter expects to see, slot by slot."""
+
+    pixels: np.ndarray
+    covariances: np.ndarray
+    usable: np.ndarray
+    """In the map and in front of the camera."""
+    T_wc: np.ndarray
+    points: np.ndarray
+    """Homogeneous points (X, ω) in the predicted camera."""
+    omegas: np.ndarray
+
+
+@dataclass
+class _Landmark:
+    """What the picture side remembers of the landmark in a slot."""
+
+    number: int
+    patch: Patch
+    first_camera: np.ndarray
+    """T_wc of its first view, (4, 4)."""
+    searches: int = 0
+    matches: int = 0
+    unseen: int = 0
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What became of one frame; k landmarks were searched, j created."""
+
+    index: int
+    time: float
+    T_wc: np.ndarray
+    """Camera in the world, (4, 4); the world is the first camera."""
+    covariance: np.ndarray
+    """(6, 6) in the right tangent of T_wc: position in camera axes, rotation."""
+    predicted: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    """Pixels of the landmarks searched, (k, 2)."""
+    search: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 2)))
+    """Their innovation covariances, (k, 2, 2)."""
+    matched: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    """Where they were found, (k, 2), NaN where they were not."""
+    status: list[str] = field(default_factory=list)
+    """`matched`, `unmatched` or `outlier`, k of them."""
+    created: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    """Pixels of new landmarks, (j, 2)."""
+    nis: float = 0.0
+    nis_dof: int = 0
+    lost: bool = False
+
+
+@dataclass
+class Tracker:
+    """Tracks a camera: `track(frame)` for each frame of a video, in order.
+
+    The mutable part is this object; all mathematics is in pure, jitted functions of the state.
+    """
+
+    calibration: Calibration
+    settings: TrackerSettings = field(default_factory=TrackerSettings)
+    landmarks: dict[int, _Landmark] = field(default_factory=dict, init=False)
+    created: int = field(default=0, init=False)
+    deleted: int = field(default=0, init=False)
+    restarts: int = field(default=0, init=False)
+    finished: list[tuple[int, np.ndarray, np.ndarray]] = field(default_factory=list, init=False)
+    """Landmarks that left the map: number, last point in the world, covariance."""
+
+    def __post_init__(self) -> None:
+        s = self.settings
+        self._filter = FILTERS[s.filter](SPATIAL, LANDMARKS[s.landmarks], s.calibration)
+        self._time: float | None = None
+        self._T_wc = self._origin = np.eye(4)
+        self._predict = jax.jit(partial(_predict, self._filter))
+        self._correct = jax.jit(partial(_correct, self._filter))
+        self._renew_map = jax.jit(partial(_renew_map, self._filter))
+        self._world_points = jax.jit(partial(_world_points, self._filter))
+        with jax.enable_x64(True):
+            self._parameters = s.parameters(self.calibration)
+            self._state = self._empty_state()
+
+    def track(self, frame: Frame) -> Tracked:
+        """Predict, search, update, and renew the map. Raises ValueError for a frame that is not
+        later than the one before."""
+        with jax.enable_x64(True):
+            return self._first(frame) if self._time is None else self._next(frame)
+
+    def points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Numbers, points in the world and covariances of all landmarks, those gone included."""
+        with jax.enable_x64(True):
+            kept = self.finished + self._recorded(sorted(self.landmarks))
+        numbers, points, covariances = zip(*kept, strict=True) if kept else ((), (), ())
+        return (
+            np.array(numbers, int),
+            np.array(points, float).reshape(-1, 3),
+            np.array(covariances, float).reshape(-1, 3, 3),
+        )
+
+    def _first(self, frame: Frame) -> Tracked:
+        created = self._renew(frame, np.zeros((0, 2)), self.settings.wanted)
+        self._time = frame.time
+        return self._tracked(frame, created=created)
+
+    def _next(self, frame: Frame) -> Tracked:
+        dt = frame.time - self._time
+        if not dt > 0:
+            raise ValueError(f"frame {frame.index}: its time is not later than the one before")
+        state, prediction = self._predict(self._state, self._parameters, dt)
+        prediction = jax.device_get(prediction)
+        prediction = prediction._replace(T_wc=self._origin @ prediction.T_wc)
+        slots = self._visible(prediction)
+        found = self._search(frame, prediction, slots)
+        matched, features = self._features(slots, found)
+        state, result = self._correct(state, self._parameters, dt, features)
+        used, nis, nis_dof, healthy = jax.device_get(result)
+        if not healthy:
+            return self._restart(frame)
+        self._state, self._time = state, frame.time
+        used = used[: len(slots)]
+        self._count(slots, used)
+        self._remove_failing()
+        pixels = prediction.pixels[slots]
+        created = self._renew(
+            frame, np.where(used[:, None], matched, pixels), self.settings.new_per_frame
+        )
+        return self._tracked(
+            frame,
+            predicted=pixels,
+            search=prediction.covariances[slots],
+            matched=matched,
+            status=[
+                "unmatched" if match is None else "matched" if ok else "outlier"
+                for match, ok in zip(found, used, strict=True)
+            ],
+            created=created,
+            nis=float(nis),
+            nis_dof=int(nis_dof),
+            lost=bool(used.sum() < LEAST_INLIERS),
+        )
+
+    def _restart(self, frame: Frame) -> Tracked:
+        """The covariance is no longer positive: begin anew where the camera was last."""
+        self.restarts += 1
+        self._remove(sorted(self.landmarks))
+        self._origin, self._state = self._T_wc, self._empty_state()
+        return replace(self._first(frame), lost=True)
+
+    def _empty_state(self) -> State:
+        s = self.settings
+        sigma = [s.velocity_sigma] * 3 + [s.angular_velocity_sigma] * 3
+        return self._filter.start(self._parameters, s.capacity, jnp.zeros(6), jnp.array(sigma))
+
+    def _visible(self, prediction: _Prediction) -> np.ndarray:
+        """Slots to search: in front, in the picture, with a bearing that the lens can see."""
+        s, c = self.settings, self.calibration
+        size = np.array([c.width, c.height])
+        inside = np.all(
+            (prediction.pixels >= s.border) & (prediction.pixels < size - s.border), axis=1
+        )
+        slots = np.flatnonzero(prediction.usable & inside)
+        # The longest known first, should there be more than can be measured.
+        order = sorted(slots, key=lambda slot: self.landmarks[slot].number)
+        return np.array(order[: s.wanted], int)
+
+    def _search(
+        self, frame: Frame, prediction: _Prediction, slots: np.ndarray
+    ) -> list[Match | None]:
+        if not len(slots):
+            return []
+        templates = np.stack(
+            [
+                self.landmarks[slot].patch.warped(affine)
+                for slot, affine in zip(slots, self._affines(prediction, slots), strict=True)
+            ]
+        )
+        return match_patches(
+            frame.image, templates, prediction.pixels[slots], prediction.covariances[slots]
+        )
+
+    def _affines(self, prediction: _Prediction, slots: np.ndarray) -> np.ndarray:
+        """How the picture around each landmark changed since its first view, (k, 2, 2).
+
+        The surface is taken to face the first camera; distortion is neglected, being nearly
+        the same over a patch.
+        """
+        first = np.stack([self.landmarks[slot].first_camera for slot in slots])
+        T_first_now = np.linalg.inv(first) @ prediction.T_wc
+        X, omega = prediction.points[slots], prediction.omegas[slots]
+        start = np.einsum("kij,kj->ki", T_first_now[:, :3, :3], X)
+        start += omega[:, None] * T_first_now[:, :3, 3]
+        ahead = np.where(np.abs(start[:, 2:]) < 1e-9, 1e-9, start[:, 2:])
+        # One pixel to the right and down in the first view, on the plane through the point.
+        step = ahead[:, :, None] * np.eye(3)[None, :2] / [[[self.calibration.fx]]]
+        moved = X[:, None] + np.einsum("kji,kaj->kai", T_first_now[:, :3, :3], step)
+        pixel = X[:, :2] / X[:, 2:]
+        focal = np.array([self.calibration.fx, self.calibration.fy])
+        affine = (moved[..., :2] / moved[..., 2:] - pixel[:, None]) * focal
+        affine = np.swapaxes(affine, 1, 2)
+        sensible = np.isfinite(affine).all(axis=(1, 2)) & (
+            np.abs(np.log(np.clip(np.linalg.det(affine), 1e-6, 1e6))) < np.log(4)
+        )
+        return np.where(sensible[:, None, None], affine, np.eye(2))
+
+    def _features(
+        self, slots: np.ndarray, found: list[Match | None]
+    ) -> tuple[np.ndarray, Features]:
+        """Pixels of the matches, NaN where there is none, and the same padded for the filter."""
+        matched = np.full((len(slots), 2), np.nan)
+        for i, match in enumerate(found):
+            if match is not None:
+                matched[i] = match.pixel
+        return matched, _padded(slots, matched, self.settings.wanted)
+
+    def _count(self, slots: np.ndarray, used: np.ndarray) -> None:
+        for landmark in self.landmarks.values():
+            landmark.unseen += 1
+        for slot, ok in zip(slots, used, strict=True):
+            landmark = self.landmarks[slot]
+            landmark.searches += 1
+            landmark.matches += int(ok)
+            landmark.unseen = 0
+
+    def _remove_failing(self) -> None:
+        """Remove landmarks that stopped matching or left the picture long ago."""
+        s = self.settings
+
+        def failing(landmark: _Landmark) -> bool:
+            judged = landmark.searches >= s.patience
+            return judged and landmark.matches < s.least_success * landmark.searches
+
+        self._remove(
+            [
+                slot
+                for slot, landmark in self.landmarks.items()
+                if failing(landmark) or landmark.unseen > s.forget_after
+            ]
+        )
+
+    def _remove(self, slots: list[int]) -> None:
+        if not slots:
+            return
+        self.finished += self._recorded(slots)
+        self.deleted += len(slots)
+        for slot in slots:
+            del self.landmarks[slot]
+        gone = np.isin(np.arange(self.settings.capacity), slots)
+        self._state = remove(self._state, jnp.asarray(gone))
+
+    def _renew(self, frame: Frame, occupied: np.ndarray, most: int) -> np.ndarray:
+        """Create landmarks where the picture is bare; their pixels. Ends the filter's frame."""
+        s = self.settings
+        free = [slot for slot in range(s.capacity) if slot not in self.landmarks]
+        count = min(most, s.wanted - len(occupied), len(free))
+        corners = np.zeros((0, 2))
+        if count > 0:
+            corners = detect_corners(
+                frame.image,
+                count,
+                occupied=occupied,
+                min_distance=s.spacing,
+                border=2 * s.border,
+            ).astype(float)
+        slots = np.array(free[: len(corners)], int)
+        new = _padded(slots, corners, most)
+        self._state, T_BC = self._renew_map(self._state, self._parameters, new)
+        self._T_wc = self._origin @ np.asarray(T_BC)
+        for slot, corner in zip(slots, corners, strict=True):
+            patch = Patch.take(frame.image, corner)
+            self.landmarks[int(slot)] = _Landmark(self.created, patch, self._T_wc)
+            self.created += 1
+        return corners
+
+    def _recorded(self, slots: list[int]) -> list[tuple[int, np.ndarray, np.ndarray]]:
+        points, covariances = jax.device_get(self._world_points(self._state, self._parameters))
+        rotation, translation = self._origin[:3, :3], self._origin[:3, 3]
+        return [
+            (
+                self.landmarks[slot].number,
+                rotation @ points[slot] + translation,
+                rotation @ covariances[slot] @ rotation.T,
+            )
+            for slot in slots
+        ]
+
+    def _tracked(self, frame: Frame, **found) -> Tracked:
+        _, covariance = self._filter.camera_pose(self._state)
+        return Tracked(frame.index, frame.time, self._T_wc, np.asarray(covariance), **found)
+
+
+def _padded(slots: np.ndarray, pixels: np.ndarray, size: int) -> Features:
+    """Features of fixed number; NaN pixels and padding are not valid."""
+    missing = size - len(slots)
+    valid = np.pad(np.isfinite(pixels).all(axis=1), (0, missing))
+    pixels = np.pad(np.nan_to_num(pixels), ((0, missing), (0, 0)))
+    return Features(
+        jnp.asarray(np.pad(slots, (0, missing))), jnp.asarray(pixels), jnp.asarray(valid)
+    )
+
+
+def _predict(
+    slam_filter: SlamFilter, state: State, parameters: Parameters, dt
+) -> tuple[State, _Prediction]:
+    dt = jnp.asarray(dt, parameters.pixel_sigma.dtype)
+    state = slam_filter.predict(state, parameters, dt)
+    slots = jnp.arange(state.active.size)
+    pixels, covariances, in_front = slam_filter.predict_features(state, parameters, dt, slots)
+    pose, points, omegas = slam_filter.predicted_camera(state, parameters, dt, slots)
+    usable = state.active & in_front & jnp.isfinite(covariances).all(axis=(1, 2))
+    return state, _Prediction(pixels, covariances, usable, pose.as_matrix(), points, omegas)
+
+
+def _correct(
+    slam_filter: SlamFilter, state: State, parameters: Parameters, dt, features: Features
+) -> tuple[State, tuple]:
+    dt = jnp.asarray(dt, parameters.pixel_sigma.dtype)
+    agreed = inliers(slam_filter, state, parameters, dt, features)
+    state, innovation = slam_filter.update(state, parameters, dt, replace(features, valid=agreed))
+    state = slam_filter.compose(state, parameters, dt)
+    healthy = jnp.isfinite(state.covariance).all() & (jnp.diagonal(state.covariance) >= 0).all()
+    return state, (innovation.used, innovation.nis, innovation.nis_dof, healthy)
+
+
+def _renew_map(slam_filter: SlamFilter, state: State, parameters: Parameters, new: Features):
+    state = slam_filter.finish(slam_filter.initialise(state, parameters, new))
+    return state, slam_filter.camera_pose(state)[0].as_matrix()
+
+
+def _world_points(slam_filter: SlamFilter, state: State, parameters: Parameters):
+    return slam_filter.landmarks_in_world(state, parameters, jnp.arange(state.active.size))

@@ -1,0 +1,601 @@
+"""Tests of jaxslam.filters.ekf: against dense filters and Jacobians, and what must not matter."""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import Case, central, close, each_geometry, each_landmark, named, pose, quick_jit
+
+from jaxslam.camera import Camera
+from jaxslam.filters import FILTERS, Features, Parameters, SlamModel, State, ekf
+from jaxslam.filters.slam import ROBOCENTRIC, WORLD, Context, Core
+from jaxslam.geometry import PLANAR, SPATIAL, difference, retract
+from jaxslam.landmarks import INVERSE_SCALING, LANDMARKS
+
+# --- a linear Gaussian problem, where the EKF must be the Kalman filter -------------------------
+
+
+class Robot(NamedTuple):
+    position: jax.Array
+    velocity: jax.Array
+    acceleration: jax.Array
+
+
+class Frame(NamedTuple):
+    """Context: the seconds not yet composed, and how the third coordinate shows (this frame)."""
+
+    dt: jax.Array
+    slant: jax.Array
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Landmarks (x, y, e); seen are (x, y) from the robot, plus e times a slant that changes.
+
+    A single sighting says nothing of e, as one picture says nothing of depth.
+    """
+
+    moves_landmarks: bool
+
+    def compose_core(self, core, context):
+        velocity = core.velocity + core.acceleration * context.dt
+        position = core.position + velocity * context.dt
+        return Robot(position, velocity, jnp.zeros_like(core.acceleration))
+
+    def view(self, core, context):
+        step = (core.velocity + core.acceleration * context.dt) * context.dt
+        return step if self.moves_landmarks else core.position + step
+
+    def compose_landmark(self, view, landmark, context):
+        return landmark.at[:2].add(-view)
+
+    def observe(self, view, landmark, context):
+        return landmark[:2] + context.slant * landmark[2] - view, jnp.array(True)
+
+    def initialise(self, view, pixel, e, context):
+        return jnp.append(pixel + view - context.slant * e, e)
+
+
+DT, STEPS, CAPACITY = 0.1, 40, 4
+ACCELERATION_SIGMA, NOISE, PRIOR = 0.7, 0.02 * np.array([[2.0, 0.5], [0.5, 1.0]]), (0.8, 0.6)
+# Landmark: slot, frames in which it is seen, frame after which it is removed.
+LIVES = {
+    0: (1, range(0, 18), 20),
+    1: (0, [0, 1, 2, 9, 10, 11, 30, 39], None),
+    2: (3, range(4, 12), 12),
+    3: (1, range(21, 40), None),
+    4: (3, range(12, 40, 3), 35),
+    5: (2, [7], 8),
+}
+START = np.array([0.0, 0.0, 1.0, -0.5]), np.diag([0.0, 0.0, 0.2, 0.3]) ** 2
+
+
+def linear_world():
+    """Measurements {frame: {landmark: pixel}} and slants, drawn from the model itself."""
+    rng = np.random.default_rng(4)
+    slants = rng.normal(size=(STEPS, 2))
+    points = rng.normal([0, 0, PRIOR[0]], [5, 5, PRIOR[1]], (len(LIVES), 3))
+    position, velocity = np.zeros(2), rng.normal(START[0][2:], [0.2, 0.3])
+    pixels = []
+    for k in range(STEPS):
+        if k:
+            velocity = velocity + DT * rng.normal(0, ACCELERATION_SIGMA, 2)
+            position = position + DT * velocity
+        ideal = points[:, :2] + points[:, 2:] * slants[k] - position
+        noisy = ideal + rng.multivariate_normal([0, 0], NOISE, len(points))
+        pixels.append({j: noisy[j] for j, (_, seen, _) in LIVES.items() if k in seen})
+    return pixels, slants
+
+
+def kalman(pixels, slants):
+    """The textbook filter with full matrices, in world coordinates; yields (names, x, P)."""
+    x, P = START
+    order = []  # landmarks in the state, as they came
+    for k in range(STEPS):
+        n = len(x)
+        if k:
+            F, G = np.eye(n), np.zeros((n, 2))
+            F[:2, 2:4] = DT * np.eye(2)
+            G[:2], G[2:4] = DT**2 * np.eye(2), DT * np.eye(2)
+            x, P = F @ x, F @ P @ F.T + ACCELERATION_SIGMA**2 * G @ G.T
+        for j, z in pixels[k].items():
+            if j not in order:
+                continue
+            H = np.zeros((2, n))
+            at = 4 + 3 * order.index(j)
+            H[:, :2], H[:, at : at + 2], H[:, at + 2] = -np.eye(2), np.eye(2), slants[k]
+            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + NOISE)
+            x, P = x + K @ (z - H @ x), (np.eye(n) - K @ H) @ P
+        for j, z in pixels[k].items():
+            if j in order:
+                continue
+            n = len(x)
+            e, sigma = PRIOR
+            J, U = np.zeros((n + 3, n)), np.zeros((n + 3, 3))
+            J[:n] = np.eye(n)
+            J[n : n + 2, :2], U[n : n + 2, :2] = np.eye(2), np.eye(2)
+            U[n : n + 2, 2], U[n + 2, 2] = -slants[k], 1
+            noise = np.block([[NOISE, np.zeros((2, 1))], [np.zeros((1, 2)), sigma**2]])
+            x = np.concatenate([x, z + x[:2] - slants[k] * e, [e]])
+            P = J @ P @ J.T + U @ noise @ U.T
+            order.append(j)
+        for j in [j for j in order if LIVES[j][2] == k]:
+            at = 4 + 3 * order.index(j)
+            kept = np.delete(np.arange(len(x)), range(at, at + 3))
+            x, P = x[kept], P[np.ix_(kept, kept)]
+            order.remove(j)
+        yield list(order), x, P
+
+
+def packed(seen):
+    """Features of {landmark: pixel}, padded by features that are not valid and hold NaN."""
+    slots, pixels = np.zeros(CAPACITY, int), np.full((CAPACITY, 2), np.nan)
+    valid = np.arange(CAPACITY) < len(seen)
+    for i, (j, z) in enumerate(seen.items()):
+        slots[i], pixels[i] = LIVES[j][0], z
+    return Features(jnp.asarray(slots), jnp.asarray(pixels), jnp.asarray(valid))
+
+
+def linear_start():
+    x, P = (jnp.asarray(a) for a in START)
+    n = 6 + 3 * CAPACITY
+    state = State(
+        core=Robot(x[:2], x[2:], jnp.zeros(2)),
+        landmarks=jnp.zeros((CAPACITY, 3)),
+        active=jnp.zeros(CAPACITY, bool),
+        covariance=jnp.zeros((n, n)),
+    )
+    return ekf.augment(state, 0, P)
+
+
+@lru_cache(maxsize=None)
+def linear_step(moves_landmarks, first=False):
+    """One frame of the filter: robocentric composes after the update, world before it."""
+    model = Linear(moves_landmarks)
+
+    def step(state, slant, known, new, gone):
+        here, motion = Frame(jnp.zeros(()), slant), Frame(jnp.asarray(DT), slant)
+        if not first:
+            state = ekf.augment(state, 4, ACCELERATION_SIGMA**2 * jnp.eye(2))
+            if moves_landmarks:
+                state, _ = ekf.update(model, state, known, NOISE, motion)
+                state = ekf.compose(model, state, motion)
+            else:
+                state = ekf.compose(model, state, motion)
+                state, _ = ekf.update(model, state, known, NOISE, here)
+        prior = tuple(jnp.asarray(number) for number in PRIOR)
+        state = ekf.initialise(model, state, new, NOISE, prior, here)
+        return ekf.remove(state, gone)
+
+    return quick_jit(step)
+
+
+def linear_run(moves_landmarks, steps=STEPS):
+    """The filter's state after every frame."""
+    state, in_map = linear_start(), set()
+    pixels, slants = linear_world()
+    for k in range(steps):
+        known = {j: z for j, z in pixels[k].items() if j in in_map}
+        new = {j: z for j, z in pixels[k].items() if j not in in_map}
+        in_map |= set(new)
+        ending = [j for j in in_map if LIVES[j][2] == k]
+        in_map -= set(ending)
+        gone = np.isin(np.arange(CAPACITY), [LIVES[j][0] for j in ending])
+        step = linear_step(moves_landmarks, first=k == 0)
+        state = step(state, slants[k], packed(known), packed(new), gone)
+        yield state
+
+
+def in_world(state, order, robocentric):
+    """Mean and covariance of (position, velocity, landmarks of `order`) in world coordinates."""
+    mean = np.concatenate([*state.core, state.landmarks.ravel()])
+    picked = list(range(4))
+    T = np.eye(len(mean))
+    for j in order:
+        at = 6 + 3 * LIVES[j][0]
+        picked += range(at, at + 3)
+        if robocentric:
+            T[at : at + 2, :2] = np.eye(2)
+    T = T[picked]
+    return T @ mean, T @ state.covariance @ T.T
+
+
+@pytest.mark.parametrize("robocentric", [True, False], ids=["robocentric", "world"])
+def test_on_a_linear_problem_the_filter_is_the_kalman_filter(robocentric):
+    pixels, slants = linear_world()
+    largest = 0
+    for state, (order, x, P) in zip(linear_run(robocentric), kalman(pixels, slants), strict=True):
+        mean, covariance = in_world(state, order, robocentric)
+        # Numbers of order 10 and 40 steps of rounding.
+        np.testing.assert_allclose(mean, x, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(covariance, P, rtol=0, atol=1e-10)
+        assert set(np.flatnonzero(state.active)) == {LIVES[j][0] for j in order}
+        largest = max(largest, len(order))
+    assert largest == CAPACITY  # the schedule fills the map, so that every slot is tried
+
+
+def test_removal_zeroes_and_a_freed_slot_is_as_good_as_a_fresh_one():
+    *_, state = linear_run(True, steps=6)
+    used, unused = LIVES[0][0], LIVES[5][0]
+    assert state.active[used]
+    assert not state.active[unused]
+    freed = ekf.remove(state, jnp.arange(CAPACITY) == used)
+    rows = np.r_[6 + 3 * used : 9 + 3 * used]
+    assert np.abs(state.covariance[rows]).max() > 0.01
+    assert not np.any(freed.covariance[rows])
+    assert not np.any(freed.covariance[:, rows])
+    assert not freed.active[used]
+    others = np.setdiff1d(np.arange(len(state.covariance)), rows)
+    kept = np.ix_(others, others)
+    np.testing.assert_array_equal(freed.covariance[kept], state.covariance[kept])
+
+    def inserted(slot):
+        new = Features(jnp.array([slot]), jnp.array([[1.0, 2.0]]), jnp.array([True]))
+        here = Frame(jnp.zeros(()), jnp.array([0.3, 0.4]))
+        return ekf.initialise(Linear(True), freed, new, NOISE, (0.8, 0.6), here)
+
+    again, fresh = inserted(used), inserted(unused)
+    assert again.active[used]
+    np.testing.assert_array_equal(again.landmarks[used], fresh.landmarks[unused])
+    order = np.arange(CAPACITY)
+    order[[used, unused]] = unused, used
+    numbers = rows_of(6, order, 3)
+    np.testing.assert_array_equal(
+        again.covariance, np.asarray(fresh.covariance)[np.ix_(numbers, numbers)]
+    )
+
+
+def rows_of(c, order, d):
+    """Places in the state of the core and of the slots in another order."""
+    return np.concatenate([np.arange(c), (c + d * order[:, None] + np.arange(d)).ravel()])
+
+
+@dataclass(frozen=True)
+class Scalar:
+    """A core of one number and landmarks of one number; a landmark is measured directly."""
+
+    moves_landmarks: bool = False
+
+    def compose_core(self, core, context):
+        return core
+
+    def view(self, core, context):
+        return core
+
+    def observe(self, view, landmark, context):
+        return landmark, jnp.array(True)
+
+
+def test_prior_one_and_noise_one_end_with_one_half():
+    """Counting a measurement twice, as an iterated filter may, would give 1/3."""
+    state = State(
+        core=jnp.zeros(1),
+        landmarks=jnp.zeros((1, 1)),
+        active=jnp.array([True]),
+        covariance=jnp.diag(jnp.array([0.0, 1.0])),
+    )
+    seen = Features(jnp.array([0]), jnp.array([[3.0]]), jnp.array([True]))
+    state, innovation = ekf.update(Scalar(), state, seen, jnp.eye(1), None)
+    np.testing.assert_allclose(state.covariance, np.diag([0.0, 0.5]), rtol=1e-15)
+    np.testing.assert_allclose(state.landmarks, [[1.5]], rtol=1e-15)
+    np.testing.assert_allclose(innovation.nis, 9 / 2, rtol=1e-15)
+
+
+# --- the real models, against dense Jacobians of the whole state --------------------------------
+
+
+def slam_parameters(geometry):
+    p, t = geometry.pixel_dim, geometry.tangent_dim
+    return Parameters(
+        camera=Camera(jnp.array([650.0, 640.0])[:p], jnp.array([320.0, 240.0])[:p]),
+        intrinsics_sigma=jnp.array([3.0, 3.0, 2.0, 2.0][: 2 * p]),
+        pixel_sigma=jnp.asarray(0.3),
+        acceleration_sigma=jnp.full(t, 0.1),
+        inverse_depth=jnp.asarray(1 / 6),
+        inverse_depth_sigma=jnp.asarray(1 / 12),
+    )
+
+
+BEARINGS = np.array([[0.3, -0.2], [-0.25, 0.1], [0.1, 0.25]])
+DEPTHS = np.array([4.0, 7.0, 2.5])
+STEP = 0.2
+
+
+def generic_state(model, capacity=3):
+    """Three landmarks ahead, first seen from elsewhere, everything correlated and nothing zero."""
+    geometry, rng = model.geometry, np.random.default_rng(8)
+    t, p = geometry.tangent_dim, geometry.pixel_dim
+    core = Core(
+        pose=pose(geometry, 11),
+        velocity=jnp.asarray(rng.normal(0, 0.5, t)),
+        acceleration=jnp.asarray(rng.normal(0, 0.5, t)),
+        calibration=jnp.asarray(rng.normal(0, 2, 2 * p)),
+    )
+    T_AC = model.view(core, Context(None, jnp.asarray(STEP))).map_from_camera
+    elsewhere = pose(geometry, 12, scale=0.1)
+
+    def landmark(bearing, depth):
+        seen = model.landmark.initialise(bearing, 1 / depth, jnp.asarray(650.0))
+        return model.landmark.transform(T_AC @ elsewhere, seen)
+
+    landmarks = jax.vmap(landmark)(BEARINGS[:, :p], DEPTHS)
+    n = 3 * t + 2 * p + landmarks.size
+    factor = rng.normal(0, 0.05, (n, n))
+    return State(core, landmarks, jnp.ones(3, bool), jnp.asarray(factor @ factor.T))
+
+
+def whole_state_function(model, state, context):
+    """δ ↦ stacked measurements of every landmark, then the composed state ⊟ its mean."""
+    c, shape = state.core_dim, state.landmarks.shape
+    mean = model.compose_core(state.core, context)
+
+    def function(delta):
+        core = retract(state.core, delta[:c])
+        landmarks = state.landmarks + delta[c:].reshape(shape)
+        view = model.view(core, context)
+        pixels = jax.vmap(lambda x: model.observe(view, x, context)[0])(landmarks)
+        if model.moves_landmarks:
+            landmarks = jax.vmap(lambda x: model.compose_landmark(view, x, context))(landmarks)
+        composed = difference(model.compose_core(core, context), mean)
+        return jnp.concatenate([pixels.ravel(), composed, landmarks.ravel()])
+
+    return function
+
+
+@lru_cache(maxsize=None)
+def slam_case(geometry, landmark, frame):
+    """A generic state; compiled: update with composition, the dense function, its Jacobian."""
+    model = SlamModel(geometry, landmark, frame)
+    parameters = slam_parameters(geometry)
+    context = Context(parameters, jnp.asarray(STEP))
+    state = quick_jit(lambda: generic_state(model))()
+
+    def block_wise(state, features):
+        updated, innovation = ekf.update(
+            model, state, features, parameters.pixel_covariance, context
+        )
+        return updated, innovation, ekf.compose(model, state, context)
+
+    def dense(state, delta):
+        return whole_state_function(model, state, context)(delta)
+
+    jacobian = jax.jacfwd(dense, argnums=1)
+    return state, quick_jit(block_wise), quick_jit(dense), quick_jit(jacobian)
+
+
+def middle_only(state, geometry, pixel):
+    """Features of all three landmarks, of which only the middle one counts."""
+    pixels = np.full((3, geometry.pixel_dim), np.nan)
+    pixels[1] = pixel
+    return Features(jnp.arange(3), jnp.asarray(pixels), jnp.array([False, True, False]))
+
+
+@pytest.mark.parametrize("landmark", each_landmark, ids=named)
+@pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD], ids=named)
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_blocks_are_the_dense_jacobians_with_only_the_middle_landmark_seen(
+    geometry, frame, landmark
+):
+    state, block_wise, dense, jacobian = slam_case(geometry, landmark, frame)
+    p, c, zero = geometry.pixel_dim, state.core_dim, np.zeros(len(state.covariance))
+    pixels, composed = np.split(dense(state, zero), [3 * p])
+    both = np.asarray(jacobian(state, zero))
+    differences = central(lambda delta: np.asarray(dense(state, delta)), zero)
+    for exact, approximate in zip(
+        np.split(both, [3 * p]), np.split(differences, [3 * p]), strict=True
+    ):
+        # Rounding over the step: 1e-16/1e-6 of the largest numbers, pixels or parameters.
+        close(approximate, exact, 1e-7)
+    H, J = np.split(both, [3 * p])
+
+    seen = pixels.reshape(3, p)[1] + np.array([0.7, -0.4])[:p]
+    updated, innovation, moved = block_wise(state, middle_only(state, geometry, seen))
+    P, R, H = np.asarray(state.covariance), 0.09 * np.eye(p), H[p : 2 * p]
+    S = H @ P @ H.T + R
+    K = P @ H.T @ np.linalg.inv(S)
+    # 1e-11: rounding, times the condition of S.
+    middle = slice(p, 2 * p)
+    close(innovation.covariance[middle, middle], S, 1e-11)
+    close(updated.covariance, P - K @ S @ K.T, 1e-11)
+    delta = K @ (seen - pixels.reshape(3, p)[1])
+    close(difference(updated.core, state.core), delta[:c], 1e-10)
+    close((updated.landmarks - state.landmarks).ravel(), delta[c:], 1e-10)
+    np.testing.assert_allclose(innovation.nis, delta_nis(S, seen - pixels[middle]), rtol=1e-9)
+    assert innovation.nis_dof == p
+
+    close(moved.covariance, J @ P @ J.T, 1e-12)
+    close(moved.landmarks.ravel(), composed[c:], 1e-14)
+
+
+def delta_nis(S, residual):
+    return residual @ np.linalg.solve(S, residual)
+
+
+def planar_case():
+    return slam_case(PLANAR, INVERSE_SCALING, ROBOCENTRIC)
+
+
+def planar_pixels(state):
+    """A pixel for every landmark, half a pixel from where it is expected."""
+    pixels = planar_case()[2](state, jnp.zeros(len(state.covariance)))[:3]
+    return pixels.reshape(3, 1) + jnp.array([[0.5], [-0.3], [0.8]])
+
+
+def test_the_order_of_the_slots_does_not_matter():
+    state, block_wise, *_ = planar_case()
+    pixels, order = planar_pixels(state), np.array([2, 0, 1])
+    numbers = rows_of(state.core_dim, order, state.landmarks.shape[1])
+    permuted = replace(
+        state,
+        landmarks=state.landmarks[order],
+        covariance=state.covariance[np.ix_(numbers, numbers)],
+    )
+    seen = jnp.array([True, True, False])
+    # Landmark i is in slot inverse[i] of the permuted state.
+    inverse = np.argsort(order)
+    plain = block_wise(state, Features(jnp.arange(3), pixels, seen))
+    other = block_wise(permuted, Features(jnp.asarray(inverse), pixels, seen))
+    np.testing.assert_allclose(other[1].nis, plain[1].nis, rtol=1e-12)
+    close(other[1].covariance, plain[1].covariance, 1e-14)
+    for before, after in ((plain[0], other[0]), (plain[2], other[2])):
+        close(after.landmarks, before.landmarks[order], 1e-13)
+        close(after.covariance, np.asarray(before.covariance)[np.ix_(numbers, numbers)], 1e-13)
+        close(difference(after.core, before.core) + 1, np.ones(before.core_dim), 1e-13)
+
+
+def test_the_order_of_the_features_does_not_matter():
+    state, block_wise, *_ = planar_case()
+    pixels, order = planar_pixels(state), np.array([2, 0, 1])
+    plain = block_wise(state, Features(jnp.arange(3), pixels, jnp.ones(3, bool)))[0]
+    other = block_wise(state, Features(jnp.asarray(order), pixels[order], jnp.ones(3, bool)))[0]
+    close(other.covariance, plain.covariance, 1e-12)
+    close(other.landmarks, plain.landmarks, 1e-12)
+
+
+def behind(state):
+    """The state with landmark 0 behind the camera, by reflecting its homogeneous point."""
+    return replace(state, landmarks=state.landmarks.at[0].multiply(jnp.array([-1, -1, 1])))
+
+
+def removed(state):
+    """The state without landmark 0."""
+    return ekf.remove(state, jnp.arange(3) == 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "valid"),
+    [(lambda state: state, False), (behind, True), (removed, True)],
+    ids=["not valid", "behind the camera", "inactive slot"],
+)
+def test_a_feature_that_cannot_be_used_changes_nothing(change, valid):
+    state, block_wise, *_ = planar_case()
+    pixels = planar_pixels(state)
+    state = change(state)
+    alone = Features(jnp.arange(3), pixels, jnp.array([valid, False, False]))
+    updated, innovation, _ = block_wise(state, alone)
+    for after, before in zip(jax.tree.leaves(updated), jax.tree.leaves(state), strict=True):
+        # The pose is multiplied by Exp(0).
+        np.testing.assert_allclose(after, before, rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(updated.landmarks, state.landmarks)
+    np.testing.assert_array_equal(updated.covariance, state.covariance)
+    assert innovation.nis == 0
+    assert innovation.nis_dof == 0
+
+    # And beside one that is used, it makes no difference, whatever its pixel says.
+    beside = Features(jnp.arange(3), pixels.at[0].set(1e9), jnp.array([valid, True, False]))
+    without = Features(jnp.arange(3), pixels, jnp.array([False, True, False]))
+    (a, a_innovation, _), (b, b_innovation, _) = (block_wise(state, f) for f in (beside, without))
+    np.testing.assert_array_equal(a.covariance, b.covariance)
+    np.testing.assert_array_equal(a.landmarks, b.landmarks)
+    assert a_innovation.nis == b_innovation.nis > 0
+    assert a_innovation.nis_dof == b_innovation.nis_dof == 1
+    np.testing.assert_array_equal(a_innovation.used, [False, True, False])
+
+
+def test_search_ellipses_are_the_diagonal_blocks_of_the_innovation_covariance():
+    for geometry, landmark, frame in (
+        (PLANAR, INVERSE_SCALING, ROBOCENTRIC),
+        (SPATIAL, LANDMARKS["inverse_depth"], WORLD),
+    ):
+        state, block_wise, dense, _ = slam_case(geometry, landmark, frame)
+        parameters, p = slam_parameters(geometry), geometry.pixel_dim
+        model = SlamModel(geometry, landmark, frame)
+        slots = jnp.array([2, 0])
+        pixels, covariances, in_front = quick_jit(
+            lambda state, model=model, parameters=parameters, slots=slots: ekf.predict_features(
+                model,
+                state,
+                slots,
+                parameters.pixel_covariance,
+                Context(parameters, jnp.asarray(STEP)),
+            )
+        )(state)
+        expected = dense(state, np.zeros(len(state.covariance)))[: 3 * p].reshape(3, p)
+        seen = Features(jnp.arange(3), expected, jnp.ones(3, bool))
+        S = block_wise(state, seen)[1].covariance.reshape(3, p, 3, p)
+        assert in_front.all()
+        close(pixels, expected[slots], 1e-14)
+        close(covariances, np.stack([S[i, :, i] for i in (2, 0)]), 1e-12)
+
+
+# --- initialisation -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD], ids=named)
+def test_landmarks_of_one_frame_share_its_pose_and_its_calibration(frame):
+    """P ← J diag(P, R, σ², R, σ²) Jᵀ for two landmarks at once, the paper's P22–P26."""
+    model = SlamModel(PLANAR, INVERSE_SCALING, frame)
+    parameters = slam_parameters(PLANAR)
+    context = Context(parameters, jnp.zeros(()))
+    state = removed(ekf.remove(generic_state(model), jnp.arange(3) == 2))
+    c, d = state.core_dim, state.landmarks.shape[1]
+    pixels, w = jnp.array([[100.0], [500.0]]), parameters.inverse_depth
+    prior = (w, parameters.inverse_depth_sigma)
+    new = Features(jnp.array([2, 0]), pixels, jnp.ones(2, bool))
+
+    def block_wise(state):
+        return ekf.initialise(model, state, new, parameters.pixel_covariance, prior, context)
+
+    def both(x):
+        view = model.view(retract(state.core, x[:c]), context)
+        return jnp.concatenate(
+            [
+                model.initialise(view, pixels[0] + x[c], w + x[c + 1], context),
+                model.initialise(view, pixels[1] + x[c + 2], w + x[c + 3], context),
+            ]
+        )
+
+    after = quick_jit(block_wise)(state)
+    J = np.asarray(quick_jit(jax.jacfwd(both))(jnp.zeros(c + 4)))
+    P = np.asarray(state.covariance)
+    full = np.zeros((c + 4, c + 4))
+    full[:c, :c] = P[:c, :c]
+    full[c:, c:] = np.diag([0.09, float(prior[1]) ** 2] * 2)
+    new_rows = np.r_[c + 2 * d : c + 3 * d, c : c + d]
+    expected = J @ full @ J.T
+    actual = np.asarray(after.covariance)[np.ix_(new_rows, new_rows)]
+    close(actual, expected, 1e-13)
+    # What the second would miss if each landmark were initialised alone.
+    assert np.abs(expected[:d, d:]).max() > 1e-3 * np.abs(expected).max()
+    # With the old state: J_core P.
+    old = np.r_[0:c, c + d : c + 2 * d]
+    close(after.covariance[np.ix_(new_rows, old)], J[:, :c] @ P[:c][:, old], 1e-13)
+    np.testing.assert_array_equal(after.covariance[np.ix_(old, old)], P[np.ix_(old, old)])
+    np.testing.assert_array_equal(after.active, [True, True, True])
+
+
+def test_inverse_scaling_has_rank_three_when_the_focal_length_is_known():
+    """Never invert a landmark block: (u − cx, v − cy, f, ω0) has a constant in it."""
+    slam = FILTERS["robocentric"](SPATIAL, INVERSE_SCALING, "known")
+    parameters = slam_parameters(SPATIAL)
+    new = Features(jnp.array([0]), jnp.array([[100.0, 300.0]]), jnp.array([True]))
+
+    def first(parameters):
+        state = slam.start(parameters, 1, jnp.zeros(6), jnp.full(6, 0.1))
+        return slam.first(state, parameters, new).covariance
+
+    block = np.asarray(quick_jit(first)(parameters))[-4:, -4:]
+    values = np.linalg.eigvalsh(block)
+    assert values[0] <= 1e-15 * values[-1]
+    assert values[1] >= 1e-6 * values[-1]
+
+
+# --- many steps ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", list(FILTERS))
+def test_covariance_stays_symmetric_and_positive_over_a_long_run(kind):
+    case = Case("circle", steps=90)
+    _, (_, _, covariances, nis) = case.compiled(kind, "inverse_scaling")(
+        case.parameters(), *case.frames(0)
+    )
+    assert np.isfinite(nis).all()
+    P = np.asarray(covariances)
+    largest = np.abs(P).max(axis=(1, 2))
+    np.testing.assert_array_equal(P, P.transpose(0, 2, 1))
+    # Rounding of some 100 steps, each adding 1e-16 of the largest entry.
+    assert (np.linalg.eigvalsh(P)[:, 0] >= -1e-13 * largest).all()
