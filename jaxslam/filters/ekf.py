@@ -22,7 +22,7 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.filters.state import Features, Innovation, State
-from jaxslam.geometry import difference, retract, tangent_dim
+from jaxslam.geometry import jacobian, nudge, retract, zero_tangent
 
 
 class Blocks(NamedTuple):
@@ -150,7 +150,7 @@ def compose(model: Model, state: State, context: Any) -> State:
     def move_landmark(view, landmark):
         return model.compose_landmark(view, landmark, context), None
 
-    core, J_core = move_core(state.core), core_jacobian(move_core, state.core)
+    core, J_core = move_core(state.core), jacobian(move_core, state.core)
     c = state.core_dim
     if not model.moves_landmarks:
         J, landmarks = None, state.landmarks
@@ -187,15 +187,15 @@ def initialise(
     mean, sigma = inverse_depth
 
     view = model.view(state.core, context)
-    view_by_core = core_jacobian(lambda core: model.view(core, context), state.core)
+    view_by_core = jacobian(lambda core: model.view(core, context), state.core)
 
     def one(pixel):
         def landmark(delta, pixel, depth):
-            value = model.initialise(retract(view, delta), pixel, depth, context)
+            value = model.initialise(nudge(view, delta), pixel, depth, context)
             return value, value
 
         (J_view, J_pixel, J_depth), value = jax.jacfwd(landmark, argnums=(0, 1, 2), has_aux=True)(
-            _zero_tangent(view), pixel, mean
+            zero_tangent(view), pixel, mean
         )
         own = J_pixel @ noise @ J_pixel.T + sigma**2 * jnp.outer(J_depth, J_depth)
         return value, J_view, own
@@ -241,21 +241,8 @@ def landmark_covariance(
 def core_covariance(function: Callable[[Any], Any], state: State) -> tuple[Any, Array]:
     """Value of a function of the core, and its first-order covariance in the value's tangent."""
     c = state.core_dim
-    J = core_jacobian(function, state.core)
+    J = jacobian(function, state.core)
     return function(state.core), J @ state.covariance[:c, :c] @ J.T
-
-
-def core_jacobian(function: Callable[[Any], Any], core: Any) -> Float[Array, "k c"]:
-    """Jacobian of `δ ↦ f(core ⊞ δ) ⊟ f(core)` at δ = 0."""
-    value = function(core)
-    return jax.jacfwd(lambda delta: difference(function(retract(core, delta)), value))(
-        _zero_tangent(core)
-    )
-
-
-def _zero_tangent(core):
-    dtype = jnp.result_type(*jax.tree.leaves(core))
-    return jnp.zeros(tangent_dim(core), dtype)
 
 
 def _observe(model, state, slots, context):
@@ -269,15 +256,15 @@ def _observe(model, state, slots, context):
 
 def _local_jacobians(view, function, state, slots) -> tuple[Array, Any, Blocks]:
     """Values, auxiliary outputs and blocks of `function(view, landmark) → (value, auxiliary)`."""
-    view_by_core, view = core_jacobian(view, state.core), view(state.core)
+    view_by_core, view = jacobian(view, state.core), view(state.core)
 
     def one(landmark):
         def moved(delta, landmark):
-            value, auxiliary = function(retract(view, delta), landmark)
+            value, auxiliary = function(nudge(view, delta), landmark)
             return value, (value, auxiliary)
 
         J, (value, auxiliary) = jax.jacfwd(moved, argnums=(0, 1), has_aux=True)(
-            _zero_tangent(view), landmark
+            zero_tangent(view), landmark
         )
         return value, auxiliary, J
 

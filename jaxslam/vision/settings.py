@@ -17,11 +17,11 @@ class TrackerSettings:
     """What a tracker assumes and how much it does. Lengths are in the unit of `nearest_depth`:
     a single camera does not see scale, so the map's unit is whatever that prior makes it."""
 
-    filter: str = "robocentric"
+    filter: str = "world"
     """Filter: a name of jaxslam.FILTERS."""
     landmarks: str = "inverse_scaling"
     """Landmark parametrization: a name of jaxslam.LANDMARKS."""
-    calibration: str = "white"
+    calibration: str = "known"
     """Treatment of the calibration: white or known."""
     wanted: int = 50
     """Landmarks to keep in view."""
@@ -31,7 +31,7 @@ class TrackerSettings:
     """Landmarks created in one frame, at the most."""
     nearest_depth: float = 1.0
     """d_min: the prior on depth reaches from here to infinity (96 %)."""
-    pixel_sigma: float = 0.5
+    pixel_sigma: float = 0.3
     """σ of a match, pixels."""
     focal_sigma: float = 1.0
     """σ of the focal lengths, pixels (with `white` calibration)."""

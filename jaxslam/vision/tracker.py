@@ -96,6 +96,7 @@ class Tracker:
         self._filter = FILTERS[s.filter](SPATIAL, LANDMARKS[s.landmarks], s.calibration)
         self._time: float | None = None
         self._T_wc = self._origin = np.eye(4)
+        self._covariance = np.zeros((6, 6))
         self._predict = jax.jit(partial(_predict, self._filter))
         self._correct = jax.jit(partial(_correct, self._filter))
         self._renew_map = jax.jit(partial(_renew_map, self._filter))
@@ -286,9 +287,10 @@ class Tracker:
                 border=2 * s.border,
             ).astype(float)
         slots = np.array(free[: len(corners)], int)
-        new = _padded(slots, corners, most)
-        self._state, T_BC = self._renew_map(self._state, self._parameters, new)
-        self._T_wc = self._origin @ np.asarray(T_BC)
+        new = _padded(slots, corners, s.wanted)
+        self._state, pose = self._renew_map(self._state, self._parameters, new)
+        T_BC, self._covariance = jax.device_get(pose)
+        self._T_wc = self._origin @ T_BC
         for slot, corner in zip(slots, corners, strict=True):
             patch = Patch.take(frame.image, corner)
             self.landmarks[int(slot)] = _Landmark(self.created, patch, self._T_wc)
@@ -308,8 +310,7 @@ class Tracker:
         ]
 
     def _tracked(self, frame: Frame, **found) -> Tracked:
-        _, covariance = self._filter.camera_pose(self._state)
-        return Tracked(frame.index, frame.time, self._T_wc, np.asarray(covariance), **found)
+        return Tracked(frame.index, frame.time, self._T_wc, self._covariance, **found)
 
 
 def _padded(slots: np.ndarray, pixels: np.ndarray, size: int) -> Features:
@@ -347,7 +348,8 @@ def _correct(
 
 def _renew_map(slam_filter: SlamFilter, state: State, parameters: Parameters, new: Features):
     state = slam_filter.finish(slam_filter.initialise(state, parameters, new))
-    return state, slam_filter.camera_pose(state)[0].as_matrix()
+    T_BC, covariance = slam_filter.camera_pose(state)
+    return state, (T_BC.as_matrix(), covariance)
 
 
 def _world_points(slam_filter: SlamFilter, state: State, parameters: Parameters):
