@@ -30,7 +30,7 @@ Command = (
 def main(arguments: list[str] | None = None) -> None:
     """Run a command. A mistake of the user's ends with exit status 2 and one line."""
     options = tyro.cli(
-        Command,  # ty: ignore[invalid-argument-type]
+        Command,
         args=arguments,
         prog="jaxslam",
         description="Monocular EKF-SLAM whose uncertainty can be believed.",

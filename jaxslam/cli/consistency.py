@@ -12,6 +12,13 @@ from typing import Annotated, Any
 
 import tyro
 
+from jaxslam.consistency import CHUNK, DTYPES, FolderStore, Study, monte_carlo, summarise, table
+from jaxslam.consistency.montecarlo import check_sizes
+from jaxslam.files import write_atomically
+from jaxslam.filters import CALIBRATIONS, FILTERS, SlamFilter
+from jaxslam.landmarks import LANDMARKS
+from jaxslam.simulation.scenario import BUILT_IN, Scenario, parse_override, scenario
+
 LAYOUT = 1
 """Version of the records on disk, so that `--resume` never mixes two."""
 
@@ -20,23 +27,35 @@ LAYOUT = 1
 class ConsistencyOptions:
     """Options of the command; every field is an option."""
 
-    scenario: str = "circle"
-    """Built-in scenario, or a TOML file with the same fields."""
-    landmarks: tuple[str, ...] = ("inverse_scaling", "inverse_depth")
-    """Landmark parametrizations: inverse_scaling, inverse_depth, cartesian."""
-    filters: tuple[str, ...] = ("robocentric",)
-    """Filters: robocentric, world."""
-    calibration: str | None = None
-    """How filters treat the camera's calibration: white or known. The scenario's by default."""
+    scenario: Annotated[
+        str,
+        tyro.conf.arg(
+            metavar="NAME",
+            help=f"A TOML file with the fields of a scenario, or one of: {', '.join(BUILT_IN)}.",
+        ),
+    ] = "circle"
+    landmarks: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(metavar="NAME …", help=f"Parametrizations: {', '.join(LANDMARKS)}."),
+    ] = ("inverse_scaling", "inverse_depth")
+    filters: Annotated[
+        tuple[str, ...], tyro.conf.arg(metavar="NAME …", help=f"Filters: {', '.join(FILTERS)}.")
+    ] = ("robocentric",)
+    calibration: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="NAME",
+            help=f"How filters treat it: {', '.join(CALIBRATIONS)}. The scenario's by default.",
+        ),
+    ] = None
     runs: int = 1000
     """Independent runs of every filter."""
     steps: int | None = None
     """Filter steps of a run. The scenario's by default."""
     seed: int = 0
     """Run i draws from this seed and i alone."""
-    dtype: str = "float64"
-    """Precision: float64 or float32."""
-    chunk: int = 100
+    dtype: Annotated[str, tyro.conf.arg(help=f"Precision: {', '.join(DTYPES)}.")] = "float64"
+    chunk: int = CHUNK
     """Runs in one batch; memory grows with it, results do not depend on it."""
     resume: bool = False
     """Go on from what an interrupted run left in --out."""
@@ -49,8 +68,6 @@ class ConsistencyOptions:
 
     def run(self) -> None:
         """Run the study, print its table, write its files."""
-        from jaxslam.consistency import summarise, table
-        from jaxslam.files import write_atomically
         from jaxslam.plots.consistency import plot_consistency
 
         study = self._study()
@@ -61,17 +78,15 @@ class ConsistencyOptions:
         print(table(summary))
         print(f"wrote {self.out / 'consistency.json'} and {self.out / 'consistency.png'}")
 
-    def _study(self):
+    def _study(self) -> Study:
         from tqdm import tqdm
 
-        from jaxslam.consistency import FolderStore, monte_carlo
-        from jaxslam.consistency.montecarlo import check_sizes
-
         check_sizes(self.runs, self.seed, self.dtype, self.chunk)
-        scenario, filters = self._scenario(), self._filters()
+        world = self._scenario()
+        filters = self._filters(world)
         manifest = {
             "layout": LAYOUT,
-            "scenario": dataclasses.asdict(scenario),
+            "scenario": dataclasses.asdict(world),
             "calibration": {name: f.calibration for name, f in filters.items()},
             "seed": self.seed,
             "dtype": self.dtype,
@@ -85,7 +100,7 @@ class ConsistencyOptions:
                 bar.update(done)
 
             return monte_carlo(
-                scenario,
+                world,
                 filters,
                 runs=self.runs,
                 seed=self.seed,
@@ -95,24 +110,18 @@ class ConsistencyOptions:
                 progress=progress,
             )
 
-    def _scenario(self):
-        from jaxslam.simulation.scenario import parse_override, scenario
-
+    def _scenario(self) -> Scenario:
         overrides: dict[str, Any] = dict(parse_override(text) for text in self.set)
         if self.steps is not None:
             overrides["steps"] = self.steps
         return scenario(self.scenario, overrides)
 
-    def _filters(self):
-        from jaxslam.filters import FILTERS
-        from jaxslam.landmarks import LANDMARKS
-
-        scenario = self._scenario()
-        calibration = self.calibration or scenario.calibration
+    def _filters(self, world: Scenario) -> dict[str, SlamFilter]:
+        calibration = self.calibration or world.calibration
         landmarks = _chosen("landmarks", self.landmarks, LANDMARKS)
         filters = _chosen("filters", self.filters, FILTERS)
         return {
-            f"{name}/{landmark.name}": make(scenario.world, landmark, calibration)
+            f"{name}/{landmark.name}": make(world.world, landmark, calibration)
             for name, make in filters.items()
             for landmark in landmarks.values()
         }

@@ -10,15 +10,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from jaxslam.consistency.statistics import normalised_squared
-from jaxslam.consistency.store import MemoryStore, Records, Store
+from jaxslam.consistency.store import MemoryStore, Store
 from jaxslam.filters import Parameters, SlamFilter, State
 from jaxslam.geometry import Pose
 from jaxslam.simulation import (
@@ -42,6 +42,27 @@ class Seconds:
 
     compile: float
     run: float
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Prior:
+    """All that a filter is told of a scenario, as data: other numbers need no other program."""
+
+    parameters: Parameters
+    velocity: Float[Array, " t"]
+    velocity_sigma: Float[Array, " t"]
+    dt: Float[Array, ""]
+
+    @staticmethod
+    def of(scenario: Scenario, dtype: jnp.dtype) -> Prior:
+        """The scenario's own numbers: the truth is drawn from this prior."""
+        return Prior(
+            parameters(scenario, dtype),
+            jnp.asarray(scenario.velocity, dtype),
+            jnp.asarray(scenario.velocity_sigma, dtype),
+            jnp.asarray(1 / scenario.rate, dtype),
+        )
 
 
 @dataclass(frozen=True)
@@ -98,17 +119,11 @@ class _Simulator:
 
     def __init__(self, scenario: Scenario, seed: int, dtype: str, size: int) -> None:
         self.scenario, self.dtype, self.size = scenario, jnp.dtype(dtype), size
-        self.parameters = parameters(scenario, self.dtype)
         self._key = jax.random.key(seed)
-        self._draw = jax.jit(jax.vmap(self._one, in_axes=(None, 0)))
-
-    def _one(self, key: Array, index: Int[Array, ""]) -> tuple[Run, Sightings]:
-        run = simulate(self.scenario, jax.random.fold_in(key, index), self.dtype)
-        return run, sightings(run)
 
     def __call__(self, chunk: range) -> tuple[Run, Sightings]:
         """The chunk's runs, padded to `size` by the runs that follow."""
-        return self._draw(self._key, chunk.start + jnp.arange(self.size))
+        return _draw(self.scenario, self.dtype, self._key, chunk.start + jnp.arange(self.size))
 
     def capacity(self, chunks: tuple[range, ...]) -> Sightings:
         """What holds every run of the study, as Python integers."""
@@ -116,40 +131,53 @@ class _Simulator:
         return jax.tree.map(lambda *counts: max(1, int(max(counts))), *seen)
 
 
+@partial(jax.jit, static_argnums=(0, 1))
+def _draw(
+    scenario: Scenario, dtype, key: Array, indices: Int[Array, " runs"]
+) -> tuple[Run, Sightings]:
+    def one(index):
+        run = simulate(scenario, jax.random.fold_in(key, index), dtype)
+        return run, sightings(run)
+
+    return jax.vmap(one)(indices)
+
+
 def _run_filter(name, slam_filter, simulator, capacity, chunks, store, progress) -> Seconds:
     if not chunks:
         return Seconds(0.0, 0.0)
     start = time.perf_counter()
+    prior = Prior.of(simulator.scenario, simulator.dtype)
     batch, _ = simulator(chunks[0])
-    compiled = (
-        jax.jit(partial(_filter_batch, slam_filter, simulator.scenario, capacity))
-        .lower(simulator.parameters, batch)
-        .compile()
-    )
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (prior, batch))
+    leaves, structure = jax.tree.flatten(shapes)
+    compiled = _compiled(slam_filter, capacity, structure, tuple(leaves))
     compiled_at = time.perf_counter()
     for chunk in chunks:
         batch, _ = simulator(chunk)
-        records, sample = jax.device_get(compiled(simulator.parameters, batch))
+        records, sample = jax.device_get(compiled(prior, batch))
         records = {key: np.asarray(value)[: len(chunk)] for key, value in records.items()}
         store.save(name, chunk, {**records, **{f"sample_{k}": v for k, v in sample.items()}})
         progress(name, len(chunk))
     return Seconds(compiled_at - start, time.perf_counter() - compiled_at)
 
 
+@lru_cache(maxsize=32)
+def _compiled(slam_filter, capacity, structure, leaves) -> jax.stages.Compiled:
+    """`_filter_batch` for data of these shapes, compiled once however often it is asked for."""
+    function = jax.jit(partial(_filter_batch, slam_filter, capacity))
+    return function.lower(*jax.tree.unflatten(structure, leaves)).compile()
+
+
 def _filter_batch(
-    slam_filter: SlamFilter,
-    scenario: Scenario,
-    capacity: Sightings,
-    parameters: Parameters,
-    runs: Run,
+    slam_filter: SlamFilter, capacity: Sightings, prior: Prior, runs: Run
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     """Records of a batch of runs, and the map and the path of its first run."""
-    one = partial(filter_run, slam_filter, scenario, capacity, parameters)
+    one = partial(filter_run, slam_filter, capacity, prior)
     records, path, state = jax.vmap(one)(runs)
     first = partial(jax.tree.map, lambda x: x[0])
     state, run = first(state), first(runs)
     slots = jnp.arange(capacity.landmarks)
-    landmarks, covariance = slam_filter.landmarks_from_above(state, parameters, slots)
+    landmarks, covariance = slam_filter.landmarks_from_above(state, prior.parameters, slots)
     return records, {
         "path": jax.vmap(lambda pose: pose.as_matrix())(first(path)),
         "true_path": jax.vmap(lambda pose: pose.as_matrix())(run.poses),
@@ -161,26 +189,18 @@ def _filter_batch(
 
 
 def filter_run(
-    slam_filter: SlamFilter,
-    scenario: Scenario,
-    capacity: Sightings,
-    parameters: Parameters,
-    run: Run,
-) -> tuple[Records, Pose, State]:
+    slam_filter: SlamFilter, capacity: Sightings, prior: Prior, run: Run
+) -> tuple[dict[str, Array], Pose, State]:
     """One filter on one simulated run: records of every step, estimated path, final state.
 
     The records hold, per step: `nees` of the pose; `nis` and `nis_dof`; `error` and `variance`
     of the camera's position (in camera axes) and orientation; the mean `landmark_nees` of the
     landmarks seen, in the chart (x/z, y/z, 1/z) of the current camera, and their number.
     """
-    dtype = parameters.pixel_sigma.dtype
-    dt = jnp.asarray(1 / scenario.rate, dtype)
+    parameters, dt = prior.parameters, prior.dt
     first, seen, new = features(run, capacity)
     state = slam_filter.start(
-        parameters,
-        capacity.landmarks,
-        jnp.asarray(scenario.velocity, dtype),
-        jnp.asarray(scenario.velocity_sigma, dtype),
+        parameters, int(capacity.landmarks), prior.velocity, prior.velocity_sigma
     )
     state = slam_filter.first(state, parameters, first)
 
@@ -194,7 +214,7 @@ def filter_run(
         records = {
             "nees": normalised_squared(*slam_filter.pose_error(state, T_BC)),
             "nis": innovation.nis,
-            "nis_dof": innovation.nis_dof.astype(dtype),
+            "nis_dof": innovation.nis_dof.astype(dt.dtype),
             "error": _camera_error(estimate, T_BC),
             "variance": jnp.diagonal(covariance),
             "landmark_nees": landmark_nees,

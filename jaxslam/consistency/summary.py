@@ -119,7 +119,7 @@ def _median(study: Study, name: str) -> np.ndarray:
 
 
 def _healthy(records: Records) -> np.ndarray:
-    return np.isfinite(records["nees"]).all(axis=1)
+    return np.asarray(np.isfinite(records["nees"]).all(axis=1))
 
 
 def _chunks(study: Study, name: str, names: tuple[str, ...] | None = None) -> Iterator[Records]:

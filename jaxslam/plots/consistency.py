@@ -119,7 +119,7 @@ def _plot_map(axes: Axes, samples: dict[str, Any]) -> None:
     _set_view(axes, np.concatenate([truth, points[seen]])[:, [0, -1]])
     axes.set_xlabel("x, m")
     axes.set_ylabel("z, m")
-    axes.set_title("run 0 from above: 95 % regions, relative to the camera", fontsize=9)
+    axes.set_title("run 0 from above, 95 % regions seen from it", fontsize=9)
     axes.legend(fontsize=7, loc="best")
     axes.grid(alpha=0.25)
 
@@ -133,7 +133,7 @@ def _set_view(axes: Axes, shown: np.ndarray) -> None:
     margin = 0.12 * (high - low).max()
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal", adjustable="box")
 
 
 def _region(mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:

@@ -55,6 +55,26 @@ def track(
     return _write(source, tracker, history, seconds, out)
 
 
+def describe(summary: dict[str, Any]) -> str:
+    """The summary in a few lines."""
+    nis, seconds = summary["nis"], summary["seconds"]
+    per_dof = nis["mean"] / nis["dof"] if nis["dof"] else float("nan")
+    lines = [
+        f"{summary['source']}: {summary['tracked']} of {summary['frames']} frames tracked, "
+        f"{summary['matches_per_frame']:.1f} matches a frame, NIS per dof {per_dof:.2f}",
+        f"{seconds['per_frame_median'] * 1e3:.0f} ms a frame (median), "
+        f"{seconds['total']:.1f} s in all, {seconds['start']:.1f} s of them to start",
+    ]
+    if "ate" in summary:
+        ate = summary["ate"]
+        share = ate["rmse"] / ate["path_length"] if ate["path_length"] else float("nan")
+        lines.append(
+            f"absolute trajectory error after {ate['alignment']} alignment: {ate['rmse']:.4f} on "
+            f"a path of {ate['path_length']:.2f}, {share:.2%}"
+        )
+    return "\n".join(lines)
+
+
 def _track_frames(
     source: Source,
     tracker: Tracker,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,16 +25,16 @@ LEAST_INLIERS = 4
 
 
 class _Prediction(NamedTuple):
-    """What the filter expects to see, slot by slot."""
+    """What the filter expects to see, slot by slot; JAX's arrays, then NumPy's."""
 
-    pixels: np.ndarray
-    covariances: np.ndarray
-    usable: np.ndarray
+    pixels: Any
+    covariances: Any
+    usable: Any
     """In the map and in front of the camera."""
-    T_wc: np.ndarray
-    points: np.ndarray
+    T_wc: Any
+    points: Any
     """Homogeneous points (X, ω) in the predicted camera."""
-    omegas: np.ndarray
+    omegas: Any
 
 
 @dataclass
@@ -128,7 +128,7 @@ class Tracker:
         return self._tracked(frame, created=created)
 
     def _next(self, frame: Frame) -> Tracked:
-        dt = frame.time - self._time
+        dt = frame.time - (-np.inf if self._time is None else self._time)
         if not dt > 0:
             raise ValueError(f"frame {frame.index}: its time is not later than the one before")
         state, prediction = self._predict(self._state, self._parameters, dt)
