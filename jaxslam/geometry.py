@@ -9,6 +9,7 @@ Perturbations are right perturbations: `T ⊞ δ = T Exp(δ)` and `T_b ⊟ T_a =
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -64,14 +65,102 @@ def tangent_dim(tree: Any) -> int:
     return sum(_sizes(jax.tree.leaves(tree, is_leaf=_is_pose)))
 
 
+def exp(group: type[Pose], delta: Float[Array, " t"]) -> Pose:
+    """`Exp(δ)` of SE(2) or SE(3), with derivatives that are exact at and near zero rotation.
+
+    SE(3): `t = v + B ω×v + C ω×(ω×v)`, B = (1 − cos θ)/θ², C = (θ − sin θ)/θ³ (Barfoot, State
+    Estimation for Robotics, §7.1). jaxlie's own takes V = R at small angles, whose derivative by
+    ω is twice the true one.
+    """
+    if group is jaxlie.SE2:
+        v, theta = delta[:2], delta[2]
+        half = theta / 2
+        # V = sinc(θ/2) R(θ/2).
+        chord = _sinc(half**2) * (jaxlie.SO2.from_radians(half) @ v)
+        return jaxlie.SE2.from_rotation_and_translation(jaxlie.SO2.from_radians(theta), chord)
+    v, omega = delta[:3], delta[3:]
+    s = omega @ omega
+    half_sinc = _sinc(s / 4)
+    wxyz = jnp.concatenate([_cos(s / 4)[None], half_sinc * omega / 2])
+    turned = jnp.cross(omega, v)
+    translation = v + half_sinc**2 / 2 * turned + _third(s) * jnp.cross(omega, turned)
+    return jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3(wxyz), translation)
+
+
+def log(pose: Pose) -> Float[Array, " t"]:
+    """`Log(T)`, the inverse of `exp`: exact to rounding at small angles, for θ below π."""
+    rotation, t = pose.rotation(), pose.translation()
+    if isinstance(rotation, jaxlie.SO2):
+        half = rotation.as_radians() / 2
+        v = (jaxlie.SO2.from_radians(-half) @ t) / _sinc(half**2)
+        return jnp.append(v, 2 * half)
+    sign = jnp.where(rotation.wxyz[0] < 0, -1.0, 1.0)
+    w, xyz = sign * rotation.wxyz[0], sign * rotation.wxyz[1:]
+    omega = 2 * _angle_by_sine(xyz @ xyz, w) * xyz
+    turned = jnp.cross(omega, t)
+    v = t - turned / 2 + _inverse_third(omega @ omega) * jnp.cross(omega, turned)
+    return jnp.concatenate([v, omega])
+
+
+# Even functions of an angle, as functions of its square s: a series below _SMALL, where the closed
+# form or its derivative would divide by nearly zero, and above it the closed form.
+_SMALL = 0.25
+
+
+def _even(s, series, closed):
+    small = s < _SMALL
+    value = jnp.zeros_like(s)
+    for coefficient in reversed(series):
+        value = value * s + coefficient
+    return jnp.where(small, value, closed(jnp.where(small, 1.0, s)))
+
+
+def _sinc(s):
+    """sin(x)/x at x² = s."""
+    series = [(-1) ** k / math.factorial(2 * k + 1) for k in range(7)]
+    return _even(s, series, lambda s: jnp.sin(jnp.sqrt(s)) / jnp.sqrt(s))
+
+
+def _cos(s):
+    """cos(x) at x² = s."""
+    series = [(-1) ** k / math.factorial(2 * k) for k in range(7)]
+    return _even(s, series, lambda s: jnp.cos(jnp.sqrt(s)))
+
+
+def _third(s):
+    """(x − sin x)/x³ at x² = s."""
+    series = [(-1) ** k / math.factorial(2 * k + 3) for k in range(7)]
+    return _even(s, series, lambda s: (1 - jnp.sin(jnp.sqrt(s)) / jnp.sqrt(s)) / s)
+
+
+def _angle_by_sine(s, cosine):
+    """x / sin(x) for x in [0, π/2] with sin² x = s and the given cosine, not negative."""
+    small = s < _SMALL * 0.04
+    ratio = s / jnp.where(small, cosine, 1.0) ** 2
+    series = jnp.zeros_like(s)
+    for k in reversed(range(8)):
+        series = series * ratio + (-1) ** k / (2 * k + 1)
+    sine = jnp.sqrt(jnp.where(small, 1.0, s))
+    return jnp.where(small, series / jnp.where(small, cosine, 1.0), jnp.atan2(sine, cosine) / sine)
+
+
+def _inverse_third(s):
+    """(1 − (x/2) cot(x/2))/x² at x² = s."""
+    series = [
+        1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160,
+        691 / 1307674368000, 1 / 74724249600,
+    ]  # fmt: skip
+    return _even(s, series, lambda s: (1 - jnp.sqrt(s) / 2 / jnp.tan(jnp.sqrt(s) / 2)) / s)
+
+
 def retract(tree: Any, delta: Float[Array, " t"]) -> Any:
     """`tree ⊞ δ`: poses by `T Exp(δ)`, vectors by addition, δ split in the order of the leaves."""
-    return _moved(tree, delta, lambda T, part: T @ type(T).exp(part))
+    return _moved(tree, delta, lambda T, part: T @ exp(type(T), part))
 
 
 def difference(tree: Any, origin: Any) -> Float[Array, " t"]:
     """`tree ⊟ origin`, the inverse of `retract`: `retract(origin, difference(tree, origin))`."""
-    return _compared(tree, origin, lambda step: step.log())
+    return _compared(tree, origin, log)
 
 
 def jacobian(function: Callable[[Any], Any], tree: Any) -> Float[Array, "k t"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from jaxtyping import Array, Float
 
-from jaxslam.geometry import Geometry, Pose
+from jaxslam.geometry import Geometry, Pose, exp
 
 
 def next_velocity(
@@ -21,4 +21,4 @@ def displacement(
     dt: Float[Array, ""],
 ) -> Pose:
     """`T_{k-1,k} = Exp((v + a Δt) Δt)` (P9), the pose of C_k in C_{k-1}."""
-    return geometry.group.exp(next_velocity(velocity, acceleration, dt) * dt)
+    return exp(geometry.group, next_velocity(velocity, acceleration, dt) * dt)

@@ -1,6 +1,6 @@
-"""What the tests of the core share: quick compilation, central differences, poses and filter runs."""
+"""What the core's tests share: quick compilation, central differences, poses, filter runs."""
 
-from functools import lru_cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,6 @@ from jaxslam.geometry import GEOMETRIES
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.simulation import features, parameters, scenario, sightings, simulate
 
-QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-"""Tests compile much and compute little: without optimisation they take half the time."""
-
 each_geometry = list(GEOMETRIES.values())
 each_landmark = list(LANDMARKS.values())
 
@@ -23,8 +20,27 @@ def named(value):
     return getattr(value, "name", None)
 
 
+@cache
+def quick_options():
+    """The compiler options of XLA's that this version of it knows."""
+    options = {
+        "xla_backend_optimization_level": 0,
+        "xla_llvm_disable_expensive_passes": True,
+        "xla_cpu_use_fusion_emitters": False,
+    }
+    known = {}
+    for name, value in options.items():
+        try:
+            jax.jit(lambda x: x, compiler_options={name: value}).lower(0.0).compile()
+        except RuntimeError:  # "No such compile option"
+            continue
+        known[name] = value
+    return known
+
+
 def quick_jit(function):
-    return jax.jit(function, compiler_options=QUICK)
+    """`jax.jit` for tests, which compile much and compute little: a third of the time."""
+    return jax.jit(function, compiler_options=quick_options())
 
 
 def central(function, x, step=1e-6):
@@ -52,17 +68,14 @@ def close(actual, desired, relative):
     np.testing.assert_allclose(actual, desired, rtol=0, atol=relative * np.abs(desired).max())
 
 
-def run_filter(slam, chosen, capacity, parameters, first, known, new):
-    """A whole run; the errors, covariances and NIS of every step, and the last state."""
-    dtype = parameters.pixel_sigma.dtype
-    state = slam.start(
-        parameters,
-        capacity,
-        jnp.asarray(chosen.velocity, dtype),
-        jnp.asarray(chosen.velocity_sigma, dtype),
-    )
+def run_filter(slam, capacity, parameters, motion, first, known, new):
+    """A whole run; the poses, covariances and NIS of every step, and the last state.
+
+    `motion` holds the nominal velocity, its σ, and the seconds of a step.
+    """
+    velocity, velocity_sigma, dt = motion
+    state = slam.start(parameters, capacity, velocity, velocity_sigma)
     state = slam.first(state, parameters, first)
-    dt = jnp.asarray(1 / chosen.rate, dtype)
 
     def step(state, frame):
         state, innovation = slam.step(state, parameters, dt, *frame)
@@ -77,10 +90,15 @@ class Case:
 
     def __init__(self, name, runs=1, seed=0, **fields):
         self.scenario = scenario(name, fields)
-        keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(seed), i))(jnp.arange(runs))
         chosen = self.scenario
-        self.runs = quick_jit(jax.vmap(lambda key: simulate(chosen, key)))(keys)
-        most = jax.tree.map(lambda x: int(x.max()), jax.vmap(sightings)(self.runs))
+
+        def draw(indices):
+            keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(seed), i))(indices)
+            drawn = jax.vmap(lambda key: simulate(chosen, key))(keys)
+            return drawn, jax.tree.map(jnp.max, jax.vmap(sightings)(drawn))
+
+        self.runs, most = quick_jit(draw)(jnp.arange(runs))
+        most = jax.tree.map(int, most)
         self.capacity = most.landmarks
         self.features = quick_jit(jax.vmap(lambda run: features(run, most)))(self.runs)
 
@@ -90,15 +108,20 @@ class Case:
     def parameters(self, dtype=None) -> Parameters:
         return parameters(self.scenario, dtype)
 
+    def motion(self, dtype=None):
+        """Nominal velocity, its σ, and the seconds of a step."""
+        s = self.scenario
+        return tuple(jnp.asarray(x, dtype) for x in (s.velocity, s.velocity_sigma, 1 / s.rate))
+
     def function(self, slam):
-        """`(parameters, first, known, new) → run`, to be compiled and mapped."""
-        return lambda *data: run_filter(slam, self.scenario, self.capacity, *data)
+        """`(parameters, motion, first, known, new) → run`, to be compiled and mapped."""
+        return partial(run_filter, slam, self.capacity)
 
     def filter(self, kind, landmark, calibration=None):
         calibration = calibration or self.scenario.calibration
         return FILTERS[kind](self.scenario.world, LANDMARKS[landmark], calibration)
 
-    @lru_cache(maxsize=None)  # noqa: B019 - cases live as long as the tests
+    @cache  # noqa: B019 - cases live as long as the tests
     def compiled(self, kind, landmark, calibration=None):
         return quick_jit(self.function(self.filter(kind, landmark, calibration)))
 

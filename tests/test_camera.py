@@ -1,4 +1,4 @@
-"""Tests of jaxslam.camera: projection against OpenCV, its inverse, its scale and its derivatives."""
+"""Tests of jaxslam.camera: projection against OpenCV, its inverse, scale and derivatives."""
 
 import jax
 import jax.numpy as jnp

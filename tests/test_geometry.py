@@ -1,6 +1,6 @@
 """Tests of jaxslam.geometry: ⊞ and ⊟ on mixed pytrees, their Jacobian, and the planar axes."""
 
-from functools import lru_cache
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +10,9 @@ import pytest
 from cases import each_geometry, named, pose, quick_jit
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import expm
 
-from jaxslam.geometry import PLANAR, difference, retract, tangent_dim
+from jaxslam.geometry import PLANAR, difference, exp, jacobian, log, retract, tangent_dim
 from jaxslam.motion import displacement
 
 # Rotation vectors shorter than π have one logarithm; with |δ| ≤ 1 per axis, √3 at the most.
@@ -29,7 +30,7 @@ def mixed(geometry, seed):
     }
 
 
-@lru_cache(maxsize=None)
+@cache
 def compiled():
     """`retract` and `difference`, compiled once for each geometry."""
     return quick_jit(retract), quick_jit(difference)
@@ -101,27 +102,9 @@ def test_dimensions_agree_with_the_group(geometry):
 
 
 ANGLES = (0.0, 1e-7, 1e-5, 1e-4, 1e-3, 1e-2)
-KNOWN_WRONG = {
-    ("planar", "float64"): (1e-7,),
-    ("planar", "float32"): (1e-5, 1e-4, 1e-3),
-    ("spatial", "float64"): (0.0, 1e-7),
-    ("spatial", "float32"): (0.0, 1e-7, 1e-5, 1e-4, 1e-3),
-}
-JAXLIE = pytest.mark.xfail(
-    strict=True,
-    reason="jaxlie's exp takes V(θ) = R instead of I + [θ]/2 below its threshold, twice the "
-    "derivative, and loses 1 − cos θ to cancellation above it",
-)
-NEAR_STRAIGHT = [
-    pytest.param(geometry, dtype, angle, marks=[JAXLIE] if angle in wrong else [])
-    for geometry in each_geometry
-    for dtype in ("float64", "float32")
-    for wrong in [KNOWN_WRONG.get((geometry.name, dtype), ())]
-    for angle in ANGLES
-]
 
 
-@lru_cache(maxsize=None)
+@cache
 def step_aside(geometry, dtype):
     """Where a step of 1 along x that turns by θ towards the second axis ends there, and d/dθ."""
     t = geometry.tangent_dim
@@ -134,10 +117,47 @@ def step_aside(geometry, dtype):
     return quick_jit(jax.value_and_grad(aside))
 
 
-@pytest.mark.parametrize(("geometry", "dtype", "angle"), NEAR_STRAIGHT, ids=named)
+@pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_a_motion_and_its_derivative_are_right_near_straight_ahead(geometry, dtype, angle):
-    value, slope = step_aside(geometry, dtype)(jnp.asarray(angle, dtype))
+    with jax.enable_x64(dtype == "float64"):
+        value, slope = step_aside(geometry, dtype)(np.asarray(angle, dtype))
     # (1 − cos θ)/θ by its series, exact to 1e-10 for θ ≤ 0.01.
     bound = {"float64": 1e-6, "float32": 1e-3}[dtype]
     np.testing.assert_allclose(value, angle / 2 - angle**3 / 24, rtol=bound, atol=1e-12)
     np.testing.assert_allclose(slope, 0.5 - angle**2 / 8, rtol=bound)
+
+
+@pytest.mark.parametrize("angle", [*ANGLES, 0.3, 0.49, 0.51, 1.0, 3.0])
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_exp_is_the_matrix_exponential_and_log_its_inverse(geometry, angle):
+    direction = np.array([0.6, -0.7, 1.1, 0.48, -0.6, 0.64])[-geometry.tangent_dim :]
+    delta = direction.copy()
+    n, k = geometry.point_dim, geometry.rotation_dim
+    delta[n:] *= angle / np.linalg.norm(direction[n:])
+    pose = exp(geometry.group, jnp.asarray(delta))
+    generator = np.zeros((n + 1, n + 1))
+    generator[:n, n] = delta[:n]
+    if k == 1:
+        generator[:2, :2] = [[0, -delta[2]], [delta[2], 0]]
+    else:
+        x, y, z = delta[3:]
+        generator[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    np.testing.assert_allclose(pose.as_matrix(), expm(generator), atol=1e-14)
+    np.testing.assert_allclose(log(pose), delta, atol=1e-13)
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_jacobians_by_the_first_order_retraction_are_those_of_retract(geometry):
+    """`jacobian` differentiates through `nudge`; the definition is through `retract`."""
+    delta = np.linspace(-0.7, 0.9, geometry.tangent_dim)
+    core = {"pose": exp(geometry.group, jnp.asarray(delta)), "vector": jnp.array([0.3, -2.0])}
+
+    def function(core):
+        return {"pose": core["pose"].inverse() @ core["pose"] @ core["pose"], "v": core["vector"]}
+
+    by_definition = jax.jacfwd(lambda d: difference(function(retract(core, d)), function(core)))(
+        jnp.zeros(geometry.tangent_dim + 2)
+    )
+    np.testing.assert_allclose(jacobian(function, core), by_definition, atol=1e-13)

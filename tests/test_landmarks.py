@@ -1,6 +1,6 @@
 """Tests of jaxslam.landmarks: what every parametrization in the table owes its Euclidean point."""
 
-from functools import lru_cache
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ def bearing_of(geometry):
     return jnp.array([0.31, -0.22])[: geometry.pixel_dim]
 
 
-@lru_cache(maxsize=None)
+@cache
 def functions(landmark):
     """The landmark's functions compiled, and `euclidean(parameters)`."""
 

@@ -89,11 +89,7 @@ def update(
     `noise` is the covariance R of one measurement. A feature that is not valid, not in the map
     or predicted behind the camera changes nothing.
     """
-    predicted, in_front, H = _observe(model, state, features.slots, context)
-    used = features.valid & in_front & state.active[features.slots]
-    H = _masked(H, used)
-    residual = jnp.where(used[:, None], features.pixels - predicted, 0.0)
-
+    predicted, residual, used, H = _residuals(model, state, features, context)
     P, slots = state.covariance, features.slots
     R = _noise_matrix(noise, used)
     HP = _rows(H, slots, P)
@@ -115,11 +111,9 @@ def update_mean(
     model: Model, state: State, features: Features, noise: Float[Array, "p p"], context: Any
 ) -> State:
     """The mean that `update` would give, with the covariance left as it is."""
-    predicted, _, H = _observe(model, state, features.slots, context)
-    H = _masked(H, features.valid)
-    residual = jnp.where(features.valid[:, None], features.pixels - predicted, 0.0)
+    _, residual, used, H = _residuals(model, state, features, context)
     HP = _rows(H, features.slots, state.covariance)
-    S = _rows(H, features.slots, HP.T) + _noise_matrix(noise, features.valid)
+    S = _rows(H, features.slots, HP.T) + _noise_matrix(noise, used)
     return _shifted(state, HP.T @ jnp.linalg.solve(S, residual.ravel()))
 
 
@@ -243,6 +237,14 @@ def core_covariance(function: Callable[[Any], Any], state: State) -> tuple[Any, 
     c = state.core_dim
     J = jacobian(function, state.core)
     return function(state.core), J @ state.covariance[:c, :c] @ J.T
+
+
+def _residuals(model, state, features, context):
+    """Predictions, residuals, which features are used, and H, the latter two zero elsewhere."""
+    predicted, in_front, H = _observe(model, state, features.slots, context)
+    used = features.valid & in_front & state.active[features.slots]
+    residual = jnp.where(used[:, None], features.pixels - predicted, 0.0)
+    return predicted, residual, used, _masked(H, used)
 
 
 def _observe(model, state, slots, context):

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam.camera import Camera, bearing, project
 from jaxslam.filters import ekf
 from jaxslam.filters.state import Features, Innovation, State
-from jaxslam.geometry import Geometry, Pose
+from jaxslam.geometry import Geometry, Pose, log
 from jaxslam.landmarks.parametrization import Parametrization
 from jaxslam.motion import displacement, next_velocity
 
@@ -312,7 +312,7 @@ class SlamFilter:
         """`Log(T_est⁻¹ T_true)` of the pose in the state, and the covariance of its tangent."""
         t = self.geometry.tangent_dim
         truth = self.model.frame.pose_from_camera(T_BC)
-        return (state.core.pose.inverse() @ truth).log(), state.covariance[:t, :t]
+        return log(state.core.pose.inverse() @ truth), state.covariance[:t, :t]
 
     def camera_pose(self, state: State) -> tuple[Pose, Float[Array, "t t"]]:
         """T_BC and its covariance in the right tangent: position in camera axes, orientation."""

@@ -146,7 +146,9 @@ def _coerced(field: str, value: Any, like: Any) -> Any:
             raise wrong("a word")
         return value
     if isinstance(like, tuple) and isinstance(like[0], tuple):
-        if not isinstance(value, list | tuple):
+        if not isinstance(value, list | tuple) or not all(
+            isinstance(pair, list | tuple) for pair in value
+        ):
             raise wrong("a list of [low, high] pairs")
         return tuple(_coerced(field, pair, like[0]) for pair in value)
     if isinstance(like, tuple):
@@ -186,6 +188,8 @@ def _check(s: Scenario) -> None:
         _check_numbers(field.name, getattr(s, field.name))
     if any(len(pair) != 2 or pair[0] >= pair[1] for pair in s.first_pixels):
         raise ValueError(f"scenario field first_pixels needs [low, high] pairs: {s.first_pixels}")
+    if s.placement == "ring" and s.geometry != "planar":
+        raise ValueError("scenario field placement: ring is only for a planar geometry")
     if s.placement == "ring" and s.velocity[-1] == 0:
         raise ValueError("placement ring needs a nominal path that turns: velocity[-1] is 0")
 

@@ -1,0 +1,469 @@
+"""Tests of jaxslam.simulation: the built-in scenarios, their overrides, and what is drawn."""
+
+import dataclasses
+import json
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import quick_jit
+from scipy import stats
+
+from jaxslam.camera import Camera, project
+from jaxslam.simulation import (
+    BUILT_IN,
+    Scenario,
+    features,
+    parameters,
+    scenario,
+    sightings,
+    simulate,
+)
+from jaxslam.simulation.scenario import parse_override
+
+FALSE_ALARM = 1e-6
+"""Share of seeds on which a statistical test here would fail although nothing is wrong."""
+
+
+def keys(count, seed=0):
+    return jax.vmap(lambda i: jax.random.fold_in(jax.random.key(seed), i))(jnp.arange(count))
+
+
+def batch(chosen, count, seed=0):
+    return quick_jit(jax.vmap(lambda key: simulate(chosen, key)))(keys(count, seed))
+
+
+# --- the built-in scenarios, as interface.md words them -----------------------------------------
+
+PLANAR_MATCHED = {
+    # acceleration σ, initial velocity σ
+    "tight": ((0.02, 0.02, 0.02), (0.002, 0.002, 0.002)),
+    "": ((0.1, 0.1, 0.1), (0.01, 0.01, 0.01)),
+    "loose": ((0.5, 0.5, 0.3), (0.1, 0.1, 0.05)),
+    "very-loose": ((3.0, 3.0, 1.0), (0.1, 0.1, 0.05)),
+}
+SPATIAL_MATCHED = {
+    "tight": ((0.02,) * 6, (0.002,) * 6),
+    "": ((0.1,) * 6, (0.01,) * 6),
+    "loose": ((0.5, 0.5, 0.5, 0.3, 0.3, 0.3), (0.1, 0.1, 0.1, 0.05, 0.05, 0.05)),
+    "very-loose": ((3.0, 3.0, 3.0, 1.0, 1.0, 1.0), (0.1, 0.1, 0.1, 0.05, 0.05, 0.05)),
+}
+CIRCLE = {
+    "tight": PLANAR_MATCHED["tight"],
+    "": PLANAR_MATCHED[""],
+    "loose": ((0.3, 0.3, 0.5), (0.05, 0.05, 0.1)),
+}
+AHEAD = {noise: PLANAR_MATCHED[noise] for noise in ("", "loose")}
+
+MATCHED = {
+    "geometry": "planar",
+    "rate": 30.0,
+    "steps": 60,
+    "landmarks": 12,
+    "placement": "prior",
+    "first_pixels": ((20.0, 620.0),),
+    "nearest_depth": 3.0,
+    "least_inverse_depth": 0.001,
+    "calibration": "known",
+    "true_calibration": "nominal",
+    "image": (640.0,),
+    "focal": (650.0,),
+    "centre": (320.0,),
+    "focal_sigma": 3.0,
+    "centre_sigma": 2.0,
+    "pixel_sigma": 0.3,
+}
+SPATIAL = MATCHED | {
+    "geometry": "spatial",
+    "landmarks": 30,
+    "first_pixels": ((20.0, 620.0), (20.0, 460.0)),
+    "image": (640.0, 480.0),
+    "focal": (650.0, 650.0),
+    "centre": (320.0, 240.0),
+}
+ON_CIRCLE = MATCHED | {
+    "steps": 200,
+    "landmarks": 36,
+    "placement": "ring",
+    "ring_radius": 8.0,
+    "calibration": "white",
+    "true_calibration": "white",
+}
+del ON_CIRCLE["first_pixels"], ON_CIRCLE["least_inverse_depth"]  # the prior's, not the ring's
+
+FAMILIES = {
+    "matched": (PLANAR_MATCHED, MATCHED, (1.2, 0.0, 0.0)),
+    "matched-forward": (AHEAD, MATCHED, (0.0, 1.2, 0.0)),
+    "matched-turn": (AHEAD, MATCHED, (0.0, 1.2, 0.3)),
+    "matched-6dof": (SPATIAL_MATCHED, SPATIAL, (1.2, 0.0, 0.0, 0.0, 0.0, 0.0)),
+    "circle": (CIRCLE, ON_CIRCLE, (0.0, 1.2, 0.3)),
+}
+EXPECTED = {
+    "-".join(filter(None, (family, noise))): fields
+    | {"velocity": velocity, "acceleration_sigma": acceleration, "velocity_sigma": start}
+    for family, (noises, fields, velocity) in FAMILIES.items()
+    for noise, (acceleration, start) in noises.items()
+}
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_built_in_scenarios_hold_the_published_numbers(name):
+    chosen = scenario(name)
+    assert chosen.name == name
+    assert {field: getattr(chosen, field) for field in EXPECTED[name]} == EXPECTED[name]
+
+
+def test_every_built_in_scenario_is_checked_here():
+    assert set(BUILT_IN) - {"room"} == set(EXPECTED)
+
+
+def test_the_filter_starts_from_the_true_priors():
+    chosen = scenario("matched-6dof-loose", nearest_depth=2.0)
+    numbers = parameters(chosen)
+    assert numbers.inverse_depth == 1 / 4
+    assert numbers.inverse_depth_sigma == 1 / 8
+    assert numbers.pixel_sigma == 0.3
+    np.testing.assert_array_equal(numbers.intrinsics_sigma, [3, 3, 2, 2])
+    np.testing.assert_array_equal(numbers.camera.intrinsics, [650, 650, 320, 240])
+    np.testing.assert_array_equal(numbers.acceleration_sigma, chosen.acceleration_sigma)
+    assert parameters(chosen, jnp.float32).pixel_sigma.dtype == jnp.float32
+
+
+# --- overrides and files ------------------------------------------------------------------------
+
+
+def test_overrides_replace_fields_and_take_the_type_of_the_field():
+    chosen = scenario("matched", {"steps": 5.0, "focal": 500}, pixel_sigma=1)
+    assert (chosen.steps, chosen.focal, chosen.pixel_sigma) == (5, (500.0,), 1.0)
+    assert isinstance(chosen.steps, int)
+    rest = {"steps", "focal", "pixel_sigma"}
+    for field in dataclasses.fields(Scenario):
+        if field.name not in rest:
+            assert getattr(chosen, field.name) == getattr(BUILT_IN["matched"], field.name)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("steps=5", ("steps", 5)),
+        (" velocity = [1, 0.5, 0] ", ("velocity", [1, 0.5, 0])),
+        ("calibration=white", ("calibration", "white")),
+        ('name="a = b"', ("name", "a = b")),
+        ("pixel_sigma=nan", ("pixel_sigma", pytest.approx(np.nan, nan_ok=True))),
+    ],
+)
+def test_an_override_is_read_as_toml(text, expected):
+    assert parse_override(text) == expected
+
+
+@pytest.mark.parametrize("text", ["steps", "=5", ""])
+def test_a_malformed_override_is_refused(text):
+    with pytest.raises(ValueError, match="field=value"):
+        parse_override(text)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"pixl_sigma": 1}, r"pixl_sigma.*did you mean pixel_sigma\?"),
+        ({"xyzzy": 1}, r"unknown scenario field 'xyzzy'; known: name, geometry"),
+        ({"pixel_sigma": float("nan")}, "pixel_sigma holds nan"),
+        ({"velocity": [1.2, float("inf"), 0.0]}, "velocity holds inf"),
+        ({"first_pixels": [[20.0, float("nan")]]}, "first_pixels"),
+        ({"steps": float("nan")}, "steps must be a whole number"),
+        ({"steps": 2.5}, "steps must be a whole number"),
+        ({"steps": 0}, "steps must be positive"),
+        ({"landmarks": -1}, "landmarks must be positive"),
+        ({"rate": 0}, "rate must be positive"),
+        ({"pixel_sigma": -0.3}, "pixel_sigma must be positive"),
+        ({"acceleration_sigma": [0.1, -0.1, 0.1]}, "acceleration_sigma must be positive"),
+        ({"velocity_sigma": [0.1, 0.1, -0.1]}, "velocity_sigma must not be negative"),
+        ({"focal_sigma": -1}, "focal_sigma must not be negative"),
+        ({"velocity": [1.2, 0.0]}, "velocity needs 3 values in a planar world, not 2"),
+        ({"geometry": "spatial"}, "needs 6 values in a spatial world, not 3"),
+        ({"focal": [650, 650]}, "focal needs 1 values in a planar world, not 2"),
+        ({"first_pixels": [[20, 620], [20, 460]]}, "first_pixels needs 1 values"),
+        ({"first_pixels": [[620, 20]]}, r"first_pixels needs \[low, high\] pairs"),
+        ({"first_pixels": 20}, r"first_pixels must be a list of \[low, high\] pairs, not 20"),
+        ({"pixel_sigma": "much"}, "pixel_sigma must be a number, not 'much'"),
+        ({"steps": True}, "steps must be a number, not True"),
+        ({"velocity": ["fast", 0, 0]}, "velocity must be a number, not 'fast'"),
+        ({"geometry": 2}, "geometry must be a word, not 2"),
+        ({"geometry": "flat"}, "geometry is 'flat'; known: planar, spatial"),
+        ({"placement": "grid"}, "placement is 'grid'; known: prior, ring"),
+        ({"calibration": "black"}, "calibration is 'black'; known: .*white"),
+        ({"true_calibration": "known"}, "true_calibration is 'known'; known: nominal"),
+        ({"placement": "ring"}, "ring needs a nominal path that turns"),
+    ],
+    ids=lambda value: ",".join(value) if isinstance(value, dict) else "",
+)
+def test_a_scenario_that_makes_no_sense_is_refused_by_field(fields, message):
+    with pytest.raises(ValueError, match=message):
+        scenario("matched", fields)
+
+
+def test_a_ring_is_only_for_the_planar_world():
+    velocity = [0.0, 0.0, 1.2, 0.0, 0.0, 0.3]
+    with pytest.raises(ValueError, match="ring"):
+        scenario("matched-6dof", placement="ring", velocity=velocity)
+
+
+def test_an_unknown_scenario_is_refused_with_a_suggestion():
+    with pytest.raises(
+        ValueError, match=r"'cirle' \(did you mean circle\?\); known: matched-tight"
+    ):
+        scenario("cirle")
+
+
+def as_toml(chosen, leave_out=()):
+    """The scenario's fields as TOML; lists and numbers are written as in JSON."""
+    lines = [
+        f"{field} = {json.dumps(value)}"
+        for field, value in dataclasses.asdict(chosen).items()
+        if field not in leave_out
+    ]
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_a_scenario_survives_a_toml_file(tmp_path, name):
+    path = tmp_path / "mine.toml"
+    path.write_text(as_toml(BUILT_IN[name]))
+    assert scenario(path) == BUILT_IN[name]
+    assert scenario(str(path), steps=7) == dataclasses.replace(BUILT_IN[name], steps=7)
+
+
+def test_a_toml_file_may_start_from_a_built_in_scenario(tmp_path):
+    path = tmp_path / "wide.toml"
+    path.write_text('base = "circle"\nfocal = 400\n')
+    assert scenario(path) == dataclasses.replace(BUILT_IN["circle"], name="wide", focal=(400.0,))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "does not exist"),
+        ("steps = ", "wrong.toml: "),
+        ('base = "cirle"', "unknown base 'cirle'; known: .*circle"),
+        ("stepz = 5", r"did you mean steps\?"),
+        ("pixel_sigma = nan", "pixel_sigma holds nan"),
+    ],
+)
+def test_a_wrong_file_is_refused(tmp_path, text, message):
+    path = tmp_path / "wrong.toml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        scenario(path)
+
+
+# --- what is drawn ------------------------------------------------------------------------------
+
+
+def test_a_run_does_not_depend_on_its_batch():
+    """Run i is drawn from fold_in(key, i)."""
+    chosen = scenario("circle", steps=20)
+    whole = batch(chosen, 6)
+    part = quick_jit(jax.vmap(lambda key: simulate(chosen, key)))(keys(6)[3:5])
+    alone = quick_jit(lambda key: simulate(chosen, key))(jax.random.fold_in(jax.random.key(0), 4))
+    for a, b, c in zip(*(jax.tree.leaves(run) for run in (whole, part, alone)), strict=True):
+        # Rounding of pixels and metres, should the compiler vectorise another way.
+        np.testing.assert_allclose(a[4], b[1], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(a[4], c, rtol=1e-12, atol=1e-12)
+    assert np.abs(whole.pixels[4] - whole.pixels[3]).max() > 0.1
+
+
+def pixels_without_noise(runs, chosen):
+    camera = Camera(jnp.asarray(chosen.focal), jnp.asarray(chosen.centre))
+
+    def one(pose, points):
+        seen = jax.vmap(pose.inverse().apply)(points)
+        return jax.vmap(project, in_axes=(None, 0))(camera, seen), seen
+
+    return quick_jit(jax.vmap(jax.vmap(one, (0, None))))(runs.poses, runs.points)
+
+
+def two_sided(sum_of_squares, count):
+    """Is a sum of squared standard normal numbers one, but for FALSE_ALARM?"""
+    low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], count)
+    assert low < sum_of_squares < high
+
+
+def centred(numbers):
+    """Have independent standard normal numbers a mean of zero, but for FALSE_ALARM?"""
+    assert abs(numbers.mean()) * np.sqrt(numbers.size) < stats.norm.isf(FALSE_ALARM / 2)
+
+
+def test_pixel_noise_has_the_stated_sigma():
+    chosen = scenario("matched-6dof", pixel_sigma=0.7)
+    runs = batch(chosen, 10)
+    ideal, _ = pixels_without_noise(runs, chosen)
+    noise = np.asarray(runs.pixels - ideal)[np.asarray(runs.visible)] / 0.7
+    assert noise.size > 10_000
+    two_sided(np.sum(noise**2), noise.size)
+    centred(noise)
+
+
+def test_accelerations_and_the_first_velocity_have_the_stated_sigmas():
+    chosen = scenario("matched-6dof-loose", landmarks=1)
+    poses = batch(chosen, 100).poses
+    before, after = (
+        jax.tree.map(lambda x, part=part: x[:, part], poses)
+        for part in (slice(None, -1), slice(1, None))
+    )
+    velocity = quick_jit(lambda a, b: (a.inverse() @ b).log())(before, after) * chosen.rate
+    acceleration = np.diff(velocity, axis=1) * chosen.rate / np.array(chosen.acceleration_sigma)
+    # The first step has its acceleration already.
+    sigma = np.hypot(chosen.velocity_sigma, np.array(chosen.acceleration_sigma) / chosen.rate)
+    first = (velocity[:, 0] - np.array(chosen.velocity)) / sigma
+    for numbers in (acceleration, np.asarray(first)):
+        for axis in range(6):
+            two_sided(np.sum(numbers[..., axis] ** 2), numbers[..., axis].size)
+            centred(numbers[..., axis])
+    # White: neighbours in time are not correlated.
+    neighbours = acceleration[:, 1:] * acceleration[:, :-1]
+    centred(neighbours / neighbours.std())
+
+
+@pytest.mark.parametrize("name", ["matched", "matched-6dof"])
+def test_matched_truth_is_drawn_from_the_filters_prior(name):
+    chosen = scenario(name, steps=1)
+    runs = batch(chosen, 200)
+    ideal, seen = (np.asarray(x)[:, 0] for x in pixels_without_noise(runs, chosen))
+    low, high = np.array(chosen.first_pixels).T
+    assert (ideal >= low - 1e-9).all()
+    assert (ideal <= high + 1e-9).all()
+    assert np.asarray(runs.visible)[:, 0].all()
+    w = 1 / seen[..., -1].ravel()
+    assert w.min() > chosen.least_inverse_depth
+    mean, sigma = 1 / 6, 1 / 12
+    prior = stats.truncnorm((chosen.least_inverse_depth - mean) / sigma, np.inf, mean, sigma)
+    assert stats.kstest(w, prior.cdf).pvalue > FALSE_ALARM
+    for axis in range(low.size):
+        uniform = stats.uniform(low[axis], high[axis] - low[axis])
+        assert stats.kstest(ideal[..., axis].ravel(), uniform.cdf).pvalue > FALSE_ALARM
+
+
+def test_the_camera_circles_around_the_centre_of_the_ring():
+    tiny = dict(velocity_sigma=[1e-9] * 3, acceleration_sigma=[1e-9] * 3)
+    runs = batch(scenario("circle", tiny), 1)
+    points, T = np.asarray(runs.points)[0], np.asarray(runs.poses.as_matrix())[0]
+    centre = points.mean(axis=0)
+    np.testing.assert_allclose(np.linalg.norm(points - centre, axis=1), 8.0, rtol=1e-12)
+    positions, ahead = T[:, :2, 2], T[:, :2, 1]
+    # 1e-6: noise of 1e-9 over 7 s, and the rounding of jaxlie's exp.
+    np.testing.assert_allclose(np.linalg.norm(positions - centre, axis=1), 4.0, rtol=1e-6)
+    # Looking along the path, at 1.2 m/s and 0.3 rad/s: the next centimetres are ahead.
+    steps = np.diff(positions, axis=0)
+    np.testing.assert_allclose(np.linalg.norm(steps, axis=1) * 30, 1.2, rtol=1e-4)
+    along = steps / np.linalg.norm(steps, axis=1)[:, None]
+    # The chord is half the step's angle of 0.01 rad off the tangent.
+    np.testing.assert_allclose(np.sum(along * ahead[:-1], axis=1), np.cos(0.005), rtol=1e-6)
+    # It turns towards the centre, that is x → z turns z towards −x.
+    left = np.asarray(T)[:, :2, 0] * -1
+    to_centre = (centre - positions) / 4.0
+    np.testing.assert_allclose(np.sum(left * to_centre, axis=1), 1.0, rtol=1e-5)
+    angles = np.unwrap(np.sort(np.arctan2(*(points - centre).T)))
+    np.testing.assert_allclose(np.diff(angles), 2 * np.pi / 36, rtol=1e-9)
+
+
+def test_true_intrinsics_are_drawn_as_stated():
+    """A pixel's deviation from the nominal camera is bearing · δf + δc."""
+    for drawing in ("nominal", "constant", "white"):
+        chosen = scenario(
+            "matched",
+            true_calibration=drawing,
+            pixel_sigma=1e-9,
+            velocity_sigma=[0] * 3,
+            steps=20,
+        )
+        runs = batch(chosen, 40)
+        ideal, seen = pixels_without_noise(runs, chosen)
+        bearings = np.asarray(seen[..., 0] / seen[..., 1])
+        deviation = np.asarray(runs.pixels - ideal)[..., 0]
+        ones = np.ones_like(bearings)
+        A = np.stack([bearings, ones], axis=-1)
+        deltas = np.einsum("rfip,rfp->rfi", np.linalg.pinv(A), deviation) / np.array([3.0, 2.0])
+        if drawing == "nominal":
+            assert np.abs(deltas).max() < 1e-6
+        elif drawing == "constant":
+            assert np.ptp(deltas, axis=1).max() < 1e-6
+            two_sided(np.sum(deltas[:, 0] ** 2), deltas[:, 0].size)
+        else:
+            two_sided(np.sum(deltas**2), deltas.size)
+            centred(deltas[:, 1:] * deltas[:, :-1])
+
+
+# --- features -----------------------------------------------------------------------------------
+
+
+@cache
+def circling():
+    """A run in which landmarks enter and leave, and come back."""
+    chosen = scenario("circle", steps=600)
+    run = quick_jit(lambda key: simulate(chosen, key))(jax.random.key(1))
+    most = jax.tree.map(int, quick_jit(sightings)(run))
+    return chosen, run, most, quick_jit(lambda run: features(run, most))(run)
+
+
+def test_every_visible_landmark_is_a_feature_exactly_once():
+    _, run, most, (first, known, new) = circling()
+    visible, pixels = np.asarray(run.visible), np.asarray(run.pixels)
+    frames = [[first]] + [
+        [jax.tree.map(lambda x, k=k: x[k], part) for part in (known, new)]
+        for k in range(len(visible) - 1)
+    ]
+    in_map, found = set(), np.zeros_like(visible, dtype=int)
+    for k, parts in enumerate(frames):
+        inserted = set()
+        for part, is_new in zip(parts, [True] if k == 0 else [False, True], strict=True):
+            for slot, pixel in zip(
+                np.asarray(part.slots)[part.valid], np.asarray(part.pixels)[part.valid], strict=True
+            ):
+                assert (slot in in_map) != is_new
+                found[k, slot] += 1
+                np.testing.assert_array_equal(pixel, pixels[k, slot])
+                if is_new:
+                    inserted.add(slot)
+        in_map |= inserted
+    np.testing.assert_array_equal(found, visible)
+    assert len(in_map) == most.landmarks
+    # The run is worth its name: some come later, some go and come back.
+    assert new.valid.any()
+    changes = np.diff(visible.astype(int), axis=0)
+    assert ((changes == 1).sum(axis=0) >= 2).any()
+
+
+def test_sightings_are_the_smallest_capacities_that_hold_a_run():
+    _, run, most, (first, known, new) = circling()
+    assert most.landmarks == np.asarray(run.visible).any(axis=0).sum()
+    assert most.first == first.valid.sum() == first.valid.size
+    for part, capacity in ((known, most.known), (new, most.new)):
+        assert part.valid.sum(axis=1).max() == capacity == part.valid.shape[1]
+
+
+def test_landmarks_are_in_the_order_of_their_first_appearance():
+    _, run, most, _ = circling()
+    visible = np.asarray(run.visible)
+    appearance = np.where(visible.any(axis=0), visible.argmax(axis=0), len(visible))
+    assert (np.diff(appearance) >= 0).all()
+    assert (appearance[: most.landmarks] < len(visible)).all()
+
+
+def test_visible_means_inside_the_picture_and_in_front():
+    chosen, run, *_ = circling()
+    nominal = dataclasses.replace(chosen, true_calibration="nominal")
+    runs = jax.tree.map(lambda x: x[None], run)
+    ideal, seen = (np.asarray(x)[0] for x in pixels_without_noise(runs, nominal))
+    in_front = seen[..., -1] > chosen.visible_depth
+    # The true camera of a frame differs from the nominal one by some pixels: keep 30 clear, which
+    # is more than 5 σ of focal length and centre together.
+    inside = ((ideal > 30) & (ideal < 610)).all(axis=-1) & in_front
+    outside = ((ideal < -30) | (ideal > 670)).any(axis=-1) | ~in_front
+    visible = np.asarray(run.visible)
+    assert visible[inside].all()
+    assert not visible[outside].any()
+    assert inside.any()
+    assert (seen[..., -1] < 0).any()
