@@ -12,13 +12,15 @@ The steps are the paper's: `augment` (P10, P11, P15), `update` (P16, P17), `comp
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve, solve_triangular
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.filters.state import Features, Innovation, State
@@ -70,12 +72,16 @@ def augment(state: State, start: int, covariance: Float[Array, "k k"]) -> State:
 
     Their rows and columns must be zero, as `marginalise` and `compose` leave them.
     """
+    if covariance.size == 0:
+        return state
     part = slice(start, start + covariance.shape[0])
     return replace(state, covariance=state.covariance.at[part, part].set(covariance))
 
 
 def marginalise(state: State, start: int, size: int) -> State:
     """Forget k numbers of the core: zero rows and columns; the caller resets their mean."""
+    if size == 0:
+        return state
     part = slice(start, start + size)
     covariance = state.covariance.at[part, :].set(0.0).at[:, part].set(0.0)
     return replace(state, covariance=covariance)
@@ -90,18 +96,22 @@ def update(
     or predicted behind the camera changes nothing.
     """
     predicted, residual, used, H = _residuals(model, state, features, context)
-    P, slots = state.covariance, features.slots
+    P = state.covariance
     R = _noise_matrix(noise, used)
-    HP = _rows(H, slots, P)
-    S = _rows(H, slots, HP.T) + R
-    factor = jnp.linalg.cholesky(S)
-    K = cho_solve((factor, True), HP).T
-    whitened = solve_triangular(factor, residual.ravel(), lower=True)
+    HP = H @ P
+    S = HP @ H.T + R
+    # L⁻¹ of S = L Lᵀ is small, and products with it are several times faster than solving for
+    # the wide HP; Joseph's form keeps P positive whatever rounding does to K.
+    whitening = solve_triangular(
+        jnp.linalg.cholesky(S), jnp.eye(S.shape[0], dtype=S.dtype), lower=True
+    )
+    K = (HP.T @ whitening.T) @ whitening
+    whitened = whitening @ residual.ravel()
 
     # Joseph's (I - KH) P (I - KH)ᵀ + K R Kᵀ, multiplied out from the left: two products of
     # rank m, and none of n × n matrices.
     left = P - K @ HP
-    covariance = left + (K @ R - _rows(H, slots, left.T).T) @ K.T
+    covariance = left + (K @ R - left @ H.T) @ K.T
     state = _shifted(state, K @ residual.ravel())
     state = replace(state, covariance=(covariance + covariance.T) / 2)
     return state, Innovation(predicted, residual, S, used, whitened @ whitened)
@@ -112,8 +122,8 @@ def update_mean(
 ) -> State:
     """The mean that `update` would give, with the covariance left as it is."""
     _, residual, used, H = _residuals(model, state, features, context)
-    HP = _rows(H, features.slots, state.covariance)
-    S = _rows(H, features.slots, HP.T) + _noise_matrix(noise, used)
+    HP = H @ state.covariance
+    S = HP @ H.T + _noise_matrix(noise, used)
     return _shifted(state, HP.T @ jnp.linalg.solve(S, residual.ravel()))
 
 
@@ -149,13 +159,12 @@ def compose(model: Model, state: State, context: Any) -> State:
     if not model.moves_landmarks:
         J, landmarks = None, state.landmarks
     else:
-        everyone = jnp.arange(state.active.size)
-        moved, _, J = _local_jacobians(view, move_landmark, state, everyone)
+        moved, _, J = _local_jacobians(view, move_landmark, state.core, state.landmarks)
         J = _masked(J, state.active)
         landmarks = jnp.where(state.active[:, None], moved, state.landmarks)
 
     def rows(P):
-        below = P[c:] if J is None else _rows(J, everyone, P)
+        below = P[c:] if J is None else _rows(J, P)
         return jnp.concatenate([J_core @ P[:c], below])
 
     return replace(state, core=core, landmarks=landmarks, covariance=rows(rows(state.covariance).T))
@@ -227,7 +236,10 @@ def landmark_covariance(
 ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
     """Values and first-order covariances of `function(view(core), landmark)`, slot by slot."""
     value, _, J = _local_jacobians(
-        view, lambda view, landmark: (function(view, landmark), None), state, slots
+        view,
+        lambda view, landmark: (function(view, landmark), None),
+        state.core,
+        state.landmarks[slots],
     )
     return value, _local_covariance(state, J, slots)
 
@@ -244,21 +256,21 @@ def _residuals(model, state, features, context):
     predicted, in_front, H = _observe(model, state, features.slots, context)
     used = features.valid & in_front & state.active[features.slots]
     residual = jnp.where(used[:, None], features.pixels - predicted, 0.0)
-    return predicted, residual, used, _masked(H, used)
+    return predicted, residual, used, _placed(_masked(H, used), features.slots, state.active.size)
 
 
 def _observe(model, state, slots, context):
     return _local_jacobians(
         lambda core: model.view(core, context),
         lambda view, landmark: model.observe(view, landmark, context),
-        state,
-        slots,
+        state.core,
+        state.landmarks[slots],
     )
 
 
-def _local_jacobians(view, function, state, slots) -> tuple[Array, Any, Blocks]:
+def _local_jacobians(view, function, core, landmarks) -> tuple[Array, Any, Blocks]:
     """Values, auxiliary outputs and blocks of `function(view, landmark) → (value, auxiliary)`."""
-    view_by_core, view = jacobian(view, state.core), view(state.core)
+    view_by_core, view = jacobian(view, core), view(core)
 
     def one(landmark):
         def moved(delta, landmark):
@@ -270,7 +282,7 @@ def _local_jacobians(view, function, state, slots) -> tuple[Array, Any, Blocks]:
         )
         return value, auxiliary, J
 
-    value, auxiliary, (by_view, by_landmark) = jax.vmap(one)(state.landmarks[slots])
+    value, auxiliary, (by_view, by_landmark) = jax.vmap(one)(landmarks)
     return value, auxiliary, Blocks(view_by_core, by_view, by_landmark)
 
 
@@ -290,12 +302,31 @@ def _noise_matrix(noise, used):
     return R.at[jnp.arange(m), :, jnp.arange(m), :].set(blocks).reshape(m * p, m * p)
 
 
-def _rows(J: Blocks, slots, B: Float[Array, "n r"]) -> Float[Array, "mk r"]:
-    """`J B` for the sparse J of which each row touches the core and one landmark."""
+def _placed(J: Blocks, slots: Int[Array, " m"], capacity: int) -> Float[Array, "mk n"]:
+    """The blocks in their places: dense, since products with it are then plain and fast."""
+    m, k, d = J.by_landmark.shape
+    here = slots[:, None] == jnp.arange(capacity)
+    own = jnp.where(here[:, None, :, None], J.by_landmark[:, :, None], 0.0)
+    shared = J.by_view @ J.view_by_core
+    return jnp.concatenate([shared.reshape(m * k, -1), own.reshape(m * k, capacity * d)], axis=1)
+
+
+def _rows(J: Blocks, B: Float[Array, "n r"]) -> Float[Array, "nl r"]:
+    """`J B` for every landmark in order, without the zeros: J has a block for each."""
     c, d = J.view_by_core.shape[1], J.by_landmark.shape[-1]
-    B_landmarks = B[c:].reshape(-1, d, B.shape[1])[slots]
-    product = J.by_view @ (J.view_by_core @ B[:c]) + J.by_landmark @ B_landmarks
-    return product.reshape(-1, B.shape[1])
+    by_view = _outer_products(J.by_view, J.view_by_core @ B[:c])
+    by_landmark = _outer_products(J.by_landmark, B[c:].reshape(-1, d, B.shape[1]))
+    return (by_view + by_landmark).reshape(-1, B.shape[1])
+
+
+def _outer_products(A: Float[Array, "*m k j"], B: Float[Array, "*m j r"]) -> Float[Array, "*m k r"]:
+    """`A B` for a small j as a sum over j, which XLA fuses to one vectorised loop.
+
+    Its batched product calls a matrix product for every small pair: twice the time on a CPU.
+    """
+    return functools.reduce(
+        operator.add, (A[..., i, None] * B[..., i, None, :] for i in range(A.shape[-1]))
+    )
 
 
 def _local_covariance(state: State, J: Blocks, slots) -> Float[Array, "m k k"]:
