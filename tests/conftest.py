@@ -6,6 +6,8 @@ import jax
 import pytest
 
 jax.config.update("jax_enable_x64", True)
+# Tests compile much and compute little.
+jax.config.update("jax_disable_most_optimizations", True)
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

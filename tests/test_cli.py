@@ -1,0 +1,90 @@
+"""Tests of the command line: files and their keys, errors of one line, resuming."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from jaxslam.cli import main
+
+SMALL = ["consistency", "--scenario", "matched-tight", "--steps", "5", "--runs", "6"]
+FILTER_KEYS = {
+    "dof", "band95", "nees", "nees_median", "lost", "inside", "nis", "nis_dof", "rmse", "sigma",
+    "landmark_nees", "landmark_dof", "diverged", "seconds",
+}  # fmt: skip
+
+
+def test_consistency_writes_what_others_read(tmp_path, capsys):
+    main([*SMALL, "--out", str(tmp_path), "--set", "pixel_sigma=0.4"])
+    summary = json.loads((tmp_path / "consistency.json").read_text())
+    assert summary["schema"] == 1
+    assert (summary["runs"], summary["steps"], summary["seed"]) == (6, 5, 0)
+    assert summary["scenario"]["pixel_sigma"] == 0.4
+    assert set(summary["filters"]) == {"robocentric/inverse_scaling", "robocentric/inverse_depth"}
+    for result in summary["filters"].values():
+        assert result.keys() >= FILTER_KEYS
+        assert len(result["nees"]) == len(result["lost"]) == 5
+    assert (tmp_path / "consistency.png").read_bytes().startswith(b"\x89PNG")
+    assert "robocentric/inverse_depth" in capsys.readouterr().out
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"consistency.json", "consistency.png", "runs"}
+
+
+def test_consistency_resumes_to_more_runs(tmp_path, capsys):
+    chunked = [*SMALL, "--out", str(tmp_path), "--chunk", "3", "--landmarks", "inverse_scaling"]
+    main(chunked)
+    first = json.loads((tmp_path / "consistency.json").read_text())
+    main([*chunked, "--resume"])
+    again = json.loads((tmp_path / "consistency.json").read_text())
+    name = "robocentric/inverse_scaling"
+    assert again["filters"][name]["nees"] == first["filters"][name]["nees"]
+    assert again["filters"][name]["seconds"]["run"] == 0
+    with pytest.raises(SystemExit) as stop:
+        main([*chunked, "--resume", "--seed", "1"])
+    assert stop.value.code == 2
+    assert "another seed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["consistency", "--runs", "0"], "runs must be at least 1, not 0"),
+        (["consistency", "--scenario", "cirle"], "did you mean circle?"),
+        (["consistency", "--scenario", "missing.toml"], "missing.toml does not exist"),
+        (["consistency", "--landmarks", "inverse_scale"], "did you mean inverse_scaling?"),
+        (["consistency", "--filters", "nothing"], "known: robocentric, world"),
+        (["consistency", "--calibration", "maybe"], "unknown calibration 'maybe'"),
+        (["consistency", "--set", "pixel_sigma=nan"], "pixel_sigma holds nan"),
+        (["consistency", "--set", "pixel_sigma"], "not of the form field=value"),
+        (["consistency", "--dtype", "int8"], "unknown dtype 'int8'"),
+        (["track", "/no/such/folder"], "/no/such/folder"),
+        (["track", "--reference", "truth.txt"], "need a SOURCE"),
+        (["track", "--frames", "0"], "frames"),
+        (["track", "--filter", "nothing"], "unknown filter 'nothing'"),
+    ],
+)
+def test_a_mistake_ends_with_status_2_and_one_line(arguments, message, tmp_path, capsys):
+    if arguments[0] == "track":
+        pytest.importorskip("cv2")
+    with pytest.raises(SystemExit) as stop:
+        main([*arguments, "--out", str(tmp_path / "out")])
+    error = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_library_imports_light_and_sets_nothing():
+    code = """
+import sys, jax
+before = dict(jax.config.values)
+import jaxslam
+heavy = {"matplotlib", "cv2", "evo", "tyro.cli", "jaxslam.vision", "jaxslam.plots"}
+assert not heavy & set(sys.modules), heavy & set(sys.modules)
+assert dict(jax.config.values) == before
+from jax._src import xla_bridge
+assert not xla_bridge.backends_are_initialized()
+"""
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)

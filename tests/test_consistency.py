@@ -1,0 +1,184 @@
+"""Tests of jaxslam.consistency: exact bands, chunking, divergence, resuming, the summary."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import jaxslam
+from jaxslam.consistency import FolderStore, MemoryStore, lost_threshold
+from jaxslam.consistency.statistics import chi2_cdf, chi2_quantile, normalised_squared
+
+SCENARIO = jaxslam.scenario("matched-tight", steps=6, landmarks=5)
+
+
+def filters(scenario=SCENARIO, names=("inverse_scaling",)):
+    return {
+        name: jaxslam.FILTERS["robocentric"](
+            scenario.world, jaxslam.LANDMARKS[name], scenario.calibration
+        )
+        for name in names
+    }
+
+
+def all_runs(study, name="inverse_scaling"):
+    parts = [study.store.load(name, chunk) for chunk in study.chunks]
+    return {
+        key: np.concatenate([part[key] for part in parts])
+        for key in parts[0]
+        if not key.startswith("sample_")
+    }
+
+
+@pytest.mark.parametrize(
+    ("dof", "runs", "low", "high"),
+    [
+        (3, 25, 2.118, 4.034),
+        (3, 100, 2.539, 3.499),
+        (3, 1000, 2.850, 3.154),
+        (3, 5000, 2.932, 3.068),
+        (6, 25, 4.719, 7.432),
+        (6, 1000, 5.787, 6.217),
+        (2, 1000, 1.878, 2.126),
+    ],
+)
+def test_bands_are_the_published_ones(dof, runs, low, high):
+    assert jaxslam.mean_band(dof, runs) == pytest.approx((low, high), abs=6e-4)
+
+
+def test_quantiles_are_those_of_scipy():
+    for dof in (1, 3, 6, 3000):
+        for q in (0.0001, 0.5, 0.9999):
+            assert chi2_quantile(q, dof) == pytest.approx(chi2.ppf(q, dof), rel=1e-9)
+            assert chi2_cdf(chi2_quantile(q, dof), dof) == pytest.approx(q, rel=1e-9)
+    assert lost_threshold(3) == pytest.approx(21.1, abs=0.02)
+
+
+def test_the_normalised_square_is_the_mahalanobis_distance_and_nan_if_there_is_none():
+    A = np.random.default_rng(0).normal(size=(4, 4))
+    P, e = A @ A.T, np.arange(4.0)
+    assert normalised_squared(e, P) == pytest.approx(e @ np.linalg.solve(P, e), rel=1e-9)
+    assert np.isnan(normalised_squared(e, -P))
+
+
+def test_chunks_do_not_matter_and_run_i_is_the_same_in_any_number_of_runs():
+    whole = all_runs(jaxslam.monte_carlo(SCENARIO, filters(), runs=7, chunk=7))
+    chunked = all_runs(jaxslam.monte_carlo(SCENARIO, filters(), runs=5, chunk=2))
+    for key, values in chunked.items():
+        # The same sums by another batch: rounding of 1e-16 through a covariance that spans 1e9.
+        np.testing.assert_allclose(values, whole[key][:5], rtol=1e-6, atol=1e-12, err_msg=key)
+
+
+def test_filters_meet_the_same_worlds():
+    study = jaxslam.monte_carlo(
+        SCENARIO, filters(names=("inverse_scaling", "inverse_depth")), runs=3
+    )
+    samples = [study.store.load(name, study.chunks[0]) for name in study.filters]
+    for key in ("sample_true_path", "sample_points"):
+        np.testing.assert_array_equal(samples[0][key], samples[1][key])
+    assert not np.array_equal(samples[0]["nees"], samples[1]["nees"])
+
+
+def test_a_diverged_run_is_counted_and_spoils_no_other():
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=6, chunk=3)
+    before = jaxslam.summarise(study)["filters"]["inverse_scaling"]
+    records = study.store.load("inverse_scaling", study.chunks[1])
+    broken = {**records, "nees": records["nees"].copy()}
+    broken["nees"][1, 3:] = np.nan
+    store = MemoryStore()
+    store.save("inverse_scaling", study.chunks[0], study.store.load("inverse_scaling", range(3)))
+    store.save("inverse_scaling", study.chunks[1], broken)
+    after = jaxslam.summarise(replace(study, store=store))["filters"]["inverse_scaling"]
+    good = np.delete(all_runs(study)["nees"], 4, axis=0)
+    assert (before["diverged"], after["diverged"]) == (0, 1)
+    np.testing.assert_allclose(after["nees"], good.mean(axis=0))
+    assert after["band95"] == list(jaxslam.mean_band(3, 5))
+    assert after["lost"][-1] == pytest.approx(before["lost"][-1] + 1 / 6)
+
+
+def test_the_summary_is_that_of_the_runs():
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=20, chunk=8)
+    summary = jaxslam.summarise(study)
+    result, runs = summary["filters"]["inverse_scaling"], all_runs(study)
+    np.testing.assert_allclose(result["nees"], runs["nees"].mean(axis=0))
+    np.testing.assert_allclose(result["nees_median"], np.median(runs["nees"], axis=0))
+    np.testing.assert_allclose(
+        result["rmse"]["position"], np.sqrt((runs["error"][..., :2] ** 2).sum(-1).mean(0))
+    )
+    np.testing.assert_allclose(
+        result["sigma"]["orientation"], np.sqrt(runs["variance"][..., 2].mean(0))
+    )
+    low, high = jaxslam.mean_band(3, 20)
+    inside = [low <= value <= high for value in result["nees"]]
+    assert result["inside"] == pytest.approx(np.mean(inside))
+    assert summary["steps"] == len(result["nees"]) == len(summary["time"]) == 6
+    assert "inverse_scaling" in jaxslam.table(summary)
+
+
+def test_a_study_resumes_from_its_folder_and_refuses_another(tmp_path):
+    manifest = {"seed": 0}
+    store = FolderStore(tmp_path, manifest, resume=False)
+    whole = jaxslam.monte_carlo(SCENARIO, filters(), runs=6, chunk=2, store=store)
+    expected = jaxslam.summarise(whole)["filters"]["inverse_scaling"]
+    next(tmp_path.glob("*/0000002-*.npz")).unlink()
+    done = []
+    again = jaxslam.monte_carlo(
+        SCENARIO,
+        filters(),
+        runs=6,
+        chunk=2,
+        store=FolderStore(tmp_path, manifest, resume=True),
+        progress=lambda name, runs: done.append(runs),
+    )
+    assert done == [2]
+    resumed = jaxslam.summarise(again)["filters"]["inverse_scaling"]
+    assert resumed["nees"] == expected["nees"]
+    with pytest.raises(ValueError, match=r"cannot resume: .* another seed"):
+        FolderStore(tmp_path, {"seed": 1}, resume=True)
+    FolderStore(tmp_path, {"seed": 1}, resume=False)
+    assert not list(tmp_path.glob("*/*.npz"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"runs": 0}, "runs must be at least 1, not 0"),
+        ({"chunk": 0}, "chunk must be at least 1"),
+        ({"seed": -1}, "seed must not be negative"),
+        ({"dtype": "float16"}, "unknown dtype 'float16'; known: float64, float32"),
+    ],
+)
+def test_sizes_that_make_no_sense_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        jaxslam.monte_carlo(SCENARIO, filters(), **arguments)
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize("name", ["matched-tight", "matched-6dof-tight"])
+def test_with_tight_noise_the_mean_nees_is_within_its_bounds(name):
+    """Bounds that a consistent filter leaves once in 10⁴ at one step: with 20 correlated steps
+    and two filters that all but agree, a false alarm for less than one seed in 500."""
+    scenario = jaxslam.scenario(name, steps=20)
+    study = jaxslam.monte_carlo(
+        scenario, filters(scenario, ("inverse_scaling", "inverse_depth")), runs=100, seed=1
+    )
+    dof = scenario.world.tangent_dim
+    low, high = jaxslam.mean_band(dof, 100, confidence=0.9999)
+    for result in jaxslam.summarise(study)["filters"].values():
+        assert (np.array(result["nees"]) > low).all()
+        assert (np.array(result["nees"]) < high).all()
+        landmark = np.array(result["landmark_nees"])
+        # 100 runs of many landmarks, correlated by the pose they share: within a tenth.
+        np.testing.assert_allclose(landmark.mean(), result["landmark_dof"], rtol=0.1)
+
+
+@pytest.mark.statistics
+def test_with_loose_noise_unified_inverse_depth_is_the_more_over_confident():
+    scenario = jaxslam.scenario("matched-loose", steps=40)
+    study = jaxslam.monte_carlo(
+        scenario, filters(scenario, ("inverse_scaling", "inverse_depth")), runs=100
+    )
+    results = jaxslam.summarise(study)["filters"]
+    scaling, depth = (results[name]["nees"][-1] for name in ("inverse_scaling", "inverse_depth"))
+    assert jaxslam.mean_band(3, 100, confidence=0.9999)[1] < scaling < depth / 2
