@@ -119,7 +119,7 @@ def _plot_map(axes: Axes, samples: dict[str, Any]) -> None:
     _set_view(axes, np.concatenate([truth, points[seen]])[:, [0, -1]])
     axes.set_xlabel("x, m")
     axes.set_ylabel("z, m")
-    axes.set_title("run 0 from above, 95 % regions seen from it", fontsize=9)
+    axes.set_title("run 0 from above, landmarks with 95 % regions", fontsize=9)
     axes.legend(fontsize=7, loc="best")
     axes.grid(alpha=0.25)
 
