@@ -24,6 +24,7 @@
 # so that whatever is inconsistent is the filter's fault.
 
 # %%
+# %matplotlib inline
 import os
 
 import numpy as np

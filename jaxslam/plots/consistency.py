@@ -116,7 +116,7 @@ def _plot_map(axes: Axes, samples: dict[str, Any]) -> None:
                 records["sample_landmarks"][slot], records["sample_landmarks_covariance"][slot]
             )
             axes.plot(*(path[-1, [0, -1], None] + region), lw=0.8, alpha=0.8, **style)
-    _set_view(axes, np.concatenate([truth, points[seen]])[:, [0, -1]])
+    _set_view(axes, truth[:, [0, -1]], points[seen][:, [0, -1]])
     axes.set_xlabel("x, m")
     axes.set_ylabel("z, m")
     axes.set_title("run 0 from above, landmarks with 95 % regions", fontsize=9)
@@ -124,11 +124,10 @@ def _plot_map(axes: Axes, samples: dict[str, Any]) -> None:
     axes.grid(alpha=0.25)
 
 
-def _set_view(axes: Axes, shown: np.ndarray) -> None:
-    """Show the path and the landmarks seen, but none of the very far ones."""
-    centre = np.median(shown, axis=0)
-    distance = np.linalg.norm(shown - centre, axis=1)
-    near = shown[distance <= 4 * np.median(distance) + 1e-9]
+def _set_view(axes: Axes, path: np.ndarray, points: np.ndarray) -> None:
+    """Show the path and the landmarks, but none of the very far ones."""
+    distance = np.linalg.norm(points - path.mean(axis=0), axis=1)
+    near = np.concatenate([path, points[distance <= 2.5 * np.median(distance)]])
     low, high = near.min(axis=0), near.max(axis=0)
     margin = 0.12 * (high - low).max()
     axes.set_xlim(low[0] - margin, high[0] + margin)
