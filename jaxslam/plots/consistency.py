@@ -64,7 +64,7 @@ def _plot_nees(axes: Axes, summary: dict[str, Any]) -> None:
     )
     axes.set_yscale("log")
     bottom, top = axes.get_ylim()
-    axes.set_ylim(min(bottom, first["dof"] / 2), max(top, first["dof"] * 2.5))
+    axes.set_ylim(min(bottom, first["dof"] / 2), max(2 * top, first["dof"] * 2.5))
     if axes.get_ylim()[1] < 100:
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
         axes.yaxis.set_major_formatter(ScalarFormatter())
@@ -80,7 +80,7 @@ def _plot_nees(axes: Axes, summary: dict[str, Any]) -> None:
 
 def _plot_errors(axes: list[Axes], samples: dict[str, Any], time: np.ndarray, n: int) -> None:
     positions = ["x", "z"] if n == 2 else ["x", "y", "z"]
-    rotations = ["θ"] if n == 2 else ["about x", "about y", "about z"]
+    rotations = ["θ"] if n == 2 else ["rotation about x", "rotation about y", "rotation about z"]
     for axis, ax in enumerate(axes):
         position = axis < n
         scale = 1.0 if position else 180 / np.pi
