@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ from jaxslam.consistency.montecarlo import check_sizes
 from jaxslam.files import write_atomically
 from jaxslam.filters import CALIBRATIONS, FILTERS, SlamFilter
 from jaxslam.landmarks import LANDMARKS
+from jaxslam.names import suggestion
 from jaxslam.simulation.scenario import BUILT_IN, Scenario, parse_override, scenario
 
 LAYOUT = 1
@@ -130,8 +130,7 @@ class ConsistencyOptions:
 def _chosen(option: str, names: Iterable[str], known: Mapping[str, Any]) -> dict[str, Any]:
     for name in names:
         if name not in known:
-            close = difflib.get_close_matches(name, known, n=1)
-            meant = f" (did you mean {close[0]}?)" if close else ""
+            meant = suggestion(name, known)
             raise ValueError(f"unknown --{option} {name!r}{meant}; known: {', '.join(known)}")
     chosen = {name: known[name] for name in names}
     if not chosen:

@@ -11,6 +11,7 @@ import tyro
 
 from jaxslam.filters import CALIBRATIONS, FILTERS
 from jaxslam.landmarks import LANDMARKS
+from jaxslam.vision.settings import TrackerSettings
 
 
 @dataclass(frozen=True)
@@ -31,22 +32,24 @@ class TrackOptions:
     """Seed of the synthetic video; nothing else is random."""
     rate: float = 30.0
     """Frames per second of a folder of images without timestamps."""
-    filter: Annotated[str, tyro.conf.arg(help=f"Filter: {', '.join(FILTERS)}.")] = "world"
+    filter: Annotated[str, tyro.conf.arg(help=f"Filter: {', '.join(FILTERS)}.")] = (
+        TrackerSettings.filter
+    )
     landmarks: Annotated[
         str, tyro.conf.arg(help=f"Landmark parametrization: {', '.join(LANDMARKS)}.")
-    ] = "inverse_scaling"
+    ] = TrackerSettings.landmarks
     calibration_treatment: Annotated[
         str, tyro.conf.arg(help=f"How the filter treats it: {', '.join(CALIBRATIONS)}.")
-    ] = "known"
-    nearest_depth: float = 1.0
+    ] = TrackerSettings.calibration
+    nearest_depth: float = TrackerSettings.nearest_depth
     """d_min, which sets the unit of the map: the prior on depth reaches from here to infinity."""
-    pixel_sigma: float = 0.3
+    pixel_sigma: float = TrackerSettings.pixel_sigma
     """Standard deviation of a match, pixels."""
-    acceleration_sigma: float = 1.0
+    acceleration_sigma: float = TrackerSettings.acceleration_sigma
     """Standard deviation of the linear acceleration, map units/s²."""
-    angular_acceleration_sigma: float = 2.0
+    angular_acceleration_sigma: float = TrackerSettings.angular_acceleration_sigma
     """Standard deviation of the angular acceleration, rad/s²."""
-    wanted: int = 50
+    wanted: int = TrackerSettings.wanted
     """Landmarks to keep in view."""
 
     def run(self) -> None:
@@ -92,8 +95,6 @@ class TrackOptions:
         return synthetic_source(frames=150 if self.frames is None else self.frames, seed=self.seed)
 
     def _settings(self):
-        from jaxslam.vision.settings import TrackerSettings
-
         return TrackerSettings(
             filter=self.filter,
             landmarks=self.landmarks,

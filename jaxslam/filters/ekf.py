@@ -252,7 +252,7 @@ def core_covariance(function: Callable[[Any], Any], state: State) -> tuple[Any, 
 
 
 def _residuals(model, state, features, context):
-    """Predictions, residuals, which features are used, and H, the latter two zero elsewhere."""
+    """Predictions, residuals, which features are used, and H; zero where one is not."""
     predicted, in_front, H = _observe(model, state, features.slots, context)
     used = features.valid & in_front & state.active[features.slots]
     residual = jnp.where(used[:, None], features.pixels - predicted, 0.0)

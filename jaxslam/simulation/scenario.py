@@ -7,7 +7,6 @@ either with some fields replaced. All are checked by one function, which names t
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import tomllib
 from collections.abc import Mapping
@@ -17,6 +16,7 @@ from typing import Any
 
 from jaxslam.filters import CALIBRATIONS
 from jaxslam.geometry import GEOMETRIES, Geometry
+from jaxslam.names import suggestion
 
 Numbers = tuple[float, ...]
 
@@ -93,7 +93,7 @@ def scenario(
         chosen = _read(Path(name))
     else:
         raise ValueError(
-            f"unknown scenario {str(name)!r}{_meant(str(name), BUILT_IN)}; known: "
+            f"unknown scenario {str(name)!r}{suggestion(str(name), BUILT_IN)}; known: "
             f"{', '.join(BUILT_IN)}, or a .toml file"
         )
     return _replaced(chosen, {**(overrides or {}), **fields})
@@ -129,7 +129,8 @@ def _replaced(chosen: Scenario, fields: Mapping[str, Any]) -> Scenario:
     for field, value in fields.items():
         if field not in known:
             raise ValueError(
-                f"unknown scenario field {field!r}{_meant(field, known)}; known: {', '.join(known)}"
+                f"unknown scenario field {field!r}{suggestion(field, known)}; "
+                f"known: {', '.join(known)}"
             )
         known[field] = _coerced(field, value, known[field])
     return Scenario(**known)
@@ -214,11 +215,6 @@ def _check_numbers(field: str, value: Any) -> None:
         raise ValueError(f"scenario field {field} must be positive, not {value}")
     if field in _NOT_NEGATIVE and value < 0:
         raise ValueError(f"scenario field {field} must not be negative, not {value}")
-
-
-def _meant(word: str, known: Any) -> str:
-    close = difflib.get_close_matches(word, list(known), n=1)
-    return f" (did you mean {close[0]}?)" if close else ""
 
 
 _PLANAR_NOISE = {
