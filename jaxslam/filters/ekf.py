@@ -88,12 +88,18 @@ def marginalise(state: State, start: int, size: int) -> State:
 
 
 def update(
-    model: Model, state: State, features: Features, noise: Float[Array, "p p"], context: Any
+    model: Model,
+    state: State,
+    features: Features,
+    noise: Float[Array, "p p"],
+    context: Any,
+    considered: slice = slice(0, 0),
 ) -> tuple[State, Innovation]:
     """The Kalman update by all features at once (P16, P17), in Joseph form.
 
     `noise` is the covariance R of one measurement. A feature that is not valid, not in the map
-    or predicted behind the camera changes nothing.
+    or predicted behind the camera changes nothing. The `considered` numbers of the core count
+    with their covariance but have no gain (Schmidt, 1966).
     """
     predicted, residual, used, H = _residuals(model, state, features, context)
     P = state.covariance
@@ -105,7 +111,7 @@ def update(
     whitening = solve_triangular(
         jnp.linalg.cholesky(S), jnp.eye(S.shape[0], dtype=S.dtype), lower=True
     )
-    K = (HP.T @ whitening.T) @ whitening
+    K = ((HP.T @ whitening.T) @ whitening).at[considered].set(0.0)
     whitened = whitening @ residual.ravel()
 
     # Joseph's (I - KH) P (I - KH)ᵀ + K R Kᵀ, multiplied out from the left: two products of
@@ -118,13 +124,19 @@ def update(
 
 
 def update_mean(
-    model: Model, state: State, features: Features, noise: Float[Array, "p p"], context: Any
+    model: Model,
+    state: State,
+    features: Features,
+    noise: Float[Array, "p p"],
+    context: Any,
+    considered: slice = slice(0, 0),
 ) -> State:
     """The mean that `update` would give, with the covariance left as it is."""
     _, residual, used, H = _residuals(model, state, features, context)
     HP = H @ state.covariance
     S = HP @ H.T + _noise_matrix(noise, used)
-    return _shifted(state, HP.T @ jnp.linalg.solve(S, residual.ravel()))
+    delta = HP.T @ jnp.linalg.solve(S, residual.ravel())
+    return _shifted(state, delta.at[considered].set(0.0))
 
 
 def predict_features(

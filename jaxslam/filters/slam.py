@@ -21,7 +21,9 @@ from jaxslam.geometry import Geometry, Pose, log
 from jaxslam.landmarks.parametrization import Parametrization
 from jaxslam.motion import displacement, next_velocity
 
-CALIBRATIONS = ("white", "known")
+CALIBRATIONS = ("white", "consider", "estimated", "known")
+"""The paper's independent draw of every frame; constant and correlated but not corrected
+(Schmidt); constant and estimated; exact."""
 
 
 @jax.tree_util.register_dataclass
@@ -230,13 +232,15 @@ class SlamFilter:
         )
         n = state.core_dim + capacity * empty.size
         state = replace(state, covariance=jnp.zeros((n, n), dtype))
-        return ekf.augment(state, t, jnp.diag(jnp.asarray(velocity_sigma, dtype) ** 2))
+        state = ekf.augment(state, t, jnp.diag(jnp.asarray(velocity_sigma, dtype) ** 2))
+        return state if self.calibration == "white" else self._with_calibration(state, parameters)
 
     def predict(self, state: State, parameters: Parameters, dt: Float[Array, ""]) -> State:
         """Append this step's acceleration and calibration error (P10, P11, P15)."""
         t = self.geometry.tangent_dim
         state = ekf.augment(state, 2 * t, jnp.diag(parameters.acceleration_sigma**2))
-        state = self._with_calibration(state, parameters)
+        if self.calibration == "white":
+            state = self._with_calibration(state, parameters)
         return (
             ekf.compose(self.model, state, Context(parameters, dt)) if self.compose_first else state
         )
@@ -246,14 +250,16 @@ class SlamFilter:
     ) -> tuple[State, Innovation]:
         """Correct by the features seen (P16, P17)."""
         context = self._context(parameters, dt)
-        return ekf.update(self.model, state, features, parameters.pixel_covariance, context)
+        noise = parameters.pixel_covariance
+        return ekf.update(self.model, state, features, noise, context, self._considered(state))
 
     def update_mean(
         self, state: State, parameters: Parameters, dt: Float[Array, ""], features: Features
     ) -> State:
         """`update` without its covariance: cheap enough to try many hypotheses."""
         context = self._context(parameters, dt)
-        return ekf.update_mean(self.model, state, features, parameters.pixel_covariance, context)
+        noise = parameters.pixel_covariance
+        return ekf.update_mean(self.model, state, features, noise, context, self._considered(state))
 
     def project(
         self, state: State, parameters: Parameters, dt: Float[Array, ""], slots: Array
@@ -284,14 +290,17 @@ class SlamFilter:
         return ekf.initialise(self.model, state, features, noise, prior, context)
 
     def finish(self, state: State) -> State:
-        """Forget the frame's calibration error: the next frame draws another (white)."""
+        """Forget the frame's calibration error where the next frame draws another (white)."""
+        if self.calibration != "white":
+            return state
         start, size = 3 * self.geometry.tangent_dim, state.core.calibration.size
         core = replace(state.core, calibration=jnp.zeros_like(state.core.calibration))
         return replace(ekf.marginalise(state, start, size), core=core)
 
     def first(self, state: State, parameters: Parameters, new: Features) -> State:
         """Frame 0: nothing has moved, everything seen is new."""
-        state = self._with_calibration(state, parameters)
+        if self.calibration == "white":
+            state = self._with_calibration(state, parameters)
         return self.finish(self.initialise(state, parameters, new))
 
     def step(
@@ -382,6 +391,12 @@ class SlamFilter:
             return state
         covariance = jnp.diag(parameters.intrinsics_sigma**2)
         return ekf.augment(state, 3 * self.geometry.tangent_dim, covariance)
+
+    def _considered(self, state: State) -> slice:
+        """The part of the core that updates leave as it is."""
+        start = 3 * self.geometry.tangent_dim
+        size = state.core.calibration.size if self.calibration == "consider" else 0
+        return slice(start, start + size)
 
     def _context(self, parameters: Parameters, dt) -> Context:
         return _composed(parameters) if self.compose_first else Context(parameters, dt)
