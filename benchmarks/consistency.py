@@ -44,13 +44,9 @@ def measure(name: str, options: Options) -> dict:
     """All seeds of one scenario."""
     fields = {} if options.steps is None else {"steps": options.steps}
     scenario = jaxslam.scenario(name, **fields)
-    filters = {
-        f"{f}/{landmarks}": jaxslam.FILTERS[f](
-            scenario.world, jaxslam.LANDMARKS[landmarks], scenario.calibration
-        )
-        for f in options.filters
-        for landmarks in options.landmarks
-    }
+    filters = jaxslam.make_filters(
+        scenario.rig, options.filters, options.landmarks, scenario.calibration
+    )
     seeds = []
     for seed in range(options.first_seed, options.first_seed + options.seeds):
         study = jaxslam.monte_carlo(scenario, filters, runs=options.runs, seed=seed)

@@ -66,10 +66,10 @@ def dense_step(f: SlamFilter, state: State, p, dt, seen: Features) -> State:
         ).ravel()
 
     zero = jnp.zeros(state.covariance.shape[0])
-    valid = jnp.repeat(seen.valid, seen.pixels.shape[1])
+    valid = jnp.repeat(seen.valid, seen.measured.shape[1])
     H = jnp.where(valid[:, None], jax.jacfwd(stack)(zero), 0.0)
-    residual = jnp.where(valid, seen.pixels.ravel() - stack(zero), 0.0)
-    R = jnp.diag(jnp.where(valid, p.pixel_sigma**2, 1.0))
+    residual = jnp.where(valid, seen.measured.ravel() - stack(zero), 0.0)
+    R = jnp.diag(jnp.where(valid, p.measurement_sigma**2, 1.0))
     P = state.covariance
     S = H @ P @ H.T + R
     K = jnp.linalg.solve(S, H @ P).T
@@ -108,9 +108,7 @@ def block_step(f: SlamFilter, state: State, p, dt, seen: Features) -> State:
 def prepared(options: Options, size: int):
     """Filter, parameters, and a batch of started states with the features of all frames."""
     scenario = jaxslam.scenario("matched", steps=options.steps, landmarks=size)
-    f = jaxslam.FILTERS["robocentric"](
-        scenario.world, jaxslam.LANDMARKS[options.landmarks], "known"
-    )
+    f = jaxslam.FILTERS["robocentric"](scenario.rig, jaxslam.LANDMARKS[options.landmarks], "known")
     p = parameters(scenario)
     capacity = Sightings(landmarks=size, first=size, known=SEEN, new=1)
 

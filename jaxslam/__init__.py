@@ -9,7 +9,7 @@ __version__ = "0.1.0"
 
 from jaxslam.camera import Camera
 from jaxslam.consistency import mean_band, monte_carlo, summarise, table
-from jaxslam.filters import FILTERS, Features, Parameters, SlamFilter, State
+from jaxslam.filters import FILTERS, Features, Parameters, SlamFilter, State, make_filters
 from jaxslam.geometry import PLANAR, SPATIAL
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.simulation import Scenario, scenario, simulate
@@ -26,6 +26,7 @@ __all__ = [
     "SlamFilter",
     "State",
     "__version__",
+    "make_filters",
     "mean_band",
     "monte_carlo",
     "scenario",

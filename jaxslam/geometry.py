@@ -37,6 +37,11 @@ class Geometry:
         return self.group.tangent_dim
 
     @property
+    def rotation_group(self) -> type[jaxlie.SO2] | type[jaxlie.SO3]:
+        """SO(2) or SO(3)."""
+        return jaxlie.SO2 if self.group is jaxlie.SE2 else jaxlie.SO3
+
+    @property
     def pixel_dim(self) -> int:
         """Coordinates of a pixel: u, or (u, v)."""
         return self.point_dim - 1
@@ -52,6 +57,11 @@ SPATIAL = Geometry("spatial", jaxlie.SE3, 3)
 GEOMETRIES = {geometry.name: geometry for geometry in (PLANAR, SPATIAL)}
 
 
+def identity(geometry: Geometry, dtype) -> Pose:
+    """The identity pose in a dtype; jaxlie's own has the default one."""
+    return jax.tree.map(lambda x: x.astype(dtype), geometry.group.identity())
+
+
 def _is_pose(leaf: Any) -> bool:
     return isinstance(leaf, jaxlie.MatrixLieGroup)
 
@@ -65,13 +75,44 @@ def tangent_dim(tree: Any) -> int:
     return sum(_sizes(jax.tree.leaves(tree, is_leaf=_is_pose)))
 
 
-def exp(group: type[Pose], delta: Float[Array, " t"]) -> Pose:
-    """`Exp(δ)` of SE(2) or SE(3), with derivatives that are exact at and near zero rotation.
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class SplitPose:
+    """A pose whose position and orientation are perturbed apart: `t + δt`, `R Exp(δθ)`.
+
+    The error state of the classical EKF-SLAM: the position's error is along the axes of the
+    frame that the pose maps to, not turned with the estimated orientation.
+    """
+
+    translation: Float[Array, " n"]
+    rotation: jaxlie.SO2 | jaxlie.SO3
+
+    @staticmethod
+    def of(pose: Pose) -> SplitPose:
+        return SplitPose(pose.translation(), pose.rotation())
+
+    def joined(self) -> Pose:
+        return joined(self.rotation, self.translation)
+
+
+def joined(rotation: jaxlie.SO2 | jaxlie.SO3, translation: Float[Array, " n"]) -> Pose:
+    """The pose (R, t)."""
+    if isinstance(rotation, jaxlie.SO2):
+        return jaxlie.SE2.from_rotation_and_translation(rotation, translation)
+    return jaxlie.SE3.from_rotation_and_translation(rotation, translation)
+
+
+def exp(group: type[jaxlie.MatrixLieGroup], delta: Float[Array, " t"]) -> Any:
+    """`Exp(δ)` of SO(n) or SE(n), with derivatives that are exact at and near zero rotation.
 
     SE(3): `t = v + B ω×v + C ω×(ω×v)`, B = (1 − cos θ)/θ², C = (θ − sin θ)/θ³ (Barfoot, State
     Estimation for Robotics, §7.1). jaxlie's own takes V = R at small angles, whose derivative by
     ω is twice the true one.
     """
+    if group is jaxlie.SO2:
+        return jaxlie.SO2.from_radians(delta[0])
+    if group is jaxlie.SO3:
+        return _turn(delta)
     if group is jaxlie.SE2:
         v, theta = delta[:2], delta[2]
         half = theta / 2
@@ -80,23 +121,30 @@ def exp(group: type[Pose], delta: Float[Array, " t"]) -> Pose:
         return jaxlie.SE2.from_rotation_and_translation(jaxlie.SO2.from_radians(theta), chord)
     v, omega = delta[:3], delta[3:]
     s = omega @ omega
-    half_sinc = _sinc(s / 4)
-    wxyz = jnp.concatenate([_cos(s / 4)[None], half_sinc * omega / 2])
     turned = jnp.cross(omega, v)
-    translation = v + half_sinc**2 / 2 * turned + _third(s) * jnp.cross(omega, turned)
-    return jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3(wxyz), translation)
+    translation = v + _sinc(s / 4) ** 2 / 2 * turned + _third(s) * jnp.cross(omega, turned)
+    return jaxlie.SE3.from_rotation_and_translation(_turn(omega), translation)
 
 
-def log(pose: Pose) -> Float[Array, " t"]:
+def _turn(omega: Float[Array, " 3"]) -> jaxlie.SO3:
+    s = omega @ omega
+    return jaxlie.SO3(jnp.concatenate([_cos(s / 4)[None], _sinc(s / 4) * omega / 2]))
+
+
+def log(pose: Any) -> Float[Array, " t"]:
     """`Log(T)`, the inverse of `exp`: exact to rounding at small angles, for θ below π."""
+    if isinstance(pose, jaxlie.SO2):
+        return pose.as_radians()[None]
+    if isinstance(pose, jaxlie.SO3):
+        sign = jnp.where(pose.wxyz[0] < 0, -1.0, 1.0)
+        w, xyz = sign * pose.wxyz[0], sign * pose.wxyz[1:]
+        return 2 * _angle_by_sine(xyz @ xyz, w) * xyz
     rotation, t = pose.rotation(), pose.translation()
     if isinstance(rotation, jaxlie.SO2):
         half = rotation.as_radians() / 2
         v = (jaxlie.SO2.from_radians(-half) @ t) / _sinc(half**2)
         return jnp.append(v, 2 * half)
-    sign = jnp.where(rotation.wxyz[0] < 0, -1.0, 1.0)
-    w, xyz = sign * rotation.wxyz[0], sign * rotation.wxyz[1:]
-    omega = 2 * _angle_by_sine(xyz @ xyz, w) * xyz
+    omega = log(rotation)
     turned = jnp.cross(omega, t)
     v = t - turned / 2 + _inverse_third(omega @ omega) * jnp.cross(omega, turned)
     return jnp.concatenate([v, omega])
@@ -187,23 +235,24 @@ def zero_tangent(tree: Any) -> Float[Array, " t"]:
     return jnp.zeros(tangent_dim(tree), jnp.result_type(*jax.tree.leaves(tree)))
 
 
-def _first_order_exp(group: type[Pose], delta: Float[Array, " t"]) -> Pose:
-    one = jnp.ones(1, delta.dtype)
-    if group is jaxlie.SE2:
-        rotation = jaxlie.SO2(jnp.concatenate([one, delta[2:]]))
-        return jaxlie.SE2.from_rotation_and_translation(rotation, delta[:2])
-    rotation = jaxlie.SO3(jnp.concatenate([one, delta[3:] / 2]))
-    return jaxlie.SE3.from_rotation_and_translation(rotation, delta[:3])
+def _first_order_exp(group: type[jaxlie.MatrixLieGroup], delta: Float[Array, " t"]) -> Any:
+    if group is jaxlie.SO2:
+        return jaxlie.SO2(jnp.concatenate([jnp.ones(1, delta.dtype), delta]))
+    if group is jaxlie.SO3:
+        return jaxlie.SO3(jnp.concatenate([jnp.ones(1, delta.dtype), delta / 2]))
+    n, turn = (2, jaxlie.SO2) if group is jaxlie.SE2 else (3, jaxlie.SO3)
+    return joined(_first_order_exp(turn, delta[n:]), delta[:n])
 
 
-def _first_order_log(step: Pose) -> Float[Array, " t"]:
-    rotation = step.rotation()
-    if isinstance(rotation, jaxlie.SO2):
-        return jnp.concatenate([step.translation(), rotation.unit_complex[1:]])
-    return jnp.concatenate([step.translation(), 2 * rotation.wxyz[1:]])
+def _first_order_log(step: Any) -> Float[Array, " t"]:
+    if isinstance(step, jaxlie.SO2):
+        return step.unit_complex[1:]
+    if isinstance(step, jaxlie.SO3):
+        return jnp.asarray(step.wxyz[1:]) * 2
+    return jnp.concatenate([step.translation(), _first_order_log(step.rotation())])
 
 
-def _moved(tree: Any, delta: Float[Array, " t"], move: Callable[[Pose, Array], Pose]) -> Any:
+def _moved(tree: Any, delta: Float[Array, " t"], move: Callable[[Any, Array], Any]) -> Any:
     leaves, structure = jax.tree.flatten(tree, is_leaf=_is_pose)
     moved, start = [], 0
     for leaf, size in zip(leaves, _sizes(leaves), strict=True):
@@ -213,7 +262,7 @@ def _moved(tree: Any, delta: Float[Array, " t"], move: Callable[[Pose, Array], P
     return jax.tree.unflatten(structure, moved)
 
 
-def _compared(tree: Any, origin: Any, log: Callable[[Pose], Array]) -> Float[Array, " t"]:
+def _compared(tree: Any, origin: Any, log: Callable[[Any], Array]) -> Float[Array, " t"]:
     leaves = jax.tree.leaves(tree, is_leaf=_is_pose)
     origins = jax.tree.leaves(origin, is_leaf=_is_pose)
     parts = [

@@ -38,12 +38,8 @@ RUNS = 200 if os.environ.get("JAXSLAM_REDUCED") else 1000
 
 def study(name):
     scenario = jaxslam.scenario(name)
-    filters = {
-        landmarks: jaxslam.FILTERS["robocentric"](
-            scenario.world, jaxslam.LANDMARKS[landmarks], scenario.calibration
-        )
-        for landmarks in ("inverse_scaling", "inverse_depth")
-    }
+    landmarks = ["inverse_scaling", "inverse_depth"]
+    filters = jaxslam.make_filters(scenario.rig, ["robocentric"], landmarks, scenario.calibration)
     return jaxslam.monte_carlo(scenario, filters, runs=RUNS, seed=0)
 
 
@@ -88,5 +84,5 @@ display(plot_consistency(loose_study, loose))
 # %%
 final = {name: result["nees"][-1] for name, result in loose["filters"].items()}
 print(final)
-assert final["inverse_scaling"] > jaxslam.mean_band(3, RUNS)[1]
-assert final["inverse_depth"] > 2 * final["inverse_scaling"]
+assert final["robocentric/inverse_scaling"] > jaxslam.mean_band(3, RUNS)[1]
+assert final["robocentric/inverse_depth"] > 2 * final["robocentric/inverse_scaling"]

@@ -119,7 +119,7 @@ class Case:
 
     def filter(self, kind, landmark, calibration=None):
         calibration = calibration or self.scenario.calibration
-        return FILTERS[kind](self.scenario.world, LANDMARKS[landmark], calibration)
+        return FILTERS[kind](self.scenario.rig, LANDMARKS[landmark], calibration)
 
     @cache  # noqa: B019 - cases live as long as the tests
     def compiled(self, kind, landmark, calibration=None):

@@ -16,7 +16,7 @@ SCENARIO = jaxslam.scenario("matched-tight", steps=6, landmarks=5)
 def filters(scenario=SCENARIO, names=("inverse_scaling",)):
     return {
         name: jaxslam.FILTERS["robocentric"](
-            scenario.world, jaxslam.LANDMARKS[name], scenario.calibration
+            scenario.rig, jaxslam.LANDMARKS[name], scenario.calibration
         )
         for name in names
     }
@@ -163,7 +163,7 @@ def test_with_tight_noise_the_mean_nees_is_within_its_bounds(name):
     study = jaxslam.monte_carlo(
         scenario, filters(scenario, ("inverse_scaling", "inverse_depth")), runs=100, seed=1
     )
-    dof = scenario.world.tangent_dim
+    dof = scenario.rig.geometry.tangent_dim
     low, high = jaxslam.mean_band(dof, 100, confidence=0.9999)
     for result in jaxslam.summarise(study)["filters"].values():
         assert (np.array(result["nees"]) > low).all()

@@ -299,8 +299,8 @@ def slam_parameters(geometry):
     return Parameters(
         camera=Camera(jnp.array([650.0, 640.0])[:p], jnp.array([320.0, 240.0])[:p]),
         intrinsics_sigma=jnp.array([3.0, 3.0, 2.0, 2.0][: 2 * p]),
-        pixel_sigma=jnp.asarray(0.3),
-        acceleration_sigma=jnp.full(t, 0.1),
+        measurement_sigma=jnp.asarray(0.3),
+        motion_sigma=jnp.full(t, 0.1),
         inverse_depth=jnp.asarray(1 / 6),
         inverse_depth_sigma=jnp.asarray(1 / 12),
     )

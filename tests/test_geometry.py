@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from jaxslam.geometry import PLANAR, difference, exp, jacobian, log, retract, tangent_dim
-from jaxslam.motion import displacement
+from jaxslam.motion import CONSTANT_VELOCITY
 
 # Rotation vectors shorter than π have one logarithm; with |δ| ≤ 1 per axis, √3 at the most.
 # Multiples of 1/64 include 0 and keep clear of tiny angles, which have a test of their own.
@@ -111,7 +111,9 @@ def step_aside(geometry, dtype):
 
     def aside(angle):
         velocity = jnp.zeros(t, dtype).at[0].set(1).at[-1].set(angle)
-        step = displacement(geometry, velocity, jnp.zeros(t, dtype), jnp.ones((), dtype))
+        step = CONSTANT_VELOCITY.displacement(
+            geometry, velocity, jnp.zeros(t, dtype), jnp.ones((), dtype)
+        )
         return step.translation()[1]
 
     return quick_jit(jax.value_and_grad(aside))

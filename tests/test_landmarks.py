@@ -34,7 +34,7 @@ def functions(landmark):
         return point / omega
 
     return (
-        quick_jit(lambda b, w: landmark.initialise(b, w, jnp.asarray(FOCAL))),
+        quick_jit(lambda b, w: landmark.initialise(jnp.append(b, 1.0), w, jnp.asarray(FOCAL))),
         quick_jit(landmark.transform),
         quick_jit(landmark.homogeneous),
         quick_jit(euclidean),
@@ -94,7 +94,7 @@ def test_derivatives_agree_with_central_differences(landmark, geometry):
     p = geometry.pixel_dim
 
     def first_seen(x):
-        return landmark.initialise(x[:p], x[p], jnp.asarray(FOCAL))
+        return landmark.initialise(jnp.append(x[:p], 1.0), x[p], jnp.asarray(FOCAL))
 
     def moved_by(delta):
         return landmark.transform(T @ geometry.group.exp(delta), parameters)

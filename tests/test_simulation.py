@@ -124,11 +124,11 @@ def test_the_filter_starts_from_the_true_priors():
     numbers = parameters(chosen)
     assert numbers.inverse_depth == 1 / 4
     assert numbers.inverse_depth_sigma == 1 / 8
-    assert numbers.pixel_sigma == 0.3
+    assert numbers.measurement_sigma == 0.3
     np.testing.assert_array_equal(numbers.intrinsics_sigma, [3, 3, 2, 2])
     np.testing.assert_array_equal(numbers.camera.intrinsics, [650, 650, 320, 240])
-    np.testing.assert_array_equal(numbers.acceleration_sigma, chosen.acceleration_sigma)
-    assert parameters(chosen, jnp.float32).pixel_sigma.dtype == jnp.float32
+    np.testing.assert_array_equal(numbers.motion_sigma, chosen.acceleration_sigma)
+    assert parameters(chosen, jnp.float32).measurement_sigma.dtype == jnp.float32
 
 
 # --- overrides and files ------------------------------------------------------------------------
@@ -272,7 +272,7 @@ def test_a_run_does_not_depend_on_its_batch():
         # Rounding of pixels and metres, should the compiler vectorise another way.
         np.testing.assert_allclose(a[4], b[1], rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(a[4], c, rtol=1e-12, atol=1e-12)
-    assert np.abs(whole.pixels[4] - whole.pixels[3]).max() > 0.1
+    assert np.abs(whole.measured[4] - whole.measured[3]).max() > 0.1
 
 
 def pixels_without_noise(runs, chosen):
@@ -300,7 +300,7 @@ def test_pixel_noise_has_the_stated_sigma():
     chosen = scenario("matched-6dof", pixel_sigma=0.7)
     runs = batch(chosen, 10)
     ideal, _ = pixels_without_noise(runs, chosen)
-    noise = np.asarray(runs.pixels - ideal)[np.asarray(runs.visible)] / 0.7
+    noise = np.asarray(runs.measured - ideal)[np.asarray(runs.visible)] / 0.7
     assert noise.size > 10_000
     two_sided(np.sum(noise**2), noise.size)
     centred(noise)
@@ -382,7 +382,7 @@ def test_true_intrinsics_are_drawn_as_stated():
         runs = batch(chosen, 40)
         ideal, seen = pixels_without_noise(runs, chosen)
         bearings = np.asarray(seen[..., 0] / seen[..., 1])
-        deviation = np.asarray(runs.pixels - ideal)[..., 0]
+        deviation = np.asarray(runs.measured - ideal)[..., 0]
         ones = np.ones_like(bearings)
         A = np.stack([bearings, ones], axis=-1)
         deltas = np.einsum("rfip,rfp->rfi", np.linalg.pinv(A), deviation) / np.array([3.0, 2.0])
@@ -410,7 +410,7 @@ def circling():
 
 def test_every_visible_landmark_is_a_feature_exactly_once():
     _, run, most, (first, known, new) = circling()
-    visible, pixels = np.asarray(run.visible), np.asarray(run.pixels)
+    visible, pixels = np.asarray(run.visible), np.asarray(run.measured)
     frames = [[first]] + [
         [jax.tree.map(lambda x, k=k: x[k], part) for part in (known, new)]
         for k in range(len(visible) - 1)
@@ -420,7 +420,9 @@ def test_every_visible_landmark_is_a_feature_exactly_once():
         inserted = set()
         for part, is_new in zip(parts, [True] if k == 0 else [False, True], strict=True):
             for slot, pixel in zip(
-                np.asarray(part.slots)[part.valid], np.asarray(part.pixels)[part.valid], strict=True
+                np.asarray(part.slots)[part.valid],
+                np.asarray(part.measured)[part.valid],
+                strict=True,
             ):
                 assert (slot in in_map) != is_new
                 found[k, slot] += 1

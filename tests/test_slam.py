@@ -20,7 +20,7 @@ DT = 0.1
 @cache
 def composer(geometry, landmark, frame):
     """`(pose, velocity, acceleration, landmark) → the same after the motion`, no covariance."""
-    model = SlamModel(geometry, landmark, frame)
+    model = SlamModel(Rig(geometry), landmark, frame)
     context = Context(None, jnp.asarray(DT))
 
     def compose(pose, velocity, acceleration, parameters):
@@ -38,7 +38,7 @@ def composer(geometry, landmark, frame):
 def a_landmark(geometry, landmark):
     def make():
         bearing = jnp.array([0.3, -0.2])[: geometry.pixel_dim]
-        seen = landmark.initialise(bearing, jnp.asarray(0.2), jnp.asarray(650.0))
+        seen = landmark.initialise(jnp.append(bearing, 1.0), jnp.asarray(0.2), jnp.asarray(650.0))
         return landmark.transform(pose(geometry, 1), seen)
 
     return quick_jit(make)()
@@ -115,8 +115,8 @@ def test_robocentric_and_world_agree_where_the_problem_is_linear():
         parameters = case.parameters()
         parameters = replace(
             parameters,
-            acceleration_sigma=parameters.acceleration_sigma * scale,
-            pixel_sigma=parameters.pixel_sigma * scale,
+            motion_sigma=parameters.motion_sigma * scale,
+            measurement_sigma=parameters.measurement_sigma * scale,
             inverse_depth_sigma=parameters.inverse_depth_sigma * scale,
         )
         slots, valid = known.slots, known.valid
@@ -172,8 +172,8 @@ def test_one_trace_serves_every_call_of_a_step():
         )
     )
     state, compiled = start(case.parameters(), first), quick_jit(step)
-    for k, pixel_sigma in enumerate((0.3, 0.5, 1.0)):
-        parameters = replace(case.parameters(), pixel_sigma=jnp.asarray(pixel_sigma))
+    for k, measurement_sigma in enumerate((0.3, 0.5, 1.0)):
+        parameters = replace(case.parameters(), measurement_sigma=jnp.asarray(measurement_sigma))
         seen = jax.tree.map(lambda x, k=k: x[k], known)
         # What is seen, the noise, and the time all change.
         seen = replace(seen, valid=seen.valid & (jnp.arange(seen.valid.size) >= k))
@@ -235,7 +235,7 @@ def test_a_run_can_be_differentiated_by_its_noise():
     start = quick_jit(slam.first)(start, parameters, first)
 
     def score(sigma):
-        noisy = replace(parameters, acceleration_sigma=sigma)
+        noisy = replace(parameters, motion_sigma=sigma)
 
         def step(state, frame):
             state, innovation = slam.step(state, noisy, dt, *frame)
@@ -246,7 +246,7 @@ def test_a_run_can_be_differentiated_by_its_noise():
         # Scaled so that each part matters: metres, log σ², and numbers compared.
         return 1e3 * state.core.pose.translation()[0] + jnp.log(pose_variance) + nis.mean()
 
-    sigma = parameters.acceleration_sigma
+    sigma = parameters.motion_sigma
     gradient = np.asarray(quick_jit(jax.grad(score))(sigma))
     assert np.isfinite(gradient).all()
     assert np.abs(gradient).max() > 1e-3
@@ -292,7 +292,7 @@ def test_a_step_leaves_no_acceleration_and_no_white_calibration_behind(kind):
     np.testing.assert_allclose(appended, [*used, 9.0, 4.0], rtol=1e-14)
     assert not np.any(state.covariance[6:11])
     assert not np.any(state.covariance[:, 6:11])
-    np.testing.assert_array_equal(state.core.acceleration, np.zeros(3))
+    np.testing.assert_array_equal(state.core.noise, np.zeros(3))
     np.testing.assert_array_equal(state.core.calibration, np.zeros(2))
 
 

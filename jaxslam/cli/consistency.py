@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,9 +13,8 @@ import tyro
 from jaxslam.consistency import CHUNK, DTYPES, FolderStore, Study, monte_carlo, summarise, table
 from jaxslam.consistency.montecarlo import check_sizes
 from jaxslam.files import write_atomically
-from jaxslam.filters import CALIBRATIONS, FILTERS, SlamFilter
+from jaxslam.filters import CALIBRATIONS, FILTERS, SlamFilter, make_filters
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.names import suggestion
 from jaxslam.simulation.scenario import BUILT_IN, Scenario, parse_override, scenario
 
 LAYOUT = 1
@@ -117,22 +115,6 @@ class ConsistencyOptions:
         return scenario(self.scenario, overrides)
 
     def _filters(self, world: Scenario) -> dict[str, SlamFilter]:
-        calibration = self.calibration or world.calibration
-        landmarks = _chosen("landmarks", self.landmarks, LANDMARKS)
-        filters = _chosen("filters", self.filters, FILTERS)
-        return {
-            f"{name}/{landmark.name}": make(world.world, landmark, calibration)
-            for name, make in filters.items()
-            for landmark in landmarks.values()
-        }
-
-
-def _chosen(option: str, names: Iterable[str], known: Mapping[str, Any]) -> dict[str, Any]:
-    for name in names:
-        if name not in known:
-            meant = suggestion(name, known)
-            raise ValueError(f"unknown --{option} {name!r}{meant}; known: {', '.join(known)}")
-    chosen = {name: known[name] for name in names}
-    if not chosen:
-        raise ValueError(f"--{option} needs at least one name; known: {', '.join(known)}")
-    return chosen
+        return make_filters(
+            world.rig, self.filters, self.landmarks, self.calibration or world.calibration
+        )

@@ -52,7 +52,6 @@ class Prior:
     parameters: Parameters
     velocity: Float[Array, " t"]
     velocity_sigma: Float[Array, " t"]
-    dt: Float[Array, ""]
 
     @staticmethod
     def of(scenario: Scenario, dtype: jnp.dtype) -> Prior:
@@ -61,7 +60,6 @@ class Prior:
             parameters(scenario, dtype),
             jnp.asarray(scenario.velocity, dtype),
             jnp.asarray(scenario.velocity_sigma, dtype),
-            jnp.asarray(1 / scenario.rate, dtype),
         )
 
 
@@ -195,9 +193,9 @@ def filter_run(
 
     The records hold, per step: `nees` of the pose; `nis` and `nis_dof`; `error` and `variance`
     of the camera's position (in camera axes) and orientation; the mean `landmark_nees` of the
-    landmarks seen, in the chart (x/z, y/z, 1/z) of the current camera, and their number.
+    landmarks seen, in the sensor's chart, and their number.
     """
-    parameters, dt = prior.parameters, prior.dt
+    parameters = prior.parameters
     first, seen, new = features(run, capacity)
     state = slam_filter.start(
         parameters, int(capacity.landmarks), prior.velocity, prior.velocity_sigma
@@ -205,8 +203,8 @@ def filter_run(
     state = slam_filter.first(state, parameters, first)
 
     def step(state, data):
-        seen, new, T_BC = data
-        state, innovation = slam_filter.step(state, parameters, dt, seen, new)
+        seen, new, control, T_BC = data
+        state, innovation = slam_filter.step(state, parameters, control, seen, new)
         estimate, covariance = slam_filter.camera_pose(state)
         landmark_nees, landmark_count = _landmark_nees(
             slam_filter, state, parameters, seen, T_BC, run.points
@@ -214,7 +212,7 @@ def filter_run(
         records = {
             "nees": normalised_squared(*slam_filter.pose_error(state, T_BC)),
             "nis": innovation.nis,
-            "nis_dof": innovation.nis_dof.astype(dt.dtype),
+            "nis_dof": innovation.nis_dof.astype(innovation.nis.dtype),
             "error": _camera_error(estimate, T_BC),
             "variance": jnp.diagonal(covariance),
             "landmark_nees": landmark_nees,
@@ -223,7 +221,7 @@ def filter_run(
         return state, (records, estimate)
 
     later = jax.tree.map(lambda x: x[1:], run.poses)
-    state, (records, path) = jax.lax.scan(step, state, (seen, new, later))
+    state, (records, path) = jax.lax.scan(step, state, (seen, new, run.controls, later))
     return records, path, state
 
 
@@ -241,8 +239,7 @@ def _camera_error(estimate: Pose, truth: Pose) -> Array:
 def _landmark_nees(slam_filter, state, parameters, seen, T_BC, points):
     """Mean over the landmarks seen, and how many; where none is seen, 0 of 0."""
     truth = jax.vmap(T_BC.inverse().apply)(points[seen.slots])
-    ones = jnp.ones_like(truth[:, :1])
-    truth = jnp.concatenate([truth[:, :-1], ones], axis=1) / truth[:, -1:]
+    truth = jax.vmap(slam_filter.model.rig.sensor.chart)(truth, jnp.ones_like(truth[:, 0]))
     chart, covariance = slam_filter.landmarks_in_camera(state, parameters, seen.slots)
     nees = jax.vmap(normalised_squared)(truth - chart, covariance)
     count = jnp.sum(seen.valid)

@@ -40,7 +40,7 @@ def summarise(study: Study) -> dict[str, Any]:
 
 
 def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
-    geometry = study.scenario.world
+    geometry = study.scenario.rig.geometry
     dof, n = geometry.tangent_dim, geometry.point_dim
     sums = _sums(study, name, dof)
     healthy = study.runs - sums["diverged"]

@@ -1,6 +1,6 @@
 """Filters: the block-wise EKF, the SLAM models it runs on, and the table of their names."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from jaxslam.filters.slam import (
     CALIBRATIONS,
@@ -12,24 +12,40 @@ from jaxslam.filters.slam import (
     inverse_depth_prior,
 )
 from jaxslam.filters.state import Features, Innovation, State
-from jaxslam.geometry import Geometry
-from jaxslam.landmarks import Parametrization
+from jaxslam.landmarks import LANDMARKS, Parametrization
+from jaxslam.names import chosen
+from jaxslam.rig import Rig
 
 
-def robocentric(geometry: Geometry, landmark: Parametrization, calibration: str) -> SlamFilter:
+def robocentric(rig: Rig, landmark: Parametrization, calibration: str) -> SlamFilter:
     """The paper's filter: landmarks in the camera frame, composition after the update."""
-    return SlamFilter(SlamModel(geometry, landmark, ROBOCENTRIC), calibration)
+    return SlamFilter(SlamModel(rig, landmark, ROBOCENTRIC), calibration)
 
 
-def world(geometry: Geometry, landmark: Parametrization, calibration: str) -> SlamFilter:
+def world(rig: Rig, landmark: Parametrization, calibration: str) -> SlamFilter:
     """The classical filter: landmarks in the base frame, prediction composed first."""
-    return SlamFilter(SlamModel(geometry, landmark, WORLD), calibration, compose_first=True)
+    return SlamFilter(SlamModel(rig, landmark, WORLD), calibration, compose_first=True)
 
 
-FILTERS: dict[str, Callable[[Geometry, Parametrization, str], SlamFilter]] = {
+FILTERS: dict[str, Callable[[Rig, Parametrization, str], SlamFilter]] = {
     "robocentric": robocentric,
     "world": world,
 }
+
+
+def make_filters(
+    rig: Rig, filters: Iterable[str], landmarks: Iterable[str], calibration: str
+) -> dict[str, SlamFilter]:
+    """Every named filter on every named parametrization, keyed `filter/landmarks`.
+
+    Raises ValueError for a name that is not known.
+    """
+    return {
+        f"{name}/{landmark.name}": make(rig, landmark, calibration)
+        for name, make in chosen("filters", filters, FILTERS).items()
+        for landmark in chosen("landmarks", landmarks, LANDMARKS).values()
+    }
+
 
 __all__ = [
     "CALIBRATIONS",
@@ -41,6 +57,7 @@ __all__ = [
     "SlamModel",
     "State",
     "inverse_depth_prior",
+    "make_filters",
     "robocentric",
     "world",
 ]

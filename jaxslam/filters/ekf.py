@@ -62,8 +62,12 @@ class Model(Protocol):
         """The predicted measurement, and whether one is possible (in front of the camera)."""
         ...
 
-    def initialise(self, view: Any, pixel: Array, inverse_depth: Array, context: Any) -> Array:
-        """A landmark from its first measurement and its prior."""
+    def initialise(self, view: Any, measured: Array, hidden: Array, context: Any) -> Array:
+        """A landmark from its first measurement and what that hides, of which a prior is given."""
+        ...
+
+    def convert(self, view: Any, landmark: Array, covariance: Array, context: Any) -> Array:
+        """The same landmark in another form, where its covariance recommends it."""
         ...
 
 
@@ -167,13 +171,34 @@ def compose(model: Model, state: State, context: Any) -> State:
         return model.compose_landmark(view, landmark, context), None
 
     core, J_core = move_core(state.core), jacobian(move_core, state.core)
-    c = state.core_dim
     if not model.moves_landmarks:
-        J, landmarks = None, state.landmarks
-    else:
-        moved, _, J = _local_jacobians(view, move_landmark, state.core, state.landmarks)
+        return _transformed(state, core, J_core, state.landmarks, None)
+    moved, _, J = _local_jacobians(view, move_landmark, state.core, state.landmarks)
+    return _transformed(state, core, J_core, moved, J)
+
+
+def convert(model: Model, state: State, context: Any) -> State:
+    """Write landmarks in the form that the model now prefers, `P ← J P Jᵀ`."""
+    c, (capacity, d) = state.core_dim, state.landmarks.shape
+    blocks = state.covariance[c:, c:].reshape(capacity, d, capacity, d)
+    own = blocks[jnp.arange(capacity), :, jnp.arange(capacity), :]
+
+    def converted(view, landmark, covariance):
+        return model.convert(view, landmark, covariance, context), None
+
+    value, _, J = _local_jacobians(
+        lambda core: model.view(core, context), converted, state.core, state.landmarks, own
+    )
+    J_core = jnp.eye(c, dtype=state.covariance.dtype)
+    return _transformed(state, state.core, J_core, value, J)
+
+
+def _transformed(state: State, core: Any, J_core: Array, landmarks: Array, J: Blocks | None):
+    """The state after a change of variables, of the core alone where J is None."""
+    c = state.core_dim
+    if J is not None:
         J = _masked(J, state.active)
-        landmarks = jnp.where(state.active[:, None], moved, state.landmarks)
+        landmarks = jnp.where(state.active[:, None], landmarks, state.landmarks)
 
     def rows(P):
         below = P[c:] if J is None else _rows(J, P)
@@ -187,35 +212,35 @@ def initialise(
     state: State,
     features: Features,
     noise: Float[Array, "p p"],
-    inverse_depth: tuple[Float[Array, ""], Float[Array, ""]],
+    prior: tuple[Float[Array, " q"], Float[Array, " q"]],
     context: Any,
 ) -> State:
     """Insert landmarks from their first measurement, `P ← J diag(P, R, σ²) Jᵀ` (P22–P26).
 
-    `inverse_depth` is the prior's mean and σ. All new landmarks share one core, so what is
-    uncertain there (the pose of a world-centric filter, the calibration) correlates them with
-    it and with one another. Whatever was in their slots must have been removed.
+    `prior` is the mean and σ of what one measurement hides. All new landmarks share one core, so
+    what is uncertain there (the pose of a world-centric filter, the calibration) correlates them
+    with it and with one another. Whatever was in their slots must have been removed.
     """
     if features.slots.size == 0:
         return state
     c, (capacity, d) = state.core_dim, state.landmarks.shape
-    mean, sigma = inverse_depth
+    mean, sigma = prior
 
     view = model.view(state.core, context)
     view_by_core = jacobian(lambda core: model.view(core, context), state.core)
 
-    def one(pixel):
-        def landmark(delta, pixel, depth):
-            value = model.initialise(nudge(view, delta), pixel, depth, context)
+    def one(measured):
+        def landmark(delta, measured, hidden):
+            value = model.initialise(nudge(view, delta), measured, hidden, context)
             return value, value
 
-        (J_view, J_pixel, J_depth), value = jax.jacfwd(landmark, argnums=(0, 1, 2), has_aux=True)(
-            zero_tangent(view), pixel, mean
-        )
-        own = J_pixel @ noise @ J_pixel.T + sigma**2 * jnp.outer(J_depth, J_depth)
+        (J_view, J_measured, J_hidden), value = jax.jacfwd(
+            landmark, argnums=(0, 1, 2), has_aux=True
+        )(zero_tangent(view), measured, mean)
+        own = J_measured @ noise @ J_measured.T + (J_hidden * sigma**2) @ J_hidden.T
         return value, J_view, own
 
-    new, J_view, own = jax.vmap(one)(features.pixels)
+    new, J_view, own = jax.vmap(one)(features.measured)
     slots = jnp.where(features.valid, features.slots, capacity)  # out of bounds: dropped
     index = c + slots[:, None] * d + jnp.arange(d)
 
@@ -267,7 +292,7 @@ def _residuals(model, state, features, context):
     """Predictions, residuals, which features are used, and H; zero where one is not."""
     predicted, in_front, H = _observe(model, state, features.slots, context)
     used = features.valid & in_front & state.active[features.slots]
-    residual = jnp.where(used[:, None], features.pixels - predicted, 0.0)
+    residual = jnp.where(used[:, None], features.measured - predicted, 0.0)
     return predicted, residual, used, _placed(_masked(H, used), features.slots, state.active.size)
 
 
@@ -280,13 +305,16 @@ def _observe(model, state, slots, context):
     )
 
 
-def _local_jacobians(view, function, core, landmarks) -> tuple[Array, Any, Blocks]:
-    """Values, auxiliary outputs and blocks of `function(view, landmark) → (value, auxiliary)`."""
+def _local_jacobians(view, function, core, landmarks, *data) -> tuple[Array, Any, Blocks]:
+    """Values, auxiliary outputs and blocks of `function(view, landmark) → (value, auxiliary)`.
+
+    `data` are further arguments of the function, one for each landmark: not differentiated.
+    """
     view_by_core, view = jacobian(view, core), view(core)
 
-    def one(landmark):
+    def one(landmark, *data):
         def moved(delta, landmark):
-            value, auxiliary = function(nudge(view, delta), landmark)
+            value, auxiliary = function(nudge(view, delta), landmark, *data)
             return value, (value, auxiliary)
 
         J, (value, auxiliary) = jax.jacfwd(moved, argnums=(0, 1), has_aux=True)(
@@ -294,7 +322,7 @@ def _local_jacobians(view, function, core, landmarks) -> tuple[Array, Any, Block
         )
         return value, auxiliary, J
 
-    value, auxiliary, (by_view, by_landmark) = jax.vmap(one)(landmarks)
+    value, auxiliary, (by_view, by_landmark) = jax.vmap(one)(landmarks, *data)
     return value, auxiliary, Blocks(view_by_core, by_view, by_landmark)
 
 

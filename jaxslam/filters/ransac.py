@@ -41,7 +41,7 @@ def inliers(
     predicted, covariance, in_front = slam_filter.predict_features(
         updated, parameters, dt, features.slots
     )
-    residual = features.pixels - predicted
+    residual = features.measured - predicted
     distance = jnp.einsum(
         "mp,mp->m", residual, jnp.linalg.solve(covariance, residual[..., None])[..., 0]
     )
@@ -54,7 +54,7 @@ def _agreement(slam_filter, state, parameters, dt, features, threshold) -> Array
     def hypothesis(one: Features) -> Array:
         updated = slam_filter.update_mean(state, parameters, dt, one)
         predicted, in_front = slam_filter.project(updated, parameters, dt, features.slots)
-        error = jnp.linalg.norm(features.pixels - predicted, axis=1)
+        error = jnp.linalg.norm(features.measured - predicted, axis=1)
         return features.valid & in_front & (error < threshold) & one.valid[0]
 
     alone = jax.tree.map(lambda x: x[:, None], features)

@@ -9,17 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.camera import Camera, bearing, project
+from jaxslam.camera import Camera
 from jaxslam.filters import ekf
 from jaxslam.filters.state import Features, Innovation, State
-from jaxslam.geometry import Geometry, Pose, log
+from jaxslam.geometry import Geometry, Pose, SplitPose, difference, identity
 from jaxslam.landmarks.parametrization import Parametrization
-from jaxslam.motion import displacement, next_velocity
+from jaxslam.rig import Rig
 
 CALIBRATIONS = ("white", "consider", "estimated", "known")
 """The paper's independent draw of every frame; constant and correlated but not corrected
@@ -31,12 +32,13 @@ CALIBRATIONS = ("white", "consider", "estimated", "known")
 class Core:
     """What the filter estimates beside the landmarks, and the noises that one step appends."""
 
-    pose: Pose
-    """T_CB in a robocentric filter, T_BC in a world-centric one."""
-    velocity: Float[Array, " t"]
-    """Linear and angular velocity in the camera's own frame, m/s and rad/s."""
-    acceleration: Float[Array, " t"]
-    """a of this step (P10); zero before `predict` and after composition."""
+    pose: Pose | SplitPose
+    """T_CB in a robocentric filter, T_BC in a world-centric one, as the `Frame` holds it."""
+    velocity: Float[Array, " v"]
+    """Linear and angular velocity in the camera's own frame, m/s and rad/s; v = t, or none."""
+    noise: Float[Array, " t"]
+    """What drives this step's motion: the acceleration a (P10), or the odometry's error; zero
+    before `predict` and after composition."""
     calibration: Float[Array, " k"]
     """Error of the intrinsics (P15); empty where the calibration is known."""
 
@@ -49,19 +51,15 @@ class Parameters:
     camera: Camera
     intrinsics_sigma: Float[Array, " 2p"]
     """σ of (f, c) or (fx, fy, cx, cy), pixels (D of P15)."""
-    pixel_sigma: Float[Array, ""]
-    """σ of a measured pixel."""
-    acceleration_sigma: Float[Array, " t"]
-    """σ of the white acceleration (Q of P11), m/s² and rad/s²."""
+    measurement_sigma: Float[Array, ""]
+    """σ of each number measured: a pixel's, or a relative position's in metres."""
+    motion_sigma: Float[Array, " t"]
+    """σ of the noise that drives the motion (Q of P11): acceleration, m/s² and rad/s², or
+    odometry, m and rad."""
     inverse_depth: Float[Array, ""]
     """Mean of the prior on 1/z, 1/m; the paper's is 1/(2 d_min)."""
     inverse_depth_sigma: Float[Array, ""]
     """σ of the prior on 1/z, 1/m; the paper's is 1/(4 d_min)."""
-
-    @property
-    def pixel_covariance(self) -> Float[Array, "p p"]:
-        """R of one measured pixel."""
-        return self.pixel_sigma**2 * jnp.eye(self.camera.focal.size, dtype=self.pixel_sigma.dtype)
 
 
 def inverse_depth_prior(nearest: float) -> tuple[float, float]:
@@ -71,21 +69,27 @@ def inverse_depth_prior(nearest: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Frame:
-    """Where landmarks live, as functions of the pose in the state and a displacement."""
+    """Where landmarks live, as functions of a pose and a displacement `T_{k-1,k}`."""
 
     name: str
     moves_landmarks: bool
+    hold: Callable[[Pose], Any]
+    """What the state holds of a pose: its error is this pytree's tangent."""
+    pose: Callable[[Any], Pose]
+    """The inverse of `hold`."""
     pose_from_camera: Callable[[Pose], Pose]
     """The pose that the state holds, from T_BC; its own inverse."""
     map_from_camera: Callable[[Pose, Pose], Pose]
-    """T_AC(k), from the pose in the state at k−1 and `T_{k-1,k}`."""
+    """T_AC(k), from the pose at k−1 and the displacement."""
     compose: Callable[[Pose, Pose], Pose]
-    """The pose in the state at k, from the one at k−1 and `T_{k-1,k}`."""
+    """The pose at k, from the one at k−1 and the displacement."""
 
 
 ROBOCENTRIC = Frame(
     name="robocentric",
     moves_landmarks=True,
+    hold=lambda T_CB: T_CB,
+    pose=lambda T_CB: T_CB,
     pose_from_camera=lambda T_BC: T_BC.inverse(),
     map_from_camera=lambda T_CB, step: step,
     compose=lambda T_CB, step: step.inverse() @ T_CB,
@@ -93,6 +97,8 @@ ROBOCENTRIC = Frame(
 WORLD = Frame(
     name="world",
     moves_landmarks=False,
+    hold=SplitPose.of,
+    pose=SplitPose.joined,
     pose_from_camera=lambda T_BC: T_BC,
     map_from_camera=lambda T_BC, step: T_BC @ step,
     compose=lambda T_BC, step: T_BC @ step,
@@ -105,8 +111,9 @@ class Context:
     """Data of the model's functions: the parameters, and the motion not yet composed."""
 
     parameters: Parameters
-    dt: Float[Array, ""]
-    """Seconds of motion between the map frame and the camera; 0 once it is composed."""
+    control: Any
+    """The motion model's input for the motion between the map frame and the camera: seconds, or
+    the odometry's reading; None once the motion is composed."""
 
 
 @jax.tree_util.register_dataclass
@@ -127,31 +134,44 @@ class View:
 class SlamModel:
     """The one-landmark functions that `jaxslam.filters.ekf` asks for."""
 
-    geometry: Geometry
+    rig: Rig
     landmark: Parametrization
     frame: Frame
+
+    @property
+    def geometry(self) -> Geometry:
+        return self.rig.geometry
 
     @property
     def moves_landmarks(self) -> bool:
         return self.frame.moves_landmarks
 
     def _displacement(self, core: Core, context: Context) -> Pose:
-        return displacement(self.geometry, core.velocity, core.acceleration, context.dt)
+        if context.control is None:
+            return identity(self.geometry, core.noise.dtype)
+        motion = self.rig.motion
+        return motion.displacement(self.geometry, core.velocity, core.noise, context.control)
 
     def view(self, core: Core, context: Context) -> View:
         """All that a landmark depends on."""
-        T_AC = self.frame.map_from_camera(core.pose, self._displacement(core, context))
+        step = self._displacement(core, context)
+        T_AC = self.frame.map_from_camera(self.frame.pose(core.pose), step)
         return View(T_AC, core.calibration)
 
     def compose_core(self, core: Core, context: Context) -> Core:
-        """P18, P19. The acceleration has been used: it is marginalised."""
-        pose = self.frame.compose(core.pose, self._displacement(core, context))
+        """P18, P19. The noise has been used: it is marginalised."""
+        step = self._displacement(core, context)
+        pose = self.frame.compose(self.frame.pose(core.pose), step).normalize()
         return replace(
             core,
-            pose=pose.normalize(),
-            velocity=next_velocity(core.velocity, core.acceleration, context.dt),
-            acceleration=jnp.zeros_like(core.acceleration),
+            pose=self.frame.hold(pose),
+            velocity=self.rig.motion.next_velocity(core.velocity, core.noise, context.control),
+            noise=jnp.zeros_like(core.noise),
         )
+
+    def camera_pose(self, core: Core) -> Pose:
+        """T_BC."""
+        return self.frame.pose_from_camera(self.frame.pose(core.pose))
 
     def compose_landmark(self, view: View, landmark: Array, context: Context) -> Array:
         """P20: the landmark in the new camera frame."""
@@ -159,9 +179,10 @@ class SlamModel:
         return self.landmark.transform(view.map_from_camera.inverse(), landmark)
 
     def observe(self, view: View, landmark: Array, context: Context) -> tuple[Array, Array]:
-        """`h = proj(K T_AC⁻¹ X)` (P12, P14), on the homogeneous numerator."""
-        point, _ = self.camera_point(view, landmark)
-        return project(view.camera(context), point), point[-1] > 0
+        """`h = proj(K T_AC⁻¹ X)` (P12, P14), and whether it is possible."""
+        point, omega = self.camera_point(view, landmark)
+        sensor = self.rig.sensor
+        return sensor.measure(view.camera(context), point, omega), sensor.possible(point)
 
     def camera_point(self, view: View, landmark: Array) -> tuple[Array, Array]:
         """The landmark in the current camera as a homogeneous point (X, ω)."""
@@ -170,14 +191,21 @@ class SlamModel:
         return T_CA.rotation() @ point + omega * T_CA.translation(), omega
 
     def chart(self, view: View, landmark: Array) -> Array:
-        """(x/z, y/z, 1/z) in the current camera: where parametrizations can be compared."""
-        point, omega = self.camera_point(view, landmark)
-        return jnp.append(point[:-1], omega) / point[-1]
+        """The sensor's chart in the current camera: where parametrizations can be compared."""
+        return self.rig.sensor.chart(*self.camera_point(view, landmark))
 
-    def initialise(self, view: View, pixel: Array, inverse_depth: Array, context: Context) -> Array:
-        """P22–P26: a landmark in the map frame from its first pixel and the prior on depth."""
+    def convert(self, view: View, landmark: Array, covariance: Array, context: Context) -> Array:
+        """The same landmark in the form that its parametrization now prefers."""
+        del context
+        if self.landmark.convert is None:
+            return landmark
+        return self.landmark.convert(view.map_from_camera.translation(), landmark, covariance)
+
+    def initialise(self, view: View, measured: Array, hidden: Array, context: Context) -> Array:
+        """P22–P26: a landmark in the map frame from its first measurement and the prior."""
         camera = view.camera(context)
-        seen = self.landmark.initialise(bearing(camera, pixel), inverse_depth, camera.focal[0])
+        point, omega = self.rig.sensor.locate(camera, measured, hidden)
+        seen = self.landmark.initialise(point, omega, camera.focal[0])
         return self.landmark.transform(view.map_from_camera, seen)
 
 
@@ -207,23 +235,27 @@ class SlamFilter:
         self,
         parameters: Parameters,
         capacity: int,
-        velocity: Float[Array, " t"],
-        velocity_sigma: Float[Array, " t"],
+        velocity: Float[Array, " v"],
+        velocity_sigma: Float[Array, " v"],
     ) -> State:
-        """An exactly known pose at the origin of B, an uncertain velocity, an empty map."""
-        dtype = parameters.pixel_sigma.dtype
+        """An exactly known pose at the origin of B, an uncertain velocity, an empty map.
+
+        The velocity is not used by a motion model without one.
+        """
+        dtype = parameters.measurement_sigma.dtype
         geometry, landmark = self.geometry, self.model.landmark
         t, p = geometry.tangent_dim, geometry.pixel_dim
+        v = t if self.model.rig.motion.has_velocity else 0
         core = Core(
-            pose=jax.tree.map(lambda x: x.astype(dtype), geometry.group.identity()),
-            velocity=jnp.asarray(velocity, dtype),
-            acceleration=jnp.zeros(t, dtype),
+            pose=self.model.frame.hold(identity(geometry, dtype)),
+            velocity=jnp.asarray(velocity, dtype)[:v],
+            noise=jnp.zeros(t, dtype),
             calibration=jnp.zeros(0 if self.calibration == "known" else 2 * p, dtype),
         )
         # An empty slot holds a point straight ahead: finite in every formula.
-        empty = landmark.initialise(
-            jnp.zeros(p, dtype), parameters.inverse_depth, parameters.camera.focal[0]
-        )
+        ahead = jnp.zeros(p + 1, dtype).at[-1].set(1.0)
+        focal = parameters.camera.focal[0]
+        empty = landmark.initialise(ahead, parameters.inverse_depth, focal)
         state = State(
             core=core,
             landmarks=jnp.tile(empty, (capacity, 1)),
@@ -232,70 +264,74 @@ class SlamFilter:
         )
         n = state.core_dim + capacity * empty.size
         state = replace(state, covariance=jnp.zeros((n, n), dtype))
-        state = ekf.augment(state, t, jnp.diag(jnp.asarray(velocity_sigma, dtype) ** 2))
+        state = ekf.augment(state, t, jnp.diag(jnp.asarray(velocity_sigma, dtype)[:v] ** 2))
         return state if self.calibration == "white" else self._with_calibration(state, parameters)
 
-    def predict(self, state: State, parameters: Parameters, dt: Float[Array, ""]) -> State:
-        """Append this step's acceleration and calibration error (P10, P11, P15)."""
-        t = self.geometry.tangent_dim
-        state = ekf.augment(state, 2 * t, jnp.diag(parameters.acceleration_sigma**2))
+    def predict(self, state: State, parameters: Parameters, control: Array) -> State:
+        """Append this step's motion noise and calibration error (P10, P11, P15)."""
+        start = self.geometry.tangent_dim + state.core.velocity.size
+        state = ekf.augment(state, start, jnp.diag(parameters.motion_sigma**2))
         if self.calibration == "white":
             state = self._with_calibration(state, parameters)
-        return (
-            ekf.compose(self.model, state, Context(parameters, dt)) if self.compose_first else state
-        )
+        if not self.compose_first:
+            return state
+        return ekf.compose(self.model, state, Context(parameters, control))
 
     def update(
-        self, state: State, parameters: Parameters, dt: Float[Array, ""], features: Features
+        self, state: State, parameters: Parameters, control: Array, features: Features
     ) -> tuple[State, Innovation]:
         """Correct by the features seen (P16, P17)."""
-        context = self._context(parameters, dt)
-        noise = parameters.pixel_covariance
+        context = self._context(parameters, control)
+        noise = self._noise(parameters)
         return ekf.update(self.model, state, features, noise, context, self._considered(state))
 
     def update_mean(
-        self, state: State, parameters: Parameters, dt: Float[Array, ""], features: Features
+        self, state: State, parameters: Parameters, control: Array, features: Features
     ) -> State:
         """`update` without its covariance: cheap enough to try many hypotheses."""
-        context = self._context(parameters, dt)
-        noise = parameters.pixel_covariance
+        context = self._context(parameters, control)
+        noise = self._noise(parameters)
         return ekf.update_mean(self.model, state, features, noise, context, self._considered(state))
 
     def project(
-        self, state: State, parameters: Parameters, dt: Float[Array, ""], slots: Array
+        self, state: State, parameters: Parameters, control: Array, slots: Array
     ) -> tuple[Float[Array, "m p"], Bool[Array, " m"]]:
         """Pixels of landmarks in the current camera, and whether they are in front of it."""
-        context = self._context(parameters, dt)
+        context = self._context(parameters, control)
         view = self.model.view(state.core, context)
         observe = jax.vmap(self.model.observe, in_axes=(None, 0, None))
         return observe(view, state.landmarks[slots], context)
 
     def predict_features(
-        self, state: State, parameters: Parameters, dt: Float[Array, ""], slots: Array
+        self, state: State, parameters: Parameters, control: Array, slots: Array
     ) -> tuple[Float[Array, "m p"], Float[Array, "m p p"], Bool[Array, " m"]]:
         """Search ellipses of a predicted state: pixels, innovation covariances, in front."""
-        context = self._context(parameters, dt)
-        return ekf.predict_features(self.model, state, slots, parameters.pixel_covariance, context)
+        context = self._context(parameters, control)
+        return ekf.predict_features(self.model, state, slots, self._noise(parameters), context)
 
-    def compose(self, state: State, parameters: Parameters, dt: Float[Array, ""]) -> State:
-        """Move into the new camera frame, after the update (P18–P21)."""
-        if self.compose_first:
+    def compose(self, state: State, parameters: Parameters, control: Array) -> State:
+        """Move into the new camera frame, after the update (P18–P21); convert landmarks."""
+        if not self.compose_first:
+            state = ekf.compose(self.model, state, Context(parameters, control))
+        if self.model.landmark.convert is None:
             return state
-        return ekf.compose(self.model, state, Context(parameters, dt))
+        return ekf.convert(self.model, state, _composed(parameters))
 
     def initialise(self, state: State, parameters: Parameters, features: Features) -> State:
         """Insert new landmarks seen from the current camera (P22–P26)."""
-        prior = (parameters.inverse_depth, parameters.inverse_depth_sigma)
-        noise, context = parameters.pixel_covariance, _composed(parameters)
+        hidden = self.model.rig.sensor.hidden
+        mean, sigma = parameters.inverse_depth, parameters.inverse_depth_sigma
+        prior = (jnp.tile(mean, hidden), jnp.tile(sigma, hidden))
+        noise, context = self._noise(parameters), _composed(parameters)
         return ekf.initialise(self.model, state, features, noise, prior, context)
 
     def finish(self, state: State) -> State:
         """Forget the frame's calibration error where the next frame draws another (white)."""
         if self.calibration != "white":
             return state
-        start, size = 3 * self.geometry.tangent_dim, state.core.calibration.size
+        part = _calibration(state)
         core = replace(state.core, calibration=jnp.zeros_like(state.core.calibration))
-        return replace(ekf.marginalise(state, start, size), core=core)
+        return replace(ekf.marginalise(state, part.start, part.stop - part.start), core=core)
 
     def first(self, state: State, parameters: Parameters, new: Features) -> State:
         """Frame 0: nothing has moved, everything seen is new."""
@@ -307,30 +343,30 @@ class SlamFilter:
         self,
         state: State,
         parameters: Parameters,
-        dt: Float[Array, ""],
+        control: Array,
         seen: Features,
         new: Features,
     ) -> tuple[State, Innovation]:
         """One frame: `seen` are features of landmarks in the map, `new` those to insert."""
-        state = self.predict(state, parameters, dt)
-        state, innovation = self.update(state, parameters, dt, seen)
-        state = self.compose(state, parameters, dt)
+        state = self.predict(state, parameters, control)
+        state, innovation = self.update(state, parameters, control, seen)
+        state = self.compose(state, parameters, control)
         return self.finish(self.initialise(state, parameters, new)), innovation
 
     def pose_error(self, state: State, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
-        """`Log(T_est⁻¹ T_true)` of the pose in the state, and the covariance of its tangent."""
-        t = self.geometry.tangent_dim
-        truth = self.model.frame.pose_from_camera(T_BC)
-        return log(state.core.pose.inverse() @ truth), state.covariance[:t, :t]
+        """`T_true ⊟ T_est` of the pose in the state, and the covariance of its tangent."""
+        t, frame = self.geometry.tangent_dim, self.model.frame
+        truth = frame.hold(frame.pose_from_camera(T_BC))
+        return difference(truth, state.core.pose), state.covariance[:t, :t]
 
     def camera_pose(self, state: State) -> tuple[Pose, Float[Array, "t t"]]:
         """T_BC and its covariance in the right tangent: position in camera axes, orientation."""
-        return ekf.core_covariance(lambda core: self.model.frame.pose_from_camera(core.pose), state)
+        return ekf.core_covariance(self.model.camera_pose, state)
 
     def landmarks_in_camera(
         self, state: State, parameters: Parameters, slots: Array
     ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
-        """(x/z, y/z, 1/z) of landmarks in the current camera, with covariances."""
+        """The sensor's chart of landmarks, (x/z, y/z, 1/z) of a camera, with covariances."""
         return ekf.landmark_covariance(
             self._composed_view(parameters), self.model.chart, state, slots
         )
@@ -362,7 +398,7 @@ class SlamFilter:
         camera_view = self._composed_view(parameters)
 
         def view(core):
-            return camera_view(core), self.model.frame.pose_from_camera(core.pose)
+            return camera_view(core), self.model.camera_pose(core)
 
         def point(view, landmark):
             (camera_view, T_BC) = view
@@ -372,16 +408,18 @@ class SlamFilter:
         return ekf.landmark_covariance(view, point, state, slots)
 
     def predicted_camera(
-        self, state: State, parameters: Parameters, dt: Float[Array, ""], slots: Array
+        self, state: State, parameters: Parameters, control: Array, slots: Array
     ) -> tuple[Pose, Float[Array, "m n"], Float[Array, " m"]]:
         """T_BC of a predicted state, and the landmarks in that camera as (X, ω)."""
-        context = self._context(parameters, dt)
+        context = self._context(parameters, control)
         view = self.model.view(state.core, context)
-        core = self.model.compose_core(state.core, context)
+        core = state.core
+        if not self.compose_first:
+            core = self.model.compose_core(core, context)
         points, omegas = jax.vmap(self.model.camera_point, in_axes=(None, 0))(
             view, state.landmarks[slots]
         )
-        return self.model.frame.pose_from_camera(core.pose), points, omegas
+        return self.model.camera_pose(core), points, omegas
 
     def _composed_view(self, parameters: Parameters) -> Callable[[Core], View]:
         return lambda core: self.model.view(core, _composed(parameters))
@@ -390,17 +428,25 @@ class SlamFilter:
         if self.calibration == "known":
             return state
         covariance = jnp.diag(parameters.intrinsics_sigma**2)
-        return ekf.augment(state, 3 * self.geometry.tangent_dim, covariance)
+        return ekf.augment(state, _calibration(state).start, covariance)
+
+    def _noise(self, parameters: Parameters) -> Float[Array, "p p"]:
+        """R of one measurement."""
+        sigma = parameters.measurement_sigma
+        return sigma**2 * jnp.eye(self.model.rig.sensor.size(self.geometry), dtype=sigma.dtype)
 
     def _considered(self, state: State) -> slice:
         """The part of the core that updates leave as it is."""
-        start = 3 * self.geometry.tangent_dim
-        size = state.core.calibration.size if self.calibration == "consider" else 0
-        return slice(start, start + size)
+        return _calibration(state) if self.calibration == "consider" else slice(0, 0)
 
-    def _context(self, parameters: Parameters, dt) -> Context:
-        return _composed(parameters) if self.compose_first else Context(parameters, dt)
+    def _context(self, parameters: Parameters, control: Array) -> Context:
+        return _composed(parameters) if self.compose_first else Context(parameters, control)
 
 
 def _composed(parameters: Parameters) -> Context:
-    return Context(parameters, jnp.zeros_like(parameters.pixel_sigma))
+    return Context(parameters, None)
+
+
+def _calibration(state: State) -> slice:
+    """Where the calibration's error is in the tangent of the core: at its end."""
+    return slice(state.core_dim - state.core.calibration.size, state.core_dim)

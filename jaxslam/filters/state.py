@@ -36,10 +36,10 @@ class State:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Features:
-    """Image points of landmarks: pixel j belongs to `slots[j]`, and counts where `valid[j]`."""
+    """Measurements of landmarks: j is of the one in `slots[j]`, and counts where `valid[j]`."""
 
     slots: Int[Array, " m"]
-    pixels: Float[Array, "m p"]
+    measured: Float[Array, "m p"]
     valid: Bool[Array, " m"]
 
 

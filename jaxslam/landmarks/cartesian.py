@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from jaxslam.landmarks.parametrization import Parametrization
 
 
-def initialise(bearing, inverse_depth, focal):
-    """`(x/z, y/z, 1) z`, with the depth z = 1/inverse_depth. `focal` is not used."""
+def initialise(point, omega, focal):
+    """`X/ω`. `focal` is not used."""
     del focal
-    return jnp.append(bearing, 1.0) / inverse_depth
+    return point / omega
 
 
 def transform(T_ab, landmark):

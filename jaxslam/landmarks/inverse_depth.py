@@ -12,41 +12,41 @@ import jax.numpy as jnp
 from jaxslam.landmarks.parametrization import Parametrization
 
 
-def initialise(bearing, inverse_depth, focal):
-    """C = 0 and the ray of the pixel; `ρ = (1/z)/|(x/z, y/z, 1)|`.
+def initialise(point, omega, focal):
+    """C = 0, the ray of X, and `ρ = ω/|X|`.
 
     The prior speaks of inverse depth 1/z, the same for every parametrization; ρ is the inverse
     distance that belongs to it. `focal` is not used.
     """
     del focal
-    ray = jnp.append(bearing, 1.0)
-    inverse_distance = inverse_depth / jnp.linalg.norm(ray)
-    return _pack(jnp.zeros_like(ray), _angles(ray), inverse_distance)
+    inverse_distance = omega / jnp.linalg.norm(point)
+    return _pack(jnp.zeros_like(point), angles_of(point), inverse_distance)
 
 
 def transform(T_ab, landmark):
     """`C' = R C + t`, `m(θ', φ') = R m(θ, φ)`, `ρ' = ρ`. Singular where the ray is vertical."""
-    anchor, angles, inverse_distance = _unpack(landmark)
-    ray = T_ab.rotation() @ _ray(angles)
-    return _pack(T_ab @ anchor, _angles(ray), inverse_distance)
+    anchor, angles, inverse_distance = unpack(landmark)
+    ray = T_ab.rotation() @ ray_of(angles)
+    return _pack(T_ab @ anchor, angles_of(ray), inverse_distance)
 
 
 def homogeneous(landmark):
     """`(ρ C + m(θ, φ), ρ)` (P4)."""
-    anchor, angles, inverse_distance = _unpack(landmark)
-    return inverse_distance * anchor + _ray(angles), inverse_distance
+    anchor, angles, inverse_distance = unpack(landmark)
+    return inverse_distance * anchor + ray_of(angles), inverse_distance
 
 
 def _pack(anchor, angles, inverse_distance):
     return jnp.concatenate([anchor, angles, inverse_distance[None]])
 
 
-def _unpack(landmark):
+def unpack(landmark):
+    """(C, (θ, φ), ρ)."""
     n = landmark.size // 2
     return landmark[:n], landmark[n:-1], landmark[-1]
 
 
-def _ray(angles):
+def ray_of(angles):
     """`m = (cos φ sin θ, −sin φ, cos φ cos θ)`; planar `(sin θ, cos θ)`."""
     if angles.size == 1:
         return jnp.stack([jnp.sin(angles[0]), jnp.cos(angles[0])])
@@ -54,8 +54,8 @@ def _ray(angles):
     return jnp.stack([jnp.cos(phi) * jnp.sin(theta), -jnp.sin(phi), jnp.cos(phi) * jnp.cos(theta)])
 
 
-def _angles(ray):
-    """`θ = atan2(x, z)`, `φ = atan2(−y, √(x² + z²))`, the inverse of `_ray`."""
+def angles_of(ray):
+    """`θ = atan2(x, z)`, `φ = atan2(−y, √(x² + z²))`, the inverse of `ray_of`."""
     theta = jnp.atan2(ray[0], ray[-1])
     if ray.size == 2:
         return theta[None]

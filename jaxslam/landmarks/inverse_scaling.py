@@ -7,13 +7,13 @@ import jax.numpy as jnp
 from jaxslam.landmarks.parametrization import Parametrization
 
 
-def initialise(bearing, inverse_depth, focal):
+def initialise(point, omega, focal):
     """`(x, y, z, ω) = f (K⁻¹(u, v, 1), 1/d)` (P22–P26), that is (u − cx, v − cy, f, f/d).
 
     ω is written with the same f as (x, y, z), so that the depth z/ω = d that the prior speaks of
     does not depend on the focal length.
     """
-    return focal * jnp.append(bearing, jnp.array([1.0, inverse_depth]))
+    return focal * jnp.append(point, omega)
 
 
 def transform(T_ab, landmark):

@@ -20,10 +20,15 @@ class Parametrization:
     name: str
     size: Callable[[int], int]
     """`size(n)`: how many parameters a landmark has."""
-    initialise: Callable[[Float[Array, " n-1"], Float[Array, ""], Float[Array, ""]], Parameters]
-    """`initialise(bearing, inverse_depth, focal)`: parameters in the camera frame of the point at
-    normalised image coordinates `bearing`, 1/z = `inverse_depth`; `focal` in pixels."""
+    initialise: Callable[[Float[Array, " n"], Float[Array, ""], Float[Array, ""]], Parameters]
+    """`initialise(X, ω, focal)`: parameters, in the camera frame, of the point X/ω; a camera gives
+    X = (x/z, y/z, 1) and ω = 1/z. `focal` in pixels."""
     transform: Callable[[Pose, Parameters], Parameters]
     """`transform(T_ab, parameters_in_b)`: the same point in frame a."""
     homogeneous: Callable[[Parameters], Homogeneous]
     """`(X, ω)` such that the point is X/ω; ω may be 0 (a point at infinity) or negative."""
+    convert: Callable[[Float[Array, " n"], Parameters, Float[Array, "d d"]], Parameters] | None = (
+        None
+    )
+    """`convert(C, parameters, covariance)`: the same point in another form where the camera, at C
+    in the landmark's frame, and the covariance recommend it; None where there is one form."""

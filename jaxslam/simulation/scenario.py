@@ -15,13 +15,17 @@ from pathlib import Path
 from typing import Any
 
 from jaxslam.filters import CALIBRATIONS
-from jaxslam.geometry import GEOMETRIES, Geometry
+from jaxslam.geometry import GEOMETRIES
+from jaxslam.motion import MOTIONS
 from jaxslam.names import suggestion
+from jaxslam.rig import Rig
+from jaxslam.sensors import SENSORS
 
 Numbers = tuple[float, ...]
 
 TRUE_CALIBRATIONS = ("nominal", "white", "constant")
-PLACEMENTS = ("prior", "ring")
+PLACEMENTS = ("prior", "ring", "room")
+ROOM_LANDMARKS = 72
 
 
 @dataclass(frozen=True)
@@ -39,11 +43,17 @@ class Scenario:
     """Nominal velocity in the camera frame, m/s and rad/s: the mean that the filter starts with."""
     velocity_sigma: Numbers = (0.01, 0.01, 0.01)
     """σ of the true initial velocity around the nominal one, and of the filter's."""
+    motion: str = "velocity"
+    """The filter's motion model. `velocity`: constant velocity, with accelerations drawn.
+    `odometry`: the nominal motion is the true one, and its noisy reading the filter's input."""
     acceleration_sigma: Numbers = (0.1, 0.1, 0.1)
-    """σ of the true white acceleration, and of the filter's, m/s² and rad/s²."""
+    """`velocity`: σ of the true white acceleration, and of the filter's, m/s² and rad/s²."""
+    odometry_sigma: Numbers = (0.01, 0.01, 0.01)
+    """`odometry`: σ of the reading of one step, and the filter's, m and rad."""
     placement: str = "prior"
     """`prior`: every landmark seen in frame 0, at a uniform pixel and an inverse depth from the
-    filter's prior. `ring`: evenly on a horizontal circle around the centre of the nominal path."""
+    filter's prior. `ring`: evenly on a horizontal circle around the centre of the nominal path.
+    `room`: 72 points along the walls of a square room, on two levels (slamtb)."""
     landmarks: int = 12
     first_pixels: tuple[Numbers, ...] = ((20.0, 620.0),)
     """`prior`: the interval of each pixel coordinate in frame 0."""
@@ -51,10 +61,26 @@ class Scenario:
     """`ring`: its radius, m."""
     nearest_depth: float = 3.0
     """d_min, m: the filter's prior on 1/z is N(1/(2 d_min), (1/(4 d_min))²)."""
+    inverse_depth: Numbers = ()
+    """Mean and σ of the filter's prior on 1/z, 1/m, where they are not those of d_min."""
     least_inverse_depth: float = 0.001
     """`prior`: truth is drawn from the prior truncated above this, 1/m."""
+    first_frame: int = 0
+    """Nothing is measured before this frame."""
+    first_landmarks: int = 0
+    """At most so many landmarks are new in frame 0; 0 for all that are visible."""
+    new_landmarks: int = 0
+    """At most so many are new in a later frame; 0 for all that are visible."""
+    known_landmarks: int = 0
+    """At most so many are measured again in a frame, drawn at random; 0 for all visible."""
+    sensor: str = "camera"
+    """What is measured: a pixel (`camera`), or the point relative to the sensor (`position`)."""
     visible_depth: float = 0.1
-    """A point nearer than this along the optical axis is not seen, m."""
+    """`camera`: a point nearer than this along the optical axis is not seen, m."""
+    range: Numbers = (0.5, 5.0)
+    """`position`: least and greatest distance of a point that is measured, m."""
+    position_sigma: float = 0.1
+    """`position`: σ of each measured coordinate, m."""
     image: Numbers = (640.0,)
     """Size of the picture, pixels."""
     focal: Numbers = (650.0,)
@@ -74,9 +100,9 @@ class Scenario:
         _check(self)
 
     @property
-    def world(self) -> Geometry:
-        """Planar or spatial geometry."""
-        return GEOMETRIES[self.geometry]
+    def rig(self) -> Rig:
+        """Geometry, motion model and sensor: what a filter is made for."""
+        return Rig(GEOMETRIES[self.geometry], MOTIONS[self.motion], SENSORS[self.sensor])
 
 
 def scenario(
@@ -146,7 +172,7 @@ def _coerced(field: str, value: Any, like: Any) -> Any:
         if not isinstance(value, str):
             raise wrong("a word")
         return value
-    if isinstance(like, tuple) and isinstance(like[0], tuple):
+    if isinstance(like, tuple) and like and isinstance(like[0], tuple):
         if not isinstance(value, list | tuple) or not all(
             isinstance(pair, list | tuple) for pair in value
         ):
@@ -166,6 +192,8 @@ def _check(s: Scenario) -> None:
     """Raise ValueError, naming the field, unless the scenario can be simulated."""
     for field, known in (
         ("geometry", tuple(GEOMETRIES)),
+        ("motion", tuple(MOTIONS)),
+        ("sensor", tuple(SENSORS)),
         ("placement", PLACEMENTS),
         ("calibration", CALIBRATIONS),
         ("true_calibration", TRUE_CALIBRATIONS),
@@ -174,9 +202,9 @@ def _check(s: Scenario) -> None:
             raise ValueError(
                 f"scenario field {field} is {getattr(s, field)!r}; known: {', '.join(known)}"
             )
-    t, p = s.world.tangent_dim, s.world.pixel_dim
+    t, p = s.rig.geometry.tangent_dim, s.rig.geometry.pixel_dim
     lengths = {
-        "velocity": t, "velocity_sigma": t, "acceleration_sigma": t,
+        "velocity": t, "velocity_sigma": t, _NOISE_OF[s.motion]: t, "range": 2,
         "image": p, "focal": p, "centre": p, "first_pixels": p,
     }  # fmt: skip
     for field, length in lengths.items():
@@ -189,17 +217,36 @@ def _check(s: Scenario) -> None:
         _check_numbers(field.name, getattr(s, field.name))
     if any(len(pair) != 2 or pair[0] >= pair[1] for pair in s.first_pixels):
         raise ValueError(f"scenario field first_pixels needs [low, high] pairs: {s.first_pixels}")
+    if s.inverse_depth and (len(s.inverse_depth) != 2 or s.inverse_depth[1] <= 0):
+        raise ValueError(f"scenario field inverse_depth needs a mean and a σ: {s.inverse_depth}")
+    if s.range[0] >= s.range[1]:
+        raise ValueError(f"scenario field range needs a least and a greatest one: {s.range}")
+    if s.sensor == "position" and s.calibration != "known":
+        raise ValueError("scenario field calibration: a position sensor has none; use known")
+    _check_placement(s)
+
+
+def _check_placement(s: Scenario) -> None:
+    if s.placement == "room" and (s.geometry != "spatial" or s.landmarks != ROOM_LANDMARKS):
+        raise ValueError(
+            f"placement room is for a spatial geometry and {ROOM_LANDMARKS} landmarks, "
+            f"not {s.geometry} and {s.landmarks}"
+        )
     if s.placement == "ring" and s.geometry != "planar":
         raise ValueError("scenario field placement: ring is only for a planar geometry")
     if s.placement == "ring" and s.velocity[-1] == 0:
         raise ValueError("placement ring needs a nominal path that turns: velocity[-1] is 0")
 
 
+_NOISE_OF = {"velocity": "acceleration_sigma", "odometry": "odometry_sigma"}
 _POSITIVE = (
     "rate", "steps", "landmarks", "ring_radius", "nearest_depth", "image", "focal",
-    "pixel_sigma", "least_inverse_depth", "visible_depth", "acceleration_sigma",
+    "pixel_sigma", "least_inverse_depth", "visible_depth", "acceleration_sigma", "position_sigma",
 )  # fmt: skip
-_NOT_NEGATIVE = ("velocity_sigma", "focal_sigma", "centre_sigma")
+_NOT_NEGATIVE = (
+    "velocity_sigma", "focal_sigma", "centre_sigma", "odometry_sigma", "range",
+    "first_frame", "first_landmarks", "new_landmarks", "known_landmarks",
+)  # fmt: skip
 
 
 def _check_numbers(field: str, value: Any) -> None:
@@ -273,6 +320,50 @@ def _built_in():
         calibration="white",
         true_calibration="white",
     )
+    yield from _with_odometry()
+
+
+def _with_odometry():
+    """The settings of two published studies, for comparison with their numbers."""
+    degree = math.radians(1)
+    yield Scenario(
+        name="room",
+        geometry="spatial",
+        rate=10.0,
+        steps=200,
+        velocity=(0.0, 0.0, 0.8, 0.0, -9 * degree, 0.0),
+        velocity_sigma=(0.0,) * 6,
+        motion="odometry",
+        odometry_sigma=(0.005,) * 3 + (0.05 * degree,) * 3,
+        acceleration_sigma=(0.1,) * 6,
+        placement="room",
+        landmarks=ROOM_LANDMARKS,
+        first_pixels=((0.0, 640.0), (0.0, 480.0)),
+        image=(640.0, 480.0),
+        focal=(320.0, 320.0),
+        centre=(320.0, 240.0),
+        pixel_sigma=1.0,
+        inverse_depth=(0.01, 0.5),
+        first_landmarks=10,
+        new_landmarks=1,
+        known_landmarks=10,
+    )
+    for suffix, sigma in (("", 0.02), ("-loose", 0.04)):
+        yield Scenario(
+            name="positions" + suffix,
+            rate=1.0,
+            steps=400,
+            velocity=(0.0, 0.25, 0.075),
+            velocity_sigma=(0.0,) * 3,
+            motion="odometry",
+            # Wheels do not slip sideways; a millimetre keeps the covariance positive definite.
+            odometry_sigma=(0.001, sigma / math.sqrt(2), 2 * math.sqrt(2) * sigma),
+            placement="ring",
+            landmarks=15,
+            ring_radius=0.25 / 0.075 + 2.5,
+            sensor="position",
+            first_frame=1,
+        )
 
 
 BUILT_IN: dict[str, Scenario] = {s.name: s for s in _built_in()}

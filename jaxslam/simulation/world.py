@@ -8,10 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.camera import Camera, bearing, project
+from jaxslam.camera import Camera, bearing
 from jaxslam.filters import Features, Parameters, inverse_depth_prior
-from jaxslam.geometry import Pose
-from jaxslam.motion import displacement, next_velocity
+from jaxslam.geometry import Pose, identity
 from jaxslam.simulation.scenario import Scenario
 
 
@@ -24,9 +23,12 @@ class Run:
     """T_BC of every frame; the first is the identity."""
     points: Float[Array, "landmarks n"]
     """In B, in the order in which they are first seen."""
-    pixels: Float[Array, "frames landmarks p"]
-    """Measured, with noise."""
+    measured: Float[Array, "frames landmarks p"]
+    """With noise."""
     visible: Bool[Array, "frames landmarks"]
+    """Which points are measured."""
+    controls: Float[Array, "steps ..."]
+    """The motion model's input of every step: seconds, or the odometry's reading."""
 
 
 @jax.tree_util.register_dataclass
@@ -46,8 +48,10 @@ class Sightings:
 
 def parameters(scenario: Scenario, dtype=None) -> Parameters:
     """The filter's numbers that fit the scenario: the true noise and the nominal camera."""
-    mean, sigma = inverse_depth_prior(scenario.nearest_depth)
-    p = scenario.world.pixel_dim
+    mean, sigma = scenario.inverse_depth or inverse_depth_prior(scenario.nearest_depth)
+    p = scenario.rig.geometry.pixel_dim
+    camera = scenario.sensor == "camera"
+    velocity = scenario.motion == "velocity"
 
     def array(values):
         return jnp.asarray(values, dtype or jnp.result_type(float))
@@ -55,8 +59,8 @@ def parameters(scenario: Scenario, dtype=None) -> Parameters:
     return Parameters(
         camera=Camera(array(scenario.focal), array(scenario.centre)),
         intrinsics_sigma=array([scenario.focal_sigma] * p + [scenario.centre_sigma] * p),
-        pixel_sigma=array(scenario.pixel_sigma),
-        acceleration_sigma=array(scenario.acceleration_sigma),
+        measurement_sigma=array(scenario.pixel_sigma if camera else scenario.position_sigma),
+        motion_sigma=array(scenario.acceleration_sigma if velocity else scenario.odometry_sigma),
         inverse_depth=array(mean),
         inverse_depth_sigma=array(sigma),
     )
@@ -67,20 +71,23 @@ def simulate(scenario: Scenario, key: Array, dtype=None) -> Run:
     motion_key, world_key, camera_key, pixel_key = jax.random.split(key, 4)
     dtype = dtype or jnp.result_type(float)
     truth = parameters(scenario, dtype)
-    poses = _trajectory(scenario, truth, motion_key)
+    poses, controls = _MOTION[scenario.motion](scenario, truth, motion_key)
     points = _PLACEMENT[scenario.placement](scenario, truth, world_key)
     cameras = _cameras(scenario, truth, camera_key)
+    measure, one = scenario.rig.sensor.measure, jnp.ones((), dtype)
 
     def frame(pose: Pose, camera: Camera):
         seen_from = jax.vmap(pose.inverse().apply)(points)
-        pixels = jax.vmap(project, in_axes=(None, 0))(camera, seen_from)
-        size = jnp.asarray(scenario.image, dtype)
-        inside = jnp.all((pixels >= 0) & (pixels < size), axis=-1)
-        return pixels, inside & (seen_from[:, -1] > scenario.visible_depth)
+        measured = jax.vmap(measure, in_axes=(None, 0, None))(camera, seen_from, one)
+        return measured, _VISIBLE[scenario.sensor](scenario, seen_from, measured)
 
-    pixels, visible = jax.vmap(frame)(poses, cameras)
-    pixels += truth.pixel_sigma * jax.random.normal(pixel_key, pixels.shape, dtype)
-    return _in_order_of_appearance(Run(poses, points, pixels, visible))
+    measured, visible = jax.vmap(frame)(poses, cameras)
+    visible &= jnp.arange(scenario.steps + 1)[:, None] >= scenario.first_frame
+    # A key of its own, so that a limit changes nothing else of a run.
+    visible = _limited(scenario, jax.random.fold_in(pixel_key, 1), visible)
+    noise = jax.random.normal(pixel_key, measured.shape, dtype)
+    measured += truth.measurement_sigma * noise
+    return _in_order_of_appearance(Run(poses, points, measured, visible, controls))
 
 
 def sightings(run: Run) -> Sightings:
@@ -100,12 +107,12 @@ def features(run: Run, capacity: Sightings) -> tuple[Features, Features, Feature
     Slot i of the filter is point i of the run. `capacity` holds Python integers.
     """
     known, new = _known_and_new(run)
-    first = _picked(new[0], run.pixels[0], int(capacity.first))
+    first = _picked(new[0], run.measured[0], int(capacity.first))
     pick = jax.vmap(_picked, in_axes=(0, 0, None))
     return (
         first,
-        pick(known[1:], run.pixels[1:], int(capacity.known)),
-        pick(new[1:], run.pixels[1:], int(capacity.new)),
+        pick(known[1:], run.measured[1:], int(capacity.known)),
+        pick(new[1:], run.measured[1:], int(capacity.new)),
     )
 
 
@@ -114,38 +121,105 @@ def _known_and_new(run: Run):
     return run.visible & before, run.visible & ~before
 
 
-def _picked(mask, pixels, count: int) -> Features:
+def _picked(mask, measured, count: int) -> Features:
     """The first `count` landmarks of the mask, padded with features that are not valid."""
     slots = jnp.argsort(~mask, stable=True)[:count]
-    return Features(slots, pixels[slots], mask[slots])
+    return Features(slots, measured[slots], mask[slots])
 
 
-def _trajectory(scenario: Scenario, truth: Parameters, key: Array) -> Pose:
+def _by_acceleration(scenario: Scenario, truth: Parameters, key: Array) -> tuple[Pose, Array]:
     """White accelerations and an initial velocity from the filter's prior (P8, P9)."""
     start_key, acceleration_key = jax.random.split(key)
-    geometry, dtype = scenario.world, truth.pixel_sigma.dtype
+    rig, dtype = scenario.rig, truth.motion_sigma.dtype
+    geometry, motion = rig.geometry, rig.motion
     t, dt = geometry.tangent_dim, jnp.asarray(1 / scenario.rate, dtype)
     velocity = jnp.asarray(scenario.velocity, dtype) + jnp.asarray(
         scenario.velocity_sigma, dtype
     ) * jax.random.normal(start_key, (t,), dtype)
-    accelerations = truth.acceleration_sigma * jax.random.normal(
+    accelerations = truth.motion_sigma * jax.random.normal(
         acceleration_key, (scenario.steps, t), dtype
     )
 
     def move(carry, acceleration):
         pose, velocity = carry
-        pose = (pose @ displacement(geometry, velocity, acceleration, dt)).normalize()
-        return (pose, next_velocity(velocity, acceleration, dt)), pose
+        pose = (pose @ motion.displacement(geometry, velocity, acceleration, dt)).normalize()
+        return (pose, motion.next_velocity(velocity, acceleration, dt)), pose
 
-    start = jax.tree.map(lambda x: x.astype(dtype), geometry.group.identity())
+    start = identity(geometry, dtype)
     _, poses = jax.lax.scan(move, (start, velocity), accelerations)
+    return _with_start(start, poses), jnp.full(scenario.steps, dt)
+
+
+def _by_odometry(scenario: Scenario, truth: Parameters, key: Array) -> tuple[Pose, Array]:
+    """The nominal motion exactly; each step is read with an error, `u` = truth − w."""
+    geometry, dtype = scenario.rig.geometry, truth.motion_sigma.dtype
+    nominal = jnp.asarray(scenario.velocity, dtype) / scenario.rate
+    still = jnp.zeros_like(nominal)
+    step = scenario.rig.motion.displacement(geometry, still, still, nominal)
+    noise = jax.random.normal(key, (scenario.steps, geometry.tangent_dim), dtype)
+
+    def move(pose, _):
+        pose = (pose @ step).normalize()
+        return pose, pose
+
+    start = identity(geometry, dtype)
+    _, poses = jax.lax.scan(move, start, length=scenario.steps)
+    return _with_start(start, poses), nominal - truth.motion_sigma * noise
+
+
+_MOTION = {"velocity": _by_acceleration, "odometry": _by_odometry}
+
+
+def _with_start(start: Pose, poses: Pose) -> Pose:
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, poses)
+
+
+def _in_image(scenario: Scenario, points, pixels) -> Bool[Array, " l"]:
+    """In front of the camera and inside the picture."""
+    inside = jnp.all((pixels >= 0) & (pixels < jnp.asarray(scenario.image, pixels.dtype)), axis=-1)
+    return inside & (points[:, -1] > scenario.visible_depth)
+
+
+def _in_range(scenario: Scenario, points, measured) -> Bool[Array, " l"]:
+    """Neither too near nor too far, in any direction."""
+    del measured
+    least, greatest = scenario.range
+    distance = jnp.linalg.norm(points, axis=-1)
+    return (distance >= least) & (distance <= greatest)
+
+
+_VISIBLE = {"camera": _in_image, "position": _in_range}
+
+
+def _limited(scenario: Scenario, key: Array, visible: Bool[Array, "frames l"]):
+    """No more landmarks in a frame than the scenario allows, drawn at random."""
+    frames, count = visible.shape
+    first, new = scenario.first_landmarks or count, scenario.new_landmarks or count
+    known = scenario.known_landmarks or count
+    if min(first, new, known) >= count:
+        return visible
+
+    def frame(before, data):
+        visible, order, most_new = data
+        again = _at_most(visible & before, order, known)
+        fresh = _at_most(visible & ~before, order, most_new)
+        return before | fresh, again | fresh
+
+    orders = jax.random.uniform(key, (frames, count))
+    most_new = jnp.full(frames, new).at[0].set(first)
+    return jax.lax.scan(frame, jnp.zeros(count, bool), (visible, orders, most_new))[1]
+
+
+def _at_most(mask, order, count) -> Bool[Array, " l"]:
+    """The `count` of the mask that come first in the order."""
+    rank = jnp.argsort(jnp.argsort(jnp.where(mask, order, jnp.inf)))
+    return mask & (rank < count)
 
 
 def _from_prior(scenario: Scenario, truth: Parameters, key: Array) -> Float[Array, "l n"]:
     """Uniform pixels of frame 0, inverse depths from the prior, truncated."""
     pixel_key, depth_key = jax.random.split(key)
-    dtype, count = truth.pixel_sigma.dtype, scenario.landmarks
+    dtype, count = truth.motion_sigma.dtype, scenario.landmarks
     low, high = jnp.asarray(scenario.first_pixels, dtype).T
     pixels = jax.random.uniform(pixel_key, (count, low.size), dtype, minval=low, maxval=high)
     lower = (scenario.least_inverse_depth - truth.inverse_depth) / truth.inverse_depth_sigma
@@ -158,7 +232,7 @@ def _from_prior(scenario: Scenario, truth: Parameters, key: Array) -> Float[Arra
 def _on_ring(scenario: Scenario, truth: Parameters, key: Array) -> Float[Array, "l n"]:
     """Evenly on a circle about the centre of the nominal path, at the camera's height."""
     del key
-    dtype = truth.pixel_sigma.dtype
+    dtype = truth.motion_sigma.dtype
     *linear, rotation = scenario.velocity
     # x' = v + ω J x has its fixed point, the centre, at J v / ω: left of a camera that turns
     # from x towards z.
@@ -168,13 +242,29 @@ def _on_ring(scenario: Scenario, truth: Parameters, key: Array) -> Float[Array, 
     return ring.astype(dtype)
 
 
-_PLACEMENT = {"prior": _from_prior, "ring": _on_ring}
+def _in_room(scenario: Scenario, truth: Parameters, key: Array) -> Float[Array, "72 3"]:
+    """The cloister of slamtb: nine points along each wall of a 12 m room, in two rows, 1 m apart
+    in height; the camera starts 0.6 m above the lower ones, 5 m from the centre, looking along
+    the wall."""
+    del scenario, key
+    along = jnp.concatenate([jnp.arange(-4, 5, 2), jnp.arange(-4, 3, 2)])
+    out = jnp.array([6] * 5 + [4] * 4)
+    wall = jnp.column_stack([along, out])  # (east, north) of the northern wall
+    walls = jnp.concatenate([wall, wall[:, ::-1] * jnp.array([-1, 1])])
+    plane = jnp.concatenate([walls, -walls])
+    east, north, up = jnp.concatenate(
+        [jnp.column_stack([plane, jnp.full(len(plane), height)]) for height in (0, 1)]
+    ).T
+    return jnp.column_stack([-(north + 5), 0.6 - up, east]).astype(truth.motion_sigma.dtype)
+
+
+_PLACEMENT = {"prior": _from_prior, "ring": _on_ring, "room": _in_room}
 
 
 def _cameras(scenario: Scenario, truth: Parameters, key: Array) -> Camera:
     """The true camera of every frame."""
     frames, size = scenario.steps + 1, truth.intrinsics_sigma.size
-    dtype = truth.pixel_sigma.dtype
+    dtype = truth.motion_sigma.dtype
     if scenario.true_calibration == "nominal":
         deltas = jnp.zeros((frames, size), dtype)
     elif scenario.true_calibration == "constant":
@@ -192,6 +282,6 @@ def _in_order_of_appearance(run: Run) -> Run:
     return replace(
         run,
         points=run.points[order],
-        pixels=run.pixels[:, order],
+        measured=run.measured[:, order],
         visible=run.visible[:, order],
     )

@@ -80,8 +80,8 @@ class TrackerSettings:
                 distortion=jnp.array(calibration.distortion) if distorted else None,
             ),
             intrinsics_sigma=jnp.array([self.focal_sigma] * 2 + [self.centre_sigma] * 2),
-            pixel_sigma=jnp.asarray(self.pixel_sigma),
-            acceleration_sigma=jnp.array([linear] * 3 + [angular] * 3),
+            measurement_sigma=jnp.asarray(self.pixel_sigma),
+            motion_sigma=jnp.array([linear] * 3 + [angular] * 3),
             inverse_depth=jnp.asarray(mean),
             inverse_depth_sigma=jnp.asarray(sigma),
         )

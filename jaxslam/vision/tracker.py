@@ -15,6 +15,7 @@ from jaxslam.filters.ekf import remove
 from jaxslam.filters.ransac import inliers
 from jaxslam.geometry import SPATIAL
 from jaxslam.landmarks import LANDMARKS
+from jaxslam.rig import Rig
 from jaxslam.vision.calibration import Calibration
 from jaxslam.vision.patches import Match, Patch, detect_corners, match_patches
 from jaxslam.vision.settings import TrackerSettings
@@ -93,7 +94,7 @@ class Tracker:
 
     def __post_init__(self) -> None:
         s = self.settings
-        self._filter = FILTERS[s.filter](SPATIAL, LANDMARKS[s.landmarks], s.calibration)
+        self._filter = FILTERS[s.filter](Rig(SPATIAL), LANDMARKS[s.landmarks], s.calibration)
         self._time: float | None = None
         self._T_wc = self._origin = np.eye(4)
         self._covariance = np.zeros((6, 6))
@@ -326,7 +327,7 @@ def _padded(slots: np.ndarray, pixels: np.ndarray, size: int) -> Features:
 def _predict(
     slam_filter: SlamFilter, state: State, parameters: Parameters, dt
 ) -> tuple[State, _Prediction]:
-    dt = jnp.asarray(dt, parameters.pixel_sigma.dtype)
+    dt = jnp.asarray(dt, parameters.measurement_sigma.dtype)
     state = slam_filter.predict(state, parameters, dt)
     slots = jnp.arange(state.active.size)
     pixels, covariances, in_front = slam_filter.predict_features(state, parameters, dt, slots)
@@ -338,7 +339,7 @@ def _predict(
 def _correct(
     slam_filter: SlamFilter, state: State, parameters: Parameters, dt, features: Features
 ) -> tuple[State, tuple]:
-    dt = jnp.asarray(dt, parameters.pixel_sigma.dtype)
+    dt = jnp.asarray(dt, parameters.measurement_sigma.dtype)
     agreed = inliers(slam_filter, state, parameters, dt, features)
     state, innovation = slam_filter.update(state, parameters, dt, replace(features, valid=agreed))
     state = slam_filter.compose(state, parameters, dt)

@@ -1,0 +1,49 @@
+"""Anchored homogeneous points (Solà, Vidal-Calleja, Civera, Montiel, IJCV 2012, §4.3).
+
+Parameters: (C, m, ρ), 2n + 1 numbers: the position C of the camera that saw the point first, a
+ray m of any length, and ρ in units of that length. The point is `C + m/ρ`: Unified Inverse Depth
+with the ray's coordinates for its angles, and so without a singular direction.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from jaxslam.landmarks.parametrization import Parametrization
+
+
+def initialise(point, omega, focal):
+    """C = 0, `m = X/|X|`, `ρ = ω/|X|`. `focal` is not used."""
+    del focal
+    length = jnp.linalg.norm(point)
+    return _pack(jnp.zeros_like(point), point / length, omega / length)
+
+
+def transform(T_ab, landmark):
+    """`C' = R C + t`, `m' = R m`, `ρ' = ρ`."""
+    anchor, ray, rho = _unpack(landmark)
+    return _pack(T_ab @ anchor, T_ab.rotation() @ ray, rho)
+
+
+def homogeneous(landmark):
+    """`(ρ C + m, ρ)`."""
+    anchor, ray, rho = _unpack(landmark)
+    return rho * anchor + ray, rho
+
+
+def _pack(anchor, ray, rho):
+    return jnp.concatenate([anchor, ray, rho[None]])
+
+
+def _unpack(landmark):
+    n = landmark.size // 2
+    return landmark[:n], landmark[n:-1], landmark[-1]
+
+
+ANCHORED_HOMOGENEOUS = Parametrization(
+    name="anchored_homogeneous",
+    size=lambda n: 2 * n + 1,
+    initialise=initialise,
+    transform=transform,
+    homogeneous=homogeneous,
+)

@@ -1,0 +1,39 @@
+"""Points on an image plane: (x/z, y/z, 1/z) (Eade, Drummond, CVPR 2006 and ICCV 2007).
+
+n numbers, of which the first two are the normalised image coordinates in the camera of the map
+frame: that of a keyframe, or, in a robocentric filter, the current one. A point behind that
+camera's image plane has no such coordinates.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from jaxslam.landmarks.parametrization import Parametrization
+
+
+def initialise(point, omega, focal):
+    """`(x/z, y/z, ω/z)`. `focal` is not used."""
+    del focal
+    return jnp.append(point[:-1], omega) / point[-1]
+
+
+def transform(T_ab, landmark):
+    """`X = R (x/z, y/z, 1) + (1/z) t`, and `(X_x/X_z, X_y/X_z, (1/z)/X_z)`."""
+    point, omega = homogeneous(landmark)
+    point = T_ab.rotation() @ point + omega * T_ab.translation()
+    return jnp.append(point[:-1], omega) / point[-1]
+
+
+def homogeneous(landmark):
+    """`((x/z, y/z, 1), 1/z)`."""
+    return landmark.at[-1].set(1.0), landmark[-1]
+
+
+IMAGE_PLANE = Parametrization(
+    name="image_plane",
+    size=lambda n: n,
+    initialise=initialise,
+    transform=transform,
+    homogeneous=homogeneous,
+)

@@ -1,0 +1,85 @@
+"""Parallax angle (Zhao, Huang, Sun, Yan, Dissanayake, IJRR 2015): two anchors and three angles.
+
+Parameters: (C₁, C₂, θ, φ, α, a): the positions of a main and an associate anchor, the direction
+m(θ, φ) of the point from the main one, the parallax angle α between the two rays at the point,
+and a constant a. With ψ the angle between m and C₂ − C₁, the law of sines gives the point
+`C₁ + m |C₂ − C₁| sin(α + ψ)/sin α`: at α = 0 it is at infinity.
+
+One view has no parallax. Until a camera has moved enough, a = 0, C₂ is C₁, and α holds Unified
+Inverse Depth's ρ; then that camera becomes the associate anchor, once, and a = 1.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from jaxslam.landmarks import inverse_depth
+from jaxslam.landmarks.inverse_depth import angles_of, ray_of
+from jaxslam.landmarks.parametrization import Parametrization
+
+LEAST_PARALLAX = 0.02
+"""Parallax, rad, at which a camera becomes the associate anchor."""
+
+
+def initialise(point, omega, focal):
+    """Unified Inverse Depth at the main anchor."""
+    anchor, angles, rho = inverse_depth.unpack(inverse_depth.initialise(point, omega, focal))
+    return _pack(anchor, anchor, angles, rho, 0.0)
+
+
+def transform(T_ab, landmark):
+    """Both anchors and the ray move; α, between two rays, stays."""
+    main, associate, angles, alpha, anchored = _unpack(landmark)
+    ray = T_ab.rotation() @ ray_of(angles)
+    return _pack(T_ab @ main, T_ab @ associate, angles_of(ray), alpha, anchored)
+
+
+def homogeneous(landmark):
+    """`(C₁ sin α + m |C₂ − C₁| sin(α + ψ), sin α)`; before the associate anchor `(ρ C₁ + m, ρ)`."""
+    main, associate, angles, alpha, anchored = _unpack(landmark)
+    ray = ray_of(angles)
+    # |C₂ − C₁| sin(α + ψ) = sin α (m·b) + cos α |b − (m·b) m|, with b = C₂ − C₁.
+    along, across = _along_and_across(ray, associate - main)
+    reach = jnp.sin(alpha) * along + jnp.cos(alpha) * across
+    done = anchored > 0.5
+    omega = jnp.where(done, jnp.sin(alpha), alpha)
+    return omega * main + jnp.where(done, reach, 1.0) * ray, omega
+
+
+def convert(camera, landmark, covariance):
+    """The camera becomes the associate anchor where `tan α = ρ |b⊥| / (1 − ρ m·b)` is enough."""
+    del covariance
+    main, _, angles, rho, anchored = _unpack(landmark)
+    along, across = _along_and_across(ray_of(angles), camera - main)
+    alpha = jnp.atan2(rho * across, 1 - rho * along)
+    ready = (anchored < 0.5) & (alpha > LEAST_PARALLAX)
+    return jnp.where(ready, _pack(main, camera, angles, alpha, 1.0), landmark)
+
+
+def _along_and_across(ray, baseline):
+    """The baseline's component along the ray, and the length of the rest."""
+    along = ray @ baseline
+    rest = baseline - along * ray
+    squared = rest @ rest
+    # No derivative where the camera has not moved across: nothing is converted there.
+    return along, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)) * (squared > 0)
+
+
+def _pack(main, associate, angles, alpha, anchored):
+    ends = jnp.stack([alpha, jnp.asarray(anchored, alpha.dtype)])
+    return jnp.concatenate([main, associate, angles, ends])
+
+
+def _unpack(landmark):
+    n = landmark.size // 3  # 3n + 1 numbers
+    return landmark[:n], landmark[n : 2 * n], landmark[2 * n : -2], landmark[-2], landmark[-1]
+
+
+PARALLAX_ANGLE = Parametrization(
+    name="parallax_angle",
+    size=lambda n: 3 * n + 1,
+    initialise=initialise,
+    transform=transform,
+    homogeneous=homogeneous,
+    convert=convert,
+)
