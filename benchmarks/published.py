@@ -1,0 +1,166 @@
+"""Other people's published numbers out of this library's filters, on their own settings.
+
+`python benchmarks/published.py` runs the scenarios `room` (slamtb, Solà's EKF-SLAM toolbox in
+MATLAB) and `positions` (2-D SLAM of Huang, Mourikis and Roumeliotis, IJRR 2010, in the settings of
+Barrau and Bonnabel) and prints ours beside theirs. Theirs are means over few runs, so ours come
+with the interval in which 95 % of the means of that many of our runs lie.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+import jaxslam
+from jaxslam.files import write_atomically
+
+ROOM_WINDOWS = {"1–50": slice(0, 50), "51–100": slice(50, 100), "101–200": slice(100, 200)}
+# Their step 1 is our step 1; both leave out the start, which has no error.
+POSITION_WINDOWS = {"all": slice(0, 400), "last 50": slice(350, 400)}
+
+
+@dataclass(frozen=True)
+class Published:
+    """A table of somebody else's: mean pose NEES by window of steps, and RMSE at the end, m."""
+
+    scenario: str
+    runs: int
+    windows: dict[str, slice]
+    nees: dict[str, tuple[float, ...] | None]
+    """By filter; None where only ours exists."""
+    rmse: dict[str, float]
+
+
+TABLES = (
+    Published(
+        scenario="room",
+        runs=25,
+        windows=ROOM_WINDOWS,
+        nees={
+            "world/inverse_depth": (6.99, 6.57, 6.88),
+            "world/anchored_homogeneous": (7.00, 6.54, 6.83),
+            "world/inverse_depth_to_cartesian": (7.01, 6.45, 6.95),
+            "world/unit_homogeneous": (15.4, 56.2, 151.0),
+            "robocentric/unit_homogeneous": None,
+            "robocentric/inverse_scaling": None,
+        },
+        rmse={
+            "world/inverse_depth": 0.082,
+            "world/anchored_homogeneous": 0.082,
+            "world/inverse_depth_to_cartesian": 0.078,
+            "world/unit_homogeneous": 0.113,
+        },
+    ),
+    Published(
+        scenario="positions",
+        runs=100,
+        windows=POSITION_WINDOWS,
+        nees={"world/cartesian": (4.77, 6.35), "robocentric/cartesian": (3.09, 3.37)},
+        rmse={},
+    ),
+    Published(
+        scenario="positions-loose",
+        runs=100,
+        windows=POSITION_WINDOWS,
+        nees={"world/cartesian": (19.1, 29.9), "robocentric/cartesian": (5.11, 6.91)},
+        rmse={},
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure."""
+
+    scenarios: tuple[str, ...] = ("room", "positions", "positions-loose")
+    """Which of the tables."""
+    runs: int = 1000
+    """Runs of every filter."""
+    seed: int = 0
+    out: Path = Path("benchmarks/results")
+    """Folder of published-SCENARIO.json."""
+
+
+def measure(table: Published, options: Options) -> dict:
+    """Ours and theirs, filter by filter."""
+    scenario = jaxslam.scenario(table.scenario)
+    rows = {}
+    for name, theirs in table.nees.items():
+        frame, landmarks = name.split("/")
+        filters = jaxslam.make_filters(scenario.rig, [frame], [landmarks], scenario.calibration)
+        study = jaxslam.monte_carlo(scenario, filters, runs=options.runs, seed=options.seed)
+        records = [study.store.load(name, chunk, ("nees", "error")) for chunk in study.chunks]
+        nees = np.concatenate([record["nees"] for record in records])
+        error = np.concatenate([record["error"] for record in records])
+        seconds = study.seconds[name]
+        rows[name] = _compared(table, nees, theirs) | {
+            "rmse": _rmse(error, scenario.rig.geometry.point_dim),
+            "published_rmse": table.rmse.get(name),
+            "diverged": int(np.sum(~np.isfinite(nees).all(axis=1))),
+            "seconds_per_run": round(seconds.run / options.runs, 4),
+        }
+        print(name, json.dumps(rows[name], ensure_ascii=False), flush=True)
+    return {
+        "scenario": table.scenario,
+        "runs": options.runs,
+        "seed": options.seed,
+        "published_runs": table.runs,
+        "band95_of_published_runs": jaxslam.mean_band(
+            scenario.rig.geometry.tangent_dim, table.runs
+        ),
+        "filters": rows,
+    }
+
+
+def _compared(table: Published, nees: np.ndarray, theirs: tuple[float, ...] | None) -> dict:
+    """Means of our runs by window, and where 95 % of the means of `table.runs` of them lie."""
+    healthy = nees[np.isfinite(nees).all(axis=1)]
+    rng = np.random.default_rng(0)
+    windows = {}
+    for i, (label, part) in enumerate(table.windows.items()):
+        by_run = healthy[:, part].mean(axis=1)
+        means = [rng.choice(by_run, table.runs).mean() for _ in range(20_000)]
+        low, high = np.quantile(means, [0.025, 0.975])
+        windows[label] = {
+            "ours": round(by_run.mean(), 3),
+            "interval95": [low.round(3), high.round(3)],
+        }
+        if theirs is not None:
+            windows[label] |= {"published": theirs[i], "within": bool(low <= theirs[i] <= high)}
+    return {"nees": windows}
+
+
+def _rmse(error: np.ndarray, n: int) -> float:
+    """Of the position, over all runs and steps."""
+    return round(float(np.sqrt((error[..., :n] ** 2).sum(axis=-1).mean())), 4)
+
+
+def _line(name: str, row: dict) -> str:
+    cells = []
+    for window in row["nees"].values():
+        low, high = window["interval95"]
+        theirs = f" ({window['published']})" if "published" in window else ""
+        cells.append(f"{window['ours']:.2f} [{low:.2f}, {high:.2f}]{theirs}")
+    rmse = f"{row['rmse']:.3f}" + (f" ({row['published_rmse']})" if row["published_rmse"] else "")
+    return f"| {name} | {' | '.join(cells)} | {rmse} |"
+
+
+def main(options: Options) -> None:
+    """Measure every table, write its file, print it."""
+    for table in (table for table in TABLES if table.scenario in options.scenarios):
+        result = measure(table, options)
+        options.out.mkdir(parents=True, exist_ok=True)
+        with write_atomically(options.out / f"published-{table.scenario}.json") as path:
+            path.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+        labels = " | ".join(f"NEES, steps {label}" for label in table.windows)
+        print(f"\n{table.scenario}: ours [95 % of the means of {table.runs} runs] (published)")
+        print(f"| filter | {labels} | RMSE m |\n|---|{'---|' * (len(table.windows) + 1)}")
+        print("\n".join(_line(name, row) for name, row in result["filters"].items()))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
