@@ -67,11 +67,16 @@ def _is_pose(leaf: Any) -> bool:
 
 
 def _sizes(leaves: list[Any]) -> list[int]:
-    return [leaf.tangent_dim if _is_pose(leaf) else leaf.size for leaf in leaves]
+    return [_pose_size(leaf) if _is_pose(leaf) else leaf.size for leaf in leaves]
+
+
+def _pose_size(leaf: Any) -> int:
+    """A pose may be a batch of poses, whose tangents follow one another."""
+    return leaf.tangent_dim * math.prod(leaf.get_batch_axes())
 
 
 def tangent_dim(tree: Any) -> int:
-    """Size of the tangent of a pytree of poses and vectors, in the order of its leaves."""
+    """Size of the tangent of a pytree of poses and arrays, in the order of its leaves."""
     return sum(_sizes(jax.tree.leaves(tree, is_leaf=_is_pose)))
 
 
@@ -257,7 +262,12 @@ def _moved(tree: Any, delta: Float[Array, " t"], move: Callable[[Any, Array], An
     moved, start = [], 0
     for leaf, size in zip(leaves, _sizes(leaves), strict=True):
         part = delta[start : start + size]
-        moved.append(move(leaf, part) if _is_pose(leaf) else leaf + part)
+        if not _is_pose(leaf):
+            moved.append(leaf + part.reshape(leaf.shape))
+        elif leaf.get_batch_axes():
+            moved.append(jax.vmap(move)(leaf, part.reshape(-1, leaf.tangent_dim)))
+        else:
+            moved.append(move(leaf, part))
         start += size
     return jax.tree.unflatten(structure, moved)
 
@@ -265,8 +275,12 @@ def _moved(tree: Any, delta: Float[Array, " t"], move: Callable[[Any, Array], An
 def _compared(tree: Any, origin: Any, log: Callable[[Any], Array]) -> Float[Array, " t"]:
     leaves = jax.tree.leaves(tree, is_leaf=_is_pose)
     origins = jax.tree.leaves(origin, is_leaf=_is_pose)
-    parts = [
-        log(o.inverse() @ leaf) if _is_pose(leaf) else leaf - o
-        for leaf, o in zip(leaves, origins, strict=True)
-    ]
-    return jnp.concatenate(parts)
+
+    def compared(leaf, origin):
+        if not _is_pose(leaf):
+            return (leaf - origin).ravel()
+        if leaf.get_batch_axes():
+            return jax.vmap(lambda a, b: log(b.inverse() @ a))(leaf, origin).ravel()
+        return log(origin.inverse() @ leaf)
+
+    return jnp.concatenate([compared(*pair) for pair in zip(leaves, origins, strict=True)])

@@ -177,6 +177,12 @@ def compose(model: Model, state: State, context: Any) -> State:
     return _transformed(state, core, J_core, moved, J)
 
 
+def transform_core(state: State, function: Callable[[Any], Any]) -> State:
+    """Apply a function to the core alone, `P ← J P Jᵀ`."""
+    J_core = jacobian(function, state.core)
+    return _transformed(state, function(state.core), J_core, state.landmarks, None)
+
+
 def convert(model: Model, state: State, context: Any) -> State:
     """Write landmarks in the form that the model now prefers, `P ← J P Jᵀ`."""
     c, (capacity, d) = state.core_dim, state.landmarks.shape

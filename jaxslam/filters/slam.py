@@ -13,7 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.camera import Camera
 from jaxslam.filters import ekf
@@ -39,6 +39,8 @@ class Core:
     noise: Float[Array, " t"]
     """What drives this step's motion: the acceleration a (P10), or the odometry's error; zero
     before `predict` and after composition."""
+    anchors: SplitPose | None
+    """T_AF of the cameras F in which landmarks are written; a batch, or None."""
     calibration: Float[Array, " k"]
     """Error of the intrinsics (P15); empty where the calibration is known."""
 
@@ -114,6 +116,8 @@ class Context:
     control: Any
     """The motion model's input for the motion between the map frame and the camera: seconds, or
     the odometry's reading; None once the motion is composed."""
+    anchor: Int[Array, ""] | None = None
+    """Number of the anchor of new landmarks, the current camera."""
 
 
 @jax.tree_util.register_dataclass
@@ -123,6 +127,7 @@ class View:
 
     map_from_camera: Pose
     """T_AC(k), the current camera in the map frame."""
+    anchors: SplitPose | None
     calibration: Float[Array, " k"]
 
     def camera(self, context: Context) -> Camera:
@@ -144,7 +149,7 @@ class SlamModel:
 
     @property
     def moves_landmarks(self) -> bool:
-        return self.frame.moves_landmarks
+        return self.frame.moves_landmarks and not self.landmark.anchored
 
     def _displacement(self, core: Core, context: Context) -> Pose:
         if context.control is None:
@@ -156,15 +161,20 @@ class SlamModel:
         """All that a landmark depends on."""
         step = self._displacement(core, context)
         T_AC = self.frame.map_from_camera(self.frame.pose(core.pose), step)
-        return View(T_AC, core.calibration)
+        return View(T_AC, core.anchors, core.calibration)
 
     def compose_core(self, core: Core, context: Context) -> Core:
         """P18, P19. The noise has been used: it is marginalised."""
         step = self._displacement(core, context)
         pose = self.frame.compose(self.frame.pose(core.pose), step).normalize()
+        anchors = core.anchors
+        if anchors is not None and self.frame.moves_landmarks:
+            moved = jax.vmap(lambda T_AF: SplitPose.of(step.inverse() @ T_AF.joined()))
+            anchors = moved(anchors)
         return replace(
             core,
             pose=self.frame.hold(pose),
+            anchors=anchors,
             velocity=self.rig.motion.next_velocity(core.velocity, core.noise, context.control),
             noise=jnp.zeros_like(core.noise),
         )
@@ -188,6 +198,9 @@ class SlamModel:
         """The landmark in the current camera as a homogeneous point (X, ω)."""
         point, omega = self.landmark.homogeneous(landmark)
         T_CA = view.map_from_camera.inverse()
+        if self.landmark.anchored:
+            T_AF = jax.tree.map(lambda x: x[landmark[-1].astype(int)], view.anchors)
+            T_CA = T_CA @ T_AF.joined()
         return T_CA.rotation() @ point + omega * T_CA.translation(), omega
 
     def chart(self, view: View, landmark: Array) -> Array:
@@ -206,7 +219,16 @@ class SlamModel:
         camera = view.camera(context)
         point, omega = self.rig.sensor.locate(camera, measured, hidden)
         seen = self.landmark.initialise(point, omega, camera.focal[0])
+        if self.landmark.anchored:
+            return seen.at[-1].set(context.anchor)
         return self.landmark.transform(view.map_from_camera, seen)
+
+    def with_anchor(self, core: Core, anchor: Int[Array, ""]) -> Core:
+        """The core with the current camera as an anchor; its motion must be composed."""
+        step = identity(self.geometry, core.noise.dtype)
+        camera = SplitPose.of(self.frame.map_from_camera(self.frame.pose(core.pose), step))
+        anchors = jax.tree.map(lambda all, one: all.at[anchor].set(one), core.anchors, camera)
+        return replace(core, anchors=anchors)
 
 
 @dataclass(frozen=True)
@@ -250,6 +272,7 @@ class SlamFilter:
             pose=self.model.frame.hold(identity(geometry, dtype)),
             velocity=jnp.asarray(velocity, dtype)[:v],
             noise=jnp.zeros(t, dtype),
+            anchors=self._no_anchors(capacity, dtype),
             calibration=jnp.zeros(0 if self.calibration == "known" else 2 * p, dtype),
         )
         # An empty slot holds a point straight ahead: finite in every formula.
@@ -323,6 +346,10 @@ class SlamFilter:
         mean, sigma = parameters.inverse_depth, parameters.inverse_depth_sigma
         prior = (jnp.tile(mean, hidden), jnp.tile(sigma, hidden))
         noise, context = self._noise(parameters), _composed(parameters)
+        if self.model.landmark.anchored:
+            anchor = _free_anchor(state)
+            state = ekf.transform_core(state, lambda core: self.model.with_anchor(core, anchor))
+            context = replace(context, anchor=anchor)
         return ekf.initialise(self.model, state, features, noise, prior, context)
 
     def finish(self, state: State) -> State:
@@ -424,6 +451,12 @@ class SlamFilter:
     def _composed_view(self, parameters: Parameters) -> Callable[[Core], View]:
         return lambda core: self.model.view(core, _composed(parameters))
 
+    def _no_anchors(self, capacity: int, dtype) -> SplitPose | None:
+        if not self.model.landmark.anchored:
+            return None
+        origin = SplitPose.of(identity(self.geometry, dtype))
+        return jax.tree.map(lambda x: jnp.tile(x, (capacity, 1)), origin)
+
     def _with_calibration(self, state: State, parameters: Parameters) -> State:
         if self.calibration == "known":
             return state
@@ -445,6 +478,12 @@ class SlamFilter:
 
 def _composed(parameters: Parameters) -> Context:
     return Context(parameters, None)
+
+
+def _free_anchor(state: State) -> Int[Array, ""]:
+    """One that no landmark refers to; there are as many anchors as landmarks."""
+    number = jnp.where(state.active, state.landmarks[:, -1].astype(int), state.active.size)
+    return jnp.argmin(jnp.zeros(state.active.size, bool).at[number].set(True, mode="drop"))
 
 
 def _calibration(state: State) -> slice:

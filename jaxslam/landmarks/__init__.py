@@ -2,6 +2,7 @@
 
 from jaxslam.landmarks.anchored_homogeneous import ANCHORED_HOMOGENEOUS
 from jaxslam.landmarks.cartesian import CARTESIAN
+from jaxslam.landmarks.framed_homogeneous import FRAMED_HOMOGENEOUS
 from jaxslam.landmarks.image_plane import IMAGE_PLANE
 from jaxslam.landmarks.inverse_depth import INVERSE_DEPTH
 from jaxslam.landmarks.inverse_depth_to_cartesian import INVERSE_DEPTH_TO_CARTESIAN
@@ -18,6 +19,7 @@ LANDMARKS: dict[str, Parametrization] = {
         CARTESIAN,
         ANCHORED_HOMOGENEOUS,
         UNIT_HOMOGENEOUS,
+        FRAMED_HOMOGENEOUS,
         INVERSE_DEPTH_TO_CARTESIAN,
         PARALLAX_ANGLE,
         IMAGE_PLANE,
@@ -27,6 +29,7 @@ LANDMARKS: dict[str, Parametrization] = {
 __all__ = [
     "ANCHORED_HOMOGENEOUS",
     "CARTESIAN",
+    "FRAMED_HOMOGENEOUS",
     "IMAGE_PLANE",
     "INVERSE_DEPTH",
     "INVERSE_DEPTH_TO_CARTESIAN",

@@ -32,3 +32,7 @@ class Parametrization:
     )
     """`convert(C, parameters, covariance)`: the same point in another form where the camera, at C
     in the landmark's frame, and the covariance recommend it; None where there is one form."""
+    anchored: bool = False
+    """Whether the parameters are in the frame of the camera that saw the point first, an *anchor*
+    that the state holds once for all landmarks of that camera. The last parameter is then a
+    constant, the anchor's number, and `transform` is not used."""
