@@ -42,6 +42,9 @@ def _unpack(landmark):
 
 ANCHORED_HOMOGENEOUS = Parametrization(
     name="anchored_homogeneous",
+    parameters="(C, m, ρ)",
+    point="C + m/ρ",
+    source="Solà et al., IJCV 2012",
     size=lambda n: 2 * n + 1,
     initialise=initialise,
     transform=transform,

@@ -25,6 +25,9 @@ def homogeneous(landmark):
 
 CARTESIAN = Parametrization(
     name="cartesian",
+    parameters="(X, Y, Z)",
+    point="(X, Y, Z)",
+    source="the classical Gaussian (the paper's Fig. 1)",
     size=lambda n: n,
     initialise=initialise,
     transform=transform,

@@ -30,6 +30,9 @@ def homogeneous(landmark):
 
 FRAMED_HOMOGENEOUS = Parametrization(
     name="framed_homogeneous",
+    parameters="(x/z, y/z, 1/z), number of an anchor",
+    point="T_AF (x/z, y/z, 1) z",
+    source="Ceriani et al., 2011",
     size=lambda n: n + 1,
     initialise=initialise,
     transform=transform,

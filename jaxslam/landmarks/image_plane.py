@@ -32,6 +32,9 @@ def homogeneous(landmark):
 
 IMAGE_PLANE = Parametrization(
     name="image_plane",
+    parameters="(x/z, y/z, 1/z)",
+    point="(x/z, y/z, 1) z",
+    source="Eade, Drummond, CVPR 2006",
     size=lambda n: n,
     initialise=initialise,
     transform=transform,

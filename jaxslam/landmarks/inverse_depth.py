@@ -64,6 +64,9 @@ def angles_of(ray):
 
 INVERSE_DEPTH = Parametrization(
     name="inverse_depth",
+    parameters="(C, θ, φ, ρ)",
+    point="C + m(θ, φ)/ρ",
+    source="Montiel, Civera, Davison, RSS 2006 (P1–P4)",
     size=lambda n: 2 * n,
     initialise=initialise,
     transform=transform,

@@ -67,6 +67,9 @@ def _cartesian(position):
 
 INVERSE_DEPTH_TO_CARTESIAN = Parametrization(
     name="inverse_depth_to_cartesian",
+    parameters="(C, θ, φ, ρ) or (X, Y, Z), which",
+    point="C + m(θ, φ)/ρ or (X, Y, Z)",
+    source="Civera, Davison, Montiel, ICRA 2007",
     size=lambda n: 2 * n + 1,
     initialise=initialise,
     transform=transform,

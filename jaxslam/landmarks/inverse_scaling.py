@@ -29,6 +29,9 @@ def homogeneous(landmark):
 
 INVERSE_SCALING = Parametrization(
     name="inverse_scaling",
+    parameters="(x, y, z, ω)",
+    point="(x, y, z)/ω",
+    source="Marzorati et al., BMVC 2008 (P5)",
     size=lambda n: n + 1,
     initialise=initialise,
     transform=transform,

@@ -77,6 +77,9 @@ def _unpack(landmark):
 
 PARALLAX_ANGLE = Parametrization(
     name="parallax_angle",
+    parameters="(C₁, C₂, θ, φ, α), whether C₂ is set",
+    point="C₁ + m ‖C₂ − C₁‖ sin(α + ψ)/sin α",
+    source="Zhao et al., IJRR 2015",
     size=lambda n: 3 * n + 1,
     initialise=initialise,
     transform=transform,

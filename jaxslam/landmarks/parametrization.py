@@ -1,8 +1,8 @@
-"""What a landmark parametrization is: four pure functions on one landmark, and its size."""
+"""What a landmark parametrization is: pure functions on one landmark, and what they mean."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from jaxtyping import Array, Float
@@ -18,6 +18,12 @@ class Parametrization:
     """A way to write a point with d numbers, for points of n = 2 (planar) or 3 coordinates."""
 
     name: str
+    parameters: str
+    """What the numbers are, as the literature writes them, for a point of three coordinates."""
+    point: str
+    """The Euclidean point."""
+    source: str
+    """Who published it."""
     size: Callable[[int], int]
     """`size(n)`: how many parameters a landmark has."""
     initialise: Callable[[Float[Array, " n"], Float[Array, ""], Float[Array, ""]], Parameters]
@@ -36,3 +42,13 @@ class Parametrization:
     """Whether the parameters are in the frame of the camera that saw the point first, an *anchor*
     that the state holds once for all landmarks of that camera. The last parameter is then a
     constant, the anchor's number, and `transform` is not used."""
+
+
+def table(parametrizations: Iterable[Parametrization]) -> str:
+    """The parametrizations as a Markdown table."""
+    rows = [
+        f"| `{p.name}` | {p.parameters} | {p.size(3)} ({p.size(2)}) | {p.point} | {p.source} |"
+        for p in parametrizations
+    ]
+    head = "| name | parameters | numbers, spatial (planar) | point | source |"
+    return "\n".join([head, "|---|---|---|---|---|", *rows])

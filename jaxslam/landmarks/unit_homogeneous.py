@@ -20,6 +20,9 @@ def initialise(point, omega, focal):
 
 UNIT_HOMOGENEOUS = Parametrization(
     name="unit_homogeneous",
+    parameters="(m, ρ)",
+    point="m/ρ",
+    source="Solà et al., IJCV 2012, without an anchor",
     size=lambda n: n + 1,
     initialise=initialise,
     transform=inverse_scaling.transform,
