@@ -135,8 +135,8 @@ def _compared(table: Published, nees: np.ndarray, theirs: tuple[float, ...] | No
 
 
 def _rmse(error: np.ndarray, n: int) -> float:
-    """Of the position, over all runs and steps."""
-    return round(float(np.sqrt((error[..., :n] ** 2).sum(axis=-1).mean())), 4)
+    """Of the position at the last step."""
+    return round(float(np.sqrt((error[:, -1, :n] ** 2).sum(axis=-1).mean())), 4)
 
 
 def _line(name: str, row: dict) -> str:

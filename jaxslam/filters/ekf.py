@@ -287,6 +287,31 @@ def landmark_covariance(
     return value, _local_covariance(state, J, slots)
 
 
+def landmark_samples(
+    view: Callable[[Any], Any],
+    function: Callable[[Any, Array], Array],
+    state: State,
+    slot: Int[Array, ""],
+    normal: Float[Array, "samples c+d"],
+) -> Float[Array, "samples k"]:
+    """`function(view(core), landmark)` of draws from the joint Gaussian of core and landmark.
+
+    `normal` are standard normal draws. Nothing is linearised: this is the distribution that the
+    filter's mean and covariance stand for.
+    """
+    c, d = state.core_dim, state.landmarks.shape[1]
+    index = jnp.concatenate([jnp.arange(c), c + slot * d + jnp.arange(d)])
+    # A covariance has no full rank (a pixel knows the ray's length): eigenvectors, not Cholesky.
+    values, vectors = jnp.linalg.eigh(state.covariance[index[:, None], index])
+    root = vectors * jnp.sqrt(jnp.maximum(values, 0.0))
+
+    def one(draw):
+        delta = root @ draw
+        return function(view(retract(state.core, delta[:c])), state.landmarks[slot] + delta[c:])
+
+    return jax.vmap(one)(normal)
+
+
 def core_covariance(function: Callable[[Any], Any], state: State) -> tuple[Any, Array]:
     """Value of a function of the core, and its first-order covariance in the value's tangent."""
     c = state.core_dim

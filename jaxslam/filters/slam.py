@@ -422,6 +422,24 @@ class SlamFilter:
 
         Not finite for a landmark at infinity; far from Gaussian for one of unknown depth.
         """
+        return ekf.landmark_covariance(*self._world_point(parameters), state, slots)
+
+    def landmark_samples(
+        self, state: State, parameters: Parameters, slots: Array, key: Array, count: int = 1000
+    ) -> Float[Array, "m count n"]:
+        """Draws of points in B from what the state says of them, nothing linearised.
+
+        A draw beyond infinity (ω < 0) comes out on the other side of the camera.
+        """
+        size = state.core_dim + state.landmarks.shape[1]
+        normal = jax.random.normal(key, (slots.size, count, size), state.covariance.dtype)
+        view, point = self._world_point(parameters)
+        return jax.vmap(lambda slot, draws: ekf.landmark_samples(view, point, state, slot, draws))(
+            slots, normal
+        )
+
+    def _world_point(self, parameters: Parameters):
+        """The functions of core and landmark that give its point in B."""
         camera_view = self._composed_view(parameters)
 
         def view(core):
@@ -432,7 +450,7 @@ class SlamFilter:
             seen, omega = self.model.camera_point(camera_view, landmark)
             return T_BC @ (seen / omega)
 
-        return ekf.landmark_covariance(view, point, state, slots)
+        return view, point
 
     def predicted_camera(
         self, state: State, parameters: Parameters, control: Array, slots: Array

@@ -60,7 +60,8 @@ def _marks(axis: Axes, results, key: str, landmarks: list[str], filters: list[st
 
 def _log_axis(axis: Axes, label: str) -> None:
     axis.set_xscale("log")
-    low, high = axis.get_xlim()
+    low, high = min(2.0, axis.get_xlim()[0]), max(10.0, axis.get_xlim()[1])
+    axis.set_xlim(low, high)
     ticks = [t for t in (1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000) if low <= t <= high]
     axis.xaxis.set_major_locator(FixedLocator(ticks))
     axis.xaxis.set_major_formatter(ScalarFormatter())

@@ -1,0 +1,40 @@
+"""Maps from above whose landmarks are drawn as what they are: clouds, not only ellipses."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+
+from jaxslam.consistency.statistics import chi2_quantile
+from jaxslam.plots.style import COLOURS
+
+
+def plot_landmark_clouds(
+    axes: Axes,
+    samples: Float[np.ndarray, "m count n"],
+    means: Float[np.ndarray, "m n"],
+    covariances: Float[np.ndarray, "m n n"],
+    *,
+    colour: str = COLOURS[0],
+    label: str = "",
+) -> None:
+    """Draw (x, z) of points in the world: draws as dots, and their first-order 95 % ellipses.
+
+    `samples` is of `SlamFilter.landmark_samples`, `means` and `covariances` of
+    `SlamFilter.landmarks_in_world`. Where dots leave their ellipse, a Gaussian in Euclidean space
+    is not what the filter believes.
+    """
+    plane = np.array([0, samples.shape[-1] - 1])
+    dots = np.asarray(samples)[..., plane].reshape(-1, 2)
+    axes.plot(*dots.T, ",", color=colour, alpha=0.5, rasterized=True)
+    axes.plot([], [], ".", color=colour, label=f"{label}: draws")
+    angle = np.linspace(0, 2 * np.pi, 121)
+    circle = np.sqrt(chi2_quantile(0.95, 2)) * np.stack([np.cos(angle), np.sin(angle)])
+    for i, (mean, covariance) in enumerate(zip(means, covariances, strict=True)):
+        values, vectors = np.linalg.eigh(np.asarray(covariance)[np.ix_(plane, plane)])
+        ellipse = np.asarray(mean)[plane, None] + vectors @ (
+            np.sqrt(np.maximum(values, 0))[:, None] * circle
+        )
+        name = f"{label}: 95 % ellipse to first order" if i == 0 else None
+        axes.plot(*ellipse, color=colour, lw=1.0, label=name)
