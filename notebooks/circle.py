@@ -50,15 +50,15 @@ filters = jaxslam.make_filters(
     SCENARIO.calibration,
 )
 
+
 # %% [markdown]
 # ## Fig. 3: the maps of one run
 #
 # A camera on a circle of 4 m, looking ahead, among 36 landmarks on a circle of 8 m, for 0.7 s:
-# long enough for some parallax, short enough that the depth of landmarks is still open. Every dot is a draw from the joint Gaussian of camera and landmark that the filter holds, pushed
-# into Euclidean space without linearising anything. The ellipses are what is usually drawn:
-# the first-order covariance of the Euclidean point.
-
-
+# long enough for some parallax, short enough that the depth of landmarks is still open. Every dot
+# is a draw from the joint Gaussian of camera and landmark that the filter holds, pushed into
+# Euclidean space without linearising anything. The ellipses are what is usually drawn: the
+# first-order covariance of the Euclidean point.
 # %%
 def one_run(steps, seed=1):
     with jax.enable_x64(True):
