@@ -1,5 +1,8 @@
 """A point seen twice: truth against quadrature, estimates against what they must be, distances."""
 
+import dataclasses
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +10,7 @@ import pytest
 from scipy.special import ndtr
 from scipy.stats import ks_2samp, norm, wasserstein_distance
 
+from jaxslam.cli import main
 from jaxslam.triangulation import (
     ESTIMATES,
     TwoViews,
@@ -199,3 +203,42 @@ def test_samples_do_not_depend_on_the_chunk(monkeypatch):
 def test_views_that_make_no_sense_are_named(fields, message):
     with pytest.raises(ValueError, match=message):
         TwoViews(**fields)
+
+
+def test_the_command_writes_what_others_read(tmp_path, capsys):
+    small = ["--particles", "3000", "--measurements", "3", "--calibration", "shared"]
+    main(["triangulate", *small, "--nearest-depth", "2", "--out", str(tmp_path)])
+    summary = json.loads((tmp_path / "triangulation.json").read_text())
+    assert summary["schema"] == 1
+    assert summary["views"] == dataclasses.asdict(TwoViews(calibration="shared", nearest_depth=2.0))
+    assert (summary["particles"], summary["measurements"], summary["seed"]) == (3000, 3, 0)
+    assert set(summary["truth"]) == {"triangulation", "posterior"}
+    assert set(summary["estimates"]) == set(ESTIMATES)
+    for result in (*summary["truth"].values(), *summary["estimates"].values()):
+        assert len(result["x"]) == len(result["z"]) == len(summary["probabilities"])
+        assert result["beyond_infinity"] == 0
+    found = summary["estimates"]["inverse_scaling"]["distance"]["posterior"]["z"]
+    for measure_name in ("ks", "wasserstein"):
+        assert found[measure_name].keys() == {"exact", "mean", "error"}
+    assert (tmp_path / "triangulation.png").read_bytes().startswith(b"\x89PNG")
+    assert {path.name for path in tmp_path.iterdir()} == {"triangulation.json", "triangulation.png"}
+    assert "inverse_depth" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--depth", "-3"], "depth must be positive"),
+        (["--particles", "10"], "particles must be at least 1000, not 10"),
+        (["--measurements", "1"], "measurements must be 0"),
+        (["--calibration", "maybe"], "known: white, shared, known"),
+    ],
+)
+def test_a_mistake_ends_with_status_2_and_one_line(arguments, message, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["triangulate", *arguments, "--out", str(tmp_path / "out")])
+    error = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
