@@ -10,6 +10,7 @@ import tyro
 
 from jaxslam.cli.consistency import ConsistencyOptions
 from jaxslam.cli.track import TrackOptions
+from jaxslam.cli.triangulate import TriangulateOptions
 
 Command = (
     Annotated[
@@ -22,6 +23,12 @@ Command = (
         TrackOptions,
         tyro.conf.subcommand(
             "track", description="Track a camera through a video: trajectory, map, overlay."
+        ),
+    ]
+    | Annotated[
+        TriangulateOptions,
+        tyro.conf.subcommand(
+            "triangulate", description="A point seen twice: what is known of its depth, and is it?"
         ),
     ]
 )

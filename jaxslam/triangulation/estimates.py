@@ -1,0 +1,96 @@
+"""What estimators make of two measured pixels: a Gaussian of the landmark's parameters.
+
+Inverse Scaling and Unified Inverse Depth come out of the library's own robocentric filter, a
+Cartesian point out of classical first-order triangulation. Each Gaussian is in parameters of its
+own; pushed through `homogeneous` it is bent as the parametrization bends it.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxslam.filters import FILTERS, Features, SlamFilter
+from jaxslam.geometry import PLANAR
+from jaxslam.landmarks import LANDMARKS, Parametrization
+from jaxslam.triangulation.samples import Samples, draw
+from jaxslam.triangulation.truth import Measured, intersect
+from jaxslam.triangulation.views import CALIBRATIONS, NOISE_DIM, TwoViews
+
+FILTERED = ("inverse_scaling", "inverse_depth")
+ESTIMATES = (*FILTERED, "cartesian")
+"""Names of the estimates, which are those of their parametrizations."""
+
+Gaussian = tuple[Float[Array, " d"], Float[Array, "d d"]]
+"""Mean and covariance of a landmark's parameters in the second camera."""
+
+
+def estimate(name: str, views: TwoViews, pixels: Float[Array, " 2"]) -> Gaussian:
+    """The named estimate from two measured pixels."""
+    measured = (views.parameters, jnp.array(views.baseline), jnp.asarray(pixels))
+    if name == "cartesian":
+        return triangulated(views.calibration, measured)
+    slam = FILTERS["robocentric"](PLANAR, LANDMARKS[name], CALIBRATIONS[views.calibration])
+    return filtered(slam, measured)
+
+
+@partial(jax.jit, static_argnames="slam")
+def filtered(slam: SlamFilter, measured: Measured) -> Gaussian:
+    """The landmark after a filter's first two frames, one second apart: seen new, seen again."""
+    parameters, baseline, pixels = measured
+    velocity = jnp.zeros(PLANAR.tangent_dim).at[0].set(baseline)
+
+    def seen(pixels):
+        slots = jnp.zeros(pixels.size, int)
+        return Features(slots, pixels[:, None], jnp.ones(pixels.size, bool))
+
+    second = jnp.ones(())
+    state = slam.start(parameters, 1, velocity, jnp.zeros_like(velocity))
+    state = slam.first(state, parameters, seen(pixels[:1]))
+    state, _ = slam.step(state, parameters, second, seen(pixels[1:]), seen(pixels[2:]))
+    own = slice(state.core_dim, None)
+    return state.landmarks[0], state.covariance[own, own]
+
+
+@partial(jax.jit, static_argnames="calibration")
+def triangulated(calibration: str, measured: Measured) -> Gaussian:
+    """(x, z) where the measured rays meet, and `J Jᵀ`, J its Jacobian by the standardised errors.
+
+    The classical Gaussian of a Cartesian point, to first order; it needs rays that meet.
+    """
+
+    def point(normal):
+        numerator, omega, _ = intersect(calibration, measured, normal)
+        return numerator / omega
+
+    exact = jnp.zeros(NOISE_DIM)
+    J = jax.jacfwd(point)(exact)
+    return point(exact), J @ J.T
+
+
+def pushed(
+    landmark: Parametrization, gaussian: Gaussian, normal: Float[Array, " k"]
+) -> tuple[Float[Array, " 2"], Float[Array, ""], Float[Array, ""]]:
+    """One sample of a Gaussian of a landmark, as a homogeneous point, with weight 1.
+
+    `gaussian` holds the mean and a root of the covariance.
+    """
+    mean, root = gaussian
+    point, omega = landmark.homogeneous(mean + root @ normal[: mean.size])
+    return point, omega, jnp.zeros_like(omega)
+
+
+def push(name: str, gaussian: Gaussian, count: int, seed: int) -> Samples:
+    """`count` points of the named estimate."""
+    mean, covariance = gaussian
+    return draw(pushed, LANDMARKS[name], (mean, _root(covariance)), count, seed)
+
+
+@jax.jit
+def _root(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """R with R Rᵀ = P, also of a P without full rank."""
+    values, vectors = jnp.linalg.eigh(covariance)
+    return vectors * jnp.sqrt(jnp.maximum(values, 0))

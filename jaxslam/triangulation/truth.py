@@ -1,0 +1,51 @@
+"""Where the point can be, given two measured pixels: exactly, by particles.
+
+Two answers are called the truth. *Triangulation* is the paper's: every particle is where two rays
+meet, through the measured pixels less their noise and intrinsics as they may be. *Posterior* is
+Bayes's with the prior on inverse depth that Inverse Scaling and Unified Inverse Depth use: the
+same particles with weights. A filter with a prior can at best have the second; the first-order
+Gaussian of a Cartesian point, which has no prior, the first.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxslam.camera import bearing
+from jaxslam.filters import Parameters
+from jaxslam.triangulation.samples import Samples, draw
+from jaxslam.triangulation.views import TwoViews, errors
+
+Measured = tuple[Parameters, Float[Array, ""], Float[Array, " 2"]]
+"""The numbers of the cameras, the baseline in metres, and the two measured pixels."""
+
+
+def intersect(
+    calibration: str, measured: Measured, normal: Float[Array, " 6"]
+) -> tuple[Float[Array, " 2"], Float[Array, ""], Float[Array, ""]]:
+    """Where two rays meet: (x, z, ω) = (b₂, 1, (b₁ − b₂)/baseline) with bearings b = (u − c)/f.
+
+    In the second camera, with the errors that belong to the standard normal numbers; at infinity
+    or beyond where the rays do not meet (ω ≤ 0). Third, the logarithm of the posterior's density
+    relative to that of the particles: `N(1/z) / f₂`, the prior and |∂(1/z)/∂u₂|, without constants.
+    The prior is flat in the ideal first pixel, as it is when a filter takes it for the landmark's.
+    """
+    parameters, baseline, pixels = measured
+    pixel_errors, intrinsics_errors = errors(calibration, parameters, normal)
+    cameras = jax.vmap(parameters.camera.perturbed)(intrinsics_errors)
+    first, second = jax.vmap(bearing)(cameras, (pixels + pixel_errors)[:, None])[:, 0]
+    inverse_depth = (first - second) / baseline
+    surprise = (inverse_depth - parameters.inverse_depth) / parameters.inverse_depth_sigma
+    log_weight = -(surprise**2) / 2 - jnp.log(cameras.focal[1, 0])
+    return jnp.stack([second, jnp.ones_like(second)]), inverse_depth, log_weight
+
+
+def particles(
+    views: TwoViews, pixels: Float[Array, " 2"], count: int, seed: int
+) -> dict[str, Samples]:
+    """`triangulation` and `posterior` given two measured pixels."""
+    measured = (views.parameters, jnp.array(views.baseline), jnp.asarray(pixels))
+    posterior = draw(intersect, views.calibration, measured, count, seed)
+    return {"triangulation": posterior.unweighted, "posterior": posterior}

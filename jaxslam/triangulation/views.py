@@ -1,0 +1,144 @@
+"""Two views of one point: the world of the paper's Figs 1 and 2, as plain data.
+
+The world is planar and its camera 1-D, `u = f x/z + c`. The second view is a baseline to the right
+of the first, without a rotation and exactly known, so that the depth z is the same in both. The
+point is written (x, z) in the second camera, the current one, where a robocentric filter has it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxslam.camera import Camera, project
+from jaxslam.filters import Parameters, inverse_depth_prior
+from jaxslam.geometry import PLANAR
+from jaxslam.names import suggestion
+from jaxslam.simulation import Scenario
+
+CALIBRATIONS = {"white": "white", "shared": "estimated", "known": "known"}
+"""What the true intrinsics are, and how a filter that knows this treats them: drawn anew in each
+view, drawn once for both views, or exactly known."""
+NOISE_DIM = 6
+"""Numbers that two measurements can depend on: two pixel errors and two errors of (f, c)."""
+
+
+@dataclass(frozen=True)
+class TwoViews:
+    """A point, two cameras that see it, and what is known of them. Metres and pixels."""
+
+    depth: float = 15.0
+    """True z of the point, m."""
+    baseline: float = 0.6
+    """Sideways motion between the views, exactly known, m."""
+    pixel: float = Scenario.centre[0]
+    """Where the first view sees the point: the principal point is on the axis."""
+    nearest_depth: float = 1.0
+    """d_min, m: the filters' prior on 1/z is N(1/(2 d_min), (1/(4 d_min))²)."""
+    calibration: str = "white"
+    """`white`: intrinsics drawn in each view; `shared`: once for both; `known`: exact."""
+    width: float = Scenario.image[0]
+    """Of the picture, pixels."""
+    focal: float = Scenario.focal[0]
+    centre: float = Scenario.centre[0]
+    focal_sigma: float = Scenario.focal_sigma
+    """σ of the focal length, pixels."""
+    centre_sigma: float = Scenario.centre_sigma
+    """σ of the principal point, pixels."""
+    pixel_sigma: float = Scenario.pixel_sigma
+    """σ of a measured pixel."""
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+    @property
+    def pixels(self) -> tuple[float, float]:
+        """Where both views see the point with the nominal camera and without noise."""
+        return self.pixel, self.pixel - self.focal * self.baseline / self.depth
+
+    @property
+    def point(self) -> tuple[float, float]:
+        """(x, z) of the point in the second camera, m."""
+        return (self.pixels[1] - self.centre) / self.focal * self.depth, self.depth
+
+    @property
+    def parameters(self) -> Parameters:
+        """The numbers of a filter that knows the noise exactly; the motion has no acceleration."""
+        mean, sigma = inverse_depth_prior(self.nearest_depth)
+        return Parameters(
+            camera=Camera(jnp.array([self.focal]), jnp.array([self.centre])),
+            intrinsics_sigma=jnp.array([self.focal_sigma, self.centre_sigma]),
+            pixel_sigma=jnp.array(self.pixel_sigma),
+            acceleration_sigma=jnp.zeros(PLANAR.tangent_dim),
+            inverse_depth=jnp.array(mean),
+            inverse_depth_sigma=jnp.array(sigma),
+        )
+
+
+def errors(
+    calibration: str, parameters: Parameters, normal: Float[Array, f" {NOISE_DIM}"]
+) -> tuple[Float[Array, " 2"], Float[Array, "2 2"]]:
+    """Pixel error and intrinsics' error (δf, δc) of both views, from standard normal numbers.
+
+    How the errors of the two views are correlated is said here and nowhere else.
+    """
+    pixel = parameters.pixel_sigma * normal[:2]
+    by_view = {
+        "white": normal[2:6].reshape(2, 2),
+        "shared": jnp.tile(normal[2:4], (2, 1)),
+        "known": jnp.zeros((2, 2), normal.dtype),
+    }[calibration]
+    return pixel, by_view * parameters.intrinsics_sigma
+
+
+def measure(views: TwoViews, count: int, seed: int) -> Float[Array, "count 2"]:
+    """Measured pixels of the point, `count` times: measurement i draws from `seed` and i alone.
+
+    They err as the filters expect: by the true intrinsics of each view and by the pixel noise.
+    """
+    parameters, (x, z) = views.parameters, views.point
+    points = jnp.array([[x + views.baseline, z], [x, z]])
+
+    def one(index):
+        normal = jax.random.normal(jax.random.fold_in(jax.random.key(seed), index), (NOISE_DIM,))
+        pixel_errors, intrinsics_errors = errors(views.calibration, parameters, normal)
+        cameras = jax.vmap(parameters.camera.perturbed)(intrinsics_errors)
+        return jax.vmap(project)(cameras, points)[:, 0] + pixel_errors
+
+    return jax.vmap(one)(jnp.arange(count))
+
+
+_POSITIVE = ("depth", "baseline", "nearest_depth", "width", "focal", "pixel_sigma")
+_NOT_NEGATIVE = ("focal_sigma", "centre_sigma")
+
+
+def _check(views: TwoViews) -> None:
+    """Raise ValueError, naming the field, unless both views can see the point."""
+    for field, value in dataclasses.asdict(views).items():
+        if field == "calibration":
+            continue
+        if not math.isfinite(value):
+            raise ValueError(f"{field} is {value}; it must be finite")
+        if field in _POSITIVE and value <= 0:
+            raise ValueError(f"{field} must be positive, not {value}")
+        if field in _NOT_NEGATIVE and value < 0:
+            raise ValueError(f"{field} must not be negative, not {value}")
+    if views.calibration not in CALIBRATIONS:
+        raise ValueError(
+            f"unknown calibration {views.calibration!r}"
+            f"{suggestion(views.calibration, CALIBRATIONS)}; known: {', '.join(CALIBRATIONS)}"
+        )
+    if not 0 <= views.pixel < views.width:
+        raise ValueError(f"pixel must be in the image, from 0 to {views.width:g}: {views.pixel:g}")
+    if views.pixels[1] < 0:
+        least = views.focal * views.baseline / views.pixel if views.pixel else math.inf
+        raise ValueError(
+            f"the second view does not see a point at depth {views.depth:g} and pixel "
+            f"{views.pixel:g} from a baseline of {views.baseline:g}: depth must be at least "
+            f"{least:.4g}, or the pixel larger"
+        )
