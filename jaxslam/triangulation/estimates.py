@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from jaxslam.filters import FILTERS, Features, SlamFilter
 from jaxslam.geometry import PLANAR
 from jaxslam.landmarks import LANDMARKS, Parametrization
+from jaxslam.rig import Rig
 from jaxslam.triangulation.samples import Samples, draw
 from jaxslam.triangulation.truth import Measured, intersect
 from jaxslam.triangulation.views import CALIBRATIONS, NOISE_DIM, TwoViews
@@ -33,7 +34,7 @@ def estimate(name: str, views: TwoViews, pixels: Float[Array, " 2"]) -> Gaussian
     measured = (views.parameters, jnp.array(views.baseline), jnp.asarray(pixels))
     if name == "cartesian":
         return triangulated(views.calibration, measured)
-    slam = FILTERS["robocentric"](PLANAR, LANDMARKS[name], CALIBRATIONS[views.calibration])
+    slam = FILTERS["robocentric"](Rig(PLANAR), LANDMARKS[name], CALIBRATIONS[views.calibration])
     return filtered(slam, measured)
 
 

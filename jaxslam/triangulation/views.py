@@ -73,8 +73,8 @@ class TwoViews:
         return Parameters(
             camera=Camera(jnp.array([self.focal]), jnp.array([self.centre])),
             intrinsics_sigma=jnp.array([self.focal_sigma, self.centre_sigma]),
-            pixel_sigma=jnp.array(self.pixel_sigma),
-            acceleration_sigma=jnp.zeros(PLANAR.tangent_dim),
+            measurement_sigma=jnp.array(self.pixel_sigma),
+            motion_sigma=jnp.zeros(PLANAR.tangent_dim),
             inverse_depth=jnp.array(mean),
             inverse_depth_sigma=jnp.array(sigma),
         )
@@ -87,7 +87,7 @@ def errors(
 
     How the errors of the two views are correlated is said here and nowhere else.
     """
-    pixel = parameters.pixel_sigma * normal[:2]
+    pixel = parameters.measurement_sigma * normal[:2]
     by_view = {
         "white": normal[2:6].reshape(2, 2),
         "shared": jnp.tile(normal[2:4], (2, 1)),
