@@ -9,6 +9,7 @@ with the interval in which 95 % of the means of that many of our runs lie.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -85,8 +86,8 @@ class Options:
     """Folder of published-SCENARIO.json."""
 
 
-def measure(table: Published, options: Options) -> dict:
-    """Ours and theirs, filter by filter."""
+def measure(table: Published, options: Options) -> Iterator[dict]:
+    """Ours and theirs; yielded after every filter, with one more row each time."""
     scenario = jaxslam.scenario(table.scenario)
     rows = {}
     for name, theirs in table.nees.items():
@@ -104,16 +105,15 @@ def measure(table: Published, options: Options) -> dict:
             "seconds_per_run": round(seconds.run / options.runs, 4),
         }
         print(name, json.dumps(rows[name], ensure_ascii=False), flush=True)
-    return {
-        "scenario": table.scenario,
-        "runs": options.runs,
-        "seed": options.seed,
-        "published_runs": table.runs,
-        "band95_of_published_runs": jaxslam.mean_band(
-            scenario.rig.geometry.tangent_dim, table.runs
-        ),
-        "filters": rows,
-    }
+        dof = scenario.rig.geometry.tangent_dim
+        yield {
+            "scenario": table.scenario,
+            "runs": options.runs,
+            "seed": options.seed,
+            "published_runs": table.runs,
+            "band95_of_published_runs": jaxslam.mean_band(dof, table.runs),
+            "filters": rows,
+        }
 
 
 def _compared(table: Published, nees: np.ndarray, theirs: tuple[float, ...] | None) -> dict:
@@ -152,10 +152,11 @@ def _line(name: str, row: dict) -> str:
 def main(options: Options) -> None:
     """Measure every table, write its file, print it."""
     for table in (table for table in TABLES if table.scenario in options.scenarios):
-        result = measure(table, options)
         options.out.mkdir(parents=True, exist_ok=True)
-        with write_atomically(options.out / f"published-{table.scenario}.json") as path:
-            path.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+        result = {"filters": {}}
+        for result in measure(table, options):
+            with write_atomically(options.out / f"published-{table.scenario}.json") as path:
+                path.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
         labels = " | ".join(f"NEES, steps {label}" for label in table.windows)
         print(f"\n{table.scenario}: ours [95 % of the means of {table.runs} runs] (published)")
         print(f"| filter | {labels} | RMSE m |\n|---|{'---|' * (len(table.windows) + 1)}")
