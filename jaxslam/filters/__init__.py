@@ -2,10 +2,9 @@
 
 from collections.abc import Callable, Iterable
 
+from jaxslam.filters.frames import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.filters.slam import (
     CALIBRATIONS,
-    ROBOCENTRIC,
-    WORLD,
     Parameters,
     SlamFilter,
     SlamModel,
@@ -27,9 +26,15 @@ def world(rig: Rig, landmark: Parametrization, calibration: str) -> SlamFilter:
     return SlamFilter(SlamModel(rig, landmark, WORLD), calibration, compose_first=True)
 
 
+def keyframe(rig: Rig, landmark: Parametrization, calibration: str) -> SlamFilter:
+    """Landmarks in the camera of the current keyframe, prediction composed first."""
+    return SlamFilter(SlamModel(rig, landmark, KEYFRAME), calibration, compose_first=True)
+
+
 FILTERS: dict[str, Callable[[Rig, Parametrization, str], SlamFilter]] = {
     "robocentric": robocentric,
     "world": world,
+    "keyframe": keyframe,
 }
 
 
@@ -57,6 +62,7 @@ __all__ = [
     "SlamModel",
     "State",
     "inverse_depth_prior",
+    "keyframe",
     "make_filters",
     "robocentric",
     "world",
