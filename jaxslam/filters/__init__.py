@@ -1,7 +1,9 @@
 """Filters: the block-wise EKF, the SLAM models it runs on, and the table of their names."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
+from jaxslam.filters import information
 from jaxslam.filters.frames import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.filters.slam import (
     CALIBRATIONS,
@@ -31,10 +33,28 @@ def keyframe(rig: Rig, landmark: Parametrization, calibration: str) -> SlamFilte
     return SlamFilter(SlamModel(rig, landmark, KEYFRAME), calibration, compose_first=True)
 
 
+def information_filter(rig: Rig, landmark: Parametrization, calibration: str) -> SlamFilter:
+    """`keyframe` in information form: the same estimates by sparse, additive updates.
+
+    Raises ValueError for landmarks with redundant parameters, whose covariance has no inverse,
+    and for a calibration to `consider`.
+    """
+    n = rig.geometry.point_dim
+    if landmark.size(n) != n:
+        minimal = ", ".join(p.name for p in LANDMARKS.values() if p.size(n) == n)
+        raise ValueError(
+            f"filter information needs landmarks of {n} parameters ({minimal}), not {landmark.name}"
+        )
+    if calibration == "consider":
+        raise ValueError("filter information cannot consider its calibration: estimate it")
+    return replace(keyframe(rig, landmark, calibration), engine=information)
+
+
 FILTERS: dict[str, Callable[[Rig, Parametrization, str], SlamFilter]] = {
     "robocentric": robocentric,
     "world": world,
     "keyframe": keyframe,
+    "information": information_filter,
 }
 
 
@@ -61,6 +81,7 @@ __all__ = [
     "SlamFilter",
     "SlamModel",
     "State",
+    "information_filter",
     "inverse_depth_prior",
     "keyframe",
     "make_filters",
