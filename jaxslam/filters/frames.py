@@ -18,11 +18,12 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.geometry import Pose, SplitPose, log
 
-KEYFRAME_TURN = 0.2
+KEYFRAME_TURN = 0.05
 """A camera that has turned more than this from its keyframe becomes the next one, rad."""
-KEYFRAME_PARALLAX = 0.2
+KEYFRAME_PARALLAX = 0.05
 """And so does one that has moved by more than this share of the landmarks' harmonic mean distance:
-about the angle by which a landmark at that distance is seen from another side, rad."""
+about the angle by which a landmark at that distance is seen from another side, rad. Both are small
+because a landmark's depth is nearly linear only in a camera near the keyframe."""
 
 
 @dataclass(frozen=True)
