@@ -1,11 +1,12 @@
 """Filters: the block-wise EKF, the SLAM models it runs on, and the table of their names."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
+from jaxslam.filters import information
+from jaxslam.filters.frames import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.filters.slam import (
     CALIBRATIONS,
-    ROBOCENTRIC,
-    WORLD,
     Parameters,
     SlamFilter,
     SlamModel,
@@ -27,9 +28,33 @@ def world(rig: Rig, landmark: Parametrization, calibration: str) -> SlamFilter:
     return SlamFilter(SlamModel(rig, landmark, WORLD), calibration, compose_first=True)
 
 
+def keyframe(rig: Rig, landmark: Parametrization, calibration: str) -> SlamFilter:
+    """Landmarks in the camera of the current keyframe, prediction composed first."""
+    return SlamFilter(SlamModel(rig, landmark, KEYFRAME), calibration, compose_first=True)
+
+
+def information_filter(rig: Rig, landmark: Parametrization, calibration: str) -> SlamFilter:
+    """`keyframe` in information form: the same estimates by sparse, additive updates.
+
+    Raises ValueError for landmarks with redundant parameters, whose covariance has no inverse,
+    and for a calibration to `consider`.
+    """
+    n = rig.geometry.point_dim
+    if landmark.size(n) != n:
+        minimal = ", ".join(p.name for p in LANDMARKS.values() if p.size(n) == n)
+        raise ValueError(
+            f"filter information needs landmarks of {n} parameters ({minimal}), not {landmark.name}"
+        )
+    if calibration == "consider":
+        raise ValueError("filter information cannot consider its calibration: estimate it")
+    return replace(keyframe(rig, landmark, calibration), engine=information)
+
+
 FILTERS: dict[str, Callable[[Rig, Parametrization, str], SlamFilter]] = {
     "robocentric": robocentric,
     "world": world,
+    "keyframe": keyframe,
+    "information": information_filter,
 }
 
 
@@ -56,7 +81,9 @@ __all__ = [
     "SlamFilter",
     "SlamModel",
     "State",
+    "information_filter",
     "inverse_depth_prior",
+    "keyframe",
     "make_filters",
     "robocentric",
     "world",

@@ -1,8 +1,7 @@
 """Monocular SLAM as a model for the filter: frame × landmark parametrization × calibration.
 
-The map frame A is where landmarks are expressed: in a robocentric filter the camera C itself, in
-a world-centric one the base B. Both are the same functions of `T_AC(k)`, the pose of the current
-camera in the map frame; they differ in what composition does.
+The filter is a model (`SlamModel`), what it does in a frame (`SlamFilter`), and the form in which
+the uncertainty is kept: the `Engine` whose functions it calls.
 """
 
 from __future__ import annotations
@@ -17,8 +16,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.camera import Camera
 from jaxslam.filters import ekf
+from jaxslam.filters.blocks import Change
+from jaxslam.filters.engine import Engine
+from jaxslam.filters.frames import Frame, KeyframePose, keyframe_due
 from jaxslam.filters.state import Features, Innovation, State
-from jaxslam.geometry import Geometry, Pose, SplitPose, difference, identity
+from jaxslam.geometry import Geometry, Pose, SplitPose, difference, identity, tangent_dim
 from jaxslam.landmarks.parametrization import Parametrization
 from jaxslam.rig import Rig
 
@@ -32,8 +34,9 @@ CALIBRATIONS = ("white", "consider", "estimated", "known")
 class Core:
     """What the filter estimates beside the landmarks, and the noises that one step appends."""
 
-    pose: Pose | SplitPose
-    """T_CB in a robocentric filter, T_BC in a world-centric one, as the `Frame` holds it."""
+    pose: Pose | SplitPose | KeyframePose
+    """T_CB in a robocentric filter, T_BC in a world-centric one, T_BK and T_KC in one with
+    keyframes: what the `Frame` holds."""
     velocity: Float[Array, " v"]
     """Linear and angular velocity in the camera's own frame, m/s and rad/s; v = t, or none."""
     noise: Float[Array, " t"]
@@ -67,44 +70,6 @@ class Parameters:
 def inverse_depth_prior(nearest: float) -> tuple[float, float]:
     """Mean and σ of 1/z whose 96 % interval is from `nearest` (d_min, metres) to infinity."""
     return 1 / (2 * nearest), 1 / (4 * nearest)
-
-
-@dataclass(frozen=True)
-class Frame:
-    """Where landmarks live, as functions of a pose and a displacement `T_{k-1,k}`."""
-
-    name: str
-    moves_landmarks: bool
-    hold: Callable[[Pose], Any]
-    """What the state holds of a pose: its error is this pytree's tangent."""
-    pose: Callable[[Any], Pose]
-    """The inverse of `hold`."""
-    pose_from_camera: Callable[[Pose], Pose]
-    """The pose that the state holds, from T_BC; its own inverse."""
-    map_from_camera: Callable[[Pose, Pose], Pose]
-    """T_AC(k), from the pose at k−1 and the displacement."""
-    compose: Callable[[Pose, Pose], Pose]
-    """The pose at k, from the one at k−1 and the displacement."""
-
-
-ROBOCENTRIC = Frame(
-    name="robocentric",
-    moves_landmarks=True,
-    hold=lambda T_CB: T_CB,
-    pose=lambda T_CB: T_CB,
-    pose_from_camera=lambda T_BC: T_BC.inverse(),
-    map_from_camera=lambda T_CB, step: step,
-    compose=lambda T_CB, step: step.inverse() @ T_CB,
-)
-WORLD = Frame(
-    name="world",
-    moves_landmarks=False,
-    hold=SplitPose.of,
-    pose=SplitPose.joined,
-    pose_from_camera=lambda T_BC: T_BC,
-    map_from_camera=lambda T_BC, step: T_BC @ step,
-    compose=lambda T_BC, step: T_BC @ step,
-)
 
 
 @jax.tree_util.register_dataclass
@@ -160,33 +125,55 @@ class SlamModel:
     def view(self, core: Core, context: Context) -> View:
         """All that a landmark depends on."""
         step = self._displacement(core, context)
-        T_AC = self.frame.map_from_camera(self.frame.pose(core.pose), step)
+        T_AC = self.frame.map_from_camera(core.pose, step)
         return View(T_AC, core.anchors, core.calibration)
 
     def compose_core(self, core: Core, context: Context) -> Core:
         """P18, P19. The noise has been used: it is marginalised."""
         step = self._displacement(core, context)
-        pose = self.frame.compose(self.frame.pose(core.pose), step).normalize()
-        anchors = core.anchors
-        if anchors is not None and self.frame.moves_landmarks:
-            moved = jax.vmap(lambda T_AF: SplitPose.of(step.inverse() @ T_AF.joined()))
-            anchors = moved(anchors)
         return replace(
             core,
-            pose=self.frame.hold(pose),
-            anchors=anchors,
+            pose=self.frame.compose(core.pose, step),
+            anchors=_seen_from(step, core.anchors) if self.frame.moves_landmarks else core.anchors,
             velocity=self.rig.motion.next_velocity(core.velocity, core.noise, context.control),
             noise=jnp.zeros_like(core.noise),
         )
 
     def camera_pose(self, core: Core) -> Pose:
         """T_BC."""
-        return self.frame.pose_from_camera(self.frame.pose(core.pose))
+        return self.frame.camera_pose(core.pose)
 
     def compose_landmark(self, view: View, landmark: Array, context: Context) -> Array:
         """P20: the landmark in the new camera frame."""
         del context
         return self.landmark.transform(view.map_from_camera.inverse(), landmark)
+
+    def reanchoring(self) -> Change | None:
+        """The current camera becomes the map frame, its motion composed; None if it never does."""
+        reanchor, transform = self.frame.reanchor, self.landmark.transform
+        if reanchor is None:
+            return None
+
+        def core(core):
+            anchors = _seen_from(self._map_from_camera(core), core.anchors)
+            return replace(core, pose=reanchor(core.pose), anchors=anchors)
+
+        def landmark(T_AC, landmark):
+            return transform(T_AC.inverse(), landmark)
+
+        moved = None if self.landmark.anchored else landmark
+        return Change(core=core, view=self._map_from_camera, landmark=moved)
+
+    def reanchoring_due(self, state: State) -> Bool[Array, ""]:
+        """Whether the camera is far from the map frame, its motion composed."""
+        points, omegas = jax.vmap(self.landmark.homogeneous)(state.landmarks)
+        inverse_distances = jnp.abs(omegas) / jnp.linalg.norm(points, axis=1)
+        counted = jnp.where(state.active, inverse_distances, 0.0)
+        return keyframe_due(self._map_from_camera(state.core), counted)
+
+    def _map_from_camera(self, core: Core) -> Pose:
+        """T_AC, once the motion is composed."""
+        return self.frame.map_from_camera(core.pose, identity(self.geometry, core.noise.dtype))
 
     def observe(self, view: View, landmark: Array, context: Context) -> tuple[Array, Array]:
         """`h = proj(K T_AC⁻¹ X)` (P12, P14), and whether it is possible."""
@@ -223,12 +210,15 @@ class SlamModel:
             return seen.at[-1].set(context.anchor)
         return self.landmark.transform(view.map_from_camera, seen)
 
-    def with_anchor(self, core: Core, anchor: Int[Array, ""]) -> Core:
-        """The core with the current camera as an anchor; its motion must be composed."""
-        step = identity(self.geometry, core.noise.dtype)
-        camera = SplitPose.of(self.frame.map_from_camera(self.frame.pose(core.pose), step))
-        anchors = jax.tree.map(lambda all, one: all.at[anchor].set(one), core.anchors, camera)
-        return replace(core, anchors=anchors)
+    def anchoring(self, anchor: Int[Array, ""]) -> Change:
+        """The current camera, its motion composed, becomes an anchor of landmarks."""
+
+        def core(core):
+            camera = SplitPose.of(self._map_from_camera(core))
+            anchors = jax.tree.map(lambda all, one: all.at[anchor].set(one), core.anchors, camera)
+            return replace(core, anchors=anchors)
+
+        return Change(core=core, view=self._map_from_camera, landmark=None)
 
 
 @dataclass(frozen=True)
@@ -236,12 +226,15 @@ class SlamFilter:
     """An EKF for monocular SLAM: static configuration; its functions are pure.
 
     One frame is `predict`, `update`, `compose`, `initialise`, in `step`. The motion is composed
-    after the update, as the paper has it, or before (`compose_first`).
+    after the update, as the paper has it, or before (`compose_first`). The states are those of
+    the engine: `State`, or `InformationState`.
     """
 
     model: SlamModel
     calibration: str = "white"
     compose_first: bool = False
+    engine: Engine = ekf
+    """The form of the filter: `ekf`, on the covariance, or `information`, on its inverse."""
 
     def __post_init__(self) -> None:
         if self.calibration not in CALIBRATIONS:
@@ -268,8 +261,9 @@ class SlamFilter:
         geometry, landmark = self.geometry, self.model.landmark
         t, p = geometry.tangent_dim, geometry.pixel_dim
         v = t if self.model.rig.motion.has_velocity else 0
+        held = self.model.frame.hold(identity(geometry, dtype))
         core = Core(
-            pose=self.model.frame.hold(identity(geometry, dtype)),
+            pose=held,
             velocity=jnp.asarray(velocity, dtype)[:v],
             noise=jnp.zeros(t, dtype),
             anchors=self._no_anchors(capacity, dtype),
@@ -279,26 +273,21 @@ class SlamFilter:
         ahead = jnp.zeros(p + 1, dtype).at[-1].set(1.0)
         focal = parameters.camera.focal[0]
         empty = landmark.initialise(ahead, parameters.inverse_depth, focal)
-        state = State(
-            core=core,
-            landmarks=jnp.tile(empty, (capacity, 1)),
-            active=jnp.zeros(capacity, bool),
-            covariance=jnp.zeros((0, 0), dtype),
-        )
-        n = state.core_dim + capacity * empty.size
-        state = replace(state, covariance=jnp.zeros((n, n), dtype))
-        state = ekf.augment(state, t, jnp.diag(jnp.asarray(velocity_sigma, dtype)[:v] ** 2))
+        state = self.engine.empty(core, jnp.tile(empty, (capacity, 1)))
+        state = self._known(state, 0, tangent_dim(held))
+        covariance = jnp.diag(jnp.asarray(velocity_sigma, dtype)[:v] ** 2)
+        state = self.engine.augment(state, tangent_dim(held), covariance)
         return state if self.calibration == "white" else self._with_calibration(state, parameters)
 
     def predict(self, state: State, parameters: Parameters, control: Array) -> State:
         """Append this step's motion noise and calibration error (P10, P11, P15)."""
-        start = self.geometry.tangent_dim + state.core.velocity.size
-        state = ekf.augment(state, start, jnp.diag(parameters.motion_sigma**2))
+        start = tangent_dim(state.core.pose) + state.core.velocity.size
+        state = self.engine.augment(state, start, jnp.diag(parameters.motion_sigma**2))
         if self.calibration == "white":
             state = self._with_calibration(state, parameters)
         if not self.compose_first:
             return state
-        return ekf.compose(self.model, state, Context(parameters, control))
+        return self.engine.compose(self.model, state, Context(parameters, control))
 
     def update(
         self, state: State, parameters: Parameters, control: Array, features: Features
@@ -306,7 +295,9 @@ class SlamFilter:
         """Correct by the features seen (P16, P17)."""
         context = self._context(parameters, control)
         noise = self._noise(parameters)
-        return ekf.update(self.model, state, features, noise, context, self._considered(state))
+        return self.engine.update(
+            self.model, state, features, noise, context, self._considered(state)
+        )
 
     def update_mean(
         self, state: State, parameters: Parameters, control: Array, features: Features
@@ -314,7 +305,9 @@ class SlamFilter:
         """`update` without its covariance: cheap enough to try many hypotheses."""
         context = self._context(parameters, control)
         noise = self._noise(parameters)
-        return ekf.update_mean(self.model, state, features, noise, context, self._considered(state))
+        return self.engine.update_mean(
+            self.model, state, features, noise, context, self._considered(state)
+        )
 
     def project(
         self, state: State, parameters: Parameters, control: Array, slots: Array
@@ -330,15 +323,33 @@ class SlamFilter:
     ) -> tuple[Float[Array, "m p"], Float[Array, "m p p"], Bool[Array, " m"]]:
         """Search ellipses of a predicted state: pixels, innovation covariances, in front."""
         context = self._context(parameters, control)
-        return ekf.predict_features(self.model, state, slots, self._noise(parameters), context)
+        return self.engine.predict_features(
+            self.model, state, slots, self._noise(parameters), context
+        )
 
     def compose(self, state: State, parameters: Parameters, control: Array) -> State:
-        """Move into the new camera frame, after the update (P18–P21); convert landmarks."""
+        """Move into the new camera frame, after the update (P18–P21); convert landmarks; make the
+        camera a keyframe where one is due."""
         if not self.compose_first:
-            state = ekf.compose(self.model, state, Context(parameters, control))
+            state = self.engine.compose(self.model, state, Context(parameters, control))
+        if self.model.frame.reanchor is not None:
+            due = self.model.reanchoring_due(state)
+            state = jax.lax.cond(due, self.reanchor, lambda state: state, state)
         if self.model.landmark.convert is None:
             return state
         return ekf.convert(self.model, state, _composed(parameters))
+
+    def reanchor(self, state: State) -> State:
+        """Make the current camera the keyframe: landmarks move to it, and T_KC is known."""
+        change = self.model.reanchoring()
+        if change is None:
+            return state
+        t = self.geometry.tangent_dim
+        return self._known(self.engine.change(state, change), t, t)
+
+    def remove(self, state: State, gone: Bool[Array, " capacity"]) -> State:
+        """Marginalise landmarks and free their slots."""
+        return self.engine.remove(state, gone)
 
     def initialise(self, state: State, parameters: Parameters, features: Features) -> State:
         """Insert new landmarks seen from the current camera (P22–P26)."""
@@ -348,9 +359,9 @@ class SlamFilter:
         noise, context = self._noise(parameters), _composed(parameters)
         if self.model.landmark.anchored:
             anchor = _free_anchor(state)
-            state = ekf.transform_core(state, lambda core: self.model.with_anchor(core, anchor))
+            state = self.engine.change(state, self.model.anchoring(anchor))
             context = replace(context, anchor=anchor)
-        return ekf.initialise(self.model, state, features, noise, prior, context)
+        return self.engine.initialise(self.model, state, features, noise, prior, context)
 
     def finish(self, state: State) -> State:
         """Forget the frame's calibration error where the next frame draws another (white)."""
@@ -358,7 +369,9 @@ class SlamFilter:
             return state
         part = _calibration(state)
         core = replace(state.core, calibration=jnp.zeros_like(state.core.calibration))
-        return replace(ekf.marginalise(state, part.start, part.stop - part.start), core=core)
+        return replace(
+            self.engine.marginalise(state, part.start, part.stop - part.start), core=core
+        )
 
     def first(self, state: State, parameters: Parameters, new: Features) -> State:
         """Frame 0: nothing has moved, everything seen is new."""
@@ -381,20 +394,22 @@ class SlamFilter:
         return self.finish(self.initialise(state, parameters, new)), innovation
 
     def pose_error(self, state: State, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
-        """`T_true ⊟ T_est` of the pose in the state, and the covariance of its tangent."""
-        t, frame = self.geometry.tangent_dim, self.model.frame
-        truth = frame.hold(frame.pose_from_camera(T_BC))
-        return difference(truth, state.core.pose), state.covariance[:t, :t]
+        """`T_true ⊟ T_est` of the frame's pose, and the covariance of its tangent."""
+        frame = self.model.frame
+        estimate, covariance = self.engine.core_covariance(
+            lambda core: frame.estimate(core.pose), state
+        )
+        return difference(frame.estimate(frame.hold(T_BC)), estimate), covariance
 
     def camera_pose(self, state: State) -> tuple[Pose, Float[Array, "t t"]]:
         """T_BC and its covariance in the right tangent: position in camera axes, orientation."""
-        return ekf.core_covariance(self.model.camera_pose, state)
+        return self.engine.core_covariance(self.model.camera_pose, state)
 
     def landmarks_in_camera(
         self, state: State, parameters: Parameters, slots: Array
     ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
         """The sensor's chart of landmarks, (x/z, y/z, 1/z) of a camera, with covariances."""
-        return ekf.landmark_covariance(
+        return self.engine.landmark_covariance(
             self._composed_view(parameters), self.model.chart, state, slots
         )
 
@@ -413,7 +428,7 @@ class SlamFilter:
             x, z = (rotation @ point)[jnp.array([0, -1])]
             return jnp.stack([jnp.atan2(x, z), omega / jnp.hypot(x, z)])
 
-        return ekf.landmark_covariance(self._composed_view(parameters), above, state, slots)
+        return self.engine.landmark_covariance(self._composed_view(parameters), above, state, slots)
 
     def landmarks_in_world(
         self, state: State, parameters: Parameters, slots: Array
@@ -422,7 +437,7 @@ class SlamFilter:
 
         Not finite for a landmark at infinity; far from Gaussian for one of unknown depth.
         """
-        return ekf.landmark_covariance(*self._world_point(parameters), state, slots)
+        return self.engine.landmark_covariance(*self._world_point(parameters), state, slots)
 
     def landmark_samples(
         self, state: State, parameters: Parameters, slots: Array, key: Array, count: int = 1000
@@ -475,11 +490,15 @@ class SlamFilter:
         origin = SplitPose.of(identity(self.geometry, dtype))
         return jax.tree.map(lambda x: jnp.tile(x, (capacity, 1)), origin)
 
+    def _known(self, state: State, start: int, size: int) -> State:
+        """Numbers of the core that are known exactly: a covariance of zero, in either form."""
+        return self.engine.augment(state, start, jnp.zeros((size, size), state.landmarks.dtype))
+
     def _with_calibration(self, state: State, parameters: Parameters) -> State:
         if self.calibration == "known":
             return state
         covariance = jnp.diag(parameters.intrinsics_sigma**2)
-        return ekf.augment(state, _calibration(state).start, covariance)
+        return self.engine.augment(state, _calibration(state).start, covariance)
 
     def _noise(self, parameters: Parameters) -> Float[Array, "p p"]:
         """R of one measurement."""
@@ -496,6 +515,14 @@ class SlamFilter:
 
 def _composed(parameters: Parameters) -> Context:
     return Context(parameters, None)
+
+
+def _seen_from(T_AN: Pose, anchors: SplitPose | None) -> SplitPose | None:
+    """T_NF of all anchors F, from their T_AF and the new map frame N in the old one."""
+    if anchors is None:
+        return None
+    T_NA = T_AN.inverse()
+    return jax.vmap(lambda T_AF: SplitPose.of(T_NA @ T_AF.joined()))(anchors)
 
 
 def _free_anchor(state: State) -> Int[Array, ""]:

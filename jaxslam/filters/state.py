@@ -54,7 +54,8 @@ class Innovation:
 
     predicted: Float[Array, "m p"]
     residual: Float[Array, "m p"]
-    covariance: Float[Array, "mp mp"]
+    covariance: Float[Array, "mp mp"] | None
+    """S; None where the form of the filter has no use for it."""
     used: Bool[Array, " m"]
     nis: Float[Array, ""]
     """Normalised innovation squared `rᵀ S⁻¹ r`, χ² with `nis_dof` degrees of freedom."""

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.filters import FILTERS, Features, Parameters, SlamFilter, State
-from jaxslam.filters.ekf import remove
 from jaxslam.filters.ransac import inliers
 from jaxslam.geometry import SPATIAL
 from jaxslam.landmarks import LANDMARKS
@@ -271,7 +270,7 @@ class Tracker:
         for slot in slots:
             del self.landmarks[slot]
         gone = np.isin(np.arange(self.settings.capacity), slots)
-        self._state = remove(self._state, jnp.asarray(gone))
+        self._state = self._filter.remove(self._state, jnp.asarray(gone))
 
     def _renew(self, frame: Frame, occupied: np.ndarray, most: int) -> np.ndarray:
         """Create landmarks where the picture is bare; their pixels. Ends the filter's frame."""

@@ -1,0 +1,348 @@
+"""Tests of the keyframe's frame, and of the information form against the covariance form."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import close, each_geometry, named, quick_jit
+
+from jaxslam.camera import Camera
+from jaxslam.filters import FILTERS, Features, Parameters, State, ekf, information
+from jaxslam.filters.frames import KEYFRAME_PARALLAX, KEYFRAME_TURN, keyframe_due
+from jaxslam.filters.information import EXACT_SIGMA, InformationState
+from jaxslam.geometry import PLANAR, difference, exp, identity, tangent_dim
+from jaxslam.landmarks import IMAGE_PLANE, INVERSE_SCALING
+from jaxslam.rig import Rig
+
+CAPACITY, STEPS, DT = 5, 10, 0.1
+# Landmark of each slot: the frame in which it is new, and that after which it is removed.
+LIVES = ((0, None), (0, None), (3, None), (0, 5), (6, None))
+
+
+class AsExact:
+    """`ekf`, knowing nothing better than the information form can say."""
+
+    def __getattr__(self, name):
+        return getattr(ekf, name)
+
+    def augment(self, state, start, covariance):
+        return ekf.augment(state, start, information.representable(covariance))
+
+
+def make(kind, geometry, calibration="white"):
+    return FILTERS[kind](Rig(geometry), IMAGE_PLANE, calibration)
+
+
+def axes(geometry, planar, spatial):
+    return jnp.array(planar if geometry is PLANAR else spatial)
+
+
+def noises(geometry, scale=1.0):
+    """The filter's numbers, every σ times a scale."""
+    p, t = geometry.pixel_dim, geometry.tangent_dim
+    return Parameters(
+        camera=Camera(jnp.full(p, 400.0), jnp.full(p, 300.0)),
+        intrinsics_sigma=scale * jnp.full(2 * p, 2.0),
+        measurement_sigma=scale * jnp.array(1.0),
+        motion_sigma=scale * jnp.full(t, 0.3),
+        inverse_depth=jnp.array(0.25),
+        inverse_depth_sigma=scale * jnp.array(0.05),
+    )
+
+
+def velocity(geometry):
+    """Sideways, turning: 0.014 rad a step, so that the fourth and the eighth make keyframes."""
+    return axes(geometry, [0.3, 0.1, 0.14], [0.3, 0.0, 0.1, 0.0, -0.14, 0.02])
+
+
+@cache
+def world(geometry, scale=1.0):
+    """New and known features, and removed landmarks, of every frame; all errors times a scale."""
+    rng = np.random.default_rng(3)
+    parameters = noises(geometry, scale)
+    rig, p = Rig(geometry), geometry.pixel_dim
+    still, poses = jnp.zeros(geometry.tangent_dim), [identity(geometry, jnp.float64)]
+    started = velocity(geometry) + scale * 0.02 * rng.normal(size=geometry.tangent_dim)
+    step = rig.motion.displacement(geometry, started, still, DT)
+    for _ in range(STEPS):
+        poses.append(poses[-1] @ step)
+    # The depths that the prior speaks of are those in the camera that sees a landmark first.
+    depths = 1 / (0.25 + scale * 0.05 * rng.normal(size=CAPACITY))
+    bearings = np.column_stack([rng.uniform(-0.3, 0.3, (CAPACITY, p)), np.ones(CAPACITY)])
+    seen_first = zip(LIVES, depths, bearings, strict=True)
+    points = jnp.stack([poses[born] @ (depth * ray) for (born, _), depth, ray in seen_first])
+
+    new, seen, gone = [], [], []
+    for k, pose in enumerate(poses):
+        inside = jax.vmap(pose.inverse().apply)(points)
+        pixels = jax.vmap(rig.sensor.measure, in_axes=(None, 0, None))(
+            parameters.camera, inside, 1.0
+        )
+        pixels += scale * rng.normal(size=pixels.shape)
+        slots = jnp.arange(CAPACITY)
+        unseen = k % 3 == np.arange(CAPACITY) % 3  # every landmark is missed now and then
+        known = np.array([born < k and (end is None or k <= end) for born, end in LIVES])
+        new.append(Features(slots, pixels, jnp.array([born == k for born, _ in LIVES])))
+        seen.append(Features(slots, pixels, jnp.asarray(known & ~unseen)))
+        gone.append(jnp.array([end == k for _, end in LIVES]))
+    return tuple(jax.tree.map(lambda *x: jnp.stack(x), *part) for part in (new, seen, gone))
+
+
+def run(slam, parameters, pose_sigma, new, seen, gone):
+    """States, covariances, NIS and camera poses of every step, from an uncertain pose."""
+    geometry = slam.geometry
+    sigma = parameters.motion_sigma / 0.3 * 0.02
+    state = slam.start(parameters, CAPACITY, velocity(geometry), sigma)
+    size = tangent_dim(state.core.pose)
+    state = slam.engine.augment(state, 0, pose_sigma**2 * jnp.eye(size))
+    state = slam.first(state, parameters, jax.tree.map(lambda x: x[0], new))
+
+    def step(state, frame):
+        new, seen, gone = frame
+        state, innovation = slam.step(state, parameters, jnp.array(DT), seen, new)
+        state = slam.remove(state, gone)
+        return state, (state, state.covariance, innovation.nis, slam.camera_pose(state))
+
+    later = jax.tree.map(lambda x: x[1:], (new, seen, gone))
+    return jax.lax.scan(step, state, later)[1]
+
+
+@cache
+def compiled(kind, geometry, engine=None, calibration="white"):
+    slam = make(kind, geometry, calibration)
+    slam = slam if engine is None else replace(slam, engine=engine)
+    return quick_jit(lambda *data: run(slam, *data))
+
+
+@cache
+def both_forms(geometry):
+    """The same run in both, exact quantities being known to 0.1 mm: a well-conditioned Λ."""
+    data = (noises(geometry), jnp.array(1e-2), *world(geometry))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(information, "EXACT_SIGMA", 1e-4)
+        covariance_form = compiled("keyframe", geometry, AsExact())(*data)
+        return covariance_form, compiled("information", geometry)(*data)
+
+
+def sigmas(P):
+    """σ of every number, 1 where it is not in the state."""
+    variances = np.diagonal(P)
+    return np.sqrt(np.where(variances > 0, variances, 1.0))
+
+
+def agree(P, Q, relative):
+    """Covariances within `relative` of the product of the σ: a bound for every entry alike."""
+    sigma = sigmas(P)
+    scale = np.outer(sigma, sigma)
+    np.testing.assert_allclose(Q / scale, P / scale, rtol=0, atol=relative)
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_a_run_in_information_form_is_the_run_in_covariance_form(geometry):
+    (states, covariances, nis, poses), others = both_forms(geometry)
+    for k in range(STEPS):
+        state, other = (jax.tree.map(lambda x, k=k: x[k], x) for x in (states, others[0]))
+        shift = difference(
+            (state.core, state.landmarks.ravel()), (other.core, other.landmarks.ravel())
+        )
+        assert np.abs(shift / sigmas(covariances[k])).max() < 1e-9
+        agree(covariances[k], others[1][k], 1e-9)
+        agree(poses[1][k], others[3][1][k], 1e-9)
+    np.testing.assert_allclose(others[2], nis, rtol=1e-9)
+    np.testing.assert_array_equal(others[0].active, states.active)
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_the_run_has_keyframes_new_landmarks_and_removed_ones(geometry):
+    states = both_forms(geometry)[1][0]
+    keyframes = np.asarray(states.core.pose.base_from_keyframe.translation())
+    assert np.sum(np.abs(np.diff(keyframes[:, 0])) > 0.05) == 2
+    assert np.asarray(states.active).sum(axis=1).tolist() == [3, 3, 4, 4, 3, 4, 4, 4, 4, 4]
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_what_is_not_in_the_state_has_no_information_at_all(geometry):
+    states = both_forms(geometry)[1][0]
+    last = jax.tree.map(lambda x: x[-1], states)
+    t, c = geometry.tangent_dim, last.core_dim
+    absent = np.zeros(len(last.information), bool)
+    absent[3 * t : c] = True  # noise and white calibration
+    absent[c:] = np.repeat(~np.asarray(last.active), geometry.point_dim)
+    assert not np.any(np.asarray(last.information)[absent])
+    assert not np.any(np.asarray(last.information)[:, absent])
+    assert np.all(np.diagonal(last.information)[~absent] > 0)
+
+
+# --- one update ---------------------------------------------------------------------------------
+
+
+def correlated(geometry, calibration="white"):
+    """A keyframe filter's state in both forms, all of it correlated; slots 1 and 4 are empty."""
+    slam, parameters = make("keyframe", geometry, calibration), noises(geometry)
+    state = slam.start(parameters, CAPACITY, velocity(geometry), jnp.zeros(geometry.tangent_dim))
+    rng = np.random.default_rng(1)
+    active = np.array([True, False, True, True, False])
+    d, c = geometry.point_dim, state.core_dim
+    present = np.concatenate([np.ones(c, bool), np.repeat(active, d)])
+    root = 0.01 * rng.normal(size=(present.sum(), 2 * present.sum()))
+    P, L = np.zeros((2, len(present), len(present)))
+    P[np.ix_(present, present)] = root @ root.T
+    L[np.ix_(present, present)] = np.linalg.inv(root @ root.T)
+    T_KC = exp(geometry.group, jnp.asarray(rng.uniform(-0.2, 0.2, geometry.tangent_dim)))
+    held = replace(state.core.pose, keyframe_from_camera=T_KC)
+    landmarks = np.column_stack([rng.uniform(-0.3, 0.3, (CAPACITY, d - 1)), np.full(CAPACITY, 0.3)])
+    landmarks = jnp.asarray(landmarks)
+    mean = replace(state.core, pose=held), landmarks, jnp.asarray(active)
+    P, L = jnp.asarray(P), jnp.asarray(L)
+    return slam, parameters, State(*mean, P), InformationState(*mean, L)
+
+
+def sighting(geometry):
+    """Slot 2, the middle landmark, is seen; 0 is not, nor is the empty slot 1."""
+    pixels = jnp.full((3, geometry.pixel_dim), 310.0).at[1].set(jnp.nan)
+    return Features(jnp.array([2, 0, 1]), pixels, jnp.array([True, False, True]))
+
+
+@cache
+def updated(geometry):
+    slam, parameters, *states = correlated(geometry)
+
+    def update(engine, state):
+        form = replace(slam, engine=engine)
+        dt, seen = jnp.array(DT), sighting(geometry)
+        after, innovation = form.update(state, parameters, dt, seen)
+        mean = form.update_mean(state, parameters, dt, seen)
+        search = form.predict_features(state, parameters, dt, jnp.array([3, 0]))
+        return after, after.covariance, innovation, mean, search
+
+    return [
+        (state, *quick_jit(lambda state, engine=engine: update(engine, state))(state))
+        for engine, state in zip((ekf, information), states, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_an_update_in_information_form_is_that_in_covariance_form(geometry):
+    (before, after, P, innovation, _, search), other = updated(geometry)
+    assert np.abs(P - before.covariance).max() > 1e-5
+    agree(P, other[2], 1e-9)
+    for a, b in ((after, other[1]), (after, other[4])):
+        shift = difference((a.core, a.landmarks.ravel()), (b.core, b.landmarks.ravel()))
+        assert np.abs(shift / sigmas(P)).max() < 1e-9
+    assert innovation.used.tolist() == other[3].used.tolist() == [True, False, False]
+    np.testing.assert_allclose(other[3].nis, innovation.nis, rtol=1e-9)
+    for a, b in zip(search, other[5], strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-9)
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_an_update_touches_no_block_between_two_landmarks(geometry):
+    before, after = updated(geometry)[1][:2]
+    c, d = before.core_dim, geometry.point_dim
+    touched = np.zeros((CAPACITY, CAPACITY), bool)
+    touched[2, 2] = True
+    old, new = (
+        np.asarray(x.information)[c:, c:].reshape(CAPACITY, d, CAPACITY, d).swapaxes(1, 2)
+        for x in (before, after)
+    )
+    np.testing.assert_array_equal(new[~touched], old[~touched])
+    assert np.all(old[0, 2] != 0)
+    assert np.all(new[touched] != old[touched])
+    cross = [np.asarray(x.information)[:c, c:].reshape(c, CAPACITY, d) for x in (before, after)]
+    np.testing.assert_array_equal(np.delete(cross[1], 2, axis=1), np.delete(cross[0], 2, axis=1))
+    assert np.any(cross[1][:, 2] != cross[0][:, 2])
+
+
+def test_landmarks_are_coupled_by_marginalising_the_pose_and_not_before():
+    slam, parameters = make("information", PLANAR, "known"), noises(PLANAR)
+    new, seen, _ = world(PLANAR)
+
+    @quick_jit
+    def coupling(new, seen):
+        state = slam.start(parameters, CAPACITY, velocity(PLANAR), jnp.full(3, 0.02))
+        first = slam.first(state, parameters, new)
+        seen, dt = replace(seen, valid=first.active), jnp.array(DT)
+        again, _ = slam.update(first, parameters, dt, seen)
+        moved, _ = slam.update(slam.predict(first, parameters, dt), parameters, dt, seen)
+        c = state.core_dim
+        states = (again, slam.reanchor(moved))
+        return [state.information[c : c + 2, c + 2 : c + 4] for state in states]
+
+    before, after = coupling(*(jax.tree.map(lambda x: x[0], f) for f in (new, seen)))
+    np.testing.assert_array_equal(before, np.zeros((2, 2)))
+    assert np.all(np.abs(after) > 1e-9)
+
+
+# --- keyframes ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_reanchoring_changes_neither_the_camera_nor_the_points(geometry):
+    slam, parameters, state, _ = correlated(geometry, "known")
+    slots = jnp.array([0, 2, 3])
+
+    def told(state):
+        points = slam.landmarks_in_world(state, parameters, slots)
+        return slam.camera_pose(state), points, slam.landmarks_in_camera(state, parameters, slots)
+
+    after = quick_jit(slam.reanchor)(state)
+    told = quick_jit(told)
+    for a, b in zip(jax.tree.leaves(told(after)), jax.tree.leaves(told(state)), strict=True):
+        close(a, b, 1e-12)
+    t = geometry.tangent_dim
+    np.testing.assert_array_equal(after.covariance[t : 2 * t], np.zeros_like(after.covariance[:t]))
+    held = after.core.pose.keyframe_from_camera
+    np.testing.assert_array_equal(held.as_matrix(), np.eye(geometry.point_dim + 1))
+    assert np.abs(after.landmarks - state.landmarks)[slots].min(axis=1).max() > 0.01
+
+
+def test_keyframe_and_world_filter_differ_to_second_order():
+    apart = []
+    for scale in (0.1, 0.01):
+        data = (noises(PLANAR, scale), jnp.array(0.0), *world(PLANAR, scale))
+        runs = [compiled(kind, PLANAR, None, "known")(*data) for kind in ("keyframe", "world")]
+        (ours, P), (theirs, _) = (run[3] for run in runs)
+        shift = jax.vmap(difference)(ours, theirs)
+        apart.append(np.abs(shift / np.sqrt(np.diagonal(P, axis1=1, axis2=2)))[-1].max())
+    # Errors of second order, by a σ that is of first.
+    assert 0 < apart[1] < apart[0] / 5
+    assert apart[1] < 1e-2
+
+
+def test_a_keyframe_is_due_after_a_turn_or_a_baseline():
+    near, far = jnp.array([0.5, 0.0, 0.5]), jnp.array([0.01, 0.0, 0.0])
+    moved, turned = jnp.array([0.3, 0.4, 0.0]), jnp.array([0.0, 0.0, 1.1 * KEYFRAME_TURN])
+    pose = PLANAR.group.exp
+    assert KEYFRAME_PARALLAX < 0.5 * 0.5
+    assert keyframe_due(pose(moved), near)
+    assert not keyframe_due(pose(moved), far)
+    assert not keyframe_due(pose(moved), jnp.zeros(3))
+    assert keyframe_due(pose(turned), far)
+    assert not keyframe_due(pose(0.8 * turned), near)
+
+
+# --- what the information form cannot do ----------------------------------------------------------
+
+
+def test_an_exact_start_is_known_to_the_least_sigma():
+    slam = make("information", PLANAR)
+
+    @quick_jit
+    def started(parameters):
+        return slam.camera_pose(slam.start(parameters, 1, jnp.zeros(3), jnp.full(3, 0.1)))
+
+    covariance = started(noises(PLANAR))[1]
+    np.testing.assert_allclose(covariance, 2 * EXACT_SIGMA**2 * np.eye(3), rtol=1e-12, atol=1e-24)
+
+
+def test_redundant_landmarks_and_considered_calibration_are_refused():
+    with pytest.raises(ValueError, match=r"image_plane.*not inverse_scaling"):
+        FILTERS["information"](Rig(PLANAR), INVERSE_SCALING, "known")
+    with pytest.raises(ValueError, match="consider"):
+        make("information", PLANAR, "consider")
+    slam, parameters, _, state = correlated(PLANAR, "consider")
+    with pytest.raises(ValueError, match="consider"):
+        replace(slam, engine=information).update(state, parameters, DT, sighting(PLANAR))
