@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Case, close, each_geometry, each_landmark, named, pose, quick_jit
+from cases import Case, close, each_geometry, few_landmarks, named, pose, quick_jit
 
 from jaxslam.filters import CALIBRATIONS, FILTERS, Features, SlamFilter, SlamModel, State, ekf
 from jaxslam.filters.slam import ROBOCENTRIC, WORLD, Context, Core
-from jaxslam.geometry import PLANAR
+from jaxslam.geometry import PLANAR, joined
 from jaxslam.landmarks import INVERSE_SCALING
+from jaxslam.rig import Rig
 
 DT = 0.1
 
@@ -24,12 +25,12 @@ def composer(geometry, landmark, frame):
     context = Context(None, jnp.asarray(DT))
 
     def compose(pose, velocity, acceleration, parameters):
-        core = Core(pose, velocity, acceleration, jnp.zeros(0))
+        core = Core(frame.hold(pose), velocity, acceleration, jnp.zeros(0))
         moved = model.compose_core(core, context)
         if frame.moves_landmarks:
             view = model.view(core, context)
             parameters = model.compose_landmark(view, parameters, context)
-        return moved.pose, moved.velocity, parameters
+        return frame.pose(moved.pose), moved.velocity, parameters
 
     return quick_jit(compose)
 
@@ -50,7 +51,7 @@ def euclidean(landmark, parameters):
 
 
 @pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD], ids=named)
-@pytest.mark.parametrize("landmark", each_landmark, ids=named)
+@pytest.mark.parametrize("landmark", few_landmarks, ids=named)
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_composition_with_no_motion_is_the_identity(geometry, landmark, frame):
     T, X = pose(geometry, 2), a_landmark(geometry, landmark)
@@ -62,7 +63,7 @@ def test_composition_with_no_motion_is_the_identity(geometry, landmark, frame):
 
 
 @pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD], ids=named)
-@pytest.mark.parametrize("landmark", each_landmark, ids=named)
+@pytest.mark.parametrize("landmark", few_landmarks, ids=named)
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_composition_with_a_motion_and_its_inverse_is_the_identity(geometry, landmark, frame):
     T, X = pose(geometry, 2), a_landmark(geometry, landmark)
@@ -76,7 +77,7 @@ def test_composition_with_a_motion_and_its_inverse_is_the_identity(geometry, lan
     np.testing.assert_allclose(X_back, X, rtol=1e-13, atol=1e-13)
 
 
-@pytest.mark.parametrize("landmark", each_landmark, ids=named)
+@pytest.mark.parametrize("landmark", few_landmarks, ids=named)
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_both_frames_speak_of_the_same_camera_and_the_same_point(geometry, landmark):
     """`T_CB ← T_{k-1,k}⁻¹ T_CB` and P20 against `T_BC ← T_BC T_{k-1,k}` and nothing at all."""
@@ -122,12 +123,12 @@ def test_robocentric_and_world_agree_where_the_problem_is_linear():
         slots, valid = known.slots, known.valid
         pixels = perfect_pixels(case, parameters, scale)
         frames = (
-            replace(first, pixels=pixels[0][first.slots]),
+            replace(first, measured=pixels[0][first.slots]),
             Features(slots, jnp.take_along_axis(pixels[1:], slots[..., None], 1), valid),
             new,
         )
-        velocity, velocity_sigma, dt = case.motion()
-        motion = (velocity, velocity_sigma * scale, dt)
+        velocity, velocity_sigma, controls = case.motion()
+        motion = (velocity, velocity_sigma * scale, controls)
         (T, P), (U, Q) = (
             case.compiled(kind, "inverse_scaling")(parameters, motion, *frames)[1][:2]
             for kind in ("robocentric", "world")
@@ -230,7 +231,7 @@ def test_a_run_can_be_differentiated_by_its_noise():
     case = Case("matched-tight", steps=4, landmarks=4)
     first, *later = case.frames(0)
     slam = case.filter("robocentric", "inverse_scaling")
-    parameters, (velocity, velocity_sigma, dt) = case.parameters(), case.motion()
+    parameters, (velocity, velocity_sigma, controls) = case.parameters(), case.motion()
     start = slam.start(parameters, case.capacity, velocity, velocity_sigma)
     start = quick_jit(slam.first)(start, parameters, first)
 
@@ -238,10 +239,10 @@ def test_a_run_can_be_differentiated_by_its_noise():
         noisy = replace(parameters, motion_sigma=sigma)
 
         def step(state, frame):
-            state, innovation = slam.step(state, noisy, dt, *frame)
+            state, innovation = slam.step(state, noisy, *frame)
             return state, innovation.nis
 
-        state, nis = jax.lax.scan(step, start, tuple(later))
+        state, nis = jax.lax.scan(step, start, (controls, *later))
         pose_variance = jnp.trace(state.covariance[:3, :3])
         # Scaled so that each part matters: metres, log σ², and numbers compared.
         return 1e3 * state.core.pose.translation()[0] + jnp.log(pose_variance) + nis.mean()
@@ -297,24 +298,41 @@ def test_a_step_leaves_no_acceleration_and_no_white_calibration_behind(kind):
 
 
 def test_an_unknown_calibration_is_refused_by_name():
-    model = SlamModel(PLANAR, INVERSE_SCALING, ROBOCENTRIC)
+    model = SlamModel(Rig(PLANAR), INVERSE_SCALING, ROBOCENTRIC)
     with pytest.raises(ValueError, match="'black'") as error:
         SlamFilter(model, "black")
     assert all(name in str(error.value) for name in CALIBRATIONS)
 
 
-def test_pose_error_is_zero_at_the_truth_and_refers_to_the_covariance():
+@pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD], ids=named)
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_a_frame_holds_every_pose_and_gives_it_back(geometry, frame):
+    T = pose(geometry, 3, scale=1.0)
+    again = frame.pose(frame.hold(frame.pose_from_camera(T)))
+    np.testing.assert_allclose(
+        frame.pose_from_camera(again).as_matrix(), T.as_matrix(), rtol=0, atol=1e-15
+    )
+
+
+@pytest.mark.parametrize("kind", list(FILTERS))
+def test_pose_error_is_zero_at_the_truth_and_refers_to_the_covariance(kind):
     case = tight()
     T_BC, delta = pose(PLANAR, 4), np.array([0.01, -0.02, 0.03])
-    for kind in FILTERS:
-        slam = case.filter(kind, "inverse_scaling")
-        state = slam.start(case.parameters(), 1, jnp.zeros(3), jnp.full(3, 0.1))
-        held = slam.model.frame.pose_from_camera(T_BC)
-        state = replace(state, core=replace(state.core, pose=held))
-        state = ekf.augment(state, 0, jnp.diag(jnp.array([1.0, 2.0, 3.0])))
-        error, covariance = slam.pose_error(state, T_BC)
-        np.testing.assert_allclose(error, np.zeros(3), atol=1e-15)
-        np.testing.assert_array_equal(covariance, np.diag([1.0, 2.0, 3.0]))
-        # The truth is the estimate, perturbed on the right by δ, in the state's own terms.
-        truth = slam.model.frame.pose_from_camera(held @ PLANAR.group.exp(jnp.asarray(delta)))
-        np.testing.assert_allclose(slam.pose_error(state, truth)[0], delta, rtol=1e-10)
+    slam = case.filter(kind, "inverse_scaling")
+    frame = slam.model.frame
+    state = slam.start(case.parameters(), 1, jnp.zeros(3), jnp.full(3, 0.1))
+    held = frame.pose_from_camera(T_BC)
+    state = replace(state, core=replace(state.core, pose=frame.hold(held)))
+    state = ekf.augment(state, 0, jnp.diag(jnp.array([1.0, 2.0, 3.0])))
+    error, covariance = slam.pose_error(state, T_BC)
+    np.testing.assert_allclose(error, np.zeros(3), atol=1e-15)
+    np.testing.assert_array_equal(covariance, np.diag([1.0, 2.0, 3.0]))
+    # The truth is the estimate perturbed by δ: as a whole and on the right where the camera is
+    # the base; along the axes of B, and turned, where B is.
+    if kind == "robocentric":
+        truth = held @ PLANAR.group.exp(jnp.asarray(delta))
+    else:
+        turn = type(held.rotation()).from_radians(delta[2])
+        truth = joined(held.rotation() @ turn, held.translation() + delta[:2])
+    error, _ = slam.pose_error(state, frame.pose_from_camera(truth))
+    np.testing.assert_allclose(error, delta, rtol=1e-10)
