@@ -542,6 +542,54 @@ def test_search_ellipses_are_the_diagonal_blocks_of_the_innovation_covariance():
         close(covariances, np.stack([S[i, :, i] for i in (2, 0)]), 1e-12)
 
 
+def test_considered_numbers_count_but_are_not_corrected():
+    """Schmidt (1966): P_xx, P_xc and P_cc by the textbook's partitioned equations."""
+    state, _, dense, jacobian = planar_case()
+    model = SlamModel(Rig(PLANAR), INVERSE_SCALING, ROBOCENTRIC)
+    context = Context(slam_parameters(PLANAR), jnp.asarray(STEP))
+    c, n = state.core_dim, len(state.covariance)
+    calibration = slice(c - 2, c)
+    seen = Features(jnp.arange(3), planar_pixels(state), jnp.ones(3, bool))
+    update, update_mean = (
+        quick_jit(
+            lambda state, function=function: function(
+                model, state, seen, noise_of(PLANAR), context, calibration
+            )
+        )
+        for function in (ekf.update, ekf.update_mean)
+    )
+    updated, innovation = update(state)
+
+    zero = np.zeros(n)
+    H, P = np.asarray(jacobian(state, zero))[:3], np.asarray(state.covariance)
+    residual = np.asarray(seen.measured).ravel() - np.asarray(dense(state, zero))[:3]
+    k = np.arange(n)[calibration]  # considered
+    x = np.delete(np.arange(n), k)  # estimated
+    S = H @ P @ H.T + 0.09 * np.eye(3)
+    K = (P[np.ix_(x, x)] @ H[:, x].T + P[np.ix_(x, k)] @ H[:, k].T) @ np.linalg.inv(S)
+    P_xx = P[np.ix_(x, x)] - K @ S @ K.T
+    P_xk = P[np.ix_(x, k)] - K @ (H[:, x] @ P[np.ix_(x, k)] + H[:, k] @ P[np.ix_(k, k)])
+    after = np.asarray(updated.covariance)
+    close(after[np.ix_(x, x)], P_xx, 1e-10)
+    close(after[np.ix_(x, k)], P_xk, 1e-10)
+    np.testing.assert_array_equal(after[np.ix_(k, k)], P[np.ix_(k, k)])
+    np.testing.assert_array_equal(after, after.T)
+    assert np.abs(P_xk - P[np.ix_(x, k)]).max() > 1e-3
+
+    np.testing.assert_array_equal(updated.core.calibration, state.core.calibration)
+    delta = np.zeros(n)
+    delta[x] = K @ residual
+    close(updated.landmarks.ravel(), state.landmarks.ravel() + delta[c:], 1e-10)
+    moved = compiled_retract()(state.core, delta[:c])
+    for a, b in zip(jax.tree.leaves(updated.core), jax.tree.leaves(moved), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(innovation.nis, residual @ np.linalg.solve(S, residual), rtol=1e-9)
+    mean = update_mean(state)
+    for a, b in zip(jax.tree.leaves(mean), jax.tree.leaves(updated), strict=True):
+        if a.shape != (n, n):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-10)
+
+
 # --- initialisation -----------------------------------------------------------------------------
 
 
