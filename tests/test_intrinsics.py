@@ -55,8 +55,8 @@ def test_a_turning_camera_estimates_its_calibration():
     assert (variances[0] <= VARIANCES).all()
     # It never forgets, and gains in both.
     assert (np.diff(variances, axis=0) <= 1e-12).all()
-    print("XX", variances[-1], state.core.calibration)
-    assert (variances[-1] < 0.97 * VARIANCES).all()
+    # Measured: 15 % and 8 % less after two thirds of a second.
+    assert (variances[-1] < 0.95 * VARIANCES).all()
     assert (np.asarray(state.core.calibration) != 0).all()
 
 
