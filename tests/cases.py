@@ -13,6 +13,8 @@ from jaxslam.simulation import features, parameters, scenario, sightings, simula
 
 each_geometry = list(GEOMETRIES.values())
 each_landmark = list(LANDMARKS.values())
+few_landmarks = [LANDMARKS[name] for name in ("inverse_scaling", "inverse_depth", "cartesian")]
+"""Where every parametrization would cost minutes: homogeneous, anchored with angles, plain."""
 
 
 def named(value):
@@ -71,18 +73,18 @@ def close(actual, desired, relative):
 def run_filter(slam, capacity, parameters, motion, first, known, new):
     """A whole run; the poses, covariances and NIS of every step, and the last state.
 
-    `motion` holds the nominal velocity, its σ, and the seconds of a step.
+    `motion` holds the nominal velocity, its σ, and the control of every step.
     """
-    velocity, velocity_sigma, dt = motion
+    velocity, velocity_sigma, controls = motion
     state = slam.start(parameters, capacity, velocity, velocity_sigma)
     state = slam.first(state, parameters, first)
 
     def step(state, frame):
-        state, innovation = slam.step(state, parameters, dt, *frame)
+        state, innovation = slam.step(state, parameters, *frame)
         pose, pose_covariance = slam.camera_pose(state)
         return state, (pose, pose_covariance, state.covariance, innovation.nis)
 
-    return jax.lax.scan(step, state, (known, new))
+    return jax.lax.scan(step, state, (controls, known, new))
 
 
 class Case:
@@ -108,10 +110,10 @@ class Case:
     def parameters(self, dtype=None) -> Parameters:
         return parameters(self.scenario, dtype)
 
-    def motion(self, dtype=None):
-        """Nominal velocity, its σ, and the seconds of a step."""
+    def motion(self, i=0):
+        """Nominal velocity, its σ, and the controls of run i."""
         s = self.scenario
-        return tuple(jnp.asarray(x, dtype) for x in (s.velocity, s.velocity_sigma, 1 / s.rate))
+        return jnp.asarray(s.velocity), jnp.asarray(s.velocity_sigma), self.runs.controls[i]
 
     def function(self, slam):
         """`(parameters, motion, first, known, new) → run`, to be compiled and mapped."""

@@ -7,12 +7,22 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from cases import each_geometry, named, pose, quick_jit
+from cases import central, close, each_geometry, named, pose, quick_jit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from jaxslam.geometry import PLANAR, difference, exp, jacobian, log, retract, tangent_dim
+from jaxslam.geometry import (
+    PLANAR,
+    SplitPose,
+    difference,
+    exp,
+    jacobian,
+    joined,
+    log,
+    retract,
+    tangent_dim,
+)
 from jaxslam.motion import CONSTANT_VELOCITY
 
 # Rotation vectors shorter than π have one logarithm; with |δ| ≤ 1 per axis, √3 at the most.
@@ -163,3 +173,64 @@ def test_jacobians_by_the_first_order_retraction_are_those_of_retract(geometry):
         jnp.zeros(geometry.tangent_dim + 2)
     )
     np.testing.assert_allclose(jacobian(function, core), by_definition, atol=1e-13)
+
+
+# --- a pose whose position and orientation are perturbed apart ----------------------------------
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_a_split_pose_joins_to_the_pose_it_is_of(geometry):
+    T = pose(geometry, 6, scale=2.0)
+    split = SplitPose.of(T)
+    assert tangent_dim(split) == geometry.tangent_dim
+    np.testing.assert_allclose(split.joined().as_matrix(), T.as_matrix(), rtol=0, atol=1e-15)
+    again = SplitPose.of(split.joined())
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(split), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_a_split_pose_moves_along_the_axes_of_its_frame_and_turns_in_its_own(geometry):
+    T = pose(geometry, 7, scale=2.0)
+    delta = np.array([0.3, -0.8, 0.5, 0.4, -0.9, 0.7])[: geometry.tangent_dim]
+    n = geometry.point_dim
+    move, subtract = compiled()
+    moved = move(SplitPose.of(T), delta)
+    np.testing.assert_allclose(moved.translation, T.translation() + delta[:n], atol=1e-15)
+    turn = exp(geometry.rotation_group, jnp.asarray(delta[n:]))
+    np.testing.assert_allclose(
+        moved.rotation.as_matrix(), T.rotation().as_matrix() @ turn.as_matrix(), atol=1e-15
+    )
+    np.testing.assert_allclose(subtract(moved, SplitPose.of(T)), delta, rtol=0, atol=1e-14)
+    # The other way round, from one pose to another.
+    other = SplitPose.of(pose(geometry, 8, scale=1.0))
+    there = move(other, subtract(moved, other))
+    np.testing.assert_allclose(
+        there.joined().as_matrix(), moved.joined().as_matrix(), rtol=0, atol=1e-14
+    )
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_jacobians_from_and_to_split_poses_agree_with_central_differences(geometry):
+    """A step of the pose in the state, and a point seen from there."""
+    step, point = pose(geometry, 9, scale=1.0), jnp.arange(1.0, geometry.point_dim + 1)
+    split = SplitPose.of(pose(geometry, 10, scale=1.0))
+
+    def function(split):
+        T = split.joined()
+        return {"seen": T.inverse() @ point, "whole": T, "after": SplitPose.of(T @ step)}
+
+    value = function(split)
+    error = quick_jit(lambda delta: difference(function(retract(split, delta)), value))
+    exact = np.asarray(quick_jit(lambda: jacobian(function, split))())
+    t = geometry.tangent_dim
+    assert exact.shape == (geometry.point_dim + 2 * t, t)
+    close(central(error, np.zeros(t)), exact, relative=1e-9)
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_joined_is_the_pose_of_its_parts(geometry):
+    T = pose(geometry, 11, scale=2.0)
+    again = joined(T.rotation(), T.translation())
+    assert type(again) is geometry.group
+    np.testing.assert_allclose(again.as_matrix(), T.as_matrix(), rtol=0, atol=1e-15)

@@ -1,5 +1,6 @@
 """Tests of jaxslam.landmarks: what every parametrization in the table owes its Euclidean point."""
 
+from dataclasses import replace
 from functools import cache
 
 import jax
@@ -9,15 +10,54 @@ import pytest
 from cases import central, close, each_geometry, each_landmark, named, pose, quick_jit
 
 from jaxslam.camera import Camera, project
-from jaxslam.landmarks import INVERSE_SCALING, LANDMARKS
+from jaxslam.landmarks import (
+    INVERSE_DEPTH,
+    INVERSE_DEPTH_TO_CARTESIAN,
+    INVERSE_SCALING,
+    LANDMARKS,
+    PARALLAX_ANGLE,
+)
+from jaxslam.landmarks.inverse_depth import angles_of
 
 FOCAL = 650.0
 INVERSE_DEPTHS = (0.02, 0.15, 1.3)
 
-pytestmark = [pytest.mark.parametrize("geometry", each_geometry, ids=named)]
-every_landmark = pytest.mark.parametrize("landmark", each_landmark, ids=named)
+SECOND_CAMERA = np.array([0.5, -0.2, 0.3])
+
+
+def converted_at_once(point, omega, focal):
+    """Inverse depth to Cartesian, after its conversion."""
+    del focal
+    position = point / omega
+    return jnp.concatenate([position, jnp.zeros_like(position), jnp.ones(1)])
+
+
+def anchored_at_once(point, omega, focal):
+    """Parallax angle with a second anchor: the angle at X/ω between the rays to both."""
+    del focal
+    second = jnp.asarray(SECOND_CAMERA[: point.size])
+    ray = point / jnp.linalg.norm(point)
+    along, rho = ray @ second, omega / jnp.linalg.norm(point)
+    across = jnp.sqrt(second @ second - along**2)
+    alpha = jnp.arctan2(rho * across, 1 - rho * along)
+    ends = jnp.stack([alpha, jnp.ones(())])
+    return jnp.concatenate([jnp.zeros_like(point), second, angles_of(point), ends])
+
+
+CONVERTED = replace(
+    INVERSE_DEPTH_TO_CARTESIAN,
+    name="inverse_depth_to_cartesian, converted",
+    initialise=converted_at_once,
+)
+ANCHORED = replace(
+    PARALLAX_ANGLE, name="parallax_angle, with both anchors", initialise=anchored_at_once
+)
+forms = [*each_landmark, CONVERTED, ANCHORED]
+
+with_geometry = pytest.mark.parametrize("geometry", each_geometry, ids=named)
+every_landmark = pytest.mark.parametrize("landmark", forms, ids=named)
 at_infinity = pytest.mark.parametrize(
-    "landmark", [p for p in each_landmark if p.name != "cartesian"], ids=named
+    "landmark", [p for p in forms if p.name != "cartesian" and p is not CONVERTED], ids=named
 )
 
 
@@ -47,11 +87,13 @@ def generic(landmark, geometry, inverse_depth=0.15):
     return transform(pose(geometry, 1), initialise(bearing_of(geometry), inverse_depth))
 
 
+@with_geometry
 @every_landmark
 def test_size_is_the_number_of_parameters(landmark, geometry):
     assert generic(landmark, geometry).shape == (landmark.size(geometry.point_dim),)
 
 
+@with_geometry
 @every_landmark
 @pytest.mark.parametrize("inverse_depth", INVERSE_DEPTHS)
 def test_first_observation_puts_the_point_on_its_ray_at_its_depth(
@@ -63,6 +105,7 @@ def test_first_observation_puts_the_point_on_its_ray_at_its_depth(
     np.testing.assert_allclose(point, ray / inverse_depth, rtol=1e-14)
 
 
+@with_geometry
 @every_landmark
 def test_transform_moves_the_euclidean_point(landmark, geometry):
     _, transform, _, euclidean = functions(landmark)
@@ -71,6 +114,7 @@ def test_transform_moves_the_euclidean_point(landmark, geometry):
     np.testing.assert_allclose(moved, T @ euclidean(parameters), rtol=1e-13, atol=1e-13)
 
 
+@with_geometry
 @every_landmark
 def test_transform_there_and_back_is_the_identity_also_for_the_parameters(landmark, geometry):
     _, transform, *_ = functions(landmark)
@@ -80,6 +124,7 @@ def test_transform_there_and_back_is_the_identity_also_for_the_parameters(landma
     close(transform(T.inverse(), moved), parameters, relative=1e-14)
 
 
+@with_geometry
 @every_landmark
 def test_transforms_compose(landmark, geometry):
     _, transform, *_ = functions(landmark)
@@ -88,9 +133,10 @@ def test_transforms_compose(landmark, geometry):
     close(transform(T @ U, parameters), transform(T, transform(U, parameters)), relative=1e-14)
 
 
+@with_geometry
 @every_landmark
 def test_derivatives_agree_with_central_differences(landmark, geometry):
-    parameters, T = np.asarray(generic(landmark, geometry)), pose(geometry, 2)
+    parameters, T = generic(landmark, geometry), pose(geometry, 2)
     p = geometry.pixel_dim
 
     def first_seen(x):
@@ -114,6 +160,7 @@ def test_derivatives_agree_with_central_differences(landmark, geometry):
         close(central(quick_jit(function), at), exact, relative=1e-8)
 
 
+@with_geometry
 @at_infinity
 def test_a_point_at_infinity_is_nothing_special(landmark, geometry):
     initialise, transform, homogeneous, _ = functions(landmark)
@@ -133,6 +180,7 @@ def test_a_point_at_infinity_is_nothing_special(landmark, geometry):
     close(central(quick_jit(pixel), np.asarray(parameters)), J, relative=1e-7)
 
 
+@with_geometry
 @at_infinity
 def test_a_negative_inverse_depth_is_legal_and_continuous(landmark, geometry):
     """Beyond infinity the pixel goes on as it came: no sign flips, nothing is clamped."""
@@ -153,6 +201,7 @@ def test_a_negative_inverse_depth_is_legal_and_continuous(landmark, geometry):
     np.testing.assert_allclose(after - at, at - before, rtol=0, atol=1e-6)
 
 
+@with_geometry
 def test_inverse_scaling_is_linear_in_the_landmark(geometry):
     _, transform, *_ = functions(INVERSE_SCALING)
     T, n = pose(geometry, 7), geometry.point_dim
@@ -160,6 +209,7 @@ def test_inverse_scaling_is_linear_in_the_landmark(geometry):
     close(transform(T, 2 * a - 3 * b), 2 * transform(T, a) - 3 * transform(T, b), relative=1e-14)
 
 
+@with_geometry
 def test_inverse_scaling_starts_in_pixels(geometry):
     """P22–P26: (u − cx, v − cy, f, f/d)."""
     initialise, *_ = functions(INVERSE_SCALING)
@@ -167,6 +217,7 @@ def test_inverse_scaling_starts_in_pixels(geometry):
     np.testing.assert_allclose(initialise(bearing_of(geometry), 0.2), expected, rtol=1e-15)
 
 
+@with_geometry
 def test_inverse_depth_holds_anchor_angles_and_inverse_distance(geometry):
     """θ = atan2(nx, nz), φ = atan2(−ny, √(nx² + nz²)), ρ along the ray, not along the axis."""
     initialise, transform, *_ = functions(LANDMARKS["inverse_depth"])
@@ -179,3 +230,147 @@ def test_inverse_depth_holds_anchor_angles_and_inverse_distance(geometry):
     np.testing.assert_allclose(parameters, expected, rtol=1e-14)
     T = pose(geometry, 8)
     np.testing.assert_allclose(transform(T, parameters)[: ray.size], T.translation(), atol=1e-15)
+
+
+# --- parallax angle -----------------------------------------------------------------------------
+
+
+def angle_between(a, b):
+    return np.arccos(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@with_geometry
+def test_parallax_angle_is_the_triangle_of_two_anchors_and_a_point(geometry, seed):
+    """Two sides and angles of a triangle by plain trigonometry: the law of sines."""
+    rng = np.random.default_rng(seed)
+    main, associate = rng.uniform(-1, 1, (2, geometry.point_dim))
+    point = rng.uniform(2, 6, geometry.point_dim)
+    ray, baseline = point - main, associate - main
+    alpha, psi = angle_between(main - point, associate - point), angle_between(ray, baseline)
+    assert alpha > 0.02
+    side = np.linalg.norm(baseline) * np.sin(np.pi - alpha - psi) / np.sin(alpha)
+    np.testing.assert_allclose(np.linalg.norm(ray), side, rtol=1e-12)
+    parameters = np.concatenate([main, associate, angles_of(ray), [alpha, 1.0]])
+    euclidean = functions(PARALLAX_ANGLE)[-1]
+    np.testing.assert_allclose(euclidean(parameters), point, rtol=1e-12)
+
+
+@pytest.mark.parametrize("moved", [0.0, 0.5, -0.5], ids=["not at all", "towards", "away"])
+@with_geometry
+def test_a_camera_that_moves_along_the_ray_has_no_parallax_and_finite_derivatives(geometry, moved):
+    parameters = generic(PARALLAX_ANGLE, geometry)
+    main, ray = _main_and_ray(parameters, geometry)
+    camera = jnp.asarray(main + moved * ray)
+    size = PARALLAX_ANGLE.size(geometry.point_dim)
+    value, J = value_and_jacobian(PARALLAX_ANGLE)(camera, parameters, jnp.eye(size))
+    np.testing.assert_array_equal(value, parameters)
+    assert all(np.isfinite(part).all() for part in J)
+    # And with such a second anchor, where no point is told, the formula is still finite.
+    flat = jnp.concatenate([main, camera, parameters[2 * main.size : -2], jnp.array([0.1, 1.0])])
+    J = quick_jit(jax.jacfwd(PARALLAX_ANGLE.homogeneous))(flat)
+    assert all(np.isfinite(part).all() for part in J)
+
+
+def _main_and_ray(parameters, geometry):
+    """The anchor, and the unit ray from there to the point."""
+    main = np.asarray(parameters[: geometry.point_dim])
+    point = np.asarray(functions(PARALLAX_ANGLE)[-1](parameters))
+    return main, (point - main) / np.linalg.norm(point - main)
+
+
+# --- conversions --------------------------------------------------------------------------------
+
+
+@cache
+def value_and_jacobian(landmark):
+    """`(camera, parameters, covariance) → converted`, and its derivatives by the first two."""
+    return quick_jit(
+        lambda *x: (landmark.convert(*x), jax.jacfwd(landmark.convert, argnums=(0, 1))(*x))
+    )
+
+
+def convert(landmark, *arguments):
+    return np.asarray(value_and_jacobian(landmark)(*arguments)[0])
+
+
+def linearity_index(anchor, point, camera, rho, sigma_rho):
+    """Civera, Davison, Montiel, ICRA 2007: `L_d = 4 σ_d |cos α| / d₁`, `σ_d = σ_ρ/ρ²`."""
+    parallax = angle_between(point - anchor, point - camera)
+    return 4 * sigma_rho / rho**2 * abs(np.cos(parallax)) / np.linalg.norm(point - camera)
+
+
+def with_last_sigma(size, sigma):
+    """A covariance of which only the last parameter before the constant counts."""
+    covariance = np.full((size, size), 7.0)
+    covariance[-2, -2] = sigma**2
+    return covariance
+
+
+@pytest.mark.parametrize("seed", range(3))
+@with_geometry
+def test_inverse_depth_becomes_cartesian_exactly_where_it_is_linear(geometry, seed):
+    landmark, n = INVERSE_DEPTH_TO_CARTESIAN, geometry.point_dim
+    parameters = np.asarray(generic(landmark, geometry, INVERSE_DEPTHS[seed]))
+    camera = np.random.default_rng(seed).uniform(-0.5, 0.5, n)
+    point, rho = np.asarray(functions(landmark)[-1](parameters)), parameters[-2]
+    # The index is proportional to σ_ρ: this one is at the threshold of 10 %.
+    threshold = 0.1 / linearity_index(parameters[:n], point, camera, rho, 1.0)
+    above = convert(landmark, camera, parameters, with_last_sigma(2 * n + 1, threshold * 1.0001))
+    np.testing.assert_array_equal(above, parameters)
+    below = convert(landmark, camera, parameters, with_last_sigma(2 * n + 1, threshold * 0.9999))
+    np.testing.assert_allclose(below[:n], point, rtol=1e-13)
+    np.testing.assert_array_equal(below[n:], [0.0] * n + [1.0])
+    np.testing.assert_allclose(functions(landmark)[-1](below), point, rtol=1e-13)
+    again = convert(landmark, camera + 0.1, below, with_last_sigma(2 * n + 1, 0.0))
+    np.testing.assert_array_equal(again, below)
+
+
+@pytest.mark.parametrize("rho", [0.0, -0.1])
+@with_geometry
+def test_a_point_at_or_beyond_infinity_does_not_become_cartesian(geometry, rho):
+    n = geometry.point_dim
+    parameters = generic(INVERSE_DEPTH_TO_CARTESIAN, geometry).at[-2].set(rho)
+    arguments = jnp.zeros(n), parameters, with_last_sigma(2 * n + 1, 1e-9)
+    value, J = value_and_jacobian(INVERSE_DEPTH_TO_CARTESIAN)(*arguments)
+    np.testing.assert_array_equal(value, parameters)
+    assert all(np.isfinite(part).all() for part in J)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@with_geometry
+def test_a_camera_becomes_the_associate_anchor_exactly_at_the_least_parallax(geometry, seed):
+    landmark, n = PARALLAX_ANGLE, geometry.point_dim
+    parameters = np.asarray(generic(landmark, geometry, INVERSE_DEPTHS[seed]))
+    main, ray = _main_and_ray(parameters, geometry)
+    point = np.asarray(functions(landmark)[-1](parameters))
+    covariance = np.eye(3 * n + 1)
+    # Across the ray and somewhat along it, as far as makes the parallax 0.02 ∓ 1e-7.
+    step = np.random.default_rng(seed).normal(size=n)
+    across = step - (step @ ray) * ray
+    across /= np.linalg.norm(across)
+    along = 0.2 * np.linalg.norm(point - main)
+
+    def camera_at(parallax):
+        left = np.linalg.norm(point - main) - along
+        return main + along * ray + left * np.tan(parallax) * across
+
+    early, late = camera_at(0.02 - 1e-7), camera_at(0.02 + 1e-7)
+    np.testing.assert_allclose(angle_between(point - main, point - late), 0.02 + 1e-7, atol=1e-12)
+    np.testing.assert_array_equal(convert(landmark, early, parameters, covariance), parameters)
+    anchored = convert(landmark, late, parameters, covariance)
+    expected = [*main, *late, *parameters[2 * n : -2], 0.02 + 1e-7, 1.0]
+    np.testing.assert_allclose(anchored, expected, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(functions(landmark)[-1](anchored), point, rtol=1e-12)
+    # Once only: the second anchor stays, however much larger another parallax is.
+    again = convert(landmark, camera_at(0.3), anchored, covariance)
+    np.testing.assert_array_equal(again, anchored)
+
+
+@pytest.mark.parametrize("landmark", [INVERSE_DEPTH_TO_CARTESIAN, PARALLAX_ANGLE], ids=named)
+@with_geometry
+def test_until_its_conversion_a_landmark_is_one_of_unified_inverse_depth(geometry, landmark):
+    parameters, plain = generic(landmark, geometry), generic(INVERSE_DEPTH, geometry)
+    ours, theirs = (functions(p)[2](x) for p, x in ((landmark, parameters), (INVERSE_DEPTH, plain)))
+    np.testing.assert_allclose(jnp.append(*ours), jnp.append(*theirs), rtol=1e-14)
+    assert parameters[-1] == 0.0

@@ -107,6 +107,44 @@ EXPECTED = {
     for noise, (acceleration, start) in noises.items()
 }
 
+DEGREE = np.pi / 180
+ODOMETRY = {"motion": "odometry", "true_calibration": "nominal", "calibration": "known"}
+EXPECTED["room"] = ODOMETRY | {
+    "geometry": "spatial",
+    "rate": 10.0,
+    "steps": 200,
+    "velocity": pytest.approx((0.0, 0.0, 0.8, 0.0, -9 * DEGREE, 0.0)),
+    "odometry_sigma": pytest.approx((0.005,) * 3 + (0.05 * DEGREE,) * 3),
+    "velocity_sigma": (0.0,) * 6,
+    "placement": "room",
+    "landmarks": 72,
+    "sensor": "camera",
+    "image": (640.0, 480.0),
+    "focal": (320.0, 320.0),
+    "centre": (320.0, 240.0),
+    "pixel_sigma": 1.0,
+    "inverse_depth": (0.01, 0.5),
+    "first_landmarks": 10,
+    "new_landmarks": 1,
+    "known_landmarks": 10,
+}
+for suffix, slip in (("", 0.02), ("-loose", 0.04)):
+    EXPECTED["positions" + suffix] = ODOMETRY | {
+        "geometry": "planar",
+        "rate": 1.0,
+        "steps": 400,
+        "velocity": (0.0, 0.25, 0.075),
+        "velocity_sigma": (0.0,) * 3,
+        "odometry_sigma": pytest.approx((0.001, slip / np.sqrt(2), 2 * np.sqrt(2) * slip)),
+        "placement": "ring",
+        "landmarks": 15,
+        "ring_radius": pytest.approx(0.25 / 0.075 + 2.5),
+        "sensor": "position",
+        "range": (0.5, 5.0),
+        "position_sigma": 0.1,
+        "first_frame": 1,
+    }
+
 
 @pytest.mark.parametrize("name", EXPECTED)
 def test_built_in_scenarios_hold_the_published_numbers(name):
@@ -116,7 +154,7 @@ def test_built_in_scenarios_hold_the_published_numbers(name):
 
 
 def test_every_built_in_scenario_is_checked_here():
-    assert set(BUILT_IN) - {"room"} == set(EXPECTED)
+    assert set(BUILT_IN) == set(EXPECTED)
 
 
 def test_the_filter_starts_from_the_true_priors():
@@ -129,6 +167,20 @@ def test_the_filter_starts_from_the_true_priors():
     np.testing.assert_array_equal(numbers.camera.intrinsics, [650, 650, 320, 240])
     np.testing.assert_array_equal(numbers.motion_sigma, chosen.acceleration_sigma)
     assert parameters(chosen, jnp.float32).measurement_sigma.dtype == jnp.float32
+
+
+def test_the_filter_is_told_of_the_motion_and_the_sensor_that_it_has():
+    chosen = scenario("positions", inverse_depth=[0.3, 0.1])
+    numbers = parameters(chosen)
+    np.testing.assert_array_equal(numbers.motion_sigma, chosen.odometry_sigma)
+    assert numbers.measurement_sigma == chosen.position_sigma
+    assert (numbers.inverse_depth, numbers.inverse_depth_sigma) == (0.3, 0.1)
+    rig = chosen.rig
+    assert (rig.geometry.name, rig.motion.name, rig.sensor.name) == (
+        "planar",
+        "odometry",
+        "position",
+    )
 
 
 # --- overrides and files ------------------------------------------------------------------------
@@ -196,6 +248,28 @@ def test_a_malformed_override_is_refused(text):
         ({"calibration": "black"}, "calibration is 'black'; known: .*white"),
         ({"true_calibration": "known"}, "true_calibration is 'known'; known: nominal"),
         ({"placement": "ring"}, "ring needs a nominal path that turns"),
+        ({"placement": "room"}, "room is for a spatial geometry and 72 landmarks"),
+        ({"motion": "wheels"}, "motion is 'wheels'; known: velocity, odometry"),
+        ({"sensor": "sonar"}, "sensor is 'sonar'; known: camera, position"),
+        (
+            {"motion": "odometry", "odometry_sigma": [0.1]},
+            "odometry_sigma needs 3 values in a planar world, not 1",
+        ),
+        ({"odometry_sigma": [0.1, -0.1, 0.1]}, "odometry_sigma must not be negative"),
+        ({"odometry_sigma": [0.1, float("nan"), 0.1]}, "odometry_sigma holds nan"),
+        ({"inverse_depth": [0.1]}, "inverse_depth needs a mean and a σ"),
+        ({"inverse_depth": [0.1, 0.0]}, "inverse_depth needs a mean and a σ"),
+        ({"inverse_depth": [float("inf"), 0.1]}, "inverse_depth holds inf"),
+        ({"first_frame": -1}, "first_frame must not be negative"),
+        ({"first_landmarks": -1}, "first_landmarks must not be negative"),
+        ({"new_landmarks": 1.5}, "new_landmarks must be a whole number"),
+        ({"new_landmarks": -1}, "new_landmarks must not be negative"),
+        ({"known_landmarks": -2}, "known_landmarks must not be negative"),
+        ({"range": [5.0, 0.5]}, "range needs a least and a greatest one"),
+        ({"range": [-1.0, 5.0]}, "range must not be negative"),
+        ({"range": 5.0}, "range needs 2 values"),
+        ({"position_sigma": 0.0}, "position_sigma must be positive"),
+        ({"sensor": "position", "calibration": "white"}, "calibration: a position sensor has none"),
     ],
     ids=lambda value: ",".join(value) if isinstance(value, dict) else "",
 )
@@ -394,6 +468,155 @@ def test_true_intrinsics_are_drawn_as_stated():
         else:
             two_sided(np.sum(deltas**2), deltas.size)
             centred(deltas[:, 1:] * deltas[:, :-1])
+
+
+def nominal_steps(poses):
+    """The rotation matrix and the translation of every step of many runs."""
+    T = np.asarray(poses.as_matrix())
+    step = np.linalg.inv(T[:, :-1]) @ T[:, 1:]
+    n = T.shape[-1] - 1
+    return step[..., :n, :n], step[..., :n, n]
+
+
+@pytest.mark.parametrize("name", ["room", "positions"])
+def test_odometry_is_read_with_the_stated_errors_of_a_nominal_motion(name):
+    chosen = scenario(name, steps=30)
+    runs = batch(chosen, 60)
+    nominal = np.array(chosen.velocity) / chosen.rate
+    # The truth goes straight, and then turns, by the nominal motion, in every step of every run.
+    rotations, translations = nominal_steps(runs.poses)
+    n = translations.shape[-1]
+    np.testing.assert_allclose(translations - nominal[:n], 0, atol=1e-12)
+    angles = np.arccos((np.trace(rotations, axis1=-2, axis2=-1) - n + 2) / 2)
+    np.testing.assert_allclose(angles, np.abs(nominal[n:]).max(), rtol=1e-9)
+    assert runs.controls.shape == (60, 30, nominal.size)
+    errors = (np.asarray(runs.controls) - nominal) / np.array(chosen.odometry_sigma)
+    for axis in range(nominal.size):
+        two_sided(np.sum(errors[..., axis] ** 2), errors[..., axis].size)
+        centred(errors[..., axis])
+    # White, and independent between axes.
+    for product in (errors[:, 1:] * errors[:, :-1], errors * np.roll(errors, 1, axis=-1)):
+        centred(product / product.std())
+
+
+def test_seconds_are_the_control_of_a_constant_velocity():
+    chosen = scenario("matched", steps=4, rate=20)
+    np.testing.assert_allclose(batch(chosen, 2).controls, np.full((2, 4), 0.05), rtol=1e-15)
+
+
+def test_positions_are_measured_in_range_and_with_the_stated_sigma():
+    chosen = scenario("positions", steps=100, first_frame=4)
+    runs = batch(chosen, 10)
+    T, points = np.asarray(runs.poses.as_matrix()), np.asarray(runs.points)
+    away = points[:, None] - T[:, :, None, :2, 2]
+    seen_from = np.einsum("rfji,rflj->rfli", T[..., :2, :2], away)
+    distance = np.linalg.norm(seen_from, axis=-1)
+    in_range = (distance >= 0.5) & (distance <= 5.0)
+    assert in_range[:, :4].any()
+    in_range[:, :4] = False  # before the first frame
+    np.testing.assert_array_equal(runs.visible, in_range)
+    assert in_range.any()
+    assert (seen_from[in_range][:, 1] < 0).any()  # behind, too
+    noise = (np.asarray(runs.measured) - seen_from)[in_range] / 0.1
+    two_sided(np.sum(noise**2), noise.size)
+    centred(noise)
+
+
+# --- the room -----------------------------------------------------------------------------------
+
+
+@cache
+def rooms():
+    """The room with limits on what is measured, and the same runs without."""
+    chosen = scenario("room", steps=60, known_landmarks=14)
+    free = dataclasses.replace(chosen, first_landmarks=0, new_landmarks=0, known_landmarks=0)
+    return chosen, batch(chosen, 3), batch(free, 3)
+
+
+def test_the_room_is_a_cloister_of_72_points_on_two_levels():
+    """Centre 5 m to the left of the start; y down, the camera 0.6 m above the lower level."""
+    _, runs, _ = rooms()
+    points = np.asarray(runs.points)[0] - np.array([-5.0, 0.0, 0.0])
+    assert len(np.unique(points.round(9), axis=0)) == 72
+    heights, count = np.unique(points[:, 1].round(9), return_counts=True)
+    np.testing.assert_allclose(heights, [-0.4, 0.6], atol=1e-9)
+    np.testing.assert_array_equal(count, [36, 36])
+    plane = points[:, [0, 2]]
+    assert np.abs(plane).max() == pytest.approx(6)
+    # Every point is on one of the two squares, and each wall is like the next.
+    assert np.isin(np.abs(plane).max(axis=1).round(9), [4, 6]).all()
+    lower = {tuple(p) for p in plane[points[:, 1] > 0].round(6)}
+    assert lower == {tuple(p) for p in plane[points[:, 1] < 0].round(6)}
+    assert {(-z, x) for x, z in lower} == lower
+    # The camera walks between the squares, around the centre.
+    path = np.asarray(runs.poses.translation())[0] - np.array([-5.0, 0.0, 0.0])
+    np.testing.assert_allclose(path[:, 1], 0, atol=1e-12)
+    assert np.abs(np.linalg.norm(path, axis=1) - 5).max() < 0.2
+    assert np.abs(np.asarray(runs.poses.as_matrix())[0, 0, :3, 2] - [0, 0, 1]).max() == 0
+
+
+def same_landmarks(limited, free):
+    """The limited run's visibility, in the order of the landmarks of the free one."""
+    distance = np.linalg.norm(free.points[:, None] - limited.points[None], axis=-1)
+    order = distance.argmin(axis=1)
+    assert sorted(order) == list(range(len(order)))
+    assert distance.min(axis=1).max() == 0
+    return limited.visible[:, order]
+
+
+@pytest.mark.parametrize("i", range(3))
+def test_no_frame_measures_more_than_its_limits_nor_less_than_it_can(i):
+    chosen, limited, free = rooms()
+    limited, free = (jax.tree.map(lambda x: np.asarray(x[i]), run) for run in (limited, free))
+    for a, b in zip(jax.tree.leaves(limited.poses), jax.tree.leaves(free.poses), strict=True):
+        np.testing.assert_array_equal(a, b)  # a limit changes nothing else of a run
+    used, before = same_landmarks(limited, free), np.zeros(72, bool)
+    counts = []
+    for k, (visible, chosen_now) in enumerate(zip(free.visible, used, strict=True)):
+        assert not (chosen_now & ~visible).any()
+        known, new = chosen_now & before, chosen_now & ~before
+        most_new = chosen.new_landmarks if k else chosen.first_landmarks
+        assert known.sum() == min(chosen.known_landmarks, (visible & before).sum())
+        assert new.sum() == min(most_new, (visible & ~before).sum())
+        counts.append((known.sum(), (visible & before).sum()))
+        before |= new
+    known, could = np.array(counts).T
+    assert (could > known).any()  # the limit was met
+    assert (could[1:] < chosen.known_landmarks).any()  # and fewer were there to be seen
+
+
+def test_the_landmarks_of_a_limited_frame_are_drawn_at_random_and_evenly():
+    """12 that are all visible: 6 are new in frame 0, of which 2 are measured in every later one."""
+    chosen = scenario("matched", steps=3, first_landmarks=6, known_landmarks=2, new_landmarks=1)
+    free = dataclasses.replace(chosen, first_landmarks=0, known_landmarks=0, new_landmarks=0)
+    # Far and nearly still, so that nothing leaves the picture.
+    still = dict(velocity=(0.0,) * 3, velocity_sigma=(0.0,) * 3, acceleration_sigma=(1e-9,) * 3)
+    runs, everything = (batch(dataclasses.replace(s, **still), 400) for s in (chosen, free))
+    runs, everything = (jax.tree.map(np.asarray, r) for r in (runs, everything))
+    assert everything.visible.all()
+    used = np.stack(
+        [
+            same_landmarks(*(jax.tree.map(lambda x, i=i: x[i], r) for r in (runs, everything)))
+            for i in range(400)
+        ]
+    )
+    assert (used[:, 0].sum(axis=1) == 6).all()
+    assert (used[:, 1:].sum(axis=2) == 3).all()
+
+    def evenly(chosen, share):
+        """Is every one of `chosen`, [runs, …], chosen with this probability?"""
+        sigma = np.sqrt(share * (1 - share) / len(chosen))
+        bound = stats.norm.isf(FALSE_ALARM / 2 / chosen[0].size) * sigma
+        assert np.abs(chosen.mean(axis=0) - share).max() < bound
+
+    evenly(used[:, 0], 1 / 2)
+    # Neighbours in the table are not drawn together: 6 of 12 leave 5/11 for the next one.
+    evenly((used[:, 0] & np.roll(used[:, 0], 1, axis=1)), 1 / 2 * 5 / 11)
+    # In frame 1 those of frame 0 are known, and 1 of the 6 others is new.
+    evenly(used[:, 1] & used[:, 0], 1 / 2 * 2 / 6)
+    evenly(used[:, 1] & ~used[:, 0], 1 / 2 * 1 / 6)
+    # Frames draw independently: 2 of 6 in frame 1, and 2 of 7, that one among them, in frame 2.
+    evenly(used[:, 0] & used[:, 1] & used[:, 2], 1 / 2 * 2 / 6 * 2 / 7)
 
 
 # --- features -----------------------------------------------------------------------------------

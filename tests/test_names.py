@@ -1,0 +1,53 @@
+"""Tests of the names that users give: of filters, of parametrizations, and what is refused."""
+
+import pytest
+
+from jaxslam.filters import FILTERS, make_filters
+from jaxslam.geometry import PLANAR
+from jaxslam.landmarks import LANDMARKS
+from jaxslam.names import chosen
+from jaxslam.rig import Rig
+
+COLOURS = {"red": 1, "green": 2, "blue": 3}
+
+
+def test_chosen_keeps_the_order_of_the_names():
+    assert list(chosen("colour", ["blue", "red"], COLOURS).items()) == [("blue", 3), ("red", 1)]
+    assert list(chosen("colour", iter(["green"]), COLOURS)) == ["green"]
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        ([], r"^colour needs at least one name; known: red, green, blue$"),
+        (["gren"], r"^unknown colour 'gren' \(did you mean green\?\); known: red, green, blue$"),
+        (["red", "xyzzy"], r"^unknown colour 'xyzzy'; known: red, green, blue$"),
+    ],
+)
+def test_a_name_that_is_not_known_is_refused_with_those_that_are(names, message):
+    with pytest.raises(ValueError, match=message):
+        chosen("colour", names, COLOURS)
+
+
+def test_filters_are_made_of_every_pair_of_names():
+    made = make_filters(Rig(PLANAR), FILTERS, LANDMARKS, "known")
+    assert list(made) == [f"{name}/{landmark}" for name in FILTERS for landmark in LANDMARKS]
+    for name, slam in made.items():
+        assert name == f"{slam.model.frame.name}/{slam.model.landmark.name}"
+        assert slam.calibration == "known"
+        assert slam.compose_first == (slam.model.frame.name == "world")
+
+
+@pytest.mark.parametrize(
+    ("filters", "landmarks", "calibration", "message"),
+    [
+        (["wrold"], ["cartesian"], "known", r"filters 'wrold' \(did you mean world\?\); known: "),
+        (["world"], ["cartesain"], "known", r"landmarks 'cartesain' \(did you mean cartesian\?\)"),
+        ([], ["cartesian"], "known", "filters needs at least one name; known: robocentric, world"),
+        (["world"], [], "known", "landmarks needs at least one name; known: inverse_scaling"),
+        (["world"], ["cartesian"], "maybe", "unknown calibration 'maybe'; known: white, consider"),
+    ],
+)
+def test_filters_of_unknown_names_are_refused(filters, landmarks, calibration, message):
+    with pytest.raises(ValueError, match=message):
+        make_filters(Rig(PLANAR), filters, landmarks, calibration)
