@@ -15,7 +15,8 @@ from cases import each_geometry, few_landmarks, named, pose, quick_jit
 
 from jaxslam.camera import Camera
 from jaxslam.filters import Parameters, SlamModel
-from jaxslam.filters.slam import ROBOCENTRIC, WORLD, Context, Core
+from jaxslam.filters.frames import ROBOCENTRIC, WORLD
+from jaxslam.filters.slam import Context, Core
 from jaxslam.geometry import PLANAR, SPATIAL, difference, retract
 from jaxslam.rig import Rig
 

@@ -29,7 +29,8 @@ from jaxslam.filters import (
     State,
     ekf,
 )
-from jaxslam.filters.slam import ROBOCENTRIC, WORLD, Context, Core
+from jaxslam.filters.frames import KEYFRAME, ROBOCENTRIC, WORLD
+from jaxslam.filters.slam import Context, Core
 from jaxslam.geometry import PLANAR, SPATIAL, joined, retract
 from jaxslam.landmarks import (
     INVERSE_DEPTH_TO_CARTESIAN,
@@ -46,7 +47,7 @@ DT = 0.1
 
 @cache
 def composer(geometry, landmark, frame):
-    """`(pose, velocity, acceleration, landmark) → the same after the motion`, no covariance."""
+    """`(T_BC, velocity, acceleration, landmark) → the same after the motion`, no covariance."""
     model = SlamModel(Rig(geometry), landmark, frame)
     context = Context(None, jnp.asarray(DT))
 
@@ -56,7 +57,7 @@ def composer(geometry, landmark, frame):
         if frame.moves_landmarks:
             view = model.view(core, context)
             parameters = model.compose_landmark(view, parameters, context)
-        return frame.pose(moved.pose), moved.velocity, parameters
+        return frame.camera_pose(moved.pose), moved.velocity, parameters
 
     return quick_jit(compose)
 
@@ -112,11 +113,11 @@ def test_both_frames_speak_of_the_same_camera_and_the_same_point(geometry, landm
     velocity, acceleration = rng.normal(size=(2, geometry.tangent_dim))
     X_C = landmark.transform(T_BC.inverse(), X_B)
     robocentric, world = (composer(geometry, landmark, f) for f in (ROBOCENTRIC, WORLD))
-    T_CB, v, X_C = robocentric(T_BC.inverse(), velocity, acceleration, X_C)
+    by_camera, v, X_C = robocentric(T_BC, velocity, acceleration, X_C)
     T_BC, w, X_B = world(T_BC, velocity, acceleration, X_B)
     np.testing.assert_allclose(v, velocity + acceleration * DT, rtol=1e-15)
     np.testing.assert_array_equal(v, w)
-    np.testing.assert_allclose(T_CB.inverse().as_matrix(), T_BC.as_matrix(), atol=1e-14)
+    np.testing.assert_allclose(by_camera.as_matrix(), T_BC.as_matrix(), atol=1e-14)
     np.testing.assert_allclose(
         T_BC @ euclidean(landmark, X_C), euclidean(landmark, X_B), rtol=1e-12, atol=1e-12
     )
@@ -476,7 +477,7 @@ def test_the_start_is_exact_in_the_pose_and_empty_in_the_map():
     assert state.core_dim == 3 + 3 + 3 + 2
 
 
-@pytest.mark.parametrize("kind", list(FILTERS))
+@pytest.mark.parametrize("kind", ["robocentric", "world"])
 def test_a_step_leaves_no_acceleration_and_no_white_calibration_behind(kind):
     case = tight()
     slam = case.filter(kind, "inverse_scaling", "white")
@@ -507,35 +508,32 @@ def test_an_unknown_calibration_is_refused_by_name():
     assert all(name in str(error.value) for name in CALIBRATIONS)
 
 
-@pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD], ids=named)
+@pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD, KEYFRAME], ids=named)
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_a_frame_holds_every_pose_and_gives_it_back(geometry, frame):
     T = pose(geometry, 3, scale=1.0)
-    again = frame.pose(frame.hold(frame.pose_from_camera(T)))
-    np.testing.assert_allclose(
-        frame.pose_from_camera(again).as_matrix(), T.as_matrix(), rtol=0, atol=1e-15
-    )
+    again = frame.camera_pose(frame.hold(T))
+    np.testing.assert_allclose(again.as_matrix(), T.as_matrix(), rtol=0, atol=1e-15)
 
 
-@pytest.mark.parametrize("kind", list(FILTERS))
+@pytest.mark.parametrize("kind", ["robocentric", "world"])
 def test_pose_error_is_zero_at_the_truth_and_refers_to_the_covariance(kind):
     case = tight()
     T_BC, delta = pose(PLANAR, 4), np.array([0.01, -0.02, 0.03])
     slam = case.filter(kind, "inverse_scaling")
-    frame = slam.model.frame
     state = slam.start(case.parameters(), 1, jnp.zeros(3), jnp.full(3, 0.1))
-    held = frame.pose_from_camera(T_BC)
-    state = replace(state, core=replace(state.core, pose=frame.hold(held)))
+    held = slam.model.frame.hold(T_BC)
+    state = replace(state, core=replace(state.core, pose=held))
     state = ekf.augment(state, 0, jnp.diag(jnp.array([1.0, 2.0, 3.0])))
     error, covariance = slam.pose_error(state, T_BC)
     np.testing.assert_allclose(error, np.zeros(3), atol=1e-15)
-    np.testing.assert_array_equal(covariance, np.diag([1.0, 2.0, 3.0]))
+    np.testing.assert_allclose(covariance, np.diag([1.0, 2.0, 3.0]), rtol=1e-14)
     # The truth is the estimate perturbed by δ: as a whole and on the right where the camera is
     # the base; along the axes of B, and turned, where B is.
     if kind == "robocentric":
-        truth = held @ PLANAR.group.exp(jnp.asarray(delta))
+        truth = (held @ PLANAR.group.exp(jnp.asarray(delta))).inverse()
     else:
-        turn = type(held.rotation()).from_radians(delta[2])
-        truth = joined(held.rotation() @ turn, held.translation() + delta[:2])
-    error, _ = slam.pose_error(state, frame.pose_from_camera(truth))
+        turn = type(held.rotation).from_radians(delta[2])
+        truth = joined(held.rotation @ turn, held.translation + delta[:2])
+    error, _ = slam.pose_error(state, truth)
     np.testing.assert_allclose(error, delta, rtol=1e-10)

@@ -42,10 +42,10 @@ class Core:
     noise: Float[Array, " t"]
     """What drives this step's motion: the acceleration a (P10), or the odometry's error; zero
     before `predict` and after composition."""
-    anchors: SplitPose | None
-    """T_AF of the cameras F in which landmarks are written; a batch, or None."""
     calibration: Float[Array, " k"]
     """Error of the intrinsics (P15); empty where the calibration is known."""
+    anchors: SplitPose | None = None
+    """T_AF of the cameras F in which landmarks are written; a batch, or None."""
 
 
 @jax.tree_util.register_dataclass
@@ -92,8 +92,8 @@ class View:
 
     map_from_camera: Pose
     """T_AC(k), the current camera in the map frame."""
-    anchors: SplitPose | None
     calibration: Float[Array, " k"]
+    anchors: SplitPose | None = None
 
     def camera(self, context: Context) -> Camera:
         """The camera with the calibration error of this step."""
@@ -126,7 +126,7 @@ class SlamModel:
         """All that a landmark depends on."""
         step = self._displacement(core, context)
         T_AC = self.frame.map_from_camera(core.pose, step)
-        return View(T_AC, core.anchors, core.calibration)
+        return View(T_AC, core.calibration, core.anchors)
 
     def compose_core(self, core: Core, context: Context) -> Core:
         """P18, P19. The noise has been used: it is marginalised."""
@@ -266,8 +266,8 @@ class SlamFilter:
             pose=held,
             velocity=jnp.asarray(velocity, dtype)[:v],
             noise=jnp.zeros(t, dtype),
-            anchors=self._no_anchors(capacity, dtype),
             calibration=jnp.zeros(0 if self.calibration == "known" else 2 * p, dtype),
+            anchors=self._no_anchors(capacity, dtype),
         )
         # An empty slot holds a point straight ahead: finite in every formula.
         ahead = jnp.zeros(p + 1, dtype).at[-1].set(1.0)
@@ -532,5 +532,7 @@ def _free_anchor(state: State) -> Int[Array, ""]:
 
 
 def _calibration(state: State) -> slice:
-    """Where the calibration's error is in the tangent of the core: at its end."""
-    return slice(state.core_dim - state.core.calibration.size, state.core_dim)
+    """Where the calibration's error is in the tangent of the core."""
+    core = state.core
+    start = tangent_dim((core.pose, core.velocity, core.noise))
+    return slice(start, start + core.calibration.size)
