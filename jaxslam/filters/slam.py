@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.camera import Camera
 from jaxslam.filters import ekf
+from jaxslam.filters.initialisation import UNDELAYED, Initialisation
 from jaxslam.filters.state import Features, Innovation, State
 from jaxslam.geometry import Geometry, Pose, SplitPose, difference, identity
 from jaxslam.landmarks.parametrization import Parametrization
@@ -214,12 +215,14 @@ class SlamFilter:
     """An EKF for monocular SLAM: static configuration; its functions are pure.
 
     One frame is `predict`, `update`, `compose`, `initialise`, in `step`. The motion is composed
-    after the update, as the paper has it, or before (`compose_first`).
+    after the update, as the paper has it, or before (`compose_first`). How landmarks enter the
+    map is the `initialisation`'s to say; it builds on `correct` and `insert`.
     """
 
     model: SlamModel
     calibration: str = "white"
     compose_first: bool = False
+    initialisation: Initialisation = UNDELAYED
 
     def __post_init__(self) -> None:
         if self.calibration not in CALIBRATIONS:
@@ -256,13 +259,15 @@ class SlamFilter:
         ahead = jnp.zeros(p + 1, dtype).at[-1].set(1.0)
         focal = parameters.camera.focal[0]
         empty = landmark.initialise(ahead, parameters.inverse_depth, focal)
+        slots = self.initialisation.slots(capacity)
         state = State(
             core=core,
-            landmarks=jnp.tile(empty, (capacity, 1)),
-            active=jnp.zeros(capacity, bool),
+            landmarks=jnp.tile(empty, (slots, 1)),
+            active=jnp.zeros(slots, bool),
             covariance=jnp.zeros((0, 0), dtype),
+            memory=self.initialisation.memory(capacity, dtype),
         )
-        n = state.core_dim + capacity * empty.size
+        n = state.core_dim + state.landmarks.size
         state = replace(state, covariance=jnp.zeros((n, n), dtype))
         state = ekf.augment(state, t, jnp.diag(jnp.asarray(velocity_sigma, dtype)[:v] ** 2))
         return state if self.calibration == "white" else self._with_calibration(state, parameters)
@@ -281,8 +286,21 @@ class SlamFilter:
         self, state: State, parameters: Parameters, control: Array, features: Features
     ) -> tuple[State, Innovation]:
         """Correct by the features seen (P16, P17)."""
+        return self.initialisation.update(self, state, parameters, control, features)
+
+    def correct(
+        self,
+        state: State,
+        parameters: Parameters,
+        control: Array,
+        features: Features,
+        share: Float[Array, " m"] | None = None,
+    ) -> tuple[State, Innovation]:
+        """The Kalman update by features of slots; with a share ρ of each, by R/ρ."""
         context = self._context(parameters, control)
         noise = self._noise(parameters)
+        if share is not None:
+            noise = noise / jnp.where(share > 0, share, 1.0)[:, None, None]
         return ekf.update(self.model, state, features, noise, context, self._considered(state))
 
     def update_mean(
@@ -318,10 +336,21 @@ class SlamFilter:
         return ekf.convert(self.model, state, _composed(parameters))
 
     def initialise(self, state: State, parameters: Parameters, features: Features) -> State:
-        """Insert new landmarks seen from the current camera (P22–P26)."""
-        hidden = self.model.rig.sensor.hidden
-        mean, sigma = parameters.inverse_depth, parameters.inverse_depth_sigma
-        prior = (jnp.tile(mean, hidden), jnp.tile(sigma, hidden))
+        """Begin new landmarks seen from the current camera (P22–P26)."""
+        return self.initialisation.initialise(self, state, parameters, features)
+
+    def insert(
+        self,
+        state: State,
+        parameters: Parameters,
+        features: Features,
+        prior: tuple[Float[Array, "m q"], Float[Array, "m q"]] | None = None,
+    ) -> State:
+        """Insert Gaussians into slots; 1/z has the parameters' prior, or one for each slot."""
+        if prior is None:
+            hidden = self.model.rig.sensor.hidden
+            mean, sigma = parameters.inverse_depth, parameters.inverse_depth_sigma
+            prior = (jnp.tile(mean, hidden), jnp.tile(sigma, hidden))
         noise, context = self._noise(parameters), _composed(parameters)
         return ekf.initialise(self.model, state, features, noise, prior, context)
 
@@ -363,12 +392,16 @@ class SlamFilter:
         """T_BC and its covariance in the right tangent: position in camera axes, orientation."""
         return ekf.core_covariance(self.model.camera_pose, state)
 
+    def reported(self, state: State) -> State:
+        """The state with one slot a landmark, whatever the initialisation keeps of it."""
+        return self.initialisation.reported(state)
+
     def landmarks_in_camera(
         self, state: State, parameters: Parameters, slots: Array
     ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
         """The sensor's chart of landmarks, (x/z, y/z, 1/z) of a camera, with covariances."""
         return ekf.landmark_covariance(
-            self._composed_view(parameters), self.model.chart, state, slots
+            self._composed_view(parameters), self.model.chart, self.reported(state), slots
         )
 
     def landmarks_from_above(
@@ -386,7 +419,8 @@ class SlamFilter:
             x, z = (rotation @ point)[jnp.array([0, -1])]
             return jnp.stack([jnp.atan2(x, z), omega / jnp.hypot(x, z)])
 
-        return ekf.landmark_covariance(self._composed_view(parameters), above, state, slots)
+        view = self._composed_view(parameters)
+        return ekf.landmark_covariance(view, above, self.reported(state), slots)
 
     def landmarks_in_world(
         self, state: State, parameters: Parameters, slots: Array
@@ -405,7 +439,7 @@ class SlamFilter:
             seen, omega = self.model.camera_point(camera_view, landmark)
             return T_BC @ (seen / omega)
 
-        return ekf.landmark_covariance(view, point, state, slots)
+        return ekf.landmark_covariance(view, point, self.reported(state), slots)
 
     def predicted_camera(
         self, state: State, parameters: Parameters, control: Array, slots: Array
