@@ -2,7 +2,8 @@
 
     python benchmarks/initialisation.py --runs 200
 
-Runs undelayed and delayed filters on the same worlds, writes one JSON file and prints a table.
+Runs undelayed and delayed filters on the same worlds, prints a table, and writes one JSON file;
+scenarios that are in the file and are not measured again stay there.
 `near` is the world of `matched` with points 0.5–5 m away, the range of MonoSLAM's particles, and
 a camera at 0.4 m/s; in the others points lie beyond it.
 """
@@ -75,7 +76,8 @@ def measure(name: str, options: Options) -> Iterator[tuple[str, dict]]:
         )
         run = jax.jit(jax.vmap(partial(filter_run, filters[pair], most, prior)))
         records = _concatenated(run(part) for part in _parts(runs, options.chunk))
-        reference = records["information"] if reference is None else reference
+        if reference is None:
+            reference = records["information"]
         yield pair, summarise(records, reference)
 
 
@@ -83,7 +85,7 @@ def filter_run(slam_filter: SlamFilter, most: Sightings, prior: Prior, run: Run)
     """One filter on one run: records of every step, and its landmarks at the last."""
     parameters = prior.parameters
     first, seen, new = features(run, most)
-    state = slam_filter.start(parameters, most.landmarks, prior.velocity, prior.velocity_sigma)
+    state = slam_filter.start(parameters, int(most.landmarks), prior.velocity, prior.velocity_sigma)
     state = slam_filter.first(state, parameters, first)
     settled = slam_filter.initialisation.settled
 
@@ -188,8 +190,8 @@ def _parts(runs: Run, size: int) -> Iterator[Run]:
 
 
 def _concatenated(parts: Iterator[dict]) -> dict[str, np.ndarray]:
-    parts = [jax.device_get(part) for part in parts]
-    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    fetched = [jax.device_get(part) for part in parts]
+    return {key: np.concatenate([part[key] for part in fetched]) for key in fetched[0]}
 
 
 HEADER = (
@@ -220,15 +222,16 @@ def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     jax.config.update("jax_enable_x64", True)
     print(HEADER)
-    results: dict[str, dict] = {}
-    for name in options.scenarios:
-        for pair, numbers in measure(name, options):
-            results.setdefault(name, {})[pair] = numbers
-            print(line(name, pair, numbers), flush=True)
-    content = {"runs": options.runs, "seed": options.seed, "scenarios": results}
+    results = json.loads(options.out.read_text()) if options.out.exists() else {}
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    with write_atomically(options.out) as path:
-        path.write_text(json.dumps(content, indent=1) + "\n")
+    for name in options.scenarios:
+        filters: dict[str, dict] = {}
+        results[name] = {"runs": options.runs, "seed": options.seed, "filters": filters}
+        for pair, numbers in measure(name, options):
+            filters[pair] = numbers
+            print(line(name, pair, numbers), flush=True)
+            with write_atomically(options.out) as path:
+                path.write_text(json.dumps(results, indent=1) + "\n")
 
 
 if __name__ == "__main__":

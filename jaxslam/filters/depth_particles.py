@@ -57,7 +57,8 @@ class DepthParticles:
     farthest: float = 5.0
     """The range of distances along a ray, m."""
     count: int = 100
-    """Particles of a ray."""
+    """Particles of a ray. Where a step of the camera moves the pixels of neighbouring ones apart by
+    many σ, none may explain a measurement between them."""
     agreement: float = 0.3
     """A ray becomes a point where σ_d / mean_d is below this."""
     lost: float = 25.0
