@@ -13,7 +13,7 @@ import tyro
 from jaxslam.consistency import CHUNK, DTYPES, FolderStore, Study, monte_carlo, summarise, table
 from jaxslam.consistency.montecarlo import check_sizes
 from jaxslam.files import write_atomically
-from jaxslam.filters import CALIBRATIONS, FILTERS, SlamFilter, make_filters
+from jaxslam.filters import CALIBRATIONS, FILTERS, MODIFIERS, SlamFilter, make_filters
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.simulation.scenario import BUILT_IN, Scenario, parse_override, scenario
 
@@ -37,7 +37,12 @@ class ConsistencyOptions:
         tyro.conf.arg(metavar="NAME …", help=f"Parametrizations: {', '.join(LANDMARKS)}."),
     ] = ("inverse_scaling", "inverse_depth")
     filters: Annotated[
-        tuple[str, ...], tyro.conf.arg(metavar="NAME …", help=f"Filters: {', '.join(FILTERS)}.")
+        tuple[str, ...],
+        tyro.conf.arg(
+            metavar="NAME …",
+            help=f"Filters: {', '.join(FILTERS)}; each may be modified, as in world+particles: "
+            f"{', '.join(MODIFIERS)}, with a number for the greatest depth, m.",
+        ),
     ] = ("robocentric",)
     calibration: Annotated[
         str | None,

@@ -182,7 +182,7 @@ def _filter_batch(
         "points": run.points,
         "landmarks": landmarks,
         "landmarks_covariance": covariance,
-        "active": state.active,
+        "active": slam_filter.reported(state).active,
     }
 
 
@@ -237,13 +237,14 @@ def _camera_error(estimate: Pose, truth: Pose) -> Array:
 
 
 def _landmark_nees(slam_filter, state, parameters, seen, T_BC, points):
-    """Mean over the landmarks seen, and how many; where none is seen, 0 of 0."""
+    """Mean over the landmarks seen that are in the map, and how many; of none, 0 of 0."""
+    counted = seen.valid & slam_filter.reported(state).active[seen.slots]
     truth = jax.vmap(T_BC.inverse().apply)(points[seen.slots])
     truth = jax.vmap(slam_filter.model.rig.sensor.chart)(truth, jnp.ones_like(truth[:, 0]))
     chart, covariance = slam_filter.landmarks_in_camera(state, parameters, seen.slots)
     nees = jax.vmap(normalised_squared)(truth - chart, covariance)
-    count = jnp.sum(seen.valid)
-    total = jnp.sum(jnp.where(seen.valid, nees, 0.0))
+    count = jnp.sum(counted)
+    total = jnp.sum(jnp.where(counted, nees, 0.0))
     return total / jnp.maximum(count, 1), count.astype(nees.dtype)
 
 

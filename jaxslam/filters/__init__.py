@@ -4,7 +4,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from jaxslam.filters import information
+from jaxslam.filters.depth_particles import DepthParticles, with_depth_particles
 from jaxslam.filters.frames import KEYFRAME, ROBOCENTRIC, WORLD
+from jaxslam.filters.gaussian_sum import GaussianSum, with_rays
 from jaxslam.filters.slam import (
     CALIBRATIONS,
     Parameters,
@@ -58,24 +60,50 @@ FILTERS: dict[str, Callable[[Rig, Parametrization, str], SlamFilter]] = {
 }
 
 
+MODIFIERS: dict[str, Callable[[SlamFilter, int | None], SlamFilter]] = {
+    "particles": with_depth_particles,
+    "rays": with_rays,
+}
+"""What `+name` behind a filter's name makes of it, with the number that may follow the name:
+the greatest depth of a delayed initialisation, m."""
+
+
 def make_filters(
     rig: Rig, filters: Iterable[str], landmarks: Iterable[str], calibration: str
 ) -> dict[str, SlamFilter]:
     """Every named filter on every named parametrization, keyed `filter/landmarks`.
 
-    Raises ValueError for a name that is not known.
+    A filter may be modified: `world+particles`, `robocentric+rays100`. Raises ValueError for a
+    name that is not known, and for a filter and a parametrization that do not go together.
     """
+    filters = list(filters)
+    chosen("filters", [name.partition("+")[0] for name in filters], FILTERS)
     return {
-        f"{name}/{landmark.name}": make(rig, landmark, calibration)
-        for name, make in chosen("filters", filters, FILTERS).items()
+        f"{name}/{landmark.name}": make_filter(rig, name, landmark, calibration)
+        for name in filters
         for landmark in chosen("landmarks", landmarks, LANDMARKS).values()
     }
+
+
+def make_filter(rig: Rig, name: str, landmark: Parametrization, calibration: str) -> SlamFilter:
+    """One filter by its name, with its modifiers. Raises ValueError."""
+    base, *modifiers = name.split("+")
+    made = chosen("filters", [base], FILTERS)[base](rig, landmark, calibration)
+    for modifier in modifiers:
+        word = modifier.rstrip("0123456789")
+        number = modifier[len(word) :]
+        modify = chosen("modifiers", [word], MODIFIERS)[word]
+        made = modify(made, int(number) if number else None)
+    return made
 
 
 __all__ = [
     "CALIBRATIONS",
     "FILTERS",
+    "MODIFIERS",
+    "DepthParticles",
     "Features",
+    "GaussianSum",
     "Innovation",
     "Parameters",
     "SlamFilter",
@@ -84,6 +112,7 @@ __all__ = [
     "information_filter",
     "inverse_depth_prior",
     "keyframe",
+    "make_filter",
     "make_filters",
     "robocentric",
     "world",

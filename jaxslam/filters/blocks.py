@@ -123,18 +123,18 @@ def new_landmarks(
     state: Any,
     features: Features,
     noise: Float[Array, "p p"],
-    prior: tuple[Float[Array, " q"], Float[Array, " q"]],
+    prior: tuple[Float[Array, "*m q"], Float[Array, "*m q"]],
     context: Any,
 ) -> tuple[Float[Array, "m d"], Blocks, Float[Array, "m d d"]]:
     """Landmarks of first measurements (P22–P26): values, J by the view, and `J diag(R, σ²) Jᵀ`.
 
     `by_landmark` is the identity: the error of landmark i is J of the core's and its own.
     """
-    mean, sigma = prior
+    mean, sigma = (jnp.broadcast_to(x, (features.slots.size, x.shape[-1])) for x in prior)
     view = model.view(state.core, context)
     view_by_core = jacobian(lambda core: model.view(core, context), state.core)
 
-    def one(measured):
+    def one(measured, mean, sigma):
         def landmark(delta, measured, hidden):
             value = model.initialise(nudge(view, delta), measured, hidden, context)
             return value, value
@@ -145,7 +145,7 @@ def new_landmarks(
         own = J_measured @ noise @ J_measured.T + (J_hidden * sigma**2) @ J_hidden.T
         return value, J_view, own
 
-    new, J_view, own = jax.vmap(one)(features.measured)
+    new, J_view, own = jax.vmap(one)(features.measured, mean, sigma)
     identity = jnp.broadcast_to(jnp.eye(new.shape[1], dtype=new.dtype), own.shape)
     return new, Blocks(view_by_core, J_view, identity), own
 

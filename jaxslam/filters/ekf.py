@@ -68,15 +68,15 @@ def update(
     model: Model,
     state: State,
     features: Features,
-    noise: Float[Array, "p p"],
+    noise: Float[Array, "*m p p"],
     context: Any,
     considered: slice = slice(0, 0),
 ) -> tuple[State, Innovation]:
     """The Kalman update by all features at once (P16, P17), in Joseph form.
 
-    `noise` is the covariance R of one measurement. A feature that is not valid, not in the map
-    or predicted behind the camera changes nothing. The `considered` numbers of the core count
-    with their covariance but have no gain (Schmidt, 1966).
+    `noise` is the covariance R of one measurement, or one for each feature. A feature that is not
+    valid, not in the map or predicted behind the camera changes nothing. The `considered` numbers
+    of the core count with their covariance but have no gain (Schmidt, 1966).
     """
     predicted, residual, used, blocks = residuals(model, state, features, context)
     H = placed(blocks, features.slots, state.active.size)
@@ -180,14 +180,15 @@ def initialise(
     state: State,
     features: Features,
     noise: Float[Array, "p p"],
-    prior: tuple[Float[Array, " q"], Float[Array, " q"]],
+    prior: tuple[Float[Array, "*m q"], Float[Array, "*m q"]],
     context: Any,
 ) -> State:
     """Insert landmarks from their first measurement, `P ← J diag(P, R, σ²) Jᵀ` (P22–P26).
 
-    `prior` is the mean and σ of what one measurement hides. All new landmarks share one core, so
-    what is uncertain there (the pose of a world-centric filter, the calibration) correlates them
-    with it and with one another. Whatever was in their slots must have been removed.
+    `prior` is the mean and σ of what one measurement hides, for all or one for each. All new
+    landmarks share one core, so what is uncertain there (the pose of a world-centric filter, the
+    calibration) correlates them with it and with one another. Whatever was in their slots must
+    have been removed.
     """
     if features.slots.size == 0:
         return state
@@ -264,7 +265,7 @@ def core_covariance(function: Callable[[Any], Any], state: State) -> tuple[Any, 
 
 def _noise_matrix(noise, used):
     """Block-diagonal R, with an identity block where a feature is not used."""
-    m, p = used.size, noise.shape[0]
+    m, p = used.size, noise.shape[-1]
     blocks = jnp.where(used[:, None, None], noise, jnp.eye(p, dtype=noise.dtype))
     R = jnp.zeros((m, p, m, p), noise.dtype)
     return R.at[jnp.arange(m), :, jnp.arange(m), :].set(blocks).reshape(m * p, m * p)

@@ -60,6 +60,7 @@ class InformationState:
     landmarks: Float[Array, "capacity d"]
     active: Bool[Array, " capacity"]
     information: Float[Array, "n n"]
+    memory: Any = ()
 
     @property
     def core_dim(self) -> int:

@@ -19,6 +19,7 @@ from jaxslam.filters import ekf
 from jaxslam.filters.blocks import Change
 from jaxslam.filters.engine import Engine
 from jaxslam.filters.frames import Frame, KeyframePose, keyframe_due
+from jaxslam.filters.initialisation import UNDELAYED, Initialisation
 from jaxslam.filters.state import Features, Innovation, State
 from jaxslam.geometry import Geometry, Pose, SplitPose, difference, identity, tangent_dim
 from jaxslam.landmarks.parametrization import Parametrization
@@ -226,8 +227,9 @@ class SlamFilter:
     """An EKF for monocular SLAM: static configuration; its functions are pure.
 
     One frame is `predict`, `update`, `compose`, `initialise`, in `step`. The motion is composed
-    after the update, as the paper has it, or before (`compose_first`). The states are those of
-    the engine: `State`, or `InformationState`.
+    after the update, as the paper has it, or before (`compose_first`). How landmarks enter the
+    map is the `initialisation`'s to say; it builds on `correct` and `insert`. The states are
+    those of the engine: `State`, or `InformationState`.
     """
 
     model: SlamModel
@@ -235,6 +237,7 @@ class SlamFilter:
     compose_first: bool = False
     engine: Engine = ekf
     """The form of the filter: `ekf`, on the covariance, or `information`, on its inverse."""
+    initialisation: Initialisation = UNDELAYED
 
     def __post_init__(self) -> None:
         if self.calibration not in CALIBRATIONS:
@@ -273,7 +276,9 @@ class SlamFilter:
         ahead = jnp.zeros(p + 1, dtype).at[-1].set(1.0)
         focal = parameters.camera.focal[0]
         empty = landmark.initialise(ahead, parameters.inverse_depth, focal)
-        state = self.engine.empty(core, jnp.tile(empty, (capacity, 1)))
+        slots = self.initialisation.slots(capacity)
+        state = self.engine.empty(core, jnp.tile(empty, (slots, 1)))
+        state = replace(state, memory=self.initialisation.memory(capacity, dtype))
         state = self._known(state, 0, tangent_dim(held))
         covariance = jnp.diag(jnp.asarray(velocity_sigma, dtype)[:v] ** 2)
         state = self.engine.augment(state, tangent_dim(held), covariance)
@@ -293,8 +298,21 @@ class SlamFilter:
         self, state: State, parameters: Parameters, control: Array, features: Features
     ) -> tuple[State, Innovation]:
         """Correct by the features seen (P16, P17)."""
+        return self.initialisation.update(self, state, parameters, control, features)
+
+    def correct(
+        self,
+        state: State,
+        parameters: Parameters,
+        control: Array,
+        features: Features,
+        share: Float[Array, " m"] | None = None,
+    ) -> tuple[State, Innovation]:
+        """The Kalman update by features of slots; with a share ρ of each, by R/ρ."""
         context = self._context(parameters, control)
         noise = self._noise(parameters)
+        if share is not None:
+            noise = noise / jnp.where(share > 0, share, 1.0)[:, None, None]
         return self.engine.update(
             self.model, state, features, noise, context, self._considered(state)
         )
@@ -352,10 +370,21 @@ class SlamFilter:
         return self.engine.remove(state, gone)
 
     def initialise(self, state: State, parameters: Parameters, features: Features) -> State:
-        """Insert new landmarks seen from the current camera (P22–P26)."""
-        hidden = self.model.rig.sensor.hidden
-        mean, sigma = parameters.inverse_depth, parameters.inverse_depth_sigma
-        prior = (jnp.tile(mean, hidden), jnp.tile(sigma, hidden))
+        """Begin new landmarks seen from the current camera (P22–P26)."""
+        return self.initialisation.initialise(self, state, parameters, features)
+
+    def insert(
+        self,
+        state: State,
+        parameters: Parameters,
+        features: Features,
+        prior: tuple[Float[Array, "m q"], Float[Array, "m q"]] | None = None,
+    ) -> State:
+        """Insert Gaussians into slots; 1/z has the parameters' prior, or one for each slot."""
+        if prior is None:
+            hidden = self.model.rig.sensor.hidden
+            mean, sigma = parameters.inverse_depth, parameters.inverse_depth_sigma
+            prior = (jnp.tile(mean, hidden), jnp.tile(sigma, hidden))
         noise, context = self._noise(parameters), _composed(parameters)
         if self.model.landmark.anchored:
             anchor = _free_anchor(state)
@@ -405,12 +434,16 @@ class SlamFilter:
         """T_BC and its covariance in the right tangent: position in camera axes, orientation."""
         return self.engine.core_covariance(self.model.camera_pose, state)
 
+    def reported(self, state: State) -> State:
+        """The state with one slot a landmark, whatever the initialisation keeps of it."""
+        return self.initialisation.reported(state)
+
     def landmarks_in_camera(
         self, state: State, parameters: Parameters, slots: Array
     ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
         """The sensor's chart of landmarks, (x/z, y/z, 1/z) of a camera, with covariances."""
         return self.engine.landmark_covariance(
-            self._composed_view(parameters), self.model.chart, state, slots
+            self._composed_view(parameters), self.model.chart, self.reported(state), slots
         )
 
     def landmarks_from_above(
@@ -428,7 +461,8 @@ class SlamFilter:
             x, z = (rotation @ point)[jnp.array([0, -1])]
             return jnp.stack([jnp.atan2(x, z), omega / jnp.hypot(x, z)])
 
-        return self.engine.landmark_covariance(self._composed_view(parameters), above, state, slots)
+        view = self._composed_view(parameters)
+        return self.engine.landmark_covariance(view, above, self.reported(state), slots)
 
     def landmarks_in_world(
         self, state: State, parameters: Parameters, slots: Array
@@ -437,7 +471,8 @@ class SlamFilter:
 
         Not finite for a landmark at infinity; far from Gaussian for one of unknown depth.
         """
-        return self.engine.landmark_covariance(*self._world_point(parameters), state, slots)
+        view, point = self._world_point(parameters)
+        return self.engine.landmark_covariance(view, point, self.reported(state), slots)
 
     def landmark_samples(
         self, state: State, parameters: Parameters, slots: Array, key: Array, count: int = 1000
@@ -449,6 +484,7 @@ class SlamFilter:
         size = state.core_dim + state.landmarks.shape[1]
         normal = jax.random.normal(key, (slots.size, count, size), state.covariance.dtype)
         view, point = self._world_point(parameters)
+        state = self.reported(state)
         return jax.vmap(lambda slot, draws: ekf.landmark_samples(view, point, state, slot, draws))(
             slots, normal
         )

@@ -26,6 +26,8 @@ class State:
     landmarks: Float[Array, "capacity d"]
     active: Bool[Array, " capacity"]
     covariance: Float[Array, "n n"]
+    memory: Any = ()
+    """What an `Initialisation` remembers of landmarks beside the Gaussian: any pytree."""
 
     @property
     def core_dim(self) -> int:

@@ -1,0 +1,238 @@
+"""What a delayed initialisation costs: consistency, bias of depth, information, frames of delay.
+
+    python benchmarks/initialisation.py --runs 200
+
+Runs undelayed and delayed filters on the same worlds, prints a table, and writes one JSON file;
+scenarios that are in the file and are not measured again stay there.
+`near` is the world of `matched` with points 0.5–5 m away, the range of MonoSLAM's particles, and
+a camera at 0.4 m/s; in the others points lie beyond it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+import jaxslam
+from jaxslam.consistency.montecarlo import Prior
+from jaxslam.consistency.statistics import lost_threshold, normalised_squared
+from jaxslam.files import write_atomically
+from jaxslam.filters import SlamFilter
+from jaxslam.simulation import Run, Sightings, features, sightings
+
+NEAR = {"inverse_depth": (1.1, 0.45), "least_inverse_depth": 0.225, "velocity": (0.4, 0.0, 0.0)}
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure."""
+
+    scenarios: tuple[str, ...] = ("near", "matched", "circle")
+    """Built-in scenarios, or `near`."""
+    filters: tuple[str, ...] = (
+        "robocentric/inverse_scaling",
+        "world/inverse_depth",
+        "robocentric/cartesian",
+        "world+particles/cartesian",
+        "robocentric+particles/cartesian",
+        "robocentric+particles30/cartesian",
+        "robocentric+rays/cartesian",
+    )
+    """Filters with their landmarks. Information is compared with the first one's."""
+    runs: int = 200
+    """Runs of every filter."""
+    seed: int = 0
+    """Run i draws from this seed and i alone."""
+    steps: int | None = None
+    """Filter steps; the scenario's by default."""
+    chunk: int = 50
+    """Runs in one batch."""
+    out: Path = Path("benchmarks/results/initialisation.json")
+    """The JSON file."""
+
+
+def measure(name: str, options: Options) -> Iterator[tuple[str, dict]]:
+    """All filters of one scenario."""
+    fields = {} if options.steps is None else {"steps": options.steps}
+    base, fields = ("matched", {**NEAR, **fields}) if name == "near" else (name, fields)
+    scenario = jaxslam.scenario(base, fields)
+    key = jax.random.key(options.seed)
+    draw = jax.jit(jax.vmap(lambda i: jaxslam.simulate(scenario, jax.random.fold_in(key, i))))
+    runs = draw(jnp.arange(options.runs))
+    most = jax.tree.map(lambda x: int(jnp.max(x)), jax.vmap(sightings)(runs))
+    prior = Prior.of(scenario, jnp.dtype(float))
+    reference = None
+    for pair in options.filters:
+        filters = jaxslam.make_filters(
+            scenario.rig, *([word] for word in pair.split("/")), scenario.calibration
+        )
+        run = jax.jit(jax.vmap(partial(filter_run, filters[pair], most, prior)))
+        records = _concatenated(run(part) for part in _parts(runs, options.chunk))
+        if reference is None:
+            reference = records["information"]
+        yield pair, summarise(records, reference)
+
+
+def filter_run(slam_filter: SlamFilter, most: Sightings, prior: Prior, run: Run) -> dict:
+    """One filter on one run: records of every step, and its landmarks at the last."""
+    parameters = prior.parameters
+    first, seen, new = features(run, most)
+    state = slam_filter.start(parameters, int(most.landmarks), prior.velocity, prior.velocity_sigma)
+    state = slam_filter.first(state, parameters, first)
+    settled = slam_filter.initialisation.settled
+
+    def step(state, frame):
+        seen, new, control, T_BC = frame
+        state, _ = slam_filter.step(state, parameters, control, seen, new)
+        estimate, covariance = slam_filter.camera_pose(state)
+        missed = estimate.translation() - T_BC.translation()
+        return state, {
+            "nees": normalised_squared(*slam_filter.pose_error(state, T_BC)),
+            "squared_error": missed @ missed,
+            "variance": jnp.trace(covariance[: missed.size, : missed.size]),
+            "information": -jnp.linalg.slogdet(covariance)[1],
+            "settled": settled(state),
+        }
+
+    later = jax.tree.map(lambda x: x[1:], run.poses)
+    last, records = jax.lax.scan(step, state, (seen, new, run.controls, later))
+    records["settled"] = jnp.concatenate([settled(state)[None], records["settled"]])
+    return records | _landmarks(slam_filter, most.landmarks, prior, run, last)
+
+
+def _landmarks(slam_filter, count, prior, run, state) -> dict:
+    """Of every landmark: when and how far away it was first seen, and what became of it."""
+    visible = run.visible[:, :count]
+    first = jnp.argmax(visible, axis=0)
+    positions = run.poses.translation()
+    T_CB = jax.tree.map(lambda x: x[-1], run.poses).inverse()
+    points = run.points[:count]
+    slots = jnp.arange(count)
+    chart, covariance = slam_filter.landmarks_in_camera(state, prior.parameters, slots)
+    truth = 1 / jax.vmap(T_CB.apply)(points)[:, -1]
+    return {
+        "begun": jnp.any(visible, axis=0),
+        "first": first,
+        "distance": jnp.linalg.norm(points - positions[first], axis=1),
+        "in_map": slam_filter.reported(state).active,
+        "seen_last": visible[-1] & (first < visible.shape[0] - 1),
+        "normalised": (chart[:, -1] - truth) / jnp.sqrt(covariance[:, -1, -1]),
+    }
+
+
+def summarise(records: dict, reference: np.ndarray) -> dict:
+    """Numbers of one filter: over all runs but those whose NEES is not finite, which are lost."""
+    healthy = np.isfinite(records["nees"]).all(axis=1)
+    good = {key: value[healthy] for key, value in records.items()}
+    nees, dof = good["nees"][:, -1], 3
+    settled, begun = good["settled"], good["begun"]
+    ever = settled.any(axis=1) & begun
+    delays = (np.argmax(settled, axis=1) - good["first"])[ever]
+    known = settled[:, -1] & good["in_map"] & good["seen_last"]
+    steps = good["information"].shape[1]
+    # Half of log det P a dimension: how much larger σ is than the reference's.
+    ratio = np.exp((reference[healthy] - good["information"]).mean(axis=0) / (2 * dof))
+    return {
+        "nees": float(nees.mean()),
+        "nees_median": float(np.median(nees)),
+        "lost": float(1 - np.sum(nees <= lost_threshold(dof)) / healthy.size),
+        "diverged": int(np.sum(~healthy)),
+        "rmse": float(np.sqrt(good["squared_error"][:, -1].mean())),
+        "sigma": float(np.sqrt(good["variance"][:, -1].mean())),
+        "sigma_ratio_third": float(ratio[steps // 3 - 1]),
+        "sigma_ratio_end": float(ratio[-1]),
+        "delay_mean": float(delays.mean()) if delays.size else None,
+        "delay_median": float(np.median(delays)) if delays.size else None,
+        "landmarks": {
+            name: _landmark_numbers(good, known, ever, begun & which)
+            for name, which in _by_distance(good["distance"]).items()
+        },
+    }
+
+
+def _by_distance(distance: np.ndarray) -> dict[str, np.ndarray]:
+    return {
+        "all": np.ones_like(distance, bool),
+        "within 5 m": distance <= 5,
+        "5-30 m": (distance > 5) & (distance <= 30),
+        "beyond 30 m": distance > 30,
+    }
+
+
+def _landmark_numbers(good: dict, known, ever, which) -> dict | None:
+    """Shares of the landmarks begun; error of 1/z over σ of those settled and seen at the end."""
+    count = int(which.sum())
+    if not count:
+        return None
+    errors = good["normalised"][known & which]
+    return {
+        "count": count,
+        "settled": float(ever[which].mean()),
+        "dropped": float((~good["in_map"])[which].mean()),
+        "compared": int(errors.size),
+        "bias": float(errors.mean()) if errors.size else None,
+        "bias_median": float(np.median(errors)) if errors.size else None,
+        "spread": float(np.sqrt((errors**2).mean())) if errors.size else None,
+    }
+
+
+def _parts(runs: Run, size: int) -> Iterator[Run]:
+    for start in range(0, runs.visible.shape[0], size):
+        yield jax.tree.map(lambda x, s=start: x[s : s + size], runs)
+
+
+def _concatenated(parts: Iterator[dict]) -> dict[str, np.ndarray]:
+    fetched = [jax.device_get(part) for part in parts]
+    return {key: np.concatenate([part[key] for part in fetched]) for key in fetched[0]}
+
+
+HEADER = (
+    f"{'scenario':<9}{'filter/landmarks':<35}{'NEES':>9}{'median':>8}{'lost':>7}{'RMSE m':>8}"
+    f"{'σ m':>7}{'σ/σ₀ ⅓':>8}{'end':>6}{'delay':>7}{'settled':>9}{'dropped':>9}{'bias/σ':>8}"
+    f"{'rms/σ':>8}"
+)
+
+
+def line(scenario: str, pair: str, f: dict) -> str:
+    """One row of the table."""
+    landmarks = f["landmarks"]["all"]
+    return (
+        f"{scenario:<9}{pair:<35}{f['nees']:>9.3g}{f['nees_median']:>8.2f}{f['lost']:>7.1%}"
+        f"{f['rmse']:>8.3f}{f['sigma']:>7.3f}{f['sigma_ratio_third']:>8.2f}"
+        f"{f['sigma_ratio_end']:>6.2f}{_number(f['delay_mean'], 7, 1)}"
+        f"{landmarks['settled']:>9.1%}{landmarks['dropped']:>9.1%}"
+        f"{_number(landmarks['bias'], 8, 2)}{_number(landmarks['spread'], 8, 2)}"
+    )
+
+
+def _number(value: float | None, width: int, digits: int) -> str:
+    return f"{'–':>{width}}" if value is None else f"{value:>{width}.{digits}f}"
+
+
+def main() -> None:
+    """Measure, print and write."""
+    options = tyro.cli(Options, description=__doc__)
+    jax.config.update("jax_enable_x64", True)
+    print(HEADER)
+    results = json.loads(options.out.read_text()) if options.out.exists() else {}
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    for name in options.scenarios:
+        filters: dict[str, dict] = {}
+        results[name] = {"runs": options.runs, "seed": options.seed, "filters": filters}
+        for pair, numbers in measure(name, options):
+            filters[pair] = numbers
+            print(line(name, pair, numbers), flush=True)
+            with write_atomically(options.out) as path:
+                path.write_text(json.dumps(results, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,275 @@
+"""Tests of delayed initialisations: depth particles and Gaussian-sum rays, in a planar world."""
+
+from dataclasses import replace
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import Case, quick_jit
+
+from jaxslam.camera import Camera
+from jaxslam.consistency.montecarlo import Prior, filter_run
+from jaxslam.filters import DepthParticles, Features, GaussianSum, Parameters, make_filter
+from jaxslam.filters.initialisation import log_density
+from jaxslam.geometry import PLANAR
+from jaxslam.landmarks import CARTESIAN, INVERSE_SCALING
+from jaxslam.rig import Rig
+from jaxslam.sensors import POSITION
+from jaxslam.simulation import Sightings
+
+FOCAL, CENTRE, SIGMA = 650.0, 320.0, 0.5
+DT, SPEED = 0.1, 0.4
+BASES = ("world", "robocentric")
+
+
+def the_parameters(motion_sigma=0.0, inverse_depth=0.2, inverse_depth_sigma=0.1):
+    camera = Camera(jnp.array([FOCAL]), jnp.array([CENTRE]))
+    return Parameters(
+        camera,
+        jnp.zeros(2),
+        jnp.asarray(SIGMA),
+        jnp.full(3, motion_sigma),
+        jnp.asarray(inverse_depth),
+        jnp.asarray(inverse_depth_sigma),
+    )
+
+
+def pixels(*values, valid=True):
+    """One feature a value, of landmarks 0, 1, …"""
+    count = len(values)
+    slots, measured = jnp.arange(count), jnp.asarray(values)[:, None]
+    return Features(slots, measured, jnp.full(count, valid))
+
+
+NONE = pixels(0.0, valid=False)
+
+
+def the_filter(base, method):
+    word = {DepthParticles: "particles", GaussianSum: "rays"}[type(method)]
+    slam = make_filter(Rig(PLANAR), f"{base}+{word}", CARTESIAN, "known")
+    return replace(slam, initialisation=method)
+
+
+@cache
+def stepper(slam):
+    return quick_jit(slam.step)
+
+
+def begun(slam, parameters, first, speed=SPEED, speed_sigma=0.0):
+    """A camera that moves along x, with a velocity that is known unless said."""
+    state = slam.start(
+        parameters, first.slots.size, jnp.array([speed, 0.0, 0.0]), jnp.full(3, speed_sigma)
+    )
+    return quick_jit(slam.first)(state, parameters, first)
+
+
+def seen_at(depth, bearing, step):
+    """The pixel of the point at that depth on the ray of frame 0."""
+    return FOCAL * (bearing - step * SPEED * DT / depth) + CENTRE
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_particles_are_the_posterior_of_depth_when_camera_and_ray_are_known(base):
+    method = DepthParticles(count=40, agreement=1e-6)
+    slam, parameters, bearing = the_filter(base, method), the_parameters(), 0.2
+    state = begun(slam, parameters, pixels(FOCAL * bearing + CENTRE))
+    state = replace(state, covariance=jnp.zeros_like(state.covariance))
+    noise = np.array([0.4, -0.7, 0.1])
+    measured = np.array([seen_at(2.1, bearing, k + 1) for k in range(3)]) + noise
+
+    for u in measured:
+        state, _ = stepper(slam)(state, parameters, DT, pixels(u), NONE)
+
+    distances = np.linspace(0.5, 5.0, 40)
+    depths = distances / np.hypot(1.0, bearing)
+    predicted = np.array([seen_at(depths, bearing, k + 1) for k in range(3)])
+    likelihood = np.exp(-(((measured[:, None] - predicted) / SIGMA) ** 2).sum(axis=0) / 2)
+    np.testing.assert_allclose(
+        state.memory[0], likelihood / likelihood.sum(), rtol=1e-6, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_a_pending_ray_does_not_change_the_camera(base):
+    slam = the_filter(base, DepthParticles(agreement=1e-6))
+    parameters = the_parameters(motion_sigma=0.1)
+    state = begun(slam, parameters, pixels(400.0), speed_sigma=0.02)
+    c = state.core_dim
+    seen = pixels(395.0)
+    with_ray, innovation = stepper(slam)(state, parameters, DT, seen, NONE)
+    without, _ = stepper(slam)(state, parameters, DT, replace(seen, valid=~seen.valid), NONE)
+    assert not np.allclose(with_ray.memory, without.memory)
+    assert innovation.nis == 0
+    for one, other in zip(
+        jax.tree.leaves(with_ray.core), jax.tree.leaves(without.core), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(with_ray.covariance[:c, :c], without.covariance[:c, :c])
+
+
+def test_a_ray_becomes_a_point_with_the_mean_and_variance_of_its_particles():
+    method = DepthParticles(count=40)
+    slam, parameters, bearing = the_filter("robocentric", method), the_parameters(), 0.2
+    state = begun(slam, parameters, pixels(FOCAL * bearing + CENTRE), speed=0.0)
+    step = stepper(slam)
+    assert not method.settled(step(state, parameters, DT, NONE, NONE)[0]).any()
+
+    distances = np.linspace(0.5, 5.0, 40)
+    weights = np.exp(-(((distances - 2.0) / 0.3) ** 2) / 2)
+    weights /= weights.sum()
+    state = replace(state, memory=jnp.asarray(weights)[None])
+    state, _ = step(state, parameters, DT, NONE, NONE)
+    assert method.settled(state).all()
+
+    mean = weights @ distances
+    variance = weights @ (distances - mean) ** 2 + (distances[1] - distances[0]) ** 2 / 12
+    ray = np.array([bearing, 1.0]) / np.hypot(1.0, bearing)
+    across = mean * SIGMA / FOCAL / (1 + bearing**2) * np.array([ray[1], -ray[0]])
+    wanted = variance * np.outer(ray, ray) + np.outer(across, across)
+    start, d = state.core_dim, state.landmarks.shape[1]
+    np.testing.assert_allclose(state.landmarks[0, :2], mean * ray, rtol=1e-12)
+    own = state.covariance[start:, start:]
+    np.testing.assert_allclose(own[:2, :2], wanted, rtol=1e-9, atol=1e-15)
+    assert not np.any(own[2:d]), "the numbers of the other form are constants"
+
+
+def test_a_pending_ray_is_reported_with_the_moments_of_inverse_depth():
+    method = DepthParticles(count=40)
+    slam, parameters = the_filter("world", method), the_parameters()
+    state = begun(slam, parameters, pixels(CENTRE))
+    in_camera = quick_jit(slam.landmarks_in_camera)
+    chart, covariance = in_camera(state, parameters, jnp.arange(1))
+    inverse = 1 / np.linspace(0.5, 5.0, 40)
+    np.testing.assert_allclose(chart[0], [0.0, inverse.mean()], atol=1e-12)
+    np.testing.assert_allclose(covariance[0, 1, 1], inverse.var(), rtol=1e-12)
+
+
+def test_a_ray_that_no_particle_explains_is_dropped():
+    slam, parameters = the_filter("world", DepthParticles(count=40)), the_parameters()
+    state = begun(slam, parameters, pixels(CENTRE))
+    state, _ = stepper(slam)(state, parameters, DT, pixels(CENTRE + 60), NONE)
+    assert not state.active.any()
+    assert not state.covariance.any()
+
+
+def test_members_are_weighed_by_bayes_rule():
+    method = GaussianSum(nearest=1.0, farthest=15.0, threshold=0.0)
+    slam, parameters, bearing = the_filter("robocentric", method), the_parameters(), 0.2
+    state = begun(slam, parameters, pixels(FOCAL * bearing + CENTRE))
+    measured = seen_at(4.0, bearing, 1) + 0.3
+    state, _ = stepper(slam)(state, parameters, DT, pixels(measured), NONE)
+
+    s = np.array([1 / 0.7, 3 / 0.7, 9 / 0.7])
+    predicted = seen_at(s, bearing, 1)
+    # The pixel of frame 0 moves a point across; depth moves it along its ray.
+    by_pixel, by_depth = 1.0, FOCAL * SPEED * DT / s**2
+    variance = by_pixel * SIGMA**2 + (by_depth * 0.3 * s) ** 2 + SIGMA**2
+    likelihood = np.exp(-((measured - predicted) ** 2) / variance / 2) / np.sqrt(variance)
+    np.testing.assert_allclose(state.memory[0], likelihood / likelihood.sum(), rtol=1e-9)
+
+
+def test_unlikely_members_are_pruned_until_one_is_left():
+    method = GaussianSum(nearest=1.0, farthest=15.0)
+    slam, parameters = the_filter("world", method), the_parameters()
+    state = begun(slam, parameters, pixels(CENTRE))
+    assert state.active.sum() == method.members == 3
+    for k in range(1, 5):
+        measured = seen_at(3 / 0.7, 0.0, k)
+        state, _ = stepper(slam)(state, parameters, DT, pixels(measured), NONE)
+    np.testing.assert_array_equal(state.active, [False, True, False])
+    np.testing.assert_array_equal(state.memory[0], [0.0, 1.0, 0.0])
+    assert method.settled(state).all()
+    first, left, last = np.split(np.asarray(state.covariance)[state.core_dim :], 3)
+    assert left.any()
+    assert not first.any(), "a pruned member leaves nothing"
+    assert not last.any(), "a pruned member leaves nothing"
+    reported = slam.reported(state)
+    np.testing.assert_array_equal(reported.landmarks[0], state.landmarks[1])
+    np.testing.assert_array_equal(reported.covariance[-2:, -2:], left[:, -4:-2])
+
+
+def test_one_member_is_the_plain_filter():
+    method = GaussianSum(nearest=1.4, farthest=1.5)
+    assert method.members == 1
+    depth = 1.4 / 0.7
+    parameters = the_parameters(0.1, 1 / depth, 0.3 / depth)
+    plain = make_filter(Rig(PLANAR), "robocentric", CARTESIAN, "known")
+    states = []
+    for slam in (plain, the_filter("robocentric", method)):
+        state = begun(slam, parameters, pixels(330.0, 250.0), speed_sigma=0.05)
+        for u in (320.0, 309.0):
+            state, _ = stepper(slam)(state, parameters, DT, pixels(u, u - 80), NONE)
+        states.append(replace(state, memory=()))
+    for one, other in zip(*map(jax.tree.leaves, states), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-14)
+
+
+def test_federated_shares_of_copies_of_one_landmark_are_one_update():
+    slam = make_filter(Rig(PLANAR), "robocentric", CARTESIAN, "known")
+    parameters = the_parameters(0.1)
+    state = begun(slam, parameters, pixels(330.0, 330.0), speed_sigma=0.05)
+    state = slam.predict(state, parameters, jnp.asarray(DT))
+    c = state.core_dim
+    copies = jnp.concatenate([jnp.arange(c + 2), jnp.arange(c, c + 2)])
+    state = replace(state, covariance=state.covariance[copies[:, None], copies])
+    correct = quick_jit(slam.correct)
+    seen = pixels(322.0, 322.0)
+    shared, _ = correct(state, parameters, DT, seen, jnp.array([0.3, 0.7]))
+    alone, _ = correct(state, parameters, DT, replace(seen, valid=jnp.array([True, False])))
+    np.testing.assert_allclose(shared.landmarks, alone.landmarks, rtol=1e-9)
+    np.testing.assert_allclose(shared.covariance, alone.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_log_density():
+    rng = np.random.default_rng(0)
+    factor, residual = rng.normal(size=(3, 3)), rng.normal(size=3)
+    covariance = factor @ factor.T
+    density, squared = log_density(jnp.asarray(residual), jnp.asarray(covariance))
+    wanted = residual @ np.linalg.solve(covariance, residual)
+    np.testing.assert_allclose(squared, wanted, rtol=1e-10)
+    _, log_determinant = np.linalg.slogdet(covariance)
+    np.testing.assert_allclose(density, -(wanted + log_determinant) / 2, rtol=1e-10)
+
+
+@cache
+def two_runs():
+    """Of three landmarks, all first seen in frame 0."""
+    return Case("matched", runs=2, steps=3, landmarks=3)
+
+
+@pytest.mark.parametrize("name", ["world+particles30", "robocentric+rays"])
+def test_a_batch_is_its_runs(name):
+    case = two_runs()
+    prior = Prior.of(case.scenario, jnp.dtype(float))
+    slam = make_filter(case.scenario.rig, name, CARTESIAN, "known")
+    run = partial(filter_run, slam, Sightings(landmarks=3, first=3, known=3, new=0), prior)
+    batch, _, _ = quick_jit(jax.vmap(run))(case.runs)
+    alone, _, _ = quick_jit(run)(case.run(1))
+    for key in ("nees", "landmark_nees", "nis"):
+        assert np.isfinite(batch[key]).all()
+        np.testing.assert_allclose(batch[key][1], alone[key], rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "landmark", "rig", "message"),
+    [
+        ("world+particle", CARTESIAN, Rig(PLANAR), "did you mean particles"),
+        ("word+particles", CARTESIAN, Rig(PLANAR), "did you mean world"),
+        ("world+", CARTESIAN, Rig(PLANAR), "unknown modifiers"),
+        ("world+rays0", CARTESIAN, Rig(PLANAR), "nearest"),
+        ("world+rays", INVERSE_SCALING, Rig(PLANAR), "cartesian"),
+        ("world+particles", INVERSE_SCALING, Rig(PLANAR), "cartesian"),
+        ("world+particles+rays", CARTESIAN, Rig(PLANAR), "cartesian"),
+        ("world+particles", CARTESIAN, Rig(PLANAR, sensor=POSITION), "hides none"),
+    ],
+)
+def test_bad_names_and_combinations(name, landmark, rig, message):
+    with pytest.raises(ValueError, match=message):
+        make_filter(rig, name, landmark, "known")
+
+
+def test_numbers_after_a_modifier_are_the_greatest_depth():
+    slam = make_filter(Rig(PLANAR), "world+particles20", CARTESIAN, "known")
+    assert slam.initialisation == DepthParticles(farthest=20)
