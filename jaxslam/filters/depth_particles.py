@@ -131,7 +131,11 @@ class DepthParticles:
         return jnp.where(in_front, likelihood, -jnp.inf), jnp.where(in_front, squared, jnp.inf)
 
     def _agreed(self, state: State) -> State:
-        """Give rays whose particles agree their depth; the next composition converts them."""
+        """Give rays whose particles agree their depth; the next composition converts them.
+
+        The depth enters as independent of the camera, as published, though it was found from the
+        camera's motion: rays that finish together share an error that the filter does not know.
+        """
         mean, variance = _moments(state.memory, self.depths(state.memory.dtype))
         # A particle stands for its cell of the range.
         variance += ((self.farthest - self.nearest) / (self.count - 1)) ** 2 / 12
@@ -161,7 +165,7 @@ def _moments(weights, values):
 
 
 def _with_inverse_depth(state: State, which, mean, variance) -> State:
-    """ρ and its own variance for some rays; it is independent of everything else."""
+    """ρ and its own variance for some rays."""
     capacity, d = state.landmarks.shape
     place = state.core_dim + jnp.arange(capacity) * d + d - 2
     own = jnp.where(which, variance, state.covariance[place, place])
