@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,8 +39,8 @@ class Options:
     """Folder of comparison.md and comparison.png."""
 
 
-def measure(options: Options) -> dict[str, dict[str, Any]]:
-    """`{scenario: {"filter/landmarks": numbers at the end of the runs}}`."""
+def measure(options: Options) -> Iterator[dict[str, dict[str, Any]]]:
+    """`{scenario: {"filter/landmarks": numbers at the end}}`, yielded after every filter."""
     results: dict[str, dict[str, Any]] = {name: {} for name in options.scenarios}
     # Filter by filter, so that scenarios of one shape share its compiled program.
     for frame in options.filters:
@@ -48,7 +49,7 @@ def measure(options: Options) -> dict[str, dict[str, Any]]:
                 numbers = _measure(name, frame, landmarks, options)
                 results[name][f"{frame}/{landmarks}"] = numbers
                 print(name, f"{frame}/{landmarks}", json.dumps(numbers), flush=True)
-    return results
+            yield results
 
 
 def _measure(name: str, frame: str, landmarks: str, options: Options) -> dict[str, Any]:
@@ -118,19 +119,25 @@ def _number(value: float | None, form: str) -> str:
 
 
 def main(options: Options) -> None:
-    """Measure, and write the three files."""
+    """Measure, and write the three files after every filter."""
     import jax
 
-    summary = {
-        "schema": 1,
-        "version": jaxslam.__version__,
-        "runs": options.runs,
-        "seed": options.seed,
-        "device": jax.devices()[0].device_kind,
-        "scenarios": measure(options),
-    }
     for folder in (options.out, options.docs):
         folder.mkdir(parents=True, exist_ok=True)
+    for results in measure(options):
+        summary = {
+            "schema": 1,
+            "version": jaxslam.__version__,
+            "runs": options.runs,
+            "seed": options.seed,
+            "device": jax.devices()[0].device_kind,
+            "scenarios": results,
+        }
+        write(summary, options)
+
+
+def write(summary: dict[str, Any], options: Options) -> None:
+    """The JSON file, the figure and the page."""
     with write_atomically(options.out / "comparison.json") as path:
         path.write_text(json.dumps(summary, indent=1) + "\n")
     plot_comparison(summary["scenarios"], options.docs / "comparison.png")
