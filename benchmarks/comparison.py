@@ -43,8 +43,8 @@ def measure(options: Options) -> Iterator[dict[str, dict[str, Any]]]:
     """`{scenario: {"filter/landmarks": numbers at the end}}`, yielded after every filter."""
     results: dict[str, dict[str, Any]] = {name: {} for name in options.scenarios}
     # Filter by filter, so that scenarios of one shape share its compiled program.
-    for frame in options.filters:
-        for landmarks in options.landmarks:
+    for landmarks in options.landmarks:
+        for frame in options.filters:
             for name in options.scenarios:
                 numbers = _measure(name, frame, landmarks, options)
                 results[name][f"{frame}/{landmarks}"] = numbers

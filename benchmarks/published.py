@@ -82,6 +82,8 @@ class Options:
     runs: int = 1000
     """Runs of every filter."""
     seed: int = 0
+    chunk: int = 10
+    """Runs in one batch: few, since a map of 72 points is large."""
     out: Path = Path("benchmarks/results")
     """Folder of published-SCENARIO.json."""
 
@@ -93,7 +95,9 @@ def measure(table: Published, options: Options) -> Iterator[dict]:
     for name, theirs in table.nees.items():
         frame, landmarks = name.split("/")
         filters = jaxslam.make_filters(scenario.rig, [frame], [landmarks], scenario.calibration)
-        study = jaxslam.monte_carlo(scenario, filters, runs=options.runs, seed=options.seed)
+        study = jaxslam.monte_carlo(
+            scenario, filters, runs=options.runs, seed=options.seed, chunk=options.chunk
+        )
         records = [study.store.load(name, chunk, ("nees", "error")) for chunk in study.chunks]
         nees = np.concatenate([record["nees"] for record in records])
         error = np.concatenate([record["error"] for record in records])
