@@ -60,6 +60,7 @@ def _measure(name: str, frame: str, landmarks: str, options: Options) -> dict[st
     rmse, sigma = f["rmse"]["position"][-1], f["sigma"]["position"][-1]
     microseconds = 1e6 * f["seconds"]["run"] / options.runs / scenario.steps
     return {
+        "runs": options.runs,
         "dof": f["dof"],
         "band95": f["band95"],
         "nees": f["nees"][-1],
@@ -87,18 +88,26 @@ def page(summary: dict[str, Any]) -> str:
         "## The parametrizations",
         landmark_table(jaxslam.LANDMARKS.values()),
     ]
+    names = list(dict.fromkeys(name for r in summary["scenarios"].values() for name in r))
     for scenario, results in summary["scenarios"].items():
         low, high = next(iter(results.values()))["band95"]
-        parts += [f"## `{scenario}` (95 % band {low:.3f}–{high:.3f})", _rows(results)]
+        parts += [
+            f"## `{scenario}` (95 % band {low:.3f}–{high:.3f})",
+            _rows(results, names, summary["runs"]),
+        ]
     return "\n\n".join(parts) + "\n"
 
 
-def _rows(results: dict[str, Any]) -> str:
+def _rows(results: dict[str, Any], names: list[str], runs: int) -> str:
     lines = [
         "| filter | NEES mean | median | inside | lost | RMSE m | σ/RMSE | µs a step |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for name, f in results.items():
+    for name in names:
+        if name not in results:
+            lines.append(f"| {name} | not measured |" + " – |" * 6)
+            continue
+        f = results[name]
         cells = (
             _number(f["nees"], "{:.2f}"),
             _number(f["nees_median"], "{:.2f}"),
@@ -108,7 +117,8 @@ def _rows(results: dict[str, Any]) -> str:
             _number(f["sigma_over_rmse"], "{:.2f}"),
             f"{f['microseconds_per_step']:.0f}",
         )
-        lines.append(f"| {name} | {' | '.join(cells)} |")
+        few = "" if f["runs"] == runs else f" ({f['runs']} runs)"
+        lines.append(f"| {name}{few} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
