@@ -80,7 +80,8 @@ def page(summary: dict[str, Any]) -> str:
         "# Parametrization × frame × scenario",
         "Made by `python benchmarks/comparison.py`; do not edit. "
         f"{summary['runs']} runs of every filter (fewer where a row says so) on the same worlds, "
-        f"seed {summary['seed']}, {summary['device']}, float64. A consistent filter has a mean NEES in the 95 % band; "
+        f"seed {summary['seed']}, {summary['device']}, float64. A consistent filter has a mean "
+        "NEES in the 95 % band; "
         "*inside* is the share of steps at which it is there; a run is *lost* when its NEES is "
         "above the 99.99 % quantile of χ². NEES, lost, RMSE and σ are those of the last step; the "
         "time is that of one step of one run in a batch, on a machine that other programs share.",
