@@ -245,15 +245,19 @@ def landmark_samples(
     """
     c, d = state.core_dim, state.landmarks.shape[1]
     index = jnp.concatenate([jnp.arange(c), c + slot * d + jnp.arange(d)])
-    # A covariance has no full rank (a pixel knows the ray's length): eigenvectors, not Cholesky.
-    values, vectors = jnp.linalg.eigh(state.covariance[index[:, None], index])
-    root = vectors * jnp.sqrt(jnp.maximum(values, 0.0))
+    root = covariance_root(state.covariance[index[:, None], index])
 
     def one(draw):
         delta = root @ draw
         return function(view(retract(state.core, delta[:c])), state.landmarks[slot] + delta[c:])
 
     return jax.vmap(one)(normal)
+
+
+def covariance_root(covariance: Float[Array, "k k"]) -> Float[Array, "k k"]:
+    """R with R Rᵀ = P, also of a P without full rank: a pixel knows the length of its ray."""
+    values, vectors = jnp.linalg.eigh(covariance)
+    return vectors * jnp.sqrt(jnp.maximum(values, 0.0))
 
 
 def core_covariance(function: Callable[[Any], Any], state: State) -> tuple[Any, Array]:

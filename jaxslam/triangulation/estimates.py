@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam.filters import FILTERS, Features, SlamFilter
+from jaxslam.filters.ekf import covariance_root
 from jaxslam.geometry import PLANAR
 from jaxslam.landmarks import LANDMARKS, Parametrization
 from jaxslam.rig import Rig
@@ -87,11 +88,4 @@ def pushed(
 def push(name: str, gaussian: Gaussian, count: int, seed: int) -> Samples:
     """`count` points of the named estimate."""
     mean, covariance = gaussian
-    return draw(pushed, LANDMARKS[name], (mean, _root(covariance)), count, seed)
-
-
-@jax.jit
-def _root(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """R with R Rᵀ = P, also of a P without full rank."""
-    values, vectors = jnp.linalg.eigh(covariance)
-    return vectors * jnp.sqrt(jnp.maximum(values, 0))
+    return draw(pushed, LANDMARKS[name], (mean, jax.jit(covariance_root)(covariance)), count, seed)
