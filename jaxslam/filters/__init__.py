@@ -52,11 +52,21 @@ def information_filter(rig: Rig, landmark: Parametrization, calibration: str) ->
     return replace(keyframe(rig, landmark, calibration), engine=information)
 
 
+def scale_gauge(rig: Rig, landmark: Parametrization, calibration: str) -> SlamFilter:
+    """The paper's filter in a unit of length of its own, whose size is estimated.
+
+    State `(b̃, θ, ṽ, v_θ, λ, landmarks)`, with lengths `e^λ` metres: what no bearing observes, the
+    scale, stays out of the products of velocity and inverse depth.
+    """
+    return replace(robocentric(rig, landmark, calibration), scale_gauge=True)
+
+
 FILTERS: dict[str, Callable[[Rig, Parametrization, str], SlamFilter]] = {
     "robocentric": robocentric,
     "world": world,
     "keyframe": keyframe,
     "information": information_filter,
+    "scale_gauge": scale_gauge,
 }
 
 
@@ -115,5 +125,6 @@ __all__ = [
     "make_filter",
     "make_filters",
     "robocentric",
+    "scale_gauge",
     "world",
 ]
