@@ -198,7 +198,11 @@ def filter_run(
     parameters = prior.parameters
     first, seen, new = features(run, capacity)
     state = slam_filter.start(
-        parameters, int(capacity.landmarks), prior.velocity, prior.velocity_sigma
+        parameters,
+        int(capacity.landmarks),
+        prior.velocity,
+        prior.velocity_sigma,
+        (int(capacity.known), int(capacity.new)),
     )
     state = slam_filter.first(state, parameters, first)
 
@@ -240,7 +244,7 @@ def _landmark_nees(slam_filter, state, parameters, seen, T_BC, points):
     """Mean over the landmarks seen that are in the map, and how many; of none, 0 of 0."""
     counted = seen.valid & slam_filter.reported(state).active[seen.slots]
     truth = jax.vmap(T_BC.inverse().apply)(points[seen.slots])
-    truth = jax.vmap(slam_filter.model.rig.sensor.chart)(truth, jnp.ones_like(truth[:, 0]))
+    truth = jax.vmap(slam_filter.rig.sensor.chart)(truth, jnp.ones_like(truth[:, 0]))
     chart, covariance = slam_filter.landmarks_in_camera(state, parameters, seen.slots)
     nees = jax.vmap(normalised_squared)(truth - chart, covariance)
     count = jnp.sum(counted)

@@ -2,9 +2,12 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import Any
 
 from jaxslam.filters import information
 from jaxslam.filters.depth_particles import DepthParticles, with_depth_particles
+from jaxslam.filters.fixed_lag import FixedLag, iterated, with_lag
+from jaxslam.filters.filter import Filter
 from jaxslam.filters.frames import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.filters.gaussian_sum import GaussianSum, with_rays
 from jaxslam.filters.slam import (
@@ -61,26 +64,41 @@ def scale_gauge(rig: Rig, landmark: Parametrization, calibration: str) -> SlamFi
     return replace(robocentric(rig, landmark, calibration), scale_gauge=True)
 
 
-FILTERS: dict[str, Callable[[Rig, Parametrization, str], SlamFilter]] = {
+def iterated_filter(rig: Rig, landmark: Parametrization, calibration: str) -> FixedLag:
+    """The paper's filter, iterated: linearised at the maximum of the posterior of every frame."""
+    return iterated(robocentric(rig, landmark, calibration))
+
+
+FILTERS: dict[str, Callable[[Rig, Parametrization, str], Filter]] = {
     "robocentric": robocentric,
     "world": world,
     "keyframe": keyframe,
     "information": information_filter,
     "scale_gauge": scale_gauge,
+    "iterated": iterated_filter,
 }
 
 
-MODIFIERS: dict[str, Callable[[SlamFilter, int | None], SlamFilter]] = {
+def with_common_depth(base: SlamFilter, percent: int | None) -> SlamFilter:
+    """The filter with priors on 1/z that are correlated, in percent; 50 by default."""
+    return replace(base, depth_correlation=0.5 if percent is None else percent / 100)
+
+
+MODIFIERS: dict[str, Callable[[Any, int | None], Filter]] = {
     "particles": with_depth_particles,
     "rays": with_rays,
+    "common": with_common_depth,
+    "lag": with_lag,
+    "iterated": iterated,
 }
-"""What `+name` behind a filter's name makes of it, with the number that may follow the name:
-the greatest depth of a delayed initialisation, m."""
+"""What `+name` behind a filter's name makes of it, with the number that may follow the name: the
+greatest depth of a delayed initialisation, m (`particles`, `rays`); the correlation of depths in
+percent (`common`); frames (`lag`); steps of Gauss–Newton instead of convergence (`iterated`)."""
 
 
 def make_filters(
     rig: Rig, filters: Iterable[str], landmarks: Iterable[str], calibration: str
-) -> dict[str, SlamFilter]:
+) -> dict[str, Filter]:
     """Every named filter on every named parametrization, keyed `filter/landmarks`.
 
     A filter may be modified: `world+particles`, `robocentric+rays100`. Raises ValueError for a
@@ -95,10 +113,10 @@ def make_filters(
     }
 
 
-def make_filter(rig: Rig, name: str, landmark: Parametrization, calibration: str) -> SlamFilter:
+def make_filter(rig: Rig, name: str, landmark: Parametrization, calibration: str) -> Filter:
     """One filter by its name, with its modifiers. Raises ValueError."""
     base, *modifiers = name.split("+")
-    made = chosen("filters", [base], FILTERS)[base](rig, landmark, calibration)
+    made: Any = chosen("filters", [base], FILTERS)[base](rig, landmark, calibration)
     for modifier in modifiers:
         word = modifier.rstrip("0123456789")
         number = modifier[len(word) :]
@@ -113,6 +131,8 @@ __all__ = [
     "MODIFIERS",
     "DepthParticles",
     "Features",
+    "Filter",
+    "FixedLag",
     "GaussianSum",
     "Innovation",
     "Parameters",

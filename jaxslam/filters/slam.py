@@ -48,6 +48,8 @@ class Core:
     keyframes: what the `Frame` holds."""
     velocity: Float[Array, " v"]
     """Linear and angular velocity in the camera's own frame, m/s and rad/s; v = t, or none."""
+    log_scale: Float[Array, " 1"] | None
+    """λ of a filter with a scale gauge, or None: lengths in the state are in units of `e^λ` m."""
     noise: Float[Array, " t"]
     """What drives this step's motion: the acceleration a (P10), or the odometry's error; zero
     before `predict` and after composition."""
@@ -55,8 +57,6 @@ class Core:
     """Error of the intrinsics (P15); empty where the calibration is known."""
     anchors: SplitPose | None = None
     """T_AF of the cameras F in which landmarks are written; a batch, or None."""
-    log_scale: Float[Array, " 1"] | None = None
-    """λ of a filter with a scale gauge, or None: lengths in the state are `e^−λ` metres."""
     depth_error: Float[Array, " 1"] | None = None
     """What the priors on 1/z of all landmarks have in common, in σ of one prior, or None."""
 
@@ -307,6 +307,10 @@ class SlamFilter:
             )
 
     @property
+    def rig(self) -> Rig:
+        return self.model.rig
+
+    @property
     def geometry(self) -> Geometry:
         return self.model.geometry
 
@@ -316,11 +320,14 @@ class SlamFilter:
         capacity: int,
         velocity: Float[Array, " v"],
         velocity_sigma: Float[Array, " v"],
+        features: tuple[int, int] | None = None,
     ) -> State:
         """An exactly known pose at the origin of B, an uncertain velocity, an empty map.
 
-        The velocity is not used by a motion model without one.
+        The velocity is not used by a motion model without one. `features` (how many a frame has
+        at the most, known and new) is for filters that remember frames.
         """
+        del features
         dtype = parameters.measurement_sigma.dtype
         geometry, landmark = self.geometry, self.model.landmark
         t, p = geometry.tangent_dim, geometry.pixel_dim
@@ -329,10 +336,10 @@ class SlamFilter:
         core = Core(
             pose=held,
             velocity=jnp.asarray(velocity, dtype)[:v],
+            log_scale=jnp.zeros(1, dtype) if self.scale_gauge else None,
             noise=jnp.zeros(t, dtype),
             calibration=jnp.zeros(0 if self.calibration == "known" else 2 * p, dtype),
             anchors=self._no_anchors(capacity, dtype),
-            log_scale=jnp.zeros(1, dtype) if self.scale_gauge else None,
             depth_error=jnp.zeros(1, dtype) if self.depth_correlation else None,
         )
         # An empty slot holds a point straight ahead: finite in every formula.
@@ -342,7 +349,7 @@ class SlamFilter:
         slots = self.initialisation.slots(capacity)
         state = self.engine.empty(core, jnp.tile(empty, (slots, 1)))
         state = replace(state, memory=self.initialisation.memory(capacity, dtype))
-        state = self._known(state, 0, tangent_dim(held))
+        state = self.engine.know(state, 0, tangent_dim(held))
         state = self._with_velocity(state, jnp.asarray(velocity_sigma, dtype)[:v])
         if self.depth_correlation:
             common = jnp.full((1, 1), self.depth_correlation, dtype)
@@ -367,15 +374,12 @@ class SlamFilter:
             [jnp.eye(velocity.size) - jnp.outer(velocity, to_scale), to_scale[None]]
         ).astype(covariance.dtype)
         joint = J @ covariance @ J.T
-        index = jnp.concatenate([_index(core, "velocity"), _index(core, "log_scale")])
         state = replace(state, core=replace(core, log_scale=-joint[-1:, -1] / 2))
-        return replace(
-            state, covariance=state.covariance.at[index[:, None], index].set(joint)
-        )
+        return self.engine.augment(state, place.start, joint)
 
     def predict(self, state: State, parameters: Parameters, control: Array) -> State:
         """Append this step's motion noise and calibration error (P10, P11, P15)."""
-        start = tangent_dim(state.core.pose) + state.core.velocity.size
+        start = _part(state.core, "noise").start
         state = self.engine.augment(state, start, jnp.diag(parameters.motion_sigma**2))
         if self.calibration == "white":
             state = self._with_calibration(state, parameters)
@@ -399,7 +403,7 @@ class SlamFilter:
     ) -> tuple[State, Innovation]:
         """The Kalman update by features of slots; with a share ρ of each, by R/ρ."""
         context = self._context(parameters, control)
-        noise = self._noise(parameters)
+        noise = self.noise(parameters)
         if share is not None:
             noise = noise / jnp.where(share > 0, share, 1.0)[:, None, None]
         return self.engine.update(
@@ -411,7 +415,7 @@ class SlamFilter:
     ) -> State:
         """`update` without its covariance: cheap enough to try many hypotheses."""
         context = self._context(parameters, control)
-        noise = self._noise(parameters)
+        noise = self.noise(parameters)
         return self.engine.update_mean(
             self.model, state, features, noise, context, self._considered(state)
         )
@@ -431,7 +435,7 @@ class SlamFilter:
         """Search ellipses of a predicted state: pixels, innovation covariances, in front."""
         context = self._context(parameters, control)
         return self.engine.predict_features(
-            self.model, state, slots, self._noise(parameters), context
+            self.model, state, slots, self.noise(parameters), context
         )
 
     def compose(self, state: State, parameters: Parameters, control: Array) -> State:
@@ -452,7 +456,7 @@ class SlamFilter:
         if change is None:
             return state
         t = self.geometry.tangent_dim
-        return self._known(self.engine.change(state, change), t, t)
+        return self.engine.know(self.engine.change(state, change), t, t)
 
     def remove(self, state: State, gone: Bool[Array, " capacity"]) -> State:
         """Marginalise landmarks and free their slots."""
@@ -475,7 +479,7 @@ class SlamFilter:
             mean, sigma = parameters.inverse_depth, parameters.inverse_depth_sigma
             prior = (jnp.tile(mean, hidden), jnp.tile(sigma, hidden))
         prior = self._prior_in_gauge(state, prior)
-        noise, context = self._noise(parameters), _composed(parameters)
+        noise, context = self.noise(parameters), _composed(parameters)
         if self.model.landmark.anchored:
             anchor = _free_anchor(state)
             state = self.engine.change(state, self.model.anchoring(anchor))
@@ -628,17 +632,13 @@ class SlamFilter:
         origin = SplitPose.of(identity(self.geometry, dtype))
         return jax.tree.map(lambda x: jnp.tile(x, (capacity, 1)), origin)
 
-    def _known(self, state: State, start: int, size: int) -> State:
-        """Numbers of the core that are known exactly: a covariance of zero, in either form."""
-        return self.engine.augment(state, start, jnp.zeros((size, size), state.landmarks.dtype))
-
     def _with_calibration(self, state: State, parameters: Parameters) -> State:
         if self.calibration == "known":
             return state
         covariance = jnp.diag(parameters.intrinsics_sigma**2)
         return self.engine.augment(state, _calibration(state).start, covariance)
 
-    def _noise(self, parameters: Parameters) -> Float[Array, "p p"]:
+    def noise(self, parameters: Parameters) -> Float[Array, "p p"]:
         """R of one measurement."""
         sigma = parameters.measurement_sigma
         return sigma**2 * jnp.eye(self.model.rig.sensor.size(self.geometry), dtype=sigma.dtype)
@@ -683,9 +683,3 @@ def _part(core: Core, name: str) -> slice:
             return slice(start, start + size)
         start += size
     raise KeyError(name)
-
-
-def _index(core: Core, name: str) -> Int[Array, " k"]:
-    """Numbers of a field in the tangent of the core."""
-    part = _part(core, name)
-    return jnp.arange(part.start, part.stop)
