@@ -6,8 +6,8 @@ from typing import Any
 
 from jaxslam.filters import information
 from jaxslam.filters.depth_particles import DepthParticles, with_depth_particles
-from jaxslam.filters.fixed_lag import FixedLag, iterated, with_lag
 from jaxslam.filters.filter import Filter
+from jaxslam.filters.fixed_lag import FixedLag, iterated, with_lag
 from jaxslam.filters.frames import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.filters.gaussian_sum import GaussianSum, with_rays
 from jaxslam.filters.slam import (
@@ -90,6 +90,7 @@ MODIFIERS: dict[str, Callable[[Any, int | None], Filter]] = {
     "common": with_common_depth,
     "lag": with_lag,
     "iterated": iterated,
+    "mean": lambda base, n: replace(base, mean=True),
 }
 """What `+name` behind a filter's name makes of it, with the number that may follow the name: the
 greatest depth of a delayed initialisation, m (`particles`, `rays`); the correlation of depths in

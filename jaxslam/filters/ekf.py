@@ -30,7 +30,6 @@ from jaxslam.filters.blocks import (
     residuals,
     rows,
     shifted,
-    small_products,
     without_auxiliary,
 )
 from jaxslam.filters.state import Features, Innovation, State

@@ -86,6 +86,8 @@ class FixedLag:
     """Gauss–Newton steps in a frame."""
     converge: bool = False
     """Levenberg–Marquardt to the maximum of the posterior first."""
+    mean: bool = False
+    """Towards the mean of the posterior instead of its maximum."""
 
     def __post_init__(self) -> None:
         if self.lag < 1 or self.iterations < 1:
@@ -245,12 +247,27 @@ class FixedLag:
         )
         A = compared.slope.reshape(-1, variables.size)
         information = A.T @ A + jnp.eye(variables.size, dtype=A.dtype)
+        gradient = variables - compared.residual.ravel() @ A
+        if self.mean:
+            gradient = gradient + jax.grad(self._half_log_det, argnums=2)(
+                parameters, before, variables, frames
+            )
         return NormalEquations(
             point,
             jax.tree.map(lambda x: x[-1], compared),
             jnp.linalg.cholesky(information),
-            variables - compared.residual.ravel() @ A,
+            gradient,
         )
+
+    def _half_log_det(self, parameters, before, variables, frames):
+        _, compared = jax.lax.scan(
+            lambda point, frame: self._advance(parameters, point, frame),
+            sensitivity.begin(before, variables),
+            frames,
+        )
+        A = compared.slope.reshape(-1, variables.size)
+        information = A.T @ A + jnp.eye(variables.size, dtype=A.dtype)
+        return jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(information))))
 
     def _absorbed(self, state: LagState, parameters: Parameters) -> tuple[Distribution, Array]:
         """The Gaussian after the oldest frame, linearised where the window has it, and the

@@ -30,6 +30,7 @@ from jaxslam.filters.blocks import (
     new_landmarks,
     residuals,
     rows,
+    small_products,
     without_auxiliary,
 )
 from jaxslam.filters.state import Features
@@ -185,17 +186,18 @@ def initialise(
     prior: tuple[Float[Array, "*m q"], Float[Array, "*m q"]],
     context: Any,
 ) -> Point:
-    """Landmarks of true pixels and depths that the variables of their slots make."""
+    """Landmarks as the filter begins them, and off by what the variables of their slots say.
+
+    The deviation is linear in them, with a σ that does not depend on the rest of the state. Were
+    it differentiated by the scale of a gauge, the maximum of the posterior would be off by about
+    N σ_λ² after N landmarks: the score of an amplitude has no mean of zero.
+    """
     if features.slots.size == 0:
         return point
-    mean, sigma = (jnp.broadcast_to(x, (features.slots.size, x.shape[-1])) for x in prior)
-    p, k = noise.shape[0], noise.shape[0] + mean.shape[1]
+    new, J, root = new_landmarks(model, point, features, noise, prior, context)
+    k = root.shape[-1]
     own = point.variables[indices(features.slots, point)[:, :k]]
-    true = replace(
-        features, measured=features.measured + own[:, :p] @ jnp.linalg.cholesky(noise).T
-    )
-    drawn = (mean + sigma * own[:, p:], sigma)
-    new, J, root = new_landmarks(model, point, true, noise, drawn, context)
+    new = new + small_products(root, own[:, :, None])[:, :, 0]
 
     S, c, capacity = point.sensitivity, point.core_dim, point.active.size
     slots = jnp.where(features.valid, features.slots, capacity)  # out of bounds: dropped
