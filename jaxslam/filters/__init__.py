@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from jaxslam.filters import information
+from jaxslam.filters.bank import Bank, with_directions, with_scales
 from jaxslam.filters.depth_particles import DepthParticles, with_depth_particles
 from jaxslam.filters.filter import Filter
 from jaxslam.filters.fixed_lag import FixedLag, iterated, with_lag
@@ -90,11 +91,17 @@ MODIFIERS: dict[str, Callable[[Any, int | None], Filter]] = {
     "common": with_common_depth,
     "lag": with_lag,
     "iterated": iterated,
-    "mean": lambda base, n: replace(base, mean=True),
+    "scales": with_scales,
+    "directions": with_directions,
 }
 """What `+name` behind a filter's name makes of it, with the number that may follow the name: the
 greatest depth of a delayed initialisation, m (`particles`, `rays`); the correlation of depths in
-percent (`common`); frames (`lag`); steps of Gauss–Newton instead of convergence (`iterated`)."""
+percent (`common`); frames (`lag`); steps of Gauss–Newton instead of convergence (`iterated`);
+members of a Gaussian sum (`scales`, `directions`)."""
+
+RECOMMENDED = "scale_gauge+lag20"
+"""The filter called `recommended`: the most consistent one of docs/consistency.md that is the
+same for every motion."""
 
 
 def make_filters(
@@ -102,10 +109,11 @@ def make_filters(
 ) -> dict[str, Filter]:
     """Every named filter on every named parametrization, keyed `filter/landmarks`.
 
-    A filter may be modified: `world+particles`, `robocentric+rays100`. Raises ValueError for a
-    name that is not known, and for a filter and a parametrization that do not go together.
+    A filter may be modified: `world+particles`, `scale_gauge+lag10`. `recommended` stands for
+    `RECOMMENDED`. Raises ValueError for a name that is not known, and for a filter and a
+    parametrization that do not go together.
     """
-    filters = list(filters)
+    filters = [RECOMMENDED if name == "recommended" else name for name in filters]
     chosen("filters", [name.partition("+")[0] for name in filters], FILTERS)
     return {
         f"{name}/{landmark.name}": make_filter(rig, name, landmark, calibration)
@@ -130,6 +138,8 @@ __all__ = [
     "CALIBRATIONS",
     "FILTERS",
     "MODIFIERS",
+    "RECOMMENDED",
+    "Bank",
     "DepthParticles",
     "Features",
     "Filter",

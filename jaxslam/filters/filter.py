@@ -36,11 +36,12 @@ class Filter(Protocol):
         parameters: Parameters,
         capacity: int,
         velocity: Float[Array, " v"],
-        velocity_sigma: Float[Array, " v"],
+        velocity_sigma: Float[Array, " v"] | Float[Array, "v v"],
         features: tuple[int, int] | None = None,
     ) -> Any:
-        """The state before frame 0: at the origin of B, with a prior on the velocity and slots for
-        `capacity` landmarks. `features`: the most that a frame has, known and new."""
+        """The state before frame 0: at the origin of B, with a prior on the velocity (σ, or a root
+        of its covariance) and slots for `capacity` landmarks. `features`: the most that a frame
+        has, known and new."""
         ...
 
     def first(self, state: Any, parameters: Parameters, new: Features) -> Any:

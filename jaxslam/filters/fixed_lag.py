@@ -86,8 +86,6 @@ class FixedLag:
     """Gauss–Newton steps in a frame."""
     converge: bool = False
     """Levenberg–Marquardt to the maximum of the posterior first."""
-    mean: bool = False
-    """Towards the mean of the posterior instead of its maximum."""
 
     def __post_init__(self) -> None:
         if self.lag < 1 or self.iterations < 1:
@@ -118,7 +116,7 @@ class FixedLag:
         parameters: Parameters,
         capacity: int,
         velocity: Float[Array, " v"],
-        velocity_sigma: Float[Array, " v"],
+        velocity_sigma: Float[Array, " v"] | Float[Array, "v v"],
         features: tuple[int, int] | None = None,
     ) -> LagState:
         """The base filter's start, and an empty window.
@@ -236,7 +234,7 @@ class FixedLag:
             motion_sigma=drawn(parameters.motion_sigma),
             intrinsics_sigma=drawn(parameters.intrinsics_sigma),
         )
-        base = replace(self.base, engine=sensitivity)
+        base: Any = replace(self.base, engine=sensitivity)
         return base.step(point, parameters, frame.control, frame.seen, frame.new)
 
     def _normal_equations(self, parameters, before, variables, frames) -> NormalEquations:
@@ -248,26 +246,12 @@ class FixedLag:
         A = compared.slope.reshape(-1, variables.size)
         information = A.T @ A + jnp.eye(variables.size, dtype=A.dtype)
         gradient = variables - compared.residual.ravel() @ A
-        if self.mean:
-            gradient = gradient + jax.grad(self._half_log_det, argnums=2)(
-                parameters, before, variables, frames
-            )
         return NormalEquations(
             point,
             jax.tree.map(lambda x: x[-1], compared),
             jnp.linalg.cholesky(information),
             gradient,
         )
-
-    def _half_log_det(self, parameters, before, variables, frames):
-        _, compared = jax.lax.scan(
-            lambda point, frame: self._advance(parameters, point, frame),
-            sensitivity.begin(before, variables),
-            frames,
-        )
-        A = compared.slope.reshape(-1, variables.size)
-        information = A.T @ A + jnp.eye(variables.size, dtype=A.dtype)
-        return jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(information))))
 
     def _absorbed(self, state: LagState, parameters: Parameters) -> tuple[Distribution, Array]:
         """The Gaussian after the oldest frame, linearised where the window has it, and the

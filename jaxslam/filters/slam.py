@@ -319,13 +319,14 @@ class SlamFilter:
         parameters: Parameters,
         capacity: int,
         velocity: Float[Array, " v"],
-        velocity_sigma: Float[Array, " v"],
+        velocity_sigma: Float[Array, " v"] | Float[Array, "v v"],
         features: tuple[int, int] | None = None,
     ) -> State:
         """An exactly known pose at the origin of B, an uncertain velocity, an empty map.
 
-        The velocity is not used by a motion model without one. `features` (how many a frame has
-        at the most, known and new) is for filters that remember frames.
+        Of the velocity's covariance, σ of each number or a root R, `P = R Rᵀ`. The velocity is
+        not used by a motion model without one. `features` (how many a frame has at the most, known
+        and new) is for filters that remember frames.
         """
         del features
         dtype = parameters.measurement_sigma.dtype
@@ -350,19 +351,21 @@ class SlamFilter:
         state = self.engine.empty(core, jnp.tile(empty, (slots, 1)))
         state = replace(state, memory=self.initialisation.memory(capacity, dtype))
         state = self.engine.know(state, 0, tangent_dim(held))
-        state = self._with_velocity(state, jnp.asarray(velocity_sigma, dtype)[:v])
+        sigma = jnp.asarray(velocity_sigma, dtype)
+        root = jnp.diag(sigma[:v]) if sigma.ndim == 1 else sigma
+        state = self._with_velocity(state, root @ root.T)
         if self.depth_correlation:
             common = jnp.full((1, 1), self.depth_correlation, dtype)
             state = self.engine.augment(state, _part(core, "depth_error").start, common)
         return state if self.calibration == "white" else self._with_calibration(state, parameters)
 
-    def _with_velocity(self, state: State, sigma: Float[Array, " v"]) -> State:
+    def _with_velocity(self, state: State, covariance: Float[Array, "v v"]) -> State:
         """The prior on the velocity; in a gauge, on its direction and on the scale.
 
         `v = e^λ ṽ`: λ takes the part along the mean, `λ ≈ nᵀδv/|v|`, and ṽ the rest. With a mean
         of −σ_λ²/2 the speed keeps its own. From standstill the scale is known, and 1.
         """
-        covariance, core = jnp.diag(sigma**2), state.core
+        core = state.core
         place = _part(core, "velocity")
         if not self.scale_gauge:
             return self.engine.augment(state, place.start, covariance)
