@@ -5,8 +5,11 @@ from dataclasses import replace
 
 from jaxslam.filters import information
 from jaxslam.filters.depth_particles import DepthParticles, with_depth_particles
+from jaxslam.filters.first_estimates import with_first_estimates
 from jaxslam.filters.frames import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.filters.gaussian_sum import GaussianSum, with_rays
+from jaxslam.filters.invariant import INVARIANT
+from jaxslam.filters.observability_constrained import with_observability_constraint
 from jaxslam.filters.slam import (
     CALIBRATIONS,
     Parameters,
@@ -52,20 +55,28 @@ def information_filter(rig: Rig, landmark: Parametrization, calibration: str) ->
     return replace(keyframe(rig, landmark, calibration), engine=information)
 
 
+def invariant_filter(rig: Rig, landmark: Parametrization, calibration: str) -> SlamFilter:
+    """`world` with the right-invariant error: landmarks' errors move with the pose's."""
+    return replace(world(rig, landmark, calibration), engine=INVARIANT)
+
+
 FILTERS: dict[str, Callable[[Rig, Parametrization, str], SlamFilter]] = {
     "robocentric": robocentric,
     "world": world,
     "keyframe": keyframe,
     "information": information_filter,
+    "invariant": invariant_filter,
 }
 
 
 MODIFIERS: dict[str, Callable[[SlamFilter, int | None], SlamFilter]] = {
     "particles": with_depth_particles,
     "rays": with_rays,
+    "oc": with_observability_constraint,
+    "fej": with_first_estimates,
 }
 """What `+name` behind a filter's name makes of it, with the number that may follow the name:
-the greatest depth of a delayed initialisation, m."""
+the greatest depth of a delayed initialisation, m; none for the consistency remedies."""
 
 
 def make_filters(
@@ -73,8 +84,9 @@ def make_filters(
 ) -> dict[str, SlamFilter]:
     """Every named filter on every named parametrization, keyed `filter/landmarks`.
 
-    A filter may be modified: `world+particles`, `robocentric+rays100`. Raises ValueError for a
-    name that is not known, and for a filter and a parametrization that do not go together.
+    A filter may be modified: `world+oc`, `world+particles`, `robocentric+rays100`. Raises
+    ValueError for a name that is not known, and for a filter and a parametrization that do not go
+    together.
     """
     filters = list(filters)
     chosen("filters", [name.partition("+")[0] for name in filters], FILTERS)
@@ -110,6 +122,7 @@ __all__ = [
     "SlamModel",
     "State",
     "information_filter",
+    "invariant_filter",
     "inverse_depth_prior",
     "keyframe",
     "make_filter",
