@@ -1,13 +1,21 @@
-"""Right-invariant EKF-SLAM (Barrau, Bonnabel, arXiv 2015; Zhang, Wu, Song, Huang, Dissanayake,
-RA-L 2017): a world-centric filter with another error.
+"""Right-invariant EKF-SLAM (Barrau, Bonnabel, arXiv:1510.06263, 2015; Zhang, Wu, Song, Huang,
+Dissanayake, RA-L 2017): a world-centric filter with another error.
 
-Its error ξ is that of the group SE_{1+N}(n), of which every landmark shares the pose's part:
-`x ⊞ ξ`: pose ← Exp(ξ_pose) pose, landmark ← Exp(ξ_pose) · (landmark + ξ_l), where a rigid motion
-acts on a parametrization by its `transform`. In these coordinates N is constant, the identity on
-ξ_pose, and H N = 0 at any estimate. The covariance is kept in the coordinates of every other
-filter here, δ = B(x) ξ: an update is then followed by `B(x⁺) B(x)⁻¹ = I + (N(x⁺) − N(x)) L`, with
-the gauge L read from the pose alone. For Cartesian landmarks the published `p ← R p + V ξ_p`
-differs by `(V − R)(ξ_p − ξ_position)`: to first order not at all.
+Its error ξ is that of a group in which every landmark shares the pose's part, `x ⊞ ξ`:
+
+    pose ← Exp(ξ_pose) pose,
+    landmark ← Exp(ξ_pose/2) · (Exp(ξ_pose/2) · landmark + ξ_l),
+
+where a rigid motion acts on a parametrization by its `transform`. For Cartesian landmarks this is
+the published SE_{1+N}, `p ← R p + V (ξ_l + ξ_position)`, but for a factor sin(θ/2)/(θ/2) of ξ_l in
+a plane. Adding ξ_l after the whole motion, or before it, is right to first order only, and moves
+every landmark by ∓θ²/2 of its distance with every correction.
+
+In these coordinates N is constant, the identity on ξ_pose, and H N = 0 at any estimate. The
+covariance is kept in the coordinates of every other filter here, δ = B(x) ξ: an update is then
+followed by `B(x⁺) B(x)⁻¹ = I + (N(x⁺) − N(x)) L`, with the gauge L read from the pose alone. The
+gauge is the base frame's: nothing is done for the scale. An update in another base frame is the
+same update, exactly where `transform` is affine in the landmark, else to first order.
 """
 
 from __future__ import annotations
@@ -40,7 +48,7 @@ def update(
     N, L = _rigid_directions(model, state)
     after = _retracted(model, state, added, N, L)
     N_after, _ = _rigid_directions(model, after)
-    return replace(after, covariance=carried(added.covariance, N, N_after, L)), innovation
+    return replace(after, covariance=carried(added.covariance, N_after - N, L)), innovation
 
 
 def update_mean(
@@ -72,11 +80,15 @@ def _retracted(
         [difference(added.core, before.core), (added.landmarks - before.landmarks).ravel()]
     )
     rigid = L @ delta
-    own = shifted(before, delta - N @ rigid)
-    one = jnp.ones((), delta.dtype)
-    core, landmarks = act(model, exp(model.geometry.group, rigid), one, own.core, own.landmarks)
-    landmarks = jnp.where(before.active[:, None], landmarks, added.landmarks)
-    return replace(added, core=core, landmarks=landmarks)
+    half, one = exp(model.geometry.group, rigid / 2), jnp.ones((), delta.dtype)
+
+    def turned(state):
+        core, landmarks = act(model, half, one, state.core, state.landmarks)
+        return replace(state, core=core, landmarks=landmarks)
+
+    after = turned(shifted(turned(before), delta - N @ rigid))
+    landmarks = jnp.where(before.active[:, None], after.landmarks, before.landmarks)
+    return replace(added, core=after.core, landmarks=landmarks)
 
 
 INVARIANT = CovarianceForm(update=update, update_mean=update_mean)

@@ -37,9 +37,15 @@ def update(
 
 def follow(model: SlamModel, before: State, after: State) -> State:
     """`after` an update, with its covariance carried from N(before) to N(after)."""
+    return replace(after, covariance=carried(after.covariance, *transport(model, before, after)))
+
+
+def transport(
+    model: SlamModel, before: State, after: State
+) -> tuple[Float[Array, "n g"], Float[Array, "g n"]]:
+    """`N(x⁺) − N(x)` and L: the gauge is read from pose and velocity."""
     N, N_after = (unobservable_directions(model, state) for state in (before, after))
-    L = read_from(N, tangent_dim((before.core.pose, before.core.velocity)))
-    return replace(after, covariance=carried(after.covariance, N, N_after, L))
+    return N_after - N, read_from(N, tangent_dim((before.core.pose, before.core.velocity)))
 
 
 OBSERVABILITY_CONSTRAINED = CovarianceForm(update=update)
@@ -49,6 +55,6 @@ def with_observability_constraint(slam_filter: SlamFilter, number: int | None = 
     """`+oc`. Raises ValueError where there is nothing to constrain, or N is not known."""
     if number is not None:
         raise ValueError(f"modifier oc takes no number, not {number}")
-    check_plain(slam_filter, "an observability constraint")
+    check_plain(slam_filter, "oc")
     check_gauge(slam_filter.model)
     return replace(slam_filter, engine=OBSERVABILITY_CONSTRAINED)

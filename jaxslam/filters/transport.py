@@ -73,13 +73,9 @@ def read_from(N: Float[Array, "n g"], count: int) -> Float[Array, "g n"]:
 
 
 def carried(
-    covariance: Float[Array, "n n"],
-    before: Float[Array, "n g"],
-    after: Float[Array, "n g"],
-    L: Float[Array, "g n"],
+    covariance: Float[Array, "n n"], change: Float[Array, "n g"], L: Float[Array, "g n"]
 ) -> Float[Array, "n n"]:
-    """`M P Mᵀ` with `M = I + (N(x⁺) − N(x)) L`, by products of rank g."""
-    change = after - before
+    """`M P Mᵀ` with `M = I + change L`, by products of rank g; the change is N(x⁺) − N(x)."""
     left = covariance + change @ (L @ covariance)
     covariance = left + (left @ L.T) @ change.T
     return (covariance + covariance.T) / 2
