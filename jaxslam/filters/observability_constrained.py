@@ -1,10 +1,9 @@
 """Observability-constrained EKF (Huang, Mourikis, Roumeliotis, IJRR 2010; Hesch et al., IJRR 2014).
 
-The published filters change Φ and H so that the linearised system cannot see more than the true
-one: `H* N_{k|k-1} = 0` and `Φ* N_{k|k-1} = N_{k+1|k}` (Hesch et al., eq. 39 and 40). Here N is
-taken at the latest estimates, landmarks included, so that H needs no change, and `Φ* = Φ M`
-(`transport`): M changes, as theirs does, the columns of pose and velocity, from which the gauge of
-an error is read. It serves both frames, and the scale of a monocular filter as well.
+The published filters change the Jacobians so that the linearised system cannot see more than the
+true one, `H* N_{k|k-1} = 0` and `Φ* N_{k|k-1} = N_{k+1|k}`. Here N is taken at the latest
+estimates, landmarks included, so that H needs no change, and `Φ* = Φ M` (`transport`); M changes
+the columns of pose and velocity alone. It serves both frames, and the scale of a monocular filter.
 """
 
 from __future__ import annotations
@@ -43,7 +42,11 @@ def follow(model: SlamModel, before: State, after: State) -> State:
 def transport(
     model: SlamModel, before: State, after: State
 ) -> tuple[Float[Array, "n g"], Float[Array, "g n"]]:
-    """`N(x⁺) − N(x)` and L: the gauge is read from pose and velocity."""
+    """`N(x⁺) − N(x)` and L: the frame is read from the pose, the scale from the velocity.
+
+    Least squares over the whole error, landmarks included, would be an L as well. It is measurably
+    worse: what is read should be what is known best. Of a camera at rest the scale is not read.
+    """
     N, N_after = (unobservable_directions(model, state) for state in (before, after))
     return N_after - N, read_from(N, tangent_dim((before.core.pose, before.core.velocity)))
 
