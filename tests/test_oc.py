@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Case, close, each_geometry, each_landmark, named, pose, quick_jit
+from cases import Case, close, each_landmark, named, pose, quick_jit
 from test_observability import GAUGE, nullity
 
 from jaxslam.camera import Camera
@@ -23,7 +23,14 @@ from jaxslam.filters.gauge import act, unobservable_directions
 from jaxslam.filters.observability_constrained import transport
 from jaxslam.filters.slam import Context, Core
 from jaxslam.geometry import PLANAR, SPATIAL, SplitPose, difference, tangent_dim
-from jaxslam.landmarks import CARTESIAN, IMAGE_PLANE, INVERSE_DEPTH, INVERSE_SCALING, LANDMARKS
+from jaxslam.landmarks import (
+    CARTESIAN,
+    FRAMED_HOMOGENEOUS,
+    IMAGE_PLANE,
+    INVERSE_DEPTH,
+    INVERSE_SCALING,
+    LANDMARKS,
+)
 from jaxslam.motion import CONSTANT_VELOCITY, ODOMETRY
 from jaxslam.rig import Rig
 from jaxslam.sensors import CAMERA
@@ -96,14 +103,11 @@ def moved(model, core, landmarks):
     return model.compose_core(core, here), landmarks
 
 
-with_frame = pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD], ids=named)
-with_geometry = pytest.mark.parametrize("geometry", each_geometry, ids=named)
-
-
-@with_frame
 @pytest.mark.parametrize(
-    ("geometry", "landmark"),
-    [(PLANAR, landmark) for landmark in each_landmark] + [(SPATIAL, INVERSE_DEPTH)],
+    ("geometry", "landmark", "frame"),
+    [(PLANAR, landmark, WORLD) for landmark in each_landmark]
+    + [(PLANAR, INVERSE_SCALING, ROBOCENTRIC), (PLANAR, FRAMED_HOMOGENEOUS, ROBOCENTRIC)]
+    + [(SPATIAL, INVERSE_DEPTH, WORLD)],
     ids=named,
 )
 def test_the_gauge_changes_no_measurement_now_or_after_a_motion(geometry, landmark, frame):
@@ -129,8 +133,8 @@ def test_the_gauge_changes_no_measurement_now_or_after_a_motion(geometry, landma
     np.testing.assert_allclose(difference(actual[0], expected[0]), 0, atol=1e-12)
 
 
-@with_frame
-@pytest.mark.parametrize("landmark", each_landmark, ids=named)
+@pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD], ids=named)
+@pytest.mark.parametrize("landmark", [INVERSE_SCALING, FRAMED_HOMOGENEOUS], ids=named)
 def test_directions_are_the_derivative_of_the_action(landmark, frame):
     """H N = 0, by other Jacobians than N's; empty slots do not move."""
     model = SlamModel(VELOCITY, landmark, frame)
@@ -211,11 +215,8 @@ RIGS = {"velocity": (CONSTANT_VELOCITY, CAMERA), "odometry": (ODOMETRY, CAMERA)}
     ("geometry", "landmark", "frame", "rig"),
     [
         (PLANAR, CARTESIAN, ROBOCENTRIC, "velocity"),
-        (PLANAR, IMAGE_PLANE, ROBOCENTRIC, "odometry"),
-        (PLANAR, INVERSE_SCALING, WORLD, "velocity"),
         (PLANAR, CARTESIAN, WORLD, "odometry"),
         (SPATIAL, IMAGE_PLANE, ROBOCENTRIC, "velocity"),
-        (SPATIAL, CARTESIAN, WORLD, "velocity"),
         (SPATIAL, CARTESIAN, WORLD, "odometry"),
     ],
     ids=lambda value: getattr(value, "name", value),
@@ -289,17 +290,11 @@ def difference_of_runs(slam, geometry, directions):
 
 REMEDIES = [
     ("robocentric+oc", PLANAR, "inverse_scaling"),
-    ("robocentric+oc", PLANAR, "inverse_depth"),
-    ("robocentric+oc", PLANAR, "framed_homogeneous"),
-    ("world+oc", PLANAR, "inverse_scaling"),
     ("world+oc", PLANAR, "parallax_angle"),
     ("world+oc", PLANAR, "framed_homogeneous"),
     ("world+fej", PLANAR, "inverse_scaling"),
-    ("world+fej", PLANAR, "inverse_depth"),
-    ("invariant", PLANAR, "inverse_scaling"),
     ("invariant", PLANAR, "anchored_homogeneous"),
     ("robocentric+oc", SPATIAL, "inverse_scaling"),
-    ("world+oc", SPATIAL, "inverse_depth"),
 ]
 
 
