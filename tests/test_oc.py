@@ -290,11 +290,9 @@ def difference_of_runs(slam, geometry, directions):
 
 REMEDIES = [
     ("robocentric+oc", PLANAR, "inverse_scaling"),
-    ("world+oc", PLANAR, "parallax_angle"),
     ("world+oc", PLANAR, "framed_homogeneous"),
     ("world+fej", PLANAR, "inverse_scaling"),
     ("invariant", PLANAR, "anchored_homogeneous"),
-    ("robocentric+oc", SPATIAL, "inverse_scaling"),
 ]
 
 
@@ -309,16 +307,15 @@ def test_uncertainty_of_the_gauge_changes_no_estimate_ever(name, geometry, landm
     assert forgotten < 1e-7
 
 
-@pytest.mark.parametrize("name", ["robocentric", "world"])
-def test_a_plain_filter_learns_what_it_cannot_see(name):
-    slam = make_filter(case(PLANAR).scenario.rig, name, INVERSE_SCALING, "known")
+def test_a_plain_filter_learns_what_it_cannot_see():
+    slam = make_filter(case(PLANAR).scenario.rig, "robocentric", INVERSE_SCALING, "known")
     moved, forgotten = difference_of_runs(slam, PLANAR, GAUGE[PLANAR] + 1)
     assert moved > 1e-5
     assert forgotten > 1e-2
 
 
 def test_with_odometry_a_robocentric_filter_has_nothing_to_constrain():
-    odometry = Case("positions", steps=8)
+    odometry = Case("positions", steps=8, landmarks=6)
     frames = odometry.parameters(), odometry.motion(), *odometry.frames(0)
     plain = odometry.compiled("robocentric", "cartesian")(*frames)[1]
     slam = make_filter(odometry.scenario.rig, "robocentric+oc", CARTESIAN, "known")
@@ -329,7 +326,7 @@ def test_with_odometry_a_robocentric_filter_has_nothing_to_constrain():
 
 def test_where_the_heading_is_known_all_are_the_kalman_filter():
     """Relative positions at a known heading are linear: one filter in every coordinates."""
-    case = Case("positions", steps=8, odometry_sigma=(0.05, 0.05, 0.0))
+    case = Case("positions", steps=8, landmarks=6, odometry_sigma=(0.05, 0.05, 0.0))
     frames = case.parameters(), case.motion(), *case.frames(0)
     linear = case.compiled("world", "cartesian")(*frames)[1]
     assert np.trace(linear[1][-1]) > 1e-3
