@@ -8,9 +8,12 @@ from jaxslam.filters import information
 from jaxslam.filters.bank import Bank, with_directions, with_scales
 from jaxslam.filters.depth_particles import DepthParticles, with_depth_particles
 from jaxslam.filters.filter import Filter
+from jaxslam.filters.first_estimates import with_first_estimates
 from jaxslam.filters.fixed_lag import FixedLag, iterated, with_lag
 from jaxslam.filters.frames import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.filters.gaussian_sum import GaussianSum, with_rays
+from jaxslam.filters.invariant import INVARIANT
+from jaxslam.filters.observability_constrained import with_observability_constraint
 from jaxslam.filters.slam import (
     CALIBRATIONS,
     Parameters,
@@ -70,6 +73,11 @@ def iterated_filter(rig: Rig, landmark: Parametrization, calibration: str) -> Fi
     return iterated(robocentric(rig, landmark, calibration))
 
 
+def invariant_filter(rig: Rig, landmark: Parametrization, calibration: str) -> SlamFilter:
+    """`world` with the right-invariant error: landmarks' errors move with the pose's."""
+    return replace(world(rig, landmark, calibration), engine=INVARIANT)
+
+
 FILTERS: dict[str, Callable[[Rig, Parametrization, str], Filter]] = {
     "robocentric": robocentric,
     "world": world,
@@ -77,6 +85,7 @@ FILTERS: dict[str, Callable[[Rig, Parametrization, str], Filter]] = {
     "information": information_filter,
     "scale_gauge": scale_gauge,
     "iterated": iterated_filter,
+    "invariant": invariant_filter,
 }
 
 
@@ -93,11 +102,15 @@ MODIFIERS: dict[str, Callable[[Any, int | None], Filter]] = {
     "iterated": iterated,
     "scales": with_scales,
     "directions": with_directions,
+    "oc": with_observability_constraint,
+    "fej": with_first_estimates,
 }
 """What `+name` behind a filter's name makes of it, with the number that may follow the name: the
 greatest depth of a delayed initialisation, m (`particles`, `rays`); the correlation of depths in
 percent (`common`); frames (`lag`); steps of Gauss–Newton instead of convergence (`iterated`);
-members of a Gaussian sum (`scales`, `directions`)."""
+members of a Gaussian sum (`scales`, `directions`). None for the consistency remedies `oc`, `fej`."""
+
+_OF_ANY_FILTER = ("iterated", "scales", "directions")
 
 RECOMMENDED = "scale_gauge+lag20"
 """The filter called `recommended`: the most consistent one of docs/consistency.md that is the
@@ -109,9 +122,9 @@ def make_filters(
 ) -> dict[str, Filter]:
     """Every named filter on every named parametrization, keyed `filter/landmarks`.
 
-    A filter may be modified: `world+particles`, `scale_gauge+lag10`. `recommended` stands for
-    `RECOMMENDED`. Raises ValueError for a name that is not known, and for a filter and a
-    parametrization that do not go together.
+    A filter may be modified: `world+oc`, `world+particles`, `scale_gauge+lag10`. `recommended`
+    stands for `RECOMMENDED`. Raises ValueError for a name that is not known, and for a filter and
+    a parametrization that do not go together.
     """
     filters = [RECOMMENDED if name == "recommended" else name for name in filters]
     chosen("filters", [name.partition("+")[0] for name in filters], FILTERS)
@@ -130,6 +143,8 @@ def make_filter(rig: Rig, name: str, landmark: Parametrization, calibration: str
         word = modifier.rstrip("0123456789")
         number = modifier[len(word) :]
         modify = chosen("modifiers", [word], MODIFIERS)[word]
+        if not isinstance(made, SlamFilter) and word not in _OF_ANY_FILTER:
+            raise ValueError(f"in {name} the modifier {word} must stand before those of windows")
         made = modify(made, int(number) if number else None)
     return made
 
@@ -151,6 +166,7 @@ __all__ = [
     "SlamModel",
     "State",
     "information_filter",
+    "invariant_filter",
     "inverse_depth_prior",
     "keyframe",
     "make_filter",

@@ -31,6 +31,8 @@ from jaxslam.rig import Rig
 
 LAG = 10
 """Frames of a lag whose number is not said."""
+MOST_MOVED = 1.0
+"""Of any variable in one step, in σ of its prior."""
 MOST_STEPS = 30
 """Of Levenberg–Marquardt in one frame."""
 
@@ -71,8 +73,9 @@ class NormalEquations(NamedTuple):
     gradient: Float[Array, " N"]
 
     def step(self) -> Float[Array, " N"]:
-        """δ."""
-        return -cho_solve((self.root, True), self.gradient)
+        """δ, shortened where it is longer than Gauss–Newton can be trusted."""
+        delta = -cho_solve((self.root, True), self.gradient)
+        return delta * jnp.minimum(1.0, MOST_MOVED / jnp.max(jnp.abs(delta)))
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,8 @@ class FixedLag:
     """Levenberg–Marquardt to the maximum of the posterior first."""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.base, SlamFilter):
+            raise ValueError("a fixed lag is around a filter, not around another window or a sum")
         if self.lag < 1 or self.iterations < 1:
             raise ValueError(
                 f"a fixed lag has at least 1 frame and 1 iteration, not {self.lag} and "
