@@ -31,8 +31,6 @@ from jaxslam.rig import Rig
 
 LAG = 10
 """Frames of a lag whose number is not said."""
-MOST_MOVED = 1.0
-"""Of any variable in one step, in σ of its prior."""
 MOST_STEPS = 30
 """Of Levenberg–Marquardt in one frame."""
 
@@ -73,9 +71,8 @@ class NormalEquations(NamedTuple):
     gradient: Float[Array, " N"]
 
     def step(self) -> Float[Array, " N"]:
-        """δ, shortened where it is longer than Gauss–Newton can be trusted."""
-        delta = -cho_solve((self.root, True), self.gradient)
-        return delta * jnp.minimum(1.0, MOST_MOVED / jnp.max(jnp.abs(delta)))
+        """δ."""
+        return -cho_solve((self.root, True), self.gradient)
 
 
 @dataclass(frozen=True)
