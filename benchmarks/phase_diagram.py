@@ -288,10 +288,10 @@ def page(rows: list[Row], options: Options) -> str:
         f"{len(rows)} cells, {options.runs} runs each, {options.steps} steps, seed "
         f"{options.seed}: planar worlds of 12 landmarks with truth drawn from the filter's own "
         "prior, the calibration known. The pose has 3 degrees of freedom: a consistent filter "
-        f"has a mean NEES of 3, at the last step inside {low:.2f}–{high:.2f} with 95 %. A cell took "
-        f"{seconds:.2g} s (median, compilation apart) on a machine that other programs shared.",
-        f"**Many comparisons.** Of {len(rows)} consistent cells {0.05 * len(rows):.0f} would be outside "
-        "the 95 % band by chance, so one such cell says little. Bonferroni's band, "
+        f"has a mean NEES of 3, at the last step inside {low:.2f}–{high:.2f} with 95 %. A cell "
+        f"took {seconds:.2g} s (median, compilation apart) on a machine that others used too.",
+        f"**Many comparisons.** Of {len(rows)} consistent cells {0.05 * len(rows):.0f} would be "
+        "outside the 95 % band by chance, so one such cell says little. Bonferroni's band, "
         f"{wide[0]:.2f}–{wide[1]:.2f}, holds *all* of them together with 95 %, however they are "
         "correlated; outside it a cell is inconsistent beyond doubt. Inside it a small "
         "inconsistency may hide. All worlds use the same draws, so that chance moves "
