@@ -15,6 +15,7 @@ import statistics
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -264,14 +265,14 @@ def judged(rows: list[Row], lost_bound: float) -> list[Row]:
     """The rows with a `verdict` by the 95 % band, and one by the band of all rows `together`."""
 
     def verdicts(row):
-        kept = row["runs"] - row["diverged"]
-        numbers = dict(dof=row["dof"], runs=max(kept, 1), lost_bound=lost_bound)
-        alone = verdict(row["nees"], row["lost"], **numbers)
-        return alone, verdict(row["nees"], row["lost"], comparisons=len(rows), **numbers)
+        runs = max(row["runs"] - row["diverged"], 1)
+        judge = partial(verdict, row["nees"], row["lost"], dof=row["dof"], runs=runs)
+        return {
+            "verdict": judge(lost_bound=lost_bound),
+            "together": judge(lost_bound=lost_bound, comparisons=len(rows)),
+        }
 
-    return [
-        {**row, **dict(zip(("verdict", "together"), verdicts(row), strict=True))} for row in rows
-    ]
+    return [{**row, **verdicts(row)} for row in rows]
 
 
 def page(rows: list[Row], options: Options) -> str:
