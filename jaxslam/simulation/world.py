@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +28,10 @@ class Run:
     """With noise."""
     visible: Bool[Array, "frames landmarks"]
     """Which points are measured."""
-    controls: Float[Array, "steps ..."]
-    """The motion model's input of every step: seconds, or the odometry's reading."""
+    controls: Any
+    """The motion model's input of every step: seconds, or a reading."""
+    cameras: Camera
+    """The true camera of every frame."""
 
 
 @jax.tree_util.register_dataclass
@@ -87,7 +90,7 @@ class Prior:
 
 
 def structure(scenario: Scenario) -> Scenario:
-    """The scenario with every number that is in its `Prior` replaced by one.
+    """The scenario with every number that is drawn from its `Prior` replaced by one.
 
     `simulate(structure(s), key, dtype, Prior.of(s))` draws the runs of `s`, and its program is
     compiled once for all scenarios that differ in such numbers only.
@@ -96,7 +99,8 @@ def structure(scenario: Scenario) -> Scenario:
     return replace(
         scenario,
         name="",
-        velocity=(1.0,) * t,
+        # With odometry the nominal motion is the true one: it is not drawn.
+        velocity=scenario.velocity if scenario.motion == "odometry" else (1.0,) * t,
         velocity_sigma=(1.0,) * t,
         acceleration_sigma=(1.0,) * t,
         odometry_sigma=(1.0,) * t,
@@ -136,7 +140,7 @@ def simulate(scenario: Scenario, key: Array, dtype=None, prior: Prior | None = N
     visible = _limited(scenario, jax.random.fold_in(pixel_key, 1), visible)
     noise = jax.random.normal(pixel_key, measured.shape, dtype)
     measured += truth.measurement_sigma * noise
-    return _in_order_of_appearance(Run(poses, points, measured, visible, controls))
+    return _in_order_of_appearance(Run(poses, points, measured, visible, controls, cameras))
 
 
 def sightings(run: Run) -> Sightings:
@@ -198,16 +202,16 @@ def _by_acceleration(scenario: Scenario, prior: Prior, key: Array) -> tuple[Pose
 def _by_odometry(scenario: Scenario, prior: Prior, key: Array) -> tuple[Pose, Array]:
     """The nominal motion exactly; each step is read with an error, `u` = truth − w."""
     geometry, sigma = scenario.rig.geometry, prior.parameters.motion_sigma
-    dtype, nominal = sigma.dtype, prior.velocity / scenario.rate
+    nominal = jnp.asarray(scenario.velocity, sigma.dtype) / scenario.rate
     still = jnp.zeros_like(nominal)
     step = scenario.rig.motion.displacement(geometry, still, still, nominal)
-    noise = jax.random.normal(key, (scenario.steps, geometry.tangent_dim), dtype)
+    noise = jax.random.normal(key, (scenario.steps, geometry.tangent_dim), sigma.dtype)
 
     def move(pose, _):
         pose = (pose @ step).normalize()
         return pose, pose
 
-    start = identity(geometry, dtype)
+    start = identity(geometry, sigma.dtype)
     _, poses = jax.lax.scan(move, start, length=scenario.steps)
     return _with_start(start, poses), nominal - sigma * noise
 
