@@ -23,7 +23,7 @@ import tyro
 
 import jaxslam
 from jaxslam.consistency import CHUNK, MemoryStore, Study, mean_band, normalised_squared, verdict
-from jaxslam.consistency.montecarlo import Seconds, filter_run
+from jaxslam.consistency.montecarlo import Seconds, check_sizes, filter_run
 from jaxslam.files import write_atomically
 from jaxslam.filters import CALIBRATIONS
 from jaxslam.plots.calibration import plot_calibration
@@ -63,6 +63,7 @@ class Options:
         ):
             if not names or set(names) - set(known):
                 raise ValueError(f"{kind} must be some of {', '.join(known)}, not {names}")
+        check_sizes(self.runs, self.seed, "float64", CHUNK)
 
 
 def measure(options: Options) -> Iterator[dict[str, Any]]:
