@@ -301,11 +301,13 @@ def page(rows: list[Row], options: Options) -> str:
         "![Mean NEES of every filter by direction](phase-diagram.png)",
         "## Cells by verdict",
         _shares(rows, names),
-        "## How much acceleration it bears",
+        "## How much it bears",
         "The largest σ of the acceleration, m/s², up to which every cell of the grid, at every "
         "d_min, is inside the band of all cells together and not lost; – where not even the "
-        "smallest is.",
-        _frontier(rows, names),
+        "smallest is:",
+        _frontier(rows, names, "acceleration_sigma_m_s2", "velocity_sigma_m_s", "σ_v = {:g} m/s"),
+        "The largest σ of the initial velocity, m/s, likewise:",
+        _frontier(rows, names, "velocity_sigma_m_s", "acceleration_sigma_m_s2", "σ_a = {:g} m/s²"),
         "## All cells",
         *(f"![{'/'.join(name)}]({_figure_name(name)})" for name in names),
     ]
@@ -343,28 +345,27 @@ def _shares(rows: list[Row], names: list[tuple[str, str]]) -> str:
     return "\n".join(lines)
 
 
-def _frontier(rows: list[Row], names: list[tuple[str, str]]) -> str:
-    velocities = sorted({row["velocity_sigma_m_s"] for row in rows})
-    header = " | ".join(f"σ_v = {v:g} m/s" for v in velocities)
-    lines = [f"| filter | direction | {header} |", "|---|---|" + "---|" * len(velocities)]
+def _frontier(rows: list[Row], names: list[tuple[str, str]], axis: str, by: str, label: str) -> str:
+    """How far every filter goes along an axis, a column for each value of another."""
+    values = sorted({row[by] for row in rows})
+    header = " | ".join(label.format(value) for value in values)
+    lines = [f"| filter | direction | {header} |", "|---|---|" + "---|" * len(values)]
     for name, direction in itertools.product(names, _directions(rows)):
         cells = _select(rows, name, direction)
-        borne = [
-            _borne([row for row in cells if row["velocity_sigma_m_s"] == v]) for v in velocities
-        ]
+        borne = [_borne([row for row in cells if row[by] == value], axis) for value in values]
         if cells:
             lines.append(f"| {'/'.join(name)} | {direction} | {' | '.join(borne)} |")
     return "\n".join(lines)
 
 
-def _borne(cells: list[Row]) -> str:
-    """The largest acceleration up to which all cells are consistent."""
+def _borne(cells: list[Row], axis: str) -> str:
+    """The largest value of the axis up to which all cells are consistent."""
     best = "–"
-    for a in sorted({row["acceleration_sigma_m_s2"] for row in cells}):
-        here = [row for row in cells if row["acceleration_sigma_m_s2"] == a]
+    for value in sorted({row[axis] for row in cells}):
+        here = [row for row in cells if row[axis] == value]
         if any(row["together"] != "consistent" for row in here):
             break
-        best = f"{a:g}"
+        best = f"{value:g}"
     return best
 
 

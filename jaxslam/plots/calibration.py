@@ -26,7 +26,7 @@ def plot_calibration(summary: dict[str, Any], path: str | Path | None = None) ->
         for name in next(iter(by_truth.values()))
     ]
     truths, treatments = summary["truths"], summary["treatments"]
-    figure = new_figure(4.2 * len(panels) + 1.2, 0.75 * len(truths) + 1.9)
+    figure = new_figure(max(4.2 * len(panels) + 1.2, 8.0), 0.75 * len(truths) + 1.9)
     axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for axis, (scenario, name) in zip(axes, panels, strict=True):
         by_truth = summary["scenarios"][scenario]
