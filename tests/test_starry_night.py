@@ -13,7 +13,15 @@ import pytest
 from cases import quick_jit
 from scipy.spatial.transform import Rotation
 
-from jaxslam.datasets.starry_night import pixel_errors, rate_errors, read, window, windows
+from jaxslam.datasets.starry_night import (
+    pixel_errors,
+    rate_errors,
+    read,
+    window,
+    windows,
+    with_reversed_gyroscope,
+    with_white_noise,
+)
 from jaxslam.filters import make_filter
 from jaxslam.geometry import SPATIAL
 from jaxslam.landmarks import LANDMARKS
@@ -64,7 +72,7 @@ def recording():
         "theta_vk_i": np.array([r.as_rotvec() for r in rotations]).T,
         "r_i_vk_i": np.array(positions).T,
         "v_vk_vk_i": (velocity + rate_noise[:, :3]).T,
-        "w_vk_vk_i": (turn + rate_noise[:, 3:]).T,
+        "w_vk_vk_i": -(turn + rate_noise[:, 3:]).T,  # the wrong sign, as in the recording
         "v_var": RATES_SIGMA[:3, None] ** 2,
         "w_var": RATES_SIGMA[3:, None] ** 2,
         "rho_i_pj_i": points.T,
@@ -95,7 +103,11 @@ def test_the_errors_of_the_measurements_are_the_noise_that_was_added(path):
     np.testing.assert_allclose(
         pixel_errors(data), np.where(visible, pixel_noise, np.nan), atol=1e-9
     )
-    np.testing.assert_allclose(rate_errors(data), rate_noise[:-1], atol=1e-9)
+    right = with_reversed_gyroscope(data)
+    np.testing.assert_allclose(rate_errors(right), rate_noise[:-1], atol=1e-9)
+    # Its σ is that of the errors, as long as the truth does not jump; the others are the file's.
+    np.testing.assert_allclose(right.rates_sigma[:3], RATES_SIGMA[:3])
+    np.testing.assert_allclose(right.rates_sigma[3:], rate_noise[:-1, 3:].std(axis=0))
     np.testing.assert_allclose(data.rates_sigma, RATES_SIGMA)
     np.testing.assert_allclose(data.pixel_sigma, PIXEL_SIGMA)
 
@@ -130,6 +142,31 @@ def test_a_window_is_a_run_from_its_first_camera(path):
     np.testing.assert_allclose(
         (run.measured[-1] - pixels)[visible], recording()[1][14][visible], atol=1e-9
     )
+
+
+def test_a_jump_of_the_truth_is_no_error_of_the_gyroscope(tmp_path):
+    arrays, _, rate_noise = recording()
+    theta = arrays["theta_vk_i"].copy()
+    theta[:, 12] += 1.0  # for one frame, at more than 3 rad/s
+    np.savez(tmp_path / "x.npz", **(arrays | {"theta_vk_i": theta}))
+    sigma = with_reversed_gyroscope(read(tmp_path / "x.npz")).rates_sigma[3:]
+    kept = np.delete(rate_noise[:-1], [11, 12], axis=0)
+    np.testing.assert_allclose(sigma, kept[:, 3:].std(axis=0))
+
+
+def test_white_noise_takes_the_place_of_the_recorded_one(path):
+    data = with_reversed_gyroscope(read(path))
+    drawn = [with_white_noise(data, seed) for seed in (0, 0, 1)]
+    np.testing.assert_array_equal(drawn[0].pixels, drawn[1].pixels)
+    assert not np.array_equal(drawn[0].rates, drawn[2].rates)
+    pixels = np.stack([pixel_errors(with_white_noise(data, seed)) for seed in range(40)])
+    rates = np.stack([rate_errors(with_white_noise(data, seed)) for seed in range(40)])
+    np.testing.assert_allclose(np.nanstd(pixels, axis=(0, 1, 2)), PIXEL_SIGMA, rtol=0.05)
+    np.testing.assert_allclose(rates.std(axis=(0, 1)), data.rates_sigma, rtol=0.1)
+    assert (drawn[0].pixels[~data.visible] == -1).all()
+    # Nothing is left of the recorded errors.
+    left = np.nanmean(pixels.mean(axis=0) * pixel_errors(data), axis=(0, 1)) / PIXEL_SIGMA**2
+    assert np.abs(left).max() < 0.1
 
 
 def test_windows_share_no_frame_and_leave_none_out_that_fits(path):
@@ -214,11 +251,13 @@ def test_the_benchmark_writes_its_files(path, tmp_path, capsys):
     out, docs = tmp_path / "results" / "starry_night.json", tmp_path / "docs"
     options = starry_night.Options(
         data=path, filters=("robocentric",), landmarks=("inverse_scaling",), steps=7, out=out,
-        docs=docs,
+        docs=docs, variants=("odometry", "odometry-white"), seeds=2,
     )  # fmt: skip
     starry_night.main(options)
     summary = json.loads(out.read_text())
-    result = summary["motions"]["odometry"]["robocentric/inverse_scaling"]
+    white = summary["variants"]["odometry-white"]["robocentric/inverse_scaling"]
+    assert white["windows"] == 6
+    result = summary["variants"]["odometry"]["robocentric/inverse_scaling"]
     assert (result["windows"], result["diverged"], result["lost"]) == (3, 0, 0)
     assert len(result["nees"]) == 7
     # White noise as stated, in three windows: a consistent filter is below with 99.99 %.
@@ -226,7 +265,7 @@ def test_the_benchmark_writes_its_files(path, tmp_path, capsys):
     # 68 innovations of 2 numbers or so: within a half of 1.
     assert 0.5 < result["nis_per_dof"] < 1.5
     assert result["rmse_m"] < 0.2
-    assert "3 windows of 7 steps" in (docs / "starry-night.md").read_text()
+    assert "Windows of 7 steps" in (docs / "starry-night.md").read_text()
     assert (docs / "starry-night.png").stat().st_size > 1000
 
 
@@ -267,9 +306,10 @@ def test_a_missing_recording_is_one_line_and_status_2(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"motions": ("flight",)}, "motions must be some of odometry, velocity"),
-        ({"steps": 0}, "steps and nearest_depth must be positive, not 0"),
-        ({"nearest_depth": 0.0}, "steps and nearest_depth must be positive"),
+        ({"variants": ("flight",)}, "unknown variants 'flight'; known: odometry, "),
+        ({"steps": 0}, "steps, seeds and nearest_depth must be positive, not 0"),
+        ({"seeds": 0}, "must be positive, not 100, 0, 0.5"),
+        ({"nearest_depth": 0.0}, "steps, seeds and nearest_depth must be positive"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(fields, message):

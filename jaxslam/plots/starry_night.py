@@ -12,15 +12,18 @@ from jaxslam.plots.style import GREY, line_style, new_figure, save
 
 
 def plot_starry_night(summary: dict[str, Any], path: str | Path | None = None) -> Figure:
-    """Draw `{"motions": {motion: {filter: numbers}}, "noise": …}`; a panel for each motion."""
-    motions = {motion: found for motion, found in summary["motions"].items() if found}
-    figure = new_figure(5.2 * len(motions) + 4.6, 4.4)
-    axes = figure.subplots(1, len(motions) + 1, squeeze=False)[0]
-    for axis, (motion, filters) in zip(axes, motions.items(), strict=False):
-        _plot_nees(axis, filters)
+    """Draw `{"variants": {variant: {filter: numbers}}, "noise": …}`; a panel for each variant."""
+    variants = {name: found for name, found in summary["variants"].items() if found}
+    columns = min(len(variants) + 1, 3)
+    rows = -(-(len(variants) + 1) // columns)
+    figure = new_figure(4.6 * columns, 3.7 * rows)
+    grid = figure.add_gridspec(rows, columns)
+    places = [figure.add_subplot(grid[i // columns, i % columns]) for i in range(len(variants) + 1)]
+    for axes, (variant, filters) in zip(places, variants.items(), strict=False):
+        _plot_nees(axes, filters)
         windows = next(iter(filters.values()))["windows"]
-        axis.set_title(f"motion: {motion}, {windows} windows", fontsize=10)
-    _plot_noise(axes[-1], summary["noise"])
+        axes.set_title(f"{variant}: {windows} windows", fontsize=10)
+    _plot_noise(places[-1], summary["noise"])
     if path is not None:
         save(figure, path)
     return figure
@@ -33,6 +36,7 @@ def _plot_nees(axes: Axes, filters: dict[str, Any]) -> None:
     for i, (name, f) in enumerate(filters.items()):
         axes.plot(range(1, len(f["nees"]) + 1), f["nees"], lw=1.6, label=name, **line_style(i))
     axes.set_yscale("log")
+    axes.set_ylim(min(axes.get_ylim()[0], 3), max(axes.get_ylim()[1], 12))
     axes.set_xlabel("step of the window")
     axes.set_ylabel(f"mean pose NEES (ideal {first['dof']})")
     axes.legend(fontsize=8)
