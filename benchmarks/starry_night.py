@@ -262,7 +262,8 @@ def page(summary: dict[str, Any]) -> str:
         "few, so that the 95 % band is wide; it says so in each table.",
         "**Noise** as the recording states it: pixels σ "
         f"{_list(noise['pixel_sigma'], '.1f')}, velocities σ "
-        f"{_list(noise['rates_sigma'][:3], '.3f')} m/s. **The gyroscope** of this file has the wrong sign: its axes correlate with the true "
+        f"{_list(noise['rates_sigma'][:3], '.3f')} m/s. **The gyroscope** of this file "
+        "has the wrong sign: its axes correlate with the true "
         f"rates by {_list(noise['gyroscope_with_truth'], '+.2f')}, and its stated σ of "
         f"{_list(noise['rates_sigma_recorded'][3:], '.2f')} rad/s is that of the mis-signed "
         f"difference. Reversed, it has {_list(noise['rates_sigma'][3:], '.2f')} rad/s against the "
@@ -326,7 +327,7 @@ def _noise_text(noise: dict[str, Any], results: dict[str, Any]) -> str:
             f"{between['v']:+.2f} (v), and an error with itself later as in the table. Errors "
             "shared by a frame look like motion of the camera: the filter believes them, so that "
             "the NEES rises, while the innovations, in which the believed part is gone, stay "
-            "small: an NIS per dof below 1 says under-confident where the NEES says over-confident. "
+            "small: an NIS per dof below 1 says under-confident where NEES says over-confident. "
             "That the NIS is correlated from step to step shows that something is wrong.",
             "",
             *lines,

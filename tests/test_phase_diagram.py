@@ -104,10 +104,13 @@ def test_a_structure_with_the_numbers_as_data_draws_the_same_runs(name):
     expected = quick_jit(lambda key: simulate(scenario, key))(key)
     for a, b in zip(*map(jax.tree.leaves, (drawn(Prior.of(scenario), key), expected)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
-    other = dataclasses.replace(scenario, velocity=(0.5, 0.7, 0.2), nearest_depth=2.0)
+    changes: dict = {"acceleration_sigma": (0.3, 0.2, 0.1), "velocity": (0.5, 0.7, 0.2)}
+    if scenario.motion == "odometry":  # its true path is not drawn, and part of the structure
+        changes = {"odometry_sigma": (0.3, 0.2, 0.1), "position_sigma": 0.7}
+    other = dataclasses.replace(scenario, **changes)
     assert structure(other) == one
     moved = drawn(Prior.of(other), key)
-    assert not np.allclose(moved.poses.translation(), expected.poses.translation())
+    assert not np.allclose(moved.measured, expected.measured)
     assert len(program) == 1
     # What is no number of the prior stays: other steps are another structure.
     assert structure(dataclasses.replace(scenario, steps=5)) != one
