@@ -329,8 +329,8 @@ def _noise_text(noise: dict[str, Any], results: dict[str, Any]) -> str:
             "shared by a frame look like motion of the camera: the filter believes them, so that "
             "the NEES rises, while the innovations, in which the believed part is gone, stay "
             "small: an NIS per dof below 1 says under-confident where NEES says over-confident. "
-            "That the NIS is correlated from step to step shows that something is wrong. The rates' "
-            f"errors have long tails too: {_list(noise['rates_beyond_4_sigma'], '.1%')} of them "
+            "That the NIS is correlated from step to step shows that something is wrong. The rates'"
+            f" errors have long tails too: {_list(noise['rates_beyond_4_sigma'], '.1%')} of them "
             "are beyond 4 σ (0.006 % of a Gaussian's), partly where the truth jumps: a mean over "
             "few windows is that of the worst, and the median says more.",
             "",
