@@ -195,7 +195,7 @@ def page(summary: dict[str, Any]) -> str:
     low, high = mean_band(3, summary["runs"])
     parts = [
         "# An uncertain calibration: which treatment is consistent?",
-        "Made by `python benchmarks/calibration.py`; do not edit. "
+        f"Made by `python benchmarks/calibration.py --runs {summary['runs']}`; do not edit. "
         f"{summary['runs']} runs of {summary['steps']} steps, seed {summary['seed']}, "
         f"{', '.join(next(iter(first.values())))}; planar, σ of the focal length 3 px and of the "
         f"principal point 2 px. A consistent filter has a mean NEES of 3, at the last step inside "

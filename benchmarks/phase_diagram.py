@@ -284,7 +284,7 @@ def page(rows: list[Row], options: Options) -> str:
     names = _filters(rows)
     parts = [
         "# Phase diagram: where a filter holds",
-        "Made by `python benchmarks/phase_diagram.py` from "
+        f"Made by `python benchmarks/phase_diagram.py --runs {options.runs}` from "
         f"[{options.out.name}]({csv_file}); do not edit. "
         f"{len(rows)} cells, {options.runs} runs each, {options.steps} steps, seed "
         f"{options.seed}: planar worlds of 12 landmarks with truth drawn from the filter's own "
