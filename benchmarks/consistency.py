@@ -1,6 +1,6 @@
 """Consistency over scenarios, filters and seeds: mean NEES, lost runs, RMSE, σ and time.
 
-    python benchmarks/consistency.py --scenarios matched-loose --filters robocentric scale_gauge --seeds 10
+    python benchmarks/consistency.py --scenarios matched-loose --filters robocentric --seeds 10
 
 Results are added to `consistency.json` one seed at a time; what it already has is not run again.
 `--page` only writes `docs/consistency.md` from what is there.
@@ -114,11 +114,11 @@ def page(results: Results) -> str:
     lines = [
         "# Consistency, filter by filter",
         "",
-        "`python benchmarks/consistency.py`; every number is measured. NEES is of the camera's pose",
-        "(ideal mean 3, 6 in 6-DoF); *inside*: share of (seed, step) pairs whose mean NEES is in the",
-        "exact 95 % band of so many runs; *lost*: runs above the 99.99 % quantile of χ²; *others*:",
-        "mean NEES without them; *worst*: greatest mean NEES of any step; RMSE and σ of the position.",
-        "All but *inside* and *worst* are at the last step.",
+        "`python benchmarks/consistency.py`; every number is measured. NEES is of the camera's",
+        "pose (ideal mean 3, 6 in 6-DoF); *inside*: share of (seed, step) pairs whose mean NEES is",
+        "in the exact 95 % band of so many runs; *lost*: runs above the 99.99 % quantile of χ²;",
+        "*others*: mean NEES without them; *worst*: greatest mean NEES of any step; RMSE and σ of",
+        "the position. All but *inside* and *worst* are at the last step.",
     ]
     for name, filters in results.items():
         scenario = jaxslam.scenario(name)

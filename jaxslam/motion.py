@@ -1,18 +1,20 @@
 """How a camera moves between two frames: models of a displacement, driven by white noise.
 
 A model says what a *control* makes of the velocity in the state and of this step's noise. The
-control is data: the seconds of the step, or the odometry's reading.
+control is data: the seconds of the step, the odometry's reading, or the rates of a vehicle.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from jaxslam.geometry import Geometry, Pose, exp, joined
+from jaxslam.geometry import Geometry, Pose, exp, identity, joined
 
 
 @dataclass(frozen=True)
@@ -22,12 +24,12 @@ class Motion:
     name: str
     has_velocity: bool
     """Whether the state holds a velocity (t numbers) or none (0)."""
-    displacement: Callable[[Geometry, Array, Array, Array], Pose]
+    displacement: Callable[[Geometry, Array, Array, Any], Pose]
     """`displacement(geometry, velocity, noise, control)`: T_{k-1,k}, the pose of C_k in C_{k-1}."""
-    next_velocity: Callable[[Array, Array, Array], Array]
+    next_velocity: Callable[[Array, Array, Any], Array]
     """`next_velocity(velocity, noise, control)`."""
-    control_shape: Callable[[Geometry], tuple[int, ...]]
-    """Of the array that is the control; zeros stand for no time and no motion."""
+    no_control: Callable[[Geometry, Any], Any]
+    """`no_control(geometry, dtype)`: the control with which nothing moves."""
 
 
 def _next_velocity(velocity, acceleration, dt):
@@ -47,12 +49,33 @@ def _odometry(geometry, velocity, noise, reading):
     return joined(exp(geometry.rotation_group, turned), moved)
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class BodyRates:
+    """The control of `BODY_RATES`: what a vehicle V measures of its motion, and its camera."""
+
+    rates: Float[Array, " t"]
+    """Linear and angular velocity in the axes of V at k−1, m/s and rad/s."""
+    seconds: Float[Array, ""]
+    camera: Pose
+    """T_VC, the camera on the vehicle."""
+
+
+def _body_rates(geometry, velocity, noise, control: BodyRates):
+    """`T_{k-1,k} = T_VC⁻¹ (R = Exp(ω Δt), t = v Δt) T_VC` with (v, ω) = rates + w."""
+    del velocity
+    displaced = (control.rates + noise) * control.seconds
+    moved, turned = jnp.split(displaced, [geometry.point_dim])
+    step = joined(exp(geometry.rotation_group, turned), moved)
+    return control.camera.inverse() @ step @ control.camera
+
+
 CONSTANT_VELOCITY = Motion(
     name="velocity",
     has_velocity=True,
     displacement=_constant_velocity,
     next_velocity=_next_velocity,
-    control_shape=lambda geometry: (),
+    no_control=lambda geometry, dtype: jnp.zeros((), dtype),
 )
 """Constant velocity with white acceleration, m/s² and rad/s²; the control is Δt (P8, P9)."""
 
@@ -61,8 +84,21 @@ ODOMETRY = Motion(
     has_velocity=False,
     displacement=_odometry,
     next_velocity=lambda velocity, noise, reading: velocity,
-    control_shape=lambda geometry: (geometry.tangent_dim,),
+    no_control=lambda geometry, dtype: jnp.zeros(geometry.tangent_dim, dtype),
 )
 """Odometry; the control is its reading u of a step, m and rad, with white error w."""
+
+BODY_RATES = Motion(
+    name="body_rates",
+    has_velocity=False,
+    displacement=_body_rates,
+    next_velocity=lambda velocity, noise, control: velocity,
+    no_control=lambda geometry, dtype: BodyRates(
+        jnp.zeros(geometry.tangent_dim, dtype), jnp.zeros((), dtype), identity(geometry, dtype)
+    ),
+)
+"""Odometry of a vehicle that carries the camera off its centre; the control is `BodyRates`, the
+noise w the white error of its rates, m/s and rad/s: the lever arm correlates what the camera sees
+of it. Not for scenarios, whose camera moves by itself."""
 
 MOTIONS = {motion.name: motion for motion in (CONSTANT_VELOCITY, ODOMETRY)}

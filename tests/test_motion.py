@@ -6,8 +6,8 @@ import pytest
 from cases import each_geometry, named, quick_jit
 from scipy.spatial.transform import Rotation
 
-from jaxslam.geometry import PLANAR
-from jaxslam.motion import MOTIONS, ODOMETRY
+from jaxslam.geometry import PLANAR, exp, identity
+from jaxslam.motion import BODY_RATES, MOTIONS, ODOMETRY, BodyRates
 
 READING = np.array([0.3, -0.1, 0.7, 0.2, -0.5, 0.4])
 ERROR = np.array([0.02, 0.03, -0.01, -0.04, 0.05, 0.02])
@@ -34,6 +34,36 @@ def test_odometry_goes_straight_and_then_turns_by_its_reading_and_error(geometry
     np.testing.assert_allclose(step.rotation().as_matrix(), rotation, atol=1e-15)
     # The straight way is along the axes before the turn.
     np.testing.assert_allclose(step.translation(), reading[:n] + error[:n], rtol=1e-15)
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_rates_of_a_vehicle_are_the_odometry_of_a_camera_at_its_centre(geometry):
+    rates, error = (reading_of(geometry, x) for x in (READING, ERROR))
+    still = jnp.zeros(geometry.tangent_dim)
+    seconds = jnp.asarray(0.2)
+    control = BodyRates(jnp.asarray(rates), seconds, identity(geometry, jnp.dtype(float)))
+    step = quick_jit(lambda *x: BODY_RATES.displacement(geometry, still, *x))(error, control)
+    expected = quick_jit(lambda *x: ODOMETRY.displacement(geometry, still, *x))(
+        0.2 * error, 0.2 * rates
+    )
+    np.testing.assert_allclose(step.as_matrix(), expected.as_matrix(), atol=1e-15)
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_a_vehicle_that_turns_moves_the_camera_by_its_lever_arm(geometry):
+    """T_WC after the step, by way of the vehicle, is that by way of the camera."""
+    rates = jnp.asarray(reading_of(geometry, READING))
+    T_VC = exp(geometry.group, jnp.asarray(reading_of(geometry, 3 * ERROR + 0.2)))
+    still = jnp.zeros(geometry.tangent_dim)
+    control = BodyRates(rates, jnp.asarray(0.5), T_VC)
+    step = quick_jit(lambda c: BODY_RATES.displacement(geometry, still, still, c))(control)
+    vehicle = quick_jit(lambda u: ODOMETRY.displacement(geometry, still, still, u))(0.5 * rates)
+    np.testing.assert_allclose((T_VC @ step).as_matrix(), (vehicle @ T_VC).as_matrix(), atol=1e-14)
+    # A vehicle that only turns moves a camera off its centre.
+    turning = rates.at[: geometry.point_dim].set(0.0)
+    control = BodyRates(turning, jnp.asarray(0.5), T_VC)
+    step = quick_jit(lambda c: BODY_RATES.displacement(geometry, still, still, c))(control)
+    assert np.linalg.norm(step.translation()) > 0.01
 
 
 def test_motions_are_known_by_their_names():

@@ -9,10 +9,12 @@ from jaxslam.consistency.statistics import (
 )
 from jaxslam.consistency.store import FolderStore, MemoryStore
 from jaxslam.consistency.summary import summarise, table
+from jaxslam.consistency.verdict import VERDICTS, verdict
 
 __all__ = [
     "CHUNK",
     "DTYPES",
+    "VERDICTS",
     "FolderStore",
     "MemoryStore",
     "Study",
@@ -23,4 +25,5 @@ __all__ = [
     "normalised_squared",
     "summarise",
     "table",
+    "verdict",
 ]

@@ -16,20 +16,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.consistency.store import MemoryStore, Store
-from jaxslam.filters import Filter, Parameters
+from jaxslam.filters import Filter
 from jaxslam.geometry import Pose
 from jaxslam.simulation import (
+    Prior,
     Run,
     Scenario,
     Sightings,
     features,
-    parameters,
     sightings,
     simulate,
+    structure,
 )
 
 DTYPES = ("float64", "float32")
@@ -43,25 +44,6 @@ class Seconds:
 
     compile: float
     run: float
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Prior:
-    """All that a filter is told of a scenario, as data: other numbers need no other program."""
-
-    parameters: Parameters
-    velocity: Float[Array, " t"]
-    velocity_sigma: Float[Array, " t"]
-
-    @staticmethod
-    def of(scenario: Scenario, dtype: jnp.dtype) -> Prior:
-        """The scenario's own numbers: the truth is drawn from this prior."""
-        return Prior(
-            parameters(scenario, dtype),
-            jnp.asarray(scenario.velocity, dtype),
-            jnp.asarray(scenario.velocity_sigma, dtype),
-        )
 
 
 @dataclass(frozen=True)
@@ -117,12 +99,14 @@ class _Simulator:
     """Draws chunks of runs, all of one shape, so that everything compiles once."""
 
     def __init__(self, scenario: Scenario, seed: int, dtype: str, size: int) -> None:
-        self.scenario, self.dtype, self.size = scenario, jnp.dtype(dtype), size
-        self._key = jax.random.key(seed)
+        self.prior, self.dtype, self.size = Prior.of(scenario, dtype), jnp.dtype(dtype), size
+        # The numbers are data, so that scenarios of one structure share a compiled simulator.
+        self._structure, self._key = structure(scenario), jax.random.key(seed)
 
     def __call__(self, chunk: range) -> tuple[Run, Sightings]:
         """The chunk's runs, padded to `size` by the runs that follow."""
-        return _draw(self.scenario, self.dtype, self._key, chunk.start + jnp.arange(self.size))
+        indices = chunk.start + jnp.arange(self.size)
+        return _draw(self._structure, self.dtype, self.prior, self._key, indices)
 
     def capacity(self, chunks: tuple[range, ...]) -> Sightings:
         """What holds every run of the study, as Python integers."""
@@ -132,10 +116,10 @@ class _Simulator:
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _draw(
-    scenario: Scenario, dtype, key: Array, indices: Int[Array, " runs"]
+    scenario: Scenario, dtype, prior: Prior, key: Array, indices: Int[Array, " runs"]
 ) -> tuple[Run, Sightings]:
     def one(index):
-        run = simulate(scenario, jax.random.fold_in(key, index), dtype)
+        run = simulate(scenario, jax.random.fold_in(key, index), dtype, prior)
         return run, sightings(run)
 
     return jax.vmap(one)(indices)
@@ -145,7 +129,7 @@ def _run_filter(name, slam_filter, simulator, capacity, chunks, store, progress)
     if not chunks:
         return Seconds(0.0, 0.0)
     start = time.perf_counter()
-    prior = Prior.of(simulator.scenario, simulator.dtype)
+    prior = simulator.prior
     batch, _ = simulator(chunks[0])
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (prior, batch))
     leaves, structure = jax.tree.flatten(shapes)

@@ -108,7 +108,7 @@ MODIFIERS: dict[str, Callable[[Any, int | None], Filter]] = {
 """What `+name` behind a filter's name makes of it, with the number that may follow the name: the
 greatest depth of a delayed initialisation, m (`particles`, `rays`); the correlation of depths in
 percent (`common`); frames (`lag`); steps of Gauss–Newton instead of convergence (`iterated`);
-members of a Gaussian sum (`scales`, `directions`). None for the consistency remedies `oc`, `fej`."""
+members of a Gaussian sum (`scales`, `directions`); none for the remedies `oc` and `fej`."""
 
 _OF_ANY_FILTER = ("iterated", "scales", "directions")
 

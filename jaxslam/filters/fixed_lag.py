@@ -222,7 +222,8 @@ class FixedLag:
                 jnp.zeros((self.lag, count), bool),
             )
 
-        control = jnp.zeros((self.lag, *rig.motion.control_shape(rig.geometry)), dtype)
+        still = rig.motion.no_control(rig.geometry, dtype)
+        control = jax.tree.map(lambda x: jnp.tile(x, (self.lag, *(1,) * x.ndim)), still)
         return Frames(jnp.zeros(self.lag, bool), control, features(known), features(new))
 
     def _advance(self, parameters: Parameters, point: Point, frame: Frames):

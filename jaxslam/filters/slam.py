@@ -69,8 +69,9 @@ class Parameters:
     camera: Camera
     intrinsics_sigma: Float[Array, " 2p"]
     """σ of (f, c) or (fx, fy, cx, cy), pixels (D of P15)."""
-    measurement_sigma: Float[Array, ""]
-    """σ of each number measured: a pixel's, or a relative position's in metres."""
+    measurement_sigma: Float[Array, ""] | Float[Array, " p"]
+    """σ of what is measured, one for all its numbers or one each: pixels, or metres of a relative
+    position."""
     motion_sigma: Float[Array, " t"]
     """σ of the noise that drives the motion (Q of P11): acceleration, m/s² and rad/s², or
     odometry, m and rad."""
@@ -643,8 +644,8 @@ class SlamFilter:
 
     def noise(self, parameters: Parameters) -> Float[Array, "p p"]:
         """R of one measurement."""
-        sigma = parameters.measurement_sigma
-        return sigma**2 * jnp.eye(self.model.rig.sensor.size(self.geometry), dtype=sigma.dtype)
+        size = self.model.rig.sensor.size(self.geometry)
+        return jnp.diag(jnp.broadcast_to(parameters.measurement_sigma, size) ** 2)
 
     def _considered(self, state: State) -> slice:
         """The part of the core that updates leave as it is."""

@@ -1,10 +1,20 @@
 """Simulation: scenarios as data, and runs drawn from them."""
 
 from jaxslam.simulation.scenario import BUILT_IN, Scenario, scenario
-from jaxslam.simulation.world import Run, Sightings, features, parameters, sightings, simulate
+from jaxslam.simulation.world import (
+    Prior,
+    Run,
+    Sightings,
+    features,
+    parameters,
+    sightings,
+    simulate,
+    structure,
+)
 
 __all__ = [
     "BUILT_IN",
+    "Prior",
     "Run",
     "Scenario",
     "Sightings",
@@ -13,4 +23,5 @@ __all__ = [
     "scenario",
     "sightings",
     "simulate",
+    "structure",
 ]

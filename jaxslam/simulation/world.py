@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +28,10 @@ class Run:
     """With noise."""
     visible: Bool[Array, "frames landmarks"]
     """Which points are measured."""
-    controls: Float[Array, "steps ..."]
-    """The motion model's input of every step: seconds, or the odometry's reading."""
+    controls: Any
+    """The motion model's input of every step: seconds, or a reading."""
+    cameras: Camera
+    """The true camera of every frame."""
 
 
 @jax.tree_util.register_dataclass
@@ -66,13 +69,63 @@ def parameters(scenario: Scenario, dtype=None) -> Parameters:
     )
 
 
-def simulate(scenario: Scenario, key: Array, dtype=None) -> Run:
-    """Draw one run: a pure function of the key, to be batched by `vmap`."""
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Prior:
+    """All that a filter is told of a scenario, as data: other numbers need no other program."""
+
+    parameters: Parameters
+    velocity: Float[Array, " t"]
+    velocity_sigma: Float[Array, " t"]
+
+    @staticmethod
+    def of(scenario: Scenario, dtype=None) -> Prior:
+        """The scenario's own numbers: the truth is drawn from this prior."""
+        dtype = dtype or jnp.result_type(float)
+        return Prior(
+            parameters(scenario, dtype),
+            jnp.asarray(scenario.velocity, dtype),
+            jnp.asarray(scenario.velocity_sigma, dtype),
+        )
+
+
+def structure(scenario: Scenario) -> Scenario:
+    """The scenario with every number that is drawn from its `Prior` replaced by one.
+
+    `simulate(structure(s), key, dtype, Prior.of(s))` draws the runs of `s`, and its program is
+    compiled once for all scenarios that differ in such numbers only.
+    """
+    t, p = scenario.rig.geometry.tangent_dim, scenario.rig.geometry.pixel_dim
+    return replace(
+        scenario,
+        name="",
+        # With odometry the nominal motion is the true one: it is not drawn.
+        velocity=scenario.velocity if scenario.motion == "odometry" else (1.0,) * t,
+        velocity_sigma=(1.0,) * t,
+        acceleration_sigma=(1.0,) * t,
+        odometry_sigma=(1.0,) * t,
+        nearest_depth=1.0,
+        inverse_depth=(),
+        focal=(1.0,) * p,
+        centre=(1.0,) * p,
+        focal_sigma=1.0,
+        centre_sigma=1.0,
+        pixel_sigma=1.0,
+        position_sigma=1.0,
+    )
+
+
+def simulate(scenario: Scenario, key: Array, dtype=None, prior: Prior | None = None) -> Run:
+    """Draw one run: a pure function of the key, to be batched by `vmap`.
+
+    The truth is drawn from the prior: the scenario's own, or one given as data.
+    """
     motion_key, world_key, camera_key, pixel_key = jax.random.split(key, 4)
     dtype = dtype or jnp.result_type(float)
-    truth = parameters(scenario, dtype)
-    poses, controls = _MOTION[scenario.motion](scenario, truth, motion_key)
-    points = _PLACEMENT[scenario.placement](scenario, truth, world_key)
+    prior = Prior.of(scenario, dtype) if prior is None else prior
+    truth = prior.parameters
+    poses, controls = _MOTION[scenario.motion](scenario, prior, motion_key)
+    points = _PLACEMENT[scenario.placement](scenario, prior, world_key)
     cameras = _cameras(scenario, truth, camera_key)
     measure, one = scenario.rig.sensor.measure, jnp.ones((), dtype)
 
@@ -87,7 +140,7 @@ def simulate(scenario: Scenario, key: Array, dtype=None) -> Run:
     visible = _limited(scenario, jax.random.fold_in(pixel_key, 1), visible)
     noise = jax.random.normal(pixel_key, measured.shape, dtype)
     measured += truth.measurement_sigma * noise
-    return _in_order_of_appearance(Run(poses, points, measured, visible, controls))
+    return _in_order_of_appearance(Run(poses, points, measured, visible, controls, cameras))
 
 
 def sightings(run: Run) -> Sightings:
@@ -127,18 +180,14 @@ def _picked(mask, measured, count: int) -> Features:
     return Features(slots, measured[slots], mask[slots])
 
 
-def _by_acceleration(scenario: Scenario, truth: Parameters, key: Array) -> tuple[Pose, Array]:
+def _by_acceleration(scenario: Scenario, prior: Prior, key: Array) -> tuple[Pose, Array]:
     """White accelerations and an initial velocity from the filter's prior (P8, P9)."""
     start_key, acceleration_key = jax.random.split(key)
-    rig, dtype = scenario.rig, truth.motion_sigma.dtype
-    geometry, motion = rig.geometry, rig.motion
+    rig, sigma = scenario.rig, prior.parameters.motion_sigma
+    geometry, motion, dtype = rig.geometry, rig.motion, sigma.dtype
     t, dt = geometry.tangent_dim, jnp.asarray(1 / scenario.rate, dtype)
-    velocity = jnp.asarray(scenario.velocity, dtype) + jnp.asarray(
-        scenario.velocity_sigma, dtype
-    ) * jax.random.normal(start_key, (t,), dtype)
-    accelerations = truth.motion_sigma * jax.random.normal(
-        acceleration_key, (scenario.steps, t), dtype
-    )
+    velocity = prior.velocity + prior.velocity_sigma * jax.random.normal(start_key, (t,), dtype)
+    accelerations = sigma * jax.random.normal(acceleration_key, (scenario.steps, t), dtype)
 
     def move(carry, acceleration):
         pose, velocity = carry
@@ -150,21 +199,21 @@ def _by_acceleration(scenario: Scenario, truth: Parameters, key: Array) -> tuple
     return _with_start(start, poses), jnp.full(scenario.steps, dt)
 
 
-def _by_odometry(scenario: Scenario, truth: Parameters, key: Array) -> tuple[Pose, Array]:
+def _by_odometry(scenario: Scenario, prior: Prior, key: Array) -> tuple[Pose, Array]:
     """The nominal motion exactly; each step is read with an error, `u` = truth − w."""
-    geometry, dtype = scenario.rig.geometry, truth.motion_sigma.dtype
-    nominal = jnp.asarray(scenario.velocity, dtype) / scenario.rate
+    geometry, sigma = scenario.rig.geometry, prior.parameters.motion_sigma
+    nominal = jnp.asarray(scenario.velocity, sigma.dtype) / scenario.rate
     still = jnp.zeros_like(nominal)
     step = scenario.rig.motion.displacement(geometry, still, still, nominal)
-    noise = jax.random.normal(key, (scenario.steps, geometry.tangent_dim), dtype)
+    noise = jax.random.normal(key, (scenario.steps, geometry.tangent_dim), sigma.dtype)
 
     def move(pose, _):
         pose = (pose @ step).normalize()
         return pose, pose
 
-    start = identity(geometry, dtype)
+    start = identity(geometry, sigma.dtype)
     _, poses = jax.lax.scan(move, start, length=scenario.steps)
-    return _with_start(start, poses), nominal - truth.motion_sigma * noise
+    return _with_start(start, poses), nominal - sigma * noise
 
 
 _MOTION = {"velocity": _by_acceleration, "odometry": _by_odometry}
@@ -216,9 +265,10 @@ def _at_most(mask, order, count) -> Bool[Array, " l"]:
     return mask & (rank < count)
 
 
-def _from_prior(scenario: Scenario, truth: Parameters, key: Array) -> Float[Array, "l n"]:
+def _from_prior(scenario: Scenario, prior: Prior, key: Array) -> Float[Array, "l n"]:
     """Uniform pixels of frame 0, inverse depths from the prior, truncated."""
     pixel_key, depth_key = jax.random.split(key)
+    truth = prior.parameters
     dtype, count = truth.motion_sigma.dtype, scenario.landmarks
     low, high = jnp.asarray(scenario.first_pixels, dtype).T
     pixels = jax.random.uniform(pixel_key, (count, low.size), dtype, minval=low, maxval=high)
@@ -229,20 +279,20 @@ def _from_prior(scenario: Scenario, truth: Parameters, key: Array) -> Float[Arra
     return jnp.column_stack([bearings, jnp.ones(count, dtype)]) / inverse_depths[:, None]
 
 
-def _on_ring(scenario: Scenario, truth: Parameters, key: Array) -> Float[Array, "l n"]:
+def _on_ring(scenario: Scenario, prior: Prior, key: Array) -> Float[Array, "l n"]:
     """Evenly on a circle about the centre of the nominal path, at the camera's height."""
     del key
-    dtype = truth.motion_sigma.dtype
-    *linear, rotation = scenario.velocity
+    dtype = prior.velocity.dtype
+    *linear, rotation = prior.velocity
     # x' = v + ω J x has its fixed point, the centre, at J v / ω: left of a camera that turns
     # from x towards z.
-    centre = jnp.asarray([-linear[-1] / rotation, linear[0] / rotation], dtype)
+    centre = jnp.stack([-linear[-1] / rotation, linear[0] / rotation])
     angles = 2 * jnp.pi * jnp.arange(scenario.landmarks, dtype=dtype) / scenario.landmarks
     ring = centre + scenario.ring_radius * jnp.column_stack([jnp.cos(angles), jnp.sin(angles)])
     return ring.astype(dtype)
 
 
-def _in_room(scenario: Scenario, truth: Parameters, key: Array) -> Float[Array, "72 3"]:
+def _in_room(scenario: Scenario, prior: Prior, key: Array) -> Float[Array, "72 3"]:
     """The cloister of slamtb: nine points along each wall of a 12 m room, in two rows, 1 m apart
     in height; the camera starts 0.6 m above the lower ones, 5 m from the centre, looking along
     the wall."""
@@ -255,7 +305,7 @@ def _in_room(scenario: Scenario, truth: Parameters, key: Array) -> Float[Array, 
     east, north, up = jnp.concatenate(
         [jnp.column_stack([plane, jnp.full(len(plane), height)]) for height in (0, 1)]
     ).T
-    return jnp.column_stack([-(north + 5), 0.6 - up, east]).astype(truth.motion_sigma.dtype)
+    return jnp.column_stack([-(north + 5), 0.6 - up, east]).astype(prior.velocity.dtype)
 
 
 _PLACEMENT = {"prior": _from_prior, "ring": _on_ring, "room": _in_room}

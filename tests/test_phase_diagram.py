@@ -1,0 +1,284 @@
+"""Tests of the phase diagram: verdicts, its file, resuming, its page and its figure."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from cases import quick_jit
+
+import jaxslam
+from jaxslam.consistency import VERDICTS, mean_band, verdict
+from jaxslam.plots.phase import PhaseCell, plot_phase_diagram
+from jaxslam.simulation import Prior, simulate, structure
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+
+import phase_diagram
+
+OPTIONS = phase_diagram.Options(
+    accelerations=(0.2, 1.0),
+    velocities=(0.1,),
+    depths=(3.0,),
+    directions=("sideways", "turn"),
+    filters=("robocentric",),
+    landmarks=("inverse_scaling",),
+    runs=4,
+    steps=3,
+)
+
+
+# --- the verdict --------------------------------------------------------------------------------
+
+
+def test_a_mean_is_judged_by_the_band_of_its_runs():
+    low, high = mean_band(3, 100)
+    for nees, expected in (
+        (3.0, "consistent"),
+        (low + 1e-6, "consistent"),
+        (low - 1e-6, "under-confident"),
+        (high - 1e-6, "consistent"),
+        (high + 1e-6, "over-confident"),
+    ):
+        assert verdict(nees, 0.0, dof=3, runs=100) == expected
+    # The same mean of more runs is no longer chance.
+    assert verdict(3.2, 0.0, dof=3, runs=100) == "consistent"
+    assert verdict(3.2, 0.0, dof=3, runs=1000) == "over-confident"
+
+
+def test_lost_runs_come_first_and_their_bound_is_not_lost_yet():
+    assert verdict(3.0, 0.011, dof=3, runs=1000) == "lost"
+    assert verdict(3.0, 0.01, dof=3, runs=1000) == "consistent"
+    assert verdict(3.0, 0.04, dof=3, runs=1000, lost_bound=0.05) == "consistent"
+    for nees in (None, float("nan")):
+        assert verdict(nees, 0.0, dof=3, runs=1000) == "lost"
+
+
+def test_many_comparisons_are_inside_their_band_together():
+    """2000 times 50 means of consistent filters: all 50 are inside in 95 % of cases, or more."""
+    rng = np.random.default_rng(0)
+    means = rng.chisquare(3 * 20, (2000, 50)) / 20
+    alone, together = (
+        np.array(
+            [[verdict(m, 0.0, dof=3, runs=20, comparisons=c) for m in row] for row in means[:n]]
+        )
+        for c, n in ((1, 200), (50, 2000))
+    )
+    assert np.mean(alone == "consistent") == pytest.approx(0.95, abs=0.01)
+    assert np.mean((alone == "consistent").all(axis=1)) < 0.2
+    assert np.mean((together == "consistent").all(axis=1)) == pytest.approx(0.95, abs=0.02)
+    assert set(np.unique(together)) <= set(VERDICTS)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"comparisons": 0}, "comparisons must be at least 1, not 0"),
+        ({"lost": 1.5}, "lost must be a share from 0 to 1, not 1.5"),
+        ({"lost": float("nan")}, "lost must be a share from 0 to 1"),
+        ({"lost_bound": -0.1}, "lost_bound must be a share from 0 to 1, not -0.1"),
+        ({"runs": 0}, "at least one run"),
+    ],
+)
+def test_a_verdict_refuses_numbers_that_make_no_sense(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        verdict(**{"nees": 3.0, "lost": 0.0, "dof": 3, "runs": 10, **arguments})
+
+
+# --- one simulator for all worlds ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["matched-loose", "circle", "positions"])
+def test_a_structure_with_the_numbers_as_data_draws_the_same_runs(name):
+    scenario = jaxslam.scenario(name, steps=4)
+    key = jax.random.key(3)
+    one, program = structure(scenario), []
+
+    def with_data(prior, key):
+        program.append(1)
+        return simulate(one, key, None, prior)
+
+    drawn = quick_jit(with_data)
+    expected = quick_jit(lambda key: simulate(scenario, key))(key)
+    for a, b in zip(*map(jax.tree.leaves, (drawn(Prior.of(scenario), key), expected)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+    changes: dict = {"acceleration_sigma": (0.3, 0.2, 0.1), "velocity": (0.5, 0.7, 0.2)}
+    if scenario.motion == "odometry":  # its true path is not drawn, and part of the structure
+        changes = {"odometry_sigma": (0.3, 0.2, 0.1), "position_sigma": 0.7}
+    other = dataclasses.replace(scenario, **changes)
+    assert structure(other) == one
+    moved = drawn(Prior.of(other), key)
+    assert not np.allclose(moved.measured, expected.measured)
+    assert len(program) == 1
+    # What is no number of the prior stays: other steps are another structure.
+    assert structure(dataclasses.replace(scenario, steps=5)) != one
+
+
+def test_all_worlds_of_the_grid_share_one_structure():
+    grid = [scenario for _, scenario in phase_diagram.worlds(phase_diagram.Options())]
+    assert len(grid) == 4 * 3 * 5 * 4
+    assert len(set(grid)) == len(grid)
+    assert len({structure(scenario) for scenario in grid}) == 1
+
+
+# --- the file -----------------------------------------------------------------------------------
+
+
+def without_seconds(path):
+    rows = phase_diagram.read(path)
+    for row in rows:
+        assert row.pop("seconds") >= 0
+    return rows
+
+
+def test_an_interrupted_run_goes_on_and_writes_the_same_file(tmp_path, monkeypatch):
+    whole, broken = (
+        dataclasses.replace(OPTIONS, out=tmp_path / f"{name}.csv", docs=tmp_path / name)
+        for name in ("whole", "broken")
+    )
+    phase_diagram.main(whole)
+    expected = without_seconds(whole.out)
+    assert len(expected) == 4
+    assert len({row["nees"] for row in expected}) == 4
+
+    measured, worlds = [], []
+    measure = phase_diagram._measure
+
+    def stops(direction, scenario, *rest):
+        if len(measured) == 2:
+            raise KeyboardInterrupt
+        measured.append(direction)
+        return measure(direction, scenario, *rest)
+
+    monkeypatch.setattr(phase_diagram, "_measure", stops)
+    with pytest.raises(KeyboardInterrupt):
+        phase_diagram.main(broken)
+    assert len(phase_diagram.read(broken.out)) == 2
+
+    monkeypatch.setattr(phase_diagram, "_measure", lambda *a: worlds.append(a[0]) or measure(*a))
+    phase_diagram.main(broken)
+    assert len(worlds) == 2  # only what was missing
+    assert without_seconds(broken.out) == expected
+    phase_diagram.main(broken)
+    assert len(worlds) == 2
+    for name in ("phase-diagram.md", "phase-diagram.png"):
+        assert (broken.docs / name).stat().st_size > 500
+    page = (broken.docs / "phase-diagram.md").read_text()
+    assert "4 cells, 4 runs each" in page
+    assert "(../broken.csv)" in page
+
+
+def test_a_cell_is_what_the_library_says_of_its_world(tmp_path):
+    options = dataclasses.replace(OPTIONS, directions=("turn",), accelerations=(1.0,))
+    ((direction, scenario),) = phase_diagram.worlds(options)
+    filters = jaxslam.make_filters(scenario.rig, ["robocentric"], ["inverse_scaling"], "known")
+    (row,) = phase_diagram._measure(direction, scenario, filters, options)
+    phase_diagram.write([row], tmp_path / "one.csv")
+    assert phase_diagram.read(tmp_path / "one.csv") == [row]
+    assert (row["velocity_z_m_s"], row["turn_rate_rad_s"]) == (1.2, 0.3)
+    assert (row["acceleration_sigma_m_s2"], row["turn_acceleration_sigma_rad_s2"]) == (0.5, 0.3)
+    assert (row["velocity_sigma_m_s"], row["turn_rate_sigma_rad_s"]) == (0.01, 0.005)
+    study = jaxslam.monte_carlo(scenario, filters, runs=4)
+    nees = study.store.load("robocentric/inverse_scaling", range(4))["nees"][:, -1]
+    assert row["nees"] == pytest.approx(nees.mean())
+    assert row["nees_median"] == pytest.approx(np.median(nees))
+
+
+def test_other_settings_are_refused(tmp_path):
+    rows = synthetic_rows()
+    path = tmp_path / "x.csv"
+    phase_diagram.write(rows, path)
+    for name, value in (("runs", 7), ("seed", 3), ("steps", 9)):
+        options = dataclasses.replace(SYNTHETIC, out=path, **{name: value})
+        with pytest.raises(ValueError, match=rf"made with {name} .*, now {value}; give another"):
+            phase_diagram.main(options)
+    assert phase_diagram.read(path) == rows
+
+
+def test_a_file_of_something_else_is_refused(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("a,b\n1,2\n")
+    with pytest.raises(ValueError, match="has other columns than a phase diagram"):
+        phase_diagram.read(path)
+    phase_diagram.write(synthetic_rows()[:1], path)
+    path.write_text(path.read_text().replace("sideways", "sideways,,"))
+    with pytest.raises(ValueError, match="line 2 is not a row of a phase diagram"):
+        phase_diagram.read(path)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"directions": ("up",)}, "directions"),
+        ({"filters": ("kalman",)}, "filters"),
+        ({"accelerations": (-1.0,)}, "acceleration_sigma must be positive"),
+        ({"depths": (0.0,)}, "nearest_depth must be positive"),
+        ({"runs": 0}, "runs must be at least 1"),
+        ({"accelerations": ()}, "accelerations holds no value"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(tmp_path, fields, message):
+    options = dataclasses.replace(OPTIONS, out=tmp_path / "x.csv", docs=tmp_path, **fields)
+    with pytest.raises(ValueError, match=message):
+        phase_diagram.main(options)
+
+
+# --- what it says -------------------------------------------------------------------------------
+
+SYNTHETIC = phase_diagram.Options(
+    accelerations=(0.2, 1.0, 2.0), velocities=(0.1,), depths=(3.0, 6.0), runs=100, steps=60
+)
+
+
+def synthetic_rows():
+    """Consistent up to 0.5 m/s² at both depths, then over-confident at one of them, then lost."""
+    numbers = {name: 0 for name in phase_diagram.COLUMNS} | {
+        "direction": "sideways", "velocity_sigma_m_s": 0.01, "filter": "robocentric",
+        "landmarks": "inverse_scaling", "runs": 100, "steps": 60, "dof": 3, "nees_not_lost": None,
+        "velocity_x_m_s": 1.2, "lost": 0.0, "seconds": 1.0,
+    }  # fmt: skip
+    found = {
+        (3.0, 0.1): (3.0, 0.0), (3.0, 0.5): (3.4, 0.0), (3.0, 1.0): (4.1, 0.0),
+        (3.0, 3.0): (1e5, 0.2), (6.0, 0.1): (3.0, 0.0), (6.0, 0.5): (2.5, 0.0),
+        (6.0, 1.0): (3.0, 0.0), (6.0, 3.0): (2.0, 0.0),
+    }  # fmt: skip
+    return [
+        numbers | {"nearest_depth_m": d, "acceleration_sigma_m_s2": a, "nees": nees, "lost": lost}
+        for (d, a), (nees, lost) in found.items()
+    ]
+
+
+def test_the_page_counts_what_the_rows_say():
+    rows = phase_diagram.judged(synthetic_rows(), 0.01)
+    assert [row["verdict"] for row in rows] == [
+        *("consistent", "consistent", "over-confident", "lost"),
+        *("consistent", "under-confident", "consistent", "under-confident"),
+    ]
+    assert [row["together"] for row in rows] == [
+        *("consistent", "consistent", "over-confident", "lost"),
+        *("consistent", "consistent", "consistent", "under-confident"),
+    ]
+    page = phase_diagram.page(rows, SYNTHETIC)
+    assert "| robocentric/inverse_scaling | sideways | 8 | 50% | 62% | 12% | 12% | 12% |" in page
+    assert "| robocentric/inverse_scaling | sideways | 0.5 |" in page
+    assert "2.54–3.50" in page  # 100 runs
+
+
+def test_the_figure_shows_every_cell_once():
+    cells = [
+        PhaseCell("a", "b", 0.1, 0.2, "lost", True, "12%"),
+        PhaseCell("a", "b", 0.3, 0.2, "over-confident", False, "3.6"),
+        PhaseCell("c", "b", 0.1, 0.2, "consistent", True, "3.0"),
+    ]
+    figure = plot_phase_diagram(cells, x_label="x", y_label="y", title="t")
+    assert len(figure.axes) == 2
+    assert [[text.get_text() for text in axes.texts] for axes in figure.axes] == [
+        ["12%", "3.6"],
+        ["3.0"],
+    ]
+    colours = {patch.get_facecolor() for patch in figure.axes[0].patches[1:]}
+    assert len(colours) == 2
+    with pytest.raises(ValueError, match="no cell to draw"):
+        plot_phase_diagram([], x_label="x", y_label="y", title="t")
