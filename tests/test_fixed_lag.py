@@ -231,7 +231,8 @@ def test_the_gauge_keeps_the_moments_of_speed_and_depth():
     np.testing.assert_allclose(v.std(axis=0)[:2], sigma[:2], rtol=0.02)
     omega = (np.asarray(state.landmarks)[0, 2] + np.asarray(delta)[:, c + 2]) / unit / 650
     np.testing.assert_allclose(omega.mean(), parameters.inverse_depth, rtol=0.01)
-    np.testing.assert_allclose(omega.std(), parameters.inverse_depth_sigma, rtol=0.01)
+    # What is exact are the moments of e^λ ω; those of ω follow to second order.
+    np.testing.assert_allclose(omega.std(), parameters.inverse_depth_sigma, rtol=0.02)
 
 
 def test_the_gauge_is_not_seen_by_a_camera():
