@@ -5,11 +5,19 @@ and the tracker all run on the same ones. Plots, vision and the command line are
 when they are asked for: `jaxslam.plots`, `jaxslam.vision`, `jaxslam.cli`.
 """
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 from jaxslam.camera import Camera
 from jaxslam.consistency import mean_band, monte_carlo, summarise, table
-from jaxslam.filters import FILTERS, Features, Parameters, SlamFilter, State, make_filters
+from jaxslam.filters import (
+    FILTERS,
+    Features,
+    Filter,
+    Parameters,
+    SlamFilter,
+    State,
+    make_filters,
+)
 from jaxslam.geometry import PLANAR, SPATIAL
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.simulation import Scenario, scenario, simulate
@@ -21,6 +29,7 @@ __all__ = [
     "SPATIAL",
     "Camera",
     "Features",
+    "Filter",
     "Parameters",
     "Scenario",
     "SlamFilter",

@@ -1,13 +1,26 @@
-"""The README's library example runs, and its commands are those of the command line."""
+"""The examples of the README and of the documents run."""
 
 import re
 from pathlib import Path
 
-README = (Path(__file__).parents[1] / "README.md").read_text()
+ROOT = Path(__file__).parents[1]
+
+
+def run_example(document: str) -> str:
+    """Execute the document's one marked snippet and return its text."""
+    text = (ROOT / document).read_text()
+    (snippet,) = re.findall(r"<!-- runs as a test -->\n```python\n(.*?)```", text, re.DOTALL)
+    exec(compile(snippet, document, "exec"), {"__name__": __name__})
+    return snippet
 
 
 def test_the_library_example_runs_and_prints_a_table(capsys):
-    (snippet,) = re.findall(r"<!-- runs as a test -->\n```python\n(.*?)```", README, re.DOTALL)
+    snippet = run_example("README.md")
     assert len(snippet.strip().splitlines()) <= 13
-    exec(compile(snippet, "README.md", "exec"), {})
     assert "robocentric/inverse_scaling" in capsys.readouterr().out
+
+
+def test_a_filter_of_ones_own_takes_part_in_a_study(capsys):
+    run_example("docs/own-filter.md")
+    (line,) = (x for x in capsys.readouterr().out.splitlines() if x.startswith("mine"))
+    assert float(line.split()[1]) < 4  # consistent: the mean NEES of 3 degrees of freedom

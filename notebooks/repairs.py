@@ -1,0 +1,140 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: py:percent,ipynb
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Why the filter breaks, what repairs it, and what remains
+#
+# With loose noise the robocentric Inverse Scaling filter believes too much of itself. Here is why,
+# sideways and straight ahead, and what helps. The truth is drawn from the filter's own prior, so
+# that whatever is inconsistent is the filter's fault.
+
+# %%
+# %matplotlib inline
+import os
+
+import matplotlib.pyplot as plt
+import numpy as np
+from IPython.display import display
+
+import jaxslam
+from jaxslam.plots.style import GREY, line_style
+
+RUNS = 100 if os.environ.get("JAXSLAM_REDUCED") else 1000
+
+
+def study(name, filters):
+    scenario = jaxslam.scenario(name)
+    made = jaxslam.make_filters(scenario.rig, filters, ["inverse_scaling"], scenario.calibration)
+    finished = jaxslam.monte_carlo(scenario, made, runs=RUNS, seed=3, chunk=25)
+    results = jaxslam.summarise(finished)["filters"]
+    return {key.split("/")[0]: result for key, result in results.items()}
+
+
+def plot(results):
+    """Mean NEES and lost runs over time."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    low, high = jaxslam.mean_band(3, RUNS)
+    left.axhspan(low, high, color=GREY, alpha=0.3, label="95 % band")
+    for index, (name, result) in enumerate(results.items()):
+        time = (1 + np.arange(len(result["nees"]))) / 30
+        left.plot(time, np.array(result["nees"], float), label=name, **line_style(index))
+        right.plot(time, 100 * np.array(result["lost"], float), **line_style(index))
+    left.set(xlabel="time, s", ylabel="mean NEES of the pose", yscale="log")
+    right.set(xlabel="time, s", ylabel="lost runs, %", ylim=(0, None))
+    left.legend()
+    plt.close(figure)
+    return figure
+
+
+def table(results):
+    for name, r in results.items():
+        rmse, sigma = r["rmse"]["position"][-1], r["sigma"]["position"][-1]
+        print(
+            f"{name:<28} NEES {r['nees'][-1]:8.2f}  lost {r['lost'][-1]:5.1%}  "
+            f"others {r['nees_not_lost'][-1]:5.2f}  RMSE {rmse:.3f} m  σ/RMSE {sigma / rmse:.2f}"
+        )
+
+
+# %% [markdown]
+# ## Sideways: the scale
+#
+# No bearing tells the scale. It is known from the prior on speed and depth, and should stay as
+# uncertain as they are. But the prediction multiplies velocity by inverse depth, and linearises
+# the product where the estimate happens to be. Every update moves the estimate, so the direction
+# that the Jacobians leave unseen turns a little, and a little is learnt of the scale that nobody
+# measured.
+#
+# - `+oc` carries the covariance along with that direction (observability constraint).
+# - `scale_gauge` takes the scale out of the products: lengths are in units of $e^\lambda$ metres,
+#   speed and inverse depth are divided by it, and $\lambda$ is one number of the state that no
+#   pixel depends on.
+# - `+directions9` adds what is left: nine filters, each sure of a part of the prior on the
+#   *direction* of the velocity, weighted by their likelihoods.
+
+# %%
+sideways = study(
+    "matched-loose", ["robocentric", "robocentric+oc", "scale_gauge", "scale_gauge+directions9"]
+)
+display(plot(sideways))
+table(sideways)
+
+# %% [markdown]
+# The error hardly changes. What changes is what the filter says of it: σ/RMSE goes from about
+# half to one.
+
+# %%
+low, high = jaxslam.mean_band(3, RUNS, confidence=0.9999)
+
+
+def ratio(result):
+    return result["sigma"]["position"][-1] / result["rmse"]["position"][-1]
+
+
+assert sideways["robocentric"]["nees"][-1] > high
+assert sideways["scale_gauge"]["nees"][-1] < sideways["robocentric"]["nees"][-1]
+assert sideways["scale_gauge+directions9"]["nees"][-1] < high
+assert ratio(sideways["robocentric"]) < 0.75 < ratio(sideways["scale_gauge"])
+
+# %% [markdown]
+# ## Straight ahead: the direction of travel
+#
+# Towards the scene it is not the scale that breaks the filter. A landmark's flow is inverse depth
+# times its distance from the point ahead, *plus* rotation. With every inverse depth unknown, two
+# planar views do not tell the direction of travel from the rotation at all, and three tell it
+# only through products. The gauge does nothing here.
+#
+# A window of twenty frames that is linearised again and again (`+lag20`) helps, and so do members
+# that are each sure of the direction.
+
+# %%
+ahead = study(
+    "matched-forward-loose",
+    ["robocentric", "scale_gauge", "scale_gauge+lag20", "scale_gauge+directions9"],
+)
+display(plot(ahead))
+table(ahead)
+
+# %%
+lost = {name: result["lost"][-1] for name, result in ahead.items()}
+assert lost["robocentric"] > 0.3
+assert lost["scale_gauge+lag20"] < lost["robocentric"] / 2
+assert lost["scale_gauge+directions9"] < lost["robocentric"] / 2
+
+# %% [markdown]
+# ## What remains
+#
+# Straight ahead the window's *maximum* of the posterior is not its mean: an inverse depth that
+# multiplies the unknown direction makes an amplitude of it, and a maximum is drawn towards the
+# larger amplitudes. Members and window together (`scale_gauge+lag20+directions9`) lose hardly a
+# run, at about a hundred times the cost of the plain filter; the measured tables are in
+# `docs/consistency.md`, and where each filter holds at all is the map of `docs/phase-diagram.md`.
