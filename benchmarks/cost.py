@@ -61,9 +61,7 @@ def main() -> None:
 
     compiled, compile_seconds = {}, {}
     for name in options.filters:
-        made = jaxslam.make_filters(
-            scenario.rig, [name], [options.landmarks], scenario.calibration
-        )
+        made = jaxslam.make_filters(scenario.rig, [name], [options.landmarks], scenario.calibration)
         (slam_filter,) = made.values()
         start = time.perf_counter()
         batch = jax.vmap(partial(filter_run, slam_filter, capacity), in_axes=(None, 0))

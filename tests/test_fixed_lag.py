@@ -282,11 +282,10 @@ def test_a_bank_of_a_linear_problem_is_its_filter(modifier):
     np.testing.assert_allclose(np.sqrt(np.diagonal(bank_P, axis1=1, axis2=2)), sigma, rtol=0.08)
 
 
-def test_recommended_is_a_name():
-    rig = Rig(each_geometry[0])
-    assert list(jaxslam.make_filters(rig, ["recommended"], ["inverse_scaling"], "known")) == [
-        f"{RECOMMENDED}/inverse_scaling"
-    ]
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_recommended_is_a_name(geometry):
+    made = jaxslam.make_filters(Rig(geometry), ["recommended"], ["inverse_scaling"], "known")
+    assert list(made) == [f"{RECOMMENDED[geometry.name]}/inverse_scaling"]
 
 
 @pytest.mark.parametrize(

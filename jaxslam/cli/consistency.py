@@ -40,8 +40,9 @@ class ConsistencyOptions:
         tuple[str, ...],
         tyro.conf.arg(
             metavar="NAME …",
-            help=f"Filters: {', '.join(FILTERS)}, or recommended ({RECOMMENDED}); each may be "
-            f"modified, as in scale_gauge+lag10: {', '.join(MODIFIERS)}, with a number.",
+            help=f"Filters: {', '.join(FILTERS)}, or recommended (here "
+            f"{' or '.join(RECOMMENDED.values())}); each may be modified, as in "
+            f"scale_gauge+lag10: {', '.join(MODIFIERS)}, with a number.",
         ),
     ] = ("robocentric",)
     calibration: Annotated[

@@ -112,9 +112,9 @@ members of a Gaussian sum (`scales`, `directions`); none for the remedies `oc` a
 
 _OF_ANY_FILTER = ("iterated", "scales", "directions")
 
-RECOMMENDED = "scale_gauge+lag20"
-"""The filter called `recommended`: the most consistent one of docs/consistency.md that is the
-same for every motion."""
+RECOMMENDED = {"planar": "scale_gauge+directions9", "spatial": "scale_gauge+lag10"}
+"""The filter called `recommended`, by geometry: of those of docs/consistency.md the one to take
+where nothing is known of the motion. In space a Gaussian sum has the square of its members."""
 
 
 def make_filters(
@@ -126,7 +126,8 @@ def make_filters(
     stands for `RECOMMENDED`. Raises ValueError for a name that is not known, and for a filter and
     a parametrization that do not go together.
     """
-    filters = [RECOMMENDED if name == "recommended" else name for name in filters]
+    recommended = RECOMMENDED[rig.geometry.name]
+    filters = [recommended if name == "recommended" else name for name in filters]
     chosen("filters", [name.partition("+")[0] for name in filters], FILTERS)
     return {
         f"{name}/{landmark.name}": make_filter(rig, name, landmark, calibration)
