@@ -140,7 +140,8 @@ def table(summary: dict[str, Any]) -> str:
     )
     lines = [header]
     for name, f in summary["filters"].items():
-        nis = np.nansum(np.array(f["nis"], float)) / np.nansum(np.array(f["nis_dof"], float))
+        with np.errstate(invalid="ignore"):  # a filter that compares nothing has no NIS
+            nis = np.nansum(np.array(f["nis"], float)) / np.nansum(np.array(f["nis_dof"], float))
         band = f"{f['band95'][0]:.3f}–{f['band95'][1]:.3f}"
         lines.append(
             f"{name:<32}{_last(f['nees'], 10, 3)}{_last(f['nees_median'], 8, 2)}{band:>14}"
