@@ -7,7 +7,7 @@ the uncertainty is kept: the `Engine` whose functions it calls.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import jax
@@ -48,7 +48,7 @@ class Core:
     keyframes: what the `Frame` holds."""
     velocity: Float[Array, " v"]
     """Linear and angular velocity in the camera's own frame, m/s and rad/s; v = t, or none."""
-    log_scale: Float[Array, " 1"] | None
+    log_scale: Float[Array, " 1"] | None = field(default=None, kw_only=True)
     """λ of a filter with a scale gauge, or None: lengths in the state are in units of `e^λ` m."""
     noise: Float[Array, " t"]
     """What drives this step's motion: the acceleration a (P10), or the odometry's error; zero
@@ -681,9 +681,9 @@ def _calibration(state: State) -> slice:
 def _part(core: Core, name: str) -> slice:
     """Where a field is in the tangent of the core."""
     start = 0
-    for field in fields(core):
-        size = tangent_dim(getattr(core, field.name))
-        if field.name == name:
+    for one in fields(core):
+        size = tangent_dim(getattr(core, one.name))
+        if one.name == name:
             return slice(start, start + size)
         start += size
     raise KeyError(name)
