@@ -148,11 +148,10 @@ def truncated_normal(y: Float[Array, " l"], lower: Float[Array, ""]) -> Float[Ar
     It makes a standard normal y a truncated one. Each half is computed from its own tail, so that
     neither loses digits; `lower` = −∞ gives y back.
     """
-    # Φ⁻¹(Φ(a) + (1 − Φ(a)) Φ(y)), and the same by the probabilities above the quantile.
+    # Φ⁻¹(Φ(a) + (1 − Φ(a)) Φ(y)), and by the probabilities above the quantile for y > 0.
     log_above = log_ndtr(-lower)
-    below = -jnp.expm1(log_above) + jnp.exp(log_above + log_ndtr(jnp.minimum(y, 0.0)))
-    above = jnp.exp(log_above + log_ndtr(-jnp.maximum(y, 0.0)))
-    return jnp.where(y < 0, ndtri(below), -ndtri(above))
+    tail = jnp.exp(log_above + log_ndtr(-jnp.abs(y)))
+    return jnp.where(y < 0, 1.0, -1.0) * ndtri(jnp.where(y < 0, -jnp.expm1(log_above) + tail, tail))
 
 
 def path(rig: Rig, problem: Problem, x: Unknowns) -> tuple[Pose, Float[Array, "steps t"]]:

@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import blackjax
 import jax
 import jax.numpy as jnp
-from blackjax.adaptation.mass_matrix import mass_matrix_adaptation
-from blackjax.adaptation.staged_adaptation import build_schedule
 from blackjax.adaptation.step_size import dual_averaging_adaptation
 from jaxtyping import Array, Float
 
@@ -31,8 +28,8 @@ class NUTS:
     """How long to sample: static configuration."""
 
     chains: int = 4
-    warmup: int = 200
-    """Steps of window adaptation of every chain: step size and a diagonal mass matrix."""
+    warmup: int = 100
+    """Steps in which every chain adapts its step size, by dual averaging."""
     draws: int = 250
     """Kept draws of every chain."""
     acceptance: float = 0.8
@@ -73,7 +70,7 @@ def sample(
     """Chains that start at draws of the mode's Gaussian.
 
     They move in x with `w = mode + R x`, where the posterior is nearly N(0, I): trajectories are
-    short, and a diagonal mass matrix is enough.
+    short, and the unit mass matrix is better than one estimated from few draws.
     """
     root = whitening_root(rig, problem, mode)
 
@@ -85,105 +82,35 @@ def sample(
         T_BC, velocity = jax.tree.map(lambda x: x[-1], path(rig, problem, unknown))
         return T_BC, velocity, unknown.inverse_depths
 
-    kernel, adaptation = blackjax.nuts.build_kernel(), _adaptation(settings)
+    kernel = blackjax.nuts.build_kernel()
+    start_averaging, update_averaging, averaged = dual_averaging_adaptation(settings.acceptance)
+    inverse_mass = jnp.ones_like(mode)
 
     def chain(key):
         start_key, key = jax.random.split(key)
         state = blackjax.nuts.init(_possible_start(target, start_key, mode), target)
 
+        # One loop over warm-up and draws: a second copy of the kernel compiles for a minute.
         def step(carry, data):
-            state, tuning = carry
-            key, stage, window_ends, warming = data
-            state, info = kernel(
-                key,
-                state,
-                target,
-                jnp.where(warming, tuning.step_size, tuning.averaged_step_size),
-                tuning.inverse_mass,
-                settings.doublings,
-            )
-            adapted = adaptation.update(
-                tuning, state.position, info.acceptance_rate, stage, window_ends
-            )
-            tuning = _where(warming, adapted, tuning)
+            state, averaging = carry
+            key, warming = data
+            size = jnp.where(warming, jnp.exp(averaging.log_step_size), averaged(averaging))
+            state, info = kernel(key, state, target, size, inverse_mass, settings.doublings)
+            adapted = update_averaging(averaging, info.acceptance_rate)
+            averaging = jax.tree.map(partial(jnp.where, warming), adapted, averaging)
             record = state.position, state.logdensity, info.is_divergent, info.num_integration_steps
-            return (state, tuning), record
+            return (state, averaging), record
 
-        carry = state, adaptation.start(mode)
+        carry = state, start_averaging(jnp.asarray(FIRST_STEP_SIZE, mode.dtype))
         keys = jax.random.split(key, settings.warmup + settings.draws)
-        _, records = jax.lax.scan(step, carry, (keys, *adaptation.schedule))
+        warming = jnp.arange(len(keys)) < settings.warmup
+        _, records = jax.lax.scan(step, carry, (keys, warming))
         x, values, divergent, leapfrogs = jax.tree.map(lambda r: r[settings.warmup :], records)
         return Chains(
             *jax.vmap(outcome)(x), values, jnp.mean(divergent), jnp.mean(leapfrogs.astype(x.dtype))
         )
 
     return jax.vmap(chain)(jax.random.split(key, settings.chains))
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class _Tuning:
-    """What the warm-up adapts."""
-
-    step_size: Float[Array, ""]
-    averaged_step_size: Float[Array, ""]
-    """What the draws are made with."""
-    inverse_mass: Float[Array, " n"]
-    averaging: Any
-    variances: Any
-
-
-@dataclass(frozen=True)
-class _Adaptation:
-    """Stan's window adaptation from blackjax's parts, as updates inside one loop.
-
-    `blackjax.window_adaptation` is the same with a loop of its own: another copy of the kernel,
-    which compiles for twice as long.
-    """
-
-    start: Callable[[Float[Array, " n"]], _Tuning]
-    update: Callable[..., _Tuning]
-    schedule: tuple[Array, Array, Array]
-    """Of every transition: stage (1 adapts the mass), whether a window ends, whether to adapt."""
-
-
-def _adaptation(settings: NUTS) -> _Adaptation:
-    average_init, average_update, average_final = dual_averaging_adaptation(settings.acceptance)
-    mass_init, mass_update, mass_final = mass_matrix_adaptation(is_diagonal_matrix=True)
-    stages = jnp.asarray(build_schedule(settings.warmup))
-    draws = jnp.zeros(settings.draws, int)
-
-    def start(like):
-        mass, size = mass_init(like.size), jnp.asarray(FIRST_STEP_SIZE, like.dtype)
-        return _Tuning(size, size, mass.inverse_mass_matrix, average_init(size), mass)
-
-    def update(tuning, position, acceptance, stage, window_ends):
-        averaging = average_update(tuning.averaging, acceptance)
-        variances = _where(stage == 1, mass_update(tuning.variances, position), tuning.variances)
-        ended = mass_final(variances)
-        variances = _where(window_ends, ended, variances)
-        averaging = _where(window_ends, average_init(average_final(averaging)), averaging)
-        return _Tuning(
-            jnp.exp(averaging.log_step_size),
-            average_final(averaging),
-            variances.inverse_mass_matrix,
-            averaging,
-            variances,
-        )
-
-    return _Adaptation(
-        start,
-        update,
-        (
-            jnp.concatenate([stages[:, 0].astype(int), draws]),
-            jnp.concatenate([stages[:, 1].astype(bool), draws.astype(bool)]),
-            jnp.arange(settings.warmup + settings.draws) < settings.warmup,
-        ),
-    )
-
-
-def _where(condition: Array, chosen: Any, other: Any) -> Any:
-    return jax.tree.map(partial(jnp.where, condition), chosen, other)
 
 
 def _possible_start(

@@ -156,6 +156,7 @@ def _posterior_errors(chains: Chains, runs: Run) -> Records:
             "nees_variance": jnp.var(nees_of_draws),
             "error": _base_error(truth, estimate),
             "covariance": covariance(base),
+            "position": estimate.translation(),
             "truth": jnp.concatenate([_base_error(truth, estimate), _last_velocity(run)]),
             "draws": scalars,
             "behind_infinity": jnp.mean(jnp.any(chains.inverse_depths < 0, axis=-1)),
