@@ -72,7 +72,7 @@ def _draws(axis: Axes, telling: dict[str, Any]) -> None:
         turn = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
         half = ELLIPSE_SIGMAS * np.sqrt(values)
         ellipse = Ellipse(
-            mean[[0, -1]],
+            (float(mean[0]), float(mean[-1])),
             2 * half[1],
             2 * half[0],
             angle=turn,
@@ -95,7 +95,7 @@ def _nees(axis: Axes, by_step: dict[str, Any]) -> None:
     one = by_step[steps[0]]
     filters = list(one["filters"])
     style = _style(["gaussian_prior_laplace", *filters])
-    named = {
+    named: dict[str, tuple[str, dict[str, Any]]] = {
         "exact": ("exact posterior", {"color": "k", "marker": "o"}),
         "gaussian_prior": ("… with the untruncated prior", {"color": GREY, "marker": "s"}),
         "gaussian_prior_laplace": ("MAP + Laplace", style["gaussian_prior_laplace"]),

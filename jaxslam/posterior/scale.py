@@ -66,7 +66,7 @@ def log_prior(problem: Problem, x: Unknowns) -> Float[Array, ""]:
         (x.pixels - problem.first) / parameters.measurement_sigma,
         (x.inverse_depths - parameters.inverse_depth) / parameters.inverse_depth_sigma,
     )
-    return -sum(jnp.sum(part**2) for part in parts) / 2
+    return -jnp.asarray(sum(jnp.sum(part**2) for part in parts)) / 2
 
 
 def scaled_log_density(

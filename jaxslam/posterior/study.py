@@ -189,7 +189,13 @@ def against_filter(study: Study, slam_filter: SlamFilter, runs: Run, exact: Pose
 def _compared(
     slam_filter: SlamFilter, landmarks: int, prior: Prior, runs: Run, exact: Pose
 ) -> Records:
-    capacity = Sightings(landmarks=landmarks, first=landmarks, known=landmarks, new=1)
+    counts: dict[str, Any] = {
+        "landmarks": landmarks,
+        "first": landmarks,
+        "known": landmarks,
+        "new": 1,
+    }
+    capacity = Sightings(**counts)
 
     def one(run, T_BC):
         _, _, state = filter_run(slam_filter, capacity, prior, run)
