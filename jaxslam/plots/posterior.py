@@ -100,8 +100,8 @@ def _nees(axis: Axes, by_step: dict[str, Any]) -> None:
         "gaussian_prior": ("… with the untruncated prior", {"color": GREY, "marker": "s"}),
         "gaussian_prior_laplace": ("MAP + Laplace", style["gaussian_prior_laplace"]),
     }
-    bands = np.array([by_step[s]["nees"]["exact"]["band95"] for s in steps])
-    axis.fill_between(x, *bands.T, color=GREY, alpha=0.25, lw=0, label="95 % band")
+    low, high = np.array([by_step[s]["nees"]["exact"]["band95"] for s in steps]).T
+    axis.bar(x, high - low, 0.6, low, color=GREY, alpha=0.25, label="95 % band")
     for key, (label, line) in named.items():
         axis.plot(x, [_value(by_step[s]["nees"][key]["mean"]) for s in steps], label=label, **line)
     for name in filters:
