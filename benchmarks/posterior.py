@@ -32,7 +32,7 @@ from jaxslam.posterior import (
     converged,
     draw_runs,
     pooled,
-    references,
+    reference,
 )
 from jaxslam.posterior.summary import summarise_filter, summarise_reference
 
@@ -95,27 +95,20 @@ def _measure(study: Study, options: Options) -> dict[str, Any]:
         range(i, min(i + options.chunk, options.runs))
         for i in range(0, options.runs, options.chunk)
     ]
-    parts = []
-    for chunk in chunks:
-        parts.append(_reference(study, store, chunk, options))
-        print(f"{study.scenario.name} {study.steps}: {chunk.stop} runs", flush=True)
-    reference = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    used = converged(reference, "exact") & converged(reference, "gaussian_prior")
-    summary = summarise_reference(reference, used)
+    parts = [_reference(study, store, chunk, options) for chunk in chunks]
+    records = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    used = converged(records, "exact") & converged(records, "gaussian_prior")
+    summary = summarise_reference(records, used)
     seconds = {"reference": time.perf_counter() - start}
     by_filter = {}
     for name in options.filters:
         start = time.perf_counter()
-        records = _filter(study, name, chunks, reference, options)
+        by_filter[name] = _filter(study, name, chunks, records, options)
         seconds[name] = time.perf_counter() - start
-        by_filter[name] = (summarise_filter(records, reference, used), records)
-        print(name, json.dumps(by_filter[name][0]), flush=True)
     return {
         **summary,
-        "filters": {name: numbers for name, (numbers, _) in by_filter.items()},
-        "telling": _telling(
-            study, reference, used, {name: records for name, (_, records) in by_filter.items()}
-        ),
+        "filters": {name: summarise_filter(own, records, used) for name, own in by_filter.items()},
+        "telling": _telling(study, records, used, by_filter),
         "seconds": seconds,
     }
 
@@ -135,15 +128,20 @@ def _store(study: Study, options: Options) -> FolderStore | MemoryStore:
 
 
 def _reference(study: Study, store, chunk: range, options: Options) -> dict[str, np.ndarray]:
-    if not store.has("reference", chunk):
-        # The last chunk is padded by the runs that follow, to be of the same shape.
-        padded = range(chunk.start, chunk.start + options.chunk)
-        runs = draw_runs(study, options.seed, padded)
-        records, chains = references(study, runs, options.seed, padded)
-        poses = jax.vmap(pooled)(chains["exact"]).parameters()
-        arrays = jax.device_get({**records, "exact_T_BC": poses})
-        store.save("reference", chunk, {k: np.asarray(v)[: len(chunk)] for k, v in arrays.items()})
-    return store.load("reference", chunk)
+    """Records of both posteriors, `exact_…` and `gaussian_prior_…`, and the exact draws."""
+    records = {}
+    for kind, truncated in (("exact", True), ("gaussian_prior", False)):
+        if not store.has(kind, chunk):
+            # The last chunk is padded by the runs that follow, to be of the same shape.
+            padded = range(chunk.start, chunk.start + options.chunk)
+            runs = draw_runs(study, options.seed, padded)
+            found, chains = reference(study, runs, options.seed, padded, truncated=truncated)
+            found["T_BC"] = jax.vmap(pooled)(chains).parameters()
+            arrays = {k: np.asarray(v)[: len(chunk)] for k, v in jax.device_get(found).items()}
+            store.save(kind, chunk, arrays)
+            print(f"{study.scenario.name} {study.steps}: {kind}, {chunk.stop} runs", flush=True)
+        records.update({f"{kind}_{k}": v for k, v in store.load(kind, chunk).items()})
+    return records
 
 
 def _filter(study: Study, name: str, chunks, reference, options: Options) -> dict[str, np.ndarray]:

@@ -24,7 +24,7 @@ from jaxslam.posterior.study import (
     converged,
     draw_runs,
     pooled,
-    references,
+    reference,
 )
 
 __all__ = [
@@ -51,7 +51,7 @@ __all__ = [
     "pose_gaussian",
     "pose_moments",
     "ranks",
-    "references",
+    "reference",
     "residuals",
     "sample",
     "starts",

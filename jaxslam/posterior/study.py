@@ -74,29 +74,24 @@ def _draw_runs(scenario: Scenario, steps: int, key: Array, indices: Array) -> Ru
     return jax.vmap(one)(indices)
 
 
-def references(
-    study: Study, runs: Run, seed: int, indices: range
-) -> tuple[Records, dict[str, Chains]]:
-    """Records of the exact posterior, of that with the whole Gaussian prior on 1/z, and of MAP and
-    Laplace for the latter; and the draws of both posteriors. All have a leading axis of runs.
+def reference(
+    study: Study, runs: Run, seed: int, indices: range, *, truncated: bool
+) -> tuple[Records, Chains]:
+    """Records of the posterior, and of MAP and Laplace beside it; and the posterior's draws.
+
+    With `truncated` it is the exact one; without, the one by the Gaussian prior on 1/z that the
+    filters believe. All have a leading axis of runs.
     """
     keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.asarray(indices))
-    records: Records = {}
-    chains = {}
-    for name, truncated in (("exact", True), ("gaussian_prior", False)):
-        problems = jax.vmap(partial(make_problem, study.scenario, truncated=truncated))(runs)
-        modes, found = _modes(study.rig, study.starts, problems, keys)
-        chains[name] = _sample(study.nuts, study.rig, problems, modes.mode, keys)
-        parts = {
-            **{f"map_{key}": value for key, value in found.items()},
-            **{
-                f"laplace_{k}": v
-                for k, v in _laplace_errors(study.rig, problems, modes, runs).items()
-            },
-            **_posterior_errors(chains[name], runs),
-        }
-        records.update({f"{name}_{key}": value for key, value in parts.items()})
-    return records, chains
+    problems = jax.vmap(partial(make_problem, study.scenario, truncated=truncated))(runs)
+    modes, found = _modes(study.rig, study.starts, problems, keys)
+    chains = _sample(study.nuts, study.rig, problems, modes.mode, keys)
+    by_laplace = _laplace_errors(study.rig, problems, modes, runs)
+    return {
+        **{f"map_{name}": value for name, value in found.items()},
+        **{f"laplace_{name}": value for name, value in by_laplace.items()},
+        **_posterior_errors(chains, runs),
+    }, chains
 
 
 @partial(jax.jit, static_argnums=(0, 1))
