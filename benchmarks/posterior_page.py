@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
+
+READING = """\
+The rows of a table are a sequence: the exact posterior's own mean and covariance, whose mean NEES
+is the number of degrees of freedom whatever its shape; the same with the prior on 1/z that the
+filters believe, which has mass at ω < 0; the Gaussian that Laplace puts at the mode of that; and
+the filters. What each row adds to the one before is the cost of that step: of the prior, of not
+being Gaussian, of recursion and linearisation."""
 
 STAGES = {
     "exact": "exact posterior: its mean and covariance",
@@ -13,9 +19,8 @@ STAGES = {
 
 
 def page(summary: dict[str, Any]) -> str:
-    """The Markdown page: findings, then the tables."""
+    """The Markdown page: how to read it, the figure, then the tables."""
     nuts = summary["nuts"]
-    findings = Path(__file__).with_name("posterior_findings.md").read_text().strip()
     parts = [
         "# The exact posterior, and how far the filters are from it",
         "Made by `python benchmarks/posterior.py`; do not edit. "
@@ -24,7 +29,7 @@ def page(summary: dict[str, Any]) -> str:
         "starts. A row is over the runs of which both posteriors converged (R̂ ≤ 1.05 and 100 "
         "effective draws of pose, velocity and density). All rows of a scenario and step are of "
         "the same runs.",
-        findings,
+        READING,
         "![Draws of one run, NEES and σ](posterior.png)",
     ]
     for scenario, by_step in summary["scenarios"].items():
