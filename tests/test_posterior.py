@@ -165,7 +165,7 @@ def test_the_variables_of_scale_have_the_jacobian_that_they_claim(truncated):
     a, b = mode + draw(problem, 2), mode + 5 * draw(problem, 3)
     claimed = [scaled_unknowns(LOOSE.rig, problem, mode, w)[1] for w in (a, b)]
     exact = [jnp.linalg.slogdet(jax.jacfwd(physical)(w))[1] for w in (a, b)]
-    assert claimed[1] - claimed[0] == pytest.approx(exact[1] - exact[0], abs=1e-9)
+    assert claimed[1] - claimed[0] == pytest.approx(float(exact[1] - exact[0]), abs=1e-9)
 
     # So the density of w is that of y, by the rule for a change of variables.
     def whitened(w):
