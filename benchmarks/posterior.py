@@ -98,6 +98,11 @@ def _measure(study: Study, options: Options) -> dict[str, Any]:
     parts = [_reference(study, store, chunk, options) for chunk in chunks]
     records = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     used = converged(records, "exact") & converged(records, "gaussian_prior")
+    if used.sum() < 2:
+        raise ValueError(
+            f"only {used.sum()} of {len(used)} problems of {study.scenario.name} at step "
+            f"{study.steps} converged: sample longer (--nuts.warmup, --nuts.draws)"
+        )
     summary = summarise_reference(records, used)
     seconds = {"reference": time.perf_counter() - start}
     by_filter = {}
