@@ -107,6 +107,20 @@ def joined(rotation: jaxlie.SO2 | jaxlie.SO3, translation: Float[Array, " n"]) -
     return jaxlie.SE3.from_rotation_and_translation(rotation, translation)
 
 
+def scaled(tree: Any, scale: Float[Array, ""]) -> Any:
+    """A pytree of poses, the lengths in them times `scale`."""
+
+    def one(pose):
+        if isinstance(pose, SplitPose):
+            return SplitPose(scale * pose.translation, pose.rotation)
+        return joined(pose.rotation(), scale * pose.translation())
+
+    def is_leaf(node):
+        return isinstance(node, SplitPose) or _is_pose(node)
+
+    return jax.tree.map(one, tree, is_leaf=is_leaf)
+
+
 def exp(group: type[jaxlie.MatrixLieGroup], delta: Float[Array, " t"]) -> Any:
     """`Exp(δ)` of SO(n) or SE(n), with derivatives that are exact at and near zero rotation.
 

@@ -26,6 +26,8 @@ class Motion:
     """`displacement(geometry, velocity, noise, control)`: T_{k-1,k}, the pose of C_k in C_{k-1}."""
     next_velocity: Callable[[Array, Array, Array], Array]
     """`next_velocity(velocity, noise, control)`."""
+    control_shape: Callable[[Geometry], tuple[int, ...]]
+    """Of the array that is the control; zeros stand for no time and no motion."""
 
 
 def _next_velocity(velocity, acceleration, dt):
@@ -50,6 +52,7 @@ CONSTANT_VELOCITY = Motion(
     has_velocity=True,
     displacement=_constant_velocity,
     next_velocity=_next_velocity,
+    control_shape=lambda geometry: (),
 )
 """Constant velocity with white acceleration, m/s² and rad/s²; the control is Δt (P8, P9)."""
 
@@ -58,6 +61,7 @@ ODOMETRY = Motion(
     has_velocity=False,
     displacement=_odometry,
     next_velocity=lambda velocity, noise, reading: velocity,
+    control_shape=lambda geometry: (geometry.tangent_dim,),
 )
 """Odometry; the control is its reading u of a step, m and rad, with white error w."""
 

@@ -10,6 +10,7 @@ import pytest
 from cases import central, close, each_geometry, each_landmark, named, pose, quick_jit
 
 from jaxslam.camera import Camera, project
+from jaxslam.geometry import joined
 from jaxslam.landmarks import (
     INVERSE_DEPTH,
     INVERSE_DEPTH_TO_CARTESIAN,
@@ -131,6 +132,19 @@ def test_transforms_compose(landmark, geometry):
     parameters = generic(landmark, geometry)
     T, U = pose(geometry, 4), pose(geometry, 5)
     close(transform(T @ U, parameters), transform(T, transform(U, parameters)), relative=1e-14)
+
+
+@with_geometry
+@every_landmark
+def test_scale_enlarges_the_point_and_commutes_with_a_turn(landmark, geometry):
+    _, transform, _, euclidean = functions(landmark)
+    parameters = generic(landmark, geometry)
+    enlarged = landmark.scale(1.7, parameters)
+    np.testing.assert_allclose(euclidean(enlarged), 1.7 * euclidean(parameters), rtol=1e-12)
+    turn = pose(geometry, 2)
+    turn = joined(turn.rotation(), 0 * turn.translation())
+    turned = landmark.scale(1.7, transform(turn, parameters))
+    np.testing.assert_allclose(transform(turn, enlarged), turned, rtol=1e-12, atol=1e-14)
 
 
 @with_geometry

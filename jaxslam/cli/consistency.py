@@ -13,7 +13,7 @@ import tyro
 from jaxslam.consistency import CHUNK, DTYPES, FolderStore, Study, monte_carlo, summarise, table
 from jaxslam.consistency.montecarlo import check_sizes
 from jaxslam.files import write_atomically
-from jaxslam.filters import CALIBRATIONS, FILTERS, MODIFIERS, SlamFilter, make_filters
+from jaxslam.filters import CALIBRATIONS, FILTERS, MODIFIERS, RECOMMENDED, Filter, make_filters
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.simulation.scenario import BUILT_IN, Scenario, parse_override, scenario
 
@@ -40,8 +40,8 @@ class ConsistencyOptions:
         tuple[str, ...],
         tyro.conf.arg(
             metavar="NAME …",
-            help=f"Filters: {', '.join(FILTERS)}; each may be modified, as in world+particles: "
-            f"{', '.join(MODIFIERS)}, with a number for the greatest depth, m.",
+            help=f"Filters: {', '.join(FILTERS)}, or recommended ({RECOMMENDED}); each may be "
+            f"modified, as in scale_gauge+lag10: {', '.join(MODIFIERS)}, with a number.",
         ),
     ] = ("robocentric",)
     calibration: Annotated[
@@ -119,7 +119,7 @@ class ConsistencyOptions:
             overrides["steps"] = self.steps
         return scenario(self.scenario, overrides)
 
-    def _filters(self, world: Scenario) -> dict[str, SlamFilter]:
+    def _filters(self, world: Scenario) -> dict[str, Filter]:
         return make_filters(
             world.rig, self.filters, self.landmarks, self.calibration or world.calibration
         )

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.consistency.store import MemoryStore, Store
-from jaxslam.filters import Parameters, SlamFilter, State
+from jaxslam.filters import Filter, Parameters
 from jaxslam.geometry import Pose
 from jaxslam.simulation import (
     Run,
@@ -68,7 +69,7 @@ class Study:
     """Finished runs: where their records are, and what is needed to read them."""
 
     scenario: Scenario
-    filters: Mapping[str, SlamFilter]
+    filters: Mapping[str, Filter]
     runs: int
     seed: int
     dtype: str
@@ -80,7 +81,7 @@ class Study:
 
 def monte_carlo(
     scenario: Scenario,
-    filters: Mapping[str, SlamFilter],
+    filters: Mapping[str, Filter],
     *,
     runs: int = 1000,
     seed: int = 0,
@@ -167,7 +168,7 @@ def _compiled(slam_filter, capacity, structure, leaves) -> jax.stages.Compiled:
 
 
 def _filter_batch(
-    slam_filter: SlamFilter, capacity: Sightings, prior: Prior, runs: Run
+    slam_filter: Filter, capacity: Sightings, prior: Prior, runs: Run
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     """Records of a batch of runs, and the map and the path of its first run."""
     one = partial(filter_run, slam_filter, capacity, prior)
@@ -187,8 +188,8 @@ def _filter_batch(
 
 
 def filter_run(
-    slam_filter: SlamFilter, capacity: Sightings, prior: Prior, run: Run
-) -> tuple[dict[str, Array], Pose, State]:
+    slam_filter: Filter, capacity: Sightings, prior: Prior, run: Run
+) -> tuple[dict[str, Array], Pose, Any]:
     """One filter on one simulated run: records of every step, estimated path, final state.
 
     The records hold, per step: `nees` of the pose; `nis` and `nis_dof`; `error` and `variance`
@@ -198,7 +199,11 @@ def filter_run(
     parameters = prior.parameters
     first, seen, new = features(run, capacity)
     state = slam_filter.start(
-        parameters, int(capacity.landmarks), prior.velocity, prior.velocity_sigma
+        parameters,
+        int(capacity.landmarks),
+        prior.velocity,
+        prior.velocity_sigma,
+        (int(capacity.known), int(capacity.new)),
     )
     state = slam_filter.first(state, parameters, first)
 
@@ -240,7 +245,7 @@ def _landmark_nees(slam_filter, state, parameters, seen, T_BC, points):
     """Mean over the landmarks seen that are in the map, and how many; of none, 0 of 0."""
     counted = seen.valid & slam_filter.reported(state).active[seen.slots]
     truth = jax.vmap(T_BC.inverse().apply)(points[seen.slots])
-    truth = jax.vmap(slam_filter.model.rig.sensor.chart)(truth, jnp.ones_like(truth[:, 0]))
+    truth = jax.vmap(slam_filter.rig.sensor.chart)(truth, jnp.ones_like(truth[:, 0]))
     chart, covariance = slam_filter.landmarks_in_camera(state, parameters, seen.slots)
     nees = jax.vmap(normalised_squared)(truth - chart, covariance)
     count = jnp.sum(counted)

@@ -2,11 +2,18 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import Any
 
 from jaxslam.filters import information
+from jaxslam.filters.bank import Bank, with_directions, with_scales
 from jaxslam.filters.depth_particles import DepthParticles, with_depth_particles
+from jaxslam.filters.filter import Filter
+from jaxslam.filters.first_estimates import with_first_estimates
+from jaxslam.filters.fixed_lag import FixedLag, iterated, with_lag
 from jaxslam.filters.frames import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.filters.gaussian_sum import GaussianSum, with_rays
+from jaxslam.filters.invariant import INVARIANT
+from jaxslam.filters.observability_constrained import with_observability_constraint
 from jaxslam.filters.slam import (
     CALIBRATIONS,
     Parameters,
@@ -52,31 +59,74 @@ def information_filter(rig: Rig, landmark: Parametrization, calibration: str) ->
     return replace(keyframe(rig, landmark, calibration), engine=information)
 
 
-FILTERS: dict[str, Callable[[Rig, Parametrization, str], SlamFilter]] = {
+def scale_gauge(rig: Rig, landmark: Parametrization, calibration: str) -> SlamFilter:
+    """The paper's filter in a unit of length of its own, whose size is estimated.
+
+    State `(b̃, θ, ṽ, v_θ, λ, landmarks)`, with lengths `e^λ` metres: what no bearing observes, the
+    scale, stays out of the products of velocity and inverse depth.
+    """
+    return replace(robocentric(rig, landmark, calibration), scale_gauge=True)
+
+
+def iterated_filter(rig: Rig, landmark: Parametrization, calibration: str) -> FixedLag:
+    """The paper's filter, iterated: linearised at the maximum of the posterior of every frame."""
+    return iterated(robocentric(rig, landmark, calibration))
+
+
+def invariant_filter(rig: Rig, landmark: Parametrization, calibration: str) -> SlamFilter:
+    """`world` with the right-invariant error: landmarks' errors move with the pose's."""
+    return replace(world(rig, landmark, calibration), engine=INVARIANT)
+
+
+FILTERS: dict[str, Callable[[Rig, Parametrization, str], Filter]] = {
     "robocentric": robocentric,
     "world": world,
     "keyframe": keyframe,
     "information": information_filter,
+    "scale_gauge": scale_gauge,
+    "iterated": iterated_filter,
+    "invariant": invariant_filter,
 }
 
 
-MODIFIERS: dict[str, Callable[[SlamFilter, int | None], SlamFilter]] = {
+def with_common_depth(base: SlamFilter, percent: int | None) -> SlamFilter:
+    """The filter with priors on 1/z that are correlated, in percent; 50 by default."""
+    return replace(base, depth_correlation=0.5 if percent is None else percent / 100)
+
+
+MODIFIERS: dict[str, Callable[[Any, int | None], Filter]] = {
     "particles": with_depth_particles,
     "rays": with_rays,
+    "common": with_common_depth,
+    "lag": with_lag,
+    "iterated": iterated,
+    "scales": with_scales,
+    "directions": with_directions,
+    "oc": with_observability_constraint,
+    "fej": with_first_estimates,
 }
-"""What `+name` behind a filter's name makes of it, with the number that may follow the name:
-the greatest depth of a delayed initialisation, m."""
+"""What `+name` behind a filter's name makes of it, with the number that may follow the name: the
+greatest depth of a delayed initialisation, m (`particles`, `rays`); the correlation of depths in
+percent (`common`); frames (`lag`); steps of Gauss–Newton instead of convergence (`iterated`);
+members of a Gaussian sum (`scales`, `directions`). None for the consistency remedies `oc`, `fej`."""
+
+_OF_ANY_FILTER = ("iterated", "scales", "directions")
+
+RECOMMENDED = "scale_gauge+lag20"
+"""The filter called `recommended`: the most consistent one of docs/consistency.md that is the
+same for every motion."""
 
 
 def make_filters(
     rig: Rig, filters: Iterable[str], landmarks: Iterable[str], calibration: str
-) -> dict[str, SlamFilter]:
+) -> dict[str, Filter]:
     """Every named filter on every named parametrization, keyed `filter/landmarks`.
 
-    A filter may be modified: `world+particles`, `robocentric+rays100`. Raises ValueError for a
-    name that is not known, and for a filter and a parametrization that do not go together.
+    A filter may be modified: `world+oc`, `world+particles`, `scale_gauge+lag10`. `recommended`
+    stands for `RECOMMENDED`. Raises ValueError for a name that is not known, and for a filter and
+    a parametrization that do not go together.
     """
-    filters = list(filters)
+    filters = [RECOMMENDED if name == "recommended" else name for name in filters]
     chosen("filters", [name.partition("+")[0] for name in filters], FILTERS)
     return {
         f"{name}/{landmark.name}": make_filter(rig, name, landmark, calibration)
@@ -85,14 +135,16 @@ def make_filters(
     }
 
 
-def make_filter(rig: Rig, name: str, landmark: Parametrization, calibration: str) -> SlamFilter:
+def make_filter(rig: Rig, name: str, landmark: Parametrization, calibration: str) -> Filter:
     """One filter by its name, with its modifiers. Raises ValueError."""
     base, *modifiers = name.split("+")
-    made = chosen("filters", [base], FILTERS)[base](rig, landmark, calibration)
+    made: Any = chosen("filters", [base], FILTERS)[base](rig, landmark, calibration)
     for modifier in modifiers:
         word = modifier.rstrip("0123456789")
         number = modifier[len(word) :]
         modify = chosen("modifiers", [word], MODIFIERS)[word]
+        if not isinstance(made, SlamFilter) and word not in _OF_ANY_FILTER:
+            raise ValueError(f"in {name} the modifier {word} must stand before those of windows")
         made = modify(made, int(number) if number else None)
     return made
 
@@ -101,8 +153,12 @@ __all__ = [
     "CALIBRATIONS",
     "FILTERS",
     "MODIFIERS",
+    "RECOMMENDED",
+    "Bank",
     "DepthParticles",
     "Features",
+    "Filter",
+    "FixedLag",
     "GaussianSum",
     "Innovation",
     "Parameters",
@@ -110,10 +166,12 @@ __all__ = [
     "SlamModel",
     "State",
     "information_filter",
+    "invariant_filter",
     "inverse_depth_prior",
     "keyframe",
     "make_filter",
     "make_filters",
     "robocentric",
+    "scale_gauge",
     "world",
 ]

@@ -125,8 +125,8 @@ def new_landmarks(
     noise: Float[Array, "p p"],
     prior: tuple[Float[Array, "*m q"], Float[Array, "*m q"]],
     context: Any,
-) -> tuple[Float[Array, "m d"], Blocks, Float[Array, "m d d"]]:
-    """Landmarks of first measurements (P22–P26): values, J by the view, and `J diag(R, σ²) Jᵀ`.
+) -> tuple[Float[Array, "m d"], Blocks, Float[Array, "m d p+q"]]:
+    """Landmarks of first measurements (P22–P26): values, J by the view, and `J diag(R, σ²)^½`.
 
     `by_landmark` is the identity: the error of landmark i is J of the core's and its own.
     """
@@ -142,11 +142,12 @@ def new_landmarks(
         (J_view, J_measured, J_hidden), value = jax.jacfwd(
             landmark, argnums=(0, 1, 2), has_aux=True
         )(zero_tangent(view), measured, mean)
-        own = J_measured @ noise @ J_measured.T + (J_hidden * sigma**2) @ J_hidden.T
-        return value, J_view, own
+        return value, J_view, jnp.concatenate([J_measured @ root, J_hidden * sigma], axis=1)
 
+    root = jnp.linalg.cholesky(noise)
     new, J_view, own = jax.vmap(one)(features.measured, mean, sigma)
-    identity = jnp.broadcast_to(jnp.eye(new.shape[1], dtype=new.dtype), own.shape)
+    m, d = new.shape
+    identity = jnp.broadcast_to(jnp.eye(d, dtype=new.dtype), (m, d, d))
     return new, Blocks(view_by_core, J_view, identity), own
 
 
@@ -198,6 +199,14 @@ def placed(J: Blocks, slots: Int[Array, " m"], capacity: int) -> Float[Array, "m
     own = jnp.where(here[:, None, :, None], J.by_landmark[:, :, None], 0.0)
     shared = J.by_view @ J.view_by_core
     return jnp.concatenate([shared.reshape(m * k, -1), own.reshape(m * k, capacity * d)], axis=1)
+
+
+def rows(J: Blocks, B: Float[Array, "n r"]) -> Float[Array, "nl r"]:
+    """`J B` for every landmark in order, without the zeros: J has a block for each."""
+    c, d = J.view_by_core.shape[1], J.by_landmark.shape[-1]
+    by_view = small_products(J.by_view, J.view_by_core @ B[:c])
+    by_landmark = small_products(J.by_landmark, B[c:].reshape(-1, d, B.shape[1]))
+    return (by_view + by_landmark).reshape(-1, B.shape[1])
 
 
 def small_products(A: Float[Array, "*m k j"], B: Float[Array, "*m j r"]) -> Float[Array, "*m k r"]:

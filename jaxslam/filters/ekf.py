@@ -28,8 +28,8 @@ from jaxslam.filters.blocks import (
     observe,
     placed,
     residuals,
+    rows,
     shifted,
-    small_products,
     without_auxiliary,
 )
 from jaxslam.filters.state import Features, Innovation, State
@@ -53,6 +53,12 @@ def augment(state: State, start: int, covariance: Float[Array, "k k"]) -> State:
         return state
     part = slice(start, start + covariance.shape[0])
     return replace(state, covariance=state.covariance.at[part, part].set(covariance))
+
+
+def know(state: State, start: int, size: int) -> State:
+    """Numbers of the core that are known exactly: their covariance is zero already."""
+    del start, size
+    return state
 
 
 def marginalise(state: State, start: int, size: int) -> State:
@@ -168,11 +174,12 @@ def _transformed(state: State, core: Any, J_core: Array, landmarks: Array, J: Bl
         J = masked(J, state.active)
         landmarks = jnp.where(state.active[:, None], landmarks, state.landmarks)
 
-    def rows(P):
-        below = P[c:] if J is None else _rows(J, P)
+    def turned(P):
+        below = P[c:] if J is None else rows(J, P)
         return jnp.concatenate([J_core @ P[:c], below])
 
-    return replace(state, core=core, landmarks=landmarks, covariance=rows(rows(state.covariance).T))
+    covariance = turned(turned(state.covariance).T)
+    return replace(state, core=core, landmarks=landmarks, covariance=covariance)
 
 
 def initialise(
@@ -193,7 +200,8 @@ def initialise(
     if features.slots.size == 0:
         return state
     c, capacity = state.core_dim, state.active.size
-    new, J, own = new_landmarks(model, state, features, noise, prior, context)
+    new, J, root = new_landmarks(model, state, features, noise, prior, context)
+    own = root @ jnp.swapaxes(root, 1, 2)
     slots = jnp.where(features.valid, features.slots, capacity)  # out of bounds: dropped
     index = indices(slots, state)
 
@@ -273,14 +281,6 @@ def _noise_matrix(noise, used):
     blocks = jnp.where(used[:, None, None], noise, jnp.eye(p, dtype=noise.dtype))
     R = jnp.zeros((m, p, m, p), noise.dtype)
     return R.at[jnp.arange(m), :, jnp.arange(m), :].set(blocks).reshape(m * p, m * p)
-
-
-def _rows(J: Blocks, B: Float[Array, "n r"]) -> Float[Array, "nl r"]:
-    """`J B` for every landmark in order, without the zeros: J has a block for each."""
-    c, d = J.view_by_core.shape[1], J.by_landmark.shape[-1]
-    by_view = small_products(J.by_view, J.view_by_core @ B[:c])
-    by_landmark = small_products(J.by_landmark, B[c:].reshape(-1, d, B.shape[1]))
-    return (by_view + by_landmark).reshape(-1, B.shape[1])
 
 
 def _local_covariance(state: State, J: Blocks, slots) -> Float[Array, "m k k"]:

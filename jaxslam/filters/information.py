@@ -101,6 +101,11 @@ def representable(covariance: Float[Array, "k k"]) -> Float[Array, "k k"]:
     return covariance + jnp.diag(jnp.maximum(EXACT_SIGMA**2 - variances, 0.0))
 
 
+def know(state: InformationState, start: int, size: int) -> InformationState:
+    """Numbers of the core that are known exactly: a variance of zero, as far as that can be."""
+    return augment(state, start, jnp.zeros((size, size), state.information.dtype))
+
+
 def marginalise(state: InformationState, start: int, size: int) -> InformationState:
     """Forget k numbers of the core, by the Schur complement: what they tied becomes coupled."""
     if size == 0:
@@ -210,7 +215,8 @@ def initialise(
     """
     if features.slots.size == 0:
         return state
-    new, J, own = new_landmarks(model, state, features, noise, prior, context)
+    new, J, root = new_landmarks(model, state, features, noise, prior, context)
+    own = small_products(root, jnp.swapaxes(root, 1, 2))
     slots = jnp.where(features.valid, features.slots, state.active.size)  # out of bounds: dropped
     difference = masked(J._replace(by_view=-J.by_view), features.valid)
     identity = jnp.eye(new.shape[1], dtype=own.dtype)

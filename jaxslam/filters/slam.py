@@ -7,7 +7,7 @@ the uncertainty is kept: the `Engine` whose functions it calls.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import jax
@@ -21,7 +21,15 @@ from jaxslam.filters.engine import Engine
 from jaxslam.filters.frames import Frame, KeyframePose, keyframe_due
 from jaxslam.filters.initialisation import UNDELAYED, Initialisation
 from jaxslam.filters.state import Features, Innovation, State
-from jaxslam.geometry import Geometry, Pose, SplitPose, difference, identity, tangent_dim
+from jaxslam.geometry import (
+    Geometry,
+    Pose,
+    SplitPose,
+    difference,
+    identity,
+    scaled,
+    tangent_dim,
+)
 from jaxslam.landmarks.parametrization import Parametrization
 from jaxslam.rig import Rig
 
@@ -40,6 +48,8 @@ class Core:
     keyframes: what the `Frame` holds."""
     velocity: Float[Array, " v"]
     """Linear and angular velocity in the camera's own frame, m/s and rad/s; v = t, or none."""
+    log_scale: Float[Array, " 1"] | None
+    """λ of a filter with a scale gauge, or None: lengths in the state are in units of `e^λ` m."""
     noise: Float[Array, " t"]
     """What drives this step's motion: the acceleration a (P10), or the odometry's error; zero
     before `predict` and after composition."""
@@ -47,6 +57,8 @@ class Core:
     """Error of the intrinsics (P15); empty where the calibration is known."""
     anchors: SplitPose | None = None
     """T_AF of the cameras F in which landmarks are written; a batch, or None."""
+    depth_error: Float[Array, " 1"] | None = None
+    """What the priors on 1/z of all landmarks have in common, in σ of one prior, or None."""
 
 
 @jax.tree_util.register_dataclass
@@ -95,6 +107,8 @@ class View:
     """T_AC(k), the current camera in the map frame."""
     calibration: Float[Array, " k"]
     anchors: SplitPose | None = None
+    log_scale: Float[Array, " 1"] | None = None
+    depth_error: Float[Array, " 1"] | None = None
 
     def camera(self, context: Context) -> Camera:
         """The camera with the calibration error of this step."""
@@ -120,14 +134,26 @@ class SlamModel:
     def _displacement(self, core: Core, context: Context) -> Pose:
         if context.control is None:
             return identity(self.geometry, core.noise.dtype)
-        motion = self.rig.motion
-        return motion.displacement(self.geometry, core.velocity, core.noise, context.control)
+        motion, noise = self.rig.motion, self._noise_in_gauge(core)
+        return motion.displacement(self.geometry, core.velocity, noise, context.control)
+
+    def _noise_in_gauge(self, core: Core) -> Float[Array, " t"]:
+        """The acceleration in the units of the state.
+
+        λ is frozen at its estimate: the noise's amplitude says nothing about scale, but its
+        derivative by λ would pretend so.
+        """
+        if core.log_scale is None:
+            return core.noise
+        unit = jnp.exp(-jax.lax.stop_gradient(core.log_scale))
+        n = self.geometry.point_dim
+        return jnp.concatenate([unit * core.noise[:n], core.noise[n:]])
 
     def view(self, core: Core, context: Context) -> View:
         """All that a landmark depends on."""
         step = self._displacement(core, context)
         T_AC = self.frame.map_from_camera(core.pose, step)
-        return View(T_AC, core.calibration, core.anchors)
+        return View(T_AC, core.calibration, core.anchors, core.log_scale, core.depth_error)
 
     def compose_core(self, core: Core, context: Context) -> Core:
         """P18, P19. The noise has been used: it is marginalised."""
@@ -136,13 +162,25 @@ class SlamModel:
             core,
             pose=self.frame.compose(core.pose, step),
             anchors=_seen_from(step, core.anchors) if self.frame.moves_landmarks else core.anchors,
-            velocity=self.rig.motion.next_velocity(core.velocity, core.noise, context.control),
+            velocity=self.rig.motion.next_velocity(
+                core.velocity, self._noise_in_gauge(core), context.control
+            ),
             noise=jnp.zeros_like(core.noise),
         )
 
     def camera_pose(self, core: Core) -> Pose:
-        """T_BC."""
-        return self.frame.camera_pose(core.pose)
+        """T_BC, in metres."""
+        return self.frame.camera_pose(self._metric_pose(core))
+
+    def estimate(self, core: Core) -> Pose | SplitPose:
+        """The one pose whose error is the filter's, in metres."""
+        return self.frame.estimate(self._metric_pose(core))
+
+    def _metric_pose(self, core: Core) -> Any:
+        """What is held of the pose, its lengths times `e^λ`."""
+        if core.log_scale is None:
+            return core.pose
+        return scaled(core.pose, jnp.exp(core.log_scale[0]))
 
     def compose_landmark(self, view: View, landmark: Array, context: Context) -> Array:
         """P20: the landmark in the new camera frame."""
@@ -191,9 +229,14 @@ class SlamModel:
             T_CA = T_CA @ T_AF.joined()
         return T_CA.rotation() @ point + omega * T_CA.translation(), omega
 
+    def metric_point(self, view: View, landmark: Array) -> tuple[Array, Array]:
+        """`camera_point` in metres: with the gauge's scale, `ω e^−λ`."""
+        point, omega = self.camera_point(view, landmark)
+        return point, omega if view.log_scale is None else omega * jnp.exp(-view.log_scale[0])
+
     def chart(self, view: View, landmark: Array) -> Array:
         """The sensor's chart in the current camera: where parametrizations can be compared."""
-        return self.rig.sensor.chart(*self.camera_point(view, landmark))
+        return self.rig.sensor.chart(*self.metric_point(view, landmark))
 
     def convert(self, view: View, landmark: Array, covariance: Array, context: Context) -> Array:
         """The same landmark in the form that its parametrization now prefers."""
@@ -205,7 +248,11 @@ class SlamModel:
     def initialise(self, view: View, measured: Array, hidden: Array, context: Context) -> Array:
         """P22–P26: a landmark in the map frame from its first measurement and the prior."""
         camera = view.camera(context)
+        if view.depth_error is not None:
+            hidden = hidden + context.parameters.inverse_depth_sigma * view.depth_error
         point, omega = self.rig.sensor.locate(camera, measured, hidden)
+        if view.log_scale is not None:
+            omega = omega * jnp.exp(view.log_scale[0])
         seen = self.landmark.initialise(point, omega, camera.focal[0])
         if self.landmark.anchored:
             return seen.at[-1].set(context.anchor)
@@ -238,12 +285,30 @@ class SlamFilter:
     engine: Engine = ekf
     """The form of the filter: `ekf`, on the covariance, or `information`, on its inverse."""
     initialisation: Initialisation = UNDELAYED
+    scale_gauge: bool = False
+    """Whether lengths in the state are in a unit of their own, `e^λ` metres, with λ estimated."""
+    depth_correlation: float = 0.0
+    """Correlation, from 0 to below 1, of the priors on 1/z of any two landmarks."""
 
     def __post_init__(self) -> None:
         if self.calibration not in CALIBRATIONS:
             raise ValueError(
                 f"unknown calibration {self.calibration!r}; known: {', '.join(CALIBRATIONS)}"
             )
+        if not 0 <= self.depth_correlation < 1:
+            raise ValueError(
+                f"a correlation of depths is from 0 to below 1, not {self.depth_correlation}"
+            )
+        motion, sensor = self.model.rig.motion, self.model.rig.sensor
+        if self.scale_gauge and not (motion.has_velocity and sensor.hidden):
+            raise ValueError(
+                "a scale gauge is for a camera with a velocity: "
+                f"motion {motion.name} and sensor {sensor.name} measure metres"
+            )
+
+    @property
+    def rig(self) -> Rig:
+        return self.model.rig
 
     @property
     def geometry(self) -> Geometry:
@@ -254,12 +319,16 @@ class SlamFilter:
         parameters: Parameters,
         capacity: int,
         velocity: Float[Array, " v"],
-        velocity_sigma: Float[Array, " v"],
+        velocity_sigma: Float[Array, " v"] | Float[Array, "v v"],
+        features: tuple[int, int] | None = None,
     ) -> State:
         """An exactly known pose at the origin of B, an uncertain velocity, an empty map.
 
-        The velocity is not used by a motion model without one.
+        Of the velocity's covariance, σ of each number or a root R, `P = R Rᵀ`. The velocity is
+        not used by a motion model without one. `features` (how many a frame has at the most, known
+        and new) is for filters that remember frames.
         """
+        del features
         dtype = parameters.measurement_sigma.dtype
         geometry, landmark = self.geometry, self.model.landmark
         t, p = geometry.tangent_dim, geometry.pixel_dim
@@ -268,9 +337,11 @@ class SlamFilter:
         core = Core(
             pose=held,
             velocity=jnp.asarray(velocity, dtype)[:v],
+            log_scale=jnp.zeros(1, dtype) if self.scale_gauge else None,
             noise=jnp.zeros(t, dtype),
             calibration=jnp.zeros(0 if self.calibration == "known" else 2 * p, dtype),
             anchors=self._no_anchors(capacity, dtype),
+            depth_error=jnp.zeros(1, dtype) if self.depth_correlation else None,
         )
         # An empty slot holds a point straight ahead: finite in every formula.
         ahead = jnp.zeros(p + 1, dtype).at[-1].set(1.0)
@@ -279,14 +350,39 @@ class SlamFilter:
         slots = self.initialisation.slots(capacity)
         state = self.engine.empty(core, jnp.tile(empty, (slots, 1)))
         state = replace(state, memory=self.initialisation.memory(capacity, dtype))
-        state = self._known(state, 0, tangent_dim(held))
-        covariance = jnp.diag(jnp.asarray(velocity_sigma, dtype)[:v] ** 2)
-        state = self.engine.augment(state, tangent_dim(held), covariance)
+        state = self.engine.know(state, 0, tangent_dim(held))
+        sigma = jnp.asarray(velocity_sigma, dtype)
+        root = jnp.diag(sigma[:v]) if sigma.ndim == 1 else sigma
+        state = self._with_velocity(state, root @ root.T)
+        if self.depth_correlation:
+            common = jnp.full((1, 1), self.depth_correlation, dtype)
+            state = self.engine.augment(state, _part(core, "depth_error").start, common)
         return state if self.calibration == "white" else self._with_calibration(state, parameters)
+
+    def _with_velocity(self, state: State, covariance: Float[Array, "v v"]) -> State:
+        """The prior on the velocity; in a gauge, on its direction and on the scale.
+
+        `v = e^λ ṽ`: λ takes the part along the mean, `λ ≈ nᵀδv/|v|`, and ṽ the rest. With a mean
+        of −σ_λ²/2 the speed keeps its own. From standstill the scale is known, and 1.
+        """
+        core = state.core
+        place = _part(core, "velocity")
+        if not self.scale_gauge:
+            return self.engine.augment(state, place.start, covariance)
+        n, velocity = self.geometry.point_dim, core.velocity
+        speed = jnp.linalg.norm(velocity[:n])
+        along = jnp.zeros_like(velocity).at[:n].set(velocity[:n] / jnp.where(speed > 0, speed, 1))
+        to_scale = along / jnp.where(speed > 0, speed, 1)
+        J = jnp.concatenate(
+            [jnp.eye(velocity.size) - jnp.outer(velocity, to_scale), to_scale[None]]
+        ).astype(covariance.dtype)
+        joint = J @ covariance @ J.T
+        state = replace(state, core=replace(core, log_scale=-joint[-1:, -1] / 2))
+        return self.engine.augment(state, place.start, joint)
 
     def predict(self, state: State, parameters: Parameters, control: Array) -> State:
         """Append this step's motion noise and calibration error (P10, P11, P15)."""
-        start = tangent_dim(state.core.pose) + state.core.velocity.size
+        start = _part(state.core, "noise").start
         state = self.engine.augment(state, start, jnp.diag(parameters.motion_sigma**2))
         if self.calibration == "white":
             state = self._with_calibration(state, parameters)
@@ -310,7 +406,7 @@ class SlamFilter:
     ) -> tuple[State, Innovation]:
         """The Kalman update by features of slots; with a share ρ of each, by R/ρ."""
         context = self._context(parameters, control)
-        noise = self._noise(parameters)
+        noise = self.noise(parameters)
         if share is not None:
             noise = noise / jnp.where(share > 0, share, 1.0)[:, None, None]
         return self.engine.update(
@@ -322,7 +418,7 @@ class SlamFilter:
     ) -> State:
         """`update` without its covariance: cheap enough to try many hypotheses."""
         context = self._context(parameters, control)
-        noise = self._noise(parameters)
+        noise = self.noise(parameters)
         return self.engine.update_mean(
             self.model, state, features, noise, context, self._considered(state)
         )
@@ -342,7 +438,7 @@ class SlamFilter:
         """Search ellipses of a predicted state: pixels, innovation covariances, in front."""
         context = self._context(parameters, control)
         return self.engine.predict_features(
-            self.model, state, slots, self._noise(parameters), context
+            self.model, state, slots, self.noise(parameters), context
         )
 
     def compose(self, state: State, parameters: Parameters, control: Array) -> State:
@@ -363,7 +459,7 @@ class SlamFilter:
         if change is None:
             return state
         t = self.geometry.tangent_dim
-        return self._known(self.engine.change(state, change), t, t)
+        return self.engine.know(self.engine.change(state, change), t, t)
 
     def remove(self, state: State, gone: Bool[Array, " capacity"]) -> State:
         """Marginalise landmarks and free their slots."""
@@ -385,12 +481,27 @@ class SlamFilter:
             hidden = self.model.rig.sensor.hidden
             mean, sigma = parameters.inverse_depth, parameters.inverse_depth_sigma
             prior = (jnp.tile(mean, hidden), jnp.tile(sigma, hidden))
-        noise, context = self._noise(parameters), _composed(parameters)
+        prior = self._prior_in_gauge(state, prior)
+        noise, context = self.noise(parameters), _composed(parameters)
         if self.model.landmark.anchored:
             anchor = _free_anchor(state)
             state = self.engine.change(state, self.model.anchoring(anchor))
             context = replace(context, anchor=anchor)
         return self.engine.initialise(self.model, state, features, noise, prior, context)
+
+    def _prior_in_gauge(self, state: State, prior: tuple[Array, Array]) -> tuple[Array, Array]:
+        """Mean and σ of 1/z such that `e^λ/z`, linear in λ, has its exact first two moments.
+
+        `E e^λ ρ = ρ0 e^(λ + P/2)` for a ρ ~ N(ρ0, σ²) and λ of variance P; the slope by λ is the
+        mean, and the variance that it leaves is `e^2λ ((ρ0² + σ²) e^2P − ρ0² e^P (1 + P))`.
+        """
+        mean, sigma = prior
+        sigma = sigma * jnp.sqrt(1 - self.depth_correlation)
+        if not self.scale_gauge:
+            return mean, sigma
+        P = self.engine.core_covariance(lambda core: core.log_scale, state)[1][0, 0]
+        variance = (mean**2 + sigma**2) * jnp.exp(2 * P) - mean**2 * jnp.exp(P) * (1 + P)
+        return mean * jnp.exp(P / 2), jnp.sqrt(variance)
 
     def finish(self, state: State) -> State:
         """Forget the frame's calibration error where the next frame draws another (white)."""
@@ -425,9 +536,7 @@ class SlamFilter:
     def pose_error(self, state: State, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
         """`T_true ⊟ T_est` of the frame's pose, and the covariance of its tangent."""
         frame = self.model.frame
-        estimate, covariance = self.engine.core_covariance(
-            lambda core: frame.estimate(core.pose), state
-        )
+        estimate, covariance = self.engine.core_covariance(self.model.estimate, state)
         return difference(frame.estimate(frame.hold(T_BC)), estimate), covariance
 
     def camera_pose(self, state: State) -> tuple[Pose, Float[Array, "t t"]]:
@@ -457,7 +566,7 @@ class SlamFilter:
         rotation = self.camera_pose(state)[0].rotation()
 
         def above(view, landmark):
-            point, omega = self.model.camera_point(view, landmark)
+            point, omega = self.model.metric_point(view, landmark)
             x, z = (rotation @ point)[jnp.array([0, -1])]
             return jnp.stack([jnp.atan2(x, z), omega / jnp.hypot(x, z)])
 
@@ -498,7 +607,7 @@ class SlamFilter:
 
         def point(view, landmark):
             (camera_view, T_BC) = view
-            seen, omega = self.model.camera_point(camera_view, landmark)
+            seen, omega = self.model.metric_point(camera_view, landmark)
             return T_BC @ (seen / omega)
 
         return view, point
@@ -512,7 +621,7 @@ class SlamFilter:
         core = state.core
         if not self.compose_first:
             core = self.model.compose_core(core, context)
-        points, omegas = jax.vmap(self.model.camera_point, in_axes=(None, 0))(
+        points, omegas = jax.vmap(self.model.metric_point, in_axes=(None, 0))(
             view, state.landmarks[slots]
         )
         return self.model.camera_pose(core), points, omegas
@@ -526,17 +635,13 @@ class SlamFilter:
         origin = SplitPose.of(identity(self.geometry, dtype))
         return jax.tree.map(lambda x: jnp.tile(x, (capacity, 1)), origin)
 
-    def _known(self, state: State, start: int, size: int) -> State:
-        """Numbers of the core that are known exactly: a covariance of zero, in either form."""
-        return self.engine.augment(state, start, jnp.zeros((size, size), state.landmarks.dtype))
-
     def _with_calibration(self, state: State, parameters: Parameters) -> State:
         if self.calibration == "known":
             return state
         covariance = jnp.diag(parameters.intrinsics_sigma**2)
         return self.engine.augment(state, _calibration(state).start, covariance)
 
-    def _noise(self, parameters: Parameters) -> Float[Array, "p p"]:
+    def noise(self, parameters: Parameters) -> Float[Array, "p p"]:
         """R of one measurement."""
         sigma = parameters.measurement_sigma
         return sigma**2 * jnp.eye(self.model.rig.sensor.size(self.geometry), dtype=sigma.dtype)
@@ -569,6 +674,15 @@ def _free_anchor(state: State) -> Int[Array, ""]:
 
 def _calibration(state: State) -> slice:
     """Where the calibration's error is in the tangent of the core."""
-    core = state.core
-    start = tangent_dim((core.pose, core.velocity, core.noise))
-    return slice(start, start + core.calibration.size)
+    return _part(state.core, "calibration")
+
+
+def _part(core: Core, name: str) -> slice:
+    """Where a field is in the tangent of the core."""
+    start = 0
+    for field in fields(core):
+        size = tangent_dim(getattr(core, field.name))
+        if field.name == name:
+            return slice(start, start + size)
+        start += size
+    raise KeyError(name)

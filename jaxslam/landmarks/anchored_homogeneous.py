@@ -31,6 +31,12 @@ def homogeneous(landmark):
     return rho * anchor + ray, rho
 
 
+def scale(factor, landmark):
+    """`C' = s C`, `m' = m`, `ρ' = ρ/s`."""
+    anchor, ray, rho = _unpack(landmark)
+    return _pack(factor * anchor, ray, rho / factor)
+
+
 def _pack(anchor, ray, rho):
     return jnp.concatenate([anchor, ray, rho[None]])
 
@@ -49,4 +55,5 @@ ANCHORED_HOMOGENEOUS = Parametrization(
     initialise=initialise,
     transform=transform,
     homogeneous=homogeneous,
+    scale=scale,
 )

@@ -23,6 +23,11 @@ def homogeneous(landmark):
     return landmark, jnp.ones((), landmark.dtype)
 
 
+def scale(factor, landmark):
+    """`X' = s X`."""
+    return factor * landmark
+
+
 CARTESIAN = Parametrization(
     name="cartesian",
     parameters="(X, Y, Z)",
@@ -32,4 +37,5 @@ CARTESIAN = Parametrization(
     initialise=initialise,
     transform=transform,
     homogeneous=homogeneous,
+    scale=scale,
 )

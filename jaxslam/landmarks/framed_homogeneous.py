@@ -28,6 +28,11 @@ def homogeneous(landmark):
     return image_plane.homogeneous(landmark[:-1])
 
 
+def scale(factor, landmark):
+    """`1/z' = (1/z)/s`; the filter moves the anchor."""
+    return jnp.append(image_plane.scale(factor, landmark[:-1]), landmark[-1])
+
+
 FRAMED_HOMOGENEOUS = Parametrization(
     name="framed_homogeneous",
     parameters="(x/z, y/z, 1/z), number of an anchor",
@@ -37,5 +42,6 @@ FRAMED_HOMOGENEOUS = Parametrization(
     initialise=initialise,
     transform=transform,
     homogeneous=homogeneous,
+    scale=scale,
     anchored=True,
 )

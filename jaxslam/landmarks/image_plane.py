@@ -30,6 +30,11 @@ def homogeneous(landmark):
     return landmark.at[-1].set(1.0), landmark[-1]
 
 
+def scale(factor, landmark):
+    """`1/z' = (1/z)/s`."""
+    return landmark.at[-1].divide(factor)
+
+
 IMAGE_PLANE = Parametrization(
     name="image_plane",
     parameters="(x/z, y/z, 1/z)",
@@ -39,4 +44,5 @@ IMAGE_PLANE = Parametrization(
     initialise=initialise,
     transform=transform,
     homogeneous=homogeneous,
+    scale=scale,
 )

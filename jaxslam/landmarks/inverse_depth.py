@@ -36,6 +36,12 @@ def homogeneous(landmark):
     return inverse_distance * anchor + ray_of(angles), inverse_distance
 
 
+def scale(factor, landmark):
+    """`C' = s C`, `ρ' = ρ/s`."""
+    anchor, angles, inverse_distance = unpack(landmark)
+    return _pack(factor * anchor, angles, inverse_distance / factor)
+
+
 def _pack(anchor, angles, inverse_distance):
     return jnp.concatenate([anchor, angles, inverse_distance[None]])
 
@@ -71,4 +77,5 @@ INVERSE_DEPTH = Parametrization(
     initialise=initialise,
     transform=transform,
     homogeneous=homogeneous,
+    scale=scale,
 )

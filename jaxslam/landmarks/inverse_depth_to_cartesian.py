@@ -38,6 +38,11 @@ def homogeneous(landmark):
     return jnp.where(converted, position, point), jnp.where(converted, 1.0, omega)
 
 
+def scale(factor, landmark):
+    """That of inverse depth; once converted, ρ = 0 and the position is scaled."""
+    return jnp.append(inverse_depth.scale(factor, landmark[:-1]), landmark[-1])
+
+
 def convert(camera, landmark, covariance):
     """To Cartesian where `L_d < 0.1`: σ_d = σ_ρ/ρ², α the parallax, d the present distance."""
     point, rho = inverse_depth.homogeneous(landmark[:-1])
@@ -74,5 +79,6 @@ INVERSE_DEPTH_TO_CARTESIAN = Parametrization(
     initialise=initialise,
     transform=transform,
     homogeneous=homogeneous,
+    scale=scale,
     convert=convert,
 )

@@ -27,6 +27,11 @@ def homogeneous(landmark):
     return landmark[:-1], landmark[-1]
 
 
+def scale(factor, landmark):
+    """`X' = X`, `ω' = ω/s`: the length of (x, y, z), which is a convention, stays."""
+    return landmark.at[-1].divide(factor)
+
+
 INVERSE_SCALING = Parametrization(
     name="inverse_scaling",
     parameters="(x, y, z, ω)",
@@ -36,4 +41,5 @@ INVERSE_SCALING = Parametrization(
     initialise=initialise,
     transform=transform,
     homogeneous=homogeneous,
+    scale=scale,
 )

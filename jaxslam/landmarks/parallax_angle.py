@@ -46,6 +46,13 @@ def homogeneous(landmark):
     return omega * main + jnp.where(done, reach, 1.0) * ray, omega
 
 
+def scale(factor, landmark):
+    """Both anchors move; α, between two rays, stays, and ρ is divided."""
+    main, associate, angles, alpha, anchored = _unpack(landmark)
+    alpha = jnp.where(anchored > 0.5, alpha, alpha / factor)
+    return _pack(factor * main, factor * associate, angles, alpha, anchored)
+
+
 def convert(camera, landmark, covariance):
     """The camera becomes the associate anchor where `tan α = ρ |b⊥| / (1 − ρ m·b)` is enough."""
     del covariance
@@ -84,5 +91,6 @@ PARALLAX_ANGLE = Parametrization(
     initialise=initialise,
     transform=transform,
     homogeneous=homogeneous,
+    scale=scale,
     convert=convert,
 )

@@ -33,6 +33,8 @@ class Parametrization:
     """`transform(T_ab, parameters_in_b)`: the same point in frame a."""
     homogeneous: Callable[[Parameters], Homogeneous]
     """`(X, ω)` such that the point is X/ω; ω may be 0 (a point at infinity) or negative."""
+    scale: Callable[[Float[Array, ""], Parameters], Parameters]
+    """`scale(s, parameters)`: the point s X/ω, numbers that do not tell the point kept."""
     convert: Callable[[Float[Array, " n"], Parameters, Float[Array, "d d"]], Parameters] | None = (
         None
     )

@@ -27,4 +27,5 @@ UNIT_HOMOGENEOUS = Parametrization(
     initialise=initialise,
     transform=inverse_scaling.transform,
     homogeneous=inverse_scaling.homogeneous,
+    scale=inverse_scaling.scale,
 )

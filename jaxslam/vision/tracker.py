@@ -93,7 +93,13 @@ class Tracker:
 
     def __post_init__(self) -> None:
         s = self.settings
-        self._filter = FILTERS[s.filter](Rig(SPATIAL), LANDMARKS[s.landmarks], s.calibration)
+        made = FILTERS[s.filter](Rig(SPATIAL), LANDMARKS[s.landmarks], s.calibration)
+        if not isinstance(made, SlamFilter):
+            raise ValueError(
+                f"filter {s.filter} cannot track: features are sought where a filter predicts "
+                "them, before it is given the frame"
+            )
+        self._filter = made
         self._time: float | None = None
         self._T_wc = self._origin = np.eye(4)
         self._covariance = np.zeros((6, 6))

@@ -1,0 +1,202 @@
+"""A Gaussian sum over the initial velocity: a bank of filters, each sure of a part of it.
+
+What no bearing observes well, the scale, or the direction of travel straight ahead, multiplies
+the inverse depths of all landmarks. A filter that is sure of it has a nearly linear problem. So
+the prior on the velocity is a sum of narrower Gaussians (Alspach, Sorenson 1972), one filter runs
+on each, and the likelihoods of their innovations weigh them.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Float
+
+from jaxslam.filters.filter import Filter
+from jaxslam.filters.slam import Parameters
+from jaxslam.filters.state import Features, Innovation, State
+from jaxslam.geometry import Pose, difference, retract
+from jaxslam.rig import Rig
+
+REACH = 2.5
+"""The members' means are spread over ± so many σ of the prior."""
+OVERLAP = 0.7
+"""σ of a member, in distances between neighbours."""
+ALONG = ("speed", "direction")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class BankState:
+    """The members' states, a batch, and the logarithms of their weights."""
+
+    members: Any
+    log_weights: Float[Array, " members"]
+
+
+@dataclass(frozen=True)
+class Bank:
+    """`count` filters `base` for each direction in which the velocity's prior is divided."""
+
+    base: Filter
+    count: int
+    along: str = "speed"
+    """`speed`: along the mean velocity, which is the scale. `direction`: across it, which is one
+    direction in a planar world and two, with `count²` members, in a spatial one."""
+
+    def __post_init__(self) -> None:
+        if self.count < 3:
+            raise ValueError(f"a Gaussian sum has at least 3 members, not {self.count}")
+        if self.along not in ALONG:
+            raise ValueError(f"unknown division {self.along!r}; known: {', '.join(ALONG)}")
+        if not self.base.rig.motion.has_velocity:
+            raise ValueError(
+                f"a Gaussian sum divides a velocity: motion {self.base.rig.motion.name} has none"
+            )
+
+    @property
+    def rig(self) -> Rig:
+        return self.base.rig
+
+    @property
+    def calibration(self) -> str:
+        return self.base.calibration
+
+    def start(
+        self,
+        parameters: Parameters,
+        capacity: int,
+        velocity: Float[Array, " v"],
+        velocity_sigma: Float[Array, " v"],
+        features: tuple[int, int] | None = None,
+    ) -> BankState:
+        """`v = v̄ + D e`, e ~ N(0, I) = Σ w_i N(A s_i, I − (1 − σ²) A Aᵀ), for directions A."""
+        dtype = parameters.measurement_sigma.dtype
+        D = jnp.diag(jnp.asarray(velocity_sigma, dtype))
+        A = self._directions(jnp.asarray(velocity, dtype), D)
+        grid, weights, sigma = self._division(A.shape[1])
+        root = D @ (jnp.eye(len(D), dtype=dtype) - (1 - sigma) * A @ A.T)
+
+        def member(place):
+            mean = velocity + D @ A @ place
+            return self.base.start(parameters, capacity, mean, root, features)
+
+        return BankState(jax.vmap(member)(jnp.asarray(grid, dtype)), jnp.asarray(weights, dtype))
+
+    def first(self, state: BankState, parameters: Parameters, new: Features) -> BankState:
+        first = jax.vmap(self.base.first, in_axes=(0, None, None))
+        return BankState(first(state.members, parameters, new), state.log_weights)
+
+    def step(
+        self,
+        state: BankState,
+        parameters: Parameters,
+        control: Array,
+        seen: Features,
+        new: Features,
+    ) -> tuple[BankState, Innovation]:
+        """Every member's step; weights by the likelihoods of the innovations."""
+        step = jax.vmap(self.base.step, in_axes=(0, None, None, None, None))
+        members, innovations = step(state.members, parameters, control, seen, new)
+        roots = jnp.linalg.cholesky(innovations.covariance)
+        log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(roots, axis1=1, axis2=2)), axis=1)
+        likelihood = -(innovations.nis + log_det) / 2
+        # A member that has diverged has no likelihood.
+        likelihood = jnp.where(jnp.isfinite(likelihood), likelihood, -jnp.inf)
+        log_weights = jax.nn.log_softmax(state.log_weights + likelihood)
+        return BankState(members, log_weights), _mixed(innovations, state.log_weights)
+
+    def pose_error(self, state: BankState, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
+        """Of the sum's mean, to first order in the members' distances, with its covariance."""
+        errors, covariances = jax.vmap(self.base.pose_error, in_axes=(0, None))(state.members, T_BC)
+        return _moments(state.log_weights, errors, covariances)
+
+    def camera_pose(self, state: BankState) -> tuple[Pose, Float[Array, "t t"]]:
+        """The sum's mean and covariance, in the tangent at its likeliest member."""
+        poses, covariances = jax.vmap(self.base.camera_pose)(state.members)
+        likeliest = jax.tree.map(lambda x: x[jnp.argmax(state.log_weights)], poses)
+        away = jax.vmap(difference, in_axes=(0, None))(poses, likeliest)
+        mean, covariance = _moments(state.log_weights, away, covariances)
+        return retract(likeliest, mean), covariance
+
+    def landmarks_in_camera(self, state: BankState, parameters: Parameters, slots: Array):
+        return self._landmarks(self.base.landmarks_in_camera, state, parameters, slots)
+
+    def landmarks_from_above(self, state: BankState, parameters: Parameters, slots: Array):
+        return self._landmarks(self.base.landmarks_from_above, state, parameters, slots)
+
+    def reported(self, state: BankState) -> State:
+        """The likeliest member's."""
+        likeliest = jnp.argmax(state.log_weights)
+        return self.base.reported(jax.tree.map(lambda x: x[likeliest], state.members))
+
+    def _landmarks(self, function, state, parameters, slots):
+        values, covariances = jax.vmap(function, in_axes=(0, None, None))(
+            state.members, parameters, slots
+        )
+        moments = jax.vmap(_moments, in_axes=(None, 1, 1))
+        return moments(state.log_weights, values, covariances)
+
+    def _directions(self, velocity, D) -> Float[Array, "v m"]:
+        """Orthonormal directions of e: the one that changes the speed most, or those that turn
+        the velocity and do not change the speed."""
+        n = self.rig.geometry.point_dim
+        linear = jnp.zeros_like(velocity).at[:n].set(velocity[:n])
+        still = jnp.linalg.norm(linear) == 0
+        along = D @ jnp.where(still, jnp.eye(velocity.size)[0].astype(D.dtype), linear)
+        along = along[:, None] / jnp.maximum(jnp.linalg.norm(along), jnp.finfo(D.dtype).tiny)
+        if self.along == "speed":
+            return along
+        projected = D[:, :n] - along @ (along.T @ D[:, :n])
+        vectors, _, _ = jnp.linalg.svd(projected, full_matrices=False)
+        return vectors[:, : n - 1]
+
+    def _division(self, directions: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Means and log weights of the members of N(0, I), and their σ."""
+        line = np.linspace(-REACH, REACH, self.count)
+        sigma = min(OVERLAP * (line[1] - line[0]), 0.9)
+        log_weight = -(line**2) / (2 * (1 - sigma**2))
+        grid = np.array(list(itertools.product(line, repeat=directions)))
+        weights = np.array([sum(w) for w in itertools.product(log_weight, repeat=directions)])
+        return grid, weights - np.logaddexp.reduce(weights), float(sigma)
+
+
+def with_scales(base: Filter, count: int | None) -> Bank:
+    """The Gaussian sum over the common scale; 9 members by default."""
+    return Bank(base, 9 if count is None else count, "speed")
+
+
+def with_directions(base: Filter, count: int | None) -> Bank:
+    """The Gaussian sum over the direction of travel; 5 members, or 5², by default."""
+    return Bank(base, 5 if count is None else count, "direction")
+
+
+def _moments(log_weights, means, covariances):
+    """Mean and covariance of a sum of Gaussians; one without weight may be anything."""
+    weights = jnp.exp(log_weights)
+    used = weights > 0
+    means = jnp.where(used[:, None], means, 0.0)
+    covariances = jnp.where(used[:, None, None], covariances, 0.0)
+    mean = weights @ means
+    away = means - mean
+    spread = away[:, :, None] * away[:, None, :]
+    return mean, jnp.tensordot(weights, covariances + spread, axes=1)
+
+
+def _mixed(innovations: Innovation, log_weights) -> Innovation:
+    """The sum's innovation: its first two moments."""
+    m, p = innovations.residual.shape[1:]
+    residual, covariance = _moments(
+        log_weights, innovations.residual.reshape(-1, m * p), innovations.covariance
+    )
+    weights = jnp.exp(log_weights)
+    used = jnp.any(innovations.used, axis=0)
+    predicted = jnp.tensordot(weights, innovations.predicted, axes=1)
+    whitened = solve_triangular(jnp.linalg.cholesky(covariance), residual, lower=True)
+    return Innovation(predicted, residual.reshape(m, p), covariance, used, whitened @ whitened)

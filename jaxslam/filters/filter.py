@@ -1,0 +1,79 @@
+"""What a filter is to those who run it: Monte Carlo studies, benchmarks, a user's own loop.
+
+`SlamFilter` and `FixedLag` are filters. One of your own needs these functions, pure and on a state
+that is any pytree of arrays; give it to `jaxslam.monte_carlo(scenario, {"mine": my_filter})`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Protocol
+
+from jaxtyping import Array, Float
+
+from jaxslam.filters.state import Features, Innovation, State
+from jaxslam.geometry import Pose
+from jaxslam.rig import Rig
+
+if TYPE_CHECKING:
+    from jaxslam.filters.slam import Parameters
+
+
+class Filter(Protocol):
+    """A recursive estimator of a camera's pose and of a map; hashable, since `jit` keys on it."""
+
+    @property
+    def rig(self) -> Rig:
+        """What it is for: geometry, motion model, sensor."""
+        ...
+
+    @property
+    def calibration(self) -> str:
+        """How it treats the camera's calibration, one of `CALIBRATIONS`."""
+        ...
+
+    def start(
+        self,
+        parameters: Parameters,
+        capacity: int,
+        velocity: Float[Array, " v"],
+        velocity_sigma: Float[Array, " v"] | Float[Array, "v v"],
+        features: tuple[int, int] | None = None,
+    ) -> Any:
+        """The state before frame 0: at the origin of B, with a prior on the velocity (σ, or a root
+        of its covariance) and slots for `capacity` landmarks. `features`: the most that a frame
+        has, known and new."""
+        ...
+
+    def first(self, state: Any, parameters: Parameters, new: Features) -> Any:
+        """Frame 0, in which everything is new."""
+        ...
+
+    def step(
+        self, state: Any, parameters: Parameters, control: Array, seen: Features, new: Features
+    ) -> tuple[Any, Innovation]:
+        """One frame: `seen` are features of landmarks in the map, `new` those to insert."""
+        ...
+
+    def pose_error(self, state: Any, T_BC: Pose) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
+        """The error against a true pose and the covariance that the filter gives it: its NEES."""
+        ...
+
+    def camera_pose(self, state: Any) -> tuple[Pose, Float[Array, "t t"]]:
+        """T_BC and its covariance, position in the camera's axes and then orientation."""
+        ...
+
+    def landmarks_in_camera(
+        self, state: Any, parameters: Parameters, slots: Array
+    ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
+        """Landmarks in the sensor's chart, (x/z, y/z, 1/z) of a camera, with covariances."""
+        ...
+
+    def landmarks_from_above(
+        self, state: Any, parameters: Parameters, slots: Array
+    ) -> tuple[Float[Array, "m 2"], Float[Array, "m 2 2"]]:
+        """Azimuth and inverse horizontal distance from the camera, axes of B, with covariances."""
+        ...
+
+    def reported(self, state: Any) -> State:
+        """A state with one slot a landmark, of which `active` says what is in the map."""
+        ...

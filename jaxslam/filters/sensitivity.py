@@ -1,0 +1,218 @@
+"""The steps of a filter as a function of whitened variables, with its derivatives.
+
+An engine for `SlamFilter` that keeps no distribution. All that is random in some frames is made of
+independent standard normal numbers y: the state before them, the noise of every step, the pixel
+and the inverse depth with which a landmark enters. The steps then are a deterministic function
+x(y), of which this engine keeps the value and `S = ∂x/∂y`; an update only compares,
+`A = ∂h/∂y = H S`. With the whitened residuals r,
+
+    −log p(y | z) = ½ |y|² + ½ Σ |r_k(y)|² + const.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.filters.blocks import (
+    Change,
+    Model,
+    composition,
+    indices,
+    local_jacobians,
+    masked,
+    new_landmarks,
+    residuals,
+    rows,
+    small_products,
+    without_auxiliary,
+)
+from jaxslam.filters.state import Features
+from jaxslam.geometry import difference, jacobian, retract, tangent_dim
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Distribution:
+    """A state `x0 ⊞ (m + L y)` with y ~ N(0, I)."""
+
+    core: Any
+    landmarks: Float[Array, "capacity d"]
+    active: Bool[Array, " capacity"]
+    offset: Float[Array, " n"]
+    root: Float[Array, "n n"]
+    """L; rows and columns of zeros where a slot is empty."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Point:
+    """The state at one y. Variables: n of the state before, then those of each frame's noise.
+
+    A landmark that enters takes the first of the n that its slot has: they are free, since an
+    empty slot has none.
+    """
+
+    core: Any
+    landmarks: Float[Array, "capacity d"]
+    active: Bool[Array, " capacity"]
+    sensitivity: Float[Array, "n N"]
+    """S."""
+    variables: Float[Array, " N"]
+    """y."""
+    used: Int[Array, ""]
+    """How many of the variables have been used: the next noise begins there."""
+    memory: Any = ()
+
+    @property
+    def core_dim(self) -> int:
+        return tangent_dim(self.core)
+
+
+class Compared(NamedTuple):
+    """A frame's measurements, whitened by R; zero where one is not used."""
+
+    predicted: Float[Array, "m p"]
+    """Not whitened."""
+    residual: Float[Array, " mp"]
+    """r = R^−½ (z − h)."""
+    slope: Float[Array, "mp N"]
+    """A = R^−½ ∂h/∂y."""
+    used: Bool[Array, " m"]
+
+
+def begin(before: Distribution, variables: Float[Array, " N"]) -> Point:
+    """The state before the frames."""
+    n, c = before.offset.size, tangent_dim(before.core)
+    delta = before.offset + before.root @ variables[:n]
+    core = retract(before.core, delta[:c])
+
+    def moved(further):
+        return difference(retract(before.core, delta[:c] + further), core)
+
+    J = jax.jacfwd(moved)(jnp.zeros(c, delta.dtype))
+    root = before.root.at[:c].set(J @ before.root[:c])
+    landmarks = before.landmarks + delta[c:].reshape(before.landmarks.shape)
+    sensitivity = jnp.pad(root, ((0, 0), (0, variables.size - n)))
+    return Point(core, landmarks, before.active, sensitivity, variables, jnp.asarray(n))
+
+
+def augment(point: Point, start: int, covariance: Float[Array, "k k"]) -> Point:
+    """The next k variables, scaled by the σ of a diagonal covariance, as k numbers of the core."""
+    k = covariance.shape[0]
+    if k == 0:
+        return point
+    sigma = jnp.sqrt(jnp.diagonal(covariance))
+    drawn = sigma * jax.lax.dynamic_slice(point.variables, (point.used,), (k,))
+    delta = jnp.zeros(point.core_dim, drawn.dtype).at[start : start + k].set(drawn)
+    own = point.used + jnp.arange(k)
+    return replace(
+        point,
+        core=retract(point.core, delta),
+        sensitivity=point.sensitivity.at[start + jnp.arange(k), own].set(sigma),
+        used=point.used + k,
+    )
+
+
+def marginalise(point: Point, start: int, size: int) -> Point:
+    """Forget k numbers of the core; the caller resets their value."""
+    return replace(point, sensitivity=point.sensitivity.at[start : start + size].set(0.0))
+
+
+def know(point: Point, start: int, size: int) -> Point:
+    """Nothing to do: what does not depend on the variables is known."""
+    del start, size
+    return point
+
+
+def update(
+    model: Model,
+    point: Point,
+    features: Features,
+    noise: Float[Array, "p p"],
+    context: Any,
+    considered: slice = slice(0, 0),
+) -> tuple[Point, Compared]:
+    """Compare with the features seen; the state stays as it is."""
+    del considered
+    predicted, residual, used, H = residuals(model, point, features, context)
+    S, c = point.sensitivity, point.core_dim
+    own = S[c:].reshape(*point.landmarks.shape, -1)[features.slots]
+    A = H.by_view @ (H.view_by_core @ S[:c]) + H.by_landmark @ own
+    whitening = solve_triangular(jnp.linalg.cholesky(noise), jnp.eye(len(noise)), lower=True)
+    return point, Compared(
+        predicted,
+        (residual @ whitening.T).ravel(),
+        (whitening.astype(A.dtype) @ A).reshape(residual.size, -1),
+        used,
+    )
+
+
+def compose(model: Model, point: Point, context: Any) -> Point:
+    """Move the state over the motion, `S ← J S`."""
+    return change(point, composition(model, context))
+
+
+def change(point: Point, variables: Change) -> Point:
+    """Write the state in other variables, `S ← J S`."""
+    S, c = point.sensitivity, point.core_dim
+    core, J_core = variables.core(point.core), jacobian(variables.core, point.core)
+    above = J_core @ S[:c]
+    if variables.landmark is None:
+        return replace(point, core=core, sensitivity=jnp.concatenate([above, S[c:]]))
+    moved, _, J = local_jacobians(
+        variables.view, without_auxiliary(variables.landmark), point.core, point.landmarks
+    )
+    below = rows(masked(J, point.active), S)
+    return replace(
+        point,
+        core=core,
+        landmarks=jnp.where(point.active[:, None], moved, point.landmarks),
+        sensitivity=jnp.concatenate([above, below]),
+    )
+
+
+def initialise(
+    model: Model,
+    point: Point,
+    features: Features,
+    noise: Float[Array, "p p"],
+    prior: tuple[Float[Array, "*m q"], Float[Array, "*m q"]],
+    context: Any,
+) -> Point:
+    """Landmarks as the filter begins them, and off by what the variables of their slots say.
+
+    The deviation is linear in them, with a σ that does not depend on the rest of the state. Were
+    it differentiated by the scale of a gauge, the maximum of the posterior would be off by about
+    N σ_λ² after N landmarks: the score of an amplitude has no mean of zero.
+    """
+    if features.slots.size == 0:
+        return point
+    new, J, root = new_landmarks(model, point, features, noise, prior, context)
+    k = root.shape[-1]
+    own = point.variables[indices(features.slots, point)[:, :k]]
+    new = new + small_products(root, own[:, :, None])[:, :, 0]
+
+    S, c, capacity = point.sensitivity, point.core_dim, point.active.size
+    slots = jnp.where(features.valid, features.slots, capacity)  # out of bounds: dropped
+    index = indices(slots, point)
+    S = S.at[index].set(J.by_view @ (J.view_by_core @ S[:c]), mode="drop")
+    S = S.at[index[:, :, None], index[:, None, :k]].add(root, mode="drop")
+    return replace(
+        point,
+        landmarks=point.landmarks.at[slots].set(new, mode="drop"),
+        active=point.active.at[slots].set(True, mode="drop"),
+        sensitivity=S,
+    )
+
+
+def core_covariance(function: Callable[[Any], Any], point: Point) -> tuple[Any, Array]:
+    """Value of a function of the core, and the covariance that y ~ N(0, I) gives it."""
+    root = jacobian(function, point.core) @ point.sensitivity[: point.core_dim]
+    return function(point.core), root @ root.T

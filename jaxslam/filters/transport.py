@@ -1,0 +1,85 @@
+"""A covariance carried along the gauge when an update has moved the estimate.
+
+An update at x learns nothing along N(x), since H(x) N(x) = 0. The next Jacobians, at the corrected
+x⁺, are blind along N(x⁺), another direction: what was unknown would seem partly known. So read
+from an error how much of it is gauge, `L` with `L N(x) = I`, and carry that much over:
+
+    M = I + (N(x⁺) − N(x)) L,    P ← M P Mᵀ,    M N(x) = N(x⁺).
+
+With the ordinary Jacobian Φ at x⁺, `Φ* = Φ M` has `Φ* N_{k|k-1} = N_{k+1|k}` (Hesch et al., IJRR
+2014), and nothing else in the filter changes. It is the covariance's correction in T-EKF 2 of Hao,
+Tian and He (arXiv:2502.05008, 2025).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxslam.filters import ekf
+from jaxslam.filters.initialisation import UNDELAYED
+from jaxslam.filters.slam import SlamFilter
+
+_SINGULAR = 1e-12
+"""Least eigenvalue of NᵀN, its columns of unit length, that counts."""
+
+
+Function = Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class CovarianceForm:
+    """An `Engine` with the functions of `ekf`, and others in the place of some."""
+
+    empty: Function = ekf.empty
+    augment: Function = ekf.augment
+    know: Function = ekf.know
+    marginalise: Function = ekf.marginalise
+    update: Function = ekf.update
+    update_mean: Function = ekf.update_mean
+    predict_features: Function = ekf.predict_features
+    compose: Function = ekf.compose
+    change: Function = ekf.change
+    initialise: Function = ekf.initialise
+    remove: Function = ekf.remove
+    landmark_covariance: Function = ekf.landmark_covariance
+    core_covariance: Function = ekf.core_covariance
+
+
+def check_plain(slam_filter: SlamFilter, remedy: str) -> None:
+    """Raise ValueError unless the filter is an EKF in covariance form with undelayed landmarks."""
+    if slam_filter.engine is not ekf:
+        raise ValueError(f"{remedy} is for the plain EKF in covariance form")
+    if slam_filter.scale_gauge:
+        raise ValueError(f"{remedy} is for filters without a scale gauge, which needs no remedy")
+    if slam_filter.initialisation is not UNDELAYED:
+        raise ValueError(f"{remedy} is for undelayed landmarks")
+
+
+def left_inverse(N: Float[Array, "n g"]) -> Float[Array, "g n"]:
+    """`(NᵀN)⁻¹ Nᵀ`; without the directions that N does not have."""
+    length = jnp.linalg.norm(N, axis=0)
+    length = jnp.where(length > 0, length, 1.0)
+    N = N / length
+    values, vectors = jnp.linalg.eigh(N.T @ N)
+    kept = values > _SINGULAR
+    inverse = jnp.where(kept, 1 / jnp.where(kept, values, 1.0), 0.0)
+    return (vectors * inverse) @ vectors.T @ N.T / length[:, None]
+
+
+def read_from(N: Float[Array, "n g"], count: int) -> Float[Array, "g n"]:
+    """L: the gauge that the first `count` numbers of an error tell."""
+    return left_inverse(N.at[count:].set(0.0))
+
+
+def carried(
+    covariance: Float[Array, "n n"], change: Float[Array, "n g"], L: Float[Array, "g n"]
+) -> Float[Array, "n n"]:
+    """`M P Mᵀ` with `M = I + change L`, by products of rank g; the change is N(x⁺) − N(x)."""
+    left = covariance + change @ (L @ covariance)
+    covariance = left + (left @ L.T) @ change.T
+    return (covariance + covariance.T) / 2

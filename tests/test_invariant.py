@@ -1,0 +1,124 @@
+"""Tests of the right-invariant filter: its retraction, and that the base frame does not matter."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import Case, close, named, pose, quick_jit
+
+from jaxslam.filters import make_filter
+from jaxslam.filters.blocks import shifted
+from jaxslam.filters.ekf import update as plain_update
+from jaxslam.filters.gauge import act
+from jaxslam.filters.slam import Context
+from jaxslam.geometry import PLANAR, SPATIAL, difference, exp, log
+from jaxslam.landmarks import CARTESIAN, INVERSE_DEPTH, INVERSE_SCALING
+
+NAMES = {PLANAR: "matched", SPATIAL: "matched-6dof"}
+
+
+@cache
+def case(geometry):
+    return Case(NAMES[geometry], steps=2, landmarks=4)
+
+
+def predicted(slam, geometry):
+    """A predicted state whose pose and landmarks are uncertain together, and its measurements."""
+    start = case(geometry)
+    first, known, _ = start.frames(0)
+    velocity, velocity_sigma, controls = start.motion()
+    given = start.parameters()
+    state = slam.first(slam.start(given, 4, velocity, velocity_sigma), given, first)
+    state = slam.predict(state, given, controls[0])
+    # A heading uncertain enough for a large correction.
+    t = geometry.tangent_dim
+    moved = state.covariance.at[jnp.arange(t), jnp.arange(t)].add(1e-2)
+    features = jax.tree.map(lambda x: x[0], known)
+    features = replace(features, measured=features.measured + 60.0)  # of 650 a radian
+    return replace(state, covariance=moved), features, given
+
+
+def seen_from_elsewhere(slam, state, rigid):
+    """The same state in another base frame, `P' = J P Jᵀ`."""
+    one = jnp.ones(())
+    core, landmarks = act(slam.model, rigid, one, state.core, state.landmarks)
+
+    def error(delta):
+        x = shifted(state, delta)
+        moved = act(slam.model, rigid, one, x.core, x.landmarks)
+        return jnp.append(difference(moved[0], core), (moved[1] - landmarks).ravel())
+
+    J = jax.jacfwd(error)(jnp.zeros(state.covariance.shape[0]))
+    return replace(state, core=core, landmarks=landmarks, covariance=J @ state.covariance @ J.T)
+
+
+@pytest.mark.parametrize(
+    ("geometry", "landmark"),
+    # Angles of a ray in space do not turn by addition.
+    [(PLANAR, INVERSE_SCALING), (PLANAR, INVERSE_DEPTH), (SPATIAL, CARTESIAN)],
+    ids=named,
+)
+def test_an_update_is_the_same_in_every_base_frame(geometry, landmark):
+    slam = make_filter(case(geometry).scenario.rig, "invariant", landmark, "known")
+
+    def both():
+        state, features, given = predicted(slam, geometry)
+        rigid = pose(geometry, 4, 1.2)
+        elsewhere = seen_from_elsewhere(slam, state, rigid)
+        a, b = (slam.update(s, given, None, features)[0] for s in (state, elsewhere))
+        return seen_from_elsewhere(slam, a, rigid), b, state
+
+    expected, actual, before = quick_jit(both)()
+    np.testing.assert_allclose(difference(actual.core, expected.core), 0, atol=1e-10)
+    close(actual.landmarks, expected.landmarks, 1e-10)
+    close(actual.covariance, expected.covariance, 1e-8)
+    assert np.abs(difference(actual.core, before.core)).max() > 1e-3
+
+
+@pytest.mark.parametrize("geometry", [PLANAR, SPATIAL], ids=lambda g: g.name)
+def test_cartesian_landmarks_are_corrected_as_published(geometry):
+    """`p ← R p + V ξ`, V by `Exp(ξ, θ) = (R, V ξ)`, but for θ²/24 of a landmark's own ξ."""
+    rig = case(geometry).scenario.rig
+    slam = make_filter(rig, "invariant", CARTESIAN, "known")
+    n = geometry.point_dim
+
+    def corrected():
+        state, features, given = predicted(slam, geometry)
+        context = Context(given, None)
+        noise = given.measurement_sigma**2 * jnp.eye(geometry.pixel_dim)
+        added, _ = plain_update(slam.model, state, features, noise, context)
+        after, _ = slam.update(state, given, None, features)
+        mean = slam.update_mean(state, given, None, features)
+        return state, added, after, mean
+
+    before, added, after, mean = quick_jit(corrected)()
+    T, T_added = before.core.pose.joined(), added.core.pose.joined()
+    turn = T.rotation().inverse() @ T_added.rotation()
+    theta = log(turn) if n == 2 else T.rotation() @ log(turn)
+
+    def cross(x):
+        return theta[0] * jnp.array([-x[1], x[0]]) if n == 2 else jnp.cross(theta, x)
+
+    size = float(jnp.linalg.norm(theta))
+    assert size > 0.02
+
+    def xi(x, x_added):
+        return x_added - x - cross(x)
+
+    def published(x, x_added):
+        return exp(geometry.group, jnp.append(xi(x, x_added), theta)) @ x
+
+    expected = jax.vmap(published)(before.landmarks, added.landmarks)
+    own = jax.vmap(xi)(before.landmarks, added.landmarks)
+    own -= xi(T.translation(), T_added.translation())
+    # V(θ) and R(θ/2) differ by θ²/24.
+    bound = size**2 / 20 * np.linalg.norm(own, axis=1)
+    assert np.all(np.linalg.norm(after.landmarks - expected, axis=1) < bound)
+    close(after.core.pose.translation, published(T.translation(), T_added.translation()), 1e-12)
+    np.testing.assert_allclose(mean.landmarks, after.landmarks, rtol=1e-9)
+    np.testing.assert_array_equal(mean.covariance, before.covariance)
+    # Not what addition gives.
+    assert np.all(np.linalg.norm(added.landmarks - expected, axis=1) > 2 * bound)

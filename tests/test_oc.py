@@ -1,0 +1,382 @@
+"""Tests of the gauge and of the filters that respect it: observability-constrained, first-estimate.
+
+What no measurement tells must stay unknown while estimates change: the stacked Jacobians keep
+their null space, and uncertainty added along it at the start changes no estimate ever after.
+"""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import Case, close, each_landmark, named, pose, quick_jit
+from test_observability import GAUGE, nullity
+
+from jaxslam.camera import Camera
+from jaxslam.filters import Parameters, SlamModel, make_filter
+from jaxslam.filters.blocks import shifted
+from jaxslam.filters.ekf import empty
+from jaxslam.filters.frames import ROBOCENTRIC, WORLD
+from jaxslam.filters.gauge import act, unobservable_directions
+from jaxslam.filters.observability_constrained import transport
+from jaxslam.filters.slam import Context, Core
+from jaxslam.geometry import PLANAR, SPATIAL, SplitPose, difference, tangent_dim
+from jaxslam.landmarks import (
+    CARTESIAN,
+    FRAMED_HOMOGENEOUS,
+    IMAGE_PLANE,
+    INVERSE_DEPTH,
+    INVERSE_SCALING,
+    LANDMARKS,
+)
+from jaxslam.motion import CONSTANT_VELOCITY, ODOMETRY
+from jaxslam.rig import Rig
+from jaxslam.sensors import CAMERA
+
+COUNT, STEPS, DT = 7, 8, 0.4
+VELOCITY = Rig(PLANAR, CONSTANT_VELOCITY, CAMERA)
+
+
+def parameters(geometry):
+    """A unit camera, so that H is of the same size as the rest."""
+    p = geometry.pixel_dim
+    return Parameters(Camera(jnp.ones(p), jnp.zeros(p)), *[jnp.zeros(())] * 5)
+
+
+def context(model, composed):
+    """Of a moving camera, or of one whose motion is composed."""
+    if composed:
+        return Context(parameters(model.geometry), None)
+    t, moving = model.geometry.tangent_dim, model.rig.motion is CONSTANT_VELOCITY
+    control = jnp.asarray(DT) if moving else jnp.linspace(0.3, 0.1, t)
+    return Context(parameters(model.geometry), control)
+
+
+def truth(model):
+    """A state with velocity, motion noise, anchors and landmarks first seen from many places."""
+    geometry, rng = model.geometry, np.random.default_rng(5)
+    t, n = geometry.tangent_dim, geometry.point_dim
+    velocity = np.concatenate([rng.uniform(0.3, 0.8, n), rng.uniform(0.1, 0.2, t - n)])
+    anchors = None
+    if model.landmark.anchored:
+        drawn = jax.vmap(geometry.group.exp)(jnp.asarray(rng.uniform(-0.3, 0.3, (COUNT, t))))
+        anchors = jax.vmap(SplitPose.of)(drawn)
+    core = Core(
+        model.frame.hold(pose(geometry, 1)),
+        jnp.asarray(velocity if model.rig.motion.has_velocity else []),
+        jnp.zeros(t),
+        jnp.zeros(0),
+        anchors,
+    )
+    T_AC = model.view(core, context(model, True)).map_from_camera
+
+    def landmark(number, bearing, depth, seen_from):
+        seen = model.landmark.initialise(jnp.append(bearing, 1.0), 1 / depth, jnp.asarray(1.0))
+        if model.landmark.anchored:
+            return seen.at[-1].set(number)
+        return model.landmark.transform(T_AC @ geometry.group.exp(seen_from), seen)
+
+    landmarks = jax.vmap(landmark)(
+        jnp.arange(COUNT),
+        rng.uniform(-0.4, 0.4, (COUNT, geometry.pixel_dim)),
+        rng.uniform(8, 20, COUNT),
+        rng.uniform(-0.3, 0.3, (COUNT, t)),
+    )
+    return replace(empty(core, landmarks), active=jnp.ones(COUNT, bool))
+
+
+def observed(model, state, composed=True):
+    """All predicted measurements."""
+    here = context(model, composed)
+    view = model.view(state.core, here)
+    return jax.vmap(lambda x: model.observe(view, x, here)[0])(state.landmarks).ravel()
+
+
+def moved(model, core, landmarks):
+    """Core and landmarks after one step."""
+    here = context(model, False)
+    view = model.view(core, here)
+    if model.moves_landmarks:
+        landmarks = jax.vmap(lambda x: model.compose_landmark(view, x, here))(landmarks)
+    return model.compose_core(core, here), landmarks
+
+
+@pytest.mark.parametrize(
+    ("geometry", "landmark", "frame"),
+    [(PLANAR, landmark, WORLD) for landmark in each_landmark]
+    + [(PLANAR, INVERSE_SCALING, ROBOCENTRIC), (PLANAR, FRAMED_HOMOGENEOUS, ROBOCENTRIC)]
+    + [(SPATIAL, INVERSE_DEPTH, WORLD)],
+    ids=named,
+)
+def test_the_gauge_changes_no_measurement_now_or_after_a_motion(geometry, landmark, frame):
+    """Finite transformations: h(g x) = h(x), and the motion of g x is g of the motion of x."""
+    model = SlamModel(Rig(geometry), landmark, frame)
+
+    def compared():
+        state = truth(model)
+        noise = jnp.linspace(0.2, -0.3, geometry.tangent_dim)
+        core, landmarks = replace(state.core, noise=noise), state.landmarks
+        rigid, factor = pose(geometry, 7, 1.5), jnp.asarray(1.7)
+        other_core, other_landmarks = act(model, rigid, factor, core, landmarks)
+        other = replace(state, core=other_core, landmarks=other_landmarks)
+        state = replace(state, core=core)
+        seen = [observed(model, s, c) for s in (state, other) for c in (False, True)]
+        after = moved(model, core, landmarks)
+        return seen, act(model, rigid, factor, *after), moved(model, other.core, other.landmarks)
+
+    (a, b, c, d), expected, actual = quick_jit(compared)()
+    close(c, a, 1e-12)
+    close(d, b, 1e-12)
+    close(actual[1], expected[1], 1e-12)
+    np.testing.assert_allclose(difference(actual[0], expected[0]), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD], ids=named)
+@pytest.mark.parametrize("landmark", [INVERSE_SCALING, FRAMED_HOMOGENEOUS], ids=named)
+def test_directions_are_the_derivative_of_the_action(landmark, frame):
+    """H N = 0, by other Jacobians than N's; empty slots do not move."""
+    model = SlamModel(VELOCITY, landmark, frame)
+
+    def products():
+        state = truth(model)
+        N = unobservable_directions(model, state)
+        H = jax.jacfwd(lambda delta: observed(model, shifted(state, delta)))(jnp.zeros(N.shape[0]))
+        half = replace(state, active=state.active.at[3].set(False))
+        return H, N, unobservable_directions(model, half)
+
+    H, N, half = map(np.asarray, quick_jit(products)())
+    d = truth(model).landmarks.shape[1]
+    start = len(N) - COUNT * d + 3 * d
+    np.testing.assert_allclose(H @ N, 0, atol=1e-13 * np.abs(H).max() * np.abs(N).max())
+    assert not half[start : start + d].any()
+    np.testing.assert_array_equal(
+        np.delete(half, range(start, start + d), 0)[:, :3],
+        np.delete(N, range(start, start + d), 0)[:, :3],
+    )
+
+
+@cache
+def steps(model, constrained):
+    """`(state, correction) → H, M, Φ, next state`: one step of a filter that is corrected."""
+
+    def step(state, correction):
+        H = jax.jacfwd(lambda delta: observed(model, shifted(state, delta)))(correction * 0)
+        after = shifted(state, correction)
+        M = jnp.eye(correction.size)
+        if constrained:
+            change, L = transport(model, state, after)
+            M += change @ L
+        after_motion = moved(model, after.core, after.landmarks)
+
+        def motion(delta):
+            x = shifted(after, delta)
+            core, landmarks = moved(model, x.core, x.landmarks)
+            return jnp.append(difference(core, after_motion[0]), landmarks.ravel())
+
+        F = jax.jacfwd(motion)(correction * 0)
+        core, landmarks = after_motion
+        return H, M, F, replace(state, core=core, landmarks=landmarks)
+
+    return quick_jit(step)
+
+
+def window(model, constrained):
+    """∂(all measurements)/∂(start, noise of every step), corrections in between; and N at the
+    start, which noise has no part in."""
+    t = model.geometry.tangent_dim
+    state = truth(model)
+    n = state.core_dim + state.landmarks.size
+    first = tangent_dim((state.core.pose, state.core.velocity))
+    kept = np.delete(np.arange(n), range(first, first + t))
+    N = np.asarray(unobservable_directions(model, state))[kept]
+    G = np.eye(n, kept.size + STEPS * t) * 0.0
+    G[kept, np.arange(kept.size)] = 1.0
+    rng, rows = np.random.default_rng(11), []
+    for k in range(STEPS + 1):
+        correction = 0.02 * rng.standard_normal(n)
+        correction[first : first + t] = 0.0
+        H, M, F, state = steps(model, constrained)(state, jnp.asarray(correction))
+        rows.append(np.asarray(H) @ G)
+        G = np.asarray(M) @ G
+        if k < STEPS:
+            here = kept.size + k * t
+            G[first : first + t] = 0.0
+            G[first : first + t, here : here + t] = np.eye(t)
+            G = np.asarray(F) @ G
+    return np.vstack(rows), N
+
+
+RIGS = {"velocity": (CONSTANT_VELOCITY, CAMERA), "odometry": (ODOMETRY, CAMERA)}
+
+
+@pytest.mark.parametrize(
+    ("geometry", "landmark", "frame", "rig"),
+    [
+        (PLANAR, CARTESIAN, ROBOCENTRIC, "velocity"),
+        (PLANAR, CARTESIAN, WORLD, "odometry"),
+        (SPATIAL, IMAGE_PLANE, ROBOCENTRIC, "velocity"),
+        (SPATIAL, CARTESIAN, WORLD, "odometry"),
+    ],
+    ids=lambda value: getattr(value, "name", value),
+)
+def test_corrections_leave_the_null_space_as_it_is(geometry, landmark, frame, rig):
+    """4 or 7 directions without odometry, 3 or 6 with it, at other estimates in every step."""
+    model = SlamModel(Rig(geometry, *RIGS[rig]), landmark, frame)
+    stacked, N = window(model, True)
+    size = np.linalg.norm(stacked, 2) * np.linalg.norm(N, 2)
+    count = N.shape[0]
+    assert np.linalg.norm(stacked[:, :count] @ N, 2) < 1e-12 * size
+    plain, _ = window(model, False)
+    unaware = np.linalg.norm(plain[:, :count] @ N, 2)
+    if frame is ROBOCENTRIC and rig == "odometry":
+        # Its pose is perturbed on the side of B: N is constant.
+        assert unaware < 1e-12 * size
+    else:
+        assert unaware > 1e-6 * size
+    if landmark.size(geometry.point_dim) > geometry.point_dim:
+        return  # its redundant numbers are another null space
+    expected = GAUGE[geometry] + (rig == "velocity")
+    # Where motion is noise, the first velocity and acceleration are seen only in their sum.
+    known = range(count, count + geometry.tangent_dim if rig == "velocity" else stacked.shape[1])
+    assert nullity(np.delete(stacked, known, axis=1)) == expected
+    assert N.shape[1] == expected
+
+
+@cache
+def case(geometry):
+    """The start of a run without odometry."""
+    return Case({PLANAR: "matched", SPATIAL: "matched-6dof"}[geometry], steps=6, landmarks=5)
+
+
+def run_with_gauge(slam, geometry, directions):
+    """A filter's run twice: as it is, and with the frame (and the scale) unknown by 0.1 at the
+    start; states after every step, their directions N, and NIS."""
+    start = case(geometry)
+    first, known, new = start.frames(0)
+    velocity, velocity_sigma, controls = start.motion()
+    given = start.parameters()
+
+    def run(sigma):
+        state = slam.start(given, start.capacity, velocity, velocity_sigma)
+        state = slam.first(state, given, first)
+        N = unobservable_directions(slam.model, state)[:, :directions]
+        state = replace(state, covariance=state.covariance + sigma**2 * N @ N.T)
+
+        def step(state, frame):
+            state, innovation = slam.step(state, given, *frame)
+            # Where the filter's directions are those of landmarks' first estimates.
+            at = replace(state, landmarks=getattr(state, "first", state.landmarks))
+            N = unobservable_directions(slam.model, at)[:, :directions]
+            kept = state.core, state.landmarks, state.covariance
+            return state, (*kept, N, innovation.nis)
+
+        return jax.lax.scan(step, state, (controls, known, new))[1]
+
+    return quick_jit(jax.vmap(run))(jnp.array([0.0, 0.1]))
+
+
+def difference_of_runs(slam, geometry, directions):
+    """How much the estimates differ between the two runs, and how much the covariances differ
+    from what was added; both relative."""
+    core, landmarks, covariance, N, nis = run_with_gauge(slam, geometry, directions)
+    estimates = [x for x in jax.tree.leaves((core, landmarks, nis)) if np.any(x[0])]
+    moved = max(float(np.abs(b - a).max() / np.abs(a).max()) for a, b in estimates)
+    added = covariance[1] - covariance[0]
+    expected = 0.01 * N[0] @ N[0].swapaxes(-1, -2)
+    return moved, float(np.abs(added - expected).max() / np.abs(expected).max())
+
+
+REMEDIES = [
+    ("robocentric+oc", PLANAR, "inverse_scaling"),
+    ("world+oc", PLANAR, "framed_homogeneous"),
+    ("world+fej", PLANAR, "inverse_scaling"),
+    ("invariant", PLANAR, "anchored_homogeneous"),
+]
+
+
+@pytest.mark.parametrize(("name", "geometry", "landmark"), REMEDIES)
+def test_uncertainty_of_the_gauge_changes_no_estimate_ever(name, geometry, landmark):
+    """Through whole steps: K and the mean are the same, and P keeps what was added, N Σ Nᵀ."""
+    rig = case(geometry).scenario.rig
+    count = GAUGE[geometry] + (name != "invariant")  # which knows nothing of the scale
+    slam = make_filter(rig, name, LANDMARKS[landmark], "known")
+    moved, forgotten = difference_of_runs(slam, geometry, count)
+    assert moved < 1e-9
+    assert forgotten < 1e-7
+
+
+def test_a_plain_filter_learns_what_it_cannot_see():
+    slam = make_filter(case(PLANAR).scenario.rig, "robocentric", INVERSE_SCALING, "known")
+    moved, forgotten = difference_of_runs(slam, PLANAR, GAUGE[PLANAR] + 1)
+    assert moved > 1e-5
+    assert forgotten > 1e-2
+
+
+def test_with_odometry_a_robocentric_filter_has_nothing_to_constrain():
+    odometry = Case("positions", steps=8, landmarks=6)
+    frames = odometry.parameters(), odometry.motion(), *odometry.frames(0)
+    plain = odometry.compiled("robocentric", "cartesian")(*frames)[1]
+    slam = make_filter(odometry.scenario.rig, "robocentric+oc", CARTESIAN, "known")
+    constrained = quick_jit(odometry.function(slam))(*frames)[1]
+    for x, y in zip(jax.tree.leaves(plain), jax.tree.leaves(constrained), strict=True):
+        np.testing.assert_allclose(x, y, rtol=0, atol=1e-11)
+
+
+def test_where_the_heading_is_known_all_are_the_kalman_filter():
+    """Relative positions at a known heading are linear: one filter in every coordinates."""
+    case = Case("positions", steps=8, landmarks=6, odometry_sigma=(0.05, 0.05, 0.0))
+    frames = case.parameters(), case.motion(), *case.frames(0)
+    linear = case.compiled("world", "cartesian")(*frames)[1]
+    assert np.trace(linear[1][-1]) > 1e-3
+    for name in ("world+oc", "world+fej", "invariant"):
+        slam = make_filter(case.scenario.rig, name, CARTESIAN, "known")
+        same = quick_jit(case.function(slam))(*frames)[1]
+        for x, y in zip(jax.tree.leaves(linear), jax.tree.leaves(same), strict=True):
+            np.testing.assert_allclose(x, y, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["robocentric+oc", "world+oc", "world+fej", "invariant"])
+def test_a_frame_without_measurements_changes_nothing(name):
+    """Neither the mean nor the covariance: the remedies are those of corrections."""
+    start = case(PLANAR)
+    slam = make_filter(start.scenario.rig, name, INVERSE_SCALING, "known")
+    first, known, _ = start.frames(0)
+    velocity, velocity_sigma, controls = start.motion()
+    given, control = start.parameters(), controls[0]
+    blind = jax.tree.map(lambda x: x[0], known)
+    blind = replace(blind, valid=jnp.zeros_like(blind.valid))
+
+    def update():
+        state = slam.first(slam.start(given, 5, velocity, velocity_sigma), given, first)
+        state = slam.predict(state, given, control)
+        after, innovation = slam.update(state, given, control, blind)
+        return state, after, innovation.nis, slam.update_mean(state, given, control, blind)
+
+    before, after, nis, mean = quick_jit(update)()
+    assert nis == 0
+    for other in (after, mean):
+        for x, y in zip(jax.tree.leaves(before), jax.tree.leaves(other), strict=True):
+            np.testing.assert_allclose(x, y, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "landmark", "message"),
+    [
+        ("keyframe+oc", "image_plane", "known of robocentric and world filters, not keyframe"),
+        ("information+oc", "image_plane", "is for the plain EKF in covariance form"),
+        ("invariant+oc", "cartesian", "is for the plain EKF in covariance form"),
+        ("world+fej+oc", "cartesian", "is for the plain EKF in covariance form"),
+        ("world+particles+oc", "cartesian", "oc is for undelayed landmarks"),
+        ("world+oc+particles", "cartesian", "delayed initialisation is for"),
+        ("world+oc3", "cartesian", "modifier oc takes no number, not 3"),
+        ("world+fej3", "cartesian", "modifier fej takes no number, not 3"),
+        ("robocentric+fej", "cartesian", "fej is for world filters: a robocentric one moves"),
+        ("world+fej", "framed_homogeneous", "written in one form, in themselves"),
+        ("world+fej", "parallax_angle", "written in one form, in themselves"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(name, landmark, message):
+    with pytest.raises(ValueError, match=message):
+        make_filter(VELOCITY, name, LANDMARKS[landmark], "known")
