@@ -26,7 +26,7 @@ from jaxslam.consistency import FolderStore, MemoryStore
 from jaxslam.files import write_atomically
 from jaxslam.plots.posterior import plot_posterior
 from jaxslam.posterior import (
-    NUTS,
+    HMC,
     Study,
     against_filter,
     converged,
@@ -59,7 +59,7 @@ class Options:
     chunk: int = 25
     """Problems sampled in one batch."""
     seed: int = 0
-    nuts: NUTS = field(default_factory=NUTS)
+    hmc: HMC = field(default_factory=HMC)
     starts: int = 4
     """Starts of the batch MAP."""
     cache: Path | None = None
@@ -84,7 +84,7 @@ def measure(options: Options) -> Iterator[dict[str, Any]]:
     results: dict[str, Any] = {name: {} for name in options.scenarios}
     for steps in options.steps:  # all scenarios of one length share their compiled programs
         for name in options.scenarios:
-            study = Study(jaxslam.scenario(name), steps, options.nuts, options.starts)
+            study = Study(jaxslam.scenario(name), steps, options.hmc, options.starts)
             results[name][str(steps)] = _measure(study, options)
             yield results
 
@@ -101,7 +101,7 @@ def _measure(study: Study, options: Options) -> dict[str, Any]:
     if used.sum() < 2:
         raise ValueError(
             f"only {used.sum()} of {len(used)} problems of {study.scenario.name} at step "
-            f"{study.steps} converged: sample longer (--nuts.warmup, --nuts.draws)"
+            f"{study.steps} converged: sample longer (--hmc.warmup, --hmc.draws)"
         )
     summary = summarise_reference(records, used)
     seconds = {"reference": time.perf_counter() - start}
@@ -124,7 +124,7 @@ def _store(study: Study, options: Options) -> FolderStore | MemoryStore:
     manifest = {
         "scenario": dataclasses.asdict(study.scenario),
         "steps": study.steps,
-        "nuts": dataclasses.asdict(study.nuts),
+        "hmc": dataclasses.asdict(study.hmc),
         "starts": study.starts,
         "seed": options.seed,
     }
@@ -134,19 +134,16 @@ def _store(study: Study, options: Options) -> FolderStore | MemoryStore:
 
 def _reference(study: Study, store, chunk: range, options: Options) -> dict[str, np.ndarray]:
     """Records of both posteriors, `exact_…` and `gaussian_prior_…`, and the exact draws."""
-    records = {}
-    for kind, truncated in (("exact", True), ("gaussian_prior", False)):
-        if not store.has(kind, chunk):
-            # The last chunk is padded by the runs that follow, to be of the same shape.
-            padded = range(chunk.start, chunk.start + options.chunk)
-            runs = draw_runs(study, options.seed, padded)
-            found, chains = reference(study, runs, options.seed, padded, truncated=truncated)
-            found["T_BC"] = jax.vmap(pooled)(chains).parameters()
-            arrays = {k: np.asarray(v)[: len(chunk)] for k, v in jax.device_get(found).items()}
-            store.save(kind, chunk, arrays)
-            print(f"{study.scenario.name} {study.steps}: {kind}, {chunk.stop} runs", flush=True)
-        records.update({f"{kind}_{k}": v for k, v in store.load(kind, chunk).items()})
-    return records
+    if not store.has("posterior", chunk):
+        # The last chunk is padded by the runs that follow, to be of the same shape.
+        padded = range(chunk.start, chunk.start + options.chunk)
+        runs = draw_runs(study, options.seed, padded)
+        found, chains = reference(study, runs, options.seed, padded)
+        found["exact_T_BC"] = jax.vmap(pooled)(chains).parameters()
+        arrays = {k: np.asarray(v)[: len(chunk)] for k, v in jax.device_get(found).items()}
+        store.save("posterior", chunk, arrays)
+        print(f"{study.scenario.name} {study.steps}: {chunk.stop} runs", flush=True)
+    return store.load("posterior", chunk)
 
 
 def _filter(study: Study, name: str, chunks, reference, options: Options) -> dict[str, np.ndarray]:
@@ -211,7 +208,7 @@ def main(options: Options) -> None:
             "version": jaxslam.__version__,
             "runs": options.runs,
             "seed": options.seed,
-            "nuts": dataclasses.asdict(options.nuts),
+            "hmc": dataclasses.asdict(options.hmc),
             "starts": options.starts,
             "device": jax.devices()[0].device_kind,
             "scenarios": {name: by_step for name, by_step in results.items() if by_step},

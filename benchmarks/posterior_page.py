@@ -20,12 +20,12 @@ STAGES = {
 
 def page(summary: dict[str, Any]) -> str:
     """The Markdown page: how to read it, the figure, then the tables."""
-    nuts = summary["nuts"]
+    hmc = summary["hmc"]
     parts = [
         "# The exact posterior, and how far the filters are from it",
         "Made by `python benchmarks/posterior.py`; do not edit. "
-        f"{summary['runs']} runs, seed {summary['seed']}, float64; NUTS with {nuts['chains']} "
-        f"chains of {nuts['draws']} draws after {nuts['warmup']}; MAP from {summary['starts']} "
+        f"{summary['runs']} runs, seed {summary['seed']}, float64; HMC with {hmc['chains']} "
+        f"chains of {hmc['draws']} draws after {hmc['warmup']}; MAP from {summary['starts']} "
         "starts. A row is over the runs of which both posteriors converged (R̂ ≤ 1.05 and 100 "
         "effective draws of pose, velocity and density). All rows of a scenario and step are of "
         "the same runs.",

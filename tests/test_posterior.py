@@ -1,4 +1,4 @@
-"""Tests of jaxslam.posterior: the model against dense formulas, MAP, NUTS, ranks, bad input."""
+"""Tests of jaxslam.posterior: the model against dense formulas, MAP, HMC, ranks, bad input."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -14,7 +14,7 @@ from scipy.stats import norm, truncnorm
 import jaxslam
 from jaxslam.geometry import difference, retract
 from jaxslam.posterior import (
-    NUTS,
+    HMC,
     Study,
     against_filter,
     check_scenario,
@@ -196,14 +196,14 @@ def nearly_linear():
     mode = jax.jit(lambda problem, s: map_estimate(rig, problem, s))(
         problem, starts(problem, jax.random.key(2), 2)
     )
-    nuts = NUTS(chains=4, warmup=50, draws=250)
-    chains = jax.jit(lambda problem, y, key: sample(nuts, rig, problem, y, key))(
+    hmc = HMC(chains=4, warmup=50, draws=250)
+    chains = jax.jit(lambda problem, y, key: sample(hmc, rig, problem, y, key))(
         problem, mode.mode, jax.random.key(3)
     )
     return problem, run, mode, chains
 
 
-def test_on_a_nearly_linear_problem_map_nuts_and_the_filter_agree():
+def test_on_a_nearly_linear_problem_map_hmc_and_the_filter_agree():
     problem, run, mode, chains = nearly_linear()
     assert bool(mode.converged)
     gradient = jax.grad(lambda y: log_density(NEARLY_LINEAR.rig, problem, y))(mode.mode)
@@ -299,13 +299,13 @@ def test_the_sampler_is_calibrated():
     """Ranks and NEES over 60 problems; false alarms: 0.4 % by six ranks, 0.1 % by the NEES."""
     scenario = jaxslam.scenario("matched-loose", steps=3, landmarks=3)
     study = Study(scenario, 3)
-    runs, nuts = draw_runs(study, 7, range(60)), NUTS(chains=2, warmup=60, draws=100)
+    runs, hmc = draw_runs(study, 7, range(60)), HMC(chains=2, warmup=60, draws=100)
 
     @jax.jit
     def one(run, key):
         problem = make_problem(scenario, run)
         mode = map_estimate(scenario.rig, problem, starts(problem, key, 1))
-        chains = sample(nuts, scenario.rig, problem, mode.mode, key)
+        chains = sample(hmc, scenario.rig, problem, mode.mode, key)
         T_BC, truth = pooled(chains), jax.tree.map(lambda x: x[-1], run.poses)
         mean, P, _ = pose_moments(T_BC)
         return (
@@ -349,7 +349,7 @@ def test_sizes_that_make_no_sense_are_refused():
         Study(LOOSE, 2, starts=0)
     for field, value in (("chains", 1), ("warmup", 5), ("draws", 0), ("acceptance", 1.0)):
         with pytest.raises(ValueError, match=field):
-            NUTS(**{field: value})
+            HMC(**{field: value})
     with pytest.raises(ValueError, match="kept"):
         ranks(np.zeros((2, 1)), np.zeros((2, 5, 1)), 6)
     with pytest.raises(ValueError, match="bins"):

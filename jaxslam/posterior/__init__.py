@@ -17,7 +17,7 @@ from jaxslam.posterior.problem import (
     unknowns,
 )
 from jaxslam.posterior.ranks import ranks, uniformity
-from jaxslam.posterior.sampler import NUTS, Chains, diagnose, sample
+from jaxslam.posterior.sampler import HMC, Chains, diagnose, given_bound, sample
 from jaxslam.posterior.study import (
     Study,
     against_filter,
@@ -28,7 +28,7 @@ from jaxslam.posterior.study import (
 )
 
 __all__ = [
-    "NUTS",
+    "HMC",
     "Chains",
     "Laplace",
     "Problem",
@@ -41,6 +41,7 @@ __all__ = [
     "draw_runs",
     "first_steps",
     "gaussian_divergence",
+    "given_bound",
     "laplace",
     "log_density",
     "make_problem",

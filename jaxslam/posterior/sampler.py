@@ -1,7 +1,13 @@
-"""Draws from the posterior by NUTS, in the variables of `scale` whitened at a mode."""
+"""Draws from the posterior by Hamiltonian Monte Carlo, in the variables of `scale` whitened at a mode.
+
+The trajectories have quasi-random lengths (Neal 2011, section 3.2; Hoffman et al. 2021). In whitened
+variables one knows how long they should be, so that NUTS, which finds that out by doubling, is not
+needed. The lengths are those of all chains and problems, so that no chain of a batch waits.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -23,21 +29,32 @@ FIRST_STEP_SIZE = 0.5
 """Of the adaptation, in variables that are nearly N(0, I)."""
 
 
+LONGEST = math.pi
+"""Trajectories last uniformly up to this long; a harmonic oscillator of N(0, I) has period 2π."""
+GOLDEN = (math.sqrt(5) - 1) / 2
+"""Its multiples modulo 1 are uniform and far from their predecessors."""
+TRUSTED = 0.8
+"""Weight of the pilot chains' covariance beside that of the mode's Gaussian."""
+
+
 @dataclass(frozen=True)
-class NUTS:
+class HMC:
     """How long to sample: static configuration."""
 
     chains: int = 4
-    warmup: int = 100
+    pilots: int = 1
+    """Rounds before the last, each whitens the variables for the next by its covariance."""
+    warmup: int = 200
     """Steps in which every chain adapts its step size, by dual averaging."""
-    draws: int = 250
+    draws: int = 500
     """Kept draws of every chain."""
-    acceptance: float = 0.8
-    doublings: int = 7
-    """A trajectory has at most 2^doublings − 1 leapfrog steps."""
+    acceptance: float = 0.9
+    """What the adaptation aims at."""
+    most_leapfrogs: int = 16
+    """Leapfrog steps that a trajectory has at the most, however short they are."""
 
     def __post_init__(self) -> None:
-        least = {"chains": 2, "warmup": 20, "draws": 8, "doublings": 1}
+        least = {"chains": 2, "pilots": 0, "warmup": 20, "draws": 8, "most_leapfrogs": 1}
         for field, value in least.items():
             if getattr(self, field) < value:
                 raise ValueError(f"{field} must be at least {value}, not {getattr(self, field)}")
@@ -65,52 +82,109 @@ class Chains:
 
 
 def sample(
-    settings: NUTS, rig: Rig, problem: Problem, mode: Float[Array, " n"], key: Array
+    settings: HMC, rig: Rig, problem: Problem, mode: Float[Array, " n"], key: Array
 ) -> Chains:
     """Chains that start at draws of the mode's Gaussian.
 
-    They move in x with `w = mode + R x`, where the posterior is nearly N(0, I): trajectories are
-    short, and the unit mass matrix is better than one estimated from few draws.
+    They move in x with `w = mode + R x` and a unit mass matrix. R whitens the mode's Gaussian in
+    the first round and the covariance of the round before in the others.
     """
-    root = whitening_root(rig, problem, mode)
 
-    def target(x):
-        return scaled_log_density(rig, problem, mode, mode + root @ x)
+    def log_density(w):
+        return scaled_log_density(rig, problem, mode, w)
 
-    def outcome(x):
-        unknown, _ = scaled_unknowns(rig, problem, mode, mode + root @ x)
+    def outcome(w):
+        unknown, _ = scaled_unknowns(rig, problem, mode, w)
         T_BC, velocity = jax.tree.map(lambda x: x[-1], path(rig, problem, unknown))
         return T_BC, velocity, unknown.inverse_depths
 
-    kernel = blackjax.nuts.build_kernel()
-    start_averaging, update_averaging, averaged = dual_averaging_adaptation(settings.acceptance)
-    inverse_mass = jnp.ones_like(mode)
+    def one_round(carry, key):
+        root, last, _ = carry
 
-    def chain(key):
-        start_key, key = jax.random.split(key)
-        state = blackjax.nuts.init(_possible_start(target, start_key, mode), target)
+        def target(x):
+            return log_density(mode + root @ x)
 
-        # One loop over warm-up and draws: a second copy of the kernel compiles for a minute.
-        def step(carry, data):
-            state, averaging = carry
-            key, warming = data
-            size = jnp.where(warming, jnp.exp(averaging.log_step_size), averaged(averaging))
-            state, info = kernel(key, state, target, size, inverse_mass, settings.doublings)
-            adapted = update_averaging(averaging, info.acceptance_rate)
-            averaging = jax.tree.map(partial(jnp.where, warming), adapted, averaging)
-            record = state.position, state.logdensity, info.is_divergent, info.num_integration_steps
-            return (state, averaging), record
-
-        carry = state, start_averaging(jnp.asarray(FIRST_STEP_SIZE, mode.dtype))
-        keys = jax.random.split(key, settings.warmup + settings.draws)
-        warming = jnp.arange(len(keys)) < settings.warmup
-        _, records = jax.lax.scan(step, carry, (keys, warming))
-        x, values, divergent, leapfrogs = jax.tree.map(lambda r: r[settings.warmup :], records)
-        return Chains(
-            *jax.vmap(outcome)(x), values, jnp.mean(divergent), jnp.mean(leapfrogs.astype(x.dtype))
+        start = jnp.linalg.solve(root, (last - mode).T).T
+        x, *diagnostics = jax.vmap(partial(_chain, settings, target))(
+            jax.random.split(key, settings.chains), start
         )
+        w = mode + x @ root.T
+        identity = jnp.eye(mode.size, dtype=mode.dtype)
+        spread = TRUSTED * jnp.cov(x.reshape(-1, mode.size).T) + (1 - TRUSTED) * identity
+        return (root @ jnp.linalg.cholesky(spread), w[:, -1], (w, *diagnostics)), None
 
-    return jax.vmap(chain)(jax.random.split(key, settings.chains))
+    key, start_key = jax.random.split(key)
+    root = whitening_root(rig, problem, mode)
+    start = jax.vmap(lambda k: _possible_start(lambda x: log_density(mode + root @ x), k, mode))(
+        jax.random.split(start_key, settings.chains)
+    )
+    per_chain, per_draw = (settings.chains,), (settings.chains, settings.draws)
+    nothing = (
+        jnp.zeros((*per_draw, mode.size), mode.dtype),
+        jnp.zeros(per_draw, mode.dtype),
+        jnp.zeros(per_chain, mode.dtype),
+        jnp.zeros(per_chain, mode.dtype),
+    )
+    carry = root, mode + start @ root.T, nothing
+    (_, _, (w, *diagnostics)), _ = jax.lax.scan(
+        one_round, carry, jax.random.split(key, settings.pilots + 1)
+    )
+    return Chains(*jax.vmap(jax.vmap(outcome))(w), *diagnostics)
+
+
+def _chain(
+    settings: HMC, target: Callable[[Array], Array], key: Array, start: Float[Array, " n"]
+) -> tuple[Array, Array, Array, Array]:
+    """Draws, their log densities, share of divergent transitions, mean number of leapfrogs."""
+    kernel = blackjax.hmc.build_kernel()
+    start_averaging, update_averaging, averaged = dual_averaging_adaptation(settings.acceptance)
+    inverse_mass = jnp.ones_like(start)
+
+    # One loop over warm-up and draws, as every copy of the kernel is compiled.
+    def step(carry, data):
+        state, averaging = carry
+        key, length, warming = data
+        size = jnp.where(warming, jnp.exp(averaging.log_step_size), averaged(averaging))
+        leapfrogs = jnp.ceil(length / size)
+        leapfrogs = jnp.clip(leapfrogs, 1, settings.most_leapfrogs).astype(int)
+        state, info = kernel(key, state, target, size, inverse_mass, leapfrogs)
+        adapted = update_averaging(averaging, info.acceptance_rate)
+        averaging = jax.tree.map(partial(jnp.where, warming), adapted, averaging)
+        record = state.position, state.logdensity, info.is_divergent, leapfrogs
+        return (state, averaging), record
+
+    carry = (
+        blackjax.hmc.init(start, target),
+        start_averaging(jnp.asarray(FIRST_STEP_SIZE, start.dtype)),
+    )
+    count = settings.warmup + settings.draws
+    lengths = LONGEST * jnp.mod(GOLDEN * jnp.arange(1, count + 1, dtype=start.dtype), 1.0)
+    warming = jnp.arange(count) < settings.warmup
+    _, records = jax.lax.scan(step, carry, (jax.random.split(key, count), lengths, warming))
+    x, values, divergent, leapfrogs = jax.tree.map(lambda r: r[settings.warmup :], records)
+    return x, values, jnp.mean(divergent, dtype=x.dtype), jnp.mean(leapfrogs, dtype=x.dtype)
+
+
+def given_bound(least_inverse_depth: float, chains: Chains) -> tuple[Chains, Float[Array, ""]]:
+    """The draws at which no inverse depth is below the bound, 1/m, and the least share of a chain.
+
+    They are draws of the posterior by the prior that is truncated there: the same density, but for
+    a factor, where it is not zero. To have the shape of before, draws are repeated evenly, which
+    adds to their autocorrelation. A share of 0 says that a chain had none.
+    """
+
+    def of_chain(chain: Chains) -> tuple[Chains, Array]:
+        above = jnp.all(chain.inverse_depths >= least_inverse_depth, axis=-1)
+        count, draws = jnp.sum(above), above.size
+        chosen = jnp.argsort(~above, stable=True)[jnp.arange(draws) * count // draws]
+
+        def take(x):
+            return x[chosen] if x.ndim else x
+
+        return jax.tree.map(take, chain), count / draws
+
+    kept, shares = jax.vmap(of_chain)(chains)
+    return kept, jnp.min(shares)
 
 
 def _possible_start(

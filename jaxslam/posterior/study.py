@@ -29,7 +29,7 @@ from jaxslam.posterior.moments import (
     wasserstein,
 )
 from jaxslam.posterior.problem import Problem, check_scenario, first_steps, make_problem
-from jaxslam.posterior.sampler import LEAST_ESS, NUTS, WORST_RHAT, Chains, diagnose, sample
+from jaxslam.posterior.sampler import LEAST_ESS, HMC, WORST_RHAT, Chains, diagnose, given_bound, sample
 from jaxslam.rig import Rig
 from jaxslam.simulation import Run, Scenario, Sightings, simulate
 
@@ -42,7 +42,7 @@ class Study:
 
     scenario: Scenario
     steps: int
-    nuts: NUTS = field(default_factory=NUTS)
+    hmc: HMC = field(default_factory=HMC)
     starts: int = 4
     """Starts of Levenberg–Marquardt: the prior mean, and draws from the prior."""
 
@@ -74,24 +74,31 @@ def _draw_runs(scenario: Scenario, steps: int, key: Array, indices: Array) -> Ru
     return jax.vmap(one)(indices)
 
 
-def reference(
-    study: Study, runs: Run, seed: int, indices: range, *, truncated: bool
-) -> tuple[Records, Chains]:
-    """Records of the posterior, and of MAP and Laplace beside it; and the posterior's draws.
+def reference(study: Study, runs: Run, seed: int, indices: range) -> tuple[Records, Chains]:
+    """Records of the posteriors, and of MAP and Laplace beside them; and the exact draws.
 
-    With `truncated` it is the exact one; without, the one by the Gaussian prior on 1/z that the
-    filters believe. All have a leading axis of runs.
+    `exact_…` is the posterior by the truncated prior on 1/z that landmarks are drawn from;
+    `gaussian_prior_…` the one by the whole Gaussian that the filters believe. The first is the
+    second given that no landmark is beyond the bound, so that its draws are some of the second's.
+    All have a leading axis of runs.
     """
     keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.asarray(indices))
-    problems = jax.vmap(partial(make_problem, study.scenario, truncated=truncated))(runs)
-    modes, found = _modes(study.rig, study.starts, problems, keys)
-    chains = _sample(study.nuts, study.rig, problems, modes.mode, keys)
-    by_laplace = _laplace_errors(study.rig, problems, modes, runs)
-    return {
-        **{f"map_{name}": value for name, value in found.items()},
-        **{f"laplace_{name}": value for name, value in by_laplace.items()},
-        **_posterior_errors(chains, runs),
-    }, chains
+    records: Records = {}
+
+    def record(kind: str, found: Records) -> None:
+        records.update({f"{kind}_{name}": value for name, value in found.items()})
+
+    for kind, truncated in (("exact", True), ("gaussian_prior", False)):
+        problems = jax.vmap(partial(make_problem, study.scenario, truncated=truncated))(runs)
+        modes, found = _modes(study.rig, study.starts, problems, keys)
+        record(f"{kind}_map", found)
+        record(f"{kind}_laplace", _laplace_errors(study.rig, problems, modes, runs))
+    chains = _sample(study.hmc, study.rig, problems, modes.mode, keys)
+    exact, share = jax.vmap(partial(given_bound, study.scenario.least_inverse_depth))(chains)
+    record("gaussian_prior", _posterior_errors(chains, runs))
+    record("exact", _posterior_errors(exact, runs))
+    records["exact_share"] = share
+    return records, exact
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -109,7 +116,7 @@ def _modes(rig: Rig, count: int, problems: Problem, keys: Array) -> tuple[Laplac
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _sample(settings: NUTS, rig: Rig, problems: Problem, modes: Array, keys: Array) -> Chains:
+def _sample(settings: HMC, rig: Rig, problems: Problem, modes: Array, keys: Array) -> Chains:
     return jax.vmap(partial(sample, settings, rig))(problems, modes, keys)
 
 
@@ -167,7 +174,7 @@ def _posterior_errors(chains: Chains, runs: Run) -> Records:
 def converged(records: Mapping[str, Any], name: str) -> np.ndarray:
     """Which problems' chains agree and have drawn enough: R̂ and effective sample size."""
     rhat, ess = np.asarray(records[f"{name}_rhat"]), np.asarray(records[f"{name}_ess"])
-    return (rhat <= WORST_RHAT) & (ess >= LEAST_ESS)
+    return (rhat <= WORST_RHAT) & (ess >= LEAST_ESS) & (np.asarray(records["exact_share"]) > 0)
 
 
 def against_filter(study: Study, slam_filter: SlamFilter, runs: Run, exact: Pose) -> Records:
