@@ -34,29 +34,33 @@ from jaxslam.posterior import (
     pooled,
     reference,
 )
-from jaxslam.posterior.summary import summarise_filter, summarise_reference
+from jaxslam.posterior.summary import summarise_filter, summarise_reference, summarise_sampler
 
 SHOWN_DRAWS = 1000
+LEAST_CONVERGED = 0.9
+"""Share of the runs; of fewer nothing is said, as those that converge are the easy ones."""
 
 
 @dataclass(frozen=True)
 class Options:
     """What to measure."""
 
-    scenarios: tuple[str, ...] = ("matched-loose", "matched-forward-loose", "matched-forward")
+    scenarios: tuple[str, ...] = ("matched-loose", "matched")
     """Simulated worlds of the matched family."""
-    steps: tuple[int, ...] = (5, 20, 60)
+    steps: tuple[int, ...] = (5, 20)
     """Steps at which the posterior is taken, each a problem of its own."""
     filters: tuple[str, ...] = (
         "robocentric/inverse_scaling",
         "world/inverse_scaling",
         "robocentric/inverse_depth",
-        "world/inverse_depth",
+        "scale_gauge/inverse_scaling",
     )
     """`filter/landmarks`."""
-    runs: int = 200
+    landmarks: int = 6
+    """Landmarks of every problem."""
+    runs: int = 48
     """Problems of every scenario and step."""
-    chunk: int = 25
+    chunk: int = 48
     """Problems sampled in one batch."""
     seed: int = 0
     hmc: HMC = field(default_factory=HMC)
@@ -84,7 +88,8 @@ def measure(options: Options) -> Iterator[dict[str, Any]]:
     results: dict[str, Any] = {name: {} for name in options.scenarios}
     for steps in options.steps:  # all scenarios of one length share their compiled programs
         for name in options.scenarios:
-            study = Study(jaxslam.scenario(name), steps, options.hmc, options.starts)
+            scenario = jaxslam.scenario(name, steps=steps, landmarks=options.landmarks)
+            study = Study(scenario, steps, options.hmc, options.starts)
             results[name][str(steps)] = _measure(study, options)
             yield results
 
@@ -98,11 +103,8 @@ def _measure(study: Study, options: Options) -> dict[str, Any]:
     parts = [_reference(study, store, chunk, options) for chunk in chunks]
     records = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     used = converged(records, "exact") & converged(records, "gaussian_prior")
-    if used.sum() < 2:
-        raise ValueError(
-            f"only {used.sum()} of {len(used)} problems of {study.scenario.name} at step "
-            f"{study.steps} converged: sample longer (--hmc.warmup, --hmc.draws)"
-        )
+    if used.mean() < LEAST_CONVERGED:
+        return summarise_sampler(records, used)
     summary = summarise_reference(records, used)
     seconds = {"reference": time.perf_counter() - start}
     by_filter = {}
@@ -206,6 +208,7 @@ def main(options: Options) -> None:
         summary = {
             "schema": 1,
             "version": jaxslam.__version__,
+            "landmarks": options.landmarks,
             "runs": options.runs,
             "seed": options.seed,
             "hmc": dataclasses.asdict(options.hmc),

@@ -24,11 +24,12 @@ def page(summary: dict[str, Any]) -> str:
     parts = [
         "# The exact posterior, and how far the filters are from it",
         "Made by `python benchmarks/posterior.py`; do not edit. "
-        f"{summary['runs']} runs, seed {summary['seed']}, float64; HMC with {hmc['chains']} "
-        f"chains of {hmc['draws']} draws after {hmc['warmup']}; MAP from {summary['starts']} "
+        f"{summary['runs']} runs with {summary['landmarks']} landmarks, seed {summary['seed']}, "
+        f"float64; Hamiltonian Monte Carlo with {hmc['chains']} chains of {hmc['draws']} draws "
+        f"after {hmc['warmup']}; MAP from {summary['starts']} "
         "starts. A row is over the runs of which both posteriors converged (R̂ ≤ 1.05 and 100 "
         "effective draws of pose, velocity and density). All rows of a scenario and step are of "
-        "the same runs.",
+        "the same runs. A scenario or step that is not here was not run.",
         READING,
         "![Draws of one run, NEES and σ](posterior.png)",
     ]
@@ -39,6 +40,8 @@ def page(summary: dict[str, Any]) -> str:
 
 
 def _section(numbers: dict[str, Any]) -> list[str]:
+    if "nees" not in numbers:
+        return [_not_converged(numbers)]
     sampler, minima = numbers["sampler"]["exact"], numbers["minima"]["gaussian_prior"]
     low, high = numbers["nees"]["exact"]["band95"]
     calibration = numbers["calibration"]
@@ -58,6 +61,16 @@ def _section(numbers: dict[str, Any]) -> list[str]:
         f"the prior mean misses the best in {minima['prior_mean_missed_best']:.0%}.",
         "\n".join(_rows(numbers, (low, high))),
     ]
+
+
+def _not_converged(numbers: dict[str, Any]) -> str:
+    sampler = numbers["sampler"]["exact"]
+    return (
+        f"Only {numbers['used']} of {numbers['runs']} runs converged (median R̂ "
+        f"{sampler['rhat_median']:.2f}, median effective draws {sampler['ess_median']:.0f}, "
+        f"{sampler['divergent']:.1%} of the transitions divergent): the draws are not the "
+        "posterior's, and nothing is compared with them."
+    )
 
 
 def _rows(numbers: dict[str, Any], band: tuple[float, float]) -> list[str]:

@@ -25,7 +25,9 @@ def plot_posterior(summary: dict[str, Any], path: str | Path | None = None) -> F
     ellipses of MAP + Laplace and of the filters. Middle: mean pose NEES by step. Below: the
     filters' σ of position over the exact one.
     """
-    scenarios = summary["scenarios"]
+    scenarios = _compared(summary["scenarios"])
+    if not scenarios:
+        raise ValueError("there is nothing to draw: the chains of no scenario converged")
     figure = new_figure(4.4 * len(scenarios), 9.5)
     axes = figure.subplots(
         3, len(scenarios), squeeze=False, gridspec_kw={"height_ratios": (1.5, 1, 0.8)}
@@ -50,6 +52,15 @@ def plot_posterior(summary: dict[str, Any], path: str | Path | None = None) -> F
     if path is not None:
         save(figure, path)
     return figure
+
+
+def _compared(scenarios: dict[str, Any]) -> dict[str, Any]:
+    """The scenarios and steps whose chains converged."""
+    kept = {
+        name: {steps: numbers for steps, numbers in by_step.items() if "nees" in numbers}
+        for name, by_step in scenarios.items()
+    }
+    return {name: by_step for name, by_step in kept.items() if by_step}
 
 
 def _style(names: list[str]) -> dict[str, dict[str, Any]]:
@@ -102,11 +113,13 @@ def _nees(axis: Axes, by_step: dict[str, Any]) -> None:
     }
     low, high = np.array([by_step[s]["nees"]["exact"]["band95"] for s in steps]).T
     axis.bar(x, high - low, 0.6, low, color=GREY, alpha=0.25, label="95 % band")
-    for key, (label, line) in named.items():
-        axis.plot(x, [_value(by_step[s]["nees"][key]["mean"]) for s in steps], label=label, **line)
-    for name in filters:
+    offsets = _offsets(len(named) + len(filters))
+    for offset, (key, (label, line)) in zip(offsets, named.items(), strict=False):
+        values = [_value(by_step[s]["nees"][key]["mean"]) for s in steps]
+        axis.plot(x + offset, values, label=label, **line)
+    for offset, name in zip(offsets[len(named) :], filters, strict=True):
         values = [_value(by_step[s]["filters"][name]["nees"]["mean"]) for s in steps]
-        axis.plot(x, values, label=name, ls="--", **style[name])
+        axis.plot(x + offset, values, label=name, ls="--", **style[name])
     axis.set_yscale("log")
     axis.set_xticks(x, steps)
     axis.set_xlabel("steps, 1/30 s")
@@ -125,13 +138,18 @@ def _sigma(axis: Axes, by_step: dict[str, Any]) -> None:
     axis.axhline(1, color="k", lw=1)
     rows = [("gaussian_prior_laplace", [by_step[s]["laplace"] for s in steps], "-")]
     rows += [(name, [by_step[s]["filters"][name] for s in steps], "--") for name in filters]
-    for name, numbers, dash in rows:
+    for offset, (name, numbers, dash) in zip(_offsets(len(rows)), rows, strict=True):
         values = [_value(number["position"]["sigma_ratio"]) for number in numbers]
-        axis.plot(x, values, ls=dash, **style[name])
+        axis.plot(x + offset, values, ls=dash, **style[name])
     axis.set_xticks(x, steps)
     axis.set_xlabel("steps, 1/30 s")
     axis.set_ylim(0, max(1.15, axis.get_ylim()[1]))
     axis.grid(alpha=0.25)
+
+
+def _offsets(count: int) -> np.ndarray:
+    """Sideways shifts by which equal values do not hide each other."""
+    return 0.4 * (np.arange(count) / (count - 1) - 0.5)
 
 
 def _value(number: float | None) -> float:

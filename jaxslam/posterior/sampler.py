@@ -1,8 +1,8 @@
-"""Draws from the posterior by Hamiltonian Monte Carlo, in the variables of `scale` whitened at a mode.
+"""Draws from the posterior by Hamiltonian Monte Carlo, in variables whitened at a mode.
 
-The trajectories have quasi-random lengths (Neal 2011, section 3.2; Hoffman et al. 2021). In whitened
-variables one knows how long they should be, so that NUTS, which finds that out by doubling, is not
-needed. The lengths are those of all chains and problems, so that no chain of a batch waits.
+The variables are those of `scale`. Trajectories have quasi-random lengths (Neal 2011, section 3.2;
+Hoffman et al. 2021): in whitened variables one knows how long they should be, and need not find
+out by doubling as NUTS does. All chains of a batch take the same lengths, so that none waits long.
 """
 
 from __future__ import annotations
@@ -33,8 +33,6 @@ LONGEST = math.pi
 """Trajectories last uniformly up to this long; a harmonic oscillator of N(0, I) has period 2π."""
 GOLDEN = (math.sqrt(5) - 1) / 2
 """Its multiples modulo 1 are uniform and far from their predecessors."""
-TRUSTED = 0.8
-"""Weight of the pilot chains' covariance beside that of the mode's Gaussian."""
 
 
 @dataclass(frozen=True)
@@ -42,19 +40,17 @@ class HMC:
     """How long to sample: static configuration."""
 
     chains: int = 4
-    pilots: int = 1
-    """Rounds before the last, each whitens the variables for the next by its covariance."""
-    warmup: int = 200
+    warmup: int = 150
     """Steps in which every chain adapts its step size, by dual averaging."""
-    draws: int = 500
+    draws: int = 300
     """Kept draws of every chain."""
-    acceptance: float = 0.9
+    acceptance: float = 0.85
     """What the adaptation aims at."""
     most_leapfrogs: int = 16
     """Leapfrog steps that a trajectory has at the most, however short they are."""
 
     def __post_init__(self) -> None:
-        least = {"chains": 2, "pilots": 0, "warmup": 20, "draws": 8, "most_leapfrogs": 1}
+        least = {"chains": 2, "warmup": 20, "draws": 8, "most_leapfrogs": 1}
         for field, value in least.items():
             if getattr(self, field) < value:
                 raise ValueError(f"{field} must be at least {value}, not {getattr(self, field)}")
@@ -86,50 +82,26 @@ def sample(
 ) -> Chains:
     """Chains that start at draws of the mode's Gaussian.
 
-    They move in x with `w = mode + R x` and a unit mass matrix. R whitens the mode's Gaussian in
-    the first round and the covariance of the round before in the others.
+    They move in x with `w = mode + R x`, where the posterior is nearly N(0, I), with a unit mass
+    matrix, which is better than one estimated from few draws.
     """
+    root = whitening_root(rig, problem, mode)
 
-    def log_density(w):
-        return scaled_log_density(rig, problem, mode, w)
+    def target(x):
+        return scaled_log_density(rig, problem, mode, mode + root @ x)
 
-    def outcome(w):
-        unknown, _ = scaled_unknowns(rig, problem, mode, w)
+    def outcome(x):
+        unknown, _ = scaled_unknowns(rig, problem, mode, mode + root @ x)
         T_BC, velocity = jax.tree.map(lambda x: x[-1], path(rig, problem, unknown))
         return T_BC, velocity, unknown.inverse_depths
 
-    def one_round(carry, key):
-        root, last, _ = carry
+    def chain(key):
+        start_key, key = jax.random.split(key)
+        start = _possible_start(target, start_key, mode)
+        x, *diagnostics = _chain(settings, target, key, start)
+        return Chains(*jax.vmap(outcome)(x), *diagnostics)
 
-        def target(x):
-            return log_density(mode + root @ x)
-
-        start = jnp.linalg.solve(root, (last - mode).T).T
-        x, *diagnostics = jax.vmap(partial(_chain, settings, target))(
-            jax.random.split(key, settings.chains), start
-        )
-        w = mode + x @ root.T
-        identity = jnp.eye(mode.size, dtype=mode.dtype)
-        spread = TRUSTED * jnp.cov(x.reshape(-1, mode.size).T) + (1 - TRUSTED) * identity
-        return (root @ jnp.linalg.cholesky(spread), w[:, -1], (w, *diagnostics)), None
-
-    key, start_key = jax.random.split(key)
-    root = whitening_root(rig, problem, mode)
-    start = jax.vmap(lambda k: _possible_start(lambda x: log_density(mode + root @ x), k, mode))(
-        jax.random.split(start_key, settings.chains)
-    )
-    per_chain, per_draw = (settings.chains,), (settings.chains, settings.draws)
-    nothing = (
-        jnp.zeros((*per_draw, mode.size), mode.dtype),
-        jnp.zeros(per_draw, mode.dtype),
-        jnp.zeros(per_chain, mode.dtype),
-        jnp.zeros(per_chain, mode.dtype),
-    )
-    carry = root, mode + start @ root.T, nothing
-    (_, _, (w, *diagnostics)), _ = jax.lax.scan(
-        one_round, carry, jax.random.split(key, settings.pilots + 1)
-    )
-    return Chains(*jax.vmap(jax.vmap(outcome))(w), *diagnostics)
+    return jax.vmap(chain)(jax.random.split(key, settings.chains))
 
 
 def _chain(

@@ -2,8 +2,8 @@
 
 Pixels tell the product of a landmark's inverse depth and the distance travelled to about a
 hundredth; the scale of both only by their priors. So the posterior is a thin ridge `v ω = const`,
-bent in the whitened variables y, and a sampler creeps along it. Here λ, the logarithm of the scale, is
-one of the variables w: with v* and a* of a mode y*,
+bent in the whitened variables y, and a sampler creeps along it. Here λ, the logarithm of the
+scale, is one of the variables w: with v* and a* of a mode y*,
 
     v = e^λ v* + (the rest),  a = a(w) + (e^λ − 1) a*,  ω = ω₀ + e^−λ (ω(w) − ω₀),
 

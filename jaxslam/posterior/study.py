@@ -17,7 +17,7 @@ from jaxtyping import Array
 
 from jaxslam.consistency.montecarlo import Prior, filter_run
 from jaxslam.consistency.statistics import normalised_squared
-from jaxslam.filters import SlamFilter
+from jaxslam.filters import Filter
 from jaxslam.geometry import Pose, difference, log
 from jaxslam.posterior.laplace import Laplace, laplace, minima, pose_gaussian, starts
 from jaxslam.posterior.moments import (
@@ -29,7 +29,15 @@ from jaxslam.posterior.moments import (
     wasserstein,
 )
 from jaxslam.posterior.problem import Problem, check_scenario, first_steps, make_problem
-from jaxslam.posterior.sampler import LEAST_ESS, HMC, WORST_RHAT, Chains, diagnose, given_bound, sample
+from jaxslam.posterior.sampler import (
+    HMC,
+    LEAST_ESS,
+    WORST_RHAT,
+    Chains,
+    diagnose,
+    given_bound,
+    sample,
+)
 from jaxslam.rig import Rig
 from jaxslam.simulation import Run, Scenario, Sightings, simulate
 
@@ -177,7 +185,7 @@ def converged(records: Mapping[str, Any], name: str) -> np.ndarray:
     return (rhat <= WORST_RHAT) & (ess >= LEAST_ESS) & (np.asarray(records["exact_share"]) > 0)
 
 
-def against_filter(study: Study, slam_filter: SlamFilter, runs: Run, exact: Pose) -> Records:
+def against_filter(study: Study, slam_filter: Filter, runs: Run, exact: Pose) -> Records:
     """A filter on the same runs, beside draws of the exact posterior: T_BC, axes run and draw.
 
     NEES and KL are in the filter's own error, the one of its `pose_error`; σ, error and
@@ -188,9 +196,7 @@ def against_filter(study: Study, slam_filter: SlamFilter, runs: Run, exact: Pose
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _compared(
-    slam_filter: SlamFilter, landmarks: int, prior: Prior, runs: Run, exact: Pose
-) -> Records:
+def _compared(slam_filter: Filter, landmarks: int, prior: Prior, runs: Run, exact: Pose) -> Records:
     counts: dict[str, Any] = {
         "landmarks": landmarks,
         "first": landmarks,

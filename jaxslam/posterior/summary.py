@@ -13,6 +13,7 @@ from jaxslam.posterior.ranks import ranks, uniformity
 
 Arrays = Mapping[str, np.ndarray]
 
+KINDS = ("exact", "gaussian_prior")
 KEPT = 99
 """Draws that a truth is ranked among; their chains are nearly uncorrelated when so thinned."""
 APART = 1.0
@@ -35,17 +36,23 @@ def summarise_nees(nees: Float[np.ndarray, " runs"], dof: int) -> dict[str, Any]
     }
 
 
+def summarise_sampler(records: Arrays, used: Bool[np.ndarray, " runs"]) -> dict[str, Any]:
+    """How many runs' chains converged, and how well they mixed."""
+    return {
+        "runs": len(used),
+        "used": int(used.sum()),
+        "sampler": {kind: _sampler(records, kind) for kind in KINDS},
+    }
+
+
 def summarise_reference(records: Arrays, used: Bool[np.ndarray, " runs"]) -> dict[str, Any]:
     """The exact posterior and what approximates it, over the runs whose chains converged."""
     r = {name: value[used] for name, value in records.items()}
     dof = r["exact_error"].shape[1]
-    kinds = ("exact", "gaussian_prior")
     return {
-        "runs": len(used),
-        "used": int(used.sum()),
-        "sampler": {kind: _sampler(records, kind) for kind in kinds},
+        **summarise_sampler(records, used),
         "calibration": _calibration(r),
-        "minima": {kind: _minima(r, kind) for kind in kinds},
+        "minima": {kind: _minima(r, kind) for kind in KINDS},
         "behind_infinity": float(r["gaussian_prior_behind_infinity"].mean()),
         "nees": {
             "exact": summarise_nees(r["exact_nees"], dof),
@@ -54,7 +61,7 @@ def summarise_reference(records: Arrays, used: Bool[np.ndarray, " runs"]) -> dic
             "exact_laplace": summarise_nees(r["exact_laplace_nees"], dof),
         },
         "exact_nees_spread": float(np.sqrt(r["exact_nees_variance"].sum()) / len(r["exact_nees"])),
-        "sigma": {kind: _sigmas(r[f"{kind}_covariance"]) for kind in kinds},
+        "sigma": {kind: _sigmas(r[f"{kind}_covariance"]) for kind in KINDS},
         "rmse": _rmse(r["exact_error"]),
         "laplace": against_exact(
             {k.removeprefix("gaussian_prior_laplace_"): v for k, v in r.items()}, r
