@@ -45,9 +45,9 @@ LEAST_CONVERGED = 0.9
 class Options:
     """What to measure."""
 
-    scenarios: tuple[str, ...] = ("matched-loose", "matched")
+    scenarios: tuple[str, ...] = ("matched-loose", "matched", "matched-forward-loose")
     """Simulated worlds of the matched family."""
-    steps: tuple[int, ...] = (5, 20)
+    steps: tuple[int, ...] = (5,)
     """Steps at which the posterior is taken, each a problem of its own."""
     filters: tuple[str, ...] = (
         "robocentric/inverse_scaling",

@@ -60,6 +60,9 @@ def problem_of(scenario, *, seed=0, truncated=True):
     return make_problem(scenario, run, truncated=truncated), run
 
 
+residuals_of = jax.jit(residuals, static_argnums=0)
+
+
 def draw(problem, seed=1):
     """A y at which everything is in front of the camera: much smaller than the prior's."""
     return 0.1 * jax.random.normal(jax.random.key(seed), (size(problem),))
@@ -130,10 +133,10 @@ def test_residuals_and_their_jacobian_are_those_of_a_dense_computation(scenario)
     problem, _ = problem_of(scenario)
     assert bool(jnp.all(problem.visible))
     y = draw(problem)
-    got = residuals(scenario.rig, problem, y)
+    got = residuals_of(scenario.rig, problem, y)
     expected = dense_residuals(scenario, problem, y)
     np.testing.assert_allclose(got, expected, rtol=1e-7, atol=1e-7)
-    J = jax.jacfwd(lambda y: residuals(scenario.rig, problem, y))(y)
+    J = jax.jacfwd(lambda y: residuals_of(scenario.rig, problem, y))(y)
     for i in (0, y.size // 2, y.size - 1):
         step = np.zeros(y.size)
         step[i] = 1e-4
@@ -147,7 +150,7 @@ def test_a_landmark_that_is_not_visible_tells_nothing_and_one_behind_is_impossib
     problem, _ = problem_of(LOOSE)
     y = draw(problem)
     hidden = replace(problem, visible=problem.visible.at[1, 2].set(False))
-    less = residuals(LOOSE.rig, hidden, y) != residuals(LOOSE.rig, problem, y)
+    less = residuals_of(LOOSE.rig, hidden, y) != residuals_of(LOOSE.rig, problem, y)
     assert np.flatnonzero(less).tolist() == [y.size + LOOSE.landmarks + 2]
     # A velocity ahead of 300 σ passes every landmark within a frame.
     past = y.at[1].set(300 / LOOSE.velocity_sigma[1])
@@ -159,6 +162,7 @@ def test_the_variables_of_scale_have_the_jacobian_that_they_claim(truncated):
     problem, _ = problem_of(LOOSE, truncated=truncated)
     mode = draw(problem)
 
+    @jax.jit
     def physical(w):
         return ravel_pytree(scaled_unknowns(LOOSE.rig, problem, mode, w)[0])[0]
 
@@ -208,11 +212,12 @@ def nearly_linear():
 def test_on_a_nearly_linear_problem_map_hmc_and_the_filter_agree():
     problem, run, mode, chains = nearly_linear()
     assert bool(mode.converged)
-    gradient = jax.grad(lambda y: log_density(NEARLY_LINEAR.rig, problem, y))(mode.mode)
+    rig = NEARLY_LINEAR.rig
+    gradient = jax.jit(jax.grad(lambda y: log_density(rig, problem, y)))(mode.mode)
     assert np.abs(gradient @ mode.root).max() < 1e-3
-    mean, P = pose_gaussian(NEARLY_LINEAR.rig, problem, mode)
+    mean, P = jax.jit(pose_gaussian, static_argnums=0)(rig, problem, mode)
 
-    T_CB, S, tangents = pose_moments(pooled(chains).inverse())
+    T_CB, S, tangents = jax.jit(lambda chains: pose_moments(pooled(chains).inverse()))(chains)
     rhat, ess = diagnose(tangents.reshape(4, -1, 3))
     assert rhat.max() < 1.05
     assert ess.min() > 200
