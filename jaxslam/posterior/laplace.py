@@ -1,0 +1,96 @@
+"""Batch MAP by Levenberg–Marquardt from several starts, and the Gaussian there (Laplace)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import optimistix
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Bool, Float
+
+from jaxslam.geometry import Pose, difference
+from jaxslam.posterior.problem import Problem, log_density, path, residuals, size, unknowns
+from jaxslam.rig import Rig
+
+SOLVER = optimistix.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
+MOST_STEPS = 200
+"""Levenberg–Marquardt steps of one start; what needs more counts as not converged."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Laplace:
+    """N(mode, R Rᵀ) in the whitened variables, with R Rᵀ = (JᵀJ)⁻¹ of the residuals there."""
+
+    mode: Float[Array, " n"]
+    root: Float[Array, "n n"]
+    log_density: Float[Array, ""]
+    """At the mode; −∞ if every start ended with a measured landmark behind the camera."""
+    converged: Bool[Array, ""]
+
+
+def starts(problem: Problem, key: Array, count: int) -> Float[Array, "count n"]:
+    """The prior mean, then draws of velocity and depths from the prior, without accelerations."""
+    n, t = size(problem), problem.prior.velocity.size
+    landmarks = problem.measured.shape[1]
+    drawn = jnp.arange(n)
+    drawn = (drawn < t) | (drawn >= n - landmarks)
+    draws = jax.random.normal(key, (count, n), problem.measured.dtype)
+    return jnp.where(drawn & (jnp.arange(count) > 0)[:, None], draws, 0.0)
+
+
+def minima(
+    rig: Rig, problem: Problem, initial: Float[Array, "s n"]
+) -> tuple[Float[Array, "s n"], Float[Array, " s"], Bool[Array, " s"]]:
+    """Where Levenberg–Marquardt ends from every start, the log density there, and convergence."""
+
+    def from_start(y):
+        solution = optimistix.least_squares(
+            lambda y, problem: residuals(rig, problem, y),
+            SOLVER,
+            y,
+            args=problem,
+            max_steps=MOST_STEPS,
+            throw=False,
+        )
+        converged = solution.result == optimistix.RESULTS.successful
+        return solution.value, log_density(rig, problem, solution.value), converged
+
+    return jax.vmap(from_start)(initial)
+
+
+def map_estimate(rig: Rig, problem: Problem, initial: Float[Array, "s n"]) -> Laplace:
+    """The best of the minima from all starts, with the Gauss–Newton covariance there."""
+    modes, values, converged = minima(rig, problem, initial)
+    best = jnp.argmax(values)
+    return laplace(rig, problem, modes[best], converged[best])
+
+
+def laplace(
+    rig: Rig, problem: Problem, mode: Float[Array, " n"], converged: Bool[Array, ""]
+) -> Laplace:
+    """The Gaussian at a mode."""
+    J = jax.jacfwd(lambda y: residuals(rig, problem, y))(mode)
+    lower = jnp.linalg.cholesky(J.T @ J)
+    root = solve_triangular(lower, jnp.eye(mode.size, dtype=mode.dtype), lower=True).T
+    return Laplace(mode, root, log_density(rig, problem, mode), converged)
+
+
+def last_pose(rig: Rig, problem: Problem, y: Float[Array, " n"]) -> Pose:
+    """T_CB after the last step."""
+    poses, _ = path(rig, problem, unknowns(problem, y))
+    return jax.tree.map(lambda x: x[-1], poses).inverse()
+
+
+def pose_gaussian(rig: Rig, problem: Problem, at: Laplace) -> tuple[Pose, Float[Array, "t t"]]:
+    """T_CB of the mode and its first-order covariance, by a right perturbation: what a
+    robocentric filter's `pose_error` speaks of."""
+    mean = last_pose(rig, problem, at.mode)
+
+    def moved(x):
+        return difference(last_pose(rig, problem, at.mode + at.root @ x), mean)
+
+    J = jax.jacfwd(moved)(jnp.zeros_like(at.mode))
+    return mean, J @ J.T

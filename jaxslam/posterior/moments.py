@@ -1,0 +1,73 @@
+"""How far a Gaussian on a pose is from draws of the posterior: NEES, σ, KL and Wasserstein."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import cho_factor, cho_solve
+from jax.scipy.special import ndtri
+from jaxtyping import Array, Float
+
+from jaxslam.geometry import Pose, difference, retract
+
+MEAN_ITERATIONS = 4
+
+
+def pose_moments(poses: Pose) -> tuple[Pose, Float[Array, "t t"], Float[Array, "s t"]]:
+    """Mean of a batch of poses, covariance, and the draws in the right tangent at the mean.
+
+    The mean is the pose at which the draws' tangent vectors have mean zero.
+    """
+
+    def tangents(mean):
+        return jax.vmap(lambda pose: difference(pose, mean))(poses)
+
+    mean = jax.tree.map(lambda x: x[0], poses)
+    for _ in range(MEAN_ITERATIONS):
+        mean = retract(mean, jnp.mean(tangents(mean), axis=0))
+    draws = tangents(mean)
+    return mean, covariance(draws), draws
+
+
+def covariance(draws: Float[Array, "s k"]) -> Float[Array, "k k"]:
+    """Sample covariance of draws."""
+    centred = draws - jnp.mean(draws, axis=0)
+    return centred.T @ centred / (len(draws) - 1)
+
+
+def gaussian_divergence(draws: Float[Array, "s k"], P: Float[Array, "k k"]) -> Float[Array, ""]:
+    """`KL(N(m, S) ‖ N(0, P))` in nats, m and S the moments of the draws."""
+    m, S = jnp.mean(draws, axis=0), covariance(draws)
+    factor = cho_factor(P, lower=True)
+    log_ratio = 2 * jnp.sum(jnp.log(jnp.diagonal(factor[0]))) - jnp.linalg.slogdet(S)[1]
+    return (jnp.trace(cho_solve(factor, S)) + m @ cho_solve(factor, m) - m.size + log_ratio) / 2
+
+
+def wasserstein(
+    draws: Float[Array, "s k"], mean: Float[Array, " k"], variance: Float[Array, " k"]
+) -> Float[Array, " k"]:
+    """Wasserstein-1 distance of each coordinate to N(mean, variance), by their quantiles."""
+    count = len(draws)
+    quantiles = ndtri((jnp.arange(count) + 0.5) / count)[:, None]
+    return jnp.mean(
+        jnp.abs(jnp.sort(draws, axis=0) - mean - jnp.sqrt(variance) * quantiles), axis=0
+    )
+
+
+def in_base_axes(poses: Pose, estimate: Pose) -> Float[Array, "s t"]:
+    """Draws of T_BC less the estimate: position along the axes of B, and `Log(R̂⁻¹ R)`."""
+
+    def one(pose):
+        turned = estimate.rotation().inverse() @ pose.rotation()
+        moved = pose.translation() - estimate.translation()
+        return jnp.concatenate([moved, difference(turned, type(turned).identity())])
+
+    return jax.vmap(one)(poses)
+
+
+def to_base_axes(estimate: Pose, P: Float[Array, "t t"]) -> Float[Array, "t t"]:
+    """The covariance of `in_base_axes` from that of T_BC's right tangent."""
+    R = estimate.rotation().as_matrix()
+    n = len(R)
+    turn = jnp.eye(len(P), dtype=P.dtype).at[:n, :n].set(R)
+    return turn @ P @ turn.T

@@ -1,0 +1,397 @@
+"""Tests of jaxslam.posterior: the model against dense formulas, MAP, HMC, ranks, bad input."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from scipy.linalg import expm
+from scipy.stats import norm, truncnorm
+
+import jaxslam
+from jaxslam.geometry import difference, retract
+from jaxslam.posterior import (
+    HMC,
+    Study,
+    against_filter,
+    check_scenario,
+    diagnose,
+    draw_runs,
+    first_steps,
+    gaussian_divergence,
+    given_bound,
+    log_density,
+    make_problem,
+    map_estimate,
+    pooled,
+    pose_gaussian,
+    pose_moments,
+    ranks,
+    reference,
+    residuals,
+    sample,
+    starts,
+    uniformity,
+    unknowns,
+    wasserstein,
+)
+from jaxslam.posterior.moments import covariance, in_base_axes, to_base_axes
+from jaxslam.posterior.problem import size, truncated_normal
+from jaxslam.posterior.scale import scaled_log_density, scaled_unknowns, whitening_root
+
+LOOSE = jaxslam.scenario("matched-loose", steps=3, landmarks=4)
+SPATIAL = jaxslam.scenario("matched-6dof-loose", steps=2, landmarks=3)
+NEARLY_LINEAR = jaxslam.scenario(
+    "matched-loose",
+    steps=3,
+    landmarks=4,
+    velocity_sigma=(1e-3,) * 3,
+    acceleration_sigma=(1e-2,) * 3,
+    inverse_depth=(0.2, 1e-3),
+    pixel_sigma=1e-2,
+)
+
+
+def problem_of(scenario, *, seed=0, truncated=True):
+    run = jaxslam.simulate(scenario, jax.random.key(seed))
+    return make_problem(scenario, run, truncated=truncated), run
+
+
+residuals_of = jax.jit(residuals, static_argnums=0)
+
+
+def draw(problem, seed=1):
+    """A y at which everything is in front of the camera: much smaller than the prior's."""
+    return 0.1 * jax.random.normal(jax.random.key(seed), (size(problem),))
+
+
+def dense_residuals(scenario, problem, y):
+    """`residuals` by homogeneous matrices and matrix exponentials, one number at a time."""
+    y, n = np.asarray(y), scenario.rig.geometry.point_dim
+    t, p, landmarks = len(scenario.velocity), n - 1, scenario.landmarks
+    mean, sigma = 1 / (2 * scenario.nearest_depth), 1 / (4 * scenario.nearest_depth)
+    velocity = np.add(scenario.velocity, np.multiply(scenario.velocity_sigma, y[:t]))
+    pixels_at = t * (scenario.steps + 1)
+    depths_at = pixels_at + landmarks * p
+    focal, centre = np.array(scenario.focal), np.array(scenario.centre)
+    points = []
+    for i in range(landmarks):
+        own = y[pixels_at + p * i : pixels_at + p * (i + 1)]
+        pixel = problem.first[i] + scenario.pixel_sigma * own
+        lower = (scenario.least_inverse_depth - mean) / sigma
+        omega = truncnorm.ppf(norm.cdf(y[depths_at + i]), lower, np.inf, mean, sigma)
+        points.append([*(np.append((pixel - centre) / focal, 1.0) / omega), 1.0])
+    T_BC, errors = np.eye(n + 1), []
+    for k in range(scenario.steps):
+        a = np.multiply(scenario.acceleration_sigma, y[t * (k + 1) : t * (k + 2)])
+        velocity = velocity + a / scenario.rate
+        T_BC = T_BC @ expm(hat(velocity / scenario.rate))
+        for i, point in enumerate(points):
+            seen = np.linalg.solve(T_BC, point)[:n]
+            error = problem.measured[k, i] - (focal * seen[:-1] / seen[-1] + centre)
+            errors.extend(error / scenario.pixel_sigma * float(problem.visible[k, i]))
+    return np.concatenate([y, errors])
+
+
+def hat(v):
+    """The matrix of a twist, translation first."""
+    n = 2 if len(v) == 3 else 3
+    M = np.zeros((n + 1, n + 1))
+    M[:n, n] = v[:n]
+    if n == 2:
+        M[:2, :2] = [[0, -v[2]], [v[2], 0]]
+    else:
+        x, y, z = v[3:]
+        M[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    return M
+
+
+@pytest.mark.parametrize("lower", [-1.99, 0.5, -6.0])
+def test_the_truncated_normal_is_scipys_and_its_slope_is_a_ratio_of_densities(lower):
+    y = np.linspace(-5, 5, 21)
+    # scipy's own quantile is exact in the tail that its argument is small in.
+    below = truncnorm.ppf(norm.cdf(y), lower, np.inf)
+    above = truncnorm.isf(norm.sf(y), lower, np.inf)
+    expected = np.where(y < 0, below, above)
+    got = truncated_normal(jnp.asarray(y), jnp.asarray(lower))
+    np.testing.assert_allclose(got, expected, rtol=1e-7, atol=1e-9)
+    slope = jax.vmap(jax.grad(lambda y: truncated_normal(y, jnp.asarray(lower))))(jnp.asarray(y))
+    ratio = norm.pdf(y) * norm.sf(lower) / norm.pdf(expected)
+    np.testing.assert_allclose(slope, ratio, rtol=1e-6)
+
+
+def test_without_a_bound_the_truncated_normal_is_the_normal():
+    y = jnp.linspace(-9, 9, 37)
+    np.testing.assert_allclose(truncated_normal(y, jnp.asarray(-jnp.inf)), y, atol=1e-12)
+
+
+@pytest.mark.parametrize("scenario", [LOOSE, SPATIAL], ids=["planar", "spatial"])
+def test_residuals_and_their_jacobian_are_those_of_a_dense_computation(scenario):
+    problem, _ = problem_of(scenario)
+    assert bool(jnp.all(problem.visible))
+    y = draw(problem)
+    got = residuals_of(scenario.rig, problem, y)
+    expected = dense_residuals(scenario, problem, y)
+    np.testing.assert_allclose(got, expected, rtol=1e-7, atol=1e-7)
+    J = jax.jacfwd(lambda y: residuals_of(scenario.rig, problem, y))(y)
+    for i in (0, y.size // 2, y.size - 1):
+        step = np.zeros(y.size)
+        step[i] = 1e-4
+        central = dense_residuals(scenario, problem, y + step)
+        central = (central - dense_residuals(scenario, problem, y - step)) / 2e-4
+        np.testing.assert_allclose(J[:, i], central, rtol=1e-5, atol=1e-5)
+    assert log_density(scenario.rig, problem, y) == pytest.approx(-expected @ expected / 2)
+
+
+def test_a_landmark_that_is_not_visible_tells_nothing_and_one_behind_is_impossible():
+    problem, _ = problem_of(LOOSE)
+    y = draw(problem)
+    hidden = replace(problem, visible=problem.visible.at[1, 2].set(False))
+    less = residuals_of(LOOSE.rig, hidden, y) != residuals_of(LOOSE.rig, problem, y)
+    assert np.flatnonzero(less).tolist() == [y.size + LOOSE.landmarks + 2]
+    # A velocity ahead of 300 σ passes every landmark within a frame.
+    past = y.at[1].set(300 / LOOSE.velocity_sigma[1])
+    assert log_density(LOOSE.rig, problem, past) == -jnp.inf
+
+
+@pytest.mark.parametrize("truncated", [True, False])
+def test_the_variables_of_scale_have_the_jacobian_that_they_claim(truncated):
+    problem, _ = problem_of(LOOSE, truncated=truncated)
+    mode = draw(problem)
+
+    @jax.jit
+    def physical(w):
+        return ravel_pytree(scaled_unknowns(LOOSE.rig, problem, mode, w)[0])[0]
+
+    at_mode = ravel_pytree(unknowns(problem, mode))[0]
+    np.testing.assert_allclose(physical(mode), at_mode, rtol=1e-12)
+    a, b = mode + draw(problem, 2), mode + 5 * draw(problem, 3)
+    claimed = [scaled_unknowns(LOOSE.rig, problem, mode, w)[1] for w in (a, b)]
+    exact = [jnp.linalg.slogdet(jax.jacfwd(physical)(w))[1] for w in (a, b)]
+    assert claimed[1] - claimed[0] == pytest.approx(float(exact[1] - exact[0]), abs=1e-9)
+
+    # So the density of w is that of y, by the rule for a change of variables.
+    def whitened(w):
+        x = physical(w)
+        return jax.lax.fori_loop(0, 30, lambda _, y: y + (x - at(y)) / slope(y), mode)
+
+    def at(y):
+        return ravel_pytree(unknowns(problem, y))[0]
+
+    def slope(y):
+        return jax.jvp(at, (y,), (jnp.ones_like(y),))[1]
+
+    values = [scaled_log_density(LOOSE.rig, problem, mode, w) for w in (a, b)]
+    expected = [
+        log_density(LOOSE.rig, problem, whitened(w))
+        + log_det
+        - jnp.sum(jnp.log(slope(whitened(w))))
+        for w, log_det in zip((a, b), exact, strict=True)
+    ]
+    assert values[1] - values[0] == pytest.approx(float(expected[1] - expected[0]), rel=1e-9)
+
+
+@lru_cache(maxsize=1)
+def nearly_linear():
+    """A problem, its MAP and its chains, made once."""
+    problem, run = problem_of(NEARLY_LINEAR, truncated=False)
+    rig = NEARLY_LINEAR.rig
+    mode = jax.jit(lambda problem, s: map_estimate(rig, problem, s))(
+        problem, starts(problem, jax.random.key(2), 2)
+    )
+    hmc = HMC(chains=4, warmup=50, draws=250)
+    chains = jax.jit(lambda problem, y, key: sample(hmc, rig, problem, y, key))(
+        problem, mode.mode, jax.random.key(3)
+    )
+    return problem, run, mode, chains
+
+
+def test_on_a_nearly_linear_problem_map_hmc_and_the_filter_agree():
+    problem, run, mode, chains = nearly_linear()
+    assert bool(mode.converged)
+    gradient = jax.grad(lambda y: log_density(NEARLY_LINEAR.rig, problem, y))(mode.mode)
+    assert np.abs(gradient @ mode.root).max() < 1e-3
+    mean, P = pose_gaussian(NEARLY_LINEAR.rig, problem, mode)
+
+    T_CB, S, tangents = pose_moments(pooled(chains).inverse())
+    rhat, ess = diagnose(tangents.reshape(4, -1, 3))
+    assert rhat.max() < 1.05
+    assert ess.min() > 200
+    sigma = np.sqrt(np.diagonal(P))
+    error = np.abs(difference(T_CB, mean)) / sigma
+    assert (error < 4 / np.sqrt(ess)).all()
+    np.testing.assert_allclose(np.diagonal(S), sigma**2, rtol=5 * np.sqrt(2 / ess.min()))
+
+    slam_filter = jaxslam.FILTERS["robocentric"](
+        NEARLY_LINEAR.rig, jaxslam.LANDMARKS["inverse_depth"], "known"
+    )
+    one = jax.tree.map(lambda x: x[None], (run, pooled(chains)))
+    study = Study(NEARLY_LINEAR, NEARLY_LINEAR.steps)
+    records = jax.tree.map(lambda x: x[0], against_filter(study, slam_filter, *one))
+    truth = jax.tree.map(lambda x: x[-1], run.poses)
+    # In base axes the Laplace covariance and the filter's must be the same but for 1 %.
+    adjoint = mean.adjoint()
+    P_base = to_base_axes(mean.inverse(), adjoint @ P @ adjoint.T)
+    np.testing.assert_allclose(records["covariance"], P_base, rtol=0.02, atol=0.01 * P_base.min())
+    base = in_base_axes(jax.tree.map(lambda x: x[None], truth), mean.inverse())[0]
+    assert np.all(np.abs(records["error"] - base) < 0.02 * np.sqrt(np.diagonal(P_base)))
+    assert 0 <= records["kl"] < 0.05
+    assert np.all(records["wasserstein"] < 0.2)
+
+
+def test_the_root_of_the_scale_variables_is_that_of_the_laplace_approximation():
+    problem, _, mode, _ = nearly_linear()
+    rig = NEARLY_LINEAR.rig
+    root = whitening_root(rig, problem, mode.mode)
+    by_w = jax.jacfwd(lambda w: ravel_pytree(scaled_unknowns(rig, problem, mode.mode, w)[0])[0])(
+        mode.mode
+    )
+    slope = ravel_pytree(
+        jax.jvp(lambda y: unknowns(problem, y), (mode.mode,), (jnp.ones_like(mode.mode),))[1]
+    )[0]
+    in_y = (by_w / slope[:, None]) @ root
+    np.testing.assert_allclose(in_y @ in_y.T, mode.root @ mode.root.T, rtol=1e-6, atol=1e-8)
+
+
+def test_moments_and_distances_of_gaussian_draws_are_those_of_the_gaussian():
+    rng = np.random.default_rng(0)
+    mean = jaxslam.PLANAR.group.from_xy_theta(1.0, -2.0, 0.4)
+    L = np.array([[0.02, 0, 0], [0.01, 0.03, 0], [-0.002, 0.001, 0.005]])
+    draws = rng.normal(size=(20000, 3)) @ L.T
+    poses = jax.vmap(lambda d: retract(mean, d))(jnp.asarray(draws))
+    found, P, tangents = pose_moments(poses)
+    np.testing.assert_allclose(difference(found, mean), draws.mean(axis=0), atol=1e-5)
+    np.testing.assert_allclose(P, L @ L.T, rtol=0.05, atol=2e-5)
+    np.testing.assert_allclose(tangents.mean(axis=0), 0, atol=1e-9)
+    shift, wide = np.array([0.1, 0, 0]), np.diag([0.04, 0.05, 0.01]) ** 2
+    S = covariance(jnp.asarray(draws))
+    inverse = np.linalg.inv(wide)
+    offset = draws.mean(axis=0) + shift
+    expected = (
+        np.trace(inverse @ S)
+        + offset @ inverse @ offset
+        - 3
+        + np.log(np.linalg.det(wide) / np.linalg.det(S))
+    ) / 2
+    assert gaussian_divergence(jnp.asarray(draws) + shift, jnp.asarray(wide)) == pytest.approx(
+        float(expected)
+    )
+    # W₁ of equal Gaussians a distance apart is that distance; of two widths, |σ − s| √(2/π).
+    distances = wasserstein(
+        jnp.asarray(draws), jnp.array([0.1, 0, 0]), jnp.diagonal(L @ L.T) * jnp.array([1, 4, 1])
+    )
+    sigma = np.linalg.norm(L, axis=1)
+    np.testing.assert_allclose(distances[0], 0.1, rtol=0.01)
+    np.testing.assert_allclose(distances[1], sigma[1] * np.sqrt(2 / np.pi), rtol=0.03)
+    assert distances[2] < 0.03 * sigma[2]
+
+
+def test_ranks_of_the_truth_are_uniform_if_and_only_if_the_draws_are_right():
+    rng = np.random.default_rng(1)
+    centre = rng.normal(size=(500, 1, 2))
+    truth, draws = (centre + rng.normal(size=(500, n, 2)) for n in (1, 400))
+    _, p = uniformity(ranks(truth[:, 0], draws, 99), 99)
+    assert (p > 1e-3).all()
+    narrow = centre + 0.7 * (draws - centre)
+    _, p = uniformity(ranks(truth[:, 0], narrow, 99), 99)
+    assert (p < 1e-3).all()
+
+
+@lru_cache(maxsize=1)
+def small_study():
+    """Records of 40 small problems and their exact draws, made once."""
+    study = Study(LOOSE, 3, HMC(chains=2, warmup=100, draws=150), starts=1)
+    records, exact = reference(study, draw_runs(study, 7, range(40)), 7, range(40))
+    return jax.device_get(records), exact
+
+
+@pytest.mark.statistics
+def test_the_posterior_is_calibrated():
+    """Ranks and NEES over 40 problems; false alarms: 0.4 % by six ranks, 0.1 % by the NEES."""
+    records, _ = small_study()
+    assert np.mean(records["exact_rhat"] < 1.1) > 0.9
+    _, p = uniformity(ranks(records["exact_truth"], records["exact_draws"], 49), 49, bins=5)
+    assert (p > 7e-4).all()
+    low, high = jaxslam.mean_band(3, 40, confidence=0.999)
+    assert low < records["exact_nees"].mean() < high
+
+
+def test_the_truncated_posterior_is_the_other_one_above_the_bound():
+    records, exact = small_study()
+    assert float(exact.inverse_depths.min()) >= LOOSE.least_inverse_depth
+    assert (records["exact_behind_infinity"] == 0).all()
+    share, behind = records["exact_share"], records["gaussian_prior_behind_infinity"]
+    assert share.min() < 1
+    assert (share <= 1 - behind + 1e-12).all()
+    # The truncated model's own density differs by the same at all the draws of the other.
+    problem, _ = problem_of(LOOSE)
+    whole = replace(problem, least_inverse_depth=jnp.asarray(-jnp.inf))
+
+    def physical_density(problem, y):
+        slope = jax.jvp(lambda y: unknowns(problem, y).inverse_depths, (y,), (jnp.ones_like(y),))[1]
+        return log_density(LOOSE.rig, problem, y) - jnp.sum(jnp.log(slope))
+
+    lower = (LOOSE.least_inverse_depth - 1 / 6) * 12
+    differences = []
+    for seed in (1, 2):
+        y = draw(problem, seed)
+        depths = jax.vmap(lambda y: truncated_normal(y, jnp.asarray(lower)))(y[-LOOSE.landmarks :])
+        same = y.at[-LOOSE.landmarks :].set(depths)
+        differences.append(physical_density(problem, y) - physical_density(whole, same))
+    assert differences[0] == pytest.approx(float(differences[1]), abs=1e-8)
+
+
+def test_draws_below_the_bound_are_replaced_evenly_by_those_above():
+    chains = small_study()[1]
+    one = jax.tree.map(lambda x: x[0], chains)
+    omega = one.inverse_depths.at[0, ::2, 1].set(-1.0).at[1, :, 0].set(-1.0)
+    kept, share = given_bound(0.0, replace(one, inverse_depths=omega))
+    draws = omega.shape[1]
+    expected = np.repeat(np.arange(1, draws, 2), 2)
+    np.testing.assert_array_equal(kept.log_density[0], one.log_density[0, expected])
+    assert share == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "match"),
+    [
+        ("circle", {}, "placement"),
+        ("positions", {}, "placement"),
+        ("matched", {"calibration": "white"}, "calibration"),
+        ("matched", {"known_landmarks": 5}, "known_landmarks"),
+        ("matched", {"first_frame": 1}, "first_frame"),
+        ("matched", {"first_pixels": [[-5.0, 600.0]]}, "first_pixels"),
+    ],
+)
+def test_a_scenario_of_another_kind_is_refused(name, fields, match):
+    with pytest.raises(ValueError, match=match):
+        check_scenario(jaxslam.scenario(name, **fields))
+
+
+def test_sizes_that_make_no_sense_are_refused():
+    _, run = problem_of(LOOSE)
+    for steps in (0, 4):
+        with pytest.raises(ValueError, match="steps must be 1 to"):
+            first_steps(run, steps)
+        with pytest.raises(ValueError, match="steps must be 1 to"):
+            Study(LOOSE, steps)
+    with pytest.raises(ValueError, match="starts"):
+        Study(LOOSE, 2, starts=0)
+    for field, value in (("chains", 1), ("warmup", 5), ("draws", 0), ("acceptance", 1.0)):
+        with pytest.raises(ValueError, match=field):
+            HMC(**{field: value})
+    with pytest.raises(ValueError, match="kept"):
+        ranks(np.zeros((2, 1)), np.zeros((2, 5, 1)), 6)
+    with pytest.raises(ValueError, match="bins"):
+        uniformity(np.zeros((2, 1), int), 98)
+
+
+def test_a_run_cut_short_is_its_beginning():
+    _, run = problem_of(LOOSE)
+    short = first_steps(run, 2)
+    np.testing.assert_array_equal(short.measured, run.measured[:3])
+    np.testing.assert_array_equal(short.poses.parameters(), run.poses.parameters()[:3])
+    assert len(short.controls) == 2
