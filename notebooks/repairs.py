@@ -141,5 +141,5 @@ assert lost["scale_gauge+directions9"] < lost["robocentric"] / 2
 # Straight ahead the window's *maximum* of the posterior is not its mean: an inverse depth that
 # multiplies the unknown direction makes an amplitude of it, and a maximum is drawn towards the
 # larger amplitudes. Members and window together (`scale_gauge+lag20+directions9`) lose hardly a
-# run, at about a hundred times the cost of the plain filter; the measured tables are in
+# run, at more than a hundred times the cost of the plain filter; the measured tables are in
 # `docs/consistency.md`, and where each filter holds at all is the map of `docs/phase-diagram.md`.
