@@ -121,6 +121,13 @@ def scaled(tree: Any, scale: Float[Array, ""]) -> Any:
     return jax.tree.map(one, tree, is_leaf=is_leaf)
 
 
+def homogeneous_apply(
+    T_ab: Pose, point: Float[Array, " n"], omega: Float[Array, ""]
+) -> Float[Array, " n"]:
+    """`X' = R X + ω t` (P20): the homogeneous point (X, ω) in frame a; ω stays."""
+    return T_ab.rotation() @ point + omega * T_ab.translation()
+
+
 def exp(group: type[jaxlie.MatrixLieGroup], delta: Float[Array, " t"]) -> Any:
     """`Exp(δ)` of SO(n) or SE(n), with derivatives that are exact at and near zero rotation.
 

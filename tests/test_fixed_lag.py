@@ -328,3 +328,27 @@ def test_the_recommended_filter_is_consistent_where_the_papers_is_not():
     low, high = jaxslam.mean_band(3, 60, 0.999)
     assert paper[-1] > high
     assert low < ours[-1] < high
+
+
+@pytest.mark.parametrize("name", ["robocentric+scales9", "robocentric+scales9+directions9"])
+def test_a_divided_prior_has_the_moments_of_the_whole(name):
+    """Also where a sum is divided again, and its base is given a root of the covariance."""
+    of = case("matched-loose")
+    velocity, sigma, _ = of.motion()
+    slam = named_filter(of, name)
+    state = slam.start(of.parameters(), of.capacity, velocity, sigma)
+    weights = jnp.exp(state.log_weights)
+    members = state.members
+    while hasattr(members, "log_weights"):
+        weights = weights[..., None] * jnp.exp(members.log_weights)
+        members = members.members
+    weights = np.asarray(weights).ravel()
+    means = np.asarray(members.core.velocity).reshape(len(weights), -1)
+    place = slice(3, 6)  # after the pose
+    own = np.asarray(members.covariance)[..., place, place].reshape(len(weights), 3, 3)
+    mean = weights @ means
+    spread = np.einsum("m,mi,mj->ij", weights, means - mean, means - mean)
+    np.testing.assert_allclose(mean, velocity, atol=1e-9)
+    np.testing.assert_allclose(
+        np.tensordot(weights, own, 1) + spread, np.diag(np.square(sigma)), rtol=0.03, atol=1e-6
+    )

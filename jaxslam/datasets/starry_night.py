@@ -18,9 +18,9 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
-from jaxslam.camera import Camera
+from jaxslam.camera import Camera, project
 from jaxslam.motion import BodyRates
 from jaxslam.simulation import Run
 
@@ -187,14 +187,10 @@ def pixel_errors(data: StarryNight) -> Float[np.ndarray, "frames landmarks 2"]:
 
     def frame(T_IC):
         seen = jax.vmap(T_IC.inverse().apply)(jnp.asarray(data.points))
-        return jax.vmap(_pixel, in_axes=(None, 0))(data.camera, seen)
+        return jax.vmap(project, in_axes=(None, 0))(data.camera, seen)
 
     true = np.asarray(jax.vmap(frame)(data.poses))
     return np.where(data.visible[..., None], data.pixels - true, np.nan)
-
-
-def _pixel(camera: Camera, point: Array) -> Array:
-    return camera.focal * point[:2] / point[2] + camera.centre
 
 
 def rate_errors(data: StarryNight) -> Float[np.ndarray, "frames-1 6"]:

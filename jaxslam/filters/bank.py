@@ -19,7 +19,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from jaxslam.filters.filter import Filter
-from jaxslam.filters.slam import Parameters
+from jaxslam.filters.slam import Parameters, velocity_root
 from jaxslam.filters.state import Features, Innovation, State
 from jaxslam.geometry import Pose, difference, retract
 from jaxslam.rig import Rig
@@ -73,12 +73,12 @@ class Bank:
         parameters: Parameters,
         capacity: int,
         velocity: Float[Array, " v"],
-        velocity_sigma: Float[Array, " v"],
+        velocity_sigma: Float[Array, " v"] | Float[Array, "v v"],
         features: tuple[int, int] | None = None,
     ) -> BankState:
         """`v = v̄ + D e`, e ~ N(0, I) = Σ w_i N(A s_i, I − (1 − σ²) A Aᵀ), for directions A."""
         dtype = parameters.measurement_sigma.dtype
-        D = jnp.diag(jnp.asarray(velocity_sigma, dtype))
+        D = velocity_root(jnp.asarray(velocity_sigma, dtype))
         A = self._directions(jnp.asarray(velocity, dtype), D)
         grid, weights, sigma = self._division(A.shape[1])
         root = D @ (jnp.eye(len(D), dtype=dtype) - (1 - sigma) * A @ A.T)
@@ -149,11 +149,12 @@ class Bank:
         n = self.rig.geometry.point_dim
         linear = jnp.zeros_like(velocity).at[:n].set(velocity[:n])
         still = jnp.linalg.norm(linear) == 0
-        along = D @ jnp.where(still, jnp.eye(velocity.size)[0].astype(D.dtype), linear)
+        along = D.T @ jnp.where(still, jnp.eye(velocity.size)[0].astype(D.dtype), linear)
         along = along[:, None] / jnp.maximum(jnp.linalg.norm(along), jnp.finfo(D.dtype).tiny)
         if self.along == "speed":
             return along
-        projected = D[:, :n] - along @ (along.T @ D[:, :n])
+        by_linear = D.T[:, :n]
+        projected = by_linear - along @ (along.T @ by_linear)
         vectors, _, _ = jnp.linalg.svd(projected, full_matrices=False)
         return vectors[:, : n - 1]
 

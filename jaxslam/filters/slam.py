@@ -26,6 +26,7 @@ from jaxslam.geometry import (
     Pose,
     SplitPose,
     difference,
+    homogeneous_apply,
     identity,
     scaled,
     tangent_dim,
@@ -228,7 +229,7 @@ class SlamModel:
         if self.landmark.anchored:
             T_AF = jax.tree.map(lambda x: x[landmark[-1].astype(int)], view.anchors)
             T_CA = T_CA @ T_AF.joined()
-        return T_CA.rotation() @ point + omega * T_CA.translation(), omega
+        return homogeneous_apply(T_CA, point, omega), omega
 
     def metric_point(self, view: View, landmark: Array) -> tuple[Array, Array]:
         """`camera_point` in metres: with the gauge's scale, `ω e^−λ`."""
@@ -352,8 +353,7 @@ class SlamFilter:
         state = self.engine.empty(core, jnp.tile(empty, (slots, 1)))
         state = replace(state, memory=self.initialisation.memory(capacity, dtype))
         state = self.engine.know(state, 0, tangent_dim(held))
-        sigma = jnp.asarray(velocity_sigma, dtype)
-        root = jnp.diag(sigma[:v]) if sigma.ndim == 1 else sigma
+        root = velocity_root(jnp.asarray(velocity_sigma, dtype))[:v, :v]
         state = self._with_velocity(state, root @ root.T)
         if self.depth_correlation:
             common = jnp.full((1, 1), self.depth_correlation, dtype)
@@ -653,6 +653,13 @@ class SlamFilter:
 
     def _context(self, parameters: Parameters, control: Array) -> Context:
         return _composed(parameters) if self.compose_first else Context(parameters, control)
+
+
+def velocity_root(
+    sigma: Float[Array, " v"] | Float[Array, "v v"],
+) -> Float[Array, "v v"]:
+    """R with `P = R Rᵀ` of the velocity's prior, given as σ of each number or as R itself."""
+    return jnp.diag(sigma) if sigma.ndim == 1 else sigma
 
 
 def _composed(parameters: Parameters) -> Context:

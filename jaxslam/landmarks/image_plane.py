@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
+from jaxslam.geometry import homogeneous_apply
 from jaxslam.landmarks.parametrization import Parametrization
 
 
@@ -21,7 +22,7 @@ def initialise(point, omega, focal):
 def transform(T_ab, landmark):
     """`X = R (x/z, y/z, 1) + (1/z) t`, and `(X_x/X_z, X_y/X_z, (1/z)/X_z)`."""
     point, omega = homogeneous(landmark)
-    point = T_ab.rotation() @ point + omega * T_ab.translation()
+    point = homogeneous_apply(T_ab, point, omega)
     return jnp.append(point[:-1], omega) / point[-1]
 
 

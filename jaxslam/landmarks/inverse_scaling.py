@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
+from jaxslam.geometry import homogeneous_apply
 from jaxslam.landmarks.parametrization import Parametrization
 
 
@@ -19,7 +20,7 @@ def initialise(point, omega, focal):
 def transform(T_ab, landmark):
     """`X' = R X + ω t`, `ω' = ω` (P20): linear in the landmark."""
     point, omega = homogeneous(landmark)
-    return jnp.append(T_ab.rotation() @ point + omega * T_ab.translation(), omega)
+    return jnp.append(homogeneous_apply(T_ab, point, omega), omega)
 
 
 def homogeneous(landmark):

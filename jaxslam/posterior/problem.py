@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.camera import bearing
 from jaxslam.consistency.montecarlo import Prior
-from jaxslam.geometry import Pose, identity
+from jaxslam.geometry import Pose, homogeneous_apply, identity
 from jaxslam.rig import Rig
 from jaxslam.simulation import Run, Scenario
 
@@ -202,7 +202,7 @@ def _pixel_errors(
     points = jnp.column_stack([bearings, jnp.ones_like(x.inverse_depths)])
 
     def one(T_CB, point, omega):
-        seen = T_CB.rotation() @ point + omega * T_CB.translation()
+        seen = homogeneous_apply(T_CB, point, omega)
         return sensor.measure(parameters.camera, seen, omega), sensor.possible(seen)
 
     of_frame = jax.vmap(one, in_axes=(None, 0, 0))
