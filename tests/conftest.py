@@ -5,6 +5,8 @@ from pathlib import Path
 import jax
 import pytest
 
+from jaxslam.consistency import montecarlo
+
 jax.config.update("jax_enable_x64", True)
 # Tests compile much and compute little.
 jax.config.update("jax_disable_most_optimizations", True)
@@ -18,3 +20,11 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"the shared data folder {SHARED_DATA} is not on this machine")
     return SHARED_DATA
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compiled_programs_are_freed():
+    """A process may hold only so many memory maps, and every compiled program takes some."""
+    yield
+    montecarlo._compiled.cache_clear()
+    jax.clear_caches()
