@@ -21,6 +21,7 @@ from jaxslam.filters.slam import (
     SlamModel,
     inverse_depth_prior,
 )
+from jaxslam.filters.split_and_merge import SplitAndMerge, with_mixture
 from jaxslam.filters.state import Features, Innovation, State
 from jaxslam.landmarks import LANDMARKS, Parametrization
 from jaxslam.names import chosen
@@ -102,15 +103,16 @@ MODIFIERS: dict[str, Callable[[Any, int | None], Filter]] = {
     "iterated": iterated,
     "scales": with_scales,
     "directions": with_directions,
+    "mixture": with_mixture,
     "oc": with_observability_constraint,
     "fej": with_first_estimates,
 }
 """What `+name` behind a filter's name makes of it, with the number that may follow the name: the
 greatest depth of a delayed initialisation, m (`particles`, `rays`); the correlation of depths in
 percent (`common`); frames (`lag`); steps of Gauss–Newton instead of convergence (`iterated`);
-members of a Gaussian sum (`scales`, `directions`); none for the remedies `oc` and `fej`."""
+members of a Gaussian sum (`scales`, `directions`, `mixture`); none for the remedies `oc` and `fej`."""
 
-_OF_ANY_FILTER = ("iterated", "scales", "directions")
+_OF_ANY_FILTER = ("iterated", "scales", "directions", "mixture")
 
 RECOMMENDED = {"planar": "scale_gauge+directions9", "spatial": "scale_gauge+lag10"}
 """The filter called `recommended`, by geometry: of those of docs/consistency.md the one to take
@@ -165,6 +167,7 @@ __all__ = [
     "Parameters",
     "SlamFilter",
     "SlamModel",
+    "SplitAndMerge",
     "State",
     "information_filter",
     "invariant_filter",

@@ -104,13 +104,18 @@ class Bank:
         """Every member's step; weights by the likelihoods of the innovations."""
         step = jax.vmap(self.base.step, in_axes=(0, None, None, None, None))
         members, innovations = step(state.members, parameters, control, seen, new)
+        return self._weighed(members, state.log_weights, innovations)
+
+    def _weighed(
+        self, members: Any, log_weights: Array, innovations: Innovation
+    ) -> tuple[BankState, Innovation]:
         roots = jnp.linalg.cholesky(innovations.covariance)
         log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(roots, axis1=1, axis2=2)), axis=1)
         likelihood = -(innovations.nis + log_det) / 2
         # A member that has diverged has no likelihood.
         likelihood = jnp.where(jnp.isfinite(likelihood), likelihood, -jnp.inf)
-        log_weights = jax.nn.log_softmax(state.log_weights + likelihood)
-        return BankState(members, log_weights), _mixed(innovations, state.log_weights)
+        after = jax.nn.log_softmax(log_weights + likelihood)
+        return BankState(members, after), _mixed(innovations, log_weights)
 
     def pose_error(self, state: BankState, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
         """Of the sum's mean, to first order in the members' distances, with its covariance."""
@@ -159,10 +164,12 @@ class Bank:
         return vectors[:, : n - 1]
 
     def _division(self, directions: int) -> tuple[np.ndarray, np.ndarray, float]:
-        """Means and log weights of the members of N(0, I), and their σ."""
+        """Means and log weights of the members of N(0, I), and their σ; the sum's variance is 1."""
         line = np.linspace(-REACH, REACH, self.count)
-        sigma = min(OVERLAP * (line[1] - line[0]), 0.9)
-        log_weight = -(line**2) / (2 * (1 - sigma**2))
+        wanted = min(OVERLAP * (line[1] - line[0]), 0.9)
+        log_weight = -(line**2) / (2 * (1 - wanted**2))
+        weight = np.exp(log_weight - np.logaddexp.reduce(log_weight))
+        sigma = np.sqrt(1 - weight @ line**2)
         grid = np.array(list(itertools.product(line, repeat=directions)))
         weights = np.array([sum(w) for w in itertools.product(log_weight, repeat=directions)])
         return grid, weights - np.logaddexp.reduce(weights), float(sigma)

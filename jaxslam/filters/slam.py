@@ -133,7 +133,8 @@ class SlamModel:
     def moves_landmarks(self) -> bool:
         return self.frame.moves_landmarks and not self.landmark.anchored
 
-    def _displacement(self, core: Core, context: Context) -> Pose:
+    def displacement(self, core: Core, context: Context) -> Pose:
+        """The camera's motion in this step; the identity once it is composed."""
         if context.control is None:
             return identity(self.geometry, core.noise.dtype)
         motion, noise = self.rig.motion, self._noise_in_gauge(core)
@@ -153,13 +154,13 @@ class SlamModel:
 
     def view(self, core: Core, context: Context) -> View:
         """All that a landmark depends on."""
-        step = self._displacement(core, context)
+        step = self.displacement(core, context)
         T_AC = self.frame.map_from_camera(core.pose, step)
         return View(T_AC, core.calibration, core.anchors, core.log_scale, core.depth_error)
 
     def compose_core(self, core: Core, context: Context) -> Core:
         """P18, P19. The noise has been used: it is marginalised."""
-        step = self._displacement(core, context)
+        step = self.displacement(core, context)
         return replace(
             core,
             pose=self.frame.compose(core.pose, step),
@@ -382,14 +383,20 @@ class SlamFilter:
         return self.engine.augment(state, place.start, joint)
 
     def predict(self, state: State, parameters: Parameters, control: Array) -> State:
-        """Append this step's motion noise and calibration error (P10, P11, P15)."""
-        start = _part(state.core, "noise").start
-        state = self.engine.augment(state, start, jnp.diag(parameters.motion_sigma**2))
-        if self.calibration == "white":
-            state = self._with_calibration(state, parameters)
+        """Append this step's noise; move already where the motion is composed first."""
+        state = self.append_noise(state, parameters)
+        return self._composed_first(state, parameters, control)
+
+    def _composed_first(self, state: State, parameters: Parameters, control: Array) -> State:
         if not self.compose_first:
             return state
         return self.engine.compose(self.model, state, Context(parameters, control))
+
+    def append_noise(self, state: State, parameters: Parameters) -> State:
+        """Append this step's motion noise and calibration error (P10, P11, P15)."""
+        start = _part(state.core, "noise").start
+        state = self.engine.augment(state, start, jnp.diag(parameters.motion_sigma**2))
+        return state if self.calibration != "white" else self._with_calibration(state, parameters)
 
     def update(
         self, state: State, parameters: Parameters, control: Array, features: Features
@@ -529,7 +536,18 @@ class SlamFilter:
         new: Features,
     ) -> tuple[State, Innovation]:
         """One frame: `seen` are features of landmarks in the map, `new` those to insert."""
-        state = self.predict(state, parameters, control)
+        return self.advance(self.append_noise(state, parameters), parameters, control, seen, new)
+
+    def advance(
+        self,
+        state: State,
+        parameters: Parameters,
+        control: Array,
+        seen: Features,
+        new: Features,
+    ) -> tuple[State, Innovation]:
+        """The rest of a `step`, its noise being appended."""
+        state = self._composed_first(state, parameters, control)
         state, innovation = self.update(state, parameters, control, seen)
         state = self.compose(state, parameters, control)
         return self.finish(self.initialise(state, parameters, new)), innovation
@@ -553,7 +571,7 @@ class SlamFilter:
     ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
         """The sensor's chart of landmarks, (x/z, y/z, 1/z) of a camera, with covariances."""
         return self.engine.landmark_covariance(
-            self._composed_view(parameters), self.model.chart, self.reported(state), slots
+            self.composed_view(parameters), self.model.chart, self.reported(state), slots
         )
 
     def landmarks_from_above(
@@ -571,7 +589,7 @@ class SlamFilter:
             x, z = (rotation @ point)[jnp.array([0, -1])]
             return jnp.stack([jnp.atan2(x, z), omega / jnp.hypot(x, z)])
 
-        view = self._composed_view(parameters)
+        view = self.composed_view(parameters)
         return self.engine.landmark_covariance(view, above, self.reported(state), slots)
 
     def landmarks_in_world(
@@ -601,7 +619,7 @@ class SlamFilter:
 
     def _world_point(self, parameters: Parameters):
         """The functions of core and landmark that give its point in B."""
-        camera_view = self._composed_view(parameters)
+        camera_view = self.composed_view(parameters)
 
         def view(core):
             return camera_view(core), self.model.camera_pose(core)
@@ -627,7 +645,8 @@ class SlamFilter:
         )
         return self.model.camera_pose(core), points, omegas
 
-    def _composed_view(self, parameters: Parameters) -> Callable[[Core], View]:
+    def composed_view(self, parameters: Parameters) -> Callable[[Core], View]:
+        """What landmarks depend on, as a function of the core, the motion being composed."""
         return lambda core: self.model.view(core, _composed(parameters))
 
     def _no_anchors(self, capacity: int, dtype) -> SplitPose | None:

@@ -1,0 +1,202 @@
+"""A Gaussian sum that divides itself anew in every frame.
+
+The sum of `Bank` is divided at the start, and what accelerations add to the velocity later is not.
+Here, in every frame, the member whose linearisation costs most is split, and the two whose merger
+costs least are merged (split and merge: Ueda et al. 2000; for filters Faubel et al. 2009).
+
+What costs is the product of the camera's displacement t with inverse depths. In a measurement
+h(X − ω t), with X and ω as they are at the estimate, errors of both neglect `−(∂h/∂X) δt δω`. So a
+member's cost is the squared pixels `tr(M P_t)`, with its own variance P_t of the displacement and
+
+    M = Σᵢ σ_ωᵢ² (∂h/∂X)ᵀ (∂h/∂X),   over landmarks i.
+
+Splits and mergers keep the sum's mean and covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxslam.filters import ekf
+from jaxslam.filters.bank import Bank, BankState
+from jaxslam.filters.blocks import shifted
+from jaxslam.filters.initialisation import UNDELAYED
+from jaxslam.filters.slam import Context, Parameters, SlamFilter
+from jaxslam.filters.state import Features, Innovation, State
+from jaxslam.geometry import difference, jacobian
+
+SPLIT = 0.8
+"""Halves of a split member are ± so many of its σ from its mean."""
+
+
+@dataclass(frozen=True)
+class SplitAndMerge(Bank):
+    """`count` filters `base`; begun as the sum over the direction of the velocity."""
+
+    base: SlamFilter
+    along: str = "direction"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.base, SlamFilter):
+            raise ValueError("a mixture is of filters, not of windows or of other sums")
+        landmark = self.base.model.landmark
+        for wrong, why in (
+            (self.base.engine is not ekf, "is of filters in covariance form"),
+            (self.base.initialisation is not UNDELAYED, "does not know delayed landmarks"),
+            (landmark.convert is not None, f"cannot switch the form of {landmark.name}"),
+        ):
+            if wrong:
+                raise ValueError(f"a mixture {why}")
+
+    @property
+    def rounds(self) -> int:
+        """Splits in a frame, at the most."""
+        return max(1, self.count // 3)
+
+    def step(
+        self,
+        state: BankState,
+        parameters: Parameters,
+        control: Array,
+        seen: Features,
+        new: Features,
+    ) -> tuple[BankState, Innovation]:
+        """Every member's step, the sum divided anew once the frame's noise is appended."""
+        append = jax.vmap(self.base.append_noise, in_axes=(0, None))
+        state = BankState(append(state.members, parameters), state.log_weights)
+        state = self._divided(state, parameters, control)
+        advance = jax.vmap(self.base.advance, in_axes=(0, None, None, None, None))
+        members, innovations = advance(state.members, parameters, control, seen, new)
+        return self._weighed(members, state.log_weights, innovations)
+
+    def _divided(self, state: BankState, parameters: Parameters, control: Array) -> BankState:
+        def displacement(core):
+            return self.base.model.displacement(core, Context(parameters, control)).translation()
+
+        cost = self._root_of_cost(state, parameters)
+
+        def pixels(core):
+            return cost @ displacement(core)
+
+        def once(_, state):
+            return _split_and_merged(pixels, state)
+
+        return jax.lax.fori_loop(0, self.rounds, once, state)
+
+    def _root_of_cost(self, state: BankState, parameters: Parameters) -> Float[Array, "n n"]:
+        """C with `CᵀC = M`, at the likeliest member."""
+        base, sensor = self.base, self.rig.sensor
+        likeliest = self.reported(state)
+        slots = jnp.arange(likeliest.active.size)
+        view_of = base.composed_view(parameters)
+
+        def inverse_depth(view, landmark):
+            return base.model.camera_point(view, landmark)[1][None]
+
+        _, variances = base.engine.landmark_covariance(view_of, inverse_depth, likeliest, slots)
+        view = view_of(likeliest.core)
+        camera = view.camera(Context(parameters, None))
+
+        def by_point(landmark):
+            point, omega = base.model.camera_point(view, landmark)
+            return jax.jacfwd(lambda point: sensor.measure(camera, point, omega))(point)
+
+        slopes = jax.vmap(by_point)(likeliest.landmarks)
+        counted = jnp.where(likeliest.active, variances[:, 0, 0], 0.0)
+        M = jnp.einsum("m,mpi,mpj->ij", counted, slopes, slopes)
+        # Nearly singular where one landmark is seen, and zero where none is.
+        n = self.rig.geometry.point_dim
+        M = M / jnp.maximum(jnp.trace(M), jnp.finfo(M.dtype).tiny)
+        return jnp.linalg.cholesky(M + 1e-6 * jnp.eye(n, dtype=M.dtype)).T
+
+
+def with_mixture(base: SlamFilter, count: int | None) -> SplitAndMerge:
+    """The Gaussian sum that divides itself anew in every frame; 9 members by default."""
+    return SplitAndMerge(base, 9 if count is None else count)
+
+
+def _split_and_merged(pixels, state: BankState) -> BankState:
+    """The member of the greatest cost split, and two of the others merged, if that is a gain.
+
+    The cost of the sum is `Σ w tr(P)` of the members' `pixels(core)`. A split lessens it by
+    `w δ² λ` with the greatest eigenvalue λ; a merger adds `wᵢ wⱼ/(wᵢ + wⱼ) |pᵢ − pⱼ|²`.
+    """
+    members, log_weights = state.members, state.log_weights
+    weights = jnp.exp(log_weights)
+    values, by_core = jax.vmap(lambda core: (pixels(core), jacobian(pixels, core)))(members.core)
+    c = by_core.shape[-1]
+    costs = jnp.einsum("kic,kcd,kid->k", by_core, members.covariance[:, :c, :c], by_core)
+    split = jnp.argmax(jnp.where(weights > 0, weights * costs, 0.0))
+    parent = _of(members, split)
+    halves, gain = _halves(parent, by_core[split])
+
+    tiny, index = jnp.finfo(weights.dtype).tiny, jnp.arange(weights.size)
+    both = weights[:, None] * weights / jnp.maximum(weights[:, None] + weights, tiny)
+    apart = jnp.sum((values[:, None] - values) ** 2, axis=-1)
+    loss = jnp.where(both > 0, both * apart, 0.0)
+    pair = (index[:, None] < index) & (index[:, None] != split) & (index != split)
+    i, j = jnp.unravel_index(jnp.argmin(jnp.where(pair, loss, jnp.inf)), loss.shape)
+    heavy, light = jnp.where(weights[i] >= weights[j], jnp.stack([i, j]), jnp.stack([j, i]))
+    merged, log_weight = _merged(
+        _of(members, heavy), _of(members, light), log_weights[heavy], log_weights[light]
+    )
+
+    gained = weights[split] * gain > loss[i, j]
+    slots = jnp.stack([i, j, split])
+    new = jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), merged, halves)
+    half = log_weights[split] - jnp.log(2.0)
+    new = BankState(new, jnp.stack([log_weight, half, half]))
+
+    def put(old, new):
+        kept = gained.reshape((1,) * new.ndim)
+        return old.at[slots].set(jnp.where(kept, new, old[slots]))
+
+    return jax.tree.map(put, state, new)
+
+
+def _of(members: Any, k: Array) -> Any:
+    return jax.tree.map(lambda x: x[k], members)
+
+
+def _halves(parent: State, by_core: Float[Array, "n c"]) -> tuple[State, Array]:
+    """N(x, P) as ½ N(x + δ c, P − δ² c cᵀ) + ½ N(x − δ c, …), with `c = P g/√(gᵀ P g)`.
+
+    g is the combination of the `n` functions of the core that varies most. Returned are both
+    halves, a batch, and `δ² gᵀ P g`.
+    """
+    c = by_core.shape[-1]
+    slopes = parent.covariance[:, :c] @ by_core.T
+    values, vectors = jnp.linalg.eigh(by_core @ slopes[:c])
+    variance = jnp.maximum(values[-1], 0.0)
+    away = (
+        SPLIT
+        * slopes
+        @ vectors[:, -1]
+        / jnp.sqrt(jnp.maximum(variance, jnp.finfo(variance.dtype).tiny))
+    )
+    smaller = parent.covariance - jnp.outer(away, away)
+
+    def half(sign):
+        return replace(shifted(parent, sign * away), covariance=smaller)
+
+    return jax.vmap(half)(jnp.array([-1.0, 1.0], away.dtype)), SPLIT**2 * variance
+
+
+def _merged(heavy: State, light: State, log_heavy, log_light) -> tuple[State, Array]:
+    """The Gaussian with the mean and the covariance of both, and the logarithm of its weight."""
+    log_weight = jnp.logaddexp(log_heavy, log_light)
+    share = jnp.where(jnp.isfinite(log_light), jnp.exp(log_light - log_weight), 0.0)
+    landmarks = (light.landmarks - heavy.landmarks).ravel()
+    away = jnp.concatenate([difference(light.core, heavy.core), landmarks])
+    # A member without weight may be anything.
+    away = jnp.where(share > 0, away, 0.0)
+    other = jnp.where(share > 0, light.covariance, 0.0)
+    spread = share * (1 - share) * jnp.outer(away, away)
+    covariance = (1 - share) * heavy.covariance + share * other + spread
+    return replace(shifted(heavy, share * away), covariance=covariance), log_weight
