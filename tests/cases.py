@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.filters import FILTERS, Parameters
+from jaxslam.filters import FILTERS, Parameters, make_filter
 from jaxslam.geometry import GEOMETRIES
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.simulation import features, parameters, scenario, sightings, simulate
@@ -130,3 +130,33 @@ class Case:
     def frames(self, i):
         """Features of run i: first, known, new."""
         return jax.tree.map(lambda x: x[i], self.features)
+
+
+def pose_run(of, slam, i=0, count=None):
+    """Every step's pose, its covariance and NIS of run i."""
+    first, known, new = of.frames(i)
+    velocity, sigma, controls = of.motion(i)
+    sizes = (known.slots.shape[1], new.slots.shape[1])
+
+    @quick_jit
+    def whole(parameters, first, known, new, controls):
+        state = slam.start(parameters, of.capacity, velocity, sigma, sizes)
+        state = slam.first(state, parameters, first)
+
+        def step(state, frame):
+            state, innovation = slam.step(state, parameters, *frame)
+            pose, covariance = slam.camera_pose(state)
+            return state, (pose, covariance, innovation.nis, innovation.residual)
+
+        return jax.lax.scan(step, state, (controls, known, new))
+
+    parts = (known, new, controls)
+    if count is not None:
+        parts = jax.tree.map(lambda x: x[:count], parts)
+    known, new, controls = parts
+    return whole(of.parameters(), first, known, new, controls)
+
+
+def named_filter(of, name, landmarks="inverse_scaling", calibration=None):
+    calibration = calibration or of.scenario.calibration
+    return make_filter(of.scenario.rig, name, LANDMARKS[landmarks], calibration)

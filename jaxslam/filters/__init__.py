@@ -110,11 +110,11 @@ MODIFIERS: dict[str, Callable[[Any, int | None], Filter]] = {
 """What `+name` behind a filter's name makes of it, with the number that may follow the name: the
 greatest depth of a delayed initialisation, m (`particles`, `rays`); the correlation of depths in
 percent (`common`); frames (`lag`); steps of Gauss–Newton instead of convergence (`iterated`);
-members of a Gaussian sum (`scales`, `directions`, `mixture`); none for the remedies `oc` and `fej`."""
+members of a Gaussian sum (`scales`, `directions`, `mixture`); none for the remedies `oc`, `fej`."""
 
 _OF_ANY_FILTER = ("iterated", "scales", "directions", "mixture")
 
-RECOMMENDED = {"planar": "scale_gauge+directions9", "spatial": "scale_gauge+lag10"}
+RECOMMENDED = {"planar": "scale_gauge+mixture17", "spatial": "scale_gauge+lag10"}
 """The filter called `recommended`, by geometry: of those of docs/consistency.md the one to take
 where nothing is known of the motion. In space a Gaussian sum has the square of its members."""
 

@@ -1,0 +1,194 @@
+"""Gaussian sums: over the initial velocity, and divided anew in every frame."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxslam
+from jaxslam.filters import RECOMMENDED, make_filter
+from jaxslam.filters.bank import BankState
+from jaxslam.filters.split_and_merge import _split_and_merged
+from jaxslam.landmarks import LANDMARKS
+from jaxslam.rig import Rig
+from tests.cases import Case, each_geometry, named, named_filter, pose_run, quick_jit
+
+
+@cache
+def case(name="matched-loose", **fields):
+    return Case(name, **{"steps": 6, "landmarks": 4, **fields})
+
+
+@pytest.mark.parametrize(
+    ("modifier", "tolerance"), [("scales5", 0.05), ("directions5", 0.05), ("mixture9", 0.15)]
+)
+def test_a_sum_for_a_linear_problem_is_its_filter(modifier, tolerance):
+    """To the error of the sum's shape: halves of a Gaussian have its moments, not its tails."""
+    of = case(
+        "matched",
+        velocity_sigma=(0.01, 0.01, 1e-6),
+        acceleration_sigma=(1e-5,) * 3,
+        inverse_depth=(1 / 6, 1e-7),
+        pixel_sigma=0.3,
+    )
+    _, (plain, plain_P, _, _) = pose_run(of, named_filter(of, "robocentric"))
+    _, (sum_, sum_P, _, _) = pose_run(of, named_filter(of, f"robocentric+{modifier}"))
+    sigma = np.sqrt(np.diagonal(plain_P, axis1=1, axis2=2))
+    away = jax.vmap(lambda a, b: (a.inverse() @ b).log())(plain, sum_)
+    assert np.abs(away / sigma).max() < tolerance
+    found = np.sqrt(np.diagonal(sum_P, axis1=1, axis2=2))
+    np.testing.assert_allclose(found, sigma, rtol=tolerance)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["robocentric+scales9", "robocentric+directions5", "robocentric+scales9+directions9",
+     "robocentric+mixture9"],
+)  # fmt: skip
+def test_a_divided_prior_has_the_moments_of_the_whole(name):
+    """Also where a sum is divided again, and its base is given a root of the covariance."""
+    of = case()
+    velocity, sigma, _ = of.motion()
+    slam = named_filter(of, name)
+    state = slam.start(of.parameters(), of.capacity, velocity, sigma)
+    weights, members = jnp.exp(state.log_weights), state.members
+    while isinstance(members, BankState):
+        weights = weights[..., None] * jnp.exp(members.log_weights)
+        members = members.members
+    weights = np.asarray(weights).ravel()
+    means = np.asarray(members.core.velocity).reshape(len(weights), -1)
+    place = slice(3, 6)  # after the pose
+    own = np.asarray(members.covariance)[..., place, place].reshape(len(weights), 3, 3)
+    mean = weights @ means
+    spread = np.einsum("m,mi,mj->ij", weights, means - mean, means - mean)
+    np.testing.assert_allclose(mean, velocity, atol=1e-9)
+    covariance = np.tensordot(weights, own, 1) + spread
+    np.testing.assert_allclose(covariance, np.diag(np.square(sigma)), rtol=1e-9, atol=1e-12)
+
+
+@cache
+def some_sum():
+    """A sum after some steps, and the function that it is divided by."""
+    of = case()
+    slam = named_filter(of, "scale_gauge+mixture5")
+    first, known, new = of.frames(0)
+    velocity, sigma, controls = of.motion()
+    parameters = of.parameters()
+
+    def whole():
+        state = slam.start(parameters, of.capacity, velocity, sigma)
+        state = slam.first(state, parameters, first)
+        state, _ = jax.lax.scan(
+            lambda state, frame: (slam.step(state, parameters, *frame)[0], None),
+            state,
+            (controls, known, new),
+        )
+        return state
+
+    return quick_jit(whole)()
+
+
+def pixels(core):
+    return 100 * core.velocity[:2]
+
+
+def moments(state):
+    """Mean and covariance of velocity, scale and landmarks."""
+    members, weights = state.members, np.exp(np.asarray(state.log_weights))
+    parts = (members.core.velocity, members.core.log_scale, members.landmarks)
+    x = np.concatenate([np.asarray(part).reshape(weights.size, -1) for part in parts], axis=1)
+    P = np.asarray(members.covariance)
+    kept = np.r_[3:7, 10 : P.shape[-1]]  # between them the noise, which is none
+    mean = weights @ x
+    own = np.tensordot(weights, P[:, kept][:, :, kept], 1)
+    return mean, own + np.einsum("k,ki,kj->ij", weights, x - mean, x - mean)
+
+
+def cost(state):
+    P = np.asarray(state.members.covariance)[:, 3:5, 3:5]
+    return np.exp(np.asarray(state.log_weights)) @ np.trace(P, axis1=1, axis2=2)
+
+
+def test_to_split_and_to_merge_keeps_the_moments_and_lessens_the_cost():
+    state = some_sum()
+    after = quick_jit(lambda state: _split_and_merged(pixels, state))(state)
+    assert not np.allclose(after.log_weights, state.log_weights)
+    np.testing.assert_allclose(np.exp(after.log_weights).sum(), 1, rtol=1e-12)
+    for before, now in zip(moments(state), moments(after), strict=True):
+        np.testing.assert_allclose(now, before, rtol=1e-9, atol=1e-12 * np.abs(before).max())
+    assert cost(after) < cost(state)
+    assert np.linalg.eigvalsh(after.members.covariance).min() > -1e-12
+
+
+def test_what_gains_nothing_is_not_split():
+    """Members far apart, each of little variance: to merge two would cost more."""
+    state = some_sum()
+    members = state.members
+    apart = jnp.arange(5.0)[:, None] * jnp.ones(3)
+    core = replace(members.core, velocity=members.core.velocity + apart)
+    state = BankState(replace(members, core=core), jnp.log(jnp.full(5, 0.2)))
+    after = _split_and_merged(pixels, state)
+    jax.tree.map(np.testing.assert_array_equal, after, state)
+
+
+def test_members_without_weight_give_their_places():
+    """Whatever is in them, such as what a diverged filter leaves."""
+    state = some_sum()
+    log_weights = jax.nn.log_softmax(state.log_weights.at[2:].set(-jnp.inf))
+    covariance = state.members.covariance.at[2:].set(jnp.nan)
+    state = BankState(replace(state.members, covariance=covariance), log_weights)
+    after = _split_and_merged(pixels, state)
+    assert np.isfinite(after.log_weights).sum() == 3
+    alive = np.isfinite(after.log_weights)
+    assert np.isfinite(np.asarray(after.members.covariance)[alive]).all()
+
+
+@pytest.mark.parametrize("name", ["world+mixture3", "robocentric+mixture3"])
+def test_a_mixture_is_of_any_frame(name):
+    of = case()
+    _, (poses, covariances, _, _) = pose_run(of, named_filter(of, name))
+    _, (plain, _, _, _) = pose_run(of, named_filter(of, name.partition("+")[0]))
+    away = jax.vmap(lambda a, b: (a.inverse() @ b).log())(plain, poses)
+    sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    assert 1e-6 < np.abs(away / sigma).max() < 1
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_recommended_is_a_name(geometry):
+    made = jaxslam.make_filters(Rig(geometry), ["recommended"], ["inverse_scaling"], "known")
+    assert list(made) == [f"{RECOMMENDED[geometry.name]}/inverse_scaling"]
+
+
+@pytest.mark.parametrize(
+    ("name", "landmarks", "message"),
+    [
+        ("robocentric+scales2", "inverse_scaling", "at least 3 members"),
+        ("robocentric+scales5+iterated", "inverse_scaling", "around a filter"),
+        ("robocentric+lag5+mixture", "inverse_scaling", "not of windows"),
+        ("world+particles+mixture", "cartesian", "delayed"),
+        ("information+mixture", "cartesian", "covariance form"),
+        ("world+mixture", "inverse_depth_to_cartesian", "cannot switch the form"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(name, landmarks, message):
+    with pytest.raises(ValueError, match=message):
+        make_filter(Rig(each_geometry[0]), name, LANDMARKS[landmarks], "known")
+
+
+@pytest.mark.statistics
+def test_the_recommended_filter_is_consistent_where_the_papers_is_not():
+    """40 runs straight ahead with loose noise, 30 steps: IS is lost; this one is in the band."""
+    chosen = jaxslam.scenario("matched-forward-loose", steps=30)
+    filters = jaxslam.make_filters(
+        chosen.rig, ["robocentric", "recommended"], ["inverse_scaling"], "known"
+    )
+    study = jaxslam.monte_carlo(chosen, filters, runs=40, seed=5, chunk=10)
+    summary = jaxslam.summarise(study)["filters"]
+    paper, ours = (np.array(f["nees"]) for f in summary.values())
+    # The 99.9 % band of a mean of 40, and one false alarm in 1000.
+    low, high = jaxslam.mean_band(3, 40, 0.999)
+    assert paper[-1] > 10 * high
+    assert low < ours[-1] < high
