@@ -34,7 +34,9 @@ class Options:
         "matched-6dof-loose",
     )  # fmt: skip
     """Built-in scenarios."""
-    filters: tuple[str, ...] = ("robocentric", "scale_gauge", "scale_gauge+lag20")
+    filters: tuple[str, ...] = (
+        "robocentric", "scale_gauge", "scale_gauge+lag20", "scale_gauge+mixture17",
+    )  # fmt: skip
     """Filters."""
     landmarks: tuple[str, ...] = ("inverse_scaling",)
     """Landmark parametrizations."""

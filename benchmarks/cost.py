@@ -36,6 +36,8 @@ class Options:
         "scale_gauge+lag10",
         "scale_gauge+lag20",
         "scale_gauge+directions9",
+        "scale_gauge+mixture9",
+        "scale_gauge+mixture17",
     )
     """Filters; times are relative to the first."""
     landmarks: str = "inverse_scaling"
