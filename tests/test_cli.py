@@ -62,6 +62,9 @@ def test_consistency_resumes_to_more_runs(tmp_path, capsys):
         (["track", "--reference", "truth.txt"], "need a SOURCE"),
         (["track", "--frames", "0"], "frames"),
         (["track", "--filter", "nothing"], "unknown filter 'nothing'"),
+        (["track", "--filter", "world+nothing"], "unknown modifiers 'nothing'"),
+        (["track", "--filter", "scale_gauge+lag5"], "cannot track"),
+        (["track", "--filter", "world+rays", "--landmarks", "cartesian"], "cannot track"),
     ],
 )
 def test_a_mistake_ends_with_status_2_and_one_line(arguments, message, tmp_path, capsys):

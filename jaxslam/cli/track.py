@@ -32,9 +32,10 @@ class TrackOptions:
     """Seed of the synthetic video; nothing else is random."""
     rate: float = 30.0
     """Frames per second of a folder of images without timestamps."""
-    filter: Annotated[str, tyro.conf.arg(help=f"Filter: {', '.join(FILTERS)}.")] = (
-        TrackerSettings.filter
-    )
+    filter: Annotated[
+        str,
+        tyro.conf.arg(help=f"Filter: {', '.join(FILTERS)}; may be modified, as in robocentric+oc."),
+    ] = TrackerSettings.filter
     landmarks: Annotated[
         str, tyro.conf.arg(help=f"Landmark parametrization: {', '.join(LANDMARKS)}.")
     ] = TrackerSettings.landmarks

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxslam.camera import Camera
 from jaxslam.filters import FILTERS, Parameters, inverse_depth_prior
 from jaxslam.landmarks import LANDMARKS
+from jaxslam.names import chosen
 from jaxslam.vision.calibration import Calibration
 
 
@@ -18,7 +19,7 @@ class TrackerSettings:
     a single camera does not see scale, so the map's unit is whatever that prior makes it."""
 
     filter: str = "world"
-    """Filter: a name of jaxslam.FILTERS."""
+    """Filter: a name of jaxslam.FILTERS, which may be modified, as in `robocentric+oc`."""
     landmarks: str = "inverse_scaling"
     """Landmark parametrization: a name of jaxslam.LANDMARKS."""
     calibration: str = "known"
@@ -57,11 +58,8 @@ class TrackerSettings:
     """Frames out of view after which a landmark is removed."""
 
     def __post_init__(self) -> None:
-        for option, known in (("filter", FILTERS), ("landmarks", LANDMARKS)):
-            if getattr(self, option) not in known:
-                raise ValueError(
-                    f"unknown {option} {getattr(self, option)!r}; known: {', '.join(known)}"
-                )
+        chosen("filter", [self.filter.partition("+")[0]], FILTERS)
+        chosen("landmarks", [self.landmarks], LANDMARKS)
 
     @property
     def capacity(self) -> int:

@@ -41,9 +41,9 @@ def track(
     An interruption (KeyboardInterrupt) or an unreadable frame (ValueError) leaves all of them for
     the frames so far, and is raised again.
     """
+    tracker = Tracker(source.calibration, settings or TrackerSettings())
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    tracker = Tracker(source.calibration, settings or TrackerSettings())
     history: list[Tracked] = []
     seconds: list[float] = []
     try:

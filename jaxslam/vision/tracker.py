@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.filters import FILTERS, Features, Parameters, SlamFilter, State
+from jaxslam.filters import Features, Parameters, SlamFilter, State, make_filter
+from jaxslam.filters.initialisation import UNDELAYED
 from jaxslam.filters.ransac import inliers
 from jaxslam.geometry import SPATIAL
 from jaxslam.landmarks import LANDMARKS
@@ -93,11 +94,11 @@ class Tracker:
 
     def __post_init__(self) -> None:
         s = self.settings
-        made = FILTERS[s.filter](Rig(SPATIAL), LANDMARKS[s.landmarks], s.calibration)
-        if not isinstance(made, SlamFilter):
+        made = make_filter(Rig(SPATIAL), s.filter, LANDMARKS[s.landmarks], s.calibration)
+        if not isinstance(made, SlamFilter) or made.initialisation is not UNDELAYED:
             raise ValueError(
-                f"filter {s.filter} cannot track: features are sought where a filter predicts "
-                "them, before it is given the frame"
+                f"filter {s.filter} cannot track: features are sought where one Gaussian predicts "
+                "them, before it is given the frame, from the frame in which they are first seen"
             )
         self._filter = made
         self._time: float | None = None
