@@ -252,6 +252,7 @@ def test_correlated_depths_have_that_correlation_and_their_own_variance():
         ("world+lag5", "inverse_depth_to_cartesian", "known", "cannot switch the form"),
         ("world+particles+lag5", "cartesian", "known", "delayed"),
         ("robocentric+common100", "inverse_scaling", "known", "below 1"),
+        ("world+particles+common50", "cartesian", "known", "delayed initialisation"),
         ("robocentric+lag5+lag5", "inverse_scaling", "known", "must stand before"),
         ("scale_gauge+oc", "inverse_scaling", "known", "needs no remedy"),
         ("robocentric+lagg5", "inverse_scaling", "known", "lagg"),
