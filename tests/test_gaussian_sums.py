@@ -157,6 +157,15 @@ def test_a_mixture_is_of_any_frame(name):
 
 
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_a_mixture_has_so_many_members(geometry):
+    """In space too, where the direction of the velocity has two angles."""
+    of = case("matched" if geometry.name == "planar" else "matched-6dof")
+    velocity, sigma, _ = of.motion()
+    slam = named_filter(of, "robocentric+mixture5")
+    assert slam.start(of.parameters(), of.capacity, velocity, sigma).log_weights.shape == (5,)
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_recommended_is_a_name(geometry):
     made = jaxslam.make_filters(Rig(geometry), ["recommended"], ["inverse_scaling"], "known")
     assert list(made) == [f"{RECOMMENDED[geometry.name]}/inverse_scaling"]

@@ -54,6 +54,10 @@ class SplitAndMerge(Bank):
             if wrong:
                 raise ValueError(f"a mixture {why}")
 
+    def _directions(self, velocity, D) -> Float[Array, "v 1"]:
+        """One, so that there are `count` members in space too: the rest is left to the splits."""
+        return super()._directions(velocity, D)[:, :1]
+
     @property
     def rounds(self) -> int:
         """Splits in a frame, at the most."""
