@@ -119,9 +119,9 @@ members of a Gaussian sum (`scales`, `directions`, `mixture`); none for the reme
 
 _OF_ANY_FILTER = ("iterated", "scales", "directions", "mixture")
 
-RECOMMENDED = {"planar": "scale_gauge+mixture17", "spatial": "scale_gauge"}
+RECOMMENDED = {"planar": "scale_gauge+mixture17", "spatial": "scale_gauge+mixture9"}
 """The filter called `recommended`, by geometry: of those of docs/consistency.md the one to take
-where nothing is known of the motion. In space a Gaussian sum has not been measured."""
+where nothing is known of the motion."""
 
 
 def make_filters(
