@@ -134,8 +134,9 @@ def _numbers(values: np.ndarray) -> list[float | None]:
 
 def table(summary: dict[str, Any]) -> str:
     """The summary's last step as text, one filter a line."""
+    wide = max(31, *map(len, summary["filters"])) + 1
     header = (
-        f"{'filter/landmarks':<32}{'NEES mean':>10}{'median':>8}{'95 % band':>14}{'inside':>8}"
+        f"{'filter/landmarks':<{wide}}{'NEES mean':>10}{'median':>8}{'95 % band':>14}{'inside':>8}"
         f"{'lost':>7}{'diverged':>9}{'NIS/dof':>8}{'RMSE m':>8}{'σ m':>8}{'seconds':>9}"
     )
     lines = [header]
@@ -144,7 +145,7 @@ def table(summary: dict[str, Any]) -> str:
             nis = np.nansum(np.array(f["nis"], float)) / np.nansum(np.array(f["nis_dof"], float))
         band = f"{f['band95'][0]:.3f}–{f['band95'][1]:.3f}"
         lines.append(
-            f"{name:<32}{_last(f['nees'], 10, 3)}{_last(f['nees_median'], 8, 2)}{band:>14}"
+            f"{name:<{wide}}{_last(f['nees'], 10, 3)}{_last(f['nees_median'], 8, 2)}{band:>14}"
             f"{f['inside']:>7.0%} {_share(f['lost'][-1]):>6}{f['diverged']:>9d}{nis:>8.3f}"
             f"{_last(f['rmse']['position'], 8, 3)}{_last(f['sigma']['position'], 8, 3)}"
             f"{f['seconds']['compile'] + f['seconds']['run']:>9.1f}"
