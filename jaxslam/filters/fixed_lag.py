@@ -21,10 +21,9 @@ import optimistix as optx
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.filters import ekf, sensitivity
-from jaxslam.filters.initialisation import UNDELAYED
+from jaxslam.filters import sensitivity
 from jaxslam.filters.sensitivity import Compared, Distribution, Point
-from jaxslam.filters.slam import Parameters, SlamFilter
+from jaxslam.filters.slam import Parameters, SlamFilter, check_one_gaussian
 from jaxslam.filters.state import Features, Innovation, State
 from jaxslam.geometry import Pose, retract
 from jaxslam.rig import Rig
@@ -95,15 +94,9 @@ class FixedLag:
                 f"a fixed lag has at least 1 frame and 1 iteration, not {self.lag} and "
                 f"{self.iterations}"
             )
-        landmark = self.base.model.landmark
-        for wrong, why in (
-            (self.base.engine is not ekf, "is for filters in covariance form"),
-            (self.base.initialisation is not UNDELAYED, "does not know delayed landmarks"),
-            (self.base.calibration == "consider", "cannot consider a calibration: estimate it"),
-            (landmark.convert is not None, f"cannot switch the form of {landmark.name}"),
-        ):
-            if wrong:
-                raise ValueError(f"a fixed lag {why}")
+        check_one_gaussian(self.base, "a fixed lag")
+        if self.base.calibration == "consider":
+            raise ValueError("a fixed lag cannot consider a calibration: estimate it")
 
     @property
     def rig(self) -> Rig:

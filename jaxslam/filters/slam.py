@@ -674,6 +674,18 @@ class SlamFilter:
         return _composed(parameters) if self.compose_first else Context(parameters, control)
 
 
+def check_one_gaussian(base: SlamFilter, what: str) -> None:
+    """Raise ValueError, saying of what, unless all that `base` knows is in one covariance."""
+    landmark = base.model.landmark
+    for wrong, why in (
+        (base.engine is not ekf, "is for filters in covariance form"),
+        (base.initialisation is not UNDELAYED, "does not know delayed landmarks"),
+        (landmark.convert is not None, f"cannot switch the form of {landmark.name}"),
+    ):
+        if wrong:
+            raise ValueError(f"{what} {why}")
+
+
 def velocity_root(
     sigma: Float[Array, " v"] | Float[Array, "v v"],
 ) -> Float[Array, "v v"]:

@@ -22,11 +22,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.filters import ekf
 from jaxslam.filters.bank import Bank, BankState
 from jaxslam.filters.blocks import shifted
-from jaxslam.filters.initialisation import UNDELAYED
-from jaxslam.filters.slam import Context, Parameters, SlamFilter
+from jaxslam.filters.slam import Context, Parameters, SlamFilter, check_one_gaussian
 from jaxslam.filters.state import Features, Innovation, State
 from jaxslam.geometry import difference, jacobian
 
@@ -45,14 +43,7 @@ class SplitAndMerge(Bank):
         super().__post_init__()
         if not isinstance(self.base, SlamFilter):
             raise ValueError("a mixture is of filters, not of windows or of other sums")
-        landmark = self.base.model.landmark
-        for wrong, why in (
-            (self.base.engine is not ekf, "is of filters in covariance form"),
-            (self.base.initialisation is not UNDELAYED, "does not know delayed landmarks"),
-            (landmark.convert is not None, f"cannot switch the form of {landmark.name}"),
-        ):
-            if wrong:
-                raise ValueError(f"a mixture {why}")
+        check_one_gaussian(self.base, "a mixture")
 
     def _directions(self, velocity, D) -> Float[Array, "v 1"]:
         """One, so that there are `count` members in space too: the rest is left to the splits."""
@@ -178,12 +169,8 @@ def _halves(parent: State, by_core: Float[Array, "n c"]) -> tuple[State, Array]:
     slopes = parent.covariance[:, :c] @ by_core.T
     values, vectors = jnp.linalg.eigh(by_core @ slopes[:c])
     variance = jnp.maximum(values[-1], 0.0)
-    away = (
-        SPLIT
-        * slopes
-        @ vectors[:, -1]
-        / jnp.sqrt(jnp.maximum(variance, jnp.finfo(variance.dtype).tiny))
-    )
+    sigma = jnp.sqrt(jnp.maximum(variance, jnp.finfo(variance.dtype).tiny))
+    away = SPLIT * slopes @ vectors[:, -1] / sigma
     smaller = parent.covariance - jnp.outer(away, away)
 
     def half(sign):
