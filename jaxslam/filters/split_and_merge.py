@@ -8,7 +8,7 @@ What costs is the product of the camera's displacement t with inverse depths. In
 h(X − ω t), with X and ω as they are at the estimate, errors of both neglect `−(∂h/∂X) δt δω`. So a
 member's cost is the squared pixels `tr(M P_t)`, with its own variance P_t of the displacement and
 
-    M = Σᵢ σ_ωᵢ² (∂h/∂X)ᵀ (∂h/∂X),   over landmarks i.
+    M = Σᵢ σ_ωᵢ² (∂h/∂X)ᵀ (∂h/∂X),   over the landmarks i in view.
 
 Splits and mergers keep the sum's mean and covariance.
 """
@@ -65,16 +65,18 @@ class SplitAndMerge(Bank):
         """Every member's step, the sum divided anew once the frame's noise is appended."""
         append = jax.vmap(self.base.append_noise, in_axes=(0, None))
         state = BankState(append(state.members, parameters), state.log_weights)
-        state = self._divided(state, parameters, control)
+        state = self._divided(state, parameters, control, seen)
         advance = jax.vmap(self.base.advance, in_axes=(0, None, None, None, None))
         members, innovations = advance(state.members, parameters, control, seen, new)
         return self._weighed(members, state.log_weights, innovations)
 
-    def _divided(self, state: BankState, parameters: Parameters, control: Array) -> BankState:
+    def _divided(
+        self, state: BankState, parameters: Parameters, control: Array, seen: Features
+    ) -> BankState:
         def displacement(core):
             return self.base.model.displacement(core, Context(parameters, control)).translation()
 
-        cost = self._root_of_cost(state, parameters)
+        cost = self._root_of_cost(state, parameters, seen)
 
         def pixels(core):
             return cost @ displacement(core)
@@ -84,17 +86,20 @@ class SplitAndMerge(Bank):
 
         return jax.lax.fori_loop(0, self.rounds, once, state)
 
-    def _root_of_cost(self, state: BankState, parameters: Parameters) -> Float[Array, "n n"]:
-        """C with `CᵀC = M`, at the likeliest member."""
+    def _root_of_cost(
+        self, state: BankState, parameters: Parameters, seen: Features
+    ) -> Float[Array, "n n"]:
+        """C with `CᵀC = M` of the landmarks that are seen, at the likeliest member."""
         base, sensor = self.base, self.rig.sensor
         likeliest = self.reported(state)
-        slots = jnp.arange(likeliest.active.size)
         view_of = base.composed_view(parameters)
 
         def inverse_depth(view, landmark):
             return base.model.camera_point(view, landmark)[1][None]
 
-        _, variances = base.engine.landmark_covariance(view_of, inverse_depth, likeliest, slots)
+        _, variances = base.engine.landmark_covariance(
+            view_of, inverse_depth, likeliest, seen.slots
+        )
         view = view_of(likeliest.core)
         camera = view.camera(Context(parameters, None))
 
@@ -102,8 +107,8 @@ class SplitAndMerge(Bank):
             point, omega = base.model.camera_point(view, landmark)
             return jax.jacfwd(lambda point: sensor.measure(camera, point, omega))(point)
 
-        slopes = jax.vmap(by_point)(likeliest.landmarks)
-        counted = jnp.where(likeliest.active, variances[:, 0, 0], 0.0)
+        slopes = jax.vmap(by_point)(likeliest.landmarks[seen.slots])
+        counted = jnp.where(seen.valid, variances[:, 0, 0], 0.0)
         M = jnp.einsum("m,mpi,mpj->ij", counted, slopes, slopes)
         # Nearly singular where one landmark is seen, and zero where none is.
         n = self.rig.geometry.point_dim
