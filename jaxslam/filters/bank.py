@@ -24,9 +24,11 @@ from jaxslam.filters.state import Features, Innovation, State
 from jaxslam.geometry import Pose, difference, retract
 from jaxslam.rig import Rig
 
-REACH = 2.5
-"""The members' means are spread over ± so many σ of the prior."""
-OVERLAP = 0.7
+REACH = (2.5, 4.0)
+"""The members' means are spread over ± so many σ of the prior, at the least and at the most."""
+SPACING = 0.5
+"""Within these, so many σ of the prior are between them."""
+OVERLAP = 0.5
 """σ of a member, in distances between neighbours."""
 ALONG = ("speed", "direction")
 
@@ -165,7 +167,8 @@ class Bank:
 
     def _division(self, directions: int) -> tuple[np.ndarray, np.ndarray, float]:
         """Means and log weights of the members of N(0, I), and their σ; the sum's variance is 1."""
-        line = np.linspace(-REACH, REACH, self.count)
+        reach = np.clip(SPACING * (self.count - 1) / 2, *REACH)
+        line = np.linspace(-reach, reach, self.count)
         wanted = min(OVERLAP * (line[1] - line[0]), 0.9)
         log_weight = -(line**2) / (2 * (1 - wanted**2))
         weight = np.exp(log_weight - np.logaddexp.reduce(log_weight))
