@@ -1,7 +1,7 @@
 """Tests of jaxslam.posterior: the model against dense formulas, MAP, HMC, ranks, bad input."""
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -38,9 +38,14 @@ from jaxslam.posterior import (
     unknowns,
     wasserstein,
 )
+from jaxslam.posterior.conditional import (
+    centre,
+    conditional_log_density,
+    conditional_unknowns,
+    whitening_root,
+)
 from jaxslam.posterior.moments import covariance, in_base_axes, to_base_axes
 from jaxslam.posterior.problem import size, truncated_normal
-from jaxslam.posterior.scale import scaled_log_density, scaled_unknowns, whitening_root
 
 LOOSE = jaxslam.scenario("matched-loose", steps=3, landmarks=4)
 SPATIAL = jaxslam.scenario("matched-6dof-loose", steps=2, landmarks=3)
@@ -158,18 +163,18 @@ def test_a_landmark_that_is_not_visible_tells_nothing_and_one_behind_is_impossib
 
 
 @pytest.mark.parametrize("truncated", [True, False])
-def test_the_variables_of_scale_have_the_jacobian_that_they_claim(truncated):
+def test_the_conditional_variables_have_the_jacobian_that_they_claim(truncated):
     problem, _ = problem_of(LOOSE, truncated=truncated)
     mode = draw(problem)
 
     @jax.jit
     def physical(w):
-        return ravel_pytree(scaled_unknowns(LOOSE.rig, problem, mode, w)[0])[0]
+        return ravel_pytree(conditional_unknowns(LOOSE.rig, problem, mode, w)[0])[0]
 
-    at_mode = ravel_pytree(unknowns(problem, mode))[0]
-    np.testing.assert_allclose(physical(mode), at_mode, rtol=1e-12)
     a, b = mode + draw(problem, 2), mode + 5 * draw(problem, 3)
-    claimed = [scaled_unknowns(LOOSE.rig, problem, mode, w)[1] for w in (a, b)]
+    if truncated:  # there is no density where an inverse depth is below the bound
+        a, b = (w.at[-LOOSE.landmarks :].add(10.0) for w in (a, b))
+    claimed = [conditional_unknowns(LOOSE.rig, problem, mode, w)[1] for w in (a, b)]
     exact = [jnp.linalg.slogdet(jax.jacfwd(physical)(w))[1] for w in (a, b)]
     assert claimed[1] - claimed[0] == pytest.approx(float(exact[1] - exact[0]), abs=1e-9)
 
@@ -184,7 +189,7 @@ def test_the_variables_of_scale_have_the_jacobian_that_they_claim(truncated):
     def slope(y):
         return jax.jvp(at, (y,), (jnp.ones_like(y),))[1]
 
-    values = [scaled_log_density(LOOSE.rig, problem, mode, w) for w in (a, b)]
+    values = [conditional_log_density(LOOSE.rig, problem, mode, w) for w in (a, b)]
     expected = [
         log_density(LOOSE.rig, problem, whitened(w))
         + log_det
@@ -242,18 +247,41 @@ def test_on_a_nearly_linear_problem_map_hmc_and_the_filter_agree():
     assert np.all(records["wasserstein"] < 0.2)
 
 
-def test_the_root_of_the_scale_variables_is_that_of_the_laplace_approximation():
+def test_at_the_mode_the_conditional_variables_have_the_laplace_approximation():
     problem, _, mode, _ = nearly_linear()
     rig = NEARLY_LINEAR.rig
     root = whitening_root(rig, problem, mode.mode)
-    by_w = jax.jacfwd(lambda w: ravel_pytree(scaled_unknowns(rig, problem, mode.mode, w)[0])[0])(
-        mode.mode
+
+    def physical(w):
+        return ravel_pytree(conditional_unknowns(rig, problem, mode.mode, w)[0])[0]
+
+    origin = centre(problem, mode.mode)
+    np.testing.assert_allclose(
+        physical(origin), ravel_pytree(unknowns(problem, mode.mode))[0], rtol=1e-6, atol=1e-8
     )
+    by_w = jax.jacfwd(physical)(origin)
     slope = ravel_pytree(
         jax.jvp(lambda y: unknowns(problem, y), (mode.mode,), (jnp.ones_like(mode.mode),))[1]
     )[0]
     in_y = (by_w / slope[:, None]) @ root
     np.testing.assert_allclose(in_y @ in_y.T, mode.root @ mode.root.T, rtol=1e-6, atol=1e-8)
+
+
+def test_given_the_path_the_conditional_variables_of_depth_are_standard_normal():
+    """Also on a path far from the mode's, at a scale and in a direction of its own."""
+    problem, _ = problem_of(LOOSE, truncated=False)
+    mode = draw(problem)
+    w = centre(problem, mode).at[:2].add(jnp.array([2.5, -2.0]))
+    density = partial(conditional_log_density, LOOSE.rig, problem, mode)
+
+    def of_depths(e):
+        return density(w.at[-LOOSE.landmarks :].set(e))
+
+    at, H = jax.jit(lambda e: (jax.grad(of_depths)(e), jax.hessian(of_depths)(e)))(
+        jnp.zeros(LOOSE.landmarks)
+    )
+    np.testing.assert_allclose(at, 0, atol=0.3)
+    np.testing.assert_allclose(H, -np.eye(LOOSE.landmarks), atol=0.15)
 
 
 def test_moments_and_distances_of_gaussian_draws_are_those_of_the_gaussian():

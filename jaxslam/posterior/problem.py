@@ -175,13 +175,13 @@ def residuals(rig: Rig, problem: Problem, y: Float[Array, " n"]) -> Float[Array,
 
 def pixel_residuals(rig: Rig, problem: Problem, x: Unknowns) -> Float[Array, " m"]:
     """`(z − h)/σ_px` of every pixel; zero where nothing was measured."""
-    errors, _ = _pixel_errors(rig, problem, x)
+    errors, _ = pixel_errors(rig, problem, x, path(rig, problem, x)[0])
     return jnp.where(problem.visible[..., None], errors, 0.0).ravel()
 
 
 def log_likelihood(rig: Rig, problem: Problem, x: Unknowns) -> Float[Array, ""]:
     """`−½ |(z − h)/σ_px|²`, up to a constant; −∞ if a measured landmark is behind the camera."""
-    errors, possible = _pixel_errors(rig, problem, x)
+    errors, possible = pixel_errors(rig, problem, x, path(rig, problem, x)[0])
     used = problem.visible & possible
     squared = jnp.sum(jnp.where(used[..., None], errors, 0.0) ** 2)
     return jnp.where(jnp.all(possible | ~problem.visible), -squared / 2, -jnp.inf)
@@ -192,11 +192,10 @@ def log_density(rig: Rig, problem: Problem, y: Float[Array, " n"]) -> Float[Arra
     return log_likelihood(rig, problem, unknowns(problem, y)) - y @ y / 2
 
 
-def _pixel_errors(
-    rig: Rig, problem: Problem, x: Unknowns
+def pixel_errors(
+    rig: Rig, problem: Problem, x: Unknowns, poses: Pose
 ) -> tuple[Float[Array, "steps l p"], Bool[Array, "steps l"]]:
-    """`(z − h)/σ_px` of every step, and whether h is possible."""
-    poses, _ = path(rig, problem, x)
+    """`(z − h)/σ_px` of every step, seen from the poses T_BC, and whether h is possible."""
     parameters, sensor = problem.prior.parameters, rig.sensor
     bearings = jax.vmap(bearing, in_axes=(None, 0))(parameters.camera, x.pixels)
     points = jnp.column_stack([bearings, jnp.ones_like(x.inverse_depths)])

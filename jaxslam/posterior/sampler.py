@@ -1,8 +1,9 @@
 """Draws from the posterior by Hamiltonian Monte Carlo, in variables whitened at a mode.
 
-The variables are those of `scale`. Trajectories have quasi-random lengths (Neal 2011, section 3.2;
-Hoffman et al. 2021): in whitened variables one knows how long they should be, and need not find
-out by doubling as NUTS does. All chains of a batch take the same lengths, so that none waits long.
+The variables are those of `conditional`. Trajectories have quasi-random lengths (Neal 2011,
+section 3.2; Hoffman et al. 2021): in whitened variables one knows how long they should be, and need
+not find out by doubling as NUTS does. All chains of a batch take the same lengths, so that none
+waits long.
 """
 
 from __future__ import annotations
@@ -19,8 +20,13 @@ from blackjax.adaptation.step_size import dual_averaging_adaptation
 from jaxtyping import Array, Float
 
 from jaxslam.geometry import Pose
+from jaxslam.posterior.conditional import (
+    centre,
+    conditional_log_density,
+    conditional_unknowns,
+    whitening_root,
+)
 from jaxslam.posterior.problem import Problem, path
-from jaxslam.posterior.scale import scaled_log_density, scaled_unknowns, whitening_root
 from jaxslam.rig import Rig
 
 WORST_RHAT = 1.05
@@ -82,16 +88,16 @@ def sample(
 ) -> Chains:
     """Chains that start at draws of the mode's Gaussian.
 
-    They move in x with `w = mode + R x`, where the posterior is nearly N(0, I), with a unit mass
+    They move in x with `w = centre + R x`, where the posterior is nearly N(0, I), with a unit mass
     matrix, which is better than one estimated from few draws.
     """
-    root = whitening_root(rig, problem, mode)
+    root, origin = whitening_root(rig, problem, mode), centre(problem, mode)
 
     def target(x):
-        return scaled_log_density(rig, problem, mode, mode + root @ x)
+        return conditional_log_density(rig, problem, mode, origin + root @ x)
 
     def outcome(x):
-        unknown, _ = scaled_unknowns(rig, problem, mode, mode + root @ x)
+        unknown, _ = conditional_unknowns(rig, problem, mode, origin + root @ x)
         T_BC, velocity = jax.tree.map(lambda x: x[-1], path(rig, problem, unknown))
         return T_BC, velocity, unknown.inverse_depths
 
