@@ -29,9 +29,7 @@ def page(summary: dict[str, Any]) -> str:
         f"after {hmc['warmup']}; MAP from {summary['starts']} "
         "starts. A row is over the runs of which both posteriors converged (R̂ ≤ 1.05 and 100 "
         "effective draws of pose, velocity and density). All rows of a scenario and step are of "
-        "the same runs. With these chains `matched-loose` does not converge at step 20, and "
-        "`matched-forward-loose` at no step that was tried (5, 10): of longer and of forward "
-        "motion this page says nothing.",
+        "the same runs.",
         READING,
         "![Draws of one run, NEES and σ](posterior.png)",
     ]

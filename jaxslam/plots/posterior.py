@@ -22,8 +22,8 @@ def plot_posterior(summary: dict[str, Any], path: str | Path | None = None) -> F
     """Draw the content of `posterior.json`, one column a scenario, at its last step.
 
     Above: draws of the exact posterior of the camera's position in one run, with the 95 %
-    ellipses of MAP + Laplace and of the filters. Middle: mean pose NEES by step. Below: the
-    filters' σ of position over the exact one.
+    ellipses of MAP + Laplace, of the first filter and of the last. Middle: mean pose NEES by step.
+    Below: the filters' σ of position over the exact one.
     """
     scenarios = _compared(summary["scenarios"])
     if not scenarios:
@@ -32,6 +32,9 @@ def plot_posterior(summary: dict[str, Any], path: str | Path | None = None) -> F
     axes = figure.subplots(
         3, len(scenarios), squeeze=False, gridspec_kw={"height_ratios": (1.5, 1, 0.8)}
     )
+    for row in axes[1:]:
+        for axis in row[1:]:
+            axis.sharey(row[0])
     for column, (name, by_step) in zip(axes.T, scenarios.items(), strict=True):
         steps = max(by_step, key=int)
         _draws(column[0], by_step[steps]["telling"])
@@ -75,8 +78,11 @@ def _draws(axis: Axes, telling: dict[str, Any]) -> None:
     draws = np.array(telling["draws"])
     axis.plot(*draws.T[[0, -1]], ".", color=GREY, ms=2, alpha=0.5, label="draws, exact posterior")
     axis.plot(*np.array(telling["truth"])[[0, -1]], "k*", ms=11, label="true position")
-    style = _style(list(telling["gaussians"]))
-    for name, gaussian in telling["gaussians"].items():
+    gaussians = telling["gaussians"]
+    names = list(gaussians)
+    style = _style(names)
+    for name in dict.fromkeys([*names[:2], names[-1]]):
+        gaussian = gaussians[name]
         mean, P = np.array(gaussian["mean"]), np.array(gaussian["covariance"])
         P = P[np.ix_([0, -1], [0, -1])]
         values, vectors = np.linalg.eigh(P)
@@ -123,7 +129,9 @@ def _nees(axis: Axes, by_step: dict[str, Any]) -> None:
     axis.set_yscale("log")
     axis.set_xticks(x, steps)
     axis.set_xlabel("steps, 1/30 s")
-    ticks = [2, 3, 5, 10, 20, 50, 100, 200, 500, 1000, 10000]
+    ticks = [2, 3, 4, 5, 7, 10, 20, 50, 100, 200, 500, 1000, 10000]
+    bottom, top = axis.get_ylim()
+    axis.set_ylim(min(bottom, 2), max(top, 6))
     axis.yaxis.set_major_locator(FixedLocator(ticks))
     axis.yaxis.set_major_formatter(ScalarFormatter())
     axis.yaxis.set_minor_formatter(NullFormatter())
