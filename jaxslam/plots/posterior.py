@@ -41,6 +41,9 @@ def plot_posterior(summary: dict[str, Any], path: str | Path | None = None) -> F
         column[0].set_title(f"{name}: one run at step {steps}", fontsize=10)
         _nees(column[1], by_step)
         _sigma(column[2], by_step)
+    bottom, top = axes[1, 0].get_ylim()
+    axes[1, 0].set_ylim(min(bottom, 2), max(top, 6))
+    axes[2, 0].set_ylim(0, max(1.15, axes[2, 0].get_ylim()[1]))
     axes[1, 0].set_ylabel("mean pose NEES")
     axes[2, 0].set_ylabel("σ of position / exact σ")
     for row, columns in ((0, 3), (1, 3)):
@@ -130,8 +133,6 @@ def _nees(axis: Axes, by_step: dict[str, Any]) -> None:
     axis.set_xticks(x, steps)
     axis.set_xlabel("steps, 1/30 s")
     ticks = [2, 3, 4, 5, 7, 10, 20, 50, 100, 200, 500, 1000, 10000]
-    bottom, top = axis.get_ylim()
-    axis.set_ylim(min(bottom, 2), max(top, 6))
     axis.yaxis.set_major_locator(FixedLocator(ticks))
     axis.yaxis.set_major_formatter(ScalarFormatter())
     axis.yaxis.set_minor_formatter(NullFormatter())
@@ -151,7 +152,6 @@ def _sigma(axis: Axes, by_step: dict[str, Any]) -> None:
         axis.plot(x + offset, values, ls=dash, **style[name])
     axis.set_xticks(x, steps)
     axis.set_xlabel("steps, 1/30 s")
-    axis.set_ylim(0, max(1.15, axis.get_ylim()[1]))
     axis.grid(alpha=0.25)
 
 
