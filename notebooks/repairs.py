@@ -83,9 +83,9 @@ def table(results):
 # - `+oc` carries the covariance along with that direction (observability constraint).
 # - `scale_gauge` takes the scale out of the products: lengths are in units of $e^\lambda$ metres,
 #   and $\lambda$ is one number of the state that no pixel depends on.
-# - `+mixture17` takes on what is left: seventeen filters, each sure of a part of the velocity, weighted
-#   by their likelihoods. In every frame the one whose product of errors costs most is split, and
-#   the two that are most alike are merged.
+# - `+mixture17` takes on what is left: seventeen filters, each sure of a part of the velocity,
+#   weighted by their likelihoods. In every frame the one whose product of errors costs most is
+#   split, and the two that are most alike are merged.
 
 # %%
 sideways = study(
@@ -144,10 +144,10 @@ assert ratio(ahead["scale_gauge+mixture17"]) > 0.8
 #
 # Straight ahead the window's *maximum* of the posterior is not its mean: an inverse depth that
 # multiplies the unknown direction makes an amplitude of it, and a maximum is drawn towards the
-# larger amplitudes. The sum goes to the mean: five frames in, it is nearly the exact posterior (0.08
-# nats from it, where the plain filter is 0.84; `docs/posterior.md`), at some twenty times the cost of
-# the plain filter. Later a few runs in a thousand are lost all the same, and one of them is enough
-# to take a mean NEES out of its band; and where accelerations are very large, it is a little
-# over-confident. Where the prior on depth is wrong, as on `circle`, no filter that believes it is
-# consistent; `+common90` believes it less. Measured tables are in `docs/consistency.md`, and where
-# each filter holds at all is the map of `docs/phase-diagram.md`.
+# larger amplitudes. The sum goes to the mean: five frames in, it is nearly the exact posterior
+# (0.08 nats from it, where the plain filter is 0.84; `docs/posterior.md`), at some twenty times
+# the cost of the plain filter. Later a few runs in a thousand are lost all the same, and one of
+# them is enough to take a mean NEES out of its band; and where accelerations are very large, it
+# is a little over-confident. Where the prior on depth is wrong, as on `circle`, no filter that
+# believes it is consistent; `+common90` believes it less. Measured tables are in
+# `docs/consistency.md`, and where each filter holds at all is the map of `docs/phase-diagram.md`.
