@@ -19,9 +19,9 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
+from jaxslam.posterior.laplace import covariance_root
 from jaxslam.posterior.problem import (
     Problem,
     Unknowns,
@@ -92,9 +92,7 @@ def whitening_root(rig: Rig, problem: Problem, mode: Float[Array, " n"]) -> Floa
         x, _ = conditional_unknowns(rig, problem, mode, w)
         return jnp.concatenate([_prior_residuals(problem, w, x), pixel_residuals(rig, problem, x)])
 
-    J = jax.jacfwd(residuals)(centre(problem, mode))
-    lower = jnp.linalg.cholesky(J.T @ J)
-    return solve_triangular(lower, jnp.eye(mode.size, dtype=mode.dtype), lower=True).T
+    return covariance_root(jax.jacfwd(residuals)(centre(problem, mode)))
 
 
 def _prior_residuals(problem: Problem, w: Float[Array, " n"], x: Unknowns) -> Float[Array, " n"]:

@@ -73,9 +73,13 @@ def laplace(
 ) -> Laplace:
     """The Gaussian at a mode."""
     J = jax.jacfwd(lambda y: residuals(rig, problem, y))(mode)
+    return Laplace(mode, covariance_root(J), log_density(rig, problem, mode), converged)
+
+
+def covariance_root(J: Float[Array, "m n"]) -> Float[Array, "n n"]:
+    """R with `R Rᵀ = (JᵀJ)⁻¹`, J of whitened residuals."""
     lower = jnp.linalg.cholesky(J.T @ J)
-    root = solve_triangular(lower, jnp.eye(mode.size, dtype=mode.dtype), lower=True).T
-    return Laplace(mode, root, log_density(rig, problem, mode), converged)
+    return solve_triangular(lower, jnp.eye(len(lower), dtype=J.dtype), lower=True).T
 
 
 def last_pose(rig: Rig, problem: Problem, y: Float[Array, " n"]) -> Pose:
