@@ -2,8 +2,8 @@
 
     python benchmarks/sequences.py ../shared/data/slider_depth ../shared/data/kitti06_first51
 
-A sequence is what `jaxslam track` takes; without one, the synthetic video is tracked. There is no
-truth of the pose's error in a frame here, so that NIS is what says whether a filter believes its
+A sequence is what `jaxslam track` takes; without one, the synthetic video is tracked, of which the
+truth is known, and so the NEES of the pose. Elsewhere only NIS says whether a filter believes its
 measurements rightly: its mean per degree of freedom is 1 if pixels and motion are as assumed.
 Results are added to `sequences.json`; `docs/sequences.md` is written from all of them.
 """
@@ -20,6 +20,9 @@ from typing import Annotated, Any
 import tyro
 
 from jaxslam.files import write_atomically
+
+NEES_FRAMES = (10, 45, 149)
+"""Frames whose pose is compared with the truth, where that is known."""
 
 Results = dict[str, dict[str, dict[str, Any]]]
 """`results[sequence][filter/landmarks]`."""
@@ -44,14 +47,15 @@ class Options:
     """The page."""
 
 
-def measure(source, filter_name: str, landmarks: str) -> dict[str, Any]:
-    """One filter on one sequence."""
+def measure(source, filter_name: str, landmarks: str, *, metric: bool) -> dict[str, Any]:
+    """One filter on one sequence; `metric` where its reference is in the unit of the map."""
     from jaxslam.vision.settings import TrackerSettings
     from jaxslam.vision.track import track
 
     settings = TrackerSettings(filter=filter_name, landmarks=landmarks)
     with tempfile.TemporaryDirectory() as folder:
         summary = track(source, folder, settings)
+        nees = _nees(source, Path(folder)) if metric else None
     nis, ate = summary["nis"], summary.get("ate")
     return {
         "frames": summary["frames"],
@@ -59,10 +63,22 @@ def measure(source, filter_name: str, landmarks: str) -> dict[str, Any]:
         "restarts": summary["restarts"],
         "matches_per_frame": round(summary["matches_per_frame"], 2),
         "nis_per_dof": round(nis["mean"] / nis["dof"], 4) if nis["dof"] else None,
+        "nees": nees,
         "error": ate and round(ate["rmse"], 5),
         "path": ate and round(ate["path_length"], 3),
         "milliseconds": round(1e3 * summary["seconds"]["per_frame_median"], 1),
     }
+
+
+def _nees(source, folder: Path) -> dict[str, float]:
+    """Of the pose, at some frames; frame 0 is known."""
+    from jaxslam.vision.trajectory import pose_nees, read_covariances, read_tum
+
+    _, T_wc = read_tum(folder / "trajectory.txt")
+    _, covariances = read_covariances(folder / "covariance.txt")
+    frames = [frame for frame in NEES_FRAMES if frame < len(T_wc)]
+    nees = pose_nees(T_wc[frames], covariances[frames], source.reference.T_wc[frames])
+    return {str(frame): float(f"{x:.4g}") for frame, x in zip(frames, nees, strict=True)}
 
 
 def page(results: Results) -> str:
@@ -74,7 +90,9 @@ def page(results: Results) -> str:
         "`jaxslam track`; only the filter changes. *NIS/dof*: mean normalised innovation squared",
         "of the matches by its degrees of freedom, 1 where pixels (σ 0.3) and motion are as",
         "assumed; active search and RANSAC take the large innovations out, which makes it smaller.",
-        "*Error*: RMS of the trajectory after the best similarity, in percent of the path.",
+        "*NEES* of the pose, ideally 6, at frames 10, 45 and 149, where truth and unit are known.",
+        "*Error*: RMS of the trajectory after the best similarity, in percent of the path. The",
+        "time is that of a machine that others used too.",
     ]
     for name, filters in results.items():
         frames = next(iter(filters.values()))["frames"]
@@ -82,15 +100,17 @@ def page(results: Results) -> str:
             "",
             f"## {name}, {frames} frames",
             "",
-            "| filter | tracked | restarts | matches a frame | NIS/dof | error | ms a frame |",
-            "|---|---|---|---|---|---|---|",
+            "| filter | tracked | restarts | matches a frame | NIS/dof | NEES | error "
+            "| ms a frame |",
+            "|---|---|---|---|---|---|---|---|",
         ]
         for key, r in filters.items():
             nis = "–" if r["nis_per_dof"] is None else f"{r['nis_per_dof']:.2f}"
+            nees = ", ".join(f"{x:.0f}" for x in (r.get("nees") or {}).values()) or "–"
             error = "–" if r["error"] is None else f"{r['error'] / r['path']:.1%}"
             lines.append(
                 f"| `{key}` | {r['tracked']} | {r['restarts']} | {r['matches_per_frame']:.1f} "
-                f"| {nis} | {error} | {r['milliseconds']:.0f} |"
+                f"| {nis} | {nees} | {error} | {r['milliseconds']:.0f} |"
             )
     return "\n".join(lines) + "\n"
 
@@ -104,11 +124,12 @@ def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     results: Results = json.loads(options.out.read_text()) if options.out.exists() else {}
     sources = [open_source(path) for path in options.sequences] or [synthetic_source(frames=150)]
+    metric = not options.sequences
     for source in sources:
         done = results.setdefault(source.name, {})
         for name in options.filters:
             for landmarks in options.landmarks:
-                done[f"{name}/{landmarks}"] = measure(source, name, landmarks)
+                done[f"{name}/{landmarks}"] = measure(source, name, landmarks, metric=metric)
                 print(source.name, name, landmarks, done[f"{name}/{landmarks}"], flush=True)
                 with write_atomically(options.out) as path:
                     path.write_text(json.dumps(results, indent=1) + "\n")

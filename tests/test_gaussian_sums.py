@@ -107,6 +107,15 @@ def moments(state):
     return mean, own + np.einsum("k,ki,kj->ij", weights, x - mean, x - mean)
 
 
+def test_a_sum_as_one_gaussian_has_its_moments():
+    state = some_sum()
+    slam = named_filter(case(), "scale_gauge+mixture5")
+    one = slam.predicted_gaussian(state, case().parameters(), case().motion()[2][0])
+    alone = BankState(jax.tree.map(lambda x: x[None], one), jnp.zeros(1))
+    for whole, single in zip(moments(state), moments(alone), strict=True):
+        np.testing.assert_allclose(single, whole, rtol=1e-9, atol=1e-12 * np.abs(whole).max())
+
+
 def cost(state):
     P = np.asarray(state.members.covariance)[:, 3:5, 3:5]
     return np.exp(np.asarray(state.log_weights)) @ np.trace(P, axis1=1, axis2=2)

@@ -25,7 +25,7 @@ class TrackOptions:
     reference: Path | None = None
     """Reference trajectory in TUM format, to report the absolute trajectory error."""
     out: Path = Path("results")
-    """Folder for trajectory.txt, map.ply, map.png, overlay.mp4 and summary.json."""
+    """Folder for trajectory.txt, covariance.txt, map.ply, map.png, overlay.mp4 and summary.json."""
     frames: int | None = None
     """Frames of the synthetic video; 150 by default."""
     seed: int = 0
@@ -74,7 +74,10 @@ class TrackOptions:
         with tqdm(total=len(source), unit="frame", disable=None) as bar:
             summary = track(source, self.out, self._settings(), progress=bar.update)
         print(describe(summary))
-        print(f"wrote trajectory.txt, map.ply, map.png, overlay.mp4, summary.json in {self.out}")
+        print(
+            "wrote trajectory.txt, covariance.txt, map.ply, map.png, overlay.mp4, summary.json "
+            f"in {self.out}"
+        )
 
     def _source(self):
         from jaxslam.vision.sources import open_source

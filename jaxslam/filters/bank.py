@@ -122,14 +122,14 @@ class Bank:
     def pose_error(self, state: BankState, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
         """Of the sum's mean, to first order in the members' distances, with its covariance."""
         errors, covariances = jax.vmap(self.base.pose_error, in_axes=(0, None))(state.members, T_BC)
-        return _moments(state.log_weights, errors, covariances)
+        return moments(state.log_weights, errors, covariances)
 
     def camera_pose(self, state: BankState) -> tuple[Pose, Float[Array, "t t"]]:
         """The sum's mean and covariance, in the tangent at its likeliest member."""
         poses, covariances = jax.vmap(self.base.camera_pose)(state.members)
         likeliest = jax.tree.map(lambda x: x[jnp.argmax(state.log_weights)], poses)
         away = jax.vmap(difference, in_axes=(0, None))(poses, likeliest)
-        mean, covariance = _moments(state.log_weights, away, covariances)
+        mean, covariance = moments(state.log_weights, away, covariances)
         return retract(likeliest, mean), covariance
 
     def landmarks_in_camera(self, state: BankState, parameters: Parameters, slots: Array):
@@ -147,8 +147,8 @@ class Bank:
         values, covariances = jax.vmap(function, in_axes=(0, None, None))(
             state.members, parameters, slots
         )
-        moments = jax.vmap(_moments, in_axes=(None, 1, 1))
-        return moments(state.log_weights, values, covariances)
+        of_each = jax.vmap(moments, in_axes=(None, 1, 1))
+        return of_each(state.log_weights, values, covariances)
 
     def _directions(self, velocity, D) -> Float[Array, "v m"]:
         """Orthonormal directions of e: the one that changes the speed most, or those that turn
@@ -188,7 +188,7 @@ def with_directions(base: Filter, count: int | None) -> Bank:
     return Bank(base, 5 if count is None else count, "direction")
 
 
-def _moments(log_weights, means, covariances):
+def moments(log_weights, means, covariances):
     """Mean and covariance of a sum of Gaussians; one without weight may be anything."""
     weights = jnp.exp(log_weights)
     used = weights > 0
@@ -203,7 +203,7 @@ def _moments(log_weights, means, covariances):
 def _mixed(innovations: Innovation, log_weights) -> Innovation:
     """The sum's innovation: its first two moments."""
     m, p = innovations.residual.shape[1:]
-    residual, covariance = _moments(
+    residual, covariance = moments(
         log_weights, innovations.residual.reshape(-1, m * p), innovations.covariance
     )
     weights = jnp.exp(log_weights)

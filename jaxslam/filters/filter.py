@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Protocol
 
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxslam.filters.state import Features, Innovation, State
 from jaxslam.geometry import Pose
 from jaxslam.rig import Rig
 
 if TYPE_CHECKING:
-    from jaxslam.filters.slam import Parameters
+    from jaxslam.filters.slam import Parameters, SlamFilter
 
 
 class Filter(Protocol):
@@ -76,4 +76,53 @@ class Filter(Protocol):
 
     def reported(self, state: Any) -> State:
         """A state with one slot a landmark, of which `active` says what is in the map."""
+        ...
+
+
+class StagedFilter(Filter, Protocol):
+    """A filter whose frame can be taken in stages: a tracker searches where `predict` says.
+
+    `step` is predict, update, compose, initialise and finish. `SlamFilter` and `SplitAndMerge`
+    are such filters.
+    """
+
+    @property
+    def gaussian_filter(self) -> SlamFilter:
+        """The filter whose states are single Gaussians: itself, or that of every member."""
+        ...
+
+    def predict(self, state: Any, parameters: Parameters, control: Array) -> Any:
+        """What is known before the frame's measurements."""
+        ...
+
+    def predicted_gaussian(self, state: Any, parameters: Parameters, control: Array) -> State:
+        """A predicted state as one Gaussian, for the functions of `gaussian_filter`."""
+        ...
+
+    def update(
+        self, state: Any, parameters: Parameters, control: Array, features: Features
+    ) -> tuple[Any, Innovation]:
+        """Correct a predicted state by the features seen."""
+        ...
+
+    def compose(self, state: Any, parameters: Parameters, control: Array) -> Any:
+        """Move into the new camera frame."""
+        ...
+
+    def initialise(self, state: Any, parameters: Parameters, features: Features) -> Any:
+        """Begin new landmarks seen from the current camera."""
+        ...
+
+    def finish(self, state: Any) -> Any:
+        """End the frame."""
+        ...
+
+    def remove(self, state: Any, gone: Bool[Array, " capacity"]) -> Any:
+        """Marginalise landmarks and free their slots."""
+        ...
+
+    def landmarks_in_world(
+        self, state: Any, parameters: Parameters, slots: Array
+    ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
+        """Points in B and their covariances, the camera's uncertainty included."""
         ...

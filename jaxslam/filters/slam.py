@@ -317,6 +317,10 @@ class SlamFilter:
     def geometry(self) -> Geometry:
         return self.model.geometry
 
+    @property
+    def gaussian_filter(self) -> SlamFilter:
+        return self
+
     def start(
         self,
         parameters: Parameters,
@@ -385,12 +389,18 @@ class SlamFilter:
     def predict(self, state: State, parameters: Parameters, control: Array) -> State:
         """Append this step's noise; move already where the motion is composed first."""
         state = self.append_noise(state, parameters)
-        return self._composed_first(state, parameters, control)
+        return self.composed_first(state, parameters, control)
 
-    def _composed_first(self, state: State, parameters: Parameters, control: Array) -> State:
+    def composed_first(self, state: State, parameters: Parameters, control: Array) -> State:
+        """Move already, where the motion is composed before the update."""
         if not self.compose_first:
             return state
         return self.engine.compose(self.model, state, Context(parameters, control))
+
+    def predicted_gaussian(self, state: State, parameters: Parameters, control: Array) -> State:
+        """A predicted state as one Gaussian of this filter: itself."""
+        del parameters, control
+        return state
 
     def append_noise(self, state: State, parameters: Parameters) -> State:
         """Append this step's motion noise and calibration error (P10, P11, P15)."""
@@ -536,18 +546,7 @@ class SlamFilter:
         new: Features,
     ) -> tuple[State, Innovation]:
         """One frame: `seen` are features of landmarks in the map, `new` those to insert."""
-        return self.advance(self.append_noise(state, parameters), parameters, control, seen, new)
-
-    def advance(
-        self,
-        state: State,
-        parameters: Parameters,
-        control: Array,
-        seen: Features,
-        new: Features,
-    ) -> tuple[State, Innovation]:
-        """The rest of a `step`, its noise being appended."""
-        state = self._composed_first(state, parameters, control)
+        state = self.predict(state, parameters, control)
         state, innovation = self.update(state, parameters, control, seen)
         state = self.compose(state, parameters, control)
         return self.finish(self.initialise(state, parameters, new)), innovation

@@ -20,9 +20,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from jaxslam.filters.bank import Bank, BankState
+from jaxslam.filters.bank import Bank, BankState, moments
 from jaxslam.filters.blocks import shifted
 from jaxslam.filters.slam import Context, Parameters, SlamFilter, check_one_gaussian
 from jaxslam.filters.state import Features, Innovation, State
@@ -54,6 +54,10 @@ class SplitAndMerge(Bank):
         """Splits in a frame, at the most."""
         return max(1, self.count // 3)
 
+    @property
+    def gaussian_filter(self) -> SlamFilter:
+        return self.base
+
     def step(
         self,
         state: BankState,
@@ -63,12 +67,53 @@ class SplitAndMerge(Bank):
         new: Features,
     ) -> tuple[BankState, Innovation]:
         """Every member's step, the sum divided anew once the frame's noise is appended."""
-        append = jax.vmap(self.base.append_noise, in_axes=(0, None))
-        state = BankState(append(state.members, parameters), state.log_weights)
-        state = self._divided(state, parameters, control, seen)
-        advance = jax.vmap(self.base.advance, in_axes=(0, None, None, None, None))
-        members, innovations = advance(state.members, parameters, control, seen, new)
+        state = self.predict(state, parameters, control)
+        state, innovation = self.update(state, parameters, control, seen)
+        state = self.compose(state, parameters, control)
+        return self.finish(self.initialise(state, parameters, new)), innovation
+
+    def predict(self, state: BankState, parameters: Parameters, control: Array) -> BankState:
+        """Append this step's noise; `update` divides the sum and composes, where that is first."""
+        del control
+        return self._each(self.base.append_noise, state, parameters)
+
+    def predicted_gaussian(self, state: BankState, parameters: Parameters, control: Array) -> State:
+        """A predicted state as one Gaussian of `base`, for its functions."""
+        one = _collapsed(state.members, state.log_weights)
+        return self.base.composed_first(one, parameters, control)
+
+    def update(
+        self, state: BankState, parameters: Parameters, control: Array, features: Features
+    ) -> tuple[BankState, Innovation]:
+        """Divide the sum anew, correct every member and weigh it."""
+        state = self._divided(state, parameters, control, features)
+
+        def updated(member):
+            member = self.base.composed_first(member, parameters, control)
+            return self.base.update(member, parameters, control, features)
+
+        members, innovations = jax.vmap(updated)(state.members)
         return self._weighed(members, state.log_weights, innovations)
+
+    def compose(self, state: BankState, parameters: Parameters, control: Array) -> BankState:
+        """Every member's; so are the following."""
+        return self._each(self.base.compose, state, parameters, control)
+
+    def initialise(self, state: BankState, parameters: Parameters, features: Features) -> BankState:
+        return self._each(self.base.initialise, state, parameters, features)
+
+    def finish(self, state: BankState) -> BankState:
+        return self._each(self.base.finish, state)
+
+    def remove(self, state: BankState, gone: Bool[Array, " capacity"]) -> BankState:
+        return self._each(self.base.remove, state, gone)
+
+    def landmarks_in_world(self, state: BankState, parameters: Parameters, slots: Array):
+        return self._landmarks(self.base.landmarks_in_world, state, parameters, slots)
+
+    def _each(self, function, state: BankState, *data: Any) -> BankState:
+        members = jax.vmap(lambda member: function(member, *data))(state.members)
+        return BankState(members, state.log_weights)
 
     def _divided(
         self, state: BankState, parameters: Parameters, control: Array, seen: Features
@@ -137,21 +182,19 @@ def _split_and_merged(pixels, state: BankState) -> BankState:
     halves, gain = _halves(parent, by_core[split])
 
     tiny, index = jnp.finfo(weights.dtype).tiny, jnp.arange(weights.size)
-    both = weights[:, None] * weights / jnp.maximum(weights[:, None] + weights, tiny)
+    shared = weights[:, None] * weights / jnp.maximum(weights[:, None] + weights, tiny)
     apart = jnp.sum((values[:, None] - values) ** 2, axis=-1)
-    loss = jnp.where(both > 0, both * apart, 0.0)
+    loss = jnp.where(shared > 0, shared * apart, 0.0)
     pair = (index[:, None] < index) & (index[:, None] != split) & (index != split)
     i, j = jnp.unravel_index(jnp.argmin(jnp.where(pair, loss, jnp.inf)), loss.shape)
-    heavy, light = jnp.where(weights[i] >= weights[j], jnp.stack([i, j]), jnp.stack([j, i]))
-    merged, log_weight = _merged(
-        _of(members, heavy), _of(members, light), log_weights[heavy], log_weights[light]
-    )
+    both = jnp.stack([i, j])
+    merged = _collapsed(_of(members, both), log_weights[both])
 
     gained = weights[split] * gain > loss[i, j]
     slots = jnp.stack([i, j, split])
     new = jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), merged, halves)
     half = log_weights[split] - jnp.log(2.0)
-    new = BankState(new, jnp.stack([log_weight, half, half]))
+    new = BankState(new, jnp.stack([jnp.logaddexp(*log_weights[both]), half, half]))
 
     def put(old, new):
         kept = gained.reshape((1,) * new.ndim)
@@ -184,15 +227,20 @@ def _halves(parent: State, by_core: Float[Array, "n c"]) -> tuple[State, Array]:
     return jax.vmap(half)(jnp.array([-1.0, 1.0], away.dtype)), SPLIT**2 * variance
 
 
-def _merged(heavy: State, light: State, log_heavy, log_light) -> tuple[State, Array]:
-    """The Gaussian with the mean and the covariance of both, and the logarithm of its weight."""
-    log_weight = jnp.logaddexp(log_heavy, log_light)
-    share = jnp.where(jnp.isfinite(log_light), jnp.exp(log_light - log_weight), 0.0)
-    landmarks = (light.landmarks - heavy.landmarks).ravel()
-    away = jnp.concatenate([difference(light.core, heavy.core), landmarks])
-    # A member without weight may be anything.
-    away = jnp.where(share > 0, away, 0.0)
-    other = jnp.where(share > 0, light.covariance, 0.0)
-    spread = share * (1 - share) * jnp.outer(away, away)
-    covariance = (1 - share) * heavy.covariance + share * other + spread
-    return replace(shifted(heavy, share * away), covariance=covariance), log_weight
+def _collapsed(members: State, log_weights: Float[Array, " k"]) -> State:
+    """The Gaussian with the mean and the covariance of a sum, of any total weight.
+
+    The mean is to first order in the members' distances from the likeliest.
+    """
+    likeliest = jnp.argmax(log_weights)
+    centre = _of(members, likeliest)
+    total = jax.nn.logsumexp(log_weights)
+    alone = jnp.where(jnp.arange(log_weights.size) == likeliest, 0.0, -jnp.inf)
+    log_weights = jnp.where(jnp.isfinite(total), log_weights - total, alone)
+
+    def away(member):
+        landmarks = (member.landmarks - centre.landmarks).ravel()
+        return jnp.concatenate([difference(member.core, centre.core), landmarks])
+
+    mean, covariance = moments(log_weights, jax.vmap(away)(members), members.covariance)
+    return replace(shifted(centre, mean), covariance=covariance)

@@ -1,4 +1,4 @@
-"""Track a whole video and write its files: trajectory, map, overlay, summary."""
+"""Track a whole video and write its files: trajectory, covariances, map, overlay, summary."""
 
 from __future__ import annotations
 
@@ -19,7 +19,11 @@ from jaxslam.vision.pointcloud import write_ply
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.sources import Frame, Source
 from jaxslam.vision.tracker import Tracked, Tracker
-from jaxslam.vision.trajectory import absolute_trajectory_error, write_tum
+from jaxslam.vision.trajectory import (
+    absolute_trajectory_error,
+    write_covariances,
+    write_tum,
+)
 
 SCHEMA = 1
 _WARM_UP = 3
@@ -35,8 +39,8 @@ def track(
     *,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> dict[str, Any]:
-    """Track `source`, write `trajectory.txt`, `map.ply`, `map.png`, `overlay.mp4` and
-    `summary.json` into the folder `out`, and return the summary.
+    """Track `source`, write `trajectory.txt`, `covariance.txt`, `map.ply`, `map.png`,
+    `overlay.mp4` and `summary.json` into the folder `out`, and return the summary.
 
     An interruption (KeyboardInterrupt) or an unreadable frame (ValueError) leaves all of them for
     the frames so far, and is raised again.
@@ -121,6 +125,8 @@ def _write(
     times = np.array([result.time for result in history])
     T_wc = np.stack([result.T_wc for result in history])
     write_tum(out / "trajectory.txt", times, T_wc)
+    covariances = np.stack([result.covariance for result in history])
+    write_covariances(out / "covariance.txt", times, covariances)
     numbers, points, covariances = _mapped(tracker, T_wc)
     write_ply(out / "map.ply", points, covariances, numbers)
     plot_map(T_wc, points, covariances, path=out / "map.png", unit="map units")

@@ -10,7 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.filters import Features, Parameters, SlamFilter, State, make_filter
+from jaxslam.filters import (
+    Features,
+    Parameters,
+    SlamFilter,
+    SplitAndMerge,
+    State,
+    make_filter,
+)
+from jaxslam.filters.filter import StagedFilter
 from jaxslam.filters.initialisation import UNDELAYED
 from jaxslam.filters.ransac import inliers
 from jaxslam.geometry import SPATIAL
@@ -95,12 +103,13 @@ class Tracker:
     def __post_init__(self) -> None:
         s = self.settings
         made = make_filter(Rig(SPATIAL), s.filter, LANDMARKS[s.landmarks], s.calibration)
-        if not isinstance(made, SlamFilter) or made.initialisation is not UNDELAYED:
+        staged = isinstance(made, SlamFilter | SplitAndMerge)
+        if not staged or made.gaussian_filter.initialisation is not UNDELAYED:
             raise ValueError(
-                f"filter {s.filter} cannot track: features are sought where one Gaussian predicts "
+                f"filter {s.filter} cannot track: features are sought where a Gaussian predicts "
                 "them, before it is given the frame, from the frame in which they are first seen"
             )
-        self._filter = made
+        self._filter: StagedFilter = made
         self._time: float | None = None
         self._T_wc = self._origin = np.eye(4)
         self._covariance = np.zeros((6, 6))
@@ -138,13 +147,13 @@ class Tracker:
         dt = frame.time - (-np.inf if self._time is None else self._time)
         if not dt > 0:
             raise ValueError(f"frame {frame.index}: its time is not later than the one before")
-        state, prediction = self._predict(self._state, self._parameters, dt)
+        predicted, prediction = self._predict(self._state, self._parameters, dt)
         prediction = jax.device_get(prediction)
         prediction = prediction._replace(T_wc=self._origin @ prediction.T_wc)
         slots = self._visible(prediction)
         found = self._search(frame, prediction, slots)
         matched, features = self._features(slots, found)
-        state, result = self._correct(state, self._parameters, dt, features)
+        state, result = self._correct(*predicted, self._parameters, dt, features)
         used, nis, nis_dof, healthy = jax.device_get(result)
         if not healthy:
             return self._restart(frame)
@@ -178,7 +187,7 @@ class Tracker:
         self._origin, self._state = self._T_wc, self._empty_state()
         return replace(self._first(frame), lost=True)
 
-    def _empty_state(self) -> State:
+    def _empty_state(self) -> Any:
         s = self.settings
         sigma = [s.velocity_sigma] * 3 + [s.angular_velocity_sigma] * 3
         return self._filter.start(self._parameters, s.capacity, jnp.zeros(6), jnp.array(sigma))
@@ -331,33 +340,44 @@ def _padded(slots: np.ndarray, pixels: np.ndarray, size: int) -> Features:
 
 
 def _predict(
-    slam_filter: SlamFilter, state: State, parameters: Parameters, dt
-) -> tuple[State, _Prediction]:
+    slam_filter: StagedFilter, state: Any, parameters: Parameters, dt
+) -> tuple[tuple[Any, State], _Prediction]:
+    """The predicted state, as it is and as one Gaussian, and what that expects to see."""
+    one = slam_filter.gaussian_filter
     dt = jnp.asarray(dt, parameters.measurement_sigma.dtype)
     state = slam_filter.predict(state, parameters, dt)
-    slots = jnp.arange(state.active.size)
-    pixels, covariances, in_front = slam_filter.predict_features(state, parameters, dt, slots)
-    pose, points, omegas = slam_filter.predicted_camera(state, parameters, dt, slots)
-    usable = state.active & in_front & jnp.isfinite(covariances).all(axis=(1, 2))
-    return state, _Prediction(pixels, covariances, usable, pose.as_matrix(), points, omegas)
+    gaussian = slam_filter.predicted_gaussian(state, parameters, dt)
+    slots = jnp.arange(gaussian.active.size)
+    pixels, covariances, in_front = one.predict_features(gaussian, parameters, dt, slots)
+    pose, points, omegas = one.predicted_camera(gaussian, parameters, dt, slots)
+    usable = gaussian.active & in_front & jnp.isfinite(covariances).all(axis=(1, 2))
+    prediction = _Prediction(pixels, covariances, usable, pose.as_matrix(), points, omegas)
+    return (state, gaussian), prediction
 
 
 def _correct(
-    slam_filter: SlamFilter, state: State, parameters: Parameters, dt, features: Features
-) -> tuple[State, tuple]:
+    slam_filter: StagedFilter,
+    state: Any,
+    gaussian: State,
+    parameters: Parameters,
+    dt,
+    features: Features,
+) -> tuple[Any, tuple]:
     dt = jnp.asarray(dt, parameters.measurement_sigma.dtype)
-    agreed = inliers(slam_filter, state, parameters, dt, features)
+    agreed = inliers(slam_filter.gaussian_filter, gaussian, parameters, dt, features)
     state, innovation = slam_filter.update(state, parameters, dt, replace(features, valid=agreed))
     state = slam_filter.compose(state, parameters, dt)
-    healthy = jnp.isfinite(state.covariance).all() & (jnp.diagonal(state.covariance) >= 0).all()
+    covariance = slam_filter.reported(state).covariance
+    healthy = jnp.isfinite(covariance).all() & (jnp.diagonal(covariance) >= 0).all()
     return state, (innovation.used, innovation.nis, innovation.nis_dof, healthy)
 
 
-def _renew_map(slam_filter: SlamFilter, state: State, parameters: Parameters, new: Features):
+def _renew_map(slam_filter: StagedFilter, state: Any, parameters: Parameters, new: Features):
     state = slam_filter.finish(slam_filter.initialise(state, parameters, new))
     T_BC, covariance = slam_filter.camera_pose(state)
     return state, (T_BC.as_matrix(), covariance)
 
 
-def _world_points(slam_filter: SlamFilter, state: State, parameters: Parameters):
-    return slam_filter.landmarks_in_world(state, parameters, jnp.arange(state.active.size))
+def _world_points(slam_filter: StagedFilter, state: Any, parameters: Parameters):
+    slots = jnp.arange(slam_filter.reported(state).active.size)
+    return slam_filter.landmarks_in_world(state, parameters, slots)

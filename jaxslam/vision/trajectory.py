@@ -1,4 +1,4 @@
-"""Trajectories as text (TUM format) and their error against a reference, by `evo`."""
+"""Trajectories and their covariances as text, and their error against a reference, by `evo`."""
 
 from pathlib import Path
 from typing import TypedDict
@@ -74,6 +74,52 @@ def write_tum(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> None:
         file.write("# t tx ty tz qx qy qz qw (s; camera in the world frame)\n")
         for time, row in zip(times, table, strict=True):
             file.write(f"{time:.9f} " + " ".join(f"{value:.9f}" for value in row) + "\n")
+
+
+def write_covariances(path: str | Path, times: ArrayLike, covariances: ArrayLike) -> None:
+    """Write times (n,) and covariances (n, 6, 6), whole or not at all.
+
+    A line is the time and the upper triangle, row by row: position in the camera's axes, rotation
+    vector. The true pose is `T_wc E`, and that is the covariance of E's translation and rotation
+    vector.
+    """
+    times = np.asarray(times, dtype=float)
+    covariances = np.asarray(covariances, dtype=float).reshape(-1, 6, 6)
+    if times.shape != (len(covariances),):
+        raise ValueError(
+            f"{len(times)} times for {len(covariances)} covariances; as many of each are accepted"
+        )
+    upper = np.triu_indices(6)
+    names = ("x", "y", "z", "rx", "ry", "rz")
+    columns = " ".join(f"{names[i]}{names[j]}" for i, j in zip(*upper, strict=True))
+    with write_atomically(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write(f"# t {columns} (s; map units and rad, in the camera frame)\n")
+        for time, covariance in zip(times, covariances, strict=True):
+            file.write(f"{time:.9f} " + " ".join(f"{x:.9e}" for x in covariance[upper]) + "\n")
+
+
+def read_covariances(
+    path: str | Path,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 6 6"]]:
+    """What `write_covariances` wrote."""
+    table = np.loadtxt(path, ndmin=2)
+    covariances = np.zeros((len(table), 6, 6))
+    rows, columns = np.triu_indices(6)
+    covariances[:, rows, columns] = covariances[:, columns, rows] = table[:, 1:]
+    return table[:, 0], covariances
+
+
+def pose_nees(
+    T_wc: ArrayLike, covariances: ArrayLike, reference: ArrayLike
+) -> Float[np.ndarray, " n"]:
+    """`eᵀ P⁻¹ e` of poses (n, 4, 4), e of `T_wc⁻¹ T_true` as in `write_covariances`; ideally 6.
+
+    The reference has the world frame and the unit of the map, as a simulation's has.
+    """
+    E = np.linalg.inv(np.asarray(T_wc, float)) @ np.asarray(reference, float)
+    errors = np.hstack([E[:, :3, 3], Rotation.from_matrix(E[:, :3, :3]).as_rotvec()])
+    solved = np.linalg.solve(np.asarray(covariances, float), errors[..., None])[..., 0]
+    return np.sum(errors * solved, axis=1)
 
 
 def absolute_trajectory_error(

@@ -14,7 +14,12 @@ from jaxslam.vision.sources import open_source
 from jaxslam.vision.synthetic import synthetic_source
 from jaxslam.vision.track import track
 from jaxslam.vision.tracker import Tracker
-from jaxslam.vision.trajectory import absolute_trajectory_error, read_tum
+from jaxslam.vision.trajectory import (
+    absolute_trajectory_error,
+    pose_nees,
+    read_covariances,
+    read_tum,
+)
 
 FRAMES = 45
 
@@ -49,12 +54,17 @@ def test_the_files_hold_every_frame_and_agree_with_the_summary(tracked):
     times, T_wc = read_tum(out / "trajectory.txt")
     np.testing.assert_allclose(times, source.times, atol=1e-6)
     np.testing.assert_allclose(T_wc[0], np.eye(4), atol=1e-9)
+    covariance_times, covariances = read_covariances(out / "covariance.txt")
+    np.testing.assert_array_equal(covariance_times, times)
+    np.testing.assert_array_equal(covariances, np.swapaxes(covariances, 1, 2))
+    assert np.linalg.eigvalsh(covariances[1:])[:, 0].min() > 0
+    assert pose_nees(T_wc[1:], covariances[1:], source.reference.T_wc[1:]).min() > 0
     ate = absolute_trajectory_error(times, T_wc, *source.reference)
     assert ate["rmse"] == pytest.approx(summary["ate"]["rmse"], rel=1e-3)
     assert json.loads((out / "summary.json").read_text())["frames"] == FRAMES
     assert (out / "map.ply").read_text().startswith("ply")
     assert {path.name for path in out.iterdir()} == {
-        "trajectory.txt", "map.ply", "map.png", "overlay.mp4", "summary.json",
+        "trajectory.txt", "covariance.txt", "map.ply", "map.png", "overlay.mp4", "summary.json",
     }  # fmt: skip
 
 
@@ -70,7 +80,7 @@ def test_an_interruption_leaves_the_files_of_the_frames_so_far(tmp_path):
         track(synthetic_source(frames=20), tmp_path, TrackerSettings(wanted=10), progress=stop)
     assert len(read_tum(tmp_path / "trajectory.txt")[0]) == 4
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 4
-    assert len(list(tmp_path.iterdir())) == 5
+    assert len(list(tmp_path.iterdir())) == 6
 
 
 def test_a_frame_must_be_later_than_the_one_before():
@@ -80,6 +90,21 @@ def test_a_frame_must_be_later_than_the_one_before():
     tracker.track(frame)
     with pytest.raises(ValueError, match="not later than the one before"):
         tracker.track(frame)
+
+
+def test_a_gaussian_sum_tracks_too():
+    """Its members share one search, and give another estimate than one filter does."""
+    source = synthetic_source(frames=10)
+    settings = TrackerSettings(wanted=12, spare=4)
+    one = Tracker(source.calibration, replace(settings, filter="robocentric"))
+    some = Tracker(source.calibration, replace(settings, filter="robocentric+mixture3"))
+    for frame in source:
+        alone, summed = one.track(frame), some.track(frame)
+    assert not summed.lost
+    assert summed.status.count("matched") >= 10
+    assert len(some.points()[1]) >= 12
+    assert np.linalg.eigvalsh(summed.covariance)[0] > 0
+    assert not np.allclose(summed.T_wc, alone.T_wc, atol=1e-6)
 
 
 @pytest.mark.parametrize("options", [{"filter": "nothing"}, {"landmarks": "nothing"}])

@@ -6,9 +6,12 @@ from scipy.spatial.transform import Rotation
 
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
+    pose_nees,
     poses,
+    read_covariances,
     read_tum,
     write_atomically,
+    write_covariances,
     write_tum,
 )
 
@@ -135,3 +138,25 @@ def test_trajectories_that_cannot_be_compared_are_refused():
     still = np.tile(np.eye(4), (len(times), 1, 1))
     with pytest.raises(ValueError, match="in one place"):
         absolute_trajectory_error(times, still, times, reference)
+
+
+def test_covariances_are_read_as_they_were_written_and_are_the_errors(tmp_path):
+    """Errors drawn from them, in the camera's axes, have a mean NEES of 6."""
+    rng = np.random.default_rng(0)
+    n = 4000
+    roots = rng.normal(0, 0.01, (n, 6, 6))
+    times, T_wc = wave(n)
+    write_covariances(tmp_path / "covariance.txt", times, roots @ np.swapaxes(roots, 1, 2))
+    read_times, P = read_covariances(tmp_path / "covariance.txt")
+    np.testing.assert_allclose(read_times, times, atol=1e-9)
+    np.testing.assert_allclose(P, roots @ np.swapaxes(roots, 1, 2), rtol=1e-8, atol=1e-12)
+    errors = np.einsum("nij,nj->ni", roots, rng.normal(size=(n, 6)))
+    E = poses(errors[:, :3], Rotation.from_rotvec(errors[:, 3:]).as_quat())
+    # The mean of n numbers of χ² with 6 degrees of freedom: σ = √(12/n) = 0.055.
+    assert abs(pose_nees(T_wc, P, T_wc @ E).mean() - 6) < 0.22
+
+
+def test_as_many_covariances_as_times(tmp_path):
+    with pytest.raises(ValueError, match="2 times for 1 covariances"):
+        write_covariances(tmp_path / "covariance.txt", [0, 1], np.eye(6)[None])
+    assert not list(tmp_path.iterdir())
