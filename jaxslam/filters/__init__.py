@@ -7,7 +7,7 @@ from typing import Any
 from jaxslam.filters import information
 from jaxslam.filters.bank import Bank, with_directions, with_scales
 from jaxslam.filters.depth_particles import DepthParticles, with_depth_particles
-from jaxslam.filters.filter import Filter
+from jaxslam.filters.filter import Filter, StagedFilter
 from jaxslam.filters.first_estimates import with_first_estimates
 from jaxslam.filters.fixed_lag import FixedLag, iterated, with_lag
 from jaxslam.filters.frames import KEYFRAME, ROBOCENTRIC, WORLD
@@ -173,6 +173,7 @@ __all__ = [
     "SlamFilter",
     "SlamModel",
     "SplitAndMerge",
+    "StagedFilter",
     "State",
     "information_filter",
     "invariant_filter",

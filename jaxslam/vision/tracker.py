@@ -15,10 +15,10 @@ from jaxslam.filters import (
     Parameters,
     SlamFilter,
     SplitAndMerge,
+    StagedFilter,
     State,
     make_filter,
 )
-from jaxslam.filters.filter import StagedFilter
 from jaxslam.filters.initialisation import UNDELAYED
 from jaxslam.filters.ransac import inliers
 from jaxslam.geometry import SPATIAL
