@@ -19,7 +19,8 @@ class TrackerSettings:
     a single camera does not see scale, so the map's unit is whatever that prior makes it."""
 
     filter: str = "world"
-    """Filter: a name of jaxslam.FILTERS, which may be modified, as in `robocentric+oc`."""
+    """Filter: a name of jaxslam.FILTERS, which may be modified, as in `robocentric+oc`.
+    `recommended` is the default, the one of docs/sequences.md with the best trajectories."""
     landmarks: str = "inverse_scaling"
     """Landmark parametrization: a name of jaxslam.LANDMARKS."""
     calibration: str = "known"
@@ -58,6 +59,8 @@ class TrackerSettings:
     """Frames out of view after which a landmark is removed."""
 
     def __post_init__(self) -> None:
+        if self.filter == "recommended":
+            object.__setattr__(self, "filter", type(self).filter)
         chosen("filter", [self.filter.partition("+")[0]], FILTERS)
         chosen("landmarks", [self.landmarks], LANDMARKS)
 

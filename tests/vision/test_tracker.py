@@ -107,6 +107,10 @@ def test_a_gaussian_sum_tracks_too():
     assert not np.allclose(summed.T_wc, alone.T_wc, atol=1e-6)
 
 
+def test_the_default_is_the_recommended_filter():
+    assert TrackerSettings(filter="recommended") == TrackerSettings()
+
+
 @pytest.mark.parametrize("options", [{"filter": "nothing"}, {"landmarks": "nothing"}])
 def test_unknown_names_are_refused(options):
     with pytest.raises(ValueError, match=r"unknown .* 'nothing'; known:"):
