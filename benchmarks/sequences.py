@@ -92,8 +92,8 @@ def page(results: Results) -> str:
         "assumed; active search and RANSAC take the large innovations out, which makes it smaller.",
         "*NEES* of the pose, ideally 6, at frames 10, 45 and 149, where truth and unit are known.",
         "*Error*: RMS of the trajectory after the best similarity, in percent of the path. The",
-        "time is that of a machine that others used too. The settings are those for a hand: a car, as",
-        "in kitti06, is lost by every filter.",
+        "time is that of a machine that others used too. The settings are those for a hand: with",
+        "them no filter follows the car of kitti06 through all frames.",
     ]
     for name, filters in results.items():
         frames = next(iter(filters.values()))["frames"]
