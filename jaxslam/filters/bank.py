@@ -92,8 +92,7 @@ class Bank:
         return BankState(jax.vmap(member)(jnp.asarray(grid, dtype)), jnp.asarray(weights, dtype))
 
     def first(self, state: BankState, parameters: Parameters, new: Features) -> BankState:
-        first = jax.vmap(self.base.first, in_axes=(0, None, None))
-        return BankState(first(state.members, parameters, new), state.log_weights)
+        return self._each(self.base.first, state, parameters, new)
 
     def step(
         self,
@@ -142,6 +141,10 @@ class Bank:
         """The likeliest member's."""
         likeliest = jnp.argmax(state.log_weights)
         return self.base.reported(jax.tree.map(lambda x: x[likeliest], state.members))
+
+    def _each(self, function, state: BankState, *data: Any) -> BankState:
+        members = jax.vmap(lambda member: function(member, *data))(state.members)
+        return BankState(members, state.log_weights)
 
     def _landmarks(self, function, state, parameters, slots):
         values, covariances = jax.vmap(function, in_axes=(0, None, None))(

@@ -82,8 +82,7 @@ class Filter(Protocol):
 class StagedFilter(Filter, Protocol):
     """A filter whose frame can be taken in stages: a tracker searches where `predict` says.
 
-    `step` is predict, update, compose, initialise and finish. `SlamFilter` and `SplitAndMerge`
-    are such filters.
+    Its `step` is `step_in_stages`. `SlamFilter` and `SplitAndMerge` are such filters.
     """
 
     @property
@@ -126,3 +125,18 @@ class StagedFilter(Filter, Protocol):
     ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
         """Points in B and their covariances, the camera's uncertainty included."""
         ...
+
+
+def step_in_stages(
+    slam_filter: StagedFilter,
+    state: Any,
+    parameters: Parameters,
+    control: Array,
+    seen: Features,
+    new: Features,
+) -> tuple[Any, Innovation]:
+    """One frame of a filter by its stages: predict, update, compose, initialise and finish."""
+    state = slam_filter.predict(state, parameters, control)
+    state, innovation = slam_filter.update(state, parameters, control, seen)
+    state = slam_filter.compose(state, parameters, control)
+    return slam_filter.finish(slam_filter.initialise(state, parameters, new)), innovation

@@ -18,6 +18,7 @@ from jaxslam.camera import Camera
 from jaxslam.filters import ekf
 from jaxslam.filters.blocks import Change
 from jaxslam.filters.engine import Engine
+from jaxslam.filters.filter import step_in_stages
 from jaxslam.filters.frames import Frame, KeyframePose, keyframe_due
 from jaxslam.filters.initialisation import UNDELAYED, Initialisation
 from jaxslam.filters.state import Features, Innovation, State
@@ -546,10 +547,7 @@ class SlamFilter:
         new: Features,
     ) -> tuple[State, Innovation]:
         """One frame: `seen` are features of landmarks in the map, `new` those to insert."""
-        state = self.predict(state, parameters, control)
-        state, innovation = self.update(state, parameters, control, seen)
-        state = self.compose(state, parameters, control)
-        return self.finish(self.initialise(state, parameters, new)), innovation
+        return step_in_stages(self, state, parameters, control, seen, new)
 
     def pose_error(self, state: State, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
         """`T_true ⊟ T_est` of the frame's pose, and the covariance of its tangent."""

@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.filters.bank import Bank, BankState, moments
 from jaxslam.filters.blocks import shifted
+from jaxslam.filters.filter import step_in_stages
 from jaxslam.filters.slam import Context, Parameters, SlamFilter, check_one_gaussian
 from jaxslam.filters.state import Features, Innovation, State
 from jaxslam.geometry import difference, jacobian
@@ -67,10 +68,7 @@ class SplitAndMerge(Bank):
         new: Features,
     ) -> tuple[BankState, Innovation]:
         """Every member's step, the sum divided anew once the frame's noise is appended."""
-        state = self.predict(state, parameters, control)
-        state, innovation = self.update(state, parameters, control, seen)
-        state = self.compose(state, parameters, control)
-        return self.finish(self.initialise(state, parameters, new)), innovation
+        return step_in_stages(self, state, parameters, control, seen, new)
 
     def predict(self, state: BankState, parameters: Parameters, control: Array) -> BankState:
         """Append this step's noise; `update` divides the sum and composes, where that is first."""
@@ -110,10 +108,6 @@ class SplitAndMerge(Bank):
 
     def landmarks_in_world(self, state: BankState, parameters: Parameters, slots: Array):
         return self._landmarks(self.base.landmarks_in_world, state, parameters, slots)
-
-    def _each(self, function, state: BankState, *data: Any) -> BankState:
-        members = jax.vmap(lambda member: function(member, *data))(state.members)
-        return BankState(members, state.log_weights)
 
     def _divided(
         self, state: BankState, parameters: Parameters, control: Array, seen: Features
