@@ -62,18 +62,13 @@ def write_tum(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> None:
 
     Quaternions are normalised, w comes last and is not negative.
     """
-    times = np.asarray(times, dtype=float)
     T_wc = np.asarray(T_wc, dtype=float).reshape(-1, 4, 4)
-    if times.shape != (len(T_wc),):
-        raise ValueError(f"{len(times)} times for {len(T_wc)} poses; as many of each are accepted")
-    table = np.empty((len(times), 7))
+    table = np.empty((len(T_wc), 7))
     table[:, :3] = T_wc[:, :3, 3]
-    if len(times):  # Rotation refuses an empty stack
+    if len(T_wc):  # Rotation refuses an empty stack
         table[:, 3:] = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True)
-    with write_atomically(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-        file.write("# t tx ty tz qx qy qz qw (s; camera in the world frame)\n")
-        for time, row in zip(times, table, strict=True):
-            file.write(f"{time:.9f} " + " ".join(f"{value:.9f}" for value in row) + "\n")
+    header = "tx ty tz qx qy qz qw (s; camera in the world frame)"
+    _write_rows(path, header, times, table, "poses", ".9f")
 
 
 def write_covariances(path: str | Path, times: ArrayLike, covariances: ArrayLike) -> None:
@@ -83,19 +78,27 @@ def write_covariances(path: str | Path, times: ArrayLike, covariances: ArrayLike
     vector. The true pose is `T_wc E`, and that is the covariance of E's translation and rotation
     vector.
     """
-    times = np.asarray(times, dtype=float)
-    covariances = np.asarray(covariances, dtype=float).reshape(-1, 6, 6)
-    if times.shape != (len(covariances),):
-        raise ValueError(
-            f"{len(times)} times for {len(covariances)} covariances; as many of each are accepted"
-        )
-    upper = np.triu_indices(6)
+    rows, columns = np.triu_indices(6)
+    table = np.asarray(covariances, dtype=float).reshape(-1, 6, 6)[:, rows, columns]
     names = ("x", "y", "z", "rx", "ry", "rz")
-    columns = " ".join(f"{names[i]}{names[j]}" for i, j in zip(*upper, strict=True))
+    pairs = " ".join(f"{names[i]}{names[j]}" for i, j in zip(rows, columns, strict=True))
+    header = f"{pairs} (s; map units and rad, in the camera frame)"
+    _write_rows(path, header, times, table, "covariances", ".9e")
+
+
+def _write_rows(
+    path: str | Path, header: str, times: ArrayLike, table: np.ndarray, what: str, number: str
+) -> None:
+    """A line of each time and row, under a comment that names the columns after the time."""
+    times = np.asarray(times, dtype=float)
+    if times.shape != (len(table),):
+        raise ValueError(
+            f"{len(times)} times for {len(table)} {what}; as many of each are accepted"
+        )
     with write_atomically(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-        file.write(f"# t {columns} (s; map units and rad, in the camera frame)\n")
-        for time, covariance in zip(times, covariances, strict=True):
-            file.write(f"{time:.9f} " + " ".join(f"{x:.9e}" for x in covariance[upper]) + "\n")
+        file.write(f"# t {header}\n")
+        for time, row in zip(times, table, strict=True):
+            file.write(f"{time:.9f} " + " ".join(format(value, number) for value in row) + "\n")
 
 
 def read_covariances(
