@@ -122,7 +122,7 @@ def page(results: Results) -> str:
         "*others*: mean NEES without them; *worst*: greatest mean NEES of any step; RMSE and σ of",
         "the position. All but *inside* and *worst* are at the last step. Seeds 0–9 drew initial",
         "velocities that are large by chance (their normalised square has a mean of 3.07), seeds",
-        "10–19 not: a mean of 3.07 is what a perfect filter has on the first ten.",
+        "10–19 not: on the first ten even a perfect filter's NEES begins at 3.07.",
     ]
     for name, filters in results.items():
         scenario = jaxslam.scenario(name)
