@@ -26,6 +26,7 @@ from jaxslam.consistency.montecarlo import Prior
 from jaxslam.consistency.statistics import lost_threshold, normalised_squared
 from jaxslam.files import write_atomically
 from jaxslam.filters import SlamFilter
+from jaxslam.linalg import cholesky
 from jaxslam.simulation import Run, Sightings, features, sightings
 
 NEAR = {"inverse_depth": (1.1, 0.45), "least_inverse_depth": 0.225, "velocity": (0.4, 0.0, 0.0)}
@@ -98,7 +99,7 @@ def filter_run(slam_filter: SlamFilter, most: Sightings, prior: Prior, run: Run)
             "nees": normalised_squared(*slam_filter.pose_error(state, T_BC)),
             "squared_error": missed @ missed,
             "variance": jnp.trace(covariance[: missed.size, : missed.size]),
-            "information": -jnp.linalg.slogdet(covariance)[1],
+            "information": -cholesky(covariance).log_det(),
             "settled": settled(state),
         }
 

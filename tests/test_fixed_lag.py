@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from jaxslam.filters import FixedLag, make_filter, sensitivity
-from jaxslam.filters.fixed_lag import Frames, _root
-from jaxslam.geometry import difference, retract, scaled
+from jaxslam.filters.fixed_lag import Frames
+from jaxslam.geometry import difference, scaled
 from jaxslam.landmarks import INVERSE_SCALING, LANDMARKS
 from jaxslam.rig import Rig
 from jaxslam.sensors import POSITION
@@ -117,7 +117,7 @@ def test_the_estimate_of_a_window_that_holds_everything_is_the_maximum_of_the_po
     slam = replace(named_filter(of, "robocentric+lag6"), iterations=8)
     state, _ = pose_run(of, slam)
     window = slam._normal_equations(of.parameters(), state.before, state.variables, state.frames)
-    assert np.abs(window.gradient).max() < 1e-6 * np.abs(window.root).max()
+    assert np.abs(window.gradient).max() < 1e-6 * np.abs(window.information.root).max()
     converged = replace(slam, iterations=1, converge=True)
     other, _ = pose_run(of, converged)
     np.testing.assert_allclose(other.variables, state.variables, atol=1e-3)
@@ -176,42 +176,6 @@ def test_a_removed_landmark_leaves_nothing_behind():
     after, _ = step(left, of.parameters(), of.motion()[2][-1], seen, frame[1])
     assert np.isfinite(np.asarray(after.estimate.covariance)).all()
     assert not np.any(after.estimate.covariance[rows])
-
-
-def test_a_root_of_any_rank():
-    rng = np.random.default_rng(0)
-    F = rng.normal(size=(5, 3)) * np.array([1, 10, 1e-3])[None]
-    F[1] = 0
-    root, solve = _root(jnp.asarray(F @ F.T))
-    close(root @ root.T, F @ F.T, 1e-10)
-    assert not np.any(root[1])
-    assert not np.any(root[:, 1])
-    b = F @ rng.normal(size=3)
-    close(root @ solve(jnp.asarray(b)), b, 1e-6)
-
-
-def test_the_gauge_keeps_the_moments_of_speed_and_depth():
-    """Draws of (λ, ṽ, ω̃) at the start have the mean and the variance of v and of ω."""
-    of = case("matched-loose")
-    slam = named_filter(of, "scale_gauge")
-    first, _, _ = of.frames(0)
-    velocity, sigma, _ = of.motion()
-    parameters = of.parameters()
-    state = slam.first(slam.start(parameters, of.capacity, velocity, sigma), parameters, first)
-    P = np.asarray(state.covariance)
-    values, vectors = np.linalg.eigh(P)
-    draws = np.random.default_rng(1).normal(size=(200_000, len(P))) * np.sqrt(np.maximum(values, 0))
-    c = state.core_dim
-    delta = jnp.asarray(draws @ vectors.T)
-    core = jax.vmap(lambda d: retract(state.core, d[:c]))(delta)
-    unit = np.exp(np.asarray(core.log_scale))[:, 0]
-    v = np.asarray(core.velocity) * np.array([1, 1, 0]) * unit[:, None]
-    np.testing.assert_allclose(v.mean(axis=0)[:2], velocity[:2], atol=2e-3)
-    np.testing.assert_allclose(v.std(axis=0)[:2], sigma[:2], rtol=0.02)
-    omega = (np.asarray(state.landmarks)[0, 2] + np.asarray(delta)[:, c + 2]) / unit / 650
-    np.testing.assert_allclose(omega.mean(), parameters.inverse_depth, rtol=0.01)
-    # What is exact are the moments of e^λ ω; those of ω follow to second order.
-    np.testing.assert_allclose(omega.std(), parameters.inverse_depth_sigma, rtol=0.02)
 
 
 def test_the_gauge_is_not_seen_by_a_camera():

@@ -8,6 +8,7 @@ and whatever the number of runs. Memory is bounded by the chunk: each chunk's re
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -32,6 +33,7 @@ from jaxslam.simulation import (
     simulate,
     structure,
 )
+from jaxslam.watchdog import finished, lapack_calls
 
 DTYPES = ("float64", "float32")
 CHUNK = 100
@@ -137,7 +139,8 @@ def _run_filter(name, slam_filter, simulator, capacity, chunks, store, progress)
     compiled_at = time.perf_counter()
     for chunk in chunks:
         batch, _ = simulator(chunk)
-        records, sample = jax.device_get(compiled(prior, batch))
+        where = f"{name}, runs {chunk.start} to {chunk.stop - 1}"
+        records, sample = jax.device_get(finished(compiled(prior, batch), where))
         records = {key: np.asarray(value)[: len(chunk)] for key, value in records.items()}
         store.save(name, chunk, {**records, **{f"sample_{k}": v for k, v in sample.items()}})
         progress(name, len(chunk))
@@ -148,7 +151,14 @@ def _run_filter(name, slam_filter, simulator, capacity, chunks, store, progress)
 def _compiled(slam_filter, capacity, structure, leaves) -> jax.stages.Compiled:
     """`_filter_batch` for data of these shapes, compiled once however often it is asked for."""
     function = jax.jit(partial(_filter_batch, slam_filter, capacity))
-    return function.lower(*jax.tree.unflatten(structure, leaves)).compile()
+    traced = function.trace(*jax.tree.unflatten(structure, leaves))
+    if calls := lapack_calls(traced.jaxpr.jaxpr):
+        warnings.warn(
+            f"{type(slam_filter).__name__} calls LAPACK in a batch ({', '.join(sorted(calls))}), "
+            "which can stand still on few processors: jaxslam.linalg has what does not",
+            stacklevel=2,
+        )
+    return traced.lower().compile()
 
 
 def _filter_batch(

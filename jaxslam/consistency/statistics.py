@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 from scipy.special import gammainc, gammaincinv
+
+from jaxslam.linalg import cholesky
 
 CONFIDENCE = 0.95
 LOST_QUANTILE = 0.9999
@@ -16,7 +16,7 @@ def normalised_squared(
     error: Float[Array, " n"], covariance: Float[Array, "n n"]
 ) -> Float[Array, ""]:
     """`eᵀ P⁻¹ e`: the NEES of an error, the NIS of an innovation; NaN unless P is positive."""
-    whitened = solve_triangular(jnp.linalg.cholesky(covariance), error, lower=True)
+    whitened = cholesky(covariance).whitening @ error
     return whitened @ whitened
 
 

@@ -15,13 +15,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from jaxslam.filters.filter import Filter
 from jaxslam.filters.slam import Parameters, velocity_root
 from jaxslam.filters.state import Features, Innovation, State
 from jaxslam.geometry import Pose, difference, retract
+from jaxslam.linalg import cholesky, eigh
 from jaxslam.rig import Rig
 
 REACH = (2.5, 4.0)
@@ -110,8 +110,7 @@ class Bank:
     def _weighed(
         self, members: Any, log_weights: Array, innovations: Innovation
     ) -> tuple[BankState, Innovation]:
-        roots = jnp.linalg.cholesky(innovations.covariance)
-        log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(roots, axis1=1, axis2=2)), axis=1)
+        log_det = jax.vmap(lambda S: cholesky(S).log_det())(innovations.covariance)
         likelihood = -(innovations.nis + log_det) / 2
         # A member that has diverged has no likelihood.
         likelihood = jnp.where(jnp.isfinite(likelihood), likelihood, -jnp.inf)
@@ -165,8 +164,8 @@ class Bank:
             return along
         by_linear = D.T[:, :n]
         projected = by_linear - along @ (along.T @ by_linear)
-        vectors, _, _ = jnp.linalg.svd(projected, full_matrices=False)
-        return vectors[:, : n - 1]
+        _, vectors = eigh(projected @ projected.T)
+        return vectors[:, :-n:-1]
 
     def _division(self, directions: int) -> tuple[np.ndarray, np.ndarray, float]:
         """Means and log weights of the members of N(0, I), and their σ; the sum's variance is 1."""
@@ -212,5 +211,5 @@ def _mixed(innovations: Innovation, log_weights) -> Innovation:
     weights = jnp.exp(log_weights)
     used = jnp.any(innovations.used, axis=0)
     predicted = jnp.tensordot(weights, innovations.predicted, axes=1)
-    whitened = solve_triangular(jnp.linalg.cholesky(covariance), residual, lower=True)
+    whitened = cholesky(covariance).whitening @ residual
     return Innovation(predicted, residual.reshape(m, p), covariance, used, whitened @ whitened)

@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.filters.state import Features
 from jaxslam.geometry import jacobian, nudge, retract, zero_tangent
+from jaxslam.linalg import cholesky
 
 Landmark = Callable[[Any, Array], Array]
 
@@ -144,7 +145,7 @@ def new_landmarks(
         )(zero_tangent(view), measured, mean)
         return value, J_view, jnp.concatenate([J_measured @ root, J_hidden * sigma], axis=1)
 
-    root = jnp.linalg.cholesky(noise)
+    root = cholesky(noise).root
     new, J_view, own = jax.vmap(one)(features.measured, mean, sigma)
     m, d = new.shape
     identity = jnp.broadcast_to(jnp.eye(d, dtype=new.dtype), (m, d, d))

@@ -12,7 +12,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.filters.blocks import (
@@ -34,6 +33,7 @@ from jaxslam.filters.blocks import (
 )
 from jaxslam.filters.state import Features, Innovation, State
 from jaxslam.geometry import jacobian, retract
+from jaxslam.linalg import cholesky, semidefinite_root
 
 
 def empty(core: Any, landmarks: Float[Array, "capacity d"]) -> State:
@@ -90,11 +90,7 @@ def update(
     R = _noise_matrix(noise, used)
     HP = H @ P
     S = HP @ H.T + R
-    # L⁻¹ of S = L Lᵀ is small, and products with it are several times faster than solving for
-    # the wide HP; Joseph's form keeps P positive whatever rounding does to K.
-    whitening = solve_triangular(
-        jnp.linalg.cholesky(S), jnp.eye(S.shape[0], dtype=S.dtype), lower=True
-    )
+    whitening = cholesky(S).whitening
     K = ((HP.T @ whitening.T) @ whitening).at[considered].set(0.0)
     whitened = whitening @ residual.ravel()
 
@@ -120,7 +116,7 @@ def update_mean(
     H = placed(blocks, features.slots, state.active.size)
     HP = H @ state.covariance
     S = HP @ H.T + _noise_matrix(noise, used)
-    delta = HP.T @ jnp.linalg.solve(S, residual.ravel())
+    delta = HP.T @ cholesky(S).solve(residual.ravel())
     return shifted(state, delta.at[considered].set(0.0))
 
 
@@ -253,19 +249,13 @@ def landmark_samples(
     """
     c, d = state.core_dim, state.landmarks.shape[1]
     index = jnp.concatenate([jnp.arange(c), c + slot * d + jnp.arange(d)])
-    root = covariance_root(state.covariance[index[:, None], index])
+    root = semidefinite_root(state.covariance[index[:, None], index]).root
 
     def one(draw):
         delta = root @ draw
         return function(view(retract(state.core, delta[:c])), state.landmarks[slot] + delta[c:])
 
     return jax.vmap(one)(normal)
-
-
-def covariance_root(covariance: Float[Array, "k k"]) -> Float[Array, "k k"]:
-    """R with R Rᵀ = P, also of a P without full rank: a pixel knows the length of its ray."""
-    values, vectors = jnp.linalg.eigh(covariance)
-    return vectors * jnp.sqrt(jnp.maximum(values, 0.0))
 
 
 def core_covariance(function: Callable[[Any], Any], state: State) -> tuple[Any, Array]:

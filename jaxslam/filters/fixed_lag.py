@@ -11,14 +11,12 @@ With a lag of one frame, iterated, it is the iterated EKF: always on the origina
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.filters import sensitivity
@@ -26,6 +24,8 @@ from jaxslam.filters.sensitivity import Compared, Distribution, Point
 from jaxslam.filters.slam import Parameters, SlamFilter, check_one_gaussian
 from jaxslam.filters.state import Features, Innovation, State
 from jaxslam.geometry import Pose, retract
+from jaxslam.least_squares import levenberg_marquardt
+from jaxslam.linalg import Cholesky, cholesky, semidefinite_root
 from jaxslam.rig import Rig
 
 LAG = 10
@@ -65,13 +65,13 @@ class NormalEquations(NamedTuple):
     newest: Point
     last: Compared
     """What the newest frame compared."""
-    root: Float[Array, "N N"]
-    """Cholesky's of I + AᵀA."""
+    information: Cholesky
+    """I + AᵀA."""
     gradient: Float[Array, " N"]
 
     def step(self) -> Float[Array, " N"]:
         """δ."""
-        return -cho_solve((self.root, True), self.gradient)
+        return -self.information.solve(self.gradient)
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ class FixedLag:
 
     def _begun(self, state: State, frames: Frames) -> LagState:
         n = state.covariance.shape[0]
-        root, _ = _root(state.covariance)
+        root = semidefinite_root(state.covariance).root
         before = Distribution(
             state.core, state.landmarks, state.active, jnp.zeros(n, root.dtype), root
         )
@@ -245,7 +245,7 @@ class FixedLag:
         return NormalEquations(
             point,
             jax.tree.map(lambda x: x[-1], compared),
-            jnp.linalg.cholesky(information),
+            cholesky(information),
             gradient,
         )
 
@@ -258,12 +258,12 @@ class FixedLag:
         oldest = jax.tree.map(lambda x: x[0], state.frames)
         point, compared = self._advance(parameters, sensitivity.begin(before, own), oldest)
         A, S = compared.slope, point.sensitivity
-        U = jnp.linalg.cholesky(A.T @ A + jnp.eye(n + q, dtype=A.dtype))
-        offset = S @ cho_solve((U, True), compared.residual @ A - own)
-        V = solve_triangular(U, S.T, lower=True)
-        root, solve = _root(V.T @ V)
+        information = cholesky(A.T @ A + jnp.eye(n + q, dtype=A.dtype))
+        offset = S @ information.solve(compared.residual @ A - own)
+        V = information.whitening @ S.T
+        root, whitening = semidefinite_root(V.T @ V)
         after = Distribution(point.core, point.landmarks, point.active, offset, root)
-        return after, jnp.concatenate([-solve(offset), y[n + q :], jnp.zeros(q, y.dtype)])
+        return after, jnp.concatenate([-whitening @ offset, y[n + q :], jnp.zeros(q, y.dtype)])
 
     def _maximum(self, parameters, before, variables, frames) -> Array:
         """The maximum of the window's posterior, by Levenberg–Marquardt."""
@@ -276,9 +276,8 @@ class FixedLag:
             )
             return jnp.concatenate([variables, compared.residual.ravel()])
 
-        solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
         solution = optx.least_squares(
-            residuals, solver, variables, max_steps=MOST_STEPS, throw=False
+            residuals, levenberg_marquardt(1e-6), variables, max_steps=MOST_STEPS, throw=False
         )
         return solution.value
 
@@ -305,7 +304,7 @@ def _estimate(window: NormalEquations) -> State:
     """The newest state, to first order in the step that is left."""
     point, S = window.newest, window.newest.sensitivity
     delta, c = S @ window.step(), point.core_dim
-    V = solve_triangular(window.root, S.T, lower=True)
+    V = window.information.whitening @ S.T
     return State(
         retract(point.core, delta[:c]),
         point.landmarks + delta[c:].reshape(point.landmarks.shape),
@@ -323,12 +322,12 @@ def _innovation(window: NormalEquations, noise: Float[Array, "p p"]) -> Innovati
     last = window.last
     A = last.slope
     left = last.residual - A @ window.step()
-    V = solve_triangular(window.root, A.T, lower=True)
+    V = window.information.whitening @ A.T
     W = jnp.eye(left.size, dtype=A.dtype) - V.T @ V
-    inverse_root = jnp.linalg.inv(jnp.linalg.cholesky(W))
+    inverse_root = cholesky(W).whitening
     whitened = inverse_root @ left
     m, p = last.predicted.shape
-    unwhiten = jnp.kron(jnp.eye(m, dtype=A.dtype), jnp.linalg.cholesky(noise))
+    unwhiten = jnp.kron(jnp.eye(m, dtype=A.dtype), cholesky(noise).root)
     root = unwhiten @ inverse_root.T
     return Innovation(
         last.predicted,
@@ -337,19 +336,3 @@ def _innovation(window: NormalEquations, noise: Float[Array, "p p"]) -> Innovati
         last.used,
         whitened @ whitened,
     )
-
-
-def _root(P: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Callable[[Array], Array]]:
-    """L with L Lᵀ = P of any rank, and the function that solves L y = b for b in its range.
-
-    Cholesky of the correlations with a jitter at rounding's size; what has no variance has a row
-    and a column of zeros.
-    """
-    sigma = jnp.sqrt(jnp.diagonal(P))
-    none = sigma == 0
-    unit = jnp.where(none, 1.0, sigma)
-    n = sigma.size
-    jitter = 10 * n * jnp.finfo(P.dtype).eps
-    correlation = P / (unit[:, None] * unit) + jnp.diag(jnp.where(none, 1.0, jitter))
-    L = jnp.linalg.cholesky(correlation)
-    return sigma[:, None] * L, lambda b: solve_triangular(L, b / unit, lower=True)

@@ -18,7 +18,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.filters.blocks import (
@@ -40,6 +39,7 @@ from jaxslam.filters.blocks import (
 )
 from jaxslam.filters.state import Features, Innovation
 from jaxslam.geometry import jacobian, tangent_dim
+from jaxslam.linalg import Cholesky, cholesky, inverse
 
 EXACT_SIGMA = 1e-6
 """Least σ that Λ represents: a micrometre, a microradian. A smaller one, as of the pose at the
@@ -91,7 +91,7 @@ def augment(state: InformationState, start: int, covariance: Float[Array, "k k"]
     if covariance.size == 0:
         return state
     part = slice(start, start + covariance.shape[0])
-    information = _inverse(representable(covariance))
+    information = cholesky(representable(covariance)).inverse()
     return replace(state, information=state.information.at[part, part].set(information))
 
 
@@ -130,11 +130,11 @@ def update(
     if considered.start != considered.stop:
         raise ValueError("the information form cannot consider: its update is a sum")
     predicted, residual, used, H = residuals(model, state, features, context)
-    weight = jnp.broadcast_to(_inverse(noise), (*used.shape, *noise.shape))
+    weight = jnp.broadcast_to(cholesky(noise).inverse(), (*used.shape, *noise.shape))
     information = _added(state, H, features.slots, weight)
     weighted = small_products(weight, residual[..., None])[..., 0]
     b = _pulled_back(state, H, features.slots, weighted)
-    delta = cho_solve((_factor(information), True), b)
+    delta = _factor(information).solve(b)
     nis = jnp.sum(residual * weighted) - b @ delta
     state = replace(shifted(state, delta), information=information)
     return state, Innovation(predicted, residual, None, used, nis)
@@ -182,17 +182,17 @@ def change(state: InformationState, variables: Change) -> InformationState:
     c = state.core_dim
     core, J_core = variables.core(state.core), jacobian(variables.core, state.core)
     spent = jnp.all(J_core == 0, axis=1)
-    inverse = jnp.linalg.inv(J_core + jnp.diag(spent.astype(J_core.dtype)))
+    core_inverse = inverse(J_core + jnp.diag(spent.astype(J_core.dtype)))
     landmarks, J = state.landmarks, None
     if variables.landmark is not None:
         moved, _, forward = local_jacobians(
             variables.view, without_auxiliary(variables.landmark), state.core, state.landmarks
         )
         landmarks = jnp.where(state.active[:, None], moved, state.landmarks)
-        J = _inverted(forward, inverse, state.active)
+        J = _inverted(forward, core_inverse, state.active)
 
     def rows(matrix):
-        return _transposed_rows(inverse, J, matrix, c)
+        return _transposed_rows(core_inverse, J, matrix, c)
 
     information = _without(rows(rows(state.information).T), 0, spent)
     return replace(
@@ -220,7 +220,8 @@ def initialise(
     slots = jnp.where(features.valid, features.slots, state.active.size)  # out of bounds: dropped
     difference = masked(J._replace(by_view=-J.by_view), features.valid)
     identity = jnp.eye(new.shape[1], dtype=own.dtype)
-    weight = jax.vmap(_inverse)(jnp.where(features.valid[:, None, None], own, identity))
+    own = jnp.where(features.valid[:, None, None], own, identity)
+    weight = jax.vmap(lambda N: cholesky(N).inverse())(own)
     return replace(
         state,
         landmarks=state.landmarks.at[slots].set(new, mode="drop"),
@@ -287,7 +288,7 @@ def _pulled_back(state, J: Blocks, slots, weighted: Float[Array, "m k"]) -> Floa
 def _inverted(J: Blocks, core_inverse: Float[Array, "c c"], active) -> Blocks:
     """Blocks of the inverse change; the identity in inactive slots."""
     identity = jnp.eye(J.by_landmark.shape[-1], dtype=core_inverse.dtype)
-    own = jnp.linalg.inv(jnp.where(active[:, None, None], J.by_landmark, identity))
+    own = jax.vmap(inverse)(jnp.where(active[:, None, None], J.by_landmark, identity))
     by_view = jnp.where(active[:, None, None], J.by_view, 0.0)
     return Blocks(J.view_by_core @ core_inverse, -small_products(own, by_view), own)
 
@@ -313,7 +314,7 @@ def _without(information: Float[Array, "n n"], start: int, gone: Bool[Array, " k
     both = gone[:, None] & gone[None, :]
     block = jnp.where(both, information[part, part], 0.0)
     rows = jnp.where(gone[:, None], information[part], 0.0)
-    whitened = solve_triangular(_factor(block), rows, lower=True)
+    whitened = _factor(block).whitening @ rows
     kept = jnp.ones(information.shape[0], bool).at[part].set(~gone)
     left = information - whitened.T @ whitened
     return jnp.where(kept[:, None] & kept[None, :], left, 0.0)
@@ -324,23 +325,15 @@ def _present(information: Float[Array, "n n"]) -> Bool[Array, " n"]:
     return jnp.diagonal(information) != 0
 
 
-def _factor(information: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Cholesky's L of Λ, with an identity in place of what is not in the state."""
+def _factor(information: Float[Array, "n n"]) -> Cholesky:
+    """Λ's, with an identity in place of what is not in the state."""
     absent = ~_present(information)
-    return jnp.linalg.cholesky(information + jnp.diag(absent.astype(information.dtype)))
-
-
-def _inverse(matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:
-    """Of a positive definite matrix, symmetric."""
-    root = solve_triangular(
-        jnp.linalg.cholesky(matrix), jnp.eye(matrix.shape[0], dtype=matrix.dtype), lower=True
-    )
-    return root.T @ root
+    return cholesky(information + jnp.diag(absent.astype(information.dtype)))
 
 
 def _whitened(state: InformationState, J: Float[Array, "k n"]) -> Float[Array, "n k"]:
     """`L⁻¹Jᵀ`, so that a covariance `J Λ⁻¹ Jᵀ` is its square."""
-    return solve_triangular(_factor(state.information), J.T, lower=True)
+    return _factor(state.information).whitening @ J.T
 
 
 def _local_covariance(state: InformationState, J: Blocks, slots) -> Float[Array, "m k k"]:

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.filters.slam import Parameters, SlamFilter
 from jaxslam.filters.state import Features, State
+from jaxslam.linalg import cholesky
 
 LOW_INNOVATION = 2.0
 """Pixels within which a match agrees with a hypothesis."""
@@ -43,7 +44,7 @@ def inliers(
     )
     residual = features.measured - predicted
     distance = jnp.einsum(
-        "mp,mp->m", residual, jnp.linalg.solve(covariance, residual[..., None])[..., 0]
+        "mp,mp->m", residual, jax.vmap(lambda S, r: cholesky(S).solve(r))(covariance, residual)
     )
     return low | (features.valid & in_front & (distance < rescue))
 

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.filters.blocks import (
@@ -35,6 +34,7 @@ from jaxslam.filters.blocks import (
 )
 from jaxslam.filters.state import Features
 from jaxslam.geometry import difference, jacobian, retract, tangent_dim
+from jaxslam.linalg import cholesky
 
 
 @jax.tree_util.register_dataclass
@@ -145,7 +145,7 @@ def update(
     S, c = point.sensitivity, point.core_dim
     own = S[c:].reshape(*point.landmarks.shape, -1)[features.slots]
     A = H.by_view @ (H.view_by_core @ S[:c]) + H.by_landmark @ own
-    whitening = solve_triangular(jnp.linalg.cholesky(noise), jnp.eye(len(noise)), lower=True)
+    whitening = cholesky(noise).whitening
     return point, Compared(
         predicted,
         (residual @ whitening.T).ravel(),

@@ -28,6 +28,7 @@ from jaxslam.filters.filter import step_in_stages
 from jaxslam.filters.slam import Context, Parameters, SlamFilter, check_one_gaussian
 from jaxslam.filters.state import Features, Innovation, State
 from jaxslam.geometry import difference, jacobian
+from jaxslam.linalg import cholesky, eigh
 
 SPLIT = 0.8
 """Halves of a split member are ± so many of its σ from its mean."""
@@ -152,7 +153,7 @@ class SplitAndMerge(Bank):
         # Nearly singular where one landmark is seen, and zero where none is.
         n = self.rig.geometry.point_dim
         M = M / jnp.maximum(jnp.trace(M), jnp.finfo(M.dtype).tiny)
-        return jnp.linalg.cholesky(M + 1e-6 * jnp.eye(n, dtype=M.dtype)).T
+        return cholesky(M + 1e-6 * jnp.eye(n, dtype=M.dtype)).root.T
 
 
 def with_mixture(base: SlamFilter, count: int | None) -> SplitAndMerge:
@@ -209,7 +210,7 @@ def _halves(parent: State, by_core: Float[Array, "n c"]) -> tuple[State, Array]:
     """
     c = by_core.shape[-1]
     slopes = parent.covariance[:, :c] @ by_core.T
-    values, vectors = jnp.linalg.eigh(by_core @ slopes[:c])
+    values, vectors = eigh(by_core @ slopes[:c])
     variance = jnp.maximum(values[-1], 0.0)
     sigma = jnp.sqrt(jnp.maximum(variance, jnp.finfo(variance.dtype).tiny))
     away = SPLIT * slopes @ vectors[:, -1] / sigma

@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 from jaxslam.filters import ekf
 from jaxslam.filters.initialisation import UNDELAYED
 from jaxslam.filters.slam import SlamFilter
+from jaxslam.linalg import eigh
 
 _SINGULAR = 1e-12
 """Least eigenvalue of NᵀN, its columns of unit length, that counts."""
@@ -65,7 +66,7 @@ def left_inverse(N: Float[Array, "n g"]) -> Float[Array, "g n"]:
     length = jnp.linalg.norm(N, axis=0)
     length = jnp.where(length > 0, length, 1.0)
     N = N / length
-    values, vectors = jnp.linalg.eigh(N.T @ N)
+    values, vectors = eigh(N.T @ N)
     kept = values > _SINGULAR
     inverse = jnp.where(kept, 1 / jnp.where(kept, values, 1.0), 0.0)
     return (vectors * inverse) @ vectors.T @ N.T / length[:, None]

@@ -7,14 +7,15 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import optimistix
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.geometry import Pose, difference
+from jaxslam.least_squares import levenberg_marquardt
+from jaxslam.linalg import cholesky
 from jaxslam.posterior.problem import Problem, log_density, path, residuals, size, unknowns
 from jaxslam.rig import Rig
 
-SOLVER = optimistix.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
+SOLVER = levenberg_marquardt(1e-9)
 MOST_STEPS = 200
 """Levenberg–Marquardt steps of one start; what needs more counts as not converged."""
 
@@ -78,8 +79,7 @@ def laplace(
 
 def covariance_root(J: Float[Array, "m n"]) -> Float[Array, "n n"]:
     """R with `R Rᵀ = (JᵀJ)⁻¹`, J of whitened residuals."""
-    lower = jnp.linalg.cholesky(J.T @ J)
-    return solve_triangular(lower, jnp.eye(len(lower), dtype=J.dtype), lower=True).T
+    return cholesky(J.T @ J).whitening.T
 
 
 def last_pose(rig: Rig, problem: Problem, y: Float[Array, " n"]) -> Pose:

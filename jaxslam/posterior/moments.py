@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_factor, cho_solve
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Float
 
 from jaxslam.geometry import Pose, difference, retract
+from jaxslam.linalg import cholesky
 
 MEAN_ITERATIONS = 4
 
@@ -38,9 +38,9 @@ def covariance(draws: Float[Array, "s k"]) -> Float[Array, "k k"]:
 def gaussian_divergence(draws: Float[Array, "s k"], P: Float[Array, "k k"]) -> Float[Array, ""]:
     """`KL(N(m, S) ‖ N(0, P))` in nats, m and S the moments of the draws."""
     m, S = jnp.mean(draws, axis=0), covariance(draws)
-    factor = cho_factor(P, lower=True)
-    log_ratio = 2 * jnp.sum(jnp.log(jnp.diagonal(factor[0]))) - jnp.linalg.slogdet(S)[1]
-    return (jnp.trace(cho_solve(factor, S)) + m @ cho_solve(factor, m) - m.size + log_ratio) / 2
+    factor = cholesky(P)
+    log_ratio = factor.log_det() - cholesky(S).log_det()
+    return (jnp.trace(factor.solve(S)) + m @ factor.solve(m) - m.size + log_ratio) / 2
 
 
 def wasserstein(

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam.filters import FILTERS, Features, SlamFilter
-from jaxslam.filters.ekf import covariance_root
 from jaxslam.geometry import PLANAR
 from jaxslam.landmarks import LANDMARKS, Parametrization
+from jaxslam.linalg import semidefinite_root
 from jaxslam.rig import Rig
 from jaxslam.triangulation.samples import Samples, draw
 from jaxslam.triangulation.truth import Measured, intersect
@@ -88,4 +88,6 @@ def pushed(
 def push(name: str, gaussian: Gaussian, count: int, seed: int) -> Samples:
     """`count` points of the named estimate."""
     mean, covariance = gaussian
-    return draw(pushed, LANDMARKS[name], (mean, jax.jit(covariance_root)(covariance)), count, seed)
+    return draw(
+        pushed, LANDMARKS[name], (mean, jax.jit(semidefinite_root)(covariance).root), count, seed
+    )

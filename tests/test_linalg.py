@@ -1,0 +1,115 @@
+"""Factorisations in JAX against NumPy's; and no program of the package may call LAPACK."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam.linalg import LEAF, cholesky, eigh, inverse, semidefinite_root
+
+SIZES = (1, 2, 3, 5, 12, LEAF, LEAF + 1, 2 * LEAF + 3, 105)
+
+
+def _positive(n, seed=0):
+    half = np.random.default_rng(seed).normal(size=(n, n + 3))
+    return half @ half.T
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_cholesky_is_numpys_and_its_inverse_whitens(n):
+    A = _positive(n)
+    root, whitening = jax.jit(cholesky)(A)
+    np.testing.assert_allclose(root, np.linalg.cholesky(A), rtol=0, atol=1e-12 * n)
+    np.testing.assert_allclose(whitening @ A @ whitening.T, np.eye(n), rtol=0, atol=1e-10)
+    assert np.all(np.triu(whitening, 1) == 0)
+
+
+def test_cholesky_solves_and_has_the_determinant():
+    A, b = _positive(12), np.arange(12.0)
+    factor = cholesky(A)
+    np.testing.assert_allclose(factor.solve(b), np.linalg.solve(A, b), rtol=1e-9)
+    np.testing.assert_allclose(factor.inverse(), np.linalg.inv(A), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(factor.log_det(), np.linalg.slogdet(A)[1], rtol=1e-12)
+
+
+@pytest.mark.parametrize("n", [2, 5, LEAF + 8])
+@pytest.mark.parametrize("least", [0.0, -1e-3])
+def test_cholesky_of_what_is_not_positive_is_nan_throughout(n, least):
+    A = np.diag(np.r_[np.ones(n - 1), least])
+    factor = cholesky(A)
+    assert np.isnan(factor.root).all()
+    assert np.isnan(factor.whitening).all()
+    assert np.isnan(factor.log_det())
+
+
+@pytest.mark.parametrize("n", [1, 4, 9])
+def test_cholesky_has_the_derivatives_of_central_differences(n):
+    A, dA = _positive(n), _positive(n, seed=1)
+    _, tangent = jax.jvp(cholesky, (A,), (dA,))
+    step = 1e-6
+    above, below = cholesky(A + step * dA), cholesky(A - step * dA)
+    for got, plus, minus in zip(tangent, above, below, strict=True):
+        expected = (plus - minus) / (2 * step)
+        np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-7)
+
+
+def test_cholesky_has_a_gradient():
+    A = jnp.asarray(_positive(6))
+    gradient = jax.grad(lambda A: cholesky(A).log_det())(A)
+    np.testing.assert_allclose(gradient, np.linalg.inv(A), rtol=1e-9, atol=1e-12)
+
+
+def test_vmap_of_cholesky_is_a_loop():
+    A = np.stack([_positive(7, seed) for seed in range(5)])
+    batch = jax.vmap(cholesky)(A)
+    for k in range(5):
+        np.testing.assert_allclose(batch.root[k], np.linalg.cholesky(A[k]), rtol=0, atol=1e-12)
+
+
+def test_semidefinite_root_has_any_rank_and_solves_in_its_range():
+    rng = np.random.default_rng(0)
+    half = rng.normal(size=(5, 3)) * np.array([1, 10, 1e-3])
+    half[1] = 0
+    root, whitening = semidefinite_root(jnp.asarray(half @ half.T))
+    np.testing.assert_allclose(root @ root.T, half @ half.T, rtol=0, atol=1e-10)
+    assert not np.any(root[1])
+    assert not np.any(root[:, 1])
+    b = half @ rng.normal(size=3)
+    np.testing.assert_allclose(root @ (whitening @ b), b, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 7])
+def test_eigh_is_numpys(n):
+    A = _positive(n) - 3 * np.eye(n)
+    values, vectors = jax.jit(eigh)(A)
+    np.testing.assert_allclose(values, np.linalg.eigvalsh(A), rtol=0, atol=1e-12 * n**2)
+    np.testing.assert_allclose(A @ vectors, vectors * values, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(vectors.T @ vectors, np.eye(n), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("A", [np.zeros((3, 3)), np.eye(3), np.diag([3.0, 1.0, 2.0])])
+def test_eigh_of_equal_or_sorted_values_is_exact_and_has_derivatives(A):
+    values, vectors = eigh(A)
+    np.testing.assert_array_equal(values, np.sort(np.diagonal(A)))
+    np.testing.assert_array_equal(np.abs(vectors).sum(axis=0), 1)
+    slope = jax.jvp(lambda A: eigh(A)[0].sum(), (A,), (_positive(3),))[1]
+    np.testing.assert_allclose(slope, np.trace(_positive(3)), rtol=1e-12)
+
+
+def test_eigenvectors_turn_with_a_perturbation_of_a_diagonal():
+    A, dA = np.diag([1.0, 2.0, 4.0]), _positive(3)
+    _, turn = jax.jvp(lambda A: eigh(A)[1], (A,), (dA,))
+    gaps = np.diagonal(A)[None, :] - np.diagonal(A)[:, None] + np.eye(3)
+    expected = dA / gaps * (1 - np.eye(3))
+    np.testing.assert_allclose(turn, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 6, 13])
+def test_inverse_is_numpys_and_needs_no_good_pivots(n):
+    A = np.random.default_rng(n).normal(size=(n, n))
+    A[0, 0] = 0 if n > 1 else 2.0
+    np.testing.assert_allclose(jax.jit(inverse)(A) @ A, np.eye(n), rtol=0, atol=1e-10)
+
+
+def test_inverse_of_a_singular_matrix_is_not_finite():
+    assert not np.isfinite(inverse(jnp.ones((3, 3)))).all()

@@ -1,0 +1,154 @@
+"""Nothing waits for ever: a dead-lock is cured where it was, and named where it still can be."""
+
+import os
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import jaxslam
+from jaxslam import posterior, watchdog
+from jaxslam.consistency.montecarlo import _filter_batch
+from jaxslam.filters import ekf
+from jaxslam.simulation import Prior, Sightings, simulate
+from jaxslam.watchdog import lapack_calls
+
+MATRICES = """
+import jax, jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
+from jaxslam import linalg, watchdog
+
+def lapack(A):
+    return solve_triangular(jnp.linalg.cholesky(A), jnp.eye(24), lower=True)
+
+def own(A):
+    return linalg.cholesky(A).whitening
+
+@jax.jit
+def program(A):
+    def step(x, _):
+        parts = [jnp.mean(jax.vmap(FUNCTION)(A + i + x[i])) for i in range(6)]
+        return 1e-9 * jnp.stack(parts), None
+    return jax.lax.scan(step, jnp.zeros(6), length=200)[0]
+
+A = jnp.tile(24 * jnp.eye(24), (300, 1, 1))
+print(watchdog.finished(program(A), "six factorisations", patience=5.0))
+"""
+
+
+def run(function: str, processors: int) -> subprocess.CompletedProcess:
+    """The program in a process of its own, whose XLA has so many threads; killed after a while."""
+    return subprocess.run(
+        [sys.executable, "-c", MATRICES.replace("FUNCTION", function)],
+        env={**os.environ, "NPROC": str(processors), "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("processors", [1, 2, 5])
+def test_factorisations_in_jax_end_with_any_number_of_processors(processors):
+    done = run("own", processors)
+    assert done.returncode == 0, done.stderr
+
+
+def test_batched_lapack_ends_too_and_if_by_the_watchdog_says_where():
+    """On jaxlib 0.10 it stands still on two processors; a jaxlib that does not may end well."""
+    done = run("lapack", 2)
+    if done.returncode != 0:
+        assert "StandsStill: six factorisations stands still: no thread has worked" in done.stderr
+
+
+def test_the_watchdog_does_not_bark_at_what_works(monkeypatch):
+    """Slowly, but for longer than the patience."""
+    monkeypatch.setattr(watchdog, "LOOK", 0.02)
+    array = jax.jit(lambda x: jax.lax.fori_loop(0, 300, lambda _, x: jnp.sin(x @ x), x))(
+        jnp.ones((400, 400))
+    )
+    began = time.monotonic()
+    assert watchdog.finished({"a": array, "b": 1.0}, "sines", patience=0.1)["a"] is array
+    assert time.monotonic() - began > 0.1
+
+
+FILTERS = [
+    "robocentric",
+    "world",
+    "keyframe",
+    "information",
+    "scale_gauge",
+    "invariant",
+    "iterated",
+    "world+particles",
+    "world+rays",
+    "robocentric+common50",
+    "scale_gauge+lag3",
+    "robocentric+scales3",
+    "scale_gauge+directions3",
+    "scale_gauge+mixture3",
+    "robocentric+oc",
+    "world+fej",
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "scenario"),
+    [*((name, "circle") for name in FILTERS), ("scale_gauge+mixture3", "matched-6dof")],
+)
+def test_no_study_of_a_filter_calls_lapack(name, scenario):
+    chosen = jaxslam.scenario(scenario, steps=2, landmarks=4)
+    cartesian = name == "information" or "+particles" in name or "+rays" in name
+    (filtered,) = jaxslam.make_filters(
+        chosen.rig, [name], ["cartesian" if cartesian else "inverse_scaling"], "known"
+    ).values()
+    prior = Prior.of(chosen)
+    runs = jax.vmap(partial(simulate, chosen))(jax.random.split(jax.random.key(0), 2))
+    capacity = Sightings(4, 4, 4, 4)
+    traced = jax.make_jaxpr(partial(_filter_batch, filtered, capacity))(prior, runs)
+    assert lapack_calls(traced.jaxpr) == set()
+
+
+def test_no_posterior_calls_lapack():
+    chosen = jaxslam.scenario("matched", landmarks=3)
+    study = posterior.Study(chosen, steps=2, hmc=posterior.HMC(chains=2))
+    runs = posterior.draw_runs(study, 0, range(2))
+    traced = jax.make_jaxpr(lambda runs: posterior.reference(study, runs, 0, range(2)))(runs)
+    assert lapack_calls(traced.jaxpr) == set()
+
+
+@pytest.mark.parametrize("function", [jnp.linalg.cholesky, jnp.linalg.inv, jnp.linalg.pinv])
+def test_calls_of_lapack_are_found_however_deep(function):
+    def sometimes(x, _):
+        return jax.lax.cond(x[0, 0] > 0, function, lambda x: x, x), None
+
+    def deep(x):
+        return jax.lax.scan(sometimes, x, length=2)[0]
+
+    traced = jax.make_jaxpr(jax.vmap(jax.jit(deep)))(jnp.ones((2, 3, 3)))
+    assert lapack_calls(traced.jaxpr)
+
+
+@dataclass(frozen=True)
+class ByLapack:
+    """An engine of a user's own."""
+
+    def __getattr__(self, name):
+        return getattr(ekf, name)
+
+    def update(self, model, state, *data):
+        jnp.linalg.cholesky(state.covariance)
+        return ekf.update(model, state, *data)
+
+
+def test_a_filter_that_calls_lapack_is_warned_of():
+    chosen = jaxslam.scenario("matched", steps=2, landmarks=4)
+    made = jaxslam.make_filters(chosen.rig, ["robocentric"], ["inverse_scaling"], "known")
+    (base,) = made.values()
+    with pytest.warns(UserWarning, match="calls LAPACK in a batch \\(cholesky"):
+        jaxslam.monte_carlo(chosen, {"mine": replace(base, engine=ByLapack())}, runs=2)
