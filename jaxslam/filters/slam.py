@@ -367,25 +367,13 @@ class SlamFilter:
         return state if self.calibration == "white" else self._with_calibration(state, parameters)
 
     def _with_velocity(self, state: State, covariance: Float[Array, "v v"]) -> State:
-        """The prior on the velocity; in a gauge, on its direction and on the scale.
-
-        `v = e^λ ṽ`: λ takes the part along the mean, `λ ≈ nᵀδv/|v|`, and ṽ the rest. With a mean
-        of −σ_λ²/2 the speed keeps its own. From standstill the scale is known, and 1.
-        """
+        """The prior on the velocity; in a gauge, on the scale and on what it leaves of it."""
         core = state.core
-        place = _part(core, "velocity")
-        if not self.scale_gauge:
-            return self.engine.augment(state, place.start, covariance)
-        n, velocity = self.geometry.point_dim, core.velocity
-        speed = jnp.linalg.norm(velocity[:n])
-        along = jnp.zeros_like(velocity).at[:n].set(velocity[:n] / jnp.where(speed > 0, speed, 1))
-        to_scale = along / jnp.where(speed > 0, speed, 1)
-        J = jnp.concatenate(
-            [jnp.eye(velocity.size) - jnp.outer(velocity, to_scale), to_scale[None]]
-        ).astype(covariance.dtype)
-        joint = J @ covariance @ J.T
-        state = replace(state, core=replace(core, log_scale=-joint[-1:, -1] / 2))
-        return self.engine.augment(state, place.start, joint)
+        if self.scale_gauge:
+            mean, covariance = velocity_in_gauge(core.velocity, covariance, self.geometry.point_dim)
+            core = replace(core, velocity=mean[:-1], log_scale=mean[-1:])
+        state = replace(state, core=core)
+        return self.engine.augment(state, _part(core, "velocity").start, covariance)
 
     def predict(self, state: State, parameters: Parameters, control: Array) -> State:
         """Append this step's noise; move already where the motion is composed first."""
@@ -681,6 +669,33 @@ def check_one_gaussian(base: SlamFilter, what: str) -> None:
     ):
         if wrong:
             raise ValueError(f"{what} {why}")
+
+
+def velocity_in_gauge(
+    velocity: Float[Array, " v"], covariance: Float[Array, "v v"], n: int
+) -> tuple[Float[Array, " v+1"], Float[Array, "v+1 v+1"]]:
+    """(ṽ, λ) for `(e^λ ṽ[:n], ṽ[n:])` to have the velocity's mean v̄ and covariance Σ.
+
+    The first n numbers are linear, the only lengths. λ takes the relative speed `sᵀδv`,
+    `s = v̄/|v̄|²`, of variance q: `λ ~ N(−P/2, P)` with `e^P = 1 + q`; given λ, nothing is left of
+    it in ṽ. The moments are exact but for `O(q²)` of what is correlated with the speed. From
+    standstill the scale is known, and 1.
+    """
+    linear = jnp.arange(velocity.size) < n
+    along_mean = jnp.where(linear, velocity, 0.0)
+    squared = along_mean @ along_mean
+    s = along_mean / jnp.where(squared > 0, squared, 1.0)
+    with_speed = covariance @ s
+    q = s @ with_speed
+    P, some = jnp.log1p(q), jnp.where(q > 0, q, 1.0)
+    shrunk = jnp.where(linear, 1 / (1 + q), 1.0)
+    by_scale = shrunk * (with_speed - q * along_mean)  # Cov(ṽ, λ)
+    rest = covariance - jnp.outer(with_speed, with_speed) / some
+    own = jnp.sqrt(shrunk[:, None] * shrunk) * rest
+    own += jnp.outer(by_scale, by_scale) / jnp.where(q > 0, P, 1.0)
+    mean = velocity - jnp.where(linear, by_scale, 0.0)
+    joint = jnp.block([[own, by_scale[:, None]], [by_scale, P]])
+    return jnp.append(mean, -P / 2), joint
 
 
 def velocity_root(
