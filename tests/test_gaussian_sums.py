@@ -10,8 +10,9 @@ import pytest
 
 import jaxslam
 from jaxslam.filters import RECOMMENDED, make_filter
-from jaxslam.filters.bank import BankState
+from jaxslam.filters.bank import BEHIND, BankState, log_likelihoods
 from jaxslam.filters.split_and_merge import _split_and_merged
+from jaxslam.filters.state import Innovation
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.rig import Rig
 from tests.cases import Case, each_geometry, named, named_filter, pose_run, quick_jit
@@ -210,3 +211,35 @@ def test_the_recommended_filter_is_consistent_where_the_papers_is_not():
     low, high = jaxslam.mean_band(3, 40, 0.999)
     assert paper[-1] > 10 * high
     assert low < ours[-1] < high
+
+
+def innovations_of(residuals, variances, used):
+    """Of members that see landmarks by one number each, uncorrelated."""
+    residuals, used = jnp.asarray(residuals)[..., None], jnp.asarray(used)
+    residuals = jnp.where(used[..., None], residuals, 0.0)
+    variances = jnp.where(used, jnp.asarray(variances), 1.0)
+    nis = jnp.sum(residuals[..., 0] ** 2 / variances, axis=1)
+    covariance = jax.vmap(jnp.diag)(variances)
+    return Innovation(residuals, residuals, covariance, used, nis)
+
+
+def test_a_member_gains_nothing_by_a_landmark_behind_itself():
+    """Two members see all their landmarks, 3σ off; a third predicts one of them behind itself."""
+    used = [[True, True], [True, True], [True, False]]
+    found = log_likelihoods(innovations_of(np.full((3, 2), 6.0), np.full((3, 2), 4.0), used))
+    weights = jax.nn.softmax(found)
+    np.testing.assert_allclose(weights[:2], 0.5, atol=1e-4)
+    np.testing.assert_allclose(weights[2] / weights[0], BEHIND, rtol=1e-9)
+
+
+def test_what_no_member_has_in_front_tells_nothing_between_them():
+    used = [[True, False], [True, False]]
+    found = log_likelihoods(innovations_of([[1.0, 0], [2.0, 0]], [[1.0, 1], [1.0, 1]], used))
+    np.testing.assert_allclose(found[0] - found[1], 1.5, rtol=1e-12)
+
+
+def test_a_member_that_has_diverged_has_no_likelihood_and_spoils_no_other():
+    sums = innovations_of([[1.0, 1.0], [np.nan, 1.0]], [[1.0, 1], [1.0, 1]], np.ones((2, 2), bool))
+    found = log_likelihoods(sums)
+    assert np.isfinite(found[0])
+    assert found[1] == -np.inf

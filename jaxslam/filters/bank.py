@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxslam.filters.filter import Filter
+from jaxslam.filters.initialisation import log_density
 from jaxslam.filters.slam import Parameters, velocity_root
 from jaxslam.filters.state import Features, Innovation, State
 from jaxslam.geometry import Pose, difference, retract
@@ -31,6 +32,9 @@ SPACING = 0.5
 OVERLAP = 0.5
 """σ of a member, in distances between neighbours."""
 ALONG = ("speed", "direction")
+BEHIND = 1e-4
+"""What a member, by its mean sure that a landmark is behind the camera, leaves for its being seen;
+as much as a residual of four σ has beyond it."""
 
 
 @jax.tree_util.register_dataclass
@@ -110,11 +114,7 @@ class Bank:
     def _weighed(
         self, members: Any, log_weights: Array, innovations: Innovation
     ) -> tuple[BankState, Innovation]:
-        log_det = jax.vmap(lambda S: cholesky(S).log_det())(innovations.covariance)
-        likelihood = -(innovations.nis + log_det) / 2
-        # A member that has diverged has no likelihood.
-        likelihood = jnp.where(jnp.isfinite(likelihood), likelihood, -jnp.inf)
-        after = jax.nn.log_softmax(log_weights + likelihood)
+        after = jax.nn.log_softmax(log_weights + log_likelihoods(innovations))
         return BankState(members, after), _mixed(innovations, log_weights)
 
     def pose_error(self, state: BankState, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
@@ -188,6 +188,28 @@ def with_scales(base: Filter, count: int | None) -> Bank:
 def with_directions(base: Filter, count: int | None) -> Bank:
     """The Gaussian sum over the direction of travel; 5 members, or 5², by default."""
     return Bank(base, 5 if count is None else count, "direction")
+
+
+def log_likelihoods(innovations: Innovation) -> Float[Array, " members"]:
+    """Of every member `log N(r; 0, S)` of all that is measured, up to a constant of them all.
+
+    A landmark that is measured and predicted behind the camera has no residual: that is no merit,
+    and without it the density is of fewer numbers than another member's. In its place stands the
+    least density that a member with the landmark in front gives it, times `BEHIND`. A member that
+    has diverged has none.
+    """
+    k, m, p = innovations.residual.shape
+    log_det = jax.vmap(lambda S: cholesky(S).log_det())(innovations.covariance)
+    joint = -(innovations.nis + log_det) / 2
+    blocks = innovations.covariance.reshape(k, m, p, m, p)
+    blocks = jnp.einsum("kmpmq->kmpq", blocks)
+    alone, _ = jax.vmap(jax.vmap(log_density))(innovations.residual, blocks)
+    in_front = innovations.used & jnp.isfinite(alone)
+    least = jnp.min(jnp.where(in_front, alone, jnp.inf), axis=0)
+    instead = jnp.where(jnp.isfinite(least), least + np.log(BEHIND), 0.0)
+    behind = jnp.sum(jnp.where(innovations.used, 0.0, instead - alone), axis=1)
+    total = joint + behind
+    return jnp.where(jnp.isfinite(total), total, -jnp.inf)
 
 
 def moments(log_weights, means, covariances):
