@@ -12,7 +12,6 @@ from jaxslam.filters.first_estimates import with_first_estimates
 from jaxslam.filters.fixed_lag import FixedLag, iterated, with_lag
 from jaxslam.filters.frames import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.filters.gaussian_sum import GaussianSum, with_rays
-from jaxslam.filters.initialisation import UNDELAYED
 from jaxslam.filters.invariant import INVARIANT
 from jaxslam.filters.observability_constrained import with_observability_constraint
 from jaxslam.filters.slam import (
@@ -93,10 +92,6 @@ FILTERS: dict[str, Callable[[Rig, Parametrization, str], Filter]] = {
 
 def with_common_depth(base: SlamFilter, percent: int | None) -> SlamFilter:
     """The filter with priors on 1/z that are correlated, in percent; 50 by default."""
-    if base.initialisation is not UNDELAYED:
-        raise ValueError(
-            "depths are correlated by the prior that a delayed initialisation replaces"
-        )
     return replace(base, depth_correlation=0.5 if percent is None else percent / 100)
 
 

@@ -309,6 +309,20 @@ class SlamFilter:
                 "a scale gauge is for a camera with a velocity: "
                 f"motion {motion.name} and sensor {sensor.name} measure metres"
             )
+        if self.initialisation is not UNDELAYED:
+            self._check_delayed()
+
+    def _check_delayed(self) -> None:
+        """Delayed initialisations have depths of their own, in metres, in place of the prior."""
+        for wrong, what in (
+            (self.depth_correlation, "correlated depths"),
+            (self.scale_gauge, "a scale gauge"),
+        ):
+            if wrong:
+                raise ValueError(
+                    f"{what} cannot go with a delayed initialisation, which replaces the prior "
+                    "on depth by depths of its own, in metres"
+                )
 
     @property
     def rig(self) -> Rig:
