@@ -70,6 +70,9 @@ def _factored(A: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array,
     h = n // 2
     L, W = _factored(A[:h, :h])
     below = A[h:, :h] @ W.T
+    # A product with L⁻¹ is wrong by the condition of L; one refinement makes it as good as
+    # substitution, which matters where A is nearly singular.
+    below += (A[h:, :h] - below @ L.T) @ W.T
     L_rest, W_rest = _factored(A[h:, h:] - below @ below.T)
     none = jnp.zeros((h, n - h), A.dtype)
     return (

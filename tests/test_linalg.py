@@ -78,6 +78,18 @@ def test_semidefinite_root_has_any_rank_and_solves_in_its_range():
     np.testing.assert_allclose(root @ (whitening @ b), b, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("n", [LEAF, 105])
+def test_large_semidefinite_matrices_have_roots_too(n):
+    """Of a fifth of their rows, and of scales far apart: the jitter is only rounding's size."""
+    rng = np.random.default_rng(0)
+    half = rng.normal(size=(100, n, n // 5)) * 10.0 ** rng.uniform(-4, 2, size=(100, n, 1))
+    P = half @ np.swapaxes(half, 1, 2)
+    root = np.asarray(jax.jit(jax.vmap(semidefinite_root))(P).root)
+    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    away = (root @ np.swapaxes(root, 1, 2) - P) / sigma[:, :, None] / sigma[:, None, :]
+    np.testing.assert_allclose(away, 0, atol=1e-11)
+
+
 @pytest.mark.parametrize("n", [1, 2, 3, 7])
 def test_eigh_is_numpys(n):
     A = _positive(n) - 3 * np.eye(n)
