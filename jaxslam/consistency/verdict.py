@@ -71,8 +71,9 @@ class Tally:
     @staticmethod
     def from_dict(numbers: dict[str, Any]) -> Tally:
         """Of what `asdict` made of it."""
-        sums = {key: PowerSums(**numbers[key]) for key in ("average", "end", "never_lost")}
-        return Tally(**{**numbers, **sums})
+        counts = (numbers[name] for name in ("dof", "runs", "diverged", "lost"))
+        sums = (PowerSums(**numbers[name]) for name in ("average", "end", "never_lost"))
+        return Tally(*counts, *sums)
 
     def asdict(self) -> dict[str, Any]:
         return asdict(self)
