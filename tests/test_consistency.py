@@ -190,7 +190,7 @@ def test_the_table_begins_with_the_verdicts_and_shows_the_plain_mean_beside_the_
     study = with_nees(study, 7, slice(4, None), 400.0)
     summary = jaxslam.summarise(study)
     result = summary["filters"]["inverse_scaling"]
-    title, verdict, others, _, header, row, *_ = jaxslam.table(summary).splitlines()
+    title, verdict, _, others, _, header, row, *_ = jaxslam.table(summary).splitlines()
     assert title == "inverse_scaling:"
     assert verdict.strip() == sentences(result["verdict"])[0]
     assert others.strip().startswith("1 of 20 runs were lost, the 19 never lost: NEES")

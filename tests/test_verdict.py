@@ -132,9 +132,8 @@ def test_a_few_lost_runs_are_named_and_judged_apart():
     # They scatter so much that the interval holds 1: only χ² tells that this is not chance.
     assert verdict["interval99"][0] < 1
     assert verdict["p"] < 1e-9
-    assert (
-        "3 of 1000 runs were lost, the 997 never lost: NEES 2.98, σ right" in sentences(verdict)[1]
-    )
+    others = sentences(verdict)[2]
+    assert others.startswith("3 of 1000 runs were lost, the 997 never lost: NEES 2.98, σ right")
 
 
 def test_a_run_that_is_lost_and_comes_back_was_lost():
@@ -168,7 +167,7 @@ def test_a_study_of_lost_runs_only_has_a_verdict(value):
     json.dumps(verdict, allow_nan=False)
     assert verdict["word"] == ("lost" if np.isnan(value) else "over-confident")
     assert verdict["never_lost"]["runs"] == 0
-    assert sentences(verdict)[1] == "4 of 4 runs were lost, and none was not"
+    assert sentences(verdict)[-1] == "4 of 4 runs were lost, all of them"
 
 
 # --- what it is made of -------------------------------------------------------------------------
@@ -199,7 +198,9 @@ def test_one_run_has_no_interval_and_still_a_p_value():
     verdict = run_verdict(np.full((1, 4), 100.0), 3)
     assert verdict["interval99"] == [None, None]
     assert verdict["word"] == "over-confident"
-    assert sentences(verdict)[0] == "NEES 100, σ too small by 5.77 [–, –]: over-confident"
+    assert (
+        sentences(verdict)[0] == "NEES 100, σ too small by 5.77 [–, –]: over-confident (p < 0.0001)"
+    )
     assert run_verdict(np.full((1, 4), 3.5), 3)["word"] == "consistent"
 
 
@@ -215,7 +216,12 @@ def test_a_verdict_is_said_in_words(factor, text):
     nees = consistent()
     nees *= 3 * factor**2 / nees.mean()
     nees = np.minimum(nees, lost_threshold(3))
-    assert sentences(run_verdict(nees, 3))[0].endswith(text)
+    found = run_verdict(nees, 3)
+    said, at_the_end = sentences(found)[:2]
+    p = f"p = {found['p']:.2g}" if factor == 1 else "p < 0.0001"
+    assert said == f"NEES {found['nees']:.2f}, {text} ({p})"
+    assert at_the_end.startswith(f"at the last step: NEES {nees[:, -1].mean():.2f}, σ ")
+    assert found["end"]["word"] == found["word"]
 
 
 @pytest.mark.parametrize(("shape", "dof"), [((3,), 3), ((0, 4), 3), ((4, 0), 3), ((4, 5), 0)])

@@ -116,9 +116,11 @@ def _judged(sums: PowerSums, dof: int, diverged: int = 0) -> dict[str, Any]:
 
 
 def _at_the_end(sums: PowerSums, dof: int, diverged: int) -> dict[str, Any]:
-    exists = sums.count and not diverged
-    p = chi2_p_value(sums.mean, dof, sums.count) if exists else 0.0
-    return {**_factor(sums, dof, diverged), "p": p}
+    factor = _factor(sums, dof, diverged)
+    if diverged or not sums.count:
+        return {**factor, "p": 0.0, "word": "lost"}
+    p = chi2_p_value(sums.mean, dof, sums.count)
+    return {**factor, "p": p, "word": _word(p, sums.mean > dof)}
 
 
 def _factor(sums: PowerSums, dof: int, diverged: int) -> dict[str, Any]:
@@ -150,26 +152,22 @@ def run_verdict(nees: Float[np.ndarray, "runs steps"], dof: int) -> dict[str, An
 
 
 def sentences(found: dict[str, Any]) -> list[str]:
-    """A verdict in words: `NEES 4.72, σ too small by 1.25 [1.24, 1.27]: over-confident`.
-
-    Where runs were lost, the verdict on those never lost follows.
-    """
-    lost = found["runs"] - found["never_lost"]["runs"]
-    if not lost:
-        return [headline(found)]
-    return [headline(found), f"{lost} of {found['runs']} runs were lost, {_without(found)}"]
+    """A verdict in words, and that at the last step; of the runs never lost, where some were."""
+    end, kept, runs = found["end"], found["never_lost"], found["runs"]
+    told = [headline(found)]
+    if end["nees"] is not None:
+        told.append(f"at the last step: {_said(end)}")
+    if lost := runs - kept["runs"]:
+        others = f"the {kept['runs']} never lost: {_said(kept)}" if kept["runs"] else "all of them"
+        told.append(f"{lost} of {runs} runs were lost, {others}")
+    return told
 
 
 def headline(found: dict[str, Any]) -> str:
-    """The verdict on all runs in words."""
+    """The verdict on all runs: `NEES 4.72, σ too small by 1.25 [1.24, 1.27]: over-confident`."""
     if found["nees"] is None:
         return f"{found['diverged']} of {found['runs']} runs diverged, no mean NEES: lost"
     return _said(found)
-
-
-def _without(found: dict[str, Any]) -> str:
-    kept = found["never_lost"]
-    return f"the {kept['runs']} never lost: {_said(kept)}" if kept["runs"] else "and none was not"
 
 
 def _said(found: dict[str, Any]) -> str:
@@ -180,7 +178,9 @@ def _said(found: dict[str, Any]) -> str:
         if factors[0] < 1:
             told, factors = "too large by", [_inverse(factors[i]) for i in (0, 2, 1)]
     factor, low, high = ("–" if f is None else _digits(f) for f in factors)
-    return f"NEES {_digits(found['nees'])}, σ {told} {factor} [{low}, {high}]: {found['word']}"
+    p = f"p = {found['p']:.2g}" if found["p"] >= 1e-4 else "p < 0.0001"
+    said = f"NEES {_digits(found['nees'])}, σ {told} {factor} [{low}, {high}]"
+    return f"{said}: {found['word']} ({p})"
 
 
 def _inverse(factor: float | None) -> float | None:
