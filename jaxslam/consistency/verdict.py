@@ -197,6 +197,7 @@ def verdict(
     *,
     dof: int,
     runs: int,
+    diverged: int = 0,
     comparisons: int = 1,
     lost_bound: float = LOST_BOUND,
 ) -> str:
@@ -205,7 +206,7 @@ def verdict(
     `lost` comes first; then a mean NEES below the 95 % band is under-confident (σ too large), one
     above it over-confident. With m comparisons the band is Bonferroni's, at 1 − 0.05/m: it holds
     all means of m consistent filters together in 95 % of cases, however they are correlated. A
-    mean that does not exist (None or NaN: every run diverged) is lost.
+    mean that does not exist (None or NaN, or of runs of which one diverged) is lost.
 
     Raises ValueError for numbers that make no sense.
     """
@@ -214,7 +215,7 @@ def verdict(
     for name, share in (("lost", lost), ("lost_bound", lost_bound)):
         if not 0 <= share <= 1:
             raise ValueError(f"{name} must be a share from 0 to 1, not {share}")
-    if lost > lost_bound or nees is None or math.isnan(nees):
+    if lost > lost_bound or diverged or nees is None or math.isnan(nees):
         return "lost"
     low, high = mean_band(dof, runs, together(comparisons))
     if nees < low:
