@@ -17,6 +17,7 @@ from jaxslam.consistency import (
     tally,
 )
 from jaxslam.consistency.statistics import chi2_cdf, chi2_quantile, normalised_squared
+from jaxslam.plots.consistency import plot_consistency
 
 SCENARIO = jaxslam.scenario("matched-tight", steps=6, landmarks=5)
 
@@ -199,6 +200,17 @@ def test_the_table_begins_with_the_verdicts_and_shows_the_plain_mean_beside_the_
     assert f"{result['nees_not_lost'][-1]:.3f}" in row
     assert result["nees"][-1] > 20 > 6 > result["nees_not_lost"][-1]
     assert row.count("5.0%") == 2
+
+
+def test_the_figure_is_titled_by_the_verdicts_and_its_curves_by_what_was_lost():
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=20)
+    study = with_nees(study, 7, 2, 400.0)
+    summary = jaxslam.summarise(study)
+    axes = plot_consistency(study, summary).axes[0]
+    verdict = sentences(summary["filters"]["inverse_scaling"]["verdict"])[0]
+    assert axes.get_title(loc="left").splitlines()[1:] == [f"inverse_scaling: {verdict}"]
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert any("of steps in the band, lost 0.0% at the end, 5.0% ever" in text for text in labels)
 
 
 def test_a_study_resumes_from_its_folder_and_refuses_another(tmp_path):
