@@ -136,6 +136,13 @@ def test_a_few_lost_runs_are_named_and_judged_apart():
     assert others.startswith("3 of 1000 runs were lost, the 997 never lost: NEES 2.98, σ right")
 
 
+def test_of_runs_that_are_chosen_by_their_nees_no_verdict_is_said():
+    nees = consistent()
+    nees[:11, 5] = 1e3
+    expected = f"11 of 1000 runs were lost, the 989 never lost: NEES {nees[11:].mean():.2f}"
+    assert sentences(run_verdict(nees, 3))[2] == expected
+
+
 def test_a_run_that_is_lost_and_comes_back_was_lost():
     nees = consistent()
     nees[4, 7] = 22.0

@@ -152,15 +152,24 @@ def run_verdict(nees: Float[np.ndarray, "runs steps"], dof: int) -> dict[str, An
 
 
 def sentences(found: dict[str, Any]) -> list[str]:
-    """A verdict in words, and that at the last step; of the runs never lost, where some were."""
+    """A verdict in words, and that at the last step; of the runs never lost, where some were.
+
+    Where more than a few were, the others are chosen by their NEES: no verdict is said of them.
+    """
     end, kept, runs = found["end"], found["never_lost"], found["runs"]
     told = [headline(found)]
     if end["nees"] is not None:
         told.append(f"at the last step: {_said(end)}")
     if lost := runs - kept["runs"]:
-        others = f"the {kept['runs']} never lost: {_said(kept)}" if kept["runs"] else "all of them"
-        told.append(f"{lost} of {runs} runs were lost, {others}")
+        told.append(f"{lost} of {runs} runs were lost, {_others(kept, lost / runs)}")
     return told
+
+
+def _others(kept: dict[str, Any], lost: float) -> str:
+    if not kept["runs"]:
+        return "all of them"
+    said = _said(kept) if lost <= LOST_BOUND else f"NEES {_digits(kept['nees'])}"
+    return f"the {kept['runs']} never lost: {said}"
 
 
 def headline(found: dict[str, Any]) -> str:
