@@ -163,7 +163,7 @@ def _numbers(f: dict[str, Any], runs: int) -> dict[str, Any]:
         "dof": f["dof"],
         "lost": lost,
         "diverged": f["diverged"],
-        "verdict": verdict(nees, lost, dof=f["dof"], runs=max(runs - f["diverged"], 1)),
+        "verdict": verdict(nees, lost, dof=f["dof"], runs=runs, diverged=f["diverged"]),
         "rmse_m": rmse,
         "sigma_over_rmse": sigma / rmse if rmse and sigma else None,
         "nis_per_dof": float(np.nansum(np.array(f["nis"], float)))

@@ -265,8 +265,8 @@ def judged(rows: list[Row], lost_bound: float) -> list[Row]:
     """The rows with a `verdict` by the 95 % band, and one by the band of all rows `together`."""
 
     def verdicts(row):
-        runs = max(row["runs"] - row["diverged"], 1)
-        judge = partial(verdict, row["nees"], row["lost"], dof=row["dof"], runs=runs)
+        numbers = {name: row[name] for name in ("dof", "runs", "diverged")}
+        judge = partial(verdict, row["nees"], row["lost"], **numbers)
         return {
             "verdict": judge(lost_bound=lost_bound),
             "together": judge(lost_bound=lost_bound, comparisons=len(rows)),

@@ -11,7 +11,14 @@ from jaxslam.cli import main
 SMALL = ["consistency", "--scenario", "matched-tight", "--steps", "5", "--runs", "6"]
 FILTER_KEYS = {
     "dof", "band95", "nees", "nees_median", "lost", "inside", "nis", "nis_dof", "rmse", "sigma",
-    "landmark_nees", "landmark_dof", "diverged", "seconds",
+    "landmark_nees", "landmark_dof", "landmark_not_finite", "diverged", "seconds", "lost_ever",
+    "survivors", "verdict",
+}  # fmt: skip
+
+
+VERDICT_KEYS = {
+    "nees", "sigma_factor", "interval99", "p", "word", "runs", "lost", "diverged", "end",
+    "never_lost",
 }  # fmt: skip
 
 
@@ -24,9 +31,12 @@ def test_consistency_writes_what_others_read(tmp_path, capsys):
     assert set(summary["filters"]) == {"robocentric/inverse_scaling", "robocentric/inverse_depth"}
     for result in summary["filters"].values():
         assert result.keys() >= FILTER_KEYS
-        assert len(result["nees"]) == len(result["lost"]) == 5
+        assert result["verdict"].keys() >= VERDICT_KEYS
+        assert len(result["nees"]) == len(result["lost"]) == len(result["lost_ever"]) == 5
     assert (tmp_path / "consistency.png").read_bytes().startswith(b"\x89PNG")
-    assert "robocentric/inverse_depth" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert printed.startswith("robocentric/inverse_scaling:\n    NEES ")
+    assert "robocentric/inverse_depth" in printed
     left = {path.name for path in tmp_path.iterdir()}
     assert left == {"consistency.json", "consistency.png", "runs"}
 

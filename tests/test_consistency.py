@@ -2,13 +2,22 @@
 
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 import jaxslam
-from jaxslam.consistency import FolderStore, MemoryStore, lost_threshold
+from jaxslam.consistency import (
+    FolderStore,
+    MemoryStore,
+    lost_threshold,
+    run_verdict,
+    sentences,
+    tally,
+)
 from jaxslam.consistency.statistics import chi2_cdf, chi2_quantile, normalised_squared
+from jaxslam.plots.consistency import plot_consistency
 
 SCENARIO = jaxslam.scenario("matched-tight", steps=6, landmarks=5)
 
@@ -80,21 +89,79 @@ def test_filters_meet_the_same_worlds():
     assert not np.array_equal(samples[0]["nees"], samples[1]["nees"])
 
 
+def with_nees(study, run, steps, value, name="inverse_scaling"):
+    """The study with another NEES of a run at some steps."""
+    store = MemoryStore()
+    for chunk in study.chunks:
+        records = study.store.load(name, chunk)
+        nees = records["nees"].copy()
+        if run in chunk:
+            nees[run - chunk.start, steps] = value
+        store.save(name, chunk, {**records, "nees": nees})
+    return replace(study, store=store)
+
+
 def test_a_diverged_run_is_counted_and_spoils_no_other():
     study = jaxslam.monte_carlo(SCENARIO, filters(), runs=6, chunk=3)
     before = jaxslam.summarise(study)["filters"]["inverse_scaling"]
-    records = study.store.load("inverse_scaling", study.chunks[1])
-    broken = {**records, "nees": records["nees"].copy()}
-    broken["nees"][1, 3:] = np.nan
-    store = MemoryStore()
-    store.save("inverse_scaling", study.chunks[0], study.store.load("inverse_scaling", range(3)))
-    store.save("inverse_scaling", study.chunks[1], broken)
-    after = jaxslam.summarise(replace(study, store=store))["filters"]["inverse_scaling"]
+    summary = jaxslam.summarise(with_nees(study, 4, slice(3, None), np.nan))
+    after = summary["filters"]["inverse_scaling"]
     good = np.delete(all_runs(study)["nees"], 4, axis=0)
     assert (before["diverged"], after["diverged"]) == (0, 1)
     np.testing.assert_allclose(after["nees"], good.mean(axis=0))
     assert after["band95"] == list(jaxslam.mean_band(3, 5))
-    assert after["lost"][-1] == pytest.approx(before["lost"][-1] + 1 / 6)
+    assert (before["survivors"], after["survivors"]) == (6, 5)
+    for key in ("lost", "lost_ever"):
+        assert after[key][-1] == pytest.approx(before[key][-1] + 1 / 6)
+    # It is not dropped from the verdict: of six runs there is no mean.
+    assert (before["verdict"]["word"], after["verdict"]["word"]) == ("consistent", "lost")
+    assert after["verdict"]["nees"] is None
+    table = jaxslam.table(summary)
+    assert "1 of 6 runs diverged, no mean NEES: lost" in table
+    assert "means and band are of the 5 runs that did not diverge" in table
+
+
+def test_a_run_that_comes_back_was_lost_ever():
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=4, chunk=2)
+    study = with_nees(with_nees(study, 1, 2, 30.0), 3, [2, 4], 25.0)
+    result = jaxslam.summarise(study)["filters"]["inverse_scaling"]
+    assert result["lost"] == [0, 0, 0.5, 0, 0.25, 0]
+    assert result["lost_ever"] == [0, 0, 0.5, 0.5, 0.5, 0.5]
+    assert result["verdict"]["lost"] == 0.5
+
+
+class OneLandmarkUnknown:
+    """A filter that has no covariance for slot 0."""
+
+    def __init__(self, inner):
+        self.inner = inner
+
+    def __getattr__(self, name):
+        return getattr(self.inner, name)
+
+    def landmarks_in_camera(self, state, parameters, slots):
+        chart, covariance = self.inner.landmarks_in_camera(state, parameters, slots)
+        return chart, jnp.where((slots == 0)[:, None, None], jnp.nan, covariance)
+
+
+def test_a_landmark_without_a_finite_nees_is_counted_and_spoils_no_other():
+    one = {"name": OneLandmarkUnknown(filters()["inverse_scaling"])}
+    study = jaxslam.monte_carlo(SCENARIO, one, runs=3, chunk=2)
+    whole = jaxslam.monte_carlo(SCENARIO, {"name": one["name"].inner}, runs=3, chunk=2)
+    summary = jaxslam.summarise(study)
+    found, expected = (jaxslam.summarise(s)["filters"]["name"] for s in (study, whole))
+    assert expected["landmark_not_finite"] == [0] * 6
+    runs = all_runs(study, "name")
+    np.testing.assert_array_equal(runs["landmark_not_finite"], 1)  # slot 0 is always in view
+    assert found["landmark_not_finite"] == [3] * 6
+    four = runs["landmark_nees"] * (runs["landmark_count"] - 1)
+    five = all_runs(whole, "name")["landmark_nees"] * runs["landmark_count"]
+    assert (four < five).all()
+    np.testing.assert_allclose(
+        found["landmark_nees"], four.sum(0) / (runs["landmark_count"] - 1).sum(0)
+    )
+    assert "name: 18 NEES of landmarks are not finite" in jaxslam.table(summary)
+    assert "not finite" not in jaxslam.table(jaxslam.summarise(whole))
 
 
 def test_the_summary_is_that_of_the_runs():
@@ -113,7 +180,37 @@ def test_the_summary_is_that_of_the_runs():
     inside = [low <= value <= high for value in result["nees"]]
     assert result["inside"] == pytest.approx(np.mean(inside))
     assert summary["steps"] == len(result["nees"]) == len(summary["time"]) == 6
-    assert "inverse_scaling" in jaxslam.table(summary)
+    expected = run_verdict(runs["nees"], 3)
+    assert result["verdict"]["interval99"] == pytest.approx(expected["interval99"])
+    assert result["verdict"]["end"]["p"] == pytest.approx(expected["end"]["p"])
+    assert tally(study, "inverse_scaling").average.mean == pytest.approx(runs["nees"].mean())
+
+
+def test_the_table_begins_with_the_verdicts_and_shows_the_plain_mean_beside_the_others():
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=20)
+    study = with_nees(study, 7, slice(4, None), 400.0)
+    summary = jaxslam.summarise(study)
+    result = summary["filters"]["inverse_scaling"]
+    title, verdict, _, others, _, header, row, *_ = jaxslam.table(summary).splitlines()
+    assert title == "inverse_scaling:"
+    assert verdict.strip() == sentences(result["verdict"])[0]
+    assert others.strip().startswith("1 of 20 runs were lost, the 19 never lost: NEES")
+    assert header.split()[:3] == ["filter/landmarks", "NEES", "mean"]
+    assert f"{result['nees'][-1]:.3f}" in row
+    assert f"{result['nees_not_lost'][-1]:.3f}" in row
+    assert result["nees"][-1] > 20 > 6 > result["nees_not_lost"][-1]
+    assert row.count("5.0%") == 2
+
+
+def test_the_figure_is_titled_by_the_verdicts_and_its_curves_by_what_was_lost():
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=20)
+    study = with_nees(study, 7, 2, 400.0)
+    summary = jaxslam.summarise(study)
+    axes = plot_consistency(study, summary).axes[0]
+    verdict = sentences(summary["filters"]["inverse_scaling"]["verdict"])[0]
+    assert axes.get_title(loc="left").splitlines()[1:] == [f"inverse_scaling: {verdict}"]
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert any("of steps in the band, lost 0.0% at the end, 5.0% ever" in text for text in labels)
 
 
 def test_a_study_resumes_from_its_folder_and_refuses_another(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 
 import jaxslam
 from jaxslam.filters import RECOMMENDED, make_filter
-from jaxslam.filters.bank import BEHIND, BankState, log_likelihoods
+from jaxslam.filters.bank import BEHIND, BankState, _mixed, log_likelihoods
 from jaxslam.filters.split_and_merge import _split_and_merged
 from jaxslam.filters.state import Innovation
 from jaxslam.landmarks import LANDMARKS
@@ -68,6 +68,18 @@ def test_a_divided_prior_has_the_moments_of_the_whole(name):
     np.testing.assert_allclose(mean, velocity, atol=1e-9)
     covariance = np.tensordot(weights, own, 1) + spread
     np.testing.assert_allclose(covariance, np.diag(np.square(sigma)), rtol=1e-9, atol=1e-12)
+
+
+def test_a_member_without_weight_spoils_no_prediction():
+    """Once diverged it is NaN, and of likelihood zero."""
+    predicted = jnp.array([[[1.0], [2.0]], [[3.0], [6.0]], [[jnp.nan], [jnp.nan]]])
+    covariance = jnp.stack([jnp.eye(2), jnp.eye(2), jnp.full((2, 2), jnp.nan)])
+    innovations = Innovation(
+        predicted, -predicted, covariance, jnp.ones((3, 2), bool), jnp.array([5.0, 45.0, jnp.nan])
+    )
+    mixed = _mixed(innovations, jnp.log(jnp.array([0.75, 0.25, 0.0])))
+    np.testing.assert_allclose(mixed.predicted[:, 0], [1.5, 3.0])
+    np.testing.assert_allclose(mixed.residual, -mixed.predicted)
 
 
 @cache

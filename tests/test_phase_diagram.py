@@ -54,6 +54,8 @@ def test_lost_runs_come_first_and_their_bound_is_not_lost_yet():
     assert verdict(3.0, 0.04, dof=3, runs=1000, lost_bound=0.05) == "consistent"
     for nees in (None, float("nan")):
         assert verdict(nees, 0.0, dof=3, runs=1000) == "lost"
+    # The mean of those that did not diverge is no mean of all.
+    assert verdict(3.0, 0.001, dof=3, runs=1000, diverged=1) == "lost"
 
 
 def test_many_comparisons_are_inside_their_band_together():
@@ -260,6 +262,8 @@ def test_the_page_counts_what_the_rows_say():
         *("consistent", "consistent", "over-confident", "lost"),
         *("consistent", "consistent", "consistent", "under-confident"),
     ]
+    (diverged,) = phase_diagram.judged([synthetic_rows()[0] | {"diverged": 1}], 0.01)
+    assert (diverged["verdict"], diverged["together"]) == ("lost", "lost")
     page = phase_diagram.page(rows, SYNTHETIC)
     assert "| robocentric/inverse_scaling | sideways | 8 | 50% | 62% | 12% | 12% | 12% |" in page
     assert "| robocentric/inverse_scaling | sideways | 0.5 |" in page

@@ -17,7 +17,7 @@ from jaxslam.filters import CALIBRATIONS, FILTERS, MODIFIERS, RECOMMENDED, Filte
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.simulation.scenario import BUILT_IN, Scenario, parse_override, scenario
 
-LAYOUT = 2
+LAYOUT = 3
 """Version of the records on disk, so that `--resume` never mixes two."""
 
 

@@ -2,14 +2,15 @@
 
 from jaxslam.consistency.montecarlo import CHUNK, DTYPES, Study, monte_carlo
 from jaxslam.consistency.statistics import (
+    PowerSums,
     chi2_quantile,
     lost_threshold,
     mean_band,
     normalised_squared,
 )
 from jaxslam.consistency.store import FolderStore, MemoryStore
-from jaxslam.consistency.summary import summarise, table
-from jaxslam.consistency.verdict import VERDICTS, verdict
+from jaxslam.consistency.summary import summarise, table, tally
+from jaxslam.consistency.verdict import VERDICTS, Tally, run_verdict, sentences, verdict
 
 __all__ = [
     "CHUNK",
@@ -17,13 +18,18 @@ __all__ = [
     "VERDICTS",
     "FolderStore",
     "MemoryStore",
+    "PowerSums",
     "Study",
+    "Tally",
     "chi2_quantile",
     "lost_threshold",
     "mean_band",
     "monte_carlo",
     "normalised_squared",
+    "run_verdict",
+    "sentences",
     "summarise",
     "table",
+    "tally",
     "verdict",
 ]

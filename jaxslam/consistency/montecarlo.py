@@ -188,7 +188,8 @@ def filter_run(
 
     The records hold, per step: `nees` of the pose; `nis` and `nis_dof`; `error` and `variance`
     of the camera's position (in camera axes) and orientation; the mean `landmark_nees` of the
-    landmarks seen, in the sensor's chart, and their number.
+    landmarks seen, in the sensor's chart, where it is finite, their number, and of how many it
+    is not.
     """
     parameters = prior.parameters
     first, seen, new = features(run, capacity)
@@ -205,17 +206,14 @@ def filter_run(
         seen, new, control, T_BC = data
         state, innovation = slam_filter.step(state, parameters, control, seen, new)
         estimate, covariance = slam_filter.camera_pose(state)
-        landmark_nees, landmark_count = _landmark_nees(
-            slam_filter, state, parameters, seen, T_BC, run.points
-        )
+        landmarks = _landmark_nees(slam_filter, state, parameters, seen, T_BC, run.points)
         records = {
             "nees": normalised_squared(*slam_filter.pose_error(state, T_BC)),
             "nis": innovation.nis,
             "nis_dof": innovation.nis_dof.astype(innovation.nis.dtype),
             "error": _camera_error(estimate, T_BC),
             "variance": jnp.diagonal(covariance),
-            "landmark_nees": landmark_nees,
-            "landmark_count": landmark_count,
+            **landmarks,
         }
         return state, (records, estimate)
 
@@ -235,16 +233,20 @@ def _camera_error(estimate: Pose, truth: Pose) -> Array:
     )
 
 
-def _landmark_nees(slam_filter, state, parameters, seen, T_BC, points):
-    """Mean over the landmarks seen that are in the map, and how many; of none, 0 of 0."""
+def _landmark_nees(slam_filter, state, parameters, seen, T_BC, points) -> dict[str, Array]:
+    """Of the landmarks seen that are in the map: the mean of what is finite, and both numbers."""
     counted = seen.valid & slam_filter.reported(state).active[seen.slots]
     truth = jax.vmap(T_BC.inverse().apply)(points[seen.slots])
     truth = jax.vmap(slam_filter.rig.sensor.chart)(truth, jnp.ones_like(truth[:, 0]))
     chart, covariance = slam_filter.landmarks_in_camera(state, parameters, seen.slots)
     nees = jax.vmap(normalised_squared)(truth - chart, covariance)
-    count = jnp.sum(counted)
-    total = jnp.sum(jnp.where(counted, nees, 0.0))
-    return total / jnp.maximum(count, 1), count.astype(nees.dtype)
+    finite = counted & jnp.isfinite(nees)
+    total = jnp.sum(jnp.where(finite, nees, 0.0))
+    return {
+        "landmark_nees": total / jnp.maximum(jnp.sum(finite), 1),
+        "landmark_count": jnp.sum(counted).astype(nees.dtype),
+        "landmark_not_finite": jnp.sum(counted & ~finite).astype(nees.dtype),
+    }
 
 
 def check_sizes(runs: int, seed: int, dtype: str, chunk: int) -> None:

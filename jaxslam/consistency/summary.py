@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from functools import reduce
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ import numpy as np
 from jaxslam.consistency.montecarlo import Study
 from jaxslam.consistency.statistics import lost_threshold, mean_band
 from jaxslam.consistency.store import Records
+from jaxslam.consistency.verdict import Tally, sentences
 
 SCHEMA = 1
 _STEPS_AT_ONCE = 50
@@ -20,8 +23,11 @@ _STEPS_AT_ONCE = 50
 def summarise(study: Study) -> dict[str, Any]:
     """The content of `consistency.json`, ready for `json.dumps`.
 
-    Means are over the runs that did not diverge; a run diverges when its NEES is not finite, or
-    its covariance not positive definite, at any step. `lost` counts diverged runs as lost.
+    A run diverges when its NEES is not finite, or its covariance not positive definite, at any
+    step. With such a run the verdict has no mean; the means of every step are over the
+    `survivors`, and `band95` and `inside` are of so many. `lost` (at the step) and `lost_ever`
+    (at any so far) count diverged runs as lost. `landmark_nees` is over the landmarks whose NEES
+    is finite; of the surviving runs' `landmark_not_finite` had one that is not.
     """
     from jaxslam import __version__
 
@@ -60,13 +66,16 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
 
     seconds = study.seconds[name]
     return {
+        "verdict": tally(study, name).verdict(),
         "dof": dof,
         "calibration": study.filters[name].calibration,
+        "survivors": int(healthy),
         "band95": [low, high],
         "nees": _numbers(mean),
         "nees_median": _numbers(_median(study, name)),
         "nees_not_lost": _numbers(kept),
         "lost": _numbers((sums["lost"] + sums["diverged"]) / study.runs),
+        "lost_ever": _numbers((sums["lost_ever"] + sums["diverged"]) / study.runs),
         "inside": float(np.mean((mean >= low) & (mean <= high))),
         "nis": _numbers(nis),
         "nis_dof": _numbers(nis_dof),
@@ -74,6 +83,7 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
         "sigma": by_part(variance),
         "landmark_nees": _numbers(landmark),
         "landmark_dof": n,
+        "landmark_not_finite": [int(count) for count in sums["landmark_not_finite"]],
         "diverged": int(sums["diverged"]),
         "seconds": {"compile": seconds.compile, "run": seconds.run},
     }
@@ -87,22 +97,30 @@ def _sums(study: Study, name: str, dof: int) -> dict[str, Any]:
         good = {k: v[healthy] for k, v in records.items() if not k.startswith("sample_")}
         with np.errstate(invalid="ignore"):
             kept = good["nees"] <= threshold
-        seen = np.where(np.isfinite(good["landmark_nees"]), good["landmark_count"], 0.0)
+        finite = good["landmark_count"] - good["landmark_not_finite"]
         part = {
             "diverged": np.sum(~healthy),
             "nees": good["nees"].sum(axis=0),
             "kept": kept.sum(axis=0),
             "kept_nees": np.where(kept, good["nees"], 0.0).sum(axis=0),
             "lost": (~kept).sum(axis=0),
+            "lost_ever": np.logical_or.accumulate(~kept, axis=1).sum(axis=0),
             "nis": good["nis"].sum(axis=0),
             "nis_dof": good["nis_dof"].sum(axis=0),
             "squared_error": (good["error"] ** 2).sum(axis=0),
             "variance": good["variance"].sum(axis=0),
-            "landmark_nees": (np.nan_to_num(good["landmark_nees"], posinf=0.0) * seen).sum(axis=0),
-            "landmark_count": seen.sum(axis=0),
+            "landmark_nees": (good["landmark_nees"] * finite).sum(axis=0),
+            "landmark_count": finite.sum(axis=0),
+            "landmark_not_finite": good["landmark_not_finite"].sum(axis=0),
         }
         total = {key: total.get(key, 0) + value for key, value in part.items()}
     return total
+
+
+def tally(study: Study, name: str) -> Tally:
+    """What the verdict on one filter is made of; tallies of other seeds may be added."""
+    dof = study.scenario.rig.geometry.tangent_dim
+    return reduce(add, (Tally.of(r["nees"], dof) for r in _chunks(study, name, ("nees",))))
 
 
 def _median(study: Study, name: str) -> np.ndarray:
@@ -133,28 +151,49 @@ def _numbers(values: np.ndarray) -> list[float | None]:
 
 
 def table(summary: dict[str, Any]) -> str:
-    """The summary's last step as text, one filter a line."""
-    wide = max(31, *map(len, summary["filters"])) + 1
+    """The verdict on every filter, then the numbers of the last step, one filter a line."""
+    filters = summary["filters"]
+    wide = max(31, *map(len, filters)) + 1
     header = (
-        f"{'filter/landmarks':<{wide}}{'NEES mean':>10}{'median':>8}{'95 % band':>14}{'inside':>8}"
-        f"{'lost':>7}{'diverged':>9}{'NIS/dof':>8}{'RMSE m':>8}{'σ m':>8}{'seconds':>9}"
+        f"{'filter/landmarks':<{wide}}{'NEES mean':>10}{'95 % band':>14}{'median':>8}{'others':>8}"
+        f"{'lost':>7}{'ever':>7}{'diverged':>9}{'NIS/dof':>8}{'RMSE m':>8}{'σ m':>8}{'seconds':>9}"
     )
-    lines = [header]
-    for name, f in summary["filters"].items():
-        with np.errstate(invalid="ignore"):  # a filter that compares nothing has no NIS
-            nis = np.nansum(np.array(f["nis"], float)) / np.nansum(np.array(f["nis_dof"], float))
-        band = f"{f['band95'][0]:.3f}–{f['band95'][1]:.3f}"
-        lines.append(
-            f"{name:<{wide}}{_last(f['nees'], 10, 3)}{_last(f['nees_median'], 8, 2)}{band:>14}"
-            f"{f['inside']:>7.0%} {_share(f['lost'][-1]):>6}{f['diverged']:>9d}{nis:>8.3f}"
-            f"{_last(f['rmse']['position'], 8, 3)}{_last(f['sigma']['position'], 8, 3)}"
-            f"{f['seconds']['compile'] + f['seconds']['run']:>9.1f}"
-        )
-    lines.append(
-        f"last of {summary['steps']} steps, {summary['runs']} runs; a consistent filter has mean "
-        f"NEES {next(iter(summary['filters'].values()))['dof']}; inside: share of steps in band"
+    return "\n".join(
+        [
+            *("\n    ".join([f"{name}:", *sentences(f["verdict"])]) for name, f in filters.items()),
+            "",
+            header,
+            *(_row(f"{name:<{wide}}", f) for name, f in filters.items()),
+            f"last of {summary['steps']} steps, {summary['runs']} runs of seed {summary['seed']}; "
+            f"a consistent filter has mean NEES {next(iter(filters.values()))['dof']}; verdicts: "
+            "of time averages, [99 % interval]",
+            "lost: NEES above the 99.99 % quantile of χ² now, ever: at any step; others: mean of "
+            "those not lost now",
+            *_notes(filters),
+        ]
     )
-    return "\n".join(lines)
+
+
+def _row(name: str, f: dict[str, Any]) -> str:
+    with np.errstate(invalid="ignore"):  # a filter that compares nothing has no NIS
+        nis = np.nansum(np.array(f["nis"], float)) / np.nansum(np.array(f["nis_dof"], float))
+    band = f"{f['band95'][0]:.3f}–{f['band95'][1]:.3f}"
+    return (
+        f"{name}{_last(f['nees'], 10, 3)}{band:>14}{_last(f['nees_median'], 8, 2)}"
+        f"{_last(f['nees_not_lost'], 8, 3)}{_share(f['lost'][-1]):>7}"
+        f"{_share(f['lost_ever'][-1]):>7}{f['diverged']:>9d}{nis:>8.3f}"
+        f"{_last(f['rmse']['position'], 8, 3)}{_last(f['sigma']['position'], 8, 3)}"
+        f"{f['seconds']['compile'] + f['seconds']['run']:>9.1f}"
+    )
+
+
+def _notes(filters: dict[str, Any]) -> Iterator[str]:
+    """What the means of the table leave out."""
+    for name, f in filters.items():
+        if f["diverged"]:
+            yield f"{name}: means and band are of the {f['survivors']} runs that did not diverge"
+        if count := sum(f["landmark_not_finite"]):
+            yield f"{name}: {count} NEES of landmarks are not finite, and not in their mean"
 
 
 def _last(values: list[float | None], width: int, digits: int) -> str:

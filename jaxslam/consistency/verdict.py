@@ -1,14 +1,203 @@
-"""What a mean NEES says of a filter, alone and as one of many comparisons."""
+"""What NEES says of a filter: by how much its covariance is wrong, in one study and on a map.
+
+A `Tally` is the verdict on one study, over all its steps; `verdict` is that on one mean at one
+step, alone and as one of many comparisons.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import asdict, dataclass
+from typing import Any
 
-from jaxslam.consistency.statistics import CONFIDENCE, mean_band
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam.consistency.statistics import (
+    CONFIDENCE,
+    PowerSums,
+    chernoff_p_value,
+    chi2_p_value,
+    lost_threshold,
+    mean_band,
+    mean_interval,
+    mean_p_value,
+)
 
 VERDICTS = ("consistent", "under-confident", "over-confident", "lost")
 LOST_BOUND = 0.01
 """More lost runs than this share make a filter lost: 100 times what a consistent one loses."""
+VERDICT_CONFIDENCE = 0.99
+"""Of the interval of a study; a consistent filter is called inconsistent once in 100 studies."""
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What a study's verdict needs of its runs: numbers that add up, over chunks and over seeds.
+
+    The steps of a run are correlated, runs are not: each run gives one number, the average of
+    its NEES over time, and its NEES at the end.
+    """
+
+    dof: int
+    runs: int
+    diverged: int
+    """Runs with a NEES that is not finite: they have no average, and a study with one no mean."""
+    lost: int
+    """Runs lost at any step, diverged ones too."""
+    average: PowerSums
+    """Time averages of the runs that did not diverge."""
+    end: PowerSums
+    """NEES at the last step of the runs that did not diverge."""
+    never_lost: PowerSums
+    """Time averages of the runs never lost."""
+
+    @staticmethod
+    def of(nees: Float[np.ndarray, "runs steps"], dof: int) -> Tally:
+        nees = np.asarray(nees, np.float64)
+        healthy = np.isfinite(nees).all(axis=1)
+        good = nees[healthy]
+        average, kept = good.mean(axis=1), (good <= lost_threshold(dof)).all(axis=1)
+        return Tally(
+            dof,
+            len(nees),
+            int(np.sum(~healthy)),
+            int(len(nees) - np.sum(kept)),
+            PowerSums.of(average),
+            PowerSums.of(good[:, -1]),
+            PowerSums.of(average[kept]),
+        )
+
+    @staticmethod
+    def from_dict(numbers: dict[str, Any]) -> Tally:
+        """Of what `asdict` made of it."""
+        counts = (numbers[name] for name in ("dof", "runs", "diverged", "lost"))
+        sums = (PowerSums(**numbers[name]) for name in ("average", "end", "never_lost"))
+        return Tally(*counts, *sums)
+
+    def asdict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    def __add__(self, other: Tally) -> Tally:
+        if self.dof != other.dof:
+            raise ValueError(f"runs of {self.dof} and of {other.dof} dof are not one study")
+        names = ("runs", "diverged", "lost", "average", "end", "never_lost")
+        return Tally(self.dof, *(getattr(self, name) + getattr(other, name) for name in names))
+
+    def verdict(self) -> dict[str, Any]:
+        """The key `verdict` of `consistency.json`.
+
+        `nees` is the mean of the runs' time averages, `sigma_factor` is √(nees/dof): every σ
+        should be so many times as large, with its 99 % interval (`mean_interval`). `p` is of a
+        consistent filter: the smaller of Hall's, for what the runs themselves scatter, and of
+        Chernoff's bound for χ², as a few lost runs scatter so much that they hide themselves.
+        `end` is the same at the last step, where p is exact. With a diverged run no mean exists
+        and the word is lost. `never_lost` is the verdict on the runs never lost: robust, and low
+        by construction, by .1–.4 % of NEES for a consistent filter over 60 steps.
+        """
+        never_lost = self.never_lost
+        return {
+            **_judged(self.average, self.dof, self.diverged),
+            "runs": self.runs,
+            "lost": self.lost / self.runs,
+            "diverged": self.diverged,
+            "end": _at_the_end(self.end, self.dof, self.diverged),
+            "never_lost": {**_judged(never_lost, self.dof), "runs": never_lost.count},
+        }
+
+
+def _judged(sums: PowerSums, dof: int, diverged: int = 0) -> dict[str, Any]:
+    factor = _factor(sums, dof, diverged)
+    if diverged or not sums.count:
+        return {**factor, "p": 0.0, "word": "lost"}
+    bounds = mean_p_value(sums, dof), chernoff_p_value(sums.mean, dof, sums.count)
+    p = float(np.nanmin(bounds))
+    return {**factor, "p": p, "word": _word(p, sums.mean > dof)}
+
+
+def _at_the_end(sums: PowerSums, dof: int, diverged: int) -> dict[str, Any]:
+    factor = _factor(sums, dof, diverged)
+    if diverged or not sums.count:
+        return {**factor, "p": 0.0, "word": "lost"}
+    p = chi2_p_value(sums.mean, dof, sums.count)
+    return {**factor, "p": p, "word": _word(p, sums.mean > dof)}
+
+
+def _factor(sums: PowerSums, dof: int, diverged: int) -> dict[str, Any]:
+    if diverged or not sums.count:
+        return {"nees": None, "sigma_factor": None, "interval99": [None, None]}
+    low_high = mean_interval(sums, VERDICT_CONFIDENCE)
+    return {
+        "nees": sums.mean,
+        "sigma_factor": math.sqrt(sums.mean / dof),
+        "interval99": [math.sqrt(m / dof) if math.isfinite(m) else None for m in low_high],
+    }
+
+
+def _word(p: float, above: bool) -> str:
+    if p >= 1 - VERDICT_CONFIDENCE:
+        return "consistent"
+    return "over-confident" if above else "under-confident"
+
+
+def run_verdict(nees: Float[np.ndarray, "runs steps"], dof: int) -> dict[str, Any]:
+    """The verdict on one study from the NEES of its independent runs, see `Tally.verdict`.
+
+    Raises ValueError unless there are runs, steps and degrees of freedom.
+    """
+    nees = np.asarray(nees)
+    if nees.ndim != 2 or not nees.size or dof < 1:
+        raise ValueError(f"NEES must be (runs, steps) with dof ≥ 1, not {nees.shape} and {dof}")
+    return Tally.of(nees, dof).verdict()
+
+
+def sentences(found: dict[str, Any]) -> list[str]:
+    """A verdict in words, and that at the last step; of the runs never lost, where some were.
+
+    Where more than a few were, the others are chosen by their NEES: no verdict is said of them.
+    """
+    end, kept, runs = found["end"], found["never_lost"], found["runs"]
+    told = [headline(found)]
+    if end["nees"] is not None:
+        told.append(f"at the last step: {_said(end)}")
+    if lost := runs - kept["runs"]:
+        told.append(f"{lost} of {runs} runs were lost, {_others(kept, lost / runs)}")
+    return told
+
+
+def _others(kept: dict[str, Any], lost: float) -> str:
+    if not kept["runs"]:
+        return "all of them"
+    said = _said(kept) if lost <= LOST_BOUND else f"NEES {_digits(kept['nees'])}"
+    return f"the {kept['runs']} never lost: {said}"
+
+
+def headline(found: dict[str, Any]) -> str:
+    """The verdict on all runs: `NEES 4.72, σ too small by 1.25 [1.24, 1.27]: over-confident`."""
+    if found["nees"] is None:
+        return f"{found['diverged']} of {found['runs']} runs diverged, no mean NEES: lost"
+    return _said(found)
+
+
+def _said(found: dict[str, Any]) -> str:
+    factors = [found["sigma_factor"], *found["interval99"]]
+    told = "right up to a factor"
+    if found["word"] != "consistent":
+        told = "too small by"
+        if factors[0] < 1:
+            told, factors = "too large by", [_inverse(factors[i]) for i in (0, 2, 1)]
+    factor, low, high = ("–" if f is None else _digits(f) for f in factors)
+    p = f"p = {found['p']:.2g}" if found["p"] >= 1e-4 else "p < 0.0001"
+    said = f"NEES {_digits(found['nees'])}, σ {told} {factor} [{low}, {high}]"
+    return f"{said}: {found['word']} ({p})"
+
+
+def _inverse(factor: float | None) -> float | None:
+    return 1 / factor if factor else None
+
+
+def _digits(value: float) -> str:
+    return f"{value:.2f}" if value < 100 else f"{value:.3g}"
 
 
 def verdict(
@@ -17,6 +206,7 @@ def verdict(
     *,
     dof: int,
     runs: int,
+    diverged: int = 0,
     comparisons: int = 1,
     lost_bound: float = LOST_BOUND,
 ) -> str:
@@ -25,7 +215,7 @@ def verdict(
     `lost` comes first; then a mean NEES below the 95 % band is under-confident (σ too large), one
     above it over-confident. With m comparisons the band is Bonferroni's, at 1 − 0.05/m: it holds
     all means of m consistent filters together in 95 % of cases, however they are correlated. A
-    mean that does not exist (None or NaN: every run diverged) is lost.
+    mean that does not exist (None or NaN, or of runs of which one diverged) is lost.
 
     Raises ValueError for numbers that make no sense.
     """
@@ -34,7 +224,7 @@ def verdict(
     for name, share in (("lost", lost), ("lost_bound", lost_bound)):
         if not 0 <= share <= 1:
             raise ValueError(f"{name} must be a share from 0 to 1, not {share}")
-    if lost > lost_bound or nees is None or math.isnan(nees):
+    if lost > lost_bound or diverged or nees is None or math.isnan(nees):
         return "lost"
     low, high = mean_band(dof, runs, together(comparisons))
     if nees < low:

@@ -232,6 +232,7 @@ def _mixed(innovations: Innovation, log_weights) -> Innovation:
     )
     weights = jnp.exp(log_weights)
     used = jnp.any(innovations.used, axis=0)
-    predicted = jnp.tensordot(weights, innovations.predicted, axes=1)
+    sure = jnp.where(weights[:, None, None] > 0, innovations.predicted, 0.0)
+    predicted = jnp.tensordot(weights, sure, axes=1)
     whitened = cholesky(covariance).whitening @ residual
     return Innovation(predicted, residual.reshape(m, p), covariance, used, whitened @ whitened)

@@ -12,6 +12,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from jaxslam.consistency import Study, summarise
 from jaxslam.consistency.statistics import chi2_quantile
+from jaxslam.consistency.verdict import headline
 from jaxslam.plots.style import GREY, line_style, new_figure, save
 
 _FARTHEST = 1 / 60
@@ -47,15 +48,12 @@ def _plot_nees(axes: Axes, summary: dict[str, Any]) -> None:
     time = np.array(summary["time"])
     first = next(iter(summary["filters"].values()))
     low, high = first["band95"]
-    axes.axhspan(low, high, color=GREY, alpha=0.25, lw=0, label="exact 95 % band of the mean")
+    band = f"exact 95 % band of the mean of {first['survivors']} runs, at one step"
+    axes.axhspan(low, high, color=GREY, alpha=0.25, lw=0, label=band)
     axes.axhline(first["dof"], color=GREY, lw=0.8)
     for i, (name, f) in enumerate(summary["filters"].items()):
         style = line_style(i)
-        inside = f"{f['inside']:.0%} of steps in the band"
-        lost = f", {f['lost'][-1]:.1%} lost at the end" if f["lost"][-1] > 0.001 else ""
-        axes.plot(
-            time, np.array(f["nees"], float), lw=1.8, label=f"{name}: {inside}{lost}", **style
-        )
+        axes.plot(time, np.array(f["nees"], float), lw=1.8, label=f"{name}: {_curve(f)}", **style)
         axes.plot(
             time, np.array(f["nees_median"], float), color=style["color"], lw=0.9, ls=(0, (1, 2))
         )
@@ -72,10 +70,23 @@ def _plot_nees(axes: Axes, summary: dict[str, Any]) -> None:
     axes.set_xlim(0, time[-1])
     axes.set_xlabel("time, s")
     axes.set_ylabel(f"pose NEES (ideal {first['dof']})")
-    scenario = summary["scenario"]["name"]
-    axes.set_title(f"{scenario}: mean of {summary['runs']} runs, seed {summary['seed']}")
+    axes.set_title(_title(summary), fontsize=10, loc="left")
     axes.legend(fontsize=8, loc="upper left")
     axes.grid(alpha=0.25, which="major")
+
+
+def _title(summary: dict[str, Any]) -> str:
+    """What was run, and the verdict on every filter."""
+    runs = f"{summary['runs']} runs, seed {summary['seed']}; over all steps, [99 % interval]:"
+    verdicts = (f"{name}: {headline(f['verdict'])}" for name, f in summary["filters"].items())
+    return "\n".join([f"{summary['scenario']['name']}, {runs}", *verdicts])
+
+
+def _curve(f: dict[str, Any]) -> str:
+    """A curve's description."""
+    inside = f"{f['inside']:.0%} of steps in the band"
+    now, ever = f["lost"][-1], f["lost_ever"][-1]
+    return f"{inside}, lost {now:.1%} at the end, {ever:.1%} ever" if ever else inside
 
 
 def _plot_errors(axes: list[Axes], samples: dict[str, Any], time: np.ndarray, n: int) -> None:

@@ -1,0 +1,131 @@
+"""Tests of benchmarks/consistency.py: seeds are pooled as one study, and measured only once."""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxslam
+from jaxslam.consistency import Tally, mean_band, run_verdict
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+
+import consistency as benchmark
+
+NAME = "robocentric/inverse_scaling"
+
+
+def measured(nees):
+    """What `measure` returns of runs with these NEES."""
+    tally = Tally.of(nees, 3)
+    return {
+        "layout": benchmark.LAYOUT, "runs": len(nees), "tally": tally.asdict(),
+        "nees": list(nees.mean(axis=0)), "lost": int(np.sum(nees[:, -1] > 21.1)),
+        "nees_not_lost": float(np.mean(nees[nees[:, -1] <= 21.1, -1])), "nees_median": 2.4,
+        "rmse": 0.3, "sigma": 0.1, "nis_per_dof": 1.0, "microseconds_per_step": 1.0,
+    }  # fmt: skip
+
+
+@pytest.fixture
+def options(tmp_path):
+    return benchmark.Options(
+        scenarios=("matched",), filters=("robocentric",), runs=30, seeds=(0, 1),
+        out=tmp_path / "x.json", docs=tmp_path / "x.md",
+    )  # fmt: skip
+
+
+def test_pooled_seeds_are_one_study_of_all_their_runs():
+    rng = np.random.default_rng(0)
+    parts = [rng.chisquare(3, (runs, 12)) for runs in (100, 300)]
+    parts[0][3, 4], parts[1][7, -1] = 50.0, 90.0
+    whole = np.concatenate(parts)
+    p = benchmark.pooled({str(i): measured(nees) for i, nees in enumerate(parts)})
+    assert (p["seeds"], p["runs"], p["band95"]) == ("0–1", 400, mean_band(3, 400))
+    np.testing.assert_allclose(p["nees"], whole.mean(axis=0))
+    assert (p["lost"], p["verdict"]["lost"]) == (pytest.approx(1 / 400), 2 / 400)
+    assert p["verdict"]["interval99"] == pytest.approx(run_verdict(whole, 3)["interval99"])
+    assert p["nees_not_lost"] == pytest.approx(np.delete(whole, 107, axis=0)[:, -1].mean())
+
+
+def test_a_seed_is_measured_as_the_library_summarises_it(options):
+    scenario = jaxslam.scenario("matched", steps=3, landmarks=4)
+    options = dataclasses.replace(options, runs=6, chunk=4)
+    found = benchmark.measure(scenario, NAME, 2, options)
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    filters = jaxslam.make_filters(
+        scenario.rig, ["robocentric"], ["inverse_scaling"], scenario.calibration
+    )
+    study = jaxslam.monte_carlo(scenario, filters, runs=6, seed=2, chunk=4)
+    expected = jaxslam.summarise(study)["filters"][NAME]
+    p = benchmark.pooled({"2": found})
+    assert p["verdict"] == expected["verdict"]
+    np.testing.assert_allclose(p["nees"], expected["nees"], rtol=1e-4)
+    assert p["lost"] == pytest.approx(expected["lost"][-1])
+    for key in ("rmse", "sigma"):
+        assert p[key] == pytest.approx(expected[key]["position"][-1], rel=1e-4)
+
+
+def test_what_is_there_is_not_measured_again_and_others_may_add_to_it(options, monkeypatch):
+    rng, asked = np.random.default_rng(0), []
+
+    def measure(scenario, name, seed, options):
+        asked.append(seed)
+        if seed == 1:  # meanwhile another command
+            found = measured(rng.chisquare(3, (30, 4)))
+            benchmark.add_to(options.out, "circle", NAME, 7, found)
+        return measured(rng.chisquare(3, (30, 4)))
+
+    monkeypatch.setattr(benchmark, "measure", measure)
+    benchmark.main(options)
+    benchmark.main(dataclasses.replace(options, seeds=(0, 1, 3)))
+    assert asked == [0, 1, 3]
+    results = benchmark.read(options.out)
+    assert {name: set(filters[NAME]) for name, filters in results.items()} == {
+        "matched": {"0", "1", "3"},
+        "circle": {"7"},
+    }
+    page = options.docs.read_text()
+    assert f"| `{NAME}` | 0–1, 3 × 30 |" in page
+    assert f"| `{NAME}` | 7 × 30 |" in page
+
+
+def test_results_of_an_older_layout_are_measured_again(options, monkeypatch):
+    options.out.write_text(json.dumps({"matched": {NAME: {"0": {"runs": 30, "nees": [3.0]}}}}))
+    asked = []
+
+    def measure(scenario, name, seed, options):
+        asked.append(seed)
+        return measured(np.full((30, 4), 3.0))
+
+    monkeypatch.setattr(benchmark, "measure", measure)
+    benchmark.main(options)
+    assert asked == [0, 1]
+
+
+def test_a_row_says_what_was_lost_and_which_means_are_in_the_band():
+    nees = np.random.default_rng(1).chisquare(3, (1000, 12))
+    nees[:, 4:] *= 1.2  # from step 5
+    nees[:20, 9:] = 100.0  # from step 10
+    row = benchmark._row("x/y", benchmark.pooled({"4": measured(nees)}), 1)
+    assert row.startswith("| `x/y` | 4 × 1000 | 3.85 | 1.133 [1.097, 1.185] |")
+    assert "over-confident" in row
+    at_steps = row.split("|")[7].split()
+    assert all(float(value) > 3.3 for value in at_steps)
+    assert "| 2.00% | 2.50% | 3.43 |" in row
+    assert len(row.split("|")) == len(benchmark.page({"m": {}}).splitlines()[-1].split("|"))
+    nees[:, 4] /= 1.2
+    row = benchmark._row("x/y", benchmark.pooled({"4": measured(nees)}), 1)
+    assert row.split("|")[7].split()[0].startswith("**")
+
+
+def test_a_diverged_run_leaves_a_row_without_a_mean():
+    nees = np.random.default_rng(2).chisquare(3, (50, 12))
+    broken = nees.copy()
+    broken[4, 2:] = np.nan
+    found = measured(nees) | {"tally": Tally.of(broken, 3).asdict()}
+    row = benchmark._row("x/y", benchmark.pooled({"0": found}), 1)
+    assert row.startswith("| `x/y` | 0 × 50 | – | – | lost | ")
+    assert "**" not in row

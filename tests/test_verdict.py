@@ -1,0 +1,237 @@
+"""Tests of the verdict on one study: its rate of false alarms, its coverage, what it says."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from jaxslam.consistency import Tally, lost_threshold, run_verdict
+from jaxslam.consistency.statistics import (
+    PowerSums,
+    chernoff_p_value,
+    chi2_p_value,
+    mean_interval,
+    mean_p_value,
+)
+from jaxslam.consistency.verdict import sentences
+
+
+def series(rng, runs, steps=20, dof=3, correlation=0.95):
+    """NEES of a consistent filter, (runs, steps): χ² at every step, whatever the correlation."""
+    error = rng.normal(size=(runs, dof))
+    nees = np.empty((runs, steps))
+    for step in range(steps):
+        nees[:, step] = np.sum(error**2, axis=1)
+        new = rng.normal(size=error.shape)
+        error = correlation * error + np.sqrt(1 - correlation**2) * new
+    return nees
+
+
+def studies(count, runs, seed=0, **of):
+    """The NEES of `count` studies of as many runs."""
+    return series(np.random.default_rng(seed), count * runs, **of).reshape(count, runs, -1)
+
+
+# --- how often it is wrong ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("steps", "correlation"), [(1, 0.0), (8, 0.0), (8, 0.9), (8, 0.995)])
+def test_a_consistent_filter_is_called_inconsistent_once_in_a_hundred_studies(steps, correlation):
+    """Half of the times on either side: of 3000 studies 15 ± 4 each, here with ± 4 σ."""
+    words = [
+        run_verdict(nees, 3)["word"]
+        for nees in studies(3000, 100, steps=steps, correlation=correlation)
+    ]
+    for side in ("over-confident", "under-confident"):
+        assert 3 <= words.count(side) <= 31, (side, words.count(side))
+    assert 12 <= 3000 - words.count("consistent") <= 50
+
+
+@pytest.mark.parametrize("dof", [3, 6])
+def test_a_sigma_wrong_by_5_percent_is_found_with_1000_runs(dof):
+    """In 95 of 100 studies, or more, though the steps of a run are all but one."""
+    found = {"over-confident": 1.05, "under-confident": 1 / 1.05}
+    for word, factor in found.items():
+        verdicts = [
+            run_verdict(factor**2 * nees, dof) for nees in studies(60, 1000, dof=dof, steps=10)
+        ]
+        assert np.mean([verdict["word"] == word for verdict in verdicts]) > 0.9
+        low, high = np.array([verdict["interval99"] for verdict in verdicts]).T
+        assert np.mean((low < factor) & (factor < high)) > 0.93
+        assert np.mean(high - low) < 0.08
+
+
+def test_the_interval_holds_the_mean_of_skewed_numbers_where_students_does_not():
+    rng = np.random.default_rng(1)
+    numbers = np.exp(rng.normal(size=(3000, 100)))
+    mean = np.exp(0.5)
+    intervals = np.array([mean_interval(PowerSums.of(row), 0.99) for row in numbers])
+    missed = np.mean((intervals[:, 0] > mean) | (intervals[:, 1] < mean))
+    t = (numbers.mean(axis=1) - mean) / (numbers.std(axis=1, ddof=1) / 10)
+    missed_by_student = np.mean(np.abs(t) > stats.t.ppf(0.995, 99))
+    assert missed < 0.02 < 0.03 < missed_by_student
+
+
+def test_the_interval_is_that_of_resampled_runs():
+    """The cubic is the closed form of the studentised bootstrap, to second order."""
+    values = series(np.random.default_rng(2), 200).mean(axis=1)
+    n, mean, deviation = len(values), values.mean(), values.std(ddof=1)
+    drawn = values[np.random.default_rng(3).integers(0, n, (20000, n))]
+    t = (drawn.mean(axis=1) - mean) / (drawn.std(axis=1, ddof=1) / np.sqrt(n))
+    high, low = mean - np.quantile(t, [0.005, 0.995]) * deviation / np.sqrt(n)
+    found = mean_interval(PowerSums.of(values), 0.99)
+    np.testing.assert_allclose(found, (low, high), atol=0.05 * (high - low))
+
+
+def test_the_interval_and_its_p_value_say_the_same():
+    rng = np.random.default_rng(4)
+    for runs in (20, 200):
+        sums = PowerSums.of(rng.chisquare(3, runs))
+        for limit in mean_interval(sums, 0.99):
+            assert mean_p_value(sums, limit) == pytest.approx(0.01, rel=1e-6)
+        assert mean_p_value(sums, sums.mean) > 0.5
+
+
+def test_at_one_step_p_is_exact():
+    means = np.random.default_rng(5).chisquare(3 * 20, 5000) / 20
+    p = np.array([chi2_p_value(mean, 3, 20) for mean in means])
+    assert stats.kstest(p, "uniform").pvalue > 0.01
+    assert chi2_p_value(4.0, 3, 20) == pytest.approx(2 * stats.chi2.sf(80, 60), rel=1e-9)
+    verdict = run_verdict(np.column_stack([np.full(20, 9.0), np.full(20, 4.0)]), 3)
+    assert verdict["end"]["p"] == pytest.approx(chi2_p_value(4.0, 3, 20))
+    assert verdict["end"]["sigma_factor"] == pytest.approx(np.sqrt(4 / 3))
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.9, 1.0])
+def test_the_bound_of_chernoff_is_one_for_every_correlation(correlation):
+    means = studies(4000, 5, steps=5, correlation=correlation).mean(axis=(1, 2))
+    p = np.array([chernoff_p_value(mean, 3, 5) for mean in means])
+    for level in (0.3, 0.1, 0.03):
+        assert np.mean(p < level) < level
+    assert all(
+        chernoff_p_value(mean, 3, 5) > chi2_p_value(mean, 3, 5) for mean in (0.5, 2.0, 4.0, 9.0)
+    )
+
+
+# --- lost runs ----------------------------------------------------------------------------------
+
+
+def consistent(runs=1000):
+    return np.minimum(series(np.random.default_rng(6), runs), lost_threshold(3))
+
+
+def test_a_few_lost_runs_are_named_and_judged_apart():
+    nees = consistent()
+    nees[:3, -1] = 1e5
+    verdict = run_verdict(nees, 3)
+    assert (verdict["word"], verdict["never_lost"]["word"]) == ("over-confident", "consistent")
+    assert (verdict["lost"], verdict["never_lost"]["runs"]) == (0.003, 997)
+    assert verdict["nees"] == pytest.approx(nees.mean())
+    assert verdict["never_lost"]["nees"] == pytest.approx(nees[3:].mean())
+    # They scatter so much that the interval holds 1: only χ² tells that this is not chance.
+    assert verdict["interval99"][0] < 1
+    assert verdict["p"] < 1e-9
+    others = sentences(verdict)[2]
+    assert others.startswith("3 of 1000 runs were lost, the 997 never lost: NEES 2.98, σ right")
+
+
+def test_of_runs_that_are_chosen_by_their_nees_no_verdict_is_said():
+    nees = consistent()
+    nees[:11, 5] = 1e3
+    expected = f"11 of 1000 runs were lost, the 989 never lost: NEES {nees[11:].mean():.2f}"
+    assert sentences(run_verdict(nees, 3))[2] == expected
+
+
+def test_a_run_that_is_lost_and_comes_back_was_lost():
+    nees = consistent()
+    nees[4, 7] = 22.0
+    assert run_verdict(nees, 3)["lost"] == 0.001
+
+
+def test_without_lost_runs_a_consistent_filter_seems_better_by_less_than_half_a_percent():
+    nees = series(np.random.default_rng(7), 20000, steps=60, correlation=0.97)
+    verdict = run_verdict(nees, 3)
+    assert 0.995 < verdict["never_lost"]["nees"] / verdict["nees"] < 0.9995
+    assert 0.0005 < verdict["lost"] < 60e-4
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_with_a_diverged_run_there_is_no_mean(value):
+    nees = consistent()
+    nees[5, 3:] = value
+    verdict = run_verdict(nees, 3)
+    assert (verdict["word"], verdict["nees"], verdict["sigma_factor"]) == ("lost", None, None)
+    assert (verdict["p"], verdict["end"]["p"], verdict["diverged"]) == (0.0, 0.0, 1)
+    assert verdict["never_lost"]["word"] == "consistent"
+    json.dumps(verdict, allow_nan=False)
+    assert sentences(verdict)[0] == "1 of 1000 runs diverged, no mean NEES: lost"
+
+
+@pytest.mark.parametrize("value", [np.nan, 1e5, 1e200])
+def test_a_study_of_lost_runs_only_has_a_verdict(value):
+    verdict = run_verdict(np.full((4, 3), value), 3)
+    json.dumps(verdict, allow_nan=False)
+    assert verdict["word"] == ("lost" if np.isnan(value) else "over-confident")
+    assert verdict["never_lost"]["runs"] == 0
+    assert sentences(verdict)[-1] == "4 of 4 runs were lost, all of them"
+
+
+# --- what it is made of -------------------------------------------------------------------------
+
+
+def test_tallies_of_parts_and_from_a_file_are_that_of_the_whole():
+    nees = series(np.random.default_rng(8), 300)
+    nees[0, 2], nees[200, 3] = np.nan, 1e3
+    parts = [Tally.of(part, 3) for part in (nees[:100], nees[100:])]
+    stored = [Tally.from_dict(json.loads(json.dumps(part.asdict()))) for part in parts]
+    assert stored == parts
+    together, whole = (parts[0] + parts[1]).verdict(), Tally.of(nees, 3).verdict()
+    assert (together["lost"], together["diverged"]) == (whole["lost"], whole["diverged"])
+    assert together["never_lost"]["interval99"] == pytest.approx(whole["never_lost"]["interval99"])
+    with pytest.raises(ValueError, match="runs of 3 and of 6 dof are not one study"):
+        parts[0] + Tally.of(nees, 6)
+
+
+def test_power_sums_have_the_moments_of_their_numbers():
+    values = np.random.default_rng(9).gamma(2.0, size=50)
+    sums = PowerSums.of(values)
+    assert sums.mean == pytest.approx(values.mean())
+    assert sums.deviation == pytest.approx(values.std(ddof=1))
+    assert sums.skewness == pytest.approx(stats.skew(values))
+
+
+def test_one_run_has_no_interval_and_still_a_p_value():
+    verdict = run_verdict(np.full((1, 4), 100.0), 3)
+    assert verdict["interval99"] == [None, None]
+    assert verdict["word"] == "over-confident"
+    assert (
+        sentences(verdict)[0] == "NEES 100, σ too small by 5.77 [–, –]: over-confident (p < 0.0001)"
+    )
+    assert run_verdict(np.full((1, 4), 3.5), 3)["word"] == "consistent"
+
+
+@pytest.mark.parametrize(
+    ("factor", "text"),
+    [
+        (1.0, "σ right up to a factor 1.00 [0.98, 1.02]: consistent"),
+        (1.26, "σ too small by 1.26 [1.23, 1.29]: over-confident"),
+        (0.8, "σ too large by 1.25 [1.22, 1.28]: under-confident"),
+    ],
+)
+def test_a_verdict_is_said_in_words(factor, text):
+    nees = consistent()
+    nees *= 3 * factor**2 / nees.mean()
+    nees = np.minimum(nees, lost_threshold(3))
+    found = run_verdict(nees, 3)
+    said, at_the_end = sentences(found)[:2]
+    p = f"p = {found['p']:.2g}" if factor == 1 else "p < 0.0001"
+    assert said == f"NEES {found['nees']:.2f}, {text} ({p})"
+    assert at_the_end.startswith(f"at the last step: NEES {nees[:, -1].mean():.2f}, σ ")
+    assert found["end"]["word"] == found["word"]
+
+
+@pytest.mark.parametrize(("shape", "dof"), [((3,), 3), ((0, 4), 3), ((4, 0), 3), ((4, 5), 0)])
+def test_what_is_no_study_is_refused(shape, dof):
+    with pytest.raises(ValueError, match="NEES must be"):
+        run_verdict(np.ones(shape), dof)
