@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TypedDict
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
@@ -12,6 +12,8 @@ from jaxslam.files import write_atomically
 
 # A pose and a reference pose further apart in time than this (s) are not compared; evo's default.
 MAX_TIME_DIFFERENCE = 0.01
+# Nine decimals of two files: their poses can differ by 4e-9 (map units and rad), and be the same.
+_ROUNDING = 1e-8
 
 
 class TrajectoryError(TypedDict):
@@ -115,14 +117,34 @@ def read_covariances(
 def pose_nees(
     T_wc: ArrayLike, covariances: ArrayLike, reference: ArrayLike
 ) -> Float[np.ndarray, " n"]:
+def exactly_known(covariances: ArrayLike) -> Bool[np.ndarray, " n"]:
+    """Which of the covariances (n, 6, 6) are zero: poses that are known by definition.
+
+    The first camera is the world frame, so every file begins with one. They have no degree of
+    freedom, and are to be left out of a mean NEES.
+    """
+    return ~np.any(np.asarray(covariances, float), axis=(1, 2))
+
+
     """`eᵀ P⁻¹ e` of poses (n, 4, 4), e of `T_wc⁻¹ T_true` as in `write_covariances`; ideally 6.
 
-    The reference has the world frame and the unit of the map, as a simulation's has.
+    The reference has the world frame and the unit of the map, as a simulation's has. Of a pose
+    that is `exactly_known` it is 0 where the pose is right, to the rounding of the files, and
+    infinite where it is not. Raises `ValueError` for any other singular covariance.
     """
     E = np.linalg.inv(np.asarray(T_wc, float)) @ np.asarray(reference, float)
     errors = np.hstack([E[:, :3, 3], Rotation.from_matrix(E[:, :3, :3]).as_rotvec()])
-    solved = np.linalg.solve(np.asarray(covariances, float), errors[..., None])[..., 0]
-    return np.sum(errors * solved, axis=1)
+    covariances = np.asarray(covariances, float)
+    known = exactly_known(covariances)
+    nees = np.where(np.linalg.norm(errors, axis=1) <= _ROUNDING, 0.0, np.inf)
+    try:
+        solved = np.linalg.solve(covariances[~known], errors[~known, :, None])[..., 0]
+    except np.linalg.LinAlgError:
+        raise ValueError(
+            "the covariance of a pose is singular; a positive one, or zero, is accepted"
+        ) from None
+    nees[~known] = np.sum(errors[~known] * solved, axis=1)
+    return nees
 
 
 def absolute_trajectory_error(

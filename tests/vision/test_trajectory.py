@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
+    exactly_known,
     pose_nees,
     poses,
     read_covariances,
@@ -160,3 +161,26 @@ def test_as_many_covariances_as_times(tmp_path):
     with pytest.raises(ValueError, match="2 times for 1 covariances"):
         write_covariances(tmp_path / "covariance.txt", [0, 1], np.eye(6)[None])
     assert not list(tmp_path.iterdir())
+def test_a_pose_that_is_known_exactly_has_a_nees_of_zero_if_it_is_right(tmp_path):
+    """Every covariance file begins with one: the first camera is the world."""
+    times, T_wc = wave(4)
+    covariances = np.tile(1e-4 * np.eye(6), (4, 1, 1))
+    covariances[0] = 0
+    write_tum(tmp_path / "t.txt", times, T_wc)
+    write_covariances(tmp_path / "covariance.txt", times, covariances)
+    read, P = read_tum(tmp_path / "t.txt")[1], read_covariances(tmp_path / "covariance.txt")[1]
+    assert exactly_known(P).tolist() == [True, False, False, False]
+    error = poses([0.02, 0.0, 0.0], [0, 0, 0, 1])
+    true = T_wc @ error
+    true[0] = T_wc[0]
+    # (0.02/0.01)², and zero although the file has rounded the pose; its 1e-8 are 1e-6 σ.
+    np.testing.assert_allclose(pose_nees(read, P, true), [0, 4, 4, 4], rtol=0, atol=1e-5)
+    assert pose_nees(read, P, T_wc @ error)[0] == np.inf
+
+
+def test_a_covariance_that_is_singular_otherwise_is_refused():
+    covariance = np.diag([1.0, 1, 1, 1, 1, 0])
+    with pytest.raises(ValueError, match="singular; a positive one, or zero, is accepted"):
+        pose_nees(np.eye(4)[None], covariance[None], np.eye(4)[None])
+
+
