@@ -24,6 +24,9 @@ class TrajectoryError(TypedDict):
     path_length: float
     extent: float
     matched: int
+    sign: float
+    orientation_rmse: float
+    straight_line: float
 
 
 def poses(translation: ArrayLike, quaternion: ArrayLike) -> Float[np.ndarray, "n 4 4"]:
@@ -114,9 +117,6 @@ def read_covariances(
     return table[:, 0], covariances
 
 
-def pose_nees(
-    T_wc: ArrayLike, covariances: ArrayLike, reference: ArrayLike
-) -> Float[np.ndarray, " n"]:
 def exactly_known(covariances: ArrayLike) -> Bool[np.ndarray, " n"]:
     """Which of the covariances (n, 6, 6) are zero: poses that are known by definition.
 
@@ -126,6 +126,9 @@ def exactly_known(covariances: ArrayLike) -> Bool[np.ndarray, " n"]:
     return ~np.any(np.asarray(covariances, float), axis=(1, 2))
 
 
+def pose_nees(
+    T_wc: ArrayLike, covariances: ArrayLike, reference: ArrayLike
+) -> Float[np.ndarray, " n"]:
     """`eᵀ P⁻¹ e` of poses (n, 4, 4), e of `T_wc⁻¹ T_true` as in `write_covariances`; ideally 6.
 
     The reference has the world frame and the unit of the map, as a simulation's has. Of a pose
@@ -158,8 +161,16 @@ def absolute_trajectory_error(
     Times (n,) and (m,) in seconds, poses (n, 4, 4) and (m, 4, 4). `evo` pairs poses by their
     times (`MAX_TIME_DIFFERENCE`) and aligns the estimate with scale (Umeyama's method).
     `path_length` is the reference's over the paired poses, `extent` the diagonal of the box
-    around them, `matched` their number. Raises `ValueError` where fewer than three poses pair
-    up or all positions of one trajectory coincide.
+    around them, `matched` their number.
+
+    Three numbers say what the error does not. `sign` is the correlation, −1 to 1, of the true
+    positions with the estimated ones, turned by the one rotation that fits the *orientations*
+    best: −1 is a world behind the camera, which the alignment turns round. `orientation_rmse`
+    is the angle, in degrees, that this rotation leaves. `straight_line` is the error that the
+    best straight line at constant speed would have, which looks at no picture.
+
+    Raises `ValueError` where fewer than three poses pair up or all positions of one trajectory
+    coincide.
     """
     from evo.core import lie_algebra, metrics, sync
     from evo.core.geometry import GeometryException
@@ -181,6 +192,7 @@ def absolute_trajectory_error(
         raise ValueError(_too_few(0)) from None
     if paired.num_poses < 3:
         raise ValueError(_too_few(paired.num_poses))
+    poses, true = np.stack(paired.poses_se3), np.stack(paired_reference.poses_se3)
     try:
         paired.align(paired_reference, correct_scale=True)
     except GeometryException:  # a straight line, about which evo leaves the roll open: see below

@@ -103,6 +103,9 @@ def test_error_ignores_frame_and_scale_and_measures_the_reference():
     assert result["rmse"] == pytest.approx(0, abs=1e-9)
     assert result["path_length"] == pytest.approx(np.linalg.norm(steps, axis=1).sum())
     assert result["extent"] == pytest.approx(np.linalg.norm(box))
+    # Orientations give the world's turn too: to the rounding of an arc cosine near 1, 1e-8 rad.
+    assert result["sign"] == pytest.approx(1, abs=1e-9)
+    assert result["orientation_rmse"] == pytest.approx(0, abs=1e-5)
     assert result["matched"] == len(times)
 
 
@@ -117,6 +120,64 @@ def test_error_has_the_size_of_the_noise():
 
 
 def test_straight_reference_is_aligned_though_its_roll_is_open():
+def test_a_reversed_world_has_sign_minus_one_though_its_error_is_zero():
+    """(t, v, ω) → −(t, v, ω) leaves every pixel, and here a curve in a plane that aligns."""
+    times, reference = wave()
+    reference[:, 2, 3] = 0
+    estimate = reference.copy()
+    estimate[:, :3, 3] *= -0.3
+    result = absolute_trajectory_error(times, estimate, times, reference)
+    assert result["rmse"] == pytest.approx(0, abs=1e-9)
+    assert result["sign"] == pytest.approx(-1, abs=1e-9)
+    assert result["orientation_rmse"] == pytest.approx(0, abs=1e-5)
+
+
+def test_positions_that_have_nothing_to_do_with_the_truth_have_no_sign():
+    times, reference = wave(4000)
+    estimate = reference.copy()
+    estimate[:, :3, 3] = np.random.default_rng(3).normal(size=(4000, 3))
+    sign = absolute_trajectory_error(times, estimate, times, reference)["sign"]
+    # A correlation of n independent points has σ of at most 1/√n.
+    assert abs(sign) < 4 / np.sqrt(4000)
+
+
+def test_orientation_error_is_the_angle_that_one_rotation_leaves():
+    times, reference = wave(40)
+    estimate = similar(reference, 1.0, [0.3, -0.5, 1.0], [0.0, 0.0, 0.0])
+    turn = Rotation.from_rotvec([0, np.radians(5), 0]).as_matrix()
+    estimate[::2, :3, :3] = estimate[::2, :3, :3] @ turn
+    estimate[1::2, :3, :3] = estimate[1::2, :3, :3] @ turn.T
+    result = absolute_trajectory_error(times, estimate, times, reference)
+    # The axes differ from pose to pose, so that no rotation takes away more than a part.
+    assert 4.5 < result["orientation_rmse"] <= 5
+    same = reference.copy()
+    same[:, :3, :3] = np.eye(3)
+    turned = same.copy()
+    turned[::2, :3, :3], turned[1::2, :3, :3] = turn, turn.T
+    result = absolute_trajectory_error(times, turned, times, same)
+    assert result["orientation_rmse"] == pytest.approx(5, abs=1e-6)
+
+
+def test_straight_line_is_the_error_of_one_at_constant_speed():
+    times = np.array([0.0, 1.0, 2.0, 3.5, 4.0, 6.0])
+    line = poses(np.outer(times, [1.0, 2.0, -0.5]) + 3, np.tile([0, 0, 0, 1], (6, 1)))
+    curved = line.copy()
+    curved[:, :3, 3] += np.outer(np.sin(times), [0.0, 0.3, 0.0])
+    straight = absolute_trajectory_error(times, curved, times, line)["straight_line"]
+    assert straight == pytest.approx(0, abs=1e-12)
+    result = absolute_trajectory_error(times, line, times, curved)
+    # What is left of a sine after the fit of a + b t to it.
+    design = np.column_stack([np.ones(6), times])
+    rest = np.sin(times) - design @ np.linalg.lstsq(design, np.sin(times), rcond=None)[0]
+    assert result["straight_line"] == pytest.approx(0.3 * np.sqrt(np.mean(rest**2)), abs=1e-12)
+    # The line itself, as an estimate, has this error or (by scale and turn) a little less.
+    assert result["rmse"] == pytest.approx(result["straight_line"], rel=0.02)
+    # The same places at another speed are not a line at constant speed.
+    slowing = line.copy()
+    slowing[:, :3, 3] = np.outer(times**2, [1.0, 2.0, -0.5])
+    assert absolute_trajectory_error(times, line, times, slowing)["straight_line"] > 1
+
+
     times = np.arange(50) / 25
     line = poses(np.outer(times, [1.0, 2.0, -0.5]), np.tile([0, 0, 0, 1], (50, 1)))
     estimate = similar(line, 3.0, [0.1, 0.7, -0.4], [5.0, 0.0, 1.0])
