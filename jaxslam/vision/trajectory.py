@@ -209,7 +209,31 @@ def absolute_trajectory_error(
         "path_length": float(paired_reference.path_length),
         "extent": float(np.linalg.norm(np.ptp(paired_reference.positions_xyz, axis=0))),
         "matched": int(paired.num_poses),
+        **_by_orientation(poses, true),
+        "straight_line": _straight_line(paired_reference.timestamps, true[:, :3, 3]),
     }
+
+
+def _by_orientation(
+    estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]
+) -> dict[str, float]:
+    """`sign` and `orientation_rmse`, by the mean rotation from estimated to true orientations."""
+    true, estimated = (Rotation.from_matrix(T[:, :3, :3]) for T in (reference, estimate))
+    turn = (true * estimated.inv()).mean()
+    angles = (true.inv() * turn * estimated).magnitude()
+    positions, turned = reference[:, :3, 3], turn.apply(estimate[:, :3, 3])
+    a, b = positions - positions.mean(0), turned - turned.mean(0)
+    return {
+        "sign": float(np.sum(a * b) / np.sqrt(np.sum(a**2) * np.sum(b**2))),
+        "orientation_rmse": float(np.degrees(np.sqrt(np.mean(angles**2)))),
+    }
+
+
+def _straight_line(times: Float[np.ndarray, " n"], positions: Float[np.ndarray, "n 3"]) -> float:
+    """RMS distance to the least squares line `a + b t`: any line can be aligned to any other."""
+    centred, t = positions - positions.mean(0), times - times.mean()
+    rest = centred - np.outer(t, t @ centred / (t @ t))
+    return float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
 
 
 def _line_alignment(
