@@ -23,20 +23,24 @@ def plot_map(
     reference: ArrayLike | None = None,
     path: str | Path,
     unit: str = "m",
+    maps: ArrayLike | None = None,
 ) -> None:
     """Draw the map from above (x, z) and from behind (x, y) into the image file `path`.
 
     `trajectory` and `reference` are poses T_wc (n, 4, 4), drawn as they are (align them first),
     `points` (n, 3) and `covariances` (n, 3, 3) landmarks in the world frame. Ellipses hold 95 %
     of the two coordinates shown. The axes cover the trajectories and the bulk of the landmarks;
-    the title says how many lie outside, and ellipses larger than the view are left out.
+    the title says how many lie outside, and ellipses larger than the view are left out. Where
+    the number of the map, `maps` (n,) of the poses, changes, the line breaks and is marked.
     """
     trajectory = np.asarray(trajectory, dtype=float).reshape(-1, 4, 4)[:, :3, 3]
     points = np.asarray(points, dtype=float).reshape(-1, 3)
     covariances = np.asarray(covariances, dtype=float).reshape(-1, 3, 3)
     finite = np.isfinite(points).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
     points, covariances = points[finite], covariances[finite]
-    lines = [("estimate", trajectory, _TRAJECTORY, "-")]
+    begun = np.flatnonzero(np.diff([] if maps is None else np.asarray(maps))) + 1
+    broken = np.insert(trajectory, begun, np.nan, axis=0)
+    lines = [("estimate", broken, _TRAJECTORY, "-")]
     if reference is not None:
         reference = np.asarray(reference, dtype=float).reshape(-1, 4, 4)[:, :3, 3]
         lines.append(("reference", reference, _REFERENCE, "--"))
@@ -56,6 +60,9 @@ def plot_map(
         if len(trajectory):
             start = trajectory[0, plane]
             axis.plot(*start, "o", color=_TRAJECTORY, ms=5, mfc="white", label="start")
+        if len(begun):
+            places = trajectory[begun][:, plane].T
+            axis.plot(*places, "D", color=_TRAJECTORY, ms=6, mfc="white", label="a new map begins")
         axis.set(xlabel=f"x ({unit})", ylabel=f"{'xyz'[up]} ({unit})", aspect="equal")
         axis.set(xlim=(low[across], high[across]), ylim=(low[up], high[up]))
         axis.set_title(f"{title}: {_counts(inside, hidden)}", fontsize=10)

@@ -47,9 +47,10 @@ class Located:
         `R ((I + [θ]×) p + δ) + t`, so that to `p`'s covariance comes `J P Jᵀ`, `J = [I, −[p]×]`.
         """
         R, t = self.T_wc[:3, :3], self.T_wc[:3, 3]
-        J = np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), -_cross(points)], axis=2)
-        total = covariances + J @ self.covariance @ np.swapaxes(J, 1, 2)
-        return points @ R.T + t, R @ total @ R.T
+        with np.errstate(invalid="ignore", over="ignore"):  # a point at infinity stays there
+            J = np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), -_cross(points)], axis=2)
+            total = covariances + J @ self.covariance @ np.swapaxes(J, 1, 2)
+            return points @ R.T + t, R @ total @ R.T
 
 
 def adjoint(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:

@@ -15,6 +15,8 @@ MAX_TIME_DIFFERENCE = 0.01
 # Nine decimals of two files: their poses can differ by 4e-9 (map units and rad), and be the same.
 _ROUNDING = 1e-8
 
+_UNITS = "every map of frames.csv has a unit of its own"
+
 
 class TrajectoryError(TypedDict):
     """What `absolute_trajectory_error` returns; lengths in the reference's unit."""
@@ -72,7 +74,7 @@ def write_tum(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> None:
     table[:, :3] = T_wc[:, :3, 3]
     if len(T_wc):  # Rotation refuses an empty stack
         table[:, 3:] = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True)
-    header = "tx ty tz qx qy qz qw (s; camera in the world frame)"
+    header = f"tx ty tz qx qy qz qw (s; camera in the world frame; {_UNITS})"
     _write_rows(path, header, times, table, "poses", ".9f")
 
 
@@ -87,7 +89,7 @@ def write_covariances(path: str | Path, times: ArrayLike, covariances: ArrayLike
     table = np.asarray(covariances, dtype=float).reshape(-1, 6, 6)[:, rows, columns]
     names = ("x", "y", "z", "rx", "ry", "rz")
     pairs = " ".join(f"{names[i]}{names[j]}" for i, j in zip(rows, columns, strict=True))
-    header = f"{pairs} (s; map units and rad, in the camera frame)"
+    header = f"{pairs} (s; map units and rad, in the camera frame, given the scale; {_UNITS})"
     _write_rows(path, header, times, table, "covariances", ".9e")
 
 
@@ -192,7 +194,7 @@ def absolute_trajectory_error(
         raise ValueError(_too_few(0)) from None
     if paired.num_poses < 3:
         raise ValueError(_too_few(paired.num_poses))
-    poses, true = np.stack(paired.poses_se3), np.stack(paired_reference.poses_se3)
+    estimated, true = np.stack(paired.poses_se3), np.stack(paired_reference.poses_se3)
     try:
         paired.align(paired_reference, correct_scale=True)
     except GeometryException:  # a straight line, about which evo leaves the roll open: see below
@@ -201,6 +203,7 @@ def absolute_trajectory_error(
         )
         paired.scale(scale)
         paired.transform(lie_algebra.se3(rotation, translation))
+    sign, angle = _by_orientation(estimated, true)
     error = metrics.APE(metrics.PoseRelation.translation_part)
     error.process_data((paired_reference, paired))
     return {
@@ -209,24 +212,23 @@ def absolute_trajectory_error(
         "path_length": float(paired_reference.path_length),
         "extent": float(np.linalg.norm(np.ptp(paired_reference.positions_xyz, axis=0))),
         "matched": int(paired.num_poses),
-        **_by_orientation(poses, true),
+        "sign": sign,
+        "orientation_rmse": angle,
         "straight_line": _straight_line(paired_reference.timestamps, true[:, :3, 3]),
     }
 
 
 def _by_orientation(
     estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]
-) -> dict[str, float]:
+) -> tuple[float, float]:
     """`sign` and `orientation_rmse`, by the mean rotation from estimated to true orientations."""
     true, estimated = (Rotation.from_matrix(T[:, :3, :3]) for T in (reference, estimate))
     turn = (true * estimated.inv()).mean()
     angles = (true.inv() * turn * estimated).magnitude()
     positions, turned = reference[:, :3, 3], turn.apply(estimate[:, :3, 3])
     a, b = positions - positions.mean(0), turned - turned.mean(0)
-    return {
-        "sign": float(np.sum(a * b) / np.sqrt(np.sum(a**2) * np.sum(b**2))),
-        "orientation_rmse": float(np.degrees(np.sqrt(np.mean(angles**2)))),
-    }
+    sign = np.sum(a * b) / np.sqrt(np.sum(a**2) * np.sum(b**2))
+    return float(sign), float(np.degrees(np.sqrt(np.mean(angles**2))))
 
 
 def _straight_line(times: Float[np.ndarray, " n"], positions: Float[np.ndarray, "n 3"]) -> float:

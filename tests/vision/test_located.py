@@ -80,8 +80,6 @@ def test_points_carry_the_cameras_covariance():
     for point, covariance, found, P in zip(points, covariances, placed, total, strict=True):
         tree = (as_pose(camera.T_wc), jax.numpy.asarray(point))
         J = np.asarray(jacobian(lambda both: both[0] @ both[1], tree))
-        expected = (
-            J[:, :6] @ camera.covariance @ J[:, :6].T + J[:, 6:] @ covariance @ J[:, 6:].T
-        )
+        expected = J[:, :6] @ camera.covariance @ J[:, :6].T + J[:, 6:] @ covariance @ J[:, 6:].T
         np.testing.assert_allclose(found, tree[0] @ tree[1], rtol=0, atol=1e-12)
         np.testing.assert_allclose(P, expected, rtol=0, atol=1e-12)

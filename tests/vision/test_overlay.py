@@ -130,18 +130,19 @@ def test_video_that_cannot_be_written_is_refused(tmp_path):
 def test_point_cloud_holds_points_and_covariances(tmp_path):
     points = np.array([[1.0, 2.0, 3.0], [-1.5, 0.25, 8.0]])
     covariances = np.array([np.diag([1.0, 2.0, 3.0]), [[4, 1, 2], [1, 5, 3], [2, 3, 6]]])
-    write_ply(tmp_path / "map.ply", points, covariances, [7, 9])
+    write_ply(tmp_path / "map.ply", points, covariances, [7, 9], [0, 1])
     header, rows = (tmp_path / "map.ply").read_text().split("end_header\n")
     assert header.startswith("ply\nformat ascii 1.0\n")
     assert "element vertex 2\n" in header
     assert re.findall(r"property float (\w+)", header) == (
         ["x", "y", "z", "cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"]
     )
-    assert "property int id\n" in header
+    assert "property int id\nproperty int map\n" in header
     table = np.array([row.split() for row in rows.splitlines()], float)
-    np.testing.assert_allclose(table[:, :3], points)
-    np.testing.assert_allclose(table[1, 3:9], [4, 1, 2, 5, 3, 6])
-    assert table[:, 9].tolist() == [7, 9]
+    # Few binary or decimal digits, all of which are written: exact.
+    np.testing.assert_array_equal(table[:, :3], points)
+    np.testing.assert_array_equal(table[1, 3:9], [4, 1, 2, 5, 3, 6])
+    assert table[:, 9:].tolist() == [[7, 0], [9, 1]]
 
 
 def test_point_cloud_refuses_what_does_not_fit(tmp_path):
