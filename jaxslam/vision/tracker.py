@@ -189,7 +189,8 @@ class Tracker:
         slots = self._visible(prediction)
         found = self._search(frame, prediction, slots)
         matched, features = self._features(slots, found)
-        state, result = self._correct(*predicted, self._parameters, dt, features)
+        least = max(LEAST_INLIERS, len(slots) // 2) if self._unmeasured else LEAST_INLIERS
+        state, result = self._correct(*predicted, self._parameters, dt, features, least)
         used, nis, nis_dof, healthy = jax.device_get(result)
         self._time = frame.time
         if not healthy:
@@ -209,7 +210,7 @@ class Tracker:
                 for match, ok in zip(found, used, strict=True)
             ],
         )
-        lost = bool(used.sum() < LEAST_INLIERS)
+        lost = not used.any()
         self._unmeasured = self._unmeasured + 1 if lost else 0
         if not self.landmarks or self._unmeasured > self.settings.lost_for:
             return self._lost(frame, **searched)
@@ -232,11 +233,11 @@ class Tracker:
         """
         self._remove(sorted(self.landmarks))
         nothing = _padded(np.zeros(0, int), np.zeros((0, 2)), self.settings.wanted)
-        state, result = self._correct(*predicted, self._parameters, dt, nothing)
+        state, result = self._correct(*predicted, self._parameters, dt, nothing, LEAST_INLIERS)
         if not result[-1]:
             self._origin = self._camera
             predicted, _ = self._predict(self._empty_state(), self._parameters, dt)
-            state, _ = self._correct(*predicted, self._parameters, dt, nothing)
+            state, _ = self._correct(*predicted, self._parameters, dt, nothing, LEAST_INLIERS)
         self._state = state
 
     def _lost(self, frame: Frame, **searched) -> Tracked:
@@ -446,11 +447,12 @@ def _correct(
     parameters: Parameters,
     dt,
     features: Features,
+    least: int,
 ) -> tuple[Any, tuple]:
     dt = jnp.asarray(dt, parameters.measurement_sigma.dtype)
     agreed = inliers(slam_filter.gaussian_filter, gaussian, parameters, dt, features)
     # A few of many that were searched can agree by chance: a lost camera only moves.
-    agreed &= jnp.sum(agreed) >= LEAST_INLIERS
+    agreed &= jnp.sum(agreed) >= least
     state, innovation = slam_filter.update(state, parameters, dt, replace(features, valid=agreed))
     state = slam_filter.compose(state, parameters, dt)
     covariance = slam_filter.reported(state).covariance
