@@ -29,6 +29,12 @@ class Located:
         """Root of the summed variances about the three axes, rad."""
         return float(np.sqrt(np.trace(self.covariance[3:, 3:])))
 
+    @property
+    def position_covariance(self) -> Float[np.ndarray, "3 3"]:
+        """Of the position, in the world's axes."""
+        R = self.T_wc[:3, :3]
+        return R @ self.covariance[:3, :3] @ R.T
+
     def then(self, step: Located) -> Located:
         """The pose `T_wc T_step`, of a camera that is located relative to this one.
 

@@ -143,13 +143,15 @@ def _write(
     write_frames(out / "frames.csv", history)
     known = _mapped(tracker, history)
     write_ply(out / "map.ply", known.points, known.covariances, known.numbers, known.maps)
+    begun = [place for place, result in enumerate(history) if result.starts and result.map]
     plot_map(
         T_wc,
         known.points,
-        known.covariances,
+        known.in_map,
         path=out / "map.png",
         unit="map units",
-        maps=[result.map for result in history],
+        begun=begun,
+        begun_covariances=[history[place].camera.position_covariance for place in begun],
     )
     summary = _summary(source, tracker, history, seconds)
     with write_atomically(out / "summary.json") as path:
@@ -194,8 +196,9 @@ def _mapped(tracker: Tracker, history: list[Tracked]) -> Points:
     away = landmarks.points[:, None] - cameras
     same = landmarks.maps[:, None] == np.array([result.map for result in history])
     distance = np.linalg.norm(away, axis=2).min(axis=1, initial=np.inf, where=same)
-    with np.errstate(invalid="ignore"):
-        known = np.isfinite(landmarks.sigmas) & (landmarks.sigmas < _KNOWN_DEPTH * distance)
+    with np.errstate(invalid="ignore"):  # of unknown depth, a variance can be anything
+        sigma = np.sqrt(np.trace(landmarks.in_map, axis1=1, axis2=2))
+        known = np.isfinite(sigma) & (sigma < _KNOWN_DEPTH * distance)
     return Points(*(part[known] for part in landmarks))
 
 

@@ -115,8 +115,8 @@ class Points(NamedTuple):
     """(n, 3); not finite for one at infinity."""
     covariances: np.ndarray
     """(n, 3, 3), the camera's uncertainty and that of the map's start included."""
-    sigmas: np.ndarray
-    """Roots of the summed variances of the three axes in their own maps."""
+    in_map: np.ndarray
+    """The same given where the map begins, (n, 3, 3)."""
 
 
 @dataclass
@@ -397,11 +397,10 @@ class Tracker:
     def _recorded(self, slots: list[int]) -> Points:
         seen = jax.device_get(self._world_points(self._state, self._parameters))
         points, covariances = (of_slot[slots] for of_slot in seen)
-        with np.errstate(invalid="ignore"):  # of unknown depth, a variance can be anything
-            sigmas = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
         numbers = np.array([self.landmarks[slot].number for slot in slots], int)
         maps = np.full_like(numbers, self.restarts)
-        return Points(numbers, maps, *self._origin.points(points, covariances), sigmas)
+        _, in_map = Located(self._origin.T_wc).points(points, covariances)
+        return Points(numbers, maps, *self._origin.points(points, covariances), in_map)
 
     def _tracked(self, frame: Frame, **found) -> Tracked:
         return Tracked(

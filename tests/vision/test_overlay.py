@@ -71,6 +71,24 @@ def test_overlay_adds_a_strip_and_refuses_unknown_statuses():
         draw([200.0, 60.0], np.eye(2), NOTHING, "seen")
 
 
+def test_a_note_stands_in_the_strip_and_leaves_the_picture():
+    plain, noted = (
+        draw_overlay(
+            GREY,
+            predicted=np.zeros((0, 2)),
+            covariances=np.zeros((0, 2, 2)),
+            matched=np.zeros((0, 2)),
+            status=[],
+            index=3,
+            time=0.1,
+            note=note,
+        )
+        for note in ("", "LOST")
+    )
+    assert np.all(plain[:-STRIP] == noted[:-STRIP])
+    assert np.any(plain[-STRIP:] != noted[-STRIP:])
+
+
 def read_video(path):
     capture = cv2.VideoCapture(str(path))
     frames = []
@@ -168,6 +186,22 @@ def test_map_is_drawn_with_and_without_landmarks_and_reference(tmp_path):
     def landmarks(image):
         return int(np.sum(np.abs(image.astype(int) - green).max(axis=2) < 10))
 
+    plot_map(
+        T_wc,
+        points,
+        covariances,
+        path=tmp_path / "two.png",
+        begun=[10],
+        begun_covariances=[0.3 * np.eye(3)],
+    )
+    two = cv2.imread(str(tmp_path / "two.png"))
+
+    def of_new_maps(image):
+        return int(np.sum(np.abs(image.astype(int) - [167, 121, 204]).max(axis=2) < 10))
+
+    # The two marks and the legend's, and the ellipses around them.
+    assert of_new_maps(two) > 100
+    assert of_new_maps(full) == 0
     assert landmarks(full) > 200
     assert landmarks(bare) == 0
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["bare.png", "full.png"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["bare.png", "full.png", "two.png"]
