@@ -5,6 +5,7 @@ import itertools
 import json
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
@@ -212,6 +213,14 @@ def test_a_filter_that_fails_is_begun_anew_from_what_prediction_says(broken):
     landmarks = tracker.points()
     assert set(landmarks.maps) == {0, 1}
     assert len(set(landmarks.numbers)) == len(landmarks.numbers) == tracker.created
+    # Where its map begins is no surer for a landmark than for the camera.
+    added = np.linalg.eigvalsh(landmarks.covariances - landmarks.in_map)
+    usual = np.linalg.norm(landmarks.points, axis=1) < 100
+    first, second = usual & (landmarks.maps == 0), usual & (landmarks.maps == 1)
+    assert first.sum() > 5
+    assert second.sum() > 5
+    np.testing.assert_allclose(added[first], 0, rtol=0, atol=1e-12)
+    assert np.all(added[second, -1] > start.covariance[:3, :3].diagonal().min())
 
 
 def test_matches_too_few_to_believe_change_nothing():
@@ -245,9 +254,8 @@ def test_an_unknown_calibration_counts_in_the_first_frame_too():
     for frame in source:
         tracker.track(frame)
     slots = np.array(sorted(tracker.landmarks))
-    charts, covariances = tracker._filter.landmarks_in_camera(
-        tracker._state, tracker._parameters, slots
-    )
+    in_camera = jax.jit(tracker._filter.landmarks_in_camera)
+    charts, covariances = in_camera(tracker._state, tracker._parameters, slots)
     # u = f x/z + c, each of f, c and u with its own σ.
     variance = 0.3**2 + 2.0**2 + (settings.focal_sigma * np.asarray(charts)[:, 0]) ** 2
     expected = variance / source.calibration.fx**2
