@@ -100,7 +100,7 @@ def page(results: Results) -> str:
         "*straight line* at constant speed, which looks at no picture, has the error beside the",
         "title. *Sign*: the correlation of true with estimated positions, turned by the",
         "orientations: −1 is a world behind the camera. *Orientation*: its RMS error, in degrees.",
-        "A camera that is lost for half a second begins a new *map*, in another unit of length.",
+        "A camera that is lost for 15 frames begins a new *map*, in another unit of length.",
         "The time is that of a machine that others used too. The settings are those for a hand:",
         "with them no filter follows the car of kitti06 through all frames.",
     ]
