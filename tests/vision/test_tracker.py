@@ -246,6 +246,21 @@ def test_matches_too_few_to_believe_change_nothing():
     np.testing.assert_allclose(corrected.covariance, expected.covariance, rtol=0, atol=1e-15)
 
 
+def test_a_lost_camera_asks_for_half_of_what_it_searches():
+    source = synthetic_source(frames=4)
+    tracker = Tracker(source.calibration, TrackerSettings(wanted=12, spare=4))
+    asked, whole = [], tracker._correct
+    tracker._correct = lambda *arguments: asked.append(arguments[-1]) or whole(*arguments)
+    results = []
+    for frame in source:
+        dark = frame.index == 2
+        frame = replace(frame, image=np.zeros_like(frame.image)) if dark else frame
+        results.append(tracker.track(frame))
+    assert [result.state for result in results] == ["start", "tracked", "lost", "tracked"]
+    assert asked == [LEAST_INLIERS, LEAST_INLIERS, len(results[3].status) // 2]
+    assert asked[-1] > LEAST_INLIERS
+
+
 def test_an_unknown_calibration_counts_in_the_first_frame_too():
     """Bearings of the landmarks that it creates are as unsure as pixel and principal point."""
     source = synthetic_source(frames=1)
