@@ -83,13 +83,13 @@ def write_covariances(path: str | Path, times: ArrayLike, covariances: ArrayLike
 
     A line is the time and the upper triangle, row by row: position in the camera's axes, rotation
     vector. The true pose is `T_wc E`, and that is the covariance of E's translation and rotation
-    vector.
+    vector. That maps which follow one another have different units of length is not in it.
     """
     rows, columns = np.triu_indices(6)
     table = np.asarray(covariances, dtype=float).reshape(-1, 6, 6)[:, rows, columns]
     names = ("x", "y", "z", "rx", "ry", "rz")
     pairs = " ".join(f"{names[i]}{names[j]}" for i, j in zip(rows, columns, strict=True))
-    header = f"{pairs} (s; map units and rad, in the camera frame, given the scale; {_UNITS})"
+    header = f"{pairs} (s; map units and rad, in the camera frame; {_UNITS}, taken as one)"
     _write_rows(path, header, times, table, "covariances", ".9e")
 
 
