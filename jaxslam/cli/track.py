@@ -25,7 +25,8 @@ class TrackOptions:
     reference: Path | None = None
     """Reference trajectory in TUM format, to report the absolute trajectory error."""
     out: Path = Path("results")
-    """Folder for trajectory.txt, covariance.txt, map.ply, map.png, overlay.mp4 and summary.json."""
+    """Folder for trajectory.txt, covariance.txt, frames.csv, map.ply, map.png, overlay.mp4 and
+    summary.json."""
     frames: int | None = None
     """Frames of the synthetic video; 150 by default."""
     seed: int = 0
@@ -75,8 +76,8 @@ class TrackOptions:
             summary = track(source, self.out, self._settings(), progress=bar.update)
         print(describe(summary))
         print(
-            "wrote trajectory.txt, covariance.txt, map.ply, map.png, overlay.mp4, summary.json "
-            f"in {self.out}"
+            "wrote trajectory.txt, covariance.txt, frames.csv, map.ply, map.png, overlay.mp4, "
+            f"summary.json in {self.out}"
         )
 
     def _source(self):

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.plots.style import COLOURS, new_figure, save
 
-_TRAJECTORY, _REFERENCE, _LANDMARKS = COLOURS[:3]
+_TRAJECTORY, _REFERENCE, _LANDMARKS, _BEGUN = COLOURS[:4]
 _CHI2_95 = 5.991  # 95 % quantile of chi-squared with two degrees of freedom
 _MARGIN = 0.12  # around what is shown, as a share of its size
 
@@ -23,20 +23,28 @@ def plot_map(
     reference: ArrayLike | None = None,
     path: str | Path,
     unit: str = "m",
+    begun: ArrayLike = (),
+    begun_covariances: ArrayLike = (),
 ) -> None:
     """Draw the map from above (x, z) and from behind (x, y) into the image file `path`.
 
     `trajectory` and `reference` are poses T_wc (n, 4, 4), drawn as they are (align them first),
     `points` (n, 3) and `covariances` (n, 3, 3) landmarks in the world frame. Ellipses hold 95 %
     of the two coordinates shown. The axes cover the trajectories and the bulk of the landmarks;
-    the title says how many lie outside, and ellipses larger than the view are left out.
+    the title says how many lie outside, and ellipses larger than the view are left out. At the
+    poses `begun` a new map begins: the line breaks and is marked, with the 95 % of
+    `begun_covariances` (k, 3, 3) of where that is; the landmarks' covariances are then to be
+    those given where their map begins.
     """
     trajectory = np.asarray(trajectory, dtype=float).reshape(-1, 4, 4)[:, :3, 3]
     points = np.asarray(points, dtype=float).reshape(-1, 3)
     covariances = np.asarray(covariances, dtype=float).reshape(-1, 3, 3)
     finite = np.isfinite(points).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
     points, covariances = points[finite], covariances[finite]
-    lines = [("estimate", trajectory, _TRAJECTORY, "-")]
+    begun = np.asarray(begun, dtype=int)
+    begun_covariances = np.asarray(begun_covariances, dtype=float).reshape(-1, 3, 3)
+    broken = np.insert(trajectory, begun, np.nan, axis=0)
+    lines = [("estimate", broken, _TRAJECTORY, "-")]
     if reference is not None:
         reference = np.asarray(reference, dtype=float).reshape(-1, 4, 4)[:, :3, 3]
         lines.append(("reference", reference, _REFERENCE, "--"))
@@ -56,6 +64,8 @@ def plot_map(
         if len(trajectory):
             start = trajectory[0, plane]
             axis.plot(*start, "o", color=_TRAJECTORY, ms=5, mfc="white", label="start")
+        if len(begun):
+            _draw_begun(axis, trajectory[begun][:, plane], begun_covariances[:, plane][:, :, plane])
         axis.set(xlabel=f"x ({unit})", ylabel=f"{'xyz'[up]} ({unit})", aspect="equal")
         axis.set(xlim=(low[across], high[across]), ylim=(low[up], high[up]))
         axis.set_title(f"{title}: {_counts(inside, hidden)}", fontsize=10)
@@ -102,16 +112,37 @@ def _draw_landmarks(
     """Draw points and their 95 % ellipses; return how many ellipses were too large to draw."""
     if not len(points):
         return 0
+    shown = 2 * np.sqrt(_CHI2_95 * np.linalg.eigvalsh(covariances)[:, 1]) <= size.max()
+    _draw_ellipses(axis, points[shown], covariances[shown], _LANDMARKS)
+    axis.plot(
+        *points.T, ".", color=_LANDMARKS, ms=3.5, label="landmarks, 95 % ellipses in their maps"
+    )
+    return int((~shown).sum())
+
+
+def _draw_begun(
+    axis: Axes, places: Float[np.ndarray, "k 2"], covariances: Float[np.ndarray, "k 2 2"]
+) -> None:
+    """Mark where maps begin, and where in the world that can be."""
+    _draw_ellipses(axis, places, covariances, _BEGUN)
+    label = "a new map begins, 95 % of where"
+    axis.plot(*places.T, "D", color=_BEGUN, ms=6, mfc="white", label=label)
+
+
+def _draw_ellipses(
+    axis: Axes,
+    centres: Float[np.ndarray, "n 2"],
+    covariances: Float[np.ndarray, "n 2 2"],
+    colour: str,
+) -> None:
+    """The 95 % ellipses of Gaussians in the plane."""
     variances, vectors = np.linalg.eigh(covariances)
     diameters = 2 * np.sqrt(_CHI2_95 * np.maximum(variances, 0.0))
     angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
-    shown = diameters[:, 1] <= size.max()
     axis.add_collection(
         EllipseCollection(
-            diameters[shown, 1], diameters[shown, 0], angles[shown], units="xy",
-            offsets=points[shown], offset_transform=axis.transData,
-            facecolors=_LANDMARKS + "18", edgecolors=_LANDMARKS + "90", linewidths=0.7,
+            diameters[:, 1], diameters[:, 0], angles, units="xy",
+            offsets=centres, offset_transform=axis.transData,
+            facecolors=colour + "18", edgecolors=colour + "90", linewidths=0.7,
         )
     )  # fmt: skip
-    axis.plot(*points.T, ".", color=_LANDMARKS, ms=3.5, label="landmarks, 95 % ellipses")
-    return int((~shown).sum())

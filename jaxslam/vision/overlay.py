@@ -32,6 +32,7 @@ def draw_overlay(
     status: Sequence[str],
     index: int | None = None,
     time: float | None = None,
+    note: str = "",
 ) -> UInt8[np.ndarray, "h2 w 3"]:
     """The frame in blue, green, red with what the filter predicted and what was found there.
 
@@ -39,8 +40,8 @@ def draw_overlay(
     standard deviations of its 2x2 covariance (pixels^2), and a ring with a line to it at the
     `matched` pixel, in the colour of its status, one of `COLOURS`. What is not finite is not
     drawn: nan for a landmark without a match, or without a prediction ('new'). Below the image
-    a strip of `STRIP` rows counts the statuses and gives `index` and `time` (s). Raises
-    `ValueError` for another status.
+    a strip of `STRIP` rows counts the statuses and gives `index`, `time` (s) and a short `note`.
+    Raises `ValueError` for another status.
     """
     unknown = sorted({str(name) for name in status} - set(COLOURS))
     if unknown:
@@ -55,7 +56,7 @@ def draw_overlay(
             _draw_prediction(canvas, centre, covariance, colour)
         if np.all(np.isfinite(found)):
             _draw_match(canvas, centre, found, colour)
-    return np.vstack([canvas, _legend(image.shape[1], status, index, time)])
+    return np.vstack([canvas, _legend(image.shape[1], status, index, time, note)])
 
 
 class OverlayWriter:
@@ -155,12 +156,13 @@ def _draw_match(
 
 
 def _legend(
-    width: int, status: Sequence[str], index: int | None, time: float | None
+    width: int, status: Sequence[str], index: int | None, time: float | None, note: str
 ) -> UInt8[np.ndarray, "strip w 3"]:
     strip = np.full((STRIP, width, 3), 20, np.uint8)
     names = [str(name) for name in status]
     place = "" if index is None else f"frame {index}"
     place += "" if time is None else f"  {time:.2f} s"
+    place += f"  {note}" if note else ""
     entries = [(place.strip(), None)] if place else []
     entries += [(f"{names.count(name)} {name}", colour) for name, colour in COLOURS.items()]
     # A narrow image gets smaller letters, a wide one does not get larger ones.

@@ -57,6 +57,8 @@ class TrackerSettings:
     """… and removed when fewer of them than this share matched."""
     forget_after: int = 30
     """Frames out of view after which a landmark is removed."""
+    lost_for: int = 15
+    """Frames in a row without tracking after which a new map is begun."""
 
     def __post_init__(self) -> None:
         if self.filter == "recommended":

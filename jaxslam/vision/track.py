@@ -1,9 +1,11 @@
-"""Track a whole video and write its files: trajectory, covariances, map, overlay, summary."""
+"""Track a whole video and write its files, from the trajectory to the overlay."""
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import json
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,12 +15,13 @@ import numpy as np
 
 from jaxslam import __version__
 from jaxslam.files import write_atomically
+from jaxslam.filters import inverse_depth_prior
 from jaxslam.plots.tracking import plot_map
 from jaxslam.vision.overlay import OverlayWriter, draw_overlay, overlay_size
 from jaxslam.vision.pointcloud import write_ply
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.sources import Frame, Source
-from jaxslam.vision.tracker import Tracked, Tracker
+from jaxslam.vision.tracker import Points, Tracked, Tracker
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
     write_covariances,
@@ -28,6 +31,10 @@ from jaxslam.vision.trajectory import (
 SCHEMA = 1
 _WARM_UP = 3
 """Frames in which functions are compiled; they count in `seconds.start`, not in the quantiles."""
+_COLUMNS = (
+    "frame", "time", "state", "map", "matches", "nis", "nis_dof",
+    "sigma_position", "sigma_orientation", "sigma_log_scale",
+)  # fmt: skip
 _KNOWN_DEPTH = 0.3
 """A point is put into the map where its σ is below this share of its distance."""
 
@@ -39,8 +46,8 @@ def track(
     *,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> dict[str, Any]:
-    """Track `source`, write `trajectory.txt`, `covariance.txt`, `map.ply`, `map.png`,
-    `overlay.mp4` and `summary.json` into the folder `out`, and return the summary.
+    """Track `source`, write `trajectory.txt`, `covariance.txt`, `frames.csv`, `map.ply`,
+    `map.png`, `overlay.mp4` and `summary.json` into the folder `out`, and return the summary.
 
     An interruption (KeyboardInterrupt) or an unreadable frame (ValueError) leaves all of them for
     the frames so far, and is raised again.
@@ -69,12 +76,18 @@ def describe(summary: dict[str, Any]) -> str:
         f"{seconds['per_frame_median'] * 1e3:.0f} ms a frame (median), "
         f"{seconds['total']:.1f} s in all, {seconds['start']:.1f} s of them to start",
     ]
+    if summary["maps"] > 1:
+        lines.append(
+            f"{summary['maps']} maps, each in a unit of its own: frames.csv says where they begin"
+        )
     if "ate" in summary:
         ate = summary["ate"]
         share = ate["rmse"] / ate["path_length"] if ate["path_length"] else float("nan")
         lines.append(
             f"absolute trajectory error after {ate['alignment']} alignment: {ate['rmse']:.4f} on "
-            f"a path of {ate['path_length']:.2f}, {share:.2%}"
+            f"a path of {ate['path_length']:.2f}, {share:.2%} (a straight line's "
+            f"{ate['straight_line']:.4f}); sign {ate['sign']:.2f}, "
+            f"orientation {ate['orientation_rmse']:.2f}°"
         )
     return "\n".join(lines)
 
@@ -116,6 +129,7 @@ def _overlay(frame: Frame, result: Tracked) -> np.ndarray:
         status=[*result.status, *["new"] * len(new)],
         index=result.index,
         time=result.time,
+        note={"tracked": "", "lost": "LOST", "start": f"MAP {result.map}"}[result.state],
     )
 
 
@@ -126,24 +140,76 @@ def _write(
     T_wc = np.stack([result.T_wc for result in history])
     write_tum(out / "trajectory.txt", times, T_wc)
     write_covariances(out / "covariance.txt", times, [result.covariance for result in history])
-    numbers, points, covariances = _mapped(tracker, T_wc)
-    write_ply(out / "map.ply", points, covariances, numbers)
-    plot_map(T_wc, points, covariances, path=out / "map.png", unit="map units")
+    write_frames(out / "frames.csv", history)
+    known = _mapped(tracker, history)
+    write_ply(out / "map.ply", known.points, known.covariances, known.numbers, known.maps)
+    begun = [place for place, result in enumerate(history) if result.starts and result.map]
+    plot_map(
+        T_wc,
+        known.points,
+        known.in_map,
+        path=out / "map.png",
+        unit="map units",
+        begun=begun,
+        begun_covariances=[history[place].camera.position_covariance for place in begun],
+    )
     summary = _summary(source, tracker, history, seconds)
     with write_atomically(out / "summary.json") as path:
         path.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
     return summary
 
 
-def _mapped(tracker: Tracker, T_wc: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The landmarks whose depth became known, with their covariances."""
-    numbers, points, covariances = tracker.points()
-    away = points[:, None] - T_wc[None, :, :3, 3]
-    distance = np.linalg.norm(away, axis=2).min(axis=1, initial=np.inf)
-    with np.errstate(invalid="ignore"):
-        sigma = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+def write_frames(path: str | Path, history: list[Tracked]) -> None:
+    """Write what became of every frame as CSV, whole or not at all.
+
+    `state` is `start` (of a map; where it is not the first, the camera is lost too), `tracked` or
+    `lost`, `map` the number of the map, from 0. σ of position (map units) and orientation (rad)
+    are roots of the summed variances of the three axes, zero in the first frame alone, which is
+    the world's.
+    `sigma_log_scale` is of the logarithm of the map's unit, empty where the filter has none in
+    doubt: then nobody has measured it.
+    """
+    with write_atomically(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(_COLUMNS)
+        writer.writerows(_row(result) for result in history)
+
+
+def _row(result: Tracked) -> list[Any]:
+    sigmas = result.camera.sigma_position, result.camera.sigma_orientation, result.sigma_log_scale
+    return [
+        result.index,
+        f"{result.time:.9f}",
+        result.state,
+        result.map,
+        result.status.count("matched"),
+        f"{result.nis:.6g}",
+        result.nis_dof,
+        *("" if sigma is None else f"{sigma:.6g}" for sigma in sigmas),
+    ]
+
+
+def _mapped(tracker: Tracker, history: list[Tracked]) -> Points:
+    """The landmarks whose depth became known in their maps."""
+    landmarks = tracker.points()
+    cameras = np.stack([result.T_wc[:3, 3] for result in history])
+    away = landmarks.points[:, None] - cameras
+    same = landmarks.maps[:, None] == np.array([result.map for result in history])
+    distance = np.linalg.norm(away, axis=2).min(axis=1, initial=np.inf, where=same)
+    with np.errstate(invalid="ignore"):  # of unknown depth, a variance can be anything
+        sigma = np.sqrt(np.trace(landmarks.in_map, axis1=1, axis2=2))
         known = np.isfinite(sigma) & (sigma < _KNOWN_DEPTH * distance)
-    return numbers[known], points[known], covariances[known]
+    return Points(*(part[known] for part in landmarks))
+
+
+def _scale_between_maps(settings: TrackerSettings) -> float:
+    """σ of the logarithm of the ratio of two maps' units, as far as the prior on depth tells.
+
+    A unit is known as well as what all depths of a scene have in common: at the worst as one of
+    them, σ/ρ of its inverse depth, in each of the two maps.
+    """
+    mean, sigma = inverse_depth_prior(settings.nearest_depth)
+    return math.sqrt(2) * sigma / mean
 
 
 def _summary(
@@ -163,6 +229,7 @@ def _summary(
         "tracked": len(history) - lost,
         "lost": lost,
         "restarts": tracker.restarts,
+        "maps": tracker.restarts + 1,
         "landmarks": {
             "mean": float(np.mean([len(result.status) for result in updates] or [0])),
             "created": tracker.created,
@@ -177,6 +244,8 @@ def _summary(
             "per_frame_p99": float(np.quantile(later, 0.99)),
         },
     }
+    if tracker.restarts:
+        summary["log_scale_sigma_between_maps"] = _scale_between_maps(tracker.settings)
     if source.reference is not None:
         times = np.array([result.time for result in history])
         T_wc = np.stack([result.T_wc for result in history])

@@ -19,18 +19,20 @@ from jaxslam.filters import (
     State,
     make_filter,
 )
+from jaxslam.filters.bank import BankState, moments
 from jaxslam.filters.initialisation import UNDELAYED
 from jaxslam.filters.ransac import inliers
 from jaxslam.geometry import SPATIAL
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.rig import Rig
 from jaxslam.vision.calibration import Calibration
+from jaxslam.vision.located import Located
 from jaxslam.vision.patches import Match, Patch, detect_corners, match_patches
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.sources import Frame
 
 LEAST_INLIERS = 4
-"""Fewer matches than this do not count as having tracked a frame."""
+"""Fewer matches than this do not count as having tracked a frame, and are not believed."""
 
 
 class _Prediction(NamedTuple):
@@ -65,10 +67,8 @@ class Tracked:
 
     index: int
     time: float
-    T_wc: np.ndarray
-    """Camera in the world, (4, 4); the world is the first camera."""
-    covariance: np.ndarray
-    """(6, 6) in the right tangent of T_wc: position in camera axes, rotation."""
+    camera: Located
+    """The camera in the world, which is the first camera; of a later map, by way of its start."""
     predicted: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     """Pixels of the landmarks searched, (k, 2)."""
     search: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 2)))
@@ -82,11 +82,51 @@ class Tracked:
     nis: float = 0.0
     nis_dof: int = 0
     lost: bool = False
+    starts: bool = False
+    """Whether a map begins here; where it is not the first, the camera was lost too."""
+    map: int = 0
+    """Number of the map; each has a unit of length of its own."""
+    sigma_log_scale: float | None = None
+    """σ of the logarithm of the map's unit, where the filter has one in doubt."""
+
+    @property
+    def T_wc(self) -> np.ndarray:
+        """(4, 4)."""
+        return self.camera.T_wc
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(6, 6) in the right tangent of T_wc: position in camera axes, rotation."""
+        return self.camera.covariance
+
+    @property
+    def state(self) -> str:
+        """`start` of a map, `lost` or `tracked`."""
+        return "start" if self.starts else "lost" if self.lost else "tracked"
+
+
+class Points(NamedTuple):
+    """n landmarks in the world, as they were seen last."""
+
+    numbers: np.ndarray
+    maps: np.ndarray
+    """Numbers of their maps."""
+    points: np.ndarray
+    """(n, 3); not finite for one at infinity."""
+    covariances: np.ndarray
+    """(n, 3, 3), the camera's uncertainty and that of the map's start included."""
+    in_map: np.ndarray
+    """The same given where the map begins, (n, 3, 3)."""
 
 
 @dataclass
 class Tracker:
     """Tracks a camera: `track(frame)` for each frame of a video, in order.
+
+    A camera that is lost moves as the filter predicts. One lost for long, or a filter whose
+    covariance is not positive any more, begins a new map where the picture has the corners for
+    it: exactly known in its own frame, and in the world as surely as its start is. Its unit of
+    length is another, which no covariance here knows of.
 
     The mutable part is this object; all mathematics is in pure, jitted functions of the state.
     """
@@ -97,8 +137,8 @@ class Tracker:
     created: int = field(default=0, init=False)
     deleted: int = field(default=0, init=False)
     restarts: int = field(default=0, init=False)
-    finished: list[tuple[int, np.ndarray, np.ndarray]] = field(default_factory=list, init=False)
-    """Landmarks that left the map: number, last point in the world, covariance."""
+    finished: list[Points] = field(default_factory=list, init=False)
+    """Landmarks that left the map."""
 
     def __post_init__(self) -> None:
         s = self.settings
@@ -111,11 +151,13 @@ class Tracker:
             )
         self._filter: StagedFilter = made
         self._time: float | None = None
-        self._T_wc = self._origin = np.eye(4)
-        self._covariance = np.zeros((6, 6))
+        self._origin = self._camera = Located()
+        self._sigma_log_scale: float | None = None
+        self._unmeasured = 0
         self._predict = jax.jit(partial(_predict, self._filter))
         self._correct = jax.jit(partial(_correct, self._filter))
         self._renew_map = jax.jit(partial(_renew_map, self._filter))
+        self._begin_map = jax.jit(partial(_begin_map, self._filter))
         self._world_points = jax.jit(partial(_world_points, self._filter))
         with jax.enable_x64(True):
             self._parameters = s.parameters(self.calibration)
@@ -127,21 +169,15 @@ class Tracker:
         with jax.enable_x64(True):
             return self._first(frame) if self._time is None else self._next(frame)
 
-    def points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Numbers, points in the world and covariances of all landmarks, those gone included."""
+    def points(self) -> Points:
+        """All landmarks, those gone included."""
         with jax.enable_x64(True):
-            kept = self.finished + self._recorded(sorted(self.landmarks))
-        numbers, points, covariances = zip(*kept, strict=True) if kept else ((), (), ())
-        return (
-            np.array(numbers, int),
-            np.array(points, float).reshape(-1, 3),
-            np.array(covariances, float).reshape(-1, 3, 3),
-        )
+            kept = [*self.finished, self._recorded(sorted(self.landmarks))]
+        return Points(*(np.concatenate(parts) for parts in zip(*kept, strict=True)))
 
     def _first(self, frame: Frame) -> Tracked:
-        created = self._renew(frame, np.zeros((0, 2)), self.settings.wanted)
         self._time = frame.time
-        return self._tracked(frame, created=created)
+        return self._tracked(frame, created=self._begun(frame, self._corners(frame)), starts=True)
 
     def _next(self, frame: Frame) -> Tracked:
         dt = frame.time - (-np.inf if self._time is None else self._time)
@@ -149,24 +185,23 @@ class Tracker:
             raise ValueError(f"frame {frame.index}: its time is not later than the one before")
         predicted, prediction = self._predict(self._state, self._parameters, dt)
         prediction = jax.device_get(prediction)
-        prediction = prediction._replace(T_wc=self._origin @ prediction.T_wc)
+        prediction = prediction._replace(T_wc=self._origin.T_wc @ prediction.T_wc)
         slots = self._visible(prediction)
         found = self._search(frame, prediction, slots)
         matched, features = self._features(slots, found)
-        state, result = self._correct(*predicted, self._parameters, dt, features)
+        least = max(LEAST_INLIERS, len(slots) // 2) if self._unmeasured else LEAST_INLIERS
+        state, result = self._correct(*predicted, self._parameters, dt, features, least)
         used, nis, nis_dof, healthy = jax.device_get(result)
+        self._time = frame.time
         if not healthy:
-            return self._restart(frame)
-        self._state, self._time = state, frame.time
+            self._fall_back(predicted, dt)
+            return self._lost(frame)
+        self._state = state
         used = used[: len(slots)]
         self._count(slots, used)
         self._remove_failing()
         pixels = prediction.pixels[slots]
-        created = self._renew(
-            frame, np.where(used[:, None], matched, pixels), self.settings.new_per_frame
-        )
-        return self._tracked(
-            frame,
+        searched = dict(
             predicted=pixels,
             search=prediction.covariances[slots],
             matched=matched,
@@ -174,18 +209,48 @@ class Tracker:
                 "unmatched" if match is None else "matched" if ok else "outlier"
                 for match, ok in zip(found, used, strict=True)
             ],
+        )
+        lost = not used.any()
+        self._unmeasured = self._unmeasured + 1 if lost else 0
+        if not self.landmarks or self._unmeasured > self.settings.lost_for:
+            return self._lost(frame, **searched)
+        occupied = np.where(used[:, None], matched, pixels)
+        created = self._renewed(frame, self._corners(frame, occupied))
+        return self._tracked(
+            frame,
+            **searched,
             created=created,
             nis=float(nis),
             nis_dof=int(nis_dof),
-            lost=bool(used.sum() < LEAST_INLIERS),
+            lost=lost,
         )
 
-    def _restart(self, frame: Frame) -> Tracked:
-        """The covariance is no longer positive: begin anew where the camera was last."""
-        self.restarts += 1
+    def _fall_back(self, predicted: tuple[Any, State], dt: float) -> None:
+        """The covariance is no longer positive: what prediction alone says of the camera.
+
+        Where that is broken too, the camera is as far from where it was last as the prior on a
+        start's velocity lets it be. The landmarks are those of the frame before.
+        """
         self._remove(sorted(self.landmarks))
-        self._origin, self._state = self._T_wc, self._empty_state()
-        return replace(self._first(frame), lost=True)
+        nothing = _padded(np.zeros(0, int), np.zeros((0, 2)), self.settings.wanted)
+        state, result = self._correct(*predicted, self._parameters, dt, nothing, LEAST_INLIERS)
+        if not result[-1]:
+            self._origin = self._camera
+            predicted, _ = self._predict(self._empty_state(), self._parameters, dt)
+            state, _ = self._correct(*predicted, self._parameters, dt, nothing, LEAST_INLIERS)
+        self._state = state
+
+    def _lost(self, frame: Frame, **searched) -> Tracked:
+        """Begin a new map at the camera as it is predicted, or wait for a picture with corners."""
+        corners = self._corners(frame)
+        self._renewed(frame, corners[:0])
+        if len(corners) < LEAST_INLIERS:
+            return self._tracked(frame, **searched, lost=True)
+        self._remove(sorted(self.landmarks))
+        self.restarts += 1
+        self._origin, self._state = self._camera, self._empty_state()
+        created = self._begun(frame, corners)
+        return self._tracked(frame, **searched, created=created, lost=True, starts=True)
 
     def _empty_state(self) -> Any:
         s = self.settings
@@ -281,52 +346,71 @@ class Tracker:
     def _remove(self, slots: list[int]) -> None:
         if not slots:
             return
-        self.finished += self._recorded(slots)
+        self.finished.append(self._recorded(slots))
         self.deleted += len(slots)
         for slot in slots:
             del self.landmarks[slot]
         gone = np.isin(np.arange(self.settings.capacity), slots)
         self._state = self._filter.remove(self._state, jnp.asarray(gone))
 
-    def _renew(self, frame: Frame, occupied: np.ndarray, most: int) -> np.ndarray:
-        """Create landmarks where the picture is bare; their pixels. Ends the filter's frame."""
+    def _corners(self, frame: Frame, occupied: np.ndarray | None = None) -> np.ndarray:
+        """Where the picture is bare; for a whole map where nothing says what is `occupied`."""
+        s = self.settings
+        free = s.capacity - len(self.landmarks)
+        count = s.wanted
+        if occupied is not None:
+            count = min(s.new_per_frame, s.wanted - len(occupied), free)
+        if count <= 0:
+            return np.zeros((0, 2))
+        return detect_corners(
+            frame.image,
+            count,
+            occupied=np.zeros((0, 2)) if occupied is None else occupied,
+            min_distance=s.spacing,
+            border=2 * s.border,
+        ).astype(float)
+
+    def _begun(self, frame: Frame, corners: np.ndarray) -> np.ndarray:
+        """Landmarks at the corners, in a state that has none; the corners. Frame 0 of a map."""
+        self._unmeasured = 0
+        return self._created(self._begin_map, frame, corners)
+
+    def _renewed(self, frame: Frame, corners: np.ndarray) -> np.ndarray:
+        """New landmarks at the corners; the corners. Ends the filter's frame."""
+        return self._created(self._renew_map, frame, corners)
+
+    def _created(self, function: Any, frame: Frame, corners: np.ndarray) -> np.ndarray:
         s = self.settings
         free = [slot for slot in range(s.capacity) if slot not in self.landmarks]
-        count = min(most, s.wanted - len(occupied), len(free))
-        corners = np.zeros((0, 2))
-        if count > 0:
-            corners = detect_corners(
-                frame.image,
-                count,
-                occupied=occupied,
-                min_distance=s.spacing,
-                border=2 * s.border,
-            ).astype(float)
         slots = np.array(free[: len(corners)], int)
         new = _padded(slots, corners, s.wanted)
-        self._state, pose = self._renew_map(self._state, self._parameters, new)
-        T_BC, self._covariance = jax.device_get(pose)
-        self._T_wc = self._origin @ T_BC
+        self._state, reported = function(self._state, self._parameters, new)
+        T_BC, covariance, log_scale = jax.device_get(reported)
+        self._camera = self._origin.then(Located(T_BC, covariance))
+        self._sigma_log_scale = float(np.sqrt(log_scale)) if log_scale > 0 else None
         for slot, corner in zip(slots, corners, strict=True):
             patch = Patch.take(frame.image, corner)
-            self.landmarks[int(slot)] = _Landmark(self.created, patch, self._T_wc)
+            self.landmarks[int(slot)] = _Landmark(self.created, patch, self._camera.T_wc)
             self.created += 1
         return corners
 
-    def _recorded(self, slots: list[int]) -> list[tuple[int, np.ndarray, np.ndarray]]:
-        points, covariances = jax.device_get(self._world_points(self._state, self._parameters))
-        rotation, translation = self._origin[:3, :3], self._origin[:3, 3]
-        return [
-            (
-                self.landmarks[slot].number,
-                rotation @ points[slot] + translation,
-                rotation @ covariances[slot] @ rotation.T,
-            )
-            for slot in slots
-        ]
+    def _recorded(self, slots: list[int]) -> Points:
+        seen = jax.device_get(self._world_points(self._state, self._parameters))
+        points, covariances = (of_slot[slots] for of_slot in seen)
+        numbers = np.array([self.landmarks[slot].number for slot in slots], int)
+        maps = np.full_like(numbers, self.restarts)
+        _, in_map = Located(self._origin.T_wc).points(points, covariances)
+        return Points(numbers, maps, *self._origin.points(points, covariances), in_map)
 
     def _tracked(self, frame: Frame, **found) -> Tracked:
-        return Tracked(frame.index, frame.time, self._T_wc, self._covariance, **found)
+        return Tracked(
+            frame.index,
+            frame.time,
+            self._camera,
+            map=self.restarts,
+            sigma_log_scale=self._sigma_log_scale,
+            **found,
+        )
 
 
 def _padded(slots: np.ndarray, pixels: np.ndarray, size: int) -> Features:
@@ -362,9 +446,12 @@ def _correct(
     parameters: Parameters,
     dt,
     features: Features,
+    least: int,
 ) -> tuple[Any, tuple]:
     dt = jnp.asarray(dt, parameters.measurement_sigma.dtype)
     agreed = inliers(slam_filter.gaussian_filter, gaussian, parameters, dt, features)
+    # A few of many that were searched can agree by chance: a lost camera only moves.
+    agreed &= jnp.sum(agreed) >= least
     state, innovation = slam_filter.update(state, parameters, dt, replace(features, valid=agreed))
     state = slam_filter.compose(state, parameters, dt)
     covariance = slam_filter.reported(state).covariance
@@ -372,10 +459,33 @@ def _correct(
     return state, (innovation.used, innovation.nis, innovation.nis_dof, healthy)
 
 
+def _begin_map(slam_filter: StagedFilter, state: Any, parameters: Parameters, new: Features):
+    state = slam_filter.first(state, parameters, new)
+    return state, _reported(slam_filter, state)
+
+
 def _renew_map(slam_filter: StagedFilter, state: Any, parameters: Parameters, new: Features):
     state = slam_filter.finish(slam_filter.initialise(state, parameters, new))
+    return state, _reported(slam_filter, state)
+
+
+def _reported(slam_filter: StagedFilter, state: Any):
+    """T_BC, its covariance and the variance of λ; zero of a filter without."""
     T_BC, covariance = slam_filter.camera_pose(state)
-    return state, (T_BC.as_matrix(), covariance)
+    return T_BC.as_matrix(), covariance, _log_scale_variance(slam_filter, state)
+
+
+def _log_scale_variance(slam_filter: StagedFilter, state: Any):
+    one = slam_filter.gaussian_filter
+    if not one.scale_gauge:
+        return jnp.zeros(())
+
+    def log_scale(state):
+        return one.engine.core_covariance(lambda core: core.log_scale, state)
+
+    if not isinstance(state, BankState):
+        return log_scale(state)[1][0, 0]
+    return moments(state.log_weights, *jax.vmap(log_scale)(state.members))[1][0, 0]
 
 
 def _world_points(slam_filter: StagedFilter, state: Any, parameters: Parameters):

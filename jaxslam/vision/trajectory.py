@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TypedDict
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
@@ -12,6 +12,10 @@ from jaxslam.files import write_atomically
 
 # A pose and a reference pose further apart in time than this (s) are not compared; evo's default.
 MAX_TIME_DIFFERENCE = 0.01
+# Nine decimals of two files: their poses can differ by 4e-9 (map units and rad), and be the same.
+_ROUNDING = 1e-8
+
+_UNITS = "every map of frames.csv has a unit of its own"
 
 
 class TrajectoryError(TypedDict):
@@ -22,6 +26,9 @@ class TrajectoryError(TypedDict):
     path_length: float
     extent: float
     matched: int
+    sign: float
+    orientation_rmse: float
+    straight_line: float
 
 
 def poses(translation: ArrayLike, quaternion: ArrayLike) -> Float[np.ndarray, "n 4 4"]:
@@ -67,7 +74,7 @@ def write_tum(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> None:
     table[:, :3] = T_wc[:, :3, 3]
     if len(T_wc):  # Rotation refuses an empty stack
         table[:, 3:] = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True)
-    header = "tx ty tz qx qy qz qw (s; camera in the world frame)"
+    header = f"tx ty tz qx qy qz qw (s; camera in the world frame; {_UNITS})"
     _write_rows(path, header, times, table, "poses", ".9f")
 
 
@@ -76,13 +83,13 @@ def write_covariances(path: str | Path, times: ArrayLike, covariances: ArrayLike
 
     A line is the time and the upper triangle, row by row: position in the camera's axes, rotation
     vector. The true pose is `T_wc E`, and that is the covariance of E's translation and rotation
-    vector.
+    vector. That maps which follow one another have different units of length is not in it.
     """
     rows, columns = np.triu_indices(6)
     table = np.asarray(covariances, dtype=float).reshape(-1, 6, 6)[:, rows, columns]
     names = ("x", "y", "z", "rx", "ry", "rz")
     pairs = " ".join(f"{names[i]}{names[j]}" for i, j in zip(rows, columns, strict=True))
-    header = f"{pairs} (s; map units and rad, in the camera frame)"
+    header = f"{pairs} (s; map units and rad, in the camera frame; {_UNITS}, taken as one)"
     _write_rows(path, header, times, table, "covariances", ".9e")
 
 
@@ -112,17 +119,37 @@ def read_covariances(
     return table[:, 0], covariances
 
 
+def exactly_known(covariances: ArrayLike) -> Bool[np.ndarray, " n"]:
+    """Which of the covariances (n, 6, 6) are zero: poses that are known by definition.
+
+    The first camera is the world frame, so every file begins with one. They have no degree of
+    freedom, and are to be left out of a mean NEES.
+    """
+    return ~np.any(np.asarray(covariances, float), axis=(1, 2))
+
+
 def pose_nees(
     T_wc: ArrayLike, covariances: ArrayLike, reference: ArrayLike
 ) -> Float[np.ndarray, " n"]:
     """`eᵀ P⁻¹ e` of poses (n, 4, 4), e of `T_wc⁻¹ T_true` as in `write_covariances`; ideally 6.
 
-    The reference has the world frame and the unit of the map, as a simulation's has.
+    The reference has the world frame and the unit of the map, as a simulation's has. Of a pose
+    that is `exactly_known` it is 0 where the pose is right, to the rounding of the files, and
+    infinite where it is not. Raises `ValueError` for any other singular covariance.
     """
     E = np.linalg.inv(np.asarray(T_wc, float)) @ np.asarray(reference, float)
     errors = np.hstack([E[:, :3, 3], Rotation.from_matrix(E[:, :3, :3]).as_rotvec()])
-    solved = np.linalg.solve(np.asarray(covariances, float), errors[..., None])[..., 0]
-    return np.sum(errors * solved, axis=1)
+    covariances = np.asarray(covariances, float)
+    known = exactly_known(covariances)
+    nees = np.where(np.linalg.norm(errors, axis=1) <= _ROUNDING, 0.0, np.inf)
+    try:
+        solved = np.linalg.solve(covariances[~known], errors[~known, :, None])[..., 0]
+    except np.linalg.LinAlgError:
+        raise ValueError(
+            "the covariance of a pose is singular; a positive one, or zero, is accepted"
+        ) from None
+    nees[~known] = np.sum(errors[~known] * solved, axis=1)
+    return nees
 
 
 def absolute_trajectory_error(
@@ -136,8 +163,16 @@ def absolute_trajectory_error(
     Times (n,) and (m,) in seconds, poses (n, 4, 4) and (m, 4, 4). `evo` pairs poses by their
     times (`MAX_TIME_DIFFERENCE`) and aligns the estimate with scale (Umeyama's method).
     `path_length` is the reference's over the paired poses, `extent` the diagonal of the box
-    around them, `matched` their number. Raises `ValueError` where fewer than three poses pair
-    up or all positions of one trajectory coincide.
+    around them, `matched` their number.
+
+    Three numbers say what the error does not. `sign` is the correlation, −1 to 1, of the true
+    positions with the estimated ones, turned by the one rotation that fits the *orientations*
+    best: −1 is a world behind the camera, which the alignment turns round. `orientation_rmse`
+    is the angle, in degrees, that this rotation leaves. `straight_line` is the error that the
+    best straight line at constant speed would have, which looks at no picture.
+
+    Raises `ValueError` where fewer than three poses pair up or all positions of one trajectory
+    coincide.
     """
     from evo.core import lie_algebra, metrics, sync
     from evo.core.geometry import GeometryException
@@ -159,6 +194,7 @@ def absolute_trajectory_error(
         raise ValueError(_too_few(0)) from None
     if paired.num_poses < 3:
         raise ValueError(_too_few(paired.num_poses))
+    estimated, true = np.stack(paired.poses_se3), np.stack(paired_reference.poses_se3)
     try:
         paired.align(paired_reference, correct_scale=True)
     except GeometryException:  # a straight line, about which evo leaves the roll open: see below
@@ -167,6 +203,7 @@ def absolute_trajectory_error(
         )
         paired.scale(scale)
         paired.transform(lie_algebra.se3(rotation, translation))
+    sign, angle = _by_orientation(estimated, true)
     error = metrics.APE(metrics.PoseRelation.translation_part)
     error.process_data((paired_reference, paired))
     return {
@@ -175,7 +212,30 @@ def absolute_trajectory_error(
         "path_length": float(paired_reference.path_length),
         "extent": float(np.linalg.norm(np.ptp(paired_reference.positions_xyz, axis=0))),
         "matched": int(paired.num_poses),
+        "sign": sign,
+        "orientation_rmse": angle,
+        "straight_line": _straight_line(paired_reference.timestamps, true[:, :3, 3]),
     }
+
+
+def _by_orientation(
+    estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]
+) -> tuple[float, float]:
+    """`sign` and `orientation_rmse`, by the mean rotation from estimated to true orientations."""
+    true, estimated = (Rotation.from_matrix(T[:, :3, :3]) for T in (reference, estimate))
+    turn = (true * estimated.inv()).mean()
+    angles = (true.inv() * turn * estimated).magnitude()
+    positions, turned = reference[:, :3, 3], turn.apply(estimate[:, :3, 3])
+    a, b = positions - positions.mean(0), turned - turned.mean(0)
+    sign = np.sum(a * b) / np.sqrt(np.sum(a**2) * np.sum(b**2))
+    return float(sign), float(np.degrees(np.sqrt(np.mean(angles**2))))
+
+
+def _straight_line(times: Float[np.ndarray, " n"], positions: Float[np.ndarray, "n 3"]) -> float:
+    """RMS distance to the least squares line `a + b t`: any line can be aligned to any other."""
+    centred, t = positions - positions.mean(0), times - times.mean()
+    rest = centred - np.outer(t, t @ centred / (t @ t))
+    return float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
 
 
 def _line_alignment(

@@ -71,6 +71,24 @@ def test_overlay_adds_a_strip_and_refuses_unknown_statuses():
         draw([200.0, 60.0], np.eye(2), NOTHING, "seen")
 
 
+def test_a_note_stands_in_the_strip_and_leaves_the_picture():
+    plain, noted = (
+        draw_overlay(
+            GREY,
+            predicted=np.zeros((0, 2)),
+            covariances=np.zeros((0, 2, 2)),
+            matched=np.zeros((0, 2)),
+            status=[],
+            index=3,
+            time=0.1,
+            note=note,
+        )
+        for note in ("", "LOST")
+    )
+    assert np.all(plain[:-STRIP] == noted[:-STRIP])
+    assert np.any(plain[-STRIP:] != noted[-STRIP:])
+
+
 def read_video(path):
     capture = cv2.VideoCapture(str(path))
     frames = []
@@ -130,18 +148,19 @@ def test_video_that_cannot_be_written_is_refused(tmp_path):
 def test_point_cloud_holds_points_and_covariances(tmp_path):
     points = np.array([[1.0, 2.0, 3.0], [-1.5, 0.25, 8.0]])
     covariances = np.array([np.diag([1.0, 2.0, 3.0]), [[4, 1, 2], [1, 5, 3], [2, 3, 6]]])
-    write_ply(tmp_path / "map.ply", points, covariances, [7, 9])
+    write_ply(tmp_path / "map.ply", points, covariances, [7, 9], [0, 1])
     header, rows = (tmp_path / "map.ply").read_text().split("end_header\n")
     assert header.startswith("ply\nformat ascii 1.0\n")
     assert "element vertex 2\n" in header
     assert re.findall(r"property float (\w+)", header) == (
         ["x", "y", "z", "cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"]
     )
-    assert "property int id\n" in header
+    assert "property int id\nproperty int map\n" in header
     table = np.array([row.split() for row in rows.splitlines()], float)
-    np.testing.assert_allclose(table[:, :3], points)
-    np.testing.assert_allclose(table[1, 3:9], [4, 1, 2, 5, 3, 6])
-    assert table[:, 9].tolist() == [7, 9]
+    # Few binary or decimal digits, all of which are written: exact.
+    np.testing.assert_array_equal(table[:, :3], points)
+    np.testing.assert_array_equal(table[1, 3:9], [4, 1, 2, 5, 3, 6])
+    assert table[:, 9:].tolist() == [[7, 0], [9, 1]]
 
 
 def test_point_cloud_refuses_what_does_not_fit(tmp_path):
@@ -167,6 +186,22 @@ def test_map_is_drawn_with_and_without_landmarks_and_reference(tmp_path):
     def landmarks(image):
         return int(np.sum(np.abs(image.astype(int) - green).max(axis=2) < 10))
 
+    plot_map(
+        T_wc,
+        points,
+        covariances,
+        path=tmp_path / "two.png",
+        begun=[10],
+        begun_covariances=[0.3 * np.eye(3)],
+    )
+    two = cv2.imread(str(tmp_path / "two.png"))
+
+    def of_new_maps(image):
+        return int(np.sum(np.abs(image.astype(int) - [167, 121, 204]).max(axis=2) < 10))
+
+    # The two marks and the legend's, and the ellipses around them.
+    assert of_new_maps(two) > 100
+    assert of_new_maps(full) == 0
     assert landmarks(full) > 200
     assert landmarks(bare) == 0
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["bare.png", "full.png"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["bare.png", "full.png", "two.png"]

@@ -98,6 +98,7 @@ def test_source_is_reproducible_and_lazy():
     assert len(source) == 4
     first, again = list(source), list(synthetic_source(4, seed=2, width=160, height=120))
     for one, other in zip(first, again, strict=True):
+        # The same operations on the same numbers, on one machine: exact.
         np.testing.assert_array_equal(one.image, other.image)
     assert first[0].image.shape == (120, 160)
     assert np.mean(first[0].image != next(iter(synthetic_source(4, 3, 160, 120))).image) > 0.9

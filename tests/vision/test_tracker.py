@@ -1,19 +1,22 @@
 """Tests of the tracker: a synthetic video is followed, and its files say so."""
 
+import csv
 import itertools
 import json
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
 pytest.importorskip("cv2")
 
+from jaxslam.vision.located import adjoint
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.sources import open_source
 from jaxslam.vision.synthetic import synthetic_source
-from jaxslam.vision.track import track
-from jaxslam.vision.tracker import Tracker
+from jaxslam.vision.track import describe, track
+from jaxslam.vision.tracker import LEAST_INLIERS, Tracker
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
     pose_nees,
@@ -29,6 +32,11 @@ def shortened(source, frames):
     return replace(
         source, times=source.times[:frames], images=lambda: itertools.islice(images(), frames)
     )
+
+
+def frames_of(out):
+    with (out / "frames.csv").open() as file:
+        return list(csv.DictReader(file))
 
 
 @pytest.fixture(scope="module")
@@ -52,20 +60,221 @@ def test_the_synthetic_camera_is_tracked(tracked):
 def test_the_files_hold_every_frame_and_agree_with_the_summary(tracked):
     out, source, summary = tracked
     times, T_wc = read_tum(out / "trajectory.txt")
-    np.testing.assert_allclose(times, source.times, atol=1e-6)
-    np.testing.assert_allclose(T_wc[0], np.eye(4), atol=1e-9)
+    # Nine decimals.
+    np.testing.assert_allclose(times, source.times, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(T_wc[0], np.eye(4), rtol=0, atol=1e-9)
     covariance_times, covariances = read_covariances(out / "covariance.txt")
+    # Exact: the same decimals of the same numbers; half of each matrix is read twice.
     np.testing.assert_array_equal(covariance_times, times)
     np.testing.assert_array_equal(covariances, np.swapaxes(covariances, 1, 2))
-    assert np.linalg.eigvalsh(covariances[1:])[:, 0].min() > 0
-    assert pose_nees(T_wc[1:], covariances[1:], source.reference.T_wc[1:]).min() > 0
+    # Nine decimals of the largest entry; all but the first are positive far beyond that.
+    eigenvalues = np.linalg.eigvalsh(covariances)
+    assert np.all(eigenvalues[1:, 0] > 1e-8 * eigenvalues[1:, -1])
+    nees = pose_nees(T_wc, covariances, source.reference.T_wc)
+    assert nees[0] == 0
+    assert np.all((nees[1:] > 0) & np.isfinite(nees[1:]))
     ate = absolute_trajectory_error(times, T_wc, *source.reference)
     assert ate["rmse"] == pytest.approx(summary["ate"]["rmse"], rel=1e-3)
     assert json.loads((out / "summary.json").read_text())["frames"] == FRAMES
     assert (out / "map.ply").read_text().startswith("ply")
     assert {path.name for path in out.iterdir()} == {
-        "trajectory.txt", "covariance.txt", "map.ply", "map.png", "overlay.mp4", "summary.json",
+        "trajectory.txt", "covariance.txt", "frames.csv", "map.ply", "map.png", "overlay.mp4",
+        "summary.json",
     }  # fmt: skip
+
+
+def test_frames_csv_says_what_became_of_every_frame(tracked):
+    out, _, summary = tracked
+    rows = frames_of(out)
+    columns = "frame,time,state,map,matches,nis,nis_dof,sigma_position,sigma_orientation"
+    assert ",".join(rows[0]) == columns + ",sigma_log_scale"
+    assert [row["state"] for row in rows] == ["start"] + ["tracked"] * (FRAMES - 1)
+    assert {row["map"] for row in rows} == {"0"}
+    assert summary["maps"] == 1
+    assert "log_scale_sigma_between_maps" not in summary
+    matches = [int(row["matches"]) for row in rows[1:]]
+    assert np.mean(matches) == pytest.approx(summary["matches_per_frame"], rel=1e-12)
+    assert [int(row["nis_dof"]) for row in rows[1:]] == [2 * count for count in matches]
+    assert sum(float(row["nis"]) for row in rows) / (FRAMES - 1) == pytest.approx(
+        summary["nis"]["mean"], rel=1e-5
+    )
+    covariances = read_covariances(out / "covariance.txt")[1]
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    for column, part in (("sigma_position", slice(3)), ("sigma_orientation", slice(3, 6))):
+        # Six digits.
+        np.testing.assert_allclose(
+            [float(row[column]) for row in rows],
+            np.sqrt(variances[:, part].sum(axis=1)),
+            rtol=1e-5,
+            atol=0,
+        )
+    # This filter has no scale apart from the map.
+    assert {row["sigma_log_scale"] for row in rows} == {""}
+
+
+DARK, LIGHT, END = 8, 14, 22
+"""Frames from which nothing is seen, from which another room is, and the end."""
+
+
+@pytest.fixture(scope="module")
+def restarted(tmp_path_factory):
+    """A video that goes dark and goes on elsewhere."""
+    out = tmp_path_factory.mktemp("restarted")
+    source, elsewhere = synthetic_source(frames=END), synthetic_source(frames=END, seed=7)
+
+    def images():
+        both = zip(source.images(), elsewhere.images(), strict=True)
+        for index, (here, there) in enumerate(both):
+            yield here if index < DARK else there if index >= LIGHT else np.zeros_like(here)
+
+    settings = TrackerSettings(wanted=30, lost_for=LIGHT - DARK - 1)
+    return out, track(replace(source, images=images), out, settings)
+
+
+def test_a_camera_that_was_lost_for_long_begins_a_new_map(restarted):
+    out, summary = restarted
+    rows = frames_of(out)
+    states = ["start", *["tracked"] * 7, *["lost"] * 6, "start", *["tracked"] * 7]
+    assert [row["state"] for row in rows] == states
+    assert [int(row["map"]) for row in rows] == [0] * LIGHT + [1] * (END - LIGHT)
+    assert summary["maps"] == 2
+    assert (summary["tracked"], summary["lost"]) == (END - 7, 7)
+    # σ/ρ of the prior on an inverse depth is ½, in each of the two maps.
+    assert summary["log_scale_sigma_between_maps"] == pytest.approx(np.sqrt(0.5), rel=1e-12)
+    assert "2 maps, each in a unit of its own" in describe(summary)
+    rows = (out / "map.ply").read_text().split("end_header\n")[1].splitlines()
+    assert {row.split()[-1] for row in rows} == {"0", "1"}
+
+
+def test_after_a_restart_the_camera_is_known_no_better_than_before(restarted):
+    out, _ = restarted
+    _, T_wc = read_tum(out / "trajectory.txt")
+    _, covariances = read_covariances(out / "covariance.txt")
+
+    def at(frame, other):
+        """The covariance of a frame, in the axes of another, the step between them known."""
+        A = adjoint(np.linalg.inv(T_wc[other]) @ T_wc[frame])
+        return A @ covariances[frame] @ A.T
+
+    # Without a measurement all that is known of the camera fades, frame by frame …
+    for frame in range(DARK, LIGHT + 1):
+        turned = np.kron(np.eye(2), T_wc[frame, :3, :3])
+        before = np.kron(np.eye(2), T_wc[DARK - 1, :3, :3])
+        grown = turned @ covariances[frame] @ turned.T
+        grown -= before @ covariances[DARK - 1] @ before.T
+        assert np.linalg.eigvalsh(grown[:3, :3])[0] > 0
+        assert np.linalg.eigvalsh(grown[3:, 3:])[0] > 0
+    # … and no measurement in another map brings it back: each adds to where its map begins.
+    for frame in range(LIGHT + 1, END):
+        gained = np.linalg.eigvalsh(at(frame, LIGHT) - covariances[LIGHT])
+        # Ten digits are written of each number, and the poses have nine decimals.
+        assert gained[0] > -1e-8 * np.trace(covariances[LIGHT])
+        assert gained[-1] > 0
+
+
+def test_nothing_but_the_first_frame_is_known_exactly(restarted):
+    rows = frames_of(restarted[0])
+    for column in ("sigma_position", "sigma_orientation"):
+        sigmas = np.array([float(row[column]) for row in rows])
+        assert sigmas[0] == 0
+        assert np.all(sigmas[1:] > 0)
+        assert np.all(sigmas[LIGHT:] > 2 * sigmas[DARK - 1])
+
+
+@pytest.mark.parametrize("broken", ["update", "prediction"])
+def test_a_filter_that_fails_is_begun_anew_from_what_prediction_says(broken):
+    """Its covariance is not positive after a frame's update, or even without one."""
+    source = synthetic_source(frames=5)
+    tracker = Tracker(source.calibration, TrackerSettings(wanted=12, spare=4))
+    whole, failures = tracker._correct, 1 if broken == "update" else 2
+
+    def failing(*arguments):
+        nonlocal failures
+        state, (*result, healthy) = whole(*arguments)
+        failures -= frame.index == 3
+        return state, (*result, healthy and not (frame.index == 3 and failures >= 0))
+
+    tracker._correct = failing
+    results = []
+    for frame in source:
+        results.append(tracker.track(frame))
+    assert [result.state for result in results] == ["start", *["tracked"] * 2, "start", "tracked"]
+    assert [result.map for result in results] == [0, 0, 0, 1, 1]
+    assert [result.lost for result in results] == [False, False, False, True, False]
+    before, start = results[2].camera, results[3].camera
+    assert start.sigma_orientation > before.sigma_orientation
+    if broken == "prediction":
+        # Where it was, give or take the prior on a start's velocity.
+        np.testing.assert_allclose(start.T_wc, before.T_wc, rtol=0, atol=1e-12)
+        moved = np.sqrt(3) * tracker.settings.velocity_sigma / 30
+        assert start.sigma_position == pytest.approx(
+            np.hypot(before.sigma_position, moved), rel=0.01
+        )
+    landmarks = tracker.points()
+    assert set(landmarks.maps) == {0, 1}
+    assert len(set(landmarks.numbers)) == len(landmarks.numbers) == tracker.created
+    # Where its map begins is no surer for a landmark than for the camera.
+    added = np.linalg.eigvalsh(landmarks.covariances - landmarks.in_map)
+    usual = np.linalg.norm(landmarks.points, axis=1) < 100
+    first, second = usual & (landmarks.maps == 0), usual & (landmarks.maps == 1)
+    assert first.sum() > 5
+    assert second.sum() > 5
+    np.testing.assert_allclose(added[first], 0, rtol=0, atol=1e-12)
+    assert np.all(added[second, -1] > start.covariance[:3, :3].diagonal().min())
+
+
+def test_matches_too_few_to_believe_change_nothing():
+    source = synthetic_source(frames=2)
+    tracker = Tracker(source.calibration, TrackerSettings(wanted=12, spare=4))
+    given = []
+    whole = tracker._correct
+    tracker._correct = lambda *arguments: given.append(arguments) or whole(*arguments)
+    for frame in source:
+        result = tracker.track(frame)
+    agreed = result.status.count("matched")
+    assert agreed > LEAST_INLIERS
+    (arguments,) = given
+    state, gaussian, parameters, dt, features, _ = arguments
+    nothing = replace(features, valid=np.zeros_like(features.valid))
+    expected, _ = whole(state, gaussian, parameters, dt, nothing, 0)
+    for least in (agreed, agreed + 1):
+        corrected, (used, nis, nis_dof, healthy) = whole(*arguments[:-1], least)
+        assert healthy
+        assert used.sum() == (agreed if least == agreed else 0)
+    assert (nis, nis_dof) == (0, 0)
+    # The same program on the same numbers, of which no match has any weight.
+    np.testing.assert_allclose(corrected.covariance, expected.covariance, rtol=0, atol=1e-15)
+
+
+def test_a_lost_camera_asks_for_half_of_what_it_searches():
+    source = synthetic_source(frames=4)
+    tracker = Tracker(source.calibration, TrackerSettings(wanted=12, spare=4))
+    asked, whole = [], tracker._correct
+    tracker._correct = lambda *arguments: asked.append(arguments[-1]) or whole(*arguments)
+    results = []
+    for frame in source:
+        dark = frame.index == 2
+        frame = replace(frame, image=np.zeros_like(frame.image)) if dark else frame
+        results.append(tracker.track(frame))
+    assert [result.state for result in results] == ["start", "tracked", "lost", "tracked"]
+    assert asked == [LEAST_INLIERS, LEAST_INLIERS, len(results[3].status) // 2]
+    assert asked[-1] > LEAST_INLIERS
+
+
+def test_an_unknown_calibration_counts_in_the_first_frame_too():
+    """Bearings of the landmarks that it creates are as unsure as pixel and principal point."""
+    source = synthetic_source(frames=1)
+    settings = TrackerSettings(wanted=12, spare=4, calibration="white", centre_sigma=2.0)
+    tracker = Tracker(source.calibration, settings)
+    for frame in source:
+        tracker.track(frame)
+    slots = np.array(sorted(tracker.landmarks))
+    in_camera = jax.jit(tracker._filter.landmarks_in_camera)
+    charts, covariances = in_camera(tracker._state, tracker._parameters, slots)
+    # u = f x/z + c, each of f, c and u with its own σ.
+    variance = 0.3**2 + 2.0**2 + (settings.focal_sigma * np.asarray(charts)[:, 0]) ** 2
+    expected = variance / source.calibration.fx**2
+    np.testing.assert_allclose(covariances[:, 0, 0], expected, rtol=1e-6, atol=0)
 
 
 def test_an_interruption_leaves_the_files_of_the_frames_so_far(tmp_path):
@@ -80,7 +289,7 @@ def test_an_interruption_leaves_the_files_of_the_frames_so_far(tmp_path):
         track(synthetic_source(frames=20), tmp_path, TrackerSettings(wanted=10), progress=stop)
     assert len(read_tum(tmp_path / "trajectory.txt")[0]) == 4
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 4
-    assert len(list(tmp_path.iterdir())) == 6
+    assert len(list(tmp_path.iterdir())) == 7
 
 
 def test_a_frame_must_be_later_than_the_one_before():
@@ -93,17 +302,22 @@ def test_a_frame_must_be_later_than_the_one_before():
 
 
 def test_a_gaussian_sum_tracks_too():
-    """Its members share one search, and give another estimate than one filter does."""
+    """Its members share one search, and give another estimate than one filter does.
+
+    With a scale of their own, of which from standstill one filter has no doubt, but they have.
+    """
     source = synthetic_source(frames=10)
     settings = TrackerSettings(wanted=12, spare=4)
-    one = Tracker(source.calibration, replace(settings, filter="robocentric"))
-    some = Tracker(source.calibration, replace(settings, filter="robocentric+mixture3"))
+    one = Tracker(source.calibration, replace(settings, filter="scale_gauge"))
+    some = Tracker(source.calibration, replace(settings, filter="scale_gauge+mixture3"))
     for frame in source:
         alone, summed = one.track(frame), some.track(frame)
     assert not summed.lost
     assert summed.status.count("matched") >= 10
-    assert len(some.points()[1]) >= 12
+    assert len(some.points().points) >= 12
     assert np.linalg.eigvalsh(summed.covariance)[0] > 0
+    assert alone.sigma_log_scale is None
+    assert 0 < summed.sigma_log_scale < 1
     assert not np.allclose(summed.T_wc, alone.T_wc, atol=1e-6)
 
 

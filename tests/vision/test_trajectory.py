@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
+    exactly_known,
     pose_nees,
     poses,
     read_covariances,
@@ -37,10 +38,11 @@ def test_written_poses_are_read_back(tmp_path):
     times, T_wc = wave()
     write_tum(tmp_path / "t.txt", times, T_wc)
     read_times, read = read_tum(tmp_path / "t.txt")
-    np.testing.assert_allclose(read_times, times, atol=1e-9)
-    np.testing.assert_allclose(read, T_wc, atol=1e-8)
+    # Nine decimals of times and positions; of quaternions, which a matrix takes twice.
+    np.testing.assert_allclose(read_times, times, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(read, T_wc, rtol=0, atol=1e-8)
     quaternions = np.loadtxt(tmp_path / "t.txt")[:, 4:]
-    np.testing.assert_allclose(np.linalg.norm(quaternions, axis=1), 1, atol=1e-8)
+    np.testing.assert_allclose(np.linalg.norm(quaternions, axis=1), 1, rtol=0, atol=1e-8)
     assert np.all(quaternions[:, 3] >= 0)
 
 
@@ -101,6 +103,9 @@ def test_error_ignores_frame_and_scale_and_measures_the_reference():
     assert result["alignment"] == "sim3"
     assert result["rmse"] == pytest.approx(0, abs=1e-9)
     assert result["path_length"] == pytest.approx(np.linalg.norm(steps, axis=1).sum())
+    # Orientations give the world's turn too: to the rounding of an arc cosine near 1, 1e-8 rad.
+    assert result["sign"] == pytest.approx(1, abs=1e-9)
+    assert result["orientation_rmse"] == pytest.approx(0, abs=1e-5)
     assert result["extent"] == pytest.approx(np.linalg.norm(box))
     assert result["matched"] == len(times)
 
@@ -113,6 +118,64 @@ def test_error_has_the_size_of_the_noise():
     result = absolute_trajectory_error(times, estimate, times, reference)
     # Seven parameters of the alignment take up next to nothing of 6000 numbers.
     assert result["rmse"] == pytest.approx(np.sqrt(np.mean(np.sum(noise**2, 1))), rel=0.01)
+
+
+def test_a_reversed_world_has_sign_minus_one_though_its_error_is_zero():
+    """(t, v, ω) → −(t, v, ω) leaves every pixel, and here a curve in a plane that aligns."""
+    times, reference = wave()
+    reference[:, 2, 3] = 0
+    estimate = reference.copy()
+    estimate[:, :3, 3] *= -0.3
+    result = absolute_trajectory_error(times, estimate, times, reference)
+    assert result["rmse"] == pytest.approx(0, abs=1e-9)
+    assert result["sign"] == pytest.approx(-1, abs=1e-9)
+    assert result["orientation_rmse"] == pytest.approx(0, abs=1e-5)
+
+
+def test_positions_that_have_nothing_to_do_with_the_truth_have_no_sign():
+    times, reference = wave(4000)
+    estimate = reference.copy()
+    estimate[:, :3, 3] = np.random.default_rng(3).normal(size=(4000, 3))
+    sign = absolute_trajectory_error(times, estimate, times, reference)["sign"]
+    # A correlation of n independent points has σ of at most 1/√n.
+    assert abs(sign) < 4 / np.sqrt(4000)
+
+
+def test_orientation_error_is_the_angle_that_one_rotation_leaves():
+    times, reference = wave(40)
+    estimate = similar(reference, 1.0, [0.3, -0.5, 1.0], [0.0, 0.0, 0.0])
+    turn = Rotation.from_rotvec([0, np.radians(5), 0]).as_matrix()
+    estimate[::2, :3, :3] = estimate[::2, :3, :3] @ turn
+    estimate[1::2, :3, :3] = estimate[1::2, :3, :3] @ turn.T
+    result = absolute_trajectory_error(times, estimate, times, reference)
+    # The axes differ from pose to pose, so that no rotation takes away more than a part.
+    assert 4.5 < result["orientation_rmse"] <= 5
+    same = reference.copy()
+    same[:, :3, :3] = np.eye(3)
+    turned = same.copy()
+    turned[::2, :3, :3], turned[1::2, :3, :3] = turn, turn.T
+    result = absolute_trajectory_error(times, turned, times, same)
+    assert result["orientation_rmse"] == pytest.approx(5, abs=1e-6)
+
+
+def test_straight_line_is_the_error_of_one_at_constant_speed():
+    times = np.array([0.0, 1.0, 2.0, 3.5, 4.0, 6.0])
+    line = poses(np.outer(times, [1.0, 2.0, -0.5]) + 3, np.tile([0, 0, 0, 1], (6, 1)))
+    curved = line.copy()
+    curved[:, :3, 3] += np.outer(np.sin(times), [0.0, 0.3, 0.0])
+    straight = absolute_trajectory_error(times, curved, times, line)["straight_line"]
+    assert straight == pytest.approx(0, abs=1e-12)
+    result = absolute_trajectory_error(times, line, times, curved)
+    # What is left of a sine after the fit of a + b t to it.
+    design = np.column_stack([np.ones(6), times])
+    rest = np.sin(times) - design @ np.linalg.lstsq(design, np.sin(times), rcond=None)[0]
+    assert result["straight_line"] == pytest.approx(0.3 * np.sqrt(np.mean(rest**2)), abs=1e-12)
+    # The line itself, as an estimate, has this error or (by scale and turn) a little less.
+    assert result["rmse"] == pytest.approx(result["straight_line"], rel=0.02)
+    # The same places at another speed are not a line at constant speed.
+    slowing = line.copy()
+    slowing[:, :3, 3] = np.outer(times**2, [1.0, 2.0, -0.5])
+    assert absolute_trajectory_error(times, line, times, slowing)["straight_line"] > 1
 
 
 def test_straight_reference_is_aligned_though_its_roll_is_open():
@@ -148,12 +211,35 @@ def test_covariances_are_read_as_they_were_written_and_are_the_errors(tmp_path):
     times, T_wc = wave(n)
     write_covariances(tmp_path / "covariance.txt", times, roots @ np.swapaxes(roots, 1, 2))
     read_times, P = read_covariances(tmp_path / "covariance.txt")
-    np.testing.assert_allclose(read_times, times, atol=1e-9)
+    np.testing.assert_allclose(read_times, times, rtol=0, atol=1e-9)
     np.testing.assert_allclose(P, roots @ np.swapaxes(roots, 1, 2), rtol=1e-8, atol=1e-12)
     errors = np.einsum("nij,nj->ni", roots, rng.normal(size=(n, 6)))
     E = poses(errors[:, :3], Rotation.from_rotvec(errors[:, 3:]).as_quat())
     # The mean of n numbers of χ² with 6 degrees of freedom: σ = √(12/n) = 0.055.
     assert abs(pose_nees(T_wc, P, T_wc @ E).mean() - 6) < 0.22
+
+
+def test_a_pose_that_is_known_exactly_has_a_nees_of_zero_if_it_is_right(tmp_path):
+    """Every covariance file begins with one: the first camera is the world."""
+    times, T_wc = wave(4)
+    covariances = np.tile(1e-4 * np.eye(6), (4, 1, 1))
+    covariances[0] = 0
+    write_tum(tmp_path / "t.txt", times, T_wc)
+    write_covariances(tmp_path / "covariance.txt", times, covariances)
+    read, P = read_tum(tmp_path / "t.txt")[1], read_covariances(tmp_path / "covariance.txt")[1]
+    assert exactly_known(P).tolist() == [True, False, False, False]
+    error = poses([0.02, 0.0, 0.0], [0, 0, 0, 1])
+    true = T_wc @ error
+    true[0] = T_wc[0]
+    # (0.02/0.01)², and zero although the file has rounded the pose; its 1e-8 are 1e-6 σ.
+    np.testing.assert_allclose(pose_nees(read, P, true), [0, 4, 4, 4], rtol=0, atol=1e-5)
+    assert pose_nees(read, P, T_wc @ error)[0] == np.inf
+
+
+def test_a_covariance_that_is_singular_otherwise_is_refused():
+    covariance = np.diag([1.0, 1, 1, 1, 1, 0])
+    with pytest.raises(ValueError, match="singular; a positive one, or zero, is accepted"):
+        pose_nees(np.eye(4)[None], covariance[None], np.eye(4)[None])
 
 
 def test_as_many_covariances_as_times(tmp_path):

@@ -1,0 +1,70 @@
+"""Where a camera is and how surely, and what is known relative to it carried into the world.
+
+`T_wc` takes the camera's coordinates to the world's. The true pose is `T_wc Exp(e)`, e ~ N(0, P):
+position in the camera's axes, then rotation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclass(frozen=True)
+class Located:
+    """A pose and the covariance P of its error; by default the origin, known exactly."""
+
+    T_wc: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    covariance: Float[np.ndarray, "6 6"] = field(default_factory=lambda: np.zeros((6, 6)))
+
+    @property
+    def sigma_position(self) -> float:
+        """Root of the summed variances along the three axes, map units."""
+        return float(np.sqrt(np.trace(self.covariance[:3, :3])))
+
+    @property
+    def sigma_orientation(self) -> float:
+        """Root of the summed variances about the three axes, rad."""
+        return float(np.sqrt(np.trace(self.covariance[3:, 3:])))
+
+    @property
+    def position_covariance(self) -> Float[np.ndarray, "3 3"]:
+        """Of the position, in the world's axes."""
+        R = self.T_wc[:3, :3]
+        return R @ self.covariance[:3, :3] @ R.T
+
+    def then(self, step: Located) -> Located:
+        """The pose `T_wc T_step`, of a camera that is located relative to this one.
+
+        `T Exp(e) T_s Exp(s) = T T_s Exp(A e) Exp(s)` with `A = Ad(T_s⁻¹)`, so that the covariance
+        is `A P Aᵀ + P_s`, to first order, of errors that are independent.
+        """
+        A = adjoint(np.linalg.inv(step.T_wc))
+        carried = A @ self.covariance @ A.T
+        return Located(self.T_wc @ step.T_wc, (carried + carried.T) / 2 + step.covariance)
+
+    def points(
+        self, points: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
+        """Points seen from here, with their covariances, in the world.
+
+        `R ((I + [θ]×) p + δ) + t`, so that to `p`'s covariance comes `J P Jᵀ`, `J = [I, −[p]×]`.
+        """
+        R, t = self.T_wc[:3, :3], self.T_wc[:3, 3]
+        with np.errstate(invalid="ignore", over="ignore"):  # a point at infinity stays there
+            J = np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), -_cross(points)], axis=2)
+            total = covariances + J @ self.covariance @ np.swapaxes(J, 1, 2)
+            return points @ R.T + t, R @ total @ R.T
+
+
+def adjoint(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
+    """`Ad(T)`, with `T Exp(e) = Exp(Ad(T) e) T`: `[[R, [t]× R], [0, R]]`, position first."""
+    R = T[:3, :3]
+    return np.block([[R, _cross(T[:3, 3]) @ R], [np.zeros((3, 3)), R]])
+
+
+def _cross(v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """`[v]×`, the matrix of the cross product with v from the left."""
+    return -np.cross(v[..., None, :], np.eye(3))
