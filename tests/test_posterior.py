@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 from functools import lru_cache, partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import quick_jit
 from jax.flatten_util import ravel_pytree
 from scipy.linalg import expm
 from scipy.stats import norm, truncnorm
@@ -33,6 +35,7 @@ from jaxslam.posterior import (
     reference,
     residuals,
     sample,
+    sampler,
     starts,
     uniformity,
     unknowns,
@@ -334,6 +337,79 @@ def small_study():
     study = Study(LOOSE, 3, HMC(chains=2, warmup=100, draws=150), starts=1)
     records, exact = reference(study, draw_runs(study, 7, range(40)), 7, range(40))
     return jax.device_get(records), exact
+
+
+def keys_used(monkeypatch, function):
+    """What a function gives, and the data of every key that it draws from or splits."""
+    found, data = [], jax.random.key_data
+
+    def recorded(use):
+        def used(key, *arguments, **options):
+            jax.debug.callback(lambda key: found.append(tuple(key.tolist())), data(key))
+            return use(key, *arguments, **options)
+
+        return used
+
+    with monkeypatch.context() as patch:
+        for name in ("split", "normal", "uniform", "truncated_normal", "bernoulli"):
+            patch.setattr(jax.random, name, recorded(getattr(jax.random, name)))
+        value = jax.block_until_ready(function())
+        jax.effects_barrier()
+    return value, found
+
+
+class Enough(Exception):
+    """Raised where a test has seen what it wanted."""
+
+
+def keys_of_reference(monkeypatch, study, runs, seed, indices):
+    """What `reference` gives to the starts of Levenberg–Marquardt and to the chains."""
+    given = {}
+
+    def modes(rig, count, problems, keys):
+        given["starts"] = keys
+        return SimpleNamespace(mode=None), {}
+
+    def chains(settings, rig, problems, modes, keys):
+        given["chains"] = keys
+        raise Enough
+
+    with monkeypatch.context() as patch:
+        patch.setattr(jaxslam.posterior.study, "_modes", modes)
+        patch.setattr(jaxslam.posterior.study, "_laplace_errors", lambda *data: {})
+        patch.setattr(jaxslam.posterior.study, "_sample", chains)
+        with pytest.raises(Enough):
+            reference(study, runs, seed, indices)
+    return given["starts"], given["chains"]
+
+
+def test_chains_and_starts_use_no_key_of_the_simulator_and_none_twice(monkeypatch):
+    """A chain that begins at the draws that made the truth knows the answer."""
+    study = Study(LOOSE, 3, HMC(chains=4, warmup=20, draws=8))
+    keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(5)))(jnp.arange(3))
+    runs, simulated = keys_used(
+        monkeypatch, lambda: quick_jit(jax.vmap(partial(jaxslam.simulate, LOOSE)))(keys)
+    )
+    starts_keys, chains_keys = keys_of_reference(monkeypatch, study, runs, 5, range(3))
+    problem = make_problem(LOOSE, jax.tree.map(lambda x: x[0], runs))
+    # Which keys there are is not the density's business, and a Gaussian's compiles in no time.
+    monkeypatch.setattr(sampler, "conditional_log_density", lambda _, __, ___, w: -w @ w / 2)
+    monkeypatch.setattr(sampler, "whitening_root", lambda _, __, mode: jnp.eye(mode.size))
+
+    def drawn(starts_key, chains_key):
+        first = starts(problem, starts_key, study.starts)
+        return first, sample(study.hmc, LOOSE.rig, problem, first[0], chains_key)
+
+    _, sampled = keys_used(
+        monkeypatch, lambda: quick_jit(jax.vmap(drawn))(starts_keys, chains_keys)
+    )
+    # Split: the run's, the motion's and the world's; drawn: velocity, accelerations, pixels, depths
+    # and noise.
+    assert len(simulated) == 3 * 8
+    # The starts'; the chains', and of every chain its own, its start's, its steps' and in every
+    # step the one that is split and the acceptance's. (The momentum's is blackjax's own.)
+    assert len(sampled) == 3 * (2 + 4 * (3 + 2 * 28))
+    assert len({*simulated, *sampled}) == len(simulated) + len(sampled)
 
 
 @pytest.mark.statistics
