@@ -107,7 +107,7 @@ def test_composition_with_a_motion_and_its_inverse_is_the_identity(geometry, lan
 @pytest.mark.parametrize("landmark", few_landmarks, ids=named)
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_both_frames_speak_of_the_same_camera_and_the_same_point(geometry, landmark):
-    """`T_CB ← T_{k-1,k}⁻¹ T_CB` and P20 against `T_BC ← T_BC T_{k-1,k}` and nothing at all."""
+    """`T_CB ← T_{k-1,k}⁻¹ T_CB`, landmarks moved, against `T_BC ← T_BC T_{k-1,k}` and no more."""
     T_BC, X_B = pose(geometry, 2), a_landmark(geometry, landmark)
     rng = np.random.default_rng(2)
     velocity, acceleration = rng.normal(size=(2, geometry.tangent_dim))
