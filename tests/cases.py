@@ -1,4 +1,10 @@
-"""What the core's tests share: quick compilation, central differences, poses, filter runs."""
+"""What the core's tests share: quick compilation, central differences, poses, filter runs.
+
+Exactly equal is only what no processor can round: what is copied, set or masked, sums with zero,
+one addition, and one compiled program on the same numbers. Whatever is computed in two ways, or by
+two programs (one may contract `a b + c`, or vectorise), has a bound, and never one that is relative
+alone where zero is expected.
+"""
 
 from functools import cache, partial
 

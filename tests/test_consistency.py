@@ -76,7 +76,8 @@ def test_filters_meet_the_same_worlds():
     )
     samples = [study.store.load(name, study.chunks[0]) for name in study.filters]
     for key in ("sample_true_path", "sample_points"):
-        np.testing.assert_array_equal(samples[0][key], samples[1][key])
+        # Drawn by one program, but made matrices by two.
+        np.testing.assert_allclose(samples[0][key], samples[1][key], rtol=0, atol=1e-13)
     assert not np.array_equal(samples[0]["nees"], samples[1]["nees"])
 
 

@@ -183,10 +183,10 @@ def test_a_split_pose_joins_to_the_pose_it_is_of(geometry):
     T = pose(geometry, 6, scale=2.0)
     split = SplitPose.of(T)
     assert tangent_dim(split) == geometry.tangent_dim
-    np.testing.assert_allclose(split.joined().as_matrix(), T.as_matrix(), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(split.joined().as_matrix(), T.as_matrix(), rtol=0, atol=1e-14)
     again = SplitPose.of(split.joined())
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(split), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
@@ -233,4 +233,4 @@ def test_joined_is_the_pose_of_its_parts(geometry):
     T = pose(geometry, 11, scale=2.0)
     again = joined(T.rotation(), T.translation())
     assert type(again) is geometry.group
-    np.testing.assert_allclose(again.as_matrix(), T.as_matrix(), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(again.as_matrix(), T.as_matrix(), rtol=0, atol=1e-14)

@@ -560,7 +560,7 @@ def same_landmarks(limited, free):
     distance = np.linalg.norm(free.points[:, None] - limited.points[None], axis=-1)
     order = distance.argmin(axis=1)
     assert sorted(order) == list(range(len(order)))
-    assert distance.min(axis=1).max() == 0
+    assert distance.min(axis=1).max() < 1e-9  # rounding of metres, in two programs
     return limited.visible[:, order]
 
 
@@ -569,7 +569,8 @@ def test_no_frame_measures_more_than_its_limits_nor_less_than_it_can(i):
     chosen, limited, free = rooms()
     limited, free = (jax.tree.map(lambda x: np.asarray(x[i]), run) for run in (limited, free))
     for a, b in zip(jax.tree.leaves(limited.poses), jax.tree.leaves(free.poses), strict=True):
-        np.testing.assert_array_equal(a, b)  # a limit changes nothing else of a run
+        # A limit changes nothing else of a run, in whose program it is: rounding of metres.
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
     used, before = same_landmarks(limited, free), np.zeros(72, bool)
     counts = []
     for k, (visible, chosen_now) in enumerate(zip(free.visible, used, strict=True)):
