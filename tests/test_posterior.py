@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import quick_jit
+from cases import keys_used, quick_jit
 from jax.flatten_util import ravel_pytree
 from scipy.linalg import expm
 from scipy.stats import norm, truncnorm
@@ -337,25 +337,6 @@ def small_study():
     study = Study(LOOSE, 3, HMC(chains=2, warmup=100, draws=150), starts=1)
     records, exact = reference(study, draw_runs(study, 7, range(40)), 7, range(40))
     return jax.device_get(records), exact
-
-
-def keys_used(monkeypatch, function):
-    """What a function gives, and the data of every key that it draws from or splits."""
-    found, data = [], jax.random.key_data
-
-    def recorded(use):
-        def used(key, *arguments, **options):
-            jax.debug.callback(lambda key: found.append(tuple(key.tolist())), data(key))
-            return use(key, *arguments, **options)
-
-        return used
-
-    with monkeypatch.context() as patch:
-        for name in ("split", "normal", "uniform", "truncated_normal", "bernoulli"):
-            patch.setattr(jax.random, name, recorded(getattr(jax.random, name)))
-        value = jax.block_until_ready(function())
-        jax.effects_barrier()
-    return value, found
 
 
 class Enough(Exception):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import quick_jit
+from cases import keys_used, quick_jit
 from scipy import stats
 
 from jaxslam.camera import Camera, project
@@ -347,6 +347,27 @@ def test_a_run_does_not_depend_on_its_batch():
         np.testing.assert_allclose(a[4], b[1], rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(a[4], c, rtol=1e-12, atol=1e-12)
     assert np.abs(whole.measured[4] - whole.measured[3]).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [
+        # Split: the run's, the motion's, the world's; drawn: velocity, accelerations, pixels,
+        # depths, intrinsics and noise.
+        ("matched", 9),
+        # Split: the run's; drawn: readings, which landmarks are measured, and noise.
+        ("room", 4),
+    ],
+)
+def test_motion_world_camera_and_noise_share_no_random_key(monkeypatch, name, count):
+    """So that they are independent: the same numbers in two of them would look random in each."""
+    calibration = {"true_calibration": "white"} if name == "matched" else {}
+    chosen = scenario(name, steps=3, **calibration)
+    _, keys = keys_used(
+        monkeypatch, lambda: quick_jit(lambda key: simulate(chosen, key))(jax.random.key(0))
+    )
+    assert len(keys) == count
+    assert len(set(keys)) == len(keys)
 
 
 def pixels_without_noise(runs, chosen):
