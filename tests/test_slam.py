@@ -123,6 +123,29 @@ def test_both_frames_speak_of_the_same_camera_and_the_same_point(geometry, landm
     )
 
 
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_in_a_gauge_the_noise_is_scaled_but_says_nothing_of_the_scale(geometry):
+    """`a e^−λ` moves the camera, its turn as it is; but the derivative by λ is none."""
+    model = SlamModel(Rig(geometry), INVERSE_SCALING, ROBOCENTRIC)
+    rng, n = np.random.default_rng(3), geometry.point_dim
+    velocity, noise = jnp.asarray(rng.normal(size=(2, geometry.tangent_dim)))
+
+    def moved(log_scale, noise):
+        held = ROBOCENTRIC.hold(pose(geometry, 2))
+        core = Core(held, velocity, noise, jnp.zeros(0), log_scale=log_scale)
+        context = Context(None, jnp.asarray(DT))
+        after = model.compose_core(core, context)
+        return model.displacement(core, context).as_matrix(), after.velocity
+
+    log_scale = jnp.array([0.7])
+    derivatives = quick_jit(jax.jacfwd(moved))(log_scale, noise)
+    assert not any(np.any(part) for part in derivatives)
+    smaller = noise.at[:n].multiply(np.exp(-0.7))
+    scaled, plain = (quick_jit(moved)(*x) for x in ((log_scale, noise), (0 * log_scale, smaller)))
+    for found, expected in zip(scaled, plain, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
+
+
 # --- whole runs ---------------------------------------------------------------------------------
 
 
