@@ -116,6 +116,39 @@ def test_a_sum_as_one_gaussian_has_its_moments():
         np.testing.assert_allclose(single, whole, rtol=1e-9, atol=1e-12 * np.abs(whole).max())
 
 
+def test_of_members_that_predict_alike_the_surer_one_gains():
+    """Bayes: with no residual the likelihood is `1/√det S`."""
+    of = case()
+    slam = named_filter(of, "robocentric+scales3")
+    first, known, _ = of.frames(0)
+    velocity, sigma, controls = of.motion()
+    parameters, sure = of.parameters(), jnp.array([0.5, 1.0, 2.0])
+
+    def begun(factor):
+        state = slam.base.start(parameters, of.capacity, velocity, factor * sigma)
+        return slam.base.first(state, parameters, first)
+
+    @quick_jit
+    def weighed(weights):
+        members = jax.vmap(begun)(sure)
+        one = jax.tree.map(lambda x: x[0], members)
+        seen, nothing = (jax.tree.map(lambda x: x[0], known),) * 2
+        nothing = replace(nothing, valid=jnp.zeros_like(seen.valid))
+        predicted = slam.base.predict(one, parameters, controls[0])
+        pixels, _ = slam.base.project(predicted, parameters, controls[0], seen.slots)
+        data = (parameters, controls[0], replace(seen, measured=pixels), nothing)
+        after, _ = slam.step(BankState(members, jnp.log(weights)), *data)
+        _, alone = jax.vmap(lambda member: slam.base.step(member, *data))(members)
+        return after.log_weights, alone
+
+    weights = np.array([0.2, 0.5, 0.3])
+    log_weights, alone = weighed(weights)
+    assert np.abs(alone.residual).max() < 1e-9
+    expected = weights / np.sqrt(np.linalg.det(np.asarray(alone.covariance)))
+    assert expected[0] / weights[0] > 1.5 * expected[2] / weights[2]
+    np.testing.assert_allclose(np.exp(log_weights), expected / expected.sum(), rtol=1e-9)
+
+
 def cost(state):
     P = np.asarray(state.members.covariance)[:, 3:5, 3:5]
     return np.exp(np.asarray(state.log_weights)) @ np.trace(P, axis1=1, axis2=2)
