@@ -21,6 +21,7 @@ from jaxslam.geometry import (
     joined,
     log,
     retract,
+    scaled,
     tangent_dim,
 )
 from jaxslam.motion import CONSTANT_VELOCITY
@@ -234,3 +235,15 @@ def test_joined_is_the_pose_of_its_parts(geometry):
     again = joined(T.rotation(), T.translation())
     assert type(again) is geometry.group
     np.testing.assert_allclose(again.as_matrix(), T.as_matrix(), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("split", [False, True], ids=["whole", "split"])
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_scaling_a_pose_scales_its_lengths_and_nothing_else(geometry, split):
+    T = pose(geometry, 1)
+    twice = scaled({"pose": SplitPose.of(T) if split else T}, 2.0)["pose"]
+    assert isinstance(twice, SplitPose if split else geometry.group)
+    twice = twice.joined() if split else twice
+    np.testing.assert_allclose(twice.translation(), 2 * T.translation(), rtol=1e-15)
+    rotation = T.rotation().as_matrix()
+    np.testing.assert_allclose(twice.rotation().as_matrix(), rotation, rtol=0, atol=1e-15)
