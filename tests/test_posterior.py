@@ -1,7 +1,7 @@
 """Tests of jaxslam.posterior: the model against dense formulas, MAP, HMC, ranks, bad input."""
 
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import cache, partial
 from types import SimpleNamespace
 
 import jax
@@ -68,7 +68,13 @@ def problem_of(scenario, *, seed=0, truncated=True):
     return make_problem(scenario, run, truncated=truncated), run
 
 
-residuals_of = jax.jit(residuals, static_argnums=0)
+@cache
+def compiled_residuals(rig):
+    return quick_jit(partial(residuals, rig))
+
+
+def residuals_of(rig, problem, y):
+    return compiled_residuals(rig)(problem, y)
 
 
 def draw(problem, seed=1):
@@ -170,7 +176,7 @@ def test_the_conditional_variables_have_the_jacobian_that_they_claim(truncated):
     problem, _ = problem_of(LOOSE, truncated=truncated)
     mode = draw(problem)
 
-    @jax.jit
+    @quick_jit
     def physical(w):
         return ravel_pytree(conditional_unknowns(LOOSE.rig, problem, mode, w)[0])[0]
 
@@ -202,7 +208,7 @@ def test_the_conditional_variables_have_the_jacobian_that_they_claim(truncated):
     assert values[1] - values[0] == pytest.approx(float(expected[1] - expected[0]), rel=1e-9)
 
 
-@lru_cache(maxsize=1)
+@cache
 def nearly_linear():
     """A problem, its MAP and its chains, made once."""
     problem, run = problem_of(NEARLY_LINEAR, truncated=False)
@@ -280,7 +286,7 @@ def test_given_the_path_the_conditional_variables_of_depth_are_standard_normal()
     def of_depths(e):
         return density(w.at[-LOOSE.landmarks :].set(e))
 
-    at, H = jax.jit(lambda e: (jax.grad(of_depths)(e), jax.hessian(of_depths)(e)))(
+    at, H = quick_jit(lambda e: (jax.grad(of_depths)(e), jax.hessian(of_depths)(e)))(
         jnp.zeros(LOOSE.landmarks)
     )
     np.testing.assert_allclose(at, 0, atol=0.3)
@@ -292,8 +298,8 @@ def test_moments_and_distances_of_gaussian_draws_are_those_of_the_gaussian():
     mean = jaxslam.PLANAR.group.from_xy_theta(1.0, -2.0, 0.4)
     L = np.array([[0.02, 0, 0], [0.01, 0.03, 0], [-0.002, 0.001, 0.005]])
     draws = rng.normal(size=(20000, 3)) @ L.T
-    poses = jax.vmap(lambda d: retract(mean, d))(jnp.asarray(draws))
-    found, P, tangents = pose_moments(poses)
+    poses = quick_jit(jax.vmap(lambda d: retract(mean, d)))(jnp.asarray(draws))
+    found, P, tangents = quick_jit(pose_moments)(poses)
     np.testing.assert_allclose(difference(found, mean), draws.mean(axis=0), atol=1e-5)
     np.testing.assert_allclose(P, L @ L.T, rtol=0.05, atol=2e-5)
     np.testing.assert_allclose(tangents.mean(axis=0), 0, atol=1e-9)
@@ -331,7 +337,7 @@ def test_ranks_of_the_truth_are_uniform_if_and_only_if_the_draws_are_right():
     assert (p < 1e-3).all()
 
 
-@lru_cache(maxsize=1)
+@cache
 def small_study():
     """Records of 40 small problems and their exact draws, made once."""
     study = Study(LOOSE, 3, HMC(chains=2, warmup=100, draws=150), starts=1)
