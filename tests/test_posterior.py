@@ -462,6 +462,18 @@ def test_a_scenario_of_another_kind_is_refused(name, fields, match):
         check_scenario(jaxslam.scenario(name, **fields))
 
 
+def test_starts_are_the_mean_of_the_prior_and_draws_of_it_without_accelerations():
+    problem, _ = problem_of(LOOSE)
+    first, *others = starts(problem, jax.random.key(0), 400)
+    assert not np.any(first)
+    others = np.array(others)
+    drawn = np.r_[:3, size(problem) - LOOSE.landmarks : size(problem)]  # velocity and depths
+    assert not np.any(np.delete(others, drawn, axis=1))
+    # 399 draws of 7 numbers: each mean within 5 σ of 0, each σ within 5 of its own of 1.
+    assert np.abs(others[:, drawn].mean(axis=0)).max() < 5 / np.sqrt(399)
+    assert np.abs(others[:, drawn].std(axis=0) - 1).max() < 5 / np.sqrt(2 * 399)
+
+
 def test_sizes_that_make_no_sense_are_refused():
     _, run = problem_of(LOOSE)
     for steps in (0, 4):

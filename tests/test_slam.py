@@ -33,6 +33,7 @@ from jaxslam.filters.frames import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.filters.slam import Context, Core
 from jaxslam.geometry import PLANAR, SPATIAL, joined, retract
 from jaxslam.landmarks import (
+    FRAMED_HOMOGENEOUS,
     INVERSE_DEPTH_TO_CARTESIAN,
     INVERSE_SCALING,
     LANDMARKS,
@@ -522,6 +523,45 @@ def test_a_step_leaves_no_acceleration_and_no_white_calibration_behind(kind):
     assert not np.any(state.covariance[:, 6:11])
     np.testing.assert_array_equal(state.core.noise, np.zeros(3))
     np.testing.assert_array_equal(state.core.calibration, np.zeros(2))
+
+
+@pytest.mark.parametrize("kind", ["robocentric", "world"])
+def test_a_map_from_above_is_azimuth_and_inverse_distance_along_the_axes_of_the_world(kind):
+    """Of a camera that is turned in every direction; azimuth from z towards x."""
+    slam = FILTERS[kind](Rig(SPATIAL), INVERSE_SCALING, "known")
+    numbers = scenario_parameters(scenario("matched-6dof"))
+    seen = Features(jnp.arange(2), jnp.array([[100.0, 90.0], [500.0, 300.0]]), jnp.ones(2, bool))
+    T_BC = pose(SPATIAL, 5, scale=1.0)
+
+    @quick_jit
+    def told():
+        state = slam.start(numbers, 2, jnp.zeros(6), jnp.full(6, 0.1))
+        state = replace(state, core=replace(state.core, pose=slam.model.frame.hold(T_BC)))
+        state = slam.insert(state, numbers, seen)
+        ask = (state, numbers, jnp.arange(2))
+        return slam.landmarks_from_above(*ask)[0], slam.landmarks_in_world(*ask)[0]
+
+    above, points = told()
+    x, _, z = (points - T_BC.translation()).T
+    np.testing.assert_allclose(above[:, 0], np.arctan2(x, z), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(above[:, 1], 1 / np.hypot(x, z), rtol=1e-12)
+
+
+def test_a_frame_with_new_landmarks_becomes_an_anchor_that_no_other_landmark_has():
+    slam = FILTERS["robocentric"](Rig(PLANAR), FRAMED_HOMOGENEOUS, "known")
+    numbers = tight().parameters()
+
+    @quick_jit
+    def inserted(state, slot):
+        return slam.insert(state, numbers, Features(slot, jnp.array([[300.0]]), jnp.array([True])))
+
+    state = slam.start(numbers, 3, jnp.zeros(3), jnp.full(3, 0.1))
+    for slot in ([0], [1], [2]):
+        state = inserted(state, jnp.array(slot))
+    before = state.landmarks[:, -1].tolist()
+    assert sorted(before) == [0, 1, 2]
+    state = slam.remove(state, jnp.arange(3) == 1)
+    assert inserted(state, jnp.array([1])).landmarks[:, -1].tolist() == before
 
 
 def test_an_unknown_calibration_is_refused_by_name():
