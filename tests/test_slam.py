@@ -147,6 +147,58 @@ def test_in_a_gauge_the_noise_is_scaled_but_says_nothing_of_the_scale(geometry):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
 
 
+@cache
+def in_gauge():
+    """A filter whose scale is known to a third, in frame 0, and the parameters."""
+    case = tight()
+    slam, parameters = case.filter("scale_gauge", "inverse_scaling"), case.parameters()
+
+    def first(parameters, new):
+        velocity, sigma = jnp.array([1.2, 0.0, 0.0]), jnp.array([0.4, 0.1, 0.1])
+        return slam.first(slam.start(parameters, case.capacity, velocity, sigma), parameters, new)
+
+    return slam, parameters, quick_jit(first)(parameters, case.frames(0)[0])
+
+
+def test_in_a_gauge_inverse_depths_have_the_moments_of_a_product_with_a_log_normal():
+    """`E e^λ ρ = e^(λ + P/2) ρ0` and `E (e^λ ρ)² = e^(2λ + 2P) (ρ0² + σ²)`, exactly."""
+    slam, parameters, state = in_gauge()
+    log_scale, P = slam.engine.core_covariance(lambda core: core.log_scale, state)
+    log_scale, P = float(log_scale[0]), float(P[0, 0])
+    assert P > 0.1
+    mean, sigma = float(parameters.inverse_depth), float(parameters.inverse_depth_sigma)
+    own = state.core_dim + 2  # of (x, z, ω) of landmark 0, in pixels
+    first = mean * np.exp(log_scale + P / 2)
+    second = (mean**2 + sigma**2) * np.exp(2 * log_scale + 2 * P)
+    np.testing.assert_allclose(state.landmarks[0, 2] / 650, first, rtol=1e-12)
+    variance = state.covariance[own, own] / 650**2
+    np.testing.assert_allclose(variance, second - first**2, rtol=1e-12)
+
+
+def test_in_a_gauge_lengths_are_told_in_metres():
+    slam, parameters, state = in_gauge()
+    slots = jnp.arange(3)
+
+    @quick_jit
+    def told(log_scale):
+        T_BC = pose(PLANAR, 3)
+        core = replace(state.core, pose=slam.model.frame.hold(T_BC), log_scale=log_scale[None])
+        here = replace(state, core=core)
+        return (
+            slam.camera_pose(here)[0].translation(),
+            slam.landmarks_in_world(here, parameters, slots)[0],
+            slam.landmarks_in_camera(here, parameters, slots)[0],
+            slam.landmarks_from_above(here, parameters, slots)[0],
+        )
+
+    one, larger = told(jnp.asarray(0.0)), told(jnp.asarray(0.5))
+    factor = np.exp(0.5)
+    for found, before, by in zip(
+        larger, one, (factor, factor, [1, 1 / factor], [1, 1 / factor]), strict=True
+    ):
+        np.testing.assert_allclose(found, before * np.asarray(by), rtol=0, atol=1e-12)
+
+
 # --- whole runs ---------------------------------------------------------------------------------
 
 
