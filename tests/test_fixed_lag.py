@@ -104,7 +104,7 @@ def test_the_sensitivities_are_the_derivatives(name, scenario_name, landmarks):
 def test_the_estimate_of_a_window_that_holds_everything_is_the_maximum_of_the_posterior():
     """Converged, with no frame absorbed: the gradient of ½|y|² + ½ Σ|r|² is zero there."""
     of = case()
-    slam = replace(named_filter(of, "robocentric+lag6"), iterations=8)
+    slam = replace(named_filter(of, "robocentric+lag6"), iterations=4)
     state, _ = pose_run(of, slam)
     normal_equations = quick_jit(
         lambda s: slam._normal_equations(of.parameters(), s.before, s.variables, s.frames)
@@ -114,6 +114,30 @@ def test_the_estimate_of_a_window_that_holds_everything_is_the_maximum_of_the_po
     converged = replace(slam, iterations=1, converge=True)
     other, _ = pose_run(of, converged)
     np.testing.assert_allclose(other.variables, state.variables, atol=1e-3)
+
+
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_a_frame_is_linearised_as_often_as_is_said(monkeypatch, iterations):
+    of = case()
+    slam = replace(named_filter(of, "robocentric+lag2"), iterations=iterations)
+    first, *later = of.frames(0)
+    velocity, sigma, controls = of.motion()
+    linearised, normal_equations = [], FixedLag._normal_equations
+
+    def counted(*arguments):
+        linearised.append(None)
+        return normal_equations(*arguments)
+
+    def one_frame(parameters):
+        known, new = (jax.tree.map(lambda x: x[0], features) for features in later)
+        sizes = known.slots.size, new.slots.size
+        state = slam.start(parameters, of.capacity, velocity, sigma, sizes)
+        state = slam.first(state, parameters, first)
+        return slam.step(state, parameters, controls[0], known, new)
+
+    monkeypatch.setattr(FixedLag, "_normal_equations", counted)
+    jax.eval_shape(one_frame, of.parameters())
+    assert len(linearised) == iterations
 
 
 def test_an_iterated_filter_uses_a_measurement_once():
