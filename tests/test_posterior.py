@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import keys_used, quick_jit
+from cases import close, each_geometry, keys_used, named, pose, quick_jit
 from jax.flatten_util import ravel_pytree
 from scipy.linalg import expm
 from scipy.stats import norm, truncnorm
@@ -338,6 +338,21 @@ def test_moments_and_distances_of_gaussian_draws_are_those_of_the_gaussian():
     np.testing.assert_allclose(distances[0], 0.1, rtol=0.01)
     np.testing.assert_allclose(distances[1], sigma[1] * np.sqrt(2 / np.pi), rtol=0.03)
     assert distances[2] < 0.03 * sigma[2]
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_a_covariance_in_base_axes_is_that_of_draws_in_base_axes(geometry):
+    """Of small draws, so that the tangent at the mean and the axes of B differ by a turn alone."""
+    rng, t = np.random.default_rng(0), geometry.tangent_dim
+    mean = pose(geometry, 3, scale=1.0)
+    draws = 1e-6 * rng.normal(size=(50, t)) @ rng.normal(size=(t, t))
+
+    @quick_jit
+    def both(draws):
+        moved = jax.vmap(lambda d: retract(mean, d))(draws)
+        return covariance(in_base_axes(moved, mean)), to_base_axes(mean, covariance(draws))
+
+    close(*both(draws), 1e-5)
 
 
 def test_ranks_of_the_truth_are_uniform_if_and_only_if_the_draws_are_right():
