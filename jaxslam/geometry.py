@@ -124,7 +124,7 @@ def scaled(tree: Any, scale: Float[Array, ""]) -> Any:
 def homogeneous_apply(
     T_ab: Pose, point: Float[Array, " n"], omega: Float[Array, ""]
 ) -> Float[Array, " n"]:
-    """`X' = R X + ω t` (P20): the homogeneous point (X, ω) in frame a; ω stays."""
+    """`X' = R X + ω t`: the homogeneous point (X, ω) in frame a; ω stays."""
     return T_ab.rotation() @ point + omega * T_ab.translation()
 
 

@@ -1,4 +1,10 @@
-"""What the core's tests share: quick compilation, central differences, poses, filter runs."""
+"""What the core's tests share: quick compilation, central differences, poses, filter runs.
+
+Exactly equal is only what no processor can round: what is copied, set or masked, sums with zero,
+one addition, and one compiled program on the same numbers. Whatever is computed in two ways, or by
+two programs (one may contract `a b + c`, or vectorise), has a bound, and never one that is relative
+alone where zero is expected.
+"""
 
 from functools import cache, partial
 
@@ -160,3 +166,22 @@ def pose_run(of, slam, i=0, count=None):
 def named_filter(of, name, landmarks="inverse_scaling", calibration=None):
     calibration = calibration or of.scenario.calibration
     return make_filter(of.scenario.rig, name, LANDMARKS[landmarks], calibration)
+
+
+def keys_used(monkeypatch, function):
+    """What a function gives, and the data of every key that it draws from or splits."""
+    found, data = [], jax.random.key_data
+
+    def recorded(use):
+        def used(key, *arguments, **options):
+            jax.debug.callback(lambda key: found.append(tuple(key.tolist())), data(key))
+            return use(key, *arguments, **options)
+
+        return used
+
+    with monkeypatch.context() as patch:
+        for name in ("split", "normal", "uniform", "truncated_normal", "bernoulli"):
+            patch.setattr(jax.random, name, recorded(getattr(jax.random, name)))
+        value = jax.block_until_ready(function())
+        jax.effects_barrier()
+    return value, found

@@ -1,5 +1,8 @@
 """What every test shares: float64, and the folder of real data where it is at hand."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -7,9 +10,19 @@ import pytest
 
 from jaxslam.consistency import montecarlo
 
+
+def _flags_that_are_known(*flags: str) -> str:
+    """XLA's flags and these, where it knows them: by others it would end the process."""
+    wanted = " ".join(filter(None, (os.environ.get("XLA_FLAGS"), *flags)))
+    start = [sys.executable, "-c", "import jax; jax.devices()"]
+    tried = subprocess.run(start, env={**os.environ, "XLA_FLAGS": wanted}, capture_output=True)
+    return wanted if tried.returncode == 0 else os.environ.get("XLA_FLAGS", "")
+
+
 jax.config.update("jax_enable_x64", True)
 # Tests compile much and compute little.
 jax.config.update("jax_disable_most_optimizations", True)
+os.environ["XLA_FLAGS"] = _flags_that_are_known("--xla_cpu_use_fusion_emitters=false")
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -39,7 +39,7 @@ def test_a_run_says_which_camera_was_the_true_one():
         error = (np.asarray(run.measured)[..., 0] - expected)[np.asarray(run.visible)]
         assert np.abs(error).max() < 1.8  # 6 σ
     assert (np.ptp(intrinsics["white"], axis=0) > 0).all()
-    assert (np.ptp(intrinsics["constant"], axis=0) == 0).all()
+    assert (np.ptp(intrinsics["constant"], axis=0) < 1e-12).all()  # rounding of hundreds
     assert (intrinsics["constant"] != [650, 320]).all()
     assert (intrinsics["nominal"] == [650, 320]).all()
 

@@ -23,7 +23,7 @@ VERDICT_KEYS = {
 
 
 def test_consistency_writes_what_others_read(tmp_path, capsys):
-    main([*SMALL, "--out", str(tmp_path), "--set", "pixel_sigma=0.4"])
+    main([*SMALL, "--chunk", "3", "--out", str(tmp_path), "--set", "pixel_sigma=0.4"])
     summary = json.loads((tmp_path / "consistency.json").read_text())
     assert summary["schema"] == 1
     assert (summary["runs"], summary["steps"], summary["seed"]) == (6, 5, 0)

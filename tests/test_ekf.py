@@ -247,13 +247,12 @@ def test_removal_zeroes_and_a_freed_slot_is_as_good_as_a_fresh_one():
 
     again, fresh = inserted(used), inserted(unused)
     assert again.active[used]
-    np.testing.assert_array_equal(again.landmarks[used], fresh.landmarks[unused])
+    # The same sums, in other places of a vectorised loop.
+    close(again.landmarks[used], fresh.landmarks[unused], 1e-14)
     order = np.arange(CAPACITY)
     order[[used, unused]] = unused, used
     numbers = rows_of(6, order, 3)
-    np.testing.assert_array_equal(
-        again.covariance, np.asarray(fresh.covariance)[np.ix_(numbers, numbers)]
-    )
+    close(again.covariance, np.asarray(fresh.covariance)[np.ix_(numbers, numbers)], 1e-14)
 
 
 def rows_of(c, order, d):
@@ -288,9 +287,10 @@ def test_prior_one_and_noise_one_end_with_one_half():
     seen = Features(jnp.array([0]), jnp.array([[3.0]]), jnp.array([True]))
     update = quick_jit(lambda state, seen: ekf.update(Scalar(), state, seen, jnp.eye(1), None))
     state, innovation = update(state, seen)
-    np.testing.assert_allclose(state.covariance, np.diag([0.0, 0.5]), rtol=1e-15)
-    np.testing.assert_allclose(state.landmarks, [[1.5]], rtol=1e-15)
-    np.testing.assert_allclose(innovation.nis, 9 / 2, rtol=1e-15)
+    # √2 and its inverse are rounded.
+    np.testing.assert_allclose(state.covariance, np.diag([0.0, 0.5]), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(state.landmarks, [[1.5]], rtol=1e-14)
+    np.testing.assert_allclose(innovation.nis, 9 / 2, rtol=1e-14)
 
 
 # --- the real models, against dense Jacobians of the whole state --------------------------------
@@ -502,7 +502,8 @@ def test_a_feature_that_cannot_be_used_changes_nothing(change, valid):
         # The pose is multiplied by Exp(0).
         np.testing.assert_allclose(after, before, rtol=0, atol=1e-15)
     np.testing.assert_array_equal(updated.landmarks, state.landmarks)
-    np.testing.assert_array_equal(updated.covariance, state.covariance)
+    # P is symmetric to rounding, and made so exactly.
+    close(updated.covariance, state.covariance, 1e-14)
     assert innovation.nis == 0
     assert innovation.nis_dof == 0
 
@@ -573,7 +574,7 @@ def test_considered_numbers_count_but_are_not_corrected():
     after = np.asarray(updated.covariance)
     close(after[np.ix_(x, x)], P_xx, 1e-10)
     close(after[np.ix_(x, k)], P_xk, 1e-10)
-    np.testing.assert_array_equal(after[np.ix_(k, k)], P[np.ix_(k, k)])
+    close(after[np.ix_(k, k)], P[np.ix_(k, k)], 1e-14)
     np.testing.assert_array_equal(after, after.T)
     assert np.abs(P_xk - P[np.ix_(x, k)]).max() > 1e-3
 
@@ -651,7 +652,8 @@ def test_inverse_scaling_has_rank_three_when_the_focal_length_is_known():
 
     block = np.asarray(quick_jit(first)(parameters))[-4:, -4:]
     values = np.linalg.eigvalsh(block)
-    assert values[0] <= 1e-15 * values[-1]
+    # Zero is found to 1e-15 of the largest, or so.
+    assert values[0] <= 1e-13 * values[-1]
     assert values[1] >= 1e-6 * values[-1]
 
 
@@ -668,6 +670,6 @@ def test_covariance_stays_symmetric_and_positive_over_a_long_run(kind):
     P = np.asarray(covariances)
     largest = np.abs(P).max(axis=(1, 2))
     # Composition and initialisation round the two halves differently; the update mends it.
-    assert (np.abs(P - P.transpose(0, 2, 1)).max(axis=(1, 2)) <= 1e-15 * largest).all()
-    # Rounding of some 100 steps, each adding 1e-16 of the largest entry.
+    assert (np.abs(P - P.transpose(0, 2, 1)).max(axis=(1, 2)) <= 1e-14 * largest).all()
+    # Rounding of some 100 steps, each adding 1e-16 of the largest entry, and of the eigenvalues.
     assert (np.linalg.eigvalsh(P)[:, 0] >= -1e-13 * largest).all()

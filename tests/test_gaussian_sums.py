@@ -15,7 +15,7 @@ from jaxslam.filters.split_and_merge import _split_and_merged
 from jaxslam.filters.state import Innovation
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.rig import Rig
-from tests.cases import Case, each_geometry, named, named_filter, pose_run, quick_jit
+from tests.cases import Case, close, each_geometry, named, named_filter, pose_run, quick_jit
 
 
 @cache
@@ -82,6 +82,36 @@ def test_a_member_without_weight_spoils_no_prediction():
     np.testing.assert_allclose(mixed.residual, -mixed.predicted)
 
 
+@pytest.mark.parametrize("name", ["matched", "matched-6dof"])
+def test_a_prior_is_divided_along_the_speed_or_across_it(name):
+    """The members of a sum over directions have one speed, and those of one over scales differ in
+    nothing else, also where what is known of the velocity is skew."""
+    of = case(name)
+    velocity, sigma, _ = of.motion()
+    t, n = velocity.size, of.scenario.rig.geometry.point_dim
+    velocity = velocity.at[:n].set(jnp.arange(1.0, n + 1))
+    root = np.diag(sigma) + 0.05 * np.random.default_rng(0).normal(size=(t, t))
+
+    def members(modifier):
+        slam = named_filter(of, f"robocentric+{modifier}")
+        return slam.start(of.parameters(), of.capacity, velocity, jnp.asarray(root)).members
+
+    forward = np.asarray(velocity).copy()
+    forward[n:] = 0
+    across, along = (
+        np.asarray(quick_jit(lambda name=name: members(name).core.velocity)()) - velocity
+        for name in ("directions3", "scales3")
+    )
+    assert len(across) == 3 ** (n - 1)
+    assert np.linalg.matrix_rank(across, tol=1e-6) == n - 1
+    np.testing.assert_allclose(across @ forward, 0, atol=1e-12)
+    # As a correlated prior has it: the others follow by their regression on the speed.
+    P = root @ root.T
+    regression = P @ forward / (forward @ P @ forward)
+    close(along, np.outer(along @ forward, regression), 1e-12)
+    assert np.abs(along @ forward).max() > 0.1
+
+
 @cache
 def some_sum():
     """A sum after some steps, and the function that it is divided by."""
@@ -120,13 +150,62 @@ def moments(state):
     return mean, own + np.einsum("k,ki,kj->ij", weights, x - mean, x - mean)
 
 
+@pytest.mark.parametrize("likeliest", [0, 3])
+def test_of_a_sum_the_likeliest_member_is_reported(likeliest):
+    slam, state = named_filter(case(), "scale_gauge+mixture5"), some_sum()
+    state = replace(state, log_weights=jnp.log(jnp.full(5, 0.1).at[likeliest].set(0.6)))
+    found = slam.reported(state)
+    expected = jax.tree.map(lambda x: x[likeliest], state.members)
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+
 def test_a_sum_as_one_gaussian_has_its_moments():
     state = some_sum()
     slam = named_filter(case(), "scale_gauge+mixture5")
-    one = slam.predicted_gaussian(state, case().parameters(), case().motion()[2][0])
+    control = case().motion()[2][0]
+    one = quick_jit(lambda s: slam.predicted_gaussian(s, case().parameters(), control))(state)
     alone = BankState(jax.tree.map(lambda x: x[None], one), jnp.zeros(1))
     for whole, single in zip(moments(state), moments(alone), strict=True):
         np.testing.assert_allclose(single, whole, rtol=1e-9, atol=1e-12 * np.abs(whole).max())
+
+
+def test_of_members_that_predict_alike_the_surer_one_gains():
+    """Bayes: with no residual the likelihood is `1/√det S`."""
+    of = case()
+    slam = named_filter(of, "robocentric+scales3")
+    first, known, _ = of.frames(0)
+    velocity, sigma, controls = of.motion()
+    parameters, sure = of.parameters(), jnp.array([0.5, 1.0, 2.0])
+
+    def begun(factor):
+        state = slam.base.start(parameters, of.capacity, velocity, factor * sigma)
+        return slam.base.first(state, parameters, first)
+
+    @quick_jit
+    def weighed(weights):
+        members = jax.vmap(begun)(sure)
+        one = jax.tree.map(lambda x: x[0], members)
+        seen, nothing = (jax.tree.map(lambda x: x[0], known),) * 2
+        nothing = replace(nothing, valid=jnp.zeros_like(seen.valid))
+        predicted = slam.base.predict(one, parameters, controls[0])
+        pixels, _ = slam.base.project(predicted, parameters, controls[0], seen.slots)
+        data = (parameters, controls[0], replace(seen, measured=pixels), nothing)
+        after, mixed = slam.step(BankState(members, jnp.log(weights)), *data)
+        _, alone = jax.vmap(lambda member: slam.base.step(member, *data))(members)
+        return after.log_weights, alone, mixed.predicted - pixels
+
+    weights = np.array([0.2, 0.5, 0.3])
+    log_weights, alone, apart = weighed(weights)
+    assert np.abs(apart).max() < 1e-9
+    assert np.abs(alone.residual).max() < 1e-9
+    expected = weights / np.sqrt(np.linalg.det(np.asarray(alone.covariance)))
+    assert expected[0] / weights[0] > 1.5 * expected[2] / weights[2]
+    np.testing.assert_allclose(np.exp(log_weights), expected / expected.sum(), rtol=1e-9)
+
+
+@cache
+def divided():
+    return quick_jit(lambda state: _split_and_merged(pixels, state))
 
 
 def cost(state):
@@ -136,7 +215,7 @@ def cost(state):
 
 def test_to_split_and_to_merge_keeps_the_moments_and_lessens_the_cost():
     state = some_sum()
-    after = quick_jit(lambda state: _split_and_merged(pixels, state))(state)
+    after = divided()(state)
     assert not np.allclose(after.log_weights, state.log_weights)
     np.testing.assert_allclose(np.exp(after.log_weights).sum(), 1, rtol=1e-12)
     for before, now in zip(moments(state), moments(after), strict=True):
@@ -152,7 +231,7 @@ def test_what_gains_nothing_is_not_split():
     apart = jnp.arange(5.0)[:, None] * jnp.ones(3)
     core = replace(members.core, velocity=members.core.velocity + apart)
     state = BankState(replace(members, core=core), jnp.log(jnp.full(5, 0.2)))
-    after = _split_and_merged(pixels, state)
+    after = divided()(state)
     jax.tree.map(np.testing.assert_array_equal, after, state)
 
 
@@ -162,7 +241,7 @@ def test_members_without_weight_give_their_places():
     log_weights = jax.nn.log_softmax(state.log_weights.at[2:].set(-jnp.inf))
     covariance = state.members.covariance.at[2:].set(jnp.nan)
     state = BankState(replace(state.members, covariance=covariance), log_weights)
-    after = _split_and_merged(pixels, state)
+    after = divided()(state)
     assert np.isfinite(after.log_weights).sum() == 3
     alive = np.isfinite(after.log_weights)
     assert np.isfinite(np.asarray(after.members.covariance)[alive]).all()
@@ -184,7 +263,8 @@ def test_a_mixture_has_so_many_members(geometry):
     of = case("matched" if geometry.name == "planar" else "matched-6dof")
     velocity, sigma, _ = of.motion()
     slam = named_filter(of, "robocentric+mixture5")
-    assert slam.start(of.parameters(), of.capacity, velocity, sigma).log_weights.shape == (5,)
+    start = jax.eval_shape(lambda v: slam.start(of.parameters(), of.capacity, v, sigma), velocity)
+    assert start.log_weights.shape == (5,)
 
 
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)

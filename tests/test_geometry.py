@@ -21,6 +21,7 @@ from jaxslam.geometry import (
     joined,
     log,
     retract,
+    scaled,
     tangent_dim,
 )
 from jaxslam.motion import CONSTANT_VELOCITY
@@ -183,10 +184,10 @@ def test_a_split_pose_joins_to_the_pose_it_is_of(geometry):
     T = pose(geometry, 6, scale=2.0)
     split = SplitPose.of(T)
     assert tangent_dim(split) == geometry.tangent_dim
-    np.testing.assert_allclose(split.joined().as_matrix(), T.as_matrix(), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(split.joined().as_matrix(), T.as_matrix(), rtol=0, atol=1e-14)
     again = SplitPose.of(split.joined())
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(split), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
@@ -233,4 +234,16 @@ def test_joined_is_the_pose_of_its_parts(geometry):
     T = pose(geometry, 11, scale=2.0)
     again = joined(T.rotation(), T.translation())
     assert type(again) is geometry.group
-    np.testing.assert_allclose(again.as_matrix(), T.as_matrix(), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(again.as_matrix(), T.as_matrix(), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("split", [False, True], ids=["whole", "split"])
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_scaling_a_pose_scales_its_lengths_and_nothing_else(geometry, split):
+    T = pose(geometry, 1)
+    twice = scaled({"pose": SplitPose.of(T) if split else T}, 2.0)["pose"]
+    assert isinstance(twice, SplitPose if split else geometry.group)
+    twice = twice.joined() if split else twice
+    np.testing.assert_allclose(twice.translation(), 2 * T.translation(), rtol=1e-15)
+    rotation = T.rotation().as_matrix()
+    np.testing.assert_allclose(twice.rotation().as_matrix(), rotation, rtol=0, atol=1e-15)

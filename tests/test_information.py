@@ -13,7 +13,7 @@ from jaxslam.camera import Camera
 from jaxslam.filters import FILTERS, Features, Parameters, State, ekf, information
 from jaxslam.filters.frames import KEYFRAME_PARALLAX, KEYFRAME_TURN, keyframe_due
 from jaxslam.filters.information import EXACT_SIGMA, InformationState
-from jaxslam.geometry import PLANAR, difference, exp, identity, tangent_dim
+from jaxslam.geometry import PLANAR, difference, exp, identity, joined, tangent_dim
 from jaxslam.landmarks import IMAGE_PLANE, INVERSE_SCALING
 from jaxslam.rig import Rig
 
@@ -325,6 +325,32 @@ def test_a_keyframe_is_due_after_a_turn_or_a_baseline():
     assert not keyframe_due(pose(moved), jnp.zeros(3))
     assert keyframe_due(pose(turned), far)
     assert not keyframe_due(pose(0.8 * turned), near)
+
+
+@pytest.mark.parametrize("landmark", [INVERSE_SCALING, IMAGE_PLANE], ids=named)
+def test_a_parallax_is_the_way_from_the_keyframe_by_the_distance_of_the_map(landmark):
+    """Whatever length a parametrization gives to a ray, and of landmarks in the map alone."""
+    slam = FILTERS["keyframe"](Rig(PLANAR), landmark, "known")
+    distance = 5.0
+    ray = jnp.array([0.75, 1.0])
+    seen = landmark.initialise(ray, jnp.asarray(1.25 / distance), jnp.asarray(650.0))
+
+    def due(way, inverse_depth):
+        state = slam.start(noises(PLANAR), 3, jnp.zeros(3), jnp.full(3, 0.1))
+        empty = landmark.initialise(ray, jnp.asarray(inverse_depth), jnp.asarray(650.0))
+        there = joined(state.core.pose.keyframe_from_camera.rotation(), jnp.array([0.0, way]))
+        pose = replace(state.core.pose, keyframe_from_camera=there)
+        state = replace(
+            state,
+            core=replace(state.core, pose=pose),
+            landmarks=jnp.stack([seen, seen, empty]),
+            active=jnp.array([True, True, False]),
+        )
+        return bool(slam.model.reanchoring_due(state))
+
+    least = KEYFRAME_PARALLAX * distance
+    assert not due(0.99 * least, 100.0)
+    assert due(1.01 * least, 100.0)
 
 
 # --- what the information form cannot do ----------------------------------------------------------

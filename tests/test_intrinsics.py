@@ -52,8 +52,8 @@ def test_a_considered_calibration_stays_as_it_is_and_correlates_with_the_pose():
 def test_a_turning_camera_estimates_its_calibration():
     state, covariances, _ = run("estimated")
     variances = np.diagonal(covariances, axis1=1, axis2=2)[:, CALIBRATION]
-    assert (variances[0] <= VARIANCES).all()
-    # It never forgets, and gains in both.
+    # It never forgets, and gains in both; rounding of 9 px² is 1e-15.
+    assert (variances[0] <= VARIANCES + 1e-12).all()
     assert (np.diff(variances, axis=0) <= 1e-12).all()
     # Measured: 15 % and 8 % less after two thirds of a second.
     assert (variances[-1] < 0.95 * VARIANCES).all()

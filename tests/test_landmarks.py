@@ -103,7 +103,8 @@ def test_first_observation_puts_the_point_on_its_ray_at_its_depth(
     initialise, _, _, euclidean = functions(landmark)
     ray = jnp.append(bearing_of(geometry), 1.0)
     point = euclidean(initialise(bearing_of(geometry), inverse_depth))
-    np.testing.assert_allclose(point, ray / inverse_depth, rtol=1e-14)
+    # Angles and their sines are good to some 1e-16 each.
+    np.testing.assert_allclose(point, ray / inverse_depth, rtol=1e-13)
 
 
 @with_geometry
@@ -122,7 +123,7 @@ def test_transform_there_and_back_is_the_identity_also_for_the_parameters(landma
     parameters, T = generic(landmark, geometry), pose(geometry, 3, scale=1.0)
     moved = transform(T, parameters)
     assert np.abs(moved - parameters).max() > 0.01
-    close(transform(T.inverse(), moved), parameters, relative=1e-14)
+    close(transform(T.inverse(), moved), parameters, relative=1e-13)
 
 
 @with_geometry
@@ -131,7 +132,7 @@ def test_transforms_compose(landmark, geometry):
     _, transform, *_ = functions(landmark)
     parameters = generic(landmark, geometry)
     T, U = pose(geometry, 4), pose(geometry, 5)
-    close(transform(T @ U, parameters), transform(T, transform(U, parameters)), relative=1e-14)
+    close(transform(T @ U, parameters), transform(T, transform(U, parameters)), relative=1e-13)
 
 
 @with_geometry
@@ -220,7 +221,7 @@ def test_inverse_scaling_is_linear_in_the_landmark(geometry):
     _, transform, *_ = functions(INVERSE_SCALING)
     T, n = pose(geometry, 7), geometry.point_dim
     a, b = np.random.default_rng(0).normal(size=(2, n + 1))
-    close(transform(T, 2 * a - 3 * b), 2 * transform(T, a) - 3 * transform(T, b), relative=1e-14)
+    close(transform(T, 2 * a - 3 * b), 2 * transform(T, a) - 3 * transform(T, b), relative=1e-13)
 
 
 @with_geometry

@@ -1,4 +1,4 @@
-"""Tests of jaxslam.motion: what an odometry's reading and its error make of a pose."""
+"""Tests of jaxslam.motion: what velocities, readings and their noise make of a pose."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +7,7 @@ from cases import each_geometry, named, quick_jit
 from scipy.spatial.transform import Rotation
 
 from jaxslam.geometry import PLANAR, exp, identity
-from jaxslam.motion import BODY_RATES, MOTIONS, ODOMETRY, BodyRates
+from jaxslam.motion import BODY_RATES, CONSTANT_VELOCITY, MOTIONS, ODOMETRY, BodyRates
 
 READING = np.array([0.3, -0.1, 0.7, 0.2, -0.5, 0.4])
 ERROR = np.array([0.02, 0.03, -0.01, -0.04, 0.05, 0.02])
@@ -16,6 +16,22 @@ ERROR = np.array([0.02, 0.03, -0.01, -0.04, 0.05, 0.02])
 def reading_of(geometry, numbers):
     """The numbers of (x, z, θ), or of (x, y, z) and a rotation vector."""
     return numbers[[0, 2, 4]] if geometry is PLANAR else numbers
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_a_step_is_made_with_the_velocity_after_the_acceleration(geometry):
+    """`v' = v + a Δt`, `T = Exp(v' Δt)` (P8, P9): by jaxlie's exponential, not ours."""
+    velocity, acceleration = (jnp.asarray(reading_of(geometry, x)) for x in (READING, 50 * ERROR))
+    after = velocity + 0.2 * acceleration
+    step, found = quick_jit(
+        lambda v, a, dt: (
+            CONSTANT_VELOCITY.displacement(geometry, v, a, dt),
+            CONSTANT_VELOCITY.next_velocity(v, a, dt),
+        )
+    )(velocity, acceleration, jnp.asarray(0.2))
+    np.testing.assert_allclose(found, after, rtol=0, atol=1e-14)
+    expected = geometry.group.exp(0.2 * after)
+    np.testing.assert_allclose(step.as_matrix(), expected.as_matrix(), rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)

@@ -151,10 +151,8 @@ def test_directions_are_the_derivative_of_the_action(landmark, frame):
     start = len(N) - COUNT * d + 3 * d
     np.testing.assert_allclose(H @ N, 0, atol=1e-13 * np.abs(H).max() * np.abs(N).max())
     assert not half[start : start + d].any()
-    np.testing.assert_array_equal(
-        np.delete(half, range(start, start + d), 0)[:, :3],
-        np.delete(N, range(start, start + d), 0)[:, :3],
-    )
+    others = np.delete(np.arange(len(N)), range(start, start + d))
+    close(half[others, :3], N[others, :3], 1e-14)
 
 
 @cache

@@ -126,7 +126,8 @@ def test_measurements_err_as_the_calibration_says():
     white = np.array(measure(TwoViews(), 4000, 0))
     shared = np.array(measure(TwoViews(calibration="shared"), 4000, 0))
     known = np.array(measure(TwoViews(calibration="known"), 4000, 0))
-    np.testing.assert_array_equal(white[:7], measure(TwoViews(), 7, 0))
+    # Rounding of hundreds of pixels: the two are compiled for other sizes.
+    np.testing.assert_allclose(white[:7], measure(TwoViews(), 7, 0), rtol=0, atol=1e-10)
     np.testing.assert_allclose(white.mean(axis=0), TwoViews().pixels, atol=0.15)
     assert abs(np.corrcoef(white.T)[0, 1]) < 0.06
     assert np.corrcoef(shared.T)[0, 1] > 0.95

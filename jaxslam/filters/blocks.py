@@ -85,7 +85,7 @@ class Change(NamedTuple):
 
 
 def composition(model: Model, context: Any) -> Change:
-    """The motion as a change of variables (P18–P20)."""
+    """The motion as a change of variables: the core's (P18, P19), and a landmark's."""
 
     def landmark(view, landmark):
         return model.compose_landmark(view, landmark, context)

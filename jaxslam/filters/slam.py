@@ -187,7 +187,7 @@ class SlamModel:
         return scaled(core.pose, jnp.exp(core.log_scale[0]))
 
     def compose_landmark(self, view: View, landmark: Array, context: Context) -> Array:
-        """P20: the landmark in the new camera frame."""
+        """The landmark in the new camera frame, for which the paper numbers no equation."""
         del context
         return self.landmark.transform(view.map_from_camera.inverse(), landmark)
 

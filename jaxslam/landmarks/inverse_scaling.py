@@ -18,7 +18,7 @@ def initialise(point, omega, focal):
 
 
 def transform(T_ab, landmark):
-    """`X' = R X + ω t`, `ω' = ω` (P20): linear in the landmark."""
+    """`X' = R X + ω t`, `ω' = ω`: linear in the landmark; the paper numbers no equation for it."""
     point, omega = homogeneous(landmark)
     return jnp.append(homogeneous_apply(T_ab, point, omega), omega)
 

@@ -43,6 +43,10 @@ from jaxslam.simulation import Run, Scenario, Sightings, simulate
 
 Records = dict[str, Array]
 
+STREAM = 0x706F7374
+"""What is folded into a run's key for the draws that are not the run's own. `simulate` splits that
+key, and `split(key, n)[i]` *is* `fold_in(key, i)`: a small number would be one of its parts."""
+
 
 @dataclass(frozen=True)
 class Study:
@@ -90,7 +94,7 @@ def reference(study: Study, runs: Run, seed: int, indices: range) -> tuple[Recor
     second given that no landmark is beyond the bound, so that its draws are some of the second's.
     All have a leading axis of runs.
     """
-    keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.asarray(indices))
+    modes_keys, chains_keys = _keys(seed, indices)
     records: Records = {}
 
     def record(kind: str, found: Records) -> None:
@@ -98,15 +102,27 @@ def reference(study: Study, runs: Run, seed: int, indices: range) -> tuple[Recor
 
     for kind, truncated in (("exact", True), ("gaussian_prior", False)):
         problems = jax.vmap(partial(make_problem, study.scenario, truncated=truncated))(runs)
-        modes, found = _modes(study.rig, study.starts, problems, keys)
+        # Both from the same starts: what differs is the prior's.
+        modes, found = _modes(study.rig, study.starts, problems, modes_keys)
         record(f"{kind}_map", found)
         record(f"{kind}_laplace", _laplace_errors(study.rig, problems, modes, runs))
-    chains = _sample(study.hmc, study.rig, problems, modes.mode, keys)
+    chains = _sample(study.hmc, study.rig, problems, modes.mode, chains_keys)
     exact, share = jax.vmap(partial(given_bound, study.scenario.least_inverse_depth))(chains)
     record("gaussian_prior", _posterior_errors(chains, runs))
     record("exact", _posterior_errors(exact, runs))
     records["exact_share"] = share
     return records, exact
+
+
+def _keys(seed: int, indices: range) -> tuple[Array, Array]:
+    """Of every run, one key for the starts of Levenberg–Marquardt and one for the chains."""
+
+    def one(index):
+        run = jax.random.fold_in(jax.random.key(seed), index)
+        return jax.random.split(jax.random.fold_in(run, STREAM))
+
+    keys = jax.vmap(one)(jnp.asarray(indices))
+    return keys[:, 0], keys[:, 1]
 
 
 @partial(jax.jit, static_argnums=(0, 1))
