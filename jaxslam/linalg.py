@@ -112,8 +112,9 @@ def semidefinite_root(P: Float[Array, "n n"]) -> SemidefiniteRoot:
 
     Of the correlations with a jitter at rounding's size; what has no variance has a row of zeros.
     """
-    sigma = jnp.sqrt(jnp.diagonal(P))
-    none = sigma == 0
+    variance = jnp.diagonal(P)
+    none = variance <= 0
+    sigma = jnp.sqrt(jnp.where(none, 0.0, variance))
     unit = jnp.where(none, 1.0, sigma)
     jitter = 10 * sigma.size * jnp.finfo(P.dtype).eps
     correlation = P / (unit[:, None] * unit) + jnp.diag(jnp.where(none, 1.0, jitter))

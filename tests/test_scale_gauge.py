@@ -51,7 +51,8 @@ def assert_moments(draws, mean, covariance, also=0.0):
 def test_the_velocity_keeps_its_mean_and_all_its_covariance(velocity, sigma, n):
     """Turning too, where what turns is no length: λ and the angular velocity are independent."""
     prior = np.diag(np.square(sigma))
-    mean, covariance = velocity_in_gauge(jnp.asarray(velocity), jnp.asarray(prior), n)
+    mean, covariance = velocity_in_gauge(jnp.asarray(velocity), jnp.diag(jnp.asarray(sigma)), n)
+    assert (np.diagonal(covariance) >= 0).all()
     assert np.linalg.eigvalsh(covariance).min() > -1e-15
     v, log_scale = velocities(mean, covariance, n)
     assert_moments(v, velocity, prior)
@@ -67,20 +68,20 @@ def test_a_velocity_correlated_in_itself_keeps_its_moments_to_second_order():
     """As a member of a Gaussian sum has it; and however it is correlated, a covariance results."""
     velocity, root = np.array([1.0, 0.5, 0.3]), np.tril(0.1 * np.ones((3, 3)))
     prior = root @ root.T
-    mean, covariance = velocity_in_gauge(jnp.asarray(velocity), jnp.asarray(prior), 2)
+    mean, covariance = velocity_in_gauge(jnp.asarray(velocity), jnp.asarray(root), 2)
     q = covariance[-1, -1]
     assert_moments(velocities(mean, covariance, 2)[0], velocity, prior, also=q)
-    along = np.outer(velocity, velocity) * 0.3  # all in one direction: nothing but correlation
+    along = np.outer(velocity, [1.0, 0, 0])  # all in one direction: nothing but correlation
     _, covariance = velocity_in_gauge(jnp.asarray(velocity), jnp.asarray(along), 2)
     assert np.linalg.eigvalsh(covariance).min() > -1e-12
 
 
 @pytest.mark.parametrize("velocity", [(0.0, 0, 0), (0.0, 0, 0.3)])
 def test_from_standstill_the_scale_is_known_and_the_velocity_has_its_prior(velocity):
-    prior = np.diag([0.25, 0.25, 0.04])
-    mean, covariance = velocity_in_gauge(jnp.asarray(velocity), jnp.asarray(prior), 2)
+    root = np.diag([0.5, 0.5, 0.25])  # whose squares are exact
+    mean, covariance = velocity_in_gauge(jnp.asarray(velocity), jnp.asarray(root), 2)
     np.testing.assert_array_equal(mean, [*velocity, 0])
-    np.testing.assert_array_equal(covariance, np.pad(prior, ((0, 1), (0, 1))))
+    np.testing.assert_array_equal(covariance, np.pad(root**2, ((0, 1), (0, 1))))
 
 
 @pytest.mark.parametrize("name", ["matched-loose", "matched-turn-loose", "matched-6dof-loose"])

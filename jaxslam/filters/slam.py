@@ -374,17 +374,17 @@ class SlamFilter:
         state = replace(state, memory=self.initialisation.memory(capacity, dtype))
         state = self.engine.know(state, 0, tangent_dim(held))
         root = velocity_root(jnp.asarray(velocity_sigma, dtype))[:v, :v]
-        state = self._with_velocity(state, root @ root.T)
+        state = self._with_velocity(state, root)
         if self.depth_correlation:
             common = jnp.full((1, 1), self.depth_correlation, dtype)
             state = self.engine.augment(state, _part(core, "depth_error").start, common)
         return state if self.calibration == "white" else self._with_calibration(state, parameters)
 
-    def _with_velocity(self, state: State, covariance: Float[Array, "v v"]) -> State:
+    def _with_velocity(self, state: State, root: Float[Array, "v v"]) -> State:
         """The prior on the velocity; in a gauge, on the scale and on what it leaves of it."""
-        core = state.core
+        core, covariance = state.core, root @ root.T
         if self.scale_gauge:
-            mean, covariance = velocity_in_gauge(core.velocity, covariance, self.geometry.point_dim)
+            mean, covariance = velocity_in_gauge(core.velocity, root, self.geometry.point_dim)
             core = replace(core, velocity=mean[:-1], log_scale=mean[-1:])
         state = replace(state, core=core)
         return self.engine.augment(state, _part(core, "velocity").start, covariance)
@@ -686,9 +686,9 @@ def check_one_gaussian(base: SlamFilter, what: str) -> None:
 
 
 def velocity_in_gauge(
-    velocity: Float[Array, " v"], covariance: Float[Array, "v v"], n: int
+    velocity: Float[Array, " v"], root: Float[Array, "v v"], n: int
 ) -> tuple[Float[Array, " v+1"], Float[Array, "v+1 v+1"]]:
-    """(ṽ, λ) for `(e^λ ṽ[:n], ṽ[n:])` to have the velocity's mean v̄ and covariance Σ.
+    """(ṽ, λ) for `(e^λ ṽ[:n], ṽ[n:])` to have the velocity's mean v̄ and covariance `Σ = R Rᵀ`.
 
     The first n numbers are linear, the only lengths. λ takes the relative speed `sᵀδv`,
     `s = v̄/|v̄|²`, of variance q: `λ ~ N(−P/2, P)` with `e^P = 1 + q`; given λ, nothing is left of
@@ -699,14 +699,14 @@ def velocity_in_gauge(
     along_mean = jnp.where(linear, velocity, 0.0)
     squared = along_mean @ along_mean
     s = along_mean / jnp.where(squared > 0, squared, 1.0)
-    with_speed = covariance @ s
-    q = s @ with_speed
-    P, some = jnp.log1p(q), jnp.where(q > 0, q, 1.0)
+    speed = root.T @ s
+    with_speed, q = root @ speed, speed @ speed
+    P = jnp.log1p(q)
     shrunk = jnp.where(linear, 1 / (1 + q), 1.0)
     by_scale = shrunk * (with_speed - q * along_mean)  # Cov(ṽ, λ)
-    rest = covariance - jnp.outer(with_speed, with_speed) / some
-    own = jnp.sqrt(shrunk[:, None] * shrunk) * rest
-    own += jnp.outer(by_scale, by_scale) / jnp.where(q > 0, P, 1.0)
+    rest = root - jnp.outer(with_speed, speed) / jnp.where(q > 0, q, 1.0)
+    rest = jnp.sqrt(shrunk)[:, None] * rest
+    own = rest @ rest.T + jnp.outer(by_scale, by_scale) / jnp.where(q > 0, P, 1.0)
     mean = velocity - jnp.where(linear, by_scale, 0.0)
     joint = jnp.block([[own, by_scale[:, None]], [by_scale, P]])
     return jnp.append(mean, -P / 2), joint
