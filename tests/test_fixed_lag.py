@@ -225,9 +225,14 @@ def test_the_gauge_is_not_seen_by_a_camera():
     np.testing.assert_allclose(poses[1], poses[0] * np.exp(0.5))
 
 
-def test_correlated_depths_have_that_correlation_and_their_own_variance():
+@pytest.mark.parametrize(
+    ("modifier", "own", "common"),
+    [("common40", 1.0, 0.4), ("scene", 2.0, 1.0), ("scene50", 1.25, 0.25)],
+)
+def test_depths_have_their_own_variance_and_what_is_common(modifier, own, common):
+    """In variances of one prior: `common` shares it, `scene` adds to it."""
     of = case("matched")
-    slam = named_filter(of, "robocentric+common40")
+    slam = named_filter(of, f"robocentric+{modifier}")
     first, _, _ = of.frames(0)
     velocity, sigma, _ = of.motion()
     parameters = of.parameters()
@@ -236,8 +241,8 @@ def test_correlated_depths_have_that_correlation_and_their_own_variance():
     index = c + 3 * np.arange(of.capacity) + 2
     P = np.asarray(state.covariance)[np.ix_(index, index)] / 650**2
     variance = float(parameters.inverse_depth_sigma) ** 2
-    np.testing.assert_allclose(np.diagonal(P), variance, rtol=1e-9)
-    np.testing.assert_allclose(P[0, 1:], 0.4 * variance, rtol=1e-9)
+    np.testing.assert_allclose(np.diagonal(P), own * variance, rtol=1e-9)
+    np.testing.assert_allclose(P[0, 1:], common * variance, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -256,6 +261,7 @@ def test_correlated_depths_have_that_correlation_and_their_own_variance():
         ("scale_gauge+particles", "cartesian", "known", "delayed initialisation"),
         ("scale_gauge+rays", "cartesian", "known", "delayed initialisation"),
         ("scale_gauge+common50+rays", "cartesian", "known", "delayed initialisation"),
+        ("robocentric+scene+rays", "cartesian", "known", "delayed initialisation"),
         ("robocentric+lag5+lag5", "inverse_scaling", "known", "must stand before"),
         ("scale_gauge+oc", "inverse_scaling", "known", "needs no remedy"),
         ("robocentric+lagg5", "inverse_scaling", "known", "lagg"),

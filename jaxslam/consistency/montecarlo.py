@@ -7,6 +7,7 @@ and whatever the number of runs. Memory is bounded by the chunk: each chunk's re
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -113,7 +114,12 @@ class _Simulator:
     def capacity(self, chunks: tuple[range, ...]) -> Sightings:
         """What holds every run of the study, as Python integers."""
         seen = [jax.tree.map(np.max, jax.device_get(self(chunk)[1])) for chunk in chunks]
-        return jax.tree.map(lambda *counts: max(1, int(max(counts))), *seen)
+        return jax.tree.map(lambda *counts: _room_for(int(max(counts))), *seen)
+
+
+def _room_for(count: int) -> int:
+    """At least one, and above four a multiple of four: other seeds then need no other program."""
+    return max(1, count) if count <= 4 else 4 * math.ceil(count / 4)
 
 
 @partial(jax.jit, static_argnums=(0, 1))

@@ -1,5 +1,6 @@
 """Filters: the block-wise EKF, the SLAM models it runs on, and the table of their names."""
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
@@ -91,14 +92,31 @@ FILTERS: dict[str, Callable[[Rig, Parametrization, str], Filter]] = {
 
 
 def with_common_depth(base: SlamFilter, percent: int | None) -> SlamFilter:
-    """The filter with priors on 1/z that are correlated, in percent; 50 by default."""
-    return replace(base, depth_correlation=0.5 if percent is None else percent / 100)
+    """The filter with priors on 1/z that are correlated, in percent; 50 by default.
+
+    Raises ValueError for a correlation of 1, with which all landmarks are as far away as the first.
+    """
+    correlation = 0.5 if percent is None else percent / 100
+    if correlation >= 1:
+        raise ValueError(f"a correlation of depths is from 0 to below 1, not {correlation}")
+    return replace(base, own_depth=math.sqrt(1 - correlation), common_depth=math.sqrt(correlation))
+
+
+def with_scene_depth(base: SlamFilter, percent: int | None) -> SlamFilter:
+    """The filter that does not know how far away its scene is.
+
+    On top of the prior on 1/z of each landmark stands an error that is common to all, with a σ of
+    so many percent of one prior's; 100 by default. The first landmarks teach it to those that
+    follow.
+    """
+    return replace(base, common_depth=1.0 if percent is None else percent / 100)
 
 
 MODIFIERS: dict[str, Callable[[Any, int | None], Filter]] = {
     "particles": with_depth_particles,
     "rays": with_rays,
     "common": with_common_depth,
+    "scene": with_scene_depth,
     "lag": with_lag,
     "iterated": iterated,
     "scales": with_scales,
@@ -109,12 +127,13 @@ MODIFIERS: dict[str, Callable[[Any, int | None], Filter]] = {
 }
 """What `+name` behind a filter's name makes of it, with the number that may follow the name: the
 greatest depth of a delayed initialisation, m (`particles`, `rays`); the correlation of depths in
-percent (`common`); frames (`lag`); steps of Gauss–Newton instead of convergence (`iterated`);
-members of a Gaussian sum (`scales`, `directions`, `mixture`); none for the remedies `oc`, `fej`."""
+percent (`common`); σ of the scene's depth in percent of one landmark's (`scene`); frames (`lag`);
+steps of Gauss–Newton instead of convergence (`iterated`); members of a Gaussian sum (`scales`,
+`directions`, `mixture`); none for the remedies `oc`, `fej`."""
 
 _OF_ANY_FILTER = ("iterated", "scales", "directions", "mixture")
 
-RECOMMENDED = {"planar": "scale_gauge+mixture17", "spatial": "scale_gauge+mixture9"}
+RECOMMENDED = {"planar": "scale_gauge+scene+mixture17", "spatial": "scale_gauge+scene+mixture9"}
 """The filter called `recommended`, by geometry: of those of docs/consistency.md the one to take
 where nothing is known of the motion."""
 

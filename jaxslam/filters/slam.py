@@ -291,17 +291,20 @@ class SlamFilter:
     initialisation: Initialisation = UNDELAYED
     scale_gauge: bool = False
     """Whether lengths in the state are in a unit of their own, `e^λ` metres, with λ estimated."""
-    depth_correlation: float = 0.0
-    """Correlation, from 0 to below 1, of the priors on 1/z of any two landmarks."""
+    own_depth: float = 1.0
+    """σ of what a landmark's 1/z has of its own, in σ of its prior."""
+    common_depth: float = 0.0
+    """σ of what the priors on 1/z of all landmarks have in common, in σ of one; it is estimated."""
 
     def __post_init__(self) -> None:
         if self.calibration not in CALIBRATIONS:
             raise ValueError(
                 f"unknown calibration {self.calibration!r}; known: {', '.join(CALIBRATIONS)}"
             )
-        if not 0 <= self.depth_correlation < 1:
+        if not (self.own_depth > 0 and self.common_depth >= 0):
             raise ValueError(
-                f"a correlation of depths is from 0 to below 1, not {self.depth_correlation}"
+                "depths have some part of their own, and one in common that is not negative, "
+                f"not {self.own_depth} and {self.common_depth}"
             )
         motion, sensor = self.model.rig.motion, self.model.rig.sensor
         if self.scale_gauge and not (motion.has_velocity and sensor.hidden):
@@ -315,7 +318,7 @@ class SlamFilter:
     def _check_delayed(self) -> None:
         """Delayed initialisations have depths of their own, in metres, in place of the prior."""
         for wrong, what in (
-            (self.depth_correlation, "correlated depths"),
+            (self.common_depth, "depths with a common part"),
             (self.scale_gauge, "a scale gauge"),
         ):
             if wrong:
@@ -363,7 +366,7 @@ class SlamFilter:
             noise=jnp.zeros(t, dtype),
             calibration=jnp.zeros(0 if self.calibration == "known" else 2 * p, dtype),
             anchors=self._no_anchors(capacity, dtype),
-            depth_error=jnp.zeros(1, dtype) if self.depth_correlation else None,
+            depth_error=jnp.zeros(1, dtype) if self.common_depth else None,
         )
         # An empty slot holds a point straight ahead: finite in every formula.
         ahead = jnp.zeros(p + 1, dtype).at[-1].set(1.0)
@@ -375,8 +378,8 @@ class SlamFilter:
         state = self.engine.know(state, 0, tangent_dim(held))
         root = velocity_root(jnp.asarray(velocity_sigma, dtype))[:v, :v]
         state = self._with_velocity(state, root)
-        if self.depth_correlation:
-            common = jnp.full((1, 1), self.depth_correlation, dtype)
+        if self.common_depth:
+            common = jnp.full((1, 1), self.common_depth**2, dtype)
             state = self.engine.augment(state, _part(core, "depth_error").start, common)
         return state if self.calibration == "white" else self._with_calibration(state, parameters)
 
@@ -517,7 +520,7 @@ class SlamFilter:
         mean, and the variance that it leaves is `e^2λ ((ρ0² + σ²) e^2P − ρ0² e^P (1 + P))`.
         """
         mean, sigma = prior
-        sigma = sigma * jnp.sqrt(1 - self.depth_correlation)
+        sigma = sigma * self.own_depth
         if not self.scale_gauge:
             return mean, sigma
         P = self.engine.core_covariance(lambda core: core.log_scale, state)[1][0, 0]
