@@ -36,6 +36,15 @@ from jaxslam.geometry import jacobian, retract
 from jaxslam.linalg import cholesky, semidefinite_root
 
 
+ROUNDING = 4.0
+"""Units in the last place of its own that every variance gets back in an update.
+
+Differences of matrices are positive up to rounding only, and what rounding takes from an
+unobserved direction in single precision adds up over hundreds of steps. With this, eigenvalues of
+the correlations stay above `−n ε` however many there are (measured over 600 steps).
+"""
+
+
 def empty(core: Any, landmarks: Float[Array, "capacity d"]) -> State:
     """A state that is exactly known, of slots that hold no landmark yet."""
     capacity = landmarks.shape[0]
@@ -78,7 +87,7 @@ def update(
     context: Any,
     considered: slice = slice(0, 0),
 ) -> tuple[State, Innovation]:
-    """The Kalman update by all features at once (P16, P17), in Joseph form.
+    """The Kalman update by all features at once (P16, P17), in Joseph's form.
 
     `noise` is the covariance R of one measurement, or one for each feature. A feature that is not
     valid, not in the map or predicted behind the camera changes nothing. The `considered` numbers
@@ -95,11 +104,13 @@ def update(
     whitened = whitening @ residual.ravel()
 
     # Joseph's (I - KH) P (I - KH)ᵀ + K R Kᵀ, multiplied out from the left: two products of
-    # rank m, and none of n × n matrices.
+    # rank m, and none of n × n matrices. An error of K then counts by its square only; what
+    # rounding does to the differences is made good by `ROUNDING`.
     left = P - K @ HP
     covariance = left + (K @ R - left @ H.T) @ K.T
+    lost = ROUNDING * jnp.finfo(P.dtype).eps * jnp.diagonal(P)
     state = shifted(state, K @ residual.ravel())
-    state = replace(state, covariance=(covariance + covariance.T) / 2)
+    state = replace(state, covariance=(covariance + covariance.T) / 2 + jnp.diag(lost))
     return state, Innovation(predicted, residual, S, used, whitened @ whitened)
 
 
