@@ -9,6 +9,7 @@ import time
 from typing import TypeVar
 
 import jax
+import jax.core
 from jax.extend.core import Jaxpr, subjaxprs
 
 Values = TypeVar("Values")
@@ -43,6 +44,7 @@ def finished(values: Values, where: str, patience: float = PATIENCE) -> Values:
     if jax.default_backend() != "cpu":
         return jax.block_until_ready(values)
     arrays = [x for x in jax.tree.leaves(values) if isinstance(x, jax.Array)]
+    arrays = [x for x in arrays if not isinstance(x, jax.core.Tracer)]  # inside another program
     began = looked = time.monotonic()
     worked, idle = time.process_time(), 0.0
     while not all(x.is_ready() for x in arrays):

@@ -280,7 +280,8 @@ def test_recommended_is_a_name(geometry):
         ("robocentric+scales5+iterated", "inverse_scaling", "around a filter"),
         ("robocentric+lag5+mixture", "inverse_scaling", "not of windows"),
         ("world+particles+mixture", "cartesian", "delayed"),
-        ("information+mixture", "cartesian", "covariance form"),
+        ("information+mixture", "cartesian", "covariance form|information form"),
+        ("information+scales5", "cartesian", "information form"),
         ("world+mixture", "inverse_depth_to_cartesian", "cannot switch the form"),
     ],
 )

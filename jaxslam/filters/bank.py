@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxslam.filters import information
 from jaxslam.filters.filter import Filter
 from jaxslam.filters.initialisation import log_density
 from jaxslam.filters.slam import Parameters, velocity_root
@@ -61,6 +62,11 @@ class Bank:
             raise ValueError(f"a Gaussian sum has at least 3 members, not {self.count}")
         if self.along not in ALONG:
             raise ValueError(f"unknown division {self.along!r}; known: {', '.join(ALONG)}")
+        if getattr(self.base, "engine", None) is information:
+            raise ValueError(
+                "a Gaussian sum weighs its members by the covariance of the innovation, "
+                "which the information form does not have"
+            )
         if not self.base.rig.motion.has_velocity:
             raise ValueError(
                 f"a Gaussian sum divides a velocity: motion {self.base.rig.motion.name} has none"
@@ -198,6 +204,7 @@ def log_likelihoods(innovations: Innovation) -> Float[Array, " members"]:
     least density that a member with the landmark in front gives it, times `BEHIND`. A member that
     has diverged has none.
     """
+    assert innovations.covariance is not None, "members in information form have no S"
     k, m, p = innovations.residual.shape
     log_det = jax.vmap(lambda S: cholesky(S).log_det())(innovations.covariance)
     joint = -(innovations.nis + log_det) / 2

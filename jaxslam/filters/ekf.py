@@ -35,7 +35,6 @@ from jaxslam.filters.state import Features, Innovation, State
 from jaxslam.geometry import jacobian, retract
 from jaxslam.linalg import cholesky, semidefinite_root
 
-
 ROUNDING = 4.0
 """Units in the last place of its own that every variance gets back in an update.
 

@@ -40,6 +40,7 @@ from jaxslam.posterior.sampler import (
 )
 from jaxslam.rig import Rig
 from jaxslam.simulation import Run, Scenario, Sightings, simulate
+from jaxslam.watchdog import finished
 
 Records = dict[str, Array]
 
@@ -103,10 +104,12 @@ def reference(study: Study, runs: Run, seed: int, indices: range) -> tuple[Recor
     for kind, truncated in (("exact", True), ("gaussian_prior", False)):
         problems = jax.vmap(partial(make_problem, study.scenario, truncated=truncated))(runs)
         # Both from the same starts: what differs is the prior's.
-        modes, found = _modes(study.rig, study.starts, problems, modes_keys)
+        where = f"{kind} posterior of {study.scenario.name}, runs {indices}"
+        modes, found = finished(_modes(study.rig, study.starts, problems, modes_keys), where)
         record(f"{kind}_map", found)
         record(f"{kind}_laplace", _laplace_errors(study.rig, problems, modes, runs))
-    chains = _sample(study.hmc, study.rig, problems, modes.mode, chains_keys)
+    where = f"chains of {study.scenario.name}, runs {indices}"
+    chains = finished(_sample(study.hmc, study.rig, problems, modes.mode, chains_keys), where)
     exact, share = jax.vmap(partial(given_bound, study.scenario.least_inverse_depth))(chains)
     record("gaussian_prior", _posterior_errors(chains, runs))
     record("exact", _posterior_errors(exact, runs))

@@ -23,6 +23,7 @@ from jaxslam.vision.trajectory import (
     read_covariances,
     read_tum,
 )
+from jaxslam.watchdog import lapack_calls
 
 FRAMES = 45
 
@@ -55,6 +56,29 @@ def test_the_synthetic_camera_is_tracked(tracked):
     assert summary["ate"]["rmse"] < 0.02 * summary["ate"]["path_length"]
     # Matches are rejected by χ², so that their NIS is below its number; 4 would be a wrong σ.
     assert 0.1 < summary["nis"]["mean"] / summary["nis"]["dof"] < 2
+
+
+@pytest.mark.parametrize("name", ["world", "robocentric+mixture3"])
+def test_the_tracker_calls_no_lapack(name, monkeypatch):
+    """In none of its programs; unbatched calls are slow where OpenBLAS has threads of its own."""
+    source, calls, programs, jit = synthetic_source(frames=3), set(), [], jax.jit
+
+    def traced(function):
+        programs.append(function)
+
+        def call(*data):
+            calls.update(lapack_calls(jax.make_jaxpr(function)(*data).jaxpr))
+            return jit(function)(*data)
+
+        return call
+
+    with monkeypatch.context() as patched:
+        patched.setattr(jax, "jit", traced)
+        tracker = Tracker(source.calibration, TrackerSettings(wanted=8, filter=name))
+    for frame in source:
+        tracker.track(frame)
+    assert len(programs) >= 4
+    assert calls == set()
 
 
 def test_the_files_hold_every_frame_and_agree_with_the_summary(tracked):
