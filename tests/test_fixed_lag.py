@@ -7,14 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from jaxslam.filters import FixedLag, make_filter, sensitivity
-from jaxslam.filters.fixed_lag import _appended, _estimate
-from jaxslam.geometry import difference
-from jaxslam.landmarks import INVERSE_SCALING, LANDMARKS
-from jaxslam.rig import Rig
-from jaxslam.sensors import POSITION
-from tests.cases import (
+from cases import (
     Case,
     central,
     close,
@@ -23,6 +16,13 @@ from tests.cases import (
     pose_run,
     quick_jit,
 )
+
+from jaxslam.filters import FixedLag, make_filter, sensitivity
+from jaxslam.filters.fixed_lag import _appended, _estimate
+from jaxslam.geometry import difference
+from jaxslam.landmarks import INVERSE_SCALING, LANDMARKS
+from jaxslam.rig import Rig
+from jaxslam.sensors import POSITION
 
 SHORT = {"steps": 6, "landmarks": 4}
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import Case, close, each_geometry, named, named_filter, pose_run, quick_jit
 
 import jaxslam
 from jaxslam.filters import RECOMMENDED, make_filter
@@ -15,7 +16,6 @@ from jaxslam.filters.split_and_merge import _split_and_merged
 from jaxslam.filters.state import Innovation
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.rig import Rig
-from tests.cases import Case, close, each_geometry, named, named_filter, pose_run, quick_jit
 
 
 @cache

@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import Case, named_filter, quick_jit
 
 from jaxslam.filters.slam import velocity_in_gauge
-from tests.cases import Case, named_filter, quick_jit
 
 DRAWS = 400_000
 ERRORS = 5.0
