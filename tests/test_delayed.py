@@ -11,7 +11,14 @@ from cases import Case, quick_jit
 
 from jaxslam.camera import Camera
 from jaxslam.consistency.montecarlo import Prior, filter_run
-from jaxslam.filters import DepthParticles, Features, GaussianSum, Parameters, make_filter
+from jaxslam.filters import (
+    DepthParticles,
+    Features,
+    GaussianSum,
+    Parameters,
+    SlamFilter,
+    make_filter,
+)
 from jaxslam.filters.initialisation import log_density
 from jaxslam.geometry import PLANAR
 from jaxslam.landmarks import CARTESIAN, INVERSE_SCALING
@@ -168,6 +175,24 @@ def test_members_are_weighed_by_bayes_rule():
     variance = by_pixel * SIGMA**2 + (by_depth * 0.3 * s) ** 2 + SIGMA**2
     likelihood = np.exp(-((measured - predicted) ** 2) / variance / 2) / np.sqrt(variance)
     np.testing.assert_allclose(state.memory[0], likelihood / likelihood.sum(), rtol=1e-9)
+
+
+@pytest.mark.parametrize("privilege", [0.0, 0.5, 1.0])
+def test_members_share_a_measurement_by_their_weights_to_the_privilege(privilege, monkeypatch):
+    """ρ_i = Λ_i^μ / Σ Λ_j^μ (Solà et al. 2005): all shares together are one measurement."""
+    method = GaussianSum(nearest=1.0, farthest=15.0, threshold=0.0, privilege=privilege)
+    slam, parameters = the_filter("robocentric", method), the_parameters()
+    state = begun(slam, parameters, pixels(FOCAL * 0.2 + CENTRE))
+    shares, correct = [], SlamFilter.correct
+
+    def recorded(self, *data):
+        shares.append(data[-1])
+        return correct(self, *data)
+
+    monkeypatch.setattr(SlamFilter, "correct", recorded)
+    after, _ = slam.step(state, parameters, DT, pixels(seen_at(4.0, 0.2, 1)), NONE)
+    powers = np.asarray(after.memory[0]) ** privilege
+    np.testing.assert_allclose(shares[0], powers / powers.sum(), rtol=1e-12)
 
 
 def test_unlikely_members_are_pruned_until_one_is_left():
