@@ -5,7 +5,7 @@ and the tracker all run on the same ones. Plots, vision and the command line are
 when they are asked for: `jaxslam.plots`, `jaxslam.vision`, `jaxslam.cli`.
 """
 
-__version__ = "0.3.0"
+__version__ = "0.4.0.dev0"
 
 from jaxslam.camera import Camera
 from jaxslam.consistency import mean_band, monte_carlo, summarise, table
