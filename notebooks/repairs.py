@@ -149,5 +149,5 @@ assert ratio(ahead["scale_gauge+mixture17"]) > 0.8
 # the cost of the plain filter. Later a few runs in a thousand are lost all the same, and one of
 # them is enough to take a mean NEES out of its band; and where accelerations are very large, it
 # is a little over-confident. Where the prior on depth is wrong, as on `circle`, no filter that
-# believes it is consistent; `+common90` believes it less. Measured tables are in
+# believes it is consistent; `+scene` learns how far away the landmarks are. Measured tables are in
 # `docs/consistency.md`, and where each filter holds at all is the map of `docs/phase-diagram.md`.
