@@ -107,7 +107,7 @@ def update(
     # rounding does to the differences is made good by `ROUNDING`.
     left = P - K @ HP
     covariance = left + (K @ R - left @ H.T) @ K.T
-    lost = ROUNDING * jnp.finfo(P.dtype).eps * jnp.diagonal(P)
+    lost = ROUNDING * jnp.finfo(P.dtype).eps * jnp.diagonal(P).at[considered].set(0.0)
     state = shifted(state, K @ residual.ravel())
     state = replace(state, covariance=(covariance + covariance.T) / 2 + jnp.diag(lost))
     return state, Innovation(predicted, residual, S, used, whitened @ whitened)
