@@ -76,7 +76,7 @@ def main() -> None:
     with write_atomically(HERE / "results" / "linalg.json") as path:
         path.write_text(json.dumps(rows, indent=1) + "\n")
     before, _, after = PAGE.read_text().partition(MARK)
-    rest = after.partition("\n\nThe larger")
+    rest = after.partition("\n\nThe larger sizes")
     with write_atomically(PAGE) as path:
         path.write_text(f"{before}{MARK}\n{table(rows)}{rest[1]}{rest[2]}")
     print(table(rows))
