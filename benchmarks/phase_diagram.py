@@ -298,9 +298,9 @@ def page(rows: list[Row], options: Options) -> str:
         "inconsistency may hide. All worlds use the same draws, so that chance moves "
         "neighbours together. A cell is *lost* when more than "
         f"{options.lost_bound:.0%} of its runs are (NEES above the 99.99 % quantile of χ²).",
-        "The column of `scale_gauge+mixture17` is of version 0.3.0, whose "
-        "gauge was wrong where the camera turns ([repairs.md](repairs.md)): its cells there are too "
-        "bad, and wait to be measured again.",
+        "The column of `scale_gauge+mixture17` is of version 0.3.0, whose gauge was wrong where "
+        "the camera turns ([repairs.md](repairs.md)): its cells there are too bad, and wait to be "
+        "measured again.",
         "![Mean NEES of every filter by direction](phase-diagram.png)",
         "## Cells by verdict",
         _shares(rows, names),
