@@ -7,6 +7,7 @@ step, alone and as one of many comparisons.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -97,30 +98,35 @@ class Tally:
         """
         never_lost = self.never_lost
         return {
-            **_judged(self.average, self.dof, self.diverged),
+            **_judged(self.average, self.dof, _of_averages, self.diverged),
             "runs": self.runs,
             "lost": self.lost / self.runs,
             "diverged": self.diverged,
-            "end": _at_the_end(self.end, self.dof, self.diverged),
-            "never_lost": {**_judged(never_lost, self.dof), "runs": never_lost.count},
+            "end": _judged(self.end, self.dof, _at_one_step, self.diverged),
+            "never_lost": {
+                **_judged(never_lost, self.dof, _of_averages),
+                "runs": never_lost.count,
+            },
         }
 
 
-def _judged(sums: PowerSums, dof: int, diverged: int = 0) -> dict[str, Any]:
+def _judged(
+    sums: PowerSums, dof: int, p_value: Callable[[PowerSums, int], float], diverged: int = 0
+) -> dict[str, Any]:
     factor = _factor(sums, dof, diverged)
     if diverged or not sums.count:
         return {**factor, "p": 0.0, "word": "lost"}
+    p = p_value(sums, dof)
+    return {**factor, "p": p, "word": _word(p, sums.mean > dof)}
+
+
+def _of_averages(sums: PowerSums, dof: int) -> float:
     bounds = mean_p_value(sums, dof), chernoff_p_value(sums.mean, dof, sums.count)
-    p = float(np.nanmin(bounds))
-    return {**factor, "p": p, "word": _word(p, sums.mean > dof)}
+    return float(np.nanmin(bounds))
 
 
-def _at_the_end(sums: PowerSums, dof: int, diverged: int) -> dict[str, Any]:
-    factor = _factor(sums, dof, diverged)
-    if diverged or not sums.count:
-        return {**factor, "p": 0.0, "word": "lost"}
-    p = chi2_p_value(sums.mean, dof, sums.count)
-    return {**factor, "p": p, "word": _word(p, sums.mean > dof)}
+def _at_one_step(sums: PowerSums, dof: int) -> float:
+    return chi2_p_value(sums.mean, dof, sums.count)
 
 
 def _factor(sums: PowerSums, dof: int, diverged: int) -> dict[str, Any]:
