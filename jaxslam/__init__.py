@@ -7,37 +7,90 @@ when they are asked for: `jaxslam.plots`, `jaxslam.vision`, `jaxslam.cli`.
 
 __version__ = "0.4.0.dev0"
 
-from jaxslam.camera import Camera
+from jaxslam.arrays import cast
 from jaxslam.consistency import mean_band, monte_carlo, summarise, table
-from jaxslam.filters import (
-    FILTERS,
-    Features,
-    Filter,
-    Parameters,
-    SlamFilter,
-    State,
-    make_filters,
-)
+from jaxslam.forms.state import Features, Innovation, State, Status
 from jaxslam.geometry import PLANAR, SPATIAL
 from jaxslam.landmarks import LANDMARKS
+from jaxslam.models.calibration import (
+    AbstractCalibration,
+    Considered,
+    Estimated,
+    Known,
+    White,
+)
+from jaxslam.models.camera import Camera
+from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import AbstractMotion, BodyRates, ConstantVelocity, Odometry
+from jaxslam.models.scale import Metre, ScaleGauge
+from jaxslam.models.sensors import AbstractSensor, Pinhole, Position, RangeBearing
+from jaxslam.names import FILTERS, make_filter, make_filters, recommended
 from jaxslam.simulation import Scenario, scenario, simulate
+from jaxslam.slam.filter import EkfSlam
+from jaxslam.slam.protocol import AbstractFilter, AbstractStaged, Capacity, Expected, Scene
+from jaxslam.slam.readouts import (
+    camera_pose,
+    landmark_samples,
+    landmarks_from_above,
+    landmarks_in_camera,
+    landmarks_in_world,
+)
+from jaxslam.wrappers.bank import Bank
+from jaxslam.wrappers.fixed_lag import FixedLag
+from jaxslam.wrappers.mixture import Mixture
 
 __all__ = [
     "FILTERS",
+    "KEYFRAME",
     "LANDMARKS",
     "PLANAR",
+    "ROBOCENTRIC",
     "SPATIAL",
+    "WORLD",
+    "AbstractCalibration",
+    "AbstractFilter",
+    "AbstractMotion",
+    "AbstractSensor",
+    "AbstractStaged",
+    "Bank",
+    "BodyRates",
     "Camera",
+    "Capacity",
+    "Considered",
+    "ConstantVelocity",
+    "EkfSlam",
+    "Estimated",
+    "Expected",
     "Features",
-    "Filter",
-    "Parameters",
+    "FixedLag",
+    "Innovation",
+    "InverseDepth",
+    "Known",
+    "Metre",
+    "Mixture",
+    "Odometry",
+    "Pinhole",
+    "Position",
+    "RangeBearing",
+    "ScaleGauge",
     "Scenario",
-    "SlamFilter",
+    "Scene",
     "State",
+    "Status",
+    "White",
     "__version__",
+    "camera_pose",
+    "cast",
+    "landmark_samples",
+    "landmarks_from_above",
+    "landmarks_in_camera",
+    "landmarks_in_world",
+    "make_filter",
     "make_filters",
     "mean_band",
     "monte_carlo",
+    "recommended",
     "scenario",
     "simulate",
     "summarise",

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -80,9 +81,7 @@ def tangent_dim(tree: Any) -> int:
     return sum(_sizes(jax.tree.leaves(tree, is_leaf=_is_pose)))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class SplitPose:
+class SplitPose(eqx.Module):
     """A pose whose position and orientation are perturbed apart: `t + δt`, `R Exp(δθ)`.
 
     The error state of the classical EKF-SLAM: the position's error is along the axes of the

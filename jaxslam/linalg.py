@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 LEAF = 32
 """Rows of what is factored column by column; of more, the halves are, and joined by products."""
@@ -31,6 +31,11 @@ class Cholesky(NamedTuple):
     """L, lower triangular."""
     whitening: Float[Array, "n n"]
     """L⁻¹: `A⁻¹ = L⁻ᵀ L⁻¹`."""
+
+    @property
+    def positive(self) -> Bool[Array, ""]:
+        """Whether A is positive definite."""
+        return jnp.all(~jnp.isnan(jnp.diagonal(self.root)))
 
     def solve(self, b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
         """A⁻¹ b."""

@@ -10,14 +10,29 @@ from typing import Annotated, Any
 
 import tyro
 
-from jaxslam.consistency import CHUNK, DTYPES, FolderStore, Study, monte_carlo, summarise, table
+from jaxslam.consistency import (
+    CHUNK,
+    DTYPES,
+    FolderStore,
+    Study,
+    monte_carlo,
+    summarise,
+    table,
+    treatment,
+)
 from jaxslam.consistency.montecarlo import check_sizes
 from jaxslam.files import write_atomically
-from jaxslam.filters import CALIBRATIONS, FILTERS, MODIFIERS, RECOMMENDED, Filter, make_filters
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.simulation.scenario import BUILT_IN, Scenario, parse_override, scenario
+from jaxslam.names import FILTERS, MODIFIERS, RECOMMENDED, make_filters
+from jaxslam.simulation.scenario import (
+    BUILT_IN,
+    CALIBRATIONS,
+    Scenario,
+    parse_override,
+    scenario,
+)
 
-LAYOUT = 3
+LAYOUT = 4
 """Version of the records on disk, so that `--resume` never mixes two."""
 
 
@@ -87,11 +102,11 @@ class ConsistencyOptions:
 
         check_sizes(self.runs, self.seed, self.dtype, self.chunk)
         world = self._scenario()
-        filters = self._filters(world)
+        filters = make_filters(world, self.filters, self.landmarks, self.calibration)
         manifest = {
             "layout": LAYOUT,
             "scenario": dataclasses.asdict(world),
-            "calibration": {name: f.calibration for name, f in filters.items()},
+            "calibration": {name: treatment(f) for name, f in filters.items()},
             "seed": self.seed,
             "dtype": self.dtype,
             "chunk": self.chunk,
@@ -119,8 +134,3 @@ class ConsistencyOptions:
         if self.steps is not None:
             overrides["steps"] = self.steps
         return scenario(self.scenario, overrides)
-
-    def _filters(self, world: Scenario) -> dict[str, Filter]:
-        return make_filters(
-            world.rig, self.filters, self.landmarks, self.calibration or world.calibration
-        )

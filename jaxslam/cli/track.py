@@ -9,8 +9,9 @@ from typing import Annotated
 
 import tyro
 
-from jaxslam.filters import CALIBRATIONS, FILTERS
 from jaxslam.landmarks import LANDMARKS
+from jaxslam.names import FILTERS
+from jaxslam.simulation.scenario import CALIBRATIONS
 from jaxslam.vision.settings import TrackerSettings
 
 

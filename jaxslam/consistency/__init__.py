@@ -9,7 +9,7 @@ from jaxslam.consistency.statistics import (
     normalised_squared,
 )
 from jaxslam.consistency.store import FolderStore, MemoryStore
-from jaxslam.consistency.summary import summarise, table, tally
+from jaxslam.consistency.summary import summarise, table, tally, treatment
 from jaxslam.consistency.verdict import VERDICTS, Tally, run_verdict, sentences, verdict
 
 __all__ = [
@@ -31,5 +31,6 @@ __all__ = [
     "summarise",
     "table",
     "tally",
+    "treatment",
     "verdict",
 ]

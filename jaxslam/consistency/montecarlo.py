@@ -15,25 +15,30 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from jaxslam.arrays import cast, is_number
 from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.consistency.store import MemoryStore, Store
-from jaxslam.filters import Filter
 from jaxslam.geometry import Pose
+from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation import (
-    Prior,
+    Room,
     Run,
     Scenario,
     Sightings,
+    as_data,
     features,
+    sensor_of,
     sightings,
     simulate,
-    structure,
 )
+from jaxslam.slam.protocol import AbstractFilter
+from jaxslam.slam.readouts import camera_pose, landmarks_from_above, landmarks_in_camera
 from jaxslam.watchdog import finished, lapack_calls
 
 DTYPES = ("float64", "float32")
@@ -54,7 +59,7 @@ class Study:
     """Finished runs: where their records are, and what is needed to read them."""
 
     scenario: Scenario
-    filters: Mapping[str, Filter]
+    filters: Mapping[str, AbstractFilter]
     runs: int
     seed: int
     dtype: str
@@ -66,7 +71,7 @@ class Study:
 
 def monte_carlo(
     scenario: Scenario,
-    filters: Mapping[str, Filter],
+    filters: Mapping[str, AbstractFilter],
     *,
     runs: int = 1000,
     seed: int = 0,
@@ -89,11 +94,9 @@ def monte_carlo(
     with jax.enable_x64(dtype == "float64"):
         simulator = _Simulator(scenario, seed, dtype, min(chunk, runs))
         missing = {name: [c for c in chunks if not store.has(name, c)] for name in filters}
-        capacity = simulator.capacity(chunks) if any(missing.values()) else None
-        for name, slam_filter in filters.items():
-            seconds[name] = _run_filter(
-                name, slam_filter, simulator, capacity, missing[name], store, progress
-            )
+        room = simulator.room(chunks) if any(missing.values()) else None
+        for name, slam in filters.items():
+            seconds[name] = _run_filter(name, slam, simulator, room, missing[name], store, progress)
         device = jax.devices()[0].device_kind
     return Study(scenario, filters, runs, seed, dtype, chunks, store, seconds, device)
 
@@ -102,19 +105,20 @@ class _Simulator:
     """Draws chunks of runs, all of one shape, so that everything compiles once."""
 
     def __init__(self, scenario: Scenario, seed: int, dtype: str, size: int) -> None:
-        self.prior, self.dtype, self.size = Prior.of(scenario, dtype), jnp.dtype(dtype), size
-        # The numbers are data, so that scenarios of one structure share a compiled simulator.
-        self._structure, self._key = structure(scenario), jax.random.key(seed)
+        self.dtype, self.size = jnp.dtype(dtype), size
+        self.sensor = cast(sensor_of(scenario), dtype)
+        self._scenario, self._key = as_data(scenario, dtype), jax.random.key(seed)
 
     def __call__(self, chunk: range) -> tuple[Run, Sightings]:
         """The chunk's runs, padded to `size` by the runs that follow."""
         indices = chunk.start + jnp.arange(self.size)
-        return _draw(self._structure, self.dtype, self.prior, self._key, indices)
+        return _draw(self._scenario, self._key, indices)
 
-    def capacity(self, chunks: tuple[range, ...]) -> Sightings:
-        """What holds every run of the study, as Python integers."""
+    def room(self, chunks: tuple[range, ...]) -> Room:
+        """What holds every run of the study."""
         seen = [jax.tree.map(np.max, jax.device_get(self(chunk)[1])) for chunk in chunks]
-        return jax.tree.map(lambda *counts: _room_for(int(max(counts))), *seen)
+        most = jax.tree.map(lambda *counts: _room_for(int(max(counts))), *seen)
+        return Room(most.landmarks, most.first, most.known, most.new)
 
 
 def _room_for(count: int) -> int:
@@ -122,45 +126,53 @@ def _room_for(count: int) -> int:
     return max(1, count) if count <= 4 else 4 * math.ceil(count / 4)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _draw(
-    scenario: Scenario, dtype, prior: Prior, key: Array, indices: Int[Array, " runs"]
-) -> tuple[Run, Sightings]:
+@jax.jit
+def _draw(scenario: Scenario, key: Array, indices: Int[Array, " runs"]) -> tuple[Run, Sightings]:
     def one(index):
-        run = simulate(scenario, jax.random.fold_in(key, index), dtype, prior)
+        run = simulate(scenario, jax.random.fold_in(key, index))
         return run, sightings(run)
 
     return jax.vmap(one)(indices)
 
 
-def _run_filter(name, slam_filter, simulator, capacity, chunks, store, progress) -> Seconds:
+def _run_filter(name, slam, simulator, room, chunks, store, progress) -> Seconds:
     if not chunks:
         return Seconds(0.0, 0.0)
     start = time.perf_counter()
-    prior = simulator.prior
+    numbers, structure = eqx.partition(cast(slam, simulator.dtype), is_number)
     batch, _ = simulator(chunks[0])
-    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (prior, batch))
-    leaves, structure = jax.tree.flatten(shapes)
-    compiled = _compiled(slam_filter, capacity, structure, tuple(leaves))
+    data = (numbers, simulator.sensor)
+    compiled = _compiled(*_hashable(structure), room, *_hashable(_shapes((*data, batch))))
     compiled_at = time.perf_counter()
     for chunk in chunks:
         batch, _ = simulator(chunk)
         where = f"{name}, runs {chunk.start} to {chunk.stop - 1}"
-        records, sample = jax.device_get(finished(compiled(prior, batch), where))
+        records, sample = jax.device_get(finished(compiled(*data, batch), where))
         records = {key: np.asarray(value)[: len(chunk)] for key, value in records.items()}
         store.save(name, chunk, {**records, **{f"sample_{k}": v for k, v in sample.items()}})
         progress(name, len(chunk))
     return Seconds(compiled_at - start, time.perf_counter() - compiled_at)
 
 
+def _shapes(tree: Any) -> Any:
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
+
+
+def _hashable(tree: Any) -> tuple[tuple[Any, ...], Any]:
+    leaves, structure = jax.tree.flatten(tree)
+    return tuple(leaves), structure
+
+
 @lru_cache(maxsize=32)
-def _compiled(slam_filter, capacity, structure, leaves) -> jax.stages.Compiled:
-    """`_filter_batch` for data of these shapes, compiled once however often it is asked for."""
-    function = jax.jit(partial(_filter_batch, slam_filter, capacity))
-    traced = function.trace(*jax.tree.unflatten(structure, leaves))
+def _compiled(leaves, structure, room: Room, shapes, of_data) -> jax.stages.Compiled:
+    """`_filter_batch` for a filter of this structure, whatever its numbers, and data of these
+    shapes: compiled once however often it is asked for."""
+    static = jax.tree.unflatten(structure, leaves)
+    function = jax.jit(partial(_filter_batch, static, room))
+    traced = function.trace(*jax.tree.unflatten(of_data, shapes))
     if calls := lapack_calls(traced.jaxpr.jaxpr):
         warnings.warn(
-            f"{type(slam_filter).__name__} calls LAPACK in a batch ({', '.join(sorted(calls))}), "
+            f"{type(static).__name__} calls LAPACK in a batch ({', '.join(sorted(calls))}), "
             "which can stand still on few processors: jaxslam.linalg has what does not",
             stacklevel=2,
         )
@@ -168,55 +180,51 @@ def _compiled(slam_filter, capacity, structure, leaves) -> jax.stages.Compiled:
 
 
 def _filter_batch(
-    slam_filter: Filter, capacity: Sightings, prior: Prior, runs: Run
+    static: AbstractFilter,
+    room: Room,
+    numbers: AbstractFilter,
+    sensor: AbstractSensor,
+    runs: Run,
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     """Records of a batch of runs, and the map and the path of its first run."""
-    one = partial(filter_run, slam_filter, capacity, prior)
-    records, path, state = jax.vmap(one)(runs)
+    slam = eqx.combine(numbers, static)
+    records, path, state = jax.vmap(partial(filter_run, slam, room, sensor))(runs)
     first = partial(jax.tree.map, lambda x: x[0])
     state, run = first(state), first(runs)
-    slots = jnp.arange(capacity.landmarks)
-    landmarks, covariance = slam_filter.landmarks_from_above(state, prior.parameters, slots)
+    landmarks, covariance = landmarks_from_above(slam, state, jnp.arange(room.landmarks))
     return records, {
         "path": jax.vmap(lambda pose: pose.as_matrix())(first(path)),
         "true_path": jax.vmap(lambda pose: pose.as_matrix())(run.poses),
         "points": run.points,
         "landmarks": landmarks,
         "landmarks_covariance": covariance,
-        "active": slam_filter.reported(state).active,
+        "active": slam.in_map(state),
     }
 
 
 def filter_run(
-    slam_filter: Filter, capacity: Sightings, prior: Prior, run: Run
+    slam: AbstractFilter, room: Room, sensor: AbstractSensor, run: Run
 ) -> tuple[dict[str, Array], Pose, Any]:
     """One filter on one simulated run: records of every step, estimated path, final state.
 
-    The records hold, per step: `nees` of the pose; `nis` and `nis_dof`; `error` and `variance`
-    of the camera's position (in camera axes) and orientation; the mean `landmark_nees` of the
-    landmarks seen, in the sensor's chart, where it is finite, their number, and of how many it
-    is not.
+    The records hold, per step: `nees` of the pose; `nis` and `nis_dof`; the update's `status`;
+    `error` and `variance` of the camera's position (in camera axes) and orientation; the mean
+    `landmark_nees` of the landmarks seen, in the sensor's chart, where it is finite, their
+    number, and of how many it is not.
     """
-    parameters = prior.parameters
-    first, seen, new = features(run, capacity)
-    state = slam_filter.start(
-        parameters,
-        int(capacity.landmarks),
-        prior.velocity,
-        prior.velocity_sigma,
-        (int(capacity.known), int(capacity.new)),
-    )
-    state = slam_filter.first(state, parameters, first)
+    first, seen, new = features(run, room)
+    state = slam.init(room.capacity, first)
 
     def step(state, data):
         seen, new, control, T_BC = data
-        state, innovation = slam_filter.step(state, parameters, control, seen, new)
-        estimate, covariance = slam_filter.camera_pose(state)
-        landmarks = _landmark_nees(slam_filter, state, parameters, seen, T_BC, run.points)
+        state, innovation = slam.step(state, control, seen, new)
+        estimate, covariance = camera_pose(slam, state)
+        landmarks = _landmark_nees(slam, sensor, state, seen, T_BC, run.points)
         records = {
-            "nees": normalised_squared(*slam_filter.pose_error(state, T_BC)),
+            "nees": normalised_squared(*slam.pose_error(state, T_BC)),
             "nis": innovation.nis,
             "nis_dof": innovation.nis_dof.astype(innovation.nis.dtype),
+            "status": innovation.status,
             "error": _camera_error(estimate, T_BC),
             "variance": jnp.diagonal(covariance),
             **landmarks,
@@ -239,12 +247,12 @@ def _camera_error(estimate: Pose, truth: Pose) -> Array:
     )
 
 
-def _landmark_nees(slam_filter, state, parameters, seen, T_BC, points) -> dict[str, Array]:
+def _landmark_nees(slam, sensor, state, seen, T_BC, points) -> dict[str, Array]:
     """Of the landmarks seen that are in the map: the mean of what is finite, and both numbers."""
-    counted = seen.valid & slam_filter.reported(state).active[seen.slots]
+    counted = seen.valid & slam.in_map(state)[seen.slots]
     truth = jax.vmap(T_BC.inverse().apply)(points[seen.slots])
-    truth = jax.vmap(slam_filter.rig.sensor.chart)(truth, jnp.ones_like(truth[:, 0]))
-    chart, covariance = slam_filter.landmarks_in_camera(state, parameters, seen.slots)
+    truth = jax.vmap(sensor.chart)(truth, jnp.ones_like(truth[:, 0]))
+    chart, covariance = landmarks_in_camera(slam, state, seen.slots, sensor)
     nees = jax.vmap(normalised_squared)(truth - chart, covariance)
     finite = counted & jnp.isfinite(nees)
     total = jnp.sum(jnp.where(finite, nees, 0.0))

@@ -14,6 +14,8 @@ from jaxslam.consistency.montecarlo import Study
 from jaxslam.consistency.statistics import lost_threshold, mean_band
 from jaxslam.consistency.store import Records
 from jaxslam.consistency.verdict import Tally, sentences
+from jaxslam.forms.state import Status
+from jaxslam.slam.filter import innermost
 
 SCHEMA = 1
 _STEPS_AT_ONCE = 50
@@ -27,7 +29,8 @@ def summarise(study: Study) -> dict[str, Any]:
     step. With such a run the verdict has no mean; the means of every step are over the
     `survivors`, and `band95` and `inside` are of so many. `lost` (at the step) and `lost_ever`
     (at any so far) count diverged runs as lost. `landmark_nees` is over the landmarks whose NEES
-    is finite; of the surviving runs' `landmark_not_finite` had one that is not.
+    is finite; of the surviving runs' `landmark_not_finite` had one that is not. `status` counts the
+    runs in which an update said that something was wrong (`jaxslam.Status`).
     """
     from jaxslam import __version__
 
@@ -46,7 +49,7 @@ def summarise(study: Study) -> dict[str, Any]:
 
 
 def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
-    geometry = study.scenario.rig.geometry
+    geometry = study.scenario.world
     dof, n = geometry.tangent_dim, geometry.point_dim
     sums = _sums(study, name, dof)
     healthy = study.runs - sums["diverged"]
@@ -68,7 +71,7 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
     return {
         "verdict": tally(study, name).verdict(),
         "dof": dof,
-        "calibration": study.filters[name].calibration,
+        "calibration": treatment(study.filters[name]),
         "survivors": int(healthy),
         "band95": [low, high],
         "nees": _numbers(mean),
@@ -85,8 +88,15 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
         "landmark_dof": n,
         "landmark_not_finite": [int(count) for count in sums["landmark_not_finite"]],
         "diverged": int(sums["diverged"]),
+        "status": {s.name.lower(): int(sums[f"status_{s.name}"]) for s in Status if s != Status.OK},
         "seconds": {"compile": seconds.compile, "run": seconds.run},
     }
+
+
+def treatment(slam: Any) -> str | None:
+    """How a filter treats its sensor's calibration, where it says so."""
+    inner = innermost(slam)
+    return None if inner is None else inner.calibration.name
 
 
 def _sums(study: Study, name: str, dof: int) -> dict[str, Any]:
@@ -112,6 +122,11 @@ def _sums(study: Study, name: str, dof: int) -> dict[str, Any]:
             "landmark_nees": (good["landmark_nees"] * finite).sum(axis=0),
             "landmark_count": finite.sum(axis=0),
             "landmark_not_finite": good["landmark_not_finite"].sum(axis=0),
+            **{
+                f"status_{s.name}": np.any(records["status"] == s, axis=1).sum()
+                for s in Status
+                if s != Status.OK
+            },
         }
         total = {key: total.get(key, 0) + value for key, value in part.items()}
     return total
@@ -119,7 +134,7 @@ def _sums(study: Study, name: str, dof: int) -> dict[str, Any]:
 
 def tally(study: Study, name: str) -> Tally:
     """What the verdict on one filter is made of; tallies of other seeds may be added."""
-    dof = study.scenario.rig.geometry.tangent_dim
+    dof = study.scenario.world.tangent_dim
     return reduce(add, (Tally.of(r["nees"], dof) for r in _chunks(study, name, ("nees",))))
 
 

@@ -20,8 +20,8 @@ import jaxlie
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxslam.camera import Camera, project
-from jaxslam.motion import BodyRates
+from jaxslam.models.camera import Camera, project
+from jaxslam.models.motion import VehicleRates
 from jaxslam.simulation import Run
 
 GLITCH = 3.0
@@ -143,7 +143,7 @@ def with_white_noise(data: StarryNight, seed: int) -> StarryNight:
 def window(data: StarryNight, start: int, steps: int) -> Run:
     """Frames `start` to `start + steps` as a run whose base B is the camera of its first frame.
 
-    Its controls are `BodyRates`. Raises ValueError for a window that is not in the recording.
+    Its controls are `VehicleRates`. Raises ValueError for a window that is not in the recording.
     """
     if steps < 1 or start < 0 or start + steps >= data.frames:
         raise ValueError(
@@ -161,7 +161,7 @@ def window(data: StarryNight, start: int, steps: int) -> Run:
         points=jax.vmap(T_CI.apply)(jnp.asarray(data.points)),
         measured=jnp.asarray(data.pixels[frames]),
         visible=jnp.asarray(data.visible[frames]),
-        controls=BodyRates(
+        controls=VehicleRates(
             rates=jnp.asarray(data.rates[start : start + steps]),
             seconds=jnp.asarray(np.diff(data.time[frames])),
             camera=every(data.vehicle_from_camera, steps),

@@ -28,7 +28,7 @@ def plot_consistency(
     end. Below: the error of run 0 with ±3σ, axis by axis. Written to `path` where one is given.
     """
     summary = summarise(study) if summary is None else summary
-    geometry = study.scenario.rig.geometry
+    geometry = study.scenario.world
     rows = geometry.tangent_dim // 3
     figure = new_figure(12.5, 5.2 + 2.2 * rows)
     grid = figure.add_gridspec(1 + rows, 6, height_ratios=[2.1, *[1] * rows])

@@ -31,7 +31,6 @@ from jaxslam.posterior.problem import (
     pixel_residuals,
     unknowns,
 )
-from jaxslam.rig import Rig
 
 
 def centre(problem: Problem, mode: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -40,28 +39,25 @@ def centre(problem: Problem, mode: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 def conditional_unknowns(
-    rig: Rig, problem: Problem, mode: Float[Array, " n"], w: Float[Array, " n"]
+    problem: Problem, mode: Float[Array, " n"], w: Float[Array, " n"]
 ) -> tuple[Unknowns, Float[Array, ""]]:
     """What w stands for, and the logarithm of the Jacobian from w, up to a constant."""
     landmarks = _landmarks(problem)
     x = unknowns(problem, w.at[-landmarks:].set(mode[-landmarks:]))
-    mean, sigma = _given_path(rig, problem, x)
+    mean, sigma = _given_path(problem, x)
     return replace(x, inverse_depths=mean + sigma * w[-landmarks:]), jnp.sum(jnp.log(sigma))
 
 
-def _given_path(
-    rig: Rig, problem: Problem, x: Unknowns
-) -> tuple[Float[Array, " l"], Float[Array, " l"]]:
+def _given_path(problem: Problem, x: Unknowns) -> tuple[Float[Array, " l"], Float[Array, " l"]]:
     """m and s of every landmark, by one step of Gauss–Newton from the inverse depths of x.
 
     A second step makes no sampler better, as pixels are nearly linear in an inverse depth.
     """
-    parameters = problem.prior.parameters
-    mean, variance = parameters.inverse_depth, parameters.inverse_depth_sigma**2
-    poses, _ = path(rig, problem, x)
+    mean, variance = problem.depth.mean, problem.depth.sigma**2
+    poses, _ = path(problem, x)
 
     def errors(omega):
-        errors, _ = pixel_errors(rig, problem, replace(x, inverse_depths=omega), poses)
+        errors, _ = pixel_errors(problem, replace(x, inverse_depths=omega), poses)
         return jnp.where(problem.visible[..., None], errors, 0.0)
 
     # A landmark's errors depend on its own inverse depth alone.
@@ -73,31 +69,30 @@ def _given_path(
 
 
 def conditional_log_density(
-    rig: Rig, problem: Problem, mode: Float[Array, " n"], w: Float[Array, " n"]
+    problem: Problem, mode: Float[Array, " n"], w: Float[Array, " n"]
 ) -> Float[Array, ""]:
     """Log posterior density of w, up to a constant; −∞ where nothing can be."""
-    x, log_jacobian = conditional_unknowns(rig, problem, mode, w)
+    x, log_jacobian = conditional_unknowns(problem, mode, w)
     prior = _prior_residuals(problem, w, x)
-    value = log_likelihood(rig, problem, x) - prior @ prior / 2 + log_jacobian
+    value = log_likelihood(problem, x) - prior @ prior / 2 + log_jacobian
     return jnp.where(jnp.all(x.inverse_depths >= problem.least_inverse_depth), value, -jnp.inf)
 
 
-def whitening_root(rig: Rig, problem: Problem, mode: Float[Array, " n"]) -> Float[Array, "n n"]:
+def whitening_root(problem: Problem, mode: Float[Array, " n"]) -> Float[Array, "n n"]:
     """R with `R Rᵀ = (JᵀJ)⁻¹` at the mode, J of all residuals, prior and pixels, by w.
 
     With w = centre + R x, x is nearly N(0, I) as far as the posterior of w is nearly Gaussian.
     """
 
     def residuals(w):
-        x, _ = conditional_unknowns(rig, problem, mode, w)
-        return jnp.concatenate([_prior_residuals(problem, w, x), pixel_residuals(rig, problem, x)])
+        x, _ = conditional_unknowns(problem, mode, w)
+        return jnp.concatenate([_prior_residuals(problem, w, x), pixel_residuals(problem, x)])
 
     return covariance_root(jax.jacfwd(residuals)(centre(problem, mode)))
 
 
 def _prior_residuals(problem: Problem, w: Float[Array, " n"], x: Unknowns) -> Float[Array, " n"]:
-    parameters = problem.prior.parameters
-    depths = (x.inverse_depths - parameters.inverse_depth) / parameters.inverse_depth_sigma
+    depths = (x.inverse_depths - problem.depth.mean) / problem.depth.sigma
     return jnp.concatenate([w[: -depths.size], depths])
 
 

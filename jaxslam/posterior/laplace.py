@@ -13,7 +13,6 @@ from jaxslam.geometry import Pose, difference
 from jaxslam.least_squares import levenberg_marquardt
 from jaxslam.linalg import cholesky
 from jaxslam.posterior.problem import Problem, log_density, path, residuals, size, unknowns
-from jaxslam.rig import Rig
 
 SOLVER = levenberg_marquardt(1e-9)
 MOST_STEPS = 200
@@ -34,7 +33,7 @@ class Laplace:
 
 def starts(problem: Problem, key: Array, count: int) -> Float[Array, "count n"]:
     """The prior mean, then draws of velocity and depths from the prior, without accelerations."""
-    n, t = size(problem), problem.prior.velocity.size
+    n, t = size(problem), problem.motion.velocity.size
     landmarks = problem.measured.shape[1]
     drawn = jnp.arange(n)
     drawn = (drawn < t) | (drawn >= n - landmarks)
@@ -43,13 +42,13 @@ def starts(problem: Problem, key: Array, count: int) -> Float[Array, "count n"]:
 
 
 def minima(
-    rig: Rig, problem: Problem, initial: Float[Array, "s n"]
+    problem: Problem, initial: Float[Array, "s n"]
 ) -> tuple[Float[Array, "s n"], Float[Array, " s"], Bool[Array, " s"]]:
     """Where Levenberg–Marquardt ends from every start, the log density there, and convergence."""
 
     def from_start(y):
         solution = optimistix.least_squares(
-            lambda y, problem: residuals(rig, problem, y),
+            lambda y, problem: residuals(problem, y),
             SOLVER,
             y,
             args=problem,
@@ -57,24 +56,22 @@ def minima(
             throw=False,
         )
         converged = solution.result == optimistix.RESULTS.successful
-        return solution.value, log_density(rig, problem, solution.value), converged
+        return solution.value, log_density(problem, solution.value), converged
 
     return jax.vmap(from_start)(initial)
 
 
-def map_estimate(rig: Rig, problem: Problem, initial: Float[Array, "s n"]) -> Laplace:
+def map_estimate(problem: Problem, initial: Float[Array, "s n"]) -> Laplace:
     """The best of the minima from all starts, with the Gauss–Newton covariance there."""
-    modes, values, converged = minima(rig, problem, initial)
+    modes, values, converged = minima(problem, initial)
     best = jnp.argmax(values)
-    return laplace(rig, problem, modes[best], converged[best])
+    return laplace(problem, modes[best], converged[best])
 
 
-def laplace(
-    rig: Rig, problem: Problem, mode: Float[Array, " n"], converged: Bool[Array, ""]
-) -> Laplace:
+def laplace(problem: Problem, mode: Float[Array, " n"], converged: Bool[Array, ""]) -> Laplace:
     """The Gaussian at a mode."""
-    J = jax.jacfwd(lambda y: residuals(rig, problem, y))(mode)
-    return Laplace(mode, covariance_root(J), log_density(rig, problem, mode), converged)
+    J = jax.jacfwd(lambda y: residuals(problem, y))(mode)
+    return Laplace(mode, covariance_root(J), log_density(problem, mode), converged)
 
 
 def covariance_root(J: Float[Array, "m n"]) -> Float[Array, "n n"]:
@@ -82,19 +79,19 @@ def covariance_root(J: Float[Array, "m n"]) -> Float[Array, "n n"]:
     return cholesky(J.T @ J).whitening.T
 
 
-def last_pose(rig: Rig, problem: Problem, y: Float[Array, " n"]) -> Pose:
+def last_pose(problem: Problem, y: Float[Array, " n"]) -> Pose:
     """T_CB after the last step."""
-    poses, _ = path(rig, problem, unknowns(problem, y))
+    poses, _ = path(problem, unknowns(problem, y))
     return jax.tree.map(lambda x: x[-1], poses).inverse()
 
 
-def pose_gaussian(rig: Rig, problem: Problem, at: Laplace) -> tuple[Pose, Float[Array, "t t"]]:
+def pose_gaussian(problem: Problem, at: Laplace) -> tuple[Pose, Float[Array, "t t"]]:
     """T_CB of the mode and its first-order covariance, by a right perturbation: what a
     robocentric filter's `pose_error` speaks of."""
-    mean = last_pose(rig, problem, at.mode)
+    mean = last_pose(problem, at.mode)
 
     def moved(x):
-        return difference(last_pose(rig, problem, at.mode + at.root @ x), mean)
+        return difference(last_pose(problem, at.mode + at.root @ x), mean)
 
     J = jax.jacfwd(moved)(jnp.zeros_like(at.mode))
     return mean, J @ J.T

@@ -5,7 +5,7 @@ step, and of every landmark its true pixel in frame 0 and its inverse depth. Wit
 z of the later frames, `−log p(y | z) = ½ |r(y)|² + const` for the residuals
 `r = [y; (z − h(y))/σ_px]`, which is all that a sampler or a least-squares solver needs.
 
-The path, the landmarks and the pixels are those of `jaxslam.motion` and `jaxslam.sensors`; a
+The path, the landmarks and the pixels are those of `jaxslam.models`; a
 landmark is the homogeneous point (bearing, 1, ω) of frame 0, so that ω = 0 is nothing special.
 
 Two things that the simulator does are left out: a first pixel is drawn inside the picture, and a
@@ -15,26 +15,29 @@ tell at the most that a noise-free pixel is less than a few σ_px beyond the edg
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import log_ndtr, ndtri
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.camera import bearing
-from jaxslam.consistency.montecarlo import Prior
+from jaxslam.arrays import cast
 from jaxslam.geometry import Pose, homogeneous_apply, identity
-from jaxslam.rig import Rig
-from jaxslam.simulation import Run, Scenario
+from jaxslam.models.camera import bearing
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.sensors import Pinhole
+from jaxslam.simulation import Run, Scenario, depth_of, motion_of, sensor_of
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Problem:
+class Problem(eqx.Module):
     """What is known of one run: the prior and the measurements. Batched by `vmap`."""
 
-    prior: Prior
+    motion: ConstantVelocity
+    sensor: Pinhole
+    depth: InverseDepth
     least_inverse_depth: Float[Array, ""]
     """The prior on 1/z is truncated below this, 1/m; −∞ for the whole Gaussian."""
     first: Float[Array, "l p"]
@@ -47,9 +50,7 @@ class Problem:
     """Seconds of every step."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Unknowns:
+class Unknowns(eqx.Module):
     """The physical quantities that the whitened variables stand for."""
 
     velocity: Float[Array, " t"]
@@ -109,9 +110,12 @@ def make_problem(scenario: Scenario, run: Run, *, truncated: bool = True) -> Pro
     another kind.
     """
     check_scenario(scenario)
-    dtype = run.measured.dtype
+    pieces = motion_of(scenario), sensor_of(scenario), depth_of(scenario)
+    motion, sensor, depth = cast(pieces, run.measured.dtype)
     return Problem(
-        prior=Prior.of(scenario, dtype),
+        motion=motion,
+        sensor=sensor,
+        depth=depth,
         least_inverse_depth=jnp.asarray(scenario.least_inverse_depth if truncated else -jnp.inf),
         first=run.measured[0],
         measured=run.measured[1:],
@@ -123,22 +127,21 @@ def make_problem(scenario: Scenario, run: Run, *, truncated: bool = True) -> Pro
 def size(problem: Problem) -> int:
     """How many whitened variables there are."""
     steps, landmarks, p = problem.measured.shape[-3:]
-    return (steps + 1) * problem.prior.velocity.shape[-1] + landmarks * (p + 1)
+    return (steps + 1) * problem.motion.velocity.shape[-1] + landmarks * (p + 1)
 
 
 def unknowns(problem: Problem, y: Float[Array, " n"]) -> Unknowns:
     """What y stands for."""
-    prior, parameters = problem.prior, problem.prior.parameters
-    t, (steps, landmarks, p) = prior.velocity.size, problem.measured.shape
+    motion, depth = problem.motion, problem.depth
+    t, (steps, landmarks, p) = motion.velocity.size, problem.measured.shape
     ends = [t, t * (steps + 1), t * (steps + 1) + landmarks * p]
     velocity, accelerations, pixels, depths = jnp.split(y, ends)
-    mean, sigma = parameters.inverse_depth, parameters.inverse_depth_sigma
-    lower = (problem.least_inverse_depth - mean) / sigma
+    lower = (problem.least_inverse_depth - depth.mean) / depth.sigma
     return Unknowns(
-        velocity=prior.velocity + prior.velocity_sigma * velocity,
-        accelerations=parameters.motion_sigma * accelerations.reshape(steps, t),
-        pixels=problem.first + parameters.measurement_sigma * pixels.reshape(landmarks, p),
-        inverse_depths=mean + sigma * truncated_normal(depths, lower),
+        velocity=motion.velocity + motion.velocity_sigma * velocity,
+        accelerations=motion.noise_sigma * accelerations.reshape(steps, t),
+        pixels=problem.first + problem.sensor.sigma * pixels.reshape(landmarks, p),
+        inverse_depths=depth.mean + depth.sigma * truncated_normal(depths, lower),
     )
 
 
@@ -154,58 +157,59 @@ def truncated_normal(y: Float[Array, " l"], lower: Float[Array, ""]) -> Float[Ar
     return jnp.where(y < 0, 1.0, -1.0) * ndtri(jnp.where(y < 0, -jnp.expm1(log_above) + tail, tail))
 
 
-def path(rig: Rig, problem: Problem, x: Unknowns) -> tuple[Pose, Float[Array, "steps t"]]:
+def path(problem: Problem, x: Unknowns) -> tuple[Pose, Float[Array, "steps t"]]:
     """T_BC and the velocity in the camera frame after every step."""
+    motion = problem.motion
 
     def move(carry, data):
         pose, velocity = carry
         acceleration, dt = data
-        step = rig.motion.displacement(rig.geometry, velocity, acceleration, dt)
-        moved = pose @ step, rig.motion.next_velocity(velocity, acceleration, dt)
+        step = motion.displacement(velocity, acceleration, dt)
+        moved = pose @ step, motion.next(velocity, acceleration, dt)
         return moved, moved
 
-    start = identity(rig.geometry, x.velocity.dtype), x.velocity
+    start = identity(motion.geometry, x.velocity.dtype), x.velocity
     return jax.lax.scan(move, start, (x.accelerations, problem.controls))[1]
 
 
-def residuals(rig: Rig, problem: Problem, y: Float[Array, " n"]) -> Float[Array, " n+m"]:
+def residuals(problem: Problem, y: Float[Array, " n"]) -> Float[Array, " n+m"]:
     """`[y; (z − h(y))/σ_px]`; zero where nothing was measured."""
-    return jnp.concatenate([y, pixel_residuals(rig, problem, unknowns(problem, y))])
+    return jnp.concatenate([y, pixel_residuals(problem, unknowns(problem, y))])
 
 
-def pixel_residuals(rig: Rig, problem: Problem, x: Unknowns) -> Float[Array, " m"]:
+def pixel_residuals(problem: Problem, x: Unknowns) -> Float[Array, " m"]:
     """`(z − h)/σ_px` of every pixel; zero where nothing was measured."""
-    errors, _ = pixel_errors(rig, problem, x, path(rig, problem, x)[0])
+    errors, _ = pixel_errors(problem, x, path(problem, x)[0])
     return jnp.where(problem.visible[..., None], errors, 0.0).ravel()
 
 
-def log_likelihood(rig: Rig, problem: Problem, x: Unknowns) -> Float[Array, ""]:
+def log_likelihood(problem: Problem, x: Unknowns) -> Float[Array, ""]:
     """`−½ |(z − h)/σ_px|²`, up to a constant; −∞ if a measured landmark is behind the camera."""
-    errors, possible = pixel_errors(rig, problem, x, path(rig, problem, x)[0])
+    errors, possible = pixel_errors(problem, x, path(problem, x)[0])
     used = problem.visible & possible
     squared = jnp.sum(jnp.where(used[..., None], errors, 0.0) ** 2)
     return jnp.where(jnp.all(possible | ~problem.visible), -squared / 2, -jnp.inf)
 
 
-def log_density(rig: Rig, problem: Problem, y: Float[Array, " n"]) -> Float[Array, ""]:
+def log_density(problem: Problem, y: Float[Array, " n"]) -> Float[Array, ""]:
     """`−½ |r|²`, the log posterior of y up to a constant; −∞ as in `log_likelihood`."""
-    return log_likelihood(rig, problem, unknowns(problem, y)) - y @ y / 2
+    return log_likelihood(problem, unknowns(problem, y)) - y @ y / 2
 
 
 def pixel_errors(
-    rig: Rig, problem: Problem, x: Unknowns, poses: Pose
+    problem: Problem, x: Unknowns, poses: Pose
 ) -> tuple[Float[Array, "steps l p"], Bool[Array, "steps l"]]:
     """`(z − h)/σ_px` of every step, seen from the poses T_BC, and whether h is possible."""
-    parameters, sensor = problem.prior.parameters, rig.sensor
-    bearings = jax.vmap(bearing, in_axes=(None, 0))(parameters.camera, x.pixels)
+    sensor = problem.sensor
+    bearings = jax.vmap(bearing, in_axes=(None, 0))(sensor.camera, x.pixels)
     points = jnp.column_stack([bearings, jnp.ones_like(x.inverse_depths)])
 
     def one(T_CB, point, omega):
         seen = homogeneous_apply(T_CB, point, omega)
-        return sensor.measure(parameters.camera, seen, omega), sensor.possible(seen)
+        return sensor.measure(seen, omega), sensor.possible(seen)
 
     of_frame = jax.vmap(one, in_axes=(None, 0, 0))
     predicted, possible = jax.vmap(lambda T_BC: of_frame(T_BC.inverse(), points, x.inverse_depths))(
         poses
     )
-    return (problem.measured - predicted) / parameters.measurement_sigma, possible
+    return (problem.measured - predicted) / sensor.sigma, possible

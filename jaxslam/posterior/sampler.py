@@ -27,7 +27,6 @@ from jaxslam.posterior.conditional import (
     whitening_root,
 )
 from jaxslam.posterior.problem import Problem, path
-from jaxslam.rig import Rig
 
 WORST_RHAT = 1.05
 LEAST_ESS = 100.0
@@ -83,22 +82,20 @@ class Chains:
     """Mean number of leapfrog steps of a draw."""
 
 
-def sample(
-    settings: HMC, rig: Rig, problem: Problem, mode: Float[Array, " n"], key: Array
-) -> Chains:
+def sample(settings: HMC, problem: Problem, mode: Float[Array, " n"], key: Array) -> Chains:
     """Chains that start at draws of the mode's Gaussian.
 
     They move in x with `w = centre + R x`, where the posterior is nearly N(0, I), with a unit mass
     matrix, which is better than one estimated from few draws.
     """
-    root, origin = whitening_root(rig, problem, mode), centre(problem, mode)
+    root, origin = whitening_root(problem, mode), centre(problem, mode)
 
     def target(x):
-        return conditional_log_density(rig, problem, mode, origin + root @ x)
+        return conditional_log_density(problem, mode, origin + root @ x)
 
     def outcome(x):
-        unknown, _ = conditional_unknowns(rig, problem, mode, origin + root @ x)
-        T_BC, velocity = jax.tree.map(lambda x: x[-1], path(rig, problem, unknown))
+        unknown, _ = conditional_unknowns(problem, mode, origin + root @ x)
+        T_BC, velocity = jax.tree.map(lambda x: x[-1], path(problem, unknown))
         return T_BC, velocity, unknown.inverse_depths
 
     def chain(key):

@@ -10,15 +10,17 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxslam.consistency.montecarlo import Prior, filter_run
+from jaxslam.arrays import cast
+from jaxslam.consistency.montecarlo import filter_run
 from jaxslam.consistency.statistics import normalised_squared
-from jaxslam.filters import Filter
 from jaxslam.geometry import Pose, difference, log
+from jaxslam.models.sensors import AbstractSensor
 from jaxslam.posterior.laplace import Laplace, laplace, minima, pose_gaussian, starts
 from jaxslam.posterior.moments import (
     covariance,
@@ -38,8 +40,9 @@ from jaxslam.posterior.sampler import (
     given_bound,
     sample,
 )
-from jaxslam.rig import Rig
-from jaxslam.simulation import Run, Scenario, Sightings, simulate
+from jaxslam.simulation import Room, Run, Scenario, as_data, sensor_of, simulate
+from jaxslam.slam.protocol import AbstractFilter
+from jaxslam.slam.readouts import camera_pose
 from jaxslam.watchdog import finished
 
 Records = dict[str, Array]
@@ -69,18 +72,16 @@ class Study:
         if self.starts < 1:
             raise ValueError(f"starts must be at least 1, not {self.starts}")
 
-    @property
-    def rig(self) -> Rig:
-        return self.scenario.rig
-
 
 def draw_runs(study: Study, seed: int, indices: range) -> Run:
     """The runs of these numbers, as `monte_carlo` draws them, up to the study's last step."""
-    return _draw_runs(study.scenario, study.steps, jax.random.key(seed), jnp.asarray(indices))
+    return _draw_runs(
+        study.steps, as_data(study.scenario), jax.random.key(seed), jnp.asarray(indices)
+    )
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _draw_runs(scenario: Scenario, steps: int, key: Array, indices: Array) -> Run:
+@partial(jax.jit, static_argnums=0)
+def _draw_runs(steps: int, scenario: Scenario, key: Array, indices: Array) -> Run:
     def one(index):
         return first_steps(simulate(scenario, jax.random.fold_in(key, index)), steps)
 
@@ -105,11 +106,11 @@ def reference(study: Study, runs: Run, seed: int, indices: range) -> tuple[Recor
         problems = jax.vmap(partial(make_problem, study.scenario, truncated=truncated))(runs)
         # Both from the same starts: what differs is the prior's.
         where = f"{kind} posterior of {study.scenario.name}, runs {indices}"
-        modes, found = finished(_modes(study.rig, study.starts, problems, modes_keys), where)
+        modes, found = finished(_modes(study.starts, problems, modes_keys), where)
         record(f"{kind}_map", found)
-        record(f"{kind}_laplace", _laplace_errors(study.rig, problems, modes, runs))
+        record(f"{kind}_laplace", _laplace_errors(problems, modes, runs))
     where = f"chains of {study.scenario.name}, runs {indices}"
-    chains = finished(_sample(study.hmc, study.rig, problems, modes.mode, chains_keys), where)
+    chains = finished(_sample(study.hmc, problems, modes.mode, chains_keys), where)
     exact, share = jax.vmap(partial(given_bound, study.scenario.least_inverse_depth))(chains)
     record("gaussian_prior", _posterior_errors(chains, runs))
     record("exact", _posterior_errors(exact, runs))
@@ -128,29 +129,29 @@ def _keys(seed: int, indices: range) -> tuple[Array, Array]:
     return keys[:, 0], keys[:, 1]
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _modes(rig: Rig, count: int, problems: Problem, keys: Array) -> tuple[Laplace, Records]:
+@partial(jax.jit, static_argnums=0)
+def _modes(count: int, problems: Problem, keys: Array) -> tuple[Laplace, Records]:
     def one(problem, key):
-        ends, values, converged = minima(rig, problem, starts(problem, key, count))
+        ends, values, converged = minima(problem, starts(problem, key, count))
         best = jnp.argmax(values)
         found = {
             "log_density": values,
             "converged": converged,
         }
-        return laplace(rig, problem, ends[best], converged[best]), found
+        return laplace(problem, ends[best], converged[best]), found
 
     return jax.vmap(one)(problems, keys)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _sample(settings: HMC, rig: Rig, problems: Problem, modes: Array, keys: Array) -> Chains:
-    return jax.vmap(partial(sample, settings, rig))(problems, modes, keys)
-
-
 @partial(jax.jit, static_argnums=0)
-def _laplace_errors(rig: Rig, problems: Problem, modes: Laplace, runs: Run) -> Records:
+def _sample(settings: HMC, problems: Problem, modes: Array, keys: Array) -> Chains:
+    return jax.vmap(partial(sample, settings))(problems, modes, keys)
+
+
+@jax.jit
+def _laplace_errors(problems: Problem, modes: Laplace, runs: Run) -> Records:
     def one(problem, at, run):
-        T_CB, P = pose_gaussian(rig, problem, at)
+        T_CB, P = pose_gaussian(problem, at)
         truth = _last(run)
         error = difference(truth.inverse(), T_CB)
         estimate = T_CB.inverse()
@@ -204,32 +205,27 @@ def converged(records: Mapping[str, Any], name: str) -> np.ndarray:
     return (rhat <= WORST_RHAT) & (ess >= LEAST_ESS) & (np.asarray(records["exact_share"]) > 0)
 
 
-def against_filter(study: Study, slam_filter: Filter, runs: Run, exact: Pose) -> Records:
+def against_filter(study: Study, slam: AbstractFilter, runs: Run, exact: Pose) -> Records:
     """A filter on the same runs, beside draws of the exact posterior: T_BC, axes run and draw.
 
     NEES and KL are in the filter's own error, the one of its `pose_error`; σ, error and
     Wasserstein distances in position along the axes of B and orientation.
     """
-    prior = Prior.of(study.scenario, runs.measured.dtype)
-    return _compared(slam_filter, study.scenario.landmarks, prior, runs, exact)
+    slam, sensor = cast((slam, sensor_of(study.scenario)), runs.measured.dtype)
+    landmarks = study.scenario.landmarks
+    return _compared(Room(landmarks, landmarks, landmarks, 1), slam, sensor, runs, exact)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _compared(slam_filter: Filter, landmarks: int, prior: Prior, runs: Run, exact: Pose) -> Records:
-    counts: dict[str, Any] = {
-        "landmarks": landmarks,
-        "first": landmarks,
-        "known": landmarks,
-        "new": 1,
-    }
-    capacity = Sightings(**counts)
-
+@eqx.filter_jit
+def _compared(
+    room: Room, slam: AbstractFilter, sensor: AbstractSensor, runs: Run, exact: Pose
+) -> Records:
     def one(run, T_BC):
-        _, _, state = filter_run(slam_filter, capacity, prior, run)
+        _, _, state = filter_run(slam, room, sensor, run)
         truth = _last(run)
-        error, P = slam_filter.pose_error(state, truth)
-        own = jax.vmap(lambda pose: slam_filter.pose_error(state, pose)[0])(T_BC)
-        estimate, P_BC = slam_filter.camera_pose(state)
+        error, P = slam.pose_error(state, truth)
+        own = jax.vmap(lambda pose: slam.pose_error(state, pose)[0])(T_BC)
+        estimate, P_BC = camera_pose(slam, state)
         base = in_base_axes(T_BC, estimate)
         P_base = to_base_axes(estimate, P_BC)
         distance = wasserstein(base, jnp.zeros(len(P_base)), jnp.diagonal(P_base))

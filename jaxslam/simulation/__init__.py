@@ -1,27 +1,37 @@
 """Simulation: scenarios as data, and runs drawn from them."""
 
+from jaxslam.simulation.pieces import (
+    calibration_of,
+    calibration_sigma_of,
+    depth_of,
+    motion_of,
+    sensor_of,
+)
 from jaxslam.simulation.scenario import BUILT_IN, Scenario, scenario
 from jaxslam.simulation.world import (
-    Prior,
+    Room,
     Run,
     Sightings,
+    as_data,
     features,
-    parameters,
     sightings,
     simulate,
-    structure,
 )
 
 __all__ = [
     "BUILT_IN",
-    "Prior",
+    "Room",
     "Run",
     "Scenario",
     "Sightings",
+    "as_data",
+    "calibration_of",
+    "calibration_sigma_of",
+    "depth_of",
     "features",
-    "parameters",
+    "motion_of",
     "scenario",
+    "sensor_of",
     "sightings",
     "simulate",
-    "structure",
 ]

@@ -10,51 +10,59 @@ import dataclasses
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jaxslam.filters import CALIBRATIONS
-from jaxslam.geometry import GEOMETRIES
-from jaxslam.motion import MOTIONS
-from jaxslam.names import suggestion
-from jaxslam.rig import Rig
-from jaxslam.sensors import SENSORS
+import equinox as eqx
+
+from jaxslam.geometry import GEOMETRIES, Geometry
+from jaxslam.lookup import suggestion
 
 Numbers = tuple[float, ...]
 
+MOTIONS = ("velocity", "odometry")
+SENSORS = ("camera", "position")
+CALIBRATIONS = ("white", "consider", "estimated", "known")
+"""The paper's independent draw of every frame; constant and correlated but not corrected
+(Schmidt); constant and estimated; exact."""
 TRUE_CALIBRATIONS = ("nominal", "white", "constant")
 PLACEMENTS = ("prior", "ring", "room")
 ROOM_LANDMARKS = 72
 
 
-@dataclass(frozen=True)
-class Scenario:
-    """A simulated experiment. SI units, radians, pixels; per axis x, (y,) z, then rotation."""
+def _structural(default: Any) -> Any:
+    return eqx.field(static=True, default=default)
 
-    name: str
-    geometry: str = "planar"
+
+class Scenario(eqx.Module):
+    """A simulated experiment. SI units, radians, pixels; per axis x, (y,) z, then rotation.
+
+    Its numbers are leaves: scenarios that differ in nothing else share their programs.
+    """
+
+    name: str = eqx.field(static=True)
+    geometry: str = _structural("planar")
     """`planar` or `spatial`."""
     rate: float = 30.0
     """Frames per second."""
-    steps: int = 60
+    steps: int = _structural(60)
     """Filter steps after frame 0, in which the first landmarks are seen."""
     velocity: Numbers = (1.2, 0.0, 0.0)
     """Nominal velocity in the camera frame, m/s and rad/s: the mean that the filter starts with."""
     velocity_sigma: Numbers = (0.01, 0.01, 0.01)
     """σ of the true initial velocity around the nominal one, and of the filter's."""
-    motion: str = "velocity"
+    motion: str = _structural("velocity")
     """The filter's motion model. `velocity`: constant velocity, with accelerations drawn.
     `odometry`: the nominal motion is the true one, and its noisy reading the filter's input."""
     acceleration_sigma: Numbers = (0.1, 0.1, 0.1)
     """`velocity`: σ of the true white acceleration, and of the filter's, m/s² and rad/s²."""
     odometry_sigma: Numbers = (0.01, 0.01, 0.01)
     """`odometry`: σ of the reading of one step, and the filter's, m and rad."""
-    placement: str = "prior"
+    placement: str = _structural("prior")
     """`prior`: every landmark seen in frame 0, at a uniform pixel and an inverse depth from the
     filter's prior. `ring`: evenly on a horizontal circle around the centre of the nominal path.
     `room`: 72 points along the walls of a square room, on two levels (slamtb)."""
-    landmarks: int = 12
+    landmarks: int = _structural(12)
     first_pixels: tuple[Numbers, ...] = ((20.0, 620.0),)
     """`prior`: the interval of each pixel coordinate in frame 0."""
     ring_radius: float = 8.0
@@ -65,15 +73,15 @@ class Scenario:
     """Mean and σ of the filter's prior on 1/z, 1/m, where they are not those of d_min."""
     least_inverse_depth: float = 0.001
     """`prior`: truth is drawn from the prior truncated above this, 1/m."""
-    first_frame: int = 0
+    first_frame: int = _structural(0)
     """Nothing is measured before this frame."""
-    first_landmarks: int = 0
+    first_landmarks: int = _structural(0)
     """At most so many landmarks are new in frame 0; 0 for all that are visible."""
-    new_landmarks: int = 0
+    new_landmarks: int = _structural(0)
     """At most so many are new in a later frame; 0 for all that are visible."""
-    known_landmarks: int = 0
+    known_landmarks: int = _structural(0)
     """At most so many are measured again in a frame, drawn at random; 0 for all visible."""
-    sensor: str = "camera"
+    sensor: str = _structural("camera")
     """What is measured: a pixel (`camera`), or the point relative to the sensor (`position`)."""
     visible_depth: float = 0.1
     """`camera`: a point nearer than this along the optical axis is not seen, m."""
@@ -91,18 +99,18 @@ class Scenario:
     """σ of each coordinate of the principal point, pixels."""
     pixel_sigma: float = 0.3
     """σ of a measured pixel coordinate."""
-    calibration: str = "known"
+    calibration: str = _structural("known")
     """How the filter treats its calibration, unless told otherwise."""
-    true_calibration: str = "nominal"
+    true_calibration: str = _structural("nominal")
     """The true intrinsics: `nominal`, or drawn `white` (every frame) or `constant` (every run)."""
 
-    def __post_init__(self) -> None:
+    def __check_init__(self) -> None:
         _check(self)
 
     @property
-    def rig(self) -> Rig:
-        """Geometry, motion model and sensor: what a filter is made for."""
-        return Rig(GEOMETRIES[self.geometry], MOTIONS[self.motion], SENSORS[self.sensor])
+    def world(self) -> Geometry:
+        """Planar or spatial."""
+        return GEOMETRIES[self.geometry]
 
 
 def scenario(
@@ -202,7 +210,7 @@ def _check(s: Scenario) -> None:
             raise ValueError(
                 f"scenario field {field} is {getattr(s, field)!r}; known: {', '.join(known)}"
             )
-    t, p = s.rig.geometry.tangent_dim, s.rig.geometry.pixel_dim
+    t, p = s.world.tangent_dim, s.world.pixel_dim
     lengths = {
         "velocity": t, "velocity_sigma": t, _NOISE_OF[s.motion]: t, "range": 2,
         "image": p, "focal": p, "centre": p, "first_pixels": p,

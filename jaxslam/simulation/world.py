@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.camera import Camera, bearing
-from jaxslam.filters import Features, Parameters, inverse_depth_prior
+from jaxslam.forms.state import Features
 from jaxslam.geometry import Pose, identity
+from jaxslam.models.camera import Camera, bearing
+from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.sensors import AbstractSensor, Pinhole
+from jaxslam.simulation.pieces import calibration_sigma_of, depth_of, motion_of, sensor_of
 from jaxslam.simulation.scenario import Scenario
+from jaxslam.slam.protocol import Capacity
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Run:
+class Run(eqx.Module):
     """Truth and measurements; frame 0 is the start, `frames` = steps + 1."""
 
     poses: Pose
@@ -34,9 +37,7 @@ class Run:
     """The true camera of every frame."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Sightings:
+class Sightings(eqx.Module):
     """How many landmarks a run sees, at the most: the capacities that a filter needs."""
 
     landmarks: Int[Array, ""]
@@ -49,98 +50,54 @@ class Sightings:
     """In one frame after 0, for the first time."""
 
 
-def parameters(scenario: Scenario, dtype=None) -> Parameters:
-    """The filter's numbers that fit the scenario: the true noise and the nominal camera."""
-    mean, sigma = scenario.inverse_depth or inverse_depth_prior(scenario.nearest_depth)
-    p = scenario.rig.geometry.pixel_dim
-    camera = scenario.sensor == "camera"
-    velocity = scenario.motion == "velocity"
-
-    def array(values):
-        return jnp.asarray(values, dtype or jnp.result_type(float))
-
-    return Parameters(
-        camera=Camera(array(scenario.focal), array(scenario.centre)),
-        intrinsics_sigma=array([scenario.focal_sigma] * p + [scenario.centre_sigma] * p),
-        measurement_sigma=array(scenario.pixel_sigma if camera else scenario.position_sigma),
-        motion_sigma=array(scenario.acceleration_sigma if velocity else scenario.odometry_sigma),
-        inverse_depth=array(mean),
-        inverse_depth_sigma=array(sigma),
-    )
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Prior:
-    """All that a filter is told of a scenario, as data: other numbers need no other program."""
-
-    parameters: Parameters
-    velocity: Float[Array, " t"]
-    velocity_sigma: Float[Array, " t"]
-
-    @staticmethod
-    def of(scenario: Scenario, dtype=None) -> Prior:
-        """The scenario's own numbers: the truth is drawn from this prior."""
-        dtype = dtype or jnp.result_type(float)
-        return Prior(
-            parameters(scenario, dtype),
-            jnp.asarray(scenario.velocity, dtype),
-            jnp.asarray(scenario.velocity_sigma, dtype),
-        )
-
-
-def structure(scenario: Scenario) -> Scenario:
-    """The scenario with every number that is drawn from its `Prior` replaced by one.
-
-    `simulate(structure(s), key, dtype, Prior.of(s))` draws the runs of `s`, and its program is
-    compiled once for all scenarios that differ in such numbers only.
-    """
-    t, p = scenario.rig.geometry.tangent_dim, scenario.rig.geometry.pixel_dim
-    return replace(
-        scenario,
-        name="",
-        # With odometry the nominal motion is the true one: it is not drawn.
-        velocity=scenario.velocity if scenario.motion == "odometry" else (1.0,) * t,
-        velocity_sigma=(1.0,) * t,
-        acceleration_sigma=(1.0,) * t,
-        odometry_sigma=(1.0,) * t,
-        nearest_depth=1.0,
-        inverse_depth=(),
-        focal=(1.0,) * p,
-        centre=(1.0,) * p,
-        focal_sigma=1.0,
-        centre_sigma=1.0,
-        pixel_sigma=1.0,
-        position_sigma=1.0,
-    )
-
-
-def simulate(scenario: Scenario, key: Array, dtype=None, prior: Prior | None = None) -> Run:
-    """Draw one run: a pure function of the key, to be batched by `vmap`.
-
-    The truth is drawn from the prior: the scenario's own, or one given as data.
-    """
-    motion_key, world_key, camera_key, pixel_key = jax.random.split(key, 4)
+def as_data(scenario: Scenario, dtype: Any = None) -> Scenario:
+    """The scenario with its numbers as arrays and without its name: what a program is made for."""
+    if any(isinstance(number, jax.Array) for number in jax.tree.leaves(scenario)):
+        return scenario
     dtype = dtype or jnp.result_type(float)
-    prior = Prior.of(scenario, dtype) if prior is None else prior
-    truth = prior.parameters
-    poses, controls = _MOTION[scenario.motion](scenario, prior, motion_key)
-    points = _PLACEMENT[scenario.placement](scenario, prior, world_key)
-    cameras = _cameras(scenario, truth, camera_key)
-    measure, one = scenario.rig.sensor.measure, jnp.ones((), dtype)
+    unnamed = replace(scenario, name="", calibration="known")
+    return jax.tree.map(lambda number: jnp.asarray(number, dtype), unnamed)
 
-    def frame(pose: Pose, camera: Camera):
+
+def simulate(scenario: Scenario, key: Array, dtype: Any = None) -> Run:
+    """Draw one run: a pure function of the scenario's numbers and of the key.
+
+    The truth is drawn from the prior of the filters of `make_filters`.
+    """
+    s = as_data(scenario, dtype)
+    motion_key, world_key, camera_key, pixel_key = jax.random.split(key, 4)
+    poses, controls = _MOTION[s.motion](s, motion_key)
+    points = _PLACEMENT[s.placement](s, world_key)
+    sensor = sensor_of(s)
+    cameras, sensors = _sensors(s, camera_key)
+    one = jnp.ones((), points.dtype)
+
+    def frame(pose: Pose, sensor):
         seen_from = jax.vmap(pose.inverse().apply)(points)
-        measured = jax.vmap(measure, in_axes=(None, 0, None))(camera, seen_from, one)
-        return measured, _VISIBLE[scenario.sensor](scenario, seen_from, measured)
+        measured = jax.vmap(sensor.measure, in_axes=(0, None))(seen_from, one)
+        return measured, _VISIBLE[s.sensor](s, seen_from, measured)
 
-    measured, visible = jax.vmap(frame)(poses, cameras)
-    visible &= jnp.arange(scenario.steps + 1)[:, None] >= scenario.first_frame
+    measured, visible = jax.vmap(frame)(poses, sensors)
+    visible &= jnp.arange(s.steps + 1)[:, None] >= s.first_frame
     # A key of its own, so that a limit changes nothing else of a run.
-    visible = _limited(scenario, jax.random.fold_in(pixel_key, 1), visible)
-    noise = jax.random.normal(pixel_key, measured.shape, dtype)
-    measured += truth.measurement_sigma * noise
+    visible = _limited(s, jax.random.fold_in(pixel_key, 1), visible)
+    noise = jax.random.normal(pixel_key, measured.shape, measured.dtype)
+    measured += sensor.sigma * noise
     return _in_order_of_appearance(Run(poses, points, measured, visible, controls, cameras))
+
+
+class Room(NamedTuple):
+    """Capacities that hold every run of a study."""
+
+    landmarks: int
+    first: int
+    known: int
+    new: int
+
+    @property
+    def capacity(self) -> Capacity:
+        """Of a filter."""
+        return Capacity(self.landmarks, self.known, self.new)
 
 
 def sightings(run: Run) -> Sightings:
@@ -154,18 +111,18 @@ def sightings(run: Run) -> Sightings:
     )
 
 
-def features(run: Run, capacity: Sightings) -> tuple[Features, Features, Features]:
+def features(run: Run, capacity: Room) -> tuple[Features, Features, Features]:
     """A run's measurements for the filter: new in frame 0; known and new of every later frame.
 
-    Slot i of the filter is point i of the run. `capacity` holds Python integers.
+    Slot i of the filter is point i of the run.
     """
     known, new = _known_and_new(run)
-    first = _picked(new[0], run.measured[0], int(capacity.first))
+    first = _picked(new[0], run.measured[0], capacity.first)
     pick = jax.vmap(_picked, in_axes=(0, 0, None))
     return (
         first,
-        pick(known[1:], run.measured[1:], int(capacity.known)),
-        pick(new[1:], run.measured[1:], int(capacity.new)),
+        pick(known[1:], run.measured[1:], capacity.known),
+        pick(new[1:], run.measured[1:], capacity.new),
     )
 
 
@@ -180,39 +137,41 @@ def _picked(mask, measured, count: int) -> Features:
     return Features(slots, measured[slots], mask[slots])
 
 
-def _by_acceleration(scenario: Scenario, prior: Prior, key: Array) -> tuple[Pose, Array]:
+def _by_acceleration(s: Scenario, key: Array) -> tuple[Pose, Array]:
     """White accelerations and an initial velocity from the filter's prior (P8, P9)."""
     start_key, acceleration_key = jax.random.split(key)
-    rig, sigma = scenario.rig, prior.parameters.motion_sigma
-    geometry, motion, dtype = rig.geometry, rig.motion, sigma.dtype
-    t, dt = geometry.tangent_dim, jnp.asarray(1 / scenario.rate, dtype)
-    velocity = prior.velocity + prior.velocity_sigma * jax.random.normal(start_key, (t,), dtype)
-    accelerations = sigma * jax.random.normal(acceleration_key, (scenario.steps, t), dtype)
+    motion = motion_of(s)
+    assert isinstance(motion, ConstantVelocity)
+    sigma, geometry = motion.noise_sigma, motion.geometry
+    t, dtype, dt = geometry.tangent_dim, sigma.dtype, 1 / s.rate
+    start_error = jax.random.normal(start_key, (t,), dtype)
+    velocity = motion.velocity + motion.velocity_sigma * start_error
+    accelerations = sigma * jax.random.normal(acceleration_key, (s.steps, t), dtype)
 
     def move(carry, acceleration):
         pose, velocity = carry
-        pose = (pose @ motion.displacement(geometry, velocity, acceleration, dt)).normalize()
-        return (pose, motion.next_velocity(velocity, acceleration, dt)), pose
+        pose = (pose @ motion.displacement(velocity, acceleration, dt)).normalize()
+        return (pose, motion.next(velocity, acceleration, dt)), pose
 
     start = identity(geometry, dtype)
     _, poses = jax.lax.scan(move, (start, velocity), accelerations)
-    return _with_start(start, poses), jnp.full(scenario.steps, dt)
+    return _with_start(start, poses), jnp.full(s.steps, dt)
 
 
-def _by_odometry(scenario: Scenario, prior: Prior, key: Array) -> tuple[Pose, Array]:
+def _by_odometry(s: Scenario, key: Array) -> tuple[Pose, Array]:
     """The nominal motion exactly; each step is read with an error, `u` = truth − w."""
-    geometry, sigma = scenario.rig.geometry, prior.parameters.motion_sigma
-    nominal = jnp.asarray(scenario.velocity, sigma.dtype) / scenario.rate
-    still = jnp.zeros_like(nominal)
-    step = scenario.rig.motion.displacement(geometry, still, still, nominal)
-    noise = jax.random.normal(key, (scenario.steps, geometry.tangent_dim), sigma.dtype)
+    motion = motion_of(s)
+    geometry, sigma = motion.geometry, motion.noise_sigma
+    nominal = jnp.stack(s.velocity) / s.rate
+    step = motion.displacement((), jnp.zeros_like(nominal), nominal)
+    noise = jax.random.normal(key, (s.steps, geometry.tangent_dim), sigma.dtype)
 
     def move(pose, _):
         pose = (pose @ step).normalize()
         return pose, pose
 
     start = identity(geometry, sigma.dtype)
-    _, poses = jax.lax.scan(move, start, length=scenario.steps)
+    _, poses = jax.lax.scan(move, start, length=s.steps)
     return _with_start(start, poses), nominal - sigma * noise
 
 
@@ -225,7 +184,7 @@ def _with_start(start: Pose, poses: Pose) -> Pose:
 
 def _in_image(scenario: Scenario, points, pixels) -> Bool[Array, " l"]:
     """In front of the camera and inside the picture."""
-    inside = jnp.all((pixels >= 0) & (pixels < jnp.asarray(scenario.image, pixels.dtype)), axis=-1)
+    inside = jnp.all((pixels >= 0) & (pixels < jnp.stack(scenario.image)), axis=-1)
     return inside & (points[:, -1] > scenario.visible_depth)
 
 
@@ -265,38 +224,37 @@ def _at_most(mask, order, count) -> Bool[Array, " l"]:
     return mask & (rank < count)
 
 
-def _from_prior(scenario: Scenario, prior: Prior, key: Array) -> Float[Array, "l n"]:
+def _from_prior(s: Scenario, key: Array) -> Float[Array, "l n"]:
     """Uniform pixels of frame 0, inverse depths from the prior, truncated."""
     pixel_key, depth_key = jax.random.split(key)
-    truth = prior.parameters
-    dtype, count = truth.motion_sigma.dtype, scenario.landmarks
-    low, high = jnp.asarray(scenario.first_pixels, dtype).T
-    pixels = jax.random.uniform(pixel_key, (count, low.size), dtype, minval=low, maxval=high)
-    lower = (scenario.least_inverse_depth - truth.inverse_depth) / truth.inverse_depth_sigma
-    draws = jax.random.truncated_normal(depth_key, lower, jnp.inf, (count,), dtype)
-    inverse_depths = truth.inverse_depth + truth.inverse_depth_sigma * draws
-    bearings = jax.vmap(bearing, in_axes=(None, 0))(truth.camera, pixels)
-    return jnp.column_stack([bearings, jnp.ones(count, dtype)]) / inverse_depths[:, None]
+    depth, count = depth_of(s), s.landmarks
+    low, high = (jnp.stack(ends) for ends in zip(*s.first_pixels, strict=True))
+    pixels = jax.random.uniform(pixel_key, (count, low.size), low.dtype, minval=low, maxval=high)
+    lower = (s.least_inverse_depth - depth.mean) / depth.sigma
+    draws = jax.random.truncated_normal(depth_key, lower, jnp.inf, (count,), low.dtype)
+    inverse_depths = depth.mean + depth.sigma * draws
+    camera = Camera(s.focal, s.centre)
+    bearings = jax.vmap(bearing, in_axes=(None, 0))(camera, pixels)
+    return jnp.column_stack([bearings, jnp.ones(count, low.dtype)]) / inverse_depths[:, None]
 
 
-def _on_ring(scenario: Scenario, prior: Prior, key: Array) -> Float[Array, "l n"]:
+def _on_ring(s: Scenario, key: Array) -> Float[Array, "l n"]:
     """Evenly on a circle about the centre of the nominal path, at the camera's height."""
     del key
-    dtype = prior.velocity.dtype
-    *linear, rotation = prior.velocity
+    *linear, rotation = s.velocity
     # x' = v + ω J x has its fixed point, the centre, at J v / ω: left of a camera that turns
     # from x towards z.
     centre = jnp.stack([-linear[-1] / rotation, linear[0] / rotation])
-    angles = 2 * jnp.pi * jnp.arange(scenario.landmarks, dtype=dtype) / scenario.landmarks
-    ring = centre + scenario.ring_radius * jnp.column_stack([jnp.cos(angles), jnp.sin(angles)])
-    return ring.astype(dtype)
+    angles = 2 * jnp.pi * jnp.arange(s.landmarks, dtype=centre.dtype) / s.landmarks
+    ring = centre + s.ring_radius * jnp.column_stack([jnp.cos(angles), jnp.sin(angles)])
+    return ring.astype(centre.dtype)
 
 
-def _in_room(scenario: Scenario, prior: Prior, key: Array) -> Float[Array, "72 3"]:
+def _in_room(s: Scenario, key: Array) -> Float[Array, "72 3"]:
     """The cloister of slamtb: nine points along each wall of a 12 m room, in two rows, 1 m apart
     in height; the camera starts 0.6 m above the lower ones, 5 m from the centre, looking along
     the wall."""
-    del scenario, key
+    del key
     along = jnp.concatenate([jnp.arange(-4, 5, 2), jnp.arange(-4, 3, 2)])
     out = jnp.array([6] * 5 + [4] * 4)
     wall = jnp.column_stack([along, out])  # (east, north) of the northern wall
@@ -305,23 +263,25 @@ def _in_room(scenario: Scenario, prior: Prior, key: Array) -> Float[Array, "72 3
     east, north, up = jnp.concatenate(
         [jnp.column_stack([plane, jnp.full(len(plane), height)]) for height in (0, 1)]
     ).T
-    return jnp.column_stack([-(north + 5), 0.6 - up, east]).astype(prior.velocity.dtype)
+    return jnp.column_stack([-(north + 5), 0.6 - up, east]).astype(jnp.result_type(s.rate))
 
 
 _PLACEMENT = {"prior": _from_prior, "ring": _on_ring, "room": _in_room}
 
 
-def _cameras(scenario: Scenario, truth: Parameters, key: Array) -> Camera:
-    """The true camera of every frame."""
-    frames, size = scenario.steps + 1, truth.intrinsics_sigma.size
-    dtype = truth.motion_sigma.dtype
-    if scenario.true_calibration == "nominal":
-        deltas = jnp.zeros((frames, size), dtype)
-    elif scenario.true_calibration == "constant":
-        deltas = jnp.tile(jax.random.normal(key, (size,), dtype), (frames, 1))
+def _sensors(s: Scenario, key: Array) -> tuple[Camera, AbstractSensor]:
+    """The true camera and the true sensor of every frame."""
+    frames, sigma, sensor = s.steps + 1, calibration_sigma_of(s), sensor_of(s)
+    if s.true_calibration == "nominal":
+        deltas = jnp.zeros((frames, sigma.size), sigma.dtype)
+    elif s.true_calibration == "constant":
+        deltas = jnp.tile(jax.random.normal(key, (sigma.size,), sigma.dtype), (frames, 1))
     else:
-        deltas = jax.random.normal(key, (frames, size), dtype)
-    return jax.vmap(truth.camera.perturbed)(deltas * truth.intrinsics_sigma)
+        deltas = jax.random.normal(key, (frames, sigma.size), sigma.dtype)
+    cameras = jax.vmap(Camera(s.focal, s.centre).perturbed)(deltas * sigma)
+    if isinstance(sensor, Pinhole):
+        return cameras, jax.vmap(lambda camera: replace(sensor, camera=camera))(cameras)
+    return cameras, jax.tree.map(lambda x: jnp.broadcast_to(x, (frames, *x.shape)), sensor)
 
 
 def _in_order_of_appearance(run: Run) -> Run:

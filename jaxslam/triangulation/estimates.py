@@ -9,18 +9,18 @@ from __future__ import annotations
 
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.filters import FILTERS, Features, SlamFilter
-from jaxslam.geometry import PLANAR
+from jaxslam.forms.state import Features
 from jaxslam.landmarks import LANDMARKS, Parametrization
 from jaxslam.linalg import semidefinite_root
-from jaxslam.rig import Rig
+from jaxslam.slam.filter import EkfSlam
 from jaxslam.triangulation.samples import Samples, draw
-from jaxslam.triangulation.truth import Measured, intersect
-from jaxslam.triangulation.views import CALIBRATIONS, NOISE_DIM, TwoViews
+from jaxslam.triangulation.truth import intersect
+from jaxslam.triangulation.views import NOISE_DIM, Given, TwoViews
 
 FILTERED = ("inverse_scaling", "inverse_depth")
 ESTIMATES = (*FILTERED, "cartesian")
@@ -32,40 +32,35 @@ Gaussian = tuple[Float[Array, " d"], Float[Array, "d d"]]
 
 def estimate(name: str, views: TwoViews, pixels: Float[Array, " 2"]) -> Gaussian:
     """The named estimate from two measured pixels."""
-    measured = (views.parameters, jnp.array(views.baseline), jnp.asarray(pixels))
+    given = views.given(pixels)
     if name == "cartesian":
-        return triangulated(views.calibration, measured)
-    slam = FILTERS["robocentric"](Rig(PLANAR), LANDMARKS[name], CALIBRATIONS[views.calibration])
-    return filtered(slam, measured)
+        return triangulated(views.calibration, given)
+    return filtered(given.filter(views.calibration, LANDMARKS[name]), given.pixels)
 
 
-@partial(jax.jit, static_argnames="slam")
-def filtered(slam: SlamFilter, measured: Measured) -> Gaussian:
+@eqx.filter_jit
+def filtered(slam: EkfSlam, pixels: Float[Array, " 2"]) -> Gaussian:
     """The landmark after a filter's first two frames, one second apart: seen new, seen again."""
-    parameters, baseline, pixels = measured
-    velocity = jnp.zeros(PLANAR.tangent_dim).at[0].set(baseline)
 
     def seen(pixels):
         slots = jnp.zeros(pixels.size, int)
         return Features(slots, pixels[:, None], jnp.ones(pixels.size, bool))
 
-    second = jnp.ones(())
-    state = slam.start(parameters, 1, velocity, jnp.zeros_like(velocity))
-    state = slam.first(state, parameters, seen(pixels[:1]))
-    state, _ = slam.step(state, parameters, second, seen(pixels[1:]), seen(pixels[2:]))
+    state = slam.init(1, seen(pixels[:1]))
+    state, _ = slam.step(state, jnp.ones(()), seen(pixels[1:]), seen(pixels[2:]))
     own = slice(state.core_dim, None)
     return state.landmarks[0], state.covariance[own, own]
 
 
 @partial(jax.jit, static_argnames="calibration")
-def triangulated(calibration: str, measured: Measured) -> Gaussian:
+def triangulated(calibration: str, given: Given) -> Gaussian:
     """(x, z) where the measured rays meet, and `J Jᵀ`, J its Jacobian by the standardised errors.
 
     The classical Gaussian of a Cartesian point, to first order; it needs rays that meet.
     """
 
     def point(normal):
-        numerator, omega, _ = intersect(calibration, measured, normal)
+        numerator, omega, _ = intersect(calibration, given, normal)
         return numerator / omega
 
     exact = jnp.zeros(NOISE_DIM)

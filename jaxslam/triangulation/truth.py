@@ -13,17 +13,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.camera import bearing
-from jaxslam.filters import Parameters
+from jaxslam.models.camera import bearing
 from jaxslam.triangulation.samples import Samples, draw
-from jaxslam.triangulation.views import TwoViews, errors
-
-Measured = tuple[Parameters, Float[Array, ""], Float[Array, " 2"]]
-"""The numbers of the cameras, the baseline in metres, and the two measured pixels."""
+from jaxslam.triangulation.views import Given, TwoViews, errors
 
 
 def intersect(
-    calibration: str, measured: Measured, normal: Float[Array, " 6"]
+    calibration: str, given: Given, normal: Float[Array, " 6"]
 ) -> tuple[Float[Array, " 2"], Float[Array, ""], Float[Array, ""]]:
     """Where two rays meet: (x, z, ω) = (b₂, 1, (b₁ − b₂)/baseline) with bearings b = (u − c)/f.
 
@@ -32,12 +28,11 @@ def intersect(
     relative to that of the particles: `N(1/z) / f₂`, the prior and |∂(1/z)/∂u₂|, without constants.
     The prior is flat in the ideal first pixel, as it is when a filter takes it for the landmark's.
     """
-    parameters, baseline, pixels = measured
-    pixel_errors, intrinsics_errors = errors(calibration, parameters, normal)
-    cameras = jax.vmap(parameters.camera.perturbed)(intrinsics_errors)
-    first, second = jax.vmap(bearing)(cameras, (pixels + pixel_errors)[:, None])[:, 0]
-    inverse_depth = (first - second) / baseline
-    surprise = (inverse_depth - parameters.inverse_depth) / parameters.inverse_depth_sigma
+    pixel_errors, intrinsics_errors = errors(calibration, given, normal)
+    cameras = jax.vmap(given.sensor.camera.perturbed)(intrinsics_errors)
+    first, second = jax.vmap(bearing)(cameras, (given.pixels + pixel_errors)[:, None])[:, 0]
+    inverse_depth = (first - second) / given.baseline
+    surprise = (inverse_depth - given.depth.mean) / given.depth.sigma
     log_weight = -(surprise**2) / 2 - jnp.log(cameras.focal[1, 0])
     return jnp.stack([second, jnp.ones_like(second)]), inverse_depth, log_weight
 
@@ -46,6 +41,5 @@ def particles(
     views: TwoViews, pixels: Float[Array, " 2"], count: int, seed: int
 ) -> dict[str, Samples]:
     """`triangulation` and `posterior` given two measured pixels."""
-    measured = (views.parameters, jnp.array(views.baseline), jnp.asarray(pixels))
-    posterior = draw(intersect, views.calibration, measured, count, seed)
+    posterior = draw(intersect, views.calibration, views.given(pixels), count, seed)
     return {"triangulation": posterior.unweighted, "posterior": posterior}

@@ -11,17 +11,25 @@ import dataclasses
 import math
 from dataclasses import dataclass
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxslam.camera import Camera, project
-from jaxslam.filters import Parameters, inverse_depth_prior
+from jaxslam.arrays import AnyArray, cast
 from jaxslam.geometry import PLANAR
-from jaxslam.names import suggestion
+from jaxslam.landmarks import Parametrization
+from jaxslam.lookup import suggestion
+from jaxslam.models.calibration import Estimated, Known, White
+from jaxslam.models.camera import Camera, project
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.sensors import Pinhole
 from jaxslam.simulation import Scenario
+from jaxslam.slam.filter import EkfSlam
 
-CALIBRATIONS = {"white": "white", "shared": "estimated", "known": "known"}
+CALIBRATIONS = {"white": White, "shared": Estimated, "known": lambda sigma: Known()}
 """What the true intrinsics are, and how a filter that knows this treats them: drawn anew in each
 view, drawn once for both views, or exactly known."""
 NOISE_DIM = 6
@@ -66,34 +74,52 @@ class TwoViews:
         """(x, z) of the point in the second camera, m."""
         return (self.pixels[1] - self.centre) / self.focal * self.depth, self.depth
 
-    @property
-    def parameters(self) -> Parameters:
-        """The numbers of a filter that knows the noise exactly; the motion has no acceleration."""
-        mean, sigma = inverse_depth_prior(self.nearest_depth)
-        return Parameters(
-            camera=Camera(jnp.array([self.focal]), jnp.array([self.centre])),
-            intrinsics_sigma=jnp.array([self.focal_sigma, self.centre_sigma]),
-            measurement_sigma=jnp.array(self.pixel_sigma),
-            motion_sigma=jnp.zeros(PLANAR.tangent_dim),
-            inverse_depth=jnp.array(mean),
-            inverse_depth_sigma=jnp.array(sigma),
+    def given(self, pixels: Float[Array, " 2"]) -> Given:
+        """What the estimates are given, of these two measured pixels."""
+        sigma = np.array([self.focal_sigma, self.centre_sigma])
+        sensor = Pinhole(Camera([self.focal], [self.centre]), self.pixel_sigma)
+        depth = InverseDepth.beyond(self.nearest_depth)
+        return cast(Given(sensor, sigma, depth, np.array(self.baseline), pixels), float)
+
+
+class Given(eqx.Module):
+    """Two measured pixels, and the numbers of those who know the noise exactly."""
+
+    sensor: Pinhole
+    intrinsics_sigma: Float[AnyArray, " 2"]
+    """σ of (f, c), pixels."""
+    depth: InverseDepth
+    """The prior on 1/z."""
+    baseline: Float[AnyArray, ""]
+    """m."""
+    pixels: Float[AnyArray, " 2"]
+
+    def filter(self, calibration: str, landmark: Parametrization) -> EkfSlam:
+        """The paper's filter; the motion has no acceleration, and one step takes a second."""
+        still = jnp.zeros(PLANAR.tangent_dim)
+        return EkfSlam(
+            motion=ConstantVelocity(still, still.at[0].set(self.baseline), still),
+            sensor=self.sensor,
+            landmark=landmark,
+            calibration=CALIBRATIONS[calibration](self.intrinsics_sigma),
+            depth=self.depth,
         )
 
 
 def errors(
-    calibration: str, parameters: Parameters, normal: Float[Array, f" {NOISE_DIM}"]
+    calibration: str, given: Given, normal: Float[Array, f" {NOISE_DIM}"]
 ) -> tuple[Float[Array, " 2"], Float[Array, "2 2"]]:
     """Pixel error and intrinsics' error (δf, δc) of both views, from standard normal numbers.
 
     How the errors of the two views are correlated is said here and nowhere else.
     """
-    pixel = parameters.measurement_sigma * normal[:2]
+    pixel = given.sensor.sigma * normal[:2]
     by_view = {
         "white": normal[2:6].reshape(2, 2),
         "shared": jnp.tile(normal[2:4], (2, 1)),
         "known": jnp.zeros((2, 2), normal.dtype),
     }[calibration]
-    return pixel, by_view * parameters.intrinsics_sigma
+    return pixel, by_view * given.intrinsics_sigma
 
 
 def measure(views: TwoViews, count: int, seed: int) -> Float[Array, "count 2"]:
@@ -101,13 +127,13 @@ def measure(views: TwoViews, count: int, seed: int) -> Float[Array, "count 2"]:
 
     They err as the filters expect: by the true intrinsics of each view and by the pixel noise.
     """
-    parameters, (x, z) = views.parameters, views.point
+    given, (x, z) = views.given(jnp.zeros(2)), views.point
     points = jnp.array([[x + views.baseline, z], [x, z]])
 
     def one(index):
         normal = jax.random.normal(jax.random.fold_in(jax.random.key(seed), index), (NOISE_DIM,))
-        pixel_errors, intrinsics_errors = errors(views.calibration, parameters, normal)
-        cameras = jax.vmap(parameters.camera.perturbed)(intrinsics_errors)
+        pixel_errors, intrinsics_errors = errors(views.calibration, given, normal)
+        cameras = jax.vmap(given.sensor.camera.perturbed)(intrinsics_errors)
         return jax.vmap(project)(cameras, points)[:, 0] + pixel_errors
 
     return jax.vmap(one)(jnp.arange(count))

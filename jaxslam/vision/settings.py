@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax.numpy as jnp
-
-from jaxslam.camera import Camera
-from jaxslam.filters import FILTERS, Parameters, inverse_depth_prior
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.names import chosen
+from jaxslam.lookup import chosen
+from jaxslam.models.camera import Camera
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.sensors import Pinhole
+from jaxslam.names import FILTERS, make_filter
+from jaxslam.simulation.pieces import TREATMENTS
+from jaxslam.slam.protocol import AbstractFilter
 from jaxslam.vision.calibration import Calibration
 
 
@@ -19,7 +22,7 @@ class TrackerSettings:
     a single camera does not see scale, so the map's unit is whatever that prior makes it."""
 
     filter: str = "world"
-    """Filter: a name of jaxslam.FILTERS, which may be modified, as in `robocentric+oc`.
+    """Filter: a name of jaxslam.names.FILTERS, which may be modified, as in `robocentric+oc`.
     `recommended` is the default, the one of docs/sequences.md with the best trajectories."""
     landmarks: str = "inverse_scaling"
     """Landmark parametrization: a name of jaxslam.LANDMARKS."""
@@ -71,20 +74,30 @@ class TrackerSettings:
         """Slots of the filter."""
         return self.wanted + self.spare
 
-    def parameters(self, calibration: Calibration) -> Parameters:
-        """The filter's numbers, float64."""
-        mean, sigma = inverse_depth_prior(self.nearest_depth)
-        linear, angular = self.acceleration_sigma, self.angular_acceleration_sigma
+    @property
+    def depth(self) -> InverseDepth:
+        """The prior on the depth of new landmarks."""
+        return InverseDepth.beyond(self.nearest_depth)
+
+    def make_filter(self, calibration: Calibration) -> AbstractFilter:
+        """The filter that is named, with these numbers. Raises ValueError."""
         distorted = any(calibration.distortion)
-        return Parameters(
-            camera=Camera(
-                focal=jnp.array([calibration.fx, calibration.fy]),
-                centre=jnp.array([calibration.cx, calibration.cy]),
-                distortion=jnp.array(calibration.distortion) if distorted else None,
+        camera = Camera(
+            (calibration.fx, calibration.fy),
+            (calibration.cx, calibration.cy),
+            calibration.distortion if distorted else None,
+        )
+        return make_filter(
+            self.filter,
+            motion=ConstantVelocity(
+                [self.acceleration_sigma] * 3 + [self.angular_acceleration_sigma] * 3,
+                [0.0] * 6,
+                [self.velocity_sigma] * 3 + [self.angular_velocity_sigma] * 3,
             ),
-            intrinsics_sigma=jnp.array([self.focal_sigma] * 2 + [self.centre_sigma] * 2),
-            measurement_sigma=jnp.asarray(self.pixel_sigma),
-            motion_sigma=jnp.array([linear] * 3 + [angular] * 3),
-            inverse_depth=jnp.asarray(mean),
-            inverse_depth_sigma=jnp.asarray(sigma),
+            sensor=Pinhole(camera, self.pixel_sigma),
+            landmark=LANDMARKS[self.landmarks],
+            calibration=TREATMENTS[self.calibration](
+                [self.focal_sigma] * 2 + [self.centre_sigma] * 2
+            ),
+            depth=self.depth,
         )

@@ -15,7 +15,6 @@ import numpy as np
 
 from jaxslam import __version__
 from jaxslam.files import write_atomically
-from jaxslam.filters import inverse_depth_prior
 from jaxslam.plots.tracking import plot_map
 from jaxslam.vision.overlay import OverlayWriter, draw_overlay, overlay_size
 from jaxslam.vision.pointcloud import write_ply
@@ -208,8 +207,8 @@ def _scale_between_maps(settings: TrackerSettings) -> float:
     A unit is known as well as what all depths of a scene have in common: at the worst as one of
     them, σ/ρ of its inverse depth, in each of the two maps.
     """
-    mean, sigma = inverse_depth_prior(settings.nearest_depth)
-    return math.sqrt(2) * sigma / mean
+    depth = settings.depth
+    return math.sqrt(2) * float(depth.sigma / depth.mean)
 
 
 def _summary(
@@ -230,6 +229,7 @@ def _summary(
         "lost": lost,
         "restarts": tracker.restarts,
         "maps": tracker.restarts + 1,
+        "failed_updates": dict(tracker.failed),
         "landmarks": {
             "mean": float(np.mean([len(result.status) for result in updates] or [0])),
             "created": tracker.created,

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.filters import (
-    Features,
-    Parameters,
-    SlamFilter,
-    SplitAndMerge,
-    StagedFilter,
-    State,
-    make_filter,
-)
-from jaxslam.filters.bank import BankState, moments
-from jaxslam.filters.initialisation import UNDELAYED
-from jaxslam.filters.ransac import inliers
-from jaxslam.geometry import SPATIAL
-from jaxslam.landmarks import LANDMARKS
-from jaxslam.rig import Rig
+from jaxslam.arrays import cast
+from jaxslam.forms.state import Features, Status
+from jaxslam.slam.filter import AtOnce, innermost
+from jaxslam.slam.protocol import AbstractStaged, Scene
+from jaxslam.slam.ransac import inliers
+from jaxslam.slam.readouts import camera_pose, landmarks_in_world
 from jaxslam.vision.calibration import Calibration
 from jaxslam.vision.located import Located
 from jaxslam.vision.patches import Match, Patch, detect_corners, match_patches
@@ -133,35 +125,38 @@ class Tracker:
 
     calibration: Calibration
     settings: TrackerSettings = field(default_factory=TrackerSettings)
+    filter: AbstractStaged | None = None
+    """One's own, in place of the filter that the settings name."""
     landmarks: dict[int, _Landmark] = field(default_factory=dict, init=False)
     created: int = field(default=0, init=False)
     deleted: int = field(default=0, init=False)
     restarts: int = field(default=0, init=False)
+    failed: Counter[str] = field(default_factory=Counter, init=False)
+    """How many updates ended in which `Status` that says that their result means nothing."""
     finished: list[Points] = field(default_factory=list, init=False)
     """Landmarks that left the map."""
 
     def __post_init__(self) -> None:
-        s = self.settings
-        made = make_filter(Rig(SPATIAL), s.filter, LANDMARKS[s.landmarks], s.calibration)
-        staged = isinstance(made, SlamFilter | SplitAndMerge)
-        if not staged or made.gaussian_filter.initialisation is not UNDELAYED:
+        made = self.settings.make_filter(self.calibration) if self.filter is None else self.filter
+        inner = innermost(made)
+        delayed = inner is not None and not isinstance(inner.entry, AtOnce)
+        if not isinstance(made, AbstractStaged) or delayed:
             raise ValueError(
-                f"filter {s.filter} cannot track: features are sought where a Gaussian predicts "
-                "them, before it is given the frame, from the frame in which they are first seen"
+                f"filter {self._filter_name} cannot track: features are sought where a Gaussian "
+                "predicts them, before it is given the frame, from the frame in which they are "
+                "first seen"
             )
-        self._filter: StagedFilter = made
         self._time: float | None = None
         self._origin = self._camera = Located()
         self._sigma_log_scale: float | None = None
         self._unmeasured = 0
-        self._predict = jax.jit(partial(_predict, self._filter))
-        self._correct = jax.jit(partial(_correct, self._filter))
-        self._renew_map = jax.jit(partial(_renew_map, self._filter))
-        self._begin_map = jax.jit(partial(_begin_map, self._filter))
-        self._world_points = jax.jit(partial(_world_points, self._filter))
         with jax.enable_x64(True):
-            self._parameters = s.parameters(self.calibration)
+            self._slam: AbstractStaged = cast(made, jnp.float64)
             self._state = self._empty_state()
+
+    @property
+    def _filter_name(self) -> str:
+        return self.settings.filter if self.filter is None else type(self.filter).__name__
 
     def track(self, frame: Frame) -> Tracked:
         """Predict, search, update, and renew the map. Raises ValueError for a frame that is not
@@ -183,17 +178,18 @@ class Tracker:
         dt = frame.time - (-np.inf if self._time is None else self._time)
         if not dt > 0:
             raise ValueError(f"frame {frame.index}: its time is not later than the one before")
-        predicted, prediction = self._predict(self._state, self._parameters, dt)
+        predicted, prediction = _predict(self._slam, self._state, dt)
         prediction = jax.device_get(prediction)
         prediction = prediction._replace(T_wc=self._origin.T_wc @ prediction.T_wc)
         slots = self._visible(prediction)
         found = self._search(frame, prediction, slots)
         matched, features = self._features(slots, found)
         least = max(LEAST_INLIERS, len(slots) // 2) if self._unmeasured else LEAST_INLIERS
-        state, result = self._correct(*predicted, self._parameters, dt, features, least)
-        used, nis, nis_dof, healthy = jax.device_get(result)
+        state, result = _correct(self._slam, *predicted, dt, features, least)
+        used, nis, nis_dof, status = jax.device_get(result)
         self._time = frame.time
-        if not healthy:
+        if status >= Status.NOT_POSITIVE:
+            self.failed[Status(int(status)).name.lower()] += 1
             self._fall_back(predicted, dt)
             return self._lost(frame)
         self._state = state
@@ -225,7 +221,7 @@ class Tracker:
             lost=lost,
         )
 
-    def _fall_back(self, predicted: tuple[Any, State], dt: float) -> None:
+    def _fall_back(self, predicted: tuple[Any, Any], dt: float) -> None:
         """The covariance is no longer positive: what prediction alone says of the camera.
 
         Where that is broken too, the camera is as far from where it was last as the prior on a
@@ -233,11 +229,11 @@ class Tracker:
         """
         self._remove(sorted(self.landmarks))
         nothing = _padded(np.zeros(0, int), np.zeros((0, 2)), self.settings.wanted)
-        state, result = self._correct(*predicted, self._parameters, dt, nothing, LEAST_INLIERS)
-        if not result[-1]:
+        state, result = _correct(self._slam, *predicted, dt, nothing, LEAST_INLIERS)
+        if int(result[-1]) >= Status.NOT_POSITIVE:
             self._origin = self._camera
-            predicted, _ = self._predict(self._empty_state(), self._parameters, dt)
-            state, _ = self._correct(*predicted, self._parameters, dt, nothing, LEAST_INLIERS)
+            predicted, _ = _predict(self._slam, self._empty_state(), dt)
+            state, _ = _correct(self._slam, *predicted, dt, nothing, LEAST_INLIERS)
         self._state = state
 
     def _lost(self, frame: Frame, **searched) -> Tracked:
@@ -253,9 +249,7 @@ class Tracker:
         return self._tracked(frame, **searched, created=created, lost=True, starts=True)
 
     def _empty_state(self) -> Any:
-        s = self.settings
-        sigma = [s.velocity_sigma] * 3 + [s.angular_velocity_sigma] * 3
-        return self._filter.start(self._parameters, s.capacity, jnp.zeros(6), jnp.array(sigma))
+        return _empty(self._slam, self.settings.capacity)
 
     def _visible(self, prediction: _Prediction) -> np.ndarray:
         """Slots to search: in front, in the picture, with a bearing that the lens can see."""
@@ -351,7 +345,7 @@ class Tracker:
         for slot in slots:
             del self.landmarks[slot]
         gone = np.isin(np.arange(self.settings.capacity), slots)
-        self._state = self._filter.remove(self._state, jnp.asarray(gone))
+        self._state = _remove(self._slam, self._state, jnp.asarray(gone))
 
     def _corners(self, frame: Frame, occupied: np.ndarray | None = None) -> np.ndarray:
         """Where the picture is bare; for a whole map where nothing says what is `occupied`."""
@@ -373,18 +367,18 @@ class Tracker:
     def _begun(self, frame: Frame, corners: np.ndarray) -> np.ndarray:
         """Landmarks at the corners, in a state that has none; the corners. Frame 0 of a map."""
         self._unmeasured = 0
-        return self._created(self._begin_map, frame, corners)
+        return self._created(_begin_map, frame, corners)
 
     def _renewed(self, frame: Frame, corners: np.ndarray) -> np.ndarray:
         """New landmarks at the corners; the corners. Ends the filter's frame."""
-        return self._created(self._renew_map, frame, corners)
+        return self._created(_renew_map, frame, corners)
 
     def _created(self, function: Any, frame: Frame, corners: np.ndarray) -> np.ndarray:
         s = self.settings
         free = [slot for slot in range(s.capacity) if slot not in self.landmarks]
         slots = np.array(free[: len(corners)], int)
         new = _padded(slots, corners, s.wanted)
-        self._state, reported = function(self._state, self._parameters, new)
+        self._state, reported = function(self._slam, self._state, new)
         T_BC, covariance, log_scale = jax.device_get(reported)
         self._camera = self._origin.then(Located(T_BC, covariance))
         self._sigma_log_scale = float(np.sqrt(log_scale)) if log_scale > 0 else None
@@ -395,7 +389,7 @@ class Tracker:
         return corners
 
     def _recorded(self, slots: list[int]) -> Points:
-        seen = jax.device_get(self._world_points(self._state, self._parameters))
+        seen = jax.device_get(_world_points(self._slam, self._state, self.settings.capacity))
         points, covariances = (of_slot[slots] for of_slot in seen)
         numbers = np.array([self.landmarks[slot].number for slot in slots], int)
         maps = np.full_like(numbers, self.restarts)
@@ -423,71 +417,70 @@ def _padded(slots: np.ndarray, pixels: np.ndarray, size: int) -> Features:
     )
 
 
-def _predict(
-    slam_filter: StagedFilter, state: Any, parameters: Parameters, dt
-) -> tuple[tuple[Any, State], _Prediction]:
+@eqx.filter_jit
+def _empty(slam: AbstractStaged, capacity: int) -> Any:
+    return slam.init(capacity)
+
+
+@eqx.filter_jit
+def _remove(slam: AbstractStaged, state: Any, gone: Any) -> Any:
+    return slam.remove(state, gone)
+
+
+@eqx.filter_jit
+def _predict(slam: AbstractStaged, state: Any, dt: Any) -> tuple[tuple[Any, Any], _Prediction]:
     """The predicted state, as it is and as one Gaussian, and what that expects to see."""
-    one = slam_filter.gaussian_filter
-    dt = jnp.asarray(dt, parameters.measurement_sigma.dtype)
-    state = slam_filter.predict(state, parameters, dt)
-    gaussian = slam_filter.predicted_gaussian(state, parameters, dt)
-    slots = jnp.arange(gaussian.active.size)
-    pixels, covariances, in_front = one.predict_features(gaussian, parameters, dt, slots)
-    pose, points, omegas = one.predicted_camera(gaussian, parameters, dt, slots)
-    usable = gaussian.active & in_front & jnp.isfinite(covariances).all(axis=(1, 2))
-    prediction = _Prediction(pixels, covariances, usable, pose.as_matrix(), points, omegas)
+    dt = jnp.asarray(dt)
+    slots = jnp.arange(slam.in_map(state).size)
+    state = slam.predict(state, dt)
+    one, gaussian = slam.gaussian(state, dt)
+    seen = one.predict_features(gaussian, dt, slots)
+    usable = seen.possible & jnp.isfinite(seen.covariance).all(axis=(1, 2))
+    pose = seen.pose.as_matrix()
+    prediction = _Prediction(seen.measured, seen.covariance, usable, pose, seen.points, seen.omegas)
     return (state, gaussian), prediction
 
 
+@eqx.filter_jit
 def _correct(
-    slam_filter: StagedFilter,
-    state: Any,
-    gaussian: State,
-    parameters: Parameters,
-    dt,
-    features: Features,
-    least: int,
+    slam: AbstractStaged, state: Any, gaussian: Any, dt: Any, features: Features, least: Any
 ) -> tuple[Any, tuple]:
-    dt = jnp.asarray(dt, parameters.measurement_sigma.dtype)
-    agreed = inliers(slam_filter.gaussian_filter, gaussian, parameters, dt, features)
+    dt = jnp.asarray(dt)
+    one, _ = slam.gaussian(state, dt)
+    agreed = inliers(one, gaussian, dt, features)
     # A few of many that were searched can agree by chance: a lost camera only moves.
     agreed &= jnp.sum(agreed) >= least
-    state, innovation = slam_filter.update(state, parameters, dt, replace(features, valid=agreed))
-    state = slam_filter.compose(state, parameters, dt)
-    covariance = slam_filter.reported(state).covariance
-    healthy = jnp.isfinite(covariance).all() & (jnp.diagonal(covariance) >= 0).all()
-    return state, (innovation.used, innovation.nis, innovation.nis_dof, healthy)
+    state, innovation = slam.update(state, dt, replace(features, valid=agreed))
+    state = slam.compose(state, dt)
+    return state, (innovation.used, innovation.nis, innovation.nis_dof, innovation.status)
 
 
-def _begin_map(slam_filter: StagedFilter, state: Any, parameters: Parameters, new: Features):
-    state = slam_filter.first(state, parameters, new)
-    return state, _reported(slam_filter, state)
+@eqx.filter_jit
+def _begin_map(slam: AbstractStaged, state: Any, new: Features):
+    state = slam.init(slam.in_map(state).size, new)
+    return state, _reported(slam, state)
 
 
-def _renew_map(slam_filter: StagedFilter, state: Any, parameters: Parameters, new: Features):
-    state = slam_filter.finish(slam_filter.initialise(state, parameters, new))
-    return state, _reported(slam_filter, state)
+@eqx.filter_jit
+def _renew_map(slam: AbstractStaged, state: Any, new: Features):
+    state = slam.close(state, new)
+    return state, _reported(slam, state)
 
 
-def _reported(slam_filter: StagedFilter, state: Any):
+def _reported(slam: AbstractStaged, state: Any):
     """T_BC, its covariance and the variance of λ; zero of a filter without."""
-    T_BC, covariance = slam_filter.camera_pose(state)
-    return T_BC.as_matrix(), covariance, _log_scale_variance(slam_filter, state)
+    T_BC, covariance = camera_pose(slam, state)
+    return T_BC.as_matrix(), covariance, _log_scale_variance(slam, state)
 
 
-def _log_scale_variance(slam_filter: StagedFilter, state: Any):
-    one = slam_filter.gaussian_filter
-    if not one.scale_gauge:
-        return jnp.zeros(())
+def _log_scale_variance(slam: AbstractStaged, state: Any):
+    def log_scale(scene: Scene):
+        λ = getattr(scene.core, "log_scale", None)
+        return jnp.zeros(1) if λ is None else λ
 
-    def log_scale(state):
-        return one.engine.core_covariance(lambda core: core.log_scale, state)
-
-    if not isinstance(state, BankState):
-        return log_scale(state)[1][0, 0]
-    return moments(state.log_weights, *jax.vmap(log_scale)(state.members))[1][0, 0]
+    return slam.marginal(state, log_scale)[1][0, 0]
 
 
-def _world_points(slam_filter: StagedFilter, state: Any, parameters: Parameters):
-    slots = jnp.arange(slam_filter.reported(state).active.size)
-    return slam_filter.landmarks_in_world(state, parameters, slots)
+@eqx.filter_jit
+def _world_points(slam: AbstractStaged, state: Any, capacity: int):
+    return landmarks_in_world(slam, state, jnp.arange(capacity))

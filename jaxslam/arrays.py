@@ -1,0 +1,79 @@
+"""The numbers that modules hold: float64 whatever JAX's precision is, until they are used.
+
+A module's leaves are NumPy's float64 or arrays of JAX's, so that a filter made before
+`jax_enable_x64` is set loses no digit. `cast` puts all of them in one precision.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+T = TypeVar("T")
+
+if TYPE_CHECKING:
+    # The type checker does not know that a converter makes arrays of what a field is given.
+    AnyArray = Any
+else:
+    AnyArray = jax.Array | np.ndarray
+
+
+def numbers(values: ArrayLike | tuple[Any, ...]) -> AnyArray:
+    """An array of floating-point numbers; JAX's arrays are left as they are."""
+    if isinstance(values, jax.Array):
+        return values
+    if isinstance(values, tuple | list) and any(isinstance(x, jax.Array) for x in values):
+        return jnp.stack(values)
+    return np.asarray(values, np.float64)
+
+
+def number_field(**options: Any) -> Any:
+    """A field of a module that holds numbers."""
+    return eqx.field(converter=numbers, **options)
+
+
+def is_number(leaf: Any) -> bool:
+    """Whether a leaf is data, to be traced, batched and differentiated."""
+    return isinstance(leaf, jax.Array | np.ndarray | jax.ShapeDtypeStruct)
+
+
+def cast(tree: T, dtype: Any) -> T:
+    """A filter, or any module, with all its floating-point numbers in one precision."""
+
+    def one(leaf):
+        if isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.floating):
+            return jnp.asarray(leaf, dtype)
+        return leaf
+
+    return jax.tree.map(one, tree)
+
+
+def precision(tree: Any) -> Any:
+    """The dtype of a module's numbers as JAX computes with them now.
+
+    Warns where they are float64 and JAX, `jax_enable_x64` being off, makes them float32: a filter
+    in single precision is one that was `cast` to it.
+    """
+    leaves = [x for x in jax.tree.leaves(tree) if isinstance(x, jax.Array | np.ndarray)]
+    wanted = np.result_type(*(x.dtype for x in leaves if jnp.issubdtype(x.dtype, jnp.floating)))
+    dtype = jax.dtypes.canonicalize_dtype(wanted)
+    if dtype != wanted:
+        warnings.warn(
+            "the state is float32, because JAX has no float64 until jax.config.update("
+            '"jax_enable_x64", True); jaxslam.cast(slam, "float32") chooses it without a warning',
+            stacklevel=4,
+        )
+    return dtype
+
+
+def check_shape(what: str, array: Any, *shapes: tuple[int, ...]) -> None:
+    """Raise ValueError, naming the number, unless it has one of these shapes."""
+    if np.shape(array) not in shapes:
+        wanted = " or ".join(str(shape) for shape in shapes)
+        raise ValueError(f"{what} has shape {np.shape(array)}; it needs {wanted}")

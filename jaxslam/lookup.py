@@ -1,0 +1,25 @@
+"""Names that users give: looked up in a table, with a word on what a mistyped one meant."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+
+def suggestion(word: str, known: Iterable[str]) -> str:
+    """` (did you mean …?)` for an error message, or nothing where no known name is close."""
+    close = difflib.get_close_matches(word, list(known), n=1)
+    return f" (did you mean {close[0]}?)" if close else ""
+
+
+def chosen(kind: str, names: Iterable[str], known: Mapping[str, Any]) -> dict[str, Any]:
+    """The named entries of a table, in the order of the names. Raises ValueError."""
+    names = list(names)
+    if not names:
+        raise ValueError(f"{kind} needs at least one name; known: {', '.join(known)}")
+    for name in names:
+        if name not in known:
+            meant = suggestion(name, known)
+            raise ValueError(f"unknown {kind} {name!r}{meant}; known: {', '.join(known)}")
+    return {name: known[name] for name in names}

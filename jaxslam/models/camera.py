@@ -1,0 +1,106 @@
+"""Pinhole cameras, 1-D for the planar world and 2-D for the spatial one, by the same functions.
+
+A camera is data: it can be batched, perturbed by its calibration's uncertainty and
+differentiated. Pixels are (u,) or (u, v); points are (x, z) or (x, y, z) in the camera frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxslam.arrays import AnyArray, check_shape, numbers
+
+UNDISTORT_ITERATIONS = 8
+"""Newton steps of `undistort`: quadratic convergence wherever the model can be inverted."""
+
+
+def _distortion(values):
+    return None if values is None else numbers(values)
+
+
+class Camera(eqx.Module):
+    """Intrinsics: `u = f x/z + c` after the lens's distortion.
+
+    `distortion` holds OpenCV's k1, k2, p1, p2, k3, or is None for an ideal lens (and always is
+    None for the 1-D camera).
+    """
+
+    focal: Float[AnyArray, " p"] = eqx.field(converter=numbers)
+    """Pixels; one of each coordinate."""
+    centre: Float[AnyArray, " p"] = eqx.field(converter=numbers)
+    distortion: Float[AnyArray, " 5"] | None = eqx.field(converter=_distortion, default=None)
+
+    def __check_init__(self) -> None:
+        check_shape("the camera's focal", self.focal, (1,), (2,))
+        check_shape("the camera's centre", self.centre, np.shape(self.focal))
+        if self.distortion is not None:
+            check_shape("the camera's distortion", self.distortion, (5,))
+
+    @property
+    def intrinsics(self) -> Float[Array, " 2p"]:
+        """(f, c) of the 1-D camera, (fx, fy, cx, cy) of the 2-D one, in pixels."""
+        return jnp.concatenate([self.focal, self.centre])
+
+    def perturbed(self, delta: Float[Array, " k"]) -> Camera:
+        """The camera with its intrinsics moved by δ; an empty δ means that they are known."""
+        if delta.size == 0:
+            return self
+        focal, centre = jnp.split(self.intrinsics + delta, 2)
+        return replace(self, focal=focal, centre=centre)
+
+
+def project(camera: Camera, point: Float[Array, " n"]) -> Float[Array, " p"]:
+    """Pixel of a point of the camera frame: `u = f d(x/z) + c`, d the distortion (P14).
+
+    The point may be the numerator of a homogeneous one: its scale, and so a point at infinity,
+    does not matter. At z = 0, where no pixel exists, the result and its derivative are finite
+    but meaningless; callers test `point[-1] > 0`.
+    """
+    depth = jnp.where(point[-1] == 0, 1.0, point[-1])
+    return camera.focal * distort(point[:-1] / depth, camera.distortion) + camera.centre
+
+
+def bearing(camera: Camera, pixel: Float[Array, " p"]) -> Float[Array, " p"]:
+    """Normalised image coordinates (x/z) or (x/z, y/z) of a pixel, the inverse of `project`."""
+    return undistort((pixel - camera.centre) / camera.focal, camera.distortion)
+
+
+def distort(ideal: Float[Array, " p"], distortion: Float[Array, " 5"] | None) -> Float[Array, " p"]:
+    """OpenCV's radial-tangential model on normalised coordinates (x/z, y/z)."""
+    if distortion is None:
+        return ideal
+    radial, tangential = _distortion_terms(ideal, distortion)
+    return ideal * radial + tangential
+
+
+def undistort(
+    distorted: Float[Array, " p"], distortion: Float[Array, " 5"] | None
+) -> Float[Array, " p"]:
+    """Inverse of `distort` by Newton's method; meaningless beyond the image that the model maps."""
+    if distortion is None:
+        return distorted
+
+    def step(ideal, _):
+        error = distort(ideal, distortion) - distorted
+        (a, b), (c, d) = jax.jacfwd(distort)(ideal, distortion)
+        correction = jnp.stack([d * error[0] - b * error[1], a * error[1] - c * error[0]])
+        return ideal - correction / (a * d - b * c), None
+
+    return jax.lax.scan(step, distorted, length=UNDISTORT_ITERATIONS)[0]
+
+
+def _distortion_terms(ideal, distortion):
+    k1, k2, p1, p2, k3 = distortion
+    x, y = ideal
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    tangential = jnp.stack(
+        [2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y]
+    )
+    return radial, tangential

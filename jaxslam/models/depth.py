@@ -1,0 +1,37 @@
+"""What is known of a new landmark's depth, which a camera hides: a prior on 1/z."""
+
+from __future__ import annotations
+
+import equinox as eqx
+from jaxtyping import Float
+
+from jaxslam.arrays import AnyArray, check_shape, number_field, numbers
+
+
+def _optional(values):
+    return None if values is None else numbers(values)
+
+
+class InverseDepth(eqx.Module):
+    """`1/z = mean + σ (own e_i + common c)`, with e_i of every landmark and one c, standard normal.
+
+    c is estimated with everything else: the first landmarks tell those that follow how far away
+    the scene is.
+    """
+
+    mean: Float[AnyArray, ""] = number_field()
+    """1/m; the paper's is 1/(2 d_min)."""
+    sigma: Float[AnyArray, ""] = number_field()
+    """1/m; the paper's is 1/(4 d_min)."""
+    own: Float[AnyArray, ""] = number_field(default=1.0)
+    common: Float[AnyArray, ""] | None = eqx.field(converter=_optional, default=None)
+    """None where landmarks have nothing in common."""
+
+    def __check_init__(self) -> None:
+        for name in ("mean", "sigma", "own"):
+            check_shape(f"the {name} of the prior on 1/z", getattr(self, name), ())
+
+    @staticmethod
+    def beyond(nearest: float) -> InverseDepth:
+        """The paper's: 96 % from `nearest` (d_min, metres) to infinity."""
+        return InverseDepth(1 / (2 * nearest), 1 / (4 * nearest))

@@ -1,0 +1,190 @@
+"""How a camera moves between two frames: models of a displacement, driven by white noise.
+
+A model says what a *control* makes of the variables that it keeps in the state and of this step's
+noise. The control is data: the seconds of the step, the odometry's reading, or the rates of a
+vehicle. A model of your own is one class with the functions of `AbstractMotion`.
+"""
+
+from abc import abstractmethod
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxslam.arrays import AnyArray, check_shape, number_field
+from jaxslam.geometry import GEOMETRIES, Geometry, Pose, exp, identity, joined
+
+
+class AbstractMotion(eqx.Module):
+    """A motion model. What it keeps in the state is any pytree of poses and vectors."""
+
+    has_velocity: ClassVar[bool] = False
+    """Whether its variables are a velocity, linear and angular, and nothing that it is told is in
+    metres: then the scale is free, and a Gaussian sum can divide it."""
+
+    if TYPE_CHECKING:  # a field or a property of each model
+
+        @property
+        def geometry(self) -> Geometry:
+            """The world it is for."""
+
+        @property
+        def noise_sigma(self) -> Float[AnyArray, " q"]:
+            """σ of the white noise of one step (Q of P11)."""
+
+    def start(self) -> tuple[Any, Float[Array, "v v"]]:
+        """The variables before the first step, and a root of their covariance, `P = R Rᵀ`."""
+        return (), jnp.zeros((0, 0))
+
+    @abstractmethod
+    def displacement(self, variables: Any, noise: Float[Array, " q"], control: Any) -> Pose:
+        """T_{k-1,k}, the pose of C_k in C_{k-1}."""
+
+    def next(self, variables: Any, noise: Float[Array, " q"], control: Any) -> Any:
+        """The variables after the step; as they were, unless a model says otherwise."""
+        del noise, control
+        return variables
+
+    @abstractmethod
+    def still(self, dtype: Any = None) -> Any:
+        """The control with which nothing moves."""
+
+    def enlarged(
+        self, variables: Any, noise: Float[Array, " q"], factor: Float[Array, ""]
+    ) -> tuple[Any, Float[Array, " q"]]:
+        """Variables and noise in a unit of length that is 1/factor; a model that is told metres
+        has no other."""
+        del factor
+        return variables, noise
+
+
+def geometry_of(tangent: Float[AnyArray, " t"], what: str) -> Geometry:
+    """The world in which a pose has so many degrees of freedom. Raises ValueError."""
+    for geometry in GEOMETRIES.values():
+        if np.shape(tangent) == (geometry.tangent_dim,):
+            return geometry
+    raise ValueError(
+        f"{what} has shape {np.shape(tangent)}; it needs 3 numbers (x, z, θ) in a planar world or "
+        "6 (x, y, z, and about them) in a spatial one"
+    )
+
+
+class ConstantVelocity(AbstractMotion):
+    """Constant velocity with white acceleration; the control is Δt in seconds (P8, P9)."""
+
+    has_velocity: ClassVar[bool] = True
+
+    noise_sigma: Float[AnyArray, " t"] = number_field()
+    """σ of the acceleration, m/s² and rad/s², in the camera's axes."""
+    velocity: Float[AnyArray, " t"] = number_field()
+    """Mean of the velocity before the first step, m/s and rad/s, in the camera's axes."""
+    velocity_sigma: Float[AnyArray, " t"] | Float[AnyArray, "t t"] = number_field()
+    """σ of each of its numbers, or a root R of its covariance `R Rᵀ`."""
+
+    def __check_init__(self) -> None:
+        t = self.geometry.tangent_dim
+        check_shape("the velocity", self.velocity, (t,))
+        check_shape("the velocity's sigma", self.velocity_sigma, (t,), (t, t))
+
+    @property
+    def geometry(self) -> Geometry:
+        return geometry_of(self.noise_sigma, "the sigma of an acceleration")
+
+    def start(self) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
+        sigma = jnp.asarray(self.velocity_sigma)
+        return jnp.asarray(self.velocity), jnp.diag(sigma) if sigma.ndim == 1 else sigma
+
+    def displacement(self, variables, noise, control) -> Pose:
+        """`T_{k-1,k} = Exp((v + a Δt) Δt)` (P9)."""
+        return exp(self.geometry.group, self.next(variables, noise, control) * control)
+
+    def next(self, variables, noise, control) -> Float[Array, " t"]:
+        """`v_k = v_{k-1} + a Δt` (P8), linear then angular, in the camera's own frame."""
+        return variables + noise * control
+
+    def still(self, dtype=None):
+        return jnp.zeros((), dtype)
+
+    def enlarged(self, variables, noise, factor):
+        n = self.geometry.point_dim
+
+        def one(rates):
+            return jnp.concatenate([factor * rates[:n], rates[n:]])
+
+        return one(variables), one(noise)
+
+
+class Odometry(AbstractMotion):
+    """Odometry; the control is its reading u of a step, m and rad, with white error w."""
+
+    noise_sigma: Float[AnyArray, " t"] = number_field()
+    """σ of the reading of one step, m and rad, in the camera's axes."""
+
+    @property
+    def geometry(self) -> Geometry:
+        return geometry_of(self.noise_sigma, "the sigma of an odometry")
+
+    def displacement(self, variables, noise, control) -> Pose:
+        """`T_{k-1,k} = (R = Exp(θ), t = ρ)` with (ρ, θ) = u + w: move straight, then turn."""
+        del variables
+        moved, turned = jnp.split(control + noise, [self.geometry.point_dim])
+        return joined(exp(self.geometry.rotation_group, turned), moved)
+
+    def still(self, dtype=None):
+        return jnp.zeros(self.geometry.tangent_dim, dtype)
+
+
+class VehicleRates(eqx.Module):
+    """The control of `BodyRates`: what a vehicle V measures of its motion, and its camera."""
+
+    rates: Float[Array, " t"]
+    """Linear and angular velocity in the axes of V at k−1, m/s and rad/s."""
+    seconds: Float[Array, ""]
+    camera: Pose
+    """T_VC, the camera on the vehicle."""
+
+
+class BodyRates(AbstractMotion):
+    """Odometry of a vehicle that carries the camera off its centre; the control is `VehicleRates`.
+
+    The lever arm correlates what the camera sees of the rates' errors.
+    """
+
+    noise_sigma: Float[AnyArray, " t"] = number_field()
+    """σ of the white error of the rates, m/s and rad/s."""
+
+    @property
+    def geometry(self) -> Geometry:
+        return geometry_of(self.noise_sigma, "the sigma of a vehicle's rates")
+
+    def displacement(self, variables, noise, control: VehicleRates) -> Pose:
+        """`T_{k-1,k} = T_VC⁻¹ (R = Exp(ω Δt), t = v Δt) T_VC` with (v, ω) = rates + w."""
+        del variables
+        displaced = (control.rates + noise) * control.seconds
+        moved, turned = jnp.split(displaced, [self.geometry.point_dim])
+        step = joined(exp(self.geometry.rotation_group, turned), moved)
+        return control.camera.inverse() @ step @ control.camera
+
+    def still(self, dtype=None):
+        zero = jnp.zeros(self.geometry.tangent_dim, dtype)
+        return VehicleRates(zero, jnp.zeros((), dtype), identity(self.geometry, zero.dtype))
+
+
+def check_control(motion: AbstractMotion, control: Any) -> None:
+    """Raise ValueError unless a control has the structure and shapes that the model asks for."""
+    wanted = jax.eval_shape(motion.still)
+    found = jax.tree.structure(control), [np.shape(x) for x in jax.tree.leaves(control)]
+    if found != (jax.tree.structure(wanted), [x.shape for x in jax.tree.leaves(wanted)]):
+        raise ValueError(
+            f"the control of {type(motion).__name__} is {_described(wanted)}, "
+            f"not {_described(control)}"
+        )
+
+
+def _described(control: Any) -> str:
+    shapes = [str(np.shape(x)) for x in jax.tree.leaves(control)]
+    kind = "an array" if len(shapes) == 1 else f"{type(control).__name__} with arrays"
+    return f"{kind} of shape {', '.join(shapes)}"

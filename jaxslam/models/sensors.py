@@ -1,0 +1,170 @@
+"""What is measured of a point: its pixel, its position, or range and bearing from the sensor.
+
+A sensor is data: its numbers can be batched, perturbed by the uncertainty of its calibration and
+differentiated. One of your own is one class with the functions of `AbstractSensor`.
+"""
+
+from abc import abstractmethod
+from dataclasses import replace
+from typing import TYPE_CHECKING, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxslam.arrays import AnyArray, check_shape, number_field
+from jaxslam.models.camera import Camera, bearing, project
+
+Homogeneous = tuple[Float[Array, " n"], Float[Array, ""]]
+
+
+class AbstractSensor(eqx.Module):
+    """A measurement model of one homogeneous point (X, ω) in the sensor's frame."""
+
+    hidden: ClassVar[int] = 0
+    """How many numbers of a point one measurement does not tell: the size of their prior, q."""
+
+    if TYPE_CHECKING:  # a field or a property of each sensor
+
+        @property
+        def sigma(self) -> Float[AnyArray, ""] | Float[AnyArray, " p"]:
+            """σ of what is measured, one for all its numbers or one each."""
+
+        @property
+        def size(self) -> int:
+            """How many numbers a measurement has, p."""
+
+        @property
+        def point_dim(self) -> int:
+            """Coordinates of the points it measures: 2 in a planar world, 3 in a spatial one."""
+
+    @abstractmethod
+    def measure(self, point: Float[Array, " n"], omega: Float[Array, ""]) -> Float[Array, " p"]:
+        """The noise-free measurement."""
+
+    @abstractmethod
+    def locate(self, measured: Float[Array, " p"], hidden: Float[Array, " q"]) -> Homogeneous:
+        """The point, from a measurement and what that hides: the inverse of `measure`."""
+
+    def possible(self, point: Float[Array, " n"]) -> Bool[Array, ""]:
+        """Whether the point can be measured at all; any can, unless a sensor says otherwise."""
+        del point
+        return jnp.ones((), bool)
+
+    def chart(self, point: Float[Array, " n"], omega: Float[Array, ""]) -> Float[Array, " n"]:
+        """Coordinates in which every parametrization is nearly Gaussian; the point's own here."""
+        return point / omega
+
+    def residual(
+        self, measured: Float[Array, " p"], predicted: Float[Array, " p"]
+    ) -> Float[Array, " p"]:
+        """What a measurement differs by; a sensor of angles wraps them."""
+        return measured - predicted
+
+    @property
+    def noise(self) -> Float[Array, "p p"]:
+        """R of one measurement."""
+        return jnp.diag(jnp.broadcast_to(jnp.asarray(self.sigma), self.size) ** 2)
+
+    @property
+    def focal(self) -> Float[AnyArray, ""]:
+        """The unit in which landmarks in pixels are written; 1 where there are no pixels."""
+        return np.ones(())
+
+    def perturbed(self, delta: Float[Array, " k"]) -> "AbstractSensor":
+        """The sensor with the error δ of its calibration; of an empty δ, the sensor itself."""
+        if delta.size:
+            raise ValueError(f"{type(self).__name__} has no calibration that could be uncertain")
+        return self
+
+
+class Pinhole(AbstractSensor):
+    """A pixel (P14), on the homogeneous numerator; it hides 1/z. Chart (x/z, y/z, 1/z)."""
+
+    hidden: ClassVar[int] = 1
+
+    camera: Camera
+    sigma: Float[AnyArray, ""] | Float[AnyArray, " p"] = number_field()
+    """σ of a measured pixel."""
+
+    def __check_init__(self) -> None:
+        check_shape("a pixel's sigma", self.sigma, (), (self.size,))
+
+    @property
+    def size(self) -> int:
+        return self.camera.focal.shape[-1]
+
+    @property
+    def point_dim(self) -> int:
+        return self.size + 1
+
+    def measure(self, point, omega):
+        del omega
+        return project(self.camera, point)
+
+    def locate(self, measured, hidden):
+        return jnp.append(bearing(self.camera, measured), 1.0), hidden[0]
+
+    def possible(self, point):
+        return point[-1] > 0
+
+    def chart(self, point, omega):
+        return jnp.append(point[:-1], omega) / point[-1]
+
+    @property
+    def focal(self):
+        return self.camera.focal[0]
+
+    def perturbed(self, delta):
+        """Intrinsics moved by δ, of (f, c) or (fx, fy, cx, cy), pixels (P15)."""
+        return replace(self, camera=self.camera.perturbed(delta))
+
+
+class Position(AbstractSensor):
+    """The point in the sensor's frame, m, all around: the relative position of 2-D SLAM studies."""
+
+    sigma: Float[AnyArray, ""] | Float[AnyArray, " n"] = number_field()
+    """σ of each coordinate, m."""
+    point_dim: int = eqx.field(static=True, default=2)
+
+    def __check_init__(self) -> None:
+        check_shape("a position's sigma", self.sigma, (), (self.point_dim,))
+
+    @property
+    def size(self) -> int:
+        return self.point_dim
+
+    def measure(self, point, omega):
+        return point / omega
+
+    def locate(self, measured, hidden):
+        del hidden
+        return measured, jnp.ones((), measured.dtype)
+
+
+class RangeBearing(AbstractSensor):
+    """Distance, m, and direction, rad, of a point in a plane: `(|p|, atan2(x, z))`, all around."""
+
+    sigma: Float[AnyArray, " 2"] = number_field()
+    """σ of range and bearing, m and rad."""
+    size: ClassVar[int] = 2
+    point_dim: ClassVar[int] = 2
+
+    def __check_init__(self) -> None:
+        check_shape("the sigma of range and bearing", self.sigma, (2,))
+
+    def measure(self, point, omega):
+        x, z = point / omega
+        return jnp.stack([jnp.hypot(x, z), jnp.atan2(x, z)])
+
+    def locate(self, measured, hidden):
+        del hidden
+        distance, angle = measured
+        point = distance * jnp.stack([jnp.sin(angle), jnp.cos(angle)])
+        return point, jnp.ones((), measured.dtype)
+
+    def residual(self, measured, predicted):
+        difference = measured - predicted
+        angle = difference[1]
+        return difference.at[1].set(jnp.atan2(jnp.sin(angle), jnp.cos(angle)))

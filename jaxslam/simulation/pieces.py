@@ -1,0 +1,53 @@
+"""A scenario's numbers as the pieces of a filter: those of the truth, which the filter is told."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from jaxslam.arrays import numbers
+from jaxslam.models.calibration import AbstractCalibration, Considered, Estimated, Known, White
+from jaxslam.models.camera import Camera
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import AbstractMotion, ConstantVelocity, Odometry
+from jaxslam.models.sensors import AbstractSensor, Pinhole, Position
+from jaxslam.simulation.scenario import Scenario
+
+TREATMENTS = {
+    "white": White,
+    "consider": Considered,
+    "estimated": Estimated,
+    "known": lambda sigma: Known(),
+}
+"""Treatments of a calibration whose numbers have these σ."""
+
+
+def motion_of(scenario: Scenario) -> AbstractMotion:
+    """The motion model, with the noise of the truth and its start."""
+    if scenario.motion == "odometry":
+        return Odometry(scenario.odometry_sigma)
+    return ConstantVelocity(scenario.acceleration_sigma, scenario.velocity, scenario.velocity_sigma)
+
+
+def sensor_of(scenario: Scenario) -> AbstractSensor:
+    """The sensor, of nominal calibration."""
+    if scenario.sensor == "position":
+        return Position(scenario.position_sigma, point_dim=scenario.world.point_dim)
+    return Pinhole(Camera(scenario.focal, scenario.centre), scenario.pixel_sigma)
+
+
+def calibration_sigma_of(scenario: Scenario) -> Any:
+    """σ of (f, c) or (fx, fy, cx, cy), pixels."""
+    p = scenario.world.pixel_dim
+    return numbers((scenario.focal_sigma,) * p + (scenario.centre_sigma,) * p)
+
+
+def calibration_of(scenario: Scenario) -> AbstractCalibration:
+    """The treatment that the scenario recommends."""
+    return TREATMENTS[scenario.calibration](calibration_sigma_of(scenario))
+
+
+def depth_of(scenario: Scenario) -> InverseDepth:
+    """The prior on 1/z."""
+    if scenario.inverse_depth:
+        return InverseDepth(*scenario.inverse_depth)
+    return InverseDepth.beyond(scenario.nearest_depth)
