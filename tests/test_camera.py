@@ -1,4 +1,4 @@
-"""Tests of jaxslam.camera: projection against OpenCV, its inverse, scale and derivatives."""
+"""Tests of jaxslam.models.camera: projection against OpenCV, its inverse, scale and derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cases import central, quick_jit
 
-from jaxslam.camera import Camera, bearing, distort, project
+from jaxslam.models.camera import Camera, bearing, distort, project
 
 IDEAL = Camera(jnp.array([525.0, 524.0]), jnp.array([308.6, 236.5]))
 # The real camera of shared/data/costado.

@@ -1,12 +1,11 @@
 """Tests of the treatments of an uncertain calibration: considered, estimated, known."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Case
+from cases import Case, quick_jit, run_filter
 
 CALIBRATION = slice(9, 11)
 """Where the error of (f, c) is in the state: after the pose, the velocity and the noise."""
@@ -21,14 +20,15 @@ def turning():
     )
 
 
-def run(calibration, parameters=None):
-    """The last state, and covariances of all steps."""
+def run(calibration, sigma=None):
+    """The last state, and covariances of all steps; with other σ of the calibration, if given."""
     case = turning()
-    parameters = case.parameters() if parameters is None else parameters
-    compiled = case.compiled("robocentric", "inverse_scaling", calibration)
-    state, (poses, pose_covariances, covariances, nis) = compiled(
-        parameters, case.motion(), *case.frames(0)
-    )
+    compiled = case.compiled("robocentric", calibration=calibration)
+    if sigma is not None:
+        slam = case.filter("robocentric", calibration=calibration)
+        slam = replace(slam, calibration=replace(slam.calibration, sigma=sigma))
+        compiled = quick_jit(partial(run_filter, case.capacity, slam))
+    state, (poses, pose_covariances, covariances, nis) = compiled(case.controls(), *case.frames(0))
     return state, np.asarray(covariances), (poses.as_matrix(), pose_covariances, nis)
 
 
@@ -62,10 +62,8 @@ def test_a_turning_camera_estimates_its_calibration():
 
 @pytest.mark.parametrize("calibration", ["consider", "estimated"])
 def test_a_calibration_without_uncertainty_is_a_known_one(calibration):
-    parameters = turning().parameters()
-    exact = replace(parameters, intrinsics_sigma=jnp.zeros(2))
-    _, covariances, results = run(calibration, exact)
-    _, known_covariances, known_results = run("known", exact)
+    _, covariances, results = run(calibration, sigma=np.zeros(2))
+    _, known_covariances, known_results = run("known")
     for a, b in zip(results, known_results, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
     assert not covariances[:, CALIBRATION].any()

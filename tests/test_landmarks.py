@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from cases import central, close, each_geometry, each_landmark, named, pose, quick_jit
 
-from jaxslam.camera import Camera, project
 from jaxslam.geometry import joined
 from jaxslam.landmarks import (
     INVERSE_DEPTH,
@@ -19,6 +18,7 @@ from jaxslam.landmarks import (
     PARALLAX_ANGLE,
 )
 from jaxslam.landmarks.inverse_depth import angles_of
+from jaxslam.models.camera import Camera, project
 
 FOCAL = 650.0
 INVERSE_DEPTHS = (0.02, 0.15, 1.3)

@@ -1,4 +1,6 @@
-"""Tests of jaxslam.motion: what velocities, readings and their noise make of a pose."""
+"""Tests of jaxslam.models.motion: what velocities, readings and their noise make of a pose."""
+
+import itertools
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,10 +9,19 @@ from cases import each_geometry, named, quick_jit
 from scipy.spatial.transform import Rotation
 
 from jaxslam.geometry import PLANAR, exp, identity
-from jaxslam.motion import BODY_RATES, CONSTANT_VELOCITY, MOTIONS, ODOMETRY, BodyRates
+from jaxslam.models.motion import BodyRates, ConstantVelocity, Odometry, VehicleRates, check_control
+from jaxslam.simulation import scenario
+from jaxslam.simulation.pieces import motion_of
+from jaxslam.simulation.scenario import MOTIONS
 
 READING = np.array([0.3, -0.1, 0.7, 0.2, -0.5, 0.4])
 ERROR = np.array([0.02, 0.03, -0.01, -0.04, 0.05, 0.02])
+SCENARIOS = {"velocity": "matched", "odometry": "positions"}
+
+
+def sigmas(geometry):
+    """Of a noise that no test draws: of what geometry the model is."""
+    return np.ones(geometry.tangent_dim)
 
 
 def reading_of(geometry, numbers):
@@ -18,16 +29,19 @@ def reading_of(geometry, numbers):
     return numbers[[0, 2, 4]] if geometry is PLANAR else numbers
 
 
+def displacement(motion):
+    """Of (variables, noise, control), compiled."""
+    return quick_jit(lambda *x: motion.displacement(*x))
+
+
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_a_step_is_made_with_the_velocity_after_the_acceleration(geometry):
     """`v' = v + a Δt`, `T = Exp(v' Δt)` (P8, P9): by jaxlie's exponential, not ours."""
     velocity, acceleration = (jnp.asarray(reading_of(geometry, x)) for x in (READING, 50 * ERROR))
     after = velocity + 0.2 * acceleration
+    motion = ConstantVelocity(*(sigmas(geometry),) * 3)
     step, found = quick_jit(
-        lambda v, a, dt: (
-            CONSTANT_VELOCITY.displacement(geometry, v, a, dt),
-            CONSTANT_VELOCITY.next_velocity(v, a, dt),
-        )
+        lambda v, a, dt: (motion.displacement(v, a, dt), motion.next(v, a, dt))
     )(velocity, acceleration, jnp.asarray(0.2))
     np.testing.assert_allclose(found, after, rtol=0, atol=1e-14)
     expected = geometry.group.exp(0.2 * after)
@@ -38,9 +52,7 @@ def test_a_step_is_made_with_the_velocity_after_the_acceleration(geometry):
 def test_odometry_goes_straight_and_then_turns_by_its_reading_and_error(geometry):
     reading, error = (reading_of(geometry, x) for x in (READING, ERROR))
     n = geometry.point_dim
-    velocity = jnp.full(geometry.tangent_dim, jnp.nan)  # not used
-    displacement = quick_jit(lambda *x: ODOMETRY.displacement(geometry, *x))
-    step = displacement(velocity, error, reading)
+    step = displacement(Odometry(sigmas(geometry)))((), error, reading)
     turned = reading[n:] + error[n:]
     if geometry is PLANAR:
         c, s = np.cos(turned[0]), np.sin(turned[0])
@@ -55,13 +67,10 @@ def test_odometry_goes_straight_and_then_turns_by_its_reading_and_error(geometry
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_rates_of_a_vehicle_are_the_odometry_of_a_camera_at_its_centre(geometry):
     rates, error = (reading_of(geometry, x) for x in (READING, ERROR))
-    still = jnp.zeros(geometry.tangent_dim)
     seconds = jnp.asarray(0.2)
-    control = BodyRates(jnp.asarray(rates), seconds, identity(geometry, jnp.dtype(float)))
-    step = quick_jit(lambda *x: BODY_RATES.displacement(geometry, still, *x))(error, control)
-    expected = quick_jit(lambda *x: ODOMETRY.displacement(geometry, still, *x))(
-        0.2 * error, 0.2 * rates
-    )
+    control = VehicleRates(jnp.asarray(rates), seconds, identity(geometry, jnp.dtype(float)))
+    step = displacement(BodyRates(sigmas(geometry)))((), error, control)
+    expected = displacement(Odometry(sigmas(geometry)))((), 0.2 * error, 0.2 * rates)
     np.testing.assert_allclose(step.as_matrix(), expected.as_matrix(), atol=1e-15)
 
 
@@ -71,21 +80,47 @@ def test_a_vehicle_that_turns_moves_the_camera_by_its_lever_arm(geometry):
     rates = jnp.asarray(reading_of(geometry, READING))
     T_VC = exp(geometry.group, jnp.asarray(reading_of(geometry, 3 * ERROR + 0.2)))
     still = jnp.zeros(geometry.tangent_dim)
-    control = BodyRates(rates, jnp.asarray(0.5), T_VC)
-    step = quick_jit(lambda c: BODY_RATES.displacement(geometry, still, still, c))(control)
-    vehicle = quick_jit(lambda u: ODOMETRY.displacement(geometry, still, still, u))(0.5 * rates)
+    moved = displacement(BodyRates(sigmas(geometry)))
+    control = VehicleRates(rates, jnp.asarray(0.5), T_VC)
+    step = moved((), still, control)
+    vehicle = displacement(Odometry(sigmas(geometry)))((), still, 0.5 * rates)
     np.testing.assert_allclose((T_VC @ step).as_matrix(), (vehicle @ T_VC).as_matrix(), atol=1e-14)
     # A vehicle that only turns moves a camera off its centre.
     turning = rates.at[: geometry.point_dim].set(0.0)
-    control = BodyRates(turning, jnp.asarray(0.5), T_VC)
-    step = quick_jit(lambda c: BODY_RATES.displacement(geometry, still, still, c))(control)
+    control = VehicleRates(turning, jnp.asarray(0.5), T_VC)
+    step = moved((), still, control)
     assert np.linalg.norm(step.translation()) > 0.01
 
 
-def test_motions_are_known_by_their_names():
-    assert {name: motion.name for name, motion in MOTIONS.items()} == {
-        "velocity": "velocity",
-        "odometry": "odometry",
+def models(geometry):
+    sigma = sigmas(geometry)
+    return [ConstantVelocity(sigma, sigma, sigma), Odometry(sigma), BodyRates(sigma)]
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_of_the_control_that_is_still_nothing_moves(geometry):
+    for motion in models(geometry):
+        variables, noise = motion.start()[0], jnp.zeros(geometry.tangent_dim)
+        assert motion.geometry is geometry
+        check_control(motion, motion.still())
+        step = motion.displacement(variables, noise, motion.still())
+        np.testing.assert_array_equal(step.as_matrix(), np.eye(geometry.point_dim + 1))
+        np.testing.assert_array_equal(motion.next(variables, noise, motion.still()), variables)
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_a_control_of_another_model_is_refused(geometry):
+    for motion, other in itertools.permutations(models(geometry), 2):
+        with pytest.raises(ValueError, match=f"the control of {type(motion).__name__} is"):
+            check_control(motion, other.still())
+
+
+def test_motions_of_scenarios_are_known_by_their_names():
+    made = {word: motion_of(scenario(name)) for word, name in SCENARIOS.items()}
+    assert {word: type(motion) for word, motion in made.items()} == {
+        "velocity": ConstantVelocity,
+        "odometry": Odometry,
     }
-    assert MOTIONS["velocity"].has_velocity
-    assert not MOTIONS["odometry"].has_velocity
+    assert tuple(made) == MOTIONS
+    assert made["velocity"].has_velocity
+    assert not made["odometry"].has_velocity

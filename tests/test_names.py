@@ -2,11 +2,11 @@
 
 import pytest
 
-from jaxslam.filters import make_filters
-from jaxslam.geometry import PLANAR
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.names import chosen
-from jaxslam.rig import Rig
+from jaxslam.lookup import chosen
+from jaxslam.models.calibration import Known
+from jaxslam.names import make_filters
+from jaxslam.simulation import scenario
 
 COLOURS = {"red": 1, "green": 2, "blue": 3}
 
@@ -31,12 +31,12 @@ def test_a_name_that_is_not_known_is_refused_with_those_that_are(names, message)
 
 def test_filters_are_made_of_every_pair_of_names():
     frames = ["robocentric", "world", "keyframe"]
-    made = make_filters(Rig(PLANAR), frames, LANDMARKS, "known")
+    made = make_filters(scenario("matched"), frames, LANDMARKS, "known")
     assert list(made) == [f"{name}/{landmark}" for name in frames for landmark in LANDMARKS]
     for name, slam in made.items():
-        assert name == f"{slam.model.frame.name}/{slam.model.landmark.name}"
-        assert slam.calibration == "known"
-        assert slam.compose_first == (slam.model.frame.name != "robocentric")
+        assert name == f"{slam.coordinates.name}/{slam.landmark.name}"
+        assert isinstance(slam.calibration, Known)
+        assert slam.compose_first == (slam.coordinates.name != "robocentric")
 
 
 @pytest.mark.parametrize(
@@ -51,4 +51,4 @@ def test_filters_are_made_of_every_pair_of_names():
 )
 def test_filters_of_unknown_names_are_refused(filters, landmarks, calibration, message):
     with pytest.raises(ValueError, match=message):
-        make_filters(Rig(PLANAR), filters, landmarks, calibration)
+        make_filters(scenario("matched"), filters, landmarks, calibration)

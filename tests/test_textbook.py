@@ -79,7 +79,7 @@ def test_in_the_world_frame_the_filter_is_the_textbooks():
     case = Case("positions", steps=STEPS, seed=5)
     run = jax.tree.map(np.asarray, case.run(0))
     last, (poses, _, covariances, nis) = case.compiled("world", "cartesian")(
-        case.parameters(), case.motion(), *case.frames(0)
+        case.controls(), *case.frames(0)
     )
     sizes = []
     for k, (order, x, P, one_nis) in enumerate(textbook(run, case.scenario)):
