@@ -12,10 +12,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.filters import FILTERS, Parameters, make_filter
 from jaxslam.geometry import GEOMETRIES
-from jaxslam.landmarks import LANDMARKS
-from jaxslam.simulation import features, parameters, scenario, sightings, simulate
+from jaxslam.landmarks import INVERSE_SCALING, LANDMARKS
+from jaxslam.models.camera import Camera
+from jaxslam.models.coordinates import ROBOCENTRIC
+from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.sensors import Pinhole
+from jaxslam.names import make_filter, scenario_pieces
+from jaxslam.simulation import Room, features, scenario, sightings, simulate
+from jaxslam.slam.filter import EkfSlam
+from jaxslam.slam.protocol import Capacity
+from jaxslam.slam.readouts import camera_pose
 
 each_geometry = list(GEOMETRIES.values())
 each_landmark = list(LANDMARKS.values())
@@ -76,18 +83,24 @@ def close(actual, desired, relative):
     np.testing.assert_allclose(actual, desired, rtol=0, atol=relative * np.abs(desired).max())
 
 
-def run_filter(slam, capacity, parameters, motion, first, known, new):
-    """A whole run; the poses, covariances and NIS of every step, and the last state.
+def a_filter(geometry, landmark=INVERSE_SCALING, coordinates=ROBOCENTRIC, **pieces):
+    """A filter for what its numbers do not matter to: no noise, and a unit camera, so that its
+    Jacobians are of the same size as the rest. `pieces` replaces what `EkfSlam` takes."""
+    t, p = geometry.tangent_dim, geometry.pixel_dim
+    unit = {
+        "motion": ConstantVelocity(*np.zeros((3, t))),
+        "sensor": Pinhole(Camera(np.ones(p), np.zeros(p)), 0.0),
+    }
+    return EkfSlam(landmark=landmark, coordinates=coordinates, **{**unit, **pieces})
 
-    `motion` holds the nominal velocity, its σ, and the control of every step.
-    """
-    velocity, velocity_sigma, controls = motion
-    state = slam.start(parameters, capacity, velocity, velocity_sigma)
-    state = slam.first(state, parameters, first)
+
+def run_filter(capacity, slam, controls, first, known, new):
+    """A whole run; the poses, covariances and NIS of every step, and the last state."""
+    state = slam.init(capacity, first)
 
     def step(state, frame):
-        state, innovation = slam.step(state, parameters, *frame)
-        pose, pose_covariance = slam.camera_pose(state)
+        state, innovation = slam.step(state, *frame)
+        pose, pose_covariance = camera_pose(slam, state)
         return state, (pose, pose_covariance, state.covariance, innovation.nis)
 
     return jax.lax.scan(step, state, (controls, known, new))
@@ -107,31 +120,29 @@ class Case:
 
         self.runs, most = quick_jit(draw)(jnp.arange(runs))
         most = jax.tree.map(int, most)
+        self.room = Room(most.landmarks, most.first, most.known, most.new)
         self.capacity = most.landmarks
-        self.features = quick_jit(jax.vmap(lambda run: features(run, most)))(self.runs)
+        self.features = quick_jit(jax.vmap(lambda run: features(run, self.room)))(self.runs)
 
     def run(self, i):
         return jax.tree.map(lambda x: x[i], self.runs)
 
-    def parameters(self, dtype=None) -> Parameters:
-        return parameters(self.scenario, dtype)
+    def pieces(self, calibration=None):
+        """Motion, sensor, calibration and depth prior of the scenario, as `EkfSlam` takes them."""
+        return scenario_pieces(self.scenario, calibration)
 
-    def motion(self, i=0):
-        """Nominal velocity, its σ, and the controls of run i."""
-        s = self.scenario
-        return jnp.asarray(s.velocity), jnp.asarray(s.velocity_sigma), self.runs.controls[i]
+    def controls(self, i=0):
+        return self.runs.controls[i]
 
-    def function(self, slam):
-        """`(parameters, motion, first, known, new) → run`, to be compiled and mapped."""
-        return partial(run_filter, slam, self.capacity)
-
-    def filter(self, kind, landmark, calibration=None):
-        calibration = calibration or self.scenario.calibration
-        return FILTERS[kind](self.scenario.rig, LANDMARKS[landmark], calibration)
+    def filter(self, name, landmark="inverse_scaling", calibration=None):
+        """A filter by its name, modifiers and all, with the scenario's numbers."""
+        return make_filter(name, landmark=LANDMARKS[landmark], **self.pieces(calibration))
 
     @cache  # noqa: B019 - cases live as long as the tests
-    def compiled(self, kind, landmark, calibration=None):
-        return quick_jit(self.function(self.filter(kind, landmark, calibration)))
+    def compiled(self, name, landmark="inverse_scaling", calibration=None):
+        """`(controls, first, known, new) → run` of such a filter; see `run_filter`."""
+        slam = self.filter(name, landmark, calibration)
+        return quick_jit(partial(run_filter, self.capacity, slam))
 
     def frames(self, i):
         """Features of run i: first, known, new."""
@@ -139,19 +150,18 @@ class Case:
 
 
 def pose_run(of, slam, i=0, count=None):
-    """Every step's pose, its covariance and NIS of run i."""
+    """Every step's pose, its covariance, NIS and residual of run i."""
     first, known, new = of.frames(i)
-    velocity, sigma, controls = of.motion(i)
-    sizes = (known.slots.shape[1], new.slots.shape[1])
+    controls = of.controls(i)
+    capacity = Capacity(of.capacity, known.slots.shape[1], new.slots.shape[1])
 
     @quick_jit
-    def whole(parameters, first, known, new, controls):
-        state = slam.start(parameters, of.capacity, velocity, sigma, sizes)
-        state = slam.first(state, parameters, first)
+    def whole(first, known, new, controls):
+        state = slam.init(capacity, first)
 
         def step(state, frame):
-            state, innovation = slam.step(state, parameters, *frame)
-            pose, covariance = slam.camera_pose(state)
+            state, innovation = slam.step(state, *frame)
+            pose, covariance = camera_pose(slam, state)
             return state, (pose, covariance, innovation.nis, innovation.residual)
 
         return jax.lax.scan(step, state, (controls, known, new))
@@ -160,12 +170,7 @@ def pose_run(of, slam, i=0, count=None):
     if count is not None:
         parts = jax.tree.map(lambda x: x[:count], parts)
     known, new, controls = parts
-    return whole(of.parameters(), first, known, new, controls)
-
-
-def named_filter(of, name, landmarks="inverse_scaling", calibration=None):
-    calibration = calibration or of.scenario.calibration
-    return make_filter(of.scenario.rig, name, LANDMARKS[landmarks], calibration)
+    return whole(first, known, new, controls)
 
 
 def keys_used(monkeypatch, function):

@@ -1,14 +1,16 @@
-"""Tests of jaxslam.filters.slam: composition, robocentric against world, and whole runs in JAX."""
+"""Tests of jaxslam.slam.filter: composition, robocentric against world, and whole runs in JAX."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import (
     Case,
+    a_filter,
     close,
     each_geometry,
     few_landmarks,
@@ -18,30 +20,29 @@ from cases import (
     run_filter,
 )
 
-from jaxslam.camera import Camera
-from jaxslam.filters import (
-    CALIBRATIONS,
-    FILTERS,
-    Features,
-    Parameters,
-    SlamFilter,
-    SlamModel,
-    State,
-    ekf,
-)
-from jaxslam.filters.frames import KEYFRAME, ROBOCENTRIC, WORLD
-from jaxslam.filters.slam import Context, Core
+from jaxslam.arrays import cast
+from jaxslam.forms.covariance import Covariance, convert
+from jaxslam.forms.state import Features, State
 from jaxslam.geometry import PLANAR, SPATIAL, joined, retract
 from jaxslam.landmarks import (
-    FRAMED_HOMOGENEOUS,
     INVERSE_DEPTH_TO_CARTESIAN,
-    INVERSE_SCALING,
     LANDMARKS,
     PARALLAX_ANGLE,
 )
-from jaxslam.rig import Rig
-from jaxslam.simulation import parameters as scenario_parameters
+from jaxslam.models.calibration import Estimated
+from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
+from jaxslam.models.scale import ScaleGauge
+from jaxslam.names import make_filter, scenario_pieces
 from jaxslam.simulation import scenario
+from jaxslam.simulation.pieces import TREATMENTS
+from jaxslam.slam.filter import insert
+from jaxslam.slam.model import COMPOSED, Context, Core
+from jaxslam.slam.readouts import (
+    camera_pose,
+    landmarks_from_above,
+    landmarks_in_camera,
+    landmarks_in_world,
+)
 
 DT = 0.1
 
@@ -49,16 +50,16 @@ DT = 0.1
 @cache
 def composer(geometry, landmark, frame):
     """`(T_BC, velocity, acceleration, landmark) → the same after the motion`, no covariance."""
-    model = SlamModel(Rig(geometry), landmark, frame)
-    context = Context(None, jnp.asarray(DT))
+    model = a_filter(geometry, landmark, frame).model
+    context = Context(jnp.asarray(DT))
 
     def compose(pose, velocity, acceleration, parameters):
-        core = Core(frame.hold(pose), velocity, acceleration, jnp.zeros(0))
+        core = Core(frame.hold(pose), velocity, None, acceleration, jnp.zeros(0))
         moved = model.compose_core(core, context)
         if frame.moves_landmarks:
             view = model.view(core, context)
             parameters = model.compose_landmark(view, parameters, context)
-        return frame.camera_pose(moved.pose), moved.velocity, parameters
+        return frame.camera_pose(moved.pose), moved.motion, parameters
 
     return quick_jit(compose)
 
@@ -127,16 +128,16 @@ def test_both_frames_speak_of_the_same_camera_and_the_same_point(geometry, landm
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_in_a_gauge_the_noise_is_scaled_but_says_nothing_of_the_scale(geometry):
     """`a e^−λ` moves the camera, its turn as it is; but the derivative by λ is none."""
-    model = SlamModel(Rig(geometry), INVERSE_SCALING, ROBOCENTRIC)
+    model = a_filter(geometry, scale=ScaleGauge()).model
     rng, n = np.random.default_rng(3), geometry.point_dim
     velocity, noise = jnp.asarray(rng.normal(size=(2, geometry.tangent_dim)))
 
     def moved(log_scale, noise):
         held = ROBOCENTRIC.hold(pose(geometry, 2))
-        core = Core(held, velocity, noise, jnp.zeros(0), log_scale=log_scale)
-        context = Context(None, jnp.asarray(DT))
+        core = Core(held, velocity, log_scale, noise, jnp.zeros(0))
+        context = Context(jnp.asarray(DT))
         after = model.compose_core(core, context)
-        return model.displacement(core, context).as_matrix(), after.velocity
+        return model.displacement(core, context).as_matrix(), after.motion
 
     log_scale = jnp.array([0.7])
     derivatives = quick_jit(jax.jacfwd(moved))(log_scale, noise)
@@ -149,24 +150,25 @@ def test_in_a_gauge_the_noise_is_scaled_but_says_nothing_of_the_scale(geometry):
 
 @cache
 def in_gauge():
-    """A filter whose scale is known to a third, in frame 0, and the parameters."""
+    """A filter whose scale is known to a third, in frame 0."""
     case = tight()
-    slam, parameters = case.filter("scale_gauge", "inverse_scaling"), case.parameters()
+    slam = case.filter("scale_gauge")
+    slam = begun_with(slam, [1.2, 0.0, 0.0], [0.4, 0.1, 0.1])
+    return slam, quick_jit(partial(slam.init, case.capacity))(case.frames(0)[0])
 
-    def first(parameters, new):
-        velocity, sigma = jnp.array([1.2, 0.0, 0.0]), jnp.array([0.4, 0.1, 0.1])
-        return slam.first(slam.start(parameters, case.capacity, velocity, sigma), parameters, new)
 
-    return slam, parameters, quick_jit(first)(parameters, case.frames(0)[0])
+def begun_with(slam, velocity, sigma):
+    """The filter with another prior on the velocity before the first step."""
+    return replace(slam, motion=replace(slam.motion, velocity=velocity, velocity_sigma=sigma))
 
 
 def test_in_a_gauge_inverse_depths_have_the_moments_of_a_product_with_a_log_normal():
     """`E e^λ ρ = e^(λ + P/2) ρ0` and `E (e^λ ρ)² = e^(2λ + 2P) (ρ0² + σ²)`, exactly."""
-    slam, parameters, state = in_gauge()
-    log_scale, P = slam.engine.core_covariance(lambda core: core.log_scale, state)
+    slam, state = in_gauge()
+    log_scale, P = slam.marginal(state, lambda scene: scene.core.log_scale)
     log_scale, P = float(log_scale[0]), float(P[0, 0])
     assert P > 0.1
-    mean, sigma = float(parameters.inverse_depth), float(parameters.inverse_depth_sigma)
+    mean, sigma = float(slam.depth.mean), float(slam.depth.sigma)
     own = state.core_dim + 2  # of (x, z, ω) of landmark 0, in pixels
     first = mean * np.exp(log_scale + P / 2)
     second = (mean**2 + sigma**2) * np.exp(2 * log_scale + 2 * P)
@@ -176,19 +178,19 @@ def test_in_a_gauge_inverse_depths_have_the_moments_of_a_product_with_a_log_norm
 
 
 def test_in_a_gauge_lengths_are_told_in_metres():
-    slam, parameters, state = in_gauge()
+    slam, state = in_gauge()
     slots = jnp.arange(3)
 
     @quick_jit
     def told(log_scale):
-        T_BC = pose(PLANAR, 3)
-        core = replace(state.core, pose=slam.model.frame.hold(T_BC), log_scale=log_scale[None])
+        held = slam.coordinates.hold(pose(PLANAR, 3))
+        core = replace(state.core, pose=held, log_scale=log_scale[None])
         here = replace(state, core=core)
         return (
-            slam.camera_pose(here)[0].translation(),
-            slam.landmarks_in_world(here, parameters, slots)[0],
-            slam.landmarks_in_camera(here, parameters, slots)[0],
-            slam.landmarks_from_above(here, parameters, slots)[0],
+            camera_pose(slam, here)[0].translation(),
+            landmarks_in_world(slam, here, slots)[0],
+            landmarks_in_camera(slam, here, slots, slam.sensor)[0],
+            landmarks_from_above(slam, here, slots)[0],
         )
 
     one, larger = told(jnp.asarray(0.0)), told(jnp.asarray(0.5))
@@ -216,24 +218,17 @@ def test_robocentric_and_world_agree_where_the_problem_is_linear():
     # The noise is scaled in everything: pixels, motion, and the prior on depth, whose mean is
     # true. (Below a hundredth, jaxlie's derivatives near zero rotation are what is compared.)
     for scale in (1.0, 0.1):
-        parameters = case.parameters()
-        parameters = replace(
-            parameters,
-            motion_sigma=parameters.motion_sigma * scale,
-            measurement_sigma=parameters.measurement_sigma * scale,
-            inverse_depth_sigma=parameters.inverse_depth_sigma * scale,
-        )
         slots, valid = known.slots, known.valid
-        pixels = perfect_pixels(case, parameters, scale)
+        pixels = perfect_pixels(case, scale)
         frames = (
             replace(first, measured=pixels[0][first.slots]),
             Features(slots, jnp.take_along_axis(pixels[1:], slots[..., None], 1), valid),
             new,
         )
-        velocity, velocity_sigma, controls = case.motion()
-        motion = (velocity, velocity_sigma * scale, controls)
         (T, P), (U, Q) = (
-            case.compiled(kind, "inverse_scaling")(parameters, motion, *frames)[1][:2]
+            quick_jit(partial(run_filter, case.capacity, less_noisy(case.filter(kind), scale)))(
+                case.controls(), *frames
+            )[1][:2]
             for kind in ("robocentric", "world")
         )
         sigma = np.sqrt(np.einsum("kii->ki", np.asarray(P)))
@@ -245,6 +240,20 @@ def test_robocentric_and_world_agree_where_the_problem_is_linear():
     # In units of σ the difference is O(scale): measured 0.0286 and 0.0029.
     assert differences[1.0] < 0.06
     assert differences[0.1] < 0.2 * differences[1.0]
+
+
+def less_noisy(slam, scale):
+    """The filter with every σ times `scale`."""
+    motion, sensor, depth = slam.motion, slam.sensor, slam.depth
+    motion = replace(
+        motion,
+        noise_sigma=motion.noise_sigma * scale,
+        velocity_sigma=motion.velocity_sigma * scale,
+    )
+    sensor = replace(sensor, sigma=sensor.sigma * scale)
+    return replace(
+        slam, motion=motion, sensor=sensor, depth=replace(depth, sigma=depth.sigma * scale)
+    )
 
 
 def exact_run(chosen, points):
@@ -278,16 +287,17 @@ def test_robocentric_and_world_agree_to_rounding_where_nothing_is_noisy(landmark
     # At the mean of the prior on 1/z.
     points = np.stack([np.linspace(-2, 2, 5), np.full(5, 5.0)], axis=1)
     truth, controls, features = exact_run(chosen, points)
-    motion = jnp.zeros(3), jnp.zeros(3), controls
+    pieces = scenario_pieces(chosen)
 
     def run(kind):
-        slam = FILTERS[kind](chosen.rig, LANDMARKS[landmark], "known")
+        slam = make_filter(kind, landmark=LANDMARKS[landmark], **pieces)
 
-        def whole(parameters, *features):
-            state, records = run_filter(slam, 5, parameters, motion, *features)
-            return records, slam.landmarks_in_world(state, parameters, jnp.arange(5))
+        @quick_jit
+        def whole(*features):
+            state, records = run_filter(5, slam, controls, *features)
+            return records, landmarks_in_world(slam, state, jnp.arange(5))
 
-        return quick_jit(whole)(scenario_parameters(chosen), *features)
+        return whole(*features)
 
     ((T, P, _, nis), (X, X_covariance)), ((U, Q, _, _), (Y, Y_covariance)) = (
         run(kind) for kind in ("robocentric", "world")
@@ -303,12 +313,12 @@ def test_robocentric_and_world_agree_to_rounding_where_nothing_is_noisy(landmark
     assert P[-1][0, 0] < 15 * 0.01**2
 
 
-def perfect_pixels(case, parameters, scale):
+def perfect_pixels(case, scale):
     """Pixels of points at the mean of the prior, in the nominal motion, with scaled noise."""
     frames, landmarks = case.runs.visible.shape[1:]
     f, c = 650.0, 320.0
     bearings = (np.linspace(60, 580, landmarks) - c) / f
-    depth = 1 / float(parameters.inverse_depth)
+    depth = 1 / float(case.pieces()["depth"].mean)
     x = bearings * depth - 1.2 / 30 * np.arange(frames)[:, None]
     noise = np.random.default_rng(0).normal(size=x.shape) * 0.3 * scale
     return jnp.asarray(f * x / depth + c + noise)[..., None]
@@ -323,8 +333,8 @@ def near():
 @pytest.mark.parametrize("landmark", [name for name in LANDMARKS if name != "inverse_scaling"])
 def test_every_parametrization_is_the_same_filter_where_the_problem_is_linear(landmark):
     case = near()
-    data = case.parameters(), case.motion(), *case.frames(0)
-    _, (T, P, _, nis) = case.compiled("robocentric", "inverse_scaling")(*data)
+    data = case.controls(), *case.frames(0)
+    _, (T, P, _, nis) = case.compiled("robocentric")(*data)
     last, (U, Q, _, other_nis) = case.compiled("robocentric", landmark)(*data)
     sigma, other_sigma = (np.sqrt(np.einsum("kii->ki", np.asarray(x))) for x in (P, Q))
     # Measured 0.10 σ and 6 % for Cartesian points, 0.026 σ and 4 % after a conversion to them, and
@@ -341,30 +351,25 @@ def test_every_parametrization_is_the_same_filter_where_the_problem_is_linear(la
 
 
 def test_one_trace_serves_every_call_of_a_step():
+    """Also with other numbers of the filter, which are data."""
     case = tight()
-    slam = case.filter("robocentric", "inverse_scaling")
+    slam = begun_with(case.filter("robocentric"), np.zeros(3), np.full(3, 0.1))
     traces = []
 
-    def step(state, parameters, dt, known, new):
+    @eqx.filter_jit
+    def step(slam, state, dt, known, new):
         traces.append(None)
-        return slam.step(state, parameters, dt, known, new)
+        return slam.step(state, dt, known, new)
 
     first, known, new = case.frames(0)
-    start = quick_jit(
-        lambda parameters, first: slam.first(
-            slam.start(parameters, case.capacity, jnp.zeros(3), jnp.full(3, 0.1)),
-            parameters,
-            first,
-        )
-    )
-    state, compiled = start(case.parameters(), first), quick_jit(step)
-    for k, measurement_sigma in enumerate((0.3, 0.5, 1.0)):
-        parameters = replace(case.parameters(), measurement_sigma=jnp.asarray(measurement_sigma))
+    state = quick_jit(partial(slam.init, case.capacity))(first)
+    for k, sigma in enumerate((0.3, 0.5, 1.0)):
+        noisy = replace(slam, sensor=replace(slam.sensor, sigma=sigma))
         seen = jax.tree.map(lambda x, k=k: x[k], known)
         # What is seen, the noise, and the time all change.
         seen = replace(seen, valid=seen.valid & (jnp.arange(seen.valid.size) >= k))
         fresh = jax.tree.map(lambda x, k=k: x[k], new)
-        state, innovation = compiled(state, parameters, jnp.asarray(0.03 + 0.01 * k), seen, fresh)
+        state, innovation = step(noisy, state, jnp.asarray(0.03 + 0.01 * k), seen, fresh)
         assert innovation.nis_dof == seen.valid.sum()
     assert len(traces) == 1
 
@@ -377,15 +382,12 @@ def leaves_close(actual, expected, relative):
 
 def test_a_batch_of_runs_is_the_runs_one_by_one():
     case = tight()
-    parameters = case.parameters()
-    slam = case.filter("robocentric", "inverse_scaling")
-    mapped = jax.vmap(case.function(slam), in_axes=(None, None, 0, 0, 0))
-    _, (poses, pose_covariances, _, nis) = quick_jit(mapped)(
-        parameters, case.motion(), *case.features
-    )
+    run = partial(run_filter, case.capacity, case.filter("robocentric"))
+    mapped = jax.vmap(run, in_axes=(None, 0, 0, 0))
+    _, (poses, pose_covariances, _, nis) = quick_jit(mapped)(case.controls(), *case.features)
     for i in range(5):
-        _, (one, covariance, _, one_nis) = case.compiled("robocentric", "inverse_scaling")(
-            parameters, case.motion(), *case.frames(i)
+        _, (one, covariance, _, one_nis) = case.compiled("robocentric")(
+            case.controls(), *case.frames(i)
         )
         # The same sums in another order, over 60 steps.
         batch = jax.tree.map(lambda x, i=i: x[i], (poses, pose_covariances, nis))
@@ -396,10 +398,10 @@ def test_single_precision_is_near_double():
     case = tight()
 
     def result(dtype):
-        data = (case.parameters(), case.motion(), *case.frames(0))
-        data = jax.tree.map(np.asarray, data)
+        data = jax.tree.map(np.asarray, (case.controls(), *case.frames(0)))
         with jax.enable_x64(dtype == "float64"):
-            _, (T, P, _, nis) = case.compiled("robocentric", "inverse_scaling")(*data)
+            slam = cast(case.filter("robocentric"), dtype)
+            _, (T, P, _, nis) = quick_jit(partial(run_filter, case.capacity, slam))(*data)
         assert nis.dtype == dtype
         sigma = np.sqrt(np.einsum("kii->ki", np.asarray(P, float)))
         return np.asarray(T.parameters(), float), sigma, np.asarray(nis, float)
@@ -415,24 +417,22 @@ def test_a_run_can_be_differentiated_by_its_noise():
     """d(position, σ and NIS)/d(acceleration σ), backwards through every step."""
     case = Case("matched-tight", steps=4, landmarks=4)
     first, *later = case.frames(0)
-    slam = case.filter("robocentric", "inverse_scaling")
-    parameters, (velocity, velocity_sigma, controls) = case.parameters(), case.motion()
-    start = slam.start(parameters, case.capacity, velocity, velocity_sigma)
-    start = quick_jit(slam.first)(start, parameters, first)
+    slam = case.filter("robocentric")
+    start = quick_jit(partial(slam.init, case.capacity))(first)
 
     def score(sigma):
-        noisy = replace(parameters, motion_sigma=sigma)
+        noisy = replace(slam, motion=replace(slam.motion, noise_sigma=sigma))
 
         def step(state, frame):
-            state, innovation = slam.step(state, noisy, *frame)
+            state, innovation = noisy.step(state, *frame)
             return state, innovation.nis
 
-        state, nis = jax.lax.scan(step, start, (controls, *later))
+        state, nis = jax.lax.scan(step, start, (case.controls(), *later))
         pose_variance = jnp.trace(state.covariance[:3, :3])
         # Scaled so that each part matters: metres, log σ², and numbers compared.
         return 1e3 * state.core.pose.translation()[0] + jnp.log(pose_variance) + nis.mean()
 
-    sigma = parameters.motion_sigma
+    sigma = jnp.asarray(slam.motion.noise_sigma)
     both = quick_jit(jax.value_and_grad(score))
     gradient = np.asarray(both(sigma)[1])
     assert np.isfinite(gradient).all()
@@ -451,12 +451,13 @@ def convertible_state(model):
     geometry, rng = model.geometry, np.random.default_rng(6)
     t, p = geometry.tangent_dim, geometry.pixel_dim
     core = Core(
-        pose=model.frame.hold(pose(geometry, 11)),
-        velocity=jnp.asarray(rng.normal(0, 0.5, t)),
+        pose=model.coordinates.hold(pose(geometry, 11)),
+        motion=jnp.asarray(rng.normal(0, 0.5, t)),
+        log_scale=None,
         noise=jnp.zeros(t),
         calibration=jnp.asarray(rng.normal(0, 2, 2 * p)),
     )
-    T_AC = model.view(core, Context(None, None)).map_from_camera
+    T_AC = model.view(core, COMPOSED).map_from_camera
 
     def landmark(bearing, inverse_depth, anchor):
         seen = model.landmark.initialise(
@@ -485,31 +486,34 @@ def convertible_state(model):
     ids=named,
 )
 def test_a_conversion_changes_neither_points_nor_what_is_known_of_them(geometry, frame, landmark):
-    model = SlamModel(Rig(geometry), landmark, frame)
-    context = Context(Parameters(Camera(None, None), *[None] * 5), None)
+    calibration = Estimated(np.full(2 * geometry.pixel_dim, 2.0))
+    model = a_filter(geometry, landmark, frame, calibration=calibration).model
     n, slots = geometry.point_dim, jnp.arange(3)
 
     def view(core):
-        return model.view(core, context)
+        return model.view(core, COMPOSED)
+
+    def chart(view, landmark):
+        return model.sensor.chart(*model.metric_point(view, landmark))
 
     def charts(state, delta):
         """The error of the core, and the landmarks in the camera's chart."""
         c = state.core_dim
         here = view(retract(state.core, delta[:c]))
         landmarks = state.landmarks + delta[c:].reshape(state.landmarks.shape)
-        seen = jax.vmap(model.chart, in_axes=(None, 0))(here, landmarks[:3])
+        seen = jax.vmap(chart, in_axes=(None, 0))(here, landmarks[:3])
         return jnp.concatenate([delta[:c], seen.ravel()])
 
     def known(state):
         zero = jnp.zeros(len(state.covariance))
         J = jax.jacfwd(charts, argnums=1)(state, zero)
-        chart, own = ekf.landmark_covariance(view, model.chart, state, slots)
-        return charts(state, zero), J @ state.covariance @ J.T, chart, own
+        alone, own = Covariance().landmark_covariance(view, chart, state, slots)
+        return charts(state, zero), J @ state.covariance @ J.T, alone, own
 
     def both():
         state = convertible_state(model)
-        converted = ekf.convert(model, state, context)
-        again = ekf.convert(model, converted, context)
+        converted = convert(model, state, COMPOSED)
+        again = convert(model, converted, COMPOSED)
         return state, converted, again, known(state), known(converted)
 
     state, converted, again, before, after = quick_jit(both)()
@@ -517,11 +521,11 @@ def test_a_conversion_changes_neither_points_nor_what_is_known_of_them(geometry,
     np.testing.assert_array_equal(converted.landmarks[:, -1], [1, 0, 1, 0])
     for a, b in zip(after, before, strict=True):
         close(a, b, 1e-9)
-    chart, covariance, alone, own = before
+    all_charts, covariance, alone, own = before
     c = state.core_dim
     for i in range(3):  # the charts alone are the diagonal blocks of everything
         block = slice(c + i * n, c + (i + 1) * n)
-        close(alone[i], chart[block], 1e-12)
+        close(alone[i], all_charts[block], 1e-12)
         close(own[i], covariance[block, block], 1e-9)
     assert np.abs(covariance[:c, c:]).max() > 1e-5  # there is something to keep
     # What is not ready, and what is not there, stays as it is, and so does the core.
@@ -543,7 +547,7 @@ def test_a_conversion_changes_neither_points_nor_what_is_known_of_them(geometry,
 def test_the_start_is_exact_in_the_pose_and_empty_in_the_map():
     case = tight()
     slam = case.filter("robocentric", "inverse_scaling", "white")
-    state = slam.start(case.parameters(), 3, jnp.array([1.2, 0.0, 0.1]), jnp.array([0.1, 0.2, 0.3]))
+    state = begun_with(slam, [1.2, 0.0, 0.1], [0.1, 0.2, 0.3]).init(3)
     assert isinstance(state, State)
     assert not state.active.any()
     sigma = np.zeros(len(state.covariance))
@@ -557,17 +561,17 @@ def test_the_start_is_exact_in_the_pose_and_empty_in_the_map():
 def test_a_step_leaves_no_acceleration_and_no_white_calibration_behind(kind):
     case = tight()
     slam = case.filter(kind, "inverse_scaling", "white")
+    slam = begun_with(slam, np.zeros(3), np.full(3, 0.1))
     first, known, new = case.frames(0)
 
-    def two(parameters):
-        state = slam.start(parameters, case.capacity, jnp.zeros(3), jnp.full(3, 0.1))
-        state = slam.first(state, parameters, first)
-        predicted = slam.predict(state, parameters, jnp.asarray(DT))
+    def two(first):
+        state = slam.init(case.capacity, first)
+        predicted = slam.predict(state, jnp.asarray(DT))
         seen = jax.tree.map(lambda x: x[0], known)
         fresh = jax.tree.map(lambda x: x[0], new)
-        return predicted, slam.step(state, parameters, jnp.asarray(DT), seen, fresh)[0]
+        return predicted, slam.step(state, jnp.asarray(DT), seen, fresh)[0]
 
-    predicted, state = quick_jit(two)(case.parameters())
+    predicted, state = quick_jit(two)(first)
     appended = np.diag(predicted.covariance)[6:11]
     used = np.zeros(3) if slam.compose_first else np.full(3, 0.02**2)
     np.testing.assert_allclose(appended, [*used, 9.0, 4.0], rtol=1e-14)
@@ -580,18 +584,16 @@ def test_a_step_leaves_no_acceleration_and_no_white_calibration_behind(kind):
 @pytest.mark.parametrize("kind", ["robocentric", "world"])
 def test_a_map_from_above_is_azimuth_and_inverse_distance_along_the_axes_of_the_world(kind):
     """Of a camera that is turned in every direction; azimuth from z towards x."""
-    slam = FILTERS[kind](Rig(SPATIAL), INVERSE_SCALING, "known")
-    numbers = scenario_parameters(scenario("matched-6dof"))
+    slam = make_filter(kind, **scenario_pieces(scenario("matched-6dof")))
     seen = Features(jnp.arange(2), jnp.array([[100.0, 90.0], [500.0, 300.0]]), jnp.ones(2, bool))
     T_BC = pose(SPATIAL, 5, scale=1.0)
 
     @quick_jit
     def told():
-        state = slam.start(numbers, 2, jnp.zeros(6), jnp.full(6, 0.1))
-        state = replace(state, core=replace(state.core, pose=slam.model.frame.hold(T_BC)))
-        state = slam.insert(state, numbers, seen)
-        ask = (state, numbers, jnp.arange(2))
-        return slam.landmarks_from_above(*ask)[0], slam.landmarks_in_world(*ask)[0]
+        state = slam.init(2)
+        state = replace(state, core=replace(state.core, pose=slam.coordinates.hold(T_BC)))
+        ask = (slam, insert(slam, state, seen), jnp.arange(2))
+        return landmarks_from_above(*ask)[0], landmarks_in_world(*ask)[0]
 
     above, points = told()
     x, _, z = (points - T_BC.translation()).T
@@ -600,14 +602,13 @@ def test_a_map_from_above_is_azimuth_and_inverse_distance_along_the_axes_of_the_
 
 
 def test_a_frame_with_new_landmarks_becomes_an_anchor_that_no_other_landmark_has():
-    slam = FILTERS["robocentric"](Rig(PLANAR), FRAMED_HOMOGENEOUS, "known")
-    numbers = tight().parameters()
+    slam = tight().filter("robocentric", "framed_homogeneous")
 
     @quick_jit
     def inserted(state, slot):
-        return slam.insert(state, numbers, Features(slot, jnp.array([[300.0]]), jnp.array([True])))
+        return insert(slam, state, Features(slot, jnp.array([[300.0]]), jnp.array([True])))
 
-    state = slam.start(numbers, 3, jnp.zeros(3), jnp.full(3, 0.1))
+    state = slam.init(3)
     for slot in ([0], [1], [2]):
         state = inserted(state, jnp.array(slot))
     before = state.landmarks[:, -1].tolist()
@@ -617,10 +618,9 @@ def test_a_frame_with_new_landmarks_becomes_an_anchor_that_no_other_landmark_has
 
 
 def test_an_unknown_calibration_is_refused_by_name():
-    model = SlamModel(Rig(PLANAR), INVERSE_SCALING, ROBOCENTRIC)
     with pytest.raises(ValueError, match="'black'") as error:
-        SlamFilter(model, "black")
-    assert all(name in str(error.value) for name in CALIBRATIONS)
+        scenario_pieces(scenario("matched"), "black")
+    assert all(name in str(error.value) for name in TREATMENTS)
 
 
 @pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD, KEYFRAME], ids=named)
@@ -635,11 +635,11 @@ def test_a_frame_holds_every_pose_and_gives_it_back(geometry, frame):
 def test_pose_error_is_zero_at_the_truth_and_refers_to_the_covariance(kind):
     case = tight()
     T_BC, delta = pose(PLANAR, 4), np.array([0.01, -0.02, 0.03])
-    slam = case.filter(kind, "inverse_scaling")
-    state = slam.start(case.parameters(), 1, jnp.zeros(3), jnp.full(3, 0.1))
-    held = slam.model.frame.hold(T_BC)
+    slam = case.filter(kind)
+    state = slam.init(1)
+    held = slam.coordinates.hold(T_BC)
     state = replace(state, core=replace(state.core, pose=held))
-    state = ekf.augment(state, 0, jnp.diag(jnp.array([1.0, 2.0, 3.0])))
+    state = slam.form.augment(state, 0, jnp.diag(jnp.array([1.0, 2.0, 3.0])))
     error, covariance = slam.pose_error(state, T_BC)
     np.testing.assert_allclose(error, np.zeros(3), rtol=0, atol=1e-14)
     # By the derivative of a pose by itself: a turn there and back, which is the identity but for
