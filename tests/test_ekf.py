@@ -1,22 +1,40 @@
-"""Tests of jaxslam.filters.ekf: against dense filters and Jacobians, and what must not matter."""
+"""Tests of jaxslam.forms.covariance: dense filters and Jacobians, and what must not matter."""
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Case, central, close, each_geometry, few_landmarks, named, pose, quick_jit
+from cases import (
+    Case,
+    central,
+    close,
+    each_geometry,
+    few_landmarks,
+    named,
+    pose,
+    quick_jit,
+    run_filter,
+)
 
-from jaxslam.camera import Camera
-from jaxslam.filters import FILTERS, Features, Parameters, SlamModel, State, ekf
-from jaxslam.filters.frames import ROBOCENTRIC, WORLD
-from jaxslam.filters.slam import Context, Core
+from jaxslam.arrays import cast
+from jaxslam.forms.covariance import Covariance
+from jaxslam.forms.state import Features, State, Status
 from jaxslam.geometry import PLANAR, SPATIAL, difference, retract
 from jaxslam.landmarks import INVERSE_SCALING, LANDMARKS
-from jaxslam.rig import Rig
+from jaxslam.models.calibration import Known, White
+from jaxslam.models.camera import Camera
+from jaxslam.models.coordinates import ROBOCENTRIC, WORLD
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.sensors import Pinhole
+from jaxslam.slam.filter import EkfSlam
+from jaxslam.slam.model import COMPOSED, Context, Core
+
+EKF = Covariance()
 
 # --- a linear Gaussian problem, where the EKF must be the Kalman filter -------------------------
 
@@ -57,6 +75,9 @@ class Linear:
 
     def observe(self, view, landmark, context):
         return landmark[:2] + context.slant * landmark[2] - view, jnp.array(True)
+
+    def residual(self, measured, predicted):
+        return measured - predicted
 
     def initialise(self, view, pixel, e, context):
         return jnp.append(pixel + view - context.slant * e, e)
@@ -151,7 +172,7 @@ def linear_start():
         active=jnp.zeros(CAPACITY, bool),
         covariance=jnp.zeros((n, n)),
     )
-    return ekf.augment(state, 0, P)
+    return EKF.augment(state, 0, P)
 
 
 @cache
@@ -162,16 +183,16 @@ def linear_step(moves_landmarks, first=False):
     def step(state, slant, known, new, gone):
         here, motion = Frame(jnp.zeros(()), slant), Frame(jnp.asarray(DT), slant)
         if not first:
-            state = ekf.augment(state, 4, ACCELERATION_SIGMA**2 * jnp.eye(2))
+            state = EKF.augment(state, 4, ACCELERATION_SIGMA**2 * jnp.eye(2))
             if moves_landmarks:
-                state, _ = ekf.update(model, state, known, NOISE, motion)
-                state = ekf.compose(model, state, motion)
+                state, _ = EKF.update(model, state, known, NOISE, motion)
+                state = EKF.compose(model, state, motion)
             else:
-                state = ekf.compose(model, state, motion)
-                state, _ = ekf.update(model, state, known, NOISE, here)
+                state = EKF.compose(model, state, motion)
+                state, _ = EKF.update(model, state, known, NOISE, here)
         prior = tuple(jnp.array([number]) for number in PRIOR)
-        state = ekf.initialise(model, state, new, NOISE, prior, here)
-        return ekf.remove(state, gone)
+        state = EKF.initialise(model, state, new, NOISE, prior, here)
+        return EKF.remove(state, gone)
 
     return quick_jit(step)
 
@@ -225,7 +246,7 @@ def test_removal_zeroes_and_a_freed_slot_is_as_good_as_a_fresh_one():
     used, unused = LIVES[0][0], LIVES[5][0]
     assert state.active[used]
     assert not state.active[unused]
-    freed = quick_jit(ekf.remove)(state, np.arange(CAPACITY) == used)
+    freed = quick_jit(EKF.remove)(state, np.arange(CAPACITY) == used)
     rows = np.r_[6 + 3 * used : 9 + 3 * used]
     assert np.abs(state.covariance[rows]).max() > 0.01
     assert not np.any(freed.covariance[rows])
@@ -242,7 +263,7 @@ def test_removal_zeroes_and_a_freed_slot_is_as_good_as_a_fresh_one():
         return insert(freed, new, prior, here)
 
     insert = quick_jit(
-        lambda state, new, prior, here: ekf.initialise(Linear(True), state, new, NOISE, prior, here)
+        lambda state, new, prior, here: EKF.initialise(Linear(True), state, new, NOISE, prior, here)
     )
 
     again, fresh = inserted(used), inserted(unused)
@@ -275,6 +296,9 @@ class Scalar:
     def observe(self, view, landmark, context):
         return landmark, jnp.array(True)
 
+    def residual(self, measured, predicted):
+        return measured - predicted
+
 
 def test_prior_one_and_noise_one_end_with_one_half():
     """Counting a measurement twice, as an iterated filter may, would give 1/3."""
@@ -285,7 +309,7 @@ def test_prior_one_and_noise_one_end_with_one_half():
         covariance=jnp.diag(jnp.array([0.0, 1.0])),
     )
     seen = Features(jnp.array([0]), jnp.array([[3.0]]), jnp.array([True]))
-    update = quick_jit(lambda state, seen: ekf.update(Scalar(), state, seen, jnp.eye(1), None))
+    update = quick_jit(lambda state, seen: EKF.update(Scalar(), state, seen, jnp.eye(1), None))
     state, innovation = update(state, seen)
     # √2 and its inverse are rounded.
     np.testing.assert_allclose(state.covariance, np.diag([0.0, 0.5]), rtol=0, atol=1e-14)
@@ -296,16 +320,18 @@ def test_prior_one_and_noise_one_end_with_one_half():
 # --- the real models, against dense Jacobians of the whole state --------------------------------
 
 
-def slam_parameters(geometry):
+def pieces(geometry):
     p, t = geometry.pixel_dim, geometry.tangent_dim
-    return Parameters(
-        camera=Camera(jnp.array([650.0, 640.0])[:p], jnp.array([320.0, 240.0])[:p]),
-        intrinsics_sigma=jnp.array([3.0, 3.0, 2.0, 2.0][: 2 * p]),
-        measurement_sigma=jnp.asarray(0.3),
-        motion_sigma=jnp.full(t, 0.1),
-        inverse_depth=jnp.asarray(1 / 6),
-        inverse_depth_sigma=jnp.asarray(1 / 12),
-    )
+    return {
+        "motion": ConstantVelocity(np.full(t, 0.1), np.zeros(t), np.full(t, 0.1)),
+        "sensor": Pinhole(Camera([650.0, 640.0][:p], [320.0, 240.0][:p]), 0.3),
+        "calibration": White([3.0, 3.0, 2.0, 2.0][: 2 * p]),
+        "depth": InverseDepth(1 / 6, 1 / 12),
+    }
+
+
+def slam_model(geometry, landmark, coordinates):
+    return EkfSlam(landmark=landmark, coordinates=coordinates, **pieces(geometry)).model
 
 
 def noise_of(geometry):
@@ -323,12 +349,13 @@ def generic_state(model, capacity=3):
     geometry, rng = model.geometry, np.random.default_rng(8)
     t, p = geometry.tangent_dim, geometry.pixel_dim
     core = Core(
-        pose=model.frame.hold(pose(geometry, 11)),
-        velocity=jnp.asarray(rng.normal(0, 0.5, t)),
+        pose=model.coordinates.hold(pose(geometry, 11)),
+        motion=jnp.asarray(rng.normal(0, 0.5, t)),
+        log_scale=None,
         noise=jnp.asarray(rng.normal(0, 0.5, t)),
         calibration=jnp.asarray(rng.normal(0, 2, 2 * p)),
     )
-    T_AC = model.view(core, Context(None, jnp.asarray(STEP))).map_from_camera
+    T_AC = model.view(core, Context(jnp.asarray(STEP))).map_from_camera
     elsewhere = pose(geometry, 12, scale=0.1)
 
     def landmark(bearing, depth):
@@ -360,16 +387,15 @@ def whole_state_function(model, state, context):
 
 
 @cache
-def slam_case(geometry, landmark, frame):
+def slam_case(geometry, landmark, coordinates):
     """A generic state; compiled: update with composition, the dense function, its Jacobian."""
-    model = SlamModel(Rig(geometry), landmark, frame)
-    parameters = slam_parameters(geometry)
-    context = Context(parameters, jnp.asarray(STEP))
+    model = slam_model(geometry, landmark, coordinates)
+    context = Context(jnp.asarray(STEP))
     state = quick_jit(lambda: generic_state(model))()
 
     def block_wise(state, features):
-        updated, innovation = ekf.update(model, state, features, noise_of(geometry), context)
-        return updated, innovation, ekf.compose(model, state, context)
+        updated, innovation = EKF.update(model, state, features, noise_of(geometry), context)
+        return updated, innovation, EKF.compose(model, state, context)
 
     def dense(state, delta):
         return whole_state_function(model, state, context)(delta)
@@ -391,12 +417,12 @@ def middle_only(state, geometry, pixel):
 
 
 @pytest.mark.parametrize("landmark", few_landmarks, ids=named)
-@pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD], ids=named)
+@pytest.mark.parametrize("coordinates", [ROBOCENTRIC, WORLD], ids=named)
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_blocks_are_the_dense_jacobians_with_only_the_middle_landmark_seen(
-    geometry, frame, landmark
+    geometry, coordinates, landmark
 ):
-    state, block_wise, dense, jacobian = slam_case(geometry, landmark, frame)
+    state, block_wise, dense, jacobian = slam_case(geometry, landmark, coordinates)
     p, c, zero = geometry.pixel_dim, state.core_dim, np.zeros(len(state.covariance))
     pixels, composed = np.split(dense(state, zero), [3 * p])
     both = np.asarray(jacobian(state, zero))
@@ -428,6 +454,8 @@ def test_blocks_are_the_dense_jacobians_with_only_the_middle_landmark_seen(
     nis = (seen - pixels[middle]) @ np.linalg.solve(S, seen - pixels[middle])
     np.testing.assert_allclose(innovation.nis, nis, rtol=1e-9)
     assert innovation.nis_dof == p
+    np.testing.assert_allclose(innovation.log_det, np.linalg.slogdet(S)[1], rtol=1e-12)
+    assert innovation.status == Status.OK
 
     np.testing.assert_array_equal(updated.covariance, updated.covariance.T)
 
@@ -484,7 +512,7 @@ def behind(state):
 
 def removed(state):
     """The state without landmark 0."""
-    return ekf.remove(state, np.arange(3) == 0)
+    return EKF.remove(state, np.arange(3) == 0)
 
 
 @pytest.mark.parametrize(
@@ -519,21 +547,16 @@ def test_a_feature_that_cannot_be_used_changes_nothing(change, valid):
 
 
 def test_search_ellipses_are_the_diagonal_blocks_of_the_innovation_covariance():
-    for geometry, landmark, frame in (
+    for geometry, landmark, coordinates in (
         (PLANAR, INVERSE_SCALING, ROBOCENTRIC),
         (SPATIAL, LANDMARKS["inverse_depth"], WORLD),
     ):
-        state, block_wise, dense, _ = slam_case(geometry, landmark, frame)
-        parameters, p = slam_parameters(geometry), geometry.pixel_dim
-        model = SlamModel(Rig(geometry), landmark, frame)
+        state, block_wise, dense, _ = slam_case(geometry, landmark, coordinates)
+        p, model = geometry.pixel_dim, slam_model(geometry, landmark, coordinates)
         slots = jnp.array([2, 0])
         pixels, covariances, in_front = quick_jit(
-            lambda state, model=model, parameters=parameters, slots=slots: ekf.predict_features(
-                model,
-                state,
-                slots,
-                noise_of(model.geometry),
-                Context(parameters, jnp.asarray(STEP)),
+            lambda state, model=model, slots=slots: EKF.predict_features(
+                model, state, slots, noise_of(model.geometry), Context(jnp.asarray(STEP))
             )
         )(state)
         expected = dense(state, np.zeros(len(state.covariance)))[: 3 * p].reshape(3, p)
@@ -547,8 +570,8 @@ def test_search_ellipses_are_the_diagonal_blocks_of_the_innovation_covariance():
 def test_considered_numbers_count_but_are_not_corrected():
     """Schmidt (1966): P_xx, P_xc and P_cc by the textbook's partitioned equations."""
     state, _, dense, jacobian = planar_case()
-    model = SlamModel(Rig(PLANAR), INVERSE_SCALING, ROBOCENTRIC)
-    context = Context(slam_parameters(PLANAR), jnp.asarray(STEP))
+    model = slam_model(PLANAR, INVERSE_SCALING, ROBOCENTRIC)
+    context = Context(jnp.asarray(STEP))
     c, n = state.core_dim, len(state.covariance)
     calibration = slice(c - 2, c)
     seen = Features(jnp.arange(3), planar_pixels(state), jnp.ones(3, bool))
@@ -558,7 +581,7 @@ def test_considered_numbers_count_but_are_not_corrected():
                 model, state, seen, noise_of(PLANAR), context, calibration
             )
         )
-        for function in (ekf.update, ekf.update_mean)
+        for function in (EKF.update, EKF.update_mean)
     )
     updated, innovation = update(state)
 
@@ -595,28 +618,27 @@ def test_considered_numbers_count_but_are_not_corrected():
 # --- initialisation -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD], ids=named)
-def test_landmarks_of_one_frame_share_its_pose_and_its_calibration(frame):
+@pytest.mark.parametrize("coordinates", [ROBOCENTRIC, WORLD], ids=named)
+def test_landmarks_of_one_frame_share_its_pose_and_its_calibration(coordinates):
     """P ← J diag(P, R, σ², R, σ²) Jᵀ for two landmarks at once, the paper's P22–P26."""
-    model = SlamModel(Rig(PLANAR), INVERSE_SCALING, frame)
-    parameters = slam_parameters(PLANAR)
-    context = Context(parameters, None)
-    everyone = slam_case(PLANAR, INVERSE_SCALING, frame)[0]
-    state = ekf.remove(everyone, jnp.array([True, False, True]))
+    model = slam_model(PLANAR, INVERSE_SCALING, coordinates)
+    depth = cast(model.depth, float)
+    everyone = slam_case(PLANAR, INVERSE_SCALING, coordinates)[0]
+    state = EKF.remove(everyone, jnp.array([True, False, True]))
     c, d = state.core_dim, state.landmarks.shape[1]
-    pixels, w = jnp.array([[100.0], [500.0]]), parameters.inverse_depth
-    prior = (w[None], parameters.inverse_depth_sigma[None])
+    pixels, w = jnp.array([[100.0], [500.0]]), depth.mean
+    prior = (w[None], depth.sigma[None])
     new = Features(jnp.array([2, 0]), pixels, jnp.ones(2, bool))
 
     def block_wise(state):
-        return ekf.initialise(model, state, new, noise_of(PLANAR), prior, context)
+        return EKF.initialise(model, state, new, noise_of(PLANAR), prior, COMPOSED)
 
     def both(x):
-        view = model.view(retract(state.core, x[:c]), context)
+        view = model.view(retract(state.core, x[:c]), COMPOSED)
         return jnp.concatenate(
             [
-                model.initialise(view, pixels[0] + x[c], w[None] + x[c + 1], context),
-                model.initialise(view, pixels[1] + x[c + 2], w[None] + x[c + 3], context),
+                model.initialise(view, pixels[0] + x[c], w[None] + x[c + 1], COMPOSED),
+                model.initialise(view, pixels[1] + x[c + 2], w[None] + x[c + 3], COMPOSED),
             ]
         )
 
@@ -625,7 +647,7 @@ def test_landmarks_of_one_frame_share_its_pose_and_its_calibration(frame):
     P = np.asarray(state.covariance)
     full = np.zeros((c + 4, c + 4))
     full[:c, :c] = P[:c, :c]
-    full[c:, c:] = np.diag([0.09, float(parameters.inverse_depth_sigma) ** 2] * 2)
+    full[c:, c:] = np.diag([0.09, float(depth.sigma) ** 2] * 2)
     new_rows = np.r_[c + 2 * d : c + 3 * d, c : c + d]
     expected = J @ full @ J.T
     actual = np.asarray(after.covariance)[np.ix_(new_rows, new_rows)]
@@ -642,15 +664,9 @@ def test_landmarks_of_one_frame_share_its_pose_and_its_calibration(frame):
 
 def test_inverse_scaling_has_rank_three_when_the_focal_length_is_known():
     """Never invert a landmark block: (u − cx, v − cy, f, ω0) has a constant in it."""
-    slam = FILTERS["robocentric"](Rig(SPATIAL), INVERSE_SCALING, "known")
-    parameters = slam_parameters(SPATIAL)
+    slam = EkfSlam(**{**pieces(SPATIAL), "calibration": Known()})
     new = Features(jnp.array([0]), jnp.array([[100.0, 300.0]]), jnp.array([True]))
-
-    def first(parameters):
-        state = slam.start(parameters, 1, jnp.zeros(6), jnp.full(6, 0.1))
-        return slam.first(state, parameters, new).covariance
-
-    block = np.asarray(quick_jit(first)(parameters))[-4:, -4:]
+    block = np.asarray(quick_jit(lambda new: slam.init(1, new).covariance)(new))[-4:, -4:]
     values = np.linalg.eigvalsh(block)
     # Zero is found to 1e-15 of the largest, or so.
     assert values[0] <= 1e-13 * values[-1]
@@ -663,14 +679,11 @@ def test_inverse_scaling_has_rank_three_when_the_focal_length_is_known():
 @pytest.mark.parametrize("kind", ["robocentric", "world", "scale_gauge"])
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_covariance_stays_symmetric_and_positive_over_a_long_run(kind, dtype):
-    """In any precision, with landmarks whose covariance is singular: as `ekf.ROUNDING` says."""
+    """In any precision, with landmarks whose covariance is singular: see `ROUNDING`."""
     case = Case("matched-very-loose", steps=600)
-
-    def cast(tree):
-        return jax.tree.map(lambda x: x.astype(dtype) if x.dtype == jnp.float64 else x, tree)
-
-    data = case.parameters(dtype), cast(case.motion()), *cast(case.frames(0))
-    _, (_, _, covariances, nis) = case.compiled(kind, "inverse_scaling")(*data)
+    slam = cast(case.filter(kind), dtype)
+    data = cast((case.controls(), *case.frames(0)), dtype)
+    _, (_, _, covariances, nis) = quick_jit(partial(run_filter, case.capacity, slam))(*data)
     assert nis.dtype == dtype
     assert np.isfinite(nis).all()
     P = np.asarray(covariances, float)

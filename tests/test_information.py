@@ -1,7 +1,7 @@
 """Tests of the keyframe's frame, and of the information form against the covariance form."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -9,51 +9,39 @@ import numpy as np
 import pytest
 from cases import close, each_geometry, named, quick_jit
 
-from jaxslam.camera import Camera
-from jaxslam.filters import FILTERS, Features, Parameters, State, ekf, information
-from jaxslam.filters.frames import KEYFRAME_PARALLAX, KEYFRAME_TURN, keyframe_due
-from jaxslam.filters.information import EXACT_SIGMA, InformationState
+from jaxslam.forms import information
+from jaxslam.forms.covariance import Covariance
+from jaxslam.forms.information import EXACT_SIGMA, Information, InformationState
+from jaxslam.forms.state import Features, State
 from jaxslam.geometry import PLANAR, difference, exp, identity, joined, tangent_dim
 from jaxslam.landmarks import IMAGE_PLANE, INVERSE_SCALING
-from jaxslam.rig import Rig
+from jaxslam.models.camera import Camera
+from jaxslam.models.coordinates import KEYFRAME_PARALLAX, KEYFRAME_TURN, keyframe_due
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.sensors import Pinhole
+from jaxslam.names import FILTERS
+from jaxslam.simulation.pieces import TREATMENTS
+from jaxslam.slam.filter import context_of, reanchored
+from jaxslam.slam.readouts import camera_pose, landmarks_in_camera, landmarks_in_world
 
 CAPACITY, STEPS, DT = 5, 10, 0.1
 # Landmark of each slot: the frame in which it is new, and that after which it is removed.
 LIVES = ((0, None), (0, None), (3, None), (0, 5), (6, None))
 
 
-class AsExact:
-    """`ekf`, knowing nothing better than the information form can say."""
-
-    def __getattr__(self, name):
-        return getattr(ekf, name)
+class AsExact(Covariance):
+    """The covariance form, knowing nothing better than the information form can say."""
 
     def augment(self, state, start, covariance):
-        return ekf.augment(state, start, information.representable(covariance))
+        return super().augment(state, start, information.representable(covariance))
 
     def know(self, state, start, size):
         return self.augment(state, start, jnp.zeros((size, size)))
 
 
-def make(kind, geometry, calibration="white"):
-    return FILTERS[kind](Rig(geometry), IMAGE_PLANE, calibration)
-
-
 def axes(geometry, planar, spatial):
     return jnp.array(planar if geometry is PLANAR else spatial)
-
-
-def noises(geometry, scale=1.0):
-    """The filter's numbers, every σ times a scale."""
-    p, t = geometry.pixel_dim, geometry.tangent_dim
-    return Parameters(
-        camera=Camera(jnp.full(p, 400.0), jnp.full(p, 300.0)),
-        intrinsics_sigma=scale * jnp.full(2 * p, 2.0),
-        measurement_sigma=scale * jnp.array(1.0),
-        motion_sigma=scale * jnp.full(t, 0.3),
-        inverse_depth=jnp.array(0.25),
-        inverse_depth_sigma=scale * jnp.array(0.05),
-    )
 
 
 def velocity(geometry):
@@ -61,15 +49,28 @@ def velocity(geometry):
     return axes(geometry, [0.3, 0.1, 0.14], [0.3, 0.0, 0.1, 0.0, -0.14, 0.02])
 
 
+def make(kind, geometry, calibration="white", scale=1.0, landmark=IMAGE_PLANE):
+    """A filter, every σ of which is times a scale."""
+    p, t = geometry.pixel_dim, geometry.tangent_dim
+    return FILTERS[kind](
+        motion=ConstantVelocity(
+            scale * np.full(t, 0.3), velocity(geometry), scale * np.full(t, 0.02)
+        ),
+        sensor=Pinhole(Camera(np.full(p, 400.0), np.full(p, 300.0)), scale * 1.0),
+        landmark=landmark,
+        calibration=TREATMENTS[calibration](scale * np.full(2 * p, 2.0)),
+        depth=InverseDepth(0.25, scale * 0.05),
+    )
+
+
 @cache
 def world(geometry, scale=1.0):
     """New and known features, and removed landmarks, of every frame; all errors times a scale."""
     rng = np.random.default_rng(3)
-    parameters = noises(geometry, scale)
-    rig, p = Rig(geometry), geometry.pixel_dim
+    slam, p = make("keyframe", geometry, scale=scale), geometry.pixel_dim
     still, poses = jnp.zeros(geometry.tangent_dim), [identity(geometry, jnp.float64)]
     started = velocity(geometry) + scale * 0.02 * rng.normal(size=geometry.tangent_dim)
-    step = rig.motion.displacement(geometry, started, still, DT)
+    step = slam.motion.displacement(started, still, DT)
     for _ in range(STEPS):
         poses.append(poses[-1] @ step)
     # The depths that the prior speaks of are those in the camera that sees a landmark first.
@@ -81,9 +82,7 @@ def world(geometry, scale=1.0):
     new, seen, gone = [], [], []
     for k, pose in enumerate(poses):
         inside = jax.vmap(pose.inverse().apply)(points)
-        pixels = jax.vmap(rig.sensor.measure, in_axes=(None, 0, None))(
-            parameters.camera, inside, 1.0
-        )
+        pixels = jax.vmap(slam.sensor.measure, in_axes=(0, None))(inside, 1.0)
         pixels += scale * rng.normal(size=pixels.shape)
         slots = jnp.arange(CAPACITY)
         unseen = k % 3 == np.arange(CAPACITY) % 3  # every landmark is missed now and then
@@ -94,36 +93,37 @@ def world(geometry, scale=1.0):
     return tuple(jax.tree.map(lambda *x: jnp.stack(x), *part) for part in (new, seen, gone))
 
 
-def run(slam, parameters, pose_sigma, new, seen, gone):
+def run(slam, pose_sigma, new, seen, gone):
     """States, covariances, NIS and camera poses of every step, from an uncertain pose."""
-    geometry = slam.geometry
-    sigma = parameters.motion_sigma / 0.3 * 0.02
-    state = slam.start(parameters, CAPACITY, velocity(geometry), sigma)
+    state = slam.init(CAPACITY)
     size = tangent_dim(state.core.pose)
-    state = slam.engine.augment(state, 0, pose_sigma**2 * jnp.eye(size))
-    state = slam.first(state, parameters, jax.tree.map(lambda x: x[0], new))
+    state = slam.form.augment(state, 0, pose_sigma**2 * jnp.eye(size))
+    if slam.calibration.each_frame:
+        drawn = jnp.diag(slam.calibration.sigma**2)
+        state = slam.form.augment(state, state.core.part("calibration").start, drawn)
+    state = slam.close(state, jax.tree.map(lambda x: x[0], new))
 
     def step(state, frame):
         new, seen, gone = frame
-        state, innovation = slam.step(state, parameters, jnp.array(DT), seen, new)
+        state, innovation = slam.step(state, jnp.array(DT), seen, new)
         state = slam.remove(state, gone)
-        return state, (state, state.covariance, innovation.nis, slam.camera_pose(state))
+        return state, (state, state.covariance, innovation.nis, camera_pose(slam, state))
 
     later = jax.tree.map(lambda x: x[1:], (new, seen, gone))
     return jax.lax.scan(step, state, later)[1]
 
 
 @cache
-def compiled(kind, geometry, engine=None, calibration="white"):
-    slam = make(kind, geometry, calibration)
-    slam = slam if engine is None else replace(slam, engine=engine)
-    return quick_jit(lambda *data: run(slam, *data))
+def compiled(kind, geometry, form=None, calibration="white", scale=1.0):
+    slam = make(kind, geometry, calibration, scale)
+    slam = slam if form is None else replace(slam, form=form)
+    return quick_jit(partial(run, slam))
 
 
 @cache
 def both_forms(geometry):
     """The same run in both, exact quantities being known to 0.1 mm: a well-conditioned Λ."""
-    data = (noises(geometry), jnp.array(1e-2), *world(geometry))
+    data = (jnp.array(1e-2), *world(geometry))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(information, "EXACT_SIGMA", 1e-4)
         covariance_form = compiled("keyframe", geometry, AsExact())(*data)
@@ -184,8 +184,8 @@ def test_what_is_not_in_the_state_has_no_information_at_all(geometry):
 
 def correlated(geometry, calibration="white"):
     """A keyframe filter's state in both forms, all of it correlated; slots 1 and 4 are empty."""
-    slam, parameters = make("keyframe", geometry, calibration), noises(geometry)
-    state = slam.start(parameters, CAPACITY, velocity(geometry), jnp.zeros(geometry.tangent_dim))
+    slam = make("keyframe", geometry, calibration)
+    state = slam.init(CAPACITY)
     rng = np.random.default_rng(1)
     active = np.array([True, False, True, True, False])
     d, c = geometry.point_dim, state.core_dim
@@ -200,7 +200,7 @@ def correlated(geometry, calibration="white"):
     landmarks = jnp.asarray(landmarks)
     mean = replace(state.core, pose=held), landmarks, jnp.asarray(active)
     P, L = jnp.asarray(P), jnp.asarray(L)
-    return slam, parameters, State(*mean, P), InformationState(*mean, L)
+    return slam, State(*mean, P), InformationState(*mean, L)
 
 
 def sighting(geometry):
@@ -211,19 +211,19 @@ def sighting(geometry):
 
 @cache
 def updated(geometry):
-    slam, parameters, *states = correlated(geometry)
+    slam, *states = correlated(geometry)
 
-    def update(engine, state):
-        form = replace(slam, engine=engine)
+    def update(form, state):
+        made = replace(slam, form=form)
         dt, seen = jnp.array(DT), sighting(geometry)
-        after, innovation = form.update(state, parameters, dt, seen)
-        mean = form.update_mean(state, parameters, dt, seen)
-        search = form.predict_features(state, parameters, dt, jnp.array([3, 0]))
-        return after, after.covariance, innovation, mean, search
+        after, innovation = made.update(state, dt, seen)
+        mean = made.update_mean(state, dt, seen)
+        search = made.predict_features(state, dt, jnp.array([3, 0]))
+        return after, after.covariance, innovation, mean, search[:3]
 
     return [
-        (state, *quick_jit(lambda state, engine=engine: update(engine, state))(state))
-        for engine, state in zip((ekf, information), states, strict=True)
+        (state, *quick_jit(partial(update, form))(state))
+        for form, state in zip((Covariance(), Information()), states, strict=True)
     ]
 
 
@@ -260,18 +260,17 @@ def test_an_update_touches_no_block_between_two_landmarks(geometry):
 
 
 def test_landmarks_are_coupled_by_marginalising_the_pose_and_not_before():
-    slam, parameters = make("information", PLANAR, "known"), noises(PLANAR)
+    slam = make("information", PLANAR, "known")
     new, seen, _ = world(PLANAR)
 
     @quick_jit
     def coupling(new, seen):
-        state = slam.start(parameters, CAPACITY, velocity(PLANAR), jnp.full(3, 0.02))
-        first = slam.first(state, parameters, new)
+        first = slam.init(CAPACITY, new)
         seen, dt = replace(seen, valid=first.active), jnp.array(DT)
-        again, _ = slam.update(first, parameters, dt, seen)
-        moved, _ = slam.update(slam.predict(first, parameters, dt), parameters, dt, seen)
-        c = state.core_dim
-        states = (again, slam.reanchor(moved))
+        again, _ = slam.update(first, dt, seen)
+        moved, _ = slam.update(slam.predict(first, dt), dt, seen)
+        c = first.core_dim
+        states = (again, reanchored(slam, moved))
         return [state.information[c : c + 2, c + 2 : c + 4] for state in states]
 
     before, after = coupling(*(jax.tree.map(lambda x: x[0], f) for f in (new, seen)))
@@ -284,14 +283,18 @@ def test_landmarks_are_coupled_by_marginalising_the_pose_and_not_before():
 
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_reanchoring_changes_neither_the_camera_nor_the_points(geometry):
-    slam, parameters, state, _ = correlated(geometry, "known")
+    slam, state, _ = correlated(geometry, "known")
     slots = jnp.array([0, 2, 3])
 
     def told(state):
-        points = slam.landmarks_in_world(state, parameters, slots)
-        return slam.camera_pose(state), points, slam.landmarks_in_camera(state, parameters, slots)
+        points = landmarks_in_world(slam, state, slots)
+        return (
+            camera_pose(slam, state),
+            points,
+            landmarks_in_camera(slam, state, slots, slam.sensor),
+        )
 
-    after = quick_jit(slam.reanchor)(state)
+    after = quick_jit(partial(reanchored, slam))(state)
     told = quick_jit(told)
     for a, b in zip(jax.tree.leaves(told(after)), jax.tree.leaves(told(state)), strict=True):
         close(a, b, 1e-12)
@@ -305,8 +308,10 @@ def test_reanchoring_changes_neither_the_camera_nor_the_points(geometry):
 def test_keyframe_and_world_filter_differ_to_second_order():
     apart = []
     for scale in (0.1, 0.01):
-        data = (noises(PLANAR, scale), jnp.array(0.0), *world(PLANAR, scale))
-        runs = [compiled(kind, PLANAR, None, "known")(*data) for kind in ("keyframe", "world")]
+        data = (jnp.array(0.0), *world(PLANAR, scale))
+        runs = [
+            compiled(kind, PLANAR, None, "known", scale)(*data) for kind in ("keyframe", "world")
+        ]
         (ours, P), (theirs, _) = (run[3] for run in runs)
         shift = jax.vmap(difference)(ours, theirs)
         apart.append(np.abs(shift / np.sqrt(np.diagonal(P, axis1=1, axis2=2)))[-1].max())
@@ -330,13 +335,13 @@ def test_a_keyframe_is_due_after_a_turn_or_a_baseline():
 @pytest.mark.parametrize("landmark", [INVERSE_SCALING, IMAGE_PLANE], ids=named)
 def test_a_parallax_is_the_way_from_the_keyframe_by_the_distance_of_the_map(landmark):
     """Whatever length a parametrization gives to a ray, and of landmarks in the map alone."""
-    slam = FILTERS["keyframe"](Rig(PLANAR), landmark, "known")
+    slam = make("keyframe", PLANAR, "known", landmark=landmark)
     distance = 5.0
     ray = jnp.array([0.75, 1.0])
     seen = landmark.initialise(ray, jnp.asarray(1.25 / distance), jnp.asarray(650.0))
 
     def due(way, inverse_depth):
-        state = slam.start(noises(PLANAR), 3, jnp.zeros(3), jnp.full(3, 0.1))
+        state = slam.init(3)
         empty = landmark.initialise(ray, jnp.asarray(inverse_depth), jnp.asarray(650.0))
         there = joined(state.core.pose.keyframe_from_camera.rotation(), jnp.array([0.0, way]))
         pose = replace(state.core.pose, keyframe_from_camera=there)
@@ -358,20 +363,20 @@ def test_a_parallax_is_the_way_from_the_keyframe_by_the_distance_of_the_map(land
 
 def test_an_exact_start_is_known_to_the_least_sigma():
     slam = make("information", PLANAR)
-
-    @quick_jit
-    def started(parameters):
-        return slam.camera_pose(slam.start(parameters, 1, jnp.zeros(3), jnp.full(3, 0.1)))
-
-    covariance = started(noises(PLANAR))[1]
+    covariance = quick_jit(lambda: camera_pose(slam, slam.init(1)))()[1]
     np.testing.assert_allclose(covariance, 2 * EXACT_SIGMA**2 * np.eye(3), rtol=1e-12, atol=1e-24)
 
 
 def test_redundant_landmarks_and_considered_calibration_are_refused():
     with pytest.raises(ValueError, match=r"image_plane.*not inverse_scaling"):
-        FILTERS["information"](Rig(PLANAR), INVERSE_SCALING, "known")
+        make("information", PLANAR, "known", landmark=INVERSE_SCALING)
     with pytest.raises(ValueError, match="consider"):
         make("information", PLANAR, "consider")
-    slam, parameters, _, state = correlated(PLANAR, "consider")
+    slam, _, state = correlated(PLANAR, "consider")
     with pytest.raises(ValueError, match="consider"):
-        replace(slam, engine=information).update(state, parameters, DT, sighting(PLANAR))
+        replace(slam, form=Information())
+    seen, context = sighting(PLANAR), context_of(slam, jnp.array(DT))
+    with pytest.raises(ValueError, match="consider"):
+        Information().update(
+            slam.model, state, seen, slam.sensor.noise, context, state.core.part("calibration")
+        )

@@ -40,6 +40,7 @@ from jaxslam.forms.blocks import (
 from jaxslam.forms.form import AbstractGaussian
 from jaxslam.forms.state import Features, Innovation, judged
 from jaxslam.geometry import jacobian, tangent_dim
+from jaxslam.landmarks import LANDMARKS
 from jaxslam.linalg import Cholesky, cholesky, inverse
 
 EXACT_SIGMA = 1e-6
@@ -85,9 +86,10 @@ class Information(AbstractGaussian):
         inverse, for those that change their form, and for a calibration that is considered."""
         n, landmark = slam.motion.geometry.point_dim, slam.landmark
         if landmark.size(n) != n or landmark.convert is not None:
+            minimal = ", ".join(p.name for p in LANDMARKS.values() if p.size(n) == n)
             raise ValueError(
-                f"the information form needs landmarks of {n} parameters, in one form, "
-                f"not {landmark.name}"
+                f"the information form needs landmarks of {n} parameters, in one form "
+                f"({minimal}), not {landmark.name}"
             )
         if not slam.calibration.corrected:
             raise ValueError("the information form cannot consider a calibration: estimate it")
