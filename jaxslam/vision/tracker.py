@@ -178,6 +178,7 @@ class Tracker:
         dt = frame.time - (-np.inf if self._time is None else self._time)
         if not dt > 0:
             raise ValueError(f"frame {frame.index}: its time is not later than the one before")
+        dt = jnp.asarray(dt)  # a number of Python's would be compiled into the programs
         predicted, prediction = _predict(self._slam, self._state, dt)
         prediction = jax.device_get(prediction)
         prediction = prediction._replace(T_wc=self._origin.T_wc @ prediction.T_wc)
@@ -185,7 +186,7 @@ class Tracker:
         found = self._search(frame, prediction, slots)
         matched, features = self._features(slots, found)
         least = max(LEAST_INLIERS, len(slots) // 2) if self._unmeasured else LEAST_INLIERS
-        state, result = _correct(self._slam, *predicted, dt, features, least)
+        state, result = _correct(self._slam, *predicted, dt, features, jnp.asarray(least))
         used, nis, nis_dof, status = jax.device_get(result)
         self._time = frame.time
         if status >= Status.NOT_POSITIVE:
@@ -221,7 +222,7 @@ class Tracker:
             lost=lost,
         )
 
-    def _fall_back(self, predicted: tuple[Any, Any], dt: float) -> None:
+    def _fall_back(self, predicted: tuple[Any, Any], dt: jax.Array) -> None:
         """The covariance is no longer positive: what prediction alone says of the camera.
 
         Where that is broken too, the camera is as far from where it was last as the prior on a
@@ -229,11 +230,12 @@ class Tracker:
         """
         self._remove(sorted(self.landmarks))
         nothing = _padded(np.zeros(0, int), np.zeros((0, 2)), self.settings.wanted)
-        state, result = _correct(self._slam, *predicted, dt, nothing, LEAST_INLIERS)
+        least = jnp.asarray(LEAST_INLIERS)
+        state, result = _correct(self._slam, *predicted, dt, nothing, least)
         if int(result[-1]) >= Status.NOT_POSITIVE:
             self._origin = self._camera
             predicted, _ = _predict(self._slam, self._empty_state(), dt)
-            state, _ = _correct(self._slam, *predicted, dt, nothing, LEAST_INLIERS)
+            state, _ = _correct(self._slam, *predicted, dt, nothing, least)
         self._state = state
 
     def _lost(self, frame: Frame, **searched) -> Tracked:
@@ -430,7 +432,6 @@ def _remove(slam: AbstractStaged, state: Any, gone: Any) -> Any:
 @eqx.filter_jit
 def _predict(slam: AbstractStaged, state: Any, dt: Any) -> tuple[tuple[Any, Any], _Prediction]:
     """The predicted state, as it is and as one Gaussian, and what that expects to see."""
-    dt = jnp.asarray(dt)
     slots = jnp.arange(slam.in_map(state).size)
     state = slam.predict(state, dt)
     one, gaussian = slam.gaussian(state, dt)
@@ -445,7 +446,6 @@ def _predict(slam: AbstractStaged, state: Any, dt: Any) -> tuple[tuple[Any, Any]
 def _correct(
     slam: AbstractStaged, state: Any, gaussian: Any, dt: Any, features: Features, least: Any
 ) -> tuple[Any, tuple]:
-    dt = jnp.asarray(dt)
     one, _ = slam.gaussian(state, dt)
     agreed = inliers(one, gaussian, dt, features)
     # A few of many that were searched can agree by chance: a lost camera only moves.
