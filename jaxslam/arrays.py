@@ -13,7 +13,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 T = TypeVar("T")
 
@@ -24,7 +23,7 @@ else:
     AnyArray = jax.Array | np.ndarray
 
 
-def numbers(values: ArrayLike | tuple[Any, ...]) -> AnyArray:
+def numbers(values: Any) -> AnyArray:
     """An array of floating-point numbers; JAX's arrays are left as they are."""
     if isinstance(values, jax.Array):
         return values

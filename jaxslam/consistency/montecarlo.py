@@ -25,6 +25,7 @@ from jaxslam.arrays import cast, is_number
 from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.consistency.store import MemoryStore, Store
 from jaxslam.geometry import Pose
+from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation import (
     Room,
@@ -79,8 +80,13 @@ def monte_carlo(
     chunk: int = CHUNK,
     store: Store | None = None,
     progress: Callable[[str, int], None] = lambda name, done: None,
+    motion: AbstractMotion | None = None,
+    sensor: AbstractSensor | None = None,
 ) -> Study:
     """Run every filter on the same simulated runs.
+
+    The runs are the scenario's; with a `motion` or a `sensor` of one's own the truth moves, or is
+    measured, as that says, in the scenario's world.
 
     `progress(filter name, finished runs)` is called after every chunk. Chunks that `store`
     already has are not run again. Raises ValueError for sizes that make no sense.
@@ -92,7 +98,7 @@ def monte_carlo(
     chunks = tuple(range(i, min(i + chunk, runs)) for i in range(0, runs, chunk))
     seconds = {}
     with jax.enable_x64(dtype == "float64"):
-        simulator = _Simulator(scenario, seed, dtype, min(chunk, runs))
+        simulator = _Simulator(scenario, seed, dtype, min(chunk, runs), motion, sensor)
         missing = {name: [c for c in chunks if not store.has(name, c)] for name in filters}
         room = simulator.room(chunks) if any(missing.values()) else None
         for name, slam in filters.items():
@@ -104,15 +110,24 @@ def monte_carlo(
 class _Simulator:
     """Draws chunks of runs, all of one shape, so that everything compiles once."""
 
-    def __init__(self, scenario: Scenario, seed: int, dtype: str, size: int) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        seed: int,
+        dtype: str,
+        size: int,
+        motion: AbstractMotion | None,
+        sensor: AbstractSensor | None,
+    ) -> None:
         self.dtype, self.size = jnp.dtype(dtype), size
-        self.sensor = cast(sensor_of(scenario), dtype)
+        self.sensor = cast(sensor_of(scenario) if sensor is None else sensor, dtype)
+        self._own = cast((motion, sensor), dtype)
         self._scenario, self._key = as_data(scenario, dtype), jax.random.key(seed)
 
     def __call__(self, chunk: range) -> tuple[Run, Sightings]:
         """The chunk's runs, padded to `size` by the runs that follow."""
         indices = chunk.start + jnp.arange(self.size)
-        return _draw(self._scenario, self._key, indices)
+        return _draw(self._scenario, self._own, self._key, indices)
 
     def room(self, chunks: tuple[range, ...]) -> Room:
         """What holds every run of the study."""
@@ -121,15 +136,36 @@ class _Simulator:
         return Room(most.landmarks, most.first, most.known, most.new)
 
 
+def draw(
+    scenario: Scenario, runs: int, *, seed: int = 0, dtype: str = "float64"
+) -> tuple[Room, Run]:
+    """The first runs of a study, a batch, and the room that they need.
+
+    Raises ValueError for sizes that make no sense.
+    """
+    check_sizes(runs, seed, dtype, runs)
+    with jax.enable_x64(dtype == "float64"):
+        simulator = _Simulator(scenario, seed, dtype, runs, None, None)
+        batch, _ = simulator(range(runs))
+        return simulator.room((range(runs),)), batch
+
+
 def _room_for(count: int) -> int:
     """At least one, and above four a multiple of four: other seeds then need no other program."""
     return max(1, count) if count <= 4 else 4 * math.ceil(count / 4)
 
 
-@jax.jit
-def _draw(scenario: Scenario, key: Array, indices: Int[Array, " runs"]) -> tuple[Run, Sightings]:
+@eqx.filter_jit
+def _draw(
+    scenario: Scenario,
+    own: tuple[AbstractMotion | None, AbstractSensor | None],
+    key: Array,
+    indices: Int[Array, " runs"],
+) -> tuple[Run, Sightings]:
+    motion, sensor = own
+
     def one(index):
-        run = simulate(scenario, jax.random.fold_in(key, index))
+        run = simulate(scenario, jax.random.fold_in(key, index), motion=motion, sensor=sensor)
         return run, sightings(run)
 
     return jax.vmap(one)(indices)

@@ -52,6 +52,10 @@ class AbstractMotion(eqx.Module):
     def still(self, dtype: Any = None) -> Any:
         """The control with which nothing moves."""
 
+    def nominal_control(self, velocity: Float[Array, " t"], seconds: Float[Array, ""]) -> Any:
+        """The control of a step at a constant velocity: what a simulation tells the model."""
+        raise NotImplementedError(f"{type(self).__name__} does not say how to simulate it")
+
     def enlarged(
         self, variables: Any, noise: Float[Array, " q"], factor: Float[Array, ""]
     ) -> tuple[Any, Float[Array, " q"]]:
@@ -108,6 +112,9 @@ class ConstantVelocity(AbstractMotion):
     def still(self, dtype=None):
         return jnp.zeros((), dtype)
 
+    def nominal_control(self, velocity, seconds):
+        return seconds
+
     def enlarged(self, variables, noise, factor):
         n = self.geometry.point_dim
 
@@ -135,6 +142,9 @@ class Odometry(AbstractMotion):
 
     def still(self, dtype=None):
         return jnp.zeros(self.geometry.tangent_dim, dtype)
+
+    def nominal_control(self, velocity, seconds):
+        return velocity * seconds
 
 
 class VehicleRates(eqx.Module):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,12 +20,12 @@ class Metre(eqx.Module):
         variables, root = motion.start()
         return variables, None, root @ root.T
 
-    def noise(self, motion: AbstractMotion, variables, noise, log_scale: None):
+    def noise(self, motion: AbstractMotion, variables, noise, log_scale: Any):
         """The step's noise, m/s² or m, as it is."""
         del motion, variables, log_scale
         return noise
 
-    def prior(self, mean: Array, sigma: Array, variance: Array | None) -> tuple[Array, Array]:
+    def prior(self, mean: Array, sigma: Array, variance: Any) -> tuple[Array, Array]:
         """Mean and σ of 1/z in the state's unit."""
         del variance
         return mean, sigma
@@ -41,7 +43,7 @@ class ScaleGauge(eqx.Module):
         mean, covariance = velocity_in_gauge(velocity, root, motion.geometry.point_dim)
         return mean[:-1], mean[-1:], covariance
 
-    def noise(self, motion: AbstractMotion, variables, noise, log_scale: Float[Array, " 1"]):
+    def noise(self, motion: AbstractMotion, variables, noise, log_scale: Any):
         """The step's noise in the units of the state.
 
         λ is frozen at its estimate: the noise's amplitude says nothing about scale, but its
@@ -50,7 +52,7 @@ class ScaleGauge(eqx.Module):
         unit = jnp.exp(-jax.lax.stop_gradient(log_scale))
         return motion.enlarged(variables, noise, unit)[1]
 
-    def prior(self, mean: Array, sigma: Array, variance: Array) -> tuple[Array, Array]:
+    def prior(self, mean: Array, sigma: Array, variance: Any) -> tuple[Array, Array]:
         """Mean and σ of 1/z such that `e^λ/z`, linear in λ, has its exact first two moments.
 
         `E e^λ ρ = ρ0 e^(λ + P/2)` for a ρ ~ N(ρ0, σ²) and λ of variance P; the slope by λ is the

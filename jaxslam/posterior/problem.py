@@ -112,6 +112,8 @@ def make_problem(scenario: Scenario, run: Run, *, truncated: bool = True) -> Pro
     check_scenario(scenario)
     pieces = motion_of(scenario), sensor_of(scenario), depth_of(scenario)
     motion, sensor, depth = cast(pieces, run.measured.dtype)
+    assert isinstance(motion, ConstantVelocity)
+    assert isinstance(sensor, Pinhole)
     return Problem(
         motion=motion,
         sensor=sensor,

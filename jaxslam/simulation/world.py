@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.forms.state import Features
-from jaxslam.geometry import Pose, identity
+from jaxslam.geometry import Pose, identity, retract
 from jaxslam.models.camera import Camera, bearing
-from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.sensors import AbstractSensor, Pinhole
 from jaxslam.simulation.pieces import calibration_sigma_of, depth_of, motion_of, sensor_of
 from jaxslam.simulation.scenario import Scenario
@@ -59,23 +59,34 @@ def as_data(scenario: Scenario, dtype: Any = None) -> Scenario:
     return jax.tree.map(lambda number: jnp.asarray(number, dtype), unnamed)
 
 
-def simulate(scenario: Scenario, key: Array, dtype: Any = None) -> Run:
+def simulate(
+    scenario: Scenario,
+    key: Array,
+    dtype: Any = None,
+    *,
+    motion: AbstractMotion | None = None,
+    sensor: AbstractSensor | None = None,
+) -> Run:
     """Draw one run: a pure function of the scenario's numbers and of the key.
 
-    The truth is drawn from the prior of the filters of `make_filters`.
+    The truth is drawn from the prior of the filters of `make_filters`; or it moves and is measured
+    as models of one's own say, in the world of the scenario.
     """
     s = as_data(scenario, dtype)
     motion_key, world_key, camera_key, pixel_key = jax.random.split(key, 4)
-    poses, controls = _MOTION[s.motion](s, motion_key)
+    if motion is None and s.motion == "odometry":
+        poses, controls = _by_odometry(s, motion_key)
+    else:
+        poses, controls = _by_noise(s, motion_of(s) if motion is None else motion, motion_key)
     points = _PLACEMENT[s.placement](s, world_key)
-    sensor = sensor_of(s)
-    cameras, sensors = _sensors(s, camera_key)
+    sensor = sensor_of(s) if sensor is None else sensor
+    cameras, sensors = _sensors(s, sensor, camera_key)
     one = jnp.ones((), points.dtype)
 
     def frame(pose: Pose, sensor):
         seen_from = jax.vmap(pose.inverse().apply)(points)
         measured = jax.vmap(sensor.measure, in_axes=(0, None))(seen_from, one)
-        return measured, _VISIBLE[s.sensor](s, seen_from, measured)
+        return measured, _visible(s, sensor, seen_from, measured)
 
     measured, visible = jax.vmap(frame)(poses, sensors)
     visible &= jnp.arange(s.steps + 1)[:, None] >= s.first_frame
@@ -137,25 +148,24 @@ def _picked(mask, measured, count: int) -> Features:
     return Features(slots, measured[slots], mask[slots])
 
 
-def _by_acceleration(s: Scenario, key: Array) -> tuple[Pose, Array]:
-    """White accelerations and an initial velocity from the filter's prior (P8, P9)."""
-    start_key, acceleration_key = jax.random.split(key)
-    motion = motion_of(s)
-    assert isinstance(motion, ConstantVelocity)
-    sigma, geometry = motion.noise_sigma, motion.geometry
-    t, dtype, dt = geometry.tangent_dim, sigma.dtype, 1 / s.rate
-    start_error = jax.random.normal(start_key, (t,), dtype)
-    velocity = motion.velocity + motion.velocity_sigma * start_error
-    accelerations = sigma * jax.random.normal(acceleration_key, (s.steps, t), dtype)
+def _by_noise(s: Scenario, motion: AbstractMotion, key: Array) -> tuple[Pose, Any]:
+    """The start and the noises of a motion model from the filter's prior (P8, P9)."""
+    start_key, noise_key = jax.random.split(key)
+    sigma, dtype = jnp.asarray(motion.noise_sigma), jnp.result_type(s.rate)
+    mean, root = motion.start()
+    start = retract(mean, root @ jax.random.normal(start_key, root.shape[:1], dtype))
+    noises = sigma * jax.random.normal(noise_key, (s.steps, sigma.size), dtype)
+    control = motion.nominal_control(jnp.stack(s.velocity), 1 / s.rate)
 
-    def move(carry, acceleration):
-        pose, velocity = carry
-        pose = (pose @ motion.displacement(velocity, acceleration, dt)).normalize()
-        return (pose, motion.next(velocity, acceleration, dt)), pose
+    def move(carry, noise):
+        pose, variables = carry
+        pose = (pose @ motion.displacement(variables, noise, control)).normalize()
+        return (pose, motion.next(variables, noise, control)), pose
 
-    start = identity(geometry, dtype)
-    _, poses = jax.lax.scan(move, (start, velocity), accelerations)
-    return _with_start(start, poses), jnp.full(s.steps, dt)
+    origin = identity(motion.geometry, dtype)
+    _, poses = jax.lax.scan(move, (origin, start), noises)
+    controls = jax.tree.map(lambda x: jnp.full((s.steps, *x.shape), x), control)
+    return _with_start(origin, poses), controls
 
 
 def _by_odometry(s: Scenario, key: Array) -> tuple[Pose, Array]:
@@ -173,9 +183,6 @@ def _by_odometry(s: Scenario, key: Array) -> tuple[Pose, Array]:
     start = identity(geometry, sigma.dtype)
     _, poses = jax.lax.scan(move, start, length=s.steps)
     return _with_start(start, poses), nominal - sigma * noise
-
-
-_MOTION = {"velocity": _by_acceleration, "odometry": _by_odometry}
 
 
 def _with_start(start: Pose, poses: Pose) -> Pose:
@@ -196,7 +203,11 @@ def _in_range(scenario: Scenario, points, measured) -> Bool[Array, " l"]:
     return (distance >= least) & (distance <= greatest)
 
 
-_VISIBLE = {"camera": _in_image, "position": _in_range}
+def _visible(s: Scenario, sensor: AbstractSensor, points, measured) -> Bool[Array, " l"]:
+    """A camera sees what is in its picture; another sensor what is in its range."""
+    if isinstance(sensor, Pinhole):
+        return _in_image(s, points, measured)
+    return _in_range(s, points, measured) & jax.vmap(sensor.possible)(points)
 
 
 def _limited(scenario: Scenario, key: Array, visible: Bool[Array, "frames l"]):
@@ -269,9 +280,9 @@ def _in_room(s: Scenario, key: Array) -> Float[Array, "72 3"]:
 _PLACEMENT = {"prior": _from_prior, "ring": _on_ring, "room": _in_room}
 
 
-def _sensors(s: Scenario, key: Array) -> tuple[Camera, AbstractSensor]:
+def _sensors(s: Scenario, sensor: AbstractSensor, key: Array) -> tuple[Camera, AbstractSensor]:
     """The true camera and the true sensor of every frame."""
-    frames, sigma, sensor = s.steps + 1, calibration_sigma_of(s), sensor_of(s)
+    frames, sigma = s.steps + 1, calibration_sigma_of(s)
     if s.true_calibration == "nominal":
         deltas = jnp.zeros((frames, sigma.size), sigma.dtype)
     elif s.true_calibration == "constant":

@@ -45,9 +45,10 @@ class Scene(eqx.Module):
 
     pose: Pose
     """T_BC, in metres."""
-    point: Float[Array, " n"] | None = None
-    """X of the landmark as a homogeneous point (X, ω) in the camera; None without a landmark."""
-    omega: Float[Array, ""] | None = None
+    point: Any = None
+    """X of the landmark as a homogeneous point (X, ω) in the camera, n numbers; None without a
+    landmark."""
+    omega: Any = None
     """ω, so that the point is X/ω metres."""
     core: Any = None
     """The filter's own variables; None where a landmark is asked for."""

@@ -182,7 +182,7 @@ class FixedLag(AbstractFilter):
         return base.step(point, frame.control, frame.seen, frame.new)
 
     def _normal_equations(self, before, variables, frames) -> NormalEquations:
-        point, compared = jax.lax.scan(self._advance, begin(before, variables), frames)
+        point, compared = self._through(before, variables, frames)
         A = compared.slope.reshape(-1, variables.size)
         information = A.T @ A + jnp.eye(variables.size, dtype=A.dtype)
         gradient = variables - compared.residual.ravel() @ A
@@ -191,6 +191,12 @@ class FixedLag(AbstractFilter):
             jax.tree.map(lambda x: x[-1], compared),
             cholesky(information),
             gradient,
+        )
+
+    def _through(self, before, variables, frames) -> tuple[Point, Compared]:
+        """The window, frame by frame."""
+        return jax.lax.scan(
+            lambda point, frame: self._advance(point, frame), begin(before, variables), frames
         )
 
     def _absorbed(self, state: LagState) -> tuple[Distribution, Array]:
@@ -217,7 +223,7 @@ class FixedLag(AbstractFilter):
         from jaxslam.least_squares import levenberg_marquardt
 
         def residuals(variables, _):
-            _, compared = jax.lax.scan(self._advance, begin(before, variables), frames)
+            _, compared = self._through(before, variables, frames)
             return jnp.concatenate([variables, compared.residual.ravel()])
 
         solution = optx.least_squares(

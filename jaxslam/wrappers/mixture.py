@@ -40,7 +40,7 @@ SPLIT = 0.8
 class Mixture(Bank, AbstractStaged):
     """`count` filters `base`; begun as the sum over the direction of the velocity."""
 
-    base: EkfSlam
+    base: EkfSlam  # ty: ignore[incompatible-mutable-override]
     along: Literal["speed", "direction"] = eqx.field(static=True, default="direction")
 
     def __check_init__(self) -> None:

@@ -1,0 +1,104 @@
+"""What measurements say of a filter's own numbers: their likelihood, and its maximum.
+
+A filter's innovations are independent if it is right, so that the measurements of a run have the
+log likelihood `−½ Σ (rᵀ S⁻¹ r + log det S)`, up to a constant (Schweppe 1965). A filter is a pytree
+of its numbers: this differentiates by any of them, through the whole run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxslam.simulation import Room, Run, features
+from jaxslam.slam.protocol import AbstractFilter
+
+MOST = 0.7
+"""The most that a number of θ changes in one step: far from the maximum its curvature misleads."""
+
+
+class Estimate(NamedTuple):
+    """The maximum of a likelihood."""
+
+    values: Float[np.ndarray, " k"]
+    standard_errors: Float[np.ndarray, " k"]
+    """Roots of the inverse Fisher information's diagonal, from the runs' own scores."""
+    log_likelihood: float
+    """Of all runs."""
+    iterations: int
+    converged: bool
+
+
+def log_likelihood(slam: AbstractFilter, room: Room, run: Run) -> Float[Array, ""]:
+    """Of all that is measured in a run after frame 0, up to a constant that is the same for all
+    filters that use the same measurements."""
+    first, seen, new = features(run, room)
+
+    def step(state, data):
+        seen, new, control = data
+        state, innovation = slam.step(state, control, seen, new)
+        assert innovation.log_det is not None, "the information form knows no likelihood"
+        return state, -(innovation.nis + innovation.log_det) / 2
+
+    _, terms = jax.lax.scan(step, slam.init(room.capacity, first), (seen, new, run.controls))
+    return jnp.sum(terms)
+
+
+def maximum_likelihood(
+    filter_of: Callable[[Float[Array, " k"]], AbstractFilter],
+    start: Float[Array, " k"],
+    room: Room,
+    runs: Run,
+    *,
+    tolerance: float = 0.05,
+    most_iterations: int = 30,
+    chunk: int = 64,
+) -> Estimate:
+    """θ for which the filters `filter_of(θ)` explain a batch of runs best.
+
+    By Fisher scoring with the information of the runs' scores, `Σ sᵢ sᵢᵀ` (Berndt, Hall, Hall,
+    Hausman 1974), until a step is below `tolerance` standard errors. Take logarithms for θ where
+    numbers are positive. Raises ValueError for an empty batch of runs.
+    """
+    count = jax.tree.leaves(runs)[0].shape[0]
+    if not count:
+        raise ValueError("a likelihood needs at least one run")
+
+    @jax.jit
+    def scored(theta, part):
+        def one(theta, run):
+            value = log_likelihood(filter_of(theta), room, run)
+            return value, value
+
+        return jax.vmap(jax.jacfwd(one, has_aux=True), in_axes=(None, 0))(theta, part)
+
+    def over_all(theta):
+        parts = [
+            jax.device_get(scored(theta, jax.tree.map(lambda x, i=i: x[i : i + chunk], runs)))
+            for i in range(0, count, chunk)
+        ]
+        scores, values = (np.concatenate(of_parts) for of_parts in zip(*parts, strict=True))
+        return scores, values.sum()
+
+    theta, converged = np.asarray(start, float), False
+    iteration = 0
+    while not converged and iteration < most_iterations:
+        iteration += 1
+        scores, value = over_all(theta)
+        information = scores.T @ scores
+        change = np.linalg.solve(information, scores.sum(axis=0))
+        theta = theta + np.clip(change, -MOST, MOST)
+        errors = np.sqrt(np.diagonal(np.linalg.inv(information)))
+        converged = bool(np.all(np.abs(change) < tolerance * errors))
+    return Estimate(theta, errors, float(value), iteration, converged)
+
+
+def gradient(slam: Any, room: Room, run: Run) -> Any:
+    """Of the run's log likelihood by every number of the filter: a filter of derivatives."""
+    return eqx.filter_grad(lambda slam: log_likelihood(slam, room, run))(slam)

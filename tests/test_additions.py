@@ -1,0 +1,123 @@
+"""What is defined outside the package is studied, tracks and has gradients like what is in it."""
+
+import inspect
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from additions import (
+    PLAIN_HOMOGENEOUS,
+    Bearing,
+    BiasedVelocity,
+    DriftingFocal,
+    Huber,
+    Pixels,
+    PlainHomogeneous,
+)
+
+import jaxslam
+from jaxslam.names import scenario_pieces
+
+
+def verdict(scenario, slam, runs=40, **models):
+    study = jaxslam.monte_carlo(scenario, {"mine": slam}, runs=runs, chunk=runs, **models)
+    found = jaxslam.summarise(study)["filters"]["mine"]
+    assert found["diverged"] == 0
+    assert not any(found["status"].values())
+    return found["verdict"]
+
+
+def paper(scenario, **pieces):
+    return jaxslam.EkfSlam(**{**scenario_pieces(scenario), **pieces})
+
+
+@pytest.mark.parametrize(
+    ("addition", "most"),
+    [(PlainHomogeneous, 50), (Bearing, 40), (Pixels, 40), (BiasedVelocity, 40), (DriftingFocal, 30),
+     (Huber, 80)],
+)  # fmt: skip
+def test_an_addition_is_one_short_class(addition, most):
+    assert len(inspect.getsource(addition).splitlines()) <= most
+
+
+def test_a_landmark_of_ones_own_is_studied():
+    scenario = jaxslam.scenario("matched-tight", steps=8)
+    found = verdict(scenario, paper(scenario, landmark=PLAIN_HOMOGENEOUS))
+    assert found["word"] == "consistent", found
+
+
+def test_a_sensor_of_ones_own_is_simulated_and_studied():
+    """All directions: a point behind is seen, and an angle that jumps by 2π is no error."""
+    scenario = jaxslam.scenario("positions", steps=25, landmarks=8)
+    sensor = Bearing(0.02)
+    slam = paper(
+        scenario, sensor=sensor, calibration=jaxslam.Known(), depth=jaxslam.InverseDepth(0.3, 0.15)
+    )
+    found = verdict(scenario, slam, sensor=sensor)
+    assert found["sigma_factor"] < 1.4, found
+
+
+def test_range_and_bearing_behind_the_sensor_wrap():
+    sensor = jaxslam.RangeBearing((0.1, 0.02))
+    behind = sensor.measure(jnp.array([-1e-3, -2.0]), jnp.ones(()))
+    other = sensor.measure(jnp.array([1e-3, -2.0]), jnp.ones(()))
+    assert abs(behind[1] - other[1]) > 6
+    np.testing.assert_allclose(sensor.residual(behind, other), [0.0, 1e-3], atol=2e-6)
+    point, omega = sensor.locate(behind, jnp.zeros(0))
+    np.testing.assert_allclose(point / omega, [-1e-3, -2.0], atol=1e-12)
+
+
+def test_range_and_bearing_is_studied():
+    scenario = jaxslam.scenario("positions", steps=25, landmarks=8)
+    sensor = jaxslam.RangeBearing((0.1, 0.02))
+    slam = paper(
+        scenario, sensor=sensor, landmark=jaxslam.LANDMARKS["cartesian"],
+        calibration=jaxslam.Known(),
+    )  # fmt: skip
+    found = verdict(scenario, slam, sensor=sensor)
+    assert found["sigma_factor"] < 1.3, found
+
+
+def biased(scenario):
+    s = scenario
+    return BiasedVelocity(s.acceleration_sigma, s.velocity, s.velocity_sigma, (0.5, 0.5, 0.3))
+
+
+def test_a_motion_with_a_bias_is_studied_and_learns_it():
+    scenario = jaxslam.scenario("matched", steps=15)
+    motion = biased(scenario)
+    assert verdict(scenario, paper(scenario, motion=motion), motion=motion)["word"] == "consistent"
+    # A filter that does not know of the bias is over-confident on the same runs.
+    assert verdict(scenario, paper(scenario), motion=motion)["word"] == "over-confident"
+
+
+def test_a_treatment_of_ones_own_is_studied():
+    scenario = jaxslam.scenario("matched", steps=10)
+    drifting = DriftingFocal([0.005], [0.001])
+    slam = paper(scenario, calibration=drifting)
+    known = paper(scenario)
+    study = jaxslam.monte_carlo(scenario, {"drifting": slam, "known": known}, runs=20, chunk=20)
+    filters = jaxslam.summarise(study)["filters"]
+    assert filters["drifting"]["diverged"] == 0
+    # What the camera may be off by makes it less sure of where it is.
+    sigma = {name: f["sigma"]["position"][-1] for name, f in filters.items()}
+    assert sigma["drifting"] > sigma["known"]
+
+
+def test_a_remedy_of_ones_own_resists_outliers():
+    scenario = jaxslam.scenario("matched-tight", steps=8)
+    plain, robust = paper(scenario), paper(scenario, form=Huber())
+    assert verdict(scenario, robust)["word"] == "consistent"
+    state = plain.init(2)
+    new = jaxslam.Features(
+        jnp.array([0, 1]), jnp.array([[300.0], [350.0]]), jnp.array([True, True])
+    )
+    state = plain.close(state, new)
+    wrong = replace(new, measured=new.measured + jnp.array([[0.0], [40.0]]))
+    moved = [
+        abs(slam.step(state, jnp.asarray(1 / 30), wrong, replace(new, valid=~new.valid))[0]
+            .landmarks[1, 0] - state.landmarks[1, 0])
+        for slam in (plain, robust)
+    ]  # fmt: skip
+    assert moved[1] < moved[0]

@@ -1,0 +1,73 @@
+"""Gradients through whole runs, and numbers of a filter found by likelihood."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import Case, quick_jit
+
+import jaxslam
+from jaxslam.consistency.likelihood import gradient, log_likelihood, maximum_likelihood
+
+
+@pytest.fixture(scope="module")
+def case():
+    return Case("matched", runs=24, steps=8, landmarks=5)
+
+
+def scaled(slam, acceleration, pixel, focal=1.0):
+    camera = slam.sensor.camera
+    return replace(
+        slam,
+        motion=replace(slam.motion, noise_sigma=slam.motion.noise_sigma * acceleration),
+        sensor=replace(
+            slam.sensor,
+            sigma=slam.sensor.sigma * pixel,
+            camera=replace(camera, focal=camera.focal * focal),
+        ),
+    )
+
+
+@pytest.mark.parametrize("name", ["robocentric", "world", "scale_gauge"])
+def test_gradients_through_a_run_are_those_of_central_differences(case, name):
+    slam, run = jaxslam.cast(case.filter(name), jnp.float64), case.run(0)
+    found = eqx.filter_jit(gradient)(slam, case.room, run)
+
+    @quick_jit
+    def value(factors):
+        return log_likelihood(scaled(slam, *factors), case.room, run)
+
+    by_factor = [
+        found.motion.noise_sigma @ slam.motion.noise_sigma,
+        found.sensor.sigma * slam.sensor.sigma,
+        found.sensor.camera.focal @ slam.sensor.camera.focal,
+    ]
+    for i, derivative in enumerate(by_factor):
+        h = 1e-5 * jnp.eye(3)[i]
+        central = (value(1 + h) - value(1 - h)) / 2e-5
+        np.testing.assert_allclose(derivative, central, rtol=1e-5, atol=1e-4)
+
+
+def test_every_number_of_a_filter_has_a_derivative(case):
+    slam = jaxslam.cast(case.filter("robocentric", calibration="white"), jnp.float64)
+    found = eqx.filter_jit(gradient)(slam, case.room, case.run(0))
+    leaves = jax.tree.leaves(found)
+    assert len(leaves) == len(jax.tree.leaves(slam))
+    assert all(np.isfinite(x).all() for x in leaves)
+    for number in (found.motion.velocity_sigma, found.calibration.sigma, found.depth.mean):
+        assert np.abs(number).max() > 0
+
+
+@pytest.mark.statistics
+def test_likelihood_finds_the_noise_that_was_simulated(case):
+    """Off by a factor of two at the start; within three standard errors at the end."""
+    slam = jaxslam.cast(case.filter("robocentric"), jnp.float64)
+    found = maximum_likelihood(
+        lambda theta: scaled(slam, *jnp.exp(theta)), np.log([2.0, 0.5]), case.room, case.runs
+    )
+    assert found.converged
+    assert np.all(np.abs(found.values) < 3 * found.standard_errors), found
+    assert np.all(found.standard_errors < 0.3)
