@@ -9,38 +9,25 @@ import numpy as np
 import pytest
 from cases import Case, quick_jit
 
-from jaxslam.camera import Camera
-from jaxslam.consistency.montecarlo import Prior, filter_run
-from jaxslam.filters import (
-    DepthParticles,
-    Features,
-    GaussianSum,
-    Parameters,
-    SlamFilter,
-    make_filter,
-)
-from jaxslam.filters.initialisation import log_density
-from jaxslam.geometry import PLANAR
+from jaxslam.consistency.montecarlo import filter_run
+from jaxslam.delayed import rays
+from jaxslam.delayed.alternatives import log_density
+from jaxslam.delayed.depth_particles import DepthParticles
+from jaxslam.delayed.rays import GaussianSum
+from jaxslam.forms.state import Features
 from jaxslam.landmarks import CARTESIAN, INVERSE_SCALING
-from jaxslam.rig import Rig
-from jaxslam.sensors import POSITION
-from jaxslam.simulation import Sightings
+from jaxslam.models.camera import Camera
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.sensors import Pinhole
+from jaxslam.names import make_filter, scenario_pieces
+from jaxslam.simulation import Room, scenario
+from jaxslam.slam.filter import correct
+from jaxslam.slam.readouts import landmarks_in_camera
 
 FOCAL, CENTRE, SIGMA = 650.0, 320.0, 0.5
 DT, SPEED = 0.1, 0.4
 BASES = ("world", "robocentric")
-
-
-def the_parameters(motion_sigma=0.0, inverse_depth=0.2, inverse_depth_sigma=0.1):
-    camera = Camera(jnp.array([FOCAL]), jnp.array([CENTRE]))
-    return Parameters(
-        camera,
-        jnp.zeros(2),
-        jnp.asarray(SIGMA),
-        jnp.full(3, motion_sigma),
-        jnp.asarray(inverse_depth),
-        jnp.asarray(inverse_depth_sigma),
-    )
 
 
 def pixels(*values, valid=True):
@@ -53,23 +40,27 @@ def pixels(*values, valid=True):
 NONE = pixels(0.0, valid=False)
 
 
-def the_filter(base, method):
-    word = {DepthParticles: "particles", GaussianSum: "rays"}[type(method)]
-    slam = make_filter(Rig(PLANAR), f"{base}+{word}", CARTESIAN, "known")
-    return replace(slam, initialisation=method)
-
-
-@cache
-def stepper(slam):
-    return quick_jit(slam.step)
-
-
-def begun(slam, parameters, first, speed=SPEED, speed_sigma=0.0):
+def plain(base, motion_sigma=0.0, speed=SPEED, speed_sigma=0.0, depth=(0.2, 0.1)):
     """A camera that moves along x, with a velocity that is known unless said."""
-    state = slam.start(
-        parameters, first.slots.size, jnp.array([speed, 0.0, 0.0]), jnp.full(3, speed_sigma)
+    return make_filter(
+        base,
+        landmark=CARTESIAN,
+        motion=ConstantVelocity([motion_sigma] * 3, [speed, 0.0, 0.0], [speed_sigma] * 3),
+        sensor=Pinhole(Camera([FOCAL], [CENTRE]), SIGMA),
+        depth=InverseDepth(*depth),
     )
-    return quick_jit(slam.first)(state, parameters, first)
+
+
+def the_filter(base, method, **numbers):
+    word = {DepthParticles: "particles", GaussianSum: "rays"}[type(method)]
+    return replace(plain(f"{base}+{word}", **numbers), entry=method)
+
+
+def begun(slam, first):
+    """The state after frame 0, and a compiled step."""
+    return quick_jit(partial(slam.init, first.slots.size))(first), quick_jit(
+        lambda *x: slam.step(*x)
+    )
 
 
 def seen_at(depth, bearing, step):
@@ -80,14 +71,14 @@ def seen_at(depth, bearing, step):
 @pytest.mark.parametrize("base", BASES)
 def test_particles_are_the_posterior_of_depth_when_camera_and_ray_are_known(base):
     method = DepthParticles(count=40, agreement=1e-6)
-    slam, parameters, bearing = the_filter(base, method), the_parameters(), 0.2
-    state = begun(slam, parameters, pixels(FOCAL * bearing + CENTRE))
+    slam, bearing = the_filter(base, method), 0.2
+    state, step = begun(slam, pixels(FOCAL * bearing + CENTRE))
     state = replace(state, covariance=jnp.zeros_like(state.covariance))
     noise = np.array([0.4, -0.7, 0.1])
     measured = np.array([seen_at(2.1, bearing, k + 1) for k in range(3)]) + noise
 
     for u in measured:
-        state, _ = stepper(slam)(state, parameters, DT, pixels(u), NONE)
+        state, _ = step(state, DT, pixels(u), NONE)
 
     distances = np.linspace(0.5, 5.0, 40)
     depths = distances / np.hypot(1.0, bearing)
@@ -100,13 +91,13 @@ def test_particles_are_the_posterior_of_depth_when_camera_and_ray_are_known(base
 
 @pytest.mark.parametrize("base", BASES)
 def test_a_pending_ray_does_not_change_the_camera(base):
-    slam = the_filter(base, DepthParticles(agreement=1e-6))
-    parameters = the_parameters(motion_sigma=0.1)
-    state = begun(slam, parameters, pixels(400.0), speed_sigma=0.02)
+    method = DepthParticles(agreement=1e-6)
+    slam = the_filter(base, method, motion_sigma=0.1, speed_sigma=0.02)
+    state, step = begun(slam, pixels(400.0))
     c = state.core_dim
     seen = pixels(395.0)
-    with_ray, innovation = stepper(slam)(state, parameters, DT, seen, NONE)
-    without, _ = stepper(slam)(state, parameters, DT, replace(seen, valid=~seen.valid), NONE)
+    with_ray, innovation = step(state, DT, seen, NONE)
+    without, _ = step(state, DT, replace(seen, valid=~seen.valid), NONE)
     assert not np.allclose(with_ray.memory, without.memory)
     assert innovation.nis == 0
     for one, other in zip(
@@ -118,16 +109,15 @@ def test_a_pending_ray_does_not_change_the_camera(base):
 
 def test_a_ray_becomes_a_point_with_the_mean_and_variance_of_its_particles():
     method = DepthParticles(count=40)
-    slam, parameters, bearing = the_filter("robocentric", method), the_parameters(), 0.2
-    state = begun(slam, parameters, pixels(FOCAL * bearing + CENTRE), speed=0.0)
-    step = stepper(slam)
-    assert not method.settled(step(state, parameters, DT, NONE, NONE)[0]).any()
+    slam, bearing = the_filter("robocentric", method, speed=0.0), 0.2
+    state, step = begun(slam, pixels(FOCAL * bearing + CENTRE))
+    assert not method.settled(step(state, DT, NONE, NONE)[0]).any()
 
     distances = np.linspace(0.5, 5.0, 40)
     weights = np.exp(-(((distances - 2.0) / 0.3) ** 2) / 2)
     weights /= weights.sum()
     state = replace(state, memory=jnp.asarray(weights)[None])
-    state, _ = step(state, parameters, DT, NONE, NONE)
+    state, _ = step(state, DT, NONE, NONE)
     assert method.settled(state).all()
 
     mean = weights @ distances
@@ -144,29 +134,33 @@ def test_a_ray_becomes_a_point_with_the_mean_and_variance_of_its_particles():
 
 def test_a_pending_ray_is_reported_with_the_moments_of_inverse_depth():
     method = DepthParticles(count=40)
-    slam, parameters = the_filter("world", method), the_parameters()
-    state = begun(slam, parameters, pixels(CENTRE))
-    in_camera = quick_jit(slam.landmarks_in_camera)
-    chart, covariance = in_camera(state, parameters, jnp.arange(1))
+    slam = the_filter("world", method)
+    state, _ = begun(slam, pixels(CENTRE))
+
+    @quick_jit
+    def in_camera(state):
+        return landmarks_in_camera(slam, state, jnp.arange(1), slam.sensor)
+
+    chart, covariance = in_camera(state)
     inverse = 1 / np.linspace(0.5, 5.0, 40)
     np.testing.assert_allclose(chart[0], [0.0, inverse.mean()], atol=1e-12)
     np.testing.assert_allclose(covariance[0, 1, 1], inverse.var(), rtol=1e-12)
 
 
 def test_a_ray_that_no_particle_explains_is_dropped():
-    slam, parameters = the_filter("world", DepthParticles(count=40)), the_parameters()
-    state = begun(slam, parameters, pixels(CENTRE))
-    state, _ = stepper(slam)(state, parameters, DT, pixels(CENTRE + 60), NONE)
+    slam = the_filter("world", DepthParticles(count=40))
+    state, step = begun(slam, pixels(CENTRE))
+    state, _ = step(state, DT, pixels(CENTRE + 60), NONE)
     assert not state.active.any()
     assert not state.covariance.any()
 
 
 def test_members_are_weighed_by_bayes_rule():
     method = GaussianSum(nearest=1.0, farthest=15.0, threshold=0.0)
-    slam, parameters, bearing = the_filter("robocentric", method), the_parameters(), 0.2
-    state = begun(slam, parameters, pixels(FOCAL * bearing + CENTRE))
+    slam, bearing = the_filter("robocentric", method), 0.2
+    state, step = begun(slam, pixels(FOCAL * bearing + CENTRE))
     measured = seen_at(4.0, bearing, 1) + 0.3
-    state, _ = stepper(slam)(state, parameters, DT, pixels(measured), NONE)
+    state, _ = step(state, DT, pixels(measured), NONE)
 
     s = np.array([1 / 0.7, 3 / 0.7, 9 / 0.7])
     predicted = seen_at(s, bearing, 1)
@@ -181,28 +175,28 @@ def test_members_are_weighed_by_bayes_rule():
 def test_members_share_a_measurement_by_their_weights_to_the_privilege(privilege, monkeypatch):
     """ρ_i = Λ_i^μ / Σ Λ_j^μ (Solà et al. 2005): all shares together are one measurement."""
     method = GaussianSum(nearest=1.0, farthest=15.0, threshold=0.0, privilege=privilege)
-    slam, parameters = the_filter("robocentric", method), the_parameters()
-    state = begun(slam, parameters, pixels(FOCAL * 0.2 + CENTRE))
-    shares, correct = [], SlamFilter.correct
+    slam = the_filter("robocentric", method)
+    state, _ = begun(slam, pixels(FOCAL * 0.2 + CENTRE))
+    shares = []
 
-    def recorded(self, *data):
+    def recorded(*data):
         shares.append(data[-1])
-        return correct(self, *data)
+        return correct(*data)
 
-    monkeypatch.setattr(SlamFilter, "correct", recorded)
-    after, _ = slam.step(state, parameters, DT, pixels(seen_at(4.0, 0.2, 1)), NONE)
+    monkeypatch.setattr(rays, "correct", recorded)
+    after, _ = slam.step(state, DT, pixels(seen_at(4.0, 0.2, 1)), NONE)
     powers = np.asarray(after.memory[0]) ** privilege
     np.testing.assert_allclose(shares[0], powers / powers.sum(), rtol=1e-12)
 
 
 def test_unlikely_members_are_pruned_until_one_is_left():
     method = GaussianSum(nearest=1.0, farthest=15.0)
-    slam, parameters = the_filter("world", method), the_parameters()
-    state = begun(slam, parameters, pixels(CENTRE))
+    slam = the_filter("world", method)
+    state, step = begun(slam, pixels(CENTRE))
     assert state.active.sum() == method.members == 3
     for k in range(1, 5):
         measured = seen_at(3 / 0.7, 0.0, k)
-        state, _ = stepper(slam)(state, parameters, DT, pixels(measured), NONE)
+        state, _ = step(state, DT, pixels(measured), NONE)
     np.testing.assert_array_equal(state.active, [False, True, False])
     np.testing.assert_array_equal(state.memory[0], [0.0, 1.0, 0.0])
     assert method.settled(state).all()
@@ -210,7 +204,7 @@ def test_unlikely_members_are_pruned_until_one_is_left():
     assert left.any()
     assert not first.any(), "a pruned member leaves nothing"
     assert not last.any(), "a pruned member leaves nothing"
-    reported = slam.reported(state)
+    reported = slam.entry.reported(state)
     np.testing.assert_array_equal(reported.landmarks[0], state.landmarks[1])
     np.testing.assert_array_equal(reported.covariance[-2:, -2:], left[:, -4:-2])
 
@@ -219,30 +213,28 @@ def test_one_member_is_the_plain_filter():
     method = GaussianSum(nearest=1.4, farthest=1.5)
     assert method.members == 1
     depth = 1.4 / 0.7
-    parameters = the_parameters(0.1, 1 / depth, 0.3 / depth)
-    plain = make_filter(Rig(PLANAR), "robocentric", CARTESIAN, "known")
+    numbers = dict(motion_sigma=0.1, speed_sigma=0.05, depth=(1 / depth, 0.3 / depth))
     states = []
-    for slam in (plain, the_filter("robocentric", method)):
-        state = begun(slam, parameters, pixels(330.0, 250.0), speed_sigma=0.05)
+    for slam in (plain("robocentric", **numbers), the_filter("robocentric", method, **numbers)):
+        state, step = begun(slam, pixels(330.0, 250.0))
         for u in (320.0, 309.0):
-            state, _ = stepper(slam)(state, parameters, DT, pixels(u, u - 80), NONE)
+            state, _ = step(state, DT, pixels(u, u - 80), NONE)
         states.append(replace(state, memory=()))
     for one, other in zip(*map(jax.tree.leaves, states), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-14)
 
 
 def test_federated_shares_of_copies_of_one_landmark_are_one_update():
-    slam = make_filter(Rig(PLANAR), "robocentric", CARTESIAN, "known")
-    parameters = the_parameters(0.1)
-    state = begun(slam, parameters, pixels(330.0, 330.0), speed_sigma=0.05)
-    state = slam.predict(state, parameters, jnp.asarray(DT))
+    slam = plain("robocentric", motion_sigma=0.1, speed_sigma=0.05)
+    state, _ = begun(slam, pixels(330.0, 330.0))
+    state = slam.predict(state, jnp.asarray(DT))
     c = state.core_dim
     copies = jnp.concatenate([jnp.arange(c + 2), jnp.arange(c, c + 2)])
     state = replace(state, covariance=state.covariance[copies[:, None], copies])
-    correct = quick_jit(slam.correct)
+    corrected = quick_jit(partial(correct, slam))
     seen = pixels(322.0, 322.0)
-    shared, _ = correct(state, parameters, DT, seen, jnp.array([0.3, 0.7]))
-    alone, _ = correct(state, parameters, DT, replace(seen, valid=jnp.array([True, False])))
+    shared, _ = corrected(state, DT, seen, jnp.array([0.3, 0.7]))
+    alone, _ = corrected(state, DT, replace(seen, valid=jnp.array([True, False])))
     np.testing.assert_allclose(shared.landmarks, alone.landmarks, rtol=1e-9)
     np.testing.assert_allclose(shared.covariance, alone.covariance, rtol=1e-6, atol=1e-12)
 
@@ -267,9 +259,8 @@ def two_runs():
 @pytest.mark.parametrize("name", ["world+particles30", "robocentric+rays"])
 def test_a_batch_is_its_runs(name):
     case = two_runs()
-    prior = Prior.of(case.scenario, jnp.dtype(float))
-    slam = make_filter(case.scenario.rig, name, CARTESIAN, "known")
-    run = partial(filter_run, slam, Sightings(landmarks=3, first=3, known=3, new=0), prior)
+    slam = case.filter(name, "cartesian")
+    run = partial(filter_run, slam, Room(landmarks=3, first=3, known=3, new=0), slam.sensor)
     batch, _, _ = quick_jit(jax.vmap(run))(case.runs)
     alone, _, _ = quick_jit(run)(case.run(1))
     for key in ("nees", "landmark_nees", "nis"):
@@ -278,23 +269,23 @@ def test_a_batch_is_its_runs(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "landmark", "rig", "message"),
+    ("name", "landmark", "sensor", "message"),
     [
-        ("world+particle", CARTESIAN, Rig(PLANAR), "did you mean particles"),
-        ("word+particles", CARTESIAN, Rig(PLANAR), "did you mean world"),
-        ("world+", CARTESIAN, Rig(PLANAR), "unknown modifiers"),
-        ("world+rays0", CARTESIAN, Rig(PLANAR), "nearest"),
-        ("world+rays", INVERSE_SCALING, Rig(PLANAR), "cartesian"),
-        ("world+particles", INVERSE_SCALING, Rig(PLANAR), "cartesian"),
-        ("world+particles+rays", CARTESIAN, Rig(PLANAR), "cartesian"),
-        ("world+particles", CARTESIAN, Rig(PLANAR, sensor=POSITION), "hides none"),
+        ("world+particle", CARTESIAN, "camera", "did you mean particles"),
+        ("word+particles", CARTESIAN, "camera", "did you mean world"),
+        ("world+", CARTESIAN, "camera", "unknown modifiers"),
+        ("world+rays0", CARTESIAN, "camera", "nearest"),
+        ("world+rays", INVERSE_SCALING, "camera", "cartesian"),
+        ("world+particles", INVERSE_SCALING, "camera", "cartesian"),
+        ("world+particles+rays", CARTESIAN, "camera", "cartesian"),
+        ("world+particles", CARTESIAN, "position", "hides none"),
     ],
 )
-def test_bad_names_and_combinations(name, landmark, rig, message):
+def test_bad_names_and_combinations(name, landmark, sensor, message):
+    pieces = scenario_pieces(scenario("matched", sensor=sensor))
     with pytest.raises(ValueError, match=message):
-        make_filter(rig, name, landmark, "known")
+        make_filter(name, landmark=landmark, **pieces)
 
 
 def test_numbers_after_a_modifier_are_the_greatest_depth():
-    slam = make_filter(Rig(PLANAR), "world+particles20", CARTESIAN, "known")
-    assert slam.initialisation == DepthParticles(farthest=20)
+    assert plain("world+particles20").entry == DepthParticles(farthest=20)

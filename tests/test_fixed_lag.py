@@ -7,22 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import (
-    Case,
-    central,
-    close,
-    each_geometry,
-    named_filter,
-    pose_run,
-    quick_jit,
-)
+from cases import Case, central, close, pose_run, quick_jit
 
-from jaxslam.filters import FixedLag, make_filter, sensitivity
-from jaxslam.filters.fixed_lag import _appended, _estimate
+from jaxslam.forms.sensitivity import begin
 from jaxslam.geometry import difference
-from jaxslam.landmarks import INVERSE_SCALING, LANDMARKS
-from jaxslam.rig import Rig
-from jaxslam.sensors import POSITION
+from jaxslam.models.sensors import Position
+from jaxslam.names import make_filter
+from jaxslam.slam.protocol import Capacity
+from jaxslam.slam.readouts import camera_pose, landmarks_in_camera
+from jaxslam.wrappers.fixed_lag import FixedLag, _appended, _estimate
 
 SHORT = {"steps": 6, "landmarks": 4}
 
@@ -42,8 +35,8 @@ def test_where_nothing_is_uncertain_all_are_one_filter(name):
         pixel_sigma=1e-3,
         inverse_depth=(1 / 6, 1e-6),
     )
-    _, (plain, plain_P, plain_nis, _) = pose_run(of, named_filter(of, "robocentric"))
-    _, (lagged, lagged_P, lagged_nis, _) = pose_run(of, named_filter(of, f"{name}+lag3"))
+    _, (plain, plain_P, plain_nis, _) = pose_run(of, of.filter("robocentric"))
+    _, (lagged, lagged_P, lagged_nis, _) = pose_run(of, of.filter(f"{name}+lag3"))
     sigma = np.sqrt(np.diagonal(plain_P, axis1=1, axis2=2))
     away = jax.vmap(lambda a, b: (a.inverse() @ b).log())(plain, lagged)
     assert np.abs(away / sigma).max() < 2e-3
@@ -54,11 +47,9 @@ def test_where_nothing_is_uncertain_all_are_one_filter(name):
 def test_one_frame_of_lag_is_the_filter_itself_at_the_first_step():
     """Nothing has been absorbed, and one Gauss–Newton step from the prediction is the EKF's."""
     of = case()
-    _, (plain, plain_P, plain_nis, plain_residual) = pose_run(
-        of, named_filter(of, "robocentric"), count=1
-    )
+    _, (plain, plain_P, plain_nis, plain_residual) = pose_run(of, of.filter("robocentric"), count=1)
     _, (lagged, lagged_P, lagged_nis, residual) = pose_run(
-        of, named_filter(of, "robocentric+lag1"), count=1
+        of, of.filter("robocentric+lag1"), count=1
     )
     # The update is the same; the composition is linearised before it or after it.
     np.testing.assert_allclose(lagged_nis, plain_nis, rtol=1e-6)
@@ -75,14 +66,13 @@ def test_one_frame_of_lag_is_the_filter_itself_at_the_first_step():
 def test_the_sensitivities_are_the_derivatives(name, scenario_name, landmarks):
     """S and A against central differences, with landmarks that enter and a white calibration."""
     of = case(scenario_name, landmarks=12 if scenario_name == "circle" else 4)
-    slam = FixedLag(named_filter(of, name, landmarks), 3)
+    slam = FixedLag(of.filter(name, landmarks), 3)
     state, _ = pose_run(of, slam)
-    parameters = of.parameters()
 
     def replayed(y):
         return jax.lax.scan(
-            lambda point, frame: slam._advance(parameters, point, frame),
-            sensitivity.begin(state.before, y),
+            lambda point, frame: slam._advance(point, frame),
+            begin(state.before, y),
             state.frames,
         )
 
@@ -104,11 +94,9 @@ def test_the_sensitivities_are_the_derivatives(name, scenario_name, landmarks):
 def test_the_estimate_of_a_window_that_holds_everything_is_the_maximum_of_the_posterior():
     """Converged, with no frame absorbed: the gradient of ½|y|² + ½ Σ|r|² is zero there."""
     of = case()
-    slam = replace(named_filter(of, "robocentric+lag6"), iterations=4)
+    slam = replace(of.filter("robocentric+lag6"), iterations=4)
     state, _ = pose_run(of, slam)
-    normal_equations = quick_jit(
-        lambda s: slam._normal_equations(of.parameters(), s.before, s.variables, s.frames)
-    )
+    normal_equations = quick_jit(lambda s: slam._normal_equations(s.before, s.variables, s.frames))
     window = normal_equations(state)
     assert np.abs(window.gradient).max() < 1e-6 * np.abs(window.information.root).max()
     converged = replace(slam, iterations=1, converge=True)
@@ -119,24 +107,21 @@ def test_the_estimate_of_a_window_that_holds_everything_is_the_maximum_of_the_po
 @pytest.mark.parametrize("iterations", [1, 3])
 def test_a_frame_is_linearised_as_often_as_is_said(monkeypatch, iterations):
     of = case()
-    slam = replace(named_filter(of, "robocentric+lag2"), iterations=iterations)
+    slam = replace(of.filter("robocentric+lag2"), iterations=iterations)
     first, *later = of.frames(0)
-    velocity, sigma, controls = of.motion()
     linearised, normal_equations = [], FixedLag._normal_equations
 
     def counted(*arguments):
         linearised.append(None)
         return normal_equations(*arguments)
 
-    def one_frame(parameters):
+    def one_frame(first):
         known, new = (jax.tree.map(lambda x: x[0], features) for features in later)
-        sizes = known.slots.size, new.slots.size
-        state = slam.start(parameters, of.capacity, velocity, sigma, sizes)
-        state = slam.first(state, parameters, first)
-        return slam.step(state, parameters, controls[0], known, new)
+        state = slam.init(Capacity(of.capacity, known.slots.size, new.slots.size), first)
+        return slam.step(state, of.controls()[0], known, new)
 
     monkeypatch.setattr(FixedLag, "_normal_equations", counted)
-    jax.eval_shape(one_frame, of.parameters())
+    jax.eval_shape(one_frame, first)
     assert len(linearised) == iterations
 
 
@@ -146,13 +131,14 @@ def test_an_iterated_filter_uses_a_measurement_once():
     An iteration that took its own posterior for a prior would end at 1/3.
     """
     of = case("matched", steps=1, landmarks=1)
-    base = named_filter(of, "iterated")
+    base = of.filter("iterated")
     state, _ = pose_run(of, base)
-    plain, _ = pose_run(of, named_filter(of, "robocentric"))
+    robocentric = of.filter("robocentric")
+    plain, _ = pose_run(of, robocentric)
     # The depth is hardly seen after one frame; the pixel is seen twice, σ² → σ²/2.
     slot = jnp.array([0])
-    _, iterated_P = base.landmarks_in_camera(state, of.parameters(), slot)
-    _, plain_P = named_filter(of, "robocentric").landmarks_in_camera(plain, of.parameters(), slot)
+    _, iterated_P = landmarks_in_camera(base, state, slot, robocentric.sensor)
+    _, plain_P = landmarks_in_camera(robocentric, plain, slot, robocentric.sensor)
     np.testing.assert_allclose(iterated_P, plain_P, rtol=0.02)
 
 
@@ -160,22 +146,21 @@ def test_absorbing_the_oldest_frame_keeps_its_point_and_all_that_is_known_of_the
     """Marginalisation is exact at one point of linearisation: a frame in which nothing happens
     after that leaves the newest mean and covariance as they were."""
     of = case()
-    slam = named_filter(of, "scale_gauge+lag3")
+    slam = of.filter("scale_gauge+lag3")
     state, _ = pose_run(of, slam)
-    parameters = of.parameters()
     oldest, nothing = (
         jax.tree.map(f, state.frames) for f in (lambda x: x[0], lambda x: jnp.zeros_like(x[0]))
     )
 
     @quick_jit
     def both(state):
-        window = slam._normal_equations(parameters, state.before, state.variables, state.frames)
-        before, variables = slam._absorbed(state, parameters)
+        window = slam._normal_equations(state.before, state.variables, state.frames)
+        before, variables = slam._absorbed(state)
         frames = _appended(state.frames, nothing)
-        absorbed = slam._normal_equations(parameters, before, variables, frames)
+        absorbed = slam._normal_equations(before, variables, frames)
         n = before.offset.size + slam._noises(before)
-        own = sensitivity.begin(state.before, state.variables[:n])
-        point = slam._advance(parameters, own, oldest)[0], sensitivity.begin(before, variables)
+        own = begin(state.before, state.variables[:n])
+        point = slam._advance(own, oldest)[0], begin(before, variables)
         return point, (_estimate(window), _estimate(absorbed))
 
     def apart(a, b):
@@ -192,7 +177,7 @@ def test_absorbing_the_oldest_frame_keeps_its_point_and_all_that_is_known_of_the
 
 def test_a_removed_landmark_leaves_nothing_behind():
     of = case()
-    slam = named_filter(of, "scale_gauge+lag3")
+    slam = of.filter("scale_gauge+lag3")
     state, _ = pose_run(of, slam)
     gone = jnp.arange(of.capacity) == 1
     left = slam.remove(state, gone)
@@ -203,10 +188,10 @@ def test_a_removed_landmark_leaves_nothing_behind():
     assert not np.any(left.estimate.covariance[rows])
     assert not np.any(left.frames.seen.valid & (left.frames.seen.slots == 1))
     _, known, new = of.frames(0)
-    step = quick_jit(slam.step)
+    step = quick_jit(lambda *x: slam.step(*x))
     frame = jax.tree.map(lambda x: x[-1], (known, new))
     seen = replace(frame[0], valid=frame[0].valid & (frame[0].slots != 1))
-    after, _ = step(left, of.parameters(), of.motion()[2][-1], seen, frame[1])
+    after, _ = step(left, of.controls()[-1], seen, frame[1])
     assert np.isfinite(np.asarray(after.estimate.covariance)).all()
     assert not np.any(after.estimate.covariance[rows])
 
@@ -214,14 +199,14 @@ def test_a_removed_landmark_leaves_nothing_behind():
 def test_the_gauge_is_not_seen_by_a_camera():
     """Nothing that is measured depends on λ."""
     of = case()
-    slam = named_filter(of, "scale_gauge")
+    slam = of.filter("scale_gauge")
     state, _ = pose_run(of, slam)
     other = replace(state, core=replace(state.core, log_scale=state.core.log_scale + 0.5))
     slots = jnp.arange(of.capacity)
-    control = of.motion()[2][0]
-    pixels = [slam.project(s, of.parameters(), control, slots)[0] for s in (state, other)]
+    control = of.controls()[0]
+    pixels = [slam.predict_features(s, control, slots).measured for s in (state, other)]
     np.testing.assert_array_equal(*pixels)
-    poses = [slam.camera_pose(s)[0].translation() for s in (state, other)]
+    poses = [camera_pose(slam, s)[0].translation() for s in (state, other)]
     np.testing.assert_allclose(poses[1], poses[0] * np.exp(0.5))
 
 
@@ -232,15 +217,13 @@ def test_the_gauge_is_not_seen_by_a_camera():
 def test_depths_have_their_own_variance_and_what_is_common(modifier, own, common):
     """In variances of one prior: `common` shares it, `scene` adds to it."""
     of = case("matched")
-    slam = named_filter(of, f"robocentric+{modifier}")
+    slam = of.filter(f"robocentric+{modifier}")
     first, _, _ = of.frames(0)
-    velocity, sigma, _ = of.motion()
-    parameters = of.parameters()
-    state = slam.first(slam.start(parameters, of.capacity, velocity, sigma), parameters, first)
+    state = slam.init(of.capacity, first)
     c = state.core_dim
     index = c + 3 * np.arange(of.capacity) + 2
     P = np.asarray(state.covariance)[np.ix_(index, index)] / 650**2
-    variance = float(parameters.inverse_depth_sigma) ** 2
+    variance = float(slam.depth.sigma) ** 2
     np.testing.assert_allclose(np.diagonal(P), own * variance, rtol=1e-9)
     np.testing.assert_allclose(P[0, 1:], common * variance, rtol=1e-9)
 
@@ -262,16 +245,17 @@ def test_depths_have_their_own_variance_and_what_is_common(modifier, own, common
         ("scale_gauge+rays", "cartesian", "known", "delayed initialisation"),
         ("scale_gauge+common50+rays", "cartesian", "known", "delayed initialisation"),
         ("robocentric+scene+rays", "cartesian", "known", "delayed initialisation"),
-        ("robocentric+lag5+lag5", "inverse_scaling", "known", "must stand before"),
+        ("robocentric+lag5+lag5", "inverse_scaling", "known", "not around a FixedLag"),
+        ("robocentric+lag5+common50", "inverse_scaling", "known", "must stand before"),
         ("scale_gauge+oc", "inverse_scaling", "known", "needs no remedy"),
         ("robocentric+lagg5", "inverse_scaling", "known", "lagg"),
     ],
 )
 def test_what_makes_no_sense_is_refused(name, landmarks, calibration, message):
     with pytest.raises(ValueError, match=message):
-        make_filter(Rig(each_geometry[0]), name, LANDMARKS[landmarks], calibration)
+        case("matched").filter(name, landmarks, calibration)
 
 
 def test_a_gauge_needs_a_camera_with_a_velocity():
     with pytest.raises(ValueError, match="measure metres"):
-        make_filter(Rig(each_geometry[0], sensor=POSITION), "scale_gauge", INVERSE_SCALING, "known")
+        make_filter("scale_gauge", **{**case("matched").pieces(), "sensor": Position(0.1)})

@@ -7,15 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Case, close, each_geometry, named, named_filter, pose_run, quick_jit
+from cases import Case, close, each_geometry, named, pose_run, quick_jit
 
 import jaxslam
-from jaxslam.filters import RECOMMENDED, make_filter
-from jaxslam.filters.bank import BEHIND, BankState, _mixed, log_likelihoods
-from jaxslam.filters.split_and_merge import _split_and_merged
-from jaxslam.filters.state import Innovation
-from jaxslam.landmarks import LANDMARKS
-from jaxslam.rig import Rig
+from jaxslam.forms.state import Innovation, Status
+from jaxslam.names import RECOMMENDED
+from jaxslam.wrappers.bank import BEHIND, BankState, _mixed, log_likelihoods, with_motion
+from jaxslam.wrappers.mixture import _split_and_merged
 
 
 @cache
@@ -35,8 +33,8 @@ def test_a_sum_for_a_linear_problem_is_its_filter(modifier, tolerance):
         inverse_depth=(1 / 6, 1e-7),
         pixel_sigma=0.3,
     )
-    _, (plain, plain_P, _, _) = pose_run(of, named_filter(of, "robocentric"))
-    _, (sum_, sum_P, _, _) = pose_run(of, named_filter(of, f"robocentric+{modifier}"))
+    _, (plain, plain_P, _, _) = pose_run(of, of.filter("robocentric"))
+    _, (sum_, sum_P, _, _) = pose_run(of, of.filter(f"robocentric+{modifier}"))
     sigma = np.sqrt(np.diagonal(plain_P, axis1=1, axis2=2))
     away = jax.vmap(lambda a, b: (a.inverse() @ b).log())(plain, sum_)
     assert np.abs(away / sigma).max() < tolerance
@@ -52,31 +50,31 @@ def test_a_sum_for_a_linear_problem_is_its_filter(modifier, tolerance):
 def test_a_divided_prior_has_the_moments_of_the_whole(name):
     """Also where a sum is divided again, and its base is given a root of the covariance."""
     of = case()
-    velocity, sigma, _ = of.motion()
-    slam = named_filter(of, name)
-    state = slam.start(of.parameters(), of.capacity, velocity, sigma)
+    motion = of.pieces()["motion"]
+    state = of.filter(name).init(of.capacity)
     weights, members = jnp.exp(state.log_weights), state.members
     while isinstance(members, BankState):
         weights = weights[..., None] * jnp.exp(members.log_weights)
         members = members.members
     weights = np.asarray(weights).ravel()
-    means = np.asarray(members.core.velocity).reshape(len(weights), -1)
+    means = np.asarray(members.core.motion).reshape(len(weights), -1)
     place = slice(3, 6)  # after the pose
     own = np.asarray(members.covariance)[..., place, place].reshape(len(weights), 3, 3)
     mean = weights @ means
     spread = np.einsum("m,mi,mj->ij", weights, means - mean, means - mean)
-    np.testing.assert_allclose(mean, velocity, atol=1e-9)
+    np.testing.assert_allclose(mean, motion.velocity, atol=1e-9)
     covariance = np.tensordot(weights, own, 1) + spread
-    np.testing.assert_allclose(covariance, np.diag(np.square(sigma)), rtol=1e-9, atol=1e-12)
+    prior = np.diag(np.square(motion.velocity_sigma))
+    np.testing.assert_allclose(covariance, prior, rtol=1e-9, atol=1e-12)
 
 
 def test_a_member_without_weight_spoils_no_prediction():
     """Once diverged it is NaN, and of likelihood zero."""
     predicted = jnp.array([[[1.0], [2.0]], [[3.0], [6.0]], [[jnp.nan], [jnp.nan]]])
     covariance = jnp.stack([jnp.eye(2), jnp.eye(2), jnp.full((2, 2), jnp.nan)])
-    innovations = Innovation(
-        predicted, -predicted, covariance, jnp.ones((3, 2), bool), jnp.array([5.0, 45.0, jnp.nan])
-    )
+    used, nis = jnp.ones((3, 2), bool), jnp.array([5.0, 45.0, jnp.nan])
+    status = jnp.array([Status.OK, Status.OK, Status.DIVERGED])
+    innovations = Innovation(predicted, -predicted, covariance, used, nis, status)
     mixed = _mixed(innovations, jnp.log(jnp.array([0.75, 0.25, 0.0])))
     np.testing.assert_allclose(mixed.predicted[:, 0], [1.5, 3.0])
     np.testing.assert_allclose(mixed.residual, -mixed.predicted)
@@ -87,19 +85,20 @@ def test_a_prior_is_divided_along_the_speed_or_across_it(name):
     """The members of a sum over directions have one speed, and those of one over scales differ in
     nothing else, also where what is known of the velocity is skew."""
     of = case(name)
-    velocity, sigma, _ = of.motion()
-    t, n = velocity.size, of.scenario.rig.geometry.point_dim
-    velocity = velocity.at[:n].set(jnp.arange(1.0, n + 1))
-    root = np.diag(sigma) + 0.05 * np.random.default_rng(0).normal(size=(t, t))
+    motion = of.pieces()["motion"]
+    t, n = motion.geometry.tangent_dim, motion.geometry.point_dim
+    velocity = np.concatenate([np.arange(1.0, n + 1), motion.velocity[n:]])
+    root = np.diag(motion.velocity_sigma) + 0.05 * np.random.default_rng(0).normal(size=(t, t))
 
     def members(modifier):
-        slam = named_filter(of, f"robocentric+{modifier}")
-        return slam.start(of.parameters(), of.capacity, velocity, jnp.asarray(root)).members
+        begun = replace(motion, velocity=velocity, velocity_sigma=root)
+        slam = with_motion(of.filter(f"robocentric+{modifier}"), begun)
+        return slam.init(of.capacity).members
 
-    forward = np.asarray(velocity).copy()
+    forward = velocity.copy()
     forward[n:] = 0
     across, along = (
-        np.asarray(quick_jit(lambda name=name: members(name).core.velocity)()) - velocity
+        np.asarray(quick_jit(lambda name=name: members(name).core.motion)()) - velocity
         for name in ("directions3", "scales3")
     )
     assert len(across) == 3 ** (n - 1)
@@ -116,32 +115,24 @@ def test_a_prior_is_divided_along_the_speed_or_across_it(name):
 def some_sum():
     """A sum after some steps, and the function that it is divided by."""
     of = case()
-    slam = named_filter(of, "scale_gauge+mixture5")
+    slam = of.filter("scale_gauge+mixture5")
     first, known, new = of.frames(0)
-    velocity, sigma, controls = of.motion()
-    parameters = of.parameters()
 
-    def whole():
-        state = slam.start(parameters, of.capacity, velocity, sigma)
-        state = slam.first(state, parameters, first)
-        state, _ = jax.lax.scan(
-            lambda state, frame: (slam.step(state, parameters, *frame)[0], None),
-            state,
-            (controls, known, new),
-        )
-        return state
+    def whole(first, *later):
+        state = slam.init(of.capacity, first)
+        return jax.lax.scan(lambda s, frame: (slam.step(s, *frame)[0], None), state, later)[0]
 
-    return quick_jit(whole)()
+    return quick_jit(whole)(first, of.controls(), known, new)
 
 
 def pixels(core):
-    return 100 * core.velocity[:2]
+    return 100 * core.motion[:2]
 
 
 def moments(state):
     """Mean and covariance of velocity, scale and landmarks."""
     members, weights = state.members, np.exp(np.asarray(state.log_weights))
-    parts = (members.core.velocity, members.core.log_scale, members.landmarks)
+    parts = (members.core.motion, members.core.log_scale, members.landmarks)
     x = np.concatenate([np.asarray(part).reshape(weights.size, -1) for part in parts], axis=1)
     P = np.asarray(members.covariance)
     kept = np.r_[3:7, 10 : P.shape[-1]]  # between them the noise, which is none
@@ -152,18 +143,18 @@ def moments(state):
 
 @pytest.mark.parametrize("likeliest", [0, 3])
 def test_of_a_sum_the_likeliest_member_is_reported(likeliest):
-    slam, state = named_filter(case(), "scale_gauge+mixture5"), some_sum()
+    slam, state = case().filter("scale_gauge+mixture5"), some_sum()
     state = replace(state, log_weights=jnp.log(jnp.full(5, 0.1).at[likeliest].set(0.6)))
-    found = slam.reported(state)
+    found = slam.likeliest(state)
     expected = jax.tree.map(lambda x: x[likeliest], state.members)
     jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
 def test_a_sum_as_one_gaussian_has_its_moments():
     state = some_sum()
-    slam = named_filter(case(), "scale_gauge+mixture5")
-    control = case().motion()[2][0]
-    one = quick_jit(lambda s: slam.predicted_gaussian(s, case().parameters(), control))(state)
+    slam = case().filter("scale_gauge+mixture5")
+    control = case().controls()[0]
+    one = quick_jit(lambda s: slam.gaussian(s, control)[1])(state)
     alone = BankState(jax.tree.map(lambda x: x[None], one), jnp.zeros(1))
     for whole, single in zip(moments(state), moments(alone), strict=True):
         np.testing.assert_allclose(single, whole, rtol=1e-9, atol=1e-12 * np.abs(whole).max())
@@ -172,24 +163,23 @@ def test_a_sum_as_one_gaussian_has_its_moments():
 def test_of_members_that_predict_alike_the_surer_one_gains():
     """Bayes: with no residual the likelihood is `1/√det S`."""
     of = case()
-    slam = named_filter(of, "robocentric+scales3")
+    slam = of.filter("robocentric+scales3")
     first, known, _ = of.frames(0)
-    velocity, sigma, controls = of.motion()
-    parameters, sure = of.parameters(), jnp.array([0.5, 1.0, 2.0])
+    motion, control = slam.base.motion, of.controls()[0]
 
     def begun(factor):
-        state = slam.base.start(parameters, of.capacity, velocity, factor * sigma)
-        return slam.base.first(state, parameters, first)
+        surer = replace(motion, velocity_sigma=factor * motion.velocity_sigma)
+        return with_motion(slam.base, surer).init(of.capacity, first)
 
     @quick_jit
     def weighed(weights):
-        members = jax.vmap(begun)(sure)
+        members = jax.vmap(begun)(jnp.array([0.5, 1.0, 2.0]))
         one = jax.tree.map(lambda x: x[0], members)
         seen, nothing = (jax.tree.map(lambda x: x[0], known),) * 2
         nothing = replace(nothing, valid=jnp.zeros_like(seen.valid))
-        predicted = slam.base.predict(one, parameters, controls[0])
-        pixels, _ = slam.base.project(predicted, parameters, controls[0], seen.slots)
-        data = (parameters, controls[0], replace(seen, measured=pixels), nothing)
+        predicted = slam.base.predict(one, control)
+        pixels = slam.base.predict_features(predicted, control, seen.slots).measured
+        data = (control, replace(seen, measured=pixels), nothing)
         after, mixed = slam.step(BankState(members, jnp.log(weights)), *data)
         _, alone = jax.vmap(lambda member: slam.base.step(member, *data))(members)
         return after.log_weights, alone, mixed.predicted - pixels
@@ -229,7 +219,7 @@ def test_what_gains_nothing_is_not_split():
     state = some_sum()
     members = state.members
     apart = jnp.arange(5.0)[:, None] * jnp.ones(3)
-    core = replace(members.core, velocity=members.core.velocity + apart)
+    core = replace(members.core, motion=members.core.motion + apart)
     state = BankState(replace(members, core=core), jnp.log(jnp.full(5, 0.2)))
     after = divided()(state)
     jax.tree.map(np.testing.assert_array_equal, after, state)
@@ -250,8 +240,8 @@ def test_members_without_weight_give_their_places():
 @pytest.mark.parametrize("name", ["world+mixture3", "robocentric+mixture3"])
 def test_a_mixture_is_of_any_frame(name):
     of = case()
-    _, (poses, covariances, _, _) = pose_run(of, named_filter(of, name))
-    _, (plain, _, _, _) = pose_run(of, named_filter(of, name.partition("+")[0]))
+    _, (poses, covariances, _, _) = pose_run(of, of.filter(name))
+    _, (plain, _, _, _) = pose_run(of, of.filter(name.partition("+")[0]))
     away = jax.vmap(lambda a, b: (a.inverse() @ b).log())(plain, poses)
     sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     assert 1e-6 < np.abs(away / sigma).max() < 1
@@ -261,15 +251,15 @@ def test_a_mixture_is_of_any_frame(name):
 def test_a_mixture_has_so_many_members(geometry):
     """In space too, where the direction of the velocity has two angles."""
     of = case("matched" if geometry.name == "planar" else "matched-6dof")
-    velocity, sigma, _ = of.motion()
-    slam = named_filter(of, "robocentric+mixture5")
-    start = jax.eval_shape(lambda v: slam.start(of.parameters(), of.capacity, v, sigma), velocity)
+    slam = of.filter("robocentric+mixture5")
+    start = jax.eval_shape(lambda: slam.init(of.capacity))
     assert start.log_weights.shape == (5,)
 
 
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_recommended_is_a_name(geometry):
-    made = jaxslam.make_filters(Rig(geometry), ["recommended"], ["inverse_scaling"], "known")
+    chosen = jaxslam.scenario("matched" if geometry.name == "planar" else "matched-6dof")
+    made = jaxslam.make_filters(chosen, ["recommended"], ["inverse_scaling"])
     assert list(made) == [f"{RECOMMENDED[geometry.name]}/inverse_scaling"]
 
 
@@ -277,26 +267,24 @@ def test_recommended_is_a_name(geometry):
     ("name", "landmarks", "message"),
     [
         ("robocentric+scales2", "inverse_scaling", "at least 3 members"),
-        ("robocentric+scales5+iterated", "inverse_scaling", "around a filter"),
-        ("robocentric+lag5+mixture", "inverse_scaling", "not of windows"),
+        ("robocentric+scales5+iterated", "inverse_scaling", "around an EkfSlam, not around a Bank"),
+        ("robocentric+lag5+mixture", "inverse_scaling", "around an EkfSlam, not around a FixedLag"),
         ("world+particles+mixture", "cartesian", "delayed"),
         ("information+mixture", "cartesian", "covariance form|information form"),
-        ("information+scales5", "cartesian", "information form"),
+        ("information+scales5", "cartesian", "which information does not have"),
         ("world+mixture", "inverse_depth_to_cartesian", "cannot switch the form"),
     ],
 )
 def test_what_makes_no_sense_is_refused(name, landmarks, message):
     with pytest.raises(ValueError, match=message):
-        make_filter(Rig(each_geometry[0]), name, LANDMARKS[landmarks], "known")
+        case("matched").filter(name, landmarks)
 
 
 @pytest.mark.statistics
 def test_the_recommended_filter_is_consistent_where_the_papers_is_not():
     """40 runs straight ahead with loose noise, 30 steps: IS is lost; this one is in the band."""
     chosen = jaxslam.scenario("matched-forward-loose", steps=30)
-    filters = jaxslam.make_filters(
-        chosen.rig, ["robocentric", "recommended"], ["inverse_scaling"], "known"
-    )
+    filters = jaxslam.make_filters(chosen, ["robocentric", "recommended"], ["inverse_scaling"])
     study = jaxslam.monte_carlo(chosen, filters, runs=40, seed=5, chunk=10)
     summary = jaxslam.summarise(study)["filters"]
     paper, ours = (np.array(f["nees"]) for f in summary.values())
@@ -313,7 +301,9 @@ def innovations_of(residuals, variances, used):
     variances = jnp.where(used, jnp.asarray(variances), 1.0)
     nis = jnp.sum(residuals[..., 0] ** 2 / variances, axis=1)
     covariance = jax.vmap(jnp.diag)(variances)
-    return Innovation(residuals, residuals, covariance, used, nis)
+    log_det = jnp.sum(jnp.log(variances), axis=1)
+    status = jnp.full(len(nis), Status.OK)
+    return Innovation(residuals, residuals, covariance, used, nis, status, log_det)
 
 
 def test_a_member_gains_nothing_by_a_landmark_behind_itself():

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from cases import Case, close, named, pose, quick_jit
 
-from jaxslam.filters import make_filter
-from jaxslam.filters.blocks import shifted
-from jaxslam.filters.ekf import update as plain_update
-from jaxslam.filters.gauge import act
-from jaxslam.filters.slam import Context
+from jaxslam.forms.blocks import shifted
+from jaxslam.forms.covariance import Covariance
 from jaxslam.geometry import PLANAR, SPATIAL, difference, exp, log
 from jaxslam.landmarks import CARTESIAN, INVERSE_DEPTH, INVERSE_SCALING
+from jaxslam.remedies.gauge import act
+from jaxslam.slam.model import COMPOSED
 
 NAMES = {PLANAR: "matched", SPATIAL: "matched-6dof"}
 
@@ -29,16 +28,13 @@ def predicted(slam, geometry):
     """A predicted state whose pose and landmarks are uncertain together, and its measurements."""
     start = case(geometry)
     first, known, _ = start.frames(0)
-    velocity, velocity_sigma, controls = start.motion()
-    given = start.parameters()
-    state = slam.first(slam.start(given, 4, velocity, velocity_sigma), given, first)
-    state = slam.predict(state, given, controls[0])
+    state = slam.predict(slam.init(4, first), start.controls()[0])
     # A heading uncertain enough for a large correction.
     t = geometry.tangent_dim
     moved = state.covariance.at[jnp.arange(t), jnp.arange(t)].add(1e-2)
     features = jax.tree.map(lambda x: x[0], known)
     features = replace(features, measured=features.measured + 60.0)  # of 650 a radian
-    return replace(state, covariance=moved), features, given
+    return replace(state, covariance=moved), features
 
 
 def seen_from_elsewhere(slam, state, rigid):
@@ -62,13 +58,13 @@ def seen_from_elsewhere(slam, state, rigid):
     ids=named,
 )
 def test_an_update_is_the_same_in_every_base_frame(geometry, landmark):
-    slam = make_filter(case(geometry).scenario.rig, "invariant", landmark, "known")
+    slam = case(geometry).filter("invariant", landmark.name)
 
     def both():
-        state, features, given = predicted(slam, geometry)
+        state, features = predicted(slam, geometry)
         rigid = pose(geometry, 4, 1.2)
         elsewhere = seen_from_elsewhere(slam, state, rigid)
-        a, b = (slam.update(s, given, None, features)[0] for s in (state, elsewhere))
+        a, b = (slam.update(s, None, features)[0] for s in (state, elsewhere))
         return seen_from_elsewhere(slam, a, rigid), b, state
 
     expected, actual, before = quick_jit(both)()
@@ -81,17 +77,14 @@ def test_an_update_is_the_same_in_every_base_frame(geometry, landmark):
 @pytest.mark.parametrize("geometry", [PLANAR, SPATIAL], ids=lambda g: g.name)
 def test_cartesian_landmarks_are_corrected_as_published(geometry):
     """`p ← R p + V ξ`, V by `Exp(ξ, θ) = (R, V ξ)`, but for θ²/24 of a landmark's own ξ."""
-    rig = case(geometry).scenario.rig
-    slam = make_filter(rig, "invariant", CARTESIAN, "known")
+    slam = case(geometry).filter("invariant", CARTESIAN.name)
     n = geometry.point_dim
 
     def corrected():
-        state, features, given = predicted(slam, geometry)
-        context = Context(given, None)
-        noise = given.measurement_sigma**2 * jnp.eye(geometry.pixel_dim)
-        added, _ = plain_update(slam.model, state, features, noise, context)
-        after, _ = slam.update(state, given, None, features)
-        mean = slam.update_mean(state, given, None, features)
+        state, features = predicted(slam, geometry)
+        added, _ = Covariance().update(slam.model, state, features, slam.sensor.noise, COMPOSED)
+        after, _ = slam.update(state, None, features)
+        mean = slam.update_mean(state, None, features)
         return state, added, after, mean
 
     before, added, after, mean = quick_jit(corrected)()

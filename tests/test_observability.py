@@ -5,20 +5,18 @@ odometry, the scale of the whole: 3 + 1 planar, 6 + 1 in space. A parametrizatio
 numbers than a point adds its redundancy for every landmark.
 """
 
+from dataclasses import replace
 from functools import cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import each_geometry, few_landmarks, named, pose, quick_jit
+from cases import a_filter, each_geometry, few_landmarks, named, pose, quick_jit
 
-from jaxslam.camera import Camera
-from jaxslam.filters import Parameters, SlamModel
-from jaxslam.filters.frames import ROBOCENTRIC, WORLD
-from jaxslam.filters.slam import Context, Core
 from jaxslam.geometry import PLANAR, SPATIAL, difference, retract
-from jaxslam.rig import Rig
+from jaxslam.models.coordinates import ROBOCENTRIC, WORLD
+from jaxslam.slam.model import COMPOSED, Context, Core
 
 STEPS, DT, COUNT = 8, 0.4, 7
 GAUGE = {PLANAR: 3, SPATIAL: 6}
@@ -35,9 +33,9 @@ def truth(model):
     rng = np.random.default_rng(5)
     t, n = geometry.tangent_dim, geometry.point_dim
     velocity = np.concatenate([rng.uniform(0.3, 0.8, n), rng.uniform(0.1, 0.2, t - n)])
-    held = model.frame.hold(pose(geometry, 1))
-    core = Core(held, jnp.asarray(velocity), jnp.zeros(t), jnp.zeros(0))
-    T_AC = model.view(core, Context(None, None)).map_from_camera
+    held = model.coordinates.hold(pose(geometry, 1))
+    core = Core(held, jnp.asarray(velocity), None, jnp.zeros(t), jnp.zeros(0))
+    T_AC = model.view(core, COMPOSED).map_from_camera
 
     def landmark(bearing, depth, anchor):
         seen = model.landmark.initialise(jnp.append(bearing, 1.0), 1 / depth, jnp.asarray(1.0))
@@ -54,12 +52,8 @@ def truth(model):
 @cache
 def linearised(geometry, landmark, frame):
     """`(core, landmarks) → H` of all pixels here, `Φ` of one step, and the state after it."""
-    model = SlamModel(Rig(geometry), landmark, frame)
-    # A unit camera: H is of the same size as the rest.
-    p = geometry.pixel_dim
-    camera = Camera(jnp.ones(p), jnp.zeros(p))
-    parameters = Parameters(camera, *[jnp.zeros(())] * 5)
-    here, motion = (Context(parameters, control) for control in (None, jnp.asarray(DT)))
+    model = a_filter(geometry, landmark, frame).model
+    motion = Context(jnp.asarray(DT))
 
     def moved(core, landmarks):
         view = model.view(core, motion)
@@ -73,8 +67,8 @@ def linearised(geometry, landmark, frame):
         def function(delta):
             c = delta.size - landmarks.size
             x = retract(core, delta[:c]), landmarks + delta[c:].reshape(landmarks.shape)
-            view = model.view(x[0], here)
-            pixels = jax.vmap(lambda landmark: model.observe(view, landmark, here)[0])(x[1])
+            view = model.view(x[0], COMPOSED)
+            pixels = jax.vmap(lambda landmark: model.observe(view, landmark, COMPOSED)[0])(x[1])
             y = moved(*x)
             return pixels.ravel(), jnp.append(difference(y[0], after), y[1])
 
@@ -96,7 +90,7 @@ def window(geometry, landmark, frame, accelerations):
     rows = []
     for k in range(STEPS + 1):
         a = accelerations[k] if k < STEPS else np.zeros(t)
-        core = Core(core.pose, core.velocity, jnp.asarray(a), core.calibration)
+        core = replace(core, noise=jnp.asarray(a))
         H, F, core, landmarks = (
             np.asarray(x) if i < 2 else x for i, x in enumerate(jacobians(core, landmarks))
         )

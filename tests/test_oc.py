@@ -11,17 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Case, close, each_landmark, named, pose, quick_jit
+from cases import Case, a_filter, close, each_landmark, named, pose, quick_jit
 from test_observability import GAUGE, nullity
 
-from jaxslam.camera import Camera
-from jaxslam.filters import Parameters, SlamModel, make_filter
-from jaxslam.filters.blocks import shifted
-from jaxslam.filters.ekf import empty
-from jaxslam.filters.frames import ROBOCENTRIC, WORLD
-from jaxslam.filters.gauge import act, unobservable_directions
-from jaxslam.filters.observability_constrained import transport
-from jaxslam.filters.slam import Context, Core
+from jaxslam.forms.blocks import shifted
+from jaxslam.forms.covariance import Covariance
 from jaxslam.geometry import PLANAR, SPATIAL, SplitPose, difference, tangent_dim
 from jaxslam.landmarks import (
     CARTESIAN,
@@ -31,27 +25,23 @@ from jaxslam.landmarks import (
     INVERSE_SCALING,
     LANDMARKS,
 )
-from jaxslam.motion import CONSTANT_VELOCITY, ODOMETRY
-from jaxslam.rig import Rig
-from jaxslam.sensors import CAMERA
+from jaxslam.models.coordinates import ROBOCENTRIC, WORLD
+from jaxslam.models.motion import Odometry
+from jaxslam.names import make_filter, scenario_pieces
+from jaxslam.remedies.gauge import act, unobservable_directions
+from jaxslam.remedies.observability_constrained import transport
+from jaxslam.simulation import scenario
+from jaxslam.slam.model import COMPOSED, Context, Core
 
 COUNT, STEPS, DT = 7, 8, 0.4
-VELOCITY = Rig(PLANAR, CONSTANT_VELOCITY, CAMERA)
-
-
-def parameters(geometry):
-    """A unit camera, so that H is of the same size as the rest."""
-    p = geometry.pixel_dim
-    return Parameters(Camera(jnp.ones(p), jnp.zeros(p)), *[jnp.zeros(())] * 5)
 
 
 def context(model, composed):
     """Of a moving camera, or of one whose motion is composed."""
     if composed:
-        return Context(parameters(model.geometry), None)
-    t, moving = model.geometry.tangent_dim, model.rig.motion is CONSTANT_VELOCITY
-    control = jnp.asarray(DT) if moving else jnp.linspace(0.3, 0.1, t)
-    return Context(parameters(model.geometry), control)
+        return COMPOSED
+    t, moving = model.geometry.tangent_dim, model.motion.has_velocity
+    return Context(jnp.asarray(DT) if moving else jnp.linspace(0.3, 0.1, t))
 
 
 def truth(model):
@@ -64,8 +54,9 @@ def truth(model):
         drawn = jax.vmap(geometry.group.exp)(jnp.asarray(rng.uniform(-0.3, 0.3, (COUNT, t))))
         anchors = jax.vmap(SplitPose.of)(drawn)
     core = Core(
-        model.frame.hold(pose(geometry, 1)),
-        jnp.asarray(velocity if model.rig.motion.has_velocity else []),
+        model.coordinates.hold(pose(geometry, 1)),
+        jnp.asarray(velocity) if model.motion.has_velocity else (),
+        None,
         jnp.zeros(t),
         jnp.zeros(0),
         anchors,
@@ -84,7 +75,7 @@ def truth(model):
         rng.uniform(8, 20, COUNT),
         rng.uniform(-0.3, 0.3, (COUNT, t)),
     )
-    return replace(empty(core, landmarks), active=jnp.ones(COUNT, bool))
+    return replace(Covariance().empty(core, landmarks), active=jnp.ones(COUNT, bool))
 
 
 def observed(model, state, composed=True):
@@ -112,7 +103,7 @@ def moved(model, core, landmarks):
 )
 def test_the_gauge_changes_no_measurement_now_or_after_a_motion(geometry, landmark, frame):
     """Finite transformations: h(g x) = h(x), and the motion of g x is g of the motion of x."""
-    model = SlamModel(Rig(geometry), landmark, frame)
+    model = a_filter(geometry, landmark, frame).model
 
     def compared():
         state = truth(model)
@@ -137,7 +128,7 @@ def test_the_gauge_changes_no_measurement_now_or_after_a_motion(geometry, landma
 @pytest.mark.parametrize("landmark", [INVERSE_SCALING, FRAMED_HOMOGENEOUS], ids=named)
 def test_directions_are_the_derivative_of_the_action(landmark, frame):
     """H N = 0, by other Jacobians than N's; empty slots do not move."""
-    model = SlamModel(VELOCITY, landmark, frame)
+    model = a_filter(PLANAR, landmark, frame).model
 
     def products():
         state = truth(model)
@@ -155,7 +146,6 @@ def test_directions_are_the_derivative_of_the_action(landmark, frame):
     close(half[others, :3], N[others, :3], 1e-14)
 
 
-@cache
 def steps(model, constrained):
     """`(state, correction) → H, M, Φ, next state`: one step of a filter that is corrected."""
 
@@ -186,16 +176,16 @@ def window(model, constrained):
     t = model.geometry.tangent_dim
     state = truth(model)
     n = state.core_dim + state.landmarks.size
-    first = tangent_dim((state.core.pose, state.core.velocity))
+    first = tangent_dim((state.core.pose, state.core.motion))
     kept = np.delete(np.arange(n), range(first, first + t))
     N = np.asarray(unobservable_directions(model, state))[kept]
     G = np.eye(n, kept.size + STEPS * t) * 0.0
     G[kept, np.arange(kept.size)] = 1.0
-    rng, rows = np.random.default_rng(11), []
+    rng, rows, step = np.random.default_rng(11), [], steps(model, constrained)
     for k in range(STEPS + 1):
         correction = 0.02 * rng.standard_normal(n)
         correction[first : first + t] = 0.0
-        H, M, F, state = steps(model, constrained)(state, jnp.asarray(correction))
+        H, M, F, state = step(state, jnp.asarray(correction))
         rows.append(np.asarray(H) @ G)
         G = np.asarray(M) @ G
         if k < STEPS:
@@ -206,11 +196,8 @@ def window(model, constrained):
     return np.vstack(rows), N
 
 
-RIGS = {"velocity": (CONSTANT_VELOCITY, CAMERA), "odometry": (ODOMETRY, CAMERA)}
-
-
 @pytest.mark.parametrize(
-    ("geometry", "landmark", "frame", "rig"),
+    ("geometry", "landmark", "frame", "motion"),
     [
         (PLANAR, CARTESIAN, ROBOCENTRIC, "velocity"),
         (PLANAR, CARTESIAN, WORLD, "odometry"),
@@ -219,25 +206,27 @@ RIGS = {"velocity": (CONSTANT_VELOCITY, CAMERA), "odometry": (ODOMETRY, CAMERA)}
     ],
     ids=lambda value: getattr(value, "name", value),
 )
-def test_corrections_leave_the_null_space_as_it_is(geometry, landmark, frame, rig):
+def test_corrections_leave_the_null_space_as_it_is(geometry, landmark, frame, motion):
     """4 or 7 directions without odometry, 3 or 6 with it, at other estimates in every step."""
-    model = SlamModel(Rig(geometry, *RIGS[rig]), landmark, frame)
+    odometry = {"motion": Odometry(np.zeros(geometry.tangent_dim))}
+    pieces = odometry if motion == "odometry" else {}
+    model = a_filter(geometry, landmark, frame, **pieces).model
     stacked, N = window(model, True)
     size = np.linalg.norm(stacked, 2) * np.linalg.norm(N, 2)
     count = N.shape[0]
     assert np.linalg.norm(stacked[:, :count] @ N, 2) < 1e-12 * size
     plain, _ = window(model, False)
     unaware = np.linalg.norm(plain[:, :count] @ N, 2)
-    if frame is ROBOCENTRIC and rig == "odometry":
+    if frame is ROBOCENTRIC and motion == "odometry":
         # Its pose is perturbed on the side of B: N is constant.
         assert unaware < 1e-12 * size
     else:
         assert unaware > 1e-6 * size
     if landmark.size(geometry.point_dim) > geometry.point_dim:
         return  # its redundant numbers are another null space
-    expected = GAUGE[geometry] + (rig == "velocity")
+    expected = GAUGE[geometry] + (motion == "velocity")
     # Where motion is noise, the first velocity and acceleration are seen only in their sum.
-    known = range(count, count + geometry.tangent_dim if rig == "velocity" else stacked.shape[1])
+    known = range(count, count + geometry.tangent_dim if motion == "velocity" else stacked.shape[1])
     assert nullity(np.delete(stacked, known, axis=1)) == expected
     assert N.shape[1] == expected
 
@@ -253,24 +242,21 @@ def run_with_gauge(slam, geometry, directions):
     start; states after every step, their directions N, and NIS."""
     start = case(geometry)
     first, known, new = start.frames(0)
-    velocity, velocity_sigma, controls = start.motion()
-    given = start.parameters()
 
     def run(sigma):
-        state = slam.start(given, start.capacity, velocity, velocity_sigma)
-        state = slam.first(state, given, first)
+        state = slam.init(start.capacity, first)
         N = unobservable_directions(slam.model, state)[:, :directions]
         state = replace(state, covariance=state.covariance + sigma**2 * N @ N.T)
 
         def step(state, frame):
-            state, innovation = slam.step(state, given, *frame)
+            state, innovation = slam.step(state, *frame)
             # Where the filter's directions are those of landmarks' first estimates.
             at = replace(state, landmarks=getattr(state, "first", state.landmarks))
             N = unobservable_directions(slam.model, at)[:, :directions]
             kept = state.core, state.landmarks, state.covariance
             return state, (*kept, N, innovation.nis)
 
-        return jax.lax.scan(step, state, (controls, known, new))[1]
+        return jax.lax.scan(step, state, (start.controls(), known, new))[1]
 
     return quick_jit(jax.vmap(run))(jnp.array([0.0, 0.1]))
 
@@ -297,16 +283,15 @@ REMEDIES = [
 @pytest.mark.parametrize(("name", "geometry", "landmark"), REMEDIES)
 def test_uncertainty_of_the_gauge_changes_no_estimate_ever(name, geometry, landmark):
     """Through whole steps: K and the mean are the same, and P keeps what was added, N Σ Nᵀ."""
-    rig = case(geometry).scenario.rig
     count = GAUGE[geometry] + (name != "invariant")  # which knows nothing of the scale
-    slam = make_filter(rig, name, LANDMARKS[landmark], "known")
+    slam = case(geometry).filter(name, landmark)
     moved, forgotten = difference_of_runs(slam, geometry, count)
     assert moved < 1e-9
     assert forgotten < 1e-7
 
 
 def test_a_plain_filter_learns_what_it_cannot_see():
-    slam = make_filter(case(PLANAR).scenario.rig, "robocentric", INVERSE_SCALING, "known")
+    slam = case(PLANAR).filter("robocentric")
     moved, forgotten = difference_of_runs(slam, PLANAR, GAUGE[PLANAR] + 1)
     assert moved > 1e-5
     assert forgotten > 1e-2
@@ -314,10 +299,9 @@ def test_a_plain_filter_learns_what_it_cannot_see():
 
 def test_with_odometry_a_robocentric_filter_has_nothing_to_constrain():
     odometry = Case("positions", steps=8, landmarks=6)
-    frames = odometry.parameters(), odometry.motion(), *odometry.frames(0)
+    frames = odometry.controls(), *odometry.frames(0)
     plain = odometry.compiled("robocentric", "cartesian")(*frames)[1]
-    slam = make_filter(odometry.scenario.rig, "robocentric+oc", CARTESIAN, "known")
-    constrained = quick_jit(odometry.function(slam))(*frames)[1]
+    constrained = odometry.compiled("robocentric+oc", "cartesian")(*frames)[1]
     for x, y in zip(jax.tree.leaves(plain), jax.tree.leaves(constrained), strict=True):
         np.testing.assert_allclose(x, y, rtol=0, atol=1e-11)
 
@@ -325,32 +309,28 @@ def test_with_odometry_a_robocentric_filter_has_nothing_to_constrain():
 def test_where_the_heading_is_known_all_are_the_kalman_filter():
     """Relative positions at a known heading are linear: one filter in every coordinates."""
     case = Case("positions", steps=8, landmarks=6, odometry_sigma=(0.05, 0.05, 0.0))
-    frames = case.parameters(), case.motion(), *case.frames(0)
+    frames = case.controls(), *case.frames(0)
     linear = case.compiled("world", "cartesian")(*frames)[1]
     assert np.trace(linear[1][-1]) > 1e-3
     for name in ("world+oc", "world+fej", "invariant"):
-        slam = make_filter(case.scenario.rig, name, CARTESIAN, "known")
-        same = quick_jit(case.function(slam))(*frames)[1]
+        same = case.compiled(name, "cartesian")(*frames)[1]
         for x, y in zip(jax.tree.leaves(linear), jax.tree.leaves(same), strict=True):
             np.testing.assert_allclose(x, y, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("name", ["robocentric+oc", "world+oc", "world+fej", "invariant"])
 def test_a_frame_without_measurements_changes_nothing(name):
-    """Neither the mean nor the covariance, but for `ekf.ROUNDING`: remedies are of corrections."""
+    """Neither the mean nor the covariance, but for `ROUNDING`: remedies are of corrections."""
     start = case(PLANAR)
-    slam = make_filter(start.scenario.rig, name, INVERSE_SCALING, "known")
+    slam, control = start.filter(name), start.controls()[0]
     first, known, _ = start.frames(0)
-    velocity, velocity_sigma, controls = start.motion()
-    given, control = start.parameters(), controls[0]
     blind = jax.tree.map(lambda x: x[0], known)
     blind = replace(blind, valid=jnp.zeros_like(blind.valid))
 
     def update():
-        state = slam.first(slam.start(given, 5, velocity, velocity_sigma), given, first)
-        state = slam.predict(state, given, control)
-        after, innovation = slam.update(state, given, control, blind)
-        return state, after, innovation.nis, slam.update_mean(state, given, control, blind)
+        state = slam.predict(slam.init(5, first), control)
+        after, innovation = slam.update(state, control, blind)
+        return state, after, innovation.nis, slam.update_mean(state, control, blind)
 
     before, after, nis, mean = quick_jit(update)()
     assert nis == 0
@@ -377,4 +357,4 @@ def test_a_frame_without_measurements_changes_nothing(name):
 )
 def test_what_does_not_go_together_is_refused(name, landmark, message):
     with pytest.raises(ValueError, match=message):
-        make_filter(VELOCITY, name, LANDMARKS[landmark], "known")
+        make_filter(name, landmark=LANDMARKS[landmark], **scenario_pieces(scenario("matched")))

@@ -1,4 +1,4 @@
-"""Tests of jaxslam.filters.ransac: both gates, and that the best hypothesis decides."""
+"""Tests of jaxslam.slam.ransac: both gates, and that the best hypothesis decides."""
 
 from dataclasses import replace
 from functools import cache
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from cases import Case, quick_jit
 
-from jaxslam.filters import Features
-from jaxslam.filters.ransac import LOW_INNOVATION, RESCUE, inliers
+from jaxslam.forms.state import Features
+from jaxslam.slam.ransac import LOW_INNOVATION, RESCUE, inliers
 
 SIGMA = 0.3
 
@@ -18,25 +18,23 @@ SIGMA = 0.3
 def matched():
     """A filter, the predicted state of its second frame, and the pixels of six landmarks there."""
     case = Case("matched-6dof", steps=1, landmarks=6)
-    slam = case.filter("robocentric", "inverse_scaling")
-    first, *_ = case.frames(0)
-    velocity, sigma, controls = case.motion()
-    sigma = sigma.at[4].set(0.5)  # a turn to the side by 17 mrad, 11 pixels
+    slam, control = case.filter("robocentric"), case.controls()[0]
+    sigma = slam.motion.velocity_sigma.copy()
+    sigma[4] = 0.5  # a turn to the side by 17 mrad, 11 pixels
+    slam = replace(slam, motion=replace(slam.motion, velocity_sigma=sigma))
 
-    def predicted(parameters):
-        state = slam.start(parameters, case.capacity, velocity, sigma)
-        state = slam.first(state, parameters, first)
-        state = slam.predict(state, parameters, controls[0])
-        return state, slam.project(state, parameters, controls[0], jnp.arange(6))[0]
+    def predicted(first):
+        state = slam.predict(slam.init(case.capacity, first), control)
+        return state, slam.predict_features(state, control, jnp.arange(6)).measured
 
-    state, pixels = quick_jit(predicted)(case.parameters())
-    return slam, state, case.parameters(), controls[0], pixels
+    state, pixels = quick_jit(predicted)(case.frames(0)[0])
+    return slam, state, control, pixels
 
 
 @cache
 def compiled(**gates):
-    slam, _, parameters, dt, _ = matched()
-    return quick_jit(lambda state, seen: inliers(slam, state, parameters, dt, seen, **gates))
+    slam, _, control, _ = matched()
+    return quick_jit(lambda state, seen: inliers(slam, state, control, seen, **gates))
 
 
 def agree(state, offsets, valid=None, **gates):

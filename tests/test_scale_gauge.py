@@ -1,11 +1,13 @@
 """The scale gauge: (λ, ṽ, ω̃) with v = e^λ ṽ and ω = e^−λ ω̃ say what the prior on v and ω says."""
 
+from functools import partial
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Case, named_filter, quick_jit
+from cases import Case, quick_jit
 
-from jaxslam.filters.slam import velocity_in_gauge
+from jaxslam.models.scale import velocity_in_gauge
 
 DRAWS = 400_000
 ERRORS = 5.0
@@ -88,27 +90,19 @@ def test_from_standstill_the_scale_is_known_and_the_velocity_has_its_prior(veloc
 def test_a_new_landmark_has_the_moments_of_its_prior(name):
     """Drawn after frame 0: `e^λ ω`, which the filter holds, exactly, ω to second order in λ."""
     of = Case(name, landmarks=5)
-    slam = named_filter(of, "scale_gauge")
-    velocity, sigma, _ = of.motion()
-    parameters, (first, _, _) = of.parameters(), of.frames(0)
-
-    @quick_jit
-    def begun(parameters, first):
-        state = slam.start(parameters, of.capacity, velocity, sigma)
-        return slam.first(state, parameters, first)
-
-    state = begun(parameters, first)
+    slam = of.filter("scale_gauge")
+    state = quick_jit(partial(slam.init, of.capacity))(of.frames(0)[0])
     c, d = state.core_dim, state.landmarks.shape[1]
     place = c - state.core.calibration.size - state.core.noise.size - 1
     assert state.core.log_scale.shape == (1,)
     index = [place, *(c + d * slot + d - 1 for slot in (0, 1))]
-    focal = float(parameters.camera.focal[0])
+    focal = float(slam.sensor.focal)
     mean = [float(state.core.log_scale[0]), *np.asarray(state.landmarks)[:2, -1] / focal]
     scale = np.array([1, focal, focal])
     covariance = np.asarray(state.covariance)[np.ix_(index, index)] / np.outer(scale, scale)
     draws = gaussian_draws(np.array(mean), covariance)
     log_scale, held = draws[:, :1], draws[:, 1:]
-    rho, sigma_rho = float(parameters.inverse_depth), float(parameters.inverse_depth_sigma)
+    rho, sigma_rho = float(slam.depth.mean), float(slam.depth.sigma)
     P = covariance[0, 0]
     # λ ~ N(−P/2, P) and ω ~ N(ρ, σ²), independent: the moments of λ and e^λ ω.
     common = rho**2 * np.expm1(P)

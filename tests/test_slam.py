@@ -621,6 +621,8 @@ def test_an_unknown_calibration_is_refused_by_name():
     with pytest.raises(ValueError, match="'black'") as error:
         scenario_pieces(scenario("matched"), "black")
     assert all(name in str(error.value) for name in TREATMENTS)
+    with pytest.raises(ValueError, match="calibration is a AbstractCalibration, not 'black'"):
+        a_filter(PLANAR, calibration="black")
 
 
 @pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD, KEYFRAME], ids=named)
