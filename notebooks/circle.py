@@ -32,10 +32,10 @@ from scipy.stats import binomtest
 
 import jaxslam
 from jaxslam.consistency import chi2_quantile
-from jaxslam.consistency.montecarlo import Prior, filter_run
+from jaxslam.consistency.montecarlo import filter_run
 from jaxslam.plots.landmarks import plot_landmark_clouds
 from jaxslam.plots.style import COLOURS, GREY, new_figure
-from jaxslam.simulation import sightings, simulate
+from jaxslam.simulation import Room, sensor_of, sightings, simulate
 
 REDUCED = bool(os.environ.get("JAXSLAM_REDUCED"))
 RUNS = 100 if REDUCED else 1000
@@ -44,10 +44,7 @@ IS, UID = "robocentric/inverse_scaling", "robocentric/inverse_depth"
 COLOUR = {IS: COLOURS[0], UID: COLOURS[1]}
 NAME = {IS: "Inverse Scaling", UID: "Unified Inverse Depth"}
 filters = jaxslam.make_filters(
-    SCENARIO.rig,
-    ["robocentric", "world"],
-    ["inverse_scaling", "inverse_depth"],
-    SCENARIO.calibration,
+    SCENARIO, ["robocentric", "world"], ["inverse_scaling", "inverse_depth"]
 )
 
 
@@ -64,21 +61,20 @@ def one_run(steps, seed=1):
     with jax.enable_x64(True):
         scenario = jaxslam.scenario("circle", steps=steps)
         run = simulate(scenario, jax.random.key(seed))
-        capacity = jax.tree.map(lambda n: max(1, int(n)), sightings(run))
-        prior = Prior.of(scenario, run.measured.dtype)
-        slots = np.arange(int(capacity.landmarks))
+        room = Room(*(max(1, int(count)) for count in jax.tree.leaves(sightings(run))))
+        slots = np.arange(room.landmarks)
 
         def result(name):
-            slam_filter = filters[name]
+            slam = filters[name]
 
             @jax.jit
-            def finished(prior, run, key):
-                _, path, state = filter_run(slam_filter, capacity, prior, run)
-                points = slam_filter.landmarks_in_world(state, prior.parameters, slots)
-                draws = slam_filter.landmark_samples(state, prior.parameters, slots, key, 2000)
+            def finished(run, key):
+                _, path, state = filter_run(slam, room, sensor_of(scenario), run)
+                points = jaxslam.landmarks_in_world(slam, state, slots)
+                draws = jaxslam.landmark_samples(slam, state, slots, key, 2000)
                 return path.translation(), points, draws
 
-            return jax.device_get(finished(prior, run, jax.random.key(2)))
+            return jax.device_get(finished(run, jax.random.key(2)))
 
         truth = np.asarray(run.poses.translation()), np.asarray(run.points)[slots]
         return truth, {name: result(name) for name in (IS, UID)}

@@ -39,7 +39,7 @@ RUNS = 200 if os.environ.get("JAXSLAM_REDUCED") else 1000
 def study(name):
     scenario = jaxslam.scenario(name)
     landmarks = ["inverse_scaling", "inverse_depth"]
-    filters = jaxslam.make_filters(scenario.rig, ["robocentric"], landmarks, scenario.calibration)
+    filters = jaxslam.make_filters(scenario, ["robocentric"], landmarks)
     return jaxslam.monte_carlo(scenario, filters, runs=RUNS, seed=0)
 
 

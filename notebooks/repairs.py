@@ -34,7 +34,7 @@ RUNS = 100 if os.environ.get("JAXSLAM_REDUCED") else 1000
 
 def study(name, filters):
     scenario = jaxslam.scenario(name)
-    made = jaxslam.make_filters(scenario.rig, filters, ["inverse_scaling"], scenario.calibration)
+    made = jaxslam.make_filters(scenario, filters, ["inverse_scaling"])
     finished = jaxslam.monte_carlo(scenario, made, runs=RUNS, seed=3, chunk=25)
     results = jaxslam.summarise(finished)["filters"]
     return {key.split("/")[0]: result for key, result in results.items()}
