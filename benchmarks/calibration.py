@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,10 +26,11 @@ import jaxslam
 from jaxslam.consistency import CHUNK, MemoryStore, Study, mean_band, normalised_squared, verdict
 from jaxslam.consistency.montecarlo import Seconds, check_sizes, filter_run
 from jaxslam.files import write_atomically
-from jaxslam.filters import CALIBRATIONS
+from jaxslam.models.sensors import Pinhole
 from jaxslam.plots.calibration import plot_calibration
-from jaxslam.simulation import Prior, Run, Scenario, Sightings, sightings, simulate
-from jaxslam.simulation.scenario import TRUE_CALIBRATIONS
+from jaxslam.simulation import Room, Run, Scenario, Sightings, sensor_of, sightings, simulate
+from jaxslam.simulation.scenario import CALIBRATIONS, TRUE_CALIBRATIONS
+from jaxslam.slam.protocol import AbstractFilter
 
 TRUTH = {
     "white": "drawn in every frame",
@@ -75,13 +77,14 @@ def measure(options: Options) -> Iterator[dict[str, Any]]:
             for truth in options.truths
         }
         drawn = {truth: draw(scenario, options) for truth, scenario in worlds.items()}
-        # One capacity for all truths, so that a filter compiles once.
-        most = [count for chunks in drawn.values() for _, count in chunks]
-        capacity = jax.tree.map(lambda *counts: max(1, *(int(c) for c in counts)), *most)
+        # One room for all truths, so that a filter compiles once.
+        seen = [count for chunks in drawn.values() for _, count in chunks]
+        most = jax.tree.map(lambda *counts: max(1, *(int(c) for c in counts)), *seen)
+        room = Room(most.landmarks, most.first, most.known, most.new)
         results[name] = {}
         for truth, scenario in worlds.items():
             runs = [chunk for chunk, _ in drawn[truth]]
-            results[name][truth] = _measure(scenario, runs, capacity, options)
+            results[name][truth] = _measure(scenario, runs, room, options)
             yield results
 
 
@@ -102,13 +105,13 @@ def _chunks(runs: int) -> tuple[range, ...]:
     return tuple(range(i, min(i + CHUNK, runs)) for i in range(0, runs, CHUNK))
 
 
-def _measure(scenario, runs: list[Run], capacity, options: Options) -> dict[str, dict[str, Any]]:
+def _measure(scenario, runs: list[Run], room: Room, options: Options) -> dict[str, dict[str, Any]]:
     results: dict[str, dict[str, Any]] = {}
     for treatment in options.treatments:
-        filters = jaxslam.make_filters(scenario.rig, options.filters, options.landmarks, treatment)
-        for name, slam_filter in filters.items():
+        filters = jaxslam.make_filters(scenario, options.filters, options.landmarks, treatment)
+        for name, slam in filters.items():
             start = time.perf_counter()
-            study, intrinsics = _run(name, slam_filter, scenario, runs, capacity, options)
+            study, intrinsics = _run(name, slam, scenario, runs, room, options)
             numbers = _numbers(jaxslam.summarise(study)["filters"][name], options.runs)
             numbers["intrinsics"] = _intrinsics(intrinsics) if treatment == "estimated" else None
             results.setdefault(name, {})[treatment] = numbers
@@ -119,32 +122,30 @@ def _measure(scenario, runs: list[Run], capacity, options: Options) -> dict[str,
 
 
 def _run(
-    name, slam_filter, scenario, runs: list[Run], capacity, options: Options
+    name, slam, scenario, runs: list[Run], room: Room, options: Options
 ) -> tuple[Study, Mapping[str, np.ndarray]]:
     """The study of one filter, and the last error of its intrinsics with their covariance."""
-    store, prior, chunks = MemoryStore(), Prior.of(scenario), _chunks(options.runs)
+    store, chunks, sensor = MemoryStore(), _chunks(options.runs), sensor_of(scenario)
     intrinsics = []
     for part, chunk in zip(chunks, runs, strict=True):
-        records, last = jax.device_get(_batch(slam_filter, capacity, prior, chunk))
+        records, last = jax.device_get(_batch(slam, room, sensor, chunk))
         store.save(name, part, records)
         intrinsics.append(last)
     joined = {key: np.concatenate([x[key] for x in intrinsics]) for key in intrinsics[0]}
     study = Study(
-        scenario, {name: slam_filter}, options.runs, options.seed, "float64", chunks, store,
+        scenario, {name: slam}, options.runs, options.seed, "float64", chunks, store,
         {name: Seconds(0.0, 0.0)}, jax.devices()[0].device_kind,
     )  # fmt: skip
     return study, joined
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _batch(slam_filter, capacity: Sightings, prior: Prior, runs: Run):
+@eqx.filter_jit
+def _batch(slam: AbstractFilter, room: Room, sensor: Pinhole, runs: Run):
     def one(run: Run):
-        records, _, state = filter_run(slam_filter, capacity, prior, run)
-        estimate, covariance = slam_filter.engine.core_covariance(
-            lambda core: core.calibration, state
-        )
+        records, _, state = filter_run(slam, room, sensor, run)
+        estimate, covariance = slam.marginal(state, lambda scene: scene.core.calibration)
         true = jax.tree.map(lambda x: x[-1], run.cameras).intrinsics
-        error = true - prior.parameters.camera.intrinsics
+        error = true - sensor.camera.intrinsics
         if estimate.size:  # a known calibration has no estimate
             error = error - estimate
         return records, {"error": error, "covariance": covariance}

@@ -54,7 +54,7 @@ def measure(options: Options) -> Iterator[dict[str, dict[str, Any]]]:
 
 def _measure(name: str, frame: str, landmarks: str, options: Options) -> dict[str, Any]:
     scenario = jaxslam.scenario(name)
-    filters = jaxslam.make_filters(scenario.rig, [frame], [landmarks], scenario.calibration)
+    filters = jaxslam.make_filters(scenario, [frame], [landmarks])
     study = jaxslam.monte_carlo(scenario, filters, runs=options.runs, seed=options.seed)
     (f,) = jaxslam.summarise(study)["filters"].values()
     rmse, sigma = f["rmse"]["position"][-1], f["sigma"]["position"][-1]

@@ -66,7 +66,7 @@ class Options:
 def measure(scenario: jaxslam.Scenario, name: str, seed: int, options: Options) -> dict[str, Any]:
     """One filter on one seed: numbers from which those of many seeds follow."""
     frame, landmarks = name.rsplit("/", 1)
-    filters = jaxslam.make_filters(scenario.rig, [frame], [landmarks], scenario.calibration)
+    filters = jaxslam.make_filters(scenario, [frame], [landmarks])
     study = jaxslam.monte_carlo(
         scenario, filters, runs=options.runs, seed=seed, chunk=options.chunk
     )

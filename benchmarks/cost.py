@@ -13,14 +13,15 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import numpy as np
 import tyro
 
 import jaxslam
-from jaxslam.consistency.montecarlo import Prior, filter_run
+from jaxslam.consistency.montecarlo import filter_run
 from jaxslam.files import write_atomically
-from jaxslam.simulation import Sightings, sightings, simulate
+from jaxslam.simulation import Room, sensor_of, sightings, simulate
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,11 @@ class Options:
     """Folder of cost.json."""
 
 
+@eqx.filter_jit
+def _records(slam, room: Room, sensor, runs) -> dict[str, jax.Array]:
+    return jax.vmap(lambda run: filter_run(slam, room, sensor, run)[0])(runs)
+
+
 def main() -> None:
     """Measure and write."""
     options = tyro.cli(Options, description=__doc__)
@@ -58,24 +64,22 @@ def main() -> None:
     keys = jax.random.split(jax.random.key(0), options.batch)
     runs = jax.jit(jax.vmap(partial(simulate, scenario)))(keys)
     most = jax.tree.map(lambda x: int(np.max(x)), jax.vmap(sightings)(runs))
-    capacity = Sightings(most.landmarks, most.first, most.known, max(1, most.new))
-    prior = Prior.of(scenario, runs.points.dtype)
+    room = Room(most.landmarks, most.first, most.known, max(1, most.new))
+    sensor = sensor_of(scenario)
 
     compiled, compile_seconds = {}, {}
     for name in options.filters:
-        made = jaxslam.make_filters(scenario.rig, [name], [options.landmarks], scenario.calibration)
-        (slam_filter,) = made.values()
+        (slam,) = jaxslam.make_filters(scenario, [name], [options.landmarks]).values()
         start = time.perf_counter()
-        batch = jax.vmap(partial(filter_run, slam_filter, capacity), in_axes=(None, 0))
-        compiled[name] = jax.jit(lambda p, r, batch=batch: batch(p, r)[0]).lower(prior, runs)
-        compiled[name] = compiled[name].compile()
+        batch = _records.lower(slam, room, sensor, runs).compile()
+        compiled[name] = partial(batch, slam, room, sensor)
         compile_seconds[name] = time.perf_counter() - start
-        jax.block_until_ready(compiled[name](prior, runs))
+        jax.block_until_ready(compiled[name](runs))
     seconds = {name: [] for name in compiled}
     for _ in range(options.turns):
         for name, function in compiled.items():
             start = time.perf_counter()
-            jax.block_until_ready(function(prior, runs))
+            jax.block_until_ready(function(runs))
             seconds[name].append(time.perf_counter() - start)
 
     base = np.array(seconds[options.filters[0]])

@@ -22,12 +22,13 @@ import numpy as np
 import tyro
 
 import jaxslam
-from jaxslam.consistency.montecarlo import Prior
 from jaxslam.consistency.statistics import lost_threshold, normalised_squared
 from jaxslam.files import write_atomically
-from jaxslam.filters import SlamFilter
 from jaxslam.linalg import cholesky
-from jaxslam.simulation import Run, Sightings, features, sightings
+from jaxslam.models.sensors import AbstractSensor
+from jaxslam.simulation import Room, Run, features, sensor_of, sightings
+from jaxslam.slam.filter import EkfSlam
+from jaxslam.slam.readouts import camera_pose, landmarks_in_camera
 
 NEAR = {"inverse_depth": (1.1, 0.45), "least_inverse_depth": 0.225, "velocity": (0.4, 0.0, 0.0)}
 
@@ -69,34 +70,30 @@ def measure(name: str, options: Options) -> Iterator[tuple[str, dict]]:
     draw = jax.jit(jax.vmap(lambda i: jaxslam.simulate(scenario, jax.random.fold_in(key, i))))
     runs = draw(jnp.arange(options.runs))
     most = jax.tree.map(lambda x: int(jnp.max(x)), jax.vmap(sightings)(runs))
-    prior = Prior.of(scenario, jnp.dtype(float))
+    room, sensor = Room(most.landmarks, most.first, most.known, most.new), sensor_of(scenario)
     reference = None
     for pair in options.filters:
-        filters = jaxslam.make_filters(
-            scenario.rig, *([word] for word in pair.split("/")), scenario.calibration
-        )
-        run = jax.jit(jax.vmap(partial(filter_run, filters[pair], most, prior)))
+        filters = jaxslam.make_filters(scenario, *([word] for word in pair.split("/")))
+        run = jax.jit(jax.vmap(partial(filter_run, filters[pair], room, sensor)))
         records = _concatenated(run(part) for part in _parts(runs, options.chunk))
         if reference is None:
             reference = records["information"]
         yield pair, summarise(records, reference)
 
 
-def filter_run(slam_filter: SlamFilter, most: Sightings, prior: Prior, run: Run) -> dict:
+def filter_run(slam: EkfSlam, room: Room, sensor: AbstractSensor, run: Run) -> dict:
     """One filter on one run: records of every step, and its landmarks at the last."""
-    parameters = prior.parameters
-    first, seen, new = features(run, most)
-    state = slam_filter.start(parameters, int(most.landmarks), prior.velocity, prior.velocity_sigma)
-    state = slam_filter.first(state, parameters, first)
-    settled = slam_filter.initialisation.settled
+    first, seen, new = features(run, room)
+    state = slam.init(room.capacity, first)
+    settled = slam.entry.settled
 
     def step(state, frame):
         seen, new, control, T_BC = frame
-        state, _ = slam_filter.step(state, parameters, control, seen, new)
-        estimate, covariance = slam_filter.camera_pose(state)
+        state, _ = slam.step(state, control, seen, new)
+        estimate, covariance = camera_pose(slam, state)
         missed = estimate.translation() - T_BC.translation()
         return state, {
-            "nees": normalised_squared(*slam_filter.pose_error(state, T_BC)),
+            "nees": normalised_squared(*slam.pose_error(state, T_BC)),
             "squared_error": missed @ missed,
             "variance": jnp.trace(covariance[: missed.size, : missed.size]),
             "information": -cholesky(covariance).log_det(),
@@ -106,10 +103,10 @@ def filter_run(slam_filter: SlamFilter, most: Sightings, prior: Prior, run: Run)
     later = jax.tree.map(lambda x: x[1:], run.poses)
     last, records = jax.lax.scan(step, state, (seen, new, run.controls, later))
     records["settled"] = jnp.concatenate([settled(state)[None], records["settled"]])
-    return records | _landmarks(slam_filter, most.landmarks, prior, run, last)
+    return records | _landmarks(slam, room.landmarks, sensor, run, last)
 
 
-def _landmarks(slam_filter, count, prior, run, state) -> dict:
+def _landmarks(slam, count, sensor, run, state) -> dict:
     """Of every landmark: when and how far away it was first seen, and what became of it."""
     visible = run.visible[:, :count]
     first = jnp.argmax(visible, axis=0)
@@ -117,13 +114,13 @@ def _landmarks(slam_filter, count, prior, run, state) -> dict:
     T_CB = jax.tree.map(lambda x: x[-1], run.poses).inverse()
     points = run.points[:count]
     slots = jnp.arange(count)
-    chart, covariance = slam_filter.landmarks_in_camera(state, prior.parameters, slots)
+    chart, covariance = landmarks_in_camera(slam, state, slots, sensor)
     truth = 1 / jax.vmap(T_CB.apply)(points)[:, -1]
     return {
         "begun": jnp.any(visible, axis=0),
         "first": first,
         "distance": jnp.linalg.norm(points - positions[first], axis=1),
-        "in_map": slam_filter.reported(state).active,
+        "in_map": slam.in_map(state),
         "seen_last": visible[-1] & (first < visible.shape[0] - 1),
         "normalised": (chart[:, -1] - truth) / jnp.sqrt(covariance[:, -1, -1]),
     }

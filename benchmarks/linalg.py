@@ -16,6 +16,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 from jax.scipy.linalg import solve_triangular
 
 from jaxslam.files import write_atomically
@@ -71,6 +72,7 @@ def table(rows: list[dict[str, float]]) -> str:
 
 
 def main() -> None:
+    """Measure and write."""
     with jax.enable_x64(True):
         rows = [measured(*size) for size in SIZES]
     with write_atomically(HERE / "results" / "linalg.json") as path:
@@ -83,4 +85,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)

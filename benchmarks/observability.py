@@ -67,7 +67,7 @@ def measure(options: Options, rows: dict[str, dict[str, Any]]) -> Iterator[None]
 def _measure(name: str, scenario_name: str, options: Options) -> dict[str, Any]:
     scenario = jaxslam.scenario(scenario_name)
     kind, landmarks = name.split("/")
-    filters = jaxslam.make_filters(scenario.rig, [kind], [landmarks], scenario.calibration)
+    filters = jaxslam.make_filters(scenario, [kind], [landmarks])
     study = jaxslam.monte_carlo(scenario, filters, runs=options.runs, seed=options.seed)
     (f,) = jaxslam.summarise(study)["filters"].values()
     return {
@@ -90,7 +90,7 @@ def _measure(name: str, scenario_name: str, options: Options) -> dict[str, Any]:
 def _along(study: Study, name: str) -> dict[str, float]:
     """Median over the runs of the last step's |error| and σ along the nominal direction of
     motion, m: with a single camera both are those of the scale."""
-    axis = int(np.argmax(np.abs(study.scenario.velocity[: study.scenario.rig.geometry.point_dim])))
+    axis = int(np.argmax(np.abs(study.scenario.velocity[: study.scenario.world.point_dim])))
     records = [study.store.load(name, chunk, ("error", "variance")) for chunk in study.chunks]
     error, variance = (
         np.concatenate([record[key][:, -1, axis] for record in records])

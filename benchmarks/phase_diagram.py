@@ -25,7 +25,7 @@ import jaxslam
 from jaxslam.consistency.statistics import mean_band
 from jaxslam.consistency.verdict import LOST_BOUND, together, verdict
 from jaxslam.files import write_atomically
-from jaxslam.names import chosen
+from jaxslam.lookup import chosen
 from jaxslam.plots.phase import PhaseCell, plot_phase_diagram
 
 ACCELERATION = (0.5, 0.5, 0.3)
@@ -138,13 +138,10 @@ def measure(options: Options, rows: list[Row]) -> Iterator[list[Row]]:
     """All rows so far, yielded after every world that was not complete."""
     done = {_key(row) for row in rows}
     grid = list(worlds(options))
-    filters = jaxslam.make_filters(
-        grid[0][1].rig, options.filters, options.landmarks, grid[0][1].calibration
-    )
     for number, (direction, scenario) in enumerate(grid, 1):
         missing = {
-            name: f
-            for name, f in filters.items()
+            name: slam
+            for name, slam in _filters_of(scenario, options).items()
             if _key(_named(direction, scenario, name)) not in done
         }
         if not missing:
@@ -156,6 +153,10 @@ def measure(options: Options, rows: list[Row]) -> Iterator[list[Row]]:
         seconds = time.perf_counter() - start
         print(f"world {number} of {len(grid)}: {len(new)} rows, {seconds:.1f} s", flush=True)
         yield rows
+
+
+def _filters_of(scenario, options: Options):
+    return jaxslam.make_filters(scenario, options.filters, options.landmarks)
 
 
 def _measure(direction: str, scenario, filters, options: Options) -> list[Row]:

@@ -150,16 +150,14 @@ def _reference(study: Study, store, chunk: range, options: Options) -> dict[str,
 
 def _filter(study: Study, name: str, chunks, reference, options: Options) -> dict[str, np.ndarray]:
     frame, landmarks = name.split("/")
-    (slam_filter,) = jaxslam.make_filters(
-        study.rig, [frame], [landmarks], study.scenario.calibration
-    ).values()
+    (slam,) = jaxslam.make_filters(study.scenario, [frame], [landmarks]).values()
     parts = []
     for chunk in chunks:
         padded = range(chunk.start, chunk.start + options.chunk)
         runs = draw_runs(study, options.seed, padded)
         draws = reference["exact_T_BC"][chunk.start : chunk.stop]
         draws = np.concatenate([draws, draws[: len(padded) - len(chunk)]])
-        records = against_filter(study, slam_filter, runs, study.rig.geometry.group(draws))
+        records = against_filter(study, slam, runs, study.scenario.world.group(draws))
         parts.append({k: np.asarray(v)[: len(chunk)] for k, v in records.items()})
     return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
@@ -169,7 +167,7 @@ def _telling(study: Study, reference, used, filters) -> dict[str, Any]:
     nees = next(iter(filters.values()))["nees"]
     order = np.argsort(np.where(used, nees, np.inf))
     run = int(order[int(used.sum()) // 2])
-    n = study.rig.geometry.point_dim
+    n = study.scenario.world.point_dim
     draws = reference["exact_draws"][run, :, :n]
     shown = np.linspace(0, len(draws) - 1, min(SHOWN_DRAWS, len(draws))).astype(int)
     center = reference["exact_position"][run]

@@ -110,7 +110,7 @@ def measure(table: Published, options: Options, rows: dict[str, dict]) -> Iterat
         if name not in wanted:
             continue
         frame, landmarks = name.split("/")
-        filters = jaxslam.make_filters(scenario.rig, [frame], [landmarks], scenario.calibration)
+        filters = jaxslam.make_filters(scenario, [frame], [landmarks])
         study = jaxslam.monte_carlo(
             scenario, filters, runs=options.runs, seed=options.seed, chunk=options.chunk
         )
@@ -120,13 +120,13 @@ def measure(table: Published, options: Options, rows: dict[str, dict]) -> Iterat
         seconds = study.seconds[name]
         rows[name] = _compared(table, nees, theirs) | {
             "runs": options.runs,
-            "rmse": _rmse(error, scenario.rig.geometry.point_dim),
+            "rmse": _rmse(error, scenario.world.point_dim),
             "published_rmse": table.rmse.get(name),
             "diverged": int(np.sum(~np.isfinite(nees).all(axis=1))),
             "seconds_per_run": round(seconds.run / options.runs, 4),
         }
         print(name, json.dumps(rows[name], ensure_ascii=False), flush=True)
-        dof = scenario.rig.geometry.tangent_dim
+        dof = scenario.world.tangent_dim
         yield {
             "scenario": table.scenario,
             "seed": options.seed,

@@ -15,12 +15,11 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
@@ -37,13 +36,15 @@ from jaxslam.datasets.starry_night import (
     with_white_noise,
 )
 from jaxslam.files import write_atomically
-from jaxslam.filters import Parameters, inverse_depth_prior
-from jaxslam.geometry import SPATIAL
-from jaxslam.motion import BODY_RATES, CONSTANT_VELOCITY
-from jaxslam.names import chosen
+from jaxslam.landmarks import LANDMARKS
+from jaxslam.lookup import chosen
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import AbstractMotion, BodyRates, ConstantVelocity
+from jaxslam.models.sensors import Pinhole
+from jaxslam.names import make_filter
 from jaxslam.plots.starry_night import plot_starry_night
-from jaxslam.rig import Rig
-from jaxslam.simulation import Prior, Run, Sightings, sightings
+from jaxslam.simulation import Room, Run, sightings
+from jaxslam.slam.protocol import AbstractFilter
 
 VARIANTS = {
     "odometry": "measured velocities as odometry, the gyroscope reversed",
@@ -89,22 +90,27 @@ class Options:
             )
 
 
-def prior(data: StarryNight, variant: str, nearest_depth: float) -> Prior:
+def pieces(data: StarryNight, variant: str, nearest_depth: float) -> dict[str, Any]:
     """What a filter is told: the noise figures of the recording, and a prior on depth."""
-    mean, sigma = inverse_depth_prior(nearest_depth)
-    odometry = not variant.startswith("velocity")
-    return Prior(
-        Parameters(
-            camera=data.camera,
-            intrinsics_sigma=jnp.zeros(4),
-            measurement_sigma=jnp.asarray(data.pixel_sigma),
-            motion_sigma=jnp.asarray(data.rates_sigma if odometry else ACCELERATION_SIGMA),
-            inverse_depth=jnp.asarray(mean),
-            inverse_depth_sigma=jnp.asarray(sigma),
-        ),
-        velocity=jnp.zeros(6),
-        velocity_sigma=jnp.asarray(VELOCITY_SIGMA),
-    )
+    still = np.zeros(6)
+    motion: AbstractMotion = BodyRates(data.rates_sigma)
+    if variant.startswith("velocity"):
+        motion = ConstantVelocity(ACCELERATION_SIGMA, still, VELOCITY_SIGMA)
+    return {
+        "motion": motion,
+        "sensor": Pinhole(data.camera, data.pixel_sigma),
+        "depth": InverseDepth.beyond(nearest_depth),
+    }
+
+
+def filters_of(told: dict[str, Any], options: Options) -> dict[str, AbstractFilter]:
+    """By name, `filter/landmarks`."""
+    landmarks = chosen("landmarks", options.landmarks, LANDMARKS)
+    return {
+        f"{name}/{landmark.name}": make_filter(name, landmark=landmark, **told)
+        for name in options.filters
+        for landmark in landmarks.values()
+    }
 
 
 def measure(data: StarryNight, options: Options) -> Iterator[dict[str, Any]]:
@@ -114,16 +120,13 @@ def measure(data: StarryNight, options: Options) -> Iterator[dict[str, Any]]:
         lambda x: max(1, int(x.max())), jax.vmap(sightings)(windows(data, options.steps))
     )
     # The slot of a landmark is its number, in every window.
-    capacity = replace(most, landmarks=data.points.shape[0])
+    room = Room(data.points.shape[0], most.first, most.known, most.new)
     for variant in options.variants:
         results[variant] = {}
-        odometry = not variant.startswith("velocity")
-        rig = Rig(SPATIAL, BODY_RATES if odometry else CONSTANT_VELOCITY)
-        filters = jaxslam.make_filters(rig, options.filters, options.landmarks, "known")
         told, batches = given(data, variant, options)
-        for name, slam_filter in filters.items():
+        for name, slam in filters_of(told, options).items():
             start = time.perf_counter()
-            parts = [jax.device_get(_batch(slam_filter, capacity, told, runs)) for runs in batches]
+            parts = [jax.device_get(_batch(slam, room, told["sensor"], runs)) for runs in batches]
             records = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
             results[variant][name] = summarise(records)
             seconds = time.perf_counter() - start
@@ -132,11 +135,11 @@ def measure(data: StarryNight, options: Options) -> Iterator[dict[str, Any]]:
             yield results
 
 
-def given(data: StarryNight, variant: str, options: Options) -> tuple[Prior, list[Run]]:
+def given(data: StarryNight, variant: str, options: Options) -> tuple[dict[str, Any], list[Run]]:
     """What the filters are told in a variant, and batches of its windows."""
     if variant != "recorded":
         data = with_reversed_gyroscope(data)
-    told = prior(data, variant, options.nearest_depth)
+    told = pieces(data, variant, options.nearest_depth)
     seeds = range(options.seeds) if variant.endswith("-white") else ()
     recordings = [with_white_noise(data, seed) for seed in seeds] or [data]
     batches = [windows(recording, options.steps) for recording in recordings]
@@ -145,9 +148,9 @@ def given(data: StarryNight, variant: str, options: Options) -> tuple[Prior, lis
     return told, batches
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _batch(slam_filter, capacity: Sightings, told: Prior, runs: Run) -> dict[str, Any]:
-    return jax.vmap(lambda run: filter_run(slam_filter, capacity, told, run)[0])(runs)
+@eqx.filter_jit
+def _batch(slam: AbstractFilter, room: Room, sensor: Pinhole, runs: Run) -> dict[str, Any]:
+    return jax.vmap(lambda run: filter_run(slam, room, sensor, run)[0])(runs)
 
 
 def summarise(records: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -251,7 +254,7 @@ def page(summary: dict[str, Any]) -> str:
     """The Markdown page."""
     noise = summary["noise"]
     results = next(iter(summary["variants"].values()))
-    mean, sigma = inverse_depth_prior(summary["nearest_depth"])
+    depth = InverseDepth.beyond(summary["nearest_depth"])
     parts = [
         "# Starry Night: real measurements with truth",
         "Made by `python benchmarks/starry_night.py --data starry_night.npz`; do not edit. The "
@@ -274,8 +277,8 @@ def page(summary: dict[str, Any]) -> str:
         f"{_list(noise['rates_sigma_recorded'][3:], '.2f')} rad/s is that of the mis-signed "
         f"difference. Reversed, it has {_list(noise['rates_sigma'][3:], '.2f')} rad/s against the "
         "truth. Inverse depth is "
-        f"{mean:g} ± {sigma:g} 1/m (d_min {summary['nearest_depth']:g} m, chosen for a table of "
-        "landmarks 0.5 to 3 m away).",
+        f"{depth.mean:g} ± {depth.sigma:g} 1/m (d_min {summary['nearest_depth']:g} m, chosen for a "
+        "table of landmarks 0.5 to 3 m away).",
         "![Mean NEES over the windows, and how the noise is correlated](starry-night.png)",
     ]
     for variant, filters in summary["variants"].items():

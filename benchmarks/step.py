@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,10 +23,11 @@ import tyro
 
 import jaxslam
 from jaxslam.files import write_atomically
-from jaxslam.filters import Features, SlamFilter, State
-from jaxslam.filters.slam import Context
+from jaxslam.forms.state import Features, State
 from jaxslam.geometry import difference, retract
-from jaxslam.simulation import Sightings, features, parameters, simulate
+from jaxslam.simulation import Room, features, simulate
+from jaxslam.slam.filter import EkfSlam
+from jaxslam.slam.model import Context
 
 SEEN = 12
 """Landmarks measured in a frame."""
@@ -49,10 +51,10 @@ class Options:
     """Folder of step.json."""
 
 
-def dense_step(f: SlamFilter, state: State, p, dt, seen: Features) -> State:
+def dense_step(f: EkfSlam, state: State, dt, seen: Features) -> State:
     """Predict, update and compose with dense Jacobians of everything at once."""
-    state = f.predict(state, p, dt)
-    context, c = Context(p, dt), state.core_dim
+    state, model = f.predict(state, dt), f.model
+    context, c = Context(dt), state.core_dim
 
     def moved(delta):
         landmarks = state.landmarks + delta[c:].reshape(state.landmarks.shape)
@@ -60,16 +62,14 @@ def dense_step(f: SlamFilter, state: State, p, dt, seen: Features) -> State:
 
     def stack(delta):
         core, landmarks = moved(delta)
-        view = f.model.view(core, context)
-        return jax.vmap(lambda x: f.model.observe(view, x, context)[0])(
-            landmarks[seen.slots]
-        ).ravel()
+        view = model.view(core, context)
+        return jax.vmap(lambda x: model.observe(view, x, context)[0])(landmarks[seen.slots]).ravel()
 
     zero = jnp.zeros(state.covariance.shape[0])
     valid = jnp.repeat(seen.valid, seen.measured.shape[1])
     H = jnp.where(valid[:, None], jax.jacfwd(stack)(zero), 0.0)
     residual = jnp.where(valid, seen.measured.ravel() - stack(zero), 0.0)
-    R = jnp.diag(jnp.where(valid, p.measurement_sigma**2, 1.0))
+    R = jnp.diag(jnp.where(valid, f.sensor.sigma**2, 1.0))
     P = state.covariance
     S = H @ P @ H.T + R
     K = jnp.linalg.solve(S, H @ P).T
@@ -80,9 +80,9 @@ def dense_step(f: SlamFilter, state: State, p, dt, seen: Features) -> State:
     )
 
     def composed(core, landmarks):
-        view = f.model.view(core, context)
-        move = partial(f.model.compose_landmark, view, context=context)
-        return f.model.compose_core(core, context), jax.vmap(move)(landmarks)
+        view = model.view(core, context)
+        move = partial(model.compose_landmark, view, context=context)
+        return model.compose_core(core, context), jax.vmap(move)(landmarks)
 
     core, landmarks = composed(state.core, state.landmarks)
 
@@ -94,59 +94,57 @@ def dense_step(f: SlamFilter, state: State, p, dt, seen: Features) -> State:
         return jnp.concatenate([difference(c_new, core), (l_new - landmarks).ravel()])
 
     J = jax.jacfwd(error)(zero)
-    state = replace(state, core=core, landmarks=landmarks, covariance=J @ state.covariance @ J.T)
-    return f.finish(state)
+    return replace(state, core=core, landmarks=landmarks, covariance=J @ state.covariance @ J.T)
 
 
-def block_step(f: SlamFilter, state: State, p, dt, seen: Features) -> State:
+def block_step(f: EkfSlam, state: State, dt, seen: Features) -> State:
     """The filter's own step, nothing new seen."""
-    state = f.predict(state, p, dt)
-    state, _ = f.update(state, p, dt, seen)
-    return f.finish(f.compose(state, p, dt))
+    state, _ = f.update(f.predict(state, dt), dt, seen)
+    return f.compose(state, dt)
 
 
 def prepared(options: Options, size: int):
-    """Filter, parameters, and a batch of started states with the features of all frames."""
+    """Filter, seconds of a step, and a batch of started states with the features of all frames."""
     scenario = jaxslam.scenario("matched", steps=options.steps, landmarks=size)
-    f = jaxslam.FILTERS["robocentric"](scenario.rig, jaxslam.LANDMARKS[options.landmarks], "known")
-    p = parameters(scenario)
-    capacity = Sightings(landmarks=size, first=size, known=SEEN, new=1)
+    (f,) = jaxslam.make_filters(scenario, ["robocentric"], [options.landmarks]).values()
+    room = Room(landmarks=size, first=size, known=SEEN, new=1)
 
     def start(key):
         run = simulate(scenario, key)
-        first, seen, _ = features(run, capacity)
-        velocity, sigma = jnp.array(scenario.velocity), jnp.array(scenario.velocity_sigma)
-        return f.first(f.start(p, size, velocity, sigma), p, first), seen
+        first, seen, _ = features(run, room)
+        return f.init(room.capacity, first), seen
 
     states, seen = jax.jit(jax.vmap(start))(jax.random.split(jax.random.key(0), options.batch))
-    return f, p, jnp.asarray(1 / scenario.rate), states, seen
+    return f, jnp.asarray(1 / scenario.rate), states, seen
 
 
-def timed(step, f, p, dt, states, seen, repeats):
+def timed(step, f, dt, states, seen, repeats):
     """Seconds to compile, median seconds of a call, and the final states."""
 
-    def run(state, seen, p, dt):
-        return jax.lax.scan(lambda s, x: (step(f, s, p, dt, x), None), state, seen)[0]
+    @eqx.filter_jit
+    def run(f, states, seen, dt):
+        def one(state, seen):
+            return jax.lax.scan(lambda s, x: (step(f, s, dt, x), None), state, seen)[0]
+
+        return jax.vmap(one)(states, seen)
 
     start = time.perf_counter()
-    compiled = (
-        jax.jit(jax.vmap(run, in_axes=(0, 0, None, None))).lower(states, seen, p, dt).compile()
-    )
+    compiled = run.lower(f, states, seen, dt).compile()
     compile_seconds = time.perf_counter() - start
-    result = jax.block_until_ready(compiled(states, seen, p, dt))
+    result = jax.block_until_ready(compiled(f, states, seen, dt))
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
-        jax.block_until_ready(compiled(states, seen, p, dt))
+        jax.block_until_ready(compiled(f, states, seen, dt))
         seconds.append(time.perf_counter() - start)
     return compile_seconds, float(np.median(seconds)), result
 
 
 def compare(options: Options, size: int) -> dict:
     """Both steps on a map of `size` landmarks."""
-    f, p, dt, states, seen = prepared(options, size)
-    compile_block, block, ours = timed(block_step, f, p, dt, states, seen, options.repeats)
-    compile_dense, dense, theirs = timed(dense_step, f, p, dt, states, seen, options.repeats)
+    f, dt, states, seen = prepared(options, size)
+    compile_block, block, ours = timed(block_step, f, dt, states, seen, options.repeats)
+    compile_dense, dense, theirs = timed(dense_step, f, dt, states, seen, options.repeats)
     difference_of_P = jnp.max(jnp.abs(ours.covariance - theirs.covariance))
     relative = float(difference_of_P / jnp.max(jnp.abs(theirs.covariance)))
     assert relative < 1e-8, f"the two steps differ: {relative:.1e} of the largest covariance"

@@ -51,7 +51,7 @@ def test_the_study_is_that_of_the_library_and_writes_its_files(tmp_path):
     filters = found["scenarios"]["matched"]["constant"]["robocentric/inverse_scaling"]
     assert set(filters) == {"estimated"}
     scenario = jaxslam.scenario("matched", steps=3, true_calibration="constant")
-    same = jaxslam.make_filters(scenario.rig, ["robocentric"], ["inverse_scaling"], "estimated")
+    same = jaxslam.make_filters(scenario, ["robocentric"], ["inverse_scaling"], "estimated")
     study = jaxslam.monte_carlo(scenario, same, runs=3)
     (expected,) = jaxslam.summarise(study)["filters"].values()
     assert filters["estimated"]["nees"] == pytest.approx(expected["nees"][-1], rel=1e-6)

@@ -55,9 +55,7 @@ def test_a_seed_is_measured_as_the_library_summarises_it(options):
     options = dataclasses.replace(options, runs=6, chunk=4)
     found = benchmark.measure(scenario, NAME, 2, options)
     assert json.loads(json.dumps(found, allow_nan=False)) == found
-    filters = jaxslam.make_filters(
-        scenario.rig, ["robocentric"], ["inverse_scaling"], scenario.calibration
-    )
+    filters = jaxslam.make_filters(scenario, ["robocentric"], ["inverse_scaling"])
     study = jaxslam.monte_carlo(scenario, filters, runs=6, seed=2, chunk=4)
     expected = jaxslam.summarise(study)["filters"][NAME]
     p = benchmark.pooled({"2": found})

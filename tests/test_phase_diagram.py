@@ -12,7 +12,7 @@ from cases import quick_jit
 import jaxslam
 from jaxslam.consistency import VERDICTS, mean_band, verdict
 from jaxslam.plots.phase import PhaseCell, plot_phase_diagram
-from jaxslam.simulation import Prior, simulate, structure
+from jaxslam.simulation import as_data, simulate
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
@@ -92,29 +92,34 @@ def test_a_verdict_refuses_numbers_that_make_no_sense(arguments, message):
 # --- one simulator for all worlds ---------------------------------------------------------------
 
 
+def structure(scenario):
+    """All but its numbers and its name."""
+    return jax.tree.structure(as_data(scenario))
+
+
 @pytest.mark.parametrize("name", ["matched-loose", "circle", "positions"])
 def test_a_structure_with_the_numbers_as_data_draws_the_same_runs(name):
     scenario = jaxslam.scenario(name, steps=4)
     key = jax.random.key(3)
     one, program = structure(scenario), []
 
-    def with_data(prior, key):
+    def with_data(data, key):
         program.append(1)
-        return simulate(one, key, None, prior)
+        return simulate(data, key)
 
     drawn = quick_jit(with_data)
     expected = quick_jit(lambda key: simulate(scenario, key))(key)
-    for a, b in zip(*map(jax.tree.leaves, (drawn(Prior.of(scenario), key), expected)), strict=True):
+    for a, b in zip(*map(jax.tree.leaves, (drawn(as_data(scenario), key), expected)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
-    changes: dict = {"acceleration_sigma": (0.3, 0.2, 0.1), "velocity": (0.5, 0.7, 0.2)}
-    if scenario.motion == "odometry":  # its true path is not drawn, and part of the structure
-        changes = {"odometry_sigma": (0.3, 0.2, 0.1), "position_sigma": 0.7}
-    other = dataclasses.replace(scenario, **changes)
+    noise = {"acceleration_sigma": (0.3, 0.2, 0.1)}
+    if scenario.motion == "odometry":
+        noise = {"odometry_sigma": (0.3, 0.2, 0.1), "position_sigma": 0.7}
+    other = dataclasses.replace(scenario, velocity=(0.5, 0.7, 0.2), **noise)
     assert structure(other) == one
-    moved = drawn(Prior.of(other), key)
+    moved = drawn(as_data(other), key)
     assert not np.allclose(moved.measured, expected.measured)
     assert len(program) == 1
-    # What is no number of the prior stays: other steps are another structure.
+    # What is no number stays: other steps are another structure.
     assert structure(dataclasses.replace(scenario, steps=5)) != one
 
 
@@ -175,7 +180,7 @@ def test_an_interrupted_run_goes_on_and_writes_the_same_file(tmp_path, monkeypat
 def test_a_cell_is_what_the_library_says_of_its_world(tmp_path):
     options = dataclasses.replace(OPTIONS, directions=("turn",), accelerations=(1.0,))
     ((direction, scenario),) = phase_diagram.worlds(options)
-    filters = jaxslam.make_filters(scenario.rig, ["robocentric"], ["inverse_scaling"], "known")
+    filters = jaxslam.make_filters(scenario, ["robocentric"], ["inverse_scaling"])
     (row,) = phase_diagram._measure(direction, scenario, filters, options)
     phase_diagram.write([row], tmp_path / "one.csv")
     assert phase_diagram.read(tmp_path / "one.csv") == [row]

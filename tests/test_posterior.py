@@ -71,13 +71,7 @@ def problem_of(scenario, *, seed=0, truncated=True):
     return make_problem(scenario, run, truncated=truncated), run
 
 
-@cache
-def compiled_residuals(rig):
-    return quick_jit(partial(residuals, rig))
-
-
-def residuals_of(rig, problem, y):
-    return compiled_residuals(rig)(problem, y)
+residuals_of = quick_jit(residuals)
 
 
 def draw(problem, seed=1):
@@ -87,7 +81,7 @@ def draw(problem, seed=1):
 
 def dense_residuals(scenario, problem, y):
     """`residuals` by homogeneous matrices and matrix exponentials, one number at a time."""
-    y, n = np.asarray(y), scenario.rig.geometry.point_dim
+    y, n = np.asarray(y), scenario.world.point_dim
     t, p, landmarks = len(scenario.velocity), n - 1, scenario.landmarks
     mean, sigma = 1 / (2 * scenario.nearest_depth), 1 / (4 * scenario.nearest_depth)
     velocity = np.add(scenario.velocity, np.multiply(scenario.velocity_sigma, y[:t]))
@@ -150,28 +144,28 @@ def test_residuals_and_their_jacobian_are_those_of_a_dense_computation(scenario)
     problem, _ = problem_of(scenario)
     assert bool(jnp.all(problem.visible))
     y = draw(problem)
-    got = residuals_of(scenario.rig, problem, y)
+    got = residuals_of(problem, y)
     expected = dense_residuals(scenario, problem, y)
     np.testing.assert_allclose(got, expected, rtol=1e-7, atol=1e-7)
-    J = jax.jacfwd(lambda y: residuals_of(scenario.rig, problem, y))(y)
+    J = jax.jacfwd(lambda y: residuals_of(problem, y))(y)
     for i in (0, y.size // 2, y.size - 1):
         step = np.zeros(y.size)
         step[i] = 1e-4
         central = dense_residuals(scenario, problem, y + step)
         central = (central - dense_residuals(scenario, problem, y - step)) / 2e-4
         np.testing.assert_allclose(J[:, i], central, rtol=1e-5, atol=1e-5)
-    assert log_density(scenario.rig, problem, y) == pytest.approx(-expected @ expected / 2)
+    assert log_density(problem, y) == pytest.approx(-expected @ expected / 2)
 
 
 def test_a_landmark_that_is_not_visible_tells_nothing_and_one_behind_is_impossible():
     problem, _ = problem_of(LOOSE)
     y = draw(problem)
     hidden = replace(problem, visible=problem.visible.at[1, 2].set(False))
-    less = residuals_of(LOOSE.rig, hidden, y) != residuals_of(LOOSE.rig, problem, y)
+    less = residuals_of(hidden, y) != residuals_of(problem, y)
     assert np.flatnonzero(less).tolist() == [y.size + LOOSE.landmarks + 2]
     # A velocity ahead of 300 σ passes every landmark within a frame.
     past = y.at[1].set(300 / LOOSE.velocity_sigma[1])
-    assert log_density(LOOSE.rig, problem, past) == -jnp.inf
+    assert log_density(problem, past) == -jnp.inf
 
 
 @pytest.mark.parametrize("truncated", [True, False])
@@ -181,12 +175,12 @@ def test_the_conditional_variables_have_the_jacobian_that_they_claim(truncated):
 
     @quick_jit
     def physical(w):
-        return ravel_pytree(conditional_unknowns(LOOSE.rig, problem, mode, w)[0])[0]
+        return ravel_pytree(conditional_unknowns(problem, mode, w)[0])[0]
 
     a, b = mode + draw(problem, 2), mode + 5 * draw(problem, 3)
     if truncated:  # there is no density where an inverse depth is below the bound
         a, b = (w.at[-LOOSE.landmarks :].add(10.0) for w in (a, b))
-    claimed = [conditional_unknowns(LOOSE.rig, problem, mode, w)[1] for w in (a, b)]
+    claimed = [conditional_unknowns(problem, mode, w)[1] for w in (a, b)]
     exact = [jnp.linalg.slogdet(jax.jacfwd(physical)(w))[1] for w in (a, b)]
     assert claimed[1] - claimed[0] == pytest.approx(float(exact[1] - exact[0]), abs=1e-9)
 
@@ -201,11 +195,9 @@ def test_the_conditional_variables_have_the_jacobian_that_they_claim(truncated):
     def slope(y):
         return jax.jvp(at, (y,), (jnp.ones_like(y),))[1]
 
-    values = [conditional_log_density(LOOSE.rig, problem, mode, w) for w in (a, b)]
+    values = [conditional_log_density(problem, mode, w) for w in (a, b)]
     expected = [
-        log_density(LOOSE.rig, problem, whitened(w))
-        + log_det
-        - jnp.sum(jnp.log(slope(whitened(w))))
+        log_density(problem, whitened(w)) + log_det - jnp.sum(jnp.log(slope(whitened(w))))
         for w, log_det in zip((a, b), exact, strict=True)
     ]
     assert values[1] - values[0] == pytest.approx(float(expected[1] - expected[0]), rel=1e-9)
@@ -217,17 +209,17 @@ def nearly_linear():
     runs = draw_runs(replace(SMALL, scenario=NEARLY_LINEAR), 0, range(40))
     problems = jax.vmap(partial(make_problem, NEARLY_LINEAR, truncated=False))(runs)
     starts_keys, chains_keys = jax.random.split(jax.random.key(2), (2, 40))
-    modes, _ = _modes(SMALL.rig, SMALL.starts, problems, starts_keys)
-    chains = _sample(SMALL.hmc, SMALL.rig, problems, modes.mode, chains_keys)
+    modes, _ = _modes(SMALL.starts, problems, starts_keys)
+    chains = _sample(SMALL.hmc, problems, modes.mode, chains_keys)
     return jax.tree.map(lambda x: x[0], (problems, runs, modes, chains))
 
 
 def test_on_a_nearly_linear_problem_map_hmc_and_the_filter_agree():
     problem, run, mode, chains = nearly_linear()
     assert bool(mode.converged)
-    gradient = jax.grad(lambda y: log_density(NEARLY_LINEAR.rig, problem, y))(mode.mode)
+    gradient = jax.grad(lambda y: log_density(problem, y))(mode.mode)
     assert np.abs(gradient @ mode.root).max() < 1e-3
-    mean, P = pose_gaussian(NEARLY_LINEAR.rig, problem, mode)
+    mean, P = pose_gaussian(problem, mode)
 
     T_CB, S, tangents = pose_moments(pooled(chains).inverse())
     rhat, ess = diagnose(tangents.reshape(SMALL.hmc.chains, -1, 3))
@@ -238,12 +230,10 @@ def test_on_a_nearly_linear_problem_map_hmc_and_the_filter_agree():
     assert (error < 4 / np.sqrt(ess)).all()
     np.testing.assert_allclose(np.diagonal(S), sigma**2, rtol=5 * np.sqrt(2 / ess.min()))
 
-    slam_filter = jaxslam.FILTERS["robocentric"](
-        NEARLY_LINEAR.rig, jaxslam.LANDMARKS["inverse_depth"], "known"
-    )
+    (slam,) = jaxslam.make_filters(NEARLY_LINEAR, ["robocentric"], ["inverse_depth"]).values()
     one = jax.tree.map(lambda x: x[None], (run, pooled(chains)))
     study = replace(SMALL, scenario=NEARLY_LINEAR)
-    records = jax.tree.map(lambda x: x[0], against_filter(study, slam_filter, *one))
+    records = jax.tree.map(lambda x: x[0], against_filter(study, slam, *one))
     truth = jax.tree.map(lambda x: x[-1], run.poses)
     # In base axes the Laplace covariance and the filter's must be the same but for 2 % of the σ.
     adjoint = mean.adjoint()
@@ -263,20 +253,19 @@ def test_of_the_minima_the_best_is_the_map_estimate(monkeypatch):
     minima = ends, values, jnp.array([False, True, False])
     module = import_module("jaxslam.posterior.laplace")  # a function has its name
     monkeypatch.setattr(module, "minima", lambda *problem: minima)
-    found = quick_jit(partial(map_estimate, LOOSE.rig))(problem, 0 * ends)
+    found = quick_jit(map_estimate)(problem, 0 * ends)
     np.testing.assert_array_equal(found.mode, ends[1])
     assert found.converged
-    J = quick_jit(jax.jacfwd(partial(residuals, LOOSE.rig, problem)))(ends[1])
+    J = quick_jit(jax.jacfwd(partial(residuals, problem)))(ends[1])
     np.testing.assert_allclose(found.root.T @ (J.T @ J) @ found.root, np.eye(len(J.T)), atol=1e-8)
 
 
 def test_at_the_mode_the_conditional_variables_have_the_laplace_approximation():
     problem, _, mode, _ = nearly_linear()
-    rig = NEARLY_LINEAR.rig
-    root = whitening_root(rig, problem, mode.mode)
+    root = whitening_root(problem, mode.mode)
 
     def physical(w):
-        return ravel_pytree(conditional_unknowns(rig, problem, mode.mode, w)[0])[0]
+        return ravel_pytree(conditional_unknowns(problem, mode.mode, w)[0])[0]
 
     origin = centre(problem, mode.mode)
     np.testing.assert_allclose(
@@ -295,7 +284,7 @@ def test_given_the_path_the_conditional_variables_of_depth_are_standard_normal()
     problem, _ = problem_of(LOOSE, truncated=False)
     mode = draw(problem)
     w = centre(problem, mode).at[:2].add(jnp.array([2.5, -2.0]))
-    density = partial(conditional_log_density, LOOSE.rig, problem, mode)
+    density = partial(conditional_log_density, problem, mode)
 
     def of_depths(e):
         return density(w.at[-LOOSE.landmarks :].set(e))
@@ -381,11 +370,11 @@ def keys_of_reference(monkeypatch, study, runs, seed, indices):
     """What `reference` gives to the starts of Levenberg–Marquardt and to the chains."""
     given = {}
 
-    def modes(rig, count, problems, keys):
+    def modes(count, problems, keys):
         given["starts"] = keys
         return SimpleNamespace(mode=None), {}
 
-    def chains(settings, rig, problems, modes, keys):
+    def chains(settings, problems, modes, keys):
         given["chains"] = keys
         raise Enough
 
@@ -408,12 +397,12 @@ def test_chains_and_starts_use_no_key_of_the_simulator_and_none_twice(monkeypatc
     starts_keys, chains_keys = keys_of_reference(monkeypatch, study, runs, 5, range(3))
     problem = make_problem(LOOSE, jax.tree.map(lambda x: x[0], runs))
     # Which keys there are is not the density's business, and a Gaussian's compiles in no time.
-    monkeypatch.setattr(sampler, "conditional_log_density", lambda _, __, ___, w: -w @ w / 2)
-    monkeypatch.setattr(sampler, "whitening_root", lambda _, __, mode: jnp.eye(mode.size))
+    monkeypatch.setattr(sampler, "conditional_log_density", lambda _, __, w: -w @ w / 2)
+    monkeypatch.setattr(sampler, "whitening_root", lambda _, mode: jnp.eye(mode.size))
 
     def drawn(starts_key, chains_key):
         first = starts(problem, starts_key, study.starts)
-        return first, sample(study.hmc, LOOSE.rig, problem, first[0], chains_key)
+        return first, sample(study.hmc, problem, first[0], chains_key)
 
     _, sampled = keys_used(
         monkeypatch, lambda: quick_jit(jax.vmap(drawn))(starts_keys, chains_keys)
@@ -451,7 +440,7 @@ def test_the_truncated_posterior_is_the_other_one_above_the_bound():
 
     def physical_density(problem, y):
         slope = jax.jvp(lambda y: unknowns(problem, y).inverse_depths, (y,), (jnp.ones_like(y),))[1]
-        return log_density(LOOSE.rig, problem, y) - jnp.sum(jnp.log(slope))
+        return log_density(problem, y) - jnp.sum(jnp.log(slope))
 
     lower = (LOOSE.least_inverse_depth - 1 / 6) * 12
     differences = []

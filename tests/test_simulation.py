@@ -11,13 +11,20 @@ import pytest
 from cases import keys_used, quick_jit
 from scipy import stats
 
-from jaxslam.camera import Camera, project
+from jaxslam.arrays import cast
+from jaxslam.models.camera import Camera, project
+from jaxslam.models.motion import Odometry
+from jaxslam.models.sensors import Position
 from jaxslam.simulation import (
     BUILT_IN,
+    Room,
     Scenario,
+    calibration_sigma_of,
+    depth_of,
     features,
-    parameters,
+    motion_of,
     scenario,
+    sensor_of,
     sightings,
     simulate,
 )
@@ -159,28 +166,26 @@ def test_every_built_in_scenario_is_checked_here():
 
 def test_the_filter_starts_from_the_true_priors():
     chosen = scenario("matched-6dof-loose", nearest_depth=2.0)
-    numbers = parameters(chosen)
-    assert numbers.inverse_depth == 1 / 4
-    assert numbers.inverse_depth_sigma == 1 / 8
-    assert numbers.measurement_sigma == 0.3
-    np.testing.assert_array_equal(numbers.intrinsics_sigma, [3, 3, 2, 2])
-    np.testing.assert_array_equal(numbers.camera.intrinsics, [650, 650, 320, 240])
-    np.testing.assert_array_equal(numbers.motion_sigma, chosen.acceleration_sigma)
-    assert parameters(chosen, jnp.float32).measurement_sigma.dtype == jnp.float32
+    depth, sensor, motion = depth_of(chosen), sensor_of(chosen), motion_of(chosen)
+    assert depth.mean == 1 / 4
+    assert depth.sigma == 1 / 8
+    assert sensor.sigma == 0.3
+    np.testing.assert_array_equal(calibration_sigma_of(chosen), [3, 3, 2, 2])
+    np.testing.assert_array_equal(sensor.camera.intrinsics, [650, 650, 320, 240])
+    np.testing.assert_array_equal(motion.noise_sigma, chosen.acceleration_sigma)
+    np.testing.assert_array_equal(motion.velocity, chosen.velocity)
+    np.testing.assert_array_equal(motion.velocity_sigma, chosen.velocity_sigma)
+    assert cast(sensor, jnp.float32).sigma.dtype == jnp.float32
 
 
 def test_the_filter_is_told_of_the_motion_and_the_sensor_that_it_has():
     chosen = scenario("positions", inverse_depth=[0.3, 0.1])
-    numbers = parameters(chosen)
-    np.testing.assert_array_equal(numbers.motion_sigma, chosen.odometry_sigma)
-    assert numbers.measurement_sigma == chosen.position_sigma
-    assert (numbers.inverse_depth, numbers.inverse_depth_sigma) == (0.3, 0.1)
-    rig = chosen.rig
-    assert (rig.geometry.name, rig.motion.name, rig.sensor.name) == (
-        "planar",
-        "odometry",
-        "position",
-    )
+    motion, sensor, depth = motion_of(chosen), sensor_of(chosen), depth_of(chosen)
+    np.testing.assert_array_equal(motion.noise_sigma, chosen.odometry_sigma)
+    assert sensor.sigma == chosen.position_sigma
+    assert (depth.mean, depth.sigma) == (0.3, 0.1)
+    assert (type(motion), type(sensor)) == (Odometry, Position)
+    assert (motion.geometry.name, sensor.point_dim) == ("planar", 2)
 
 
 # --- overrides and files ------------------------------------------------------------------------
@@ -650,7 +655,8 @@ def circling():
     chosen = scenario("circle", steps=600)
     run = quick_jit(lambda key: simulate(chosen, key))(jax.random.key(1))
     most = jax.tree.map(int, quick_jit(sightings)(run))
-    return chosen, run, most, quick_jit(lambda run: features(run, most))(run)
+    room = Room(most.landmarks, most.first, most.known, most.new)
+    return chosen, run, most, quick_jit(lambda run: features(run, room))(run)
 
 
 def test_every_visible_landmark_is_a_feature_exactly_once():

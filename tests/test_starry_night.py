@@ -22,11 +22,8 @@ from jaxslam.datasets.starry_night import (
     with_reversed_gyroscope,
     with_white_noise,
 )
-from jaxslam.filters import make_filter
-from jaxslam.geometry import SPATIAL
-from jaxslam.landmarks import LANDMARKS
-from jaxslam.motion import BODY_RATES
-from jaxslam.rig import Rig
+from jaxslam.models.motion import BodyRates
+from jaxslam.names import make_filter
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
@@ -122,12 +119,12 @@ def test_a_window_is_a_run_from_its_first_camera(path):
     # The true rates move the camera along its true path.
     rates = data.rates[4:14] - rate_errors(data)[4:14]
     controls = replace(run.controls, rates=jnp.asarray(rates))
-    nothing = jnp.zeros(6)
+    motion, nothing = BodyRates(data.rates_sigma), jnp.zeros(6)
 
     @quick_jit
     def path_of(controls):
         def move(T, control):
-            T = T @ BODY_RATES.displacement(SPATIAL, nothing, nothing, control)
+            T = T @ motion.displacement((), nothing, control)
             return T, T
 
         return jax.lax.scan(move, T_BC, controls)[1]
@@ -215,17 +212,17 @@ def test_a_file_of_something_else_is_refused(tmp_path):
 def test_each_measured_number_may_have_its_own_noise(path):
     """S − S without noise is R: one σ for both coordinates, or one each."""
     data = read(path)
-    slam = make_filter(Rig(SPATIAL, BODY_RATES), "world", LANDMARKS["inverse_scaling"], "known")
-    told = starry_night.prior(data, "odometry", 0.5).parameters
+    told = starry_night.pieces(data, "odometry", 0.5)
 
     @quick_jit
-    def ellipse(parameters):
-        state = slam.start(parameters, 1, jnp.zeros(6), jnp.zeros(6))
-        return slam.predict_features(state, parameters, jnp.zeros(6), jnp.zeros(1, int))[1][0]
+    def ellipse(sigma):
+        sensor = replace(told["sensor"], sigma=sigma)
+        slam = make_filter("world", **{**told, "sensor": sensor})
+        slots = jnp.zeros(1, int)
+        return slam.predict_features(slam.init(1), slam.motion.still(), slots).covariance[0]
 
     for sigma, expected in ((jnp.array([2.0, 3.0]), [4.0, 9.0]), (jnp.array(1.5), [2.25] * 2)):
-        without = ellipse(replace(told, measurement_sigma=0 * sigma))
-        S = ellipse(replace(told, measurement_sigma=sigma))
+        without, S = ellipse(0 * sigma), ellipse(sigma)
         np.testing.assert_allclose(S - without, np.diag(expected), atol=1e-9)
 
 

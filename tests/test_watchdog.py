@@ -4,18 +4,20 @@ import os
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
 
 import jaxslam
 from jaxslam import posterior, watchdog
+from jaxslam.arrays import is_number
 from jaxslam.consistency.montecarlo import _filter_batch
-from jaxslam.filters import ekf
-from jaxslam.simulation import Prior, Sightings, simulate
+from jaxslam.forms.covariance import Covariance
+from jaxslam.simulation import Room, sensor_of, simulate
 from jaxslam.watchdog import lapack_calls
 
 MATRICES = """
@@ -104,13 +106,13 @@ FILTERS = [
 def test_no_study_of_a_filter_calls_lapack(name, scenario):
     chosen = jaxslam.scenario(scenario, steps=2, landmarks=4)
     cartesian = name == "information" or "+particles" in name or "+rays" in name
-    (filtered,) = jaxslam.make_filters(
-        chosen.rig, [name], ["cartesian" if cartesian else "inverse_scaling"], "known"
+    (slam,) = jaxslam.make_filters(
+        chosen, [name], ["cartesian" if cartesian else "inverse_scaling"], "known"
     ).values()
-    prior = Prior.of(chosen)
+    numbers, structure = eqx.partition(slam, is_number)
     runs = jax.vmap(partial(simulate, chosen))(jax.random.split(jax.random.key(0), 2))
-    capacity = Sightings(4, 4, 4, 4)
-    traced = jax.make_jaxpr(partial(_filter_batch, filtered, capacity))(prior, runs)
+    batch = partial(_filter_batch, structure, Room(4, 4, 4, 4))
+    traced = jax.make_jaxpr(batch)(numbers, sensor_of(chosen), runs)
     assert lapack_calls(traced.jaxpr) == set()
 
 
@@ -134,21 +136,17 @@ def test_calls_of_lapack_are_found_however_deep(function):
     assert lapack_calls(traced.jaxpr)
 
 
-@dataclass(frozen=True)
-class ByLapack:
-    """An engine of a user's own."""
-
-    def __getattr__(self, name):
-        return getattr(ekf, name)
+class ByLapack(Covariance):
+    """A form of a user's own."""
 
     def update(self, model, state, *data):
         jnp.linalg.cholesky(state.covariance)
-        return ekf.update(model, state, *data)
+        return super().update(model, state, *data)
 
 
 def test_a_filter_that_calls_lapack_is_warned_of():
     chosen = jaxslam.scenario("matched", steps=2, landmarks=4)
-    made = jaxslam.make_filters(chosen.rig, ["robocentric"], ["inverse_scaling"], "known")
+    made = jaxslam.make_filters(chosen, ["robocentric"], ["inverse_scaling"], "known")
     (base,) = made.values()
     with pytest.warns(UserWarning, match="calls LAPACK in a batch \\(cholesky"):
-        jaxslam.monte_carlo(chosen, {"mine": replace(base, engine=ByLapack())}, runs=2)
+        jaxslam.monte_carlo(chosen, {"mine": replace(base, form=ByLapack())}, runs=2)
