@@ -23,12 +23,16 @@ MOST = 0.7
 """The most that a number of θ changes in one step: far from the maximum its curvature misleads."""
 
 
+STEP = 1e-4
+"""Of the central differences of the gradient, in θ."""
+
+
 class Estimate(NamedTuple):
     """The maximum of a likelihood."""
 
     values: Float[np.ndarray, " k"]
     standard_errors: Float[np.ndarray, " k"]
-    """Roots of the inverse Fisher information's diagonal, from the runs' own scores."""
+    """Roots of the diagonal of the inverse of the observed information."""
     log_likelihood: float
     """Of all runs."""
     iterations: int
@@ -62,39 +66,45 @@ def maximum_likelihood(
 ) -> Estimate:
     """θ for which the filters `filter_of(θ)` explain a batch of runs best.
 
-    By Fisher scoring with the information of the runs' scores, `Σ sᵢ sᵢᵀ` (Berndt, Hall, Hall,
-    Hausman 1974), until a step is below `tolerance` standard errors. Take logarithms for θ where
-    numbers are positive. Raises ValueError for an empty batch of runs.
+    By Newton's method with the observed information, the central differences of the gradient, until
+    a step is below `tolerance` standard errors. Take logarithms for θ where numbers are positive.
+    Raises ValueError for an empty batch of runs.
     """
     count = jax.tree.leaves(runs)[0].shape[0]
     if not count:
         raise ValueError("a likelihood needs at least one run")
 
     @jax.jit
-    def scored(theta, part):
-        def one(theta, run):
-            value = log_likelihood(filter_of(theta), room, run)
-            return value, value
+    def of_part(theta, part):
+        def total(theta):
+            values = jax.vmap(lambda run: log_likelihood(filter_of(theta), room, run))(part)
+            return jnp.sum(values), jnp.sum(values)
 
-        return jax.vmap(jax.jacfwd(one, has_aux=True), in_axes=(None, 0))(theta, part)
+        return jax.jacfwd(total, has_aux=True)(theta)
 
     def over_all(theta):
         parts = [
-            jax.device_get(scored(theta, jax.tree.map(lambda x, i=i: x[i : i + chunk], runs)))
+            jax.device_get(of_part(theta, jax.tree.map(lambda x, i=i: x[i : i + chunk], runs)))
             for i in range(0, count, chunk)
         ]
-        scores, values = (np.concatenate(of_parts) for of_parts in zip(*parts, strict=True))
-        return scores, values.sum()
+        return [sum(of_parts) for of_parts in zip(*parts, strict=True)]
 
-    theta, converged = np.asarray(start, float), False
-    iteration = 0
+    def information(theta):
+        slopes = [
+            over_all(theta - step)[0] - over_all(theta + step)[0]
+            for step in STEP * np.eye(theta.size)
+        ]
+        return (np.array(slopes) + np.array(slopes).T) / (4 * STEP)
+
+    theta, converged, iteration = np.asarray(start, float), False, 0
     while not converged and iteration < most_iterations:
         iteration += 1
-        scores, value = over_all(theta)
-        information = scores.T @ scores
-        change = np.linalg.solve(information, scores.sum(axis=0))
+        (slope, value), (curvature, axes) = over_all(theta), np.linalg.eigh(information(theta))
+        # Uphill even where the surface is not yet concave.
+        curvature = np.maximum(np.abs(curvature), 1e-6 * np.abs(curvature).max())
+        change = axes @ ((axes.T @ slope) / curvature)
         theta = theta + np.clip(change, -MOST, MOST)
-        errors = np.sqrt(np.diagonal(np.linalg.inv(information)))
+        errors = np.sqrt(np.sum(axes**2 / curvature, axis=1))
         converged = bool(np.all(np.abs(change) < tolerance * errors))
     return Estimate(theta, errors, float(value), iteration, converged)
 

@@ -1,0 +1,117 @@
+"""The structure that a newcomer may rely on: imports one way, short functions, small rooms."""
+
+import ast
+import os
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+
+import jaxslam
+from jaxslam.slam.filter import EkfSlam
+from jaxslam.slam.protocol import AbstractFilter, AbstractStaged
+
+PACKAGE = Path(jaxslam.__file__).parent
+FILES = sorted(PACKAGE.rglob("*.py"))
+ORDER = (
+    "arrays", "files", "linalg", "lookup", "watchdog", "geometry", "least_squares", "landmarks",
+    "models", "forms", "slam", "delayed", "remedies", "wrappers", "simulation", "names",
+    "consistency", "posterior", "triangulation", "datasets", "plots", "vision", "cli",
+)  # fmt: skip
+"""Rooms, each of which imports only those before it."""
+
+
+def room(module):
+    """The room that a module is in; the package itself has none."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else None
+
+
+def imports(path):
+    """Modules of the package that a file imports, wherever it does so."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("jaxslam."):
+            for alias in node.names:
+                whole = f"{node.module}.{alias.name}"
+                is_file = (PACKAGE.parent / whole.replace(".", "/")).with_suffix(".py").exists()
+                yield whole if is_file else node.module
+        if isinstance(node, ast.Import):
+            yield from (a.name for a in node.names if a.name.startswith("jaxslam."))
+
+
+def functions():
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                body = node.body
+                if isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):
+                    body = body[1:]
+                yield sum(n.end_lineno - n.lineno + 1 for n in body)
+
+
+def test_imports_go_one_way_between_rooms():
+    wrong = []
+    for path in FILES:
+        own = path.relative_to(PACKAGE).with_suffix("").parts[0]
+        if own == "__init__":
+            continue
+        for module in imports(path):
+            if room(module) != own and ORDER.index(room(module)) > ORDER.index(own):
+                wrong.append(f"{path.relative_to(PACKAGE)} imports {module}")
+    assert not wrong
+
+
+def test_no_files_import_one_another_in_a_circle():
+    graph = {}
+    for path in FILES:
+        parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        graph[name] = set(imports(path)) - {name}
+    done = set()
+
+    def visit(name, above):
+        assert name not in above, " → ".join([*above, name])
+        if name not in done:
+            for other in graph.get(name, ()):
+                visit(other, [*above, name])
+            done.add(name)
+
+    for name in graph:
+        visit(name, [])
+
+
+def test_rooms_and_functions_are_small():
+    lines = {}
+    for path in FILES:
+        own = path.relative_to(PACKAGE).parts[0]
+        lines[own] = lines.get(own, 0) + len(path.read_text().splitlines())
+    biggest = max(lines, key=lines.get)
+    assert lines[biggest] <= 0.18 * sum(lines.values()), (biggest, lines)
+    assert statistics.median(functions()) <= 8
+
+
+def public(cls):
+    return {name for name in dir(cls) if not name.startswith("_")} - {
+        name for name, value in vars(cls).items() if name in cls.__dataclass_fields__
+    }
+
+
+def test_a_filter_is_three_functions_and_one_that_tracks_six_more():
+    assert AbstractFilter.__abstractmethods__ == {"init", "step", "marginal"}
+    assert AbstractStaged.__abstractmethods__ == {
+        "init", "marginal", "predict", "predict_features", "update", "compose", "close", "remove",
+    }  # fmt: skip
+    methods = {n for n in public(EkfSlam) if callable(getattr(EkfSlam, n, None))}
+    assert len(methods - set(EkfSlam.__dataclass_fields__)) <= 13
+
+
+def test_importing_the_package_is_light():
+    """No figures, commands, bars or solvers; no device, no configuration; 1.5 s of processor."""
+    program = (
+        "import sys, time, resource; import jaxslam; import jax;"
+        "heavy = {'matplotlib', 'tyro', 'tqdm', 'optimistix', 'cv2', 'evo'} & set(sys.modules);"
+        "assert not heavy, heavy;"
+        "assert not jax._src.xla_bridge._backends;"
+        "assert not jax.config.jax_enable_x64"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, env=os.environ, timeout=120)
