@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 T = TypeVar("T")
 
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     AnyArray = Any
 else:
     AnyArray = jax.Array | np.ndarray
+
+Number = Float[AnyArray, ""] | float
+"""One number as a caller has it: Python's, or an array's."""
 
 
 def numbers(values: Any) -> AnyArray:

@@ -21,6 +21,10 @@ import jaxlie
 from jaxtyping import Array, Float
 
 Pose = jaxlie.SE2 | jaxlie.SE3
+Point = Float[Array, " n"]
+Scalar = Float[Array, ""]
+Homogeneous = tuple[Point, Scalar]
+"""(X, ω), the point X/ω; at infinity where ω is 0."""
 
 
 @dataclass(frozen=True)

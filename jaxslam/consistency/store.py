@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from jaxslam.files import write_atomically
 Records = dict[str, np.ndarray]
 
 
+@runtime_checkable
 class Store(Protocol):
     """Records by filter and chunk; a chunk is the range of its runs."""
 

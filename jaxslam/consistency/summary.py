@@ -52,7 +52,7 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
     geometry = study.scenario.world
     dof, n = geometry.tangent_dim, geometry.point_dim
     sums = _sums(study, name, dof)
-    healthy = study.runs - sums["diverged"]
+    healthy = study.runs - int(sums["diverged"])
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = sums["nees"] / healthy
         kept = sums["kept_nees"] / sums["kept"]
@@ -72,7 +72,7 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
         "verdict": tally(study, name).verdict(),
         "dof": dof,
         "calibration": treatment(study.filters[name]),
-        "survivors": int(healthy),
+        "survivors": healthy,
         "band95": [low, high],
         "nees": _numbers(mean),
         "nees_median": _numbers(_median(study, name)),

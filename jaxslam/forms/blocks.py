@@ -13,7 +13,7 @@ import functools
 import operator
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +37,7 @@ class Blocks(NamedTuple):
     by_landmark: Float[Array, "m k d"]
 
 
+@runtime_checkable
 class Model(Protocol):
     """Pure functions on the core and one landmark; `context` is whatever data they need."""
 
@@ -215,7 +216,7 @@ def rows(J: Blocks, B: Float[Array, "n r"]) -> Float[Array, "nl r"]:
     return (by_view + by_landmark).reshape(-1, B.shape[1])
 
 
-def small_products(A: Float[Array, "*m k j"], B: Float[Array, "*m j r"]) -> Float[Array, "*m k r"]:
+def small_products(A: Float[Array, "*m k j"], B: Float[Array, "*#m j r"]) -> Float[Array, "*m k r"]:
     """`A B` for a small j as a sum over j, which XLA fuses to one vectorised loop.
 
     Its batched product calls a matrix product for every small pair: twice the time on a CPU.

@@ -199,7 +199,7 @@ class Covariance(AbstractGaussian):
         J = jacobian(function, state.core)
         return function(state.core), J @ state.covariance[:c, :c] @ J.T
 
-    def joint_covariance(self, state: State, slot: Int[Array, ""]) -> Float[Array, "c+d c+d"]:
+    def joint_covariance(self, state: State, slot: Int[Array, ""]) -> Float[Array, "k k"]:
         c, d = state.core_dim, state.landmarks.shape[1]
         index = jnp.concatenate([jnp.arange(c), c + slot * d + jnp.arange(d)])
         return state.covariance[index[:, None], index]

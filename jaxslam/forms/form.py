@@ -138,5 +138,5 @@ class AbstractGaussian(AbstractForm):
         """Values and first-order covariances of `function(view(core), landmark)`, slot by slot."""
 
     @abstractmethod
-    def joint_covariance(self, state: Any, slot: Int[Array, ""]) -> Float[Array, "c+d c+d"]:
+    def joint_covariance(self, state: Any, slot: Int[Array, ""]) -> Float[Array, "k k"]:
         """Of the core and one landmark."""

@@ -248,7 +248,7 @@ class Information(AbstractGaussian):
 
     def joint_covariance(
         self, state: InformationState, slot: Int[Array, ""]
-    ) -> Float[Array, "c+d c+d"]:
+    ) -> Float[Array, "k k"]:
         c, d = state.core_dim, state.landmarks.shape[1]
         index = jnp.concatenate([jnp.arange(c), c + slot * d + jnp.arange(d)])
         return state.covariance[index[:, None], index]

@@ -34,11 +34,14 @@ class State(eqx.Module):
 
 
 class Features(eqx.Module):
-    """Measurements of landmarks: j is of the one in `slots[j]`, and counts where `valid[j]`."""
+    """Measurements of landmarks: j is of the one in `slots[j]`, and counts where `valid[j]`.
 
-    slots: Int[Array, " m"]
-    measured: Float[Array, "m p"]
-    valid: Bool[Array, " m"]
+    Of one frame, or of some.
+    """
+
+    slots: Int[Array, "*frames m"]
+    measured: Float[Array, "*frames m p"]
+    valid: Bool[Array, "*frames m"]
 
 
 class Status(IntEnum):
@@ -62,7 +65,7 @@ class Innovation(eqx.Module):
 
     predicted: Float[Array, "m p"]
     residual: Float[Array, "m p"]
-    covariance: Float[Array, "mp mp"] | None
+    covariance: Float[Array, "m*p m*p"] | None
     """S; None where the form of the filter has no use for it."""
     used: Bool[Array, " m"]
     nis: Float[Array, ""]

@@ -8,40 +8,42 @@ with the ray's coordinates for its angles, and so without a singular direction.
 from __future__ import annotations
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from jaxslam.landmarks.parametrization import Parametrization
+from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
+from jaxslam.landmarks.parametrization import Parameters, Parametrization
 
 
-def initialise(point, omega, focal):
+def initialise(point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " 2*n+1"]:
     """C = 0, `m = X/|X|`, `ρ = ω/|X|`. `focal` is not used."""
     del focal
     length = jnp.linalg.norm(point)
     return _pack(jnp.zeros_like(point), point / length, omega / length)
 
 
-def transform(T_ab, landmark):
+def transform(T_ab: Pose, landmark: Parameters) -> Parameters:
     """`C' = R C + t`, `m' = R m`, `ρ' = ρ`."""
     anchor, ray, rho = _unpack(landmark)
     return _pack(T_ab @ anchor, T_ab.rotation() @ ray, rho)
 
 
-def homogeneous(landmark):
+def homogeneous(landmark: Parameters) -> Homogeneous:
     """`(ρ C + m, ρ)`."""
     anchor, ray, rho = _unpack(landmark)
     return rho * anchor + ray, rho
 
 
-def scale(factor, landmark):
+def scale(factor: Scalar, landmark: Parameters) -> Parameters:
     """`C' = s C`, `m' = m`, `ρ' = ρ/s`."""
     anchor, ray, rho = _unpack(landmark)
     return _pack(factor * anchor, ray, rho / factor)
 
 
-def _pack(anchor, ray, rho):
+def _pack(anchor: Point, ray: Point, rho: Scalar) -> Float[Array, " 2*n+1"]:
     return jnp.concatenate([anchor, ray, rho[None]])
 
 
-def _unpack(landmark):
+def _unpack(landmark: Parameters) -> tuple[Point, Point, Scalar]:
     n = landmark.size // 2
     return landmark[:n], landmark[n:-1], landmark[-1]
 

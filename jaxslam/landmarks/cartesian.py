@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from jaxslam.landmarks.parametrization import Parametrization
+from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
+from jaxslam.landmarks.parametrization import Parameters, Parametrization
 
 
-def initialise(point, omega, focal):
+def initialise(point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " n"]:
     """`X/ω`. `focal` is not used."""
     del focal
     return point / omega
 
 
-def transform(T_ab, landmark):
+def transform(T_ab: Pose, landmark: Parameters) -> Parameters:
     """`X' = R X + t`."""
     return T_ab @ landmark
 
 
-def homogeneous(landmark):
+def homogeneous(landmark: Parameters) -> Homogeneous:
     """`(X, 1)`: never at infinity."""
     return landmark, jnp.ones((), landmark.dtype)
 
 
-def scale(factor, landmark):
+def scale(factor: Scalar, landmark: Parameters) -> Parameters:
     """`X' = s X`."""
     return factor * landmark
 

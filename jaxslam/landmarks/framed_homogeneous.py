@@ -8,27 +8,29 @@ pose a frame, where an anchor of its own would cost every landmark a position.
 from __future__ import annotations
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
+from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
 from jaxslam.landmarks import image_plane
-from jaxslam.landmarks.parametrization import Parametrization
+from jaxslam.landmarks.parametrization import Parameters, Parametrization
 
 
-def initialise(point, omega, focal):
+def initialise(point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " n+1"]:
     """`(x/z, y/z, ω/z, 0)`; the filter puts in the anchor's number."""
     return jnp.append(image_plane.initialise(point, omega, focal), 0.0)
 
 
-def transform(T_ab, landmark):
+def transform(T_ab: Pose, landmark: Parameters) -> Parameters:
     """The point as seen from another frame: not what a filter does, which moves the anchor."""
     return jnp.append(image_plane.transform(T_ab, landmark[:-1]), landmark[-1])
 
 
-def homogeneous(landmark):
+def homogeneous(landmark: Parameters) -> Homogeneous:
     """`((x/z, y/z, 1), 1/z)` in the anchor."""
     return image_plane.homogeneous(landmark[:-1])
 
 
-def scale(factor, landmark):
+def scale(factor: Scalar, landmark: Parameters) -> Parameters:
     """`1/z' = (1/z)/s`; the filter moves the anchor."""
     return jnp.append(image_plane.scale(factor, landmark[:-1]), landmark[-1])
 

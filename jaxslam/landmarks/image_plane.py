@@ -8,30 +8,31 @@ camera's image plane has no such coordinates.
 from __future__ import annotations
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from jaxslam.geometry import homogeneous_apply
-from jaxslam.landmarks.parametrization import Parametrization
+from jaxslam.geometry import Homogeneous, Point, Pose, Scalar, homogeneous_apply
+from jaxslam.landmarks.parametrization import Parameters, Parametrization
 
 
-def initialise(point, omega, focal):
+def initialise(point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " n"]:
     """`(x/z, y/z, ω/z)`. `focal` is not used."""
     del focal
     return jnp.append(point[:-1], omega) / point[-1]
 
 
-def transform(T_ab, landmark):
+def transform(T_ab: Pose, landmark: Parameters) -> Parameters:
     """`X = R (x/z, y/z, 1) + (1/z) t`, and `(X_x/X_z, X_y/X_z, (1/z)/X_z)`."""
     point, omega = homogeneous(landmark)
     point = homogeneous_apply(T_ab, point, omega)
     return jnp.append(point[:-1], omega) / point[-1]
 
 
-def homogeneous(landmark):
+def homogeneous(landmark: Parameters) -> Homogeneous:
     """`((x/z, y/z, 1), 1/z)`."""
     return landmark.at[-1].set(1.0), landmark[-1]
 
 
-def scale(factor, landmark):
+def scale(factor: Scalar, landmark: Parameters) -> Parameters:
     """`1/z' = (1/z)/s`."""
     return landmark.at[-1].divide(factor)
 

@@ -8,11 +8,16 @@ the ray. The point is `C + m(θ, φ)/ρ`.
 from __future__ import annotations
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from jaxslam.landmarks.parametrization import Parametrization
+from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
+from jaxslam.landmarks.parametrization import Parameters, Parametrization
+
+Angles = Float[Array, " a"]
+"""(θ, φ), or θ."""
 
 
-def initialise(point, omega, focal):
+def initialise(point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " 2*n"]:
     """C = 0, the ray of X, and `ρ = ω/|X|`.
 
     The prior speaks of inverse depth 1/z, the same for every parametrization; ρ is the inverse
@@ -23,36 +28,36 @@ def initialise(point, omega, focal):
     return _pack(jnp.zeros_like(point), angles_of(point), inverse_distance)
 
 
-def transform(T_ab, landmark):
+def transform(T_ab: Pose, landmark: Parameters) -> Parameters:
     """`C' = R C + t`, `m(θ', φ') = R m(θ, φ)`, `ρ' = ρ`. Singular where the ray is vertical."""
     anchor, angles, inverse_distance = unpack(landmark)
     ray = T_ab.rotation() @ ray_of(angles)
     return _pack(T_ab @ anchor, angles_of(ray), inverse_distance)
 
 
-def homogeneous(landmark):
+def homogeneous(landmark: Parameters) -> Homogeneous:
     """`(ρ C + m(θ, φ), ρ)` (P4)."""
     anchor, angles, inverse_distance = unpack(landmark)
     return inverse_distance * anchor + ray_of(angles), inverse_distance
 
 
-def scale(factor, landmark):
+def scale(factor: Scalar, landmark: Parameters) -> Parameters:
     """`C' = s C`, `ρ' = ρ/s`."""
     anchor, angles, inverse_distance = unpack(landmark)
     return _pack(factor * anchor, angles, inverse_distance / factor)
 
 
-def _pack(anchor, angles, inverse_distance):
+def _pack(anchor: Point, angles: Angles, inverse_distance: Scalar) -> Float[Array, " 2*n"]:
     return jnp.concatenate([anchor, angles, inverse_distance[None]])
 
 
-def unpack(landmark):
+def unpack(landmark: Parameters) -> tuple[Point, Angles, Scalar]:
     """(C, (θ, φ), ρ)."""
     n = landmark.size // 2
     return landmark[:n], landmark[n:-1], landmark[-1]
 
 
-def ray_of(angles):
+def ray_of(angles: Angles) -> Point:
     """`m = (cos φ sin θ, −sin φ, cos φ cos θ)`; planar `(sin θ, cos θ)`."""
     if angles.size == 1:
         return jnp.stack([jnp.sin(angles[0]), jnp.cos(angles[0])])
@@ -60,7 +65,7 @@ def ray_of(angles):
     return jnp.stack([jnp.cos(phi) * jnp.sin(theta), -jnp.sin(phi), jnp.cos(phi) * jnp.cos(theta)])
 
 
-def angles_of(ray):
+def angles_of(ray: Point) -> Angles:
     """`θ = atan2(x, z)`, `φ = atan2(−y, √(x² + z²))`, the inverse of `ray_of`."""
     theta = jnp.atan2(ray[0], ray[-1])
     if ray.size == 2:

@@ -7,20 +7,22 @@ Parameters: Unified Inverse Depth's, then a constant that is 0 until the point i
 from __future__ import annotations
 
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
+from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
 from jaxslam.landmarks import inverse_depth
-from jaxslam.landmarks.parametrization import Parametrization
+from jaxslam.landmarks.parametrization import Parameters, ParametersCovariance, Parametrization
 
 LINEARITY = 0.1
 """A point is converted below this linearity index `L_d = 4 σ_d |cos α| / d`."""
 
 
-def initialise(point, omega, focal):
+def initialise(point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " 2*n+1"]:
     """As Unified Inverse Depth, not converted."""
     return jnp.append(inverse_depth.initialise(point, omega, focal), 0.0)
 
 
-def transform(T_ab, landmark):
+def transform(T_ab: Pose, landmark: Parameters) -> Parameters:
     """That of the form the point is in."""
     moved = T_ab @ _position(landmark)
     return jnp.where(
@@ -30,7 +32,7 @@ def transform(T_ab, landmark):
     )
 
 
-def homogeneous(landmark):
+def homogeneous(landmark: Parameters) -> Homogeneous:
     """`(X, 1)` once converted; before that `(ρ C + m, ρ)`."""
     point, omega = inverse_depth.homogeneous(landmark[:-1])
     converted = _converted(landmark)
@@ -38,12 +40,12 @@ def homogeneous(landmark):
     return jnp.where(converted, position, point), jnp.where(converted, 1.0, omega)
 
 
-def scale(factor, landmark):
+def scale(factor: Scalar, landmark: Parameters) -> Parameters:
     """That of inverse depth; once converted, ρ = 0 and the position is scaled."""
     return jnp.append(inverse_depth.scale(factor, landmark[:-1]), landmark[-1])
 
 
-def convert(camera, landmark, covariance):
+def convert(camera: Point, landmark: Parameters, covariance: ParametersCovariance) -> Parameters:
     """To Cartesian where `L_d < 0.1`: σ_d = σ_ρ/ρ², α the parallax, d the present distance."""
     point, rho = inverse_depth.homogeneous(landmark[:-1])
     safe = jnp.where(rho > 0, rho, 1.0)
@@ -57,16 +59,16 @@ def convert(camera, landmark, covariance):
     return jnp.where(ready & ~_converted(landmark), _cartesian(position), landmark)
 
 
-def _position(landmark):
+def _position(landmark: Parameters) -> Point:
     """X once converted, and the anchor C before."""
     return landmark[: (landmark.size - 1) // 2]
 
 
-def _converted(landmark):
+def _converted(landmark: Parameters) -> Bool[Array, ""]:
     return landmark[-1] > 0.5
 
 
-def _cartesian(position):
+def _cartesian(position: Point) -> Float[Array, " 2*n+1"]:
     return jnp.concatenate([position, jnp.zeros_like(position), jnp.ones(1, position.dtype)])
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from jaxslam.geometry import homogeneous_apply
-from jaxslam.landmarks.parametrization import Parametrization
+from jaxslam.geometry import Homogeneous, Point, Pose, Scalar, homogeneous_apply
+from jaxslam.landmarks.parametrization import Parameters, Parametrization
 
 
-def initialise(point, omega, focal):
+def initialise(point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " n+1"]:
     """`(x, y, z, ω) = f (K⁻¹(u, v, 1), 1/d)` (P22–P26), that is (u − cx, v − cy, f, f/d).
 
     ω is written with the same f as (x, y, z), so that the depth z/ω = d that the prior speaks of
@@ -17,18 +18,18 @@ def initialise(point, omega, focal):
     return focal * jnp.append(point, omega)
 
 
-def transform(T_ab, landmark):
+def transform(T_ab: Pose, landmark: Parameters) -> Parameters:
     """`X' = R X + ω t`, `ω' = ω`: linear in the landmark; the paper numbers no equation for it."""
     point, omega = homogeneous(landmark)
     return jnp.append(homogeneous_apply(T_ab, point, omega), omega)
 
 
-def homogeneous(landmark):
+def homogeneous(landmark: Parameters) -> Homogeneous:
     """The parameters themselves (P5)."""
     return landmark[:-1], landmark[-1]
 
 
-def scale(factor, landmark):
+def scale(factor: Scalar, landmark: Parameters) -> Parameters:
     """`X' = X`, `ω' = ω/s`: the length of (x, y, z), which is a convention, stays."""
     return landmark.at[-1].divide(factor)
 

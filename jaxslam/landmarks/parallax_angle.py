@@ -12,29 +12,31 @@ Inverse Depth's ρ; then that camera becomes the associate anchor, once, and a =
 from __future__ import annotations
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
+from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
 from jaxslam.landmarks import inverse_depth
-from jaxslam.landmarks.inverse_depth import angles_of, ray_of
-from jaxslam.landmarks.parametrization import Parametrization
+from jaxslam.landmarks.inverse_depth import Angles, angles_of, ray_of
+from jaxslam.landmarks.parametrization import Parameters, ParametersCovariance, Parametrization
 
 LEAST_PARALLAX = 0.02
 """Parallax, rad, at which a camera becomes the associate anchor."""
 
 
-def initialise(point, omega, focal):
+def initialise(point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " 3*n+1"]:
     """Unified Inverse Depth at the main anchor."""
     anchor, angles, rho = inverse_depth.unpack(inverse_depth.initialise(point, omega, focal))
     return _pack(anchor, anchor, angles, rho, 0.0)
 
 
-def transform(T_ab, landmark):
+def transform(T_ab: Pose, landmark: Parameters) -> Parameters:
     """Both anchors and the ray move; α, between two rays, stays."""
     main, associate, angles, alpha, anchored = _unpack(landmark)
     ray = T_ab.rotation() @ ray_of(angles)
     return _pack(T_ab @ main, T_ab @ associate, angles_of(ray), alpha, anchored)
 
 
-def homogeneous(landmark):
+def homogeneous(landmark: Parameters) -> Homogeneous:
     """`(C₁ sin α + m |C₂ − C₁| sin(α + ψ), sin α)`; before the associate anchor `(ρ C₁ + m, ρ)`."""
     main, associate, angles, alpha, anchored = _unpack(landmark)
     ray = ray_of(angles)
@@ -46,14 +48,14 @@ def homogeneous(landmark):
     return omega * main + jnp.where(done, reach, 1.0) * ray, omega
 
 
-def scale(factor, landmark):
+def scale(factor: Scalar, landmark: Parameters) -> Parameters:
     """Both anchors move; α, between two rays, stays, and ρ is divided."""
     main, associate, angles, alpha, anchored = _unpack(landmark)
     alpha = jnp.where(anchored > 0.5, alpha, alpha / factor)
     return _pack(factor * main, factor * associate, angles, alpha, anchored)
 
 
-def convert(camera, landmark, covariance):
+def convert(camera: Point, landmark: Parameters, covariance: ParametersCovariance) -> Parameters:
     """The camera becomes the associate anchor where `tan α = ρ |b⊥| / (1 − ρ m·b)` is enough."""
     del covariance
     main, _, angles, rho, anchored = _unpack(landmark)
@@ -63,7 +65,7 @@ def convert(camera, landmark, covariance):
     return jnp.where(ready, _pack(main, camera, angles, alpha, 1.0), landmark)
 
 
-def _along_and_across(ray, baseline):
+def _along_and_across(ray: Point, baseline: Point) -> tuple[Scalar, Scalar]:
     """The baseline's component along the ray, and the length of the rest."""
     along = ray @ baseline
     rest = baseline - along * ray
@@ -72,12 +74,14 @@ def _along_and_across(ray, baseline):
     return along, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)) * (squared > 0)
 
 
-def _pack(main, associate, angles, alpha, anchored):
+def _pack(
+    main: Point, associate: Point, angles: Angles, alpha: Scalar, anchored: Scalar | float
+) -> Float[Array, " 3*n+1"]:
     ends = jnp.stack([alpha, jnp.asarray(anchored, alpha.dtype)])
     return jnp.concatenate([main, associate, angles, ends])
 
 
-def _unpack(landmark):
+def _unpack(landmark: Parameters) -> tuple[Point, Point, Angles, Scalar, Scalar]:
     n = landmark.size // 3  # 3n + 1 numbers
     return landmark[:n], landmark[n : 2 * n], landmark[2 * n : -2], landmark[-2], landmark[-1]
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 from jaxtyping import Array, Float
 
-from jaxslam.geometry import Pose
+from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
 
 Parameters = Float[Array, " d"]
-Homogeneous = tuple[Float[Array, " n"], Float[Array, ""]]
+ParametersCovariance = Float[Array, "d d"]
 
 
 @dataclass(frozen=True)
@@ -26,18 +26,16 @@ class Parametrization:
     """Who published it."""
     size: Callable[[int], int]
     """`size(n)`: how many parameters a landmark has."""
-    initialise: Callable[[Float[Array, " n"], Float[Array, ""], Float[Array, ""]], Parameters]
+    initialise: Callable[[Point, Scalar, Scalar], Parameters]
     """`initialise(X, ω, focal)`: parameters, in the camera frame, of the point X/ω; a camera gives
     X = (x/z, y/z, 1) and ω = 1/z. `focal` in pixels."""
     transform: Callable[[Pose, Parameters], Parameters]
     """`transform(T_ab, parameters_in_b)`: the same point in frame a."""
     homogeneous: Callable[[Parameters], Homogeneous]
     """`(X, ω)` such that the point is X/ω; ω may be 0 (a point at infinity) or negative."""
-    scale: Callable[[Float[Array, ""], Parameters], Parameters]
+    scale: Callable[[Scalar, Parameters], Parameters]
     """`scale(s, parameters)`: the point s X/ω, numbers that do not tell the point kept."""
-    convert: Callable[[Float[Array, " n"], Parameters, Float[Array, "d d"]], Parameters] | None = (
-        None
-    )
+    convert: Callable[[Point, Parameters, ParametersCovariance], Parameters] | None = None
     """`convert(C, parameters, covariance)`: the same point in another form where the camera, at C
     in the landmark's frame, and the covariance recommend it; None where there is one form."""
     anchored: bool = False

@@ -7,12 +7,14 @@ vector: in the frame of a first camera m has unit length, where Inverse Scaling 
 from __future__ import annotations
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
+from jaxslam.geometry import Point, Scalar
 from jaxslam.landmarks import inverse_scaling
 from jaxslam.landmarks.parametrization import Parametrization
 
 
-def initialise(point, omega, focal):
+def initialise(point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " n+1"]:
     """`(m, ρ) = (X, ω)/|X|`. `focal` is not used."""
     del focal
     return jnp.append(point, omega) / jnp.linalg.norm(point)

@@ -7,6 +7,7 @@ differentiated. Pixels are (u,) or (u, v); points are (x, z) or (x, y, z) in the
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,12 +16,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxslam.arrays import AnyArray, check_shape, numbers
+from jaxslam.geometry import Point, Scalar
 
+Pixel = Float[Array, " p"]
+"""A pixel, or normalised coordinates."""
 UNDISTORT_ITERATIONS = 8
 """Newton steps of `undistort`: quadratic convergence wherever the model can be inverted."""
 
 
-def _distortion(values):
+def _distortion(values: Any) -> AnyArray | None:
     return None if values is None else numbers(values)
 
 
@@ -43,7 +47,7 @@ class Camera(eqx.Module):
             check_shape("the camera's distortion", self.distortion, (5,))
 
     @property
-    def intrinsics(self) -> Float[Array, " 2p"]:
+    def intrinsics(self) -> Float[Array, " k"]:
         """(f, c) of the 1-D camera, (fx, fy, cx, cy) of the 2-D one, in pixels."""
         return jnp.concatenate([self.focal, self.centre])
 
@@ -55,7 +59,7 @@ class Camera(eqx.Module):
         return replace(self, focal=focal, centre=centre)
 
 
-def project(camera: Camera, point: Float[Array, " n"]) -> Float[Array, " p"]:
+def project(camera: Camera, point: Point) -> Pixel:
     """Pixel of a point of the camera frame: `u = f d(x/z) + c`, d the distortion (P14).
 
     The point may be the numerator of a homogeneous one: its scale, and so a point at infinity,
@@ -66,12 +70,12 @@ def project(camera: Camera, point: Float[Array, " n"]) -> Float[Array, " p"]:
     return camera.focal * distort(point[:-1] / depth, camera.distortion) + camera.centre
 
 
-def bearing(camera: Camera, pixel: Float[Array, " p"]) -> Float[Array, " p"]:
+def bearing(camera: Camera, pixel: Pixel) -> Pixel:
     """Normalised image coordinates (x/z) or (x/z, y/z) of a pixel, the inverse of `project`."""
     return undistort((pixel - camera.centre) / camera.focal, camera.distortion)
 
 
-def distort(ideal: Float[Array, " p"], distortion: Float[Array, " 5"] | None) -> Float[Array, " p"]:
+def distort(ideal: Pixel, distortion: Float[AnyArray, " 5"] | None) -> Pixel:
     """OpenCV's radial-tangential model on normalised coordinates (x/z, y/z)."""
     if distortion is None:
         return ideal
@@ -79,9 +83,7 @@ def distort(ideal: Float[Array, " p"], distortion: Float[Array, " 5"] | None) ->
     return ideal * radial + tangential
 
 
-def undistort(
-    distorted: Float[Array, " p"], distortion: Float[Array, " 5"] | None
-) -> Float[Array, " p"]:
+def undistort(distorted: Pixel, distortion: Float[AnyArray, " 5"] | None) -> Pixel:
     """Inverse of `distort` by Newton's method; meaningless beyond the image that the model maps."""
     if distortion is None:
         return distorted
@@ -95,7 +97,9 @@ def undistort(
     return jax.lax.scan(step, distorted, length=UNDISTORT_ITERATIONS)[0]
 
 
-def _distortion_terms(ideal, distortion):
+def _distortion_terms(
+    ideal: Float[Array, " 2"], distortion: Float[AnyArray, " 5"]
+) -> tuple[Scalar, Float[Array, " 2"]]:
     k1, k2, p1, p2, k3 = distortion
     x, y = ideal
     r2 = x * x + y * y

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 from jaxtyping import Float
 
-from jaxslam.arrays import AnyArray, check_shape, number_field, numbers
+from jaxslam.arrays import AnyArray, Number, check_shape, number_field, numbers
 
 
-def _optional(values):
+def _optional(values: Any) -> AnyArray | None:
     return None if values is None else numbers(values)
 
 
@@ -32,6 +34,6 @@ class InverseDepth(eqx.Module):
             check_shape(f"the {name} of the prior on 1/z", getattr(self, name), ())
 
     @staticmethod
-    def beyond(nearest: float) -> InverseDepth:
+    def beyond(nearest: Number) -> InverseDepth:
         """The paper's: 96 % from `nearest` (d_min, metres) to infinity."""
         return InverseDepth(1 / (2 * nearest), 1 / (4 * nearest))

@@ -14,8 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxslam.arrays import AnyArray, check_shape, number_field
-from jaxslam.geometry import GEOMETRIES, Geometry, Pose, exp, identity, joined
+from jaxslam.arrays import AnyArray, Number, check_shape, number_field
+from jaxslam.geometry import GEOMETRIES, Geometry, Pose, Scalar, exp, identity, joined
+
+Tangent = Float[Array, " t"]
+"""A velocity, or a displacement: linear, then angular."""
 
 
 class AbstractMotion(eqx.Module):
@@ -52,12 +55,12 @@ class AbstractMotion(eqx.Module):
     def still(self, dtype: Any = None) -> Any:
         """The control with which nothing moves."""
 
-    def nominal_control(self, velocity: Float[Array, " t"], seconds: Float[Array, ""]) -> Any:
+    def nominal_control(self, velocity: Float[Array, " t"], seconds: Number) -> Any:
         """The control of a step at a constant velocity: what a simulation tells the model."""
         raise NotImplementedError(f"{type(self).__name__} does not say how to simulate it")
 
     def enlarged(
-        self, variables: Any, noise: Float[Array, " q"], factor: Float[Array, ""]
+        self, variables: Any, noise: Float[Array, " q"], factor: Scalar
     ) -> tuple[Any, Float[Array, " q"]]:
         """Variables and noise in a unit of length that is 1/factor; a model that is told metres
         has no other."""
@@ -97,25 +100,27 @@ class ConstantVelocity(AbstractMotion):
     def geometry(self) -> Geometry:
         return geometry_of(self.noise_sigma, "the sigma of an acceleration")
 
-    def start(self) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
+    def start(self) -> tuple[Tangent, Float[Array, "t t"]]:
         sigma = jnp.asarray(self.velocity_sigma)
         return jnp.asarray(self.velocity), jnp.diag(sigma) if sigma.ndim == 1 else sigma
 
-    def displacement(self, variables, noise, control) -> Pose:
+    def displacement(self, variables: Tangent, noise: Tangent, control: Number) -> Pose:
         """`T_{k-1,k} = Exp((v + a Δt) Δt)` (P9)."""
         return exp(self.geometry.group, self.next(variables, noise, control) * control)
 
-    def next(self, variables, noise, control) -> Float[Array, " t"]:
+    def next(self, variables: Tangent, noise: Tangent, control: Number) -> Tangent:
         """`v_k = v_{k-1} + a Δt` (P8), linear then angular, in the camera's own frame."""
         return variables + noise * control
 
-    def still(self, dtype=None):
+    def still(self, dtype: Any = None) -> Scalar:
         return jnp.zeros((), dtype)
 
-    def nominal_control(self, velocity, seconds):
+    def nominal_control(self, velocity: Tangent, seconds: Number) -> Number:
         return seconds
 
-    def enlarged(self, variables, noise, factor):
+    def enlarged(
+        self, variables: Tangent, noise: Tangent, factor: Scalar
+    ) -> tuple[Tangent, Tangent]:
         n = self.geometry.point_dim
 
         def one(rates):
@@ -134,16 +139,18 @@ class Odometry(AbstractMotion):
     def geometry(self) -> Geometry:
         return geometry_of(self.noise_sigma, "the sigma of an odometry")
 
-    def displacement(self, variables, noise, control) -> Pose:
+    def displacement(
+        self, variables: tuple[()], noise: Tangent, control: Float[AnyArray, " t"]
+    ) -> Pose:
         """`T_{k-1,k} = (R = Exp(θ), t = ρ)` with (ρ, θ) = u + w: move straight, then turn."""
         del variables
         moved, turned = jnp.split(control + noise, [self.geometry.point_dim])
         return joined(exp(self.geometry.rotation_group, turned), moved)
 
-    def still(self, dtype=None):
+    def still(self, dtype: Any = None) -> Tangent:
         return jnp.zeros(self.geometry.tangent_dim, dtype)
 
-    def nominal_control(self, velocity, seconds):
+    def nominal_control(self, velocity: Tangent, seconds: Number) -> Tangent:
         return velocity * seconds
 
 
@@ -170,7 +177,7 @@ class BodyRates(AbstractMotion):
     def geometry(self) -> Geometry:
         return geometry_of(self.noise_sigma, "the sigma of a vehicle's rates")
 
-    def displacement(self, variables, noise, control: VehicleRates) -> Pose:
+    def displacement(self, variables: tuple[()], noise: Tangent, control: VehicleRates) -> Pose:
         """`T_{k-1,k} = T_VC⁻¹ (R = Exp(ω Δt), t = v Δt) T_VC` with (v, ω) = rates + w."""
         del variables
         displaced = (control.rates + noise) * control.seconds
@@ -178,7 +185,7 @@ class BodyRates(AbstractMotion):
         step = joined(exp(self.geometry.rotation_group, turned), moved)
         return control.camera.inverse() @ step @ control.camera
 
-    def still(self, dtype=None):
+    def still(self, dtype: Any = None) -> VehicleRates:
         zero = jnp.zeros(self.geometry.tangent_dim, dtype)
         return VehicleRates(zero, jnp.zeros((), dtype), identity(self.geometry, zero.dtype))
 

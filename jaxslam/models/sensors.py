@@ -14,9 +14,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.arrays import AnyArray, check_shape, number_field
+from jaxslam.geometry import Homogeneous, Point, Scalar
 from jaxslam.models.camera import Camera, bearing, project
 
-Homogeneous = tuple[Float[Array, " n"], Float[Array, ""]]
+Measurement = Float[Array, " p"]
 
 
 class AbstractSensor(eqx.Module):
@@ -40,25 +41,23 @@ class AbstractSensor(eqx.Module):
             """Coordinates of the points it measures: 2 in a planar world, 3 in a spatial one."""
 
     @abstractmethod
-    def measure(self, point: Float[Array, " n"], omega: Float[Array, ""]) -> Float[Array, " p"]:
+    def measure(self, point: Point, omega: Scalar) -> Measurement:
         """The noise-free measurement."""
 
     @abstractmethod
-    def locate(self, measured: Float[Array, " p"], hidden: Float[Array, " q"]) -> Homogeneous:
+    def locate(self, measured: Measurement, hidden: Float[Array, " q"]) -> Homogeneous:
         """The point, from a measurement and what that hides: the inverse of `measure`."""
 
-    def possible(self, point: Float[Array, " n"]) -> Bool[Array, ""]:
+    def possible(self, point: Point) -> Bool[Array, ""]:
         """Whether the point can be measured at all; any can, unless a sensor says otherwise."""
         del point
         return jnp.ones((), bool)
 
-    def chart(self, point: Float[Array, " n"], omega: Float[Array, ""]) -> Float[Array, " n"]:
+    def chart(self, point: Point, omega: Scalar) -> Point:
         """Coordinates in which every parametrization is nearly Gaussian; the point's own here."""
         return point / omega
 
-    def residual(
-        self, measured: Float[Array, " p"], predicted: Float[Array, " p"]
-    ) -> Float[Array, " p"]:
+    def residual(self, measured: Measurement, predicted: Measurement) -> Measurement:
         """What a measurement differs by; a sensor of angles wraps them."""
         return measured - predicted
 
@@ -99,24 +98,24 @@ class Pinhole(AbstractSensor):
     def point_dim(self) -> int:
         return self.size + 1
 
-    def measure(self, point, omega):
+    def measure(self, point: Point, omega: Scalar) -> Measurement:
         del omega
         return project(self.camera, point)
 
-    def locate(self, measured, hidden):
+    def locate(self, measured: Measurement, hidden: Float[Array, " 1"]) -> Homogeneous:
         return jnp.append(bearing(self.camera, measured), 1.0), hidden[0]
 
-    def possible(self, point):
+    def possible(self, point: Point) -> Bool[Array, ""]:
         return point[-1] > 0
 
-    def chart(self, point, omega):
+    def chart(self, point: Point, omega: Scalar) -> Point:
         return jnp.append(point[:-1], omega) / point[-1]
 
     @property
-    def focal(self):
-        return self.camera.focal[0]
+    def focal(self) -> Float[AnyArray, ""]:
+        return self.camera.focal[..., 0]
 
-    def perturbed(self, delta):
+    def perturbed(self, delta: Float[Array, " k"]) -> "Pinhole":
         """Intrinsics moved by δ, of (f, c) or (fx, fy, cx, cy), pixels (P15)."""
         return replace(self, camera=self.camera.perturbed(delta))
 
@@ -135,10 +134,10 @@ class Position(AbstractSensor):
     def size(self) -> int:
         return self.point_dim
 
-    def measure(self, point, omega):
+    def measure(self, point: Point, omega: Scalar) -> Measurement:
         return point / omega
 
-    def locate(self, measured, hidden):
+    def locate(self, measured: Measurement, hidden: Float[Array, " 0"]) -> Homogeneous:
         del hidden
         return measured, jnp.ones((), measured.dtype)
 
@@ -154,17 +153,17 @@ class RangeBearing(AbstractSensor):
     def __check_init__(self) -> None:
         check_shape("the sigma of range and bearing", self.sigma, (2,))
 
-    def measure(self, point, omega):
+    def measure(self, point: Point, omega: Scalar) -> Measurement:
         x, z = point / omega
         return jnp.stack([jnp.hypot(x, z), jnp.atan2(x, z)])
 
-    def locate(self, measured, hidden):
+    def locate(self, measured: Measurement, hidden: Float[Array, " 0"]) -> Homogeneous:
         del hidden
         distance, angle = measured
         point = distance * jnp.stack([jnp.sin(angle), jnp.cos(angle)])
         return point, jnp.ones((), measured.dtype)
 
-    def residual(self, measured, predicted):
+    def residual(self, measured: Measurement, predicted: Measurement) -> Measurement:
         difference = measured - predicted
         angle = difference[1]
         return difference.at[1].set(jnp.atan2(jnp.sin(angle), jnp.cos(angle)))

@@ -174,7 +174,7 @@ def path(problem: Problem, x: Unknowns) -> tuple[Pose, Float[Array, "steps t"]]:
     return jax.lax.scan(move, start, (x.accelerations, problem.controls))[1]
 
 
-def residuals(problem: Problem, y: Float[Array, " n"]) -> Float[Array, " n+m"]:
+def residuals(problem: Problem, y: Float[Array, " n"]) -> Float[Array, " k"]:
     """`[y; (z − h(y))/σ_px]`; zero where nothing was measured."""
     return jnp.concatenate([y, pixel_residuals(problem, unknowns(problem, y))])
 

@@ -267,8 +267,9 @@ def correct(
     control: Any,
     seen: Features,
     share: Float[Array, " m"] | None = None,
-) -> tuple[Any, Innovation]:
-    """The Kalman update by features of slots; with a share ρ of each, by R/ρ."""
+) -> tuple[Any, Any]:
+    """The Kalman update by features of slots, with a share ρ of each by R/ρ; and what the form
+    says that it compared."""
     noise = slam.sensor.noise
     if share is not None:
         noise = noise / jnp.where(share > 0, share, 1.0)[:, None, None]
@@ -392,7 +393,7 @@ def _depth_prior(slam: EkfSlam, state: Any) -> tuple[Float[Array, " q"], Float[A
     """Mean and σ of what a measurement hides of a landmark, its own part alone."""
     hidden, depth = slam.sensor.hidden, slam.depth
     mean, sigma = jnp.tile(depth.mean, hidden), jnp.tile(depth.sigma, hidden) * depth.own
-    variance = None
+    variance: Any = None
     if isinstance(slam.scale, ScaleGauge):
         variance = slam.form.core_covariance(lambda core: core.log_scale, state)[1][0, 0]
     return slam.scale.prior(mean, sigma, variance)

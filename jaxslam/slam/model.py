@@ -124,8 +124,9 @@ class SlamModel(eqx.Module):
     def _noises(self, core: Core) -> tuple[Float[Array, " q"], Float[Array, " w"]]:
         """The motion's noise in the units of the state, and the calibration's."""
         own = self.motion.noise_sigma.shape[-1]
-        noise = core.noise[:own]
-        return self.scale.noise(self.motion, core.motion, noise, core.log_scale), core.noise[own:]
+        noise, drift = core.noise[:own], core.noise[own:]
+        log_scale: Any = core.log_scale
+        return self.scale.noise(self.motion, core.motion, noise, log_scale), drift
 
     def view(self, core: Core, context: Context) -> View:
         """All that a landmark depends on."""
@@ -238,7 +239,7 @@ class SlamModel(eqx.Module):
         point, omega = sensor.locate(measured, hidden)
         if view.log_scale is not None:
             omega = omega * jnp.exp(view.log_scale[0])
-        seen = self.landmark.initialise(point, omega, sensor.focal)
+        seen = self.landmark.initialise(point, omega, jnp.asarray(sensor.focal))
         if self.landmark.anchored:
             return seen.at[-1].set(context.anchor)
         return self.landmark.transform(view.map_from_camera, seen)

@@ -24,7 +24,7 @@ from jaxslam.forms.state import Features, Innovation, State, Status, judged
 from jaxslam.geometry import Pose, retract
 from jaxslam.linalg import Cholesky, cholesky, semidefinite_root
 from jaxslam.models.motion import check_control
-from jaxslam.slam.filter import EkfSlam, check_one_gaussian
+from jaxslam.slam.filter import EkfSlam, check_features, check_one_gaussian, correct
 from jaxslam.slam.protocol import AbstractFilter, Capacity
 
 LAG = 10
@@ -34,9 +34,9 @@ MOST_STEPS = 30
 
 
 class Frames(eqx.Module):
-    """What happened in some frames, the oldest first."""
+    """What happened in some frames, the oldest first, or in one."""
 
-    happened: Bool[Array, " frames"]
+    happened: Bool[Array, "*frames"]
     """False in the places of frames that are not there yet: nothing moves in them."""
     control: Any
     seen: Features
@@ -176,10 +176,13 @@ class FixedLag(AbstractFilter):
         control = jax.tree.map(lambda x: jnp.tile(x, (self.frames, *(1,) * x.ndim)), still)
         return Frames(jnp.zeros(self.frames, bool), control, features(known), features(new))
 
-    def _advance(self, point: Point, frame: Frames) -> tuple[Point, Any]:
+    def _advance(self, point: Point, frame: Frames) -> tuple[Point, Compared]:
         """One frame of the base filter, as a function of the variables."""
         base = replace(self.base, form=Sensitivity(frame.happened))
-        return base.step(point, frame.control, frame.seen, frame.new)
+        check_features(base, frame.seen)
+        predicted = base.predict(point, frame.control)
+        compared_at, compared = correct(base, predicted, frame.control, frame.seen)
+        return base.close(base.compose(compared_at, frame.control), frame.new), compared
 
     def _normal_equations(self, before, variables, frames) -> NormalEquations:
         point, compared = self._through(before, variables, frames)
