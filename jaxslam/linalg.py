@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxslam.arrays import AnyArray
+
 LEAF = 32
 """Rows of what is factored column by column; of more, the halves are, and joined by products."""
 UNROLLED = 4
@@ -37,7 +39,7 @@ class Cholesky(NamedTuple):
         """Whether A is positive definite."""
         return jnp.all(~jnp.isnan(jnp.diagonal(self.root)))
 
-    def solve(self, b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+    def solve(self, b: Float[AnyArray, "n ..."]) -> Float[Array, "n ..."]:
         """A⁻¹ b."""
         return self.whitening.T @ (self.whitening @ b)
 
@@ -51,7 +53,7 @@ class Cholesky(NamedTuple):
 
 
 @jax.custom_jvp
-def cholesky(A: Float[Array, "n n"]) -> Cholesky:
+def cholesky(A: Float[AnyArray, "n n"]) -> Cholesky:
     """Both L and L⁻¹ of a symmetric A, of which the lower triangle is read."""
     root, whitening = _factored(jnp.asarray(A))
     positive = jnp.all(jnp.diagonal(root) > 0)

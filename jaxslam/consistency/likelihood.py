@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxslam.arrays import AnyArray
 from jaxslam.simulation import Room, Run, features
 from jaxslam.slam.protocol import AbstractFilter
 
@@ -56,7 +57,7 @@ def log_likelihood(slam: AbstractFilter, room: Room, run: Run) -> Float[Array, "
 
 def maximum_likelihood(
     filter_of: Callable[[Float[Array, " k"]], AbstractFilter],
-    start: Float[Array, " k"],
+    start: Float[AnyArray, " k"],
     room: Room,
     runs: Run,
     *,

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import gammainc, gammaincc, gammaincinv, stdtr, stdtrit
 
+from jaxslam.arrays import AnyArray
 from jaxslam.linalg import cholesky
 
 CONFIDENCE = 0.95
@@ -20,7 +21,7 @@ LOST_QUANTILE = 0.9999
 
 
 def normalised_squared(
-    error: Float[Array, " n"], covariance: Float[Array, "n n"]
+    error: Float[AnyArray, " n"], covariance: Float[AnyArray, "n n"]
 ) -> Float[Array, ""]:
     """`eᵀ P⁻¹ e`: the NEES of an error, the NIS of an innovation; NaN unless P is positive."""
     whitened = cholesky(covariance).whitening @ error

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.arrays import AnyArray
 from jaxslam.forms.blocks import (
     Blocks,
     Change,
@@ -176,7 +177,7 @@ class Covariance(AbstractGaussian):
             covariance=covariance.at[index[:, :, None], index[:, None, :]].add(own, mode="drop"),
         )
 
-    def remove(self, state: State, gone: Bool[Array, " capacity"]) -> State:
+    def remove(self, state: State, gone: Bool[AnyArray, " capacity"]) -> State:
         kept = jnp.repeat(~gone, state.landmarks.shape[1])
         kept = jnp.concatenate([jnp.ones(state.core_dim, bool), kept])
         covariance = jnp.where(kept[:, None] & kept[None, :], state.covariance, 0.0)

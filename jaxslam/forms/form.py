@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.arrays import AnyArray
 from jaxslam.forms.blocks import Change, Landmark, Model, composition
 from jaxslam.forms.state import Features
 
@@ -100,7 +101,7 @@ class AbstractGaussian(AbstractForm):
         """A state of slots that hold no landmark yet, and a core that is still to be augmented."""
 
     @abstractmethod
-    def remove(self, state: Any, gone: Bool[Array, " capacity"]) -> Any:
+    def remove(self, state: Any, gone: Bool[AnyArray, " capacity"]) -> Any:
         """Marginalise landmarks and free their slots."""
 
     def update_mean(

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.arrays import AnyArray
 from jaxslam.forms.blocks import (
     Blocks,
     Change,
@@ -220,7 +221,9 @@ class Information(AbstractGaussian):
             information=_added(state, difference, slots, weight),
         )
 
-    def remove(self, state: InformationState, gone: Bool[Array, " capacity"]) -> InformationState:
+    def remove(
+        self, state: InformationState, gone: Bool[AnyArray, " capacity"]
+    ) -> InformationState:
         """O(n³), where the covariance form only forgets."""
         numbers = jnp.repeat(gone, state.landmarks.shape[1])
         information = _without(state.information, state.core_dim, numbers)

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.arrays import AnyArray
 from jaxslam.geometry import tangent_dim
 
 
@@ -39,9 +40,9 @@ class Features(eqx.Module):
     Of one frame, or of some.
     """
 
-    slots: Int[Array, "*frames m"]
-    measured: Float[Array, "*frames m p"]
-    valid: Bool[Array, "*frames m"]
+    slots: Int[AnyArray, "*frames m"]
+    measured: Float[AnyArray, "*frames m p"]
+    valid: Bool[AnyArray, "*frames m"]
 
 
 class Status(IntEnum):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxslam.arrays import Number
 from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
 from jaxslam.landmarks.parametrization import Parameters, Parametrization
 
@@ -33,7 +34,7 @@ def homogeneous(landmark: Parameters) -> Homogeneous:
     return rho * anchor + ray, rho
 
 
-def scale(factor: Scalar, landmark: Parameters) -> Parameters:
+def scale(factor: Number, landmark: Parameters) -> Parameters:
     """`C' = s C`, `m' = m`, `ρ' = ρ/s`."""
     anchor, ray, rho = _unpack(landmark)
     return _pack(factor * anchor, ray, rho / factor)

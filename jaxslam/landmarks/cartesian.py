@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxslam.arrays import Number
 from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
 from jaxslam.landmarks.parametrization import Parameters, Parametrization
 
@@ -25,7 +26,7 @@ def homogeneous(landmark: Parameters) -> Homogeneous:
     return landmark, jnp.ones((), landmark.dtype)
 
 
-def scale(factor: Scalar, landmark: Parameters) -> Parameters:
+def scale(factor: Number, landmark: Parameters) -> Parameters:
     """`X' = s X`."""
     return factor * landmark
 

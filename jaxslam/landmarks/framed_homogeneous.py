@@ -10,6 +10,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxslam.arrays import Number
 from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
 from jaxslam.landmarks import image_plane
 from jaxslam.landmarks.parametrization import Parameters, Parametrization
@@ -30,7 +31,7 @@ def homogeneous(landmark: Parameters) -> Homogeneous:
     return image_plane.homogeneous(landmark[:-1])
 
 
-def scale(factor: Scalar, landmark: Parameters) -> Parameters:
+def scale(factor: Number, landmark: Parameters) -> Parameters:
     """`1/z' = (1/z)/s`; the filter moves the anchor."""
     return jnp.append(image_plane.scale(factor, landmark[:-1]), landmark[-1])
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxslam.arrays import Number
 from jaxslam.geometry import Homogeneous, Point, Pose, Scalar, homogeneous_apply
 from jaxslam.landmarks.parametrization import Parameters, Parametrization
 
@@ -32,7 +33,7 @@ def homogeneous(landmark: Parameters) -> Homogeneous:
     return landmark.at[-1].set(1.0), landmark[-1]
 
 
-def scale(factor: Scalar, landmark: Parameters) -> Parameters:
+def scale(factor: Number, landmark: Parameters) -> Parameters:
     """`1/z' = (1/z)/s`."""
     return landmark.at[-1].divide(factor)
 

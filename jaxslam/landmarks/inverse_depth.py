@@ -10,6 +10,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxslam.arrays import Number
 from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
 from jaxslam.landmarks.parametrization import Parameters, Parametrization
 
@@ -41,7 +42,7 @@ def homogeneous(landmark: Parameters) -> Homogeneous:
     return inverse_distance * anchor + ray_of(angles), inverse_distance
 
 
-def scale(factor: Scalar, landmark: Parameters) -> Parameters:
+def scale(factor: Number, landmark: Parameters) -> Parameters:
     """`C' = s C`, `ρ' = ρ/s`."""
     anchor, angles, inverse_distance = unpack(landmark)
     return _pack(factor * anchor, angles, inverse_distance / factor)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxslam.arrays import Number
 from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
 from jaxslam.landmarks import inverse_depth
 from jaxslam.landmarks.parametrization import Parameters, ParametersCovariance, Parametrization
@@ -40,7 +41,7 @@ def homogeneous(landmark: Parameters) -> Homogeneous:
     return jnp.where(converted, position, point), jnp.where(converted, 1.0, omega)
 
 
-def scale(factor: Scalar, landmark: Parameters) -> Parameters:
+def scale(factor: Number, landmark: Parameters) -> Parameters:
     """That of inverse depth; once converted, ρ = 0 and the position is scaled."""
     return jnp.append(inverse_depth.scale(factor, landmark[:-1]), landmark[-1])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxslam.arrays import Number
 from jaxslam.geometry import Homogeneous, Point, Pose, Scalar, homogeneous_apply
 from jaxslam.landmarks.parametrization import Parameters, Parametrization
 
@@ -29,7 +30,7 @@ def homogeneous(landmark: Parameters) -> Homogeneous:
     return landmark[:-1], landmark[-1]
 
 
-def scale(factor: Scalar, landmark: Parameters) -> Parameters:
+def scale(factor: Number, landmark: Parameters) -> Parameters:
     """`X' = X`, `ω' = ω/s`: the length of (x, y, z), which is a convention, stays."""
     return landmark.at[-1].divide(factor)
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxslam.arrays import Number
 from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
 from jaxslam.landmarks import inverse_depth
 from jaxslam.landmarks.inverse_depth import Angles, angles_of, ray_of
@@ -48,7 +49,7 @@ def homogeneous(landmark: Parameters) -> Homogeneous:
     return omega * main + jnp.where(done, reach, 1.0) * ray, omega
 
 
-def scale(factor: Scalar, landmark: Parameters) -> Parameters:
+def scale(factor: Number, landmark: Parameters) -> Parameters:
     """Both anchors move; α, between two rays, stays, and ρ is divided."""
     main, associate, angles, alpha, anchored = _unpack(landmark)
     alpha = jnp.where(anchored > 0.5, alpha, alpha / factor)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from jaxtyping import Array, Float
 
+from jaxslam.arrays import Number
 from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
 
 Parameters = Float[Array, " d"]
@@ -33,7 +34,7 @@ class Parametrization:
     """`transform(T_ab, parameters_in_b)`: the same point in frame a."""
     homogeneous: Callable[[Parameters], Homogeneous]
     """`(X, ω)` such that the point is X/ω; ω may be 0 (a point at infinity) or negative."""
-    scale: Callable[[Scalar, Parameters], Parameters]
+    scale: Callable[[Number, Parameters], Parameters]
     """`scale(s, parameters)`: the point s X/ω, numbers that do not tell the point kept."""
     convert: Callable[[Point, Parameters, ParametersCovariance], Parameters] | None = None
     """`convert(C, parameters, covariance)`: the same point in another form where the camera, at C

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.arrays import AnyArray, check_shape, number_field
-from jaxslam.geometry import Homogeneous, Point, Scalar
+from jaxslam.arrays import AnyArray, Number, check_shape, number_field
+from jaxslam.geometry import Homogeneous, Point
 from jaxslam.models.camera import Camera, bearing, project
 
 Measurement = Float[Array, " p"]
@@ -41,7 +41,7 @@ class AbstractSensor(eqx.Module):
             """Coordinates of the points it measures: 2 in a planar world, 3 in a spatial one."""
 
     @abstractmethod
-    def measure(self, point: Point, omega: Scalar) -> Measurement:
+    def measure(self, point: Point, omega: Number) -> Measurement:
         """The noise-free measurement."""
 
     @abstractmethod
@@ -53,7 +53,7 @@ class AbstractSensor(eqx.Module):
         del point
         return jnp.ones((), bool)
 
-    def chart(self, point: Point, omega: Scalar) -> Point:
+    def chart(self, point: Point, omega: Number) -> Point:
         """Coordinates in which every parametrization is nearly Gaussian; the point's own here."""
         return point / omega
 
@@ -98,7 +98,7 @@ class Pinhole(AbstractSensor):
     def point_dim(self) -> int:
         return self.size + 1
 
-    def measure(self, point: Point, omega: Scalar) -> Measurement:
+    def measure(self, point: Point, omega: Number) -> Measurement:
         del omega
         return project(self.camera, point)
 
@@ -108,7 +108,7 @@ class Pinhole(AbstractSensor):
     def possible(self, point: Point) -> Bool[Array, ""]:
         return point[-1] > 0
 
-    def chart(self, point: Point, omega: Scalar) -> Point:
+    def chart(self, point: Point, omega: Number) -> Point:
         return jnp.append(point[:-1], omega) / point[-1]
 
     @property
@@ -134,7 +134,7 @@ class Position(AbstractSensor):
     def size(self) -> int:
         return self.point_dim
 
-    def measure(self, point: Point, omega: Scalar) -> Measurement:
+    def measure(self, point: Point, omega: Number) -> Measurement:
         return point / omega
 
     def locate(self, measured: Measurement, hidden: Float[Array, " 0"]) -> Homogeneous:
@@ -153,7 +153,7 @@ class RangeBearing(AbstractSensor):
     def __check_init__(self) -> None:
         check_shape("the sigma of range and bearing", self.sigma, (2,))
 
-    def measure(self, point: Point, omega: Scalar) -> Measurement:
+    def measure(self, point: Point, omega: Number) -> Measurement:
         x, z = point / omega
         return jnp.stack([jnp.hypot(x, z), jnp.atan2(x, z)])
 

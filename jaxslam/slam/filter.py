@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.arrays import cast, precision
+from jaxslam.arrays import AnyArray, cast, precision
 from jaxslam.forms.covariance import Covariance, convert
 from jaxslam.forms.form import AbstractForm, AbstractGaussian
 from jaxslam.forms.state import Features, Innovation, State
@@ -195,7 +195,7 @@ class EkfSlam(AbstractStaged):
         check_features(self, new)
         return _forgotten(self, self.entry.initialise(self, state, new))
 
-    def remove(self, state: Any, gone: Bool[Array, " capacity"]) -> Any:
+    def remove(self, state: Any, gone: Bool[AnyArray, " capacity"]) -> Any:
         return self.gaussian_form.remove(state, gone)
 
     def marginal(

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.arrays import AnyArray
 from jaxslam.forms.state import Features, Innovation
 from jaxslam.geometry import Pose, difference
 
@@ -131,7 +132,7 @@ class AbstractStaged(AbstractFilter):
         """Insert new landmarks, seen from the current camera (P22–P26), and end the frame."""
 
     @abstractmethod
-    def remove(self, state: Any, gone: Bool[Array, " capacity"]) -> Any:
+    def remove(self, state: Any, gone: Bool[AnyArray, " capacity"]) -> Any:
         """Marginalise landmarks and free their slots."""
 
     def step(

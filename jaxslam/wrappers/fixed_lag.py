@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.arrays import AnyArray
 from jaxslam.forms.sensitivity import Compared, Distribution, Point, Sensitivity, begin
 from jaxslam.forms.state import Features, Innovation, State, Status, judged
 from jaxslam.geometry import Pose, retract
@@ -124,7 +125,7 @@ class FixedLag(AbstractFilter):
         status = judged(window.information.positive, state.estimate.covariance, state.variables)
         return state, replace(innovation, status=jnp.maximum(status, failed))
 
-    def remove(self, state: LagState, gone: Bool[Array, " capacity"]) -> LagState:
+    def remove(self, state: LagState, gone: Bool[AnyArray, " capacity"]) -> LagState:
         """Marginalise landmarks, with what the window measured of them, and free their slots."""
         before, frames = state.before, state.frames
         n, c = before.offset.size, state.estimate.core_dim

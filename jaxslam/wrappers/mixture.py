@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.arrays import AnyArray
 from jaxslam.forms.blocks import shifted
 from jaxslam.forms.state import Features, Innovation, State
 from jaxslam.geometry import difference, jacobian
@@ -92,7 +93,7 @@ class Mixture(Bank, AbstractStaged):
     def close(self, state: BankState, new: Features) -> BankState:
         return self._each(lambda member: self.base.close(member, new), state)
 
-    def remove(self, state: BankState, gone: Bool[Array, " capacity"]) -> BankState:
+    def remove(self, state: BankState, gone: Bool[AnyArray, " capacity"]) -> BankState:
         return self._each(lambda member: self.base.remove(member, gone), state)
 
     def _directions(self, velocity, D) -> Float[Array, "v 1"]:
