@@ -126,6 +126,7 @@ def _run(
 ) -> tuple[Study, Mapping[str, np.ndarray]]:
     """The study of one filter, and the last error of its intrinsics with their covariance."""
     store, chunks, sensor = MemoryStore(), _chunks(options.runs), sensor_of(scenario)
+    assert isinstance(sensor, Pinhole)
     intrinsics = []
     for part, chunk in zip(chunks, runs, strict=True):
         records, last = jax.device_get(_batch(slam, room, sensor, chunk))

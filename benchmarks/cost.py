@@ -71,7 +71,7 @@ def main() -> None:
     for name in options.filters:
         (slam,) = jaxslam.make_filters(scenario, [name], [options.landmarks]).values()
         start = time.perf_counter()
-        batch = _records.lower(slam, room, sensor, runs).compile()
+        batch = _records.lower(slam, room, sensor, runs).compile()  # ty: ignore[missing-attribute]
         compiled[name] = partial(batch, slam, room, sensor)
         compile_seconds[name] = time.perf_counter() - start
         jax.block_until_ready(compiled[name](runs))

@@ -61,10 +61,10 @@ class Options:
     """The JSON file."""
 
 
-def measure(name: str, options: Options) -> Iterator[tuple[str, dict]]:
+def measure(world: str, options: Options) -> Iterator[tuple[str, dict]]:
     """All filters of one scenario."""
     fields = {} if options.steps is None else {"steps": options.steps}
-    base, fields = ("matched", {**NEAR, **fields}) if name == "near" else (name, fields)
+    base, fields = ("matched", {**NEAR, **fields}) if world == "near" else (world, fields)
     scenario = jaxslam.scenario(base, fields)
     key = jax.random.key(options.seed)
     draw = jax.jit(jax.vmap(lambda i: jaxslam.simulate(scenario, jax.random.fold_in(key, i))))
@@ -73,8 +73,10 @@ def measure(name: str, options: Options) -> Iterator[tuple[str, dict]]:
     room, sensor = Room(most.landmarks, most.first, most.known, most.new), sensor_of(scenario)
     reference = None
     for pair in options.filters:
-        filters = jaxslam.make_filters(scenario, *([word] for word in pair.split("/")))
-        run = jax.jit(jax.vmap(partial(filter_run, filters[pair], room, sensor)))
+        name, landmark = pair.split("/")
+        slam = jaxslam.make_filters(scenario, [name], [landmark])[pair]
+        assert isinstance(slam, EkfSlam)
+        run = jax.jit(jax.vmap(partial(filter_run, slam, room, sensor)))
         records = _concatenated(run(part) for part in _parts(runs, options.chunk))
         if reference is None:
             reference = records["information"]

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
 from posterior_page import page
@@ -157,7 +158,7 @@ def _filter(study: Study, name: str, chunks, reference, options: Options) -> dic
         runs = draw_runs(study, options.seed, padded)
         draws = reference["exact_T_BC"][chunk.start : chunk.stop]
         draws = np.concatenate([draws, draws[: len(padded) - len(chunk)]])
-        records = against_filter(study, slam, runs, study.scenario.world.group(draws))
+        records = against_filter(study, slam, runs, study.scenario.world.group(jnp.asarray(draws)))
         parts.append({k: np.asarray(v)[: len(chunk)] for k, v in records.items()})
     return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 

@@ -129,7 +129,7 @@ def timed(step, f, dt, states, seen, repeats):
         return jax.vmap(one)(states, seen)
 
     start = time.perf_counter()
-    compiled = run.lower(f, states, seen, dt).compile()
+    compiled = run.lower(f, states, seen, dt).compile()  # ty: ignore[missing-attribute]
     compile_seconds = time.perf_counter() - start
     result = jax.block_until_ready(compiled(f, states, seen, dt))
     seconds = []
