@@ -104,8 +104,8 @@ class Covariance(AbstractGaussian):
         lost = ROUNDING * jnp.finfo(P.dtype).eps * jnp.diagonal(P).at[considered].set(0.0)
         state = shifted(state, K @ residual.ravel())
         state = replace(state, covariance=(covariance + covariance.T) / 2 + jnp.diag(lost))
-        positive = factor.positive & jnp.all(jnp.diagonal(state.covariance) >= 0)
-        status = judged(positive, state.covariance, state.landmarks)
+        variances = jnp.diagonal(covariance) + lost
+        status = judged(factor.positive & jnp.all(variances >= 0), variances, state.landmarks)
         nis = whitened @ whitened
         return state, Innovation(predicted, residual, S, used, nis, status, factor.log_det())
 

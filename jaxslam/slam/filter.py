@@ -210,7 +210,7 @@ class EkfSlam(AbstractStaged):
             return self.form.core_covariance(
                 lambda core: function(Scene(model.camera_pose(core), core=core)), state
             )
-        view, landmark = scene_of_landmark(self, function)
+        view, landmark = scene_of_landmark(self, function, state.core)
         return self.gaussian_form.landmark_covariance(
             view, landmark, self.entry.reported(state), slots
         )
@@ -226,20 +226,30 @@ class EkfSlam(AbstractStaged):
 
 
 def scene_of_landmark(
-    slam: EkfSlam, function: Callable[[Scene], Any]
+    slam: EkfSlam, function: Callable[[Scene], Any], core: Core
 ) -> tuple[Callable[[Core], Any], Callable[[Any, Array], Any]]:
     """A function of a landmark's scene as one of a view, itself a function of the core, and of the
-    landmark."""
-    model = slam.model
+    landmark. The view has the camera's pose only if the function asks for it."""
+    model, here = slam.model, slam.model.camera_pose(core)
+    needed = _asks_for_pose(function, here)
 
-    def view(core: Core) -> tuple[View, Pose]:
-        return model.view(core, COMPOSED), model.camera_pose(core)
+    def view(core: Core) -> tuple[View, Pose | None]:
+        return model.view(core, COMPOSED), model.camera_pose(core) if needed else None
 
     def landmark(view, landmark):
         seen_from, T_BC = view
-        return function(Scene(T_BC, *model.metric_point(seen_from, landmark)))
+        pose = T_BC if needed else here
+        return function(Scene(pose, *model.metric_point(seen_from, landmark)))
 
     return view, landmark
+
+
+def _asks_for_pose(function: Callable[[Scene], Any], pose: Pose) -> bool:
+    """Whether the value depends on the camera's pose: a derivative by it costs a third of one."""
+    point = jnp.ones_like(pose.translation())
+    program = jax.make_jaxpr(lambda *parts: function(Scene(*parts)))(pose, point, point[0]).jaxpr
+    used = {id(x) for step in program.eqns for x in step.invars} | {id(x) for x in program.outvars}
+    return any(id(x) in used for x in program.invars[: len(jax.tree.leaves(pose))])
 
 
 def append_noise(slam: EkfSlam, state: Any) -> Any:

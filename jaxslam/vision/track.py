@@ -16,6 +16,7 @@ import numpy as np
 from jaxslam import __version__
 from jaxslam.files import write_atomically
 from jaxslam.plots.tracking import plot_map
+from jaxslam.slam.protocol import AbstractStaged
 from jaxslam.vision.overlay import OverlayWriter, draw_overlay, overlay_size
 from jaxslam.vision.pointcloud import write_ply
 from jaxslam.vision.settings import TrackerSettings
@@ -43,15 +44,17 @@ def track(
     out: str | Path,
     settings: TrackerSettings | None = None,
     *,
+    slam: AbstractStaged | None = None,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> dict[str, Any]:
     """Track `source`, write `trajectory.txt`, `covariance.txt`, `frames.csv`, `map.ply`,
     `map.png`, `overlay.mp4` and `summary.json` into the folder `out`, and return the summary.
 
     An interruption (KeyboardInterrupt) or an unreadable frame (ValueError) leaves all of them for
-    the frames so far, and is raised again.
+    the frames so far, and is raised again. `slam` is a filter of one's own, in place of the one
+    that the settings name.
     """
-    tracker = Tracker(source.calibration, settings or TrackerSettings())
+    tracker = Tracker(source.calibration, settings or TrackerSettings(), slam)
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     history: list[Tracked] = []
@@ -223,6 +226,7 @@ def _summary(
         "schema": SCHEMA,
         "version": __version__,
         "source": source.name,
+        "filter": tracker.filter_name,
         "settings": dataclasses.asdict(tracker.settings),
         "frames": len(history),
         "tracked": len(history) - lost,

@@ -142,7 +142,7 @@ class Tracker:
         delayed = inner is not None and not isinstance(inner.entry, AtOnce)
         if not isinstance(made, AbstractStaged) or delayed:
             raise ValueError(
-                f"filter {self._filter_name} cannot track: features are sought where a Gaussian "
+                f"filter {self.filter_name} cannot track: features are sought where a Gaussian "
                 "predicts them, before it is given the frame, from the frame in which they are "
                 "first seen"
             )
@@ -155,7 +155,8 @@ class Tracker:
             self._state = self._empty_state()
 
     @property
-    def _filter_name(self) -> str:
+    def filter_name(self) -> str:
+        """As in the settings, or of the class of one's own."""
         return self.settings.filter if self.filter is None else type(self.filter).__name__
 
     def track(self, frame: Frame) -> Tracked:

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.arrays import cast, precision
 from jaxslam.delayed.alternatives import log_density
-from jaxslam.forms.state import Features, Innovation, judged
+from jaxslam.forms.state import Features, Innovation, Status
 from jaxslam.geometry import Pose, difference, retract
 from jaxslam.linalg import cholesky, eigh
 from jaxslam.models.motion import AbstractMotion
@@ -62,7 +62,7 @@ class Bank(AbstractFilter):
         if self.along not in ALONG:
             raise ValueError(f"unknown division {self.along!r}; known: {', '.join(ALONG)}")
         inner = self._inner
-        if not getattr(inner.form, "innovation_covariance", True):
+        if not inner.gaussian_form.innovation_covariance:
             raise ValueError(
                 "a Gaussian sum weighs its members by the covariance of the innovation, "
                 f"which {type(inner.form).__name__.lower()} does not have"
@@ -136,7 +136,9 @@ class Bank(AbstractFilter):
         self, members: Any, log_weights: Array, innovations: Innovation
     ) -> tuple[BankState, Innovation]:
         after = jax.nn.log_softmax(log_weights + log_likelihoods(innovations))
-        return BankState(members, after), _mixed(innovations, log_weights)
+        # The sum fails with the likeliest member, as one that has failed is weighed no more.
+        status = innovations.status[jnp.argmax(after)]
+        return BankState(members, after), _mixed(innovations, log_weights, status)
 
     def _each(self, function, state: BankState, *data: Any) -> BankState:
         members = jax.vmap(lambda member: function(member, *data))(state.members)
@@ -212,8 +214,11 @@ def moments(log_weights, means, covariances):
     return mean, jnp.tensordot(weights, covariances + spread, axes=1)
 
 
-def _mixed(innovations: Innovation, log_weights) -> Innovation:
-    """The sum's innovation: its first two moments."""
+def _mixed(innovations: Innovation, log_weights, status) -> Innovation:
+    """The sum's innovation: its first two moments, without members that have failed."""
+    failed = innovations.status >= Status.NOT_POSITIVE
+    healthy = jax.nn.log_softmax(jnp.where(failed, -jnp.inf, log_weights))
+    log_weights = jnp.where(jnp.any(failed), healthy, log_weights)
     m, p = innovations.residual.shape[1:]
     residual, covariance = moments(
         log_weights, innovations.residual.reshape(-1, m * p), innovations.covariance
@@ -224,9 +229,6 @@ def _mixed(innovations: Innovation, log_weights) -> Innovation:
     predicted = jnp.tensordot(weights, sure, axes=1)
     factor = cholesky(covariance)
     whitened = factor.whitening @ residual
-    status = jnp.maximum(
-        innovations.status[jnp.argmax(log_weights)], judged(factor.positive, whitened)
-    )
     return Innovation(
         predicted, residual.reshape(m, p), covariance, used, whitened @ whitened, status,
         factor.log_det(),
