@@ -110,7 +110,7 @@ def joined(rotation: jaxlie.SO2 | jaxlie.SO3, translation: Float[Array, " n"]) -
     return jaxlie.SE3.from_rotation_and_translation(rotation, translation)
 
 
-def scaled(tree: Any, scale: Float[Array, ""]) -> Any:
+def scaled(tree: Any, scale: Scalar) -> Any:
     """A pytree of poses, the lengths in them times `scale`."""
 
     def one(pose):

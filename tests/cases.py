@@ -7,6 +7,7 @@ alone where zero is expected.
 """
 
 from functools import cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -87,7 +88,7 @@ def a_filter(geometry, landmark=INVERSE_SCALING, coordinates=ROBOCENTRIC, **piec
     """A filter for what its numbers do not matter to: no noise, and a unit camera, so that its
     Jacobians are of the same size as the rest. `pieces` replaces what `EkfSlam` takes."""
     t, p = geometry.tangent_dim, geometry.pixel_dim
-    unit = {
+    unit: dict[str, Any] = {
         "motion": ConstantVelocity(*np.zeros((3, t))),
         "sensor": Pinhole(Camera(np.ones(p), np.zeros(p)), 0.0),
     }

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import jax
+import jaxtyping
 import pytest
 
 from jaxslam.consistency import montecarlo
@@ -33,6 +34,14 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"the shared data folder {SHARED_DATA} is not on this machine")
     return SHARED_DATA
+
+
+@pytest.fixture
+def unchecked():
+    """No check of types, where the package itself is to refuse what is none of its pieces."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,12 +13,15 @@ import pytest
 
 import jaxslam
 
+pytestmark = pytest.mark.usefixtures("unchecked")
+
 CAMERA = jaxslam.Camera([650.0], [320.0])
 PLANAR = jaxslam.ConstantVelocity([0.1] * 3, [1.2, 0.0, 0.0], [0.1] * 3)
 
 
 def a_filter(**pieces):
-    return jaxslam.EkfSlam(**{"motion": PLANAR, "sensor": jaxslam.Pinhole(CAMERA, 0.3), **pieces})
+    own: dict[str, Any] = {"motion": PLANAR, "sensor": jaxslam.Pinhole(CAMERA, 0.3), **pieces}
+    return jaxslam.EkfSlam(**own)
 
 
 def features(m, p=1):

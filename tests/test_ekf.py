@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -79,8 +79,11 @@ class Linear:
     def residual(self, measured, predicted):
         return measured - predicted
 
-    def initialise(self, view, pixel, e, context):
-        return jnp.append(pixel + view - context.slant * e, e)
+    def initialise(self, view, measured, hidden, context):
+        return jnp.append(measured + view - context.slant * hidden, hidden)
+
+    def convert(self, view, landmark, covariance, context):
+        return landmark
 
 
 DT, STEPS, CAPACITY = 0.1, 40, 4
@@ -178,20 +181,20 @@ def linear_start():
 @cache
 def linear_step(moves_landmarks, first=False):
     """One frame of the filter: robocentric composes after the update, world before it."""
-    model = Linear(moves_landmarks)
+    model, noise = Linear(moves_landmarks), jnp.asarray(NOISE)
 
     def step(state, slant, known, new, gone):
         here, motion = Frame(jnp.zeros(()), slant), Frame(jnp.asarray(DT), slant)
         if not first:
             state = EKF.augment(state, 4, ACCELERATION_SIGMA**2 * jnp.eye(2))
             if moves_landmarks:
-                state, _ = EKF.update(model, state, known, NOISE, motion)
+                state, _ = EKF.update(model, state, known, noise, motion)
                 state = EKF.compose(model, state, motion)
             else:
                 state = EKF.compose(model, state, motion)
-                state, _ = EKF.update(model, state, known, NOISE, here)
-        prior = tuple(jnp.array([number]) for number in PRIOR)
-        state = EKF.initialise(model, state, new, NOISE, prior, here)
+                state, _ = EKF.update(model, state, known, noise, here)
+        prior = jnp.array(PRIOR[:1]), jnp.array(PRIOR[1:])
+        state = EKF.initialise(model, state, new, noise, prior, here)
         return EKF.remove(state, gone)
 
     return quick_jit(step)
@@ -259,11 +262,13 @@ def test_removal_zeroes_and_a_freed_slot_is_as_good_as_a_fresh_one():
     def inserted(slot):
         new = Features(jnp.array([slot]), jnp.array([[1.0, 2.0]]), jnp.array([True]))
         here = Frame(jnp.zeros(()), jnp.array([0.3, 0.4]))
-        prior = tuple(jnp.array([number]) for number in PRIOR)
+        prior = jnp.array(PRIOR[:1]), jnp.array(PRIOR[1:])
         return insert(freed, new, prior, here)
 
     insert = quick_jit(
-        lambda state, new, prior, here: EKF.initialise(Linear(True), state, new, NOISE, prior, here)
+        lambda state, new, prior, here: EKF.initialise(
+            Linear(True), state, new, jnp.asarray(NOISE), prior, here
+        )
     )
 
     again, fresh = inserted(used), inserted(unused)
@@ -293,11 +298,20 @@ class Scalar:
     def view(self, core, context):
         return core
 
+    def compose_landmark(self, view, landmark, context):
+        return landmark
+
     def observe(self, view, landmark, context):
         return landmark, jnp.array(True)
 
     def residual(self, measured, predicted):
         return measured - predicted
+
+    def initialise(self, view, measured, hidden, context):
+        return measured
+
+    def convert(self, view, landmark, covariance, context):
+        return landmark
 
 
 def test_prior_one_and_noise_one_end_with_one_half():
@@ -320,7 +334,7 @@ def test_prior_one_and_noise_one_end_with_one_half():
 # --- the real models, against dense Jacobians of the whole state --------------------------------
 
 
-def pieces(geometry):
+def pieces(geometry) -> dict[str, Any]:
     p, t = geometry.pixel_dim, geometry.tangent_dim
     return {
         "motion": ConstantVelocity(np.full(t, 0.1), np.zeros(t), np.full(t, 0.1)),
@@ -664,7 +678,7 @@ def test_landmarks_of_one_frame_share_its_pose_and_its_calibration(coordinates):
 
 def test_inverse_scaling_has_rank_three_when_the_focal_length_is_known():
     """Never invert a landmark block: (u − cx, v − cy, f, ω0) has a constant in it."""
-    slam = EkfSlam(**{**pieces(SPATIAL), "calibration": Known()})
+    slam = replace(EkfSlam(**pieces(SPATIAL)), calibration=Known())
     new = Features(jnp.array([0]), jnp.array([[100.0, 300.0]]), jnp.array([True]))
     block = np.asarray(quick_jit(lambda new: slam.init(1, new).covariance)(new))[-4:, -4:]
     values = np.linalg.eigvalsh(block)

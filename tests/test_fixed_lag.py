@@ -251,6 +251,7 @@ def test_depths_have_their_own_variance_and_what_is_common(modifier, own, common
         ("robocentric+lagg5", "inverse_scaling", "known", "lagg"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_what_makes_no_sense_is_refused(name, landmarks, calibration, message):
     with pytest.raises(ValueError, match=message):
         case("matched").filter(name, landmarks, calibration)

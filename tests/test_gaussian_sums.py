@@ -74,7 +74,7 @@ def test_a_member_without_weight_spoils_no_prediction():
     covariance = jnp.stack([jnp.eye(2), jnp.eye(2), jnp.full((2, 2), jnp.nan)])
     used, nis = jnp.ones((3, 2), bool), jnp.array([5.0, 45.0, jnp.nan])
     status = jnp.array([Status.OK, Status.OK, Status.DIVERGED])
-    innovations = Innovation(predicted, -predicted, covariance, used, nis, status)
+    innovations = jax.vmap(Innovation)(predicted, -predicted, covariance, used, nis, status)
     mixed = _mixed(innovations, jnp.log(jnp.array([0.75, 0.25, 0.0])))
     np.testing.assert_allclose(mixed.predicted[:, 0], [1.5, 3.0])
     np.testing.assert_allclose(mixed.residual, -mixed.predicted)
@@ -219,8 +219,11 @@ def test_what_gains_nothing_is_not_split():
     state = some_sum()
     members = state.members
     apart = jnp.arange(5.0)[:, None] * jnp.ones(3)
-    core = replace(members.core, motion=members.core.motion + apart)
-    state = BankState(replace(members, core=core), jnp.log(jnp.full(5, 0.2)))
+
+    def moved(member, by):
+        return replace(member, core=replace(member.core, motion=member.core.motion + by))
+
+    state = BankState(jax.vmap(moved)(members, apart), jnp.log(jnp.full(5, 0.2)))
     after = divided()(state)
     jax.tree.map(np.testing.assert_array_equal, after, state)
 
@@ -230,7 +233,8 @@ def test_members_without_weight_give_their_places():
     state = some_sum()
     log_weights = jax.nn.log_softmax(state.log_weights.at[2:].set(-jnp.inf))
     covariance = state.members.covariance.at[2:].set(jnp.nan)
-    state = BankState(replace(state.members, covariance=covariance), log_weights)
+    with_covariance = jax.vmap(lambda member, P: replace(member, covariance=P))
+    state = BankState(with_covariance(state.members, covariance), log_weights)
     after = divided()(state)
     assert np.isfinite(after.log_weights).sum() == 3
     alive = np.isfinite(after.log_weights)
@@ -275,6 +279,7 @@ def test_recommended_is_a_name(geometry):
         ("world+mixture", "inverse_depth_to_cartesian", "cannot switch the form"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_what_makes_no_sense_is_refused(name, landmarks, message):
     with pytest.raises(ValueError, match=message):
         case("matched").filter(name, landmarks)
@@ -303,7 +308,7 @@ def innovations_of(residuals, variances, used):
     covariance = jax.vmap(jnp.diag)(variances)
     log_det = jnp.sum(jnp.log(variances), axis=1)
     status = jnp.full(len(nis), Status.OK)
-    return Innovation(residuals, residuals, covariance, used, nis, status, log_det)
+    return jax.vmap(Innovation)(residuals, residuals, covariance, used, nis, status, log_det)
 
 
 def test_a_member_gains_nothing_by_a_landmark_behind_itself():

@@ -10,6 +10,7 @@ import pytest
 from cases import central, close, each_geometry, named, pose, quick_jit
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jaxslam.motion import CONSTANT_VELOCITY
 from scipy.linalg import expm
 
 from jaxslam.geometry import (
@@ -24,7 +25,6 @@ from jaxslam.geometry import (
     scaled,
     tangent_dim,
 )
-from jaxslam.motion import CONSTANT_VELOCITY
 
 # Rotation vectors shorter than π have one logarithm; with |δ| ≤ 1 per axis, √3 at the most.
 # Multiples of 1/64 include 0 and keep clear of tiny angles, which have a test of their own.

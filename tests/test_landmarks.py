@@ -266,7 +266,7 @@ def test_parallax_angle_is_the_triangle_of_two_anchors_and_a_point(geometry, see
     assert alpha > 0.02
     side = np.linalg.norm(baseline) * np.sin(np.pi - alpha - psi) / np.sin(alpha)
     np.testing.assert_allclose(np.linalg.norm(ray), side, rtol=1e-12)
-    parameters = np.concatenate([main, associate, angles_of(ray), [alpha, 1.0]])
+    parameters = np.concatenate([main, associate, angles_of(jnp.asarray(ray)), [alpha, 1.0]])
     euclidean = functions(PARALLAX_ANGLE)[-1]
     np.testing.assert_allclose(euclidean(parameters), point, rtol=1e-12)
 

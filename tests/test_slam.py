@@ -617,6 +617,7 @@ def test_a_frame_with_new_landmarks_becomes_an_anchor_that_no_other_landmark_has
     assert inserted(state, jnp.array([1])).landmarks[:, -1].tolist() == before
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_an_unknown_calibration_is_refused_by_name():
     with pytest.raises(ValueError, match="'black'") as error:
         scenario_pieces(scenario("matched"), "black")
