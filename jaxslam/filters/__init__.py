@@ -133,7 +133,7 @@ steps of Gauss–Newton instead of convergence (`iterated`); members of a Gaussi
 
 _OF_ANY_FILTER = ("iterated", "scales", "directions", "mixture")
 
-RECOMMENDED = {"planar": "scale_gauge+scene+mixture17", "spatial": "scale_gauge+scene+mixture9"}
+RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gauge+scene50+mixture9"}
 """The filter called `recommended`, by geometry: of those of docs/consistency.md the one to take
 where nothing is known of the motion."""
 
