@@ -299,9 +299,7 @@ def page(rows: list[Row], options: Options) -> str:
         "inconsistency may hide. All worlds use the same draws, so that chance moves "
         "neighbours together. A cell is *lost* when more than "
         f"{options.lost_bound:.0%} of its runs are (NEES above the 99.99 % quantile of χ²).",
-        "The column of `scale_gauge+mixture17` is of version 0.3.0, whose gauge was wrong where "
-        "the camera turns ([repairs.md](repairs.md)): its cells there are too bad, and wait to be "
-        "measured again.",
+        *_partial(rows, names),
         "![Mean NEES of every filter by direction](phase-diagram.png)",
         "## Cells by verdict",
         _shares(rows, names),
@@ -320,6 +318,21 @@ def page(rows: list[Row], options: Options) -> str:
 
 def _filters(rows: list[Row]) -> list[tuple[str, str]]:
     return list(dict.fromkeys((r["filter"], r["landmarks"]) for r in rows))
+
+
+def _partial(rows: list[Row], names: list[tuple[str, str]]) -> list[str]:
+    """A sentence for every filter that was measured at some of the depths only."""
+    depths = {row["nearest_depth_m"] for row in rows}
+    own = {
+        name: {r["nearest_depth_m"] for r in rows if (r["filter"], r["landmarks"]) == name}
+        for name in names
+    }
+    return [
+        f"`{'/'.join(name)}` is measured at d_min {', '.join(f'{d:g}' for d in sorted(found))} m "
+        "only: below, its cells are fewer, and its shares and limits are of these alone."
+        for name, found in own.items()
+        if found != depths
+    ]
 
 
 def _directions(rows: list[Row]) -> list[str]:
@@ -383,11 +396,7 @@ def draw(rows: list[Row], options: Options) -> None:
     """One figure of all filters at the middle depth, and one of every filter at all depths."""
     depths = sorted({row["nearest_depth_m"] for row in rows})
     middle = depths[len(depths) // 2]
-    cells = [
-        _cell(row, f"{row['filter']}\n{row['landmarks']}")
-        for row in rows
-        if row["nearest_depth_m"] == middle
-    ]
+    cells = [_cell(row, _label(row)) for row in rows if row["nearest_depth_m"] == middle]
     runs = f"{options.runs} runs a cell"
     _draw(
         cells, f"mean pose NEES (ideal 3), d_min {middle:g} m, {runs}", options, "phase-diagram.png"
@@ -412,6 +421,11 @@ def _draw(cells: list[PhaseCell], title: str, options: Options, name: str) -> No
 
 def _figure_name(name: tuple[str, str]) -> str:
     return f"phase-diagram-{'-'.join(name)}.png"
+
+
+def _label(row: Row) -> str:
+    """Filter and landmarks, in lines that are short enough for the side of a panel."""
+    return "\n".join([row["filter"].replace("+", "\n+", 1), row["landmarks"]])
 
 
 def _cell(row: Row, panel: str) -> PhaseCell:

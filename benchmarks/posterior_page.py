@@ -11,10 +11,6 @@ filters believe, which has mass at ω < 0; the Gaussian that Laplace puts at the
 the filters. What each row adds to the one before is the cost of that step: of the prior, of not
 being Gaussian, of recursion and linearisation."""
 
-STALE = """\
-These numbers are of version 0.3.0: chain 0 of the sampler then started at the true velocity, and \
-the gauge of `scale_gauge` was wrong where the camera turns; they wait to be measured again."""
-
 STAGES = {
     "exact": "exact posterior: its mean and covariance",
     "gaussian_prior": "… with the whole Gaussian prior on 1/z",
@@ -35,7 +31,6 @@ def page(summary: dict[str, Any]) -> str:
         "effective draws of pose, velocity and density). All rows of a scenario and step are of "
         "the same runs.",
         READING,
-        *([STALE] if summary["version"] == "0.3.0" else []),
         "![Draws of one run, NEES and σ](posterior.png)",
     ]
     for scenario, by_step in summary["scenarios"].items():

@@ -1,6 +1,6 @@
 """Words for filters: what the command line, settings and tables of results call them.
 
-A name is a filter and its modifiers, `scale_gauge+scene+mixture17`. What goes together is decided
+A name is a filter and its modifiers, `scale_gauge+scene50+mixture17`. What goes together is decided
 by the objects; here is only what each word makes.
 """
 
@@ -148,7 +148,7 @@ percent (`common`); σ of the scene's depth in percent of one landmark's (`scene
 steps of Gauss–Newton instead of convergence (`iterated`); members of a Gaussian sum (`scales`,
 `directions`, `mixture`); none for the remedies `oc`, `fej`."""
 
-RECOMMENDED = {"planar": "scale_gauge+scene+mixture17", "spatial": "scale_gauge+scene+mixture9"}
+RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gauge+scene50+mixture9"}
 """The filter called `recommended`, by geometry: of those of docs/consistency.md the one to take
 where nothing is known of the motion."""
 

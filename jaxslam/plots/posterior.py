@@ -98,6 +98,7 @@ def _draws(axis: Axes, telling: dict[str, Any]) -> None:
             angle=turn,
             fill=False,
             lw=1.6,
+            ls="-" if names.index(name) < len(COLOURS) else "--",
             edgecolor=style[name]["color"],
             label=f"{name}, 95 %",
         )
