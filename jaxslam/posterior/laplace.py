@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix
@@ -19,9 +18,7 @@ MOST_STEPS = 200
 """Levenberg–Marquardt steps of one start; what needs more counts as not converged."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Laplace:
+class Laplace(eqx.Module):
     """N(mode, R Rᵀ) in the whitened variables, with R Rᵀ = (JᵀJ)⁻¹ of the residuals there."""
 
     mode: Float[Array, " n"]

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import blackjax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from blackjax.adaptation.step_size import dual_averaging_adaptation
@@ -63,22 +64,20 @@ class HMC:
             raise ValueError(f"acceptance must be between 0 and 1, not {self.acceptance}")
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Chains:
-    """What the chains of one problem drew: axes chain, draw, …"""
+class Chains(eqx.Module):
+    """What the chains of one problem drew: axes chain, draw, …; or what one of them did."""
 
     T_BC: Pose
     """After the last step."""
-    velocity: Float[Array, "chains draws t"]
+    velocity: Float[Array, "*chains draws t"]
     """After the last step, in the camera frame."""
-    inverse_depths: Float[Array, "chains draws l"]
+    inverse_depths: Float[Array, "*chains draws l"]
     """1/z in frame 0."""
-    log_density: Float[Array, "chains draws"]
+    log_density: Float[Array, "*chains draws"]
     """Of the variables that were sampled, up to a constant."""
-    divergent: Float[Array, " chains"]
+    divergent: Float[Array, "*chains"]
     """Share of the transitions that diverged."""
-    leapfrogs: Float[Array, " chains"]
+    leapfrogs: Float[Array, "*chains"]
     """Mean number of leapfrog steps of a draw."""
 
 
