@@ -33,7 +33,7 @@ class Estimate(NamedTuple):
 
     values: Float[np.ndarray, " k"]
     standard_errors: Float[np.ndarray, " k"]
-    """Roots of the diagonal of the inverse of the observed information."""
+    """By the scatter of the runs' scores (White 1982): they hold for a wrong model too."""
     log_likelihood: float
     """Of all runs."""
     iterations: int
@@ -76,38 +76,41 @@ def maximum_likelihood(
         raise ValueError("a likelihood needs at least one run")
 
     @jax.jit
-    def of_part(theta, part):
-        def total(theta):
-            values = jax.vmap(lambda run: log_likelihood(filter_of(theta), room, run))(part)
-            return jnp.sum(values), jnp.sum(values)
+    def scored(theta, part):
+        def one(theta, run):
+            value = log_likelihood(filter_of(theta), room, run)
+            return value, value
 
-        return jax.jacfwd(total, has_aux=True)(theta)
+        return jax.vmap(jax.jacfwd(one, has_aux=True), in_axes=(None, 0))(theta, part)
 
     def over_all(theta):
+        """The scores and the values of all runs."""
         parts = [
-            jax.device_get(of_part(theta, jax.tree.map(lambda x, i=i: x[i : i + chunk], runs)))
+            jax.device_get(scored(theta, jax.tree.map(lambda x, i=i: x[i : i + chunk], runs)))
             for i in range(0, count, chunk)
         ]
-        return [sum(of_parts) for of_parts in zip(*parts, strict=True)]
+        return [np.concatenate(of_parts) for of_parts in zip(*parts, strict=True)]
+
+    def slope(theta):
+        return over_all(theta)[0].sum(axis=0)
 
     def information(theta):
-        slopes = [
-            over_all(theta - step)[0] - over_all(theta + step)[0]
-            for step in STEP * np.eye(theta.size)
-        ]
-        return (np.array(slopes) + np.array(slopes).T) / (4 * STEP)
+        steps = STEP * np.eye(theta.size)
+        fall = np.array([slope(theta - h) - slope(theta + h) for h in steps])
+        return (fall + fall.T) / (4 * STEP)
 
     theta, converged, iteration = np.asarray(start, float), False, 0
     while not converged and iteration < most_iterations:
         iteration += 1
-        (slope, value), (curvature, axes) = over_all(theta), np.linalg.eigh(information(theta))
+        (scores, values), (curvature, axes) = over_all(theta), np.linalg.eigh(information(theta))
         # Uphill even where the surface is not yet concave.
         curvature = np.maximum(np.abs(curvature), 1e-6 * np.abs(curvature).max())
-        change = axes @ ((axes.T @ slope) / curvature)
+        by_run = (scores @ axes) / curvature @ axes.T
+        change = by_run.sum(axis=0)
         theta = theta + np.clip(change, -MOST, MOST)
-        errors = np.sqrt(np.sum(axes**2 / curvature, axis=1))
+        errors = np.sqrt(np.sum((by_run - by_run.mean(axis=0)) ** 2, axis=0))
         converged = bool(np.all(np.abs(change) < tolerance * errors))
-    return Estimate(theta, errors, float(value), iteration, converged)
+    return Estimate(theta, errors, float(values.sum()), iteration, converged)
 
 
 def gradient(slam: Any, room: Room, run: Run) -> Any:
