@@ -63,7 +63,7 @@ def test_planar_camera_is_the_spatial_one_with_y_zero():
 @pytest.mark.parametrize("scale", [1e-6, 7.3, 1e6])
 @each_camera
 def test_projection_does_not_depend_on_the_scale_of_the_point(camera, scale):
-    X = points(1)[0]
+    X = jnp.asarray(points(1)[0])
     # 1e-10 px: rounding only.
     np.testing.assert_allclose(project(camera, scale * X), project(camera, X), rtol=0, atol=1e-10)
 
@@ -86,7 +86,7 @@ def test_perturbed_moves_the_intrinsics_and_keeps_the_lens():
     np.testing.assert_array_equal(moved.intrinsics, WIDE.intrinsics + delta)
     np.testing.assert_array_equal(moved.distortion, WIDE.distortion)
     # u = f d(x/z) + c: by hand, what the shift of f and c does to a pixel.
-    X = points(1)[0]
+    X = jnp.asarray(points(1)[0])
     d = distort(X[:2] / X[2], WIDE.distortion)
     np.testing.assert_allclose(
         project(moved, X) - project(WIDE, X), delta[:2] * d + delta[2:], rtol=0, atol=1e-10
@@ -100,12 +100,13 @@ def test_an_empty_perturbation_means_a_known_camera():
 @each_camera
 def test_derivatives_agree_with_central_differences(camera):
     X = points(1, seed=1)[0]
-    pixel = np.asarray(project(camera, X))
+    seen = jnp.asarray(X)
+    pixel = np.asarray(project(camera, seen))
     delta = np.array([0.5, -0.5, 1.0, 2.0])
     functions = {
         "project": (lambda x: project(camera, x), X),
         "bearing": (lambda u: bearing(camera, u), pixel),
-        "intrinsics": (lambda d: project(camera.perturbed(d), X), delta),
+        "intrinsics": (lambda d: project(camera.perturbed(d), seen), delta),
     }
     for name, (function, at) in functions.items():
         # Rounding of a pixel (1e-13) over the step of 1e-6, relative to hundreds a metre.

@@ -36,10 +36,12 @@ def test_a_step_with_the_wrong_control_says_what_is_asked_for():
         slam.step(state, jnp.zeros(6), features(2), nothing)
 
 
-@pytest.mark.parametrize("wrong", [features(2, p=2), replace(features(2), slots=jnp.arange(3))])
+@pytest.mark.parametrize(
+    "wrong", [lambda: features(2, p=2), lambda: replace(features(2), slots=jnp.arange(3))]
+)
 def test_features_of_another_shape_are_refused_by_name(wrong):
     with pytest.raises(ValueError, match=r"features\.(slots|measured) has shape"):
-        a_filter().init(2, wrong)
+        a_filter().init(2, wrong())
 
 
 @pytest.mark.parametrize("wrong", [0, -1, 2.5, "many"])

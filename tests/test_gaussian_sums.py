@@ -75,7 +75,7 @@ def test_a_member_without_weight_spoils_no_prediction():
     used, nis = jnp.ones((3, 2), bool), jnp.array([5.0, 45.0, jnp.nan])
     status = jnp.array([Status.OK, Status.OK, Status.DIVERGED])
     innovations = jax.vmap(Innovation)(predicted, -predicted, covariance, used, nis, status)
-    mixed = _mixed(innovations, jnp.log(jnp.array([0.75, 0.25, 0.0])))
+    mixed = _mixed(innovations, jnp.log(jnp.array([0.75, 0.25, 0.0])), status[0])
     np.testing.assert_allclose(mixed.predicted[:, 0], [1.5, 3.0])
     np.testing.assert_allclose(mixed.residual, -mixed.predicted)
 

@@ -101,7 +101,7 @@ def test_eigh_is_numpys(n):
 
 @pytest.mark.parametrize("A", [np.zeros((3, 3)), np.eye(3), np.diag([3.0, 1.0, 2.0])])
 def test_eigh_of_equal_or_sorted_values_is_exact_and_has_derivatives(A):
-    values, vectors = eigh(A)
+    values, vectors = eigh(jnp.asarray(A))
     np.testing.assert_array_equal(values, np.sort(np.diagonal(A)))
     np.testing.assert_array_equal(np.abs(vectors).sum(axis=0), 1)
     slope = jax.jvp(lambda A: eigh(A)[0].sum(), (A,), (_positive(3),))[1]

@@ -7,6 +7,7 @@ from jaxslam.lookup import chosen
 from jaxslam.models.calibration import Known
 from jaxslam.names import make_filters
 from jaxslam.simulation import scenario
+from jaxslam.slam.filter import EkfSlam
 
 COLOURS = {"red": 1, "green": 2, "blue": 3}
 
@@ -34,6 +35,7 @@ def test_filters_are_made_of_every_pair_of_names():
     made = make_filters(scenario("matched"), frames, LANDMARKS, "known")
     assert list(made) == [f"{name}/{landmark}" for name in frames for landmark in LANDMARKS]
     for name, slam in made.items():
+        assert isinstance(slam, EkfSlam)
         assert name == f"{slam.coordinates.name}/{slam.landmark.name}"
         assert isinstance(slam.calibration, Known)
         assert slam.compose_first == (slam.coordinates.name != "robocentric")

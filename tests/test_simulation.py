@@ -13,8 +13,8 @@ from scipy import stats
 
 from jaxslam.arrays import cast
 from jaxslam.models.camera import Camera, project
-from jaxslam.models.motion import Odometry
-from jaxslam.models.sensors import Position
+from jaxslam.models.motion import ConstantVelocity, Odometry
+from jaxslam.models.sensors import Pinhole, Position
 from jaxslam.simulation import (
     BUILT_IN,
     Room,
@@ -167,6 +167,8 @@ def test_every_built_in_scenario_is_checked_here():
 def test_the_filter_starts_from_the_true_priors():
     chosen = scenario("matched-6dof-loose", nearest_depth=2.0)
     depth, sensor, motion = depth_of(chosen), sensor_of(chosen), motion_of(chosen)
+    assert isinstance(sensor, Pinhole)
+    assert isinstance(motion, ConstantVelocity)
     assert depth.mean == 1 / 4
     assert depth.sigma == 1 / 8
     assert sensor.sigma == 0.3

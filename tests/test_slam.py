@@ -35,7 +35,7 @@ from jaxslam.models.scale import ScaleGauge
 from jaxslam.names import make_filter, scenario_pieces
 from jaxslam.simulation import scenario
 from jaxslam.simulation.pieces import TREATMENTS
-from jaxslam.slam.filter import insert
+from jaxslam.slam.filter import EkfSlam, insert
 from jaxslam.slam.model import COMPOSED, Context, Core
 from jaxslam.slam.readouts import (
     camera_pose,
@@ -585,6 +585,7 @@ def test_a_step_leaves_no_acceleration_and_no_white_calibration_behind(kind):
 def test_a_map_from_above_is_azimuth_and_inverse_distance_along_the_axes_of_the_world(kind):
     """Of a camera that is turned in every direction; azimuth from z towards x."""
     slam = make_filter(kind, **scenario_pieces(scenario("matched-6dof")))
+    assert isinstance(slam, EkfSlam)
     seen = Features(jnp.arange(2), jnp.array([[100.0, 90.0], [500.0, 300.0]]), jnp.ones(2, bool))
     T_BC = pose(SPATIAL, 5, scale=1.0)
 
