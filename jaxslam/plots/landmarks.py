@@ -21,8 +21,8 @@ def plot_landmark_clouds(
 ) -> None:
     """Draw (x, z) of points in the world: draws as dots, and their first-order 95 % ellipses.
 
-    `samples` is of `SlamFilter.landmark_samples`, `means` and `covariances` of
-    `SlamFilter.landmarks_in_world`. Where dots leave their ellipse, a Gaussian in Euclidean space
+    `samples` is of `jaxslam.landmark_samples`, `means` and `covariances` of
+    `jaxslam.landmarks_in_world`. Where dots leave their ellipse, a Gaussian in Euclidean space
     is not what the filter believes.
     """
     plane = np.array([0, samples.shape[-1] - 1])

@@ -1,0 +1,51 @@
+"""What is defined outside the package tracks a camera: a sensor, a motion, a landmark, a treatment
+of the calibration and a remedy."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2")
+
+from additions import PLAIN_HOMOGENEOUS, BiasedVelocity, DriftingFocal, Huber, Pixels
+
+import jaxslam
+from jaxslam.vision.settings import TrackerSettings
+from jaxslam.vision.synthetic import synthetic_source
+from jaxslam.vision.tracker import Tracker
+
+FRAMES = 8
+
+
+def pieces_of(kind, calibration):
+    linear, angular = [1.0] * 3, [2.0] * 3
+    motion = BiasedVelocity(linear + angular, [0.0] * 6, [0.5] * 6, [0.1] * 6)
+    if kind == "sensor and motion":
+        sensor = Pixels((calibration.fx, calibration.cx, calibration.cy), 0.3)
+        return {"motion": motion, "sensor": sensor, "calibration": jaxslam.Estimated([1.0] * 3)}
+    camera = jaxslam.Camera((calibration.fx, calibration.fy), (calibration.cx, calibration.cy))
+    return {
+        "motion": jaxslam.ConstantVelocity(linear + angular, [0.0] * 6, [0.5] * 6),
+        "sensor": jaxslam.Pinhole(camera, 0.3),
+        "calibration": DriftingFocal([0.01], [0.001]),
+        "landmark": PLAIN_HOMOGENEOUS,
+        "form": Huber(3.0),
+    }
+
+
+@pytest.mark.parametrize("kind", ["sensor and motion", "landmark, calibration and remedy"])
+def test_additions_of_ones_own_track(kind):
+    source = synthetic_source(frames=FRAMES)
+    slam = jaxslam.EkfSlam(
+        **pieces_of(kind, source.calibration),
+        depth=jaxslam.InverseDepth.beyond(1.0),
+        coordinates=jaxslam.WORLD,
+    )
+    tracker = Tracker(source.calibration, TrackerSettings(wanted=20, spare=4), slam)
+    tracked = [tracker.track(frame) for frame in source]
+    assert [t.state for t in tracked] == ["start"] + ["tracked"] * (FRAMES - 1)
+    assert not tracker.failed
+    assert source.reference is not None
+    # Orientation is seen within a small part of a degree; the camera turns by several.
+    step = np.linalg.inv(source.reference.T_wc[0]) @ source.reference.T_wc[FRAMES - 1]
+    error = np.linalg.inv(step) @ tracked[-1].T_wc
+    assert np.degrees(np.linalg.norm(error[:3, :3] - np.eye(3))) < 1.0
