@@ -232,6 +232,7 @@ def test_a_verdict_is_said_in_words(factor, text):
 
 
 @pytest.mark.parametrize(("shape", "dof"), [((3,), 3), ((0, 4), 3), ((4, 0), 3), ((4, 5), 0)])
+@pytest.mark.usefixtures("unchecked")
 def test_what_is_no_study_is_refused(shape, dof):
     with pytest.raises(ValueError, match="NEES must be"):
         run_verdict(np.ones(shape), dof)

@@ -193,7 +193,7 @@ def pixel_errors(data: StarryNight) -> Float[np.ndarray, "frames landmarks 2"]:
     return np.where(data.visible[..., None], data.pixels - true, np.nan)
 
 
-def rate_errors(data: StarryNight) -> Float[np.ndarray, "frames-1 6"]:
+def rate_errors(data: StarryNight) -> Float[np.ndarray, "steps 6"]:
     """Measured minus true rates of the vehicle, the true ones from its poses."""
     T_CV = data.vehicle_from_camera.inverse()
     T_IV = jax.vmap(lambda T: T @ T_CV)(data.poses)

@@ -155,11 +155,12 @@ class Odometry(AbstractMotion):
 
 
 class VehicleRates(eqx.Module):
-    """The control of `BodyRates`: what a vehicle V measures of its motion, and its camera."""
+    """The control of `BodyRates`: what a vehicle V measures of its motion, and its camera; in one
+    step, or in some."""
 
-    rates: Float[Array, " t"]
+    rates: Float[Array, "*steps t"]
     """Linear and angular velocity in the axes of V at k−1, m/s and rad/s."""
-    seconds: Float[Array, ""]
+    seconds: Float[Array, "*steps"]
     camera: Pose
     """T_VC, the camera on the vehicle."""
 

@@ -61,6 +61,7 @@ def test_short_distortion_is_padded(tmp_path, given):
         ({"distortion": [0.1, "x"]}, r"distortion\[1\] is 'x'"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_bad_fields_are_refused_naming_file_and_field(tmp_path, changes, words):
     path = write(tmp_path / "bad.json", **changes)
     with pytest.raises(ValueError, match=words) as caught:

@@ -76,7 +76,7 @@ def test_flat_and_full_images_give_no_corners(frame):
     flat = np.full((100, 100), 90, np.uint8)
     assert detect_corners(flat, 5, occupied=NOWHERE, min_distance=5, border=5).shape == (0, 2)
     assert len(detect_corners(frame, 0, occupied=NOWHERE, min_distance=5, border=5)) == 0
-    grid = np.stack(np.meshgrid(np.arange(0, 640, 8), np.arange(0, 480, 8)), -1).reshape(-1, 2)
+    grid = np.stack(np.meshgrid(np.arange(0.0, 640, 8), np.arange(0.0, 480, 8)), -1).reshape(-1, 2)
     assert len(detect_corners(frame, 9, occupied=grid, min_distance=20, border=5)) == 0
 
 
