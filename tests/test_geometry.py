@@ -10,7 +10,6 @@ import pytest
 from cases import central, close, each_geometry, named, pose, quick_jit
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from jaxslam.motion import CONSTANT_VELOCITY
 from scipy.linalg import expm
 
 from jaxslam.geometry import (
@@ -25,6 +24,7 @@ from jaxslam.geometry import (
     scaled,
     tangent_dim,
 )
+from jaxslam.models.motion import ConstantVelocity
 
 # Rotation vectors shorter than π have one logarithm; with |δ| ≤ 1 per axis, √3 at the most.
 # Multiples of 1/64 include 0 and keep clear of tiny angles, which have a test of their own.
@@ -122,9 +122,9 @@ def step_aside(geometry, dtype):
 
     def aside(angle):
         velocity = jnp.zeros(t, dtype).at[0].set(1).at[-1].set(angle)
-        step = CONSTANT_VELOCITY.displacement(
-            geometry, velocity, jnp.zeros(t, dtype), jnp.ones((), dtype)
-        )
+        still = jnp.zeros(t, dtype)
+        motion = ConstantVelocity(still, still, still)
+        step = motion.displacement(velocity, still, jnp.ones((), dtype))
         return step.translation()[1]
 
     return quick_jit(jax.value_and_grad(aside))
@@ -241,7 +241,7 @@ def test_joined_is_the_pose_of_its_parts(geometry):
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_scaling_a_pose_scales_its_lengths_and_nothing_else(geometry, split):
     T = pose(geometry, 1)
-    twice = scaled({"pose": SplitPose.of(T) if split else T}, 2.0)["pose"]
+    twice = scaled({"pose": SplitPose.of(T) if split else T}, jnp.asarray(2.0))["pose"]
     assert isinstance(twice, SplitPose if split else geometry.group)
     twice = twice.joined() if split else twice
     np.testing.assert_allclose(twice.translation(), 2 * T.translation(), rtol=1e-15)
