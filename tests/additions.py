@@ -5,12 +5,11 @@ from dataclasses import replace
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxslam
-from jaxslam.arrays import number_field
+from jaxslam.arrays import AnyArray, number_field
 from jaxslam.forms.blocks import residuals
 from jaxslam.forms.covariance import Covariance
 from jaxslam.geometry import exp, homogeneous_apply
@@ -55,7 +54,7 @@ class Bearing(jaxslam.AbstractSensor):
     size: ClassVar[int] = 1
     point_dim: ClassVar[int] = 2
 
-    sigma: jax.Array = number_field()
+    sigma: AnyArray = number_field()
 
     def measure(self, point, omega):
         return jnp.atan2(point[0], point[1])[None]
@@ -79,9 +78,9 @@ class Pixels(jaxslam.AbstractSensor):
     size: ClassVar[int] = 2
     point_dim: ClassVar[int] = 3
 
-    intrinsics: jax.Array = number_field()
+    intrinsics: AnyArray = number_field()
     """f, cx, cy, pixels."""
-    sigma: jax.Array = number_field()
+    sigma: AnyArray = number_field()
 
     def measure(self, point, omega):
         return self.intrinsics[0] * point[:2] / point[2] + self.intrinsics[1:]
@@ -103,10 +102,10 @@ class Pixels(jaxslam.AbstractSensor):
 class BiasedVelocity(jaxslam.AbstractMotion):
     """Constant velocity, driven by white acceleration and by a constant one that is not known."""
 
-    acceleration_sigma: jax.Array = number_field()
-    velocity: jax.Array = number_field()
-    velocity_sigma: jax.Array = number_field()
-    bias_sigma: jax.Array = number_field()
+    acceleration_sigma: AnyArray = number_field()
+    velocity: AnyArray = number_field()
+    velocity_sigma: AnyArray = number_field()
+    bias_sigma: AnyArray = number_field()
 
     @property
     def geometry(self):
@@ -144,9 +143,9 @@ def _by_name(velocity):
 class DriftingFocal(jaxslam.AbstractCalibration):
     """One relative error of all focal lengths, which moves from frame to frame."""
 
-    sigma: jax.Array = number_field()
+    sigma: AnyArray = number_field()
     """At the start, one number."""
-    drift: jax.Array = number_field()
+    drift: AnyArray = number_field()
     """In one step, one number."""
 
     @property
