@@ -33,7 +33,7 @@ from jaxslam.consistency.montecarlo import draw
 
 jax.config.update("jax_enable_x64", True)
 REDUCED = bool(os.environ.get("JAXSLAM_REDUCED"))
-RUNS, STEPS, GRID = (16, 10, 5) if REDUCED else (128, 60, 15)
+RUNS, STEPS, GRID = (16, 10, 5) if REDUCED else (128, 60, 21)
 
 # %% [markdown]
 # ## A filter of two numbers
@@ -97,9 +97,11 @@ values = np.asarray(surface(jnp.asarray(grid.reshape(-1, 2)))).reshape(GRID, GRI
 
 figure, axes = plt.subplots(figsize=(6, 4.2), layout="constrained")
 levels = values.max() - np.array([300, 100, 30, 10, 3, 1, 0.3])
-contours = axes.contour(accelerations, pixels, values, levels=levels, colors="0.6", linewidths=0.8)
-below = {level: f"−{values.max() - level:.2g}" for level in contours.levels}
-axes.clabel(contours, fmt=below, fontsize=7)
+contours = axes.contour(
+    accelerations, pixels, values, levels, colors="0.6", linewidths=0.8, linestyles="solid"
+)
+below = {level: f"−{values.max() - level:.3g}" for level in contours.levels}
+axes.clabel(contours, contours.levels[:-2], fmt=below, fontsize=8)
 axes.plot(*path.T, "o-", color="#0072B2", ms=4, label="Newton's method")
 axes.plot(1, 1, "*", color="#D55E00", ms=12, label="the truth")
 axes.set(
@@ -107,6 +109,9 @@ axes.set(
     ylabel="σ of a pixel / truth",
     title="Mean log likelihood of a run, below its maximum",
 )  # fmt: skip
+for axis, ticks in ((axes.xaxis, (0.3, 0.5, 1, 2, 4)), (axes.yaxis, (0.4, 0.6, 1, 1.6))):
+    axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
+    axis.set_ticks([], minor=True)
 axes.legend(loc="upper left")
 plt.show()
 
