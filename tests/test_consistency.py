@@ -209,7 +209,9 @@ def test_the_figure_is_titled_by_the_verdicts_and_its_curves_by_what_was_lost():
     axes = plot_consistency(study, summary).axes[0]
     verdict = sentences(summary["filters"]["inverse_scaling"]["verdict"])[0]
     assert axes.get_title(loc="left").splitlines()[1:] == [f"inverse_scaling: {verdict}"]
-    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    legend = axes.get_legend()
+    assert legend is not None
+    labels = [text.get_text() for text in legend.get_texts()]
     assert any("of steps in the band, lost 0.0% at the end, 5.0% ever" in text for text in labels)
 
 

@@ -88,7 +88,7 @@ def world(geometry, scale=1.0):
         unseen = k % 3 == np.arange(CAPACITY) % 3  # every landmark is missed now and then
         known = np.array([born < k and (end is None or k <= end) for born, end in LIVES])
         new.append(Features(slots, pixels, jnp.array([born == k for born, _ in LIVES])))
-        seen.append(Features(slots, pixels, jnp.asarray(known & ~unseen)))
+        seen.append(Features(slots, pixels, jnp.asarray(known & np.logical_not(unseen))))
         gone.append(jnp.array([end == k for _, end in LIVES]))
     return tuple(jax.tree.map(lambda *x: jnp.stack(x), *part) for part in (new, seen, gone))
 

@@ -91,14 +91,13 @@ def window(geometry, landmark, frame, accelerations):
     for k in range(STEPS + 1):
         a = accelerations[k] if k < STEPS else np.zeros(t)
         core = replace(core, noise=jnp.asarray(a))
-        H, F, core, landmarks = (
-            np.asarray(x) if i < 2 else x for i, x in enumerate(jacobians(core, landmarks))
-        )
+        H, F, core, landmarks = jacobians(core, landmarks)
+        H, F = np.asarray(H), np.asarray(F)
         rows.append(H[:, state] @ G)
         if k < STEPS:
             G = F[np.ix_(state, state)] @ G
             here = state.size + k * t
-            G[:, here : here + t] += F[np.ix_(state, range(2 * t, 3 * t))]
+            G[:, here : here + t] += F[np.ix_(state, np.arange(2 * t, 3 * t))]
     return np.vstack(rows), state.size
 
 

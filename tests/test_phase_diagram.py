@@ -3,6 +3,7 @@
 import dataclasses
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -85,8 +86,9 @@ def test_many_comparisons_are_inside_their_band_together():
     ],
 )
 def test_a_verdict_refuses_numbers_that_make_no_sense(arguments, message):
+    numbers: dict[str, Any] = {"nees": 3.0, "lost": 0.0, "dof": 3, "runs": 10, **arguments}
     with pytest.raises(ValueError, match=message):
-        verdict(**{"nees": 3.0, "lost": 0.0, "dof": 3, "runs": 10, **arguments})
+        verdict(**numbers)
 
 
 # --- one simulator for all worlds ---------------------------------------------------------------

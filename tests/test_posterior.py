@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache, partial
 from importlib import import_module
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from cases import close, each_geometry, keys_used, named, pose, quick_jit
 from jax.flatten_util import ravel_pytree
+from jaxlie import SE2
 from scipy.linalg import expm
 from scipy.stats import norm, truncnorm
 
@@ -228,7 +230,7 @@ def test_on_a_nearly_linear_problem_map_hmc_and_the_filter_agree():
     sigma = np.sqrt(np.diagonal(P))
     error = np.abs(difference(T_CB, mean)) / sigma
     assert (error < 4 / np.sqrt(ess)).all()
-    np.testing.assert_allclose(np.diagonal(S), sigma**2, rtol=5 * np.sqrt(2 / ess.min()))
+    np.testing.assert_allclose(np.diagonal(S), sigma**2, rtol=float(5 * np.sqrt(2 / ess.min())))
 
     (slam,) = jaxslam.make_filters(NEARLY_LINEAR, ["robocentric"], ["inverse_depth"]).values()
     one = jax.tree.map(lambda x: x[None], (run, pooled(chains)))
@@ -298,7 +300,7 @@ def test_given_the_path_the_conditional_variables_of_depth_are_standard_normal()
 
 def test_moments_and_distances_of_gaussian_draws_are_those_of_the_gaussian():
     rng = np.random.default_rng(0)
-    mean = jaxslam.PLANAR.group.from_xy_theta(1.0, -2.0, 0.4)
+    mean = SE2.from_xy_theta(1.0, -2.0, 0.4)
     L = np.array([[0.02, 0, 0], [0.01, 0.03, 0], [-0.002, 0.001, 0.005]])
     draws = rng.normal(size=(20000, 3)) @ L.T
     poses = quick_jit(jax.vmap(lambda d: retract(mean, d)))(jnp.asarray(draws))
@@ -379,9 +381,9 @@ def keys_of_reference(monkeypatch, study, runs, seed, indices):
         raise Enough
 
     with monkeypatch.context() as patch:
-        patch.setattr(jaxslam.posterior.study, "_modes", modes)
-        patch.setattr(jaxslam.posterior.study, "_laplace_errors", lambda *data: {})
-        patch.setattr(jaxslam.posterior.study, "_sample", chains)
+        patch.setattr("jaxslam.posterior.study._modes", modes)
+        patch.setattr("jaxslam.posterior.study._laplace_errors", lambda *data: {})
+        patch.setattr("jaxslam.posterior.study._sample", chains)
         with pytest.raises(Enough):
             reference(study, runs, seed, indices)
     return given["starts"], given["chains"]
@@ -501,8 +503,9 @@ def test_sizes_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match="starts"):
         Study(LOOSE, 2, starts=0)
     for field, value in (("chains", 1), ("warmup", 5), ("draws", 0), ("acceptance", 1.0)):
+        wrong: dict[str, Any] = {field: value}
         with pytest.raises(ValueError, match=field):
-            HMC(**{field: value})
+            HMC(**wrong)
     with pytest.raises(ValueError, match="kept"):
         ranks(np.zeros((2, 1)), np.zeros((2, 5, 1)), 6)
     with pytest.raises(ValueError, match="bins"):

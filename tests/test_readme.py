@@ -36,7 +36,9 @@ def test_a_log_of_ones_own_goes_through_the_filter(capsys):
     assert len(examples("docs/own-data.md")) == 3
     run_example("docs/own-data.md")
     out = capsys.readouterr().out
-    position = [float(x) for x in re.search(r"\[([^]]*)\] ±", out)[1].split()]
+    printed = re.search(r"\[([^]]*)\] ±", out)
+    assert printed is not None
+    position = [float(x) for x in printed[1].split()]
     assert abs(position[0] - 1.5) < 0.2
     assert abs(position[1]) < 0.2
     for name in ("bearings:", "biased:"):

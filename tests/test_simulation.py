@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -64,7 +65,7 @@ CIRCLE = {
 }
 AHEAD = {noise: PLANAR_MATCHED[noise] for noise in ("", "loose")}
 
-MATCHED = {
+MATCHED: dict[str, Any] = {
     "geometry": "planar",
     "rate": 30.0,
     "steps": 60,
@@ -368,7 +369,7 @@ def test_a_run_does_not_depend_on_its_batch():
 )
 def test_motion_world_camera_and_noise_share_no_random_key(monkeypatch, name, count):
     """So that they are independent: the same numbers in two of them would look random in each."""
-    calibration = {"true_calibration": "white"} if name == "matched" else {}
+    calibration: dict[str, Any] = {"true_calibration": "white"} if name == "matched" else {}
     chosen = scenario(name, steps=3, **calibration)
     _, keys = keys_used(
         monkeypatch, lambda: quick_jit(lambda key: simulate(chosen, key))(jax.random.key(0))

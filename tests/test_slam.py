@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache, partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -281,8 +282,8 @@ def exact_run(chosen, points):
 )
 def test_robocentric_and_world_agree_to_rounding_where_nothing_is_noisy(landmark, fields):
     """With odometry, all residuals zero: one linear problem, in two sets of coordinates."""
-    velocity = dict(velocity=[0.3, 1.2, 0.4], velocity_sigma=[0.0] * 3)
-    sigma = dict(odometry_sigma=[0.01, 0.02, 0.03])
+    velocity: dict[str, Any] = dict(velocity=[0.3, 1.2, 0.4], velocity_sigma=[0.0] * 3)
+    sigma: dict[str, Any] = dict(odometry_sigma=[0.01, 0.02, 0.03])
     chosen = scenario("matched", steps=15, motion="odometry", **velocity, **sigma, **fields)
     # At the mean of the prior on 1/z.
     points = np.stack([np.linspace(-2, 2, 5), np.full(5, 5.0)], axis=1)

@@ -5,6 +5,7 @@ import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +29,8 @@ from jaxslam.names import make_filter
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 import starry_night
+
+from jaxslam.slam.filter import EkfSlam
 
 FRAMES, LANDMARK_COUNT = 26, 6
 FOCAL, CENTRE = np.array([480.0, 490.0]), np.array([320.0, 240.0])
@@ -218,6 +221,7 @@ def test_each_measured_number_may_have_its_own_noise(path):
     def ellipse(sigma):
         sensor = replace(told["sensor"], sigma=sigma)
         slam = make_filter("world", **{**told, "sensor": sensor})
+        assert isinstance(slam, EkfSlam)
         slots = jnp.zeros(1, int)
         return slam.predict_features(slam.init(1), slam.motion.still(), slots).covariance[0]
 
@@ -310,5 +314,6 @@ def test_a_missing_recording_is_one_line_and_status_2(tmp_path, capsys):
     ],
 )
 def test_options_that_make_no_sense_are_refused(fields, message):
+    given: dict[str, Any] = {"data": Path("x.npz"), **fields}
     with pytest.raises(ValueError, match=message):
-        starry_night.Options(**{"data": Path("x.npz"), **fields})
+        starry_night.Options(**given)

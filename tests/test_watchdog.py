@@ -139,9 +139,9 @@ def test_calls_of_lapack_are_found_however_deep(function):
 class ByLapack(Covariance):
     """A form of a user's own."""
 
-    def update(self, model, state, *data):
+    def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         jnp.linalg.cholesky(state.covariance)
-        return super().update(model, state, *data)
+        return super().update(model, state, features, noise, context, considered)
 
 
 def test_a_filter_that_calls_lapack_is_warned_of():
