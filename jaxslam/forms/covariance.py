@@ -200,11 +200,6 @@ class Covariance(AbstractGaussian):
         J = jacobian(function, state.core)
         return function(state.core), J @ state.covariance[:c, :c] @ J.T
 
-    def joint_covariance(self, state: State, slot: Int[Array, ""]) -> Float[Array, "k k"]:
-        c, d = state.core_dim, state.landmarks.shape[1]
-        index = jnp.concatenate([jnp.arange(c), c + slot * d + jnp.arange(d)])
-        return state.covariance[index[:, None], index]
-
 
 def convert(model: Model, state: State, context: Any) -> State:
     """Write landmarks in the form that the model now prefers, `P ← J P Jᵀ`."""

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.arrays import AnyArray
@@ -138,6 +139,8 @@ class AbstractGaussian(AbstractForm):
     ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
         """Values and first-order covariances of `function(view(core), landmark)`, slot by slot."""
 
-    @abstractmethod
     def joint_covariance(self, state: Any, slot: Int[Array, ""]) -> Float[Array, "k k"]:
-        """Of the core and one landmark."""
+        """Of the core and one landmark, k = c + d numbers."""
+        c, d = state.core_dim, state.landmarks.shape[1]
+        index = jnp.concatenate([jnp.arange(c), c + slot * d + jnp.arange(d)])
+        return state.covariance[index[:, None], index]

@@ -249,13 +249,6 @@ class Information(AbstractGaussian):
         whitened = _whitened(state, J)
         return function(state.core), whitened.T @ whitened
 
-    def joint_covariance(
-        self, state: InformationState, slot: Int[Array, ""]
-    ) -> Float[Array, "k k"]:
-        c, d = state.core_dim, state.landmarks.shape[1]
-        index = jnp.concatenate([jnp.arange(c), c + slot * d + jnp.arange(d)])
-        return state.covariance[index[:, None], index]
-
 
 def representable(covariance: Float[Array, "k k"]) -> Float[Array, "k k"]:
     """The covariance with its variances raised to `EXACT_SIGMA²`, where they are less."""
