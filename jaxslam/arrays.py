@@ -36,6 +36,11 @@ def numbers(values: Any) -> AnyArray:
     return np.asarray(values, np.float64)
 
 
+def optional_numbers(values: Any) -> AnyArray | None:
+    """`numbers`, or None."""
+    return None if values is None else numbers(values)
+
+
 def number_field(**options: Any) -> Any:
     """A field of a module that holds numbers."""
     return eqx.field(converter=numbers, **options)

@@ -12,19 +12,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxslam.arrays import AnyArray
 from jaxslam.forms.blocks import (
     Blocks,
     Change,
-    Landmark,
     Model,
     indices,
     local_jacobians,
     masked,
     new_landmarks,
-    observe,
     placed,
     residuals,
     rows,
@@ -126,17 +124,6 @@ class Covariance(AbstractGaussian):
         delta = HP.T @ cholesky(S).solve(residual.ravel())
         return shifted(state, delta.at[considered].set(0.0))
 
-    def predict_features(
-        self,
-        model: Model,
-        state: State,
-        slots: Int[Array, " m"],
-        noise: Float[Array, "p p"],
-        context: Any,
-    ) -> tuple[Float[Array, "m p"], Float[Array, "m p p"], Bool[Array, " m"]]:
-        predicted, in_front, H = observe(model, state, slots, context)
-        return predicted, _local_covariance(state, H, slots) + noise, in_front
-
     def change(self, state: State, variables: Change) -> State:
         """Write the state in other variables, `P ← J P Jᵀ`."""
         core, J_core = variables.core(state.core), jacobian(variables.core, state.core)
@@ -183,17 +170,20 @@ class Covariance(AbstractGaussian):
         covariance = jnp.where(kept[:, None] & kept[None, :], state.covariance, 0.0)
         return replace(state, active=state.active & ~gone, covariance=covariance)
 
-    def landmark_covariance(
-        self,
-        view: Callable[[Any], Any],
-        function: Landmark,
-        state: State,
-        slots: Int[Array, " m"],
-    ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
-        value, _, J = local_jacobians(
-            view, without_auxiliary(function), state.core, state.landmarks[slots]
-        )
-        return value, _local_covariance(state, J, slots)
+    def local_covariance(self, state: State, J: Blocks, slots) -> Float[Array, "m k k"]:
+        """`J P Jᵀ` of every landmark's own rows: the diagonal blocks only."""
+        c, (capacity, d) = state.core_dim, state.landmarks.shape
+        P = state.covariance
+        P_view = J.view_by_core @ P[:c, :c] @ J.view_by_core.T
+        P_cross = (P[c:, :c] @ J.view_by_core.T).reshape(capacity, d, -1)[slots]
+        P_landmark = P[c:, c:].reshape(capacity, d, capacity, d)[slots, :, slots, :]
+
+        def one(by_view, by_landmark, P_cross, P_landmark):
+            cross = by_landmark @ P_cross @ by_view.T
+            own = by_landmark @ P_landmark @ by_landmark.T
+            return by_view @ P_view @ by_view.T + cross + cross.T + own
+
+        return jax.vmap(one)(J.by_view, J.by_landmark, P_cross, P_landmark)
 
     def core_covariance(self, function: Callable[[Any], Any], state: State) -> tuple[Any, Array]:
         c = state.core_dim
@@ -238,19 +228,3 @@ def _noise_matrix(noise, used):
     blocks = jnp.where(used[:, None, None], noise, jnp.eye(p, dtype=noise.dtype))
     R = jnp.zeros((m, p, m, p), noise.dtype)
     return R.at[jnp.arange(m), :, jnp.arange(m), :].set(blocks).reshape(m * p, m * p)
-
-
-def _local_covariance(state: State, J: Blocks, slots) -> Float[Array, "m k k"]:
-    """`J P Jᵀ` of every landmark's own rows: the diagonal blocks only."""
-    c, (capacity, d) = state.core_dim, state.landmarks.shape
-    P = state.covariance
-    P_view = J.view_by_core @ P[:c, :c] @ J.view_by_core.T
-    P_cross = (P[c:, :c] @ J.view_by_core.T).reshape(capacity, d, -1)[slots]
-    P_landmark = P[c:, c:].reshape(capacity, d, capacity, d)[slots, :, slots, :]
-
-    def one(by_view, by_landmark, P_cross, P_landmark):
-        cross = by_landmark @ P_cross @ by_view.T
-        own = by_landmark @ P_landmark @ by_landmark.T
-        return by_view @ P_view @ by_view.T + cross + cross.T + own
-
-    return jax.vmap(one)(J.by_view, J.by_landmark, P_cross, P_landmark)

@@ -16,7 +16,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.arrays import AnyArray
-from jaxslam.forms.blocks import Change, Landmark, Model, composition
+from jaxslam.forms.blocks import (
+    Blocks,
+    Change,
+    Landmark,
+    Model,
+    composition,
+    local_jacobians,
+    observe,
+    without_auxiliary,
+)
 from jaxslam.forms.state import Features
 
 
@@ -118,6 +127,11 @@ class AbstractGaussian(AbstractForm):
         return self.update(model, state, features, noise, context, considered)[0]
 
     @abstractmethod
+    def local_covariance(
+        self, state: Any, J: Blocks, slots: Int[Array, " m"]
+    ) -> Float[Array, "m k k"]:
+        """`J P Jᵀ` of every landmark's own rows: the diagonal blocks only."""
+
     def predict_features(
         self,
         model: Model,
@@ -128,8 +142,9 @@ class AbstractGaussian(AbstractForm):
     ) -> tuple[Float[Array, "m p"], Float[Array, "m p p"], Bool[Array, " m"]]:
         """Where landmarks should be seen: measurements, covariances of their innovations, possible
         or not. These are the centres and the search ellipses of active search."""
+        predicted, in_front, H = observe(model, state, slots, context)
+        return predicted, self.local_covariance(state, H, slots) + noise, in_front
 
-    @abstractmethod
     def landmark_covariance(
         self,
         view: Callable[[Any], Any],
@@ -138,6 +153,10 @@ class AbstractGaussian(AbstractForm):
         slots: Int[Array, " m"],
     ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
         """Values and first-order covariances of `function(view(core), landmark)`, slot by slot."""
+        value, _, J = local_jacobians(
+            view, without_auxiliary(function), state.core, state.landmarks[slots]
+        )
+        return value, self.local_covariance(state, J, slots)
 
     def joint_covariance(self, state: Any, slot: Int[Array, ""]) -> Float[Array, "k k"]:
         """Of the core and one landmark, k = c + d numbers."""

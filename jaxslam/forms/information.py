@@ -19,19 +19,17 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxslam.arrays import AnyArray
 from jaxslam.forms.blocks import (
     Blocks,
     Change,
-    Landmark,
     Model,
     indices,
     local_jacobians,
     masked,
     new_landmarks,
-    observe,
     placed,
     residuals,
     shifted,
@@ -151,18 +149,6 @@ class Information(AbstractGaussian):
         status = judged(factor.positive, information, state.landmarks)
         return state, Innovation(predicted, residual, None, used, nis, status)
 
-    def predict_features(
-        self,
-        model: Model,
-        state: InformationState,
-        slots: Int[Array, " m"],
-        noise: Float[Array, "p p"],
-        context: Any,
-    ) -> tuple[Float[Array, "m p"], Float[Array, "m p p"], Bool[Array, " m"]]:
-        """Factors Λ, which the covariance form need not: O(n³), then O(n²) a landmark."""
-        predicted, in_front, H = observe(model, state, slots, context)
-        return predicted, _local_covariance(state, H, slots) + noise, in_front
-
     def change(self, state: InformationState, variables: Change) -> InformationState:
         """Write the state in other variables, `Λ ← J⁻ᵀ Λ J⁻¹`.
 
@@ -207,9 +193,8 @@ class Information(AbstractGaussian):
             return state
         new, J, root = new_landmarks(model, state, features, noise, prior, context)
         own = small_products(root, jnp.swapaxes(root, 1, 2))
-        slots = jnp.where(
-            features.valid, features.slots, state.active.size
-        )  # out of bounds: dropped
+        capacity = state.active.size
+        slots = jnp.where(features.valid, features.slots, capacity)  # out of bounds: dropped
         difference = masked(J._replace(by_view=-J.by_view), features.valid)
         identity = jnp.eye(new.shape[1], dtype=own.dtype)
         own = jnp.where(features.valid[:, None, None], own, identity)
@@ -229,17 +214,12 @@ class Information(AbstractGaussian):
         information = _without(state.information, state.core_dim, numbers)
         return replace(state, active=state.active & ~gone, information=information)
 
-    def landmark_covariance(
-        self,
-        view: Callable[[Any], Any],
-        function: Landmark,
-        state: InformationState,
-        slots: Int[Array, " m"],
-    ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
-        value, _, J = local_jacobians(
-            view, without_auxiliary(function), state.core, state.landmarks[slots]
-        )
-        return value, _local_covariance(state, J, slots)
+    def local_covariance(self, state: InformationState, J: Blocks, slots) -> Float[Array, "m k k"]:
+        """Factors Λ, which the covariance form need not: O(n³), then O(n²) a landmark."""
+        m, k, _ = J.by_landmark.shape
+        whitened = _whitened(state, placed(J, slots, state.active.size))
+        whitened = whitened.reshape(-1, m, k)
+        return jnp.einsum("nmk,nml->mkl", whitened, whitened)
 
     def core_covariance(
         self, function: Callable[[Any], Any], state: InformationState
@@ -330,11 +310,3 @@ def _factor(information: Float[Array, "n n"]) -> Cholesky:
 def _whitened(state: InformationState, J: Float[Array, "k n"]) -> Float[Array, "n k"]:
     """`L⁻¹Jᵀ`, so that a covariance `J Λ⁻¹ Jᵀ` is its square."""
     return _factor(state.information).whitening @ J.T
-
-
-def _local_covariance(state: InformationState, J: Blocks, slots) -> Float[Array, "m k k"]:
-    """`J Λ⁻¹ Jᵀ` of every landmark's own rows: the diagonal blocks only."""
-    m, k, _ = J.by_landmark.shape
-    whitened = _whitened(state, placed(J, slots, state.active.size))
-    whitened = whitened.reshape(-1, m, k)
-    return jnp.einsum("nmk,nml->mkl", whitened, whitened)

@@ -7,7 +7,6 @@ differentiated. Pixels are (u,) or (u, v); points are (x, z) or (x, y, z) in the
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,17 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxslam.arrays import AnyArray, check_shape, numbers
+from jaxslam.arrays import AnyArray, check_shape, numbers, optional_numbers
 from jaxslam.geometry import Point, Scalar
 
 Pixel = Float[Array, " p"]
 """A pixel, or normalised coordinates."""
 UNDISTORT_ITERATIONS = 8
 """Newton steps of `undistort`: quadratic convergence wherever the model can be inverted."""
-
-
-def _distortion(values: Any) -> AnyArray | None:
-    return None if values is None else numbers(values)
 
 
 class Camera(eqx.Module):
@@ -38,7 +33,7 @@ class Camera(eqx.Module):
     focal: Float[AnyArray, " p"] = eqx.field(converter=numbers)
     """Pixels; one of each coordinate."""
     centre: Float[AnyArray, " p"] = eqx.field(converter=numbers)
-    distortion: Float[AnyArray, " 5"] | None = eqx.field(converter=_distortion, default=None)
+    distortion: Float[AnyArray, " 5"] | None = eqx.field(converter=optional_numbers, default=None)
 
     def __check_init__(self) -> None:
         check_shape("the camera's focal", self.focal, (1,), (2,))

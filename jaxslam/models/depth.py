@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 from jaxtyping import Float
 
-from jaxslam.arrays import AnyArray, Number, check_shape, number_field, numbers
-
-
-def _optional(values: Any) -> AnyArray | None:
-    return None if values is None else numbers(values)
+from jaxslam.arrays import AnyArray, Number, check_shape, number_field, optional_numbers
 
 
 class InverseDepth(eqx.Module):
@@ -26,7 +20,7 @@ class InverseDepth(eqx.Module):
     sigma: Float[AnyArray, ""] = number_field()
     """1/m; the paper's is 1/(4 d_min)."""
     own: Float[AnyArray, ""] = number_field(default=1.0)
-    common: Float[AnyArray, ""] | None = eqx.field(converter=_optional, default=None)
+    common: Float[AnyArray, ""] | None = eqx.field(converter=optional_numbers, default=None)
     """None where landmarks have nothing in common."""
 
     def __check_init__(self) -> None:

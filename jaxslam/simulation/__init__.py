@@ -1,7 +1,6 @@
 """Simulation: scenarios as data, and runs drawn from them."""
 
 from jaxslam.simulation.pieces import (
-    calibration_of,
     calibration_sigma_of,
     depth_of,
     motion_of,
@@ -25,7 +24,6 @@ __all__ = [
     "Scenario",
     "Sightings",
     "as_data",
-    "calibration_of",
     "calibration_sigma_of",
     "depth_of",
     "features",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from jaxslam.arrays import numbers
-from jaxslam.models.calibration import AbstractCalibration, Considered, Estimated, Known, White
+from jaxslam.models.calibration import Considered, Estimated, Known, White
 from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import AbstractMotion, ConstantVelocity, Odometry
@@ -39,11 +39,6 @@ def calibration_sigma_of(scenario: Scenario) -> Any:
     """σ of (f, c) or (fx, fy, cx, cy), pixels."""
     p = scenario.world.pixel_dim
     return numbers((scenario.focal_sigma,) * p + (scenario.centre_sigma,) * p)
-
-
-def calibration_of(scenario: Scenario) -> AbstractCalibration:
-    """The treatment that the scenario recommends."""
-    return TREATMENTS[scenario.calibration](calibration_sigma_of(scenario))
 
 
 def depth_of(scenario: Scenario) -> InverseDepth:
