@@ -63,6 +63,8 @@ CIRCLE = {
     "": PLANAR_MATCHED[""],
     "loose": ((0.3, 0.3, 0.5), (0.05, 0.05, 0.1)),
 }
+FROM_REST = {"": (PLANAR_MATCHED["loose"][0], (0.5, 0.5, 0.2))}
+SPATIAL_FROM_REST = {"": (SPATIAL_MATCHED["loose"][0], (0.5, 0.5, 0.5, 0.2, 0.2, 0.2))}
 AHEAD = {noise: PLANAR_MATCHED[noise] for noise in ("", "loose")}
 
 MATCHED: dict[str, Any] = {
@@ -106,6 +108,8 @@ FAMILIES = {
     "matched-forward": (AHEAD, MATCHED, (0.0, 1.2, 0.0)),
     "matched-turn": (AHEAD, MATCHED, (0.0, 1.2, 0.3)),
     "matched-6dof": (SPATIAL_MATCHED, SPATIAL, (1.2, 0.0, 0.0, 0.0, 0.0, 0.0)),
+    "standstill": (FROM_REST, MATCHED | {"still_frames": 0}, (0.0,) * 3),
+    "standstill-6dof": (SPATIAL_FROM_REST, SPATIAL, (0.0,) * 6),
     "circle": (CIRCLE, ON_CIRCLE, (0.0, 1.2, 0.3)),
 }
 EXPECTED = {
@@ -268,6 +272,8 @@ def test_a_malformed_override_is_refused(text):
         ({"inverse_depth": [0.1]}, "inverse_depth needs a mean and a σ"),
         ({"inverse_depth": [0.1, 0.0]}, "inverse_depth needs a mean and a σ"),
         ({"inverse_depth": [float("inf"), 0.1]}, "inverse_depth holds inf"),
+        ({"still_frames": -1}, "still_frames must not be negative"),
+        ({"still_frames": 2, "motion": "odometry"}, "still_frames: odometry has the nominal"),
         ({"first_frame": -1}, "first_frame must not be negative"),
         ({"first_landmarks": -1}, "first_landmarks must not be negative"),
         ({"new_landmarks": 1.5}, "new_landmarks must be a whole number"),
@@ -526,6 +532,21 @@ def test_odometry_is_read_with_the_stated_errors_of_a_nominal_motion(name):
     # White, and independent between axes.
     for product in (errors[:, 1:] * errors[:, :-1], errors * np.roll(errors, 1, axis=-1)):
         centred(product / product.std())
+
+
+def test_a_camera_stands_exactly_still_and_then_moves_off_with_the_velocity_drawn():
+    chosen = scenario("standstill", steps=7, still_frames=3)
+    runs, free = batch(chosen, 30), batch(dataclasses.replace(chosen, still_frames=0, steps=4), 30)
+    T, moving = np.asarray(runs.poses.as_matrix()), np.asarray(free.poses.as_matrix())
+    np.testing.assert_array_equal(T[:, :4], np.broadcast_to(np.eye(3), (30, 4, 3, 3)))
+    np.testing.assert_allclose(T[:, 3:], moving, rtol=0, atol=1e-12)  # the same draws, later
+    assert (np.abs(T[:, 4, :2, 2]).max(axis=1) > 1e-4).all()
+    # The measurements of a camera that stands still differ by their noise alone.
+    change = np.diff(np.asarray(runs.measured)[:, :4], axis=1) / chosen.pixel_sigma / np.sqrt(2)
+    two_sided(np.sum(change[:, ::2] ** 2), change[:, ::2].size)
+    # It may stand still to the end.
+    to_the_end = batch(scenario("standstill-6dof", steps=2, still_frames=60), 1)
+    assert not np.asarray(to_the_end.poses.translation()).any()
 
 
 def test_seconds_are_the_control_of_a_constant_velocity():

@@ -51,6 +51,9 @@ class Scenario(eqx.Module):
     """Nominal velocity in the camera frame, m/s and rad/s: the mean that the filter starts with."""
     velocity_sigma: Numbers = (0.01, 0.01, 0.01)
     """σ of the true initial velocity around the nominal one, and of the filter's."""
+    still_frames: int = _structural(0)
+    """`velocity`: the camera first stands exactly still for so many steps, then moves off with the
+    velocity drawn. The filter is not told."""
     motion: str = _structural("velocity")
     """The filter's motion model. `velocity`: constant velocity, with accelerations drawn.
     `odometry`: the nominal motion is the true one, and its noisy reading the filter's input."""
@@ -231,6 +234,8 @@ def _check(s: Scenario) -> None:
         raise ValueError(f"scenario field range needs a least and a greatest one: {s.range}")
     if s.sensor == "position" and s.calibration != "known":
         raise ValueError("scenario field calibration: a position sensor has none; use known")
+    if s.motion == "odometry" and s.still_frames:
+        raise ValueError("scenario field still_frames: odometry has the nominal motion; use 0")
     _check_placement(s)
 
 
@@ -253,7 +258,7 @@ _POSITIVE = (
 )  # fmt: skip
 _NOT_NEGATIVE = (
     "velocity_sigma", "focal_sigma", "centre_sigma", "odometry_sigma", "range",
-    "first_frame", "first_landmarks", "new_landmarks", "known_landmarks",
+    "still_frames", "first_frame", "first_landmarks", "new_landmarks", "known_landmarks",
 )  # fmt: skip
 
 
@@ -285,6 +290,15 @@ _SPATIAL_NOISE = {
     "-loose": ((0.5,) * 3 + (0.3,) * 3, (0.1,) * 3 + (0.05,) * 3),
     "-very-loose": ((3.0,) * 3 + (1.0,) * 3, (0.1,) * 3 + (0.05,) * 3),
 }
+_SPATIAL: dict[str, Any] = {
+    "geometry": "spatial",
+    "landmarks": 30,
+    "first_pixels": ((20.0, 620.0), (20.0, 460.0)),
+    "image": (640.0, 480.0),
+    "focal": (650.0, 650.0),
+    "centre": (320.0, 240.0),
+}
+"""The world and the camera of 6-DoF scenarios."""
 _CIRCLE_NOISE = {
     "-tight": _PLANAR_NOISE["-tight"],
     "": _PLANAR_NOISE[""],
@@ -308,15 +322,20 @@ def _built_in():
     yield from _family("matched-forward", towards, velocity=(0.0, 1.2, 0.0))
     yield from _family("matched-turn", towards, velocity=(0.0, 1.2, 0.3))
     yield from _family(
-        "matched-6dof",
-        _SPATIAL_NOISE,
-        geometry="spatial",
-        velocity=(1.2, 0.0, 0.0, 0.0, 0.0, 0.0),
-        landmarks=30,
-        first_pixels=((20.0, 620.0), (20.0, 460.0)),
-        image=(640.0, 480.0),
-        focal=(650.0, 650.0),
-        centre=(320.0, 240.0),
+        "matched-6dof", _SPATIAL_NOISE, velocity=(1.2, 0.0, 0.0, 0.0, 0.0, 0.0), **_SPATIAL
+    )
+    yield Scenario(
+        name="standstill",
+        velocity=(0.0,) * 3,
+        velocity_sigma=(0.5, 0.5, 0.2),
+        acceleration_sigma=_PLANAR_NOISE["-loose"][0],
+    )
+    yield Scenario(
+        name="standstill-6dof",
+        velocity=(0.0,) * 6,
+        velocity_sigma=(0.5,) * 3 + (0.2,) * 3,
+        acceleration_sigma=_SPATIAL_NOISE["-loose"][0],
+        **_SPATIAL,
     )
     yield from _family(
         "circle",

@@ -149,12 +149,16 @@ def _picked(mask, measured, count: int) -> Features:
 
 
 def _by_noise(s: Scenario, motion: AbstractMotion, key: Array) -> tuple[Pose, Any]:
-    """The start and the noises of a motion model from the filter's prior (P8, P9)."""
+    """The start and the noises of a motion model from the filter's prior (P8, P9).
+
+    In frames in which the camera stands still, neither pose nor variables move.
+    """
     start_key, noise_key = jax.random.split(key)
     sigma, dtype = jnp.asarray(motion.noise_sigma), jnp.result_type(s.rate)
     mean, root = motion.start()
     start = retract(mean, root @ jax.random.normal(start_key, root.shape[:1], dtype))
-    noises = sigma * jax.random.normal(noise_key, (s.steps, sigma.size), dtype)
+    still = min(s.still_frames, s.steps)
+    noises = sigma * jax.random.normal(noise_key, (s.steps - still, sigma.size), dtype)
     control = motion.nominal_control(jnp.stack(s.velocity), 1 / s.rate)
 
     def move(carry, noise):
@@ -165,7 +169,7 @@ def _by_noise(s: Scenario, motion: AbstractMotion, key: Array) -> tuple[Pose, An
     origin = identity(motion.geometry, dtype)
     _, poses = jax.lax.scan(move, (origin, start), noises)
     controls = jax.tree.map(lambda x: jnp.full((s.steps, *x.shape), x), control)
-    return _with_start(origin, poses), controls
+    return _with_start(origin, poses, still), controls
 
 
 def _by_odometry(s: Scenario, key: Array) -> tuple[Pose, Array]:
@@ -185,8 +189,10 @@ def _by_odometry(s: Scenario, key: Array) -> tuple[Pose, Array]:
     return _with_start(start, poses), nominal - sigma * noise
 
 
-def _with_start(start: Pose, poses: Pose) -> Pose:
-    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, poses)
+def _with_start(start: Pose, poses: Pose, still: int = 0) -> Pose:
+    """The start, the same again for so many frames, and the poses."""
+    starts = jax.tree.map(lambda x: jnp.broadcast_to(x, (1 + still, *x.shape)), start)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), starts, poses)
 
 
 def _in_image(scenario: Scenario, points, pixels) -> Bool[Array, " l"]:
