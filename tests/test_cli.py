@@ -12,7 +12,7 @@ SMALL = ["consistency", "--scenario", "matched-tight", "--steps", "5", "--runs",
 FILTER_KEYS = {
     "dof", "band95", "nees", "nees_median", "lost", "inside", "nis", "nis_dof", "rmse", "sigma",
     "landmark_nees", "landmark_dof", "landmark_not_finite", "diverged", "seconds", "lost_ever",
-    "survivors", "verdict",
+    "survivors", "verdict", "beyond_scale", "log_scale", "reversed",
 }  # fmt: skip
 
 
@@ -37,6 +37,7 @@ def test_consistency_writes_what_others_read(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert printed.startswith("robocentric/inverse_scaling:\n    NEES ")
     assert "robocentric/inverse_depth" in printed
+    assert "given the scale" in printed
     left = {path.name for path in tmp_path.iterdir()}
     assert left == {"consistency.json", "consistency.png", "runs"}
 

@@ -93,15 +93,21 @@ def test_filters_meet_the_same_worlds():
     assert not np.array_equal(samples[0]["nees"], samples[1]["nees"])
 
 
-def with_nees(study, run, steps, value, name="inverse_scaling"):
+def with_nees(study, run, steps, value):
     """The study with another NEES of a run at some steps."""
-    store = MemoryStore()
+    return with_records(study, run, steps, nees=value)
+
+
+def with_records(study, runs, steps, **values):
+    """The study with other records of a run, or of some, at some steps."""
+    store, chosen = MemoryStore(), np.arange(study.runs)[runs]
     for chunk in study.chunks:
-        records = study.store.load(name, chunk)
-        nees = records["nees"].copy()
-        if run in chunk:
-            nees[run - chunk.start, steps] = value
-        store.save(name, chunk, {**records, "nees": nees})
+        records = study.store.load("inverse_scaling", chunk)
+        records = {name: record.copy() for name, record in records.items()}
+        for name, value in values.items():
+            for run in set(np.ravel(chosen)) & set(chunk):
+                records[name][run - chunk.start, steps] = value
+        store.save("inverse_scaling", chunk, records)
     return replace(study, store=store)
 
 
@@ -184,6 +190,57 @@ def test_the_summary_is_that_of_the_runs():
     assert result["verdict"]["interval99"] == pytest.approx(expected["interval99"])
     assert result["verdict"]["end"]["p"] == pytest.approx(expected["end"]["p"])
     assert tally(study, "inverse_scaling").average.mean == pytest.approx(runs["nees"].mean())
+
+
+def test_the_summary_beyond_scale_is_that_of_the_runs():
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=20, chunk=CHUNK)
+    study = with_records(study, 7, 3, beyond_scale=50.0, log_scale=-2.0, reversed=1.0)
+    result, runs = jaxslam.summarise(study)["filters"]["inverse_scaling"], all_runs(study)
+    beyond, scale = result["beyond_scale"], result["log_scale"]
+    assert beyond["dof"] == 2
+    assert beyond["band95"] == list(jaxslam.mean_band(2, 20))
+    np.testing.assert_allclose(beyond["nees"], runs["beyond_scale"].mean(axis=0))
+    np.testing.assert_allclose(beyond["nees_median"], np.median(runs["beyond_scale"], axis=0))
+    assert beyond["lost"] == [0, 0, 0, 0.05, 0, 0]  # 50 is beyond what χ² with 2 dof reaches
+    expected = run_verdict(runs["beyond_scale"], 2)
+    assert beyond["verdict"]["nees"] == pytest.approx(expected["nees"])
+    error, sigma = runs["log_scale"], runs["log_scale_sigma"]
+    for key, values in (("error", error), ("sigma", sigma), ("normalised", error / sigma)):
+        key = "sigma" if key == "sigma" else f"{key}_rms"
+        np.testing.assert_allclose(scale[key], np.sqrt(np.mean(values**2, axis=0)))
+    np.testing.assert_allclose(scale["error_median"], np.median(np.abs(error), axis=0))
+    np.testing.assert_allclose(scale["sigma_median"], np.median(sigma, axis=0))
+    assert result["reversed"] == [0, 0, 0, 0.05, 0, 0]
+
+
+def test_only_runs_that_moved_can_be_reversed():
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=4, chunk=2)
+    study = with_records(study, slice(0, 3), 0, reversed=np.nan)
+    study = with_records(with_records(study, 3, 0, reversed=1.0), slice(None), 1, reversed=np.nan)
+    result = jaxslam.summarise(study)["filters"]["inverse_scaling"]
+    assert result["reversed"] == [1.0, None, 0, 0, 0, 0]
+
+
+def test_scale_is_reported_where_nothing_is_told_in_metres():
+    assert SCENARIO.scale_free
+    assert not jaxslam.scenario("positions").scale_free
+    assert not jaxslam.scenario("room").scale_free
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=4, chunk=2)
+    summary = jaxslam.summarise(study)
+    measured = {**summary, "scale_free": False}
+    titles = [axes.get_title() for axes in plot_consistency(study, summary).axes]
+    fewer = [axes.get_title() for axes in plot_consistency(study, measured).axes]
+    scale = {"pose NEES given the scale (ideal 2)", "log of the scale: error and claimed σ"}
+    assert set(titles) - set(fewer) == scale
+    row = next(
+        line
+        for line in jaxslam.table(summary).split("given the scale")[1].splitlines()
+        if line.startswith("inverse_scaling")
+    )
+    result = summary["filters"]["inverse_scaling"]
+    for value in (result["beyond_scale"]["nees"][-1], result["log_scale"]["error_rms"][-1]):
+        assert f" {value:.3f}" in row
+    assert "given the scale" not in jaxslam.table(measured)
 
 
 def test_the_table_begins_with_the_verdicts_and_shows_the_plain_mean_beside_the_others():

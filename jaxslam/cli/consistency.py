@@ -32,7 +32,7 @@ from jaxslam.simulation.scenario import (
     scenario,
 )
 
-LAYOUT = 4
+LAYOUT = 5
 """Version of the records on disk, so that `--resume` never mixes two."""
 
 

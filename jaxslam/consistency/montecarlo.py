@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from jaxslam.arrays import cast, is_number
+from jaxslam.consistency.beyond_scale import beyond_scale, reversal
 from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.consistency.store import MemoryStore, Store
 from jaxslam.geometry import Pose
@@ -243,9 +244,11 @@ def filter_run(
 ) -> tuple[dict[str, Array], Pose, Any]:
     """One filter on one simulated run: records of every step, estimated path, final state.
 
-    The records hold, per step: `nees` of the pose; `nis` and `nis_dof`; the update's `status`;
-    `error` and `variance` of the camera's position (in camera axes) and orientation; the mean
-    `landmark_nees` of the landmarks seen, in the sensor's chart, where it is finite, their
+    The records hold, per step: `nees` of the pose, and `beyond_scale` what is left of it at the
+    best scale of the truth; that `log_scale` and the `log_scale_sigma` that the filter claims;
+    whether the displacement is `reversed`, NaN without one; `nis` and `nis_dof`; the update's
+    `status`; `error` and `variance` of the camera's position (in camera axes) and orientation; the
+    mean `landmark_nees` of the landmarks seen, in the sensor's chart, where it is finite, their
     number, and of how many it is not.
     """
     first, seen, new = features(run, room)
@@ -258,6 +261,8 @@ def filter_run(
         landmarks = _landmark_nees(slam, sensor, state, seen, T_BC, run.points)
         records = {
             "nees": normalised_squared(*slam.pose_error(state, T_BC)),
+            **_scale(slam, state, T_BC),
+            "reversed": reversal(estimate, T_BC),
             "nis": innovation.nis,
             "nis_dof": innovation.nis_dof.astype(innovation.nis.dtype),
             "status": innovation.status,
@@ -270,6 +275,11 @@ def filter_run(
     later = jax.tree.map(lambda x: x[1:], run.poses)
     state, (records, path) = jax.lax.scan(step, state, (seen, new, run.controls, later))
     return records, path, state
+
+
+def _scale(slam: AbstractFilter, state: Any, T_BC: Pose) -> dict[str, Array]:
+    best = beyond_scale(partial(slam.pose_error, state), T_BC)
+    return {"beyond_scale": best.nees, "log_scale": best.log_scale, "log_scale_sigma": best.sigma}
 
 
 def _camera_error(estimate: Pose, truth: Pose) -> Array:

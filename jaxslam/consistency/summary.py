@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import reduce
 from operator import add
 from typing import Any
@@ -31,6 +31,11 @@ def summarise(study: Study) -> dict[str, Any]:
     (at any so far) count diverged runs as lost. `landmark_nees` is over the landmarks whose NEES
     is finite; of the surviving runs' `landmark_not_finite` had one that is not. `status` counts the
     runs in which an update said that something was wrong (`jaxslam.Status`).
+
+    `beyond_scale` is what NEES is at the scale of the truth that explains the estimate best, with
+    the same numbers; `log_scale` that scale's error, the σ claimed (root mean squares and medians)
+    and the error in σ; `reversed` the share of the displaced runs whose estimate points away from
+    the truth. Where the sensor measures metres, or the motion is told in metres, they say little.
     """
     from jaxslam import __version__
 
@@ -39,6 +44,7 @@ def summarise(study: Study) -> dict[str, Any]:
         "version": __version__,
         "scenario": dataclasses.asdict(study.scenario),
         "runs": study.runs,
+        "scale_free": study.scenario.scale_free,
         "steps": study.scenario.steps,
         "seed": study.seed,
         "dtype": study.dtype,
@@ -68,6 +74,7 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
         }
 
     seconds = study.seconds[name]
+    beyond = tally(study, name, "beyond_scale")
     return {
         "verdict": tally(study, name).verdict(),
         "dof": dof,
@@ -84,6 +91,16 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
         "nis_dof": _numbers(nis_dof),
         "rmse": by_part(error),
         "sigma": by_part(variance),
+        "beyond_scale": {
+            "dof": beyond.dof,
+            "band95": list(mean_band(beyond.dof, max(healthy, 1))),
+            "nees": _numbers(sums["beyond_scale"] / max(healthy, 1)),
+            "nees_median": _numbers(_median(study, name, "beyond_scale")),
+            "lost": _numbers((sums["beyond_lost"] + sums["diverged"]) / study.runs),
+            "verdict": beyond.verdict(),
+        },
+        "log_scale": _log_scale(study, name, sums, healthy),
+        "reversed": _numbers(_ratio(sums["reversed"], sums["displaced"])),
         "landmark_nees": _numbers(landmark),
         "landmark_dof": n,
         "landmark_not_finite": [int(count) for count in sums["landmark_not_finite"]],
@@ -91,6 +108,27 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
         "status": {s.name.lower(): int(sums[f"status_{s.name}"]) for s in Status if s != Status.OK},
         "seconds": {"compile": seconds.compile, "run": seconds.run},
     }
+
+
+def _log_scale(study: Study, name: str, sums: dict[str, Any], healthy: int) -> dict[str, Any]:
+    """Root mean squares over the surviving runs; medians over all."""
+
+    def rms(of: str) -> list[float | None]:
+        return _numbers(np.sqrt(_ratio(sums[of], healthy)))
+
+    return {
+        "error_rms": rms("squared_log_scale"),
+        "error_median": _numbers(_median(study, name, "log_scale", np.abs)),
+        "sigma": rms("log_scale_variance"),
+        "sigma_median": _numbers(_median(study, name, "log_scale_sigma")),
+        "normalised_rms": rms("normalised_log_scale"),
+    }
+
+
+def _ratio(sums: np.ndarray, counts: Any) -> np.ndarray:
+    """NaN where nothing was counted."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return sums / counts
 
 
 def treatment(slam: Any) -> str | None:
@@ -115,6 +153,7 @@ def _sums(study: Study, name: str, dof: int) -> dict[str, Any]:
             "kept_nees": np.where(kept, good["nees"], 0.0).sum(axis=0),
             "lost": (~kept).sum(axis=0),
             "lost_ever": np.logical_or.accumulate(~kept, axis=1).sum(axis=0),
+            **_scale_sums(good, lost_threshold(dof - 1)),
             "nis": good["nis"].sum(axis=0),
             "nis_dof": good["nis_dof"].sum(axis=0),
             "squared_error": (good["error"] ** 2).sum(axis=0),
@@ -132,20 +171,42 @@ def _sums(study: Study, name: str, dof: int) -> dict[str, Any]:
     return total
 
 
-def tally(study: Study, name: str) -> Tally:
-    """What the verdict on one filter is made of; tallies of other seeds may be added."""
-    dof = study.scenario.world.tangent_dim
-    return reduce(add, (Tally.of(r["nees"], dof) for r in _chunks(study, name, ("nees",))))
+def _scale_sums(good: Records, threshold: float) -> dict[str, Any]:
+    """Of what is beyond scale, of scale, and of the direction of the displacement."""
+    error, sigma = good["log_scale"], good["log_scale_sigma"]
+    with np.errstate(over="ignore"):  # no σ of a scale that nothing depends on
+        variance = sigma**2
+    return {
+        "beyond_scale": good["beyond_scale"].sum(axis=0),
+        "beyond_lost": (good["beyond_scale"] > threshold).sum(axis=0),
+        "squared_log_scale": (error**2).sum(axis=0),
+        "log_scale_variance": variance.sum(axis=0),
+        "normalised_log_scale": ((error / sigma) ** 2).sum(axis=0),
+        "reversed": np.nansum(good["reversed"], axis=0),
+        "displaced": np.isfinite(good["reversed"]).sum(axis=0),
+    }
 
 
-def _median(study: Study, name: str) -> np.ndarray:
+def tally(study: Study, name: str, record: str = "nees") -> Tally:
+    """What the verdict on one filter is made of, on the NEES of its poses or on what of it is
+    `beyond_scale`; tallies of other seeds may be added."""
+    dof = study.scenario.world.tangent_dim - (record == "beyond_scale")
+    return reduce(add, (Tally.of(r[record], dof) for r in _chunks(study, name, (record,))))
+
+
+def _median(
+    study: Study,
+    name: str,
+    record: str = "nees",
+    of: Callable[[np.ndarray], np.ndarray] = lambda values: values,
+) -> np.ndarray:
     """Median over all runs, diverged ones above everything."""
     medians = []
     for start in range(0, study.scenario.steps, _STEPS_AT_ONCE):
         part = slice(start, start + _STEPS_AT_ONCE)
         columns = [
-            np.where(_healthy(records)[:, None], records["nees"], np.inf)[:, part]
-            for records in _chunks(study, name, ("nees",))
+            np.where(_healthy(records)[:, None], of(records[record]), np.inf)[:, part]
+            for records in _chunks(study, name, ("nees", record))
         ]
         medians.append(np.median(np.concatenate(columns), axis=0))
     return np.concatenate(medians)
@@ -184,6 +245,7 @@ def table(summary: dict[str, Any]) -> str:
             "of time averages, [99 % interval]",
             "lost: NEES above the 99.99 % quantile of χ² now, ever: at any step; others: mean of "
             "those not lost now",
+            *(_scale_table(filters, wide) if summary["scale_free"] else ()),
             *_notes(filters),
         ]
     )
@@ -199,6 +261,30 @@ def _row(name: str, f: dict[str, Any]) -> str:
         f"{_share(f['lost_ever'][-1]):>7}{f['diverged']:>9d}{nis:>8.3f}"
         f"{_last(f['rmse']['position'], 8, 3)}{_last(f['sigma']['position'], 8, 3)}"
         f"{f['seconds']['compile'] + f['seconds']['run']:>9.1f}"
+    )
+
+
+def _scale_table(filters: dict[str, Any], wide: int) -> Iterator[str]:
+    """What of the poses' errors is not one of scale, and the scale's, at the last step."""
+    yield ""
+    yield (
+        f"{'given the scale':<{wide}}{'NEES mean':>10}{'95 % band':>14}{'median':>8}{'lost':>7}"
+        f"{'reversed':>10}{'log-scale error':>17}{'claimed σ':>11}{'error/σ':>9}  verdict"
+    )
+    for name, f in filters.items():
+        beyond, scale = f["beyond_scale"], f["log_scale"]
+        low, high = beyond["band95"]
+        yield (
+            f"{name:<{wide}}{_last(beyond['nees'], 10, 3)}{f'{low:.3f}–{high:.3f}':>14}"
+            f"{_last(beyond['nees_median'], 8, 2)}{_share(beyond['lost'][-1]):>7}"
+            f"{_share(f['reversed'][-1]):>10}{_last(scale['error_rms'], 17, 3)}"
+            f"{_last(scale['sigma_median'], 11, 3)}{_last(scale['normalised_rms'], 9, 2)}"
+            f"  {beyond['verdict']['word']}"
+        )
+    dof = next(iter(filters.values()))["beyond_scale"]["dof"]
+    yield (
+        f"at the scale of the truth that explains the estimate best: ideal NEES {dof}; reversed: "
+        "displaced away from the truth; error and error/σ of log-scale: rms, σ: median"
     )
 
 

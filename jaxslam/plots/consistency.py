@@ -25,18 +25,25 @@ def plot_consistency(
     """Draw a study; `summary` is `summarise(study)`, made here if it is not given.
 
     Above: the mean NEES of every filter with its exact 95 % band, and the map of run 0 at its
-    end. Below: the error of run 0 with ±3σ, axis by axis. Written to `path` where one is given.
+    end. Where the scale is free, below that: NEES given the scale, and the scale's own error.
+    Below: the error of run 0 with ±3σ, axis by axis. Written to `path` where one is given.
     """
     summary = summarise(study) if summary is None else summary
     geometry = study.scenario.world
-    rows = geometry.tangent_dim // 3
-    figure = new_figure(12.5, 5.2 + 2.2 * rows)
-    grid = figure.add_gridspec(1 + rows, 6, height_ratios=[2.1, *[1] * rows])
+    rows, free = geometry.tangent_dim // 3, summary["scale_free"]
+    heights = [2.1, *[1.3] * free, *[1] * rows]
+    figure = new_figure(12.5, 0.8 + 2.1 * sum(heights))
+    grid = figure.add_gridspec(len(heights), 6, height_ratios=heights)
     _plot_nees(figure.add_subplot(grid[0, :4]), summary)
     samples = {name: study.store.load(name, study.chunks[0]) for name in study.filters}
     _plot_map(figure.add_subplot(grid[0, 4:]), samples)
+    if free:
+        _plot_beyond_scale(figure.add_subplot(grid[1, :3]), summary)
+        _plot_log_scale(figure.add_subplot(grid[1, 3:]), summary)
     axes = [
-        figure.add_subplot(grid[1 + r, 2 * c : 2 * c + 2]) for r in range(rows) for c in range(3)
+        figure.add_subplot(grid[1 + free + r, 2 * c : 2 * c + 2])
+        for r in range(rows)
+        for c in range(3)
     ]
     _plot_errors(axes, samples, np.array(summary["time"]), geometry.point_dim)
     if path is not None:
@@ -63,16 +70,63 @@ def _plot_nees(axes: Axes, summary: dict[str, Any]) -> None:
     axes.set_yscale("log")
     bottom, top = axes.get_ylim()
     axes.set_ylim(min(bottom, first["dof"] / 2), max(2 * top, first["dof"] * 2.5))
-    if axes.get_ylim()[1] < 100:
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
-        axes.yaxis.set_major_formatter(ScalarFormatter())
-        axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlim(0, time[-1])
-    axes.set_xlabel("time, s")
+    _name_decades(axes)
+    _over_time(axes, time)
     axes.set_ylabel(f"pose NEES (ideal {first['dof']})")
     axes.set_title(_title(summary), fontsize=10, loc="left")
     axes.legend(fontsize=8, loc="upper left")
+
+
+def _name_decades(axes: Axes) -> None:
+    """Numbers between the powers of ten of a logarithmic axis that has few of them."""
+    bottom, top = axes.get_ylim()
+    if top < 100 * bottom:
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+        axes.yaxis.set_major_formatter(ScalarFormatter())
+        axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _over_time(axes: Axes, time: np.ndarray) -> None:
+    axes.set_xlim(0, time[-1])
+    axes.set_xlabel("time, s")
     axes.grid(alpha=0.25, which="major")
+
+
+def _plot_beyond_scale(axes: Axes, summary: dict[str, Any]) -> None:
+    """Mean and median NEES at the scale of the truth that explains the estimate best."""
+    time = np.array(summary["time"])
+    first = next(iter(summary["filters"].values()))["beyond_scale"]
+    axes.axhspan(*first["band95"], color=GREY, alpha=0.25, lw=0)
+    axes.axhline(first["dof"], color=GREY, lw=0.8)
+    for i, f in enumerate(summary["filters"].values()):
+        style, beyond = line_style(i), f["beyond_scale"]
+        axes.plot(time, np.array(beyond["nees"], float), lw=1.8, **style)
+        median = np.array(beyond["nees_median"], float)
+        axes.plot(time, median, color=style["color"], lw=0.9, ls=(0, (1, 2)))
+    axes.set_yscale("log")
+    bottom, top = axes.get_ylim()
+    axes.set_ylim(min(bottom, first["dof"] / 2), max(top, first["dof"] * 2.5))
+    _name_decades(axes)
+    _over_time(axes, time)
+    axes.set_title(f"pose NEES given the scale (ideal {first['dof']})", fontsize=9)
+
+
+def _plot_log_scale(axes: Axes, summary: dict[str, Any]) -> None:
+    """The error of log-scale, and the σ claimed: its median, as one reversed run, in which
+    nothing depends on the scale, has a σ beyond all others."""
+    time = np.array(summary["time"])
+    for i, f in enumerate(summary["filters"].values()):
+        style, scale = line_style(i), f["log_scale"]
+        axes.plot(time, np.array(scale["error_rms"], float), lw=1.8, **style)
+        sigma = np.array(scale["sigma_median"], float)
+        axes.plot(time, sigma, color=style["color"], lw=0.9, ls=(0, (4, 2)))
+    axes.plot([], [], color=GREY, lw=1.8, label="error, rms of runs")
+    axes.plot([], [], color=GREY, lw=0.9, ls=(0, (4, 2)), label="σ claimed, median of runs")
+    axes.set_yscale("log")
+    _name_decades(axes)
+    _over_time(axes, time)
+    axes.set_title("log of the scale: error and claimed σ", fontsize=9)
+    axes.legend(fontsize=7, loc="best")
 
 
 def _title(summary: dict[str, Any]) -> str:

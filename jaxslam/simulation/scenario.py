@@ -115,6 +115,11 @@ class Scenario(eqx.Module):
         """Planar or spatial."""
         return GEOMETRIES[self.geometry]
 
+    @property
+    def scale_free(self) -> bool:
+        """Whether nothing is measured or told in metres: only priors know the scale."""
+        return self.motion == "velocity" and self.sensor == "camera"
+
 
 def scenario(
     name: str | Path = "circle", overrides: Mapping[str, Any] | None = None, **fields: Any

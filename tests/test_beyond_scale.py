@@ -1,0 +1,152 @@
+"""Tests of what of a pose's error is not one of scale: exact values, and χ² of one dof fewer."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import Case, each_geometry, named, pose, quick_jit
+from scipy import stats
+
+from jaxslam.consistency.beyond_scale import NOTICEABLE, SCALES, beyond_scale, reversal
+from jaxslam.consistency.montecarlo import filter_run
+from jaxslam.consistency.statistics import normalised_squared
+from jaxslam.geometry import PLANAR, difference, identity, joined, scaled
+from jaxslam.simulation import sensor_of
+
+FALSE_ALARM = 1e-6
+"""Share of seeds on which a statistical test here would fail although nothing is wrong."""
+
+
+def covariance(t, seed=0):
+    root = np.random.default_rng(seed).normal(size=(t, t))
+    return jnp.asarray(root @ root.T + 0.1 * np.eye(t))
+
+
+def linear_case(geometry, seed=1):
+    """A truth, the derivative g of the error by its scale, and an error that is affine in it."""
+    truth = pose(geometry, seed)
+    A = jnp.asarray(np.random.default_rng(seed).normal(size=(geometry.tangent_dim, 3)))
+    A = A[:, : geometry.point_dim]
+
+    def error(T, noise):
+        return A @ (T.translation() - truth.translation()) + noise
+
+    return truth, A @ truth.translation(), error
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_what_is_left_of_a_linear_error_is_its_part_across_the_scale(geometry):
+    truth, g, error = linear_case(geometry)
+    P, noise = covariance(geometry.tangent_dim), 0.02 * jnp.arange(1.0, geometry.tangent_dim + 1)
+    found = beyond_scale(lambda T: (error(T, noise), P), truth)
+    W = np.linalg.inv(np.asarray(P))
+    away = float(g @ W @ noise / (g @ W @ g))  # s = 1 − away
+    left = noise - away * g
+    assert away < 0.9
+    np.testing.assert_allclose(found.nees, left @ W @ left, rtol=1e-9)
+    np.testing.assert_allclose(found.log_scale, np.log(1 - away), rtol=1e-9)
+    np.testing.assert_allclose(found.sigma, 1 / ((1 - away) * np.sqrt(g @ W @ g)), rtol=1e-9)
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_it_is_chi_square_with_one_degree_of_freedom_fewer(geometry):
+    t, count = geometry.tangent_dim, 4000
+    truth, _, error = linear_case(geometry)
+    P = 1e-6 * covariance(t)
+    root = np.linalg.cholesky(P)
+    noises = jax.random.normal(jax.random.key(0), (count, t)) @ root.T
+    of_each = jax.vmap(lambda noise: beyond_scale(lambda T: (error(T, noise), P), truth))
+    found = jax.jit(of_each)(noises)
+    low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], count * (t - 1))
+    assert low < np.sum(found.nees) < high
+    # The scale's own error is standard normal in its claimed σ, to first order in the noise.
+    low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], count)
+    assert 0.99 * low < np.sum((found.log_scale / found.sigma) ** 2) < 1.01 * high
+
+
+@pytest.mark.parametrize("factor", [0.05, 0.7, 1.3, 30.0])
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_a_pure_error_of_scale_is_nothing_beyond_it(geometry, factor):
+    truth, P = pose(geometry, 3), covariance(geometry.tangent_dim)
+    estimate = scaled(truth, jnp.asarray(factor))
+    for own in (lambda T: T, lambda T: T.inverse()):  # of T_BC, and of T_CB as robocentric
+        found = beyond_scale(lambda T, own=own: (difference(own(T), own(estimate)), P), truth)
+        assert found.nees < 1e-18
+        np.testing.assert_allclose(found.log_scale, np.log(factor), rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_it_does_not_depend_on_what_is_claimed_of_the_scale(geometry):
+    truth, g, error = linear_case(geometry)
+    P, noise = covariance(geometry.tangent_dim), 0.02 * jnp.ones(geometry.tangent_dim)
+    first, other = (
+        beyond_scale(lambda T, c=c: (error(T, noise), P + c * jnp.outer(g, g)), truth)
+        for c in (0.0, 9.0)
+    )
+    np.testing.assert_allclose(first.nees, other.nees, rtol=1e-8)
+    np.testing.assert_allclose(first.log_scale, other.log_scale, rtol=1e-8)
+    # σ² of log s is that of s, which grows by c, over s².
+    s = np.exp(first.log_scale)
+    np.testing.assert_allclose(other.sigma**2 - first.sigma**2, 9.0 / s**2, rtol=1e-7)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("distance", [0.0, 1e-30, 1e-12])
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_without_a_displacement_there_is_no_scale_and_no_nan(geometry, distance, dtype):
+    P = jnp.asarray(covariance(geometry.tangent_dim), dtype)
+    n = geometry.point_dim
+    truth = joined(identity(geometry, dtype).rotation(), jnp.full(n, distance, dtype))
+    estimate = jax.tree.map(lambda x: jnp.asarray(x, dtype), pose(geometry, 2))
+    found = beyond_scale(lambda T: (difference(T, estimate), P), truth)
+    whole = normalised_squared(difference(truth, estimate), P)
+    np.testing.assert_allclose(found.nees, whole, rtol=1e-4)
+    assert np.isfinite(found.log_scale)
+    assert found.sigma > 1e6
+    if not distance:
+        assert found.log_scale == 0
+        assert np.isinf(found.sigma)
+
+
+def test_a_reversed_path_is_best_explained_by_none():
+    truth = joined(identity(PLANAR, jnp.float64).rotation(), jnp.array([1.0, 0.5]))
+    behind = scaled(truth, jnp.asarray(-1.0))
+    found = beyond_scale(lambda T: (difference(T, behind), 0.01 * jnp.eye(3)), truth)
+    np.testing.assert_allclose(np.exp(found.log_scale), SCALES[0])
+    np.testing.assert_allclose(found.nees, 125.0, rtol=3 * SCALES[0])
+    assert reversal(behind, truth) == 1
+    assert reversal(truth, truth) == 0
+    assert reversal(identity(PLANAR, jnp.float64), truth) == 0
+    near = scaled(truth, jnp.asarray(0.99 * NOTICEABLE / np.hypot(1, 0.5)))
+    assert np.isnan(reversal(behind, near))
+    assert reversal(behind, scaled(near, jnp.asarray(1.02))) == 1
+
+
+@pytest.mark.parametrize("name", ["robocentric", "scale_gauge+mixture3"])
+def test_of_a_filter_it_is_the_least_nees_over_all_scales(name):
+    case = Case("standstill", steps=8)
+    slam, sensor = case.filter(name), sensor_of(case.scenario)
+    run = case.run(0)
+    records, path, state = quick_jit(partial(filter_run, slam, case.room, sensor))(run)
+    truth = jax.tree.map(lambda x: x[-1], run.poses)
+
+    P = slam.pose_error(state, truth)[1]
+
+    def nees(log_scale):
+        return normalised_squared(slam.pose_error(state, scaled(truth, jnp.exp(log_scale)))[0], P)
+
+    least, best = records["beyond_scale"][-1], records["log_scale"][-1]
+    around = best + np.linspace(-3.0, 3.0, 121)
+    over_scales = np.asarray(quick_jit(jax.vmap(nees))(around))
+    assert over_scales.argmin() == 60
+    np.testing.assert_allclose(over_scales[60], least, rtol=1e-6)
+    assert (records["beyond_scale"] <= records["nees"] * (1 + 1e-9)).all()
+    assert records["nees"][-1] > 1.001 * least  # the scale is wrong by something
+    # σ by the curvature of what is minimised, 2/σ², by differences.
+    h = 1e-3
+    curvature = (nees(best + h) - 2 * nees(best) + nees(best - h)) / h**2
+    np.testing.assert_allclose(curvature, 2 / records["log_scale_sigma"][-1] ** 2, rtol=0.02)
+    t_est, t_true = (p.translation()[-1] for p in (path, run.poses))
+    assert records["reversed"][-1] == float(t_est @ t_true < 0)
