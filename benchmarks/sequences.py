@@ -77,7 +77,8 @@ def measure(source, settings: TrackerSettings, *, metric: bool) -> dict[str, Any
 
 def _nees(source, folder: Path) -> dict[str, float]:
     """Of the pose, at some frames; frame 0 is known."""
-    from jaxslam.vision.trajectory import pose_nees, read_covariances, read_tum
+    from jaxslam.tum import read_tum
+    from jaxslam.vision.trajectory import pose_nees, read_covariances
 
     _, T_wc = read_tum(folder / "trajectory.txt")
     _, covariances = read_covariances(folder / "covariance.txt")

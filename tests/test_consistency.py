@@ -1,10 +1,13 @@
 """Tests of jaxslam.consistency: exact bands, chunking, divergence, resuming, the summary."""
 
 from dataclasses import replace
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import quick_jit
 from scipy.stats import chi2
 
 import jaxslam
@@ -16,9 +19,13 @@ from jaxslam.consistency import (
     sentences,
     tally,
 )
+from jaxslam.consistency.montecarlo import draw, filter_run
 from jaxslam.consistency.statistics import chi2_cdf, chi2_quantile, normalised_squared
 from jaxslam.names import scenario_pieces
 from jaxslam.plots.consistency import plot_consistency
+from jaxslam.simulation import Room, sensor_of, sightings
+from jaxslam.simulation.run import in_order_of_appearance
+from jaxslam.slam.protocol import AbstractFilter
 
 SCENARIO = jaxslam.scenario("matched-tight", steps=6, landmarks=5)
 CHUNK = 3
@@ -308,6 +315,79 @@ def test_a_study_resumes_from_its_folder_and_refuses_another(tmp_path):
 def test_sizes_that_make_no_sense_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         jaxslam.monte_carlo(SCENARIO, filters(), **arguments)
+
+
+def in_slots_of_their_own(run):
+    """The run whose landmarks have a slot each, and keep it."""
+    frames, slots = run.visible.shape
+    new = np.asarray(run.new)
+    column = np.cumsum(new.ravel(order="F")).reshape(new.shape, order="F") - 1
+    visible = np.zeros((frames, new.sum()), bool)
+    measured, points = np.zeros((*visible.shape, 2)), np.zeros((new.sum(), 3))
+    for k, slot in np.ndindex(frames, slots):
+        visible[k, column[k, slot]] = True
+        measured[k, column[k, slot]] = run.measured[k, slot]
+        points[column[k, slot]] = run.points[k, slot]
+    found = replace(
+        run,
+        points=jnp.asarray(points),
+        measured=jnp.asarray(measured),
+        visible=jnp.asarray(visible),
+        new=None,
+    )
+    return in_order_of_appearance(found)
+
+
+def records_of(slam, sensor, run):
+    room = Room(*map(int, jax.tree.leaves(sightings(run))))
+    return quick_jit(partial(filter_run, slam, room, sensor))(run)[0]
+
+
+@pytest.mark.parametrize("name", ["robocentric", "scale_gauge+mixture3"])
+def test_a_slot_used_again_is_as_good_as_one_of_its_own(name):
+    """What is not seen again says no more: without it a filter goes on as with it."""
+    scenario = jaxslam.scenario("handheld", steps=25, landmarks=4, velocity_sigma=[0.3] * 6)
+    slam = next(iter(jaxslam.make_filters(scenario, [name], ["inverse_scaling"]).values()))
+    run, sensor = jaxslam.simulate(scenario, jax.random.key(4)), sensor_of(scenario)
+    apart = in_slots_of_their_own(run)
+    assert apart.visible.shape[1] > 7
+    found, expected = (records_of(slam, sensor, one) for one in (run, apart))
+    for key in ("nees", "nis", "error", "variance", "landmark_nees", "landmark_count"):
+        # Sums in another order, through a covariance that spans 1e9.
+        np.testing.assert_allclose(found[key], expected[key], rtol=1e-5, atol=1e-9, err_msg=key)
+
+
+class WithoutRemove(AbstractFilter):
+    """A filter of three functions."""
+
+    base: jaxslam.EkfSlam
+
+    def init(self, capacity, first=None):
+        return self.base.init(capacity, first)
+
+    def step(self, state, control, seen, new):
+        return self.base.step(state, control, seen, new)
+
+    def marginal(self, state, function, slots=None):
+        return self.base.marginal(state, function, slots)
+
+
+def test_a_filter_that_cannot_remove_landmarks_cannot_use_slots_again():
+    for name, refused in (("handheld", True), ("matched-6dof", False)):
+        scenario = jaxslam.scenario(name, steps=2, landmarks=3)
+        slam = WithoutRemove(jaxslam.EkfSlam(**scenario_pieces(scenario)))
+        run = jaxslam.simulate(scenario, jax.random.key(0))
+        through = partial(filter_run, slam, Room(3, 3, 3, 3), sensor_of(scenario))
+        if not refused:
+            assert jax.eval_shape(through, run)
+            continue
+        with pytest.raises(ValueError, match=r"WithoutRemove has no remove\(state, gone\)"):
+            through(run)
+
+
+def test_no_frame_has_room_for_more_features_than_there_are_landmarks():
+    room, _ = draw(jaxslam.scenario("matched-6dof", steps=1), 2)
+    assert room == Room(landmarks=32, first=30, known=30, new=1)
 
 
 @pytest.mark.statistics

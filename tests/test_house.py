@@ -14,9 +14,9 @@ from jaxslam.slam.protocol import AbstractFilter, AbstractStaged
 PACKAGE = Path(jaxslam.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 ORDER = (
-    "arrays", "files", "linalg", "lookup", "watchdog", "geometry", "least_squares", "landmarks",
-    "models", "forms", "slam", "delayed", "remedies", "wrappers", "simulation", "names",
-    "consistency", "posterior", "triangulation", "datasets", "plots", "vision", "cli",
+    "arrays", "files", "tum", "linalg", "lookup", "watchdog", "geometry", "least_squares",
+    "landmarks", "models", "forms", "slam", "delayed", "remedies", "wrappers", "simulation",
+    "names", "consistency", "posterior", "triangulation", "datasets", "plots", "vision", "cli",
 )  # fmt: skip
 """Rooms, each of which imports only those before it."""
 

@@ -23,6 +23,7 @@ from jaxslam.simulation import (
     calibration_sigma_of,
     depth_of,
     features,
+    gone,
     motion_of,
     scenario,
     sensor_of,
@@ -119,6 +120,16 @@ EXPECTED = {
     for noise, (acceleration, start) in noises.items()
 }
 
+EXPECTED["handheld"] = SPATIAL | {
+    "trajectory": "",
+    "steps": 150,
+    "velocity": (0.0,) * 6,
+    "velocity_sigma": (1.0,) * 6,
+    "acceleration_sigma": (4.0,) * 3 + (6.0,) * 3,
+    "placement": "rays",
+    "depth_range": (1.0, 6.0),
+    "nearest_depth": 1.0,
+}
 DEGREE = np.pi / 180
 ODOMETRY = {"motion": "odometry", "true_calibration": "nominal", "calibration": "known"}
 EXPECTED["room"] = ODOMETRY | {
@@ -274,6 +285,11 @@ def test_a_malformed_override_is_refused(text):
         ({"inverse_depth": [float("inf"), 0.1]}, "inverse_depth holds inf"),
         ({"still_frames": -1}, "still_frames must not be negative"),
         ({"still_frames": 2, "motion": "odometry"}, "still_frames: odometry has the nominal"),
+        ({"depth_range": [5.0]}, "depth_range needs a least and a greatest depth"),
+        ({"depth_range": [5.0, 2.0]}, "depth_range needs a least and a greatest depth"),
+        ({"depth_range": [0.0, 2.0]}, "depth_range must be positive"),
+        ({"placement": "rays", "known_landmarks": 3}, "known_landmarks: placement rays has no"),
+        ({"placement": "rays", "sensor": "position"}, "placement rays is for a camera"),
         ({"first_frame": -1}, "first_frame must not be negative"),
         ({"first_landmarks": -1}, "first_landmarks must not be negative"),
         ({"new_landmarks": 1.5}, "new_landmarks must be a whole number"),
@@ -668,6 +684,97 @@ def test_the_landmarks_of_a_limited_frame_are_drawn_at_random_and_evenly():
     evenly(used[:, 1] & ~used[:, 0], 1 / 2 * 1 / 6)
     # Frames draw independently: 2 of 6 in frame 1, and 2 of 7, that one among them, in frame 2.
     evenly(used[:, 0] & used[:, 1] & used[:, 2], 1 / 2 * 2 / 6 * 2 / 7)
+
+
+# --- landmarks that come and go ------------------------------------------------------------------
+
+
+@cache
+def coming_and_going():
+    """Runs that turn much, with a landmark for every one that leaves the picture."""
+    fast = dict(landmarks=8, steps=40, velocity_sigma=[1.0] * 6, pixel_sigma=1e-6)
+    chosen = scenario("handheld", fast)
+    return chosen, batch(chosen, 60)
+
+
+def test_there_are_always_as_many_landmarks_in_view():
+    chosen, runs = coming_and_going()
+    assert runs.visible.shape == runs.new.shape == (60, 41, 8)
+    assert runs.points.shape == (60, 41, 8, 3)
+    assert np.asarray(runs.visible).all()
+    assert ((runs.measured > -1e-3) & (runs.measured < np.array(chosen.image) + 1e-3)).all()
+    seen_from = seen_by_frame(runs, np.asarray(runs.points))
+    pixels = seen_from[..., :2] / seen_from[..., 2:] * 650 + np.array([320, 240])
+    np.testing.assert_allclose(runs.measured, pixels, rtol=0, atol=1e-4)
+
+
+def seen_by_frame(runs, points):
+    """Points in the camera, frame by frame."""
+    T = np.linalg.inv(np.asarray(runs.poses.as_matrix()))
+    return np.einsum("rfij,rflj->rfli", T[..., :3, :3], points) + T[:, :, None, :3, 3]
+
+
+def test_a_landmark_is_replaced_when_and_only_when_it_leaves_the_picture():
+    chosen, runs = coming_and_going()
+    new, points = np.asarray(runs.new), np.asarray(runs.points)
+    assert new[:, 0].all()
+    assert 0.02 < new[:, 1:].mean() < 0.5
+    stays = (points[:, 1:] == points[:, :-1]).all(axis=-1)
+    np.testing.assert_array_equal(stays, ~new[:, 1:])
+    # Where the one of the frame before would be now.
+    before = np.concatenate([points[:, :1], points[:, :-1]], axis=1)
+    x, y, z = np.moveaxis(seen_by_frame(runs, before), -1, 0)
+    u, v = 650 * x / z + 320, 650 * y / z + 240
+    inside = (z > chosen.visible_depth) & (u >= 0) & (u < 640) & (v >= 0) & (v < 480)
+    np.testing.assert_array_equal(inside[:, 1:], ~new[:, 1:])
+
+
+def test_it_is_thrown_along_a_random_ray_at_a_random_depth():
+    chosen, runs = coming_and_going()
+    new = np.asarray(runs.new)
+    depth = seen_by_frame(runs, np.asarray(runs.points))[..., 2]
+    later = new.copy()
+    later[:, 0] = False
+    for chosen_now in (new, later):
+        least, greatest = chosen.depth_range
+        uniform = stats.uniform(least, greatest - least)
+        assert stats.kstest(depth[chosen_now], uniform.cdf).pvalue > FALSE_ALARM
+        for axis, (low, high) in enumerate(chosen.first_pixels):
+            pixels = np.asarray(runs.measured)[chosen_now][:, axis]
+            uniform = stats.uniform(low, high - low)
+            assert stats.kstest(pixels, uniform.cdf).pvalue > FALSE_ALARM
+    # Neither slots nor frames repeat one another.
+    assert len(np.unique(depth[new])) == new.sum()
+
+
+def test_features_and_slots_of_landmarks_that_come_and_go():
+    _, runs = coming_and_going()
+    run = jax.tree.map(lambda x: x[0], runs)
+    most = jax.tree.map(int, sightings(run))
+    new = np.asarray(run.new)
+    assert (most.landmarks, most.first) == (8, 8)
+    assert most.new == new[1:].sum(axis=1).max()
+    assert most.known == (~new).sum(axis=1).max()
+    room = Room(10, 8, 8, 8)  # with room for two more
+    first, known, fresh = features(run, room)
+    left = np.asarray(gone(run, room))
+    assert left.shape == (40, 10)
+    assert first.valid.all()
+    for k in range(40):
+        assert set(np.flatnonzero(left[k])) == set(np.flatnonzero(new[k + 1]))
+        assert set(np.asarray(fresh.slots)[k][fresh.valid[k]]) == set(np.flatnonzero(new[k + 1]))
+        assert set(np.asarray(known.slots)[k][known.valid[k]]) == set(np.flatnonzero(~new[k + 1]))
+    # One that ends without a successor is gone in the frame in which it is not seen, and only then.
+    ended = dataclasses.replace(run, visible=run.visible.at[7:, 3].set(False))
+    left = np.asarray(gone(ended, Room(8, 8, 8, 8)))
+    assert left[6, 3]
+    assert not left[7:, 3].any()
+    assert gone(circling()[1], Room(36, 1, 1, 1)) is None
+
+
+def test_a_sensor_without_rays_cannot_throw_landmarks():
+    with pytest.raises(ValueError, match="placement rays is for a Pinhole, not for Position"):
+        simulate(scenario("handheld"), jax.random.key(0), sensor=Position(0.1, point_dim=3))
 
 
 # --- features -----------------------------------------------------------------------------------

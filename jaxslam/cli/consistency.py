@@ -44,7 +44,9 @@ class ConsistencyOptions:
         str,
         tyro.conf.arg(
             metavar="NAME",
-            help=f"A TOML file with the fields of a scenario, or one of: {', '.join(BUILT_IN)}.",
+            help="A TOML file with the fields of a scenario, handheld-NAME of a trajectory in "
+            "$JAXSLAM_DATA/trajectories (../shared/data by default; any TUM file by --set "
+            f"trajectory=FILE), or one of: {', '.join(BUILT_IN)}.",
         ),
     ] = "circle"
     landmarks: Annotated[

@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxslam.arrays import AnyArray
-from jaxslam.simulation import Room, Run, features
+from jaxslam.consistency.recursion import run_through
+from jaxslam.simulation import Room, Run
 from jaxslam.slam.protocol import AbstractFilter
 
 MOST = 0.7
@@ -43,16 +44,13 @@ class Estimate(NamedTuple):
 def log_likelihood(slam: AbstractFilter, room: Room, run: Run) -> Float[Array, ""]:
     """Of all that is measured in a run after frame 0, up to a constant that is the same for all
     filters that use the same measurements."""
-    first, seen, new = features(run, room)
 
-    def step(state, data):
-        seen, new, control = data
-        state, innovation = slam.step(state, control, seen, new)
+    def term(state, innovation, frame):
+        del state, frame
         assert innovation.log_det is not None, "the information form knows no likelihood"
-        return state, -(innovation.nis + innovation.log_det) / 2
+        return -(innovation.nis + innovation.log_det) / 2
 
-    _, terms = jax.lax.scan(step, slam.init(room.capacity, first), (seen, new, run.controls))
-    return jnp.sum(terms)
+    return jnp.sum(run_through(slam, room, run, term)[1])
 
 
 def maximum_likelihood(

@@ -23,6 +23,7 @@ from jaxtyping import Array, Int
 
 from jaxslam.arrays import cast, is_number
 from jaxslam.consistency.beyond_scale import beyond_scale, reversal
+from jaxslam.consistency.recursion import Frame, run_through
 from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.consistency.store import MemoryStore, Store
 from jaxslam.geometry import Pose
@@ -33,11 +34,12 @@ from jaxslam.simulation import (
     Run,
     Scenario,
     Sightings,
+    Trajectory,
     as_data,
-    features,
     sensor_of,
     sightings,
     simulate,
+    trajectory_of,
 )
 from jaxslam.slam.protocol import AbstractFilter
 from jaxslam.slam.readouts import camera_pose, landmarks_from_above, landmarks_in_camera
@@ -81,13 +83,13 @@ def monte_carlo(
     chunk: int = CHUNK,
     store: Store | None = None,
     progress: Callable[[str, int], None] = lambda name, done: None,
-    motion: AbstractMotion | None = None,
+    motion: AbstractMotion | Trajectory | None = None,
     sensor: AbstractSensor | None = None,
 ) -> Study:
     """Run every filter on the same simulated runs.
 
-    The runs are the scenario's; with a `motion` or a `sensor` of one's own the truth moves, or is
-    measured, as that says, in the scenario's world.
+    The runs are the scenario's; with a `motion` (or a `Trajectory`) or a `sensor` of one's own the
+    truth moves, or is measured, as that says, in the scenario's world.
 
     `progress(filter name, finished runs)` is called after every chunk. Chunks that `store`
     already has are not run again. Raises ValueError for sizes that make no sense.
@@ -117,9 +119,10 @@ class _Simulator:
         seed: int,
         dtype: str,
         size: int,
-        motion: AbstractMotion | None,
+        motion: AbstractMotion | Trajectory | None,
         sensor: AbstractSensor | None,
     ) -> None:
+        motion = trajectory_of(scenario, dtype) if motion is None else motion
         self.dtype, self.size = jnp.dtype(dtype), size
         self.sensor = cast(sensor_of(scenario) if sensor is None else sensor, dtype)
         self._own = cast((motion, sensor), dtype)
@@ -131,10 +134,11 @@ class _Simulator:
         return _draw(self._scenario, self._own, self._key, indices)
 
     def room(self, chunks: tuple[range, ...]) -> Room:
-        """What holds every run of the study."""
+        """What holds every run of the study; no frame has more features than a run has slots."""
         seen = [jax.tree.map(np.max, jax.device_get(self(chunk)[1])) for chunk in chunks]
         most = jax.tree.map(lambda *counts: _room_for(int(max(counts))), *seen)
-        return Room(most.landmarks, most.first, most.known, most.new)
+        slots = self(chunks[0])[0].visible.shape[-1]
+        return Room(most.landmarks, *(min(n, slots) for n in (most.first, most.known, most.new)))
 
 
 def draw(
@@ -159,7 +163,7 @@ def _room_for(count: int) -> int:
 @eqx.filter_jit
 def _draw(
     scenario: Scenario,
-    own: tuple[AbstractMotion | None, AbstractSensor | None],
+    own: tuple[AbstractMotion | Trajectory | None, AbstractSensor | None],
     key: Array,
     indices: Int[Array, " runs"],
 ) -> tuple[Run, Sightings]:
@@ -232,7 +236,7 @@ def _filter_batch(
     return records, {
         "path": jax.vmap(lambda pose: pose.as_matrix())(first(path)),
         "true_path": jax.vmap(lambda pose: pose.as_matrix())(run.poses),
-        "points": run.points,
+        "points": run.points_by_frame[-1],
         "landmarks": landmarks,
         "landmarks_covariance": covariance,
         "active": slam.in_map(state),
@@ -251,14 +255,11 @@ def filter_run(
     mean `landmark_nees` of the landmarks seen, in the sensor's chart, where it is finite, their
     number, and of how many it is not.
     """
-    first, seen, new = features(run, room)
-    state = slam.init(room.capacity, first)
 
-    def step(state, data):
-        seen, new, control, T_BC = data
-        state, innovation = slam.step(state, control, seen, new)
+    def told(state, innovation, frame: Frame):
+        T_BC = frame.pose
         estimate, covariance = camera_pose(slam, state)
-        landmarks = _landmark_nees(slam, sensor, state, seen, T_BC, run.points)
+        landmarks = _landmark_nees(slam, sensor, state, frame)
         records = {
             "nees": normalised_squared(*slam.pose_error(state, T_BC)),
             **_scale(slam, state, T_BC),
@@ -270,10 +271,9 @@ def filter_run(
             "variance": jnp.diagonal(covariance),
             **landmarks,
         }
-        return state, (records, estimate)
+        return records, estimate
 
-    later = jax.tree.map(lambda x: x[1:], run.poses)
-    state, (records, path) = jax.lax.scan(step, state, (seen, new, run.controls, later))
+    state, (records, path) = run_through(slam, room, run, told)
     return records, path, state
 
 
@@ -293,10 +293,11 @@ def _camera_error(estimate: Pose, truth: Pose) -> Array:
     )
 
 
-def _landmark_nees(slam, sensor, state, seen, T_BC, points) -> dict[str, Array]:
+def _landmark_nees(slam, sensor, state, frame: Frame) -> dict[str, Array]:
     """Of the landmarks seen that are in the map: the mean of what is finite, and both numbers."""
+    seen = frame.seen
     counted = seen.valid & slam.in_map(state)[seen.slots]
-    truth = jax.vmap(T_BC.inverse().apply)(points[seen.slots])
+    truth = jax.vmap(frame.pose.inverse().apply)(frame.points[seen.slots])
     truth = jax.vmap(sensor.chart)(truth, jnp.ones_like(truth[:, 0]))
     chart, covariance = landmarks_in_camera(slam, state, seen.slots, sensor)
     nees = jax.vmap(normalised_squared)(truth - chart, covariance)

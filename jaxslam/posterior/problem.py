@@ -68,6 +68,8 @@ def check_scenario(scenario: Scenario) -> None:
         "placement": "prior",
         "motion": "velocity",
         "sensor": "camera",
+        "trajectory": "",
+        "still_frames": 0,
         "calibration": "known",
         "true_calibration": "nominal",
         "first_frame": 0,

@@ -6,16 +6,10 @@ from jaxslam.simulation.pieces import (
     motion_of,
     sensor_of,
 )
+from jaxslam.simulation.run import Room, Run, Sightings, features, gone, sightings
 from jaxslam.simulation.scenario import BUILT_IN, Scenario, scenario
-from jaxslam.simulation.world import (
-    Room,
-    Run,
-    Sightings,
-    as_data,
-    features,
-    sightings,
-    simulate,
-)
+from jaxslam.simulation.trajectories import Trajectory
+from jaxslam.simulation.world import as_data, simulate, trajectory_of
 
 __all__ = [
     "BUILT_IN",
@@ -23,13 +17,16 @@ __all__ = [
     "Run",
     "Scenario",
     "Sightings",
+    "Trajectory",
     "as_data",
     "calibration_sigma_of",
     "depth_of",
     "features",
+    "gone",
     "motion_of",
     "scenario",
     "sensor_of",
     "sightings",
     "simulate",
+    "trajectory_of",
 ]

@@ -17,6 +17,7 @@ import equinox as eqx
 
 from jaxslam.geometry import GEOMETRIES, Geometry
 from jaxslam.lookup import suggestion
+from jaxslam.simulation.trajectories import find
 
 Numbers = tuple[float, ...]
 
@@ -26,7 +27,7 @@ CALIBRATIONS = ("white", "consider", "estimated", "known")
 """The paper's independent draw of every frame; constant and correlated but not corrected
 (Schmidt); constant and estimated; exact."""
 TRUE_CALIBRATIONS = ("nominal", "white", "constant")
-PLACEMENTS = ("prior", "ring", "room")
+PLACEMENTS = ("prior", "ring", "room", "rays")
 ROOM_LANDMARKS = 72
 
 
@@ -51,6 +52,9 @@ class Scenario(eqx.Module):
     """Nominal velocity in the camera frame, m/s and rad/s: the mean that the filter starts with."""
     velocity_sigma: Numbers = (0.01, 0.01, 0.01)
     """σ of the true initial velocity around the nominal one, and of the filter's."""
+    trajectory: str = _structural("")
+    """Along what the camera truly moves, from a start drawn at random: a TUM file, or the name of
+    one in $JAXSLAM_DATA/trajectories. Empty: it moves as the filter's prior says."""
     still_frames: int = _structural(0)
     """`velocity`: the camera first stands exactly still for so many steps, then moves off with the
     velocity drawn. The filter is not told."""
@@ -64,10 +68,14 @@ class Scenario(eqx.Module):
     placement: str = _structural("prior")
     """`prior`: every landmark seen in frame 0, at a uniform pixel and an inverse depth from the
     filter's prior. `ring`: evenly on a horizontal circle around the centre of the nominal path.
-    `room`: 72 points along the walls of a square room, on two levels (slamtb)."""
+    `room`: 72 points along the walls of a square room, on two levels (slamtb). `rays`: always as
+    many in view; for one that leaves, which is gone for good, another is thrown along a random ray
+    of the camera there."""
     landmarks: int = _structural(12)
     first_pixels: tuple[Numbers, ...] = ((20.0, 620.0),)
-    """`prior`: the interval of each pixel coordinate in frame 0."""
+    """`prior`, `rays`: the interval of each pixel coordinate at first sight."""
+    depth_range: Numbers = (1.0, 6.0)
+    """`rays`: least and greatest depth at first sight, m; uniform in between."""
     ring_radius: float = 8.0
     """`ring`: its radius, m."""
     nearest_depth: float = 3.0
@@ -129,16 +137,23 @@ def scenario(
     A TOML file may name a built-in scenario to start from: `base = "circle"`.
     Raises ValueError for an unknown name or field and for a value that makes no sense.
     """
-    if str(name) in BUILT_IN:
-        chosen = BUILT_IN[str(name)]
-    elif str(name).endswith(".toml"):
-        chosen = _read(Path(name))
-    else:
+    chosen = _read(Path(name)) if str(name).endswith(".toml") else _named(str(name))
+    if chosen is None:
         raise ValueError(
             f"unknown scenario {str(name)!r}{suggestion(str(name), BUILT_IN)}; known: "
-            f"{', '.join(BUILT_IN)}, or a .toml file"
+            f"{', '.join(BUILT_IN)}, {HANDHELD}NAME of a trajectory, or a .toml file"
         )
     return _replaced(chosen, {**(overrides or {}), **fields})
+
+
+def _named(name: str) -> Scenario | None:
+    """A built-in scenario, or one along a trajectory of this name."""
+    if not name.startswith(HANDHELD):
+        return BUILT_IN.get(name)
+    trajectory = name.removeprefix(HANDHELD)
+    find(trajectory)  # or say now what is known
+    numbers = _OUTDOORS if trajectory in _OUTDOOR_TRAJECTORIES else {}
+    return dataclasses.replace(BUILT_IN["handheld"], name=name, trajectory=trajectory, **numbers)
 
 
 def parse_override(text: str) -> tuple[str, Any]:
@@ -160,9 +175,9 @@ def _read(path: Path) -> Scenario:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ValueError(f"scenario file {path}: {error}") from None
     base = fields.pop("base", None)
-    if base is not None and base not in BUILT_IN:
+    start = _named(base) if base else Scenario(name=path.stem)
+    if start is None:
         raise ValueError(f"{path}: unknown base {base!r}; known: {', '.join(BUILT_IN)}")
-    start = BUILT_IN[base] if base else Scenario(name=path.stem)
     return _replaced(start, {"name": path.stem, **fields})
 
 
@@ -235,12 +250,21 @@ def _check(s: Scenario) -> None:
         raise ValueError(f"scenario field first_pixels needs [low, high] pairs: {s.first_pixels}")
     if s.inverse_depth and (len(s.inverse_depth) != 2 or s.inverse_depth[1] <= 0):
         raise ValueError(f"scenario field inverse_depth needs a mean and a σ: {s.inverse_depth}")
+    if len(s.depth_range) != 2 or s.depth_range[0] >= s.depth_range[1]:
+        raise ValueError(
+            f"scenario field depth_range needs a least and a greatest depth: {s.depth_range}"
+        )
     if s.range[0] >= s.range[1]:
         raise ValueError(f"scenario field range needs a least and a greatest one: {s.range}")
     if s.sensor == "position" and s.calibration != "known":
         raise ValueError("scenario field calibration: a position sensor has none; use known")
-    if s.motion == "odometry" and s.still_frames:
-        raise ValueError("scenario field still_frames: odometry has the nominal motion; use 0")
+    if s.motion == "odometry" and (s.still_frames or s.trajectory):
+        field = "still_frames" if s.still_frames else "trajectory"
+        raise ValueError(f"scenario field {field}: odometry has the nominal motion; leave it out")
+    if s.trajectory and s.geometry != "spatial":
+        raise ValueError(
+            f"scenario field trajectory is for a spatial world, not a {s.geometry} one"
+        )
     _check_placement(s)
 
 
@@ -250,16 +274,27 @@ def _check_placement(s: Scenario) -> None:
             f"placement room is for a spatial geometry and {ROOM_LANDMARKS} landmarks, "
             f"not {s.geometry} and {s.landmarks}"
         )
+    if s.placement == "rays":
+        _check_rays(s)
     if s.placement == "ring" and s.geometry != "planar":
         raise ValueError("scenario field placement: ring is only for a planar geometry")
     if s.placement == "ring" and s.velocity[-1] == 0:
         raise ValueError("placement ring needs a nominal path that turns: velocity[-1] is 0")
 
 
+def _check_rays(s: Scenario) -> None:
+    if s.sensor != "camera":
+        raise ValueError(f"placement rays is for a camera, not for a {s.sensor} sensor")
+    for field in ("first_frame", "first_landmarks", "new_landmarks", "known_landmarks"):
+        if getattr(s, field):
+            raise ValueError(f"scenario field {field}: placement rays has no limits; use 0")
+
+
 _NOISE_OF = {"velocity": "acceleration_sigma", "odometry": "odometry_sigma"}
 _POSITIVE = (
     "rate", "steps", "landmarks", "ring_radius", "nearest_depth", "image", "focal",
-    "pixel_sigma", "least_inverse_depth", "visible_depth", "acceleration_sigma", "position_sigma",
+    "pixel_sigma", "least_inverse_depth", "visible_depth", "depth_range",
+    "acceleration_sigma", "position_sigma",
 )  # fmt: skip
 _NOT_NEGATIVE = (
     "velocity_sigma", "focal_sigma", "centre_sigma", "odometry_sigma", "range",
@@ -311,6 +346,17 @@ _CIRCLE_NOISE = {
 }
 
 
+HANDHELD = "handheld-"
+"""What a trajectory's name follows in the name of its scenario."""
+_OUTDOORS: dict[str, Any] = {
+    "depth_range": (5.0, 50.0),
+    "nearest_depth": 5.0,
+    "velocity_sigma": (10.0,) * 3 + (1.0,) * 3,
+}
+_OUTDOOR_TRAJECTORIES = ("kitti_00",)
+"""Of a car on a road."""
+
+
 def _family(family: str, noises: Mapping[str, tuple[Numbers, Numbers]], **fields: Any):
     for suffix, (acceleration, velocity) in noises.items():
         yield Scenario(
@@ -340,6 +386,16 @@ def _built_in():
         velocity=(0.0,) * 6,
         velocity_sigma=(0.5,) * 3 + (0.2,) * 3,
         acceleration_sigma=_SPATIAL_NOISE["-loose"][0],
+        **_SPATIAL,
+    )
+    yield Scenario(
+        name="handheld",
+        steps=150,
+        velocity=(0.0,) * 6,
+        velocity_sigma=(1.0,) * 6,
+        acceleration_sigma=(4.0,) * 3 + (6.0,) * 3,
+        placement="rays",
+        nearest_depth=1.0,
         **_SPATIAL,
     )
     yield from _family(

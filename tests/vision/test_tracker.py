@@ -16,6 +16,7 @@ pytest.importorskip("cv2")
 import jaxslam
 from jaxslam.forms.state import Status
 from jaxslam.slam.readouts import landmarks_in_camera
+from jaxslam.tum import read_tum
 from jaxslam.vision import tracker as programs
 from jaxslam.vision.located import adjoint
 from jaxslam.vision.settings import TrackerSettings
@@ -27,7 +28,6 @@ from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
     pose_nees,
     read_covariances,
-    read_tum,
 )
 from jaxslam.watchdog import lapack_calls
 

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxslam.tum import poses, read_tum
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
     exactly_known,
     pose_nees,
-    poses,
     read_covariances,
-    read_tum,
     write_atomically,
     write_covariances,
     write_tum,

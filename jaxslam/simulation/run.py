@@ -1,0 +1,134 @@
+"""One run for a filter: truth and measurements, and what of them is new, known or gone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.forms.state import Features
+from jaxslam.geometry import Pose
+from jaxslam.models.camera import Camera
+from jaxslam.slam.protocol import Capacity
+
+
+class Run(eqx.Module):
+    """Truth and measurements; frame 0 is the start, `frames` = steps + 1.
+
+    Landmarks are in slots, those of the filter: each in one of its own, or, where there is `new`,
+    one after the other. There a landmark that is not seen in one frame is gone for good, and the
+    next to be first seen may have its slot, in the same frame.
+    """
+
+    poses: Pose
+    """T_BC of every frame; the first is the identity."""
+    points: Float[Array, "*frames landmarks n"]
+    """In B, in the order in which they are first seen; with `new`, those of every frame."""
+    measured: Float[Array, "frames landmarks p"]
+    """With noise."""
+    visible: Bool[Array, "frames landmarks"]
+    """Which points are measured."""
+    controls: Any
+    """The motion model's input of every step: seconds, or a reading."""
+    cameras: Camera
+    """The true camera of every frame."""
+    new: Bool[Array, "frames landmarks"] | None = None
+    """Which of the visible are seen for the first time, where slots are used again."""
+
+    @property
+    def points_by_frame(self) -> Float[Array, "frames landmarks n"]:
+        """The point that each slot stands for."""
+        return jnp.broadcast_to(self.points, (*self.visible.shape, self.points.shape[-1]))
+
+
+class Sightings(eqx.Module):
+    """How many landmarks a run sees, at the most: the capacities that a filter needs."""
+
+    landmarks: Int[Array, ""]
+    """Ever; or the slots that they share."""
+    first: Int[Array, ""]
+    """In frame 0."""
+    known: Int[Array, ""]
+    """In one frame, seen before."""
+    new: Int[Array, ""]
+    """In one frame after 0, for the first time."""
+
+
+class Room(NamedTuple):
+    """Capacities that hold every run of a study."""
+
+    landmarks: int
+    first: int
+    known: int
+    new: int
+
+    @property
+    def capacity(self) -> Capacity:
+        """Of a filter."""
+        return Capacity(self.landmarks, self.known, self.new)
+
+
+def sightings(run: Run) -> Sightings:
+    """Capacities that hold this run exactly."""
+    known, new = _known_and_new(run)
+    return Sightings(
+        landmarks=jnp.sum(jnp.any(run.visible, axis=0)),
+        first=jnp.sum(run.visible[0]),
+        known=jnp.max(jnp.sum(known, axis=1), initial=0),
+        new=jnp.max(jnp.sum(new[1:], axis=1), initial=0),
+    )
+
+
+def features(run: Run, capacity: Room) -> tuple[Features, Features, Features]:
+    """A run's measurements for the filter: new in frame 0; known and new of every later frame.
+
+    Slot i of the filter is point i of the run.
+    """
+    known, new = _known_and_new(run)
+    first = _picked(new[0], run.measured[0], capacity.first)
+    pick = jax.vmap(_picked, in_axes=(0, 0, None))
+    return (
+        first,
+        pick(known[1:], run.measured[1:], capacity.known),
+        pick(new[1:], run.measured[1:], capacity.new),
+    )
+
+
+def gone(run: Run, capacity: Room) -> Bool[Array, "steps slots"] | None:
+    """The filter's slots whose landmark of the frame before is not seen any more, of every frame
+    after 0; None where landmarks keep their slots."""
+    if run.new is None:
+        return None
+    left = run.visible[:-1] & (~run.visible[1:] | run.new[1:])
+    count = capacity.landmarks
+    return jnp.pad(left, ((0, 0), (0, max(0, count - left.shape[1]))))[:, :count]
+
+
+def _known_and_new(run: Run):
+    if run.new is not None:
+        return run.visible & ~run.new, run.visible & run.new
+    before = jnp.cumsum(run.visible, axis=0) - run.visible > 0
+    return run.visible & before, run.visible & ~before
+
+
+def _picked(mask, measured, count: int) -> Features:
+    """The first `count` landmarks of the mask, padded with features that are not valid."""
+    slots = jnp.argsort(~mask, stable=True)[:count]
+    return Features(slots, measured[slots], mask[slots])
+
+
+def in_order_of_appearance(run: Run) -> Run:
+    """Landmarks that are never seen come last, so that a filter needs no slots for them."""
+    never = run.visible.shape[0]
+    seen = jnp.any(run.visible, axis=0)
+    order = jnp.argsort(jnp.where(seen, jnp.argmax(run.visible, axis=0), never), stable=True)
+    return replace(
+        run,
+        points=run.points[order],
+        measured=run.measured[:, order],
+        visible=run.visible[:, order],
+    )

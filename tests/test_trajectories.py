@@ -1,0 +1,197 @@
+"""Tests of recorded trajectories as truths: smoothed, without gaps, from starts drawn at random."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import quick_jit
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+import jaxslam
+from jaxslam.simulation import BUILT_IN, Trajectory, scenario, simulate, trajectory_of
+from jaxslam.simulation.trajectories import CUTOFF, GAP, find, sampled
+from jaxslam.tum import poses
+
+FALSE_ALARM = 1e-6
+"""Share of seeds on which a statistical test here would fail although nothing is wrong."""
+
+
+def path_at(times):
+    """A slow, smooth motion: positions and turns, of which x tells the time."""
+    position = np.stack([times**2 / 10, np.sin(times), 0.3 * np.cos(times)], axis=1)
+    return position, Rotation.from_rotvec(np.outer(np.sin(0.5 * times), [0.3, 1.0, -0.2]))
+
+
+def write(path, times, *, jitter=0.0, flip=False):
+    """The motion at these times as a TUM file, with Gaussian jitter in metres."""
+    position, turn = path_at(times)
+    rng = np.random.default_rng(0)
+    quaternions = turn.as_quat()
+    if flip:
+        quaternions *= rng.choice([-1, 1], (times.size, 1))
+    rows = [times, *(position + jitter * rng.normal(size=position.shape)).T, *quaternions.T]
+    np.savetxt(path, np.column_stack(rows), fmt="%.10f", header="t tx ty tz qx qy qz qw")
+    return path
+
+
+def with_a_gap(rate=50.0):
+    """Times of 4 s, a gap, and 3 s more."""
+    return np.concatenate([np.arange(0, 4, 1 / rate), np.arange(4 + 3 * GAP, 8, 1 / rate)])
+
+
+def matrices(trajectory):
+    return poses(trajectory.poses[:, 4:], np.roll(trajectory.poses[:, :4], -1, axis=1))
+
+
+def test_a_path_is_sampled_at_the_rate_and_not_across_its_gap(tmp_path):
+    times = with_a_gap()
+    found = sampled(write(tmp_path / "a.txt", times), 30.0, 45)
+    first = np.arange(int(times[times < 4].max() * 30) + 1) / 30
+    second = 4 + 3 * GAP + np.arange(len(found.poses) - first.size) / 30
+    assert second[-1] <= times[-1] < second[-1] + 1 / 30
+    position, turn = path_at(np.concatenate([first, second]))
+    T = matrices(found)
+    angle = (Rotation.from_matrix(T[:, :3, :3]).inv() * turn).magnitude()
+    # A spline that smooths bends less than its data at the ends of its pieces, and only there.
+    np.testing.assert_allclose(T[:, :3, 3], position, rtol=0, atol=5e-4)
+    assert angle.max() < 5e-4
+    inner = np.concatenate([np.arange(8, first.size - 8), np.arange(first.size + 8, len(T) - 8)])
+    np.testing.assert_allclose(T[inner, :3, 3], position[inner], rtol=0, atol=1e-5)
+    assert angle[inner].max() < 1e-5
+    # A run of 45 steps starts where 45 poses follow in the same piece.
+    ends = np.repeat([first.size, len(T)], [first.size, second.size])
+    np.testing.assert_array_equal(found.starts, np.flatnonzero(np.arange(len(T)) + 45 < ends))
+
+
+def test_a_run_is_relative_to_its_first_camera_and_starts_anywhere(tmp_path):
+    found = sampled(write(tmp_path / "a.txt", with_a_gap()), 30.0, 45)
+    keys = jax.random.split(jax.random.key(0), 300)
+    runs = np.asarray(quick_jit(jax.vmap(lambda key: found.run(key).as_matrix()))(keys))
+    np.testing.assert_allclose(runs[:, 0], np.broadcast_to(np.eye(4), (300, 4, 4)), atol=1e-12)
+    T = matrices(found)
+    expected = np.stack([np.linalg.inv(T[i]) @ T[i : i + 46] for i in found.starts])
+    distance = np.abs(runs[:, None] - expected).max(axis=(2, 3, 4))
+    assert distance.min(axis=1).max() < 1e-9
+    drawn = distance.argmin(axis=1)
+    counts = np.bincount(drawn * 6 // found.starts.size, minlength=6)
+    assert stats.chisquare(counts).pvalue > FALSE_ALARM
+
+
+def test_what_trembles_goes_and_what_moves_stays(tmp_path):
+    times = np.arange(0, 8, 0.01)
+    found = sampled(write(tmp_path / "a.txt", times, jitter=1e-3), 30.0, 45)
+    error = matrices(found)[:, :3, 3] - path_at(np.arange(len(found.poses)) / 30)[0]
+    # A millimetre of 100 poses a second, of which what is below the cutoff stays.
+    assert np.sqrt(np.mean(error**2)) < 1.2e-3 * np.sqrt(CUTOFF / 50)
+
+
+def test_signs_of_quaternions_and_repeated_times_do_not_matter(tmp_path):
+    times = with_a_gap()
+    plain = sampled(write(tmp_path / "a.txt", times), 30.0, 45)
+    flipped = sampled(write(tmp_path / "b.txt", times, flip=True), 30.0, 45)
+    repeated = sampled(write(tmp_path / "c.txt", np.repeat(times, 2)), 30.0, 45)
+    for other in (flipped, repeated):
+        np.testing.assert_allclose(matrices(other), matrices(plain), rtol=0, atol=1e-9)
+        np.testing.assert_array_equal(other.starts, plain.starts)
+
+
+@pytest.fixture
+def data(tmp_path, monkeypatch):
+    """A data folder with one trajectory."""
+    (tmp_path / "trajectories").mkdir()
+    write(tmp_path / "trajectories" / "walk.txt", with_a_gap())
+    monkeypatch.setenv("JAXSLAM_DATA", str(tmp_path))
+    return tmp_path / "trajectories" / "walk.txt"
+
+
+def test_a_scenario_is_named_after_its_trajectory(data, tmp_path):
+    chosen = scenario("handheld-walk", steps=30)
+    assert chosen == dataclasses.replace(
+        BUILT_IN["handheld"], name="handheld-walk", trajectory="walk", steps=30
+    )
+    by_file = scenario("handheld", trajectory=str(data), steps=30)
+    for other in (chosen, by_file):
+        found = trajectory_of(other)
+        assert found is not None
+        np.testing.assert_array_equal(found.poses, sampled(data, 30.0, 30).poses)
+    (tmp_path / "mine.toml").write_text('base = "handheld-walk"\nlandmarks = 7\n')
+    assert scenario(tmp_path / "mine.toml").trajectory == "walk"
+    assert trajectory_of(scenario("matched")) is None
+
+
+def test_a_car_sees_far(data):
+    data.rename(data.with_name("kitti_00.txt"))
+    car = scenario("handheld-kitti_00")
+    assert (car.depth_range, car.nearest_depth) == ((5.0, 50.0), 5.0)
+    assert car.velocity_sigma[0] == 10
+
+
+@pytest.mark.usefixtures("data")
+def test_the_truth_moves_along_it_and_the_filter_is_told_the_seconds_only():
+    chosen = scenario("handheld-walk", steps=20, landmarks=4)
+    run = quick_jit(lambda key: simulate(chosen, key))(jax.random.key(2))
+    still = quick_jit(lambda key: simulate(dataclasses.replace(chosen, still_frames=5), key))
+    np.testing.assert_allclose(run.controls, np.full(20, 1 / 30), rtol=1e-12)
+    T = np.asarray(run.poses.as_matrix())
+    speed = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1) * 30
+    assert (speed > 0.1).all()
+    assert (speed < 2.0).all()
+    waiting = np.asarray(still(jax.random.key(2)).poses.as_matrix())
+    np.testing.assert_array_equal(waiting[:6], np.broadcast_to(np.eye(4), (6, 4, 4)))
+    assert np.linalg.norm(waiting[6, :3, 3]) > 0.1 / 30
+    # Others start elsewhere, the same key at the same place.
+    again, other = (jaxslam.simulate(chosen, jax.random.key(k)) for k in (2, 3))
+    np.testing.assert_allclose(again.poses.as_matrix(), T, rtol=0, atol=1e-12)
+    assert np.abs(np.asarray(other.poses.as_matrix()) - T).max() > 1e-3
+
+
+@pytest.mark.usefixtures("data")
+def test_a_study_may_go_along_a_trajectory_of_ones_own(tmp_path):
+    own = sampled(write(tmp_path / "own.txt", np.arange(0, 3, 0.02)), 30.0, 4)
+    chosen = scenario("handheld-walk", steps=4, landmarks=6)
+    filters = jaxslam.make_filters(chosen, ["robocentric"], ["inverse_scaling"])
+    (name,) = filters
+    paths = []
+    for motion in (own, None):
+        study = jaxslam.monte_carlo(chosen, filters, runs=1, motion=motion)
+        paths.append(study.store.load(name, study.chunks[0])["sample_true_path"])
+    assert np.abs(paths[0] - paths[1]).max() > 1e-4
+    with pytest.raises(ValueError, match="a trajectory for 4 steps, not 5"):
+        simulate(dataclasses.replace(chosen, steps=5), jax.random.key(0), motion=own)
+
+
+def test_what_is_no_trajectory_is_refused(data, tmp_path):
+    assert find(str(data)) == data
+    with pytest.raises(ValueError, match=r"no trajectory 'wakl' \(did you mean walk\?\)"):
+        scenario("handheld-wakl")
+    with pytest.raises(ValueError, match="has no 10 s without a gap: its longest piece has 4"):
+        trajectory_of(scenario("handheld-walk", steps=300))
+    (tmp_path / "short.txt").write_text("0 0 0 0 0 0 0 1\n0.1 0 0 0 0 0 0 1\n")
+    with pytest.raises(ValueError, match="its longest piece has 0"):
+        sampled(tmp_path / "short.txt", 30.0, 1)
+    (tmp_path / "other.txt").write_text("1 2 3\n")
+    with pytest.raises(ValueError, match="eight finite numbers"):
+        sampled(tmp_path / "other.txt", 30.0, 1)
+    with pytest.raises(ValueError, match="trajectory is for a spatial world"):
+        scenario("matched", trajectory="walk")
+    with pytest.raises(ValueError, match="trajectory: odometry has the nominal motion"):
+        scenario("room", trajectory="walk")
+    assert isinstance(trajectory_of(scenario("handheld-walk", steps=5)), Trajectory)
+
+
+def test_every_trajectory_of_the_shared_data_is_one(shared_data, monkeypatch):
+    monkeypatch.setenv("JAXSLAM_DATA", str(shared_data))
+    names = [path.stem for path in sorted((shared_data / "trajectories").glob("*.txt"))]
+    for name in set(names) - {"kitti_00_kitti_format"}:
+        found = trajectory_of(scenario(f"handheld-{name}"))
+        assert found is not None
+        assert found.starts.size > 500
+        norms = np.linalg.norm(found.poses[:, :4], axis=1)
+        np.testing.assert_allclose(norms, 1, rtol=1e-9)
+        position = np.asarray(found.poses)[:, 4:]
+        steps = np.linalg.norm(position[found.starts + 1] - position[found.starts], axis=1)
+        assert steps.max() * 30 < (20 if name == "kitti_00" else 5)
+    assert jnp.asarray(found.starts).dtype.kind == "i"
