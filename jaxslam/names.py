@@ -39,6 +39,7 @@ from jaxslam.slam.filter import EkfSlam
 from jaxslam.slam.protocol import AbstractFilter
 from jaxslam.wrappers.bank import Bank
 from jaxslam.wrappers.fixed_lag import LAG, FixedLag, iterated
+from jaxslam.wrappers.from_rest import from_rest
 from jaxslam.wrappers.mixture import Mixture
 
 
@@ -137,6 +138,7 @@ _AROUND_ANY_FILTER: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
     "scales": lambda slam, count: Bank(slam, 9 if count is None else count, "speed"),
     "directions": lambda slam, count: Bank(slam, 5 if count is None else count, "direction"),
     "mixture": lambda slam, count: Mixture(slam, 9 if count is None else count),
+    "rest": from_rest,
 }
 MODIFIERS: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
     **_OF_ONE_FILTER,

@@ -1,0 +1,167 @@
+"""A Gaussian sum that sets out from rest: a growing window of all frames, until parallax is there.
+
+Nobody told the filter how its camera moves. What the first frames leave open has several modes, and
+a filter that linearises where it stands picks one of them at the first pixel's noise. So everything
+since frame 0 is kept and linearised again with every frame (`jaxslam.window`), each mode for itself,
+and in every frame the members of the sum are the modes' Gaussians, weighed by their evidence. When
+the translation is known to a fraction of itself, the sum goes on alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.arrays import AnyArray, cast, precision
+from jaxslam.forms.state import Features, Innovation
+from jaxslam.geometry import Pose
+from jaxslam.slam.protocol import AbstractStaged, Capacity, Expected
+from jaxslam.window import record as window
+from jaxslam.window.handover import gauge_state
+from jaxslam.window.modes import Modes, at_rest, refined, searched, when
+from jaxslam.window.problem import Layout
+from jaxslam.window.record import Record
+from jaxslam.wrappers.bank import BankState
+from jaxslam.wrappers.mixture import Mixture
+
+SIZES = {"planar": (9, 17, 33, 61), "spatial": (9, 17, 31)}
+"""Frames of the windows that are compiled; the smallest that holds all is computed."""
+DIRECTIONS = {"planar": 16, "spatial": 8}
+"""In which the search sets out, from rest beside."""
+SEARCHES = (3, 6, 12)
+"""Frames after which minima are sought anew."""
+REFINEMENTS = 4
+"""Steps of Levenberg–Marquardt with every new frame, at the most."""
+LEAST_FRAMES = 8
+"""In the window before the sum may go on alone."""
+KNOWN = 0.1
+"""σ of the translation, in translations, given the scale: below it parallax is there."""
+
+
+class RestState(eqx.Module):
+    """The sum, and what it is begun anew from as long as the window is open."""
+
+    sum: BankState
+    record: Record
+    modes: Modes
+    open: Bool[Array, ""]
+
+
+class FromRest(AbstractStaged):
+    """The start of `base`."""
+
+    base: Mixture
+    sizes: tuple[int, ...] = eqx.field(static=True)
+    directions: int = eqx.field(static=True)
+    known: float = eqx.field(static=True, default=KNOWN)
+
+    def init(self, capacity: int | Capacity, first: Features | None = None) -> RestState:
+        ekf, count = self.base.base, self.base.count
+        dtype, (landmarks, *_) = precision(ekf), Capacity.of(capacity)
+        begun = window.empty(ekf.motion, self.sizes[-1], landmarks, ekf.sensor.size, dtype)
+        if first is not None:
+            begun = window.begun(begun, first)
+        member = ekf.init(capacity, first)
+        members = jax.tree.map(lambda x: jnp.tile(x, (count, *(1,) * x.ndim)), member)
+        modes = at_rest(cast(ekf, dtype), begun, count, dtype)
+        return RestState(BankState(members, modes.log_weights), begun, modes, jnp.ones((), bool))
+
+    def predict(self, state: RestState, control: Any) -> RestState:
+        return self._of_sum(state, self.base.predict(state.sum, control))
+
+    def gaussian(self, state: RestState, control: Any):
+        return self.base.gaussian(state.sum, control)
+
+    def predict_features(self, state: RestState, control: Any, slots: Int[Array, " m"]) -> Expected:
+        return self.base.predict_features(state.sum, control, slots)
+
+    def update(
+        self, state: RestState, control: Any, seen: Features
+    ) -> tuple[RestState, Innovation]:
+        after, innovation = self.base.update(state.sum, control, seen)
+        stepped = window.stepped(state.record, control, seen)
+        return replace(state, sum=after, record=stepped), innovation
+
+    def compose(self, state: RestState, control: Any) -> RestState:
+        return self._of_sum(state, self.base.compose(state.sum, control))
+
+    def close(self, state: RestState, new: Features) -> RestState:
+        """End the frame, and begin the sum anew from the window's modes while that is open."""
+        after = self.base.close(state.sum, new)
+        state = replace(state, sum=after, record=window.begun(state.record, new))
+        least = 1
+        for frames in self.sizes:
+            count = state.record.last + 1
+            wanted = state.open & (count > least) & (count <= frames)
+            state = self._anew(state, frames, wanted)
+            least = frames
+        return replace(state, open=state.open & ~self._ready(state))
+
+    def remove(self, state: RestState, gone: Bool[AnyArray, " capacity"]) -> RestState:
+        modes = state.modes
+        y = jnp.where(gone[:, None], 0.0, modes.minima.y)
+        return RestState(
+            self.base.remove(state.sum, gone),
+            window.removed(state.record, gone),
+            replace(modes, minima=replace(modes.minima, y=y)),
+            state.open,
+        )
+
+    def marginal(self, state: RestState, function, slots: Int[Array, " m"] | None = None):
+        return self.base.marginal(state.sum, function, slots)
+
+    def in_map(self, state: RestState) -> Bool[Array, " capacity"]:
+        return self.base.in_map(state.sum)
+
+    def pose_error(self, state: RestState, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
+        return self.base.pose_error(state.sum, T_BC)
+
+    @staticmethod
+    def _of_sum(state: RestState, after: BankState) -> RestState:
+        return replace(state, sum=after)
+
+    def _anew(self, state: RestState, frames: int, wanted: Bool[Array, ""]) -> RestState:
+        """The modes of a window of so many frames, and the sum of them."""
+        ekf, record = self.base.base, state.record.cut(frames)
+        size = Layout.of(ekf).size(frames)
+
+        def solved(state):
+            x = state.modes.minima.x
+            modes = replace(state.modes, minima=replace(state.modes.minima, x=x[:, :size]))
+            modes = refined(ekf, record, modes, REFINEMENTS, wanted)
+            due = wanted & jnp.any(record.last == jnp.array(SEARCHES))
+            modes = searched(ekf, record, modes, self.directions, due)
+            like = jax.tree.map(lambda leaf: leaf[0], state.sum.members)
+            members = jax.vmap(lambda m: gauge_state(ekf, record, m, like))(modes.minima)
+            whole = x.at[:, :size].set(modes.minima.x).at[:, size:].set(0.0)
+            modes = replace(modes, minima=replace(modes.minima, x=whole))
+            return replace(state, sum=BankState(members, modes.log_weights), modes=modes)
+
+        return when(wanted, solved, state)
+
+    def _ready(self, state: RestState) -> Bool[Array, ""]:
+        """Whether one mode is left whose translation is known, or there is no room."""
+        member = self.base.likeliest(state.sum)
+        part = member.core.part("pose")
+        n = self.base.base.motion.geometry.point_dim
+        position = slice(part.start, part.start + n)
+        variance = jnp.trace(member.covariance[position, position])
+        squared = jnp.sum(member.core.pose.translation() ** 2)
+        known = variance < self.known**2 * squared
+        enough = state.record.last >= LEAST_FRAMES
+        alone = state.sum.log_weights[0] > -1e-3
+        return state.record.full | (enough & alone & known)
+
+
+def from_rest(base: Mixture, frames: int | None = None) -> FromRest:
+    """The sum with a start that looks for itself how the camera moves."""
+    name = base.base.motion.geometry.name
+    sizes = SIZES[name]
+    if frames is not None:
+        sizes = tuple(size for size in sizes if size < frames + 1) + (frames + 1,)
+    return FromRest(base, sizes, DIRECTIONS[name])
