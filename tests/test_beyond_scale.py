@@ -6,13 +6,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Case, each_geometry, named, pose, quick_jit
+from cases import Case, central, each_geometry, named, pose, quick_jit
 from scipy import stats
 
-from jaxslam.consistency.beyond_scale import NOTICEABLE, SCALES, beyond_scale, reversal
+from jaxslam.consistency.beyond_scale import (
+    NOTICEABLE,
+    SCALES,
+    against_noisy_truth,
+    beyond_scale,
+    reversal,
+)
 from jaxslam.consistency.montecarlo import filter_run
 from jaxslam.consistency.statistics import normalised_squared
-from jaxslam.geometry import PLANAR, difference, identity, joined, scaled
+from jaxslam.geometry import PLANAR, difference, identity, joined, retract, scaled
 from jaxslam.simulation import sensor_of
 
 FALSE_ALARM = 1e-6
@@ -122,6 +128,22 @@ def test_a_reversed_path_is_best_explained_by_none():
     near = scaled(truth, jnp.asarray(0.99 * NOTICEABLE / np.hypot(1, 0.5)))
     assert np.isnan(reversal(behind, near))
     assert reversal(behind, scaled(near, jnp.asarray(1.02))) == 1
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_of_a_noisy_truth_the_noise_is_added_as_the_error_depends_on_it(geometry):
+    t = geometry.tangent_dim
+    truth, estimate, P = pose(geometry, 1), pose(geometry, 2), covariance(t)
+    sigma = np.linspace(0.1, 0.3, t)
+    for own in (lambda T: T, lambda T: T.inverse()):
+
+        def error(T, own=own):
+            return difference(own(T), own(estimate))
+
+        found, noisy = against_noisy_truth(lambda T, error=error: (error(T), P), sigma)(truth)
+        np.testing.assert_allclose(found, error(truth), rtol=0, atol=1e-14)
+        J = central(lambda d: error(retract(truth, jnp.asarray(d))), np.zeros(t))
+        np.testing.assert_allclose(noisy, P + J @ np.diag(sigma**2) @ J.T, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["robocentric", "scale_gauge+mixture3"])

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.geometry import Pose, Scalar, scaled
+from jaxslam.arrays import AnyArray
+from jaxslam.geometry import Pose, Scalar, retract, scaled, zero_tangent
 from jaxslam.linalg import cholesky
 
 STEPS = 3
@@ -22,6 +23,10 @@ SCALES = (1e-3, 1e3)
 """Least and greatest s that is tried: a reversed path is best explained by none, s = 0."""
 NOTICEABLE = 0.01
 """Displacement from which on it can be said to be reversed, m."""
+
+
+PoseError = Callable[[Pose], tuple[Float[Array, " t"], Float[Array, "t t"]]]
+"""The error against a true T_BC, and its covariance: an `AbstractFilter.pose_error` of a state."""
 
 
 class BeyondScale(NamedTuple):
@@ -36,9 +41,7 @@ class BeyondScale(NamedTuple):
     nothing depends on s."""
 
 
-def beyond_scale(
-    pose_error: Callable[[Pose], tuple[Float[Array, " t"], Float[Array, "t t"]]], truth: Pose
-) -> BeyondScale:
+def beyond_scale(pose_error: PoseError, truth: Pose) -> BeyondScale:
     """The smallest NEES over the scale of a true T_BC, of an error and covariance against any.
 
     P is that against the truth itself (of a Gaussian sum it depends on the pose, a little).
@@ -57,6 +60,21 @@ def beyond_scale(
         s = jnp.clip(s - step, *SCALES).astype(one.dtype)
     error, slope = whitened(s)
     return BeyondScale(error @ error, jnp.log(s), 1 / (s * jnp.sqrt(slope @ slope)))
+
+
+def against_noisy_truth(pose_error: PoseError, sigma: Float[AnyArray, " t"]) -> PoseError:
+    """The error against a true pose that is itself known with σ only, in the camera's axes.
+
+    To first order: `P + J diag(σ²) Jᵀ`, J of the error by the true pose.
+    """
+
+    def noisy(T_BC: Pose) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
+        error, P = pose_error(T_BC)
+        J = jax.jacfwd(lambda delta: pose_error(retract(T_BC, delta))[0])(zero_tangent(T_BC))
+        root = J * jnp.asarray(sigma)
+        return error, P + root @ root.T
+
+    return noisy
 
 
 def reversal(estimate: Pose, truth: Pose) -> Scalar:
