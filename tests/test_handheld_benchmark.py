@@ -44,6 +44,8 @@ def test_numbers_are_those_of_the_runs():
         assert found["lost"][i] == (0.04 if step > 20 else 0)
         rms = np.sqrt(np.mean(error[kept, step] ** 2))
         assert found["log_scale_rms"][i] == pytest.approx(rms)
+        median = np.median(np.where(kept, np.abs(error[:, step]), np.inf))
+        assert found["log_scale_median"][i] == pytest.approx(median)
         rms = np.sqrt(np.mean((error[kept, step] / sigma[kept, step]) ** 2))
         assert found["log_scale_normalised"][i] == pytest.approx(rms)
     assert found["beyond_scale_median"][0] == pytest.approx(np.median(nees[:, 9]) / 5)
