@@ -26,7 +26,7 @@ import tyro
 import jaxslam
 from jaxslam.arrays import cast
 from jaxslam.consistency import lost_threshold
-from jaxslam.consistency.beyond_scale import against_noisy_truth, beyond_scale, reversal
+from jaxslam.consistency.beyond_scale import beyond_scale, reversal
 from jaxslam.consistency.recursion import Frame, run_through
 from jaxslam.datasets import tracks
 from jaxslam.files import write_atomically
@@ -155,8 +155,7 @@ def _through(slam: AbstractFilter, room: Room, runs: Run) -> dict[str, jax.Array
     """Records of a batch of windows, against a truth that is itself uncertain."""
 
     def told(state: Any, innovation: Any, frame: Frame) -> dict[str, jax.Array]:
-        pose_error = against_noisy_truth(partial(slam.pose_error, state), TRUTH_SIGMA)
-        best = beyond_scale(pose_error, frame.pose)
+        best = beyond_scale(partial(slam.pose_error, state), frame.pose, TRUTH_SIGMA)
         estimate, _ = camera_pose(slam, state)
         found = (*best, reversal(estimate, frame.pose), innovation.nis, innovation.nis_dof)
         return dict(zip(RECORDS, found, strict=True))

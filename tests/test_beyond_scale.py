@@ -6,13 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Case, central, each_geometry, named, pose, quick_jit
+from cases import Case, each_geometry, named, pose, quick_jit
 from scipy import stats
 
 from jaxslam.consistency.beyond_scale import (
     NOTICEABLE,
     SCALES,
-    against_noisy_truth,
     beyond_scale,
     reversal,
 )
@@ -131,19 +130,30 @@ def test_a_reversed_path_is_best_explained_by_none():
 
 
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
-def test_of_a_noisy_truth_the_noise_is_added_as_the_error_depends_on_it(geometry):
-    t = geometry.tangent_dim
-    truth, estimate, P = pose(geometry, 1), pose(geometry, 2), covariance(t)
-    sigma = np.linspace(0.1, 0.3, t)
-    for own in (lambda T: T, lambda T: T.inverse()):
+def test_the_noise_of_the_truth_is_of_the_scale_of_the_estimate(geometry):
+    """An estimate that is right in its own unit, against truths that are not."""
+    t, count = geometry.tangent_dim, 3000
+    truth, sigma = pose(geometry, 1), 1e-3 * np.linspace(1.0, 2.0, t)
+    estimate, P = scaled(truth, jnp.asarray(4.0)), 1e-6 * covariance(t)
+    keys = jax.random.split(jax.random.key(0))
+    noises = sigma * jax.random.normal(keys[0], (count, t))
+    own_noises = jax.random.normal(keys[1], (count, t)) @ np.linalg.cholesky(P).T
 
-        def error(T, own=own):
-            return difference(own(T), own(estimate))
+    def one(noise, own_noise):
+        near = retract(truth, noise)
+        of = lambda T: (difference(T, estimate) + own_noise, P)  # noqa: E731
+        return beyond_scale(of, near, sigma)
 
-        found, noisy = against_noisy_truth(lambda T, error=error: (error(T), P), sigma)(truth)
-        np.testing.assert_allclose(found, error(truth), rtol=0, atol=1e-14)
-        J = central(lambda d: error(retract(truth, jnp.asarray(d))), np.zeros(t))
-        np.testing.assert_allclose(noisy, P + J @ np.diag(sigma**2) @ J.T, rtol=1e-6, atol=1e-9)
+    found = quick_jit(jax.vmap(one))(noises, own_noises)
+    low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], count * (t - 1))
+    # To first order in noise of a thousandth.
+    assert 0.99 * low < np.sum(found.nees) < 1.01 * high
+    low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], count)
+    normalised = (found.log_scale - np.log(4.0)) / found.sigma
+    assert 0.99 * low < np.sum(normalised**2) < 1.01 * high
+    # Without the truth's noise it is far too large.
+    bare = beyond_scale(lambda T: (difference(T, estimate), P), retract(truth, noises[0]))
+    assert bare.nees > 2 * one(noises[0], 0 * own_noises[0]).nees
 
 
 @pytest.mark.parametrize("name", ["robocentric", "scale_gauge+mixture3"])

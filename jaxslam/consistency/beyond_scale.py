@@ -41,40 +41,41 @@ class BeyondScale(NamedTuple):
     nothing depends on s."""
 
 
-def beyond_scale(pose_error: PoseError, truth: Pose) -> BeyondScale:
+def beyond_scale(
+    pose_error: PoseError, truth: Pose, truth_sigma: Float[AnyArray, " t"] | None = None
+) -> BeyondScale:
     """The smallest NEES over the scale of a true T_BC, of an error and covariance against any.
 
-    P is that against the truth itself (of a Gaussian sum it depends on the pose, a little).
+    P is that against the truth itself (of a Gaussian sum it depends on the pose, a little). Of a
+    truth that is itself known with σ only, in the camera's axes, it is `P + J(s) diag(σ²) J(s)ᵀ`,
+    J(s) of e(s) by the true pose.
     """
-    whitening = cholesky(pose_error(truth)[1]).whitening
+    P = pose_error(truth)[1]
+    fixed = cholesky(P).whitening
+
+    def error(s: Scalar, truth: Pose) -> Float[Array, " t"]:
+        return pose_error(scaled(truth, s))[0]
+
+    def whitening(s: Scalar) -> Float[Array, "t t"]:
+        if truth_sigma is None:
+            return fixed
+        J = jax.jacfwd(lambda delta: error(s, retract(truth, delta)))(zero_tangent(truth))
+        root = J * jnp.asarray(truth_sigma)
+        return cholesky(P + root @ root.T).whitening
 
     def whitened(s: Scalar) -> tuple[Float[Array, " t"], Float[Array, " t"]]:
         """The error against T(s) and its derivative by s, both whitened."""
-        return jax.jvp(lambda s: whitening @ pose_error(scaled(truth, s))[0], (s,), (one,))
+        W = whitening(s)
+        return jax.jvp(lambda s: W @ error(s, truth), (s,), (one,))
 
     s = one = jnp.ones((), truth.translation().dtype)
     for _ in range(STEPS):
-        error, slope = whitened(s)
+        e, slope = whitened(s)
         curvature = slope @ slope
-        step = (slope @ error) / jnp.where(curvature > 0, curvature, 1.0)
+        step = (slope @ e) / jnp.where(curvature > 0, curvature, 1.0)
         s = jnp.clip(s - step, *SCALES).astype(one.dtype)
-    error, slope = whitened(s)
-    return BeyondScale(error @ error, jnp.log(s), 1 / (s * jnp.sqrt(slope @ slope)))
-
-
-def against_noisy_truth(pose_error: PoseError, sigma: Float[AnyArray, " t"]) -> PoseError:
-    """The error against a true pose that is itself known with σ only, in the camera's axes.
-
-    To first order: `P + J diag(σ²) Jᵀ`, J of the error by the true pose.
-    """
-
-    def noisy(T_BC: Pose) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
-        error, P = pose_error(T_BC)
-        J = jax.jacfwd(lambda delta: pose_error(retract(T_BC, delta))[0])(zero_tangent(T_BC))
-        root = J * jnp.asarray(sigma)
-        return error, P + root @ root.T
-
-    return noisy
+    e, slope = whitened(s)
+    return BeyondScale(e @ e, jnp.log(s), 1 / (s * jnp.sqrt(slope @ slope)))
 
 
 def reversal(estimate: Pose, truth: Pose) -> Scalar:
