@@ -4,7 +4,23 @@ Needs the extra `posterior`: blackjax and optimistix.
 """
 
 from jaxslam.posterior.laplace import Laplace, laplace, map_estimate, minima, pose_gaussian, starts
+from jaxslam.posterior.mixtures import (
+    PoseMixture,
+    cross_entropy,
+    entropy,
+    mixture_divergence,
+    mixture_moments,
+    mixture_of_modes,
+)
+from jaxslam.posterior.modes import (
+    mode_weights,
+    nearest_mode,
+    reversed_draws,
+    second_mode,
+    valley,
+)
 from jaxslam.posterior.moments import gaussian_divergence, pose_moments, wasserstein
+from jaxslam.posterior.multimodal import Draws, tempered_sample
 from jaxslam.posterior.problem import (
     Problem,
     Unknowns,
@@ -26,19 +42,26 @@ from jaxslam.posterior.study import (
     pooled,
     reference,
 )
+from jaxslam.posterior.tempered import SMC, Particles, tempered
 
 __all__ = [
     "HMC",
+    "SMC",
     "Chains",
+    "Draws",
     "Laplace",
+    "Particles",
+    "PoseMixture",
     "Problem",
     "Study",
     "Unknowns",
     "against_filter",
     "check_scenario",
     "converged",
+    "cross_entropy",
     "diagnose",
     "draw_runs",
+    "entropy",
     "first_steps",
     "gaussian_divergence",
     "given_bound",
@@ -47,6 +70,11 @@ __all__ = [
     "make_problem",
     "map_estimate",
     "minima",
+    "mixture_divergence",
+    "mixture_moments",
+    "mixture_of_modes",
+    "mode_weights",
+    "nearest_mode",
     "path",
     "pooled",
     "pose_gaussian",
@@ -54,9 +82,14 @@ __all__ = [
     "ranks",
     "reference",
     "residuals",
+    "reversed_draws",
     "sample",
+    "second_mode",
     "starts",
+    "tempered",
+    "tempered_sample",
     "uniformity",
     "unknowns",
+    "valley",
     "wasserstein",
 ]

@@ -42,8 +42,8 @@ so that no variable has their length as its period."""
 class SMC:
     """How many particles move how far: static configuration."""
 
-    particles: int = 512
-    moves: int = 3
+    particles: int = 2048
+    moves: int = 2
     """Trajectories of every particle between two powers."""
     leapfrogs: int = 6
     """Leapfrog steps of a trajectory."""
@@ -52,14 +52,18 @@ class SMC:
     particles before they move, so that more than it survive."""
     acceptance: float = 0.8
     """What the adaptation of the step size aims at."""
-    most_powers: int = 60
-    """Powers β at the most; where 1 is not reached with them the draws are none."""
+    last: int = 3
+    """How often the particles move at β = 1."""
+    most_rounds: int = 60
+    """Rounds of resampling and moving at the most; where β = 1 is not reached with them the
+    draws are none."""
     landmark_draws: int = 8
     """Draws of every landmark given a path, of which one is kept."""
 
     def __post_init__(self) -> None:
-        least = {"particles": 8, "moves": 1, "leapfrogs": 1, "most_powers": 2, "landmark_draws": 1}
-        for field, value in least.items():
+        least = {"particles": 8, "last": 1, "most_rounds": 2}
+        ones = ("moves", "leapfrogs", "landmark_draws")
+        for field, value in {**least, **dict.fromkeys(ones, 1)}.items():
             if getattr(self, field) < value:
                 raise ValueError(f"{field} must be at least {value}, not {getattr(self, field)}")
         for field in ("survivors", "acceptance"):
@@ -68,15 +72,17 @@ class SMC:
 
 
 class Trace(eqx.Module):
-    """What happened at every power; NaN after the last."""
+    """What happened in every round; NaN after the last."""
 
-    power: Float[Array, " powers"]
-    """β that was reached."""
-    effective: Float[Array, " powers"]
-    """Effective sample size of the weights by which the particles went there."""
-    acceptance: Float[Array, " powers"]
-    """Mean acceptance of the moves before."""
-    step_size: Float[Array, " powers"]
+    power: Float[Array, " rounds"]
+    """β that the particles have weights for at its end."""
+    effective: Float[Array, " rounds"]
+    """Effective sample size by these weights."""
+    acceptance: Float[Array, " rounds"]
+    """Mean acceptance of its moves, which were at the β of the round before."""
+    step_size: Float[Array, " rounds"]
+    distinct: Float[Array, " rounds"]
+    """How many particles were left by its resampling, not counting copies."""
 
 
 class Particles(eqx.Module):
@@ -85,12 +91,8 @@ class Particles(eqx.Module):
     position: Float[Array, "s n"]
     log_evidence: Float[Array, ""]
     """`log ∫ exp(log likelihood) N(y; 0, I) dy`."""
-    distinct: Int[Array, ""]
-    """How many different particles there were before the last moves."""
     reached: Bool[Array, ""]
-    """Whether β = 1 was reached."""
-    count: Int[Array, ""]
-    """How many powers there were."""
+    """Whether they have moved at β = 1 as often as they should."""
     trace: Trace
 
 
@@ -99,49 +101,45 @@ class _Carry(NamedTuple):
     state: Any
     log_step: Float[Array, ""]
     log_evidence: Float[Array, ""]
-    distinct: Int[Array, ""]
+    left: Int[Array, ""]
+    """Rounds at β = 1 that are still to come."""
     count: Int[Array, ""]
     trace: Trace
 
 
 def tempered(settings: SMC, log_likelihood: LogLikelihood, like: Array, key: Array) -> Particles:
     """Draws of the posterior `∝ exp(log_likelihood(y)) N(y; 0, I)` of a y shaped like `like`."""
-    first_key, key, last_key = jax.random.split(key, 3)
+    first_key, key = jax.random.split(key)
     start = jax.random.normal(first_key, (settings.particles, like.size), like.dtype)
-    state = blackjax.smc.adaptive_tempered.init(start)
-    nothing = jnp.full(settings.most_powers, jnp.nan, like.dtype)
-    zero = jnp.zeros((), like.dtype)
-    carry = _Carry(
-        key,
-        state._replace(weights=state.weights.astype(like.dtype), tempering_param=zero),
-        jnp.log(zero + FIRST_STEP_SIZE),
-        zero,
-        jnp.asarray(settings.particles),
-        jnp.asarray(0),
-        Trace(nothing, nothing, nothing, nothing),
-    )
 
     def going(carry):
-        return (carry.state.tempering_param < 1) & (carry.count < settings.most_powers)
+        return (carry.left > 0) & (carry.count < settings.most_rounds)
 
     def advance(carry):
         return _advanced(settings, log_likelihood, carry)
 
-    end = jax.lax.while_loop(going, advance, carry)
-    # The weights of the last power are not equal yet: it resamples and moves once more.
-    last = _advanced(settings, log_likelihood, end._replace(key=last_key))
-    return Particles(
-        position=last.state.particles,
-        log_evidence=end.log_evidence,
-        distinct=last.distinct,
-        reached=end.state.tempering_param >= 1,
-        count=end.count,
-        trace=end.trace,
+    end = jax.lax.while_loop(going, advance, _begun(settings, start, key))
+    return Particles(end.state.particles, end.log_evidence, end.left == 0, end.trace)
+
+
+def _begun(settings: SMC, start: Float[Array, "s n"], key: Array) -> _Carry:
+    zero = jnp.zeros((), start.dtype)
+    weights = jnp.full(len(start), 1 / len(start), start.dtype)
+    state = blackjax.smc.tempered.TemperedSMCState(start, weights, zero)
+    nothing = jnp.full(settings.most_rounds, jnp.nan, start.dtype)
+    return _Carry(
+        key,
+        state,
+        jnp.log(zero + FIRST_STEP_SIZE),
+        zero,
+        jnp.asarray(settings.last),
+        jnp.asarray(0),
+        Trace(*(nothing,) * 5),
     )
 
 
 def _advanced(settings: SMC, log_likelihood: LogLikelihood, carry: _Carry) -> _Carry:
-    """Resampled, moved and weighted for the next power, which is 1 again after 1."""
+    """Resampled, moved and weighted for the next power: after 1 it is 1, and weights are equal."""
     key, step_key = jax.random.split(carry.key)
     metric = mean_information(log_likelihood, carry.state)
     kernel = blackjax.adaptive_tempered_smc(
@@ -161,13 +159,14 @@ def _advanced(settings: SMC, log_likelihood: LogLikelihood, carry: _Carry) -> _C
         1 / jnp.sum(state.weights**2),
         accepted,
         jnp.exp(carry.log_step),
+        jnp.sum(jnp.bincount(info.ancestors, length=settings.particles) > 0),
     )
     return _Carry(
         key,
         state,
         carry.log_step + GAIN * (accepted - settings.acceptance),
         carry.log_evidence + info.log_likelihood_increment,
-        jnp.sum(jnp.bincount(info.ancestors, length=settings.particles) > 0),
+        carry.left - (carry.state.tempering_param >= 1),
         carry.count + 1,
         jax.tree.map(lambda all, one: all.at[carry.count].set(one), carry.trace, trace),
     )
