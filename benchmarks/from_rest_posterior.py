@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -47,7 +47,7 @@ from jaxslam.posterior.modes import LEAST_SHARE
 from jaxslam.posterior.summary import summarise_nees
 from jaxslam.watchdog import finished
 
-Records = Mapping[str, np.ndarray]
+Records = dict[str, np.ndarray]
 
 STREAM = 0x74656D70
 """What is folded into a run's key for the particles, which are not the run's own draws."""

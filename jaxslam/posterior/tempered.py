@@ -21,7 +21,6 @@ import blackjax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from blackjax.smc import extend_params
 from blackjax.smc.resampling import systematic
 from jaxtyping import Array, Bool, Float, Int
 
@@ -74,15 +73,15 @@ class SMC:
 class Trace(eqx.Module):
     """What happened in every round; NaN after the last."""
 
-    power: Float[Array, " rounds"]
+    power: Float[Array, "*rounds"]
     """β that the particles have weights for at its end."""
-    effective: Float[Array, " rounds"]
-    """Effective sample size by these weights."""
-    acceptance: Float[Array, " rounds"]
+    effective: Float[Array, "*rounds"]
+    """Effective share of the particles by these weights."""
+    acceptance: Float[Array, "*rounds"]
     """Mean acceptance of its moves, which were at the β of the round before."""
-    step_size: Float[Array, " rounds"]
-    distinct: Float[Array, " rounds"]
-    """How many particles were left by its resampling, not counting copies."""
+    step_size: Float[Array, "*rounds"]
+    distinct: Float[Array, "*rounds"]
+    """Share of the particles that its resampling left; the others became copies of them."""
 
 
 class Particles(eqx.Module):
@@ -142,12 +141,13 @@ def _advanced(settings: SMC, log_likelihood: LogLikelihood, carry: _Carry) -> _C
     """Resampled, moved and weighted for the next power: after 1 it is 1, and weights are equal."""
     key, step_key = jax.random.split(carry.key)
     metric = mean_information(log_likelihood, carry.state)
+    shared = {"size": jnp.exp(carry.log_step), **metric._asdict()}
     kernel = blackjax.adaptive_tempered_smc(
         _log_prior,
         log_likelihood,
         _trajectory(settings.leapfrogs),
         blackjax.hmc.init,
-        extend_params({"size": jnp.exp(carry.log_step), **metric._asdict()}),
+        {name: value[None] for name, value in shared.items()},  # of all particles
         systematic,
         settings.survivors,
         num_mcmc_steps=settings.moves,
@@ -156,10 +156,10 @@ def _advanced(settings: SMC, log_likelihood: LogLikelihood, carry: _Carry) -> _C
     accepted = jnp.mean(info.update_info.acceptance_rate)
     trace = Trace(
         state.tempering_param,
-        1 / jnp.sum(state.weights**2),
+        1 / jnp.sum(state.weights**2) / settings.particles,
         accepted,
         jnp.exp(carry.log_step),
-        jnp.sum(jnp.bincount(info.ancestors, length=settings.particles) > 0),
+        jnp.mean(jnp.bincount(info.ancestors, length=settings.particles) > 0, dtype=accepted.dtype),
     )
     return _Carry(
         key,
