@@ -29,19 +29,20 @@ from jaxslam.files import write_atomically
 from jaxslam.geometry import Pose, difference
 from jaxslam.posterior import (
     SMC,
-    Problem,
+    Draws,
     Study,
     draw_runs,
+    halves,
     make_problem,
     mixture_divergence,
     mixture_of_modes,
+    pool,
     pose_moments,
     ranks,
     reversed_draws,
     second_mode,
     tempered_sample,
     uniformity,
-    valley,
 )
 from jaxslam.posterior.modes import LEAST_SHARE
 from jaxslam.posterior.summary import summarise_nees
@@ -52,6 +53,12 @@ Records = dict[str, np.ndarray]
 STREAM = 0x74656D70
 """What is folded into a run's key for the particles, which are not the run's own draws."""
 REPEATS = 2
+SAMPLER = (
+    "landmarks_effective", "rounds", "acceptance", "least_distinct", "least_effective",
+)  # fmt: skip
+BY_RUN = (
+    "pooled_nees", "nees", "log_evidence", "reversed", "second_mode", "pooled_second_mode",
+)  # fmt: skip
 KEPT = 99
 """Draws that a truth is ranked among."""
 THINNED = 8
@@ -98,11 +105,15 @@ def drawn(study: Study, options: Options, indices: range) -> Records:
     runs = draw_runs(study, options.seed, indices)
     problems = jax.vmap(partial(make_problem, study.scenario))(runs)
     truth = jax.tree.map(lambda x: x[:, -1], runs.poses)
-    base = jax.vmap(partial(jax.random.fold_in, jax.random.key(options.seed)))(jnp.asarray(indices))
-    keys = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, STREAM), REPEATS))(base)
+    keys = jax.vmap(partial(_keys, jax.random.key(options.seed)))(jnp.asarray(indices))
     where = f"tempered particles of {study.scenario.name}, runs {indices}"
     found = finished(_drawn(options.smc, problems, truth, keys), where)
     return {name: np.asarray(value) for name, value in found.items()}
+
+
+def _keys(key: jax.Array, index: jax.Array) -> jax.Array:
+    """One of every repeat, and one of their pool."""
+    return jax.random.split(jax.random.fold_in(jax.random.fold_in(key, index), STREAM), REPEATS + 1)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -111,48 +122,48 @@ def _drawn(settings: SMC, problems, truth, keys) -> dict[str, jax.Array]:
 
     def of_run(data):
         problem, truth, keys = data
-        T_BC, records = jax.lax.map(partial(_repeat, settings, problem), keys)
-        of_repeat = jax.vmap(partial(_pose_errors, truth))(T_BC)
-        both = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), T_BC)
-        pooled = {f"pooled_{name}": x for name, x in _pose_errors(truth, both).items()}
-        draws = pose_moments(both)[2][::THINNED]
-        return {**records, **of_repeat, **pooled, "draws": draws}
+        repeats = jax.lax.map(partial(tempered_sample, settings, problem), keys[:-1])
+        of_repeat = jax.vmap(partial(_of_draws, truth))(repeats)
+        pooled = pool(repeats, keys[-1])
+        own = {f"pooled_{name}": x for name, x in _of_draws(truth, pooled).items()}
+        kept = pose_moments(pooled.last)[2][::THINNED]
+        return {**of_repeat, **own, **jax.vmap(_of_particles)(repeats), "draws": kept}
 
     return jax.lax.map(of_run, (problems, truth, keys))
 
 
-def _repeat(settings: SMC, problem: Problem, key: jax.Array) -> tuple[Pose, dict[str, jax.Array]]:
-    """T_BC after the last step, and what is known without the truth."""
-    draws = tempered_sample(settings, problem, key)
-    last, trace = draws.last, draws.trace
-    two = second_mode(last) >= LEAST_SHARE
-    labels = reversed_draws(last).astype(int)
-    sides = mixture_of_modes(last, jnp.where(two, labels, 0), 2)
-    return last, {
-        "log_evidence": draws.log_evidence,
-        "reversed": jnp.mean(labels, dtype=draws.velocity.dtype),
-        "second_mode": second_mode(last),
-        "valley": valley(last),
-        "kl_of_one_gaussian": mixture_divergence(last, mixture_of_modes(last, 0 * labels, 1)),
-        "kl_of_a_gaussian_a_mode": mixture_divergence(last, sides),
-        "landmarks_effective": draws.effective,
-        "reached": draws.reached,
-        "rounds": jnp.sum(~jnp.isnan(trace.power)),
-        "acceptance": jnp.nanmean(trace.acceptance),
-        "least_distinct": jnp.nanmin(trace.distinct) / settings.particles,
-        "least_effective": jnp.nanmin(trace.effective) / settings.particles,
-    }
-
-
-def _pose_errors(truth: Pose, T_BC: Pose) -> dict[str, jax.Array]:
-    """Error, covariance and NEES of the draws' mean, in the right tangent there."""
-    mean, P, _ = pose_moments(T_BC)
+def _of_draws(truth: Pose, draws: Draws) -> dict[str, jax.Array]:
+    """NEES, modes and divergences of the last pose, in the right tangent at its mean."""
+    mean, P, tangents = pose_moments(draws.last)
     error = difference(truth, mean)
+    behind = reversed_draws(draws.last)
+    group = halves(tangents)
+    group = jnp.where(second_mode(tangents, group) >= LEAST_SHARE, group, False)
+    one, two = (mixture_of_modes(draws.last, x.astype(int), 2) for x in (group & False, group))
     return {
         "nees": normalised_squared(error, P),
         "error": error,
         "covariance": P,
         "mean": mean.parameters(),
+        "log_evidence": draws.log_evidence,
+        "reversed": jnp.mean(behind, dtype=P.dtype),
+        "reversed_mode": second_mode(draws.last.translation(), behind),
+        "second_mode": jnp.mean(group, dtype=P.dtype),
+        "kl_of_one_gaussian": mixture_divergence(draws.last, one),
+        "kl_of_two_gaussians": mixture_divergence(draws.last, two),
+    }
+
+
+def _of_particles(draws: Draws) -> dict[str, jax.Array]:
+    """How well the particles did."""
+    trace = draws.trace
+    return {
+        "landmarks_effective": draws.effective,
+        "reached": draws.reached,
+        "rounds": jnp.sum(~jnp.isnan(trace.power)),
+        "acceptance": jnp.nanmean(trace.acceptance),
+        "least_distinct": jnp.nanmin(trace.distinct),
+        "least_effective": jnp.nanmin(trace.effective),
     }
 
 
@@ -172,40 +183,36 @@ def summarise(records: Records) -> dict[str, Any]:
         "sigma": _root_mean_square(np.sqrt(np.diagonal(r["pooled_covariance"], 0, 1, 2))),
         "modes": _modes(r),
         "repeats": _agreement(r),
-        "kl": {name: _quantiles(r[name].mean(axis=1)) for name in r if name.startswith("kl_")},
-        "sampler": {
-            name: _quantiles(r[name])
-            for name in (
-                "landmarks_effective", "rounds", "acceptance", "least_distinct", "least_effective",
-            )
-        },
-        "by_run": {
-            name: np.round(r[name], 4).tolist()
-            for name in ("pooled_nees", "nees", "log_evidence", "reversed", "valley", "second_mode")
-        },
-    }  # fmt: skip
-
-
-def _modes(r: Records) -> dict[str, Any]:
-    """Share of the runs with a second mode, by the mean of the repeats' weights of it."""
-    weights = r["second_mode"].mean(axis=1)
-    several = weights > LEAST_SHARE
-    return {
-        "with_second_mode": float(several.mean()),
-        "with_reversed_draws": float(np.mean(r["reversed"].mean(axis=1) > LEAST_SHARE)),
-        "weight_of_second": _quantiles(weights[several]) if several.any() else None,
-        "nees_with_second_mode": float(r["pooled_nees"][several].mean()) if several.any() else None,
+        "kl": {name: _quantiles(r[name]) for name in r if name.startswith("pooled_kl_")},
+        "sampler": {name: _quantiles(r[name]) for name in SAMPLER},
+        "by_run": {name: np.round(r[name], 4).tolist() for name in BY_RUN},
     }
 
 
+def _modes(r: Records) -> dict[str, Any]:
+    """Share of the runs with a second mode of more than 5 %: any, and the reversed one."""
+    found = {}
+    for name in ("second_mode", "reversed_mode"):
+        weights = r[f"pooled_{name}"]
+        several = weights > LEAST_SHARE
+        found[name] = {
+            "runs": float(several.mean()),
+            "runs_by_repeat": [float(x) for x in np.mean(r[name] > LEAST_SHARE, axis=0)],
+            "weight": _quantiles(weights[several]) if several.any() else None,
+            "nees": float(r["pooled_nees"][several].mean()) if several.any() else None,
+        }
+    return found
+
+
 def _agreement(r: Records) -> dict[str, Any]:
-    """Differences of the two repeats: log evidence, weight of reversed draws, mean over σ."""
+    """Differences of the two repeats: log evidence, weights, mean and log σ."""
     sigma = np.sqrt(np.diagonal(r["pooled_covariance"], 0, 1, 2))
     apart = (r["error"][:, 0] - r["error"][:, 1]) / sigma
     spreads = np.sqrt(np.diagonal(r["covariance"], 0, 2, 3))
     return {
         "log_evidence": _quantiles(np.abs(np.diff(r["log_evidence"]))),
         "reversed": _quantiles(np.abs(np.diff(r["reversed"]))),
+        "second_mode": _quantiles(np.abs(np.diff(r["second_mode"]))),
         "mean_over_sigma": _quantiles(np.abs(apart)),
         "log_sigma": _quantiles(np.abs(np.diff(np.log(spreads), axis=1))),
     }

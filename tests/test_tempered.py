@@ -25,6 +25,7 @@ from jaxslam.posterior import (
     cross_entropy,
     draw_runs,
     entropy,
+    halves,
     make_problem,
     map_estimate,
     mixture_divergence,
@@ -32,6 +33,7 @@ from jaxslam.posterior import (
     mixture_of_modes,
     mode_weights,
     nearest_mode,
+    pool,
     pooled,
     pose_moments,
     reversed_draws,
@@ -58,9 +60,9 @@ BENT = jaxslam.scenario(
     "matched-loose",
     steps=4,
     landmarks=2,
-    velocity=(3.0, 3.0, 0.0),
-    inverse_depth=(0.3, 0.25),
-    pixel_sigma=3.0,
+    velocity=(10.0, 20.0, 0.0),
+    inverse_depth=(0.1, 0.08),
+    pixel_sigma=30.0,
 )
 """Few pixels, of landmarks so near that they are no linear functions of inverse depth."""
 REST = jaxslam.scenario(
@@ -259,7 +261,7 @@ def test_the_slope_of_the_likelihood_of_a_path_is_its_own_nearly():
     density = quick_jit(partial(marginal_log_likelihood, problem))
     slope = quick_jit(jax.grad(partial(marginal_log_likelihood, problem)))(y)
     numbers = central(lambda y: density(y)[None], np.asarray(y))[0]
-    np.testing.assert_allclose(numbers, slope, rtol=1e-3)
+    np.testing.assert_allclose(numbers, slope, rtol=0.05)
 
 
 @cache
@@ -351,6 +353,24 @@ def test_every_draw_is_whole():
     assert draws.unknowns.inverse_depths.min() > LOOSE.least_inverse_depth
 
 
+def test_repeats_are_pooled_by_their_evidence():
+    draws, _ = on_one_mode()
+    shifted = jax.tree.map(lambda x: x + 100.0, draws.velocity)
+    one, two = draws, replace(draws, velocity=shifted, log_evidence=draws.log_evidence + np.log(3))
+    both = pool(jax.tree.map(lambda *x: jnp.stack(x), one, two), jax.random.key(0))
+    assert both.velocity.shape == (3000, 3)
+    assert np.mean(both.velocity[:, 0] > 50) == pytest.approx(0.75, abs=1e-3)
+    assert both.log_evidence - draws.log_evidence == pytest.approx(np.log(2))
+    # A draw is taken as a whole.
+    depths = np.asarray(both.unknowns.inverse_depths)
+    order = [
+        int(np.flatnonzero((draws.unknowns.inverse_depths == w).all(axis=1))[0])
+        for w in depths[[0, 1700, 2999]]
+    ]
+    velocities = both.velocity[jnp.array([0, 1700, 2999])] % 100.0
+    np.testing.assert_allclose(velocities, draws.velocity[jnp.array(order)] % 100.0, atol=1e-9)
+
+
 def test_no_tempered_posterior_calls_lapack():
     problem = problem_of(LOOSE)
     one = partial(tempered_sample, replace(FEW, particles=8))
@@ -368,25 +388,43 @@ def two_sided(share, apart, count=2000, sigma=0.1):
     return SE2.from_xy_theta(*jnp.asarray(xy).T, jnp.asarray(theta)), other
 
 
-def test_reversed_draws_are_those_beyond_the_origin_from_most():
-    for share in (0.2, 0.45):
-        poses, other = two_sided(share, 0.5)
-        np.testing.assert_array_equal(reversed_draws(poses), other)
-        assert valley(poses) < 0.1
-        assert second_mode(poses) == pytest.approx(share)
+@pytest.mark.parametrize("share", [0.2, 0.45])
+def test_reversed_draws_are_those_beyond_the_origin_from_most(share):
+    poses, other = two_sided(share, 0.5)
+    group = quick_jit(reversed_draws)(poses)
+    np.testing.assert_array_equal(group, other)
+    assert valley(poses.translation(), group) < 0.1
+    assert second_mode(poses.translation(), group) == pytest.approx(share)
 
 
 def test_one_mode_around_the_origin_has_no_second():
     poses, _ = two_sided(0.5, 0.0)
-    assert 0.4 < np.mean(reversed_draws(poses)) < 0.6
-    assert valley(poses) > 1
-    assert second_mode(poses) == 0
+    _, _, tangents = pose_moments(poses)
+    behind, group = reversed_draws(poses), quick_jit(halves)(tangents)
+    for points, lesser in ((poses.translation(), behind), (tangents, group)):
+        assert 0.4 < np.mean(lesser) <= 0.5
+        assert valley(points, lesser) > 1
+        assert second_mode(points, lesser) == 0
 
 
-def test_without_a_draw_beyond_the_origin_there_is_no_second_mode():
+def test_without_a_draw_beyond_the_origin_there_is_no_reversed_mode():
     poses, _ = two_sided(0.0, 1.0)
-    assert not reversed_draws(poses).any()
-    assert second_mode(poses) == 0
+    group = reversed_draws(poses)
+    assert not group.any()
+    assert second_mode(poses.translation(), group) == 0
+
+
+@pytest.mark.parametrize("share", [0.1, 0.4])
+def test_halves_are_the_modes_whatever_units_and_correlations_hide_them(share):
+    """Two sharp sides in one of three numbers, which a linear map mixes with the others."""
+    rng = np.random.default_rng(0)
+    other = np.arange(1000) < share * 1000
+    points = rng.normal(size=(1000, 3)) * [0.05, 1.0, 1.0]
+    points[:, 0] += np.where(other, -0.5, 0.5)
+    mixed = points @ np.array([[1.0, 2.0, 1e-3], [30.0, 1.0, 0.0], [0.0, 0.0, 1e-3]]).T + 7.0
+    group = quick_jit(halves)(jnp.asarray(mixed))
+    np.testing.assert_array_equal(group, other)
+    assert second_mode(jnp.asarray(mixed), group) == pytest.approx(share)
 
 
 def modes_of(share, apart, sigma=0.1):
@@ -457,10 +495,9 @@ def test_a_mode_without_draws_has_no_weight_and_does_no_harm():
         )
     )
     assert cross_entropy(poses, found) == pytest.approx(float(cross_entropy(poses, without)))
-    for one, other_one in zip(mixture_moments(found), mixture_moments(without), strict=True):
-        np.testing.assert_allclose(
-            *(getattr(x, "parameters", lambda x=x: x)() for x in (one, other_one)), atol=1e-12
-        )
+    (mean, P), (expected, S) = mixture_moments(found), mixture_moments(without)
+    np.testing.assert_allclose(difference(mean, expected), 0, atol=1e-12)
+    np.testing.assert_allclose(P, S, atol=1e-12)
 
 
 @pytest.mark.parametrize(

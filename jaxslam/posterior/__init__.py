@@ -13,6 +13,7 @@ from jaxslam.posterior.mixtures import (
     mixture_of_modes,
 )
 from jaxslam.posterior.modes import (
+    halves,
     mode_weights,
     nearest_mode,
     reversed_draws,
@@ -20,7 +21,7 @@ from jaxslam.posterior.modes import (
     valley,
 )
 from jaxslam.posterior.moments import gaussian_divergence, pose_moments, wasserstein
-from jaxslam.posterior.multimodal import Draws, tempered_sample
+from jaxslam.posterior.multimodal import Draws, pool, tempered_sample
 from jaxslam.posterior.problem import (
     Problem,
     Unknowns,
@@ -65,6 +66,7 @@ __all__ = [
     "first_steps",
     "gaussian_divergence",
     "given_bound",
+    "halves",
     "laplace",
     "log_density",
     "make_problem",
@@ -76,6 +78,7 @@ __all__ = [
     "mode_weights",
     "nearest_mode",
     "path",
+    "pool",
     "pooled",
     "pose_gaussian",
     "pose_moments",

@@ -85,7 +85,9 @@ def landmarks_given(problem: Problem, x: Unknowns, poses: Pose) -> Landmarks:
     around = first.mean.at[:, -1].max(bound)
     found, possible = _linearised(problem, x, poses, jax.lax.stop_gradient(around))
     sigma = found.whitening[:, -1, -1]
-    lowest = (bound - found.mean[:, -1]) / sigma
+    # Where there is no bound the slope by σ would be that of ∞/σ.
+    some = jnp.isfinite(bound)
+    lowest = jnp.where(some, (jnp.where(some, bound, 0.0) - found.mean[:, -1]) / sigma, -jnp.inf)
     above = _log_above(lowest) - _log_above(bound)
     log_det = jnp.sum(jnp.log(jnp.diagonal(found.whitening, axis1=1, axis2=2)), axis=1)
     return Landmarks(

@@ -67,3 +67,30 @@ def tempered_sample(settings: SMC, problem: Problem, key: Array) -> Draws:
         reached=found.reached,
         trace=found.trace,
     )
+
+
+def pool(repeats: Draws, key: Array) -> Draws:
+    """Independent repeats, the first axis of all arrays, as draws of one: each by its evidence.
+
+    Where few of the first particles find a narrow mode its weight errs by much more than later
+    particles can tell. The repeats of more evidence then found more of it, and count by that much.
+    """
+    count, draws = repeats.velocity.shape[:2]
+    weights = jnp.repeat(jax.nn.softmax(repeats.log_evidence), draws) / draws
+    chosen = systematic(key, weights, count * draws)
+
+    def taken(x):
+        return x.reshape(count * draws, *x.shape[2:])[chosen]
+
+    unknowns, T_BC, velocity = jax.tree.map(
+        taken, (repeats.unknowns, repeats.T_BC, repeats.velocity)
+    )
+    return Draws(
+        unknowns=unknowns,
+        T_BC=T_BC,
+        velocity=velocity,
+        log_evidence=logsumexp(repeats.log_evidence) - jnp.log(count),
+        effective=jnp.mean(repeats.effective),
+        reached=jnp.all(repeats.reached),
+        trace=repeats.trace,
+    )

@@ -44,14 +44,14 @@ class SMC:
     particles: int = 2048
     moves: int = 2
     """Trajectories of every particle between two powers."""
-    leapfrogs: int = 6
+    leapfrogs: int = 5
     """Leapfrog steps of a trajectory."""
     survivors: float = 0.4
     """Effective share of the particles that the next power is to leave. It is foreseen from the
     particles before they move, so that more than it survive."""
     acceptance: float = 0.8
     """What the adaptation of the step size aims at."""
-    last: int = 3
+    last: int = 2
     """How often the particles move at β = 1."""
     most_rounds: int = 60
     """Rounds of resampling and moving at the most; where β = 1 is not reached with them the
