@@ -60,9 +60,9 @@ BENT = jaxslam.scenario(
     "matched-loose",
     steps=4,
     landmarks=2,
-    velocity=(10.0, 20.0, 0.0),
-    inverse_depth=(0.1, 0.08),
-    pixel_sigma=30.0,
+    velocity=(5.0, 10.0, 0.0),
+    inverse_depth=(0.15, 0.1),
+    pixel_sigma=10.0,
 )
 """Few pixels, of landmarks so near that they are no linear functions of inverse depth."""
 REST = jaxslam.scenario(
@@ -268,19 +268,19 @@ def test_the_slope_of_the_likelihood_of_a_path_is_its_own_nearly():
 def bent():
     """A path with bent pixels, its exact likelihood and moments, and landmarks drawn of it."""
     problem, y = problem_of(BENT), true_path(BENT)
-    keys = jax.random.split(jax.random.key(0), 4000)
-    draws = quick_jit(jax.vmap(lambda key: landmark_draws(problem, y, key, 4)))(keys)
+    keys = jax.random.split(jax.random.key(0), 20000)
+    draws = quick_jit(jax.vmap(lambda key: landmark_draws(problem, y, key, 8)))(keys)
     return marginal_log_likelihood(problem, y), by_quadrature(problem, y), draws
 
 
 def test_the_weight_of_a_path_makes_its_likelihood_exact_where_pixels_are_bent():
-    """Bounds: 5 standard errors of 4000 draws."""
+    """Bounds: 5 standard errors of 20 000 draws."""
     value, (expected, _), (_, log_weights) = bent()
-    assert abs(value - expected) > 0.02, (value, expected)  # the linear model's own is wrong here
+    assert abs(value - expected) > 0.1  # the linear model's own is wrong here
     weights = np.exp(log_weights)
-    error = 5 * weights.std() / np.sqrt(4000)
+    error = 5 * weights.std() / np.sqrt(20000)
     assert np.exp(expected - value) == pytest.approx(weights.mean(), abs=error)
-    assert error < 0.01
+    assert error < 0.03
 
 
 def test_weighted_landmarks_have_their_exact_moments():
@@ -289,9 +289,9 @@ def test_weighted_landmarks_have_their_exact_moments():
     omega = np.asarray(x.inverse_depths)
     mean = weights @ omega
     sigma = np.sqrt(moments[:, 1])
-    np.testing.assert_allclose((mean - moments[:, 0]) / sigma, 0, atol=5 / np.sqrt(4000))
+    np.testing.assert_allclose((mean - moments[:, 0]) / sigma, 0, atol=5 / np.sqrt(10000))
     variance = weights @ (omega - mean) ** 2
-    np.testing.assert_allclose(variance / moments[:, 1], 1, atol=0.15)
+    np.testing.assert_allclose(variance / moments[:, 1], 1, atol=0.1)
     assert omega.min() > BENT.least_inverse_depth
 
 

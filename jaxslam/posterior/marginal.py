@@ -73,6 +73,8 @@ def marginal_log_likelihood(problem: Problem, y: Float[Array, " n"]) -> Float[Ar
 def landmarks_given(problem: Problem, x: Unknowns, poses: Pose) -> Landmarks:
     """The linear model of every landmark at the end of one step of Gauss–Newton.
 
+    One is enough while the camera has moved by less than its distance from the landmarks; after
+    more the weights of `landmark_draws` differ much, and few draws count.
     No derivative is taken through that step: a Hamiltonian trajectory is reversible whatever its
     forces are.
     """

@@ -62,7 +62,7 @@ def _lesser(group: Bool[Array, " s"]) -> Bool[Array, " s"]:
     return group ^ (jnp.mean(group) > 0.5)
 
 
-def _mean(points: Float[Array, s * k], group: Bool[Array, " s"]) -> Float[Array, "*k"]:
+def _mean(points: Float[Array, "s ..."], group: Bool[Array, " s"]) -> Array:
     weights = group / jnp.maximum(jnp.sum(group), 1)
     return weights.astype(points.dtype) @ points
 
