@@ -176,7 +176,7 @@ def summarise(records: Records) -> dict[str, Any]:
     return {
         "runs": len(used),
         "used": int(used.sum()),
-        "nees": summarise_nees(r["pooled_nees"], dof),
+        "nees": {**summarise_nees(r["pooled_nees"], dof), **_expected(r)},
         "nees_of_repeats": [summarise_nees(nees, dof) for nees in r["nees"].T],
         "rank_p_values": [float(value) for value in p],
         "rmse": _root_mean_square(r["pooled_error"]),
@@ -187,6 +187,20 @@ def summarise(records: Records) -> dict[str, Any]:
         "sampler": {name: _quantiles(r[name]) for name in SAMPLER},
         "by_run": {name: np.round(r[name], 4).tolist() for name in BY_RUN},
     }
+
+
+def _expected(r: Records) -> dict[str, float]:
+    """By the posteriors' own draws: σ of the mean NEES, and p that its ranks among theirs are even.
+
+    The mean is the degrees of freedom whatever the posteriors' shape, but for those with long tails
+    or several modes the χ² band is too narrow.
+    """
+    own = np.einsum(
+        "rsi,rij,rsj->rs", r["draws"], np.linalg.inv(r["pooled_covariance"]), r["draws"]
+    )
+    _, p = uniformity(ranks(r["pooled_nees"][:, None], own[..., None], KEPT), KEPT)
+    spread = np.sqrt(np.sum(np.var(own, axis=1))) / len(own)
+    return {"spread_of_mean": float(spread), "rank_p_value": float(p[0])}
 
 
 def _modes(r: Records) -> dict[str, Any]:

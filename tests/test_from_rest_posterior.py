@@ -9,8 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import jaxslam
-
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 import from_rest_posterior as benchmark
@@ -49,7 +47,9 @@ def test_the_summary_says_of_known_records_what_they_are():
     assert found["used"] == RUNS
     low, high = found["nees"]["band95"]
     assert low < found["nees"]["mean"] < high
-    assert min(found["rank_p_values"]) > 1e-3
+    assert min(*found["rank_p_values"], found["nees"]["rank_p_value"]) > 1e-3
+    # The variance of χ² with 3 degrees of freedom is 6.
+    assert found["nees"]["spread_of_mean"] == pytest.approx(np.sqrt(6 / RUNS), rel=0.1)
     np.testing.assert_allclose(found["sigma"], 1)
     assert found["modes"]["second_mode"]["runs"] == pytest.approx(0.1)
     assert found["modes"]["second_mode"]["weight"]["median"] == pytest.approx(0.2)
@@ -97,10 +97,9 @@ def test_options_that_make_no_sense_are_refused():
 
 
 def test_the_file_in_the_repository_is_calibrated():
-    """Of 60 runs of which the truth is a draw of the prior; false alarms 0.1 % and 0.3 %."""
+    """Of 60 runs of which the truth is a draw of the prior; false alarms 0.3 % and 0.4 %."""
     path = Path(benchmark.__file__).parent / "results" / "from_rest_posterior.json"
     found = json.loads(path.read_text())
     assert found["used"] == found["runs"] == 60
-    low, high = jaxslam.mean_band(3, 60, confidence=0.999)
-    assert low < found["nees"]["mean"] < high
-    assert min(found["rank_p_values"]) > 1e-3
+    assert abs(found["nees"]["mean"] - 3) < 3 * found["nees"]["spread_of_mean"]
+    assert min(*found["rank_p_values"], found["nees"]["rank_p_value"]) > 1e-3
