@@ -9,10 +9,15 @@ import pytest
 from cases import Case, each_geometry, named, pose, quick_jit
 from scipy import stats
 
-from jaxslam.consistency.beyond_scale import NOTICEABLE, SCALES, beyond_scale, reversal
+from jaxslam.consistency.beyond_scale import (
+    NOTICEABLE,
+    SCALES,
+    beyond_scale,
+    reversal,
+)
 from jaxslam.consistency.montecarlo import filter_run
 from jaxslam.consistency.statistics import normalised_squared
-from jaxslam.geometry import PLANAR, difference, identity, joined, scaled
+from jaxslam.geometry import PLANAR, difference, identity, joined, retract, scaled
 from jaxslam.simulation import sensor_of
 
 FALSE_ALARM = 1e-6
@@ -122,6 +127,33 @@ def test_a_reversed_path_is_best_explained_by_none():
     near = scaled(truth, jnp.asarray(0.99 * NOTICEABLE / np.hypot(1, 0.5)))
     assert np.isnan(reversal(behind, near))
     assert reversal(behind, scaled(near, jnp.asarray(1.02))) == 1
+
+
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_the_noise_of_the_truth_is_of_the_scale_of_the_estimate(geometry):
+    """An estimate that is right in its own unit, against truths that are not."""
+    t, count = geometry.tangent_dim, 3000
+    truth, sigma = pose(geometry, 1), 1e-3 * np.linspace(1.0, 2.0, t)
+    estimate, P = scaled(truth, jnp.asarray(4.0)), 1e-6 * covariance(t)
+    keys = jax.random.split(jax.random.key(0))
+    noises = sigma * jax.random.normal(keys[0], (count, t))
+    own_noises = jax.random.normal(keys[1], (count, t)) @ np.linalg.cholesky(P).T
+
+    def one(noise, own_noise):
+        near = retract(truth, noise)
+        of = lambda T: (difference(T, estimate) + own_noise, P)  # noqa: E731
+        return beyond_scale(of, near, sigma)
+
+    found = quick_jit(jax.vmap(one))(noises, own_noises)
+    low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], count * (t - 1))
+    # To first order in noise of a thousandth.
+    assert 0.99 * low < np.sum(found.nees) < 1.01 * high
+    low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], count)
+    normalised = (found.log_scale - np.log(4.0)) / found.sigma
+    assert 0.99 * low < np.sum(normalised**2) < 1.01 * high
+    # Without the truth's noise it is far too large.
+    bare = beyond_scale(lambda T: (difference(T, estimate), P), retract(truth, noises[0]))
+    assert bare.nees > 2 * one(noises[0], 0 * own_noises[0]).nees
 
 
 @pytest.mark.parametrize("name", ["robocentric", "scale_gauge+mixture3"])

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import quick_jit
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 import jaxslam
 from jaxslam.consistency import (
@@ -239,12 +239,18 @@ def test_scale_is_reported_where_nothing_is_told_in_metres():
     fewer = [axes.get_title() for axes in plot_consistency(study, measured).axes]
     scale = {"pose NEES given the scale (ideal 2)", "log of the scale: error and claimed σ"}
     assert set(titles) - set(fewer) == scale
+    result = summary["filters"]["inverse_scaling"]
+    log_scale = next(a for a in plot_consistency(study, summary).axes if "log of" in a.get_title())
+    error, ideal = (np.asarray(line.get_ydata()) for line in log_scale.lines[:2])
+    np.testing.assert_array_equal(error, result["log_scale"]["error_median"])
+    np.testing.assert_allclose(
+        ideal, norm.ppf(0.75) * np.array(result["log_scale"]["sigma_median"]), rtol=1e-4
+    )
     row = next(
         line
         for line in jaxslam.table(summary).split("given the scale")[1].splitlines()
         if line.startswith("inverse_scaling")
     )
-    result = summary["filters"]["inverse_scaling"]
     for value in (result["beyond_scale"]["nees"][-1], result["log_scale"]["error_rms"][-1]):
         assert f" {value:.3f}" in row
     assert "given the scale" not in jaxslam.table(measured)

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.geometry import Pose, Scalar, scaled
+from jaxslam.arrays import AnyArray
+from jaxslam.geometry import Pose, Scalar, retract, scaled, zero_tangent
 from jaxslam.linalg import cholesky
 
 STEPS = 3
@@ -22,6 +23,10 @@ SCALES = (1e-3, 1e3)
 """Least and greatest s that is tried: a reversed path is best explained by none, s = 0."""
 NOTICEABLE = 0.01
 """Displacement from which on it can be said to be reversed, m."""
+
+
+PoseError = Callable[[Pose], tuple[Float[Array, " t"], Float[Array, "t t"]]]
+"""The error against a true T_BC, and its covariance: an `AbstractFilter.pose_error` of a state."""
 
 
 class BeyondScale(NamedTuple):
@@ -37,26 +42,40 @@ class BeyondScale(NamedTuple):
 
 
 def beyond_scale(
-    pose_error: Callable[[Pose], tuple[Float[Array, " t"], Float[Array, "t t"]]], truth: Pose
+    pose_error: PoseError, truth: Pose, truth_sigma: Float[AnyArray, " t"] | None = None
 ) -> BeyondScale:
     """The smallest NEES over the scale of a true T_BC, of an error and covariance against any.
 
-    P is that against the truth itself (of a Gaussian sum it depends on the pose, a little).
+    P is that against the truth itself (of a Gaussian sum it depends on the pose, a little). Of a
+    truth that is itself known with σ only, in the camera's axes, it is `P + J(s) diag(σ²) J(s)ᵀ`,
+    J(s) of e(s) by the true pose.
     """
-    whitening = cholesky(pose_error(truth)[1]).whitening
+    P = pose_error(truth)[1]
+    fixed = cholesky(P).whitening
+
+    def error(s: Scalar, truth: Pose) -> Float[Array, " t"]:
+        return pose_error(scaled(truth, s))[0]
+
+    def whitening(s: Scalar) -> Float[Array, "t t"]:
+        if truth_sigma is None:
+            return fixed
+        J = jax.jacfwd(lambda delta: error(s, retract(truth, delta)))(zero_tangent(truth))
+        root = J * jnp.asarray(truth_sigma)
+        return cholesky(P + root @ root.T).whitening
 
     def whitened(s: Scalar) -> tuple[Float[Array, " t"], Float[Array, " t"]]:
         """The error against T(s) and its derivative by s, both whitened."""
-        return jax.jvp(lambda s: whitening @ pose_error(scaled(truth, s))[0], (s,), (one,))
+        W = whitening(s)
+        return jax.jvp(lambda s: W @ error(s, truth), (s,), (one,))
 
     s = one = jnp.ones((), truth.translation().dtype)
     for _ in range(STEPS):
-        error, slope = whitened(s)
+        e, slope = whitened(s)
         curvature = slope @ slope
-        step = (slope @ error) / jnp.where(curvature > 0, curvature, 1.0)
+        step = (slope @ e) / jnp.where(curvature > 0, curvature, 1.0)
         s = jnp.clip(s - step, *SCALES).astype(one.dtype)
-    error, slope = whitened(s)
-    return BeyondScale(error @ error, jnp.log(s), 1 / (s * jnp.sqrt(slope @ slope)))
+    e, slope = whitened(s)
+    return BeyondScale(e @ e, jnp.log(s), 1 / (s * jnp.sqrt(slope @ slope)))
 
 
 def reversal(estimate: Pose, truth: Pose) -> Scalar:

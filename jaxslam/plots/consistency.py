@@ -17,6 +17,8 @@ from jaxslam.plots.style import GREY, line_style, new_figure, save
 
 _FARTHEST = 1 / 60
 """Least inverse distance that the map draws, 1/m."""
+_MEDIAN_OF_NORMAL = 0.6745
+"""Median of |x| for a standard normal x."""
 
 
 def plot_consistency(
@@ -112,16 +114,16 @@ def _plot_beyond_scale(axes: Axes, summary: dict[str, Any]) -> None:
 
 
 def _plot_log_scale(axes: Axes, summary: dict[str, Any]) -> None:
-    """The error of log-scale, and the σ claimed: its median, as one reversed run, in which
-    nothing depends on the scale, has a σ beyond all others."""
+    """The error of log-scale and what it should be by the σ claimed: medians, as one reversed run,
+    which no scale explains, has an error and a σ beyond all others."""
     time = np.array(summary["time"])
     for i, f in enumerate(summary["filters"].values()):
         style, scale = line_style(i), f["log_scale"]
-        axes.plot(time, np.array(scale["error_rms"], float), lw=1.8, **style)
-        sigma = np.array(scale["sigma_median"], float)
-        axes.plot(time, sigma, color=style["color"], lw=0.9, ls=(0, (4, 2)))
-    axes.plot([], [], color=GREY, lw=1.8, label="error, rms of runs")
-    axes.plot([], [], color=GREY, lw=0.9, ls=(0, (4, 2)), label="σ claimed, median of runs")
+        axes.plot(time, np.array(scale["error_median"], float), lw=1.8, **style)
+        ideal = _MEDIAN_OF_NORMAL * np.array(scale["sigma_median"], float)
+        axes.plot(time, ideal, color=style["color"], lw=0.9, ls=(0, (4, 2)))
+    axes.plot([], [], color=GREY, lw=1.8, label="|error|, median of runs")
+    axes.plot([], [], color=GREY, lw=0.9, ls=(0, (4, 2)), label="by the σ claimed: 0.67 σ, median")
     axes.set_yscale("log")
     _name_decades(axes)
     _over_time(axes, time)

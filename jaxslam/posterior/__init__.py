@@ -4,7 +4,24 @@ Needs the extra `posterior`: blackjax and optimistix.
 """
 
 from jaxslam.posterior.laplace import Laplace, laplace, map_estimate, minima, pose_gaussian, starts
+from jaxslam.posterior.mixtures import (
+    PoseMixture,
+    cross_entropy,
+    entropy,
+    mixture_divergence,
+    mixture_moments,
+    mixture_of_modes,
+)
+from jaxslam.posterior.modes import (
+    halves,
+    mode_weights,
+    nearest_mode,
+    reversed_draws,
+    second_mode,
+    valley,
+)
 from jaxslam.posterior.moments import gaussian_divergence, pose_moments, wasserstein
+from jaxslam.posterior.multimodal import Draws, pool, tempered_sample
 from jaxslam.posterior.problem import (
     Problem,
     Unknowns,
@@ -26,37 +43,56 @@ from jaxslam.posterior.study import (
     pooled,
     reference,
 )
+from jaxslam.posterior.tempered import SMC, Particles, tempered
 
 __all__ = [
     "HMC",
+    "SMC",
     "Chains",
+    "Draws",
     "Laplace",
+    "Particles",
+    "PoseMixture",
     "Problem",
     "Study",
     "Unknowns",
     "against_filter",
     "check_scenario",
     "converged",
+    "cross_entropy",
     "diagnose",
     "draw_runs",
+    "entropy",
     "first_steps",
     "gaussian_divergence",
     "given_bound",
+    "halves",
     "laplace",
     "log_density",
     "make_problem",
     "map_estimate",
     "minima",
+    "mixture_divergence",
+    "mixture_moments",
+    "mixture_of_modes",
+    "mode_weights",
+    "nearest_mode",
     "path",
+    "pool",
     "pooled",
     "pose_gaussian",
     "pose_moments",
     "ranks",
     "reference",
     "residuals",
+    "reversed_draws",
     "sample",
+    "second_mode",
     "starts",
+    "tempered",
+    "tempered_sample",
     "uniformity",
     "unknowns",
+    "valley",
     "wasserstein",
 ]

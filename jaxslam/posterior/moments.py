@@ -18,15 +18,21 @@ def pose_moments(poses: Pose) -> tuple[Pose, Float[Array, "t t"], Float[Array, "
 
     The mean is the pose at which the draws' tangent vectors have mean zero.
     """
+    count = poses.parameters().shape[0]
+    mean, draws = mean_pose(poses, jnp.full(count, 1 / count, poses.parameters().dtype))
+    return mean, covariance(draws), draws
+
+
+def mean_pose(poses: Pose, weights: Float[Array, " s"]) -> tuple[Pose, Float[Array, "s t"]]:
+    """Mean of poses by weights whose sum is 1, and the poses in the right tangent at it."""
 
     def tangents(mean):
         return jax.vmap(lambda pose: difference(pose, mean))(poses)
 
-    mean = jax.tree.map(lambda x: x[0], poses)
+    mean = jax.tree.map(lambda x: x[jnp.argmax(weights)], poses)
     for _ in range(MEAN_ITERATIONS):
-        mean = retract(mean, jnp.mean(tangents(mean), axis=0))
-    draws = tangents(mean)
-    return mean, covariance(draws), draws
+        mean = retract(mean, weights @ tangents(mean))
+    return mean, tangents(mean)
 
 
 def covariance(draws: Float[Array, "s k"]) -> Float[Array, "k k"]:

@@ -149,7 +149,7 @@ def unknowns(problem: Problem, y: Float[Array, " n"]) -> Unknowns:
     )
 
 
-def truncated_normal(y: Float[Array, "*l"], lower: Float[Array, ""]) -> Float[Array, "*l"]:
+def truncated_normal(y: Float[Array, "*l"], lower: Float[Array, "*#l"]) -> Float[Array, "*l"]:
     """The quantile of N(0, 1) truncated below `lower` at the probability Φ(y).
 
     It makes a standard normal y a truncated one. Each half is computed from its own tail, so that

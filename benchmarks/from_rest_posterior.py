@@ -1,0 +1,291 @@
+"""Is the exact posterior of a camera that sets out from rest calibrated, and how many modes has it?
+
+`python benchmarks/from_rest_posterior.py` draws the posterior of simulated runs by tempered
+sequential Monte Carlo, each twice with other particles, and writes
+`benchmarks/results/from_rest_posterior.json`, anew after every chunk. `--cache FOLDER` keeps what
+was drawn, and the same command goes on with it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+import jaxslam
+from jaxslam.consistency import FolderStore, MemoryStore
+from jaxslam.consistency.statistics import normalised_squared
+from jaxslam.files import write_atomically
+from jaxslam.geometry import Pose, difference
+from jaxslam.posterior import (
+    SMC,
+    Draws,
+    Study,
+    draw_runs,
+    halves,
+    make_problem,
+    mixture_divergence,
+    mixture_of_modes,
+    pool,
+    pose_moments,
+    ranks,
+    reversed_draws,
+    second_mode,
+    tempered_sample,
+    uniformity,
+)
+from jaxslam.posterior.modes import LEAST_SHARE
+from jaxslam.posterior.summary import summarise_nees
+from jaxslam.watchdog import finished
+
+Records = dict[str, np.ndarray]
+
+STREAM = 0x74656D70
+"""What is folded into a run's key for the particles, which are not the run's own draws."""
+REPEATS = 2
+SAMPLER = (
+    "landmarks_effective", "rounds", "acceptance", "least_distinct", "least_effective",
+)  # fmt: skip
+BY_RUN = (
+    "pooled_nees", "nees", "log_evidence", "reversed", "second_mode", "pooled_second_mode",
+)  # fmt: skip
+KEPT = 99
+"""Draws that a truth is ranked among."""
+THINNED = 8
+"""One draw of so many is kept for the ranks."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure."""
+
+    steps: int = 10
+    """Frames after the first; the posterior is taken at the last."""
+    landmarks: int = 12
+    velocity_sigma: tuple[float, ...] = (0.5, 0.5, 0.2)
+    """σ of the velocity around rest, m/s and rad/s."""
+    runs: int = 60
+    chunk: int = 10
+    """Runs after which the numbers are written."""
+    seed: int = 0
+    smc: SMC = field(default_factory=SMC)
+    cache: Path | None = None
+    """Folder that keeps the records of the chunks."""
+    out: Path = Path("benchmarks/results/from_rest_posterior.json")
+
+    def __post_init__(self) -> None:
+        if self.runs < 2 or self.chunk < 1:
+            raise ValueError(f"at least 2 runs in chunks of 1, not {self.runs} and {self.chunk}")
+
+
+def standstill(options: Options) -> Study:
+    """The study of a planar camera whose velocity is only known to be about 0."""
+    scenario = jaxslam.scenario(
+        "matched-loose",
+        steps=options.steps,
+        landmarks=options.landmarks,
+        velocity=(0.0, 0.0, 0.0),
+        velocity_sigma=options.velocity_sigma,
+    )
+    return Study(scenario, options.steps)
+
+
+def drawn(study: Study, options: Options, indices: range) -> Records:
+    """Records of runs, axes run, repeat; the program is the same for all chunks."""
+    runs = draw_runs(study, options.seed, indices)
+    problems = jax.vmap(partial(make_problem, study.scenario))(runs)
+    truth = jax.tree.map(lambda x: x[:, -1], runs.poses)
+    keys = jax.vmap(partial(_keys, jax.random.key(options.seed)))(jnp.asarray(indices))
+    where = f"tempered particles of {study.scenario.name}, runs {indices}"
+    found = finished(_drawn(options.smc, problems, truth, keys), where)
+    return {name: np.asarray(value) for name, value in found.items()}
+
+
+def _keys(key: jax.Array, index: jax.Array) -> jax.Array:
+    """One of every repeat, and one of their pool."""
+    return jax.random.split(jax.random.fold_in(jax.random.fold_in(key, index), STREAM), REPEATS + 1)
+
+
+@partial(jax.jit, static_argnums=0)
+def _drawn(settings: SMC, problems, truth, keys) -> dict[str, jax.Array]:
+    """One run and repeat after the other: each has as many rounds as it needs."""
+
+    def of_run(data):
+        problem, truth, keys = data
+        repeats = jax.lax.map(partial(tempered_sample, settings, problem), keys[:-1])
+        of_repeat = jax.vmap(partial(_of_draws, truth))(repeats)
+        pooled = pool(repeats, keys[-1])
+        own = {f"pooled_{name}": x for name, x in _of_draws(truth, pooled).items()}
+        kept = pose_moments(pooled.last)[2][::THINNED]
+        return {**of_repeat, **own, **jax.vmap(_of_particles)(repeats), "draws": kept}
+
+    return jax.lax.map(of_run, (problems, truth, keys))
+
+
+def _of_draws(truth: Pose, draws: Draws) -> dict[str, jax.Array]:
+    """NEES, modes and divergences of the last pose, in the right tangent at its mean."""
+    mean, P, tangents = pose_moments(draws.last)
+    error = difference(truth, mean)
+    behind = reversed_draws(draws.last)
+    group = halves(tangents)
+    group = jnp.where(second_mode(tangents, group) >= LEAST_SHARE, group, False)
+    one, two = (mixture_of_modes(draws.last, x.astype(int), 2) for x in (group & False, group))
+    return {
+        "nees": normalised_squared(error, P),
+        "error": error,
+        "covariance": P,
+        "mean": mean.parameters(),
+        "log_evidence": draws.log_evidence,
+        "reversed": jnp.mean(behind, dtype=P.dtype),
+        "reversed_mode": second_mode(draws.last.translation(), behind),
+        "second_mode": jnp.mean(group, dtype=P.dtype),
+        "kl_of_one_gaussian": mixture_divergence(draws.last, one),
+        "kl_of_two_gaussians": mixture_divergence(draws.last, two),
+    }
+
+
+def _of_particles(draws: Draws) -> dict[str, jax.Array]:
+    """How well the particles did."""
+    trace = draws.trace
+    return {
+        "landmarks_effective": draws.effective,
+        "reached": draws.reached,
+        "rounds": jnp.sum(~jnp.isnan(trace.power)),
+        "acceptance": jnp.nanmean(trace.acceptance),
+        "least_distinct": jnp.nanmin(trace.distinct),
+        "least_effective": jnp.nanmin(trace.effective),
+    }
+
+
+def summarise(records: Records) -> dict[str, Any]:
+    """Numbers of the runs whose particles reached the whole likelihood in every repeat."""
+    used = np.all(records["reached"], axis=1)
+    r = {name: value[used] for name, value in records.items()}
+    dof = r["error"].shape[-1]
+    _, p = uniformity(ranks(r["pooled_error"], r["draws"], KEPT), KEPT)
+    return {
+        "runs": len(used),
+        "used": int(used.sum()),
+        "nees": {**summarise_nees(r["pooled_nees"], dof), **_expected(r)},
+        "nees_of_repeats": [summarise_nees(nees, dof) for nees in r["nees"].T],
+        "rank_p_values": [float(value) for value in p],
+        "rmse": _root_mean_square(r["pooled_error"]),
+        "sigma": _root_mean_square(np.sqrt(np.diagonal(r["pooled_covariance"], 0, 1, 2))),
+        "modes": _modes(r),
+        "repeats": _agreement(r),
+        "kl": {name: _quantiles(r[name]) for name in r if name.startswith("pooled_kl_")},
+        "sampler": {name: _quantiles(r[name]) for name in SAMPLER},
+        "by_run": {name: np.round(r[name], 4).tolist() for name in BY_RUN},
+    }
+
+
+def _expected(r: Records) -> dict[str, float]:
+    """By the posteriors' own draws: σ of the mean NEES, and p that its ranks among theirs are even.
+
+    The mean is the degrees of freedom whatever the posteriors' shape, but for those with long tails
+    or several modes the χ² band is too narrow.
+    """
+    own = np.einsum(
+        "rsi,rij,rsj->rs", r["draws"], np.linalg.inv(r["pooled_covariance"]), r["draws"]
+    )
+    _, p = uniformity(ranks(r["pooled_nees"][:, None], own[..., None], KEPT), KEPT)
+    spread = np.sqrt(np.sum(np.var(own, axis=1))) / len(own)
+    return {"spread_of_mean": float(spread), "rank_p_value": float(p[0])}
+
+
+def _modes(r: Records) -> dict[str, Any]:
+    """Share of the runs with a second mode of more than 5 %: any, and the reversed one."""
+    found = {}
+    for name in ("second_mode", "reversed_mode"):
+        weights = r[f"pooled_{name}"]
+        several = weights > LEAST_SHARE
+        found[name] = {
+            "runs": float(several.mean()),
+            "runs_by_repeat": [float(x) for x in np.mean(r[name] > LEAST_SHARE, axis=0)],
+            "weight": _quantiles(weights[several]) if several.any() else None,
+            "nees": float(r["pooled_nees"][several].mean()) if several.any() else None,
+        }
+    return found
+
+
+def _agreement(r: Records) -> dict[str, Any]:
+    """Differences of the two repeats: log evidence, weights, mean and log σ."""
+    sigma = np.sqrt(np.diagonal(r["pooled_covariance"], 0, 1, 2))
+    apart = (r["error"][:, 0] - r["error"][:, 1]) / sigma
+    spreads = np.sqrt(np.diagonal(r["covariance"], 0, 2, 3))
+    return {
+        "log_evidence": _quantiles(np.abs(np.diff(r["log_evidence"]))),
+        "reversed": _quantiles(np.abs(np.diff(r["reversed"]))),
+        "second_mode": _quantiles(np.abs(np.diff(r["second_mode"]))),
+        "mean_over_sigma": _quantiles(np.abs(apart)),
+        "log_sigma": _quantiles(np.abs(np.diff(np.log(spreads), axis=1))),
+    }
+
+
+def _quantiles(values: np.ndarray) -> dict[str, float]:
+    names = {"median": 0.5, "worst_tenth": 0.9, "most": 1.0, "least": 0.0}
+    return {name: float(np.quantile(values, q)) for name, q in names.items()}
+
+
+def _root_mean_square(values: np.ndarray) -> list[float]:
+    """Of each coordinate over the runs."""
+    return np.sqrt(np.mean(values**2, axis=0)).tolist()
+
+
+def measure(options: Options) -> Iterator[dict[str, Any]]:
+    """The summary of all runs so far, after every chunk."""
+    study, store = standstill(options), _store(options)
+    chunks = [
+        range(start, min(start + options.chunk, options.runs))
+        for start in range(0, options.runs, options.chunk)
+    ]
+    parts = []
+    for chunk in chunks:
+        if not store.has("from_rest", chunk):
+            start = time.perf_counter()
+            store.save("from_rest", chunk, drawn(study, options, chunk))
+            print(f"{chunk.stop} runs, {time.perf_counter() - start:.0f} s", flush=True)
+        parts.append(store.load("from_rest", chunk))
+        yield summarise({name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
+
+
+def _store(options: Options) -> FolderStore | MemoryStore:
+    if options.cache is None:
+        return MemoryStore()
+    return FolderStore(options.cache, _settings(options), resume=True)
+
+
+def _settings(options: Options) -> dict[str, Any]:
+    """What the numbers depend on."""
+    given = dataclasses.asdict(options)
+    return {name: given[name] for name in ("steps", "landmarks", "velocity_sigma", "seed", "smc")}
+
+
+def main(options: Options) -> None:
+    """Measure, and write the file after every chunk."""
+    jax.config.update("jax_enable_x64", True)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    for summary in measure(options):
+        written = {
+            "schema": 1,
+            "version": jaxslam.__version__,
+            **_settings(options),
+            "device": jax.devices()[0].device_kind,
+            **summary,
+        }
+        with write_atomically(options.out) as temporary:
+            temporary.write_text(json.dumps(written, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))

@@ -1,0 +1,274 @@
+"""Filters along real trajectories and on recorded tracks: what is right beyond the scale?
+
+    python benchmarks/handheld.py --filters robocentric scale_gauge+scene50+mixture9 --runs 200
+
+Simulates runs along every trajectory in $JAXSLAM_DATA/trajectories (../shared/data by default), as
+`jaxslam consistency --scenario handheld-NAME` does, and runs the same filters on the tracks of real
+drives in $JAXSLAM_DATA/kitti_tracks. Results are added to `handheld.json` one filter at a time;
+what it already has, of as many runs, is not run again. `docs/handheld.md` is written from it, by
+`--page` alone from what is there.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+import tyro
+
+import jaxslam
+from jaxslam.arrays import cast
+from jaxslam.consistency import lost_threshold
+from jaxslam.consistency.beyond_scale import beyond_scale, reversal
+from jaxslam.consistency.recursion import Frame, run_through
+from jaxslam.datasets import tracks
+from jaxslam.files import write_atomically
+from jaxslam.simulation import Room, Run, Scenario, sightings
+from jaxslam.simulation.trajectories import folder
+from jaxslam.slam.protocol import AbstractFilter
+from jaxslam.slam.readouts import camera_pose
+
+DOF = 5
+"""Of a pose in space beyond its scale."""
+STEPS = (10, 30, 60, 100, 150)
+"""Of which numbers are shown, where a run has them; and the last."""
+TRACKS_PIXEL_SIGMA = 0.5
+"""Of a tracked point, which drifts, pixels."""
+TRUTH_SIGMA = np.array([0.1] * 3 + [np.radians(0.1)] * 3)
+"""Of the true poses of the drives, m and rad."""
+RECORDS = ("beyond_scale", "log_scale", "log_scale_sigma", "reversed", "nis", "nis_dof")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure."""
+
+    filters: tuple[str, ...] = ("world", "robocentric", "scale_gauge+scene50+mixture9")
+    """Filters, with modifiers."""
+    landmarks: str = "inverse_scaling"
+    """Landmark parametrization."""
+    trajectories: tuple[str, ...] = ()
+    """Names of trajectories; all of the data folder by default."""
+    drives: tuple[str, ...] = ()
+    """Names of drives with tracks; all of the data folder by default."""
+    runs: int = 200
+    """Simulated runs along every trajectory."""
+    steps: int = 150
+    """Of a simulated run."""
+    starts: int = 20
+    """Windows of every drive."""
+    frames: int = 100
+    """Steps of a window of a drive."""
+    seed: int = 0
+    """Of the simulated runs."""
+    chunk: int = 25
+    """Runs in one batch."""
+    out: Path = Path("benchmarks/results/handheld.json")
+    """The results, added to."""
+    docs: Path = Path("docs/handheld.md")
+    """The page."""
+    page: bool = False
+    """Only write the page."""
+
+
+def main(options: Options) -> None:
+    """Measure what is not measured yet, one filter at a time, and write the page."""
+    results = json.loads(options.out.read_text()) if options.out.exists() else {}
+    for where, name, wanted, measure in () if options.page else _studies(options):
+        found = results.setdefault(where, {}).get(name)
+        if found and all(found.get(key) == value for key, value in wanted.items()):
+            continue
+        results[where][name] = {**wanted, **measure()}
+        print(f"{where} {name}: {_row(results[where][name], -1)}", flush=True)
+        with write_atomically(options.out) as path:
+            path.write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
+    with write_atomically(options.docs) as path:
+        path.write_text(page(results))
+
+
+def _studies(options: Options) -> Iterator[tuple[str, str, dict[str, int], Any]]:
+    """Of what, by which filter, of how many runs, and the function that measures it."""
+    simulated = {"runs": options.runs, "steps": options.steps, "seed": options.seed}
+    recorded = {"runs": options.starts, "steps": options.frames}
+    for trajectory in options.trajectories or _known("trajectories/*.txt", "kitti_format"):
+        chosen = jaxslam.scenario(f"handheld-{trajectory}", steps=options.steps)
+        for name, slam in _filters(chosen, options).items():
+            yield chosen.name, name, simulated, partial(_simulated, chosen, name, slam, options)
+    for drive in options.drives or _known("kitti_tracks/*/tracks.npz"):
+        data = tracks.read(folder().parent / "kitti_tracks" / drive)
+        for name, slam in _filters(on_the_road(data), options).items():
+            yield f"tracks-{drive}", name, recorded, partial(_recorded, data, slam, options)
+
+
+def _known(pattern: str, without: str = " ") -> list[str]:
+    """Names in the data folder: of files, or of the folders that hold them."""
+    paths = sorted(folder().parent.glob(pattern))
+    return [p.parent.name if p.suffix == ".npz" else p.stem for p in paths if without not in p.stem]
+
+
+def _filters(scenario: Scenario, options: Options) -> dict[str, AbstractFilter]:
+    return jaxslam.make_filters(scenario, list(options.filters), [options.landmarks])
+
+
+def on_the_road(data: tracks.Tracks) -> Scenario:
+    """What the filters are told of a drive: its camera, and the priors of a car."""
+    (fx, fy), (cx, cy) = np.asarray(data.camera.focal), np.asarray(data.camera.centre)
+    return jaxslam.scenario(
+        "handheld",
+        rate=10.0,
+        image=[float(n) for n in data.image],
+        focal=[float(fx), float(fy)],
+        centre=[float(cx), float(cy)],
+        pixel_sigma=TRACKS_PIXEL_SIGMA,
+        nearest_depth=5.0,
+        velocity_sigma=[10.0] * 3 + [1.0] * 3,
+    )
+
+
+def _simulated(
+    scenario: Scenario, name: str, slam: AbstractFilter, options: Options
+) -> dict[str, Any]:
+    study = jaxslam.monte_carlo(
+        scenario, {name: slam}, runs=options.runs, seed=options.seed, chunk=options.chunk
+    )
+    parts = [study.store.load(name, chunk, RECORDS) for chunk in study.chunks]
+    return numbers({key: np.concatenate([part[key] for part in parts]) for key in RECORDS})
+
+
+def _recorded(data: tracks.Tracks, slam: AbstractFilter, options: Options) -> dict[str, Any]:
+    with jax.enable_x64(True):
+        runs = tracks.windows(data, options.frames, options.starts)
+        most = jax.tree.map(lambda x: max(1, int(x.max())), jax.vmap(sightings)(runs))
+        room = Room(most.landmarks, most.first, most.known, most.new)
+        return numbers(jax.device_get(_through(cast(slam, "float64"), room, runs)))
+
+
+@eqx.filter_jit
+def _through(slam: AbstractFilter, room: Room, runs: Run) -> dict[str, jax.Array]:
+    """Records of a batch of windows, against a truth that is itself uncertain."""
+
+    def told(state: Any, innovation: Any, frame: Frame) -> dict[str, jax.Array]:
+        best = beyond_scale(partial(slam.pose_error, state), frame.pose, TRUTH_SIGMA)
+        estimate, _ = camera_pose(slam, state)
+        found = (*best, reversal(estimate, frame.pose), innovation.nis, innovation.nis_dof)
+        return dict(zip(RECORDS, found, strict=True))
+
+    return jax.vmap(lambda run: run_through(slam, room, run, told)[1])(runs)
+
+
+def numbers(records: dict[str, np.ndarray]) -> dict[str, Any]:
+    """What `handheld.json` keeps of records (runs, steps): lists over the steps in `at`.
+
+    Means are of the runs that are finite there; the others count as lost.
+    """
+    count = records["beyond_scale"].shape[1]
+    at = [step for step in STEPS if step < count] + [count]
+    part = {key: np.asarray(values)[:, np.array(at) - 1] for key, values in records.items()}
+    nees, error, sigma = (part[key] for key in ("beyond_scale", "log_scale", "log_scale_sigma"))
+    finite = np.isfinite(nees)
+
+    def mean(values: np.ndarray) -> list[float | None]:
+        counted = finite & np.isfinite(values)
+        sums = np.where(counted, values, 0.0).sum(axis=0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return _for_json(sums / counted.sum(axis=0))
+
+    def root(values: np.ndarray) -> list[float | None]:
+        return [None if x is None else float(np.sqrt(x)) for x in mean(values)]
+
+    with np.errstate(invalid="ignore"):
+        lost = ~(nees <= lost_threshold(DOF))
+        normalised = (error / sigma) ** 2
+        nis = np.nansum(records["nis"]) / np.nansum(records["nis_dof"])
+    return {
+        "at": at,
+        "beyond_scale": mean(nees / DOF),
+        "beyond_scale_median": _for_json(np.median(np.where(finite, nees, np.inf), axis=0) / DOF),
+        "lost": lost.mean(axis=0).tolist(),
+        "log_scale_rms": root(error**2),
+        "log_scale_median": _for_json(np.median(np.where(finite, np.abs(error), np.inf), axis=0)),
+        "log_scale_sigma": _for_json(np.median(np.where(finite, sigma, np.inf), axis=0)),
+        "log_scale_normalised": root(normalised),
+        "reversed": mean(part["reversed"]),
+        "nis": _for_json(np.array([nis]))[0],
+    }
+
+
+def _for_json(values: np.ndarray) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+COLUMNS = (
+    "step", "NEES/dof", "median", "lost", "log-scale rms", "median", "σ claimed", "error/σ",
+    "reversed",
+)  # fmt: skip
+
+
+def _row(found: dict[str, Any], i: int) -> str:
+    """One step's numbers, as the page has them."""
+
+    def shown(key: str, form: str) -> str:
+        value = found[key][i]
+        return "–" if value is None else format(value, form if abs(value) < 1e3 else ".1e")
+
+    return " | ".join(
+        [
+            str(found["at"][i]),
+            shown("beyond_scale", ".2f"),
+            shown("beyond_scale_median", ".2f"),
+            shown("lost", ".0%"),
+            shown("log_scale_rms", ".2f"),
+            shown("log_scale_median", ".2f"),
+            shown("log_scale_sigma", ".2f"),
+            shown("log_scale_normalised", ".1f"),
+            shown("reversed", ".0%"),
+        ]
+    )
+
+
+def page(results: dict[str, Any]) -> str:
+    """`docs/handheld.md`."""
+    lines = [_HEAD]
+    for where, filters in sorted(results.items()):
+        runs = next(iter(filters.values()))["runs"]
+        lines += [f"## {where}", "", f"{runs} runs.", ""]
+        lines += ["| filter | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
+        for name, found in filters.items():
+            label = f"{name}, NIS {found['nis']:.2f}" if found["nis"] is not None else name
+            for i in range(len(found["at"])):
+                lines.append(f"| {label if i == 0 else ''} | {_row(found, i)} |")
+        lines.append("")
+    return "\n".join(lines).rstrip() + "\n"
+
+
+_HEAD = """# A camera along real trajectories
+
+Written by `python benchmarks/handheld.py`; all numbers are in `benchmarks/results/handheld.json`.
+
+*handheld-NAME*: simulated runs of a camera along a recorded trajectory, from starts drawn at
+random, 30 landmarks in view at depths from 1 to 6 m (a car: 5 to 50 m), pixel σ 0.3. No filter is
+told where the camera is going: its prior is a velocity of 0 ± 1 m/s and 0 ± 1 rad/s with white
+accelerations of 4 m/s² and 6 rad/s² (a car: ± 10 m/s).
+
+*tracks-DRIVE*: recorded tracks of points in real pictures, at most 40 at a time, known movers
+left out, pixel σ 0.5, at 10 Hz, a car's priors; the truth's own σ of 0.1 m and 0.1° is added to
+the filter's.
+
+*NEES/dof* is that of the pose at the scale of the truth that explains it best, ideal 1, and its
+median over the runs, ideal 0.87; *lost* the share of runs above the 99.99 % quantile of χ²; then
+the error of the log of the scale (a run reversed from its start counts as 6.9, the greatest that
+is tried), the median of its size, the median σ that the filter claims of it and the error in σ
+(rms, ideal 1); *reversed* the share of runs displaced away from the truth. NIS is per number
+measured, over all steps.
+"""
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))

@@ -1,0 +1,152 @@
+"""Recorded bearings with identities: feature tracks on drives through streets, with true poses.
+
+A folder of KITTI's tracks, as `kitti_tracks` has them: `tracks.npz` (observations by frame and
+track, which tracks move, times, intrinsics) and `groundtruth.txt` in TUM's format, T_WC.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxslam.models.camera import Camera
+from jaxslam.simulation import Run
+from jaxslam.tum import read_tum
+
+MOVING = 1
+"""What a track is marked with that contradicts a still scene."""
+_ARRAYS = ("frame", "track", "pixel", "moving", "times", "intrinsics", "image_size")
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """A drive, as its camera sees it. SI units, pixels."""
+
+    frame: Int[np.ndarray, " observations"]
+    track: Int[np.ndarray, " observations"]
+    """Numbered by first sight."""
+    pixel: Float[np.ndarray, "observations 2"]
+    moving: Int[np.ndarray, " tracks"]
+    """1: moves, or is a wrong match; 0: stands still; −1: nobody knows."""
+    times: Float[np.ndarray, " frames"]
+    poses: Float[np.ndarray, "frames 4 4"]
+    """T_WC, true."""
+    camera: Camera
+    image: Int[np.ndarray, " 2"]
+    """Width and height of a picture."""
+
+    @property
+    def frames(self) -> int:
+        return self.times.size
+
+
+def read(folder: str | Path) -> Tracks:
+    """Read a drive. Raises ValueError, naming the file, unless it is one."""
+    path = Path(folder) / "tracks.npz"
+    try:
+        with np.load(path) as file:
+            arrays = {name: np.asarray(file[name]) for name in _ARRAYS if name in file}
+    except FileNotFoundError:
+        raise ValueError(f"{path} does not exist") from None
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise ValueError(f"{path} is not an .npz file: {error}") from None
+    if missing := [name for name in _ARRAYS if name not in arrays]:
+        raise ValueError(f"{path} lacks {', '.join(missing)}: it holds no tracks")
+    _, poses = read_tum(Path(folder) / "groundtruth.txt")
+    if len(poses) != arrays["times"].size:
+        raise ValueError(
+            f"{folder} has {len(poses)} true poses of {arrays['times'].size} frames; one of each "
+            "is needed"
+        )
+    fx, fy, cx, cy = arrays["intrinsics"]
+    return Tracks(
+        frame=arrays["frame"],
+        track=arrays["track"],
+        pixel=np.asarray(arrays["pixel"], float),
+        moving=arrays["moving"],
+        times=np.asarray(arrays["times"], float),
+        poses=poses,
+        camera=Camera([fx, fy], [cx, cy]),
+        image=arrays["image_size"],
+    )
+
+
+def window(
+    data: Tracks, start: int, steps: int, *, landmarks: int = 40, moving: bool = False
+) -> Run:
+    """Frames `start` to `start + steps` as a run whose base B is the camera of its first frame.
+
+    It has at most so many tracks at a time, those that were seen first; where one ends, the
+    longest seen of the others takes its slot. Tracks known to be `moving` are left out unless they
+    are asked for. Where the points are is not known: NaN. Raises ValueError for a window that is
+    not in the drive.
+    """
+    if steps < 1 or start < 0 or start + steps >= data.frames or landmarks < 1:
+        raise ValueError(
+            f"{steps} steps from frame {start} with {landmarks} landmarks are not in "
+            f"{data.frames} frames; at least one step and one landmark is accepted"
+        )
+    frames = slice(start, start + steps + 1)
+    measured, visible, new = _in_slots(_observations(data, frames, moving), landmarks)
+    T_BC = np.linalg.inv(data.poses[start]) @ data.poses[frames]
+    return Run(
+        poses=jaxlie.SE3.from_matrix(jnp.asarray(T_BC)),
+        points=jnp.full((*visible.shape, 3), jnp.nan),
+        measured=jnp.asarray(measured),
+        visible=jnp.asarray(visible),
+        controls=jnp.asarray(np.diff(data.times[frames])),
+        cameras=jax.tree.map(lambda x: jnp.tile(x, (steps + 1, 1)), data.camera),
+        new=jnp.asarray(new),
+    )
+
+
+def windows(data: Tracks, steps: int, count: int, *, landmarks: int = 40) -> Run:
+    """A batch of windows, evenly over the drive; they overlap where they do not fit otherwise.
+
+    Raises ValueError where there is none.
+    """
+    if count < 1:
+        raise ValueError(f"at least one window is accepted, not {count}")
+    starts = np.linspace(0, data.frames - steps - 1, count).astype(int)
+    runs = [window(data, int(start), steps, landmarks=landmarks) for start in starts]
+    return jax.tree.map(lambda *parts: jnp.stack(parts), *runs)
+
+
+def _observations(data: Tracks, frames: slice, moving: bool) -> Iterator[dict[int, np.ndarray]]:
+    """Of every frame, the pixel of each track, those that were seen first in front."""
+    wanted = moving | (data.moving[data.track] != MOVING)
+    for k in range(frames.start, frames.stop):
+        here = np.flatnonzero(wanted & (data.frame == k))
+        here = here[np.argsort(data.track[here])]
+        yield {int(data.track[i]): data.pixel[i] for i in here}
+
+
+def _in_slots(
+    observations: Iterator[dict[int, np.ndarray]], count: int
+) -> tuple[
+    Float[np.ndarray, "frames slots 2"], Bool[np.ndarray, "frames slots"], Bool[np.ndarray, ...]
+]:
+    """Pixels, which slots are seen, and in which of them another track begins."""
+    held: list[int | None] = [None] * count
+    rows = []
+    for pixels in observations:
+        kept = [track if track in pixels else None for track in held]
+        waiting = (track for track in pixels if track not in kept)
+        held = [next(waiting, None) if track is None else track for track in kept]
+        rows.append(
+            (
+                [pixels.get(track, np.zeros(2)) for track in held],
+                [track is not None for track in held],
+                [now is not None and now != before for now, before in zip(held, kept, strict=True)],
+            )
+        )
+    measured, visible, new = (np.array(column) for column in zip(*rows, strict=True))
+    return measured, visible, new

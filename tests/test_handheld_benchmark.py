@@ -1,0 +1,104 @@
+"""Tests of benchmarks/handheld.py: its numbers are those of its runs, and measured only once."""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import test_tracks
+import test_trajectories
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+
+import handheld as benchmark
+
+
+def records(runs=50, steps=40):
+    """Of a consistent filter, of which one run is lost from step 20 on and one diverges there."""
+    rng = np.random.default_rng(0)
+    nees, sigma = rng.chisquare(5, (runs, steps)), rng.uniform(0.1, 0.3, (runs, steps))
+    nees[3, 20:], nees[4, 20:] = 500.0, np.nan
+    away = np.zeros((runs, steps))
+    away[:5], away[:, :15] = 1.0, np.nan
+    return {
+        "beyond_scale": nees,
+        "log_scale": sigma * rng.normal(size=sigma.shape),
+        "log_scale_sigma": sigma,
+        "reversed": away,
+        "nis": np.full((runs, steps), 9.0),
+        "nis_dof": np.full((runs, steps), 10.0),
+    }
+
+
+def test_numbers_are_those_of_the_runs():
+    given = records()
+    found = benchmark.numbers(given)
+    assert found["at"] == [10, 30, 40]
+    nees, error, sigma = (given[k] for k in ("beyond_scale", "log_scale", "log_scale_sigma"))
+    good = np.arange(50) != 4
+    for i, step in enumerate((9, 29, 39)):
+        kept = good if step > 20 else np.ones(50, bool)
+        assert found["beyond_scale"][i] == pytest.approx(nees[kept, step].mean() / 5)
+        assert found["lost"][i] == (0.04 if step > 20 else 0)
+        rms = np.sqrt(np.mean(error[kept, step] ** 2))
+        assert found["log_scale_rms"][i] == pytest.approx(rms)
+        median = np.median(np.where(kept, np.abs(error[:, step]), np.inf))
+        assert found["log_scale_median"][i] == pytest.approx(median)
+        rms = np.sqrt(np.mean((error[kept, step] / sigma[kept, step]) ** 2))
+        assert found["log_scale_normalised"][i] == pytest.approx(rms)
+    assert found["beyond_scale_median"][0] == pytest.approx(np.median(nees[:, 9]) / 5)
+    assert found["log_scale_sigma"][0] == pytest.approx(np.median(sigma[:, 9]))
+    # Of those that moved; the one that diverged, reversed as it is, does not count.
+    assert found["reversed"] == [None, pytest.approx(4 / 49), pytest.approx(4 / 49)]
+    assert found["nis"] == pytest.approx(0.9)
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+
+
+def test_the_page_has_every_step_of_every_filter():
+    results = {"handheld-a": {"one": {"runs": 50, "steps": 40, **benchmark.numbers(records())}}}
+    page = benchmark.page(results)
+    assert "## handheld-a\n\n50 runs." in page
+    rows = [line for line in page.splitlines() if line.startswith("| ")][1:]
+    assert [row.split(" | ")[1] for row in rows] == ["10", "30", "40"]
+    assert rows[0].startswith("| one, NIS 0.90 | 10 | ")
+    assert "4%" in rows[1]
+
+
+@pytest.fixture
+def options(tmp_path, monkeypatch):
+    """A folder of one trajectory and one drive."""
+    monkeypatch.setenv("JAXSLAM_DATA", str(tmp_path))
+    (tmp_path / "trajectories").mkdir()
+    (tmp_path / "kitti_tracks" / "street").mkdir(parents=True)
+    times = np.arange(0, 2, 0.02)
+    test_trajectories.write(tmp_path / "trajectories" / "walk.txt", times)
+    test_tracks.write(tmp_path / "kitti_tracks" / "street")
+    return benchmark.Options(
+        filters=("robocentric",), runs=2, steps=3, starts=2, frames=4,
+        out=tmp_path / "x.json", docs=tmp_path / "x.md",
+    )  # fmt: skip
+
+
+def test_everything_in_the_folder_is_measured_and_only_once(options, capsys, monkeypatch):
+    benchmark.main(options)
+    found = json.loads(options.out.read_text())
+    assert set(found) == {"handheld-walk", "tracks-street"}
+    for where, (runs, steps) in {"handheld-walk": (2, 3), "tracks-street": (2, 4)}.items():
+        result = found[where]["robocentric/inverse_scaling"]
+        assert (result["runs"], result["steps"]) == (runs, steps)
+        assert result["at"] == [steps]
+        assert result["beyond_scale"][0] is not None
+        assert where in options.docs.read_text()
+    assert len(capsys.readouterr().out.splitlines()) == 2
+
+    def again(*_):
+        raise AssertionError("what is there already was measured again")
+
+    monkeypatch.setattr(benchmark, "numbers", again)
+    benchmark.main(options)
+    with pytest.raises(AssertionError, match="again"):
+        benchmark.main(dataclasses.replace(options, runs=3))
+    benchmark.main(dataclasses.replace(options, page=True, filters=("nonsense",)))
+    assert json.loads(options.out.read_text()) == found
