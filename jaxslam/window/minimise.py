@@ -52,16 +52,13 @@ def minimised(
     record: Record,
     start: Minimum,
     steps: int,
-    wanted: Bool[Array, ""] | bool = True,
+   
 ) -> Minimum:
-    """After at most so many steps; none if it is not wanted.
-
-    In a batch nothing is computed where no member of it is wanted.
-    """
+    """After at most so many steps."""
 
     def going(carry):
         step, now = carry
-        return (step < steps) & ~now.converged & wanted
+        return (step < steps) & ~now.converged
 
     def once(carry):
         step, now = carry

@@ -9,7 +9,7 @@ weighed by Laplace's `−½ |r|² − ½ log det A`, A the information of all un
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -20,14 +20,14 @@ from jaxtyping import Array, Bool, Float
 from jaxslam.linalg import cholesky
 from jaxslam.slam.filter import EkfSlam
 from jaxslam.window.minimise import Minimum, minimised, started, turned
-from jaxslam.window.problem import Layout, Reduced, reduced
+from jaxslam.window.problem import Layout, reduced
 from jaxslam.window.record import Record
 
 Value = TypeVar("Value")
 
 SPEED = 1.2
 """Starts move with so many σ of the prior on the initial velocity."""
-SEARCH_STEPS = 30
+SEARCH_STEPS = 16
 """Of Levenberg–Marquardt, from every start."""
 APART = 1.0
 """Minima nearer than this in the better one's information, squared, are one."""
@@ -41,17 +41,37 @@ class Modes(eqx.Module):
     """Normalised; −∞ of places without a mode."""
 
 
-def when(wanted: Bool[Array, ""], function: Callable[[Value], Value], value: Value) -> Value:
-    """`function(value)` if it is wanted, else the value.
+def when(
+    wanted: Bool[Array, ""], function: Callable[..., Value], value: Value, *given: Any
+) -> Value:
+    """`function(value, *given)` if it is wanted, else the value.
 
     In a batch `lax.cond` computes both sides of every member; this computes nothing where no
-    member wants it.
+    member wants it. What the function needs is given to it through the counter of the loop, or the
+    compiler would move the work out of a loop that does not change it.
     """
+    stacked = jax.tree.map(lambda x: jnp.stack([x, x]), given)
 
     def once(carry):
-        return jnp.zeros((), bool), function(carry[1])
+        turn, value = carry
+        now = jax.tree.map(lambda x: x[turn], stacked)
+        return turn + 1, function(value, *now)
 
-    return jax.lax.while_loop(lambda carry: carry[0], once, (jnp.asarray(wanted), value))[1]
+    def due(carry):
+        return wanted & (carry[0] < 1)
+
+    return jax.lax.while_loop(due, once, (jnp.zeros((), int), value))[1]
+
+
+def each_alive(
+    function: Callable[..., Any], values: Any, alive: Bool[Array, " k"], *given: Any
+) -> Any:
+    """`function(value, *given)` of every value that is alive; the others stay as they are."""
+
+    def one(carry, data):
+        return carry, when(data[1], function, data[0], *given)
+
+    return jax.lax.scan(one, None, (values, alive))[1]
 
 
 def at_rest(slam: EkfSlam, record: Record, count: int, dtype: Any) -> Modes:
@@ -83,52 +103,63 @@ def starts(slam: EkfSlam, record: Record, count: int, dtype: Any) -> Minimum:
     return jax.vmap(started)(jax.vmap(lambda x, y: turned(slam, record, x, y))(x, rest.y), rest.y)
 
 
-def evidence(at: Minimum, local: Reduced) -> Float[Array, ""]:
-    """Laplace's `−½ |r|² − ½ log det A`."""
+def sought(
+    slam: EkfSlam,
+    record: Record,
+    modes: Modes,
+    steps: int,
+    wanted: Bool[Array, ""],
+    directions: int = 0,
+    search: Bool[Array, ""] | None = None,
+) -> Modes:
+    """The modes with what has been measured since, each from where it is; and, of a search, what
+    is found beside them from rest and from so many directions."""
+    alive = wanted & jnp.isfinite(modes.log_weights)
+    minima = jax.vmap(lambda m: started(m.x, m.y))(modes.minima)
+    minima = each_alive(lambda m, record: minimised(slam, record, m, steps), minima, alive, record)
+    if search is not None:
+        found = at_rest(slam, record, 1 + directions, modes.log_weights.dtype).minima
+
+        def from_everywhere(_, record):
+            begun = starts(slam, record, directions, modes.log_weights.dtype)
+            return jax.vmap(lambda m: minimised(slam, record, m, SEARCH_STEPS))(begun)
+
+        found = when(search, from_everywhere, found, record)
+        minima = jax.tree.map(lambda *x: jnp.concatenate(x), minima, found)
+        alive = jnp.concatenate([alive, jnp.broadcast_to(search, 1 + directions)])
+    return _likeliest(slam, record, minima, alive, len(modes.log_weights))
+
+
+class Weighed(NamedTuple):
+    """A minimum, its log evidence `−½ |r|² − ½ log det A`, and the information of its path."""
+
+    minimum: Minimum
+    evidence: Float[Array, ""]
+    information: Float[Array, "N N"]
+
+
+def _weighed(slam: EkfSlam, weighed: Weighed, record: Record) -> Weighed:
+    at = weighed.minimum
+    local = reduced(slam, record, at.x, at.y)
     own = jnp.sum(jax.vmap(lambda factor: factor.log_det())(local.landmarks))
     value = -(at.cost + cholesky(local.information).log_det() + own) / 2
-    return jnp.where(jnp.isfinite(value), value, -jnp.inf)
+    return Weighed(at, jnp.where(jnp.isfinite(value), value, -jnp.inf), local.information)
 
 
-def refined(
-    slam: EkfSlam, record: Record, modes: Modes, steps: int, wanted: Bool[Array, ""]
-) -> Modes:
-    """The modes with what has been measured since: each from where it is."""
-    alive = wanted & jnp.isfinite(modes.log_weights)
-    begun = jax.vmap(lambda m: started(m.x, m.y))(modes.minima)
-
-    def one(minimum, alive):
-        return minimised(slam, record, minimum, steps, alive)
-
-    minima = jax.vmap(one)(begun, alive)
-    return when(wanted, lambda old: _chosen(slam, record, minima, alive, len(alive)), modes)
-
-
-def searched(
-    slam: EkfSlam, record: Record, modes: Modes, count: int, wanted: Bool[Array, ""]
-) -> Modes:
-    """The modes, and what is found beside them from `count` directions and from rest."""
-
-    def with_others(modes):
-        found = starts(slam, record, count, modes.log_weights.dtype)
-        found = jax.vmap(lambda m: minimised(slam, record, m, SEARCH_STEPS))(found)
-        both = jax.tree.map(lambda *x: jnp.concatenate(x), modes.minima, found)
-        alive = jnp.concatenate([jnp.isfinite(modes.log_weights), jnp.ones(1 + count, bool)])
-        return _chosen(slam, record, both, alive, len(modes.log_weights))
-
-    return when(wanted, with_others, modes)
-
-
-def _chosen(slam, record, minima: Minimum, alive: Bool[Array, " k"], count: int) -> Modes:
+def _likeliest(slam, record, minima: Minimum, alive: Bool[Array, " k"], count: int) -> Modes:
     """The likeliest of the minima that are distinct, weighed."""
-    local = jax.vmap(lambda m: reduced(slam, record, m.x, m.y))(minima)
-    value = jnp.where(alive, jax.vmap(evidence)(minima, local), -jnp.inf)
+    k, size = minima.x.shape
+    none = jnp.full(k, -jnp.inf, minima.x.dtype)
+    begun = Weighed(minima, none, jnp.zeros((k, size, size), minima.x.dtype))
+    _, value, information = each_alive(
+        lambda weighed, record: _weighed(slam, weighed, record), begun, alive, record
+    )
     best_first = jnp.argsort(-value)
     value = value[best_first]
-    x, information = minima.x[best_first], local.information[best_first]
+    x, information = minima.x[best_first], information[best_first]
     away = x[:, None] - x[None]
     squared = jnp.einsum("ijn,jno,ijo->ij", away, information, away)
-    index = jnp.arange(len(value))
+    index = jnp.arange(k)
     again = jnp.any((squared < APART) & (index < index[:, None]), axis=1)
     value = jnp.where(again, -jnp.inf, value)
     kept = jnp.argsort(-value)[:count]

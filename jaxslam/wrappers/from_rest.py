@@ -18,12 +18,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.arrays import AnyArray, cast, precision
-from jaxslam.forms.state import Features, Innovation
+from jaxslam.forms.state import Features, Innovation, State
 from jaxslam.geometry import Pose
+from jaxslam.slam.filter import EkfSlam
 from jaxslam.slam.protocol import AbstractStaged, Capacity, Expected
 from jaxslam.window import record as window
 from jaxslam.window.handover import gauge_state
-from jaxslam.window.modes import Modes, at_rest, refined, searched, when
+from jaxslam.window.modes import Modes, at_rest, each_alive, sought, when
 from jaxslam.window.problem import Layout
 from jaxslam.window.record import Record
 from jaxslam.wrappers.bank import BankState
@@ -98,7 +99,8 @@ class FromRest(AbstractStaged):
         for frames in self.sizes:
             count = state.record.last + 1
             wanted = state.open & (count > least) & (count <= frames)
-            state = self._anew(state, frames, wanted)
+            searches = [k for k in SEARCHES if least <= k < frames]
+            state = self._anew(state, frames, wanted, searches)
             least = frames
         return replace(state, open=state.open & ~self._ready(state))
 
@@ -125,24 +127,25 @@ class FromRest(AbstractStaged):
     def _of_sum(state: RestState, after: BankState) -> RestState:
         return replace(state, sum=after)
 
-    def _anew(self, state: RestState, frames: int, wanted: Bool[Array, ""]) -> RestState:
+    def _anew(
+        self, state: RestState, frames: int, wanted: Bool[Array, ""], searches: list[int]
+    ) -> RestState:
         """The modes of a window of so many frames, and the sum of them."""
         ekf, record = self.base.base, state.record.cut(frames)
         size = Layout.of(ekf).size(frames)
 
-        def solved(state):
+        def solved(state, record):
             x = state.modes.minima.x
             modes = replace(state.modes, minima=replace(state.modes.minima, x=x[:, :size]))
-            modes = refined(ekf, record, modes, REFINEMENTS, wanted)
-            due = wanted & jnp.any(record.last == jnp.array(SEARCHES))
-            modes = searched(ekf, record, modes, self.directions, due)
-            like = jax.tree.map(lambda leaf: leaf[0], state.sum.members)
-            members = jax.vmap(lambda m: gauge_state(ekf, record, m, like))(modes.minima)
-            whole = x.at[:, :size].set(modes.minima.x).at[:, size:].set(0.0)
-            modes = replace(modes, minima=replace(modes.minima, x=whole))
+            due = jnp.any(record.last == jnp.array(searches)) if searches else None
+            yes = jnp.ones((), bool)
+            modes = sought(ekf, record, modes, REFINEMENTS, yes, self.directions, due)
+            members = _members(ekf, record, modes, state.sum.members)
+            x = x.at[:, :size].set(modes.minima.x)
+            modes = replace(modes, minima=replace(modes.minima, x=x))
             return replace(state, sum=BankState(members, modes.log_weights), modes=modes)
 
-        return when(wanted, solved, state)
+        return when(wanted, solved, state, record)
 
     def _ready(self, state: RestState) -> Bool[Array, ""]:
         """Whether one mode is left whose translation is known, or there is no room."""
@@ -156,6 +159,16 @@ class FromRest(AbstractStaged):
         enough = state.record.last >= LEAST_FRAMES
         alone = state.sum.log_weights[0] > -1e-3
         return state.record.full | (enough & alone & known)
+
+
+def _members(ekf: EkfSlam, record: Record, modes: Modes, members: State) -> State:
+    """The Gaussians of the modes."""
+
+    def begun(both, record):
+        return both[0], gauge_state(ekf, record, *both)
+
+    alive = jnp.isfinite(modes.log_weights)
+    return each_alive(begun, (modes.minima, members), alive, record)[1]
 
 
 def from_rest(base: Mixture, frames: int | None = None) -> FromRest:
