@@ -148,7 +148,8 @@ MODIFIERS: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
 greatest depth of a delayed initialisation, m (`particles`, `rays`); the correlation of depths in
 percent (`common`); σ of the scene's depth in percent of one landmark's (`scene`); frames (`lag`);
 steps of Gauss–Newton instead of convergence (`iterated`); members of a Gaussian sum (`scales`,
-`directions`, `mixture`); none for the remedies `oc`, `fej`."""
+`directions`, `mixture`); frames, at the most, after which such a sum goes on alone (`rest`); none
+for the remedies `oc`, `fej`."""
 
 RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gauge+scene50+mixture9"}
 """The filter called `recommended`, by geometry: of those of docs/consistency.md the one to take

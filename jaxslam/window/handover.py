@@ -14,14 +14,15 @@ balances.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from jaxslam.forms.blocks import shifted
 from jaxslam.forms.state import State
-from jaxslam.geometry import identity, jacobian, scaled
+from jaxslam.geometry import Scalar, identity, jacobian, scaled
 from jaxslam.linalg import Cholesky, cholesky
 from jaxslam.models.scale import ScaleGauge
 from jaxslam.slam.filter import EkfSlam
@@ -29,6 +30,7 @@ from jaxslam.window.minimise import LANDMARK_STEPS, Minimum, landmarks
 from jaxslam.window.problem import (
     Layout,
     Reduced,
+    hidden,
     located,
     path,
     reduced,
@@ -68,22 +70,19 @@ def rescaled(
     return x, _nearer(slam, record, at, factor)
 
 
-def _nearer(slam, record, at: Minimum, factor) -> Float[Array, "m q"]:
+def _nearer(slam: EkfSlam, record: Record, at: Minimum, factor: Scalar) -> Float[Array, "m q"]:
     """Inverse depths divided by a factor, in their own part; the common error stays."""
-    depth, layout = slam.depth, Layout.of(slam)
+    depth, layout, p = slam.depth, Layout.of(slam), slam.sensor.size
     common = at.x[layout.start : layout.start + layout.common]
-    share = 0.0 if depth.common is None else jnp.sum(common) * depth.common
-    p = slam.sensor.size
-    hidden = depth.mean + depth.sigma * (depth.own * at.y[:, p:] + share)
-    own = ((hidden / factor - depth.mean) / depth.sigma - share) / depth.own
-    begun = jnp.any(record.seen, axis=0)
-    return at.y.at[:, p:].set(jnp.where(begun[:, None], own, at.y[:, p:]))
+    gained = (1 / factor - 1) * hidden(slam, common, at.y[:, p:])
+    begun = jnp.any(record.seen, axis=0)[:, None]
+    return at.y.at[:, p:].add(jnp.where(begun, gained / (depth.sigma * depth.own), 0.0))
 
 
 def scaling(slam: EkfSlam, record: Record, at: Minimum) -> Direction:
     """s, the shortest of those that differ by what common and own errors of depth share."""
     zero = jnp.zeros((), at.x.dtype)
-    _, (x, y) = jax.jvp(lambda l: rescaled(slam, record, at, l), (zero,), (zero + 1,))
+    _, (x, y) = jax.jvp(lambda by: rescaled(slam, record, at, by), (zero,), (zero + 1,))
     layout, depth = Layout.of(slam), slam.depth
     if depth.common is None:
         return Direction(x, y)
@@ -94,7 +93,9 @@ def scaling(slam: EkfSlam, record: Record, at: Minimum) -> Direction:
     return Direction(x.at[layout.start].add(shared), y)
 
 
-def variances(local: Reduced, whitening: Float[Array, "N N"]) -> tuple[Array, Array]:
+def variances(
+    local: Reduced, whitening: Float[Array, "N N"]
+) -> tuple[Float[Array, " N"], Float[Array, "m q"]]:
     """Diagonals of A⁻¹: of x, and of y."""
     by_x = jnp.sum(whitening**2, axis=0)
     spread = jnp.einsum("mqn,on->mqo", local.coupling, whitening)
@@ -102,7 +103,9 @@ def variances(local: Reduced, whitening: Float[Array, "N N"]) -> tuple[Array, Ar
     return by_x, own + jnp.sum(spread**2, axis=2)
 
 
-def shift_of_scale(slam: EkfSlam, local: Reduced, s: Direction, factor: Cholesky):
+def shift_of_scale(
+    slam: EkfSlam, local: Reduced, s: Direction, factor: Cholesky
+) -> Float[Array, ""]:
     """λ of the mean, of a density that has its maximum at 0."""
     of_x, of_y = variances(local, factor.whitening)
     told = jnp.where(s.x != 0, 1 - of_x, 0.0)
@@ -128,76 +131,100 @@ def gauge_state(slam: EkfSlam, record: Record, mode: Minimum, like: State) -> St
 
 
 def _state(slam, record, at, step, local, s: Direction, factor: Cholesky, like: State) -> State:
-    layout, k = Layout.of(slam), record.last
-    parts, by_x = _parts(slam, record, at, local, layout)
-    # λ, by x and by what is left of every y: y = ŷ − C (x − x̂) + e.
-    scale_by_x = (s.x - jnp.einsum("mq,mqn->n", s.y, local.coupling)) / s.squared
-    scale_by_y = s.y / s.squared
-    is_gauge = isinstance(slam.scale, ScaleGauge)
-    zero = jnp.zeros(1, at.x.dtype)
-
-    def core_of(parts, log_scale):
-        return _core(slam, like.core, parts, log_scale)
-
-    def landmark_of(parts, first, y, measured, log_scale):
-        return _landmark(slam, parts, first, y, measured, log_scale)
-
-    core = core_of(parts, zero)
-    G = jacobian(lambda both: core_of(*both), (parts, zero))
-    by_parts, by_scale = G[:, :-1], G[:, -1]
-    unit = by_scale if is_gauge else jnp.zeros_like(by_scale)
-    core_by_x = by_parts @ by_x + jnp.outer(unit, scale_by_x)
-    core_by_y = jnp.einsum("c,mq->cmq", unit, scale_by_y)
-
-    firsts = jax.tree.map(lambda leaf: leaf[record.first], local.path.frames)
-    begun = record.measured[record.first, jnp.arange(record.first.size)]
-    S_first = local.by_x.frame[record.first]
-
-    def one(first, y, measured, S_first, C):
-        def of(everything):
-            parts, first, y, log_scale = everything
-            return landmark_of(parts, first, y, measured, log_scale)
-
-        everything = parts, first, y, zero
-        value = of(everything)
-        J = jacobian(of, everything)
-        ends = [by_x.shape[0], by_x.shape[0] + S_first.shape[0], J.shape[1] - 1]
-        by_parts, by_first, by_y, by_scale = jnp.split(J, ends, axis=1)
-        unit = by_scale[:, 0] if is_gauge else jnp.zeros_like(by_scale[:, 0])
-        rows = by_parts @ by_x + by_first @ S_first - by_y @ C + jnp.outer(unit, scale_by_x)
-        return value, rows, by_y, unit
-
-    values, rows, by_own, units = jax.vmap(one)(firsts, at.y, begun, S_first, local.coupling)
-    m, d = values.shape
+    """The Gaussian of x, and of what is left of every y given x, as one of the filter's numbers;
+    x moves back by a step."""
+    newest, by_x = _newest(slam, record, at, local)
+    scale = _scale(slam, local, s)
+    core, of_core = _core_rows(slam, newest, by_x, scale, like.core)
+    values, of_landmarks = _landmark_rows(slam, record, at, local, (newest, by_x), scale)
     active = jnp.any(record.seen, axis=0)
-    by_own = jnp.einsum("idq,ij->idjq", by_own, jnp.eye(m, dtype=at.x.dtype))
-    by_others = by_own + jnp.einsum("id,jq->idjq", units, scale_by_y)
-    whole_by_x = jnp.concatenate([core_by_x, jnp.where(active[:, None, None], rows, 0.0).reshape(m * d, -1)])
-    by_others = jnp.where(active[:, None, None, None], by_others, 0.0).reshape(m * d, m, -1)
-    whole_by_y = jnp.concatenate([core_by_y, by_others])
-    V = factor.whitening @ whole_by_x.T
-    U = jnp.einsum("mqo,nmo->mqn", local.landmarks.whitening, whole_by_y).reshape(-1, V.shape[1])
-    covariance = V.T @ V + U.T @ U
-    from jaxslam.forms.blocks import shifted
-
-    moved = -whole_by_x @ step
-    state = State(core, jnp.where(active[:, None], values, like.landmarks), active, covariance, like.memory)
-    return shifted(state, moved)
+    rows = _stacked(of_core, of_landmarks, active)
+    landmarks = jnp.where(active[:, None], values, like.landmarks)
+    covariance = _covariance(local, factor, rows)
+    return shifted(State(core, landmarks, active, covariance, like.memory), -rows.x @ step)
 
 
-def _parts(slam, record, at, local: Reduced, layout: Layout):
+class Rows(NamedTuple):
+    """Jacobians of the filter's numbers: by x, and by what is left of every y given x."""
+
+    x: Float[Array, "*n N"]
+    y: Float[Array, "*n m q"]
+
+
+def _scale(slam: EkfSlam, local: Reduced, s: Direction) -> Rows:
+    """Of λ; zero in a filter without. `y = ŷ − C (x − x̂) + e`."""
+    squared = s.squared if isinstance(slam.scale, ScaleGauge) else jnp.inf
+    by_x = s.x - jnp.einsum("mq,mqn->n", s.y, local.coupling)
+    return Rows(by_x / squared, s.y / squared)
+
+
+def _newest(slam, record, at: Minimum, local: Reduced):
     """(frame, motion's variables, common error) at the newest frame, and their Jacobian by x."""
-    k = record.last
+    layout, k = Layout.of(slam), record.last
     frame = jax.tree.map(lambda leaf: leaf[k], local.path.frames)
-    shared = slice(layout.start, layout.start + layout.common)
     eye = jnp.eye(at.x.size, dtype=at.x.dtype)
-    by_x = jnp.concatenate([local.by_x.frame[k], local.by_x.motion[k], eye[shared]])
+    common = eye[layout.start : layout.start + layout.common]
+    by_x = jnp.concatenate([local.by_x.frame[k], local.by_x.motion[k], common])
     return (frame, local.path.motion[k], local.path.common), by_x
 
 
-def _core(slam: EkfSlam, like, parts, log_scale):
+def _core_rows(slam, newest, by_x, scale: Rows, like) -> tuple[Any, Rows]:
+    """The filter's core and its Jacobians."""
+    zero = jnp.zeros(1, by_x.dtype)
+    J = jacobian(lambda both: _core(slam, like, *both), (newest, zero))
+    by_newest, unit = J[:, :-1], J[:, -1]
+    by_y = jnp.einsum("c,mq->cmq", unit, scale.y)
+    return _core(slam, like, newest, zero), Rows(by_newest @ by_x + jnp.outer(unit, scale.x), by_y)
+
+
+def _landmark_rows(
+    slam, record, at: Minimum, local: Reduced, newest, scale: Rows
+) -> tuple[Float[Array, "m d"], Rows]:
+    """All landmarks and their Jacobians: each by its own y, and by λ's."""
+    (newest, by_x), zero = newest, jnp.zeros(1, at.x.dtype)
+    firsts = jax.tree.map(lambda leaf: leaf[record.first], local.path.frames)
+    of_firsts = local.by_x.frame[record.first]
+
+    def one(first, of_first, measured, y, coupling):
+        def of(everything):
+            newest, first, y, log_scale = everything
+            return _landmark(slam, newest, first, y, measured, log_scale)
+
+        everything = newest, first, y, zero
+        J = jacobian(of, everything)
+        ends = [len(by_x), len(by_x) + len(of_first), J.shape[1] - 1]
+        by_newest, by_first, by_y, unit = jnp.split(J, ends, axis=1)
+        rows = by_newest @ by_x + by_first @ of_first - by_y @ coupling
+        return of(everything), rows + unit * scale.x, by_y, unit[:, 0]
+
+    values, rows, by_own, units = jax.vmap(one)(
+        firsts, of_firsts, record.first_measured, at.y, local.coupling
+    )
+    own = jnp.einsum("idq,ij->idjq", by_own, jnp.eye(len(at.y), dtype=at.y.dtype))
+    return values, Rows(rows, own + jnp.einsum("id,jq->idjq", units, scale.y))
+
+
+def _stacked(core: Rows, landmarks: Rows, active: Bool[Array, " m"]) -> Rows:
+    """Of the whole state; zero where no landmark is."""
+
+    def whole(of_core, of_each):
+        kept = jnp.where(active.reshape(-1, *(1,) * (of_each.ndim - 1)), of_each, 0.0)
+        return jnp.concatenate([of_core, kept.reshape(-1, *of_each.shape[2:])])
+
+    return Rows(*map(whole, core, landmarks))
+
+
+def _covariance(local: Reduced, factor: Cholesky, rows: Rows) -> Float[Array, "n n"]:
+    """Of numbers with these Jacobians."""
+    by_x = factor.whitening @ rows.x.T
+    by_y = jnp.einsum("mqo,nmo->mqn", local.landmarks.whitening, rows.y)
+    by_y = by_y.reshape(-1, len(rows.x))
+    return by_x.T @ by_x + by_y.T @ by_y
+
+
+def _core(slam: EkfSlam, like, newest, log_scale):
     """The filter's core, with lengths in units of e^λ m."""
-    frame, variables, common = parts
+    frame, variables, common = newest
     unit = jnp.exp(-log_scale[0])
     variables, _ = slam.motion.enlarged(variables, like.noise, unit)
     kept = not slam.calibration.each_frame
@@ -207,18 +234,14 @@ def _core(slam: EkfSlam, like, parts, log_scale):
         motion=variables,
         log_scale=None if like.log_scale is None else log_scale,
         calibration=frame.calibration if kept else like.calibration,
-        depth_error=None if like.depth_error is None else _common_error(slam, common),
+        # The filter keeps c in σ of one landmark's prior.
+        depth_error=None if like.depth_error is None else slam.depth.common * common,
     )
 
 
-def _common_error(slam, common):
-    """The filter keeps c in σ of one landmark's prior."""
-    return slam.depth.common * common
-
-
-def _landmark(slam: EkfSlam, parts, first, y, measured, log_scale):
+def _landmark(slam: EkfSlam, newest, first, y, measured, log_scale):
     """The landmark in the map frame of the newest camera, in units of e^λ m."""
-    frame, _, common = parts
+    frame, _, common = newest
     seen, omega = located(slam, first.calibration, common, measured, y)
     unit = jnp.exp(-log_scale[0])
     held = slam.coordinates.hold(scaled(frame.pose, unit))

@@ -44,7 +44,8 @@ class Minimum(eqx.Module):
 
 def started(x: Float[Array, " N"], y: Float[Array, "m q"]) -> Minimum:
     """Before the first step."""
-    return Minimum(x, y, jnp.asarray(jnp.inf, x.dtype), jnp.asarray(1e-3, x.dtype), jnp.asarray(False))
+    cost, damping = jnp.asarray(jnp.inf, x.dtype), jnp.asarray(1e-3, x.dtype)
+    return Minimum(x, y, cost, damping, jnp.asarray(False))
 
 
 def minimised(
@@ -52,7 +53,6 @@ def minimised(
     record: Record,
     start: Minimum,
     steps: int,
-   
 ) -> Minimum:
     """After at most so many steps."""
 
@@ -139,5 +139,3 @@ def turned(
 
     turn, _ = jax.lax.scan(once, jnp.zeros(t - n, x.dtype), length=steps)
     return x.at[n:t].add(jnp.where(jnp.all(jnp.isfinite(turn)), turn, 0.0))
-
-

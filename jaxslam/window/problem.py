@@ -1,8 +1,8 @@
 """All frames of a window at once: unknowns, residuals, and the least squares of them.
 
 Everything random since frame 0 is written as standard normal numbers: x of what all landmarks
-have in common (the motion's start, the common error of the depths, the calibration, and the noise of
-every step), and y of each landmark (its true first measurement, and what that hides). With the
+have in common (the motion's start, the common error of the depths, the calibration, and the noise
+of every step), and y of each landmark (its true first measurement, and what that hides). With the
 measurements z, `−log p(x, y | z) = ½ (|x|² + |y|² + |r(x, y)|²)` up to a constant.
 
 A landmark depends on x and on its own y alone: given x the landmarks are eliminated one by one
@@ -11,7 +11,7 @@ A landmark depends on x and on its own y alone: given x the landmarks are elimin
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -119,32 +119,37 @@ def located(
     y: Float[Array, " q"],
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """The homogeneous point of a landmark, in the camera of the frame that first measured it."""
-    sensor, depth = slam.calibration.sensor(slam.sensor, calibration), slam.depth
-    p = measured.size
-    hidden = depth.mean + depth.sigma * (depth.own * y[p:] + jnp.sum(common) * _share(slam))
-    return sensor.locate(measured + cholesky(sensor.noise).root @ y[:p], hidden)
+    sensor, p = slam.calibration.sensor(slam.sensor, calibration), measured.size
+    pixel = measured + cholesky(sensor.noise).root @ y[:p]
+    return sensor.locate(pixel, hidden(slam, common, y[p:]))
 
 
-def _share(slam: EkfSlam) -> Array:
-    """σ of the depths' common error, in σ of one."""
-    return jnp.zeros(()) if slam.depth.common is None else jnp.asarray(slam.depth.common)
+def hidden(
+    slam: EkfSlam, common: Float[Array, " c"], own: Float[Array, "*m o"]
+) -> Float[Array, "*m o"]:
+    """`1/z = mean + σ (own e_i + common c)`, 1/m: what a measurement hides."""
+    depth = slam.depth
+    shared = 0.0 if depth.common is None else jnp.sum(common) * depth.common
+    return depth.mean + depth.sigma * (depth.own * own + shared)
 
 
 class Sight(NamedTuple):
-    """The point of a landmark in the camera that first saw it, and its Jacobians."""
+    """The point of a landmark in the camera that first saw it, and its Jacobians.
+
+    Homogeneous points (X, ω) have h = n + 1 numbers.
+    """
 
     point: Float[Array, " n"]
     omega: Float[Array, ""]
-    by_pose: Float[Array, "n+1 t"]
+    by_pose: Float[Array, "h t"]
     """Of (X, ω), by the tangent of that camera's pose."""
-    by_calibration: Float[Array, "n+1 k"]
-    by_common: Float[Array, "n+1 c"]
-    by_y: Float[Array, "n+1 q"]
+    by_calibration: Float[Array, "h k"]
+    by_common: Float[Array, "h c"]
+    by_y: Float[Array, "h q"]
 
 
 def sights(slam: EkfSlam, record: Record, at: Path, y: Float[Array, "m q"]) -> Sight:
     """Of all landmarks, from the frames in which they were first seen."""
-    first = record.measured[record.first, jnp.arange(record.first.size)]
     calibrations = at.frames.calibration[record.first]
 
     def one(measured, calibration, y):
@@ -156,7 +161,7 @@ def sights(slam: EkfSlam, record: Record, at: Path, y: Float[Array, "m q"]) -> S
         slopes = jax.jacfwd(of, argnums=(0, 1, 2))(*arguments)
         return Sight(there[:-1], there[-1], _by_motion(slam, there[:-1], there[-1]), *slopes)
 
-    return jax.vmap(one)(first, calibrations, y)
+    return jax.vmap(one)(record.first_measured, calibrations, y)
 
 
 def _by_motion(slam: EkfSlam, point: Float[Array, " n"], omega: Float[Array, ""]) -> Array:
@@ -169,7 +174,7 @@ def _by_motion(slam: EkfSlam, point: Float[Array, " n"], omega: Float[Array, ""]
     return jax.jacfwd(moved)(jnp.zeros(still.tangent_dim, point.dtype))
 
 
-def _relative(record: Record, at: Path) -> Float[Array, "F m n n+1"]:
+def _relative(record: Record, at: Path) -> Float[Array, "F m n h"]:
     """(R, t) of every frame in the axes of every landmark's first one: T_CF."""
     firsts = jax.tree.map(lambda x: x[record.first], at.frames.pose)
 
@@ -186,10 +191,10 @@ class Seen(NamedTuple):
 
     residual: Float[Array, "F m p"]
     impossible: Bool[Array, "F m"]
-    by_point: Float[Array, "F m p n+1"]
+    by_point: Float[Array, "F m p h"]
     """Jacobian by (X, ω) in the camera."""
     by_calibration: Float[Array, "F m p k"]
-    points: Float[Array, "F m n+1"]
+    points: Float[Array, "F m h"]
     """(X, ω) in the camera."""
 
 
@@ -219,10 +224,12 @@ def _seen(slam: EkfSlam, record: Record, at: Path, relative, sight: Sight) -> Se
         return jnp.where(used.reshape(used.shape + (1,) * (x.ndim - 2)), x, 0.0)
 
     residual, impossible, by_point, by_calibration, points = found
-    return Seen(masked(residual), impossible & used, masked(by_point), masked(by_calibration), points)
+    return Seen(
+        masked(residual), impossible & used, masked(by_point), masked(by_calibration), points
+    )
 
 
-def _by_first(seen: Seen, relative) -> Float[Array, "F m p n+1"]:
+def _by_first(seen: Seen, relative) -> Float[Array, "F m p h"]:
     """Jacobian of the residuals by (X, ω) in the camera of the first sight."""
     by_point, by_omega = seen.by_point[..., :-1], seen.by_point[..., -1]
     E = jnp.einsum("kmpn,kmno->kmpo", by_point, relative)
@@ -260,42 +267,140 @@ class Sensitivities(NamedTuple):
     motion: Float[Array, "F v N"]
 
 
-def sensitivities(
-    slam: EkfSlam, record: Record, x: Float[Array, " N"], at: Path
-) -> Sensitivities:
+def sensitivities(slam: EkfSlam, record: Record, x: Float[Array, " N"], at: Path) -> Sensitivities:
     """Step by step, by the chain rule."""
-    layout, size = Layout.of(slam), x.size
-    eye = jnp.eye(size, dtype=x.dtype)
-    states = at.frames.pose, at.motion, at.frames.calibration
-    before = jax.tree.map(lambda leaf: leaf[:-1], states)
-    steps = x[layout.whole :].reshape(record.frames - 1, -1)
-    each = jnp.arange(record.frames - 1), record.controls
+    begun, driving = _driven(slam, record, x)
+    states = len(begun)
 
-    def local(state, data, numbers):
-        return jacobian(lambda both: _moved(slam, both[0], data, both[1]), (state, numbers))
+    def move(S, data):
+        slope, driving = data
+        S = slope[:, :states] @ S + slope[:, states:] @ driving
+        return S, S
 
-    slopes = jax.vmap(local)(before, each, steps)
-    happened = (each[0] < record.last)[:, None, None]
-    still = jnp.eye(slopes.shape[1], slopes.shape[2], dtype=x.dtype)
-    slopes = jnp.where(happened, slopes, still)
+    _, later = jax.lax.scan(move, begun, (_slopes(slam, record, x, at), driving))
+    every = jnp.concatenate([begun[None], later])
+    t, v = slam.motion.geometry.tangent_dim, Layout.of(slam).start
+    frame = jnp.concatenate([every[:, :t], every[:, t + v :]], axis=1)
+    return Sensitivities(frame, every[:, t : t + v])
+
+
+def _driven(
+    slam: EkfSlam, record: Record, x: Float[Array, " N"]
+) -> tuple[Float[Array, "s N"], Float[Array, "steps w N"]]:
+    """Jacobians by x of (pose, motion, calibration) in frame 0, and of what drives every step."""
+    layout, eye = Layout.of(slam), jnp.eye(x.size, dtype=x.dtype)
     ends = [layout.start, layout.start + layout.common, layout.whole]
     start, _, drawn, driving = jnp.split(eye, ends)
     _, root = slam.motion.start()
     sigma = jnp.asarray(slam.calibration.sigma)[:, None]
-    t = slam.motion.geometry.tangent_dim
-    begun = jnp.concatenate([jnp.zeros((t, size), x.dtype), root @ start, sigma * drawn])
-    driving = driving.reshape(record.frames - 1, -1, size)
+    pose = jnp.zeros((slam.motion.geometry.tangent_dim, x.size), x.dtype)
+    begun = jnp.concatenate([pose, root @ start, sigma * drawn])
+    return begun, driving.reshape(record.frames - 1, -1, x.size)
 
-    def move(S, data):
-        slope, driving = data
-        S = slope[:, : len(S)] @ S + slope[:, len(S) :] @ driving
-        return S, S
 
-    _, later = jax.lax.scan(move, begun, (slopes, driving))
-    every = jnp.concatenate([begun[None], later])
-    v = layout.start
-    frame = jnp.concatenate([every[:, :t], every[:, t + v :]], axis=1)
-    return Sensitivities(frame, every[:, t : t + v])
+def _slopes(
+    slam: EkfSlam, record: Record, x: Float[Array, " N"], at: Path
+) -> Float[Array, "steps s d"]:
+    """Jacobian of every step by the state before it and by what drives it, d = s + w numbers."""
+    states = at.frames.pose, at.motion, at.frames.calibration
+    before = jax.tree.map(lambda leaf: leaf[:-1], states)
+    numbers = x[Layout.of(slam).whole :].reshape(record.frames - 1, -1)
+    data = jnp.arange(record.frames - 1), record.controls
+
+    def local(state, data, numbers):
+        return jacobian(lambda both: _moved(slam, both[0], data, both[1]), (state, numbers))
+
+    slopes = jax.vmap(local)(before, data, numbers)
+    happened = (data[0] < record.last)[:, None, None]
+    return jnp.where(happened, slopes, jnp.eye(*slopes.shape[1:], dtype=x.dtype))
+
+
+class Linear(NamedTuple):
+    """All residuals r, and their Jacobians by what each depends on; zero where none is."""
+
+    residual: Float[Array, "F m p"]
+    by_frame: Float[Array, "F m p a"]
+    """By the frame's tangent: pose, then calibration."""
+    by_first: Float[Array, "F m p a"]
+    """By that of the frame in which the landmark was first seen."""
+    by_common: Float[Array, "F m p c"]
+    by_y: Float[Array, "F m p q"]
+
+
+def linearised(slam: EkfSlam, record: Record, at: Path, y: Float[Array, "m q"]) -> Linear:
+    """The residuals at a path and landmarks."""
+    sight, relative = sights(slam, record, at, y), _relative(record, at)
+    seen = _seen(slam, record, at, relative, sight)
+    by_sight = _by_first(seen, relative)
+    here = jax.vmap(jax.vmap(lambda X: _by_motion(slam, X[:-1], X[-1])))(seen.points)
+    # T_C Exp(δ) moves a point by −δ in the camera's axes.
+    by_pose = -jnp.einsum("kmpn,kmnt->kmpt", seen.by_point, here)
+    of_first = jnp.concatenate([sight.by_pose, sight.by_calibration], -1)
+    return Linear(
+        seen.residual,
+        jnp.concatenate([by_pose, seen.by_calibration], -1),
+        jnp.einsum("kmpn,mna->kmpa", by_sight, of_first),
+        jnp.einsum("kmpn,mnc->kmpc", by_sight, sight.by_common),
+        jnp.einsum("kmpn,mnq->kmpq", by_sight, sight.by_y),
+    )
+
+
+def _in_first(record: Record, each: Float[Array, "m ..."]) -> Float[Array, "F ..."]:
+    """What every landmark adds to the frame in which it was first seen."""
+    return jnp.einsum("m...,mf->f...", each, _is_first(record, each.dtype))
+
+
+def _is_first(record: Record, dtype: Any) -> Float[Array, "m F"]:
+    return (record.first[:, None] == jnp.arange(record.frames)).astype(dtype)
+
+
+def _information(record: Record, J: Linear) -> Float[Array, "z z"]:
+    """`JᵀJ`, by the tangents of all frames one after the other (F a numbers), then by the common
+    error: z numbers in all, as of the following."""
+    A, first, common = J.by_frame, J.by_first, J.by_common
+    side = jnp.einsum("kmpa,kmpc->kac", A, common)
+    side += _in_first(record, jnp.einsum("kmpa,kmpc->mac", first, common))
+    side = side.reshape(record.frames * A.shape[-1], -1)
+    corner = jnp.einsum("kmpc,kmpd->cd", common, common)
+    return jnp.block([[_between_frames(record, A, first), side], [side.T, corner]])
+
+
+def _between_frames(
+    record: Record, A: Float[Array, "F m p a"], first: Float[Array, "F m p a"]
+) -> Float[Array, "n n"]:
+    """`JᵀJ` of all frames' tangents, n = F a: a residual ties its frame to the landmark's first."""
+    pairs = jnp.einsum("kmpa,kmpb->kmab", A, first)
+    crossed = jnp.einsum("kmab,mf->kafb", pairs, _is_first(record, A.dtype))
+    own = jnp.einsum("kmpa,kmpb->kab", A, A)
+    own += _in_first(record, jnp.einsum("kmpa,kmpb->mab", first, first))
+    index = jnp.arange(record.frames)
+    both = crossed + jnp.transpose(crossed, (2, 3, 0, 1))
+    both = both.at[index, :, index, :].add(own)
+    return both.reshape(record.frames * A.shape[-1], -1)
+
+
+def _gradient(record: Record, J: Linear) -> Float[Array, " z"]:
+    """`Jᵀr`."""
+    frames = jnp.einsum("kmpa,kmp->ka", J.by_frame, J.residual)
+    frames += _in_first(record, jnp.einsum("kmpa,kmp->ma", J.by_first, J.residual))
+    return jnp.append(frames.ravel(), jnp.einsum("kmpc,kmp->c", J.by_common, J.residual))
+
+
+def _with_landmarks(record: Record, J: Linear) -> Float[Array, "z m q"]:
+    """`JᵀB`, B the Jacobian by y."""
+    own = jnp.einsum("kmpa,kmpq->kamq", J.by_frame, J.by_y)
+    first = jnp.einsum("kmpa,kmpq->maq", J.by_first, J.by_y)
+    own += jnp.einsum("maq,mf->famq", first, _is_first(record, first.dtype))
+    common = jnp.einsum("kmpc,kmpq->cmq", J.by_common, J.by_y)
+    return jnp.concatenate([own.reshape(-1, *own.shape[2:]), common])
+
+
+def _of_landmarks(
+    y: Float[Array, "m q"], J: Linear
+) -> tuple[Float[Array, "m q q"], Float[Array, "m q"]]:
+    """Information and gradient of every landmark given the path."""
+    information = jnp.einsum("kmpq,kmpo->mqo", J.by_y, J.by_y) + jnp.eye(y.shape[1], dtype=y.dtype)
+    return information, jnp.einsum("kmpq,kmp->mq", J.by_y, J.residual) + y
 
 
 class Reduced(NamedTuple):
@@ -315,59 +420,32 @@ class Reduced(NamedTuple):
 def reduced(
     slam: EkfSlam, record: Record, x: Float[Array, " N"], y: Float[Array, "m q"]
 ) -> Reduced:
-    """One linearisation: normal equations by the frames' tangents, then by x."""
+    """One linearisation: normal equations by the frames' tangents, without the landmarks; then
+    by x."""
     at = path(slam, record, x)
-    S = sensitivities(slam, record, x, at)
-    sight, relative = sights(slam, record, at, y), _relative(record, at)
-    seen = _seen(slam, record, at, relative, sight)
-    E, r = _by_first(seen, relative), seen.residual
-    here = jax.vmap(jax.vmap(lambda X: _by_motion(slam, X[:-1], X[-1])))(seen.points)
-    # T_C Exp(δ) moves a point by −δ in the camera's axes.
-    A = jnp.concatenate([-jnp.einsum("kmpn,kmnt->kmpt", seen.by_point, here), seen.by_calibration], -1)
-    by_first = jnp.concatenate([sight.by_pose, sight.by_calibration], -1)
-    first = jnp.einsum("kmpn,mna->kmpa", E, by_first)
-    B = jnp.einsum("kmpn,mnq->kmpq", E, sight.by_y)
-    common = jnp.einsum("kmpn,mnc->kmpc", E, sight.by_common)
-
-    frames, a, c = record.frames, A.shape[-1], common.shape[-1]
-    where = (record.first[:, None] == jnp.arange(frames)).astype(x.dtype)  # m F
-    index = jnp.arange(frames)
-    size = frames * a + c
-    own = jnp.einsum("kmpa,kmpb->kab", A, A)
-    crossed = jnp.einsum("kmab,mf->kafb", jnp.einsum("kmpa,kmpb->kmab", A, first), where)
-    firsts = jnp.einsum("mab,mf->fab", jnp.einsum("kmpa,kmpb->mab", first, first), where)
-    M = crossed + jnp.transpose(crossed, (2, 3, 0, 1))
-    M = M.at[index, :, index, :].add(own + firsts).reshape(frames * a, -1)
-    by_common = jnp.einsum("kmpa,kmpc->kac", A, common)
-    by_common += jnp.einsum("mac,mf->fac", jnp.einsum("kmpa,kmpc->mac", first, common), where)
-    side = by_common.reshape(frames * a, c)
-    corner = jnp.einsum("kmpc,kmpd->cd", common, common)
-    M = jnp.block([[M, side], [side.T, corner]])
-
-    gradient = jnp.einsum("kmpa,kmp->ka", A, r)
-    gradient += jnp.einsum("ma,mf->fa", jnp.einsum("kmpa,kmp->ma", first, r), where)
-    gradient = jnp.append(gradient.ravel(), jnp.einsum("kmpc,kmp->c", common, r))
-
-    W = jnp.einsum("kmpa,kmpq->kamq", A, B)
-    W += jnp.einsum("maq,mf->famq", jnp.einsum("kmpa,kmpq->maq", first, B), where)
-    W = jnp.concatenate([W.reshape(frames * a, *B.shape[1::2]), jnp.einsum("kmpc,kmpq->cmq", common, B)])
-
-    information = jnp.einsum("kmpq,kmpo->mqo", B, B) + jnp.eye(y.shape[1], dtype=y.dtype)
-    own_factor = cholesky_each(information)
-    slope = jnp.einsum("kmpq,kmp->mq", B, r) + y
-
-    layout = Layout.of(slam)
-    eye = jnp.eye(x.size, dtype=x.dtype)
-    to_x = jnp.concatenate([S.frame.reshape(frames * a, -1), eye[layout.start : layout.start + c]])
-    half = jnp.einsum("imq,moq->imo", W, own_factor.whitening).reshape(size, -1)
-    left = M - half @ half.T
-    whitened = jnp.einsum("mqo,mo->mq", own_factor.whitening, slope).ravel()
-    H = to_x.T @ (left @ to_x) + eye
-    g = to_x.T @ (gradient - half @ whitened) + x
+    S, J = sensitivities(slam, record, x, at), linearised(slam, record, at, y)
+    information, slope = _of_landmarks(y, J)
+    own = cholesky_each(information)
+    W = _with_landmarks(record, J)
+    half = jnp.einsum("zmq,moq->zmo", W, own.whitening).reshape(len(W), -1)
+    whitened = jnp.einsum("mqo,mo->mq", own.whitening, slope).ravel()
+    to_x = _to_x(slam, S)
+    left = _information(record, J) - half @ half.T
+    gradient = to_x.T @ (_gradient(record, J) - half @ whitened) + x
     by_x = (half.T @ to_x).reshape(*slope.shape, -1)
-    coupling = jnp.einsum("moq,mon->mqn", own_factor.whitening, by_x)
-    return Reduced(at, S, H, g, own_factor, coupling)
+    coupling = jnp.einsum("moq,mon->mqn", own.whitening, by_x)
+    eye = jnp.eye(x.size, dtype=x.dtype)
+    return Reduced(at, S, to_x.T @ (left @ to_x) + eye, gradient, own, coupling)
+
+
+def _to_x(slam: EkfSlam, S: Sensitivities) -> Float[Array, "z N"]:
+    """Jacobian by x of all frames' tangents and the common error."""
+    layout, size = Layout.of(slam), S.frame.shape[-1]
+    eye = jnp.eye(size, dtype=S.frame.dtype)
+    common = eye[layout.start : layout.start + layout.common]
+    return jnp.concatenate([S.frame.reshape(-1, size), common])
 
 
 def cholesky_each(A: Float[Array, "m q q"]) -> Cholesky:
+    """Of every landmark."""
     return jax.vmap(cholesky)(A)

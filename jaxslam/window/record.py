@@ -42,6 +42,11 @@ class Record(eqx.Module):
         k = jnp.arange(self.frames)[:, None]
         return self.seen & (k > self.first) & (k <= self.last)
 
+    @property
+    def first_measured(self) -> Float[Array, "m p"]:
+        """What every slot's landmark was first measured at."""
+        return self.measured[self.first, jnp.arange(self.first.size)]
+
     def cut(self, frames: int) -> Record:
         """The first frames alone, for a smaller problem."""
         return Record(
@@ -68,7 +73,9 @@ def empty(motion: AbstractMotion, frames: int, landmarks: int, p: int, dtype: An
 def stepped(record: Record, control: Any, seen: Features) -> Record:
     """With one frame more and what it measured of known landmarks. A full record stays as it is."""
     k = jnp.where(record.full, record.frames, record.last + 1)  # beyond the end: dropped
-    controls = jax.tree.map(lambda all, one: all.at[k - 1].set(one, mode="drop"), record.controls, control)
+    controls = jax.tree.map(
+        lambda all, one: all.at[k - 1].set(one, mode="drop"), record.controls, control
+    )
     stepped = replace(record, last=jnp.minimum(k, record.frames - 1), controls=controls)
     return _measured(stepped, k, seen)
 

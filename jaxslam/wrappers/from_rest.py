@@ -1,10 +1,10 @@
 """A Gaussian sum that sets out from rest: a growing window of all frames, until parallax is there.
 
-Nobody told the filter how its camera moves. What the first frames leave open has several modes, and
-a filter that linearises where it stands picks one of them at the first pixel's noise. So everything
-since frame 0 is kept and linearised again with every frame (`jaxslam.window`), each mode for itself,
-and in every frame the members of the sum are the modes' Gaussians, weighed by their evidence. When
-the translation is known to a fraction of itself, the sum goes on alone.
+Nobody told the filter how its camera moves. What the first frames leave open has several modes,
+and a filter that linearises where it stands picks one of them at the first pixel's noise. So
+everything since frame 0 is kept and linearised again with every frame (`jaxslam.window`), each mode
+for itself, and in every frame the members of the sum are the modes' Gaussians, weighed by their
+evidence. When the translation is known to a fraction of itself, the sum goes on alone.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam.arrays import AnyArray, cast, precision
 from jaxslam.forms.state import Features, Innovation, State
 from jaxslam.geometry import Pose
-from jaxslam.slam.filter import EkfSlam
+from jaxslam.slam.filter import EkfSlam, innermost
 from jaxslam.slam.protocol import AbstractStaged, Capacity, Expected
 from jaxslam.window import record as window
 from jaxslam.window.handover import gauge_state
@@ -60,6 +60,21 @@ class FromRest(AbstractStaged):
     sizes: tuple[int, ...] = eqx.field(static=True)
     directions: int = eqx.field(static=True)
     known: float = eqx.field(static=True, default=KNOWN)
+
+    def __check_init__(self) -> None:
+        if not isinstance(self.base, Mixture):
+            raise ValueError(
+                "a start from rest is of a Gaussian sum that divides itself (mixture), not of a "
+                f"{type(self.base).__name__}"
+            )
+        _check_base(self.base.base)
+        if min(self.sizes, default=0) < 3 or list(self.sizes) != sorted(set(self.sizes)):
+            raise ValueError(
+                "a start from rest keeps windows of 3 frames and more (frame 0 and at least 2 "
+                f"after it), each larger than the one before, not {self.sizes}"
+            )
+        if self.directions < 1:
+            raise ValueError(f"a search sets out in 1 direction at least, not {self.directions}")
 
     def init(self, capacity: int | Capacity, first: Features | None = None) -> RestState:
         ekf, count = self.base.base, self.base.count
@@ -171,10 +186,24 @@ def _members(ekf: EkfSlam, record: Record, modes: Modes, members: State) -> Stat
     return each_alive(begun, (modes.minima, members), alive, record)[1]
 
 
+def _check_base(ekf: EkfSlam) -> None:
+    """Raise ValueError unless a window can say all that the filter keeps."""
+    for wrong, why in (
+        (not ekf.motion.has_velocity, f"of a velocity, which {type(ekf.motion).__name__} lacks"),
+        (not ekf.sensor.hidden, f"for a camera; {type(ekf.sensor).__name__} measures metres"),
+        (ekf.landmark.anchored, f"without anchors, which {ekf.landmark.name} has"),
+        (not ekf.calibration.corrected, "for a calibration that is known, white or estimated"),
+    ):
+        if wrong:
+            raise ValueError(f"a start from rest is {why}")
+
+
 def from_rest(base: Mixture, frames: int | None = None) -> FromRest:
-    """The sum with a start that looks for itself how the camera moves."""
-    name = base.base.motion.geometry.name
+    """The sum with a start that looks for itself how the camera moves, within so many frames after
+    frame 0. Raises ValueError for what does not go together."""
+    inner = innermost(base)
+    name = "planar" if inner is None else inner.motion.geometry.name
     sizes = SIZES[name]
     if frames is not None:
-        sizes = tuple(size for size in sizes if size < frames + 1) + (frames + 1,)
+        sizes = (*(size for size in sizes if size < frames + 1), frames + 1)
     return FromRest(base, sizes, DIRECTIONS[name])

@@ -1,0 +1,194 @@
+"""Tests of the sum that sets out from rest: what it finds, and what it refuses."""
+
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import Case, quick_jit
+
+from jaxslam.consistency.statistics import lost_threshold
+from jaxslam.forms.state import Features
+from jaxslam.models.calibration import Considered
+from jaxslam.wrappers.from_rest import FromRest, from_rest
+
+RUNS, STEPS = 6, 12
+SUM = "scale_gauge+mixture3"
+STARTED = f"{SUM}+rest8"
+"""Eight frames are one window, and are over within the run."""
+
+
+@cache
+def standstill():
+    return Case("standstill-6dof", RUNS, landmarks=12, steps=STEPS)
+
+
+@cache
+def stages(name):
+    """`init` and `step` of the filter, of a batch of runs."""
+    of = standstill()
+    slam = of.filter(name)
+    return (
+        quick_jit(jax.vmap(lambda first: slam.init(of.capacity, first))),
+        quick_jit(jax.vmap(slam.step)),
+    )
+
+
+@cache
+def followed(name):
+    """The state after every frame, a batch of runs."""
+    of = standstill()
+    first, known, new = of.features
+    init, step = stages(name)
+    states = [init(first)]
+    for k in range(STEPS):
+        frame = jax.tree.map(lambda x: x[:, k], (of.runs.controls, known, new))
+        states.append(step(states[-1], *frame)[0])
+    return states
+
+
+def pose_of(name):
+    slam, runs = standstill().filter(name), standstill().runs
+
+    @quick_jit
+    @jax.vmap
+    def one(state, run):
+        truth = jax.tree.map(lambda x: x[-1], run.poses)
+        error, P = slam.pose_error(state, truth)
+        pose, _ = slam.marginal(state, lambda scene: scene.pose)
+        along = pose.translation() @ truth.translation()
+        return error, P, along
+
+    error, P, along = (np.asarray(x) for x in one(followed(name)[-1], runs))
+    return np.einsum("ri,ri->r", error, np.linalg.solve(P, error[..., None])[..., 0]), along
+
+
+def test_from_rest_no_run_is_lost_and_none_goes_backwards():
+    """Of those in which the sum alone loses some. Six degrees of freedom: NEES is 6 ± 1.4."""
+    nees, along = pose_of(STARTED)
+    assert nees.max() < lost_threshold(6)
+    assert nees.mean() < 12
+    assert (along > 0).all()
+    alone, _ = pose_of(SUM)
+    assert not (alone < lost_threshold(6)).all()
+
+
+def test_the_window_closes_and_the_sum_goes_on_alone():
+    states = followed(STARTED)
+    still_open = np.array([state.open for state in states])
+    assert still_open[:8].all()
+    assert not still_open[8:].any()
+    closed, after = states[8], states[9]
+    jax.tree.map(np.testing.assert_array_equal, after.modes, closed.modes)
+    assert not np.array_equal(after.sum.members.covariance, closed.sum.members.covariance)
+
+
+def test_the_members_are_the_modes_as_long_as_the_window_is_open():
+    for state in followed(STARTED)[1:9]:
+        np.testing.assert_array_equal(state.sum.log_weights, state.modes.log_weights)
+        np.testing.assert_allclose(np.exp(state.modes.log_weights).sum(axis=1), 1, rtol=1e-9)
+
+
+def test_the_first_frames_leave_several_modes_and_the_last_ones_one():
+    """So that the search is needed, and ends."""
+    early, late = (followed(STARTED)[k].modes.log_weights for k in (3, 8))
+    assert (np.isfinite(early).sum(axis=1) > 1).any()
+    assert (np.exp(late).max(axis=1) > 0.9).mean() > 0.5
+
+
+def test_landmarks_are_removed_in_the_midst_of_a_window():
+    of, slam = standstill(), standstill().filter(STARTED)
+    _, step = stages(STARTED)
+    before = followed(STARTED)[4]
+    gone = jnp.arange(of.capacity) < 3
+    less = quick_jit(jax.vmap(lambda state: slam.remove(state, gone)))(before)
+    assert not less.record.seen[..., :3].any()
+    np.testing.assert_array_equal(less.record.seen[..., 3:], before.record.seen[..., 3:])
+    assert not jax.vmap(slam.in_map)(less)[:, :3].any()
+    first, known, new = of.features
+    controls, known, new = jax.tree.map(lambda x: x[:, 4], (of.runs.controls, known, new))
+    rest = Features(known.slots, known.measured, known.valid & ~gone[known.slots])
+    after, innovation = step(less, controls, rest, new)
+    assert not jax.vmap(slam.in_map)(after)[:, :3].any()
+    assert jax.vmap(slam.in_map)(after)[:, 3:].all()
+    assert (innovation.status == 0).all()
+    every = followed(STARTED)[5]
+    sizes = [
+        np.linalg.slogdet(state.sum.members.covariance[:, 0, :6, :6])[1] for state in (after, every)
+    ]
+    assert (sizes[0] > sizes[1]).all()
+
+
+def test_features_are_predicted_where_they_are_seen():
+    of, slam = standstill(), standstill().filter(STARTED)
+    _, known, _ = of.features
+    controls, seen = jax.tree.map(lambda x: x[:, 6], (of.runs.controls, known))
+
+    @quick_jit
+    @jax.vmap
+    def expected(state, control, slots):
+        predicted = slam.predict(state, control)
+        _, one = slam.gaussian(predicted, control)
+        return slam.predict_features(predicted, control, slots), one.active
+
+    there, active = expected(followed(STARTED)[6], controls, seen.slots)
+    assert there.possible.all()
+    assert active.all()
+    wrong = np.asarray(seen.measured - there.measured)
+    squared = np.einsum(
+        "rmi,rmi->rm", wrong, np.linalg.solve(there.covariance, wrong[..., None])[..., 0]
+    )
+    assert squared.mean() < 6  # of two pixels: 2, of all whose covariance is right
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("scale_gauge+rest8", "Gaussian sum that divides itself .mixture., not of a EkfSlam"),
+        ("robocentric+directions3+rest8", "mixture., not of a Bank"),
+        ("scale_gauge+mixture3+rest1", r"3 frames and more .* not \(2,\)"),
+        ("scale_gauge+mixture3+rest0", r"3 frames and more .* not \(1,\)"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_what_cannot_start_from_rest_is_refused(name, message):
+    with pytest.raises(ValueError, match=message):
+        standstill().filter(name)
+
+
+@pytest.mark.parametrize("landmark", ["anchored_homogeneous", "inverse_depth"])
+def test_a_landmark_with_an_anchor_is_refused(landmark):
+    with pytest.raises(ValueError, match=f"without anchors, which {landmark} has"):
+        standstill().filter("world+mixture3+rest8", landmark)
+
+
+def test_a_calibration_that_is_not_corrected_is_refused():
+    base = standstill().filter(SUM)
+    considered = Considered([3.0] * 2 + [2.0] * 2)
+    base = eqx.tree_at(lambda base: base.base.calibration, base, considered)
+    with pytest.raises(ValueError, match="calibration that is known, white or estimated"):
+        from_rest(base, 8)
+
+
+@pytest.mark.parametrize("sizes", [(9, 9), (17, 9), ()])
+def test_windows_that_do_not_grow_are_refused(sizes):
+    with pytest.raises(ValueError, match="each larger than the one before"):
+        FromRest(standstill().filter(SUM), sizes, 4)
+
+
+def test_a_search_in_no_direction_is_refused():
+    with pytest.raises(ValueError, match="1 direction at least, not 0"):
+        FromRest(standstill().filter(SUM), (9,), 0)
+
+
+def test_windows_grow_up_to_the_frames_that_are_named():
+    base = standstill().filter(SUM)
+    assert from_rest(base).sizes == (9, 17, 31)
+    assert from_rest(base, 8).sizes == (9,)
+    assert from_rest(base, 20).sizes == (9, 17, 21)
+    assert from_rest(base, 2).sizes == (3,)

@@ -1,0 +1,465 @@
+"""Tests of jaxslam.window: what is remembered, and least squares against dense algebra."""
+
+from dataclasses import replace
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import close, quick_jit
+
+import jaxslam
+from jaxslam.forms.state import Features
+from jaxslam.geometry import jacobian
+from jaxslam.landmarks import INVERSE_SCALING
+from jaxslam.linalg import cholesky
+from jaxslam.models.calibration import Estimated, Known, White
+from jaxslam.models.depth import InverseDepth
+from jaxslam.names import scale_gauge, scenario_pieces
+from jaxslam.posterior import log_density, make_problem
+from jaxslam.posterior.laplace import minima
+from jaxslam.simulation import scenario
+from jaxslam.window import handover, minimise
+from jaxslam.window.handover import gauge_state, rescaled, scaling, shift_of_scale, variances
+from jaxslam.window.minimise import minimised, started
+from jaxslam.window.modes import each_alive, when
+from jaxslam.window.problem import Layout, path, reduced, residuals, sensitivities
+from jaxslam.window.record import Record, begun, empty, removed, stepped
+
+FRAMES, FIRST = 5, jnp.array([0, 0, 0, 1, 0, 2])
+"""Landmarks begin in three frames."""
+
+
+class Case(NamedTuple):
+    """A filter, measurements that it could have made, and the unknowns that made them."""
+
+    slam: Any
+    record: Record
+    x: Any
+    y: Any
+
+
+def pieces(name, **fields):
+    return scenario_pieces(scenario(name, fields), "known")
+
+
+def filter_of(name, treatment, common):
+    """Everything is measured well, or the posterior would have many minima."""
+    made = pieces(name)
+    p = made["sensor"].size
+    sigma = np.array([3.0] * p + [2.0] * p)
+    depth = InverseDepth(0.25, 0.05, 0.8, common)
+    calibration = Known() if treatment is Known else treatment(sigma)
+    return scale_gauge(
+        **{**made, "depth": depth, "calibration": calibration}, landmark=INVERSE_SCALING
+    )
+
+
+@cache
+def case(name="standstill", treatment=Known, common=None, last=FRAMES - 1):
+    """Pixels by the model itself at unknowns drawn from the prior, and noise on them."""
+    slam = filter_of(name, treatment, common)
+    draw = np.random.default_rng(5)
+    m, p, N = FIRST.size, slam.sensor.size, Layout.of(slam).size(FRAMES)
+    x = jnp.asarray(0.5 * draw.standard_normal(N)).at[0].set(1.5)
+    y = jnp.asarray(0.5 * draw.standard_normal((m, p + 1)))
+    seen = (jnp.arange(FRAMES)[:, None] >= FIRST) & (jnp.arange(FRAMES)[:, None] <= last)
+    first = jnp.asarray(draw.uniform(150, 450, (m, p)))
+    record = Record(
+        jnp.asarray(last),
+        jnp.full(FRAMES - 1, 1 / 5),
+        jnp.tile(first, (FRAMES, 1, 1)),
+        seen.at[2, 1].set(False),
+        FIRST,
+    )
+    wrong = quick_jit(residuals)(slam, record, quick_jit(path)(slam, record, x), y)
+    noise = jnp.where(record.compared[..., None], draw.standard_normal(wrong.shape), 0.0)
+    measured = record.measured - slam.sensor.sigma * (wrong - noise)
+    return Case(slam, replace(record, measured=measured), x, y)
+
+
+CASES = [
+    ("standstill", Known, None),
+    ("standstill", White, 0.5),
+    ("standstill", Estimated, 0.5, 3),
+    ("standstill-6dof", White, None, 3),
+    ("standstill-6dof", Estimated, 0.5),
+]
+
+
+def each(cases):
+    def name(of):
+        return "-".join(getattr(part, "__name__", str(part)) for part in of)
+
+    return pytest.mark.parametrize("of", cases, ids=name)
+
+
+each_case = each(CASES)
+
+
+def all_residuals(slam, record, u, shape):
+    """`[x; y; r]`, as one function of both."""
+    x, y = u[: -shape[0] * shape[1]], u[-shape[0] * shape[1] :].reshape(shape)
+    return jnp.append(u, residuals(slam, record, path(slam, record, x), y).ravel())
+
+
+@quick_jit
+def _dense(slam, record, x, y):
+    def of(u):
+        return all_residuals(slam, record, u, y.shape)
+
+    u = jnp.append(x, y.ravel())
+    return of(u), jax.jacfwd(of)(u)
+
+
+def dense(slam, record, x, y):
+    """Residuals of everything, information and gradient, in NumPy."""
+    r, J = (np.asarray(value) for value in _dense(slam, record, x, y))
+    return r, J.T @ J, J.T @ r
+
+
+@quick_jit
+def _precisely(slam, record, x, y):
+    return minimised(slam, record, started(x, y), 60)
+
+
+def precisely(slam, record, x, y):
+    """The minimum as well as numbers can say it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(minimise, "TOLERANCE", 1e-14)
+        return _precisely(slam, record, x, y)
+
+
+@cache
+def minimum(*of):
+    """Of a case, from the truth."""
+    return precisely(*case(*of))
+
+
+# What is remembered
+
+
+def features(slots, measured, valid=None):
+    valid = np.ones(len(slots), bool) if valid is None else valid
+    return Features(jnp.array(slots), jnp.array(measured)[:, None], jnp.array(valid))
+
+
+def some_record():
+    """Three frames, three slots: 0 and 1 begin in frame 0, slot 2 in frame 1."""
+    record = empty(pieces("standstill")["motion"], 3, 3, 1, jnp.float64)
+    record = begun(record, features([1, 0, 2], [11.0, 10.0, 99.0], [True, True, False]))
+    record = stepped(record, jnp.asarray(0.1), features([0, 1], [20.0, 21.0]))
+    record = begun(record, features([2], [22.0]))
+    return stepped(record, jnp.asarray(0.2), features([2, 0], [32.0, 30.0], [True, False]))
+
+
+def test_a_record_has_every_measurement_by_frame_and_slot():
+    record = some_record()
+    assert record.last == 2
+    np.testing.assert_array_equal(record.controls, [0.1, 0.2])
+    np.testing.assert_array_equal(record.first, [0, 0, 1])
+    seen = [[True, True, False], [True, True, True], [False, False, True]]
+    np.testing.assert_array_equal(record.seen, seen)
+    expected = [[10, 11, 0], [20, 21, 22], [0, 0, 32]]
+    np.testing.assert_array_equal(record.measured[..., 0], expected)
+    compared = [[False] * 3, [True, True, False], [False, False, True]]
+    np.testing.assert_array_equal(record.compared, compared)
+
+
+def test_a_full_record_stays_as_it_is():
+    record = some_record()
+    assert record.full
+    after = stepped(record, jnp.asarray(9.0), features([0, 1], [90.0, 91.0]))
+    jax.tree.map(np.testing.assert_array_equal, after, record)
+
+
+def test_a_slot_that_is_used_again_forgets_its_old_track():
+    record = begun(some_record(), features([0], [50.0]))
+    assert record.first[0] == 2
+    np.testing.assert_array_equal(record.seen[:, 0], [False, False, True])
+    assert record.measured[2, 0, 0] == 50
+    np.testing.assert_array_equal(record.seen[:, 1:], some_record().seen[:, 1:])
+
+
+def test_what_is_removed_is_not_seen():
+    record = removed(some_record(), jnp.array([False, True, False]))
+    assert not record.seen[:, 1].any()
+    np.testing.assert_array_equal(record.seen[:, ::2], some_record().seen[:, ::2])
+
+
+def test_a_record_is_cut_to_its_first_frames():
+    record = some_record().cut(2)
+    assert (record.frames, int(record.last), record.controls.shape) == (2, 1, (1,))
+    np.testing.assert_array_equal(record.seen, some_record().seen[:2])
+    np.testing.assert_array_equal(record.measured, some_record().measured[:2])
+
+
+# The quadratic
+
+
+@each_case
+def test_what_is_reduced_is_the_schur_complement_of_the_dense_problem(of):
+    slam, record, x, y = case(*of)
+    x, y = x + 0.1, y - 0.1
+    got = quick_jit(reduced)(slam, record, x, y)
+    _, A, g = dense(slam, record, x, y)
+    N = x.size
+    coupling = np.linalg.solve(A[N:, N:], A[N:, :N])
+    assert np.abs(A[:N, :N] - np.eye(N)).max() > 1
+    close(got.information, A[:N, :N] - A[:N, N:] @ coupling, 1e-8)
+    close(got.gradient, g[:N] - coupling.T @ g[N:], 1e-8)
+    close(got.coupling.reshape(y.size, N), coupling, 1e-8)
+    m, q = y.shape
+    own = A[N:, N:].reshape(m, q, m, q)[np.arange(m), :, np.arange(m)]
+    roots = np.asarray(got.landmarks.root)
+    close(roots @ roots.transpose(0, 2, 1), own, 1e-8)
+
+
+@each_case
+def test_sensitivities_are_the_derivatives_of_the_path(of):
+    slam, record, x, _ = case(*of)
+
+    @quick_jit
+    def both(x):
+        at = path(slam, record, x)
+
+        def of_frame(k):
+            def frame(x):
+                whole = path(slam, record, x)
+                return jax.tree.map(lambda leaf: leaf[k], (whole.frames, whole.motion))
+
+            return jacobian(frame, x)
+
+        return sensitivities(slam, record, x, at), jnp.stack([of_frame(k) for k in range(FRAMES)])
+
+    got, expected = both(x)
+    a = got.frame.shape[1]
+    close(got.frame, expected[:, :a], 1e-8)
+    close(got.motion, expected[:, a:], 1e-8)
+
+
+# Minima
+
+
+@each_case
+def test_a_minimum_costs_less_than_the_truth_and_has_no_gradient(of):
+    slam, record, x, y = case(*of)
+    at = minimum(*of)
+    r, A, g = dense(slam, record, at.x, at.y)
+    truth, *_ = dense(slam, record, x, y)
+    np.testing.assert_allclose(at.cost, r @ r, rtol=1e-9)
+    assert at.cost < truth @ truth
+    # What a Newton step would still gain.
+    assert g @ np.linalg.solve(A, g) < 1e-9
+
+
+@each(CASES[1:3])
+def test_a_minimum_is_found_within_the_tolerance(of):
+    """Of half the sum of squares, and in far fewer steps than are allowed."""
+    slam, record, x, y = case(*of)
+    start = started(0.9 * x, y)
+    found = quick_jit(lambda record, start: minimised(slam, record, start, 60))(record, start)
+    assert found.converged
+    assert found.damping < 1
+    assert found.cost - minimum(*of).cost < 10 * minimise.TOLERANCE
+
+
+def test_the_window_is_the_exact_posterior_of_a_run_and_has_its_minimum():
+    chosen = scenario("matched-loose", steps=3, landmarks=4)
+    run = jaxslam.simulate(chosen, jax.random.key(0))
+    problem = make_problem(chosen, run, truncated=False)
+    slam = scale_gauge(**scenario_pieces(chosen), landmark=INVERSE_SCALING)
+    everywhere = jnp.arange(4)
+    record = empty(slam.motion, 4, 4, 1, jnp.float64)
+    record = begun(record, Features(everywhere, run.measured[0], run.visible[0]))
+    for k in range(3):
+        seen = Features(everywhere, run.measured[k + 1], run.visible[k + 1])
+        record = stepped(record, run.controls[k], seen)
+
+    def joined(x, y):
+        return jnp.concatenate([x, y[:, 0], y[:, 1]])
+
+    draw = np.random.default_rng(1)
+    x, y = jnp.asarray(0.3 * draw.standard_normal(12)), jnp.asarray(draw.standard_normal((4, 2)))
+    r, *_ = dense(slam, record, x, y)
+    np.testing.assert_allclose(-r @ r / 2, log_density(problem, joined(x, y)), rtol=1e-9)
+    found = precisely(slam, record, 0 * x, 0 * y)
+    modes, values, _ = quick_jit(minima)(problem, jnp.zeros((1, 20)))
+    np.testing.assert_allclose(-found.cost / 2, values[0], rtol=1e-6)
+    np.testing.assert_allclose(joined(found.x, found.y), modes[0], atol=1e-4)
+
+
+# Scale
+
+
+@each_case
+def test_all_lengths_enlarged_show_the_same_pixels(of):
+    slam, record, *_ = case(*of)
+    at = minimum(*of)
+
+    @quick_jit
+    def wrong(log_scale):
+        x, y = rescaled(slam, record, at, log_scale)
+        there = path(slam, record, x)
+        return residuals(slam, record, there, y), there.frames.pose.translation()
+
+    (same, near), (other, far) = wrong(0.0), wrong(0.3)
+    np.testing.assert_allclose(other, same, atol=1e-9)
+    np.testing.assert_allclose(far, np.exp(0.3) * near, rtol=1e-9, atol=1e-12)
+
+
+@each_case
+def test_scaling_is_an_eigenvector_of_the_information_with_value_1(of):
+    """And orthogonal to the gradient wherever that is zero."""
+    slam, record, *_ = case(*of)
+    at = minimum(*of)
+    s = quick_jit(scaling)(slam, record, at)
+    both = np.append(s.x, s.y.ravel())
+    np.testing.assert_allclose(s.squared, both @ both, rtol=1e-12)
+    _, A, g = dense(slam, record, at.x, at.y)
+    np.testing.assert_allclose(A @ both, both, atol=1e-6 * float(np.linalg.norm(both)))
+    assert abs(g @ both) < 1e-5 * np.linalg.norm(both)
+
+
+def test_scaling_is_the_derivative_of_what_is_rescaled():
+    """Where no error is common: there it is the shortest of those that change no pixel."""
+    slam, record, *_ = case("standstill-6dof", White, None, 3)
+    at = minimum("standstill-6dof", White, None, 3)
+    wide = quick_jit(lambda log_scale: rescaled(slam, record, at, log_scale))
+    s = quick_jit(scaling)(slam, record, at)
+    for one, more, less in zip(s, wide(1e-5), wide(-1e-5), strict=True):
+        np.testing.assert_allclose(one, (more - less) / 2e-5, atol=1e-7)
+
+
+def test_of_common_errors_scaling_is_the_shortest():
+    slam, record, *_ = case("standstill", White, 0.5)
+    at = minimum("standstill", White, 0.5)
+    s = quick_jit(scaling)(slam, record, at)
+    # What changes no depth: the common error up, and every own one down.
+    p, start = slam.sensor.size, Layout.of(slam).start
+    free = s.x[start] - jnp.sum(s.y[:, p:]) * slam.depth.common / slam.depth.own
+    assert abs(free) < 1e-9
+    assert abs(s.x[start]) > 1e-3
+
+
+def test_the_mean_is_shifted_by_the_volume_of_the_rest():
+    """`½ d log det A/dλ`, against differences of it."""
+    of = "standstill-6dof", White, None, 3
+    slam, record, *_ = case(*of)
+    at = minimum(*of)
+    local, s = quick_jit(reduced)(slam, record, at.x, at.y), quick_jit(scaling)(slam, record, at)
+
+    def half_log_det(log_scale):
+        _, A, _ = dense(slam, record, *rescaled(slam, record, at, jnp.asarray(log_scale)))
+        return np.linalg.slogdet(A)[1] / 2
+
+    slope = (half_log_det(1e-4) - half_log_det(-1e-4)) / 2e-4
+    factor = cholesky(local.information)
+    shift = shift_of_scale(slam, local, s, factor)
+    assert abs(slope) > 1e-2
+    assert abs(shift) < handover.MOST_SHIFT
+    np.testing.assert_allclose(shift * s.squared, -slope, rtol=1e-5)
+    by_x, by_y = variances(local, factor.whitening)
+    _, A, _ = dense(slam, record, at.x, at.y)
+    inverse = np.diagonal(np.linalg.inv(A))
+    np.testing.assert_allclose(np.append(by_x, by_y.ravel()), inverse, rtol=1e-7)
+
+
+# What the filter goes on from
+
+
+@each(CASES[2:4])
+def test_the_filters_state_is_the_gaussian_of_the_mode(of, monkeypatch):
+    """Marginals in metres are those of the dense inverse; λ has the variance 1/|s|²."""
+    monkeypatch.setattr(handover, "MOST_SHIFT", 0.0)
+    slam, record, *_ = case(*of)
+    at = minimum(*of)
+    m, p = FIRST.size, slam.sensor.size
+
+    @quick_jit
+    def handed(at):
+        first = Features(jnp.arange(m), record.measured[0], jnp.zeros(m, bool))
+        state = gauge_state(slam, record, at, slam.init(m, first))
+        told = slam.marginal(state, lambda scene: scene.pose)
+        points = slam.marginal(
+            state, lambda scene: jnp.append(scene.point, scene.omega) / scene.point[-1],
+            jnp.arange(m),
+        )  # fmt: skip
+        return state, told, points
+
+    def of_window(u):
+        x, y = u[: -m * (p + 1)], u[-m * (p + 1) :].reshape(m, p + 1)
+        there = path(slam, record, x)
+        return jax.tree.map(lambda leaf: leaf[record.last], there.frames.pose), bearings(there, y)
+
+    def bearings(there, y):
+        """Of the landmarks in the newest camera: bearing and inverse depth."""
+        newest = jax.tree.map(lambda leaf: leaf[record.last], there.frames.pose)
+
+        def one(first, measured, y):
+            begun = jax.tree.map(lambda leaf: leaf[first], there.frames)
+            T = newest.inverse() @ begun.pose
+            sensor = slam.calibration.sensor(slam.sensor, begun.calibration)
+            depth = slam.depth
+            common = 0.0 if depth.common is None else depth.common * there.common[0]
+            omega = depth.mean + depth.sigma * (depth.own * y[p:] + common)
+            X, omega = sensor.locate(measured + sensor.sigma * y[:p], omega)
+            X = T.rotation() @ X + T.translation() * omega
+            return jnp.append(X, omega) / X[-1]
+
+        return jax.vmap(one)(FIRST, record.measured[FIRST, jnp.arange(m)], y)
+
+    state, (pose, covariance), (points, spread) = handed(at)
+    u = jnp.append(at.x, at.y.ravel())
+    J_pose, J_points = quick_jit(
+        lambda u: (jacobian(lambda u: of_window(u)[0], u), jax.jacfwd(lambda u: of_window(u)[1])(u))
+    )(u)
+    expected_pose, expected_points = quick_jit(of_window)(u)
+    _, A, _ = dense(slam, record, at.x, at.y)
+    Sigma = np.linalg.inv(A)
+    assert state.active.all()
+    close(pose.inverse().log(), expected_pose.inverse().log(), 1e-3)
+    close(covariance, J_pose @ Sigma @ J_pose.T, 1e-3)
+    close(points, expected_points, 1e-3)
+    close(spread, np.einsum("min,no,mjo->mij", J_points, Sigma, J_points), 1e-3)
+    part = state.core.part("log_scale").start
+    s = scaling(slam, record, at)
+    np.testing.assert_allclose(state.covariance[part, part], 1 / s.squared, rtol=1e-9)
+    assert np.linalg.eigvalsh(state.covariance).min() > -1e-12
+
+
+# Work that is not wanted
+
+
+def counted(found):
+    """Doubles a value, and counts how often that is done."""
+
+    def doubled(value, *given):
+        jax.debug.callback(lambda _: found.append(1), value)
+        return 2 * value + sum(given)
+
+    return doubled
+
+
+@pytest.mark.parametrize("wanted", [[False] * 3, [True, False, True]])
+def test_what_nobody_in_a_batch_wants_is_not_done(wanted):
+    found, values = [], jnp.arange(1.0, 4.0)
+    after = quick_jit(jax.vmap(lambda w, v: when(w, counted(found), v, jnp.asarray(0.5))))(
+        jnp.array(wanted), values
+    )
+    jax.block_until_ready(after)
+    jax.effects_barrier()
+    np.testing.assert_array_equal(after, np.where(wanted, 2 * values + 0.5, values))
+    assert bool(found) == any(wanted)
+
+
+def test_only_the_living_are_worked_on():
+    found, alive = [], jnp.array([True, False, False, True])
+    values = jnp.arange(4.0)
+    after = quick_jit(lambda alive: each_alive(counted(found), values, alive))(alive)
+    jax.block_until_ready(after)
+    jax.effects_barrier()
+    np.testing.assert_array_equal(after, jnp.where(alive, 2 * values, values))
+    assert len(found) == 2
