@@ -30,17 +30,17 @@ from jaxslam.window.record import Record
 from jaxslam.wrappers.bank import BankState
 from jaxslam.wrappers.mixture import Mixture
 
-SIZES = {"planar": (9, 17, 33, 61), "spatial": (9, 17, 31)}
+SIZES = {"planar": (9, 25, 61), "spatial": (9, 31)}
 """Frames of the windows that are compiled; the smallest that holds all is computed."""
 DIRECTIONS = {"planar": 16, "spatial": 8}
 """In which the search sets out, from rest beside."""
-SEARCHES = (3, 6, 12)
+SEARCHES = (1, 2, 3, 4, 6, 8, 11, 15, 20, 26, 34)
 """Frames after which minima are sought anew."""
 REFINEMENTS = 4
 """Steps of Levenberg–Marquardt with every new frame, at the most."""
 LEAST_FRAMES = 8
 """In the window before the sum may go on alone."""
-KNOWN = 0.1
+KNOWN = 0.03
 """σ of the translation, in translations, given the scale: below it parallax is there."""
 
 
