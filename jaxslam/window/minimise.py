@@ -32,14 +32,14 @@ LANDMARK_STEPS = 3
 
 
 class Minimum(eqx.Module):
-    """Where a minimisation stands."""
+    """Where a minimisation stands; or a batch of them."""
 
-    x: Float[Array, " N"]
-    y: Float[Array, "m q"]
-    cost: Float[Array, ""]
+    x: Float[Array, "*k N"]
+    y: Float[Array, "*k m q"]
+    cost: Float[Array, "*k"]
     """|x|² + |y|² + |r|²; ∞ before the first step, and where nothing is possible."""
-    damping: Float[Array, ""]
-    converged: Bool[Array, ""]
+    damping: Float[Array, "*k"]
+    converged: Bool[Array, "*k"]
 
 
 def started(x: Float[Array, " N"], y: Float[Array, "m q"]) -> Minimum:
