@@ -1,0 +1,126 @@
+"""From rest: how many runs of a filter are lost, and how true the others are, frame by frame.
+
+    python benchmarks/from_rest.py --filters scale_gauge+mixture3+rest --scenarios standstill-6dof
+
+The camera sets out with a velocity that nobody told the filter. Results are added to
+`from_rest.json`; what it already has, of as many runs, is not measured again. The table in
+`docs/from-rest.md` is written from it, by `--page` alone from what is there.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+import jaxslam
+from jaxslam.files import write_atomically
+
+STEPS = (1, 3, 6, 10, 20, 30, 60)
+"""Frames of the table."""
+BEGIN, END = "<!-- from_rest.py -->", "<!-- end -->"
+"""Between these the page is written."""
+KEYS = ("dof", "band95", "nees", "nees_not_lost", "lost", "lost_ever", "rmse", "sigma")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure."""
+
+    scenarios: tuple[str, ...] = ("standstill", "standstill-6dof")
+    """Scenarios."""
+    filters: tuple[str, ...] = ("robocentric", "scale_gauge+mixture9")
+    """Filters."""
+    runs: int = 200
+    """Runs."""
+    seed: int = 101
+    """One that nothing was chosen by."""
+    chunk: int = 1
+    """Runs in one batch. Windows of different lengths wait for one another in a batch."""
+    out: Path = Path("benchmarks/results/from_rest.json")
+    """The results, added to."""
+    docs: Path = Path("docs/from-rest.md")
+    """The page."""
+    page: bool = False
+    """Only write the page."""
+
+
+def measure(options: Options, scenario: str, name: str) -> dict[str, Any]:
+    """One filter in one scenario."""
+    world = jaxslam.scenario(scenario)
+    filters = jaxslam.make_filters(world, [name], ["inverse_scaling"])
+    study = jaxslam.monte_carlo(
+        world, filters, runs=options.runs, seed=options.seed, chunk=options.chunk
+    )
+    ((_, found),) = jaxslam.summarise(study)["filters"].items()
+    beyond = found["beyond_scale"]
+    return {
+        "runs": options.runs,
+        "seed": options.seed,
+        **{key: found[key] for key in KEYS},
+        "beyond_scale": beyond["nees"],
+        "beyond_scale_dof": beyond["dof"],
+        "reversed": found["reversed"],
+        "milliseconds_per_run": 1e3 * found["seconds"]["run"] / options.runs,
+        "compile": found["seconds"]["compile"],
+    }
+
+
+def table(results: dict[str, dict[str, Any]]) -> str:
+    """The numbers of all filters, one table a scenario."""
+    parts = []
+    for scenario, filters in results.items():
+        first = next(iter(filters.values()))
+        low, high = first["band95"]
+        parts.append(
+            f"`{scenario}`, {first['runs']} runs of seed {first['seed']}; ideal {first['dof']}, "
+            f"95 % band {low:.2f}–{high:.2f}. *Lost; mean NEES of the others* at frames:"
+        )
+        header = ["filter", *map(str, STEPS), "ever lost", "RMSE and σ at the end, m", "s a run"]
+        rows = [header, ["---"] * len(header), *(_row(*item) for item in filters.items())]
+        parts.append("\n".join(f"| {' | '.join(row)} |" for row in rows))
+    return "\n\n".join(parts)
+
+
+def _row(name: str, found: dict[str, Any]) -> list[str]:
+    def at(step: int) -> str:
+        kept = found["nees_not_lost"][step - 1]
+        return f"{found['lost'][step - 1]:.1%}; {'–' if kept is None else format(kept, '.1f')}"
+
+    rmse, sigma = (found[key]["position"][-1] for key in ("rmse", "sigma"))
+    return [
+        f"`{name}`",
+        *map(at, STEPS),
+        f"{found['lost_ever'][-1]:.1%}",
+        f"{rmse:.3f}, {sigma:.3f}",
+        f"{found['milliseconds_per_run'] / 1e3:.2g}",
+    ]
+
+
+def with_table(text: str, results: dict[str, dict[str, Any]]) -> str:
+    """The page with the table in its place. Raises ValueError where it has none."""
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"the page has no place for the table: {BEGIN} … {END}")
+    return f"{before}{BEGIN}\n\n{table(results)}\n\n{END}{after}"
+
+
+def main(options: Options) -> None:
+    results = json.loads(options.out.read_text()) if options.out.exists() else {}
+    wanted = [] if options.page else [(s, f) for s in options.scenarios for f in options.filters]
+    for scenario, name in wanted:
+        there = results.setdefault(scenario, {}).get(name, {})
+        if (there.get("runs"), there.get("seed")) != (options.runs, options.seed):
+            results[scenario][name] = measure(options, scenario, name)
+            with write_atomically(options.out) as path:
+                path.write_text(json.dumps(results, indent=1) + "\n")
+    with write_atomically(options.docs) as path:
+        path.write_text(with_table(options.docs.read_text(), results))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
