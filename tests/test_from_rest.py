@@ -12,7 +12,7 @@ from cases import Case, quick_jit
 from jaxslam.consistency.statistics import lost_threshold
 from jaxslam.forms.state import Features
 from jaxslam.models.calibration import Considered
-from jaxslam.wrappers.from_rest import FromRest, from_rest
+from jaxslam.wrappers.from_rest import SIZES, FromRest, from_rest
 
 RUNS, STEPS = 6, 12
 SUM = "scale_gauge+mixture3"
@@ -187,7 +187,21 @@ def test_a_search_in_no_direction_is_refused():
 
 def test_windows_grow_up_to_the_frames_that_are_named():
     base = standstill().filter(SUM)
-    assert from_rest(base).sizes == (9, 17, 31)
+    assert from_rest(base).sizes == SIZES["spatial"] == (9, 31)
     assert from_rest(base, 8).sizes == (9,)
-    assert from_rest(base, 20).sizes == (9, 17, 21)
+    assert from_rest(base, 20).sizes == (9, 21)
     assert from_rest(base, 2).sizes == (3,)
+
+
+def test_measurements_that_nothing_explains_leave_the_sum_to_itself():
+    """Pixels that are no numbers: the modes stay, and keep their weights."""
+    init, step = stages(STARTED)
+    state = init(standstill().features[0])
+    for k in range(3):
+        control, known, new = frame(k)
+        if k == 2:
+            known = eqx.tree_at(lambda f: f.measured, known, known.measured * jnp.nan)
+        before = state
+        state, _ = step(state, control, known, new)
+    np.testing.assert_array_equal(state.modes.log_weights, before.modes.log_weights)
+    np.testing.assert_array_equal(state.modes.minima.x, before.modes.minima.x)

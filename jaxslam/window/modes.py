@@ -108,13 +108,15 @@ def sought(
     record: Record,
     modes: Modes,
     steps: int,
-    wanted: Bool[Array, ""],
     directions: int = 0,
     search: Bool[Array, ""] | None = None,
-) -> Modes:
+) -> tuple[Modes, Bool[Array, ""]]:
     """The modes with what has been measured since, each from where it is; and, of a search, what
-    is found beside them from rest and from so many directions."""
-    alive = wanted & jnp.isfinite(modes.log_weights)
+    is found beside them from rest and from so many directions.
+
+    Where nothing explains what was measured, the modes stay as they are, and the second is False.
+    """
+    alive = jnp.isfinite(modes.log_weights)
     minima = jax.vmap(lambda m: started(m.x, m.y))(modes.minima)
     minima = each_alive(lambda m, record: minimised(slam, record, m, steps), minima, alive, record)
     if search is not None:
@@ -127,7 +129,9 @@ def sought(
         found = when(search, from_everywhere, found, record)
         minima = jax.tree.map(lambda *x: jnp.concatenate(x), minima, found)
         alive = jnp.concatenate([alive, jnp.broadcast_to(search, 1 + directions)])
-    return _likeliest(slam, record, minima, alive, len(modes.log_weights))
+    after = _likeliest(slam, record, minima, alive, len(modes.log_weights))
+    explained = jnp.isfinite(after.log_weights[0])
+    return jax.tree.map(lambda new, old: jnp.where(explained, new, old), after, modes), explained
 
 
 class Weighed(NamedTuple):

@@ -153,12 +153,13 @@ class FromRest(AbstractStaged):
             x = state.modes.minima.x
             modes = replace(state.modes, minima=replace(state.modes.minima, x=x[:, :size]))
             due = jnp.any(record.last == jnp.array(searches)) if searches else None
-            yes = jnp.ones((), bool)
-            modes = sought(ekf, record, modes, REFINEMENTS, yes, self.directions, due)
+            modes, explained = sought(ekf, record, modes, REFINEMENTS, self.directions, due)
             members = _members(ekf, record, modes, state.sum.members)
+            begun = BankState(members, modes.log_weights)
+            begun = jax.tree.map(lambda new, old: jnp.where(explained, new, old), begun, state.sum)
             x = x.at[:, :size].set(modes.minima.x)
             modes = replace(modes, minima=replace(modes.minima, x=x))
-            return replace(state, sum=BankState(members, modes.log_weights), modes=modes)
+            return replace(state, sum=begun, modes=modes)
 
         return when(wanted, solved, state, record)
 
