@@ -45,7 +45,8 @@ def test_a_row_says_at_every_frame_what_is_lost_and_how_true_the_others_are():
 def test_the_table_stands_in_its_place_and_replaces_the_old_one():
     page = f"before\n{BEGIN}\nold\n{END}\nafter\n"
     new = with_table(page, {"standstill": {"mine": found()}})
-    assert new.startswith("before\n") and new.endswith("\nafter\n")
+    assert new.startswith("before\n")
+    assert new.endswith("\nafter\n")
     assert "old" not in new
     assert "`mine`" in new
     assert with_table(new, {"standstill": {"mine": found()}}) == new
