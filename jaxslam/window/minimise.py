@@ -100,7 +100,7 @@ def landmarks(
     eye = jnp.eye(y.shape[1], dtype=y.dtype)
 
     def once(carry, _):
-        y, damping, (kept, information, slope, cost) = carry
+        damping, (kept, information, slope, cost) = carry
         damped = information * (1 + damping[:, None, None] * eye)
         tried = kept - jax.vmap(lambda A, b: A.solve(b))(cholesky_each(damped), slope)
         there = tried, *landmark_slopes(slam, record, at, tried)
@@ -111,11 +111,11 @@ def landmarks(
             (kept, information, slope, cost),
         )
         damping = jnp.where(better, damping / 10, jnp.maximum(10 * damping, 1e-3))
-        return (y, damping, best), None
+        return (damping, best), None
 
     start = y, *landmark_slopes(slam, record, at, y)
-    carry = y, jnp.zeros(len(y), y.dtype), start
-    (_, _, (y, _, _, cost)), _ = jax.lax.scan(once, carry, length=steps)
+    carry = jnp.zeros(len(y), y.dtype), start
+    (_, (y, _, _, cost)), _ = jax.lax.scan(once, carry, length=steps)
     return y, jnp.sum(cost)
 
 

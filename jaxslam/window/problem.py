@@ -83,7 +83,7 @@ def path(slam: EkfSlam, record: Record, x: Float[Array, " N"]) -> Path:
 
     def move(state, data):
         k, control, numbers = data
-        there = _moved(slam, state, (k, control), numbers)
+        there = _moved(slam, state, control, numbers)
         there = jax.tree.map(lambda new, old: jnp.where(k < record.last, new, old), there, state)
         return there, there
 
@@ -97,10 +97,9 @@ def path(slam: EkfSlam, record: Record, x: Float[Array, " N"]) -> Path:
     return Path(Frame(poses, deltas), variables, common)
 
 
-def _moved(slam: EkfSlam, state, data, numbers):
+def _moved(slam: EkfSlam, state, control, numbers):
     """Pose, motion's variables and calibration one step on."""
-    pose, variables, delta = state
-    layout, (_, control) = Layout.of(slam), data
+    (pose, variables, delta), layout = state, Layout.of(slam)
     own = slam.motion.noise_sigma.shape[-1]
     noise, drift = jnp.split(slam.model.noise_sigma * numbers[: layout.step], [own])
     sigma = jnp.asarray(slam.calibration.sigma)
@@ -305,13 +304,12 @@ def _slopes(
     states = at.frames.pose, at.motion, at.frames.calibration
     before = jax.tree.map(lambda leaf: leaf[:-1], states)
     numbers = x[Layout.of(slam).whole :].reshape(record.frames - 1, -1)
-    data = jnp.arange(record.frames - 1), record.controls
 
-    def local(state, data, numbers):
-        return jacobian(lambda both: _moved(slam, both[0], data, both[1]), (state, numbers))
+    def local(state, control, numbers):
+        return jacobian(lambda both: _moved(slam, both[0], control, both[1]), (state, numbers))
 
-    slopes = jax.vmap(local)(before, data, numbers)
-    happened = (data[0] < record.last)[:, None, None]
+    slopes = jax.vmap(local)(before, record.controls, numbers)
+    happened = (jnp.arange(record.frames - 1) < record.last)[:, None, None]
     return jnp.where(happened, slopes, jnp.eye(*slopes.shape[1:], dtype=x.dtype))
 
 

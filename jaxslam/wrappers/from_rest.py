@@ -88,7 +88,7 @@ class FromRest(AbstractStaged):
         return RestState(BankState(members, modes.log_weights), begun, modes, jnp.ones((), bool))
 
     def predict(self, state: RestState, control: Any) -> RestState:
-        return self._of_sum(state, self.base.predict(state.sum, control))
+        return replace(state, sum=self.base.predict(state.sum, control))
 
     def gaussian(self, state: RestState, control: Any):
         return self.base.gaussian(state.sum, control)
@@ -104,7 +104,7 @@ class FromRest(AbstractStaged):
         return replace(state, sum=after, record=stepped), innovation
 
     def compose(self, state: RestState, control: Any) -> RestState:
-        return self._of_sum(state, self.base.compose(state.sum, control))
+        return replace(state, sum=self.base.compose(state.sum, control))
 
     def close(self, state: RestState, new: Features) -> RestState:
         """End the frame, and begin the sum anew from the window's modes while that is open."""
@@ -137,10 +137,6 @@ class FromRest(AbstractStaged):
 
     def pose_error(self, state: RestState, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
         return self.base.pose_error(state.sum, T_BC)
-
-    @staticmethod
-    def _of_sum(state: RestState, after: BankState) -> RestState:
-        return replace(state, sum=after)
 
     def _anew(
         self, state: RestState, frames: int, wanted: Bool[Array, ""], searches: list[int]
