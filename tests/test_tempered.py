@@ -16,7 +16,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 
 import jaxslam
-from jaxslam.geometry import difference, log
+from jaxslam.geometry import difference, log, retract
 from jaxslam.posterior import (
     HMC,
     SMC,
@@ -25,7 +25,10 @@ from jaxslam.posterior import (
     cross_entropy,
     draw_runs,
     entropy,
+    filter_mixture,
+    gaussian_sum,
     halves,
+    main_direction,
     make_problem,
     map_estimate,
     mixture_divergence,
@@ -39,6 +42,7 @@ from jaxslam.posterior import (
     reversed_draws,
     sample,
     second_mode,
+    share_against,
     starts,
     tempered,
     tempered_sample,
@@ -52,7 +56,9 @@ from jaxslam.posterior.marginal import (
 )
 from jaxslam.posterior.problem import log_likelihood, size
 from jaxslam.posterior.tempered import _trajectory, mean_information
+from jaxslam.slam.readouts import camera_pose
 from jaxslam.watchdog import lapack_calls
+from jaxslam.wrappers.from_rest import from_rest
 
 FEW = SMC(particles=800, moves=3)
 LOOSE = jaxslam.scenario("matched-loose", steps=3, landmarks=4)
@@ -498,6 +504,100 @@ def test_a_mode_without_draws_has_no_weight_and_does_no_harm():
     (mean, P), (expected, S) = mixture_moments(found), mixture_moments(without)
     np.testing.assert_allclose(difference(mean, expected), 0, atol=1e-12)
     np.testing.assert_allclose(P, S, atol=1e-12)
+
+
+def test_the_share_against_a_direction_is_that_of_draws_of_the_sum():
+    """Of turned means: a Gaussian's axes are its mean's."""
+    means = SE2.from_xy_theta(*jnp.array([[0.1, -0.2, 5.0], [0.05, 0.1, 5.0], [0.3, 1.5, 0.0]]))
+    P = jnp.diag(jnp.array([0.3, 0.05, 0.01]) ** 2)
+    mixture = PoseMixture(means, jnp.stack([P, P, P * jnp.nan]), jnp.array([0.6, 0.4, 0.0]))
+    direction = jnp.array([0.8, -0.6])
+    rng = np.random.default_rng(0)
+    expected = 0.0
+    for k, weight in enumerate((0.6, 0.4)):
+        mean = jax.tree.map(lambda x, k=k: x[k], means)
+        moved = rng.normal(size=(40000, 2)) @ np.diag([0.3, 0.05])
+        t = mean.translation() + moved @ np.asarray(mean.rotation().as_matrix()).T
+        expected += weight * np.mean(t @ direction < 0)
+    found = quick_jit(share_against)(mixture, direction)
+    assert found == pytest.approx(expected, abs=5 * 0.5 / np.sqrt(40000))
+    assert share_against(mixture, -direction) == pytest.approx(float(1 - found))
+
+
+def test_the_main_direction_is_that_of_most_displacements():
+    poses, other = two_sided(0.3, 0.5)
+    np.testing.assert_allclose(main_direction(poses), [-0.8, 0.6], atol=0.02)
+    back = jax.tree.map(lambda x: x[jnp.asarray(other)], poses)
+    np.testing.assert_allclose(main_direction(back), [0.8, -0.6], atol=0.02)
+
+
+@cache
+def a_sum():
+    """A Gaussian sum of five members, each with a pose and a covariance of its own, its filter,
+    and a true pose."""
+    (slam,) = jaxslam.make_filters(LOOSE, ["scale_gauge+mixture5"], ["inverse_scaling"]).values()
+    state, rng = slam.init(4), np.random.default_rng(0)
+    away = rng.normal([0.1, 0.05, 0.0], 0.03, (5, 3))
+    roots = rng.normal(0.0, 0.03, state.members.covariance.shape)
+
+    def moved(member, away, root):
+        core = replace(member.core, pose=retract(member.core.pose, away))
+        return replace(member, core=core, covariance=root @ root.T)
+
+    members = jax.vmap(moved)(state.members, jnp.asarray(away), jnp.asarray(roots))
+    return slam, replace(state, members=members), SE2.from_xy_theta(-0.1, -0.1, 0.02)
+
+
+def test_the_gaussians_of_a_filter_have_its_moments():
+    slam, state, _ = a_sum()
+    found = filter_mixture(slam, state)
+    assert np.sum(found.weights) == pytest.approx(1)
+    assert np.sum(np.asarray(found.weights) > 1e-3) > 1
+    (mean, P), (expected, S) = mixture_moments(found), camera_pose(slam, state)
+    sigma = np.sqrt(np.diagonal(S))
+    np.testing.assert_allclose(difference(mean, expected) / sigma, 0, atol=1e-2)
+    np.testing.assert_allclose(P / np.outer(sigma, sigma), S / np.outer(sigma, sigma), atol=2e-2)
+
+
+def test_a_start_from_rest_has_the_gaussians_of_its_sum_and_a_plain_filter_has_one():
+    slam, state, _ = a_sum()
+    start = from_rest(slam, 3)
+    begun = replace(start.init(4), sum=state)
+    jax.tree.map(
+        np.testing.assert_array_equal, filter_mixture(start, begun), filter_mixture(slam, state)
+    )
+    member = slam.likeliest(state)
+    mean, P = camera_pose(slam.base, member)
+    one = filter_mixture(slam.base, member)
+    assert one.weights.tolist() == [1.0]
+    np.testing.assert_array_equal(one.means.parameters()[0], mean.parameters())
+    np.testing.assert_array_equal(one.covariances[0], P)
+
+
+def drawn_from(mixture, count):
+    """Poses of a sum of Gaussians."""
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(len(mixture.weights), count, p=np.asarray(mixture.weights))
+    roots = np.linalg.cholesky(np.asarray(mixture.covariances))
+    away = np.einsum("sij,sj->si", roots[chosen], rng.normal(size=(count, 3)))
+    means = jax.tree.map(lambda x: x[chosen], mixture.means)
+    return jax.vmap(retract)(means, jnp.asarray(away))
+
+
+def test_of_its_own_draws_a_sum_of_gaussians_is_the_exact_one():
+    """Shifted by σ of its first number, it is not."""
+    slam, state, truth = a_sum()
+    mixture = filter_mixture(slam, state)
+    draws = drawn_from(mixture, 2000)
+    against = quick_jit(partial(gaussian_sum, slam))
+    found = against(state, truth, draws)
+    assert found["kl_of_sum"] == pytest.approx(0, abs=0.1)
+    assert found["reversed"] == pytest.approx(float(found["exact_reversed"]), abs=0.03)
+    far = jnp.array([np.sqrt(found["covariance"][0, 0]), 0.0, 0.0])
+    moved = jax.vmap(retract, in_axes=(0, None))(draws, far)
+    assert against(state, truth, moved)["kl_of_sum"] > 0.3
+    error, P = slam.pose_error(state, truth)
+    assert found["nees"] == pytest.approx(float(error @ np.linalg.solve(P, error)))
 
 
 @pytest.mark.parametrize(
