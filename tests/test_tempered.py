@@ -51,10 +51,9 @@ from jaxslam.posterior import (
 from jaxslam.posterior.marginal import (
     landmark_draws,
     marginal_log_likelihood,
-    path_size,
     path_unknowns,
 )
-from jaxslam.posterior.problem import log_likelihood, size
+from jaxslam.posterior.problem import Unknowns, inverse_depths, log_likelihood, path_size, size
 from jaxslam.posterior.tempered import _trajectory, mean_information
 from jaxslam.slam.readouts import camera_pose
 from jaxslam.watchdog import lapack_calls
@@ -204,30 +203,32 @@ def problem_of(scenario, *, truncated=True):
 
 def of_landmark(problem, i):
     """The problem with this landmark alone."""
-    return replace(
-        problem,
-        first=problem.first[i : i + 1],
-        measured=problem.measured[:, i : i + 1],
-        visible=problem.visible[:, i : i + 1],
+    own, record = slice(i, i + 1), problem.record
+    alone = replace(
+        record,
+        measured=record.measured[:, own],
+        seen=record.seen[:, own],
+        first=record.first[own],
     )
+    return replace(problem, record=alone)
 
 
 def by_quadrature(problem, y):
     """Log of the likelihood of a path, and mean and variance of every landmark's inverse depth."""
     x = path_unknowns(problem, y)
-    depth, lower = problem.depth, float(problem.least_inverse_depth)
+    depth, lower = problem.slam.depth, float(problem.least_inverse_depth)
     low = max(lower, float(depth.mean - 7 * depth.sigma))
     omega = np.linspace(low, float(depth.mean + 7 * depth.sigma), 4001)
     white = np.linspace(-7, 7, 141)
     log_prior = norm.logpdf(omega, depth.mean, depth.sigma)
     log_prior = log_prior - norm.logsf(lower, depth.mean, depth.sigma)
     total, moments = 0.0, []
-    for i in range(problem.first.shape[0]):
+    for i in range(problem.landmarks):
         own = of_landmark(problem, i)
 
         def value(e, w, own=own):
-            at = replace(x, pixels=own.first + own.sensor.sigma * e, inverse_depths=w[None])
-            return log_likelihood(own, at)
+            numbers = jnp.stack([e, (w - depth.mean) / depth.sigma])[None]
+            return log_likelihood(own, Unknowns(x.path, numbers))
 
         grid = jax.jit(jax.vmap(jax.vmap(value, (None, 0)), (0, None)))(white, omega)
         steps = (white[1] - white[0]) * (omega[1] - omega[0])
@@ -292,7 +293,7 @@ def test_the_weight_of_a_path_makes_its_likelihood_exact_where_pixels_are_bent()
 def test_weighted_landmarks_have_their_exact_moments():
     _, (_, moments), (x, log_weights) = bent()
     weights = np.exp(log_weights) / np.sum(np.exp(log_weights))
-    omega = np.asarray(x.inverse_depths)
+    omega = np.asarray(jax.vmap(partial(inverse_depths, problem_of(BENT)))(x))
     mean = weights @ omega
     sigma = np.sqrt(moments[:, 1])
     np.testing.assert_allclose((mean - moments[:, 0]) / sigma, 0, atol=5 / np.sqrt(10000))
@@ -308,7 +309,8 @@ def test_a_path_with_a_landmark_behind_the_camera_is_impossible():
     past = y.at[1].set(1000 / REST.velocity_sigma[1])
     assert marginal_log_likelihood(problem, past) == -jnp.inf
     assert landmark_draws(problem, past, jax.random.key(0), 3)[1] == -jnp.inf
-    hidden = replace(problem, visible=jnp.zeros_like(problem.visible))
+    unseen = replace(problem.record, seen=jnp.zeros_like(problem.record.seen))
+    hidden = replace(problem, record=unseen)
     assert marginal_log_likelihood(hidden, past) == pytest.approx(0, abs=1e-12)
 
 
@@ -329,6 +331,11 @@ def on_one_mode():
     return quick_jit(partial(tempered_sample, particles))(problem, key), chains(problem)
 
 
+def depths_of(draws):
+    """Inverse depths of draws of `on_one_mode`, 1/m."""
+    return jax.vmap(partial(inverse_depths, problem_of(LOOSE)))(draws.unknowns)
+
+
 def test_on_a_problem_of_one_mode_particles_and_chains_agree():
     """In the last pose, the velocity and the depths; bounds are 5 of what 400 draws would err."""
     draws, chains = on_one_mode()
@@ -341,7 +348,7 @@ def test_on_a_problem_of_one_mode_particles_and_chains_agree():
     np.testing.assert_allclose(np.diagonal(S) / sigma**2, 1, atol=5 * np.sqrt(2 / 400))
     for own, other in (
         (draws.velocity, chains.velocity),
-        (draws.unknowns.inverse_depths, chains.inverse_depths),
+        (depths_of(draws), chains.inverse_depths),
     ):
         expected = np.asarray(other).reshape(-1, own.shape[1])
         apart = (own.mean(axis=0) - expected.mean(axis=0)) / expected.std(axis=0)
@@ -354,9 +361,11 @@ def test_every_draw_is_whole():
     draws, _ = on_one_mode()
     assert draws.T_BC.parameters().shape[:2] == (1500, 3)
     np.testing.assert_array_equal(draws.last.parameters(), draws.T_BC.parameters()[:, -1])
-    moved = draws.unknowns.velocity + draws.unknowns.accelerations.sum(axis=1) / LOOSE.rate
+    first, *changes = np.split(np.asarray(draws.unknowns.path), 4, axis=1)
+    moved = np.array(LOOSE.velocity) + np.array(LOOSE.velocity_sigma) * first
+    moved = moved + np.array(LOOSE.acceleration_sigma) * sum(changes) / LOOSE.rate
     np.testing.assert_allclose(draws.velocity, moved, atol=1e-9)
-    assert draws.unknowns.inverse_depths.min() > LOOSE.least_inverse_depth
+    assert depths_of(draws).min() > LOOSE.least_inverse_depth
 
 
 def test_repeats_are_pooled_by_their_evidence():
@@ -368,9 +377,9 @@ def test_repeats_are_pooled_by_their_evidence():
     assert np.mean(both.velocity[:, 0] > 50) == pytest.approx(0.75, abs=1e-3)
     assert both.log_evidence - draws.log_evidence == pytest.approx(np.log(2))
     # A draw is taken as a whole.
-    depths = np.asarray(both.unknowns.inverse_depths)
+    depths = np.asarray(both.unknowns.landmarks[..., -1])
     order = [
-        int(np.flatnonzero((draws.unknowns.inverse_depths == w).all(axis=1))[0])
+        int(np.flatnonzero((draws.unknowns.landmarks[..., -1] == w).all(axis=1))[0])
         for w in depths[[0, 1700, 2999]]
     ]
     velocities = both.velocity[jnp.array([0, 1700, 2999])] % 100.0

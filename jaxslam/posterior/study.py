@@ -182,6 +182,7 @@ def _posterior_errors(chains: Chains, runs: Run) -> Records:
         scalars = jnp.column_stack([base, velocity])
         watched = jnp.column_stack([tangents, velocity, chains.log_density.ravel()])
         rhat, ess = diagnose(watched.reshape(*shape, -1))
+        behind = jnp.any(chains.inverse_depths < 0, axis=-1)
         nees_of_draws = jax.vmap(lambda d: normalised_squared(d, P))(tangents)
         return {
             "nees": normalised_squared(difference(truth.inverse(), T_CB), P),
@@ -191,7 +192,7 @@ def _posterior_errors(chains: Chains, runs: Run) -> Records:
             "position": estimate.translation(),
             "truth": jnp.concatenate([_base_error(truth, estimate), _last_velocity(run)]),
             "draws": scalars,
-            "behind_infinity": jnp.mean(jnp.any(chains.inverse_depths < 0, axis=-1)),
+            "behind_infinity": jnp.mean(behind, dtype=P.dtype),
             "rhat": jnp.max(rhat),
             "ess": jnp.min(ess),
             "divergent": jnp.mean(chains.divergent),
