@@ -15,14 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import tyro
+from pages import with_table
 
 import jaxslam
 from jaxslam.files import write_atomically
 
 STEPS = (1, 3, 6, 10, 20, 30, 60)
 """Frames of the table."""
-BEGIN, END = "<!-- from_rest.py -->", "<!-- end -->"
-"""Between these the page is written."""
+BEGIN = "<!-- from_rest.py -->"
+"""Behind this the page is written."""
 KEYS = ("dof", "band95", "nees", "nees_not_lost", "lost", "lost_ever", "rmse", "sigma")
 
 
@@ -100,15 +101,6 @@ def _row(name: str, found: dict[str, Any]) -> list[str]:
     ]
 
 
-def with_table(text: str, results: dict[str, dict[str, Any]]) -> str:
-    """The page with the table in its place. Raises ValueError where it has none."""
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise ValueError(f"the page has no place for the table: {BEGIN} … {END}")
-    return f"{before}{BEGIN}\n\n{table(results)}\n\n{END}{after}"
-
-
 def main(options: Options) -> None:
     results = json.loads(options.out.read_text()) if options.out.exists() else {}
     wanted = [] if options.page else [(s, f) for s in options.scenarios for f in options.filters]
@@ -119,7 +111,7 @@ def main(options: Options) -> None:
             with write_atomically(options.out) as path:
                 path.write_text(json.dumps(results, indent=1) + "\n")
     with write_atomically(options.docs) as path:
-        path.write_text(with_table(options.docs.read_text(), results))
+        path.write_text(with_table(options.docs.read_text(), BEGIN, table(results)))
 
 
 if __name__ == "__main__":
