@@ -22,6 +22,10 @@ class InverseDepth(eqx.Module):
     own: Float[AnyArray, ""] = number_field(default=1.0)
     common: Float[AnyArray, ""] | None = eqx.field(converter=optional_numbers, default=None)
     """None where landmarks have nothing in common."""
+    unit: Float[AnyArray, ""] | None = eqx.field(converter=optional_numbers, default=None)
+    """σ of the log of the metre in which all of this was meant, and whatever else is told: a filter
+    with a unit of its own (`ScaleGauge`) claims no more of the scale, whatever it sees. None where
+    it was the metre."""
 
     def __check_init__(self) -> None:
         for name in ("mean", "sigma", "own"):

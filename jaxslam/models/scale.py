@@ -53,7 +53,7 @@ class ScaleGauge(eqx.Module):
         motion: AbstractMotion,
         variables: Float[Array, " v"],
         noise: Float[Array, " q"],
-        log_scale: Float[Array, " 1"],
+        log_scale: Float[Array, " u"],
     ) -> Float[Array, " q"]:
         """The step's noise in the units of the state.
 

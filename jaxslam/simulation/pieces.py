@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from jaxslam.arrays import numbers
@@ -44,5 +45,7 @@ def calibration_sigma_of(scenario: Scenario) -> Any:
 def depth_of(scenario: Scenario) -> InverseDepth:
     """The prior on 1/z."""
     if scenario.inverse_depth:
-        return InverseDepth(*scenario.inverse_depth)
-    return InverseDepth.beyond(scenario.nearest_depth)
+        depth = InverseDepth(*scenario.inverse_depth)
+    else:
+        depth = InverseDepth.beyond(scenario.nearest_depth)
+    return replace(depth, unit=numbers(scenario.scale_sigma)) if scenario.scale_sigma else depth

@@ -82,6 +82,9 @@ class Scenario(eqx.Module):
     """d_min, m: the filter's prior on 1/z is N(1/(2 d_min), (1/(4 d_min))²)."""
     inverse_depth: Numbers = ()
     """Mean and σ of the filter's prior on 1/z, 1/m, where they are not those of d_min."""
+    scale_sigma: float = 0.0
+    """σ of the log of the metre in which the filter is told all this; 0 where it is a metre. Only a
+    filter with a unit of its own (`scale_gauge`) can heed it."""
     least_inverse_depth: float = 0.001
     """`prior`: truth is drawn from the prior truncated above this, 1/m."""
     first_frame: int = _structural(0)
@@ -298,7 +301,7 @@ _POSITIVE = (
 )  # fmt: skip
 _NOT_NEGATIVE = (
     "velocity_sigma", "focal_sigma", "centre_sigma", "odometry_sigma", "range",
-    "still_frames", "first_frame", "first_landmarks", "new_landmarks", "known_landmarks",
+    "scale_sigma", "still_frames", "first_frame", "first_landmarks", "new_landmarks", "known_landmarks",
 )  # fmt: skip
 
 
@@ -396,6 +399,7 @@ def _built_in():
         acceleration_sigma=(4.0,) * 3 + (6.0,) * 3,
         placement="rays",
         nearest_depth=1.0,
+        scale_sigma=0.4,
         **_SPATIAL,
     )
     yield from _family(

@@ -41,8 +41,9 @@ class Core(eqx.Module):
     keyframes: what the `Coordinates` hold."""
     motion: Any
     """What the motion model keeps: a velocity in the camera's own frame, a bias, nothing."""
-    log_scale: Float[Array, " 1"] | None
-    """λ of a filter with a scale gauge, or None: lengths in the state are in units of `e^λ` m."""
+    log_scale: Float[Array, " u"] | None
+    """λ of a filter with a scale gauge, or None: lengths in the state are in units of `e^λ` of what
+    was told as metres. Behind it, where that is not known, the log of these metres in metres."""
     noise: Float[Array, " q"]
     """What drives this step's motion: the acceleration a (P10), or the odometry's error, and what
     the calibration drifts by; zero before `predict` and after composition."""
@@ -85,7 +86,7 @@ class View(eqx.Module):
     """T_AC(k), the current camera in the map frame."""
     calibration: Float[Array, " k"]
     anchors: SplitPose | None = None
-    log_scale: Float[Array, " 1"] | None = None
+    log_scale: Float[Array, " u"] | None = None
     depth_error: Float[Array, " 1"] | None = None
 
 
@@ -156,10 +157,10 @@ class SlamModel(eqx.Module):
         return self.coordinates.estimate(self._metric_pose(core))
 
     def _metric_pose(self, core: Core) -> Any:
-        """What is held of the pose, its lengths times `e^λ`."""
+        """What is held of the pose, in metres."""
         if core.log_scale is None:
             return core.pose
-        return scaled(core.pose, jnp.exp(core.log_scale[0]))
+        return scaled(core.pose, jnp.exp(jnp.sum(core.log_scale)))
 
     def compose_landmark(self, view: View, landmark: Array, context: Context) -> Array:
         """The landmark in the new camera frame, for which the paper numbers no equation."""
@@ -222,7 +223,7 @@ class SlamModel(eqx.Module):
     def metric_point(self, view: View, landmark: Array) -> tuple[Array, Array]:
         """`camera_point` in metres: with the gauge's scale, `ω e^−λ`."""
         point, omega = self.camera_point(view, landmark)
-        return point, omega if view.log_scale is None else omega * jnp.exp(-view.log_scale[0])
+        return point, omega if view.log_scale is None else omega * jnp.exp(-jnp.sum(view.log_scale))
 
     def convert(self, view: View, landmark: Array, covariance: Array, context: Context) -> Array:
         """The same landmark in the form that its parametrization now prefers."""

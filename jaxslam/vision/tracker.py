@@ -477,7 +477,7 @@ def _reported(slam: AbstractStaged, state: Any):
 def _log_scale_variance(slam: AbstractStaged, state: Any):
     def log_scale(scene: Scene):
         λ = getattr(scene.core, "log_scale", None)
-        return jnp.zeros(1) if λ is None else λ
+        return jnp.zeros(1) if λ is None else jnp.sum(λ)[None]
 
     return slam.marginal(state, log_scale)[1][0, 0]
 

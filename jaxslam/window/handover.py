@@ -58,6 +58,9 @@ def _state(slam, record, at, step, local, s: Direction, factor: Cholesky, like: 
     rows = _stacked(of_core, of_landmarks, active)
     landmarks = jnp.where(active[:, None], values, like.landmarks)
     covariance = _covariance(local, factor, rows)
+    if core.log_scale is not None and slam.depth.unit is not None:
+        place = core.part("log_scale").start + 1
+        covariance = covariance.at[place, place].add(slam.depth.unit**2)
     return shifted(State(core, landmarks, active, covariance, like.memory), -rows.x @ step)
 
 
@@ -98,8 +101,8 @@ def _less_told(rows: Rows, core, factor: Scalar) -> Rows:
     """With σ of λ so many times as large; it is correlated with nothing."""
     if core.log_scale is None:
         return rows
-    part = core.part("log_scale")
-    return Rows(*(row.at[part].multiply(factor) for row in rows))
+    place = core.part("log_scale").start
+    return Rows(*(row.at[place].multiply(factor) for row in rows))
 
 
 def _landmark_rows(
@@ -157,7 +160,7 @@ def _core(slam: EkfSlam, like, newest, log_scale):
         like,
         pose=slam.coordinates.hold(scaled(frame.pose, unit)),
         motion=variables,
-        log_scale=None if like.log_scale is None else log_scale,
+        log_scale=None if like.log_scale is None else like.log_scale.at[:1].set(log_scale),
         calibration=frame.calibration if kept else like.calibration,
         # The filter keeps c in σ of one landmark's prior.
         depth_error=None if like.depth_error is None else slam.depth.common * common,
