@@ -13,8 +13,8 @@ from jaxtyping import Float
 from jaxslam.files import write_atomically
 
 MODEL = "pinhole"
-_INTRINSICS = ("fx", "fy", "cx", "cy")
-_KEYS = ("width", "height", *_INTRINSICS)
+INTRINSICS = ("fx", "fy", "cx", "cy")
+_KEYS = ("width", "height", *INTRINSICS)
 GUESSED_FIELD_OF_VIEW = 65.0
 """Degrees along the longer side: between a phone that films and a webcam."""
 _GUESSED_SHARE, _TOLD_SHARE, _CENTRE_SHARE = 0.15, 0.05, 0.02
@@ -117,7 +117,7 @@ def read_calibration(path: str | Path) -> Calibration:
     except ValueError as error:  # bad JSON and bad UTF-8 alike
         raise ValueError(f"{path}: not a JSON file ({error})") from None
     try:
-        return _from_fields(fields)
+        return from_fields(fields)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
@@ -138,11 +138,12 @@ def write_calibration(path: str | Path, calibration: Calibration, **further: Any
 def as_fields(calibration: Calibration) -> dict[str, Any]:
     """What the file holds; of what nobody stated, nothing."""
     fields = {"model": MODEL, **asdict(calibration)}
-    fields["sigma"] = dict(zip(_INTRINSICS, calibration.sigma, strict=False))
+    fields["sigma"] = dict(zip(INTRINSICS, calibration.sigma, strict=False))
     return {key: value for key, value in fields.items() if value or key not in ("sigma", "guessed")}
 
 
-def _from_fields(fields: Any) -> Calibration:
+def from_fields(fields: Any) -> Calibration:
+    """What `as_fields` was made of. Raises ValueError for what is no pinhole camera's."""
     if not isinstance(fields, dict):
         raise ValueError(f"holds a {type(fields).__name__}; a JSON object is accepted")
     model = fields.get("model", MODEL)
@@ -163,9 +164,9 @@ def _from_fields(fields: Any) -> Calibration:
 
 
 def _sigma_from(sigma: Any) -> tuple[Any, ...]:
-    if not isinstance(sigma, dict) or (sigma and not sigma.keys() >= set(_INTRINSICS)):
-        raise ValueError(f"sigma is {sigma!r}; one with {', '.join(_INTRINSICS)} is accepted")
-    return tuple(sigma[key] for key in _INTRINSICS) if sigma else ()
+    if not isinstance(sigma, dict) or (sigma and not sigma.keys() >= set(INTRINSICS)):
+        raise ValueError(f"sigma is {sigma!r}; one with {', '.join(INTRINSICS)} is accepted")
+    return tuple(sigma[key] for key in INTRINSICS) if sigma else ()
 
 
 def _require_number(name: str, value: object) -> None:
@@ -179,7 +180,7 @@ def _require_number(name: str, value: object) -> None:
 def _checked_sigma(sigma: Sequence[float]) -> tuple[float, ...]:
     if len(sigma) not in (0, 4):
         raise ValueError(f"sigma has {len(sigma)} entries; of fx, fy, cx, cy are accepted")
-    for key, value in zip(_INTRINSICS, sigma, strict=False):
+    for key, value in zip(INTRINSICS, sigma, strict=False):
         _require_number(f"sigma of {key}", value)
         if value < 0:
             raise ValueError(f"sigma of {key} is {value}; at least zero is accepted")

@@ -17,6 +17,7 @@ from jaxslam import __version__
 from jaxslam.files import write_atomically
 from jaxslam.plots.tracking import plot_map
 from jaxslam.slam.protocol import AbstractStaged
+from jaxslam.vision.calibration import INTRINSICS, as_fields
 from jaxslam.vision.overlay import OverlayWriter, draw_overlay, overlay_size
 from jaxslam.vision.pointcloud import write_ply
 from jaxslam.vision.settings import TrackerSettings
@@ -214,6 +215,21 @@ def _scale_between_maps(settings: TrackerSettings) -> float:
     return math.sqrt(2) * float(depth.sigma / depth.mean)
 
 
+def _calibration(tracker: Tracker) -> dict[str, Any]:
+    """What the camera was taken for, and where it is estimated, what it is in the end with σ."""
+    camera = tracker.camera()
+    given = as_fields(tracker.calibration)
+    if camera is None:
+        return {"given": given}
+    treatment, mean, covariance = camera
+    result = {"treatment": treatment, "given": given}
+    if treatment == "estimated":
+        sigma = np.sqrt(np.diagonal(covariance))
+        result["estimated"] = dict(zip(INTRINSICS, mean.tolist(), strict=True))
+        result["sigma"] = dict(zip(INTRINSICS, sigma.tolist(), strict=True))
+    return result
+
+
 def _summary(
     source: Source, tracker: Tracker, history: list[Tracked], seconds: list[float]
 ) -> dict[str, Any]:
@@ -228,6 +244,7 @@ def _summary(
         "source": source.name,
         "filter": tracker.filter_name,
         "settings": dataclasses.asdict(tracker.settings),
+        "calibration": _calibration(tracker),
         "frames": len(history),
         "tracked": len(history) - lost,
         "lost": lost,

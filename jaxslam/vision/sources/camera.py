@@ -8,9 +8,10 @@ from threading import Condition, Thread
 import cv2
 import numpy as np
 
+from jaxslam.vision.pictures import as_grey
 from jaxslam.vision.sources.recording import Layout, Recording
 from jaxslam.vision.sources.source import Image
-from jaxslam.vision.sources.video import grey, opened
+from jaxslam.vision.sources.video import opened
 
 PATIENCE = 5.0
 """Seconds in which a camera must deliver a picture."""
@@ -39,7 +40,7 @@ class Live:
                 while True:
                     came, image = newest.wait(self.number)
                     self._came = came - self._begun
-                    yield grey(image)
+                    yield as_grey(image)
             finally:
                 newest.stop()
 

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam.vision.pictures import as_grey
 from jaxslam.vision.sources.recording import Layout, Recording
 from jaxslam.vision.sources.source import Image
 
@@ -52,7 +53,7 @@ def _at_rate(path: Path, times: list[float], wrong: int, rate: float) -> Float[n
 
 
 @contextmanager
-def opened(where: Path | int) -> Iterator[cv2.VideoCapture]:
+def opened(where: Path | int) -> Generator[cv2.VideoCapture]:
     """A capture of a file or of a camera's number, released at the end."""
     capture = cv2.VideoCapture(where if isinstance(where, int) else str(where))
     try:
@@ -61,18 +62,13 @@ def opened(where: Path | int) -> Iterator[cv2.VideoCapture]:
         capture.release()
 
 
-def grey(image: np.ndarray) -> Image:
-    """A picture of OpenCV's, blue, green and red or grey already."""
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-
-
 def _images(path: Path) -> Iterator[Image]:
     with opened(path) as capture:
         while True:
             found, image = capture.read()
             if not found:
                 return
-            yield grey(image)
+            yield as_grey(image)
 
 
 VIDEO = Layout(
