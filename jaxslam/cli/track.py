@@ -57,8 +57,8 @@ class TrackOptions:
     calibration_treatment: Annotated[
         str | None,
         tyro.conf.arg(
-            help=f"How the filter treats it: {', '.join(CALIBRATIONS)}. By default one that a field "
-            "of view tells, or that is guessed, is estimated, and any other is known."
+            help=f"How the filter treats it: {', '.join(CALIBRATIONS)}. By default one that a "
+            "field of view tells, or that is guessed, is estimated, and any other is known."
         ),
     ] = TrackerSettings.calibration
     nearest_depth: float = TrackerSettings.nearest_depth
@@ -85,9 +85,7 @@ class TrackOptions:
         target = None if self.target is None else read_target(self.target)
         total = len(source) or self.frames
         with tqdm(total=total, unit="frame", disable=None) as bar:
-            summary = track(
-                source, self.out, self._settings(), target=target, progress=bar.update
-            )
+            summary = track(source, self.out, self._settings(), target=target, progress=bar.update)
         print(describe(summary))
         print(
             "wrote trajectory.txt, covariance.txt, frames.csv, map.ply, map.png, overlay.mp4, "
@@ -116,7 +114,9 @@ class TrackOptions:
                 "--calibration, --fov, --reference and --target need a SOURCE: the synthetic video "
                 "has its own"
             )
-        source = synthetic_source(frames=150 if self.frames is None else self.frames, seed=self.seed)
+        source = synthetic_source(
+            frames=150 if self.frames is None else self.frames, seed=self.seed
+        )
         return resized(selected(source, start=self.start, every=self.every), self.scale)
 
     def _settings(self):

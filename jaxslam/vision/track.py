@@ -22,6 +22,7 @@ from jaxslam.vision.overlay import OverlayWriter, draw_overlay, overlay_size
 from jaxslam.vision.pointcloud import write_ply
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.sources import Frame, Source
+from jaxslam.vision.target import Target, as_summary
 from jaxslam.vision.tracker import Points, Tracked, Tracker
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
@@ -46,6 +47,7 @@ def track(
     settings: TrackerSettings | None = None,
     *,
     slam: AbstractStaged | None = None,
+    target: Target | None = None,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> dict[str, Any]:
     """Track `source`, write `trajectory.txt`, `covariance.txt`, `frames.csv`, `map.ply`,
@@ -53,9 +55,9 @@ def track(
 
     An interruption (KeyboardInterrupt) or an unreadable frame (ValueError) leaves all of them for
     the frames so far, and is raised again. `slam` is a filter of one's own, in place of the one
-    that the settings name.
+    that the settings name. `target`, known points that the first frame sees, makes the map metric.
     """
-    tracker = Tracker(source.calibration, settings or TrackerSettings(), slam)
+    tracker = Tracker(source.calibration, settings or TrackerSettings(), slam, target)
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     history: list[Tracked] = []
@@ -265,6 +267,8 @@ def _summary(
             "per_frame_p99": float(np.quantile(later, 0.99)),
         },
     }
+    if tracker.target is not None and tracker.sighting is not None:
+        summary["target"] = as_summary(tracker.target, tracker.sighting)
     if tracker.restarts:
         summary["log_scale_sigma_between_maps"] = _scale_between_maps(tracker.settings)
     if source.reference is not None:

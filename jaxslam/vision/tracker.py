@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,8 +15,9 @@ import numpy as np
 
 from jaxslam.arrays import cast
 from jaxslam.forms.state import Features, Status
+from jaxslam.models.scale import Metre
 from jaxslam.models.sensors import Pinhole
-from jaxslam.slam.filter import AtOnce, EkfSlam, innermost
+from jaxslam.slam.filter import AtOnce, EkfSlam, begun, innermost
 from jaxslam.slam.protocol import AbstractStaged, Scene
 from jaxslam.slam.ransac import inliers
 from jaxslam.slam.readouts import camera_pose, landmarks_in_world
@@ -27,6 +29,7 @@ from jaxslam.vision.pictures import as_grey
 from jaxslam.vision.resume import grown, leaves, read_record, write_record
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.sources.source import Frame, check_size
+from jaxslam.vision.target import Sighting, Target, known_depths, sighted
 
 LEAST_INLIERS = 4
 """Fewer matches than this do not count as having tracked a frame, and are not believed."""
@@ -110,6 +113,11 @@ class Tracker:
     settings: TrackerSettings = field(default_factory=TrackerSettings)
     filter: AbstractStaged | None = None
     """One's own, in place of the filter that the settings name."""
+    target: Target | None = None
+    """Points of known positions, m, that the first frame sees: then the first map is in metres, the
+    unit of `nearest_depth`. For an `EkfSlam` in metres, whose depths have nothing in common."""
+    sighting: Sighting | None = field(default=None, init=False)
+    """Where the first frame saw the target."""
     landmarks: dict[int, Landmark] = field(default_factory=dict, init=False)
     created: int = field(default=0, init=False)
     deleted: int = field(default=0, init=False)
@@ -131,6 +139,16 @@ class Tracker:
                 "predicts them, before it is given the frame, from the frame in which they are "
                 "first seen"
             )
+        if self.target is not None and not _keeps_metres(made):
+            raise ValueError(
+                f"filter {self.filter_name} cannot begin with a target: one that is an EkfSlam, "
+                "without a scale of its own, as `world` and `robocentric` are, is accepted"
+            )
+        if self.target is not None and len(self.target.points) > self.settings.wanted:
+            raise ValueError(
+                f"the target has {len(self.target.points)} points, and {self.settings.wanted} "
+                "landmarks are wanted"
+            )
         self._time: float | None = None
         self._origin = self._camera = Located()
         self._sigma_log_scale: float | None = None
@@ -148,9 +166,10 @@ class Tracker:
         """Predict, search, update, and renew the map. Raises ValueError, and changes nothing, for
         a frame of another size than the calibration's, or not later than the one before."""
         self._check(frame)
-        self.steps += 1
         with jax.enable_x64(True):
-            return self._first(frame) if self._time is None else self._next(frame)
+            tracked = self._first(frame) if self._time is None else self._next(frame)
+        self.steps += 1
+        return tracked
 
     def step(self, image: Any, time: float) -> Tracked:
         """`track` a picture taken at `time` (s): grey, or in colour in OpenCV's order (BGR), uint8
@@ -183,7 +202,12 @@ class Tracker:
         return inner.calibration.name, mean, covariance
 
     def save(self, path: str | Path) -> None:
-        """Write all that is needed to go on from here (.npz), whole or not at all."""
+        """Write all that is needed to go on from here (.npz), whole or not at all.
+
+        Raises ValueError before the first frame, when there is nothing to go on from.
+        """
+        if self._time is None:
+            raise ValueError("a tracker that was given no frame yet has nothing to save")
         header = {
             "calibration": as_fields(self.calibration),
             "settings": asdict(self.settings),
@@ -225,8 +249,26 @@ class Tracker:
         return tracker
 
     def _first(self, frame: Frame) -> Tracked:
+        corners = self._corners(frame)
+        created = (
+            self._begun(frame, corners) if self.target is None else self._known(frame, corners)
+        )
         self._time = frame.time
-        return self._tracked(frame, created=self._begun(frame, self._corners(frame)), starts=True)
+        return self._tracked(frame, created=created, starts=True)
+
+    def _known(self, frame: Frame, corners: np.ndarray) -> np.ndarray:
+        """`_begun` at the target's points, which come first, and at corners away from them."""
+        assert self.target is not None
+        s = self.settings
+        seen = sighted(self.target, frame.image, self.calibration, s.pixel_sigma)
+        distances = np.linalg.norm(corners[:, None] - seen.pixels, axis=2)
+        apart = corners[np.all(distances >= s.spacing, axis=1)]
+        pixels = np.concatenate([seen.pixels, apart])[: s.wanted]
+        depths = known_depths(seen, s.wanted, float(s.depth.mean), float(s.depth.sigma))
+        self.sighting = seen
+        return self._created(
+            partial(_begin_known, jax.tree.map(jnp.asarray, depths)), frame, pixels
+        )
 
     def _next(self, frame: Frame) -> Tracked:
         # A number of Python's would be compiled into the programs.
@@ -461,6 +503,11 @@ class Tracker:
         )
 
 
+def _keeps_metres(slam: AbstractStaged) -> bool:
+    """Whether depths in metres can be told to a filter, landmark by landmark."""
+    return isinstance(slam, EkfSlam) and isinstance(slam.scale, Metre) and slam.depth.common is None
+
+
 def _padded(slots: np.ndarray, pixels: np.ndarray, size: int) -> Features:
     """Features of fixed number; NaN pixels and padding are not valid."""
     missing = size - len(slots)
@@ -510,6 +557,12 @@ def _correct(
 @eqx.filter_jit
 def _begin_map(slam: AbstractStaged, state: Any, new: Features):
     state = slam.init(slam.in_map(state).size, new)
+    return state, _reported(slam, state)
+
+
+@eqx.filter_jit
+def _begin_known(depths: Any, slam: EkfSlam, state: Any, new: Features):
+    state = begun(slam, slam.in_map(state).size, new, depths)
     return state, _reported(slam, state)
 
 
