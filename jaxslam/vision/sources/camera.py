@@ -4,8 +4,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Condition, Thread
+from typing import Any
 
-import cv2
 import numpy as np
 
 from jaxslam.vision.pictures import as_grey
@@ -48,7 +48,7 @@ class Live:
 class _Newest:
     """What a capture delivered last, taken once."""
 
-    def __init__(self, capture: cv2.VideoCapture) -> None:
+    def __init__(self, capture: Any) -> None:
         self._changed = Condition()
         self._picture: tuple[float, np.ndarray] | None = None
         self._running = True
@@ -67,7 +67,7 @@ class _Newest:
         self._running = False
         self._thread.join(PATIENCE)
 
-    def _fetch(self, capture: cv2.VideoCapture) -> None:
+    def _fetch(self, capture: Any) -> None:
         while self._running:
             found, image = capture.read()
             with self._changed:
