@@ -37,7 +37,7 @@ class CalibrateOptions:
     def run(self) -> None:
         """Calibrate, print the numbers, write the files."""
         require_vision("calibrating")
-        from jaxslam.vision.board import Board
+        from jaxslam.video.board import Board
 
         board = Board(self.board, self.columns, self.rows, self.square, self.dictionary)
         if self.board_video is None:
@@ -56,7 +56,7 @@ class CalibrateOptions:
     def _calibrate(self, board, video: Path) -> None:
         from tqdm import tqdm
 
-        from jaxslam.vision.calibrate import calibrate, describe, write
+        from jaxslam.video.calibrate import calibrate, describe, write
 
         with one_line_warnings(), tqdm(unit="picture", disable=None) as bar:
             calibrated = calibrate(video, board, bar.update)

@@ -93,8 +93,8 @@ class TrackOptions:
         )
 
     def _source(self):
-        from jaxslam.vision.sources import open_source
-        from jaxslam.vision.sources.source import resized, selected
+        from jaxslam.video import open_source
+        from jaxslam.video.source import resized, selected
         from jaxslam.vision.synthetic import synthetic_source
 
         if self.source is not None:

@@ -14,7 +14,7 @@ from jaxslam.models.sensors import Pinhole
 from jaxslam.names import FILTERS, make_filter
 from jaxslam.simulation.pieces import TREATMENTS
 from jaxslam.slam.protocol import AbstractFilter
-from jaxslam.vision.calibration import Calibration
+from jaxslam.video.calibration import Calibration
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxslam.vision.calibration import Calibration
-from jaxslam.vision.sources.recording import read_image
+from jaxslam.video.calibration import Calibration
+from jaxslam.video.recording import read_image
 
 LEAST_POINTS = 4
 _METRES = ("metre", "metres", "meter", "meters", "m")

@@ -21,14 +21,14 @@ from jaxslam.slam.filter import AtOnce, EkfSlam, begun, innermost
 from jaxslam.slam.protocol import AbstractStaged, Scene
 from jaxslam.slam.ransac import inliers
 from jaxslam.slam.readouts import camera_pose, landmarks_in_world
-from jaxslam.vision.calibration import Calibration, as_fields, from_fields
+from jaxslam.video.calibration import Calibration, as_fields, from_fields
+from jaxslam.video.pictures import as_grey
+from jaxslam.video.source import Frame, check_size
 from jaxslam.vision.landmarks import NO_POINTS, Landmark, Points, joined, stacked, unstacked
 from jaxslam.vision.located import Located
 from jaxslam.vision.patches import Match, Patch, detect_corners, match_patches
-from jaxslam.vision.pictures import as_grey
 from jaxslam.vision.resume import grown, leaves, read_record, write_record
 from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.sources.source import Frame, check_size
 from jaxslam.vision.target import Sighting, Target, known_depths, sighted
 
 LEAST_INLIERS = 4

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxslam.cli import main
+from jaxslam.video import open_source
 from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.sources import open_source
 from jaxslam.vision.synthetic import room, synthetic_source
 from jaxslam.vision.target import KnownPoint, Target, read_target, sighted
 from jaxslam.vision.tracker import Tracker

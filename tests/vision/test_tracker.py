@@ -17,10 +17,10 @@ import jaxslam
 from jaxslam.forms.state import Status
 from jaxslam.slam.readouts import landmarks_in_camera
 from jaxslam.tum import read_tum
+from jaxslam.video import open_source
 from jaxslam.vision import tracker as programs
 from jaxslam.vision.located import adjoint
 from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.sources import open_source
 from jaxslam.vision.synthetic import synthetic_source
 from jaxslam.vision.track import describe, track
 from jaxslam.vision.tracker import LEAST_INLIERS, Tracker

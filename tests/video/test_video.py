@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from pictures import HEIGHT, WIDTH, brightness, picture
 
-from jaxslam.vision.calibration import Calibration, write_calibration
-from jaxslam.vision.sources import camera, open_source, video
+from jaxslam.video import camera, file, open_source
+from jaxslam.video.calibration import Calibration, write_calibration
 
 RATE = 25.0
 
@@ -104,17 +104,17 @@ class Told:
 def test_times_that_do_not_increase_are_those_of_the_frame_rate(monkeypatch, tmp_path):
     monkeypatch.setattr(cv2, "VideoCapture", lambda path: Told([0.0, 0.1, 0.1, 0.3], []))
     with pytest.warns(UserWarning, match=r"picture 2 is at 0\.100 s, after one at 0\.100 s; taken"):
-        times = video.read_times(tmp_path / "v.mp4")
+        times = file.read_times(tmp_path / "v.mp4")
     np.testing.assert_allclose(times, np.arange(4) / RATE, rtol=0, atol=1e-12)
     monkeypatch.setattr(cv2, "VideoCapture", lambda path: Told([0.0, 0.0], [], rate=0.0))
     with pytest.raises(ValueError, match="no frame rate is stated"):
-        video.read_times(tmp_path / "v.mp4")
+        file.read_times(tmp_path / "v.mp4")
 
 
 def test_a_video_that_ends_early_says_so(monkeypatch, tmp_path):
     monkeypatch.setattr(cv2, "VideoCapture", lambda path: Told([0.0, 0.1], [], stated=9))
     with pytest.warns(UserWarning, match="it has 9 pictures, of which 2 can be read"):
-        assert len(video.read_times(tmp_path / "v.mp4")) == 2
+        assert len(file.read_times(tmp_path / "v.mp4")) == 2
 
 
 def test_a_picture_that_is_gone_when_it_is_reached_is_named(filmed, calibration):

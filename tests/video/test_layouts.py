@@ -6,8 +6,8 @@ import pytest
 from pictures import HEIGHT, WIDTH, brightness, picture, write_pictures
 from scipy.spatial.transform import Rotation
 
-from jaxslam.vision.calibration import Calibration, write_calibration
-from jaxslam.vision.sources import open_source
+from jaxslam.video import open_source
+from jaxslam.video.calibration import Calibration, write_calibration
 
 
 def pose(seed):

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxslam.vision.pictures import as_grey
-from jaxslam.vision.sources.recording import Layout, Recording
-from jaxslam.vision.sources.source import Image
-from jaxslam.vision.sources.video import opened
+from jaxslam.video.file import opened
+from jaxslam.video.pictures import as_grey
+from jaxslam.video.recording import Layout, Recording
+from jaxslam.video.source import Image
 
 PATIENCE = 5.0
 """Seconds in which a camera must deliver a picture."""

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from pictures import HEIGHT, WIDTH, brightness, picture
 
-from jaxslam.vision.calibration import Calibration, from_field_of_view, write_calibration
-from jaxslam.vision.sources import open_source
-from jaxslam.vision.sources.source import selected
+from jaxslam.video import open_source
+from jaxslam.video.calibration import Calibration, from_field_of_view, write_calibration
+from jaxslam.video.source import selected
 from jaxslam.vision.trajectory import write_tum
 
 DATA = Path(__file__).parents[3] / "shared" / "data"

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxslam.vision.calibration import Calibration
-from jaxslam.vision.sources.recording import Layout, Recording, fixed, of_files, read_table
-from jaxslam.vision.sources.source import Trajectory
+from jaxslam.video.calibration import Calibration
+from jaxslam.video.recording import Layout, Recording, fixed, of_files, read_table
+from jaxslam.video.source import Trajectory
 
 RATE = 30.0
 CAMERA = Calibration(640, 480, 585.0, 585.0, 320.0, 240.0)

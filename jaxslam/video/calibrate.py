@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxslam.files import write_atomically
-from jaxslam.vision.board import Board, View
-from jaxslam.vision.calibration import Calibration, write_calibration
-from jaxslam.vision.sources.opening import open_recording
-from jaxslam.vision.sources.recording import Recording
+from jaxslam.video.board import Board, View
+from jaxslam.video.calibration import Calibration, write_calibration
+from jaxslam.video.opening import open_recording
+from jaxslam.video.recording import Recording
 
 LOOKED_AT = 300
 """Pictures of a video in which the board is sought, at the most, spread over all of it."""

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.vision.pictures import as_grey
-from jaxslam.vision.sources.recording import Layout, Recording
-from jaxslam.vision.sources.source import Image
+from jaxslam.video.pictures import as_grey
+from jaxslam.video.recording import Layout, Recording
+from jaxslam.video.source import Image
 
 VIDEO_TYPES = (".mp4", ".m4v", ".avi", ".mov", ".mkv", ".webm", ".mpg", ".mpeg")
 

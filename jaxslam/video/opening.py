@@ -7,21 +7,21 @@ from dataclasses import replace
 from pathlib import Path
 
 from jaxslam.tum import read_tum
-from jaxslam.vision.calibration import (
+from jaxslam.video.calibration import (
     GUESSED_FIELD_OF_VIEW,
     Calibration,
     from_field_of_view,
     read_calibration,
 )
-from jaxslam.vision.sources.camera import CAMERA
-from jaxslam.vision.sources.euroc import EUROC
-from jaxslam.vision.sources.folder import PLAIN, TIMESTAMPED
-from jaxslam.vision.sources.kitti import KITTI
-from jaxslam.vision.sources.recording import Layout, Recording
-from jaxslam.vision.sources.seven_scenes import SEVEN_SCENES
-from jaxslam.vision.sources.source import Source, Trajectory, check_size, resized, selected
-from jaxslam.vision.sources.tum_rgbd import TUM_RGBD
-from jaxslam.vision.sources.video import VIDEO
+from jaxslam.video.camera import CAMERA
+from jaxslam.video.euroc import EUROC
+from jaxslam.video.file import VIDEO
+from jaxslam.video.folder import PLAIN, TIMESTAMPED
+from jaxslam.video.kitti import KITTI
+from jaxslam.video.recording import Layout, Recording
+from jaxslam.video.seven_scenes import SEVEN_SCENES
+from jaxslam.video.source import Source, Trajectory, check_size, resized, selected
+from jaxslam.video.tum_rgbd import TUM_RGBD
 
 LAYOUTS = (CAMERA, VIDEO, TUM_RGBD, EUROC, KITTI, SEVEN_SCENES, TIMESTAMPED, PLAIN)
 """The first that recognises a path opens it; a new layout is one file and one name."""

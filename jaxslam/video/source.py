@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxslam.vision.calibration import Calibration
+from jaxslam.video.calibration import Calibration
 
 Image = UInt8[np.ndarray, "height width"]
 

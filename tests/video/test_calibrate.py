@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxslam.cli import main
-from jaxslam.vision.board import Board, View, sharpness
-from jaxslam.vision.calibrate import calibrate, covered, different, drawn_coverage
-from jaxslam.vision.calibration import Calibration, read_calibration
+from jaxslam.video.board import Board, View, sharpness
+from jaxslam.video.calibrate import calibrate, covered, different, drawn_coverage
+from jaxslam.video.calibration import Calibration, read_calibration
 from jaxslam.vision.synthetic import add_noise
 
 CAMERA = Calibration(480, 360, 430.0, 428.0, 233.0, 184.0)

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.tum import poses
-from jaxslam.vision.calibration import Calibration
-from jaxslam.vision.sources.recording import (
+from jaxslam.video.calibration import Calibration
+from jaxslam.video.recording import (
     Layout,
     Recording,
     finite_number,
@@ -22,7 +22,7 @@ from jaxslam.vision.sources.recording import (
     read_timestamps,
     text_lines,
 )
-from jaxslam.vision.sources.source import Trajectory
+from jaxslam.video.source import Trajectory
 
 NANOSECONDS = 1e9
 TRUTH = "state_groundtruth_estimate0"

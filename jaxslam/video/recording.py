@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.vision.calibration import Calibration, read_calibration
-from jaxslam.vision.sources.source import Image, Trajectory
+from jaxslam.video.calibration import Calibration, read_calibration
+from jaxslam.video.source import Image, Trajectory
 
 IMAGE_TYPES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
 

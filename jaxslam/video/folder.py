@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.tum import read_tum
-from jaxslam.vision.sources.recording import (
+from jaxslam.video.recording import (
     Layout,
     Recording,
     image_files,
@@ -13,7 +13,7 @@ from jaxslam.vision.sources.recording import (
     of_files,
     read_timestamps,
 )
-from jaxslam.vision.sources.source import Trajectory
+from jaxslam.video.source import Trajectory
 
 
 def _open_timestamped(path: Path, _rate: float) -> Recording:

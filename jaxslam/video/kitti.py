@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.vision.calibration import Calibration
-from jaxslam.vision.sources.recording import (
+from jaxslam.video.calibration import Calibration
+from jaxslam.video.recording import (
     Calibrator,
     Layout,
     Recording,
@@ -20,7 +20,7 @@ from jaxslam.vision.sources.recording import (
     read_table,
     text_lines,
 )
-from jaxslam.vision.sources.source import Trajectory
+from jaxslam.video.source import Trajectory
 
 CAMERAS = ("0", "2")
 

@@ -8,8 +8,8 @@ import re
 from pathlib import Path
 
 from jaxslam.tum import read_tum
-from jaxslam.vision.calibration import Calibration
-from jaxslam.vision.sources.recording import (
+from jaxslam.video.calibration import Calibration
+from jaxslam.video.recording import (
     Calibrator,
     Layout,
     Recording,
@@ -18,7 +18,7 @@ from jaxslam.vision.sources.recording import (
     of_files,
     read_timestamps,
 )
-from jaxslam.vision.sources.source import Trajectory
+from jaxslam.video.source import Trajectory
 
 INTRINSICS = {
     "1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
