@@ -72,6 +72,12 @@ def test_consistency_resumes_to_more_runs(tmp_path, capsys):
         (["track", "/no/such/folder"], "/no/such/folder"),
         (["track", "--reference", "truth.txt"], "need a SOURCE"),
         (["track", "--frames", "0"], "frames"),
+        (["track", "--fov", "60"], "need a SOURCE"),
+        (["track", "--every", "0"], "every is 0"),
+        (["track", "--frames", "5", "--start", "2"], "start is 2.0 s; synthetic (seed 0) has"),
+        (["track", "--scale", "-1"], "scale is -1.0"),
+        (["track", "--calibration-treatment", "maybe"], "unknown calibration 'maybe'"),
+        (["calibrate", "/no/such/film"], "/no/such/film: no such file or folder"),
         (["track", "--filter", "nothing"], "unknown filter 'nothing'"),
         (["track", "--filter", "world+nothing"], "unknown modifiers 'nothing'"),
         (["track", "--filter", "scale_gauge+lag5"], "cannot track"),
@@ -79,7 +85,7 @@ def test_consistency_resumes_to_more_runs(tmp_path, capsys):
     ],
 )
 def test_a_mistake_ends_with_status_2_and_one_line(arguments, message, tmp_path, capsys):
-    if arguments[0] == "track":
+    if arguments[0] in ("track", "calibrate"):
         pytest.importorskip("cv2")
     with pytest.raises(SystemExit) as stop:
         main([*arguments, "--out", str(tmp_path / "out")])

@@ -85,6 +85,10 @@ def describe(summary: dict[str, Any]) -> str:
         lines.append(
             f"{summary['maps']} maps, each in a unit of its own: frames.csv says where they begin"
         )
+    camera = summary["calibration"]
+    if "estimated" in camera:
+        pairs = ((key, camera["estimated"][key], camera["sigma"][key]) for key in INTRINSICS)
+        lines.append("camera: " + ", ".join(f"{k} {x:.1f} ± {s:.1f}" for k, x, s in pairs))
     if "ate" in summary:
         ate = summary["ate"]
         share = ate["rmse"] / ate["path_length"] if ate["path_length"] else float("nan")
@@ -94,6 +98,8 @@ def describe(summary: dict[str, Any]) -> str:
             f"{ate['straight_line']:.4f}); sign {ate['sign']:.2f}, "
             f"orientation {ate['orientation_rmse']:.2f}°"
         )
+    if "no_ate" in summary:
+        lines.append(f"no trajectory error: {summary['no_ate']}")
     return "\n".join(lines)
 
 
@@ -271,8 +277,16 @@ def _summary(
         summary["target"] = as_summary(tracker.target, tracker.sighting)
     if tracker.restarts:
         summary["log_scale_sigma_between_maps"] = _scale_between_maps(tracker.settings)
-    if source.reference is not None:
-        times = np.array([result.time for result in history])
-        T_wc = np.stack([result.T_wc for result in history])
-        summary["ate"] = absolute_trajectory_error(times, T_wc, *source.reference)
-    return summary
+    return summary | _errors(source, history)
+
+
+def _errors(source: Source, history: list[Tracked]) -> dict[str, Any]:
+    """The trajectory error, where there is a reference, or why it cannot be told."""
+    if source.reference is None:
+        return {}
+    times = np.array([result.time for result in history])
+    T_wc = np.stack([result.T_wc for result in history])
+    try:
+        return {"ate": absolute_trajectory_error(times, T_wc, *source.reference)}
+    except ValueError as error:  # of few frames, or of a camera that stood still
+        return {"no_ate": str(error)}
