@@ -51,7 +51,7 @@ def test_a_guessed_focal_length_is_estimated_while_the_camera_moves():
     treatment, (fx, fy, cx, cy), covariance = camera
     assert treatment == "estimated"
     assert fx == fy
-    # Measured: of 34 pixels 10 are left, in a second, though the guess's σ was a third of its error.
+    # Measured: of 34 pixels 10 are left in a second, from a guess with a σ of 11.
     assert abs(fx - true) < 0.5 * abs(guess.fx - true)
     assert np.sqrt(covariance[0, 0]) < 0.5 * guess.sigma[0]
     assert abs(cx - 159.5) < 6.4
