@@ -32,7 +32,7 @@ import cv2
 from IPython.display import Image, display
 
 from jaxslam.plots.style import new_figure
-from jaxslam.video import open_source
+from jaxslam.video.opening import open_source
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.synthetic import synthetic_source
 from jaxslam.vision.track import describe, track

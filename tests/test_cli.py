@@ -101,10 +101,16 @@ def test_the_library_imports_light_and_sets_nothing():
 import sys, jax
 before = dict(jax.config.values)
 import jaxslam
-heavy = {"matplotlib", "cv2", "evo", "tyro.cli", "jaxslam.vision", "jaxslam.plots"}
+heavy = {"matplotlib", "cv2", "evo", "tyro.cli", "jaxslam.vision", "jaxslam.video", "jaxslam.plots"}
 assert not heavy & set(sys.modules), heavy & set(sys.modules)
 assert dict(jax.config.values) == before
 from jax._src import xla_bridge
 assert not xla_bridge.backends_are_initialized()
 """
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
+
+
+def test_commands_without_pictures_need_no_opencv():
+    """And what OpenCV is to be silent about is set before it is imported."""
+    code = "import sys, jaxslam.cli; assert not {'cv2', 'evo'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -93,7 +93,7 @@ class TrackOptions:
         )
 
     def _source(self):
-        from jaxslam.video import open_source
+        from jaxslam.video.opening import open_source
         from jaxslam.video.source import resized, selected
         from jaxslam.vision.synthetic import synthetic_source
 

@@ -17,8 +17,8 @@ from jaxslam import __version__
 from jaxslam.files import write_atomically
 from jaxslam.plots.tracking import plot_map
 from jaxslam.slam.protocol import AbstractStaged
-from jaxslam.video import Frame, Source
 from jaxslam.video.calibration import INTRINSICS, as_fields
+from jaxslam.video.source import Frame, Source
 from jaxslam.vision.overlay import OverlayWriter, draw_overlay, overlay_size
 from jaxslam.vision.pointcloud import write_ply
 from jaxslam.vision.settings import TrackerSettings

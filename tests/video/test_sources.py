@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from pictures import HEIGHT, WIDTH, brightness, picture
 
-from jaxslam.video import open_source
 from jaxslam.video.calibration import Calibration, from_field_of_view, write_calibration
+from jaxslam.video.opening import open_source
 from jaxslam.video.source import selected
 from jaxslam.vision.trajectory import write_tum
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from pictures import HEIGHT, WIDTH, brightness, picture
 
-from jaxslam.video import camera, file, open_source
+from jaxslam.video import camera, file
 from jaxslam.video.calibration import Calibration, write_calibration
+from jaxslam.video.opening import open_source
 
 RATE = 25.0
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxslam.video import open_source
+from jaxslam.video.opening import open_source
 from jaxslam.vision.patches import Patch, detect_corners, match_patch, match_patches
 from jaxslam.vision.synthetic import add_noise, synthetic_source
 

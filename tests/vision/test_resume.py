@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import jaxslam
-from jaxslam.video import Frame
 from jaxslam.video.calibration import from_field_of_view
 from jaxslam.video.pictures import as_grey
+from jaxslam.video.source import Frame
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.synthetic import synthetic_source
 from jaxslam.vision.tracker import Tracker

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxslam.cli import main
-from jaxslam.video import open_source
+from jaxslam.video.opening import open_source
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.synthetic import room, synthetic_source
 from jaxslam.vision.target import KnownPoint, Target, read_target, sighted
