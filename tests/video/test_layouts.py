@@ -211,6 +211,13 @@ def test_seven_scenes_has_a_pose_beside_each_picture(seven_scenes):
     np.testing.assert_allclose(source.reference.T_wc, [pose(0), pose(3)], rtol=0, atol=1e-12)
 
 
+def test_a_picture_of_seven_scenes_may_lack_its_pose(seven_scenes):
+    (seven_scenes / "frame-000000.pose.txt").unlink()
+    reference = open_source(seven_scenes).reference
+    assert reference is not None
+    np.testing.assert_allclose(reference.times, [3 / 30], rtol=0, atol=1e-12)
+
+
 def test_a_pose_of_seven_scenes_that_is_no_matrix_is_named(seven_scenes):
     (seven_scenes / "frame-000003.pose.txt").write_text("1 0 0 0\n")
     with pytest.raises(ValueError, match=r"frame-000003\.pose\.txt: holds 1 rows; a 4x4"):

@@ -166,6 +166,13 @@ def test_a_live_camera_gives_the_newest_picture_with_the_time_it_came(monkeypatc
     assert np.all(np.diff(numbers) % 20 > 1)
 
 
+def test_a_reader_faster_than_the_camera_waits_for_the_next_picture(monkeypatch, calibration):
+    monkeypatch.setattr(cv2, "VideoCapture", lambda number: Filming())
+    frames = list(open_source("0", calibration=calibration, frames=5))
+    assert np.all(np.diff([int(frame.image[0, 0]) for frame in frames]) != 0)
+    assert np.all(np.diff([frame.time for frame in frames]) > 0)
+
+
 def test_a_camera_without_a_picture_is_refused(monkeypatch, calibration):
     monkeypatch.setattr(cv2, "VideoCapture", lambda n: Filming(0))
     monkeypatch.setattr(camera, "PATIENCE", 0.2)

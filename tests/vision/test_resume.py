@@ -7,6 +7,8 @@ import jaxslam
 from jaxslam.video.calibration import from_field_of_view
 from jaxslam.video.pictures import as_grey
 from jaxslam.video.source import Frame
+from jaxslam.vision.landmarks import Landmark, stacked, unstacked
+from jaxslam.vision.patches import Patch
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.synthetic import synthetic_source
 from jaxslam.vision.tracker import Tracker
@@ -60,6 +62,23 @@ def test_a_loaded_tracker_goes_on_digit_by_digit(video, tmp_path):
         np.testing.assert_array_equal(one, other)
     for count in ("created", "deleted", "restarts", "steps", "failed"):
         assert getattr(tracker, count) == getattr(loaded, count), count
+
+
+def test_landmarks_are_the_same_after_their_arrays():
+    draw = np.random.default_rng(0)
+    picture = draw.integers(0, 256, (60, 60), dtype=np.uint8)
+    landmarks = {
+        slot: Landmark(7 + slot, Patch.take(picture, np.array([30.2, 29.7])), np.eye(4), 5, 4, slot)
+        for slot in (2, 0)
+    }
+    again = unstacked(stacked(landmarks))
+    assert list(again) == [2, 0]
+    for slot, landmark in landmarks.items():
+        for name in ("number", "searches", "matches", "unseen"):
+            assert getattr(again[slot], name) == getattr(landmark, name)
+        np.testing.assert_array_equal(again[slot].patch.stored, landmark.patch.stored)
+        np.testing.assert_array_equal(again[slot].patch.pixel, landmark.patch.pixel)
+    assert unstacked(stacked({})) == {}
 
 
 def test_a_calibration_that_is_estimated_is_saved_with_it(video, tmp_path):

@@ -86,9 +86,9 @@ def test_the_sigma_of_the_depths_covers_what_pixels_do(video, card):
         seen = sighted(noisy, frames[0].image, source.calibration, 0.3)
         errors.append(seen.inverse_depths - 1 / card[1][:, 2])
     covariance = np.cov(np.transpose(errors))
-    # 300 draws tell a variance to 8 %, and the bound is met with equality where all is common.
+    # 300 draws tell a σ to 4 %; the bound is met with equality where all is common, by √4 of each.
     assert np.linalg.eigvalsh(np.diag(1.2 * said**2) - covariance)[0] > 0
-    assert np.all(said < 4 * np.sqrt(np.diag(covariance)))
+    np.testing.assert_allclose(said, 2 * np.sqrt(np.diag(covariance)), rtol=0.15)
 
 
 @pytest.fixture(scope="module")
