@@ -50,7 +50,8 @@ summaries = {}
 for name, settings in SETTINGS.items():
     source = open_source(Path(VIDEO)) if VIDEO else synthetic_source(frames=FRAMES, seed=0)
     summaries[name] = track(source, out / name, settings)
-    print(f"{name} ({settings.filter}/{settings.landmarks}, calibration {settings.calibration})")
+    treatment = summaries[name]["calibration"]["treatment"]
+    print(f"{name} ({settings.filter}/{settings.landmarks}, calibration {treatment})")
     print(describe(summaries[name]), "\n")
 
 # %% [markdown]

@@ -18,14 +18,13 @@ PATIENCE = 5.0
 
 
 class Live:
-    """The newest picture of a camera, and when it came: seconds of a monotonic clock, from 0.
+    """The newest picture of a camera, and when it came: seconds after it was opened.
 
     A thread of its own fetches them, so that what a slow reader skips does not wait in a queue.
     """
 
     def __init__(self, number: int) -> None:
         self.number = number
-        self._begun = time.monotonic()
         self._came = 0.0
 
     def clock(self) -> float:
@@ -35,11 +34,12 @@ class Live:
     def images(self) -> Iterator[Image]:
         """Pictures as they come. Raises ValueError where none comes for `PATIENCE` seconds."""
         with opened(self.number) as capture:
+            begun = time.monotonic()
             newest = _Newest(capture)
             try:
                 while True:
                     came, image = newest.wait(self.number)
-                    self._came = came - self._begun
+                    self._came = came - begun
                     yield as_grey(image)
             finally:
                 newest.stop()

@@ -58,6 +58,8 @@ def track(
     that the settings name. `target`, known points that the first frame sees, makes the map metric.
     """
     tracker = Tracker(source.calibration, settings or TrackerSettings(), slam, target)
+    if source.clock is not None:
+        tracker.compile()
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     history: list[Tracked] = []

@@ -176,6 +176,17 @@ class Tracker:
         or floats from 0 to 1."""
         return self.track(Frame(self.steps, float(time), as_grey(image)))
 
+    def compile(self) -> None:
+        """Compile all programs now; else the first frames wait for it, and a camera does not."""
+        c = self.calibration
+        noise = np.random.default_rng(0).integers(0, 256, (c.height, c.width), dtype=np.uint8)
+        other = Tracker(c, self.settings, self.filter)
+        for step in range(2):
+            other.step(noise, step / 30)
+        with jax.enable_x64(True):
+            other._remove(sorted(other.landmarks))
+        other.camera()
+
     def _check(self, frame: Frame) -> None:
         check_size(f"frame {frame.index}", frame.image, self.calibration)
         before = -np.inf if self._time is None else self._time
@@ -234,7 +245,10 @@ class Tracker:
         header, arrays = read_record(path)
         if header["filter"] is not None and filter is None:
             raise ValueError(f"{path}: was saved with a filter {header['filter']}; give that")
-        settings = TrackerSettings(**header["settings"])
+        try:
+            settings = TrackerSettings(**header["settings"])
+        except TypeError:
+            raise ValueError(f"{path}: was saved by another version, with other settings") from None
         tracker = cls(from_fields(header["calibration"]), settings, filter)
         for name, value in header["numbers"].items():
             setattr(tracker, name, value)

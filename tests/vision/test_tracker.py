@@ -429,6 +429,20 @@ def test_a_filter_of_ones_own_tracks_as_the_built_in_one_does():
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-8)
 
 
+def test_programs_can_be_compiled_before_the_first_frame():
+    source = synthetic_source(frames=3)
+    settings, compiled = TrackerSettings(wanted=8, spare=4, filter="world"), []
+    world = settings.make_filter(source.calibration)
+    assert isinstance(world, jaxslam.EkfSlam)
+    tracker = Tracker(source.calibration, settings, Outside(world, lambda: compiled.append(1)))
+    tracker.compile()
+    assert len(compiled) == 1
+    assert tracker.steps == tracker.created == len(tracker.landmarks) == 0
+    for frame in source:
+        tracker.track(frame)
+    assert len(compiled) == 1
+
+
 def test_the_default_is_the_recommended_filter():
     assert TrackerSettings(filter="recommended") == TrackerSettings()
 
