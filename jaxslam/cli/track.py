@@ -40,7 +40,7 @@ class TrackOptions:
     start: float = 0.0
     """Where to begin, seconds after the first frame: at the frame that is nearest."""
     every: int = 1
-    """Track every so manieth frame only."""
+    """Track every n-th frame only."""
     scale: float = 1.0
     """Make pictures, and their calibration, so many times as large: 0.5 for half the size."""
     seed: int = 0

@@ -81,7 +81,7 @@ def check_size(what: str, image: Image, calibration: Calibration) -> None:
 def selected(
     source: Source, *, start: float = 0.0, every: int = 1, frames: int | None = None
 ) -> Source:
-    """Every so manieth frame from the one that is nearest to `start` on, `frames` at the most.
+    """Every `every`-th frame from the one that is nearest to `start` on, `frames` at the most.
 
     `start` is in seconds after the first frame. Raises ValueError for numbers that select none.
     """

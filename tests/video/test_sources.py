@@ -154,7 +154,7 @@ def test_a_field_of_view_takes_the_place_of_a_calibration(timestamped):
     assert open_source(timestamped, fov=90.0).calibration == from_field_of_view(WIDTH, HEIGHT, 90.0)
 
 
-def test_every_so_manieth_frame_from_the_nearest_to_the_start(folder, calibration):
+def test_every_third_frame_from_the_nearest_to_the_start(folder, calibration):
     whole = open_source(folder, calibration=calibration, rate=10.0)
     part = open_source(folder, calibration=calibration, rate=10.0, start=0.26, every=3, frames=2)
     chosen = [frame for frame in whole if frame.index in (3, 6)]
