@@ -141,7 +141,7 @@ def _share(r: dict[str, Any], key: str) -> str:
 def main() -> None:
     """Measure and write."""
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-    from jaxslam.vision.sources import open_source
+    from jaxslam.video.opening import open_source
     from jaxslam.vision.synthetic import synthetic_source
 
     options = tyro.cli(Options, description=__doc__)

@@ -2,8 +2,11 @@
 
 The models are pure functions of one pose and one landmark; the filters, the Monte Carlo study
 and the tracker all run on the same ones. Plots, vision and the command line are imported only
-when they are asked for: `jaxslam.plots`, `jaxslam.vision`, `jaxslam.cli`.
+when they are asked for: `jaxslam.plots`, `jaxslam.vision`, `jaxslam.cli`; so are `jaxslam.Tracker`
+and `jaxslam.TrackerSettings`, which need the vision extra.
 """
+
+from typing import Any
 
 __version__ = "0.4.0.dev0"
 
@@ -96,3 +99,15 @@ __all__ = [
     "summarise",
     "table",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "Tracker":
+        from jaxslam.vision.tracker import Tracker
+
+        return Tracker
+    if name == "TrackerSettings":
+        from jaxslam.vision.settings import TrackerSettings
+
+        return TrackerSettings
+    raise AttributeError(f"module 'jaxslam' has no attribute {name!r}")

@@ -32,8 +32,8 @@ import cv2
 from IPython.display import Image, display
 
 from jaxslam.plots.style import new_figure
+from jaxslam.video.opening import open_source
 from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.sources import open_source
 from jaxslam.vision.synthetic import synthetic_source
 from jaxslam.vision.track import describe, track
 
@@ -50,7 +50,8 @@ summaries = {}
 for name, settings in SETTINGS.items():
     source = open_source(Path(VIDEO)) if VIDEO else synthetic_source(frames=FRAMES, seed=0)
     summaries[name] = track(source, out / name, settings)
-    print(f"{name} ({settings.filter}/{settings.landmarks}, calibration {settings.calibration})")
+    treatment = summaries[name]["calibration"]["treatment"]
+    print(f"{name} ({settings.filter}/{settings.landmarks}, calibration {treatment})")
     print(describe(summaries[name]), "\n")
 
 # %% [markdown]

@@ -97,6 +97,14 @@ def test_an_empty_perturbation_means_a_known_camera():
     assert WIDE.perturbed(jnp.zeros(0)) is WIDE
 
 
+def test_square_pixels_have_one_error_of_both_focal_lengths():
+    moved = WIDE.perturbed(jnp.array([3.0, -1.0, 2.0]))
+    np.testing.assert_array_equal(moved.focal, WIDE.focal + 3.0)
+    np.testing.assert_array_equal(moved.centre, WIDE.centre + jnp.array([-1.0, 2.0]))
+    with pytest.raises((TypeError, ValueError)):
+        project(LINE.perturbed(jnp.array([3.0, -1.0, 2.0])), jnp.array([0.1, 1.0]))
+
+
 @each_camera
 def test_derivatives_agree_with_central_differences(camera):
     X = points(1, seed=1)[0]

@@ -72,6 +72,12 @@ def test_consistency_resumes_to_more_runs(tmp_path, capsys):
         (["track", "/no/such/folder"], "/no/such/folder"),
         (["track", "--reference", "truth.txt"], "need a SOURCE"),
         (["track", "--frames", "0"], "frames"),
+        (["track", "--fov", "60"], "need a SOURCE"),
+        (["track", "--every", "0"], "every is 0"),
+        (["track", "--frames", "5", "--start", "2"], "start is 2.0 s; synthetic (seed 0) has"),
+        (["track", "--scale", "-1"], "scale is -1.0"),
+        (["track", "--calibration-treatment", "maybe"], "unknown calibration 'maybe'"),
+        (["calibrate", "/no/such/film"], "/no/such/film: no such file or folder"),
         (["track", "--filter", "nothing"], "unknown filter 'nothing'"),
         (["track", "--filter", "world+nothing"], "unknown modifiers 'nothing'"),
         (["track", "--filter", "scale_gauge+lag5"], "cannot track"),
@@ -79,7 +85,7 @@ def test_consistency_resumes_to_more_runs(tmp_path, capsys):
     ],
 )
 def test_a_mistake_ends_with_status_2_and_one_line(arguments, message, tmp_path, capsys):
-    if arguments[0] == "track":
+    if arguments[0] in ("track", "calibrate"):
         pytest.importorskip("cv2")
     with pytest.raises(SystemExit) as stop:
         main([*arguments, "--out", str(tmp_path / "out")])
@@ -95,10 +101,16 @@ def test_the_library_imports_light_and_sets_nothing():
 import sys, jax
 before = dict(jax.config.values)
 import jaxslam
-heavy = {"matplotlib", "cv2", "evo", "tyro.cli", "jaxslam.vision", "jaxslam.plots"}
+heavy = {"matplotlib", "cv2", "evo", "tyro.cli", "jaxslam.vision", "jaxslam.video", "jaxslam.plots"}
 assert not heavy & set(sys.modules), heavy & set(sys.modules)
 assert dict(jax.config.values) == before
 from jax._src import xla_bridge
 assert not xla_bridge.backends_are_initialized()
 """
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
+
+
+def test_commands_without_pictures_need_no_opencv():
+    """And what OpenCV is to be silent about is set before it is imported."""
+    code = "import sys, jaxslam.cli; assert not {'cv2', 'evo'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

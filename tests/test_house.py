@@ -17,7 +17,7 @@ ORDER = (
     "arrays", "files", "tum", "linalg", "lookup", "watchdog", "geometry", "least_squares",
     "landmarks", "models", "forms", "slam", "delayed", "remedies", "window", "wrappers",
     "simulation", "names", "consistency", "posterior", "triangulation", "datasets", "plots",
-    "vision", "cli",
+    "video", "vision", "cli",
 )  # fmt: skip
 """Rooms, each of which imports only those before it."""
 

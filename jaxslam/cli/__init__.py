@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from jaxslam.cli.calibrate import CalibrateOptions
 from jaxslam.cli.consistency import ConsistencyOptions
 from jaxslam.cli.track import TrackOptions
 from jaxslam.cli.triangulate import TriangulateOptions
@@ -23,6 +24,12 @@ Command = (
         TrackOptions,
         tyro.conf.subcommand(
             "track", description="Track a camera through a video: trajectory, map, overlay."
+        ),
+    ]
+    | Annotated[
+        CalibrateOptions,
+        tyro.conf.subcommand(
+            "calibrate", description="Film a board: the camera's calibration, and how sure it is."
         ),
     ]
     | Annotated[

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from jaxslam.cli.extra import one_line_warnings, require_vision
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.names import FILTERS
 from jaxslam.simulation.scenario import CALIBRATIONS
@@ -20,16 +20,29 @@ class TrackOptions:
     """Options of the command; every field is an option."""
 
     source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
-    """Folder of images, data set folder or video file. Without it: a synthetic video."""
+    """Video file, folder of images, data set folder (TUM RGB-D, EuRoC, KITTI odometry, 7-Scenes) or
+    the number of a camera, 0. Without it: a synthetic video."""
     calibration: Path | None = None
     """Camera's JSON file: model, width, height, fx, fy, cx, cy, distortion (OpenCV's order)."""
+    fov: float | None = None
+    """Horizontal field of view in place of a calibration, degrees; it is estimated then. With
+    neither, a usual one is guessed."""
     reference: Path | None = None
-    """Reference trajectory in TUM format, to report the absolute trajectory error."""
+    """Reference trajectory in TUM format, to report the absolute trajectory error; by default the
+    data set's own."""
+    target: Path | None = None
+    """JSON file of known points that the first frame sees: the map is in metres."""
     out: Path = Path("results")
     """Folder for trajectory.txt, covariance.txt, frames.csv, map.ply, map.png, overlay.mp4 and
     summary.json."""
     frames: int | None = None
-    """Frames of the synthetic video; 150 by default."""
+    """Frames to track, at the most; of the synthetic video 150 by default."""
+    start: float = 0.0
+    """Where to begin, seconds after the first frame: at the frame that is nearest."""
+    every: int = 1
+    """Track every n-th frame only."""
+    scale: float = 1.0
+    """Make pictures, and their calibration, so many times as large: 0.5 for half the size."""
     seed: int = 0
     """Seed of the synthetic video; nothing else is random."""
     rate: float = 30.0
@@ -42,7 +55,11 @@ class TrackOptions:
         str, tyro.conf.arg(help=f"Landmark parametrization: {', '.join(LANDMARKS)}.")
     ] = TrackerSettings.landmarks
     calibration_treatment: Annotated[
-        str, tyro.conf.arg(help=f"How the filter treats it: {', '.join(CALIBRATIONS)}.")
+        str | None,
+        tyro.conf.arg(
+            help=f"How the filter treats it: {', '.join(CALIBRATIONS)}. By default one that a "
+            "field of view tells, or that is guessed, is estimated, and any other is known."
+        ),
     ] = TrackerSettings.calibration
     nearest_depth: float = TrackerSettings.nearest_depth
     """d_min, which sets the unit of the map: the prior on depth reaches from here to infinity."""
@@ -57,24 +74,18 @@ class TrackOptions:
 
     def run(self) -> None:
         """Track the video, print the summary, write its files."""
-        # Their own complaints about broken files would come beside our one line.
-        os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-        try:
-            import cv2  # noqa: F401
-            import evo  # noqa: F401
-        except ImportError as error:
-            raise ValueError(
-                f"tracking needs the vision extra ({error.name} is missing): "
-                "pip install 'jaxslam[vision]'"
-            ) from None
+        require_vision("tracking")
         from tqdm import tqdm
 
+        from jaxslam.vision.target import read_target
         from jaxslam.vision.track import describe, track
 
-        source = self._source()
-        with tqdm(total=len(source), unit="frame", disable=None) as bar:
-            summary = track(source, self.out, self._settings(), progress=bar.update)
+        with one_line_warnings():
+            source = self._source()
+        target = None if self.target is None else read_target(self.target)
+        total = len(source) or self.frames
+        with tqdm(total=total, unit="frame", disable=None) as bar:
+            summary = track(source, self.out, self._settings(), target=target, progress=bar.update)
         print(describe(summary))
         print(
             "wrote trajectory.txt, covariance.txt, frames.csv, map.ply, map.png, overlay.mp4, "
@@ -82,23 +93,31 @@ class TrackOptions:
         )
 
     def _source(self):
-        from jaxslam.vision.sources import open_source
+        from jaxslam.video.opening import open_source
+        from jaxslam.video.source import resized, selected
         from jaxslam.vision.synthetic import synthetic_source
 
         if self.source is not None:
-            if self.frames is not None:
-                raise ValueError("--frames is for the synthetic video: leave SOURCE out")
             return open_source(
                 self.source,
                 calibration=self.calibration,
+                fov=self.fov,
                 reference=self.reference,
                 rate=self.rate,
+                start=self.start,
+                every=self.every,
+                frames=self.frames,
+                scale=self.scale,
             )
-        if self.calibration or self.reference:
+        if self.calibration or self.fov is not None or self.reference or self.target:
             raise ValueError(
-                "--calibration and --reference need a SOURCE: the synthetic video has its own"
+                "--calibration, --fov, --reference and --target need a SOURCE: the synthetic video "
+                "has its own"
             )
-        return synthetic_source(frames=150 if self.frames is None else self.frames, seed=self.seed)
+        source = synthetic_source(
+            frames=150 if self.frames is None else self.frames, seed=self.seed
+        )
+        return resized(selected(source, start=self.start, every=self.every), self.scale)
 
     def _settings(self):
         return TrackerSettings(

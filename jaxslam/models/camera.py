@@ -47,9 +47,14 @@ class Camera(eqx.Module):
         return jnp.concatenate([self.focal, self.centre])
 
     def perturbed(self, delta: Float[Array, " k"]) -> Camera:
-        """The camera with its intrinsics moved by δ; an empty δ means that they are known."""
+        """The camera with its intrinsics moved by δ; an empty δ means that they are known.
+
+        Of a 2-D camera δ may also be of (f, cx, cy): fx and fy are off by the same number.
+        """
         if delta.size == 0:
             return self
+        if delta.size == 3 and np.shape(self.focal) == (2,):
+            delta = delta[jnp.array([0, 0, 1, 2])]
         focal, centre = jnp.split(self.intrinsics + delta, 2)
         return replace(self, focal=focal, centre=centre)
 

@@ -287,6 +287,18 @@ def correct(
     return slam.form.update(slam.model, state, seen, noise, context, _considered(slam, state))
 
 
+def begun(
+    slam: EkfSlam,
+    capacity: int | Capacity,
+    first: Features,
+    prior: tuple[Float[Array, "m q"], Float[Array, "m q"]],
+) -> Any:
+    """`init` of landmarks each of which has a prior of its own: mean and σ of 1/z."""
+    check_features(slam, first)
+    state = _with_frames_calibration(slam, slam.init(capacity))
+    return _forgotten(slam, insert(slam, state, first, prior))
+
+
 def insert(
     slam: EkfSlam,
     state: Any,

@@ -1,1 +1,1 @@
-"""Video: sources, image patches, tracking and what is written of it; needs the extra `vision`."""
+"""Image patches, tracking and what is written of it; needs the extra `vision`."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.lookup import chosen
+from jaxslam.models.calibration import AbstractCalibration
 from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
@@ -13,7 +14,7 @@ from jaxslam.models.sensors import Pinhole
 from jaxslam.names import FILTERS, make_filter
 from jaxslam.simulation.pieces import TREATMENTS
 from jaxslam.slam.protocol import AbstractFilter
-from jaxslam.vision.calibration import Calibration
+from jaxslam.video.calibration import Calibration
 
 
 @dataclass(frozen=True)
@@ -26,8 +27,9 @@ class TrackerSettings:
     `recommended` is the default, the one of docs/sequences.md with the best trajectories."""
     landmarks: str = "inverse_scaling"
     """Landmark parametrization: a name of jaxslam.LANDMARKS."""
-    calibration: str = "known"
-    """Treatment of the calibration: white or known."""
+    calibration: str | None = None
+    """Treatment of the calibration: a name of TREATMENTS. By default one that is guessed, from a
+    field of view, is estimated, and any other is known."""
     wanted: int = 50
     """Landmarks to keep in view."""
     spare: int = 20
@@ -39,9 +41,9 @@ class TrackerSettings:
     pixel_sigma: float = 0.3
     """σ of a match, pixels."""
     focal_sigma: float = 1.0
-    """σ of the focal lengths, pixels (with `white` calibration)."""
+    """σ of the focal lengths, pixels, of a calibration that states none and is not known."""
     centre_sigma: float = 1.0
-    """σ of the principal point, pixels (with `white` calibration)."""
+    """σ of the principal point, pixels, of the same."""
     velocity_sigma: float = 0.5
     """σ of the initial linear velocity, 1/s."""
     angular_velocity_sigma: float = 0.5
@@ -68,6 +70,8 @@ class TrackerSettings:
             object.__setattr__(self, "filter", type(self).filter)
         chosen("filter", [self.filter.partition("+")[0]], FILTERS)
         chosen("landmarks", [self.landmarks], LANDMARKS)
+        if self.calibration is not None:
+            chosen("calibration", [self.calibration], TREATMENTS)
 
     @property
     def capacity(self) -> int:
@@ -96,8 +100,13 @@ class TrackerSettings:
             ),
             sensor=Pinhole(camera, self.pixel_sigma),
             landmark=LANDMARKS[self.landmarks],
-            calibration=TREATMENTS[self.calibration](
-                [self.focal_sigma] * 2 + [self.centre_sigma] * 2
-            ),
+            calibration=self.treatment(calibration),
             depth=self.depth,
         )
+
+    def treatment(self, calibration: Calibration) -> AbstractCalibration:
+        """What the filter makes of a calibration, with the σ that it states or else with these."""
+        name = self.calibration or ("estimated" if calibration.guessed else "known")
+        stated = [self.focal_sigma] * 2 + [self.centre_sigma] * 2
+        sigma = list(calibration.sigma) or stated
+        return TREATMENTS[name](sigma[1:] if calibration.guessed else sigma)

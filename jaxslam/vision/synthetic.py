@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from jaxslam.vision.calibration import Calibration
-from jaxslam.vision.sources import Image, Source, Trajectory
+from jaxslam.video.calibration import Calibration
+from jaxslam.video.source import Image, Source, Trajectory
 
 NOISE = 2.0  # standard deviation of the sensor noise, in grey levels
 SUPERSAMPLING = 2

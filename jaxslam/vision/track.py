@@ -17,10 +17,12 @@ from jaxslam import __version__
 from jaxslam.files import write_atomically
 from jaxslam.plots.tracking import plot_map
 from jaxslam.slam.protocol import AbstractStaged
+from jaxslam.video.calibration import INTRINSICS, as_fields
+from jaxslam.video.source import Frame, Source
 from jaxslam.vision.overlay import OverlayWriter, draw_overlay, overlay_size
 from jaxslam.vision.pointcloud import write_ply
 from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.sources import Frame, Source
+from jaxslam.vision.target import Target, as_summary
 from jaxslam.vision.tracker import Points, Tracked, Tracker
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
@@ -45,6 +47,7 @@ def track(
     settings: TrackerSettings | None = None,
     *,
     slam: AbstractStaged | None = None,
+    target: Target | None = None,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> dict[str, Any]:
     """Track `source`, write `trajectory.txt`, `covariance.txt`, `frames.csv`, `map.ply`,
@@ -52,9 +55,11 @@ def track(
 
     An interruption (KeyboardInterrupt) or an unreadable frame (ValueError) leaves all of them for
     the frames so far, and is raised again. `slam` is a filter of one's own, in place of the one
-    that the settings name.
+    that the settings name. `target`, known points that the first frame sees, makes the map metric.
     """
-    tracker = Tracker(source.calibration, settings or TrackerSettings(), slam)
+    tracker = Tracker(source.calibration, settings or TrackerSettings(), slam, target)
+    if source.clock is not None:
+        tracker.compile()
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     history: list[Tracked] = []
@@ -82,6 +87,10 @@ def describe(summary: dict[str, Any]) -> str:
         lines.append(
             f"{summary['maps']} maps, each in a unit of its own: frames.csv says where they begin"
         )
+    camera = summary["calibration"]
+    if "estimated" in camera:
+        pairs = ((key, camera["estimated"][key], camera["sigma"][key]) for key in INTRINSICS)
+        lines.append("camera: " + ", ".join(f"{k} {x:.1f} ± {s:.1f}" for k, x, s in pairs))
     if "ate" in summary:
         ate = summary["ate"]
         share = ate["rmse"] / ate["path_length"] if ate["path_length"] else float("nan")
@@ -91,6 +100,8 @@ def describe(summary: dict[str, Any]) -> str:
             f"{ate['straight_line']:.4f}); sign {ate['sign']:.2f}, "
             f"orientation {ate['orientation_rmse']:.2f}°"
         )
+    if "no_ate" in summary:
+        lines.append(f"no trajectory error: {summary['no_ate']}")
     return "\n".join(lines)
 
 
@@ -214,6 +225,21 @@ def _scale_between_maps(settings: TrackerSettings) -> float:
     return math.sqrt(2) * float(depth.sigma / depth.mean)
 
 
+def _calibration(tracker: Tracker) -> dict[str, Any]:
+    """What the camera was taken for, and where it is estimated, what it is in the end with σ."""
+    camera = tracker.camera()
+    given = as_fields(tracker.calibration)
+    if camera is None:
+        return {"given": given}
+    treatment, mean, covariance = camera
+    result = {"treatment": treatment, "given": given}
+    if treatment == "estimated":
+        sigma = np.sqrt(np.diagonal(covariance))
+        result["estimated"] = dict(zip(INTRINSICS, mean.tolist(), strict=True))
+        result["sigma"] = dict(zip(INTRINSICS, sigma.tolist(), strict=True))
+    return result
+
+
 def _summary(
     source: Source, tracker: Tracker, history: list[Tracked], seconds: list[float]
 ) -> dict[str, Any]:
@@ -228,6 +254,7 @@ def _summary(
         "source": source.name,
         "filter": tracker.filter_name,
         "settings": dataclasses.asdict(tracker.settings),
+        "calibration": _calibration(tracker),
         "frames": len(history),
         "tracked": len(history) - lost,
         "lost": lost,
@@ -248,10 +275,20 @@ def _summary(
             "per_frame_p99": float(np.quantile(later, 0.99)),
         },
     }
+    if tracker.target is not None and tracker.sighting is not None:
+        summary["target"] = as_summary(tracker.target, tracker.sighting)
     if tracker.restarts:
         summary["log_scale_sigma_between_maps"] = _scale_between_maps(tracker.settings)
-    if source.reference is not None:
-        times = np.array([result.time for result in history])
-        T_wc = np.stack([result.T_wc for result in history])
-        summary["ate"] = absolute_trajectory_error(times, T_wc, *source.reference)
-    return summary
+    return summary | _errors(source, history)
+
+
+def _errors(source: Source, history: list[Tracked]) -> dict[str, Any]:
+    """The trajectory error, where there is a reference, or why it cannot be told."""
+    if source.reference is None:
+        return {}
+    times = np.array([result.time for result in history])
+    T_wc = np.stack([result.T_wc for result in history])
+    try:
+        return {"ate": absolute_trajectory_error(times, T_wc, *source.reference)}
+    except ValueError as error:  # of few frames, or of a camera that stood still
+        return {"no_ate": str(error)}

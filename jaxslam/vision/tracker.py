@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,18 +15,29 @@ import numpy as np
 
 from jaxslam.arrays import cast
 from jaxslam.forms.state import Features, Status
-from jaxslam.slam.filter import AtOnce, innermost
+from jaxslam.models.scale import Metre
+from jaxslam.models.sensors import Pinhole
+from jaxslam.slam.filter import AtOnce, EkfSlam, begun, innermost
 from jaxslam.slam.protocol import AbstractStaged, Scene
 from jaxslam.slam.ransac import inliers
 from jaxslam.slam.readouts import camera_pose, landmarks_in_world
-from jaxslam.vision.calibration import Calibration
+from jaxslam.video.calibration import Calibration, as_fields, from_fields
+from jaxslam.video.pictures import as_grey
+from jaxslam.video.source import Frame, check_size
+from jaxslam.vision.landmarks import NO_POINTS, Landmark, Points, joined, stacked, unstacked
 from jaxslam.vision.located import Located
 from jaxslam.vision.patches import Match, Patch, detect_corners, match_patches
+from jaxslam.vision.resume import grown, leaves, read_record, write_record
 from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.sources import Frame
+from jaxslam.vision.target import Sighting, Target, known_depths, sighted
 
 LEAST_INLIERS = 4
 """Fewer matches than this do not count as having tracked a frame, and are not believed."""
+
+_NUMBERS = (
+    "created", "deleted", "restarts", "steps", "_time", "_unmeasured", "_sigma_log_scale"
+)  # fmt: skip
+"""What a tracker counts and measures, one number each."""
 
 
 class _Prediction(NamedTuple):
@@ -38,19 +51,6 @@ class _Prediction(NamedTuple):
     points: Any
     """Homogeneous points (X, ω) in the predicted camera."""
     omegas: Any
-
-
-@dataclass
-class _Landmark:
-    """What the picture side remembers of the landmark in a slot."""
-
-    number: int
-    patch: Patch
-    first_camera: np.ndarray
-    """T_wc of its first view, (4, 4)."""
-    searches: int = 0
-    matches: int = 0
-    unseen: int = 0
 
 
 @dataclass(frozen=True)
@@ -97,23 +97,9 @@ class Tracked:
         return "start" if self.starts else "lost" if self.lost else "tracked"
 
 
-class Points(NamedTuple):
-    """n landmarks in the world, as they were seen last."""
-
-    numbers: np.ndarray
-    maps: np.ndarray
-    """Numbers of their maps."""
-    points: np.ndarray
-    """(n, 3); not finite for one at infinity."""
-    covariances: np.ndarray
-    """(n, 3, 3), the camera's uncertainty and that of the map's start included."""
-    in_map: np.ndarray
-    """The same given where the map begins, (n, 3, 3)."""
-
-
 @dataclass
 class Tracker:
-    """Tracks a camera: `track(frame)` for each frame of a video, in order.
+    """Tracks a camera: `step(image, time)` or `track(frame)` for each frame of a video, in order.
 
     A camera that is lost moves as the filter predicts. One lost for long, or a filter whose
     covariance is not positive any more, begins a new map where the picture has the corners for
@@ -127,10 +113,17 @@ class Tracker:
     settings: TrackerSettings = field(default_factory=TrackerSettings)
     filter: AbstractStaged | None = None
     """One's own, in place of the filter that the settings name."""
-    landmarks: dict[int, _Landmark] = field(default_factory=dict, init=False)
+    target: Target | None = None
+    """Points of known positions, m, that the first frame sees: then the first map is in metres, the
+    unit of `nearest_depth`. For an `EkfSlam` in metres, whose depths have nothing in common."""
+    sighting: Sighting | None = field(default=None, init=False)
+    """Where the first frame saw the target."""
+    landmarks: dict[int, Landmark] = field(default_factory=dict, init=False)
     created: int = field(default=0, init=False)
     deleted: int = field(default=0, init=False)
     restarts: int = field(default=0, init=False)
+    steps: int = field(default=0, init=False)
+    """Frames given so far."""
     failed: Counter[str] = field(default_factory=Counter, init=False)
     """How many updates ended in which `Status` that says that their result means nothing."""
     finished: list[Points] = field(default_factory=list, init=False)
@@ -146,6 +139,16 @@ class Tracker:
                 "predicts them, before it is given the frame, from the frame in which they are "
                 "first seen"
             )
+        if self.target is not None and not _keeps_metres(made):
+            raise ValueError(
+                f"filter {self.filter_name} cannot begin with a target: one that is an EkfSlam, "
+                "without a scale of its own, as `world` and `robocentric` are, is accepted"
+            )
+        if self.target is not None and len(self.target.points) > self.settings.wanted:
+            raise ValueError(
+                f"the target has {len(self.target.points)} points, and {self.settings.wanted} "
+                "landmarks are wanted"
+            )
         self._time: float | None = None
         self._origin = self._camera = Located()
         self._sigma_log_scale: float | None = None
@@ -160,26 +163,130 @@ class Tracker:
         return self.settings.filter if self.filter is None else type(self.filter).__name__
 
     def track(self, frame: Frame) -> Tracked:
-        """Predict, search, update, and renew the map. Raises ValueError for a frame that is not
-        later than the one before."""
+        """Predict, search, update, and renew the map. Raises ValueError, and changes nothing, for
+        a frame of another size than the calibration's, or not later than the one before."""
+        self._check(frame)
         with jax.enable_x64(True):
-            return self._first(frame) if self._time is None else self._next(frame)
+            tracked = self._first(frame) if self._time is None else self._next(frame)
+        self.steps += 1
+        return tracked
+
+    def step(self, image: Any, time: float) -> Tracked:
+        """`track` a picture taken at `time` (s): grey, or in colour in OpenCV's order (BGR), uint8
+        or floats from 0 to 1."""
+        return self.track(Frame(self.steps, float(time), as_grey(image)))
+
+    def compile(self) -> None:
+        """Compile all programs now; else the first frames wait for it, and a camera does not."""
+        c = self.calibration
+        noise = np.random.default_rng(0).integers(0, 256, (c.height, c.width), dtype=np.uint8)
+        other = Tracker(c, self.settings, self.filter)
+        for step in range(2):
+            other.step(noise, step / 30)
+        with jax.enable_x64(True):
+            other._remove(sorted(other.landmarks))
+        other.camera()
+
+    def _check(self, frame: Frame) -> None:
+        check_size(f"frame {frame.index}", frame.image, self.calibration)
+        before = -np.inf if self._time is None else self._time
+        if not before < frame.time < np.inf:
+            raise ValueError(
+                f"frame {frame.index}: its time, {frame.time} s, is not later than the one before, "
+                f"{before} s"
+            )
 
     def points(self) -> Points:
         """All landmarks, those gone included."""
         with jax.enable_x64(True):
             kept = [*self.finished, self._recorded(sorted(self.landmarks))]
-        return Points(*(np.concatenate(parts) for parts in zip(*kept, strict=True)))
+        return joined(kept)
+
+    def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
+        """How the calibration is treated, and fx, fy, cx, cy with their covariance, pixels, as far
+        as this map tells. None of a filter of one's own without a pinhole camera."""
+        inner = innermost(self._slam)
+        if inner is None or not isinstance(inner.sensor, Pinhole):
+            return None
+        with jax.enable_x64(True):
+            mean, covariance = jax.device_get(_intrinsics(self._slam, inner, self._state))
+        return inner.calibration.name, mean, covariance
+
+    def save(self, path: str | Path) -> None:
+        """Write all that is needed to go on from here (.npz), whole or not at all.
+
+        Raises ValueError before the first frame, when there is nothing to go on from.
+        """
+        if self._time is None:
+            raise ValueError("a tracker that was given no frame yet has nothing to save")
+        header = {
+            "calibration": as_fields(self.calibration),
+            "settings": asdict(self.settings),
+            "filter": None if self.filter is None else self.filter_name,
+            "numbers": {name: getattr(self, name) for name in _NUMBERS},
+            "failed": dict(self.failed),
+        }
+        poses = self._origin, self._camera
+        arrays = {
+            **leaves(self._state, "state"),
+            **leaves([(pose.T_wc, pose.covariance) for pose in poses], "poses"),
+            **stacked(self.landmarks),
+            **joined([NO_POINTS, *self.finished])._asdict(),
+        }
+        write_record(path, header, arrays)
+
+    @classmethod
+    def load(cls, path: str | Path, filter: AbstractStaged | None = None) -> Tracker:
+        """The tracker that was saved, which goes on as that would have: digit by digit.
+
+        One with a filter of one's own is to be given that again. Raises ValueError for a file
+        that is none, or of another filter.
+        """
+        header, arrays = read_record(path)
+        if header["filter"] is not None and filter is None:
+            raise ValueError(f"{path}: was saved with a filter {header['filter']}; give that")
+        try:
+            settings = TrackerSettings(**header["settings"])
+        except TypeError:
+            raise ValueError(f"{path}: was saved by another version, with other settings") from None
+        tracker = cls(from_fields(header["calibration"]), settings, filter)
+        for name, value in header["numbers"].items():
+            setattr(tracker, name, value)
+        tracker.failed.update(header["failed"])
+        tracker.landmarks = unstacked(arrays)
+        tracker.finished = [Points(*(arrays[name] for name in Points._fields))]
+        tracker._origin, tracker._camera = (
+            Located(arrays[f"poses/{i}"], arrays[f"poses/{i + 1}"]) for i in (0, 2)
+        )
+        with jax.enable_x64(True):
+            tracker._state = grown(tracker._state, arrays, "state")
+        return tracker
 
     def _first(self, frame: Frame) -> Tracked:
+        corners = self._corners(frame)
+        created = (
+            self._begun(frame, corners) if self.target is None else self._known(frame, corners)
+        )
         self._time = frame.time
-        return self._tracked(frame, created=self._begun(frame, self._corners(frame)), starts=True)
+        return self._tracked(frame, created=created, starts=True)
+
+    def _known(self, frame: Frame, corners: np.ndarray) -> np.ndarray:
+        """`_begun` at the target's points, which come first, and at corners away from them."""
+        assert self.target is not None
+        s = self.settings
+        seen = sighted(self.target, frame.image, self.calibration, s.pixel_sigma)
+        distances = np.linalg.norm(corners[:, None] - seen.pixels, axis=2)
+        apart = corners[np.all(distances >= s.spacing, axis=1)]
+        pixels = np.concatenate([seen.pixels, apart])[: s.wanted]
+        depths = known_depths(seen, s.wanted, float(s.depth.mean), float(s.depth.sigma))
+        self.sighting = seen
+        return self._created(
+            partial(_begin_known, jax.tree.map(jnp.asarray, depths)), frame, pixels
+        )
 
     def _next(self, frame: Frame) -> Tracked:
-        dt = frame.time - (-np.inf if self._time is None else self._time)
-        if not dt > 0:
-            raise ValueError(f"frame {frame.index}: its time is not later than the one before")
-        dt = jnp.asarray(dt)  # a number of Python's would be compiled into the programs
+        # A number of Python's would be compiled into the programs.
+        dt = jnp.asarray(frame.time - (self._time or 0.0))
         predicted, prediction = _predict(self._slam, self._state, dt)
         prediction = jax.device_get(prediction)
         prediction = prediction._replace(T_wc=self._origin.T_wc @ prediction.T_wc)
@@ -328,7 +435,7 @@ class Tracker:
         """Remove landmarks that stopped matching or left the picture long ago."""
         s = self.settings
 
-        def failing(landmark: _Landmark) -> bool:
+        def failing(landmark: Landmark) -> bool:
             judged = landmark.searches >= s.patience
             return judged and landmark.matches < s.least_success * landmark.searches
 
@@ -387,7 +494,7 @@ class Tracker:
         self._sigma_log_scale = float(np.sqrt(log_scale)) if log_scale > 0 else None
         for slot, corner in zip(slots, corners, strict=True):
             patch = Patch.take(frame.image, corner)
-            self.landmarks[int(slot)] = _Landmark(self.created, patch, self._camera.T_wc)
+            self.landmarks[int(slot)] = Landmark(self.created, patch, self._camera.T_wc)
             self.created += 1
         return corners
 
@@ -408,6 +515,11 @@ class Tracker:
             sigma_log_scale=self._sigma_log_scale,
             **found,
         )
+
+
+def _keeps_metres(slam: AbstractStaged) -> bool:
+    """Whether depths in metres can be told to a filter, landmark by landmark."""
+    return isinstance(slam, EkfSlam) and isinstance(slam.scale, Metre) and slam.depth.common is None
 
 
 def _padded(slots: np.ndarray, pixels: np.ndarray, size: int) -> Features:
@@ -463,6 +575,12 @@ def _begin_map(slam: AbstractStaged, state: Any, new: Features):
 
 
 @eqx.filter_jit
+def _begin_known(depths: Any, slam: EkfSlam, state: Any, new: Features):
+    state = begun(slam, slam.in_map(state).size, new, depths)
+    return state, _reported(slam, state)
+
+
+@eqx.filter_jit
 def _renew_map(slam: AbstractStaged, state: Any, new: Features):
     state = slam.close(state, new)
     return state, _reported(slam, state)
@@ -480,6 +598,16 @@ def _log_scale_variance(slam: AbstractStaged, state: Any):
         return jnp.zeros(1) if λ is None else jnp.sum(λ)[None]
 
     return slam.marginal(state, log_scale)[1][0, 0]
+
+
+@eqx.filter_jit
+def _intrinsics(slam: AbstractStaged, inner: EkfSlam, state: Any):
+    def intrinsics(scene: Scene):
+        sensor = inner.calibration.sensor(inner.sensor, scene.core.calibration)
+        assert isinstance(sensor, Pinhole)
+        return sensor.camera.intrinsics
+
+    return slam.marginal(state, intrinsics)
 
 
 @eqx.filter_jit

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxslam.vision.calibration import Calibration
+from jaxslam.video.calibration import Calibration
 from jaxslam.vision.synthetic import (
     NOISE,
     Quad,

@@ -1,22 +1,18 @@
-"""Videos in every layout on disk, and every way in which such a layout can be wrong."""
+"""Folders of images, the part of a video that is wanted, and every way in which it can be wrong."""
 
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from pictures import HEIGHT, WIDTH, brightness, picture
 
-from jaxslam.vision.calibration import Calibration, write_calibration
-from jaxslam.vision.sources import open_source
+from jaxslam.video.calibration import Calibration, from_field_of_view, write_calibration
+from jaxslam.video.opening import open_source
+from jaxslam.video.source import selected
 from jaxslam.vision.trajectory import write_tum
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
-WIDTH, HEIGHT = 64, 48
-
-
-def picture(index):
-    """A grey image that tells its index by its brightness."""
-    return np.full((HEIGHT, WIDTH), 10 * index + 5, np.uint8)
 
 
 @pytest.fixture
@@ -54,10 +50,6 @@ def set_lines(path, *lines):
     (path / "timestamps.txt").write_text("\n".join(lines) + "\n")
 
 
-def brightness(source):
-    return [int(frame.image[0, 0]) for frame in source]
-
-
 def test_timestamped_layout_gives_named_images_at_stated_times(timestamped):
     source = open_source(timestamped)
     frames = list(source)
@@ -86,19 +78,6 @@ def test_plain_folder_is_sorted_by_number(folder, calibration):
     assert brightness(source) == [10 * index + 5 for index in range(1, 12)]
     np.testing.assert_allclose(source.times, np.arange(11) / 20, rtol=0, atol=1e-12)
     assert source.reference is None
-
-
-def test_video_is_read_with_its_own_rate(tmp_path, calibration):
-    path = tmp_path / "video.mp4"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 25.0, (WIDTH, HEIGHT))
-    for index in range(6):
-        writer.write(cv2.cvtColor(picture(3 * index), cv2.COLOR_GRAY2BGR))
-    writer.release()
-    source = open_source(path, calibration=calibration)
-    assert len(source) == 6
-    np.testing.assert_allclose(source.times, np.arange(6) / 25, rtol=0, atol=1e-12)
-    # Compression changes the grey levels a little.
-    np.testing.assert_allclose(brightness(source), [5, 35, 65, 95, 125, 155], atol=4)
 
 
 def test_reading_is_lazy_and_can_be_repeated(timestamped):
@@ -150,18 +129,95 @@ def test_image_of_another_size_is_refused(folder, calibration):
 def test_what_is_no_source_is_refused(tmp_path, folder, calibration):
     with pytest.raises(ValueError, match="no such file or folder"):
         open_source(tmp_path / "nowhere")
-    with pytest.raises(ValueError, match="comes without a calibration"):
-        open_source(folder)
+    with pytest.raises(ValueError, match="one of them is accepted"):
+        open_source(folder, calibration=calibration, fov=60.0)
     with pytest.raises(ValueError, match="rate is 0"):
         open_source(folder, calibration=calibration, rate=0)
-    with pytest.raises(ValueError, match=r"unknown kind of source; accepted: a video file"):
+    with pytest.raises(ValueError, match=r"a file \.txt, an unknown kind of source; accepted: the"):
         open_source(folder / "notes.txt", calibration=calibration)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match="holds no images"):
+    with pytest.raises(ValueError, match="a folder with nothing in it, an unknown kind"):
         open_source(tmp_path / "empty", calibration=calibration)
-    (tmp_path / "text.mp4").write_text("no video")
-    with pytest.raises(ValueError, match="cannot be read as a video"):
-        open_source(tmp_path / "text.mp4", calibration=calibration)
+    (tmp_path / "empty" / "deeper").mkdir()
+    (tmp_path / "empty" / "a.txt").touch()
+    with pytest.raises(ValueError, match=r"a folder with a\.txt, deeper/, …, an unknown .* EuRoC"):
+        open_source(tmp_path / "empty", calibration=calibration)
+
+
+def test_without_a_calibration_a_lens_is_guessed_and_said_so(folder):
+    with pytest.warns(UserWarning, match="pictures: comes without a calibration; .* 65°"):
+        source = open_source(folder)
+    assert source.calibration == from_field_of_view(WIDTH, HEIGHT)
+
+
+def test_a_field_of_view_takes_the_place_of_a_calibration(timestamped):
+    assert open_source(timestamped, fov=90.0).calibration == from_field_of_view(WIDTH, HEIGHT, 90.0)
+
+
+def test_every_third_frame_from_the_nearest_to_the_start(folder, calibration):
+    whole = open_source(folder, calibration=calibration, rate=10.0)
+    part = open_source(folder, calibration=calibration, rate=10.0, start=0.26, every=3, frames=2)
+    chosen = [frame for frame in whole if frame.index in (3, 6)]
+    assert len(part) == 2
+    assert part.times.tolist() == [frame.time for frame in chosen]
+    for frame, expected in zip(part, chosen, strict=True):
+        assert (frame.index, frame.time) == (expected.index, expected.time)
+        np.testing.assert_array_equal(frame.image, expected.image)
+    rest = open_source(folder, calibration=calibration, rate=10.0, start=0.24)
+    assert [frame.index for frame in rest] == list(range(2, 11))
+
+
+def test_a_selection_of_a_selection_counts_in_the_whole_video(folder, calibration):
+    part = open_source(folder, calibration=calibration, rate=10.0, start=0.1, every=2)
+    again = selected(part, start=0.4, every=2)
+    assert [frame.index for frame in again] == [5, 9]
+    assert brightness(again) == [10 * (5 + 1) + 5, 10 * (9 + 1) + 5]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"every": 0}, "every is 0; a positive"),
+        ({"frames": 0}, "frames is 0; a positive"),
+        ({"start": -1.0}, r"start is -1\.0 s; pictures has frames from 0 to 1\.000 s"),
+        ({"start": 1.1}, r"start is 1\.1 s; pictures has frames from 0 to 1\.000 s"),
+        ({"start": float("nan")}, "start is nan s"),
+        ({"scale": 0.0}, r"scale is 0\.0; a positive factor"),
+        ({"scale": 0.001}, "width would be 0; at least one pixel"),
+    ],
+)
+def test_a_selection_of_nothing_is_refused(folder, calibration, options, message):
+    with pytest.raises(ValueError, match=message):
+        open_source(folder, calibration=calibration, rate=10.0, **options)
+
+
+def test_a_smaller_picture_and_its_calibration_see_a_point_in_the_same_direction(tmp_path):
+    """A bright spot, where the scaled calibration has it."""
+    draw = np.random.default_rng(0)
+    camera = Calibration(320, 240, 300.0, 310.0, 150.0, 125.0)
+    write_calibration(tmp_path / "calibration.json", camera)
+    (tmp_path / "images").mkdir()
+    ray = np.array([0.21, -0.13, 1.0])
+    u, v, _ = camera.matrix @ ray
+    y, x = np.mgrid[:240, :320]
+    image = 200 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 6.0**2)) + draw.uniform(0, 1)
+    cv2.imwrite(str(tmp_path / "images" / "0.png"), np.rint(image).astype(np.uint8))
+    set_lines(tmp_path, "0 0.png")
+    source = open_source(tmp_path, scale=0.4)
+    (frame,) = source
+    assert frame.image.shape == (96, 128)
+    weight = np.where(frame.image > 20, frame.image, 0).astype(float)
+    y, x = np.mgrid[:96, :128]
+    centre = np.array([np.sum(weight * x), np.sum(weight * y)]) / weight.sum()
+    # Grey levels are whole; pixels counted from the corner would be 0.3 off.
+    np.testing.assert_allclose(centre, (source.calibration.matrix @ ray)[:2], rtol=0, atol=0.05)
+
+
+def test_a_picture_of_another_size_is_refused_before_it_is_scaled(folder, calibration):
+    cv2.imwrite(str(folder / "frame5.png"), np.zeros((HEIGHT, WIDTH + 2), np.uint8))
+    source = open_source(folder, calibration=calibration, scale=0.5)
+    with pytest.raises(ValueError, match="image 4 is 66x48, the calibration is for 64x48"):
+        list(source)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,65 @@
+"""`jaxslam calibrate`: a camera's calibration from a video of a board."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaxslam.cli.extra import one_line_warnings, require_vision
+from jaxslam.files import write_atomically
+
+
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """Options of the command; every field is an option."""
+
+    board_video: Annotated[
+        Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="BOARD_VIDEO")
+    ] = None
+    """Video or folder of images of a board that is held still and tilted all ways. Without it: the
+    board is drawn, to be printed."""
+    board: str = "checkerboard"
+    """Checkerboard or charuco."""
+    columns: int = 10
+    """Squares across, counted on the paper (9 corners inside)."""
+    rows: int = 7
+    """Squares down."""
+    square: float = 0.025
+    """Side of a square, metres; the intrinsics do not depend on it."""
+    dictionary: str = "5X5_100"
+    """Of a charuco board's markers, whose sides are 3/4 of a square."""
+    out: Path = Path("results")
+    """Folder for calibration.json and coverage.png, or for board.png."""
+
+    def run(self) -> None:
+        """Calibrate, print the numbers, write the files."""
+        require_vision("calibrating")
+        from jaxslam.video.board import Board
+
+        board = Board(self.board, self.columns, self.rows, self.square, self.dictionary)
+        if self.board_video is None:
+            self._draw(board)
+        else:
+            self._calibrate(board, self.board_video)
+
+    def _draw(self, board) -> None:
+        import cv2
+
+        self.out.mkdir(parents=True, exist_ok=True)
+        with write_atomically(self.out / "board.png") as path:
+            cv2.imwrite(str(path), board.drawn())
+        print(f"wrote {self.out / 'board.png'}: print it, and measure a square")
+
+    def _calibrate(self, board, video: Path) -> None:
+        from tqdm import tqdm
+
+        from jaxslam.video.calibrate import calibrate, describe, write
+
+        with one_line_warnings(), tqdm(unit="picture", disable=None) as bar:
+            calibrated = calibrate(video, board, bar.update)
+        write(calibrated, board, self.out)
+        print(describe(calibrated))
+        print(f"wrote calibration.json, coverage.png in {self.out}")

@@ -1,0 +1,34 @@
+"""What the commands that look at pictures share: their libraries, and warnings of one line."""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+from collections.abc import Generator
+from contextlib import contextmanager
+
+
+def require_vision(what: str) -> None:
+    """Raise ValueError unless the vision extra is installed, which `what` needs."""
+    # Their own complaints about broken files would come beside our one line.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    try:
+        import cv2  # noqa: F401
+        import evo  # noqa: F401
+    except ImportError as error:
+        raise ValueError(
+            f"{what} needs the vision extra ({error.name} is missing): "
+            "pip install 'jaxslam[vision]'"
+        ) from None
+
+
+@contextmanager
+def one_line_warnings() -> Generator[None]:
+    """Warnings as one line on standard error, as a person at a terminal wants them."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield
+    for warning in caught:
+        print(f"jaxslam: warning: {warning.message}", file=sys.stderr)

@@ -1,0 +1,1 @@
+"""Videos: where they come from, what camera filmed them, how one is calibrated; extra `vision`."""

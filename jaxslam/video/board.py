@@ -1,0 +1,146 @@
+"""Boards that calibrate a camera: what they look like, and where a picture shows their corners."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+KINDS = ("checkerboard", "charuco")
+MARKER_SHARE = 0.75
+"""Side of a ChArUco marker, in squares."""
+_LEAST_CORNERS = 8
+_REACH = 0.3
+"""To each side of a corner, in the least distance of two, in which it is refined."""
+_AROUND = 9
+"""Side of the neighbourhood of a corner, pixels, in which its edges are looked at."""
+
+
+class View(NamedTuple):
+    """k corners of a board in one picture."""
+
+    pixels: Float32[np.ndarray, "k 2"]
+    points: Float32[np.ndarray, "k 3"]
+    """Where they are on the board, m; z is 0."""
+    outline: Float[np.ndarray, "4 2"]
+    """Pixels of the board's four outer corners."""
+    sharpness: float
+    """Slope of the edges at the corners, in their contrasts a pixel: 1/2 for a perfect one."""
+
+
+@dataclass(frozen=True)
+class Board:
+    """So many squares across and down, of side `square`, m, counted on the paper.
+
+    A `charuco` board has a marker of `dictionary` in every white square, so that part of it is
+    enough. Raises ValueError for what is no board.
+    """
+
+    kind: str = "checkerboard"
+    columns: int = 10
+    rows: int = 7
+    square: float = 0.025
+    dictionary: str = "5X5_100"
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"unknown board {self.kind!r}; known: {', '.join(KINDS)}")
+        if min(self.columns, self.rows) < 4:
+            raise ValueError(
+                f"a board of {self.columns}x{self.rows} squares; at least 4x4 are accepted"
+            )
+        if not 0 < self.square < np.inf:
+            raise ValueError(f"square is {self.square} m; a positive length is accepted")
+        if not hasattr(cv2.aruco, f"DICT_{self.dictionary}"):
+            raise ValueError(f"unknown dictionary {self.dictionary!r}; as 4X4_50, 5X5_100, 6X6_250")
+
+    @property
+    def corners(self) -> Float32[np.ndarray, "n 3"]:
+        """Where four squares meet, row by row, m."""
+        y, x = np.mgrid[1 : self.rows, 1 : self.columns]
+        return self._on_board(np.stack([x.ravel(), y.ravel()], 1))
+
+    def _on_board(self, squares: np.ndarray) -> Float32[np.ndarray, "n 3"]:
+        return np.pad(self.square * squares, ((0, 0), (0, 1))).astype(np.float32)
+
+    @cached_property
+    def _charuco(self) -> Any:
+        dictionary = cv2.aruco.getPredefinedDictionary(
+            getattr(cv2.aruco, f"DICT_{self.dictionary}")
+        )
+        size = (self.columns, self.rows)
+        return cv2.aruco.CharucoBoard(size, self.square, MARKER_SHARE * self.square, dictionary)
+
+    @cached_property
+    def _detector(self) -> Any:
+        return cv2.aruco.CharucoDetector(self._charuco)
+
+    def drawn(self, pixels: int = 100) -> UInt8[np.ndarray, "h w"]:
+        """The board to print, a square of so many pixels, with a white margin of one square."""
+        size = (self.columns * pixels, self.rows * pixels)
+        if self.kind == "charuco":
+            board = self._charuco.generateImage(size)
+        else:
+            dark = np.add.outer(np.arange(self.rows), np.arange(self.columns)) % 2 == 0
+            board = np.kron(np.where(dark, 0, 255), np.ones((pixels, pixels))).astype(np.uint8)
+        return np.pad(board, pixels, constant_values=255)
+
+    def find(self, image: UInt8[np.ndarray, "h w"]) -> View | None:
+        """The board in a picture; None where too little of it is seen."""
+        find = self._find_charuco if self.kind == "charuco" else self._find_checkerboard
+        pixels, points = find(image)
+        if len(pixels) < _LEAST_CORNERS or np.linalg.matrix_rank(points - points[0]) < 2:
+            return None
+        outline = self._outline(pixels, points)
+        if outline is None:
+            return None
+        return View(pixels, points, outline, sharpness(image, pixels))
+
+    def _find_checkerboard(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        found, pixels = cv2.findChessboardCornersSB(
+            image,
+            (self.columns - 1, self.rows - 1),
+            flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY,
+        )
+        if not found:
+            return _NOTHING
+        return self._refined(image, pixels), self.corners
+
+    def _refined(self, image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        """At the saddle of the grey levels: three times as exact as where they were detected."""
+        grid = pixels.reshape(self.rows - 1, self.columns - 1, 2)
+        apart = min(np.linalg.norm(np.diff(grid, axis=a), axis=2).min() for a in (0, 1))
+        reach = int(np.clip(_REACH * apart, 2, 10))
+        end = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
+        return cv2.cornerSubPix(image, pixels, (reach, reach), (-1, -1), end).reshape(-1, 2)
+
+    def _find_charuco(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        pixels, numbers, *_ = self._detector.detectBoard(image)
+        return _NOTHING if numbers is None else (
+            pixels.reshape(-1, 2), self.corners[np.ravel(numbers)]
+        )  # fmt: skip
+
+    def _outline(self, pixels: np.ndarray, points: np.ndarray) -> np.ndarray | None:
+        """Of the whole board, by the homography of the corners seen."""
+        H, _ = cv2.findHomography(points[:, :2], pixels)
+        if H is None:
+            return None
+        ends = np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * (self.columns, self.rows)
+        there = np.column_stack([self.square * ends, np.ones(4)]) @ H.T
+        return there[:, :2] / there[:, 2:]
+
+
+_NOTHING = np.zeros((0, 2), np.float32), np.zeros((0, 3), np.float32)
+
+
+def sharpness(image: UInt8[np.ndarray, "h w"], pixels: Float32[np.ndarray, "k 2"]) -> float:
+    """The median over corners of the steepest slope beside one, over the contrast there."""
+    across, down = cv2.spatialGradient(image)
+    slope = np.hypot(across, down, dtype=np.float32) / 8  # Sobel's kernel counts a step 8 times
+    window = np.ones((_AROUND, _AROUND), np.uint8)
+    contrast = cv2.dilate(image, window).astype(np.float32) - cv2.erode(image, window)
+    x, y = np.clip(np.rint(pixels).astype(int), 0, np.array(image.shape[::-1]) - 1).T
+    steepest = cv2.dilate(slope, window)[y, x]
+    return float(np.median(steepest / np.maximum(contrast[y, x], 1.0)))

@@ -1,0 +1,150 @@
+"""The calibration file: what is read back, and what is refused with which words."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jaxslam.video.calibration import (
+    Calibration,
+    from_field_of_view,
+    read_calibration,
+    write_calibration,
+)
+
+GOOD = {
+    "model": "pinhole",
+    "width": 640,
+    "height": 480,
+    "fx": 525.0,
+    "fy": 524.0,
+    "cx": 308.5,
+    "cy": 236.5,
+    "distortion": [0.1, -0.2],
+}
+
+
+def write(path, **changes):
+    fields = {**GOOD, **changes}
+    path.write_text(json.dumps({key: value for key, value in fields.items() if value is not None}))
+    return path
+
+
+def test_written_calibration_is_read_back(tmp_path):
+    calibration = Calibration(640, 480, 525.06, 524.2, 308.6, 236.5, (0.1, -0.2, 1e-4, 2e-4, 0.3))
+    write_calibration(tmp_path / "calibration.json", calibration)
+    assert read_calibration(tmp_path / "calibration.json") == calibration
+    assert [file.name for file in tmp_path.iterdir()] == ["calibration.json"]
+
+
+def test_standard_deviations_are_written_and_read_back(tmp_path):
+    path = tmp_path / "calibration.json"
+    calibration = Calibration(640, 480, 525.0, 524.0, 308.5, 236.5, sigma=(1.5, 1.6, 0.7, 0.8))
+    write_calibration(path, calibration, sigma={"distortion": [0.1] * 5}, views=12)
+    assert read_calibration(path) == calibration
+    written = json.loads(path.read_text())
+    assert written["sigma"] == {
+        "fx": 1.5, "fy": 1.6, "cx": 0.7, "cy": 0.8, "distortion": [0.1] * 5
+    }  # fmt: skip
+    assert written["views"] == 12
+
+
+def test_what_nobody_stated_is_not_written(tmp_path):
+    write_calibration(tmp_path / "c.json", Calibration(640, 480, 525.0, 524.0, 308.5, 236.5))
+    assert json.loads((tmp_path / "c.json").read_text()).keys() == {
+        "model", "width", "height", "fx", "fy", "cx", "cy", "distortion"
+    }  # fmt: skip
+
+
+def test_a_guess_stays_a_guess_in_a_file(tmp_path):
+    write_calibration(tmp_path / "c.json", from_field_of_view(640, 480))
+    assert read_calibration(tmp_path / "c.json") == from_field_of_view(640, 480)
+
+
+@pytest.mark.parametrize("width", [640, 1000])
+def test_a_field_of_view_reaches_from_edge_to_edge(width):
+    calibration = from_field_of_view(width, 480, 80.0)
+    assert calibration.guessed
+    across = np.degrees(np.arctan(width / 2 / calibration.fx)) * 2
+    assert across == pytest.approx(80.0, rel=1e-12)
+    assert calibration.fx == calibration.fy
+    assert (calibration.cx, calibration.cy) == ((width - 1) / 2, 239.5)
+    assert calibration.sigma[:2] == (0.05 * calibration.fx,) * 2
+
+
+def test_a_guess_is_of_the_longer_side_and_less_sure():
+    wide, tall = from_field_of_view(640, 480), from_field_of_view(480, 640)
+    assert wide.fx == tall.fx == pytest.approx(320 / np.tan(np.radians(65 / 2)), rel=1e-12)
+    assert wide.sigma[0] == pytest.approx(0.15 * wide.fx, rel=1e-12)
+    assert wide.sigma[2] == pytest.approx(0.02 * 640, rel=1e-12)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 180.0, -60.0, float("nan")])
+def test_a_field_of_view_that_no_pinhole_has_is_refused(degrees):
+    with pytest.raises(ValueError, match="more than 0 and less than 180"):
+        from_field_of_view(640, 480, degrees)
+
+
+def test_resized_keeps_directions_and_the_share_of_every_error():
+    old = Calibration(640, 480, 525.0, 524.0, 308.5, 236.5, (0.1,), sigma=(1.0, 2.0, 3.0, 4.0))
+    new = old.resized(320, 120)
+    # The picture's corner (-1/2, -1/2) stays its corner.
+    ray = np.linalg.solve(old.matrix, [-0.5, -0.5, 1.0])
+    np.testing.assert_allclose((new.matrix @ ray)[:2], [-0.5, -0.5], rtol=0, atol=1e-12)
+    ray = np.linalg.solve(old.matrix, [639.5, 479.5, 1.0])
+    np.testing.assert_allclose((new.matrix @ ray)[:2], [319.5, 119.5], rtol=0, atol=1e-12)
+    assert new.sigma == (0.5, 0.5, 1.5, 1.0)
+    assert new.distortion == old.distortion
+
+
+def test_matrix_projects_as_a_pinhole(tmp_path):
+    calibration = read_calibration(write(tmp_path / "c.json"))
+    u, v, w = calibration.matrix @ np.array([0.4, -0.2, 2.0])
+    assert (u / w, v / w) == pytest.approx((525.0 * 0.2 + 308.5, 524.0 * -0.1 + 236.5))
+
+
+@pytest.mark.parametrize("given", [[], [0.1], [0.1, -0.2, 0.01, 0.02]])
+def test_short_distortion_is_padded(tmp_path, given):
+    calibration = read_calibration(write(tmp_path / "c.json", distortion=given))
+    assert calibration.distortion == tuple(given) + (0.0,) * (5 - len(given))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"fx": None, "cy": None}, "fx, cy missing"),
+        ({"model": "fisheye"}, "'fisheye' is unknown"),
+        ({"fx": -525.0}, "fx is -525.0; a positive"),
+        ({"fy": float("nan")}, "fy is nan; a finite"),
+        ({"cx": float("inf")}, "cx is inf; a finite"),
+        ({"width": 0}, "width is 0; a positive"),
+        ({"width": 640.5}, "width is 640.5; a whole"),
+        ({"fx": "525"}, "fx is '525'; a number"),
+        ({"height": True}, "height is True; a number"),
+        ({"distortion": [0.0] * 6}, "has 6 entries"),
+        ({"distortion": 0.1}, "distortion is not a list"),
+        ({"distortion": [0.1, "x"]}, r"distortion\[1\] is 'x'"),
+        ({"sigma": {"fx": 1.0}}, "one with fx, fy, cx, cy is accepted"),
+        ({"sigma": [1.0, 1.0, 1.0, 1.0]}, "one with fx, fy, cx, cy is accepted"),
+        ({"sigma": {"fx": -1.0, "fy": 1.0, "cx": 1.0, "cy": 1.0}}, "sigma of fx is -1.0"),
+        ({"sigma": {"fx": "1", "fy": 1.0, "cx": 1.0, "cy": 1.0}}, "sigma of fx is '1'"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_bad_fields_are_refused_naming_file_and_field(tmp_path, changes, words):
+    path = write(tmp_path / "bad.json", **changes)
+    with pytest.raises(ValueError, match=words) as caught:
+        read_calibration(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"), [("{", "not a JSON file"), ("[1]", "holds a list"), (None, "cannot read")]
+)
+def test_other_files_are_refused(tmp_path, text, words):
+    path = tmp_path / "c.json"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ValueError, match=words):
+        read_calibration(path)

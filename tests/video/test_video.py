@@ -1,0 +1,186 @@
+"""Video files with times of their own, and live cameras."""
+
+import itertools
+import struct
+import time
+
+import cv2
+import numpy as np
+import pytest
+from pictures import HEIGHT, WIDTH, brightness, picture
+
+from jaxslam.video import camera, file
+from jaxslam.video.calibration import Calibration, write_calibration
+from jaxslam.video.opening import open_source
+
+RATE = 25.0
+
+
+@pytest.fixture
+def calibration(tmp_path):
+    path = tmp_path / "camera.json"
+    write_calibration(path, Calibration(WIDTH, HEIGHT, 60.0, 60.0, 31.5, 23.5))
+    return path
+
+
+@pytest.fixture
+def filmed(tmp_path):
+    """Six pictures at a constant rate."""
+    path = tmp_path / "video.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), RATE, (WIDTH, HEIGHT))
+    for index in range(6):
+        writer.write(cv2.cvtColor(picture(3 * index), cv2.COLOR_GRAY2BGR))
+    writer.release()
+    return path
+
+
+def with_durations(data, ticks):
+    """An MP4 file whose pictures last so many ticks each: its table `stts` written anew."""
+    containers = (b"moov", b"trak", b"mdia", b"minf", b"stbl")
+
+    def rebuilt(data):
+        boxes, place = b"", 0
+        while place < len(data):
+            size, kind = struct.unpack(">I4s", data[place : place + 8])
+            body = data[place + 8 : place + size]
+            if kind in containers:
+                body = rebuilt(body)
+            if kind == b"stts":
+                rows = b"".join(struct.pack(">II", 1, t) for t in ticks)
+                body = struct.pack(">II", 0, len(ticks)) + rows
+            if kind == b"edts":  # what ends the video after the old duration
+                kind = b"free"
+            boxes += struct.pack(">I4s", len(body) + 8, kind) + body
+            place += size
+        return boxes
+
+    return rebuilt(data)
+
+
+def ticks_of(data):
+    """The constant duration of a picture in the file."""
+    place = data.index(b"stts")
+    return struct.unpack(">II", data[place + 12 : place + 20])[1]
+
+
+def test_a_video_of_varying_rate_has_its_own_times(filmed, calibration):
+    data = filmed.read_bytes()
+    durations = np.array([1, 2, 1, 3, 1, 1])
+    filmed.write_bytes(with_durations(data, (durations * ticks_of(data)).tolist()))
+    source = open_source(filmed, calibration=calibration)
+    # To the file's tick.
+    np.testing.assert_allclose(source.times, [0, 0.04, 0.12, 0.16, 0.28, 0.32], atol=1e-4)
+    assert len(source) == 6
+    np.testing.assert_allclose(brightness(source), [5, 35, 65, 95, 125, 155], atol=4)
+
+
+class Told:
+    """A capture that delivers these times and pictures."""
+
+    def __init__(self, times, images, *, rate=RATE, stated=None):
+        self.times, self.images = iter(times), iter(images)
+        self.stated = len(times) if stated is None else stated
+        self.rate, self.now, self.released = rate, 0.0, False
+
+    def grab(self):
+        now = next(self.times, None)
+        self.now = self.now if now is None else now
+        return now is not None
+
+    def get(self, which):
+        return {
+            cv2.CAP_PROP_POS_MSEC: 1e3 * self.now,
+            cv2.CAP_PROP_FPS: self.rate,
+            cv2.CAP_PROP_FRAME_COUNT: self.stated,
+        }[which]
+
+    def read(self):
+        image = next(self.images, None)
+        return image is not None, image
+
+    def release(self):
+        self.released = True
+
+
+def test_times_that_do_not_increase_are_those_of_the_frame_rate(monkeypatch, tmp_path):
+    monkeypatch.setattr(cv2, "VideoCapture", lambda path: Told([0.0, 0.1, 0.1, 0.3], []))
+    with pytest.warns(UserWarning, match=r"picture 2 is at 0\.100 s, after one at 0\.100 s; taken"):
+        times = file.read_times(tmp_path / "v.mp4")
+    np.testing.assert_allclose(times, np.arange(4) / RATE, rtol=0, atol=1e-12)
+    monkeypatch.setattr(cv2, "VideoCapture", lambda path: Told([0.0, 0.0], [], rate=0.0))
+    with pytest.raises(ValueError, match="no frame rate is stated"):
+        file.read_times(tmp_path / "v.mp4")
+
+
+def test_a_video_that_ends_early_says_so(monkeypatch, tmp_path):
+    monkeypatch.setattr(cv2, "VideoCapture", lambda path: Told([0.0, 0.1], [], stated=9))
+    with pytest.warns(UserWarning, match="it has 9 pictures, of which 2 can be read"):
+        assert len(file.read_times(tmp_path / "v.mp4")) == 2
+
+
+def test_a_picture_that_is_gone_when_it_is_reached_is_named(filmed, calibration):
+    source = open_source(filmed, calibration=calibration)
+    filmed.write_bytes(b"")
+    with pytest.raises(ValueError, match=r"video\.mp4: image 0 cannot be read: the pictures end"):
+        list(source)
+
+
+def test_a_file_that_is_no_video_is_refused(tmp_path, calibration):
+    (tmp_path / "text.mp4").write_text("no video")
+    with pytest.raises(ValueError, match="cannot be read as a video"):
+        open_source(tmp_path / "text.mp4", calibration=calibration)
+
+
+class Filming(Told):
+    """A camera that delivers a picture every 2 ms."""
+
+    def __init__(self, count=None):
+        pictures = (np.dstack([picture(i % 20)] * 3) for i in itertools.count())
+        super().__init__([], itertools.islice(pictures, count))
+
+    def read(self):
+        time.sleep(0.002)
+        return super().read()
+
+
+def test_a_live_camera_gives_the_newest_picture_with_the_time_it_came(monkeypatch, calibration):
+    opened = []
+    monkeypatch.setattr(
+        cv2, "VideoCapture", lambda n: opened.append((n, Filming())) or opened[-1][1]
+    )
+    source = open_source("0", calibration=calibration, frames=4)
+    frames = []
+    for frame in source:
+        frames.append(frame)
+        time.sleep(0.02)  # a reader slower than the camera
+    assert source.name == "camera 0"
+    assert {number for number, _ in opened} == {0}
+    assert all(capture.released for _, capture in opened)
+    assert [frame.index for frame in frames] == [0, 1, 2, 3]
+    assert frames[0].image.shape == (HEIGHT, WIDTH)
+    times = np.array([frame.time for frame in frames])
+    assert times[0] > 0
+    assert np.all(np.diff(times) >= 0.01)
+    # What came meanwhile is skipped, not queued.
+    numbers = np.array([frame.image[0, 0] // 10 for frame in frames], int)
+    assert np.all(np.diff(numbers) % 20 > 1)
+
+
+def test_a_reader_faster_than_the_camera_waits_for_the_next_picture(monkeypatch, calibration):
+    monkeypatch.setattr(cv2, "VideoCapture", lambda number: Filming())
+    frames = list(open_source("0", calibration=calibration, frames=5))
+    assert np.all(np.diff([int(frame.image[0, 0]) for frame in frames]) != 0)
+    assert np.all(np.diff([frame.time for frame in frames]) > 0)
+
+
+def test_a_camera_without_a_picture_is_refused(monkeypatch, calibration):
+    monkeypatch.setattr(cv2, "VideoCapture", lambda n: Filming(0))
+    monkeypatch.setattr(camera, "PATIENCE", 0.2)
+    with pytest.raises(ValueError, match="camera 7 delivers no picture"):
+        open_source("7", calibration=calibration)
+
+
+def test_a_live_camera_has_no_frame_to_start_at(monkeypatch, calibration):
+    monkeypatch.setattr(cv2, "VideoCapture", lambda n: Filming())
+    with pytest.raises(ValueError, match="a live camera starts when it is opened"):
+        open_source("0", calibration=calibration, start=1.0)

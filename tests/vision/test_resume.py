@@ -1,0 +1,176 @@
+"""Pictures one by one, and a tracker that goes on from a file as if nothing had been."""
+
+import numpy as np
+import pytest
+
+import jaxslam
+from jaxslam.video.calibration import from_field_of_view
+from jaxslam.video.pictures import as_grey
+from jaxslam.video.source import Frame
+from jaxslam.vision.landmarks import Landmark, stacked, unstacked
+from jaxslam.vision.patches import Patch
+from jaxslam.vision.settings import TrackerSettings
+from jaxslam.vision.synthetic import synthetic_source
+from jaxslam.vision.tracker import Tracker
+
+FRAMES, HALF = 10, 5
+SETTINGS = TrackerSettings(wanted=12, spare=4)
+
+
+@pytest.fixture(scope="module")
+def video():
+    source = synthetic_source(frames=FRAMES, width=320, height=240)
+    return source.calibration, list(source)
+
+
+def same(one, other):
+    for name, value in vars(one).items():
+        if isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
+    np.testing.assert_array_equal(one.T_wc, other.T_wc)
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+    names = ("index", "time", "state", "status", "nis", "nis_dof", "map", "sigma_log_scale")
+    for name in names:
+        assert getattr(one, name) == getattr(other, name), name
+
+
+def test_step_is_track_with_the_frames_counted(video):
+    calibration, frames = video
+    one, other = Tracker(calibration, SETTINGS), jaxslam.Tracker(calibration, SETTINGS)
+    for frame in frames[:3]:
+        same(one.track(frame), other.step(frame.image, frame.time))
+    assert one.steps == other.steps == 3
+
+
+def test_a_loaded_tracker_goes_on_digit_by_digit(video, tmp_path):
+    calibration, frames = video
+    settings = TrackerSettings(filter="scale_gauge+mixture3", wanted=12, spare=4, patience=2)
+    tracker = Tracker(calibration, settings)
+    for frame in frames[:HALF]:
+        image = frame.image.copy()
+        image[:, :160] *= frame.index == 0  # its landmarks are not found again, and are removed
+        tracker.step(image, frame.time)
+    assert tracker.deleted > 0
+    tracker.save(tmp_path / "tracker.npz")
+    assert [path.name for path in tmp_path.iterdir()] == ["tracker.npz"]
+    loaded = Tracker.load(tmp_path / "tracker.npz")
+    assert loaded.settings == tracker.settings
+    assert loaded.calibration == calibration
+    for frame in frames[HALF:]:
+        same(tracker.step(frame.image, frame.time), loaded.step(frame.image, frame.time))
+    for one, other in zip(tracker.points(), loaded.points(), strict=True):
+        np.testing.assert_array_equal(one, other)
+    for count in ("created", "deleted", "restarts", "steps", "failed"):
+        assert getattr(tracker, count) == getattr(loaded, count), count
+
+
+def test_landmarks_are_the_same_after_their_arrays():
+    draw = np.random.default_rng(0)
+    picture = draw.integers(0, 256, (60, 60), dtype=np.uint8)
+    landmarks = {
+        slot: Landmark(7 + slot, Patch.take(picture, np.array([30.2, 29.7])), np.eye(4), 5, 4, slot)
+        for slot in (2, 0)
+    }
+    again = unstacked(stacked(landmarks))
+    assert list(again) == [2, 0]
+    for slot, landmark in landmarks.items():
+        for name in ("number", "searches", "matches", "unseen"):
+            assert getattr(again[slot], name) == getattr(landmark, name)
+        np.testing.assert_array_equal(again[slot].patch.stored, landmark.patch.stored)
+        np.testing.assert_array_equal(again[slot].patch.pixel, landmark.patch.pixel)
+    assert unstacked(stacked({})) == {}
+
+
+def test_a_calibration_that_is_estimated_is_saved_with_it(video, tmp_path):
+    _, frames = video
+    tracker = Tracker(from_field_of_view(320, 240), SETTINGS)
+    for frame in frames[:HALF]:
+        tracker.track(frame)
+    tracker.save(tmp_path / "t.npz")
+    found, expected = Tracker.load(tmp_path / "t.npz").camera(), tracker.camera()
+    assert found is not None
+    assert expected is not None
+    assert found[0] == "estimated"
+    np.testing.assert_array_equal(found[1], expected[1])
+    np.testing.assert_array_equal(found[2], expected[2])
+
+
+def test_a_filter_of_ones_own_is_given_again(video, tmp_path):
+    calibration, frames = video
+    own = TrackerSettings(filter="robocentric").make_filter(calibration)
+    assert isinstance(own, jaxslam.EkfSlam)
+    tracker = Tracker(calibration, SETTINGS, own)
+    tracker.track(frames[0])
+    tracker.save(tmp_path / "t.npz")
+    with pytest.raises(ValueError, match=r"t\.npz: was saved with a filter EkfSlam; give that"):
+        Tracker.load(tmp_path / "t.npz")
+    loaded = Tracker.load(tmp_path / "t.npz", own)
+    same(tracker.track(frames[1]), loaded.track(frames[1]))
+    longer = TrackerSettings(filter="robocentric", landmarks="inverse_depth")
+    other = longer.make_filter(calibration)
+    assert isinstance(other, jaxslam.EkfSlam)
+    with pytest.raises(ValueError, match="the state in the file is of another filter"):
+        Tracker.load(tmp_path / "t.npz", other)
+
+
+def test_there_is_nothing_to_save_before_the_first_frame(video, tmp_path):
+    with pytest.raises(ValueError, match="was given no frame yet"):
+        Tracker(video[0], SETTINGS).save(tmp_path / "t.npz")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["missing", "text", "other archive"])
+def test_a_file_that_is_no_trackers_is_refused(tmp_path, kind):
+    path = tmp_path / "t.npz"
+    if kind == "text":
+        path.write_text("nothing")
+    if kind == "other archive":
+        np.savez(path, header=np.array("{}"), a=np.zeros(3))
+    with pytest.raises(ValueError, match=r"t\.npz: (cannot be read|is no tracker's file)"):
+        Tracker.load(path)
+
+
+@pytest.mark.parametrize(
+    ("image", "time", "message"),
+    [
+        (np.zeros((240, 321), np.uint8), 1.0, "frame 1 is 321x240, the calibration is for 320x240"),
+        (np.zeros((240, 320, 4), np.uint8), 1.0, r"not of shape \(240, 320, 4\)"),
+        (np.zeros(240, np.uint8), 1.0, r"not of shape \(240,\)"),
+        (np.zeros((0, 0), np.uint8), 1.0, r"not of shape \(0, 0\)"),
+        (np.zeros((240, 320), np.uint16), 1.0, "not uint16"),
+        (np.full((240, 320), 255.0), 1.0, "not floats from 255 to 255"),
+        (np.full((240, 320), np.nan), 1.0, "not floats from nan to nan"),
+        (np.zeros((240, 320), np.uint8), 0.0, "its time, 0.0 s, is not later than the one before"),
+        (np.zeros((240, 320), np.uint8), np.nan, "its time, nan s, is not later"),
+        (np.zeros((240, 320), np.uint8), np.inf, "its time, inf s, is not later"),
+    ],
+)
+def test_a_picture_that_cannot_be_is_refused_and_changes_nothing(video, image, time, message):
+    calibration, frames = video
+    touched, untouched = Tracker(calibration, SETTINGS), Tracker(calibration, SETTINGS)
+    for tracker in (touched, untouched):
+        tracker.track(frames[0])
+    with pytest.raises(ValueError, match=message):
+        touched.step(image, time)
+    same(touched.track(frames[1]), untouched.track(frames[1]))
+
+
+def test_the_first_time_is_finite_too(video):
+    calibration, frames = video
+    with pytest.raises(ValueError, match="its time, nan s"):
+        Tracker(calibration, SETTINGS).track(Frame(0, float("nan"), frames[0].image))
+
+
+def test_a_picture_becomes_grey_bytes():
+    draw = np.random.default_rng(0)
+    grey = draw.integers(0, 256, (6, 8), dtype=np.uint8)
+    assert as_grey(grey) is grey
+    np.testing.assert_array_equal(as_grey(grey[..., None]), grey)
+    np.testing.assert_array_equal(as_grey(np.dstack([grey] * 3)), grey)
+    np.testing.assert_array_equal(as_grey(grey / 255), grey)
+    np.testing.assert_array_equal(as_grey((grey / 255).astype(np.float32)), grey)
+    np.testing.assert_array_equal(as_grey(grey[:, ::-1]), grey[:, ::-1])
+    # OpenCV's order: the last colour is red, of which grey has 0.299.
+    red = np.zeros((6, 8, 3), np.uint8)
+    red[..., 2] = 200
+    np.testing.assert_allclose(as_grey(red), 0.299 * 200, rtol=0, atol=0.6)

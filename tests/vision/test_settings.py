@@ -1,0 +1,67 @@
+"""What a tracker makes of the calibration that it is given."""
+
+import numpy as np
+import pytest
+
+from jaxslam.models.calibration import Estimated, Known, White
+from jaxslam.video.calibration import Calibration, from_field_of_view
+from jaxslam.vision.settings import TrackerSettings
+from jaxslam.vision.synthetic import synthetic_source
+from jaxslam.vision.tracker import Tracker
+
+STATED = Calibration(640, 480, 500.0, 500.0, 320.0, 240.0, sigma=(4.0, 3.0, 2.0, 1.0))
+PLAIN = Calibration(640, 480, 500.0, 500.0, 320.0, 240.0)
+GUESSED = from_field_of_view(640, 480)
+
+
+@pytest.mark.parametrize(
+    ("name", "calibration", "kind", "sigma"),
+    [
+        (None, PLAIN, Known, ()),
+        (None, STATED, Known, ()),
+        (None, GUESSED, Estimated, (GUESSED.sigma[0], 12.8, 12.8)),
+        ("known", GUESSED, Known, ()),
+        ("estimated", STATED, Estimated, (4.0, 3.0, 2.0, 1.0)),
+        ("white", PLAIN, White, (0.7, 0.7, 0.6, 0.6)),
+        ("white", GUESSED, White, (GUESSED.sigma[0], 12.8, 12.8)),
+    ],
+)
+def test_a_guess_is_estimated_and_stated_sigmas_are_used(name, calibration, kind, sigma):
+    settings = TrackerSettings(calibration=name, focal_sigma=0.7, centre_sigma=0.6)
+    treatment = settings.treatment(calibration)
+    assert type(treatment) is kind
+    np.testing.assert_allclose(treatment.sigma, sigma, rtol=1e-12)
+
+
+def test_an_unknown_treatment_is_refused():
+    with pytest.raises(ValueError, match="unknown calibration 'maybe'; known: white, consider"):
+        TrackerSettings(calibration="maybe")
+
+
+def test_a_guessed_focal_length_is_estimated_while_the_camera_moves():
+    source = synthetic_source(frames=30, width=320, height=240)
+    true = source.calibration.fx
+    guess = from_field_of_view(320, 240, 70.0)
+    tracker = Tracker(guess, TrackerSettings(wanted=20, spare=4))
+    for frame in source:
+        tracked = tracker.track(frame)
+    assert tracked.state == "tracked"
+    camera = tracker.camera()
+    assert camera is not None
+    treatment, (fx, fy, cx, cy), covariance = camera
+    assert treatment == "estimated"
+    assert fx == fy
+    # Measured: of 34 pixels 10 are left in a second, from a guess with a σ of 11.
+    assert abs(fx - true) < 0.5 * abs(guess.fx - true)
+    assert np.sqrt(covariance[0, 0]) < 0.5 * guess.sigma[0]
+    assert abs(cx - 159.5) < 6.4
+    assert abs(cy - 119.5) < 6.4
+
+
+def test_a_known_camera_is_reported_as_it_is():
+    tracker = Tracker(PLAIN, TrackerSettings(wanted=10))
+    camera = tracker.camera()
+    assert camera is not None
+    assert camera[0] == "known"
+    np.testing.assert_array_equal(camera[1], [500.0, 500.0, 320.0, 240.0])
+    np.testing.assert_array_equal(camera[2], 0.0)
