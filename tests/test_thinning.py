@@ -14,7 +14,7 @@ from jaxslam.names import scale_gauge, scenario_pieces
 from jaxslam.simulation import scenario
 from jaxslam.window.minimise import started
 from jaxslam.window.problem import Layout, path
-from jaxslam.window.record import Record
+from jaxslam.window.record import whole
 from jaxslam.window.thinning import kept, thinned
 
 FRAMES = 7
@@ -31,16 +31,7 @@ def full(frames=FRAMES):
     k = jnp.arange(frames)[:, None]
     seen = jnp.concatenate([k >= 0, k >= 1, k == 3, k < 0], axis=1)
     measured = jnp.where(seen[..., None], 100.0 * k[..., None] + jnp.arange(2.0), 0.0)
-    return Record(
-        jnp.asarray(frames - 1),
-        jnp.full(frames - 1, 0.1),
-        jnp.ones(frames - 1),
-        jnp.zeros(frames - 1, bool),
-        jnp.zeros((), bool),
-        measured,
-        seen,
-        jnp.array([0, 1, 3, 0]),
-    )
+    return whole(jnp.full(frames - 1, 0.1), measured, seen, jnp.array([0, 1, 3, 0]))
 
 
 def unknowns(slam, record, count=2):

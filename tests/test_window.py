@@ -26,7 +26,7 @@ from jaxslam.window.handover import gauge_state
 from jaxslam.window.minimise import minimised, started
 from jaxslam.window.modes import each_alive, when
 from jaxslam.window.problem import Layout, path, reduced, residuals, sensitivities
-from jaxslam.window.record import Record, begun, empty, removed, stepped
+from jaxslam.window.record import Record, begun, empty, removed, stepped, whole
 from jaxslam.window.scale import rescaled, scaling, shift_of_scale, variances
 
 FRAMES, FIRST = 5, jnp.array([0, 0, 0, 1, 0, 2])
@@ -68,16 +68,9 @@ def case(name="standstill", treatment=Known, common=None, last=FRAMES - 1):
     y = jnp.asarray(0.5 * draw.standard_normal((m, p + 1)))
     seen = (jnp.arange(FRAMES)[:, None] >= FIRST) & (jnp.arange(FRAMES)[:, None] <= last)
     first = jnp.asarray(draw.uniform(150, 450, (m, p)))
-    record = Record(
-        jnp.asarray(last),
-        jnp.full(FRAMES - 1, 1 / 5),
-        jnp.ones(FRAMES - 1),
-        jnp.zeros(FRAMES - 1, bool),
-        jnp.zeros((), bool),
-        jnp.tile(first, (FRAMES, 1, 1)),
-        seen.at[2, 1].set(False),
-        FIRST,
-    )
+    seen = seen.at[2, 1].set(False)
+    record = whole(jnp.full(FRAMES - 1, 1 / 5), jnp.tile(first, (FRAMES, 1, 1)), seen, FIRST)
+    record = replace(record, last=jnp.asarray(last))
     wrong = quick_jit(residuals)(slam, record, quick_jit(path)(slam, record, x), y)
     noise = jnp.where(record.compared[..., None], draw.standard_normal(wrong.shape), 0.0)
     measured = record.measured - slam.sensor.sigma * (wrong - noise)

@@ -31,7 +31,7 @@ from jaxslam.simulation import Run, Scenario, depth_of, motion_of, sensor_of
 from jaxslam.slam.filter import EkfSlam
 from jaxslam.window import problem as window
 from jaxslam.window.problem import Layout, Path
-from jaxslam.window.record import Record
+from jaxslam.window.record import Record, whole
 
 
 class Problem(eqx.Module):
@@ -115,14 +115,7 @@ def make_problem(scenario: Scenario, run: Run, *, truncated: bool = True) -> Pro
     """
     check_scenario(scenario)
     slam = EkfSlam(motion=motion_of(scenario), sensor=sensor_of(scenario), depth=depth_of(scenario))
-    frames, landmarks = run.visible.shape
-    record = Record(
-        last=jnp.asarray(frames - 1),
-        controls=run.controls,
-        measured=run.measured,
-        seen=run.visible,
-        first=jnp.zeros(landmarks, int),
-    )
+    record = whole(run.controls, run.measured, run.visible, jnp.zeros(run.visible.shape[1], int))
     least = jnp.asarray(scenario.least_inverse_depth if truncated else -jnp.inf)
     return Problem(cast(slam, run.measured.dtype), record, least)
 

@@ -301,7 +301,8 @@ _POSITIVE = (
 )  # fmt: skip
 _NOT_NEGATIVE = (
     "velocity_sigma", "focal_sigma", "centre_sigma", "odometry_sigma", "range",
-    "scale_sigma", "still_frames", "first_frame", "first_landmarks", "new_landmarks", "known_landmarks",
+    "scale_sigma", "still_frames", "first_frame", "first_landmarks", "new_landmarks",
+    "known_landmarks",
 )  # fmt: skip
 
 

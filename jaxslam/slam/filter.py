@@ -359,8 +359,9 @@ def _empty(slam: EkfSlam, capacity: int, dtype: Any) -> Any:
     slam = cast(slam, dtype)
     variables, log_scale, covariance = slam.scale.start(slam.motion)
     depth = slam.depth
-    unknown = log_scale is not None and depth.unit is not None
-    log_scale = jnp.append(log_scale, 0.0) if unknown else log_scale
+    unit = None if log_scale is None else depth.unit
+    if log_scale is not None and unit is not None:
+        log_scale = jnp.append(log_scale, 0.0)
     core = Core(
         pose=held(identity(geometry, dtype)),
         motion=variables,
@@ -377,9 +378,9 @@ def _empty(slam: EkfSlam, capacity: int, dtype: Any) -> Any:
     state = replace(state, memory=slam.entry.memory(capacity, dtype))
     state = slam.form.know(state, 0, tangent_dim(core.pose))
     state = slam.form.augment(state, core.part("motion").start, covariance)
-    if unknown:
-        unit = jnp.reshape(depth.unit**2, (1, 1))
-        state = slam.form.augment(state, core.part("log_scale").start + 1, unit)
+    if unit is not None:
+        variance = jnp.reshape(unit**2, (1, 1))
+        state = slam.form.augment(state, core.part("log_scale").start + 1, variance)
     if depth.common is not None:
         common = jnp.reshape(depth.common**2, (1, 1))
         state = slam.form.augment(state, core.part("depth_error").start, common)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.forms.blocks import shifted
 from jaxslam.forms.state import State
-from jaxslam.geometry import identity, jacobian, scaled
+from jaxslam.geometry import Scalar, identity, jacobian, scaled
 from jaxslam.linalg import Cholesky, cholesky
 from jaxslam.models.scale import ScaleGauge
 from jaxslam.slam.filter import EkfSlam

@@ -97,6 +97,19 @@ def empty(motion: AbstractMotion, frames: int, landmarks: int, p: int, dtype: An
     )
 
 
+def whole(
+    controls: Any,
+    measured: Float[Array, "F m p"],
+    seen: Bool[Array, "F m"],
+    first: Int[Array, " m"],
+) -> Record:
+    """A full record of frames that all moved."""
+    steps = len(seen) - 1
+    ones, no = jnp.ones(steps, measured.dtype), jnp.zeros(steps, bool)
+    moved = jnp.zeros((), bool)
+    return Record(jnp.asarray(steps), controls, ones, no, moved, measured, seen, first)
+
+
 def stepped(record: Record, control: Any, seen: Features, noise: Float[Array, "p p"]) -> Record:
     """With one frame more and what it measured of known landmarks, of such a covariance. A full
     record stays as it is."""

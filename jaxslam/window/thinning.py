@@ -87,7 +87,7 @@ def _noises(slam: EkfSlam, record: Record, fewer: Record, x: Float[Array, " N"])
     return x.at[layout.whole :].set(jnp.concatenate([own, drawn], axis=1).ravel())
 
 
-def _sums(steps: Float[Array, steps * n], frames: int) -> Float[Array, steps * n]:
+def _sums(steps: Float[Array, "steps ..."], frames: int) -> Float[Array, "steps ..."]:
     """Over the steps between frames that stay; zero behind."""
     segment = np.searchsorted(kept(frames), np.arange(frames - 1), side="right") - 1
     return jax.ops.segment_sum(steps, segment, num_segments=frames - 1)

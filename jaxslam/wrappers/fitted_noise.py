@@ -152,9 +152,9 @@ class FittedNoise(AbstractStaged):
 
     def _factors(self, state: NoiseState) -> Float[Array, " t"]:
         """Of σ: the roots of the mean variances."""
-        both = jnp.sqrt(jnp.exp(state.log_weights) @ jnp.asarray(FACTORS**2))
-        linear = jnp.arange(self._groups[1].stop) < self._groups[0].stop
-        return jnp.where(linear, *both)
+        linear, angular = jnp.sqrt(jnp.exp(state.log_weights) @ jnp.asarray(FACTORS**2))
+        (_, n), (_, t) = ((part.start, part.stop) for part in self._groups)
+        return jnp.where(jnp.arange(t) < n, linear, angular)
 
     def _begun_anew(self, state: NoiseState) -> NoiseState:
         """With the velocity that was told at first, if the camera has not moved."""
