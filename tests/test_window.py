@@ -405,9 +405,9 @@ def test_of_common_errors_scaling_is_the_shortest():
     assert abs(s.x[start]) > 1e-3
 
 
-def test_the_mean_is_shifted_by_the_volume_of_the_rest():
-    """`½ d log det A/dλ`, against differences of it."""
-    of = "standstill-6dof", White, None, 3
+@each([CASES[3], CASES[4]])
+def test_the_mean_is_shifted_by_the_volume_of_the_rest(of):
+    """`½ d log det A/dλ`, against differences of it; the prior balances that at the shift."""
     slam, record, *_ = case(*of)
     at = minimum(*of)
     local, s = quick_jit(reduced)(slam, record, at.x, at.y), quick_jit(scaling)(slam, record, at)
@@ -416,16 +416,36 @@ def test_the_mean_is_shifted_by_the_volume_of_the_rest():
         _, A, _ = dense(slam, record, *rescaled(slam, record, at, jnp.asarray(log_scale)))
         return np.linalg.slogdet(A)[1] / 2
 
-    slope = (half_log_det(1e-4) - half_log_det(-1e-4)) / 2e-4
+    expected = (half_log_det(-1e-4) - half_log_det(1e-4)) / 2e-4
     factor = cholesky(local.information)
-    shift = shift_of_scale(slam, at, local, s, factor)
-    assert abs(slope) > 1e-2
-    assert abs(shift) < scale.MOST_SHIFT
-    np.testing.assert_allclose(shift * s.squared, -slope, rtol=1e-5)
+    slope = scale._slope_of_volume(slam, local, s, factor, jnp.zeros(at.x.size, bool))
+    assert abs(expected) > 1e-2
+    np.testing.assert_allclose(slope, expected, rtol=1e-4)
     by_x, by_y = variances(local, factor.whitening)
     _, A, _ = dense(slam, record, at.x, at.y)
     inverse = np.diagonal(np.linalg.inv(A))
     np.testing.assert_allclose(np.append(by_x, by_y.ravel()), inverse, rtol=1e-7)
+    shift = quick_jit(shift_of_scale)(slam, record, at, local, factor)
+    assert 1e-3 < abs(shift) < scale.MOST_SHIFT
+
+    def prior(log_scale):
+        return sum(np.sum(u**2) for u in rescaled(slam, record, at, log_scale)) / 2
+
+    np.testing.assert_allclose((prior(shift + 1e-4) - prior(shift - 1e-4)) / 2e-4, slope, rtol=1e-4)
+
+
+def test_accelerations_whose_size_is_not_told_follow_the_scale():
+    """They draw as little to one as to another, and λ is the less certain."""
+    slam, record, x, y = case("standstill-6dof", White, None, 3)
+    at = started(x, y)
+    fitted = replace(slam, motion=replace(slam.motion, noise_told=False))
+    s = quick_jit(scaling)(slam, record, at)
+    layout = Layout.of(slam)
+    steps = at.x[layout.whole :].reshape(record.frames - 1, -1)[:, :3]
+    np.testing.assert_allclose(scale.told(slam, at, s), s.squared, rtol=1e-12)
+    rest = s.squared - jnp.sum(steps**2)
+    np.testing.assert_allclose(scale.told(fitted, at, s), rest, rtol=1e-9)
+    assert rest < s.squared - 1
 
 
 # What the filter goes on from

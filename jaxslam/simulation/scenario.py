@@ -82,7 +82,7 @@ class Scenario(eqx.Module):
     """d_min, m: the filter's prior on 1/z is N(1/(2 d_min), (1/(4 d_min))²)."""
     inverse_depth: Numbers = ()
     """Mean and σ of the filter's prior on 1/z, 1/m, where they are not those of d_min."""
-    scale_sigma: float = 0.0
+    scale_sigma: float = _structural(0.0)
     """σ of the log of the metre in which the filter is told all this; 0 where it is a metre. Only a
     filter with a unit of its own (`scale_gauge`) can heed it."""
     least_inverse_depth: float = 0.001

@@ -11,7 +11,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.linalg import cholesky
 from jaxslam.slam.filter import EkfSlam
@@ -52,7 +52,7 @@ def minimised(
     slam: EkfSlam,
     record: Record,
     start: Minimum,
-    steps: int,
+    steps: int | Int[Array, ""],
 ) -> Minimum:
     """After at most so many steps."""
 

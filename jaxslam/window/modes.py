@@ -22,7 +22,7 @@ from jaxslam.slam.filter import EkfSlam
 from jaxslam.window.minimise import Minimum, minimised, started, turned
 from jaxslam.window.problem import Layout, reduced
 from jaxslam.window.record import Record
-from jaxslam.window.scale import enlarged, scaling, shift_of_scale
+from jaxslam.window.scale import enlarged, shift_of_scale
 
 Value = TypeVar("Value")
 
@@ -170,7 +170,7 @@ def _weighed(slam: EkfSlam, weighed: Weighed, record: Record) -> Weighed:
     factor = cholesky(local.information)
     own = jnp.sum(jax.vmap(lambda factor: factor.log_det())(local.landmarks))
     value = -(at.cost + factor.log_det() + own) / 2
-    shift = shift_of_scale(slam, at, local, scaling(slam, record, at), factor)
+    shift = shift_of_scale(slam, record, at, local, factor)
     return Weighed(at, jnp.where(jnp.isfinite(value), value, -jnp.inf), shift, local.information)
 
 

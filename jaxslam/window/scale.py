@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxslam.geometry import Scalar
 from jaxslam.linalg import Cholesky, cholesky
@@ -25,8 +25,10 @@ from jaxslam.window.minimise import Minimum
 from jaxslam.window.problem import Layout, Reduced, hidden
 from jaxslam.window.record import Record
 
-MOST_SHIFT = 0.5
+MOST_SHIFT = 2.0
 """Of λ, from the maximum to the mean."""
+SHIFTS = 8
+"""Steps of Newton's method from the one to the other."""
 
 
 class Direction(NamedTuple):
@@ -43,9 +45,28 @@ class Direction(NamedTuple):
 def rescaled(
     slam: EkfSlam, record: Record, at: Minimum, log_scale: Float[Array, ""]
 ) -> tuple[Float[Array, " N"], Float[Array, "m q"]]:
-    """The unknowns with all lengths e^λ times as large: the same pixels."""
-    factor = jnp.exp(log_scale)
-    return enlarged(slam, at.x, factor), _nearer(slam, record, at, factor)
+    """The likeliest unknowns with all lengths e^λ times as large: the same pixels."""
+    factor, p = jnp.exp(log_scale), slam.sensor.size
+    layout = Layout.of(slam)
+    place = slice(layout.start, layout.start + layout.common)
+    there = hidden(slam, at.x[place], at.y[:, p:]) / factor
+    begun = jnp.any(record.seen, axis=0)[:, None]
+    common, own = _shared(slam, begun, there)
+    x = enlarged(slam, at.x, factor).at[place].set(common)
+    return x, at.y.at[:, p:].set(jnp.where(begun, own, at.y[:, p:]))
+
+
+def _shared(
+    slam: EkfSlam, begun: Bool[Array, "m 1"], inverse_depths: Float[Array, "m o"]
+) -> tuple[Float[Array, " c"], Float[Array, "m o"]]:
+    """The likeliest common and own errors of inverse depths."""
+    depth = slam.depth
+    own = (inverse_depths - depth.mean) / (depth.sigma * depth.own)
+    if depth.common is None:
+        return jnp.zeros(0, own.dtype), own
+    ratio = jnp.where(begun, depth.common / depth.own, 0.0)
+    common = jnp.sum(ratio * own) / (1 + jnp.sum(ratio**2))
+    return common[None], own - ratio * common
 
 
 def enlarged(slam: EkfSlam, x: Float[Array, " N"], factor: Scalar) -> Float[Array, " N"]:
@@ -62,27 +83,11 @@ def enlarged(slam: EkfSlam, x: Float[Array, " N"], factor: Scalar) -> Float[Arra
     return x.at[layout.whole :].set(steps.at[:, :own].set(noises).ravel())
 
 
-def _nearer(slam: EkfSlam, record: Record, at: Minimum, factor: Scalar) -> Float[Array, "m q"]:
-    """Inverse depths divided by a factor, in their own part; the common error stays."""
-    depth, layout, p = slam.depth, Layout.of(slam), slam.sensor.size
-    common = at.x[layout.start : layout.start + layout.common]
-    gained = (1 / factor - 1) * hidden(slam, common, at.y[:, p:])
-    begun = jnp.any(record.seen, axis=0)[:, None]
-    return at.y.at[:, p:].add(jnp.where(begun, gained / (depth.sigma * depth.own), 0.0))
-
-
 def scaling(slam: EkfSlam, record: Record, at: Minimum) -> Direction:
-    """s, the shortest of those that differ by what common and own errors of depth share."""
+    """s: of those that differ by what common and own errors of depth share, the shortest."""
     zero = jnp.zeros((), at.x.dtype)
     _, (x, y) = jax.jvp(lambda by: rescaled(slam, record, at, by), (zero,), (zero + 1,))
-    layout, depth = Layout.of(slam), slam.depth
-    if depth.common is None:
-        return Direction(x, y)
-    begun, p = jnp.any(record.seen, axis=0), slam.sensor.size
-    ratio = jnp.where(begun[:, None], depth.common / depth.own, 0.0)
-    shared = jnp.sum(ratio * y[:, p:]) / (1 + jnp.sum(ratio**2))
-    y = y.at[:, p:].add(-ratio * shared)
-    return Direction(x.at[layout.start].add(shared), y)
+    return Direction(x, y)
 
 
 def told(slam: EkfSlam, at: Minimum, s: Direction) -> Float[Array, ""]:
@@ -112,15 +117,33 @@ def variances(
 
 
 def shift_of_scale(
-    slam: EkfSlam, at: Minimum, local: Reduced, s: Direction, factor: Cholesky
+    slam: EkfSlam, record: Record, at: Minimum, local: Reduced, factor: Cholesky
 ) -> Float[Array, ""]:
-    """λ of the mean, of a density that has its maximum at 0.
+    """λ of the mean, of a density that has its maximum at 0: where the prior and the volume of the
+    rest balance, all lengths enlarged alike. Accelerations whose size is not told follow."""
+    s = scaling(slam, record, at)
+    untold = _untold(slam, at.x, s) != 0
+    slope = _slope_of_volume(slam, local, s, factor, untold)
 
-    What is not told of the accelerations follows the scale: it draws as the maximum did.
-    """
+    def cost(log_scale):
+        x, y = rescaled(slam, record, at, log_scale)
+        return (jnp.sum(jnp.where(untold, at.x, x) ** 2) + jnp.sum(y**2)) / 2 - slope * log_scale
+
+    def once(_, log_scale):
+        one = jnp.ones_like(log_scale)
+        gradient, curvature = jax.jvp(jax.grad(cost), (log_scale,), (one,))
+        step = gradient / jnp.maximum(curvature, 1.0)
+        return jnp.clip(log_scale - jnp.clip(step, -0.5, 0.5), -MOST_SHIFT, MOST_SHIFT)
+
+    return jax.lax.fori_loop(0, SHIFTS, once, jnp.zeros_like(slope))
+
+
+def _slope_of_volume(slam, local: Reduced, s: Direction, factor: Cholesky, untold) -> Scalar:
+    """`−½ d log det A/dλ`."""
     of_x, of_y = variances(local, factor.whitening)
-    p, untold = slam.sensor.size, _untold(slam, at.x, s)
-    drawn = jnp.where(untold != 0, untold**2, 1 - of_x)
-    slope = jnp.sum(jnp.where(s.x != 0, drawn, 0.0))
-    slope = slope - jnp.sum(jnp.where(s.y[:, p:] != 0, 1 - of_y[:, p:], 0.0))
-    return jnp.clip(slope / told(slam, at, s), -MOST_SHIFT, MOST_SHIFT)
+    layout, p = Layout.of(slam), slam.sensor.size
+    place = jnp.arange(of_x.size) - layout.start
+    of_depth = (place >= 0) & (place < layout.common)
+    sign = jnp.where((s.x == 0) | untold, 0.0, jnp.where(of_depth, -1.0, 1.0))
+    depths = jnp.where(s.y[:, p:] != 0, 1 - of_y[:, p:], 0.0)
+    return jnp.sum(sign * (1 - of_x)) - jnp.sum(depths)

@@ -124,6 +124,7 @@ class FromRest(AbstractStaged):
         return when(state.open & state.record.full, self._thinned, state)
 
     def moving(self, state: RestState) -> Bool[Array, ""]:
+        """Whether the newest frame says anything of how the camera moves: it has not stood."""
         return ~state.record.standing
 
     def remove(self, state: RestState, gone: Bool[AnyArray, " capacity"]) -> RestState:
