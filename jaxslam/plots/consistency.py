@@ -11,12 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from jaxslam.consistency import Study, summarise
-from jaxslam.consistency.statistics import chi2_quantile
 from jaxslam.consistency.verdict import headline
+from jaxslam.plots.landmarks import region_from_above
 from jaxslam.plots.style import GREY, line_style, new_figure, save
 
-_FARTHEST = 1 / 60
-"""Least inverse distance that the map draws, 1/m."""
 _MEDIAN_OF_NORMAL = 0.6745
 """Median of |x| for a standard normal x."""
 
@@ -179,7 +177,7 @@ def _plot_map(axes: Axes, samples: dict[str, Any]) -> None:
         path = records["sample_path"][:, :-1, -1]
         axes.plot(path[:, 0], path[:, -1], lw=1.5, label=name, **style)
         for slot in records["sample_active"].nonzero()[0]:
-            region = _region(
+            region = region_from_above(
                 records["sample_landmarks"][slot], records["sample_landmarks_covariance"][slot]
             )
             axes.plot(*(path[-1, [0, -1], None] + region), lw=0.8, alpha=0.8, **style)
@@ -200,13 +198,3 @@ def _set_view(axes: Axes, path: np.ndarray, points: np.ndarray) -> None:
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)
     axes.set_aspect("equal", adjustable="box")
-
-
-def _region(mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """The 95 % ellipse of azimuth and inverse distance, bent into the plane; (2, points)."""
-    values, vectors = np.linalg.eigh(covariance)
-    angle = np.linspace(0, 2 * np.pi, 181)
-    circle = np.sqrt(chi2_quantile(0.95, 2)) * np.stack([np.cos(angle), np.sin(angle)])
-    azimuth, inverse = mean[:, None] + vectors @ (np.sqrt(np.maximum(values, 0))[:, None] * circle)
-    distance = 1 / np.maximum(inverse, _FARTHEST)
-    return distance * np.stack([np.sin(azimuth), np.cos(azimuth)])
