@@ -25,14 +25,16 @@ def plot_consistency(
     """Draw a study; `summary` is `summarise(study)`, made here if it is not given.
 
     Above: the mean NEES of every filter with its exact 95 % band, and the map of run 0 at its
-    end. Where the scale is free, below that: NEES given the scale, and the scale's own error.
+    end, in the same colours. Where the scale is free, below that: NEES given the scale, and the scale's own error.
     Below: the error of run 0 with ±3σ, axis by axis. Written to `path` where one is given.
     """
     summary = summarise(study) if summary is None else summary
     geometry = study.scenario.world
     rows, free = geometry.tangent_dim // 3, summary["scale_free"]
     heights = [2.1, *[1.3] * free, *[1] * rows]
-    figure = new_figure(12.5, 0.8 + 2.1 * sum(heights))
+    figure = new_figure(12.5, 1.0 + 0.2 * len(study.filters) + 2.1 * sum(heights))
+    # Over the whole width, as the verdicts are longer than the axes that they are on.
+    figure.suptitle(_title(summary), x=0.01, ha="left", fontsize=10)
     grid = figure.add_gridspec(len(heights), 6, height_ratios=heights)
     _plot_nees(figure.add_subplot(grid[0, :4]), summary)
     samples = {name: study.store.load(name, study.chunks[0]) for name in study.filters}
@@ -73,7 +75,6 @@ def _plot_nees(axes: Axes, summary: dict[str, Any]) -> None:
     _name_decades(axes)
     _over_time(axes, time)
     axes.set_ylabel(f"pose NEES (ideal {first['dof']})")
-    axes.set_title(_title(summary), fontsize=10, loc="left")
     axes.legend(fontsize=8, loc="upper left")
 
 
@@ -172,10 +173,10 @@ def _plot_map(axes: Axes, samples: dict[str, Any]) -> None:
     points = first["sample_points"]
     axes.plot(truth[:, 0], truth[:, -1], color="black", lw=1.2, label="truth")
     axes.plot(points[:, 0], points[:, -1], "k+", ms=6, mew=1, label="landmarks")
-    for i, (name, records) in enumerate(samples.items()):
+    for i, records in enumerate(samples.values()):
         style = line_style(i)
         path = records["sample_path"][:, :-1, -1]
-        axes.plot(path[:, 0], path[:, -1], lw=1.5, label=name, **style)
+        axes.plot(path[:, 0], path[:, -1], lw=1.5, **style)
         for slot in records["sample_active"].nonzero()[0]:
             region = region_from_above(
                 records["sample_landmarks"][slot], records["sample_landmarks_covariance"][slot]
@@ -185,7 +186,9 @@ def _plot_map(axes: Axes, samples: dict[str, Any]) -> None:
     axes.set_xlabel("x, m")
     axes.set_ylabel("z, m")
     axes.set_title("run 0 from above, landmarks with 95 % regions", fontsize=9)
-    axes.legend(fontsize=7, loc="best")
+    # Below the axes: inside it would hide landmarks and ticks of a narrow map.
+    below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.13), "frameon": False}
+    axes.legend(fontsize=8, ncols=2, **below)
     axes.grid(alpha=0.25)
 
 
