@@ -38,6 +38,7 @@ from jaxslam.simulation.scenario import Scenario
 from jaxslam.slam.filter import EkfSlam
 from jaxslam.slam.protocol import AbstractFilter
 from jaxslam.wrappers.bank import Bank
+from jaxslam.wrappers.fitted_noise import MEMORY, FittedNoise
 from jaxslam.wrappers.fixed_lag import LAG, FixedLag, iterated
 from jaxslam.wrappers.from_rest import from_rest
 from jaxslam.wrappers.mixture import Mixture
@@ -139,6 +140,7 @@ _AROUND_ANY_FILTER: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
     "directions": lambda slam, count: Bank(slam, 5 if count is None else count, "direction"),
     "mixture": lambda slam, count: Mixture(slam, 9 if count is None else count),
     "rest": from_rest,
+    "noise": lambda slam, frames: FittedNoise(slam, MEMORY if frames is None else frames),
 }
 MODIFIERS: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
     **_OF_ONE_FILTER,
@@ -148,8 +150,8 @@ MODIFIERS: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
 greatest depth of a delayed initialisation, m (`particles`, `rays`); the correlation of depths in
 percent (`common`); σ of the scene's depth in percent of one landmark's (`scene`); frames (`lag`);
 steps of Gauss–Newton instead of convergence (`iterated`); members of a Gaussian sum (`scales`,
-`directions`, `mixture`); frames, at the most, after which such a sum goes on alone (`rest`); none
-for the remedies `oc`, `fej`."""
+`directions`, `mixture`); frames of the longest window of a start (`rest`); frames of which the
+noise is remembered (`noise`); none for the remedies `oc`, `fej`."""
 
 RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gauge+scene50+mixture9"}
 """The filter called `recommended`, by geometry: of those of docs/consistency.md the one to take

@@ -21,12 +21,13 @@ from jaxslam.names import scale_gauge, scenario_pieces
 from jaxslam.posterior import log_density, make_problem
 from jaxslam.posterior.laplace import minima
 from jaxslam.simulation import scenario
-from jaxslam.window import handover, minimise
-from jaxslam.window.handover import gauge_state, rescaled, scaling, shift_of_scale, variances
+from jaxslam.window import minimise, scale
+from jaxslam.window.handover import gauge_state
 from jaxslam.window.minimise import minimised, started
 from jaxslam.window.modes import each_alive, when
 from jaxslam.window.problem import Layout, path, reduced, residuals, sensitivities
 from jaxslam.window.record import Record, begun, empty, removed, stepped
+from jaxslam.window.scale import rescaled, scaling, shift_of_scale, variances
 
 FRAMES, FIRST = 5, jnp.array([0, 0, 0, 1, 0, 2])
 """Landmarks begin in three frames."""
@@ -70,6 +71,7 @@ def case(name="standstill", treatment=Known, common=None, last=FRAMES - 1):
     record = Record(
         jnp.asarray(last),
         jnp.full(FRAMES - 1, 1 / 5),
+        jnp.ones(FRAMES - 1),
         jnp.tile(first, (FRAMES, 1, 1)),
         seen.at[2, 1].set(False),
         FIRST,
@@ -359,7 +361,7 @@ def test_the_mean_is_shifted_by_the_volume_of_the_rest():
     factor = cholesky(local.information)
     shift = shift_of_scale(slam, local, s, factor)
     assert abs(slope) > 1e-2
-    assert abs(shift) < handover.MOST_SHIFT
+    assert abs(shift) < scale.MOST_SHIFT
     np.testing.assert_allclose(shift * s.squared, -slope, rtol=1e-5)
     by_x, by_y = variances(local, factor.whitening)
     _, A, _ = dense(slam, record, at.x, at.y)
@@ -373,7 +375,7 @@ def test_the_mean_is_shifted_by_the_volume_of_the_rest():
 @each(CASES[2:4])
 def test_the_filters_state_is_the_gaussian_of_the_mode(of, monkeypatch):
     """Marginals in metres are those of the dense inverse; λ has the variance 1/|s|²."""
-    monkeypatch.setattr(handover, "MOST_SHIFT", 0.0)
+    monkeypatch.setattr(scale, "MOST_SHIFT", 0.0)
     slam, record, *_ = case(*of)
     at = minimum(*of)
     m, p = FIRST.size, slam.sensor.size
@@ -381,7 +383,7 @@ def test_the_filters_state_is_the_gaussian_of_the_mode(of, monkeypatch):
     @quick_jit
     def handed(at):
         first = Features(jnp.arange(m), record.measured[0], jnp.zeros(m, bool))
-        state = gauge_state(slam, record, at, slam.init(m, first))
+        state = gauge_state(slam, record, at, jnp.zeros(()), slam.init(m, first))
         told = slam.marginal(state, lambda scene: scene.pose)
         points = slam.marginal(
             state, lambda scene: jnp.append(scene.point, scene.omega) / scene.point[-1],

@@ -1,14 +1,7 @@
 """What a filter goes on from: the Gaussian of one mode at the window's newest frame.
 
-**Scale.** No measurement changes with λ in `(t, v, a, ω) → (e^λ t, e^λ v, e^λ a, e^−λ ω)`: with s
-the derivative of all whitened unknowns u by λ, the information A = I + JᵀJ has A s = s. So
-`λ = sᵀ(u − û)/|s|²` has the variance 1/|s|² and is uncorrelated with everything that does not
-scale: that is the gauge in which the filter goes on.
-
-**The mean is not the maximum.** Along λ the density has the volume of all the rest, det A(λ)^−½,
-and `½ d log det A/dλ = Σ_ω (1 − var) − Σ_a (1 − var)`: every inverse depth that the pixels tell
-draws the mean to smaller scales, every acceleration to larger ones. The Gaussian stands where that
-balances.
+It stands at the mean of the scale (`jaxslam.window.scale`), in the gauge in which λ is uncorrelated
+with everything that does not scale.
 """
 
 from __future__ import annotations
@@ -22,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.forms.blocks import shifted
 from jaxslam.forms.state import State
-from jaxslam.geometry import Scalar, identity, jacobian, scaled
+from jaxslam.geometry import identity, jacobian, scaled
 from jaxslam.linalg import Cholesky, cholesky
 from jaxslam.models.scale import ScaleGauge
 from jaxslam.slam.filter import EkfSlam
@@ -30,95 +23,18 @@ from jaxslam.window.minimise import LANDMARK_STEPS, Minimum, landmarks
 from jaxslam.window.problem import (
     Layout,
     Reduced,
-    hidden,
     located,
     path,
     reduced,
 )
 from jaxslam.window.record import Record
-
-MOST_SHIFT = 0.5
-"""Of λ, from the maximum to the mean."""
+from jaxslam.window.scale import Direction, rescaled, scaling
 
 
-class Direction(NamedTuple):
-    """A derivative of the whitened unknowns."""
-
-    x: Float[Array, " N"]
-    y: Float[Array, "m q"]
-
-    @property
-    def squared(self) -> Float[Array, ""]:
-        return jnp.sum(self.x**2) + jnp.sum(self.y**2)
-
-
-def rescaled(
-    slam: EkfSlam, record: Record, at: Minimum, log_scale: Float[Array, ""]
-) -> tuple[Float[Array, " N"], Float[Array, "m q"]]:
-    """The unknowns with all lengths e^λ times as large: the same pixels."""
-    layout, motion = Layout.of(slam), slam.motion
-    factor = jnp.exp(log_scale)
-    mean, root = motion.start()
-    steps = at.x[layout.whole :].reshape(record.frames - 1, -1)
-    own = motion.noise_sigma.shape[-1]
-    variables = mean + root @ at.x[: layout.start]
-    larger, _ = motion.enlarged(variables, steps[0, :own], factor)
-    start = root.T @ cholesky(root @ root.T).solve(larger - mean)
-    noises = jax.vmap(lambda noise: motion.enlarged(variables, noise, factor)[1])(steps[:, :own])
-    x = at.x.at[: layout.start].set(start)
-    x = x.at[layout.whole :].set(steps.at[:, :own].set(noises).ravel())
-    return x, _nearer(slam, record, at, factor)
-
-
-def _nearer(slam: EkfSlam, record: Record, at: Minimum, factor: Scalar) -> Float[Array, "m q"]:
-    """Inverse depths divided by a factor, in their own part; the common error stays."""
-    depth, layout, p = slam.depth, Layout.of(slam), slam.sensor.size
-    common = at.x[layout.start : layout.start + layout.common]
-    gained = (1 / factor - 1) * hidden(slam, common, at.y[:, p:])
-    begun = jnp.any(record.seen, axis=0)[:, None]
-    return at.y.at[:, p:].add(jnp.where(begun, gained / (depth.sigma * depth.own), 0.0))
-
-
-def scaling(slam: EkfSlam, record: Record, at: Minimum) -> Direction:
-    """s, the shortest of those that differ by what common and own errors of depth share."""
-    zero = jnp.zeros((), at.x.dtype)
-    _, (x, y) = jax.jvp(lambda by: rescaled(slam, record, at, by), (zero,), (zero + 1,))
-    layout, depth = Layout.of(slam), slam.depth
-    if depth.common is None:
-        return Direction(x, y)
-    begun, p = jnp.any(record.seen, axis=0), slam.sensor.size
-    ratio = jnp.where(begun[:, None], depth.common / depth.own, 0.0)
-    shared = jnp.sum(ratio * y[:, p:]) / (1 + jnp.sum(ratio**2))
-    y = y.at[:, p:].add(-ratio * shared)
-    return Direction(x.at[layout.start].add(shared), y)
-
-
-def variances(
-    local: Reduced, whitening: Float[Array, "N N"]
-) -> tuple[Float[Array, " N"], Float[Array, "m q"]]:
-    """Diagonals of A⁻¹: of x, and of y."""
-    by_x = jnp.sum(whitening**2, axis=0)
-    spread = jnp.einsum("mqn,on->mqo", local.coupling, whitening)
-    own = jax.vmap(lambda factor: jnp.sum(factor.whitening**2, axis=0))(local.landmarks)
-    return by_x, own + jnp.sum(spread**2, axis=2)
-
-
-def shift_of_scale(
-    slam: EkfSlam, local: Reduced, s: Direction, factor: Cholesky
-) -> Float[Array, ""]:
-    """λ of the mean, of a density that has its maximum at 0."""
-    of_x, of_y = variances(local, factor.whitening)
-    told = jnp.where(s.x != 0, 1 - of_x, 0.0)
-    p = slam.sensor.size
-    slope = jnp.sum(told) - jnp.sum(jnp.where(s.y[:, p:] != 0, 1 - of_y[:, p:], 0.0))
-    return jnp.clip(slope / s.squared, -MOST_SHIFT, MOST_SHIFT)
-
-
-def gauge_state(slam: EkfSlam, record: Record, mode: Minimum, like: State) -> State:
-    """The filter's state of one mode, in a unit that is a metre at the mean."""
-    local = reduced(slam, record, mode.x, mode.y)
-    s = scaling(slam, record, mode)
-    shift = shift_of_scale(slam, local, s, cholesky(local.information))
+def gauge_state(
+    slam: EkfSlam, record: Record, mode: Minimum, shift: Float[Array, ""], like: State
+) -> State:
+    """The filter's state of one mode whose mean has such a λ, in a unit that is a metre there."""
     x, y = rescaled(slam, record, mode, shift)
     y, _ = landmarks(slam, record, path(slam, record, x), y, LANDMARK_STEPS)
     at = replace(mode, x=x, y=y)

@@ -22,6 +22,7 @@ from jaxslam.slam.filter import EkfSlam
 from jaxslam.window.minimise import Minimum, minimised, started, turned
 from jaxslam.window.problem import Layout, reduced
 from jaxslam.window.record import Record
+from jaxslam.window.scale import enlarged, scaling, shift_of_scale
 
 Value = TypeVar("Value")
 
@@ -39,6 +40,8 @@ class Modes(eqx.Module):
     minima: Minimum
     log_weights: Float[Array, " modes"]
     """Normalised; −∞ of places without a mode."""
+    shifts: Float[Array, " modes"]
+    """λ of every mode's mean, of which the maximum has 0."""
 
 
 def when(
@@ -80,7 +83,7 @@ def at_rest(slam: EkfSlam, record: Record, count: int, dtype: Any) -> Modes:
     q = slam.sensor.size + slam.sensor.hidden
     x, y = jnp.zeros((count, size), dtype), jnp.zeros((count, m, q), dtype)
     alone = jnp.where(jnp.arange(count) == 0, 0.0, -jnp.inf).astype(dtype)
-    return Modes(jax.vmap(started)(x, y), alone)
+    return Modes(jax.vmap(started)(x, y), alone, jnp.zeros(count, dtype))
 
 
 def directions(n: int, count: int) -> np.ndarray:
@@ -94,13 +97,23 @@ def directions(n: int, count: int) -> np.ndarray:
     return np.column_stack([ring * np.cos(angle), ring * np.sin(angle), height])
 
 
-def starts(slam: EkfSlam, record: Record, count: int, dtype: Any) -> Minimum:
-    """The prior's mean, and translations in all directions with the rotations that fit them."""
-    n = slam.motion.geometry.point_dim
-    rest = at_rest(slam, record, 1 + count, dtype).minima
-    away = np.concatenate([np.zeros((1, n)), SPEED * directions(n, count)])
-    x = rest.x.at[:, :n].set(jnp.asarray(away, dtype))
-    return jax.vmap(started)(jax.vmap(lambda x, y: turned(slam, record, x, y))(x, rest.y), rest.y)
+def starts(slam: EkfSlam, record: Record, likeliest: Minimum, count: int) -> Minimum:
+    """The prior's mean, the reversal of what is likeliest, and translations in all directions,
+    with the rotations that fit them."""
+    n, dtype = slam.motion.geometry.point_dim, likeliest.x.dtype
+    rest = at_rest(slam, record, 2 + count, dtype).minima
+    away = np.concatenate([np.zeros((2, n)), SPEED * directions(n, count)])
+    x, y = reversed_(slam, likeliest)
+    x, y = rest.x.at[:, :n].set(jnp.asarray(away, dtype)).at[1].set(x), rest.y.at[1].set(y)
+    return jax.vmap(started)(jax.vmap(lambda x, y: turned(slam, record, x, y))(x, y), y)
+
+
+def reversed_(slam: EkfSlam, at: Minimum) -> tuple[Float[Array, " N"], Float[Array, "m q"]]:
+    """The other way, among points that are as much too near as they were too far."""
+    layout, p = Layout.of(slam), slam.sensor.size
+    x = enlarged(slam, at.x, jnp.asarray(-1.0, at.x.dtype))
+    common = slice(layout.start, layout.start + layout.common)
+    return x.at[common].multiply(-1), at.y.at[:, p:].multiply(-1)
 
 
 def sought(
@@ -112,50 +125,63 @@ def sought(
     search: Bool[Array, ""] | None = None,
 ) -> tuple[Modes, Bool[Array, ""]]:
     """The modes with what has been measured since, each from where it is; and, of a search, what
-    is found beside them from rest and from so many directions.
+    is found beside them from rest, from the reversal of the likeliest and from so many directions.
 
     Where nothing explains what was measured, the modes stay as they are, and the second is False.
     """
     alive = jnp.isfinite(modes.log_weights)
     minima = jax.vmap(lambda m: started(m.x, m.y))(modes.minima)
-    minima = each_alive(lambda m, record: minimised(slam, record, m, steps), minima, alive, record)
+    most = jnp.full(len(alive), steps)
     if search is not None:
-        found = at_rest(slam, record, 1 + directions, modes.log_weights.dtype).minima
-
-        def from_everywhere(_, record):
-            begun = starts(slam, record, directions, modes.log_weights.dtype)
-            return jax.vmap(lambda m: minimised(slam, record, m, SEARCH_STEPS))(begun)
-
-        found = when(search, from_everywhere, found, record)
+        likeliest = jax.tree.map(lambda leaf: leaf[0], minima)
+        found = _starts_of(slam, record, likeliest, directions, search)
         minima = jax.tree.map(lambda *x: jnp.concatenate(x), minima, found)
-        alive = jnp.concatenate([alive, jnp.broadcast_to(search, 1 + directions)])
+        alive = jnp.append(alive, jnp.broadcast_to(search, 2 + directions))
+        most = jnp.append(most, jnp.full(2 + directions, SEARCH_STEPS))
+
+    def further(both, record):
+        return minimised(slam, record, *both), both[1]
+
+    minima, _ = each_alive(further, (minima, most), alive, record)
     after = _likeliest(slam, record, minima, alive, len(modes.log_weights))
     explained = jnp.isfinite(after.log_weights[0])
     return jax.tree.map(lambda new, old: jnp.where(explained, new, old), after, modes), explained
 
 
+def _starts_of(slam, record, likeliest: Minimum, directions: int, wanted: Bool[Array, ""]):
+    """`starts`, if they are wanted."""
+    none = at_rest(slam, record, 2 + directions, likeliest.x.dtype).minima
+    return when(wanted, lambda _, *at: starts(slam, *at, directions), none, record, likeliest)
+
+
 class Weighed(NamedTuple):
-    """A minimum, its log evidence `−½ |r|² − ½ log det A`, and the information of its path."""
+    """A minimum, its log evidence `−½ |r|² − ½ log det A`, what λ its mean has, and the
+    information of its path."""
 
     minimum: Minimum
     evidence: Float[Array, ""]
+    shift: Float[Array, ""]
     information: Float[Array, "N N"]
 
 
 def _weighed(slam: EkfSlam, weighed: Weighed, record: Record) -> Weighed:
     at = weighed.minimum
     local = reduced(slam, record, at.x, at.y)
+    factor = cholesky(local.information)
     own = jnp.sum(jax.vmap(lambda factor: factor.log_det())(local.landmarks))
-    value = -(at.cost + cholesky(local.information).log_det() + own) / 2
-    return Weighed(at, jnp.where(jnp.isfinite(value), value, -jnp.inf), local.information)
+    value = -(at.cost + factor.log_det() + own) / 2
+    shift = shift_of_scale(slam, local, scaling(slam, record, at), factor)
+    return Weighed(at, jnp.where(jnp.isfinite(value), value, -jnp.inf), shift, local.information)
 
 
 def _likeliest(slam, record, minima: Minimum, alive: Bool[Array, " k"], count: int) -> Modes:
     """The likeliest of the minima that are distinct, weighed."""
     k, size = minima.x.shape
     none = jnp.full(k, -jnp.inf, minima.x.dtype)
-    begun = Weighed(minima, none, jnp.zeros((k, size, size), minima.x.dtype))
-    _, value, information = each_alive(
+    begun = Weighed(
+        minima, none, jnp.zeros(k, none.dtype), jnp.zeros((k, size, size), minima.x.dtype)
+    )
+    _, value, shift, information = each_alive(
         lambda weighed, record: _weighed(slam, weighed, record), begun, alive, record
     )
     best_first = jnp.argsort(-value)
@@ -170,4 +196,5 @@ def _likeliest(slam, record, minima: Minimum, alive: Bool[Array, " k"], count: i
     return Modes(
         jax.tree.map(lambda leaf: leaf[best_first][kept], minima),
         jax.nn.log_softmax(value[kept]),
+        shift[best_first][kept],
     )

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.geometry import Pose, homogeneous_apply, identity, jacobian, nudge, retract
+from jaxslam.geometry import Pose, Scalar, homogeneous_apply, identity, jacobian, nudge, retract
 from jaxslam.linalg import Cholesky, cholesky
 from jaxslam.slam.filter import EkfSlam
 from jaxslam.window.record import Record
@@ -82,14 +82,14 @@ def path(slam: EkfSlam, record: Record, x: Float[Array, " N"]) -> Path:
     drawn = jnp.asarray(slam.calibration.sigma)
 
     def move(state, data):
-        k, control, numbers = data
-        there = _moved(slam, state, control, numbers)
+        k, control, merged, numbers = data
+        there = _moved(slam, state, control, merged, numbers)
         there = jax.tree.map(lambda new, old: jnp.where(k < record.last, new, old), there, state)
         return there, there
 
     origin = identity(motion.geometry, x.dtype)
     begun = origin, retract(mean, root @ start), drawn * (first if layout.each else once)
-    data = jnp.arange(record.frames - 1), record.controls, steps
+    data = jnp.arange(record.frames - 1), record.controls, record.merged, steps
     _, later = jax.lax.scan(move, begun, data)
     poses, variables, deltas = jax.tree.map(
         lambda one, more: jnp.concatenate([one[None], more]), begun, later
@@ -97,11 +97,15 @@ def path(slam: EkfSlam, record: Record, x: Float[Array, " N"]) -> Path:
     return Path(Frame(poses, deltas), variables, common)
 
 
-def _moved(slam: EkfSlam, state, control, numbers):
-    """Pose, motion's variables and calibration one step on."""
+def _moved(slam: EkfSlam, state, control, merged: Scalar, numbers):
+    """Pose, motion's variables and calibration one step on, which is made of so many.
+
+    The mean of m white accelerations has σ/√m, the sum of m drifts √m σ.
+    """
     (pose, variables, delta), layout = state, Layout.of(slam)
     own = slam.motion.noise_sigma.shape[-1]
     noise, drift = jnp.split(slam.model.noise_sigma * numbers[: layout.step], [own])
+    noise, drift = noise / jnp.sqrt(merged), drift * jnp.sqrt(merged)
     sigma = jnp.asarray(slam.calibration.sigma)
     return (
         pose @ slam.motion.displacement(variables, noise, control),
@@ -305,10 +309,14 @@ def _slopes(
     before = jax.tree.map(lambda leaf: leaf[:-1], states)
     numbers = x[Layout.of(slam).whole :].reshape(record.frames - 1, -1)
 
-    def local(state, control, numbers):
-        return jacobian(lambda both: _moved(slam, both[0], control, both[1]), (state, numbers))
+    def local(state, control, merged, numbers):
+        def moved(both):
+            state, numbers = both
+            return _moved(slam, state, control, merged, numbers)
 
-    slopes = jax.vmap(local)(before, record.controls, numbers)
+        return jacobian(moved, (state, numbers))
+
+    slopes = jax.vmap(local)(before, record.controls, record.merged, numbers)
     happened = (jnp.arange(record.frames - 1) < record.last)[:, None, None]
     return jnp.where(happened, slopes, jnp.eye(*slopes.shape[1:], dtype=x.dtype))
 

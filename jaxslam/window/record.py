@@ -21,6 +21,8 @@ class Record(eqx.Module):
     last: Int[Array, ""]
     controls: Any
     """Of F − 1 steps."""
+    merged: Float[Array, " steps"]
+    """Of how many steps of the process each is made; 1 until the window was thinned."""
     measured: Float[Array, "F m p"]
     """By slot of the landmark."""
     seen: Bool[Array, "F m"]
@@ -31,6 +33,12 @@ class Record(eqx.Module):
     def frames(self) -> int:
         """F."""
         return self.seen.shape[0]
+
+    @property
+    def steps(self) -> Float[Array, ""]:
+        """Of the process, since frame 0."""
+        happened = jnp.arange(self.merged.size) < self.last
+        return jnp.sum(jnp.where(happened, self.merged, 0.0))
 
     @property
     def full(self) -> Bool[Array, ""]:
@@ -52,6 +60,7 @@ class Record(eqx.Module):
         return Record(
             jnp.minimum(self.last, frames - 1),
             jax.tree.map(lambda x: x[: frames - 1], self.controls),
+            self.merged[: frames - 1],
             self.measured[:frames],
             self.seen[:frames],
             self.first,
@@ -64,6 +73,7 @@ def empty(motion: AbstractMotion, frames: int, landmarks: int, p: int, dtype: An
     return Record(
         jnp.zeros((), int),
         jax.tree.map(lambda x: jnp.tile(x, (frames - 1, *(1,) * x.ndim)), still),
+        jnp.ones(frames - 1, dtype),
         jnp.zeros((frames, landmarks, p), dtype),
         jnp.zeros((frames, landmarks), bool),
         jnp.zeros(landmarks, int),

@@ -27,6 +27,7 @@ from jaxslam.window.handover import gauge_state
 from jaxslam.window.modes import Modes, at_rest, each_alive, sought, when
 from jaxslam.window.problem import Layout
 from jaxslam.window.record import Record
+from jaxslam.window.thinning import thinned
 from jaxslam.wrappers.bank import BankState
 from jaxslam.wrappers.mixture import Mixture
 
@@ -38,8 +39,8 @@ SEARCHES = (1, 2, 3, 4, 6, 8, 11, 15, 20, 26, 34)
 """Frames after which minima are sought anew."""
 REFINEMENTS = 4
 """Steps of Levenberg–Marquardt with every new frame, at the most."""
-LEAST_FRAMES = 8
-"""In the window before the sum may go on alone."""
+LEAST_STEPS = 8
+"""Since frame 0 before the sum may go on alone."""
 KNOWN = 0.03
 """σ of the translation, in translations, given the scale: below it parallax is there."""
 
@@ -117,7 +118,8 @@ class FromRest(AbstractStaged):
             searches = [k for k in SEARCHES if least <= k < frames]
             state = self._anew(state, frames, wanted, searches)
             least = frames
-        return replace(state, open=state.open & ~self._ready(state))
+        state = replace(state, open=state.open & ~self._ready(state))
+        return when(state.open & state.record.full, self._thinned, state)
 
     def remove(self, state: RestState, gone: Bool[AnyArray, " capacity"]) -> RestState:
         modes = state.modes
@@ -159,8 +161,12 @@ class FromRest(AbstractStaged):
 
         return when(wanted, solved, state, record)
 
+    def _thinned(self, state: RestState) -> RestState:
+        record, minima = thinned(self.base.base, state.record, state.modes.minima)
+        return replace(state, record=record, modes=replace(state.modes, minima=minima))
+
     def _ready(self, state: RestState) -> Bool[Array, ""]:
-        """Whether one mode is left whose translation is known, or there is no room."""
+        """Whether one mode is left whose translation is known."""
         member = self.base.likeliest(state.sum)
         part = member.core.part("pose")
         n = self.base.base.motion.geometry.point_dim
@@ -168,19 +174,20 @@ class FromRest(AbstractStaged):
         variance = jnp.trace(member.covariance[position, position])
         squared = jnp.sum(member.core.pose.translation() ** 2)
         known = variance < self.known**2 * squared
-        enough = state.record.last >= LEAST_FRAMES
+        enough = state.record.steps >= LEAST_STEPS
         alone = state.sum.log_weights[0] > -1e-3
-        return state.record.full | (enough & alone & known)
+        return enough & alone & known
 
 
 def _members(ekf: EkfSlam, record: Record, modes: Modes, members: State) -> State:
     """The Gaussians of the modes."""
 
-    def begun(both, record):
-        return both[0], gauge_state(ekf, record, *both)
+    def begun(data, record):
+        mode, shift, member = data
+        return mode, shift, gauge_state(ekf, record, mode, shift, member)
 
     alive = jnp.isfinite(modes.log_weights)
-    return each_alive(begun, (modes.minima, members), alive, record)[1]
+    return each_alive(begun, (modes.minima, modes.shifts, members), alive, record)[2]
 
 
 def _check_base(ekf: EkfSlam) -> None:

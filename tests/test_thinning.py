@@ -1,0 +1,115 @@
+"""Tests of jaxslam.window.thinning: a full window goes on with every other frame."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import quick_jit
+
+from jaxslam.landmarks import INVERSE_SCALING
+from jaxslam.models.calibration import Known, White
+from jaxslam.names import scale_gauge, scenario_pieces
+from jaxslam.simulation import scenario
+from jaxslam.window.minimise import started
+from jaxslam.window.problem import Layout, path
+from jaxslam.window.record import Record
+from jaxslam.window.thinning import kept, thinned
+
+FRAMES = 7
+
+
+def filter_of(treatment=Known):
+    made = scenario_pieces(scenario("standstill-6dof"), "known")
+    calibration = treatment() if treatment is Known else treatment(np.array([3.0] * 2 + [2.0] * 2))
+    return scale_gauge(**{**made, "calibration": calibration}, landmark=INVERSE_SCALING)
+
+
+def full(frames=FRAMES):
+    """Landmark 0 is always seen, 1 from frame 1 on, 2 in frame 3 alone, 3 never."""
+    k = jnp.arange(frames)[:, None]
+    seen = jnp.concatenate([k >= 0, k >= 1, k == 3, k < 0], axis=1)
+    measured = jnp.where(seen[..., None], 100.0 * k[..., None] + jnp.arange(2.0), 0.0)
+    return Record(
+        jnp.asarray(frames - 1),
+        jnp.full(frames - 1, 0.1),
+        jnp.ones(frames - 1),
+        measured,
+        seen,
+        jnp.array([0, 1, 3, 0]),
+    )
+
+
+def unknowns(slam, record, count=2):
+    draw = np.random.default_rng(3)
+    size, m = Layout.of(slam).size(record.frames), record.first.size
+    x, y = draw.standard_normal((count, size)), draw.standard_normal((count, m, 3))
+    return jax.vmap(started)(jnp.asarray(x), jnp.asarray(y))
+
+
+@pytest.mark.parametrize(
+    ("frames", "stay"), [(3, [0, 2]), (4, [0, 1, 3]), (7, [0, 2, 4, 6]), (8, [0, 1, 3, 5, 7])]
+)
+def test_the_first_and_the_newest_frame_stay(frames, stay):
+    assert kept(frames).tolist() == stay
+
+
+@pytest.mark.parametrize("treatment", [Known, White])
+@pytest.mark.parametrize("frames", [FRAMES, FRAMES + 1])
+def test_velocities_and_calibrations_of_the_frames_that_stay_are_the_same(frames, treatment):
+    """Twice over, so that steps of different lengths are merged too."""
+    slam, record = filter_of(treatment), full(frames)
+    minima = unknowns(slam, record)
+    fewer, starts = thinned(slam, record, minima)
+    before, after = (
+        quick_jit(path)(slam, of, of_minima.x[1])
+        for of, of_minima in ((record, minima), (fewer, starts))
+    )
+    stay = kept(frames)
+    np.testing.assert_allclose(after.motion[: len(stay)], before.motion[stay], atol=1e-12)
+    np.testing.assert_allclose(
+        after.frames.calibration[: len(stay)], before.frames.calibration[stay], atol=1e-12
+    )
+    np.testing.assert_allclose(fewer.controls.sum(), record.controls.sum(), rtol=1e-12)
+    assert fewer.merged[: len(stay) - 1].tolist() == np.diff(stay).tolist()
+    assert (fewer.merged[len(stay) - 1 :] == 1).all()
+    again, last = thinned(slam, replace(fewer, last=jnp.asarray(frames - 1)), starts)
+    there = quick_jit(path)(slam, again, last.x[1]).motion
+    count = len(stay)
+    ends = [k for k in stay if k < count]
+    np.testing.assert_allclose(there[: len(ends)], after.motion[np.array(ends)], atol=1e-12)
+
+
+def test_the_variance_that_merged_steps_add_to_the_velocity_is_that_of_both():
+    slam, record = filter_of(), replace(full(), controls=jnp.full(FRAMES - 1, 0.1))
+    fewer, _ = thinned(slam, record, unknowns(slam, record))
+
+    def added(of):
+        def velocity(x):
+            return quick_jit(path)(slam, of, x).motion[of.last]
+
+        J = jax.jacfwd(velocity)(jnp.zeros(Layout.of(slam).size(FRAMES)))[
+            :, Layout.of(slam).whole :
+        ]
+        return J @ J.T
+
+    np.testing.assert_allclose(added(fewer), added(record), atol=1e-12)
+
+
+def test_landmarks_begin_in_the_first_frame_that_stays():
+    """One that only a dropped frame saw is kept, as of the frame after it."""
+    slam, record = filter_of(), full()
+    minima = unknowns(slam, record)
+    fewer, starts = thinned(slam, record, minima)
+    assert fewer.last == 3
+    assert fewer.first.tolist() == [0, 1, 2, 0]
+    assert fewer.seen[:4, 0].all()
+    assert fewer.seen[:, 1].tolist() == [False, True, True, True, False, False, False]
+    assert fewer.seen[:, 2].tolist() == [False, False, True, False, False, False, False]
+    assert not fewer.seen[:, 3].any()
+    np.testing.assert_array_equal(fewer.measured[2, 2], [300, 301])
+    np.testing.assert_array_equal(fewer.measured[:4, 0, 0], [0, 200, 400, 600])
+    np.testing.assert_array_equal(starts.y[:, 0], minima.y[:, 0])
+    np.testing.assert_array_equal(starts.y[:, 1, 2], minima.y[:, 1, 2])
+    assert (starts.y[:, 1:3, :2] == 0).all()
