@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxslam.consistency.recursion import run_through
+from jaxslam.consistency.recursion import Frame, run_through
+from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.forms.state import State
 from jaxslam.simulation import Room, Run
 from jaxslam.slam.readouts import landmarks_from_above
@@ -22,34 +24,44 @@ ALIKE = 0.7
 
 
 class Modes(NamedTuple):
-    """Of every frame after 0 until the sum goes on alone; the likeliest mode comes first."""
+    """Of every frame after 0 as long as the window holds all frames; the likeliest comes first."""
 
-    weights: Float[Array, "frames modes"]
+    weights: Float[np.ndarray, "frames modes"]
     """0 of places without a mode."""
-    paths: Float[Array, "frames modes window n"]
+    paths: Float[np.ndarray, "frames modes window n"]
     """Where the camera was in every frame of the window, from frame 0 on, m; B's axes. After the
     newest frame nothing moves."""
-    landmarks: Float[Array, "frames modes m 2"]
+    landmarks: Float[np.ndarray, "frames modes m 2"]
     """From the newest camera: azimuth (from z towards x, B's axes) and inverse distance, 1/m."""
-    covariances: Float[Array, "frames modes m 2 2"]
+    covariances: Float[np.ndarray, "frames modes m 2 2"]
     """Of these, given the scale, which no pixel tells."""
-    misfits: Float[Array, "frames modes"]
+    misfits: Float[np.ndarray, "frames modes"]
     """Root mean square of all residuals so far, in σ of a pixel."""
+    nees: Float[np.ndarray, " steps"]
+    """Of the sum's pose, in every frame of the run."""
 
 
 def modes_of_run(slam: FromRest, room: Room, run: Run) -> Modes:
-    """Follow the modes of a start from rest through a run, on the machine's processor."""
+    """Follow the modes of a start from rest through a run.
 
-    @jax.jit
-    def followed(slam, run):
-        return run_through(slam, room, run, lambda state, *_: (_told(slam, state), state.open))[1]
-
-    told, is_open = jax.device_get(followed(slam, run))
-    count = min(int(is_open.sum()) + 1, len(is_open))
-    return Modes(*(np.asarray(numbers)[:count] for numbers in told))
+    It ends where the sum goes on alone, or where frames of the window are merged.
+    """
+    told, nees, newest, is_open = jax.device_get(_through(slam, room, run))
+    whole = (newest == 1 + np.arange(len(newest))) & np.append(True, is_open[:-1])
+    return Modes(*(numbers[: whole.sum()] for numbers in told), nees)
 
 
-def _told(slam: FromRest, state: RestState) -> Modes:
+@eqx.filter_jit
+def _through(slam: FromRest, room: Room, run: Run) -> tuple[Any, Array, Array, Array]:
+    def told(state: RestState, _, frame: Frame):
+        nees = normalised_squared(*slam.pose_error(state, frame.pose))
+        return _told(slam, state), nees, state.record.last, state.open
+
+    return run_through(slam, room, run, told)[1]
+
+
+def _told(slam: FromRest, state: RestState) -> tuple[Array, ...]:
+    """The fields of `Modes` that are each mode's, of one frame."""
     ekf, record, modes = slam.base.base, state.record, state.modes
 
     def one(minimum: Minimum, member: State) -> tuple[Array, ...]:
@@ -59,7 +71,7 @@ def _told(slam: FromRest, state: RestState) -> Modes:
         seen = landmarks_from_above(ekf, given_scale(member), slots)
         return at.frames.pose.translation(), *seen, misfit
 
-    return Modes(jnp.exp(modes.log_weights), *jax.vmap(one)(modes.minima, state.sum.members))
+    return jnp.exp(modes.log_weights), *jax.vmap(one)(modes.minima, state.sum.members)
 
 
 def given_scale(state: State) -> State:
@@ -78,23 +90,23 @@ def followed(modes: Modes) -> Int[np.ndarray, "frames modes"]:
     Two paths are compared by their cosine, up to the older one's newest frame: scale and small
     bends change nothing of it.
     """
-    last: list[Float[np.ndarray, "k n"]] = []
     numbers = np.full(modes.weights.shape, -1)
+    last: dict[int, Float[np.ndarray, "k n"]] = {}
     for frame, (weights, paths) in enumerate(zip(modes.weights, modes.paths, strict=True)):
-        here = {}
+        here: dict[int, Float[np.ndarray, "k n"]] = {}
         for mode in np.flatnonzero(weights > 0):
             moved = paths[mode, 1 : frame + 2]
-            alike = [_cosine(moved[: len(other)], other) for other in last]
-            likest = int(np.argmax(alike)) if alike else -1
-            known = likest >= 0 and alike[likest] > ALIKE
-            number = likest if known else len(last)
-            numbers[frame, mode] = number
+            numbers[frame, mode] = number = _number(moved, {**last, **here})
             here.setdefault(number, moved)
-            if not known:
-                last.append(moved)
-        for number, moved in here.items():
-            last[number] = moved
+        last |= here
     return numbers
+
+
+def _number(moved: Float[np.ndarray, "k n"], known: dict[int, Float[np.ndarray, "j n"]]) -> int:
+    """Of the known path that this one is like, or a new one."""
+    alike = {number: _cosine(moved[: len(other)], other) for number, other in known.items()}
+    likest = max(alike, key=lambda number: alike[number], default=-1)
+    return likest if alike.get(likest, 0.0) > ALIKE else len(known)
 
 
 def _cosine(a: Float[np.ndarray, "k n"], b: Float[np.ndarray, "k n"]) -> float:

@@ -15,6 +15,8 @@ from jaxslam.consistency.verdict import headline
 from jaxslam.plots.landmarks import region_from_above
 from jaxslam.plots.style import GREY, line_style, new_figure, save
 
+_LEGEND_LINE = 0.05
+"""Of the height of the axes of NEES, on which its legend hides no curve."""
 _MEDIAN_OF_NORMAL = 0.6745
 """Median of |x| for a standard normal x."""
 
@@ -25,8 +27,9 @@ def plot_consistency(
     """Draw a study; `summary` is `summarise(study)`, made here if it is not given.
 
     Above: the mean NEES of every filter with its exact 95 % band, and the map of run 0 at its
-    end, in the same colours. Where the scale is free, below that: NEES given the scale, and the scale's own error.
-    Below: the error of run 0 with ±3σ, axis by axis. Written to `path` where one is given.
+    end, in the same colours. Where the scale is free, below that: NEES given the scale, and the
+    scale's own error. Below: the error of run 0 with ±3σ, axis by axis. Written to `path` where
+    one is given.
     """
     summary = summarise(study) if summary is None else summary
     geometry = study.scenario.world
@@ -71,7 +74,9 @@ def _plot_nees(axes: Axes, summary: dict[str, Any]) -> None:
     )
     axes.set_yscale("log")
     bottom, top = axes.get_ylim()
-    axes.set_ylim(min(bottom, first["dof"] / 2), max(2 * top, first["dof"] * 2.5))
+    bottom, top = min(bottom, first["dof"] / 2), max(top, first["dof"] * 1.2)
+    legend = _LEGEND_LINE * (len(summary["filters"]) + 2)
+    axes.set_ylim(bottom, bottom * (top / bottom) ** (1 / (1 - min(legend, 0.5))))
     _name_decades(axes)
     _over_time(axes, time)
     axes.set_ylabel(f"pose NEES (ideal {first['dof']})")
@@ -171,8 +176,8 @@ def _plot_map(axes: Axes, samples: dict[str, Any]) -> None:
     truth = first["sample_true_path"][:, :-1, -1]
     seen = first["sample_active"].nonzero()[0]
     points = first["sample_points"]
-    axes.plot(truth[:, 0], truth[:, -1], color="black", lw=1.2, label="truth")
-    axes.plot(points[:, 0], points[:, -1], "k+", ms=6, mew=1, label="landmarks")
+    axes.plot(truth[:, 0], truth[:, -1], color="black", lw=1.2)
+    axes.plot(points[:, 0], points[:, -1], "k+", ms=6, mew=1)
     for i, records in enumerate(samples.values()):
         style = line_style(i)
         path = records["sample_path"][:, :-1, -1]
@@ -185,10 +190,8 @@ def _plot_map(axes: Axes, samples: dict[str, Any]) -> None:
     _set_view(axes, truth[:, [0, -1]], points[seen][:, [0, -1]])
     axes.set_xlabel("x, m")
     axes.set_ylabel("z, m")
-    axes.set_title("run 0 from above, landmarks with 95 % regions", fontsize=9)
-    # Below the axes: inside it would hide landmarks and ticks of a narrow map.
-    below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.13), "frameon": False}
-    axes.legend(fontsize=8, ncols=2, **below)
+    # Said in the title: a legend would hide landmarks and ticks of a narrow map.
+    axes.set_title("run 0 from above, landmarks with 95 % regions\nblack: the truth", fontsize=9)
     axes.grid(alpha=0.25)
 
 

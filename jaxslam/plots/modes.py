@@ -14,8 +14,11 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from jaxslam.arrays import AnyArray
+from jaxslam.consistency.modes import Modes, followed
 from jaxslam.plots.landmarks import region_from_above
 from jaxslam.plots.style import COLOURS, GREY, new_figure, save
+from jaxslam.simulation import Run
 
 FRAMES = (1, 10, 20, 27, 40)
 """Of the maps."""
@@ -62,6 +65,29 @@ class Worlds:
         return int(np.argmax(weights)) if weights.max() > LEAST else None
 
 
+def worlds_of(
+    run: Run, modes: Modes, filtered: Float[AnyArray, "frames n"], filter_name: str, rate: float
+) -> Worlds:
+    """What is seen from above, (x, z), of a run, of its modes and of where a filter believes the
+    camera to be in every frame after 0."""
+
+    def above(points):
+        return np.asarray(points)[..., [0, -1]]
+
+    return Worlds(
+        truth=above(run.poses.translation()),
+        points=above(run.points),
+        weights=modes.weights,
+        numbers=followed(modes),
+        paths=above(modes.paths),
+        landmarks=modes.landmarks,
+        covariances=modes.covariances,
+        filtered=above(filtered),
+        filter_name=filter_name,
+        rate=rate,
+    )
+
+
 class _Look(NamedTuple):
     """Of a world that is shown."""
 
@@ -89,9 +115,8 @@ def plot_modes(
     looks = _looks(worlds, np.argsort(-shares.sum(axis=0), kind="stable")[:WORLDS].tolist())
     figure = new_figure(10, 3.7 * len(looks) + 2.4)
     figure.suptitle("Two worlds explain the same pixels, until one dies", fontsize=14)
-    *rows, bands = figure.subfigures(
-        len(looks) + 1, 1, height_ratios=[*[3.7] * len(looks), 2.1]
-    ).tolist()
+    grid = figure.add_gridspec(len(looks) + 1, 1, height_ratios=[*[3.7] * len(looks), 2.1])
+    *rows, bands = (figure.add_subfigure(grid[i]) for i in range(len(looks) + 1))
     for row, (number, look) in zip(rows, looks.items(), strict=True):
         _row(row, worlds, frames, number, look)
     _head(rows[0], frames, worlds.rate)
@@ -114,8 +139,8 @@ def _nearest(worlds: Worlds, shown: list[int]) -> int:
     """Which of the worlds shown the filter is in: whose path it is nearest to."""
     away = np.zeros(len(shown))
     for frame in range(1, len(worlds.weights) + 1):
-        modes = [worlds.mode(frame, number) for number in shown]
-        if None not in modes:
+        modes = [m for number in shown if (m := worlds.mode(frame, number)) is not None]
+        if len(modes) == len(shown):
             here = worlds.paths[frame - 1, modes, frame]
             away += np.linalg.norm(here - worlds.filtered[frame - 1], axis=1)
     return shown[int(np.argmin(away))]
