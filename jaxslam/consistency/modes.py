@@ -14,6 +14,7 @@ from jaxslam.consistency.recursion import Frame, run_through
 from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.forms.state import State
 from jaxslam.simulation import Room, Run
+from jaxslam.slam.protocol import AbstractFilter
 from jaxslam.slam.readouts import landmarks_from_above
 from jaxslam.window.minimise import Minimum
 from jaxslam.window.problem import path, residuals
@@ -41,11 +42,16 @@ class Modes(NamedTuple):
     """Of the sum's pose, in every frame of the run."""
 
 
-def modes_of_run(slam: FromRest, room: Room, run: Run) -> Modes:
+def modes_of_run(slam: AbstractFilter, room: Room, run: Run) -> Modes:
     """Follow the modes of a start from rest through a run.
 
-    It ends where the sum goes on alone, or where frames of the window are merged.
+    It ends where the sum goes on alone, or where frames of the window are merged. Raises
+    ValueError for a filter without such a start.
     """
+    if not isinstance(slam, FromRest):
+        raise ValueError(
+            f"modes are those of a start from rest (+rest), not of {type(slam).__name__}"
+        )
     told, nees, newest, is_open = jax.device_get(_through(slam, room, run))
     whole = (newest == 1 + np.arange(len(newest))) & np.append(True, is_open[:-1])
     return Modes(*(numbers[: whole.sum()] for numbers in told), nees)
