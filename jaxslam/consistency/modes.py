@@ -52,18 +52,21 @@ def modes_of_run(slam: AbstractFilter, room: Room, run: Run) -> Modes:
         raise ValueError(
             f"modes are those of a start from rest (+rest), not of {type(slam).__name__}"
         )
-    told, nees, newest, is_open = jax.device_get(_through(slam, room, run))
+    told, nees, newest, is_open = jax.device_get(_compiled(slam, room, run))
     whole = (newest == 1 + np.arange(len(newest))) & np.append(True, is_open[:-1])
     return Modes(*(numbers[: whole.sum()] for numbers in told), nees)
 
 
-@eqx.filter_jit
 def _through(slam: FromRest, room: Room, run: Run) -> tuple[Any, Array, Array, Array]:
     def told(state: RestState, _, frame: Frame):
         nees = normalised_squared(*slam.pose_error(state, frame.pose))
         return _told(slam, state), nees, state.record.last, state.open
 
     return run_through(slam, room, run, told)[1]
+
+
+_compiled = eqx.filter_jit(_through)
+"""Once for all runs of a shape."""
 
 
 def _told(slam: FromRest, state: RestState) -> tuple[Array, ...]:

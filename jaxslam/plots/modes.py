@@ -35,7 +35,7 @@ _OTHERS, _DEAD, _FILTER = "#BBBBBB", "#F3F3F3", COLOURS[2]
 class Worlds:
     """What there is to be drawn of one run: the truth, a filter, and the modes of every frame."""
 
-    truth: Float[np.ndarray, "frames+1 2"]
+    truth: Float[np.ndarray, "times 2"]
     """Where the camera is, (x, z), m, from frame 0 on."""
     points: Float[np.ndarray, "m 2"]
     """The true landmarks, m."""
@@ -163,7 +163,9 @@ def _head(row: SubFigure, frames: Sequence[int], rate: float) -> None:
 
 def _row(row: SubFigure, worlds: Worlds, frames: Sequence[int], number: int, look: _Look) -> None:
     """A world's maps, and under them its camera."""
-    axes = row.subplots(2, len(frames), sharex="row", sharey="row", height_ratios=[2.6, 1])
+    axes = row.subplots(
+        2, len(frames), sharex="row", sharey="row", squeeze=False, height_ratios=[2.6, 1]
+    )
     for above, below, frame in zip(*axes, frames, strict=True):
         above.plot(*worlds.points.T, "+", color="black", ms=7, mew=1.1, zorder=4)
         below.plot(*worlds.truth[: frame + 1].T, color="black", lw=1.4, zorder=5)
@@ -178,7 +180,7 @@ def _row(row: SubFigure, worlds: Worlds, frames: Sequence[int], number: int, loo
             weight = worlds.shares()[frame - 1, number]
             _map(above, worlds, frame, mode, look.colour, _strength(weight))
             _camera(below, worlds.paths[frame - 1, mode, : frame + 1], weight, look.colour)
-    _view(axes, worlds)
+    _view(axes, worlds, frames[-1])
     row.supylabel(f"the camera goes {look.way}", color=look.colour, fontweight="bold", fontsize=13)
 
 
@@ -218,12 +220,13 @@ def _dead(above: Axes, below: Axes, worlds: Worlds, number: int, look: _Look) ->
     above.text(0.5, 0.72, said, transform=above.transAxes, ha="center", va="center", fontsize=10)
 
 
-def _view(axes: np.ndarray, worlds: Worlds) -> None:
+def _view(axes: np.ndarray, worlds: Worlds, last: int) -> None:
     low, high = worlds.points.min(axis=0), worlds.points.max(axis=0)
     side = 1.35 * np.abs(worlds.points[:, 0]).max()
     axes[0, 0].set_xlim(-side, side)
     axes[0, 0].set_ylim(0.75 * low[1], 1.08 * high[1])
-    ways = np.concatenate([worlds.truth, worlds.filtered])
+    alive = worlds.paths[:last][worlds.weights[:last] > LEAST].reshape(-1, 2)
+    ways = np.concatenate([worlds.truth[: last + 1], worlds.filtered[:last], alive])
     reach = 1.12 * np.abs(ways[:, 0]).max()
     axes[1, 0].set_xlim(-reach, reach)
     axes[1, 0].set_ylim(min(-0.6 * reach, 1.2 * ways[:, 1].min()), 1.2 * ways[:, 1].max() + 0.1)
