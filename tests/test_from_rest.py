@@ -25,6 +25,16 @@ def standstill():
     return Case("standstill-6dof", RUNS, landmarks=12, steps=STEPS)
 
 
+STILL, MOVING = 14, 16
+
+
+@cache
+def standing():
+    """First still for longer than a window, then as from rest."""
+    steps = STILL + MOVING
+    return Case("standstill-6dof", RUNS, landmarks=12, steps=steps, still_frames=STILL)
+
+
 @cache
 def stages(name):
     """`init` and `step` of the filter, of a batch of runs."""
@@ -36,24 +46,24 @@ def stages(name):
     )
 
 
-def frame(k):
+def frame(k, of=standstill):
     """Controls, known and new features of step k, of all runs."""
-    _, known, new = standstill().features
-    return jax.tree.map(lambda x: x[:, k], (standstill().runs.controls, known, new))
+    _, known, new = of().features
+    return jax.tree.map(lambda x: x[:, k], (of().runs.controls, known, new))
 
 
 @cache
-def followed(name):
+def followed(name, of=standstill):
     """The state after every frame, a batch of runs."""
     init, step = stages(name)
-    states = [init(standstill().features[0])]
-    for k in range(STEPS):
-        states.append(step(states[-1], *frame(k))[0])
+    states = [init(of().features[0])]
+    for k in range(of().scenario.steps):
+        states.append(step(states[-1], *frame(k, of))[0])
     return states
 
 
-def pose_of(name):
-    slam, runs = standstill().filter(name), standstill().runs
+def pose_of(name, of=standstill):
+    slam, runs = of().filter(name), of().runs
 
     @quick_jit
     @jax.vmap
@@ -64,7 +74,7 @@ def pose_of(name):
         along = pose.translation() @ truth.translation()
         return error, P, along
 
-    error, P, along = (np.asarray(x) for x in one(followed(name)[-1], runs))
+    error, P, along = (np.asarray(x) for x in one(followed(name, of)[-1], runs))
     return np.einsum("ri,ri->r", error, np.linalg.solve(P, error[..., None])[..., 0]), along
 
 
@@ -86,6 +96,26 @@ def test_the_window_closes_and_the_sum_goes_on_alone():
     closed, after = states[8], states[9]
     jax.tree.map(np.testing.assert_array_equal, after.modes, closed.modes)
     assert not np.array_equal(after.sum.members.covariance, closed.sum.members.covariance)
+
+
+def test_standing_teaches_nothing_and_then_the_motion_is_found():
+    """The window is thinned as often as it is full, reaches back to frame 0, and stays open."""
+    states = followed(STARTED, standing)
+    first, last = states[3], states[STILL]
+    assert last.open.all()
+    assert (last.record.steps == STILL).all()
+    assert (last.record.last < STILL).all()
+
+    @quick_jit
+    @jax.vmap
+    def log_scale(state):
+        return standing().filter(STARTED).marginal(state, lambda scene: scene.core.log_scale)[1]
+
+    sigma = [np.sqrt(np.asarray(log_scale(state))) for state in (first, last)]
+    assert (sigma[1] > 0.9 * sigma[0]).all()
+    nees, along = pose_of(STARTED, standing)
+    assert nees.max() < lost_threshold(6)
+    assert (along > 0).all()
 
 
 def test_the_members_are_the_modes_as_long_as_the_window_is_open():

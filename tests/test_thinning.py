@@ -35,6 +35,8 @@ def full(frames=FRAMES):
         jnp.asarray(frames - 1),
         jnp.full(frames - 1, 0.1),
         jnp.ones(frames - 1),
+        jnp.zeros(frames - 1, bool),
+        jnp.zeros((), bool),
         measured,
         seen,
         jnp.array([0, 1, 3, 0]),
@@ -95,6 +97,23 @@ def test_the_variance_that_merged_steps_add_to_the_velocity_is_that_of_both():
         return J @ J.T
 
     np.testing.assert_allclose(added(fewer), added(record), atol=1e-12)
+
+
+@pytest.mark.parametrize("restart", [1, 2])
+def test_a_velocity_drawn_anew_stays_drawn_anew(restart):
+    """From there on: what stood before takes no time."""
+    slam, record = filter_of(), full()
+    record = replace(record, restarted=record.restarted.at[restart].set(True))
+    minima = unknowns(slam, record)
+    fewer, starts = thinned(slam, record, minima)
+    step = restart // 2
+    assert fewer.restarted.tolist() == [k == step for k in range(FRAMES - 1)]
+    length = 0.1 if restart == 1 else 0.2
+    np.testing.assert_allclose(fewer.controls[step], length)
+    layout = Layout.of(slam)
+    was = minima.x[:, layout.whole + restart * layout.step :][:, : layout.step]
+    now = starts.x[:, layout.whole + step * layout.step :][:, : layout.step]
+    np.testing.assert_array_equal(now, was)
 
 
 def test_landmarks_begin_in_the_first_frame_that_stays():

@@ -72,6 +72,8 @@ def case(name="standstill", treatment=Known, common=None, last=FRAMES - 1):
         jnp.asarray(last),
         jnp.full(FRAMES - 1, 1 / 5),
         jnp.ones(FRAMES - 1),
+        jnp.zeros(FRAMES - 1, bool),
+        jnp.zeros((), bool),
         jnp.tile(first, (FRAMES, 1, 1)),
         seen.at[2, 1].set(False),
         FIRST,
@@ -152,9 +154,11 @@ def some_record():
     """Three frames, three slots: 0 and 1 begin in frame 0, slot 2 in frame 1."""
     record = empty(pieces("standstill")["motion"], 3, 3, 1, jnp.float64)
     record = begun(record, features([1, 0, 2], [11.0, 10.0, 99.0], [True, True, False]))
-    record = stepped(record, jnp.asarray(0.1), features([0, 1], [20.0, 21.0]))
+    record = stepped(record, jnp.asarray(0.1), features([0, 1], [20.0, 21.0]), jnp.eye(1))
     record = begun(record, features([2], [22.0]))
-    return stepped(record, jnp.asarray(0.2), features([2, 0], [32.0, 30.0], [True, False]))
+    return stepped(
+        record, jnp.asarray(0.2), features([2, 0], [32.0, 30.0], [True, False]), jnp.eye(1)
+    )
 
 
 def test_a_record_has_every_measurement_by_frame_and_slot():
@@ -173,8 +177,70 @@ def test_a_record_has_every_measurement_by_frame_and_slot():
 def test_a_full_record_stays_as_it_is():
     record = some_record()
     assert record.full
-    after = stepped(record, jnp.asarray(9.0), features([0, 1], [90.0, 91.0]))
+    after = stepped(record, jnp.asarray(9.0), features([0, 1], [90.0, 91.0]), jnp.eye(1))
     jax.tree.map(np.testing.assert_array_equal, after, record)
+
+
+def standing_then_moving():
+    """Slots 0 and 1 since frame 0, slot 2 since the second frame in which nothing moved."""
+    record = empty(pieces("standstill")["motion"], 4, 3, 1, jnp.float64)
+    record = begun(record, features([0, 1], [10.0, 20.0]))
+    records = []
+    for there, new in [
+        (features([0, 1], [11.0, 19.0]), features([2], [33.0], [False])),
+        (features([0, 1], [9.0, 21.0]), features([2], [30.0])),
+        (features([0, 2], [10.5, 30.5]), features([1], [0.0], [False])),
+        (features([0, 2], [40.0, 60.0]), features([1], [0.0], [False])),
+        (features([0, 2], [40.0, 60.0]), features([1], [0.0], [False])),
+    ]:
+        record = begun(stepped(record, jnp.asarray(0.1), there, jnp.eye(1)), new)
+        records.append(record)
+    return records
+
+
+def test_while_nothing_moves_the_newest_frame_takes_the_place_of_the_one_before():
+    first, second, third, *_ = standing_then_moving()
+    for record in (first, second, third):
+        assert record.standing
+        assert record.last == 1
+        assert not record.restarted.any()
+    np.testing.assert_array_equal(second.measured[1, :2, 0], [9, 21])
+    np.testing.assert_array_equal(third.seen[1], [True, False, True])
+    np.testing.assert_array_equal(third.measured[1, [0, 2], 0], [10.5, 30.5])
+    np.testing.assert_array_equal(third.first, [0, 0, 1])
+
+
+def test_with_the_first_motion_the_velocity_is_drawn_anew():
+    *_, moved, after = standing_then_moving()
+    assert not moved.standing
+    assert moved.last == 2
+    np.testing.assert_array_equal(moved.restarted, [False, True, False])
+    np.testing.assert_array_equal(after.restarted, [False, True, False])
+    assert after.last == 3
+
+
+def test_what_moved_at_once_never_stood():
+    record = some_record()
+    assert not record.standing
+    assert not record.restarted.any()
+
+
+def test_a_velocity_drawn_anew_does_not_depend_on_the_one_before():
+    slam, record, x, _ = case("standstill-6dof", White, None, 3)
+    record = replace(record, restarted=record.restarted.at[1].set(True))
+    layout = Layout.of(slam)
+    own = slice(layout.whole + layout.step + layout.each, None)
+    there = quick_jit(path)(slam, record, x)
+    mean, root = slam.motion.start()
+    drawn = mean + root @ x[own][: layout.start]
+    np.testing.assert_allclose(there.motion[2], drawn, rtol=1e-12)
+    step = there.frames.pose
+    moved = jax.tree.map(lambda leaf: leaf[1], step).inverse() @ jax.tree.map(
+        lambda leaf: leaf[2], step
+    )
+    np.testing.assert_allclose(moved.log(), drawn / 5, rtol=1e-9)
+    other = quick_jit(path)(slam, record, x.at[: layout.start].add(1.0))
+    np.testing.assert_array_equal(other.motion[2], there.motion[2])
 
 
 def test_a_slot_that_is_used_again_forgets_its_old_track():
@@ -278,7 +344,7 @@ def test_the_window_is_the_exact_posterior_of_a_run_and_has_its_minimum():
     record = begun(record, Features(everywhere, run.measured[0], run.visible[0]))
     for k in range(3):
         seen = Features(everywhere, run.measured[k + 1], run.visible[k + 1])
-        record = stepped(record, run.controls[k], seen)
+        record = stepped(record, run.controls[k], seen, slam.sensor.noise)
 
     def joined(x, y):
         return jnp.concatenate([x, y[:, 0], y[:, 1]])

@@ -23,6 +23,8 @@ from jaxslam.tum import read_tum
 
 MOVING = 1
 """What a track is marked with that contradicts a still scene."""
+GOLDEN = (5**0.5 - 1) / 2
+"""Of one: each multiple falls into the widest gap that those before it leave, modulo 1."""
 _ARRAYS = ("frame", "track", "pixel", "moving", "times", "intrinsics", "image_size")
 
 
@@ -84,10 +86,9 @@ def window(
 ) -> Run:
     """Frames `start` to `start + steps` as a run whose base B is the camera of its first frame.
 
-    It has at most so many tracks at a time, those that were seen first; where one ends, the
-    longest seen of the others takes its slot. Tracks known to be `moving` are left out unless they
-    are asked for. Where the points are is not known: NaN. Raises ValueError for a window that is
-    not in the drive.
+    It has at most so many tracks at a time, spread over the picture; where one ends, another takes
+    its slot. Tracks known to be `moving` are left out unless they are asked for. Where the points
+    are is not known: NaN. Raises ValueError for a window that is not in the drive.
     """
     if steps < 1 or start < 0 or start + steps >= data.frames or landmarks < 1:
         raise ValueError(
@@ -121,11 +122,15 @@ def windows(data: Tracks, steps: int, count: int, *, landmarks: int = 40) -> Run
 
 
 def _observations(data: Tracks, frames: slice, moving: bool) -> Iterator[dict[int, np.ndarray]]:
-    """Of every frame, the pixel of each track, those that were seen first in front."""
+    """Of every frame, the pixel of each track, in an order whose beginnings are spread.
+
+    Tracks are numbered across the picture: the first so many are all on one side of it.
+    """
+    turn = GOLDEN * data.track % 1
     wanted = moving | (data.moving[data.track] != MOVING)
     for k in range(frames.start, frames.stop):
         here = np.flatnonzero(wanted & (data.frame == k))
-        here = here[np.argsort(data.track[here])]
+        here = here[np.argsort(turn[here])]
         yield {int(data.track[i]): data.pixel[i] for i in here}
 
 

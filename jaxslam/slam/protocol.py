@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.arrays import AnyArray
@@ -142,6 +143,11 @@ class AbstractStaged(AbstractFilter):
         state = self.predict(state, control)
         state, innovation = self.update(state, control, seen)
         return self.close(self.compose(state, control), new), innovation
+
+    def moving(self, state: Any) -> Bool[Array, ""]:
+        """Whether the newest frame says anything of how the camera moves."""
+        del state
+        return jnp.ones((), bool)
 
     def update_mean(self, state: Any, control: Any, seen: Features) -> Any:
         """A state with the mean that `update` gives, to try hypotheses with; cheaper, if it can."""

@@ -82,14 +82,14 @@ def path(slam: EkfSlam, record: Record, x: Float[Array, " N"]) -> Path:
     drawn = jnp.asarray(slam.calibration.sigma)
 
     def move(state, data):
-        k, control, merged, numbers = data
-        there = _moved(slam, state, control, merged, numbers)
+        k, *step = data
+        there = _moved(slam, state, *step)
         there = jax.tree.map(lambda new, old: jnp.where(k < record.last, new, old), there, state)
         return there, there
 
     origin = identity(motion.geometry, x.dtype)
     begun = origin, retract(mean, root @ start), drawn * (first if layout.each else once)
-    data = jnp.arange(record.frames - 1), record.controls, record.merged, steps
+    data = (jnp.arange(record.frames - 1), *_driven_by(record), steps)
     _, later = jax.lax.scan(move, begun, data)
     poses, variables, deltas = jax.tree.map(
         lambda one, more: jnp.concatenate([one[None], more]), begun, later
@@ -97,19 +97,29 @@ def path(slam: EkfSlam, record: Record, x: Float[Array, " N"]) -> Path:
     return Path(Frame(poses, deltas), variables, common)
 
 
-def _moved(slam: EkfSlam, state, control, merged: Scalar, numbers):
-    """Pose, motion's variables and calibration one step on, which is made of so many.
+def _driven_by(record: Record) -> tuple[Any, Float[Array, " steps"], Bool[Array, " steps"]]:
+    """What is known of every step: the arguments of `_moved` before the last."""
+    return record.controls, record.merged, record.restarted
 
-    The mean of m white accelerations has σ/√m, the sum of m drifts √m σ.
+
+def _moved(slam: EkfSlam, state, control, merged: Scalar, restarted: Bool[Array, ""], numbers):
+    """Pose, motion's variables and calibration one step on.
+
+    The mean of m white accelerations has σ/√m, the sum of m drifts √m σ. A velocity that is drawn
+    anew has the numbers of an acceleration, and no acceleration.
     """
-    (pose, variables, delta), layout = state, Layout.of(slam)
-    own = slam.motion.noise_sigma.shape[-1]
+    (pose, variables, delta), layout, motion = state, Layout.of(slam), slam.motion
+    own = motion.noise_sigma.shape[-1]
     noise, drift = jnp.split(slam.model.noise_sigma * numbers[: layout.step], [own])
     noise, drift = noise / jnp.sqrt(merged), drift * jnp.sqrt(merged)
+    mean, root = motion.start()
+    anew = retract(mean, root @ numbers[: layout.start])
+    variables = jax.tree.map(lambda new, old: jnp.where(restarted, new, old), anew, variables)
+    noise = jnp.where(restarted, 0.0, noise)
     sigma = jnp.asarray(slam.calibration.sigma)
     return (
-        pose @ slam.motion.displacement(variables, noise, control),
-        slam.motion.next(variables, noise, control),
+        pose @ motion.displacement(variables, noise, control),
+        motion.next(variables, noise, control),
         sigma * numbers[layout.step :] if layout.each else slam.calibration.next(delta, drift),
     )
 
@@ -309,14 +319,10 @@ def _slopes(
     before = jax.tree.map(lambda leaf: leaf[:-1], states)
     numbers = x[Layout.of(slam).whole :].reshape(record.frames - 1, -1)
 
-    def local(state, control, merged, numbers):
-        def moved(both):
-            state, numbers = both
-            return _moved(slam, state, control, merged, numbers)
+    def local(state, numbers, *given):
+        return jacobian(lambda both: _moved(slam, both[0], *given, both[1]), (state, numbers))
 
-        return jacobian(moved, (state, numbers))
-
-    slopes = jax.vmap(local)(before, record.controls, record.merged, numbers)
+    slopes = jax.vmap(local)(before, numbers, *_driven_by(record))
     happened = (jnp.arange(record.frames - 1) < record.last)[:, None, None]
     return jnp.where(happened, slopes, jnp.eye(*slopes.shape[1:], dtype=x.dtype))
 

@@ -1,4 +1,9 @@
-"""What a window remembers: every measurement since its first frame, and which landmark it is of."""
+"""What a window remembers: every measurement since its first frame, and which landmark it is of.
+
+**Standing teaches nothing** of how the camera will move. While all pixels are where they were first
+seen, the newest frame takes the place of the one before, and with the first motion the velocity is
+drawn anew.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +17,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.arrays import AnyArray
 from jaxslam.forms.state import Features
+from jaxslam.linalg import cholesky
 from jaxslam.models.motion import AbstractMotion
+
+STILL = 5.0
+"""σ of χ², above its mean, up to which pixels are where they were."""
 
 
 class Record(eqx.Module):
@@ -23,6 +32,10 @@ class Record(eqx.Module):
     """Of F − 1 steps."""
     merged: Float[Array, " steps"]
     """Of how many steps of the process each is made; 1 until the window was thinned."""
+    restarted: Bool[Array, " steps"]
+    """In which the velocity is drawn anew: it stood before."""
+    standing: Bool[Array, ""]
+    """Whether nothing has moved since frame 0."""
     measured: Float[Array, "F m p"]
     """By slot of the landmark."""
     seen: Bool[Array, "F m"]
@@ -61,6 +74,8 @@ class Record(eqx.Module):
             jnp.minimum(self.last, frames - 1),
             jax.tree.map(lambda x: x[: frames - 1], self.controls),
             self.merged[: frames - 1],
+            self.restarted[: frames - 1],
+            self.standing,
             self.measured[:frames],
             self.seen[:frames],
             self.first,
@@ -74,20 +89,40 @@ def empty(motion: AbstractMotion, frames: int, landmarks: int, p: int, dtype: An
         jnp.zeros((), int),
         jax.tree.map(lambda x: jnp.tile(x, (frames - 1, *(1,) * x.ndim)), still),
         jnp.ones(frames - 1, dtype),
+        jnp.zeros(frames - 1, bool),
+        jnp.ones((), bool),
         jnp.zeros((frames, landmarks, p), dtype),
         jnp.zeros((frames, landmarks), bool),
         jnp.zeros(landmarks, int),
     )
 
 
-def stepped(record: Record, control: Any, seen: Features) -> Record:
-    """With one frame more and what it measured of known landmarks. A full record stays as it is."""
-    k = jnp.where(record.full, record.frames, record.last + 1)  # beyond the end: dropped
+def stepped(record: Record, control: Any, seen: Features, noise: Float[Array, "p p"]) -> Record:
+    """With one frame more and what it measured of known landmarks, of such a covariance. A full
+    record stays as it is."""
+    stood = record.standing & (record.last == 1)
+    stands = record.standing & _still(record, seen, noise)
+    k = jnp.where(stood & stands, 1, record.last + 1)  # beyond the end: dropped
     controls = jax.tree.map(
         lambda all, one: all.at[k - 1].set(one, mode="drop"), record.controls, control
     )
-    stepped = replace(record, last=jnp.minimum(k, record.frames - 1), controls=controls)
+    restarted = record.restarted.at[k - 1].set(stood & ~stands, mode="drop")
+    # What the frame in this place saw is forgotten, but for where landmarks begin.
+    kept = record.seen & ((jnp.arange(record.frames) != k)[:, None] | (record.first == k))
+    last = jnp.minimum(k, record.frames - 1)
+    stepped = replace(
+        record, last=last, controls=controls, restarted=restarted, standing=stands, seen=kept
+    )
     return _measured(stepped, k, seen)
+
+
+def _still(record: Record, seen: Features, noise: Float[Array, "p p"]) -> Bool[Array, ""]:
+    """Whether all that is seen is where it was first seen, or nothing says that it is not."""
+    moved = seen.measured - record.first_measured[seen.slots]
+    whitened = moved @ cholesky(2 * noise).whitening.T
+    squared = jnp.sum(jnp.where(seen.valid[:, None], whitened, 0.0) ** 2)
+    dof = jnp.sum(seen.valid) * moved.shape[1]
+    return squared <= dof + STILL * jnp.sqrt(2 * dof)
 
 
 def begun(record: Record, new: Features) -> Record:

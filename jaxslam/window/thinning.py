@@ -1,9 +1,9 @@
 """A full window goes on with every other frame.
 
-While a camera stands, or only turns, parallax does not come, and what the first frames leave open
-stays open. So a window that is full keeps its first frame, its newest, and every other one between:
-two steps become one of their whole length, driven by the mean of both accelerations. The older a
-part of the window, the coarser it becomes, and it reaches back to frame 0 for ever.
+While a camera only turns, parallax does not come, and what the first frames leave open stays open.
+So a window that is full keeps its first frame, its newest, and every other one between: two steps
+become one of their whole length, driven by the mean of both accelerations. The older a part of the
+window, the coarser it becomes, and it reaches back to frame 0 for ever.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.arrays import AnyArray
 from jaxslam.slam.filter import EkfSlam
@@ -40,32 +40,49 @@ def thinned(slam: EkfSlam, record: Record, minima: Minimum) -> tuple[Record, Min
 
 
 def _fewer(record: Record) -> Record:
-    stay, seen = kept(record.frames), record.seen
-    # A landmark seen in no frame that stays keeps its last sight, as of the frame after it.
-    last = (record.frames - 1) - jnp.argmax(seen[::-1], axis=0)
-    orphan = jnp.any(seen, axis=0) & ~jnp.any(seen[stay], axis=0)
-    slots = jnp.arange(last.size)
-    to = jnp.where(orphan, last + 1, record.frames)
-    measured = record.measured.at[to, slots].set(record.measured[last, slots], mode="drop")
-    seen = _padded(seen.at[to, slots].set(True, mode="drop")[stay], record.frames)
+    stay, frames = kept(record.frames), record.frames
+    measured, seen = _without_orphans(record)
+    seen = _padded(seen[stay], frames)
+    # Where the velocity is drawn anew, it stood before.
+    lasting = jax.tree.map(lambda x: jnp.where(_stood(record), 0.0, x), record.controls)
     return Record(
         jnp.asarray(len(stay) - 1, record.last.dtype),
-        jax.tree.map(lambda x: _sums(x, record.frames), record.controls),
-        jnp.maximum(_sums(record.merged, record.frames), 1.0),
-        _padded(measured[stay], record.frames),
+        jax.tree.map(lambda x: _sums(x, frames), lasting),
+        jnp.maximum(_sums(record.merged, frames), 1.0),
+        _sums(record.restarted.astype(int), frames) > 0,
+        record.standing,
+        _padded(measured[stay], frames),
         seen,
         jnp.argmax(seen, axis=0).astype(record.first.dtype),
     )
 
 
+def _without_orphans(record: Record) -> tuple[Array, Array]:
+    """Measurements, and where they are; a landmark that no frame that stays has seen keeps its last
+    sight, as of the frame after it."""
+    seen = record.seen
+    last = (record.frames - 1) - jnp.argmax(seen[::-1], axis=0)
+    orphan = jnp.any(seen, axis=0) & ~jnp.any(seen[kept(record.frames)], axis=0)
+    slots, to = jnp.arange(last.size), jnp.where(orphan, last + 1, record.frames)
+    measured = record.measured.at[to, slots].set(record.measured[last, slots], mode="drop")
+    return measured, seen.at[to, slots].set(True, mode="drop")
+
+
+def _stood(record: Record) -> Bool[Array, " steps"]:
+    """Steps just before one in which the velocity is drawn anew."""
+    return jnp.append(record.restarted[1:], False)
+
+
 def _noises(slam: EkfSlam, record: Record, fewer: Record, x: Float[Array, " N"]) -> Any:
     """Unknowns of the merged steps: `√(m₁ + m₂) n = √m₁ n₁ + √m₂ n₂` adds the same velocity; a
-    calibration that is drawn anew is that of the frame that stays."""
+    calibration that is drawn anew is that of the frame that stays, and so is a velocity."""
     layout, frames = Layout.of(slam), record.frames
     steps = x[layout.whole :].reshape(frames - 1, -1)
     own, drawn = jnp.split(steps, [layout.step], axis=1)
     roots = jnp.sqrt(jnp.stack([record.merged, fewer.merged]))[..., None]
-    own = _sums(roots[0] * own, frames) / roots[1]
+    added = _sums(roots[0] * own, frames) / roots[1]
+    anew = _sums(jnp.where(record.restarted[:, None], own, 0.0), frames)
+    own = jnp.where(fewer.restarted[:, None], anew, added)
     drawn = _padded(drawn[kept(frames)[1:] - 1], frames - 1)
     return x.at[layout.whole :].set(jnp.concatenate([own, drawn], axis=1).ravel())
 

@@ -83,6 +83,7 @@ class FittedNoise(AbstractStaged):
 
     def predict(self, state: NoiseState, control: Any) -> NoiseState:
         """Of every factor's velocity too."""
+        state = self._begun_anew(state)
         factors = self._factors(state)
         foreseen = jax.vmap(partial(_foreseen, self._inner.motion, control))
         before = _foreseen(self._inner.motion, control, factors, *self._velocity(state.inner))
@@ -118,6 +119,9 @@ class FittedNoise(AbstractStaged):
     def remove(self, state: NoiseState, gone: Bool[AnyArray, " capacity"]) -> NoiseState:
         return replace(state, inner=self.base.remove(state.inner, gone))
 
+    def moving(self, state: NoiseState) -> Bool[Array, ""]:
+        return self.base.moving(state.inner)
+
     def marginal(self, state: NoiseState, function, slots: Int[Array, " m"] | None = None):
         return self.base.marginal(state.inner, function, slots)
 
@@ -152,6 +156,16 @@ class FittedNoise(AbstractStaged):
         linear = jnp.arange(self._groups[1].stop) < self._groups[0].stop
         return jnp.where(linear, *both)
 
+    def _begun_anew(self, state: NoiseState) -> NoiseState:
+        """With the velocity that was told at first, if the camera has not moved."""
+        velocity, root = self._inner.motion.start()
+        moving = self.moving(state)
+        return replace(
+            state,
+            velocity=jnp.where(moving, state.velocity, velocity),
+            covariance=jnp.where(moving, state.covariance, root @ root.T),
+        )
+
     def _learned(self, state: NoiseState) -> NoiseState:
         fading = 1 - 1 / self.memory
         after, told_first = self._velocity(state.inner), _prior(state.log_weights.dtype)
@@ -160,7 +174,8 @@ class FittedNoise(AbstractStaged):
             told = _told(_part(part, *state.before), _part(part, *after))
             heard = jax.vmap(partial(_heard, told))
             evidence, v, V = heard(state.velocity[:, part], state.covariance[:, part, part])
-            evidence = jnp.where(jnp.all(jnp.isfinite(evidence)), evidence, 0.0)
+            learned = self.moving(state) & jnp.all(jnp.isfinite(evidence))
+            evidence = jnp.where(learned, evidence, 0.0)
             faded = fading * log_weights + (1 - fading) * told_first
             return jax.nn.log_softmax(faded + evidence), v, V
 

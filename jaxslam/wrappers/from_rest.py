@@ -43,6 +43,8 @@ LEAST_STEPS = 8
 """Since frame 0 before the sum may go on alone."""
 KNOWN = 0.03
 """σ of the translation, in translations, given the scale: below it parallax is there."""
+MOVED = 0.3
+"""The same, below which a camera has done more than turn."""
 
 
 class RestState(eqx.Module):
@@ -101,7 +103,7 @@ class FromRest(AbstractStaged):
         self, state: RestState, control: Any, seen: Features
     ) -> tuple[RestState, Innovation]:
         after, innovation = self.base.update(state.sum, control, seen)
-        stepped = window.stepped(state.record, control, seen)
+        stepped = window.stepped(state.record, control, seen, self.base.base.sensor.noise)
         return replace(state, sum=after, record=stepped), innovation
 
     def compose(self, state: RestState, control: Any) -> RestState:
@@ -120,6 +122,9 @@ class FromRest(AbstractStaged):
             least = frames
         state = replace(state, open=state.open & ~self._ready(state))
         return when(state.open & state.record.full, self._thinned, state)
+
+    def moving(self, state: RestState) -> Bool[Array, ""]:
+        return ~state.record.standing
 
     def remove(self, state: RestState, gone: Bool[AnyArray, " capacity"]) -> RestState:
         modes = state.modes
@@ -150,7 +155,8 @@ class FromRest(AbstractStaged):
         def solved(state, record):
             x = state.modes.minima.x
             modes = replace(state.modes, minima=replace(state.modes.minima, x=x[:, :size]))
-            due = jnp.any(record.last == jnp.array(searches)) if searches else None
+            due = jnp.any(record.last == jnp.array(searches)) & ~record.standing
+            due = due if searches else None
             modes, explained = sought(ekf, record, modes, REFINEMENTS, self.directions, due)
             members = _members(ekf, record, modes, state.sum.members)
             begun = BankState(members, modes.log_weights)
@@ -166,7 +172,8 @@ class FromRest(AbstractStaged):
         return replace(state, record=record, modes=replace(state.modes, minima=minima))
 
     def _ready(self, state: RestState) -> Bool[Array, ""]:
-        """Whether one mode is left whose translation is known."""
+        """Whether one mode is left whose translation is known; or, where there is no room, whether
+        there is a translation."""
         member = self.base.likeliest(state.sum)
         part = member.core.part("pose")
         n = self.base.base.motion.geometry.point_dim
@@ -176,7 +183,8 @@ class FromRest(AbstractStaged):
         known = variance < self.known**2 * squared
         enough = state.record.steps >= LEAST_STEPS
         alone = state.sum.log_weights[0] > -1e-3
-        return enough & alone & known
+        moved = variance < MOVED**2 * squared
+        return (enough & alone & known) | (state.record.full & moved)
 
 
 def _members(ekf: EkfSlam, record: Record, modes: Modes, members: State) -> State:
