@@ -536,6 +536,11 @@ def main(options: Options) -> None:
     check_same(found, options)
     for rows in measure(options, found):
         write(rows, options.out)
+    report(options)
+
+
+def report(options: Options) -> None:
+    """Draw the file and write its page."""
     found = _apart(read(options.out))
     rows = [row for part in found for row in judged(part, options.lost_bound)]
     draw(rows, options)
