@@ -134,7 +134,7 @@ def draw_figure(options: Options) -> None:
         rest, ekf = (jaxslam.cast(slam, jnp.float64) for slam in made.values())
         _, path, _ = eqx.filter_jit(filter_run)(ekf, room, sensor_of(scenario), run)
         modes = modes_of_run(rest, room, run)
-    worlds = worlds_of(run, modes, path.translation(), EKF, scenario.rate)
+    worlds = worlds_of(run, modes, path.translation(), "the EKF", scenario.rate)
     plot_modes(worlds, path=options.docs.with_suffix(".png"))
 
 
