@@ -151,8 +151,8 @@ for frame in (frame for frame in FRAMES if frame <= len(modes.weights)):
 print(f"truth at frame {STEPS}: {np.round(translations[-1], 2)}, EKF: {np.round(path[-1], 2)}")
 
 # %% [markdown]
-# The residuals are alike to a percent. No test of a filter's innovations can tell that it is in the
-# wrong world: the EKF has no symptom.
+# From the third frame on the residuals are alike to a percent: how well a world explains its pixels
+# does not tell that it is the wrong one.
 #
 # ## Many cameras
 #
