@@ -20,6 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import tyro
+from pages import with_table
 
 import jaxslam
 from jaxslam.consistency.modes import modes_of_run
@@ -30,12 +31,12 @@ from jaxslam.simulation import sensor_of
 
 STEPS = (1, 3, 6, 10, 20, 30, 60)
 """Frames of the table."""
-BEGIN, END = "<!-- from_rest.py -->", "<!-- end -->"
-"""Between these the page is written."""
 TOLD = {"seed": 0, "run": 35, "steps": 40}
 """The run of the figure: of the first sixty, one in which an EKF is in the world that dies."""
 SUM, EKF = "scale_gauge+mixture5+rest", "robocentric"
 """Its filters."""
+BEGIN = "<!-- from_rest.py -->"
+"""Behind this the page is written."""
 KEYS = ("dof", "band95", "nees", "nees_not_lost", "lost", "lost_ever", "rmse", "sigma")
 
 
@@ -115,15 +116,6 @@ def _row(name: str, found: dict[str, Any]) -> list[str]:
     ]
 
 
-def with_table(text: str, results: dict[str, dict[str, Any]]) -> str:
-    """The page with the table in its place. Raises ValueError where it has none."""
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise ValueError(f"the page has no place for the table: {BEGIN} … {END}")
-    return f"{before}{BEGIN}\n\n{table(results)}\n\n{END}{after}"
-
-
 def draw_figure(options: Options) -> None:
     """The modes of one run, beside the page."""
     with jax.enable_x64(True):
@@ -151,7 +143,7 @@ def main(options: Options) -> None:
             with write_atomically(options.out) as path:
                 path.write_text(json.dumps(results, indent=1) + "\n")
     with write_atomically(options.docs) as path:
-        path.write_text(with_table(options.docs.read_text(), results))
+        path.write_text(with_table(options.docs.read_text(), BEGIN, table(results)))
 
 
 if __name__ == "__main__":

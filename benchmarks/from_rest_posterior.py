@@ -1,9 +1,10 @@
 """Is the exact posterior of a camera that sets out from rest calibrated, and how many modes has it?
 
 `python benchmarks/from_rest_posterior.py` draws the posterior of simulated runs by tempered
-sequential Monte Carlo, each twice with other particles, and writes
-`benchmarks/results/from_rest_posterior.json`, anew after every chunk. `--cache FOLDER` keeps what
-was drawn, and the same command goes on with it.
+sequential Monte Carlo, each twice with other particles, runs filters on the same runs, and writes
+`benchmarks/results/from_rest_posterior.json`, anew after every chunk, and a table in
+`docs/from-rest.md`. `--cache FOLDER` keeps what was drawn, and the same command goes on with it;
+once all is drawn it measures the filters alone.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -21,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from pages import with_table
 
 import jaxslam
 from jaxslam.consistency import FolderStore, MemoryStore
@@ -31,7 +33,9 @@ from jaxslam.posterior import (
     SMC,
     Draws,
     Study,
+    against_filter,
     draw_runs,
+    gaussian_sum,
     halves,
     make_problem,
     mixture_divergence,
@@ -45,7 +49,7 @@ from jaxslam.posterior import (
     uniformity,
 )
 from jaxslam.posterior.modes import LEAST_SHARE
-from jaxslam.posterior.summary import summarise_nees
+from jaxslam.posterior.summary import position_dim, summarise_filter, summarise_nees
 from jaxslam.watchdog import finished
 
 Records = dict[str, np.ndarray]
@@ -59,6 +63,9 @@ SAMPLER = (
 BY_RUN = (
     "pooled_nees", "nees", "log_evidence", "reversed", "second_mode", "pooled_second_mode",
 )  # fmt: skip
+BY_RUN_OF_FILTER = ("nees", "kl_of_sum", "reversed", "exact_reversed")
+BEGIN = "<!-- from_rest_posterior.py -->"
+"""Behind this the page is written."""
 KEPT = 99
 """Draws that a truth is ranked among."""
 THINNED = 8
@@ -79,9 +86,13 @@ class Options:
     """Runs after which the numbers are written."""
     seed: int = 0
     smc: SMC = field(default_factory=SMC)
+    filters: tuple[str, ...] = ("scale_gauge+mixture5+rest",)
+    """Measured on the same runs, and never kept."""
     cache: Path | None = None
-    """Folder that keeps the records of the chunks."""
+    """Folder that keeps what was drawn, by chunks."""
     out: Path = Path("benchmarks/results/from_rest_posterior.json")
+    docs: Path = Path("docs/from-rest.md")
+    """The page."""
 
     def __post_init__(self) -> None:
         if self.runs < 2 or self.chunk < 1:
@@ -127,7 +138,9 @@ def _drawn(settings: SMC, problems, truth, keys) -> dict[str, jax.Array]:
         pooled = pool(repeats, keys[-1])
         own = {f"pooled_{name}": x for name, x in _of_draws(truth, pooled).items()}
         kept = pose_moments(pooled.last)[2][::THINNED]
-        return {**of_repeat, **own, **jax.vmap(_of_particles)(repeats), "draws": kept}
+        poses = pooled.last.parameters()
+        particles = jax.vmap(_of_particles)(repeats)
+        return {**of_repeat, **own, **particles, "draws": kept, "poses": poses}
 
     return jax.lax.map(of_run, (problems, truth, keys))
 
@@ -167,7 +180,17 @@ def _of_particles(draws: Draws) -> dict[str, jax.Array]:
     }
 
 
-def summarise(records: Records) -> dict[str, Any]:
+def beside(study: Study, name: str, options: Options, indices: range, poses: np.ndarray) -> Records:
+    """Records of a filter on the same runs, beside parameters of the drawn T_BC, axes run, draw."""
+    (slam,) = jaxslam.make_filters(study.scenario, [name], ["inverse_scaling"]).values()
+    runs = draw_runs(study, options.seed, indices)
+    T_BC = study.scenario.world.group(jnp.asarray(poses))
+    found = against_filter(study, slam, runs, T_BC, gaussian_sum)
+    found = finished(found, f"{name} beside the posterior of runs {indices}")
+    return {key: np.asarray(value) for key, value in found.items()}
+
+
+def summarise(records: Records, filters: Mapping[str, Records]) -> dict[str, Any]:
     """Numbers of the runs whose particles reached the whole likelihood in every repeat."""
     used = np.all(records["reached"], axis=1)
     r = {name: value[used] for name, value in records.items()}
@@ -184,8 +207,27 @@ def summarise(records: Records) -> dict[str, Any]:
         "modes": _modes(r),
         "repeats": _agreement(r),
         "kl": {name: _quantiles(r[name]) for name in r if name.startswith("pooled_kl_")},
+        "filters": {name: _of_filter(found, records, used) for name, found in filters.items()},
         "sampler": {name: _quantiles(r[name]) for name in SAMPLER},
         "by_run": {name: np.round(r[name], 4).tolist() for name in BY_RUN},
+    }
+
+
+def _of_filter(found: Records, records: Records, used: np.ndarray) -> dict[str, Any]:
+    """A filter beside the exact posterior, as one Gaussian and as all that it has."""
+    exact = {f"exact_{name}": records[f"pooled_{name}"] for name in ("error", "covariance")}
+    f = {name: value[used] for name, value in found.items()}
+    own, draws = f["reversed"], f["exact_reversed"]
+    return {
+        **summarise_filter(found, exact, used),
+        "rmse": _root_mean_square(f["error"]),
+        "sigma": _root_mean_square(np.sqrt(np.diagonal(f["covariance"], 0, 1, 2))),
+        "kl_of_sum": _quantiles(f["kl_of_sum"]),
+        "reversed": {
+            "correlation": float(np.corrcoef(own, draws)[0, 1]),
+            "mean_difference": float(np.mean(np.abs(own - draws))),
+        },
+        "by_run": {name: np.round(f[name], 4).tolist() for name in BY_RUN_OF_FILTER},
     }
 
 
@@ -249,14 +291,22 @@ def measure(options: Options) -> Iterator[dict[str, Any]]:
         range(start, min(start + options.chunk, options.runs))
         for start in range(0, options.runs, options.chunk)
     ]
-    parts = []
+    parts, others = [], {name: [] for name in options.filters}
     for chunk in chunks:
         if not store.has("from_rest", chunk):
             start = time.perf_counter()
             store.save("from_rest", chunk, drawn(study, options, chunk))
             print(f"{chunk.stop} runs, {time.perf_counter() - start:.0f} s", flush=True)
         parts.append(store.load("from_rest", chunk))
-        yield summarise({name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
+        for name, of_chunks in others.items():
+            of_chunks.append(beside(study, name, options, chunk, parts[-1]["poses"]))
+        filters = {name: _joined(of_chunks) for name, of_chunks in others.items()}
+        yield summarise(_joined(parts), filters)
+
+
+def _joined(parts: Sequence[Records]) -> Records:
+    """The records of all chunks, one after the other."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _store(options: Options) -> FolderStore | MemoryStore:
@@ -271,8 +321,40 @@ def _settings(options: Options) -> dict[str, Any]:
     return {name: given[name] for name in ("steps", "landmarks", "velocity_sigma", "seed", "smc")}
 
 
+def table(summary: dict[str, Any]) -> str:
+    """The exact posterior, the best sums of Gaussians, and the filters, on the same runs."""
+    header = ["", "NEES", "RMSE, m", "over the exact one", "σ, m", "KL, nats", "reversed weight"]
+    kl = {name: summary["kl"][f"pooled_kl_of_{name}"] for name in ("one_gaussian", "two_gaussians")}
+    rows = [
+        ["exact posterior", f"{summary['nees']['mean']:.2f}", *_accuracy(summary, 1.0), "0", "0"],
+        ["its mean and covariance", "", "", "", "", _median(kl["one_gaussian"]), ""],
+        ["a Gaussian for each mode", "", "", "", "", _median(kl["two_gaussians"]), ""],
+        *(_row(*item) for item in summary["filters"].items()),
+    ]
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _row(name: str, found: dict[str, Any]) -> list[str]:
+    accuracy = _accuracy(found, found["position"]["rmse_ratio"])
+    nees, wrong = found["nees"]["mean"], found["reversed"]
+    weight = f"{wrong['mean_difference']:.3f}; {wrong['correlation']:.2f}"
+    return [f"`{name}`", f"{nees:.2f}", *accuracy, _median(found["kl_of_sum"]), weight]
+
+
+def _accuracy(found: dict[str, Any], ratio: float) -> list[str]:
+    """RMSE of the position, over the exact one, and σ."""
+    position = slice(position_dim(len(found["rmse"])))
+    rmse, sigma = (np.linalg.norm(found[key][position]) for key in ("rmse", "sigma"))
+    return [f"{rmse:.3f}", f"{ratio:.2f}", f"{sigma:.3f}"]
+
+
+def _median(quantiles: dict[str, float]) -> str:
+    return f"{quantiles['median']:.2f}; {quantiles['worst_tenth']:.2f}"
+
+
 def main(options: Options) -> None:
-    """Measure, and write the file after every chunk."""
+    """Measure, and write the file and the page after every chunk."""
     jax.config.update("jax_enable_x64", True)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     for summary in measure(options):
@@ -285,6 +367,8 @@ def main(options: Options) -> None:
         }
         with write_atomically(options.out) as temporary:
             temporary.write_text(json.dumps(written, indent=1) + "\n")
+        with write_atomically(options.docs) as page:
+            page.write_text(with_table(options.docs.read_text(), BEGIN, table(summary)))
 
 
 if __name__ == "__main__":

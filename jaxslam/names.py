@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from jaxslam.delayed.depth_particles import with_depth_particles
 from jaxslam.delayed.rays import with_rays
 from jaxslam.forms.covariance import Covariance
@@ -154,8 +156,23 @@ steps of Gauss–Newton instead of convergence (`iterated`); members of a Gaussi
 noise is remembered (`noise`); none for the remedies `oc`, `fej`."""
 
 RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gauge+scene50+mixture9"}
-"""The filter called `recommended`, by geometry: of those of docs/consistency.md the one to take
-where nothing is known of the motion."""
+"""The filter called `recommended`, by geometry, where the velocity is told."""
+FROM_REST = {
+    "planar": "scale_gauge+scene100+mixture5+rest+noise",
+    "spatial": "scale_gauge+scene100+mixture3+rest8+noise",
+}
+"""The one where it is not: the camera sets out from rest, or nobody says how."""
+
+
+def recommended_name(motion: AbstractMotion) -> str:
+    """What `recommended` stands for, of those of docs/consistency.md and docs/from-rest.md: for a
+    velocity whose mean is less than 3 σ of it, a filter that looks for itself."""
+    geometry = motion.geometry
+    if not motion.has_velocity:
+        return RECOMMENDED[geometry.name]
+    mean, root = (np.asarray(x)[: geometry.point_dim] for x in motion.start())
+    told = mean @ mean > 3 * np.linalg.norm(mean @ root)
+    return (RECOMMENDED if told else FROM_REST)[geometry.name]
 
 
 def make_filter(name: str, **pieces: Any) -> AbstractFilter:
@@ -164,7 +181,7 @@ def make_filter(name: str, **pieces: Any) -> AbstractFilter:
     Raises ValueError for a name that is not known, and for what does not go together.
     """
     if name == "recommended":
-        name = RECOMMENDED[pieces["motion"].geometry.name]
+        name = recommended_name(pieces["motion"])
     base, *modifiers = name.split("+")
     made: Any = chosen("filters", [base], FILTERS)[base](**pieces)
     for modifier in modifiers:
@@ -186,10 +203,10 @@ def make_filters(
     """Every named filter on every named parametrization, keyed `filter/landmarks`.
 
     Their numbers are the scenario's. A filter may be modified: `world+oc`, `scale_gauge+lag10`;
-    `recommended` stands for `RECOMMENDED`. The calibration is treated as the scenario says, unless
-    another treatment is named. Raises ValueError.
+    `recommended` stands for `recommended_name`. The calibration is treated as the scenario says,
+    unless another treatment is named. Raises ValueError.
     """
-    recommended = RECOMMENDED[scenario.geometry]
+    recommended = recommended_name(motion_of(scenario))
     names = [recommended if name == "recommended" else name for name in filters]
     chosen("filters", [name.partition("+")[0] for name in names], FILTERS)
     return {
@@ -220,7 +237,7 @@ def recommended(
     calibration: AbstractCalibration | None = None,
     depth: InverseDepth | None = None,
 ) -> AbstractFilter:
-    """The filter to take where nothing is known of the motion, of one's own pieces."""
+    """The filter to take, of one's own pieces: `recommended_name`."""
     pieces: Mapping[str, Any] = {"calibration": calibration, "depth": depth}
     given = {name: piece for name, piece in pieces.items() if piece is not None}
     return make_filter("recommended", motion=motion, sensor=sensor, landmark=landmark, **given)

@@ -11,7 +11,8 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 import from_rest as benchmark
-from from_rest import BEGIN, END, Options, main, table, with_table
+from from_rest import BEGIN, Options, main, table
+from pages import END, with_table
 
 STEPS = 60
 
@@ -44,17 +45,17 @@ def test_a_row_says_at_every_frame_what_is_lost_and_how_true_the_others_are():
 
 def test_the_table_stands_in_its_place_and_replaces_the_old_one():
     page = f"before\n{BEGIN}\nold\n{END}\nafter\n"
-    new = with_table(page, {"standstill": {"mine": found()}})
+    new = with_table(page, BEGIN, table({"standstill": {"mine": found()}}))
     assert new.startswith("before\n")
     assert new.endswith("\nafter\n")
     assert "old" not in new
     assert "`mine`" in new
-    assert with_table(new, {"standstill": {"mine": found()}}) == new
+    assert with_table(new, BEGIN, table({"standstill": {"mine": found()}})) == new
 
 
 def test_a_page_without_a_place_is_refused():
     with pytest.raises(ValueError, match="no place for the table"):
-        with_table("nothing", {"standstill": {"mine": found()}})
+        with_table(f"a page with {END}", BEGIN, "a table")
 
 
 def test_what_is_there_is_not_measured_again(tmp_path, monkeypatch):

@@ -43,7 +43,7 @@ def records():
 
 
 def test_the_summary_says_of_known_records_what_they_are():
-    found = benchmark.summarise(records())
+    found = benchmark.summarise(records(), {})
     assert found["used"] == RUNS
     low, high = found["nees"]["band95"]
     assert low < found["nees"]["mean"] < high
@@ -62,11 +62,86 @@ def test_the_summary_says_of_known_records_what_they_are():
     json.dumps(found)
 
 
+def of_filter():
+    """A filter whose error and σ are twice the exact ones; its weights are those of the draws,
+    in every other run with 0.1 more."""
+    exact = records()
+    draws = np.linspace(0, 0.5, RUNS)
+    return {
+        "nees": exact["pooled_nees"],
+        "kl": np.full(RUNS, 1.5),
+        "error": 2 * exact["pooled_error"],
+        "covariance": 4 * exact["pooled_covariance"],
+        "wasserstein": np.full((RUNS, 3), 0.5),
+        "kl_of_sum": np.linspace(0, 1, RUNS),
+        "reversed": draws + np.where(np.arange(RUNS) % 2, 0.1, 0.0),
+        "exact_reversed": draws,
+    }
+
+
+def test_the_summary_says_of_a_filter_how_far_it_is_from_the_exact_posterior():
+    found = benchmark.summarise(records(), {"mine": of_filter()})
+    mine = found["filters"]["mine"]
+    for part in ("position", "orientation"):
+        assert mine[part]["rmse_ratio"] == pytest.approx(2)
+        assert mine[part]["sigma_ratio"] == pytest.approx(2)
+    np.testing.assert_allclose(mine["rmse"], 2 * np.array(found["rmse"]))
+    np.testing.assert_allclose(mine["sigma"], 2)
+    assert mine["nees"]["mean"] == pytest.approx(found["nees"]["mean"])
+    assert mine["kl_of_sum"]["median"] == pytest.approx(0.5)
+    assert mine["reversed"]["mean_difference"] == pytest.approx(0.05)
+    assert 0.9 < mine["reversed"]["correlation"] < 0.99
+    json.dumps(found)
+
+
+def test_a_row_of_the_table_says_how_far_a_filter_is_from_the_exact_posterior():
+    two = {"pooled_kl_of_two_gaussians": np.full(RUNS, 0.25)}
+    rows = benchmark.table(benchmark.summarise(records() | two, {"mine": of_filter()})).splitlines()
+    cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+    exact, one, two, mine = cells[2:]
+    assert (exact[4], mine[4]) == (f"{np.sqrt(2):.3f}", f"{2 * np.sqrt(2):.3f}")
+    assert float(mine[2]) == pytest.approx(2 * float(exact[2]), abs=2e-3)
+    assert (exact[3], mine[3]) == ("1.00", "2.00")
+    assert [row[5] for row in (one, two, mine)] == ["0.50; 0.90", "0.25; 0.25", "0.50; 0.90"]
+    assert mine[0] == "`mine`"
+    assert mine[6].startswith("0.050; 0.9")
+
+
+def test_what_was_drawn_is_not_drawn_again_but_filters_are_measured_anew(tmp_path, monkeypatch):
+    options = benchmark.Options(
+        steps=3, landmarks=4, runs=4, chunk=2, filters=("robocentric",), cache=tmp_path,
+    )  # fmt: skip
+    asked = []
+
+    def drawn(study, options, indices):
+        asked.append(indices)
+        found = records() | {"pooled_kl_of_two_gaussians": np.zeros(RUNS)}
+        poses = study.scenario.world.group.identity((RUNS, 128)).parameters()
+        return {k: v[list(indices)] for k, v in (found | {"poses": np.asarray(poses)}).items()}
+
+    def beside(study, name, options, indices, poses):
+        asked.append((name, indices, poses.shape))
+        return {k: v[list(indices)] for k, v in of_filter().items()}
+
+    monkeypatch.setattr(benchmark, "drawn", drawn)
+    monkeypatch.setattr(benchmark, "beside", beside)
+    *_, first = benchmark.measure(options)
+    measured = [("robocentric", range(i, i + 2), (2, 128, 4)) for i in (0, 2)]
+    assert asked == [range(2), measured[0], range(2, 4), measured[1]]
+    asked.clear()
+    *_, second = benchmark.measure(options)
+    assert asked == measured
+    assert second == first
+    assert first["runs"] == 4
+
+
 def test_runs_that_did_not_reach_the_whole_likelihood_are_counted_and_left_out():
     all_runs = records()
     all_runs["reached"][3, 1] = False
     all_runs["pooled_nees"][3] = 1e6
-    found = benchmark.summarise(all_runs)
+    found = benchmark.summarise(all_runs, {"mine": of_filter()})
+    assert found["filters"]["mine"]["nees"]["runs"] == RUNS - 1
+    assert len(found["filters"]["mine"]["by_run"]["reversed"]) == RUNS - 1
     assert (found["runs"], found["used"]) == (RUNS, RUNS - 1)
     assert found["nees"]["mean"] < 10
 

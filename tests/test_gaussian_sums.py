@@ -11,7 +11,8 @@ from cases import Case, close, each_geometry, named, pose_run, quick_jit
 
 import jaxslam
 from jaxslam.forms.state import Innovation, Status
-from jaxslam.names import RECOMMENDED
+from jaxslam.models.motion import ConstantVelocity
+from jaxslam.names import FROM_REST, RECOMMENDED, recommended_name
 from jaxslam.wrappers.bank import BEHIND, BankState, _mixed, log_likelihoods, with_motion
 from jaxslam.wrappers.mixture import _split_and_merged
 
@@ -260,11 +261,24 @@ def test_a_mixture_has_so_many_members(geometry):
     assert start.log_weights.shape == (5,)
 
 
+@pytest.mark.parametrize(("told", "names"), [("matched", RECOMMENDED), ("standstill", FROM_REST)])
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
-def test_recommended_is_a_name(geometry):
-    chosen = jaxslam.scenario("matched" if geometry.name == "planar" else "matched-6dof")
+def test_recommended_is_a_name(geometry, told, names):
+    """Another one where the velocity is told."""
+    chosen = jaxslam.scenario(told if geometry.name == "planar" else f"{told}-6dof")
     made = jaxslam.make_filters(chosen, ["recommended"], ["inverse_scaling"])
-    assert list(made) == [f"{RECOMMENDED[geometry.name]}/inverse_scaling"]
+    assert list(made) == [f"{names[geometry.name]}/inverse_scaling"]
+
+
+def test_a_velocity_is_told_that_is_3_sigma_from_rest():
+    """Along itself: across it the direction is known the less, the speed not."""
+
+    def name(sigma):
+        motion = ConstantVelocity([0.1] * 3, [0.0, 1.0, 0.0], sigma)
+        return recommended_name(motion)
+
+    assert name([5.0, 0.33, 5.0]) == RECOMMENDED["planar"]
+    assert name([0.0, 0.34, 0.0]) == FROM_REST["planar"]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import close, each_geometry, keys_used, named, pose, quick_jit
-from jax.flatten_util import ravel_pytree
 from jaxlie import SE2
 from scipy.linalg import expm
 from scipy.stats import norm, truncnorm
@@ -76,6 +75,11 @@ def problem_of(scenario, *, seed=0, truncated=True):
 residuals_of = quick_jit(residuals)
 
 
+def as_vector(x):
+    """The numbers of `Unknowns` in the order of y."""
+    return jnp.concatenate([x.path, x.landmarks[:, :-1].ravel(), x.landmarks[:, -1]])
+
+
 def draw(problem, seed=1):
     """A y at which everything is in front of the camera: much smaller than the prior's."""
     return 0.1 * jax.random.normal(jax.random.key(seed), (size(problem),))
@@ -93,7 +97,7 @@ def dense_residuals(scenario, problem, y):
     points = []
     for i in range(landmarks):
         own = y[pixels_at + p * i : pixels_at + p * (i + 1)]
-        pixel = problem.first[i] + scenario.pixel_sigma * own
+        pixel = problem.record.measured[0, i] + scenario.pixel_sigma * own
         lower = (scenario.least_inverse_depth - mean) / sigma
         omega = truncnorm.ppf(norm.cdf(y[depths_at + i]), lower, np.inf, mean, sigma)
         points.append([*(np.append((pixel - centre) / focal, 1.0) / omega), 1.0])
@@ -104,8 +108,8 @@ def dense_residuals(scenario, problem, y):
         T_BC = T_BC @ expm(hat(velocity / scenario.rate))
         for i, point in enumerate(points):
             seen = np.linalg.solve(T_BC, point)[:n]
-            error = problem.measured[k, i] - (focal * seen[:-1] / seen[-1] + centre)
-            errors.extend(error / scenario.pixel_sigma * float(problem.visible[k, i]))
+            error = problem.record.measured[k + 1, i] - (focal * seen[:-1] / seen[-1] + centre)
+            errors.extend(error / scenario.pixel_sigma * float(problem.record.seen[k + 1, i]))
     return np.concatenate([y, errors])
 
 
@@ -144,7 +148,7 @@ def test_without_a_bound_the_truncated_normal_is_the_normal():
 @pytest.mark.parametrize("scenario", [LOOSE, SPATIAL], ids=["planar", "spatial"])
 def test_residuals_and_their_jacobian_are_those_of_a_dense_computation(scenario):
     problem, _ = problem_of(scenario)
-    assert bool(jnp.all(problem.visible))
+    assert bool(jnp.all(problem.record.seen))
     y = draw(problem)
     got = residuals_of(problem, y)
     expected = dense_residuals(scenario, problem, y)
@@ -162,7 +166,8 @@ def test_residuals_and_their_jacobian_are_those_of_a_dense_computation(scenario)
 def test_a_landmark_that_is_not_visible_tells_nothing_and_one_behind_is_impossible():
     problem, _ = problem_of(LOOSE)
     y = draw(problem)
-    hidden = replace(problem, visible=problem.visible.at[1, 2].set(False))
+    seen = problem.record.seen.at[2, 2].set(False)
+    hidden = replace(problem, record=replace(problem.record, seen=seen))
     less = residuals_of(hidden, y) != residuals_of(problem, y)
     assert np.flatnonzero(less).tolist() == [y.size + LOOSE.landmarks + 2]
     # A velocity ahead of 300 σ passes every landmark within a frame.
@@ -177,7 +182,7 @@ def test_the_conditional_variables_have_the_jacobian_that_they_claim(truncated):
 
     @quick_jit
     def physical(w):
-        return ravel_pytree(conditional_unknowns(problem, mode, w)[0])[0]
+        return as_vector(conditional_unknowns(problem, mode, w)[0])
 
     a, b = mode + draw(problem, 2), mode + 5 * draw(problem, 3)
     if truncated:  # there is no density where an inverse depth is below the bound
@@ -192,7 +197,7 @@ def test_the_conditional_variables_have_the_jacobian_that_they_claim(truncated):
         return jax.lax.fori_loop(0, 30, lambda _, y: y + (x - at(y)) / slope(y), mode)
 
     def at(y):
-        return ravel_pytree(unknowns(problem, y))[0]
+        return as_vector(unknowns(problem, y))
 
     def slope(y):
         return jax.jvp(at, (y,), (jnp.ones_like(y),))[1]
@@ -267,16 +272,16 @@ def test_at_the_mode_the_conditional_variables_have_the_laplace_approximation():
     root = whitening_root(problem, mode.mode)
 
     def physical(w):
-        return ravel_pytree(conditional_unknowns(problem, mode.mode, w)[0])[0]
+        return as_vector(conditional_unknowns(problem, mode.mode, w)[0])
 
     origin = centre(problem, mode.mode)
     np.testing.assert_allclose(
-        physical(origin), ravel_pytree(unknowns(problem, mode.mode))[0], rtol=1e-6, atol=1e-8
+        physical(origin), as_vector(unknowns(problem, mode.mode)), rtol=1e-6, atol=1e-8
     )
     by_w = jax.jacfwd(physical)(origin)
-    slope = ravel_pytree(
+    slope = as_vector(
         jax.jvp(lambda y: unknowns(problem, y), (mode.mode,), (jnp.ones_like(mode.mode),))[1]
-    )[0]
+    )
     in_y = (by_w / slope[:, None]) @ root
     np.testing.assert_allclose(in_y @ in_y.T, mode.root @ mode.root.T, rtol=1e-6, atol=1e-8)
 
@@ -441,7 +446,7 @@ def test_the_truncated_posterior_is_the_other_one_above_the_bound():
     whole = replace(problem, least_inverse_depth=jnp.asarray(-jnp.inf))
 
     def physical_density(problem, y):
-        slope = jax.jvp(lambda y: unknowns(problem, y).inverse_depths, (y,), (jnp.ones_like(y),))[1]
+        slope = jax.jvp(lambda y: as_vector(unknowns(problem, y)), (y,), (jnp.ones_like(y),))[1]
         return log_density(problem, y) - jnp.sum(jnp.log(slope))
 
     lower = (LOOSE.least_inverse_depth - 1 / 6) * 12

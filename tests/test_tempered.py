@@ -16,7 +16,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 
 import jaxslam
-from jaxslam.geometry import difference, log
+from jaxslam.geometry import difference, log, retract
 from jaxslam.posterior import (
     HMC,
     SMC,
@@ -25,7 +25,10 @@ from jaxslam.posterior import (
     cross_entropy,
     draw_runs,
     entropy,
+    filter_mixture,
+    gaussian_sum,
     halves,
+    main_direction,
     make_problem,
     map_estimate,
     mixture_divergence,
@@ -39,6 +42,7 @@ from jaxslam.posterior import (
     reversed_draws,
     sample,
     second_mode,
+    share_against,
     starts,
     tempered,
     tempered_sample,
@@ -47,12 +51,13 @@ from jaxslam.posterior import (
 from jaxslam.posterior.marginal import (
     landmark_draws,
     marginal_log_likelihood,
-    path_size,
     path_unknowns,
 )
-from jaxslam.posterior.problem import log_likelihood, size
+from jaxslam.posterior.problem import Unknowns, inverse_depths, log_likelihood, path_size, size
 from jaxslam.posterior.tempered import _trajectory, mean_information
+from jaxslam.slam.readouts import camera_pose
 from jaxslam.watchdog import lapack_calls
+from jaxslam.wrappers.from_rest import from_rest
 
 FEW = SMC(particles=800, moves=3)
 LOOSE = jaxslam.scenario("matched-loose", steps=3, landmarks=4)
@@ -198,30 +203,32 @@ def problem_of(scenario, *, truncated=True):
 
 def of_landmark(problem, i):
     """The problem with this landmark alone."""
-    return replace(
-        problem,
-        first=problem.first[i : i + 1],
-        measured=problem.measured[:, i : i + 1],
-        visible=problem.visible[:, i : i + 1],
+    own, record = slice(i, i + 1), problem.record
+    alone = replace(
+        record,
+        measured=record.measured[:, own],
+        seen=record.seen[:, own],
+        first=record.first[own],
     )
+    return replace(problem, record=alone)
 
 
 def by_quadrature(problem, y):
     """Log of the likelihood of a path, and mean and variance of every landmark's inverse depth."""
     x = path_unknowns(problem, y)
-    depth, lower = problem.depth, float(problem.least_inverse_depth)
+    depth, lower = problem.slam.depth, float(problem.least_inverse_depth)
     low = max(lower, float(depth.mean - 7 * depth.sigma))
     omega = np.linspace(low, float(depth.mean + 7 * depth.sigma), 4001)
     white = np.linspace(-7, 7, 141)
     log_prior = norm.logpdf(omega, depth.mean, depth.sigma)
     log_prior = log_prior - norm.logsf(lower, depth.mean, depth.sigma)
     total, moments = 0.0, []
-    for i in range(problem.first.shape[0]):
+    for i in range(problem.landmarks):
         own = of_landmark(problem, i)
 
         def value(e, w, own=own):
-            at = replace(x, pixels=own.first + own.sensor.sigma * e, inverse_depths=w[None])
-            return log_likelihood(own, at)
+            numbers = jnp.stack([e, (w - depth.mean) / depth.sigma])[None]
+            return log_likelihood(own, Unknowns(x.path, numbers))
 
         grid = jax.jit(jax.vmap(jax.vmap(value, (None, 0)), (0, None)))(white, omega)
         steps = (white[1] - white[0]) * (omega[1] - omega[0])
@@ -286,7 +293,7 @@ def test_the_weight_of_a_path_makes_its_likelihood_exact_where_pixels_are_bent()
 def test_weighted_landmarks_have_their_exact_moments():
     _, (_, moments), (x, log_weights) = bent()
     weights = np.exp(log_weights) / np.sum(np.exp(log_weights))
-    omega = np.asarray(x.inverse_depths)
+    omega = np.asarray(jax.vmap(partial(inverse_depths, problem_of(BENT)))(x))
     mean = weights @ omega
     sigma = np.sqrt(moments[:, 1])
     np.testing.assert_allclose((mean - moments[:, 0]) / sigma, 0, atol=5 / np.sqrt(10000))
@@ -302,7 +309,8 @@ def test_a_path_with_a_landmark_behind_the_camera_is_impossible():
     past = y.at[1].set(1000 / REST.velocity_sigma[1])
     assert marginal_log_likelihood(problem, past) == -jnp.inf
     assert landmark_draws(problem, past, jax.random.key(0), 3)[1] == -jnp.inf
-    hidden = replace(problem, visible=jnp.zeros_like(problem.visible))
+    unseen = replace(problem.record, seen=jnp.zeros_like(problem.record.seen))
+    hidden = replace(problem, record=unseen)
     assert marginal_log_likelihood(hidden, past) == pytest.approx(0, abs=1e-12)
 
 
@@ -323,6 +331,11 @@ def on_one_mode():
     return quick_jit(partial(tempered_sample, particles))(problem, key), chains(problem)
 
 
+def depths_of(draws):
+    """Inverse depths of draws of `on_one_mode`, 1/m."""
+    return jax.vmap(partial(inverse_depths, problem_of(LOOSE)))(draws.unknowns)
+
+
 def test_on_a_problem_of_one_mode_particles_and_chains_agree():
     """In the last pose, the velocity and the depths; bounds are 5 of what 400 draws would err."""
     draws, chains = on_one_mode()
@@ -335,7 +348,7 @@ def test_on_a_problem_of_one_mode_particles_and_chains_agree():
     np.testing.assert_allclose(np.diagonal(S) / sigma**2, 1, atol=5 * np.sqrt(2 / 400))
     for own, other in (
         (draws.velocity, chains.velocity),
-        (draws.unknowns.inverse_depths, chains.inverse_depths),
+        (depths_of(draws), chains.inverse_depths),
     ):
         expected = np.asarray(other).reshape(-1, own.shape[1])
         apart = (own.mean(axis=0) - expected.mean(axis=0)) / expected.std(axis=0)
@@ -348,9 +361,11 @@ def test_every_draw_is_whole():
     draws, _ = on_one_mode()
     assert draws.T_BC.parameters().shape[:2] == (1500, 3)
     np.testing.assert_array_equal(draws.last.parameters(), draws.T_BC.parameters()[:, -1])
-    moved = draws.unknowns.velocity + draws.unknowns.accelerations.sum(axis=1) / LOOSE.rate
+    first, *changes = np.split(np.asarray(draws.unknowns.path), 4, axis=1)
+    moved = np.array(LOOSE.velocity) + np.array(LOOSE.velocity_sigma) * first
+    moved = moved + np.array(LOOSE.acceleration_sigma) * sum(changes) / LOOSE.rate
     np.testing.assert_allclose(draws.velocity, moved, atol=1e-9)
-    assert draws.unknowns.inverse_depths.min() > LOOSE.least_inverse_depth
+    assert depths_of(draws).min() > LOOSE.least_inverse_depth
 
 
 def test_repeats_are_pooled_by_their_evidence():
@@ -362,9 +377,9 @@ def test_repeats_are_pooled_by_their_evidence():
     assert np.mean(both.velocity[:, 0] > 50) == pytest.approx(0.75, abs=1e-3)
     assert both.log_evidence - draws.log_evidence == pytest.approx(np.log(2))
     # A draw is taken as a whole.
-    depths = np.asarray(both.unknowns.inverse_depths)
+    depths = np.asarray(both.unknowns.landmarks[..., -1])
     order = [
-        int(np.flatnonzero((draws.unknowns.inverse_depths == w).all(axis=1))[0])
+        int(np.flatnonzero((draws.unknowns.landmarks[..., -1] == w).all(axis=1))[0])
         for w in depths[[0, 1700, 2999]]
     ]
     velocities = both.velocity[jnp.array([0, 1700, 2999])] % 100.0
@@ -498,6 +513,100 @@ def test_a_mode_without_draws_has_no_weight_and_does_no_harm():
     (mean, P), (expected, S) = mixture_moments(found), mixture_moments(without)
     np.testing.assert_allclose(difference(mean, expected), 0, atol=1e-12)
     np.testing.assert_allclose(P, S, atol=1e-12)
+
+
+def test_the_share_against_a_direction_is_that_of_draws_of_the_sum():
+    """Of turned means: a Gaussian's axes are its mean's."""
+    means = SE2.from_xy_theta(*jnp.array([[0.1, -0.2, 5.0], [0.05, 0.1, 5.0], [0.3, 1.5, 0.0]]))
+    P = jnp.diag(jnp.array([0.3, 0.05, 0.01]) ** 2)
+    mixture = PoseMixture(means, jnp.stack([P, P, P * jnp.nan]), jnp.array([0.6, 0.4, 0.0]))
+    direction = jnp.array([0.8, -0.6])
+    rng = np.random.default_rng(0)
+    expected = 0.0
+    for k, weight in enumerate((0.6, 0.4)):
+        mean = jax.tree.map(lambda x, k=k: x[k], means)
+        moved = rng.normal(size=(40000, 2)) @ np.diag([0.3, 0.05])
+        t = mean.translation() + moved @ np.asarray(mean.rotation().as_matrix()).T
+        expected += weight * np.mean(t @ direction < 0)
+    found = quick_jit(share_against)(mixture, direction)
+    assert found == pytest.approx(expected, abs=5 * 0.5 / np.sqrt(40000))
+    assert share_against(mixture, -direction) == pytest.approx(float(1 - found))
+
+
+def test_the_main_direction_is_that_of_most_displacements():
+    poses, other = two_sided(0.3, 0.5)
+    np.testing.assert_allclose(main_direction(poses), [-0.8, 0.6], atol=0.02)
+    back = jax.tree.map(lambda x: x[jnp.asarray(other)], poses)
+    np.testing.assert_allclose(main_direction(back), [0.8, -0.6], atol=0.02)
+
+
+@cache
+def a_sum():
+    """A Gaussian sum of five members, each with a pose and a covariance of its own, its filter,
+    and a true pose."""
+    (slam,) = jaxslam.make_filters(LOOSE, ["scale_gauge+mixture5"], ["inverse_scaling"]).values()
+    state, rng = slam.init(4), np.random.default_rng(0)
+    away = rng.normal([0.1, 0.05, 0.0], 0.03, (5, 3))
+    roots = rng.normal(0.0, 0.03, state.members.covariance.shape)
+
+    def moved(member, away, root):
+        core = replace(member.core, pose=retract(member.core.pose, away))
+        return replace(member, core=core, covariance=root @ root.T)
+
+    members = jax.vmap(moved)(state.members, jnp.asarray(away), jnp.asarray(roots))
+    return slam, replace(state, members=members), SE2.from_xy_theta(-0.1, -0.1, 0.02)
+
+
+def test_the_gaussians_of_a_filter_have_its_moments():
+    slam, state, _ = a_sum()
+    found = filter_mixture(slam, state)
+    assert np.sum(found.weights) == pytest.approx(1)
+    assert np.sum(np.asarray(found.weights) > 1e-3) > 1
+    (mean, P), (expected, S) = mixture_moments(found), camera_pose(slam, state)
+    sigma = np.sqrt(np.diagonal(S))
+    np.testing.assert_allclose(difference(mean, expected) / sigma, 0, atol=1e-2)
+    np.testing.assert_allclose(P / np.outer(sigma, sigma), S / np.outer(sigma, sigma), atol=2e-2)
+
+
+def test_a_start_from_rest_has_the_gaussians_of_its_sum_and_a_plain_filter_has_one():
+    slam, state, _ = a_sum()
+    start = from_rest(slam, 3)
+    begun = replace(start.init(4), sum=state)
+    jax.tree.map(
+        np.testing.assert_array_equal, filter_mixture(start, begun), filter_mixture(slam, state)
+    )
+    member = slam.likeliest(state)
+    mean, P = camera_pose(slam.base, member)
+    one = filter_mixture(slam.base, member)
+    assert one.weights.tolist() == [1.0]
+    np.testing.assert_array_equal(one.means.parameters()[0], mean.parameters())
+    np.testing.assert_array_equal(one.covariances[0], P)
+
+
+def drawn_from(mixture, count):
+    """Poses of a sum of Gaussians."""
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(len(mixture.weights), count, p=np.asarray(mixture.weights))
+    roots = np.linalg.cholesky(np.asarray(mixture.covariances))
+    away = np.einsum("sij,sj->si", roots[chosen], rng.normal(size=(count, 3)))
+    means = jax.tree.map(lambda x: x[chosen], mixture.means)
+    return jax.vmap(retract)(means, jnp.asarray(away))
+
+
+def test_of_its_own_draws_a_sum_of_gaussians_is_the_exact_one():
+    """Shifted by σ of its first number, it is not."""
+    slam, state, truth = a_sum()
+    mixture = filter_mixture(slam, state)
+    draws = drawn_from(mixture, 2000)
+    against = quick_jit(partial(gaussian_sum, slam))
+    found = against(state, truth, draws)
+    assert found["kl_of_sum"] == pytest.approx(0, abs=0.1)
+    assert found["reversed"] == pytest.approx(float(found["exact_reversed"]), abs=0.03)
+    far = jnp.array([np.sqrt(found["covariance"][0, 0]), 0.0, 0.0])
+    moved = jax.vmap(retract, in_axes=(0, None))(draws, far)
+    assert against(state, truth, moved)["kl_of_sum"] > 0.3
+    error, P = slam.pose_error(state, truth)
+    assert found["nees"] == pytest.approx(float(error @ np.linalg.solve(P, error)))
 
 
 @pytest.mark.parametrize(

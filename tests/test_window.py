@@ -425,7 +425,7 @@ def test_the_mean_is_shifted_by_the_volume_of_the_rest():
 
     slope = (half_log_det(1e-4) - half_log_det(-1e-4)) / 2e-4
     factor = cholesky(local.information)
-    shift = shift_of_scale(slam, local, s, factor)
+    shift = shift_of_scale(slam, at, local, s, factor)
     assert abs(slope) > 1e-2
     assert abs(shift) < scale.MOST_SHIFT
     np.testing.assert_allclose(shift * s.squared, -slope, rtol=1e-5)

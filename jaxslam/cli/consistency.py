@@ -23,7 +23,7 @@ from jaxslam.consistency import (
 from jaxslam.consistency.montecarlo import check_sizes
 from jaxslam.files import write_atomically
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.names import FILTERS, MODIFIERS, RECOMMENDED, make_filters
+from jaxslam.names import FILTERS, FROM_REST, MODIFIERS, RECOMMENDED, make_filters
 from jaxslam.simulation.scenario import (
     BUILT_IN,
     CALIBRATIONS,
@@ -58,8 +58,9 @@ class ConsistencyOptions:
         tyro.conf.arg(
             metavar="NAME …",
             help=f"Filters: {', '.join(FILTERS)}, or recommended (here "
-            f"{' or '.join(RECOMMENDED.values())}); each may be modified, as in "
-            f"scale_gauge+lag10: {', '.join(MODIFIERS)}, with a number.",
+            f"{' or '.join(RECOMMENDED.values())}; from rest "
+            f"{' or '.join(FROM_REST.values())}); each may be modified, as in scale_gauge+lag10: "
+            f"{', '.join(MODIFIERS)}, with a number.",
         ),
     ] = ("robocentric",)
     calibration: Annotated[

@@ -25,57 +25,58 @@ from jaxslam.posterior.laplace import covariance_root
 from jaxslam.posterior.problem import (
     Problem,
     Unknowns,
-    log_likelihood,
+    landmark_costs,
     path,
-    pixel_errors,
+    path_size,
     pixel_residuals,
     unknowns,
 )
+from jaxslam.window.problem import Path, landmark_slopes
 
 
 def centre(problem: Problem, mode: Float[Array, " n"]) -> Float[Array, " n"]:
     """w of the mode: its own path and pixels, and every inverse depth at its m."""
-    return mode.at[-_landmarks(problem) :].set(0.0)
+    return mode.at[-problem.landmarks :].set(0.0)
 
 
 def conditional_unknowns(
     problem: Problem, mode: Float[Array, " n"], w: Float[Array, " n"]
 ) -> tuple[Unknowns, Float[Array, ""]]:
     """What w stands for, and the logarithm of the Jacobian from w, up to a constant."""
-    landmarks = _landmarks(problem)
-    x = unknowns(problem, w.at[-landmarks:].set(mode[-landmarks:]))
-    mean, sigma = _given_path(problem, x)
-    return replace(x, inverse_depths=mean + sigma * w[-landmarks:]), jnp.sum(jnp.log(sigma))
+    return _on_path(problem, mode, w, path(problem, w[: path_size(problem)]))
 
 
-def _given_path(problem: Problem, x: Unknowns) -> tuple[Float[Array, " l"], Float[Array, " l"]]:
-    """m and s of every landmark, by one step of Gauss–Newton from the inverse depths of x.
+def _on_path(
+    problem: Problem, mode: Float[Array, " n"], w: Float[Array, " n"], at: Path
+) -> tuple[Unknowns, Float[Array, ""]]:
+    depths = slice(-problem.landmarks, None)
+    x = unknowns(problem, w.at[depths].set(mode[depths]))
+    mean, sigma = _given_path(problem, at, x)
+    landmarks = x.landmarks.at[:, -1].set(mean + sigma * w[depths])
+    return replace(x, landmarks=landmarks), jnp.sum(jnp.log(sigma))
+
+
+def _given_path(
+    problem: Problem, at: Path, x: Unknowns
+) -> tuple[Float[Array, " l"], Float[Array, " l"]]:
+    """Whitened m and s of every landmark, by one step of Gauss–Newton from the inverse depths of x.
 
     A second step makes no sampler better, as pixels are nearly linear in an inverse depth.
     """
-    mean, variance = problem.depth.mean, problem.depth.sigma**2
-    poses, _ = path(problem, x)
-
-    def errors(omega):
-        errors, _ = pixel_errors(problem, replace(x, inverse_depths=omega), poses)
-        return jnp.where(problem.visible[..., None], errors, 0.0)
-
-    # A landmark's errors depend on its own inverse depth alone.
-    omega = x.inverse_depths
-    here, slope = jax.jvp(errors, (omega,), (jnp.ones_like(omega),))
-    information = 1 / variance + jnp.sum(slope**2, axis=(0, 2))
-    downhill = (mean - omega) / variance - jnp.sum(slope * here, axis=(0, 2))
-    return omega + downhill / information, 1 / jnp.sqrt(information)
+    information, gradient, _ = landmark_slopes(problem.slam, problem.record, at, x.landmarks)
+    own = information[:, -1, -1]
+    return x.landmarks[:, -1] - gradient[:, -1] / own, 1 / jnp.sqrt(own)
 
 
 def conditional_log_density(
     problem: Problem, mode: Float[Array, " n"], w: Float[Array, " n"]
 ) -> Float[Array, ""]:
     """Log posterior density of w, up to a constant; −∞ where nothing can be."""
-    x, log_jacobian = conditional_unknowns(problem, mode, w)
-    prior = _prior_residuals(problem, w, x)
-    value = log_likelihood(problem, x) - prior @ prior / 2 + log_jacobian
-    return jnp.where(jnp.all(x.inverse_depths >= problem.least_inverse_depth), value, -jnp.inf)
+    at = path(problem, w[: path_size(problem)])
+    x, log_jacobian = _on_path(problem, mode, w, at)
+    costs = landmark_costs(problem, at, x.landmarks)
+    value = log_jacobian - (jnp.sum(costs) + x.path @ x.path) / 2
+    return jnp.where(jnp.all(x.landmarks[:, -1] >= problem.lowest), value, -jnp.inf)
 
 
 def whitening_root(problem: Problem, mode: Float[Array, " n"]) -> Float[Array, "n n"]:
@@ -86,15 +87,6 @@ def whitening_root(problem: Problem, mode: Float[Array, " n"]) -> Float[Array, "
 
     def residuals(w):
         x, _ = conditional_unknowns(problem, mode, w)
-        return jnp.concatenate([_prior_residuals(problem, w, x), pixel_residuals(problem, x)])
+        return jnp.concatenate([x.path, x.landmarks.ravel(), pixel_residuals(problem, x)])
 
     return covariance_root(jax.jacfwd(residuals)(centre(problem, mode)))
-
-
-def _prior_residuals(problem: Problem, w: Float[Array, " n"], x: Unknowns) -> Float[Array, " n"]:
-    depths = (x.inverse_depths - problem.depth.mean) / problem.depth.sigma
-    return jnp.concatenate([w[: -depths.size], depths])
-
-
-def _landmarks(problem: Problem) -> int:
-    return problem.measured.shape[-2]

@@ -11,7 +11,16 @@ from jaxtyping import Array, Bool, Float
 from jaxslam.geometry import Pose, difference
 from jaxslam.least_squares import levenberg_marquardt
 from jaxslam.linalg import cholesky
-from jaxslam.posterior.problem import Problem, log_density, path, residuals, size, unknowns
+from jaxslam.posterior.problem import (
+    Problem,
+    last,
+    log_density,
+    path,
+    residuals,
+    size,
+    unknowns,
+)
+from jaxslam.window.problem import Layout
 
 SOLVER = levenberg_marquardt(1e-9)
 MOST_STEPS = 200
@@ -30,11 +39,10 @@ class Laplace(eqx.Module):
 
 def starts(problem: Problem, key: Array, count: int) -> Float[Array, "count n"]:
     """The prior mean, then draws of velocity and depths from the prior, without accelerations."""
-    n, t = size(problem), problem.motion.velocity.size
-    landmarks = problem.measured.shape[1]
+    n, start = size(problem), Layout.of(problem.slam).start
     drawn = jnp.arange(n)
-    drawn = (drawn < t) | (drawn >= n - landmarks)
-    draws = jax.random.normal(key, (count, n), problem.measured.dtype)
+    drawn = (drawn < start) | (drawn >= n - problem.landmarks)
+    draws = jax.random.normal(key, (count, n), problem.record.measured.dtype)
     return jnp.where(drawn & (jnp.arange(count) > 0)[:, None], draws, 0.0)
 
 
@@ -78,8 +86,8 @@ def covariance_root(J: Float[Array, "m n"]) -> Float[Array, "n n"]:
 
 def last_pose(problem: Problem, y: Float[Array, " n"]) -> Pose:
     """T_CB after the last step."""
-    poses, _ = path(problem, unknowns(problem, y))
-    return jax.tree.map(lambda x: x[-1], poses).inverse()
+    T_BC, _ = last(path(problem, unknowns(problem, y).path))
+    return T_BC.inverse()
 
 
 def pose_gaussian(problem: Problem, at: Laplace) -> tuple[Pose, Float[Array, "t t"]]:

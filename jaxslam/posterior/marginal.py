@@ -9,7 +9,6 @@ weights draws of path and landmarks become those of the exact posterior.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -18,17 +17,16 @@ import jax.numpy as jnp
 from jax.scipy.special import log_ndtr, logsumexp
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.geometry import Pose
-from jaxslam.linalg import cholesky
 from jaxslam.posterior.problem import (
     Problem,
     Unknowns,
+    landmark_costs,
     path,
-    pixel_errors,
     size,
     truncated_normal,
     unknowns,
 )
+from jaxslam.window.problem import Path, cholesky_each, landmark_slopes
 
 
 class Landmarks(NamedTuple):
@@ -49,12 +47,6 @@ class Landmarks(NamedTuple):
     """Whether it is in front of the camera wherever it is measured."""
 
 
-def path_size(problem: Problem) -> int:
-    """How many of the whitened variables are the path's."""
-    landmarks, p = problem.measured.shape[-2:]
-    return size(problem) - landmarks * (p + 1)
-
-
 def path_unknowns(problem: Problem, y: Float[Array, " n"]) -> Unknowns:
     """What the path's variables stand for; pixels and depths at the centre of their priors."""
     return unknowns(problem, jnp.zeros(size(problem), y.dtype).at[: y.size].set(y))
@@ -65,12 +57,11 @@ def marginal_log_likelihood(problem: Problem, y: Float[Array, " n"]) -> Float[Ar
 
     Up to the constant that `log_likelihood` leaves out; −∞ if one is behind the camera.
     """
-    x = path_unknowns(problem, y)
-    found = landmarks_given(problem, x, path(problem, x)[0])
+    found = landmarks_given(problem, path_unknowns(problem, y), path(problem, y))
     return jnp.where(jnp.all(found.possible), jnp.sum(found.log_evidence), -jnp.inf)
 
 
-def landmarks_given(problem: Problem, x: Unknowns, poses: Pose) -> Landmarks:
+def landmarks_given(problem: Problem, x: Unknowns, at: Path) -> Landmarks:
     """The linear model of every landmark at the end of one step of Gauss–Newton.
 
     One is enough while the camera has moved by less than its distance from the landmarks; after
@@ -78,22 +69,19 @@ def landmarks_given(problem: Problem, x: Unknowns, poses: Pose) -> Landmarks:
     No derivative is taken through that step: a Hamiltonian trajectory is reversible whatever its
     forces are.
     """
-    start = jnp.concatenate(
-        [jnp.zeros_like(x.pixels), _whitened(problem, x.inverse_depths)[:, None]], axis=1
-    )
-    fixed = jax.lax.stop_gradient(poses)
-    first, _ = _linearised(problem, x, fixed, start)
-    bound = _whitened(problem, problem.least_inverse_depth)
+    first = _linearised(problem, jax.lax.stop_gradient(at), x.landmarks)
+    bound = problem.lowest
     around = first.mean.at[:, -1].max(bound)
-    found, possible = _linearised(problem, x, poses, jax.lax.stop_gradient(around))
+    found = _linearised(problem, at, jax.lax.stop_gradient(around))
     sigma = found.whitening[:, -1, -1]
     # Where there is no bound the slope by σ would be that of ∞/σ.
     some = jnp.isfinite(bound)
     lowest = jnp.where(some, (jnp.where(some, bound, 0.0) - found.mean[:, -1]) / sigma, -jnp.inf)
     above = _log_above(lowest) - _log_above(bound)
     log_det = jnp.sum(jnp.log(jnp.diagonal(found.whitening, axis1=1, axis2=2)), axis=1)
+    evidence = log_det - found.cost + above
     return Landmarks(
-        found.mean, found.whitening, found.cost, log_det - found.cost + above, lowest, possible
+        found.mean, found.whitening, found.cost, evidence, lowest, jnp.isfinite(found.cost)
     )
 
 
@@ -103,50 +91,14 @@ class _Quadratic(NamedTuple):
     cost: Float[Array, " l"]
 
 
-def _linearised(
-    problem: Problem, x: Unknowns, poses: Pose, around: Float[Array, "l k"]
-) -> tuple[_Quadratic, Bool[Array, " l"]]:
-    """`½ |θ|² + ½ |r + J (θ − θ₀)|²` as a quadratic form of each landmark's θ."""
-
-    def errors(theta):
-        return _errors(problem, x, poses, theta)
-
-    def along(axis):
-        # A landmark's errors depend on its own numbers alone.
-        tangent = jnp.zeros_like(around).at[:, axis].set(1.0)
-        return jax.jvp(errors, (around,), (tangent,))[1][0]
-
-    here, possible = errors(around)
-    J = jnp.stack([along(axis) for axis in range(around.shape[1])], axis=-1)
-    information = jnp.eye(around.shape[1]) + jnp.einsum("klpi,klpj->lij", J, J)
-    uphill = around + jnp.einsum("klpi,klp->li", J, here)
-    factor = jax.vmap(cholesky)(information)
-    down = jnp.einsum("lij,lj->li", factor.whitening, uphill)
-    mean = around - jnp.einsum("lji,lj->li", factor.whitening, down)
-    squared = jnp.sum(around**2, axis=1) + jnp.sum(here**2, axis=(0, 2))
-    return _Quadratic(mean, factor.whitening, (squared - jnp.sum(down**2, axis=1)) / 2), possible
-
-
-def _placed(problem: Problem, x: Unknowns, theta: Float[Array, "l k"]) -> Unknowns:
-    """The unknowns with landmarks of these whitened numbers."""
-    return replace(
-        x,
-        pixels=problem.first + problem.sensor.sigma * theta[:, :-1],
-        inverse_depths=problem.depth.mean + problem.depth.sigma * theta[:, -1],
-    )
-
-
-def _errors(
-    problem: Problem, x: Unknowns, poses: Pose, theta: Float[Array, "l k"]
-) -> tuple[Float[Array, "steps l p"], Bool[Array, " l"]]:
-    """`(z − h(θ))/σ_px`, zero where nothing was measured, and whether what was is possible."""
-    errors, possible = pixel_errors(problem, _placed(problem, x, theta), poses)
-    seen = problem.visible
-    return jnp.where(seen[..., None], errors, 0.0), jnp.all(possible | ~seen, axis=0)
-
-
-def _whitened(problem: Problem, omega: Float[Array, "*l"]) -> Float[Array, "*l"]:
-    return (omega - problem.depth.mean) / problem.depth.sigma
+def _linearised(problem: Problem, at: Path, around: Float[Array, "l k"]) -> _Quadratic:
+    """`½ |θ|² + ½ |r + J (θ − θ₀)|²` as a quadratic form of each landmark's θ; of one that cannot
+    be seen at θ₀ the cost is ∞."""
+    information, uphill, cost = landmark_slopes(problem.slam, problem.record, at, around)
+    whitening = cholesky_each(information).whitening
+    down = jnp.einsum("lij,lj->li", whitening, uphill)
+    mean = around - jnp.einsum("lji,lj->li", whitening, down)
+    return _Quadratic(mean, whitening, (cost - jnp.sum(down**2, axis=1)) / 2)
 
 
 def _log_above(lower: Float[Array, "*l"]) -> Float[Array, "*l"]:
@@ -166,30 +118,27 @@ def landmark_draws(
     So weighted, path and landmarks together are draws of the exact posterior (Andrieu and Roberts
     2009).
     """
-    x = path_unknowns(problem, y)
-    poses, _ = path(problem, x)
-    found = landmarks_given(problem, x, poses)
+    at = path(problem, y)
+    found = landmarks_given(problem, path_unknowns(problem, y), at)
     draw_key, choice_key = jax.random.split(key)
     normal = jax.random.normal(draw_key, (count, *found.mean.shape), y.dtype)
     white = normal.at[..., -1].set(truncated_normal(normal[..., -1], found.lowest))
     theta = found.mean + jnp.einsum("lji,clj->cli", found.whitening, white)
-    log_weights = jax.vmap(partial(_log_weights, problem, x, poses, found))(theta, white)
+    log_weights = jax.vmap(partial(_log_weights, problem, at, found))(theta, white)
     chosen = jax.random.categorical(choice_key, log_weights, axis=0)
     kept = jnp.take_along_axis(theta, chosen[None, :, None], axis=0)[0]
     means = logsumexp(log_weights, axis=0) - jnp.log(count)
-    return _placed(problem, x, kept), jnp.sum(means)
+    return Unknowns(y, kept), jnp.sum(means)
 
 
 def _log_weights(
     problem: Problem,
-    x: Unknowns,
-    poses: Pose,
+    at: Path,
     found: Landmarks,
     theta: Float[Array, "l k"],
     white: Float[Array, "l k"],
 ) -> Float[Array, " l"]:
     """Of every landmark, the log of its exact density over that of its linear model."""
-    errors, possible = _errors(problem, x, poses, theta)
-    exact = -(jnp.sum(theta**2, axis=1) + jnp.sum(errors**2, axis=(0, 2))) / 2
+    exact = -landmark_costs(problem, at, theta) / 2
     linear = -found.cost - jnp.sum(white**2, axis=1) / 2
-    return jnp.where(possible, exact - linear, -jnp.inf)
+    return jnp.where(found.possible & jnp.isfinite(exact), exact - linear, -jnp.inf)

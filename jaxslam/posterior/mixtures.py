@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,7 +20,10 @@ from jaxslam.delayed.alternatives import log_density
 from jaxslam.geometry import Pose, difference
 from jaxslam.linalg import cholesky
 from jaxslam.posterior.moments import covariance, mean_pose, pose_moments
-from jaxslam.wrappers.bank import moments
+from jaxslam.slam.protocol import AbstractFilter
+from jaxslam.slam.readouts import camera_pose
+from jaxslam.wrappers.bank import Bank, moments
+from jaxslam.wrappers.from_rest import FromRest
 
 NEIGHBOUR = 8
 """Whose distance the entropy is estimated by; more than the copies that draws may have."""
@@ -32,6 +36,17 @@ class PoseMixture(eqx.Module):
     covariances: Float[Array, "m t t"]
     weights: Float[Array, " m"]
     """They sum to 1."""
+
+
+def filter_mixture(slam: AbstractFilter, state: Any) -> PoseMixture:
+    """T_BC as a filter has it: a Gaussian of every member of its sum; of another filter, one."""
+    if isinstance(slam, FromRest):
+        return filter_mixture(slam.base, state.sum)
+    if isinstance(slam, Bank):
+        of_member = jax.vmap(partial(camera_pose, slam.base))
+        return PoseMixture(*of_member(state.members), jnp.exp(state.log_weights))
+    mean, P = jax.tree.map(lambda x: x[None], camera_pose(slam, state))
+    return PoseMixture(mean, P, jnp.ones(1, P.dtype))
 
 
 def component_log_densities(mixture: PoseMixture, poses: Pose) -> Float[Array, "s m"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jax.scipy.special import ndtr
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.geometry import Pose
@@ -25,9 +26,28 @@ def reversed_draws(T_BC: Pose) -> Bool[Array, " s"]:
     The pixels of (t, v, ω) are those of −(t, v, ω), so that a mode which rivals the best one has
     its displacement reversed. The sides are those of the line that displacements are nearest to.
     """
+    return T_BC.translation() @ main_direction(T_BC) < 0
+
+
+def main_direction(T_BC: Pose) -> Float[Array, " n"]:
+    """Unit vector along the line that displacements are nearest to, to the side of most draws."""
     displacements = T_BC.translation()
     _, axes = eigh(displacements.T @ displacements / len(displacements))
-    return _lesser(displacements @ axes[:, -1] < 0)
+    axis = axes[:, -1]
+    return jnp.where(jnp.mean(displacements @ axis < 0) > 0.5, -axis, axis)
+
+
+def share_against(mixture: PoseMixture, direction: Float[Array, " n"]) -> Float[Array, ""]:
+    """How much of a sum of Gaussians has a displacement t of `tᵀd < 0`, d the direction.
+
+    A right perturbation moves t by the mean's rotation of it, to first order.
+    """
+    n = direction.size
+    along = mixture.means.translation() @ direction
+    turned = jnp.einsum("kij,i->kj", mixture.means.rotation().as_matrix(), direction)
+    variance = jnp.einsum("ki,kij,kj->k", turned, mixture.covariances[:, :n, :n], turned)
+    shares = ndtr(-along / jnp.sqrt(variance))
+    return jnp.sum(jnp.where(mixture.weights > 0, mixture.weights * shares, 0.0))
 
 
 def halves(tangents: Float[Array, "s k"]) -> Bool[Array, " s"]:

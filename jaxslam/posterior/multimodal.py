@@ -16,8 +16,8 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.geometry import Pose
-from jaxslam.posterior.marginal import landmark_draws, marginal_log_likelihood, path_size
-from jaxslam.posterior.problem import Problem, Unknowns, path
+from jaxslam.posterior.marginal import landmark_draws, marginal_log_likelihood
+from jaxslam.posterior.problem import Problem, Unknowns, path, path_size
 from jaxslam.posterior.tempered import SMC, Trace, tempered
 
 
@@ -25,7 +25,7 @@ class Draws(eqx.Module):
     """Equally weighted draws of one problem's exact posterior, some of them more than once."""
 
     unknowns: Unknowns
-    """Velocity before the first step, accelerations, pixels and inverse depths; first axis draw."""
+    """Of path and landmarks; first axis draw."""
     T_BC: Pose
     """After every step: axes draw, step."""
     velocity: Float[Array, "draws t"]
@@ -47,7 +47,7 @@ class Draws(eqx.Module):
 def tempered_sample(settings: SMC, problem: Problem, key: Array) -> Draws:
     """Draws of the posterior of a problem, however many modes it has."""
     paths_key, landmarks_key, last_key = jax.random.split(key, 3)
-    like = jnp.zeros(path_size(problem), problem.measured.dtype)
+    like = jnp.zeros(path_size(problem), problem.record.measured.dtype)
     found = tempered(settings, partial(marginal_log_likelihood, problem), like, paths_key)
     keys = jax.random.split(landmarks_key, settings.particles)
     unknowns, log_weights = jax.vmap(
@@ -57,11 +57,11 @@ def tempered_sample(settings: SMC, problem: Problem, key: Array) -> Draws:
     weights = jnp.exp(log_weights - total)
     chosen = systematic(last_key, weights, settings.particles)
     unknowns = jax.tree.map(lambda x: x[chosen], unknowns)
-    T_BC, velocity = jax.vmap(partial(path, problem))(unknowns)
+    at = jax.vmap(partial(path, problem))(unknowns.path)
     return Draws(
         unknowns=unknowns,
-        T_BC=T_BC,
-        velocity=velocity[:, -1],
+        T_BC=jax.tree.map(lambda x: x[:, 1:], at.frames.pose),
+        velocity=at.motion[:, -1],
         log_evidence=found.log_evidence + total - jnp.log(settings.particles),
         effective=1 / jnp.sum(weights**2) / settings.particles,
         reached=found.reached,

@@ -1,12 +1,14 @@
 """The generative model of a simulated run in whitened variables: what its posterior is made of.
 
-The unknowns y are standard normal a priori: the initial velocity, the white acceleration of every
-step, and of every landmark its true pixel in frame 0 and its inverse depth. With the measurements
-z of the later frames, `−log p(y | z) = ½ |r(y)|² + const` for the residuals
-`r = [y; (z − h(y))/σ_px]`, which is all that a sampler or a least-squares solver needs.
+It is that of `jaxslam.window`, with all frames in the window and every landmark first seen in frame
+0. Its unknowns are one vector y here, standard normal a priori: those of the path (the initial
+velocity, and the white acceleration of every step), then the true pixels of all landmarks in frame
+0, then their inverse depths. With the measurements z of the later frames, `−log p(y | z) =
+½ |r(y)|² + const` for the residuals `r = [y; (z − h(y))/σ_px]`, which is all that a sampler or a
+least-squares solver needs.
 
-The path, the landmarks and the pixels are those of `jaxslam.models`; a
-landmark is the homogeneous point (bearing, 1, ω) of frame 0, so that ω = 0 is nothing special.
+One thing is added: landmarks are drawn from a prior on 1/z that is truncated. A standard normal
+number of y is made a truncated one, and that is the window's.
 
 Two things that the simulator does are left out: a first pixel is drawn inside the picture, and a
 landmark outside the picture is not measured. Both are nearly functions of what is measured: they
@@ -21,45 +23,45 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import log_ndtr, ndtri
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxslam.arrays import cast
-from jaxslam.geometry import Pose, homogeneous_apply, identity
-from jaxslam.models.camera import bearing
-from jaxslam.models.depth import InverseDepth
-from jaxslam.models.motion import ConstantVelocity
-from jaxslam.models.sensors import Pinhole
+from jaxslam.geometry import Pose
 from jaxslam.simulation import Run, Scenario, depth_of, motion_of, sensor_of
+from jaxslam.slam.filter import EkfSlam
+from jaxslam.window import problem as window
+from jaxslam.window.problem import Layout, Path
+from jaxslam.window.record import Record
 
 
 class Problem(eqx.Module):
     """What is known of one run: the prior and the measurements. Batched by `vmap`."""
 
-    motion: ConstantVelocity
-    sensor: Pinhole
-    depth: InverseDepth
+    slam: EkfSlam
+    """A filter that is told the scenario's motion, sensor and prior on 1/z; only these count."""
+    record: Record
+    """What was measured in all frames."""
     least_inverse_depth: Float[Array, ""]
     """The prior on 1/z is truncated below this, 1/m; −∞ for the whole Gaussian."""
-    first: Float[Array, "l p"]
-    """Pixels of frame 0."""
-    measured: Float[Array, "steps l p"]
-    """Pixels of the later frames."""
-    visible: Bool[Array, "steps l"]
-    """Which of them were measured."""
-    controls: Float[Array, " steps"]
-    """Seconds of every step."""
+
+    @property
+    def landmarks(self) -> int:
+        """How many there are."""
+        return self.record.first.size
+
+    @property
+    def lowest(self) -> Float[Array, ""]:
+        """The bound in the whitened number of an inverse depth."""
+        depth = self.slam.depth
+        return (self.least_inverse_depth - depth.mean) / depth.sigma
 
 
 class Unknowns(eqx.Module):
-    """The physical quantities that the whitened variables stand for."""
+    """The whitened numbers of `jaxslam.window`."""
 
-    velocity: Float[Array, " t"]
-    """Before the first step, in the camera frame, m/s and rad/s."""
-    accelerations: Float[Array, "steps t"]
-    pixels: Float[Array, "l p"]
-    """True pixels of frame 0."""
-    inverse_depths: Float[Array, " l"]
-    """1/z in frame 0, 1/m."""
+    path: Float[Array, " N"]
+    landmarks: Float[Array, "l q"]
+    """Of each its true pixel in frame 0, then its inverse depth."""
 
 
 def check_scenario(scenario: Scenario) -> None:
@@ -112,41 +114,34 @@ def make_problem(scenario: Scenario, run: Run, *, truncated: bool = True) -> Pro
     another kind.
     """
     check_scenario(scenario)
-    pieces = motion_of(scenario), sensor_of(scenario), depth_of(scenario)
-    motion, sensor, depth = cast(pieces, run.measured.dtype)
-    assert isinstance(motion, ConstantVelocity)
-    assert isinstance(sensor, Pinhole)
-    return Problem(
-        motion=motion,
-        sensor=sensor,
-        depth=depth,
-        least_inverse_depth=jnp.asarray(scenario.least_inverse_depth if truncated else -jnp.inf),
-        first=run.measured[0],
-        measured=run.measured[1:],
-        visible=run.visible[1:],
+    slam = EkfSlam(motion=motion_of(scenario), sensor=sensor_of(scenario), depth=depth_of(scenario))
+    frames, landmarks = run.visible.shape
+    record = Record(
+        last=jnp.asarray(frames - 1),
         controls=run.controls,
+        measured=run.measured,
+        seen=run.visible,
+        first=jnp.zeros(landmarks, int),
     )
+    least = jnp.asarray(scenario.least_inverse_depth if truncated else -jnp.inf)
+    return Problem(cast(slam, run.measured.dtype), record, least)
+
+
+def path_size(problem: Problem) -> int:
+    """How many of the whitened variables are the path's."""
+    return Layout.of(problem.slam).size(problem.record.frames)
 
 
 def size(problem: Problem) -> int:
     """How many whitened variables there are."""
-    steps, landmarks, p = problem.measured.shape[-3:]
-    return (steps + 1) * problem.motion.velocity.shape[-1] + landmarks * (p + 1)
+    return path_size(problem) + problem.landmarks * (problem.slam.sensor.size + 1)
 
 
 def unknowns(problem: Problem, y: Float[Array, " n"]) -> Unknowns:
     """What y stands for."""
-    motion, depth = problem.motion, problem.depth
-    t, (steps, landmarks, p) = motion.velocity.size, problem.measured.shape
-    ends = [t, t * (steps + 1), t * (steps + 1) + landmarks * p]
-    velocity, accelerations, pixels, depths = jnp.split(y, ends)
-    lower = (problem.least_inverse_depth - depth.mean) / depth.sigma
-    return Unknowns(
-        velocity=motion.velocity + motion.velocity_sigma * velocity,
-        accelerations=motion.noise_sigma * accelerations.reshape(steps, t),
-        pixels=problem.first + problem.sensor.sigma * pixels.reshape(landmarks, p),
-        inverse_depths=depth.mean + depth.sigma * truncated_normal(depths, lower),
-    )
+    x, pixels, depths = jnp.split(y, [path_size(problem), y.size - problem.landmarks])
+    depths = truncated_normal(depths, problem.lowest)
+    return Unknowns(x, jnp.column_stack([pixels.reshape(problem.landmarks, -1), depths]))
 
 
 def truncated_normal(y: Float[Array, "*l"], lower: Float[Array, "*#l"]) -> Float[Array, "*l"]:
@@ -161,19 +156,19 @@ def truncated_normal(y: Float[Array, "*l"], lower: Float[Array, "*#l"]) -> Float
     return jnp.where(y < 0, 1.0, -1.0) * ndtri(jnp.where(y < 0, -jnp.expm1(log_above) + tail, tail))
 
 
-def path(problem: Problem, x: Unknowns) -> tuple[Pose, Float[Array, "steps t"]]:
-    """T_BC and the velocity in the camera frame after every step."""
-    motion = problem.motion
+def path(problem: Problem, x: Float[Array, " N"]) -> Path:
+    """Poses and velocities of all frames."""
+    return window.path(problem.slam, problem.record, x)
 
-    def move(carry, data):
-        pose, velocity = carry
-        acceleration, dt = data
-        step = motion.displacement(velocity, acceleration, dt)
-        moved = pose @ step, motion.next(velocity, acceleration, dt)
-        return moved, moved
 
-    start = identity(motion.geometry, x.velocity.dtype), x.velocity
-    return jax.lax.scan(move, start, (x.accelerations, problem.controls))[1]
+def last(at: Path) -> tuple[Pose, Float[Array, " t"]]:
+    """T_BC and the velocity in the camera frame after the last step."""
+    return jax.tree.map(lambda x: x[-1], (at.frames.pose, at.motion))
+
+
+def inverse_depths(problem: Problem, x: Unknowns) -> Float[Array, " l"]:
+    """1/z in frame 0, 1/m."""
+    return window.hidden(problem.slam, jnp.zeros(0), x.landmarks[:, -1])
 
 
 def residuals(problem: Problem, y: Float[Array, " n"]) -> Float[Array, " k"]:
@@ -182,38 +177,23 @@ def residuals(problem: Problem, y: Float[Array, " n"]) -> Float[Array, " k"]:
 
 
 def pixel_residuals(problem: Problem, x: Unknowns) -> Float[Array, " m"]:
-    """`(z − h)/σ_px` of every pixel; zero where nothing was measured."""
-    errors, _ = pixel_errors(problem, x, path(problem, x)[0])
-    return jnp.where(problem.visible[..., None], errors, 0.0).ravel()
+    """`(z − h)/σ_px` of every pixel after frame 0; zero where nothing was measured."""
+    at = path(problem, x.path)
+    return window.residuals(problem.slam, problem.record, at, x.landmarks)[1:].ravel()
+
+
+def landmark_costs(problem: Problem, at: Path, landmarks: Float[Array, "l q"]) -> Array:
+    """Of every landmark `|y|² + |(z − h)/σ_px|²`, y its own numbers; ∞ if it is measured where it
+    is behind the camera."""
+    return window.landmark_slopes(problem.slam, problem.record, at, landmarks)[2]
 
 
 def log_likelihood(problem: Problem, x: Unknowns) -> Float[Array, ""]:
     """`−½ |(z − h)/σ_px|²`, up to a constant; −∞ if a measured landmark is behind the camera."""
-    errors, possible = pixel_errors(problem, x, path(problem, x)[0])
-    used = problem.visible & possible
-    squared = jnp.sum(jnp.where(used[..., None], errors, 0.0) ** 2)
-    return jnp.where(jnp.all(possible | ~problem.visible), -squared / 2, -jnp.inf)
+    costs = landmark_costs(problem, path(problem, x.path), x.landmarks)
+    return -jnp.sum(costs - jnp.sum(x.landmarks**2, axis=1)) / 2
 
 
 def log_density(problem: Problem, y: Float[Array, " n"]) -> Float[Array, ""]:
     """`−½ |r|²`, the log posterior of y up to a constant; −∞ as in `log_likelihood`."""
     return log_likelihood(problem, unknowns(problem, y)) - y @ y / 2
-
-
-def pixel_errors(
-    problem: Problem, x: Unknowns, poses: Pose
-) -> tuple[Float[Array, "steps l p"], Bool[Array, "steps l"]]:
-    """`(z − h)/σ_px` of every step, seen from the poses T_BC, and whether h is possible."""
-    sensor = problem.sensor
-    bearings = jax.vmap(bearing, in_axes=(None, 0))(sensor.camera, x.pixels)
-    points = jnp.column_stack([bearings, jnp.ones_like(x.inverse_depths)])
-
-    def one(T_CB, point, omega):
-        seen = homogeneous_apply(T_CB, point, omega)
-        return sensor.measure(seen, omega), sensor.possible(seen)
-
-    of_frame = jax.vmap(one, in_axes=(None, 0, 0))
-    predicted, possible = jax.vmap(lambda T_BC: of_frame(T_BC.inverse(), points, x.inverse_depths))(
-        poses
-    )
-    return (problem.measured - predicted) / sensor.sigma, possible

@@ -27,7 +27,7 @@ from jaxslam.posterior.conditional import (
     conditional_unknowns,
     whitening_root,
 )
-from jaxslam.posterior.problem import Problem, path
+from jaxslam.posterior.problem import Problem, inverse_depths, last, path
 
 WORST_RHAT = 1.05
 LEAST_ESS = 100.0
@@ -94,8 +94,7 @@ def sample(settings: HMC, problem: Problem, mode: Float[Array, " n"], key: Array
 
     def outcome(x):
         unknown, _ = conditional_unknowns(problem, mode, origin + root @ x)
-        T_BC, velocity = jax.tree.map(lambda x: x[-1], path(problem, unknown))
-        return T_BC, velocity, unknown.inverse_depths
+        return *last(path(problem, unknown.path)), inverse_depths(problem, unknown)
 
     def chain(key):
         start_key, key = jax.random.split(key)

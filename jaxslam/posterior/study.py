@@ -5,7 +5,7 @@ Problem i is run i of `monte_carlo` with the same scenario and seed, cut after `
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -22,6 +22,8 @@ from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.geometry import Pose, difference, log
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.posterior.laplace import Laplace, laplace, minima, pose_gaussian, starts
+from jaxslam.posterior.mixtures import filter_mixture, mixture_divergence
+from jaxslam.posterior.modes import main_direction, share_against
 from jaxslam.posterior.moments import (
     covariance,
     gaussian_divergence,
@@ -180,6 +182,7 @@ def _posterior_errors(chains: Chains, runs: Run) -> Records:
         scalars = jnp.column_stack([base, velocity])
         watched = jnp.column_stack([tangents, velocity, chains.log_density.ravel()])
         rhat, ess = diagnose(watched.reshape(*shape, -1))
+        behind = jnp.any(chains.inverse_depths < 0, axis=-1)
         nees_of_draws = jax.vmap(lambda d: normalised_squared(d, P))(tangents)
         return {
             "nees": normalised_squared(difference(truth.inverse(), T_CB), P),
@@ -189,7 +192,7 @@ def _posterior_errors(chains: Chains, runs: Run) -> Records:
             "position": estimate.translation(),
             "truth": jnp.concatenate([_base_error(truth, estimate), _last_velocity(run)]),
             "draws": scalars,
-            "behind_infinity": jnp.mean(jnp.any(chains.inverse_depths < 0, axis=-1)),
+            "behind_infinity": jnp.mean(behind, dtype=P.dtype),
             "rhat": jnp.max(rhat),
             "ess": jnp.min(ess),
             "divergent": jnp.mean(chains.divergent),
@@ -205,38 +208,70 @@ def converged(records: Mapping[str, Any], name: str) -> np.ndarray:
     return (rhat <= WORST_RHAT) & (ess >= LEAST_ESS) & (np.asarray(records["exact_share"]) > 0)
 
 
-def against_filter(study: Study, slam: AbstractFilter, runs: Run, exact: Pose) -> Records:
-    """A filter on the same runs, beside draws of the exact posterior: T_BC, axes run and draw.
+Comparison = Callable[[AbstractFilter, Any, Pose, Pose], Records]
+"""Of a filter, its state after the last step, the true T_BC there, and draws of it."""
+
+
+def one_gaussian(slam: AbstractFilter, state: Any, truth: Pose, T_BC: Pose) -> Records:
+    """The filter's mean and covariance beside draws of the exact posterior.
 
     NEES and KL are in the filter's own error, the one of its `pose_error`; σ, error and
     Wasserstein distances in position along the axes of B and orientation.
     """
+    error, P = slam.pose_error(state, truth)
+    own = jax.vmap(lambda pose: slam.pose_error(state, pose)[0])(T_BC)
+    estimate, P_BC = camera_pose(slam, state)
+    base = in_base_axes(T_BC, estimate)
+    P_base = to_base_axes(estimate, P_BC)
+    distance = wasserstein(base, jnp.zeros(len(P_base)), jnp.diagonal(P_base))
+    return {
+        "nees": normalised_squared(error, P),
+        "kl": gaussian_divergence(own, P),
+        "error": _base_error(truth, estimate),
+        "covariance": P_base,
+        "position": estimate.translation(),
+        "wasserstein": distance / jnp.std(base, axis=0),
+    }
+
+
+def gaussian_sum(slam: AbstractFilter, state: Any, truth: Pose, T_BC: Pose) -> Records:
+    """Also all Gaussians of a sum: KL of the draws' density from theirs, and how much of either
+    lies on the other side of the origin than most draws do."""
+    mixture, ahead = filter_mixture(slam, state), main_direction(T_BC)
+    return {
+        **one_gaussian(slam, state, truth, T_BC),
+        "kl_of_sum": mixture_divergence(T_BC, mixture),
+        "reversed": share_against(mixture, ahead),
+        "exact_reversed": jnp.mean(T_BC.translation() @ ahead < 0, dtype=ahead.dtype),
+    }
+
+
+def against_filter(
+    study: Study,
+    slam: AbstractFilter,
+    runs: Run,
+    exact: Pose,
+    comparison: Comparison = one_gaussian,
+) -> Records:
+    """A filter on the same runs, beside draws of the exact posterior: T_BC, axes run and draw."""
     slam, sensor = cast((slam, sensor_of(study.scenario)), runs.measured.dtype)
     landmarks = study.scenario.landmarks
-    return _compared(Room(landmarks, landmarks, landmarks, 1), slam, sensor, runs, exact)
+    room = Room(landmarks, landmarks, landmarks, 1)
+    return _compared(comparison, room, slam, sensor, runs, exact)
 
 
 @eqx.filter_jit
 def _compared(
-    room: Room, slam: AbstractFilter, sensor: AbstractSensor, runs: Run, exact: Pose
+    comparison: Comparison,
+    room: Room,
+    slam: AbstractFilter,
+    sensor: AbstractSensor,
+    runs: Run,
+    exact: Pose,
 ) -> Records:
     def one(run, T_BC):
         _, _, state = filter_run(slam, room, sensor, run)
-        truth = _last(run)
-        error, P = slam.pose_error(state, truth)
-        own = jax.vmap(lambda pose: slam.pose_error(state, pose)[0])(T_BC)
-        estimate, P_BC = camera_pose(slam, state)
-        base = in_base_axes(T_BC, estimate)
-        P_base = to_base_axes(estimate, P_BC)
-        distance = wasserstein(base, jnp.zeros(len(P_base)), jnp.diagonal(P_base))
-        return {
-            "nees": normalised_squared(error, P),
-            "kl": gaussian_divergence(own, P),
-            "error": _base_error(truth, estimate),
-            "covariance": P_base,
-            "position": estimate.translation(),
-            "wasserstein": distance / jnp.std(base, axis=0),
-        }
+        return comparison(slam, state, _last(run), T_BC)
 
     return jax.vmap(one)(runs, exact)
 

@@ -71,7 +71,7 @@ def summarise_reference(records: Arrays, used: Bool[np.ndarray, " runs"]) -> dic
 
 def against_exact(filter_records: Arrays, reference: Arrays) -> dict[str, Any]:
     """σ and error of an estimate over those of the exact posterior, run by run."""
-    n = _position_dim(reference["exact_error"].shape[1])
+    n = position_dim(reference["exact_error"].shape[1])
     out: dict[str, Any] = {}
     for part, axes in (("position", slice(0, n)), ("orientation", slice(n, None))):
         own = _sigma(filter_records["covariance"], axes)
@@ -116,7 +116,7 @@ def _sampler(records: Arrays, kind: str) -> dict[str, float]:
 
 def _calibration(r: Arrays) -> dict[str, Any]:
     """Simulation-based calibration of position, orientation and velocity."""
-    n = _position_dim(r["exact_error"].shape[1])
+    n = position_dim(r["exact_error"].shape[1])
     axes = "xz" if n == 2 else "xyz"
     turns = ["θ"] if n == 2 else ["θx", "θy", "θz"]
     names = [*axes, *turns, *(f"v{axis}" for axis in axes), *(f"v{turn}" for turn in turns)]
@@ -142,7 +142,7 @@ def _minima(r: Arrays, kind: str) -> dict[str, float]:
 
 
 def _sigmas(P: Float[np.ndarray, "runs t t"]) -> dict[str, float]:
-    n = _position_dim(P.shape[-1])
+    n = position_dim(P.shape[-1])
     return {
         "position": float(np.median(_sigma(P, slice(0, n)))),
         "orientation": float(np.median(_sigma(P, slice(n, None)))),
@@ -150,7 +150,7 @@ def _sigmas(P: Float[np.ndarray, "runs t t"]) -> dict[str, float]:
 
 
 def _rmse(errors: Float[np.ndarray, "runs t"]) -> dict[str, float]:
-    n = _position_dim(errors.shape[1])
+    n = position_dim(errors.shape[1])
     return {
         "position": float(np.sqrt(np.mean(np.sum(errors[:, :n] ** 2, axis=1)))),
         "orientation": float(np.sqrt(np.mean(np.sum(errors[:, n:] ** 2, axis=1)))),
@@ -161,7 +161,8 @@ def _sigma(P: Float[np.ndarray, "runs t t"], axes: slice) -> Float[np.ndarray, "
     return np.sqrt(np.trace(P[:, axes, axes], axis1=1, axis2=2))
 
 
-def _position_dim(tangent_dim: int) -> int:
+def position_dim(tangent_dim: int) -> int:
+    """How many of a pose's numbers are of its position."""
     return {3: 2, 6: 3}[tangent_dim]
 
 

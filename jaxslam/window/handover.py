@@ -28,7 +28,7 @@ from jaxslam.window.problem import (
     reduced,
 )
 from jaxslam.window.record import Record
-from jaxslam.window.scale import Direction, rescaled, scaling
+from jaxslam.window.scale import Direction, rescaled, scaling, told
 
 
 def gauge_state(
@@ -52,6 +52,7 @@ def _state(slam, record, at, step, local, s: Direction, factor: Cholesky, like: 
     newest, by_x = _newest(slam, record, at, local)
     scale = _scale(slam, local, s)
     core, of_core = _core_rows(slam, newest, by_x, scale, like.core)
+    of_core = _less_told(of_core, like.core, jnp.sqrt(s.squared / told(slam, at, s)))
     values, of_landmarks = _landmark_rows(slam, record, at, local, (newest, by_x), scale)
     active = jnp.any(record.seen, axis=0)
     rows = _stacked(of_core, of_landmarks, active)
@@ -91,6 +92,14 @@ def _core_rows(slam, newest, by_x, scale: Rows, like) -> tuple[Any, Rows]:
     by_newest, unit = J[:, :-1], J[:, -1]
     by_y = jnp.einsum("c,mq->cmq", unit, scale.y)
     return _core(slam, like, newest, zero), Rows(by_newest @ by_x + jnp.outer(unit, scale.x), by_y)
+
+
+def _less_told(rows: Rows, core, factor: Scalar) -> Rows:
+    """With σ of λ so many times as large; it is correlated with nothing."""
+    if core.log_scale is None:
+        return rows
+    part = core.part("log_scale")
+    return Rows(*(row.at[part].multiply(factor) for row in rows))
 
 
 def _landmark_rows(

@@ -170,7 +170,7 @@ def _weighed(slam: EkfSlam, weighed: Weighed, record: Record) -> Weighed:
     factor = cholesky(local.information)
     own = jnp.sum(jax.vmap(lambda factor: factor.log_det())(local.landmarks))
     value = -(at.cost + factor.log_det() + own) / 2
-    shift = shift_of_scale(slam, local, scaling(slam, record, at), factor)
+    shift = shift_of_scale(slam, at, local, scaling(slam, record, at), factor)
     return Weighed(at, jnp.where(jnp.isfinite(value), value, -jnp.inf), shift, local.information)
 
 

@@ -85,6 +85,22 @@ def scaling(slam: EkfSlam, record: Record, at: Minimum) -> Direction:
     return Direction(x.at[layout.start].add(shared), y)
 
 
+def told(slam: EkfSlam, at: Minimum, s: Direction) -> Float[Array, ""]:
+    """1/variance of λ: |s|², without the accelerations where their size is not told."""
+    return s.squared - jnp.sum(_untold(slam, at.x, s) ** 2)
+
+
+def _untold(slam: EkfSlam, x: Float[Array, " N"], s: Direction) -> Float[Array, " N"]:
+    """Accelerations that scale and whose size is not told; zero elsewhere."""
+    layout = Layout.of(slam)
+    if slam.motion.noise_told:
+        return jnp.zeros_like(x)
+    own = slam.motion.noise_sigma.shape[-1]
+    place = jnp.arange(x.size) - layout.whole
+    own = (place >= 0) & (place % (layout.step + layout.each) < own)
+    return jnp.where(own & (s.x != 0), x, 0.0)
+
+
 def variances(
     local: Reduced, whitening: Float[Array, "N N"]
 ) -> tuple[Float[Array, " N"], Float[Array, "m q"]]:
@@ -96,11 +112,15 @@ def variances(
 
 
 def shift_of_scale(
-    slam: EkfSlam, local: Reduced, s: Direction, factor: Cholesky
+    slam: EkfSlam, at: Minimum, local: Reduced, s: Direction, factor: Cholesky
 ) -> Float[Array, ""]:
-    """λ of the mean, of a density that has its maximum at 0."""
+    """λ of the mean, of a density that has its maximum at 0.
+
+    What is not told of the accelerations follows the scale: it draws as the maximum did.
+    """
     of_x, of_y = variances(local, factor.whitening)
-    told = jnp.where(s.x != 0, 1 - of_x, 0.0)
-    p = slam.sensor.size
-    slope = jnp.sum(told) - jnp.sum(jnp.where(s.y[:, p:] != 0, 1 - of_y[:, p:], 0.0))
-    return jnp.clip(slope / s.squared, -MOST_SHIFT, MOST_SHIFT)
+    p, untold = slam.sensor.size, _untold(slam, at.x, s)
+    drawn = jnp.where(untold != 0, untold**2, 1 - of_x)
+    slope = jnp.sum(jnp.where(s.x != 0, drawn, 0.0))
+    slope = slope - jnp.sum(jnp.where(s.y[:, p:] != 0, 1 - of_y[:, p:], 0.0))
+    return jnp.clip(slope / told(slam, at, s), -MOST_SHIFT, MOST_SHIFT)

@@ -135,7 +135,7 @@ class FittedNoise(AbstractStaged):
         """The base filter with the σ that is believed now."""
         motion: Any = self._inner.motion
         sigma = self._factors(state) * jnp.asarray(motion.noise_sigma)
-        return with_motion(self.base, replace(motion, noise_sigma=sigma))
+        return with_motion(self.base, replace(motion, noise_sigma=sigma, noise_told=False))
 
     @property
     def _inner(self) -> Any:
