@@ -1,10 +1,12 @@
 """From rest: how many runs of a filter are lost, and how true the others are, frame by frame.
 
     python benchmarks/from_rest.py --filters scale_gauge+mixture3+rest --scenarios standstill-6dof
+    python benchmarks/from_rest.py --figure
 
 The camera sets out with a velocity that nobody told the filter. Results are added to
 `from_rest.json`; what it already has, of as many runs, is not measured again. The table in
-`docs/from-rest.md` is written from it, by `--page` alone from what is there.
+`docs/from-rest.md` is written from it, by `--page` alone from what is there. `--figure` draws one
+run beside it, whose modes live long.
 """
 
 from __future__ import annotations
@@ -14,14 +16,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import tyro
 from pages import with_table
 
 import jaxslam
+from jaxslam.consistency.modes import modes_of_run
+from jaxslam.consistency.montecarlo import draw, filter_run
 from jaxslam.files import write_atomically
+from jaxslam.plots.modes import plot_modes, worlds_of
+from jaxslam.simulation import sensor_of
 
 STEPS = (1, 3, 6, 10, 20, 30, 60)
 """Frames of the table."""
+TOLD = {"seed": 0, "run": 35, "steps": 40}
+"""The run of the figure: of the first sixty, one in which an EKF is in the world that dies."""
+SUM, EKF = "scale_gauge+mixture5+rest", "robocentric"
+"""Its filters."""
 BEGIN = "<!-- from_rest.py -->"
 """Behind this the page is written."""
 KEYS = ("dof", "band95", "nees", "nees_not_lost", "lost", "lost_ever", "rmse", "sigma")
@@ -47,6 +60,8 @@ class Options:
     """The page."""
     page: bool = False
     """Only write the page."""
+    figure: bool = False
+    """Only draw the figure."""
 
 
 def measure(options: Options, scenario: str, name: str) -> dict[str, Any]:
@@ -101,7 +116,24 @@ def _row(name: str, found: dict[str, Any]) -> list[str]:
     ]
 
 
+def draw_figure(options: Options) -> None:
+    """The modes of one run, beside the page."""
+    with jax.enable_x64(True):
+        scenario = jaxslam.scenario("standstill", steps=TOLD["steps"])
+        room, runs = draw(scenario, TOLD["run"] + 1, seed=TOLD["seed"])
+        run = jax.tree.map(lambda x: x[TOLD["run"]], runs)
+        made = jaxslam.make_filters(scenario, [SUM, EKF], ["inverse_scaling"])
+        rest, ekf = (jaxslam.cast(slam, jnp.float64) for slam in made.values())
+        _, path, _ = eqx.filter_jit(filter_run)(ekf, room, sensor_of(scenario), run)
+        modes = modes_of_run(rest, room, run)
+    worlds = worlds_of(run, modes, path.translation(), "the EKF", scenario.rate)
+    plot_modes(worlds, path=options.docs.with_suffix(".png"))
+
+
 def main(options: Options) -> None:
+    if options.figure:
+        draw_figure(options)
+        return
     results = json.loads(options.out.read_text()) if options.out.exists() else {}
     wanted = [] if options.page else [(s, f) for s in options.scenarios for f in options.filters]
     for scenario, name in wanted:

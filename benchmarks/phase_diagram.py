@@ -4,6 +4,9 @@
 writes `benchmarks/results/phase-diagram.csv`, one row for each world and filter, and from it
 `docs/phase-diagram.md` with its figures. The file is whole after every world: the same command
 again skips what is there, and another filter or another value of an axis adds its rows.
+
+The direction `from-rest` has no nominal motion, and an axis of its own: how little is known of the
+initial velocity. Filters with a window (`+rest`) cost seconds a run and take fewer runs.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ import os
 import statistics
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,7 @@ from typing import Any
 import tyro
 
 import jaxslam
+from jaxslam.consistency import CHUNK
 from jaxslam.consistency.statistics import mean_band
 from jaxslam.consistency.verdict import LOST_BOUND, together, verdict
 from jaxslam.files import write_atomically
@@ -37,8 +41,11 @@ DIRECTIONS = {
     "forward": (0.0, 1.2, 0.0),
     "turn": (0.0, 1.2, 0.3),
     "sideways-turn": (1.2, 0.0, 0.3),
+    "from-rest": (0.0, 0.0, 0.0),
 }
 """Nominal velocity (x, z, θ), m/s and rad/s; `turn` is forward and turning."""
+REST = "from-rest"
+MOVING = tuple(name for name in DIRECTIONS if name != REST)
 
 Row = dict[str, Any]
 KEY = {
@@ -51,7 +58,7 @@ KEY = {
 }
 """Columns that name a row, in the order of the file."""
 SETTINGS = {"runs": int, "seed": int, "steps": int}
-"""Columns that all rows of a file share."""
+"""Columns that all rows of a file share; `runs` those of the filters without a window."""
 COLUMNS = {
     **KEY,
     "velocity_x_m_s": float,
@@ -85,14 +92,18 @@ class Options:
     """σ of the acceleration, as multiples of (0.5, 0.5 m/s², 0.3 rad/s²)."""
     velocities: tuple[float, ...] = (0.02, 0.1, 0.5, 1.0)
     """σ of the initial velocity, as multiples of (0.1, 0.1 m/s, 0.05 rad/s)."""
+    rest_velocities: tuple[float, ...] = (0.5, 1.5, 5.0, 15.0)
+    """The same from rest."""
     depths: tuple[float, ...] = (1.5, 3.0, 6.0)
     """d_min, m: the prior on 1/z is N(1/(2 d_min), (1/(4 d_min))²)."""
-    directions: tuple[str, ...] = tuple(DIRECTIONS)
-    """Nominal motions."""
+    directions: tuple[str, ...] = MOVING
+    """Nominal motions; `from-rest` beside."""
     filters: tuple[str, ...] = ("robocentric", "world")
     landmarks: tuple[str, ...] = ("inverse_scaling", "inverse_depth")
     runs: int = 1000
     """Runs of every filter in every world."""
+    window_runs: int = 40
+    """Runs of a filter with a window, one by one: in a batch the longest window is waited for."""
     seed: int = 0
     """The same draws in every world: neighbours differ by their numbers and not by their luck."""
     steps: int = 60
@@ -109,24 +120,23 @@ def worlds(options: Options) -> Iterator[tuple[str, jaxslam.Scenario]]:
 
     Raises ValueError for an axis without values and for values that make no sense.
     """
-    for name in ("accelerations", "velocities", "depths"):
+    for name in ("accelerations", "velocities", "rest_velocities", "depths"):
         if not getattr(options, name):
             raise ValueError(f"{name} holds no value: an axis needs at least one")
-    directions = chosen("directions", options.directions, DIRECTIONS)
-    for (name, velocity), depth, a, v in itertools.product(
-        directions.items(), options.depths, options.accelerations, options.velocities
-    ):
-        yield (
-            name,
-            jaxslam.scenario(
-                "matched",
-                steps=options.steps,
-                velocity=velocity,
-                nearest_depth=depth,
-                acceleration_sigma=_scaled(a, ACCELERATION),
-                velocity_sigma=_scaled(v, VELOCITY),
-            ),
-        )
+    for name, velocity in chosen("directions", options.directions, DIRECTIONS).items():
+        velocities = options.rest_velocities if name == REST else options.velocities
+        for depth, a, v in itertools.product(options.depths, options.accelerations, velocities):
+            yield (
+                name,
+                jaxslam.scenario(
+                    "matched",
+                    steps=options.steps,
+                    velocity=velocity,
+                    nearest_depth=depth,
+                    acceleration_sigma=_scaled(a, ACCELERATION),
+                    velocity_sigma=_scaled(v, VELOCITY),
+                ),
+            )
 
 
 def _scaled(scale: float, sigmas: tuple[float, ...]) -> list[float]:
@@ -159,24 +169,34 @@ def _filters_of(scenario, options: Options):
     return jaxslam.make_filters(scenario, options.filters, options.landmarks)
 
 
+def _runs(filter_name: str, options: Options) -> int:
+    return options.window_runs if _has_window(filter_name) else options.runs
+
+
+def _has_window(filter_name: str) -> bool:
+    return "+rest" in filter_name
+
+
 def _measure(direction: str, scenario, filters, options: Options) -> list[Row]:
-    study = jaxslam.monte_carlo(scenario, filters, runs=options.runs, seed=options.seed)
-    results = jaxslam.summarise(study)["filters"]
-    return [
-        {
-            **_named(direction, scenario, name),
-            "velocity_x_m_s": scenario.velocity[0],
-            "velocity_z_m_s": scenario.velocity[1],
-            "turn_rate_rad_s": scenario.velocity[2],
-            "turn_acceleration_sigma_rad_s2": scenario.acceleration_sigma[2],
-            "turn_rate_sigma_rad_s": scenario.velocity_sigma[2],
-            "runs": options.runs,
-            "seed": options.seed,
-            "steps": options.steps,
-            **_numbers(result),
-        }
-        for name, result in results.items()
-    ]
+    """A row of every filter."""
+    return [_row(direction, scenario, name, slam, options) for name, slam in filters.items()]
+
+
+def _row(direction: str, scenario, name: str, slam, options: Options) -> Row:
+    runs, chunk = _runs(name, options), 1 if _has_window(name) else CHUNK
+    study = jaxslam.monte_carlo(scenario, {name: slam}, runs=runs, seed=options.seed, chunk=chunk)
+    return {
+        **_named(direction, scenario, name),
+        "velocity_x_m_s": scenario.velocity[0],
+        "velocity_z_m_s": scenario.velocity[1],
+        "turn_rate_rad_s": scenario.velocity[2],
+        "turn_acceleration_sigma_rad_s2": scenario.acceleration_sigma[2],
+        "turn_rate_sigma_rad_s": scenario.velocity_sigma[2],
+        "runs": runs,
+        "seed": options.seed,
+        "steps": options.steps,
+        **_numbers(jaxslam.summarise(study)["filters"][name]),
+    }
 
 
 def _named(direction: str, scenario, name: str) -> Row:
@@ -251,11 +271,13 @@ def write(rows: Iterable[Row], path: Path) -> None:
 def check_same(rows: list[Row], options: Options) -> None:
     """Raise ValueError unless rows made with these options may join the file."""
     for row in rows:
-        for name in SETTINGS:
-            if row[name] != getattr(options, name):
+        now = {name: getattr(options, name) for name in SETTINGS}
+        now["runs"] = _runs(row["filter"], options)
+        for name, value in now.items():
+            if row[name] != value:
                 raise ValueError(
                     f"cannot go on with {options.out}: it was made with {name} {row[name]}, "
-                    f"now {getattr(options, name)}; give another --out"
+                    f"now {value}; give another --out"
                 )
 
 
@@ -278,13 +300,28 @@ def judged(rows: list[Row], lost_bound: float) -> list[Row]:
 
 def page(rows: list[Row], options: Options) -> str:
     """The Markdown page, from judged rows."""
+    moving, resting = _apart(rows)
+    parts = [
+        "# Phase diagram: where a filter holds",
+        *(_of_moving(moving, options) if moving else []),
+        *(_of_rest(resting, options) if resting else []),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _apart(rows: list[Row]) -> tuple[list[Row], list[Row]]:
+    """Those with a nominal motion, and those from rest."""
+    resting = [row for row in rows if row["direction"] == REST]
+    return [row for row in rows if row["direction"] != REST], resting
+
+
+def _of_moving(rows: list[Row], options: Options) -> list[str]:
     low, high = mean_band(rows[0]["dof"], options.runs)
     wide = mean_band(rows[0]["dof"], options.runs, together(len(rows)))
     csv_file = Path(os.path.relpath(options.out, options.docs)).as_posix()
     seconds = statistics.median(row["seconds"] for row in rows)
     names = _filters(rows)
-    parts = [
-        "# Phase diagram: where a filter holds",
+    return [
         f"Made by `python benchmarks/phase_diagram.py --runs {options.runs}` from "
         f"[{options.out.name}]({csv_file}); do not edit. "
         f"{len(rows)} cells, {options.runs} runs each, {options.steps} steps, seed "
@@ -313,7 +350,33 @@ def page(rows: list[Row], options: Options) -> str:
         "## All cells",
         *(f"![{'/'.join(name)}]({_figure_name(name)})" for name in names),
     ]
-    return "\n\n".join(parts) + "\n"
+
+
+def _of_rest(rows: list[Row], options: Options) -> list[str]:
+    depths = ", ".join(f"{d:g}" for d in sorted({row["nearest_depth_m"] for row in rows}))
+    filters, landmarks = (
+        " ".join(dict.fromkeys(row[name] for row in rows)) for name in ("filter", "landmarks")
+    )
+    return [
+        "## From rest",
+        f"`--directions {REST} --filters {filters} --landmarks {landmarks} "
+        f"--window-runs {options.window_runs}` adds worlds in which the camera's mean velocity is "
+        f"zero, and only σ of the initial velocity is told, up to a walker's; d_min {depths} m. "
+        "One Gaussian cannot say that a camera goes left or right ([from-rest.md](from-rest.md)).",
+        *(_how_many(name, rows) for name in _filters(rows)),
+        "![Mean NEES from rest](phase-diagram-from-rest.png)",
+        _shares(rows, _filters(rows)),
+    ]
+
+
+def _how_many(name: tuple[str, str], rows: list[Row]) -> str:
+    """The runs of a filter's cells, and what band that makes."""
+    row = _select(rows, name, REST)[0]
+    low, high = mean_band(row["dof"], row["runs"])
+    return (
+        f"`{'/'.join(name)}`: {row['runs']} runs a cell, 95 % band {low:.2f}–{high:.2f}; "
+        f"one lost run is {1 / row['runs']:.1%}."
+    )
 
 
 def _filters(rows: list[Row]) -> list[tuple[str, str]]:
@@ -393,7 +456,14 @@ def _select(rows: list[Row], name: tuple[str, str], direction: str) -> list[Row]
 
 
 def draw(rows: list[Row], options: Options) -> None:
-    """One figure of all filters at the middle depth, and one of every filter at all depths."""
+    """One figure of all filters at the middle depth, one of every filter at all depths, and one of
+    the worlds from rest."""
+    rows, resting = _apart(rows)
+    if resting:
+        _draw_rest(resting, options)
+    if not rows:
+        return
+    rows = sorted(rows, key=lambda row: list(DIRECTIONS).index(row["direction"]))
     depths = sorted({row["nearest_depth_m"] for row in rows})
     middle = depths[len(depths) // 2]
     cells = [_cell(row, _label(row)) for row in rows if row["nearest_depth_m"] == middle]
@@ -408,8 +478,20 @@ def draw(rows: list[Row], options: Options) -> None:
         _draw(cells, title, options, _figure_name(name))
 
 
+def _draw_rest(rows: list[Row], options: Options) -> None:
+    """A column for each filter."""
+    cells = [
+        replace(
+            _cell(row, f"d_min {row['nearest_depth_m']:g} m"),
+            column=f"{_label(row)}\n{row['runs']} runs a cell",
+        )
+        for row in sorted(rows, key=lambda row: _has_window(row["filter"]))
+    ]
+    title = "from rest: mean pose NEES (ideal 3)"
+    _draw(cells, title, options, "phase-diagram-from-rest.png")
+
+
 def _draw(cells: list[PhaseCell], title: str, options: Options, name: str) -> None:
-    cells = sorted(cells, key=lambda cell: list(DIRECTIONS).index(cell.column))
     plot_phase_diagram(
         cells,
         x_label="σ of the acceleration, m/s² (of turning: × 0.6 rad/s²)",
@@ -454,7 +536,13 @@ def main(options: Options) -> None:
     check_same(found, options)
     for rows in measure(options, found):
         write(rows, options.out)
-    rows = judged(read(options.out), options.lost_bound)
+    report(options)
+
+
+def report(options: Options) -> None:
+    """Draw the file and write its page."""
+    found = _apart(read(options.out))
+    rows = [row for part in found for row in judged(part, options.lost_bound)]
     draw(rows, options)
     with write_atomically(options.docs / "phase-diagram.md") as path:
         path.write_text(page(rows, options))

@@ -276,9 +276,10 @@ def test_the_figure_is_titled_by_the_verdicts_and_its_curves_by_what_was_lost():
     study = jaxslam.monte_carlo(SCENARIO, filters(), runs=20)
     study = with_nees(study, 7, 2, 400.0)
     summary = jaxslam.summarise(study)
-    axes = plot_consistency(study, summary).axes[0]
+    figure = plot_consistency(study, summary)
+    axes = figure.axes[0]
     verdict = sentences(summary["filters"]["inverse_scaling"]["verdict"])[0]
-    assert axes.get_title(loc="left").splitlines()[1:] == [f"inverse_scaling: {verdict}"]
+    assert figure.get_suptitle().splitlines()[1:] == [f"inverse_scaling: {verdict}"]
     legend = axes.get_legend()
     assert legend is not None
     labels = [text.get_text() for text in legend.get_texts()]

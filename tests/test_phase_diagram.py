@@ -132,6 +132,21 @@ def test_all_worlds_of_the_grid_share_one_structure():
     assert len({structure(scenario) for scenario in grid}) == 1
 
 
+def test_worlds_from_rest_have_an_axis_of_their_own():
+    options = phase_diagram.Options(
+        directions=("from-rest", "turn"), accelerations=(1.0,), depths=(3.0,)
+    )
+    found = list(phase_diagram.worlds(options))
+    at_rest = [scenario for name, scenario in found if name == "from-rest"]
+    assert [scenario.velocity for scenario in at_rest] == [(0.0, 0.0, 0.0)] * 4
+    assert [scenario.velocity_sigma[0] for scenario in at_rest] == [0.05, 0.15, 0.5, 1.5]
+    assert [scenario.velocity_sigma[2] for scenario in at_rest] == [0.025, 0.075, 0.25, 0.75]
+    assert at_rest[2].acceleration_sigma == (0.5, 0.5, 0.3)
+    turning = [scenario for name, scenario in found if name == "turn"]
+    assert [scenario.velocity_sigma[0] for scenario in turning] == [0.002, 0.01, 0.05, 0.1]
+    assert len({structure(scenario) for _, scenario in found}) == 1
+
+
 # --- the file -----------------------------------------------------------------------------------
 
 
@@ -206,6 +221,34 @@ def test_other_settings_are_refused(tmp_path):
     assert phase_diagram.read(path) == rows
 
 
+def test_filters_with_a_window_take_their_own_number_of_runs_one_by_one(tmp_path, monkeypatch):
+    asked = {}
+
+    def monte_carlo(scenario, filters, *, runs, seed, chunk):
+        (name,) = filters
+        asked[name] = runs, chunk
+        found = {key: 0 for key in ("dof", "inside", "diverged")}
+        curves = {key: [3.0] for key in ("nees", "nees_median", "nees_not_lost", "lost")}
+        sizes = {key: {"position": [0.1]} for key in ("rmse", "sigma")}
+        each = found | curves | sizes | {"band95": (2.0, 4.0), "seconds": {"run": 1.0}}
+        return {"filters": {name: each}}
+
+    monkeypatch.setattr(jaxslam, "monte_carlo", monte_carlo)
+    monkeypatch.setattr(jaxslam, "summarise", lambda study: study)
+    options = dataclasses.replace(OPTIONS, runs=100, window_runs=7, out=tmp_path / "x.csv")
+    filters = {"robocentric/inverse_scaling": None, "mixture5+rest/inverse_scaling": None}
+    ((_, scenario), *_) = phase_diagram.worlds(options)
+    rows = phase_diagram._measure("sideways", scenario, filters, options)
+    assert asked == {
+        "robocentric/inverse_scaling": (100, phase_diagram.CHUNK),
+        "mixture5+rest/inverse_scaling": (7, 1),
+    }
+    assert [row["runs"] for row in rows] == [100, 7]
+    phase_diagram.check_same(rows, options)
+    with pytest.raises(ValueError, match=r"made with runs 7, now 8; give another"):
+        phase_diagram.check_same(rows, dataclasses.replace(options, window_runs=8))
+
+
 def test_a_file_of_something_else_is_refused(tmp_path):
     path = tmp_path / "x.csv"
     path.write_text("a,b\n1,2\n")
@@ -226,6 +269,7 @@ def test_a_file_of_something_else_is_refused(tmp_path):
         ({"depths": (0.0,)}, "nearest_depth must be positive"),
         ({"runs": 0}, "runs must be at least 1"),
         ({"accelerations": ()}, "accelerations holds no value"),
+        ({"rest_velocities": ()}, "rest_velocities holds no value"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(tmp_path, fields, message):
@@ -275,6 +319,30 @@ def test_the_page_counts_what_the_rows_say():
     assert "| robocentric/inverse_scaling | sideways | 8 | 50% | 62% | 12% | 12% | 12% |" in page
     assert "| robocentric/inverse_scaling | sideways | 0.5 |" in page
     assert "2.54–3.50" in page  # 100 runs
+
+
+def test_what_is_found_from_rest_has_a_section_and_a_figure_of_its_own(tmp_path):
+    """And changes neither the rest of the page nor its band of all cells."""
+    moving = synthetic_rows()
+    resting = [
+        row | {"direction": "from-rest", "velocity_x_m_s": 0.0, "filter": name, "runs": runs}
+        for row in moving[:2]
+        for name, runs in (("mixture5+rest", 20), ("robocentric", 100))
+    ]
+    options = dataclasses.replace(SYNTHETIC, window_runs=20, docs=tmp_path)
+    options = dataclasses.replace(options, out=tmp_path / "x.csv")
+    pages = []
+    for rows in (moving, [*moving, *resting]):
+        phase_diagram.write(rows, options.out)
+        phase_diagram.report(options)
+        pages.append((tmp_path / "phase-diagram.md").read_text())
+    before, after = pages
+    assert after.startswith(before.rstrip("\n"))
+    section = after[len(before) :]
+    assert "`mixture5+rest/inverse_scaling`: 20 runs a cell, 95 % band 2.02–4.16" in section
+    assert "one lost run is 5.0%" in section
+    assert "| robocentric/inverse_scaling | from-rest | 2 | 100% |" in section
+    assert (tmp_path / "phase-diagram-from-rest.png").stat().st_size > 500
 
 
 def test_the_figure_shows_every_cell_once():

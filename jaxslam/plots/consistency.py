@@ -11,12 +11,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from jaxslam.consistency import Study, summarise
-from jaxslam.consistency.statistics import chi2_quantile
 from jaxslam.consistency.verdict import headline
+from jaxslam.plots.landmarks import region_from_above
 from jaxslam.plots.style import GREY, line_style, new_figure, save
 
-_FARTHEST = 1 / 60
-"""Least inverse distance that the map draws, 1/m."""
+_LEGEND_LINE = 0.05
+"""Of the height of the axes of NEES, on which its legend hides no curve."""
 _MEDIAN_OF_NORMAL = 0.6745
 """Median of |x| for a standard normal x."""
 
@@ -27,14 +27,17 @@ def plot_consistency(
     """Draw a study; `summary` is `summarise(study)`, made here if it is not given.
 
     Above: the mean NEES of every filter with its exact 95 % band, and the map of run 0 at its
-    end. Where the scale is free, below that: NEES given the scale, and the scale's own error.
-    Below: the error of run 0 with ±3σ, axis by axis. Written to `path` where one is given.
+    end, in the same colours. Where the scale is free, below that: NEES given the scale, and the
+    scale's own error. Below: the error of run 0 with ±3σ, axis by axis. Written to `path` where
+    one is given.
     """
     summary = summarise(study) if summary is None else summary
     geometry = study.scenario.world
     rows, free = geometry.tangent_dim // 3, summary["scale_free"]
     heights = [2.1, *[1.3] * free, *[1] * rows]
-    figure = new_figure(12.5, 0.8 + 2.1 * sum(heights))
+    figure = new_figure(12.5, 1.0 + 0.2 * len(study.filters) + 2.1 * sum(heights))
+    # Over the whole width, as the verdicts are longer than the axes that they are on.
+    figure.suptitle(_title(summary), x=0.01, ha="left", fontsize=10)
     grid = figure.add_gridspec(len(heights), 6, height_ratios=heights)
     _plot_nees(figure.add_subplot(grid[0, :4]), summary)
     samples = {name: study.store.load(name, study.chunks[0]) for name in study.filters}
@@ -71,11 +74,12 @@ def _plot_nees(axes: Axes, summary: dict[str, Any]) -> None:
     )
     axes.set_yscale("log")
     bottom, top = axes.get_ylim()
-    axes.set_ylim(min(bottom, first["dof"] / 2), max(2 * top, first["dof"] * 2.5))
+    bottom, top = min(bottom, first["dof"] / 2), max(top, first["dof"] * 1.2)
+    legend = _LEGEND_LINE * (len(summary["filters"]) + 2)
+    axes.set_ylim(bottom, bottom * (top / bottom) ** (1 / (1 - min(legend, 0.5))))
     _name_decades(axes)
     _over_time(axes, time)
     axes.set_ylabel(f"pose NEES (ideal {first['dof']})")
-    axes.set_title(_title(summary), fontsize=10, loc="left")
     axes.legend(fontsize=8, loc="upper left")
 
 
@@ -172,22 +176,22 @@ def _plot_map(axes: Axes, samples: dict[str, Any]) -> None:
     truth = first["sample_true_path"][:, :-1, -1]
     seen = first["sample_active"].nonzero()[0]
     points = first["sample_points"]
-    axes.plot(truth[:, 0], truth[:, -1], color="black", lw=1.2, label="truth")
-    axes.plot(points[:, 0], points[:, -1], "k+", ms=6, mew=1, label="landmarks")
-    for i, (name, records) in enumerate(samples.items()):
+    axes.plot(truth[:, 0], truth[:, -1], color="black", lw=1.2)
+    axes.plot(points[:, 0], points[:, -1], "k+", ms=6, mew=1)
+    for i, records in enumerate(samples.values()):
         style = line_style(i)
         path = records["sample_path"][:, :-1, -1]
-        axes.plot(path[:, 0], path[:, -1], lw=1.5, label=name, **style)
+        axes.plot(path[:, 0], path[:, -1], lw=1.5, **style)
         for slot in records["sample_active"].nonzero()[0]:
-            region = _region(
+            region = region_from_above(
                 records["sample_landmarks"][slot], records["sample_landmarks_covariance"][slot]
             )
             axes.plot(*(path[-1, [0, -1], None] + region), lw=0.8, alpha=0.8, **style)
     _set_view(axes, truth[:, [0, -1]], points[seen][:, [0, -1]])
     axes.set_xlabel("x, m")
     axes.set_ylabel("z, m")
-    axes.set_title("run 0 from above, landmarks with 95 % regions", fontsize=9)
-    axes.legend(fontsize=7, loc="best")
+    # Said in the title: a legend would hide landmarks and ticks of a narrow map.
+    axes.set_title("run 0 from above, landmarks with 95 % regions\nblack: the truth", fontsize=9)
     axes.grid(alpha=0.25)
 
 
@@ -200,13 +204,3 @@ def _set_view(axes: Axes, path: np.ndarray, points: np.ndarray) -> None:
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)
     axes.set_aspect("equal", adjustable="box")
-
-
-def _region(mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """The 95 % ellipse of azimuth and inverse distance, bent into the plane; (2, points)."""
-    values, vectors = np.linalg.eigh(covariance)
-    angle = np.linspace(0, 2 * np.pi, 181)
-    circle = np.sqrt(chi2_quantile(0.95, 2)) * np.stack([np.cos(angle), np.sin(angle)])
-    azimuth, inverse = mean[:, None] + vectors @ (np.sqrt(np.maximum(values, 0))[:, None] * circle)
-    distance = 1 / np.maximum(inverse, _FARTHEST)
-    return distance * np.stack([np.sin(azimuth), np.cos(azimuth)])

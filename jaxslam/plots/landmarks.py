@@ -9,6 +9,9 @@ from matplotlib.axes import Axes
 from jaxslam.consistency.statistics import chi2_quantile
 from jaxslam.plots.style import COLOURS
 
+_FARTHEST = 1 / 60
+"""Least inverse distance that is drawn, 1/m."""
+
 
 def plot_landmark_clouds(
     axes: Axes,
@@ -38,3 +41,18 @@ def plot_landmark_clouds(
         )
         name = f"{label}: 95 % ellipse to first order" if i == 0 else None
         axes.plot(*ellipse, color=colour, lw=1.0, label=name)
+
+
+def region_from_above(
+    mean: Float[np.ndarray, " 2"], covariance: Float[np.ndarray, "2 2"], share: float = 0.95
+) -> Float[np.ndarray, "2 k"]:
+    """The outline, from the camera, of so much of a Gaussian in azimuth and inverse distance.
+
+    It is an ellipse bent into the plane; what reaches behind the camera ends in front of it, far.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.linspace(0, 2 * np.pi, 181)
+    circle = np.sqrt(chi2_quantile(share, 2)) * np.stack([np.cos(angle), np.sin(angle)])
+    azimuth, inverse = mean[:, None] + vectors @ (np.sqrt(np.maximum(values, 0))[:, None] * circle)
+    distance = 1 / np.maximum(inverse, _FARTHEST)
+    return distance * np.stack([np.sin(azimuth), np.cos(azimuth)])
