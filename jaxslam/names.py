@@ -158,8 +158,8 @@ noise is remembered (`noise`); none for the remedies `oc`, `fej`."""
 RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gauge+scene50+mixture9"}
 """The filter called `recommended`, by geometry, where the velocity is told."""
 FROM_REST = {
-    "planar": "scale_gauge+scene100+mixture5+rest+noise",
-    "spatial": "scale_gauge+scene100+mixture3+rest8+noise",
+    "planar": "scale_gauge+scene50+mixture5+rest",
+    "spatial": "scale_gauge+scene50+mixture3+rest8",
 }
 """The one where it is not: the camera sets out from rest, or nobody says how."""
 

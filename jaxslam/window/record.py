@@ -20,6 +20,8 @@ from jaxslam.forms.state import Features
 from jaxslam.linalg import cholesky
 from jaxslam.models.motion import AbstractMotion
 
+TIED = 0.8
+"""Share of the landmarks in view."""
 STILL = 5.0
 """σ of χ², above its mean, up to which pixels are where they were."""
 
@@ -56,6 +58,13 @@ class Record(eqx.Module):
     @property
     def full(self) -> Bool[Array, ""]:
         return self.last == self.frames - 1
+
+    @property
+    def tied(self) -> Bool[Array, ""]:
+        """Whether most of what the newest frame sees was seen in the first half of the frames."""
+        seen = self.seen[self.last]
+        long = seen & (2 * self.first <= self.last)
+        return jnp.sum(long) >= TIED * jnp.sum(seen)
 
     @property
     def compared(self) -> Bool[Array, "F m"]:

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxslam.arrays import AnyArray
 from jaxslam.slam.filter import EkfSlam
@@ -87,7 +87,7 @@ def _noises(slam: EkfSlam, record: Record, fewer: Record, x: Float[Array, " N"])
     return x.at[layout.whole :].set(jnp.concatenate([own, drawn], axis=1).ravel())
 
 
-def _sums(steps: Float[Array, "steps ..."], frames: int) -> Float[Array, "steps ..."]:
+def _sums(steps: Shaped[Array, "steps ..."], frames: int) -> Shaped[Array, "steps ..."]:
     """Over the steps between frames that stay; zero behind."""
     segment = np.searchsorted(kept(frames), np.arange(frames - 1), side="right") - 1
     return jax.ops.segment_sum(steps, segment, num_segments=frames - 1)

@@ -37,7 +37,7 @@ MEMORY = 100
 """Frames after which what they said of the noise has faded to 1/e."""
 FACTORS = 2.0 ** np.arange(-4, 5)
 """Of σ; so far may it be from what was told."""
-TOLD = np.log(2.0)
+TOLD = np.log(3.0)
 """σ of the log of what was told."""
 
 

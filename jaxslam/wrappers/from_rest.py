@@ -43,7 +43,7 @@ LEAST_STEPS = 8
 """Since frame 0 before the sum may go on alone."""
 KNOWN = 0.03
 """σ of the translation, in translations, given the scale: below it parallax is there."""
-MOVED = 0.3
+MOVED = 0.1
 """The same, below which a camera has done more than turn."""
 
 
@@ -174,7 +174,7 @@ class FromRest(AbstractStaged):
 
     def _ready(self, state: RestState) -> Bool[Array, ""]:
         """Whether one mode is left whose translation is known; or, where there is no room, whether
-        there is a translation."""
+        there is a translation, or its landmarks leave the view."""
         member = self.base.likeliest(state.sum)
         part = member.core.part("pose")
         n = self.base.base.motion.geometry.point_dim
@@ -185,7 +185,8 @@ class FromRest(AbstractStaged):
         enough = state.record.steps >= LEAST_STEPS
         alone = state.sum.log_weights[0] > -1e-3
         moved = variance < MOVED**2 * squared
-        return (enough & alone & known) | (state.record.full & moved)
+        over = moved | ~state.record.tied
+        return (enough & alone & known) | (state.record.full & over)
 
 
 def _members(ekf: EkfSlam, record: Record, modes: Modes, members: State) -> State:
