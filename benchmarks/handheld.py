@@ -263,8 +263,7 @@ Written by `python benchmarks/handheld.py`; all numbers are in `benchmarks/resul
 random, 30 landmarks in view at depths from 1 to 6 m (a car: 5 to 50 m), pixel σ 0.3. No filter is
 told where the camera is going: its prior is a velocity of 0 ± 1 m/s and 0 ± 1 rad/s with white
 accelerations of 4 m/s² and 6 rad/s² (a car: ± 10 m/s), and on 1/z N(0.5, 0.25²) (a car: 0.1,
-0.05). The metre in which it is told all this is itself uncertain, by 40 %: what `scale_gauge`
-claims of the scale is never less.
+0.05). The metre in which it is told all this is itself uncertain, by 40 %.
 
 *tracks-DRIVE*: recorded tracks of points in real pictures, at most 40 at a time, known movers
 left out, pixel σ 1, at 10 Hz, points beyond 17 m and a velocity of 0 ± 10 m/s; the truth's own σ
