@@ -1,11 +1,13 @@
 """The scale gauge: (λ, ṽ, ω̃) with v = e^λ ṽ and ω = e^−λ ω̃ say what the prior on v and ω says."""
 
+from dataclasses import replace
 from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Case, quick_jit
+from cases import Case, pose_run, quick_jit
 
 from jaxslam.models.scale import velocity_in_gauge
 
@@ -112,3 +114,19 @@ def test_a_new_landmark_has_the_moments_of_its_prior(name):
     assert_moments(np.column_stack([log_scale, held]), [-P / 2, rho, rho], expected, also=2 * P**2)
     omega = held * np.exp(-log_scale)
     assert_moments(omega, [rho, rho], np.diag([sigma_rho**2] * 2), also=5 * P)
+
+
+def test_a_metre_that_is_not_known_is_in_the_metric_covariance_and_nowhere_else():
+    """Nothing that is seen tells of it, and it tells nothing of what is seen."""
+    of = Case("matched-turn", 1, steps=8)
+    slam = of.filter("scale_gauge")
+    unknown = replace(slam, depth=replace(slam.depth, unit=0.4))
+    _, (known, P, nis, _) = pose_run(of, slam)
+    _, (poses, wide, same_nis, _) = pose_run(of, unknown)
+    np.testing.assert_allclose(same_nis, nis, rtol=1e-9)
+    np.testing.assert_allclose(poses.parameters(), known.parameters(), atol=1e-12)
+    pose = jax.tree.map(lambda x: x[-1], poses)
+    # T Exp(δ): the displacement in the camera's axes, all of it with the metre.
+    along = np.concatenate([pose.inverse().rotation() @ pose.translation(), [0.0]])
+    np.testing.assert_allclose(wide[-1] - P[-1], 0.16 * np.outer(along, along), atol=1e-9)
+    assert np.linalg.norm(along) > 0.1
