@@ -48,7 +48,7 @@ class Worlds:
     landmarks: Float[np.ndarray, "frames modes m 2"]
     """Azimuth and inverse distance from the newest camera, 1/m."""
     covariances: Float[np.ndarray, "frames modes m 2 2"]
-    filtered: Float[np.ndarray, "frames 2"]
+    filtered: Float[np.ndarray, "steps 2"]
     """Where a filter with one mode believes the camera to be, m."""
     filter_name: str
     rate: float
@@ -66,7 +66,7 @@ class Worlds:
 
 
 def worlds_of(
-    run: Run, modes: Modes, filtered: Float[AnyArray, "frames n"], filter_name: str, rate: float
+    run: Run, modes: Modes, filtered: Float[AnyArray, "steps n"], filter_name: str, rate: float
 ) -> Worlds:
     """What is seen from above, (x, z), of a run, of its modes and of where a filter believes the
     camera to be in every frame after 0."""

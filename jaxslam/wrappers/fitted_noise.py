@@ -9,7 +9,7 @@ update of the whole filter has told of it,
     Λ = V⁺⁻¹ − V⁻⁻¹,  η = V⁺⁻¹ v⁺ − V⁻⁻¹ v⁻,
 
 and is weighed by how well it had foreseen that (multiple models: Magill 1965). The filter goes on
-with the root of the weighted mean of σ². What is long ago fades from the weights, as motion changes.
+with the root of the weighted mean of σ². What is long ago fades from the weights.
 """
 
 from __future__ import annotations
