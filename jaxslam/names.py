@@ -206,8 +206,9 @@ def make_filters(
     `recommended` stands for `recommended_name`. The calibration is treated as the scenario says,
     unless another treatment is named. Raises ValueError.
     """
-    recommended = recommended_name(motion_of(scenario))
-    names = [recommended if name == "recommended" else name for name in filters]
+    names = [
+        recommended_name(motion_of(scenario)) if name == "recommended" else name for name in filters
+    ]
     chosen("filters", [name.partition("+")[0] for name in names], FILTERS)
     return {
         f"{name}/{landmark.name}": make_filter(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.files import write_atomically
+from jaxslam.files import read_json, write_atomically
 
 MODEL = "pinhole"
 INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -109,17 +109,7 @@ def read_calibration(path: str | Path) -> Calibration:
     Raises `ValueError`, naming the file, where it is missing, is not JSON, or does not hold a
     pinhole camera.
     """
-    path = Path(path)
-    try:
-        fields = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot read the calibration ({error.strerror})") from None
-    except ValueError as error:  # bad JSON and bad UTF-8 alike
-        raise ValueError(f"{path}: not a JSON file ({error})") from None
-    try:
-        return from_fields(fields)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+    return read_json(path, "calibration", from_fields)
 
 
 def write_calibration(path: str | Path, calibration: Calibration, **further: Any) -> None:

@@ -4,7 +4,6 @@ MonoSLAM's start (Davison, Reid, Molton, Stasse, PAMI 2007): a picture of known 
 """
 
 import itertools
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxslam.files import read_json
 from jaxslam.video.calibration import Calibration
 from jaxslam.video.recording import read_image
 
@@ -89,17 +89,8 @@ def read_target(path: str | Path) -> Target:
     point may have a `patch`, an image file beside the JSON's. Raises ValueError, naming file and
     point, for anything else; further keys are ignored.
     """
-    path = Path(path)
-    try:
-        fields = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot read the target ({error.strerror})") from None
-    except ValueError as error:  # bad JSON and bad UTF-8 alike
-        raise ValueError(f"{path}: not a JSON file ({error})") from None
-    try:
-        return _from_fields(fields, path.parent)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+    folder = Path(path).parent
+    return read_json(path, "target", lambda fields: _from_fields(fields, folder))
 
 
 def _from_fields(fields: Any, folder: Path) -> Target:

@@ -16,13 +16,6 @@ DATA = Path(__file__).parents[3] / "shared" / "data"
 
 
 @pytest.fixture
-def calibration(tmp_path):
-    path = tmp_path / "camera.json"
-    write_calibration(path, Calibration(WIDTH, HEIGHT, 60.0, 60.0, 31.5, 23.5))
-    return path
-
-
-@pytest.fixture
 def folder(tmp_path):
     """Images 1 to 11 without leading zeros."""
     path = tmp_path / "pictures"

@@ -10,17 +10,9 @@ import pytest
 from pictures import HEIGHT, WIDTH, brightness, picture
 
 from jaxslam.video import camera, file
-from jaxslam.video.calibration import Calibration, write_calibration
 from jaxslam.video.opening import open_source
 
 RATE = 25.0
-
-
-@pytest.fixture
-def calibration(tmp_path):
-    path = tmp_path / "camera.json"
-    write_calibration(path, Calibration(WIDTH, HEIGHT, 60.0, 60.0, 31.5, 23.5))
-    return path
 
 
 @pytest.fixture
