@@ -544,3 +544,22 @@ def test_only_the_living_are_worked_on():
     jax.effects_barrier()
     np.testing.assert_array_equal(after, jnp.where(alive, 2 * values, values))
     assert len(found) == 2
+
+
+def test_a_metre_that_is_not_known_stays_so_and_changes_nothing_else():
+    slam, record, x, y = case("standstill-6dof", White, None, 3)
+    unknown = replace(slam, depth=replace(slam.depth, unit=0.4))
+    at, m = started(x, y), FIRST.size
+    first = Features(jnp.arange(m), record.measured[0], jnp.zeros(m, bool))
+
+    def covariance(slam):
+        state = gauge_state(slam, record, at, jnp.zeros(()), slam.init(m, first))
+        return state.covariance, state.core.part("log_scale").stop - 1
+
+    (P, _), (wide, place) = (
+        quick_jit(lambda slam=slam: covariance(slam))() for slam in (slam, unknown)
+    )
+    np.testing.assert_allclose(wide[place, place], 0.16, rtol=1e-12)
+    assert not np.delete(wide[place], place).any()
+    rest = np.delete(np.delete(wide, place, 0), place, 1)
+    np.testing.assert_allclose(rest, P, atol=1e-12)

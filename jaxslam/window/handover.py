@@ -57,10 +57,7 @@ def _state(slam, record, at, step, local, s: Direction, factor: Cholesky, like: 
     active = jnp.any(record.seen, axis=0)
     rows = _stacked(of_core, of_landmarks, active)
     landmarks = jnp.where(active[:, None], values, like.landmarks)
-    covariance = _covariance(local, factor, rows)
-    if core.log_scale is not None and slam.depth.unit is not None:
-        place = core.part("log_scale").start + 1
-        covariance = covariance.at[place, place].add(slam.depth.unit**2)
+    covariance = _with_metre(_covariance(local, factor, rows), like)
     return shifted(State(core, landmarks, active, covariance, like.memory), -rows.x @ step)
 
 
@@ -95,6 +92,13 @@ def _core_rows(slam, newest, by_x, scale: Rows, like) -> tuple[Any, Rows]:
     by_newest, unit = J[:, :-1], J[:, -1]
     by_y = jnp.einsum("c,mq->cmq", unit, scale.y)
     return _core(slam, like, newest, zero), Rows(by_newest @ by_x + jnp.outer(unit, scale.x), by_y)
+
+
+def _with_metre(covariance: Float[Array, "n n"], like: State) -> Float[Array, "n n"]:
+    """What is not known of the metre, behind λ, is as it was: nothing tells of it."""
+    part = like.core.part("log_scale")
+    metre = slice(part.start + 1, part.stop)
+    return covariance.at[metre, metre].set(like.covariance[metre, metre])
 
 
 def _less_told(rows: Rows, core, factor: Scalar) -> Rows:
