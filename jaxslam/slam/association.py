@@ -66,9 +66,12 @@ Association = Callable[[Candidates], Bool[Array, " m"]]
 """Which candidates are believed."""
 
 
-def candidates(slam: AbstractStaged, state: Any, control: Any, features: Features) -> Candidates:
+def candidates(
+    slam: AbstractStaged, state: Any, control: Any, features: Features, tolerance: Any = 0.0
+) -> Candidates:
     """The innovations of features of a predicted state that is one Gaussian.
 
+    `tolerance` is a σ, in the unit of a measurement, by which each may be off beyond its noise.
     Raises ValueError for a filter whose innovations have no covariance.
     """
     _, innovation = slam.update(state, control, features)
@@ -77,8 +80,9 @@ def candidates(slam: AbstractStaged, state: Any, control: Any, features: Feature
             f"matches of {type(slam).__name__} cannot be tested: its innovations have no covariance"
         )
     m, p = innovation.residual.shape
-    S = innovation.covariance.reshape(m, p, m, p)
-    return Candidates(innovation.residual, S, innovation.used)
+    S = innovation.covariance
+    S += tolerance**2 * jnp.eye(m * p, dtype=S.dtype)
+    return Candidates(innovation.residual, S.reshape(m, p, m, p), innovation.used)
 
 
 def everything(found: Candidates) -> Bool[Array, " m"]:

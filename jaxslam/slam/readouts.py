@@ -75,6 +75,21 @@ def landmarks_from_above(
     return slam.marginal(state, above, slots)
 
 
+def landmarks_on_sides(
+    slam: AbstractFilter, state: Any, slots: Int[Array, " m"], sigmas: float = 2.0
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """How many landmarks are surely in front of infinity, 1/z > 0, and how many surely behind.
+
+    Pixels do not tell the one from the other: a world that is mostly behind is a reversed one.
+    """
+    inverse_depth, P = slam.marginal(
+        state, lambda scene: (scene.omega / scene.point[-1])[None], slots
+    )
+    sure = slam.in_map(state)[slots] & (inverse_depth[:, 0] ** 2 > sigmas**2 * P[:, 0, 0])
+    ahead = inverse_depth[:, 0] > 0
+    return jnp.sum(sure & ahead), jnp.sum(sure & ~ahead)
+
+
 def landmarks_in_world(
     slam: AbstractFilter, state: Any, slots: Int[Array, " m"]
 ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:

@@ -33,6 +33,9 @@ class TrackerSettings:
     field of view, is estimated, and any other is known."""
     association: str = "sequential"
     """Which matches are believed: a name of jaxslam.slam.association.ASSOCIATIONS."""
+    tolerance: float = 1.5
+    """σ of what cameras and patches do beyond their noise, in `pixel_sigma`: matches are tested
+    with it, and weighed without."""
     wanted: int = 50
     """Landmarks to keep in view."""
     spare: int = 20

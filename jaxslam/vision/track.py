@@ -261,6 +261,7 @@ def _summary(
         "restarts": tracker.restarts,
         "maps": tracker.restarts + 1,
         "failed_updates": dict(tracker.failed),
+        "reversed_tests": tracker.reversed,
         "landmarks": {
             "mean": float(np.mean([len(result.status) for result in updates] or [0])),
             "created": tracker.created,

@@ -21,7 +21,12 @@ from jaxslam.models.sensors import Pinhole
 from jaxslam.slam.association import ASSOCIATIONS, Association, candidates
 from jaxslam.slam.filter import AtOnce, EkfSlam, begun, innermost
 from jaxslam.slam.protocol import AbstractStaged, Scene
-from jaxslam.slam.readouts import camera_pose_in_unit, landmarks_in_unit
+from jaxslam.slam.readouts import (
+    camera_pose,
+    camera_pose_in_unit,
+    landmarks_in_unit,
+    landmarks_on_sides,
+)
 from jaxslam.video.calibration import Calibration, as_fields, from_fields
 from jaxslam.video.pictures import as_grey
 from jaxslam.video.source import Frame, check_size
@@ -38,9 +43,12 @@ CHANCE = 0.05
 """Of a landmark that is not in the picture to have a match all the same that agrees …"""
 BY_CHANCE = 1e-3
 """… and of a frame to be believed although its landmarks are not there."""
+ASTRAY = np.radians(10.0)
+"""σ of the orientation in its map from which on a camera is lost."""
 
 _NUMBERS = (
-    "created", "deleted", "restarts", "steps", "_time", "_unmeasured", "_sigma_log_scale"
+    "created", "deleted", "restarts", "reversed", "steps", "_time", "_unmeasured",
+    "_sigma_log_scale",
 )  # fmt: skip
 """What a tracker counts and measures, one number each."""
 
@@ -56,6 +64,8 @@ class _Prediction(NamedTuple):
     points: Any
     """Homogeneous points (X, ω) in the predicted camera."""
     omegas: Any
+    sides: Any
+    """How many landmarks are surely in front of the camera, and how many behind it."""
 
 
 @dataclass(frozen=True)
@@ -131,6 +141,8 @@ class Tracker:
     """Frames given so far."""
     failed: Counter[str] = field(default_factory=Counter, init=False)
     """How many updates ended in which `Status` that says that their result means nothing."""
+    reversed: int = field(default=0, init=False)
+    """Maps that turned out to lie behind the camera, and were given up."""
     finished: list[Points] = field(default_factory=list, init=False)
     """Landmarks that left the map."""
 
@@ -295,11 +307,14 @@ class Tracker:
         predicted, prediction = _predict(self._slam, self._state, dt)
         prediction = jax.device_get(prediction)
         prediction = prediction._replace(T_wc=self._origin.T_wc @ prediction.T_wc)
+        ahead, behind = prediction.sides
+        if behind > ahead and behind >= LEAST_MATCHES:
+            return self._turned_round(frame, predicted, dt)
         slots = self._visible(prediction)
         found = self._search(frame, prediction, slots)
         matched, features = self._features(slots, found)
         state, result = self._correct(predicted, dt, features, _more_than_chance(len(slots)))
-        used, nis, nis_dof, status = jax.device_get(result)
+        used, nis, nis_dof, orientation, status = jax.device_get(result)
         self._time = frame.time
         if status >= Status.NOT_POSITIVE:
             self.failed[Status(int(status)).name.lower()] += 1
@@ -319,7 +334,7 @@ class Tracker:
                 for match, ok in zip(found, used, strict=True)
             ],
         )
-        lost = not used.any()
+        lost = bool(not used.any() or orientation > ASTRAY)
         self._unmeasured = self._unmeasured + 1 if lost else 0
         if not self.landmarks or self._unmeasured > self.settings.lost_for:
             return self._lost(frame, **searched)
@@ -338,8 +353,20 @@ class Tracker:
         self, predicted: tuple[Any, Any], dt: jax.Array, features: Features, least: int = 1
     ) -> tuple[Any, tuple]:
         """Update by the matches that agree, if they are so many at least."""
-        association = ASSOCIATIONS[self.settings.association]
-        return _correct(self._slam, association, *predicted, dt, features, jnp.asarray(least))
+        s = self.settings
+        numbers = jnp.asarray(s.tolerance * s.pixel_sigma), jnp.asarray(least)
+        association = ASSOCIATIONS[s.association]
+        return _correct(self._slam, association, *predicted, dt, features, *numbers)
+
+    def _turned_round(self, frame: Frame, predicted: tuple[Any, Any], dt: jax.Array) -> Tracked:
+        """The map lies behind the camera: another one is begun."""
+        self.reversed += 1
+        self._time = frame.time
+        self._state, _ = self._correct(predicted, dt, self._nothing())
+        return self._lost(frame)
+
+    def _nothing(self) -> Features:
+        return _padded(np.zeros(0, int), np.zeros((0, 2)), self.settings.wanted)
 
     def _fall_back(self, predicted: tuple[Any, Any], dt: jax.Array) -> None:
         """The covariance is no longer positive: what prediction alone says of the camera.
@@ -348,7 +375,7 @@ class Tracker:
         start's velocity lets it be. The landmarks are those of the frame before.
         """
         self._remove(sorted(self.landmarks))
-        nothing = _padded(np.zeros(0, int), np.zeros((0, 2)), self.settings.wanted)
+        nothing = self._nothing()
         state, result = self._correct(predicted, dt, nothing)
         if int(result[-1]) >= Status.NOT_POSITIVE:
             self._origin = self._camera
@@ -566,7 +593,10 @@ def _predict(slam: AbstractStaged, state: Any, dt: Any) -> tuple[tuple[Any, Any]
     seen = one.predict_features(gaussian, dt, slots)
     usable = seen.possible & jnp.isfinite(seen.covariance).all(axis=(1, 2))
     pose = seen.pose.as_matrix()
-    prediction = _Prediction(seen.measured, seen.covariance, usable, pose, seen.points, seen.omegas)
+    sides = landmarks_on_sides(one, gaussian, slots)
+    prediction = _Prediction(
+        seen.measured, seen.covariance, usable, pose, seen.points, seen.omegas, sides
+    )
     return (state, gaussian), prediction
 
 
@@ -578,15 +608,19 @@ def _correct(
     gaussian: Any,
     dt: Any,
     features: Features,
+    tolerance: Any,
     least: Any,
 ) -> tuple[Any, tuple]:
     one, _ = slam.gaussian(state, dt)
-    agreed = association(candidates(one, gaussian, dt, features))
+    agreed = association(candidates(one, gaussian, dt, features, tolerance))
     # A few of many that were searched can agree by chance: a lost camera only moves.
     agreed &= jnp.sum(agreed) >= least
     state, innovation = slam.update(state, dt, replace(features, valid=agreed))
     state = slam.compose(state, dt)
-    return state, (innovation.used, innovation.nis, innovation.nis_dof, innovation.status)
+    _, P = camera_pose(slam, state)
+    orientation = jnp.sqrt(jnp.trace(P[3:, 3:]))
+    of_update = innovation.used, innovation.nis, innovation.nis_dof
+    return state, (*of_update, orientation, innovation.status)
 
 
 @eqx.filter_jit

@@ -271,11 +271,13 @@ def test_matches_too_few_to_believe_change_nothing(monkeypatch):
     agreed = result.status.count("matched")
     assert agreed > LEAST_MATCHES
     (arguments,) = given
-    *before, features, _ = arguments
+    *before, features, tolerance, _ = arguments
     nothing = replace(features, valid=np.zeros_like(features.valid))
-    expected, _ = whole(*before, nothing, np.array(0))
+    expected, _ = whole(*before, nothing, tolerance, np.array(0))
     for least in (agreed, agreed + 1):
-        corrected, (used, nis, nis_dof, status) = whole(*before, features, np.array(least))
+        corrected, (used, nis, nis_dof, _, status) = whole(
+            *before, features, tolerance, np.array(least)
+        )
         assert status == Status.OK
         assert used.sum() == (agreed if least == agreed else 0)
     assert (nis, nis_dof) == (0, 0)
@@ -339,7 +341,7 @@ def test_a_frame_must_be_later_than_the_one_before():
 def test_a_gaussian_sum_tracks_too():
     """Its members share one search, and give another estimate than one filter does.
 
-    With a scale of their own, of which from standstill one filter has no doubt, but they have.
+    With a scale of their own, in a unit that nobody told.
     """
     source = synthetic_source(frames=10)
     settings = TrackerSettings(wanted=12, spare=4)
@@ -351,8 +353,8 @@ def test_a_gaussian_sum_tracks_too():
     assert summed.status.count("matched") >= 10
     assert len(some.points().points) >= 12
     assert np.linalg.eigvalsh(summed.covariance)[0] > 0
-    assert alone.sigma_log_scale is None
-    assert 0 < (summed.sigma_log_scale or 0) < 1
+    for result in (alone, summed):
+        assert 0.999 * settings.unit_sigma < (result.sigma_log_scale or 0) < 2
     assert not np.allclose(summed.T_wc, alone.T_wc, atol=1e-6)
 
 
