@@ -33,8 +33,8 @@ class TrackOptions:
     target: Path | None = None
     """JSON file of known points that the first frame sees: the map is in metres."""
     out: Path = Path("results")
-    """Folder for trajectory.txt, covariance.txt, frames.csv, map.ply, map.png, overlay.mp4 and
-    summary.json."""
+    """Folder for trajectory.txt, covariance.txt, frames.csv, summary.json, map.ply, map.png and
+    overlay.mp4."""
     frames: int | None = None
     """Frames to track, at the most; of the synthetic video 150 by default."""
     start: float = 0.0
@@ -71,6 +71,8 @@ class TrackOptions:
     """Standard deviation of the angular acceleration, rad/s²."""
     wanted: int = TrackerSettings.wanted
     """Landmarks to keep in view."""
+    overlay: bool = True
+    """Whether to write overlay.mp4."""
 
     def run(self) -> None:
         """Track the video, print the summary, write its files."""

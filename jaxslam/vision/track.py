@@ -8,6 +8,7 @@ import json
 import math
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ from jaxslam.plots.tracking import plot_map
 from jaxslam.slam.protocol import AbstractStaged
 from jaxslam.video.calibration import INTRINSICS, as_fields
 from jaxslam.video.source import Frame, Source
-from jaxslam.vision.overlay import OverlayWriter, draw_overlay, overlay_size
+from jaxslam.vision.film import Aside, OverlayWriter
+from jaxslam.vision.overlay import draw_overlay, overlay_size
 from jaxslam.vision.pointcloud import write_ply
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.target import Target, as_summary
@@ -48,10 +50,12 @@ def track(
     *,
     slam: AbstractStaged | None = None,
     target: Target | None = None,
+    overlay: bool = True,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> dict[str, Any]:
-    """Track `source`, write `trajectory.txt`, `covariance.txt`, `frames.csv`, `map.ply`,
-    `map.png`, `overlay.mp4` and `summary.json` into the folder `out`, and return the summary.
+    """Track `source`, write `trajectory.txt`, `covariance.txt`, `frames.csv`, `summary.json`,
+    `map.ply`, `map.png` and, if wanted, `overlay.mp4` into the folder `out`, and return the
+    summary.
 
     An interruption (KeyboardInterrupt) or an unreadable frame (ValueError) leaves all of them for
     the frames so far, and is raised again. `slam` is a filter of one's own, in place of the one
@@ -65,7 +69,8 @@ def track(
     history: list[Tracked] = []
     seconds: list[float] = []
     try:
-        _track_frames(source, tracker, out / "overlay.mp4", history, seconds, progress)
+        film = out / "overlay.mp4" if overlay else None
+        _track_frames(source, tracker, film, history, seconds, progress)
     except BaseException:
         if history:
             _write(source, tracker, history, seconds, out)
@@ -108,22 +113,33 @@ def describe(summary: dict[str, Any]) -> str:
 def _track_frames(
     source: Source,
     tracker: Tracker,
-    video: Path,
+    film: Path | None,
     history: list[Tracked],
     seconds: list[float],
     progress: Callable[[int], None],
 ) -> None:
-    size = overlay_size(source.calibration.width, source.calibration.height)
-    with OverlayWriter(video, size, _rate(source.times)) as writer:
+    with ExitStack() as stack:
+        writer = None if film is None else stack.enter_context(_writer(source, film))
+        aside = stack.enter_context(Aside())
         start = time.perf_counter()
         for frame in source:
             result = tracker.track(frame)
-            writer.write(_overlay(frame, result))
+            if writer is not None:
+                aside.give(_film, writer, frame, result)
             history.append(result)
             now = time.perf_counter()
             seconds.append(now - start)
             start = now
             progress(1)
+
+
+def _writer(source: Source, path: Path) -> OverlayWriter:
+    size = overlay_size(source.calibration.width, source.calibration.height)
+    return OverlayWriter(path, size, _rate(source.times))
+
+
+def _film(writer: OverlayWriter, frame: Frame, result: Tracked) -> None:
+    writer.write(_overlay(frame, result))
 
 
 def _rate(times: np.ndarray) -> float:
@@ -132,6 +148,7 @@ def _rate(times: np.ndarray) -> float:
 
 
 def _overlay(frame: Frame, result: Tracked) -> np.ndarray:
+    """The picture of what was sought and found in a frame."""
     new = result.created
     nothing = np.full((len(new), 2), np.nan)
     return draw_overlay(
@@ -140,10 +157,27 @@ def _overlay(frame: Frame, result: Tracked) -> np.ndarray:
         covariances=np.concatenate([result.search, np.full((len(new), 2, 2), np.nan)]),
         matched=np.concatenate([result.matched, new]),
         status=[*result.status, *["new"] * len(new)],
-        index=result.index,
-        time=result.time,
-        note={"tracked": "", "lost": "LOST", "start": f"MAP {result.map}"}[result.state],
+        notes=_notes(result),
+        banner=_banner(result),
     )
+
+
+def _notes(result: Tracked) -> tuple[str, str]:
+    """Which frame it is, and the σ of its pose."""
+    camera, log_scale = result.camera, result.sigma_log_scale
+    degrees = math.degrees(camera.sigma_orientation)
+    scale = "" if log_scale is None else f"  log scale {log_scale:.3g}"
+    return (
+        f"frame {result.index}  {result.time:.2f} s  map {result.map}",
+        f"sigma: position {camera.sigma_position:.3g}  {degrees:.3g} deg{scale}",
+    )
+
+
+def _banner(result: Tracked) -> str:
+    """What nobody is to overlook: nothing while all is well."""
+    if result.starts:
+        return f"LOST: MAP {result.map} BEGINS" if result.lost else ""
+    return "" if result.state == "tracked" else result.state.upper()
 
 
 def _write(
@@ -154,11 +188,18 @@ def _write(
     write_tum(out / "trajectory.txt", times, T_wc)
     write_covariances(out / "covariance.txt", times, [result.covariance for result in history])
     write_frames(out / "frames.csv", history)
-    known = _mapped(tracker, history)
+    summary = _summary(source, tracker, history, seconds)
+    with write_atomically(out / "summary.json") as path:
+        path.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    _draw_map(_mapped(tracker, history), history, out)
+    return summary
+
+
+def _draw_map(known: Points, history: list[Tracked], out: Path) -> None:
     write_ply(out / "map.ply", known.points, known.covariances, known.numbers, known.maps)
     begun = [place for place, result in enumerate(history) if result.starts and result.map]
     plot_map(
-        T_wc,
+        np.stack([result.T_wc for result in history]),
         known.points,
         known.in_map,
         path=out / "map.png",
@@ -166,10 +207,6 @@ def _write(
         begun=begun,
         begun_covariances=[history[place].camera.position_covariance for place in begun],
     )
-    summary = _summary(source, tracker, history, seconds)
-    with write_atomically(out / "summary.json") as path:
-        path.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    return summary
 
 
 def write_frames(path: str | Path, history: list[Tracked]) -> None:
