@@ -19,7 +19,7 @@ from jaxslam.files import write_atomically
 from jaxslam.plots.tracking import plot_map
 from jaxslam.slam.protocol import AbstractStaged
 from jaxslam.video.calibration import INTRINSICS, as_fields
-from jaxslam.video.source import Frame, Source
+from jaxslam.video.source import Frame, Source, Trajectory
 from jaxslam.vision.film import Aside, OverlayWriter
 from jaxslam.vision.overlay import draw_overlay, overlay_size
 from jaxslam.vision.pointcloud import write_ply
@@ -28,6 +28,7 @@ from jaxslam.vision.target import Target, as_summary
 from jaxslam.vision.tracker import Points, Tracked, Tracker
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
+    alignment,
     write_covariances,
     write_tum,
 )
@@ -183,27 +184,30 @@ def _banner(result: Tracked) -> str:
 def _write(
     source: Source, tracker: Tracker, history: list[Tracked], seconds: list[float], out: Path
 ) -> dict[str, Any]:
-    times = np.array([result.time for result in history])
-    T_wc = np.stack([result.T_wc for result in history])
+    times, T_wc = _trajectory(history)
     write_tum(out / "trajectory.txt", times, T_wc)
     write_covariances(out / "covariance.txt", times, [result.covariance for result in history])
     write_frames(out / "frames.csv", history)
     summary = _summary(source, tracker, history, seconds)
     with write_atomically(out / "summary.json") as path:
         path.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    _draw_map(_mapped(tracker, history), history, out)
+    _draw_map(_mapped(tracker, history), history, _reference_in_map(source, history), out)
     return summary
 
 
-def _draw_map(known: Points, history: list[Tracked], out: Path) -> None:
+def _draw_map(
+    known: Points, history: list[Tracked], reference: np.ndarray | None, out: Path
+) -> None:
     write_ply(out / "map.ply", known.points, known.covariances, known.numbers, known.maps)
     begun = [place for place, result in enumerate(history) if result.starts and result.map]
     plot_map(
-        np.stack([result.T_wc for result in history]),
+        _trajectory(history).T_wc,
         known.points,
         known.in_map,
+        reference=reference,
         path=out / "map.png",
         unit="map units",
+        lost=[result.lost for result in history],
         begun=begun,
         begun_covariances=[history[place].camera.position_covariance for place in begun],
     )
@@ -319,13 +323,30 @@ def _summary(
     return summary | _errors(source, history)
 
 
+def _trajectory(history: list[Tracked]) -> Trajectory:
+    times = np.array([result.time for result in history])
+    return Trajectory(times, np.stack([result.T_wc for result in history]))
+
+
+def _reference_in_map(source: Source, history: list[Tracked]) -> np.ndarray | None:
+    """What of the reference is of the time of these frames, (m, 4, 4), aligned as for its error."""
+    if source.reference is None:
+        return None
+    trajectory, (times, T_wc) = _trajectory(history), source.reference
+    try:
+        there = alignment(*trajectory, *source.reference)
+    except ValueError:
+        return None
+    same = (times >= trajectory.times[0]) & (times <= trajectory.times[-1])
+    return there.inverse().moved(T_wc[same])
+
+
 def _errors(source: Source, history: list[Tracked]) -> dict[str, Any]:
     """The trajectory error, where there is a reference, or why it cannot be told."""
     if source.reference is None:
         return {}
-    times = np.array([result.time for result in history])
-    T_wc = np.stack([result.T_wc for result in history])
     try:
-        return {"ate": absolute_trajectory_error(times, T_wc, *source.reference)}
+        error = absolute_trajectory_error(*_trajectory(history), *source.reference)
+        return {"ate": error}
     except ValueError as error:  # of few frames, or of a camera that stood still
         return {"no_ate": str(error)}

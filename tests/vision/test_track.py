@@ -1,7 +1,9 @@
 """What `track` writes: which files, in which order, whatever goes wrong on the way."""
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 pytest.importorskip("cv2")
@@ -21,6 +23,11 @@ def small(frames):
 
 def names(folder):
     return {path.name for path in folder.iterdir()}
+
+
+def length(T_wc):
+    """Of the path."""
+    return np.linalg.norm(np.diff(T_wc[:, :3, 3], axis=0), axis=1).sum()
 
 
 def fail(*_, **__):
@@ -44,4 +51,32 @@ def test_an_overlay_that_cannot_be_drawn_ends_the_run_and_leaves_the_files(tmp_p
     monkeypatch.setattr(tracking, "draw_overlay", fail)
     with pytest.raises(ValueError, match="cannot draw"):
         tracking.track(small(3), tmp_path, SETTINGS)
+    assert names(tmp_path) == NUMBERS | FIGURES
+
+
+def test_the_map_shows_the_reference_in_its_own_frame_and_unit(tmp_path, monkeypatch):
+    """Of the frames tracked; the trajectory's error is the rest, in the reference's unit."""
+    drawn = {}
+    monkeypatch.setattr(tracking, "plot_map", lambda *data, **more: drawn.update(more, data=data))
+    whole, source = small(40), small(12)
+    summary = tracking.track(
+        replace(source, reference=whole.reference), tmp_path, SETTINGS, overlay=False
+    )
+    estimate, reference = drawn["data"][0], drawn["reference"]
+    assert estimate.shape == reference.shape
+    # One factor between the lengths of the two worlds, and no turn between their shapes.
+    ate, true = summary["ate"], whole.reference
+    assert true is not None
+    scale = length(true.T_wc[:12]) / length(reference)
+    error = scale * (estimate - reference)[:, :3, 3]
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) == pytest.approx(ate["rmse"], rel=1e-6)
+    assert drawn["lost"] == [False] * 12
+
+
+def test_without_a_reference_that_fits_the_map_is_drawn_all_the_same(tmp_path):
+    source = small(3)
+    assert source.reference is not None
+    late = source.reference._replace(times=source.reference.times + 100)
+    summary = tracking.track(replace(source, reference=late), tmp_path, SETTINGS, overlay=False)
+    assert "0 poses" in summary["no_ate"]
     assert names(tmp_path) == NUMBERS | FIGURES

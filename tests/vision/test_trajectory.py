@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from jaxslam.tum import poses, read_tum
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
+    alignment,
     exactly_known,
     pose_nees,
     read_covariances,
@@ -107,6 +108,24 @@ def test_error_ignores_frame_and_scale_and_measures_the_reference():
     assert result["orientation_rmse"] == pytest.approx(0, abs=1e-5)
     assert result["extent"] == pytest.approx(np.linalg.norm(box))
     assert result["matched"] == len(times)
+
+
+@pytest.mark.parametrize("straight", [False, True])
+def test_alignment_is_that_of_the_error_and_can_be_undone(straight):
+    times, reference = wave()
+    if straight:
+        reference[:, :3, 3] = np.outer(times, [1.0, 2.0, -0.5])
+    estimate = similar(reference, 0.2, [0.3, -0.5, 1.0], [1.0, 2.0, 3.0])
+    estimate[:, :3, 3] += np.random.default_rng(2).normal(0, 0.01, (len(times), 3))
+    found = alignment(times, estimate, times, reference)
+    error = found.moved(estimate)[:, :3, 3] - reference[:, :3, 3]
+    rmse = absolute_trajectory_error(times, estimate, times, reference)["rmse"]
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) == pytest.approx(rmse, rel=1e-9)
+    assert found.scale == pytest.approx(5, rel=0.02)
+    # Rounding.
+    np.testing.assert_allclose(
+        found.inverse().moved(found.moved(estimate)), estimate, rtol=0, atol=1e-12
+    )
 
 
 def test_error_has_the_size_of_the_noise():
