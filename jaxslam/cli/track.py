@@ -73,6 +73,8 @@ class TrackOptions:
     """Landmarks to keep in view."""
     overlay: bool = True
     """Whether to write overlay.mp4."""
+    viewer: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
+    """Recording for the rerun viewer, written as the frames come."""
 
     def run(self) -> None:
         """Track the video, print the summary, write its files."""

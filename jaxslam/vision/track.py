@@ -7,12 +7,14 @@ import dataclasses
 import json
 import math
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Generator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from jaxslam import __version__
 from jaxslam.files import write_atomically
@@ -32,10 +34,13 @@ from jaxslam.vision.trajectory import (
     write_covariances,
     write_tum,
 )
+from jaxslam.vision.viewer import Viewer
 
 SCHEMA = 1
 _WARM_UP = 3
 """Frames in which functions are compiled; they count in `seconds.start`, not in the quantiles."""
+_MAP_EVERY = 10
+"""Frames from one map of a recording to the next."""
 _COLUMNS = (
     "frame", "time", "state", "map", "matches", "nis", "nis_dof",
     "sigma_position", "sigma_orientation", "sigma_log_scale",
@@ -52,6 +57,7 @@ def track(
     slam: AbstractStaged | None = None,
     target: Target | None = None,
     overlay: bool = True,
+    viewer: str | Path | None = None,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> dict[str, Any]:
     """Track `source`, write `trajectory.txt`, `covariance.txt`, `frames.csv`, `summary.json`,
@@ -61,7 +67,9 @@ def track(
     An interruption (KeyboardInterrupt) or an unreadable frame (ValueError) leaves all of them for
     the frames so far, and is raised again. `slam` is a filter of one's own, in place of the one
     that the settings name. `target`, known points that the first frame sees, makes the map metric.
+    `viewer` is a file for the rerun viewer, FILE.rrd, written beside the others.
     """
+    recording = None if viewer is None else Viewer(viewer, source.calibration)
     tracker = Tracker(source.calibration, settings or TrackerSettings(), slam, target)
     if source.clock is not None:
         tracker.compile()
@@ -71,7 +79,7 @@ def track(
     seconds: list[float] = []
     try:
         film = out / "overlay.mp4" if overlay else None
-        _track_frames(source, tracker, film, history, seconds, progress)
+        _track_frames(source, tracker, film, recording, history, seconds, progress)
     except BaseException:
         if history:
             _write(source, tracker, history, seconds, out)
@@ -115,23 +123,49 @@ def _track_frames(
     source: Source,
     tracker: Tracker,
     film: Path | None,
+    viewer: Viewer | None,
     history: list[Tracked],
     seconds: list[float],
     progress: Callable[[int], None],
 ) -> None:
-    with ExitStack() as stack:
-        writer = None if film is None else stack.enter_context(_writer(source, film))
-        aside = stack.enter_context(Aside())
+    with _shown(source, tracker, film, viewer, history) as show:
         start = time.perf_counter()
         for frame in source:
-            result = tracker.track(frame)
-            if writer is not None:
-                aside.give(_film, writer, frame, result)
-            history.append(result)
+            history.append(tracker.track(frame))
+            show(frame)
             now = time.perf_counter()
             seconds.append(now - start)
             start = now
             progress(1)
+
+
+@contextmanager
+def _shown(
+    source: Source,
+    tracker: Tracker,
+    film: Path | None,
+    viewer: Viewer | None,
+    history: list[Tracked],
+) -> Generator[Callable[[Frame], None]]:
+    """What shows the newest frame, as film and in the viewer, aside from the tracking."""
+    with ExitStack() as stack:
+        writer = None if film is None else stack.enter_context(_writer(source, film))
+        recording = None if viewer is None else stack.enter_context(viewer)
+        aside = stack.enter_context(Aside())
+
+        def show(frame: Frame) -> None:
+            if writer is not None:
+                aside.give(_film, writer, frame, history[-1])
+            if recording is not None:
+                aside.give(recording.show, frame, history[-1])
+                if len(history) % _MAP_EVERY == 0:
+                    aside.give(recording.show_map, _mapped(tracker, history))
+
+        try:
+            yield show
+        finally:
+            if recording is not None and history:
+                aside.give(recording.show_map, _mapped(tracker, history))
 
 
 def _writer(source: Source, path: Path) -> OverlayWriter:
@@ -246,14 +280,22 @@ def _row(result: Tracked) -> list[Any]:
 def _mapped(tracker: Tracker, history: list[Tracked]) -> Points:
     """The landmarks whose depth became known in their maps."""
     landmarks = tracker.points()
-    cameras = np.stack([result.T_wc[:3, 3] for result in history])
-    away = landmarks.points[:, None] - cameras
-    same = landmarks.maps[:, None] == np.array([result.map for result in history])
-    distance = np.linalg.norm(away, axis=2).min(axis=1, initial=np.inf, where=same)
     with np.errstate(invalid="ignore"):  # of unknown depth, a variance can be anything
         sigma = np.sqrt(np.trace(landmarks.in_map, axis1=1, axis2=2))
-        known = np.isfinite(sigma) & (sigma < _KNOWN_DEPTH * distance)
+        known = np.isfinite(sigma) & (sigma < _KNOWN_DEPTH * _distances(landmarks, history))
     return Points(*(part[known] for part in landmarks))
+
+
+def _distances(landmarks: Points, history: list[Tracked]) -> Float[np.ndarray, " n"]:
+    """To the nearest camera of their map; zero of a landmark that is nowhere."""
+    cameras = _trajectory(history).T_wc[:, :3, 3]
+    maps = np.array([result.map for result in history])
+    distances = np.zeros(len(landmarks.numbers))
+    somewhere = np.isfinite(landmarks.points).all(axis=1)
+    for number in np.unique(landmarks.maps):
+        those = somewhere & (landmarks.maps == number)
+        distances[those] = KDTree(cameras[maps == number]).query(landmarks.points[those])[0]
+    return distances
 
 
 def _scale_between_maps(settings: TrackerSettings) -> float:
