@@ -37,7 +37,7 @@ from jaxslam.vision.trajectory import (
 from jaxslam.vision.viewer import Viewer
 
 SCHEMA = 1
-_WARM_UP = 3
+WARM_UP = 3
 """Frames in which functions are compiled; they count in `seconds.start`, not in the quantiles."""
 _MAP_EVERY = 10
 """Frames from one map of a recording to the next."""
@@ -330,7 +330,7 @@ def _summary(
     updates = history[1:]
     dof = sum(result.nis_dof for result in updates)
     count = max(len(updates), 1)
-    later = seconds[_WARM_UP:] or seconds
+    later = seconds[WARM_UP:] or seconds
     summary = {
         "schema": SCHEMA,
         "version": __version__,
@@ -353,7 +353,7 @@ def _summary(
         "nis": {"mean": sum(result.nis for result in updates) / count, "dof": dof / count},
         "seconds": {
             "total": sum(seconds),
-            "start": sum(seconds[:_WARM_UP]),
+            "start": sum(seconds[:WARM_UP]),
             "per_frame_median": float(np.median(later)),
             "per_frame_p99": float(np.quantile(later, 0.99)),
         },

@@ -2,12 +2,15 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import tqdm
 
 pytest.importorskip("cv2")
 
+from jaxslam.cli.track import TrackOptions
 from jaxslam.vision import track as tracking
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.synthetic import synthetic_source
@@ -80,3 +83,32 @@ def test_without_a_reference_that_fits_the_map_is_drawn_all_the_same(tmp_path):
     summary = tracking.track(replace(source, reference=late), tmp_path, SETTINGS, overlay=False)
     assert "0 poses" in summary["no_ate"]
     assert names(tmp_path) == NUMBERS | FIGURES
+
+
+def test_the_command_says_that_it_compiles_and_hands_over_what_is_wanted(monkeypatch, capsys):
+    said, asked = [], {}
+
+    class Bar(tqdm.tqdm):
+        def __init__(self, **options):
+            super().__init__(**{**options, "disable": False})
+            said.append(self.desc)
+
+        def set_description(self, desc=None, refresh=True):
+            said.append((self.n, desc))
+
+    def tracked(source, out, settings, *, progress, **more):
+        asked.update(more)
+        for _ in range(5):
+            progress(1)
+        return {}
+
+    monkeypatch.setattr(tqdm, "tqdm", Bar)
+    monkeypatch.setattr(tracking, "track", tracked)
+    monkeypatch.setattr(tracking, "describe", str)
+    TrackOptions(overlay=False, viewer=Path("seen.rrd"), frames=5).run()
+    assert said == ["compiling …", (tracking.WARM_UP, "tracking")]
+    assert (asked["overlay"], asked["viewer"]) == (False, Path("seen.rrd"))
+    printed = capsys.readouterr().out
+    assert "summary.json" in printed
+    assert "seen.rrd" in printed
+    assert "overlay.mp4" not in printed
