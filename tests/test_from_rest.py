@@ -132,6 +132,21 @@ def test_standing_teaches_nothing_and_then_the_motion_is_found():
     assert (along > 0).all()
 
 
+def test_without_landmarks_the_camera_is_known_less_with_every_frame():
+    of, (init, step) = standstill(), stages(STARTED)
+    slam, state = of.filter(STARTED), init(of.features[0])
+    gone = jnp.ones((RUNS, of.capacity), bool)
+    state = quick_jit(jax.vmap(slam.remove))(state, gone)
+    sigmas = []
+    for k in range(3):
+        control, *seen = frame(k)
+        unseen = (eqx.tree_at(lambda f: f.valid, f, jnp.zeros_like(f.valid)) for f in seen)
+        state, _ = step(state, control, *unseen)
+        P = quick_jit(jax.vmap(lambda s: slam.marginal(s, lambda scene: scene.pose)))(state)[1]
+        sigmas.append(np.sqrt(np.einsum("rii->r", np.asarray(P))))
+    assert (np.diff(sigmas, axis=0) > 0.5 * sigmas[0]).all()
+
+
 def test_the_members_are_the_modes_as_long_as_the_window_is_open():
     for state in followed(STARTED)[1:9]:
         np.testing.assert_array_equal(state.sum.log_weights, state.modes.log_weights)

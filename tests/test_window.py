@@ -212,6 +212,12 @@ def test_with_the_first_motion_the_velocity_is_drawn_anew():
     assert after.last == 3
 
 
+def test_a_frame_in_which_nothing_is_seen_does_not_say_that_the_camera_stands():
+    first, *_ = standing_then_moving()
+    unseen = features([0, 1], [11.0, 19.0], [False, False])
+    assert not stepped(first, jnp.asarray(0.1), unseen, jnp.eye(1)).standing
+
+
 def test_what_moved_at_once_never_stood():
     record = some_record()
     assert not record.standing

@@ -208,7 +208,10 @@ class EkfSlam(AbstractStaged):
         model = self.model
         if slots is None:
             return self.form.core_covariance(
-                lambda core: function(Scene(model.camera_pose(core), core=core)), state
+                lambda core: function(
+                    Scene(model.camera_pose(core), core=core, log_scale=core.log_scale)
+                ),
+                state,
             )
         view, landmark = scene_of_landmark(self, function, state.core)
         return self.gaussian_form.landmark_covariance(
@@ -239,7 +242,8 @@ def scene_of_landmark(
     def landmark(view, landmark):
         seen_from, T_BC = view
         pose = T_BC if needed else here
-        return function(Scene(pose, *model.metric_point(seen_from, landmark)))
+        seen = model.metric_point(seen_from, landmark)
+        return function(Scene(pose, *seen, log_scale=seen_from.log_scale))
 
     return view, landmark
 

@@ -53,6 +53,9 @@ class Scene(eqx.Module):
     """ω, so that the point is X/ω metres."""
     core: Any = None
     """The filter's own variables; None where a landmark is asked for."""
+    log_scale: Any = None
+    """Numbers whose sum is the log of the filter's unit of length in metres; None of one that is in
+    metres."""
 
 
 class Expected(NamedTuple):

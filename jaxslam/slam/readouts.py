@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxslam.geometry import Pose, retract
-from jaxslam.linalg import semidefinite_root
+from jaxslam.geometry import Pose, Scalar, retract, tangent_dim
+from jaxslam.linalg import cholesky, semidefinite_root
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.slam.filter import EkfSlam, scene_of_landmark
 from jaxslam.slam.protocol import AbstractFilter, Scene
@@ -19,6 +19,36 @@ from jaxslam.slam.protocol import AbstractFilter, Scene
 def camera_pose(slam: AbstractFilter, state: Any) -> tuple[Pose, Float[Array, "t t"]]:
     """T_BC and its covariance in the right tangent: position in camera axes, orientation."""
     return slam.marginal(state, lambda scene: scene.pose)
+
+
+def camera_pose_in_unit(
+    slam: AbstractFilter, state: Any
+) -> tuple[Pose, Float[Array, "t t"], Scalar]:
+    """T_BC in metres, its covariance *given the scale*, and the variance of the log of the scale.
+
+    The camera's path is known much better than its size: with J of the pose by λ, the covariance of
+    `camera_pose` is `P + J var(λ) Jᵀ`, and P is what is returned. Of a filter in metres it is all.
+    """
+
+    def both(scene: Scene):
+        return scene.pose, _log_scale(scene)
+
+    (pose, _), P = slam.marginal(state, both)
+    t = tangent_dim(pose)
+    return pose, _given_rest(P, t), jnp.sum(P[t:, t:])
+
+
+def landmarks_in_unit(
+    slam: AbstractFilter, state: Any, slots: Int[Array, " m"]
+) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
+    """`landmarks_in_world`, with covariances given the scale."""
+
+    def both(scene: Scene):
+        return jnp.concatenate([_point_in_world(scene), _log_scale(scene)])
+
+    values, P = slam.marginal(state, both, slots)
+    n = values.shape[1] - jax.eval_shape(lambda: slam.marginal(state, _log_scale)[0]).size
+    return values[:, :n], jax.vmap(lambda P: _given_rest(P, n))(P)
 
 
 def landmarks_in_camera(
@@ -83,6 +113,20 @@ def landmark_samples(
         return jax.vmap(one)(draws)
 
     return jax.vmap(of_slot)(slots, normal)
+
+
+def _log_scale(scene: Scene) -> Float[Array, " u"]:
+    return jnp.zeros(0) if scene.log_scale is None else scene.log_scale
+
+
+def _given_rest(P: Float[Array, "k k"], n: int) -> Float[Array, "n n"]:
+    """Covariance of the first n numbers, given the others."""
+    if n == len(P):
+        return P
+    # Where those are known there is nothing to subtract.
+    tiny = jnp.finfo(P.dtype).tiny * jnp.eye(len(P) - n, dtype=P.dtype)
+    half = cholesky(P[n:, n:] + tiny).whitening @ P[n:, :n]
+    return P[:n, :n] - half.T @ half
 
 
 def _point_in_world(scene: Scene) -> Float[Array, " n"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.lookup import chosen
@@ -13,6 +13,7 @@ from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.sensors import Pinhole
 from jaxslam.names import FILTERS, make_filter
 from jaxslam.simulation.pieces import TREATMENTS
+from jaxslam.slam.association import ASSOCIATIONS
 from jaxslam.slam.protocol import AbstractFilter
 from jaxslam.video.calibration import Calibration
 
@@ -30,6 +31,8 @@ class TrackerSettings:
     calibration: str | None = None
     """Treatment of the calibration: a name of TREATMENTS. By default one that is guessed, from a
     field of view, is estimated, and any other is known."""
+    association: str = "sequential"
+    """Which matches are believed: a name of jaxslam.slam.association.ASSOCIATIONS."""
     wanted: int = 50
     """Landmarks to keep in view."""
     spare: int = 20
@@ -38,6 +41,9 @@ class TrackerSettings:
     """Landmarks created in one frame, at the most."""
     nearest_depth: float = 1.0
     """d_min: the prior on depth reaches from here to infinity (96 %)."""
+    unit_sigma: float = 1.0
+    """σ of the log of the unit of length, for filters with a scale of their own (`scale_gauge`):
+    nobody told it in metres."""
     pixel_sigma: float = 0.3
     """σ of a match, pixels."""
     focal_sigma: float = 1.0
@@ -70,6 +76,7 @@ class TrackerSettings:
             object.__setattr__(self, "filter", type(self).filter)
         chosen("filter", [self.filter.partition("+")[0]], FILTERS)
         chosen("landmarks", [self.landmarks], LANDMARKS)
+        chosen("association", [self.association], ASSOCIATIONS)
         if self.calibration is not None:
             chosen("calibration", [self.calibration], TREATMENTS)
 
@@ -81,7 +88,7 @@ class TrackerSettings:
     @property
     def depth(self) -> InverseDepth:
         """The prior on the depth of new landmarks."""
-        return InverseDepth.beyond(self.nearest_depth)
+        return replace(InverseDepth.beyond(self.nearest_depth), unit=self.unit_sigma)
 
     def make_filter(self, calibration: Calibration) -> AbstractFilter:
         """The filter that is named, with these numbers. Raises ValueError."""

@@ -12,15 +12,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.stats import binom
 
 from jaxslam.arrays import cast
 from jaxslam.forms.state import Features, Status
 from jaxslam.models.scale import Metre
 from jaxslam.models.sensors import Pinhole
+from jaxslam.slam.association import ASSOCIATIONS, Association, candidates
 from jaxslam.slam.filter import AtOnce, EkfSlam, begun, innermost
 from jaxslam.slam.protocol import AbstractStaged, Scene
-from jaxslam.slam.ransac import inliers
-from jaxslam.slam.readouts import camera_pose, landmarks_in_world
+from jaxslam.slam.readouts import camera_pose_in_unit, landmarks_in_unit
 from jaxslam.video.calibration import Calibration, as_fields, from_fields
 from jaxslam.video.pictures import as_grey
 from jaxslam.video.source import Frame, check_size
@@ -31,8 +32,12 @@ from jaxslam.vision.resume import grown, leaves, read_record, write_record
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.target import Sighting, Target, known_depths, sighted
 
-LEAST_INLIERS = 4
-"""Fewer matches than this do not count as having tracked a frame, and are not believed."""
+LEAST_MATCHES = 4
+"""Fewer do not count as having tracked a frame, and are not believed."""
+CHANCE = 0.05
+"""Of a landmark that is not in the picture to have a match all the same that agrees …"""
+BY_CHANCE = 1e-3
+"""… and of a frame to be believed although its landmarks are not there."""
 
 _NUMBERS = (
     "created", "deleted", "restarts", "steps", "_time", "_unmeasured", "_sigma_log_scale"
@@ -293,8 +298,7 @@ class Tracker:
         slots = self._visible(prediction)
         found = self._search(frame, prediction, slots)
         matched, features = self._features(slots, found)
-        least = max(LEAST_INLIERS, len(slots) // 2) if self._unmeasured else LEAST_INLIERS
-        state, result = _correct(self._slam, *predicted, dt, features, jnp.asarray(least))
+        state, result = self._correct(predicted, dt, features, _more_than_chance(len(slots)))
         used, nis, nis_dof, status = jax.device_get(result)
         self._time = frame.time
         if status >= Status.NOT_POSITIVE:
@@ -330,6 +334,13 @@ class Tracker:
             lost=lost,
         )
 
+    def _correct(
+        self, predicted: tuple[Any, Any], dt: jax.Array, features: Features, least: int = 1
+    ) -> tuple[Any, tuple]:
+        """Update by the matches that agree, if they are so many at least."""
+        association = ASSOCIATIONS[self.settings.association]
+        return _correct(self._slam, association, *predicted, dt, features, jnp.asarray(least))
+
     def _fall_back(self, predicted: tuple[Any, Any], dt: jax.Array) -> None:
         """The covariance is no longer positive: what prediction alone says of the camera.
 
@@ -338,19 +349,18 @@ class Tracker:
         """
         self._remove(sorted(self.landmarks))
         nothing = _padded(np.zeros(0, int), np.zeros((0, 2)), self.settings.wanted)
-        least = jnp.asarray(LEAST_INLIERS)
-        state, result = _correct(self._slam, *predicted, dt, nothing, least)
+        state, result = self._correct(predicted, dt, nothing)
         if int(result[-1]) >= Status.NOT_POSITIVE:
             self._origin = self._camera
             predicted, _ = _predict(self._slam, self._empty_state(), dt)
-            state, _ = _correct(self._slam, *predicted, dt, nothing, least)
+            state, _ = self._correct(predicted, dt, nothing)
         self._state = state
 
     def _lost(self, frame: Frame, **searched) -> Tracked:
         """Begin a new map at the camera as it is predicted, or wait for a picture with corners."""
         corners = self._corners(frame)
         self._renewed(frame, corners[:0])
-        if len(corners) < LEAST_INLIERS:
+        if len(corners) < LEAST_MATCHES:
             return self._tracked(frame, **searched, lost=True)
         self._remove(sorted(self.landmarks))
         self.restarts += 1
@@ -522,6 +532,11 @@ def _keeps_metres(slam: AbstractStaged) -> bool:
     return isinstance(slam, EkfSlam) and isinstance(slam.scale, Metre) and slam.depth.common is None
 
 
+def _more_than_chance(searched: int) -> int:
+    """Matches of so many landmarks searched that are not there by chance."""
+    return max(LEAST_MATCHES, int(binom.isf(BY_CHANCE, searched, CHANCE)) + 1)
+
+
 def _padded(slots: np.ndarray, pixels: np.ndarray, size: int) -> Features:
     """Features of fixed number; NaN pixels and padding are not valid."""
     missing = size - len(slots)
@@ -557,10 +572,16 @@ def _predict(slam: AbstractStaged, state: Any, dt: Any) -> tuple[tuple[Any, Any]
 
 @eqx.filter_jit
 def _correct(
-    slam: AbstractStaged, state: Any, gaussian: Any, dt: Any, features: Features, least: Any
+    slam: AbstractStaged,
+    association: Association,
+    state: Any,
+    gaussian: Any,
+    dt: Any,
+    features: Features,
+    least: Any,
 ) -> tuple[Any, tuple]:
     one, _ = slam.gaussian(state, dt)
-    agreed = inliers(one, gaussian, dt, features)
+    agreed = association(candidates(one, gaussian, dt, features))
     # A few of many that were searched can agree by chance: a lost camera only moves.
     agreed &= jnp.sum(agreed) >= least
     state, innovation = slam.update(state, dt, replace(features, valid=agreed))
@@ -587,17 +608,9 @@ def _renew_map(slam: AbstractStaged, state: Any, new: Features):
 
 
 def _reported(slam: AbstractStaged, state: Any):
-    """T_BC, its covariance and the variance of λ; zero of a filter without."""
-    T_BC, covariance = camera_pose(slam, state)
-    return T_BC.as_matrix(), covariance, _log_scale_variance(slam, state)
-
-
-def _log_scale_variance(slam: AbstractStaged, state: Any):
-    def log_scale(scene: Scene):
-        λ = getattr(scene.core, "log_scale", None)
-        return jnp.zeros(1) if λ is None else jnp.sum(λ)[None]
-
-    return slam.marginal(state, log_scale)[1][0, 0]
+    """T_BC, its covariance given the scale and the variance of λ; zero of a filter without."""
+    T_BC, covariance, log_scale = camera_pose_in_unit(slam, state)
+    return T_BC.as_matrix(), covariance, log_scale
 
 
 @eqx.filter_jit
@@ -612,4 +625,4 @@ def _intrinsics(slam: AbstractStaged, inner: EkfSlam, state: Any):
 
 @eqx.filter_jit
 def _world_points(slam: AbstractStaged, state: Any, capacity: int):
-    return landmarks_in_world(slam, state, jnp.arange(capacity))
+    return landmarks_in_unit(slam, state, jnp.arange(capacity))

@@ -139,12 +139,12 @@ def stepped(record: Record, control: Any, seen: Features, noise: Float[Array, "p
 
 
 def _still(record: Record, seen: Features, noise: Float[Array, "p p"]) -> Bool[Array, ""]:
-    """Whether all that is seen is where it was first seen, or nothing says that it is not."""
+    """Whether all that is seen, and that is something, is where it was first seen."""
     moved = seen.measured - record.first_measured[seen.slots]
     whitened = moved @ cholesky(2 * noise).whitening.T
     squared = jnp.sum(jnp.where(seen.valid[:, None], whitened, 0.0) ** 2)
     dof = jnp.sum(seen.valid) * moved.shape[1]
-    return squared <= dof + STILL * jnp.sqrt(2 * dof)
+    return (dof > 0) & (squared <= dof + STILL * jnp.sqrt(2 * dof))
 
 
 def begun(record: Record, new: Features) -> Record:

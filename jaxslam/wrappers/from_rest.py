@@ -113,10 +113,11 @@ class FromRest(AbstractStaged):
         """End the frame, and begin the sum anew from the window's modes while that is open."""
         after = self.base.close(state.sum, new)
         state = replace(state, sum=after, record=window.begun(state.record, new))
-        least = 1
+        # Where nothing was ever seen there is nothing to begin anew from.
+        anew, least = state.open & jnp.any(state.record.seen), 1
         for frames in self.sizes:
             count = state.record.last + 1
-            wanted = state.open & (count > least) & (count <= frames)
+            wanted = anew & (count > least) & (count <= frames)
             searches = [k for k in SEARCHES if least <= k < frames]
             state = self._anew(state, frames, wanted, searches)
             least = frames

@@ -1,0 +1,205 @@
+"""Tests of jaxslam.slam.association: what each lets through and keeps, on constructed ambiguity."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import Case, quick_jit
+from scipy.stats import chi2
+
+from jaxslam.forms.information import Information
+from jaxslam.forms.state import Features
+from jaxslam.landmarks import LANDMARKS
+from jaxslam.slam.association import ASSOCIATIONS, GATE, Candidates, candidates
+
+SIGMA = 0.3
+M = 20
+AGREEING, JOINT = ("ransac", "jcbb", "sequential"), ("jcbb", "sequential")
+"""Those that ask for agreement; and for that of all believed together."""
+compiled = {name: jax.jit(function) for name, function in ASSOCIATIONS.items()}
+
+
+@pytest.fixture(autouse=True)
+def double():
+    with jax.enable_x64(True):
+        yield
+
+
+def covariance(rng, turn=15.0):
+    """S of M landmarks seen by a camera that may have turned by so many pixels."""
+    motion = rng.normal(size=(2 * M, 3)) * [turn, turn, 2.0]
+    depth = np.zeros((2 * M, M))
+    for i in range(M):
+        depth[2 * i : 2 * i + 2, i] = 0.7 * rng.normal(size=2)
+    return motion @ motion.T + depth @ depth.T + SIGMA**2 * np.eye(2 * M)
+
+
+def found(rng, wrong=0.0, S=None):
+    """Matches drawn from S, of which a share is anywhere in its ellipse; and which these are."""
+    S = covariance(rng) if S is None else S
+    r = (np.linalg.cholesky(S) @ rng.normal(size=2 * M)).reshape(M, 2)
+    bad = rng.permutation(M) < wrong * M
+    for i in np.flatnonzero(bad):
+        own = S[2 * i : 2 * i + 2, 2 * i : 2 * i + 2]
+        angle, radius = rng.uniform(0, 2 * np.pi), 3 * np.sqrt(rng.uniform())
+        r[i] = np.linalg.cholesky(own) @ [radius * np.cos(angle), radius * np.sin(angle)]
+    S = jnp.asarray(S.reshape(M, 2, M, 2))
+    return Candidates(jnp.asarray(r), S, jnp.ones(M, bool)), bad
+
+
+def rates(name, wrong, runs=20):
+    """Mean shares of right matches kept and of wrong ones let through."""
+    rng = np.random.default_rng(0)
+    kept, let = [], []
+    for _ in range(runs):
+        matches, bad = found(rng, wrong)
+        believed = np.asarray(compiled[name](matches))
+        kept.append(believed[~bad].mean())
+        let.append(believed[bad].mean() if bad.any() else 0.0)
+    return np.mean(kept), np.mean(let)
+
+
+@pytest.mark.parametrize("name", ASSOCIATIONS)
+def test_what_is_true_is_kept(name):
+    assert rates(name, 0.0)[0] > 0.97
+
+
+@pytest.mark.parametrize(("name", "kept", "let"), [("sequential", 0.95, 0.05), ("jcbb", 0.7, 0.1)])
+def test_of_as_many_wrong_as_right_matches_the_wrong_ones_are_put_out(name, kept, let):
+    found_kept, found_let = rates(name, 0.5)
+    assert found_kept > kept
+    assert found_let < let
+
+
+def test_an_ellipse_alone_does_not_see_a_wrong_match():
+    assert rates("individual", 0.5)[1] > 0.9
+
+
+@pytest.mark.parametrize("name", JOINT)
+def test_what_moves_by_itself_is_not_believed(name):
+    """A third of the landmarks are on something that moved by 12 pixels: they agree among
+    themselves, but fewer of them do."""
+    rng = np.random.default_rng(1)
+    matches, _ = found(rng)
+    moving = np.arange(M) < M // 3
+    shifted = matches.residual + jnp.asarray(moving[:, None] * np.array([9.0, -8.0]))
+    believed = np.asarray(compiled[name](matches._replace(residual=shifted)))
+    assert believed[~moving].mean() > 0.9
+    assert believed[moving].mean() < 0.2
+
+
+@pytest.mark.parametrize("name", JOINT)
+def test_of_two_places_of_one_landmark_one_is_believed(name):
+    """Repeated texture: the landmarks of the second half are those of the first, found again a few
+    pixels beside."""
+    rng, half = np.random.default_rng(2), M // 2
+    S = covariance(rng)[:M, :M]
+    H = np.vstack([np.eye(M), np.eye(M)])
+    twice = H @ (S - SIGMA**2 * np.eye(M)) @ H.T + SIGMA**2 * np.eye(2 * M)
+    matches, _ = found(rng, S=twice)
+    aside = rng.choice([-6.0, 6.0], size=(half, 2))
+    residual = matches.residual.at[half:].add(jnp.asarray(aside))
+    believed = np.asarray(compiled[name](matches._replace(residual=residual)))
+    assert believed[:half].mean() > 0.85
+    assert not (believed[:half] & believed[half:]).any()
+
+
+@pytest.mark.parametrize("name", ASSOCIATIONS)
+def test_what_is_not_valid_is_never_believed(name):
+    matches, _ = found(np.random.default_rng(3))
+    valid = jnp.arange(M) % 3 > 0
+    believed = compiled[name](matches._replace(valid=valid))
+    assert not np.any(believed & ~valid)
+    assert not np.any(compiled[name](matches._replace(valid=jnp.zeros(M, bool))))
+
+
+def test_the_order_of_the_matches_does_not_matter():
+    matches, _ = found(np.random.default_rng(4), 0.3)
+    order = np.random.default_rng(5).permutation(M)
+    S = matches.covariance[order][:, :, order]
+    for name in AGREEING:
+        believed = np.asarray(compiled[name](matches))
+        permuted = compiled[name](Candidates(matches.residual[order], S, matches.valid[order]))
+        np.testing.assert_array_equal(permuted, believed[order])
+
+
+def jointly_compatible(matches, kept):
+    index = np.flatnonzero(np.repeat(kept, 2))
+    S = np.asarray(matches.covariance).reshape(2 * M, 2 * M)[np.ix_(index, index)]
+    r = np.asarray(matches.residual).ravel()[index]
+    return r @ np.linalg.solve(S, r) < chi2.ppf(GATE, len(index))
+
+
+def test_joint_compatibility_finds_the_largest_set_there_is():
+    """By trying all sets of eight matches."""
+    rng = np.random.default_rng(6)
+    for _ in range(5):
+        matches, _ = found(rng, 0.4)
+        valid = np.arange(M) < 8
+        matches = matches._replace(valid=jnp.asarray(valid))
+        alone = np.asarray(compiled["individual"](matches))
+        sets = (np.array([k >> i & 1 for i in range(M)], bool) for k in range(1, 2**8))
+        largest = max(
+            s.sum() for s in sets if not (s & ~alone).any() and jointly_compatible(matches, s)
+        )
+        believed = np.asarray(compiled["jcbb"](matches))
+        assert believed.sum() == largest
+        assert jointly_compatible(matches, believed)
+
+
+def test_sequential_ends_with_matches_that_all_fit_the_others():
+    """Each given all the others, by conditioning S itself."""
+    matches, _ = found(np.random.default_rng(7), 0.4)
+    believed = np.asarray(compiled["sequential"](matches))
+    assert believed.sum() > 8
+    S = np.asarray(matches.covariance).reshape(2 * M, 2 * M)
+    r = np.asarray(matches.residual).ravel()
+    for i in np.flatnonzero(believed):
+        own = [2 * i, 2 * i + 1]
+        others = np.setdiff1d(np.flatnonzero(np.repeat(believed, 2)), own)
+        gain = np.linalg.solve(S[np.ix_(others, others)], S[np.ix_(others, own)]).T
+        left = r[own] - gain @ r[others]
+        C = S[np.ix_(own, own)] - gain @ S[np.ix_(others, own)]
+        assert left @ np.linalg.solve(C, left) < chi2.ppf(GATE, 2)
+
+
+@cache
+def matched():
+    """A filter, the predicted state of its second frame, and the pixels of six landmarks there."""
+    case = Case("matched-6dof", steps=1, landmarks=6)
+    slam, control = case.filter("robocentric"), case.controls()[0]
+    sigma = slam.motion.velocity_sigma.copy()
+    sigma[4] = 0.5  # a turn to the side by 17 mrad, 11 pixels
+    slam = replace(slam, motion=replace(slam.motion, velocity_sigma=sigma))
+
+    def predicted(first):
+        state = slam.predict(slam.init(case.capacity, first), control)
+        return state, slam.predict_features(state, control, jnp.arange(6)).measured
+
+    state, pixels = quick_jit(predicted)(case.frames(0)[0])
+    return slam, state, control, pixels
+
+
+@pytest.mark.parametrize("name", AGREEING)
+def test_what_the_filter_does_not_know_is_no_outlier(name):
+    """All are off by one turn of the camera: each explains the others, but not the stranger."""
+    slam, state, control, pixels = matched()
+    offsets = np.tile([4.0, 0.0], (6, 1))
+    offsets[2] = [-30.0, 20.0]
+    seen = Features(jnp.arange(6), pixels + jnp.asarray(offsets), jnp.ones(6, bool))
+    believed = quick_jit(
+        lambda state, seen: ASSOCIATIONS[name](candidates(slam, state, control, seen))
+    )
+    assert believed(state, seen).tolist() == [True, True, False, True, True, True]
+
+
+def test_a_filter_without_the_covariance_of_its_innovations_is_refused():
+    case = Case("matched-6dof", steps=1, landmarks=6)
+    slam, control, first = matched()[0], case.controls()[0], case.frames(0)[0]
+    slam = replace(slam, form=Information(), landmark=LANDMARKS["image_plane"])
+    state = slam.predict(slam.init(case.capacity, first), control)
+    with pytest.raises(ValueError, match="innovations have no covariance"):
+        candidates(slam, state, control, first)
