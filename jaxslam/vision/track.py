@@ -220,7 +220,9 @@ def _write(
 ) -> dict[str, Any]:
     times, T_wc = _trajectory(history)
     write_tum(out / "trajectory.txt", times, T_wc)
-    write_covariances(out / "covariance.txt", times, [result.covariance for result in history])
+    scaled = any(result.sigma_log_scale is not None for result in history)
+    covariances = [result.covariance for result in history]
+    write_covariances(out / "covariance.txt", times, covariances, given_scale=scaled)
     write_frames(out / "frames.csv", history)
     summary = _summary(source, tracker, history, seconds)
     with write_atomically(out / "summary.json") as path:
@@ -253,9 +255,9 @@ def write_frames(path: str | Path, history: list[Tracked]) -> None:
     `state` is `start` (of a map; where it is not the first, the camera is lost too), `tracked` or
     `lost`, `map` the number of the map, from 0. σ of position (map units) and orientation (rad)
     are roots of the summed variances of the three axes, zero in the first frame alone, which is
-    the world's.
-    `sigma_log_scale` is of the logarithm of the map's unit, empty where the filter has none in
-    doubt: then nobody has measured it.
+    the world's, and given the scale of the map. `sigma_log_scale` is what the filter does not know
+    of that, σ of the logarithm of the map's unit; empty where it is in no doubt of it: then nobody
+    has measured it.
     """
     with write_atomically(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")

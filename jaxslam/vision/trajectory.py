@@ -16,6 +16,7 @@ MAX_TIME_DIFFERENCE = 0.01
 _ROUNDING = 1e-8
 
 _UNITS = "every map of frames.csv has a unit of its own"
+_GIVEN_SCALE = "given the scale of its map, of which sigma_log_scale of frames.csv is in doubt"
 
 
 class TrajectoryError(TypedDict):
@@ -65,18 +66,23 @@ def write_tum(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> None:
     _write_rows(path, header, times, table, "poses", ".9f")
 
 
-def write_covariances(path: str | Path, times: ArrayLike, covariances: ArrayLike) -> None:
+def write_covariances(
+    path: str | Path, times: ArrayLike, covariances: ArrayLike, *, given_scale: bool = False
+) -> None:
     """Write times (n,) and covariances (n, 6, 6), whole or not at all.
 
     A line is the time and the upper triangle, row by row: position in the camera's axes, rotation
     vector. The true pose is `T_wc E`, and that is the covariance of E's translation and rotation
-    vector. That maps which follow one another have different units of length is not in it.
+    vector. That maps which follow one another have different units of length is not in it. The
+    header says whether these are covariances `given_scale`, of a filter with a unit of its own, or
+    of poses in a unit that the filter takes for exactly known.
     """
     rows, columns = np.triu_indices(6)
     table = np.asarray(covariances, dtype=float).reshape(-1, 6, 6)[:, rows, columns]
     names = ("x", "y", "z", "rx", "ry", "rz")
     pairs = " ".join(f"{names[i]}{names[j]}" for i, j in zip(rows, columns, strict=True))
-    header = f"{pairs} (s; map units and rad, in the camera frame; {_UNITS}, taken as one)"
+    scale = _GIVEN_SCALE if given_scale else "the filter has no doubt of its scale"
+    header = f"{pairs} (s; map units and rad, in the camera frame; {_UNITS}, taken as one; {scale})"
     _write_rows(path, header, times, table, "covariances", ".9e")
 
 

@@ -37,6 +37,15 @@ def fail(*_, **__):
     raise ValueError("cannot draw")
 
 
+@pytest.mark.parametrize(("name", "in_doubt"), [("scale_gauge+mixture3", True), ("world", False)])
+def test_a_filter_with_a_unit_of_its_own_says_so_beside_its_covariances(tmp_path, name, in_doubt):
+    tracking.track(small(3), tmp_path, replace(SETTINGS, filter=name), overlay=False)
+    header = (tmp_path / "covariance.txt").read_text().splitlines()[0]
+    assert ("given the scale of its map" in header) == in_doubt
+    last = (tmp_path / "frames.csv").read_text().splitlines()[-1].split(",")
+    assert (last[-1] != "") == in_doubt
+
+
 def test_the_overlay_can_be_left_out(tmp_path):
     tracking.track(small(3), tmp_path, SETTINGS, overlay=False)
     assert names(tmp_path) == NUMBERS | FIGURES

@@ -237,6 +237,18 @@ def test_covariances_are_read_as_they_were_written_and_are_the_errors(tmp_path):
     assert abs(pose_nees(T_wc, P, T_wc @ E).mean() - 6) < 0.22
 
 
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [(True, "given the scale of its map, of which sigma_log_scale"), (False, "no doubt of its")],
+)
+def test_the_header_says_whether_scale_is_in_a_covariance(tmp_path, given, words):
+    path = tmp_path / "covariance.txt"
+    write_covariances(path, [0.0], np.eye(6)[None], given_scale=given)
+    header, _ = path.read_text().splitlines()
+    assert header.startswith("# t xx xy")
+    assert words in header
+
+
 def test_a_pose_that_is_known_exactly_has_a_nees_of_zero_if_it_is_right(tmp_path):
     """Every covariance file begins with one: the first camera is the world."""
     times, T_wc = wave(4)
