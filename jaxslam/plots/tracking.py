@@ -1,5 +1,6 @@
 """The map of a tracked video: trajectory, reference and landmarks with their uncertainty."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,37 @@ _CHI2_95 = 5.991  # 95 % quantile of chi-squared with two degrees of freedom
 _MARGIN = 0.06  # around what is shown, as a share of its size
 _WIDTH, _LEAST_HEIGHT, _HEIGHT = 5.0, 0.9, 3.5  # of a panel, inches
 _TICKS, _TICK = 15, 0.05  # how many viewing directions, and how long: a share of the view's size
+
+_Box = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
+"""The least and the greatest coordinates of a view."""
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """A view of the world along one axis."""
+
+    title: str
+    plane: list[int]
+    """The coordinates to the right and up."""
+    box: _Box
+    with_landmarks: bool = True
+
+    @property
+    def size(self) -> float:
+        """Of the longest side of the box, the hidden one too."""
+        return float(np.max(self.box[1] - self.box[0]))
+
+    @property
+    def height(self) -> float:
+        """Inches."""
+        across, up = (self.box[1] - self.box[0])[self.plane]
+        return min(max(_WIDTH * up / across, _LEAST_HEIGHT), _HEIGHT)
+
+    def seen(
+        self, points: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
+    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
+        """What is seen of them from here."""
+        return points[:, self.plane], covariances[:, self.plane][:, :, self.plane]
 
 
 def plot_map(
@@ -37,10 +69,10 @@ def plot_map(
     are landmarks in the world frame. Ellipses hold 95 % of the two coordinates shown. The axes
     cover the trajectories and the bulk of the landmarks; titles say how many lie outside, and
     ellipses larger than the view are left out; a path that is small beside them is shown alone
-    too. Where `lost`, true or false for each pose, the line is dotted: there
-    nothing was measured. At the poses `begun` a new map begins: the line breaks and is marked, with
-    the 95 % of `begun_covariances` (b, 3, 3) of where that is; the landmarks' covariances are then
-    to be those given where their map begins.
+    too. Where `lost`, true or false for each pose, the line is dotted: there nothing was measured.
+    At the poses `begun` a new map begins: the line breaks and is marked, with the 95 % of
+    `begun_covariances` (b, 3, 3) of where that is; the landmarks' covariances are then to be those
+    given where their map begins.
     """
     poses = np.asarray(trajectory, dtype=float).reshape(-1, 4, 4)
     points = np.asarray(points, dtype=float).reshape(-1, 3)
@@ -53,28 +85,27 @@ def plot_map(
     if reference is not None:
         true = np.asarray(reference, dtype=float).reshape(-1, 4, 4)[:, :3, 3]
         lines.insert(0, ("reference", true, _REFERENCE, "--"))
-    path_alone = np.concatenate([line for _, line, _, _ in lines])
-    low, high = _view(path_alone, points)
+    shown = np.concatenate([line for _, line, _, _ in lines])
+    low, high = _view(shown, points)
     inside = np.all((points >= low) & (points <= high), axis=1)
-    figure, panels = _panels(_view(path_alone, points[:0]), (low, high))
-    for axis, plane, view, title in panels:
-        size = float(np.max(view[1] - view[0]))
-        if view[0] is low:
-            kept = points[inside][:, plane], covariances[inside][:, plane][:, :, plane]
-            title += f": {_counts(inside, _draw_landmarks(axis, *kept, size))}"
-        _draw_directions(axis, poses, plane, _TICK * size)
+    figure, panels = _panels(_view(shown, points[:0]), (low, high))
+    for axis, panel in panels:
+        hidden = 0
+        if panel.with_landmarks:
+            hidden = _draw_landmarks(axis, panel, points[inside], covariances[inside])
+        _draw_directions(axis, panel, poses)
         for name, line, colour, style in lines:
-            axis.plot(*line[:, plane].T, style, color=colour, lw=1.6, label=name)
+            axis.plot(*line[:, panel.plane].T, style, color=colour, lw=1.6, label=name)
         if len(poses):
-            axis.plot(*poses[0, plane, 3], "o", color=_TRAJECTORY, ms=6, mfc="white", label="start")
+            start = poses[0, panel.plane, 3]
+            axis.plot(*start, "o", color=_TRAJECTORY, ms=6, mfc="white", label="start")
         if len(begun):
-            there = poses[begun, :3, 3][:, plane]
-            _draw_begun(axis, there, begun_covariances[:, plane][:, :, plane])
-        _set_axes(axis, plane, view, unit)
-        axis.set_title(title, fontsize=9)
-    figure.legend(
-        *panels[-1][0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8
-    )
+            _draw_begun(axis, panel, poses[begun, :3, 3], begun_covariances)
+        counts = f": {_counts(inside, hidden)}" if panel.with_landmarks else ""
+        axis.set_title(panel.title + counts, fontsize=9)
+        _set_axes(axis, panel, unit)
+    entries = panels[-1][0].get_legend_handles_labels()
+    figure.legend(*entries, loc="outside lower center", ncols=2, fontsize=8)
     save(figure, path)
 
 
@@ -98,49 +129,39 @@ def _lines(
     return lines
 
 
-def _panels(
-    path: tuple[np.ndarray, np.ndarray], everything: tuple[np.ndarray, np.ndarray]
-) -> tuple[Figure, list[tuple[Axes, list[int], tuple[np.ndarray, np.ndarray], str]]]:
-    """Axes, the two coordinates that they show, corners of the view, and what it is.
-
-    From above and from behind, one above the other, x to the right; what is deeper than wide from
-    above and from the side, z to the right. Over them the path alone, where it is small in the map.
-    """
-    size = everything[1] - everything[0]
-    deep = size[2] > size[0]
-    above, upright = ([2, 0], [2, 1]) if deep else ([0, 2], [0, 1])
-    panels = [(above, everything, "from above")]
-    panels += [(upright, everything, "from the side" if deep else "from behind")]
-    if np.max(path[1] - path[0]) < 0.5 * np.max(size):
-        panels.insert(0, (above, path, "the path, from above"))
-    heights = [_height(plane, view) for plane, view, _ in panels]
+def _panels(path: _Box, everything: _Box) -> tuple[Figure, list[tuple[Axes, _Panel]]]:
+    """From above and from behind, one above the other, x to the right; what is deeper than wide
+    from above and from the side, z to the right. Over them the path alone, where it is small."""
+    across, _, deep = everything[1] - everything[0]
+    above, upright = ([2, 0], [2, 1]) if deep > across else ([0, 2], [0, 1])
+    panels = [
+        _Panel("from above", above, everything),
+        _Panel("from the side" if deep > across else "from behind", upright, everything),
+    ]
+    alone = _Panel("the path, from above", above, path, with_landmarks=False)
+    if alone.size < 0.5 * panels[0].size:
+        panels.insert(0, alone)
+    heights = [panel.height for panel in panels]
     figure = new_figure(_WIDTH + 0.6, sum(heights) + 0.6 * len(panels) + 0.7)
     axes = figure.subplots(len(panels), 1, height_ratios=heights)
-    return figure, [(axis, *panel) for axis, panel in zip(axes, panels, strict=True)]
+    return figure, list(zip(axes, panels, strict=True))
 
 
-def _height(plane: list[int], view: tuple[np.ndarray, np.ndarray]) -> float:
-    across, up = (view[1] - view[0])[plane]
-    return min(max(_WIDTH * up / across, _LEAST_HEIGHT), _HEIGHT)
-
-
-def _set_axes(axis: Axes, plane: list[int], view: tuple[np.ndarray, np.ndarray], unit: str) -> None:
-    (left, low), (right, high) = view[0][plane], view[1][plane]
-    across, up = ("xyz"[i] for i in plane)
+def _set_axes(axis: Axes, panel: _Panel, unit: str) -> None:
+    (left, bottom), (right, top) = (corner[panel.plane] for corner in panel.box)
+    across, up = ("xyz"[i] for i in panel.plane)
     axis.set(xlabel=f"{across} ({unit})", ylabel=f"{up} ({unit})", aspect="equal")
-    axis.set(xlim=(left, right), ylim=(low, high))
+    axis.set(xlim=(left, right), ylim=(bottom, top))
     axis.grid(alpha=0.25, lw=0.5)
-    if plane != [0, 2]:  # y points down, and so does x where z points to the right
+    if panel.plane != [0, 2]:  # y points down, and so does x where z points to the right
         axis.invert_yaxis()
 
 
-def _draw_directions(
-    axis: Axes, poses: Float[np.ndarray, "n 4 4"], plane: list[int], length: float
-) -> None:
+def _draw_directions(axis: Axes, panel: _Panel, poses: Float[np.ndarray, "n 4 4"]) -> None:
     """Ticks along the path to where the camera looks, as long as they are seen from here."""
     chosen = poses[:: max(1, len(poses) // _TICKS)]
-    ends = chosen[:, :3, 3] + length * chosen[:, :3, 2]
-    ticks = np.stack([chosen[:, :3, 3], ends], axis=1)[:, :, plane]
+    ends = chosen[:, :3, 3] + _TICK * panel.size * chosen[:, :3, 2]
+    ticks = np.stack([chosen[:, :3, 3], ends], axis=1)[:, :, panel.plane]
     label = "where the camera looks"
     axis.add_collection(LineCollection(list(ticks), colors=GREY, linewidths=0.9, label=label))
 
@@ -152,9 +173,7 @@ def _counts(inside: np.ndarray, hidden: int) -> str:
     return text + (f", {hidden} without ellipse" if hidden else "")
 
 
-def _view(
-    lines: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m 3"]
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+def _view(lines: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m 3"]) -> _Box:
     """The box around the trajectories and the landmarks that are not absurdly far, with margin.
 
     Far: beyond five times the interquartile range from the quartiles, along any axis.
@@ -175,23 +194,28 @@ def _view(
 
 def _draw_landmarks(
     axis: Axes,
-    points: Float[np.ndarray, "n 2"],
-    covariances: Float[np.ndarray, "n 2 2"],
-    size: float,
+    panel: _Panel,
+    points: Float[np.ndarray, "n 3"],
+    covariances: Float[np.ndarray, "n 3 3"],
 ) -> int:
     """Draw points and their 95 % ellipses; return how many ellipses were too large to draw."""
     if not len(points):
         return 0
-    shown = 2 * np.sqrt(_CHI2_95 * np.linalg.eigvalsh(covariances)[:, 1]) <= size
+    points, covariances = panel.seen(points, covariances)
+    shown = 2 * np.sqrt(_CHI2_95 * np.linalg.eigvalsh(covariances)[:, 1]) <= panel.size
     _draw_ellipses(axis, points[shown], covariances[shown], _LANDMARKS)
     axis.plot(*points.T, ".", color=_LANDMARKS, ms=3.5, label="landmarks, 95 % in their maps")
     return int((~shown).sum())
 
 
 def _draw_begun(
-    axis: Axes, places: Float[np.ndarray, "k 2"], covariances: Float[np.ndarray, "k 2 2"]
+    axis: Axes,
+    panel: _Panel,
+    places: Float[np.ndarray, "k 3"],
+    covariances: Float[np.ndarray, "k 3 3"],
 ) -> None:
     """Mark where maps begin, and where in the world that can be."""
+    places, covariances = panel.seen(places, covariances)
     _draw_ellipses(axis, places, covariances, _BEGUN)
     label = "a map begins, 95 % of where"
     axis.plot(*places.T, "D", color=_BEGUN, ms=6, mfc="white", label=label)
