@@ -16,6 +16,7 @@ _TRAJECTORY, _REFERENCE, _LANDMARKS, _BEGUN = COLOURS[:4]
 _CHI2_95 = 5.991  # 95 % quantile of chi-squared with two degrees of freedom
 _MARGIN = 0.06  # around what is shown, as a share of its size
 _WIDTH, _LEAST_HEIGHT, _HEIGHT = 5.0, 0.9, 3.5  # of a panel, inches
+_WORDS, _LEGEND = 0.7, 1.2  # height of a panel's title and label, and of the legend, inches
 _TICKS, _TICK = 15, 0.05  # how many viewing directions, and how long: a share of the view's size
 
 _Box = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
@@ -142,7 +143,7 @@ def _panels(path: _Box, everything: _Box) -> tuple[Figure, list[tuple[Axes, _Pan
     if alone.size < 0.5 * panels[0].size:
         panels.insert(0, alone)
     heights = [panel.height for panel in panels]
-    figure = new_figure(_WIDTH + 0.6, sum(heights) + 0.6 * len(panels) + 0.7)
+    figure = new_figure(_WIDTH + 0.6, sum(heights) + _WORDS * len(panels) + _LEGEND)
     axes = figure.subplots(len(panels), 1, height_ratios=heights)
     return figure, list(zip(axes, panels, strict=True))
 

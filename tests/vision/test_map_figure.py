@@ -1,5 +1,7 @@
 """What stands in the figure of a map: lines, ticks, marks, where the axes end."""
 
+import itertools
+
 import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection, LineCollection
@@ -128,3 +130,19 @@ def test_a_camera_that_stands_still_without_landmarks_is_drawn(drawn):
         "from above",
         "from behind",
     ]
+
+
+@pytest.mark.parametrize(("length", "width"), [(100.0, 20.0), (3.0, 1.0), (0.2, 1.0), (5.0, 9.0)])
+def test_titles_labels_and_legend_have_room(drawn, length, width):
+    """None is cut off or drawn over another."""
+    figure = drawn(
+        path_along_x(length=length), *wall(width=width),
+        reference=path_along_x(length=length), lost=np.arange(30) > 25,
+        begun=[10], begun_covariances=[0.01 * np.eye(3)],
+    )["from above"].figure  # fmt: skip
+    figure.draw_without_rendering()
+    words = [part for axis in figure.axes for part in (axis.title, axis.xaxis.label)]
+    boxes = [part.get_window_extent() for part in [*words, figure.legends[0]]]
+    whole = figure.bbox
+    assert all(box.y0 >= whole.y0 and box.y1 <= whole.y1 for box in boxes)
+    assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
