@@ -21,6 +21,9 @@ def _flags_that_are_known(*flags: str) -> str:
 
 
 jax.config.update("jax_enable_x64", True)
+if not jax.config.values["jax_compilation_cache_dir"]:  # commands would keep programs at home
+    jax.config.update("jax_enable_compilation_cache", False)
+    os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
 # Tests compile much and compute little.
 jax.config.update("jax_disable_most_optimizations", True)
 os.environ["XLA_FLAGS"] = _flags_that_are_known("--xla_cpu_use_fusion_emitters=false")

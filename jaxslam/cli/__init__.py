@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from jaxslam.cli.cache import keep_programs
 from jaxslam.cli.calibrate import CalibrateOptions
 from jaxslam.cli.consistency import ConsistencyOptions
 from jaxslam.cli.track import TrackOptions
@@ -51,6 +52,7 @@ def main(arguments: list[str] | None = None) -> None:
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.HelptextFromCommentsOff),
     )
     signal.signal(signal.SIGTERM, _interrupt)
+    keep_programs()
     try:
         options.run()
     except ValueError as error:

@@ -14,6 +14,9 @@ from jaxslam.names import FILTERS
 from jaxslam.simulation.scenario import CALIBRATIONS
 from jaxslam.vision.settings import TrackerSettings
 
+_COMPILING = "compiling …"
+"""What the bar says while the first frames wait for their programs."""
+
 
 @dataclass(frozen=True)
 class TrackOptions:
@@ -33,8 +36,8 @@ class TrackOptions:
     target: Path | None = None
     """JSON file of known points that the first frame sees: the map is in metres."""
     out: Path = Path("results")
-    """Folder for trajectory.txt, covariance.txt, frames.csv, map.ply, map.png, overlay.mp4 and
-    summary.json."""
+    """Folder for trajectory.txt, covariance.txt, frames.csv, summary.json, map.ply, map.png and
+    overlay.mp4."""
     frames: int | None = None
     """Frames to track, at the most; of the synthetic video 150 by default."""
     start: float = 0.0
@@ -71,6 +74,10 @@ class TrackOptions:
     """Standard deviation of the angular acceleration, rad/s²."""
     wanted: int = TrackerSettings.wanted
     """Landmarks to keep in view."""
+    overlay: bool = True
+    """Whether to write overlay.mp4."""
+    viewer: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
+    """Recording for the rerun viewer, written as the frames come."""
 
     def run(self) -> None:
         """Track the video, print the summary, write its files."""
@@ -78,19 +85,33 @@ class TrackOptions:
         from tqdm import tqdm
 
         from jaxslam.vision.target import read_target
-        from jaxslam.vision.track import describe, track
+        from jaxslam.vision.track import WARM_UP, describe, track
 
         with one_line_warnings():
             source = self._source()
         target = None if self.target is None else read_target(self.target)
         total = len(source) or self.frames
-        with tqdm(total=total, unit="frame", disable=None) as bar:
-            summary = track(source, self.out, self._settings(), target=target, progress=bar.update)
+        with tqdm(total=total, desc=_COMPILING, unit="frame", disable=None) as bar:
+
+            def progress(frames: int) -> None:
+                bar.update(frames)
+                if bar.n == WARM_UP:
+                    bar.set_description("tracking")
+
+            summary = track(
+                source,
+                self.out,
+                self._settings(),
+                target=target,
+                overlay=self.overlay,
+                viewer=self.viewer,
+                progress=progress,
+            )
         print(describe(summary))
-        print(
-            "wrote trajectory.txt, covariance.txt, frames.csv, map.ply, map.png, overlay.mp4, "
-            f"summary.json in {self.out}"
-        )
+        written = "trajectory.txt, covariance.txt, frames.csv, summary.json, map.ply, map.png"
+        print(f"wrote {written}{', overlay.mp4' if self.overlay else ''} in {self.out}")
+        if self.viewer is not None:
+            print(f"wrote {self.viewer}: rerun {self.viewer} shows it")
 
     def _source(self):
         from jaxslam.video.opening import open_source

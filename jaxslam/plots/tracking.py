@@ -1,18 +1,54 @@
 """The map of a tracked video: trajectory, reference and landmarks with their uncertainty."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
-from matplotlib.collections import EllipseCollection
+from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from jaxslam.plots.style import COLOURS, new_figure, save
+from jaxslam.plots.style import COLOURS, GREY, new_figure, save
 
 _TRAJECTORY, _REFERENCE, _LANDMARKS, _BEGUN = COLOURS[:4]
 _CHI2_95 = 5.991  # 95 % quantile of chi-squared with two degrees of freedom
-_MARGIN = 0.12  # around what is shown, as a share of its size
+_MARGIN = 0.06  # around what is shown, as a share of its size
+_WIDTH, _LEAST_HEIGHT, _HEIGHT = 5.0, 0.9, 3.5  # of a panel, inches
+_WORDS, _LEGEND = 0.7, 1.2  # height of a panel's title and label, and of the legend, inches
+_TICKS, _TICK = 15, 0.05  # how many viewing directions, and how long: a share of the view's size
+
+_Box = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
+"""The least and the greatest coordinates of a view."""
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """A view of the world along one axis."""
+
+    title: str
+    plane: list[int]
+    """The coordinates to the right and up."""
+    box: _Box
+    with_landmarks: bool = True
+
+    @property
+    def size(self) -> float:
+        """Of the longest side of the box, the hidden one too."""
+        return float(np.max(self.box[1] - self.box[0]))
+
+    @property
+    def height(self) -> float:
+        """Inches."""
+        across, up = (self.box[1] - self.box[0])[self.plane]
+        return min(max(_WIDTH * up / across, _LEAST_HEIGHT), _HEIGHT)
+
+    def seen(
+        self, points: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
+    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
+        """What is seen of them from here."""
+        return points[:, self.plane], covariances[:, self.plane][:, :, self.plane]
 
 
 def plot_map(
@@ -23,68 +59,122 @@ def plot_map(
     reference: ArrayLike | None = None,
     path: str | Path,
     unit: str = "m",
+    lost: ArrayLike = (),
     begun: ArrayLike = (),
     begun_covariances: ArrayLike = (),
 ) -> None:
-    """Draw the map from above (x, z) and from behind (x, y) into the image file `path`.
+    """Draw the map from above (x and z) and from behind or the side (y) into the image file `path`.
 
-    `trajectory` and `reference` are poses T_wc (n, 4, 4), drawn as they are (align them first),
-    `points` (n, 3) and `covariances` (n, 3, 3) landmarks in the world frame. Ellipses hold 95 %
-    of the two coordinates shown. The axes cover the trajectories and the bulk of the landmarks;
-    the title says how many lie outside, and ellipses larger than the view are left out. At the
-    poses `begun` a new map begins: the line breaks and is marked, with the 95 % of
-    `begun_covariances` (k, 3, 3) of where that is; the landmarks' covariances are then to be
-    those given where their map begins.
+    `trajectory` and `reference` are poses T_wc (n, 4, 4) and (m, 4, 4), drawn as they are (align
+    them first); ticks point where the camera looks. `points` (k, 3) and `covariances` (k, 3, 3)
+    are landmarks in the world frame. Ellipses hold 95 % of the two coordinates shown. The axes
+    cover the trajectories and the bulk of the landmarks; titles say how many lie outside, and
+    ellipses larger than the view are left out; a path that is small beside them is shown alone
+    too. Where `lost`, true or false for each pose, the line is dotted: there nothing was measured.
+    At the poses `begun` a new map begins: the line breaks and is marked, with the 95 % of
+    `begun_covariances` (b, 3, 3) of where that is; the landmarks' covariances are then to be those
+    given where their map begins.
     """
-    trajectory = np.asarray(trajectory, dtype=float).reshape(-1, 4, 4)[:, :3, 3]
+    poses = np.asarray(trajectory, dtype=float).reshape(-1, 4, 4)
     points = np.asarray(points, dtype=float).reshape(-1, 3)
     covariances = np.asarray(covariances, dtype=float).reshape(-1, 3, 3)
     finite = np.isfinite(points).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
     points, covariances = points[finite], covariances[finite]
     begun = np.asarray(begun, dtype=int)
     begun_covariances = np.asarray(begun_covariances, dtype=float).reshape(-1, 3, 3)
-    broken = np.insert(trajectory, begun, np.nan, axis=0)
-    lines = [("estimate", broken, _TRAJECTORY, "-")]
+    lines = _lines(poses, np.resize(np.asarray(lost, dtype=bool), len(poses)), begun)
     if reference is not None:
-        reference = np.asarray(reference, dtype=float).reshape(-1, 4, 4)[:, :3, 3]
-        lines.append(("reference", reference, _REFERENCE, "--"))
-    low, high = _view(np.concatenate([line for _, line, _, _ in lines]), points)
+        true = np.asarray(reference, dtype=float).reshape(-1, 4, 4)[:, :3, 3]
+        lines.insert(0, ("reference", true, _REFERENCE, "--"))
+    shown = np.concatenate([line for _, line, _, _ in lines])
+    low, high = _view(shown, points)
     inside = np.all((points >= low) & (points <= high), axis=1)
-    figure = new_figure(11, 5.2)
-    axes = figure.subplots(1, 2)
-    for axis, (across, up), title in zip(
-        axes, [(0, 2), (0, 1)], ["from above", "from behind"], strict=True
-    ):
-        plane = [across, up]
-        hidden = _draw_landmarks(
-            axis, points[inside][:, plane], covariances[inside][:, plane][:, :, plane], high - low
-        )
+    figure, panels = _panels(_view(shown, points[:0]), (low, high))
+    for axis, panel in panels:
+        hidden = 0
+        if panel.with_landmarks:
+            hidden = _draw_landmarks(axis, panel, points[inside], covariances[inside])
+        _draw_directions(axis, panel, poses)
         for name, line, colour, style in lines:
-            axis.plot(line[:, across], line[:, up], style, color=colour, lw=1.6, label=name)
-        if len(trajectory):
-            start = trajectory[0, plane]
-            axis.plot(*start, "o", color=_TRAJECTORY, ms=5, mfc="white", label="start")
+            axis.plot(*line[:, panel.plane].T, style, color=colour, lw=1.6, label=name)
+        if len(poses):
+            start = poses[0, panel.plane, 3]
+            axis.plot(*start, "o", color=_TRAJECTORY, ms=6, mfc="white", label="start")
         if len(begun):
-            _draw_begun(axis, trajectory[begun][:, plane], begun_covariances[:, plane][:, :, plane])
-        axis.set(xlabel=f"x ({unit})", ylabel=f"{'xyz'[up]} ({unit})", aspect="equal")
-        axis.set(xlim=(low[across], high[across]), ylim=(low[up], high[up]))
-        axis.set_title(f"{title}: {_counts(inside, hidden)}", fontsize=10)
-        axis.grid(alpha=0.25, lw=0.5)
-    axes[1].invert_yaxis()  # y points down
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+            _draw_begun(axis, panel, poses[begun, :3, 3], begun_covariances)
+        counts = f": {_counts(inside, hidden)}" if panel.with_landmarks else ""
+        axis.set_title(panel.title + counts, fontsize=9)
+        _set_axes(axis, panel, unit)
+    entries = panels[-1][0].get_legend_handles_labels()
+    figure.legend(*entries, loc="outside lower center", ncols=2, fontsize=8)
     save(figure, path)
 
 
+def _lines(
+    poses: Float[np.ndarray, "n 4 4"], lost: Bool[np.ndarray, " n"], begun: Int[np.ndarray, " b"]
+) -> list[tuple[str, np.ndarray, str, str]]:
+    """Name, points, colour and style: the estimate, and apart where the camera was lost."""
+    positions = poses[:, :3, 3]
+
+    def broken(hidden: np.ndarray) -> np.ndarray:
+        shown = np.where(hidden[:, None], np.nan, positions)
+        return np.insert(shown, begun, np.nan, axis=0)
+
+    lines = [("estimate", broken(lost), _TRAJECTORY, "-")]
+    if lost.any():
+        # From the last frame that was tracked to the next.
+        around = lost.copy()
+        around[1:] |= lost[:-1]
+        around[:-1] |= lost[1:]
+        lines.append(("lost: only predicted", broken(~around), GREY, ":"))
+    return lines
+
+
+def _panels(path: _Box, everything: _Box) -> tuple[Figure, list[tuple[Axes, _Panel]]]:
+    """From above and from behind, one above the other, x to the right; what is deeper than wide
+    from above and from the side, z to the right. Over them the path alone, where it is small."""
+    across, _, deep = everything[1] - everything[0]
+    above, upright = ([2, 0], [2, 1]) if deep > across else ([0, 2], [0, 1])
+    panels = [
+        _Panel("from above", above, everything),
+        _Panel("from the side" if deep > across else "from behind", upright, everything),
+    ]
+    alone = _Panel("the path, from above", above, path, with_landmarks=False)
+    if alone.size < 0.5 * panels[0].size:
+        panels.insert(0, alone)
+    heights = [panel.height for panel in panels]
+    figure = new_figure(_WIDTH + 0.6, sum(heights) + _WORDS * len(panels) + _LEGEND)
+    axes = figure.subplots(len(panels), 1, height_ratios=heights)
+    return figure, list(zip(axes, panels, strict=True))
+
+
+def _set_axes(axis: Axes, panel: _Panel, unit: str) -> None:
+    (left, bottom), (right, top) = (corner[panel.plane] for corner in panel.box)
+    across, up = ("xyz"[i] for i in panel.plane)
+    axis.set(xlabel=f"{across} ({unit})", ylabel=f"{up} ({unit})", aspect="equal")
+    axis.set(xlim=(left, right), ylim=(bottom, top))
+    axis.grid(alpha=0.25, lw=0.5)
+    if panel.plane != [0, 2]:  # y points down, and so does x where z points to the right
+        axis.invert_yaxis()
+
+
+def _draw_directions(axis: Axes, panel: _Panel, poses: Float[np.ndarray, "n 4 4"]) -> None:
+    """Ticks along the path to where the camera looks, as long as they are seen from here."""
+    chosen = poses[:: max(1, len(poses) // _TICKS)]
+    ends = chosen[:, :3, 3] + _TICK * panel.size * chosen[:, :3, 2]
+    ticks = np.stack([chosen[:, :3, 3], ends], axis=1)[:, :, panel.plane]
+    label = "where the camera looks"
+    axis.add_collection(LineCollection(list(ticks), colors=GREY, linewidths=0.9, label=label))
+
+
 def _counts(inside: np.ndarray, hidden: int) -> str:
-    text = f"{inside.sum()} of {len(inside)} landmarks"
+    text = f"{inside.sum()} landmarks"
     if not inside.all():
-        text += f", {(~inside).sum()} outside"
-    return text + (f", {hidden} without ellipse (too large)" if hidden else "")
+        text += f", {(~inside).sum()} more outside"
+    return text + (f", {hidden} without ellipse" if hidden else "")
 
 
-def _view(
-    lines: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m 3"]
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+def _view(lines: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m 3"]) -> _Box:
     """The box around the trajectories and the landmarks that are not absurdly far, with margin.
 
     Far: beyond five times the interquartile range from the quartiles, along any axis.
@@ -105,27 +195,30 @@ def _view(
 
 def _draw_landmarks(
     axis: Axes,
-    points: Float[np.ndarray, "n 2"],
-    covariances: Float[np.ndarray, "n 2 2"],
-    size: Float[np.ndarray, " 3"],
+    panel: _Panel,
+    points: Float[np.ndarray, "n 3"],
+    covariances: Float[np.ndarray, "n 3 3"],
 ) -> int:
     """Draw points and their 95 % ellipses; return how many ellipses were too large to draw."""
     if not len(points):
         return 0
-    shown = 2 * np.sqrt(_CHI2_95 * np.linalg.eigvalsh(covariances)[:, 1]) <= size.max()
+    points, covariances = panel.seen(points, covariances)
+    shown = 2 * np.sqrt(_CHI2_95 * np.linalg.eigvalsh(covariances)[:, 1]) <= panel.size
     _draw_ellipses(axis, points[shown], covariances[shown], _LANDMARKS)
-    axis.plot(
-        *points.T, ".", color=_LANDMARKS, ms=3.5, label="landmarks, 95 % ellipses in their maps"
-    )
+    axis.plot(*points.T, ".", color=_LANDMARKS, ms=3.5, label="landmarks, 95 % in their maps")
     return int((~shown).sum())
 
 
 def _draw_begun(
-    axis: Axes, places: Float[np.ndarray, "k 2"], covariances: Float[np.ndarray, "k 2 2"]
+    axis: Axes,
+    panel: _Panel,
+    places: Float[np.ndarray, "k 3"],
+    covariances: Float[np.ndarray, "k 3 3"],
 ) -> None:
     """Mark where maps begin, and where in the world that can be."""
+    places, covariances = panel.seen(places, covariances)
     _draw_ellipses(axis, places, covariances, _BEGUN)
-    label = "a new map begins, 95 % of where"
+    label = "a map begins, 95 % of where"
     axis.plot(*places.T, "D", color=_BEGUN, ms=6, mfc="white", label=label)
 
 

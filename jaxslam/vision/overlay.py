@@ -1,15 +1,14 @@
-"""The picture of active search over a video frame, and the video file of such pictures."""
+"""The picture of active search over a video frame."""
 
-import os
 from collections.abc import Sequence
-from pathlib import Path
-from types import TracebackType
+from functools import cache
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int32, UInt8
 
-# Okabe and Ito's colours, distinct to the colour-blind, as OpenCV's blue, green, red.
+# Okabe and Ito's colours, distinct to the colour-blind, as OpenCV's blue, green, red; and yet each
+# status has a shape of its own.
 COLOURS = {
     "matched": (115, 158, 0),  # bluish green
     "unmatched": (0, 159, 230),  # orange
@@ -17,10 +16,16 @@ COLOURS = {
     "new": (233, 180, 86),  # sky blue
 }
 SIGMAS = 3.0  # the ellipses' size
-STRIP = 24  # height of the legend's strip below the image, in pixels
+LEAST_RADIUS = 4.0  # pixels, of an ellipse: a smaller one would not be seen
+ROW = 18  # height of the legend's rows below the image, in pixels
 _SHIFT = 4  # OpenCV's drawing takes whole numbers: sixteenths of a pixel
-_KEY = "+ predicted, 3 sigma; . found"
-_FONT, _TEXT = cv2.FONT_HERSHEY_SIMPLEX, 0.4
+_FONT, _LIGHT, _DARK = cv2.FONT_HERSHEY_SIMPLEX, (235, 235, 235), 20
+_TURN, _DASH = 48, 4  # points on an ellipse, and on a dash or a gap of it
+_CROSS = np.array([[[-4.0, -4.0], [4.0, 4.0]], [[-4.0, 4.0], [4.0, -4.0]]])
+_SQUARE = np.array([[[-5.0, -5.0], [5.0, -5.0], [5.0, 5.0], [-5.0, 5.0], [-5.0, -5.0]]])
+_SYMBOL, _GAP = 20, 8  # widths in the legend, pixels
+_WIDEST = ("frame 12345  1234.56 s  map 12", "sigma: position 0.00123  0.123 deg  log scale 0.0123")
+"""Notes as long as they become, for which there is room in the legend."""
 
 
 def draw_overlay(
@@ -30,150 +35,156 @@ def draw_overlay(
     covariances: Float[np.ndarray, "n 2 2"],
     matched: Float[np.ndarray, "n 2"],
     status: Sequence[str],
-    index: int | None = None,
-    time: float | None = None,
-    note: str = "",
+    notes: tuple[str, str] = ("", ""),
+    banner: str = "",
 ) -> UInt8[np.ndarray, "h2 w 3"]:
     """The frame in blue, green, red with what the filter predicted and what was found there.
 
-    For each of n landmarks: a small cross at the `predicted` pixel (u, v), the ellipse of three
-    standard deviations of its 2x2 covariance (pixels^2), and a ring with a line to it at the
-    `matched` pixel, in the colour of its status, one of `COLOURS`. What is not finite is not
-    drawn: nan for a landmark without a match, or without a prediction ('new'). Below the image
-    a strip of `STRIP` rows counts the statuses and gives `index`, `time` (s) and a short `note`.
-    Raises `ValueError` for another status.
+    For each of n landmarks the ellipse of three standard deviations of its 2x2 covariance
+    (pixels^2) around the `predicted` pixel (u, v), at least of `LEAST_RADIUS`, and what was found
+    at the `matched` pixel, as its status, one of `COLOURS`, says: a dot ('matched') or a cross
+    ('outlier') with a line from the prediction, a square ('new'); 'unmatched', the ellipse is
+    dashed, and empty. What is not finite is not drawn. `banner` stands in large letters over the
+    picture. Below it are two `notes`, ASCII, and a legend that counts the statuses, in as many rows
+    as the width asks for. Raises `ValueError` for another status.
     """
-    unknown = sorted({str(name) for name in status} - set(COLOURS))
+    names = np.array([str(name) for name in status], dtype="U16")
+    unknown = sorted(set(names.tolist()) - set(COLOURS))
     if unknown:
         raise ValueError(f"status {unknown[0]!r} is unknown; {', '.join(COLOURS)} are accepted")
     # Less contrast, so that the lines stand out.
     canvas = cv2.cvtColor(cv2.convertScaleAbs(image, alpha=0.75, beta=20), cv2.COLOR_GRAY2BGR)
-    for centre, covariance, found, name in zip(
-        predicted, covariances, matched, status, strict=True
-    ):
-        colour = COLOURS[str(name)]
-        if np.all(np.isfinite(centre)):
-            _draw_prediction(canvas, centre, covariance, colour)
-        if np.all(np.isfinite(found)):
-            _draw_match(canvas, centre, found, colour)
-    return np.vstack([canvas, _legend(image.shape[1], status, index, time, note)])
-
-
-class OverlayWriter:
-    """An MP4 file written frame by frame, complete at any end of the `with` block.
-
-    Frames go to a temporary name beside `path`, which becomes `path` when the block ends, by an
-    exception or an interruption too; without a single frame nothing is left. `size` is width
-    and height in pixels of the frames to come (MP4 drops the last row or column of an odd one),
-    `rate` in 1/s. Raises `ValueError` where the
-    file cannot be opened or a frame has another size.
-    """
-
-    def __init__(self, path: str | Path, size: tuple[int, int], rate: float) -> None:
-        self.path = Path(path)
-        self.size = size
-        self.rate = rate
-        self.frames = 0
-        if self.path.suffix.lower() != ".mp4":
-            raise ValueError(f"{self.path}: a name ending in .mp4 is accepted")
-        self._temporary = self.path.with_name(f".{os.getpid()}.{self.path.name}")
-
-    def __enter__(self) -> "OverlayWriter":
-        fourcc = cv2.VideoWriter.fourcc(*"mp4v")
-        self._writer = cv2.VideoWriter(str(self._temporary), fourcc, self.rate, self.size)
-        if not self._writer.isOpened():
-            self._temporary.unlink(missing_ok=True)
-            raise ValueError(
-                f"{self.path}: cannot be opened as an MP4 video of {self.size[0]}x{self.size[1]} "
-                f"at {self.rate} frames/s"
-            )
-        return self
-
-    def write(self, frame: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Append a frame, as `draw_overlay` returns it."""
-        if frame.shape != (self.size[1], self.size[0], 3):  # OpenCV would drop it silently
-            raise ValueError(
-                f"{self.path}: a frame of shape {frame.shape} does not fit a video of "
-                f"{self.size[0]}x{self.size[1]} in colour"
-            )
-        self._writer.write(frame)
-        self.frames += 1
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._writer.release()
-        if self.frames:
-            self._temporary.replace(self.path)
-        else:
-            self._temporary.unlink(missing_ok=True)
+    for name in COLOURS:
+        chosen = names == name
+        _draw(canvas, name, predicted[chosen], covariances[chosen], matched[chosen])
+    if banner:
+        _draw_banner(canvas, banner)
+    counts = {name: int(np.sum(names == name)) for name in COLOURS}
+    return np.vstack([canvas, _legend(image.shape[1], notes, counts)])
 
 
 def overlay_size(width: int, height: int) -> tuple[int, int]:
     """Width and height in pixels of what `draw_overlay` makes of an image of this size."""
-    return width, height + STRIP
+    return width, height + ROW * _rows(width)
 
 
-def _fixed(value: Float[np.ndarray, " 2"]) -> tuple[int, int]:
-    x, y = np.rint(np.clip(value, -2000, 20000) * 2**_SHIFT).astype(int)
-    return int(x), int(y)
-
-
-def _draw_prediction(
+def _draw(
     canvas: UInt8[np.ndarray, "h w 3"],
-    centre: Float[np.ndarray, " 2"],
-    covariance: Float[np.ndarray, "2 2"],
-    colour: tuple[int, int, int],
+    status: str,
+    predicted: Float[np.ndarray, "k 2"],
+    covariances: Float[np.ndarray, "k 2 2"],
+    matched: Float[np.ndarray, "k 2"],
 ) -> None:
-    for arm in ((3.0, 0.0), (0.0, 3.0)):
-        ends = _fixed(centre - arm), _fixed(centre + arm)
-        cv2.line(canvas, *ends, colour, 1, cv2.LINE_AA, _SHIFT)
-    if not np.all(np.isfinite(covariance)):
-        return
-    variances, axes = np.linalg.eigh(covariance)
-    radii = np.minimum(SIGMAS * np.sqrt(np.maximum(variances, 0.0)), 2000.0)
-    angle = float(np.degrees(np.arctan2(axes[1, 1], axes[0, 1])))
-    long, short = _fixed(radii[::-1])
-    cv2.ellipse(
-        canvas, _fixed(centre), (long, short), angle, 0, 360, colour, 1, cv2.LINE_AA, _SHIFT
-    )
+    """k landmarks of one status."""
+    expected, found = np.isfinite(predicted).all(axis=1), np.isfinite(matched).all(axis=1)
+    shaped = expected & np.isfinite(covariances).all(axis=(1, 2))
+    ellipses = search_ellipses(predicted[shaped], covariances[shaped])
+    _draw_lines(canvas, _dashes(ellipses) if status == "unmatched" else ellipses, status)
+    _draw_lines(canvas, np.stack([predicted, matched], axis=1)[expected & found], status)
+    _draw_marks(canvas, matched[found], status)
 
 
-def _draw_match(
-    canvas: UInt8[np.ndarray, "h w 3"],
-    centre: Float[np.ndarray, " 2"],
-    found: Float[np.ndarray, " 2"],
-    colour: tuple[int, int, int],
+def _draw_marks(
+    canvas: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "k 2"], status: str
 ) -> None:
-    if np.all(np.isfinite(centre)):
-        cv2.line(canvas, _fixed(centre), _fixed(found), colour, 1, cv2.LINE_AA, _SHIFT)
-    else:  # a wider ring, as there is no ellipse to catch the eye
-        cv2.circle(canvas, _fixed(found), 6 << _SHIFT, colour, 1, cv2.LINE_AA, _SHIFT)
-    cv2.circle(canvas, _fixed(found), 2 << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
+    """Where landmarks were found."""
+    if status in ("outlier", "new"):
+        shape = _CROSS if status == "outlier" else _SQUARE
+        lines = pixels[:, None, None] + shape
+        _draw_lines(canvas, lines.reshape(-1, *shape.shape[1:]), status)
+    else:
+        for pixel in _fixed(pixels).tolist():
+            cv2.circle(canvas, pixel, 2 << _SHIFT, COLOURS[status], -1, cv2.LINE_AA, _SHIFT)
+
+
+def search_ellipses(
+    centres: Float[np.ndarray, "k 2"], covariances: Float[np.ndarray, "k 2 2"]
+) -> Float[np.ndarray, "k p 2"]:
+    """Closed lines of p points around the centres, three standard deviations away."""
+    variances, axes = np.linalg.eigh(covariances)
+    radii = np.clip(SIGMAS * np.sqrt(np.maximum(variances, 0.0)), LEAST_RADIUS, 2000.0)
+    angles = np.linspace(0, 2 * np.pi, _TURN + 1)
+    circle = np.stack([np.cos(angles), np.sin(angles)])
+    return centres[:, None] + np.swapaxes((axes * radii[:, None]) @ circle, 1, 2)
+
+
+def _dashes(lines: Float[np.ndarray, "k p 2"]) -> Float[np.ndarray, "d q 2"]:
+    """Every other piece of each."""
+    pieces = lines[:, :_TURN].reshape(-1, _TURN // _DASH, _DASH, 2)
+    return pieces[:, ::2].reshape(-1, _DASH, 2)
+
+
+def _draw_lines(
+    canvas: UInt8[np.ndarray, "h w 3"], lines: Float[np.ndarray, "k p 2"], status: str
+) -> None:
+    """With a dark seam, so that they stand out on what is bright too."""
+    fixed = list(_fixed(lines))
+    cv2.polylines(canvas, fixed, False, (0, 0, 0), 3, cv2.LINE_8, _SHIFT)
+    cv2.polylines(canvas, fixed, False, COLOURS[status], 1, cv2.LINE_AA, _SHIFT)
+
+
+def _fixed(pixels: Float[np.ndarray, "*k 2"]) -> Int32[np.ndarray, "*k 2"]:
+    return np.rint(np.clip(pixels, -2000, 20000) * 2**_SHIFT).astype(np.int32)
+
+
+def _draw_banner(canvas: UInt8[np.ndarray, "h w 3"], text: str) -> None:
+    """Large letters on a dark band at the top."""
+    height, width = canvas.shape[:2]
+    across, up = cv2.getTextSize(text, _FONT, 1.0, 2)[0]
+    scale = min(0.9 * width / across, height / 11 / up)
+    band = canvas[: round(height / 6)]
+    band //= 4
+    place = round((width - scale * across) / 2), round((len(band) + scale * up) / 2)
+    cv2.putText(canvas, text, place, _FONT, scale, _LIGHT, max(1, round(2 * scale)), cv2.LINE_AA)
 
 
 def _legend(
-    width: int, status: Sequence[str], index: int | None, time: float | None, note: str
+    width: int, notes: tuple[str, str], counts: dict[str, int]
 ) -> UInt8[np.ndarray, "strip w 3"]:
-    strip = np.full((STRIP, width, 3), 20, np.uint8)
-    names = [str(name) for name in status]
-    place = "" if index is None else f"frame {index}"
-    place += "" if time is None else f"  {time:.2f} s"
-    place += f"  {note}" if note else ""
-    entries = [(place.strip(), None)] if place else []
-    entries += [(f"{names.count(name)} {name}", colour) for name, colour in COLOURS.items()]
-    # A narrow image gets smaller letters, a wide one does not get larger ones.
-    scale = _TEXT * min(1.0, width / 560)
-    x, baseline = round(20 * scale), STRIP // 2 + round(11 * scale)
-    for text, colour in entries:
-        if colour is not None:
-            cv2.circle(strip, (x + 4, STRIP // 2), 4, colour, -1, cv2.LINE_AA)
-            x += 13
-        cv2.putText(strip, text, (x, baseline), _FONT, scale, (235, 235, 235), 1, cv2.LINE_AA)
-        x += cv2.getTextSize(text, _FONT, scale, 1)[0][0] + round(35 * scale)
-    if x + cv2.getTextSize(_KEY, _FONT, scale, 1)[0][0] < width:
-        cv2.putText(strip, _KEY, (x, baseline), _FONT, scale, (170, 170, 170), 1, cv2.LINE_AA)
+    strip = np.full((ROW * _rows(width), width, 3), _DARK, np.uint8)
+    places = _places(width)
+    for note, (x, y) in zip(notes, places, strict=False):
+        _write(strip, note, x, y)
+    for (status, count), (x, y) in zip(counts.items(), places[len(notes) :], strict=True):
+        _draw_symbol(strip, status, x, y)
+        _write(strip, f"{count} {status}", x + _SYMBOL, y)
     return strip
+
+
+def _draw_symbol(strip: UInt8[np.ndarray, "strip w 3"], status: str, x: int, y: int) -> None:
+    """What a landmark of this status looks like."""
+    centre, nothing = np.array([[x + 7.0, y]]), np.full((1, 2), np.nan)
+    away = {"matched": 2.0, "outlier": 5.0, "new": 0.0}
+    found = centre + np.array([away[status], 0.0]) if status in away else nothing
+    covariance = np.eye(2)[None] * (6.0 / SIGMAS) ** 2
+    _draw(strip, status, nothing if status == "new" else centre, covariance, found)
+
+
+def _write(strip: UInt8[np.ndarray, "strip w 3"], text: str, x: int, y: int) -> None:
+    scale = _letters(strip.shape[1])
+    place = (x, y + round(11 * scale))
+    cv2.putText(strip, text, place, _FONT, scale, _LIGHT, 1, cv2.LINE_AA)
+
+
+def _letters(width: int) -> float:
+    """Smaller letters under a narrow image, though none that cannot be read if they fit."""
+    widest = max(cv2.getTextSize(text, _FONT, 1.0, 1)[0][0] for text in _WIDEST)
+    return min(max(width / 1400, 0.36), 0.45, (width - _GAP) / widest)
+
+
+def _rows(width: int) -> int:
+    return 1 + _places(width)[-1][1] // ROW
+
+
+@cache
+def _places(width: int) -> list[tuple[int, int]]:
+    """Left end and middle of the notes and of the statuses, the first of which begins a row."""
+    widest = [(text, 0) for text in _WIDEST] + [(f"00 {name}", _SYMBOL) for name in COLOURS]
+    places, x, y = [], 4, ROW // 2
+    for text, before in widest:
+        wide = before + cv2.getTextSize(text, _FONT, _letters(width), 1)[0][0] + _GAP
+        if places and (x + wide > width or len(places) == len(_WIDEST)):
+            x, y = 4, y + ROW
+        places.append((x, y))
+        x += wide
+    return places

@@ -38,7 +38,8 @@ def write_ply(
     header = [
         "ply",
         "format ascii 1.0",
-        "comment landmarks in the world frame; every map has a unit of length of its own",
+        "comment landmarks in the world frame; every map has a unit of length of its own, and",
+        "comment covariances are given that unit",
         f"element vertex {len(points)}",
         *(f"property float {name}" for name in _PROPERTIES),
         "property int id",

@@ -7,32 +7,40 @@ import dataclasses
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from jaxslam import __version__
 from jaxslam.files import write_atomically
 from jaxslam.plots.tracking import plot_map
 from jaxslam.slam.protocol import AbstractStaged
 from jaxslam.video.calibration import INTRINSICS, as_fields
-from jaxslam.video.source import Frame, Source
-from jaxslam.vision.overlay import OverlayWriter, draw_overlay, overlay_size
+from jaxslam.video.source import Frame, Source, Trajectory
+from jaxslam.vision.film import Aside, OverlayWriter
+from jaxslam.vision.overlay import draw_overlay, overlay_size
 from jaxslam.vision.pointcloud import write_ply
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.target import Target, as_summary
 from jaxslam.vision.tracker import Points, Tracked, Tracker
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
+    alignment,
     write_covariances,
     write_tum,
 )
+from jaxslam.vision.viewer import Viewer
 
 SCHEMA = 1
-_WARM_UP = 3
+WARM_UP = 3
 """Frames in which functions are compiled; they count in `seconds.start`, not in the quantiles."""
+_MAP_EVERY = 10
+"""Frames from one map of a recording to the next."""
 _COLUMNS = (
     "frame", "time", "state", "map", "matches", "nis", "nis_dof",
     "sigma_position", "sigma_orientation", "sigma_log_scale",
@@ -48,15 +56,20 @@ def track(
     *,
     slam: AbstractStaged | None = None,
     target: Target | None = None,
+    overlay: bool = True,
+    viewer: str | Path | None = None,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> dict[str, Any]:
-    """Track `source`, write `trajectory.txt`, `covariance.txt`, `frames.csv`, `map.ply`,
-    `map.png`, `overlay.mp4` and `summary.json` into the folder `out`, and return the summary.
+    """Track `source`, write `trajectory.txt`, `covariance.txt`, `frames.csv`, `summary.json`,
+    `map.ply`, `map.png` and, if wanted, `overlay.mp4` into the folder `out`, and return the
+    summary.
 
     An interruption (KeyboardInterrupt) or an unreadable frame (ValueError) leaves all of them for
     the frames so far, and is raised again. `slam` is a filter of one's own, in place of the one
     that the settings name. `target`, known points that the first frame sees, makes the map metric.
+    `viewer` is a file for the rerun viewer, FILE.rrd, written beside the others.
     """
+    recording = None if viewer is None else Viewer(viewer, source.calibration)
     tracker = Tracker(source.calibration, settings or TrackerSettings(), slam, target)
     if source.clock is not None:
         tracker.compile()
@@ -65,7 +78,8 @@ def track(
     history: list[Tracked] = []
     seconds: list[float] = []
     try:
-        _track_frames(source, tracker, out / "overlay.mp4", history, seconds, progress)
+        film = out / "overlay.mp4" if overlay else None
+        _track_frames(source, tracker, film, recording, history, seconds, progress)
     except BaseException:
         if history:
             _write(source, tracker, history, seconds, out)
@@ -108,22 +122,59 @@ def describe(summary: dict[str, Any]) -> str:
 def _track_frames(
     source: Source,
     tracker: Tracker,
-    video: Path,
+    film: Path | None,
+    viewer: Viewer | None,
     history: list[Tracked],
     seconds: list[float],
     progress: Callable[[int], None],
 ) -> None:
-    size = overlay_size(source.calibration.width, source.calibration.height)
-    with OverlayWriter(video, size, _rate(source.times)) as writer:
+    with _shown(source, tracker, film, viewer, history) as show:
         start = time.perf_counter()
         for frame in source:
-            result = tracker.track(frame)
-            writer.write(_overlay(frame, result))
-            history.append(result)
+            history.append(tracker.track(frame))
+            show(frame)
             now = time.perf_counter()
             seconds.append(now - start)
             start = now
             progress(1)
+
+
+@contextmanager
+def _shown(
+    source: Source,
+    tracker: Tracker,
+    film: Path | None,
+    viewer: Viewer | None,
+    history: list[Tracked],
+) -> Generator[Callable[[Frame], None]]:
+    """What shows the newest frame, as film and in the viewer, aside from the tracking."""
+    with ExitStack() as stack:
+        writer = None if film is None else stack.enter_context(_writer(source, film))
+        recording = None if viewer is None else stack.enter_context(viewer)
+        aside = stack.enter_context(Aside())
+
+        def show(frame: Frame) -> None:
+            if writer is not None:
+                aside.give(_film, writer, frame, history[-1])
+            if recording is not None:
+                aside.give(recording.show, frame, history[-1])
+                if len(history) % _MAP_EVERY == 0:
+                    aside.give(recording.show_map, _mapped(tracker, history))
+
+        try:
+            yield show
+        finally:
+            if recording is not None and history:
+                aside.give(recording.show_map, _mapped(tracker, history))
+
+
+def _writer(source: Source, path: Path) -> OverlayWriter:
+    size = overlay_size(source.calibration.width, source.calibration.height)
+    return OverlayWriter(path, size, _rate(source.times))
+
+
+def _film(writer: OverlayWriter, frame: Frame, result: Tracked) -> None:
+    writer.write(_overlay(frame, result))
 
 
 def _rate(times: np.ndarray) -> float:
@@ -132,6 +183,7 @@ def _rate(times: np.ndarray) -> float:
 
 
 def _overlay(frame: Frame, result: Tracked) -> np.ndarray:
+    """The picture of what was sought and found in a frame."""
     new = result.created
     nothing = np.full((len(new), 2), np.nan)
     return draw_overlay(
@@ -140,36 +192,61 @@ def _overlay(frame: Frame, result: Tracked) -> np.ndarray:
         covariances=np.concatenate([result.search, np.full((len(new), 2, 2), np.nan)]),
         matched=np.concatenate([result.matched, new]),
         status=[*result.status, *["new"] * len(new)],
-        index=result.index,
-        time=result.time,
-        note={"tracked": "", "lost": "LOST", "start": f"MAP {result.map}"}[result.state],
+        notes=_notes(result),
+        banner=_banner(result),
     )
+
+
+def _notes(result: Tracked) -> tuple[str, str]:
+    """Which frame it is, and the σ of its pose."""
+    camera, log_scale = result.camera, result.sigma_log_scale
+    degrees = math.degrees(camera.sigma_orientation)
+    scale = "" if log_scale is None else f"  log scale {log_scale:.3g}"
+    return (
+        f"frame {result.index}  {result.time:.2f} s  map {result.map}",
+        f"sigma: position {camera.sigma_position:.3g}  {degrees:.3g} deg{scale}",
+    )
+
+
+def _banner(result: Tracked) -> str:
+    """What nobody is to overlook: nothing while all is well."""
+    if result.starts:
+        return f"LOST: MAP {result.map} BEGINS" if result.lost else ""
+    return "" if result.state == "tracked" else result.state.upper()
 
 
 def _write(
     source: Source, tracker: Tracker, history: list[Tracked], seconds: list[float], out: Path
 ) -> dict[str, Any]:
-    times = np.array([result.time for result in history])
-    T_wc = np.stack([result.T_wc for result in history])
+    times, T_wc = _trajectory(history)
     write_tum(out / "trajectory.txt", times, T_wc)
-    write_covariances(out / "covariance.txt", times, [result.covariance for result in history])
+    scaled = any(result.sigma_log_scale is not None for result in history)
+    covariances = [result.covariance for result in history]
+    write_covariances(out / "covariance.txt", times, covariances, given_scale=scaled)
     write_frames(out / "frames.csv", history)
-    known = _mapped(tracker, history)
-    write_ply(out / "map.ply", known.points, known.covariances, known.numbers, known.maps)
-    begun = [place for place, result in enumerate(history) if result.starts and result.map]
-    plot_map(
-        T_wc,
-        known.points,
-        known.in_map,
-        path=out / "map.png",
-        unit="map units",
-        begun=begun,
-        begun_covariances=[history[place].camera.position_covariance for place in begun],
-    )
     summary = _summary(source, tracker, history, seconds)
     with write_atomically(out / "summary.json") as path:
         path.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    _draw_map(_mapped(tracker, history), history, _reference_in_map(source, history), out)
     return summary
+
+
+def _draw_map(
+    known: Points, history: list[Tracked], reference: np.ndarray | None, out: Path
+) -> None:
+    write_ply(out / "map.ply", known.points, known.covariances, known.numbers, known.maps)
+    begun = [place for place, result in enumerate(history) if result.starts and result.map]
+    plot_map(
+        _trajectory(history).T_wc,
+        known.points,
+        known.in_map,
+        reference=reference,
+        path=out / "map.png",
+        unit="map units",
+        lost=[result.lost for result in history],
+        begun=begun,
+        begun_covariances=[history[place].camera.position_covariance for place in begun],
+    )
 
 
 def write_frames(path: str | Path, history: list[Tracked]) -> None:
@@ -178,9 +255,9 @@ def write_frames(path: str | Path, history: list[Tracked]) -> None:
     `state` is `start` (of a map; where it is not the first, the camera is lost too), `tracked` or
     `lost`, `map` the number of the map, from 0. σ of position (map units) and orientation (rad)
     are roots of the summed variances of the three axes, zero in the first frame alone, which is
-    the world's.
-    `sigma_log_scale` is of the logarithm of the map's unit, empty where the filter has none in
-    doubt: then nobody has measured it.
+    the world's, and given the scale of the map. `sigma_log_scale` is what the filter does not know
+    of that, σ of the logarithm of the map's unit; empty where it is in no doubt of it: then nobody
+    has measured it.
     """
     with write_atomically(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -205,14 +282,22 @@ def _row(result: Tracked) -> list[Any]:
 def _mapped(tracker: Tracker, history: list[Tracked]) -> Points:
     """The landmarks whose depth became known in their maps."""
     landmarks = tracker.points()
-    cameras = np.stack([result.T_wc[:3, 3] for result in history])
-    away = landmarks.points[:, None] - cameras
-    same = landmarks.maps[:, None] == np.array([result.map for result in history])
-    distance = np.linalg.norm(away, axis=2).min(axis=1, initial=np.inf, where=same)
     with np.errstate(invalid="ignore"):  # of unknown depth, a variance can be anything
         sigma = np.sqrt(np.trace(landmarks.in_map, axis1=1, axis2=2))
-        known = np.isfinite(sigma) & (sigma < _KNOWN_DEPTH * distance)
+        known = np.isfinite(sigma) & (sigma < _KNOWN_DEPTH * _distances(landmarks, history))
     return Points(*(part[known] for part in landmarks))
+
+
+def _distances(landmarks: Points, history: list[Tracked]) -> Float[np.ndarray, " n"]:
+    """To the nearest camera of their map; zero of a landmark that is nowhere."""
+    cameras = _trajectory(history).T_wc[:, :3, 3]
+    maps = np.array([result.map for result in history])
+    distances = np.zeros(len(landmarks.numbers))
+    somewhere = np.isfinite(landmarks.points).all(axis=1)
+    for number in np.unique(landmarks.maps):
+        those = somewhere & (landmarks.maps == number)
+        distances[those] = KDTree(cameras[maps == number]).query(landmarks.points[those])[0]
+    return distances
 
 
 def _scale_between_maps(settings: TrackerSettings) -> float:
@@ -247,7 +332,7 @@ def _summary(
     updates = history[1:]
     dof = sum(result.nis_dof for result in updates)
     count = max(len(updates), 1)
-    later = seconds[_WARM_UP:] or seconds
+    later = seconds[WARM_UP:] or seconds
     summary = {
         "schema": SCHEMA,
         "version": __version__,
@@ -271,7 +356,7 @@ def _summary(
         "nis": {"mean": sum(result.nis for result in updates) / count, "dof": dof / count},
         "seconds": {
             "total": sum(seconds),
-            "start": sum(seconds[:_WARM_UP]),
+            "start": sum(seconds[:WARM_UP]),
             "per_frame_median": float(np.median(later)),
             "per_frame_p99": float(np.quantile(later, 0.99)),
         },
@@ -283,13 +368,30 @@ def _summary(
     return summary | _errors(source, history)
 
 
+def _trajectory(history: list[Tracked]) -> Trajectory:
+    times = np.array([result.time for result in history])
+    return Trajectory(times, np.stack([result.T_wc for result in history]))
+
+
+def _reference_in_map(source: Source, history: list[Tracked]) -> np.ndarray | None:
+    """What of the reference is of the time of these frames, (m, 4, 4), aligned as for its error."""
+    if source.reference is None:
+        return None
+    trajectory, (times, T_wc) = _trajectory(history), source.reference
+    try:
+        there = alignment(*trajectory, *source.reference)
+    except ValueError:
+        return None
+    same = (times >= trajectory.times[0]) & (times <= trajectory.times[-1])
+    return there.inverse().moved(T_wc[same])
+
+
 def _errors(source: Source, history: list[Tracked]) -> dict[str, Any]:
     """The trajectory error, where there is a reference, or why it cannot be told."""
     if source.reference is None:
         return {}
-    times = np.array([result.time for result in history])
-    T_wc = np.stack([result.T_wc for result in history])
     try:
-        return {"ate": absolute_trajectory_error(times, T_wc, *source.reference)}
+        error = absolute_trajectory_error(*_trajectory(history), *source.reference)
+        return {"ate": error}
     except ValueError as error:  # of few frames, or of a camera that stood still
         return {"no_ate": str(error)}

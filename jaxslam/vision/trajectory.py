@@ -1,7 +1,7 @@
 """Trajectories and their covariances as text, and their error against a reference, by `evo`."""
 
 from pathlib import Path
-from typing import TypedDict
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -16,6 +16,7 @@ MAX_TIME_DIFFERENCE = 0.01
 _ROUNDING = 1e-8
 
 _UNITS = "every map of frames.csv has a unit of its own"
+_GIVEN_SCALE = "given the scale of its map, of which sigma_log_scale of frames.csv is in doubt"
 
 
 class TrajectoryError(TypedDict):
@@ -29,6 +30,26 @@ class TrajectoryError(TypedDict):
     sign: float
     orientation_rmse: float
     straight_line: float
+
+
+class Similarity(NamedTuple):
+    """`x → s R x + t`, of world frames: a Sim(3)."""
+
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, " 3"]
+    scale: float
+
+    def inverse(self) -> "Similarity":
+        """`x → R' (x − t)/s`."""
+        back = self.rotation.T
+        return Similarity(back, -back @ self.translation / self.scale, 1 / self.scale)
+
+    def moved(self, T_wc: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
+        """The poses in the other world."""
+        result = T_wc.copy()
+        result[:, :3, :3] = self.rotation @ T_wc[:, :3, :3]
+        result[:, :3, 3] = self.scale * T_wc[:, :3, 3] @ self.rotation.T + self.translation
+        return result
 
 
 def write_tum(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> None:
@@ -45,18 +66,23 @@ def write_tum(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> None:
     _write_rows(path, header, times, table, "poses", ".9f")
 
 
-def write_covariances(path: str | Path, times: ArrayLike, covariances: ArrayLike) -> None:
+def write_covariances(
+    path: str | Path, times: ArrayLike, covariances: ArrayLike, *, given_scale: bool = False
+) -> None:
     """Write times (n,) and covariances (n, 6, 6), whole or not at all.
 
     A line is the time and the upper triangle, row by row: position in the camera's axes, rotation
     vector. The true pose is `T_wc E`, and that is the covariance of E's translation and rotation
-    vector. That maps which follow one another have different units of length is not in it.
+    vector. That maps which follow one another have different units of length is not in it. The
+    header says whether these are covariances `given_scale`, of a filter with a unit of its own, or
+    of poses in a unit that the filter takes for exactly known.
     """
     rows, columns = np.triu_indices(6)
     table = np.asarray(covariances, dtype=float).reshape(-1, 6, 6)[:, rows, columns]
     names = ("x", "y", "z", "rx", "ry", "rz")
     pairs = " ".join(f"{names[i]}{names[j]}" for i, j in zip(rows, columns, strict=True))
-    header = f"{pairs} (s; map units and rad, in the camera frame; {_UNITS}, taken as one)"
+    scale = _GIVEN_SCALE if given_scale else "the filter has no doubt of its scale"
+    header = f"{pairs} (s; map units and rad, in the camera frame; {_UNITS}, taken as one; {scale})"
     _write_rows(path, header, times, table, "covariances", ".9e")
 
 
@@ -141,35 +167,11 @@ def absolute_trajectory_error(
     Raises `ValueError` where fewer than three poses pair up or all positions of one trajectory
     coincide.
     """
-    from evo.core import lie_algebra, metrics, sync
-    from evo.core.geometry import GeometryException
-    from evo.core.trajectory import PoseTrajectory3D
+    from evo.core import metrics
 
-    def evo_trajectory(times: ArrayLike, T_wc: ArrayLike) -> PoseTrajectory3D:
-        T_wc = np.asarray(T_wc, dtype=float)
-        # evo reads the scalar first; poses_se3 alone would make it check float32 too strictly.
-        x, y, z, w = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat().T
-        return PoseTrajectory3D(T_wc[:, :3, 3], np.stack([w, x, y, z], 1), np.asarray(times, float))
-
-    try:
-        paired_reference, paired = sync.associate_trajectories(
-            evo_trajectory(reference_times, reference),
-            evo_trajectory(estimate_times, estimate),
-            max_diff=MAX_TIME_DIFFERENCE,
-        )
-    except sync.SyncException:
-        raise ValueError(_too_few(0)) from None
-    if paired.num_poses < 3:
-        raise ValueError(_too_few(paired.num_poses))
+    paired, paired_reference = _paired(estimate_times, estimate, reference_times, reference)
     estimated, true = np.stack(paired.poses_se3), np.stack(paired_reference.poses_se3)
-    try:
-        paired.align(paired_reference, correct_scale=True)
-    except GeometryException:  # a straight line, about which evo leaves the roll open: see below
-        rotation, translation, scale = _line_alignment(
-            paired.positions_xyz, paired_reference.positions_xyz
-        )
-        paired.scale(scale)
-        paired.transform(lie_algebra.se3(rotation, translation))
+    _align(paired, paired_reference)
     sign, angle = _by_orientation(estimated, true)
     error = metrics.APE(metrics.PoseRelation.translation_part)
     error.process_data((paired_reference, paired))
@@ -183,6 +185,62 @@ def absolute_trajectory_error(
         "orientation_rmse": angle,
         "straight_line": _straight_line(paired_reference.timestamps, true[:, :3, 3]),
     }
+
+
+def alignment(
+    estimate_times: ArrayLike,
+    estimate: ArrayLike,
+    reference_times: ArrayLike,
+    reference: ArrayLike,
+) -> Similarity:
+    """From the estimate's world to the reference's: that of `absolute_trajectory_error`, which is
+    of the same arguments and raises the same."""
+    return _align(*_paired(estimate_times, estimate, reference_times, reference))
+
+
+def _paired(
+    estimate_times: ArrayLike,
+    estimate: ArrayLike,
+    reference_times: ArrayLike,
+    reference: ArrayLike,
+) -> tuple[Any, Any]:
+    """Estimate and reference as `evo` has them, pose by pose of the same time."""
+    from evo.core import sync
+
+    try:
+        paired_reference, paired = sync.associate_trajectories(
+            _evo_trajectory(reference_times, reference),
+            _evo_trajectory(estimate_times, estimate),
+            max_diff=MAX_TIME_DIFFERENCE,
+        )
+    except sync.SyncException:
+        raise ValueError(_too_few(0)) from None
+    if paired.num_poses < 3:
+        raise ValueError(_too_few(paired.num_poses))
+    return paired, paired_reference
+
+
+def _evo_trajectory(times: ArrayLike, T_wc: ArrayLike) -> Any:
+    from evo.core.trajectory import PoseTrajectory3D
+
+    T_wc = np.asarray(T_wc, dtype=float)
+    # evo reads the scalar first; poses_se3 alone would make it check float32 too strictly.
+    x, y, z, w = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat().T
+    return PoseTrajectory3D(T_wc[:, :3, 3], np.stack([w, x, y, z], 1), np.asarray(times, float))
+
+
+def _align(paired: Any, paired_reference: Any) -> Similarity:
+    """Move the estimate to where it fits best, in place; by what."""
+    from evo.core import lie_algebra
+    from evo.core.geometry import GeometryException
+
+    try:
+        return Similarity(*paired.align(paired_reference, correct_scale=True))
+    except GeometryException:  # a straight line, about which evo leaves the roll open: see below
+        found = _line_alignment(paired.positions_xyz, paired_reference.positions_xyz)
+        paired.scale(found.scale)
+        paired.transform(lie_algebra.se3(found.rotation, found.translation))
+        return found
 
 
 def _by_orientation(
@@ -207,7 +265,7 @@ def _straight_line(times: Float[np.ndarray, " n"], positions: Float[np.ndarray, 
 
 def _line_alignment(
     estimate: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"], float]:
+) -> Similarity:
     """Umeyama's rotation, translation and scale without the test that the rank is two.
 
     On a straight line the rotation about it is arbitrary, but no position depends on it where
@@ -221,7 +279,7 @@ def _line_alignment(
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
     rotation = left @ np.diag(signs) @ right
     scale = float(singular @ signs / np.sum(centred**2))
-    return rotation, mean_reference - scale * rotation @ mean_estimate, scale
+    return Similarity(rotation, mean_reference - scale * rotation @ mean_estimate, scale)
 
 
 def _too_few(count: int) -> str:

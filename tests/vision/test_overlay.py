@@ -1,13 +1,16 @@
 """The overlay and its video, the point cloud and the picture of the map."""
 
 import re
+import threading
+import time
 
 import cv2
 import numpy as np
 import pytest
 
 from jaxslam.plots.tracking import plot_map
-from jaxslam.vision.overlay import COLOURS, STRIP, OverlayWriter, draw_overlay, overlay_size
+from jaxslam.vision.film import WAITING, Aside, OverlayWriter
+from jaxslam.vision.overlay import COLOURS, LEAST_RADIUS, draw_overlay, overlay_size
 from jaxslam.vision.pointcloud import write_ply
 
 GREY = np.full((120, 640), 100, np.uint8)
@@ -16,7 +19,7 @@ NOTHING = np.full((1, 2), np.nan)
 
 def coloured(overlay, status):
     """Rows and columns of the image (without the legend) where a status' colour is drawn."""
-    difference = np.abs(overlay[:-STRIP].astype(int) - COLOURS[status]).max(axis=2)
+    difference = np.abs(overlay[: len(GREY)].astype(int) - COLOURS[status]).max(axis=2)
     return np.argwhere(difference < 30)
 
 
@@ -27,14 +30,17 @@ def draw(predicted, covariance, matched, status):
         covariances=np.asarray(covariance, float).reshape(-1, 2, 2),
         matched=np.asarray(matched, float).reshape(-1, 2),
         status=[status],
-        index=3,
-        time=0.1,
     )
 
 
+def lines(overlay):
+    """Where anything is drawn in the image, whatever its colour."""
+    return overlay[: len(GREY)].max(axis=2) != int(0.75 * 100 + 20)
+
+
 def test_ellipse_reaches_three_sigma_along_its_axes():
-    overlay = draw([200.0, 60.0], np.diag([100.0, 9.0]), NOTHING, "unmatched")
-    rows, columns = coloured(overlay, "unmatched").T
+    overlay = draw([200.0, 60.0], np.diag([100.0, 9.0]), [200.0, 60.0], "matched")
+    rows, columns = coloured(overlay, "matched").T
     assert columns.min() == pytest.approx(200 - 30, abs=1)
     assert columns.max() == pytest.approx(200 + 30, abs=1)
     assert rows.min() == pytest.approx(60 - 9, abs=1)
@@ -51,7 +57,7 @@ def test_ellipse_is_tilted_as_its_covariance():
 def test_match_is_drawn_at_its_pixel_and_joined_to_the_prediction():
     overlay = draw([200.0, 60.0], np.eye(2), [240.0, 60.0], "matched")
     drawn = {tuple(place) for place in coloured(overlay, "matched")}
-    assert {(60, 200), (60, 220), (60, 240), (61, 240)} <= drawn
+    assert {(60, 202), (60, 220), (60, 240), (61, 240)} <= drawn
 
 
 def test_new_landmark_without_prediction_is_drawn():
@@ -60,33 +66,84 @@ def test_new_landmark_without_prediction_is_drawn():
     assert (rows.mean(), columns.mean()) == pytest.approx((40, 50), abs=0.5)
 
 
-def test_overlay_adds_a_strip_and_refuses_unknown_statuses():
-    overlay = draw([200.0, 60.0], np.eye(2), NOTHING, "unmatched")
-    assert overlay.shape == (120 + STRIP, 640, 3)
+def test_an_ellipse_is_never_too_small_to_be_seen():
+    overlay = draw([200.0, 60.0], 1e-4 * np.eye(2), NOTHING, "unmatched")
+    for places in np.nonzero(lines(overlay)):  # with its seam
+        assert np.ptp(places) == pytest.approx(2 * LEAST_RADIUS + 3, abs=1.5)
+
+
+def test_every_status_has_a_shape_of_its_own():
+    """Without colours: what is found at the same place in the same ellipse looks different."""
+    there, wide = [200.0, 60.0], 36 * np.eye(2)
+    matched = lines(draw(there, wide, there, "matched"))
+    outlier = lines(draw(there, wide, there, "outlier"))
+    unmatched = lines(draw(there, wide, NOTHING, "unmatched"))
+    new = lines(draw(NOTHING, np.full((2, 2), np.nan), there, "new"))
+    # A full dot, a cross with nothing beside its middle, a square, and nothing.
+    assert matched[60 - 1 : 60 + 2, 200 - 1 : 200 + 2].all()
+    assert outlier[60 - 3, 200 - 3]
+    assert not outlier[60 - 3, 200]
+    assert new[60 - 5, 200 - 5]
+    assert not new[60 - 2 : 60 + 3, 200 - 2 : 200 + 3].any()
+    assert not unmatched[60 - 10 : 60 + 11, 200 - 10 : 200 + 11].any()
+    # The ellipse of 18 pixels is whole or dashed.
+    angles = np.linspace(0, 2 * np.pi, 200)
+    ring = np.rint([60 + 18 * np.sin(angles), 200 + 18 * np.cos(angles)]).astype(int)
+    assert matched[*ring].mean() > 0.95
+    assert 0.3 < unmatched[*ring].mean() < 0.8
+
+
+@pytest.mark.parametrize("width", [160, 320, 640, 1280])
+def test_the_legend_fits_its_width(width):
+    """All of it is written: the longest notes and counts end before the right edge."""
+    image = np.full((90, width), 100, np.uint8)
+    overlay = draw_overlay(
+        image,
+        predicted=np.full((200, 2), np.nan),
+        covariances=np.full((200, 2, 2), np.nan),
+        matched=np.full((200, 2), np.nan),
+        status=["matched", "unmatched", "outlier", "new"] * 50,
+        notes=(
+            "frame 12345  1234.56 s  map 12",
+            "sigma: position 0.00123  0.123 deg  log scale 0.0123",
+        ),
+    )
+    assert overlay.shape == (*overlay_size(width, 90)[::-1], 3)
     assert overlay.dtype == np.uint8
-    assert overlay_size(640, 120) == (640, 120 + STRIP)
+    strip = overlay[90:].max(axis=2)
+    assert not np.any(strip[:, -1] > 60)
     for colour in COLOURS.values():  # the legend shows every colour
-        assert np.any(np.all(overlay[-STRIP:] == colour, axis=2))
+        assert np.any(np.abs(overlay[90:].astype(int) - colour).max(axis=2) < 60)
+
+
+def test_unknown_statuses_are_refused():
     with pytest.raises(ValueError, match="'seen' is unknown; matched, unmatched"):
         draw([200.0, 60.0], np.eye(2), NOTHING, "seen")
 
 
-def test_a_note_stands_in_the_strip_and_leaves_the_picture():
-    plain, noted = (
-        draw_overlay(
-            GREY,
-            predicted=np.zeros((0, 2)),
-            covariances=np.zeros((0, 2, 2)),
-            matched=np.zeros((0, 2)),
-            status=[],
-            index=3,
-            time=0.1,
-            note=note,
-        )
-        for note in ("", "LOST")
+def with_words(**words):
+    nothing = np.zeros((0, 2))
+    return draw_overlay(
+        GREY,
+        predicted=nothing,
+        covariances=np.zeros((0, 2, 2)),
+        matched=nothing,
+        status=[],
+        **words,
     )
-    assert np.all(plain[:-STRIP] == noted[:-STRIP])
-    assert np.any(plain[-STRIP:] != noted[-STRIP:])
+
+
+def test_notes_stand_below_the_picture_and_a_banner_in_it():
+    plain, noted = with_words(), with_words(notes=("frame 3", "sigma"))
+    height = len(GREY)
+    assert np.all(plain[:height] == noted[:height])
+    assert np.any(plain[height:] != noted[height:])
+    banner = with_words(banner="LOST")
+    assert np.all(plain[height:] == banner[height:])
+    rows, columns = np.nonzero(banner[: height // 6, :, 0] > 120)
+    # In the middle, and half as high as the band, a twelfth of the picture.
+    assert columns.mean() == pytest.approx(320, abs=10)
+    assert np.ptp(rows) == pytest.approx(height / 12, abs=3)
 
 
 def read_video(path):
@@ -122,6 +179,58 @@ def test_video_is_whole_whatever_ends_it(tmp_path, interruption):
     frames = read_video(path)
     assert [round(frame.mean(), -1) for frame in frames] == [20, 60, 100, 140]
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_is_given_aside_is_done_in_order_and_elsewhere():
+    done, threads = [], set()
+
+    def work(number):
+        time.sleep(0.001)
+        threads.add(threading.current_thread())
+        done.append(number)
+
+    with Aside() as aside:
+        for number in range(3 * WAITING):
+            aside.give(work, number)
+            # No more than these wait, and one is being done.
+            assert number - len(done) <= WAITING
+    assert done == list(range(3 * WAITING))
+    assert len(threads) == 1
+    assert threading.current_thread() not in threads
+    assert not any(thread.is_alive() for thread in threads)
+
+
+def test_an_interruption_leaves_nothing_undone():
+    done = []
+
+    def interrupted():
+        with Aside() as aside:
+            for number in range(4):
+                aside.give(lambda n: (time.sleep(0.01), done.append(n)), number)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert done == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("given", [1, 5 * WAITING])
+def test_what_fails_aside_is_raised_here(given):
+    """At the end, or where more is given; and it ends, although much is waiting."""
+    reached = []
+
+    def fail():
+        raise ValueError("of the thread")
+
+    def go_on():
+        with Aside() as aside:
+            for number in range(given):
+                aside.give(fail)
+                reached.append(number)
+
+    with pytest.raises(ValueError, match="of the thread"):
+        go_on()
+    assert len(reached) <= WAITING
 
 
 def test_video_without_frames_leaves_nothing(tmp_path):

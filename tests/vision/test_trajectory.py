@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from jaxslam.tum import poses, read_tum
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
+    alignment,
     exactly_known,
     pose_nees,
     read_covariances,
@@ -107,6 +108,24 @@ def test_error_ignores_frame_and_scale_and_measures_the_reference():
     assert result["orientation_rmse"] == pytest.approx(0, abs=1e-5)
     assert result["extent"] == pytest.approx(np.linalg.norm(box))
     assert result["matched"] == len(times)
+
+
+@pytest.mark.parametrize("straight", [False, True])
+def test_alignment_is_that_of_the_error_and_can_be_undone(straight):
+    times, reference = wave()
+    if straight:
+        reference[:, :3, 3] = np.outer(times, [1.0, 2.0, -0.5])
+    estimate = similar(reference, 0.2, [0.3, -0.5, 1.0], [1.0, 2.0, 3.0])
+    estimate[:, :3, 3] += np.random.default_rng(2).normal(0, 0.01, (len(times), 3))
+    found = alignment(times, estimate, times, reference)
+    error = found.moved(estimate)[:, :3, 3] - reference[:, :3, 3]
+    rmse = absolute_trajectory_error(times, estimate, times, reference)["rmse"]
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) == pytest.approx(rmse, rel=1e-9)
+    assert found.scale == pytest.approx(5, rel=0.02)
+    # Rounding.
+    np.testing.assert_allclose(
+        found.inverse().moved(found.moved(estimate)), estimate, rtol=0, atol=1e-12
+    )
 
 
 def test_error_has_the_size_of_the_noise():
@@ -216,6 +235,18 @@ def test_covariances_are_read_as_they_were_written_and_are_the_errors(tmp_path):
     E = poses(errors[:, :3], Rotation.from_rotvec(errors[:, 3:]).as_quat())
     # The mean of n numbers of χ² with 6 degrees of freedom: σ = √(12/n) = 0.055.
     assert abs(pose_nees(T_wc, P, T_wc @ E).mean() - 6) < 0.22
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [(True, "given the scale of its map, of which sigma_log_scale"), (False, "no doubt of its")],
+)
+def test_the_header_says_whether_scale_is_in_a_covariance(tmp_path, given, words):
+    path = tmp_path / "covariance.txt"
+    write_covariances(path, [0.0], np.eye(6)[None], given_scale=given)
+    header, _ = path.read_text().splitlines()
+    assert header.startswith("# t xx xy")
+    assert words in header
 
 
 def test_a_pose_that_is_known_exactly_has_a_nees_of_zero_if_it_is_right(tmp_path):

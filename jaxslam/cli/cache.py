@@ -1,0 +1,37 @@
+"""Compiled programs are kept from one command to the next."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import jax
+
+_WORTH = 0.2
+"""Programs that compile for so many seconds are kept; by default JAX keeps those of one second."""
+
+
+def keep_programs() -> None:
+    """Have JAX keep programs in the user's cache folder, unless JAX was told about a cache.
+
+    That is `$XDG_CACHE_HOME/jaxslam`, `~/.cache/jaxslam` by default. JAX's own variables
+    JAX_COMPILATION_CACHE_DIR (another folder) and JAX_ENABLE_COMPILATION_CACHE (false: none) come
+    first, and so do its configuration's. A folder that cannot be made is done without.
+    """
+    told = jax.config.values
+    if told["jax_compilation_cache_dir"] or not told["jax_enable_compilation_cache"]:
+        return
+    try:
+        folder = _cache_home() / "jaxslam"
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # RuntimeError: nobody's home
+        return
+    if os.access(folder, os.W_OK):
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH)
+
+
+def _cache_home() -> Path:
+    told = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
+    return Path(told) if told else Path.home() / ".cache"

@@ -1,0 +1,68 @@
+"""Commands keep their programs, the library does not, and what JAX was told comes first."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import pytest
+
+import jaxslam.cli
+from jaxslam.cli.cache import keep_programs
+
+FOLDER, ENABLED = "jax_compilation_cache_dir", "jax_enable_compilation_cache"
+LEAST = "jax_persistent_cache_min_compile_time_secs"
+
+
+@pytest.fixture
+def told(monkeypatch, tmp_path):
+    """JAX's configuration, of which nothing is set; it is put back as it was."""
+    before = {name: getattr(jax.config, name) for name in (FOLDER, ENABLED, LEAST)}
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", raising=False)
+    jax.config.update(FOLDER, None)
+    jax.config.update(ENABLED, True)
+    yield jax.config
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+def test_programs_are_kept_in_the_users_cache(told, tmp_path):
+    keep_programs()
+    assert getattr(told, FOLDER) == str(tmp_path / "cache" / "jaxslam")
+    assert (tmp_path / "cache" / "jaxslam").is_dir()
+    assert 0 < getattr(told, LEAST) < 1
+
+
+def test_without_a_told_folder_it_is_below_the_users_home(told, tmp_path, monkeypatch):
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.delenv("LOCALAPPDATA", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    keep_programs()
+    assert getattr(told, FOLDER) == str(tmp_path / ".cache" / "jaxslam")
+
+
+@pytest.mark.parametrize("setting", [(FOLDER, "/elsewhere"), (ENABLED, False)])
+def test_what_jax_was_told_stays(told, tmp_path, setting):
+    told.update(*setting)
+    keep_programs()
+    assert getattr(told, setting[0]) == setting[1]
+    assert getattr(told, FOLDER) in (None, "/elsewhere")
+    assert not (tmp_path / "cache").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_done_without(told, tmp_path):
+    (tmp_path / "cache").write_text("a file")
+    keep_programs()
+    assert getattr(told, FOLDER) is None
+
+
+def test_commands_keep_programs_and_an_import_does_not(monkeypatch, tmp_path):
+    called = []
+    monkeypatch.setattr(jaxslam.cli, "keep_programs", lambda: called.append(1))
+    with pytest.raises(SystemExit):
+        jaxslam.cli.main(["consistency", "--runs", "0", "--out", str(tmp_path)])
+    assert called == [1]
+    code = f"import jax, jaxslam.cli; assert jax.config.{FOLDER} is None"
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    subprocess.run([sys.executable, "-c", code], check=True, env=clean, timeout=120)

@@ -1,0 +1,123 @@
+"""What `track` writes: which files, in which order, whatever goes wrong on the way."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tqdm
+
+pytest.importorskip("cv2")
+
+from jaxslam.cli.track import TrackOptions
+from jaxslam.vision import track as tracking
+from jaxslam.vision.settings import TrackerSettings
+from jaxslam.vision.synthetic import synthetic_source
+
+SETTINGS = TrackerSettings(wanted=10, spare=4)
+NUMBERS = {"trajectory.txt", "covariance.txt", "frames.csv", "summary.json"}
+FIGURES = {"map.ply", "map.png"}
+
+
+def small(frames):
+    return synthetic_source(frames=frames, width=160, height=120)
+
+
+def names(folder):
+    return {path.name for path in folder.iterdir()}
+
+
+def length(T_wc):
+    """Of the path."""
+    return np.linalg.norm(np.diff(T_wc[:, :3, 3], axis=0), axis=1).sum()
+
+
+def fail(*_, **__):
+    raise ValueError("cannot draw")
+
+
+@pytest.mark.parametrize(("name", "in_doubt"), [("scale_gauge+mixture3", True), ("world", False)])
+def test_a_filter_with_a_unit_of_its_own_says_so_beside_its_covariances(tmp_path, name, in_doubt):
+    tracking.track(small(3), tmp_path, replace(SETTINGS, filter=name), overlay=False)
+    header = (tmp_path / "covariance.txt").read_text().splitlines()[0]
+    assert ("given the scale of its map" in header) == in_doubt
+    last = (tmp_path / "frames.csv").read_text().splitlines()[-1].split(",")
+    assert (last[-1] != "") == in_doubt
+
+
+def test_the_overlay_can_be_left_out(tmp_path):
+    tracking.track(small(3), tmp_path, SETTINGS, overlay=False)
+    assert names(tmp_path) == NUMBERS | FIGURES
+
+
+def test_numbers_are_there_before_a_figure_is_drawn(tmp_path, monkeypatch):
+    monkeypatch.setattr(tracking, "plot_map", fail)
+    with pytest.raises(ValueError, match="cannot draw"):
+        tracking.track(small(3), tmp_path, SETTINGS, overlay=False)
+    assert names(tmp_path) == NUMBERS | {"map.ply"}
+    assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 3
+
+
+def test_an_overlay_that_cannot_be_drawn_ends_the_run_and_leaves_the_files(tmp_path, monkeypatch):
+    monkeypatch.setattr(tracking, "draw_overlay", fail)
+    with pytest.raises(ValueError, match="cannot draw"):
+        tracking.track(small(3), tmp_path, SETTINGS)
+    assert names(tmp_path) == NUMBERS | FIGURES
+
+
+def test_the_map_shows_the_reference_in_its_own_frame_and_unit(tmp_path, monkeypatch):
+    """Of the frames tracked; the trajectory's error is the rest, in the reference's unit."""
+    drawn = {}
+    monkeypatch.setattr(tracking, "plot_map", lambda *data, **more: drawn.update(more, data=data))
+    whole, source = small(40), small(12)
+    summary = tracking.track(
+        replace(source, reference=whole.reference), tmp_path, SETTINGS, overlay=False
+    )
+    estimate, reference = drawn["data"][0], drawn["reference"]
+    assert estimate.shape == reference.shape
+    # One factor between the lengths of the two worlds, and no turn between their shapes.
+    ate, true = summary["ate"], whole.reference
+    assert true is not None
+    scale = length(true.T_wc[:12]) / length(reference)
+    error = scale * (estimate - reference)[:, :3, 3]
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) == pytest.approx(ate["rmse"], rel=1e-6)
+    assert drawn["lost"] == [False] * 12
+
+
+def test_without_a_reference_that_fits_the_map_is_drawn_all_the_same(tmp_path):
+    source = small(3)
+    assert source.reference is not None
+    late = source.reference._replace(times=source.reference.times + 100)
+    summary = tracking.track(replace(source, reference=late), tmp_path, SETTINGS, overlay=False)
+    assert "0 poses" in summary["no_ate"]
+    assert names(tmp_path) == NUMBERS | FIGURES
+
+
+def test_the_command_says_that_it_compiles_and_hands_over_what_is_wanted(monkeypatch, capsys):
+    said, asked = [], {}
+
+    class Bar(tqdm.tqdm):
+        def __init__(self, **options):
+            super().__init__(**{**options, "disable": False})
+            said.append(self.desc)
+
+        def set_description(self, desc=None, refresh=True):
+            said.append((self.n, desc))
+
+    def tracked(source, out, settings, *, progress, **more):
+        asked.update(more)
+        for _ in range(5):
+            progress(1)
+        return {}
+
+    monkeypatch.setattr(tqdm, "tqdm", Bar)
+    monkeypatch.setattr(tracking, "track", tracked)
+    monkeypatch.setattr(tracking, "describe", str)
+    TrackOptions(overlay=False, viewer=Path("seen.rrd"), frames=5).run()
+    assert said == ["compiling …", (tracking.WARM_UP, "tracking")]
+    assert (asked["overlay"], asked["viewer"]) == (False, Path("seen.rrd"))
+    printed = capsys.readouterr().out
+    assert "summary.json" in printed
+    assert "seen.rrd" in printed
+    assert "overlay.mp4" not in printed

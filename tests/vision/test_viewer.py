@@ -1,0 +1,118 @@
+"""A recording for rerun holds what was tracked, and is there whatever ends the run."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2")
+
+from jaxslam.vision.settings import TrackerSettings
+from jaxslam.vision.synthetic import synthetic_source
+from jaxslam.vision.track import track
+
+SETTINGS = TrackerSettings(wanted=10, spare=4)
+FRAMES = 4
+
+
+def read(path):
+    """Rows of every entity, in order of frames: their frame and the rest by name."""
+    chunk = pytest.importorskip("rerun.chunk")
+    rows = {}
+    for part in chunk.RrdReader(path).stream():
+        rows.setdefault(part.entity_path, []).extend(part.to_record_batch().to_pylist())
+    timed = {name: [row for row in some if "frame" in row] for name, some in rows.items()}
+    return {name: sorted(some, key=lambda row: row["frame"]) for name, some in timed.items()}
+
+
+def of(rows, column):
+    """The values of a component, as of `Scalars:scalars`."""
+    return [row[next(name for name in row if name.endswith(column))] for row in rows]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    pytest.importorskip("rerun")
+    out = tmp_path_factory.mktemp("recorded")
+    path = out / "new" / "seen.rrd"
+    summary = track(
+        synthetic_source(frames=FRAMES, width=160, height=120), out, SETTINGS, viewer=path
+    )
+    return out, read(path), summary
+
+
+def test_every_frame_is_recorded_with_its_picture_and_camera(recorded):
+    out, rows, _ = recorded
+    pose, image = rows["/world/camera"], rows["/world/camera/image"]
+    assert [row["frame"] for row in pose] == [row["frame"] for row in image] == [0, 1, 2, 3]
+    positions = np.loadtxt(out / "trajectory.txt")[:, 1:4]
+    # Single precision.
+    np.testing.assert_allclose(
+        np.array(of(pose, "translation"))[:, 0], positions, rtol=0, atol=1e-6
+    )
+    assert all(bytes(blob[0])[:2] == b"\xff\xd8" for blob in of(image, "blob"))  # JPEG
+    (path,) = {name for name in rows if name.startswith("/world/path/")}
+    whole = of(rows[path], "strips")[-1][0]
+    np.testing.assert_allclose(whole, positions, rtol=0, atol=1e-6)
+
+
+def test_numbers_are_those_of_the_table(recorded):
+    out, rows, _ = recorded
+    table = np.genfromtxt(out / "frames.csv", delimiter=",", names=True, dtype=None)
+    for name in ("position", "orientation"):
+        values = np.array(of(rows[f"/sigma/{name}"], "scalars"))[:, 0]
+        np.testing.assert_allclose(values, table[f"sigma_{name}"], rtol=1e-5)
+    nis = np.array(of(rows["/nis/per_dof"], "scalars"))[:, 0]
+    np.testing.assert_allclose(nis, (table["nis"][1:] / table["nis_dof"][1:]), rtol=1e-5)
+    assert "/sigma/log_scale" not in rows  # of a filter in map units
+    assert of(rows["/state"], "text") == [["frame 0: start, map 0"], ["frame 1: tracked, map 0"]]
+
+
+def test_what_was_sought_and_found_is_recorded(recorded):
+    _, rows, summary = recorded
+    found = of(rows["/world/camera/image/matched/found"], "positions")
+    assert sum(map(len, found)) == summary["matches_per_frame"] * (FRAMES - 1)
+    searched = of(rows["/world/camera/image/matched/searched"], "strips")
+    assert [len(some) for some in searched] == [len(some) for some in found]
+    created = of(rows["/world/camera/image/new/found"], "positions")
+    assert sum(map(len, created)) == summary["landmarks"]["created"]
+
+
+def test_an_interruption_leaves_what_was_seen(tmp_path):
+    pytest.importorskip("rerun")
+
+    def stop(frames):
+        nonlocal seen
+        seen += frames
+        if seen == 2:
+            raise KeyboardInterrupt
+
+    seen, path = 0, tmp_path / "seen.rrd"
+    source = synthetic_source(frames=FRAMES, width=160, height=120)
+    with pytest.raises(KeyboardInterrupt):
+        track(source, tmp_path, SETTINGS, viewer=path, overlay=False, progress=stop)
+    rows = read(path)
+    assert [row["frame"] for row in rows["/world/camera"]] == [0, 1]
+    assert [row["frame"] for row in rows["/world/landmarks"]] == [1]
+
+
+def test_without_rerun_it_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    source = synthetic_source(frames=FRAMES)
+    with pytest.raises(ValueError, match=r"needs rerun: pip install 'jaxslam\[viewer\]'"):
+        track(source, tmp_path / "out", SETTINGS, viewer=tmp_path / "seen.rrd")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_recording_ends_in_rrd(tmp_path):
+    pytest.importorskip("rerun")
+    source = synthetic_source(frames=FRAMES)
+    with pytest.raises(ValueError, match=r"seen\.mp4: a name ending in \.rrd is accepted"):
+        track(source, tmp_path / "out", SETTINGS, viewer=tmp_path / "seen.mp4")
+    assert not list(tmp_path.iterdir())
+
+
+def test_tracking_without_a_recording_does_not_import_rerun():
+    code = "import sys, jaxslam.vision.track; assert 'rerun' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
