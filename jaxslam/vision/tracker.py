@@ -24,9 +24,11 @@ from jaxslam.slam.readouts import camera_pose, landmarks_in_world
 from jaxslam.video.calibration import Calibration, as_fields, from_fields
 from jaxslam.video.pictures import as_grey
 from jaxslam.video.source import Frame, check_size
+from jaxslam.vision.corners import detect_corners
 from jaxslam.vision.landmarks import NO_POINTS, Landmark, Points, joined, stacked, unstacked
 from jaxslam.vision.located import Located
-from jaxslam.vision.patches import Match, Patch, detect_corners, match_patches
+from jaxslam.vision.matching import Match, match_patches
+from jaxslam.vision.patches import Patch
 from jaxslam.vision.resume import grown, leaves, read_record, write_record
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.target import Sighting, Target, known_depths, sighted

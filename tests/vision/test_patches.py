@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from jaxslam.video.opening import open_source
-from jaxslam.vision.patches import Patch, detect_corners, match_patch, match_patches
+from jaxslam.vision.corners import detect_corners
+from jaxslam.vision.matching import match_patch, match_patches
+from jaxslam.vision.patches import Patch
 from jaxslam.vision.synthetic import add_noise, synthetic_source
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
