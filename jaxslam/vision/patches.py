@@ -1,4 +1,4 @@
-"""Image patches: how a landmark looked when it was first seen, and how it would look from elsewhere.
+"""Image patches: how a landmark looked when first seen, and how it would from elsewhere.
 
 Positions are pixels (u, v) = (column, row), with pixel centres at whole numbers.
 """
