@@ -77,8 +77,7 @@ def match_patches(
     if not matches:
         return matches
     whole, half = image.astype(np.float32), templates.shape[1] // 2
-    # Half a pixel's diagonal wider, else a tiny ellipse could hold no whole pixel.
-    ellipses = _Ellipses.of(centres, covariances, gate).grown(0.5)
+    ellipses = _Ellipses.of(centres, covariances, gate)
     reach = _WIDEST * image.shape[1] if max_radius is None else max_radius
     boxes = _boxes_around(ellipses, reach, half, image.shape)
     least = threshold - ambiguity
@@ -174,15 +173,12 @@ class _Ellipses(NamedTuple):
     def of(
         cls, centres: Float[np.ndarray, "n 2"], covariances: Float[np.ndarray, "n 2 2"], gate: float
     ) -> "_Ellipses":
-        uu, uv, vv = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
-        some = (uu >= 0) & (vv >= 0) & (uu * vv >= uv * uv)
+        # Half a pixel's diagonal wider, else a tiny ellipse could hold no whole pixel.
+        uu, vv = covariances[:, 0, 0] + 0.5 / gate, covariances[:, 1, 1] + 0.5 / gate
+        uv = covariances[:, 0, 1]
+        some = (uu > 0) & (vv > 0) & (uu * vv > uv * uv)
         centres = np.where((some & np.isfinite(centres).all(axis=1))[:, None], centres, np.nan)
         return cls(centres, uu, uv, vv, gate)
-
-    def grown(self, squared: float) -> "_Ellipses":
-        """Reaching further: the squared half-axes longer by `squared`, pixels²."""
-        more = squared / self.gate
-        return self._replace(uu=self.uu + more, vv=self.vv + more)
 
     def reach(self) -> Float[np.ndarray, "n 2"]:
         """How far each goes from its centre along u and v, pixels."""
@@ -293,9 +289,8 @@ def _narrowed(
         return boxes
     side = (templates.shape[1] + 1) // 2
     halved = _Halved.of(image, side)
-    grown = ellipses.grown(_NEARBY**2)
     small = [
-        halved.places(templates[box.owner[0]], box, grown, least - _COARSE_LOSS)
+        halved.places(templates[box.owner[0]], box, ellipses, least - _COARSE_LOSS)
         for box in (boxes.only(index) for index in np.flatnonzero(large)[:, None])
     ]
     parts = [boxes.only(~large), *small]
@@ -333,8 +328,10 @@ class _Halved(NamedTuple):
         places = np.flatnonzero((scores == highest) & (scores >= least))
         row, column = np.divmod(places, scores.shape[1])
         pixels = 2 * (np.stack([column, row], axis=1) + first) + offset
-        owner = np.full(len(pixels), box.owner[0])
-        height = np.where(ellipses.hold(owner, pixels), scores.ravel()[places], -1)
+        owner, around = np.full(len(pixels), box.owner[0]), 2 * np.stack([_RIGHT, _DOWN], axis=1)
+        near = (pixels[:, None] + around).reshape(-1, 2)
+        inside = ellipses.hold(np.repeat(owner, 9), near).reshape(-1, 9).any(axis=1)
+        height = np.where(inside, scores.ravel()[places], -1)
         best = np.argsort(-height)[:_COARSE]
         best = best[height[best] >= np.maximum(height[best[:1]] - _COARSE_MARGIN, least)]
         low = np.maximum(pixels[best] - _NEARBY - 1, box.low)

@@ -266,3 +266,26 @@ def test_flat_pictures_hold_nothing_in_a_wide_ellipse():
     assert match_patch(texture(seed=5), template, CENTRE + 150, WIDE) is None
     # Of a patch with nothing in it, too.
     assert match_patch(texture(), np.full_like(template, 9), CENTRE + 150, WIDE) is None
+
+
+def test_likenesses_outside_of_a_wide_ellipse_do_not_count():
+    image = texture()
+    u, v = 320, 240
+    patch = image[v - 12 :, u - 12 :][:25, :25].copy()
+    template = Patch.take(image, np.array([320.0, 240.0])).warped(np.eye(2))
+    along = np.array([[2000.0, 1960.0], [1960.0, 2000.0]])
+    for x, y in [(80, -80), (-80, 80), (110, -60), (-110, 60), (50, -100), (-50, 100), (90, -20)]:
+        image[v + y - 12 :, u + x - 12 :][:25, :25] = patch
+    image[v - 12 :, u - 12 :][:25, :25] = add_noise(patch, np.random.default_rng(0), 12.0)
+    match = match_patch(image, template, np.array([340.0, 260.0]), along)
+    assert match is not None
+    np.testing.assert_allclose(match.pixel, [u, v], atol=0.3)
+
+
+def test_a_patch_on_the_rim_of_a_wide_ellipse_is_found():
+    """Even where the nearest pixel of half the size is outside of it."""
+    reach, place = np.sqrt(9.21 * WIDE[0, 0]), np.array([320.0, 240.0])
+    template = Patch.take(texture(), place).warped(np.eye(2))
+    for angle in np.arange(0, 2 * np.pi, np.pi / 8):
+        centre = place + 0.999 * reach * np.array([np.cos(angle), np.sin(angle)])
+        assert match_patch(texture(), template, centre, WIDE, max_radius=200.0) is not None
