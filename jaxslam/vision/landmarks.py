@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from jaxslam.vision.patches import STORED, Patch
 
-_COUNTS = ("number", "searches", "matches", "unseen")
+_COUNTS = ("number", "missed", "unseen")
 
 
 @dataclass
@@ -22,9 +22,18 @@ class Landmark:
     patch: Patch
     first_camera: np.ndarray
     """T_wc of its first view, (4, 4)."""
-    searches: int = 0
-    matches: int = 0
+    success: float = 1.0
+    """Share of the latest searches that found it, the older ones weighing ever less."""
+    missed: int = 0
+    """Searches in a row, up to now, that did not find it."""
     unseen: int = 0
+    """Frames since it was found."""
+
+    def searched(self, found: bool, patience: float) -> None:
+        """Count one search; `success` is an average over about `patience` of them."""
+        self.success += (found - self.success) / patience
+        self.missed = 0 if found else self.missed + 1
+        self.unseen = 0 if found else self.unseen
 
 
 class Points(NamedTuple):
@@ -39,6 +48,10 @@ class Points(NamedTuple):
     """(n, 3, 3), the camera's uncertainty and that of the map's start included."""
     in_map: np.ndarray
     """The same given where the map begins, (n, 3, 3)."""
+
+    def only(self, which: np.ndarray) -> Points:
+        """Some of them, in the order given."""
+        return Points(*(part[which] for part in self))
 
 
 NO_POINTS = Points(
@@ -60,6 +73,7 @@ def stacked(landmarks: Mapping[int, Landmark]) -> dict[str, np.ndarray]:
     return {
         "slots": np.array(list(landmarks), int),
         "counts": np.array(counts, int).reshape(-1, len(_COUNTS)),
+        "success": np.array([landmark.success for landmark in kept], float),
         "first_cameras": np.array(cameras, float).reshape(-1, 4, 4),
         "pixels": np.array([patch.pixel for patch in patches], float).reshape(-1, 2),
         "stored": np.array([patch.stored for patch in patches], np.float32).reshape(
@@ -74,14 +88,16 @@ def unstacked(arrays: Mapping[str, np.ndarray]) -> dict[int, Landmark]:
     return {int(slot): _restored(*row) for slot, *row in rows}
 
 
-_FIELDS = ("slots", "counts", "first_cameras", "pixels", "stored")
+_FIELDS = ("slots", "counts", "success", "first_cameras", "pixels", "stored")
 
 
 def _restored(
     counts: np.ndarray,
+    success: float,
     first_camera: Float[np.ndarray, "4 4"],
     pixel: Float[np.ndarray, " 2"],
     stored: np.ndarray,
 ) -> Landmark:
     named = dict(zip(_COUNTS, counts.tolist(), strict=True))
-    return Landmark(patch=Patch(pixel, stored), first_camera=first_camera, **named)
+    patch = Patch(pixel, stored)
+    return Landmark(patch=patch, first_camera=first_camera, success=float(success), **named)

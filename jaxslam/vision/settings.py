@@ -39,7 +39,8 @@ class TrackerSettings:
     wanted: int = 50
     """Landmarks to keep in view."""
     spare: int = 20
-    """Slots for landmarks that are out of view for a while."""
+    """Slots for landmarks that are out of view. They stay until new ones need the slots; then the
+    longest unseen and least known go first."""
     new_per_frame: int = 8
     """Landmarks created in one frame, at the most."""
     nearest_depth: float = 1.0
@@ -65,12 +66,13 @@ class TrackerSettings:
     """Pixels along the image's edge where nothing is matched or created."""
     spacing: float = 20.0
     """Least distance of a new landmark to the others, pixels."""
+    absent_after: int = 5
+    """A landmark that so many searches in a row did not find counts as in view no more, and
+    keeps no new one away."""
     patience: int = 10
-    """A landmark is judged after this many searches …"""
-    least_success: float = 0.5
-    """… and removed when fewer of them than this share matched."""
-    forget_after: int = 30
-    """Frames out of view after which a landmark is removed."""
+    """A landmark is judged by an average over about so many of its latest searches …"""
+    least_success: float = 0.35
+    """… and removed when fewer of them than this share found it; at first, all count as found."""
     lost_for: int = 15
     """Frames in a row without tracking after which a new map is begun."""
 

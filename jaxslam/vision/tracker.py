@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -30,9 +30,12 @@ from jaxslam.slam.readouts import (
 from jaxslam.video.calibration import Calibration, as_fields, from_fields
 from jaxslam.video.pictures import as_grey
 from jaxslam.video.source import Frame, check_size
+from jaxslam.vision.corners import detect_corners
 from jaxslam.vision.landmarks import NO_POINTS, Landmark, Points, joined, stacked, unstacked
 from jaxslam.vision.located import Located
-from jaxslam.vision.patches import Match, Patch, detect_corners, match_patches
+from jaxslam.vision.map import Prediction, failing, in_view, note_found, to_search, worst_first
+from jaxslam.vision.matching import Match, match_patches
+from jaxslam.vision.patches import Patch
 from jaxslam.vision.resume import grown, leaves, read_record, write_record
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.target import Sighting, Target, known_depths, sighted
@@ -51,21 +54,6 @@ _NUMBERS = (
     "_sigma_log_scale",
 )  # fmt: skip
 """What a tracker counts and measures, one number each."""
-
-
-class _Prediction(NamedTuple):
-    """What the filter expects to see, slot by slot; JAX's arrays, then NumPy's."""
-
-    pixels: Any
-    covariances: Any
-    usable: Any
-    """In the map and in front of the camera."""
-    T_wc: Any
-    points: Any
-    """Homogeneous points (X, ω) in the predicted camera."""
-    omegas: Any
-    sides: Any
-    """How many landmarks are surely in front of the camera, and how many behind it."""
 
 
 @dataclass(frozen=True)
@@ -310,8 +298,8 @@ class Tracker:
         ahead, behind = prediction.sides
         if behind > ahead and behind >= LEAST_MATCHES:
             return self._turned_round(frame, predicted, dt)
-        slots = self._visible(prediction)
-        found = self._search(frame, prediction, slots)
+        slots, affines = to_search(self.landmarks, prediction, self.calibration, self.settings)
+        found = self._search(frame, prediction, slots, affines)
         matched, features = self._features(slots, found)
         state, result = self._correct(predicted, dt, features, _more_than_chance(len(slots)))
         used, nis, nis_dof, orientation, status = jax.device_get(result)
@@ -322,8 +310,8 @@ class Tracker:
             return self._lost(frame)
         self._state = state
         used = used[: len(slots)]
-        self._count(slots, used)
-        self._remove_failing()
+        note_found(self.landmarks, slots, used, self.settings)
+        self._remove(failing(self.landmarks, self.settings))
         pixels = prediction.pixels[slots]
         searched = dict(
             predicted=pixels,
@@ -338,8 +326,10 @@ class Tracker:
         self._unmeasured = self._unmeasured + 1 if lost else 0
         if not self.landmarks or self._unmeasured > self.settings.lost_for:
             return self._lost(frame, **searched)
-        occupied = np.where(used[:, None], matched, pixels)
-        created = self._renewed(frame, self._corners(frame, occupied))
+        here = in_view(self.landmarks, slots, self.settings)
+        corners = self._corners(frame, np.where(used[:, None], matched, pixels)[here])
+        self._make_room(len(corners), slots[here])
+        created = self._renewed(frame, corners)
         return self._tracked(
             frame,
             **searched,
@@ -398,56 +388,20 @@ class Tracker:
     def _empty_state(self) -> Any:
         return _empty(self._slam, self.settings.capacity)
 
-    def _visible(self, prediction: _Prediction) -> np.ndarray:
-        """Slots to search: in front, in the picture, with a bearing that the lens can see."""
-        s, c = self.settings, self.calibration
-        size = np.array([c.width, c.height])
-        inside = np.all(
-            (prediction.pixels >= s.border) & (prediction.pixels < size - s.border), axis=1
-        )
-        slots = np.flatnonzero(prediction.usable & inside)
-        # The longest known first, should there be more than can be measured.
-        order = sorted(slots, key=lambda slot: self.landmarks[slot].number)
-        return np.array(order[: s.wanted], int)
-
     def _search(
-        self, frame: Frame, prediction: _Prediction, slots: np.ndarray
+        self, frame: Frame, prediction: Prediction, slots: np.ndarray, affines: np.ndarray
     ) -> list[Match | None]:
         if not len(slots):
             return []
         templates = np.stack(
             [
                 self.landmarks[slot].patch.warped(affine)
-                for slot, affine in zip(slots, self._affines(prediction, slots), strict=True)
+                for slot, affine in zip(slots, affines, strict=True)
             ]
         )
         return match_patches(
             frame.image, templates, prediction.pixels[slots], prediction.covariances[slots]
         )
-
-    def _affines(self, prediction: _Prediction, slots: np.ndarray) -> np.ndarray:
-        """How the picture around each landmark changed since its first view, (k, 2, 2).
-
-        The surface is taken to face the first camera; distortion is neglected, being nearly
-        the same over a patch.
-        """
-        first = np.stack([self.landmarks[slot].first_camera for slot in slots])
-        T_first_now = np.linalg.inv(first) @ prediction.T_wc
-        X, omega = prediction.points[slots], prediction.omegas[slots]
-        start = np.einsum("kij,kj->ki", T_first_now[:, :3, :3], X)
-        start += omega[:, None] * T_first_now[:, :3, 3]
-        ahead = np.where(np.abs(start[:, 2:]) < 1e-9, 1e-9, start[:, 2:])
-        # One pixel to the right and down in the first view, on the plane through the point.
-        step = ahead[:, :, None] * np.eye(3)[None, :2] / [[[self.calibration.fx]]]
-        moved = X[:, None] + np.einsum("kji,kaj->kai", T_first_now[:, :3, :3], step)
-        pixel = X[:, :2] / X[:, 2:]
-        focal = np.array([self.calibration.fx, self.calibration.fy])
-        affine = (moved[..., :2] / moved[..., 2:] - pixel[:, None]) * focal
-        affine = np.swapaxes(affine, 1, 2)
-        sensible = np.isfinite(affine).all(axis=(1, 2)) & (
-            np.abs(np.log(np.clip(np.linalg.det(affine), 1e-6, 1e6))) < np.log(4)
-        )
-        return np.where(sensible[:, None, None], affine, np.eye(2))
 
     def _features(
         self, slots: np.ndarray, found: list[Match | None]
@@ -459,35 +413,22 @@ class Tracker:
                 matched[i] = match.pixel
         return matched, _padded(slots, matched, self.settings.wanted)
 
-    def _count(self, slots: np.ndarray, used: np.ndarray) -> None:
-        for landmark in self.landmarks.values():
-            landmark.unseen += 1
-        for slot, ok in zip(slots, used, strict=True):
-            landmark = self.landmarks[slot]
-            landmark.searches += 1
-            landmark.matches += int(ok)
-            landmark.unseen = 0
-
-    def _remove_failing(self) -> None:
-        """Remove landmarks that stopped matching or left the picture long ago."""
-        s = self.settings
-
-        def failing(landmark: Landmark) -> bool:
-            judged = landmark.searches >= s.patience
-            return judged and landmark.matches < s.least_success * landmark.searches
-
-        self._remove(
-            [
-                slot
-                for slot, landmark in self.landmarks.items()
-                if failing(landmark) or landmark.unseen > s.forget_after
-            ]
-        )
-
     def _remove(self, slots: list[int]) -> None:
-        if not slots:
+        if slots:
+            self._give_up(slots, self._recorded(slots))
+
+    def _make_room(self, count: int, kept: np.ndarray) -> None:
+        """Give up landmarks, those `kept` apart, until there are slots for so many new ones."""
+        missing = count + len(self.landmarks) - self.settings.capacity
+        if missing <= 0:
             return
-        self.finished.append(self._recorded(slots))
+        slots = np.setdiff1d(list(self.landmarks), kept)
+        points = self._recorded(slots.tolist())
+        worst = worst_first([self.landmarks[slot] for slot in slots], points)[:missing]
+        self._give_up(slots[worst].tolist(), points.only(worst))
+
+    def _give_up(self, slots: list[int], recorded: Points) -> None:
+        self.finished.append(recorded)
         self.deleted += len(slots)
         for slot in slots:
             del self.landmarks[slot]
@@ -497,15 +438,14 @@ class Tracker:
     def _corners(self, frame: Frame, occupied: np.ndarray | None = None) -> np.ndarray:
         """Where the picture is bare; for a whole map where nothing says what is `occupied`."""
         s = self.settings
-        free = s.capacity - len(self.landmarks)
-        count = s.wanted
+        wanted = s.wanted
         if occupied is not None:
-            count = min(s.new_per_frame, s.wanted - len(occupied), free)
-        if count <= 0:
+            wanted = min(s.new_per_frame, s.wanted - len(occupied))
+        if wanted <= 0:
             return np.zeros((0, 2))
         return detect_corners(
             frame.image,
-            count,
+            wanted,
             occupied=np.zeros((0, 2)) if occupied is None else occupied,
             min_distance=s.spacing,
             border=2 * s.border,
@@ -585,7 +525,7 @@ def _remove(slam: AbstractStaged, state: Any, gone: Any) -> Any:
 
 
 @eqx.filter_jit
-def _predict(slam: AbstractStaged, state: Any, dt: Any) -> tuple[tuple[Any, Any], _Prediction]:
+def _predict(slam: AbstractStaged, state: Any, dt: Any) -> tuple[tuple[Any, Any], Prediction]:
     """The predicted state, as it is and as one Gaussian, and what that expects to see."""
     slots = jnp.arange(slam.in_map(state).size)
     state = slam.predict(state, dt)
@@ -594,7 +534,7 @@ def _predict(slam: AbstractStaged, state: Any, dt: Any) -> tuple[tuple[Any, Any]
     usable = seen.possible & jnp.isfinite(seen.covariance).all(axis=(1, 2))
     pose = seen.pose.as_matrix()
     sides = landmarks_on_sides(one, gaussian, slots)
-    prediction = _Prediction(
+    prediction = Prediction(
         seen.measured, seen.covariance, usable, pose, seen.points, seen.omegas, sides
     )
     return (state, gaussian), prediction

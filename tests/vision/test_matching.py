@@ -1,4 +1,4 @@
-"""Corners, warped patches and active search, against positions known exactly."""
+"""Warped patches and active search, against positions known exactly."""
 
 from pathlib import Path
 
@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 from jaxslam.video.opening import open_source
-from jaxslam.vision.patches import Patch, detect_corners, match_patch, match_patches
-from jaxslam.vision.synthetic import add_noise, synthetic_source
+from jaxslam.vision import matching
+from jaxslam.vision.corners import detect_corners
+from jaxslam.vision.matching import match_patch, match_patches
+from jaxslam.vision.patches import Patch
+from jaxslam.vision.synthetic import add_noise
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 NOWHERE = np.empty((0, 2))
@@ -34,50 +37,6 @@ def picture(warp=((1, 0), (0, 1)), shift=(0.0, 0.0), size=121, sigma=2.0, seed=0
 
 
 CENTRE = np.array([60.0, 60.0])
-
-
-@pytest.fixture(scope="module")
-def frame():
-    return next(iter(synthetic_source(1, seed=3))).image
-
-
-def test_corners_keep_their_distances_and_cover_the_image(frame):
-    occupied = np.array([[100.0, 100.0], [500.0, 300.0]])
-    corners = detect_corners(frame, 48, occupied=occupied, min_distance=15, border=20)
-    assert len(corners) == 48
-    points = np.concatenate([corners, occupied])
-    distances = np.linalg.norm(points[:, None] - points[None], axis=2)
-    assert distances[np.triu_indices(len(points), 1)].min() >= 15
-    assert np.all((corners >= 20) & (corners <= np.array([639, 479]) - 20))
-    quarters = np.bincount((corners[:, 0] > 320) * 2 + (corners[:, 1] > 240), minlength=4)
-    assert quarters.min() >= 8
-
-
-def test_new_corners_go_where_there_are_none(frame):
-    left = np.stack(np.meshgrid(np.arange(40, 320, 40), np.arange(40, 480, 40)), -1)
-    corners = detect_corners(
-        frame, 10, occupied=left.reshape(-1, 2).astype(float), min_distance=10, border=20
-    )
-    assert len(corners) == 10
-    assert np.all(corners[:, 0] > 300)
-
-
-def test_corner_of_a_square_is_found_with_its_fraction():
-    big = np.full((8 * 80, 8 * 80), 60, np.uint8)
-    big[8 * 30 + 3 :, 8 * 40 + 6 :] = 200
-    image = cv2.resize(big, (80, 80), interpolation=cv2.INTER_AREA)
-    corners = detect_corners(image, 5, occupied=NOWHERE, min_distance=10, border=10)
-    assert len(corners) == 1
-    # The edge lies between pixels: position 8 k + j of the large image is k + (j - 3.5) / 8.
-    np.testing.assert_allclose(corners[0], [40 + 2 / 8, 30 - 1 / 8], atol=0.25)
-
-
-def test_flat_and_full_images_give_no_corners(frame):
-    flat = np.full((100, 100), 90, np.uint8)
-    assert detect_corners(flat, 5, occupied=NOWHERE, min_distance=5, border=5).shape == (0, 2)
-    assert len(detect_corners(frame, 0, occupied=NOWHERE, min_distance=5, border=5)) == 0
-    grid = np.stack(np.meshgrid(np.arange(0.0, 640, 8), np.arange(0.0, 480, 8)), -1).reshape(-1, 2)
-    assert len(detect_corners(frame, 9, occupied=grid, min_distance=20, border=5)) == 0
 
 
 def test_patch_has_the_sub_pixel_position_in_its_centre():
@@ -237,3 +196,96 @@ def test_many_patches_at_once_equal_one_by_one():
     assert together[5] is None
     assert sum(match is not None for match in together) >= 8
     assert match_patches(second, templates[:0], centres[:0], covariances[:0]) == []
+
+
+def texture(width=640, height=480, seed=4):
+    """Blurred noise: nothing in it is like anything else."""
+    noise = np.random.default_rng(seed).standard_normal((height, width)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    return np.clip(128 + 35 * smooth / smooth.std(), 0, 255).astype(np.uint8)
+
+
+WIDE = np.diag([50.0**2, 50.0**2])  # gate: 152 pixels to each side
+
+
+@pytest.mark.parametrize("away", [(120, 0), (-121, 3), (44.5, -101.3), (2, 3)])
+def test_a_patch_far_from_its_prediction_is_found(away):
+    template = Patch.take(texture(), CENTRE + 150.3).warped(np.eye(2))
+    centre = CENTRE + 150.3 - away
+    match = match_patch(add_noise(texture(), np.random.default_rng(0), 3.0), template, centre, WIDE)
+    assert match is not None
+    np.testing.assert_allclose(match.pixel, CENTRE + 150.3, atol=0.1)
+    # The same place, outside of a narrower ellipse and of one cut short.
+    if np.linalg.norm(away) > 100:
+        assert match_patch(texture(), template, centre, WIDE / 4) is None
+        assert match_patch(texture(), template, centre, WIDE, max_radius=90.0) is None
+
+
+def test_an_ellipse_is_cut_at_a_quarter_of_the_width():
+    template = Patch.take(texture(), CENTRE + 150).warped(np.eye(2))
+    for away, found in ((158, True), (163, False)):
+        match = match_patch(texture(), template, CENTRE + 150 + [away, 0], WIDE * 4)
+        assert (match is not None) == found
+
+
+def test_the_wide_search_finds_what_the_whole_one_finds(monkeypatch):
+    """Of half the size nothing is missed that is found pixel by pixel, whatever its place."""
+    first = texture()
+    second = add_noise(cv2.GaussianBlur(first, (0, 0), 0.7), np.random.default_rng(1), 6.0)
+    rng = np.random.default_rng(2)
+    places = rng.uniform((180, 180), (460, 300), (40, 2))
+    templates = np.array([Patch.take(first, place).warped(np.eye(2)) for place in places])
+    given = templates, places + rng.uniform(-90, 90, (40, 2)), np.tile(WIDE, (40, 1, 1))
+    wide = match_patches(second, *given)
+    monkeypatch.setattr(matching, "_NARROW", np.inf)
+    for one, other in zip(wide, match_patches(second, *given), strict=True):
+        assert one is not None
+        assert other is not None
+        # The starts differ by the rounding of scores of single precision.
+        np.testing.assert_allclose(one.pixel, other.pixel, rtol=0, atol=1e-3)
+        assert one.score == pytest.approx(other.score, rel=1e-5)
+
+
+@pytest.mark.parametrize("shift", [(140, 0), (0, 121), (61, 60)])
+def test_a_texture_that_is_there_twice_is_ambiguous_in_a_wide_ellipse(shift):
+    image = texture()
+    u, v = 250, 200
+    place = np.array([u, v], float)
+    image[v + shift[1] - 12 :, u + shift[0] - 12 :][:25, :25] = image[v - 12 :, u - 12 :][:25, :25]
+    template = Patch.take(image, place).warped(np.eye(2))
+    centre = place + np.array(shift) / 2
+    assert match_patch(image, template, centre, WIDE) is None
+    assert match_patch(image, template, centre, WIDE, ambiguity=0.0) is not None
+    assert match_patch(image, template, place - np.array(shift) / 4, WIDE / 4) is not None
+
+
+def test_flat_pictures_hold_nothing_in_a_wide_ellipse():
+    template = Patch.take(texture(), CENTRE + 150).warped(np.eye(2))
+    flat = np.full((480, 640), 90, np.uint8)
+    assert match_patch(flat, template, CENTRE + 150, WIDE) is None
+    assert match_patch(texture(seed=5), template, CENTRE + 150, WIDE) is None
+    # Of a patch with nothing in it, too.
+    assert match_patch(texture(), np.full_like(template, 9), CENTRE + 150, WIDE) is None
+
+
+def test_likenesses_outside_of_a_wide_ellipse_do_not_count():
+    image = texture()
+    u, v = 321, 241
+    patch = image[v - 12 :, u - 12 :][:25, :25].copy()
+    template = Patch.take(image, np.array([321.0, 241.0])).warped(np.eye(2))
+    along = np.array([[2000.0, 1960.0], [1960.0, 2000.0]])
+    for x, y in [(80, -80), (-80, 80), (110, -60), (-110, 60), (50, -100), (-50, 100), (90, -20)]:
+        image[v + y - 12 :, u + x - 12 :][:25, :25] = patch
+    image[v - 12 :, u - 12 :][:25, :25] = add_noise(patch, np.random.default_rng(0), 12.0)
+    match = match_patch(image, template, np.array([340.0, 260.0]), along)
+    assert match is not None
+    np.testing.assert_allclose(match.pixel, [u, v], atol=0.3)
+
+
+def test_a_patch_on_the_rim_of_a_wide_ellipse_is_found():
+    """Even where the nearest pixel of half the size is outside of it."""
+    reach, place = np.sqrt(9.21 * WIDE[0, 0]), np.array([320.0, 240.0])
+    template = Patch.take(texture(), place).warped(np.eye(2))
+    for angle in np.arange(0, 2 * np.pi, np.pi / 8):
+        centre = place + 0.999 * reach * np.array([np.cos(angle), np.sin(angle)])
+        assert match_patch(texture(), template, centre, WIDE, max_radius=200.0) is not None

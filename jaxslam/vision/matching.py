@@ -1,0 +1,374 @@
+"""Active search: where in a picture the patches are, each within the ellipse of its prediction.
+
+Positions are pixels (u, v) = (column, row), with pixel centres at whole numbers.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+_ITERATIONS = 3
+_MAX_SHIFT = 1.5  # pixels: a refinement that moves further than this has left its peak
+_WIDEST = 0.25  # of the picture's width: an ellipse is searched no further from its centre
+_NARROW = 91**2  # pixels: boxes of more are searched in the picture of half the size first
+_COARSE = 6  # peaks of half the size that are looked at in full, for each patch
+_COARSE_MARGIN = 0.25  # of score: peaks so far below the highest are not
+_NEARBY = 3  # pixels around such a peak
+_COARSE_LOSS = 0.1  # of score: what a match loses at half the size, where pixels fall otherwise
+
+
+@dataclass(frozen=True)
+class Match:
+    """Where a patch was found: pixel (u, v), sub-pixel, and its correlation score up to 1."""
+
+    pixel: Float[np.ndarray, " 2"]
+    score: float
+
+
+def match_patch(
+    image: UInt8[np.ndarray, "h w"],
+    template: Float32[np.ndarray, "window window"],
+    centre: Float[np.ndarray, " 2"],
+    covariance: Float[np.ndarray, "2 2"],
+    *,
+    gate: float = 9.21,
+    threshold: float = 0.8,
+    max_radius: float | None = None,
+    ambiguity: float = 0.05,
+) -> Match | None:
+    """Active search: the place most like `template` within the ellipse of the prediction.
+
+    Looks where (x - centre)' covariance^-1 (x - centre) <= `gate` (a quantile of chi2 with two
+    degrees of freedom), at most `max_radius` pixels from the centre along each axis (by default
+    a quarter of the image's width: a wider ellipse is cut there), for the best zero-mean
+    normalised cross-correlation, then refines it to sub-pixel. None where no peak reaches
+    `threshold`, or where a second peak comes within `ambiguity` of the best one's score (0:
+    never ambiguous), or where the ellipse is outside the image. A wide ellipse is searched in
+    the image of half the size, and around the highest peaks there again in the whole one.
+    """
+    return match_patches(
+        image,
+        template[None],
+        np.asarray(centre, dtype=float)[None],
+        np.asarray(covariance, dtype=float)[None],
+        gate=gate,
+        threshold=threshold,
+        max_radius=max_radius,
+        ambiguity=ambiguity,
+    )[0]
+
+
+def match_patches(
+    image: UInt8[np.ndarray, "h w"],
+    templates: Float32[np.ndarray, "n window window"],
+    centres: Float[np.ndarray, "n 2"],
+    covariances: Float[np.ndarray, "n 2 2"],
+    *,
+    gate: float = 9.21,
+    threshold: float = 0.8,
+    max_radius: float | None = None,
+    ambiguity: float = 0.05,
+) -> list[Match | None]:
+    """`match_patch` for n patches; faster than one by one, as all are judged together."""
+    matches: list[Match | None] = [None] * len(templates)
+    if not matches:
+        return matches
+    whole, half = image.astype(np.float32), templates.shape[1] // 2
+    ellipses = _Ellipses.of(centres, covariances, gate)
+    reach = _WIDEST * image.shape[1] if max_radius is None else max_radius
+    boxes = _boxes_around(ellipses, reach, half, image.shape)
+    least = threshold - ambiguity
+    boxes = _narrowed(image, templates, ellipses, boxes, least)
+    peaks = _peaks(whole, templates, boxes, least)
+    peaks = peaks.only(ellipses.hold(peaks.owner, peaks.pixels))
+    best = _alone(peaks, threshold, ambiguity)
+    if len(best.owner):
+        starts = best.pixels + _quadratic_peaks(best.around)
+        pixels = refine(whole, templates[best.owner], starts)
+        for owner, pixel, score in zip(best.owner.tolist(), pixels, best.scores, strict=True):
+            matches[owner] = Match(pixel, float(score))
+    return matches
+
+
+def refine(
+    image: Float32[np.ndarray, "h w"],
+    templates: Float32[np.ndarray, "n window window"],
+    pixels: Float[np.ndarray, "n 2"],
+) -> Float[np.ndarray, "n 2"]:
+    """The positions near `pixels` that fit the templates best, by Gauss-Newton.
+
+    Minimises the squared difference of the two windows, each made zero-mean with unit norm (so
+    gain and offset do not matter); inverse compositional, so that the gradient is the
+    template's. One that does not converge stays where it is.
+    """
+    steps = _gauss_newton_steps(templates)
+    side = templates.shape[1] - 2
+    positions = pixels
+    for _ in range(_ITERATIONS):
+        windows = _windows(image, positions, side)
+        windows -= windows.mean(axis=1, keepdims=True)
+        norms = np.sqrt(np.einsum("ni,ni->n", windows, windows) + 1e-6)
+        # The steps ignore what of a window is like its template, so there is nothing to subtract.
+        shifts = (steps @ windows[:, :, None])[:, :, 0] / norms[:, None]
+        positions = np.clip(positions - shifts, pixels - 2 * _MAX_SHIFT, pixels + 2 * _MAX_SHIFT)
+    gone = np.abs(positions - pixels).max(axis=1) > _MAX_SHIFT
+    return np.where(gone[:, None], pixels, positions)
+
+
+def _windows(
+    image: Float32[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"], side: int
+) -> Float32[np.ndarray, "n m"]:
+    """The squares of `side` pixels around sub-pixel positions, row by row (m = side²)."""
+    line = np.arange(side) - side // 2
+    u, v = pixels[:, :1] + np.tile(line, side), pixels[:, 1:] + np.repeat(line, side)
+    return cv2.remap(
+        image,
+        u.astype(np.float32),
+        v.astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+
+
+def _gauss_newton_steps(
+    templates: Float32[np.ndarray, "n window window"],
+) -> Float32[np.ndarray, "n 2 m"]:
+    """What takes each window of unit norm to the shift (2,) it shows against its template.
+
+    The rows are orthogonal to constants and to the template's inside (m values), so they see
+    the residual without its mean and gain. Zero for a template without texture in two
+    directions.
+    """
+    inside = templates[:, 1:-1, 1:-1]
+    target = inside.reshape(len(templates), 1, -1)
+    target = target - target.mean(axis=2, keepdims=True)
+    norm = np.sqrt(np.sum(target**2, axis=2, keepdims=True) + 1e-6)
+    target /= norm
+    across = templates[:, 1:-1, 2:] - templates[:, 1:-1, :-2]
+    down = templates[:, 2:, 1:-1] - templates[:, :-2, 1:-1]
+    gradient = np.stack([across, down], axis=1).reshape(len(templates), 2, -1) * (0.5 / norm)
+    gradient -= gradient.mean(axis=2, keepdims=True)
+    gradient -= (gradient @ target.transpose(0, 2, 1)) * target
+    hessian = gradient @ gradient.transpose(0, 2, 1)
+    (xx, xy), (_, yy) = hessian.transpose(1, 2, 0)
+    determinant = xx * yy - xy * xy
+    adjugate = np.stack([yy, -xy, -xy, xx], axis=1).reshape(-1, 2, 2)
+    inverse = np.where(determinant > 1e-8, 1 / np.maximum(determinant, 1e-8), 0.0)
+    return (adjugate * inverse[:, None, None]) @ gradient
+
+
+class _Ellipses(NamedTuple):
+    """n ellipses (x - centre)' covariance^-1 (x - centre) <= gate; NaN for one that is none."""
+
+    centres: Float[np.ndarray, "n 2"]
+    uu: Float[np.ndarray, " n"]
+    uv: Float[np.ndarray, " n"]
+    vv: Float[np.ndarray, " n"]
+    gate: float
+
+    @classmethod
+    def of(
+        cls, centres: Float[np.ndarray, "n 2"], covariances: Float[np.ndarray, "n 2 2"], gate: float
+    ) -> "_Ellipses":
+        # Half a pixel's diagonal wider, else a tiny ellipse could hold no whole pixel.
+        uu, vv = covariances[:, 0, 0] + 0.5 / gate, covariances[:, 1, 1] + 0.5 / gate
+        uv = covariances[:, 0, 1]
+        some = (uu > 0) & (vv > 0) & (uu * vv > uv * uv)
+        centres = np.where((some & np.isfinite(centres).all(axis=1))[:, None], centres, np.nan)
+        return cls(centres, uu, uv, vv, gate)
+
+    def reach(self) -> Float[np.ndarray, "n 2"]:
+        """How far each goes from its centre along u and v, pixels."""
+        variances = np.stack([self.uu, self.vv], axis=1)
+        return np.sqrt(self.gate * np.maximum(variances, 0.0))
+
+    def hold(
+        self, which: Int[np.ndarray, " m"], pixels: Int[np.ndarray, "m 2"]
+    ) -> Bool[np.ndarray, " m"]:
+        """Whether each pixel lies within the ellipse that `which` says."""
+        x, y = (pixels - self.centres[which]).T
+        uu, uv, vv = self.uu[which], self.uv[which], self.vv[which]
+        return (vv * x - 2 * uv * y) * x + uu * y * y <= self.gate * (uu * vv - uv * uv)
+
+
+class _Boxes(NamedTuple):
+    """m rectangles of whole pixels, from `low` to `high` inclusive, for patches `owner`."""
+
+    owner: Int[np.ndarray, " m"]
+    low: Int[np.ndarray, "m 2"]
+    high: Int[np.ndarray, "m 2"]
+
+    @property
+    def sizes(self) -> Int[np.ndarray, "m 2"]:
+        """Columns and rows."""
+        return self.high - self.low + 1
+
+    def only(self, which: np.ndarray) -> "_Boxes":
+        return _Boxes(*(part[which] for part in self))
+
+    def large_enough(self) -> "_Boxes":
+        """Those of three pixels each way: a peak needs a neighbour on either side."""
+        return self.only(np.all(self.sizes >= 3, axis=1))
+
+
+def _boxes_around(
+    ellipses: _Ellipses, max_reach: float, half: int, shape: tuple[int, ...]
+) -> _Boxes:
+    """What to score for each ellipse: all of it, and one pixel more all around to tell a peak on
+    the rim by; as far as windows of `half` pixels to each side are within the picture."""
+    some = np.flatnonzero(np.isfinite(ellipses.centres + ellipses.reach()).all(axis=1))
+    middle, reach = ellipses.centres[some], np.minimum(ellipses.reach()[some], max_reach)
+    last = np.array(shape[::-1]) - 1 - half
+    # Clipped as numbers, which have no greatest one, before they are whole.
+    low = np.clip(np.floor(middle - reach) - 1, half, last + 1).astype(int)
+    high = np.clip(np.ceil(middle + reach) + 1, half - 1, last).astype(int)
+    return _Boxes(some, low, high).large_enough()
+
+
+class _Peaks(NamedTuple):
+    """k local maxima of the score of patches `owner`, each with its neighbourhood of 3x3."""
+
+    owner: Int[np.ndarray, " k"]
+    pixels: Int[np.ndarray, "k 2"]
+    scores: Float32[np.ndarray, " k"]
+    around: Float32[np.ndarray, "k 9"]
+
+    def only(self, which: np.ndarray) -> "_Peaks":
+        return _Peaks(*(part[which] for part in self))
+
+
+def _peaks(
+    image: Float32[np.ndarray, "h w"],
+    templates: Float32[np.ndarray, "n window window"],
+    boxes: _Boxes,
+    least: float,
+) -> _Peaks:
+    """The local maxima within each box, its rim apart, that reach `least`."""
+    (width, _), half = boxes.sizes.max(axis=0, initial=3), templates.shape[1] // 2
+    tops = np.concatenate([[0], np.cumsum(boxes.sizes[:, 1])])
+    # One below another, so that peaks are looked for in all of them at once.
+    sheet = np.full((tops[-1], width), -1, np.float32)
+    for owner, (u, v), (end_u, end_v), top in zip(*boxes, tops[:-1], strict=True):
+        region = image[v - half : end_v + half + 1, u - half : end_u + half + 1]
+        scores = cv2.matchTemplate(region, templates[owner], cv2.TM_CCOEFF_NORMED)
+        sheet[top : top + scores.shape[0], : scores.shape[1]] = scores
+    row, column = np.divmod(np.flatnonzero(sheet >= least), width)
+    box = np.searchsorted(tops, row, side="right") - 1
+    at = np.stack([column, row - tops[box]], axis=1)
+    inner = ((at > 0) & (at < boxes.sizes[box] - 1)).all(axis=1)
+    row, column, box, at = row[inner], column[inner], box[inner], at[inner]
+    around = sheet[row[:, None] + _DOWN, column[:, None] + _RIGHT]
+    found = _Peaks(boxes.owner[box], boxes.low[box] + at, around[:, 4], around)
+    return found.only(found.scores == around.max(axis=1))
+
+
+def _alone(peaks: _Peaks, threshold: float, ambiguity: float) -> _Peaks:
+    """The best peak of each patch, of those that have one which is high enough and alone."""
+    order = np.lexsort((-peaks.scores, peaks.owner))
+    peaks = peaks.only(order)
+    _, first, of = np.unique(peaks.owner, return_index=True, return_inverse=True)
+    best = peaks.only(first)
+    apart = (np.abs(peaks.pixels - best.pixels[of]) > 2).any(axis=1)
+    rivals = peaks.owner[apart & (peaks.scores > best.scores[of] - ambiguity)]
+    return best.only((best.scores >= threshold) & ~np.isin(best.owner, rivals))
+
+
+def _narrowed(
+    image: UInt8[np.ndarray, "h w"],
+    templates: Float32[np.ndarray, "n window window"],
+    ellipses: _Ellipses,
+    boxes: _Boxes,
+    least: float,
+) -> _Boxes:
+    """The boxes, in place of each large one those around its peaks in the picture's half."""
+    large = boxes.sizes.prod(axis=1) > _NARROW
+    if not large.any():
+        return boxes
+    side = (templates.shape[1] + 1) // 2
+    halved = _Halved.of(image, side)
+    small = [
+        halved.places(templates[box.owner[0]], box, ellipses, least - _COARSE_LOSS)
+        for box in (boxes.only(index) for index in np.flatnonzero(large)[:, None])
+    ]
+    parts = [boxes.only(~large), *small]
+    return _Boxes(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+class _Halved(NamedTuple):
+    """A picture of half the size, in which windows of `side` pixels are compared."""
+
+    image: Float32[np.ndarray, "r c"]
+    spread: Float32[np.ndarray, "r c"]
+    """The norm of each window without its mean."""
+    side: int
+
+    @classmethod
+    def of(cls, image: UInt8[np.ndarray, "h w"], side: int) -> "_Halved":
+        half, size = cv2.pyrDown(image).astype(np.float32), (side, side)
+        squares = cv2.sqrBoxFilter(half, cv2.CV_32F, size) - cv2.boxFilter(half, -1, size) ** 2
+        # One grey level at the least, so that a bare wall is like nothing.
+        return cls(half, side * np.sqrt(np.maximum(squares, 1.0)), side)
+
+    def places(
+        self,
+        template: Float32[np.ndarray, "window window"],
+        box: _Boxes,
+        ellipses: _Ellipses,
+        least: float,
+    ) -> _Boxes:
+        """Boxes of the whole picture around the highest peaks within one box and its ellipse."""
+        # The window at x covers the whole picture's pixels about 2 x + offset.
+        offset = template.shape[0] // 2 - 2 * (self.side // 2)
+        first, last = -((offset - box.low[0]) // 2), (box.high[0] - offset) // 2
+        scores = self._scores(template, first, last)
+        highest = cv2.dilate(scores, np.ones((3, 3), np.uint8))
+        places = np.flatnonzero((scores == highest) & (scores >= least))
+        row, column = np.divmod(places, scores.shape[1])
+        pixels = 2 * (np.stack([column, row], axis=1) + first) + offset
+        owner, around = np.full(len(pixels), box.owner[0]), 2 * np.stack([_RIGHT, _DOWN], axis=1)
+        near = (pixels[:, None] + around).reshape(-1, 2)
+        inside = ellipses.hold(np.repeat(owner, 9), near).reshape(-1, 9).any(axis=1)
+        height = np.where(inside, scores.ravel()[places], -1)
+        best = np.argsort(-height)[:_COARSE]
+        best = best[height[best] >= np.maximum(height[best[:1]] - _COARSE_MARGIN, least)]
+        low = np.maximum(pixels[best] - _NEARBY - 1, box.low)
+        high = np.minimum(pixels[best] + _NEARBY + 1, box.high)
+        return _Boxes(owner[best], low, high).large_enough()
+
+    def _scores(
+        self,
+        template: Float32[np.ndarray, "window window"],
+        first: Int[np.ndarray, " 2"],
+        last: Int[np.ndarray, " 2"],
+    ) -> Float32[np.ndarray, "r c"]:
+        """Normalised cross-correlations of the windows at the pixels from `first` to `last`."""
+        before, after = self.side // 2, (self.side - 1) // 2
+        (left, top), (right, bottom) = first, last + 1
+        region = self.image[top - before : bottom + after, left - before : right + after]
+        kernel = cv2.pyrDown(template)
+        kernel -= kernel.mean()
+        norm = np.sqrt(np.sum(kernel**2)) + 1e-6
+        scores = cv2.filter2D(region, -1, kernel / norm)
+        scores = scores[before : scores.shape[0] - after, before : scores.shape[1] - after]
+        return scores / self.spread[top:bottom, left:right]
+
+
+_RIGHT = np.tile([-1, 0, 1], 3)
+_DOWN = np.repeat([-1, 0, 1], 3)
+# Least squares of 1, x, y, x^2, xy, y^2 on a 3x3 neighbourhood.
+_QUADRATIC = np.linalg.pinv(
+    np.stack([np.ones(9), _RIGHT, _DOWN, _RIGHT**2, _RIGHT * _DOWN, _DOWN**2], axis=1)
+)
+
+
+def _quadratic_peaks(around: Float32[np.ndarray, "k 9"]) -> Float[np.ndarray, "k 2"]:
+    """Where paraboloids fitted to 3x3 scores peak, from the middle one, within one pixel."""
+    _, bx, by, cxx, cxy, cyy = _QUADRATIC @ around.T
+    determinant = 4 * cxx * cyy - cxy**2
+    peaked = (cxx < 0) & (determinant > 0)
+    shift = np.stack([cxy * by - 2 * cyy * bx, cxy * bx - 2 * cxx * by], axis=1)
+    shift /= np.where(peaked, determinant, np.inf)[:, None]
+    return np.clip(shift, -1.0, 1.0)
