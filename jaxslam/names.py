@@ -40,6 +40,7 @@ from jaxslam.simulation.scenario import Scenario
 from jaxslam.slam.filter import EkfSlam
 from jaxslam.slam.protocol import AbstractFilter
 from jaxslam.wrappers.bank import Bank
+from jaxslam.wrappers.checked import TOLERANCE, Checked
 from jaxslam.wrappers.fitted_noise import MEMORY, FittedNoise
 from jaxslam.wrappers.fixed_lag import LAG, FixedLag, iterated
 from jaxslam.wrappers.from_rest import from_rest
@@ -71,6 +72,12 @@ def scale_gauge(**pieces: Any) -> EkfSlam:
     return EkfSlam(coordinates=ROBOCENTRIC, scale=ScaleGauge(), **pieces)
 
 
+def world_gauge(**pieces: Any) -> EkfSlam:
+    """`scale_gauge` with landmarks in the base frame: its map is not moved by every frame's noise,
+    and its scale drifts less on long video."""
+    return EkfSlam(coordinates=WORLD, scale=ScaleGauge(), **pieces)
+
+
 def iterated_filter(**pieces: Any) -> FixedLag:
     """The paper's filter, iterated: linearised at the maximum of the posterior of every frame."""
     return iterated(robocentric(**pieces))
@@ -87,6 +94,7 @@ FILTERS: dict[str, Callable[..., AbstractFilter]] = {
     "keyframe": keyframe,
     "information": information,
     "scale_gauge": scale_gauge,
+    "world_gauge": world_gauge,
     "iterated": iterated_filter,
     "invariant": invariant,
 }
@@ -143,6 +151,9 @@ _AROUND_ANY_FILTER: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
     "mixture": lambda slam, count: Mixture(slam, 9 if count is None else count),
     "rest": from_rest,
     "noise": lambda slam, frames: FittedNoise(slam, MEMORY if frames is None else frames),
+    "checked": lambda slam, percent: Checked(
+        slam, tolerance=TOLERANCE if percent is None else percent / 100
+    ),
 }
 MODIFIERS: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
     **_OF_ONE_FILTER,
@@ -153,7 +164,8 @@ greatest depth of a delayed initialisation, m (`particles`, `rays`); the correla
 percent (`common`); σ of the scene's depth in percent of one landmark's (`scene`); frames (`lag`);
 steps of Gauss–Newton instead of convergence (`iterated`); members of a Gaussian sum (`scales`,
 `directions`, `mixture`); frames of the longest window of a start (`rest`); frames of which the
-noise is remembered (`noise`); none for the remedies `oc`, `fej`."""
+noise is remembered (`noise`); by how much a match may be off beyond its noise, in percent of that
+(`checked`); none for the remedies `oc`, `fej`."""
 
 RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gauge+scene50+mixture9"}
 """The filter called `recommended`, by geometry, where the velocity is told."""

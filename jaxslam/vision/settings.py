@@ -23,7 +23,7 @@ class TrackerSettings:
     """What a tracker assumes and how much it does. Lengths are in the unit of `nearest_depth`:
     a single camera does not see scale, so the map's unit is whatever that prior makes it."""
 
-    filter: str = "world"
+    filter: str = "world_gauge+scene50+mixture3+rest8"
     """Filter: a name of jaxslam.names.FILTERS, which may be modified, as in `robocentric+oc`.
     `recommended` is the default, the one of docs/sequences.md with the best trajectories."""
     landmarks: str = "inverse_scaling"

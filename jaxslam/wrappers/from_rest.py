@@ -176,12 +176,12 @@ class FromRest(AbstractStaged):
     def _ready(self, state: RestState) -> Bool[Array, ""]:
         """Whether one mode is left whose translation is known; or, where there is no room, whether
         there is a translation, or its landmarks leave the view."""
-        member = self.base.likeliest(state.sum)
+        ekf, member = self.base.base, self.base.likeliest(state.sum)
         part = member.core.part("pose")
-        n = self.base.base.motion.geometry.point_dim
+        n = ekf.motion.geometry.point_dim
         position = slice(part.start, part.start + n)
         variance = jnp.trace(member.covariance[position, position])
-        squared = jnp.sum(member.core.pose.translation() ** 2)
+        squared = jnp.sum(ekf.model.camera_pose(member.core).translation() ** 2)
         known = variance < self.known**2 * squared
         enough = state.record.steps >= LEAST_STEPS
         alone = state.sum.log_weights[0] > -1e-3
