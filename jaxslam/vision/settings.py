@@ -33,8 +33,8 @@ class TrackerSettings:
     wanted: int = 50
     """Landmarks to keep in view."""
     spare: int = 20
-    """Slots for landmarks that are out of view. They stay until new ones need the slots; then the
-    longest unseen and least known go first."""
+    """Slots for landmarks that are out of view. They stay until new ones need the slots: then
+    those searched in vain go first, then the longest unseen and least known."""
     new_per_frame: int = 8
     """Landmarks created in one frame, at the most."""
     nearest_depth: float = 1.0

@@ -68,13 +68,15 @@ def test_landmarks_are_the_same_after_their_arrays():
     draw = np.random.default_rng(0)
     picture = draw.integers(0, 256, (60, 60), dtype=np.uint8)
     landmarks = {
-        slot: Landmark(7 + slot, Patch.take(picture, np.array([30.2, 29.7])), np.eye(4), 0.7, 4, slot)
+        slot: Landmark(
+            7 + slot, Patch.take(picture, np.array([30.2, 29.7])), np.eye(4), 0.7, 4, slot
+        )
         for slot in (2, 0)
     }
     again = unstacked(stacked(landmarks))
     assert list(again) == [2, 0]
     for slot, landmark in landmarks.items():
-        for name in ("number", "searches", "matches", "unseen"):
+        for name in ("number", "success", "missed", "unseen"):
             assert getattr(again[slot], name) == getattr(landmark, name)
         np.testing.assert_array_equal(again[slot].patch.stored, landmark.patch.stored)
         np.testing.assert_array_equal(again[slot].patch.pixel, landmark.patch.pixel)
