@@ -32,7 +32,7 @@ class TrackerSettings:
     field of view, is estimated, and any other is known."""
     wanted: int = 50
     """Landmarks to keep in view."""
-    spare: int = 20
+    spare: int = 30
     """Slots for landmarks that are out of view. They stay until new ones need the slots: then
     those searched in vain go first, then the longest unseen and least known."""
     new_per_frame: int = 8
