@@ -109,6 +109,20 @@ def test_what_looks_twice_as_large_or_half_as_large_is_not_searched(ahead, seen)
         np.testing.assert_allclose(affines[0], np.eye(2) * 4 / (4 - ahead), rtol=1e-2)
 
 
+@pytest.mark.parametrize(("degrees", "seen"), [(0, True), (60, True), (73, False), (100, False)])
+def test_what_is_seen_from_the_side_is_searched_as_far_as_its_patch_reaches(degrees, seen):
+    """A patch of 41 pixels has the 15 of a window that is narrower by 41/15 at the most."""
+    angle = np.radians(degrees)
+    cos, sin, place = np.cos(angle), np.sin(angle), np.array([0, 0, 4.0])
+    T_wc = np.eye(4)
+    T_wc[:3, :3] = [[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]]
+    T_wc[:3, 3] = place - T_wc[:3, :3] @ place
+    slots, affines = searched({0: landmark(0)}, predicted([place])._replace(T_wc=T_wc))
+    assert len(slots) == seen
+    if seen:
+        np.testing.assert_allclose(affines[0], np.diag([cos, 1]), atol=0.01)
+
+
 def test_what_is_at_infinity_looks_the_same_from_anywhere():
     slots, affines = searched({0: landmark(0)}, predicted([(0.1, 0, 1.0)], (3, 0, 5), omega=0.0))
     assert slots.tolist() == [0]
@@ -160,7 +174,14 @@ def test_slots_are_given_to_new_landmarks_when_none_is_free(monkeypatch):
     source = synthetic_source(frames=12, **SMALL)
     tracker = Tracker(source.calibration, TrackerSettings(wanted=12, spare=2))
     hiding(monkeypatch, lambda number: number < 6)
-    kept = []
+    kept, asked = [], []
+
+    def worst(landmarks, *rest):
+        asked.extend(landmarks)
+        assert all(one.unseen > 0 for one in landmarks)
+        return worst_first(landmarks, *rest)
+
+    monkeypatch.setattr(programs, "worst_first", worst)
     for frame in source:
         tracked = tracker.track(frame)
         kept.append({one.number for one in tracker.landmarks.values()})
@@ -168,6 +189,7 @@ def test_slots_are_given_to_new_landmarks_when_none_is_free(monkeypatch):
     assert sum(number < 6 for number in kept[1]) == 2
     assert all(len(numbers) == 14 for numbers in kept[1:])
     assert tracked.status.count("matched") >= 9
+    assert len(asked) >= 6
     assert len(tracker.points().numbers) == tracker.created == 14 + tracker.deleted
 
 
