@@ -121,16 +121,20 @@ def failing(landmarks: Mapping[int, Landmark], settings: TrackerSettings) -> lis
     return [slot for slot, one in landmarks.items() if one.success < settings.least_success]
 
 
-def worst_first(landmarks: Sequence[Landmark], points: Points) -> Int[np.ndarray, " k"]:
-    """The order in which to give up landmarks out of view, whose `points` these are.
+def worst_first(
+    landmarks: Sequence[Landmark], points: Points, settings: TrackerSettings
+) -> Int[np.ndarray, " k"]:
+    """The order in which to give up landmarks that are not in view; `points` are theirs.
 
-    By the time since they were seen, times the σ of their place as a share of their distance
-    from where they were first seen: known ones are worth more, as they say where the camera is.
+    First those that are searched in vain, then by the time since they were seen, times the σ of
+    their place as a share of their distance from where they were first seen: known ones are
+    worth more, as they say where the camera is when it returns.
     """
-    unseen = np.array([landmark.unseen for landmark in landmarks])
+    away = np.array([one.missed <= settings.absent_after for one in landmarks], bool)
+    unseen = np.array([one.unseen for one in landmarks])
     starts = np.array([one.first_camera[:3, 3] for one in landmarks]).reshape(-1, 3)
     distances = np.linalg.norm(points.points - starts, axis=1)
     with np.errstate(invalid="ignore"):  # at infinity, or of unknown depth
         shares = np.sqrt(np.trace(points.in_map, axis1=1, axis2=2)) / distances
-    known = np.minimum(np.nan_to_num(shares, nan=1.0), 1.0)
-    return np.argsort(-unseen * known, kind="stable")
+    unknown = np.minimum(np.nan_to_num(shares, nan=1.0), 1.0)
+    return np.lexsort((-unseen * unknown, away))

@@ -38,9 +38,9 @@ class TrackerSettings:
     with it, and weighed without."""
     wanted: int = 50
     """Landmarks to keep in view."""
-    spare: int = 20
-    """Slots for landmarks that are out of view. They stay until new ones need the slots; then the
-    longest unseen and least known go first."""
+    spare: int = 30
+    """Slots for landmarks that are out of view. They stay until new ones need the slots: then
+    those searched in vain go first, then the longest unseen and least known."""
     new_per_frame: int = 8
     """Landmarks created in one frame, at the most."""
     nearest_depth: float = 1.0

@@ -424,7 +424,8 @@ class Tracker:
             return
         slots = np.setdiff1d(list(self.landmarks), kept)
         points = self._recorded(slots.tolist())
-        worst = worst_first([self.landmarks[slot] for slot in slots], points)[:missing]
+        candidates = [self.landmarks[slot] for slot in slots]
+        worst = worst_first(candidates, points, self.settings)[:missing]
         self._give_up(slots[worst].tolist(), points.only(worst))
 
     def _give_up(self, slots: list[int], recorded: Points) -> None:

@@ -76,7 +76,7 @@ def test_landmarks_are_the_same_after_their_arrays():
     again = unstacked(stacked(landmarks))
     assert list(again) == [2, 0]
     for slot, landmark in landmarks.items():
-        for name in ("number", "searches", "matches", "unseen"):
+        for name in ("number", "success", "missed", "unseen"):
             assert getattr(again[slot], name) == getattr(landmark, name)
         np.testing.assert_array_equal(again[slot].patch.stored, landmark.patch.stored)
         np.testing.assert_array_equal(again[slot].patch.pixel, landmark.patch.pixel)

@@ -1,0 +1,208 @@
+"""The map's upkeep: which landmarks are searched, in view, and given up."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2")
+
+from jaxslam.video.calibration import Calibration
+from jaxslam.vision import tracker as programs
+from jaxslam.vision.landmarks import Landmark, Points
+from jaxslam.vision.map import Prediction, failing, in_view, note_found, to_search, worst_first
+from jaxslam.vision.patches import Patch
+from jaxslam.vision.settings import TrackerSettings
+from jaxslam.vision.synthetic import synthetic_source
+from jaxslam.vision.tracker import Tracker
+
+CAMERA = Calibration(640, 480, 500.0, 500.0, 319.5, 239.5)
+SETTINGS = TrackerSettings(wanted=5)
+PATCH = Patch.take(np.zeros((60, 60), np.uint8), np.array([30.0, 30.0]))
+
+
+def landmark(number, **counts):
+    return Landmark(number, PATCH, np.eye(4), **counts)
+
+
+def search(landmarks, found, times):
+    slots = np.array(list(landmarks), int)
+    for _ in range(times):
+        note_found(landmarks, slots, np.array(found), SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("before", "in_vain", "goes"), [(400, 15, True), (400, 5, False), (0, 9, False), (0, 12, True)]
+)
+def test_a_landmark_is_judged_by_its_latest_searches(before, in_vain, goes):
+    landmarks = {3: landmark(0), 4: landmark(1)}
+    search(landmarks, [True, True], before)
+    search(landmarks, [False, True], in_vain)
+    assert failing(landmarks, SETTINGS) == ([3] if goes else [])
+
+
+def test_one_found_every_other_time_is_kept():
+    landmarks = {3: landmark(0), 4: landmark(1)}
+    for _ in range(50):
+        search(landmarks, [False, True], 1)
+        search(landmarks, [True, True], 1)
+    assert failing(landmarks, SETTINGS) == []
+    assert 0.4 < landmarks[3].success < 0.6
+
+
+def test_a_frame_in_which_nothing_is_found_is_held_against_none():
+    landmarks = {3: landmark(0), 4: landmark(1)}
+    search(landmarks, [False, False], 40)
+    assert failing(landmarks, SETTINGS) == []
+    assert in_view(landmarks, [3, 4], SETTINGS).all()
+    assert [one.unseen for one in landmarks.values()] == [40, 40]
+
+
+def test_a_landmark_counts_as_in_view_until_it_was_missed_some_times():
+    landmarks = {3: landmark(0), 4: landmark(1)}
+    search(landmarks, [False, True], SETTINGS.absent_after)
+    assert in_view(landmarks, [4, 3, 9], SETTINGS).tolist() == [True, True, False]
+    search(landmarks, [False, True], 1)
+    assert in_view(landmarks, [4, 3], SETTINGS).tolist() == [True, False]
+    assert (landmarks[3].missed, landmarks[3].unseen) == (SETTINGS.absent_after + 1,) * 2
+    search(landmarks, [True, True], 1)
+    assert in_view(landmarks, [4, 3], SETTINGS).all()
+    assert (landmarks[3].missed, landmarks[3].unseen) == (0, 0)
+
+
+def predicted(points, position=(0.0, 0.0, 0.0), omega=1.0):
+    """Of points in the first camera, by one at `position` that looks the same way."""
+    here = np.asarray(points, float) - omega * np.asarray(position)
+    pixels = 500 * here[:, :2] / here[:, 2:] + [319.5, 239.5]
+    T_wc = np.eye(4)
+    T_wc[:3, 3] = position
+    count = len(points)
+    covariances = np.tile(np.eye(2), (count, 1, 1))
+    return Prediction(pixels, covariances, here[:, 2] > 0, T_wc, here, np.full(count, omega))
+
+
+def searched(landmarks, prediction):
+    return to_search(landmarks, prediction, CAMERA, SETTINGS)
+
+
+def test_what_is_in_the_picture_is_searched_the_longest_known_first():
+    points = [(0, 0, 4.0), (1, 0, 4.0), (3, 0, 4.0), (0, 0, -4.0), (0, 1, 4.0)]
+    landmarks = {slot: landmark(10 - slot) for slot in range(5)}
+    slots, affines = searched(landmarks, predicted(points))
+    assert slots.tolist() == [4, 1, 0]
+    np.testing.assert_allclose(affines, np.tile(np.eye(2), (3, 1, 1)), atol=1e-12)
+    landmarks[4].missed = SETTINGS.absent_after + 1
+    assert searched(landmarks, predicted(points))[0].tolist() == [1, 0, 4]
+    many = {slot: landmark(slot) for slot in range(9)}
+    assert searched(many, predicted([(0.1 * i, 0, 4.0) for i in range(9)]))[0].tolist() == [
+        *range(5)
+    ]
+    assert searched({}, predicted(np.zeros((0, 3))))[0].shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("ahead", "seen"), [(1.8, True), (2.2, False), (-3.6, True), (-4.4, False)]
+)
+def test_what_looks_twice_as_large_or_half_as_large_is_not_searched(ahead, seen):
+    prediction = predicted([(0.1, 0, 4.0)], (0, 0, ahead))
+    slots, affines = searched({0: landmark(0)}, prediction)
+    assert len(slots) == seen
+    if seen:
+        np.testing.assert_allclose(affines[0], np.eye(2) * 4 / (4 - ahead), rtol=1e-2)
+
+
+@pytest.mark.parametrize(("degrees", "seen"), [(0, True), (60, True), (73, False), (100, False)])
+def test_what_is_seen_from_the_side_is_searched_as_far_as_its_patch_reaches(degrees, seen):
+    """A patch of 41 pixels has the 15 of a window that is narrower by 41/15 at the most."""
+    angle = np.radians(degrees)
+    cos, sin, place = np.cos(angle), np.sin(angle), np.array([0, 0, 4.0])
+    T_wc = np.eye(4)
+    T_wc[:3, :3] = [[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]]
+    T_wc[:3, 3] = place - T_wc[:3, :3] @ place
+    slots, affines = searched({0: landmark(0)}, predicted([place])._replace(T_wc=T_wc))
+    assert len(slots) == seen
+    if seen:
+        np.testing.assert_allclose(affines[0], np.diag([cos, 1]), atol=0.01)
+
+
+def test_what_is_at_infinity_looks_the_same_from_anywhere():
+    slots, affines = searched({0: landmark(0)}, predicted([(0.1, 0, 1.0)], (3, 0, 5), omega=0.0))
+    assert slots.tolist() == [0]
+    np.testing.assert_allclose(affines[0], np.eye(2), atol=1e-12)
+
+
+def test_the_worst_known_and_longest_unseen_go_first():
+    sigmas = np.array([0.1, 0.1, 5.0, np.nan, 0.1, 0.2])
+    unseen = [100, 300, 40, 20, 8, 100]
+    missed = [0, 0, 0, 2, 6, 0]
+    landmarks = [
+        landmark(i, unseen=u, missed=m) for i, (u, m) in enumerate(zip(unseen, missed, strict=True))
+    ]
+    covariances = sigmas[:, None, None] ** 2 * np.eye(3) / 3
+    places = np.tile([0.0, 0.0, 2.0], (6, 1))
+    points = Points(np.arange(6), np.zeros(6, int), places, covariances, covariances)
+    assert worst_first(landmarks, points, SETTINGS).tolist() == [4, 2, 3, 1, 5, 0]
+
+
+SMALL = {"width": 320, "height": 240}
+
+
+def hiding(monkeypatch, hidden):
+    """Let landmarks of some numbers not be in front of the camera while `hidden` says so."""
+
+    def search(landmarks, prediction, *rest):
+        slots = [slot for slot, one in landmarks.items() if hidden(one.number)]
+        usable = prediction.usable & ~np.isin(np.arange(len(prediction.usable)), slots)
+        return to_search(landmarks, prediction._replace(usable=usable), *rest)
+
+    monkeypatch.setattr(programs, "to_search", search)
+
+
+def test_a_landmark_out_of_view_is_kept_while_there_are_slots_and_found_again(monkeypatch):
+    source = synthetic_source(frames=25, **SMALL)
+    there = [frame.image for frame in source]
+    tracker = Tracker(source.calibration, TrackerSettings(wanted=12, spare=20))
+    away = range(4, 45)
+    hiding(monkeypatch, lambda number: number < 4 and index in away)
+    for index, image in enumerate([*there, *there[::-1]]):
+        tracker.step(image, index / 30)
+        unseen = {one.number: one.unseen for one in tracker.landmarks.values()}
+        if index == away[-1]:
+            assert [unseen[number] for number in range(4)] == [len(away)] * 4
+    assert [unseen[number] < 5 for number in range(4)] == [True] * 4
+
+
+def test_slots_are_given_to_new_landmarks_when_none_is_free(monkeypatch):
+    source = synthetic_source(frames=12, **SMALL)
+    tracker = Tracker(source.calibration, TrackerSettings(wanted=12, spare=2))
+    hiding(monkeypatch, lambda number: number < 6)
+    kept, asked = [], []
+
+    def worst(landmarks, *rest):
+        asked.extend(landmarks)
+        assert all(one.unseen > 0 for one in landmarks)
+        return worst_first(landmarks, *rest)
+
+    monkeypatch.setattr(programs, "worst_first", worst)
+    for frame in source:
+        tracked = tracker.track(frame)
+        kept.append({one.number for one in tracker.landmarks.values()})
+    # Six new ones in the place of six that are not seen, of which two have slots.
+    assert sum(number < 6 for number in kept[1]) == 2
+    assert all(len(numbers) == 14 for numbers in kept[1:])
+    assert tracked.status.count("matched") >= 9
+    assert len(asked) >= 6
+    assert len(tracker.points().numbers) == tracker.created == 14 + tracker.deleted
+
+
+def test_what_is_covered_makes_room_for_new_landmarks_elsewhere():
+    source = synthetic_source(frames=16, **SMALL)
+    settings = TrackerSettings(wanted=12, spare=12, spacing=8.0)
+    tracker = Tracker(source.calibration, settings)
+    for frame in source:
+        frame.image[:, :160][frame.index >= 5] = 0
+        tracked = tracker.track(frame)
+        right = tracked.predicted[:, 0] > 170
+        found = np.array(tracked.status)[right] == "matched" if frame.index else right
+        if frame.index == 5 + settings.absent_after:
+            before = found.sum()
+    assert before < 10
+    assert found.sum() >= 11
