@@ -73,8 +73,8 @@ def scale_gauge(**pieces: Any) -> EkfSlam:
 
 
 def world_gauge(**pieces: Any) -> EkfSlam:
-    """`scale_gauge` with landmarks in the base frame: its map is not moved by every frame's noise,
-    and its scale drifts less on long video."""
+    """`scale_gauge` with landmarks in the base frame: its scale drifts less on long video, and its
+    covariance is too small where the camera turns."""
     return EkfSlam(coordinates=WORLD, scale=ScaleGauge(), **pieces)
 
 

@@ -12,7 +12,8 @@ from jaxslam.cli.extra import one_line_warnings, require_vision
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.names import FILTERS
 from jaxslam.simulation.scenario import CALIBRATIONS
-from jaxslam.vision.settings import TrackerSettings
+from jaxslam.slam.association import ASSOCIATIONS
+from jaxslam.vision.settings import METRIC, TrackerSettings
 
 _COMPILING = "compiling …"
 """What the bar says while the first frames wait for their programs."""
@@ -52,8 +53,11 @@ class TrackOptions:
     """Frames per second of a folder of images without timestamps."""
     filter: Annotated[
         str,
-        tyro.conf.arg(help=f"Filter: {', '.join(FILTERS)}; may be modified, as in robocentric+oc."),
-    ] = TrackerSettings.filter
+        tyro.conf.arg(
+            help=f"Filter: {', '.join(FILTERS)}; may be modified, as in robocentric+oc. "
+            f"recommended stands for {TrackerSettings.filter}, with a target for {METRIC}."
+        ),
+    ] = "recommended"
     landmarks: Annotated[
         str, tyro.conf.arg(help=f"Landmark parametrization: {', '.join(LANDMARKS)}.")
     ] = TrackerSettings.landmarks
@@ -72,6 +76,9 @@ class TrackOptions:
     """Standard deviation of the linear acceleration, map units/s²."""
     angular_acceleration_sigma: float = TrackerSettings.angular_acceleration_sigma
     """Standard deviation of the angular acceleration, rad/s²."""
+    association: Annotated[
+        str, tyro.conf.arg(help=f"Which matches are believed: {', '.join(ASSOCIATIONS)}.")
+    ] = TrackerSettings.association
     wanted: int = TrackerSettings.wanted
     """Landmarks to keep in view."""
     overlay: bool = True
@@ -141,13 +148,15 @@ class TrackOptions:
         return resized(selected(source, start=self.start, every=self.every), self.scale)
 
     def _settings(self):
+        metric = self.filter == "recommended" and self.target is not None
         return TrackerSettings(
-            filter=self.filter,
+            filter=METRIC if metric else self.filter,
             landmarks=self.landmarks,
             calibration=self.calibration_treatment,
             nearest_depth=self.nearest_depth,
             pixel_sigma=self.pixel_sigma,
             acceleration_sigma=self.acceleration_sigma,
             angular_acceleration_sigma=self.angular_acceleration_sigma,
+            association=self.association,
             wanted=self.wanted,
         )

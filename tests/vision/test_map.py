@@ -15,7 +15,7 @@ from jaxslam.vision.synthetic import synthetic_source
 from jaxslam.vision.tracker import Tracker
 
 CAMERA = Calibration(640, 480, 500.0, 500.0, 319.5, 239.5)
-SETTINGS = TrackerSettings(wanted=5)
+SETTINGS = TrackerSettings(filter="world", wanted=5)
 PATCH = Patch.take(np.zeros((60, 60), np.uint8), np.array([30.0, 30.0]))
 
 
@@ -159,7 +159,7 @@ def hiding(monkeypatch, hidden):
 def test_a_landmark_out_of_view_is_kept_while_there_are_slots_and_found_again(monkeypatch):
     source = synthetic_source(frames=25, **SMALL)
     there = [frame.image for frame in source]
-    tracker = Tracker(source.calibration, TrackerSettings(wanted=12, spare=20))
+    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=20))
     away = range(4, 45)
     hiding(monkeypatch, lambda number: number < 4 and index in away)
     for index, image in enumerate([*there, *there[::-1]]):
@@ -172,7 +172,7 @@ def test_a_landmark_out_of_view_is_kept_while_there_are_slots_and_found_again(mo
 
 def test_slots_are_given_to_new_landmarks_when_none_is_free(monkeypatch):
     source = synthetic_source(frames=12, **SMALL)
-    tracker = Tracker(source.calibration, TrackerSettings(wanted=12, spare=2))
+    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=2))
     hiding(monkeypatch, lambda number: number < 6)
     kept, asked = [], []
 
@@ -195,7 +195,7 @@ def test_slots_are_given_to_new_landmarks_when_none_is_free(monkeypatch):
 
 def test_what_is_covered_makes_room_for_new_landmarks_elsewhere():
     source = synthetic_source(frames=16, **SMALL)
-    settings = TrackerSettings(wanted=12, spare=12, spacing=8.0)
+    settings = TrackerSettings(filter="world", wanted=12, spare=12, spacing=8.0)
     tracker = Tracker(source.calibration, settings)
     for frame in source:
         frame.image[:, :160][frame.index >= 5] = 0

@@ -14,7 +14,7 @@ from jaxslam.vision.synthetic import synthetic_source
 from jaxslam.vision.tracker import Tracker
 
 FRAMES, HALF = 10, 5
-SETTINGS = TrackerSettings(wanted=12, spare=4)
+SETTINGS = TrackerSettings(filter="world", wanted=12, spare=4)
 
 
 @pytest.fixture(scope="module")

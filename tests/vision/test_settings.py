@@ -27,7 +27,7 @@ GUESSED = from_field_of_view(640, 480)
     ],
 )
 def test_a_guess_is_estimated_and_stated_sigmas_are_used(name, calibration, kind, sigma):
-    settings = TrackerSettings(calibration=name, focal_sigma=0.7, centre_sigma=0.6)
+    settings = TrackerSettings(filter="world", calibration=name, focal_sigma=0.7, centre_sigma=0.6)
     treatment = settings.treatment(calibration)
     assert type(treatment) is kind
     np.testing.assert_allclose(treatment.sigma, sigma, rtol=1e-12)
@@ -42,7 +42,7 @@ def test_a_guessed_focal_length_is_estimated_while_the_camera_moves():
     source = synthetic_source(frames=45, width=320, height=240)
     true = source.calibration.fx
     guess = from_field_of_view(320, 240, 70.0)
-    tracker = Tracker(guess, TrackerSettings(wanted=20, spare=4))
+    tracker = Tracker(guess, TrackerSettings(filter="world", wanted=20, spare=4))
     for frame in source:
         tracked = tracker.track(frame)
     assert tracked.state == "tracked"
@@ -61,7 +61,7 @@ def test_a_guessed_focal_length_is_estimated_while_the_camera_moves():
 
 
 def test_a_known_camera_is_reported_as_it_is():
-    tracker = Tracker(PLAIN, TrackerSettings(wanted=10))
+    tracker = Tracker(PLAIN, TrackerSettings(filter="world", wanted=10))
     camera = tracker.camera()
     assert camera is not None
     assert camera[0] == "known"

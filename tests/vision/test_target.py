@@ -17,7 +17,7 @@ from jaxslam.vision.tracker import Tracker
 
 FRAMES = 14
 TURN = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
-SMALL = TrackerSettings(wanted=20, spare=4)
+SMALL = TrackerSettings(filter="world", wanted=20, spare=4)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_the_sigma_of_the_depths_covers_what_pixels_do(video, card):
 def trackers(video, card):
     """With a target and without, both with a prior on depth that is far off."""
     source, frames = video
-    settings = TrackerSettings(wanted=20, spare=4, nearest_depth=3.0)
+    settings = TrackerSettings(filter="world", wanted=20, spare=4, nearest_depth=3.0)
     told = Tracker(source.calibration, settings, target=target(card, frames[0].image))
     alone = Tracker(source.calibration, settings)
     for frame in frames:
@@ -140,7 +140,9 @@ def test_a_filter_whose_unit_is_not_the_metre_cannot_begin_with_a_target(video, 
 
 def test_a_target_has_room_in_the_map(video, card):
     with pytest.raises(ValueError, match="the target has 4 points, and 3 landmarks are wanted"):
-        Tracker(video[0].calibration, TrackerSettings(wanted=3), target=target(card))
+        Tracker(
+            video[0].calibration, TrackerSettings(filter="world", wanted=3), target=target(card)
+        )
 
 
 def test_a_picture_without_the_target_is_refused_and_nothing_changes(video, card):

@@ -15,7 +15,7 @@ from jaxslam.vision import track as tracking
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.synthetic import synthetic_source
 
-SETTINGS = TrackerSettings(wanted=10, spare=4)
+SETTINGS = TrackerSettings(filter="world", wanted=10, spare=4)
 NUMBERS = {"trajectory.txt", "covariance.txt", "frames.csv", "summary.json"}
 FIGURES = {"map.ply", "map.png"}
 

@@ -50,7 +50,7 @@ def frames_of(out):
 def tracked(tmp_path_factory):
     out = tmp_path_factory.mktemp("tracked")
     source = synthetic_source(frames=FRAMES)
-    return out, source, track(source, out, TrackerSettings(wanted=30))
+    return out, source, track(source, out, TrackerSettings(filter="world", wanted=30))
 
 
 def test_the_synthetic_camera_is_tracked(tracked):
@@ -161,7 +161,7 @@ def restarted(tmp_path_factory):
         for index, (here, there) in enumerate(both):
             yield here if index < DARK else there if index >= LIGHT else np.zeros_like(here)
 
-    settings = TrackerSettings(wanted=30, lost_for=LIGHT - DARK - 1)
+    settings = TrackerSettings(filter="world", wanted=30, lost_for=LIGHT - DARK - 1)
     return out, track(replace(source, images=images), out, settings)
 
 
@@ -219,7 +219,7 @@ def test_nothing_but_the_first_frame_is_known_exactly(restarted):
 def test_a_filter_that_fails_is_begun_anew_from_what_prediction_says(broken, monkeypatch):
     """Its covariance is not positive after a frame's update, or even without one."""
     source = synthetic_source(frames=5)
-    tracker = Tracker(source.calibration, TrackerSettings(wanted=12, spare=4))
+    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=4))
     whole, failures = programs._correct, 1 if broken == "update" else 2
 
     def failing(*arguments):
@@ -261,7 +261,7 @@ def test_a_filter_that_fails_is_begun_anew_from_what_prediction_says(broken, mon
 
 def test_matches_too_few_to_believe_change_nothing(monkeypatch):
     source = synthetic_source(frames=2)
-    tracker = Tracker(source.calibration, TrackerSettings(wanted=12, spare=4))
+    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=4))
     given, whole = [], programs._correct
     monkeypatch.setattr(
         programs, "_correct", lambda *arguments: given.append(arguments) or whole(*arguments)
@@ -298,7 +298,9 @@ def test_so_many_matches_are_not_there_by_chance(searched):
 def test_an_unknown_calibration_counts_in_the_first_frame_too():
     """Bearings of the landmarks that it creates are as unsure as pixel and principal point."""
     source = synthetic_source(frames=1)
-    settings = TrackerSettings(wanted=12, spare=4, calibration="white", centre_sigma=2.0)
+    settings = TrackerSettings(
+        filter="world", wanted=12, spare=4, calibration="white", centre_sigma=2.0
+    )
     tracker = Tracker(source.calibration, settings)
     for frame in source:
         tracker.track(frame)
@@ -323,7 +325,12 @@ def test_an_interruption_leaves_the_files_of_the_frames_so_far(tmp_path):
 
     seen = 0
     with pytest.raises(KeyboardInterrupt):
-        track(synthetic_source(frames=20), tmp_path, TrackerSettings(wanted=10), progress=stop)
+        track(
+            synthetic_source(frames=20),
+            tmp_path,
+            TrackerSettings(filter="world", wanted=10),
+            progress=stop,
+        )
     assert len(read_tum(tmp_path / "trajectory.txt")[0]) == 4
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 4
     assert len(list(tmp_path.iterdir())) == 7
@@ -331,7 +338,7 @@ def test_an_interruption_leaves_the_files_of_the_frames_so_far(tmp_path):
 
 def test_a_frame_must_be_later_than_the_one_before():
     source = synthetic_source(frames=2)
-    tracker = Tracker(source.calibration, TrackerSettings(wanted=10))
+    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=10))
     frame = next(iter(source))
     tracker.track(frame)
     with pytest.raises(ValueError, match="not later than the one before"):
@@ -344,7 +351,7 @@ def test_a_gaussian_sum_tracks_too():
     With a scale of their own, in a unit that nobody told.
     """
     source = synthetic_source(frames=10)
-    settings = TrackerSettings(wanted=12, spare=4)
+    settings = TrackerSettings(filter="world", wanted=12, spare=4)
     one = Tracker(source.calibration, replace(settings, filter="scale_gauge"))
     some = Tracker(source.calibration, replace(settings, filter="scale_gauge+mixture3"))
     for frame in source:
@@ -450,7 +457,7 @@ def test_unknown_names_are_refused(options):
 
 def test_a_real_sequence_is_tracked(shared_data, tmp_path):
     source = shortened(open_source(shared_data / "costado"), 60)
-    summary = track(source, tmp_path, TrackerSettings(wanted=30))
+    summary = track(source, tmp_path, TrackerSettings(filter="world", wanted=30))
     assert summary["tracked"] == 60
     # Measured on all 720 frames: 0.2 %.
     assert summary["ate"]["rmse"] < 0.03 * summary["ate"]["path_length"]

@@ -12,7 +12,7 @@ from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.synthetic import synthetic_source
 from jaxslam.vision.track import track
 
-SETTINGS = TrackerSettings(wanted=10, spare=4)
+SETTINGS = TrackerSettings(filter="world", wanted=10, spare=4)
 FRAMES = 4
 
 
