@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from scipy.stats import binom
 
 from jaxslam.arrays import cast
@@ -22,7 +23,6 @@ from jaxslam.slam.association import ASSOCIATIONS, Association, candidates
 from jaxslam.slam.filter import AtOnce, EkfSlam, begun, innermost
 from jaxslam.slam.protocol import AbstractStaged, Scene
 from jaxslam.slam.readouts import (
-    camera_pose,
     camera_pose_in_unit,
     landmarks_in_unit,
     landmarks_on_sides,
@@ -47,7 +47,8 @@ CHANCE = 0.05
 BY_CHANCE = 1e-3
 """… and of a frame to be believed although its landmarks are not there."""
 ASTRAY = np.radians(10.0)
-"""σ of the orientation in its map from which on a camera is lost."""
+"""σ of the directions in which landmarks are expected from which on none is believed: one linear
+update from there would be wrong, and sure."""
 
 _NUMBERS = (
     "created", "deleted", "restarts", "reversed", "steps", "_time", "_unmeasured",
@@ -301,8 +302,11 @@ class Tracker:
         slots, affines = to_search(self.landmarks, prediction, self.calibration, self.settings)
         found = self._search(frame, prediction, slots, affines)
         matched, features = self._features(slots, found)
-        state, result = self._correct(predicted, dt, features, _more_than_chance(len(slots)))
-        used, nis, nis_dof, orientation, status = jax.device_get(result)
+        least = self.settings.wanted + 1  # more than there are
+        if not self._astray(prediction.covariances[slots]):
+            least = _more_than_chance(len(slots), found_again=self._unmeasured > 0)
+        state, result = self._correct(predicted, dt, features, least)
+        used, nis, nis_dof, status = jax.device_get(result)
         self._time = frame.time
         if status >= Status.NOT_POSITIVE:
             self.failed[Status(int(status)).name.lower()] += 1
@@ -322,12 +326,14 @@ class Tracker:
                 for match, ok in zip(found, used, strict=True)
             ],
         )
-        lost = bool(not used.any() or orientation > ASTRAY)
+        lost = not used.any()
         self._unmeasured = self._unmeasured + 1 if lost else 0
         if not self.landmarks or self._unmeasured > self.settings.lost_for:
             return self._lost(frame, **searched)
         here = in_view(self.landmarks, slots, self.settings)
         corners = self._corners(frame, np.where(used[:, None], matched, pixels)[here])
+        # What a lost camera sees may be another place: it is not put into this map.
+        corners = corners[:0] if lost else corners
         self._make_room(len(corners), slots[here])
         created = self._renewed(frame, corners)
         return self._tracked(
@@ -347,6 +353,13 @@ class Tracker:
         numbers = jnp.asarray(s.tolerance * s.pixel_sigma), jnp.asarray(least)
         association = ASSOCIATIONS[s.association]
         return _correct(self._slam, association, *predicted, dt, features, *numbers)
+
+    def _astray(self, ellipses: Float[np.ndarray, "k 2 2"]) -> bool:
+        """Whether most landmarks are expected too widely."""
+        if not len(ellipses):
+            return False
+        longest = np.sqrt(np.linalg.eigvalsh(ellipses)[:, -1])
+        return bool(np.median(longest) > ASTRAY * self.calibration.fx)
 
     def _turned_round(self, frame: Frame, predicted: tuple[Any, Any], dt: jax.Array) -> Tracked:
         """The map lies behind the camera: another one is begun."""
@@ -500,9 +513,14 @@ def _keeps_metres(slam: AbstractStaged) -> bool:
     return isinstance(slam, EkfSlam) and isinstance(slam.scale, Metre) and slam.depth.common is None
 
 
-def _more_than_chance(searched: int) -> int:
-    """Matches of so many landmarks searched that are not there by chance."""
-    return max(LEAST_MATCHES, int(binom.isf(BY_CHANCE, searched, CHANCE)) + 1)
+def _more_than_chance(searched: int, found_again: bool = False) -> int:
+    """Matches of so many landmarks searched that are not there by chance.
+
+    A camera that was lost searches ever wider, where there is always something that looks alike:
+    it is `found_again` where half of what it searches agrees.
+    """
+    least = max(LEAST_MATCHES, int(binom.isf(BY_CHANCE, searched, CHANCE)) + 1)
+    return max(least, searched // 2) if found_again else least
 
 
 def _padded(slots: np.ndarray, pixels: np.ndarray, size: int) -> Features:
@@ -558,10 +576,7 @@ def _correct(
     agreed &= jnp.sum(agreed) >= least
     state, innovation = slam.update(state, dt, replace(features, valid=agreed))
     state = slam.compose(state, dt)
-    _, P = camera_pose(slam, state)
-    orientation = jnp.sqrt(jnp.trace(P[3:, 3:]))
-    of_update = innovation.used, innovation.nis, innovation.nis_dof
-    return state, (*of_update, orientation, innovation.status)
+    return state, (innovation.used, innovation.nis, innovation.nis_dof, innovation.status)
 
 
 @eqx.filter_jit

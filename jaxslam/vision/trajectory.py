@@ -145,6 +145,33 @@ def pose_nees(
     return nees
 
 
+def nees_beyond_scale(
+    T_wc: ArrayLike, covariances: ArrayLike, reference: ArrayLike
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """The least NEES of each pose (n, 4, 4) over the scale s > 0 of the reference's position, and
+    that scale; χ² with 5 degrees of freedom for covariances that are true given the scale.
+
+    The error as in `pose_nees` is affine in s, `e(s) = a s + b`, so that
+    `s = −aᵀ P⁻¹ b / aᵀ P⁻¹ a`. Where the reference has not moved, s is 1.
+    """
+    T_wc, reference = np.asarray(T_wc, float), np.asarray(reference, float)
+    to_camera = np.swapaxes(T_wc[:, :3, :3], 1, 2)
+    turn = Rotation.from_matrix(to_camera @ reference[:, :3, :3]).as_rotvec()
+
+    def in_camera(positions: Float[np.ndarray, "n 3"], rest: ArrayLike) -> np.ndarray:
+        moved = np.einsum("nij,nj->ni", to_camera, positions)
+        return np.hstack([moved, np.broadcast_to(rest, turn.shape)])
+
+    a = in_camera(reference[:, :3, 3], 0.0)
+    b = in_camera(-T_wc[:, :3, 3], turn)
+    solved = np.linalg.solve(np.asarray(covariances, float), np.stack([a, b], axis=2))
+    aa, ab = (np.einsum("ni,ni->n", a, solved[..., k]) for k in (0, 1))
+    scale = np.where(aa > 0, np.maximum(-ab / np.where(aa > 0, aa, 1.0), 1e-3), 1.0)
+    error = scale[:, None] * a + b
+    weighed = np.einsum("ni,nik->nk", error, solved)
+    return scale * weighed[:, 0] + weighed[:, 1], scale
+
+
 def absolute_trajectory_error(
     estimate_times: ArrayLike,
     estimate: ArrayLike,

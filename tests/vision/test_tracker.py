@@ -275,7 +275,7 @@ def test_matches_too_few_to_believe_change_nothing(monkeypatch):
     nothing = replace(features, valid=np.zeros_like(features.valid))
     expected, _ = whole(*before, nothing, tolerance, np.array(0))
     for least in (agreed, agreed + 1):
-        corrected, (used, nis, nis_dof, _, status) = whole(
+        corrected, (used, nis, nis_dof, status) = whole(
             *before, features, tolerance, np.array(least)
         )
         assert status == Status.OK
@@ -293,6 +293,7 @@ def test_so_many_matches_are_not_there_by_chance(searched):
     least = programs._more_than_chance(searched)
     assert np.mean(chance >= least) < 1.2e-3
     assert least == LEAST_MATCHES or np.mean(chance >= least - 1) > 1e-3
+    assert programs._more_than_chance(searched, found_again=True) == max(least, searched // 2)
 
 
 def test_an_unknown_calibration_counts_in_the_first_frame_too():

@@ -9,6 +9,7 @@ from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
     alignment,
     exactly_known,
+    nees_beyond_scale,
     pose_nees,
     read_covariances,
     write_atomically,
@@ -276,3 +277,34 @@ def test_as_many_covariances_as_times(tmp_path):
     with pytest.raises(ValueError, match="2 times for 1 covariances"):
         write_covariances(tmp_path / "covariance.txt", [0, 1], np.eye(6)[None])
     assert not list(tmp_path.iterdir())
+
+
+def test_beyond_scale_is_the_least_nees_over_the_scale_of_the_reference():
+    rng = np.random.default_rng(0)
+    T = np.tile(np.eye(4), (5, 1, 1))
+    T[:, :3, :3] = Rotation.from_rotvec(0.5 * rng.normal(size=(5, 3))).as_matrix()
+    T[:, :3, 3] = rng.normal(size=(5, 3))
+    root = 0.1 * rng.normal(size=(5, 6, 6)) + 0.05 * np.eye(6)
+    P = root @ np.swapaxes(root, 1, 2)
+    reference = T.copy()
+    reference[:, :3, 3] = 3.0 * (T[:, :3, 3] + 0.05 * rng.normal(size=(5, 3)))
+    nees, scale = nees_beyond_scale(T, P, reference)
+
+    def at(s):
+        scaled = reference.copy()
+        scaled[:, :3, 3] *= s[:, None]
+        return pose_nees(T, P, scaled)
+
+    np.testing.assert_allclose(nees, at(scale), rtol=1e-9)
+    assert np.all(nees < at(1.01 * scale))
+    assert np.all(nees < at(0.99 * scale))
+
+
+def test_a_reversed_path_is_not_explained_by_any_scale():
+    T = np.tile(np.eye(4), (1, 1, 1))
+    T[0, :3, 3] = [1.0, 0, 0]
+    reference = T.copy()
+    reference[0, :3, 3] = [-2.0, 0, 0]
+    nees, scale = nees_beyond_scale(T, 0.01 * np.eye(6)[None], reference)
+    assert scale[0] < 0.01
+    np.testing.assert_allclose(nees, 100, rtol=0.01)
