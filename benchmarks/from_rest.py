@@ -89,13 +89,13 @@ def table(results: dict[str, dict[str, Any]]) -> str:
     """The numbers of all filters, one table a scenario."""
     parts = []
     for scenario, filters in results.items():
-        first = next(iter(filters.values()))
-        low, high = first["band95"]
+        dof = next(iter(filters.values()))["dof"]
         parts.append(
-            f"`{scenario}`, {first['runs']} runs of seed {first['seed']}; ideal {first['dof']}, "
-            f"95 % band {low:.2f}–{high:.2f}. *Lost; mean NEES of the others* at frames:"
+            f"`{scenario}`; ideal {dof}, 95 % of means in the band. *Lost; mean NEES of the others* "
+            "at frames:"
         )
-        header = ["filter", *map(str, STEPS), "ever lost", "RMSE and σ at the end, m", "s a run"]
+        header = ["filter", "runs, band", *map(str, STEPS), "ever lost"]
+        header += ["RMSE and σ at the end, m", "s a run"]
         rows = [header, ["---"] * len(header), *(_row(*item) for item in filters.items())]
         parts.append("\n".join(f"| {' | '.join(row)} |" for row in rows))
     return "\n\n".join(parts)
@@ -107,8 +107,10 @@ def _row(name: str, found: dict[str, Any]) -> list[str]:
         return f"{found['lost'][step - 1]:.1%}; {'–' if kept is None else format(kept, '.1f')}"
 
     rmse, sigma = (found[key]["position"][-1] for key in ("rmse", "sigma"))
+    low, high = found["band95"]
     return [
         f"`{name}`",
+        f"{found['runs']} (seed {found['seed']}), {low:.2f}–{high:.2f}",
         *map(at, STEPS),
         f"{found['lost_ever'][-1]:.1%}",
         f"{rmse:.3f}, {sigma:.3f}",

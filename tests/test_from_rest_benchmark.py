@@ -38,7 +38,7 @@ def test_a_row_says_at_every_frame_what_is_lost_and_how_true_the_others_are():
     nees[5], nees[-1] = 7.25, None
     row = table({"standstill": {"mine": found(nees_not_lost=nees)}}).splitlines()[-1]
     assert row.split(" | ") == [
-        "| `mine`", "25.0%; 3.0", "25.0%; 3.0", "25.0%; 7.2", "25.0%; 3.0", "25.0%; 3.0",
+        "| `mine`", "50 (seed 3), 2.40–3.70", "25.0%; 3.0", "25.0%; 3.0", "25.0%; 7.2", "25.0%; 3.0", "25.0%; 3.0",
         "25.0%; 3.0", "25.0%; –", "50.0%", "0.100, 0.200", "1.5 |",
     ]  # fmt: skip
 
@@ -67,6 +67,6 @@ def test_what_is_there_is_not_measured_again(tmp_path, monkeypatch):
     options.out.write_text(json.dumps({"standstill": {"mine": found()}}))
     monkeypatch.setattr(benchmark, "measure", lambda *_: found(runs=51, seed=3))
     main(options)
-    assert "50 runs of seed 3" in options.docs.read_text()
+    assert "50 (seed 3)" in options.docs.read_text()
     main(replace(options, runs=51))
-    assert "51 runs of seed 3" in options.docs.read_text()
+    assert "51 (seed 3)" in options.docs.read_text()
