@@ -38,8 +38,8 @@ def test_a_row_says_at_every_frame_what_is_lost_and_how_true_the_others_are():
     nees[5], nees[-1] = 7.25, None
     row = table({"standstill": {"mine": found(nees_not_lost=nees)}}).splitlines()[-1]
     assert row.split(" | ") == [
-        "| `mine`", "50 (seed 3), 2.40–3.70", "25.0%; 3.0", "25.0%; 3.0", "25.0%; 7.2", "25.0%; 3.0", "25.0%; 3.0",
-        "25.0%; 3.0", "25.0%; –", "50.0%", "0.100, 0.200", "1.5 |",
+        "| `mine`", "50 (seed 3), 2.40–3.70", "25.0%; 3.0", "25.0%; 3.0", "25.0%; 7.2",
+        "25.0%; 3.0", "25.0%; 3.0", "25.0%; 3.0", "25.0%; –", "50.0%", "0.100, 0.200", "1.5 |",
     ]  # fmt: skip
 
 

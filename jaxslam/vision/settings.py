@@ -61,12 +61,12 @@ class TrackerSettings:
     """σ of the principal point, pixels, of the same."""
     velocity_sigma: float = 0.5
     """σ of the initial linear velocity, 1/s."""
-    angular_velocity_sigma: float = 0.5
+    angular_velocity_sigma: float = 1.0
     """σ of the initial angular velocity, rad/s."""
     acceleration_sigma: float = 1.0
     """σ of the linear acceleration, 1/s²."""
-    angular_acceleration_sigma: float = 2.0
-    """σ of the angular acceleration, rad/s²."""
+    angular_acceleration_sigma: float = 6.0
+    """σ of the angular acceleration, rad/s²: a hand's, as in the scenarios `handheld-NAME`."""
     border: int = 12
     """Pixels along the image's edge where nothing is matched or created."""
     spacing: float = 20.0

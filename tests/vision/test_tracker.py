@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -294,6 +295,45 @@ def test_so_many_matches_are_not_there_by_chance(searched):
     assert np.mean(chance >= least) < 1.2e-3
     assert least == LEAST_MATCHES or np.mean(chance >= least - 1) > 1e-3
     assert programs._more_than_chance(searched, found_again=True) == max(least, searched // 2)
+
+
+def test_a_world_behind_the_camera_is_given_up():
+    source = synthetic_source(frames=4)
+    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=4))
+    results = []
+    for frame in source:
+        if frame.index == 2:
+            state = tracker._state
+            behind = state.landmarks.at[:, 3].multiply(-1)
+            tracker._state = replace(state, landmarks=behind, covariance=1e-6 * state.covariance)
+        results.append(tracker.track(frame))
+    assert [result.state for result in results] == ["start", "tracked", "start", "tracked"]
+    assert [result.map for result in results] == [0, 0, 1, 1]
+    assert tracker.reversed == 1
+
+
+def test_what_a_lost_camera_sees_is_not_put_into_its_map():
+    source, rng = synthetic_source(frames=5), np.random.default_rng(0)
+    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=20, spare=20))
+    for frame in source:
+        elsewhere = frame.index >= 3
+        noise = rng.integers(0, 256, frame.image.shape, dtype=np.uint8)
+        image = cv2.blur(noise, (5, 5)) if elsewhere else frame.image
+        result = tracker.track(replace(frame, image=image))
+        assert result.lost == elsewhere
+        assert not elsewhere or len(result.created) == 0
+
+
+def test_nothing_is_believed_where_landmarks_are_expected_too_widely():
+    source = synthetic_source(frames=3)
+    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=4))
+    first, second, third = source
+    tracker.track(first)
+    assert tracker.track(second).state == "tracked"
+    state = tracker._state
+    turned = state.covariance.at[np.arange(3, 6), np.arange(3, 6)].add(0.3**2)
+    tracker._state = replace(state, covariance=turned)
+    assert tracker.track(third).state == "lost"
 
 
 def test_an_unknown_calibration_counts_in_the_first_frame_too():

@@ -1,0 +1,81 @@
+"""Tests of what is read from a state given the scale, and of the side on which landmarks are."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax.numpy as jnp
+import numpy as np
+from cases import Case, quick_jit
+
+from jaxslam.slam.readouts import (
+    camera_pose,
+    camera_pose_in_unit,
+    landmarks_in_unit,
+    landmarks_in_world,
+    landmarks_on_sides,
+)
+
+STEPS, COUNT = 4, 6
+
+
+@cache
+def case():
+    return Case("matched-6dof-loose", steps=STEPS, landmarks=COUNT)
+
+
+@cache
+def said(name, unit=None):
+    """Pose and landmarks of the last frame, with and without the scale, in a metre so uncertain."""
+    of = case()
+    slam = of.filter(name)
+    slam = replace(slam, depth=replace(slam.depth, unit=unit))
+    slots = jnp.arange(COUNT)
+
+    def run(first, known, new, controls):
+        state = slam.init(of.capacity, first)
+        for k in range(STEPS):
+            at = [
+                replace(f, **{n: getattr(f, n)[k] for n in f.__annotations__}) for f in (known, new)
+            ]
+            state, _ = slam.step(state, controls[k], *at)
+        return (
+            camera_pose(slam, state)[1],
+            camera_pose_in_unit(slam, state)[1:],
+            landmarks_in_world(slam, state, slots)[1],
+            landmarks_in_unit(slam, state, slots)[1],
+        )
+
+    return quick_jit(run)(*of.frames(0), of.controls())
+
+
+def test_given_the_scale_nothing_depends_on_what_is_known_of_the_metre():
+    metric, (given, variance), points, points_given = said("scale_gauge")
+    wide, (same, wider), wide_points, same_points = said("scale_gauge", 1.0)
+    np.testing.assert_allclose(same, given, rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(same_points, points_given, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(wider - variance, 1.0, rtol=1e-9)
+    assert np.trace(wide) > 2 * np.trace(metric)
+    assert np.all(np.trace(wide_points, axis1=1, axis2=2) > np.trace(points, axis1=1, axis2=2))
+
+
+def test_of_a_filter_in_metres_the_scale_takes_nothing_away():
+    metric, (given, variance), points, points_given = said("robocentric")
+    np.testing.assert_allclose(given, metric, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(points_given, points, rtol=0, atol=1e-12)
+    assert variance == 0
+
+
+def test_landmarks_are_surely_in_front_surely_behind_or_neither():
+    of = case()
+    slam, slots = of.filter("robocentric"), jnp.arange(COUNT)
+    state = slam.init(of.capacity, of.frames(0)[0])
+    omega = state.landmarks[:, 3]
+    d, c = state.landmarks.shape[1], state.core_dim
+    own = c + d * np.arange(COUNT) + 3
+    sure = state.covariance.at[own, own].set(1e-6 * omega**2)
+    sides = quick_jit(lambda state: landmarks_on_sides(slam, state, slots))
+    assert [int(n) for n in sides(state)] == [0, 0]
+    assert [int(n) for n in sides(replace(state, covariance=sure))] == [COUNT, 0]
+    turned = state.landmarks.at[:2, 3].set(-omega[:2])
+    turned = replace(state, covariance=sure, landmarks=turned)
+    assert [int(n) for n in sides(turned)] == [COUNT - 2, 2]
