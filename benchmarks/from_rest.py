@@ -91,8 +91,8 @@ def table(results: dict[str, dict[str, Any]]) -> str:
     for scenario, filters in results.items():
         dof = next(iter(filters.values()))["dof"]
         parts.append(
-            f"`{scenario}`; ideal {dof}, 95 % of means in the band. *Lost; mean NEES of the others* "
-            "at frames:"
+            f"`{scenario}`; ideal {dof}, the band of 95 % of means. "
+            "*Lost; mean NEES of the others* at frames:"
         )
         header = ["filter", "runs, band", *map(str, STEPS), "ever lost"]
         header += ["RMSE and σ at the end, m", "s a run"]

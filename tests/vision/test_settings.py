@@ -51,8 +51,8 @@ def test_a_guessed_focal_length_is_estimated_while_the_camera_moves():
     treatment, (fx, fy, cx, cy), covariance = camera
     assert treatment == "estimated"
     assert fx == fy
-    # Measured: of 34 pixels 11 to 20 are left after 1.5 seconds, from a guess with a σ of 11. One of
-    # three seeds ends farther off than the guess: so short a video tells little of the lens.
+    # Measured: of 34 pixels 11 to 20 are left after 1.5 seconds, from a guess with a σ of 11. One
+    # of three seeds ends farther off than the guess: so short a video tells little of the lens.
     assert abs(fx - true) < 0.7 * abs(guess.fx - true)
     assert np.sqrt(covariance[0, 0]) < 0.5 * guess.sigma[0]
     # Two σ of the guess; measured: 16 and 16 pixels.
