@@ -37,10 +37,11 @@ from jaxslam.simulation.pieces import (
     sensor_of,
 )
 from jaxslam.simulation.scenario import Scenario
+from jaxslam.slam.association import TOLERANCE
 from jaxslam.slam.filter import EkfSlam
 from jaxslam.slam.protocol import AbstractFilter
 from jaxslam.wrappers.bank import Bank
-from jaxslam.wrappers.checked import TOLERANCE, Checked
+from jaxslam.wrappers.checked import Checked
 from jaxslam.wrappers.fitted_noise import MEMORY, FittedNoise
 from jaxslam.wrappers.fixed_lag import LAG, FixedLag, iterated
 from jaxslam.wrappers.from_rest import from_rest

@@ -28,6 +28,8 @@ from jaxslam.slam.protocol import AbstractStaged
 
 GATE = 0.99
 """Share of true matches that a test lets through."""
+TOLERANCE = 1.5
+"""σ of what cameras and trackers of features do beyond their noise, in that."""
 STARTS = 8
 """Of `sequential`, at the most …"""
 ENOUGH = 0.8

@@ -5,7 +5,6 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import cv2
@@ -34,12 +33,7 @@ class Aside:
             self._waiting.popleft().result()
         self._waiting.append(self._thread.submit(function, *arguments))
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         try:
             for done in self._waiting:
                 done.result()
@@ -86,12 +80,7 @@ class OverlayWriter:
         self._writer.write(frame)
         self.frames += 1
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self._writer.release()
         if self.frames:
             self._temporary.replace(self.path)

@@ -13,7 +13,7 @@ from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.sensors import Pinhole
 from jaxslam.names import FILTERS, FROM_REST, make_filter
 from jaxslam.simulation.pieces import TREATMENTS
-from jaxslam.slam.association import ASSOCIATIONS
+from jaxslam.slam.association import ASSOCIATIONS, TOLERANCE
 from jaxslam.slam.protocol import AbstractFilter
 from jaxslam.video.calibration import Calibration
 
@@ -38,7 +38,7 @@ class TrackerSettings:
     field of view, is estimated, and any other is known."""
     association: str = "sequential"
     """Which matches are believed: a name of jaxslam.slam.association.ASSOCIATIONS."""
-    tolerance: float = 1.5
+    tolerance: float = TOLERANCE
     """σ of what cameras and patches do beyond their noise, in `pixel_sigma`: matches are tested
     with it, and weighed without."""
     wanted: int = 50

@@ -302,9 +302,9 @@ class Tracker:
         slots, affines = to_search(self.landmarks, prediction, self.calibration, self.settings)
         found = self._search(frame, prediction, slots, affines)
         matched, features = self._features(slots, found)
-        least = self.settings.wanted + 1  # more than there are
-        if not self._astray(prediction.covariances[slots]):
-            least = _more_than_chance(len(slots), found_again=self._unmeasured > 0)
+        if self._astray(prediction.covariances[slots]):
+            features = self._nothing()
+        least = _more_than_chance(len(slots), found_again=self._unmeasured > 0)
         state, result = self._correct(predicted, dt, features, least)
         used, nis, nis_dof, status = jax.device_get(result)
         self._time = frame.time
@@ -331,9 +331,10 @@ class Tracker:
         if not self.landmarks or self._unmeasured > self.settings.lost_for:
             return self._lost(frame, **searched)
         here = in_view(self.landmarks, slots, self.settings)
-        corners = self._corners(frame, np.where(used[:, None], matched, pixels)[here])
         # What a lost camera sees may be another place: it is not put into this map.
-        corners = corners[:0] if lost else corners
+        corners = np.zeros((0, 2))
+        if not lost:
+            corners = self._corners(frame, np.where(used[:, None], matched, pixels)[here])
         self._make_room(len(corners), slots[here])
         created = self._renewed(frame, corners)
         return self._tracked(

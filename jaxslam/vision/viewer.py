@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 from uuid import uuid4
 
@@ -86,12 +85,7 @@ class Viewer:
         self._record.log("world/landmarks/sigma", ellipsoids)
         self._record.log("world/landmarks", points)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self._record.disconnect()
 
     def _show_picture(self, frame: Frame, result: Tracked) -> None:

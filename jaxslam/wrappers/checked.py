@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,24 +12,23 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam.arrays import AnyArray
 from jaxslam.forms.state import Features, Innovation
 from jaxslam.geometry import Pose
-from jaxslam.slam.association import ASSOCIATIONS, candidates
+from jaxslam.lookup import chosen
+from jaxslam.slam.association import ASSOCIATIONS, TOLERANCE, candidates
 from jaxslam.slam.filter import innermost
 from jaxslam.slam.protocol import AbstractStaged, Capacity, Expected
-
-TOLERANCE = 1.5
-"""σ by which a match may be off beyond its noise, in that."""
 
 
 class Checked(AbstractStaged):
     """`base`, whose updates are by the features that an `Association` believes; its state."""
 
     base: AbstractStaged
-    association: Literal["individual", "ransac", "jcbb", "sequential"] = eqx.field(
-        static=True, default="sequential"
-    )
+    association: str = eqx.field(static=True, default="sequential")
+    """A name of ASSOCIATIONS."""
     tolerance: float = eqx.field(static=True, default=TOLERANCE)
+    """σ by which a match may be off beyond its noise, in that."""
 
     def __check_init__(self) -> None:
+        chosen("association", [self.association], ASSOCIATIONS)
         if not isinstance(self.base, AbstractStaged) or innermost(self.base) is None:
             raise ValueError(
                 "features are checked before the update of a frame that has one, which "
