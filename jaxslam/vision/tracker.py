@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +19,7 @@ from jaxslam.arrays import cast
 from jaxslam.forms.state import Features, Status
 from jaxslam.models.scale import Metre
 from jaxslam.models.sensors import Pinhole
+from jaxslam.programs import Program, in_background
 from jaxslam.slam.association import ASSOCIATIONS, Association, candidates
 from jaxslam.slam.filter import AtOnce, EkfSlam, begun, innermost
 from jaxslam.slam.protocol import AbstractStaged, Scene
@@ -184,14 +185,31 @@ class Tracker:
 
     def compile(self) -> None:
         """Compile all programs now; else the first frames wait for it, and a camera does not."""
-        c = self.calibration
-        noise = np.random.default_rng(0).integers(0, 256, (c.height, c.width), dtype=np.uint8)
-        other = Tracker(c, self.settings, self.filter)
-        for step in range(2):
-            other.step(noise, step / 30)
         with jax.enable_x64(True):
-            other._remove(sorted(other.landmarks))
-        other.camera()
+            for thread in self._prepared():
+                thread.join()
+
+    def _prepared(self) -> list[threading.Thread]:
+        """Have all programs compiled by two threads, in the order in which they are needed."""
+        slam, state, new, dt = self._slam, self._state, self._nothing(), jnp.zeros(())
+        gone = jnp.zeros(self.settings.capacity, bool)
+
+        def corrected() -> None:
+            predicted, _ = _predict.compile(slam, state, dt)
+            _correct.compile(*self._correction(predicted, dt, new))
+
+        return [
+            in_background(
+                lambda: _begin_map.compile(slam, state, new),
+                lambda: _renew_map.compile(slam, state, new),
+                self.camera,
+            ),
+            in_background(
+                corrected,
+                lambda: _world_points.compile(slam, state, self.settings.capacity),
+                lambda: _remove.compile(slam, state, gone),
+            ),
+        ]
 
     def _check(self, frame: Frame) -> None:
         check_size(f"frame {frame.index}", frame.image, self.calibration)
@@ -269,6 +287,7 @@ class Tracker:
         return tracker
 
     def _first(self, frame: Frame) -> Tracked:
+        self._prepared()
         corners = self._corners(frame)
         created = (
             self._begun(frame, corners) if self.target is None else self._known(frame, corners)
@@ -350,10 +369,16 @@ class Tracker:
         self, predicted: tuple[Any, Any], dt: jax.Array, features: Features, least: int = 1
     ) -> tuple[Any, tuple]:
         """Update by the matches that agree, if they are so many at least."""
+        return _correct(*self._correction(predicted, dt, features, least))
+
+    def _correction(
+        self, predicted: tuple[Any, Any], dt: jax.Array, features: Features, least: int = 1
+    ) -> tuple[Any, ...]:
+        """What that is of."""
         s = self.settings
         numbers = jnp.asarray(s.tolerance * s.pixel_sigma), jnp.asarray(least)
         association = ASSOCIATIONS[s.association]
-        return _correct(self._slam, association, *predicted, dt, features, *numbers)
+        return self._slam, association, *predicted, dt, features, *numbers
 
     def _astray(self, ellipses: Float[np.ndarray, "k 2 2"]) -> bool:
         """Whether most landmarks are expected too widely."""
@@ -534,17 +559,17 @@ def _padded(slots: np.ndarray, pixels: np.ndarray, size: int) -> Features:
     )
 
 
-@eqx.filter_jit
+@Program
 def _empty(slam: AbstractStaged, capacity: int) -> Any:
     return slam.init(capacity)
 
 
-@eqx.filter_jit
+@Program
 def _remove(slam: AbstractStaged, state: Any, gone: Any) -> Any:
     return slam.remove(state, gone)
 
 
-@eqx.filter_jit
+@Program
 def _predict(slam: AbstractStaged, state: Any, dt: Any) -> tuple[tuple[Any, Any], Prediction]:
     """The predicted state, as it is and as one Gaussian, and what that expects to see."""
     slots = jnp.arange(slam.in_map(state).size)
@@ -560,7 +585,7 @@ def _predict(slam: AbstractStaged, state: Any, dt: Any) -> tuple[tuple[Any, Any]
     return (state, gaussian), prediction
 
 
-@eqx.filter_jit
+@Program
 def _correct(
     slam: AbstractStaged,
     association: Association,
@@ -580,19 +605,19 @@ def _correct(
     return state, (innovation.used, innovation.nis, innovation.nis_dof, innovation.status)
 
 
-@eqx.filter_jit
+@Program
 def _begin_map(slam: AbstractStaged, state: Any, new: Features):
     state = slam.init(slam.in_map(state).size, new)
     return state, _reported(slam, state)
 
 
-@eqx.filter_jit
+@Program
 def _begin_known(depths: Any, slam: EkfSlam, state: Any, new: Features):
     state = begun(slam, slam.in_map(state).size, new, depths)
     return state, _reported(slam, state)
 
 
-@eqx.filter_jit
+@Program
 def _renew_map(slam: AbstractStaged, state: Any, new: Features):
     state = slam.close(state, new)
     return state, _reported(slam, state)
@@ -604,7 +629,7 @@ def _reported(slam: AbstractStaged, state: Any):
     return T_BC.as_matrix(), covariance, log_scale
 
 
-@eqx.filter_jit
+@Program
 def _intrinsics(slam: AbstractStaged, inner: EkfSlam, state: Any):
     def intrinsics(scene: Scene):
         sensor = inner.calibration.sensor(inner.sensor, scene.core.calibration)
@@ -614,6 +639,6 @@ def _intrinsics(slam: AbstractStaged, inner: EkfSlam, state: Any):
     return slam.marginal(state, intrinsics)
 
 
-@eqx.filter_jit
+@Program
 def _world_points(slam: AbstractStaged, state: Any, capacity: int):
     return landmarks_in_unit(slam, state, jnp.arange(capacity))
