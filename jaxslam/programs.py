@@ -1,10 +1,10 @@
 """Programs that are compiled before they are needed, and kept from one process to the next.
 
 JAX's cache of compiled programs spares the compiler; a program of ten thousand operations is still
-traced and lowered by Python, for seconds. Here the whole is kept, where JAX keeps its own: a file
-for each program, by all that it depends on. One that is damaged, or another user's, is compiled
-anew. Such a file is code, and what is around it a pickle: a folder for programs is to be its
-user's alone, as it is to be for JAX's.
+traced and lowered by Python, for seconds. Here the whole is kept, if a folder is told (`keep_in`):
+a file for each program, by all that it depends on. One that is damaged, or another user's, is
+compiled anew. Such a file is code, and what is around it a pickle: as for JAX's own cache, the
+folder is to be its user's alone.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from types import FunctionType
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
 from jaxslam.files import write_atomically
@@ -35,6 +36,15 @@ OPTIONS = {
     "cpu": {"xla_cpu_experimental_ynn_fusion_type": "", "xla_cpu_use_fusion_emitters": False}
 }
 """Of the compiler, by platform; done without where it does not know them."""
+
+
+_kept_in: Path | None = None
+
+
+def keep_in(folder: Path | None) -> None:
+    """From now on keep every program that is made in this folder, and take it from there."""
+    global _kept_in
+    _kept_in = folder
 
 
 class Program:
@@ -71,7 +81,7 @@ class Program:
         return future.result()
 
     def _make(self, call: _Call) -> _Made:
-        folder, name = _folder(), self.function.__name__
+        folder, name = _kept_in, _name(self.function)
         if folder is None:
             return _compile(self.function, call, name)
         try:
@@ -99,7 +109,7 @@ class _Call(NamedTuple):
     def of(cls, args: tuple[Any, ...]) -> _Call:
         leaves, structure = jax.tree.flatten(args)
         kinds = tuple((x.shape, x.dtype.name) if _is_array(x) else x for x in leaves)
-        key = structure, tuple(map(_is_array, leaves)), kinds, jax.config.jax_enable_x64
+        key = structure, tuple(map(_is_array, leaves)), kinds, wide()
         return cls([x for x in leaves if _is_array(x)], key)
 
     def arguments(self, arrays: list[Any]) -> tuple[Any, ...]:
@@ -108,6 +118,15 @@ class _Call(NamedTuple):
         rest = iter(arrays)
         leaves = [next(rest) if array else x for array, x in zip(are_arrays, kinds, strict=True)]
         return jax.tree.unflatten(structure, leaves)
+
+
+def wide() -> bool:
+    """Whether numbers are of 64 bits where this is asked."""
+    return bool(jnp.result_type(float) == jnp.float64)
+
+
+def _name(function: Callable[..., Any]) -> str:
+    return getattr(function, "__name__", type(function).__name__)
 
 
 def _is_array(leaf: Any) -> bool:
@@ -141,7 +160,7 @@ def _compile(function: Callable[..., Any], call: _Call, name: str) -> _Made:
 
 def _with_options(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
     options = OPTIONS.get(jax.default_backend())
-    with contextlib.suppress(jax.errors.JaxRuntimeError):
+    with contextlib.suppress(RuntimeError):
         return lowered.compile(compiler_options=options)
     return lowered.compile()
 
@@ -149,9 +168,8 @@ def _with_options(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
 def in_background(*steps: Callable[[], Any]) -> threading.Thread:
     """Take the steps one after the other, aside; those not begun when the process ends are left
     out. What goes wrong will do so again where it is needed."""
-    wide = jax.config.jax_enable_x64
 
-    @jax.enable_x64(wide)
+    @jax.enable_x64(wide())
     def take() -> None:
         for step in steps:
             if threading.main_thread().is_alive():
@@ -201,14 +219,6 @@ class _Unpickler(pickle.Unpickler):
 
     def persistent_load(self, pid: str) -> FunctionType:
         return self._functions[pid]
-
-
-def _folder() -> Path | None:
-    """Where JAX keeps its programs, if it does so in a folder."""
-    told = jax.config.values
-    folder = told["jax_compilation_cache_dir"]
-    kept = folder and told["jax_enable_compilation_cache"] and "://" not in folder
-    return Path(folder) if kept else None
 
 
 def _read(path: Path, functions: dict[str, FunctionType]) -> _Made | None:

@@ -23,7 +23,7 @@ from jaxslam.forms.blocks import (
     local_jacobians,
     masked,
     new_landmarks,
-    placed,
+    observed,
     residuals,
     rows,
     shifted,
@@ -84,11 +84,10 @@ class Covariance(AbstractGaussian):
     ) -> tuple[State, Innovation]:
         """The Kalman update by all features at once (P16, P17), in Joseph's form."""
         predicted, residual, used, blocks = residuals(model, state, features, context)
-        H = placed(blocks, features.slots, state.active.size)
         P = state.covariance
         R = _noise_matrix(noise, used)
-        HP = H @ P
-        S = HP @ H.T + R
+        HP = observed(blocks, features.slots, P)
+        S = observed(blocks, features.slots, HP.T).T + R
         factor = cholesky(S)
         whitening = factor.whitening
         K = ((HP.T @ whitening.T) @ whitening).at[considered].set(0.0)
@@ -98,7 +97,7 @@ class Covariance(AbstractGaussian):
         # rank m, and none of n × n matrices. An error of K then counts by its square only; what
         # rounding does to the differences is made good by `ROUNDING`.
         left = P - K @ HP
-        covariance = left + (K @ R - left @ H.T) @ K.T
+        covariance = left + (K @ R - observed(blocks, features.slots, left.T).T) @ K.T
         lost = ROUNDING * jnp.finfo(P.dtype).eps * jnp.diagonal(P).at[considered].set(0.0)
         state = shifted(state, K @ residual.ravel())
         state = replace(state, covariance=(covariance + covariance.T) / 2 + jnp.diag(lost))
@@ -118,9 +117,8 @@ class Covariance(AbstractGaussian):
     ) -> State:
         """The mean that `update` would give, with the covariance left as it is."""
         _, residual, used, blocks = residuals(model, state, features, context)
-        H = placed(blocks, features.slots, state.active.size)
-        HP = H @ state.covariance
-        S = HP @ H.T + _noise_matrix(noise, used)
+        HP = observed(blocks, features.slots, state.covariance)
+        S = observed(blocks, features.slots, HP.T).T + _noise_matrix(noise, used)
         delta = HP.T @ cholesky(S).solve(residual.ravel())
         return shifted(state, delta.at[considered].set(0.0))
 
