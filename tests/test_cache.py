@@ -49,7 +49,7 @@ def test_without_a_told_folder_it_is_below_the_users_home(told, tmp_path, monkey
 
 
 @pytest.mark.parametrize(
-    "setting, kept_in",
+    ("setting", "kept_in"),
     [
         ((FOLDER, "/elsewhere"), Path("/elsewhere")),
         ((FOLDER, "gs://bucket/elsewhere"), None),

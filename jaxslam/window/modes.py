@@ -33,7 +33,7 @@ SEARCH_STEPS = 16
 APART = 1.0
 """Minima nearer than this in the better one's information, squared, are one."""
 
-NEGLIGIBLE = 20.0
+NEGLIGIBLE = 100.0
 """Of log evidence: a mode so much less likely than the likeliest is none."""
 
 

@@ -176,7 +176,7 @@ class FromRest(AbstractStaged):
         searches, together = [k for k in SEARCHES[name] if k in newest], IN_TURN[name]
         if not searches and not together:
             return None
-        count, steps = 2 + self.directions, record.steps.astype(int) - 3
+        count, steps = 2 + self.directions, record.steps.astype(int) - 4
         turn = (jnp.arange(count) - 1 - together * steps) % count < together
         whole = jnp.any(record.last == jnp.array(searches, int))
         return (whole | turn) & ~record.standing
