@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -45,6 +45,8 @@ the correlations stay above `−n ε` however many there are (measured over 600 
 
 class Covariance(AbstractGaussian):
     """Mean and covariance: the extended Kalman filter."""
+
+    divisible: ClassVar[bool] = True
 
     def empty(self, core: Any, landmarks: Float[Array, "capacity d"]) -> State:
         """A state that is exactly known, of slots that hold no landmark yet."""

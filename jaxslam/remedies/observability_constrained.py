@@ -2,8 +2,8 @@
 
 The published filters change the Jacobians so that the linearised system cannot see more than the
 true one, `H* N_{k|k-1} = 0` and `Φ* N_{k|k-1} = N_{k+1|k}`. Here N is taken at the latest
-estimates, landmarks included, so that H needs no change, and `Φ* = Φ M` (`transport`); M changes
-the columns of pose and velocity alone. It serves both frames, and the scale of a monocular filter.
+estimates, landmarks included, so that H needs no change, and `Φ* = Φ M` (`transport`). It serves
+both frames, and the scale of a monocular filter, in metres or in a unit of its own.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from jaxtyping import Array, Float
 from jaxslam.forms.covariance import Covariance
 from jaxslam.forms.state import State
 from jaxslam.geometry import tangent_dim
-from jaxslam.remedies.gauge import check_gauge, unobservable_directions
-from jaxslam.remedies.transport import carried, check_plain, read_from
+from jaxslam.remedies.gauge import check_gauge, scale_is_free, unobservable_directions
+from jaxslam.remedies.transport import carried, check_undelayed, read_from, read_scale_too
 from jaxslam.slam.model import SlamModel
 
 
@@ -26,7 +26,7 @@ class ObservabilityConstrained(Covariance):
 
     def check(self, slam: Any) -> None:
         """Raise ValueError where there is nothing to constrain, or N is not known."""
-        check_plain(slam, "oc")
+        check_undelayed(slam, "oc")
         check_gauge(slam.model)
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
@@ -42,10 +42,14 @@ def follow(model: SlamModel, before: State, after: State) -> State:
 def transport(
     model: SlamModel, before: State, after: State
 ) -> tuple[Float[Array, "n g"], Float[Array, "g n"]]:
-    """`N(x⁺) − N(x)` and L: the frame is read from the pose, the scale from the velocity.
+    """`N(x⁺) − N(x)` and L: the frame is read from the pose, the scale from all else that is known.
 
-    Least squares over the whole error, landmarks included, would be an L as well. It is measurably
-    worse: what is read should be what is known best. Of a camera at rest the scale is not read.
+    Least squares over the whole error for the frame too, landmarks included, is measurably worse:
+    what is read should be what is known best.
     """
     N, N_after = (unobservable_directions(model, state) for state in (before, after))
-    return N_after - N, read_from(N, tangent_dim((before.core.pose, before.core.motion)))
+    pose, frame = tangent_dim(before.core.pose), model.geometry.tangent_dim
+    L = read_from(N[:, :frame], pose)
+    if scale_is_free(model):
+        L = read_scale_too(N, L, before.covariance, pose)
+    return N_after - N, L
