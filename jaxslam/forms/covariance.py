@@ -85,6 +85,22 @@ class Covariance(AbstractGaussian):
         considered: slice = slice(0, 0),
     ) -> tuple[State, Innovation]:
         """The Kalman update by all features at once (P16, P17), in Joseph's form."""
+        return self.update_at(model, state, None, features, noise, context, considered)
+
+    def update_at(
+        self,
+        model: Model,
+        state: State,
+        offset: Float[Array, " n"] | None,
+        features: Features,
+        noise: Float[Array, "p p"] | Float[Array, "m p p"],
+        context: Any,
+        considered: slice = slice(0, 0),
+    ) -> tuple[State, Innovation]:
+        """`update` of the prediction x ⊞ offset, with H and the residuals of the state x.
+
+        A step of Gauss–Newton to the maximum of the posterior; None is no offset.
+        """
         predicted, residual, used, blocks = residuals(model, state, features, context)
         H = placed(blocks, features.slots, state.active.size)
         P = state.covariance
@@ -94,6 +110,8 @@ class Covariance(AbstractGaussian):
         factor = cholesky(S)
         whitening = factor.whitening
         K = ((HP.T @ whitening.T) @ whitening).at[considered].set(0.0)
+        if offset is not None:
+            residual = residual - (H @ offset).reshape(residual.shape)
         whitened = whitening @ residual.ravel()
 
         # Joseph's (I - KH) P (I - KH)ᵀ + K R Kᵀ, multiplied out from the left: two products of
@@ -102,7 +120,8 @@ class Covariance(AbstractGaussian):
         left = P - K @ HP
         covariance = left + (K @ R - left @ H.T) @ K.T
         lost = ROUNDING * jnp.finfo(P.dtype).eps * jnp.diagonal(P).at[considered].set(0.0)
-        state = shifted(state, K @ residual.ravel())
+        delta = K @ residual.ravel()
+        state = shifted(state, delta if offset is None else offset + delta)
         state = replace(state, covariance=(covariance + covariance.T) / 2 + jnp.diag(lost))
         variances = jnp.diagonal(covariance) + lost
         status = judged(factor.positive & jnp.all(variances >= 0), variances, state.landmarks)

@@ -11,18 +11,24 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam.forms.covariance import Covariance
 from jaxslam.forms.state import State
-from jaxslam.geometry import tangent_dim
+from jaxslam.geometry import difference, tangent_dim
 from jaxslam.remedies.gauge import check_gauge, scale_is_free, unobservable_directions
 from jaxslam.remedies.transport import carried, check_undelayed, read_from, read_scale_too
 from jaxslam.slam.model import SlamModel
 
 
 class ObservabilityConstrained(Covariance):
-    """The covariance carried along the gauge after every update."""
+    """The covariance carried along the gauge after every update, and between the steps of one."""
+
+    steps: int = eqx.field(static=True, default=1)
+    """Of Gauss–Newton in an update: an EKF has one. Where a second goes far from the first, as of
+    a camera whose acceleration is large, the first would be wrong, and carried on."""
 
     def check(self, slam: Any) -> None:
         """Raise ValueError where there is nothing to constrain, or N is not known."""
@@ -30,13 +36,30 @@ class ObservabilityConstrained(Covariance):
         check_gauge(slam.model)
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
-        after, innovation = super().update(model, state, features, noise, context, considered)
-        return follow(model, state, after), innovation
+        at, offset = state, None
+        for _ in range(self.steps - 1):
+            at = follow(
+                model, at, self._mean(model, at, offset, features, noise, context, considered)
+            )
+            offset = apart(state, at)
+        after, innovation = self.update_at(model, at, offset, features, noise, context, considered)
+        return follow(model, at, after), innovation
+
+    def _mean(self, model, at, offset, *data) -> State:
+        """The mean that a step gives, with the covariance as it was."""
+        after, _ = self.update_at(model, at, offset, *data)
+        return replace(after, covariance=at.covariance)
 
 
 def follow(model: SlamModel, before: State, after: State) -> State:
     """`after` an update, with its covariance carried from N(before) to N(after)."""
     return replace(after, covariance=carried(after.covariance, *transport(model, before, after)))
+
+
+def apart(state: State, origin: State) -> Float[Array, " n"]:
+    """`state ⊟ origin`."""
+    landmarks = (state.landmarks - origin.landmarks).ravel()
+    return jnp.concatenate([difference(state.core, origin.core), landmarks])
 
 
 def transport(
