@@ -73,13 +73,16 @@ class Convention:
         return position + turn if self.order == "position-first" else turn + position
 
 
-def alternatives(convention: Convention) -> tuple[Convention, ...]:
+def alternatives(convention: Convention, geometry: Geometry) -> tuple[Convention, ...]:
     """All conventions that differ to first order, this one among them, of the same scale.
 
-    The stated one keeps its kind of error: right and split are not told apart.
+    The stated one keeps its kind of error, as right and split are not told apart. In the plane no
+    axes turn a rotation, and mixed is world.
     """
     ours = convention.error if convention.error != "left" else "right"
-    choices = product((ours, "left"), CHOICES["axes"], CHOICES["order"])
+    turned = convention.axes if convention.axes != "body" else "world"
+    axes = ("body", turned) if geometry is PLANAR else CHOICES["axes"]
+    choices = product((ours, "left"), axes, CHOICES["order"])
     return tuple(Convention(*choice, convention.scale) for choice in choices)
 
 

@@ -38,7 +38,8 @@ class Evaluation:
     sigmas: Float[np.ndarray, "runs steps n"]
     """What the filter claims of every error."""
     times: Float[np.ndarray, " steps"]
-    """Seconds, or numbers of steps where nobody told times."""
+    timed: bool
+    """Whether they are seconds, or numbers of steps as nobody told times."""
     names: tuple[str, ...]
     """Of the axes."""
     convention: Convention | None = None
@@ -87,12 +88,12 @@ class Evaluation:
     @property
     def rmse(self) -> Float[np.ndarray, "steps n"]:
         """Of every step and axis."""
-        return np.sqrt(np.mean(self.errors**2, axis=0))
+        return _rms(self.errors)
 
     @property
     def sigma(self) -> Float[np.ndarray, "steps n"]:
         """Claimed, of every step and axis: the root of the mean variance."""
-        return np.sqrt(np.mean(self.sigmas**2, axis=0))
+        return _rms(self.sigmas)
 
     @property
     def outside3sigma(self) -> Float[np.ndarray, " n"]:
@@ -106,7 +107,8 @@ class Evaluation:
 
     def axis_verdict(self, axis: int) -> dict[str, Any]:
         """The verdict on one axis alone, of one degree of freedom."""
-        return run_verdict((self.errors[..., axis] / self.sigmas[..., axis]) ** 2, 1)
+        with np.errstate(over="ignore"):
+            return run_verdict((self.errors[..., axis] / self.sigmas[..., axis]) ** 2, 1)
 
     def asdict(self) -> dict[str, Any]:
         """The content of `evaluation.json`."""
@@ -138,11 +140,14 @@ class Evaluation:
         }
 
     def save(self, folder: str | Path) -> Path:
-        """Write `evaluation.json` into a folder, which is made; its path."""
+        """Write `evaluation.json` into a folder, which is made; its path. Raises ValueError."""
         path = Path(folder) / "evaluation.json"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with write_atomically(path) as temporary:
-            temporary.write_text(json.dumps(self.asdict(), indent=1, allow_nan=False) + "\n")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with write_atomically(path) as temporary:
+                temporary.write_text(json.dumps(self.asdict(), indent=1, allow_nan=False) + "\n")
+        except OSError as error:
+            raise ValueError(f"{folder}: cannot write there ({error.strerror})") from None
         return path
 
     def __str__(self) -> str:
@@ -164,7 +169,7 @@ class Evaluation:
 
     def _row(self, axis: int) -> str:
         found = self.axis_verdict(axis)
-        rmse, sigma = (np.sqrt(np.mean(x[:, axis] ** 2)) for x in (self.rmse, self.sigma))
+        rmse, sigma = (float(_rms(x[:, axis])) for x in (self.rmse, self.sigma))
         factor, low, high = (
             "–" if x is None else f"{x:.3f}" if x < 10 else f"{x:.3g}"
             for x in (found["sigma_factor"], *found["interval99"])
@@ -193,7 +198,7 @@ def evaluate(
     """
     e, P = paired(errors, covariances)
     start = without_known(e, P)
-    times = step_times(times, e.shape[1])
+    at = step_times(times, e.shape[1])
     e, P = e[:, start:], P[:, start:]
     return Evaluation(
         quantity=quantity,
@@ -201,10 +206,17 @@ def evaluate(
         nees=normalised(e, P),
         errors=e,
         sigmas=np.sqrt(np.diagonal(P, axis1=-2, axis2=-1)),
-        times=times[start:],
+        times=at[start:],
+        timed=times is not None,
         names=_names(names, e.shape[-1]),
         notes=left_out(start),
     )
+
+
+def _rms(values: Float[np.ndarray, "k ..."]) -> Float[np.ndarray, "..."]:
+    """Root of the mean square over the first axis; infinite where it overflows."""
+    with np.errstate(over="ignore"):
+        return np.sqrt(np.mean(values**2, axis=0))
 
 
 def left_out(start: int) -> tuple[str, ...]:

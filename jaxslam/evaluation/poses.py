@@ -100,6 +100,7 @@ def evaluate_poses(
         errors=found.errors,
         sigmas=found.sigmas,
         times=step_times(times, poses.estimates.shape[1])[found.start :],
+        timed=times is not None,
         names=stated.names(geometry_of(poses.estimates)),
         convention=stated,
         alignment=align,
@@ -236,13 +237,14 @@ def _moved(run: Poses, convention: Convention, motion: Similarity) -> Poses:
 
 def _identified(poses: Poses, stated: Convention, align: str, found: _Compared) -> Identification:
     """Among the conventions of the same scale; where none of them does, given the scale."""
+    geometry = geometry_of(poses.estimates)
     nees = {
         c: found.nees if c == stated else _compared(poses, c, align).nees
-        for c in alternatives(stated)
+        for c in alternatives(stated, geometry)
     }
     same = identify(stated, nees, found.dof)
     if same.consistent or found.dof < found.errors.shape[-1] or align != "none":
         return same
-    others = alternatives(replace(stated, scale="given"))
+    others = alternatives(replace(stated, scale="given"), geometry)
     given = identify(stated, {c: _compared(poses, c, align).nees for c in others}, found.dof - 1)
     return replace(given, nees=same.nees | given.nees)

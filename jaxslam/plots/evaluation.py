@@ -59,7 +59,7 @@ def plot_nees(
     ax.set_ylabel(f"mean {evaluation.quantity} (ideal {evaluation.dof})")
     many = f"{evaluation.runs} runs" if evaluation.runs > 1 else "one run"
     ax.set_title(f"{evaluation.quantity} of {many}, grey: exact 95 % band of one step", fontsize=9)
-    return _over_time(ax)
+    return _over_time(evaluation, ax)
 
 
 def plot_outside(evaluation: Evaluation, *, ax: Axes, label: str | None = None) -> Axes:
@@ -90,15 +90,15 @@ def plot_axis(
         _at_end(ax, evaluation.times, rmse, label, colour)
     ax.set_ylim(bottom=0)
     ax.set_title(f"{evaluation.names[axis]}: RMSE (solid), σ claimed (dashed)", fontsize=9)
-    return _over_time(ax)
+    return _over_time(evaluation, ax)
 
 
 def _at_end(ax: Axes, times: np.ndarray, values: np.ndarray, label: str, colour: str) -> None:
     ax.annotate(f" {label}", (times[-1], values[-1]), color=colour, va="center", fontsize=8)
 
 
-def _over_time(ax: Axes) -> Axes:
+def _over_time(evaluation: Evaluation, ax: Axes) -> Axes:
     ax.margins(x=0)
-    ax.set_xlabel("time, s, or step")
+    ax.set_xlabel("time, s" if evaluation.timed else "step")
     ax.grid(alpha=0.25)
     return ax

@@ -28,7 +28,6 @@ from jaxslam.vision.tracker import LEAST_MATCHES, Tracker
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
     pose_nees,
-    read_covariances,
 )
 from jaxslam.watchdog import lapack_calls
 
