@@ -15,6 +15,7 @@ import pytest
 pytest.importorskip("cv2")
 
 import jaxslam
+from jaxslam.evaluation import read_covariances
 from jaxslam.forms.state import Status
 from jaxslam.slam.readouts import landmarks_in_camera
 from jaxslam.tum import read_tum
