@@ -19,9 +19,10 @@ import equinox as eqx
 import jax
 import numpy as np
 import tyro
-from jaxtyping import Array
+from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
+from jaxslam.arrays import AnyArray
 from jaxslam.evaluation.convention import Convention, alternatives, geometry_of, turning
 from jaxslam.evaluation.poses import evaluate_poses
 from jaxslam.files import write_atomically
@@ -88,7 +89,7 @@ def displaced(T: np.ndarray, errors: np.ndarray, convention: Convention) -> np.n
 
 
 @eqx.filter_jit
-def _exp(geometry: Geometry, own: Array) -> Array:
+def _exp(geometry: Geometry, own: Float[AnyArray, "k t"]) -> Array:
     return jax.vmap(lambda delta: exp(geometry.group, delta).as_matrix())(own)
 
 

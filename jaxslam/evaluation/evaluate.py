@@ -213,7 +213,7 @@ def evaluate(
     )
 
 
-def _rms(values: np.ndarray) -> np.ndarray:
+def _rms(values: np.ndarray) -> Any:
     """Root of the mean square over the first axis; infinite where it overflows."""
     with np.errstate(over="ignore"):
         return np.sqrt(np.mean(values**2, axis=0))

@@ -39,6 +39,8 @@ _RIGID = 1e-4
 """How far from orthonormal a rotation may be: what rounding to six digits leaves is less."""
 _SINGULAR = 1e-12
 """Of a variance, what is left of it where all of it is scale's."""
+_ENOUGH = 100
+"""Runs, by which conventions are told from each other."""
 BY_FIRST = "aligned by the first pose, which the covariances take for known"
 TO_ALL = "aligned to all positions, and the joint covariance projected to that gauge"
 INDEPENDENT = (
@@ -237,14 +239,15 @@ def _moved(run: Poses, convention: Convention, motion: Similarity) -> Poses:
 
 def _identified(poses: Poses, stated: Convention, align: str, found: _Compared) -> Identification:
     """Among the conventions of the same scale; where none of them does, given the scale."""
+    few = Poses(*(None if x is None else x[:_ENOUGH] for x in poses))
     geometry = geometry_of(poses.estimates)
     nees = {
-        c: found.nees if c == stated else _compared(poses, c, align).nees
+        c: found.nees[:_ENOUGH] if c == stated else _compared(few, c, align).nees
         for c in alternatives(stated, geometry)
     }
     same = identify(stated, nees, found.dof)
     if same.consistent or found.dof < found.errors.shape[-1] or align != "none":
         return same
     others = alternatives(replace(stated, scale="given"), geometry)
-    given = identify(stated, {c: _compared(poses, c, align).nees for c in others}, found.dof - 1)
+    given = identify(stated, {c: _compared(few, c, align).nees for c in others}, found.dof - 1)
     return replace(given, nees=same.nees | given.nees)
