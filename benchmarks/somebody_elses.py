@@ -12,6 +12,7 @@ prints and writes by how much ours differ, the verdict, and which convention the
 from __future__ import annotations
 
 import argparse
+import importlib
 import importlib.util
 import json
 import sys
@@ -28,19 +29,17 @@ def generate(path: Path, runs: int) -> None:
     """Run navlie's filter; write T_wc, P, truth and NEES of every tenth of a second."""
     if importlib.util.find_spec("navlie") is None:
         sys.exit("skipped: navlie is not installed (pip install navlie, in an environment apart)")
-    import navlie
-    from navlie.lib import BodyFrameVelocity, RangePoseToAnchor, SE3State
-
+    navlie, lib = (importlib.import_module(name) for name in ("navlie", "navlie.lib"))
     start = np.diag([0.1**2] * 3 + [0.3**3, 0.3**2, 0.3**2])
     Q = np.diag([0.01**2] * 3 + [0.1] * 3)
-    process = BodyFrameVelocity(Q)
-    ranges = [RangePoseToAnchor(list(a), list(tag), 0.1**2) for a in ANCHORS for tag in TAGS]
+    process = lib.BodyFrameVelocity(Q)
+    ranges = [lib.RangePoseToAnchor(list(a), list(tag), 0.1**2) for a in ANCHORS for tag in TAGS]
 
     def velocity(t, x):
         return np.array([np.sin(0.1 * t), np.cos(0.1 * t), np.sin(0.1 * t), 1, 0, 0])
 
     data = navlie.DataGenerator(process, velocity, Q, 100, ranges, 10)
-    true_start = SE3State([0] * 6, stamp=0.0)
+    true_start = lib.SE3State([0] * 6, stamp=0.0)
 
     def trial(number: int) -> list[tuple]:
         np.random.seed(number)  # noqa: NPY002, navlie draws from it

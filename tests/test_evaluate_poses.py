@@ -158,8 +158,8 @@ def test_words_of_a_convention_that_are_not_known_are_refused(word, message):
 
 def test_the_checker_is_right_in_95_of_100_constructed_cases():
     """And never guesses: the first of the benchmark's two hundred."""
-    said = [benchmark.judged(benchmark.constructed(number, 50)) for number in range(30)]
-    assert said.count("right") >= 29
+    said = [benchmark.judged(benchmark.constructed(number, 50)) for number in range(20)]
+    assert said.count("right") >= 19
     assert said.count("guessed") == 0
 
 

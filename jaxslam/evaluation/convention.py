@@ -180,12 +180,17 @@ def lever(p: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n r"]:
 
 
 def _in_float64(function: Any, error: str, *arrays: Float[np.ndarray, "*batch _ _"]) -> Any:
-    """A function of one pose, over all of them, as NumPy's arrays."""
-    batch = arrays[0].shape[:-2]
+    """A function of poses, over all of them, as NumPy's arrays.
+
+    Their number is filled up to a power of two, so that few programs serve logs of all sizes.
+    """
+    batch, count = arrays[0].shape[:-2], int(np.prod(arrays[0].shape[:-2]))
     flat = (np.asarray(x, np.float64).reshape(-1, *x.shape[-2:]) for x in arrays)
+    more = (1 << (count - 1).bit_length()) - count
+    filled = (np.concatenate([x, np.repeat(x[:1], more, axis=0)]) for x in flat)
     with jax.enable_x64(True):
-        result = jax.device_get(function(error, geometry_of(arrays[0]), *flat))
-    return jax.tree.map(lambda x: np.asarray(x).reshape(*batch, *x.shape[1:]), result)
+        result = jax.device_get(function(error, geometry_of(arrays[0]), *filled))
+    return jax.tree.map(lambda x: np.asarray(x)[:count].reshape(*batch, *x.shape[1:]), result)
 
 
 def _error(error: str, estimate: Pose, truth: Pose) -> Float[Array, " t"]:

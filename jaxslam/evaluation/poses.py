@@ -239,7 +239,9 @@ def _moved(run: Poses, convention: Convention, motion: Similarity) -> Poses:
 
 def _identified(poses: Poses, stated: Convention, align: str, found: _Compared) -> Identification:
     """Among the conventions of the same scale; where none of them does, given the scale."""
-    few = Poses(*(None if x is None else x[:_ENOUGH] for x in poses))
+    few = Poses(*(x[:_ENOUGH] for x in poses[:3]))
+    if poses.joint is not None:
+        few = few._replace(joint=poses.joint[:_ENOUGH])
     geometry = geometry_of(poses.estimates)
     nees = {
         c: found.nees[:_ENOUGH] if c == stated else _compared(few, c, align).nees

@@ -68,7 +68,8 @@ def plot_outside(evaluation: Evaluation, *, ax: Axes, label: str | None = None) 
     places = np.arange(len(shares))
     ax.barh(places, shares, color=COLOURS[0], label=label)
     for place, share in zip(places, shares, strict=True):
-        ax.annotate(f" {share:.2g} %", (share, place), va="center", fontsize=8)
+        beyond = max(share, 100 * OUTSIDE)  # where the grey line hides no digit
+        ax.annotate(f"  {share:.2g} %", (beyond, place), va="center", fontsize=8)
     ax.axvline(100 * OUTSIDE, color=GREY, lw=1.2)
     ax.set_yticks(places, evaluation.names[:_WIDEST])
     ax.invert_yaxis()
@@ -89,6 +90,8 @@ def plot_axis(
     if label is not None:
         _at_end(ax, evaluation.times, rmse, label, colour)
     ax.set_ylim(bottom=0)
+    if evaluation.convention is not None:
+        ax.set_ylabel("rad" if evaluation.names[axis].startswith("r") else "m, or map units")
     ax.set_title(f"{evaluation.names[axis]}: RMSE (solid), σ claimed (dashed)", fontsize=9)
     return _over_time(evaluation, ax)
 
