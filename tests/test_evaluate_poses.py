@@ -183,11 +183,13 @@ def test_nothing_is_said_where_conventions_cannot_be_told():
     assert found.identified.convention is None
     assert set(found.identified.consistent) == set(alternatives(Convention(), SPATIAL))
     assert "cannot be told from" in str(found)
+    assert "; and 8 more" in str(found)
 
 
 def test_one_run_tells_no_convention():
     found = jaxslam.evaluate_poses(*logged(Convention("left"), runs=1, steps=50))
     assert found.suggested is None
+    assert "1 run of 50 steps" in str(found)
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.5])
@@ -452,8 +454,11 @@ def test_a_folder_of_runs_is_its_arrays(tmp_path, capsys):
     np.testing.assert_allclose(single["nees"], arrays.nees[3], rtol=1e-4)
     # What is stated comes before what the file says.
     main(["evaluate", *arguments, "--error", "left", "--order", "position-first"])
+    assert capsys.readouterr().out.startswith("NEES ")
     stated = json.loads((tmp_path / "one" / "evaluation.json").read_text())["convention"]
-    assert (stated["error"], stated["order"]) == ("left", "position-first")
+    assert stated == {
+        "error": "left", "axes": "world", "order": "position-first", "scale": "marginal",
+    }  # fmt: skip
 
 
 def test_poses_in_arrays_are_those_in_files(tmp_path):

@@ -21,9 +21,9 @@ class EvaluateOptions:
     covariances and truths; FILE.csv with lines of run, step, errors, upper triangle), a trajectory
     in TUM format (t tx ty tz qx qy qz qw, s and m), or a folder: one run, or one a sub-folder, of
     estimate.txt, covariance.txt and truth.txt."""
-    covariance: Path | None = None
+    covariance: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Covariances of the trajectory's poses, docs/covariance-format.md."""
-    truth: Path | None = None
+    truth: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """True trajectory in TUM format; of a folder, that of all runs."""
     error: Annotated[
         str | None,

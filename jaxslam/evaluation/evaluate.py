@@ -158,26 +158,28 @@ class Evaluation:
     def _table(self) -> list[str]:
         low, high = self.band95
         inside = np.mean((self.mean >= low) & (self.mean <= high))
-        head = ("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ")
+        runs = f"{self.runs} run{'s' if self.runs > 1 else ''}"
         return [
-            f"{self.runs} runs of {self.steps} steps; mean {self.quantity} of a consistent filter "
-            f"{self.dof}, at one step in {low:.3f}–{high:.3f} with 95 %: {inside:.0%} of steps are",
-            "".join(f"{name:>{15 + 2 * (name[0] == '9')}}" for name in head),
+            f"{runs} of {self.steps} steps; mean {self.quantity} of a consistent filter {self.dof}, "
+            f"at one step in {low:.3f}–{high:.3f} with 95 %: {inside:.0%} of steps are",
+            _columns("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
             *(self._row(i) for i in range(len(self.names))),
-            f"{'a consistent filter has':>77}{OUTSIDE:>15.2%}",
+            _columns("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}"),
         ]
 
     def _row(self, axis: int) -> str:
         found = self.axis_verdict(axis)
-        rmse, sigma = (float(_rms(x[:, axis])) for x in (self.rmse, self.sigma))
+        rmse, sigma = (f"{_rms(x[:, axis]):.4g}" for x in (self.rmse, self.sigma))
         factor, low, high = (
             "–" if x is None else f"{x:.3f}" if x < 10 else f"{x:.3g}"
             for x in (found["sigma_factor"], *found["interval99"])
         )
-        return (
-            f"{self.names[axis]:>15}{rmse:>15.4g}{sigma:>15.4g}{factor:>15}"
-            f"{f'[{low}, {high}]':>17}{self.outside3sigma[axis]:>15.2%}"
-        )
+        outside = f"{self.outside3sigma[axis]:.2%}"
+        return _columns(self.names[axis], rmse, sigma, factor, f"[{low}, {high}]", outside)
+
+
+def _columns(*cells: str) -> str:
+    return f"{cells[0]:<14}" + "".join(f"{cell:>17}" for cell in cells[1:])
 
 
 def evaluate(

@@ -22,6 +22,9 @@ from jaxslam.evaluation.convention import Convention
 NOTICEABLE = 0.05
 """NEES that differ by less than this share say the same of σ, to 2.5 %."""
 
+_TOLD = 3
+"""Conventions that cannot be told, of which a sentence speaks."""
+
 
 @dataclass(frozen=True)
 class Identification:
@@ -58,7 +61,10 @@ class Identification:
                 f"the convention ({self.stated}) is doubtful: only with {self.suggested} would "
                 f"the data be consistent, NEES {self.nees[self.suggested]:.2f}"
             )
-        others = "; ".join(str(c) for c in self.consistent if c != self.stated)
+        apart = [str(c) for c in self.consistent if c != self.stated]
+        others = "; ".join(apart[:_TOLD])
+        if len(apart) > _TOLD:
+            others += f"; and {len(apart) - _TOLD} more"
         if self.doubtful:
             return f"the convention ({self.stated}) is doubtful, but these cannot be told: {others}"
         if others:

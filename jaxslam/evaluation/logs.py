@@ -97,7 +97,7 @@ def _evaluate_arrays(
     times, P = arrays.get("times"), arrays["covariances"]
     if held == ["estimates"]:
         said = {name: str(arrays[name]) for name in CHOICES if name in arrays}
-        convention = Convention(**(said | stated))
+        convention = _stated(said, stated)
         truths = arrays["truths"]
         return evaluate_poses(arrays["estimates"], P, truths, convention, align=align, times=times)
     if stated or align != "none":
@@ -108,6 +108,13 @@ def _evaluate_arrays(
     quantity = "NIS" if nis or held == ["innovations"] else "NEES"
     names = [str(name) for name in np.ravel(arrays.get("names", ()))]
     return evaluate(arrays[held[0]], P, times=times, names=names, quantity=quantity)
+
+
+def _stated(said: dict[str, str], stated: dict[str, str]) -> Convention:
+    """What is stated before what is said; axes that were said are of the error that was."""
+    if "error" in stated:
+        said = {name: value for name, value in said.items() if name != "axes"}
+    return Convention(**(said | stated))
 
 
 def _npz(path: Path) -> dict[str, Any]:
@@ -207,7 +214,7 @@ def _evaluate_runs(runs: tuple[Run, ...], stated: dict[str, str], align: str) ->
                 f"{runs[0].covariance} ({Convention(**read[0].said)})"
             )
     steps = min(len(one.times) for one in read)
-    convention = Convention(**(read[0].said | stated))
+    convention = _stated(read[0].said, stated)
 
     def all_of(name: str) -> np.ndarray:
         return np.stack([getattr(one, name)[:steps] for one in read])
