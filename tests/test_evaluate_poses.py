@@ -533,6 +533,10 @@ def test_poses_that_are_none_are_refused_by_run_and_step():
         jaxslam.evaluate_poses(T, P, truth[:2])
     with pytest.raises(ValueError, match=r"must be \(3, 6, 6, 6\), or the joint ones"):
         jaxslam.evaluate_poses(T, P[..., :3, :3], truth)
+    far = truth.copy()
+    far[0, 0, 0, 3] = 1e300
+    with pytest.raises(ValueError, match=r"truths hold 1e\+300; up to 1e\+100 is accepted"):
+        jaxslam.evaluate_poses(T, P, far, align="se3")
     with pytest.raises(ValueError, match="estimates must be matrices"):
         jaxslam.evaluate_poses(T[..., :2, :2], P, truth)
 
@@ -545,6 +549,7 @@ WORDS = [
     "-1",
     "0",
     "1e400",
+    "1e300",
     "abc",
     "\t",
     "0 0 0 0 0 0 0 1",

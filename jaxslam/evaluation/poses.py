@@ -37,6 +37,8 @@ from jaxslam.lookup import chosen
 
 _RIGID = 1e-4
 """How far from orthonormal a rotation may be: what rounding to six digits leaves is less."""
+LARGEST = 1e100
+"""Of the numbers of poses, whose squares are finite then."""
 _SINGULAR = 1e-12
 """Of a variance, what is left of it where all of it is scale's."""
 _ENOUGH = 100
@@ -128,6 +130,9 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
             f"covariances of {runs} runs of {steps} poses must be {each}, or the joint ones "
             f"{joint}, not {P.shape}"
         )
+    for what, x in (("estimates", T), ("truths", truth), ("covariances", P)):
+        if np.abs(x).max() > LARGEST:
+            raise ValueError(f"{what} hold {np.abs(x).max():.2g}; up to {LARGEST:.0e} is accepted")
     if P.shape == each:
         return Poses(T, P, truth)
     blocks = P.reshape(runs, steps, t, steps, t)
