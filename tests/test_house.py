@@ -16,8 +16,8 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 ORDER = (
     "arrays", "files", "tum", "linalg", "lookup", "watchdog", "geometry", "least_squares",
     "landmarks", "models", "forms", "slam", "delayed", "remedies", "window", "wrappers",
-    "simulation", "names", "consistency", "posterior", "triangulation", "datasets", "plots",
-    "video", "vision", "cli",
+    "simulation", "names", "consistency", "evaluation", "posterior", "triangulation", "datasets",
+    "plots", "video", "vision", "cli",
 )  # fmt: skip
 """Rooms, each of which imports only those before it."""
 
