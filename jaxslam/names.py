@@ -74,8 +74,8 @@ def scale_gauge(**pieces: Any) -> EkfSlam:
 
 
 def world_gauge(**pieces: Any) -> EkfSlam:
-    """`scale_gauge` with landmarks in the base frame: its scale drifts less on long video, and its
-    covariance is too small where the camera turns."""
+    """`scale_gauge` with landmarks in the base frame; its covariance is too small where the camera
+    turns."""
     return EkfSlam(coordinates=WORLD, scale=ScaleGauge(), **pieces)
 
 
@@ -181,7 +181,7 @@ RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gaug
 """The filter called `recommended`, by geometry, where the velocity is told."""
 FROM_REST = {
     "planar": "scale_gauge+scene50+mixture5+rest",
-    "spatial": "scale_gauge+oc2+scene50+mixture3+rest8",
+    "spatial": "scale_gauge+oc+scene50+mixture3+rest8",
 }
 """The one where it is not: the camera sets out from rest, or nobody says how."""
 

@@ -65,7 +65,7 @@ def apart(state: State, origin: State) -> Float[Array, " n"]:
 def transport(
     model: SlamModel, before: State, after: State
 ) -> tuple[Float[Array, "n g"], Float[Array, "g n"]]:
-    """`N(x⁺) − N(x)` and L: the frame is read from the pose, the scale from all else that is known.
+    """`N(x⁺) − N(x)` and L: the frame is read from the pose, the scale from velocity or landmarks.
 
     Least squares over the whole error for the frame too, landmarks included, is measurably worse:
     what is read should be what is known best.
@@ -74,5 +74,7 @@ def transport(
     pose, frame = tangent_dim(before.core.pose), model.geometry.tangent_dim
     L = read_from(N[:, :frame], pose)
     if scale_is_free(model):
-        L = read_scale_too(N, L, before.covariance, pose)
+        velocity = slice(pose, pose + model.geometry.point_dim)
+        landmarks = slice(before.core_dim, before.covariance.shape[0])
+        L = read_scale_too(N, L, before.covariance, velocity, landmarks)
     return N_after - N, L

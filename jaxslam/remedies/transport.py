@@ -25,7 +25,7 @@ from jaxslam.slam.filter import AtOnce
 _SINGULAR = 1e-12
 """Least eigenvalue of NᵀN, its columns of unit length, that counts."""
 READINGS = 2
-"""Of the scale, each by what the one before says of every number."""
+"""Of the scale from landmarks, after a first in which all count alike."""
 _SUREST = 1e-4
 """Relative error below which none is surer than another."""
 
@@ -59,23 +59,34 @@ def read_from(N: Float[Array, "n g"], count: int) -> Float[Array, "g n"]:
 
 
 def read_scale_too(
-    N: Float[Array, "n h"], frame: Float[Array, "g n"], covariance: Float[Array, "n n"], pose: int
+    N: Float[Array, "n h"],
+    frame: Float[Array, "g n"],
+    covariance: Float[Array, "n n"],
+    velocity: slice,
+    landmarks: slice,
 ) -> Float[Array, "h n"]:
-    """L of a frame that is read from the pose, the first numbers of an error, and of a scale, the
-    last column of N: what all others say of it together, each as surely as it says it.
+    """L of a frame that is read from the pose, and of a scale, the last column of N: as far as the
+    camera moves it is read from its velocity, else from the landmarks.
 
-    How surely is the variance that it keeps when the gauge is taken from the error, by a first
-    reading in which all count alike: whatever is unknown of the gauge changes no reading. So old
-    landmarks count more than new ones, and the velocity of a camera at rest does not.
+    Landmarks count by the variance that they keep when the gauge is taken from their errors, and
+    the velocity by what it keeps across itself: whatever is unknown of the gauge changes no
+    reading. (To count everything by its variance is measurably worse than the velocity alone.)
     """
-    scale = N[:, -1]
+    scale, place = N[:, -1], jnp.arange(N.shape[0])
     size = scale - N[:, :-1] @ (frame @ scale)
-    size = jnp.where(jnp.arange(size.size) < pose, 0.0, size)
-    L = _with_scale(N, frame, size)
+
+    def of(part: slice, weight: Any = 1.0) -> Float[Array, "h n"]:
+        inside = (place >= part.start) & (place < part.stop)
+        return _with_scale(N, frame, jnp.where(inside, size / weight, 0.0))
+
+    by_landmarks = of(landmarks)
     for _ in range(READINGS):
-        left = jnp.maximum(_left(covariance, N, L), 0.0) + (_SUREST * size) ** 2
-        L = _with_scale(N, frame, size / jnp.where(left > 0, left, 1.0))
-    return L
+        left = jnp.maximum(_left(covariance, N, by_landmarks), 0.0) + (_SUREST * size) ** 2
+        by_landmarks = of(landmarks, jnp.where(left > 0, left, 1.0))
+    by_velocity, speed = of(velocity), jnp.sum(size[velocity] ** 2)
+    unknown = jnp.sum(_left(covariance, N, by_velocity)[velocity])
+    moves = speed / jnp.where(speed > 0, speed + jnp.maximum(unknown, 0.0), 1.0)
+    return moves * by_velocity + (1 - moves) * by_landmarks
 
 
 def _with_scale(
