@@ -88,11 +88,12 @@ def measure(source, settings: TrackerSettings, *, exact: bool) -> dict[str, Any]
 
 def _beyond_scale(source, folder: Path) -> dict[str, float]:
     """NEES of the pose beyond scale by its degrees of freedom, at some frames."""
+    from jaxslam.evaluation import read_covariances
     from jaxslam.tum import read_tum
-    from jaxslam.vision.trajectory import nees_beyond_scale, read_covariances
+    from jaxslam.vision.trajectory import nees_beyond_scale
 
     _, T_wc = read_tum(folder / "trajectory.txt")
-    _, covariances = read_covariances(folder / "covariance.txt")
+    covariances = read_covariances(folder / "covariance.txt").covariances
     frames = [frame for frame in FRAMES if frame < len(T_wc)]
     truth = source.reference.T_wc[frames]
     nees, _ = nees_beyond_scale(T_wc[frames], covariances[frames], truth)

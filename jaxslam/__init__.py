@@ -12,6 +12,7 @@ __version__ = "0.4.0.dev0"
 
 from jaxslam.arrays import cast
 from jaxslam.consistency import mean_band, monte_carlo, summarise, table
+from jaxslam.evaluation import Convention, Evaluation, evaluate, evaluate_log, evaluate_poses
 from jaxslam.forms.state import Features, Innovation, State, Status
 from jaxslam.geometry import PLANAR, SPATIAL
 from jaxslam.landmarks import LANDMARKS
@@ -62,8 +63,10 @@ __all__ = [
     "Capacity",
     "Considered",
     "ConstantVelocity",
+    "Convention",
     "EkfSlam",
     "Estimated",
+    "Evaluation",
     "Expected",
     "Features",
     "FixedLag",
@@ -85,6 +88,9 @@ __all__ = [
     "__version__",
     "camera_pose",
     "cast",
+    "evaluate",
+    "evaluate_log",
+    "evaluate_poses",
     "landmark_samples",
     "landmarks_from_above",
     "landmarks_in_camera",

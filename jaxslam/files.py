@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 T = TypeVar("T")
 
 
@@ -42,3 +44,8 @@ def read_json(path: str | Path, what: str, parse: Callable[[Any], T]) -> T:
         return parse(fields)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def json_numbers(values: np.ndarray) -> list[float | None]:
+    """For JSON, which has no NaN."""
+    return [float(value) if np.isfinite(value) else None for value in values]

@@ -74,8 +74,8 @@ def scale_gauge(**pieces: Any) -> EkfSlam:
 
 
 def world_gauge(**pieces: Any) -> EkfSlam:
-    """`scale_gauge` with landmarks in the base frame: its scale drifts less on long video, and its
-    covariance is too small where the camera turns."""
+    """`scale_gauge` with landmarks in the base frame; its covariance is too small where the camera
+    turns."""
     return EkfSlam(coordinates=WORLD, scale=ScaleGauge(), **pieces)
 
 
@@ -125,6 +125,15 @@ def with_scene_depth(slam: EkfSlam, percent: int | None) -> EkfSlam:
     return replace(slam, depth=replace(slam.depth, common=common))
 
 
+def with_observability_constraint(slam: EkfSlam, steps: int | None) -> EkfSlam:
+    """The filter whose covariance is carried along the gauge, after each of so many steps of
+    Gauss–Newton in an update; 1 by default, as an EKF has. Raises ValueError."""
+    steps = 1 if steps is None else steps
+    if steps < 1:
+        raise ValueError(f"modifier oc takes a number of steps of at least 1, not {steps}")
+    return _with_form("oc", ObservabilityConstrained(steps))(slam, None)
+
+
 def _with_form(word: str, form: AbstractForm) -> Callable[[EkfSlam, int | None], EkfSlam]:
     def remedied(slam: EkfSlam, number: int | None) -> EkfSlam:
         if number is not None:
@@ -141,7 +150,7 @@ _OF_ONE_FILTER: dict[str, Callable[[EkfSlam, int | None], EkfSlam]] = {
     "rays": with_rays,
     "common": with_common_depth,
     "scene": with_scene_depth,
-    "oc": _with_form("oc", ObservabilityConstrained()),
+    "oc": with_observability_constraint,
     "fej": _with_form("fej", FirstEstimates()),
 }
 _AROUND_ANY_FILTER: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
@@ -166,13 +175,13 @@ percent (`common`); σ of the scene's depth in percent of one landmark's (`scene
 steps of Gauss–Newton instead of convergence (`iterated`); members of a Gaussian sum (`scales`,
 `directions`, `mixture`); frames of the longest window of a start (`rest`); frames of which the
 noise is remembered (`noise`); by how much a match may be off beyond its noise, in percent of that
-(`checked`); none for the remedies `oc`, `fej`."""
+(`checked`); steps of Gauss–Newton in an update (`oc`); none for the remedy `fej`."""
 
 RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gauge+scene50+mixture9"}
 """The filter called `recommended`, by geometry, where the velocity is told."""
 FROM_REST = {
     "planar": "scale_gauge+scene50+mixture5+rest",
-    "spatial": "scale_gauge+scene50+mixture3+rest8",
+    "spatial": "scale_gauge+oc+scene50+mixture3+rest8",
 }
 """The one where it is not: the camera sets out from rest, or nobody says how."""
 

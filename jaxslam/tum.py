@@ -1,11 +1,25 @@
-"""Trajectories as text in the format of TUM's benchmark: `t tx ty tz qx qy qz qw` a line."""
+"""Trajectories as text in the format of TUM's benchmark: `t tx ty tz qx qy qz qw` a line.
+
+And what other files of a time and numbers a line have in common with them.
+"""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
+
+from jaxslam.files import write_atomically
+
+
+class Table(NamedTuple):
+    """Numbers as text: what its comments say, its rows and the lines that they stand on."""
+
+    comments: tuple[str, ...]
+    rows: Float[np.ndarray, "n k"]
+    lines: tuple[int, ...]
 
 
 def poses(translation: ArrayLike, quaternion: ArrayLike) -> Float[np.ndarray, "n 4 4"]:
@@ -23,33 +37,87 @@ def read_tum(path: str | Path) -> tuple[Float[np.ndarray, " n"], Float[np.ndarra
     Empty lines and those that start with # are skipped. Raises `ValueError`, naming the file and
     the line, for anything else that is not eight finite numbers with a non-zero quaternion.
     """
+    columns = "t tx ty tz qx qy qz qw"
+    _, rows, lines = read_table(path, "trajectory", "poses", f"eight finite numbers {columns}", 8)
+    zero = np.flatnonzero(~rows[:, 4:].any(axis=1))
+    if zero.size:
+        raise ValueError(f"{path}, line {lines[zero[0]]}: the quaternion is zero")
+    return rows[:, 0], poses(rows[:, 1:4], rows[:, 4:])
+
+
+def read_table(path: str | Path, what: str, holds: str, row: str, columns: int | None) -> Table:
+    """Lines of so many numbers, by spaces or commas, but for empty lines and comments (#).
+
+    With None of as many as the first has; a line of words before it is a comment too. Raises
+    `ValueError`, naming the file and the line: it is a `what` that holds `holds`, and a `row` of
+    it is what is accepted.
+    """
     path = Path(path)
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
-        raise ValueError(f"{path}: cannot read the trajectory ({error.strerror})") from None
+        raise ValueError(f"{path}: cannot read the {what} ({error.strerror})") from None
     except UnicodeDecodeError:
         raise ValueError(f"{path}: not a text file") from None
-    rows = [
-        _tum_row(path, number, line)
-        for number, line in enumerate(lines, start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
+    told = {number: line for number, line in enumerate(lines, start=1) if line.strip()}
+    comments = {n: line for n, line in told.items() if line.lstrip().startswith("#")}
+    rows = {n: line for n, line in told.items() if n not in comments}
+    if columns is None and rows:
+        first = min(rows)
+        if not any(map(_is_number, _words(rows[first]))):
+            comments = {first: rows.pop(first)} | comments
+        columns = len(_words(rows[min(rows)])) if rows else 0
     if not rows:
-        raise ValueError(f"{path}: holds no poses; lines of t tx ty tz qx qy qz qw are accepted")
-    table = np.array(rows)
-    return table[:, 0], poses(table[:, 1:4], table[:, 4:])
+        raise ValueError(f"{path}: holds no {holds}; lines of {row} are accepted")
+    table = [_row(path, number, line, row, columns or 0) for number, line in rows.items()]
+    return Table(tuple(comments.values()), np.array(table), tuple(rows))
 
 
-def _tum_row(path: Path, number: int, line: str) -> list[float]:
+def _words(line: str) -> list[str]:
+    return line.replace(",", " ").split()
+
+
+def _is_number(word: str) -> bool:
     try:
-        row = [float(word) for word in line.replace(",", " ").split()]
+        float(word)
     except ValueError:
-        row = []
-    if len(row) != 8 or not np.all(np.isfinite(row)):
-        raise ValueError(
-            f"{path}, line {number}: eight finite numbers t tx ty tz qx qy qz qw are accepted"
-        )
-    if not any(row[4:]):
-        raise ValueError(f"{path}, line {number}: the quaternion is zero")
+        return False
+    return True
+
+
+def _row(path: Path, number: int, line: str, accepted: str, columns: int) -> list[float]:
+    words = _words(line)
+    row = [float(word) for word in words] if all(map(_is_number, words)) else []
+    if len(row) != columns or not np.all(np.isfinite(row)):
+        raise ValueError(f"{path}, line {number}: {accepted} are accepted")
     return row
+
+
+def write_tum(path: str | Path, times: ArrayLike, T_wc: ArrayLike, remark: str = "") -> None:
+    """Write times (n,) in seconds and poses (n, 4, 4) in TUM format, whole or not at all.
+
+    Quaternions are normalised, w comes last and is not negative. The `remark` is for the header.
+    """
+    T_wc = np.asarray(T_wc, dtype=float).reshape(-1, 4, 4)
+    table = np.empty((len(T_wc), 7))
+    table[:, :3] = T_wc[:, :3, 3]
+    if len(T_wc):  # Rotation refuses an empty stack
+        table[:, 3:] = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True)
+    remark = f"; {remark}" if remark else ""
+    header = f"tx ty tz qx qy qz qw (s; camera in the world frame{remark})"
+    write_table(path, header, times, table, "poses", ".9f")
+
+
+def write_table(
+    path: str | Path, header: str, times: ArrayLike, table: np.ndarray, what: str, number: str
+) -> None:
+    """A line of each time and row, under a comment that names the columns after the time."""
+    times = np.asarray(times, dtype=float)
+    if times.shape != (len(table),):
+        raise ValueError(
+            f"{len(times)} times for {len(table)} {what}; as many of each are accepted"
+        )
+    with write_atomically(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write(f"# t {header}\n")
+        for time, row in zip(times, table, strict=True):
+            file.write(f"{time:.9f} " + " ".join(format(value, number) for value in row) + "\n")

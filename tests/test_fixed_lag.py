@@ -247,7 +247,7 @@ def test_depths_have_their_own_variance_and_what_is_common(modifier, own, common
         ("robocentric+scene+rays", "cartesian", "known", "delayed initialisation"),
         ("robocentric+lag5+lag5", "inverse_scaling", "known", "not around a FixedLag"),
         ("robocentric+lag5+common50", "inverse_scaling", "known", "must stand before"),
-        ("scale_gauge+oc", "inverse_scaling", "known", "needs no remedy"),
+        ("robocentric+oc+lag5", "inverse_scaling", "known", "covariance form"),
         ("robocentric+lagg5", "inverse_scaling", "known", "lagg"),
     ],
 )

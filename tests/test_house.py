@@ -16,7 +16,8 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 ORDER = (
     "arrays", "files", "programs", "tum", "linalg", "lookup", "watchdog", "geometry",
     "least_squares", "landmarks", "models", "forms", "slam", "delayed", "remedies", "window",
-    "wrappers", "simulation", "names", "consistency", "posterior", "triangulation", "datasets",
+    "wrappers", "simulation", "names", "consistency", "evaluation", "posterior", "triangulation",
+    "datasets",
     "plots", "video", "vision", "cli",
 )  # fmt: skip
 """Rooms, each of which imports only those before it."""

@@ -1,7 +1,10 @@
 """The examples of the README and of the documents run."""
 
+import json
 import re
 from pathlib import Path
+
+from jaxslam.evaluation import CHOICES, Convention, read_covariances
 
 ROOT = Path(__file__).parents[1]
 
@@ -48,3 +51,27 @@ def test_a_log_of_ones_own_goes_through_the_filter(capsys):
 def test_a_filter_has_gradients(capsys):
     run_example("docs/gradients.md")
     assert "by the pixel's σ" in capsys.readouterr().out
+
+
+def test_errors_of_any_filter_have_a_verdict(capsys, tmp_path, monkeypatch):
+    """And trajectories with covariances have one, by way of their files."""
+    monkeypatch.chdir(tmp_path)
+    assert len(examples("docs/evaluate.md")) == 2
+    run_example("docs/evaluate.md")
+    out = capsys.readouterr().out
+    promised = "NEES 5.03, σ too small by 1.29 [1.26, 1.33]: over-confident (p < 0.0001)"
+    assert promised in (ROOT / "docs/evaluate.md").read_text()
+    assert out.startswith(promised)
+    assert json.loads(Path("results/evaluation.json").read_text())["runs"] == 50
+    assert out.count("σ should be ×") == 2
+
+
+def test_the_covariance_file_of_the_page_is_one(tmp_path):
+    """Its keys and defaults are those of the reader."""
+    page = (ROOT / "docs/covariance-format.md").read_text()
+    header = next(line.strip() for line in page.splitlines() if "# t xx" in line)
+    numbers = " ".join(["1"] * 22)
+    (tmp_path / "c.txt").write_text(f"{header}\n{numbers}\n")
+    assert read_covariances(tmp_path / "c.txt").convention == Convention()
+    for key, choices in CHOICES.items():
+        assert all(f"`{choice}`" in page for choice in choices), key

@@ -11,6 +11,7 @@ import tyro
 from jaxslam.cli.cache import keep_programs
 from jaxslam.cli.calibrate import CalibrateOptions
 from jaxslam.cli.consistency import ConsistencyOptions
+from jaxslam.cli.evaluate import EvaluateOptions
 from jaxslam.cli.track import TrackOptions
 from jaxslam.cli.triangulate import TriangulateOptions
 
@@ -19,6 +20,12 @@ Command = (
         ConsistencyOptions,
         tyro.conf.subcommand(
             "consistency", description="Simulate many runs of filters: are they consistent?"
+        ),
+    ]
+    | Annotated[
+        EvaluateOptions,
+        tyro.conf.subcommand(
+            "evaluate", description="Errors and covariances of your own filter: is it consistent?"
         ),
     ]
     | Annotated[

@@ -14,6 +14,7 @@ from jaxslam.consistency.montecarlo import Study
 from jaxslam.consistency.statistics import lost_threshold, mean_band
 from jaxslam.consistency.store import Records
 from jaxslam.consistency.verdict import Tally, sentences
+from jaxslam.files import json_numbers
 from jaxslam.forms.state import Status
 from jaxslam.slam.filter import innermost
 
@@ -69,8 +70,8 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
 
     def by_part(per_axis):
         return {
-            "position": _numbers(np.sqrt(per_axis[:, :n].sum(axis=1))),
-            "orientation": _numbers(np.sqrt(per_axis[:, n:].sum(axis=1))),
+            "position": json_numbers(np.sqrt(per_axis[:, :n].sum(axis=1))),
+            "orientation": json_numbers(np.sqrt(per_axis[:, n:].sum(axis=1))),
         }
 
     seconds = study.seconds[name]
@@ -81,27 +82,27 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
         "calibration": treatment(study.filters[name]),
         "survivors": healthy,
         "band95": [low, high],
-        "nees": _numbers(mean),
-        "nees_median": _numbers(_median(study, name)),
-        "nees_not_lost": _numbers(kept),
-        "lost": _numbers((sums["lost"] + sums["diverged"]) / study.runs),
-        "lost_ever": _numbers((sums["lost_ever"] + sums["diverged"]) / study.runs),
+        "nees": json_numbers(mean),
+        "nees_median": json_numbers(_median(study, name)),
+        "nees_not_lost": json_numbers(kept),
+        "lost": json_numbers((sums["lost"] + sums["diverged"]) / study.runs),
+        "lost_ever": json_numbers((sums["lost_ever"] + sums["diverged"]) / study.runs),
         "inside": float(np.mean((mean >= low) & (mean <= high))),
-        "nis": _numbers(nis),
-        "nis_dof": _numbers(nis_dof),
+        "nis": json_numbers(nis),
+        "nis_dof": json_numbers(nis_dof),
         "rmse": by_part(error),
         "sigma": by_part(variance),
         "beyond_scale": {
             "dof": beyond.dof,
             "band95": list(mean_band(beyond.dof, max(healthy, 1))),
-            "nees": _numbers(sums["beyond_scale"] / max(healthy, 1)),
-            "nees_median": _numbers(_median(study, name, "beyond_scale")),
-            "lost": _numbers((sums["beyond_lost"] + sums["diverged"]) / study.runs),
+            "nees": json_numbers(sums["beyond_scale"] / max(healthy, 1)),
+            "nees_median": json_numbers(_median(study, name, "beyond_scale")),
+            "lost": json_numbers((sums["beyond_lost"] + sums["diverged"]) / study.runs),
             "verdict": beyond.verdict(),
         },
         "log_scale": _log_scale(study, name, sums, healthy),
-        "reversed": _numbers(_ratio(sums["reversed"], sums["displaced"])),
-        "landmark_nees": _numbers(landmark),
+        "reversed": json_numbers(_ratio(sums["reversed"], sums["displaced"])),
+        "landmark_nees": json_numbers(landmark),
         "landmark_dof": n,
         "landmark_not_finite": [int(count) for count in sums["landmark_not_finite"]],
         "diverged": int(sums["diverged"]),
@@ -114,13 +115,13 @@ def _log_scale(study: Study, name: str, sums: dict[str, Any], healthy: int) -> d
     """Root mean squares over the surviving runs; medians over all."""
 
     def rms(of: str) -> list[float | None]:
-        return _numbers(np.sqrt(_ratio(sums[of], healthy)))
+        return json_numbers(np.sqrt(_ratio(sums[of], healthy)))
 
     return {
         "error_rms": rms("squared_log_scale"),
-        "error_median": _numbers(_median(study, name, "log_scale", np.abs)),
+        "error_median": json_numbers(_median(study, name, "log_scale", np.abs)),
         "sigma": rms("log_scale_variance"),
-        "sigma_median": _numbers(_median(study, name, "log_scale_sigma")),
+        "sigma_median": json_numbers(_median(study, name, "log_scale_sigma")),
         "normalised_rms": rms("normalised_log_scale"),
     }
 
@@ -219,11 +220,6 @@ def _healthy(records: Records) -> np.ndarray:
 def _chunks(study: Study, name: str, names: tuple[str, ...] | None = None) -> Iterator[Records]:
     for chunk in study.chunks:
         yield study.store.load(name, chunk, names)
-
-
-def _numbers(values: np.ndarray) -> list[float | None]:
-    """For JSON, which has no NaN."""
-    return [float(value) if np.isfinite(value) else None for value in values]
 
 
 def table(summary: dict[str, Any]) -> str:

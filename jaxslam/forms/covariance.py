@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -45,6 +45,8 @@ the correlations stay above `−n ε` however many there are (measured over 600 
 
 class Covariance(AbstractGaussian):
     """Mean and covariance: the extended Kalman filter."""
+
+    divisible: ClassVar[bool] = True
 
     def empty(self, core: Any, landmarks: Float[Array, "capacity d"]) -> State:
         """A state that is exactly known, of slots that hold no landmark yet."""
@@ -83,6 +85,22 @@ class Covariance(AbstractGaussian):
         considered: slice = slice(0, 0),
     ) -> tuple[State, Innovation]:
         """The Kalman update by all features at once (P16, P17), in Joseph's form."""
+        return self.update_at(model, state, None, features, noise, context, considered)
+
+    def update_at(
+        self,
+        model: Model,
+        state: State,
+        offset: Float[Array, " n"] | None,
+        features: Features,
+        noise: Float[Array, "p p"] | Float[Array, "m p p"],
+        context: Any,
+        considered: slice = slice(0, 0),
+    ) -> tuple[State, Innovation]:
+        """`update` of the prediction x ⊞ offset, with H and the residuals of the state x.
+
+        A step of Gauss–Newton to the maximum of the posterior; None is no offset.
+        """
         predicted, residual, used, blocks = residuals(model, state, features, context)
         P = state.covariance
         R = _noise_matrix(noise, used)
@@ -91,6 +109,9 @@ class Covariance(AbstractGaussian):
         factor = cholesky(S)
         whitening = factor.whitening
         K = ((HP.T @ whitening.T) @ whitening).at[considered].set(0.0)
+        if offset is not None:
+            moved = observed(blocks, features.slots, offset[:, None])
+            residual = residual - moved.reshape(residual.shape)
         whitened = whitening @ residual.ravel()
 
         # Joseph's (I - KH) P (I - KH)ᵀ + K R Kᵀ, multiplied out from the left: two products of
@@ -99,7 +120,8 @@ class Covariance(AbstractGaussian):
         left = P - K @ HP
         covariance = left + (K @ R - observed(blocks, features.slots, left.T).T) @ K.T
         lost = ROUNDING * jnp.finfo(P.dtype).eps * jnp.diagonal(P).at[considered].set(0.0)
-        state = shifted(state, K @ residual.ravel())
+        delta = K @ residual.ravel()
+        state = shifted(state, delta if offset is None else offset + delta)
         state = replace(state, covariance=(covariance + covariance.T) / 2 + jnp.diag(lost))
         variances = jnp.diagonal(covariance) + lost
         status = judged(factor.positive & jnp.all(variances >= 0), variances, state.landmarks)

@@ -32,6 +32,9 @@ from jaxslam.forms.state import Features
 class AbstractForm(eqx.Module):
     """The steps of a frame, on a state of its own."""
 
+    divisible: ClassVar[bool] = False
+    """Whether its state is a mean and a covariance of `x ⊞ δ`, to be divided and merged as such."""
+
     def check(self, slam: Any) -> None:
         """Raise ValueError for a filter of which this cannot be the form; any can be, here."""
 

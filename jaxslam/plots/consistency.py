@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from jaxslam.consistency import Study, summarise
 from jaxslam.consistency.verdict import headline
 from jaxslam.plots.landmarks import region_from_above
-from jaxslam.plots.style import GREY, line_style, new_figure, save
+from jaxslam.plots.style import GREY, line_style, name_decades, new_figure, save
 
 _LEGEND_LINE = 0.05
 """Of the height of the axes of NEES, on which its legend hides no curve."""
@@ -77,19 +76,10 @@ def _plot_nees(axes: Axes, summary: dict[str, Any]) -> None:
     bottom, top = min(bottom, first["dof"] / 2), max(top, first["dof"] * 1.2)
     legend = _LEGEND_LINE * (len(summary["filters"]) + 2)
     axes.set_ylim(bottom, bottom * (top / bottom) ** (1 / (1 - min(legend, 0.5))))
-    _name_decades(axes)
+    name_decades(axes)
     _over_time(axes, time)
     axes.set_ylabel(f"pose NEES (ideal {first['dof']})")
     axes.legend(fontsize=8, loc="upper left")
-
-
-def _name_decades(axes: Axes) -> None:
-    """Numbers between the powers of ten of a logarithmic axis that has few of them."""
-    bottom, top = axes.get_ylim()
-    if top < 100 * bottom:
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
-        axes.yaxis.set_major_formatter(ScalarFormatter())
-        axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _over_time(axes: Axes, time: np.ndarray) -> None:
@@ -112,7 +102,7 @@ def _plot_beyond_scale(axes: Axes, summary: dict[str, Any]) -> None:
     axes.set_yscale("log")
     bottom, top = axes.get_ylim()
     axes.set_ylim(min(bottom, first["dof"] / 2), max(top, first["dof"] * 2.5))
-    _name_decades(axes)
+    name_decades(axes)
     _over_time(axes, time)
     axes.set_title(f"pose NEES given the scale (ideal {first['dof']})", fontsize=9)
 
@@ -129,7 +119,7 @@ def _plot_log_scale(axes: Axes, summary: dict[str, Any]) -> None:
     axes.plot([], [], color=GREY, lw=1.8, label="|error|, median of runs")
     axes.plot([], [], color=GREY, lw=0.9, ls=(0, (4, 2)), label="by the σ claimed: 0.67 σ, median")
     axes.set_yscale("log")
-    _name_decades(axes)
+    name_decades(axes)
     _over_time(axes, time)
     axes.set_title("log of the scale: error and claimed σ", fontsize=9)
     axes.legend(fontsize=7, loc="best")

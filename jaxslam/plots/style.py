@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from jaxslam.files import write_atomically
 
@@ -33,3 +35,12 @@ def save(figure: Figure, path: str | Path) -> None:
     """Write the figure whole or not at all."""
     with write_atomically(path) as temporary:
         figure.savefig(temporary, dpi=150)
+
+
+def name_decades(axes: Axes) -> None:
+    """Numbers between the powers of ten of a logarithmic axis that has few of them."""
+    bottom, top = axes.get_ylim()
+    if top < 100 * bottom:
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+        axes.yaxis.set_major_formatter(ScalarFormatter())
+        axes.yaxis.set_minor_formatter(NullFormatter())

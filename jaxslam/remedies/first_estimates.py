@@ -10,7 +10,7 @@ of unknown depth is bad, and remains the linearisation point for good.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 from jax import numpy as jnp
@@ -20,7 +20,7 @@ from jaxslam.forms.covariance import Covariance
 from jaxslam.forms.state import Features, State
 from jaxslam.models.coordinates import WORLD
 from jaxslam.remedies.observability_constrained import follow
-from jaxslam.remedies.transport import check_plain
+from jaxslam.remedies.transport import check_metric, check_undelayed
 from jaxslam.slam.model import SlamModel
 
 
@@ -34,9 +34,12 @@ class FirstEstimateState(State):
 class FirstEstimates(Covariance):
     """Residuals of the estimate, H of the first estimates, and `transport` of the core."""
 
+    divisible: ClassVar[bool] = False
+
     def check(self, slam: Any) -> None:
         """Raise ValueError for filters whose landmarks have no first estimate to keep."""
-        check_plain(slam, "fej")
+        check_metric(slam, "fej")
+        check_undelayed(slam, "fej")
         if slam.coordinates is not WORLD:
             raise ValueError(
                 f"fej is for world filters: a {slam.coordinates.name} one moves its landmarks, "

@@ -32,7 +32,7 @@ from jaxslam.forms.state import State
 from jaxslam.geometry import difference, exp, tangent_dim
 from jaxslam.models.coordinates import WORLD
 from jaxslam.remedies.gauge import act, unobservable_directions
-from jaxslam.remedies.transport import carried, check_plain, read_from
+from jaxslam.remedies.transport import carried, check_metric, check_undelayed, read_from
 from jaxslam.slam.model import SlamModel
 
 
@@ -41,7 +41,8 @@ class Invariant(Covariance):
 
     def check(self, slam: Any) -> None:
         """Raise ValueError unless the filter is a plain world-centric one."""
-        check_plain(slam, "invariant")
+        check_metric(slam, "invariant")
+        check_undelayed(slam, "invariant")
         if slam.coordinates is not WORLD:
             raise ValueError(
                 f"the right-invariant error is of world filters, not {slam.coordinates.name} ones"

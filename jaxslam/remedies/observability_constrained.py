@@ -2,8 +2,8 @@
 
 The published filters change the Jacobians so that the linearised system cannot see more than the
 true one, `H* N_{k|k-1} = 0` and `Φ* N_{k|k-1} = N_{k+1|k}`. Here N is taken at the latest
-estimates, landmarks included, so that H needs no change, and `Φ* = Φ M` (`transport`); M changes
-the columns of pose and velocity alone. It serves both frames, and the scale of a monocular filter.
+estimates, landmarks included, so that H needs no change, and `Φ* = Φ M` (`transport`). It serves
+both frames, and the scale of a monocular filter, in metres or in a unit of its own.
 """
 
 from __future__ import annotations
@@ -11,27 +11,44 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam.forms.covariance import Covariance
 from jaxslam.forms.state import State
-from jaxslam.geometry import tangent_dim
-from jaxslam.remedies.gauge import check_gauge, unobservable_directions
-from jaxslam.remedies.transport import carried, check_plain, read_from
+from jaxslam.geometry import difference, tangent_dim
+from jaxslam.remedies.gauge import check_gauge, scale_is_free, unobservable_directions
+from jaxslam.remedies.transport import carried, check_undelayed, read_from, read_scale_too
 from jaxslam.slam.model import SlamModel
 
 
 class ObservabilityConstrained(Covariance):
-    """The covariance carried along the gauge after every update."""
+    """The covariance carried along the gauge after every update, and between the steps of one."""
+
+    steps: int = eqx.field(static=True, default=1)
+    """Of Gauss–Newton in an update: an EKF has one. Where a second goes far from the first, as of
+    a camera whose acceleration is large, the first would be wrong, and carried on."""
 
     def check(self, slam: Any) -> None:
         """Raise ValueError where there is nothing to constrain, or N is not known."""
-        check_plain(slam, "oc")
+        check_undelayed(slam, "oc")
         check_gauge(slam.model)
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
-        after, innovation = super().update(model, state, features, noise, context, considered)
-        return follow(model, state, after), innovation
+        at, offset = state, None
+        for _ in range(self.steps - 1):
+            at = follow(
+                model, at, self._mean(model, at, offset, features, noise, context, considered)
+            )
+            offset = apart(state, at)
+        after, innovation = self.update_at(model, at, offset, features, noise, context, considered)
+        return follow(model, at, after), innovation
+
+    def _mean(self, model, at, offset, *data) -> State:
+        """The mean that a step gives, with the covariance as it was."""
+        after, _ = self.update_at(model, at, offset, *data)
+        return replace(after, covariance=at.covariance)
 
 
 def follow(model: SlamModel, before: State, after: State) -> State:
@@ -39,13 +56,25 @@ def follow(model: SlamModel, before: State, after: State) -> State:
     return replace(after, covariance=carried(after.covariance, *transport(model, before, after)))
 
 
+def apart(state: State, origin: State) -> Float[Array, " n"]:
+    """`state ⊟ origin`."""
+    landmarks = (state.landmarks - origin.landmarks).ravel()
+    return jnp.concatenate([difference(state.core, origin.core), landmarks])
+
+
 def transport(
     model: SlamModel, before: State, after: State
 ) -> tuple[Float[Array, "n g"], Float[Array, "g n"]]:
-    """`N(x⁺) − N(x)` and L: the frame is read from the pose, the scale from the velocity.
+    """`N(x⁺) − N(x)` and L: the frame is read from the pose, the scale from velocity or landmarks.
 
-    Least squares over the whole error, landmarks included, would be an L as well. It is measurably
-    worse: what is read should be what is known best. Of a camera at rest the scale is not read.
+    Least squares over the whole error for the frame too, landmarks included, is measurably worse:
+    what is read should be what is known best.
     """
     N, N_after = (unobservable_directions(model, state) for state in (before, after))
-    return N_after - N, read_from(N, tangent_dim((before.core.pose, before.core.motion)))
+    pose, frame = tangent_dim(before.core.pose), model.geometry.tangent_dim
+    L = read_from(N[:, :frame], pose)
+    if scale_is_free(model):
+        velocity = slice(pose, pose + model.geometry.point_dim)
+        landmarks = slice(before.core_dim, before.covariance.shape[0])
+        L = read_scale_too(N, L, before.covariance, velocity, landmarks)
+    return N_after - N, L

@@ -345,12 +345,16 @@ def innermost(slam: Any) -> EkfSlam | None:
     return slam
 
 
-def check_one_gaussian(base: Any, what: str) -> None:
-    """Raise ValueError, saying of what, unless all that `base` knows is in one covariance."""
+def check_one_gaussian(base: Any, what: str, remedies: bool = False) -> None:
+    """Raise ValueError, saying of what, unless all that `base` knows is in one covariance.
+
+    With `remedies`, of a form that only looks after it in its own way as well.
+    """
     if not isinstance(base, EkfSlam):
         raise ValueError(f"{what} is around an EkfSlam, not around a {type(base).__name__}")
+    plain = type(base.form) is Covariance or (remedies and base.form.divisible)
     for wrong, why in (
-        (type(base.form) is not Covariance, "is for filters in covariance form"),
+        (not plain, "is for filters in covariance form"),
         (not isinstance(base.entry, AtOnce), "does not know delayed landmarks"),
         (base.landmark.convert is not None, f"cannot switch the form of {base.landmark.name}"),
     ):

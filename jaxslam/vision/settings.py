@@ -29,8 +29,7 @@ class TrackerSettings:
     filter: str = FROM_REST["spatial"]
     """Filter: a name of jaxslam.names.FILTERS, which may be modified, as in `robocentric+oc`.
     `recommended` is the default: it finds out by itself how the camera sets out, and what it claims
-    is true most often. On long, sideways video `world_gauge` in place of `scale_gauge` keeps to one
-    scale better, and claims too much (docs/sequences.md)."""
+    is true most often (docs/sequences.md)."""
     landmarks: str = "inverse_scaling"
     """Landmark parametrization: a name of jaxslam.LANDMARKS."""
     calibration: str | None = None

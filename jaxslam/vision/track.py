@@ -32,7 +32,7 @@ from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
     alignment,
     write_covariances,
-    write_tum,
+    write_trajectory,
 )
 from jaxslam.vision.viewer import Viewer
 
@@ -219,7 +219,7 @@ def _write(
     source: Source, tracker: Tracker, history: list[Tracked], seconds: list[float], out: Path
 ) -> dict[str, Any]:
     times, T_wc = _trajectory(history)
-    write_tum(out / "trajectory.txt", times, T_wc)
+    write_trajectory(out / "trajectory.txt", times, T_wc)
     scaled = any(result.sigma_log_scale is not None for result in history)
     covariances = [result.covariance for result in history]
     write_covariances(out / "covariance.txt", times, covariances, given_scale=scaled)

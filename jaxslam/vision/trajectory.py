@@ -1,19 +1,22 @@
 """Trajectories and their covariances as text, and their error against a reference, by `evo`."""
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from jaxslam.files import write_atomically
+from jaxslam.evaluation import covariance_text
+from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, Similarity, similarity
+from jaxslam.evaluation.arrays import ROUNDING, exactly_known, normalised
+from jaxslam.evaluation.convention import Convention, errors_beyond_scale, pose_errors
+from jaxslam.tum import write_tum
 
-# A pose and a reference pose further apart in time than this (s) are not compared; evo's default.
-MAX_TIME_DIFFERENCE = 0.01
-# Nine decimals of two files: their poses can differ by 4e-9 (map units and rad), and be the same.
-_ROUNDING = 1e-8
+TRACKED = Convention("split", "body")
+"""The error whose covariances are written: position in the camera's axes, rotation vector."""
 
 _UNITS = "every map of frames.csv has a unit of its own"
 _GIVEN_SCALE = "given the scale of its map, of which sigma_log_scale of frames.csv is in doubt"
@@ -32,144 +35,53 @@ class TrajectoryError(TypedDict):
     straight_line: float
 
 
-class Similarity(NamedTuple):
-    """`x → s R x + t`, of world frames: a Sim(3)."""
-
-    rotation: Float[np.ndarray, "3 3"]
-    translation: Float[np.ndarray, " 3"]
-    scale: float
-
-    def inverse(self) -> "Similarity":
-        """`x → R' (x − t)/s`."""
-        back = self.rotation.T
-        return Similarity(back, -back @ self.translation / self.scale, 1 / self.scale)
-
-    def moved(self, T_wc: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
-        """The poses in the other world."""
-        result = T_wc.copy()
-        result[:, :3, :3] = self.rotation @ T_wc[:, :3, :3]
-        result[:, :3, 3] = self.scale * T_wc[:, :3, 3] @ self.rotation.T + self.translation
-        return result
-
-
-def write_tum(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> None:
-    """Write times (n,) in seconds and poses (n, 4, 4) in TUM format, whole or not at all.
-
-    Quaternions are normalised, w comes last and is not negative.
-    """
-    T_wc = np.asarray(T_wc, dtype=float).reshape(-1, 4, 4)
-    table = np.empty((len(T_wc), 7))
-    table[:, :3] = T_wc[:, :3, 3]
-    if len(T_wc):  # Rotation refuses an empty stack
-        table[:, 3:] = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True)
-    header = f"tx ty tz qx qy qz qw (s; camera in the world frame; {_UNITS})"
-    _write_rows(path, header, times, table, "poses", ".9f")
+def write_trajectory(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> None:
+    """Write times (n,) in seconds and poses (n, 4, 4) in TUM format, whole or not at all."""
+    write_tum(path, times, T_wc, _UNITS)
 
 
 def write_covariances(
     path: str | Path, times: ArrayLike, covariances: ArrayLike, *, given_scale: bool = False
 ) -> None:
-    """Write times (n,) and covariances (n, 6, 6), whole or not at all.
+    """Write times (n,) and covariances (n, 6, 6) of the `TRACKED` error, whole or not at all.
 
-    A line is the time and the upper triangle, row by row: position in the camera's axes, rotation
-    vector. The true pose is `T_wc E`, and that is the covariance of E's translation and rotation
-    vector. That maps which follow one another have different units of length is not in it. The
-    header says whether these are covariances `given_scale`, of a filter with a unit of its own, or
-    of poses in a unit that the filter takes for exactly known.
+    That maps which follow one another have different units of length is not in it. The header says
+    whether these are covariances `given_scale`, of a filter with a unit of its own, or of poses in
+    a unit that the filter takes for exactly known.
     """
-    rows, columns = np.triu_indices(6)
-    table = np.asarray(covariances, dtype=float).reshape(-1, 6, 6)[:, rows, columns]
-    names = ("x", "y", "z", "rx", "ry", "rz")
-    pairs = " ".join(f"{names[i]}{names[j]}" for i, j in zip(rows, columns, strict=True))
+    convention = replace(TRACKED, scale="given" if given_scale else "marginal")
     scale = _GIVEN_SCALE if given_scale else "the filter has no doubt of its scale"
-    header = f"{pairs} (s; map units and rad, in the camera frame; {_UNITS}, taken as one; {scale})"
-    _write_rows(path, header, times, table, "covariances", ".9e")
-
-
-def _write_rows(
-    path: str | Path, header: str, times: ArrayLike, table: np.ndarray, what: str, number: str
-) -> None:
-    """A line of each time and row, under a comment that names the columns after the time."""
-    times = np.asarray(times, dtype=float)
-    if times.shape != (len(table),):
-        raise ValueError(
-            f"{len(times)} times for {len(table)} {what}; as many of each are accepted"
-        )
-    with write_atomically(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-        file.write(f"# t {header}\n")
-        for time, row in zip(times, table, strict=True):
-            file.write(f"{time:.9f} " + " ".join(format(value, number) for value in row) + "\n")
-
-
-def read_covariances(
-    path: str | Path,
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 6 6"]]:
-    """What `write_covariances` wrote."""
-    table = np.loadtxt(path, ndmin=2)
-    covariances = np.zeros((len(table), 6, 6))
-    rows, columns = np.triu_indices(6)
-    covariances[:, rows, columns] = covariances[:, columns, rows] = table[:, 1:]
-    return table[:, 0], covariances
-
-
-def exactly_known(covariances: ArrayLike) -> Bool[np.ndarray, " n"]:
-    """Which of the covariances (n, 6, 6) are zero: poses that are known by definition.
-
-    The first camera is the world frame, so every file begins with one. They have no degree of
-    freedom, and are to be left out of a mean NEES.
-    """
-    return ~np.any(np.asarray(covariances, float), axis=(1, 2))
+    remark = f"{_UNITS}, taken as one; {scale}"
+    covariance_text.write_covariances(
+        path, times, covariances, convention, length="map", remark=remark
+    )
 
 
 def pose_nees(
     T_wc: ArrayLike, covariances: ArrayLike, reference: ArrayLike
 ) -> Float[np.ndarray, " n"]:
-    """`eᵀ P⁻¹ e` of poses (n, 4, 4), e of `T_wc⁻¹ T_true` as in `write_covariances`; ideally 6.
+    """`eᵀ P⁻¹ e` of poses (n, 4, 4), e the `TRACKED` error; ideally 6.
 
     The reference has the world frame and the unit of the map, as a simulation's has. Of a pose
     that is `exactly_known` it is 0 where the pose is right, to the rounding of the files, and
-    infinite where it is not. Raises `ValueError` for any other singular covariance.
+    infinite where it is not. Raises `ValueError` for any other covariance that is not positive.
     """
-    E = np.linalg.inv(np.asarray(T_wc, float)) @ np.asarray(reference, float)
-    errors = np.hstack([E[:, :3, 3], Rotation.from_matrix(E[:, :3, :3]).as_rotvec()])
+    errors = pose_errors(TRACKED, *(np.asarray(T, float) for T in (T_wc, reference)))
     covariances = np.asarray(covariances, float)
     known = exactly_known(covariances)
-    nees = np.where(np.linalg.norm(errors, axis=1) <= _ROUNDING, 0.0, np.inf)
-    try:
-        solved = np.linalg.solve(covariances[~known], errors[~known, :, None])[..., 0]
-    except np.linalg.LinAlgError:
-        raise ValueError(
-            "the covariance of a pose is singular; a positive one, or zero, is accepted"
-        ) from None
-    nees[~known] = np.sum(errors[~known] * solved, axis=1)
+    nees = np.where(np.linalg.norm(errors, axis=1) <= ROUNDING, 0.0, np.inf)
+    nees[~known] = normalised(errors[None, ~known], covariances[None, ~known])[0]
     return nees
 
 
 def nees_beyond_scale(
     T_wc: ArrayLike, covariances: ArrayLike, reference: ArrayLike
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """The least NEES of each pose (n, 4, 4) over the scale s > 0 of the reference's position, and
-    that scale; χ² with 5 degrees of freedom for covariances that are true given the scale.
-
-    The error as in `pose_nees` is affine in s, `e(s) = a s + b`, so that
-    `s = −aᵀ P⁻¹ b / aᵀ P⁻¹ a`. Where the reference has not moved, s is 1.
-    """
-    T_wc, reference = np.asarray(T_wc, float), np.asarray(reference, float)
-    to_camera = np.swapaxes(T_wc[:, :3, :3], 1, 2)
-    turn = Rotation.from_matrix(to_camera @ reference[:, :3, :3]).as_rotvec()
-
-    def in_camera(positions: Float[np.ndarray, "n 3"], rest: ArrayLike) -> np.ndarray:
-        moved = np.einsum("nij,nj->ni", to_camera, positions)
-        return np.hstack([moved, np.broadcast_to(rest, turn.shape)])
-
-    a = in_camera(reference[:, :3, 3], 0.0)
-    b = in_camera(-T_wc[:, :3, 3], turn)
-    solved = np.linalg.solve(np.asarray(covariances, float), np.stack([a, b], axis=2))
-    aa, ab = (np.einsum("ni,ni->n", a, solved[..., k]) for k in (0, 1))
-    scale = np.where(aa > 0, np.maximum(-ab / np.where(aa > 0, aa, 1.0), 1e-3), 1.0)
-    error = scale[:, None] * a + b
-    weighed = np.einsum("ni,nik->nk", error, solved)
-    return scale * weighed[:, 0] + weighed[:, 1], scale
+    """The least NEES of each pose (n, 4, 4) over the scale s of the reference's position, and that
+    scale: `consistency.beyond_scale` of the `TRACKED` error."""
+    arrays = (np.asarray(x, float) for x in (T_wc, reference, covariances))
+    best = errors_beyond_scale(TRACKED, *arrays)
+    return np.asarray(best.nees), np.exp(np.asarray(best.log_scale))
 
 
 def absolute_trajectory_error(
@@ -264,7 +176,7 @@ def _align(paired: Any, paired_reference: Any) -> Similarity:
     try:
         return Similarity(*paired.align(paired_reference, correct_scale=True))
     except GeometryException:  # a straight line, about which evo leaves the roll open: see below
-        found = _line_alignment(paired.positions_xyz, paired_reference.positions_xyz)
+        found = similarity(paired.positions_xyz, paired_reference.positions_xyz, scaled=True)
         paired.scale(found.scale)
         paired.transform(lie_algebra.se3(found.rotation, found.translation))
         return found
@@ -288,25 +200,6 @@ def _straight_line(times: Float[np.ndarray, " n"], positions: Float[np.ndarray, 
     centred, t = positions - positions.mean(0), times - times.mean()
     rest = centred - np.outer(t, t @ centred / (t @ t))
     return float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
-
-
-def _line_alignment(
-    estimate: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "n 3"]
-) -> Similarity:
-    """Umeyama's rotation, translation and scale without the test that the rank is two.
-
-    On a straight line the rotation about it is arbitrary, but no position depends on it where
-    the reference is the line, so that the error is the smallest one all the same.
-    """
-    mean_estimate, mean_reference = estimate.mean(0), reference.mean(0)
-    centred, target = estimate - mean_estimate, reference - mean_reference
-    left, singular, right = np.linalg.svd(target.T @ centred)
-    if singular[0] <= 1e-12 * np.sum(target**2) or not np.any(target):
-        raise ValueError("all poses of a trajectory are in one place; a Sim(3) needs a motion")
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation = left @ np.diag(signs) @ right
-    scale = float(singular @ signs / np.sum(centred**2))
-    return Similarity(rotation, mean_reference - scale * rotation @ mean_estimate, scale)
 
 
 def _too_few(count: int) -> str:

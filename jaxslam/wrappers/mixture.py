@@ -45,7 +45,7 @@ class Mixture(Bank, AbstractStaged):
     along: Literal["speed", "direction"] = eqx.field(static=True, default="direction")
 
     def __check_init__(self) -> None:
-        check_one_gaussian(self.base, "a mixture")
+        check_one_gaussian(self.base, "a mixture", remedies=True)
 
     @property
     def rounds(self) -> int:

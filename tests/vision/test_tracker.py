@@ -15,6 +15,7 @@ import pytest
 pytest.importorskip("cv2")
 
 import jaxslam
+from jaxslam.evaluation import read_covariances
 from jaxslam.forms.state import Status
 from jaxslam.slam.readouts import landmarks_in_camera
 from jaxslam.tum import read_tum
@@ -28,7 +29,6 @@ from jaxslam.vision.tracker import LEAST_MATCHES, Tracker
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
     pose_nees,
-    read_covariances,
 )
 from jaxslam.watchdog import lapack_calls
 
@@ -98,7 +98,7 @@ def test_the_files_hold_every_frame_and_agree_with_the_summary(tracked):
     # Nine decimals.
     np.testing.assert_allclose(times, source.times, rtol=0, atol=1e-9)
     np.testing.assert_allclose(T_wc[0], np.eye(4), rtol=0, atol=1e-9)
-    covariance_times, covariances = read_covariances(out / "covariance.txt")
+    covariance_times, covariances, _ = read_covariances(out / "covariance.txt")
     # Exact: the same decimals of the same numbers; half of each matrix is read twice.
     np.testing.assert_array_equal(covariance_times, times)
     np.testing.assert_array_equal(covariances, np.swapaxes(covariances, 1, 2))
@@ -133,7 +133,7 @@ def test_frames_csv_says_what_became_of_every_frame(tracked):
     assert sum(float(row["nis"]) for row in rows) / (FRAMES - 1) == pytest.approx(
         summary["nis"]["mean"], rel=1e-5
     )
-    covariances = read_covariances(out / "covariance.txt")[1]
+    covariances = read_covariances(out / "covariance.txt").covariances
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     for column, part in (("sigma_position", slice(3)), ("sigma_orientation", slice(3, 6))):
         # Six digits.
@@ -184,7 +184,7 @@ def test_a_camera_that_was_lost_for_long_begins_a_new_map(restarted):
 def test_after_a_restart_the_camera_is_known_no_better_than_before(restarted):
     out, _ = restarted
     _, T_wc = read_tum(out / "trajectory.txt")
-    _, covariances = read_covariances(out / "covariance.txt")
+    covariances = read_covariances(out / "covariance.txt").covariances
 
     def at(frame, other):
         """The covariance of a frame, in the axes of another, the step between them known."""

@@ -1,0 +1,160 @@
+"""Trajectories of different worlds, and what becomes of a covariance when one is laid on the other.
+
+A trajectory that nothing ties to the world is known up to a rigid motion, and of pictures alone up
+to a similarity: a gauge. A covariance is of errors in one gauge, and aligning the trajectory to
+the truth is a change of gauge (Zhang, Gallego, Scaramuzza, RA-L 2018): to first order the errors e
+of all poses become `e − U (Vᵀ U)⁻¹ Vᵀ e`, the oblique projection along the gauge's directions U
+onto the errors that the alignment leaves as they are, `Vᵀ e = 0`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxslam.evaluation.convention import Convention, change, converted, geometry_of, lever
+
+ALIGNMENTS = ("none", "se3", "sim3")
+MAX_TIME_DIFFERENCE = 0.01
+"""Poses further apart in time than this (s) are not compared; evo's default."""
+_SPLIT = Convention("split", "world")
+"""The error in which gauge directions are written."""
+
+
+class Similarity(NamedTuple):
+    """`x → s R x + t`, of world frames: a Sim(n)."""
+
+    rotation: Float[np.ndarray, "n n"]
+    translation: Float[np.ndarray, " n"]
+    scale: float
+
+    def inverse(self) -> Similarity:
+        """`x → R' (x − t)/s`."""
+        back = self.rotation.T
+        return Similarity(back, -back @ self.translation / self.scale, 1 / self.scale)
+
+    def moved(self, T_wc: Float[np.ndarray, "*batch d d"]) -> Float[np.ndarray, "*batch d d"]:
+        """The poses in the other world."""
+        n, result = T_wc.shape[-1] - 1, T_wc.copy()
+        result[..., :n, :n] = self.rotation @ T_wc[..., :n, :n]
+        result[..., :n, n] = self.scale * T_wc[..., :n, n] @ self.rotation.T + self.translation
+        return result
+
+    def moved_covariances(
+        self,
+        covariances: Float[np.ndarray, "k t t"],
+        T_wc: Float[np.ndarray, "k d d"],
+        convention: Convention,
+    ) -> Float[np.ndarray, "k t t"]:
+        """Covariances of the poses in the other world, of errors in the same convention."""
+        split, n = converted(covariances, T_wc, convention, _SPLIT), len(self.translation)
+        J = np.eye(split.shape[-1])
+        J[:n, :n] = self.scale * self.rotation
+        if n == 3:
+            J[n:, n:] = self.rotation
+        return converted(J @ split @ J.T, self.moved(T_wc), _SPLIT, convention)
+
+
+def associated(
+    first: Float[np.ndarray, " n"], second: Float[np.ndarray, " m"]
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Places of the times that belong together, as evo pairs them.
+
+    To each of the shorter the nearest of the longer, within `MAX_TIME_DIFFERENCE`.
+    """
+    if len(first) < len(second):
+        return associated(second, first)[::-1]
+    order = np.argsort(first, kind="stable")
+    after = np.clip(np.searchsorted(first[order], second), 1, max(len(first) - 1, 1))
+    beside = order[np.stack([after - 1, np.minimum(after, len(first) - 1)])]
+    away = np.abs(first[beside] - second)
+    nearest = np.where(away[1] < away[0], beside[1], beside[0])
+    close = np.flatnonzero(away.min(axis=0) <= MAX_TIME_DIFFERENCE)
+    return nearest[close], close
+
+
+def similarity(
+    estimate: Float[np.ndarray, "k n"], reference: Float[np.ndarray, "k n"], *, scaled: bool
+) -> Similarity:
+    """Umeyama's least squares of positions (TPAMI 1991), without the test that the rank is two.
+
+    On a straight line the rotation about it is arbitrary, but no position depends on it where
+    the reference is the line, so that the error is the smallest one all the same. Raises
+    ValueError where all positions of one are in one place.
+    """
+    mean_estimate, mean_reference = estimate.mean(0), reference.mean(0)
+    centred, target = estimate - mean_estimate, reference - mean_reference
+    left, singular, right = np.linalg.svd(target.T @ centred)
+    if singular[0] <= 1e-12 * np.sum(target**2) or not np.any(target):
+        name = "Sim(3)" if scaled else "SE(3)"
+        raise ValueError(f"all poses of a trajectory are in one place; a {name} needs a motion")
+    signs = np.ones(len(singular))
+    signs[-1] = np.sign(np.linalg.det(left @ right))
+    rotation = left @ np.diag(signs) @ right
+    scale = float(singular @ signs / np.sum(centred**2)) if scaled else 1.0
+    return Similarity(rotation, mean_reference - scale * rotation @ mean_estimate, scale)
+
+
+def at_first_pose(
+    estimate: Float[np.ndarray, "d d"], truth: Float[np.ndarray, "d d"]
+) -> Similarity:
+    """The rigid motion that takes one pose to another."""
+    n = len(estimate) - 1
+    motion = truth @ np.linalg.inv(estimate)
+    return Similarity(motion[:n, :n], motion[:n, n], 1.0)
+
+
+def projected(
+    T_wc: Float[np.ndarray, "k d d"],
+    covariances: Float[np.ndarray, "k t t"] | Float[np.ndarray, "kt kt"],
+    convention: Convention,
+    *,
+    scaled: bool,
+) -> Float[np.ndarray, "k t t"]:
+    """Covariances of aligned poses in the gauge of `similarity`, which is `Σ U_posᵀ e_pos = 0`.
+
+    `covariances` are those of every pose, whose errors are then taken as independent of each
+    other's, or the joint one of all. With W = (VᵀU)⁻¹ the k-th block of `Q P Qᵀ` is
+    `P_kk − U_k W (VᵀP)_k − (…)ᵀ + U_k W VᵀPV Wᵀ U_kᵀ`.
+    """
+    U = gauge_directions(T_wc, scaled=scaled)
+    V = U.copy()
+    V[:, T_wc.shape[-1] - 1 :] = 0
+    P, VP, VPV = _in_split(T_wc, covariances, convention, V)
+    UW = U @ np.linalg.pinv(np.einsum("kta,ktb->ab", V, U))
+    lost = UW @ VP
+    result = P - lost - np.swapaxes(lost, 1, 2) + UW @ VPV @ np.swapaxes(UW, 1, 2)
+    return converted(result, T_wc, _SPLIT, convention)
+
+
+def _in_split(
+    T_wc: np.ndarray, covariances: np.ndarray, convention: Convention, V: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """P of every pose, (VᵀP) at every pose, and VᵀPV."""
+    count, t = V.shape[:2]
+    if covariances.ndim == 3:
+        P = converted(covariances, T_wc, convention, _SPLIT)
+        VP = np.swapaxes(V, 1, 2) @ P
+        return P, VP, np.sum(VP @ V, axis=0)
+    blocks = np.swapaxes(covariances.reshape(count, t, count, t), 1, 2)
+    J = change(T_wc, convention, _SPLIT)
+    blocks = J[:, None] @ blocks @ np.swapaxes(J, 1, 2)
+    VP = np.einsum("kta,kjtu->jau", V, blocks)
+    return blocks[range(count), range(count)], VP, np.sum(VP @ V, axis=0)
+
+
+def gauge_directions(
+    T_wc: Float[np.ndarray, "k d d"], *, scaled: bool
+) -> Float[np.ndarray, "k t g"]:
+    """Errors (split, world) of the poses by a translation, a rotation about the origin and, where
+    wanted, the log of a scale: what no measurement within the trajectory tells."""
+    n, t = T_wc.shape[-1] - 1, geometry_of(T_wc).tangent_dim
+    positions = T_wc[:, :n, n]
+    U = np.zeros((len(T_wc), t, t + scaled))
+    U[:, :, :t] = np.eye(t)
+    U[:, :n, n:t] = lever(positions)
+    if scaled:
+        U[:, :n, t] = positions
+    return U

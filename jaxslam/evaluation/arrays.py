@@ -1,0 +1,130 @@
+"""Errors and covariances as somebody else's program logged them: checked, named, whitened."""
+
+from __future__ import annotations
+
+from typing import Any, NoReturn
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
+
+ASYMMETRY = 1e-5
+"""Of a covariance, in σ of its two axes: what rounding to six digits leaves is less."""
+ROUNDING = 1e-8
+"""Nine decimals of two files: their poses can differ by 4e-9 (map units, rad), and be the same."""
+
+
+def numbers(what: str, values: ArrayLike, ndim: int, shape: str) -> Float[np.ndarray, ...]:
+    """An array of finite float64 of so many axes. Raises ValueError, naming run and step."""
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind not in "fiub":
+            raise ValueError
+        array = array.astype(np.float64)
+    except (ValueError, TypeError):
+        raise ValueError(f"{what} must be numbers, an array {shape}") from None
+    if array.ndim != ndim or not array.size:
+        raise ValueError(f"{what} must be an array {shape}, not {array.shape}")
+    if not np.isfinite(array).all():
+        place = np.argwhere(~np.isfinite(array))[0]
+        raise ValueError(f"{what} of {at(place)} holds {array[tuple(place)]}; only finite numbers")
+    return array
+
+
+def at(place: Any) -> str:
+    """`run 3, step 17`, counted from 0."""
+    return f"run {place[0]}, step {place[1]}"
+
+
+def paired(
+    errors: ArrayLike, covariances: ArrayLike
+) -> tuple[Float[np.ndarray, "runs steps n"], Float[np.ndarray, "runs steps n n"]]:
+    """Errors and covariances that belong together. Raises ValueError, naming run and step."""
+    e = numbers("errors", errors, 3, "(runs, steps, n), with one run errors[None]")
+    P = numbers("covariances", covariances, 4, "(runs, steps, n, n)")
+    if P.shape != (*e.shape, e.shape[-1]):
+        wanted = (*e.shape, e.shape[-1])
+        raise ValueError(f"errors are {e.shape}, so covariances must be {wanted}, not {P.shape}")
+    return e, P
+
+
+def step_times(times: ArrayLike | None, steps: int) -> Float[np.ndarray, " steps"]:
+    """Seconds of every step; its number where nobody told. Raises ValueError."""
+    if times is None:
+        return np.arange(1.0, steps + 1)
+    try:
+        array = np.asarray(times, np.float64)
+    except (ValueError, TypeError):
+        array = np.empty(0)
+    if array.shape != (steps,) or not np.isfinite(array).all() or (np.diff(array) < 0).any():
+        raise ValueError(f"times must be {steps} finite seconds, one a step, that do not decrease")
+    return array
+
+
+def exactly_known(
+    covariances: Float[np.ndarray, "*batch n n"],
+) -> Bool[np.ndarray, "*batch"]:
+    """Which covariances are zero: what is known by definition, as a first camera at the origin.
+
+    It has no degree of freedom, and no part in a NEES.
+    """
+    return ~np.any(covariances, axis=(-2, -1))
+
+
+def without_known(
+    errors: Float[np.ndarray, "runs steps n"], covariances: Float[np.ndarray, "runs steps n n"]
+) -> int:
+    """Of how many steps at the beginning all runs know everything by definition.
+
+    Raises ValueError where one is wrong all the same, or where nothing else is left.
+    """
+    known = exactly_known(covariances)
+    beginning = int(np.argmin(known.all(axis=0))) if not known.all() else known.shape[1]
+    wrong = known & (np.abs(errors).max(axis=-1) > ROUNDING)
+    if wrong.any():
+        run, step = np.argwhere(wrong)[0]
+        raise ValueError(
+            f"the covariance of {at((run, step))} is zero, and its error is not: "
+            f"{np.abs(errors[run, step]).max():.3g}; a positive definite one is accepted"
+        )
+    if beginning == known.shape[1]:
+        raise ValueError("all covariances are zero; positive definite ones are accepted")
+    return beginning
+
+
+def normalised(
+    errors: Float[np.ndarray, "runs steps n"], covariances: Float[np.ndarray, "runs steps n n"]
+) -> Float[np.ndarray, "runs steps"]:
+    """`eᵀ P⁻¹ e`, by a Cholesky factor of the correlations.
+
+    Raises ValueError, naming run and step, unless every P is symmetric and positive definite.
+    """
+    variance = np.diagonal(covariances, axis1=-2, axis2=-1)
+    if (variance <= 0).any():
+        run, step, axis = np.argwhere(variance <= 0)[0]
+        told = f"variance {variance[run, step, axis]:.3g} at place {axis}"
+        _refuse((run, step), f"has {told}")
+    sigma = np.sqrt(variance)
+    correlation = covariances / sigma[..., :, None] / sigma[..., None, :]
+    skewed = np.abs(correlation - np.swapaxes(correlation, -1, -2)).max(axis=(-2, -1))
+    if (skewed > ASYMMETRY).any():
+        place = np.argwhere(skewed > ASYMMETRY)[0]
+        _refuse(place, f"is not symmetric (by {skewed[tuple(place)]:.2g} in σ)")
+    with np.errstate(over="ignore"):  # an infinite NEES is one of a run that diverged
+        whitened = np.linalg.solve(_factors(correlation), (errors / sigma)[..., None])[..., 0]
+        return np.sum(whitened**2, axis=-1)
+
+
+def _factors(correlation: Float[np.ndarray, "runs steps n n"]) -> np.ndarray:
+    try:
+        return np.linalg.cholesky(correlation)
+    except np.linalg.LinAlgError:
+        least = np.linalg.eigvalsh(correlation)[..., 0]
+        place = np.argwhere(least <= max(float(least.min()), 0.0))[0]
+        _refuse(place, f"has an eigenvalue {least[tuple(place)]:.3g} times its variances")
+
+
+def _refuse(place: Any, fault: str) -> NoReturn:
+    raise ValueError(
+        f"the covariance of {at(place)} {fault}; a symmetric, positive definite one is accepted"
+    )

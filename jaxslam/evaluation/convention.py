@@ -1,0 +1,222 @@
+"""Of which error of a pose a covariance is: the choices that nobody writes down.
+
+An estimate T̂ = (R̂, p̂) maps body coordinates to the world, T = (R, p) is the truth, and
+
+    right   T = T̂ Exp(ξ): about the body, first along its own axes
+    left    T = Exp(ξ) T̂: about the world's origin, so that a turn there moves the position
+    split   p = p̂ + δp along the world's axes, and R = R̂ Exp(δθ) about the body's
+
+are the errors. To first order right and split are the same but for the axes; left differs by the
+adjoint of T̂. Every error may then be written along other axes, turned by R̂: `body`, `world` (ROS:
+split, world) or `mixed`, the position along the world's and the rotation about the body's (MSCKF,
+error-state filters: split, mixed; GTSAM: right, body, rotation-first). A covariance is `marginal`,
+or `given` the scale of the world, of which its filter then knows nothing.
+
+All matrices that change one into another have determinant one: a wrong convention keeps
+`log det P` and raises the expected NEES, to `tr(P_wrong⁻¹ P)`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from functools import partial
+from itertools import product
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxslam.consistency.beyond_scale import BeyondScale, beyond_scale
+from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, log
+from jaxslam.lookup import chosen
+
+CHOICES = {
+    "error": ("right", "left", "split"),
+    "axes": ("body", "world", "mixed"),
+    "order": ("position-first", "rotation-first"),
+    "scale": ("marginal", "given"),
+}
+NATURAL_AXES = {"right": "body", "left": "world", "split": "world"}
+"""Axes of an error of which nobody says more; of `split` those of ROS."""
+_OWN_AXES = {"right": ("body", "body"), "left": ("world", "world"), "split": ("world", "body")}
+"""Axes along which position and rotation of the errors come out, before they are turned."""
+_PARTS = {"body": ("body", "body"), "world": ("world", "world"), "mixed": ("world", "body")}
+
+
+@dataclass(frozen=True)
+class Convention:
+    """Of which error a covariance is. Raises ValueError, naming what is accepted."""
+
+    error: str = "right"
+    axes: str = ""
+    """By default the error's own (`NATURAL_AXES`)."""
+    order: str = "position-first"
+    scale: str = "marginal"
+
+    def __post_init__(self) -> None:
+        if not self.axes:
+            object.__setattr__(self, "axes", NATURAL_AXES.get(self.error, "body"))
+        for name, known in CHOICES.items():
+            chosen(name, [getattr(self, name)], dict.fromkeys(known))
+
+    def __str__(self) -> str:
+        return " ".join(f"{name}={value}" for name, value in asdict(self).items())
+
+    def names(self, geometry: Geometry) -> tuple[str, ...]:
+        """Of the numbers of an error, in their order."""
+        position, turn = ("x", "y", "z"), ("rx", "ry", "rz")
+        if geometry is PLANAR:
+            position, turn = ("x", "y"), ("r",)
+        return position + turn if self.order == "position-first" else turn + position
+
+
+def alternatives(convention: Convention, geometry: Geometry) -> tuple[Convention, ...]:
+    """All conventions that differ to first order, this one among them, of the same scale.
+
+    The stated one keeps its kind of error, as right and split are not told apart. In the plane no
+    axes turn a rotation, and mixed is world.
+    """
+    ours = convention.error if convention.error != "left" else "right"
+    turned = convention.axes if convention.axes != "body" else "world"
+    axes = ("body", turned) if geometry is PLANAR else CHOICES["axes"]
+    choices = product((ours, "left"), axes, CHOICES["order"])
+    return tuple(Convention(*choice, convention.scale) for choice in choices)
+
+
+def geometry_of(poses: Float[np.ndarray, "*batch d d"]) -> Geometry:
+    """That of matrices (…, 3, 3) or (…, 4, 4)."""
+    return SPATIAL if poses.shape[-1] == 4 else PLANAR
+
+
+def pose_errors(
+    convention: Convention,
+    estimates: Float[np.ndarray, "*batch d d"],
+    truths: Float[np.ndarray, "*batch d d"],
+) -> Float[np.ndarray, "*batch t"]:
+    """The error of every pose in the convention."""
+    error = _in_float64(_errors, convention.error, estimates, truths)
+    return np.einsum("...ij,...j->...i", turning(convention, estimates), error)
+
+
+def errors_beyond_scale(
+    convention: Convention,
+    estimates: Float[np.ndarray, "*batch d d"],
+    truths: Float[np.ndarray, "*batch d d"],
+    covariances: Float[np.ndarray, "*batch t t"],
+) -> BeyondScale:
+    """What of every pose's error is not one of scale (`consistency.beyond_scale`), of covariances
+    in the convention, about the origin of the world."""
+    turn = turning(convention, estimates)
+    return _in_float64(_beyond_scale, convention.error, estimates, truths, turn, covariances)
+
+
+def from_right(
+    convention: Convention, estimates: Float[np.ndarray, "*batch d d"]
+) -> Float[np.ndarray, "*batch t t"]:
+    """M of `ξ = M ξ_right` to first order: `P = M P_right Mᵀ` is the covariance's."""
+    n = estimates.shape[-1] - 1
+    R, p = estimates[..., :n, :n], estimates[..., :n, n]
+    M = np.zeros((*R.shape[:-2], *(2 * [geometry_of(estimates).tangent_dim])))
+    M[..., :n, :n] = R if convention.error != "right" else np.eye(n)
+    M[..., n:, n:] = _rotation_matrix(R) if convention.error == "left" else np.eye(M.shape[-1] - n)
+    if convention.error == "left":
+        M[..., :n, n:] = -lever(p) @ M[..., n:, n:]
+    return turning(convention, estimates) @ M
+
+
+def converted(
+    covariances: Float[np.ndarray, "*batch t t"],
+    poses: Float[np.ndarray, "*batch d d"],
+    old: Convention,
+    new: Convention,
+) -> Float[np.ndarray, "*batch t t"]:
+    """Covariances of poses, of one convention, in another."""
+    J = change(poses, old, new)
+    return J @ covariances @ np.swapaxes(J, -1, -2)
+
+
+def change(
+    poses: Float[np.ndarray, "*batch d d"], old: Convention, new: Convention
+) -> Float[np.ndarray, "*batch t t"]:
+    """J of `ξ_new = J ξ_old`, to first order."""
+    return from_right(new, poses) @ np.linalg.inv(from_right(old, poses))
+
+
+def turning(
+    convention: Convention, estimates: Float[np.ndarray, "*batch d d"]
+) -> Float[np.ndarray, "*batch t t"]:
+    """What turns an error as it comes out to the axes and the order of the convention."""
+    n, t = estimates.shape[-1] - 1, geometry_of(estimates).tangent_dim
+    R = estimates[..., :n, :n]
+    N = np.zeros((*R.shape[:-2], t, t))
+    position, rotation = zip(_OWN_AXES[convention.error], _PARTS[convention.axes], strict=True)
+    N[..., :n, :n] = _turned(R, *position)
+    N[..., n:, n:] = _turned(_rotation_matrix(R), *rotation)
+    return N if convention.order == "position-first" else np.roll(N, t - n, axis=-2)
+
+
+def _turned(R: np.ndarray, old: str, new: str) -> np.ndarray:
+    if old == new:
+        return np.broadcast_to(np.eye(R.shape[-1]), R.shape)
+    return R if new == "world" else np.swapaxes(R, -1, -2)
+
+
+def _rotation_matrix(R: np.ndarray) -> np.ndarray:
+    """What turns a rotation vector: R, or in the plane nothing."""
+    return R if R.shape[-1] == 3 else np.ones((*R.shape[:-2], 1, 1))
+
+
+def lever(p: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n r"]:
+    """How a small turn about the origin moves points p: `ω ↦ ω × p`."""
+    zero = np.zeros(p.shape[:-1])
+    if p.shape[-1] == 2:
+        return np.stack([-p[..., 1], p[..., 0]], axis=-1)[..., None]
+    x, y, z = np.moveaxis(p, -1, 0)
+    rows = [[zero, z, -y], [-z, zero, x], [y, -x, zero]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _in_float64(function: Any, error: str, *arrays: Float[np.ndarray, "*batch _ _"]) -> Any:
+    """A function of poses, over all of them, as NumPy's arrays.
+
+    Their number is filled up to a power of two, so that few programs serve logs of all sizes.
+    """
+    batch, count = arrays[0].shape[:-2], int(np.prod(arrays[0].shape[:-2]))
+    flat = (np.asarray(x, np.float64).reshape(-1, *x.shape[-2:]) for x in arrays)
+    more = (1 << (count - 1).bit_length()) - count
+    filled = (np.concatenate([x, np.repeat(x[:1], more, axis=0)]) for x in flat)
+    with jax.enable_x64(True):
+        result = jax.device_get(function(error, geometry_of(arrays[0]), *filled))
+    return jax.tree.map(lambda x: np.asarray(x)[:count].reshape(*batch, *x.shape[1:]), result)
+
+
+def _error(error: str, estimate: Pose, truth: Pose) -> Float[Array, " t"]:
+    """Of one pose, along its own axes (`_OWN_AXES`), position first."""
+    if error == "left":
+        return log(truth @ estimate.inverse())
+    if error == "right":
+        return log(estimate.inverse() @ truth)
+    turn = log(estimate.rotation().inverse() @ truth.rotation())
+    return jnp.concatenate([truth.translation() - estimate.translation(), turn])
+
+
+@eqx.filter_jit
+def _errors(error: str, geometry: Geometry, estimates: Array, truths: Array) -> Array:
+    of = geometry.group.from_matrix
+    return jax.vmap(lambda T, true: _error(error, of(T), of(true)))(estimates, truths)
+
+
+@eqx.filter_jit
+def _beyond_scale(
+    error: str, geometry: Geometry, estimates: Array, truths: Array, turn: Array, P: Array
+) -> BeyondScale:
+    of = geometry.group.from_matrix
+
+    def one(estimate, truth, turn, P):
+        told = partial(_error, error, of(estimate))
+        return beyond_scale(lambda true: (turn @ told(true), P), of(truth))
+
+    return jax.vmap(one)(estimates, truths, turn, P)

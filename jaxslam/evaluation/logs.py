@@ -1,0 +1,275 @@
+"""Logs of somebody's filter: arrays in npz or CSV, trajectories in folders, to a verdict."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, associated
+from jaxslam.evaluation.convention import CHOICES, Convention
+from jaxslam.evaluation.covariance_text import read_covariances
+from jaxslam.evaluation.evaluate import Evaluation, evaluate
+from jaxslam.evaluation.poses import evaluate_poses
+from jaxslam.lookup import suggestion
+from jaxslam.tum import read_table, read_tum
+
+ESTIMATES = ("estimate.txt", "trajectory.txt")
+COVARIANCES = ("covariance.txt",)
+TRUTHS = ("truth.txt", "groundtruth.txt")
+_KEYS = (
+    "errors", "innovations", "covariances", "estimates", "truths", "times", "names", *CHOICES,
+)  # fmt: skip
+_CONTENTS = (
+    "errors and covariances, innovations and covariances, or estimates, covariances and truths"
+)
+
+
+class Run(NamedTuple):
+    """One trajectory: where its files are."""
+
+    estimate: Path
+    covariance: Path
+    truth: Path
+
+
+class _Associated(NamedTuple):
+    times: Float[np.ndarray, " n"]
+    estimates: Float[np.ndarray, "n 4 4"]
+    covariances: Float[np.ndarray, "n 6 6"]
+    truths: Float[np.ndarray, "n 4 4"]
+    said: dict[str, str]
+    logged: int
+
+
+def evaluate_log(
+    source: str | Path,
+    *,
+    covariance: str | Path | None = None,
+    truth: str | Path | None = None,
+    stated: Mapping[str, str] | None = None,
+    align: str = "none",
+    nis: bool = False,
+) -> Evaluation:
+    """The verdict on what a file or a folder holds.
+
+    `source` is an npz file of arrays, a CSV file of `run, step, errors, upper triangle` lines, a
+    trajectory in TUM format with its `covariance` and `truth`, or a folder: one run, or one a
+    sub-folder, of `estimate.txt`, `covariance.txt` and `truth.txt`. What is `stated` of the
+    convention (`error`, `axes`, `order`, `scale`) comes before what the files say. With `nis`
+    errors are innovations. Raises ValueError, naming the file.
+    """
+    source, stated = Path(source), dict(stated or {})
+    if not source.exists():
+        raise ValueError(f"{source}: no such file or folder")
+    if source.suffix in (".npz", ".csv"):
+        for name, value in (("covariance", covariance), ("truth", truth)):
+            if value is not None:
+                raise ValueError(f"{source}: a {name} file goes with a trajectory, not with arrays")
+        arrays = _npz(source) if source.suffix == ".npz" else _csv(source)
+        return _named(source, lambda: _evaluate_arrays(arrays, stated, align, nis))
+    if nis:
+        raise ValueError(f"{source}: innovations come in an npz or CSV file, not in a trajectory")
+    return _evaluate_runs(_runs(source, covariance, truth), stated, align)
+
+
+def _named(source: Path, evaluation: Callable[[], Evaluation]) -> Evaluation:
+    """With the file's name in every error."""
+    try:
+        return evaluation()
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
+
+
+def _evaluate_arrays(
+    arrays: dict[str, Any], stated: dict[str, str], align: str, nis: bool
+) -> Evaluation:
+    """Of errors, innovations or poses, by the names of the arrays."""
+    held = [name for name in ("errors", "innovations", "estimates") if name in arrays]
+    needed = {"covariances", *(["truths"] if held == ["estimates"] else [])}
+    if len(held) != 1 or not needed <= arrays.keys():
+        raise ValueError(f"holds {', '.join(arrays)}; {_CONTENTS} are accepted")
+    times, P = arrays.get("times"), arrays["covariances"]
+    if held == ["estimates"]:
+        said = {name: str(arrays[name]) for name in CHOICES if name in arrays}
+        convention = _stated(said, stated)
+        truths = arrays["truths"]
+        return evaluate_poses(arrays["estimates"], P, truths, convention, align=align, times=times)
+    if stated or align != "none":
+        raise ValueError(
+            "conventions and alignments are of poses, and here are errors, which are what they "
+            "are; estimates, covariances and truths are accepted"
+        )
+    quantity = "NIS" if nis or held == ["innovations"] else "NEES"
+    names = [str(name) for name in np.ravel(arrays.get("names", ()))]
+    return evaluate(arrays[held[0]], P, times=times, names=names, quantity=quantity)
+
+
+def _stated(said: dict[str, str], stated: dict[str, str]) -> Convention:
+    """What is stated before what is said; axes that were said are of the error that was."""
+    if "error" in stated:
+        said = {name: value for name, value in said.items() if name != "axes"}
+    return Convention(**(said | stated))
+
+
+def _npz(path: Path) -> dict[str, Any]:
+    """The arrays of a file; nothing in it is run."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except OSError as error:
+        raise ValueError(f"{path}: cannot read the arrays ({error.strerror or error})") from None
+    except (ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
+        raise ValueError(f"{path}: not an npz file of numbers ({error})") from None
+    except AttributeError:  # an npy file in its place
+        raise ValueError(f"{path}: one array, not an npz file of named ones") from None
+    for name in arrays:
+        if name not in _KEYS:
+            meant = suggestion(name, _KEYS)
+            raise ValueError(f"{path}: unknown array {name!r}{meant}; known: {', '.join(_KEYS)}")
+    return arrays
+
+
+def _csv(path: Path) -> dict[str, Any]:
+    """Lines `run, step, n errors, n (n + 1)/2 of the upper triangle`; a first one of names."""
+    row = "numbers run, step, n errors and the n (n + 1)/2 of the upper triangle row by row"
+    comments, rows, lines = read_table(path, "log", "errors", row, None)
+    n = round((np.sqrt(9 + 8 * (rows.shape[1] - 2)) - 3) / 2) if rows.shape[1] > 3 else 0
+    if n < 1 or 2 + n * (n + 3) // 2 != rows.shape[1]:
+        raise ValueError(f"{path}: {rows.shape[1]} columns; {row} are accepted")
+    order, runs, steps = _rectangle(path, rows[:, :2], lines)
+    table = rows[order].reshape(runs, steps, -1)
+    upper, P = np.triu_indices(n), np.zeros((runs, steps, n, n))
+    P[..., upper[0], upper[1]] = P[..., upper[1], upper[0]] = table[..., 2 + n :]
+    titles = [word.strip() for word in comments[0].replace(",", " ").split()] if comments else []
+    named = len(titles) == rows.shape[1] and not comments[0].lstrip().startswith("#")
+    names = {"names": titles[2 : 2 + n]} if named else {}
+    return {"errors": table[..., 2 : 2 + n], "covariances": P, **names}
+
+
+def _rectangle(
+    path: Path, places: Float[np.ndarray, "k 2"], lines: tuple[int, ...]
+) -> tuple[Int[np.ndarray, " k"], int, int]:
+    """The order of the rows by run and step, of which every run has the same."""
+    runs, steps = (np.unique(column) for column in places.T)
+    pairs, first = np.unique(places, axis=0, return_index=True)
+    if len(pairs) < len(places):
+        twice = np.setdiff1d(np.arange(len(places)), first)[0]
+        run, step = places[twice]
+        raise ValueError(f"{path}, line {lines[twice]}: run {run:g}, step {step:g} comes twice")
+    if len(pairs) != len(runs) * len(steps):
+        count = [int(np.sum(places[:, 0] == run)) for run in runs]
+        short = runs[int(np.argmin(count))]
+        raise ValueError(
+            f"{path}: run {short:g} has {min(count)} of {len(steps)} steps; all runs need the same"
+        )
+    return np.lexsort((places[:, 1], places[:, 0])), len(runs), len(steps)
+
+
+def _runs(source: Path, covariance: str | Path | None, truth: str | Path | None) -> tuple[Run, ...]:
+    """The files of every run."""
+    if source.is_dir():
+        if _first(source, ESTIMATES) is not None:
+            return (_run(source, covariance, truth),)
+        if covariance is not None:
+            raise ValueError(f"{source}: with many runs each needs a covariance.txt of its own")
+        folders = sorted(x for x in source.iterdir() if x.is_dir() and x.name[0] != ".")
+        if not folders:
+            raise ValueError(f"{source}: holds neither {ESTIMATES[0]} nor sub-folders, one a run")
+        return tuple(_run(folder, None, truth) for folder in folders)
+    for name, value in (("covariance", covariance), ("truth", truth)):
+        if value is None:
+            raise ValueError(
+                f"{source}: a trajectory needs a {name} file beside it (--{name} FILE); arrays "
+                "come as .npz or .csv"
+            )
+    return (Run(source, Path(str(covariance)), Path(str(truth))),)
+
+
+def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) -> Run:
+    def found(given: str | Path | None, names: tuple[str, ...]) -> Path:
+        path = _first(folder, names) if given is None else Path(given)
+        if path is None:
+            raise ValueError(f"{folder}: holds no {' or '.join(names)}")
+        return path
+
+    return Run(found(None, ESTIMATES), found(covariance, COVARIANCES), found(truth, TRUTHS))
+
+
+def _first(folder: Path, names: tuple[str, ...]) -> Path | None:
+    return next((folder / name for name in names if (folder / name).is_file()), None)
+
+
+def _evaluate_runs(runs: tuple[Run, ...], stated: dict[str, str], align: str) -> Evaluation:
+    read = [_read(run) for run in runs]
+    for run, one in zip(runs, read, strict=True):
+        if one.said != read[0].said:
+            raise ValueError(
+                f"{run.covariance}: says another convention ({Convention(**one.said)}) than "
+                f"{runs[0].covariance} ({Convention(**read[0].said)})"
+            )
+    steps = min(len(one.times) for one in read)
+    convention = _stated(read[0].said, stated)
+
+    def all_of(name: str) -> np.ndarray:
+        return np.stack([getattr(one, name)[:steps] for one in read])
+
+    found = _named(
+        runs[0].estimate if len(runs) == 1 else runs[0].estimate.parent.parent,
+        lambda: evaluate_poses(
+            all_of("estimates"),
+            all_of("covariances"),
+            all_of("truths"),
+            convention,
+            align=align,
+            times=read[0].times[:steps],
+        ),
+    )
+    told = tuple(_left_out(runs, read, steps))
+    if not read[0].said and not stated:
+        told += (f"the file does not say its convention; assumed: {convention}",)
+    return replace(found, notes=(*found.notes, *told))
+
+
+def _left_out(runs: tuple[Run, ...], read: list[_Associated], steps: int) -> Iterator[str]:
+    logged, paired = sum(one.logged for one in read), sum(len(one.times) for one in read)
+    if paired < logged:
+        yield f"{logged - paired} of {logged} poses have no truth within {MAX_TIME_DIFFERENCE} s"
+    longest = max(len(one.times) for one in read)
+    if longest > steps:
+        yield f"runs have {steps} to {longest} steps; the first {steps} are compared"
+
+
+def _read(run: Run) -> _Associated:
+    """One run, pose by pose of the same time."""
+    times, estimates = read_tum(run.estimate)
+    text, (true_times, truths) = read_covariances(run.covariance), read_tum(run.truth)
+    with_P, of_P = _times_in_common(run.estimate, times, run.covariance, text.times)
+    times, estimates, P = times[with_P], estimates[with_P], text.covariances[of_P]
+    with_truth, of_truth = _times_in_common(run.estimate, times, run.truth, true_times)
+    return _Associated(
+        times[with_truth],
+        estimates[with_truth],
+        P[with_truth],
+        truths[of_truth],
+        text.said,
+        len(times),
+    )
+
+
+def _times_in_common(
+    path: Path, times: np.ndarray, other: Path, other_times: np.ndarray
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    ours, theirs = associated(times, other_times)
+    if not len(ours):
+        spans = (f"{x.min():.3f}–{x.max():.3f} s" for x in (times, other_times))
+        raise ValueError(
+            f"{path} and {other} have no time stamps in common within {MAX_TIME_DIFFERENCE} s: "
+            f"{' and '.join(spans)}"
+        )
+    return ours, theirs

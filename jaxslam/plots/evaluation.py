@@ -1,0 +1,107 @@
+"""The figure of an evaluation: the verdict, NEES over time, errors beside σ, shares outside 3σ."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxslam.evaluation import Evaluation
+from jaxslam.evaluation.evaluate import OUTSIDE
+from jaxslam.plots.style import COLOURS, GREY, line_style, name_decades, new_figure, save
+
+_PER_ROW = 3
+_WIDEST = 12
+"""Axes that are drawn; of more the first."""
+
+
+def plot_evaluation(evaluation: Evaluation, path: str | Path | None = None) -> Figure:
+    """Draw an evaluation, the verdict as its title; written to `path` where one is given.
+
+    Above: the mean NEES of every step with its exact 95 % band, and the share of errors outside
+    ±3σ, axis by axis. Below: RMSE and claimed σ of every axis.
+    """
+    axes = min(len(evaluation.names), _WIDEST)
+    rows = -(-axes // _PER_ROW)
+    figure = new_figure(11.5, 3.9 + 1.9 * rows)
+    figure.suptitle(evaluation.headline, x=0.01, ha="left", fontsize=12, weight="bold")
+    grid = figure.add_gridspec(1 + rows, _PER_ROW, height_ratios=[1.6, *[1] * rows])
+    plot_nees(evaluation, ax=figure.add_subplot(grid[0, :2]))
+    plot_outside(evaluation, ax=figure.add_subplot(grid[0, 2]))
+    for axis in range(axes):
+        place = grid[1 + axis // _PER_ROW, axis % _PER_ROW]
+        plot_axis(evaluation, axis, ax=figure.add_subplot(place))
+    if path is not None:
+        save(figure, path)
+    return figure
+
+
+def plot_nees(
+    evaluation: Evaluation, *, ax: Axes, label: str | None = None, place: int = 0
+) -> Axes:
+    """Mean NEES over time with its exact 95 % band, at whose end the `label` stands.
+
+    For evaluations in the same axes `place` counts, for their colours.
+    """
+    style, (low, high) = line_style(place), evaluation.band95
+    ax.axhspan(low, high, color=GREY, alpha=0.25, lw=0)
+    ax.axhline(evaluation.dof, color=GREY, lw=0.8)
+    marker = "o" if evaluation.steps == 1 else None
+    ax.plot(evaluation.times, evaluation.mean, lw=1.8, marker=marker, **style)
+    if label is not None:
+        _at_end(ax, evaluation.times, evaluation.mean, label, style["color"])
+    ax.set_yscale("log")
+    bottom, top = ax.get_ylim()
+    ax.set_ylim(min(bottom, evaluation.dof / 2), max(top, evaluation.dof * 2))
+    name_decades(ax)
+    ax.set_ylabel(f"mean {evaluation.quantity} (ideal {evaluation.dof})")
+    many = f"{evaluation.runs} runs" if evaluation.runs > 1 else "one run"
+    ax.set_title(f"{evaluation.quantity} of {many}, grey: exact 95 % band of one step", fontsize=9)
+    return _over_time(evaluation, ax)
+
+
+def plot_outside(evaluation: Evaluation, *, ax: Axes, label: str | None = None) -> Axes:
+    """Share of the errors of every axis outside ±3σ, beside the .27 % of Gaussian ones."""
+    shares = 100 * evaluation.outside3sigma[:_WIDEST]
+    places = np.arange(len(shares))
+    ax.barh(places, shares, color=COLOURS[0], label=label)
+    for place, share in zip(places, shares, strict=True):
+        beyond = max(share, 100 * OUTSIDE)  # where the grey line hides no digit
+        ax.annotate(f"  {share:.2g} %", (beyond, place), va="center", fontsize=8)
+    ax.axvline(100 * OUTSIDE, color=GREY, lw=1.2)
+    ax.set_yticks(places, evaluation.names[:_WIDEST])
+    ax.invert_yaxis()
+    ax.set_xlim(0, max(1.25 * shares.max(), 1.0))
+    ax.set_xlabel("% of errors")
+    ax.set_title("outside ±3σ; grey line: 0.27 % of Gaussian errors", fontsize=9)
+    return ax
+
+
+def plot_axis(
+    evaluation: Evaluation, axis: int, *, ax: Axes, label: str | None = None, place: int = 0
+) -> Axes:
+    """RMSE (solid) and claimed σ (dashed) of one axis over time."""
+    colour, marker = line_style(place)["color"], "o" if evaluation.steps == 1 else None
+    rmse, sigma = evaluation.rmse[:, axis], evaluation.sigma[:, axis]
+    ax.plot(evaluation.times, rmse, lw=1.8, color=colour, marker=marker)
+    ax.plot(evaluation.times, sigma, lw=1.4, ls="--", color=colour, marker=marker)
+    if label is not None:
+        _at_end(ax, evaluation.times, rmse, label, colour)
+    ax.set_ylim(bottom=0)
+    if evaluation.convention is not None:
+        ax.set_ylabel("rad" if evaluation.names[axis].startswith("r") else "m, or map units")
+    ax.set_title(f"{evaluation.names[axis]}: RMSE (solid), σ claimed (dashed)", fontsize=9)
+    return _over_time(evaluation, ax)
+
+
+def _at_end(ax: Axes, times: np.ndarray, values: np.ndarray, label: str, colour: str) -> None:
+    ax.annotate(f" {label}", (times[-1], values[-1]), color=colour, va="center", fontsize=8)
+
+
+def _over_time(evaluation: Evaluation, ax: Axes) -> Axes:
+    ax.margins(x=0)
+    ax.set_xlabel("time, s" if evaluation.timed else "step")
+    ax.grid(alpha=0.25)
+    return ax

@@ -1,0 +1,394 @@
+"""Errors and covariances of anybody's filter: the verdict, the files, the command, bad input."""
+
+import json
+import time
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from cases import Case, quick_jit
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxslam
+from jaxslam.cli import main
+from jaxslam.consistency import normalised_squared, run_verdict
+from jaxslam.consistency.recursion import run_through
+from jaxslam.evaluation.arrays import ASYMMETRY
+from jaxslam.plots.evaluation import plot_axis, plot_evaluation, plot_nees, plot_outside
+from jaxslam.plots.style import new_figure
+from jaxslam.tum import write_tum
+
+KEYS = {
+    "schema", "version", "quantity", "runs", "steps", "dof", "time", "band95", "nees", "inside",
+    "verdict", "outside3sigma", "rmse", "sigma", "axis_verdict", "convention", "alignment",
+    "suggested", "identified", "notes",
+}  # fmt: skip
+
+
+def drawn(runs=60, steps=7, n=3, factor=1.0, seed=0):
+    """Errors, `factor` times as large as the covariances say, correlated axes."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(runs, steps, n, n)) + 2 * np.eye(n)
+    noise = factor * rng.normal(size=(runs, steps, n, 1))
+    return (root @ noise)[..., 0], root @ np.swapaxes(root, -1, -2)
+
+
+# --- the numbers --------------------------------------------------------------------------------
+
+
+def test_nees_verdict_and_shares_are_those_of_the_definitions():
+    e, P = drawn()
+    found = jaxslam.evaluate(e, P)
+    nees = np.einsum("rki,rkij,rkj->rk", e, np.linalg.inv(P), e)
+    np.testing.assert_allclose(found.nees, nees, rtol=1e-9)
+    assert found.verdict == run_verdict(found.nees, 3)
+    assert found.band95 == jaxslam.mean_band(3, 60)
+    np.testing.assert_allclose(found.mean, nees.mean(axis=0), rtol=1e-9)
+    sigma = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
+    np.testing.assert_allclose(found.rmse, np.sqrt((e**2).mean(axis=0)), rtol=1e-12)
+    np.testing.assert_allclose(found.sigma, np.sqrt((sigma**2).mean(axis=0)), rtol=1e-12)
+    np.testing.assert_array_equal(found.outside3sigma, (abs(e) > 3 * sigma).mean(axis=(0, 1)))
+
+
+@pytest.mark.parametrize(
+    ("factor", "word"), [(1.0, "consistent"), (1.3, "over-confident"), (0.8, "under-confident")]
+)
+def test_the_verdict_says_by_what_factor_sigma_is_wrong(factor, word):
+    found = jaxslam.evaluate(*drawn(runs=400, factor=factor))
+    assert found.verdict["word"] == word
+    low, high = found.verdict["interval99"]
+    assert low < factor < high
+    assert high - low < 0.1
+    for axis in range(3):
+        low, high = found.axis_verdict(axis)["interval99"]
+        assert low < factor < high
+    assert word in str(found)
+    assert word in found.headline
+
+
+def test_it_is_the_verdict_of_a_study_on_the_filter_of_a_study():
+    """NEES of other linear algebra, on the same errors and covariances: to rounding."""
+    case = Case("matched-tight", steps=6)
+    slam = case.filter("robocentric")
+
+    def told(state, innovation, frame):
+        e, P = slam.pose_error(state, frame.pose)
+        return e, P, normalised_squared(e, P)
+
+    runs = [case.run(i) for i in range(4)]
+    program = quick_jit(lambda run: run_through(slam, case.room, run, told)[1])
+    e, P, nees = (np.stack(x) for x in zip(*map(program, runs), strict=True))
+    found = jaxslam.evaluate(e, P)
+    np.testing.assert_allclose(found.nees, nees, rtol=1e-9)
+    theirs = run_verdict(nees, 3)
+    assert found.verdict["word"] == theirs["word"]
+    assert found.verdict["sigma_factor"] == pytest.approx(theirs["sigma_factor"], rel=1e-10)
+    # Of the same NEES every digit is the same.
+    assert replace(found, nees=nees).verdict == theirs
+
+
+def test_a_study_of_a_thousand_runs_takes_less_than_two_seconds():
+    e, P = drawn(1000, 60, 6)
+    start = time.perf_counter()
+    str(jaxslam.evaluate(e, P))
+    assert time.perf_counter() - start < 2
+
+
+def test_units_that_differ_by_twenty_powers_of_ten_do_not_matter():
+    e, P = drawn()
+    scale = np.array([1e-10, 1.0, 1e10])
+    found = jaxslam.evaluate(e * scale, P * scale * scale[:, None])
+    np.testing.assert_allclose(found.nees, jaxslam.evaluate(e, P).nees, rtol=1e-9)
+
+
+def test_innovations_have_a_nis():
+    found = jaxslam.evaluate(*drawn(), quantity="NIS")
+    assert found.headline.startswith("NIS ")
+    assert "NEES" not in str(found)
+    assert found.asdict()["quantity"] == "NIS"
+
+
+def test_one_run_has_a_verdict_without_an_interval():
+    e, P = drawn(runs=1, steps=30, factor=3.0)
+    verdict = jaxslam.evaluate(e, P).verdict
+    assert verdict["word"] == "over-confident"
+    assert verdict["interval99"] == [None, None]
+
+
+def test_steps_that_are_known_by_definition_are_left_out():
+    e, P = drawn()
+    e[:, 0], P[:, 0] = 0, 0
+    found = jaxslam.evaluate(e, P, times=np.arange(7) / 10)
+    assert found.steps == 6
+    assert found.times[0] == 0.1
+    assert "the first step is known exactly" in str(found)
+    np.testing.assert_array_equal(found.nees, jaxslam.evaluate(e[:, 1:], P[:, 1:]).nees)
+    e[3, 0, 1] = 0.2
+    with pytest.raises(ValueError, match=r"run 3, step 0 is zero, and its error is not: 0\.2"):
+        jaxslam.evaluate(e, P)
+    with pytest.raises(ValueError, match="all covariances are zero"):
+        jaxslam.evaluate(0 * e, 0 * P)
+
+
+def test_a_run_whose_nees_overflows_has_diverged():
+    e, P = drawn()
+    e[2] = 1e300
+    found = jaxslam.evaluate(e, P * 1e-100)
+    assert found.verdict["word"] == "lost"
+    assert found.verdict["diverged"] == 1
+    json.dumps(found.asdict(), allow_nan=False)
+
+
+# --- what is refused ----------------------------------------------------------------------------
+
+
+def changed(values, place, value):
+    values = np.array(values)
+    values[place] = value
+    return values
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda e, P: (e[0], P), r"errors must be an array \(runs, steps, n\), .*errors\[None\]"),
+        (lambda e, P: (e, P[:, :3]), r"covariances must be \(60, 7, 3, 3\), not \(60, 3, 3, 3\)"),
+        (lambda e, P: (e, P[..., 0]), r"covariances must be an array \(runs, steps, n, n\)"),
+        (lambda e, P: (changed(e, (4, 2, 1), np.nan), P), "errors of run 4, step 2 holds nan"),
+        (lambda e, P: (e, changed(P, (5, 1, 0, 0), np.inf)), "covariances of run 5, step 1 holds"),
+        (
+            lambda e, P: (e, changed(P, (3, 4), -np.eye(3))),
+            "run 3, step 4 has variance -1 at place 0",
+        ),
+        (
+            lambda e, P: (e, changed(P, (3, 4, 0, 1), 9.0)),
+            r"run 3, step 4 is not symmetric .*a symmetric, positive definite one is accepted",
+        ),
+        (
+            lambda e, P: (e, changed(P, (6, 5), np.ones((3, 3)) + 1e-3 * np.eye(3) - 5e-3)),
+            "",
+        ),
+        (
+            lambda e, P: (e, changed(P, (6, 5), 2 * np.ones((3, 3)) - np.diag([1.0, 1, 1]))),
+            "run 6, step 5 has an eigenvalue",
+        ),
+        (lambda e, P: (e, changed(P, (6, 5), np.zeros((3, 3)))), "run 6, step 5 "),
+        (lambda e, P: (e[:0], P[:0]), r"errors must be an array .*, not \(0, 7, 3\)"),
+        (lambda e, P: ("many", P), "errors must be numbers"),
+        (lambda e, P: (e.astype(complex), P), "errors must be numbers"),
+        (lambda e, P: ([[1.0, 2.0], [3.0]], P), "errors must be numbers"),
+    ],
+)
+def test_arrays_that_make_no_sense_are_refused_by_run_and_step(change, message):
+    e, P = change(*drawn())
+    if not message:
+        assert jaxslam.evaluate(e, P).runs == 60  # nearly singular, but positive
+        return
+    with pytest.raises(ValueError, match=message):
+        jaxslam.evaluate(e, P)
+
+
+def test_rounding_of_a_text_is_no_asymmetry():
+    e, P = drawn()
+    P[..., 0, 1] *= 1 + ASYMMETRY / 100
+    jaxslam.evaluate(e, P)
+
+
+@pytest.mark.parametrize("times", [[1, 2, 3], np.full(7, np.nan), [0, 1, 2, 3, 2, 5, 6], "soon"])
+def test_times_are_one_a_step_and_do_not_decrease(times):
+    with pytest.raises(ValueError, match="times must be 7 finite seconds"):
+        jaxslam.evaluate(*drawn(), times=times)
+
+
+@pytest.mark.parametrize("names", [["x"], ["x", "x", "y"]])
+def test_names_are_one_an_axis(names):
+    with pytest.raises(ValueError, match="names must be 3 different ones"):
+        jaxslam.evaluate(*drawn(), names=names)
+
+
+def tried(function):
+    """What a function returns, or what its ValueError says; no other is one of the user's."""
+    try:
+        return function(), ""
+    except ValueError as error:
+        return None, str(error)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_whatever_the_arrays_there_is_a_valid_result_or_one_clear_line(data):
+    number = st.floats(allow_nan=True, allow_infinity=True) | st.integers(-3, 3)
+    shape = data.draw(st.tuples(*[st.integers(0, 3)] * 3))
+    size = int(np.prod(shape))
+    e = np.reshape(data.draw(st.lists(number, min_size=size, max_size=size)), shape)
+    other = (*shape[:2], *[data.draw(st.integers(0, 3) | st.just(shape[2]))] * 2)
+    size = int(np.prod(other))
+    P = np.reshape(data.draw(st.lists(number, min_size=size, max_size=size)), other)
+    if data.draw(st.booleans()) and P.shape[-1]:
+        P = np.einsum("...ij,...kj->...ik", np.clip(np.nan_to_num(P), -1e9, 1e9), P)
+    with np.errstate(all="ignore"):
+        found, told = tried(lambda: jaxslam.evaluate(e, P))
+    if found is None:
+        assert told
+        assert "\n" not in told
+        return
+    assert not np.isnan(found.nees).any()
+    json.dumps(found.asdict(), allow_nan=False)
+    assert str(found)
+
+
+# --- files and the command ----------------------------------------------------------------------
+
+
+def test_the_command_writes_what_others_read(tmp_path, capsys):
+    e, P = drawn(factor=1.4)
+    np.savez(tmp_path / "runs.npz", errors=e, covariances=P, names=["x", "y", "θ"])
+    main(["evaluate", str(tmp_path / "runs.npz"), "--out", str(tmp_path / "out")])
+    written = json.loads((tmp_path / "out" / "evaluation.json").read_text())
+    assert written.keys() >= KEYS
+    assert written["schema"] == 1
+    assert written["verdict"]["word"] == "over-confident"
+    assert len(written["nees"]) == written["steps"] == 7
+    assert set(written["outside3sigma"]) == {"x", "y", "θ"}
+    assert len(written["rmse"]["θ"]) == len(written["sigma"]["x"]) == 7
+    assert written["convention"] is None
+    assert written["suggested"] is None
+    assert (tmp_path / "out" / "evaluation.png").read_bytes().startswith(b"\x89PNG")
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"evaluation.json", "evaluation.png"}
+    out = capsys.readouterr().out
+    assert out.startswith("NEES ")
+    assert "over-confident" in out
+
+
+def as_csv(path, e, P, header=""):
+    rows, columns = np.triu_indices(e.shape[-1])
+    runs, steps = np.indices(e.shape[:2])
+    table = [runs[..., None], steps[..., None], e, P[..., rows, columns]]
+    lines = np.concatenate(table, axis=-1).reshape(-1, 2 + e.shape[-1] + len(rows))
+    np.savetxt(path, lines[::-1], delimiter=",", fmt="%.17g", header=header, comments="")
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_a_csv_file_is_the_same_as_its_arrays_in_any_order_of_lines(tmp_path, n):
+    e, P = drawn(runs=5, n=n)
+    names = [f"e{i}" for i in range(n)]
+    rest = [f"P{i}" for i in range(n * (n + 1) // 2)]
+    as_csv(tmp_path / "log.csv", e, P, ",".join(["run", "step", *names, *rest]))
+    found = jaxslam.evaluate_log(tmp_path / "log.csv")
+    np.testing.assert_allclose(found.nees, jaxslam.evaluate(e, P).nees, rtol=1e-12)
+    assert found.names == tuple(names)
+    as_csv(tmp_path / "bare.csv", e, P)
+    assert jaxslam.evaluate_log(tmp_path / "bare.csv", nis=True).quantity == "NIS"
+
+
+def lines(*rows):
+    return "".join(",".join(map(str, row)) + "\n" for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.csv", lines((0, 0, 1.0, 1.0), (0, 1, 1.0)), "line 2: numbers run, step, n errors"),
+        ("a.csv", lines((0, 0, 1.0, 1.0, 3.0)), "5 columns; numbers run, step"),
+        ("a.csv", lines((0, 0, 1.0, 1.0), (0, 0, 2.0, 1.0)), "line 2: run 0, step 0 comes twice"),
+        ("a.csv", lines((0, 0, 1, 1), (0, 1, 1, 1), (1, 0, 1, 1)), "run 1 has 1 of 2 steps"),
+        ("a.csv", lines((0, 0, "nan", 1.0)), "line 1: numbers run"),
+        ("a.csv", lines((0, 0, 1.0, -1.0)), "run 0, step 0 has variance -1"),
+        ("a.csv", "", "holds no errors"),
+        ("a.csv", "run,step,e,P\n", "holds no errors"),
+        ("a.npz", "nonsense", "not an npz file"),
+        ("a.npz", "", "not an npz file"),
+        ("missing.npz", None, "no such file or folder"),
+        ("estimate.txt", "0 0 0 0 0 0 0 1\n", "needs a covariance file"),
+    ],
+)
+def test_a_file_that_makes_no_sense_ends_with_status_2_and_one_line(
+    name, content, message, tmp_path, capsys
+):
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    refused([str(tmp_path / name)], message, tmp_path, capsys)
+
+
+def refused(arguments, message, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["evaluate", *arguments, "--out", str(tmp_path / "out")])
+    error = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"errors": np.ones((1, 1, 1))}, "errors and covariances"),
+        ({"eror": np.ones((1, 1, 1))}, "unknown array 'eror' (did you mean error?)"),
+        ({"errors": np.array([None])}, "not an npz file of numbers"),
+        ({"errors": np.ones((1, 1, 1)), "covariances": np.array("many")}, "must be numbers"),
+        ({"errors": 1, "innovations": 1, "covariances": 1}, "holds errors, innovations"),
+        ({"estimates": np.ones((1, 1, 4, 4)), "covariances": 1.0}, "covariances and truths"),
+    ],
+)
+def test_arrays_under_other_names_are_refused(arrays, message, tmp_path, capsys):
+    np.savez(tmp_path / "a.npz", **arrays)
+    refused([str(tmp_path / "a.npz")], message, tmp_path, capsys)
+
+
+def test_options_that_do_not_go_together_are_refused(tmp_path, capsys):
+    e, P = drawn()
+    np.savez(tmp_path / "a.npz", errors=e, covariances=P)
+    arrays = str(tmp_path / "a.npz")
+    refused(
+        [arrays, "--error", "left"], "conventions and alignments are of poses", tmp_path, capsys
+    )
+    refused([arrays, "--truth", arrays], "a truth file goes with a trajectory", tmp_path, capsys)
+    write_tum(tmp_path / "t.txt", [0.0], np.eye(4)[None])
+    for_poses = [str(tmp_path / "t.txt"), "--nis"]
+    refused(for_poses, "innovations come in an npz or CSV file", tmp_path, capsys)
+
+
+def test_a_folder_that_cannot_be_made_is_a_mistake_of_one_line(tmp_path, capsys):
+    e, P = drawn()
+    np.savez(tmp_path / "a.npz", errors=e, covariances=P)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SystemExit) as stop:
+        main(["evaluate", str(tmp_path / "a.npz"), "--out", str(tmp_path / "file")])
+    assert stop.value.code == 2
+    assert "cannot write there" in capsys.readouterr().err
+
+
+# --- the figure ---------------------------------------------------------------------------------
+
+
+def test_the_figure_has_the_verdict_as_its_title(tmp_path):
+    found = jaxslam.evaluate(*drawn(n=14))
+    figure = plot_evaluation(found, tmp_path / "evaluation.png")
+    assert figure.get_suptitle() == found.headline
+    assert len(figure.axes) == 2 + 12
+    assert (tmp_path / "evaluation.png").stat().st_size > 10_000
+
+
+def test_two_filters_share_axes_with_labels_at_the_ends_of_their_lines():
+    figure = new_figure(4, 3)
+    axes = figure.subplots(1, 3)
+    for place, (label, factor) in enumerate({"mine": 1.0, "theirs": 2.0}.items()):
+        found = jaxslam.evaluate(*drawn(factor=factor), times=np.arange(7.0))
+        assert plot_nees(found, ax=axes[0], label=label, place=place) is axes[0]
+        plot_axis(found, 1, ax=axes[1], label=label, place=place)
+        plot_outside(found, ax=axes[2], label=label)
+    for ax in axes[:2]:
+        told = {text.get_text().strip() for text in ax.texts}
+        assert told == {"mine", "theirs"}
+    assert axes[0].get_xlabel() == "time, s"
+    colours = {line.get_color() for line in axes[1].lines}
+    assert len(colours) == 2
+
+
+def test_nothing_is_left_on_in_jax():
+    before = dict(jax.config.values)
+    jaxslam.evaluate(*drawn())
+    assert dict(jax.config.values) == before

@@ -1,0 +1,595 @@
+"""Poses against the truth: conventions, their checker, alignments, text, folders of runs."""
+
+import json
+import sys
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+import jaxslam
+from jaxslam.cli import main
+from jaxslam.consistency import Tally
+from jaxslam.evaluation import Convention, converted, pose_errors
+from jaxslam.evaluation.alignment import (
+    Similarity,
+    associated,
+    gauge_directions,
+    projected,
+    similarity,
+)
+from jaxslam.evaluation.convention import CHOICES, alternatives, change, from_right
+from jaxslam.evaluation.covariance_text import read_covariances, write_covariances
+from jaxslam.evaluation.identify import identify
+from jaxslam.geometry import PLANAR, SPATIAL, difference
+from jaxslam.tum import write_tum
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+
+import conventions as benchmark
+
+EVERY = [Convention(*c) for c in product(*list(CHOICES.values())[:3])]
+FALSE_ALARM = 1e-4
+
+
+def some(geometry, shape, seed=0, spread=1.0):
+    """Poses (…, d, d)."""
+    rng = np.random.default_rng(seed)
+    size = int(np.prod(shape))
+    group, t = geometry.group, geometry.tangent_dim
+    T = jax.vmap(lambda x: group.exp(x).as_matrix())(
+        jnp.asarray(spread * rng.normal(size=(size, t)))
+    )
+    return np.asarray(T).reshape(*shape, *T.shape[1:])
+
+
+def covariance(t, seed=0, size=0.05):
+    root = np.diag(size * 10 ** np.linspace(-1, 0, t)) @ (
+        np.eye(t) + 0.3 * np.random.default_rng(seed).normal(size=(t, t))
+    )
+    return root @ root.T
+
+
+def logged(convention, geometry=SPATIAL, runs=40, steps=6, seed=0, spread=1.0, factor=1.0):
+    """Poses, covariances and truths whose errors in the convention are drawn from them."""
+    T, t = some(geometry, (runs, steps), seed, spread), geometry.tangent_dim
+    P = np.broadcast_to(covariance(t), (runs, steps, t, t))
+    noise = np.random.default_rng(seed + 1).normal(size=(runs, steps, t))
+    errors = factor * noise @ np.linalg.cholesky(covariance(t)).T
+    return T, P, benchmark.displaced(T, errors, convention)
+
+
+def consistent(nees, dof):
+    """Whether a sum of independent NEES is χ², up to a false alarm in 10 000."""
+    low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], nees.size * dof)
+    return low < nees.sum() < high
+
+
+# --- conventions --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("geometry", [PLANAR, SPATIAL])
+def test_right_and_left_errors_are_those_of_the_group(geometry):
+    T, truth = some(geometry, (5,)), some(geometry, (5,), 1, 0.5)
+    of = geometry.group.from_matrix
+    for i in range(5):
+        right = difference(of(jnp.asarray(truth[i])), of(jnp.asarray(T[i])))
+        np.testing.assert_allclose(pose_errors(Convention(), T, truth)[i], right, atol=1e-12)
+        left = of(jnp.asarray(truth[i] @ np.linalg.inv(T[i]))).log()
+        np.testing.assert_allclose(pose_errors(Convention("left"), T, truth)[i], left, atol=1e-9)
+
+
+def test_the_split_error_is_what_ros_and_error_state_filters_have():
+    T, truth = some(SPATIAL, (5,)), some(SPATIAL, (5,), 1)
+    R, true = T[:, :3, :3], truth[:, :3, :3]
+    position = truth[:, :3, 3] - T[:, :3, 3]
+    world = Rotation.from_matrix(true @ np.swapaxes(R, 1, 2)).as_rotvec()
+    body = Rotation.from_matrix(np.swapaxes(R, 1, 2) @ true).as_rotvec()
+    for axes, turn in (("world", world), ("mixed", body)):
+        expected = np.hstack([position, turn])
+        found = pose_errors(Convention("split", axes), T, truth)
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+        found = pose_errors(Convention("split", axes, "rotation-first"), T, truth)
+        np.testing.assert_allclose(found, np.roll(expected, 3, axis=1), atol=1e-9)
+    in_body = np.einsum("nji,nj->ni", R, position)
+    found = pose_errors(Convention("split", "body"), T, truth)
+    np.testing.assert_allclose(found, np.hstack([in_body, body]), atol=1e-9)
+
+
+@pytest.mark.parametrize("geometry", [PLANAR, SPATIAL])
+@pytest.mark.parametrize("convention", EVERY, ids=str)
+def test_the_change_of_a_convention_is_the_derivative_of_its_error(convention, geometry):
+    T, t, step = some(geometry, (2,)), geometry.tangent_dim, 1e-6
+    J = np.stack(
+        [
+            pose_errors(convention, T, benchmark.displaced(T, np.tile(d, (2, 1)), Convention()))
+            for d in step * np.eye(t)
+        ],
+        axis=-1,
+    )
+    np.testing.assert_allclose(J / step, from_right(convention, T), atol=1e-5)
+    np.testing.assert_allclose(abs(np.linalg.det(from_right(convention, T))), 1, rtol=1e-9)
+
+
+@pytest.mark.parametrize("convention", EVERY, ids=str)
+def test_a_filter_that_is_right_is_consistent_in_its_own_convention(convention):
+    """Exactly, by construction, whatever the size of the errors."""
+    T, P, truth = logged(convention)
+    found = jaxslam.evaluate_poses(T, P, truth, convention)
+    assert consistent(found.nees, 6)
+    assert found.names[0] == ("x" if convention.order == "position-first" else "rx")
+    assert found.identified is not None
+    assert convention in found.identified.consistent or found.verdict["word"] != "consistent"
+
+
+def test_conversion_to_another_convention_and_back_changes_nothing():
+    T, P = some(SPATIAL, (4,)), np.broadcast_to(covariance(6), (4, 6, 6))
+    for new in EVERY:
+        there = converted(P, T, EVERY[0], new)
+        np.testing.assert_allclose(converted(there, T, new, EVERY[0]), P, atol=1e-12)
+        J = change(T, EVERY[0], new)
+        np.testing.assert_allclose(there, J @ P @ np.swapaxes(J, 1, 2), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ({"error": "lfet"}, "unknown error 'lfet' .did you mean left"),
+        ({"axes": "camera"}, "unknown axes 'camera'; known: body, world, mixed"),
+        ({"order": "xyz"}, "unknown order"),
+        ({"scale": "free"}, "unknown scale"),
+    ],
+)
+def test_words_of_a_convention_that_are_not_known_are_refused(word, message):
+    with pytest.raises(ValueError, match=message):
+        Convention(**word)
+
+
+# --- the checker --------------------------------------------------------------------------------
+
+
+def test_the_checker_is_right_in_95_of_100_constructed_cases():
+    """And never guesses: the first of the benchmark's two hundred."""
+    said = [benchmark.judged(benchmark.constructed(number, 50)) for number in range(20)]
+    assert said.count("right") >= 19
+    assert said.count("guessed") == 0
+
+
+def test_a_wrong_convention_is_doubted_and_the_right_one_suggested():
+    true, stated = Convention("left", order="rotation-first"), Convention("right")
+    found = jaxslam.evaluate_poses(*logged(true), stated)
+    assert found.suggested == true
+    assert found.asdict()["suggested"]["order"] == "rotation-first"
+    assert "is doubtful: only with error=left axes=world order=rotation-first" in str(found)
+    found = jaxslam.evaluate_poses(*logged(true), true)
+    assert found.suggested is None
+    assert "is the only one that makes the data consistent" in str(found)
+
+
+def test_nothing_is_said_where_conventions_cannot_be_told():
+    T, _, _ = logged(Convention(), spread=0.0)
+    P = np.broadcast_to(1e-4 * np.eye(6), (*T.shape[:2], 6, 6))
+    noise = 1e-2 * np.random.default_rng(0).normal(size=(*T.shape[:2], 6))
+    found = jaxslam.evaluate_poses(T, P, benchmark.displaced(T, noise, Convention()))
+    assert found.identified is not None
+    assert found.identified.convention is None
+    assert set(found.identified.consistent) == set(alternatives(Convention(), SPATIAL))
+    assert "cannot be told from" in str(found)
+    assert "; and 8 more" in str(found)
+
+
+def test_one_run_tells_no_convention():
+    found = jaxslam.evaluate_poses(*logged(Convention("left"), runs=1, steps=50))
+    assert found.suggested is None
+    assert "1 run of 50 steps" in str(found)
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.5])
+def test_where_sigma_is_wrong_no_convention_is_blamed(factor):
+    found = jaxslam.evaluate_poses(*logged(Convention(), factor=factor))
+    assert found.identified is not None
+    assert found.identified.consistent == ()
+    assert "no other convention" in str(found)
+
+
+def test_the_checker_asks_for_differences_beyond_scatter_and_of_some_size():
+    rng = np.random.default_rng(0)
+    nees = rng.chisquare(6, size=(50, 10))
+    a, b, c = (Convention(error) for error in ("right", "left", "split"))
+    assert identify(a, {a: nees, b: 1.03 * nees}, 6).convention is None
+    assert identify(b, {a: nees, b: 1.2 * nees}, 6).convention == a
+    noisy = nees + rng.normal(0.5, 20, size=(50, 10))
+    assert identify(a, {a: nees, c: noisy}, 6).consistent == (a, c)
+
+
+def test_a_covariance_given_the_scale_is_found_where_the_truth_has_another():
+    T, P, truth = logged(Convention("split", "body"))
+    truth = truth.copy()
+    truth[..., :3, 3] *= 1.7
+    found = jaxslam.evaluate_poses(T, P, truth, Convention("split", "body"))
+    assert found.suggested == Convention("split", "body", scale="given")
+    given = jaxslam.evaluate_poses(T, P, truth, found.suggested)
+    assert given.dof == 5
+    # The scale of small displacements is not affine, nor are errors exactly Gaussian.
+    assert given.verdict["word"] == "consistent"
+    assert "given the scale" in str(given)
+    for axis in range(6):
+        assert given.axis_verdict(axis)["word"] in (
+            "consistent",
+            "under-confident",
+            "over-confident",
+        )
+
+
+# --- alignment ----------------------------------------------------------------------------------
+
+MOTION = Similarity(Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix(), np.array([5.0, -3, 1]), 1.0)
+
+
+def elsewhere(T, P, convention, motion):
+    """The estimate in another world, with its covariance there."""
+    shape = T.shape
+    flat, flat_P = T.reshape(-1, 4, 4), P.reshape(-1, 6, 6)
+    moved = motion.moved_covariances(flat_P, flat, convention)
+    return motion.moved(flat).reshape(shape), moved.reshape(P.shape)
+
+
+@pytest.mark.parametrize("convention", EVERY[::5], ids=str)
+@pytest.mark.parametrize("scale", [1.0, 0.3])
+def test_alignment_by_all_positions_undoes_a_motion_of_the_world(convention, scale):
+    T, P, truth = logged(convention, runs=4, steps=12, spread=2.0)
+    align = "se3" if scale == 1 else "sim3"
+    moved = elsewhere(T, P, convention, MOTION._replace(scale=scale))
+    here = jaxslam.evaluate_poses(T, P, truth, convention, align=align)
+    there = jaxslam.evaluate_poses(*moved, truth, convention, align=align)
+    np.testing.assert_allclose(there.nees, here.nees, rtol=1e-6)
+    np.testing.assert_allclose(there.rmse, here.rmse, rtol=1e-6)
+    np.testing.assert_allclose(there.sigma, here.sigma, rtol=1e-6)
+
+
+def test_a_moved_covariance_is_that_of_moved_errors():
+    """Drawn errors, moved as poses are: their covariance is the one that was transported."""
+    convention, motion = Convention("left", "body", "rotation-first"), MOTION._replace(scale=2.5)
+    T = np.tile(some(SPATIAL, (1,)), (1, 40_000, 1, 1))
+    P = 1e-4 * covariance(6)
+    noise = np.random.default_rng(0).normal(size=(1, 40_000, 6)) @ np.linalg.cholesky(P).T
+    truth = benchmark.displaced(T, noise, convention)
+    errors = pose_errors(convention, motion.moved(T), motion.moved(truth))[0]
+    expected = motion.moved_covariances(P[None], T[0, :1], convention)[0]
+    sigma = np.sqrt(np.diag(expected))
+    # Of 40 000 draws the correlations scatter by .005.
+    np.testing.assert_allclose(
+        np.cov(errors.T) / sigma / sigma[:, None], expected / sigma / sigma[:, None], atol=0.03
+    )
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+def test_the_oblique_projection_is_what_alignment_does_to_errors(scaled):
+    """A joint covariance with most of its errors common to all poses, as a SLAM's: the NEES of
+    aligned poses is χ² with the projected covariance, and far too small with the first one."""
+    convention, steps, runs = Convention("split", "world"), 6, 40
+    T = np.tile(some(SPATIAL, (1, steps), 3, 2.0), (runs, 1, 1, 1))
+    U = gauge_directions(T[0], scaled=scaled).reshape(6 * steps, -1)
+    own = np.kron(np.eye(steps), 1e-6 * np.diag([1, 4, 9, 1, 2, 3]))
+    joint = own + 1e-4 * U @ U.T
+    noise = np.random.default_rng(5).normal(size=(runs, 6 * steps)) @ np.linalg.cholesky(joint).T
+    truth = benchmark.displaced(T, noise.reshape(runs, steps, 6), convention)
+    align = "sim3" if scaled else "se3"
+    joints = np.broadcast_to(joint, (runs, *joint.shape))
+    found = jaxslam.evaluate_poses(T, joints, truth, convention, align=align)
+    for step in range(steps):
+        assert consistent(found.nees[:, step], 6)
+    assert "joint covariance projected" in str(found)
+    blocks = found.sigmas[0] ** 2
+    assert blocks.mean() < 0.1 * np.diag(joint).mean()
+
+
+def test_the_projected_covariance_of_independent_errors_is_the_joint_ones():
+    T, P = some(SPATIAL, (5,), 2), np.stack([covariance(6, seed) for seed in range(5)])
+    joint = np.zeros((30, 30))
+    for k in range(5):
+        joint[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = P[k]
+    for convention in EVERY[::4]:
+        one, other = (projected(T, x, convention, scaled=True) for x in (P, joint))
+        np.testing.assert_allclose(one, other, atol=1e-12)
+    U = gauge_directions(T, scaled=True)
+    V = U.copy()
+    V[:, 3:] = 0
+    split = Convention("split", "world")
+    Q = (
+        np.eye(30)
+        - U.reshape(30, 7)
+        @ np.linalg.inv(V.reshape(30, 7).T @ U.reshape(30, 7))
+        @ V.reshape(30, 7).T
+    )
+    whole = Q @ joint @ Q.T
+    for k in range(5):
+        block = whole[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
+        np.testing.assert_allclose(projected(T, P, split, scaled=True)[k], block, atol=1e-12)
+
+
+@pytest.mark.parametrize("convention", [Convention("left"), Convention("split")])
+def test_an_estimate_that_begins_at_a_known_pose_is_aligned_there(convention):
+    T, P, truth = logged(convention)
+    P, truth = P.copy(), truth.copy()
+    P[:, 0], truth[:, 0] = 0, T[:, 0]
+    here = jaxslam.evaluate_poses(T, P, truth, convention)
+    moved = elsewhere(T, P, convention, MOTION)
+    there = jaxslam.evaluate_poses(*moved, truth, convention, align="se3")
+    assert there.steps == 5
+    np.testing.assert_allclose(there.nees, here.nees, rtol=1e-6)
+    assert "aligned by the first pose" in str(there)
+    assert consistent(there.nees, 6)
+    larger = elsewhere(T, P, convention, MOTION._replace(scale=3.0))
+    free = jaxslam.evaluate_poses(*larger, truth, convention, align="sim3")
+    assert free.dof == 5
+    assert (free.nees <= there.nees * (1 + 1e-6)).all()
+    assert consistent(free.nees, 5)
+
+
+def test_given_the_scale_and_se3_go_together_only_where_the_first_pose_is_known():
+    with pytest.raises(ValueError, match="aligned by sim3, or by se3 where the first is zero"):
+        jaxslam.evaluate_poses(*logged(Convention()), Convention(scale="given"), align="se3")
+    with pytest.raises(ValueError, match="unknown align 'rigid'; known: none, se3, sim3"):
+        jaxslam.evaluate_poses(*logged(Convention()), align="rigid")
+
+
+def test_positions_in_one_place_cannot_be_aligned():
+    T, P, _ = logged(Convention(), spread=0.0)
+    with pytest.raises(ValueError, match="in one place"):
+        jaxslam.evaluate_poses(T, P, np.tile(np.eye(4), (*T.shape[:2], 1, 1)), align="sim3")
+
+
+def test_pairs_and_fits_are_those_of_evo():
+    core = pytest.importorskip("evo.core.geometry")
+    sync = pytest.importorskip("evo.core.sync")
+    trajectory = pytest.importorskip("evo.core.trajectory")
+    rng = np.random.default_rng(0)
+    for seed in range(20):
+        n, m = rng.integers(3, 40, size=2)
+        a, b = (np.sort(rng.uniform(0, 0.1, size)) for size in (n, m))
+
+        def evos(times):
+            still = np.tile([1.0, 0, 0, 0], (len(times), 1))
+            return trajectory.PoseTrajectory3D(np.zeros((len(times), 3)), still, times)
+
+        ours, theirs = associated(a, b)
+        first, second = sync.associate_trajectories(evos(a), evos(b), max_diff=0.01)
+        np.testing.assert_array_equal(a[ours], first.timestamps)
+        np.testing.assert_array_equal(b[theirs], second.timestamps)
+        x, y = rng.normal(size=(2, 10, 3))
+        for scaled in (False, True):
+            R, t, s = core.umeyama_alignment(x.T, y.T, scaled)
+            found = similarity(x, y, scaled=scaled)
+            np.testing.assert_allclose(found.rotation, R, atol=1e-9, err_msg=str(seed))
+            np.testing.assert_allclose(found.translation, t, atol=1e-9)
+            assert found.scale == pytest.approx(s)
+
+
+# --- text and folders ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("convention", [*EVERY[::3], Convention(scale="given")], ids=str)
+def test_a_covariance_file_says_its_convention(tmp_path, convention):
+    P = np.stack([covariance(6, seed) for seed in range(3)])
+    write_covariances(tmp_path / "c.txt", [0, 0.5, 1], P, convention, remark="by me; all of it")
+    found = read_covariances(tmp_path / "c.txt")
+    np.testing.assert_allclose(found.covariances, P, rtol=1e-9)
+    np.testing.assert_array_equal(found.times, [0, 0.5, 1])
+    assert found.convention == convention
+    assert (tmp_path / "c.txt").read_text().count("#") == 1
+
+
+def upper(P):
+    return " ".join(str(x) for x in P[np.triu_indices(6)])
+
+
+def test_a_covariance_file_by_others_may_be_in_degrees_and_say_little(tmp_path):
+    path, P = tmp_path / "c.txt", covariance(6)
+    path.write_text(f"# made by my filter\n# angle=deg order=rotation-first\n\n0, {upper(P)}\n")
+    found = read_covariances(path)
+    unit = np.repeat([np.pi / 180, 1.0], 3)
+    np.testing.assert_allclose(found.covariances[0], P * unit * unit[:, None], rtol=1e-12)
+    assert found.said == {"order": "rotation-first"}
+    path.write_text(f"0 {upper(P)}\n")
+    assert read_covariances(path).convention == Convention()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0 1 2 3\n", "line 1: 22 finite numbers"),
+        ("# a\n" + "nan " * 22, "line 2: 22 finite numbers"),
+        ("# error=lfet\n" + "1 " * 22, r"unknown error 'lfet' \(did you mean left\?\)"),
+        ("# eror=left\n" + "1 " * 22, r"unknown key 'eror' in the header \(did you mean error\?\)"),
+        ("# angle=grad\n" + "1 " * 22, "unknown angle 'grad'"),
+        ("#\n", "holds no covariances"),
+    ],
+)
+def test_bad_covariance_files_are_refused_by_name(tmp_path, text, message):
+    (tmp_path / "c.txt").write_text(text)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_covariances(tmp_path / "c.txt")
+    assert str(tmp_path / "c.txt") in str(caught.value)
+
+
+def write_runs(folder, T, P, truth, convention, times=None):
+    times = np.arange(T.shape[1]) / 10 if times is None else times
+    for run in range(len(T)):
+        own = folder / f"run{run:02}"
+        own.mkdir(parents=True)
+        write_tum(own / "estimate.txt", times, T[run])
+        write_covariances(own / "covariance.txt", times, P[run], convention)
+        write_tum(own / "truth.txt", times + 0.004, truth[run])
+
+
+def test_a_folder_of_runs_is_its_arrays(tmp_path, capsys):
+    convention = Convention("split", "mixed", "rotation-first")
+    T, P, truth = logged(convention, runs=12)
+    write_runs(tmp_path / "runs", T, P, truth, convention)
+    main(["evaluate", str(tmp_path / "runs"), "--out", str(tmp_path)])
+    written = json.loads((tmp_path / "evaluation.json").read_text())
+    arrays = jaxslam.evaluate_poses(T, P, truth, convention)
+    # Nine decimals of poses whose least σ is 5e-3.
+    np.testing.assert_allclose(written["nees"], arrays.mean, rtol=1e-4)
+    assert written["convention"] == {
+        "error": "split", "axes": "mixed", "order": "rotation-first", "scale": "marginal",
+    }  # fmt: skip
+    assert written["time"] == pytest.approx(np.arange(6) / 10)
+    assert list(written["rmse"]) == ["rx", "ry", "rz", "x", "y", "z"]
+    capsys.readouterr()
+    one = tmp_path / "runs" / "run03"
+    arguments = [str(one / "estimate.txt"), "--covariance", str(one / "covariance.txt")]
+    arguments += ["--truth", str(one / "truth.txt"), "--out", str(tmp_path / "one")]
+    main(["evaluate", *arguments])
+    single = json.loads((tmp_path / "one" / "evaluation.json").read_text())
+    np.testing.assert_allclose(single["nees"], arrays.nees[3], rtol=1e-4)
+    # What is stated comes before what the file says.
+    main(["evaluate", *arguments, "--error", "left", "--order", "position-first"])
+    assert capsys.readouterr().out.startswith("NEES ")
+    stated = json.loads((tmp_path / "one" / "evaluation.json").read_text())["convention"]
+    assert stated == {
+        "error": "left", "axes": "world", "order": "position-first", "scale": "marginal",
+    }  # fmt: skip
+
+
+def test_poses_in_arrays_are_those_in_files(tmp_path):
+    T, P, truth = logged(Convention("left"), runs=3)
+    np.savez(tmp_path / "a.npz", estimates=T, covariances=P, truths=truth, error="left")
+    found = jaxslam.evaluate_log(tmp_path / "a.npz")
+    assert found.convention == Convention("left")
+    np.testing.assert_array_equal(
+        found.nees, jaxslam.evaluate_poses(T, P, truth, Convention("left")).nees
+    )
+
+
+def test_runs_of_unlike_length_are_compared_as_far_as_all_go(tmp_path):
+    T, P, truth = logged(Convention(), runs=3)
+    write_runs(tmp_path, T, P, truth, Convention())
+    write_tum(tmp_path / "run01" / "truth.txt", np.arange(4) / 10, truth[1, :4])
+    found = jaxslam.evaluate_log(tmp_path)
+    assert found.steps == 4
+    assert "2 of 18 poses have no truth within 0.01 s" in str(found)
+    assert "runs have 4 to 6 steps; the first 4 are compared" in str(found)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda f: (f / "run01" / "truth.txt").unlink(), "run01: holds no truth.txt"),
+        (lambda f: (f / "run00" / "estimate.txt").unlink(), "run00: holds no estimate.txt"),
+        (
+            lambda f: write_tum(f / "run01" / "truth.txt", [99.0], np.eye(4)[None]),
+            "no time stamps in common within 0.01 s",
+        ),
+        (
+            lambda f: write_covariances(
+                f / "run01" / "covariance.txt", [0.0], np.eye(6)[None], Convention("left")
+            ),
+            "says another convention",
+        ),
+        (lambda f: (f / "run01" / "covariance.txt").write_bytes(b"\xff\xfe"), "not a text file"),
+        (
+            lambda f: write_covariances(
+                f / "run01" / "covariance.txt", [0.0], -np.eye(6)[None], Convention()
+            ),
+            "run 1, step 0 has variance -1",
+        ),
+    ],
+)
+def test_a_folder_with_a_fault_ends_with_status_2_and_one_line(spoil, message, tmp_path, capsys):
+    T, P, truth = logged(Convention(), runs=2)
+    write_runs(tmp_path / "runs", T, P, truth, Convention())
+    spoil(tmp_path / "runs")
+    with pytest.raises(SystemExit) as stop:
+        main(["evaluate", str(tmp_path / "runs"), "--out", str(tmp_path / "out")])
+    error = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_empty_folder_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"holds neither estimate\.txt nor sub-folders"):
+        jaxslam.evaluate_log(tmp_path)
+
+
+def test_poses_that_are_none_are_refused_by_run_and_step():
+    T, P, truth = logged(Convention(), runs=3)
+    bent = T.copy()
+    bent[1, 2, 0, 0] += 0.1
+    with pytest.raises(ValueError, match="estimates of run 1, step 2 is no rigid motion"):
+        jaxslam.evaluate_poses(bent, P, truth)
+    with pytest.raises(ValueError, match=r"truths must be too, not \(2, 6, 4, 4\)"):
+        jaxslam.evaluate_poses(T, P, truth[:2])
+    with pytest.raises(ValueError, match=r"must be \(3, 6, 6, 6\), or the joint ones"):
+        jaxslam.evaluate_poses(T, P[..., :3, :3], truth)
+    far = truth.copy()
+    far[0, 0, 0, 3] = 1e300
+    with pytest.raises(ValueError, match=r"truths hold 1e\+300; up to 1e\+100 is accepted"):
+        jaxslam.evaluate_poses(T, P, far, align="se3")
+    with pytest.raises(ValueError, match="estimates must be matrices"):
+        jaxslam.evaluate_poses(T[..., :2, :2], P, truth)
+
+
+WORDS = [
+    "# error=left",
+    "# x=",
+    "nan",
+    "1",
+    "-1",
+    "0",
+    "1e400",
+    "1e300",
+    "abc",
+    "\t",
+    "0 0 0 0 0 0 0 1",
+    "\0",
+]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.lists(st.sampled_from(WORDS), max_size=24).map(" ".join), max_size=4), st.data())
+def test_whatever_is_in_a_file_there_is_a_result_or_one_line(tmp_path_factory, text, data):
+    folder = tmp_path_factory.mktemp("fuzz")
+    T, P, truth = logged(Convention(), runs=1, steps=2)
+    write_runs(folder, T, P, truth, Convention())
+    which = data.draw(st.sampled_from(["estimate.txt", "covariance.txt", "truth.txt"]))
+    path = folder / "run00" / which
+    kept = path.read_text() if data.draw(st.booleans()) else ""
+    path.write_text(kept + "\n".join(text))
+    try:
+        found = jaxslam.evaluate_log(folder)
+    except ValueError as error:
+        told = str(error)
+    else:
+        told = str(found.headline)
+        assert not np.isnan(found.nees).any()
+    assert told
+    assert "\n" not in told
+
+
+def test_of_the_trackers_files_nees_is_given_the_scale(tmp_path):
+    trajectory = pytest.importorskip("jaxslam.vision.trajectory")
+    T, P, truth = logged(trajectory.TRACKED, runs=1, steps=300)
+    T, P, truth = T[0], P[0].copy(), truth[0].copy()
+    P[0], truth[0] = 0, T[0]
+    times = np.arange(300) / 30
+    trajectory.write_trajectory(tmp_path / "trajectory.txt", times, T)
+    trajectory.write_covariances(tmp_path / "covariance.txt", times, P, given_scale=True)
+    write_tum(tmp_path / "groundtruth.txt", times, truth)
+    found = jaxslam.evaluate_log(tmp_path)
+    assert found.convention == replace(trajectory.TRACKED, scale="given")
+    assert (found.dof, found.steps) == (5, 299)
+    nees, _ = trajectory.nees_beyond_scale(T[1:], P[1:], truth[1:])
+    np.testing.assert_allclose(found.nees[0], nees, rtol=1e-4)
+    assert Tally.of(found.nees, 5).average.mean == pytest.approx(found.verdict["nees"])
