@@ -47,7 +47,7 @@ def found(rng, wrong=0.0, S=None):
         angle, radius = rng.uniform(0, 2 * np.pi), 3 * np.sqrt(rng.uniform())
         r[i] = np.linalg.cholesky(own) @ [radius * np.cos(angle), radius * np.sin(angle)]
     S = jnp.asarray(S.reshape(M, 2, M, 2))
-    return Candidates(jnp.asarray(r), S, jnp.ones(M, bool)), bad
+    return Candidates(jnp.asarray(r), S, jnp.ones(M, bool), jnp.arange(M)), bad
 
 
 def rates(name, wrong, runs=20):
@@ -122,7 +122,8 @@ def test_the_order_of_the_matches_does_not_matter():
     S = matches.covariance[order][:, :, order]
     for name in AGREEING:
         believed = np.asarray(compiled[name](matches))
-        permuted = compiled[name](Candidates(matches.residual[order], S, matches.valid[order]))
+        valid, landmark = matches.valid[order], matches.landmark[order]
+        permuted = compiled[name](Candidates(matches.residual[order], S, valid, landmark))
         np.testing.assert_array_equal(permuted, believed[order])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.stats import binom
 
 from jaxslam.arrays import cast
@@ -32,10 +32,11 @@ from jaxslam.video.calibration import Calibration, as_fields, from_fields
 from jaxslam.video.pictures import as_grey
 from jaxslam.video.source import Frame, check_size
 from jaxslam.vision.corners import detect_corners
+from jaxslam.vision.epipolar import MINIMAL, of_one_motion
 from jaxslam.vision.landmarks import NO_POINTS, Landmark, Points, joined, stacked, unstacked
 from jaxslam.vision.located import Located
 from jaxslam.vision.map import Prediction, failing, in_view, note_found, to_search, worst_first
-from jaxslam.vision.matching import Match, match_patches
+from jaxslam.vision.matching import PEAKS, Match, match_patches
 from jaxslam.vision.patches import Patch
 from jaxslam.vision.resume import grown, leaves, read_record, write_record
 from jaxslam.vision.settings import TrackerSettings
@@ -194,14 +195,22 @@ class Tracker:
         slam, state, new, dt = self._slam, self._state, self._nothing(), jnp.zeros(())
         gone = jnp.zeros(self.settings.capacity, bool)
 
+        def believed(wide: bool) -> None:
+            predicted, _ = _predict.compile(slam, state, dt)
+            count = self.settings.wanted * (PEAKS if wide else 1)
+            nothing = _padded(np.zeros(0, int), np.zeros((0, 2)), count)
+            _believed.compile(*self._belief(predicted, dt, nothing, wide))
+
         def corrected() -> None:
             predicted, _ = _predict.compile(slam, state, dt)
-            _correct.compile(*self._correction(predicted, dt, new))
+            _correct.compile(slam, predicted[0], dt, new)
 
         return [
             in_background(
                 lambda: _begin_map.compile(slam, state, new),
+                lambda: believed(True),
                 lambda: _renew_map.compile(slam, state, new),
+                lambda: believed(False),
                 self.camera,
             ),
             in_background(
@@ -320,11 +329,12 @@ class Tracker:
             return self._turned_round(frame, predicted, dt)
         slots, affines = to_search(self.landmarks, prediction, self.calibration, self.settings)
         found = self._search(frame, prediction, slots, affines)
-        matched, features = self._features(slots, found)
         if self._astray(prediction.covariances[slots]):
-            features = self._nothing()
-        least = _more_than_chance(len(slots), found_again=self._unmeasured > 0)
-        state, result = self._correct(predicted, dt, features, least)
+            agreed = matched = np.full((len(slots), 2), np.nan)
+        else:
+            agreed, matched = self._agreed(predicted, dt, slots, found)
+        features = _padded(slots, agreed, self.settings.wanted)
+        state, result = _correct(self._slam, predicted[0], dt, features)
         used, nis, nis_dof, status = jax.device_get(result)
         self._time = frame.time
         if status >= Status.NOT_POSITIVE:
@@ -333,7 +343,7 @@ class Tracker:
             return self._lost(frame)
         self._state = state
         used = used[: len(slots)]
-        note_found(self.landmarks, slots, used, self.settings)
+        note_found(self.landmarks, slots, used, agreed, self.settings)
         self._remove(failing(self.landmarks, self.settings))
         pixels = prediction.pixels[slots]
         searched = dict(
@@ -341,8 +351,8 @@ class Tracker:
             search=prediction.covariances[slots],
             matched=matched,
             status=[
-                "unmatched" if match is None else "matched" if ok else "outlier"
-                for match, ok in zip(found, used, strict=True)
+                "matched" if ok else "outlier" if places else "unmatched"
+                for places, ok in zip(found, used, strict=True)
             ],
         )
         lost = not used.any()
@@ -365,20 +375,79 @@ class Tracker:
             lost=lost,
         )
 
-    def _correct(
-        self, predicted: tuple[Any, Any], dt: jax.Array, features: Features, least: int = 1
-    ) -> tuple[Any, tuple]:
-        """Update by the matches that agree, if they are so many at least."""
-        return _correct(*self._correction(predicted, dt, features, least))
+    def _agreed(
+        self, predicted: tuple[Any, Any], dt: jax.Array, slots: np.ndarray, found: list[list[Match]]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels of the landmarks whose matches agree, if they are more than chance, and of all
+        that were found; NaN of the others."""
+        owner = np.repeat(np.arange(len(slots)), [len(places) for places in found])
+        pixels = np.array([match.pixel for places in found for match in places]).reshape(-1, 2)
+        matched = _of_first(owner, pixels, len(slots))
+        least = _more_than_chance(len(slots))
+        if self._unmeasured:
+            # A camera that was lost searches ever wider, and something always looks alike.
+            least = max(least, len(slots) // 2)
+        if len(owner) > len(np.unique(owner)):
+            least += MINIMAL
+            agreed = self._of_several(predicted, dt, (slots[owner], owner, pixels), len(slots))
+        else:
+            believed = self._believed(predicted, dt, slots[owner], pixels)
+            agreed = _of_first(owner[believed], pixels[believed], len(slots))
+        if np.isfinite(agreed[:, 0]).sum() < least:
+            agreed[:] = np.nan
+        return agreed, np.where(np.isfinite(agreed), agreed, matched)
 
-    def _correction(
-        self, predicted: tuple[Any, Any], dt: jax.Array, features: Features, least: int = 1
-    ) -> tuple[Any, ...]:
-        """What that is of."""
+    def _of_several(
+        self, predicted: tuple[Any, Any], dt: jax.Array, places: tuple[np.ndarray, ...], count: int
+    ) -> np.ndarray:
+        """Pixels that agree, of landmarks with several places each, which are told with their slots
+        and owners.
+
+        Where ellipses are wide, depth and direction make of a prediction what is not linear: those
+        that agree but for that, and with one motion, are what a linear test is given. One that puts
+        out most of them is not believed: of a camera that sets out it says nothing.
+        """
+        slots, owner, pixels = places
+        believed = self._believed(predicted, dt, slots, pixels, wide=True)
+        slots, owner, pixels = slots[believed], owner[believed], pixels[believed]
+        lately, rigid = self._rigid(slots, pixels)
+        tested = np.flatnonzero(rigid | ~lately)
+        linear = tested[self._believed(predicted, dt, slots[tested], pixels[tested])]
+        best = linear if 2 * rigid[linear].sum() >= rigid.sum() else np.flatnonzero(rigid)
+        return _of_first(owner[best], pixels[best], count)
+
+    def _rigid(self, slots: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which landmarks were seen when any was seen last, and which of these agree with one
+        motion since then."""
         s = self.settings
-        numbers = jnp.asarray(s.tolerance * s.pixel_sigma), jnp.asarray(least)
-        association = ASSOCIATIONS[s.association]
-        return self._slam, association, *predicted, dt, features, *numbers
+        unseen = np.array([self.landmarks[slot].unseen for slot in slots], int)
+        before = np.array([self.landmarks[slot].seen_at for slot in slots]).reshape(-1, 2)
+        lately = unseen == unseen.min(initial=unseen.max(initial=0))
+        rigid = np.zeros_like(lately)
+        rigid[lately] = of_one_motion(
+            before[lately], pixels[lately], self.calibration, s.tolerance * s.pixel_sigma
+        )
+        return lately, rigid
+
+    def _believed(
+        self,
+        predicted: tuple[Any, Any],
+        dt: jax.Array,
+        slots: np.ndarray,
+        pixels: np.ndarray,
+        wide: bool = False,
+    ) -> np.ndarray:
+        """Which matches the filter believes."""
+        features = _padded(slots, pixels, self.settings.wanted * (PEAKS if wide else 1))
+        return np.asarray(_believed(*self._belief(predicted, dt, features, wide)))[: len(slots)]
+
+    def _belief(
+        self, predicted: tuple[Any, Any], dt: jax.Array, features: Features, wide: bool = False
+    ) -> tuple[Any, ...]:
+        """What `_believed` is given."""
+        s = self.settings
+        tolerance = jnp.asarray(s.tolerance * s.pixel_sigma)
+        return self._slam, ASSOCIATIONS[s.association], wide, *predicted, dt, features, tolerance
 
     def _astray(self, ellipses: Float[np.ndarray, "k 2 2"]) -> bool:
         """Whether most landmarks are expected too widely."""
@@ -391,7 +460,7 @@ class Tracker:
         """The map lies behind the camera: another one is begun."""
         self.reversed += 1
         self._time = frame.time
-        self._state, _ = self._correct(predicted, dt, self._nothing())
+        self._state, _ = _correct(self._slam, predicted[0], dt, self._nothing())
         return self._lost(frame)
 
     def _nothing(self) -> Features:
@@ -405,11 +474,11 @@ class Tracker:
         """
         self._remove(sorted(self.landmarks))
         nothing = self._nothing()
-        state, result = self._correct(predicted, dt, nothing)
+        state, result = _correct(self._slam, predicted[0], dt, nothing)
         if int(result[-1]) >= Status.NOT_POSITIVE:
             self._origin = self._camera
             predicted, _ = _predict(self._slam, self._empty_state(), dt)
-            state, _ = self._correct(predicted, dt, nothing)
+            state, _ = _correct(self._slam, predicted[0], dt, nothing)
         self._state = state
 
     def _lost(self, frame: Frame, **searched) -> Tracked:
@@ -429,7 +498,7 @@ class Tracker:
 
     def _search(
         self, frame: Frame, prediction: Prediction, slots: np.ndarray, affines: np.ndarray
-    ) -> list[Match | None]:
+    ) -> list[list[Match]]:
         if not len(slots):
             return []
         templates = np.stack(
@@ -441,16 +510,6 @@ class Tracker:
         return match_patches(
             frame.image, templates, prediction.pixels[slots], prediction.covariances[slots]
         )
-
-    def _features(
-        self, slots: np.ndarray, found: list[Match | None]
-    ) -> tuple[np.ndarray, Features]:
-        """Pixels of the matches, NaN where there is none, and the same padded for the filter."""
-        matched = np.full((len(slots), 2), np.nan)
-        for i, match in enumerate(found):
-            if match is not None:
-                matched[i] = match.pixel
-        return matched, _padded(slots, matched, self.settings.wanted)
 
     def _remove(self, slots: list[int]) -> None:
         if slots:
@@ -511,7 +570,7 @@ class Tracker:
         self._sigma_log_scale = float(np.sqrt(log_scale)) if log_scale > 0 else None
         for slot, corner in zip(slots, corners, strict=True):
             patch = Patch.take(frame.image, corner)
-            self.landmarks[int(slot)] = Landmark(self.created, patch, self._camera.T_wc)
+            self.landmarks[int(slot)] = Landmark(self.created, patch, self._camera.T_wc, corner)
             self.created += 1
         return corners
 
@@ -539,14 +598,16 @@ def _keeps_metres(slam: AbstractStaged) -> bool:
     return isinstance(slam, EkfSlam) and isinstance(slam.scale, Metre) and slam.depth.common is None
 
 
-def _more_than_chance(searched: int, found_again: bool = False) -> int:
-    """Matches of so many landmarks searched that are not there by chance.
+def _more_than_chance(searched: int) -> int:
+    """Matches of so many landmarks searched that do not agree by chance."""
+    return max(LEAST_MATCHES, int(binom.isf(BY_CHANCE, searched, CHANCE)) + 1)
 
-    A camera that was lost searches ever wider, where there is always something that looks alike:
-    it is `found_again` where half of what it searches agrees.
-    """
-    least = max(LEAST_MATCHES, int(binom.isf(BY_CHANCE, searched, CHANCE)) + 1)
-    return max(least, searched // 2) if found_again else least
+
+def _of_first(owner: np.ndarray, pixels: np.ndarray, count: int) -> Float[np.ndarray, "count 2"]:
+    """The first pixel of each owner, NaN of those that have none."""
+    first = np.full((count, 2), np.nan)
+    first[owner[::-1]] = pixels[::-1]
+    return first
 
 
 def _padded(slots: np.ndarray, pixels: np.ndarray, size: int) -> Features:
@@ -586,21 +647,25 @@ def _predict(slam: AbstractStaged, state: Any, dt: Any) -> tuple[tuple[Any, Any]
 
 
 @Program
-def _correct(
+def _believed(
     slam: AbstractStaged,
     association: Association,
+    wide: bool,
     state: Any,
     gaussian: Any,
     dt: Any,
     features: Features,
     tolerance: Any,
-    least: Any,
-) -> tuple[Any, tuple]:
+) -> Bool[jax.Array, " m"]:
     one, _ = slam.gaussian(state, dt)
-    agreed = association(candidates(one, gaussian, dt, features, tolerance))
-    # A few of many that were searched can agree by chance: a lost camera only moves.
-    agreed &= jnp.sum(agreed) >= least
-    state, innovation = slam.update(state, dt, replace(features, valid=agreed))
+    return association(candidates(one, gaussian, dt, features, tolerance, curved=wide))
+
+
+@Program
+def _correct(
+    slam: AbstractStaged, state: Any, dt: Any, features: Features
+) -> tuple[Any, tuple[Any, ...]]:
+    state, innovation = slam.update(state, dt, features)
     state = slam.compose(state, dt)
     return state, (innovation.used, innovation.nis, innovation.nis_dof, innovation.status)
 

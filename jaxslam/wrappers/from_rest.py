@@ -39,6 +39,12 @@ SEARCHES = {"planar": (1, 2, 3, 4, 6, 8, 11, 15, 20, 26, 34), "spatial": (1, 2, 
 """Frames after which minima are sought anew, from all starts …"""
 IN_TURN = {"planar": 0, "spatial": 1}
 """… and from how many of them after every other frame, in turn: no frame waits for them all."""
+DIVIDED = {"planar": True, "spatial": False}
+"""Whether the sum is divided anew in every frame, or its members are the modes and what becomes of
+them: halves of a Gaussian, each linearised off its middle, can be worse than the whole."""
+GIVEN_UP = 10.0
+"""Of log evidence: modes so much less likely than the likeliest end with the window. What has been
+weighed without a linearisation is not to be overturned by one."""
 REFINEMENTS = 4
 """Steps of Levenberg–Marquardt with every new frame, at the most."""
 LEAST_STEPS = 8
@@ -104,7 +110,9 @@ class FromRest(AbstractStaged):
     def update(
         self, state: RestState, control: Any, seen: Features
     ) -> tuple[RestState, Innovation]:
-        after, innovation = self.base.update(state.sum, control, seen)
+        divided = DIVIDED[self.base.base.motion.geometry.name]
+        update = self.base.update if divided else self.base.corrected
+        after, innovation = update(state.sum, control, seen)
         stepped = window.stepped(state.record, control, seen, self.base.base.sensor.noise)
         return replace(state, sum=after, record=stepped), innovation
 
@@ -122,7 +130,8 @@ class FromRest(AbstractStaged):
             wanted = anew & (count > least) & (count <= frames)
             state = self._anew(state, frames, wanted, least)
             least = frames
-        state = replace(state, open=state.open & ~self._ready(state))
+        ready = self._ready(state)
+        state = replace(state, sum=_likely(state.sum, anew & ready), open=state.open & ~ready)
         return when(state.open & state.record.full, self._thinned, state)
 
     def moving(self, state: RestState) -> Bool[Array, ""]:
@@ -200,6 +209,13 @@ class FromRest(AbstractStaged):
         moved = variance < MOVED**2 * squared
         over = moved | ~state.record.tied
         return (enough & alone & known) | (state.record.full & over)
+
+
+def _likely(members: BankState, now: Bool[Array, ""]) -> BankState:
+    """Without those that are `GIVEN_UP`, if that is now."""
+    unlikely = members.log_weights < jnp.max(members.log_weights) - GIVEN_UP
+    weights = jnp.where(now & unlikely, -jnp.inf, members.log_weights)
+    return replace(members, log_weights=weights)
 
 
 def _members(ekf: EkfSlam, record: Record, modes: Modes, members: State) -> State:
