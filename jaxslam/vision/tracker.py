@@ -20,7 +20,7 @@ from jaxslam.forms.state import Features, Status
 from jaxslam.models.scale import Metre
 from jaxslam.models.sensors import Pinhole
 from jaxslam.programs import Program, in_background
-from jaxslam.slam.association import ASSOCIATIONS, Association, candidates
+from jaxslam.slam.association import ASSOCIATIONS, Association, candidates, one_point_ransac
 from jaxslam.slam.filter import AtOnce, EkfSlam, begun, innermost
 from jaxslam.slam.protocol import AbstractStaged, Scene
 from jaxslam.slam.readouts import (
@@ -195,11 +195,10 @@ class Tracker:
         slam, state, new, dt = self._slam, self._state, self._nothing(), jnp.zeros(())
         gone = jnp.zeros(self.settings.capacity, bool)
 
-        def believed(wide: bool) -> None:
+        def believed(in_wide: Association | None) -> None:
             predicted, _ = _predict.compile(slam, state, dt)
-            count = self.settings.wanted * (PEAKS if wide else 1)
-            nothing = _padded(np.zeros(0, int), np.zeros((0, 2)), count)
-            _believed.compile(*self._belief(predicted, dt, nothing, wide))
+            nothing = np.zeros(0, int), np.zeros((0, 2))
+            _believed.compile(*self._belief(predicted, dt, *nothing, in_wide))
 
         def corrected() -> None:
             predicted, _ = _predict.compile(slam, state, dt)
@@ -208,9 +207,8 @@ class Tracker:
         return [
             in_background(
                 lambda: _begin_map.compile(slam, state, new),
-                lambda: believed(True),
+                *(partial(believed, association) for association in (*self._in_wide, None)),
                 lambda: _renew_map.compile(slam, state, new),
-                lambda: believed(False),
                 self.camera,
             ),
             in_background(
@@ -387,9 +385,10 @@ class Tracker:
         if self._unmeasured:
             # A camera that was lost searches ever wider, and something always looks alike.
             least = max(least, len(slots) // 2)
-        if len(owner) > len(np.unique(owner)):
+        wide = len(owner) > len(np.unique(owner))
+        if wide:
             least += MINIMAL
-            agreed = self._of_several(predicted, dt, (slots[owner], owner, pixels), len(slots))
+            agreed = self._of_several(predicted, dt, slots, owner, pixels, least)
         else:
             believed = self._believed(predicted, dt, slots[owner], pixels)
             agreed = _of_first(owner[believed], pixels[believed], len(slots))
@@ -398,23 +397,33 @@ class Tracker:
         return agreed, np.where(np.isfinite(agreed), agreed, matched)
 
     def _of_several(
-        self, predicted: tuple[Any, Any], dt: jax.Array, places: tuple[np.ndarray, ...], count: int
+        self,
+        predicted: tuple[Any, Any],
+        dt: jax.Array,
+        slots: np.ndarray,
+        owner: np.ndarray,
+        pixels: np.ndarray,
+        least: int,
     ) -> np.ndarray:
-        """Pixels that agree, of landmarks with several places each, which are told with their slots
-        and owners.
+        """Pixels that agree, of landmarks with several places each; `least` are enough.
 
         Where ellipses are wide, depth and direction make of a prediction what is not linear: those
         that agree but for that, and with one motion, are what a linear test is given. One that puts
         out most of them is not believed: of a camera that sets out it says nothing.
         """
-        slots, owner, pixels = places
-        believed = self._believed(predicted, dt, slots, pixels, wide=True)
-        slots, owner, pixels = slots[believed], owner[believed], pixels[believed]
-        lately, rigid = self._rigid(slots, pixels)
-        tested = np.flatnonzero(rigid | ~lately)
-        linear = tested[self._believed(predicted, dt, slots[tested], pixels[tested])]
-        best = linear if 2 * rigid[linear].sum() >= rigid.sum() else np.flatnonzero(rigid)
-        return _of_first(owner[best], pixels[best], count)
+        agreed = np.zeros((0, 2))
+        for association in self._in_wide:
+            believed = self._believed(predicted, dt, slots[owner], pixels, association)
+            places = np.flatnonzero(believed)
+            lately, rigid = self._rigid(slots[owner[places]], pixels[places])
+            tested = places[_one_of_each(owner[places], rigid | ~lately)]
+            rigid = np.isin(tested, places[rigid])
+            linear = self._believed(predicted, dt, slots[owner[tested]], pixels[tested])
+            best = tested[linear if 2 * (linear & rigid).sum() >= rigid.sum() else rigid]
+            agreed = _of_first(owner[best], pixels[best], len(slots))
+            if len(best) >= least:
+                break
+        return agreed
 
     def _rigid(self, slots: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Which landmarks were seen when any was seen last, and which of these agree with one
@@ -429,25 +438,37 @@ class Tracker:
         )
         return lately, rigid
 
+    @property
+    def _in_wide(self) -> dict[Association, None]:
+        """The associations that are tried where ellipses are wide: the quick one first."""
+        return dict.fromkeys((one_point_ransac, ASSOCIATIONS[self.settings.association]))
+
     def _believed(
         self,
         predicted: tuple[Any, Any],
         dt: jax.Array,
         slots: np.ndarray,
         pixels: np.ndarray,
-        wide: bool = False,
+        in_wide: Association | None = None,
     ) -> np.ndarray:
-        """Which matches the filter believes."""
-        features = _padded(slots, pixels, self.settings.wanted * (PEAKS if wide else 1))
-        return np.asarray(_believed(*self._belief(predicted, dt, features, wide)))[: len(slots)]
+        """Which matches the filter believes, by an association for wide ellipses or the usual."""
+        belief = self._belief(predicted, dt, slots, pixels, in_wide)
+        return np.asarray(_believed(*belief))[: len(slots)]
 
     def _belief(
-        self, predicted: tuple[Any, Any], dt: jax.Array, features: Features, wide: bool = False
+        self,
+        predicted: tuple[Any, Any],
+        dt: jax.Array,
+        slots: np.ndarray,
+        pixels: np.ndarray,
+        in_wide: Association | None = None,
     ) -> tuple[Any, ...]:
         """What `_believed` is given."""
-        s = self.settings
+        s, wide = self.settings, in_wide is not None
+        features = _padded(slots, pixels, s.wanted * (PEAKS if wide else 1))
         tolerance = jnp.asarray(s.tolerance * s.pixel_sigma)
-        return self._slam, ASSOCIATIONS[s.association], wide, *predicted, dt, features, tolerance
+        association = ASSOCIATIONS[s.association] if in_wide is None else in_wide
+        return self._slam, association, wide, *predicted, dt, features, tolerance
 
     def _astray(self, ellipses: Float[np.ndarray, "k 2 2"]) -> bool:
         """Whether most landmarks are expected too widely."""
@@ -601,6 +622,12 @@ def _keeps_metres(slam: AbstractStaged) -> bool:
 def _more_than_chance(searched: int) -> int:
     """Matches of so many landmarks searched that do not agree by chance."""
     return max(LEAST_MATCHES, int(binom.isf(BY_CHANCE, searched, CHANCE)) + 1)
+
+
+def _one_of_each(owner: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """The first of each owner among these."""
+    some = np.flatnonzero(among)
+    return some[np.unique(owner[some], return_index=True)[1]]
 
 
 def _of_first(owner: np.ndarray, pixels: np.ndarray, count: int) -> Float[np.ndarray, "count 2"]:
