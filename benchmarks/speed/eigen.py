@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from benchmarks.speed.workload import Inputs, Records, kept
+from jaxslam.models.sensors import Pinhole
 
 SOURCE = Path(__file__).with_name("ekf.cpp")
 FLAGS = ("-std=c++17", "-O3", "-march=native", "-DNDEBUG", "-shared", "-fPIC", "-pthread")
@@ -77,6 +78,7 @@ def by_hand(
         "last_covariance": np.zeros((runs, len(index), len(index))),
     }
     arrays = {name: np.ascontiguousarray(x, np.float64) for name, x in arrays.items()}
+    assert isinstance(slam.sensor, Pinhole)
     camera, two = slam.sensor.camera, ctypes.c_double * 2
     problem = _Problem(
         runs, steps, m, float(inputs.seconds), two(*camera.focal), two(*camera.centre),

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.speed.workload import Inputs, Records, kept
+from jaxslam.models.sensors import Pinhole
 
 
 class Numbers(NamedTuple):
@@ -125,9 +126,11 @@ def by_loop(inputs: Inputs) -> Callable[[], Records]:
     """The loop on these inputs."""
     slam, start = inputs.slam, inputs.start
     p, t = inputs.pixels.shape[3], slam.motion.geometry.tangent_dim
+    sensor = slam.sensor
+    assert isinstance(sensor, Pinhole)
     given = Numbers(
-        float(inputs.seconds), np.asarray(slam.sensor.camera.focal),
-        np.asarray(slam.sensor.camera.centre), np.eye(p) * float(slam.sensor.sigma) ** 2,
+        float(inputs.seconds), np.asarray(sensor.camera.focal),
+        np.asarray(sensor.camera.centre), np.eye(p) * float(sensor.sigma) ** 2,
         np.diag(np.asarray(slam.motion.noise_sigma) ** 2),
         np.diag(np.asarray(slam.calibration.sigma) ** 2),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What is computed: the filter on runs that see every landmark in every frame, NEES of each step."""
+"""What is computed: a filter whose runs see every landmark in every frame, NEES of each step."""
 
 from __future__ import annotations
 
@@ -71,8 +71,8 @@ def prepared(work: Workload) -> Inputs:
         velocity=(*(0.0,) * p, -0.6, *(0.0,) * (2 * p - 1)), image=(1e4,) * p, centre=(5e3,) * p,
         first_pixels=((4.7e3, 5.3e3),) * p,
     )  # fmt: skip
-    slam = jaxslam.make_filters(scenario, ["robocentric"], ["inverse_scaling"])
-    (slam,) = slam.values()
+    (slam,) = jaxslam.make_filters(scenario, ["robocentric"], ["inverse_scaling"]).values()
+    assert isinstance(slam, EkfSlam)
     room = Room(work.landmarks, work.landmarks, work.landmarks, 1)
 
     def one(index):

@@ -11,9 +11,9 @@ import math
 import os
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
@@ -207,8 +207,13 @@ def _side_by_side(function: Callable[[range], Any], chunks: list[range]) -> Iter
     program's matrices are too small to be divided. What has not begun is dropped on an error."""
     alone = jax.default_backend() != "cpu" or len(chunks) == 1
     with ThreadPoolExecutor(1 if alone else processors()) as pool:
-        with closing(pool.map(function, chunks)) as results:
-            yield from zip(chunks, results, strict=True)
+        waiting = deque((chunk, pool.submit(function, chunk)) for chunk in chunks)
+        try:
+            while waiting:  # what has been told is not kept
+                chunk, result = waiting.popleft()
+                yield chunk, result.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def processors() -> int:
