@@ -113,8 +113,8 @@ def test_no_chunk_begins_after_an_error(monkeypatch):
 
     monkeypatch.setattr(montecarlo, "processors", lambda: 1)
     told, side_by_side = [], montecarlo._side_by_side
+    chunks = [range(i, i + 1) for i in range(99)]
     with pytest.raises(ValueError, match="chunk 2"):
-        chunks = [range(i, i + 1) for i in range(99)]
         told.extend((chunk.start, stop) for chunk, stop in side_by_side(computed, chunks))
     assert told == [(0, 1), (1, 2)]
     assert len(began) < 99
