@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from jaxslam.forms.state import Features
 from jaxslam.linalg import cholesky
@@ -49,7 +49,7 @@ class Candidates(NamedTuple):
     @property
     def gate(self) -> float:
         """χ² of one match."""
-        return float(chi2.ppf(GATE, self.residual.shape[1]))
+        return float(_chi2_quantile(self.residual.shape[1]))
 
     def distances(self) -> Float[Array, " m"]:
         """Squared Mahalanobis distance of each by itself; infinite of what is not valid."""
@@ -145,7 +145,7 @@ def joint_compatibility(found: Candidates, most: int = MOST_NODES) -> Bool[Array
     order = jnp.argsort(alone)
     within = (alone < found.gate)[order]
     ordered = Candidates(found.residual[order], found.covariance[order][:, :, order], within)
-    bounds = jnp.asarray(chi2.ppf(GATE, p * np.arange(1, m + 1)), found.residual.dtype)
+    bounds = jnp.asarray(_chi2_quantile(p * np.arange(1, m + 1)), found.residual.dtype)
 
     def step(node: _Node) -> _Node:
         W, square = _whitened(ordered, node)
@@ -314,3 +314,8 @@ def _squared(r: Float[Array, "m p"], S: Float[Array, "m p p"]) -> Float[Array, "
     """`rᵀ S⁻¹ r`; infinite where S is not positive."""
     squared = jax.vmap(lambda r, S: jnp.sum((cholesky(S).whitening @ r) ** 2))(r, S)
     return jnp.where(jnp.isnan(squared), jnp.inf, squared)
+
+
+def _chi2_quantile(dof: Any) -> Any:
+    """The χ² value below which a true match is with probability `GATE`."""
+    return 2 * gammaincinv(np.asarray(dof) / 2, GATE)
