@@ -1,5 +1,6 @@
 """Tests of jaxslam.consistency: exact bands, chunking, divergence, resuming, the summary."""
 
+import time
 from dataclasses import replace
 from functools import partial
 
@@ -15,6 +16,7 @@ from jaxslam.consistency import (
     FolderStore,
     MemoryStore,
     lost_threshold,
+    montecarlo,
     run_verdict,
     sentences,
     tally,
@@ -87,6 +89,35 @@ def test_chunks_do_not_matter_and_run_i_is_the_same_in_any_number_of_runs():
     for key, values in chunked.items():
         # The same sums by another batch: rounding of 1e-16 through a covariance that spans 1e9.
         np.testing.assert_allclose(values, whole[key][:5], rtol=1e-6, atol=1e-12, err_msg=key)
+
+
+def test_chunks_side_by_side_are_those_one_after_another(monkeypatch):
+    def computed(number):
+        monkeypatch.setattr(montecarlo, "processors", lambda: number)
+        return all_runs(jaxslam.monte_carlo(SCENARIO, filters(), runs=7, chunk=2))
+
+    alone, together = computed(1), computed(3)
+    for key, values in alone.items():
+        np.testing.assert_array_equal(values, together[key], err_msg=key)
+
+
+def test_no_chunk_begins_after_an_error(monkeypatch):
+    began = []
+
+    def computed(chunk):
+        began.append(chunk.start)
+        if chunk.start == 2:
+            raise ValueError("chunk 2")
+        time.sleep(0.01)
+        return chunk.stop
+
+    monkeypatch.setattr(montecarlo, "processors", lambda: 1)
+    told, side_by_side = [], montecarlo._side_by_side
+    chunks = [range(i, i + 1) for i in range(99)]
+    with pytest.raises(ValueError, match="chunk 2"):
+        told.extend((chunk.start, stop) for chunk, stop in side_by_side(computed, chunks))
+    assert told == [(0, 1), (1, 2)]
+    assert len(began) < 99
 
 
 def test_filters_meet_the_same_worlds():

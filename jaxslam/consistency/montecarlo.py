@@ -8,9 +8,12 @@ and whatever the number of runs. Memory is bounded by the chunk: each chunk's re
 from __future__ import annotations
 
 import math
+import os
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
@@ -185,14 +188,39 @@ def _run_filter(name, slam, simulator, room, chunks, store, progress) -> Seconds
     data = (numbers, simulator.sensor)
     compiled = _compiled(*_hashable(structure), room, *_hashable(_shapes((*data, batch))))
     compiled_at = time.perf_counter()
-    for chunk in chunks:
-        batch, _ = simulator(chunk)
-        where = f"{name}, runs {chunk.start} to {chunk.stop - 1}"
-        records, sample = jax.device_get(finished(compiled(*data, batch), where))
+
+    def computed(chunk: range) -> Any:
+        with jax.enable_x64(simulator.dtype == "float64"):  # a thread's own
+            batch, _ = simulator(chunk)
+            where = f"{name}, runs {chunk.start} to {chunk.stop - 1}"
+            return jax.device_get(finished(compiled(*data, batch), where))
+
+    for chunk, (records, sample) in _side_by_side(computed, chunks):
         records = {key: np.asarray(value)[: len(chunk)] for key, value in records.items()}
         store.save(name, chunk, {**records, **{f"sample_{k}": v for k, v in sample.items()}})
         progress(name, len(chunk))
     return Seconds(compiled_at - start, time.perf_counter() - compiled_at)
+
+
+def _side_by_side(function: Callable[[range], Any], chunks: list[range]) -> Iterator[Any]:
+    """Chunks in order with what the function makes of them, on a CPU one in each processor: a
+    program's matrices are too small to be divided. What has not begun is dropped on an error."""
+    alone = jax.default_backend() != "cpu" or len(chunks) == 1
+    with ThreadPoolExecutor(1 if alone else processors()) as pool:
+        waiting = deque((chunk, pool.submit(function, chunk)) for chunk in chunks)
+        try:
+            while waiting:  # what has been told is not kept
+                chunk, result = waiting.popleft()
+                yield chunk, result.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def processors() -> int:
+    """How many this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # not everywhere
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _shapes(tree: Any) -> Any:

@@ -20,12 +20,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from jaxslam.forms.form import curvature
 from jaxslam.forms.state import Features
 from jaxslam.linalg import cholesky
-from jaxslam.slam.filter import context_of
+from jaxslam.slam.filter import EkfSlam, context_of
 from jaxslam.slam.protocol import AbstractStaged
 
 GATE = 0.99
@@ -53,7 +53,7 @@ class Candidates(NamedTuple):
     @property
     def gate(self) -> float:
         """χ² of one match."""
-        return float(chi2.ppf(GATE, self.residual.shape[1]))
+        return float(_chi2_quantile(self.residual.shape[1]))
 
     def distances(self) -> Float[Array, " m"]:
         """Squared Mahalanobis distance of each by itself; infinite of what is not valid."""
@@ -91,7 +91,7 @@ def candidates(
 
     `tolerance` is a σ, in the unit of a measurement, by which each may be off beyond its noise.
     Of a `curved` measurement, the covariance has the terms of second order of each match by
-    itself: of a camera that may have set out in any direction, they are what depth does to it.
+    itself, where an `EkfSlam` tells them: of a camera that may have set out in any direction, they are what depth does to it.
     Raises ValueError for a filter whose innovations have no covariance.
     """
     _, innovation = slam.update(state, control, features)
@@ -103,7 +103,7 @@ def candidates(
     S = innovation.covariance
     S += tolerance**2 * jnp.eye(m * p, dtype=S.dtype)
     S = S.reshape(m, p, m, p)
-    if curved:
+    if curved and isinstance(slam, EkfSlam):
         i = jnp.arange(m)
         S = S.at[i, :, i].add(_second_order(slam, state, control, features.slots))
     first_alike = jnp.argmax(features.slots == features.slots[:, None], axis=1)
@@ -111,7 +111,7 @@ def candidates(
 
 
 def _second_order(
-    slam: Any, state: Any, control: Any, slots: Int[Array, " m"]
+    slam: EkfSlam, state: Any, control: Any, slots: Int[Array, " m"]
 ) -> Float[Array, "m p p"]:
     """`½ tr(∂²h_a Q ∂²h_b Q)`, Q of what one measurement depends on (Bar-Shalom, Li, Kirubarajan,
     *Estimation with Applications to Tracking and Navigation*, 2001, §10.3.2)."""
@@ -180,7 +180,7 @@ def joint_compatibility(found: Candidates, most: int = MOST_NODES) -> Bool[Array
     within = (alone < found.gate)[order]
     S = found.covariance[order][:, :, order]
     ordered = Candidates(found.residual[order], S, within, found.landmark[order])
-    bounds = jnp.asarray(chi2.ppf(GATE, p * np.arange(1, m + 1)), found.residual.dtype)
+    bounds = jnp.asarray(_chi2_quantile(p * np.arange(1, m + 1)), found.residual.dtype)
 
     def step(node: _Node) -> _Node:
         W, square = _whitened(ordered, node)
@@ -349,3 +349,8 @@ def _squared(r: Float[Array, "m p"], S: Float[Array, "m p p"]) -> Float[Array, "
     """`rᵀ S⁻¹ r`; infinite where S is not positive."""
     squared = jax.vmap(lambda r, S: jnp.sum((cholesky(S).whitening @ r) ** 2))(r, S)
     return jnp.where(jnp.isnan(squared), jnp.inf, squared)
+
+
+def _chi2_quantile(dof: Any) -> Any:
+    """The χ² value below which a true match is with probability `GATE`."""
+    return 2 * gammaincinv(np.asarray(dof) / 2, GATE)

@@ -1,0 +1,146 @@
+"""Microseconds of a run's step: ours beside NumPy, and beside C++ with Eigen.
+
+    python -m benchmarks.speed --out FILE.json
+
+The same pixels and controls for all, whose results are compared first. All in one process on one
+processor, in turns; the median counts, and compilation is apart. C++ needs a compiler, and the
+headers of `pip install cmeel-eigen` or of the system.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import tyro
+
+from benchmarks.speed.eigen import build, by_hand
+from benchmarks.speed.loop import by_loop
+from benchmarks.speed.workload import WORKLOADS, Inputs, Workload, ours, prepared
+from jaxslam.files import write_atomically
+
+AGREEMENT = 1e-9
+"""Of every NEES, and of the last covariance relative to its largest entry."""
+LOOP_RUNS = 4
+"""The loop of NumPy is slow, and its time is the same for every run."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure."""
+
+    out: Path
+    """JSON file."""
+    workloads: tuple[str, ...] = tuple(WORKLOADS)
+    """A is planar with 12 landmarks, B has six degrees of freedom and 30 landmarks."""
+    runs: int = 1024
+    """At most so many."""
+    steps: int = 100
+    """At most so many."""
+    repeats: int = 5
+    """Turns; the median counts."""
+
+
+def first(inputs: Inputs, runs: int) -> Inputs:
+    start, pixels, poses = jax.tree.map(lambda x: x[:runs], tuple(inputs[2:]))
+    return inputs._replace(start=start, pixels=pixels, poses=poses)
+
+
+def difference(found, wanted) -> float:
+    """The largest relative one, of so many runs as both have."""
+    (nees, P), (nees_wanted, P_wanted) = found, wanted
+    runs = min(len(nees), len(nees_wanted))
+    nees, nees_wanted, P, P_wanted = (x[:runs] for x in (nees, nees_wanted, P, P_wanted))
+    of_P = np.max(np.abs(P - P_wanted)) / np.max(np.abs(P_wanted))
+    return float(max(np.max(np.abs(nees / nees_wanted - 1)), of_P))
+
+
+def dgemm() -> float:
+    """GFlop/s of the machine's own product of matrices."""
+    A = np.random.default_rng(0).normal(size=(1000, 1000))
+    seconds = []
+    for _ in range(5):
+        began = time.perf_counter()
+        A @ A
+        seconds.append(time.perf_counter() - began)
+    return 2 * len(A) ** 3 / min(seconds) / 1e9
+
+
+def flops(work: Workload) -> float:
+    """Of one step, as the program in C++ multiplies: the update of rank m and the composition."""
+    d, t, p = (4, 6, 2) if "6dof" in work.scenario else (3, 3, 1)
+    n, m = 3 * t + work.landmarks * d, work.landmarks * p
+    update = 2 * m * n * (t + d) + 2 * m * m * (t + d) + m**3 / 3 + m * m * n + m * n * n
+    return update + 2 * 2 * n * (n - 3 * t) * (t + d)
+
+
+def measured(work: Workload, library: Any, repeats: int, product: float) -> dict[str, Any]:
+    """Times of all on one workload; `product` is `dgemm`."""
+    inputs = prepared(work)
+    began = time.perf_counter()
+    calls = {"jaxslam": ours(inputs)}
+    compile_seconds = time.perf_counter() - began
+    calls["numpy"] = by_loop(first(inputs, LOOP_RUNS))
+    if not isinstance(library, str):
+        calls["eigen"] = by_hand(library, inputs)
+        calls["eigen_fixed_sizes"] = by_hand(library, inputs, fixed=True)
+    results = {name: call() for name, call in calls.items()}
+    apart = {name: difference(found, results["jaxslam"]) for name, found in results.items()}
+    wrong = {name: x for name, x in apart.items() if not x < AGREEMENT}
+    assert not wrong, f"not the same results: {wrong}"
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(repeats):
+        for name, call in calls.items():
+            began = time.perf_counter()
+            call()
+            seconds[name].append((time.perf_counter() - began) / len(results[name][0]))
+    median = {name: float(np.median(x)) / work.steps for name, x in seconds.items()}
+    return {
+        "runs": work.runs,
+        "steps": work.steps,
+        "microseconds_per_step": {name: round(1e6 * x, 2) for name, x in median.items()},
+        "speed_against": {
+            name: round(x / median["jaxslam"], 3) for name, x in median.items() if name != "jaxslam"
+        },
+        "largest_difference": apart,
+        "compile_seconds": round(compile_seconds, 2),
+        "share_of_dgemm": {
+            name: round(flops(work) / x / 1e9 / product, 3) for name, x in median.items()
+        },
+    }
+
+
+def main() -> None:
+    """Measure, compare, write."""
+    options = tyro.cli(Options, description=__doc__)
+    jax.config.update("jax_enable_x64", True)
+    with tempfile.TemporaryDirectory() as folder:
+        library = build(Path(folder))
+        if isinstance(library, str):
+            print(f"without C++: {library}")
+        result: dict[str, Any] = {"dgemm_gflops": round(dgemm(), 1)}
+        for name in options.workloads:
+            work = WORKLOADS[name].reduced(options.runs, options.steps)
+            product = result["dgemm_gflops"]
+            result[name] = measured(work, library, options.repeats, product)
+    result["peak_memory_MiB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+    result["load"] = os.getloadavg()
+    with write_atomically(options.out) as path:
+        path.write_text(json.dumps(result, indent=1) + "\n")
+    print(json.dumps(result, indent=1))
+
+
+if __name__ == "__main__":
+    # Before JAX starts its threads, which are as many as there are processors to use.
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    main()

@@ -1,0 +1,41 @@
+"""Tests of benchmarks/speed: all who are compared compute the same."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.speed.__main__ import AGREEMENT, difference, flops
+from benchmarks.speed.eigen import build, by_hand
+from benchmarks.speed.loop import by_loop
+from benchmarks.speed.workload import WORKLOADS, ours, prepared
+
+
+@pytest.mark.parametrize("name", ["A", "B"])
+def test_everybody_computes_the_same_filter(name, tmp_path):
+    work = dataclasses.replace(WORKLOADS[name].reduced(2, 3), landmarks=5)
+    with jax.enable_x64(True):
+        inputs = prepared(work)
+        wanted = ours(inputs)()
+        assert difference(by_loop(inputs)(), wanted) < AGREEMENT
+        library = build(tmp_path)
+        if isinstance(library, str):
+            pytest.skip(library)
+        assert difference(by_hand(library, inputs)(), wanted) < AGREEMENT
+
+
+def test_a_wrong_covariance_is_a_difference():
+    with jax.enable_x64(True):
+        inputs = prepared(dataclasses.replace(WORKLOADS["A"].reduced(1, 2), landmarks=3))
+        nees, P = ours(inputs)()
+    assert difference((nees, P * (1 + 1e-6)), (nees, P)) > AGREEMENT
+    assert difference((nees * (1 + 1e-6), P), (nees, P)) > AGREEMENT
+
+
+def test_more_landmarks_are_more_work():
+    few, many = (dataclasses.replace(WORKLOADS["A"], landmarks=n) for n in (12, 24))
+    assert 3 < flops(many) / flops(few) < 8
