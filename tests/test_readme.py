@@ -48,6 +48,11 @@ def test_a_log_of_ones_own_goes_through_the_filter(capsys):
         assert "over-confident" not in out[out.index(name) :].splitlines()[1]
 
 
+def test_the_papers_filter_is_put_together_of_its_equations(capsys):
+    run_example("docs/paper.md")
+    assert capsys.readouterr().out.startswith("(47, 47)")
+
+
 def test_a_filter_has_gradients(capsys):
     run_example("docs/gradients.md")
     assert "by the pixel's σ" in capsys.readouterr().out
