@@ -11,7 +11,6 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
 
@@ -26,6 +25,7 @@ from jaxslam.consistency.beyond_scale import beyond_scale, reversal
 from jaxslam.consistency.recursion import Frame, run_through
 from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.consistency.store import MemoryStore, Store
+from jaxslam.consistency.summary import Seconds, Study
 from jaxslam.geometry import Pose
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.sensors import AbstractSensor
@@ -36,6 +36,7 @@ from jaxslam.simulation import (
     Sightings,
     Trajectory,
     as_data,
+    as_scenario,
     sensor_of,
     sightings,
     simulate,
@@ -50,31 +51,8 @@ CHUNK = 100
 """Runs in one batch: enough to fill vector units, few enough to stay in the cache."""
 
 
-@dataclass(frozen=True)
-class Seconds:
-    """Wall time of one filter over all its runs."""
-
-    compile: float
-    run: float
-
-
-@dataclass(frozen=True)
-class Study:
-    """Finished runs: where their records are, and what is needed to read them."""
-
-    scenario: Scenario
-    filters: Mapping[str, AbstractFilter]
-    runs: int
-    seed: int
-    dtype: str
-    chunks: tuple[range, ...]
-    store: Store
-    seconds: Mapping[str, Seconds]
-    device: str
-
-
 def monte_carlo(
-    scenario: Scenario,
+    scenario: Scenario | str,
     filters: Mapping[str, AbstractFilter],
     *,
     runs: int = 1000,
@@ -88,8 +66,9 @@ def monte_carlo(
 ) -> Study:
     """Run every filter on the same simulated runs.
 
-    The runs are the scenario's; with a `motion` (or a `Trajectory`) or a `sensor` of one's own the
-    truth moves, or is measured, as that says, in the scenario's world.
+    The runs are the scenario's, which may be given by name; with a `motion` (or a `Trajectory`)
+    or a `sensor` of one's own the truth moves, or is measured, as that says, in the scenario's
+    world.
 
     `progress(filter name, finished runs)` is called after every chunk. Chunks that `store`
     already has are not run again. Raises ValueError for sizes that make no sense.
@@ -97,6 +76,7 @@ def monte_carlo(
     if not filters:
         raise ValueError("no filter to run: name at least one")
     check_sizes(runs, seed, dtype, chunk)
+    scenario = as_scenario(scenario)
     store = MemoryStore() if store is None else store
     chunks = tuple(range(i, min(i + chunk, runs)) for i in range(0, runs, chunk))
     seconds = {}

@@ -3,24 +3,68 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import reduce
 from operator import add
 from typing import Any
 
 import numpy as np
 
-from jaxslam.consistency.montecarlo import Study
 from jaxslam.consistency.statistics import lost_threshold, mean_band
-from jaxslam.consistency.store import Records
+from jaxslam.consistency.store import Records, Store
 from jaxslam.consistency.verdict import Tally, sentences
 from jaxslam.files import json_numbers
 from jaxslam.forms.state import Status
+from jaxslam.simulation import Scenario
 from jaxslam.slam.filter import innermost
+from jaxslam.slam.protocol import AbstractFilter
 
 SCHEMA = 1
 _STEPS_AT_ONCE = 50
 """Steps of which the median holds all runs in memory."""
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """Wall time of one filter over all its runs."""
+
+    compile: float
+    run: float
+
+
+@dataclass(frozen=True, repr=False)
+class Study:
+    """Finished runs: where their records are, and what is needed to read them."""
+
+    scenario: Scenario
+    filters: Mapping[str, AbstractFilter]
+    runs: int
+    seed: int
+    dtype: str
+    chunks: tuple[range, ...]
+    store: Store
+    seconds: Mapping[str, Seconds]
+    device: str
+
+    def __repr__(self) -> str:
+        """Its table, so that a study prints as what it found."""
+        return table(summarise(self))
+
+    def to_pandas(self) -> Any:
+        """A `pandas.DataFrame` of what every step of every filter says, one row each.
+
+        Raises ValueError where pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError:
+            raise ValueError("to_pandas needs pandas: pip install pandas") from None
+        summary = summarise(self)
+        parts = [_by_step(summary["filters"][name]) for name in self.filters]
+        steps = {"step": range(1, summary["steps"] + 1), "time": summary["time"]}
+        frames = [pandas.DataFrame({**steps, **part}, dtype=float) for part in parts]
+        return pandas.concat(frames, keys=list(self.filters), names=["filter", "row"])
 
 
 def summarise(study: Study) -> dict[str, Any]:
@@ -109,6 +153,13 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
         "status": {s.name.lower(): int(sums[f"status_{s.name}"]) for s in Status if s != Status.OK},
         "seconds": {"compile": seconds.compile, "run": seconds.run},
     }
+
+
+def _by_step(found: dict[str, Any]) -> dict[str, list[float | None]]:
+    """Columns of a filter's numbers that have one value a step."""
+    alone = ("nees", "nees_median", "nees_not_lost", "lost", "lost_ever", "nis", "nis_dof")
+    parts = {f"{kind}_{k}": v for kind in ("rmse", "sigma") for k, v in found[kind].items()}
+    return {**{key: found[key] for key in alone}, **parts}
 
 
 def _log_scale(study: Study, name: str, sums: dict[str, Any], healthy: int) -> dict[str, Any]:

@@ -149,6 +149,11 @@ def scenario(
     return _replaced(chosen, {**(overrides or {}), **fields})
 
 
+def as_scenario(given: Scenario | str) -> Scenario:
+    """A scenario, or the one of this name. Raises ValueError."""
+    return given if isinstance(given, Scenario) else scenario(given)
+
+
 def _named(name: str) -> Scenario | None:
     """A built-in scenario, or one along a trajectory of this name."""
     if not name.startswith(HANDHELD):

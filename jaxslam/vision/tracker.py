@@ -19,6 +19,7 @@ from jaxslam.arrays import cast
 from jaxslam.forms.state import Features, Status
 from jaxslam.models.scale import Metre
 from jaxslam.models.sensors import Pinhole
+from jaxslam.names import CANNOT_TRACK
 from jaxslam.slam.association import ASSOCIATIONS, Association, candidates
 from jaxslam.slam.filter import AtOnce, EkfSlam, begun, innermost
 from jaxslam.slam.protocol import AbstractStaged, Scene
@@ -143,7 +144,7 @@ class Tracker:
             raise ValueError(
                 f"filter {self.filter_name} cannot track: features are sought where a Gaussian "
                 "predicts them, before it is given the frame, from the frame in which they are "
-                "first seen"
+                f"first seen; all do but {', '.join(CANNOT_TRACK)}"
             )
         if self.target is not None and not _keeps_metres(made):
             raise ValueError(
