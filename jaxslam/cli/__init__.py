@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import textwrap
 from typing import Annotated
 
 import tyro
@@ -69,6 +70,8 @@ def main(arguments: list[str] | None = None) -> None:
         options.run()
     except ValueError as error:
         _fail(2, str(error))
+    except OSError as error:  # a path that is too long, a folder that may not be written
+        _fail(2, f"{textwrap.shorten(str(error.filename), 80)}: {error.strerror or error}")
     except KeyboardInterrupt as interrupt:
         _fail(130, f"interrupted{f': {interrupt}' if str(interrupt) else ''}")
 

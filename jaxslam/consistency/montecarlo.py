@@ -49,6 +49,8 @@ from jaxslam.watchdog import finished, lapack_calls
 DTYPES = ("float64", "float32")
 CHUNK = 100
 """Runs in one batch: enough to fill vector units, few enough to stay in the cache."""
+MOST_RUNS = 10**8
+"""Of a study."""
 
 
 def monte_carlo(
@@ -293,9 +295,11 @@ def _landmark_nees(slam, sensor, state, frame: Frame) -> dict[str, Array]:
 def check_sizes(runs: int, seed: int, dtype: str, chunk: int) -> None:
     """Raise ValueError for sizes that make no sense."""
     for name, value in (("runs", runs), ("chunk", chunk)):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, not {value}")
-    if seed < 0:
-        raise ValueError(f"seed must not be negative, not {seed}")
+        if not 1 <= value <= MOST_RUNS:
+            least = "at least 1" if value < 1 else f"at most {MOST_RUNS}"
+            raise ValueError(f"{name} must be {least}, not {value}")
+    if not 0 <= seed < 2**63:
+        bound = "not be negative" if seed < 0 else "be below 2⁶³"
+        raise ValueError(f"seed must {bound}, not {seed}")
     if dtype not in DTYPES:
         raise ValueError(f"unknown dtype {dtype!r}; known: {', '.join(DTYPES)}")

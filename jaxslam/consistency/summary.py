@@ -21,6 +21,11 @@ from jaxslam.slam.filter import innermost
 from jaxslam.slam.protocol import AbstractFilter
 
 SCHEMA = 1
+RECORDS = (
+    "nees", "beyond_scale", "log_scale", "log_scale_sigma", "reversed", "nis", "nis_dof", "status",
+    "error", "variance", "landmark_nees", "landmark_count", "landmark_not_finite",
+)  # fmt: skip
+"""What a summary reads of the records of a run."""
 _STEPS_AT_ONCE = 50
 """Steps of which the median holds all runs in memory."""
 
@@ -113,10 +118,9 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
     low, high = mean_band(dof, max(healthy, 1))
 
     def by_part(per_axis):
-        return {
-            "position": json_numbers(np.sqrt(per_axis[:, :n].sum(axis=1))),
-            "orientation": json_numbers(np.sqrt(per_axis[:, n:].sum(axis=1))),
-        }
+        with np.errstate(invalid="ignore"):  # of a variance that is negative
+            parts = np.sqrt(per_axis[:, :n].sum(axis=1)), np.sqrt(per_axis[:, n:].sum(axis=1))
+        return dict(zip(("position", "orientation"), map(json_numbers, parts), strict=True))
 
     seconds = study.seconds[name]
     beyond = tally(study, name, "beyond_scale")
@@ -192,9 +196,9 @@ def treatment(slam: Any) -> str | None:
 def _sums(study: Study, name: str, dof: int) -> dict[str, Any]:
     """Sums over the runs that did not diverge, chunk by chunk."""
     threshold, total = lost_threshold(dof), {}
-    for records in _chunks(study, name):
+    for records in _chunks(study, name, RECORDS):
         healthy = _healthy(records)
-        good = {k: v[healthy] for k, v in records.items() if not k.startswith("sample_")}
+        good = {key: value[healthy] for key, value in records.items()}
         with np.errstate(invalid="ignore"):
             kept = good["nees"] <= threshold
         finite = good["landmark_count"] - good["landmark_not_finite"]
@@ -268,7 +272,7 @@ def _healthy(records: Records) -> np.ndarray:
     return np.asarray(np.isfinite(records["nees"]).all(axis=1))
 
 
-def _chunks(study: Study, name: str, names: tuple[str, ...] | None = None) -> Iterator[Records]:
+def _chunks(study: Study, name: str, names: tuple[str, ...]) -> Iterator[Records]:
     for chunk in study.chunks:
         yield study.store.load(name, chunk, names)
 

@@ -29,6 +29,7 @@ CALIBRATIONS = ("white", "consider", "estimated", "known")
 TRUE_CALIBRATIONS = ("nominal", "white", "constant")
 PLACEMENTS = ("prior", "ring", "room", "rays")
 ROOM_LANDMARKS = 72
+LARGEST_WHOLE = 2**31 - 1
 
 
 def _structural(default: Any) -> Any:
@@ -222,6 +223,8 @@ def _coerced(field: str, value: Any, like: Any) -> Any:
         return tuple(_coerced(field, number, 0.0) for number in values)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise wrong("a number")
+    if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
+        raise wrong(f"a number up to {LARGEST_WHOLE}")
     if isinstance(like, int) and value != int(value if math.isfinite(value) else 0):
         raise wrong("a whole number")
     return type(like)(value)

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from scipy.stats import binom
 
 from jaxslam.arrays import cast
+from jaxslam.files import one_line
 from jaxslam.forms.state import Features, Status
 from jaxslam.models.scale import Metre
 from jaxslam.models.sensors import Pinhole
@@ -250,12 +251,28 @@ class Tracker:
         that is none, or of another filter.
         """
         header, arrays = read_record(path)
-        if header["filter"] is not None and filter is None:
+        if header.get("filter") is not None and filter is None:
             raise ValueError(f"{path}: was saved with a filter {header['filter']}; give that")
         try:
             settings = TrackerSettings(**header["settings"])
         except TypeError:
             raise ValueError(f"{path}: was saved by another version, with other settings") from None
+        except KeyError:
+            raise ValueError(f"{path}: is damaged: it has no settings") from None
+        try:
+            return cls._restored(settings, header, arrays, filter)
+        except (KeyError, TypeError, IndexError, AttributeError) as error:
+            raise ValueError(f"{path}: is damaged ({one_line(error)})") from None
+
+    @classmethod
+    def _restored(
+        cls,
+        settings: TrackerSettings,
+        header: dict[str, Any],
+        arrays: dict[str, np.ndarray],
+        filter: AbstractStaged | None,
+    ) -> Tracker:
+        """What `save` wrote, as it was."""
         tracker = cls(from_fields(header["calibration"]), settings, filter)
         for name, value in header["numbers"].items():
             setattr(tracker, name, value)
