@@ -256,19 +256,16 @@ TARGETS: dict[str, Target] = {
 def problem(target: Target, folder: Path, trap: Path, draw: np.random.Generator) -> str:
     """What is wrong with how a case ends; given.nothing if it ends as it must."""
     try:
-        result = target.read(folder, draw)
+        wrong = _not_finite(target.read(folder, draw))
     except ValueError as error:
         text = str(error)
-        if not text or "\n" in text or len(text) > LONGEST:
-            return f"not one clear line: {text[:300]!r}"
-        return _left_over(folder)
-    except BaseException as error:
-        if isinstance(error, KeyboardInterrupt):
-            raise
-        return traceback.format_exc(limit=-6)
+        clear = text and "\n" not in text and len(text) <= LONGEST
+        wrong = "" if clear else f"not one clear line: {text[:300]!r}"
+    except (Exception, SystemExit):
+        wrong = traceback.format_exc(limit=-6)
     if trap.exists() and trap.read_text() == MARK:
-        return "a pickle in the data was run"
-    return _not_finite(result) or _left_over(folder)
+        wrong = "a pickle in the data was run"
+    return wrong or _left_over(folder)
 
 
 def _left_over(folder: Path) -> str:

@@ -106,7 +106,8 @@ class PowerSums:
         n, m = self.count, self.mean
         second = self.second / n - m * m
         third = self.third / n - 3 * m * self.second / n + 2 * m * m * m
-        return third / (second * math.sqrt(second)) if second > 1e-12 * m * m else 0.0
+        cubed = second * math.sqrt(max(second, 0.0))
+        return third / cubed if second > 1e-12 * m * m and cubed > 0 else 0.0
 
 
 def mean_interval(sums: PowerSums, confidence: float) -> tuple[float, float]:
