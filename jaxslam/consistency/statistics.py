@@ -136,8 +136,13 @@ def mean_p_value(sums: PowerSums, expected: float) -> float:
     return 2 * float(stdtr(sums.count - 1, -abs(_symmetric(t, k))))
 
 
+_FAR = 1e50
+"""Of a studentised mean: beyond it no power of it is a number."""
+
+
 def _symmetric(t: float, k: float) -> float:
     """Hall's cubic `g(t) = t + k/6 + k t²/3 + k² t³/27`, with k = skewness/√n: monotone."""
+    t = min(max(t, -_FAR), _FAR)
     return t + k / 6 + k * t**2 / 3 + k**2 * t**3 / 27
 
 
