@@ -18,6 +18,8 @@ from typing import Any, BinaryIO, TypeVar
 import numpy as np
 
 T = TypeVar("T")
+LARGEST = 1e100
+"""Of the numbers of poses and pictures, whose squares are finite then."""
 
 
 @contextmanager
@@ -98,6 +100,8 @@ def check_real(what: str, x: np.ndarray) -> None:
         raise ValueError(f"{what} holds {x.dtype}; real numbers are accepted")
     if not np.isfinite(x).all():
         raise ValueError(f"{what} holds a number that is not finite")
+    if x.size and (most := float(np.abs(x).max())) > LARGEST:
+        raise ValueError(f"{what} holds {most:.2g}; up to {LARGEST:.0e} is accepted")
 
 
 def one_line(error: BaseException) -> str:

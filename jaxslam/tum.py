@@ -11,10 +11,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from jaxslam.files import write_atomically
-
-LARGEST = 1e100
-"""Of the numbers of poses, whose squares are finite then."""
+from jaxslam.files import LARGEST, write_atomically
 
 
 class Table(NamedTuple):

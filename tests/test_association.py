@@ -10,10 +10,12 @@ import pytest
 from cases import Case, quick_jit
 from scipy.stats import chi2
 
+from jaxslam.forms.form import curvature
 from jaxslam.forms.information import Information
 from jaxslam.forms.state import Features
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.slam.association import ASSOCIATIONS, GATE, Candidates, candidates
+from jaxslam.slam.filter import context_of
 
 SIGMA = 0.3
 M = 20
@@ -47,7 +49,7 @@ def found(rng, wrong=0.0, S=None):
         angle, radius = rng.uniform(0, 2 * np.pi), 3 * np.sqrt(rng.uniform())
         r[i] = np.linalg.cholesky(own) @ [radius * np.cos(angle), radius * np.sin(angle)]
     S = jnp.asarray(S.reshape(M, 2, M, 2))
-    return Candidates(jnp.asarray(r), S, jnp.ones(M, bool)), bad
+    return Candidates(jnp.asarray(r), S, jnp.ones(M, bool), jnp.arange(M)), bad
 
 
 def rates(name, wrong, runs=20):
@@ -122,7 +124,8 @@ def test_the_order_of_the_matches_does_not_matter():
     S = matches.covariance[order][:, :, order]
     for name in AGREEING:
         believed = np.asarray(compiled[name](matches))
-        permuted = compiled[name](Candidates(matches.residual[order], S, matches.valid[order]))
+        valid, landmark = matches.valid[order], matches.landmark[order]
+        permuted = compiled[name](Candidates(matches.residual[order], S, valid, landmark))
         np.testing.assert_array_equal(permuted, believed[order])
 
 
@@ -203,6 +206,28 @@ def test_a_tolerance_is_noise_of_each_match_by_itself():
     added = (some.covariance - none.covariance).reshape(12, 12)
     np.testing.assert_allclose(added, 0.49 * np.eye(12), atol=1e-9)
     np.testing.assert_array_equal(some.residual, none.residual)
+
+
+def test_of_a_curved_measurement_the_spread_of_a_moving_camera_is_told():
+    """Against samples: what a linear prediction leaves out of each match's covariance."""
+    slam, state, control, pixels = matched()
+    seen = Features(jnp.arange(6), pixels, jnp.ones(6, bool))
+    linear, curved = (candidates(slam, state, control, seen, curved=x) for x in (False, True))
+    added = np.asarray(curved.covariance - linear.covariance)
+    own = added[np.arange(6), :, np.arange(6)]
+    rest = added.copy()
+    rest[np.arange(6), :, np.arange(6)] = 0.0
+    np.testing.assert_array_equal(rest, 0.0)
+    assert np.all(np.linalg.eigvalsh(own) >= -1e-12)
+    hessian, Q = curvature(
+        slam.gaussian_form, slam.model, state, jnp.arange(6), context_of(slam, control)
+    )
+    rng = np.random.default_rng(0)
+    for H, P, extra in zip(np.asarray(hessian), np.asarray(Q), own, strict=True):
+        root = np.linalg.cholesky(P + 1e-15 * np.trace(P) * np.eye(len(P)))
+        draws = rng.normal(size=(200_000, len(P))) @ root.T
+        bent = np.einsum("pij,ni,nj->np", H, draws, draws) / 2
+        np.testing.assert_allclose(np.cov(bent.T), extra, atol=0.05 * np.trace(extra))
 
 
 def test_a_filter_without_the_covariance_of_its_innovations_is_refused():

@@ -21,6 +21,7 @@ from cases import (
 )
 
 from jaxslam.arrays import cast
+from jaxslam.forms.blocks import Blocks, observed, placed
 from jaxslam.forms.covariance import Covariance
 from jaxslam.forms.state import Features, State, Status
 from jaxslam.geometry import PLANAR, SPATIAL, difference, retract
@@ -709,3 +710,11 @@ def test_covariance_stays_symmetric_and_positive_over_a_long_run(kind, dtype):
     assert np.abs(correlations - correlations.transpose(0, 2, 1)).max() <= 100 * unit
     least = np.linalg.eigvalsh((correlations + correlations.transpose(0, 2, 1)) / 2)[:, 0]
     assert least.min() >= -P.shape[1] * unit
+
+
+def test_products_with_blocks_leave_out_only_zeros():
+    rng = np.random.default_rng(0)
+    m, k, v, c, d, capacity = 3, 2, 4, 5, 3, 6
+    J = Blocks(*(jnp.asarray(rng.normal(size=s)) for s in ((v, c), (m, k, v), (m, k, d))))
+    slots, B = jnp.array([4, 0, 4]), jnp.asarray(rng.normal(size=(c + capacity * d, 7)))
+    close(observed(J, slots, B), placed(J, slots, capacity) @ B, 1e-14)

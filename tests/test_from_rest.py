@@ -1,5 +1,6 @@
 """Tests of the sum that sets out from rest: what it finds, and what it refuses."""
 
+from dataclasses import replace
 from functools import cache
 
 import equinox as eqx
@@ -12,7 +13,8 @@ from cases import Case, quick_jit
 from jaxslam.consistency.statistics import lost_threshold
 from jaxslam.forms.state import Features
 from jaxslam.models.calibration import Considered
-from jaxslam.wrappers.from_rest import SIZES, FromRest, from_rest
+from jaxslam.window.record import empty
+from jaxslam.wrappers.from_rest import IN_TURN, SEARCHES, SIZES, FromRest, from_rest
 
 RUNS, STEPS = 6, 12
 SUM = "scale_gauge+mixture3"
@@ -264,3 +266,38 @@ def test_measurements_that_nothing_explains_leave_the_sum_to_itself():
         state, _ = step(state, control, known, new)
     np.testing.assert_array_equal(state.modes.log_weights, before.modes.log_weights)
     np.testing.assert_array_equal(state.modes.minima.x, before.modes.minima.x)
+
+
+def due(slam, last, standing=False, steps=None, newest=range(1, 9)):
+    """From which starts is sought after frame `last`, `steps` frames since the first."""
+    frames = newest.stop
+    merged = jnp.ones(frames - 1).at[0].add((last if steps is None else steps) - last)
+    record = empty(slam.base.base.motion, frames, 4, 2, jnp.float64)
+    stood = jnp.asarray(standing)
+    record = replace(record, last=jnp.asarray(last), merged=merged, standing=stood)
+    return slam._due(record, newest)
+
+
+def test_a_search_is_from_all_starts_at_first_and_then_from_some_in_turn():
+    slam = from_rest(standstill().filter(SUM), 8)
+    starts, together = 2 + slam.directions, IN_TURN["spatial"]
+    early = SEARCHES["spatial"]
+    for last in early:
+        assert due(slam, last).shape == (starts,)
+        assert due(slam, last).all()
+        assert not due(slam, last, standing=True).any()
+    later = [np.asarray(due(slam, 8, steps=max(early) + 1 + k)) for k in range(starts)]
+    assert {int(x.sum()) for x in later} == {together}
+    # The reversal of the likeliest first, and none twice before all had their turn.
+    assert later[0][1]
+    np.testing.assert_array_equal(np.sum(later, axis=0), together)
+    assert not np.logical_and(later[0], later[1]).any()
+
+
+def test_in_the_plane_a_search_is_from_all_starts_or_from_none():
+    slam = from_rest(Case("standstill", 1, landmarks=4, steps=2).filter(SUM))
+    assert IN_TURN["planar"] == 0
+    for last in range(1, 9):
+        found = due(slam, last)
+        assert found.all() if last in SEARCHES["planar"] else not found.any()
+    assert due(slam, 40, newest=range(35, 61)) is None

@@ -14,9 +14,10 @@ from jaxslam.slam.protocol import AbstractFilter, AbstractStaged
 PACKAGE = Path(jaxslam.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 ORDER = (
-    "arrays", "files", "tum", "linalg", "lookup", "watchdog", "geometry", "least_squares",
-    "landmarks", "models", "forms", "slam", "delayed", "remedies", "window", "wrappers",
-    "simulation", "names", "consistency", "evaluation", "posterior", "triangulation", "datasets",
+    "arrays", "files", "programs", "tum", "linalg", "lookup", "watchdog", "geometry",
+    "least_squares", "landmarks", "models", "forms", "slam", "delayed", "remedies", "window",
+    "wrappers", "simulation", "names", "consistency", "evaluation", "posterior", "triangulation",
+    "datasets",
     "plots", "video", "vision", "cli",
 )  # fmt: skip
 """Rooms, each of which imports only those before it."""

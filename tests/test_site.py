@@ -1,10 +1,12 @@
 """The pages hang together: each is in the site, each link goes somewhere, versions agree."""
 
+import ast
 import re
 import tomllib
 from pathlib import Path
 
 import pytest
+from test_house import ORDER
 
 import jaxslam
 
@@ -51,6 +53,18 @@ def test_every_page_and_notebook_is_in_the_site():
     listed = set((ROOT / "docs" / "index.md").read_text().split())
     assert {page.stem for page in PAGES} - {"index"} <= listed
     assert {f"tutorials/{path.stem}" for path in (ROOT / "notebooks").glob("*.py")} <= listed
+
+
+def test_every_room_is_in_the_site():
+    """In another order than that of imports: what users meet first comes first."""
+    sources = ast.parse((ROOT / "docs" / "site_sources.py").read_text()).body
+    (listed,) = [x.value for x in sources if isinstance(x, ast.Assign) and _name(x) == "ROOMS"]
+    assert sorted(ast.literal_eval(listed)) == sorted(ORDER)
+
+
+def _name(assignment: ast.Assign) -> str | None:
+    target = assignment.targets[0]
+    return target.id if isinstance(target, ast.Name) else None
 
 
 def test_the_version_is_one():

@@ -21,7 +21,7 @@ from jaxslam.names import scale_gauge, scenario_pieces
 from jaxslam.posterior import log_density, make_problem
 from jaxslam.posterior.laplace import minima
 from jaxslam.simulation import scenario
-from jaxslam.window import minimise, scale
+from jaxslam.window import minimise, modes, scale
 from jaxslam.window.handover import gauge_state
 from jaxslam.window.minimise import minimised, started
 from jaxslam.window.modes import each_alive, when
@@ -550,6 +550,22 @@ def test_only_the_living_are_worked_on():
     jax.effects_barrier()
     np.testing.assert_array_equal(after, jnp.where(alive, 2 * values, values))
     assert len(found) == 2
+
+
+def test_a_mode_that_is_next_to_impossible_is_none(monkeypatch):
+    """Of distinct minima those remain, as modes, whose evidence is not too far below the best."""
+    costs = 2 * jnp.array([7.0, 0.0, 2 * modes.NEGLIGIBLE, 0.9 * modes.NEGLIGIBLE])
+    at = jax.vmap(started)(10.0 * jnp.eye(4), jnp.zeros((4, 1, 3)))
+    at = replace(at, cost=costs)
+
+    def weighed(slam, now, record):
+        return now._replace(evidence=-now.minimum.cost / 2, information=jnp.eye(4))
+
+    monkeypatch.setattr(modes, "_weighed", weighed)
+    found = modes._likeliest(None, jnp.zeros(()), at, jnp.ones(4, bool), 4)
+    weights = jax.nn.log_softmax(-costs / 2)[jnp.array([1, 0, 3])]
+    np.testing.assert_allclose(found.log_weights, jnp.append(weights, -jnp.inf), rtol=1e-12)
+    np.testing.assert_array_equal(found.minima.x[:3], at.x[jnp.array([1, 0, 3])])
 
 
 def test_a_metre_that_is_not_known_stays_so_and_changes_nothing_else():

@@ -7,19 +7,24 @@ from pathlib import Path
 
 import jax
 
+from jaxslam.programs import keep_in
+
 _WORTH = 0.2
 """Programs that compile for so many seconds are kept; by default JAX keeps those of one second."""
 
 
 def keep_programs() -> None:
-    """Have JAX keep programs in the user's cache folder, unless JAX was told about a cache.
+    """Keep programs in the user's cache folder, or where JAX was told to keep them.
 
     That is `$XDG_CACHE_HOME/jaxslam`, `~/.cache/jaxslam` by default. JAX's own variables
     JAX_COMPILATION_CACHE_DIR (another folder) and JAX_ENABLE_COMPILATION_CACHE (false: none) come
     first, and so do its configuration's. A folder that cannot be made is done without.
     """
-    told = jax.config.values
-    if told["jax_compilation_cache_dir"] or not told["jax_enable_compilation_cache"]:
+    if not jax.config.values["jax_enable_compilation_cache"]:
+        return
+    told = jax.config.values["jax_compilation_cache_dir"]
+    if told:
+        keep_in(None if "://" in told else Path(told))
         return
     try:
         folder = _cache_home() / "jaxslam"
@@ -27,6 +32,7 @@ def keep_programs() -> None:
     except (OSError, RuntimeError):  # RuntimeError: nobody's home
         return
     if os.access(folder, os.W_OK):
+        keep_in(folder)
         jax.config.update("jax_compilation_cache_dir", str(folder))
         if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
             jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH)

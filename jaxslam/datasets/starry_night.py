@@ -104,6 +104,9 @@ def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
                 f"{path}: {name} must have the shape {wanted}, not {arrays[name].shape}"
             )
         check_real(f"{path}: {name}", arrays[name])
+    for name in ("w_var", "v_var", "y_var"):
+        if (arrays[name] <= 0).any():
+            raise ValueError(f"{path}: {name} holds a variance that is not positive")
     if (np.diff(arrays["t"].ravel()) <= 0).any():
         raise ValueError(f"{path}: t must increase")
 

@@ -33,8 +33,9 @@ from jaxslam.evaluation.convention import (
 )
 from jaxslam.evaluation.evaluate import Evaluation, left_out
 from jaxslam.evaluation.identify import Identification, identify
+from jaxslam.files import LARGEST
 from jaxslam.lookup import chosen
-from jaxslam.tum import LARGEST, not_rigid
+from jaxslam.tum import not_rigid
 
 _RIGID = 1e-4
 """How far from orthonormal a rotation may be: what rounding to six digits leaves is less."""

@@ -208,6 +208,14 @@ def placed(J: Blocks, slots: Int[Array, " m"], capacity: int) -> Float[Array, "m
     return jnp.concatenate([shared.reshape(m * k, -1), own.reshape(m * k, capacity * d)], axis=1)
 
 
+def observed(J: Blocks, slots: Int[Array, " m"], B: Float[Array, "n r"]) -> Float[Array, "mk r"]:
+    """`J B` of blocks in these slots, without the zeros."""
+    c, d = J.view_by_core.shape[1], J.by_landmark.shape[-1]
+    own = B[c:].reshape(-1, d, B.shape[1])[slots]
+    by_view = J.by_view.reshape(-1, J.by_view.shape[-1]) @ (J.view_by_core @ B[:c])
+    return by_view + small_products(J.by_landmark, own).reshape(by_view.shape)
+
+
 def rows(J: Blocks, B: Float[Array, "n r"]) -> Float[Array, "nl r"]:
     """`J B` for every landmark in order, without the zeros: J has a block for each."""
     c, d = J.view_by_core.shape[1], J.by_landmark.shape[-1]

@@ -23,7 +23,7 @@ from jaxslam.forms.blocks import (
     local_jacobians,
     masked,
     new_landmarks,
-    placed,
+    observed,
     residuals,
     rows,
     shifted,
@@ -102,23 +102,23 @@ class Covariance(AbstractGaussian):
         A step of Gauss–Newton to the maximum of the posterior; None is no offset.
         """
         predicted, residual, used, blocks = residuals(model, state, features, context)
-        H = placed(blocks, features.slots, state.active.size)
         P = state.covariance
         R = _noise_matrix(noise, used)
-        HP = H @ P
-        S = HP @ H.T + R
+        HP = observed(blocks, features.slots, P)
+        S = observed(blocks, features.slots, HP.T).T + R
         factor = cholesky(S)
         whitening = factor.whitening
         K = ((HP.T @ whitening.T) @ whitening).at[considered].set(0.0)
         if offset is not None:
-            residual = residual - (H @ offset).reshape(residual.shape)
+            moved = observed(blocks, features.slots, offset[:, None])
+            residual = residual - moved.reshape(residual.shape)
         whitened = whitening @ residual.ravel()
 
         # Joseph's (I - KH) P (I - KH)ᵀ + K R Kᵀ, multiplied out from the left: two products of
         # rank m, and none of n × n matrices. An error of K then counts by its square only; what
         # rounding does to the differences is made good by `ROUNDING`.
         left = P - K @ HP
-        covariance = left + (K @ R - left @ H.T) @ K.T
+        covariance = left + (K @ R - observed(blocks, features.slots, left.T).T) @ K.T
         lost = ROUNDING * jnp.finfo(P.dtype).eps * jnp.diagonal(P).at[considered].set(0.0)
         delta = K @ residual.ravel()
         state = shifted(state, delta if offset is None else offset + delta)
@@ -139,9 +139,8 @@ class Covariance(AbstractGaussian):
     ) -> State:
         """The mean that `update` would give, with the covariance left as it is."""
         _, residual, used, blocks = residuals(model, state, features, context)
-        H = placed(blocks, features.slots, state.active.size)
-        HP = H @ state.covariance
-        S = HP @ H.T + _noise_matrix(noise, used)
+        HP = observed(blocks, features.slots, state.covariance)
+        S = observed(blocks, features.slots, HP.T).T + _noise_matrix(noise, used)
         delta = HP.T @ cholesky(S).solve(residual.ravel())
         return shifted(state, delta.at[considered].set(0.0))
 

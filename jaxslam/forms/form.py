@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -27,6 +28,7 @@ from jaxslam.forms.blocks import (
     without_auxiliary,
 )
 from jaxslam.forms.state import Features
+from jaxslam.geometry import jacobian, nudge
 
 
 class AbstractForm(eqx.Module):
@@ -166,3 +168,22 @@ class AbstractGaussian(AbstractForm):
         c, d = state.core_dim, state.landmarks.shape[1]
         index = jnp.concatenate([jnp.arange(c), c + slot * d + jnp.arange(d)])
         return state.covariance[index[:, None], index]
+
+
+def curvature(
+    form: AbstractGaussian, model: Model, state: Any, slots: Int[Array, " m"], context: Any
+) -> tuple[Float[Array, "m p k k"], Float[Array, "m k k"]]:
+    """Second derivatives of every landmark's measurement by what it depends on, the view and the
+    landmark's own numbers, and the covariance of these."""
+    view = model.view(state.core, context)
+    view_by_core = jacobian(lambda core: model.view(core, context), state.core)
+    v, d, m = len(view_by_core), state.landmarks.shape[1], slots.size
+
+    def measured(delta, landmark):
+        return model.observe(nudge(view, delta[:v]), landmark + delta[v:], context)[0]
+
+    zero = jnp.zeros(v + d, state.landmarks.dtype)
+    hessian = jax.vmap(lambda landmark: jax.jacfwd(jax.jacfwd(measured))(zero, landmark))
+    eye = jnp.broadcast_to(jnp.eye(v + d, dtype=zero.dtype), (m, v + d, v + d))
+    itself = Blocks(view_by_core, eye[:, :, :v], eye[:, :, v:])
+    return hessian(state.landmarks[slots]), form.local_covariance(state, itself, slots)

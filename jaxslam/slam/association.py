@@ -19,11 +19,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from scipy.stats import chi2
 
+from jaxslam.forms.form import curvature
 from jaxslam.forms.state import Features
 from jaxslam.linalg import cholesky
+from jaxslam.slam.filter import context_of
 from jaxslam.slam.protocol import AbstractStaged
 
 GATE = 0.99
@@ -45,6 +47,8 @@ class Candidates(NamedTuple):
     covariance: Float[Array, "m p m p"]
     """S of all."""
     valid: Bool[Array, " m"]
+    landmark: Int[Array, " m"]
+    """Of which each is a match: a number below m."""
 
     @property
     def gate(self) -> float:
@@ -61,7 +65,13 @@ class Candidates(NamedTuple):
         S = self.covariance
         gain = S[:, :, match] @ _inverse(S[match, :, match])
         residual = self.residual - gain @ self.residual[match]
-        return Candidates(residual, _eliminated(S, match), self.valid.at[match].set(False))
+        valid = self.valid & (self.landmark != self.landmark[match])
+        return Candidates(residual, _eliminated(S, match), valid, self.landmark)
+
+    def best_of_each(self, distances: Float[Array, "*k m"]) -> Float[Array, "*k m"]:
+        """The least of each landmark, infinite of a number that has none."""
+        least = jax.vmap(lambda row: jax.ops.segment_min(row, self.landmark, len(self.landmark)))
+        return least(distances.reshape(-1, len(self.landmark))).reshape(distances.shape)
 
 
 Association = Callable[[Candidates], Bool[Array, " m"]]
@@ -69,11 +79,19 @@ Association = Callable[[Candidates], Bool[Array, " m"]]
 
 
 def candidates(
-    slam: AbstractStaged, state: Any, control: Any, features: Features, tolerance: Any = 0.0
+    slam: AbstractStaged,
+    state: Any,
+    control: Any,
+    features: Features,
+    tolerance: Any = 0.0,
+    *,
+    curved: bool = False,
 ) -> Candidates:
     """The innovations of features of a predicted state that is one Gaussian.
 
     `tolerance` is a σ, in the unit of a measurement, by which each may be off beyond its noise.
+    Of a `curved` measurement, the covariance has the terms of second order of each match by
+    itself: of a camera that may have set out in any direction, they are what depth does to it.
     Raises ValueError for a filter whose innovations have no covariance.
     """
     _, innovation = slam.update(state, control, features)
@@ -84,7 +102,23 @@ def candidates(
     m, p = innovation.residual.shape
     S = innovation.covariance
     S += tolerance**2 * jnp.eye(m * p, dtype=S.dtype)
-    return Candidates(innovation.residual, S.reshape(m, p, m, p), innovation.used)
+    S = S.reshape(m, p, m, p)
+    if curved:
+        i = jnp.arange(m)
+        S = S.at[i, :, i].add(_second_order(slam, state, control, features.slots))
+    first_alike = jnp.argmax(features.slots == features.slots[:, None], axis=1)
+    return Candidates(innovation.residual, S, innovation.used, first_alike)
+
+
+def _second_order(
+    slam: Any, state: Any, control: Any, slots: Int[Array, " m"]
+) -> Float[Array, "m p p"]:
+    """`½ tr(∂²h_a Q ∂²h_b Q)`, Q of what one measurement depends on (Bar-Shalom, Li, Kirubarajan,
+    *Estimation with Applications to Tracking and Navigation*, 2001, §10.3.2)."""
+    context = context_of(slam, control)
+    hessian, Q = curvature(slam.gaussian_form, slam.model, state, slots, context)
+    HQ = jnp.einsum("mpij,mjk->mpik", hessian, Q)
+    return jnp.einsum("mpij,mqji->mpq", HQ, HQ) / 2
 
 
 def everything(found: Candidates) -> Bool[Array, " m"]:
@@ -116,9 +150,9 @@ def sequential(found: Candidates) -> Bool[Array, " m"]:
 
     From other starts the same, until most matches agree; the set with the most is the one.
     """
-    disagreement = jnp.sum(jnp.minimum(_distances_given_one(found), found.gate), axis=1)
-    firsts = jnp.argsort(disagreement)[:STARTS]
-    enough = ENOUGH * jnp.sum(found.valid)
+    distances = found.best_of_each(_distances_given_one(found))
+    firsts = jnp.argsort(jnp.sum(jnp.minimum(distances, found.gate), axis=1))[:STARTS]
+    enough = ENOUGH * jnp.sum(jnp.isfinite(found.best_of_each(found.distances())))
 
     def another(state):
         start, best = state
@@ -144,7 +178,8 @@ def joint_compatibility(found: Candidates, most: int = MOST_NODES) -> Bool[Array
     alone = found.distances()
     order = jnp.argsort(alone)
     within = (alone < found.gate)[order]
-    ordered = Candidates(found.residual[order], found.covariance[order][:, :, order], within)
+    S = found.covariance[order][:, :, order]
+    ordered = Candidates(found.residual[order], S, within, found.landmark[order])
     bounds = jnp.asarray(chi2.ppf(GATE, p * np.arange(1, m + 1)), found.residual.dtype)
 
     def step(node: _Node) -> _Node:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.tum import LARGEST
+from jaxslam.files import LARGEST
 from jaxslam.video.calibration import Calibration
 from jaxslam.video.recording import (
     Calibrator,

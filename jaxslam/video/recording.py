@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.tum import LARGEST, not_rigid
+from jaxslam.files import LARGEST
+from jaxslam.tum import not_rigid
 from jaxslam.video.calibration import Calibration, read_calibration
 from jaxslam.video.source import Image, Trajectory
 

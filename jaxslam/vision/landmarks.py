@@ -22,6 +22,8 @@ class Landmark:
     patch: Patch
     first_camera: np.ndarray
     """T_wc of its first view, (4, 4)."""
+    seen_at: np.ndarray
+    """Pixel (u, v) of its latest view."""
     success: float = 1.0
     """Share of the latest searches that found it, the older ones weighing ever less."""
     missed: int = 0
@@ -29,11 +31,13 @@ class Landmark:
     unseen: int = 0
     """Frames since it was found."""
 
-    def searched(self, found: bool, patience: float) -> None:
-        """Count one search; `success` is an average over about `patience` of them."""
+    def searched(self, found: bool, pixel: np.ndarray, patience: float) -> None:
+        """Count one search, that found it at this pixel or not; `success` is an average over about
+        `patience` of them."""
         self.success += (found - self.success) / patience
         self.missed = 0 if found else self.missed + 1
-        self.unseen = 0 if found else self.unseen
+        if found:
+            self.unseen, self.seen_at = 0, pixel
 
 
 class Points(NamedTuple):
@@ -75,6 +79,7 @@ def stacked(landmarks: Mapping[int, Landmark]) -> dict[str, np.ndarray]:
         "counts": np.array(counts, int).reshape(-1, len(_COUNTS)),
         "success": np.array([landmark.success for landmark in kept], float),
         "first_cameras": np.array(cameras, float).reshape(-1, 4, 4),
+        "seen_at": np.array([landmark.seen_at for landmark in kept], float).reshape(-1, 2),
         "pixels": np.array([patch.pixel for patch in patches], float).reshape(-1, 2),
         "stored": np.array([patch.stored for patch in patches], np.float32).reshape(
             -1, STORED, STORED
@@ -88,16 +93,17 @@ def unstacked(arrays: Mapping[str, np.ndarray]) -> dict[int, Landmark]:
     return {int(slot): _restored(*row) for slot, *row in rows}
 
 
-_FIELDS = ("slots", "counts", "success", "first_cameras", "pixels", "stored")
+_FIELDS = ("slots", "counts", "success", "first_cameras", "seen_at", "pixels", "stored")
 
 
 def _restored(
     counts: np.ndarray,
     success: float,
     first_camera: Float[np.ndarray, "4 4"],
+    seen_at: Float[np.ndarray, " 2"],
     pixel: Float[np.ndarray, " 2"],
     stored: np.ndarray,
 ) -> Landmark:
-    named = dict(zip(_COUNTS, counts.tolist(), strict=True))
+    number, missed, unseen = counts.tolist()
     patch = Patch(pixel, stored)
-    return Landmark(patch=patch, first_camera=first_camera, success=float(success), **named)
+    return Landmark(number, patch, first_camera, seen_at, float(success), missed, unseen)

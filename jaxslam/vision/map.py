@@ -103,17 +103,18 @@ def note_found(
     landmarks: Mapping[int, Landmark],
     slots: Int[np.ndarray, " k"],
     found: Bool[np.ndarray, " k"],
+    pixels: Float[np.ndarray, "k 2"],
     settings: TrackerSettings,
 ) -> None:
-    """Note which of the landmarks searched were found.
+    """Note which of the landmarks searched were found, and where.
 
     That nothing at all was found is the camera's failure, and held against no landmark.
     """
     for landmark in landmarks.values():
         landmark.unseen += 1
     if found.any():
-        for slot, ok in zip(slots, found, strict=True):
-            landmarks[slot].searched(bool(ok), settings.patience)
+        for slot, ok, pixel in zip(slots, found, pixels, strict=True):
+            landmarks[slot].searched(bool(ok), pixel, settings.patience)
 
 
 def failing(landmarks: Mapping[int, Landmark], settings: TrackerSettings) -> list[int]:

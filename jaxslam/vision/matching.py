@@ -4,7 +4,7 @@ Positions are pixels (u, v) = (column, row), with pixel centres at whole numbers
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -18,6 +18,10 @@ _COARSE = 6  # peaks of half the size that are looked at in full, for each patch
 _COARSE_MARGIN = 0.25  # of score: peaks so far below the highest are not
 _NEARBY = 3  # pixels around such a peak
 _COARSE_LOSS = 0.1  # of score: what a match loses at half the size, where pixels fall otherwise
+PEAKS = 3
+"""Places in a wide ellipse that may be a patch's, at the most …"""
+_PEAKS_MARGIN = 0.12  # … with scores so far below the best one's
+_APART = 2  # pixels: nearer peaks are one place
 
 
 @dataclass(frozen=True)
@@ -26,39 +30,6 @@ class Match:
 
     pixel: Float[np.ndarray, " 2"]
     score: float
-
-
-def match_patch(
-    image: UInt8[np.ndarray, "h w"],
-    template: Float32[np.ndarray, "window window"],
-    centre: Float[np.ndarray, " 2"],
-    covariance: Float[np.ndarray, "2 2"],
-    *,
-    gate: float = 9.21,
-    threshold: float = 0.8,
-    max_radius: float | None = None,
-    ambiguity: float = 0.05,
-) -> Match | None:
-    """Active search: the place most like `template` within the ellipse of the prediction.
-
-    Looks where (x - centre)' covariance^-1 (x - centre) <= `gate` (a quantile of chi2 with two
-    degrees of freedom), at most `max_radius` pixels from the centre along each axis (by default
-    a quarter of the image's width: a wider ellipse is cut there), for the best zero-mean
-    normalised cross-correlation, then refines it to sub-pixel. None where no peak reaches
-    `threshold`, or where a second peak comes within `ambiguity` of the best one's score (0:
-    never ambiguous), or where the ellipse is outside the image. A wide ellipse is searched in
-    the image of half the size, and around the highest peaks there again in the whole one.
-    """
-    return match_patches(
-        image,
-        template[None],
-        np.asarray(centre, dtype=float)[None],
-        np.asarray(covariance, dtype=float)[None],
-        gate=gate,
-        threshold=threshold,
-        max_radius=max_radius,
-        ambiguity=ambiguity,
-    )[0]
 
 
 def match_patches(
@@ -71,9 +42,20 @@ def match_patches(
     threshold: float = 0.8,
     max_radius: float | None = None,
     ambiguity: float = 0.05,
-) -> list[Match | None]:
-    """`match_patch` for n patches; faster than one by one, as all are judged together."""
-    matches: list[Match | None] = [None] * len(templates)
+) -> list[list[Match]]:
+    """Active search: the places most like each template within the ellipse of its prediction.
+
+    Looks where (x - centre)' covariance^-1 (x - centre) <= `gate` (a quantile of chi2 with two
+    degrees of freedom), at most `max_radius` pixels from the centre along each axis (by default
+    a quarter of the image's width: a wider ellipse is cut there), for peaks of the zero-mean
+    normalised cross-correlation, and refines them to sub-pixel. In a narrow ellipse that is the
+    best peak; none where it does not reach `threshold`, or where a second one comes within
+    `ambiguity` of its score (0: never ambiguous). A wide ellipse is searched in the image of half
+    the size, and around the highest peaks there again in the whole one; as the best of many peaks
+    often is another place, up to `PEAKS` are told, best first, for who knows what else was found
+    to choose from. None where the ellipse is outside the image.
+    """
+    matches: list[list[Match]] = [[] for _ in templates]
     if not matches:
         return matches
     whole, half = image.astype(np.float32), templates.shape[1] // 2
@@ -81,15 +63,19 @@ def match_patches(
     reach = _WIDEST * image.shape[1] if max_radius is None else max_radius
     boxes = _boxes_around(ellipses, reach, half, image.shape)
     least = threshold - ambiguity
+    wide = boxes.owner[boxes.large()]
     boxes = _narrowed(image, templates, ellipses, boxes, least)
     peaks = _peaks(whole, templates, boxes, least)
     peaks = peaks.only(ellipses.hold(peaks.owner, peaks.pixels))
-    best = _alone(peaks, threshold, ambiguity)
-    if len(best.owner):
-        starts = best.pixels + _quadratic_peaks(best.around)
-        pixels = refine(whole, templates[best.owner], starts)
-        for owner, pixel, score in zip(best.owner.tolist(), pixels, best.scores, strict=True):
-            matches[owner] = Match(pixel, float(score))
+    peaks = peaks.only(np.lexsort((-peaks.scores, peaks.owner)))
+    in_wide = np.isin(peaks.owner, wide)
+    alone = _alone(peaks.only(~in_wide), threshold, ambiguity)
+    chosen = alone.joined(_several(peaks.only(in_wide)))
+    if len(chosen.owner):
+        starts = chosen.pixels + _quadratic_peaks(chosen.around)
+        pixels = refine(whole, templates[chosen.owner], starts)
+        for owner, pixel, score in zip(chosen.owner.tolist(), pixels, chosen.scores, strict=True):
+            matches[owner].append(Match(pixel, float(score)))
     return matches
 
 
@@ -209,6 +195,10 @@ class _Boxes(NamedTuple):
     def only(self, which: np.ndarray) -> "_Boxes":
         return _Boxes(*(part[which] for part in self))
 
+    def large(self) -> Bool[np.ndarray, " m"]:
+        """Which are searched in the picture of half the size first."""
+        return self.sizes.prod(axis=1) > _NARROW
+
     def large_enough(self) -> "_Boxes":
         """Those of three pixels each way: a peak needs a neighbour on either side."""
         return self.only(np.all(self.sizes >= 3, axis=1))
@@ -236,8 +226,11 @@ class _Peaks(NamedTuple):
     scores: Float32[np.ndarray, " k"]
     around: Float32[np.ndarray, "k 9"]
 
-    def only(self, which: np.ndarray) -> "_Peaks":
+    def only(self, which: Any) -> "_Peaks":
         return _Peaks(*(part[which] for part in self))
+
+    def joined(self, others: "_Peaks") -> "_Peaks":
+        return _Peaks(*map(np.concatenate, zip(self, others, strict=True)))
 
 
 def _peaks(
@@ -266,14 +259,27 @@ def _peaks(
 
 
 def _alone(peaks: _Peaks, threshold: float, ambiguity: float) -> _Peaks:
-    """The best peak of each patch, of those that have one which is high enough and alone."""
-    order = np.lexsort((-peaks.scores, peaks.owner))
-    peaks = peaks.only(order)
+    """The best peak of each patch, of those that have one which is high enough and alone; of peaks
+    in order of patches, best first."""
     _, first, of = np.unique(peaks.owner, return_index=True, return_inverse=True)
     best = peaks.only(first)
-    apart = (np.abs(peaks.pixels - best.pixels[of]) > 2).any(axis=1)
+    apart = (np.abs(peaks.pixels - best.pixels[of]) > _APART).any(axis=1)
     rivals = peaks.owner[apart & (peaks.scores > best.scores[of] - ambiguity)]
     return best.only((best.scores >= threshold) & ~np.isin(best.owner, rivals))
+
+
+def _several(peaks: _Peaks) -> _Peaks:
+    """Up to `PEAKS` peaks of each patch, apart from one another; of peaks in the same order."""
+    kept: list[int] = []
+    for i, (owner, pixel, score) in enumerate(zip(*peaks[:3], strict=True)):
+        better = [j for j in kept[-PEAKS:] if peaks.owner[j] == owner]
+        if not better or (
+            len(better) < PEAKS
+            and score >= peaks.scores[better[0]] - _PEAKS_MARGIN
+            and np.abs(peaks.pixels[better] - pixel).max(axis=1).min() > _APART
+        ):
+            kept.append(i)
+    return peaks.only(kept)
 
 
 def _narrowed(
@@ -284,7 +290,7 @@ def _narrowed(
     least: float,
 ) -> _Boxes:
     """The boxes, in place of each large one those around its peaks in the picture's half."""
-    large = boxes.sizes.prod(axis=1) > _NARROW
+    large = boxes.large()
     if not large.any():
         return boxes
     side = (templates.shape[1] + 1) // 2

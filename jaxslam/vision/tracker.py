@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.stats import binom
 
 from jaxslam.arrays import cast
@@ -21,7 +21,8 @@ from jaxslam.forms.state import Features, Status
 from jaxslam.models.scale import Metre
 from jaxslam.models.sensors import Pinhole
 from jaxslam.names import CANNOT_TRACK
-from jaxslam.slam.association import ASSOCIATIONS, Association, candidates
+from jaxslam.programs import Program, in_background
+from jaxslam.slam.association import ASSOCIATIONS, Association, candidates, one_point_ransac
 from jaxslam.slam.filter import AtOnce, EkfSlam, begun, innermost
 from jaxslam.slam.protocol import AbstractStaged, Scene
 from jaxslam.slam.readouts import (
@@ -33,10 +34,11 @@ from jaxslam.video.calibration import Calibration, as_fields, from_fields
 from jaxslam.video.pictures import as_grey
 from jaxslam.video.source import Frame, check_size
 from jaxslam.vision.corners import detect_corners
+from jaxslam.vision.epipolar import MINIMAL, of_one_motion
 from jaxslam.vision.landmarks import NO_POINTS, Landmark, Points, joined, stacked, unstacked
 from jaxslam.vision.located import Located
 from jaxslam.vision.map import Prediction, failing, in_view, note_found, to_search, worst_first
-from jaxslam.vision.matching import Match, match_patches
+from jaxslam.vision.matching import PEAKS, Match, match_patches
 from jaxslam.vision.patches import Patch
 from jaxslam.vision.resume import grown, leaves, read_record, write_record
 from jaxslam.vision.settings import TrackerSettings
@@ -186,14 +188,37 @@ class Tracker:
 
     def compile(self) -> None:
         """Compile all programs now; else the first frames wait for it, and a camera does not."""
-        c = self.calibration
-        noise = np.random.default_rng(0).integers(0, 256, (c.height, c.width), dtype=np.uint8)
-        other = Tracker(c, self.settings, self.filter)
-        for step in range(2):
-            other.step(noise, step / 30)
         with jax.enable_x64(True):
-            other._remove(sorted(other.landmarks))
-        other.camera()
+            for thread in self._prepared():
+                thread.join()
+
+    def _prepared(self) -> list[threading.Thread]:
+        """Have all programs compiled by two threads, in the order in which they are needed."""
+        slam, state, new, dt = self._slam, self._state, self._nothing(), jnp.zeros(())
+        gone = jnp.zeros(self.settings.capacity, bool)
+
+        def believed(in_wide: Association | None) -> None:
+            predicted, _ = _predict.compile(slam, state, dt)
+            nothing = np.zeros(0, int), np.zeros((0, 2))
+            _believed.compile(*self._belief(predicted, dt, *nothing, in_wide))
+
+        def corrected() -> None:
+            predicted, _ = _predict.compile(slam, state, dt)
+            _correct.compile(slam, predicted[0], dt, new)
+
+        return [
+            in_background(
+                lambda: _begin_map.compile(slam, state, new),
+                *(partial(believed, association) for association in (*self._in_wide, None)),
+                lambda: _renew_map.compile(slam, state, new),
+                self.camera,
+            ),
+            in_background(
+                corrected,
+                lambda: _world_points.compile(slam, state, self.settings.capacity),
+                lambda: _remove.compile(slam, state, gone),
+            ),
+        ]
 
     def _check(self, frame: Frame) -> None:
         check_size(f"frame {frame.index}", frame.image, self.calibration)
@@ -287,6 +312,7 @@ class Tracker:
         return tracker
 
     def _first(self, frame: Frame) -> Tracked:
+        self._prepared()
         corners = self._corners(frame)
         created = (
             self._begun(frame, corners) if self.target is None else self._known(frame, corners)
@@ -319,11 +345,12 @@ class Tracker:
             return self._turned_round(frame, predicted, dt)
         slots, affines = to_search(self.landmarks, prediction, self.calibration, self.settings)
         found = self._search(frame, prediction, slots, affines)
-        matched, features = self._features(slots, found)
         if self._astray(prediction.covariances[slots]):
-            features = self._nothing()
-        least = _more_than_chance(len(slots), found_again=self._unmeasured > 0)
-        state, result = self._correct(predicted, dt, features, least)
+            agreed = matched = np.full((len(slots), 2), np.nan)
+        else:
+            agreed, matched = self._agreed(predicted, dt, slots, found)
+        features = _padded(slots, agreed, self.settings.wanted)
+        state, result = _correct(self._slam, predicted[0], dt, features)
         used, nis, nis_dof, status = jax.device_get(result)
         self._time = frame.time
         if status >= Status.NOT_POSITIVE:
@@ -332,7 +359,7 @@ class Tracker:
             return self._lost(frame)
         self._state = state
         used = used[: len(slots)]
-        note_found(self.landmarks, slots, used, self.settings)
+        note_found(self.landmarks, slots, used, agreed, self.settings)
         self._remove(failing(self.landmarks, self.settings))
         pixels = prediction.pixels[slots]
         searched = dict(
@@ -340,8 +367,8 @@ class Tracker:
             search=prediction.covariances[slots],
             matched=matched,
             status=[
-                "unmatched" if match is None else "matched" if ok else "outlier"
-                for match, ok in zip(found, used, strict=True)
+                "matched" if ok else "outlier" if places else "unmatched"
+                for places, ok in zip(found, used, strict=True)
             ],
         )
         lost = not used.any()
@@ -364,14 +391,102 @@ class Tracker:
             lost=lost,
         )
 
-    def _correct(
-        self, predicted: tuple[Any, Any], dt: jax.Array, features: Features, least: int = 1
-    ) -> tuple[Any, tuple]:
-        """Update by the matches that agree, if they are so many at least."""
+    def _agreed(
+        self, predicted: tuple[Any, Any], dt: jax.Array, slots: np.ndarray, found: list[list[Match]]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels of the landmarks whose matches agree, if they are more than chance, and of all
+        that were found; NaN of the others."""
+        owner = np.repeat(np.arange(len(slots)), [len(places) for places in found])
+        pixels = np.array([match.pixel for places in found for match in places]).reshape(-1, 2)
+        matched = _of_first(owner, pixels, len(slots))
+        least = _more_than_chance(len(slots))
+        if self._unmeasured:
+            # A camera that was lost searches ever wider, and something always looks alike.
+            least = max(least, len(slots) // 2)
+        wide = len(owner) > len(np.unique(owner))
+        if wide:
+            least += MINIMAL
+            agreed = self._of_several(predicted, dt, slots, owner, pixels, least)
+        else:
+            believed = self._believed(predicted, dt, slots[owner], pixels)
+            agreed = _of_first(owner[believed], pixels[believed], len(slots))
+        if np.isfinite(agreed[:, 0]).sum() < least:
+            agreed[:] = np.nan
+        return agreed, np.where(np.isfinite(agreed), agreed, matched)
+
+    def _of_several(
+        self,
+        predicted: tuple[Any, Any],
+        dt: jax.Array,
+        slots: np.ndarray,
+        owner: np.ndarray,
+        pixels: np.ndarray,
+        least: int,
+    ) -> np.ndarray:
+        """Pixels that agree, of landmarks with several places each; `least` are enough.
+
+        Where ellipses are wide, depth and direction make of a prediction what is not linear: those
+        that agree but for that, and with one motion, are what a linear test is given. One that puts
+        out most of them is not believed: of a camera that sets out it says nothing.
+        """
+        agreed = np.zeros((0, 2))
+        for association in self._in_wide:
+            believed = self._believed(predicted, dt, slots[owner], pixels, association)
+            places = np.flatnonzero(believed)
+            lately, rigid = self._rigid(slots[owner[places]], pixels[places])
+            tested = places[_one_of_each(owner[places], rigid | ~lately)]
+            rigid = np.isin(tested, places[rigid])
+            linear = self._believed(predicted, dt, slots[owner[tested]], pixels[tested])
+            best = tested[linear if 2 * (linear & rigid).sum() >= rigid.sum() else rigid]
+            agreed = _of_first(owner[best], pixels[best], len(slots))
+            if len(best) >= least:
+                break
+        return agreed
+
+    def _rigid(self, slots: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which landmarks were seen when any was seen last, and which of these agree with one
+        motion since then."""
         s = self.settings
-        numbers = jnp.asarray(s.tolerance * s.pixel_sigma), jnp.asarray(least)
-        association = ASSOCIATIONS[s.association]
-        return _correct(self._slam, association, *predicted, dt, features, *numbers)
+        unseen = np.array([self.landmarks[slot].unseen for slot in slots], int)
+        before = np.array([self.landmarks[slot].seen_at for slot in slots]).reshape(-1, 2)
+        lately = unseen == unseen.min(initial=unseen.max(initial=0))
+        rigid = np.zeros_like(lately)
+        rigid[lately] = of_one_motion(
+            before[lately], pixels[lately], self.calibration, s.tolerance * s.pixel_sigma
+        )
+        return lately, rigid
+
+    @property
+    def _in_wide(self) -> dict[Association, None]:
+        """The associations that are tried where ellipses are wide: the quick one first."""
+        return dict.fromkeys((one_point_ransac, ASSOCIATIONS[self.settings.association]))
+
+    def _believed(
+        self,
+        predicted: tuple[Any, Any],
+        dt: jax.Array,
+        slots: np.ndarray,
+        pixels: np.ndarray,
+        in_wide: Association | None = None,
+    ) -> np.ndarray:
+        """Which matches the filter believes, by an association for wide ellipses or the usual."""
+        belief = self._belief(predicted, dt, slots, pixels, in_wide)
+        return np.asarray(_believed(*belief))[: len(slots)]
+
+    def _belief(
+        self,
+        predicted: tuple[Any, Any],
+        dt: jax.Array,
+        slots: np.ndarray,
+        pixels: np.ndarray,
+        in_wide: Association | None = None,
+    ) -> tuple[Any, ...]:
+        """What `_believed` is given."""
+        s, wide = self.settings, in_wide is not None
+        features = _padded(slots, pixels, s.wanted * (PEAKS if wide else 1))
+        tolerance = jnp.asarray(s.tolerance * s.pixel_sigma)
+        association = ASSOCIATIONS[s.association] if in_wide is None else in_wide
+        return self._slam, association, wide, *predicted, dt, features, tolerance
 
     def _astray(self, ellipses: Float[np.ndarray, "k 2 2"]) -> bool:
         """Whether most landmarks are expected too widely."""
@@ -384,7 +499,7 @@ class Tracker:
         """The map lies behind the camera: another one is begun."""
         self.reversed += 1
         self._time = frame.time
-        self._state, _ = self._correct(predicted, dt, self._nothing())
+        self._state, _ = _correct(self._slam, predicted[0], dt, self._nothing())
         return self._lost(frame)
 
     def _nothing(self) -> Features:
@@ -398,11 +513,11 @@ class Tracker:
         """
         self._remove(sorted(self.landmarks))
         nothing = self._nothing()
-        state, result = self._correct(predicted, dt, nothing)
+        state, result = _correct(self._slam, predicted[0], dt, nothing)
         if int(result[-1]) >= Status.NOT_POSITIVE:
             self._origin = self._camera
             predicted, _ = _predict(self._slam, self._empty_state(), dt)
-            state, _ = self._correct(predicted, dt, nothing)
+            state, _ = _correct(self._slam, predicted[0], dt, nothing)
         self._state = state
 
     def _lost(self, frame: Frame, **searched) -> Tracked:
@@ -422,7 +537,7 @@ class Tracker:
 
     def _search(
         self, frame: Frame, prediction: Prediction, slots: np.ndarray, affines: np.ndarray
-    ) -> list[Match | None]:
+    ) -> list[list[Match]]:
         if not len(slots):
             return []
         templates = np.stack(
@@ -434,16 +549,6 @@ class Tracker:
         return match_patches(
             frame.image, templates, prediction.pixels[slots], prediction.covariances[slots]
         )
-
-    def _features(
-        self, slots: np.ndarray, found: list[Match | None]
-    ) -> tuple[np.ndarray, Features]:
-        """Pixels of the matches, NaN where there is none, and the same padded for the filter."""
-        matched = np.full((len(slots), 2), np.nan)
-        for i, match in enumerate(found):
-            if match is not None:
-                matched[i] = match.pixel
-        return matched, _padded(slots, matched, self.settings.wanted)
 
     def _remove(self, slots: list[int]) -> None:
         if slots:
@@ -504,7 +609,7 @@ class Tracker:
         self._sigma_log_scale = float(np.sqrt(log_scale)) if log_scale > 0 else None
         for slot, corner in zip(slots, corners, strict=True):
             patch = Patch.take(frame.image, corner)
-            self.landmarks[int(slot)] = Landmark(self.created, patch, self._camera.T_wc)
+            self.landmarks[int(slot)] = Landmark(self.created, patch, self._camera.T_wc, corner)
             self.created += 1
         return corners
 
@@ -532,14 +637,22 @@ def _keeps_metres(slam: AbstractStaged) -> bool:
     return isinstance(slam, EkfSlam) and isinstance(slam.scale, Metre) and slam.depth.common is None
 
 
-def _more_than_chance(searched: int, found_again: bool = False) -> int:
-    """Matches of so many landmarks searched that are not there by chance.
+def _more_than_chance(searched: int) -> int:
+    """Matches of so many landmarks searched that do not agree by chance."""
+    return max(LEAST_MATCHES, int(binom.isf(BY_CHANCE, searched, CHANCE)) + 1)
 
-    A camera that was lost searches ever wider, where there is always something that looks alike:
-    it is `found_again` where half of what it searches agrees.
-    """
-    least = max(LEAST_MATCHES, int(binom.isf(BY_CHANCE, searched, CHANCE)) + 1)
-    return max(least, searched // 2) if found_again else least
+
+def _one_of_each(owner: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """The first of each owner among these."""
+    some = np.flatnonzero(among)
+    return some[np.unique(owner[some], return_index=True)[1]]
+
+
+def _of_first(owner: np.ndarray, pixels: np.ndarray, count: int) -> Float[np.ndarray, "count 2"]:
+    """The first pixel of each owner, NaN of those that have none."""
+    first = np.full((count, 2), np.nan)
+    first[owner[::-1]] = pixels[::-1]
+    return first
 
 
 def _padded(slots: np.ndarray, pixels: np.ndarray, size: int) -> Features:
@@ -552,17 +665,17 @@ def _padded(slots: np.ndarray, pixels: np.ndarray, size: int) -> Features:
     )
 
 
-@eqx.filter_jit
+@Program
 def _empty(slam: AbstractStaged, capacity: int) -> Any:
     return slam.init(capacity)
 
 
-@eqx.filter_jit
+@Program
 def _remove(slam: AbstractStaged, state: Any, gone: Any) -> Any:
     return slam.remove(state, gone)
 
 
-@eqx.filter_jit
+@Program
 def _predict(slam: AbstractStaged, state: Any, dt: Any) -> tuple[tuple[Any, Any], Prediction]:
     """The predicted state, as it is and as one Gaussian, and what that expects to see."""
     slots = jnp.arange(slam.in_map(state).size)
@@ -578,39 +691,43 @@ def _predict(slam: AbstractStaged, state: Any, dt: Any) -> tuple[tuple[Any, Any]
     return (state, gaussian), prediction
 
 
-@eqx.filter_jit
-def _correct(
+@Program
+def _believed(
     slam: AbstractStaged,
     association: Association,
+    wide: bool,
     state: Any,
     gaussian: Any,
     dt: Any,
     features: Features,
     tolerance: Any,
-    least: Any,
-) -> tuple[Any, tuple]:
+) -> Bool[jax.Array, " m"]:
     one, _ = slam.gaussian(state, dt)
-    agreed = association(candidates(one, gaussian, dt, features, tolerance))
-    # A few of many that were searched can agree by chance: a lost camera only moves.
-    agreed &= jnp.sum(agreed) >= least
-    state, innovation = slam.update(state, dt, replace(features, valid=agreed))
+    return association(candidates(one, gaussian, dt, features, tolerance, curved=wide))
+
+
+@Program
+def _correct(
+    slam: AbstractStaged, state: Any, dt: Any, features: Features
+) -> tuple[Any, tuple[Any, ...]]:
+    state, innovation = slam.update(state, dt, features)
     state = slam.compose(state, dt)
     return state, (innovation.used, innovation.nis, innovation.nis_dof, innovation.status)
 
 
-@eqx.filter_jit
+@Program
 def _begin_map(slam: AbstractStaged, state: Any, new: Features):
     state = slam.init(slam.in_map(state).size, new)
     return state, _reported(slam, state)
 
 
-@eqx.filter_jit
+@Program
 def _begin_known(depths: Any, slam: EkfSlam, state: Any, new: Features):
     state = begun(slam, slam.in_map(state).size, new, depths)
     return state, _reported(slam, state)
 
 
-@eqx.filter_jit
+@Program
 def _renew_map(slam: AbstractStaged, state: Any, new: Features):
     state = slam.close(state, new)
     return state, _reported(slam, state)
@@ -622,7 +739,7 @@ def _reported(slam: AbstractStaged, state: Any):
     return T_BC.as_matrix(), covariance, log_scale
 
 
-@eqx.filter_jit
+@Program
 def _intrinsics(slam: AbstractStaged, inner: EkfSlam, state: Any):
     def intrinsics(scene: Scene):
         sensor = inner.calibration.sensor(inner.sensor, scene.core.calibration)
@@ -632,6 +749,6 @@ def _intrinsics(slam: AbstractStaged, inner: EkfSlam, state: Any):
     return slam.marginal(state, intrinsics)
 
 
-@eqx.filter_jit
+@Program
 def _world_points(slam: AbstractStaged, state: Any, capacity: int):
     return landmarks_in_unit(slam, state, jnp.arange(capacity))

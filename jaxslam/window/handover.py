@@ -53,26 +53,31 @@ def _state(slam, record, at, step, local, s: Direction, factor: Cholesky, like: 
     scale = _scale(slam, local, s)
     core, of_core = _core_rows(slam, newest, by_x, scale, like.core)
     of_core = _less_told(of_core, like.core, jnp.sqrt(s.squared / told(slam, at, s)))
-    values, of_landmarks = _landmark_rows(slam, record, at, local, (newest, by_x), scale)
+    values, of_landmarks, own = _landmark_rows(slam, record, at, local, (newest, by_x), scale)
     active = jnp.any(record.seen, axis=0)
     rows = _stacked(of_core, of_landmarks, active)
+    own = jnp.where(active[:, None, None], own, 0.0)
     landmarks = jnp.where(active[:, None], values, like.landmarks)
-    covariance = _with_metre(_covariance(local, factor, rows), like)
+    covariance = _with_metre(_covariance(local, factor, rows, own, scale), like)
     return shifted(State(core, landmarks, active, covariance, like.memory), -rows.x @ step)
 
 
 class Rows(NamedTuple):
-    """Jacobians of the filter's numbers: by x, and by what is left of every y given x."""
+    """Jacobians of the filter's numbers, by x and by λ: λ depends on what is left of every y given
+    x, and so do a landmark's numbers on its own."""
 
     x: Float[Array, "*n N"]
-    y: Float[Array, "*n m q"]
+    unit: Float[Array, "*n"]
 
 
-def _scale(slam: EkfSlam, local: Reduced, s: Direction) -> Rows:
-    """Of λ; zero in a filter without. `y = ŷ − C (x − x̂) + e`."""
+def _scale(slam: EkfSlam, local: Reduced, s: Direction) -> Direction:
+    """Of λ, by x and by e, what is left of every y; zero in a filter without.
+
+    `y = ŷ − C (x − x̂) + e`.
+    """
     squared = s.squared if isinstance(slam.scale, ScaleGauge) else jnp.inf
     by_x = s.x - jnp.einsum("mq,mqn->n", s.y, local.coupling)
-    return Rows(by_x / squared, s.y / squared)
+    return Direction(by_x / squared, s.y / squared)
 
 
 def _newest(slam, record, at: Minimum, local: Reduced):
@@ -85,13 +90,13 @@ def _newest(slam, record, at: Minimum, local: Reduced):
     return (frame, local.path.motion[k], local.path.common), by_x
 
 
-def _core_rows(slam, newest, by_x, scale: Rows, like) -> tuple[Any, Rows]:
+def _core_rows(slam, newest, by_x, scale: Direction, like) -> tuple[Any, Rows]:
     """The filter's core and its Jacobians."""
     zero = jnp.zeros(1, by_x.dtype)
     J = jacobian(lambda both: _core(slam, like, *both), (newest, zero))
     by_newest, unit = J[:, :-1], J[:, -1]
-    by_y = jnp.einsum("c,mq->cmq", unit, scale.y)
-    return _core(slam, like, newest, zero), Rows(by_newest @ by_x + jnp.outer(unit, scale.x), by_y)
+    rows = by_newest @ by_x + jnp.outer(unit, scale.x)
+    return _core(slam, like, newest, zero), Rows(rows, unit)
 
 
 def _with_metre(covariance: Float[Array, "n n"], like: State) -> Float[Array, "n n"]:
@@ -110,9 +115,9 @@ def _less_told(rows: Rows, core, factor: Scalar) -> Rows:
 
 
 def _landmark_rows(
-    slam, record, at: Minimum, local: Reduced, newest, scale: Rows
-) -> tuple[Float[Array, "m d"], Rows]:
-    """All landmarks and their Jacobians: each by its own y, and by λ's."""
+    slam, record, at: Minimum, local: Reduced, newest, scale: Direction
+) -> tuple[Float[Array, "m d"], Rows, Float[Array, "m d q"]]:
+    """All landmarks and their Jacobians, the last by its own y each."""
     (newest, by_x), zero = newest, jnp.zeros(1, at.x.dtype)
     firsts = jax.tree.map(lambda leaf: leaf[record.first], local.path.frames)
     of_firsts = local.by_x.frame[record.first]
@@ -132,8 +137,7 @@ def _landmark_rows(
     values, rows, by_own, units = jax.vmap(one)(
         firsts, of_firsts, record.first_measured, at.y, local.coupling
     )
-    own = jnp.einsum("idq,ij->idjq", by_own, jnp.eye(len(at.y), dtype=at.y.dtype))
-    return values, Rows(rows, own + jnp.einsum("id,jq->idjq", units, scale.y))
+    return values, Rows(rows, units), by_own
 
 
 def _stacked(core: Rows, landmarks: Rows, active: Bool[Array, " m"]) -> Rows:
@@ -146,12 +150,21 @@ def _stacked(core: Rows, landmarks: Rows, active: Bool[Array, " m"]) -> Rows:
     return Rows(*map(whole, core, landmarks))
 
 
-def _covariance(local: Reduced, factor: Cholesky, rows: Rows) -> Float[Array, "n n"]:
-    """Of numbers with these Jacobians."""
-    by_x = factor.whitening @ rows.x.T
-    by_y = jnp.einsum("mqo,nmo->mqn", local.landmarks.whitening, rows.y)
-    by_y = by_y.reshape(-1, len(rows.x))
-    return by_x.T @ by_x + by_y.T @ by_y
+def _covariance(
+    local: Reduced, factor: Cholesky, rows: Rows, own: Float[Array, "m d q"], scale: Direction
+) -> Float[Array, "n n"]:
+    """Of numbers with these Jacobians. With B of their own y and u of λ, whose derivative by y is
+    s: `(B + u sᵀ) Λ⁻¹ (B + u sᵀ)ᵀ`, B and Λ in blocks."""
+    whitened = factor.whitening @ rows.x.T
+    B = jnp.einsum("mqo,mdo->mdq", local.landmarks.whitening, own)
+    s = jnp.einsum("mqo,mo->mq", local.landmarks.whitening, scale.y)
+    m, d, _ = own.shape
+    c, u = len(rows.unit) - m * d, rows.unit
+    across = jnp.pad(jnp.einsum("mdq,mq->md", B, s).ravel(), (c, 0)) + u * jnp.sum(s**2) / 2
+    covariance = whitened.T @ whitened + jnp.outer(u, across) + jnp.outer(across, u)
+    place = c + jnp.arange(m * d).reshape(m, d)
+    blocks = jnp.einsum("mdq,meq->mde", B, B)
+    return covariance.at[place[:, :, None], place[:, None]].add(blocks)
 
 
 def _core(slam: EkfSlam, like, newest, log_scale):

@@ -113,9 +113,11 @@ def landmarks(
         damping = jnp.where(better, damping / 10, jnp.maximum(10 * damping, 1e-3))
         return (damping, best), None
 
-    start = y, *landmark_slopes(slam, record, at, y)
-    carry = jnp.zeros(len(y), y.dtype), start
-    (_, (y, _, _, cost)), _ = jax.lax.scan(once, carry, length=steps)
+    # A step of nothing first: the slopes are then one piece of the program and not two.
+    m = len(y)
+    start = y, jnp.broadcast_to(eye, (m, *eye.shape)), jnp.zeros_like(y), jnp.full(m, jnp.inf)
+    carry = jnp.zeros(m, y.dtype), jax.tree.map(lambda x: x.astype(y.dtype), start)
+    (_, (y, _, _, cost)), _ = jax.lax.scan(once, carry, length=steps + 1)
     return y, jnp.sum(cost)
 
 

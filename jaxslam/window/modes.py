@@ -33,6 +33,9 @@ SEARCH_STEPS = 16
 APART = 1.0
 """Minima nearer than this in the better one's information, squared, are one."""
 
+NEGLIGIBLE = 100.0
+"""Of log evidence: a mode so much less likely than the likeliest is none."""
+
 
 class Modes(eqx.Module):
     """A batch of minima, the likeliest first."""
@@ -97,15 +100,22 @@ def directions(n: int, count: int) -> np.ndarray:
     return np.column_stack([ring * np.cos(angle), ring * np.sin(angle), height])
 
 
-def starts(slam: EkfSlam, record: Record, likeliest: Minimum, count: int) -> Minimum:
+def starts(
+    slam: EkfSlam, record: Record, likeliest: Minimum, wanted: Bool[Array, " starts"]
+) -> Minimum:
     """The prior's mean, the reversal of what is likeliest, and translations in all directions,
-    with the rotations that fit them."""
+    those that are wanted with the rotations that fit them."""
     n, dtype = slam.motion.geometry.point_dim, likeliest.x.dtype
-    rest = at_rest(slam, record, 2 + count, dtype).minima
-    away = np.concatenate([np.zeros((2, n)), SPEED * directions(n, count)])
+    rest = at_rest(slam, record, wanted.size, dtype).minima
+    away = np.concatenate([np.zeros((2, n)), SPEED * directions(n, wanted.size - 2)])
     x, y = reversed_(slam, likeliest)
     x, y = rest.x.at[:, :n].set(jnp.asarray(away, dtype)).at[1].set(x), rest.y.at[1].set(y)
-    return jax.vmap(started)(jax.vmap(lambda x, y: turned(slam, record, x, y))(x, y), y)
+
+    def fitted(start, record):
+        x, y = start
+        return turned(slam, record, x, y), y
+
+    return jax.vmap(started)(*each_alive(fitted, (x, y), wanted, record))
 
 
 def reversed_(slam: EkfSlam, at: Minimum) -> tuple[Float[Array, " N"], Float[Array, "m q"]]:
@@ -121,11 +131,10 @@ def sought(
     record: Record,
     modes: Modes,
     steps: int,
-    directions: int = 0,
-    search: Bool[Array, ""] | None = None,
+    search: Bool[Array, " starts"] | None = None,
 ) -> tuple[Modes, Bool[Array, ""]]:
     """The modes with what has been measured since, each from where it is; and, of a search, what
-    is found beside them from rest, from the reversal of the likeliest and from so many directions.
+    is found beside them from those `starts` that it says.
 
     Where nothing explains what was measured, the modes stay as they are, and the second is False.
     """
@@ -134,10 +143,10 @@ def sought(
     most = jnp.full(len(alive), steps)
     if search is not None:
         likeliest = jax.tree.map(lambda leaf: leaf[0], minima)
-        found = _starts_of(slam, record, likeliest, directions, search)
+        found = starts(slam, record, likeliest, search)
         minima = jax.tree.map(lambda *x: jnp.concatenate(x), minima, found)
-        alive = jnp.append(alive, jnp.broadcast_to(search, 2 + directions))
-        most = jnp.append(most, jnp.full(2 + directions, SEARCH_STEPS))
+        alive = jnp.append(alive, search)
+        most = jnp.append(most, jnp.full(search.size, SEARCH_STEPS))
 
     def further(both, record):
         return minimised(slam, record, *both), both[1]
@@ -146,12 +155,6 @@ def sought(
     after = _likeliest(slam, record, minima, alive, len(modes.log_weights))
     explained = jnp.isfinite(after.log_weights[0])
     return jax.tree.map(lambda new, old: jnp.where(explained, new, old), after, modes), explained
-
-
-def _starts_of(slam, record, likeliest: Minimum, directions: int, wanted: Bool[Array, ""]):
-    """`starts`, if they are wanted."""
-    none = at_rest(slam, record, 2 + directions, likeliest.x.dtype).minima
-    return when(wanted, lambda _, *at: starts(slam, *at, directions), none, record, likeliest)
 
 
 class Weighed(NamedTuple):
@@ -192,6 +195,7 @@ def _likeliest(slam, record, minima: Minimum, alive: Bool[Array, " k"], count: i
     index = jnp.arange(k)
     again = jnp.any((squared < APART) & (index < index[:, None]), axis=1)
     value = jnp.where(again, -jnp.inf, value)
+    value = jnp.where(value < jnp.max(value) - NEGLIGIBLE, -jnp.inf, value)
     kept = jnp.argsort(-value)[:count]
     return Modes(
         jax.tree.map(lambda leaf: leaf[best_first][kept], minima),

@@ -35,8 +35,16 @@ SIZES = {"planar": (9, 25, 61), "spatial": (9, 31)}
 """Frames of the windows that are compiled; the smallest that holds all is computed."""
 DIRECTIONS = {"planar": 16, "spatial": 8}
 """In which the search sets out, from rest beside."""
-SEARCHES = (1, 2, 3, 4, 6, 8, 11, 15, 20, 26, 34)
-"""Frames after which minima are sought anew."""
+SEARCHES = {"planar": (1, 2, 3, 4, 6, 8, 11, 15, 20, 26, 34), "spatial": (1, 2, 3)}
+"""Frames after which minima are sought anew, from all starts …"""
+IN_TURN = {"planar": 0, "spatial": 1}
+"""… and from how many of them after every other frame, in turn: no frame waits for them all."""
+DIVIDED = {"planar": True, "spatial": False}
+"""Whether the sum is divided anew in every frame, or its members are the modes and what becomes of
+them: halves of a Gaussian, each linearised off its middle, can be worse than the whole."""
+GIVEN_UP = 10.0
+"""Of log evidence: modes so much less likely than the likeliest end with the window. What has been
+weighed without a linearisation is not to be overturned by one."""
 REFINEMENTS = 4
 """Steps of Levenberg–Marquardt with every new frame, at the most."""
 LEAST_STEPS = 8
@@ -102,7 +110,9 @@ class FromRest(AbstractStaged):
     def update(
         self, state: RestState, control: Any, seen: Features
     ) -> tuple[RestState, Innovation]:
-        after, innovation = self.base.update(state.sum, control, seen)
+        divided = DIVIDED[self.base.base.motion.geometry.name]
+        update = self.base.update if divided else self.base.corrected
+        after, innovation = update(state.sum, control, seen)
         stepped = window.stepped(state.record, control, seen, self.base.base.sensor.noise)
         return replace(state, sum=after, record=stepped), innovation
 
@@ -118,10 +128,10 @@ class FromRest(AbstractStaged):
         for frames in self.sizes:
             count = state.record.last + 1
             wanted = anew & (count > least) & (count <= frames)
-            searches = [k for k in SEARCHES if least <= k < frames]
-            state = self._anew(state, frames, wanted, searches)
+            state = self._anew(state, frames, wanted, least)
             least = frames
-        state = replace(state, open=state.open & ~self._ready(state))
+        ready = self._ready(state)
+        state = replace(state, sum=_likely(state.sum, anew & ready), open=state.open & ~ready)
         return when(state.open & state.record.full, self._thinned, state)
 
     def moving(self, state: RestState) -> Bool[Array, ""]:
@@ -148,18 +158,17 @@ class FromRest(AbstractStaged):
         return self.base.pose_error(state.sum, T_BC)
 
     def _anew(
-        self, state: RestState, frames: int, wanted: Bool[Array, ""], searches: list[int]
+        self, state: RestState, frames: int, wanted: Bool[Array, ""], least: int
     ) -> RestState:
-        """The modes of a window of so many frames, and the sum of them."""
+        """The modes of a window of so many frames, more than `least`, and the sum of them."""
         ekf, record = self.base.base, state.record.cut(frames)
         size = Layout.of(ekf).size(frames)
 
         def solved(state, record):
             x = state.modes.minima.x
             modes = replace(state.modes, minima=replace(state.modes.minima, x=x[:, :size]))
-            due = jnp.any(record.last == jnp.array(searches)) & ~record.standing
-            due = due if searches else None
-            modes, explained = sought(ekf, record, modes, REFINEMENTS, self.directions, due)
+            due = self._due(record, range(least, frames))
+            modes, explained = sought(ekf, record, modes, REFINEMENTS, due)
             members = _members(ekf, record, modes, state.sum.members)
             begun = BankState(members, modes.log_weights)
             begun = jax.tree.map(lambda new, old: jnp.where(explained, new, old), begun, state.sum)
@@ -168,6 +177,18 @@ class FromRest(AbstractStaged):
             return replace(state, sum=begun, modes=modes)
 
         return when(wanted, solved, state, record)
+
+    def _due(self, record: Record, newest: range) -> Bool[Array, " starts"] | None:
+        """From which starts minima are sought after this frame; None where from none after any
+        that can be the newest one."""
+        name = self.base.base.motion.geometry.name
+        searches, together = [k for k in SEARCHES[name] if k in newest], IN_TURN[name]
+        if not searches and not together:
+            return None
+        count, steps = 2 + self.directions, record.steps.astype(int) - 4
+        turn = (jnp.arange(count) - 1 - together * steps) % count < together
+        whole = jnp.any(record.last == jnp.array(searches, int))
+        return (whole | turn) & ~record.standing
 
     def _thinned(self, state: RestState) -> RestState:
         record, minima = thinned(self.base.base, state.record, state.modes.minima)
@@ -188,6 +209,13 @@ class FromRest(AbstractStaged):
         moved = variance < MOVED**2 * squared
         over = moved | ~state.record.tied
         return (enough & alone & known) | (state.record.full & over)
+
+
+def _likely(members: BankState, now: Bool[Array, ""]) -> BankState:
+    """Without those that are `GIVEN_UP`, if that is now."""
+    unlikely = members.log_weights < jnp.max(members.log_weights) - GIVEN_UP
+    weights = jnp.where(now & unlikely, -jnp.inf, members.log_weights)
+    return replace(members, log_weights=weights)
 
 
 def _members(ekf: EkfSlam, record: Record, modes: Modes, members: State) -> State:

@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam.arrays import AnyArray
 from jaxslam.forms.blocks import shifted
 from jaxslam.forms.state import Features, Innovation, State
-from jaxslam.geometry import difference, jacobian
+from jaxslam.geometry import difference, jacobian, log
 from jaxslam.linalg import cholesky, eigh
 from jaxslam.models.motion import check_control
 from jaxslam.slam.filter import EkfSlam, append_noise, check_one_gaussian, composed_first
@@ -77,7 +77,12 @@ class Mixture(Bank, AbstractStaged):
         self, state: BankState, control: Any, seen: Features
     ) -> tuple[BankState, Innovation]:
         """Divide the sum anew, correct every member and weigh it."""
-        state = self._divided(state, control, seen)
+        return self.corrected(self._divided(state, control, seen), control, seen)
+
+    def corrected(
+        self, state: BankState, control: Any, seen: Features
+    ) -> tuple[BankState, Innovation]:
+        """Correct every member as it is, and weigh it."""
 
         def updated(member):
             member = composed_first(self.base, member, control)
@@ -102,7 +107,9 @@ class Mixture(Bank, AbstractStaged):
 
     def _divided(self, state: BankState, control: Any, seen: Features) -> BankState:
         def displacement(core):
-            return self.base.model.displacement(core, Context(control)).translation()
+            # Of the logarithm: a turn is not to be split for what it does to the translation.
+            moved = log(self.base.model.displacement(core, Context(control)))
+            return moved[: self.base.motion.geometry.point_dim]
 
         cost = self._root_of_cost(state, seen)
 

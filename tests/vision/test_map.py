@@ -20,13 +20,13 @@ PATCH = Patch.take(np.zeros((60, 60), np.uint8), np.array([30.0, 30.0]))
 
 
 def landmark(number, **counts):
-    return Landmark(number, PATCH, np.eye(4), **counts)
+    return Landmark(number, PATCH, np.eye(4), np.zeros(2), **counts)
 
 
 def search(landmarks, found, times):
     slots = np.array(list(landmarks), int)
     for _ in range(times):
-        note_found(landmarks, slots, np.array(found), SETTINGS)
+        note_found(landmarks, slots, np.array(found), np.array([[7.0, 8.0]] * len(slots)), SETTINGS)
 
 
 @pytest.mark.parametrize(
@@ -37,6 +37,13 @@ def test_a_landmark_is_judged_by_its_latest_searches(before, in_vain, goes):
     search(landmarks, [True, True], before)
     search(landmarks, [False, True], in_vain)
     assert failing(landmarks, SETTINGS) == ([3] if goes else [])
+
+
+def test_where_a_landmark_was_found_last_is_noted():
+    landmarks = {3: landmark(0), 4: landmark(1)}
+    search(landmarks, [True, False], 1)
+    assert [one.seen_at.tolist() for one in landmarks.values()] == [[7.0, 8.0], [0.0, 0.0]]
+    assert [one.unseen for one in landmarks.values()] == [0, 1]
 
 
 def test_one_found_every_other_time_is_kept():

@@ -69,7 +69,13 @@ def test_landmarks_are_the_same_after_their_arrays():
     picture = draw.integers(0, 256, (60, 60), dtype=np.uint8)
     landmarks = {
         slot: Landmark(
-            7 + slot, Patch.take(picture, np.array([30.2, 29.7])), np.eye(4), 0.7, 4, slot
+            7 + slot,
+            Patch.take(picture, np.array([30.2, 29.7])),
+            np.eye(4),
+            np.array([3.5, slot]),
+            0.7,
+            4,
+            slot,
         )
         for slot in (2, 0)
     }
@@ -78,6 +84,7 @@ def test_landmarks_are_the_same_after_their_arrays():
     for slot, landmark in landmarks.items():
         for name in ("number", "success", "missed", "unseen"):
             assert getattr(again[slot], name) == getattr(landmark, name)
+        np.testing.assert_array_equal(again[slot].seen_at, landmark.seen_at)
         np.testing.assert_array_equal(again[slot].patch.stored, landmark.patch.stored)
         np.testing.assert_array_equal(again[slot].patch.pixel, landmark.patch.pixel)
     assert unstacked(stacked({})) == {}

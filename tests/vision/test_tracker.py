@@ -73,9 +73,10 @@ def test_the_tracker_calls_no_lapack(name_of_filter, monkeypatch):
     def looked_into(name, program):
         def call(*data):
             if name not in calls:
-                calls[name] = lapack_calls(traced(program)(*data)[0].jaxpr)
+                calls[name] = lapack_calls(traced(program.function)(*data)[0].jaxpr)
             return program(*data)
 
+        call.compile = program.compile
         return call
 
     jitted = {n: f for n, f in vars(programs).items() if isinstance(f, type(programs._predict))}
@@ -294,7 +295,6 @@ def test_so_many_matches_are_not_there_by_chance(searched):
     least = programs._more_than_chance(searched)
     assert np.mean(chance >= least) < 1.2e-3
     assert least == LEAST_MATCHES or np.mean(chance >= least - 1) > 1e-3
-    assert programs._more_than_chance(searched, found_again=True) == max(least, searched // 2)
 
 
 def test_a_world_behind_the_camera_is_given_up():

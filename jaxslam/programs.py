@@ -1,0 +1,273 @@
+"""Programs that are compiled before they are needed, and kept from one process to the next.
+
+JAX's cache of compiled programs spares the compiler; a program of ten thousand operations is still
+traced and lowered by Python, for seconds. Here the whole is kept, if a folder is told (`keep_in`):
+a file for each program, by all that it depends on. One that is damaged, or another user's, is
+compiled anew. Such a file is code, and what is around it a pickle: as for JAX's own cache, the
+folder is to be its user's alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import os
+import pickle
+import platform
+import secrets
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from types import FunctionType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.experimental.serialize_executable import deserialize_and_load, serialize
+
+from jaxslam.files import write_atomically
+
+OPTIONS = {
+    # Libraries of kernels whose threads wait for one another: matrices here are too small.
+    "cpu": {"xla_cpu_experimental_ynn_fusion_type": "", "xla_cpu_use_fusion_emitters": False}
+}
+"""Of the compiler, by platform; done without where it does not know them."""
+
+
+_kept_in: Path | None = None
+
+
+def keep_in(folder: Path | None) -> None:
+    """From now on keep every program that is made in this folder, and take it from there."""
+    global _kept_in
+    _kept_in = folder
+
+
+class Program:
+    """A pure function of pytrees, compiled once for each structure of its arguments.
+
+    Arrays among their leaves (or `jax.ShapeDtypeStruct`, for `compile`) are data; everything else
+    is part of the program, and is to be hashable.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
+        self._made: dict[Any, Future[_Made]] = {}
+        self._lock = threading.Lock()
+
+    def __call__(self, *args: Any) -> Any:
+        call = _Call.of(args)
+        return self._compiled(call)(call.arrays)
+
+    def compile(self, *args: Any) -> Any:
+        """Compile for such arguments, or wait for who does; what it returns, as shapes."""
+        return self._compiled(_Call.of(args)).shapes
+
+    def _compiled(self, call: _Call) -> _Made:
+        with self._lock:
+            future = self._made.get(call.key)
+            if mine := future is None:
+                future = self._made[call.key] = Future()
+        if mine:
+            try:
+                future.set_result(self._make(call))
+            except BaseException as error:
+                future.set_exception(error)
+                del self._made[call.key]
+        return future.result()
+
+    def _make(self, call: _Call) -> _Made:
+        folder, name = _kept_in, _name(self.function)
+        if folder is None:
+            return _compile(self.function, call, name)
+        try:
+            key = _Pickled.of((self.function, call.key, _surroundings()))
+        except (pickle.PicklingError, AttributeError, TypeError):
+            return _compile(self.function, call, name)  # a function of one's own, without a name
+        path = folder / f"{name}-{hashlib.sha256(key.data).hexdigest()}.program"
+        made = _read(path, key.functions)
+        if made is None:
+            # What JAX has read from its own cache cannot be written again: a name that it
+            # has never seen is not there.
+            made = _compile(self.function, call, f"{name}_{secrets.token_hex(4)}")
+            _keep(path, made)
+        return made
+
+
+class _Call(NamedTuple):
+    """What a program is called with."""
+
+    arrays: list[Any]
+    key: Any
+    """Structure, and of every leaf its shape and type or, where it is no array, itself."""
+
+    @classmethod
+    def of(cls, args: tuple[Any, ...]) -> _Call:
+        leaves, structure = jax.tree.flatten(args)
+        kinds = tuple((x.shape, x.dtype.name) if _is_array(x) else x for x in leaves)
+        key = structure, tuple(map(_is_array, leaves)), kinds, wide()
+        return cls([x for x in leaves if _is_array(x)], key)
+
+    def arguments(self, arrays: list[Any]) -> tuple[Any, ...]:
+        """With these arrays in place of its own."""
+        structure, are_arrays, kinds, _ = self.key
+        rest = iter(arrays)
+        leaves = [next(rest) if array else x for array, x in zip(are_arrays, kinds, strict=True)]
+        return jax.tree.unflatten(structure, leaves)
+
+
+def wide() -> bool:
+    """Whether numbers are of 64 bits where this is asked."""
+    return bool(jnp.result_type(float) == jnp.float64)
+
+
+def _name(function: Callable[..., Any]) -> str:
+    return getattr(function, "__name__", type(function).__name__)
+
+
+def _is_array(leaf: Any) -> bool:
+    return hasattr(leaf, "shape") and hasattr(leaf, "dtype")
+
+
+class _Made(NamedTuple):
+    """A program of lists of arrays, and the structure of what it returns."""
+
+    compiled: jax.stages.Compiled
+    shapes: Any
+
+    def __call__(self, arrays: list[Any]) -> Any:
+        return jax.tree.unflatten(jax.tree.structure(self.shapes), self.compiled(arrays))
+
+
+def _compile(function: Callable[..., Any], call: _Call, name: str) -> _Made:
+    structures = []
+
+    def flat(arrays):
+        leaves, structure = jax.tree.flatten(function(*call.arguments(arrays)))
+        structures.append(structure)
+        return leaves
+
+    flat.__name__ = name
+    shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in call.arrays]
+    lowered = jax.jit(flat).lower(shapes)
+    after = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in lowered.out_info]
+    return _Made(_with_options(lowered), jax.tree.unflatten(structures[-1], after))
+
+
+def _with_options(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
+    options = OPTIONS.get(jax.default_backend())
+    with contextlib.suppress(RuntimeError):
+        return lowered.compile(compiler_options=options)
+    return lowered.compile()
+
+
+def in_background(*steps: Callable[[], Any]) -> threading.Thread:
+    """Take the steps one after the other, aside; those not begun when the process ends are left
+    out. What goes wrong will do so again where it is needed."""
+
+    @jax.enable_x64(wide())
+    def take() -> None:
+        for step in steps:
+            if threading.main_thread().is_alive():
+                with contextlib.suppress(Exception):
+                    step()
+
+    thread = threading.Thread(target=take)
+    thread.start()
+    return thread
+
+
+class _Pickled(NamedTuple):
+    """A pickle in which functions are only named; and these."""
+
+    data: bytes
+    functions: dict[str, FunctionType]
+
+    @classmethod
+    def of(cls, value: Any) -> _Pickled:
+        file = io.BytesIO()
+        pickler = _Pickler(file)
+        pickler.dump(value)
+        return cls(file.getvalue(), pickler.functions)
+
+
+class _Pickler(pickle.Pickler):
+    def __init__(self, file: io.BytesIO) -> None:
+        super().__init__(file, protocol=5)
+        # Equal things are to have equal pickles, be they one or two.
+        self.fast = True
+        self.functions: dict[str, FunctionType] = {}
+
+    def persistent_id(self, obj: Any) -> str | None:
+        if not isinstance(obj, FunctionType):
+            return None
+        if obj.__closure__:
+            raise pickle.PicklingError(f"{obj.__qualname__} has values that nothing tells")
+        name = f"{obj.__module__}.{obj.__qualname__}:{obj.__code__.co_firstlineno}"
+        self.functions[name] = obj
+        return name
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, data: bytes, functions: dict[str, FunctionType]) -> None:
+        super().__init__(io.BytesIO(data))
+        self._functions = functions
+
+    def persistent_load(self, pid: str) -> FunctionType:
+        return self._functions[pid]
+
+
+def _read(path: Path, functions: dict[str, FunctionType]) -> _Made | None:
+    """A program that was kept; None where there is none, or where it is not to be trusted."""
+    try:
+        if hasattr(os, "getuid") and path.stat().st_uid != os.getuid():
+            return None
+        digest, data = path.read_bytes().split(b"\n", 1)
+        if digest.decode() != hashlib.sha256(data).hexdigest():
+            return None
+        shapes, *program = _Unpickler(data, functions).load()
+        return _Made(deserialize_and_load(*program), shapes)
+    except Exception:  # of another version, of any kind
+        return None
+
+
+def _keep(path: Path, made: _Made) -> None:
+    try:
+        data = _Pickled.of((made.shapes, *serialize(made.compiled))).data
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with write_atomically(path) as temporary:
+            temporary.write_bytes(hashlib.sha256(data).hexdigest().encode() + b"\n" + data)
+    except Exception:  # a full disk, a program that cannot be written: compiled again next time
+        return
+
+
+def _surroundings() -> tuple[Any, ...]:
+    """All that a program depends on beside its function's arguments."""
+    device = jax.devices()[0]
+    config = jax.config.values
+    settings = sorted((name, str(x)) for name, x in config.items() if "cache" not in name)
+    where = device.client.platform_version, device.device_kind, len(jax.devices())
+    return _sources(), *where, settings, os.environ.get("XLA_FLAGS"), OPTIONS
+
+
+@cache
+def _sources() -> tuple[str, ...]:
+    """What this package, those that it computes with and this processor are."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
+    versions = (version(name) for name in ("jax", "jaxlib", "equinox", "jaxlie", "numpy"))
+    return digest.hexdigest(), platform.python_version(), *versions, *_processor()
+
+
+def _processor() -> tuple[str, ...]:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    features = [line for line in lines if line.lower().startswith(("flags", "features"))]
+    return platform.machine(), platform.processor(), *features[:1]

@@ -1,0 +1,199 @@
+"""Programs are made once for each structure, kept whole, and taken back only where they fit."""
+
+import threading
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import programs
+from jaxslam.models.depth import InverseDepth
+from jaxslam.programs import Program, in_background, keep_in, wide
+
+traced = []
+
+
+def scaled(depth, values, factor=2.0):
+    """A pytree with a module in it; `factor` is part of the program."""
+    traced.append(wide())
+    return {"depth": depth, "values": factor * depth.sigma * values}
+
+
+def arguments(size=3):
+    depth = InverseDepth.beyond(2.0)
+    return jax.tree.map(jnp.asarray, depth), jnp.arange(float(size))
+
+
+@pytest.fixture(autouse=True)
+def none_traced():
+    traced.clear()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Where programs are kept; put back as it was."""
+    before = programs._kept_in
+    keep_in(tmp_path / "programs")
+    yield tmp_path / "programs"
+    keep_in(before)
+
+
+def check(program, size=3):
+    depth, values = arguments(size)
+    found, expected = program(depth, values), scaled(depth, values)
+    traced.pop()
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    np.testing.assert_allclose(found["values"], expected["values"], rtol=1e-6)
+    assert np.any(np.asarray(found["values"]) > 0)
+
+
+def test_a_program_is_made_once_for_each_structure():
+    program = Program(scaled)
+    for size in (3, 3, 4, 3, 4):
+        check(program, size)
+    assert len(traced) == 2
+    depth, values = arguments()
+    threefold, twofold = program(depth, values, 3.0), program(depth, values)
+    np.testing.assert_allclose(threefold["values"], 1.5 * twofold["values"])
+    assert len(traced) == 3
+
+
+def test_it_is_made_from_shapes_before_there_are_numbers():
+    program = Program(scaled)
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), arguments())
+    after = program.compile(*shapes)
+    assert (after["values"].shape, after["values"].dtype) == ((3,), arguments()[1].dtype)
+    assert isinstance(after["depth"], InverseDepth)
+    check(program)
+    assert len(traced) == 1
+
+
+def test_who_needs_it_waits_for_who_makes_it():
+    def slow(x):
+        traced.append(1)
+        time.sleep(0.3)
+        return x + 1
+
+    program, found = Program(slow), []
+    threads = [
+        threading.Thread(target=lambda: found.append(program(1 + jnp.zeros(())))) for _ in "ab"
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert found == [2.0, 2.0]
+    assert len(traced) == 1
+
+
+def test_a_failure_is_told_to_everyone_and_tried_again():
+    def failing(x):
+        traced.append(1)
+        raise ValueError("no")
+
+    program = Program(failing)
+    for _ in range(2):
+        with pytest.raises(ValueError, match="no"):
+            program(jnp.zeros(()))
+    assert len(traced) == 2
+
+
+def test_steps_are_taken_aside_in_the_callers_precision():
+    def failing():
+        raise ValueError("not the last word")
+
+    program, caller = Program(scaled), wide()
+    with jax.enable_x64(not caller):
+        in_background(failing, lambda: program.compile(*arguments())).join()
+        assert traced == [not caller]
+        check(program)
+    assert traced == [not caller]
+    check(program)
+    assert traced == [not caller, caller]
+
+
+def test_a_kept_program_is_neither_traced_nor_compiled(folder):
+    for _ in range(3):
+        check(Program(scaled))
+    assert len(traced) == 1
+    assert len(list(folder.iterdir())) == 1
+    check(Program(scaled), 4)
+    assert len(list(folder.iterdir())) == len(traced) == 2
+
+
+def test_shapes_of_a_kept_program_are_those_of_a_new_one(folder):
+    """What is called with another's result is found again, whoever made that."""
+    new = Program(scaled).compile(*arguments())
+    kept = Program(scaled).compile(*arguments())
+    assert len(traced) == 1
+    keys = [programs._Call.of((x,)).key for x in (new, kept)]
+    assert keys[0] == keys[1]
+    assert programs._Pickled.of(keys[0]).data == programs._Pickled.of(keys[1]).data
+
+
+@pytest.mark.parametrize("damage", [b"", b"nonsense", "cut", "changed"])
+def test_a_damaged_program_is_made_anew(folder, damage):
+    check(Program(scaled))
+    (path,) = folder.iterdir()
+    whole = path.read_bytes()
+    middle = len(whole) // 2
+    damaged = {"cut": whole[:middle], "changed": whole[:middle] + b"?" + whole[middle + 1 :]}
+    path.write_bytes(damaged.get(damage, damage))
+    check(Program(scaled))
+    assert len(traced) == 2
+    check(Program(scaled))  # and was kept again
+    assert len(traced) == 2
+
+
+def test_another_users_program_is_not_taken(folder, monkeypatch):
+    check(Program(scaled))
+    monkeypatch.setattr(programs.os, "getuid", lambda: 12345)
+    check(Program(scaled))
+    assert len(traced) == 2
+
+
+@pytest.mark.parametrize("what", ["sources", "processor", "flags"])
+def test_what_was_made_elsewhere_is_not_taken(folder, monkeypatch, what):
+    check(Program(scaled))
+    if what == "flags":
+        monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
+    else:
+        monkeypatch.setattr(programs, f"_{what}", lambda: ("other",))
+        monkeypatch.setattr(
+            programs, "_sources", getattr(programs._sources, "__wrapped__", programs._sources)
+        )
+    check(Program(scaled))
+    assert len(traced) == len(list(folder.iterdir())) == 2
+
+
+def test_a_function_with_values_of_its_own_is_not_kept(folder):
+    def around(value):
+        return lambda x: value * x
+
+    def called(function, x):
+        return function(x)
+
+    for value in (2.0, 3.0):
+        assert float(Program(called)(around(value), jnp.ones(()))) == value
+    assert not folder.exists()
+
+
+def test_a_folder_that_cannot_be_written_is_done_without(tmp_path):
+    before = programs._kept_in
+    (tmp_path / "file").write_text("")
+    keep_in(tmp_path / "file")
+    try:
+        check(Program(scaled))
+    finally:
+        keep_in(before)
+
+
+def test_options_that_the_compiler_does_not_know_are_done_without(monkeypatch):
+    monkeypatch.setitem(programs.OPTIONS, "cpu", {"xla_no_such_option": True})
+    check(Program(scaled))
+
+
+def test_the_compiler_knows_the_options():
+    jax.jit(jnp.sin).lower(0.0).compile(compiler_options=programs.OPTIONS["cpu"])
