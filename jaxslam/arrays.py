@@ -33,6 +33,8 @@ def numbers(values: Any) -> AnyArray:
         return values
     if isinstance(values, tuple | list) and any(isinstance(x, jax.Array) for x in values):
         return jnp.stack(values)
+    if np.iscomplexobj(values):
+        raise ValueError("real numbers are accepted, not complex ones")
     return np.asarray(values, np.float64)
 
 

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Generator
+import struct
+import textwrap
+import tokenize
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
 T = TypeVar("T")
+LARGEST = 1e100
+"""Of the numbers of poses and pictures, whose squares are finite then."""
 
 
 @contextmanager
@@ -44,6 +52,61 @@ def read_json(path: str | Path, what: str, parse: Callable[[Any], T]) -> T:
         return parse(fields)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def read_arrays(path: str | Path, names: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+    """The arrays of an npz file, or those of them that are named and there; nothing in it is run.
+
+    Raises ValueError, naming the file, for one that cannot be read, or that holds objects.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as raw:  # NumPy leaves what it opens itself open, where it is broken
+            arrays = _loaded(raw, names)
+    except FileNotFoundError:
+        raise ValueError(f"{path} does not exist") from None
+    except OSError as error:
+        raise ValueError(f"{path}: cannot read the arrays ({error.strerror or error})") from None
+    except _NOT_ARRAYS as error:
+        pickled = "pickle" in str(error)  # NumPy's advice then is to trust the file
+        why = "another kind of file, or objects in it" if pickled else one_line(error)
+        raise ValueError(f"{path}: not an npz file of numbers ({why})") from None
+    for name, x in arrays.items():
+        if not isinstance(x, np.ndarray):  # a member that is no array comes as its bytes
+            raise ValueError(f"{path}: not an npz file of numbers ({name} is no array)")
+    return arrays
+
+
+def _loaded(raw: BinaryIO, names: Iterable[str] | None) -> dict[str, np.ndarray]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of headers that are not quite NumPy's
+        file = np.load(raw, allow_pickle=False)
+        if isinstance(file, np.ndarray):
+            raise ValueError("one array, without a name")
+        wanted = file.files if names is None else [n for n in names if n in file.files]
+        return {name: file[name] for name in wanted}
+
+
+_NOT_ARRAYS = (
+    ValueError, EOFError, KeyError, NotImplementedError, TypeError, MemoryError, RuntimeError,
+    SyntaxError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What a broken archive, or an array with a broken header, ends in."""
+
+
+def check_real(what: str, x: np.ndarray) -> None:
+    """Raise ValueError unless an array that was read holds finite real numbers."""
+    if x.dtype.kind not in "fiu":
+        raise ValueError(f"{what} holds {x.dtype}; real numbers are accepted")
+    if not np.isfinite(x).all():
+        raise ValueError(f"{what} holds a number that is not finite")
+    if x.size and (most := float(np.abs(x).max())) > LARGEST:
+        raise ValueError(f"{what} holds {most:.2g}; up to {LARGEST:.0e} is accepted")
+
+
+def one_line(error: BaseException) -> str:
+    """What an error says, on one line that is not too long."""
+    return textwrap.shorten(str(error), 200, placeholder=" …")
 
 
 def json_numbers(values: np.ndarray) -> list[float | None]:

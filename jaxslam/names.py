@@ -19,7 +19,7 @@ from jaxslam.forms.covariance import Covariance
 from jaxslam.forms.form import AbstractForm
 from jaxslam.forms.information import Information
 from jaxslam.landmarks import LANDMARKS, Parametrization
-from jaxslam.lookup import chosen
+from jaxslam.lookup import chosen, listed
 from jaxslam.models.calibration import AbstractCalibration
 from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.models.depth import InverseDepth
@@ -36,7 +36,7 @@ from jaxslam.simulation.pieces import (
     motion_of,
     sensor_of,
 )
-from jaxslam.simulation.scenario import Scenario
+from jaxslam.simulation.scenario import Scenario, as_scenario
 from jaxslam.slam.association import TOLERANCE
 from jaxslam.slam.filter import EkfSlam
 from jaxslam.slam.protocol import AbstractFilter
@@ -177,6 +177,10 @@ steps of Gauss–Newton instead of convergence (`iterated`); members of a Gaussi
 noise is remembered (`noise`); by how much a match may be off beyond its noise, in percent of that
 (`checked`); steps of Gauss–Newton in an update (`oc`); none for the remedy `fej`."""
 
+CANNOT_TRACK = ("iterated", "+lag", "+iterated", "+scales", "+directions", "+particles", "+rays")
+"""Filters and modifiers with which a frame cannot be taken in stages (`AbstractStaged`), or a
+landmark is not one Gaussian from the frame in which it is first seen."""
+
 RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gauge+scene50+mixture9"}
 """The filter called `recommended`, by geometry, where the velocity is told."""
 FROM_REST = {
@@ -217,19 +221,22 @@ def make_filter(name: str, **pieces: Any) -> AbstractFilter:
 
 
 def make_filters(
-    scenario: Scenario,
-    filters: Iterable[str],
-    landmarks: Iterable[str],
+    scenario: Scenario | str,
+    filters: str | Iterable[str],
+    landmarks: str | Iterable[str],
     calibration: str | None = None,
 ) -> dict[str, AbstractFilter]:
     """Every named filter on every named parametrization, keyed `filter/landmarks`.
 
-    Their numbers are the scenario's. A filter may be modified: `world+oc`, `scale_gauge+lag10`;
+    Their numbers are the scenario's, which may be given by name; one name may be given without a
+    list. A filter may be modified: `world+oc`, `scale_gauge+lag10`;
     `recommended` stands for `recommended_name`. The calibration is treated as the scenario says,
     unless another treatment is named. Raises ValueError.
     """
+    scenario = as_scenario(scenario)
     names = [
-        recommended_name(motion_of(scenario)) if name == "recommended" else name for name in filters
+        recommended_name(motion_of(scenario)) if name == "recommended" else name
+        for name in listed(filters)
     ]
     chosen("filters", [name.partition("+")[0] for name in names], FILTERS)
     return {

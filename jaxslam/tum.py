@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from jaxslam.files import write_atomically
+from jaxslam.files import LARGEST, write_atomically
 
 
 class Table(NamedTuple):
@@ -39,10 +39,27 @@ def read_tum(path: str | Path) -> tuple[Float[np.ndarray, " n"], Float[np.ndarra
     """
     columns = "t tx ty tz qx qy qz qw"
     _, rows, lines = read_table(path, "trajectory", "poses", f"eight finite numbers {columns}", 8)
-    zero = np.flatnonzero(~rows[:, 4:].any(axis=1))
-    if zero.size:
+    size = np.abs(rows[:, 4:]).max(axis=1)
+    if (zero := np.flatnonzero(size == 0)).size:
         raise ValueError(f"{path}, line {lines[zero[0]]}: the quaternion is zero")
+    far = (np.abs(rows).max(axis=1) > LARGEST) | (size < 1 / LARGEST)
+    if (wrong := np.flatnonzero(far)).size:
+        raise ValueError(
+            f"{path}, line {lines[wrong[0]]}: numbers up to {LARGEST:.0e}, and a quaternion longer "
+            f"than {1 / LARGEST:.0e}, are accepted"
+        )
     return rows[:, 0], poses(rows[:, 1:4], rows[:, 4:])
+
+
+def not_rigid(T: Float[np.ndarray, "*k d d"], tolerance: float) -> Bool[np.ndarray, "*k"]:
+    """Which matrices are no [R t; 0 1] with R a rotation, to so much of its numbers."""
+    n = T.shape[-1] - 1
+    R = T[..., :n, :n]
+    with np.errstate(over="ignore", invalid="ignore"):
+        skewed = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(n)).max(axis=(-2, -1))
+        turned_over = ~(np.linalg.det(R) > 0)
+    last = (T[..., n, :] != np.eye(n + 1)[n]).any(axis=-1)
+    return ~(skewed <= tolerance) | turned_over | last
 
 
 def read_table(path: str | Path, what: str, holds: str, row: str, columns: int | None) -> Table:

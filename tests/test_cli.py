@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+import jaxslam
 from jaxslam.cli import main
 
 SMALL = ["consistency", "--scenario", "matched-tight", "--steps", "5", "--runs", "6"]
@@ -80,7 +81,7 @@ def test_consistency_resumes_to_more_runs(tmp_path, capsys):
         (["calibrate", "/no/such/film"], "/no/such/film: no such file or folder"),
         (["track", "--filter", "nothing"], "unknown filter 'nothing'"),
         (["track", "--filter", "world+nothing"], "unknown modifiers 'nothing'"),
-        (["track", "--filter", "scale_gauge+lag5"], "cannot track"),
+        (["track", "--filter", "scale_gauge+lag5"], "all do but iterated, +lag"),
         (["track", "--filter", "world+rays", "--landmarks", "cartesian"], "cannot track"),
     ],
 )
@@ -94,6 +95,11 @@ def test_a_mistake_ends_with_status_2_and_one_line(arguments, message, tmp_path,
     assert message in error
     assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_the_version_is_told(capsys):
+    main(["--version"])
+    assert capsys.readouterr().out == f"jaxslam {jaxslam.__version__}\n"
 
 
 def test_the_library_imports_light_and_sets_nothing():

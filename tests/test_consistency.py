@@ -24,7 +24,8 @@ from jaxslam.consistency import (
 from jaxslam.consistency.montecarlo import draw, filter_run
 from jaxslam.consistency.statistics import chi2_cdf, chi2_quantile, normalised_squared
 from jaxslam.names import scenario_pieces
-from jaxslam.plots.consistency import plot_consistency
+from jaxslam.plots.consistency import plot_consistency, plot_outside
+from jaxslam.plots.style import new_figure
 from jaxslam.simulation import Room, sensor_of, sightings
 from jaxslam.simulation.run import in_order_of_appearance
 from jaxslam.slam.protocol import AbstractFilter
@@ -456,3 +457,23 @@ def test_with_loose_noise_unified_inverse_depth_is_the_more_over_confident():
     results = jaxslam.summarise(study)["filters"]
     scaling, depth = (results[name]["nees"][-1] for name in ("inverse_scaling", "inverse_depth"))
     assert jaxslam.mean_band(3, 100, confidence=0.9999)[1] < scaling < depth / 2
+
+
+def test_the_share_outside_three_sigma_is_counted_and_drawn():
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=20)
+    chunk = study.chunks[0]
+    records = dict(study.store.load("inverse_scaling", chunk))
+    error, variance = np.zeros_like(records["error"]), np.ones_like(records["variance"])
+    error[:5, 2, 0] = 3.01  # of a quarter of the runs, on one of two axes of the position
+    error[:, 3, 2] = -2.99
+    error[:2, 4, 2] = -40.0
+    study.store.save("inverse_scaling", chunk, {**records, "error": error, "variance": variance})
+    summary = jaxslam.summarise(study)
+    outside = summary["filters"]["inverse_scaling"]["outside3sigma"]
+    assert outside["position"] == [0, 0, 5 / 40, 0, 0, 0]
+    assert outside["orientation"] == [0, 0, 0, 0, 2 / 20, 0]
+    axes = plot_outside(summary, ax=new_figure(3, 3).subplots(), label={"inverse_scaling": "IS"})
+    drawn = [np.asarray(line.get_ydata()) for line in axes.lines[:2]]
+    np.testing.assert_allclose(drawn[0], 100 * np.array(outside["position"]))
+    np.testing.assert_allclose(drawn[1], 100 * np.array(outside["orientation"]))
+    assert [text.get_text() for text in axes.texts] == [" IS"]

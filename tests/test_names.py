@@ -1,13 +1,17 @@
 """Tests of the names that users give: of filters, of parametrizations, and what is refused."""
 
+import sys
+
 import pytest
 
+from jaxslam.consistency import monte_carlo, summarise, table
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.lookup import chosen
 from jaxslam.models.calibration import Known
-from jaxslam.names import make_filters
+from jaxslam.names import CANNOT_TRACK, FILTERS, MODIFIERS, make_filters
 from jaxslam.simulation import scenario
-from jaxslam.slam.filter import EkfSlam
+from jaxslam.slam.filter import AtOnce, EkfSlam, innermost
+from jaxslam.slam.protocol import AbstractStaged
 
 COLOURS = {"red": 1, "green": 2, "blue": 3}
 
@@ -54,3 +58,53 @@ def test_filters_are_made_of_every_pair_of_names():
 def test_filters_of_unknown_names_are_refused(filters, landmarks, calibration, message):
     with pytest.raises(ValueError, match=message):
         make_filters(scenario("matched"), filters, landmarks, calibration)
+
+
+def test_one_name_needs_no_list_and_a_scenario_goes_by_its_name():
+    made = make_filters("matched", "robocentric", "inverse_scaling")
+    assert list(made) == ["robocentric/inverse_scaling"]
+    assert list(chosen("colour", "red", COLOURS)) == ["red"]
+    with pytest.raises(ValueError, match=r"unknown scenario 'matcht' \(did you mean matched\?\)"):
+        make_filters("matcht", "robocentric", "inverse_scaling")
+
+
+def tracks(name: str) -> bool:
+    of_points = {"information", "world+particles", "world+rays"}
+    landmark = "cartesian" if name in of_points else "inverse_scaling"
+    (slam,) = make_filters("matched-6dof", name, landmark).values()
+    inner = innermost(slam)
+    return isinstance(slam, AbstractStaged) and (inner is None or isinstance(inner.entry, AtOnce))
+
+
+def test_the_filters_that_cannot_track_are_those_that_the_error_names():
+    around = {word for word in MODIFIERS if word not in ("oc", "fej")}
+    assert {name for name in FILTERS if not tracks(name)} == {"iterated"}
+    below = {"rest": "world+mixture3"}
+    cannot = {f"+{word}" for word in around if not tracks(f"{below.get(word, 'world')}+{word}")}
+    assert {"iterated", *cannot} == set(CANNOT_TRACK)
+
+
+def test_a_study_prints_as_its_table_and_is_a_data_frame():
+    study = monte_carlo(
+        scenario("matched-tight", steps=3),
+        make_filters("matched-tight", ["robocentric", "world"], "inverse_scaling"),
+        runs=4,
+    )
+    summary = summarise(study)
+    assert str(study) == repr(study) == table(summary)
+    frame = study.to_pandas()
+    assert len(frame) == 2 * 3
+    found = summary["filters"]["world/inverse_scaling"]
+    rows = frame.loc["world/inverse_scaling"]
+    assert list(rows["nees"]) == found["nees"]
+    assert list(rows["sigma_position"]) == found["sigma"]["position"]
+    assert list(rows["step"]) == [1, 2, 3]
+
+
+def test_without_pandas_a_study_says_so(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    study = monte_carlo(
+        "matched-tight", make_filters("matched-tight", "world", "cartesian"), runs=1
+    )
+    with pytest.raises(ValueError, match="pip install pandas"):
+        study.to_pandas()

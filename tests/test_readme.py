@@ -4,7 +4,10 @@ import json
 import re
 from pathlib import Path
 
+import cv2
+
 from jaxslam.evaluation import CHOICES, Convention, read_covariances
+from jaxslam.vision.synthetic import synthetic_source
 
 ROOT = Path(__file__).parents[1]
 
@@ -48,6 +51,11 @@ def test_a_log_of_ones_own_goes_through_the_filter(capsys):
         assert "over-confident" not in out[out.index(name) :].splitlines()[1]
 
 
+def test_the_papers_filter_is_put_together_of_its_equations(capsys):
+    run_example("docs/paper.md")
+    assert capsys.readouterr().out.startswith("(47, 47)")
+
+
 def test_a_filter_has_gradients(capsys):
     run_example("docs/gradients.md")
     assert "by the pixel's σ" in capsys.readouterr().out
@@ -64,6 +72,58 @@ def test_errors_of_any_filter_have_a_verdict(capsys, tmp_path, monkeypatch):
     assert out.startswith(promised)
     assert json.loads(Path("results/evaluation.json").read_text())["runs"] == 50
     assert out.count("σ should be ×") == 2
+
+
+def test_a_landmark_of_ones_own_goes_into_the_papers_filter(capsys):
+    run_example("docs/own-landmark.md")
+    lines = capsys.readouterr().out.splitlines()
+    plain, papers = (lines[lines.index(f"{name}:") + 1] for name in ("plain", "paper"))
+    assert ": consistent (p = " in plain
+    assert plain == papers  # the calibration is known: the two differ by a factor f
+
+
+def test_a_study_is_kept_in_files(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_example("docs/large-studies.md")
+    assert capsys.readouterr().out == "60 runs in 3 files\n"
+    files = sorted(Path("results/runs").glob("*/*.npz"))
+    written = [file.stat().st_mtime_ns for file in files]
+    run_example("docs/large-studies.md")  # goes on from there: nothing is run again
+    assert [file.stat().st_mtime_ns for file in files] == written
+
+
+def test_single_precision_is_a_choice(capsys):
+    run_example("docs/float32.md")
+    double, single = capsys.readouterr().out.splitlines()
+    assert double.endswith("diverged 0")
+    assert single.endswith("diverged 0")
+
+
+def test_the_sites_first_page_has_ten_lines(capsys):
+    snippet = run_example("docs/index.md")
+    assert len(snippet.strip().splitlines()) <= 10
+    assert "scale_gauge+mixture9/inverse_scaling" in capsys.readouterr().out
+
+
+def test_a_film_goes_through_the_tracker_in_python(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    source = synthetic_source(frames=6, width=320, height=240)
+    writer = cv2.VideoWriter("walk.mp4", cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (320, 240))
+    for frame in source:
+        writer.write(cv2.cvtColor(frame.image, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    run_example("docs/own-video.md")
+    assert Path("tracker.npz").stat().st_size > 0
+
+
+def test_every_snippet_of_every_page_runs():
+    """Each document with snippets is run by a test of this file; what is not run says why."""
+    tests = Path(__file__).read_text()
+    for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]:
+        text, name = path.read_text(), str(path.relative_to(ROOT))
+        excused = text.count("<!-- does not run as a test: ")
+        assert text.count("```python") == len(examples(name)) + excused, name
+        assert not examples(name) or f'run_example("{name}")' in tests, name
 
 
 def test_the_covariance_file_of_the_page_is_one(tmp_path):

@@ -132,7 +132,7 @@ def test_what_holds_no_tracks_is_refused(tmp_path, drive):
     with pytest.raises(ValueError, match="lacks track, pixel"):
         read(tmp_path)
     (tmp_path / "tracks.npz").write_text("no")
-    with pytest.raises(ValueError, match=r"is not an \.npz file"):
+    with pytest.raises(ValueError, match="not an npz file of numbers"):
         read(tmp_path)
 
 

@@ -236,3 +236,11 @@ def test_a_verdict_is_said_in_words(factor, text):
 def test_what_is_no_study_is_refused(shape, dof):
     with pytest.raises(ValueError, match="NEES must be"):
         run_verdict(np.ones(shape), dof)
+
+
+@pytest.mark.parametrize("size", [1e-220, 1e-120, 1e120, 1e160])
+def test_runs_beyond_all_measure_have_a_verdict(size):
+    """No power of their NEES may end the verdict instead."""
+    nees = size * np.random.default_rng(0).chisquare(3, (20, 4))
+    word = Tally.of(nees, 3).verdict()["word"]
+    assert word in ({"under-confident"} if size < 1 else {"over-confident", "lost"})

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import signal
 import sys
+import textwrap
 from typing import Annotated
 
 import tyro
 
+from jaxslam import __version__
 from jaxslam.cli.cache import keep_programs
 from jaxslam.cli.calibrate import CalibrateOptions
 from jaxslam.cli.consistency import ConsistencyOptions
@@ -51,11 +53,15 @@ Command = (
 
 def main(arguments: list[str] | None = None) -> None:
     """Run a command. A mistake of the user's ends with exit status 2 and one line."""
+    given = sys.argv[1:] if arguments is None else arguments
+    if given == ["--version"]:
+        print(f"jaxslam {__version__}")
+        return
     options = tyro.cli(
         Command,
-        args=arguments,
+        args=given,
         prog="jaxslam",
-        description="Monocular EKF-SLAM whose uncertainty can be believed.",
+        description="Monocular EKF-SLAM whose uncertainty can be believed. --version says which.",
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.HelptextFromCommentsOff),
     )
     signal.signal(signal.SIGTERM, _interrupt)
@@ -64,6 +70,8 @@ def main(arguments: list[str] | None = None) -> None:
         options.run()
     except ValueError as error:
         _fail(2, str(error))
+    except OSError as error:  # a path that is too long, a folder that may not be written
+        _fail(2, f"{textwrap.shorten(str(error.filename), 80)}: {error.strerror or error}")
     except KeyboardInterrupt as interrupt:
         _fail(130, f"interrupted{f': {interrupt}' if str(interrupt) else ''}")
 

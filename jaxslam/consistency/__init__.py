@@ -1,6 +1,6 @@
 """Is a filter consistent? Monte Carlo runs, NEES and NIS with exact bounds, and their summary."""
 
-from jaxslam.consistency.montecarlo import CHUNK, DTYPES, Study, monte_carlo
+from jaxslam.consistency.montecarlo import CHUNK, DTYPES, monte_carlo
 from jaxslam.consistency.statistics import (
     PowerSums,
     chi2_quantile,
@@ -9,7 +9,7 @@ from jaxslam.consistency.statistics import (
     normalised_squared,
 )
 from jaxslam.consistency.store import FolderStore, MemoryStore
-from jaxslam.consistency.summary import summarise, table, tally, treatment
+from jaxslam.consistency.summary import Study, summarise, table, tally, treatment
 from jaxslam.consistency.verdict import VERDICTS, Tally, run_verdict, sentences, verdict
 
 __all__ = [

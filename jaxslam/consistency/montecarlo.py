@@ -14,7 +14,6 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
 
@@ -29,6 +28,7 @@ from jaxslam.consistency.beyond_scale import beyond_scale, reversal
 from jaxslam.consistency.recursion import Frame, run_through
 from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.consistency.store import MemoryStore, Store
+from jaxslam.consistency.summary import Seconds, Study
 from jaxslam.geometry import Pose
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.sensors import AbstractSensor
@@ -39,6 +39,7 @@ from jaxslam.simulation import (
     Sightings,
     Trajectory,
     as_data,
+    as_scenario,
     sensor_of,
     sightings,
     simulate,
@@ -51,33 +52,12 @@ from jaxslam.watchdog import finished, lapack_calls
 DTYPES = ("float64", "float32")
 CHUNK = 100
 """Runs in one batch: enough to fill vector units, few enough to stay in the cache."""
-
-
-@dataclass(frozen=True)
-class Seconds:
-    """Wall time of one filter over all its runs."""
-
-    compile: float
-    run: float
-
-
-@dataclass(frozen=True)
-class Study:
-    """Finished runs: where their records are, and what is needed to read them."""
-
-    scenario: Scenario
-    filters: Mapping[str, AbstractFilter]
-    runs: int
-    seed: int
-    dtype: str
-    chunks: tuple[range, ...]
-    store: Store
-    seconds: Mapping[str, Seconds]
-    device: str
+MOST_RUNS = 10**8
+"""Of a study."""
 
 
 def monte_carlo(
-    scenario: Scenario,
+    scenario: Scenario | str,
     filters: Mapping[str, AbstractFilter],
     *,
     runs: int = 1000,
@@ -91,8 +71,9 @@ def monte_carlo(
 ) -> Study:
     """Run every filter on the same simulated runs.
 
-    The runs are the scenario's; with a `motion` (or a `Trajectory`) or a `sensor` of one's own the
-    truth moves, or is measured, as that says, in the scenario's world.
+    The runs are the scenario's, which may be given by name; with a `motion` (or a `Trajectory`)
+    or a `sensor` of one's own the truth moves, or is measured, as that says, in the scenario's
+    world.
 
     `progress(filter name, finished runs)` is called after every chunk. Chunks that `store`
     already has are not run again. Raises ValueError for sizes that make no sense.
@@ -100,6 +81,7 @@ def monte_carlo(
     if not filters:
         raise ValueError("no filter to run: name at least one")
     check_sizes(runs, seed, dtype, chunk)
+    scenario = as_scenario(scenario)
     store = MemoryStore() if store is None else store
     chunks = tuple(range(i, min(i + chunk, runs)) for i in range(0, runs, chunk))
     seconds = {}
@@ -341,9 +323,11 @@ def _landmark_nees(slam, sensor, state, frame: Frame) -> dict[str, Array]:
 def check_sizes(runs: int, seed: int, dtype: str, chunk: int) -> None:
     """Raise ValueError for sizes that make no sense."""
     for name, value in (("runs", runs), ("chunk", chunk)):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, not {value}")
-    if seed < 0:
-        raise ValueError(f"seed must not be negative, not {seed}")
+        if not 1 <= value <= MOST_RUNS:
+            least = "at least 1" if value < 1 else f"at most {MOST_RUNS}"
+            raise ValueError(f"{name} must be {least}, not {value}")
+    if not 0 <= seed < 2**63:
+        bound = "not be negative" if seed < 0 else "be below 2⁶³"
+        raise ValueError(f"seed must {bound}, not {seed}")
     if dtype not in DTYPES:
         raise ValueError(f"unknown dtype {dtype!r}; known: {', '.join(DTYPES)}")

@@ -106,7 +106,8 @@ class PowerSums:
         n, m = self.count, self.mean
         second = self.second / n - m * m
         third = self.third / n - 3 * m * self.second / n + 2 * m * m * m
-        return third / (second * math.sqrt(second)) if second > 1e-12 * m * m else 0.0
+        cubed = second * math.sqrt(max(second, 0.0))
+        return third / cubed if second > 1e-12 * m * m and cubed > 0 else 0.0
 
 
 def mean_interval(sums: PowerSums, confidence: float) -> tuple[float, float]:
@@ -135,8 +136,13 @@ def mean_p_value(sums: PowerSums, expected: float) -> float:
     return 2 * float(stdtr(sums.count - 1, -abs(_symmetric(t, k))))
 
 
+_FAR = 1e50
+"""Of a studentised mean: beyond it no power of it is a number."""
+
+
 def _symmetric(t: float, k: float) -> float:
     """Hall's cubic `g(t) = t + k/6 + k t²/3 + k² t³/27`, with k = skewness/√n: monotone."""
+    t = min(max(t, -_FAR), _FAR)
     return t + k / 6 + k * t**2 / 3 + k**2 * t**3 / 27
 
 

@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from jaxslam.files import write_atomically
+from jaxslam.files import read_arrays, read_json, write_atomically
 
 Records = dict[str, np.ndarray]
 
@@ -54,7 +54,7 @@ class FolderStore:
         path = folder / "manifest.json"
         wanted = json.loads(json.dumps(manifest))
         if resume and path.exists():
-            _check_same(path, json.loads(path.read_text()), wanted)
+            _check_same(path, read_json(path, "manifest", _as_manifest), wanted)
         else:
             for old in folder.glob("*/*.npz"):
                 old.unlink()
@@ -72,12 +72,38 @@ class FolderStore:
             np.savez(file, allow_pickle=False, **records)
 
     def load(self, filter_name: str, chunk: range, names: Iterable[str] | None = None) -> Records:
-        with np.load(self._path(filter_name, chunk)) as file:
-            return {name: file[name] for name in (file.files if names is None else names)}
+        path, names = self._path(filter_name, chunk), None if names is None else list(names)
+        records = read_arrays(path, names)
+        for name in names or ():
+            if name not in records:
+                raise ValueError(f"{path} lacks {name}: {_DAMAGED}")
+        _check_records(path, len(chunk), records)
+        return records
 
     def _path(self, filter_name: str, chunk: range) -> Path:
         name = f"{chunk.start:07d}-{chunk.stop - 1:07d}.npz"
         return self.folder / filter_name.replace("/", "-") / name
+
+
+_DAMAGED = "it is damaged; remove it, and run again with --resume"
+
+
+def _check_records(path: Path, runs: int, records: Records) -> None:
+    """Raise ValueError unless all that is not of one sample is of so many runs and equal steps."""
+    shapes = {n: x.shape[:2] for n, x in records.items() if not n.startswith("sample_")}
+    numbers = all(x.dtype.kind in "fiub" for x in records.values())
+    if (
+        not numbers
+        or len(set(shapes.values())) > 1
+        or any(s[:1] != (runs,) for s in shapes.values())
+    ):
+        raise ValueError(f"{path} holds other records than those of {runs} runs: {_DAMAGED}")
+
+
+def _as_manifest(found: Any) -> dict[str, Any]:
+    if not isinstance(found, dict):
+        raise ValueError(f"holds a {type(found).__name__}; an object is accepted")
+    return found
 
 
 def _check_same(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:

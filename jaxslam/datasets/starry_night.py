@@ -10,9 +10,9 @@ the variance of that difference: see `with_reversed_gyroscope`.
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxslam.files import check_real, read_arrays
 from jaxslam.models.camera import Camera, project
 from jaxslam.models.motion import VehicleRates
 from jaxslam.simulation import Run
@@ -27,7 +28,7 @@ from jaxslam.simulation import Run
 GLITCH = 3.0
 """Rate above which the vehicle does not turn, rad/s: the truth jumps by 0.6 rad and back in one
 frame, at 10 rad/s."""
-_SHAPES = {
+SHAPES: dict[str, tuple[Any, ...]] = {
     "t": (1, None), "theta_vk_i": (3, None), "r_i_vk_i": (3, None), "w_vk_vk_i": (3, None),
     "v_vk_vk_i": (3, None), "w_var": (3, 1), "v_var": (3, 1), "rho_i_pj_i": (3, -1),
     "y_k_j": (4, None, -1), "y_var": (4, 1), "C_c_v": (3, 3), "rho_v_c_v": (3, 1),
@@ -64,15 +65,9 @@ class StarryNight:
 def read(path: str | Path) -> StarryNight:
     """Read the arrays. Raises ValueError, naming the file, unless they are those of the data."""
     path = Path(path)
-    try:
-        with np.load(path) as file:
-            arrays = {name: np.asarray(file[name], float) for name in _SHAPES if name in file}
-    except FileNotFoundError:
-        raise ValueError(f"{path} does not exist") from None
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise ValueError(f"{path} is not an .npz file: {error}") from None
-    _check(path, arrays)
-    a = arrays
+    a = read_arrays(path, SHAPES)
+    _check(path, a)
+    a = {name: np.asarray(x, float) for name, x in a.items()}
     rotation = jaxlie.SO3.from_matrix(jnp.asarray(a["C_c_v"].T))
     T_VC = jaxlie.SE3.from_rotation_and_translation(rotation, jnp.asarray(a["rho_v_c_v"].ravel()))
     # C_vi = Exp(−θ), so that the vehicle's axes in the room are Exp(θ).
@@ -98,18 +93,20 @@ def read(path: str | Path) -> StarryNight:
 
 
 def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    missing = [name for name in _SHAPES if name not in arrays]
+    missing = [name for name in SHAPES if name not in arrays]
     if missing:
         raise ValueError(f"{path} lacks {', '.join(missing)}: it is no Starry Night")
     sizes = {None: arrays["t"].size, -1: arrays["rho_i_pj_i"].shape[-1]}
-    for name, shape in _SHAPES.items():
+    for name, shape in SHAPES.items():
         wanted = tuple(sizes.get(size, size) for size in shape)
         if arrays[name].shape != wanted:
             raise ValueError(
                 f"{path}: {name} must have the shape {wanted}, not {arrays[name].shape}"
             )
-        if not np.isfinite(arrays[name]).all():
-            raise ValueError(f"{path}: {name} holds a number that is not finite")
+        check_real(f"{path}: {name}", arrays[name])
+    for name in ("w_var", "v_var", "y_var"):
+        if (arrays[name] <= 0).any():
+            raise ValueError(f"{path}: {name} holds a variance that is not positive")
     if (np.diff(arrays["t"].ravel()) <= 0).any():
         raise ValueError(f"{path}: t must increase")
 

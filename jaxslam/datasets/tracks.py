@@ -6,7 +6,6 @@ track, which tracks move, times, intrinsics) and `groundtruth.txt` in TUM's form
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.files import check_real, read_arrays
 from jaxslam.models.camera import Camera
 from jaxslam.simulation import Run
 from jaxslam.tum import read_tum
@@ -25,7 +25,12 @@ MOVING = 1
 """What a track is marked with that contradicts a still scene."""
 GOLDEN = (5**0.5 - 1) / 2
 """Of one: each multiple falls into the widest gap that those before it leave, modulo 1."""
-_ARRAYS = ("frame", "track", "pixel", "moving", "times", "intrinsics", "image_size")
+_SHAPES = {
+    "frame": ("observations",), "track": ("observations",), "pixel": ("observations", 2),
+    "moving": ("tracks",), "times": ("frames",), "intrinsics": (4,), "image_size": (2,),
+}  # fmt: skip
+_NUMBERS = ("frame", "track", "moving", "image_size")
+"""Whole ones."""
 
 
 @dataclass(frozen=True)
@@ -53,15 +58,8 @@ class Tracks:
 def read(folder: str | Path) -> Tracks:
     """Read a drive. Raises ValueError, naming the file, unless it is one."""
     path = Path(folder) / "tracks.npz"
-    try:
-        with np.load(path) as file:
-            arrays = {name: np.asarray(file[name]) for name in _ARRAYS if name in file}
-    except FileNotFoundError:
-        raise ValueError(f"{path} does not exist") from None
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise ValueError(f"{path} is not an .npz file: {error}") from None
-    if missing := [name for name in _ARRAYS if name not in arrays]:
-        raise ValueError(f"{path} lacks {', '.join(missing)}: it holds no tracks")
+    arrays = read_arrays(path, _SHAPES)
+    _check(path, arrays)
     _, poses = read_tum(Path(folder) / "groundtruth.txt")
     if len(poses) != arrays["times"].size:
         raise ValueError(
@@ -79,6 +77,24 @@ def read(folder: str | Path) -> Tracks:
         camera=Camera([fx, fy], [cx, cy]),
         image=arrays["image_size"],
     )
+
+
+def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Raise ValueError, naming the file, for arrays that are none of a drive."""
+    if missing := [name for name in _SHAPES if name not in arrays]:
+        raise ValueError(f"{path} lacks {', '.join(missing)}: it holds no tracks")
+    sizes: dict[str, int] = {}
+    for name, shape in _SHAPES.items():
+        x = arrays[name]
+        wanted = tuple(sizes.setdefault(n, x.size) if isinstance(n, str) else n for n in shape)
+        if x.shape != wanted:
+            raise ValueError(f"{path}: {name} must have the shape {wanted}, not {x.shape}")
+        check_real(f"{path}: {name}", x)
+        if name in _NUMBERS and x.dtype.kind not in "iu":
+            raise ValueError(f"{path}: {name} must hold whole numbers, not {x.dtype}")
+    for name, count in (("frame", sizes["frames"]), ("track", sizes["tracks"])):
+        if ((arrays[name] < 0) | (arrays[name] >= count)).any():
+            raise ValueError(f"{path}: {name} holds a number that is not from 0 to {count - 1}")
 
 
 def window(

@@ -105,14 +105,19 @@ def normalised(
         told = f"variance {variance[run, step, axis]:.3g} at place {axis}"
         _refuse((run, step), f"has {told}")
     sigma = np.sqrt(variance)
-    correlation = covariances / sigma[..., :, None] / sigma[..., None, :]
+    with np.errstate(over="ignore"):
+        correlation = covariances / sigma[..., :, None] / sigma[..., None, :]
+    if not np.isfinite(correlation).all():
+        place = tuple(np.argwhere(~np.isfinite(correlation))[0])
+        _refuse(place[:2], f"has {covariances[place]:.3g} where its variances allow less")
     skewed = np.abs(correlation - np.swapaxes(correlation, -1, -2)).max(axis=(-2, -1))
     if (skewed > ASYMMETRY).any():
         place = np.argwhere(skewed > ASYMMETRY)[0]
         _refuse(place, f"is not symmetric (by {skewed[tuple(place)]:.2g} in σ)")
-    with np.errstate(over="ignore"):  # an infinite NEES is one of a run that diverged
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite: of a run that diverged
         whitened = np.linalg.solve(_factors(correlation), (errors / sigma)[..., None])[..., 0]
-        return np.sum(whitened**2, axis=-1)
+        nees = np.sum(whitened**2, axis=-1)
+    return np.where(np.isnan(nees), np.inf, nees)
 
 
 def _factors(correlation: Float[np.ndarray, "runs steps n n"]) -> np.ndarray:

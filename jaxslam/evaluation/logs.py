@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from jaxslam.evaluation.convention import CHOICES, Convention
 from jaxslam.evaluation.covariance_text import read_covariances
 from jaxslam.evaluation.evaluate import Evaluation, evaluate
 from jaxslam.evaluation.poses import evaluate_poses
+from jaxslam.files import read_arrays
 from jaxslam.lookup import suggestion
 from jaxslam.tum import read_table, read_tum
 
@@ -119,15 +119,7 @@ def _stated(said: dict[str, str], stated: dict[str, str]) -> Convention:
 
 def _npz(path: Path) -> dict[str, Any]:
     """The arrays of a file; nothing in it is run."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except OSError as error:
-        raise ValueError(f"{path}: cannot read the arrays ({error.strerror or error})") from None
-    except (ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
-        raise ValueError(f"{path}: not an npz file of numbers ({error})") from None
-    except AttributeError:  # an npy file in its place
-        raise ValueError(f"{path}: one array, not an npz file of named ones") from None
+    arrays: dict[str, Any] = dict(read_arrays(path))
     for name in arrays:
         if name not in _KEYS:
             meant = suggestion(name, _KEYS)

@@ -33,12 +33,12 @@ from jaxslam.evaluation.convention import (
 )
 from jaxslam.evaluation.evaluate import Evaluation, left_out
 from jaxslam.evaluation.identify import Identification, identify
+from jaxslam.files import LARGEST
 from jaxslam.lookup import chosen
+from jaxslam.tum import not_rigid
 
 _RIGID = 1e-4
 """How far from orthonormal a rotation may be: what rounding to six digits leaves is less."""
-LARGEST = 1e100
-"""Of the numbers of poses, whose squares are finite then."""
 _SINGULAR = 1e-12
 """Of a variance, what is left of it where all of it is scale's."""
 _ENOUGH = 100
@@ -140,14 +140,9 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
 
 
 def _rigid(what: str, T: np.ndarray, accepted: str) -> np.ndarray:
-    n = T.shape[-1] - 1
     if T.shape[-2:] not in ((3, 3), (4, 4)):
         raise ValueError(f"{what} must be matrices {accepted}, not {T.shape}")
-    R = T[..., :n, :n]
-    with np.errstate(over="ignore", invalid="ignore"):
-        skewed = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(n)).max(axis=(-2, -1))
-        wrong = ~(skewed <= _RIGID) | (np.linalg.det(R) < 0)
-    wrong |= (T[..., n, :] != np.eye(n + 1)[n]).any(axis=-1)
+    wrong = not_rigid(T, _RIGID)
     if wrong.any():
         place = at(np.argwhere(wrong)[0])
         raise ValueError(f"{what} of {place} is no rigid motion [R t; 0 1] with R a rotation")

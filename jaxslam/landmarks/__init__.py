@@ -25,6 +25,7 @@ LANDMARKS: dict[str, Parametrization] = {
         IMAGE_PLANE,
     )
 }
+"""Every parametrization by its name."""
 
 __all__ = [
     "ANCHORED_HOMOGENEOUS",

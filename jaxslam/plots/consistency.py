@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from matplotlib.figure import Figure
 
 from jaxslam.consistency import Study, summarise
 from jaxslam.consistency.verdict import headline
+from jaxslam.evaluation.evaluate import OUTSIDE
 from jaxslam.plots.landmarks import region_from_above
 from jaxslam.plots.style import GREY, line_style, name_decades, new_figure, save
 
@@ -25,27 +27,28 @@ def plot_consistency(
 ) -> Figure:
     """Draw a study; `summary` is `summarise(study)`, made here if it is not given.
 
-    Above: the mean NEES of every filter with its exact 95 % band, and the map of run 0 at its
-    end, in the same colours. Where the scale is free, below that: NEES given the scale, and the
-    scale's own error. Below: the error of run 0 with ±3σ, axis by axis. Written to `path` where
-    one is given.
+    Above: the mean NEES of every filter with its exact 95 % band, and the share of errors outside
+    ±3σ. Where the scale is free, below that: NEES given the scale, and the scale's own error.
+    Below: the error of run 0 with ±3σ, axis by axis, and its map at the end. Written to `path`
+    where one is given.
     """
     summary = summarise(study) if summary is None else summary
     geometry = study.scenario.world
     rows, free = geometry.tangent_dim // 3, summary["scale_free"]
-    heights = [2.1, *[1.3] * free, *[1] * rows]
+    heights = [2.1, *[1.3] * free, *[1.1] * rows]
     figure = new_figure(12.5, 1.0 + 0.2 * len(study.filters) + 2.1 * sum(heights))
     # Over the whole width, as the verdicts are longer than the axes that they are on.
     figure.suptitle(_title(summary), x=0.01, ha="left", fontsize=10)
-    grid = figure.add_gridspec(len(heights), 6, height_ratios=heights)
-    _plot_nees(figure.add_subplot(grid[0, :4]), summary)
-    samples = {name: study.store.load(name, study.chunks[0]) for name in study.filters}
-    _plot_map(figure.add_subplot(grid[0, 4:]), samples)
+    grid = figure.add_gridspec(len(heights), 12, height_ratios=heights)
+    plot_nees(summary, ax=figure.add_subplot(grid[0, :8]))
+    plot_outside(summary, ax=figure.add_subplot(grid[0, 8:]))
     if free:
-        _plot_beyond_scale(figure.add_subplot(grid[1, :3]), summary)
-        _plot_log_scale(figure.add_subplot(grid[1, 3:]), summary)
+        plot_beyond_scale(summary, ax=figure.add_subplot(grid[1, :6]))
+        plot_log_scale(summary, ax=figure.add_subplot(grid[1, 6:]))
+    samples = {name: study.store.load(name, study.chunks[0]) for name in study.filters}
+    _plot_map(figure.add_subplot(grid[1 + free :, 9:]), samples)
     axes = [
-        figure.add_subplot(grid[1 + free + r, 2 * c : 2 * c + 2])
+        figure.add_subplot(grid[1 + free + r, 3 * c : 3 * c + 3])
         for r in range(rows)
         for c in range(3)
     ]
@@ -55,7 +58,12 @@ def plot_consistency(
     return figure
 
 
-def _plot_nees(axes: Axes, summary: dict[str, Any]) -> None:
+def plot_nees(summary: dict[str, Any], *, ax: Axes, label: Mapping[str, str] | None = None) -> Axes:
+    """Mean NEES of every filter over time with its exact 95 % band, and the medians, dotted.
+
+    A filter may be called otherwise in the legend: `label={"robocentric/inverse_depth": "UID"}`.
+    """
+    axes, label = ax, label or {}
     time = np.array(summary["time"])
     first = next(iter(summary["filters"].values()))
     low, high = first["band95"]
@@ -64,7 +72,13 @@ def _plot_nees(axes: Axes, summary: dict[str, Any]) -> None:
     axes.axhline(first["dof"], color=GREY, lw=0.8)
     for i, (name, f) in enumerate(summary["filters"].items()):
         style = line_style(i)
-        axes.plot(time, np.array(f["nees"], float), lw=1.8, label=f"{name}: {_curve(f)}", **style)
+        axes.plot(
+            time,
+            np.array(f["nees"], float),
+            lw=1.8,
+            label=f"{label.get(name, name)}: {_curve(f)}",
+            **style,
+        )
         axes.plot(
             time, np.array(f["nees_median"], float), color=style["color"], lw=0.9, ls=(0, (1, 2))
         )
@@ -80,6 +94,34 @@ def _plot_nees(axes: Axes, summary: dict[str, Any]) -> None:
     _over_time(axes, time)
     axes.set_ylabel(f"pose NEES (ideal {first['dof']})")
     axes.legend(fontsize=8, loc="upper left")
+    return axes
+
+
+def plot_outside(
+    summary: dict[str, Any], *, ax: Axes, label: Mapping[str, str] | None = None
+) -> Axes:
+    """Share of errors outside ±3σ over time, of the position (solid) and the orientation (thin).
+
+    Where a `label` is given for a filter, it stands at the end of its line.
+    """
+    time, label = np.array(summary["time"]), label or {}
+    for i, (name, f) in enumerate(summary["filters"].items()):
+        style, outside = line_style(i), f["outside3sigma"]
+        position, orientation = (
+            100 * np.array(outside[part], float) for part in ("position", "orientation")
+        )
+        ax.plot(time, position, lw=1.8, **style)
+        ax.plot(time, orientation, lw=0.8, **style)
+        if name in label:
+            place = (time[-1], position[-1])
+            ax.annotate(f" {label[name]}", place, color=style["color"], va="center", fontsize=8)
+    ax.axhline(100 * OUTSIDE, color=GREY, lw=0.8)
+    ax.set_ylim(0, max(1.0, ax.get_ylim()[1]))
+    _over_time(ax, time)
+    ax.set_ylabel("% of errors")
+    told = "outside ±3σ: position, orientation (thin)"
+    ax.set_title(f"{told}\ngrey: 0.27 % of Gaussian errors", fontsize=9)
+    return ax
 
 
 def _over_time(axes: Axes, time: np.ndarray) -> None:
@@ -88,8 +130,9 @@ def _over_time(axes: Axes, time: np.ndarray) -> None:
     axes.grid(alpha=0.25, which="major")
 
 
-def _plot_beyond_scale(axes: Axes, summary: dict[str, Any]) -> None:
+def plot_beyond_scale(summary: dict[str, Any], *, ax: Axes) -> Axes:
     """Mean and median NEES at the scale of the truth that explains the estimate best."""
+    axes = ax
     time = np.array(summary["time"])
     first = next(iter(summary["filters"].values()))["beyond_scale"]
     axes.axhspan(*first["band95"], color=GREY, alpha=0.25, lw=0)
@@ -105,11 +148,13 @@ def _plot_beyond_scale(axes: Axes, summary: dict[str, Any]) -> None:
     name_decades(axes)
     _over_time(axes, time)
     axes.set_title(f"pose NEES given the scale (ideal {first['dof']})", fontsize=9)
+    return axes
 
 
-def _plot_log_scale(axes: Axes, summary: dict[str, Any]) -> None:
+def plot_log_scale(summary: dict[str, Any], *, ax: Axes) -> Axes:
     """The error of log-scale and what it should be by the σ claimed: medians, as one reversed run,
     which no scale explains, has an error and a σ beyond all others."""
+    axes = ax
     time = np.array(summary["time"])
     for i, f in enumerate(summary["filters"].values()):
         style, scale = line_style(i), f["log_scale"]
@@ -123,6 +168,7 @@ def _plot_log_scale(axes: Axes, summary: dict[str, Any]) -> None:
     _over_time(axes, time)
     axes.set_title("log of the scale: error and claimed σ", fontsize=9)
     axes.legend(fontsize=7, loc="best")
+    return axes
 
 
 def _title(summary: dict[str, Any]) -> str:
@@ -153,7 +199,7 @@ def _plot_errors(axes: list[Axes], samples: dict[str, Any], time: np.ndarray, n:
             ax.plot(time, bound, time, -bound, lw=0.8, alpha=0.8, **style)
             ax.plot(time, error, lw=1.5, **style)
         label = positions[axis] if position else rotations[axis - n]
-        ax.set_title(f"run 0: error in {label} with ±3σ", fontsize=9)
+        ax.set_title(f"run 0: {label} with ±3σ", fontsize=9)
         ax.set_ylabel("m" if position else "degrees")
         ax.set_xlim(0, time[-1])
         ax.grid(alpha=0.25)
@@ -181,7 +227,7 @@ def _plot_map(axes: Axes, samples: dict[str, Any]) -> None:
     axes.set_xlabel("x, m")
     axes.set_ylabel("z, m")
     # Said in the title: a legend would hide landmarks and ticks of a narrow map.
-    axes.set_title("run 0 from above, landmarks with 95 % regions\nblack: the truth", fontsize=9)
+    axes.set_title("run 0 from above, 95 % regions\nblack: the truth", fontsize=9)
     axes.grid(alpha=0.25)
 
 

@@ -7,7 +7,7 @@ from jaxslam.simulation.pieces import (
     sensor_of,
 )
 from jaxslam.simulation.run import Room, Run, Sightings, features, gone, sightings
-from jaxslam.simulation.scenario import BUILT_IN, Scenario, scenario
+from jaxslam.simulation.scenario import BUILT_IN, Scenario, as_scenario, scenario
 from jaxslam.simulation.trajectories import Trajectory
 from jaxslam.simulation.world import as_data, simulate, trajectory_of
 
@@ -19,6 +19,7 @@ __all__ = [
     "Sightings",
     "Trajectory",
     "as_data",
+    "as_scenario",
     "calibration_sigma_of",
     "depth_of",
     "features",

@@ -29,6 +29,7 @@ CALIBRATIONS = ("white", "consider", "estimated", "known")
 TRUE_CALIBRATIONS = ("nominal", "white", "constant")
 PLACEMENTS = ("prior", "ring", "room", "rays")
 ROOM_LANDMARKS = 72
+LARGEST_WHOLE = 2**31 - 1
 
 
 def _structural(default: Any) -> Any:
@@ -149,6 +150,11 @@ def scenario(
     return _replaced(chosen, {**(overrides or {}), **fields})
 
 
+def as_scenario(given: Scenario | str) -> Scenario:
+    """A scenario, or the one of this name. Raises ValueError."""
+    return given if isinstance(given, Scenario) else scenario(given)
+
+
 def _named(name: str) -> Scenario | None:
     """A built-in scenario, or one along a trajectory of this name."""
     if not name.startswith(HANDHELD):
@@ -217,6 +223,8 @@ def _coerced(field: str, value: Any, like: Any) -> Any:
         return tuple(_coerced(field, number, 0.0) for number in values)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise wrong("a number")
+    if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
+        raise wrong(f"a number up to {LARGEST_WHOLE}")
     if isinstance(like, int) and value != int(value if math.isfinite(value) else 0):
         raise wrong("a whole number")
     return type(like)(value)

@@ -88,7 +88,7 @@ def _without_gaps(times: Float[np.ndarray, " n"], T: Float[np.ndarray, "n 4 4"])
     """The pieces between the gaps, each as times and (position, quaternion x, y, z, w)."""
     forward = np.concatenate([[True], times[1:] > np.maximum.accumulate(times)[:-1]])
     times, T = times[forward], T[forward]
-    seconds = np.diff(times)
+    seconds = np.diff(times) if times.size > 1 else np.zeros(1)
     gaps = np.flatnonzero(seconds > max(GAP, 1.5 * float(np.median(seconds)))) + 1
     for part in np.split(np.arange(times.size), gaps):
         if part.size >= LEAST:

@@ -91,7 +91,8 @@ def candidates(
 
     `tolerance` is a σ, in the unit of a measurement, by which each may be off beyond its noise.
     Of a `curved` measurement, the covariance has the terms of second order of each match by
-    itself, where an `EkfSlam` tells them: of a camera that may have set out in any direction, they are what depth does to it.
+    itself, where an `EkfSlam` tells them: what depth does to it, of a camera that may have set
+    out in any direction.
     Raises ValueError for a filter whose innovations have no covariance.
     """
     _, innovation = slam.update(state, control, features)

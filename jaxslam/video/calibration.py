@@ -163,7 +163,7 @@ def _require_number(name: str, value: object) -> None:
     # bool is an int to Python, but `true` in the file is a mistake.
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise ValueError(f"{name} is {value!r}; a number is accepted")
-    if not math.isfinite(value):
+    if not abs(value) < math.inf or (isinstance(value, int) and abs(value) > 2**63):
         raise ValueError(f"{name} is {value}; a finite number is accepted")
 
 

@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam.files import one_line
 from jaxslam.tum import poses
 from jaxslam.video.calibration import Calibration
 from jaxslam.video.recording import (
     Layout,
     Recording,
+    check_rigid,
     finite_number,
     fixed,
     listed,
@@ -71,10 +73,14 @@ def _camera_truth(truth: Path, yaml: Path) -> Trajectory:
     """`T_WS = T_WB T_BS`, of rows `ns, px, py, pz, qw, qx, qy, qz`."""
     text = "\n".join(line for _, line in text_lines(yaml))
     T_BS = np.reshape(_numbers(yaml, text, "data", 16), (4, 4))
+    check_rigid(yaml, T_BS[None])
     table = read_table(truth, 8, ",")
-    return Trajectory(
-        table[:, 0] / NANOSECONDS, poses(table[:, 1:4], table[:, [5, 6, 7, 4]]) @ T_BS
-    )
+    try:
+        T_WB = poses(table[:, 1:4], table[:, [5, 6, 7, 4]])
+    except ValueError as error:
+        raise ValueError(f"{truth}: {one_line(error)}") from None
+    check_rigid(truth, T_WB)
+    return Trajectory(table[:, 0] / NANOSECONDS, T_WB @ T_BS)
 
 
 def _numbers(path: Path, text: str, key: str, count: int) -> Float[np.ndarray, " n"]:

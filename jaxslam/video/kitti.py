@@ -9,12 +9,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam.files import LARGEST
 from jaxslam.video.calibration import Calibration
 from jaxslam.video.recording import (
     Calibrator,
     Layout,
     Recording,
     check_later,
+    check_rigid,
+    finite_number,
     image_files,
     of_files,
     read_table,
@@ -51,10 +54,13 @@ def _projection(path: Path, camera: str) -> Float[np.ndarray, "3 4"]:
     for place, line in text_lines(path):
         name, _, rest = line.partition(":")
         if name.strip() == f"P{camera}":
-            try:
-                return np.array(rest.split(), float).reshape(3, 4)
-            except ValueError:
-                raise ValueError(f"{place}: P{camera}: and twelve numbers are accepted") from None
+            numbers = [finite_number(word) for word in rest.split()]
+            if len(numbers) != 12 or None in numbers:
+                raise ValueError(f"{place}: P{camera}: and twelve numbers are accepted")
+            P = np.array(numbers, float).reshape(3, 4)
+            if not (np.abs(P).max() <= LARGEST and (np.diagonal(P) != 0).all()):
+                raise ValueError(f"{place}: no projection of a camera with a focal length")
+            return P
     raise ValueError(f"{path}: has no line P{camera}: of the images image_{camera}")
 
 
@@ -78,6 +84,7 @@ def _camera_truth(
     _check_count(path, len(rows), len(times))
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
     T_wc[:, :3] = rows
+    check_rigid(path, T_wc)
     if P is not None:
         T_wc[:, :3, 3] -= rows[:, :, :3] @ np.linalg.solve(P[:, :3], P[:, 3])
     return Trajectory(times, T_wc)

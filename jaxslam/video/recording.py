@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam.files import LARGEST
+from jaxslam.tum import not_rigid
 from jaxslam.video.calibration import Calibration, read_calibration
 from jaxslam.video.source import Image, Trajectory
 
@@ -145,6 +147,14 @@ def check_later(place: str, time: float, before: list[float]) -> None:
         raise ValueError(f"{place}: time {time} s does not come after {before[-1]} s")
 
 
+def check_rigid(path: Path, T: Float[np.ndarray, "n 4 4"]) -> None:
+    """Raise ValueError unless poses are turned and moved, and nothing else, by 1 %."""
+    wrong = not_rigid(T, 0.01) | ~(np.abs(T[:, :3, 3]).max(axis=1) <= LARGEST)
+    if wrong.any():
+        pose = int(np.argmax(wrong))
+        raise ValueError(f"{path}: pose {pose} is no rigid motion [R t] with R a rotation")
+
+
 def finite_number(word: str) -> float | None:
     """The number that a word is, or None."""
     try:
@@ -162,22 +172,26 @@ def _timestamp(place: str, line: str, separator: str | None) -> tuple[float, str
     return time, words[1].strip()
 
 
-def read_table(path: Path, columns: int, separator: str | None = None) -> Float[np.ndarray, "n k"]:
+def read_table(
+    path: Path, columns: int, separator: str | None = None, *, finite: bool = True
+) -> Float[np.ndarray, "n k"]:
     """Rows of at least so many numbers, as text; `ValueError` names the line that is none.
 
-    Numbers beyond them are left out.
+    Numbers beyond them are left out. All are finite, unless that is not asked for.
     """
-    rows = [_row(place, line, columns, separator) for place, line in text_lines(path)]
+    rows = [_row(place, line, columns, separator, finite) for place, line in text_lines(path)]
     if not rows:
         raise ValueError(f"{path}: holds no rows of {columns} numbers")
     return np.array(rows)
 
 
-def _row(place: str, line: str, columns: int, separator: str | None) -> list[float]:
+def _row(place: str, line: str, columns: int, separator: str | None, finite: bool) -> list[float]:
     try:
         row = [float(word) for word in line.split(separator)]
     except ValueError:
         row = []
     if len(row) < columns:
         raise ValueError(f"{place}: {columns} numbers are accepted")
+    if finite and not all(map(math.isfinite, row[:columns])):
+        raise ValueError(f"{place}: {columns} finite numbers are accepted")
     return row[:columns]

@@ -9,7 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.video.calibration import Calibration
-from jaxslam.video.recording import Layout, Recording, fixed, of_files, read_table
+from jaxslam.video.recording import (
+    Layout,
+    Recording,
+    check_rigid,
+    fixed,
+    of_files,
+    read_table,
+)
 from jaxslam.video.source import Trajectory
 
 RATE = 30.0
@@ -37,11 +44,13 @@ def _truth(files: list[Path], times: np.ndarray) -> Trajectory | None:
     known = [place for place, stem in enumerate(stems) if stem.is_file()]
     T_wc = np.array([_pose(stems[place]) for place in known]).reshape(-1, 4, 4)
     finite = np.isfinite(T_wc).all(axis=(1, 2))
+    for place, T in zip(np.array(known, int)[finite], T_wc[finite], strict=True):
+        check_rigid(stems[place], T[None])
     return Trajectory(times[known][finite], T_wc[finite]) if finite.any() else None
 
 
 def _pose(path: Path) -> np.ndarray:
-    matrix = read_table(path, 4)
+    matrix = read_table(path, 4, finite=False)
     if matrix.shape != (4, 4):
         raise ValueError(f"{path}: holds {len(matrix)} rows; a 4x4 matrix is accepted")
     return matrix

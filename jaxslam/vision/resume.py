@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.files import write_atomically
+from jaxslam.files import read_arrays, write_atomically
 
 FORMAT = "jaxslam tracker 1"
 
@@ -28,14 +27,13 @@ def write_record(
 
 def read_record(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays. Raises ValueError, naming the file, for one of another kind."""
+    arrays = read_arrays(path)
     try:
-        with np.load(path) as archive:
-            arrays = {name: archive[name] for name in archive.files}
         header = json.loads(str(arrays.pop("header")))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except (ValueError, KeyError, zipfile.BadZipFile):
-        header, arrays = {}, {}
+    except (ValueError, KeyError):
+        header = {}
+    if not isinstance(header, dict):
+        header = {}
     if header.get("format") != FORMAT:
         raise ValueError(f"{path}: is no tracker's file ({FORMAT})")
     return header, arrays

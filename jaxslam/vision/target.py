@@ -120,7 +120,7 @@ def _point(index: int, fields: Any, folder: Path) -> KnownPoint:
 def _numbers(what: str, value: Any, count: int) -> Float[np.ndarray, " n"]:
     try:
         numbers = np.array(value, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.zeros(0)
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
         raise ValueError(f"{what} is {value!r}; {count} finite numbers are accepted")

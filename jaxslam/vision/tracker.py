@@ -16,9 +16,11 @@ from jaxtyping import Bool, Float
 from scipy.stats import binom
 
 from jaxslam.arrays import cast
+from jaxslam.files import one_line
 from jaxslam.forms.state import Features, Status
 from jaxslam.models.scale import Metre
 from jaxslam.models.sensors import Pinhole
+from jaxslam.names import CANNOT_TRACK
 from jaxslam.programs import Program, in_background
 from jaxslam.slam.association import ASSOCIATIONS, Association, candidates, one_point_ransac
 from jaxslam.slam.filter import AtOnce, EkfSlam, begun, innermost
@@ -145,7 +147,7 @@ class Tracker:
             raise ValueError(
                 f"filter {self.filter_name} cannot track: features are sought where a Gaussian "
                 "predicts them, before it is given the frame, from the frame in which they are "
-                "first seen"
+                f"first seen; all do but {', '.join(CANNOT_TRACK)}"
             )
         if self.target is not None and not _keeps_metres(made):
             raise ValueError(
@@ -274,12 +276,28 @@ class Tracker:
         that is none, or of another filter.
         """
         header, arrays = read_record(path)
-        if header["filter"] is not None and filter is None:
+        if header.get("filter") is not None and filter is None:
             raise ValueError(f"{path}: was saved with a filter {header['filter']}; give that")
         try:
             settings = TrackerSettings(**header["settings"])
         except TypeError:
             raise ValueError(f"{path}: was saved by another version, with other settings") from None
+        except KeyError:
+            raise ValueError(f"{path}: is damaged: it has no settings") from None
+        try:
+            return cls._restored(settings, header, arrays, filter)
+        except (KeyError, TypeError, IndexError, AttributeError) as error:
+            raise ValueError(f"{path}: is damaged ({one_line(error)})") from None
+
+    @classmethod
+    def _restored(
+        cls,
+        settings: TrackerSettings,
+        header: dict[str, Any],
+        arrays: dict[str, np.ndarray],
+        filter: AbstractStaged | None,
+    ) -> Tracker:
+        """What `save` wrote, as it was."""
         tracker = cls(from_fields(header["calibration"]), settings, filter)
         for name, value in header["numbers"].items():
             setattr(tracker, name, value)

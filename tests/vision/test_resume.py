@@ -128,14 +128,21 @@ def test_there_is_nothing_to_save_before_the_first_frame(video, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("kind", ["missing", "text", "other archive"])
-def test_a_file_that_is_no_trackers_is_refused(tmp_path, kind):
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("missing", r"t\.npz does not exist"),
+        ("text", r"t\.npz: not an npz file of numbers \(another kind of file"),
+        ("other archive", r"t\.npz: is no tracker's file"),
+    ],
+)
+def test_a_file_that_is_no_trackers_is_refused(tmp_path, kind, message):
     path = tmp_path / "t.npz"
     if kind == "text":
         path.write_text("nothing")
     if kind == "other archive":
         np.savez(path, header=np.array("{}"), a=np.zeros(3))
-    with pytest.raises(ValueError, match=r"t\.npz: (cannot be read|is no tracker's file)"):
+    with pytest.raises(ValueError, match=message):
         Tracker.load(path)
 
 

@@ -1,0 +1,86 @@
+"""The pages hang together: each is in the site, each link goes somewhere, versions agree."""
+
+import ast
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from test_house import ORDER
+
+import jaxslam
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *PAGES]
+
+
+def anchors(path: Path) -> set[str]:
+    """What headings of a page are called in links."""
+    titles = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE)
+    kept = (re.sub(r"[^\w\- ]", "", title.lower().replace("`", "")) for title in titles)
+    return {title.strip().replace(" ", "-") for title in kept}
+
+
+def broken(path: Path) -> list[str]:
+    """Links and pictures of a document that lead nowhere in the repository."""
+    wrong = []
+    for link in re.findall(
+        r"\]\(([^)\s]+)\)", re.sub(r"```.*?```", "", path.read_text(), flags=re.S)
+    ):
+        place, _, anchor = link.partition("#")
+        target = (path.parent / place).resolve() if place else path
+        if "://" in link or place.startswith("tutorials/"):
+            continue
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            wrong.append(link)
+    return wrong
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_links_lead_to_what_is_there(document):
+    assert not broken(document)
+
+
+def test_a_link_that_leads_nowhere_is_found(tmp_path):
+    (tmp_path / "a.md").write_text(
+        "# One, two\n[x](b.md) [y](#one-two) [z](#three) [w](a.md#one-two)"
+    )
+    assert broken(tmp_path / "a.md") == ["b.md", "#three"]
+
+
+def test_every_page_and_notebook_is_in_the_site():
+    listed = set((ROOT / "docs" / "index.md").read_text().split())
+    assert {page.stem for page in PAGES} - {"index"} <= listed
+    assert {f"tutorials/{path.stem}" for path in (ROOT / "notebooks").glob("*.py")} <= listed
+
+
+def test_every_room_is_in_the_site():
+    """In another order than that of imports: what users meet first comes first."""
+    sources = ast.parse((ROOT / "docs" / "site_sources.py").read_text()).body
+    (listed,) = [x.value for x in sources if isinstance(x, ast.Assign) and _name(x) == "ROOMS"]
+    assert sorted(ast.literal_eval(listed)) == sorted(ORDER)
+
+
+def _name(assignment: ast.Assign) -> str | None:
+    target = assignment.targets[0]
+    return target.id if isinstance(target, ast.Name) else None
+
+
+def test_the_version_is_one():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert project["version"] == jaxslam.__version__
+    assert f"version: {jaxslam.__version__}\n" in citation
+
+
+def test_every_public_name_is_documented():
+    for name in set(jaxslam.__all__) - {"__version__"}:
+        value = getattr(jaxslam, name)
+        assert value.__doc__, name
+
+
+def test_the_workflow_calls_what_runs_here():
+    workflow = (ROOT / ".github" / "workflows" / "ci.yml").read_text()
+    assert "run: .ci/run\n" in workflow
+    assert (ROOT / ".ci" / "run").stat().st_mode & 0o100
