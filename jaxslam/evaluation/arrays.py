@@ -53,7 +53,8 @@ def step_times(times: ArrayLike | None, steps: int) -> Float[np.ndarray, " steps
     if times is None:
         return np.arange(1.0, steps + 1)
     try:
-        array = np.asarray(times, np.float64)
+        real = not np.iscomplexobj(times)
+        array = np.asarray(times, np.float64) if real else np.empty(0)
     except (ValueError, TypeError):
         array = np.empty(0)
     if array.shape != (steps,) or not np.isfinite(array).all() or (np.diff(array) < 0).any():
