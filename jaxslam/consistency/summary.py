@@ -204,14 +204,14 @@ def treatment(slam: Any) -> str | None:
     return None if inner is None else inner.calibration.name
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of estimates that are beyond all measure
 def _sums(study: Study, name: str, dof: int) -> dict[str, Any]:
     """Sums over the runs that did not diverge, chunk by chunk."""
     threshold, total = lost_threshold(dof), {}
     for records in _chunks(study, name, RECORDS):
         healthy = _healthy(records)
         good = {key: value[healthy] for key, value in records.items()}
-        with np.errstate(invalid="ignore"):
-            kept = good["nees"] <= threshold
+        kept = good["nees"] <= threshold
         finite = good["landmark_count"] - good["landmark_not_finite"]
         part = {
             "diverged": np.sum(~healthy),

@@ -29,7 +29,9 @@ PROBABILITIES = (0.005, 0.05, 0.25, 0.5, 0.75, 0.95, 0.995)
 COORDINATES = ("x", "z")
 FARTHEST = 10.0
 """Times the true depth: a point beyond counts as that far in Wasserstein distances."""
-PARTICLES, LEAST_PARTICLES = 1_000_000, 1000
+PARTICLES, MOST = 10**8
+"""Particles that a machine holds."""
+LEAST_PARTICLES = 1_000_000, 1000
 MEASUREMENTS = 100
 AVERAGED_PARTICLES = 2**16
 """Particles for each measurement of an average, at most: its error is 0.001 in a KS distance,
@@ -123,6 +125,11 @@ def check_sizes(particles: int, measurements: int, seed: int) -> None:
     """Raise ValueError for sizes that make no sense."""
     if particles < LEAST_PARTICLES:
         raise ValueError(f"particles must be at least {LEAST_PARTICLES}, not {particles}")
+    for name, count in (("particles", particles), ("measurements", measurements)):
+        if count > MOST:
+            raise ValueError(f"{name} must be at most {MOST}, not {count}")
+    if seed >= 2**63:
+        raise ValueError(f"seed must be below 2⁶³, not {seed}")
     if measurements < 0 or measurements == 1:
         raise ValueError(
             f"measurements must be 0 (no average) or at least 2 (for its error), not {measurements}"

@@ -1,6 +1,7 @@
 """What a layout says of a video, and what layouts share: image files, lists of times, tables."""
 
 import math
+import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -68,7 +69,7 @@ def listed(listing: Path, folder: Path, names: list[str]) -> list[Path]:
     """Files in a folder whose names a list holds. Raises ValueError for one that is missing."""
     files = [folder / name for name in names]
     for name, file in zip(names, files, strict=True):
-        if not file.is_file():
+        if not os.path.isfile(file):  # which a name that no file can have is not either
             raise ValueError(f"{listing}: names {name}, but {file} is missing")
     return files
 
