@@ -29,9 +29,9 @@ PROBABILITIES = (0.005, 0.05, 0.25, 0.5, 0.75, 0.95, 0.995)
 COORDINATES = ("x", "z")
 FARTHEST = 10.0
 """Times the true depth: a point beyond counts as that far in Wasserstein distances."""
-PARTICLES, MOST = 10**8
+PARTICLES, LEAST_PARTICLES = 1_000_000, 1000
+MOST = 10**8
 """Particles that a machine holds."""
-LEAST_PARTICLES = 1_000_000, 1000
 MEASUREMENTS = 100
 AVERAGED_PARTICLES = 2**16
 """Particles for each measurement of an average, at most: its error is 0.001 in a KS distance,
