@@ -29,6 +29,8 @@ PROBABILITIES = (0.005, 0.05, 0.25, 0.5, 0.75, 0.95, 0.995)
 COORDINATES = ("x", "z")
 FARTHEST = 10.0
 """Times the true depth: a point beyond counts as that far in Wasserstein distances."""
+MOST = 10**8
+"""Particles that a machine holds."""
 PARTICLES, LEAST_PARTICLES = 1_000_000, 1000
 MOST = 10**8
 """Particles that a machine holds."""
