@@ -32,8 +32,6 @@ FARTHEST = 10.0
 MOST = 10**8
 """Particles that a machine holds."""
 PARTICLES, LEAST_PARTICLES = 1_000_000, 1000
-MOST = 10**8
-"""Particles that a machine holds."""
 MEASUREMENTS = 100
 AVERAGED_PARTICLES = 2**16
 """Particles for each measurement of an average, at most: its error is 0.001 in a KS distance,
