@@ -403,9 +403,7 @@ class Tracker:
         if self._unmeasured:
             # A camera that was lost searches ever wider, and something always looks alike.
             least = max(least, len(slots) // 2)
-        wide = len(owner) > len(np.unique(owner))
-        if wide:
-            least += MINIMAL
+        if len(owner) > len(np.unique(owner)):
             agreed = self._of_several(predicted, dt, slots, owner, pixels, least)
         else:
             believed = self._believed(predicted, dt, slots[owner], pixels)
@@ -423,13 +421,12 @@ class Tracker:
         pixels: np.ndarray,
         least: int,
     ) -> np.ndarray:
-        """Pixels that agree, of landmarks with several places each; `least` are enough.
+        """Pixels that agree, of landmarks with several places each, if they are `least` at least.
 
         Where ellipses are wide, depth and direction make of a prediction what is not linear: those
         that agree but for that, and with one motion, are what a linear test is given. One that puts
         out most of them is not believed: of a camera that sets out it says nothing.
         """
-        agreed = np.zeros((0, 2))
         for association in self._in_wide:
             believed = self._believed(predicted, dt, slots[owner], pixels, association)
             places = np.flatnonzero(believed)
@@ -437,11 +434,11 @@ class Tracker:
             tested = places[_one_of_each(owner[places], rigid | ~lately)]
             rigid = np.isin(tested, places[rigid])
             linear = self._believed(predicted, dt, slots[owner[tested]], pixels[tested])
-            best = tested[linear if 2 * (linear & rigid).sum() >= rigid.sum() else rigid]
-            agreed = _of_first(owner[best], pixels[best], len(slots))
-            if len(best) >= least:
-                break
-        return agreed
+            predictable = 2 * (linear & rigid).sum() >= rigid.sum()
+            best = tested[linear if predictable else rigid]
+            if len(best) >= least + (0 if predictable else MINIMAL):
+                return _of_first(owner[best], pixels[best], len(slots))
+        return np.full((len(slots), 2), np.nan)
 
     def _rigid(self, slots: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Which landmarks were seen when any was seen last, and which of these agree with one
