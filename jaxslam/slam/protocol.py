@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 from jaxtyping import Array, Bool, Float, Int
@@ -113,6 +113,10 @@ class AbstractFilter(eqx.Module):
 
 class AbstractStaged(AbstractFilter):
     """A filter whose frame can be taken in stages: all that a tracker asks for."""
+
+    sets_out_anywhere: ClassVar[bool] = False
+    """Whether measurements of a start that no linear prediction expects are welcome: the filter
+    finds by itself what explains them."""
 
     @abstractmethod
     def predict(self, state: Any, control: Any) -> Any:

@@ -42,6 +42,7 @@ def match_patches(
     threshold: float = 0.8,
     max_radius: float | None = None,
     ambiguity: float = 0.05,
+    several: bool = True,
 ) -> list[list[Match]]:
     """Active search: the places most like each template within the ellipse of its prediction.
 
@@ -52,8 +53,8 @@ def match_patches(
     best peak; none where it does not reach `threshold`, or where a second one comes within
     `ambiguity` of its score (0: never ambiguous). A wide ellipse is searched in the image of half
     the size, and around the highest peaks there again in the whole one; as the best of many peaks
-    often is another place, up to `PEAKS` are told, best first, for who knows what else was found
-    to choose from. None where the ellipse is outside the image.
+    often is another place, `several` are told, up to `PEAKS`, best first, for who knows what else
+    was found to choose from. None where the ellipse is outside the image.
     """
     matches: list[list[Match]] = [[] for _ in templates]
     if not matches:
@@ -68,7 +69,7 @@ def match_patches(
     peaks = _peaks(whole, templates, boxes, least)
     peaks = peaks.only(ellipses.hold(peaks.owner, peaks.pixels))
     peaks = peaks.only(np.lexsort((-peaks.scores, peaks.owner)))
-    in_wide = np.isin(peaks.owner, wide)
+    in_wide = several & np.isin(peaks.owner, wide)
     alone = _alone(peaks.only(~in_wide), threshold, ambiguity)
     chosen = alone.joined(_several(peaks.only(in_wide)))
     if len(chosen.owner):

@@ -163,6 +163,7 @@ class Tracker:
         self._origin = self._camera = Located()
         self._sigma_log_scale: float | None = None
         self._unmeasured = 0
+        self._sets_out = made.sets_out_anywhere
         with jax.enable_x64(True):
             self._slam: AbstractStaged = cast(made, jnp.float64)
             self._state = self._empty_state()
@@ -209,7 +210,7 @@ class Tracker:
         return [
             in_background(
                 lambda: _begin_map.compile(slam, state, new),
-                *(partial(believed, association) for association in (*self._in_wide, None)),
+                *(partial(believed, one) for one in (*self._in_wide, None)),
                 lambda: _renew_map.compile(slam, state, new),
                 self.camera,
             ),
@@ -425,13 +426,13 @@ class Tracker:
 
         Where ellipses are wide, depth and direction make of a prediction what is not linear: those
         that agree but for that, and with one motion, are what a linear test is given. One that puts
-        out most of them is not believed: of a camera that sets out it says nothing.
+        out most of them is not believed: the filter `sets_out_anywhere`.
         """
         for association in self._in_wide:
             believed = self._believed(predicted, dt, slots[owner], pixels, association)
             places = np.flatnonzero(believed)
             lately, rigid = self._rigid(slots[owner[places]], pixels[places])
-            tested = places[_one_of_each(owner[places], rigid | ~lately)]
+            tested = places[_alone(owner[places], rigid | ~lately)]
             rigid = np.isin(tested, places[rigid])
             linear = self._believed(predicted, dt, slots[owner[tested]], pixels[tested])
             predictable = 2 * (linear & rigid).sum() >= rigid.sum()
@@ -456,6 +457,8 @@ class Tracker:
     @property
     def _in_wide(self) -> dict[Association, None]:
         """The associations that are tried where ellipses are wide: the quick one first."""
+        if not self._sets_out:
+            return {}
         return dict.fromkeys((one_point_ransac, ASSOCIATIONS[self.settings.association]))
 
     def _believed(
@@ -543,9 +546,10 @@ class Tracker:
                 for slot, affine in zip(slots, affines, strict=True)
             ]
         )
-        return match_patches(
-            frame.image, templates, prediction.pixels[slots], prediction.covariances[slots]
-        )
+        pixels, covariances = prediction.pixels[slots], prediction.covariances[slots]
+        # One linear update from matches that no linear prediction expects would be wrong, and sure.
+        several = self._sets_out
+        return match_patches(frame.image, templates, pixels, covariances, several=several)
 
     def _remove(self, slots: list[int]) -> None:
         if slots:
@@ -639,10 +643,11 @@ def _more_than_chance(searched: int) -> int:
     return max(LEAST_MATCHES, int(binom.isf(BY_CHANCE, searched, CHANCE)) + 1)
 
 
-def _one_of_each(owner: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """The first of each owner among these."""
+def _alone(owner: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """Those among these whose owner has no other one there."""
     some = np.flatnonzero(among)
-    return some[np.unique(owner[some], return_index=True)[1]]
+    _, of, count = np.unique(owner[some], return_inverse=True, return_counts=True)
+    return some[count[of] == 1]
 
 
 def _of_first(owner: np.ndarray, pixels: np.ndarray, count: int) -> Float[np.ndarray, "count 2"]:

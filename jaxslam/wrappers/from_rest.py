@@ -10,7 +10,7 @@ evidence. When the translation is known to a fraction of itself, the sum goes on
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -66,6 +66,8 @@ class RestState(eqx.Module):
 
 class FromRest(AbstractStaged):
     """The start of `base`."""
+
+    sets_out_anywhere: ClassVar[bool] = True
 
     base: Mixture
     sizes: tuple[int, ...] = eqx.field(static=True)

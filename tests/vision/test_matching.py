@@ -267,6 +267,8 @@ def test_of_a_texture_that_is_there_twice_in_a_wide_ellipse_both_places_are_told
     assert scores == sorted(scores, reverse=True)
     for there in (place, place + shift):
         assert min(np.linalg.norm(match.pixel - there) for match in places[:2]) < 0.1
+    assert match_patch(image, template, centre, WIDE, several=False) is None
+    assert match_patch(image, template, centre, WIDE, several=False, ambiguity=0.0) is not None
     assert match_patch(image, template, place - np.array(shift) / 4, WIDE / 4) is not None
 
 
