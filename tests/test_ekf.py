@@ -21,6 +21,7 @@ from cases import (
 )
 
 from jaxslam.arrays import cast
+from jaxslam.forms import blocks
 from jaxslam.forms.blocks import Blocks, observed, placed
 from jaxslam.forms.covariance import Covariance
 from jaxslam.forms.state import Features, State, Status
@@ -712,7 +713,9 @@ def test_covariance_stays_symmetric_and_positive_over_a_long_run(kind, dtype):
     assert least.min() >= -P.shape[1] * unit
 
 
-def test_products_with_blocks_leave_out_only_zeros():
+@pytest.mark.parametrize("dense", [0, 1000])
+def test_products_with_blocks_leave_out_only_zeros(dense, monkeypatch):
+    monkeypatch.setattr(blocks, "DENSE", dense)
     rng = np.random.default_rng(0)
     m, k, v, c, d, capacity = 3, 2, 4, 5, 3, 6
     J = Blocks(*(jnp.asarray(rng.normal(size=s)) for s in ((v, c), (m, k, v), (m, k, d))))

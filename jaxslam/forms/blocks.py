@@ -25,6 +25,9 @@ from jaxslam.linalg import cholesky
 
 Landmark = Callable[[Any, Array], Array]
 
+DENSE = 200
+"""Numbers up to which a product with all of J's zeros is faster than gathering what is not zero."""
+
 
 class Blocks(NamedTuple):
     """Jacobian of k numbers for each of m landmarks; row block j touches the core and slot j.
@@ -209,8 +212,10 @@ def placed(J: Blocks, slots: Int[Array, " m"], capacity: int) -> Float[Array, "m
 
 
 def observed(J: Blocks, slots: Int[Array, " m"], B: Float[Array, "n r"]) -> Float[Array, "mk r"]:
-    """`J B` of blocks in these slots, without the zeros."""
+    """`J B` of blocks in these slots, of more than `DENSE` numbers without the zeros."""
     c, d = J.view_by_core.shape[1], J.by_landmark.shape[-1]
+    if len(B) <= DENSE:
+        return placed(J, slots, (len(B) - c) // d) @ B
     own = B[c:].reshape(-1, d, B.shape[1])[slots]
     by_view = J.by_view.reshape(-1, J.by_view.shape[-1]) @ (J.view_by_core @ B[:c])
     return by_view + small_products(J.by_landmark, own).reshape(by_view.shape)
