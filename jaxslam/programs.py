@@ -17,6 +17,7 @@ import pickle
 import platform
 import secrets
 import threading
+import weakref
 from collections.abc import Callable
 from concurrent.futures import Future
 from functools import cache
@@ -47,6 +48,16 @@ def keep_in(folder: Path | None) -> None:
     _kept_in = folder
 
 
+_all: weakref.WeakSet[Program] = weakref.WeakSet()
+
+
+def forget() -> None:
+    """Free all programs that were made, as `jax.clear_caches` does JAX's: each holds some of the
+    memory maps of which a process may have only so many."""
+    for program in _all:
+        program._made.clear()
+
+
 class Program:
     """A pure function of pytrees, compiled once for each structure of its arguments.
 
@@ -58,6 +69,7 @@ class Program:
         self.function = function
         self._made: dict[Any, Future[_Made]] = {}
         self._lock = threading.Lock()
+        _all.add(self)
 
     def __call__(self, *args: Any) -> Any:
         call = _Call.of(args)

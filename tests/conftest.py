@@ -9,6 +9,7 @@ import jax
 import jaxtyping
 import pytest
 
+from jaxslam import programs
 from jaxslam.consistency import montecarlo
 
 
@@ -52,4 +53,5 @@ def _compiled_programs_are_freed():
     """A process may hold only so many memory maps, and every compiled program takes some."""
     yield
     montecarlo._compiled.cache_clear()
+    programs.forget()
     jax.clear_caches()

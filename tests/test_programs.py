@@ -10,7 +10,7 @@ import pytest
 
 from jaxslam import programs
 from jaxslam.models.depth import InverseDepth
-from jaxslam.programs import Program, in_background, keep_in, wide
+from jaxslam.programs import Program, forget, in_background, keep_in, wide
 
 traced = []
 
@@ -197,3 +197,12 @@ def test_options_that_the_compiler_does_not_know_are_done_without(monkeypatch):
 
 def test_the_compiler_knows_the_options():
     jax.jit(jnp.sin).lower(0.0).compile(compiler_options=programs.OPTIONS["cpu"])
+
+
+def test_what_is_forgotten_is_made_again():
+    program = Program(lambda x: 2 * x)
+    program(jnp.ones(2))
+    assert program._made
+    forget()
+    assert not program._made
+    assert program(jnp.ones(2)).tolist() == [2.0, 2.0]
