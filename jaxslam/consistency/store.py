@@ -89,14 +89,10 @@ _DAMAGED = "it is damaged; remove it, and run again with --resume"
 
 
 def _check_records(path: Path, runs: int, records: Records) -> None:
-    """Raise ValueError unless all that is not of one sample is of so many runs and equal steps."""
-    shapes = {n: x.shape[:2] for n, x in records.items() if not n.startswith("sample_")}
+    """Raise ValueError unless all are numbers, and what is not of one sample is of so many runs."""
+    of_runs = (x for name, x in records.items() if not name.startswith("sample_"))
     numbers = all(x.dtype.kind in "fiub" for x in records.values())
-    if (
-        not numbers
-        or len(set(shapes.values())) > 1
-        or any(s[:1] != (runs,) for s in shapes.values())
-    ):
+    if not numbers or any(x.shape[:1] != (runs,) for x in of_runs):
         raise ValueError(f"{path} holds other records than those of {runs} runs: {_DAMAGED}")
 
 
