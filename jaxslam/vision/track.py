@@ -8,13 +8,14 @@ import json
 import math
 import time
 from collections.abc import Callable, Generator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
+from scipy.stats import chi2
 
 from jaxslam import __version__
 from jaxslam.files import write_atomically
@@ -31,6 +32,7 @@ from jaxslam.vision.tracker import Points, Tracked, Tracker
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
     alignment,
+    relative_pose_error,
     write_covariances,
     write_trajectory,
 )
@@ -354,6 +356,7 @@ def _summary(
         },
         "matches_per_frame": sum(result.nis_dof for result in updates) / 2 / count,
         "nis": {"mean": sum(result.nis for result in updates) / count, "dof": dof / count},
+        "nis_ungated": _ungated(updates),
         "seconds": {
             "total": sum(seconds),
             "start": sum(seconds[:WARM_UP]),
@@ -366,6 +369,19 @@ def _summary(
     if tracker.restarts:
         summary["log_scale_sigma_between_maps"] = _scale_between_maps(tracker.settings)
     return summary | _errors(source, history)
+
+
+def _ungated(updates: list[Tracked]) -> dict[str, Any]:
+    """What the predictions are worth: squared innovations of all that was found, wrong matches and
+    all, by the median of χ² of 2 degrees of freedom, and the share beyond its 95 %."""
+    squared = np.concatenate([np.zeros(0), *(result.innovations for result in updates)])
+    if not len(squared):
+        return {"matches": 0, "median": None, "beyond95": None}
+    return {
+        "matches": len(squared),
+        "median": float(np.median(squared) / chi2.median(2)),
+        "beyond95": float(np.mean(squared > chi2.ppf(0.95, 2))),
+    }
 
 
 def _trajectory(history: list[Tracked]) -> Trajectory:
@@ -390,8 +406,11 @@ def _errors(source: Source, history: list[Tracked]) -> dict[str, Any]:
     """The trajectory error, where there is a reference, or why it cannot be told."""
     if source.reference is None:
         return {}
+    trajectories = *_trajectory(history), *source.reference
     try:
-        error = absolute_trajectory_error(*_trajectory(history), *source.reference)
-        return {"ate": error}
+        errors: dict[str, Any] = {"ate": absolute_trajectory_error(*trajectories)}
     except ValueError as error:  # of few frames, or of a camera that stood still
         return {"no_ate": str(error)}
+    with suppress(ValueError):  # of less than a second
+        errors["rpe"] = relative_pose_error(*trajectories)
+    return errors

@@ -100,6 +100,16 @@ class Tracked:
         return self.camera.covariance
 
     @property
+    def innovations(self) -> Float[np.ndarray, " f"]:
+        """Squared innovations `νᵀ S⁻¹ ν` of the f landmarks that were found, before any was tested
+        for agreement: of two degrees of freedom each where the prediction is right."""
+        found = np.isfinite(self.matched[:, 0])
+        off = (self.matched - self.predicted)[found]
+        return np.einsum(
+            "ki,ki->k", off, np.linalg.solve(self.search[found], off[..., None])[..., 0]
+        )
+
+    @property
     def state(self) -> str:
         """`start` of a map, `lost` or `tracked`."""
         return "start" if self.starts else "lost" if self.lost else "tracked"

@@ -35,6 +35,15 @@ class TrajectoryError(TypedDict):
     straight_line: float
 
 
+class RelativeError(TypedDict):
+    """What `relative_pose_error` returns."""
+
+    seconds: float
+    translation: float
+    rotation: float
+    way: float
+
+
 def write_trajectory(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> None:
     """Write times (n,) in seconds and poses (n, 4, 4) in TUM format, whole or not at all."""
     write_tum(path, times, T_wc, _UNITS)
@@ -124,6 +133,40 @@ def absolute_trajectory_error(
         "orientation_rmse": angle,
         "straight_line": _straight_line(paired_reference.timestamps, true[:, :3, 3]),
     }
+
+
+def relative_pose_error(
+    estimate_times: ArrayLike,
+    estimate: ArrayLike,
+    reference_times: ArrayLike,
+    reference: ArrayLike,
+    seconds: float = 1.0,
+) -> RelativeError:
+    """The relative pose error over `seconds`, by `evo`: how far a motion of that long is off.
+
+    RMS over all pairs of poses so far apart: of the `translation`, in the reference's unit, and of
+    the `rotation`, in degrees; `way` is the reference's own displacement, RMS. Of the alignment
+    only its scale matters. Arguments are those of
+    `absolute_trajectory_error`, and so is what is raised; also for a trajectory that is shorter.
+    """
+    from evo.core import metrics
+
+    paired, paired_reference = _paired(estimate_times, estimate, reference_times, reference)
+    _align(paired, paired_reference)
+    apart = max(1, round(seconds / float(np.median(np.diff(paired_reference.timestamps)))))
+    if apart >= paired.num_poses:
+        raise ValueError(f"no two poses of the trajectory are {seconds:g} s apart")
+
+    def rms(relation: Any) -> float:
+        error = metrics.RPE(relation, apart, metrics.Unit.frames, all_pairs=True)
+        error.process_data((paired_reference, paired))
+        return float(error.get_statistic(metrics.StatisticsType.rmse))
+
+    translation = rms(metrics.PoseRelation.translation_part)
+    rotation = rms(metrics.PoseRelation.rotation_angle_deg)
+    ways = paired_reference.positions_xyz[apart:] - paired_reference.positions_xyz[:-apart]
+    way = float(np.sqrt(np.mean(np.sum(ways**2, axis=1))))
+    return {"seconds": seconds, "translation": translation, "rotation": rotation, "way": way}
 
 
 def alignment(

@@ -22,11 +22,11 @@ from jaxslam.slam.readouts import landmarks_in_camera
 from jaxslam.tum import read_tum
 from jaxslam.video.opening import open_source
 from jaxslam.vision import tracker as programs
-from jaxslam.vision.located import adjoint
+from jaxslam.vision.located import Located, adjoint
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.synthetic import synthetic_source
 from jaxslam.vision.track import describe, track
-from jaxslam.vision.tracker import LEAST_MATCHES, Tracker
+from jaxslam.vision.tracker import LEAST_MATCHES, Tracked, Tracker
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
     pose_nees,
@@ -117,6 +117,22 @@ def test_the_files_hold_every_frame_and_agree_with_the_summary(tracked):
         "trajectory.txt", "covariance.txt", "frames.csv", "map.ply", "map.png", "overlay.mp4",
         "summary.json",
     }  # fmt: skip
+
+
+def test_innovations_are_of_all_that_was_found_believed_or_not(tracked):
+    one = Tracked(
+        0, 0.0, Located(),
+        predicted=np.array([[10.0, 20.0], [5.0, 5.0], [0.0, 0.0]]),
+        search=np.stack([np.diag([4.0, 1.0]), np.eye(2), np.array([[2.0, 1.0], [1.0, 2.0]])]),
+        matched=np.array([[12.0, 21.0], [np.nan, np.nan], [1.0, 1.0]]),
+        status=["matched", "unmatched", "outlier"],
+    )  # fmt: skip
+    np.testing.assert_allclose(one.innovations, [2, 2 / 3], rtol=1e-12)
+    ungated = tracked[2]["nis_ungated"]
+    assert ungated["matches"] >= tracked[2]["matches_per_frame"] * (FRAMES - 1)
+    # The settings' accelerations are larger than this camera's, its pixels as good as they say.
+    assert 0 < ungated["median"] < 1.2
+    assert 0 <= ungated["beyond95"] < 0.1
 
 
 def test_frames_csv_says_what_became_of_every_frame(tracked):

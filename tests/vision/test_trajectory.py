@@ -13,6 +13,7 @@ from jaxslam.vision.trajectory import (
     alignment,
     nees_beyond_scale,
     pose_nees,
+    relative_pose_error,
     write_covariances,
 )
 
@@ -174,6 +175,28 @@ def test_orientation_error_is_the_angle_that_one_rotation_leaves():
     turned[::2, :3, :3], turned[1::2, :3, :3] = turn, turn.T
     result = absolute_trajectory_error(times, turned, times, same)
     assert result["orientation_rmse"] == pytest.approx(5, abs=1e-6)
+
+
+def test_relative_error_is_that_of_a_second_in_the_references_unit():
+    """A gyro's bias and a scale: what they do in a second, wherever the trajectory begins."""
+    times, reference = wave(400)
+    estimate = similar(reference, 0.2, [0.3, -0.5, 1.0], [1.0, 2.0, 3.0])
+    assert relative_pose_error(times, estimate, times, reference)["translation"] < 1e-9
+    apart = round(0.5 / np.median(np.diff(times)))
+    drift = Rotation.from_rotvec(np.outer(times, np.radians([0, 0, 2.0]))).as_matrix()
+    estimate[:, :3, :3] = drift @ reference[:, :3, :3]
+    estimate[:, :3, 3] = reference[:, :3, 3]
+    result = relative_pose_error(times, estimate, times, reference, seconds=0.5)
+    lasts = times[apart] - times[0]
+    assert result["rotation"] == pytest.approx(2.0 * lasts, rel=1e-6)
+    moved = np.linalg.norm(reference[apart:, :3, 3] - reference[:-apart, :3, 3], axis=1)
+    assert result["way"] == pytest.approx(np.sqrt(np.mean(moved**2)))
+    estimate = reference.copy()
+    estimate[::2, 0, 3] += 0.01  # half of them, against the other half
+    error = relative_pose_error(times, estimate, times, reference, seconds=np.diff(times)[0])
+    assert error["translation"] == pytest.approx(0.01, rel=1e-3)
+    with pytest.raises(ValueError, match="no two poses"):
+        relative_pose_error(times, estimate, times, reference, seconds=1e4)
 
 
 def test_straight_line_is_the_error_of_one_at_constant_speed():
