@@ -1,23 +1,29 @@
 """The tracker from many starts of a sequence: how often it is lost, reversed, or believes a lie.
 
+    python benchmarks/starts.py
     python benchmarks/starts.py ../shared/data/kitti06_first51 --starts 8 --frames 40
 
 Starts are spread evenly; each is a tracker of its own, with the settings of `jaxslam track`. A
 *lie* is a frame whose NEES beyond scale is that of an error of 5 σ, of those that are looked at;
 the reference counts as known to 0.3 % of the farthest distance from the start and to 0.06°. Whether
-it is, `benchmarks/reference.py` says.
+it is, `benchmarks/reference.py` says. Results are added to `starts.json`, and their table to
+`docs/stress.md`.
 """
 
 from __future__ import annotations
 
+import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import tyro
+from pages import with_table
 from scipy.stats import chi2, norm
 
+from jaxslam.files import write_atomically
 from jaxslam.video.opening import open_source
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.tracker import Tracker
@@ -31,18 +37,25 @@ EVERY = 10
 """Frames from one that is looked at to the next."""
 
 
+MARK = "<!-- by starts.py -->"
+
+
 @dataclass(frozen=True)
 class Options:
     """What to measure."""
 
-    sequence: Annotated[Path, tyro.conf.Positional]
-    """Data set folder with a reference."""
+    sequences: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Data set folders with a reference; by default all there are in $JAXSLAM_DATA."""
     starts: int = 20
     """Starts."""
     frames: int = 100
-    """Frames that are tracked from each."""
+    """Frames that are tracked from each; of a video that is not much longer, half of it."""
     filter: str = "recommended"
     """Filter."""
+    out: Path = Path("benchmarks/results/starts.json")
+    """The results, added to."""
+    page: Path = Path("docs/stress.md")
+    """The page."""
 
 
 class Outcome(NamedTuple):
@@ -90,25 +103,56 @@ def outcome(source, frames, settings: TrackerSettings) -> Outcome:
     )
 
 
-def main() -> None:
-    """Print a line for each start, and one for all."""
-    options = tyro.cli(Options, description=__doc__)
-    source = open_source(options.sequence)
+def starts(sequence: Path, options: Options) -> dict[str, Any]:
+    """Outcomes from all starts of one sequence, printed as they come."""
+    source = open_source(sequence)
     if source.reference is None:
-        raise SystemExit(f"{options.sequence}: there is no reference")
-    frames, settings = list(source), TrackerSettings(filter=options.filter)
-    last = max(0, len(frames) - options.frames)
-    begins = np.unique(np.linspace(0, last, options.starts).astype(int))
-    print("start  tracked  maps   sign  error, %  beyond scale  lies")
+        raise SystemExit(f"{sequence}: there is no reference")
+    images, settings = list(source), TrackerSettings(filter=options.filter)
+    frames = min(options.frames, len(images) // 2)
+    begins = np.unique(np.linspace(0, len(images) - frames, options.starts).astype(int))
+    print(f"{source.name}\nstart  tracked  maps   sign  error, %  beyond scale  lies")
     line = "{:>5}  {:7.2f}  {:4.1f}  {:5.2f}  {:8.2f}  {:12.2f}  {:4.2f}".format
-    outcomes = []
-    for begin in begins:
-        outcomes.append(outcome(source, frames[begin : begin + options.frames], settings))
-        print(line(begin, *outcomes[-1]), flush=True)
-    tracked, maps, sign, error, beyond, lies = np.array(outcomes).T
-    means = np.nanmean(maps), np.nanmin(sign), np.nanmedian(error), np.nanmedian(beyond)
-    print(line("all", tracked.mean(), *means, np.nanmean(lies)), "(mean, least sign, medians)")
-    print(f"reversed: {np.sum(sign < 0)} of {len(outcomes)}")
+    found = {}
+    for begin in begins.tolist():
+        one = outcome(source, images[begin : begin + frames], settings)
+        print(line(begin, *one), flush=True)
+        found[str(begin)] = [None if np.isnan(x) else round(float(x), 4) for x in one]
+    return {"filter": settings.filter, "frames": frames, "starts": found}
+
+
+def table(results: dict[str, dict[str, Any]]) -> str:
+    """Of all sequences, as Markdown."""
+    head = (
+        "| sequence | starts of frames | tracked | maps | reversed | error, median, worst "
+        "| beyond scale | lies |"
+    )
+    return "\n".join([head, "|---" * 8 + "|", *(_row(n, r) for n, r in results.items())])
+
+
+def _row(name: str, result: dict[str, Any]) -> str:
+    of_start = np.array(list(result["starts"].values()), float)
+    tracked, maps, sign, error, beyond, lies = of_start.T
+    return (
+        f"| {name} | {len(of_start)} of {result['frames']} | {tracked.mean():.1%} "
+        f"| {maps.mean():.2g} | {np.sum(sign < 0)} | {np.nanmedian(error):.2f} %, "
+        f"{np.nanmax(error):.1f} % | {np.nanmedian(beyond):.2g} | {np.nanmean(lies):.1%} |"
+    )
+
+
+def main() -> None:
+    """Print a line for each start, and write the results."""
+    options = tyro.cli(Options, description=__doc__)
+    data = Path(os.environ.get("JAXSLAM_DATA", "../shared/data"))
+    results = json.loads(options.out.read_text()) if options.out.exists() else {}
+    for sequence in options.sequences or sorted(path.parent for path in data.glob("*/images")):
+        results[sequence.name] = starts(sequence, options)
+        with write_atomically(options.out) as path:
+            path.write_text(json.dumps(results, indent=1) + "\n")
+    print(table(results))
+    text = with_table(options.page.read_text(), MARK, table(results))
+    with write_atomically(options.page) as path:
+        path.write_text(text)
 
 
 if __name__ == "__main__":

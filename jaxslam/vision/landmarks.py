@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from jaxslam.vision.patches import STORED, Patch
 
-_COUNTS = ("number", "missed", "unseen")
+_COUNTS = ("number", "missed", "unseen", "found")
 
 
 @dataclass
@@ -30,6 +30,8 @@ class Landmark:
     """Searches in a row, up to now, that did not find it."""
     unseen: int = 0
     """Frames since it was found."""
+    found: int = 0
+    """Searches that found it."""
 
     def searched(self, found: bool, pixel: np.ndarray, patience: float) -> None:
         """Count one search, that found it at this pixel or not; `success` is an average over about
@@ -38,6 +40,7 @@ class Landmark:
         self.missed = 0 if found else self.missed + 1
         if found:
             self.unseen, self.seen_at = 0, pixel
+            self.found += 1
 
 
 class Points(NamedTuple):
@@ -104,6 +107,7 @@ def _restored(
     pixel: Float[np.ndarray, " 2"],
     stored: np.ndarray,
 ) -> Landmark:
-    number, missed, unseen = counts.tolist()
-    patch = Patch(pixel, stored)
-    return Landmark(number, patch, first_camera, seen_at, float(success), missed, unseen)
+    patch, named = Patch(pixel, stored), dict(zip(_COUNTS, counts.tolist(), strict=True))
+    return Landmark(
+        patch=patch, first_camera=first_camera, seen_at=seen_at, success=float(success), **named
+    )

@@ -53,10 +53,18 @@ BY_CHANCE = 1e-3
 ASTRAY = np.radians(10.0)
 """σ of the directions in which landmarks are expected from which on none is believed: one linear
 update from there would be wrong, and sure."""
+PROVEN = 10
+"""A landmark that was found so often is where the map says: one that is then found elsewhere
+contradicts it …"""
+CONTRADICTED = 0.2
+"""… and no frame is believed while more than this share of them do, of at least `PROVEN`, in one
+direction: half of the picture may be a lorry's, or the map is wrong. Chance matches have none."""
+_LATELY = 3
+"""Frames over which that share is an average."""
 
 _NUMBERS = (
     "created", "deleted", "restarts", "reversed", "steps", "_time", "_unmeasured",
-    "_sigma_log_scale",
+    "_sigma_log_scale", "_proven", "_elsewhere",
 )  # fmt: skip
 """What a tracker counts and measures, one number each."""
 
@@ -173,6 +181,7 @@ class Tracker:
         self._origin = self._camera = Located()
         self._sigma_log_scale: float | None = None
         self._unmeasured = 0
+        self._proven = self._elsewhere = 0.0
         self._sets_out = made.sets_out_anywhere
         with jax.enable_x64(True):
             self._slam: AbstractStaged = cast(made, jnp.float64)
@@ -360,6 +369,8 @@ class Tracker:
             agreed = matched = np.full((len(slots), 2), np.nan)
         else:
             agreed, matched = self._agreed(predicted, dt, slots, found)
+            if self._contradicted(slots, matched - prediction.pixels[slots], agreed):
+                agreed = np.full_like(agreed, np.nan)
         features = _padded(slots, agreed, self.settings.wanted)
         state, result = _correct(self._slam, predicted[0], dt, features)
         used, nis, nis_dof, status = jax.device_get(result)
@@ -422,6 +433,22 @@ class Tracker:
         if np.isfinite(agreed[:, 0]).sum() < least:
             agreed[:] = np.nan
         return agreed, np.where(np.isfinite(agreed), agreed, matched)
+
+    def _contradicted(
+        self, slots: np.ndarray, moved: Float[np.ndarray, "k 2"], agreed: Float[np.ndarray, "k 2"]
+    ) -> bool:
+        """Whether too many proven landmarks are found elsewhere than those that agree; `moved` is
+        where all were found from where they were expected, NaN of those that were not."""
+        agree = np.isfinite(agreed[:, 0])
+        if agree.any():
+            proven = np.array([self.landmarks[slot].found >= PROVEN for slot in slots], bool)
+            proven &= np.isfinite(moved[:, 0])
+            aside = moved[proven & ~agree] - np.median(moved[agree], axis=0)
+            directions = aside / np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-9)
+            self._proven += (proven.sum() - self._proven) / _LATELY
+            alike = float(np.linalg.norm(directions.sum(axis=0)))
+            self._elsewhere += (alike - self._elsewhere) / _LATELY
+        return bool(self._elsewhere > CONTRADICTED * max(self._proven, PROVEN))
 
     def _of_several(
         self,
@@ -603,6 +630,7 @@ class Tracker:
     def _begun(self, frame: Frame, corners: np.ndarray) -> np.ndarray:
         """Landmarks at the corners, in a state that has none; the corners. Frame 0 of a map."""
         self._unmeasured = 0
+        self._proven = self._elsewhere = 0.0
         return self._created(_begin_map, frame, corners)
 
     def _renewed(self, frame: Frame, corners: np.ndarray) -> np.ndarray:

@@ -22,11 +22,13 @@ from jaxslam.slam.readouts import landmarks_in_camera
 from jaxslam.tum import read_tum
 from jaxslam.video.opening import open_source
 from jaxslam.vision import tracker as programs
+from jaxslam.vision.landmarks import Landmark
 from jaxslam.vision.located import Located, adjoint
+from jaxslam.vision.patches import STORED, Patch
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.synthetic import synthetic_source
 from jaxslam.vision.track import describe, track
-from jaxslam.vision.tracker import LEAST_MATCHES, Tracked, Tracker
+from jaxslam.vision.tracker import LEAST_MATCHES, PROVEN, Tracked, Tracker
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
     pose_nees,
@@ -117,6 +119,53 @@ def test_the_files_hold_every_frame_and_agree_with_the_summary(tracked):
         "trajectory.txt", "covariance.txt", "frames.csv", "map.ply", "map.png", "overlay.mp4",
         "summary.json",
     }  # fmt: skip
+
+
+def test_half_a_picture_that_moves_otherwise_is_not_believed_for_long():
+    """Its corners become landmarks; then those that were there before are found elsewhere."""
+    source, states = synthetic_source(frames=80, seed=4), []
+    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=50))
+    pan = np.cumsum(np.random.default_rng(4).normal(1.5, 1, 120))
+    still = next(iter(source)).image
+    for frame in source:
+        image = frame.image.copy()
+        if frame.index >= 60:
+            image[:, :320] = np.roll(still, int(pan[frame.index] - pan[60]), axis=1)[:, :320]
+        states.append(tracker.track(replace(frame, image=image)).state)
+    assert states[:65] == ["start"] + ["tracked"] * 64
+    # Lost at 70; without the test all are tracked, and 20 sigma off.
+    assert states[74:] == ["lost"] * 6
+
+
+def test_only_what_is_proven_and_moves_alike_contradicts_the_map():
+    tracker = Tracker(
+        synthetic_source(frames=1).calibration, TrackerSettings(filter="world", wanted=40)
+    )
+    rng, slots = np.random.default_rng(0), np.arange(40)
+    patch = Patch(np.zeros(2), np.zeros((STORED, STORED), np.float32))
+    moved = np.tile([3.0, -1.0], (40, 1))
+    agreed = moved.copy()
+    agreed[20:] = np.nan
+
+    def contradicted(aside, found):
+        tracker._proven = tracker._elsewhere = 0.0
+        one = {k: Landmark(k, patch, np.eye(4), np.zeros(2), found=found) for k in range(40)}
+        tracker.landmarks = one
+        answers = []
+        for one in aside:
+            now = moved.copy()
+            now[20:] += one
+            answers.append(tracker._contradicted(slots, now, agreed))
+        return answers
+
+    alike = np.tile([5.0, 2.0], (20, 20, 1))
+    assert all(contradicted(alike, found=PROVEN))  # 20 of 40
+    assert not any(contradicted(alike, found=PROVEN - 1))
+    # The sum of 20 directions at random is 4.5 long, RMS; the average of three, of 40, is rarely 8.
+    assert sum(contradicted(rng.normal(0, 5, (300, 20, 2)), PROVEN)[3:]) <= 3
+    # Where the whole frame is not believed, nothing is learnt from it.
+    agreed[:] = np.nan
+    assert not any(contradicted(alike, found=PROVEN))
 
 
 def test_innovations_are_of_all_that_was_found_believed_or_not(tracked):

@@ -1,0 +1,275 @@
+"""The tracker where a camera sees what it should not: is a lie believed, and what comes after?
+
+    python benchmarks/disturbances.py
+    python benchmarks/disturbances.py --only black cut --seeds 3
+
+Synthetic videos whose truth is known exactly, with the settings of `jaxslam track`. A *lie* is a
+frame that is said to be tracked, in the first map, and of which the NEES beyond scale is that of an
+error of 5 σ; after a cut, any frame that is: the camera is elsewhere. Results are added to
+`disturbances.json`, and their table to `docs/stress.md`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import tyro
+from pages import with_table
+from starts import LIE
+
+from jaxslam.files import write_atomically
+from jaxslam.video.source import Frame, Source
+from jaxslam.vision.settings import TrackerSettings
+from jaxslam.vision.synthetic import add_noise, handheld_trajectory, render, room, synthetic_source
+from jaxslam.vision.tracker import Tracker
+from jaxslam.vision.trajectory import nees_beyond_scale
+
+RATE = 30
+MARK = "<!-- by disturbances.py -->"
+FIRST_SEED = 150
+"""Of the videos; nothing was tried on these."""
+
+
+class Disturbed(NamedTuple):
+    """A video of which the frames `during` are not as they should be."""
+
+    frames: Iterator[Frame]
+    T_wc: np.ndarray
+    """Where the camera is; NaN where it is in another world."""
+    during: range
+    wrong: float = 0.0
+    """Share of the matches of which the place is any other in the ellipse."""
+
+
+class Confused(Tracker):
+    """A tracker whose search errs."""
+
+    def confuse(self, during: range, share: float, seed: int) -> None:
+        """From now on, in these frames, as often as that."""
+        self._during, self._share, self._rng = during, share, np.random.default_rng(seed)
+
+    def _search(self, frame, prediction, slots, affines):
+        found = super()._search(frame, prediction, slots, affines)
+        if frame.index not in self._during:
+            return found
+        wrong = self._rng.random(len(found)) < self._share
+        return [
+            [self._elsewhere_of(m, prediction, slot) for m in places] if w else places
+            for places, w, slot in zip(found, wrong, slots, strict=True)
+        ]
+
+    def _elsewhere_of(self, match, prediction, slot):
+        angle, radius = self._rng.uniform(0, 2 * np.pi), 3 * np.sqrt(self._rng.random())
+        aside = radius * np.array([np.cos(angle), np.sin(angle)])
+        root = np.linalg.cholesky(prediction.covariances[slot])
+        return replace(match, pixel=prediction.pixels[slot] + root @ aside)
+
+
+def black(seed: int) -> Disturbed:
+    """5 s without light."""
+    source, during = _source(330, seed), range(60, 60 + 5 * RATE)
+    return Disturbed(
+        _changed(source, during, lambda frame: np.zeros_like(frame.image)), *_of(source, during)
+    )
+
+
+def cut(seed: int) -> Disturbed:
+    """From here on another room."""
+    source, other, during = _source(180, seed), list(_source(180, seed + 1000)), range(80, 180)
+    T_wc = _of(source, during)[0].copy()
+    T_wc[during.start :] = np.nan
+    return Disturbed(_changed(source, during, lambda f: other[f.index].image), T_wc, during)
+
+
+def hand(seed: int) -> Disturbed:
+    """A hand, blurred, goes across in front of the lens."""
+    source, during = _source(180, seed), range(60, 100)
+    noise = np.random.default_rng(seed).integers(60, 120, (480, 400), dtype=np.uint8)
+    skin = cv2.GaussianBlur(noise, (0, 0), 3)
+
+    def covered(frame: Frame) -> np.ndarray:
+        image, left = frame.image.copy(), 20 * (frame.index - during.start) - 200
+        there = image[:, max(0, left) : left + 400]
+        there[:] = skin[:, : there.shape[1]]
+        return image
+
+    return Disturbed(_changed(source, during, covered), *_of(source, during))
+
+
+def ghost(seed: int) -> Disturbed:
+    """A reflection: every picture has itself over it, 37 pixels aside."""
+    source, during = _source(180, seed), range(60, 180)
+
+    def doubled(frame: Frame) -> np.ndarray:
+        return cv2.addWeighted(frame.image, 0.5, np.roll(frame.image, 37, axis=1), 0.5, 0)
+
+    return Disturbed(_changed(source, during, doubled), *_of(source, during))
+
+
+def half_wrong(seed: int) -> Disturbed:
+    """Half of the picture moves otherwise, all of it alike: a lorry, a door."""
+    source, during = _source(180, seed), range(60, 180)
+    pan = np.cumsum(np.random.default_rng(seed).normal(0, 1, 400)) + 1.5 * np.arange(400)
+    still = next(iter(source)).image
+
+    def partly(frame: Frame) -> np.ndarray:
+        image = frame.image.copy()
+        aside = int(pan[frame.index] - pan[during.start])
+        image[:, :320] = np.roll(still, aside, axis=1)[:, :320]
+        return image
+
+    return Disturbed(_changed(source, during, partly), *_of(source, during))
+
+
+def scattered(seed: int) -> Disturbed:
+    """Half of all matches are wrong, each in its own way: a repeated texture, leaves."""
+    source, during = _source(180, seed), range(60, 180)
+    return Disturbed(iter(source), *_of(source, during), wrong=0.5)
+
+
+def rotation(seed: int) -> Disturbed:
+    """A camera that only turns; it sets out after 4 s."""
+    during = range(1, 4 * RATE)
+    T_wc = handheld_trajectory(np.arange(240) / RATE, seed)
+    T_wc[during.stop :, :3, 3] -= T_wc[during.stop - 1, :3, 3]
+    T_wc[: during.stop, :3, 3] = 0
+    return Disturbed(_rendered(T_wc, seed), T_wc, during)
+
+
+def standing(seed: int) -> Disturbed:
+    """60 s on a tripod, and then by hand."""
+    during = range(1, 60 * RATE)
+    moving = handheld_trajectory(np.arange(90) / RATE, seed)
+    T_wc = np.concatenate([np.tile(np.eye(4), (during.stop, 1, 1)), moving])
+    return Disturbed(_rendered(T_wc, seed), T_wc, during)
+
+
+DISTURBANCES: dict[str, tuple[Callable[[int], Disturbed], str]] = {
+    "black": (black, "5 s black"),
+    "cut": (cut, "a cut to another room"),
+    "hand": (hand, "a hand in front, 1.3 s"),
+    "scattered": (scattered, "half of the matches wrong, each otherwise, 4 s"),
+    "half_wrong": (half_wrong, "half of the picture moves otherwise, 4 s"),
+    "ghost": (ghost, "a double picture, 4 s"),
+    "rotation": (rotation, "pure rotation, 4 s from the start"),
+    "standing": (standing, "standing, 60 s from the start"),
+}
+"""By name, and in words."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure."""
+
+    only: tuple[str, ...] = tuple(DISTURBANCES)
+    """Disturbances."""
+    seeds: int = 5
+    """Videos of each."""
+    filter: str = "recommended"
+    """Filter."""
+    out: Path = Path("benchmarks/results/disturbances.json")
+    """The results, added to."""
+    page: Path = Path("docs/stress.md")
+    """The page."""
+
+
+def _source(frames: int, seed: int) -> Source:
+    return synthetic_source(frames=frames, seed=seed, rate=RATE)
+
+
+def _of(source: Source, during: range) -> tuple[np.ndarray, range]:
+    assert source.reference is not None
+    return source.reference.T_wc, during
+
+
+def _changed(
+    source: Source, during: range, picture: Callable[[Frame], np.ndarray]
+) -> Iterator[Frame]:
+    for frame in source:
+        yield replace(frame, image=picture(frame)) if frame.index in during else frame
+
+
+def _rendered(T_wc: np.ndarray, seed: int) -> Iterator[Frame]:
+    """The room of a seed from these poses; one that is as the one before is rendered once."""
+    calibration = _source(1, seed).calibration
+    quads, before, clean = room(seed, calibration.fx), np.full((4, 4), np.nan), None
+    for index, pose in enumerate(T_wc):
+        if clean is None or not np.array_equal(pose, before):
+            before, clean = pose, render(quads, pose, calibration)
+        yield Frame(index, index / RATE, add_noise(clean, np.random.default_rng([seed, index])))
+
+
+def measure(disturbed: Disturbed, settings: TrackerSettings, seed: int) -> dict[str, float]:
+    """What becomes of a tracker: shares of the frames meanwhile, and in the last second."""
+    tracker = Confused(_source(1, seed).calibration, settings)
+    tracker.confuse(disturbed.during if disturbed.wrong else range(0), disturbed.wrong, seed)
+    results = [tracker.track(frame) for frame in disturbed.frames]
+    tracked = np.array([result.state == "tracked" for result in results])
+    believed = tracked & [result.map == 0 for result in results]
+    index = np.arange(len(results))
+    elsewhere = np.isnan(disturbed.T_wc[:, 0, 0])
+    lies = believed & elsewhere
+    known = np.flatnonzero(believed & ~elsewhere)
+    poses, covariances = ([getattr(results[k], x) for k in known] for x in ("T_wc", "covariance"))
+    nees, _ = nees_beyond_scale(np.stack(poses), np.stack(covariances), disturbed.T_wc[known])
+    lies[known] = nees > LIE
+    during, after = np.isin(index, disturbed.during), index >= disturbed.during.stop
+    late = after & (index >= len(index) - RATE)
+    return {
+        "tracked_during": float(tracked[during].mean()),
+        "tracked_at_end": float(tracked[late].mean())
+        if late.any()
+        else float(tracked[-RATE:].mean()),
+        "in_first_map_at_end": float(results[-1].map == 0),
+        "maps": tracker.restarts + 1,
+        "reversed": tracker.reversed,
+        "lies": float(lies.sum() / tracked.sum()),
+        "beyond_scale": float(np.median(nees)) / 5,
+    }
+
+
+def table(results: dict[str, list[dict[str, float]]]) -> str:
+    """As Markdown, a row for each disturbance."""
+    lines = [
+        "| what | videos | tracked meanwhile | in the last second | in the first map | maps "
+        "| beyond scale | lies |",
+        "|---" * 8 + "|",
+    ]
+    for name, (_, words) in DISTURBANCES.items():
+        if name in results:
+            rows = results[name]
+            mean = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
+            lines.append(
+                f"| {words} | {len(rows)} | {mean['tracked_during']:.0%} "
+                f"| {mean['tracked_at_end']:.0%} | {mean['in_first_map_at_end']:.0%} "
+                f"| {mean['maps']:.2g} | {mean['beyond_scale']:.2g} | {mean['lies']:.1%} |"
+            )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Print a line for each video, and write the results."""
+    options = tyro.cli(Options, description=__doc__)
+    settings = TrackerSettings(filter=options.filter)
+    results: dict[str, Any] = json.loads(options.out.read_text()) if options.out.exists() else {}
+    for name in options.only:
+        results[name] = []
+        for seed in range(FIRST_SEED, FIRST_SEED + options.seeds):
+            results[name].append(measure(DISTURBANCES[name][0](seed), settings, seed))
+            print(name, seed, results[name][-1], flush=True)
+        with write_atomically(options.out) as path:
+            path.write_text(json.dumps(results, indent=1) + "\n")
+    print(table(results))
+    text = with_table(options.page.read_text(), MARK, table(results))
+    with write_atomically(options.page) as path:
+        path.write_text(text)
+
+
+if __name__ == "__main__":
+    main()
