@@ -42,7 +42,8 @@ def plot_posterior(summary: dict[str, Any], path: str | Path | None = None) -> F
 
     Above: draws of the exact posterior of the camera's position in one run, with the 95 %
     ellipses of MAP + Laplace, of the first filter and of the last. Middle: mean pose NEES, a row
-    for each method. Below: σ of position over the exact one.
+    for each method. Below: σ of position over the exact one. Raises ValueError where no chain
+    converged.
     """
     scenarios = _compared(summary["scenarios"])
     if not scenarios:
