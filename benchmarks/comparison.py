@@ -37,6 +37,8 @@ class Options:
     """Folder of comparison.json."""
     docs: Path = Path("docs")
     """Folder of comparison.md and comparison.png."""
+    page_only: bool = False
+    """Only write page and figure again."""
 
 
 def measure(options: Options) -> Iterator[dict[str, dict[str, Any]]]:
@@ -131,6 +133,9 @@ def _number(value: float | None, form: str) -> str:
 
 def main(options: Options) -> None:
     """Measure, and write the three files after every filter."""
+    if options.page_only:
+        write(json.loads((options.out / "comparison.json").read_text()), options)
+        return
     import jax
 
     for folder in (options.out, options.docs):

@@ -473,7 +473,7 @@ def draw(rows: list[Row], options: Options) -> None:
     )
     for name in _filters(rows):
         own = [row for row in rows if (row["filter"], row["landmarks"]) == name]
-        cells = [_cell(row, f"d_min {row['nearest_depth_m']:g} m") for row in own]
+        cells = [_cell(row, _depth(row)) for row in own]
         title = f"{'/'.join(name)}: mean pose NEES (ideal 3), {runs}"
         _draw(cells, title, options, _figure_name(name))
 
@@ -482,7 +482,7 @@ def _draw_rest(rows: list[Row], options: Options) -> None:
     """A column for each filter."""
     cells = [
         replace(
-            _cell(row, f"d_min {row['nearest_depth_m']:g} m"),
+            _cell(row, _depth(row)),
             column=f"{_label(row)}\n{row['runs']} runs a cell",
         )
         for row in sorted(rows, key=lambda row: _has_window(row["filter"]))
@@ -505,9 +505,31 @@ def _figure_name(name: tuple[str, str]) -> str:
     return f"phase-diagram-{'-'.join(name)}.png"
 
 
+def _depth(row: Row) -> str:
+    return f"nearest depth\nd_min {row['nearest_depth_m']:g} m"
+
+
+WORDS = {
+    "robocentric": "robocentric",
+    "world": "in the world",
+    "scale_gauge": "scale kept apart",
+    "scene": "depths share a scene",
+    "mixture": "{} Gaussians",
+    "rest": "windows from rest",
+    "inverse_scaling": "Inverse Scaling",
+    "inverse_depth": "Unified Inverse Depth",
+}
+"""What filters, their modifiers and landmarks are, in words; of others the name."""
+
+
 def _label(row: Row) -> str:
-    """Filter and landmarks, in lines that are short enough for the side of a panel."""
-    return "\n".join([row["filter"].replace("+", "\n+", 1), row["landmarks"]])
+    """Landmarks and filter in words, in lines that are short enough for the side of a panel."""
+    return ",\n".join(_word(name) for name in [row["landmarks"], *row["filter"].split("+")])
+
+
+def _word(name: str) -> str:
+    kind = name.rstrip("0123456789")
+    return WORDS.get(kind, name).format(name.removeprefix(kind))
 
 
 def _cell(row: Row, panel: str) -> PhaseCell:
@@ -518,6 +540,7 @@ def _cell(row: Row, panel: str) -> PhaseCell:
         y=row["velocity_sigma_m_s"],
         verdict=row["verdict"],
         certain=row["verdict"] == row["together"],
+        lost=row["lost"],
         text=f"{row['lost']:.0%}" if row["verdict"] == "lost" else _short(row["nees"]),
     )
 

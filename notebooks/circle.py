@@ -22,7 +22,6 @@
 # the gain comes from the parametrization and which from the robocentric frame.
 
 # %%
-# %matplotlib inline
 import os
 
 import jax
@@ -85,7 +84,7 @@ figure = new_figure(12, 6.4)
 for axes, (name, (path, (means, covariances), draws)) in zip(
     figure.subplots(1, 2, sharex=True, sharey=True), maps.items(), strict=True
 ):
-    plot_landmark_clouds(axes, draws, means, covariances, colour=COLOUR[name], label=NAME[name])
+    plot_landmark_clouds(draws, means, covariances, ax=axes, colour=COLOUR[name], label=NAME[name])
     axes.plot(*true_points.T, "k+", ms=9, mew=1.5, label="true landmarks")
     axes.plot(*true_path.T, "k", lw=1, label="true path")
     axes.plot(*path.T, color=COLOURS[2], lw=1.5, ls="--", label="estimated path")

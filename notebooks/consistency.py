@@ -24,7 +24,6 @@
 # so that whatever is inconsistent is the filter's fault.
 
 # %%
-# %matplotlib inline
 import os
 
 import numpy as np

@@ -24,7 +24,6 @@
 # m/s: all that is told.
 
 # %%
-# %matplotlib inline
 import os
 
 import jax

@@ -19,7 +19,6 @@
 # by climbing the likelihood of the filter's innovations (Schweppe 1965).
 
 # %%
-# %matplotlib inline
 import os
 
 import jax

@@ -26,7 +26,6 @@
 # $(f, c)$, landmarks.
 
 # %%
-# %matplotlib inline
 import math
 
 import equinox as eqx

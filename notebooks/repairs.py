@@ -19,7 +19,6 @@
 # that whatever is inconsistent is the filter's fault.
 
 # %%
-# %matplotlib inline
 import os
 
 import matplotlib.pyplot as plt

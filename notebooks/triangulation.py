@@ -31,7 +31,6 @@
 # Gaussian has no prior. Both truths are reported.
 
 # %%
-# %matplotlib inline
 import itertools
 import os
 

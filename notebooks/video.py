@@ -23,7 +23,6 @@
 # Scaling, the calibration's uncertainty in every update) and the one that `jaxslam track` uses.
 
 # %%
-# %matplotlib inline
 import os
 import tempfile
 from pathlib import Path
@@ -31,8 +30,12 @@ from pathlib import Path
 import cv2
 from IPython.display import Image, display
 
+from jaxslam.plots.frames import Laid, plot_frames
 from jaxslam.plots.style import new_figure
+from jaxslam.tum import read_tum
 from jaxslam.video.opening import open_source
+from jaxslam.vision.pointcloud import read_ply
+from jaxslam.vision.projection import seen_from
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.synthetic import synthetic_source
 from jaxslam.vision.track import describe, track
@@ -79,6 +82,31 @@ for axes, (share, image) in zip(figure.subplots(1, 3), shown, strict=True):
     axes.set_title(f"the paper's filter, at {share:.0%} of the video", fontsize=10)
     axes.axis("off")
 display(figure)
+
+# %% [markdown]
+# ## The map laid over the frames
+#
+# The landmarks of the whole map, as it is at the end, with ellipses of three standard deviations,
+# in the frames where the camera then was estimated to be. Crosses sit on the corners that they
+# were made of, all through the video: the map and the trajectory fit one another. A landmark
+# stays thin across the ray and long along it, so that its ellipse is small from where it was
+# first seen.
+
+# %%
+cloud = read_ply(out / "the paper's filter" / "map.ply")
+path = read_tum(out / "the paper's filter" / "trajectory.txt")[1]
+source = open_source(Path(VIDEO)) if VIDEO else synthetic_source(frames=FRAMES, seed=0)
+chosen = {round(share * (len(path) - 1)) for share in (0.1, 0.5, 1.0)}
+laid = [
+    Laid(
+        f"frame {frame.index}, {frame.time:.2f} s",
+        frame.image,
+        *seen_from(path[frame.index], cloud.points, cloud.covariances, source.calibration),
+    )
+    for frame in source
+    if frame.index in chosen
+]
+display(plot_frames(laid))
 
 # %% [markdown]
 # ## Trajectory and landmarks

@@ -87,6 +87,8 @@ class ConsistencyOptions:
     """Override scenario fields, for instance pixel_sigma=1 or velocity=[1.2,0,0]."""
     out: Path = Path("results")
     """Folder for consistency.json, consistency.png and the records of all runs."""
+    pdf: bool = False
+    """Write consistency.pdf too: one column for print, 3.4 in wide, its letters embedded."""
 
     def run(self) -> None:
         """Run the study, print its table, write its files."""
@@ -97,6 +99,8 @@ class ConsistencyOptions:
         with write_atomically(self.out / "consistency.json") as path:
             path.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
         plot_consistency(study, summary, self.out / "consistency.png")
+        if self.pdf:
+            plot_consistency(study, summary, self.out / "consistency.pdf", column=True)
         print(table(summary))
         print(f"wrote {self.out / 'consistency.json'} and {self.out / 'consistency.png'}")
 

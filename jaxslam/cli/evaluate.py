@@ -68,6 +68,8 @@ class EvaluateOptions:
     """The errors of a CSV or npz file are innovations, and the covariances theirs."""
     out: Path = Path("results")
     """Folder for evaluation.json and evaluation.png."""
+    pdf: bool = False
+    """Write evaluation.pdf too: one column for print, 3.4 in wide, its letters embedded."""
 
     def run(self) -> None:
         """Evaluate, print the verdict and the table, write the files."""
@@ -76,6 +78,8 @@ class EvaluateOptions:
         found = self._evaluation()
         written = found.save(self.out)
         plot_evaluation(found, self.out / "evaluation.png")
+        if self.pdf:
+            plot_evaluation(found, self.out / "evaluation.pdf", column=True)
         print(found)
         print(f"wrote {written} and {self.out / 'evaluation.png'}")
 

@@ -41,7 +41,8 @@ def chi2_cdf(value: float, dof: float) -> float:
 def mean_band(dof: int, runs: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Two-sided bounds of the mean NEES of `runs` independent runs at ONE time step.
 
-    `N · mean ~ χ²(N n)` exactly. The steps of a run are correlated: never pool them.
+    `N · mean ~ χ²(N n)` exactly. The steps of a run are correlated: never pool them. Raises
+    ValueError without a run or a degree of freedom.
     """
     if dof < 1 or runs < 1:
         raise ValueError(f"a band needs at least one run and one dof, not {runs} and {dof}")
@@ -75,7 +76,10 @@ def chernoff_p_value(mean: float, dof: float, runs: int) -> float:
 
 @dataclass(frozen=True)
 class PowerSums:
-    """Of independent numbers: how many, and the sums of their first three powers. They add up."""
+    """Of independent numbers: how many, and the sums of their first three powers. They add up.
+
+    `count` numbers x: `first` is Σ x, `second` Σ x², `third` Σ x³.
+    """
 
     count: int = 0
     first: float = 0.0
@@ -84,6 +88,7 @@ class PowerSums:
 
     @staticmethod
     def of(values: Float[np.ndarray, " n"]) -> PowerSums:
+        """Of these numbers."""
         values = np.asarray(values, np.float64)
         with np.errstate(over="ignore"):  # of a lost run's: no interval then
             return PowerSums(values.size, *(float(np.sum(values**power)) for power in (1, 2, 3)))

@@ -26,7 +26,7 @@ class Store(Protocol):
 
 
 class MemoryStore:
-    """Keeps everything: for notebooks and small studies."""
+    """Keeps everything, for small studies: `save` a chunk, does it `has` one, `load` it."""
 
     def __init__(self) -> None:
         self._records: dict[tuple[str, range], Records] = {}
@@ -43,7 +43,8 @@ class MemoryStore:
 
 
 class FolderStore:
-    """One file a chunk, written whole or not at all, beside a manifest of what made them.
+    """One file a chunk, written whole or not at all, beside a manifest of what made them: `save` a
+    chunk, does it `has` one, `load` it, which raises ValueError for a damaged file.
 
     `manifest` holds whatever decides a run's result. A folder made with another manifest is
     refused when `resume` is set, and emptied of its chunks otherwise.

@@ -43,14 +43,23 @@ class Study:
     """Finished runs: where their records are, and what is needed to read them."""
 
     scenario: Scenario
+    """The world that was simulated."""
     filters: Mapping[str, AbstractFilter]
+    """By the names under which their records are kept."""
     runs: int
+    """Of every filter, on the same worlds."""
     seed: int
+    """Of all draws."""
     dtype: str
+    """`float64` or `float32`."""
     chunks: tuple[range, ...]
+    """Runs that were computed, and are kept, together."""
     store: Store
+    """Where the records are."""
     seconds: Mapping[str, Seconds]
+    """What each filter took."""
     device: str
+    """On which it was computed."""
 
     def __repr__(self) -> str:
         """Its table, so that a study prints as what it found."""

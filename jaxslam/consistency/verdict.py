@@ -41,6 +41,7 @@ class Tally:
     """
 
     dof: int
+    """Degrees of freedom of one NEES."""
     runs: int
     diverged: int
     """Runs with a NEES that is not finite: they have no average, and a study with one no mean."""
@@ -55,6 +56,7 @@ class Tally:
 
     @staticmethod
     def of(nees: Float[np.ndarray, "runs steps"], dof: int) -> Tally:
+        """Of the NEES of runs, with so many degrees of freedom."""
         nees = np.asarray(nees, np.float64)
         healthy = np.isfinite(nees).all(axis=1)
         good = nees[healthy]
@@ -77,6 +79,7 @@ class Tally:
         return Tally(*counts, *sums)
 
     def asdict(self) -> dict[str, Any]:
+        """Numbers as JSON has them, for `from_dict`."""
         return asdict(self)
 
     def __add__(self, other: Tally) -> Tally:

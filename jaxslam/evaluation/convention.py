@@ -51,10 +51,13 @@ class Convention:
     """Of which error a covariance is. Raises ValueError, naming what is accepted."""
 
     error: str = "right"
+    """`right`, `left` or `split`."""
     axes: str = ""
     """By default the error's own (`NATURAL_AXES`)."""
     order: str = "position-first"
+    """Or `rotation-first`: of the rows of a covariance."""
     scale: str = "marginal"
+    """Or `given`: the covariance is that of a world whose scale is known."""
 
     def __post_init__(self) -> None:
         if not self.axes:

@@ -33,7 +33,9 @@ class Evaluation:
     quantity: str
     """NEES, or NIS of innovations."""
     dof: int
+    """Degrees of freedom: the NEES that a consistent filter has on average."""
     nees: Float[np.ndarray, "runs steps"]
+    """Of every run and step; not finite of one that diverged."""
     errors: Float[np.ndarray, "runs steps n"]
     sigmas: Float[np.ndarray, "runs steps n"]
     """What the filter claims of every error."""
@@ -45,6 +47,7 @@ class Evaluation:
     convention: Convention | None = None
     """Of the covariances, where they are of poses."""
     alignment: str = "none"
+    """By which the estimates were laid on the truth: `none`, `se3` or `sim3`."""
     identified: Identification | None = None
     """Which convention would make the data consistent, where it was asked."""
     notes: tuple[str, ...] = ()

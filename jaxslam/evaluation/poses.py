@@ -85,13 +85,14 @@ def evaluate_poses(
     align: str = "none",
     times: ArrayLike | None = None,
 ) -> Evaluation:
-    """The verdict on a filter from its poses T_wc (runs, steps, 4, 4), or (…, 3, 3) in the plane.
+    """The verdict on a filter from its poses T_wc, m, and the true ones.
 
-    `covariances` are of every pose, (runs, steps, 6, 6), or of all poses of a run together, (runs,
-    6 steps, 6 steps), of the errors that the `convention` names. Where the estimate is of another
-    world, `align` it by `se3` or `sim3`: by the first pose, if that is exactly known, else to all
-    positions. The covariance is transported with it. Whether another convention would make the
-    data consistent is tried too. Raises ValueError, naming run and step.
+    `estimates` and `truths` are (runs, steps, 4, 4), or (runs, steps, 3, 3) in the plane, `times`
+    (steps,) in seconds. `covariances` are of every pose, (runs, steps, 6, 6), or of all poses of a
+    run together, (runs, 6 steps, 6 steps), of the errors that the `convention` names. Where the
+    estimate is of another world, `align` it by `se3` or `sim3`: by the first pose, if that is
+    exactly known, else to all positions. The covariance is transported with it. Whether another
+    convention would make the data consistent is tried too. Raises ValueError, naming run and step.
     """
     stated = convention or Convention()
     chosen("align", [align], dict.fromkeys(ALIGNMENTS))

@@ -42,6 +42,7 @@ class Features(eqx.Module):
 
     slots: Int[AnyArray, "*frames m"]
     measured: Float[AnyArray, "*frames m p"]
+    """What the sensor says of each: of a camera a pixel, (u,) or (u, v)."""
     valid: Bool[AnyArray, "*frames m"]
 
 

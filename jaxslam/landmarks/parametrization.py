@@ -19,6 +19,7 @@ class Parametrization:
     """A way to write a point with d numbers, for points of n = 2 (planar) or 3 coordinates."""
 
     name: str
+    """By which `LANDMARKS` and the commands know it."""
     parameters: str
     """What the numbers are, as the literature writes them, for a point of three coordinates."""
     point: str

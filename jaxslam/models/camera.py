@@ -33,6 +33,7 @@ class Camera(eqx.Module):
     focal: Float[AnyArray, " p"] = eqx.field(converter=numbers)
     """Pixels; one of each coordinate."""
     centre: Float[AnyArray, " p"] = eqx.field(converter=numbers)
+    """The principal point, pixels."""
     distortion: Float[AnyArray, " 5"] | None = eqx.field(converter=optional_numbers, default=None)
 
     def __check_init__(self) -> None:

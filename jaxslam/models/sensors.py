@@ -72,7 +72,10 @@ class AbstractSensor(eqx.Module):
         return np.ones(())
 
     def perturbed(self, delta: Float[Array, " k"]) -> "AbstractSensor":
-        """The sensor with the error δ of its calibration; of an empty δ, the sensor itself."""
+        """The sensor with the error δ of its calibration; of an empty δ, the sensor itself.
+
+        Raises ValueError for any other δ of a sensor without a calibration.
+        """
         if delta.size:
             raise ValueError(f"{type(self).__name__} has no calibration that could be uncertain")
         return self
@@ -84,6 +87,7 @@ class Pinhole(AbstractSensor):
     hidden: ClassVar[int] = 1
 
     camera: Camera
+    """What turns directions into pixels."""
     sigma: Float[AnyArray, ""] | Float[AnyArray, " p"] = number_field()
     """σ of a measured pixel."""
 
@@ -126,6 +130,7 @@ class Position(AbstractSensor):
     sigma: Float[AnyArray, ""] | Float[AnyArray, " n"] = number_field()
     """σ of each coordinate, m."""
     point_dim: int = eqx.field(static=True, default=2)
+    """2 in the plane, 3 in space."""
 
     def __check_init__(self) -> None:
         check_shape("a position's sigma", self.sigma, (), (self.point_dim,))

@@ -14,113 +14,158 @@ from jaxslam.consistency import Study, summarise
 from jaxslam.consistency.verdict import headline
 from jaxslam.evaluation.evaluate import OUTSIDE
 from jaxslam.plots.landmarks import region_from_above
-from jaxslam.plots.style import GREY, line_style, name_decades, new_figure, save
+from jaxslam.plots.style import (
+    COLUMN,
+    GREY,
+    MEDIAN_DASH,
+    End,
+    column_title,
+    for_print,
+    label_ends,
+    line_style,
+    name_numbers,
+    new_figure,
+    save,
+    set_title,
+    short_names,
+)
 
-_LEGEND_LINE = 0.05
-"""Of the height of the axes of NEES, on which its legend hides no curve."""
 _MEDIAN_OF_NORMAL = 0.6745
 """Median of |x| for a standard normal x."""
 
 
 def plot_consistency(
-    study: Study, summary: dict[str, Any] | None = None, path: str | Path | None = None
+    study: Study,
+    summary: dict[str, Any] | None = None,
+    path: str | Path | None = None,
+    *,
+    column: bool = False,
 ) -> Figure:
     """Draw a study; `summary` is `summarise(study)`, made here if it is not given.
 
     Above: the mean NEES of every filter with its exact 95 % band, and the share of errors outside
     ±3σ. Where the scale is free, below that: NEES given the scale, and the scale's own error.
-    Below: the error of run 0 with ±3σ, axis by axis, and its map at the end. Written to `path`
-    where one is given.
+    Below: the error of run 0 with ±3σ, axis by axis, and its map at the end. As one `column` for
+    print, 3.4 in wide with letters of 8 pt, it is without run 0. Written to `path` where one is
+    given.
     """
     summary = summarise(study) if summary is None else summary
-    geometry = study.scenario.world
-    rows, free = geometry.tangent_dim // 3, summary["scale_free"]
-    heights = [2.1, *[1.3] * free, *[1.1] * rows]
-    figure = new_figure(12.5, 1.0 + 0.2 * len(study.filters) + 2.1 * sum(heights))
-    # Over the whole width, as the verdicts are longer than the axes that they are on.
-    figure.suptitle(_title(summary), x=0.01, ha="left", fontsize=10)
-    grid = figure.add_gridspec(len(heights), 12, height_ratios=heights)
-    plot_nees(summary, ax=figure.add_subplot(grid[0, :8]))
-    plot_outside(summary, ax=figure.add_subplot(grid[0, 8:]))
-    if free:
-        plot_beyond_scale(summary, ax=figure.add_subplot(grid[1, :6]))
-        plot_log_scale(summary, ax=figure.add_subplot(grid[1, 6:]))
-    samples = {name: study.store.load(name, study.chunks[0]) for name in study.filters}
-    _plot_map(figure.add_subplot(grid[1 + free :, 9:]), samples)
-    axes = [
-        figure.add_subplot(grid[1 + free + r, 3 * c : 3 * c + 3])
-        for r in range(rows)
-        for c in range(3)
-    ]
-    _plot_errors(axes, samples, np.array(summary["time"]), geometry.point_dim)
+    figure = _column(summary) if column else _page(study, summary)
     if path is not None:
         save(figure, path)
     return figure
 
 
-def plot_nees(summary: dict[str, Any], *, ax: Axes, label: Mapping[str, str] | None = None) -> Axes:
+def _column(summary: dict[str, Any]) -> Figure:
+    drawn = [plot_nees, plot_outside]
+    if summary["scale_free"]:
+        drawn += [plot_beyond_scale, plot_log_scale]
+    title = column_title(_title(summary))
+    figure = new_figure(COLUMN, 0.15 * len(title.splitlines()) + 1.9 * len(drawn))
+    figure.suptitle(title, x=0.02, ha="left")
+    for plot, ax in zip(drawn, figure.subplots(len(drawn), 1), strict=True):
+        plot(summary, ax=ax)
+    for_print(figure)
+    return figure
+
+
+def _page(study: Study, summary: dict[str, Any]) -> Figure:
+    geometry = study.scenario.world
+    rows, free = geometry.tangent_dim // 3, summary["scale_free"]
+    heights = [2.1, *[1.3] * free, *[1.1] * rows]
+    figure = new_figure(12.5, 1.0 + 0.2 * len(study.filters) + 2.1 * sum(heights))
+    # Over the whole width, as the verdicts are longer than the axes that they are on.
+    figure.suptitle(_title(summary), x=0.01, ha="left", fontsize=11)
+    # Each row by itself, as the room that names take is of its own.
+    grid = figure.add_gridspec(len(heights) - rows + 1, 1, height_ratios=_last(heights, rows))
+    places = [figure.add_subfigure(cell) for cell in grid]
+    plots = [(plot_nees, plot_outside), *[(plot_beyond_scale, plot_log_scale)] * free]
+    for place, pair in zip(places, plots, strict=False):
+        for plot, ax in zip(pair, place.subplots(1, 2, width_ratios=[4, 3]), strict=True):
+            plot(summary, ax=ax)
+    samples = {name: study.store.load(name, study.chunks[0]) for name in study.filters}
+    grid = places[-1].add_gridspec(rows, 4)
+    axes = [places[-1].add_subplot(grid[r, c]) for r in range(rows) for c in range(3)]
+    _plot_errors(axes, samples, np.array(summary["time"]), geometry.point_dim)
+    _plot_map(places[-1].add_subplot(grid[:, 3]), samples)
+    return figure
+
+
+def _last(heights: list[float], rows: int) -> list[float]:
+    """The last rows as one."""
+    return [*heights[:-rows], sum(heights[-rows:])]
+
+
+Labels = Mapping[str, str]
+"""What filters are called at the ends of their lines: `{"robocentric/inverse_depth": "UID"}`."""
+
+
+def plot_nees(summary: dict[str, Any], *, ax: Axes, label: Labels | None = None) -> Axes:
     """Mean NEES of every filter over time with its exact 95 % band, and the medians, dotted.
 
-    A filter may be called otherwise in the legend: `label={"robocentric/inverse_depth": "UID"}`.
+    `summary` is of `summarise`. Names stand at the ends of the lines; a filter may be called
+    otherwise by `label`.
     """
-    axes, label = ax, label or {}
-    time = np.array(summary["time"])
     first = next(iter(summary["filters"].values()))
-    low, high = first["band95"]
-    band = f"exact 95 % band of the mean of {first['survivors']} runs, at one step"
-    axes.axhspan(low, high, color=GREY, alpha=0.25, lw=0, label=band)
-    axes.axhline(first["dof"], color=GREY, lw=0.8)
-    for i, (name, f) in enumerate(summary["filters"].items()):
-        style = line_style(i)
-        axes.plot(
-            time,
-            np.array(f["nees"], float),
-            lw=1.8,
-            label=f"{label.get(name, name)}: {_curve(f)}",
-            **style,
-        )
-        axes.plot(
-            time, np.array(f["nees_median"], float), color=style["color"], lw=0.9, ls=(0, (1, 2))
-        )
-    axes.plot(
-        [], [], color=GREY, lw=0.9, ls=(0, (1, 2)), label="median (2.37 for χ²₃, 5.35 for χ²₆)"
-    )
-    axes.set_yscale("log")
-    bottom, top = axes.get_ylim()
-    bottom, top = min(bottom, first["dof"] / 2), max(top, first["dof"] * 1.2)
-    legend = _LEGEND_LINE * (len(summary["filters"]) + 2)
-    axes.set_ylim(bottom, bottom * (top / bottom) ** (1 / (1 - min(legend, 0.5))))
-    name_decades(axes)
-    _over_time(axes, time)
-    axes.set_ylabel(f"pose NEES (ideal {first['dof']})")
-    axes.legend(fontsize=8, loc="upper left")
-    return axes
+    ideal = f"ideal {first['dof']}"
+    _plot_means(summary["filters"], summary, ax, label)
+    ax.set_ylabel(f"pose NEES ({ideal})")
+    band = f"grey: exact 95 % band of {first['survivors']} runs"
+    set_title(ax, f"mean NEES; dotted: median\n{band}")
+    return ax
 
 
-def plot_outside(
-    summary: dict[str, Any], *, ax: Axes, label: Mapping[str, str] | None = None
-) -> Axes:
+def _plot_means(
+    numbers: dict[str, dict[str, Any]], summary: dict[str, Any], ax: Axes, label: Labels | None
+) -> None:
+    """Means with the band of the first, and medians, over time."""
+    time, first = np.array(summary["time"]), next(iter(numbers.values()))
+    ax.axhspan(*first["band95"], color=GREY, alpha=0.25, lw=0)
+    ax.axhline(first["dof"], color=GREY, lw=0.8)
+    lines = []
+    for (name, f), style in _styled(numbers):
+        mean, median = (np.array(f[key], float) for key in ("nees", "nees_median"))
+        ax.plot(time, mean, lw=1.8, **style)
+        ax.plot(time, median, color=style["color"], lw=0.9, ls=MEDIAN_DASH)
+        lines.append((name, mean, style["color"]))
+    ax.set_yscale("log")
+    bottom, top = ax.get_ylim()
+    ax.set_ylim(min(bottom, first["dof"] / 2), max(top, first["dof"] * 1.5))
+    name_numbers(ax.yaxis)
+    _over_time(ax, time)
+    _name(ax, time, lines, label)
+
+
+def _styled(numbers: Mapping[str, Any]):
+    """Filters and their numbers, with the style of their lines."""
+    return [(item, line_style(i)) for i, item in enumerate(numbers.items())]
+
+
+def _name(ax: Axes, time: np.ndarray, lines: list, label: Labels | None) -> None:
+    """Write the names of `(filter, values, colour)` at the ends of their lines."""
+    called = {**short_names([name for name, _, _ in lines]), **(label or {})}
+    label_ends(ax, [End(called[name], time, values, colour) for name, values, colour in lines])
+
+
+def plot_outside(summary: dict[str, Any], *, ax: Axes, label: Labels | None = None) -> Axes:
     """Share of errors outside ±3σ over time, of the position (solid) and the orientation (thin).
 
-    Where a `label` is given for a filter, it stands at the end of its line.
+    Names stand at the ends of the position's lines; a filter may be called otherwise by `label`.
     """
-    time, label = np.array(summary["time"]), label or {}
-    for i, (name, f) in enumerate(summary["filters"].items()):
-        style, outside = line_style(i), f["outside3sigma"]
+    time, lines = np.array(summary["time"]), []
+    for (name, f), style in _styled(summary["filters"]):
         position, orientation = (
-            100 * np.array(outside[part], float) for part in ("position", "orientation")
+            100 * np.array(f["outside3sigma"][part], float) for part in ("position", "orientation")
         )
         ax.plot(time, position, lw=1.8, **style)
         ax.plot(time, orientation, lw=0.8, **style)
-        if name in label:
-            place = (time[-1], position[-1])
-            ax.annotate(f" {label[name]}", place, color=style["color"], va="center", fontsize=8)
+        lines.append((name, position, style["color"]))
     ax.axhline(100 * OUTSIDE, color=GREY, lw=0.8)
     ax.set_ylim(0, max(1.0, ax.get_ylim()[1]))
     _over_time(ax, time)
     ax.set_ylabel("% of errors")
-    told = "outside ±3σ: position, orientation (thin)"
-    ax.set_title(f"{told}\ngrey: 0.27 % of Gaussian errors", fontsize=9)
+    set_title(ax, "outside ±3σ: position, orientation (thin)\ngrey: 0.27 % of Gaussian errors")
+    _name(ax, time, lines, label)
     return ax
 
 
@@ -130,59 +175,53 @@ def _over_time(axes: Axes, time: np.ndarray) -> None:
     axes.grid(alpha=0.25, which="major")
 
 
-def plot_beyond_scale(summary: dict[str, Any], *, ax: Axes) -> Axes:
-    """Mean and median NEES at the scale of the truth that explains the estimate best."""
-    axes = ax
-    time = np.array(summary["time"])
-    first = next(iter(summary["filters"].values()))["beyond_scale"]
-    axes.axhspan(*first["band95"], color=GREY, alpha=0.25, lw=0)
-    axes.axhline(first["dof"], color=GREY, lw=0.8)
-    for i, f in enumerate(summary["filters"].values()):
-        style, beyond = line_style(i), f["beyond_scale"]
-        axes.plot(time, np.array(beyond["nees"], float), lw=1.8, **style)
-        median = np.array(beyond["nees_median"], float)
-        axes.plot(time, median, color=style["color"], lw=0.9, ls=(0, (1, 2)))
-    axes.set_yscale("log")
-    bottom, top = axes.get_ylim()
-    axes.set_ylim(min(bottom, first["dof"] / 2), max(top, first["dof"] * 2.5))
-    name_decades(axes)
-    _over_time(axes, time)
-    axes.set_title(f"pose NEES given the scale (ideal {first['dof']})", fontsize=9)
-    return axes
+def plot_beyond_scale(summary: dict[str, Any], *, ax: Axes, label: Labels | None = None) -> Axes:
+    """Mean and median NEES at the scale of the truth that explains the estimate best.
+
+    Where the scale is free; names at the ends of the lines, or those of `label`.
+    """
+    numbers = {name: f["beyond_scale"] for name, f in summary["filters"].items()}
+    _plot_means(numbers, summary, ax, label)
+    ideal = f"ideal {next(iter(numbers.values()))['dof']}"
+    ax.set_ylabel(f"NEES ({ideal})")
+    set_title(ax, "NEES given the scale; dotted: median")
+    return ax
 
 
-def plot_log_scale(summary: dict[str, Any], *, ax: Axes) -> Axes:
+def plot_log_scale(summary: dict[str, Any], *, ax: Axes, label: Labels | None = None) -> Axes:
     """The error of log-scale and what it should be by the σ claimed: medians, as one reversed run,
-    which no scale explains, has an error and a σ beyond all others."""
-    axes = ax
-    time = np.array(summary["time"])
-    for i, f in enumerate(summary["filters"].values()):
-        style, scale = line_style(i), f["log_scale"]
-        axes.plot(time, np.array(scale["error_median"], float), lw=1.8, **style)
-        ideal = _MEDIAN_OF_NORMAL * np.array(scale["sigma_median"], float)
-        axes.plot(time, ideal, color=style["color"], lw=0.9, ls=(0, (4, 2)))
-    axes.plot([], [], color=GREY, lw=1.8, label="|error|, median of runs")
-    axes.plot([], [], color=GREY, lw=0.9, ls=(0, (4, 2)), label="by the σ claimed: 0.67 σ, median")
-    axes.set_yscale("log")
-    name_decades(axes)
-    _over_time(axes, time)
-    axes.set_title("log of the scale: error and claimed σ", fontsize=9)
-    axes.legend(fontsize=7, loc="best")
-    return axes
+    which no scale explains, has an error and a σ beyond all others.
+
+    Where the scale is free; names at the ends of the lines, or those of `label`.
+    """
+    time, lines = np.array(summary["time"]), []
+    for (name, f), style in _styled(summary["filters"]):
+        error, sigma = (
+            np.array(f["log_scale"][key], float) for key in ("error_median", "sigma_median")
+        )
+        ax.plot(time, error, lw=1.8, **style)
+        ax.plot(time, _MEDIAN_OF_NORMAL * sigma, color=style["color"], lw=0.9, ls=(0, (4, 2)))
+        lines.append((name, error, style["color"]))
+    ax.set_yscale("log")
+    name_numbers(ax.yaxis)
+    _over_time(ax, time)
+    ax.set_ylabel("error of ln(scale)")
+    set_title(ax, "scale: median error of the runs\ndashed: by the σ claimed, 0.67 of its median")
+    _name(ax, time, lines, label)
+    return ax
 
 
 def _title(summary: dict[str, Any]) -> str:
-    """What was run, and the verdict on every filter."""
-    runs = f"{summary['runs']} runs, seed {summary['seed']}; over all steps, [99 % interval]:"
-    verdicts = (f"{name}: {headline(f['verdict'])}" for name, f in summary["filters"].items())
-    return "\n".join([f"{summary['scenario']['name']}, {runs}", *verdicts])
+    """The verdict on every filter, how many of its runs were lost, and what was run."""
+    verdicts = (f"{name}: {_verdict(f)}" for name, f in summary["filters"].items())
+    told = f"{summary['runs']} runs, seed {summary['seed']}; over all steps, [99 % interval]"
+    return "\n".join([*verdicts, f"{summary['scenario']['name']}, {told}"])
 
 
-def _curve(f: dict[str, Any]) -> str:
-    """A curve's description."""
-    inside = f"{f['inside']:.0%} of steps in the band"
+def _verdict(f: dict[str, Any]) -> str:
     now, ever = f["lost"][-1], f["lost_ever"][-1]
-    return f"{inside}, lost {now:.1%} at the end, {ever:.1%} ever" if ever else inside
+    lost = f"; lost {now:.1%} at the end, {ever:.1%} ever" if ever else ""
+    return headline(f["verdict"]) + lost
 
 
 def _plot_errors(axes: list[Axes], samples: dict[str, Any], time: np.ndarray, n: int) -> None:
@@ -199,7 +238,7 @@ def _plot_errors(axes: list[Axes], samples: dict[str, Any], time: np.ndarray, n:
             ax.plot(time, bound, time, -bound, lw=0.8, alpha=0.8, **style)
             ax.plot(time, error, lw=1.5, **style)
         label = positions[axis] if position else rotations[axis - n]
-        ax.set_title(f"run 0: {label} with ±3σ", fontsize=9)
+        set_title(ax, f"run 0: {label} with ±3σ")
         ax.set_ylabel("m" if position else "degrees")
         ax.set_xlim(0, time[-1])
         ax.grid(alpha=0.25)
@@ -227,7 +266,7 @@ def _plot_map(axes: Axes, samples: dict[str, Any]) -> None:
     axes.set_xlabel("x, m")
     axes.set_ylabel("z, m")
     # Said in the title: a legend would hide landmarks and ticks of a narrow map.
-    axes.set_title("run 0 from above, 95 % regions\nblack: the truth", fontsize=9)
+    axes.set_title("run 0 from above,\n95 % regions\nblack: the truth", fontsize=9)
     axes.grid(alpha=0.25)
 
 

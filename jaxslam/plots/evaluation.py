@@ -10,19 +10,54 @@ from matplotlib.figure import Figure
 
 from jaxslam.evaluation import Evaluation
 from jaxslam.evaluation.evaluate import OUTSIDE
-from jaxslam.plots.style import COLOURS, GREY, line_style, name_decades, new_figure, save
+from jaxslam.plots.style import (
+    COLOURS,
+    COLUMN,
+    GREY,
+    LETTERS,
+    End,
+    column_title,
+    for_print,
+    label_end,
+    line_style,
+    name_numbers,
+    new_figure,
+    save,
+    set_title,
+)
 
 _PER_ROW = 3
 _WIDEST = 12
 """Axes that are drawn; of more the first."""
 
 
-def plot_evaluation(evaluation: Evaluation, path: str | Path | None = None) -> Figure:
+def plot_evaluation(
+    evaluation: Evaluation, path: str | Path | None = None, *, column: bool = False
+) -> Figure:
     """Draw an evaluation, the verdict as its title; written to `path` where one is given.
 
     Above: the mean NEES of every step with its exact 95 % band, and the share of errors outside
-    ±3σ, axis by axis. Below: RMSE and claimed σ of every axis.
+    ±3σ, axis by axis. Below: RMSE and claimed σ of every axis. As one `column` for print, 3.4 in
+    wide with letters of 8 pt, it is what is above.
     """
+    figure = _column(evaluation) if column else _page(evaluation)
+    if path is not None:
+        save(figure, path)
+    return figure
+
+
+def _column(evaluation: Evaluation) -> Figure:
+    shown = min(len(evaluation.names), _WIDEST)
+    figure = new_figure(COLUMN, 3.0 + 0.16 * shown)
+    figure.suptitle(column_title(evaluation.headline), x=0.02, ha="left")
+    above, below = figure.subplots(2, 1, height_ratios=[1.9, 0.16 * shown])
+    plot_nees(evaluation, ax=above)
+    plot_outside(evaluation, ax=below)
+    for_print(figure)
+    return figure
+
+
+def _page(evaluation: Evaluation) -> Figure:
     axes = min(len(evaluation.names), _WIDEST)
     rows = -(-axes // _PER_ROW)
     figure = new_figure(11.5, 3.9 + 1.9 * rows)
@@ -33,8 +68,6 @@ def plot_evaluation(evaluation: Evaluation, path: str | Path | None = None) -> F
     for axis in range(axes):
         place = grid[1 + axis // _PER_ROW, axis % _PER_ROW]
         plot_axis(evaluation, axis, ax=figure.add_subplot(place))
-    if path is not None:
-        save(figure, path)
     return figure
 
 
@@ -51,14 +84,15 @@ def plot_nees(
     marker = "o" if evaluation.steps == 1 else None
     ax.plot(evaluation.times, evaluation.mean, lw=1.8, marker=marker, **style)
     if label is not None:
-        _at_end(ax, evaluation.times, evaluation.mean, label, style["color"])
+        label_end(ax, End(label, evaluation.times, evaluation.mean, style["color"]))
     ax.set_yscale("log")
     bottom, top = ax.get_ylim()
     ax.set_ylim(min(bottom, evaluation.dof / 2), max(top, evaluation.dof * 2))
-    name_decades(ax)
+    name_numbers(ax.yaxis)
     ax.set_ylabel(f"mean {evaluation.quantity} (ideal {evaluation.dof})")
     many = f"{evaluation.runs} runs" if evaluation.runs > 1 else "one run"
-    ax.set_title(f"{evaluation.quantity} of {many}, grey: exact 95 % band of one step", fontsize=9)
+    told = f"{evaluation.quantity} of {many}\ngrey: exact 95 % band of one step"
+    set_title(ax, told)
     return _over_time(evaluation, ax)
 
 
@@ -69,13 +103,13 @@ def plot_outside(evaluation: Evaluation, *, ax: Axes, label: str | None = None) 
     ax.barh(places, shares, color=COLOURS[0], label=label)
     for place, share in zip(places, shares, strict=True):
         beyond = max(share, 100 * OUTSIDE)  # where the grey line hides no digit
-        ax.annotate(f"  {share:.2g} %", (beyond, place), va="center", fontsize=8)
+        ax.annotate(f"  {share:.2g} %", (beyond, place), va="center", fontsize=LETTERS)
     ax.axvline(100 * OUTSIDE, color=GREY, lw=1.2)
     ax.set_yticks(places, evaluation.names[:_WIDEST])
     ax.invert_yaxis()
     ax.set_xlim(0, max(1.25 * shares.max(), 1.0))
     ax.set_xlabel("% of errors")
-    ax.set_title("outside ±3σ; grey line: 0.27 % of Gaussian errors", fontsize=9)
+    set_title(ax, "outside ±3σ\ngrey line: 0.27 % of Gaussian errors")
     return ax
 
 
@@ -88,16 +122,12 @@ def plot_axis(
     ax.plot(evaluation.times, rmse, lw=1.8, color=colour, marker=marker)
     ax.plot(evaluation.times, sigma, lw=1.4, ls="--", color=colour, marker=marker)
     if label is not None:
-        _at_end(ax, evaluation.times, rmse, label, colour)
+        label_end(ax, End(label, evaluation.times, rmse, colour))
     ax.set_ylim(bottom=0)
     if evaluation.convention is not None:
         ax.set_ylabel("rad" if evaluation.names[axis].startswith("r") else "m, or map units")
-    ax.set_title(f"{evaluation.names[axis]}: RMSE (solid), σ claimed (dashed)", fontsize=9)
+    set_title(ax, f"{evaluation.names[axis]}: RMSE (solid), σ claimed (dashed)")
     return _over_time(evaluation, ax)
-
-
-def _at_end(ax: Axes, times: np.ndarray, values: np.ndarray, label: str, colour: str) -> None:
-    ax.annotate(f" {label}", (times[-1], values[-1]), color=colour, va="center", fontsize=8)
 
 
 def _over_time(evaluation: Evaluation, ax: Axes) -> Axes:

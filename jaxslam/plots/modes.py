@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -108,11 +108,11 @@ def plot_modes(
     left, and what the filter still believes. Below: the weights, one on the other. Written to
     `path` where one is given. Raises ValueError where none of the frames has modes.
     """
-    last, shares = len(worlds.weights), worlds.shares()
+    last = len(worlds.weights)
     frames = [frame for frame in frames if 1 <= frame <= last]
     if not frames:
         raise ValueError(f"no frame to draw: the modes are known in frames 1 to {last}")
-    looks = _looks(worlds, np.argsort(-shares.sum(axis=0), kind="stable")[:WORLDS].tolist())
+    looks = _looks(worlds)
     figure = new_figure(10, 3.7 * len(looks) + 2.4)
     figure.suptitle("Two worlds explain the same pixels, until one dies", fontsize=14)
     grid = figure.add_gridspec(len(looks) + 1, 1, height_ratios=[*[3.7] * len(looks), 2.1])
@@ -120,14 +120,17 @@ def plot_modes(
     for row, (number, look) in zip(rows, looks.items(), strict=True):
         _row(row, worlds, frames, number, look)
     _head(rows[0], frames, worlds.rate)
-    _bands(bands, shares, looks, frames)
+    plot_weights(worlds, frames, ax=bands.subplots())
     _legend(bands, worlds)
     if path is not None:
         save(figure, path)
     return figure
 
 
-def _looks(worlds: Worlds, shown: list[int]) -> dict[int, _Look]:
+def _looks(worlds: Worlds) -> dict[int, _Look]:
+    """Of the worlds with the most weight over all frames."""
+    weightiest = np.argsort(-worlds.shares().sum(axis=0), kind="stable")
+    shown = weightiest[:WORLDS].tolist()
     astray = _nearest(worlds, shown)
     return {
         number: _Look(COLOURS[i], _way(worlds, number), number == astray)
@@ -240,17 +243,34 @@ def _view(axes: np.ndarray, worlds: Worlds, last: int) -> None:
         each.yaxis.set_major_locator(MaxNLocator(2))
 
 
-def _bands(row: SubFigure, shares: np.ndarray, looks: dict[int, _Look], frames: Sequence[int]):
-    axes = row.subplots()
+def plot_weights(
+    worlds: Worlds,
+    frames: Sequence[int] = FRAMES,
+    *,
+    ax: Axes,
+    label: Mapping[str, str] | None = None,
+) -> Axes:
+    """The weights of all worlds over the frames, one on the other; white at some frames.
+
+    A world is called by the way its camera goes, or as `label` calls that: `{"left": "astray"}`.
+    """
+    axes, looks, shares = ax, _looks(worlds), worlds.shares()
+    called = label or {}
     steps, bottom = np.arange(1, len(shares) + 1), np.zeros(len(shares))
     for number, look in looks.items():
         share = shares[:, number]
         axes.fill_between(steps, bottom, bottom + share, color=look.colour, alpha=0.9, lw=0)
         middle = int(np.sum(share * steps) / np.sum(share)) - 1
         axes.text(
-            steps[middle], (bottom + share / 2)[middle], f"goes {look.way}", color="white",
-            ha="center", va="center", fontsize=12, fontweight="bold",
-        )  # fmt: skip
+            steps[middle],
+            (bottom + share / 2)[middle],
+            called.get(look.way, f"goes {look.way}"),
+            color="white",
+            ha="center",
+            va="center",
+            fontsize=12,
+            fontweight="bold",
+        )
         bottom = bottom + share
     axes.fill_between(steps, bottom, 1, color=_OTHERS, lw=0)
     for frame in frames:
@@ -258,6 +278,7 @@ def _bands(row: SubFigure, shares: np.ndarray, looks: dict[int, _Look], frames: 
     axes.set(xlim=(1, steps[-1]), ylim=(0, 1), xticks=frames, yticks=[0, 0.5, 1])
     axes.set_xlabel("frame")
     axes.set_ylabel("weight")
+    return axes
 
 
 def _legend(row: SubFigure, worlds: Worlds) -> None:

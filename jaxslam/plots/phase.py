@@ -12,14 +12,14 @@ from matplotlib.patches import Patch, Rectangle
 
 from jaxslam.plots.style import COLOURS, new_figure, save
 
-# Of Okabe and Ito's, with a lightness that falls from consistent to lost, so that the order
-# survives without colour; the number in the cell says the rest.
+# Of Okabe and Ito's; lost is grey, the darker the more runs are; the number says the rest.
 _COLOUR = {
     "consistent": "#FFFFFF",
     "under-confident": COLOURS[5],
     "over-confident": COLOURS[4],
-    "lost": "#4D4D4D",
 }
+_FEW_LOST, _ALL_LOST = 0.78, 0.05
+"""Lightness, linear in the root of the share: most of what is lost is lost by a few runs."""
 _DOUBTFUL = {"under-confident": "#D9EEFA", "over-confident": "#FBEBC8"}
 _MISSING = "///"
 
@@ -39,6 +39,8 @@ class PhaseCell:
     certain: bool
     """Whether it is the same by the band of all cells together."""
     text: str
+    lost: float = 0.0
+    """Share of the runs."""
 
 
 def plot_phase_diagram(
@@ -58,20 +60,19 @@ def plot_phase_diagram(
     rows, columns = (
         list(dict.fromkeys(getattr(c, name) for c in cells)) for name in ("row", "column")
     )
-    xs, ys = (sorted({getattr(c, axis) for c in cells}) for axis in ("x", "y"))
-    width = 0.47 * len(xs) * len(columns) + 0.25 * len(columns) + 1.1
-    height = 0.29 * len(ys) * len(rows) + 0.3 * len(rows) + 1.3
+    xs, ys = _values(cells)
+    width = 0.47 * len(xs) * len(columns) + 0.25 * len(columns) + 2.3
+    height = 0.29 * len(ys) * len(rows) + 0.3 * len(rows) + 1.4
+    height += 0.15 * max(column.count("\n") for column in columns)
     figure = new_figure(max(width, 7.0), height)
     axes = figure.subplots(len(rows), len(columns), sharex=True, sharey=True, squeeze=False)
     for i, row in enumerate(rows):
         for j, column in enumerate(columns):
             inside = [c for c in cells if (c.row, c.column) == (row, column)]
-            _panel(axes[i, j], inside, xs, ys)
-            if i == 0:
-                axes[i, j].set_title(column, fontsize=9)
+            plot_cells(inside, ax=axes[i, j], label=column if i == 0 else "", of=cells)
             if j == len(columns) - 1:
                 axes[i, j].yaxis.set_label_position("right")
-                axes[i, j].set_ylabel(row, fontsize=9)
+                axes[i, j].set_ylabel(row, fontsize=9, rotation=0, ha="left", va="center")
     figure.supxlabel(x_label, fontsize=9)
     figure.supylabel(y_label, fontsize=9)
     figure.legend(
@@ -88,21 +89,44 @@ def plot_phase_diagram(
     return figure
 
 
-def _panel(axes: Axes, cells: list[PhaseCell], xs: list[float], ys: list[float]) -> None:
-    axes.add_patch(Rectangle((-0.5, -0.5), len(xs), len(ys), fc="none", hatch=_MISSING, ec="0.85"))
+def _values(cells: Sequence[PhaseCell]) -> tuple[list[float], list[float]]:
+    """Of both axes."""
+    return sorted({cell.x for cell in cells}), sorted({cell.y for cell in cells})
+
+
+def plot_cells(
+    cells: Sequence[PhaseCell],
+    *,
+    ax: Axes,
+    label: str = "",
+    of: Sequence[PhaseCell] | None = None,
+) -> Axes:
+    """One panel, with `label` as its title; the axes show the places of all cells it is one `of`,
+    hatched where there is none."""
+    xs, ys = _values(of or cells)
+    ax.add_patch(Rectangle((-0.5, -0.5), len(xs), len(ys), fc="none", hatch=_MISSING, ec="0.85"))
     for cell in cells:
         x, y = xs.index(cell.x), ys.index(cell.y)
-        axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, fc=_colour(cell), ec="0.7", lw=0.5))
-        ink = "white" if cell.verdict == "lost" else "black"
-        axes.text(x, y, cell.text, ha="center", va="center", fontsize=7.5, color=ink)
-    axes.set_xlim(-0.5, len(xs) - 0.5)
-    axes.set_ylim(-0.5, len(ys) - 0.5)
-    axes.set_xticks(range(len(xs)), [f"{x:g}" for x in xs], fontsize=8)
-    axes.set_yticks(range(len(ys)), [f"{y:g}" for y in ys], fontsize=8)
-    axes.tick_params(length=0)
+        ax.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, fc=_colour(cell), ec="0.7", lw=0.5))
+        dark = cell.verdict == "lost" and _lightness(cell.lost) < 0.5
+        ink = "white" if dark else "black"
+        ax.text(x, y, cell.text, ha="center", va="center", fontsize=7.5, color=ink)
+    ax.set_xlim(-0.5, len(xs) - 0.5)
+    ax.set_ylim(-0.5, len(ys) - 0.5)
+    ax.set_xticks(range(len(xs)), [f"{x:g}" for x in xs], fontsize=8)
+    ax.set_yticks(range(len(ys)), [f"{y:g}" for y in ys], fontsize=8)
+    ax.tick_params(length=0)
+    ax.set_title(label, fontsize=9)
+    return ax
+
+
+def _lightness(lost: float) -> float:
+    return _FEW_LOST + (_ALL_LOST - _FEW_LOST) * lost**0.5
 
 
 def _colour(cell: PhaseCell) -> str:
+    if cell.verdict == "lost":
+        return f"{_lightness(cell.lost):.3f}"
     return _COLOUR[cell.verdict] if cell.certain else _DOUBTFUL[cell.verdict]
 
 
@@ -111,10 +135,11 @@ def _legend() -> list[Patch]:
         return Patch(facecolor=colour, edgecolor="0.6", label=label)
 
     return [
-        patch(_COLOUR["consistent"], "inside the 95 % band"),
-        patch(_COLOUR["lost"], "lost runs (their share)"),
-        patch(_DOUBTFUL["over-confident"], "above the 95 % band"),
+        patch(_COLOUR["consistent"], "NEES inside the 95 % band"),
+        patch(_DOUBTFUL["over-confident"], "above it"),
         patch(_COLOUR["over-confident"], "above the band of all cells together"),
-        patch(_DOUBTFUL["under-confident"], "below the 95 % band"),
-        patch(_COLOUR["under-confident"], "below the band of all cells together"),
+        Patch(facecolor="none", edgecolor="0.6", hatch=_MISSING, label="not measured"),
+        patch(_DOUBTFUL["under-confident"], "below it"),
+        patch(_COLOUR["under-confident"], "below the band of all cells"),
+        *(patch(f"{_lightness(s):.3f}", f"{s:.0%} of the runs lost") for s in (0.02, 0.25, 0.9)),
     ]

@@ -1,14 +1,24 @@
-"""Colours and file writing that all figures share."""
+"""Colours, labels, sizes and file writing that all figures share."""
 
 from __future__ import annotations
 
+import io
+import textwrap
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+from matplotlib.text import Text
+from matplotlib.ticker import FixedLocator, NullFormatter
+from numpy.typing import ArrayLike
+from scipy.optimize import isotonic_regression
 
 from jaxslam.files import write_atomically
 
@@ -16,6 +26,29 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Okabe and Ito's colours, distinct to the colour-blind."""
 DASHES = ("-", "--", "-.", ":")
 GREY = "#666666"
+COLUMN = 3.4
+"""Width of one column of a paper, inches."""
+LETTERS = 8.0
+"""Points: of labels at lines, and of everything in print."""
+MEDIAN_DASH = (0, (1, 2))
+"""Of the medians, where a line is a mean."""
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+_FITTING = 50
+"""Characters in a line of a column."""
+_POWERS = range(-9, 13)
+_DIGITS = ((4, (1, 1.5, 2, 3, 4, 5, 7)), (20, (1, 2, 3, 5)), (500, (1, 2, 5)), (np.inf, (1,)))
+"""Of the numbers named on an axis whose ends differ by a factor of so much at the most."""
+_SPACED = 1.25
+"""Height of a line of text, in sizes of its letters."""
+
+
+class _Shown(Figure):
+    """A figure that a notebook shows by itself, without pyplot or a magic line."""
+
+    def _repr_png_(self) -> bytes:
+        picture = io.BytesIO()
+        self.savefig(picture, format="png", dpi=100)
+        return picture.getvalue()
 
 
 def line_style(index: int) -> dict[str, Any]:
@@ -25,22 +58,141 @@ def line_style(index: int) -> dict[str, Any]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """A figure in inches, outside pyplot's global state."""
-    figure = Figure(figsize=(width, height), layout="constrained")
+    """A figure in inches, outside pyplot's global state; as a cell's last value it is shown."""
+    figure = _Shown(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def save(figure: Figure, path: str | Path) -> None:
-    """Write the figure whole or not at all."""
-    with write_atomically(path) as temporary:
+    """Write the figure whole or not at all; a PDF with TrueType letters, as publishers ask."""
+    with write_atomically(path) as temporary, mpl.rc_context({"pdf.fonttype": 42}):
         figure.savefig(temporary, dpi=150)
 
 
-def name_decades(axes: Axes) -> None:
-    """Numbers between the powers of ten of a logarithmic axis that has few of them."""
-    bottom, top = axes.get_ylim()
-    if top < 100 * bottom:
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
-        axes.yaxis.set_major_formatter(ScalarFormatter())
-        axes.yaxis.set_minor_formatter(NullFormatter())
+def column_title(text: str) -> str:
+    """Lines that fit on a figure of `COLUMN` width."""
+    return "\n".join(part for line in text.splitlines() for part in textwrap.wrap(line, _FITTING))
+
+
+def for_print(figure: Figure) -> None:
+    """Every letter of a figure of `COLUMN` width at 8 points."""
+    for axes in figure.axes:
+        axes.tick_params(which="both", labelsize=LETTERS)
+    for text in figure.findobj(Text):
+        text.set_fontsize(LETTERS)
+
+
+def set_title(axes: Axes, text: str) -> None:
+    """Above the left end of the axes: in a column there is room to the right of them."""
+    axes.set_title(text, x=0, ha="left", fontsize=9)
+
+
+def name_numbers(axis: Axis) -> None:
+    """Name the round numbers of a logarithmic axis, as many as its length bears, as they are."""
+    low, high = sorted(axis.get_view_interval())
+    digits = next(digits for most, digits in _DIGITS if high <= most * low)
+    axis.set_major_locator(FixedLocator([d * 10.0**power for power in _POWERS for d in digits]))
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
+def same_x(axes: Sequence[Axes]) -> None:
+    """One scale for axes that are compared."""
+    limits = np.array([each.get_xlim() for each in axes])
+    for each in axes:
+        each.set_xlim(limits.min(), limits.max())
+        if each.get_xscale() == "log":
+            name_numbers(each.xaxis)
+
+
+def draw_dots(
+    axes: Axes,
+    values: ArrayLike,
+    rows: ArrayLike,
+    most: float,
+    *,
+    colour: str,
+    marker: str = "o",
+    label: str | None = None,
+) -> None:
+    """A dot for each value along x; of one beyond `most` an arrow to there, and the number.
+
+    What is not finite is an arrow as well, without a number: there is none.
+    """
+    values, rows = np.asarray(values, float), np.asarray(rows, float)
+    inside = values <= most
+    axes.plot(values[inside], rows[inside], marker, color=colour, ms=6, ls="none", label=label)
+    axes.plot(np.full(np.sum(~inside), most), rows[~inside], ls="none")  # the axes reach it
+    for value, row in zip(values[~inside], rows[~inside], strict=True):
+        told = f"{value:.0e}".replace("e+0", "e") if np.isfinite(value) else "no mean"
+        axes.annotate(
+            told, (most, row), (-26, 0), textcoords="offset points", ha="right", va="center",
+            color=colour, fontsize=7, arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.4},
+        )  # fmt: skip
+
+
+class End(NamedTuple):
+    """What a line is called, and where it ends."""
+
+    label: str
+    x: Float[np.ndarray, " n"]
+    y: Float[np.ndarray, " n"]
+    colour: str
+
+
+def label_end(axes: Axes, end: End) -> None:
+    """Write a line's name where it ends, whatever the limits of the axes become."""
+    last = np.flatnonzero(np.isfinite(end.y))[-1:]
+    for i in last:
+        axes.annotate(
+            end.label, (end.x[i], end.y[i]), (4, 0), textcoords="offset points", va="center",
+            color=end.colour, fontsize=LETTERS, annotation_clip=False,
+        )  # fmt: skip
+
+
+def label_ends(axes: Axes, ends: Sequence[End]) -> None:
+    """Write each line's name to the right of the axes, in its colour, where it ends.
+
+    Names that would lie on one another are moved apart, as little as that takes, and joined to
+    their line. To be called when the limits of the axes are set; a line without a number gets
+    none.
+    """
+    ends = [end for end in ends if np.isfinite(end.y).any()]
+    last = [np.flatnonzero(np.isfinite(end.y))[-1] for end in ends]
+    points = np.array([(end.x[i], end.y[i]) for end, i in zip(ends, last, strict=True)])
+    if not ends:
+        return
+    pixels = axes.transData.transform(points)
+    heights = np.clip(axes.transAxes.inverted().transform(pixels)[:, 1], 0, 1)
+    room = _SPACED * LETTERS / 72 / _height(axes)
+    for end, point, height in zip(ends, points, _apart(heights, room), strict=True):
+        axes.annotate(
+            end.label, tuple(point), (1.02, height), textcoords=axes.transAxes, color=end.colour,
+            fontsize=LETTERS, va="center", annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": end.colour, "lw": 0.5, "relpos": (0, 0.5)},
+        )  # fmt: skip
+
+
+def _height(axes: Axes) -> float:
+    """About, in inches: the layout is made later."""
+    return 0.85 * axes.bbox.height / axes.figure.dpi
+
+
+def _apart(places: Float[np.ndarray, " n"], least: float) -> Float[np.ndarray, " n"]:
+    """The places nearest to those given, in squares, that are apart by the least distance."""
+    order = np.argsort(places, kind="stable")
+    steps = least * np.arange(len(places))
+    moved = np.empty(len(places))
+    moved[order] = isotonic_regression(places[order] - steps).x + steps
+    return moved - max(0.0, moved.max() - 1)
+
+
+def short_names(names: Sequence[str]) -> dict[str, str]:
+    """`filter/landmarks` without what all of several have in common."""
+    parts = [name.split("/") for name in names]
+    if len(names) > 1 and all(len(part) == 2 for part in parts):
+        for same, other in ((0, 1), (1, 0)):
+            if len({part[same] for part in parts}) == 1:
+                return {name: part[other] for name, part in zip(names, parts, strict=True)}
+    return {name: name for name in names}

@@ -1,19 +1,22 @@
 """The map of a tracked video: trajectory, reference and landmarks with their uncertainty."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
-from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from jaxslam.plots.landmarks import draw_ellipses
 from jaxslam.plots.style import COLOURS, GREY, new_figure, save
 
 _TRAJECTORY, _REFERENCE, _LANDMARKS, _BEGUN = COLOURS[:4]
 _CHI2_95 = 5.991  # 95 % quantile of chi-squared with two degrees of freedom
+_SIGMAS_95 = math.sqrt(_CHI2_95)
 _MARGIN = 0.06  # around what is shown, as a share of its size
 _WIDTH, _LEAST_HEIGHT, _HEIGHT = 5.0, 0.9, 3.5  # of a panel, inches
 _WORDS, _LEGEND = 0.7, 1.2  # height of a panel's title and label, and of the legend, inches
@@ -57,13 +60,14 @@ def plot_map(
     covariances: ArrayLike,
     *,
     reference: ArrayLike | None = None,
-    path: str | Path,
+    path: str | Path | None = None,
     unit: str = "m",
     lost: ArrayLike = (),
     begun: ArrayLike = (),
     begun_covariances: ArrayLike = (),
-) -> None:
-    """Draw the map from above (x and z) and from behind or the side (y) into the image file `path`.
+) -> Figure:
+    """Draw the map from above (x and z) and from behind or the side (y); written to `path` where
+    one is given.
 
     `trajectory` and `reference` are poses T_wc (n, 4, 4) and (m, 4, 4), drawn as they are (align
     them first); ticks point where the camera looks. `points` (k, 3) and `covariances` (k, 3, 3)
@@ -107,7 +111,32 @@ def plot_map(
         _set_axes(axis, panel, unit)
     entries = panels[-1][0].get_legend_handles_labels()
     figure.legend(*entries, loc="outside lower center", ncols=2, fontsize=8)
-    save(figure, path)
+    if path is not None:
+        save(figure, path)
+    return figure
+
+
+def plot_path(
+    trajectory: ArrayLike,
+    *,
+    ax: Axes,
+    label: str = "estimate",
+    lost: ArrayLike = (),
+    unit: str = "m",
+) -> Axes:
+    """The path of poses T_wc (n, 4, 4) from above: x to the right, z up, in `unit`.
+
+    Ticks point where the camera looks; dotted where it was `lost`, true or false for each pose.
+    """
+    poses = np.asarray(trajectory, dtype=float).reshape(-1, 4, 4)
+    hidden = np.resize(np.asarray(lost, dtype=bool), len(poses))
+    panel = _Panel("from above", [0, 2], _view(poses[:, :3, 3], np.empty((0, 3))))
+    estimate, *predicted = _lines(poses, hidden, np.empty(0, int))
+    for name, line, colour, style in [(label, *estimate[1:]), *predicted]:
+        ax.plot(*line[:, panel.plane].T, style, color=colour, lw=1.6, label=name)
+    _draw_directions(ax, panel, poses)
+    _set_axes(ax, panel, unit)
+    return ax
 
 
 def _lines(
@@ -203,8 +232,8 @@ def _draw_landmarks(
     if not len(points):
         return 0
     points, covariances = panel.seen(points, covariances)
-    shown = 2 * np.sqrt(_CHI2_95 * np.linalg.eigvalsh(covariances)[:, 1]) <= panel.size
-    _draw_ellipses(axis, points[shown], covariances[shown], _LANDMARKS)
+    shown = 2 * _SIGMAS_95 * np.sqrt(np.linalg.eigvalsh(covariances)[:, 1]) <= panel.size
+    draw_ellipses(axis, points[shown], covariances[shown], _SIGMAS_95, _LANDMARKS)
     axis.plot(*points.T, ".", color=_LANDMARKS, ms=3.5, label="landmarks, 95 % in their maps")
     return int((~shown).sum())
 
@@ -217,25 +246,6 @@ def _draw_begun(
 ) -> None:
     """Mark where maps begin, and where in the world that can be."""
     places, covariances = panel.seen(places, covariances)
-    _draw_ellipses(axis, places, covariances, _BEGUN)
+    draw_ellipses(axis, places, covariances, _SIGMAS_95, _BEGUN)
     label = "a map begins, 95 % of where"
     axis.plot(*places.T, "D", color=_BEGUN, ms=6, mfc="white", label=label)
-
-
-def _draw_ellipses(
-    axis: Axes,
-    centres: Float[np.ndarray, "n 2"],
-    covariances: Float[np.ndarray, "n 2 2"],
-    colour: str,
-) -> None:
-    """The 95 % ellipses of Gaussians in the plane."""
-    variances, vectors = np.linalg.eigh(covariances)
-    diameters = 2 * np.sqrt(_CHI2_95 * np.maximum(variances, 0.0))
-    angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
-    axis.add_collection(
-        EllipseCollection(
-            diameters[:, 1], diameters[:, 0], angles, units="xy",
-            offsets=centres, offset_transform=axis.transData,
-            facecolors=colour + "18", edgecolors=colour + "90", linewidths=0.7,
-        )
-    )  # fmt: skip

@@ -43,16 +43,14 @@ def plot_triangulation(comparison: Comparison, path: str | Path | None = None) -
     depth is from the particles' of triangulation: the furthest is the KS distance.
     """
     views = comparison.views
-    distributions = {**comparison.truth, **comparison.estimates}
-    styles = _styles(comparison)
-    depths = _limits(distributions, lambda of: of.z, _FARTHEST * views.depth)
     figure = new_figure(11.5, 5.6)
     grid = figure.add_gridspec(2, 2, width_ratios=[1, 1.25], height_ratios=[1.5, 1])
     density = figure.add_subplot(grid[0, 1])
-    difference = figure.add_subplot(grid[1, 1], sharex=density)
-    _plot_plane(figure.add_subplot(grid[:, 0]), distributions, styles, depths, views.point)
-    _plot_density(density, distributions, styles, depths)
-    _plot_difference(difference, distributions, styles, depths)
+    plot_plane(comparison, ax=figure.add_subplot(grid[:, 0]))
+    plot_density(comparison, ax=density)
+    plot_difference(comparison, ax=figure.add_subplot(grid[1, 1], sharex=density))
+    density.tick_params(labelbottom=False)
+    density.set_xlabel("")
     figure.suptitle(
         f"a point at {views.depth:g} m, pixel {views.pixel:g}, seen from a baseline of "
         f"{views.baseline:g} m; calibration {views.calibration}, $d_{{min}}$ "
@@ -62,6 +60,16 @@ def plot_triangulation(comparison: Comparison, path: str | Path | None = None) -
     if path is not None:
         save(figure, path)
     return figure
+
+
+def _distributions(comparison: Comparison) -> dict[str, Samples]:
+    return {**comparison.truth, **comparison.estimates}
+
+
+def _depths(comparison: Comparison) -> Limits:
+    """Of the axes of depth, m."""
+    farthest = _FARTHEST * comparison.views.depth
+    return _limits(_distributions(comparison), lambda of: of.z, farthest)
 
 
 def _styles(comparison: Comparison) -> dict[str, dict[str, Any]]:
@@ -92,7 +100,16 @@ def _limits(
     return max(low, -farthest / 4), min(high, farthest)
 
 
-def _plot_plane(axes: Axes, distributions, styles, depths: Limits, point) -> None:
+Labels = Mapping[str, str]
+"""Other names of distributions: `{"inverse_depth": "UID"}`."""
+
+
+def plot_plane(comparison: Comparison, *, ax: Axes, label: Labels | None = None) -> Axes:
+    """Regions of 50 % and 95 % in the second camera: x from the ray to the point, and depth, m."""
+    distributions, styles = _distributions(comparison), _styles(comparison)
+    axes, depths, point = ax, _depths(comparison), comparison.views.point
+    axes.set_title("+ the point, particles of triangulation, regions of 50 % and 95 %", fontsize=9)
+
     def sideways(of: Samples) -> np.ndarray:
         with np.errstate(invalid="ignore"):  # ∞ − ∞: no place in the picture
             offset = of.x - point[0] / point[1] * of.z
@@ -113,13 +130,15 @@ def _plot_plane(axes: Axes, distributions, styles, depths: Limits, point) -> Non
             *edges, density.T, levels, colors=style["color"], linestyles=[style["linestyle"]],
             linewidths=1.5,
         )  # fmt: skip
+        if label and name in label:
+            axes.plot([], [], lw=1.5, label=label[name], **style)
     axes.plot(0, point[1], "k+", ms=9, mew=1.5)
     axes.set_xlim(*width)
     axes.set_ylim(*depths)
     axes.set_xlabel("x from the second camera's ray to the point, m")
     axes.set_ylabel("depth z, m")
-    axes.set_title("+ the point, particles of triangulation, regions of 50 % and 95 %", fontsize=9)
     axes.grid(alpha=0.25)
+    return axes
 
 
 def _regions(
@@ -138,7 +157,10 @@ def _regions(
     return [(e[1:] + e[:-1]) / 2 for e in edges], density, sorted(set(levels))
 
 
-def _plot_density(axes: Axes, distributions, styles, limits) -> None:
+def plot_density(comparison: Comparison, *, ax: Axes, label: Labels | None = None) -> Axes:
+    """The density of the depth, 1/m, by triangulation (grey), posterior and estimates."""
+    distributions, styles = _distributions(comparison), _styles(comparison)
+    axes, limits, named = ax, _depths(comparison), {**_LABELS, **(label or {})}
     for name, of in distributions.items():
         counts, edges = np.histogram(of.z, _DEPTH_BINS, range=limits, weights=of.weight)
         width = edges[1] - edges[0]
@@ -146,22 +168,29 @@ def _plot_density(axes: Axes, distributions, styles, limits) -> None:
         centres = edges[:-1] + width / 2
         if name == _TRUTH:
             axes.fill_between(centres, density, color=GREY, alpha=0.25, lw=0)
-        axes.plot(centres, density, lw=1.5, label=_LABELS[name], **styles[name])
+        axes.plot(centres, density, lw=1.5, label=named.get(name, name), **styles[name])
     axes.set_ylabel("density of the depth, 1/m")
     axes.set_ylim(0, 1.15 * axes.get_ylim()[1])
-    axes.tick_params(labelbottom=False)
+    axes.set_xlim(*limits)
+    axes.set_xlabel("depth z, m")
     axes.legend(fontsize=8, loc="upper right")
     axes.grid(alpha=0.25)
+    return axes
 
 
-def _plot_difference(axes: Axes, distributions, styles, limits) -> None:
+def plot_difference(comparison: Comparison, *, ax: Axes, label: Labels | None = None) -> Axes:
+    """How far each distribution function of the depth is from triangulation's."""
+    distributions, styles = _distributions(comparison), _styles(comparison)
+    axes, limits, named = ax, _depths(comparison), label or {}
     depths = np.linspace(*limits, 400)
     functions = {
         name: shares_up_to(marginal(of.z, of.weight), depths) for name, of in distributions.items()
     }
     for name, function in functions.items():
-        axes.plot(depths, function - functions[_TRUTH], lw=1.5, **styles[name])
+        told = named.get(name)
+        axes.plot(depths, function - functions[_TRUTH], lw=1.5, label=told, **styles[name])
     axes.set_xlim(*limits)
     axes.set_xlabel("depth z, m")
     axes.set_ylabel("distribution function\nless triangulation's")
     axes.grid(alpha=0.25)
+    return axes

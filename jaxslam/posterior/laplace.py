@@ -32,9 +32,11 @@ class Laplace(eqx.Module):
 
     mode: Float[Array, " n"]
     root: Float[Array, "n n"]
+    """R."""
     log_density: Float[Array, ""]
     """At the mode; −∞ if every start ended with a measured landmark behind the camera."""
     converged: Bool[Array, ""]
+    """Whether the best start ended at a minimum."""
 
 
 def starts(problem: Problem, key: Array, count: int) -> Float[Array, "count n"]:

@@ -33,7 +33,9 @@ class PoseMixture(eqx.Module):
     """`Σ w_i N(T_i, P_i)`: Gaussians on a pose, by right perturbations."""
 
     means: Pose
+    """T_i, a batch of m."""
     covariances: Float[Array, "m t t"]
+    """P_i: position in camera axes, m, then orientation, rad."""
     weights: Float[Array, " m"]
     """They sum to 1."""
 
@@ -71,7 +73,8 @@ def entropy(draws: Float[Array, "s k"], neighbour: int = NEIGHBOUR) -> Float[Arr
 
     The estimate of Kozachenko and Leonenko (1987) after whitening by the draws' covariance:
     `ψ(s) − ψ(k) + log c + n E log d`, d the distance to the k-th neighbour and c the volume of the
-    unit ball in n dimensions. Of a few hundred draws it is right to about 0.1.
+    unit ball in n dimensions. Of a few hundred draws it is right to about 0.1. Raises
+    ValueError unless there are more draws than `neighbour`.
     """
     count, n = draws.shape
     if not 1 <= neighbour < count:

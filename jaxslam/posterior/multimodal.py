@@ -37,6 +37,7 @@ class Draws(eqx.Module):
     reached: Bool[Array, ""]
     """Whether the whole likelihood was reached; otherwise these are no draws of the posterior."""
     trace: Trace
+    """How the likelihood was reached."""
 
     @property
     def last(self) -> Pose:

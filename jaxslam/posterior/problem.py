@@ -60,6 +60,7 @@ class Unknowns(eqx.Module):
     """The whitened numbers of `jaxslam.window`."""
 
     path: Float[Array, " N"]
+    """The initial velocity and the accelerations, in σ of their prior."""
     landmarks: Float[Array, "l q"]
     """Of each its true pixel in frame 0, then its inverse depth."""
 

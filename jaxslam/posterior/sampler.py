@@ -43,9 +43,10 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 
 @dataclass(frozen=True)
 class HMC:
-    """How long to sample: static configuration."""
+    """How long to sample: static configuration. Raises ValueError for numbers too small."""
 
     chains: int = 4
+    """Independent ones of every problem, by which convergence is seen."""
     warmup: int = 150
     """Steps in which every chain adapts its step size, by dual averaging."""
     draws: int = 300

@@ -56,11 +56,17 @@ key, and `split(key, n)[i]` *is* `fold_in(key, i)`: a small number would be one 
 
 @dataclass(frozen=True)
 class Study:
-    """What to compute for every problem: static configuration."""
+    """What to compute for every problem: static configuration.
+
+    Raises ValueError for a scenario of another generative model, and for numbers out of range.
+    """
 
     scenario: Scenario
+    """The world of all problems."""
     steps: int
+    """After so many the posterior is taken."""
     hmc: HMC = field(default_factory=HMC)
+    """How long to sample."""
     starts: int = 4
     """Starts of Levenberg–Marquardt: the prior mean, and draws from the prior."""
 

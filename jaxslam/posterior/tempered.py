@@ -39,7 +39,8 @@ so that no variable has their length as its period."""
 
 @dataclass(frozen=True)
 class SMC:
-    """How many particles move how far: static configuration."""
+    """How many particles move how far: static configuration. Raises ValueError for numbers out of
+    range."""
 
     particles: int = 2048
     moves: int = 2
@@ -88,11 +89,13 @@ class Particles(eqx.Module):
     """Equally weighted draws of the posterior."""
 
     position: Float[Array, "s n"]
+    """One y each."""
     log_evidence: Float[Array, ""]
     """`log ∫ exp(log likelihood) N(y; 0, I) dy`."""
     reached: Bool[Array, ""]
     """Whether they have moved at β = 1 as often as they should."""
     trace: Trace
+    """How β went from 0 to 1."""
 
 
 class _Carry(NamedTuple):
@@ -107,7 +110,7 @@ class _Carry(NamedTuple):
 
 
 def tempered(settings: SMC, log_likelihood: LogLikelihood, like: Array, key: Array) -> Particles:
-    """Draws of the posterior `∝ exp(log_likelihood(y)) N(y; 0, I)` of a y shaped like `like`."""
+    """Draws of the posterior `∝ exp(log_likelihood(y)) N(y; 0, I)` of a y as `like` (n,) is."""
     first_key, key = jax.random.split(key)
     start = jax.random.normal(first_key, (settings.particles, like.size), like.dtype)
 

@@ -43,7 +43,7 @@ def simulate(
 
     The truth is drawn from the prior of the filters of `make_filters`, or moves along the
     scenario's trajectory; or it moves and is measured as models of one's own say, in the world of
-    the scenario.
+    the scenario. Raises ValueError for a sensor that landmarks of this placement cannot have.
     """
     motion = trajectory_of(scenario, dtype) if motion is None else motion
     s = as_data(scenario, dtype)

@@ -94,13 +94,16 @@ class EkfSlam(AbstractStaged):
     """An EKF for SLAM. Its numbers are leaves: they can be batched and differentiated.
 
     `jaxslam.EkfSlam(motion=ConstantVelocity(…), sensor=Pinhole(camera, 0.3))` is the paper's
-    filter of a camera whose calibration is known.
+    filter of a camera whose calibration is known. Raises ValueError for pieces that do not go
+    together.
     """
 
     motion: AbstractMotion
     sensor: AbstractSensor
     landmark: Parametrization = eqx.field(static=True, default=INVERSE_SCALING)
+    """What is estimated of a landmark, one of `LANDMARKS`."""
     coordinates: Coordinates = eqx.field(static=True, default=ROBOCENTRIC)
+    """Of which frame landmarks are: `ROBOCENTRIC`, `WORLD` or `KEYFRAME`."""
     calibration: AbstractCalibration = Known()
     depth: InverseDepth = InverseDepth.beyond(1.0)
     """The prior on 1/z of a camera's landmarks."""

@@ -46,10 +46,15 @@ class Comparison:
     """Truth and estimates as samples at the exact pixels, and distances for noisy ones."""
 
     views: TwoViews
+    """What was seen, from where."""
     particles: int
+    """So many are the truth."""
     seed: int
+    """Of the particles and of the pixels' noise."""
     truth: Mapping[str, Samples]
+    """`triangulation`, of the pixels alone, and `posterior`, with the filters' prior."""
     estimates: Mapping[str, Samples]
+    """By parametrization."""
     exact: Distances
     """Of the estimates from the pixels without noise."""
     measured: tuple[Distances, ...]

@@ -53,7 +53,9 @@ class TwoViews:
     width: float = Scenario.image[0]
     """Of the picture, pixels."""
     focal: float = Scenario.focal[0]
+    """Length, pixels."""
     centre: float = Scenario.centre[0]
+    """The principal point, pixels."""
     focal_sigma: float = Scenario.focal_sigma
     """σ of the focal length, pixels."""
     centre_sigma: float = Scenario.centre_sigma

@@ -1,8 +1,10 @@
 """The map as a point cloud file: landmarks with their covariances in PLY."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.files import write_atomically
@@ -52,3 +54,31 @@ def write_ply(
     ]
     with write_atomically(path) as temporary:
         temporary.write_text("\n".join(header + rows) + "\n", encoding="ascii")
+
+
+class Cloud(NamedTuple):
+    """What a file of `write_ply` holds."""
+
+    points: Float[np.ndarray, "n 3"]
+    """Map units, in the world frame."""
+    covariances: Float[np.ndarray, "n 3 3"]
+    ids: Int[np.ndarray, " n"]
+    maps: Int[np.ndarray, " n"]
+
+
+def read_ply(path: str | Path) -> Cloud:
+    """Read what `write_ply` wrote. Raises `ValueError` for any other file."""
+    path = Path(path)
+    try:
+        header, _, rows = path.read_text(encoding="ascii").partition("end_header\n")
+        table = np.array([row.split() for row in rows.splitlines()], dtype=float)
+    except (OSError, ValueError):
+        header, table = "", np.zeros(0)
+    named = [line.split()[-1] for line in header.splitlines() if line.startswith("property")]
+    table = table.reshape(-1, len(_PROPERTIES) + 2) if not table.size else table
+    if named != [*_PROPERTIES, "id", "map"] or table.shape[1:] != (len(named),):
+        raise ValueError(f"{path} is not a map.ply as jaxslam track writes it")
+    covariances = np.zeros((len(table), 3, 3))
+    upper = np.triu_indices(3)
+    covariances[:, *upper] = covariances[:, *upper[::-1]] = table[:, 3:9]
+    return Cloud(table[:, :3], covariances, table[:, 9].astype(int), table[:, 10].astype(int))

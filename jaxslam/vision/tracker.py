@@ -133,9 +133,11 @@ class Tracker:
     length is another, which no covariance here knows of.
 
     The mutable part is this object; all mathematics is in pure, jitted functions of the state.
+    Raises ValueError for a filter that cannot track, or cannot begin with the target.
     """
 
     calibration: Calibration
+    """Of the camera, for the size of its pictures."""
     settings: TrackerSettings = field(default_factory=TrackerSettings)
     filter: AbstractStaged | None = None
     """One's own, in place of the filter that the settings name."""
@@ -145,9 +147,13 @@ class Tracker:
     sighting: Sighting | None = field(default=None, init=False)
     """Where the first frame saw the target."""
     landmarks: dict[int, Landmark] = field(default_factory=dict, init=False)
+    """Those in the map, by their slot of the state."""
     created: int = field(default=0, init=False)
+    """Landmarks so far."""
     deleted: int = field(default=0, init=False)
+    """Those of them that were given up."""
     restarts: int = field(default=0, init=False)
+    """Maps begun after the first."""
     steps: int = field(default=0, init=False)
     """Frames given so far."""
     failed: Counter[str] = field(default_factory=Counter, init=False)

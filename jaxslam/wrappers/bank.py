@@ -47,7 +47,11 @@ class BankState(eqx.Module):
 
 
 class Bank(AbstractFilter):
-    """`count` filters `base` for each direction in which the velocity's prior is divided."""
+    """`count` filters `base` for each direction in which the velocity's prior is divided.
+
+    Raises ValueError for fewer than 3, another division, and a base that has no velocity or no
+    covariance of its innovation.
+    """
 
     base: AbstractFilter
     """An `EkfSlam`, or what is built around one."""

@@ -71,7 +71,10 @@ class NormalEquations(NamedTuple):
 
 
 class FixedLag(AbstractFilter):
-    """The smoother around `base`, a filter in covariance form whose landmarks enter undelayed."""
+    """The smoother around `base`, a filter in covariance form whose landmarks enter undelayed.
+
+    Raises ValueError for another base, and for numbers out of range.
+    """
 
     base: EkfSlam
     frames: int = eqx.field(static=True, default=LAG)

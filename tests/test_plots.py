@@ -1,0 +1,160 @@
+"""What all figures share: names at lines, ticks, sizes for print, files, how they are called."""
+
+import importlib
+import inspect
+import itertools
+import pkgutil
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.text import Annotation, Text
+
+import jaxslam
+import jaxslam.plots
+from jaxslam.plots.consistency import plot_consistency
+from jaxslam.plots.evaluation import plot_evaluation
+from jaxslam.plots.style import (
+    COLUMN,
+    End,
+    draw_dots,
+    label_ends,
+    name_numbers,
+    new_figure,
+    save,
+    short_names,
+)
+
+
+def evaluation():
+    rng, sigma = np.random.default_rng(0), np.array([0.1, 0.1, 0.02])
+    errors = 1.3 * sigma * rng.normal(size=(20, 10, 3))
+    return jaxslam.evaluate(errors, np.broadcast_to(np.diag(sigma**2), (20, 10, 3, 3)))
+
+
+def annotations(axes):
+    return [text for text in axes.texts if isinstance(text, Annotation)]
+
+
+def ends(values):
+    x = np.arange(3.0)
+    return [End(f"line {i}", x, np.array([1.0, y, y]), "k") for i, y in enumerate(values)]
+
+
+def places(axes):
+    """Where names stand, in pixels from below, by name."""
+    axes.figure.draw_without_rendering()
+    boxes = {text.get_text(): Text.get_window_extent(text) for text in axes.texts}
+    return {name: (box.y0, box.y1, box.x0) for name, box in boxes.items()}
+
+
+def test_names_stand_where_their_lines_end_and_never_on_one_another():
+    axes = new_figure(5, 3).subplots()
+    axes.set(xlim=(0, 2), ylim=(0, 10))
+    label_ends(axes, ends([2.0, 8.0, 8.01, 8.02]))
+    found = places(axes)
+    alone = found.pop("line 0")
+    assert np.mean(alone[:2]) == pytest.approx(axes.transData.transform((2, 2.0))[1], abs=2)
+    boxes = [found[f"line {i}"] for i in (1, 2, 3)]  # in the order of the lines
+    assert all(below[1] <= above[0] for below, above in itertools.pairwise(boxes))
+    assert all(box[2] >= axes.get_window_extent().x1 for box in boxes)
+
+
+def test_a_line_that_breaks_off_is_named_at_its_last_number_and_one_without_any_is_not():
+    axes = new_figure(5, 3).subplots()
+    axes.set(xlim=(0, 2), ylim=(0, 10))
+    gone, never = np.array([1.0, 7.0, np.nan]), np.full(3, np.nan)
+    label_ends(axes, [End("gone", np.arange(3.0), gone, "k"), End("never", gone, never, "k")])
+    (text,) = annotations(axes)
+    assert (text.get_text(), text.xy) == ("gone", (1.0, 7.0))
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "told"),
+    [
+        (2.2, 6.5, ["3", "4", "5"]),
+        (0.9, 12, ["1", "2", "3", "5", "10"]),
+        (0.9, 300, ["1", "2", "5", "10", "20", "50", "100", "200"]),
+        (0.002, 0.011, ["0.002", "0.003", "0.005", "0.01"]),
+        (0.5, 5000, ["1", "10", "100", "1000"]),
+    ],
+)
+def test_ticks_are_round_numbers_written_out(low, high, told):
+    figure = new_figure(4, 3)
+    axes = figure.subplots()
+    axes.set_yscale("log")
+    axes.set_ylim(low, high)
+    name_numbers(axes.yaxis)
+    figure.draw_without_rendering()
+    ticks = zip(axes.get_yticks(), axes.get_yticklabels(), strict=True)
+    assert [label.get_text() for value, label in ticks if low <= value <= high][: len(told)] == told
+
+
+def test_what_is_beyond_the_axes_is_an_arrow_with_its_number():
+    axes = new_figure(4, 3).subplots()
+    draw_dots(axes, np.array([3.0, 2e5, np.nan, 1000.0]), np.arange(4), 1000.0, colour="k")
+    (dots,) = (line for line in axes.lines if line.get_marker() == "o")
+    np.testing.assert_array_equal(dots.get_xydata(), [[3.0, 0], [1000.0, 3]])
+    assert [(text.get_text(), text.xy) for text in annotations(axes)] == [
+        ("2e5", (1000.0, 1)),
+        ("no mean", (1000.0, 2)),
+    ]
+    assert axes.get_xlim()[1] >= 1000
+
+
+def test_filters_are_named_by_what_tells_them_apart():
+    assert short_names(["a/x", "b/x"]) == {"a/x": "a", "b/x": "b"}
+    assert short_names(["a/x", "a/y"]) == {"a/x": "x", "a/y": "y"}
+    for names in (["a/x"], ["a/x", "b/y"], ["mine", "b/x"]):
+        assert short_names(names) == {name: name for name in names}
+
+
+def test_a_column_for_print_has_its_width_its_letters_and_nothing_outside(tmp_path):
+    scenario = jaxslam.scenario("matched", steps=5)
+    filters = jaxslam.make_filters(scenario, "robocentric", ["inverse_scaling", "inverse_depth"])
+    study = jaxslam.monte_carlo(scenario, filters, runs=4)
+    for figure in (
+        plot_evaluation(evaluation(), column=True),
+        plot_consistency(study, column=True),
+    ):
+        assert figure.get_figwidth() == COLUMN == 3.4
+        save(figure, tmp_path / "figure.pdf")
+        shown = [text for text in figure.findobj(Text) if text.get_text() and text.get_visible()]
+        assert {text.get_fontsize() for text in shown} == {8.0}
+        drawn = figure.get_tightbbox()  # inches
+        assert -0.01 <= drawn.x0 < drawn.x1 <= COLUMN + 0.01
+        written = (tmp_path / "figure.pdf").read_bytes()
+        assert b"/Type3" not in written.replace(b" ", b"")
+        assert b"/FontFile2" in written  # TrueType: type 42
+
+
+def test_a_figure_is_a_picture_in_a_notebook():
+    shown = getattr(new_figure(1, 1), "_repr_png_")  # noqa: B009
+    assert shown().startswith(b"\x89PNG")
+
+
+def plot_functions():
+    for module in pkgutil.iter_modules(jaxslam.plots.__path__):
+        found = vars(importlib.import_module(f"jaxslam.plots.{module.name}"))
+        for name, value in found.items():
+            if name.startswith("plot_") and value.__module__.endswith(module.name):
+                yield pytest.param(value, id=f"{module.name}.{name}")
+
+
+@pytest.mark.parametrize("plot", list(plot_functions()))
+def test_what_draws_a_figure_returns_it_and_what_draws_axes_takes_them(plot):
+    """Whole figures are made of functions that draw into axes of one's own, by a name."""
+    taken, returned = inspect.signature(plot).parameters, inspect.signature(plot).return_annotation
+    if returned in ("Figure", Figure):
+        assert "path" in taken
+        room = importlib.import_module(plot.__module__)
+        assert any("ax" in inspect.signature(f).parameters for f in public_plots(room))
+    else:
+        assert returned in ("Axes", Axes)
+        for name in ("ax", "label"):
+            assert taken[name].kind is inspect.Parameter.KEYWORD_ONLY
+
+
+def public_plots(module):
+    return [value for name, value in vars(module).items() if name.startswith("plot_")]
