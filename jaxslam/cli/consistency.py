@@ -81,6 +81,9 @@ class ConsistencyOptions:
     """Runs in one batch; memory grows with it, results do not depend on it."""
     resume: bool = False
     """Go on from what an interrupted run left in --out."""
+    cluster: str | None = None
+    """Address of a Dask scheduler that runs, as in tcp://127.0.0.1:8786, to whose workers the
+    chunks are handed. Needs the cluster extra."""
     set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FIELD=VALUE …")] = field(
         default_factory=tuple
     )
@@ -130,6 +133,7 @@ class ConsistencyOptions:
                 chunk=self.chunk,
                 store=store,
                 progress=progress,
+                cluster=self.cluster,
             )
 
     def _scenario(self) -> Scenario:
