@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from jaxslam.cli.progress import Progress
 from jaxslam.consistency import (
     CHUNK,
     DTYPES,
@@ -20,7 +21,7 @@ from jaxslam.consistency import (
     table,
     treatment,
 )
-from jaxslam.consistency.montecarlo import check_sizes
+from jaxslam.consistency.montecarlo import check_sizes, divided
 from jaxslam.files import write_atomically
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.names import FILTERS, FROM_REST, MODIFIERS, RECOMMENDED, make_filters
@@ -81,6 +82,9 @@ class ConsistencyOptions:
     """Runs in one batch; memory grows with it, results do not depend on it."""
     resume: bool = False
     """Go on from what an interrupted run left in --out."""
+    cluster: str | None = None
+    """Address of a Dask scheduler that runs, as in tcp://127.0.0.1:8786, to whose workers the
+    chunks are handed. Needs the cluster extra."""
     set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FIELD=VALUE …")] = field(
         default_factory=tuple
     )
@@ -105,8 +109,6 @@ class ConsistencyOptions:
         print(f"wrote {self.out / 'consistency.json'} and {self.out / 'consistency.png'}")
 
     def _study(self) -> Study:
-        from tqdm import tqdm
-
         check_sizes(self.runs, self.seed, self.dtype, self.chunk)
         world = self._scenario()
         filters = make_filters(world, self.filters, self.landmarks, self.calibration)
@@ -119,12 +121,9 @@ class ConsistencyOptions:
             "chunk": self.chunk,
         }
         store = FolderStore(self.out / "runs", manifest, resume=self.resume)
-        with tqdm(total=self.runs * len(filters), unit="run", disable=None) as bar:
-
-            def progress(name: str, done: int) -> None:
-                bar.set_description(name, refresh=False)
-                bar.update(done)
-
+        chunks = divided(self.runs, self.chunk)
+        done = sum(len(c) for name in filters for c in chunks if store.has(name, c))
+        with Progress(self.runs * len(filters), done) as progress:
             return monte_carlo(
                 world,
                 filters,
@@ -134,6 +133,7 @@ class ConsistencyOptions:
                 chunk=self.chunk,
                 store=store,
                 progress=progress,
+                cluster=self.cluster,
             )
 
     def _scenario(self) -> Scenario:

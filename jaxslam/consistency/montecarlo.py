@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 import os
+import threading
 import time
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,9 +25,10 @@ from jaxtyping import Array, Int
 
 from jaxslam.arrays import cast, is_number
 from jaxslam.consistency.beyond_scale import beyond_scale, reversal
+from jaxslam.consistency.cluster import as_tasks, connected
 from jaxslam.consistency.recursion import Frame, run_through
 from jaxslam.consistency.statistics import normalised_squared
-from jaxslam.consistency.store import MemoryStore, Store
+from jaxslam.consistency.store import MemoryStore, Records, Store
 from jaxslam.consistency.summary import Seconds, Study
 from jaxslam.geometry import Pose
 from jaxslam.models.motion import AbstractMotion
@@ -68,6 +69,7 @@ def monte_carlo(
     progress: Callable[[str, int], None] = lambda name, done: None,
     motion: AbstractMotion | Trajectory | None = None,
     sensor: AbstractSensor | None = None,
+    cluster: Any = None,
 ) -> Study:
     """Run every filter on the same simulated runs.
 
@@ -75,24 +77,36 @@ def monte_carlo(
     or a `sensor` of one's own the truth moves, or is measured, as that says, in the scenario's
     world.
 
-    `progress(filter name, finished runs)` is called after every chunk. Chunks that `store`
-    already has are not run again. Raises ValueError for sizes that make no sense.
+    `progress(filter name, finished runs)` is called after every chunk, and with no runs before
+    the first, when the filter is to be compiled. Chunks that `store` already has are not run again.
+
+    With a `cluster`, the address of a Dask scheduler or a `distributed.Client`, the chunks are
+    computed there and kept here; their seconds are of all together, compilation among them.
+
+    Raises ValueError for sizes that make no sense.
     """
     if not filters:
         raise ValueError("no filter to run: name at least one")
     check_sizes(runs, seed, dtype, chunk)
     scenario = as_scenario(scenario)
     store = MemoryStore() if store is None else store
-    chunks = tuple(range(i, min(i + chunk, runs)) for i in range(0, runs, chunk))
+    chunks = divided(runs, chunk)
     seconds = {}
-    with jax.enable_x64(dtype == "float64"):
+    with jax.enable_x64(dtype == "float64"), connected(cluster) as client:
+        each = _side_by_side if client is None else partial(as_tasks, client)
         simulator = _Simulator(scenario, seed, dtype, min(chunk, runs), motion, sensor)
         missing = {name: [c for c in chunks if not store.has(name, c)] for name in filters}
-        room = simulator.room(chunks) if any(missing.values()) else None
+        room = simulator.room(chunks, each) if any(missing.values()) else None
         for name, slam in filters.items():
-            seconds[name] = _run_filter(name, slam, simulator, room, missing[name], store, progress)
+            job = _Job(name, slam, simulator, room)
+            seconds[name] = _run_filter(job, missing[name], store, progress, each)
         device = jax.devices()[0].device_kind
     return Study(scenario, filters, runs, seed, dtype, chunks, store, seconds, device)
+
+
+def divided(runs: int, chunk: int) -> tuple[range, ...]:
+    """So many runs in chunks."""
+    return tuple(range(i, min(i + chunk, runs)) for i in range(0, runs, chunk))
 
 
 class _Simulator:
@@ -108,19 +122,29 @@ class _Simulator:
         sensor: AbstractSensor | None,
     ) -> None:
         motion = trajectory_of(scenario, dtype) if motion is None else motion
+        self._given = scenario, seed, dtype, size, motion, sensor
         self.dtype, self.size = jnp.dtype(dtype), size
         self.sensor = cast(sensor_of(scenario) if sensor is None else sensor, dtype)
         self._own = cast((motion, sensor), dtype)
         self._scenario, self._key = as_data(scenario, dtype), jax.random.key(seed)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For another machine, which has no file of a trajectory, and makes its own key."""
+        return _Simulator, self._given
 
     def __call__(self, chunk: range) -> tuple[Run, Sightings]:
         """The chunk's runs, padded to `size` by the runs that follow."""
         indices = chunk.start + jnp.arange(self.size)
         return _draw(self._scenario, self._own, self._key, indices)
 
-    def room(self, chunks: tuple[range, ...]) -> Room:
+    def most(self, chunk: range) -> Sightings:
+        """Of any of the chunk's runs."""
+        with jax.enable_x64(self.dtype == "float64"):  # a thread's own
+            return jax.tree.map(np.max, jax.device_get(self(chunk)[1]))
+
+    def room(self, chunks: tuple[range, ...], each: Each) -> Room:
         """What holds every run of the study; no frame has more features than a run has slots."""
-        seen = [jax.tree.map(np.max, jax.device_get(self(chunk)[1])) for chunk in chunks]
+        seen = [most for _, most in each(self.most, list(chunks))]
         most = jax.tree.map(lambda *counts: _room_for(int(max(counts))), *seen)
         slots = self(chunks[0])[0].visible.shape[-1]
         return Room(most.landmarks, *(min(n, slots) for n in (most.first, most.known, most.new)))
@@ -137,7 +161,7 @@ def draw(
     with jax.enable_x64(dtype == "float64"):
         simulator = _Simulator(scenario, seed, dtype, runs, None, None)
         batch, _ = simulator(range(runs))
-        return simulator.room((range(runs),)), batch
+        return simulator.room((range(runs),), _side_by_side), batch
 
 
 def _room_for(count: int) -> int:
@@ -161,39 +185,63 @@ def _draw(
     return jax.vmap(one)(indices)
 
 
-def _run_filter(name, slam, simulator, room, chunks, store, progress) -> Seconds:
+class _Job(NamedTuple):
+    """What computes a chunk of a filter's records, here or on another machine."""
+
+    name: str
+    slam: AbstractFilter
+    simulator: _Simulator
+    room: Room | None
+
+    def __call__(self, chunk: range) -> Records:
+        with jax.enable_x64(self.simulator.dtype == "float64"):  # a thread's own
+            batch, _ = self.simulator(chunk)
+            compiled, data = self.program(batch)
+            where = f"{self.name}, runs {chunk.start} to {chunk.stop - 1}"
+            records, sample = jax.device_get(finished(compiled(*data, batch), where))
+        records = {key: np.asarray(value)[: len(chunk)] for key, value in records.items()}
+        return {**records, **{f"sample_{k}": v for k, v in sample.items()}}
+
+    def program(self, batch: Run) -> tuple[jax.stages.Compiled, tuple[Any, ...]]:
+        """And what it is called with before the batch; many threads that ask compile it once."""
+        numbers, structure = eqx.partition(cast(self.slam, self.simulator.dtype), is_number)
+        data = (numbers, self.simulator.sensor)
+        shapes = _hashable(_shapes((*data, batch)))
+        with _COMPILING:
+            return _compiled(*_hashable(structure), self.room, *shapes), data
+
+
+_COMPILING = threading.Lock()
+
+Each = Callable[[Callable[[range], Any], list[range]], Iterator[tuple[range, Any]]]
+"""Chunks, as they are finished, with what a function makes of them."""
+
+
+def _run_filter(
+    job: _Job, chunks: list[range], store: Store, progress: Callable[[str, int], None], each: Each
+) -> Seconds:
     if not chunks:
         return Seconds(0.0, 0.0)
+    progress(job.name, 0)
     start = time.perf_counter()
-    numbers, structure = eqx.partition(cast(slam, simulator.dtype), is_number)
-    batch, _ = simulator(chunks[0])
-    data = (numbers, simulator.sensor)
-    compiled = _compiled(*_hashable(structure), room, *_hashable(_shapes((*data, batch))))
+    if each is _side_by_side:
+        job.program(job.simulator(chunks[0])[0])
     compiled_at = time.perf_counter()
-
-    def computed(chunk: range) -> Any:
-        with jax.enable_x64(simulator.dtype == "float64"):  # a thread's own
-            batch, _ = simulator(chunk)
-            where = f"{name}, runs {chunk.start} to {chunk.stop - 1}"
-            return jax.device_get(finished(compiled(*data, batch), where))
-
-    for chunk, (records, sample) in _side_by_side(computed, chunks):
-        records = {key: np.asarray(value)[: len(chunk)] for key, value in records.items()}
-        store.save(name, chunk, {**records, **{f"sample_{k}": v for k, v in sample.items()}})
-        progress(name, len(chunk))
+    for chunk, records in each(job, chunks):
+        store.save(job.name, chunk, records)
+        progress(job.name, len(chunk))
     return Seconds(compiled_at - start, time.perf_counter() - compiled_at)
 
 
 def _side_by_side(function: Callable[[range], Any], chunks: list[range]) -> Iterator[Any]:
-    """Chunks in order with what the function makes of them, on a CPU one in each processor: a
-    program's matrices are too small to be divided. What has not begun is dropped on an error."""
+    """As they are finished, on a CPU one in each processor: a program's matrices are too small to
+    be divided. What has not begun is dropped on an error."""
     alone = jax.default_backend() != "cpu" or len(chunks) == 1
     with ThreadPoolExecutor(1 if alone else processors()) as pool:
-        waiting = deque((chunk, pool.submit(function, chunk)) for chunk in chunks)
+        waiting = {pool.submit(function, chunk): chunk for chunk in chunks}
         try:
-            while waiting:  # what has been told is not kept
-                chunk, result = waiting.popleft()
-                yield chunk, result.result()
+            for future in as_completed(waiting):
+                yield waiting.pop(future), future.result()  # what has been told is not kept
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
 

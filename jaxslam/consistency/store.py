@@ -56,6 +56,8 @@ class FolderStore:
         wanted = json.loads(json.dumps(manifest))
         if resume and path.exists():
             _check_same(path, read_json(path, "manifest", _as_manifest), wanted)
+            for unfinished in folder.glob("*/.*.npz"):  # by a process that was killed
+                unfinished.unlink(missing_ok=True)
         else:
             for old in folder.glob("*/*.npz"):
                 old.unlink()

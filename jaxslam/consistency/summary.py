@@ -26,8 +26,8 @@ RECORDS = (
     "error", "variance", "landmark_nees", "landmark_count", "landmark_not_finite",
 )  # fmt: skip
 """What a summary reads of the records of a run."""
-_STEPS_AT_ONCE = 50
-"""Steps of which the median holds all runs in memory."""
+_VALUES_AT_ONCE = 10**7
+"""Of which the median holds all runs in memory: of as many steps as this makes."""
 
 
 @dataclass(frozen=True)
@@ -278,9 +278,9 @@ def _median(
     of: Callable[[np.ndarray], np.ndarray] = lambda values: values,
 ) -> np.ndarray:
     """Median over all runs, diverged ones above everything."""
-    medians = []
-    for start in range(0, study.scenario.steps, _STEPS_AT_ONCE):
-        part = slice(start, start + _STEPS_AT_ONCE)
+    medians, at_once = [], max(1, _VALUES_AT_ONCE // study.runs)
+    for start in range(0, study.scenario.steps, at_once):
+        part = slice(start, start + at_once)
         columns = [
             np.where(_healthy(records)[:, None], of(records[record]), np.inf)[:, part]
             for records in _chunks(study, name, ("nees", record))

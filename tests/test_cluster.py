@@ -1,0 +1,115 @@
+"""Tests of studies on a Dask cluster: the same numbers as here, although a worker is killed."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+import jaxslam
+from jaxslam.cli import main
+from jaxslam.consistency.montecarlo import _Job, _side_by_side, _Simulator, divided
+
+SCENARIO = jaxslam.scenario("matched-tight", steps=4, landmarks=3)
+RUNS, CHUNK = 120, 3
+
+
+def filters():
+    return jaxslam.make_filters(SCENARIO, ["robocentric"], ["inverse_scaling"])
+
+
+def records(study):
+    (name,) = study.filters
+    return [study.store.load(name, chunk) for chunk in study.chunks]
+
+
+def assert_same(found, wanted):
+    for one, other in zip(found, wanted, strict=True):
+        assert one.keys() == other.keys()
+        for key in one:
+            np.testing.assert_array_equal(one[key], other[key], err_msg=key)
+
+
+@pytest.fixture
+def processes():
+    """A scheduler's address and the processes of two workers, as a person starts them."""
+    distributed = pytest.importorskip("distributed")
+    # Workers compile as the tests do.
+    env = {**os.environ, "JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
+    started = []
+
+    def start(program, *arguments):
+        command = [sys.executable, "-m", f"distributed.cli.dask_{program}", *arguments]
+        started.append(subprocess.Popen(command, env=env, stderr=subprocess.DEVNULL))
+
+    port = distributed.utils.open_port()
+    address = f"tcp://127.0.0.1:{port}"
+    start("scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard", "--no-show")
+    for _ in range(2):
+        start("worker", address, "--no-nanny", "--nthreads", "1", "--no-dashboard")
+    yield address, started[1:]
+    for process in started:
+        process.kill()
+    for process in started:
+        process.wait(30)
+
+
+@pytest.mark.timeout(180)
+def test_a_study_on_a_cluster_is_the_same_although_a_worker_is_killed(processes, tmp_path):
+    address, workers = processes
+    from distributed import Client
+
+    done = []
+
+    def progress(name, runs):
+        done.append(runs)
+        if sum(done) == 5 * CHUNK:
+            workers[0].send_signal(signal.SIGKILL)
+            assert workers[0].wait(30) == -signal.SIGKILL
+
+    with Client(address, timeout=60, set_as_default=False) as client:
+        client.wait_for_workers(2, timeout=90)
+        sizes = {"runs": RUNS, "chunk": CHUNK}
+        study = jaxslam.monte_carlo(SCENARIO, filters(), **sizes, cluster=client, progress=progress)
+        assert len(client.nthreads()) == 1  # it was killed before the end
+    wanted = jaxslam.monte_carlo(SCENARIO, filters(), **sizes)
+    assert sum(done) == RUNS
+    assert_same(records(study), records(wanted))
+    found, expected = (jaxslam.summarise(s)["filters"] for s in (study, wanted))
+    for one, other in zip(found.values(), expected.values(), strict=True):
+        del one["seconds"], other["seconds"]
+    assert found == expected
+
+
+def test_nobody_at_an_address_is_said_in_one_line(tmp_path, capsys, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("jaxslam.consistency.cluster.PATIENCE", 0.5)
+    command = ["consistency", "--scenario", "matched-tight", "--out", str(tmp_path / "out")]
+    with pytest.raises(SystemExit) as stop:
+        main([*command, "--cluster", "tcp://127.0.0.1:9"])
+    error = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert "no Dask scheduler answers at 'tcp://127.0.0.1:9'" in error
+    assert error.count("\n") == 1
+
+
+def test_without_the_extra_a_study_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ValueError, match=r"pip install 'jaxslam\[cluster\]'"):
+        jaxslam.monte_carlo(SCENARIO, filters(), runs=2, cluster="tcp://127.0.0.1:9")
+
+
+def test_what_computes_a_chunk_survives_a_pickle():
+    """In whatever precision the process is: this one's is float64."""
+    cloudpickle = pytest.importorskip("cloudpickle")
+    with jax.enable_x64(False):
+        (name, slam) = next(iter(filters().items()))
+        simulator = _Simulator(SCENARIO, 5, "float32", 2, None, None)
+        job = _Job(name, slam, simulator, simulator.room(divided(4, 2), _side_by_side))
+        whole = cloudpickle.dumps(job)
+        again = cloudpickle.loads(whole)
+    assert len(whole) < 20_000
+    assert_same([again(range(2, 4))], [job(range(2, 4))])
