@@ -1,0 +1,138 @@
+"""The steps of a program on elements: operations, and what is more than an operation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from jaxslam.native.elements import Elements, Refs
+
+
+@dataclass(frozen=True)
+class Apply:
+    """Operations that do not depend on one another."""
+
+    made: Refs
+
+
+@dataclass(frozen=True)
+class Product:
+    """`C = A Bᵀ`."""
+
+    made: Refs
+    """m × n."""
+    left: Refs
+    """m × k."""
+    right: Refs
+    """n × k."""
+
+
+@dataclass(frozen=True)
+class Take:
+    """`made[e] = table[which[e]]`, in every run another."""
+
+    made: Refs
+    table: Refs
+    which: Refs
+
+
+@dataclass(frozen=True)
+class Put:
+    """A copy of `table` with `values[e]` at `which[e]`, or added there; dropped where −1."""
+
+    made: Refs
+    table: Refs
+    which: Refs
+    values: Refs
+    add: bool
+
+
+@dataclass(frozen=True)
+class Sort:
+    """Rows of all arrays by the first `keys` of them, stable."""
+
+    made: Refs
+    """arrays × rows × n."""
+    given: Refs
+    keys: int
+
+
+@dataclass(frozen=True)
+class Loop:
+    """`length` times: `carry ← after`; carry is `before` at first."""
+
+    steps: list[Any]
+    length: int
+    reverse: bool
+    carry: Refs
+    before: Refs
+    after: Refs
+    read: Refs
+    """Variables, of which in turn t is row t of `rows`."""
+    rows: Refs
+    written: Refs
+    """Row t is what `results` are in turn t."""
+    results: Refs
+
+
+@dataclass(frozen=True)
+class While:
+    """`carry ← after` as long as `going`, in every run for itself."""
+
+    condition: list[Any]
+    steps: list[Any]
+    carry: Refs
+    before: Refs
+    after: Refs
+    going: Refs
+    """One."""
+
+
+@dataclass(frozen=True)
+class Program:
+    """A function of arrays: elements, how they are computed, and what goes in and out."""
+
+    elements: Elements
+    steps: list[Any]
+    inputs: list[Refs]
+    outputs: list[Refs]
+
+
+def read_by(step: Any) -> list[Refs]:
+    """Elements that have to be in memory for a step that is not an `Apply`; a loop's last."""
+    match step:
+        case Product():
+            return [step.left, step.right]
+        case Take():
+            return [step.table, step.which]
+        case Put():
+            return [step.table, step.which, step.values]
+        case Sort():
+            return [step.given]
+        case Loop():
+            return [step.before, step.rows]
+        case While():
+            return [step.before]
+    return []
+
+
+def read_at_end(step: Any) -> list[Refs]:
+    """What a loop reads after its steps."""
+    match step:
+        case Loop():
+            return [step.after, step.results]
+        case While():
+            return [step.after, step.going]
+    return []
+
+
+def written_by(step: Any) -> list[Refs]:
+    """Elements that a step writes itself."""
+    match step:
+        case Loop():
+            return [step.carry, step.read, step.written]
+        case While():
+            return [step.carry]
+    return [np.asarray(step.made)]
