@@ -15,7 +15,7 @@ from jaxslam.native.program import (
     Product,
     Program,
     While,
-    read_at_end,
+    read_in_turn,
     read_by,
     written_by,
 )
@@ -252,7 +252,7 @@ class _Places:
         for inner in inside(step):
             self.visit(inner, within)
         self.clock = end
-        for refs in [*read_at_end(step), *written_by(step)]:
+        for refs in [*read_in_turn(step), *written_by(step)]:
             self.read(self.used(refs), within)
 
     def fit(self) -> None:

@@ -111,18 +111,16 @@ def read_by(step: Any) -> list[Refs]:
             return [step.table, step.which, step.values]
         case Sort():
             return [step.given]
-        case Loop():
-            return [step.before, step.rows]
-        case While():
+        case Loop() | While():
             return [step.before]
     return []
 
 
-def read_at_end(step: Any) -> list[Refs]:
-    """What a loop reads after its steps."""
+def read_in_turn(step: Any) -> list[Refs]:
+    """What a loop reads in every turn, beside its steps."""
     match step:
         case Loop():
-            return [step.after, step.results]
+            return [step.rows, step.after, step.results]
         case While():
             return [step.after, step.going]
     return []
