@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxslam.native.elements import CONSTANT, NAMES, OPERATIONS, Refs
-from jaxslam.native.plan import Plan, arity, leaves
+from jaxslam.native.plan import Plan, arity
 from jaxslam.native.program import Apply, Loop, Product, Put, Sort, Take, While
 
 PRELUDE = Path(__file__).with_name("prelude.hpp")
@@ -94,7 +94,7 @@ class _Writer:
             case While():
                 return self.repeat(step)
             case Product():
-                return self.product(step) if self.plan.live[step.made].any() else ""
+                return self.product(step) if self.wanted(step).any() else ""
         if not self.plan.live[step.made].any():
             return ""
         made = self.tables(self.offset(step.made))
@@ -123,7 +123,7 @@ class _Writer:
 
     def of_form(self, refs: Refs, form: int) -> str:
         """Numbers of one form."""
-        sources = leaves(self.plan, refs)
+        sources = self.plan.leaves(refs)
         places = [self.literal(x) or self.offset(x) for x in sources]
         return self.loop_over(places, self.offset(refs), self.text(form))
 
@@ -192,19 +192,24 @@ class _Writer:
         self.local[int(to[e])] = name
         return f"const V {name} = {text.format(*names)}; AT({to[e]}) = {name};"
 
+    def wanted(self, step: Product) -> np.ndarray:
+        """Which numbers of a product are used."""
+        return (step.made >= 0) & self.plan.live[step.made]
+
     def product(self, step: Product) -> str:
         """By the tiles that cost least, of what is not zero."""
-        alive = self.plan.live[step.made]
+        alive = self.wanted(step)
         rows, columns = alive.any(1), alive.any(0)
         made = np.where(alive, step.made, -1)[np.ix_(rows, columns)]
+        addend = made if step.addend is None else step.addend[np.ix_(rows, columns)]
         left, right = step.left[rows], step.right[columns]
         there = [~self.elements.is_zero(x) for x in (left, right)]
         tiled = [(_cost(*there, *tile), tile) for tile in TILES]
         _, (M, N) = min(tiled)
         tables, tiles = self.tiled(left, M), self.tiled(right, N)
-        lists, starts, chosen, places = [], {}, [], []
+        lists, starts, chosen, places, added = [], {}, [], [], []
         groups = [_padded(x, size) for x, size in zip(there, (M, N), strict=True)]
-        near = _padded_places(made, M, N)
+        near, plus = (_padded_places(x, M, N) for x in (made, addend))
         for i, row in enumerate(groups[0]):
             for j, column in enumerate(groups[1]):
                 k = np.flatnonzero(row.any(0) & column.any(0)).astype(np.int16)
@@ -212,13 +217,21 @@ class _Writer:
                     starts[k.tobytes()] = sum(map(len, lists))
                     lists.append(k)
                 begin = starts[k.tobytes()]
+                if np.all(near[i, j] < 0):
+                    continue
                 chosen.append((i * left.shape[1] * M, j * right.shape[1] * N, begin, len(k)))
                 places.append(near[i, j])
-        to = np.array(places)
-        to = np.where(to < 0, self.trash, self.plan.slot[to] * BYTES)
+                added.append(plus[i, j])
+        to, plus = (self.or_trash(np.array(x)) for x in (places, added))
         arguments = [tables, tiles, self.tables(to), self.tables(np.concatenate(lists), "int16_t")]
         arguments += [self.tables(np.array(chosen)), str(len(chosen))]
-        return f"product<{M}, {N}>(m, {', '.join(arguments)});"
+        sign = 0 if step.addend is None else step.sign
+        arguments += [self.tables(plus) if sign else "nullptr"]
+        return f"product<{M}, {N}, {sign}>(m, {', '.join(arguments)});"
+
+    def or_trash(self, refs: Refs) -> np.ndarray:
+        """Bytes, of −1 where nothing is."""
+        return np.where(refs < 0, self.trash, self.plan.slot[refs] * BYTES)
 
     def tiled(self, refs: Refs, size: int) -> str:
         """Places of a tile's rows for every k."""

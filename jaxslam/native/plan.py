@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from jaxslam.native.elements import CONSTANT, VARIABLE, Refs
+from jaxslam.native.elements import CODES, CONSTANT, NAMES, OPERATIONS, VARIABLE, Refs
+from jaxslam.native.fuse import fused
 from jaxslam.native.program import (
     Apply,
     Loop,
@@ -42,13 +43,23 @@ class Plan:
     slots: int = 0
     """In all."""
 
+    def leaves(self, refs: Refs) -> list[Refs]:
+        """What is read from memory for elements of one form, in the order of its text."""
+        code, *operands = self.forms[self.form[refs[0]]]
+        found = []
+        for k, operand in enumerate(operands[: arity(code)]):
+            argument = self.program.elements.arguments[refs, k]
+            found += self.leaves(argument) if operand else [argument]
+        return found
+
 
 def plan(program: Program) -> Plan:
     """Liveness, expressions and places of a program."""
     live, needed = _live(program)
-    inlined = _inlined(program, live, needed)
+    inlined, uses = _inlined(program, live, needed)
     form, forms = _forms(program, live, inlined)
     result = Plan(program, live, inlined, form, forms, np.full(live.size, -1, np.int64))
+    result.program = replace(program, steps=fused(result, uses))
     _Places(result).assign()
     return result
 
@@ -94,16 +105,28 @@ def _live(program: Program) -> tuple[np.ndarray, np.ndarray]:
     return live, needed
 
 
-def _inlined(program: Program, live: np.ndarray, needed: np.ndarray) -> np.ndarray:
-    """Operations that only one other operation uses, in the same loop."""
+def _inlined(program: Program, live, needed) -> tuple[np.ndarray, np.ndarray]:
+    """Operations that only one other operation uses, in the same loop; and numbers of uses.
+
+    What is added to a product of matrices is not among them, but part of that product.
+    """
     elements = program.elements
     computed = np.flatnonzero(live & (elements.code > VARIABLE))
     arguments = elements.arguments[computed]
     uses, user = np.zeros(elements.size, np.int64), np.zeros(elements.size, np.int64)
     np.add.at(uses, arguments, 1)
     user[arguments] = computed[:, None]
-    once = live & ~needed & (elements.code > VARIABLE) & (uses == 1)
-    return once & (elements.region == elements.region[user])
+    uses += needed
+    once = live & (elements.code > VARIABLE) & (uses == 1) & ~needed
+    product, added = np.zeros(elements.size, bool), [CODES["add"], CODES["sub"]]
+    each(program.steps, lambda step: _mark(step, product))
+    once &= ~(np.isin(elements.code, added) & product[elements.arguments].any(1))
+    return once & (elements.region == elements.region[user]), uses
+
+
+def _mark(step: Any, product: np.ndarray) -> None:
+    if isinstance(step, Product):
+        product[step.made] = True
 
 
 def _forms(program: Program, live, inlined) -> tuple[np.ndarray, list[tuple[int, ...]]]:
@@ -151,21 +174,8 @@ def inside(step: Any) -> list[list[Any]]:
     return []
 
 
-def leaves(plan: Plan, refs: Refs) -> list[Refs]:
-    """What is read from memory for elements of one form, in the order of its text."""
-    elements = plan.program.elements
-    code, *operands = plan.forms[plan.form[refs[0]]]
-    found = []
-    for k, operand in enumerate(operands[: arity(code)]):
-        argument = elements.arguments[refs, k]
-        found += leaves(plan, argument) if operand else [argument]
-    return found
-
-
 def arity(code: int) -> int:
     """Operands of an operation."""
-    from jaxslam.native.elements import NAMES, OPERATIONS
-
     text = OPERATIONS[NAMES[code - 2]].text
     return 3 if "{2}" in text else 2 if "{1}" in text else 1
 
@@ -241,7 +251,7 @@ class _Places:
         made = step.made[plan.live[step.made] & ~plan.inlined[step.made]]
         self.write(made, around)
         for form in np.unique(plan.form[made]):
-            for refs in leaves(plan, made[plan.form[made] == form]):
+            for refs in plan.leaves(made[plan.form[made] == form]):
                 self.read(refs, around)
 
     def loop(self, step, around) -> None:

@@ -65,13 +65,20 @@ static inline bool l_any(V x) {
   return false;
 }
 
-// C = A Bᵀ by tiles of M × N sums. A tile is its rows' and its columns' places for every k, of which
+// A Bᵀ, or C + SIGN A Bᵀ, by tiles of M × N sums. A tile is its rows' and its columns' places for every k, of which
 // those count that are in a list: first row, first column, begin of the list, and its length.
-template <int M, int N>
+template <int M, int N, int SIGN>
 static void product(char *m, const int *A, const int *B, const int *places, const int16_t *list,
-                    const int *tile, int tiles) {
+                    const int *tile, int tiles, const int *addend) {
   for (; tiles; --tiles, tile += 4, places += M * N) {
     V sum[M][N] = {};
+    if (SIGN) {
+#pragma GCC unroll 16
+      for (int i = 0; i < M; ++i)
+#pragma GCC unroll 16
+        for (int j = 0; j < N; ++j) sum[i][j] = AT(addend[i * N + j]);
+      addend += M * N;
+    }
     const int *a = A + tile[0], *b = B + tile[1];
     const int16_t *k = list + tile[2];
     for (const int16_t *end = k + tile[3]; k < end; ++k) {
@@ -83,7 +90,7 @@ static void product(char *m, const int *A, const int *B, const int *places, cons
       for (int j = 0; j < N; ++j) {
         const V y = AT(column[j]);
 #pragma GCC unroll 16
-        for (int i = 0; i < M; ++i) sum[i][j] += x[i] * y;
+        for (int i = 0; i < M; ++i) sum[i][j] += SIGN < 0 ? -(x[i] * y) : x[i] * y;
       }
     }
 #pragma GCC unroll 16

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from jaxslam.native.elements import Elements, Refs
 
 
@@ -19,14 +17,17 @@ class Apply:
 
 @dataclass(frozen=True)
 class Product:
-    """`C = A Bᵀ`."""
+    """`A Bᵀ`, or `C ± A Bᵀ`."""
 
     made: Refs
-    """m × n."""
+    """m × n; −1 where none is wanted."""
     left: Refs
     """m × k."""
     right: Refs
     """n × k."""
+    addend: Refs | None = None
+    """C."""
+    sign: int = 1
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,8 @@ def read_by(step: Any) -> list[Refs]:
     """Elements that have to be in memory for a step that is not an `Apply`; a loop's last."""
     match step:
         case Product():
-            return [step.left, step.right]
+            added = [] if step.addend is None else [step.addend[step.made >= 0]]
+            return [step.left, step.right, *added]
         case Take():
             return [step.table, step.which]
         case Put():
@@ -133,4 +135,4 @@ def written_by(step: Any) -> list[Refs]:
             return [step.carry, step.read, step.written]
         case While():
             return [step.carry]
-    return [np.asarray(step.made)]
+    return [step.made[step.made >= 0]]
