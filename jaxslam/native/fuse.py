@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 MANY = 64
 """Sums of products from which on they are looked at as a product of matrices."""
+FILLED = 1.3
+"""Of a block at most so many times what is wanted."""
 Terms = list[tuple[int, list[int]]]
 """Sign, and leaves of a form of which the product is meant: one or two."""
 
@@ -121,17 +123,27 @@ def _factors(refs: Refs, terms: Terms, sources: list[Refs]) -> list[Product] | N
     rows, row = np.unique(first, axis=0, return_inverse=True)
     columns, column = np.unique(second, axis=0, return_inverse=True)
     row, column = row.ravel(), column.ravel()
-    met: dict[bytes, list[int]] = {}
-    order = np.lexsort((column, row))
-    for members in np.split(order, np.flatnonzero(np.diff(row[order])) + 1):
-        met.setdefault(column[members].tobytes(), []).append(members)
-    if len(met) * 2 > len(rows) or len(rows) * len(columns) < refs.size:
+    part = _parts(row, column)
+    blocks = [np.flatnonzero(part == k) for k in np.unique(part)]
+    grids = [[np.unique(x[block]) for x in (row, column)] for block in blocks]
+    if sum(len(a) * len(b) for a, b in grids) > FILLED * refs.size or len(blocks) * 2 > len(rows):
         return None
-    return [
-        Product(
-            np.stack([refs[x] for x in blocks]),
-            rows[[row[x[0]] for x in blocks]],
-            columns[column[blocks[0]]],
-        )
-        for blocks in met.values()
-    ]
+    products = []
+    for block, (own, across) in zip(blocks, grids, strict=True):
+        made = np.full((len(own), len(across)), -1)
+        made[np.searchsorted(own, row[block]), np.searchsorted(across, column[block])] = refs[block]
+        products.append(Product(made, rows[own], columns[across]))
+    return products
+
+
+def _parts(row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Of pairs of a row and a column, those that hang together have one number."""
+    part = np.arange(row.size)
+    while True:
+        before = part
+        for where in (row, column):
+            least = np.full(where.max() + 1, row.size)
+            np.minimum.at(least, where, part)
+            part = least[where]
+        if np.array_equal(part, before):
+            return part

@@ -68,7 +68,7 @@ static inline bool l_any(V x) {
 // A Bᵀ, or C + SIGN A Bᵀ, by tiles of M × N sums. A tile is its rows' and its columns' places for every k, of which
 // those count that are in a list: first row, first column, begin of the list, and its length.
 template <int M, int N, int SIGN>
-static void product(char *m, const int *A, const int *B, const int *places, const int16_t *list,
+__attribute__((noinline)) static void product(char *m, const int *A, const int *B, const int *places, const int16_t *list,
                     const int *tile, int tiles, const int *addend) {
   for (; tiles; --tiles, tile += 4, places += M * N) {
     V sum[M][N] = {};
@@ -81,6 +81,7 @@ static void product(char *m, const int *A, const int *B, const int *places, cons
     }
     const int *a = A + tile[0], *b = B + tile[1];
     const int16_t *k = list + tile[2];
+    asm("" : "+r"(a), "+r"(b));  // two pointers, not one for every row of a known table
     for (const int16_t *end = k + tile[3]; k < end; ++k) {
       const int *row = a + *k * M, *column = b + *k * N;
       V x[M];

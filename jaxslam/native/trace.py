@@ -13,6 +13,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 from jax.interpreters import partial_eval
 
+from jaxslam.linalg import symmetric_part
 from jaxslam.native.elements import OPERATIONS, Elements, Refs
 from jaxslam.native.program import Apply, Loop, Product, Program, Put, Sort, Take, While
 
@@ -76,6 +77,8 @@ class Tracer:
     def one(self, equation: Any, arguments: list[Refs]) -> list[Refs]:
         """One operation, by its rule."""
         name, parameters = equation.primitive.name, equation.params
+        if name in INNER and parameters.get("name") == symmetric_part.__name__:
+            return [_mirrored(arguments[0])]
         if name in INNER:
             return self.closed(parameters[INNER[name]], arguments)
         if name in MOVES:
@@ -120,6 +123,12 @@ INNER = {
     "custom_vjp_call_jaxpr": "fun_jaxpr",
 }
 """Functions within, by the parameter that holds them."""
+
+def _mirrored(x: Refs) -> Refs:
+    """The lower half above too."""
+    lower = np.tri(x.shape[-1], dtype=bool)
+    return np.where(lower, x, np.swapaxes(x, -1, -2))
+
 
 # What only moves numbers: functions of the primitive's parameters and of arrays of elements.
 
