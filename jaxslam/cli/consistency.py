@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import tyro
 
 from jaxslam.consistency import (
+    BACKENDS,
     CHUNK,
     DTYPES,
     FolderStore,
@@ -20,7 +21,7 @@ from jaxslam.consistency import (
     table,
     treatment,
 )
-from jaxslam.consistency.montecarlo import check_sizes
+from jaxslam.consistency.montecarlo import check_backend, check_sizes
 from jaxslam.files import write_atomically
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.names import FILTERS, FROM_REST, MODIFIERS, RECOMMENDED, make_filters
@@ -79,6 +80,9 @@ class ConsistencyOptions:
     dtype: Annotated[str, tyro.conf.arg(help=f"Precision: {', '.join(DTYPES)}.")] = "float64"
     chunk: int = CHUNK
     """Runs in one batch; memory grows with it, results do not depend on it."""
+    backend: Annotated[
+        str, tyro.conf.arg(help=f"What computes: {', '.join(BACKENDS)} (needs a C++ compiler).")
+    ] = "xla"
     resume: bool = False
     """Go on from what an interrupted run left in --out."""
     set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FIELD=VALUE …")] = field(
@@ -104,6 +108,7 @@ class ConsistencyOptions:
         from tqdm import tqdm
 
         check_sizes(self.runs, self.seed, self.dtype, self.chunk)
+        check_backend(self.backend)
         world = self._scenario()
         filters = make_filters(world, self.filters, self.landmarks, self.calibration)
         manifest = {
@@ -113,6 +118,7 @@ class ConsistencyOptions:
             "seed": self.seed,
             "dtype": self.dtype,
             "chunk": self.chunk,
+            **({} if self.backend == "xla" else {"backend": self.backend}),
         }
         store = FolderStore(self.out / "runs", manifest, resume=self.resume)
         with tqdm(total=self.runs * len(filters), unit="run", disable=None) as bar:
@@ -128,6 +134,7 @@ class ConsistencyOptions:
                 seed=self.seed,
                 dtype=self.dtype,
                 chunk=self.chunk,
+                backend=self.backend,
                 store=store,
                 progress=progress,
             )

@@ -79,12 +79,14 @@ def _live(program: Program) -> tuple[np.ndarray, np.ndarray]:
                 case Apply():
                     live[arguments[step.made[live[step.made]]]] = True
                 case Loop():
+                    need(step.carry)
                     need(step.after)
                     need(step.results[live[step.written].any(0)])
                     visit(step.steps)
                     need(step.before)
                     need(step.rows[:, live[step.read]])
                 case While():
+                    need(step.carry)
                     need(step.after)
                     visit(step.steps)
                     need(step.going)
