@@ -210,8 +210,9 @@ class _Writer:
         lists, starts, chosen, places, added = [], {}, [], [], []
         groups = [_padded(x, size) for x, size in zip(there, (M, N), strict=True)]
         near, plus = (_padded_places(x, M, N) for x in (made, addend))
-        for i, row in enumerate(groups[0]):
-            for j, column in enumerate(groups[1]):
+        # Columns outside: theirs stay in the nearest cache.
+        for j, column in enumerate(groups[1]):
+            for i, row in enumerate(groups[0]):
                 k = np.flatnonzero(row.any(0) & column.any(0)).astype(np.int16)
                 if k.tobytes() not in starts:
                     starts[k.tobytes()] = sum(map(len, lists))
@@ -356,7 +357,8 @@ def _padded_places(made: np.ndarray, M: int, N: int) -> np.ndarray:
 
 
 def _cost(left: np.ndarray, right: np.ndarray, M: int, N: int) -> float:
-    """Cycles of a product by tiles, of these that are not zero: two sums or two loads each."""
+    """Half cycles of a product by tiles, of these that are not zero: two sums or two loads a cycle,
+    and one of a tile's rows, which come from farther away, in two cycles."""
     rows, columns = _padded(left, M).any(1), _padded(right, N).any(1)
     terms = float((rows.astype(float) @ columns.T.astype(float)).sum())
-    return terms * max(M * N, 1.15 * (M + N)) + 8.0 * len(rows) * len(columns)
+    return terms * max(M * N, 1.15 * (M + N), 4 * M) + 8.0 * len(rows) * len(columns)

@@ -6,6 +6,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import jax
@@ -24,13 +25,25 @@ FEW_PRODUCTS = 400
 """A product of matrices with fewer is written out number by number."""
 
 
+_tracing = ContextVar("tracing", default=False)
+
+
+def tracing() -> bool:
+    """Whether what is traced now is for the native backend, where no index costs much."""
+    return _tracing.get()
+
+
 class NotSupportedError(ValueError):
     """A function that has something for which there is no rule."""
 
 
 def program(function: Callable[..., Any], *arguments: Any) -> tuple[Program, Any]:
     """The program of a function of such arguments, and the shapes of what it returns."""
-    traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    token = _tracing.set(True)
+    try:
+        traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    finally:
+        _tracing.reset(token)
     leaves = jax.tree.leaves(arguments)
     jaxpr, used = partial_eval.dce_jaxpr(traced.jaxpr, [True] * len(traced.out_avals))[:2]
     tracer = Tracer(Elements(_dtype([*leaves, *traced.out_avals])))
