@@ -130,6 +130,15 @@ def semidefinite_root(P: Float[Array, "n n"]) -> SemidefiniteRoot:
     return SemidefiniteRoot(sigma[:, None] * L, W / unit)
 
 
+@jax.jit
+def symmetric_part(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """`(A + Aᵀ) / 2` of what is symmetric but for rounding.
+
+    By its name the native backend knows that half of A is enough.
+    """
+    return (A + A.T) / 2
+
+
 def eigh(A: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """Eigenvalues, the least first, and eigenvectors as columns, by Jacobi's rotations.
 

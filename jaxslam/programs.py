@@ -48,6 +48,11 @@ def keep_in(folder: Path | None) -> None:
     _kept_in = folder
 
 
+def kept_in() -> Path | None:
+    """The folder that was told."""
+    return _kept_in
+
+
 _all: weakref.WeakSet[Program] = weakref.WeakSet()
 
 
@@ -273,10 +278,11 @@ def _sources() -> tuple[str, ...]:
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
     versions = (version(name) for name in ("jax", "jaxlib", "equinox", "jaxlie", "numpy"))
-    return digest.hexdigest(), platform.python_version(), *versions, *_processor()
+    return digest.hexdigest(), platform.python_version(), *versions, *processor()
 
 
-def _processor() -> tuple[str, ...]:
+def processor() -> tuple[str, ...]:
+    """What this machine's processor is, and what it can do."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

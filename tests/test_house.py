@@ -15,7 +15,7 @@ PACKAGE = Path(jaxslam.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 ORDER = (
     "arrays", "files", "programs", "tum", "linalg", "lookup", "watchdog", "geometry",
-    "least_squares", "landmarks", "models", "forms", "slam", "delayed", "remedies", "window",
+    "least_squares", "native", "landmarks", "models", "forms", "slam", "delayed", "remedies", "window",
     "wrappers", "simulation", "names", "consistency", "evaluation", "posterior", "triangulation",
     "datasets",
     "plots", "video", "vision", "cli",

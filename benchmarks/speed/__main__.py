@@ -1,4 +1,4 @@
-"""Microseconds of a run's step: ours beside NumPy, and beside C++ with Eigen.
+"""Microseconds of a run's step: ours, by XLA and native, beside NumPy, and C++ with Eigen.
 
     python -m benchmarks.speed --out FILE.json
 
@@ -24,11 +24,21 @@ import tyro
 
 from benchmarks.speed.eigen import build, by_hand
 from benchmarks.speed.loop import by_loop
-from benchmarks.speed.workload import WORKLOADS, Inputs, Workload, ours, prepared
+from benchmarks.speed.workload import (
+    WORKLOADS,
+    Inputs,
+    Workload,
+    by_native,
+    ours,
+    prepared,
+)
 from jaxslam.files import write_atomically
+from jaxslam.native.build import compiler
 
 AGREEMENT = 1e-9
-"""Of every NEES, and of the last covariance relative to its largest entry."""
+"""In double precision, of every NEES, and of the last covariance relative to its largest entry."""
+SINGLE = "native_float32"
+OURS = ("jaxslam", "native", SINGLE)
 LOOP_RUNS = 4
 """The loop of NumPy is slow, and its time is the same for every run."""
 
@@ -87,14 +97,19 @@ def measured(work: Workload, library: Any, repeats: int, product: float) -> dict
     inputs = prepared(work)
     began = time.perf_counter()
     calls = {"jaxslam": ours(inputs)}
-    compile_seconds = time.perf_counter() - began
+    compile_seconds = {"jaxslam": round(time.perf_counter() - began, 2)}
+    if compiler() is not None:
+        began = time.perf_counter()
+        calls["native"] = by_native(inputs)
+        compile_seconds["native"] = round(time.perf_counter() - began, 2)
+        calls[SINGLE] = by_native(inputs, "float32")
     calls["numpy"] = by_loop(first(inputs, LOOP_RUNS))
     if not isinstance(library, str):
         calls["eigen"] = by_hand(library, inputs)
         calls["eigen_fixed_sizes"] = by_hand(library, inputs, fixed=True)
     results = {name: call() for name, call in calls.items()}
     apart = {name: difference(found, results["jaxslam"]) for name, found in results.items()}
-    wrong = {name: x for name, x in apart.items() if not x < AGREEMENT}
+    wrong = {name: x for name, x in apart.items() if name != SINGLE and not x < AGREEMENT}
     assert not wrong, f"not the same results: {wrong}"
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(repeats):
@@ -108,10 +123,12 @@ def measured(work: Workload, library: Any, repeats: int, product: float) -> dict
         "steps": work.steps,
         "microseconds_per_step": {name: round(1e6 * x, 2) for name, x in median.items()},
         "speed_against": {
-            name: round(x / median["jaxslam"], 3) for name, x in median.items() if name != "jaxslam"
+            ours: {name: round(x / median[ours], 3) for name, x in median.items() if name != ours}
+            for ours in OURS
+            if ours in median
         },
         "largest_difference": apart,
-        "compile_seconds": round(compile_seconds, 2),
+        "compile_seconds": compile_seconds,
         "share_of_dgemm": {
             name: round(flops(work) / x / 1e9 / product, 3) for name, x in median.items()
         },

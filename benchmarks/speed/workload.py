@@ -14,9 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxslam
+from jaxslam.arrays import cast, is_number
 from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.forms.state import Features, State
 from jaxslam.geometry import Pose
+from jaxslam.native import batched
 from jaxslam.simulation import features, simulate
 from jaxslam.simulation.run import Room
 from jaxslam.slam.filter import EkfSlam
@@ -97,14 +99,13 @@ def kept(slam: EkfSlam, start: State) -> np.ndarray:
     return np.setdiff1d(np.arange(c + start.landmarks[0].size), gone)
 
 
-@partial(eqx.filter_jit, donate="none")
-def filtered(
+def filtered_run(
     slam: EkfSlam, seconds: Array, start: State, pixels: Array, poses: Pose
 ) -> tuple[Array, Array]:
-    """NEES of every step, and the last covariance, of a batch of runs."""
-    m = pixels.shape[2]
+    """NEES of every step, and the last covariance, of one run."""
+    m = pixels.shape[1]
     nothing = Features(
-        jnp.zeros(1, int), jnp.zeros((1, pixels.shape[3]), pixels.dtype), jnp.zeros(1, bool)
+        jnp.zeros(1, int), jnp.zeros((1, pixels.shape[2]), pixels.dtype), jnp.zeros(1, bool)
     )
 
     def step(state, frame):
@@ -113,11 +114,16 @@ def filtered(
         state, _ = slam.step(state, seconds, seen, nothing)
         return state, normalised_squared(*slam.pose_error(state, T_BC))
 
-    def one(start, pixels, poses):
-        last, nees = jax.lax.scan(step, start, (pixels, poses))
-        return nees, last.covariance
+    last, nees = jax.lax.scan(step, start, (pixels, poses))
+    return nees, last.covariance
 
-    return jax.vmap(one)(start, pixels, poses)
+
+@partial(eqx.filter_jit, donate="none")
+def filtered(
+    slam: EkfSlam, seconds: Array, start: State, pixels: Array, poses: Pose
+) -> tuple[Array, Array]:
+    """The same of a batch of runs."""
+    return jax.vmap(partial(filtered_run, slam, seconds))(start, pixels, poses)
 
 
 def ours(inputs: Inputs) -> Callable[[], Records]:
@@ -129,5 +135,25 @@ def ours(inputs: Inputs) -> Callable[[], Records]:
     def call() -> Records:
         nees, covariance = jax.block_until_ready(compiled(inputs.slam, *data))
         return np.asarray(nees), np.asarray(covariance[:, index[:, None], index])
+
+    return call
+
+
+def by_native(inputs: Inputs, dtype: str = "float64") -> Callable[[], Records]:
+    """The same by the native backend. Raises ValueError without a C++ compiler."""
+    index = kept(inputs.slam, inputs.start)
+    with jax.enable_x64(dtype == "float64"):
+        numbers, static = eqx.partition(cast(inputs.slam, dtype), is_number)
+        seconds, *runs = jax.tree.map(lambda x: np.asarray(x, dtype), tuple(inputs[1:]))
+
+        def one(shared, run):
+            numbers, seconds = shared
+            return filtered_run(eqx.combine(numbers, static), seconds, *run)
+
+        batch = batched(one, (numbers, seconds), tuple(runs))
+
+    def call() -> Records:
+        nees, covariance = batch((numbers, seconds), tuple(runs))
+        return nees, covariance[:, index[:, None], index]
 
     return call

@@ -12,6 +12,7 @@ import tyro
 
 from jaxslam.cli.progress import Progress
 from jaxslam.consistency import (
+    BACKENDS,
     CHUNK,
     DTYPES,
     FolderStore,
@@ -21,7 +22,7 @@ from jaxslam.consistency import (
     table,
     treatment,
 )
-from jaxslam.consistency.montecarlo import check_sizes, divided
+from jaxslam.consistency.montecarlo import check_backend, check_sizes, divided
 from jaxslam.files import write_atomically
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.names import FILTERS, FROM_REST, MODIFIERS, RECOMMENDED, make_filters
@@ -80,6 +81,9 @@ class ConsistencyOptions:
     dtype: Annotated[str, tyro.conf.arg(help=f"Precision: {', '.join(DTYPES)}.")] = "float64"
     chunk: int = CHUNK
     """Runs in one batch; memory grows with it, results do not depend on it."""
+    backend: Annotated[
+        str, tyro.conf.arg(help=f"What computes: {', '.join(BACKENDS)} (needs a C++ compiler).")
+    ] = "xla"
     resume: bool = False
     """Go on from what an interrupted run left in --out."""
     cluster: str | None = None
@@ -110,6 +114,7 @@ class ConsistencyOptions:
 
     def _study(self) -> Study:
         check_sizes(self.runs, self.seed, self.dtype, self.chunk)
+        check_backend(self.backend)
         world = self._scenario()
         filters = make_filters(world, self.filters, self.landmarks, self.calibration)
         manifest = {
@@ -119,6 +124,7 @@ class ConsistencyOptions:
             "seed": self.seed,
             "dtype": self.dtype,
             "chunk": self.chunk,
+            **({} if self.backend == "xla" else {"backend": self.backend}),
         }
         store = FolderStore(self.out / "runs", manifest, resume=self.resume)
         chunks = divided(self.runs, self.chunk)
@@ -131,6 +137,7 @@ class ConsistencyOptions:
                 seed=self.seed,
                 dtype=self.dtype,
                 chunk=self.chunk,
+                backend=self.backend,
                 store=store,
                 progress=progress,
                 cluster=self.cluster,

@@ -1,6 +1,6 @@
 """Is a filter consistent? Monte Carlo runs, NEES and NIS with exact bounds, and their summary."""
 
-from jaxslam.consistency.montecarlo import CHUNK, DTYPES, monte_carlo
+from jaxslam.consistency.montecarlo import BACKENDS, CHUNK, DTYPES, monte_carlo
 from jaxslam.consistency.statistics import (
     PowerSums,
     chi2_quantile,
@@ -13,6 +13,7 @@ from jaxslam.consistency.summary import Study, summarise, table, tally, treatmen
 from jaxslam.consistency.verdict import VERDICTS, Tally, run_verdict, sentences, verdict
 
 __all__ = [
+    "BACKENDS",
     "CHUNK",
     "DTYPES",
     "VERDICTS",

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from jaxslam import native
 from jaxslam.arrays import cast, is_number
 from jaxslam.consistency.beyond_scale import beyond_scale, reversal
 from jaxslam.consistency.cluster import as_tasks, connected
@@ -51,6 +52,8 @@ from jaxslam.slam.readouts import camera_pose, landmarks_from_above, landmarks_i
 from jaxslam.watchdog import finished, lapack_calls
 
 DTYPES = ("float64", "float32")
+BACKENDS = ("xla", "native")
+"""XLA, or a program in C++ that is made from the same functions where there is a compiler."""
 CHUNK = 100
 """Runs in one batch: enough to fill vector units, few enough to stay in the cache."""
 MOST_RUNS = 10**8
@@ -65,6 +68,7 @@ def monte_carlo(
     seed: int = 0,
     dtype: str = "float64",
     chunk: int = CHUNK,
+    backend: str = "xla",
     store: Store | None = None,
     progress: Callable[[str, int], None] = lambda name, done: None,
     motion: AbstractMotion | Trajectory | None = None,
@@ -83,11 +87,16 @@ def monte_carlo(
     With a `cluster`, the address of a Dask scheduler or a `distributed.Client`, the chunks are
     computed there and kept here; their seconds are of all together, compilation among them.
 
+    With the `backend` "native" filters are compiled by the system's C++ compiler
+    (`jaxslam.native`), to the same numbers but for rounding; where that cannot be, a warning says
+    why, and XLA computes them.
+
     Raises ValueError for sizes that make no sense.
     """
     if not filters:
         raise ValueError("no filter to run: name at least one")
     check_sizes(runs, seed, dtype, chunk)
+    check_backend(backend)
     scenario = as_scenario(scenario)
     store = MemoryStore() if store is None else store
     chunks = divided(runs, chunk)
@@ -98,7 +107,7 @@ def monte_carlo(
         missing = {name: [c for c in chunks if not store.has(name, c)] for name in filters}
         room = simulator.room(chunks, each) if any(missing.values()) else None
         for name, slam in filters.items():
-            job = _Job(name, slam, simulator, room)
+            job = _Job(name, slam, simulator, room, backend)
             seconds[name] = _run_filter(job, missing[name], store, progress, each)
         device = jax.devices()[0].device_kind
     return Study(scenario, filters, runs, seed, dtype, chunks, store, seconds, device)
@@ -192,6 +201,7 @@ class _Job(NamedTuple):
     slam: AbstractFilter
     simulator: _Simulator
     room: Room | None
+    backend: str
 
     def __call__(self, chunk: range) -> Records:
         with jax.enable_x64(self.simulator.dtype == "float64"):  # a thread's own
@@ -207,8 +217,9 @@ class _Job(NamedTuple):
         numbers, structure = eqx.partition(cast(self.slam, self.simulator.dtype), is_number)
         data = (numbers, self.simulator.sensor)
         shapes = _hashable(_shapes((*data, batch)))
+        made = {"xla": _compiled, "native": _native}[self.backend]
         with _COMPILING:
-            return _compiled(*_hashable(structure), self.room, *shapes), data
+            return made(*_hashable(structure), self.room, *shapes), data
 
 
 _COMPILING = threading.Lock()
@@ -278,6 +289,31 @@ def _compiled(leaves, structure, room: Room, shapes, of_data) -> jax.stages.Comp
     return traced.lower().compile()
 
 
+@lru_cache(maxsize=32)
+def _native(leaves, structure, room: Room, shapes, of_data) -> Callable[..., Any]:
+    """The same of `_compiled` by the native backend; XLA's, with a warning, where it cannot."""
+    static = jax.tree.unflatten(structure, leaves)
+    numbers, sensor, runs = jax.tree.unflatten(of_data, shapes)
+
+    def one(shared, run):
+        numbers, sensor = shared
+        slam = eqx.combine(numbers, static)
+        records, path, state = filter_run(slam, room, sensor, run)
+        return records, _sample(slam, room, path, state, run)
+
+    try:
+        batch = native.batched(one, (numbers, sensor), runs)
+    except ValueError as error:
+        warnings.warn(f"{error}; {type(static).__name__} is computed by XLA", stacklevel=2)
+        return _compiled(leaves, structure, room, shapes, of_data)
+
+    def computed(numbers, sensor, runs):
+        records, samples = batch((numbers, sensor), runs)
+        return records, {name: x[0] for name, x in samples.items()}
+
+    return computed
+
+
 def _filter_batch(
     static: AbstractFilter,
     room: Room,
@@ -289,10 +325,14 @@ def _filter_batch(
     slam = eqx.combine(numbers, static)
     records, path, state = jax.vmap(partial(filter_run, slam, room, sensor))(runs)
     first = partial(jax.tree.map, lambda x: x[0])
-    state, run = first(state), first(runs)
+    return records, _sample(slam, room, first(path), first(state), first(runs))
+
+
+def _sample(slam, room: Room, path: Pose, state: Any, run: Run) -> dict[str, Array]:
+    """The map and the path of one run."""
     landmarks, covariance = landmarks_from_above(slam, state, jnp.arange(room.landmarks))
-    return records, {
-        "path": jax.vmap(lambda pose: pose.as_matrix())(first(path)),
+    return {
+        "path": jax.vmap(lambda pose: pose.as_matrix())(path),
         "true_path": jax.vmap(lambda pose: pose.as_matrix())(run.poses),
         "points": run.points_by_frame[-1],
         "landmarks": landmarks,
@@ -379,3 +419,9 @@ def check_sizes(runs: int, seed: int, dtype: str, chunk: int) -> None:
         raise ValueError(f"seed must {bound}, not {seed}")
     if dtype not in DTYPES:
         raise ValueError(f"unknown dtype {dtype!r}; known: {', '.join(DTYPES)}")
+
+
+def check_backend(backend: str) -> None:
+    """Raise ValueError for a backend that is not known."""
+    if backend not in BACKENDS:
+        raise ValueError(f"unknown backend {backend!r}; known: {', '.join(BACKENDS)}")

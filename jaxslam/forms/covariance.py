@@ -32,7 +32,7 @@ from jaxslam.forms.blocks import (
 from jaxslam.forms.form import AbstractGaussian
 from jaxslam.forms.state import Features, Innovation, State, judged
 from jaxslam.geometry import jacobian
-from jaxslam.linalg import cholesky
+from jaxslam.linalg import cholesky, symmetric_part
 
 ROUNDING = 4.0
 """Units in the last place of its own that every variance gets back in an update.
@@ -122,7 +122,7 @@ class Covariance(AbstractGaussian):
         lost = ROUNDING * jnp.finfo(P.dtype).eps * jnp.diagonal(P).at[considered].set(0.0)
         delta = K @ residual.ravel()
         state = shifted(state, delta if offset is None else offset + delta)
-        state = replace(state, covariance=(covariance + covariance.T) / 2 + jnp.diag(lost))
+        state = replace(state, covariance=symmetric_part(covariance) + jnp.diag(lost))
         variances = jnp.diagonal(covariance) + lost
         status = judged(factor.positive & jnp.all(variances >= 0), variances, state.landmarks)
         nis = whitened @ whitened

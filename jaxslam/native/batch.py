@@ -1,0 +1,86 @@
+"""A batch of runs by a program in C++: compiled, and called with arrays."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxslam.native.build import built
+from jaxslam.native.emit import BYTES, source
+from jaxslam.native.plan import plan
+from jaxslam.native.trace import NotSupportedError, program
+
+__all__ = ["Batch", "NotSupportedError", "batched"]
+
+
+class Batch:
+    """`jax.vmap(function, (None, 0))(shared, runs)`, to rounding; of NumPy's arrays."""
+
+    def __init__(self, function: Callable[[Any, Any], Any], shared: Any, runs: Any) -> None:
+        one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), runs)
+        self._given = _kinds((shared, one))
+        traced, self._shapes = program(function, *jax.tree.map(_kind, (shared, one)))
+        inputs = [(x.dtype, own) for x, own in zip(*self._leaves(shared, one), strict=True)]
+        outputs = jax.tree.leaves(self._shapes)
+        self.source = source(plan(traced), (inputs, [x.dtype for x in outputs]))
+        library = built(self.source)
+        self._run, library.arena.restype = library.run, ctypes.c_long
+        self._arena = library.arena()
+        self._width = BYTES // traced.elements.dtype.itemsize
+
+    def __call__(self, shared: Any, runs: Any, *, threads: int = 1) -> Any:
+        """The results of all runs; the same whatever the number of threads."""
+        one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), runs)
+        if _kinds((shared, one)) != self._given:
+            raise ValueError("other shapes or types than the program is for")
+        given = [np.ascontiguousarray(x) for x in jax.tree.leaves((shared, runs))]
+        count = len(jax.tree.leaves(runs)[0])
+        leaves, structure = jax.tree.flatten(self._shapes)
+        made = [np.empty((count, *x.shape), x.dtype) for x in leaves]
+        pointers = [(ctypes.c_void_p * len(x))(*(y.ctypes.data for y in x)) for x in (given, made)]
+
+        def part(firsts) -> None:
+            arena = np.empty(self._arena + BYTES, np.uint8)
+            begin = ctypes.c_void_p(arena.ctypes.data + -arena.ctypes.data % BYTES)
+            for first in firsts:
+                some = min(self._width, count - first)
+                self._run(begin, *pointers, ctypes.c_long(first), ctypes.c_long(some))
+
+        groups = range(0, count, self._width)
+        parts = [groups[k::threads] for k in range(threads)]
+        if threads == 1:
+            part(groups)
+        else:
+            with ThreadPoolExecutor(threads) as pool:
+                list(pool.map(part, parts))
+        return jax.tree.unflatten(structure, made)
+
+    @staticmethod
+    def _leaves(shared, one):
+        return (
+            jax.tree.leaves((shared, one)),
+            [False] * len(jax.tree.leaves(shared)) + [True] * len(jax.tree.leaves(one)),
+        )
+
+
+def _kind(x: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(np.shape(x), x.dtype)
+
+
+def _kinds(tree: Any) -> Any:
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, tuple((np.shape(x), np.dtype(x.dtype)) for x in leaves)
+
+
+def batched(function: Callable[[Any, Any], Any], shared: Any, runs: Any) -> Batch:
+    """A program for arguments of these shapes and types.
+
+    Raises `NotSupportedError` for a function that has something for which there is no rule, and
+    ValueError without a C++ compiler.
+    """
+    return Batch(function, shared, runs)

@@ -1,0 +1,75 @@
+"""From C++ to a library that is loaded, kept in the cache folder as other programs are."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import shlex
+import shutil
+import subprocess
+import tempfile
+from functools import cache
+from pathlib import Path
+
+from jaxslam import programs
+from jaxslam.files import write_atomically
+
+FLAGS = (
+    *("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math"),
+    *("-ffp-contract=fast", "-Wno-psabi", "-shared", "-fPIC"),
+)
+
+
+def compiler() -> list[str] | None:
+    """The command of `$CXX`, or of the system's compiler; None without one."""
+    told = shlex.split(os.environ.get("CXX", ""))
+    names = told[:1] or ["c++", "g++", "clang++"]
+    found = next((path for name in names if (path := shutil.which(name))), None)
+    return None if found is None else [found, *told[1:]]
+
+
+def built(source: str) -> ctypes.CDLL:
+    """The library of a program. Raises ValueError without a compiler, or where it fails."""
+    command = compiler()
+    if command is None:
+        raise ValueError("the native backend needs a C++ compiler: none is found ($CXX, c++, g++)")
+    key = "\n".join([source, *command, *FLAGS, _version(tuple(command)), *programs.processor()])
+    folder = programs.kept_in() or _own_folder()
+    path = folder / f"native-{hashlib.sha256(key.encode()).hexdigest()}.so"
+    if not _trusted(path):
+        folder.mkdir(parents=True, exist_ok=True)
+        with write_atomically(path) as temporary:
+            _compile(command, source, temporary)
+    return ctypes.CDLL(str(path))
+
+
+def _trusted(path: Path) -> bool:
+    return path.exists() and (not hasattr(os, "getuid") or path.stat().st_uid == os.getuid())
+
+
+def _compile(command: list[str], source: str, path: Path) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "program.cpp"
+        file.write_text(source)
+        arguments = [*command, *FLAGS, str(file), "-o", str(path), "-lm"]
+        done = subprocess.run(arguments, capture_output=True, text=True)
+    if done.returncode:
+        raise ValueError(f"the C++ compiler failed: {done.stderr[-2000:]}")
+
+
+@cache
+def _version(command: tuple[str, ...]) -> str:
+    return subprocess.run([*command, "--version"], capture_output=True, text=True).stdout
+
+
+@cache
+def _own_folder() -> Path:
+    """Of this process, where nothing is to be kept."""
+    folder = tempfile.TemporaryDirectory(prefix="jaxslam-native-")
+    _folders.append(folder)
+    return Path(folder.name)
+
+
+_folders: list[tempfile.TemporaryDirectory[str]] = []
+"""Removed when the process ends."""

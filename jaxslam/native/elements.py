@@ -1,0 +1,254 @@
+"""What a program computes, number by number: arrays are arrays of *elements*.
+
+An element is a number of one run: a constant, a variable, or an operation on elements. An array of
+the traced function is an integer array of elements, so that slices, transposes, concatenations and
+whatever else only moves numbers cost nothing when the program runs, zeros are known to be zeros
+wherever they go, and what is computed twice is found.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Refs = np.ndarray
+"""Elements, integers; of any shape."""
+
+CONSTANT, VARIABLE = 0, 1
+
+
+class Operation(NamedTuple):
+    """In C++, of operands {0}, {1}, {2}, and in NumPy."""
+
+    text: str
+    value: Callable[..., Any]
+    commutes: bool = False
+
+
+def _truth(function):
+    return lambda *x: function(*x).astype(float)
+
+
+def _compared(sign: str, function: Callable[..., Any]) -> Operation:
+    return Operation(f"(({{0}} {sign} {{1}}) ? ONE : ZERO)", _truth(function))
+
+
+def _called(name: str, function: Callable[..., Any]) -> Operation:
+    return Operation(f"l_{name}({{0}})", function)
+
+
+def _select(which, first, second):
+    return np.where(which != 0, second, first)
+
+
+OPERATIONS = {
+    "copy": Operation("{0}", np.positive),
+    "add": Operation("({0} + {1})", np.add, True),
+    "sub": Operation("({0} - {1})", np.subtract),
+    "mul": Operation("({0} * {1})", np.multiply, True),
+    "div": Operation("({0} / {1})", np.divide),
+    "neg": Operation("(-{0})", np.negative),
+    "max": Operation("l_max({0}, {1})", np.maximum, True),
+    "min": Operation("l_min({0}, {1})", np.minimum, True),
+    "eq": _compared("==", np.equal),
+    "ne": _compared("!=", np.not_equal),
+    "lt": _compared("<", np.less),
+    "le": _compared("<=", np.less_equal),
+    "gt": _compared(">", np.greater),
+    "ge": _compared(">=", np.greater_equal),
+    "and": Operation("({0} * {1})", _truth(np.logical_and), True),
+    "or": Operation("l_max({0}, {1})", _truth(np.logical_or), True),
+    "not": Operation("(ONE - {0})", _truth(np.logical_not)),
+    "select": Operation("(({0} != ZERO) ? {2} : {1})", _select),
+    "is_finite": Operation("l_is_finite({0})", _truth(np.isfinite)),
+    "sqrt": Operation("l_sqrt({0})", np.sqrt),
+    "abs": Operation("l_fabs({0})", np.abs),
+    "floor": _called("floor", np.floor),
+    "ceil": _called("ceil", np.ceil),
+    "round": _called("rint", np.rint),
+    "trunc": _called("trunc", np.trunc),
+    "sign": Operation("l_sign({0})", np.sign),
+    "sin": _called("sin", np.sin),
+    "cos": _called("cos", np.cos),
+    "tan": _called("tan", np.tan),
+    "asin": _called("asin", np.arcsin),
+    "acos": _called("acos", np.arccos),
+    "atan": _called("atan", np.arctan),
+    "sinh": _called("sinh", np.sinh),
+    "cosh": _called("cosh", np.cosh),
+    "tanh": _called("tanh", np.tanh),
+    "exp": _called("exp", np.exp),
+    "expm1": _called("expm1", np.expm1),
+    "log": _called("log", np.log),
+    "log1p": _called("log1p", np.log1p),
+    "atan2": Operation("l_atan2({0}, {1})", np.arctan2),
+    "pow": Operation("l_pow({0}, {1})", np.power),
+}
+"""On numbers of one kind: integers are numbers without a fraction, and truth is 0 or 1."""
+NAMES = tuple(OPERATIONS)
+CODES = {name: code for code, name in enumerate(NAMES, start=2)}
+
+
+class Elements:
+    """All elements of a program, in an order in which they can be computed."""
+
+    def __init__(self, dtype: Any) -> None:
+        self.dtype = np.dtype(dtype)
+        self.size = 0
+        self._code = np.zeros(1024, np.int16)
+        self._arguments = np.zeros((1024, 3), np.int32)
+        self._value = np.zeros(1024)
+        self._region = np.zeros(1024, np.int32)
+        self._regions = 1
+        self._known: list[dict[tuple[Any, ...], Any]] = [{}]
+        self._inside = [0]
+        self._constants: dict[Any, int] = {}
+        self.zero, self.one = (int(self.constant(x)) for x in (0.0, 1.0))
+
+    @property
+    def code(self) -> np.ndarray:
+        """Of every element CONSTANT, VARIABLE or one of `CODES`."""
+        return self._code[: self.size]
+
+    @property
+    def arguments(self) -> np.ndarray:
+        """Operands; 0 for what an operation does not have."""
+        return self._arguments[: self.size]
+
+    @property
+    def value(self) -> np.ndarray:
+        """Of constants."""
+        return self._value[: self.size]
+
+    @property
+    def region(self) -> np.ndarray:
+        """In which loop it is computed."""
+        return self._region[: self.size]
+
+    @contextmanager
+    def inside(self):
+        """What is made here is not known outside: the body of a loop."""
+        self._known.append({})
+        self._inside.append(self._regions)
+        self._regions += 1
+        try:
+            yield
+        finally:
+            self._known.pop()
+            self._inside.pop()
+
+    def constant(self, values: Any) -> Refs:
+        """Elements for known numbers."""
+        values = np.asarray(values, self.dtype).astype(float)
+        unique, inverse = np.unique(values.ravel().view(np.int64), return_inverse=True)
+        found = np.array([self._one_constant(int(bits)) for bits in unique], np.int32)
+        return found[inverse].reshape(values.shape) if values.size else np.zeros(values.shape, int)
+
+    def _one_constant(self, bits: int) -> int:
+        if bits not in self._constants:
+            (self._constants[bits],) = self._new(1, CONSTANT)
+            self._value[self._constants[bits]] = np.int64(bits).view(float)
+        return self._constants[bits]
+
+    def variables(self, shape: tuple[int, ...]) -> Refs:
+        """Numbers that something else writes."""
+        return self._new(math.prod(shape), VARIABLE).reshape(shape)
+
+    def _new(self, count: int, code: int) -> Refs:
+        start, self.size = self.size, self.size + count
+        while self.size > len(self._code):
+            for name in ("_code", "_arguments", "_value", "_region"):
+                old = getattr(self, name)
+                setattr(self, name, np.concatenate([old, np.zeros_like(old)]))
+        self._code[start : self.size] = code
+        self._region[start : self.size] = self._inside[-1]
+        return np.arange(start, self.size, dtype=np.int32)
+
+    def is_constant(self, refs: Refs) -> np.ndarray:
+        """Where they are."""
+        return self._code[refs] == CONSTANT
+
+    def is_zero(self, refs: Refs) -> np.ndarray:
+        """Where they are zero, of either sign."""
+        return self.is_constant(refs) & (self._value[refs] == 0)
+
+    def known(self, refs: Refs) -> np.ndarray | None:
+        """Values, where all are constant."""
+        return self._value[refs] if np.all(self.is_constant(refs)) else None
+
+    def once(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+        """What was made by this name here or around, or what is made now."""
+        for known in reversed(self._known):
+            if key in known:
+                return known[key]
+        self._known[-1][key] = made = make()
+        return made
+
+    def apply(self, name: str, *arguments: Refs) -> tuple[Refs, Refs]:
+        """The results, and which elements are new for them."""
+        arrays = np.broadcast_arrays(*arguments)
+        flat = [x.ravel() for x in arrays]
+        result = np.full(flat[0].shape, -1, np.int32)
+        for where, instead in self._shortcuts(name, flat):
+            np.copyto(result, instead, where=where & (result < 0))
+        todo = result < 0
+        constant = todo & np.logical_and.reduce([self.is_constant(x) for x in flat])
+        if constant.any():
+            result[constant] = self._folded(name, [x[constant] for x in flat])
+        todo &= ~constant
+        before = self.size
+        if todo.any():
+            result[todo] = self._computed(name, [x[todo] for x in flat])
+        return result.reshape(arrays[0].shape), np.arange(before, self.size, dtype=np.int32)
+
+    def _folded(self, name: str, arguments: list[Refs]) -> Refs:
+        with np.errstate(all="ignore"):
+            values = OPERATIONS[name].value(*(self._value[x].astype(self.dtype) for x in arguments))
+        return self.constant(values)
+
+    def _shortcuts(self, name: str, x: list[Refs]):
+        """Where, and what is the result without computing it. A product with 0 is 0."""
+        if name in ("mul", "and"):
+            for a, b in (x, x[::-1]):
+                yield self.is_zero(a), self.zero
+                yield a == self.one, b
+        elif name in ("add", "or"):
+            for a, b in (x, x[::-1]):
+                yield self.is_zero(a), b
+        elif name == "sub":
+            yield self.is_zero(x[1]), x[0]
+        elif name == "div":
+            yield x[1] == self.one, x[0]
+            yield self.is_zero(x[0]) & ~self.is_zero(x[1]), self.zero
+        elif name == "select":
+            yield self.is_zero(x[0]) | (x[1] == x[2]), x[1]
+            yield self.is_constant(x[0]), x[2]
+
+    def _computed(self, name: str, arguments: list[Refs]) -> Refs:
+        """One element for every set of operands, in the order of their first use."""
+        keys = np.zeros((len(arguments[0]), 3), np.int32)
+        keys[:, : len(arguments)] = np.stack(arguments, 1)
+        if OPERATIONS[name].commutes:
+            keys[:, :2].sort(axis=1)
+        joined = np.ascontiguousarray(keys).view(np.dtype((np.void, 12))).ravel()
+        _, first, inverse = np.unique(joined, return_index=True, return_inverse=True)
+        order = np.argsort(first)
+        keys, code = keys[first[order]], CODES[name]
+        found = np.array([self._lookup((code, *key)) for key in keys.tolist()], np.int32)
+        missing = found < 0
+        new = self._new(int(missing.sum()), code)
+        self._arguments[new] = keys[missing]
+        found[missing] = new
+        known = self._known[-1]
+        for key, ref in zip(keys[missing].tolist(), new.tolist(), strict=True):
+            known[code, *key] = ref
+        rank = np.empty(len(order), np.int64)
+        rank[order] = np.arange(len(order))
+        return found[rank[inverse]]
+
+    def _lookup(self, key: tuple[int, ...]) -> int:
+        return next((known[key] for known in reversed(self._known) if key in known), -1)

@@ -1,0 +1,287 @@
+"""What of a program is computed at all, what is kept in memory and where."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from jaxslam.native.elements import CODES, CONSTANT, NAMES, OPERATIONS, VARIABLE, Refs
+from jaxslam.native.fuse import fused
+from jaxslam.native.program import (
+    Apply,
+    Loop,
+    Product,
+    Program,
+    While,
+    read_in_turn,
+    read_by,
+    written_by,
+)
+
+LONGEST = 24
+"""Operations in one expression."""
+
+
+@dataclass
+class Plan:
+    """By element."""
+
+    program: Program
+    live: np.ndarray
+    """Whether anything depends on it."""
+    inlined: np.ndarray
+    """Whether it is only part of another's expression."""
+    form: np.ndarray
+    """Number of its expression in `forms`."""
+    forms: list[tuple[int, ...]]
+    """Code, and of every operand a form + 1, or 0 for what is in memory."""
+    slot: np.ndarray
+    """Where it is in memory, in vectors; −1 for what is not."""
+    slots: int = 0
+    """In all."""
+
+    def leaves(self, refs: Refs) -> list[Refs]:
+        """What is read from memory for elements of one form, in the order of its text."""
+        code, *operands = self.forms[self.form[refs[0]]]
+        found = []
+        for k, operand in enumerate(operands[: arity(code)]):
+            argument = self.program.elements.arguments[refs, k]
+            found += self.leaves(argument) if operand else [argument]
+        return found
+
+
+def plan(program: Program) -> Plan:
+    """Liveness, expressions and places of a program."""
+    live, needed = _live(program)
+    inlined, uses = _inlined(program, live, needed)
+    form, forms = _forms(program, live, inlined)
+    result = Plan(program, live, inlined, form, forms, np.full(live.size, -1, np.int64))
+    result.program = replace(program, steps=fused(result, uses))
+    _Places(result).assign()
+    return result
+
+
+def _live(program: Program) -> tuple[np.ndarray, np.ndarray]:
+    """Which elements are used, and which of them not only by operations."""
+    elements = program.elements
+    live, needed = (np.zeros(elements.size, bool) for _ in range(2))
+    arguments = elements.arguments
+
+    def need(refs):
+        live[refs] = needed[refs] = True
+
+    def visit(steps):
+        for step in reversed(steps):
+            match step:
+                case Apply():
+                    live[arguments[step.made[live[step.made]]]] = True
+                case Loop():
+                    need(step.carry)
+                    need(step.after)
+                    need(step.results[live[step.written].any(0)])
+                    visit(step.steps)
+                    need(step.before)
+                    need(step.rows[:, live[step.read]])
+                case While():
+                    need(step.carry)
+                    need(step.after)
+                    visit(step.steps)
+                    need(step.going)
+                    visit(step.condition)
+                    need(step.before)
+                case Product():
+                    alive = live[step.made]
+                    need(step.left[alive.any(1)])
+                    need(step.right[alive.any(0)])
+                case _ if live[step.made].any():
+                    live[step.made] = True
+                    for refs in read_by(step):
+                        need(refs)
+
+    for refs in program.outputs:
+        need(refs)
+    visit(program.steps)
+    return live, needed
+
+
+def _inlined(program: Program, live, needed) -> tuple[np.ndarray, np.ndarray]:
+    """Operations that only one other operation uses, in the same loop; and numbers of uses.
+
+    What is added to a product of matrices is not among them, but part of that product.
+    """
+    elements = program.elements
+    computed = np.flatnonzero(live & (elements.code > VARIABLE))
+    arguments = elements.arguments[computed]
+    uses, user = np.zeros(elements.size, np.int64), np.zeros(elements.size, np.int64)
+    np.add.at(uses, arguments, 1)
+    user[arguments] = computed[:, None]
+    uses += needed
+    once = live & (elements.code > VARIABLE) & (uses == 1) & ~needed
+    product, added = np.zeros(elements.size, bool), [CODES["add"], CODES["sub"]]
+    each(program.steps, lambda step: _mark(step, product))
+    once &= ~(np.isin(elements.code, added) & product[elements.arguments].any(1))
+    return once & (elements.region == elements.region[user]), uses
+
+
+def _mark(step: Any, product: np.ndarray) -> None:
+    if isinstance(step, Product):
+        product[step.made] = True
+
+
+def _forms(program: Program, live, inlined) -> tuple[np.ndarray, list[tuple[int, ...]]]:
+    """Expressions; what is too long for one is taken apart."""
+    elements = program.elements
+    form, size = np.zeros(elements.size, np.int64), np.zeros(elements.size, np.int64)
+    forms: dict[tuple[int, ...], int] = {}
+
+    def visit(step):
+        if not isinstance(step, Apply):
+            return
+        made = step.made[live[step.made]]
+        arguments = elements.arguments[made]
+        within = inlined[arguments]
+        length = 1 + np.where(within, size[arguments], 0).sum(1)
+        inlined[arguments[length > LONGEST]] = False
+        within = inlined[arguments]
+        size[made] = 1 + np.where(within, size[arguments], 0).sum(1)
+        keys = np.concatenate(
+            [elements.code[made][:, None], np.where(within, form[arguments] + 1, 0)], axis=1
+        )
+        unique, inverse = np.unique(keys, axis=0, return_inverse=True)
+        numbers = [forms.setdefault(tuple(key), len(forms)) for key in unique.tolist()]
+        form[made] = np.array(numbers, np.int64)[inverse.ravel()] if made.size else 0
+
+    each(program.steps, visit)
+    return form, list(forms)
+
+
+def each(steps: list[Any], visit: Callable[[Any], None]) -> None:
+    """Every step in the order of the program, a loop before what is in it."""
+    for step in steps:
+        visit(step)
+        for inner in inside(step):
+            each(inner, visit)
+
+
+def inside(step: Any) -> list[list[Any]]:
+    """The lists of steps in a step."""
+    match step:
+        case Loop():
+            return [step.steps]
+        case While():
+            return [step.condition, step.steps]
+    return []
+
+
+def arity(code: int) -> int:
+    """Operands of an operation."""
+    text = OPERATIONS[NAMES[code - 2]].text
+    return 3 if "{2}" in text else 2 if "{1}" in text else 1
+
+
+@dataclass
+class _Block:
+    refs: Refs
+    start: int
+    end: int
+    first: int = -1
+    enclosing: tuple[tuple[int, int], ...] = ()
+
+
+@dataclass
+class _Places:
+    """Blocks of memory, from the step that writes to the last that reads."""
+
+    plan: Plan
+    blocks: list[_Block] = field(default_factory=list)
+    clock: int = 0
+
+    def __post_init__(self) -> None:
+        self.block_of = np.full(self.plan.live.size, -1, np.int64)
+
+    def assign(self) -> None:
+        """Slots of all that is in memory."""
+        program, elements = self.plan.program, self.plan.program.elements
+        kept = self.plan.live & (elements.code == CONSTANT)
+        self.write(np.flatnonzero(kept), ())
+        for refs in program.inputs:
+            self.write(refs.ravel() if self.plan.live[refs].any() else refs.ravel()[:0], ())
+        self.visit(program.steps, ())
+        self.clock += 1
+        for refs in [np.flatnonzero(kept), *program.outputs]:
+            self.read(refs, ())
+        self.fit()
+
+    def write(self, refs: Refs, around) -> None:
+        """A block for these numbers, from now on."""
+        new = refs[self.block_of[refs] < 0]
+        if new.size:
+            self.block_of[new] = len(self.blocks)
+            self.blocks.append(_Block(new, self.clock, self.clock, enclosing=around))
+
+    def read(self, refs: Refs, around) -> None:
+        """They are used now, or in every turn of the loops around that began after them."""
+        for number in np.unique(self.block_of[refs]):
+            if number < 0:
+                continue
+            block = self.blocks[number]
+            ends = [end for begin, end in around if block.start < begin]
+            block.end = max(block.end, self.clock, *ends[:1])
+
+    def visit(self, steps, around) -> None:
+        for step in steps:
+            self.clock += 1
+            if isinstance(step, Apply):
+                self.apply(step, around)
+                continue
+            for refs in read_by(step):
+                self.read(self.used(refs), around)
+            for refs in written_by(step):
+                refs = np.asarray(refs).ravel()
+                self.write(refs[self.plan.live[refs]], around)
+            if inside(step):
+                self.loop(step, around)
+
+    def used(self, refs):
+        return refs[self.plan.live[refs]]
+
+    def apply(self, step, around) -> None:
+        plan = self.plan
+        made = step.made[plan.live[step.made] & ~plan.inlined[step.made]]
+        self.write(made, around)
+        for form in np.unique(plan.form[made]):
+            for refs in plan.leaves(made[plan.form[made] == form]):
+                self.read(refs, around)
+
+    def loop(self, step, around) -> None:
+        begin = self.clock
+        self.clock += 1
+        end = begin + 2 + sum(_duration(inner) for inner in inside(step))
+        within = (*around, (begin + 1, end))
+        for inner in inside(step):
+            self.visit(inner, within)
+        self.clock = end
+        for refs in [*read_in_turn(step), *written_by(step)]:
+            self.read(self.used(refs), within)
+
+    def fit(self) -> None:
+        """The first gap that is free for as long."""
+        taken: list[tuple[int, int, int]] = []
+        for block in self.blocks:
+            taken = [x for x in taken if x[2] >= block.start]
+            block.first, size = 0, len(block.refs)
+            for first, last, _ in sorted(taken):
+                if first - block.first >= size:
+                    break
+                block.first = max(block.first, last)
+            taken.append((block.first, block.first + size, block.end))
+            self.plan.slot[block.refs] = block.first + np.arange(size)
+            self.plan.slots = max(self.plan.slots, block.first + size)
+
+
+def _duration(steps) -> int:
+    """Ticks of the clock."""
+    return sum(1 + (2 + sum(map(_duration, inside(x))) if inside(x) else 0) for x in steps)

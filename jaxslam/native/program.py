@@ -1,0 +1,138 @@
+"""The steps of a program on elements: operations, and what is more than an operation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from jaxslam.native.elements import Elements, Refs
+
+
+@dataclass(frozen=True)
+class Apply:
+    """Operations that do not depend on one another."""
+
+    made: Refs
+
+
+@dataclass(frozen=True)
+class Product:
+    """`A Bᵀ`, or `C ± A Bᵀ`."""
+
+    made: Refs
+    """m × n; −1 where none is wanted."""
+    left: Refs
+    """m × k."""
+    right: Refs
+    """n × k."""
+    addend: Refs | None = None
+    """C."""
+    sign: int = 1
+
+
+@dataclass(frozen=True)
+class Take:
+    """`made[e] = table[which[e]]`, in every run another."""
+
+    made: Refs
+    table: Refs
+    which: Refs
+
+
+@dataclass(frozen=True)
+class Put:
+    """A copy of `table` with `values[e]` at `which[e]`, or added there; dropped where −1."""
+
+    made: Refs
+    table: Refs
+    which: Refs
+    values: Refs
+    add: bool
+
+
+@dataclass(frozen=True)
+class Sort:
+    """Rows of all arrays by the first `keys` of them, stable."""
+
+    made: Refs
+    """arrays × rows × n."""
+    given: Refs
+    keys: int
+
+
+@dataclass(frozen=True)
+class Loop:
+    """`length` times: `carry ← after`; carry is `before` at first."""
+
+    steps: list[Any]
+    length: int
+    reverse: bool
+    carry: Refs
+    before: Refs
+    after: Refs
+    read: Refs
+    """Variables, of which in turn t is row t of `rows`."""
+    rows: Refs
+    written: Refs
+    """Row t is what `results` are in turn t."""
+    results: Refs
+
+
+@dataclass(frozen=True)
+class While:
+    """`carry ← after` as long as `going`, in every run for itself."""
+
+    condition: list[Any]
+    steps: list[Any]
+    carry: Refs
+    before: Refs
+    after: Refs
+    going: Refs
+    """One."""
+
+
+@dataclass(frozen=True)
+class Program:
+    """A function of arrays: elements, how they are computed, and what goes in and out."""
+
+    elements: Elements
+    steps: list[Any]
+    inputs: list[Refs]
+    outputs: list[Refs]
+
+
+def read_by(step: Any) -> list[Refs]:
+    """Elements that have to be in memory for a step that is not an `Apply`; a loop's last."""
+    match step:
+        case Product():
+            added = [] if step.addend is None else [step.addend[step.made >= 0]]
+            return [step.left, step.right, *added]
+        case Take():
+            return [step.table, step.which]
+        case Put():
+            return [step.table, step.which, step.values]
+        case Sort():
+            return [step.given]
+        case Loop() | While():
+            return [step.before]
+    return []
+
+
+def read_in_turn(step: Any) -> list[Refs]:
+    """What a loop reads in every turn, beside its steps."""
+    match step:
+        case Loop():
+            return [step.rows, step.after, step.results]
+        case While():
+            return [step.after, step.going]
+    return []
+
+
+def written_by(step: Any) -> list[Refs]:
+    """Elements that a step writes itself."""
+    match step:
+        case Loop():
+            return [step.carry, step.read, step.written]
+        case While():
+            return [step.carry]
+    return [step.made[step.made >= 0]]
