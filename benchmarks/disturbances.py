@@ -134,20 +134,25 @@ def scattered(seed: int) -> Disturbed:
 
 
 def rotation(seed: int) -> Disturbed:
-    """A camera that only turns; it sets out after 4 s."""
+    """A camera that only turns; it sets out after 4 s, within one."""
     during = range(1, 4 * RATE)
     T_wc = handheld_trajectory(np.arange(240) / RATE, seed)
-    T_wc[during.stop :, :3, 3] -= T_wc[during.stop - 1, :3, 3]
-    T_wc[: during.stop, :3, 3] = 0
+    T_wc[:, :3, 3] = 0
+    T_wc[during.stop :, :3, 3] = _set_out(240 - during.stop, seed)[:, :3, 3]
     return Disturbed(_rendered(T_wc, seed), T_wc, during)
 
 
 def standing(seed: int) -> Disturbed:
     """60 s on a tripod, and then by hand."""
     during = range(1, 60 * RATE)
-    moving = handheld_trajectory(np.arange(90) / RATE, seed)
-    T_wc = np.concatenate([np.tile(np.eye(4), (during.stop, 1, 1)), moving])
+    T_wc = np.concatenate([np.tile(np.eye(4), (during.stop, 1, 1)), _set_out(90, seed)])
     return Disturbed(_rendered(T_wc, seed), T_wc, during)
+
+
+def _set_out(count: int, seed: int) -> np.ndarray:
+    """Poses of a hand that comes from rest to its speed within a second."""
+    pace = np.clip(np.arange(count) / RATE, 0, 1)
+    return handheld_trajectory(np.cumsum(3 * pace**2 - 2 * pace**3) / RATE, seed)
 
 
 DISTURBANCES: dict[str, tuple[Callable[[int], Disturbed], str]] = {
