@@ -78,8 +78,8 @@ def monte_carlo(
     `progress(filter name, finished runs)` is called after every chunk. Chunks that `store`
     already has are not run again. Raises ValueError for sizes that make no sense.
     """
-    if not filters:
-        raise ValueError("no filter to run: name at least one")
+    if not filters or not isinstance(filters, Mapping):
+        raise ValueError("no filters by name: a dict is accepted, as make_filters gives it")
     check_sizes(runs, seed, dtype, chunk)
     scenario = as_scenario(scenario)
     store = MemoryStore() if store is None else store
