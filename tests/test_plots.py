@@ -188,7 +188,7 @@ def test_wrong_names_and_kinds_are_told_what_is_accepted(study):
         plot_nees(study, ax=ax, label={wrong: "UID"})
     with pytest.raises(ValueError, match=r"the scale of this scenario is measured"):
         plot_log_scale({**jaxslam.summarise(study), "scale_free": False}, ax=ax)
-    with pytest.raises(ValueError, match="a study is summarised, .* not list"):
+    with pytest.raises(ValueError, match=r"a study is summarised, .* not list"):
         jaxslam.summarise([study])  # ty: ignore[invalid-argument-type]
     with pytest.raises(ValueError, match="a dict is accepted, as make_filters gives it"):
         jaxslam.monte_carlo("matched", list(study.filters))  # ty: ignore[invalid-argument-type]

@@ -134,6 +134,10 @@ def test_every_snippet_of_every_page_runs():
         assert not examples(name) or f'run_example("{name}")' in tests, name
 
 
+SAYS = re.compile("…|--help|--version")
+"""What is no command to be checked: one that is abridged, or ends at once."""
+
+
 def commands() -> list[str]:
     """Command lines of `jaxslam` and of benchmarks in blocks and between backticks, all pages."""
     found: set[str] = set()
@@ -141,8 +145,8 @@ def commands() -> list[str]:
         text = path.read_text()
         blocks = "\n".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL))
         told = re.findall(r"^((?:jaxslam|python) .*)$", blocks, re.MULTILINE)
-        told += re.findall(r"`((?:jaxslam|python benchmarks/\w+\.py) [^`\n]+)`", text)
-        found |= {line.partition(" #")[0].strip() for line in told if "…" not in line}
+        told += re.findall(r"`((?:jaxslam \w+|python benchmarks/\w+\.py) [^`\n]+)`", text)
+        found |= {line.partition(" #")[0].strip() for line in told if not SAYS.search(line)}
     return sorted(found)
 
 

@@ -165,7 +165,8 @@ class Evaluation:
         runs = f"{self.runs} run{'s' if self.runs > 1 else ''}"
         return [
             f"{runs} of {self.steps} steps; mean {self.quantity} of a consistent filter "
-            f"{self.dof}, at one step in {low:.3f}–{high:.3f} with 95 %: {inside:.0%} of these are",
+            f"{self.dof}, at one step in {low:.3f}–{high:.3f} with 95 %; "
+            f"{inside:.0%} of the steps are inside",
             _columns("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
             *(self._row(i) for i in range(len(self.names))),
             _columns("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}"),
