@@ -54,7 +54,12 @@ def is_number(leaf: Any) -> bool:
 
 
 def cast(tree: T, dtype: Any) -> T:
-    """A filter, or any module, with all its floating-point numbers in one precision."""
+    """A filter, or any module, with all its floating-point numbers in one precision.
+
+    Raises ValueError for a name of none.
+    """
+    if isinstance(dtype, str) and dtype not in ("float64", "float32", "float16", "bfloat16"):
+        raise ValueError(f"unknown dtype {dtype!r}; known: float64, float32")
 
     def one(leaf):
         if isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.floating):

@@ -63,7 +63,7 @@ def not_rigid(T: Float[np.ndarray, "*k d d"], tolerance: float) -> Bool[np.ndarr
 
 
 def read_table(path: str | Path, what: str, holds: str, row: str, columns: int | None) -> Table:
-    """Lines of so many numbers, by spaces or commas, but for empty lines and comments (#).
+    """Lines of so many numbers, apart as in `words`, but for empty lines and comments (#).
 
     With None of as many as the first has; a line of words before it is a comment too. Raises
     `ValueError`, naming the file and the line: it is a `what` that holds `holds`, and a `row` of
@@ -81,17 +81,18 @@ def read_table(path: str | Path, what: str, holds: str, row: str, columns: int |
     rows = {n: line for n, line in told.items() if n not in comments}
     if columns is None and rows:
         first = min(rows)
-        if not any(map(_is_number, _words(rows[first]))):
+        if not any(map(_is_number, words(rows[first]))):
             comments = {first: rows.pop(first)} | comments
-        columns = len(_words(rows[min(rows)])) if rows else 0
+        columns = len(words(rows[min(rows)])) if rows else 0
     if not rows:
         raise ValueError(f"{path}: holds no {holds}; lines of {row} are accepted")
     table = [_row(path, number, line, row, columns or 0) for number, line in rows.items()]
     return Table(tuple(comments.values()), np.array(table), tuple(rows))
 
 
-def _words(line: str) -> list[str]:
-    return line.replace(",", " ").split()
+def words(line: str) -> list[str]:
+    """Apart by spaces, by commas, or by semicolons, as where a comma is in a number."""
+    return line.replace(";" if ";" in line else ",", " ").split()
 
 
 def _is_number(word: str) -> bool:
@@ -103,8 +104,8 @@ def _is_number(word: str) -> bool:
 
 
 def _row(path: Path, number: int, line: str, accepted: str, columns: int) -> list[float]:
-    words = _words(line)
-    row = [float(word) for word in words] if all(map(_is_number, words)) else []
+    told = words(line)
+    row = [float(word) for word in told] if all(map(_is_number, told)) else []
     if len(row) != columns or not np.all(np.isfinite(row)):
         raise ValueError(f"{path}, line {number}: {accepted} are accepted")
     return row

@@ -292,6 +292,8 @@ def lines(*rows):
     [
         ("a.csv", lines((0, 0, 1.0, 1.0), (0, 1, 1.0)), "line 2: numbers run, step, n errors"),
         ("a.csv", lines((0, 0, 1.0, 1.0, 3.0)), "5 columns; numbers run, step"),
+        ("a.csv", lines((0, 0, 1.0, 1.0, 3.0)), "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"),
+        ("a.csv", "0;0;1,0;1,0\n", "line 1: numbers run, step"),
         ("a.csv", lines((0, 0, 1.0, 1.0), (0, 0, 2.0, 1.0)), "line 2: run 0, step 0 comes twice"),
         ("a.csv", lines((0, 0, 1, 1), (0, 1, 1, 1), (1, 0, 1, 1)), "run 1 has 1 of 2 steps"),
         ("a.csv", lines((0, 0, "nan", 1.0)), "line 1: numbers run"),
@@ -362,6 +364,19 @@ def test_a_folder_that_cannot_be_made_is_a_mistake_of_one_line(tmp_path, capsys)
 
 
 # --- the figure ---------------------------------------------------------------------------------
+
+
+def test_semicolons_are_as_good_as_commas(tmp_path):
+    text = "run;step;e;P\n0;0;0.5;1\n1;0;-0.5;1\n"
+    (tmp_path / "a.csv").write_text(text)
+    found = jaxslam.evaluate_log(tmp_path / "a.csv")
+    np.testing.assert_array_equal(found.errors[:, 0, 0], [0.5, -0.5])
+    assert found.names == ("e",)
+
+
+def test_what_is_neither_nees_nor_nis_is_refused():
+    with pytest.raises(ValueError, match=r"unknown quantity 'NES' .*known: NEES, NIS"):
+        jaxslam.evaluate(*drawn(), quantity="NES")
 
 
 def test_the_figure_has_the_verdict_as_its_title(tmp_path):

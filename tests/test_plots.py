@@ -5,6 +5,7 @@ import inspect
 import itertools
 import pkgutil
 
+import jax
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
@@ -13,7 +14,13 @@ from matplotlib.text import Annotation, Text
 
 import jaxslam
 import jaxslam.plots
-from jaxslam.plots.consistency import plot_consistency
+from jaxslam.plots.consistency import (
+    plot_beyond_scale,
+    plot_consistency,
+    plot_log_scale,
+    plot_nees,
+    plot_outside,
+)
 from jaxslam.plots.evaluation import plot_evaluation
 from jaxslam.plots.style import (
     COLUMN,
@@ -25,6 +32,13 @@ from jaxslam.plots.style import (
     save,
     short_names,
 )
+
+
+@pytest.fixture(scope="module")
+def study():
+    scenario = jaxslam.scenario("matched", steps=5)
+    filters = jaxslam.make_filters(scenario, "robocentric", ["inverse_scaling", "inverse_depth"])
+    return jaxslam.monte_carlo(scenario, filters, runs=4)
 
 
 def evaluation():
@@ -110,10 +124,7 @@ def test_filters_are_named_by_what_tells_them_apart():
         assert short_names(names) == {name: name for name in names}
 
 
-def test_a_column_for_print_has_its_width_its_letters_and_nothing_outside(tmp_path):
-    scenario = jaxslam.scenario("matched", steps=5)
-    filters = jaxslam.make_filters(scenario, "robocentric", ["inverse_scaling", "inverse_depth"])
-    study = jaxslam.monte_carlo(scenario, filters, runs=4)
+def test_a_column_for_print_has_its_width_its_letters_and_nothing_outside(study, tmp_path):
     for figure in (
         plot_evaluation(evaluation(), column=True),
         plot_consistency(study, column=True),
@@ -158,3 +169,38 @@ def test_what_draws_a_figure_returns_it_and_what_draws_axes_takes_them(plot):
 
 def public_plots(module):
     return [value for name, value in vars(module).items() if name.startswith("plot_")]
+
+
+def test_a_study_is_drawn_and_tabled_as_its_summary_is(study):
+    summary = jaxslam.summarise(study)
+    assert jaxslam.table(study) == jaxslam.table(summary) == repr(study)
+    for plot in (plot_nees, plot_outside, plot_beyond_scale, plot_log_scale):
+        lines = [plot(of, ax=new_figure(3, 3).subplots()).lines for of in (study, summary)]
+        for one, other in zip(*lines, strict=True):
+            np.testing.assert_array_equal(one.get_xydata(), other.get_xydata())
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_wrong_names_and_kinds_are_told_what_is_accepted(study):
+    ax = new_figure(3, 3).subplots()
+    wrong = "robocentric/inverse_dept"
+    with pytest.raises(ValueError, match=r"unknown label .*did you mean robocentric/inverse_depth"):
+        plot_nees(study, ax=ax, label={wrong: "UID"})
+    with pytest.raises(ValueError, match=r"the scale of this scenario is measured"):
+        plot_log_scale({**jaxslam.summarise(study), "scale_free": False}, ax=ax)
+    with pytest.raises(ValueError, match=r"a study is summarised, .* not list"):
+        jaxslam.summarise([study])  # ty: ignore[invalid-argument-type]
+    with pytest.raises(ValueError, match="a dict is accepted, as make_filters gives it"):
+        jaxslam.monte_carlo("matched", list(study.filters))  # ty: ignore[invalid-argument-type]
+    with pytest.raises(ValueError, match="unknown dtype 'float17'; known: float64, float32"):
+        jaxslam.cast(study.filters, "float17")
+    with pytest.raises(ValueError, match="confidence must be between 0 and 1, not 95"):
+        jaxslam.mean_band(3, 10, 95)
+
+
+def test_a_scenario_is_simulated_by_its_name():
+    runs = [
+        jaxslam.simulate(world, jax.random.key(0))
+        for world in ("matched-tight", jaxslam.scenario("matched-tight"))
+    ]
+    np.testing.assert_array_equal(runs[0].points, runs[1].points)

@@ -2,14 +2,22 @@
 
 import json
 import re
+import shlex
+import tomllib
 from pathlib import Path
 
 import cv2
+import numpy as np
+import tyro
 
+import jaxslam
+from jaxslam.cli import Command
 from jaxslam.evaluation import CHOICES, Convention, read_covariances
 from jaxslam.vision.synthetic import synthetic_source
+from jaxslam.vision.target import read_target
 
 ROOT = Path(__file__).parents[1]
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def examples(document: str) -> list[str]:
@@ -119,11 +127,64 @@ def test_a_film_goes_through_the_tracker_in_python(tmp_path, monkeypatch):
 def test_every_snippet_of_every_page_runs():
     """Each document with snippets is run by a test of this file; what is not run says why."""
     tests = Path(__file__).read_text()
-    for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]:
+    for path in DOCUMENTS:
         text, name = path.read_text(), str(path.relative_to(ROOT))
         excused = text.count("<!-- does not run as a test: ")
         assert text.count("```python") == len(examples(name)) + excused, name
         assert not examples(name) or f'run_example("{name}")' in tests, name
+
+
+SAYS = re.compile("…|--help|--version")
+"""What is no command to be checked: one that is abridged, or ends at once."""
+
+
+def commands() -> list[str]:
+    """Command lines of `jaxslam` and of benchmarks in blocks and between backticks, all pages."""
+    found: set[str] = set()
+    for path in DOCUMENTS:
+        text = path.read_text()
+        blocks = "\n".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL))
+        told = re.findall(r"^((?:jaxslam|python) .*)$", blocks, re.MULTILINE)
+        told += re.findall(r"`((?:jaxslam \w+|python benchmarks/\w+\.py) [^`\n]+)`", text)
+        found |= {line.partition(" #")[0].strip() for line in told if not SAYS.search(line)}
+    return sorted(found)
+
+
+def test_every_command_of_every_page_is_accepted():
+    """Its options and their kinds, without being run."""
+    checked = [line for line in commands() if line.startswith("jaxslam ")]
+    assert len(checked) > 20
+    for line in checked:
+        options = tyro.cli(Command, args=shlex.split(line)[1:], config=(tyro.conf.OmitArgPrefixes,))
+        assert hasattr(options, "run"), line
+
+
+def test_every_benchmark_of_every_page_is_there_with_its_options():
+    checked = [line for line in commands() if line.startswith("python ")]
+    assert len(checked) > 2
+    for line in checked:
+        script = line.split()[1]
+        source = (ROOT / script).read_text()
+        for option in re.findall(r"--([\w-]+)", line):
+            assert re.search(rf"\b{option.replace('-', '_')}\b", source), (line, option)
+
+
+def test_the_scenario_file_of_the_page_is_one(tmp_path):
+    (snippet,) = re.findall(r"```toml\n(.*?)```", (ROOT / "docs/data.md").read_text(), re.DOTALL)
+    (tmp_path / "mine.toml").write_text(snippet)
+    mine = jaxslam.scenario(str(tmp_path / "mine.toml"))
+    assert mine.pixel_sigma == tomllib.loads(snippet)["pixel_sigma"]
+    assert mine.ring_radius == jaxslam.scenario("circle").ring_radius
+
+
+def test_the_target_of_the_page_is_one(tmp_path):
+    page = (ROOT / "docs/own-video.md").read_text()
+    (snippet,) = re.findall(r"```json\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "target.json").write_text(snippet)
+    for name in re.findall(r'"([\w-]+\.png)"', snippet):
+        patch = np.random.default_rng(0).integers(0, 255, (15, 15)).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / name), patch)
+    assert len(read_target(tmp_path / "target.json").points) == snippet.count('"name"')
 
 
 def test_the_covariance_file_of_the_page_is_one(tmp_path):

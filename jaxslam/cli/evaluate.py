@@ -81,7 +81,9 @@ class EvaluateOptions:
         if self.pdf:
             plot_evaluation(found, self.out / "evaluation.pdf", column=True)
         print(found)
-        print(f"wrote {written} and {self.out / 'evaluation.png'}")
+        print(
+            f"wrote {written}, evaluation.png{' and evaluation.pdf' if self.pdf else ''} beside it"
+        )
 
     def _evaluation(self) -> Evaluation:
         stated = {name: getattr(self, name) for name in CHOICES}

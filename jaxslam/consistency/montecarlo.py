@@ -93,8 +93,8 @@ def monte_carlo(
 
     Raises ValueError for sizes that make no sense.
     """
-    if not filters:
-        raise ValueError("no filter to run: name at least one")
+    if not filters or not isinstance(filters, Mapping):
+        raise ValueError("no filters by name: a dict is accepted, as make_filters gives it")
     check_sizes(runs, seed, dtype, chunk)
     check_backend(backend)
     scenario = as_scenario(scenario)

@@ -42,10 +42,12 @@ def mean_band(dof: int, runs: int, confidence: float = CONFIDENCE) -> tuple[floa
     """Two-sided bounds of the mean NEES of `runs` independent runs at ONE time step.
 
     `N · mean ~ χ²(N n)` exactly. The steps of a run are correlated: never pool them. Raises
-    ValueError without a run or a degree of freedom.
+    ValueError without a run or a degree of freedom, and for no confidence between 0 and 1.
     """
     if dof < 1 or runs < 1:
         raise ValueError(f"a band needs at least one run and one dof, not {runs} and {dof}")
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence must be between 0 and 1, not {confidence}")
     tail = (1 - confidence) / 2
     low, high = (chi2_quantile(q, runs * dof) / runs for q in (tail, 1 - tail))
     return low, high

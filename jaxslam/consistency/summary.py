@@ -81,6 +81,13 @@ class Study:
         return pandas.concat(frames, keys=list(self.filters), names=["filter", "row"])
 
 
+def as_summary(given: Study | dict[str, Any]) -> dict[str, Any]:
+    """A summary, or that of a study. Raises ValueError for anything else."""
+    if isinstance(given, dict) and "filters" in given:
+        return given
+    return summarise(given)  # ty: ignore[invalid-argument-type]
+
+
 def summarise(study: Study) -> dict[str, Any]:
     """The content of `consistency.json`, ready for `json.dumps`.
 
@@ -98,7 +105,12 @@ def summarise(study: Study) -> dict[str, Any]:
 
     `outside3sigma` is the share of errors beyond three of the claimed σ, axis by axis and then the
     mean of the axes: 0.27 % of Gaussian errors.
+    Raises ValueError for what is no study.
     """
+    if not isinstance(study, Study):
+        raise ValueError(
+            f"a study is summarised, as monte_carlo gives it, not {type(study).__name__}"
+        )
     from jaxslam import __version__
 
     return {
@@ -298,8 +310,12 @@ def _chunks(study: Study, name: str, names: tuple[str, ...]) -> Iterator[Records
         yield study.store.load(name, chunk, names)
 
 
-def table(summary: dict[str, Any]) -> str:
-    """The verdict on every filter, then the numbers of the last step, one filter a line."""
+def table(summary: dict[str, Any] | Study) -> str:
+    """The verdict on every filter, then the numbers of the last step, one filter a line.
+
+    Of a `summary`, or of a study, which is summarised here.
+    """
+    summary = as_summary(summary)
     filters = summary["filters"]
     wide = max(31, *map(len, filters)) + 1
     header = (

@@ -19,6 +19,7 @@ from jaxslam.evaluation.arrays import normalised, paired, step_times, without_kn
 from jaxslam.evaluation.convention import Convention
 from jaxslam.evaluation.identify import Identification
 from jaxslam.files import json_numbers, write_atomically
+from jaxslam.lookup import chosen
 
 SCHEMA = 1
 SIGMAS = 3
@@ -164,7 +165,8 @@ class Evaluation:
         runs = f"{self.runs} run{'s' if self.runs > 1 else ''}"
         return [
             f"{runs} of {self.steps} steps; mean {self.quantity} of a consistent filter "
-            f"{self.dof}, at one step in {low:.3f}–{high:.3f} with 95 %: {inside:.0%} of steps are",
+            f"{self.dof}, at one step in {low:.3f}–{high:.3f} with 95 %; "
+            f"{inside:.0%} of the steps are inside",
             _columns("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
             *(self._row(i) for i in range(len(self.names))),
             _columns("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}"),
@@ -206,7 +208,7 @@ def evaluate(
     at = step_times(times, e.shape[1])
     e, P = e[:, start:], P[:, start:]
     return Evaluation(
-        quantity=quantity,
+        quantity=next(iter(chosen("quantity", quantity, dict.fromkeys(("NEES", "NIS"))))),
         dof=e.shape[-1],
         nees=normalised(e, P),
         errors=e,

@@ -17,7 +17,7 @@ from jaxslam.evaluation.evaluate import Evaluation, evaluate
 from jaxslam.evaluation.poses import evaluate_poses
 from jaxslam.files import read_arrays
 from jaxslam.lookup import suggestion
-from jaxslam.tum import read_table, read_tum
+from jaxslam.tum import read_table, read_tum, words
 
 ESTIMATES = ("estimate.txt", "trajectory.txt")
 COVARIANCES = ("covariance.txt",)
@@ -127,18 +127,21 @@ def _npz(path: Path) -> dict[str, Any]:
     return arrays
 
 
+_COLUMNS = "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"
+
+
 def _csv(path: Path) -> dict[str, Any]:
     """Lines `run, step, n errors, n (n + 1)/2 of the upper triangle`; a first one of names."""
     row = "numbers run, step, n errors and the n (n + 1)/2 of the upper triangle row by row"
     comments, rows, lines = read_table(path, "log", "errors", row, None)
     n = round((np.sqrt(9 + 8 * (rows.shape[1] - 2)) - 3) / 2) if rows.shape[1] > 3 else 0
     if n < 1 or 2 + n * (n + 3) // 2 != rows.shape[1]:
-        raise ValueError(f"{path}: {rows.shape[1]} columns; {row} are accepted")
+        raise ValueError(f"{path}: {rows.shape[1]} columns; {row} are accepted: {_COLUMNS} columns")
     order, runs, steps = _rectangle(path, rows[:, :2], lines)
     table = rows[order].reshape(runs, steps, -1)
     upper, P = np.triu_indices(n), np.zeros((runs, steps, n, n))
     P[..., upper[0], upper[1]] = P[..., upper[1], upper[0]] = table[..., 2 + n :]
-    titles = [word.strip() for word in comments[0].replace(",", " ").split()] if comments else []
+    titles = words(comments[0]) if comments else []
     named = len(titles) == rows.shape[1] and not comments[0].lstrip().startswith("#")
     names = {"names": titles[2 : 2 + n]} if named else {}
     return {"errors": table[..., 2 : 2 + n], "covariances": P, **names}

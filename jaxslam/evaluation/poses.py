@@ -95,6 +95,10 @@ def evaluate_poses(
     convention would make the data consistent is tried too. Raises ValueError, naming run and step.
     """
     stated = convention or Convention()
+    if not isinstance(stated, Convention):
+        raise ValueError(
+            f"a convention is a jaxslam.Convention, as Convention('right'), not {stated}"
+        )
     chosen("align", [align], dict.fromkeys(ALIGNMENTS))
     poses = checked_poses(estimates, covariances, truths)
     found = _compared(poses, stated, align)

@@ -11,8 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxslam.consistency import Study, summarise
+from jaxslam.consistency.summary import as_summary
 from jaxslam.consistency.verdict import headline
 from jaxslam.evaluation.evaluate import OUTSIDE
+from jaxslam.lookup import chosen
 from jaxslam.plots.landmarks import region_from_above
 from jaxslam.plots.style import (
     COLUMN,
@@ -100,12 +102,13 @@ Labels = Mapping[str, str]
 """What filters are called at the ends of their lines: `{"robocentric/inverse_depth": "UID"}`."""
 
 
-def plot_nees(summary: dict[str, Any], *, ax: Axes, label: Labels | None = None) -> Axes:
+def plot_nees(summary: dict[str, Any] | Study, *, ax: Axes, label: Labels | None = None) -> Axes:
     """Mean NEES of every filter over time with its exact 95 % band, and the medians, dotted.
 
-    `summary` is of `summarise`. Names stand at the ends of the lines; a filter may be called
-    otherwise by `label`.
+    `summary` is of `summarise`, or a study. Names stand at the ends of the lines; a filter may be
+    called otherwise by `label`.
     """
+    summary = as_summary(summary)
     first = next(iter(summary["filters"].values()))
     ideal = f"ideal {first['dof']}"
     _plot_means(summary["filters"], summary, ax, label)
@@ -143,15 +146,18 @@ def _styled(numbers: Mapping[str, Any]):
 
 def _name(ax: Axes, time: np.ndarray, lines: list, label: Labels | None) -> None:
     """Write the names of `(filter, values, colour)` at the ends of their lines."""
-    called = {**short_names([name for name, _, _ in lines]), **(label or {})}
+    names = [name for name, _, _ in lines]
+    chosen("label", label or names, dict.fromkeys(names))
+    called = {**short_names(names), **(label or {})}
     label_ends(ax, [End(called[name], time, values, colour) for name, values, colour in lines])
 
 
-def plot_outside(summary: dict[str, Any], *, ax: Axes, label: Labels | None = None) -> Axes:
+def plot_outside(summary: dict[str, Any] | Study, *, ax: Axes, label: Labels | None = None) -> Axes:
     """Share of errors outside ±3σ over time, of the position (solid) and the orientation (thin).
 
     Names stand at the ends of the position's lines; a filter may be called otherwise by `label`.
     """
+    summary = as_summary(summary)
     time, lines = np.array(summary["time"]), []
     for (name, f), style in _styled(summary["filters"]):
         position, orientation = (
@@ -175,11 +181,22 @@ def _over_time(axes: Axes, time: np.ndarray) -> None:
     axes.grid(alpha=0.25, which="major")
 
 
-def plot_beyond_scale(summary: dict[str, Any], *, ax: Axes, label: Labels | None = None) -> Axes:
+def _with_scale(given: dict[str, Any] | Study) -> dict[str, Any]:
+    """A summary that has the scale's error. Raises ValueError where the scale is no unknown."""
+    summary = as_summary(given)
+    if not summary["scale_free"]:
+        raise ValueError("the scale of this scenario is measured: there is no error of it to draw")
+    return summary
+
+
+def plot_beyond_scale(
+    summary: dict[str, Any] | Study, *, ax: Axes, label: Labels | None = None
+) -> Axes:
     """Mean and median NEES at the scale of the truth that explains the estimate best.
 
     Where the scale is free; names at the ends of the lines, or those of `label`.
     """
+    summary = _with_scale(summary)
     numbers = {name: f["beyond_scale"] for name, f in summary["filters"].items()}
     _plot_means(numbers, summary, ax, label)
     ideal = f"ideal {next(iter(numbers.values()))['dof']}"
@@ -188,12 +205,15 @@ def plot_beyond_scale(summary: dict[str, Any], *, ax: Axes, label: Labels | None
     return ax
 
 
-def plot_log_scale(summary: dict[str, Any], *, ax: Axes, label: Labels | None = None) -> Axes:
+def plot_log_scale(
+    summary: dict[str, Any] | Study, *, ax: Axes, label: Labels | None = None
+) -> Axes:
     """The error of log-scale and what it should be by the σ claimed: medians, as one reversed run,
     which no scale explains, has an error and a σ beyond all others.
 
     Where the scale is free; names at the ends of the lines, or those of `label`.
     """
+    summary = _with_scale(summary)
     time, lines = np.array(summary["time"]), []
     for (name, f), style in _styled(summary["filters"]):
         error, sigma = (

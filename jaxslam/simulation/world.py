@@ -17,7 +17,7 @@ from jaxslam.models.sensors import AbstractSensor, Pinhole
 from jaxslam.simulation.pieces import calibration_sigma_of, motion_of, sensor_of
 from jaxslam.simulation.placement import PLACEMENT, thrown
 from jaxslam.simulation.run import Run, in_order_of_appearance
-from jaxslam.simulation.scenario import Scenario
+from jaxslam.simulation.scenario import Scenario, as_scenario
 from jaxslam.simulation.trajectories import Trajectory, find, sampled
 from jaxslam.simulation.visibility import limited, visible
 
@@ -32,19 +32,20 @@ def as_data(scenario: Scenario, dtype: Any = None) -> Scenario:
 
 
 def simulate(
-    scenario: Scenario,
+    scenario: Scenario | str,
     key: Array,
     dtype: Any = None,
     *,
     motion: AbstractMotion | Trajectory | None = None,
     sensor: AbstractSensor | None = None,
 ) -> Run:
-    """Draw one run: a pure function of the scenario's numbers and of the key.
+    """Draw one run: a pure function of the scenario's numbers and of the key (`jax.random.key`).
 
     The truth is drawn from the prior of the filters of `make_filters`, or moves along the
     scenario's trajectory; or it moves and is measured as models of one's own say, in the world of
     the scenario. Raises ValueError for a sensor that landmarks of this placement cannot have.
     """
+    scenario = as_scenario(scenario)
     motion = trajectory_of(scenario, dtype) if motion is None else motion
     s = as_data(scenario, dtype)
     motion_key, world_key, camera_key, pixel_key = jax.random.split(key, 4)
