@@ -48,7 +48,7 @@ def _apply(plan: Plan, uses, step: Apply, owner, result: list[Any]) -> Apply:
     """What remains; products are appended to the result, and those that they replace are gone."""
     made = step.made[plan.live[step.made] & ~plan.inlined[step.made]]
     gone = []
-    for form in np.unique(plan.form[made]):
+    for form in np.unique(plan.form[made]).tolist():
         refs = made[plan.form[made] == form]
         terms = _terms(plan, form)
         if terms is None or refs.size < MANY:
