@@ -53,5 +53,6 @@ def _compiled_programs_are_freed():
     """A process may hold only so many memory maps, and every compiled program takes some."""
     yield
     montecarlo._compiled.cache_clear()
+    montecarlo._native.cache_clear()
     programs.forget()
     jax.clear_caches()

@@ -15,10 +15,9 @@ PACKAGE = Path(jaxslam.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 ORDER = (
     "arrays", "files", "programs", "tum", "linalg", "lookup", "watchdog", "geometry",
-    "least_squares", "native", "landmarks", "models", "forms", "slam", "delayed", "remedies", "window",
-    "wrappers", "simulation", "names", "consistency", "evaluation", "posterior", "triangulation",
-    "datasets",
-    "plots", "video", "vision", "cli",
+    "least_squares", "native", "landmarks", "models", "forms", "slam", "delayed", "remedies",
+    "window", "wrappers", "simulation", "names", "consistency", "evaluation", "posterior",
+    "triangulation", "datasets", "plots", "video", "vision", "cli",
 )  # fmt: skip
 """Rooms, each of which imports only those before it."""
 

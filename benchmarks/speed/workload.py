@@ -144,7 +144,7 @@ def by_native(inputs: Inputs, dtype: str = "float64") -> Callable[[], Records]:
     index = kept(inputs.slam, inputs.start)
     with jax.enable_x64(dtype == "float64"):
         numbers, static = eqx.partition(cast(inputs.slam, dtype), is_number)
-        seconds, *runs = jax.tree.map(lambda x: np.asarray(x, dtype), tuple(inputs[1:]))
+        seconds, *runs = jax.tree.map(np.asarray, cast(tuple(inputs[1:]), dtype))
 
         def one(shared, run):
             numbers, seconds = shared

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from jaxslam import programs
 from jaxslam.files import write_atomically
+from jaxslam.native.emit import Source
 
 FLAGS = (
     *("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math"),
@@ -29,14 +30,15 @@ def compiler() -> list[str] | None:
     return None if found is None else [found, *told[1:]]
 
 
-def built(source: str) -> ctypes.CDLL:
+def built(source: Source) -> ctypes.CDLL:
     """The library of a program. Raises ValueError without a compiler, or where it fails."""
     command = compiler()
     if command is None:
         raise ValueError("the native backend needs a C++ compiler: none is found ($CXX, c++, g++)")
-    key = "\n".join([source, *command, *FLAGS, _version(tuple(command)), *programs.processor()])
+    text = [source.text, *command, *FLAGS, _version(tuple(command)), *programs.processor()]
+    digest = hashlib.sha256("\n".join(text).encode() + source.tables).hexdigest()
     folder = programs.kept_in() or _own_folder()
-    path = folder / f"native-{hashlib.sha256(key.encode()).hexdigest()}.so"
+    path = folder / f"native-{digest}.so"
     if not _trusted(path):
         folder.mkdir(parents=True, exist_ok=True)
         with write_atomically(path) as temporary:
@@ -48,11 +50,12 @@ def _trusted(path: Path) -> bool:
     return path.exists() and (not hasattr(os, "getuid") or path.stat().st_uid == os.getuid())
 
 
-def _compile(command: list[str], source: str, path: Path) -> None:
+def _compile(command: list[str], source: Source, path: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "program.cpp"
-        file.write_text(source)
-        arguments = [*command, *FLAGS, str(file), "-o", str(path), "-lm"]
+        file, tables = (Path(folder) / name for name in ("program.cpp", "tables"))
+        file.write_text(source.text)
+        tables.write_bytes(source.tables)
+        arguments = [*command, *FLAGS, f'-DTABLES="{tables}"', str(file), "-o", str(path), "-lm"]
         done = subprocess.run(arguments, capture_output=True, text=True)
     if done.returncode:
         raise ValueError(f"the C++ compiler failed: {done.stderr[-2000:]}")

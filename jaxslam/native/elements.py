@@ -11,11 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-Refs = np.ndarray
+if TYPE_CHECKING:
+    Refs = Any
+else:
+    Refs = np.ndarray | np.integer
 """Elements, integers; of any shape."""
 
 CONSTANT, VARIABLE = 0, 1
@@ -150,7 +153,7 @@ class Elements:
 
     def _one_constant(self, bits: int) -> int:
         if bits not in self._constants:
-            (self._constants[bits],) = self._new(1, CONSTANT)
+            self._constants[bits] = int(self._new(1, CONSTANT)[0])
             self._value[self._constants[bits]] = np.int64(bits).view(float)
         return self._constants[bits]
 
@@ -168,15 +171,15 @@ class Elements:
         self._region[start : self.size] = self._inside[-1]
         return np.arange(start, self.size, dtype=np.int32)
 
-    def is_constant(self, refs: Refs) -> np.ndarray:
+    def is_constant(self, refs: Refs) -> Any:
         """Where they are."""
         return self._code[refs] == CONSTANT
 
-    def is_zero(self, refs: Refs) -> np.ndarray:
+    def is_zero(self, refs: Refs) -> Any:
         """Where they are zero, of either sign."""
         return self.is_constant(refs) & (self._value[refs] == 0)
 
-    def known(self, refs: Refs) -> np.ndarray | None:
+    def known(self, refs: Refs) -> Any:
         """Values, where all are constant."""
         return self._value[refs] if np.all(self.is_constant(refs)) else None
 
@@ -250,5 +253,5 @@ class Elements:
         rank[order] = np.arange(len(order))
         return found[rank[inverse]]
 
-    def _lookup(self, key: tuple[int, ...]) -> int:
+    def _lookup(self, key: tuple[Any, ...]) -> int:
         return next((known[key] for known in reversed(self._known) if key in known), -1)

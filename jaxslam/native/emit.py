@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,14 @@ BYTES = 64
 """Of a vector."""
 
 
-def source(plan: Plan, kinds: tuple[list[tuple[Any, bool]], list[Any]]) -> str:
+class Source(NamedTuple):
+    """A program in C++, and the constant arrays that it finds in the file `TABLES`."""
+
+    text: str
+    tables: bytes
+
+
+def source(plan: Plan, kinds: tuple[list[tuple[Any, bool]], list[Any]]) -> Source:
     """The whole program; `kinds` are the types of what goes in, and whether every run has its
     own, and the types of what comes out."""
     writer = _Writer(plan)
@@ -34,35 +41,42 @@ def source(plan: Plan, kinds: tuple[list[tuple[Any, bool]], list[Any]]) -> str:
     head = [f"#define SCALAR {scalar}", f"#define WIDTH {width}"]
     head += ["#if defined(__x86_64__) && defined(__gnu_linux__)"]
     head += [f"#define VECTOR_MATH(x) {letter}", "#endif", PRELUDE.read_text()]
-    return "\n".join([*head, *writer.tables.lines, *writer.functions, entry])
+    return Source("\n".join([*head, *writer.functions, entry]), writer.tables.data)
 
 
 class _Tables:
-    """Constant arrays, each of them once."""
+    """Constant arrays, each of them once, in one piece of memory: compilers are slow on lists."""
 
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-        self._names: dict[Any, str] = {}
+    def __init__(self, scalar: Any) -> None:
+        self._kinds = {"int": np.int32, "int16_t": np.int16, "SCALAR": scalar}
+        self._pieces: list[bytes] = []
+        self._places: dict[Any, int] = {}
+        self._size = 0
 
     def __call__(self, values: Any, kind: str = "int") -> str:
-        values = np.ravel(values)
-        key = kind, values.tobytes()
-        if key not in self._names:
-            self._names[key] = name = f"t{len(self._names)}"
-            numbers = ",".join(map(str, values.tolist())) or "0"
-            self.lines.append(f"static const {kind} {name}[] = {{{numbers}}};")
-        return self._names[key]
+        data = np.ravel(values).astype(self._kinds[kind]).tobytes()
+        if (kind, data) not in self._places:
+            self._places[kind, data] = self._size
+            self._pieces.append(data + bytes(-len(data) % 8))
+            self._size += len(self._pieces[-1])
+        return f"((const {kind} *)(jaxslam_tables + {self._places[kind, data]}))"
+
+    @property
+    def data(self) -> bytes:
+        """All of them."""
+        return b"".join(self._pieces)
 
 
 class _Writer:
     def __init__(self, plan: Plan) -> None:
         self.plan, self.elements = plan, plan.program.elements
-        self.tables, self.functions = _Tables(), []
+        self.tables = _Tables(self.elements.dtype)
+        self.functions: list[str] = []
         self.texts: dict[int, str] = {}
         self.local: dict[int, str] = {}
         self.count = 0
 
-    def offset(self, refs: Refs) -> np.ndarray:
+    def offset(self, refs: Refs) -> Any:
         """Bytes."""
         slots = self.plan.slot[refs]
         assert np.all(slots >= 0), "a number is not in memory"
@@ -77,7 +91,9 @@ class _Writer:
             self.local = outer
             name = f"f{len(self.functions)}"
             text = "\n".join(x for x in body if x)
-            self.functions.append(f"static __attribute__((noinline)) void {name}(char *m) {{\n{text}\n}}")
+            self.functions.append(
+                f"static __attribute__((noinline)) void {name}(char *m) {{\n{text}\n}}"
+            )
             calls.append(f"{name}(m);")
         return " ".join(calls)
 
@@ -108,7 +124,9 @@ class _Writer:
                 return f"{self.copied(step.made, step.table)} {put}"
             case Sort():
                 sizes = ", ".join(map(str, step.made.shape))
-                return f"{self.copied(step.made, step.given)} sort(m, {made}, {sizes}, {step.keys});"
+                return (
+                    f"{self.copied(step.made, step.given)} sort(m, {made}, {sizes}, {step.keys});"
+                )
         raise AssertionError(step)
 
     def copied(self, to: Refs, source: Refs) -> str:
@@ -119,7 +137,9 @@ class _Writer:
         plan = self.plan
         made = step.made[plan.live[step.made] & ~plan.inlined[step.made]]
         forms = plan.form[made]
-        return "\n".join(self.of_form(made[forms == form], form) for form in np.unique(forms))
+        return "\n".join(
+            self.of_form(made[forms == form], form) for form in np.unique(forms).tolist()
+        )
 
     def of_form(self, refs: Refs, form: int) -> str:
         """Numbers of one form."""
@@ -182,11 +202,15 @@ class _Writer:
         body = f"{names[-1]} = {filled};"
         if inner > 1:
             body = f"for (long i = 0; i < {inner}; ++i) {body}"
-        return "\n".join([f"for (long o = 0; o < {rows.shape[1]}; ++o) {{", *lines, f"  {body}", "}"])
+        return "\n".join(
+            [f"for (long o = 0; o < {rows.shape[1]}; ++o) {{", *lines, f"  {body}", "}"]
+        )
 
     def one(self, places: list[Any], to: np.ndarray, text: str, e: int) -> str:
         """One number."""
-        names = [x if isinstance(x, str) else self.local.get(int(x[e]), f"AT({x[e]})") for x in places]
+        names = [
+            x if isinstance(x, str) else self.local.get(int(x[e]), f"AT({x[e]})") for x in places
+        ]
         name = f"x{self.count}"
         self.count += 1
         self.local[int(to[e])] = name
@@ -252,7 +276,11 @@ class _Writer:
         moved = step.after != step.carry
         begin = self.copied(step.carry, step.before)
         turn = f"{step.length - 1} - t" if step.reverse else "t"
-        lines = [begin, f"for (long t = 0; t < {step.length}; ++t) {{", f"const long turn = {turn};"]
+        lines = [
+            begin,
+            f"for (long t = 0; t < {step.length}; ++t) {{",
+            f"const long turn = {turn};",
+        ]
         lines.append(self.row(step.rows[:, read], step.read[read], True))
         lines.append(body)
         lines.append(self.row(step.written[:, told], step.results[told], False))
@@ -295,16 +323,17 @@ class _Writer:
         """The function that is called from outside, for `count` runs from `first` on."""
         program, lines = self.plan.program, []
         constants = np.flatnonzero(self.plan.live & (self.elements.code == CONSTANT))
-        values = self.tables([_number(x) for x in self.elements.value[constants]], "SCALAR")
+        values = self.tables(self.elements.value[constants], "SCALAR")
         places = self.tables(self.offset(constants))
-        lines.append(f"for (long e = 0; e < {constants.size}; ++e) AT({places}[e]) = C({values}[e]);")
+        lines.append(
+            f"for (long e = 0; e < {constants.size}; ++e) AT({places}[e]) = C({values}[e]);"
+        )
         lines.append(f"AT({self.trash}) = ZERO;")
         for k, (refs, (kind, own)) in enumerate(zip(program.inputs, inputs, strict=True)):
             if refs.size and self.plan.live[refs].any():
-                begin = int(self.offset(refs.ravel()[:1])[0])
-                lines.append(
-                    f"load<{_type(kind)}>(m, in[{k}], {refs.size}, {begin}, first, count, {int(own)});"
-                )
+                begin, each = int(self.offset(refs.ravel()[:1])[0]), int(own)
+                call = f"(m, in[{k}], {refs.size}, {begin}, first, count, {each});"
+                lines.append(f"load<{_type(kind)}>{call}")
         lines.append(body)
         for k, (refs, kind) in enumerate(zip(program.outputs, outputs, strict=True)):
             if refs.size:
@@ -359,6 +388,6 @@ def _padded_places(made: np.ndarray, M: int, N: int) -> np.ndarray:
 def _cost(left: np.ndarray, right: np.ndarray, M: int, N: int) -> float:
     """Half cycles of a product by tiles, of these that are not zero: two sums or two loads a cycle,
     and one of a tile's rows, which come from farther away, in two cycles."""
-    rows, columns = _padded(left, M).any(1), _padded(right, N).any(1)
+    rows, columns = (np.any(_padded(x, size), axis=1) for x, size in ((left, M), (right, N)))
     terms = float((rows.astype(float) @ columns.T.astype(float)).sum())
-    return terms * max(M * N, 1.15 * (M + N), 4 * M) + 8.0 * len(rows) * len(columns)
+    return terms * max(M * N, 1.15 * (M + N), 4 * M) + 8.0 * rows.shape[0] * columns.shape[0]

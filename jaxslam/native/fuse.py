@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from jaxslam.native.elements import CODES, Refs
 from jaxslam.native.program import Apply, Loop, Product, While
-
-if TYPE_CHECKING:
-    from jaxslam.native.plan import Plan
 
 MANY = 64
 """Sums of products from which on they are looked at as a product of matrices."""
@@ -21,12 +18,12 @@ Terms = list[tuple[int, list[int]]]
 """Sign, and leaves of a form of which the product is meant: one or two."""
 
 
-def fused(plan: Plan, uses: np.ndarray) -> list[Any]:
-    """The program's steps with such operations as `Product`; `uses` counts them by element."""
+def fused(plan: Any, uses: np.ndarray) -> list[Any]:
+    """The steps of a `Plan` with such operations as `Product`; `uses` counts them by element."""
     return _steps(plan, uses, plan.program.steps)
 
 
-def _steps(plan: Plan, uses: np.ndarray, steps: list[Any]) -> list[Any]:
+def _steps(plan: Any, uses: np.ndarray, steps: list[Any]) -> list[Any]:
     owner = np.full(plan.live.size, -1)
     result: list[Any] = []
     for step in steps:
@@ -44,11 +41,11 @@ def _steps(plan: Plan, uses: np.ndarray, steps: list[Any]) -> list[Any]:
     return [step for step in result if step is not None]
 
 
-def _apply(plan: Plan, uses, step: Apply, owner, result: list[Any]) -> Apply:
+def _apply(plan: Any, uses, step: Apply, owner, result: list[Any]) -> Apply:
     """What remains; products are appended to the result, and those that they replace are gone."""
     made = step.made[plan.live[step.made] & ~plan.inlined[step.made]]
     gone = []
-    for form in np.unique(plan.form[made]):
+    for form in np.unique(plan.form[made]).tolist():
         refs = made[plan.form[made] == form]
         terms = _terms(plan, form)
         if terms is None or refs.size < MANY:
@@ -63,7 +60,7 @@ def _apply(plan: Plan, uses, step: Apply, owner, result: list[Any]) -> Apply:
     return Apply(np.setdiff1d(step.made, np.concatenate(gone))) if gone else step
 
 
-def _terms(plan: Plan, form: int) -> Terms | None:
+def _terms(plan: Any, form: int) -> Terms | None:
     """Of a sum of numbers and of products of two; None for another expression."""
     names = {CODES[name]: name for name in ("add", "sub", "mul", "neg")}
 

@@ -16,8 +16,8 @@ from jaxslam.native.program import (
     Product,
     Program,
     While,
-    read_in_turn,
     read_by,
+    read_in_turn,
     written_by,
 )
 
@@ -224,7 +224,7 @@ class _Places:
 
     def read(self, refs: Refs, around) -> None:
         """They are used now, or in every turn of the loops around that began after them."""
-        for number in np.unique(self.block_of[refs]):
+        for number in np.unique(self.block_of[refs]).tolist():
             if number < 0:
                 continue
             block = self.blocks[number]
@@ -252,7 +252,7 @@ class _Places:
         plan = self.plan
         made = step.made[plan.live[step.made] & ~plan.inlined[step.made]]
         self.write(made, around)
-        for form in np.unique(plan.form[made]):
+        for form in np.unique(plan.form[made]).tolist():
             for refs in plan.leaves(made[plan.form[made] == form]):
                 self.read(refs, around)
 

@@ -6,6 +6,14 @@
 typedef SCALAR V __attribute__((vector_size(WIDTH * sizeof(SCALAR)), may_alias, aligned(sizeof(SCALAR) * WIDTH)));
 constexpr int W = WIDTH;
 
+// Constant arrays, from a file.
+#ifdef __APPLE__
+asm(".const_data\n.balign 64\n_jaxslam_tables:\n.incbin \"" TABLES "\"\n.text");
+#else
+asm(".pushsection .rodata\n.balign 64\njaxslam_tables:\n.incbin \"" TABLES "\"\n.popsection");
+#endif
+extern "C" const char jaxslam_tables[] __attribute__((visibility("hidden")));
+
 #define AT(offset) (*(V *)(m + (offset)))
 #define ZERO (V{})
 #define ONE (V{} + (SCALAR)1)

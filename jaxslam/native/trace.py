@@ -14,7 +14,6 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 from jax.interpreters import partial_eval
 
-from jaxslam.linalg import symmetric_part
 from jaxslam.native.elements import OPERATIONS, Elements, Refs
 from jaxslam.native.program import Apply, Loop, Product, Program, Put, Sort, Take, While
 
@@ -90,7 +89,7 @@ class Tracer:
     def one(self, equation: Any, arguments: list[Refs]) -> list[Refs]:
         """One operation, by its rule."""
         name, parameters = equation.primitive.name, equation.params
-        if name in INNER and parameters.get("name") == symmetric_part.__name__:
+        if name in INNER and parameters.get("name") == "symmetric_part":
             return [_mirrored(arguments[0])]
         if name in INNER:
             return self.closed(parameters[INNER[name]], arguments)
@@ -136,6 +135,7 @@ INNER = {
     "custom_vjp_call_jaxpr": "fun_jaxpr",
 }
 """Functions within, by the parameter that holds them."""
+
 
 def _mirrored(x: Refs) -> Refs:
     """The lower half above too."""
@@ -207,7 +207,7 @@ def _iota(tracer, equation, _):
 def _convert(tracer, equation, arguments):
     (x,) = arguments
     old, new = (np.dtype(v.aval.dtype) for v in (equation.invars[0], equation.outvars[0]))
-    if new == bool and old != bool:
+    if new.kind == "b" and old.kind != "b":
         return tracer.apply("ne", x, tracer.constant(0.0))
     if np.issubdtype(new, np.integer) and np.issubdtype(old, np.floating):
         return tracer.apply("trunc", x)
@@ -216,7 +216,7 @@ def _convert(tracer, equation, arguments):
 
 def _only_of_truth(name):
     def rule(tracer, equation, arguments):
-        if equation.outvars[0].aval.dtype != bool:
+        if equation.outvars[0].aval.dtype.kind != "b":
             raise NotSupportedError(f"not supported by the native backend: {name} of integers")
         return tracer.apply(name, *arguments)
 
@@ -383,7 +383,9 @@ def _dynamic_slice(tracer, equation, arguments):
 
 def _dynamic_update_slice(tracer, equation, arguments):
     x, new, *starts = arguments
-    starts = [_clipped(tracer, s, n - k) for s, n, k in zip(starts, x.shape, new.shape, strict=True)]
+    starts = [
+        _clipped(tracer, s, n - k) for s, n, k in zip(starts, x.shape, new.shape, strict=True)
+    ]
     return _written(tracer, x, _places(tracer, starts, new.shape), new, add=False)
 
 
@@ -456,7 +458,9 @@ def _gather(tracer, equation, arguments):
     shape = equation.outvars[0].aval.shape
     batch = [k for k in range(len(shape)) if k not in numbers.offset_dims]
     gone = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
-    window = dict(zip([k for k in range(x.ndim) if k not in gone], numbers.offset_dims, strict=True))
+    window = dict(
+        zip([k for k in range(x.ndim) if k not in gone], numbers.offset_dims, strict=True)
+    )
     at = np.indices(shape)
     here = tuple(at[k] for k in batch)
     places, inside = _window_places(

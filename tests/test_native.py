@@ -1,0 +1,187 @@
+"""Tests of jaxslam/native: a program in C++ computes what the function says, run by run."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxslam
+from jaxslam import linalg
+from jaxslam.consistency import montecarlo
+from jaxslam.native import NotSupportedError, batched
+from jaxslam.native.build import compiler
+from jaxslam.native.elements import Elements
+
+needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C++ compiler")
+RUNS = 11
+"""A whole group of eight, and some of another."""
+DRAWN = np.random.default_rng(0).normal(size=(RUNS, 12, 12))
+SHARED = np.array([1.5, -2.0])
+
+
+def fixed_indices(shared, A):
+    picked = A.at[3:6, :].set(0.0).at[:, 3:6].set(shared[0]).at[4:6, 4:6].add(A[:2, :2])
+    return picked[::-1, ::2], jax.lax.pad(picked[:3], shared[1], ((1, -1, 0), (0, 2, 1)))
+
+
+def indices_of_a_run(shared, A):
+    order = jnp.argsort(A[0])
+    blocks = A.reshape(4, 3, 4, 3)[order[:3] % 4, :, order[:3] % 4, :]
+    dropped = A.at[order[:4] + 9].set(A[:4], mode="drop")
+    return A[order], blocks, dropped, A.at[order[:4] % 3].add(A[:4]), jnp.sort(A, 0)
+
+
+def numbers(shared, A):
+    x = A[0]
+    return (
+        (jnp.sin(x), jnp.cos(x), jnp.exp(x), jnp.log(jnp.abs(x)), jnp.arctan2(x, x[::-1])),
+        (x**3, x**-2, x % 0.3, (x * 9).astype(int) // 2, jnp.clip(x, -0.1, 0.1), jnp.sqrt(x)),
+        (jnp.cumsum(x), jnp.argmax(x), jnp.max(x), jnp.all(x > 0), jnp.any(x > 0), jnp.prod(x)),
+    )
+
+
+def branches(shared, A):
+    cases = [lambda x: x, lambda x: 2 * x, lambda x: 3 * x]
+    switched = jax.lax.switch(jnp.argmax(A[0]) % 3, cases, A)
+    return switched, jax.lax.cond(A[0, 0] > 0, jnp.sin, jnp.cos, A)
+
+
+def loops(shared, A):
+    def turn(carry, x):
+        P, swapped, other = carry
+        P = (P @ A.T * 0.1 + jnp.eye(12)) + (P @ A.T).T @ A
+        P = P / jnp.sqrt(jnp.sum(P**2))
+        return (P, other, swapped + x[0]), (P[0], x @ x)
+
+    start = A, A[0], 0 * A[0]
+    rows = jnp.tile(A[1], (400, 1)) * jnp.arange(400)[:, None]
+    forwards = jax.lax.scan(turn, start, rows)
+    return forwards, jax.lax.scan(turn, start, rows, reverse=True)
+
+
+def loop_that_runs_leave(shared, A):
+    def more(carry):
+        return carry[0] < 3
+
+    return jax.lax.while_loop(
+        more, lambda c: (c[0] + jnp.abs(c[1][0, 0]) + 0.1, 1.1 * c[1]), (0.0, A)
+    )
+
+
+def products(shared, A):
+    B, picked = A @ A.T + jnp.eye(12), jnp.arange(12) % 5 == jnp.arange(12)[:, None] % 5
+    sparse = jnp.where(picked, A, 0.0)
+    batches = jnp.einsum("mij,mjk->mik", A.reshape(3, 8, 6), A.reshape(3, 6, 8))
+    return B - sparse @ B @ sparse.T, jnp.tril(A) @ A, batches, linalg.symmetric_part(B)
+
+
+def factors(shared, A):
+    S = A @ A.T + jnp.eye(12)
+    return linalg.cholesky(S), linalg.inverse(A[:5, :5]), linalg.eigh(S[:3, :3])[0]
+
+
+def derivative(shared, A):
+    def value(x):
+        return jnp.sin(x) * linalg.cholesky(jnp.outer(x, x) + jnp.eye(12)).root.sum() * shared[0]
+
+    return jax.jacfwd(value)(A[0])
+
+
+CASES = (
+    fixed_indices, indices_of_a_run, numbers, branches, loops, loop_that_runs_leave, products,
+    factors, derivative,
+)  # fmt: skip
+
+
+@needs_compiler
+@pytest.mark.parametrize("function", CASES, ids=lambda f: f.__name__)
+def test_a_function_is_what_vmap_makes_of_it(function):
+    found = batched(function, SHARED, DRAWN)(SHARED, DRAWN, threads=2)
+    wanted = jax.vmap(function, (None, 0))(SHARED, DRAWN)
+    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        assert x.dtype == y.dtype
+        np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-11)
+
+
+@needs_compiler
+def test_single_precision_is_single():
+    given = DRAWN.astype(np.float32), SHARED.astype(np.float32)
+    with jax.enable_x64(False):
+        (found, *_) = batched(products, given[1], given[0])(given[1], given[0])
+    wanted, *_ = jax.vmap(products, (None, 0))(SHARED, DRAWN)
+    error = np.max(np.abs(found - wanted)) / np.max(np.abs(wanted))
+    assert found.dtype == np.float32
+    assert 1e-9 < error < 1e-5
+
+
+@needs_compiler
+def test_what_does_not_fit_is_refused():
+    batch = batched(numbers, SHARED, DRAWN)
+    with pytest.raises(ValueError, match="other shapes or types"):
+        batch(SHARED, DRAWN[:, :5])
+    with pytest.raises(NotSupportedError, match="not supported by the native backend: fft"):
+        batched(lambda shared, A: jnp.fft.fft(A).real, SHARED, DRAWN)
+
+
+def test_without_a_compiler_it_says_so(monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.raises(ValueError, match=r"needs a C\+\+ compiler"):
+        batched(numbers, SHARED, DRAWN)
+
+
+def test_zeros_cost_nothing_and_nothing_is_computed_twice():
+    elements = Elements(np.float64)
+    x = elements.variables((3,))
+    zero = elements.constant(np.zeros(3))
+    assert np.all(elements.is_zero(elements.apply("mul", x, zero)[0]))
+    np.testing.assert_array_equal(elements.apply("add", x, zero)[0], x)
+    one_way, made = elements.apply("add", x, x[::-1])
+    assert made.size == 2
+    np.testing.assert_array_equal(elements.apply("add", x[::-1], x)[0], one_way)
+
+
+FILTERS = (
+    ("robocentric", "inverse_scaling"),
+    ("world", "inverse_depth"),
+    ("scale_gauge", "inverse_scaling"),
+)
+
+
+@needs_compiler
+@pytest.mark.parametrize(("name", "landmark"), FILTERS)
+def test_a_study_has_the_same_records(name, landmark):
+    scenario = jaxslam.scenario("matched", steps=6, landmarks=4)
+    filters = jaxslam.make_filters(scenario, [name], [landmark])
+    studies = [
+        jaxslam.monte_carlo(scenario, filters, runs=12, chunk=10, backend=backend)
+        for backend in ("native", "xla")
+    ]
+    for chunk in studies[0].chunks:
+        found, wanted = (study.store.load(f"{name}/{landmark}", chunk) for study in studies)
+        assert found.keys() == wanted.keys()
+        for key, value in wanted.items():
+            scale = np.nanmax(np.abs(value), initial=1e-30)
+            np.testing.assert_allclose(found[key], value, rtol=1e-9, atol=1e-9 * scale)
+
+
+def test_a_study_falls_back_to_xla(monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    scenario = jaxslam.scenario("matched", steps=6, landmarks=4)  # compiled above
+    filters = jaxslam.make_filters(scenario, ["world"], ["inverse_depth"])
+    montecarlo._native.cache_clear()
+    with pytest.warns(UserWarning, match="is computed by XLA"):
+        study = jaxslam.monte_carlo(scenario, filters, runs=10, backend="native")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        wanted = jaxslam.monte_carlo(scenario, filters, runs=10)
+    (chunk,) = study.chunks
+    found, records = (s.store.load("world/inverse_depth", chunk)["nees"] for s in (study, wanted))
+    np.testing.assert_array_equal(found, records)
+
+
+def test_an_unknown_backend_is_refused():
+    filters = jaxslam.make_filters("matched", ["world"], ["inverse_scaling"])
+    with pytest.raises(ValueError, match="known: xla, native"):
+        jaxslam.monte_carlo("matched", filters, runs=1, backend="tpu")
