@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from typing import Any
 
 import jax
 import numpy as np
@@ -72,7 +73,7 @@ def test_a_study_on_a_cluster_is_the_same_although_a_worker_is_killed(processes,
 
     with Client(address, timeout=60, set_as_default=False) as client:
         client.wait_for_workers(2, timeout=90)
-        sizes = {"runs": RUNS, "chunk": CHUNK}
+        sizes: dict[str, Any] = {"runs": RUNS, "chunk": CHUNK}
         study = jaxslam.monte_carlo(SCENARIO, filters(), **sizes, cluster=client, progress=progress)
         assert len(client.nthreads()) == 1  # it was killed before the end
     wanted = jaxslam.monte_carlo(SCENARIO, filters(), **sizes)

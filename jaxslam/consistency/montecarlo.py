@@ -201,7 +201,7 @@ class _Job(NamedTuple):
     slam: AbstractFilter
     simulator: _Simulator
     room: Room | None
-    backend: str
+    backend: str = "xla"
 
     def __call__(self, chunk: range) -> Records:
         with jax.enable_x64(self.simulator.dtype == "float64"):  # a thread's own
@@ -212,7 +212,7 @@ class _Job(NamedTuple):
         records = {key: np.asarray(value)[: len(chunk)] for key, value in records.items()}
         return {**records, **{f"sample_{k}": v for k, v in sample.items()}}
 
-    def program(self, batch: Run) -> tuple[jax.stages.Compiled, tuple[Any, ...]]:
+    def program(self, batch: Run) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         """And what it is called with before the batch; many threads that ask compile it once."""
         numbers, structure = eqx.partition(cast(self.slam, self.simulator.dtype), is_number)
         data = (numbers, self.simulator.sensor)
