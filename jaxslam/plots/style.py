@@ -47,7 +47,7 @@ class _Shown(Figure):
 
     def _repr_png_(self) -> bytes:
         picture = io.BytesIO()
-        self.savefig(picture, format="png", dpi=100)
+        self.savefig(picture, format="png", dpi=80)
         return picture.getvalue()
 
 
