@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -97,8 +97,9 @@ def name_numbers(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def same_x(axes: Sequence[Axes]) -> None:
+def same_x(axes: Iterable[Axes]) -> None:
     """One scale for axes that are compared."""
+    axes = list(axes)
     limits = np.array([each.get_xlim() for each in axes])
     for each in axes:
         each.set_xlim(limits.min(), limits.max())

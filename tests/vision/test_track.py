@@ -97,7 +97,7 @@ def test_without_a_reference_that_fits_the_map_is_drawn_all_the_same(tmp_path):
 def test_the_command_says_that_it_compiles_and_hands_over_what_is_wanted(monkeypatch, capsys):
     said, asked = [], {}
 
-    class Bar(tqdm.auto.tqdm):
+    class Bar(tqdm.tqdm):
         def __init__(self, **options):
             super().__init__(**options)
             said.append(self.desc)
