@@ -13,7 +13,6 @@ import jax
 import pytest
 
 from jaxslam.cli import main
-from jaxslam.cli.progress import EVERY, Progress, spoken
 
 KILLS = 2
 """In the tests; `python tests/test_long_work.py 20` does twenty."""
@@ -21,51 +20,6 @@ COMMAND = [
     "consistency", "--scenario", "matched-tight", "--landmarks", "inverse_scaling", "--steps", "5",
     "--set", "landmarks=3", "--runs", "600", "--chunk", "10",
 ]  # fmt: skip
-
-
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-def test_a_log_has_a_line_now_and_then_with_the_time_left():
-    now, log = [0.0], io.StringIO()
-    with Progress(1100, 100, stream=log, clock=lambda: now[0]) as progress:
-        progress("a", 0)
-        for _ in range(10):
-            now[0] += EVERY / 2
-            progress("a", 50)
-    lines = log.getvalue().splitlines()
-    assert len(lines) == 5
-    assert lines[0] == "jaxslam: a: 200 of 1100 runs (18%), 9 min left"
-    assert lines[-1] == "jaxslam: a: 600 of 1100 runs (55%), 5 min left"
-
-
-def test_what_is_short_is_silent_in_a_log():
-    log = io.StringIO()
-    with Progress(10, stream=log, clock=lambda: 0.0) as progress:
-        progress("a", 0)
-        progress("a", 10)
-    assert log.getvalue() == ""
-
-
-def test_a_terminal_has_a_bar_that_says_compiling():
-    screen = Terminal()
-    with Progress(10, 4, stream=screen) as progress:
-        progress("a", 0)
-        assert "a, compiling" in screen.getvalue()
-        progress("a", 6)
-    last = screen.getvalue().split("\r")[-1]
-    assert last.startswith("a: 100%")
-    assert "10/10" in last
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [(0.4, "0 s"), (80, "80 s"), (120, "2 min"), (7100, "118 min"), (12030, "3 h 20 min")],
-)
-def test_a_duration_is_spoken(seconds, words):
-    assert spoken(seconds) == words
 
 
 def started(out, *arguments):

@@ -54,12 +54,11 @@ class CalibrateOptions:
         print(f"wrote {self.out / 'board.png'}: print it, and measure a square")
 
     def _calibrate(self, board, video: Path) -> None:
-        from tqdm import tqdm
-
+        from jaxslam.progress import bar
         from jaxslam.video.calibrate import calibrate, describe, write
 
-        with one_line_warnings(), tqdm(unit="picture", disable=None) as bar:
-            calibrated = calibrate(video, board, bar.update)
+        with one_line_warnings(), bar(None, "picture") as shown:
+            calibrated = calibrate(video, board, shown.update)
         write(calibrated, board, self.out)
         print(describe(calibrated))
         print(f"wrote calibration.json, coverage.png in {self.out}")

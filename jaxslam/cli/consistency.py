@@ -10,7 +10,6 @@ from typing import Annotated, Any
 
 import tyro
 
-from jaxslam.cli.progress import Progress
 from jaxslam.consistency import (
     BACKENDS,
     CHUNK,
@@ -25,6 +24,7 @@ from jaxslam.consistency import (
 from jaxslam.consistency.montecarlo import check_backend, check_sizes, divided
 from jaxslam.files import write_atomically
 from jaxslam.landmarks import LANDMARKS
+from jaxslam.progress import StudyBar
 from jaxslam.names import FILTERS, FROM_REST, MODIFIERS, RECOMMENDED, make_filters
 from jaxslam.simulation.scenario import (
     BUILT_IN,
@@ -129,7 +129,7 @@ class ConsistencyOptions:
         store = FolderStore(self.out / "runs", manifest, resume=self.resume)
         chunks = divided(self.runs, self.chunk)
         done = sum(len(c) for name in filters for c in chunks if store.has(name, c))
-        with Progress(self.runs * len(filters), done) as progress:
+        with StudyBar(self.runs * len(filters), done) as progress:
             return monte_carlo(
                 world,
                 filters,

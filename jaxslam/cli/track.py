@@ -89,8 +89,7 @@ class TrackOptions:
     def run(self) -> None:
         """Track the video, print the summary, write its files."""
         require_vision("tracking")
-        from tqdm import tqdm
-
+        from jaxslam.progress import bar
         from jaxslam.vision.target import read_target
         from jaxslam.vision.track import WARM_UP, describe, track
 
@@ -98,12 +97,12 @@ class TrackOptions:
             source = self._source()
         target = None if self.target is None else read_target(self.target)
         total = len(source) or self.frames
-        with tqdm(total=total, desc=_COMPILING, unit="frame", disable=None) as bar:
+        with bar(total, "frame", _COMPILING) as shown:
 
             def progress(frames: int) -> None:
-                bar.update(frames)
-                if bar.n == WARM_UP:
-                    bar.set_description("tracking")
+                shown.update(frames)
+                if shown.n == WARM_UP:
+                    shown.set_description("tracking")
 
             summary = track(
                 source,

@@ -56,7 +56,7 @@ class TriangulateOptions:
         print(f"wrote {self.out / 'triangulation.json'} and {self.out / 'triangulation.png'}")
 
     def _comparison(self) -> Comparison:
-        from tqdm import tqdm
+        from jaxslam.progress import bar
 
         views = TwoViews(
             depth=self.depth,
@@ -67,11 +67,11 @@ class TriangulateOptions:
         )
         check_sizes(self.particles, self.measurements, self.seed)
         self.out.mkdir(parents=True, exist_ok=True)
-        with tqdm(total=self.measurements, unit="measurement", disable=None) as bar:
+        with bar(self.measurements, "measurement") as shown:
             return compare(
                 views,
                 particles=self.particles,
                 measurements=self.measurements,
                 seed=self.seed,
-                progress=bar.update,
+                progress=shown.update,
             )

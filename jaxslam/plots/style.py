@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,7 +47,7 @@ class _Shown(Figure):
 
     def _repr_png_(self) -> bytes:
         picture = io.BytesIO()
-        self.savefig(picture, format="png", dpi=100)
+        self.savefig(picture, format="png", dpi=80)
         return picture.getvalue()
 
 
@@ -97,8 +97,9 @@ def name_numbers(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def same_x(axes: Sequence[Axes]) -> None:
+def same_x(axes: Iterable[Axes]) -> None:
     """One scale for axes that are compared."""
+    axes = list(axes)
     limits = np.array([each.get_xlim() for each in axes])
     for each in axes:
         each.set_xlim(limits.min(), limits.max())

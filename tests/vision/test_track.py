@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tqdm
+import tqdm.auto
 
 pytest.importorskip("cv2")
 
@@ -99,7 +99,7 @@ def test_the_command_says_that_it_compiles_and_hands_over_what_is_wanted(monkeyp
 
     class Bar(tqdm.tqdm):
         def __init__(self, **options):
-            super().__init__(**{**options, "disable": False})
+            super().__init__(**options)
             said.append(self.desc)
 
         def set_description(self, desc=None, refresh=True):
@@ -111,7 +111,7 @@ def test_the_command_says_that_it_compiles_and_hands_over_what_is_wanted(monkeyp
             progress(1)
         return {}
 
-    monkeypatch.setattr(tqdm, "tqdm", Bar)
+    monkeypatch.setattr(tqdm.auto, "tqdm", Bar)
     monkeypatch.setattr(tracking, "track", tracked)
     monkeypatch.setattr(tracking, "describe", str)
     TrackOptions(overlay=False, viewer=Path("seen.rrd"), frames=5).run()

@@ -1,0 +1,62 @@
+"""What moves while one waits: a bar at a terminal and in a notebook, lines in a log."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+PATIENCE = 10.0
+"""Seconds between two lines of a log; what takes less has none."""
+
+
+def bar(total: int | None, unit: str, desc: str | None = None, done: int = 0) -> Any:
+    """A bar of tqdm with the time left, to be updated and closed, or used in a `with` block; so
+    many are `done` already.
+
+    Where standard error is neither a terminal nor a notebook's it is lines, `PATIENCE` apart: a
+    file would keep all that is drawn over at a terminal.
+    """
+    from tqdm.auto import tqdm
+
+    if sys.stderr.isatty() or "ipykernel" in sys.modules:
+        return tqdm(total=total, unit=unit, desc=desc, initial=done)
+    return tqdm(
+        total=total, unit=unit, desc=desc, initial=done, file=_Lines(sys.stderr), ncols=80, ascii=True,
+        delay=PATIENCE, mininterval=PATIENCE, maxinterval=PATIENCE,
+    )  # fmt: skip
+
+
+class StudyBar:
+    """A bar for `monte_carlo(…, progress=StudyBar(runs × filters))`, closed when all are done; so
+    many are `done` already. It says what is compiled."""
+
+    def __init__(self, total: int, done: int = 0) -> None:
+        self._bar = bar(total, "run", done=done)
+
+    def __enter__(self) -> StudyBar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def __call__(self, name: str, runs: int) -> None:
+        """So many more runs of this filter are done; none: it is now compiled."""
+        self._bar.set_description(name if runs else f"{name}, compiling", refresh=not runs)
+        self._bar.update(runs)
+        if self._bar.n >= self._bar.total:
+            self._bar.close()
+
+
+class _Lines:
+    """A file to which what would be drawn anew is a line more."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+
+    def write(self, text: str) -> None:
+        told = text.replace("\r", "").strip()
+        if told:
+            self._file.write(f"{told}\n")
+
+    def flush(self) -> None:
+        self._file.flush()

@@ -1,0 +1,71 @@
+"""What moves while one waits: bars for people, lines for files, nothing for what is short."""
+
+import io
+import sys
+
+import pytest
+
+from jaxslam import progress
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def written(monkeypatch, file, patience=0.0):
+    """What 20 steps write."""
+    monkeypatch.setattr(sys, "stderr", file)
+    monkeypatch.setattr(progress, "PATIENCE", patience)
+    with progress.bar(20, "run", "waiting") as shown:
+        for _ in range(20):
+            shown.update(1)
+    return file.getvalue()
+
+
+def test_a_terminal_has_a_bar_that_is_drawn_over(monkeypatch):
+    text = written(monkeypatch, Terminal())
+    assert "\r" in text
+    assert "20/20" in text
+
+
+def test_a_log_has_lines_without_control_characters(monkeypatch):
+    lines = written(monkeypatch, io.StringIO()).splitlines()
+    assert "waiting" in lines[0]
+    assert "20/20" in lines[-1]
+    assert all(line.isprintable() and len(line) <= 80 for line in lines)
+
+
+def test_what_is_short_leaves_no_line_in_a_log(monkeypatch):
+    assert written(monkeypatch, io.StringIO(), patience=10.0) == ""
+
+
+def test_a_study_moves_a_bar_to_its_end(monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    move = progress.StudyBar(4)
+    for name, done in (("a", 2), ("b", 1), ("b", 1)):  # as monte_carlo calls it
+        move(name, done)
+    assert "4/4" in terminal.getvalue()
+    assert terminal.getvalue().endswith("\n")  # closed
+
+
+def test_a_study_says_what_is_compiled_and_where_it_goes_on(monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with progress.StudyBar(10, done=4) as move:
+        move("a", 0)
+        assert "a, compiling" in terminal.getvalue()
+        assert "4/10" in terminal.getvalue()
+        move("a", 6)
+    last = terminal.getvalue().split("\r")[-1]
+    assert last.startswith("a: 100%")
+    assert "10/10" in last
+
+
+@pytest.mark.parametrize("total", [None, 3])
+def test_a_bar_needs_no_total(monkeypatch, total):
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    with progress.bar(total, "frame") as shown:
+        shown.update(1)
+        assert shown.n == 1
