@@ -21,8 +21,8 @@ def bar(total: int | None, unit: str, desc: str | None = None, done: int = 0) ->
     if sys.stderr.isatty() or "ipykernel" in sys.modules:
         return tqdm(total=total, unit=unit, desc=desc, initial=done)
     return tqdm(
-        total=total, unit=unit, desc=desc, initial=done, file=_Lines(sys.stderr), ncols=80, ascii=True,
-        delay=PATIENCE, mininterval=PATIENCE, maxinterval=PATIENCE,
+        total=total, unit=unit, desc=desc, initial=done, file=_Lines(sys.stderr), ncols=80,
+        ascii=True, delay=PATIENCE, mininterval=PATIENCE, maxinterval=PATIENCE,
     )  # fmt: skip
 
 

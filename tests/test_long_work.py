@@ -1,6 +1,5 @@
 """Tests of work that takes long: what it tells, and what is left of it when it is killed."""
 
-import io
 import json
 import random
 import signal

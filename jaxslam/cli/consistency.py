@@ -24,8 +24,8 @@ from jaxslam.consistency import (
 from jaxslam.consistency.montecarlo import check_backend, check_sizes, divided
 from jaxslam.files import write_atomically
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.progress import StudyBar
 from jaxslam.names import FILTERS, FROM_REST, MODIFIERS, RECOMMENDED, make_filters
+from jaxslam.progress import StudyBar
 from jaxslam.simulation.scenario import (
     BUILT_IN,
     CALIBRATIONS,
