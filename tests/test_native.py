@@ -10,7 +10,7 @@ import pytest
 import jaxslam
 from jaxslam import linalg
 from jaxslam.consistency import montecarlo
-from jaxslam.native import NotSupportedError, batched
+from jaxslam.native import NotSupportedError, batched, build
 from jaxslam.native.build import compiler
 from jaxslam.native.elements import Elements
 
@@ -129,6 +129,13 @@ def test_without_a_compiler_it_says_so(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     with pytest.raises(ValueError, match=r"needs a C\+\+ compiler"):
         batched(numbers, SHARED, DRAWN)
+
+
+@needs_compiler
+def test_a_compiler_that_does_not_end_is_ended(monkeypatch):
+    monkeypatch.setattr(build, "PATIENCE", 1e-3)
+    with pytest.raises(ValueError, match="did not end within"):
+        batched(lambda shared, A: A * 12345.0, SHARED, DRAWN)
 
 
 def test_zeros_cost_nothing_and_nothing_is_computed_twice():

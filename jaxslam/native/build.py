@@ -22,6 +22,10 @@ FLAGS = (
 )
 
 
+PATIENCE = 900.0
+"""Seconds that a compiler may take."""
+
+
 def compiler() -> list[str] | None:
     """The command of `$CXX`, or of the system's compiler; None without one."""
     told = shlex.split(os.environ.get("CXX", ""))
@@ -56,7 +60,10 @@ def _compile(command: list[str], source: Source, path: Path) -> None:
         file.write_text(source.text)
         tables.write_bytes(source.tables)
         arguments = [*command, *FLAGS, f'-DTABLES="{tables}"', str(file), "-o", str(path), "-lm"]
-        done = subprocess.run(arguments, capture_output=True, text=True)
+        try:
+            done = subprocess.run(arguments, capture_output=True, text=True, timeout=PATIENCE)
+        except subprocess.TimeoutExpired:
+            raise ValueError(f"the C++ compiler did not end within {PATIENCE:.0f} s") from None
     if done.returncode:
         raise ValueError(f"the C++ compiler failed: {done.stderr[-2000:]}")
 
