@@ -160,7 +160,8 @@ def test_what_was_made_elsewhere_is_not_taken(folder, monkeypatch, what):
     if what == "flags":
         monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
     else:
-        monkeypatch.setattr(programs, f"_{what}", lambda: ("other",))
+        name = {"sources": "_sources", "processor": "processor"}[what]
+        monkeypatch.setattr(programs, name, lambda: ("other",))
         monkeypatch.setattr(
             programs, "_sources", getattr(programs._sources, "__wrapped__", programs._sources)
         )
