@@ -35,7 +35,7 @@ def killed_at_random(out, seed, kills):
     chunks were there at every kill."""
     choose, found = random.Random(seed), []
     for _ in range(kills):
-        wanted = min(60, len(chunks(out)) + choose.randint(0, 8))
+        wanted = min(60, len(chunks(out)) + choose.randint(0, 100 // kills))
         process = started(out, "--resume")
         while process.poll() is None and len(chunks(out)) < wanted:
             time.sleep(0.001)
