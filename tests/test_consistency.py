@@ -21,7 +21,7 @@ from jaxslam.consistency import (
     sentences,
     tally,
 )
-from jaxslam.consistency.montecarlo import draw, filter_run
+from jaxslam.consistency.montecarlo import check_sizes, draw, filter_run
 from jaxslam.consistency.statistics import chi2_cdf, chi2_quantile, normalised_squared
 from jaxslam.names import scenario_pieces
 from jaxslam.plots.consistency import plot_consistency, plot_outside
@@ -357,6 +357,13 @@ def test_a_study_resumes_from_its_folder_and_refuses_another(tmp_path):
 def test_sizes_that_make_no_sense_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         jaxslam.monte_carlo(SCENARIO, filters(), **arguments)
+
+
+@pytest.mark.parametrize("sizes", [("10", 0, 5), (2.5, 0, 5), (10, None, 5), (10, 0, 5.0)])
+def test_sizes_that_are_no_whole_numbers_are_refused(sizes):
+    runs, seed, chunk = sizes
+    with pytest.raises(ValueError, match="must be a whole number, not"):
+        check_sizes(runs, seed, "float64", chunk)
 
 
 def in_slots_of_their_own(run):

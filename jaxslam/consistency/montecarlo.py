@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import lru_cache, partial
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -408,8 +409,11 @@ def _landmark_nees(slam, sensor, state, frame: Frame) -> dict[str, Array]:
     }
 
 
-def check_sizes(runs: int, seed: int, dtype: str, chunk: int) -> None:
-    """Raise ValueError for sizes that make no sense."""
+def check_sizes(runs: Any, seed: Any, dtype: str, chunk: Any) -> None:
+    """Raise ValueError for sizes that are no whole numbers or make no sense."""
+    for name, value in (("runs", runs), ("chunk", chunk), ("seed", seed)):
+        if not isinstance(value, Integral):
+            raise ValueError(f"{name} must be a whole number, not {value!r}")
     for name, value in (("runs", runs), ("chunk", chunk)):
         if not 1 <= value <= MOST_RUNS:
             least = "at least 1" if value < 1 else f"at most {MOST_RUNS}"

@@ -164,6 +164,11 @@ class Tracker:
     """Landmarks that left the map."""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.calibration, Calibration):
+            raise ValueError(
+                f"calibration is a {type(self.calibration).__name__}; a Calibration is accepted, "
+                "which `jaxslam.video.calibration.read_calibration` reads from a file"
+            )
         made = self.settings.make_filter(self.calibration) if self.filter is None else self.filter
         inner = innermost(made)
         delayed = inner is not None and not isinstance(inner.entry, AtOnce)
