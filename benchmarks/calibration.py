@@ -25,7 +25,7 @@ import tyro
 import jaxslam
 from jaxslam.consistency import CHUNK, MemoryStore, Study, mean_band, normalised_squared, verdict
 from jaxslam.consistency.montecarlo import Seconds, check_sizes, filter_run
-from jaxslam.files import write_atomically
+from jaxslam.files import write_atomically, write_json
 from jaxslam.models.sensors import Pinhole
 from jaxslam.plots.calibration import plot_calibration
 from jaxslam.simulation import Room, Run, Scenario, Sightings, sensor_of, sightings, simulate
@@ -331,8 +331,7 @@ def main(options: Options) -> None:
 
 def write(summary: dict[str, Any], options: Options) -> None:
     """The JSON file, the figure and the page."""
-    with write_atomically(options.out) as path:
-        path.write_text(json.dumps(summary, indent=1) + "\n")
+    write_json(options.out, summary)
     plot_calibration(summary, options.docs / "calibration.png")
     with write_atomically(options.docs / "calibration.md") as path:
         path.write_text(page(summary))

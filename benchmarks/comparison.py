@@ -15,7 +15,7 @@ from typing import Any
 import tyro
 
 import jaxslam
-from jaxslam.files import write_atomically
+from jaxslam.files import write_atomically, write_json
 from jaxslam.landmarks import table as landmark_table
 from jaxslam.plots.comparison import plot_comparison
 
@@ -154,8 +154,7 @@ def main(options: Options) -> None:
 
 def write(summary: dict[str, Any], options: Options) -> None:
     """The JSON file, the figure and the page."""
-    with write_atomically(options.out / "comparison.json") as path:
-        path.write_text(json.dumps(summary, indent=1) + "\n")
+    write_json(options.out / "comparison.json", summary)
     plot_comparison(summary["scenarios"], options.docs / "comparison.png")
     with write_atomically(options.docs / "comparison.md") as path:
         path.write_text(page(summary))

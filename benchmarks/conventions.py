@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from jaxslam.arrays import AnyArray
 from jaxslam.evaluation.convention import Convention, alternatives, geometry_of, turning
 from jaxslam.evaluation.poses import evaluate_poses
-from jaxslam.files import write_atomically
+from jaxslam.files import write_json
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, exp
 
 KINDS = ("anisotropic",) * 6 + ("isotropic", "still", "over-confident", "under-confident")
@@ -155,8 +155,7 @@ def main(options: Options) -> None:
         "kinds": {kind: dict(count) for kind, count in by_kind.items()},
     }
     options.out.mkdir(parents=True, exist_ok=True)
-    with write_atomically(options.out / "conventions.json") as path:
-        path.write_text(json.dumps(result, indent=1) + "\n")
+    write_json(options.out / "conventions.json", result)
     print(json.dumps(result, indent=1))
 
 

@@ -20,7 +20,7 @@ import tyro
 
 import jaxslam
 from jaxslam.consistency.montecarlo import filter_run
-from jaxslam.files import write_atomically
+from jaxslam.files import write_json
 from jaxslam.simulation import Room, sensor_of, sightings, simulate
 
 
@@ -94,8 +94,7 @@ def main() -> None:
         for name, turns in seconds.items()
     }
     options.out.mkdir(parents=True, exist_ok=True)
-    with write_atomically(options.out / "cost.json") as path:
-        path.write_text(json.dumps({"scenario": scenario.name, "filters": result}, indent=1) + "\n")
+    write_json(options.out / "cost.json", {"scenario": scenario.name, "filters": result})
     print(json.dumps(result, indent=1))
 
 

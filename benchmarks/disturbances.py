@@ -20,10 +20,10 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import tyro
-from pages import with_table
+from pages import write_table
 from starts import LIE
 
-from jaxslam.files import write_atomically
+from jaxslam.files import write_json
 from jaxslam.video.source import Frame, Source
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.synthetic import add_noise, handheld_trajectory, render, room, synthetic_source
@@ -268,12 +268,9 @@ def main() -> None:
         for seed in range(FIRST_SEED, FIRST_SEED + options.seeds):
             results[name].append(measure(DISTURBANCES[name][0](seed), settings, seed))
             print(name, seed, results[name][-1], flush=True)
-        with write_atomically(options.out) as path:
-            path.write_text(json.dumps(results, indent=1) + "\n")
+        write_json(options.out, results)
     print(table(results))
-    text = with_table(options.page.read_text(), MARK, table(results))
-    with write_atomically(options.page) as path:
-        path.write_text(text)
+    write_table(options.page, MARK, table(results))
 
 
 if __name__ == "__main__":

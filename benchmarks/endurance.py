@@ -9,7 +9,6 @@ Results are written to `endurance.json`, and their table to `docs/stress.md`.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -18,9 +17,9 @@ from typing import Annotated
 
 import numpy as np
 import tyro
-from pages import with_table
+from pages import write_table
 
-from jaxslam.files import write_atomically
+from jaxslam.files import write_json
 from jaxslam.video.opening import open_source
 from jaxslam.video.source import Frame
 from jaxslam.vision.settings import TrackerSettings
@@ -80,11 +79,8 @@ def main() -> None:
             print(rows[-1], flush=True)
             seconds, tracked = [], []
     results = {"sequence": source.name, "filter": tracker.filter_name, "rows": rows}
-    with write_atomically(options.out) as path:
-        path.write_text(json.dumps(results, indent=1) + "\n")
-    text = with_table(options.page.read_text(), MARK, table(rows))
-    with write_atomically(options.page) as path:
-        path.write_text(text)
+    write_json(options.out, results)
+    write_table(options.page, MARK, table(rows))
 
 
 def table(rows: list[list[float]]) -> str:

@@ -16,7 +16,6 @@ not done again.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,13 +25,13 @@ import equinox as eqx
 import jax
 import numpy as np
 import tyro
-from pages import with_table
+from pages import write_table
 
 import jaxslam
 from jaxslam.arrays import cast
 from jaxslam.consistency.montecarlo import DTYPES, draw, filter_run
 from jaxslam.consistency.statistics import lost_threshold
-from jaxslam.files import read_json, write_atomically
+from jaxslam.files import read_json, write_json
 from jaxslam.forms.state import Status
 from jaxslam.simulation import Scenario, sensor_of
 from jaxslam.simulation.scenario import BUILT_IN
@@ -138,11 +137,8 @@ def main() -> None:
         there = done["scenarios"].setdefault(name, {})
         asked = tuple(f for f in options.filters if f"{f}/inverse_scaling" not in there)
         there.update(measured(name, asked, options.runs))
-        with write_atomically(options.out) as path:
-            path.write_text(json.dumps(done, indent=1) + "\n")
-        text = with_table(options.page.read_text(), MARK, table(done["scenarios"]))
-        with write_atomically(options.page) as path:
-            path.write_text(text)
+        write_json(options.out, done)
+        write_table(options.page, MARK, table(done["scenarios"]))
 
 
 def table(scenarios: dict[str, dict[str, Any]]) -> str:

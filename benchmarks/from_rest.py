@@ -20,12 +20,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import tyro
-from pages import with_table
+from pages import write_table
 
 import jaxslam
 from jaxslam.consistency.modes import modes_of_run
 from jaxslam.consistency.montecarlo import draw, filter_run
-from jaxslam.files import write_atomically
+from jaxslam.files import write_json
 from jaxslam.plots.modes import plot_modes, worlds_of
 from jaxslam.simulation import sensor_of
 
@@ -142,10 +142,8 @@ def main(options: Options) -> None:
         there = results.setdefault(scenario, {}).get(name, {})
         if (there.get("runs"), there.get("seed")) != (options.runs, options.seed):
             results[scenario][name] = measure(options, scenario, name)
-            with write_atomically(options.out) as path:
-                path.write_text(json.dumps(results, indent=1) + "\n")
-    with write_atomically(options.docs) as path:
-        path.write_text(with_table(options.docs.read_text(), BEGIN, table(results)))
+            write_json(options.out, results)
+    write_table(options.docs, BEGIN, table(results))
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ once all is drawn it measures the filters alone.
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,12 +21,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from pages import with_table
+from pages import write_table
 
 import jaxslam
 from jaxslam.consistency import FolderStore, MemoryStore
 from jaxslam.consistency.statistics import normalised_squared
-from jaxslam.files import write_atomically
+from jaxslam.files import write_json
 from jaxslam.geometry import Pose, difference
 from jaxslam.posterior import (
     SMC,
@@ -365,10 +364,8 @@ def main(options: Options) -> None:
             "device": jax.devices()[0].device_kind,
             **summary,
         }
-        with write_atomically(options.out) as temporary:
-            temporary.write_text(json.dumps(written, indent=1) + "\n")
-        with write_atomically(options.docs) as page:
-            page.write_text(with_table(options.docs.read_text(), BEGIN, table(summary)))
+        write_json(options.out, written)
+        write_table(options.docs, BEGIN, table(summary))
 
 
 if __name__ == "__main__":

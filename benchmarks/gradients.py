@@ -9,7 +9,6 @@ of `docs/gradients.md`.
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +21,7 @@ import tyro
 import jaxslam
 from jaxslam.consistency.likelihood import maximum_likelihood
 from jaxslam.consistency.montecarlo import draw
-from jaxslam.files import write_atomically
+from jaxslam.files import write_atomically, write_json
 
 NAMES = ("linear acceleration, m/s²", "angular acceleration, rad/s²", "pixel")
 MARK = "<!-- written by benchmarks/gradients.py -->"
@@ -108,8 +107,7 @@ def table(r: dict) -> str:
 def main(options: Options) -> None:
     with jax.enable_x64(True):
         results = measure(options)
-    with write_atomically(options.out) as path:
-        path.write_text(json.dumps(results, indent=1) + "\n")
+    write_json(options.out, results)
     before, _, after = options.page.read_text().partition(MARK)
     _, _, rest = after.partition(MARK)
     with write_atomically(options.page) as path:

@@ -29,7 +29,7 @@ from jaxslam.consistency import lost_threshold
 from jaxslam.consistency.beyond_scale import beyond_scale, reversal
 from jaxslam.consistency.recursion import Frame, run_through
 from jaxslam.datasets import tracks
-from jaxslam.files import write_atomically
+from jaxslam.files import write_atomically, write_json
 from jaxslam.simulation import Room, Run, Scenario, sightings
 from jaxslam.simulation.trajectories import folder
 from jaxslam.slam.protocol import AbstractFilter
@@ -94,8 +94,7 @@ def main(options: Options) -> None:
             continue
         results[where][name] = {**wanted, **measure()}
         print(f"{where} {name}: {_row(results[where][name], -1)}", flush=True)
-        with write_atomically(options.out) as path:
-            path.write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
+        write_json(options.out, results, allow_nan=False)
     with write_atomically(options.docs) as path:
         path.write_text(page(results))
 

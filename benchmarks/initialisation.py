@@ -23,7 +23,7 @@ import tyro
 
 import jaxslam
 from jaxslam.consistency.statistics import lost_threshold, normalised_squared
-from jaxslam.files import write_atomically
+from jaxslam.files import write_json
 from jaxslam.linalg import cholesky
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation import Room, Run, features, sensor_of, sightings
@@ -230,8 +230,7 @@ def main() -> None:
         for pair, numbers in measure(name, options):
             filters[pair] = numbers
             print(line(name, pair, numbers), flush=True)
-            with write_atomically(options.out) as path:
-                path.write_text(json.dumps(results, indent=1) + "\n")
+            write_json(options.out, results)
 
 
 if __name__ == "__main__":

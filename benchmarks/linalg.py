@@ -8,7 +8,6 @@ of docs/dead-lock.md. LAPACK's batches are run one program at a time: two at onc
 
 from __future__ import annotations
 
-import json
 import statistics
 import time
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 import tyro
 from jax.scipy.linalg import solve_triangular
 
-from jaxslam.files import write_atomically
+from jaxslam.files import write_atomically, write_json
 from jaxslam.linalg import cholesky
 
 SIZES = [(100, 3), (100, 12), (100, 24), (1700, 24), (1, 48), (100, 48), (100, 105), (20, 250)]
@@ -75,8 +74,7 @@ def main() -> None:
     """Measure and write."""
     with jax.enable_x64(True):
         rows = [measured(*size) for size in SIZES]
-    with write_atomically(HERE / "results" / "linalg.json") as path:
-        path.write_text(json.dumps(rows, indent=1) + "\n")
+    write_json(HERE / "results" / "linalg.json", rows)
     before, _, after = PAGE.read_text().partition(MARK)
     rest = after.partition("\n\nThe larger sizes")
     with write_atomically(PAGE) as path:

@@ -18,7 +18,7 @@ import tyro
 
 import jaxslam
 from jaxslam.consistency import Study
-from jaxslam.files import write_atomically
+from jaxslam.files import write_json
 
 
 @dataclass(frozen=True)
@@ -135,8 +135,7 @@ def main(options: Options) -> None:
     rows = json.loads(options.out.read_text())["scenarios"] if options.out.exists() else {}
     options.out.parent.mkdir(parents=True, exist_ok=True)
     for _ in measure(options, rows):
-        with write_atomically(options.out) as path:
-            path.write_text(json.dumps({"schema": 1, "scenarios": rows}, indent=1) + "\n")
+        write_json(options.out, {"schema": 1, "scenarios": rows})
     print(table(rows))
 
 

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from jaxslam.files import write_atomically
+
 END = "<!-- end -->"
 
 
-def with_table(text: str, begin: str, table: str) -> str:
-    """The page with the table after its mark, in place of an older one.
+def write_table(page: Path, begin: str, table: str) -> None:
+    """Put the table after its mark on the page, in place of an older one.
 
     Raises ValueError where the page has no such place.
     """
-    before, mark, rest = text.partition(begin)
+    before, mark, rest = page.read_text().partition(begin)
     _, end, after = rest.partition(END)
     if not mark or not end:
         raise ValueError(f"the page has no place for the table: {begin} … {END}")
-    return f"{before}{begin}\n\n{table}\n\n{END}{after}"
+    with write_atomically(page) as path:
+        path.write_text(f"{before}{begin}\n\n{table}\n\n{END}{after}")

@@ -24,7 +24,7 @@ from posterior_page import page
 
 import jaxslam
 from jaxslam.consistency import FolderStore, MemoryStore
-from jaxslam.files import write_atomically
+from jaxslam.files import write_atomically, write_json
 from jaxslam.plots.posterior import plot_posterior
 from jaxslam.posterior import (
     HMC,
@@ -215,8 +215,7 @@ def main(options: Options) -> None:
             "device": jax.devices()[0].device_kind,
             "scenarios": {name: by_step for name, by_step in results.items() if by_step},
         }
-        with write_atomically(path) as temporary:
-            temporary.write_text(json.dumps(summary, indent=1) + "\n")
+        write_json(path, summary)
         _write_docs(summary, options)
 
 

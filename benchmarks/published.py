@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 
 import jaxslam
-from jaxslam.files import write_atomically
+from jaxslam.files import write_json
 
 ROOM_WINDOWS = {"1–50": slice(0, 50), "51–100": slice(50, 100), "101–200": slice(100, 200)}
 # Their step 1 is our step 1; both leave out the start, which has no error.
@@ -178,8 +178,7 @@ def main(options: Options) -> None:
         result = json.loads(file.read_text()) if kept else {"filters": {}}
         for measured in measure(table, options, result["filters"]):
             result = measured
-            with write_atomically(file) as path:
-                path.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+            write_json(file, result, ensure_ascii=False)
         labels = " | ".join(f"NEES, steps {label}" for label in table.windows)
         print(f"\n{table.scenario}: ours [95 % of the means of {table.runs} runs] (published)")
         print(f"| filter | {labels} | RMSE m |\n|---|{'---|' * (len(table.windows) + 1)}")

@@ -24,7 +24,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from jaxslam.files import write_atomically
+from jaxslam.files import write_atomically, write_json
 from jaxslam.names import FROM_REST
 from jaxslam.vision.settings import TrackerSettings
 
@@ -194,8 +194,7 @@ def main() -> None:
             key += "" if calibration == "known" else f"/{calibration}"
             done[key] = measure(source, settings, exact=exact)
             print(source.name, key, done[key], flush=True)
-            with write_atomically(options.out) as path:
-                path.write_text(json.dumps(results, indent=1) + "\n")
+            write_json(options.out, results)
     with write_atomically(options.page) as path:
         path.write_text(page(results))
 

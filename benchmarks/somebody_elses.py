@@ -63,7 +63,7 @@ def generate(path: Path, runs: int) -> None:
 def compare(path: Path, out: Path) -> dict:
     """Ours beside theirs."""
     import jaxslam
-    from jaxslam.files import write_atomically
+    from jaxslam.files import write_json
 
     with np.load(path) as file:
         data = dict(file)
@@ -81,8 +81,7 @@ def compare(path: Path, out: Path) -> dict:
         "stated_wrongly": str(wrong),
     }
     out.mkdir(parents=True, exist_ok=True)
-    with write_atomically(out / "navlie.json") as temporary:
-        temporary.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+    write_json(out / "navlie.json", result, ensure_ascii=False)
     return result
 
 

@@ -35,7 +35,7 @@ from jaxslam.datasets.starry_night import (
     with_reversed_gyroscope,
     with_white_noise,
 )
-from jaxslam.files import write_atomically
+from jaxslam.files import write_atomically, write_json
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.lookup import chosen
 from jaxslam.models.depth import InverseDepth
@@ -409,8 +409,7 @@ def main(options: Options) -> None:
 
 def write(summary: dict[str, Any], options: Options) -> None:
     """The JSON file, the figure and the page."""
-    with write_atomically(options.out) as path:
-        path.write_text(json.dumps(summary, indent=1, ensure_ascii=False) + "\n")
+    write_json(options.out, summary, ensure_ascii=False)
     plot_starry_night(summary, options.docs / "starry-night.png")
     with write_atomically(options.docs / "starry-night.md") as path:
         path.write_text(page(summary))

@@ -20,10 +20,10 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import tyro
-from pages import with_table
+from pages import write_table
 from scipy.stats import chi2, norm
 
-from jaxslam.files import write_atomically
+from jaxslam.files import write_json
 from jaxslam.video.opening import open_source
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.tracker import Tracker
@@ -147,12 +147,9 @@ def main() -> None:
     results = json.loads(options.out.read_text()) if options.out.exists() else {}
     for sequence in options.sequences or sorted(path.parent for path in data.glob("*/images")):
         results[sequence.name] = starts(sequence, options)
-        with write_atomically(options.out) as path:
-            path.write_text(json.dumps(results, indent=1) + "\n")
+        write_json(options.out, results)
     print(table(results))
-    text = with_table(options.page.read_text(), MARK, table(results))
-    with write_atomically(options.page) as path:
-        path.write_text(text)
+    write_table(options.page, MARK, table(results))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ import numpy as np
 import tyro
 
 import jaxslam
-from jaxslam.files import write_atomically
+from jaxslam.files import write_json
 from jaxslam.forms.state import Features, State
 from jaxslam.geometry import difference, retract
 from jaxslam.simulation import Room, features, simulate
@@ -167,8 +167,7 @@ def main() -> None:
         "maps": {size: compare(options, size) for size in options.maps},
     }
     options.out.mkdir(parents=True, exist_ok=True)
-    with write_atomically(options.out / "step.json") as path:
-        path.write_text(json.dumps(result, indent=1) + "\n")
+    write_json(options.out / "step.json", result)
     print(json.dumps(result, indent=1))
 
 

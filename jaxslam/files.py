@@ -54,6 +54,13 @@ def read_json(path: str | Path, what: str, parse: Callable[[Any], T]) -> T:
         raise ValueError(f"{path}: {error}") from None
 
 
+def write_json(path: str | Path, value: Any, **options: Any) -> None:
+    """Write a value as JSON, whole or not at all; `options` are `json.dumps`'s."""
+    text = json.dumps(value, indent=1, **options) + "\n"
+    with write_atomically(path) as temporary:
+        temporary.write_text(text)
+
+
 def read_arrays(path: str | Path, names: Iterable[str] | None = None) -> dict[str, np.ndarray]:
     """The arrays of an npz file, or those of them that are named and there; nothing in it is run.
 

@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 import from_rest as benchmark
 from from_rest import BEGIN, Options, main, table
-from pages import END, with_table
+from pages import END, write_table
 
 STEPS = 60
 
@@ -43,19 +43,25 @@ def test_a_row_says_at_every_frame_what_is_lost_and_how_true_the_others_are():
     ]  # fmt: skip
 
 
-def test_the_table_stands_in_its_place_and_replaces_the_old_one():
-    page = f"before\n{BEGIN}\nold\n{END}\nafter\n"
-    new = with_table(page, BEGIN, table({"standstill": {"mine": found()}}))
+def test_the_table_stands_in_its_place_and_replaces_the_old_one(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
+    write_table(page, BEGIN, table({"standstill": {"mine": found()}}))
+    new = page.read_text()
     assert new.startswith("before\n")
     assert new.endswith("\nafter\n")
     assert "old" not in new
     assert "`mine`" in new
-    assert with_table(new, BEGIN, table({"standstill": {"mine": found()}})) == new
+    write_table(page, BEGIN, table({"standstill": {"mine": found()}}))
+    assert page.read_text() == new
 
 
-def test_a_page_without_a_place_is_refused():
+def test_a_page_without_a_place_is_refused(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f"a page with {END}")
     with pytest.raises(ValueError, match="no place for the table"):
-        with_table(f"a page with {END}", BEGIN, "a table")
+        write_table(page, BEGIN, "a table")
+    assert page.read_text() == f"a page with {END}"
 
 
 def test_what_is_there_is_not_measured_again(tmp_path, monkeypatch):

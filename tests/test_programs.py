@@ -27,17 +27,17 @@ def arguments(size=3):
 
 
 @pytest.fixture(autouse=True)
-def none_traced():
+def none_traced_and_none_kept(monkeypatch):
+    """Whatever commands have told before."""
     traced.clear()
+    monkeypatch.setattr(programs, "_kept_in", None)
 
 
 @pytest.fixture
 def folder(tmp_path):
-    """Where programs are kept; put back as it was."""
-    before = programs._kept_in
+    """Where programs are kept."""
     keep_in(tmp_path / "programs")
-    yield tmp_path / "programs"
-    keep_in(before)
+    return tmp_path / "programs"
 
 
 def check(program, size=3):
@@ -154,14 +154,13 @@ def test_another_users_program_is_not_taken(folder, monkeypatch):
     assert len(traced) == 2
 
 
-@pytest.mark.parametrize("what", ["sources", "processor", "flags"])
+@pytest.mark.parametrize("what", ["_sources", "processor", "flags"])
 def test_what_was_made_elsewhere_is_not_taken(folder, monkeypatch, what):
     check(Program(scaled))
     if what == "flags":
         monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
     else:
-        name = {"sources": "_sources", "processor": "processor"}[what]
-        monkeypatch.setattr(programs, name, lambda: ("other",))
+        monkeypatch.setattr(programs, what, lambda: ("other",))
         monkeypatch.setattr(
             programs, "_sources", getattr(programs._sources, "__wrapped__", programs._sources)
         )
@@ -182,13 +181,9 @@ def test_a_function_with_values_of_its_own_is_not_kept(folder):
 
 
 def test_a_folder_that_cannot_be_written_is_done_without(tmp_path):
-    before = programs._kept_in
     (tmp_path / "file").write_text("")
     keep_in(tmp_path / "file")
-    try:
-        check(Program(scaled))
-    finally:
-        keep_in(before)
+    check(Program(scaled))
 
 
 def test_options_that_the_compiler_does_not_know_are_done_without(monkeypatch):

@@ -32,7 +32,7 @@ from benchmarks.speed.workload import (
     ours,
     prepared,
 )
-from jaxslam.files import write_atomically
+from jaxslam.files import write_json
 from jaxslam.native.build import compiler
 
 AGREEMENT = 1e-9
@@ -150,8 +150,7 @@ def main() -> None:
             result[name] = measured(work, library, options.repeats, product)
     result["peak_memory_MiB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
     result["load"] = os.getloadavg()
-    with write_atomically(options.out) as path:
-        path.write_text(json.dumps(result, indent=1) + "\n")
+    write_json(options.out, result)
     print(json.dumps(result, indent=1))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,7 +21,7 @@ from jaxslam.consistency import (
     treatment,
 )
 from jaxslam.consistency.montecarlo import check_backend, check_sizes, divided
-from jaxslam.files import write_atomically
+from jaxslam.files import write_json
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.names import FILTERS, FROM_REST, MODIFIERS, RECOMMENDED, make_filters
 from jaxslam.progress import StudyBar
@@ -104,8 +103,7 @@ class ConsistencyOptions:
 
         study = self._study()
         summary = summarise(study)
-        with write_atomically(self.out / "consistency.json") as path:
-            path.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
+        write_json(self.out / "consistency.json", summary, allow_nan=False)
         plot_consistency(study, summary, self.out / "consistency.png")
         if self.pdf:
             plot_consistency(study, summary, self.out / "consistency.pdf", column=True)

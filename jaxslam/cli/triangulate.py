@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from jaxslam.files import write_atomically
+from jaxslam.files import write_json
 from jaxslam.triangulation import CALIBRATIONS, Comparison, TwoViews, compare, summarise, table
 from jaxslam.triangulation.comparison import MEASUREMENTS, PARTICLES, check_sizes
 
@@ -49,8 +48,7 @@ class TriangulateOptions:
 
         comparison = self._comparison()
         summary = summarise(comparison)
-        with write_atomically(self.out / "triangulation.json") as path:
-            path.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
+        write_json(self.out / "triangulation.json", summary, allow_nan=False)
         plot_triangulation(comparison, self.out / "triangulation.png")
         print(table(summary))
         print(f"wrote {self.out / 'triangulation.json'} and {self.out / 'triangulation.png'}")

@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from jaxslam.files import read_arrays, read_json, write_atomically
+from jaxslam.files import read_arrays, read_json, write_atomically, write_json
 
 Records = dict[str, np.ndarray]
 
@@ -62,8 +62,7 @@ class FolderStore:
             for old in folder.glob("*/*.npz"):
                 old.unlink()
             folder.mkdir(parents=True, exist_ok=True)
-            with write_atomically(path) as temporary:
-                temporary.write_text(json.dumps(wanted, indent=1) + "\n")
+            write_json(path, wanted)
 
     def has(self, filter_name: str, chunk: range) -> bool:
         return self._path(filter_name, chunk).exists()

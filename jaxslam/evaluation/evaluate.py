@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -18,7 +17,7 @@ from jaxslam.consistency.verdict import headline, run_verdict, sentences
 from jaxslam.evaluation.arrays import normalised, paired, step_times, without_known
 from jaxslam.evaluation.convention import Convention
 from jaxslam.evaluation.identify import Identification
-from jaxslam.files import json_numbers, write_atomically
+from jaxslam.files import json_numbers, write_json
 from jaxslam.lookup import chosen
 
 SCHEMA = 1
@@ -148,8 +147,7 @@ class Evaluation:
         path = Path(folder) / "evaluation.json"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with write_atomically(path) as temporary:
-                temporary.write_text(json.dumps(self.asdict(), indent=1, allow_nan=False) + "\n")
+            write_json(path, self.asdict(), allow_nan=False)
         except OSError as error:
             raise ValueError(f"{folder}: cannot write there ({error.strerror})") from None
         return path

@@ -14,6 +14,7 @@ from jaxslam.plots.style import (
     COLOURS,
     GREY,
     MARKERS,
+    MOST_NEES,
     draw_dots,
     name_numbers,
     new_figure,
@@ -21,9 +22,6 @@ from jaxslam.plots.style import (
     save,
     set_title,
 )
-
-MOST_NEES = 1000.0
-"""What is beyond is an arrow with a number."""
 
 
 def plot_calibration(summary: dict[str, Any], path: str | Path | None = None) -> Figure:

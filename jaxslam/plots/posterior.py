@@ -16,6 +16,7 @@ from jaxslam.plots.style import (
     COLOURS,
     DASHES,
     GREY,
+    MOST_NEES,
     draw_dots,
     name_numbers,
     new_figure,
@@ -26,7 +27,7 @@ from jaxslam.plots.style import (
 
 ELLIPSE_SIGMAS = 2.4477
 """Half axes of the region with 95 % of a Gaussian in the plane, in σ."""
-MOST_NEES, MOST_RATIO = 1000.0, 3.0
+MOST_RATIO = 3.0
 """What is beyond is an arrow with a number."""
 LAPLACE = "MAP + Laplace"
 _STAGES = {

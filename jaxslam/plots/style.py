@@ -33,6 +33,8 @@ LETTERS = 8.0
 MEDIAN_DASH = (0, (1, 2))
 """Of the medians, where a line is a mean."""
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+MOST_NEES = 1000.0
+"""On an axis of dots; what is beyond is an arrow with a number."""
 _FITTING = 50
 """Characters in a line of a column."""
 _POWERS = range(-9, 13)

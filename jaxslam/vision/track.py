@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import json
 import math
 import time
 from collections.abc import Callable, Generator
@@ -18,7 +17,7 @@ from scipy.spatial import KDTree
 from scipy.stats import chi2
 
 from jaxslam import __version__
-from jaxslam.files import write_atomically
+from jaxslam.files import write_atomically, write_json
 from jaxslam.plots.tracking import plot_map
 from jaxslam.slam.protocol import AbstractStaged
 from jaxslam.video.calibration import INTRINSICS, as_fields
@@ -227,8 +226,7 @@ def _write(
     write_covariances(out / "covariance.txt", times, covariances, given_scale=scaled)
     write_frames(out / "frames.csv", history)
     summary = _summary(source, tracker, history, seconds)
-    with write_atomically(out / "summary.json") as path:
-        path.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    write_json(out / "summary.json", summary, allow_nan=False)
     _draw_map(_mapped(tracker, history), history, _reference_in_map(source, history), out)
     return summary
 
