@@ -14,6 +14,7 @@ import jaxslam
 from jaxslam.forms.state import Features
 from jaxslam.geometry import jacobian
 from jaxslam.landmarks import INVERSE_SCALING
+from jaxslam.lazy import each_alive, when
 from jaxslam.linalg import cholesky
 from jaxslam.models.calibration import Estimated, Known, White
 from jaxslam.models.depth import InverseDepth
@@ -24,7 +25,6 @@ from jaxslam.simulation import scenario
 from jaxslam.window import minimise, modes, scale
 from jaxslam.window.handover import gauge_state
 from jaxslam.window.minimise import minimised, started
-from jaxslam.window.modes import each_alive, when
 from jaxslam.window.problem import Layout, path, reduced, residuals, sensitivities
 from jaxslam.window.record import Record, begun, empty, removed, stepped, whole
 from jaxslam.window.scale import rescaled, scaling, shift_of_scale, variances

@@ -20,11 +20,12 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam.arrays import AnyArray, cast, precision
 from jaxslam.forms.state import Features, Innovation, State
 from jaxslam.geometry import Pose
+from jaxslam.lazy import each_alive, when
 from jaxslam.slam.filter import EkfSlam, innermost
 from jaxslam.slam.protocol import AbstractStaged, Capacity, Expected
 from jaxslam.window import record as window
 from jaxslam.window.handover import gauge_state
-from jaxslam.window.modes import Modes, at_rest, each_alive, sought, when
+from jaxslam.window.modes import Modes, at_rest, sought
 from jaxslam.window.problem import Layout
 from jaxslam.window.record import Record
 from jaxslam.window.thinning import thinned
