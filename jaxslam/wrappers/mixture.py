@@ -108,11 +108,11 @@ class Mixture(Bank, AbstractStaged):
         """Every member after a step with measurements, weighed by what it did not expect."""
         told = jax.eval_shape(step, _of(state.members, 0))[1]
         both = state.members, zeros(told, self.count)
-        members, innovations = each_alive(lambda both: step(both[0]), both, alive(state))
+        members, innovations = each_alive(lambda both: step(both[0]), both, state.alive)
         return self._weighed(members, state.log_weights, innovations)
 
     def _each(self, function, state: BankState, *data: Any) -> BankState:
-        members = each_alive(function, state.members, alive(state), *data)
+        members = each_alive(function, state.members, state.alive, *data)
         return BankState(members, state.log_weights)
 
     def compose(self, state: BankState, control: Any) -> BankState:
@@ -172,11 +172,6 @@ class Mixture(Bank, AbstractStaged):
         return jnp.sqrt(total) * cholesky(M / total + 1e-6 * eye).root.T
 
 
-def alive(state: BankState) -> Bool[Array, " members"]:
-    """Members that weigh anything."""
-    return jnp.isfinite(state.log_weights)
-
-
 class _Parts(NamedTuple):
     """A sum, and functions of the core of every member: values, Jacobians, and covariances."""
 
@@ -196,7 +191,7 @@ def _described(pixels: Pixels, member: State) -> tuple[Array, Array, Array]:
 
 
 def _parts(pixels: Pixels, state: BankState) -> _Parts:
-    return _Parts(state, *of_alive(partial(_described, pixels), state.members, alive(state)))
+    return _Parts(state, *of_alive(partial(_described, pixels), state.members, state.alive))
 
 
 def _split_and_merged(pixels: Pixels, parts: _Parts) -> tuple[_Parts, Bool[Array, ""]]:
