@@ -22,7 +22,6 @@ from jaxslam.arrays import cast, precision
 from jaxslam.delayed.alternatives import log_density
 from jaxslam.forms.state import Features, Innovation, Status
 from jaxslam.geometry import Pose, difference, retract
-from jaxslam.lazy import of_alive
 from jaxslam.linalg import cholesky, eigh
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.slam.filter import EkfSlam, innermost
@@ -109,8 +108,8 @@ class Bank(AbstractFilter):
 
     def marginal(self, state: BankState, function, slots: Int[Array, " m"] | None = None):
         """The sum's mean and covariance: of a value, in the tangent at its likeliest member."""
-        values, covariances = of_alive(
-            lambda member: self.base.marginal(member, function, slots), state.members, state.alive
+        values, covariances = jax.vmap(lambda member: self.base.marginal(member, function, slots))(
+            state.members
         )
         if slots is not None:
             of_each = jax.vmap(moments, in_axes=(None, 1, 1))
@@ -126,7 +125,7 @@ class Bank(AbstractFilter):
 
     def pose_error(self, state: BankState, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
         """Of the sum's mean, to first order in the members' distances, with its covariance."""
-        errors, covariances = of_alive(self.base.pose_error, state.members, state.alive, T_BC)
+        errors, covariances = jax.vmap(self.base.pose_error, in_axes=(0, None))(state.members, T_BC)
         return moments(state.log_weights, errors, covariances)
 
     def likeliest(self, state: BankState) -> Any:

@@ -2,7 +2,8 @@
 
 The sum of `Bank` is divided at the start, and what accelerations add to the velocity later is not.
 Here, in every frame, the member whose linearisation costs most is split, and the two whose merger
-costs least are merged (split and merge: Ueda et al. 2000; for filters Faubel et al. 2009).
+costs least are merged (split and merge: Ueda et al. 2000; for filters Faubel et al. 2009). Where a
+split gains nothing there are fewer members, and only those that are there are computed.
 
 What costs is the product of the camera's displacement t with inverse depths. In a measurement
 h(X − ω t), with X and ω as they are at the estimate, errors of both neglect `−(∂h/∂X) δt δω`. So a
@@ -38,7 +39,7 @@ from jaxslam.slam.model import COMPOSED, Context
 from jaxslam.slam.protocol import AbstractStaged, Expected
 from jaxslam.wrappers.bank import Bank, BankState, moments
 
-WORTH = 1e-4
+WORTH = 3e-5
 """What a split has to gain, in σ² of a measured pixel, summed over the landmarks; two members
 whose merger costs less than a quarter of it are one."""
 SPLIT = 0.8
@@ -46,8 +47,8 @@ SPLIT = 0.8
 
 
 class Mixture(Bank, AbstractStaged):
-    """`count` filters `base`; begun as the sum over the direction of the velocity (`along`), or
-    over the speed. Raises ValueError as `Bank` does, and for a base of several Gaussians."""
+    """At most `count` filters `base`; begun as the sum over the direction of the velocity
+    (`along`), or over the speed. Raises ValueError as `Bank` does, and for a base of several Gaussians."""
 
     base: EkfSlam  # ty: ignore[incompatible-mutable-override]
     along: Literal["speed", "direction"] = eqx.field(static=True, default="direction")
