@@ -48,7 +48,8 @@ SPLIT = 0.8
 
 class Mixture(Bank, AbstractStaged):
     """At most `count` filters `base`; begun as the sum over the direction of the velocity
-    (`along`), or over the speed. Raises ValueError as `Bank` does, and for a base of several Gaussians."""
+    (`along`), or over the speed. Raises ValueError as `Bank` does, and for a base of several
+    Gaussians."""
 
     base: EkfSlam  # ty: ignore[incompatible-mutable-override]
     along: Literal["speed", "direction"] = eqx.field(static=True, default="direction")
