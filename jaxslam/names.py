@@ -173,9 +173,10 @@ MODIFIERS: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
 greatest depth of a delayed initialisation, m (`particles`, `rays`); the correlation of depths in
 percent (`common`); σ of the scene's depth in percent of one landmark's (`scene`); frames (`lag`);
 steps of Gauss–Newton instead of convergence (`iterated`); members of a Gaussian sum (`scales`,
-`directions`, `mixture`); frames of the longest window of a start (`rest`); frames of which the
-noise is remembered (`noise`); by how much a match may be off beyond its noise, in percent of that
-(`checked`); steps of Gauss–Newton in an update (`oc`); none for the remedy `fej`."""
+`directions`, of a `mixture` at the most); frames of the longest window of a start (`rest`); frames
+of which the noise is remembered (`noise`); by how much a match may be off beyond its noise, in
+percent of that (`checked`); steps of Gauss–Newton in an update (`oc`); none for the remedy
+`fej`."""
 
 CANNOT_TRACK = ("iterated", "+lag", "+iterated", "+scales", "+directions", "+particles", "+rays")
 """Filters and modifiers with which a frame cannot be taken in stages (`AbstractStaged`), or a

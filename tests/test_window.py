@@ -24,7 +24,6 @@ from jaxslam.simulation import scenario
 from jaxslam.window import minimise, modes, scale
 from jaxslam.window.handover import gauge_state
 from jaxslam.window.minimise import minimised, started
-from jaxslam.window.modes import each_alive, when
 from jaxslam.window.problem import Layout, path, reduced, residuals, sensitivities
 from jaxslam.window.record import Record, begun, empty, removed, stepped, whole
 from jaxslam.window.scale import rescaled, scaling, shift_of_scale, variances
@@ -515,41 +514,6 @@ def test_the_filters_state_is_the_gaussian_of_the_mode(of, monkeypatch):
     s = scaling(slam, record, at)
     np.testing.assert_allclose(state.covariance[part, part], 1 / s.squared, rtol=1e-9)
     assert np.linalg.eigvalsh(state.covariance).min() > -1e-12
-
-
-# Work that is not wanted
-
-
-def counted(found):
-    """Doubles a value, and counts how often that is done."""
-
-    def doubled(value, *given):
-        jax.debug.callback(lambda _: found.append(1), value)
-        return 2 * value + sum(given)
-
-    return doubled
-
-
-@pytest.mark.parametrize("wanted", [[False] * 3, [True, False, True]])
-def test_what_nobody_in_a_batch_wants_is_not_done(wanted):
-    found, values = [], jnp.arange(1.0, 4.0)
-    after = quick_jit(jax.vmap(lambda w, v: when(w, counted(found), v, jnp.asarray(0.5))))(
-        jnp.array(wanted), values
-    )
-    jax.block_until_ready(after)
-    jax.effects_barrier()
-    np.testing.assert_array_equal(after, np.where(wanted, 2 * values + 0.5, values))
-    assert bool(found) == any(wanted)
-
-
-def test_only_the_living_are_worked_on():
-    found, alive = [], jnp.array([True, False, False, True])
-    values = jnp.arange(4.0)
-    after = quick_jit(lambda alive: each_alive(counted(found), values, alive))(alive)
-    jax.block_until_ready(after)
-    jax.effects_barrier()
-    np.testing.assert_array_equal(after, jnp.where(alive, 2 * values, values))
-    assert len(found) == 2
 
 
 def test_a_mode_that_is_next_to_impossible_is_none(monkeypatch):

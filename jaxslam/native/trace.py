@@ -133,6 +133,7 @@ INNER = {
     "custom_jvp_call": "call_jaxpr",
     "custom_vjp_call": "call_jaxpr",
     "custom_vjp_call_jaxpr": "fun_jaxpr",
+    "custom_vmap_call": "call",
 }
 """Functions within, by the parameter that holds them."""
 

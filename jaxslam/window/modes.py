@@ -8,8 +8,7 @@ weighed by Laplace's `−½ |r|² − ½ log det A`, A the information of all un
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,14 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxslam.lazy import each_alive
 from jaxslam.linalg import cholesky
 from jaxslam.slam.filter import EkfSlam
 from jaxslam.window.minimise import Minimum, minimised, started, turned
 from jaxslam.window.problem import Layout, reduced
 from jaxslam.window.record import Record
 from jaxslam.window.scale import enlarged, shift_of_scale
-
-Value = TypeVar("Value")
 
 SPEED = 1.2
 """Starts move with so many σ of the prior on the initial velocity."""
@@ -45,39 +43,6 @@ class Modes(eqx.Module):
     """Normalised; −∞ of places without a mode."""
     shifts: Float[Array, " modes"]
     """λ of every mode's mean, of which the maximum has 0."""
-
-
-def when(
-    wanted: Bool[Array, ""], function: Callable[..., Value], value: Value, *given: Any
-) -> Value:
-    """`function(value, *given)` if it is wanted, else the value.
-
-    In a batch `lax.cond` computes both sides of every member; this computes nothing where no
-    member wants it. What the function needs is given to it through the counter of the loop, or the
-    compiler would move the work out of a loop that does not change it.
-    """
-    stacked = jax.tree.map(lambda x: jnp.stack([x, x]), given)
-
-    def once(carry):
-        turn, value = carry
-        now = jax.tree.map(lambda x: x[turn], stacked)
-        return turn + 1, function(value, *now)
-
-    def due(carry):
-        return wanted & (carry[0] < 1)
-
-    return jax.lax.while_loop(due, once, (jnp.zeros((), int), value))[1]
-
-
-def each_alive(
-    function: Callable[..., Any], values: Any, alive: Bool[Array, " k"], *given: Any
-) -> Any:
-    """`function(value, *given)` of every value that is alive; the others stay as they are."""
-
-    def one(carry, data):
-        return carry, when(data[1], function, data[0], *given)
-
-    return jax.lax.scan(one, None, (values, alive))[1]
 
 
 def at_rest(slam: EkfSlam, record: Record, count: int, dtype: Any) -> Modes:

@@ -45,6 +45,11 @@ class BankState(eqx.Module):
     members: Any
     log_weights: Float[Array, " members"]
 
+    @property
+    def alive(self) -> Bool[Array, " members"]:
+        """Members that weigh anything."""
+        return jnp.isfinite(self.log_weights)
+
 
 class Bank(AbstractFilter):
     """`count` filters `base` for each direction in which the velocity's prior is divided.

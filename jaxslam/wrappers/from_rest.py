@@ -20,11 +20,12 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam.arrays import AnyArray, cast, precision
 from jaxslam.forms.state import Features, Innovation, State
 from jaxslam.geometry import Pose
+from jaxslam.lazy import each_alive, when
 from jaxslam.slam.filter import EkfSlam, innermost
 from jaxslam.slam.protocol import AbstractStaged, Capacity, Expected
 from jaxslam.window import record as window
 from jaxslam.window.handover import gauge_state
-from jaxslam.window.modes import Modes, at_rest, each_alive, sought, when
+from jaxslam.window.modes import Modes, at_rest, sought
 from jaxslam.window.problem import Layout
 from jaxslam.window.record import Record
 from jaxslam.window.thinning import thinned
@@ -171,7 +172,8 @@ class FromRest(AbstractStaged):
             modes = replace(state.modes, minima=replace(state.modes.minima, x=x[:, :size]))
             due = self._due(record, range(least, frames))
             modes, explained = sought(ekf, record, modes, REFINEMENTS, due)
-            members = _members(ekf, record, modes, state.sum.members)
+            like = self.base.likeliest(state.sum)
+            members = _members(ekf, record, modes, state.sum.members, like)
             begun = BankState(members, modes.log_weights)
             begun = jax.tree.map(lambda new, old: jnp.where(explained, new, old), begun, state.sum)
             x = x.at[:, :size].set(modes.minima.x)
@@ -220,15 +222,16 @@ def _likely(members: BankState, now: Bool[Array, ""]) -> BankState:
     return replace(members, log_weights=weights)
 
 
-def _members(ekf: EkfSlam, record: Record, modes: Modes, members: State) -> State:
-    """The Gaussians of the modes."""
+def _members(ekf: EkfSlam, record: Record, modes: Modes, members: State, like: State) -> State:
+    """The Gaussians of the modes; of what a window does not tell, as in a state that is up to date,
+    which members without weight are not."""
 
-    def begun(data, record):
-        mode, shift, member = data
-        return mode, shift, gauge_state(ekf, record, mode, shift, member)
+    def begun(data, record, like):
+        mode, shift, _ = data
+        return mode, shift, gauge_state(ekf, record, mode, shift, like)
 
     alive = jnp.isfinite(modes.log_weights)
-    return each_alive(begun, (modes.minima, modes.shifts, members), alive, record)[2]
+    return each_alive(begun, (modes.minima, modes.shifts, members), alive, record, like)[2]
 
 
 def _check_base(ekf: EkfSlam) -> None:

@@ -2,7 +2,8 @@
 
 The sum of `Bank` is divided at the start, and what accelerations add to the velocity later is not.
 Here, in every frame, the member whose linearisation costs most is split, and the two whose merger
-costs least are merged (split and merge: Ueda et al. 2000; for filters Faubel et al. 2009).
+costs least are merged (split and merge: Ueda et al. 2000; for filters Faubel et al. 2009). Where a
+split gains nothing there are fewer members, and only those that are there are computed.
 
 What costs is the product of the camera's displacement t with inverse depths. In a measurement
 h(X − ω t), with X and ω as they are at the estimate, errors of both neglect `−(∂h/∂X) δt δω`. So a
@@ -15,18 +16,22 @@ Splits and mergers keep the sum's mean and covariance.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.arrays import AnyArray
 from jaxslam.forms.blocks import shifted
 from jaxslam.forms.state import Features, Innovation, State
 from jaxslam.geometry import difference, jacobian, log
+from jaxslam.lazy import at_places, each_alive, of_alive, repeated, zeros
 from jaxslam.linalg import cholesky, eigh
 from jaxslam.models.motion import check_control
 from jaxslam.slam.filter import EkfSlam, append_noise, check_one_gaussian, composed_first
@@ -34,13 +39,17 @@ from jaxslam.slam.model import COMPOSED, Context
 from jaxslam.slam.protocol import AbstractStaged, Expected
 from jaxslam.wrappers.bank import Bank, BankState, moments
 
+WORTH = 3e-5
+"""What a split has to gain, in σ² of a measured pixel, summed over the landmarks; two members
+whose merger costs less than a quarter of it are one."""
 SPLIT = 0.8
 """Halves of a split member are ± so many of its σ from its mean."""
 
 
 class Mixture(Bank, AbstractStaged):
-    """`count` filters `base`; begun as the sum over the direction of the velocity (`along`), or
-    over the speed. Raises ValueError as `Bank` does, and for a base of several Gaussians."""
+    """At most `count` filters `base`; begun as the sum over the direction of the velocity
+    (`along`), or over the speed. Raises ValueError as `Bank` does, and for a base of several
+    Gaussians."""
 
     base: EkfSlam  # ty: ignore[incompatible-mutable-override]
     along: Literal["speed", "direction"] = eqx.field(static=True, default="direction")
@@ -57,7 +66,13 @@ class Mixture(Bank, AbstractStaged):
         self, state: BankState, control: Any, seen: Features, new: Features
     ) -> tuple[BankState, Innovation]:
         """Every member's step, the sum divided anew once the frame's noise is appended."""
-        return AbstractStaged.step(self, state, control, seen, new)
+        state = self._divided(self.predict(state, control), control, seen)
+
+        def stepped(member):
+            member, innovation = self._updated(member, control, seen)
+            return self.base.close(self.base.compose(member, control), new), innovation
+
+        return self._measured(stepped, state)
 
     def predict(self, state: BankState, control: Any) -> BankState:
         """Append this step's noise; `update` divides the sum and composes, where that is first."""
@@ -84,13 +99,23 @@ class Mixture(Bank, AbstractStaged):
         self, state: BankState, control: Any, seen: Features
     ) -> tuple[BankState, Innovation]:
         """Correct every member as it is, and weigh it."""
+        return self._measured(lambda member: self._updated(member, control, seen), state)
 
-        def updated(member):
-            member = composed_first(self.base, member, control)
-            return self.base.update(member, control, seen)
+    def _updated(self, member: State, control: Any, seen: Features) -> tuple[State, Innovation]:
+        return self.base.update(composed_first(self.base, member, control), control, seen)
 
-        members, innovations = jax.vmap(updated)(state.members)
+    def _measured(
+        self, step: Callable[[State], tuple[State, Innovation]], state: BankState
+    ) -> tuple[BankState, Innovation]:
+        """Every member after a step with measurements, weighed by what it did not expect."""
+        told = jax.eval_shape(step, _of(state.members, 0))[1]
+        both = state.members, zeros(told, self.count)
+        members, innovations = each_alive(lambda both: step(both[0]), both, state.alive)
         return self._weighed(members, state.log_weights, innovations)
+
+    def _each(self, function, state: BankState, *data: Any) -> BankState:
+        members = each_alive(function, state.members, state.alive, *data)
+        return BankState(members, state.log_weights)
 
     def compose(self, state: BankState, control: Any) -> BankState:
         """Every member's; so are the following."""
@@ -117,10 +142,7 @@ class Mixture(Bank, AbstractStaged):
         def pixels(core):
             return cost @ displacement(core)
 
-        def once(_, state):
-            return _split_and_merged(pixels, state)
-
-        return jax.lax.fori_loop(0, self.rounds, once, state)
+        return repeated(partial(_split_and_merged, pixels), _parts(pixels, state), self.rounds).sum
 
     def _root_of_cost(self, state: BankState, seen: Features) -> Float[Array, "n n"]:
         """C with `CᵀC = M` of the landmarks that are seen, at the likeliest member."""
@@ -137,66 +159,103 @@ class Mixture(Bank, AbstractStaged):
         )
         view = view_of(likeliest.core)
         sensor = model.sensor_of(view)
+        whitening = cholesky(sensor.noise).whitening
 
         def by_point(landmark):
             point, omega = model.camera_point(view, landmark)
             return jax.jacfwd(lambda point: sensor.measure(point, omega))(point)
 
-        slopes = jax.vmap(by_point)(likeliest.landmarks[seen.slots])
+        slopes = whitening @ jax.vmap(by_point)(likeliest.landmarks[seen.slots])
         counted = jnp.where(seen.valid, variances[:, 0, 0], 0.0)
         M = jnp.einsum("m,mpi,mpj->ij", counted, slopes, slopes)
         # Nearly singular where one landmark is seen, and zero where none is.
-        n = base.motion.geometry.point_dim
-        M = M / jnp.maximum(jnp.trace(M), jnp.finfo(M.dtype).tiny)
-        return cholesky(M + 1e-6 * jnp.eye(n, dtype=M.dtype)).root.T
+        total = jnp.maximum(jnp.trace(M), jnp.finfo(M.dtype).tiny)
+        eye = jnp.eye(self.base.motion.geometry.point_dim, dtype=M.dtype)
+        return jnp.sqrt(total) * cholesky(M / total + 1e-6 * eye).root.T
 
 
-def _split_and_merged(pixels, state: BankState) -> BankState:
-    """The member of the greatest cost split, and two of the others merged, if that is a gain.
+class _Parts(NamedTuple):
+    """A sum, and functions of the core of every member: values, Jacobians, and covariances."""
 
-    The cost of the sum is `Σ w tr(P)` of the members' `pixels(core)`. A split lessens it by
-    `w δ² λ` with the greatest eigenvalue λ; a merger adds `wᵢ wⱼ/(wᵢ + wⱼ) |pᵢ − pⱼ|²`.
+    sum: BankState
+    values: Float[Array, "k n"]
+    by_core: Float[Array, "k n c"]
+    covariances: Float[Array, "k n n"]
+
+
+Pixels = Callable[[Any], Float[Array, " n"]]
+
+
+def _described(pixels: Pixels, member: State) -> tuple[Array, Array, Array]:
+    by_core = jacobian(pixels, member.core)
+    c = by_core.shape[1]
+    return pixels(member.core), by_core, by_core @ member.covariance[:c, :c] @ by_core.T
+
+
+def _parts(pixels: Pixels, state: BankState) -> _Parts:
+    return _Parts(state, *of_alive(partial(_described, pixels), state.members, state.alive))
+
+
+def _split_and_merged(pixels: Pixels, parts: _Parts) -> tuple[_Parts, Bool[Array, ""]]:
+    """The member of the greatest cost split, and two of the others merged, if that is a gain; else
+    two merged, if that costs nothing; and whether any of it was done.
+
+    The cost of the sum is `Σ w tr(P)` of the members' `pixels(core)`, in σ of a pixel. A split
+    lessens it by `w δ² λ` with the greatest eigenvalue λ; a merger adds
+    `wᵢ wⱼ/(wᵢ + wⱼ) |pᵢ − pⱼ|²`, and nothing with a member without weight, whose place it frees.
     """
-    members, log_weights = state.members, state.log_weights
-    weights = jnp.exp(log_weights)
-    values, by_core = jax.vmap(lambda core: (pixels(core), jacobian(pixels, core)))(members.core)
-    c = by_core.shape[-1]
-    costs = jnp.einsum("kic,kcd,kid->k", by_core, members.covariance[:, :c, :c], by_core)
+    weights = jnp.exp(parts.sum.log_weights)
+    costs = jnp.einsum("kii->k", parts.covariances)
     split = jnp.argmax(jnp.where(weights > 0, weights * costs, 0.0))
-    parent = _of(members, split)
-    halves, gain = _halves(parent, by_core[split])
+    gain = weights[split] * SPLIT**2 * eigh(parts.covariances[split])[0][-1]
 
     tiny, index = jnp.finfo(weights.dtype).tiny, jnp.arange(weights.size)
     shared = weights[:, None] * weights / jnp.maximum(weights[:, None] + weights, tiny)
-    apart = jnp.sum((values[:, None] - values) ** 2, axis=-1)
+    apart = jnp.sum((parts.values[:, None] - parts.values) ** 2, axis=-1)
     loss = jnp.where(shared > 0, shared * apart, 0.0)
-    pair = (index[:, None] < index) & (index[:, None] != split) & (index != split)
-    i, j = jnp.unravel_index(jnp.argmin(jnp.where(pair, loss, jnp.inf)), loss.shape)
-    both = jnp.stack([i, j])
-    merged = collapsed(_of(members, both), log_weights[both])
+    pairs = index[:, None] < index
+    others, cost = _cheapest(loss, pairs & (index[:, None] != split) & (index != split))
+    alike, least = _cheapest(loss, pairs & (weights[:, None] > 0) & (weights > 0))
+    divided = (gain > cost) & (gain > WORTH)
+    due = divided | (least < WORTH / 4)
 
-    gained = weights[split] * gain > loss[i, j]
-    slots = jnp.stack([i, j, split])
-    new = jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), merged, halves)
-    half = log_weights[split] - jnp.log(2.0)
-    new = BankState(new, jnp.stack([jnp.logaddexp(*log_weights[both]), half, half]))
-
-    def put(old, new):
-        kept = gained.reshape((1,) * new.ndim)
-        return old.at[slots].set(jnp.where(kept, new, old[slots]))
-
-    return jax.tree.map(put, state, new)
+    pair = jnp.where(divided, others, alike)
+    # A merger alone needs no third place, but places are different.
+    third = jnp.where(divided, split, jnp.argmax((index != pair[0]) & (index != pair[1])))
+    places = jnp.append(pair, third)[None]
+    return at_places(partial(_replaced, pixels), parts, places, due[None], given=divided), due
 
 
-def _of(members: Any, k: Array) -> Any:
+def _replaced(pixels: Pixels, three: _Parts, _: Any, divided: Bool[Array, ""]) -> _Parts:
+    """The first two merged in the first place, and the third split into the others; if it is to be
+    split, or else the second place is free."""
+    members, log_weights = three.sum.members, three.sum.log_weights
+    merged = collapsed(_of(members, np.s_[:2]), log_weights[:2])
+    halves = _halves(_of(members, 2), three.by_core[2])
+    old = _of(members, np.s_[1:])
+    two = jax.tree.map(lambda half, old: jnp.where(divided, half, old), halves, old)
+    half = log_weights[2] - jnp.log(2.0)
+    weights = jnp.where(divided, half, jnp.stack([-jnp.full_like(half, jnp.inf), log_weights[2]]))
+    members = jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), merged, two)
+    state = BankState(members, jnp.append(jnp.logaddexp(*log_weights[:2]), weights))
+    return _Parts(state, *jax.vmap(partial(_described, pixels))(members))
+
+
+def _cheapest(loss: Float[Array, "k k"], pairs: Bool[Array, "k k"]) -> tuple[Array, Array]:
+    """The pair that is merged at the least loss, and that; ∞ without a pair."""
+    loss = jnp.where(pairs, loss, jnp.inf)
+    pair = jnp.stack(jnp.unravel_index(jnp.argmin(loss), loss.shape))
+    return pair, loss[tuple(pair)]
+
+
+def _of(members: Any, k: Any) -> Any:
     return jax.tree.map(lambda x: x[k], members)
 
 
-def _halves(parent: State, by_core: Float[Array, "n c"]) -> tuple[State, Array]:
-    """N(x, P) as ½ N(x + δ c, P − δ² c cᵀ) + ½ N(x − δ c, …), with `c = P g/√(gᵀ P g)`.
+def _halves(parent: State, by_core: Float[Array, "n c"]) -> State:
+    """N(x, P) as ½ N(x + δ c, P − δ² c cᵀ) + ½ N(x − δ c, …), with `c = P g/√(gᵀ P g)`: a batch.
 
-    g is the combination of the `n` functions of the core that varies most. Returned are both
-    halves, a batch, and `δ² gᵀ P g`.
+    g is the combination of the `n` functions of the core that varies most.
     """
     c = by_core.shape[-1]
     slopes = parent.covariance[:, :c] @ by_core.T
@@ -209,7 +268,7 @@ def _halves(parent: State, by_core: Float[Array, "n c"]) -> tuple[State, Array]:
     def half(sign):
         return replace(shifted(parent, sign * away), covariance=smaller)
 
-    return jax.vmap(half)(jnp.array([-1.0, 1.0], away.dtype)), SPLIT**2 * variance
+    return jax.vmap(half)(jnp.array([-1.0, 1.0], away.dtype))
 
 
 def collapsed(members: State, log_weights: Float[Array, " k"]) -> State:

@@ -1,0 +1,228 @@
+"""Work that is done only where it is wanted, in a batch too.
+
+In a batch `lax.cond` computes both sides for every member, and a `lax.while_loop` goes on for all
+until the last has ended. Here those that want it are gathered from the whole batch and computed in
+blocks, so that the work is that of those who want it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Bool, Int
+
+Value = TypeVar("Value")
+
+PARTS = 4
+"""Of a batch, in a block, where each of the batch has one work at the most. Where it has many,
+a block is as large as the batch: in small ones the compiler's products of matrices are slow."""
+LEAST = 8
+"""Works in a block."""
+
+
+def when(
+    wanted: Bool[Array, ""], function: Callable[..., Value], value: Value, *given: Any
+) -> Value:
+    """`function(value, *given)` if it is wanted, else the value."""
+    one = jax.tree.map(lambda x: jnp.asarray(x)[None], value)
+    after = each_alive(function, one, wanted[None], *given)
+    return jax.tree.map(lambda x: x[0], after)
+
+
+def each_alive(
+    function: Callable[..., Value], values: Value, alive: Bool[Array, " k"], *given: Any
+) -> Value:
+    """`function(value, *given)` of every value that is alive; the others stay as they are.
+
+    `values` is a pytree of arrays whose first axis is k; the function returns what it is given.
+    """
+
+    def alone(value, beside, given):
+        del beside
+        return function(value, *given)
+
+    return at_places(_of_one(alone), values, _each_place(alive), alive, (), given)
+
+
+def of_alive(
+    function: Callable[..., Any], values: Any, alive: Bool[Array, " k"], *given: Any
+) -> Any:
+    """`function(value, *given)` of every value that is alive; zeros for the others."""
+    first = jax.tree.map(lambda x: x[0], values)
+    none = zeros(jax.eval_shape(function, first, *given), alive.size)
+
+    def alone(_, value, given):
+        return function(value, *given)
+
+    return at_places(_of_one(alone), none, _each_place(alive), alive, values, given)
+
+
+def zeros(shapes: Any, k: int) -> Any:
+    """So many of what has these shapes."""
+    return jax.tree.map(lambda x: jnp.zeros((k, *x.shape), x.dtype), shapes)
+
+
+def _each_place(alive: Bool[Array, " k"]) -> Int[Array, "k 1"]:
+    return jnp.arange(alive.size)[:, None]
+
+
+def _of_one(function: Callable[..., Any]) -> Callable[..., Any]:
+    def alone(values, beside, given):
+        one = jax.tree.map(lambda x: x[0], (values, beside))
+        return jax.tree.map(lambda x: x[None], function(*one, given))
+
+    return alone
+
+
+def at_places(
+    function: Callable[[Value, Any, Any], Value],
+    values: Value,
+    places: Int[Array, "w r"],
+    wanted: Bool[Array, " w"],
+    beside: Any = (),
+    given: Any = (),
+) -> Value:
+    """The values after each of w works that is wanted.
+
+    `values` is a pytree of arrays of one first axis, and so is what stands `beside` and is only
+    read. A work takes the r values in its places to what is there afterwards,
+    `function(those, those beside, given)`. No two works have one place.
+    """
+    r = places.shape[1]
+    rows = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((r, *x.shape[1:]), x.dtype), (values, beside)
+    )
+    closed = eqx.filter_closure_convert(function, *rows, given)
+    arrays, static = eqx.partition(closed, eqx.is_array)
+
+    def call(rows, shared):
+        arrays, given = shared
+        return eqx.combine(arrays, static)(*rows, given)
+
+    @custom_vmap
+    def work(values, beside, places, wanted, shared):
+        def one(values, data):
+            place, wanted = data
+            old, next_to = jax.tree.map(lambda x: x[place], (values, beside))
+
+            def replaced(old, next_to, shared):
+                return call((old, next_to), shared)
+
+            new = _once(wanted, replaced, old, next_to, shared)
+            return jax.tree.map(lambda x, new: x.at[place].set(new), values, new), None
+
+        return jax.lax.scan(one, values, (places, wanted))[0]
+
+    @work.def_vmap
+    def in_batch(size, batched, *data):
+        spread = _spread(size, tuple(batched[:-1]), data[:-1])
+        after = _in_blocks(call, *spread, data[-1], batched[-1])
+        return after, jax.tree.map(lambda _: True, after)
+
+    return work(values, beside, places, wanted, (arrays, given))
+
+
+def repeated(
+    function: Callable[..., tuple[Value, Bool[Array, ""]]], value: Value, most: int
+) -> Value:
+    """The value after `function`, again as long as that says so, but no more than `most` times.
+
+    In a batch it is called for all until none says so: one that has ended it has to leave as it is.
+    """
+    closed = eqx.filter_closure_convert(function, value)
+    arrays, static = eqx.partition(closed, eqx.is_array)
+
+    def call(value, arrays):
+        return eqx.combine(arrays, static)(value)
+
+    def loop(call, value):
+        def again(carry):
+            turn, value, _ = carry
+            value, going = call(value)
+            return turn + 1, value, jnp.any(going)
+
+        def due(carry):
+            return carry[2] & (carry[0] < most)
+
+        start = jnp.zeros((), int), value, jnp.ones((), bool)
+        return jax.lax.while_loop(due, again, start)[1]
+
+    @custom_vmap
+    def one(value, arrays):
+        return loop(lambda value: call(value, arrays), value)
+
+    @one.def_vmap
+    def in_batch(size, batched, value, arrays):
+        value = _spread(size, batched[0], value)
+        axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched[1])
+        every = jax.vmap(call, in_axes=(0, axes))
+        after = loop(lambda value: every(value, arrays), value)
+        return after, jax.tree.map(lambda _: True, after)
+
+    return one(value, arrays)
+
+
+def _once(
+    wanted: Bool[Array, ""], function: Callable[..., Value], value: Value, *given: Any
+) -> Value:
+    """What the function needs is given to it through the counter of the loop, or the compiler
+    would move the work out of a loop that does not change it."""
+    stacked = jax.tree.map(lambda x: jnp.stack([x, x]), given)
+
+    def once(carry):
+        turn, value = carry
+        return turn + 1, function(value, *jax.tree.map(lambda x: x[turn], stacked))
+
+    def due(carry):
+        return wanted & (carry[0] < 1)
+
+    return jax.lax.while_loop(due, once, (jnp.zeros((), int), value))[1]
+
+
+def _spread(size: int, batched: Any, values: Any) -> Any:
+    """A batch of so many of all of them."""
+
+    def one(is_batched, x):
+        return x if is_batched else jnp.broadcast_to(x, (size, *jnp.shape(x)))
+
+    return jax.tree.map(one, batched, values)
+
+
+def _in_blocks(
+    call: Callable[..., Any],
+    values: Any,
+    beside: Any,
+    places: Int[Array, "b w r"],
+    wanted: Bool[Array, "b w"],
+    shared: Any,
+    batched: Any,
+) -> Any:
+    """Of a batch b: what is wanted, wherever it is, block by block."""
+    b, w = wanted.shape
+    k = jax.tree.leaves(values)[0].shape[1]
+    size = min(b * w, max(LEAST, b * min(w, PARTS) // PARTS))
+    count = jnp.sum(wanted)
+    works = jnp.flatnonzero(wanted, size=b * w + size, fill_value=b * w)
+    places = (places + k * jnp.arange(b)[:, None, None]).reshape(b * w, -1)
+    flat, beside = jax.tree.map(lambda x: x.reshape(b * k, *x.shape[2:]), (values, beside))
+    axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
+
+    def block(carry):
+        done, flat = carry
+        work = jax.lax.dynamic_slice(works, (done,), (size,))
+        place = places[work]
+        rows = jax.tree.map(lambda x: x[place], (flat, beside))
+        own = jax.tree.map(lambda each, x: x[work // w] if each else x, batched, shared)
+        after = jax.vmap(call, in_axes=(0, axes))(rows, own)
+        place = jnp.where((work < b * w)[:, None], place, b * k)
+        flat = jax.tree.map(lambda x, new: x.at[place].set(new, mode="drop"), flat, after)
+        return done + size, flat
+
+    start = jnp.zeros((), works.dtype), flat
+    flat = jax.lax.while_loop(lambda carry: carry[0] < count, block, start)[1]
+    return jax.tree.map(lambda x, old: x.reshape(old.shape), flat, values)

@@ -1,0 +1,146 @@
+"""Work is done where it is wanted and nowhere else, alone and in a batch, with the same result."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxslam import lazy
+from jaxslam.lazy import at_places, each_alive, of_alive, repeated, when
+
+BATCH, PLACES = 20, 5
+
+
+def counted(found):
+    """Doubles a value, and counts how often that is done."""
+
+    def doubled(value, *given):
+        jax.debug.callback(lambda _: found.append(1), value)
+        return 2 * value + sum(given)
+
+    return doubled
+
+
+def done(value):
+    jax.block_until_ready(value)
+    jax.effects_barrier()
+    return value
+
+
+def drawn():
+    """Values of a batch, which are alive, and a number for each of the batch."""
+    keys = jax.random.split(jax.random.key(3), 3)
+    values = {
+        "x": jax.random.normal(keys[0], (BATCH, PLACES, 3)),
+        "count": jnp.zeros((BATCH, PLACES), int),
+    }
+    alive = jax.random.bernoulli(keys[1], 0.3, (BATCH, PLACES))
+    return values, alive, jax.random.normal(keys[2], (BATCH,))
+
+
+def moved(value, by):
+    return {"x": by * value["x"] + 1, "count": value["count"] + 1}
+
+
+def check(after, values, alive, by):
+    expected = jnp.where(alive[..., None], by[:, None, None] * values["x"] + 1, values["x"])
+    np.testing.assert_allclose(after["x"], expected, rtol=1e-12)
+    np.testing.assert_array_equal(after["count"], alive)
+
+
+@pytest.mark.parametrize("wanted", [[False] * 3, [True, False, True]])
+def test_what_nobody_in_a_batch_wants_is_not_done(wanted):
+    found, values = [], jnp.arange(1.0, 4.0)
+    after = jax.jit(jax.vmap(lambda w, v: when(w, counted(found), v, jnp.asarray(0.5))))(
+        jnp.array(wanted), values
+    )
+    done(after)
+    np.testing.assert_array_equal(after, np.where(wanted, 2 * values + 0.5, values))
+    assert bool(found) == any(wanted)
+
+
+def test_only_the_living_are_worked_on():
+    found, alive = [], jnp.array([True, False, False, True])
+    values = jnp.arange(4.0)
+    after = done(jax.jit(lambda alive: each_alive(counted(found), values, alive))(alive))
+    np.testing.assert_array_equal(after, jnp.where(alive, 2 * values, values))
+    assert len(found) == 2
+
+
+def test_a_batch_is_worked_on_in_blocks_of_those_alive_wherever_they_are():
+    found, alive = (
+        [],
+        jnp.zeros((16, 4), bool).at[jnp.array([2, 7, 7]), jnp.array([0, 1, 3])].set(True),
+    )
+    values = jnp.arange(64.0).reshape(16, 4)
+    after = done(jax.jit(jax.vmap(lambda v, a: each_alive(counted(found), v, a)))(values, alive))
+    np.testing.assert_array_equal(after, jnp.where(alive, 2 * values, values))
+    assert len(found) == 16  # one block, and not 64
+
+
+@pytest.mark.parametrize("least", [1, 8, 1000])
+def test_a_batch_gives_what_each_gives_alone(least, monkeypatch):
+    monkeypatch.setattr(lazy, "LEAST", least)
+    values, alive, by = drawn()
+    in_batch = jax.jit(jax.vmap(lambda *given: each_alive(moved, *given)))(values, alive, by)
+    check(in_batch, values, alive, by)
+    one_by_one = jax.jit(lambda *batch: jax.lax.map(lambda given: each_alive(moved, *given), batch))
+    check(one_by_one(values, alive, by), values, alive, by)
+
+
+def test_what_a_function_is_closed_over_may_be_of_the_batch():
+    def closed(values, alive, by):
+        return each_alive(lambda value: moved(value, by), values, alive)
+
+    values, alive, by = drawn()
+    check(jax.jit(jax.vmap(closed))(values, alive, by), values, alive, by)
+
+
+def test_batches_of_batches():
+    values, alive, by = drawn()
+    parts = jax.tree.map(lambda x: x.reshape(4, -1, *x.shape[1:]), (values, alive, by))
+    after = jax.jit(jax.vmap(jax.vmap(lambda *given: each_alive(moved, *given))))(*parts)
+    check(jax.tree.map(lambda x: x.reshape(BATCH, *x.shape[2:]), after), values, alive, by)
+
+
+def test_what_is_not_alive_has_no_result():
+    values, alive, by = drawn()
+    values["x"] = jnp.where(alive[..., None], values["x"], jnp.nan)
+    after = jax.jit(jax.vmap(lambda v, a, b: of_alive(moved, v, a, b)["x"]))(values, alive, by)
+    expected = jnp.where(alive[..., None], by[:, None, None] * values["x"] + 1, 0.0)
+    np.testing.assert_allclose(after, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("in_batch", [False, True])
+def test_a_work_may_be_of_several_places(in_batch):
+    """Two values change places, beside a third array that is only read."""
+    values, beside = jnp.arange(24.0).reshape(4, 6), 100.0 * jnp.ones((4, 6))
+    places = jnp.array([[[0, 5], [1, 2]], [[3, 1], [4, 5]], [[0, 1], [2, 3]], [[5, 4], [3, 2]]])
+    wanted = jnp.array([[True, False], [True, True], [False, False], [False, True]])
+
+    def swapped(two, hundred, sign):
+        return two[::-1] + sign * hundred
+
+    def work(values, beside, places, wanted):
+        return at_places(swapped, values, places, wanted, beside, jnp.asarray(-1.0))
+
+    each = jax.vmap(work) if in_batch else lambda *x: jnp.stack(list(map(work, *x)))
+    after = np.asarray(each(values, beside, places, wanted))
+    expected = np.array(values)
+    for run in range(4):
+        for place, due in zip(np.asarray(places[run]), wanted[run], strict=True):
+            if due:
+                expected[run, place] = expected[run, place[::-1]] - 100
+    np.testing.assert_array_equal(after, expected)
+
+
+@pytest.mark.parametrize("in_batch", [False, True])
+def test_a_work_is_repeated_until_it_is_done_or_enough(in_batch):
+    def halved(value):
+        going = value > 1
+        return jnp.where(going, value / 2, value), going
+
+    start = jnp.array([8.0, 0.5, 1.0, 1024.0])
+    each = jax.vmap if in_batch else lambda one: lambda all: jnp.stack(list(map(one, all)))
+    after = each(lambda value: repeated(halved, value, 5))(start)
+    np.testing.assert_array_equal(after, [1, 0.5, 1, 32])
