@@ -21,6 +21,7 @@ from jaxslam.consistency import (
     treatment,
 )
 from jaxslam.consistency.montecarlo import check_backend, check_sizes, divided
+from jaxslam.consistency.records import check_records, write_records
 from jaxslam.files import write_json
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.names import FILTERS, FROM_REST, MODIFIERS, RECOMMENDED, make_filters
@@ -97,16 +98,24 @@ class ConsistencyOptions:
     pdf: bool = False
     """Write consistency.pdf too: one column for print, 3.4 in wide, its letters embedded."""
 
+    records: Path | None = None
+    """Write every step of every run, a row each, as a Parquet file of this name. Needs the parquet
+    extra."""
+
     def run(self) -> None:
         """Run the study, print its table, write its files."""
         from jaxslam.plots.consistency import plot_consistency
 
+        if self.records is not None:
+            check_records(self.records)
         study = self._study()
         summary = summarise(study)
         write_json(self.out / "consistency.json", summary, allow_nan=False)
         plot_consistency(study, summary, self.out / "consistency.png")
         if self.pdf:
             plot_consistency(study, summary, self.out / "consistency.pdf", column=True)
+        if self.records is not None:
+            write_records(study, self.records)
         print(table(summary))
         print(f"wrote {self.out / 'consistency.json'} and {self.out / 'consistency.png'}")
 

@@ -1,6 +1,7 @@
 """Is a filter consistent? Monte Carlo runs, NEES and NIS with exact bounds, and their summary."""
 
 from jaxslam.consistency.montecarlo import BACKENDS, CHUNK, DTYPES, monte_carlo
+from jaxslam.consistency.records import write_records
 from jaxslam.consistency.statistics import (
     PowerSums,
     chi2_quantile,
@@ -34,4 +35,5 @@ __all__ = [
     "tally",
     "treatment",
     "verdict",
+    "write_records",
 ]
