@@ -9,7 +9,8 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.speed.__main__ import AGREEMENT, difference, flops
+from benchmarks.speed.__main__ import AGREEMENT, difference, flops, without_pose
+from benchmarks.speed.dynamax_ekf import TOLERANCE, by_dynamax, missing
 from benchmarks.speed.eigen import build, by_hand
 from benchmarks.speed.loop import by_loop
 from benchmarks.speed.workload import WORKLOADS, ours, prepared
@@ -26,6 +27,24 @@ def test_everybody_computes_the_same_filter(name, tmp_path):
         if isinstance(library, str):
             pytest.skip(library)
         assert difference(by_hand(library, inputs)(), wanted) < AGREEMENT
+
+
+def test_dynamax_computes_the_same_but_for_the_pose():
+    pytest.importorskip("dynamax")
+    with jax.enable_x64(True):
+        inputs = prepared(dataclasses.replace(WORKLOADS["A"].reduced(2, 3), landmarks=5))
+        assert missing(inputs) is None
+        both = map(without_pose, (by_dynamax(inputs)(), ours(inputs)()))
+        assert difference(*both) < TOLERANCE
+
+
+def test_it_is_said_why_dynamax_is_not_measured(monkeypatch):
+    with jax.enable_x64(True):
+        inputs = prepared(dataclasses.replace(WORKLOADS["B"].reduced(1, 1), landmarks=3))
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert missing(inputs) == "dynamax is not installed"
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
+    assert missing(inputs) == "only planar"
 
 
 def test_a_wrong_covariance_is_a_difference():

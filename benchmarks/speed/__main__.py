@@ -1,10 +1,10 @@
-"""Microseconds of a run's step: ours, by XLA and native, beside NumPy, and C++ with Eigen.
+"""Microseconds of a run's step: ours, by XLA and native, beside NumPy, dynamax, and C++ with Eigen.
 
     python -m benchmarks.speed --out FILE.json
 
 The same pixels and controls for all, whose results are compared first. All in one process on one
 processor, in turns; the median counts, and compilation is apart. C++ needs a compiler, and the
-headers of `pip install cmeel-eigen` or of the system.
+headers of `pip install cmeel-eigen` or of the system; dynamax is measured where it is installed.
 """
 
 from __future__ import annotations
@@ -22,11 +22,13 @@ import jax
 import numpy as np
 import tyro
 
+from benchmarks.speed.dynamax_ekf import TOLERANCE, by_dynamax, missing
 from benchmarks.speed.eigen import build, by_hand
 from benchmarks.speed.loop import by_loop
 from benchmarks.speed.workload import (
     WORKLOADS,
     Inputs,
+    Records,
     Workload,
     by_native,
     ours,
@@ -73,6 +75,12 @@ def difference(found, wanted) -> float:
     return float(max(np.max(np.abs(nees / nees_wanted - 1)), of_P))
 
 
+def without_pose(records: Records) -> Records:
+    """Of the velocity and the landmarks alone, planar: dynamax's pose is no element of a group."""
+    nees, P = records
+    return np.ones_like(nees), P[:, 3:, 3:]
+
+
 def dgemm() -> float:
     """GFlop/s of the machine's own product of matrices."""
     A = np.random.default_rng(0).normal(size=(1000, 1000))
@@ -104,12 +112,20 @@ def measured(work: Workload, library: Any, repeats: int, product: float) -> dict
         compile_seconds["native"] = round(time.perf_counter() - began, 2)
         calls[SINGLE] = by_native(inputs, "float32")
     calls["numpy"] = by_loop(first(inputs, LOOP_RUNS))
+    if why := missing(inputs):
+        print(f"{work.name} without dynamax: {why}")
+    else:
+        calls["dynamax"] = by_dynamax(inputs)
     if not isinstance(library, str):
         calls["eigen"] = by_hand(library, inputs)
         calls["eigen_fixed_sizes"] = by_hand(library, inputs, fixed=True)
     results = {name: call() for name, call in calls.items()}
-    apart = {name: difference(found, results["jaxslam"]) for name, found in results.items()}
-    wrong = {name: x for name, x in apart.items() if name != SINGLE and not x < AGREEMENT}
+    wanted = results["jaxslam"]
+    apart = {name: difference(found, wanted) for name, found in results.items()}
+    if "dynamax" in results:
+        apart["dynamax"] = difference(*map(without_pose, (results["dynamax"], wanted)))
+    bounds = {SINGLE: np.inf, "dynamax": TOLERANCE}
+    wrong = {name: x for name, x in apart.items() if not x < bounds.get(name, AGREEMENT)}
     assert not wrong, f"not the same results: {wrong}"
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(repeats):
