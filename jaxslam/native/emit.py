@@ -101,7 +101,9 @@ class _Writer:
         if isinstance(step, Apply):
             return self.apply(step)
         self.local.clear()  # it writes where they were
-        return self.other(step)
+        text = self.other(step)
+        self.local.clear()  # and over what it has copied first
+        return text
 
     def other(self, step: Any) -> str:
         match step:
