@@ -134,8 +134,9 @@ def test_every_snippet_of_every_page_runs():
         assert not examples(name) or f'run_example("{name}")' in tests, name
 
 
-SAYS = re.compile("…|--help|--version")
-"""What is no command to be checked: one that is abridged, or ends at once."""
+OURS = r"jaxslam \w+|python benchmarks/\w+\.py|python -m benchmarks\.\w+"
+SAYS = re.compile("…|--help|--version|python -c|python -m p")
+"""What is no command of ours to be checked: one that is abridged, ends at once, or is Python's."""
 
 
 def commands() -> list[str]:
@@ -145,7 +146,7 @@ def commands() -> list[str]:
         text = path.read_text()
         blocks = "\n".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL))
         told = re.findall(r"^((?:jaxslam|python) .*)$", blocks, re.MULTILINE)
-        told += re.findall(r"`((?:jaxslam \w+|python benchmarks/\w+\.py) [^`\n]+)`", text)
+        told += re.findall(rf"`((?:{OURS}) [^`\n]+)`", text)
         found |= {line.partition(" #")[0].strip() for line in told if not SAYS.search(line)}
     return sorted(found)
 
@@ -159,12 +160,20 @@ def test_every_command_of_every_page_is_accepted():
         assert hasattr(options, "run"), line
 
 
+def sources(words: list[str]) -> list[Path]:
+    """The files of the program that `python` is told to run: `FILE.py` or `-m PACKAGE`."""
+    if words[0] != "-m":
+        return [ROOT / words[0]]
+    package = ROOT / words[1].replace(".", "/")
+    assert (package / "__main__.py").is_file(), words
+    return sorted(package.glob("*.py"))
+
+
 def test_every_benchmark_of_every_page_is_there_with_its_options():
     checked = [line for line in commands() if line.startswith("python ")]
     assert len(checked) > 2
     for line in checked:
-        script = line.split()[1]
-        source = (ROOT / script).read_text()
+        source = "".join(path.read_text() for path in sources(line.split()[1:]))
         for option in re.findall(r"--([\w-]+)", line):
             assert re.search(rf"\b{option.replace('-', '_')}\b", source), (line, option)
 
