@@ -2,9 +2,10 @@
 
     python -m benchmarks.speed --out FILE.json
 
-The same pixels and controls for all, whose results are compared first. All in one process on one
-processor, in turns; the median counts, and compilation is apart. C++ needs a compiler, and the
-headers of `pip install cmeel-eigen` or of the system; dynamax is measured where it is installed.
+The same pixels and controls for all, whose results are compared first; beside the filter alone
+stand whole studies: drawing, every record, statistics. All in one process on one processor, in
+turns; the median counts, and compilation is apart. C++ needs a compiler, and the headers of
+`pip install cmeel-eigen` or of the system; dynamax is measured where it is installed.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import os
 import resource
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,7 @@ import tyro
 from benchmarks.speed.dynamax_ekf import TOLERANCE, by_dynamax, missing
 from benchmarks.speed.eigen import build, by_hand
 from benchmarks.speed.loop import by_loop
+from benchmarks.speed.study import study_of
 from benchmarks.speed.workload import (
     WORKLOADS,
     Inputs,
@@ -34,13 +37,15 @@ from benchmarks.speed.workload import (
     ours,
     prepared,
 )
+from jaxslam.consistency import BACKENDS
 from jaxslam.files import write_json
 from jaxslam.native.build import compiler
 
 AGREEMENT = 1e-9
 """In double precision, of every NEES, and of the last covariance relative to its largest entry."""
 SINGLE = "native_float32"
-OURS = ("jaxslam", "native", SINGLE)
+OURS = ("jaxslam", "native", SINGLE, *(f"study_{name}" for name in BACKENDS))
+"""The filter alone, and whole studies of it: drawing, every record, statistics."""
 LOOP_RUNS = 4
 """The loop of NumPy is slow, and its time is the same for every run."""
 
@@ -100,9 +105,10 @@ def flops(work: Workload) -> float:
     return update + 2 * 2 * n * (n - 3 * t) * (t + d)
 
 
-def measured(work: Workload, library: Any, repeats: int, product: float) -> dict[str, Any]:
-    """Times of all on one workload; `product` is `dgemm`."""
-    inputs = prepared(work)
+def contestants(
+    inputs: Inputs, library: Any
+) -> tuple[dict[str, Callable[[], Records]], dict[str, float]]:
+    """All who compute the same on these inputs, and the seconds that ours took to compile."""
     began = time.perf_counter()
     calls = {"jaxslam": ours(inputs)}
     compile_seconds = {"jaxslam": round(time.perf_counter() - began, 2)}
@@ -113,40 +119,62 @@ def measured(work: Workload, library: Any, repeats: int, product: float) -> dict
         calls[SINGLE] = by_native(inputs, "float32")
     calls["numpy"] = by_loop(first(inputs, LOOP_RUNS))
     if why := missing(inputs):
-        print(f"{work.name} without dynamax: {why}")
+        print(f"without dynamax: {why}")
     else:
         calls["dynamax"] = by_dynamax(inputs)
     if not isinstance(library, str):
         calls["eigen"] = by_hand(library, inputs)
         calls["eigen_fixed_sizes"] = by_hand(library, inputs, fixed=True)
-    results = {name: call() for name, call in calls.items()}
+    return calls, compile_seconds
+
+
+def apart(results: dict[str, Records]) -> dict[str, float]:
+    """By how much all differ from ours; asserts that it is little."""
     wanted = results["jaxslam"]
-    apart = {name: difference(found, wanted) for name, found in results.items()}
+    found = {name: difference(of, wanted) for name, of in results.items()}
     if "dynamax" in results:
-        apart["dynamax"] = difference(*map(without_pose, (results["dynamax"], wanted)))
+        found["dynamax"] = difference(*map(without_pose, (results["dynamax"], wanted)))
     bounds = {SINGLE: np.inf, "dynamax": TOLERANCE}
-    wrong = {name: x for name, x in apart.items() if not x < bounds.get(name, AGREEMENT)}
+    wrong = {name: x for name, x in found.items() if not x < bounds.get(name, AGREEMENT)}
     assert not wrong, f"not the same results: {wrong}"
+    return found
+
+
+def in_turns(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+    """Median seconds of each."""
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(repeats):
         for name, call in calls.items():
             began = time.perf_counter()
             call()
-            seconds[name].append((time.perf_counter() - began) / len(results[name][0]))
-    median = {name: float(np.median(x)) / work.steps for name, x in seconds.items()}
+            seconds[name].append(time.perf_counter() - began)
+    return {name: float(np.median(x)) for name, x in seconds.items()}
+
+
+def measured(work: Workload, library: Any, repeats: int, product: float) -> dict[str, Any]:
+    """Times of all on one workload; `product` is `dgemm`."""
+    filters, compile_seconds = contestants(prepared(work), library)
+    results = {name: call() for name, call in filters.items()}
+    runs = {name: len(of[0]) for name, of in results.items()}
+    studies = {f"study_{name}": name for name in BACKENDS if name == "xla" or name in filters}
+    calls = {**filters, **{key: study_of(work, name) for key, name in studies.items()}}
+    for key in studies:
+        calls[key]()  # compiles
+    seconds = in_turns(calls, repeats)
+    each = {name: x / runs.get(name, work.runs) / work.steps for name, x in seconds.items()}
     return {
         "runs": work.runs,
         "steps": work.steps,
-        "microseconds_per_step": {name: round(1e6 * x, 2) for name, x in median.items()},
+        "microseconds_per_step": {name: round(1e6 * x, 2) for name, x in each.items()},
         "speed_against": {
-            ours: {name: round(x / median[ours], 3) for name, x in median.items() if name != ours}
+            ours: {name: round(x / each[ours], 3) for name, x in each.items() if name != ours}
             for ours in OURS
-            if ours in median
+            if ours in each
         },
-        "largest_difference": apart,
+        "largest_difference": apart(results),
         "compile_seconds": compile_seconds,
         "share_of_dgemm": {
-            name: round(flops(work) / x / 1e9 / product, 3) for name, x in median.items()
+            name: round(flops(work) / each[name] / 1e9 / product, 3) for name in filters
         },
     }
 

@@ -19,9 +19,10 @@ from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.forms.state import Features, State
 from jaxslam.geometry import Pose
 from jaxslam.native import batched
-from jaxslam.simulation import features, simulate
+from jaxslam.simulation import Scenario, features, simulate
 from jaxslam.simulation.run import Room
 from jaxslam.slam.filter import EkfSlam
+from jaxslam.slam.protocol import AbstractFilter
 
 
 @dataclass(frozen=True)
@@ -64,16 +65,25 @@ Records = tuple[Float[np.ndarray, "runs steps"], Float[np.ndarray, "runs n n"]]
 """NEES of the pose in every step, and the last covariance, of pose, velocity and landmarks."""
 
 
-def prepared(work: Workload) -> Inputs:
-    """Simulated runs, the first ones whose landmarks are all seen in every frame."""
+def scenario_of(work: Workload) -> Scenario:
+    """Away from the landmarks, before a picture without edges: nothing is lost."""
     p = 1 if "6dof" not in work.scenario else 2
-    scenario = jaxslam.scenario(
+    return jaxslam.scenario(
         work.scenario, steps=work.steps, landmarks=work.landmarks, calibration="white",
-        # Away from the landmarks, before a picture without edges: nothing is lost.
         velocity=(*(0.0,) * p, -0.6, *(0.0,) * (2 * p - 1)), image=(1e4,) * p, centre=(5e3,) * p,
         first_pixels=((4.7e3, 5.3e3),) * p,
     )  # fmt: skip
-    (slam,) = jaxslam.make_filters(scenario, ["robocentric"], ["inverse_scaling"]).values()
+
+
+def filters_of(scenario: Scenario) -> dict[str, AbstractFilter]:
+    """The one that is measured, by its name."""
+    return jaxslam.make_filters(scenario, ["robocentric"], ["inverse_scaling"])
+
+
+def prepared(work: Workload) -> Inputs:
+    """Simulated runs, the first ones whose landmarks are all seen in every frame."""
+    scenario = scenario_of(work)
+    (slam,) = filters_of(scenario).values()
     assert isinstance(slam, EkfSlam)
     room = Room(work.landmarks, work.landmarks, work.landmarks, 1)
 

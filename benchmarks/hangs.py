@@ -1,0 +1,162 @@
+"""Does any study stand still? Studies of all filters, on thread pools of one, two and four.
+
+    python benchmarks/hangs.py --out benchmarks/results/hangs.json
+
+A study is a filter with a modifier, a parametrization and a scenario, drawn at random of all that
+go together; its runs are few but of several chunks side by side. All are computed one after
+another in a process, which tells what it begins. Where it is silent for too long it is ended, the
+study is written down as one that hangs, and another process goes on with the next.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import queue
+import tempfile
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import tyro
+
+import jaxslam
+from jaxslam.files import write_json
+from jaxslam.landmarks import LANDMARKS
+from jaxslam.names import FILTERS, MODIFIERS, make_filters
+from jaxslam.simulation.scenario import BUILT_IN
+
+DIVERSE = [*FILTERS, "recommended"]
+MEMBERS = {"lag": 3, "scales": 3, "directions": 3, "mixture": 3, "rest": 8}
+"""Numbers behind modifiers whose programs would otherwise take minutes to compile."""
+
+
+class Case(NamedTuple):
+    """What a study is of."""
+
+    scenario: str
+    filter: str
+    landmark: str
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to try."""
+
+    out: Path
+    """JSON file."""
+    studies: int = 200
+    threads: tuple[int, ...] = (1, 2, 4)
+    """Of XLA's pool. With one, the process has one processor; else all of the machine."""
+    runs: int = 90
+    steps: int = 5
+    limit: float = 400.0
+    """Seconds in which a study ends, its compilation included."""
+    seed: int = 0
+
+
+def drawn(draw: np.random.Generator) -> Case:
+    """One of all that go together."""
+    while True:
+        scenario, landmark = (str(draw.choice(list(of))) for of in (BUILT_IN, LANDMARKS))
+        name, word = str(draw.choice(DIVERSE)), str(draw.choice(["", *MODIFIERS]))
+        if word:
+            name += f"+{word}{MEMBERS.get(word, '')}"
+        try:
+            make_filters(scenario, [name], [landmark])
+        except ValueError:
+            continue
+        return Case(scenario, name, landmark)
+
+
+def study(case: Case, runs: int, steps: int) -> str:
+    """How it ended."""
+    scenario = jaxslam.scenario(case.scenario, steps=steps)
+    filters = make_filters(scenario, [case.filter], [case.landmark])
+    try:
+        found = jaxslam.summarise(
+            jaxslam.monte_carlo(scenario, filters, runs=runs, chunk=max(1, runs // 6))
+        )
+    except Exception as error:  # whatever it is, it has ended
+        return f"{type(error).__name__}: {error}"
+    return "finished" if found["runs"] == runs else "incomplete"
+
+
+def work(told: Any, threads: int, cases: list[tuple[int, Case]], runs: int, steps: int) -> None:
+    """In a process of its own: each case's number when it begins, and how it ended."""
+    if threads == 1:
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    jax.config.update("jax_enable_x64", True)
+    for number, case in cases:
+        told.put((number, None))
+        told.put((number, study(case, runs, steps)))
+        jax.clear_caches()
+        jaxslam.consistency.montecarlo._compiled.cache_clear()
+
+
+def heard(told: Any, process: Any, limit: float) -> tuple[int, str | None] | None:
+    """What the process tells next; None where it is silent for too long, or has died."""
+    until = time.monotonic() + limit
+    while time.monotonic() < until:
+        try:
+            return told.get(timeout=1.0)
+        except queue.Empty:
+            if not process.is_alive():
+                return None
+    return None
+
+
+def tried(cases: list[Case], threads: int, options: Options) -> dict[int, str]:
+    """How every case ended on a pool of so many threads."""
+    os.environ["NPROC"] = str(threads)
+    context = multiprocessing.get_context("spawn")
+    ended: dict[int, str] = {}
+    while len(ended) < len(cases):
+        left = [(i, case) for i, case in enumerate(cases) if i not in ended]
+        told = context.Queue()
+        process = context.Process(
+            target=work, args=(told, threads, left, options.runs, options.steps)
+        )
+        process.start()
+        at = left[0][0]
+        while len(ended) < len(cases):
+            message = heard(told, process, options.limit)
+            if message is None:
+                ended[at] = "hangs" if process.is_alive() else f"exit status {process.exitcode}"
+                print(f"{threads} threads, {at} {'/'.join(cases[at])}: {ended[at]}", flush=True)
+                break
+            at, end = message
+            if end is not None:
+                ended[at] = end
+        process.kill()
+        process.join()
+    return ended
+
+
+def main() -> None:
+    """Try all, write."""
+    options = tyro.cli(Options, description=__doc__)
+    draw = np.random.default_rng(options.seed)
+    cases = [drawn(draw) for _ in range(options.studies)]
+    result: dict[str, Any] = {"studies": len(cases), "seed": options.seed}
+    with tempfile.TemporaryDirectory() as folder:  # what one pool has compiled the next one reads
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder)
+        for threads in options.threads:
+            began = time.perf_counter()
+            ended = tried(cases, threads, options)
+            others = {"/".join(cases[i]): end for i, end in ended.items() if end != "finished"}
+            result[f"{threads} threads"] = {
+                "ended": Counter(end.partition(":")[0] for end in ended.values()),
+                "not_finished": others,
+                "seconds": round(time.perf_counter() - began),
+            }
+            print(f"{threads} threads: {result[f'{threads} threads']}", flush=True)
+            write_json(options.out, result)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+"""How the time and the memory of a whole study grow, one axis at a time.
+
+    python -m benchmarks.speed.sweep --out FILE.json
+
+Every point is a process of its own (`benchmarks.speed.study`), which ends or is ended. The
+exponent of an axis is the slope of log seconds over log size by least squares; `worst` is by how
+much the time for one more differs at most from that of the largest size. JSON is written after
+every point, and what is there already is not measured again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from jaxslam.files import read_json, write_json
+
+AXES: dict[str, tuple[tuple[int, ...], dict[str, int]]] = {
+    "runs": ((128, 512, 2048, 8192), {"steps": 20, "chunk": 128}),
+    "steps": ((10, 25, 50, 100, 200, 400), {"runs": 200}),
+    "landmarks": ((4, 8, 16, 32, 64), {"runs": 200, "steps": 20}),
+    "chunk": ((10, 25, 50, 100, 200, 500), {"runs": 1000, "steps": 20}),
+    "processors": ((1, 2), {"runs": 800, "steps": 50}),
+}
+"""Sizes, and what else is not as `study.Options` has it."""
+LIMIT = 900.0
+"""Seconds of a process."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure."""
+
+    out: Path
+    """JSON file."""
+    axes: tuple[str, ...] = tuple(AXES)
+    backends: tuple[str, ...] = ("xla", "native")
+    workload: str = "A"
+
+
+def point(**options: Any) -> dict[str, Any]:
+    """What `study` prints for these options; or why there is nothing."""
+    words = [f"--{name}={value}" for name, value in options.items()]
+    command = [sys.executable, "-m", "benchmarks.speed.study", *words]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=False)
+    except subprocess.TimeoutExpired:
+        return {"error": f"not finished after {LIMIT:.0f} s"}
+    if done.returncode:
+        return {"error": " ".join(done.stderr.split())[-500:]}
+    return {**json.loads(done.stdout.splitlines()[-1]), "load": round(os.getloadavg()[0], 1)}
+
+
+def growth(sizes: list[int], seconds: list[float]) -> dict[str, float]:
+    """The exponent, and the worst of the times for one more against that of the largest size."""
+    exponent = np.polyfit(np.log(sizes), np.log(seconds), 1)[0]
+    each = np.array(seconds) / sizes
+    worst = np.max(np.abs(each / each[-1] - 1))
+    return {"exponent": round(float(exponent), 3), "worst": round(float(worst), 3)}
+
+
+def main() -> None:
+    """Measure, write."""
+    options = tyro.cli(Options, description=__doc__)
+    result: dict[str, Any] = (
+        read_json(options.out, "measurements", dict) if options.out.exists() else {}
+    )
+    for axis in options.axes:
+        sizes, others = AXES[axis]
+        for backend in options.backends:
+            found = result.setdefault(axis, {}).setdefault(backend, {"points": {}})
+            points = found["points"]
+            for size in sizes:
+                if "seconds" in points.get(str(size), {}):
+                    continue
+                given = {"workload": options.workload, "backend": backend, **others, axis: size}
+                points[str(size)] = point(**given)
+                print(f"{backend}, {axis} {size}: {points[str(size)]}", flush=True)
+                write_json(options.out, result)
+            known = [n for n in sizes if "seconds" in points[str(n)]]
+            if len(known) > 1:
+                found |= growth(known, [points[str(n)]["seconds"] for n in known])
+            write_json(options.out, result)
+
+
+if __name__ == "__main__":
+    main()
