@@ -44,7 +44,8 @@ def test_consistency_writes_what_others_read(tmp_path, capsys):
 
 
 def test_consistency_resumes_to_more_runs(tmp_path, capsys):
-    chunked = [*SMALL, "--out", str(tmp_path), "--chunk", "3", "--landmarks", "inverse_scaling"]
+    few = [*SMALL, "--chunk", "3", "--landmarks", "inverse_scaling"]
+    chunked = [*few, "--out", str(tmp_path)]
     main(chunked)
     first = json.loads((tmp_path / "consistency.json").read_text())
     main([*chunked, "--resume"])
@@ -56,6 +57,14 @@ def test_consistency_resumes_to_more_runs(tmp_path, capsys):
         main([*chunked, "--resume", "--seed", "1"])
     assert stop.value.code == 2
     assert "another seed" in capsys.readouterr().err
+    in_sums = ["--out", str(tmp_path / "sums")]
+    main([*few, *in_sums, "--reduce"])
+    sums = json.loads((tmp_path / "sums" / "consistency.json").read_text())
+    assert sums["filters"][name]["nees"] == first["filters"][name]["nees"]
+    assert (sums["medians_of"], first["medians_of"]) == (3, 6)
+    with pytest.raises(SystemExit):
+        main([*few, *in_sums, "--resume"])
+    assert "another reduced (True, now None)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -69,6 +78,7 @@ def test_consistency_resumes_to_more_runs(tmp_path, capsys):
         (["consistency", "--calibration", "maybe"], "unknown calibration 'maybe'"),
         (["consistency", "--set", "pixel_sigma=nan"], "pixel_sigma holds nan"),
         (["consistency", "--set", "pixel_sigma"], "not of the form field=value"),
+        (["consistency", "--reduce", "--records", "all.parquet"], "leave out --records"),
         (["consistency", "--dtype", "int8"], "unknown dtype 'int8'"),
         (["track", "/no/such/folder"], "/no/such/folder"),
         (["track", "--reference", "truth.txt"], "need a SOURCE"),

@@ -76,6 +76,7 @@ def test_a_study_on_a_cluster_is_the_same_although_a_worker_is_killed(processes,
         sizes: dict[str, Any] = {"runs": RUNS, "chunk": CHUNK}
         study = jaxslam.monte_carlo(SCENARIO, filters(), **sizes, cluster=client, progress=progress)
         assert len(client.nthreads()) == 1  # it was killed before the end
+        sums = jaxslam.monte_carlo(SCENARIO, filters(), **sizes, cluster=client, reduced=True)
     wanted = jaxslam.monte_carlo(SCENARIO, filters(), **sizes)
     assert sum(done) == RUNS
     assert_same(records(study), records(wanted))
@@ -83,6 +84,8 @@ def test_a_study_on_a_cluster_is_the_same_although_a_worker_is_killed(processes,
     for one, other in zip(found.values(), expected.values(), strict=True):
         del one["seconds"], other["seconds"]
     assert found == expected
+    wanted = jaxslam.monte_carlo(SCENARIO, filters(), **sizes, reduced=True)
+    assert_same(records(sums), records(wanted))  # which the worker has added up
 
 
 def test_nobody_at_an_address_is_said_in_one_line(tmp_path, capsys, monkeypatch):

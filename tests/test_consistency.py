@@ -23,6 +23,7 @@ from jaxslam.consistency import (
 )
 from jaxslam.consistency.montecarlo import check_sizes, draw, filter_run
 from jaxslam.consistency.statistics import chi2_cdf, chi2_quantile, normalised_squared
+from jaxslam.consistency.sums import added
 from jaxslam.names import scenario_pieces
 from jaxslam.plots.consistency import plot_consistency, plot_outside
 from jaxslam.plots.style import new_figure
@@ -100,6 +101,41 @@ def test_chunks_side_by_side_are_those_one_after_another(monkeypatch):
     alone, together = computed(1), computed(3)
     for key, values in alone.items():
         np.testing.assert_array_equal(values, together[key], err_msg=key)
+
+
+def without(summary, *gone):
+    """A summary without what is named so, at any depth."""
+    if not isinstance(summary, dict):
+        return summary
+    return {key: without(value, *gone) for key, value in summary.items() if key not in gone}
+
+
+def test_a_reduced_study_says_the_same_but_for_its_medians(tmp_path):
+    """One run diverges, others are lost: all that is counted has something to count."""
+    sizes = {"runs": 40, "chunk": 6}
+    spoilt = jaxslam.scenario("matched-loose", steps=6)
+    slams = jaxslam.make_filters(spoilt, ["robocentric"], ["cartesian", "inverse_scaling"])
+    whole = jaxslam.monte_carlo(spoilt, slams, **sizes)
+    store = FolderStore(tmp_path, {"reduced": True}, resume=False)
+    reduced = jaxslam.monte_carlo(spoilt, slams, **sizes, store=store, reduced=True)
+    medians = "nees_median", "error_median", "sigma_median", "medians_of", "seconds"
+    found, wanted = (jaxslam.summarise(study) for study in (reduced, whole))
+    assert without(found, *medians) == without(wanted, *medians)
+    assert (found["medians_of"], wanted["medians_of"]) == (6, 40)
+    first = jaxslam.summarise(jaxslam.monte_carlo(spoilt, slams, runs=6, chunk=6))
+    for name, f in found["filters"].items():
+        assert f["nees_median"] == first["filters"][name]["nees_median"]
+        assert tally(reduced, name) == tally(whole, name)
+    kept = store.load(next(iter(slams)), reduced.chunks[1])
+    assert all(name.startswith("sum_") for name in kept)
+    assert sum(x.nbytes for x in kept.values()) < 16 * 8 * 6 * 3
+    with pytest.raises(ValueError, match="another reduced"):
+        FolderStore(tmp_path, {}, resume=True)
+
+
+def test_sums_of_something_else_are_refused():
+    with pytest.raises(ValueError, match="other sums: nees"):
+        added([{"nees": 1, "nis": 2}, {"nis": 3}])
 
 
 def test_no_chunk_begins_after_an_error(monkeypatch):

@@ -87,12 +87,15 @@ def test_where_the_velocity_is_measured_weights_are_the_evidence_of_whole_filter
     motion, measured, R = chain()
     _, before, after = kalman(motion, 0.5, measured, R)
     totals = []
+
+    @quick_jit
+    def heard(factor, v, V, before, after):
+        return _heard(_told(before, after), *_foreseen(motion, 0.1, factor, v, V))
+
     for factor in (0.5, 4.0):
         v, V, total = jnp.zeros(3), jnp.eye(3), 0.0
-        for one, other in zip(before, after, strict=True):
-            v, V = _foreseen(motion, 0.1, factor, v, V)
-            told = _told(*jax.tree.map(jnp.asarray, (one, other)))
-            evidence, v, V = _heard(told, v, V)
+        for both in zip(before, after, strict=True):
+            evidence, v, V = heard(factor, v, V, *jax.tree.map(jnp.asarray, both))
             total += evidence
         whole, _, expected = kalman(motion, factor, measured, R)
         np.testing.assert_allclose(v, expected[-1][0], rtol=1e-6)

@@ -193,6 +193,16 @@ def test_tallies_of_parts_and_from_a_file_are_that_of_the_whole():
         parts[0] + Tally.of(nees, 6)
 
 
+def test_a_tally_is_numbers_that_add_up():
+    draw = np.random.default_rng(3)
+    both = [draw.chisquare(3, size=(n, 7)) for n in (30, 20)]
+    both[1][3, 2:] = np.nan
+    both[0][5, 4] = 1e3
+    one, other = (Tally.of(nees, 3) for nees in both)
+    assert Tally.of_numbers(one.numbers() + other.numbers(), 3) == one + other
+    assert (one + other).lost == 2
+
+
 def test_power_sums_have_the_moments_of_their_numbers():
     values = np.random.default_rng(9).gamma(2.0, size=50)
     sums = PowerSums.of(values)

@@ -24,10 +24,10 @@ import tyro
 from jaxslam.files import read_json, write_json
 
 AXES: dict[str, tuple[tuple[int, ...], dict[str, int]]] = {
-    "runs": ((128, 512, 2048, 8192), {"steps": 20, "chunk": 128}),
-    "steps": ((10, 25, 50, 100, 200, 400), {"runs": 200}),
-    "landmarks": ((4, 8, 16, 32, 64), {"runs": 200, "steps": 20}),
-    "chunk": ((10, 25, 50, 100, 200, 500), {"runs": 1000, "steps": 20}),
+    "runs": ((128, 512, 2048, 8192), {"steps": 100, "chunk": 128}),
+    "steps": ((10, 25, 50, 100, 200, 400), {"runs": 800}),
+    "landmarks": ((4, 8, 16, 32, 64), {"runs": 200, "steps": 50}),
+    "chunk": ((10, 25, 50, 100, 200, 500), {"runs": 1000, "steps": 50}),
     "processors": ((1, 2), {"runs": 800, "steps": 50}),
 }
 """Sizes, and what else is not as `study.Options` has it."""

@@ -86,6 +86,9 @@ class ConsistencyOptions:
     ] = "xla"
     resume: bool = False
     """Go on from what an interrupted run left in --out."""
+    reduce: bool = False
+    """Keep sums over the runs of each chunk instead of their records: files and traffic do not
+    grow with --runs in a chunk. Medians are then of the first chunk."""
     cluster: str | None = None
     """Address of a Dask scheduler that runs, as in tcp://127.0.0.1:8786, to whose workers the
     chunks are handed. Needs the cluster extra."""
@@ -108,6 +111,8 @@ class ConsistencyOptions:
 
         if self.records is not None:
             check_records(self.records)
+            if self.reduce:
+                raise ValueError("--reduce keeps no records of every run: leave out --records")
         study = self._study()
         summary = summarise(study)
         write_json(self.out / "consistency.json", summary, allow_nan=False)
@@ -132,6 +137,7 @@ class ConsistencyOptions:
             "dtype": self.dtype,
             "chunk": self.chunk,
             **({} if self.backend == "xla" else {"backend": self.backend}),
+            **({"reduced": True} if self.reduce else {}),
         }
         store = FolderStore(self.out / "runs", manifest, resume=self.resume)
         chunks = divided(self.runs, self.chunk)
@@ -148,6 +154,7 @@ class ConsistencyOptions:
                 store=store,
                 progress=progress,
                 cluster=self.cluster,
+                reduced=self.reduce,
             )
 
     def _scenario(self) -> Scenario:

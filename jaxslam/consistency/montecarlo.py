@@ -32,6 +32,7 @@ from jaxslam.consistency.recursion import Frame, run_through
 from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.consistency.store import MemoryStore, Records, Store
 from jaxslam.consistency.summary import Seconds, Study
+from jaxslam.consistency.sums import as_sums
 from jaxslam.geometry import Pose
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.sensors import AbstractSensor
@@ -75,6 +76,7 @@ def monte_carlo(
     motion: AbstractMotion | Trajectory | None = None,
     sensor: AbstractSensor | None = None,
     cluster: Any = None,
+    reduced: bool = False,
 ) -> Study:
     """Run every filter on the same simulated runs.
 
@@ -92,6 +94,9 @@ def monte_carlo(
     (`jaxslam.native`), to the same numbers but for rounding; where that cannot be, a warning says
     why, and XLA computes them.
 
+    A `reduced` study keeps of every chunk but the first only sums over its runs, made where the
+    chunk is computed: all of a summary but the medians, which are then the first chunk's.
+
     Raises ValueError for sizes that make no sense.
     """
     if not filters or not isinstance(filters, Mapping):
@@ -108,10 +113,10 @@ def monte_carlo(
         missing = {name: [c for c in chunks if not store.has(name, c)] for name in filters}
         room = simulator.room(chunks, each) if any(missing.values()) else None
         for name, slam in filters.items():
-            job = _Job(name, slam, simulator, room, backend)
+            job = _Job(name, slam, simulator, room, backend, reduced)
             seconds[name] = _run_filter(job, missing[name], store, progress, each)
         device = jax.devices()[0].device_kind
-    return Study(scenario, filters, runs, seed, dtype, chunks, store, seconds, device)
+    return Study(scenario, filters, runs, seed, dtype, chunks, store, seconds, device, reduced)
 
 
 def divided(runs: int, chunk: int) -> tuple[range, ...]:
@@ -203,6 +208,7 @@ class _Job(NamedTuple):
     simulator: _Simulator
     room: Room | None
     backend: str = "xla"
+    reduced: bool = False
 
     def __call__(self, chunk: range) -> Records:
         with jax.enable_x64(self.simulator.dtype == "float64"):  # a thread's own
@@ -211,6 +217,8 @@ class _Job(NamedTuple):
             where = f"{self.name}, runs {chunk.start} to {chunk.stop - 1}"
             records, sample = jax.device_get(finished(compiled(*data, batch), where))
         records = {key: np.asarray(value)[: len(chunk)] for key, value in records.items()}
+        if self.reduced and chunk.start > 0:
+            return as_sums(records, batch.poses.tangent_dim)
         return {**records, **{f"sample_{k}": v for k, v in sample.items()}}
 
     def program(self, batch: Run) -> tuple[Callable[..., Any], tuple[Any, ...]]:

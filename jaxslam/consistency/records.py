@@ -31,9 +31,12 @@ def write_records(study: Study, path: str | Path) -> None:
     """Write what `filter_run` tells of every step of every run, a row each: the filter's name, the
     run, the step (from 1), its time in s, and one column for every number.
 
-    Raises ValueError for a name that does not end in .parquet, and without the parquet extra.
+    Raises ValueError for a name that does not end in .parquet, without the parquet extra, and for
+    a reduced study, which has no such records.
     """
     path = check_records(path)
+    if study.reduced:
+        raise ValueError("a reduced study keeps sums, no records of every run to write")
     import pyarrow as pa
     import pyarrow.parquet as parquet
 

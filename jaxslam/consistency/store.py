@@ -12,6 +12,8 @@ import numpy as np
 from jaxslam.files import read_arrays, read_json, write_atomically, write_json
 
 Records = dict[str, np.ndarray]
+SUM = "sum_"
+"""Before the names of sums over the runs of a chunk."""
 
 
 @runtime_checkable
@@ -91,8 +93,8 @@ _DAMAGED = "it is damaged; remove it, and run again with --resume"
 
 
 def _check_records(path: Path, runs: int, records: Records) -> None:
-    """Raise ValueError unless all are numbers, and what is not of one sample is of so many runs."""
-    of_runs = (x for name, x in records.items() if not name.startswith("sample_"))
+    """Raise ValueError unless all are numbers, and what is of each run is of so many runs."""
+    of_runs = (x for name, x in records.items() if not name.startswith(("sample_", SUM)))
     numbers = all(x.dtype.kind in "fiub" for x in records.values())
     if not numbers or any(x.shape[:1] != (runs,) for x in of_runs):
         raise ValueError(f"{path} holds other records than those of {runs} runs: {_DAMAGED}")
@@ -105,10 +107,10 @@ def _as_manifest(found: Any) -> dict[str, Any]:
 
 
 def _check_same(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
-    different = [key for key in wanted if found.get(key) != wanted[key]]
+    different = [key for key in {**wanted, **found} if found.get(key) != wanted.get(key)]
     if different:
         key = different[0]
         raise ValueError(
             f"cannot resume: {path} was made with another {key} "
-            f"({found.get(key)!r}, now {wanted[key]!r}); use another --out or leave --resume out"
+            f"({found.get(key)!r}, now {wanted.get(key)!r}); use another --out or leave --resume out"
         )

@@ -5,14 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import reduce
-from operator import add
 from typing import Any
 
 import numpy as np
 
-from jaxslam.consistency.statistics import lost_threshold, mean_band
+from jaxslam.consistency.statistics import mean_band
 from jaxslam.consistency.store import Records, Store
+from jaxslam.consistency.sums import RECORDS, Sums, added, sums_of, survived, tally_of
 from jaxslam.consistency.verdict import Tally, sentences
 from jaxslam.files import json_numbers
 from jaxslam.forms.state import Status
@@ -21,11 +20,6 @@ from jaxslam.slam.filter import innermost
 from jaxslam.slam.protocol import AbstractFilter
 
 SCHEMA = 1
-RECORDS = (
-    "nees", "beyond_scale", "log_scale", "log_scale_sigma", "reversed", "nis", "nis_dof", "status",
-    "error", "variance", "landmark_nees", "landmark_count", "landmark_not_finite",
-)  # fmt: skip
-"""What a summary reads of the records of a run."""
 _VALUES_AT_ONCE = 10**7
 """Of which the median holds all runs in memory: of as many steps as this makes."""
 
@@ -60,6 +54,19 @@ class Study:
     """What each filter took."""
     device: str
     """On which it was computed."""
+    reduced: bool = False
+    """Whether of all chunks but the first only sums are kept."""
+
+    @property
+    def whole(self) -> tuple[range, ...]:
+        """The chunks whose records are kept."""
+        return self.chunks[:1] if self.reduced else self.chunks
+
+    def loaded(self, name: str) -> Iterator[Records]:
+        """Of every chunk, what a summary reads of what is kept of a filter."""
+        for chunk in self.chunks:
+            is_whole = not self.reduced or chunk == self.chunks[0]
+            yield self.store.load(name, chunk, RECORDS if is_whole else None)
 
     def __repr__(self) -> str:
         """Its table, so that a study prints as what it found."""
@@ -105,6 +112,7 @@ def summarise(study: Study) -> dict[str, Any]:
 
     `outside3sigma` is the share of errors beyond three of the claimed σ, axis by axis and then the
     mean of the axes: 0.27 % of Gaussian errors.
+    Medians are over the first `medians_of` runs, all but where a study keeps sums alone.
     Raises ValueError for what is no study.
     """
     if not isinstance(study, Study):
@@ -118,6 +126,7 @@ def summarise(study: Study) -> dict[str, Any]:
         "version": __version__,
         "scenario": dataclasses.asdict(study.scenario),
         "runs": study.runs,
+        "medians_of": sum(map(len, study.whole)),
         "scale_free": study.scenario.scale_free,
         "steps": study.scenario.steps,
         "seed": study.seed,
@@ -131,7 +140,7 @@ def summarise(study: Study) -> dict[str, Any]:
 def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
     geometry = study.scenario.world
     dof, n = geometry.tangent_dim, geometry.point_dim
-    sums = _sums(study, name, dof)
+    sums = _sums(study, name)
     healthy = study.runs - int(sums["diverged"])
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = sums["nees"] / healthy
@@ -147,9 +156,9 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
         return dict(zip(("position", "orientation"), map(json_numbers, parts), strict=True))
 
     seconds = study.seconds[name]
-    beyond = tally(study, name, "beyond_scale")
+    beyond = tally_of(sums, "beyond_scale", dof)
     return {
-        "verdict": tally(study, name).verdict(),
+        "verdict": tally_of(sums, "nees", dof).verdict(),
         "dof": dof,
         "calibration": treatment(study.filters[name]),
         "survivors": healthy,
@@ -225,62 +234,16 @@ def treatment(slam: Any) -> str | None:
     return None if inner is None else inner.calibration.name
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of estimates that are beyond all measure
-def _sums(study: Study, name: str, dof: int) -> dict[str, Any]:
-    """Sums over the runs that did not diverge, chunk by chunk."""
-    threshold, total = lost_threshold(dof), {}
-    for records in _chunks(study, name, RECORDS):
-        healthy = _healthy(records)
-        good = {key: value[healthy] for key, value in records.items()}
-        kept = good["nees"] <= threshold
-        finite = good["landmark_count"] - good["landmark_not_finite"]
-        part = {
-            "diverged": np.sum(~healthy),
-            "nees": good["nees"].sum(axis=0),
-            "kept": kept.sum(axis=0),
-            "kept_nees": np.where(kept, good["nees"], 0.0).sum(axis=0),
-            "lost": (~kept).sum(axis=0),
-            "lost_ever": np.logical_or.accumulate(~kept, axis=1).sum(axis=0),
-            **_scale_sums(good, lost_threshold(dof - 1)),
-            "nis": good["nis"].sum(axis=0),
-            "nis_dof": good["nis_dof"].sum(axis=0),
-            "squared_error": (good["error"] ** 2).sum(axis=0),
-            "outside": (good["error"] ** 2 > 9 * good["variance"]).sum(axis=0),
-            "variance": good["variance"].sum(axis=0),
-            "landmark_nees": (good["landmark_nees"] * finite).sum(axis=0),
-            "landmark_count": finite.sum(axis=0),
-            "landmark_not_finite": good["landmark_not_finite"].sum(axis=0),
-            **{
-                f"status_{s.name}": np.any(records["status"] == s, axis=1).sum()
-                for s in Status
-                if s != Status.OK
-            },
-        }
-        total = {key: total.get(key, 0) + value for key, value in part.items()}
-    return total
-
-
-def _scale_sums(good: Records, threshold: float) -> dict[str, Any]:
-    """Of what is beyond scale, of scale, and of the direction of the displacement."""
-    error, sigma = good["log_scale"], good["log_scale_sigma"]
-    with np.errstate(over="ignore"):  # no σ of a scale that nothing depends on
-        variance = sigma**2
-    return {
-        "beyond_scale": good["beyond_scale"].sum(axis=0),
-        "beyond_lost": (good["beyond_scale"] > threshold).sum(axis=0),
-        "squared_log_scale": (error**2).sum(axis=0),
-        "log_scale_variance": variance.sum(axis=0),
-        "normalised_log_scale": ((error / sigma) ** 2).sum(axis=0),
-        "reversed": np.nansum(good["reversed"], axis=0),
-        "displaced": np.isfinite(good["reversed"]).sum(axis=0),
-    }
-
-
 def tally(study: Study, name: str, record: str = "nees") -> Tally:
     """What the verdict on one filter is made of, on the NEES of its poses or on what of it is
     `beyond_scale`; tallies of other seeds may be added."""
-    dof = study.scenario.world.tangent_dim - (record == "beyond_scale")
-    return reduce(add, (Tally.of(r[record], dof) for r in _chunks(study, name, (record,))))
+    return tally_of(_sums(study, name), record, study.scenario.world.tangent_dim)
+
+
+def _sums(study: Study, name: str) -> Sums:
+    """Of all chunks."""
+    dof = study.scenario.world.tangent_dim
+    return added(sums_of(kept, dof) for kept in study.loaded(name))
 
 
 def _median(
@@ -289,25 +252,17 @@ def _median(
     record: str = "nees",
     of: Callable[[np.ndarray], np.ndarray] = lambda values: values,
 ) -> np.ndarray:
-    """Median over all runs, diverged ones above everything."""
+    """Median over all runs whose records are kept, diverged ones above everything."""
     medians, at_once = [], max(1, _VALUES_AT_ONCE // study.runs)
     for start in range(0, study.scenario.steps, at_once):
         part = slice(start, start + at_once)
         columns = [
-            np.where(_healthy(records)[:, None], of(records[record]), np.inf)[:, part]
-            for records in _chunks(study, name, ("nees", record))
+            np.where(survived(records)[:, None], of(records[record]), np.inf)[:, part]
+            for chunk in study.whole
+            for records in [study.store.load(name, chunk, ("nees", record))]
         ]
         medians.append(np.median(np.concatenate(columns), axis=0))
     return np.concatenate(medians)
-
-
-def _healthy(records: Records) -> np.ndarray:
-    return np.asarray(np.isfinite(records["nees"]).all(axis=1))
-
-
-def _chunks(study: Study, name: str, names: tuple[str, ...]) -> Iterator[Records]:
-    for chunk in study.chunks:
-        yield study.store.load(name, chunk, names)
 
 
 def table(summary: dict[str, Any] | Study) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -77,6 +77,18 @@ class Tally:
         counts = (numbers[name] for name in ("dof", "runs", "diverged", "lost"))
         sums = (PowerSums(**numbers[name]) for name in ("average", "end", "never_lost"))
         return Tally(*counts, *sums)
+
+    @staticmethod
+    def of_numbers(numbers: Float[np.ndarray, " 15"], dof: int) -> Tally:
+        """Of what `numbers` made of one tally, or of a sum of such."""
+        runs, diverged, lost = (int(x) for x in numbers[:3])
+        sums = (PowerSums(int(n), *map(float, rest)) for n, *rest in numbers[3:].reshape(3, 4))
+        return Tally(dof, runs, diverged, lost, *sums)
+
+    def numbers(self) -> Float[np.ndarray, " 15"]:
+        """All that adds up, for `of_numbers`."""
+        sums = (x for each in (self.average, self.end, self.never_lost) for x in astuple(each))
+        return np.array([self.runs, self.diverged, self.lost, *sums], np.float64)
 
     def asdict(self) -> dict[str, Any]:
         """Numbers as JSON has them, for `from_dict`."""

@@ -1,0 +1,109 @@
+"""What a chunk of runs adds to a summary: sums over its runs, which add up over chunks.
+
+A study may keep them in place of the records (`monte_carlo(..., reduced=True)`): its memory, its
+files and what travels from a cluster then do not grow with the runs of a chunk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from jaxslam.consistency.statistics import lost_threshold
+from jaxslam.consistency.store import SUM, Records
+from jaxslam.consistency.verdict import Tally
+from jaxslam.forms.state import Status
+
+RECORDS = (
+    "nees", "beyond_scale", "log_scale", "log_scale_sigma", "reversed", "nis", "nis_dof", "status",
+    "error", "variance", "landmark_nees", "landmark_count", "landmark_not_finite",
+)  # fmt: skip
+"""What a summary reads of the records of a run."""
+
+Sums = dict[str, Any]
+
+
+def as_sums(records: Records, dof: int) -> Records:
+    """A chunk's records as what a store keeps instead of them: sums, by their names after `sum_`.
+
+    `dof` is that of a pose. Of the runs that did not diverge, but for `diverged`, the numbers of
+    updates by status, and the tallies of the verdicts.
+    """
+    return {f"{SUM}{name}": np.asarray(value) for name, value in _sums(records, dof).items()}
+
+
+def sums_of(kept: Records, dof: int) -> Sums:
+    """Of a chunk, whichever of both a store has kept."""
+    own = {name.removeprefix(SUM): x for name, x in kept.items() if name.startswith(SUM)}
+    return own or _sums(kept, dof)
+
+
+def added(each: Iterable[Sums]) -> Sums:
+    """Of all chunks. Raises ValueError for chunks that hold other sums than the first."""
+    total: Sums = {}
+    for part in each:
+        if total and total.keys() != part.keys():
+            raise ValueError(f"a chunk has other sums: {', '.join(total.keys() ^ part.keys())}")
+        total = {name: total.get(name, 0) + value for name, value in part.items()}
+    return total
+
+
+def tally_of(sums: Sums, record: str, dof: int) -> Tally:
+    """What the verdict on `nees` or on `beyond_scale` is made of; `dof` is that of a pose."""
+    return Tally.of_numbers(sums[f"tally_{record}"], dof - (record == "beyond_scale"))
+
+
+def survived(records: Records) -> Bool[np.ndarray, " runs"]:
+    """Which runs did not diverge."""
+    return np.asarray(np.isfinite(records["nees"]).all(axis=1))
+
+
+@np.errstate(over="ignore", invalid="ignore")  # of estimates that are beyond all measure
+def _sums(records: Records, dof: int) -> Sums:
+    healthy = survived(records)
+    good = {name: records[name][healthy] for name in RECORDS}
+    kept = good["nees"] <= lost_threshold(dof)
+    finite = good["landmark_count"] - good["landmark_not_finite"]
+    return {
+        "tally_nees": Tally.of(records["nees"], dof).numbers(),
+        "tally_beyond_scale": Tally.of(records["beyond_scale"], dof - 1).numbers(),
+        "diverged": np.sum(~healthy),
+        "nees": good["nees"].sum(axis=0),
+        "kept": kept.sum(axis=0),
+        "kept_nees": np.where(kept, good["nees"], 0.0).sum(axis=0),
+        "lost": (~kept).sum(axis=0),
+        "lost_ever": np.logical_or.accumulate(~kept, axis=1).sum(axis=0),
+        **_of_scale(good, lost_threshold(dof - 1)),
+        "nis": good["nis"].sum(axis=0),
+        "nis_dof": good["nis_dof"].sum(axis=0),
+        "squared_error": (good["error"] ** 2).sum(axis=0),
+        "outside": (good["error"] ** 2 > 9 * good["variance"]).sum(axis=0),
+        "variance": good["variance"].sum(axis=0),
+        "landmark_nees": (good["landmark_nees"] * finite).sum(axis=0),
+        "landmark_count": finite.sum(axis=0),
+        "landmark_not_finite": good["landmark_not_finite"].sum(axis=0),
+        **{
+            f"status_{s.name}": np.any(records["status"] == s, axis=1).sum()
+            for s in Status
+            if s != Status.OK
+        },
+    }
+
+
+def _of_scale(good: Records, threshold: float) -> Sums:
+    """Of what is beyond scale, of scale, and of the direction of the displacement."""
+    error, sigma = good["log_scale"], good["log_scale_sigma"]
+    with np.errstate(over="ignore"):  # no σ of a scale that nothing depends on
+        variance = sigma**2
+    return {
+        "beyond_scale": good["beyond_scale"].sum(axis=0),
+        "beyond_lost": (good["beyond_scale"] > threshold).sum(axis=0),
+        "squared_log_scale": (error**2).sum(axis=0),
+        "log_scale_variance": variance.sum(axis=0),
+        "normalised_log_scale": ((error / sigma) ** 2).sum(axis=0),
+        "reversed": np.nansum(good["reversed"], axis=0),
+        "displaced": np.isfinite(good["reversed"]).sum(axis=0),
+    }
