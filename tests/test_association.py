@@ -1,7 +1,7 @@
 """Tests of jaxslam.slam.association: what each lets through and keeps, on constructed ambiguity."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -202,7 +202,8 @@ def test_what_the_filter_does_not_know_is_no_outlier(name):
 def test_a_tolerance_is_noise_of_each_match_by_itself():
     slam, state, control, pixels = matched()
     seen = Features(jnp.arange(6), pixels + 1.0, jnp.ones(6, bool))
-    some, none = (candidates(slam, state, control, seen, tolerance) for tolerance in (0.7, 0.0))
+    seek = quick_jit(partial(candidates, slam))
+    some, none = (seek(state, control, seen, tolerance) for tolerance in (0.7, 0.0))
     added = (some.covariance - none.covariance).reshape(12, 12)
     np.testing.assert_allclose(added, 0.49 * np.eye(12), atol=1e-9)
     np.testing.assert_array_equal(some.residual, none.residual)
@@ -234,6 +235,6 @@ def test_a_filter_without_the_covariance_of_its_innovations_is_refused():
     case = Case("matched-6dof", steps=1, landmarks=6)
     slam, control, first = matched()[0], case.controls()[0], case.frames(0)[0]
     slam = replace(slam, form=Information(), landmark=LANDMARKS["image_plane"])
-    state = slam.predict(slam.init(case.capacity, first), control)
+    state = jax.eval_shape(lambda: slam.predict(slam.init(case.capacity, first), control))
     with pytest.raises(ValueError, match="innovations have no covariance"):
-        candidates(slam, state, control, first)
+        jax.eval_shape(lambda state: candidates(slam, state, control, first), state)
