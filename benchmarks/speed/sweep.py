@@ -3,9 +3,9 @@
     python -m benchmarks.speed.sweep --out FILE.json
 
 Every point is a process of its own (`benchmarks.speed.study`), which ends or is ended. The
-exponent of an axis is the slope of log seconds over log size by least squares; `worst` is by how
-much the time for one more differs at most from that of the largest size. JSON is written after
-every point, and what is there already is not measured again.
+exponent of an axis along which there is more to do is the slope of log seconds over log size by
+least squares; `worst` is by how much the time for one more differs at most from that of the largest
+size. JSON is written after every point, and what is there already is not measured again.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ AXES: dict[str, tuple[tuple[int, ...], dict[str, int]]] = {
     "processors": ((1, 2), {"runs": 800, "steps": 50}),
 }
 """Sizes, and what else is not as `study.Options` has it."""
+GROWING = ("runs", "steps", "landmarks")
+"""Axes along which a study is more work."""
 LIMIT = 900.0
 """Seconds of a process."""
 
@@ -86,7 +88,7 @@ def main() -> None:
                 print(f"{backend}, {axis} {size}: {points[str(size)]}", flush=True)
                 write_json(options.out, result)
             known = [n for n in sizes if "seconds" in points[str(n)]]
-            if len(known) > 1:
+            if axis in GROWING and len(known) > 1:
                 found |= growth(known, [points[str(n)]["seconds"] for n in known])
             write_json(options.out, result)
 
