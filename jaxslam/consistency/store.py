@@ -107,10 +107,10 @@ def _as_manifest(found: Any) -> dict[str, Any]:
 
 
 def _check_same(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
-    different = [key for key in {**wanted, **found} if found.get(key) != wanted.get(key)]
-    if different:
-        key = different[0]
-        raise ValueError(
-            f"cannot resume: {path} was made with another {key} "
-            f"({found.get(key)!r}, now {wanted.get(key)!r}); use another --out or leave --resume out"
-        )
+    for key in {**wanted, **found}:
+        now, then = wanted.get(key), found.get(key)
+        if now != then:
+            raise ValueError(
+                f"cannot resume: {path} was made with another {key} ({then!r}, now {now!r}); "
+                "use another --out or leave --resume out"
+            )
