@@ -3,6 +3,7 @@
 import time
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -112,7 +113,7 @@ def without(summary, *gone):
 
 def test_a_reduced_study_says_the_same_but_for_its_medians(tmp_path):
     """One run diverges, others are lost: all that is counted has something to count."""
-    sizes = {"runs": 40, "chunk": 6}
+    sizes: dict[str, Any] = {"runs": 40, "chunk": 6}
     spoilt = jaxslam.scenario("matched-loose", steps=6)
     slams = jaxslam.make_filters(spoilt, ["robocentric"], ["cartesian", "inverse_scaling"])
     whole = jaxslam.monte_carlo(spoilt, slams, **sizes)
