@@ -25,12 +25,13 @@ import numpy as np
 import tyro
 
 import jaxslam
+from jaxslam.consistency import montecarlo
 from jaxslam.files import write_json
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.names import FILTERS, MODIFIERS, make_filters
 from jaxslam.simulation.scenario import BUILT_IN
 
-DIVERSE = [*FILTERS, "recommended"]
+NAMES = [*FILTERS, "recommended"]
 MEMBERS = {"lag": 3, "scales": 3, "directions": 3, "mixture": 3, "rest": 8}
 """Numbers behind modifiers whose programs would otherwise take minutes to compile."""
 
@@ -63,7 +64,7 @@ def drawn(draw: np.random.Generator) -> Case:
     """One of all that go together."""
     while True:
         scenario, landmark = (str(draw.choice(list(of))) for of in (BUILT_IN, LANDMARKS))
-        name, word = str(draw.choice(DIVERSE)), str(draw.choice(["", *MODIFIERS]))
+        name, word = str(draw.choice(NAMES)), str(draw.choice(["", *MODIFIERS]))
         if word:
             name += f"+{word}{MEMBERS.get(word, '')}"
         try:
@@ -94,8 +95,8 @@ def work(told: Any, threads: int, cases: list[tuple[int, Case]], runs: int, step
     for number, case in cases:
         told.put((number, None))
         told.put((number, study(case, runs, steps)))
+        montecarlo.forget()
         jax.clear_caches()
-        jaxslam.consistency.montecarlo._compiled.cache_clear()
 
 
 def heard(told: Any, process: Any, limit: float) -> tuple[int, str | None] | None:

@@ -104,6 +104,29 @@ def test_chunks_side_by_side_are_those_one_after_another(monkeypatch):
         np.testing.assert_array_equal(values, together[key], err_msg=key)
 
 
+def test_a_batch_in_parts_that_fit_the_cache_is_the_same(monkeypatch):
+    """Seven runs, three at a time: the last part has two of them again."""
+
+    def computed():
+        montecarlo.forget()
+        study = jaxslam.monte_carlo(SCENARIO, filters(), runs=7, chunk=7)
+        return [study.store.load(name, study.chunks[0]) for name in study.filters]
+
+    def at_once(bytes):
+        monkeypatch.setattr(montecarlo, "CACHE", bytes)
+        return montecarlo._at_once(room, batch)
+
+    room, batch = draw(SCENARIO, 7)
+    assert at_once(montecarlo.CACHE) >= 7
+    whole = computed()
+    assert any(at_once(bytes) == 3 for bytes in range(0, 10**6, 100))
+    for parts, records in zip(computed(), whole, strict=True):
+        assert parts.keys() == records.keys()
+        for key, values in records.items():
+            np.testing.assert_allclose(parts[key], values, rtol=1e-6, atol=1e-12, err_msg=key)
+    montecarlo.forget()
+
+
 def without(summary, *gone):
     """A summary without what is named so, at any depth."""
     if not isinstance(summary, dict):

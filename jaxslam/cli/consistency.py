@@ -80,7 +80,7 @@ class ConsistencyOptions:
     """Run i draws from this seed and i alone."""
     dtype: Annotated[str, tyro.conf.arg(help=f"Precision: {', '.join(DTYPES)}.")] = "float64"
     chunk: int = CHUNK
-    """Runs in one batch; memory grows with it, results do not depend on it."""
+    """Runs that are computed and kept together; memory grows with it, results do not."""
     backend: Annotated[
         str, tyro.conf.arg(help=f"What computes: {', '.join(BACKENDS)} (needs a C++ compiler).")
     ] = "xla"
@@ -100,7 +100,6 @@ class ConsistencyOptions:
     """Folder for consistency.json, consistency.png and the records of all runs."""
     pdf: bool = False
     """Write consistency.pdf too: one column for print, 3.4 in wide, its letters embedded."""
-
     records: Path | None = None
     """Write every step of every run, a row each, as a Parquet file of this name. Needs the parquet
     extra."""

@@ -57,7 +57,9 @@ DTYPES = ("float64", "float32")
 BACKENDS = ("xla", "native")
 """XLA, or a program in C++ that is made from the same functions where there is a compiler."""
 CHUNK = 100
-"""Runs in one batch: enough to fill vector units, few enough to stay in the cache."""
+"""Runs that are drawn, handed out and kept together."""
+CACHE = 3 * 2**19
+"""Bytes of covariances that a processor works on: about what its second cache holds."""
 MOST_RUNS = 10**8
 """Of a study."""
 
@@ -323,6 +325,13 @@ def _native(leaves, structure, room: Room, shapes, of_data) -> Callable[..., Any
     return computed
 
 
+def forget() -> None:
+    """Free the programs of all filters, each of which holds some of the memory maps of which a
+    process may have only so many; as `jaxslam.programs.forget` does the tracker's."""
+    _compiled.cache_clear()
+    _native.cache_clear()
+
+
 def _filter_batch(
     static: AbstractFilter,
     room: Room,
@@ -332,9 +341,31 @@ def _filter_batch(
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     """Records of a batch of runs, and the map and the path of its first run."""
     slam = eqx.combine(numbers, static)
-    records, path, state = jax.vmap(partial(filter_run, slam, room, sensor))(runs)
-    first = partial(jax.tree.map, lambda x: x[0])
-    return records, _sample(slam, room, first(path), first(state), first(runs))
+
+    def part(runs):
+        records, path, state = jax.vmap(partial(filter_run, slam, room, sensor))(runs)
+        first = partial(jax.tree.map, lambda x: x[0])
+        return records, _sample(slam, room, first(path), first(state), first(runs))
+
+    count = len(runs.visible)
+    parts = math.ceil(count / _at_once(room, runs))
+    if parts == 1:
+        return part(runs)
+    size = math.ceil(count / parts)
+    again = jnp.arange(parts * size) % count
+    records, samples = jax.lax.map(
+        part, jax.tree.map(lambda x: x[again].reshape(parts, size, *x.shape[1:]), runs)
+    )
+    records = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], records)
+    return records, jax.tree.map(lambda x: x[0], samples)
+
+
+def _at_once(room: Room, runs: Run) -> int:
+    """Runs whose covariances stay in a processor's cache; all where there is no such."""
+    if jax.default_backend() != "cpu":
+        return len(runs.visible)
+    n = 2 * runs.poses.tangent_dim + room.landmarks * (runs.points.shape[-1] + 1)
+    return max(1, CACHE // (n * n * runs.points.dtype.itemsize))
 
 
 def _sample(slam, room: Room, path: Pose, state: Any, run: Run) -> dict[str, Array]:
