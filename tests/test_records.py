@@ -54,18 +54,8 @@ def test_a_file_says_what_made_it_and_holds_a_chunk_at_a_time(study, tmp_path):
 
 
 def test_the_command_writes_it_and_resumes_to_the_same(tmp_path):
-    command = [
-        "consistency",
-        "--scenario",
-        "matched",
-        "--steps",
-        "3",
-        "--runs",
-        "4",
-        "--chunk",
-        "2",
-    ]
-    command += ["--landmarks", "inverse_scaling", "--out", str(tmp_path)]
+    sizes = "--scenario matched --steps 3 --runs 4 --chunk 2 --landmarks inverse_scaling"
+    command = ["consistency", *sizes.split(), "--out", str(tmp_path)]
     path = tmp_path / "all.parquet"
     main([*command, "--records", str(path)])
     before = path.read_bytes()

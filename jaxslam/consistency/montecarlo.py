@@ -32,7 +32,7 @@ from jaxslam.consistency.recursion import Frame, run_through
 from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.consistency.store import MemoryStore, Records, Store
 from jaxslam.consistency.summary import Seconds, Study
-from jaxslam.consistency.sums import as_sums
+from jaxslam.consistency.sums import as_sums, keeps_records
 from jaxslam.geometry import Pose
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.sensors import AbstractSensor
@@ -219,9 +219,9 @@ class _Job(NamedTuple):
             where = f"{self.name}, runs {chunk.start} to {chunk.stop - 1}"
             records, sample = jax.device_get(finished(compiled(*data, batch), where))
         records = {key: np.asarray(value)[: len(chunk)] for key, value in records.items()}
-        if self.reduced and chunk.start > 0:
-            return as_sums(records, batch.poses.tangent_dim)
-        return {**records, **{f"sample_{k}": v for k, v in sample.items()}}
+        if keeps_records(chunk, self.reduced):
+            return {**records, **{f"sample_{k}": v for k, v in sample.items()}}
+        return as_sums(records, batch.poses.tangent_dim)
 
     def program(self, batch: Run) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         """And what it is called with before the batch; many threads that ask compile it once."""

@@ -11,7 +11,15 @@ import numpy as np
 
 from jaxslam.consistency.statistics import mean_band
 from jaxslam.consistency.store import Records, Store
-from jaxslam.consistency.sums import RECORDS, Sums, added, sums_of, survived, tally_of
+from jaxslam.consistency.sums import (
+    RECORDS,
+    Sums,
+    added,
+    keeps_records,
+    sums_of,
+    survived,
+    tally_of,
+)
 from jaxslam.consistency.verdict import Tally, sentences
 from jaxslam.files import json_numbers
 from jaxslam.forms.state import Status
@@ -60,13 +68,13 @@ class Study:
     @property
     def whole(self) -> tuple[range, ...]:
         """The chunks whose records are kept."""
-        return self.chunks[:1] if self.reduced else self.chunks
+        return tuple(chunk for chunk in self.chunks if keeps_records(chunk, self.reduced))
 
     def loaded(self, name: str) -> Iterator[Records]:
         """Of every chunk, what a summary reads of what is kept of a filter."""
         for chunk in self.chunks:
-            is_whole = not self.reduced or chunk == self.chunks[0]
-            yield self.store.load(name, chunk, RECORDS if is_whole else None)
+            whole = keeps_records(chunk, self.reduced)
+            yield self.store.load(name, chunk, RECORDS if whole else None)
 
     def __repr__(self) -> str:
         """Its table, so that a study prints as what it found."""

@@ -26,6 +26,11 @@ RECORDS = (
 Sums = dict[str, Any]
 
 
+def keeps_records(chunk: range, reduced: bool) -> bool:
+    """Whether a study keeps the chunk whole: of a reduced one the first, for its medians."""
+    return not reduced or chunk.start == 0
+
+
 def as_sums(records: Records, dof: int) -> Records:
     """A chunk's records as what a store keeps instead of them: sums, by their names after `sum_`.
 
