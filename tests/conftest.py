@@ -1,5 +1,6 @@
 """What every test shares: float64, and the folder of real data where it is at hand."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -25,6 +26,7 @@ jax.config.update("jax_enable_x64", True)
 if not jax.config.values["jax_compilation_cache_dir"]:  # commands would keep programs at home
     jax.config.update("jax_enable_compilation_cache", False)
     os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
+gc.disable()  # else a tenth of the time: tracing makes many objects. Collected after every file.
 # Tests compile much and compute little.
 jax.config.update("jax_disable_most_optimizations", True)
 os.environ["XLA_FLAGS"] = _flags_that_are_known("--xla_cpu_use_fusion_emitters=false")
@@ -52,7 +54,7 @@ def unchecked():
 def _compiled_programs_are_freed():
     """A process may hold only so many memory maps, and every compiled program takes some."""
     yield
-    montecarlo._compiled.cache_clear()
-    montecarlo._native.cache_clear()
+    montecarlo.forget()
     programs.forget()
     jax.clear_caches()
+    gc.collect()
