@@ -28,7 +28,7 @@ AXES: dict[str, tuple[tuple[int, ...], dict[str, int]]] = {
     "steps": ((10, 25, 50, 100, 200, 400), {"runs": 800}),
     "landmarks": ((4, 8, 16, 32, 64), {"runs": 200, "steps": 50}),
     "chunk": ((10, 25, 50, 100, 200, 500), {"runs": 1000, "steps": 50}),
-    "processors": ((1, 2), {"runs": 800, "steps": 50}),
+    "processors": ((1, 2), {"runs": 1600, "steps": 100}),
 }
 """Sizes, and what else is not as `study.Options` has it."""
 GROWING = ("runs", "steps", "landmarks")
