@@ -150,6 +150,9 @@ def test_a_reduced_study_says_the_same_but_for_its_medians(tmp_path):
     for name, f in found["filters"].items():
         assert f["nees_median"] == first["filters"][name]["nees_median"]
         assert tally(reduced, name) == tally(whole, name)
+    titles = "".join(axes.get_title() for axes in plot_consistency(reduced, found).axes)
+    assert titles.count("median of the first 6 runs") == 2
+    assert titles.count("median error of the first 6 runs") == 1
     kept = store.load(next(iter(slams)), reduced.chunks[1])
     assert all(name.startswith("sum_") for name in kept)
     assert sum(x.nbytes for x in kept.values()) < 16 * 8 * 6 * 3

@@ -114,8 +114,14 @@ def plot_nees(summary: dict[str, Any] | Study, *, ax: Axes, label: Labels | None
     _plot_means(summary["filters"], summary, ax, label)
     ax.set_ylabel(f"pose NEES ({ideal})")
     band = f"grey: exact 95 % band of {first['survivors']} runs"
-    set_title(ax, f"mean NEES; dotted: median\n{band}")
+    set_title(ax, f"mean NEES; dotted: median{_of_some(summary)}\n{band}")
     return ax
+
+
+def _of_some(summary: dict[str, Any]) -> str:
+    """Of which runs the medians are, where it is not all."""
+    some = summary.get("medians_of", summary["runs"])  # not in earlier versions
+    return "" if some == summary["runs"] else f" of the first {some} runs"
 
 
 def _plot_means(
@@ -201,7 +207,7 @@ def plot_beyond_scale(
     _plot_means(numbers, summary, ax, label)
     ideal = f"ideal {next(iter(numbers.values()))['dof']}"
     ax.set_ylabel(f"NEES ({ideal})")
-    set_title(ax, "NEES given the scale; dotted: median")
+    set_title(ax, f"NEES given the scale; dotted: median{_of_some(summary)}")
     return ax
 
 
@@ -226,7 +232,8 @@ def plot_log_scale(
     name_numbers(ax.yaxis)
     _over_time(ax, time)
     ax.set_ylabel("error of ln(scale)")
-    set_title(ax, "scale: median error of the runs\ndashed: by the σ claimed, 0.67 of its median")
+    of = _of_some(summary) or " of the runs"
+    set_title(ax, f"scale: median error{of}\ndashed: by the σ claimed, 0.67 of its median")
     _name(ax, time, lines, label)
     return ax
 
