@@ -12,6 +12,7 @@ With a lag of one frame, iterated, it is the iterated EKF: always on the origina
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -59,8 +60,12 @@ class NormalEquations(NamedTuple):
     """The window at one point: `(I + AᵀA) δ = −g` with g = y − Aᵀ r."""
 
     newest: Point
+    sensitivity: Float[Array, "n N"]
+    """Of the newest point, S."""
     last: Compared
     """What the newest frame compared."""
+    slope: Float[Array, "mp N"]
+    """Of the newest frame, A."""
     information: Cholesky
     """I + AᵀA."""
     gradient: Float[Array, " N"]
@@ -180,9 +185,9 @@ class FixedLag(AbstractFilter):
         control = jax.tree.map(lambda x: jnp.tile(x, (self.frames, *(1,) * x.ndim)), still)
         return Frames(jnp.zeros(self.frames, bool), control, features(known), features(new))
 
-    def _advance(self, point: Point, frame: Frames) -> tuple[Point, Compared]:
+    def _advance(self, before: Distribution, point: Point, frame: Frames) -> tuple[Point, Compared]:
         """One frame of the base filter, as a function of the variables."""
-        base = replace(self.base, form=Sensitivity(frame.happened))
+        base = replace(self.base, form=Sensitivity(before, frame.happened))
         check_features(base, frame.seen)
         predicted = base.predict(point, frame.control)
         compared_at, compared = correct(base, predicted, frame.control, frame.seen)
@@ -190,21 +195,21 @@ class FixedLag(AbstractFilter):
 
     def _normal_equations(self, before, variables, frames) -> NormalEquations:
         point, compared = self._through(before, variables, frames)
-        A = compared.slope.reshape(-1, variables.size)
+        A = jax.tree.map(lambda x: jax.lax.collapse(x, 0, 2), compared.slope).by_variables(before)
         information = A.T @ A + jnp.eye(variables.size, dtype=A.dtype)
         gradient = variables - compared.residual.ravel() @ A
         return NormalEquations(
             point,
+            point.sensitivity(before),
             jax.tree.map(lambda x: x[-1], compared),
+            A[-compared.residual.shape[1] :],
             cholesky(information),
             gradient,
         )
 
     def _through(self, before, variables, frames) -> tuple[Point, Compared]:
         """The window, frame by frame."""
-        return jax.lax.scan(
-            lambda point, frame: self._advance(point, frame), begin(before, variables), frames
-        )
+        return jax.lax.scan(partial(self._advance, before), begin(before, variables), frames)
 
     def _absorbed(self, state: LagState) -> tuple[Distribution, Array]:
         """The Gaussian after the oldest frame, linearised where the window has it, and the
@@ -213,8 +218,8 @@ class FixedLag(AbstractFilter):
         n, q = before.offset.size, self._noises(before)
         own = y[: n + q]
         oldest = jax.tree.map(lambda x: x[0], state.frames)
-        point, compared = self._advance(begin(before, own), oldest)
-        A, S = compared.slope, point.sensitivity
+        point, compared = self._advance(before, begin(before, own), oldest)
+        A, S = compared.slope.by_variables(before), point.sensitivity(before)
         information = cholesky(A.T @ A + jnp.eye(n + q, dtype=A.dtype))
         offset = S @ information.solve(compared.residual @ A - own)
         V = information.whitening @ S.T
@@ -254,7 +259,7 @@ def _appended(frames: Frames, newest: Frames) -> Frames:
 
 def _estimate(window: NormalEquations) -> State:
     """The newest state, to first order in the step that is left."""
-    point, S = window.newest, window.newest.sensitivity
+    point, S = window.newest, window.sensitivity
     delta, c = S @ window.step(), point.core_dim
     V = window.information.whitening @ S.T
     return State(
@@ -271,8 +276,7 @@ def _innovation(window: NormalEquations, noise: Float[Array, "p p"]) -> Innovati
     What is left of the residual after the step, e, and `W = I − A C Aᵀ`, with the covariance C
     after it, give the whitened innovation W⁻¹ e and its covariance W⁻¹.
     """
-    last = window.last
-    A = last.slope
+    last, A = window.last, window.slope
     left = last.residual - A @ window.step()
     V = window.information.whitening @ A.T
     W = jnp.eye(left.size, dtype=A.dtype) - V.T @ V
