@@ -5,17 +5,20 @@
 A study is a filter with a modifier, a parametrization and a scenario, drawn at random of all that
 go together; its runs are few but of several chunks side by side. All are computed one after
 another in a process, which tells what it begins. Where it is silent for too long it is ended, the
-study is written down as one that hangs, and another process goes on with the next.
+study is written down as one that hangs, and another process goes on with the next. It takes hours:
+the file is written after every study, and the same command goes on where it ends.
 """
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import queue
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -49,7 +52,7 @@ class Options:
     """What to try."""
 
     out: Path
-    """JSON file."""
+    """JSON file; one that is there is gone on with."""
     studies: int = 200
     threads: tuple[int, ...] = (1, 2, 4)
     """Of XLA's pool. With one, the process has one processor; else all of the machine."""
@@ -111,31 +114,45 @@ def heard(told: Any, process: Any, limit: float) -> tuple[int, str | None] | Non
     return None
 
 
-def tried(cases: list[Case], threads: int, options: Options) -> dict[int, str]:
-    """How every case ended on a pool of so many threads."""
+def tried(
+    cases: list[Case],
+    threads: int,
+    options: Options,
+    ended: list[str],
+    save: Callable[[], None] = lambda: None,
+) -> None:
+    """How every case ended on a pool of so many threads, added to what has `ended` before."""
     os.environ["NPROC"] = str(threads)
     context = multiprocessing.get_context("spawn")
-    ended: dict[int, str] = {}
     while len(ended) < len(cases):
-        left = [(i, case) for i, case in enumerate(cases) if i not in ended]
+        left = list(enumerate(cases))[len(ended) :]
         told = context.Queue()
         process = context.Process(
             target=work, args=(told, threads, left, options.runs, options.steps)
         )
         process.start()
-        at = left[0][0]
         while len(ended) < len(cases):
             message = heard(told, process, options.limit)
             if message is None:
-                ended[at] = "hangs" if process.is_alive() else f"exit status {process.exitcode}"
-                print(f"{threads} threads, {at} {'/'.join(cases[at])}: {ended[at]}", flush=True)
+                ended.append("hangs" if process.is_alive() else f"exit status {process.exitcode}")
                 break
-            at, end = message
-            if end is not None:
-                ended[at] = end
+            if (end := message[1]) is not None:
+                ended.append(end)
+                save()
         process.kill()
         process.join()
-    return ended
+        save()
+
+
+def begun(options: Options) -> dict[str, Any]:
+    """What has been found so far. Raises ValueError for a file of other studies."""
+    of = {"studies": options.studies, "seed": options.seed}
+    if not options.out.exists():
+        return of
+    result = json.loads(options.out.read_text())
+    if any(result.get(name) != value for name, value in of.items()):
+        raise ValueError(f"{options.out} is of other studies than {of}: write to another file")
+    return result
 
 
 def main() -> None:
@@ -143,20 +160,23 @@ def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     draw = np.random.default_rng(options.seed)
     cases = [drawn(draw) for _ in range(options.studies)]
-    result: dict[str, Any] = {"studies": len(cases), "seed": options.seed}
+    result = begun(options)
     with tempfile.TemporaryDirectory() as folder:  # what one pool has compiled the next one reads
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder)
         for threads in options.threads:
-            began = time.perf_counter()
-            ended = tried(cases, threads, options)
-            others = {"/".join(cases[i]): end for i, end in ended.items() if end != "finished"}
-            result[f"{threads} threads"] = {
-                "ended": Counter(end.partition(":")[0] for end in ended.values()),
-                "not_finished": others,
-                "seconds": round(time.perf_counter() - began),
-            }
-            print(f"{threads} threads: {result[f'{threads} threads']}", flush=True)
-            write_json(options.out, result)
+            found = result.setdefault(f"{threads} threads", {"ended": [], "seconds": 0})
+            began = time.perf_counter() - found["seconds"]
+
+            def save(found: dict[str, Any] = found, began: float = began) -> None:
+                found["seconds"] = round(time.perf_counter() - began)
+                write_json(options.out, result)
+
+            tried(cases, threads, options, found["ended"], save)
+            ends = [end.partition(":")[0] for end in found["ended"]]
+            print(f"{threads} threads: {Counter(ends)}", flush=True)
+            for case, end in zip(cases, found["ended"], strict=True):
+                if end != "finished":
+                    print("  ", "/".join(case), end)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.arrays import AnyArray
 
-LEAF = 20
+LEAF = 24
 """Rows of what is factored column by column; of more, such blocks are, and joined by products."""
 HALVED = 128
 """Rows above which the halves are factored: fewer and larger products."""
