@@ -9,7 +9,6 @@ benchmarks/linalg.py`).
 from __future__ import annotations
 
 from functools import partial
-from itertools import pairwise
 from typing import NamedTuple
 
 import jax
@@ -19,10 +18,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.arrays import AnyArray
 
-LEAF = 24
-"""Rows of what is factored column by column; of more, such blocks are, and joined by products."""
-HALVED = 128
-"""Rows above which the halves are factored: fewer and larger products."""
+LEAF = 32
+"""Rows of what is factored column by column; of more, the halves are, and joined by products."""
 UNROLLED = 4
 """Rows up to which the loops over them are written out."""
 SWEEPS = 10
@@ -74,34 +71,10 @@ def _(primals, tangents):
 
 
 def _factored(A: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
-    """L and L⁻¹: products of matrices, and leaves."""
+    """L and L⁻¹ by halves: products of matrices, and leaves."""
     n = A.shape[0]
     if n <= LEAF:
         return _factored_by_columns(A)
-    return _factored_by_halves(A) if n > HALVED else _factored_by_blocks(A)
-
-
-def _factored_by_blocks(A: Float[Array, "n n"]) -> tuple[Array, Array]:
-    """L block column by block column from the left, and L⁻¹ block row by block row."""
-    n = A.shape[0]
-    pieces = -(-n // LEAF)
-    edges = [piece * n // pieces for piece in range(pieces + 1)]
-    columns, rows = [A[:, :0]], [A[:0]]
-    for start, end in pairwise(edges):
-        left = jnp.concatenate([column[start:] for column in columns], axis=1)
-        above = jnp.concatenate([row[:, :start] for row in rows])
-        panel = A[start:, start:end] - left @ left[: end - start].T
-        root, whitening = _factored_by_columns(panel[: end - start])
-        column = jnp.concatenate([root, panel[end - start :] @ whitening.T])
-        row = jnp.concatenate([-whitening @ (left[: end - start] @ above), whitening], axis=1)
-        columns.append(jnp.pad(column, ((start, 0), (0, 0))))
-        rows.append(jnp.pad(row, ((0, 0), (0, n - end))))
-    return jnp.concatenate(columns, axis=1), jnp.concatenate(rows)
-
-
-def _factored_by_halves(A: Float[Array, "n n"]) -> tuple[Array, Array]:
-    """L and L⁻¹ of one half, and of what it leaves of the other."""
-    n = A.shape[0]
     h = n // 2
     L, W = _factored(A[:h, :h])
     below = A[h:, :h] @ W.T
