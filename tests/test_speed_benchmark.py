@@ -18,14 +18,19 @@ from benchmarks.speed.sweep import growth, point
 from benchmarks.speed.workload import WORKLOADS, ours, prepared
 
 
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    """The program in C++, or why there is none."""
+    return build(tmp_path_factory.mktemp("eigen"))
+
+
 @pytest.mark.parametrize("name", ["A", "B"])
-def test_everybody_computes_the_same_filter(name, tmp_path):
+def test_everybody_computes_the_same_filter(name, library):
     work = dataclasses.replace(WORKLOADS[name].reduced(2, 3), landmarks=5)
     with jax.enable_x64(True):
         inputs = prepared(work)
         wanted = ours(inputs)()
         assert difference(by_loop(inputs)(), wanted) < AGREEMENT
-        library = build(tmp_path)
         if isinstance(library, str):
             pytest.skip(library)
         assert difference(by_hand(library, inputs)(), wanted) < AGREEMENT
