@@ -26,6 +26,7 @@ from jaxslam.consistency.montecarlo import check_sizes, draw, filter_run
 from jaxslam.consistency.statistics import chi2_cdf, chi2_quantile, normalised_squared
 from jaxslam.consistency.sums import added
 from jaxslam.names import scenario_pieces
+from jaxslam.native.build import compiler
 from jaxslam.plots.consistency import plot_consistency, plot_outside
 from jaxslam.plots.style import new_figure
 from jaxslam.simulation import Room, sensor_of, sightings
@@ -125,6 +126,29 @@ def test_a_batch_in_parts_that_fit_the_cache_is_the_same(monkeypatch):
         for key, values in records.items():
             np.testing.assert_allclose(parts[key], values, rtol=1e-6, atol=1e-12, err_msg=key)
     montecarlo.forget()
+
+
+@pytest.mark.parametrize("backend", ["xla", "native"])
+def test_of_the_last_chunk_only_what_is_wanted_is_computed(backend, monkeypatch):
+    """Three at a time by XLA, as soon as one of them is wanted; as many as are wanted natively."""
+    if backend == "native" and compiler() is None:
+        pytest.skip("no C++ compiler")
+    simulator = montecarlo._Simulator(SCENARIO, 0, "float64", 7, None, None)
+    room, batch = draw(SCENARIO, 7)
+    n = 6 + 3 * room.landmarks
+    monkeypatch.setattr(montecarlo, "CACHE", 3 * 8 * n**2)
+    assert montecarlo._at_once(room, batch) == 3
+    montecarlo.forget()
+    slam = filters()["inverse_scaling"]
+    compiled, data = montecarlo._Job("", slam, simulator, room, backend).program(batch)
+    (all_of_them, sample), (some, same) = (compiled(*data, batch, wanted) for wanted in (7, 2))
+    montecarlo.forget()
+    for key, values in all_of_them.items():
+        np.testing.assert_array_equal(some[key][:2], values[:2], err_msg=key)
+    jax.tree.map(np.testing.assert_array_equal, sample, same)
+    assert np.all(all_of_them["nees"] > 0)
+    assert len(some["nees"]) == {"xla": 7, "native": 2}[backend]
+    assert np.all(some["nees"][3:] == 0)
 
 
 def without(summary, *gone):

@@ -202,5 +202,4 @@ if __name__ == "__main__":
     # Before JAX starts its threads, which are as many as there are processors to use.
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     main()

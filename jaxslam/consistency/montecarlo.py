@@ -217,14 +217,15 @@ class _Job(NamedTuple):
             batch, _ = self.simulator(chunk)
             compiled, data = self.program(batch)
             where = f"{self.name}, runs {chunk.start} to {chunk.stop - 1}"
-            records, sample = jax.device_get(finished(compiled(*data, batch), where))
+            records, sample = jax.device_get(finished(compiled(*data, batch, len(chunk)), where))
         records = {key: np.asarray(value)[: len(chunk)] for key, value in records.items()}
         if keeps_records(chunk, self.reduced):
             return {**records, **{f"sample_{k}": v for k, v in sample.items()}}
         return as_sums(records, batch.poses.tangent_dim)
 
     def program(self, batch: Run) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        """And what it is called with before the batch; many threads that ask compile it once."""
+        """And what it is called with before the batch and the number of its runs that are wanted;
+        many threads that ask compile it once."""
         numbers, structure = eqx.partition(cast(self.slam, self.simulator.dtype), is_number)
         data = (numbers, self.simulator.sensor)
         shapes = _hashable(_shapes((*data, batch)))
@@ -290,7 +291,7 @@ def _compiled(leaves, structure, room: Room, shapes, of_data) -> jax.stages.Comp
     shapes: compiled once however often it is asked for."""
     static = jax.tree.unflatten(structure, leaves)
     function = jax.jit(partial(_filter_batch, static, room))
-    traced = function.trace(*jax.tree.unflatten(of_data, shapes))
+    traced = function.trace(*jax.tree.unflatten(of_data, shapes), 0)
     if calls := lapack_calls(traced.jaxpr.jaxpr):
         warnings.warn(
             f"{type(static).__name__} calls LAPACK in a batch ({', '.join(sorted(calls))}), "
@@ -318,8 +319,8 @@ def _native(leaves, structure, room: Room, shapes, of_data) -> Callable[..., Any
         warnings.warn(f"{error}; {type(static).__name__} is computed by XLA", stacklevel=2)
         return _compiled(leaves, structure, room, shapes, of_data)
 
-    def computed(numbers, sensor, runs):
-        records, samples = batch((numbers, sensor), runs)
+    def computed(numbers, sensor, runs, wanted):
+        records, samples = batch((numbers, sensor), jax.tree.map(lambda x: x[:wanted], runs))
         return records, {name: x[0] for name, x in samples.items()}
 
     return computed
@@ -338,8 +339,10 @@ def _filter_batch(
     numbers: AbstractFilter,
     sensor: AbstractSensor,
     runs: Run,
+    wanted: Int[Array, ""],
 ) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Records of a batch of runs, and the map and the path of its first run."""
+    """Records of a batch of runs, and the map and the path of its first run. Of the last chunk
+    only the first runs are `wanted`: where there are none of them in a part, it is not computed."""
     slam = eqx.combine(numbers, static)
 
     def part(runs):
@@ -353,9 +356,16 @@ def _filter_batch(
         return part(runs)
     size = math.ceil(count / parts)
     again = jnp.arange(parts * size) % count
-    records, samples = jax.lax.map(
-        part, jax.tree.map(lambda x: x[again].reshape(parts, size, *x.shape[1:]), runs)
-    )
+    in_parts = jax.tree.map(lambda x: x[again].reshape(parts, size, *x.shape[1:]), runs)
+    part = jax.jit(part)  # traced once
+    shapes = jax.eval_shape(part, jax.tree.map(lambda x: x[0], in_parts))
+
+    def part_if_wanted(given):
+        first, runs = given
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        return jax.lax.cond(first < wanted, part, lambda _: nothing, runs)
+
+    records, samples = jax.lax.map(part_if_wanted, (size * jnp.arange(parts), in_parts))
     records = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], records)
     return records, jax.tree.map(lambda x: x[0], samples)
 
