@@ -16,28 +16,37 @@ import os
 import pickle
 import platform
 import secrets
+import sys
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from types import FunctionType
+from types import BuiltinFunctionType, FunctionType
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
+from jax.extend.core import Jaxpr
 
 from jaxslam.files import write_atomically
 
-OPTIONS = {
-    # Libraries of kernels whose threads wait for one another: matrices here are too small.
-    "cpu": {"xla_cpu_experimental_ynn_fusion_type": "", "xla_cpu_use_fusion_emitters": False}
-}
+Options = Mapping[str, Mapping[str, Any]]
 """Of the compiler, by platform; done without where it does not know them."""
 
+# Without emitters of fusions it takes two thirds of the time, to programs that are as fast.
+BATCHED: Options = {"cpu": {"xla_cpu_use_fusion_emitters": False}}
+# Libraries of kernels whose threads wait for one another: matrices of one run are too small.
+ALONE: Options = {"cpu": {**BATCHED["cpu"], "xla_cpu_experimental_ynn_fusion_type": ""}}
+
+MOST = 32
+"""Structures of whose programs one keeps those that were used last."""
+PACKAGES = ("jax", "jaxlib", "equinox", "jaxlie", "lineax", "numpy", "optimistix")
+"""Whose versions are known: a program of anything else but these, Python's and this package's
+functions is not kept, as they may change without notice."""
 
 _kept_in: Path | None = None
 
@@ -60,18 +69,24 @@ def forget() -> None:
     """Free all programs that were made, as `jax.clear_caches` does JAX's: each holds some of the
     memory maps of which a process may have only so many."""
     for program in _all:
-        program._made.clear()
+        program.forget()
 
 
 class Program:
     """A pure function of pytrees, compiled once for each structure of its arguments.
 
     Arrays among their leaves (or `jax.ShapeDtypeStruct`, for `compile`) are data; everything else
-    is part of the program, and is to be hashable.
+    is part of the program, and is to be hashable. What is traced may be `seen`, with the
+    arguments, before it is compiled.
     """
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.function = function
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        options: Options = ALONE,
+        seen: Callable[[Jaxpr, tuple[Any, ...]], None] = lambda jaxpr, args: None,
+    ) -> None:
+        self.function, self.options, self.seen = function, options, seen
         self._made: dict[Any, Future[_Made]] = {}
         self._lock = threading.Lock()
         _all.add(self)
@@ -84,35 +99,61 @@ class Program:
         """Compile for such arguments, or wait for who does; what it returns, as shapes."""
         return self._compiled(_Call.of(args)).shapes
 
+    def forget(self) -> None:
+        """Free what was made."""
+        with self._lock:
+            self._made.clear()
+
     def _compiled(self, call: _Call) -> _Made:
         with self._lock:
-            future = self._made.get(call.key)
+            future = self._made.pop(call.key, None)
             if mine := future is None:
-                future = self._made[call.key] = Future()
+                future = Future()
+            self._made[call.key] = future  # the last
+            while len(self._made) > MOST:
+                del self._made[next(iter(self._made))]
         if mine:
             try:
                 future.set_result(self._make(call))
             except BaseException as error:
                 future.set_exception(error)
-                del self._made[call.key]
+                with self._lock:
+                    self._made.pop(call.key, None)
         return future.result()
 
     def _make(self, call: _Call) -> _Made:
         folder, name = _kept_in, _name(self.function)
         if folder is None:
-            return _compile(self.function, call, name)
+            return self._compile(call, name)
         try:
-            key = _Pickled.of((self.function, call.key, _surroundings()))
+            key = _Pickled.of((self.function, call.key, _surroundings(), self.options))
         except (pickle.PicklingError, AttributeError, TypeError):
-            return _compile(self.function, call, name)  # a function of one's own, without a name
+            return self._compile(call, name)  # of one's own
         path = folder / f"{name}-{hashlib.sha256(key.data).hexdigest()}.program"
         made = _read(path, key.functions)
         if made is None:
             # What JAX has read from its own cache cannot be written again: a name that it
             # has never seen is not there.
-            made = _compile(self.function, call, f"{name}_{secrets.token_hex(4)}")
+            made = self._compile(call, f"{name}_{secrets.token_hex(4)}")
             _keep(path, made)
         return made
+
+    def _compile(self, call: _Call, name: str) -> _Made:
+        structures = []
+
+        def flat(arrays):
+            leaves, structure = jax.tree.flatten(self.function(*call.arguments(arrays)))
+            structures.append(structure)
+            return leaves
+
+        flat.__name__ = name
+        shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in call.arrays]
+        traced = jax.jit(flat).trace(shapes)
+        self.seen(traced.jaxpr.jaxpr, call.arguments(shapes))
+        lowered = traced.lower()
+        after = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in lowered.out_info]
+        compiled = _with_options(lowered, self.options)
+        return _Made(compiled, jax.tree.unflatten(structures[-1], after))
 
 
 class _Call(NamedTuple):
@@ -160,25 +201,10 @@ class _Made(NamedTuple):
         return jax.tree.unflatten(jax.tree.structure(self.shapes), self.compiled(arrays))
 
 
-def _compile(function: Callable[..., Any], call: _Call, name: str) -> _Made:
-    structures = []
-
-    def flat(arrays):
-        leaves, structure = jax.tree.flatten(function(*call.arguments(arrays)))
-        structures.append(structure)
-        return leaves
-
-    flat.__name__ = name
-    shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in call.arrays]
-    lowered = jax.jit(flat).lower(shapes)
-    after = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in lowered.out_info]
-    return _Made(_with_options(lowered), jax.tree.unflatten(structures[-1], after))
-
-
-def _with_options(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
-    options = OPTIONS.get(jax.default_backend())
+def _with_options(lowered: jax.stages.Lowered, options: Options) -> jax.stages.Compiled:
+    own = options.get(jax.default_backend())
     with contextlib.suppress(RuntimeError):
-        return lowered.compile(compiler_options=options)
+        return lowered.compile(compiler_options=None if own is None else dict(own))
     return lowered.compile()
 
 
@@ -220,6 +246,8 @@ class _Pickler(pickle.Pickler):
         self.functions: dict[str, FunctionType] = {}
 
     def persistent_id(self, obj: Any) -> str | None:
+        if isinstance(obj, type | FunctionType | BuiltinFunctionType) and not _known(obj):
+            raise pickle.PicklingError(f"{obj.__qualname__} may change without notice")
         if not isinstance(obj, FunctionType):
             return None
         if obj.__closure__:
@@ -227,6 +255,11 @@ class _Pickler(pickle.Pickler):
         name = f"{obj.__module__}.{obj.__qualname__}:{obj.__code__.co_firstlineno}"
         self.functions[name] = obj
         return name
+
+
+def _known(obj: type | FunctionType | BuiltinFunctionType) -> bool:
+    package = (obj.__module__ or "builtins").partition(".")[0]
+    return package in ("jaxslam", *PACKAGES) or package in sys.stdlib_module_names
 
 
 class _Unpickler(pickle.Unpickler):
@@ -268,7 +301,7 @@ def _surroundings() -> tuple[Any, ...]:
     config = jax.config.values
     settings = sorted((name, str(x)) for name, x in config.items() if "cache" not in name)
     where = device.client.platform_version, device.device_kind, len(jax.devices())
-    return _sources(), *where, settings, os.environ.get("XLA_FLAGS"), OPTIONS
+    return _sources(), *where, settings, os.environ.get("XLA_FLAGS")
 
 
 @cache
@@ -277,7 +310,7 @@ def _sources() -> tuple[str, ...]:
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
-    versions = (version(name) for name in ("jax", "jaxlib", "equinox", "jaxlie", "numpy"))
+    versions = (version(name) for name in PACKAGES)
     return digest.hexdigest(), platform.python_version(), *versions, *processor()
 
 

@@ -140,8 +140,8 @@ def test_of_the_last_chunk_only_what_is_wanted_is_computed(backend, monkeypatch)
     assert montecarlo._at_once(room, batch) == 3
     montecarlo.forget()
     slam = filters()["inverse_scaling"]
-    compiled, data = montecarlo._Job("", slam, simulator, room, backend).program(batch)
-    (all_of_them, sample), (some, same) = (compiled(*data, batch, wanted) for wanted in (7, 2))
+    program = montecarlo._Job("", slam, simulator, room, backend).program(batch)
+    (all_of_them, sample), (some, same) = (program(np.int32(n)) for n in (7, 2))
     montecarlo.forget()
     for key, values in all_of_them.items():
         np.testing.assert_array_equal(some[key][:2], values[:2], err_msg=key)

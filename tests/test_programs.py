@@ -1,8 +1,10 @@
 """Programs are made once for each structure, kept whole, and taken back only where they fit."""
 
+import operator
 import threading
 import time
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +15,7 @@ from jaxslam.models.depth import InverseDepth
 from jaxslam.programs import Program, forget, in_background, keep_in, wide
 
 traced = []
+KNOWN = programs._known
 
 
 def scaled(depth, values, factor=2.0):
@@ -31,6 +34,7 @@ def none_traced_and_none_kept(monkeypatch):
     """Whatever commands have told before."""
     traced.clear()
     monkeypatch.setattr(programs, "_kept_in", None)
+    monkeypatch.setattr(programs, "_known", lambda obj: True)
 
 
 @pytest.fixture
@@ -186,13 +190,51 @@ def test_a_folder_that_cannot_be_written_is_done_without(tmp_path):
     check(Program(scaled))
 
 
-def test_options_that_the_compiler_does_not_know_are_done_without(monkeypatch):
-    monkeypatch.setitem(programs.OPTIONS, "cpu", {"xla_no_such_option": True})
+def test_options_that_the_compiler_does_not_know_are_done_without():
+    check(Program(scaled, {"cpu": {"xla_no_such_option": True}}))
+
+
+@pytest.mark.parametrize("options", [programs.ALONE, programs.BATCHED])
+def test_the_compiler_knows_the_options(options):
+    jax.jit(jnp.sin).lower(0.0).compile(compiler_options=options["cpu"])
+
+
+class Own(eqx.Module):
+    """A piece of one's own."""
+
+    factor: jax.Array
+
+    def __mul__(self, x):
+        return self.factor * x
+
+
+def test_what_may_change_without_notice_is_not_kept(folder, monkeypatch):
+    """Nobody tells when a function or a piece of one's own has become another."""
+    monkeypatch.setattr(programs, "_known", KNOWN)
     check(Program(scaled))
+    assert Program(operator.mul)(Own(jnp.ones(())), jnp.ones(())) == 1.0
+    assert not folder.exists()
+    assert Program(operator.mul)(jnp.ones(()), jnp.ones(())) == 1.0
+    assert len(list(folder.iterdir())) == 1
 
 
-def test_the_compiler_knows_the_options():
-    jax.jit(jnp.sin).lower(0.0).compile(compiler_options=programs.OPTIONS["cpu"])
+def test_what_is_traced_is_seen_with_the_arguments_before_it_is_compiled():
+    told = []
+    program = Program(scaled, seen=lambda jaxpr, args: told.append((len(jaxpr.eqns) > 0, args)))
+    check(program)
+    check(program)
+    ((has_equations, (depth, values)),) = told
+    assert has_equations
+    assert isinstance(depth, InverseDepth)
+    assert values.shape == (3,)
+
+
+def test_those_that_were_not_used_for_long_are_freed(monkeypatch):
+    monkeypatch.setattr(programs, "MOST", 2)
+    program = Program(scaled)
+    for size in (3, 4, 3, 5, 3, 4):  # 4 was freed for 5
+        check(program, size)
+    assert len(traced) == 4
 
 
 def test_what_is_forgotten_is_made_again():

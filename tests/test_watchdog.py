@@ -111,7 +111,10 @@ def test_no_study_of_a_filter_calls_lapack(name, scenario):
     ).values()
     numbers, structure = eqx.partition(slam, is_number)
     runs = jax.vmap(partial(simulate, chosen))(jax.random.split(jax.random.key(0), 2))
-    batch = partial(_filter_batch, structure, Room(4, 4, 4, 4))
+
+    def batch(numbers, *args):
+        return _filter_batch.function(eqx.combine(numbers, structure), Room(4, 4, 4, 4), *args)
+
     traced = jax.make_jaxpr(batch)(numbers, sensor_of(chosen), runs, 2)
     assert lapack_calls(traced.jaxpr) == set()
 

@@ -22,6 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Jaxpr
 from jaxtyping import Array, Int
 
 from jaxslam import native
@@ -36,6 +37,7 @@ from jaxslam.consistency.sums import as_sums, keeps_records
 from jaxslam.geometry import Pose
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.sensors import AbstractSensor
+from jaxslam.programs import BATCHED, Program
 from jaxslam.simulation import (
     Room,
     Run,
@@ -186,7 +188,7 @@ def _room_for(count: int) -> int:
     return max(1, count) if count <= 4 else 4 * math.ceil(count / 4)
 
 
-@eqx.filter_jit
+@partial(Program, options=BATCHED)
 def _draw(
     scenario: Scenario,
     own: tuple[AbstractMotion | Trajectory | None, AbstractSensor | None],
@@ -215,23 +217,27 @@ class _Job(NamedTuple):
     def __call__(self, chunk: range) -> Records:
         with jax.enable_x64(self.simulator.dtype == "float64"):  # a thread's own
             batch, _ = self.simulator(chunk)
-            compiled, data = self.program(batch)
             where = f"{self.name}, runs {chunk.start} to {chunk.stop - 1}"
-            records, sample = jax.device_get(finished(compiled(*data, batch, len(chunk)), where))
+            found = self.program(batch)(np.int32(len(chunk)))
+            records, sample = jax.device_get(finished(found, where))
         records = {key: np.asarray(value)[: len(chunk)] for key, value in records.items()}
         if keeps_records(chunk, self.reduced):
             return {**records, **{f"sample_{k}": v for k, v in sample.items()}}
         return as_sums(records, batch.poses.tangent_dim)
 
-    def program(self, batch: Run) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        """And what it is called with before the batch and the number of its runs that are wanted;
-        many threads that ask compile it once."""
-        numbers, structure = eqx.partition(cast(self.slam, self.simulator.dtype), is_number)
-        data = (numbers, self.simulator.sensor)
-        shapes = _hashable(_shapes((*data, batch)))
-        made = {"xla": _compiled, "native": _native}[self.backend]
-        with _COMPILING:
-            return made(*_hashable(structure), self.room, *shapes), data
+    def program(self, batch: Run) -> Callable[[Any], Any]:
+        """Compiled, by the first thread that asks: of the number of runs that are wanted of the
+        batch."""
+        slam, sensor = cast(self.slam, self.simulator.dtype), self.simulator.sensor
+        if self.backend == "native":
+            numbers, structure = eqx.partition(slam, is_number)
+            shapes = _hashable(_shapes((numbers, sensor, batch)))
+            with _COMPILING:
+                program = _native(*_hashable(structure), self.room, *shapes)
+            if program is not None:
+                return partial(program, numbers, sensor, batch)
+        _filter_batch.compile(slam, self.room, sensor, batch, np.int32(0))
+        return partial(_filter_batch, slam, self.room, sensor, batch)
 
 
 _COMPILING = threading.Lock()
@@ -286,24 +292,9 @@ def _hashable(tree: Any) -> tuple[tuple[Any, ...], Any]:
 
 
 @lru_cache(maxsize=32)
-def _compiled(leaves, structure, room: Room, shapes, of_data) -> jax.stages.Compiled:
-    """`_filter_batch` for a filter of this structure, whatever its numbers, and data of these
-    shapes: compiled once however often it is asked for."""
-    static = jax.tree.unflatten(structure, leaves)
-    function = jax.jit(partial(_filter_batch, static, room))
-    traced = function.trace(*jax.tree.unflatten(of_data, shapes), 0)
-    if calls := lapack_calls(traced.jaxpr.jaxpr):
-        warnings.warn(
-            f"{type(static).__name__} calls LAPACK in a batch ({', '.join(sorted(calls))}), "
-            "which can stand still on few processors: jaxslam.linalg has what does not",
-            stacklevel=2,
-        )
-    return traced.lower().compile()
-
-
-@lru_cache(maxsize=32)
-def _native(leaves, structure, room: Room, shapes, of_data) -> Callable[..., Any]:
-    """The same of `_compiled` by the native backend; XLA's, with a warning, where it cannot."""
+def _native(leaves, structure, room: Room, shapes, of_data) -> Callable[..., Any] | None:
+    """What computes as `_filter_batch` does, for a filter of this structure, whatever its numbers,
+    and data of these shapes; None, with a warning, where the native backend cannot."""
     static = jax.tree.unflatten(structure, leaves)
     numbers, sensor, runs = jax.tree.unflatten(of_data, shapes)
 
@@ -317,7 +308,7 @@ def _native(leaves, structure, room: Room, shapes, of_data) -> Callable[..., Any
         batch = native.batched(one, (numbers, sensor), runs)
     except ValueError as error:
         warnings.warn(f"{error}; {type(static).__name__} is computed by XLA", stacklevel=2)
-        return _compiled(leaves, structure, room, shapes, of_data)
+        return None
 
     def computed(numbers, sensor, runs, wanted):
         records, samples = batch((numbers, sensor), jax.tree.map(lambda x: x[:wanted], runs))
@@ -328,22 +319,31 @@ def _native(leaves, structure, room: Room, shapes, of_data) -> Callable[..., Any
 
 def forget() -> None:
     """Free the programs of all filters, each of which holds some of the memory maps of which a
-    process may have only so many; as `jaxslam.programs.forget` does the tracker's."""
-    _compiled.cache_clear()
+    process may have only so many."""
+    for program in (_draw, _filter_batch):
+        program.forget()
     _native.cache_clear()
 
 
+def _warn_of_lapack(jaxpr: Jaxpr, args: tuple[Any, ...]) -> None:
+    if calls := lapack_calls(jaxpr):
+        warnings.warn(
+            f"{type(args[0]).__name__} calls LAPACK in a batch ({', '.join(sorted(calls))}), "
+            "which can stand still on few processors: jaxslam.linalg has what does not",
+            stacklevel=2,
+        )
+
+
+@partial(Program, options=BATCHED, seen=_warn_of_lapack)
 def _filter_batch(
-    static: AbstractFilter,
+    slam: AbstractFilter,
     room: Room,
-    numbers: AbstractFilter,
     sensor: AbstractSensor,
     runs: Run,
     wanted: Int[Array, ""],
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     """Records of a batch of runs, and the map and the path of its first run. Of the last chunk
     only the first runs are `wanted`: where there are none of them in a part, it is not computed."""
-    slam = eqx.combine(numbers, static)
 
     def part(runs):
         records, path, state = jax.vmap(partial(filter_run, slam, room, sensor))(runs)
@@ -357,13 +357,13 @@ def _filter_batch(
     size = math.ceil(count / parts)
     again = jnp.arange(parts * size) % count
     in_parts = jax.tree.map(lambda x: x[again].reshape(parts, size, *x.shape[1:]), runs)
-    part = jax.jit(part)  # traced once
-    shapes = jax.eval_shape(part, jax.tree.map(lambda x: x[0], in_parts))
+    traced_once = jax.jit(part)
+    shapes = jax.eval_shape(traced_once, jax.tree.map(lambda x: x[0], in_parts))
 
     def part_if_wanted(given):
         first, runs = given
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        return jax.lax.cond(first < wanted, part, lambda _: nothing, runs)
+        return jax.lax.cond(first < wanted, traced_once, lambda _: nothing, runs)
 
     records, samples = jax.lax.map(part_if_wanted, (size * jnp.arange(parts), in_parts))
     records = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], records)
