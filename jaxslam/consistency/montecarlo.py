@@ -362,7 +362,7 @@ def _filter_batch(
 
     def part_if_wanted(given):
         first, runs = given
-        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        nothing = jax.tree.map(jnp.zeros_like, shapes)
         return jax.lax.cond(first < wanted, traced_once, lambda _: nothing, runs)
 
     records, samples = jax.lax.map(part_if_wanted, (size * jnp.arange(parts), in_parts))
