@@ -13,6 +13,7 @@ from jaxslam.consistency.beyond_scale import (
     NOTICEABLE,
     SCALES,
     beyond_scale,
+    one_scale,
     reversal,
 )
 from jaxslam.consistency.montecarlo import filter_run
@@ -182,3 +183,80 @@ def test_of_a_filter_it_is_the_least_nees_over_all_scales(name):
     np.testing.assert_allclose(curvature, 2 / records["log_scale_sigma"][-1] ** 2, rtol=0.02)
     t_est, t_true = (p.translation()[-1] for p in (path, run.poses))
     assert records["reversed"][-1] == float(t_est @ t_true < 0)
+
+
+def constructed(steps, drift, *, common=0.0, runs=60, sigma=0.01, seed=0):
+    """Per-pose scales that ramp by `drift` with independent and common errors; NEES, scale, σ."""
+    rng = np.random.default_rng(seed)
+    ramp = 1 + drift * np.linspace(0, 1, steps)
+    away = np.sqrt(1 - common**2) * rng.normal(size=(runs, steps))
+    away += common * rng.normal(size=(runs, 1))
+    s = 3.0 * ramp * (1 + sigma * away)
+    return rng.chisquare(5, (runs, steps)), np.log(s), np.full((runs, steps), sigma)
+
+
+def test_one_scale_is_the_least_sum_over_the_run():
+    geometry, K = PLANAR, 7
+    truths = [pose(geometry, seed) for seed in range(K)]
+    A = jnp.asarray(np.random.default_rng(1).normal(size=(3, 2)))
+    noises = 0.05 * np.random.default_rng(2).normal(size=(K, 3))
+    P = covariance(3)
+    errors = [
+        lambda T, truth=truth, noise=noise: (
+            A @ (T.translation() - 1.1 * truth.translation()) + noise,
+            P,
+        )
+        for truth, noise in zip(truths, noises, strict=True)
+    ]
+    each = [beyond_scale(error, truth) for error, truth in zip(errors, truths, strict=True)]
+    found = one_scale(*(np.array(x) for x in zip(*each, strict=True)))
+
+    def at(s):
+        scale = jnp.asarray(s)
+        pairs = zip(errors, truths, strict=True)
+        return np.array([normalised_squared(error(scaled(T, scale))[0], P) for error, T in pairs])
+
+    best = float(np.exp(found.log_scale))
+    np.testing.assert_allclose(found.nees, at(best), rtol=1e-8)
+    assert at(best).sum() < min(at(0.999 * best).sum(), at(1.001 * best).sum())
+    np.testing.assert_allclose(found.nees, each_nees(each) + found.normalised, rtol=1e-12)
+
+
+def each_nees(each):
+    return np.array([float(best.nees) for best in each])
+
+
+def test_of_independent_poses_one_degree_of_freedom_goes_once_and_not_once_a_pose():
+    runs, steps = 400, 20
+    found = one_scale(*constructed(steps, 0.0, runs=runs, sigma=1e-4))
+    low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], runs * (6 * steps - 1))
+    assert low < found.nees.sum() < high
+    assert found.nees.sum() > stats.chi2.ppf(1 - FALSE_ALARM, runs * 5 * steps)
+
+
+def test_an_error_of_scale_that_the_whole_run_has_in_common_is_the_gauge():
+    nees, log_scale, sigma = constructed(20, 0.0, common=1.0, sigma=0.3)
+    found = one_scale(nees, log_scale, sigma)
+    np.testing.assert_allclose(found.nees, nees, rtol=1e-9)
+    np.testing.assert_allclose(found.drift, 0.0, atol=1e-12)
+
+
+def test_a_scale_that_drifts_is_not_forgiven():
+    nees, log_scale, sigma = constructed(200, 3.0)
+    found = one_scale(nees, log_scale, sigma)
+    assert found.nees.mean() > 100
+    np.testing.assert_allclose(np.ptp(found.drift, axis=1), np.log(4), rtol=0.1)
+
+
+def test_poses_before_the_unit_is_fixed_keep_a_scale_of_their_own():
+    nees, log_scale, sigma = constructed(20, 0.0)
+    log_scale[:, :5] += 2.0
+    fixed = np.arange(20) >= 5
+    found = one_scale(nees, log_scale, sigma, np.broadcast_to(fixed, nees.shape))
+    np.testing.assert_array_equal(found.nees[:, :5], nees[:, :5])
+    assert np.isnan(found.drift[:, :5]).all()
+    later = one_scale(nees[:, 5:], log_scale[:, 5:], sigma[:, 5:])
+    np.testing.assert_allclose(found.nees[:, 5:], later.nees)
+    nothing = one_scale(nees, log_scale, sigma, np.zeros_like(nees, bool))
+    np.testing.assert_array_equal(nothing.nees, nees)
+    assert np.isnan(nothing.log_scale).all()

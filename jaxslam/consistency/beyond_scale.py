@@ -1,7 +1,9 @@
-"""What of a pose's error is not one of scale, which pictures alone do not tell.
+"""What of the poses' errors is not one of scale, which pictures alone do not tell.
 
-The truth of another scale, `T(s) = (R, s t)`, explains them as well as the true one, s = 1. The
-error against it that is the smallest in the filter's own metric is its error *beyond scale*.
+The truth of another scale, `T(s) = (R, s t)`, explains them as well as the true one, s = 1, but only
+one scale for all poses of a map does: it is the gauge (Zhang, Gallego, Scaramuzza, RA-L 2018). The
+ratio of the scales of two poses is told by the pixels, and where it changes, the scale drifts.
+`beyond_scale` is of one pose alone; `one_scale` makes of all poses of a run the NEES at one scale.
 """
 
 from __future__ import annotations
@@ -11,7 +13,8 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from jaxslam.arrays import AnyArray
 from jaxslam.geometry import Pose, Scalar, retract, scaled, zero_tangent
@@ -76,6 +79,52 @@ def beyond_scale(
         s = jnp.clip(s - step, *SCALES).astype(one.dtype)
     e, slope = whitened(s)
     return BeyondScale(e @ e, jnp.log(s), 1 / (s * jnp.sqrt(slope @ slope)))
+
+
+class OneScale(NamedTuple):
+    """Of runs at one scale each; with a fixed unit throughout, K poses of a run have K t − 1 degrees
+    of freedom together."""
+
+    nees: Float[np.ndarray, "*runs steps"]
+    """`e(ŝ)ᵀ P⁻¹ e(ŝ)`: t degrees of freedom a pose, less at most one where the errors of scale are
+    common to the run, as the fit then takes out more than the one degree of freedom of its own."""
+    log_scale: Float[np.ndarray, "*runs"]
+    """log ŝ of the run: NaN where no pose tells it."""
+    drift: Float[np.ndarray, "*runs steps"]
+    """`log ŝ_k − log ŝ`: how far the scale of a pose is from that of its run; NaN before the unit is
+    fixed."""
+    normalised: Float[np.ndarray, "*runs steps"]
+    """The square of the drift in its claimed σ, the last term of `nees`: at most one degree of
+    freedom."""
+
+
+def one_scale(
+    nees: Float[np.ndarray, "*runs steps"],
+    log_scale: Float[np.ndarray, "*runs steps"],
+    sigma: Float[np.ndarray, "*runs steps"],
+    fixed: Bool[np.ndarray, "*runs steps"] | None = None,
+) -> OneScale:
+    """NEES at the one scale of a run that explains all of its poses best, of a `BeyondScale` each.
+
+    An error that is affine in s has `NEES_k(s) = NEES_k(ŝ_k) + w_k (s − ŝ_k)²`, with
+    `w = gᵀ P⁻¹ g` and g = de/ds, so that `ŝ = Σ w_k ŝ_k / Σ w_k` minimises the sum. A pose whose unit
+    is not `fixed` yet, while a start is still being found out, is of a unit of its own: it keeps its
+    own scale, and has no part in the run's.
+    """
+    own, s = np.asarray(nees, np.float64), np.exp(np.asarray(log_scale, np.float64))
+    there = np.isfinite(own) & np.isfinite(s) & (True if fixed is None else np.asarray(fixed))
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        w = np.where(there, 1 / (s * np.asarray(sigma, np.float64)) ** 2, 0.0)
+        best = np.sum(w * np.where(there, s, 0.0), axis=-1) / np.sum(w, axis=-1)
+        away = w * (s - best[..., None]) ** 2
+        drift = np.where(there, np.log(s) - np.log(best)[..., None], np.nan)
+        told = w > 0
+    return OneScale(
+        own + np.where(told, away, 0.0),
+        np.log(best),
+        np.where(there & told, drift, np.nan),
+        np.where(there & told, away, np.nan),
+    )
 
 
 def reversal(estimate: Pose, truth: Pose) -> Scalar:
