@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxslam.consistency import Tally, lost_threshold, run_verdict
+from jaxslam.consistency import Tally, lost_threshold, not_disproved, run_verdict
 from jaxslam.consistency.statistics import (
     PowerSums,
     chernoff_p_value,
@@ -175,6 +175,50 @@ def test_a_study_of_lost_runs_only_has_a_verdict(value):
     assert verdict["word"] == ("lost" if np.isnan(value) else "over-confident")
     assert verdict["never_lost"]["runs"] == 0
     assert sentences(verdict)[-1] == "4 of 4 runs were lost, all of them"
+
+
+# --- degrees of freedom that a fit may have taken -------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mean", "word", "factor"),
+    [
+        (6 * 1.2, "over-confident", np.sqrt(1.2)),
+        (5.5, "consistent", 1.0),
+        (5 / 1.2, "under-confident", np.sqrt(1 / 1.2)),
+    ],
+)
+def test_anything_between_all_and_what_a_fit_leaves_is_right(mean, word, factor):
+    nees = np.random.default_rng(10).chisquare(6, (2000, 4))
+    nees *= mean / nees.mean()
+    found = run_verdict(nees, 6, fitted=1.0)
+    assert (found["word"], found["sigma_factor"]) == (word, pytest.approx(factor))
+    low, high = mean_interval(PowerSums.of(nees.mean(axis=1)), 0.99)
+    assert found["interval99"] == pytest.approx([np.sqrt(low / 6), np.sqrt(high / 5)])
+    assert not_disproved(found) is (word == "consistent")
+
+
+@pytest.mark.parametrize("runs", [1, 300])
+def test_where_all_may_be_fitted_only_over_confidence_can_be_proven(runs):
+    nees = np.random.default_rng(11).chisquare(1, (runs, 4))
+    for factor in (0.0, 1e-6, 1.0):
+        found = run_verdict(factor * nees, 1, fitted=1)
+        assert not_disproved(found)
+        assert found["interval99"][1] is None
+        json.dumps(found, allow_nan=False)
+    assert run_verdict(40 * nees, 1, fitted=1)["word"] == "over-confident"
+
+
+def test_tallies_with_a_fit_add_up_and_no_others_are_of_one_study():
+    nees = np.random.default_rng(12).chisquare(3, (20, 4))
+    one, other = Tally.of(nees[:5], 3, 0.5), Tally.of(nees[5:], 3, 0.5)
+    assert Tally.from_dict(json.loads(json.dumps(one.asdict()))) == one
+    assert Tally.of_numbers(one.numbers() + other.numbers(), 3, 0.5) == one + other
+    with pytest.raises(ValueError, match=r"with 0\.5 and 0\.0 dof fitted"):
+        one + Tally.of(nees, 3)
+    for fitted in (-0.1, 3.1, np.nan):
+        with pytest.raises(ValueError, match="fitted must be from 0 to the 3 degrees of freedom"):
+            run_verdict(nees, 3, fitted)
 
 
 # --- what it is made of -------------------------------------------------------------------------

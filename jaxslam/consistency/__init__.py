@@ -11,7 +11,14 @@ from jaxslam.consistency.statistics import (
 )
 from jaxslam.consistency.store import FolderStore, MemoryStore
 from jaxslam.consistency.summary import Study, summarise, table, tally, treatment
-from jaxslam.consistency.verdict import VERDICTS, Tally, run_verdict, sentences, verdict
+from jaxslam.consistency.verdict import (
+    VERDICTS,
+    Tally,
+    not_disproved,
+    run_verdict,
+    sentences,
+    verdict,
+)
 
 __all__ = [
     "BACKENDS",
@@ -28,6 +35,7 @@ __all__ = [
     "mean_band",
     "monte_carlo",
     "normalised_squared",
+    "not_disproved",
     "run_verdict",
     "sentences",
     "summarise",

@@ -53,10 +53,20 @@ class Tally:
     """NEES at the last step of the runs that did not diverge."""
     never_lost: PowerSums
     """Time averages of the runs never lost."""
+    fitted: float = 0.0
+    """Of every NEES between 0 and so many degrees of freedom were taken by a fit to the run."""
 
     @staticmethod
-    def of(nees: Float[np.ndarray, "runs steps"], dof: int) -> Tally:
-        """Of the NEES of runs, with so many degrees of freedom."""
+    def of(nees: Float[np.ndarray, "runs steps"], dof: int, fitted: float = 0.0) -> Tally:
+        """Of the NEES of runs, with so many degrees of freedom.
+
+        What one fit to a whole run takes from each of its NEES depends on how its errors are
+        correlated: of an unknown scale of K poses between 1/K and 1. With `fitted` the filter is
+        right where the mean is anywhere between `dof - fitted` and `dof`. Raises ValueError
+        unless `fitted` is from 0 to `dof`.
+        """
+        if not 0 <= fitted <= dof:
+            raise ValueError(f"fitted must be from 0 to the {dof} degrees of freedom, not {fitted}")
         nees = np.asarray(nees, np.float64)
         healthy = np.isfinite(nees).all(axis=1)
         good = nees[healthy]
@@ -69,6 +79,7 @@ class Tally:
             PowerSums.of(average),
             PowerSums.of(good[:, -1]),
             PowerSums.of(average[kept]),
+            float(fitted),
         )
 
     @staticmethod
@@ -76,14 +87,14 @@ class Tally:
         """Of what `asdict` made of it."""
         counts = (numbers[name] for name in ("dof", "runs", "diverged", "lost"))
         sums = (PowerSums(**numbers[name]) for name in ("average", "end", "never_lost"))
-        return Tally(*counts, *sums)
+        return Tally(*counts, *sums, numbers.get("fitted", 0.0))
 
     @staticmethod
-    def of_numbers(numbers: Float[np.ndarray, " 15"], dof: int) -> Tally:
+    def of_numbers(numbers: Float[np.ndarray, " 15"], dof: int, fitted: float = 0.0) -> Tally:
         """Of what `numbers` made of one tally, or of a sum of such."""
         runs, diverged, lost = (int(x) for x in numbers[:3])
         sums = (PowerSums(int(n), *map(float, rest)) for n, *rest in numbers[3:].reshape(3, 4))
-        return Tally(dof, runs, diverged, lost, *sums)
+        return Tally(dof, runs, diverged, lost, *sums, fitted)
 
     def numbers(self) -> Float[np.ndarray, " 15"]:
         """All that adds up, for `of_numbers`."""
@@ -97,8 +108,13 @@ class Tally:
     def __add__(self, other: Tally) -> Tally:
         if self.dof != other.dof:
             raise ValueError(f"runs of {self.dof} and of {other.dof} dof are not one study")
+        if self.fitted != other.fitted:
+            raise ValueError(
+                f"runs with {self.fitted} and {other.fitted} dof fitted are not one study"
+            )
         names = ("runs", "diverged", "lost", "average", "end", "never_lost")
-        return Tally(self.dof, *(getattr(self, name) + getattr(other, name) for name in names))
+        sums = (getattr(self, name) + getattr(other, name) for name in names)
+        return Tally(self.dof, *sums, self.fitted)
 
     def verdict(self) -> dict[str, Any]:
         """The key `verdict` of `consistency.json`.
@@ -110,49 +126,67 @@ class Tally:
         `end` is the same at the last step, where p is exact. With a diverged run no mean exists
         and the word is lost. `never_lost` is the verdict on the runs never lost: robust, and low
         by construction, by .1–.4 % of NEES for a consistent filter over 60 steps.
+
+        With `fitted` a NEES above dof is compared with dof, one below dof − fitted with that, and
+        one between them is right: its σ factor is 1, and the interval is from √(low/dof) to
+        √(high/(dof − fitted)), without an upper end where all may be fitted.
         """
-        never_lost = self.never_lost
+        never_lost, right = self.never_lost, (self.dof - self.fitted, self.dof)
         return {
-            **_judged(self.average, self.dof, _of_averages, self.diverged),
+            **_judged(self.average, right, _of_averages, self.diverged),
             "runs": self.runs,
             "lost": self.lost / self.runs,
             "diverged": self.diverged,
-            "end": _judged(self.end, self.dof, _at_one_step, self.diverged),
+            "end": _judged(self.end, right, _at_one_step, self.diverged),
             "never_lost": {
-                **_judged(never_lost, self.dof, _of_averages),
+                **_judged(never_lost, right, _of_averages),
                 "runs": never_lost.count,
             },
         }
 
 
 def _judged(
-    sums: PowerSums, dof: int, p_value: Callable[[PowerSums, int], float], diverged: int = 0
+    sums: PowerSums,
+    right: tuple[float, float],
+    p_value: Callable[[PowerSums, float], float],
+    diverged: int = 0,
 ) -> dict[str, Any]:
-    factor = _factor(sums, dof, diverged)
+    """Of a mean, that of a right filter being anywhere from the one bound to the other."""
+    factor = _factor(sums, right, diverged)
     if diverged or not sums.count:
         return {**factor, "p": 0.0, "word": "lost"}
-    p = p_value(sums, dof)
-    return {**factor, "p": p, "word": _word(p, sums.mean > dof)}
+    nearest = _nearest(sums.mean, right)
+    p = 1.0 if sums.mean == nearest else p_value(sums, nearest)
+    return {**factor, "p": p, "word": _word(p, sums.mean > nearest)}
 
 
-def _of_averages(sums: PowerSums, dof: int) -> float:
-    bounds = mean_p_value(sums, dof), chernoff_p_value(sums.mean, dof, sums.count)
+def _nearest(mean: float, right: tuple[float, float]) -> float:
+    return min(max(mean, right[0]), right[1])
+
+
+def _of_averages(sums: PowerSums, expected: float) -> float:
+    bounds = mean_p_value(sums, expected), chernoff_p_value(sums.mean, expected, sums.count)
     return float(np.nanmin(bounds))
 
 
-def _at_one_step(sums: PowerSums, dof: int) -> float:
-    return chi2_p_value(sums.mean, dof, sums.count)
+def _at_one_step(sums: PowerSums, expected: float) -> float:
+    return chi2_p_value(sums.mean, expected, sums.count)
 
 
-def _factor(sums: PowerSums, dof: int, diverged: int) -> dict[str, Any]:
+def _factor(sums: PowerSums, right: tuple[float, float], diverged: int) -> dict[str, Any]:
     if diverged or not sums.count:
         return {"nees": None, "sigma_factor": None, "interval99": [None, None]}
-    low_high = mean_interval(sums, VERDICT_CONFIDENCE)
+    nearest, (low, high) = _nearest(sums.mean, right), mean_interval(sums, VERDICT_CONFIDENCE)
     return {
         "nees": sums.mean,
-        "sigma_factor": math.sqrt(sums.mean / dof),
-        "interval99": [math.sqrt(m / dof) if math.isfinite(m) else None for m in low_high],
+        "sigma_factor": 1.0 if sums.mean == nearest else math.sqrt(sums.mean / nearest),
+        "interval99": [_root(low, right[1]), _root(high, right[0])],
     }
+
+
+def _root(mean: float, expected: float) -> float | None:
+    """None where the mean is not known, and where none is too small."""
+    return math.sqrt(mean / expected) if expected and math.isfinite(mean) else None
 
 
 def _word(p: float, above: bool) -> str:
@@ -161,15 +195,23 @@ def _word(p: float, above: bool) -> str:
     return "over-confident" if above else "under-confident"
 
 
-def run_verdict(nees: Float[np.ndarray, "runs steps"], dof: int) -> dict[str, Any]:
-    """The verdict on one study from the NEES of its independent runs, see `Tally.verdict`.
+def run_verdict(
+    nees: Float[np.ndarray, "runs steps"], dof: int, fitted: float = 0.0
+) -> dict[str, Any]:
+    """The verdict on one study from the NEES of its independent runs, see `Tally.verdict`; what is
+    `fitted`, see `Tally.of`.
 
     Raises ValueError unless there are runs, steps and degrees of freedom.
     """
     nees = np.asarray(nees)
     if nees.ndim != 2 or not nees.size or dof < 1:
         raise ValueError(f"NEES must be (runs, steps) with dof ≥ 1, not {nees.shape} and {dof}")
-    return Tally.of(nees, dof).verdict()
+    return Tally.of(nees, dof, fitted).verdict()
+
+
+def not_disproved(found: dict[str, Any]) -> bool:
+    """Whether a verdict lets a filter be consistent, be that shown or not."""
+    return found["word"] in ("consistent", "cannot tell")
 
 
 def sentences(found: dict[str, Any]) -> list[str]:
