@@ -298,3 +298,47 @@ def test_runs_beyond_all_measure_have_a_verdict(size):
     nees = size * np.random.default_rng(0).chisquare(3, (20, 4))
     word = Tally.of(nees, 3).verdict()["word"]
     assert word in ({"under-confident"} if size < 1 else {"over-confident", "lost"})
+
+
+# --- runs that are not equally long -------------------------------------------------------------
+
+
+def test_every_run_is_averaged_over_the_steps_that_it_has():
+    nees = series(np.random.default_rng(7), 40)
+    logged = np.ones(nees.shape, bool)
+    logged[0, 5:], logged[1, :7], logged[2, 3:9] = False, False, False
+    broken = np.where(logged, nees, np.nan)
+    found = run_verdict(broken, 3, logged=logged)
+    averages = [row[there].mean() for row, there in zip(nees, logged, strict=True)]
+    assert found["nees"] == pytest.approx(np.mean(averages), rel=1e-12)
+    assert found["diverged"] == 0
+    ends = np.append(nees[0, 4], nees[1:, -1])
+    assert found["end"]["nees"] == pytest.approx(ends.mean(), rel=1e-12)
+    assert run_verdict(nees, 3, logged=np.ones(nees.shape, bool)) == run_verdict(nees, 3)
+
+
+def test_a_nees_that_is_logged_and_not_finite_is_of_a_run_that_diverged():
+    nees = series(np.random.default_rng(8), 40)
+    logged = np.ones(nees.shape, bool)
+    logged[0, 5:] = False
+    nees[0, 5:], nees[0, 2] = np.nan, np.inf
+    assert run_verdict(nees, 3, logged=logged)["diverged"] == 1
+    assert run_verdict(nees, 3)["diverged"] == 1
+    nees[0, 2], nees[0, 3] = 1.0, 1e6
+    assert run_verdict(nees, 3, logged=logged)["lost"] == 1 / 40
+
+
+def test_a_run_without_a_step_is_refused():
+    logged = np.ones((4, 5), bool)
+    logged[2] = False
+    with pytest.raises(ValueError, match="with a step of every run"):
+        run_verdict(np.ones((4, 5)), 3, logged=logged)
+
+
+def test_runs_of_unlike_length_keep_the_rate_of_false_alarms():
+    """Of 600 studies of 30 runs, cut anywhere: 6 expected, 19 or more once in 10 000."""
+    rng, words = np.random.default_rng(9), []
+    for nees in studies(600, 30, seed=10, steps=12):
+        logged = np.arange(12) < rng.integers(1, 13, size=(30, 1))
+        words.append(run_verdict(nees, 3, logged=logged)["word"])
+    assert sum(word.endswith("confident") for word in words) < 19

@@ -12,7 +12,7 @@ from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxslam.consistency.statistics import (
     CONFIDENCE,
@@ -57,27 +57,38 @@ class Tally:
     """Of every NEES between 0 and so many degrees of freedom were taken by a fit to the run."""
 
     @staticmethod
-    def of(nees: Float[np.ndarray, "runs steps"], dof: int, fitted: float = 0.0) -> Tally:
+    def of(
+        nees: Float[np.ndarray, "runs steps"],
+        dof: int,
+        fitted: float = 0.0,
+        logged: Bool[np.ndarray, "runs steps"] | None = None,
+    ) -> Tally:
         """Of the NEES of runs, with so many degrees of freedom.
+
+        Where runs are not equally long, or have gaps, `logged` says which steps of each are there:
+        its average is over those, and its end is the last of them.
 
         What one fit to a whole run takes from each of its NEES depends on how its errors are
         correlated: of an unknown scale of K poses between 1/K and 1. With `fitted` the filter is
         right where the mean is anywhere between `dof - fitted` and `dof`. Raises ValueError
-        unless `fitted` is from 0 to `dof`.
+        unless `fitted` is from 0 to `dof`, and every run has a step.
         """
         if not 0 <= fitted <= dof:
             raise ValueError(f"fitted must be from 0 to the {dof} degrees of freedom, not {fitted}")
         nees = np.asarray(nees, np.float64)
-        healthy = np.isfinite(nees).all(axis=1)
-        good = nees[healthy]
-        average, kept = good.mean(axis=1), (good <= lost_threshold(dof)).all(axis=1)
+        there = _logged(nees, logged)
+        healthy = (np.isfinite(nees) | ~there).all(axis=1)
+        good, there = nees[healthy], there[healthy]
+        average = good.mean(axis=1, where=True if there.all() else there)
+        kept = ((good <= lost_threshold(dof)) | ~there).all(axis=1)
+        last = there.shape[1] - 1 - np.argmax(there[:, ::-1], axis=1)
         return Tally(
             dof,
             len(nees),
             int(np.sum(~healthy)),
             int(len(nees) - np.sum(kept)),
             PowerSums.of(average),
-            PowerSums.of(good[:, -1]),
+            PowerSums.of(good[range(len(good)), last]),
             PowerSums.of(average[kept]),
             float(fitted),
         )
@@ -145,6 +156,16 @@ class Tally:
         }
 
 
+def _logged(
+    nees: Float[np.ndarray, "runs steps"], logged: Bool[np.ndarray, "runs steps"] | None
+) -> Bool[np.ndarray, "runs steps"]:
+    """Which steps are there. Raises ValueError unless every run has one."""
+    there = np.ones(nees.shape, bool) if logged is None else np.asarray(logged, bool)
+    if there.shape != nees.shape or not there.any(axis=1).all():
+        raise ValueError(f"logged must be {nees.shape}, with a step of every run")
+    return there
+
+
 def _judged(
     sums: PowerSums,
     right: tuple[float, float],
@@ -196,17 +217,20 @@ def _word(p: float, above: bool) -> str:
 
 
 def run_verdict(
-    nees: Float[np.ndarray, "runs steps"], dof: int, fitted: float = 0.0
+    nees: Float[np.ndarray, "runs steps"],
+    dof: int,
+    fitted: float = 0.0,
+    logged: Bool[np.ndarray, "runs steps"] | None = None,
 ) -> dict[str, Any]:
     """The verdict on one study from the NEES of its independent runs, see `Tally.verdict`; what is
-    `fitted`, see `Tally.of`.
+    `fitted` and `logged`, see `Tally.of`.
 
     Raises ValueError unless there are runs, steps and degrees of freedom.
     """
     nees = np.asarray(nees)
     if nees.ndim != 2 or not nees.size or dof < 1:
         raise ValueError(f"NEES must be (runs, steps) with dof ≥ 1, not {nees.shape} and {dof}")
-    return Tally.of(nees, dof, fitted).verdict()
+    return Tally.of(nees, dof, fitted, logged).verdict()
 
 
 def not_disproved(found: dict[str, Any]) -> bool:
