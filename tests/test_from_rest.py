@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -132,6 +133,20 @@ def test_standing_teaches_nothing_and_then_the_motion_is_found():
     nees, along = pose_of(STARTED, standing)
     assert nees.max() < lost_threshold(6)
     assert (along > 0).all()
+
+
+@pytest.mark.parametrize("around", ["", "+checked", "+noise", "+checked+noise", "+noise+checked"])
+def test_what_stands_around_a_start_from_rest_says_what_it_says(around):
+    slam: Any = standstill().filter(f"{STARTED}{around}")
+    assert slam.sets_out_anywhere
+    state = slam.init(standstill().capacity)
+    for standing in (False, True):
+        told = jnp.asarray(standing)
+        state = eqx.tree_at(lambda s: getattr(s, "inner", s).record.standing, state, told)
+        assert slam.moving(state) == (not standing)
+    slam = standstill().filter(f"{SUM}{around}")
+    assert not slam.sets_out_anywhere
+    assert slam.moving(slam.init(standstill().capacity))
 
 
 def test_without_landmarks_the_camera_is_known_less_with_every_frame():

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.arrays import AnyArray
@@ -114,9 +115,12 @@ class AbstractFilter(eqx.Module):
 class AbstractStaged(AbstractFilter):
     """A filter whose frame can be taken in stages: all that a tracker asks for."""
 
-    sets_out_anywhere: ClassVar[bool] = False
-    """Whether measurements of a start that no linear prediction expects are welcome: the filter
-    finds by itself what explains them."""
+    @property
+    def sets_out_anywhere(self) -> bool:
+        """Whether measurements of a start that no linear prediction expects are welcome: the filter
+        finds by itself what explains them. What stands around a filter, its `base`, does as that
+        does."""
+        return getattr(getattr(self, "base", None), "sets_out_anywhere", False)
 
     @abstractmethod
     def predict(self, state: Any, control: Any) -> Any:
@@ -149,6 +153,11 @@ class AbstractStaged(AbstractFilter):
         state = self.predict(state, control)
         state, innovation = self.update(state, control, seen)
         return self.close(self.compose(state, control), new), innovation
+
+    def moving(self, state: Any) -> Bool[Array, ""]:
+        """Whether the newest frame says anything of how the camera moves."""
+        del state
+        return jnp.ones((), bool)
 
     def update_mean(self, state: Any, control: Any, seen: Features) -> Any:
         """A state with the mean that `update` gives, to try hypotheses with; cheaper, if it can."""

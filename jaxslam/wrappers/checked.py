@@ -61,6 +61,9 @@ class Checked(AbstractStaged):
     def close(self, state: Any, new: Features) -> Any:
         return self.base.close(state, new)
 
+    def moving(self, state: Any) -> Bool[Array, ""]:
+        return self.base.moving(state)
+
     def remove(self, state: Any, gone: Bool[AnyArray, " capacity"]) -> Any:
         return self.base.remove(state, gone)
 

@@ -31,7 +31,6 @@ from jaxslam.linalg import cholesky, eigh
 from jaxslam.slam.filter import innermost
 from jaxslam.slam.protocol import AbstractStaged, Capacity, Expected
 from jaxslam.wrappers.bank import with_motion
-from jaxslam.wrappers.from_rest import FromRest
 
 MEMORY = 100
 """Frames after which what they said of the noise has faded to 1/e."""
@@ -117,6 +116,9 @@ class FittedNoise(AbstractStaged):
     def close(self, state: NoiseState, new: Features) -> NoiseState:
         return replace(state, inner=self.fitted(state).close(state.inner, new))
 
+    def moving(self, state: NoiseState) -> Bool[Array, ""]:
+        return self.base.moving(state.inner)
+
     def remove(self, state: NoiseState, gone: Bool[AnyArray, " capacity"]) -> NoiseState:
         return replace(state, inner=self.base.remove(state.inner, gone))
 
@@ -154,16 +156,10 @@ class FittedNoise(AbstractStaged):
         (_, n), (_, t) = ((part.start, part.stop) for part in self._groups)
         return jnp.where(jnp.arange(t) < n, linear, angular)
 
-    def _moving(self, state: NoiseState) -> Bool[Array, ""]:
-        """Whether the newest frame says anything of how the camera moves."""
-        if isinstance(self.base, FromRest):
-            return self.base.moving(state.inner)
-        return jnp.ones((), bool)
-
     def _begun_anew(self, state: NoiseState) -> NoiseState:
         """With the velocity that was told at first, if the camera has not moved."""
         velocity, root = self._inner.motion.start()
-        moving = self._moving(state)
+        moving = self.moving(state)
         return replace(
             state,
             velocity=jnp.where(moving, state.velocity, velocity),
@@ -178,7 +174,7 @@ class FittedNoise(AbstractStaged):
             told = _told(_part(part, *state.before), _part(part, *after))
             heard = jax.vmap(partial(_heard, told))
             evidence, v, V = heard(state.velocity[:, part], state.covariance[:, part, part])
-            learned = self._moving(state) & jnp.all(jnp.isfinite(evidence))
+            learned = self.moving(state) & jnp.all(jnp.isfinite(evidence))
             evidence = jnp.where(learned, evidence, 0.0)
             faded = fading * log_weights + (1 - fading) * told_first
             return jax.nn.log_softmax(faded + evidence), v, V

@@ -10,7 +10,7 @@ evidence. When the translation is known to a fraction of itself, the sum goes on
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -68,8 +68,6 @@ class RestState(eqx.Module):
 class FromRest(AbstractStaged):
     """The start of `base`."""
 
-    sets_out_anywhere: ClassVar[bool] = True
-
     base: Mixture
     sizes: tuple[int, ...] = eqx.field(static=True)
     directions: int = eqx.field(static=True)
@@ -89,6 +87,11 @@ class FromRest(AbstractStaged):
             )
         if self.directions < 1:
             raise ValueError(f"a search sets out in 1 direction at least, not {self.directions}")
+
+    @property
+    def sets_out_anywhere(self) -> bool:
+        """It does: the window looks for what explains a start."""
+        return True
 
     def init(self, capacity: int | Capacity, first: Features | None = None) -> RestState:
         ekf, count = self.base.base, self.base.count
@@ -138,7 +141,7 @@ class FromRest(AbstractStaged):
         return when(state.open & state.record.full, self._thinned, state)
 
     def moving(self, state: RestState) -> Bool[Array, ""]:
-        """Whether the newest frame says anything of how the camera moves: it has not stood."""
+        """It says so unless the camera has stood."""
         return ~state.record.standing
 
     def remove(self, state: RestState, gone: Bool[AnyArray, " capacity"]) -> RestState:
