@@ -278,7 +278,7 @@ def _not_finite(result: Any) -> str:
     if isinstance(result, Evaluation):  # an infinite NEES is one of a run that diverged
         json.dumps(result.asdict(), allow_nan=False)
         assert str(result)
-        return "NEES is not a number" if np.isnan(result.nees).any() else ""
+        return "" if result.logged.any(axis=1).all() else "a run without a NEES"
     bad = next((place for place, x in _numbers(result, "result") if not np.isfinite(x).all()), None)
     return f"{bad} is not finite" if bad else ""
 

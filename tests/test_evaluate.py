@@ -23,7 +23,7 @@ from jaxslam.tum import write_tum
 KEYS = {
     "schema", "version", "quantity", "runs", "steps", "dof", "time", "band95", "nees", "inside",
     "verdict", "outside3sigma", "rmse", "sigma", "axis_verdict", "convention", "alignment",
-    "suggested", "identified", "notes",
+    "suggested", "identified", "notes", "runs_of_step", "band95_of_step",
 }  # fmt: skip
 
 
@@ -234,9 +234,81 @@ def test_whatever_the_arrays_there_is_a_valid_result_or_one_clear_line(data):
         assert told
         assert "\n" not in told
         return
-    assert not np.isnan(found.nees).any()
+    np.testing.assert_array_equal(np.isnan(found.nees), np.isnan(found.errors).all(axis=-1))
     json.dumps(found.asdict(), allow_nan=False)
     assert str(found)
+
+
+# --- runs that are not equally long ---------------------------------------------------------------
+
+
+def test_runs_with_gaps_and_of_unlike_length_are_averaged_over_what_they_have():
+    e, P = drawn(factor=1.2)
+    e[2, 4:], P[2, 4:], e[5, 1:3], P[5, 1:3] = (np.nan,) * 4
+    found = jaxslam.evaluate(e, P)
+    there = ~np.isnan(e).any(axis=-1)
+    nees = np.einsum("rki,rkij,rkj->rk", e, np.linalg.pinv(np.nan_to_num(P)), e)
+    averages = [row[own].mean() for row, own in zip(nees, there, strict=True)]
+    assert found.verdict["nees"] == pytest.approx(np.mean(averages), rel=1e-9)
+    assert found.verdict["diverged"] == 0
+    np.testing.assert_allclose(found.mean, np.nanmean(nees, axis=0), rtol=1e-9)
+    np.testing.assert_allclose(found.rmse, np.sqrt(np.nanmean(e**2, axis=0)), rtol=1e-12)
+    np.testing.assert_array_equal(found.runs_of_step, [60, 59, 59, 60, 59, 59, 59])
+    for step, count in enumerate(found.runs_of_step):
+        np.testing.assert_array_equal(found.band95_of_step[step], jaxslam.mean_band(3, int(count)))
+    sigma = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
+    outside = (abs(e) > 3 * sigma)[there].mean(axis=0)
+    np.testing.assert_allclose(found.outside3sigma, outside, rtol=1e-12)
+    assert "5 of 420 steps are not compared (3 of run 2, 2 of run 5)" in str(found)
+    written = json.loads(json.dumps(found.asdict(), allow_nan=False))
+    assert written["runs_of_step"] == found.runs_of_step.tolist()
+    assert any("not compared" in note for note in written["notes"])
+
+
+def test_runs_padded_to_one_length_are_their_own():
+    """The same verdict as of the runs one by one, whatever is missing at their ends."""
+    e, P = drawn(runs=3, factor=1.2)
+    e[1, 3:], P[1, 3:] = np.nan, np.nan
+    found = jaxslam.evaluate(e, P)
+    alone = jaxslam.evaluate(e[1:2, :3], P[1:2, :3])
+    np.testing.assert_array_equal(found.nees[1, :3], alone.nees[0])
+    whole = jaxslam.evaluate(*drawn(runs=3, factor=1.2))
+    np.testing.assert_array_equal(found.nees[[0, 2]], whole.nees[[0, 2]])
+
+
+def test_a_step_of_which_only_a_part_is_missing_is_refused():
+    e, P = drawn()
+    e[2, 4] = np.nan
+    with pytest.raises(ValueError, match="errors of run 2, step 4 holds nan"):
+        jaxslam.evaluate(e, P)
+    e[2, 4], P[2, 4] = 1.0, np.nan
+    with pytest.raises(ValueError, match="covariances of run 2, step 4 holds nan"):
+        jaxslam.evaluate(e, P)
+    e[2], P[2] = np.nan, np.nan
+    with pytest.raises(ValueError, match="run 2 has no step"):
+        jaxslam.evaluate(e, P)
+
+
+def test_the_beginning_that_a_run_knows_exactly_may_be_later_than_the_others():
+    e, P = drawn()
+    e[:, 0], P[:, 0] = 0, 0
+    e[3, 0], P[3, 0], e[3, 1], P[3, 1] = np.nan, np.nan, 0, 0
+    found = jaxslam.evaluate(e, P)
+    assert found.steps == 6
+    assert found.runs_of_step[0] == 59
+    assert "at the beginning of runs 60 steps are known exactly, and left out" in str(found)
+
+
+def test_a_run_of_a_csv_file_may_lack_steps(tmp_path):
+    e, P = drawn(runs=5)
+    as_csv(tmp_path / "log.csv", e, P)
+    kept = (tmp_path / "log.csv").read_text().splitlines()[2:]  # lines are backwards: the last run
+    (tmp_path / "log.csv").write_text("\n".join(kept))
+    found = jaxslam.evaluate_log(tmp_path / "log.csv")
+    e[4, 5:], P[4, 5:] = np.nan, np.nan
+    np.testing.assert_allclose(found.nees, jaxslam.evaluate(e, P).nees, rtol=1e-12)
+    assert "2 of 35 steps are not compared (2 of run 4)" in str(found)
+    plot_evaluation(found, tmp_path / "evaluation.png")
 
 
 # --- files and the command ----------------------------------------------------------------------
@@ -295,7 +367,7 @@ def lines(*rows):
         ("a.csv", lines((0, 0, 1.0, 1.0, 3.0)), "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"),
         ("a.csv", "0;0;1,0;1,0\n", "line 1: numbers run, step"),
         ("a.csv", lines((0, 0, 1.0, 1.0), (0, 0, 2.0, 1.0)), "line 2: run 0, step 0 comes twice"),
-        ("a.csv", lines((0, 0, 1, 1), (0, 1, 1, 1), (1, 0, 1, 1)), "run 1 has 1 of 2 steps"),
+        ("a.csv", lines(*((r, 9 * r + s, 1, 1) for r in range(3) for s in (0, 1))), "6 different"),
         ("a.csv", lines((0, 0, "nan", 1.0)), "line 1: numbers run"),
         ("a.csv", lines((0, 0, 1.0, -1.0)), "run 0, step 0 has variance -1"),
         ("a.csv", "", "holds no errors"),

@@ -374,6 +374,44 @@ def test_pairs_and_fits_are_those_of_evo():
             assert found.scale == pytest.approx(s)
 
 
+# --- runs that are not equally long ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize("align", ["none", "se3", "sim3"])
+def test_poses_that_were_not_logged_change_nothing_of_the_others(align, joint):
+    """A run that is padded, and one with a gap in its truth, are the runs without those steps."""
+    T, P, truth = (np.array(x) for x in logged(Convention("left"), runs=3, steps=8))
+    T[1, 5:, :3], P[1, 5:], truth[2, 3] = np.nan, np.nan, np.nan
+    kept = [np.arange(8), np.arange(5), np.delete(np.arange(8), 3)]
+
+    def evaluated(T, P, truth):
+        if joint:
+            runs, steps = P.shape[:2]
+            whole = np.zeros((runs, 6 * steps, 6 * steps))
+            for k in range(steps):
+                whole[:, 6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = P[:, k]
+            P = whole
+        return jaxslam.evaluate_poses(T, P, truth, Convention("left"), align=align)
+
+    found = evaluated(T, P, truth)
+    for run, steps in enumerate(kept):
+        alone = evaluated(*(x[run : run + 1, steps] for x in (T, P, truth)))
+        np.testing.assert_allclose(found.nees[run, steps], alone.nees[0], rtol=1e-9)
+        np.testing.assert_allclose(found.errors[run, steps], alone.errors[0], atol=1e-12)
+        np.testing.assert_allclose(found.sigmas[run, steps], alone.sigmas[0], rtol=1e-9)
+        assert found.logged[run].sum() == len(steps)
+    assert "4 of 24 steps are not compared (3 of run 1, 1 of run 2)" in str(found)
+    json.dumps(found.asdict(), allow_nan=False)
+
+
+def test_conventions_are_told_from_runs_of_unlike_length_too():
+    true = Convention("left", order="rotation-first")
+    T, P, truth = (np.array(x) for x in logged(true))
+    T[:9, 4:], P[:9, 4:] = np.nan, np.nan
+    assert jaxslam.evaluate_poses(T, P, truth).suggested == true
+
+
 # --- text and folders ---------------------------------------------------------------------------
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -15,7 +15,7 @@ ROUNDING = 1e-8
 
 
 def numbers(what: str, values: ArrayLike, ndim: int, shape: str) -> Float[np.ndarray, ...]:
-    """An array of finite float64 of so many axes. Raises ValueError, naming run and step."""
+    """An array of float64 of so many axes, finite or not. Raises ValueError."""
     try:
         array = np.asarray(values)
         if array.dtype.kind not in "fiub":
@@ -25,10 +25,40 @@ def numbers(what: str, values: ArrayLike, ndim: int, shape: str) -> Float[np.nda
         raise ValueError(f"{what} must be numbers, an array {shape}") from None
     if array.ndim != ndim or not array.size:
         raise ValueError(f"{what} must be an array {shape}, not {array.shape}")
-    if not np.isfinite(array).all():
-        place = np.argwhere(~np.isfinite(array))[0]
-        raise ValueError(f"{what} of {at(place)} holds {array[tuple(place)]}; only finite numbers")
     return array
+
+
+def check_finite(
+    what: str, array: Float[np.ndarray, ...], logged: Bool[np.ndarray, "runs steps"] | None = None
+) -> None:
+    """Raise ValueError, naming run and step, for what is not finite at a step that was logged."""
+    wrong = ~np.isfinite(array)
+    if logged is not None:
+        wrong &= logged.reshape(*logged.shape, *[1] * (array.ndim - 2))
+    if wrong.any():
+        place = np.argwhere(wrong)[0]
+        raise ValueError(f"{what} of {at(place)} holds {array[tuple(place)]}; only finite numbers")
+
+
+def all_nan(array: Float[np.ndarray, "runs steps ..."]) -> Bool[np.ndarray, "runs steps"]:
+    """Where every number of a step is NaN, so that nothing was logged."""
+    return np.asarray(np.isnan(array).all(axis=tuple(range(2, array.ndim))))
+
+
+def filled(
+    array: Float[np.ndarray, "runs steps ..."],
+    logged: Bool[np.ndarray, "runs steps"],
+    value: ArrayLike,
+) -> Float[np.ndarray, "runs steps ..."]:
+    """With a value at every step that was not logged."""
+    return np.where(logged.reshape(*logged.shape, *[1] * (array.ndim - 2)), array, value)
+
+
+def check_every_run(logged: Bool[np.ndarray, "runs steps"]) -> None:
+    """Raise ValueError for a run of which no step was logged."""
+    if not logged.any(axis=1).all():
+        run = int(np.argmin(logged.any(axis=1)))
+        raise ValueError(f"run {run} has no step: all of it is NaN; runs with a step are accepted")
 
 
 def at(place: Any) -> str:
@@ -36,16 +66,31 @@ def at(place: Any) -> str:
     return f"run {place[0]}, step {place[1]}"
 
 
-def paired(
-    errors: ArrayLike, covariances: ArrayLike
-) -> tuple[Float[np.ndarray, "runs steps n"], Float[np.ndarray, "runs steps n n"]]:
-    """Errors and covariances that belong together. Raises ValueError, naming run and step."""
+class Paired(NamedTuple):
+    """Errors and covariances that belong together."""
+
+    errors: Float[np.ndarray, "runs steps n"]
+    covariances: Float[np.ndarray, "runs steps n n"]
+    logged: Bool[np.ndarray, "runs steps"]
+    """Which steps of which run are there; the others are zeros, with a covariance of one."""
+
+
+def paired(errors: ArrayLike, covariances: ArrayLike) -> Paired:
+    """Errors and covariances, and where they are.
+
+    A step whose error and covariance are both all NaN was not logged. Raises ValueError, naming
+    run and step, for any other number that is not finite, and for a run without a step.
+    """
     e = numbers("errors", errors, 3, "(runs, steps, n), with one run errors[None]")
     P = numbers("covariances", covariances, 4, "(runs, steps, n, n)")
     if P.shape != (*e.shape, e.shape[-1]):
         wanted = (*e.shape, e.shape[-1])
         raise ValueError(f"errors are {e.shape}, so covariances must be {wanted}, not {P.shape}")
-    return e, P
+    logged = ~(all_nan(e) & all_nan(P))
+    check_finite("errors", e, logged)
+    check_finite("covariances", P, logged)
+    check_every_run(logged)
+    return Paired(filled(e, logged, 0.0), filled(P, logged, np.eye(e.shape[-1])), logged)
 
 
 def step_times(times: ArrayLike | None, steps: int) -> Float[np.ndarray, " steps"]:
@@ -72,15 +117,27 @@ def exactly_known(
     return ~np.any(covariances, axis=(-2, -1))
 
 
-def without_known(
-    errors: Float[np.ndarray, "runs steps n"], covariances: Float[np.ndarray, "runs steps n n"]
-) -> int:
-    """Of how many steps at the beginning all runs know everything by definition.
+class Compared(NamedTuple):
+    """The steps that have a part in a verdict."""
 
-    Raises ValueError where one is wrong all the same, or where nothing else is left.
+    start: int
+    """Before it no run has one."""
+    logged: Bool[np.ndarray, "runs steps"]
+    """Which, of all steps."""
+    notes: tuple[str, ...]
+    """A word on those that are known by definition."""
+
+
+def without_known(
+    errors: Float[np.ndarray, "runs steps n"],
+    covariances: Float[np.ndarray, "runs steps n n"],
+    logged: Bool[np.ndarray, "runs steps"],
+) -> Compared:
+    """All steps that were logged but those at the beginning of a run that it knows by definition.
+
+    Raises ValueError where one is wrong all the same, or where of a run nothing else is left.
     """
-    known = exactly_known(covariances)
-    beginning = int(np.argmin(known.all(axis=0))) if not known.all() else known.shape[1]
+    known = exactly_known(covariances) & logged
     wrong = known & (np.abs(errors).max(axis=-1) > ROUNDING)
     if wrong.any():
         run, step = np.argwhere(wrong)[0]
@@ -88,9 +145,28 @@ def without_known(
             f"the covariance of {at((run, step))} is zero, and its error is not: "
             f"{np.abs(errors[run, step]).max():.3g}; a positive definite one is accepted"
         )
-    if beginning == known.shape[1]:
+    if (known == logged).all():
         raise ValueError("all covariances are zero; positive definite ones are accepted")
-    return beginning
+    before = np.logical_and.accumulate(known | ~logged, axis=1)
+    if before.all(axis=1).any():
+        run = int(np.argmax(before.all(axis=1)))
+        raise ValueError(
+            f"all covariances of run {run} are zero; positive definite ones are accepted"
+        )
+    left = logged & ~before
+    start = int(np.argmax(left.any(axis=0)))
+    return Compared(start, left, _left_out(known & before, start))
+
+
+def _left_out(known: Bool[np.ndarray, "runs steps"], start: int) -> tuple[str, ...]:
+    """A word on the steps at the beginning that are known by definition."""
+    if not known.any():
+        return ()
+    if known[:, :start].all() and not known[:, start:].any():
+        steps = "the first step is" if start == 1 else f"the first {start} steps are"
+        return (f"{steps} known exactly, and left out",)
+    many = f"{known.sum()} steps are" if known.sum() > 1 else "one step is"
+    return (f"at the beginning of runs {many} known exactly, and left out",)
 
 
 def normalised(

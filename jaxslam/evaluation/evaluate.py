@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.consistency.statistics import mean_band
 from jaxslam.consistency.verdict import headline, run_verdict, sentences
-from jaxslam.evaluation.arrays import normalised, paired, step_times, without_known
+from jaxslam.evaluation.arrays import filled, normalised, paired, step_times, without_known
 from jaxslam.evaluation.convention import Convention
 from jaxslam.evaluation.identify import Identification
 from jaxslam.files import json_numbers, write_json
@@ -22,6 +22,8 @@ from jaxslam.lookup import chosen
 
 SCHEMA = 1
 SIGMAS = 3
+_TOLD = 3
+"""Runs that a sentence names."""
 OUTSIDE = 0.0027
 """Share of a Gaussian beyond ±3σ."""
 
@@ -35,7 +37,7 @@ class Evaluation:
     dof: int
     """Degrees of freedom: the NEES that a consistent filter has on average."""
     nees: Float[np.ndarray, "runs steps"]
-    """Of every run and step; not finite of one that diverged."""
+    """Of every run and step; infinite of one that diverged, NaN where nothing was logged."""
     errors: Float[np.ndarray, "runs steps n"]
     sigmas: Float[np.ndarray, "runs steps n"]
     """What the filter claims of every error."""
@@ -52,6 +54,8 @@ class Evaluation:
     """Which convention would make the data consistent, where it was asked."""
     notes: tuple[str, ...] = ()
     """What was left out, and what was assumed."""
+    run_names: tuple[str, ...] = ()
+    """Of the runs, where they have names."""
 
     @property
     def runs(self) -> int:
@@ -64,7 +68,7 @@ class Evaluation:
     @cached_property
     def verdict(self) -> dict[str, Any]:
         """Of one study over all steps, see `jaxslam.consistency.Tally.verdict`."""
-        return run_verdict(self.nees, self.dof)
+        return run_verdict(self.nees, self.dof, logged=self.logged)
 
     @property
     def headline(self) -> str:
@@ -72,36 +76,58 @@ class Evaluation:
         return headline(self.verdict).replace("NEES", self.quantity, 1)
 
     @cached_property
+    def logged(self) -> Bool[np.ndarray, "runs steps"]:
+        """Which steps of which run there are."""
+        return ~np.isnan(self.nees)
+
+    @cached_property
     def finite(self) -> Bool[np.ndarray, " runs"]:
         """Which runs did not diverge: what means and band are of, as in `consistency.json`."""
-        return np.asarray(np.isfinite(self.nees).all(axis=1))
+        return np.asarray((np.isfinite(self.nees) | ~self.logged).all(axis=1))
+
+    @cached_property
+    def runs_of_step(self) -> Int[np.ndarray, " steps"]:
+        """How many runs a step's mean and band are of."""
+        return np.sum(self.logged & self.finite[:, None], axis=0)
 
     @property
     def mean(self) -> Float[np.ndarray, " steps"]:
-        """Mean NEES of every step; NaN where no run is left."""
-        if not self.finite.any():
-            return np.full(self.steps, np.nan)
-        return self.nees[self.finite].mean(axis=0)
+        """Mean NEES of every step, over the runs that have it; NaN where no run is left."""
+        return _mean(self.nees[self.finite], self.logged[self.finite])
 
     @property
     def band95(self) -> tuple[float, float]:
-        """Exact bounds of the mean at one step (`jaxslam.mean_band`)."""
+        """Exact bounds of the mean at one step of which no run is missing (`jaxslam.mean_band`)."""
         return mean_band(self.dof, max(int(self.finite.sum()), 1))
+
+    @property
+    def band95_of_step(self) -> Float[np.ndarray, "steps 2"]:
+        """The same of every step, of as many runs as have it."""
+        counts, place = np.unique(np.maximum(self.runs_of_step, 1), return_inverse=True)
+        return np.array([mean_band(self.dof, int(count)) for count in counts])[place]
+
+    @property
+    def inside(self) -> float:
+        """Share of the steps that a run has whose mean is in its band."""
+        low, high = self.band95_of_step.T
+        inside = np.sum((self.mean >= low) & (self.mean <= high))
+        return float(inside / max(np.count_nonzero(self.runs_of_step), 1))
 
     @property
     def rmse(self) -> Float[np.ndarray, "steps n"]:
         """Of every step and axis."""
-        return _rms(self.errors)
+        return _rms(self.errors, self.logged)
 
     @property
     def sigma(self) -> Float[np.ndarray, "steps n"]:
         """Claimed, of every step and axis: the root of the mean variance."""
-        return _rms(self.sigmas)
+        return _rms(self.sigmas, self.logged)
 
     @property
     def outside3sigma(self) -> Float[np.ndarray, " n"]:
         """Share of the errors of every axis beyond ±3σ; .27 % of Gaussian ones are."""
-        return np.mean(np.abs(self.errors) > SIGMAS * self.sigmas, axis=(0, 1))
+        beyond = np.abs(self.errors) > SIGMAS * self.sigmas
+        return np.sum(beyond, axis=(0, 1)) / np.sum(self.logged)
 
     @property
     def suggested(self) -> Convention | None:
@@ -111,14 +137,14 @@ class Evaluation:
     def axis_verdict(self, axis: int) -> dict[str, Any]:
         """The verdict on one axis alone, of one degree of freedom."""
         with np.errstate(over="ignore"):
-            return run_verdict((self.errors[..., axis] / self.sigmas[..., axis]) ** 2, 1)
+            nees = (self.errors[..., axis] / self.sigmas[..., axis]) ** 2
+            return run_verdict(nees, 1, logged=self.logged)
 
     def asdict(self) -> dict[str, Any]:
         """The content of `evaluation.json`."""
         from jaxslam import __version__
 
         by_axis = {name: i for i, name in enumerate(self.names)}
-        low, high = self.band95
         return {
             "schema": SCHEMA,
             "version": __version__,
@@ -127,9 +153,11 @@ class Evaluation:
             "steps": self.steps,
             "dof": self.dof,
             "time": json_numbers(self.times),
-            "band95": [low, high],
+            "band95": list(self.band95),
             "nees": json_numbers(self.mean),
-            "inside": float(np.mean((self.mean >= low) & (self.mean <= high))),
+            "runs_of_step": self.runs_of_step.tolist(),
+            "band95_of_step": self.band95_of_step.tolist(),
+            "inside": self.inside,
             "verdict": self.verdict,
             "outside3sigma": {n: float(self.outside3sigma[i]) for n, i in by_axis.items()},
             "rmse": {n: json_numbers(self.rmse[:, i]) for n, i in by_axis.items()},
@@ -139,7 +167,7 @@ class Evaluation:
             "alignment": self.alignment,
             "suggested": None if self.suggested is None else asdict(self.suggested),
             "identified": None if self.identified is None else self.identified.asdict(),
-            "notes": list(self.notes),
+            "notes": self.remarks,
         }
 
     def save(self, folder: str | Path) -> Path:
@@ -155,16 +183,37 @@ class Evaluation:
     def __str__(self) -> str:
         told = [line.replace("NEES", self.quantity) for line in sentences(self.verdict)]
         doubt = [] if self.identified is None else [self.identified.sentence]
-        return "\n".join([*told, *doubt, "", *self._table(), *self.notes])
+        return "\n".join([*told, *doubt, "", *self._table(), *self.remarks])
+
+    @property
+    def remarks(self) -> list[str]:
+        """All notes: what is missing, what was left out, what was assumed."""
+        return [*self._missing(), *self.notes]
+
+    def _missing(self) -> list[str]:
+        """A sentence on the steps of runs that are not there."""
+        missing = np.sum(~self.logged, axis=1)
+        if not missing.any():
+            return []
+        most = np.argsort(-missing, kind="stable")[: min(_TOLD, np.count_nonzero(missing))]
+        told = ", ".join(f"{missing[run]} of {self._run(int(run))}" for run in most)
+        more = np.count_nonzero(missing) - len(most)
+        told += f" and some of {more} other run{'s' if more > 1 else ''}" if more else ""
+        return [
+            f"{missing.sum()} of {self.nees.size} steps are not compared ({told}); each run is "
+            "averaged over the steps that it has, each step over the runs that have it"
+        ]
+
+    def _run(self, run: int) -> str:
+        return self.run_names[run] if self.run_names else f"run {run}"
 
     def _table(self) -> list[str]:
         low, high = self.band95
-        inside = np.mean((self.mean >= low) & (self.mean <= high))
         runs = f"{self.runs} run{'s' if self.runs > 1 else ''}"
         return [
             f"{runs} of {self.steps} steps; mean {self.quantity} of a consistent filter "
             f"{self.dof}, at one step in {low:.3f}–{high:.3f} with 95 %; "
-            f"{inside:.0%} of the steps are inside",
+            f"{self.inside:.0%} of the steps are inside",
             _columns("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
             *(self._row(i) for i in range(len(self.names))),
             _columns("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}"),
@@ -172,7 +221,8 @@ class Evaluation:
 
     def _row(self, axis: int) -> str:
         found = self.axis_verdict(axis)
-        rmse, sigma = (f"{_rms(x[:, axis]):.4g}" for x in (self.rmse, self.sigma))
+        there = self.logged.any(axis=0)
+        rmse, sigma = (f"{_rms(x[there, axis]):.4g}" for x in (self.rmse, self.sigma))
         factor, low, high = (
             "–" if x is None else f"{x:.3f}" if x < 10 else f"{x:.3g}"
             for x in (found["sigma_factor"], *found["interval99"])
@@ -197,37 +247,41 @@ def evaluate(
     n, n), or from innovations and theirs with `quantity="NIS"`, which needs no truth.
 
     Runs are independent of each other, steps of a run need not be. `times` (steps,) are seconds and
-    `names` (n,) those of the axes. Steps at the beginning that every run knows exactly, with a
-    covariance of zero, are left out. Raises ValueError, naming run and step, for what is not
+    `names` (n,) those of the axes. Runs need not be equally long: where an error and its covariance
+    are both all NaN, nothing was logged. Steps at the beginning that a run knows exactly, with a
+    covariance of zero, are left out. Raises ValueError, naming run and step, for what else is not
     finite, not symmetric or not positive definite.
     """
-    e, P = paired(errors, covariances)
-    start = without_known(e, P)
+    e, P, logged = paired(errors, covariances)
+    start, logged, notes = without_known(e, P, logged)
     at = step_times(times, e.shape[1])
-    e, P = e[:, start:], P[:, start:]
+    e, P, logged = e[:, start:], P[:, start:], logged[:, start:]
     return Evaluation(
         quantity=next(iter(chosen("quantity", quantity, dict.fromkeys(("NEES", "NIS"))))),
         dof=e.shape[-1],
-        nees=normalised(e, P),
-        errors=e,
-        sigmas=np.sqrt(np.diagonal(P, axis1=-2, axis2=-1)),
+        nees=filled(normalised(e, filled(P, logged, np.eye(e.shape[-1]))), logged, np.nan),
+        errors=filled(e, logged, np.nan),
+        sigmas=filled(np.sqrt(np.diagonal(P, axis1=-2, axis2=-1)), logged, np.nan),
         times=at[start:],
         timed=times is not None,
         names=_names(names, e.shape[-1]),
-        notes=left_out(start),
+        notes=notes,
     )
 
 
-def _rms(values: np.ndarray) -> Any:
+def _rms(values: np.ndarray, there: np.ndarray | None = None) -> Any:
     """Root of the mean square over the first axis; infinite where it overflows."""
     with np.errstate(over="ignore"):
-        return np.sqrt(np.mean(values**2, axis=0))
+        return np.sqrt(np.mean(values**2, axis=0) if there is None else _mean(values**2, there))
 
 
-def left_out(start: int) -> tuple[str, ...]:
-    """A word on the steps at the beginning that are known by definition."""
-    steps = "the first step is" if start == 1 else f"the first {start} steps are"
-    return (f"{steps} known exactly, and left out",) if start else ()
+def _mean(
+    values: Float[np.ndarray, "runs steps ..."], there: Bool[np.ndarray, "runs steps"]
+) -> Float[np.ndarray, "steps ..."]:
+    """Over the runs that have a step; NaN where none has it."""
+    count = np.sum(there, axis=0).reshape(-1, *[1] * (values.ndim - 2))
+    total = np.sum(filled(values, there, 0.0), axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def _names(names: Sequence[str], n: int) -> tuple[str, ...]:

@@ -84,13 +84,14 @@ class Identification:
 def identify(
     stated: Convention, nees: Mapping[Convention, Float[np.ndarray, "runs steps"]], dof: int
 ) -> Identification:
-    """The convention from the NEES that each of them gives, of the same runs."""
-    finite = {c: x for c, x in nees.items() if np.isfinite(x).all()}
-    means = {c: float(x.mean()) for c, x in finite.items()}
+    """The convention from the NEES that each of them gives, of the same runs; NaN where nothing was
+    logged."""
+    finite = {c: x for c, x in nees.items() if not np.isinf(x).any()}
+    means = {c: float(np.nanmean(x)) for c, x in finite.items()}
     if not finite:
         return Identification(stated, means, ())
     best = min(finite, key=lambda c: means[c])
-    if run_verdict(finite[best], dof)["word"] != "consistent":
+    if run_verdict(finite[best], dof, logged=~np.isnan(finite[best]))["word"] != "consistent":
         return Identification(stated, means, ())
     equal = tuple(c for c in finite if not _worse(finite[c], finite[best]))
     return Identification(stated, means, equal)
@@ -98,7 +99,7 @@ def identify(
 
 def _worse(nees: Float[np.ndarray, "runs steps"], least: Float[np.ndarray, "runs steps"]) -> bool:
     """Whether the one NEES is larger than the other beyond doubt, and noticeably."""
-    if nees.mean() < (1 + NOTICEABLE) * least.mean():
+    if np.nanmean(nees) < (1 + NOTICEABLE) * np.nanmean(least):
         return False
-    p = mean_p_value(PowerSums.of(nees.mean(axis=1) - least.mean(axis=1)), 0.0)
+    p = mean_p_value(PowerSums.of(np.nanmean(nees, axis=1) - np.nanmean(least, axis=1)), 0.0)
     return p < 1 - VERDICT_CONFIDENCE

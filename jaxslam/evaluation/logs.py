@@ -127,6 +127,8 @@ def _npz(path: Path) -> dict[str, Any]:
     return arrays
 
 
+_APART = 2
+"""Runs whose steps together are more than so many times those of the longest do not share them."""
 _COLUMNS = "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"
 
 
@@ -137,33 +139,34 @@ def _csv(path: Path) -> dict[str, Any]:
     n = round((np.sqrt(9 + 8 * (rows.shape[1] - 2)) - 3) / 2) if rows.shape[1] > 3 else 0
     if n < 1 or 2 + n * (n + 3) // 2 != rows.shape[1]:
         raise ValueError(f"{path}: {rows.shape[1]} columns; {row} are accepted: {_COLUMNS} columns")
-    order, runs, steps = _rectangle(path, rows[:, :2], lines)
-    table = rows[order].reshape(runs, steps, -1)
-    upper, P = np.triu_indices(n), np.zeros((runs, steps, n, n))
-    P[..., upper[0], upper[1]] = P[..., upper[1], upper[0]] = table[..., 2 + n :]
+    places, runs, steps = _rectangle(path, rows[:, :2], lines)
+    e, P = np.full((runs, steps, n), np.nan), np.full((runs, steps, n, n), np.nan)
+    e[places], triangle, upper = rows[:, 2 : 2 + n], np.empty((len(rows), n, n)), np.triu_indices(n)
+    triangle[:, *upper] = triangle[:, *upper[::-1]] = rows[:, 2 + n :]
+    P[places] = triangle
     titles = words(comments[0]) if comments else []
     named = len(titles) == rows.shape[1] and not comments[0].lstrip().startswith("#")
     names = {"names": titles[2 : 2 + n]} if named else {}
-    return {"errors": table[..., 2 : 2 + n], "covariances": P, **names}
+    return {"errors": e, "covariances": P, **names}
 
 
 def _rectangle(
     path: Path, places: Float[np.ndarray, "k 2"], lines: tuple[int, ...]
-) -> tuple[Int[np.ndarray, " k"], int, int]:
-    """The order of the rows by run and step, of which every run has the same."""
-    runs, steps = (np.unique(column) for column in places.T)
+) -> tuple[tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]], int, int]:
+    """The run and the step of every row, and how many there are; a run need not have all steps."""
+    (runs, run), (steps, step) = (np.unique(x, return_inverse=True) for x in places.T)
     pairs, first = np.unique(places, axis=0, return_index=True)
     if len(pairs) < len(places):
         twice = np.setdiff1d(np.arange(len(places)), first)[0]
-        run, step = places[twice]
-        raise ValueError(f"{path}, line {lines[twice]}: run {run:g}, step {step:g} comes twice")
-    if len(pairs) != len(runs) * len(steps):
-        count = [int(np.sum(places[:, 0] == run)) for run in runs]
-        short = runs[int(np.argmin(count))]
+        r, s = places[twice]
+        raise ValueError(f"{path}, line {lines[twice]}: run {r:g}, step {s:g} comes twice")
+    longest = int(np.bincount(run).max())
+    if len(steps) > _APART * longest:
         raise ValueError(
-            f"{path}: run {short:g} has {min(count)} of {len(steps)} steps; all runs need the same"
+            f"{path}: the runs have {len(steps)} different steps, and none more than {longest}; "
+            "steps that are counted alike in all runs are accepted, as from the start of each"
         )
-    return np.lexsort((places[:, 1], places[:, 0])), len(runs), len(steps)
+    return (run, step), len(runs), len(steps)
 
 
 def _runs(source: Path, covariance: str | Path | None, truth: str | Path | None) -> tuple[Run, ...]:

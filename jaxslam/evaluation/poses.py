@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxslam.evaluation.alignment import (
@@ -17,8 +17,12 @@ from jaxslam.evaluation.alignment import (
     similarity,
 )
 from jaxslam.evaluation.arrays import (
+    all_nan,
     at,
+    check_every_run,
+    check_finite,
     exactly_known,
+    filled,
     normalised,
     numbers,
     step_times,
@@ -31,7 +35,7 @@ from jaxslam.evaluation.convention import (
     geometry_of,
     pose_errors,
 )
-from jaxslam.evaluation.evaluate import Evaluation, left_out
+from jaxslam.evaluation.evaluate import Evaluation
 from jaxslam.evaluation.identify import Identification, identify
 from jaxslam.files import LARGEST
 from jaxslam.lookup import chosen
@@ -61,6 +65,8 @@ class Poses(NamedTuple):
     estimates: Float[np.ndarray, "runs steps d d"]
     covariances: Float[np.ndarray, "runs steps t t"]
     truths: Float[np.ndarray, "runs steps d d"]
+    logged: Bool[np.ndarray, "runs steps"]
+    """Which steps of which run there are; the others are identities, of unit covariance."""
     joint: Float[np.ndarray, "runs steps*t steps*t"] | None = None
     """The covariance of all poses of a run, where it is known."""
 
@@ -88,11 +94,13 @@ def evaluate_poses(
     """The verdict on a filter from its poses T_wc, m, and the true ones.
 
     `estimates` and `truths` are (runs, steps, 4, 4), or (runs, steps, 3, 3) in the plane, `times`
-    (steps,) in seconds. `covariances` are of every pose, (runs, steps, 6, 6), or of all poses of a
-    run together, (runs, 6 steps, 6 steps), of the errors that the `convention` names. Where the
-    estimate is of another world, `align` it by `se3` or `sim3`: by the first pose, if that is
-    exactly known, else to all positions. The covariance is transported with it. Whether another
-    convention would make the data consistent is tried too. Raises ValueError, naming run and step.
+    (steps,) in seconds. A pose that is all NaN together with its covariance was not logged, and one
+    whose truth is all NaN is not compared. `covariances` are of every pose, (runs, steps, 6, 6), or
+    of all poses of a run together, (runs, 6 steps, 6 steps), of the errors that the `convention`
+    names. Where the estimate is of another world, `align` it by `se3` or `sim3`: by the first pose,
+    if that is exactly known, else to all positions. The covariance is transported with it. Whether
+    another convention would make the data consistent is tried too. Raises ValueError, naming run
+    and step.
     """
     stated = convention or Convention()
     if not isinstance(stated, Convention):
@@ -114,7 +122,7 @@ def evaluate_poses(
         convention=stated,
         alignment=align,
         identified=_identified(poses, stated, align, found),
-        notes=(*left_out(found.start), *found.notes),
+        notes=found.notes,
     )
 
 
@@ -122,7 +130,7 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
     """Arrays that belong together. Raises ValueError, naming run and step."""
     matrices = "(runs, steps, 4, 4), or (runs, steps, 3, 3) in the plane"
     T, truth = (
-        _rigid(what, numbers(what, x, 4, matrices), matrices)
+        _matrices(what, numbers(what, x, 4, matrices), matrices)
         for what, x in (("estimates", estimates), ("truths", truths))
     )
     if T.shape != truth.shape:
@@ -135,38 +143,65 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
             f"covariances of {runs} runs of {steps} poses must be {each}, or the joint ones "
             f"{joint}, not {P.shape}"
         )
+    joints = P if P.shape == joint else None
+    if joints is not None:
+        blocks = joints.reshape(runs, steps, t, steps, t)
+        P = np.moveaxis(blocks[:, range(steps), :, range(steps)], 0, 1)
+    logged = ~(all_nan(T[..., :-1, :]) & all_nan(P) | all_nan(truth[..., :-1, :]))
+    check_every_run(logged)
+    if joints is not None:
+        joints = _joint(joints, np.repeat(logged, t, axis=1))
     for what, x in (("estimates", T), ("truths", truth), ("covariances", P)):
-        if np.abs(x).max() > LARGEST:
-            raise ValueError(f"{what} hold {np.abs(x).max():.2g}; up to {LARGEST:.0e} is accepted")
-    if P.shape == each:
-        return Poses(T, P, truth)
-    blocks = P.reshape(runs, steps, t, steps, t)
-    return Poses(T, np.moveaxis(blocks[:, range(steps), :, range(steps)], 0, 1), truth, P)
+        check_finite(what, x, logged)
+        if (largest := np.abs(x[logged]).max()) > LARGEST:
+            raise ValueError(f"{what} hold {largest:.2g}; up to {LARGEST:.0e} is accepted")
+    T, truth = (filled(x, logged, np.eye(x.shape[-1])) for x in (T, truth))
+    _check_rigid("estimates", T)
+    _check_rigid("truths", truth)
+    return Poses(T, filled(P, logged, np.eye(t)), truth, logged, joints)
 
 
-def _rigid(what: str, T: np.ndarray, accepted: str) -> np.ndarray:
+def _joint(
+    P: Float[np.ndarray, "runs k k"], logged: Bool[np.ndarray, "runs k"]
+) -> Float[np.ndarray, "runs k k"]:
+    """Zero where one of two numbers was not logged. Raises ValueError for any that cannot be."""
+    P = np.where(logged[:, :, None] & logged[:, None], P, 0.0)
+    if not (np.abs(P) <= LARGEST).all():
+        run = int(np.argwhere(~(np.abs(P) <= LARGEST))[0, 0])
+        raise ValueError(
+            f"covariances of run {run} hold numbers that are not finite, or beyond {LARGEST:.0e}"
+        )
+    return P
+
+
+def _matrices(what: str, T: np.ndarray, accepted: str) -> np.ndarray:
     if T.shape[-2:] not in ((3, 3), (4, 4)):
         raise ValueError(f"{what} must be matrices {accepted}, not {T.shape}")
+    return T
+
+
+def _check_rigid(what: str, T: np.ndarray) -> None:
     wrong = not_rigid(T, _RIGID)
     if wrong.any():
         place = at(np.argwhere(wrong)[0])
         raise ValueError(f"{what} of {place} is no rigid motion [R t; 0 1] with R a rotation")
-    return T
 
 
 def _compared(poses: Poses, convention: Convention, align: str) -> _Compared:
     laid, given, notes = _laid(poses, convention, align)
     errors = pose_errors(convention, laid.estimates, laid.truths)
-    start = without_known(errors, laid.covariances)
-    later = Poses(*(x[:, start:] for x in laid[:3]))
+    start, logged, known = without_known(errors, laid.covariances, laid.logged)
+    later = Poses(*(x[:, start:] for x in laid[:3]), logged[:, start:])
+    t = errors.shape[-1]
+    later = later._replace(covariances=filled(later.covariances, later.logged, np.eye(t)))
     errors, P = errors[:, start:], later.covariances
-    nees = normalised(errors, P)
-    if given:
-        return _Compared(
-            *_beyond_scale(later, convention), P.shape[-1] - 1, start, (*notes, BEYOND)
-        )
+    nees, dof = normalised(errors, P), t
     sigmas = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
-    return _Compared(errors, sigmas, nees, P.shape[-1], start, notes)
+    if given:
+        errors, sigmas, nees = _beyond_scale(later, convention)
+        dof, notes = t - 1, (*notes, BEYOND)
+    there = (filled(x, later.logged, np.nan) for x in (errors, sigmas, nees))
+    return _Compared(*there, dof, start, (*known, *notes))
 
 
 def _beyond_scale(
@@ -197,7 +232,8 @@ def _laid(poses: Poses, convention: Convention, align: str) -> tuple[Poses, bool
     given = convention.scale == "given"
     if align == "none":
         return poses, given, ()
-    if exactly_known(poses.covariances[:, 0]).all():
+    first = poses.covariances[range(len(poses.logged)), np.argmax(poses.logged, axis=1)]
+    if exactly_known(first).all():
         return _each_run(poses, convention, _by_first), given or align == "sim3", (BY_FIRST,)
     if given and align == "se3":
         raise ValueError(
@@ -212,12 +248,17 @@ def _laid(poses: Poses, convention: Convention, align: str) -> tuple[Poses, bool
 
 
 def _each_run(poses: Poses, convention: Convention, lay) -> Poses:
-    joints = poses.joint if poses.joint is not None else [None] * len(poses.estimates)
-    runs = [
-        lay(Poses(*run), convention)
-        for run in zip(poses.estimates, poses.covariances, poses.truths, joints, strict=True)
-    ]
-    return Poses(*(np.stack([run[i] for run in runs]) for i in range(3)))
+    """Every run by itself, of the poses that were logged."""
+    laid = [x.copy() for x in poses[:3]]
+    for run, logged in enumerate(poses.logged):
+        joint = None
+        if poses.joint is not None:
+            rows = np.flatnonzero(np.repeat(logged, poses.covariances.shape[-1]))
+            joint = poses.joint[run][np.ix_(rows, rows)]
+        there = Poses(*(x[run, logged] for x in poses[:4]), joint)
+        for x, moved in zip(laid, lay(there, convention)[:3], strict=True):
+            x[run, logged] = moved
+    return Poses(*laid, poses.logged)
 
 
 def _by_first(run: Poses, convention: Convention) -> Poses:
@@ -244,7 +285,7 @@ def _moved(run: Poses, convention: Convention, motion: Similarity) -> Poses:
 
 def _identified(poses: Poses, stated: Convention, align: str, found: _Compared) -> Identification:
     """Among the conventions of the same scale; where none of them does, given the scale."""
-    few = Poses(*(x[:_ENOUGH] for x in poses[:3]))
+    few = Poses(*(x[:_ENOUGH] for x in poses[:4]))
     if poses.joint is not None:
         few = few._replace(joint=poses.joint[:_ENOUGH])
     geometry = geometry_of(poses.estimates)

@@ -78,8 +78,8 @@ def plot_nees(
 
     For evaluations in the same axes `place` counts, for their colours.
     """
-    style, (low, high) = line_style(place), evaluation.band95
-    ax.axhspan(low, high, color=GREY, alpha=0.25, lw=0)
+    style = line_style(place)
+    _band(evaluation, ax)
     ax.axhline(evaluation.dof, color=GREY, lw=0.8)
     marker = "o" if evaluation.steps == 1 else None
     ax.plot(evaluation.times, evaluation.mean, lw=1.8, marker=marker, **style)
@@ -94,6 +94,15 @@ def plot_nees(
     told = f"{evaluation.quantity} of {many}\ngrey: exact 95 % band of one step"
     set_title(ax, told)
     return _over_time(evaluation, ax)
+
+
+def _band(evaluation: Evaluation, ax: Axes) -> None:
+    """Where the mean of a consistent filter is; wider at steps that fewer runs have."""
+    if evaluation.logged.all():
+        ax.axhspan(*evaluation.band95, color=GREY, alpha=0.25, lw=0)
+        return
+    low, high = evaluation.band95_of_step.T
+    ax.fill_between(evaluation.times, low, high, color=GREY, alpha=0.25, lw=0, step="mid")
 
 
 def plot_outside(evaluation: Evaluation, *, ax: Axes, label: str | None = None) -> Axes:
