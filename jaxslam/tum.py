@@ -51,6 +51,26 @@ def read_tum(path: str | Path) -> tuple[Float[np.ndarray, " n"], Float[np.ndarra
     return rows[:, 0], poses(rows[:, 1:4], rows[:, 4:])
 
 
+_LATEST = 1e11
+"""Seconds since 1970 of the year 5138."""
+_SLOWEST = 1e3
+"""Seconds between two poses, more than a moving thing has."""
+
+
+def check_seconds(what: str, times: Float[np.ndarray, " n"]) -> None:
+    """Raise ValueError where times are too large to be seconds, since 1970 or from pose to pose."""
+    last = float(np.abs(times).max())
+    step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
+    if last <= _LATEST and step <= _SLOWEST:
+        return
+    by_size = ((1e17, "nanoseconds"), (1e14, "microseconds"), (0.0, "milliseconds"))
+    by_step = ((1e6, "nanoseconds"), (0.0, "microseconds"))
+    size, units = (last, by_size) if last > _LATEST else (step, by_step)
+    unit = next(unit for least, unit in units if size >= least)
+    told = f"up to {last:.3g}" if last > _LATEST else f"{step:.3g} from one to the next"
+    raise ValueError(f"{what}: times {told} look like {unit}; seconds are accepted")
+
+
 def not_rigid(T: Float[np.ndarray, "*k d d"], tolerance: float) -> Bool[np.ndarray, "*k"]:
     """Which matrices are no [R t; 0 1] with R a rotation, to so much of its numbers."""
     n = T.shape[-1] - 1

@@ -259,7 +259,7 @@ def test_runs_with_gaps_and_of_unlike_length_are_averaged_over_what_they_have():
     sigma = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
     outside = (abs(e) > 3 * sigma)[there].mean(axis=0)
     np.testing.assert_allclose(found.outside3sigma, outside, rtol=1e-12)
-    assert "5 of 420 steps are not compared (3 of run 2, 2 of run 5)" in str(found)
+    assert "5 of 420 steps are not compared (run 2: 3, run 5: 2)" in str(found)
     written = json.loads(json.dumps(found.asdict(), allow_nan=False))
     assert written["runs_of_step"] == found.runs_of_step.tolist()
     assert any("not compared" in note for note in written["notes"])
@@ -307,7 +307,7 @@ def test_a_run_of_a_csv_file_may_lack_steps(tmp_path):
     found = jaxslam.evaluate_log(tmp_path / "log.csv")
     e[4, 5:], P[4, 5:] = np.nan, np.nan
     np.testing.assert_allclose(found.nees, jaxslam.evaluate(e, P).nees, rtol=1e-12)
-    assert "2 of 35 steps are not compared (2 of run 4)" in str(found)
+    assert "2 of 35 steps are not compared (run 4: 2)" in str(found)
     plot_evaluation(found, tmp_path / "evaluation.png")
 
 

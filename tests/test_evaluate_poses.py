@@ -401,7 +401,7 @@ def test_poses_that_were_not_logged_change_nothing_of_the_others(align, joint):
         np.testing.assert_allclose(found.errors[run, steps], alone.errors[0], atol=1e-12)
         np.testing.assert_allclose(found.sigmas[run, steps], alone.sigmas[0], rtol=1e-9)
         assert found.logged[run].sum() == len(steps)
-    assert "4 of 24 steps are not compared (3 of run 1, 1 of run 2)" in str(found)
+    assert "4 of 24 steps are not compared (run 1: 3, run 2: 1)" in str(found)
     json.dumps(found.asdict(), allow_nan=False)
 
 
@@ -509,14 +509,134 @@ def test_poses_in_arrays_are_those_in_files(tmp_path):
     )
 
 
-def test_runs_of_unlike_length_are_compared_as_far_as_all_go(tmp_path):
+def test_runs_of_unlike_length_in_folders_are_compared_as_far_as_each_goes(tmp_path):
     T, P, truth = logged(Convention(), runs=3)
     write_runs(tmp_path, T, P, truth, Convention())
-    write_tum(tmp_path / "run01" / "truth.txt", np.arange(4) / 10, truth[1, :4])
+    times = np.arange(6) / 10
+    write_tum(tmp_path / "run01" / "truth.txt", times[:4], truth[1, :4])
+    write_tum(tmp_path / "run02" / "estimate.txt", times[:5], T[2, :5])
     found = jaxslam.evaluate_log(tmp_path)
-    assert found.steps == 4
-    assert "2 of 18 poses have no truth within 0.01 s" in str(found)
-    assert "runs have 4 to 6 steps; the first 4 are compared" in str(found)
+    arrays = jaxslam.evaluate_poses(T, P, truth)
+    assert found.steps == 6
+    there = np.ones((3, 6), bool)
+    there[1, 4:], there[2, 5:] = False, False
+    np.testing.assert_array_equal(found.logged, there)
+    np.testing.assert_allclose(found.nees[there], arrays.nees[there], rtol=1e-4)
+    assert "3 of 18 steps are not compared (run01: 2, run02: 1)" in str(found)
+    assert "2 of 17 poses have no truth within 0.01 s, and are left out" in str(found)
+    assert "1 of 18 covariances are at no time of the estimate" in str(found)
+    assert "1 of 16 true poses are at no time of the estimate" in str(found)
+    assert "runs have 5 to 6 poses" in str(found)
+
+
+def one_run(folder, steps=40, offset=0.0, shown=None):
+    """Files of one run of ten poses a second; the truth is later, and times are as they are shown
+    in the files that are named."""
+    T, P, truth = (x[0] for x in logged(Convention(), runs=1, steps=steps))
+    folder.mkdir(parents=True, exist_ok=True)
+    times = 1.4e9 + np.arange(steps) / 10
+    write_tum(folder / "estimate.txt", times, T)
+    write_covariances(folder / "covariance.txt", times, P, Convention())
+    write_tum(folder / "truth.txt", times + offset, truth)
+    for name, of in (shown or {}).items():
+        rows = [line.split(maxsplit=1) for line in (folder / name).read_text().splitlines()[1:]]
+        (folder / name).write_text("".join(f"{of(float(t))} {rest}\n" for t, rest in rows))
+    return folder
+
+
+def nanoseconds(t):
+    return f"{round(t * 1e9)}"
+
+
+FILES = ("estimate.txt", "covariance.txt", "truth.txt")
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"offset": 0.05}, "truth.txt have no time stamps in common"),
+        ({"shown": dict.fromkeys(FILES, nanoseconds)}, "1.4e.18 look like nanoseconds; seconds"),
+        ({"shown": {"covariance.txt": nanoseconds}}, "covariance.txt: times .* like nanoseconds"),
+        ({"shown": {"truth.txt": lambda t: f"{t * 1e3:.0f}"}}, "truth.txt: .* like milliseconds"),
+        (
+            {"shown": dict.fromkeys(FILES, lambda t: f"{(t - 1.4e9) * 1e9:.0f}")},
+            r"times 1e\+08 from one to the next look like nanoseconds",
+        ),
+        (
+            {"shown": dict.fromkeys(FILES, lambda t: f"{t:g}")},
+            "its 40 lines have 1 different times, as if printed with too few digits",
+        ),
+        (
+            {"shown": {"truth.txt": lambda t: f"{t + (t > 1.4e9 + 0.7) * 0.03:.9f}"}},
+            r"of its 40 times .* only 8 can be compared: 40 have a covariance .* 8 a truth\. "
+            r".*truth\.txt holds 40 times .* nearest is 0\.03 s away",
+        ),
+        (
+            {"shown": {"truth.txt": lambda t: f"{1.4e9 + (t - 1.4e9) % 2:.9f}"}},
+            "times go back from 1400000001.900 to 1400000000.000 s; one run",
+        ),
+    ],
+)
+def test_a_log_of_which_most_would_not_be_compared_is_refused_with_the_reason(
+    given, message, tmp_path
+):
+    with pytest.raises(ValueError, match=message) as caught:
+        jaxslam.evaluate_log(one_run(tmp_path / "run", **given))
+    assert "\n" not in str(caught.value)
+
+
+def test_files_of_other_rates_are_compared_where_they_meet(tmp_path):
+    """A truth of every third pose is compared whole, as one of ten times as many is."""
+    run = one_run(tmp_path / "run", shown=None)
+    lines = (run / "truth.txt").read_text().splitlines()
+    (run / "truth.txt").write_text("\n".join(lines[1::3]))
+    found = jaxslam.evaluate_log(run)
+    assert found.logged.sum() == 14
+    assert "26 of 40 poses have no truth" in str(found)
+
+
+def test_a_truth_of_a_small_part_of_the_time_is_refused(tmp_path):
+    run = one_run(tmp_path / "run")
+    lines = (run / "truth.txt").read_text().splitlines()
+    (run / "truth.txt").write_text("\n".join(lines[:16]))
+    with pytest.raises(ValueError, match=r"only 15 can be compared.* half of the lines"):
+        jaxslam.evaluate_log(run)
+
+
+def test_times_of_arrays_are_seconds_too():
+    T, P, truth = logged(Convention(), runs=1)
+    with pytest.raises(ValueError, match=r"times 1e.08 from one to the next look like nanoseconds"):
+        jaxslam.evaluate_poses(T, P, truth, times=np.arange(6) * 100_000_000)
+
+
+def test_steps_at_other_times_in_other_runs_are_counted_and_it_is_said(tmp_path):
+    T, P, truth = logged(Convention(), runs=2)
+    write_runs(tmp_path, T, P, truth, Convention())
+    assert "steps are counted" not in str(jaxslam.evaluate_log(tmp_path))
+    slower = np.arange(6) / 5
+    write_tum(tmp_path / "run01" / "estimate.txt", slower, T[1])
+    write_covariances(tmp_path / "run01" / "covariance.txt", slower, P[1], Convention())
+    write_tum(tmp_path / "run01" / "truth.txt", slower, truth[1])
+    told = str(jaxslam.evaluate_log(tmp_path))
+    assert "their times differ between runs, and are those of run00" in told
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ("run00/trajectory.txt", r"run00: holds estimate\.txt and trajectory\.txt; one of them"),
+        ("run00/groundtruth.txt", r"run00: holds truth\.txt and groundtruth\.txt; one of them"),
+        ("estimate.txt", r"holds a run, and others in sub-folders \(run00, run01\)"),
+    ],
+)
+def test_files_of_two_runs_are_not_mixed(more, message, tmp_path):
+    write_runs(tmp_path, *logged(Convention(), runs=2), Convention())
+    (tmp_path / more).write_text((tmp_path / "run01" / "estimate.txt").read_text())
+    with pytest.raises(ValueError, match=message):
+        jaxslam.evaluate_log(tmp_path)
+
+
+STAMPS, LEFT = np.arange(6) / 10, Convention("left")
 
 
 @pytest.mark.parametrize(
@@ -530,14 +650,14 @@ def test_runs_of_unlike_length_are_compared_as_far_as_all_go(tmp_path):
         ),
         (
             lambda f: write_covariances(
-                f / "run01" / "covariance.txt", [0.0], np.eye(6)[None], Convention("left")
+                f / "run01" / "covariance.txt", STAMPS, np.tile(np.eye(6), (6, 1, 1)), LEFT
             ),
             "says another convention",
         ),
         (lambda f: (f / "run01" / "covariance.txt").write_bytes(b"\xff\xfe"), "not a text file"),
         (
             lambda f: write_covariances(
-                f / "run01" / "covariance.txt", [0.0], -np.eye(6)[None], Convention()
+                f / "run01" / "covariance.txt", STAMPS, np.tile(-np.eye(6), (6, 1, 1)), Convention()
             ),
             "run 1, step 0 has variance -1",
         ),

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
+from jaxslam.tum import check_seconds
+
 ASYMMETRY = 1e-5
 """Of a covariance, in σ of its two axes: what rounding to six digits leaves is less."""
 ROUNDING = 1e-8
@@ -104,6 +106,7 @@ def step_times(times: ArrayLike | None, steps: int) -> Float[np.ndarray, " steps
         array = np.empty(0)
     if array.shape != (steps,) or not np.isfinite(array).all() or (np.diff(array) < 0).any():
         raise ValueError(f"times must be {steps} finite seconds, one a step, that do not decrease")
+    check_seconds("times", array)
     return array
 
 

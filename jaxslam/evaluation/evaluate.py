@@ -196,9 +196,9 @@ class Evaluation:
         if not missing.any():
             return []
         most = np.argsort(-missing, kind="stable")[: min(_TOLD, np.count_nonzero(missing))]
-        told = ", ".join(f"{missing[run]} of {self._run(int(run))}" for run in most)
+        told = ", ".join(f"{self._run(int(run))}: {missing[run]}" for run in most)
         more = np.count_nonzero(missing) - len(most)
-        told += f" and some of {more} other run{'s' if more > 1 else ''}" if more else ""
+        told += f", and {more} more run{'s' if more > 1 else ''}" if more else ""
         return [
             f"{missing.sum()} of {self.nees.size} steps are not compared ({told}); each run is "
             "averaged over the steps that it has, each step over the runs that have it"

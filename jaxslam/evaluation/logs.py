@@ -2,49 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, associated
-from jaxslam.evaluation.convention import CHOICES, Convention
-from jaxslam.evaluation.covariance_text import read_covariances
+from jaxslam.evaluation.convention import CHOICES
 from jaxslam.evaluation.evaluate import Evaluation, evaluate
 from jaxslam.evaluation.poses import evaluate_poses
+from jaxslam.evaluation.trajectories import evaluate_runs, named, runs_of, stated_before
 from jaxslam.files import read_arrays
 from jaxslam.lookup import suggestion
-from jaxslam.tum import read_table, read_tum, words
+from jaxslam.tum import read_table, words
 
-ESTIMATES = ("estimate.txt", "trajectory.txt")
-COVARIANCES = ("covariance.txt",)
-TRUTHS = ("truth.txt", "groundtruth.txt")
 _KEYS = (
     "errors", "innovations", "covariances", "estimates", "truths", "times", "names", *CHOICES,
 )  # fmt: skip
 _CONTENTS = (
     "errors and covariances, innovations and covariances, or estimates, covariances and truths"
 )
-
-
-class Run(NamedTuple):
-    """One trajectory: where its files are."""
-
-    estimate: Path
-    covariance: Path
-    truth: Path
-
-
-class _Associated(NamedTuple):
-    times: Float[np.ndarray, " n"]
-    estimates: Float[np.ndarray, "n 4 4"]
-    covariances: Float[np.ndarray, "n 6 6"]
-    truths: Float[np.ndarray, "n 4 4"]
-    said: dict[str, str]
-    logged: int
 
 
 def evaluate_log(
@@ -72,18 +50,10 @@ def evaluate_log(
             if value is not None:
                 raise ValueError(f"{source}: a {name} file goes with a trajectory, not with arrays")
         arrays = _npz(source) if source.suffix == ".npz" else _csv(source)
-        return _named(source, lambda: _evaluate_arrays(arrays, stated, align, nis))
+        return named(source, lambda: _evaluate_arrays(arrays, stated, align, nis))
     if nis:
         raise ValueError(f"{source}: innovations come in an npz or CSV file, not in a trajectory")
-    return _evaluate_runs(_runs(source, covariance, truth), stated, align)
-
-
-def _named(source: Path, evaluation: Callable[[], Evaluation]) -> Evaluation:
-    """With the file's name in every error."""
-    try:
-        return evaluation()
-    except ValueError as error:
-        raise ValueError(f"{source}: {error}") from None
+    return evaluate_runs(runs_of(source, covariance, truth), stated, align)
 
 
 def _evaluate_arrays(
@@ -97,7 +67,7 @@ def _evaluate_arrays(
     times, P = arrays.get("times"), arrays["covariances"]
     if held == ["estimates"]:
         said = {name: str(arrays[name]) for name in CHOICES if name in arrays}
-        convention = _stated(said, stated)
+        convention = stated_before(said, stated)
         truths = arrays["truths"]
         return evaluate_poses(arrays["estimates"], P, truths, convention, align=align, times=times)
     if stated or align != "none":
@@ -108,13 +78,6 @@ def _evaluate_arrays(
     quantity = "NIS" if nis or held == ["innovations"] else "NEES"
     names = [str(name) for name in np.ravel(arrays.get("names", ()))]
     return evaluate(arrays[held[0]], P, times=times, names=names, quantity=quantity)
-
-
-def _stated(said: dict[str, str], stated: dict[str, str]) -> Convention:
-    """What is stated before what is said; axes that were said are of the error that was."""
-    if "error" in stated:
-        said = {name: value for name, value in said.items() if name != "axes"}
-    return Convention(**(said | stated))
 
 
 def _npz(path: Path) -> dict[str, Any]:
@@ -167,107 +130,3 @@ def _rectangle(
             "steps that are counted alike in all runs are accepted, as from the start of each"
         )
     return (run, step), len(runs), len(steps)
-
-
-def _runs(source: Path, covariance: str | Path | None, truth: str | Path | None) -> tuple[Run, ...]:
-    """The files of every run."""
-    if source.is_dir():
-        if _first(source, ESTIMATES) is not None:
-            return (_run(source, covariance, truth),)
-        if covariance is not None:
-            raise ValueError(f"{source}: with many runs each needs a covariance.txt of its own")
-        folders = sorted(x for x in source.iterdir() if x.is_dir() and x.name[0] != ".")
-        if not folders:
-            raise ValueError(f"{source}: holds neither {ESTIMATES[0]} nor sub-folders, one a run")
-        return tuple(_run(folder, None, truth) for folder in folders)
-    for name, value in (("covariance", covariance), ("truth", truth)):
-        if value is None:
-            raise ValueError(
-                f"{source}: a trajectory needs a {name} file beside it (--{name} FILE); arrays "
-                "come as .npz or .csv"
-            )
-    return (Run(source, Path(str(covariance)), Path(str(truth))),)
-
-
-def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) -> Run:
-    def found(given: str | Path | None, names: tuple[str, ...]) -> Path:
-        path = _first(folder, names) if given is None else Path(given)
-        if path is None:
-            raise ValueError(f"{folder}: holds no {' or '.join(names)}")
-        return path
-
-    return Run(found(None, ESTIMATES), found(covariance, COVARIANCES), found(truth, TRUTHS))
-
-
-def _first(folder: Path, names: tuple[str, ...]) -> Path | None:
-    return next((folder / name for name in names if (folder / name).is_file()), None)
-
-
-def _evaluate_runs(runs: tuple[Run, ...], stated: dict[str, str], align: str) -> Evaluation:
-    read = [_read(run) for run in runs]
-    for run, one in zip(runs, read, strict=True):
-        if one.said != read[0].said:
-            raise ValueError(
-                f"{run.covariance}: says another convention ({Convention(**one.said)}) than "
-                f"{runs[0].covariance} ({Convention(**read[0].said)})"
-            )
-    steps = min(len(one.times) for one in read)
-    convention = _stated(read[0].said, stated)
-
-    def all_of(name: str) -> np.ndarray:
-        return np.stack([getattr(one, name)[:steps] for one in read])
-
-    found = _named(
-        runs[0].estimate if len(runs) == 1 else runs[0].estimate.parent.parent,
-        lambda: evaluate_poses(
-            all_of("estimates"),
-            all_of("covariances"),
-            all_of("truths"),
-            convention,
-            align=align,
-            times=read[0].times[:steps],
-        ),
-    )
-    told = tuple(_left_out(runs, read, steps))
-    if not read[0].said and not stated:
-        told += (f"the file does not say its convention; assumed: {convention}",)
-    return replace(found, notes=(*found.notes, *told))
-
-
-def _left_out(runs: tuple[Run, ...], read: list[_Associated], steps: int) -> Iterator[str]:
-    logged, paired = sum(one.logged for one in read), sum(len(one.times) for one in read)
-    if paired < logged:
-        yield f"{logged - paired} of {logged} poses have no truth within {MAX_TIME_DIFFERENCE} s"
-    longest = max(len(one.times) for one in read)
-    if longest > steps:
-        yield f"runs have {steps} to {longest} steps; the first {steps} are compared"
-
-
-def _read(run: Run) -> _Associated:
-    """One run, pose by pose of the same time."""
-    times, estimates = read_tum(run.estimate)
-    text, (true_times, truths) = read_covariances(run.covariance), read_tum(run.truth)
-    with_P, of_P = _times_in_common(run.estimate, times, run.covariance, text.times)
-    times, estimates, P = times[with_P], estimates[with_P], text.covariances[of_P]
-    with_truth, of_truth = _times_in_common(run.estimate, times, run.truth, true_times)
-    return _Associated(
-        times[with_truth],
-        estimates[with_truth],
-        P[with_truth],
-        truths[of_truth],
-        text.said,
-        len(times),
-    )
-
-
-def _times_in_common(
-    path: Path, times: np.ndarray, other: Path, other_times: np.ndarray
-) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    ours, theirs = associated(times, other_times)
-    if not len(ours):
-        spans = (f"{x.min():.3f}–{x.max():.3f} s" for x in (times, other_times))
-        raise ValueError(
-            f"{path} and {other} have no time stamps in common within {MAX_TIME_DIFFERENCE} s: "
-            f"{' and '.join(spans)}"
-        )
-    return ours, theirs

@@ -90,10 +90,17 @@ def plot_nees(
     ax.set_ylim(min(bottom, evaluation.dof / 2), max(top, evaluation.dof * 2))
     name_numbers(ax.yaxis)
     ax.set_ylabel(f"mean {evaluation.quantity} (ideal {evaluation.dof})")
-    many = f"{evaluation.runs} runs" if evaluation.runs > 1 else "one run"
-    told = f"{evaluation.quantity} of {many}\ngrey: exact 95 % band of one step"
+    told = f"{evaluation.quantity} of {_runs(evaluation)}\ngrey: exact 95 % band of one step"
     set_title(ax, told)
     return _over_time(evaluation, ax)
+
+
+def _runs(evaluation: Evaluation) -> str:
+    """Of how many runs the means are."""
+    least = int(evaluation.runs_of_step.min())
+    if 0 < least < evaluation.finite.sum():
+        return f"{least} to {evaluation.runs} runs"
+    return f"{evaluation.runs} runs" if evaluation.runs > 1 else "one run"
 
 
 def _band(evaluation: Evaluation, ax: Axes) -> None:

@@ -1,0 +1,269 @@
+"""Runs as files: trajectories with covariances and truths, paired by time, to a verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, associated
+from jaxslam.evaluation.convention import Convention
+from jaxslam.evaluation.covariance_text import read_covariances
+from jaxslam.evaluation.evaluate import Evaluation
+from jaxslam.evaluation.poses import evaluate_poses
+from jaxslam.tum import check_seconds, read_tum
+
+ESTIMATES = ("estimate.txt", "trajectory.txt")
+COVARIANCES = ("covariance.txt",)
+TRUTHS = ("truth.txt", "groundtruth.txt")
+LEAST_SHARE = 0.5
+"""Of the poses that could be compared, and of the time of the estimate, so much must be."""
+_WITHIN = f"within {MAX_TIME_DIFFERENCE} s"
+
+
+class Run(NamedTuple):
+    """One trajectory: what it is called, and where its files are."""
+
+    name: str
+    estimate: Path
+    covariance: Path
+    truth: Path
+
+
+_File: TypeAlias = tuple[Path, np.ndarray]
+"""Where it is, and its times."""
+
+
+class _Found(NamedTuple):
+    """What a file holds, at the times of the estimate; NaN where it holds nothing."""
+
+    times: Float[np.ndarray, " m"]
+    """Its own."""
+    values: Float[np.ndarray, "n d d"]
+    used: int
+    """How many of its own are at times of the estimate."""
+
+    @property
+    def there(self) -> Bool[np.ndarray, " n"]:
+        return ~np.isnan(self.values[:, 0, 0])
+
+
+class _Logged(NamedTuple):
+    """A run, pose by pose of its estimate."""
+
+    run: Run
+    times: Float[np.ndarray, " n"]
+    estimates: Float[np.ndarray, "n 4 4"]
+    covariances: _Found
+    truths: _Found
+    said: dict[str, str]
+
+
+def runs_of(
+    source: Path, covariance: str | Path | None, truth: str | Path | None
+) -> tuple[Run, ...]:
+    """The files of every run. Raises ValueError where one is not there, or two could be meant."""
+    if not source.is_dir():
+        for name, value in (("covariance", covariance), ("truth", truth)):
+            if value is None:
+                raise ValueError(
+                    f"{source}: a trajectory needs a {name} file beside it (--{name} FILE); "
+                    "arrays come as .npz or .csv"
+                )
+        return (Run(source.stem, source, Path(str(covariance)), Path(str(truth))),)
+    folders = sorted(x for x in source.iterdir() if x.is_dir() and x.name[0] != ".")
+    if _only(source, ESTIMATES) is not None:
+        if runs := [folder.name for folder in folders if _only(folder, ESTIMATES) is not None]:
+            raise ValueError(
+                f"{source}: holds a run, and others in sub-folders ({', '.join(runs[:3])}); a "
+                "folder of one run, or one of sub-folders, is accepted"
+            )
+        return (_run(source, covariance, truth),)
+    if covariance is not None:
+        raise ValueError(f"{source}: with many runs each needs a covariance.txt of its own")
+    if not folders:
+        raise ValueError(f"{source}: holds neither {ESTIMATES[0]} nor sub-folders, one a run")
+    return tuple(_run(folder, None, truth) for folder in folders)
+
+
+def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) -> Run:
+    def found(given: str | Path | None, names: tuple[str, ...]) -> Path:
+        path = _only(folder, names) if given is None else Path(given)
+        if path is None:
+            raise ValueError(f"{folder}: holds no {' or '.join(names)}")
+        return path
+
+    files = found(None, ESTIMATES), found(covariance, COVARIANCES), found(truth, TRUTHS)
+    return Run(folder.resolve().name, *files)
+
+
+def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
+    """The one file of these names. Raises ValueError where there are two, maybe of two runs."""
+    there = [folder / name for name in names if (folder / name).is_file()]
+    if len(there) > 1:
+        raise ValueError(
+            f"{folder}: holds {' and '.join(path.name for path in there)}; one of them is accepted"
+        )
+    return there[0] if there else None
+
+
+def evaluate_runs(runs: tuple[Run, ...], stated: dict[str, str], align: str) -> Evaluation:
+    """The verdict on them, in the convention that is stated, or else said in the files."""
+    read = [_read(run) for run in runs]
+    for one in read:
+        if one.said != read[0].said:
+            raise ValueError(
+                f"{one.run.covariance}: says another convention ({Convention(**one.said)}) than "
+                f"{runs[0].covariance} ({Convention(**read[0].said)})"
+            )
+    convention = stated_before(read[0].said, stated)
+    longest = max(read, key=lambda one: len(one.times))
+    found = named(
+        runs[0].estimate if len(runs) == 1 else runs[0].estimate.parent.parent,
+        lambda: evaluate_poses(
+            _filled_up([one.estimates for one in read]),
+            _filled_up([one.covariances.values for one in read]),
+            _filled_up([one.truths.values for one in read]),
+            convention,
+            align=align,
+            times=longest.times,
+        ),
+    )
+    told = (*_left_out(read), *_other_times(read, longest))
+    if not read[0].said and not stated:
+        told += (f"the file does not say its convention; assumed: {convention}",)
+    names = tuple(run.name for run in runs)
+    return replace(found, notes=(*found.notes, *told), run_names=names)
+
+
+def _filled_up(runs: list[np.ndarray]) -> np.ndarray:
+    """All of them in one array, with NaN behind those that are shorter than the longest."""
+    result = np.full((len(runs), max(map(len, runs)), *runs[0].shape[1:]), np.nan)
+    for whole, run in zip(result, runs, strict=True):
+        whole[: len(run)] = run
+    return result
+
+
+def stated_before(said: dict[str, str], stated: dict[str, str]) -> Convention:
+    """What is stated before what is said; axes that were said are of the error that was."""
+    if "error" in stated:
+        said = {name: value for name, value in said.items() if name != "axes"}
+    return Convention(**(said | stated))
+
+
+def named(source: Path, evaluation: Callable[[], Evaluation]) -> Evaluation:
+    """With the file's name in every error."""
+    try:
+        return evaluation()
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
+
+
+def _left_out(read: list[_Logged]) -> Iterator[str]:
+    """A sentence for everything in the files that has no part in the verdict."""
+    logged = sum(len(one.times) for one in read)
+    kinds = ("covariance", [x.covariances for x in read]), ("truth", [x.truths for x in read])
+    for what, found in kinds:
+        if without := logged - sum(int(np.sum(x.there)) for x in found):
+            yield f"{without} of {logged} poses have no {what} {_WITHIN}, and are left out"
+    for what, found in kinds:
+        held = sum(len(x.times) for x in found)
+        if unused := held - sum(x.used for x in found):
+            many = {"covariance": "covariances", "truth": "true poses"}[what]
+            yield f"{unused} of {held} {many} are at no time of the estimate, and are left out"
+    shortest, longest = (f(len(one.times) for one in read) for f in (min, max))
+    if shortest < longest:
+        yield f"runs have {shortest} to {longest} poses"
+
+
+def _other_times(read: list[_Logged], longest: _Logged) -> Iterator[str]:
+    """Steps are counted; a word where they are not at the same times after the first pose."""
+
+    def since(one: _Logged, steps: int) -> np.ndarray:
+        return one.times[:steps] - one.times[0]
+
+    for one in read:
+        steps = len(one.times)
+        if np.abs(since(one, steps) - since(longest, steps)).max() > MAX_TIME_DIFFERENCE:
+            yield (
+                "steps are counted from the first pose of each run; their times differ between "
+                f"runs, and are those of {longest.run.name}"
+            )
+            return
+
+
+def _read(run: Run) -> _Logged:
+    """One run, pose by pose of its estimate. Raises ValueError where few can be compared."""
+    times, estimates = read_tum(run.estimate)
+    text, (true_times, truths) = read_covariances(run.covariance), read_tum(run.truth)
+    files = (run.estimate, times), (run.covariance, text.times), (run.truth, true_times)
+    for path, told in files:
+        _check_times(path, told)
+    covariances = _at_times(files[0], files[1], text.covariances)
+    true = _at_times(files[0], files[2], truths)
+    read = _Logged(run, times, estimates, covariances, true, text.said)
+    _check_share(read)
+    return read
+
+
+def _check_times(path: Path, times: Float[np.ndarray, " n"]) -> None:
+    """Raise ValueError unless times are seconds, of one run, and of their own each."""
+    check_seconds(str(path), times)
+    back = np.flatnonzero(np.diff(times) < 0)
+    if back.size:
+        raise ValueError(
+            f"{path}: times go back from {times[back[0]]:.3f} to {times[back[0] + 1]:.3f} s; one "
+            "run, in order of time, is accepted"
+        )
+    different = len(np.unique(times))
+    if different < LEAST_SHARE * len(times):
+        raise ValueError(
+            f"{path}: its {len(times)} lines have {different} different times, as if printed with "
+            "too few digits; a time of its own for each is accepted"
+        )
+
+
+def _at_times(ours: _File, theirs: _File, values: Float[np.ndarray, "m ..."]) -> _Found:
+    """The values at our times. Raises ValueError where there is none."""
+    (path, times), (other, other_times) = ours, theirs
+    at, of = associated(times, other_times)
+    if not len(at):
+        spans = " and ".join(f"{x.min():.3f}–{x.max():.3f} s" for x in (times, other_times))
+        raise ValueError(f"{path} and {other} have no time stamps in common {_WITHIN}: {spans}")
+    result = np.full((len(times), *values.shape[1:]), np.nan)
+    nearest_last = np.argsort(-np.abs(times[at] - other_times[of]), kind="stable")
+    result[at[nearest_last]] = values[of[nearest_last]]
+    return _Found(other_times, result, len(np.unique(of)))
+
+
+def _check_share(read: _Logged) -> None:
+    """Raise ValueError where most of a run would not be compared."""
+    others = (read.run.covariance, read.covariances), (read.run.truth, read.truths)
+    there = read.covariances.there & read.truths.there
+    fewest = min(len(x) for x in (read.times, read.covariances.times, read.truths.times))
+    enough = np.sum(there) >= LEAST_SHARE * fewest
+    if enough and _span(read.times[there]) >= LEAST_SHARE * _span(read.times):
+        return
+    path, worse = min(others, key=lambda other: int(np.sum(other[1].there)))
+    after = np.clip(np.searchsorted(worse.times, read.times), 1, max(len(worse.times) - 1, 1))
+    beside = worse.times[np.minimum([after - 1, after], len(worse.times) - 1)]
+    away = float(np.median(np.abs(beside - read.times).min(axis=0)))
+    raise ValueError(
+        f"{read.run.estimate}: of its {_held(read.times)} only {np.sum(there)} can be compared: "
+        f"{np.sum(read.covariances.there)} have a covariance {_WITHIN}, and "
+        f"{np.sum(read.truths.there)} a truth. {path} holds {_held(worse.times)}, of which the "
+        f"nearest is {away:.3g} s away (median). A verdict needs half of the lines of the shortest "
+        "file, over half of the estimate's time"
+    )
+
+
+def _held(times: Float[np.ndarray, " n"]) -> str:
+    return f"{len(times)} times from {times[0]:.3f} to {times[-1]:.3f} s"
+
+
+def _span(times: Float[np.ndarray, " n"]) -> float:
+    return float(times[-1] - times[0]) if len(times) else 0.0
