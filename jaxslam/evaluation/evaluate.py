@@ -17,6 +17,7 @@ from jaxslam.consistency.verdict import headline, run_verdict, sentences
 from jaxslam.evaluation.arrays import filled, normalised, paired, step_times, without_known
 from jaxslam.evaluation.convention import Convention
 from jaxslam.evaluation.identify import Identification
+from jaxslam.evaluation.mistakes import Logged, Mistake, mistakes, withheld
 from jaxslam.files import json_numbers, write_json
 from jaxslam.lookup import chosen
 
@@ -68,11 +69,22 @@ class Evaluation:
     @cached_property
     def verdict(self) -> dict[str, Any]:
         """Of one study over all steps, see `jaxslam.consistency.Tally.verdict`."""
-        return run_verdict(self.nees, self.dof, logged=self.logged)
+        found = run_verdict(self.nees, self.dof, logged=self.logged)
+        return withheld(found) if self.mistakes else found
+
+    @cached_property
+    def mistakes(self) -> tuple[Mistake, ...]:
+        """Of logging, as far as they are recognised; then no verdict is said."""
+        numbers = [f"{time:g} s" if self.timed else f"step {time - 1:g}" for time in self.times]
+        factors = [self.axis_verdict(axis) for axis in range(len(self.names))]
+        runs = [self._run(run) for run in range(self.runs)]
+        return mistakes(Logged(self.errors, self.sigmas, self.names, runs, numbers, factors))
 
     @property
     def headline(self) -> str:
         """The verdict in a line."""
+        if self.mistakes:
+            return f"no verdict: {', '.join(mistake.what for mistake in self.mistakes)}"
         return headline(self.verdict).replace("NEES", self.quantity, 1)
 
     @cached_property
@@ -167,6 +179,7 @@ class Evaluation:
             "alignment": self.alignment,
             "suggested": None if self.suggested is None else asdict(self.suggested),
             "identified": None if self.identified is None else self.identified.asdict(),
+            "mistakes": [mistake.told for mistake in self.mistakes],
             "notes": self.remarks,
         }
 
@@ -183,6 +196,8 @@ class Evaluation:
     def __str__(self) -> str:
         told = [line.replace("NEES", self.quantity) for line in sentences(self.verdict)]
         doubt = [] if self.identified is None else [self.identified.sentence]
+        if self.mistakes:
+            told, doubt = [self.headline, *(mistake.told for mistake in self.mistakes)], []
         return "\n".join([*told, *doubt, "", *self._table(), *self.remarks])
 
     @property
@@ -210,8 +225,9 @@ class Evaluation:
     def _table(self) -> list[str]:
         low, high = self.band95
         runs = f"{self.runs} run{'s' if self.runs > 1 else ''}"
+        steps = f"{self.steps} step{'s' if self.steps > 1 else ''}"
         return [
-            f"{runs} of {self.steps} steps; mean {self.quantity} of a consistent filter "
+            f"{runs} of {steps}; mean {self.quantity} of a consistent filter "
             f"{self.dof}, at one step in {low:.3f}–{high:.3f} with 95 %; "
             f"{self.inside:.0%} of the steps are inside",
             _columns("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),

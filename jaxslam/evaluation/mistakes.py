@@ -1,0 +1,224 @@
+"""Mistakes of logging, which make the numbers of a right filter wrong, recognised and named.
+
+Each is told from what a filter can do by itself, and says how rarely it is seen by chance.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+FALSE_ALARM = 1e-4
+"""Studies of right runs that are taken for ones with runs and steps interchanged, at the most."""
+DEGREES = 180 / np.pi
+_PERIODS = ((2 * np.pi, "2π", "(−π, π]"), (360.0, "360°", "(−180°, 180°]"))
+_FAR, _NEAR = 8.0, 5.0
+"""An error beyond so many σ is not one of its axis; within so many of a full turn it is."""
+_WIDEST = {True: 1.0, None: 0.5}
+"""Rad from a full turn, of an axis that is known for an angle and of one that may be."""
+_WRONG = 5.0
+"""An axis whose σ may be right up to this factor is in its unit."""
+_NARROW = 2.0
+"""Interval of a factor, upper by lower end, that tells 57 from its neighbours."""
+_CORRELATED = 0.3
+"""Neighbours that correlate less may be strangers."""
+_MANY = 300
+"""Runs and steps that are looked at for correlations."""
+_ANGLES = re.compile(
+    r"r[xyz]|rot.*|[θφψαβ].*|.*(theta|phi|psi|heading|yaw|roll|pitch|angle|orient|bearing"
+    r"|attitude|azimuth|elevation).*",
+    re.IGNORECASE,
+)
+_LENGTHS = re.compile(
+    r"[ptv]?_?[xyz]|.*(pos|vel|speed|range|dist|depth|height|scale).*", re.IGNORECASE
+)
+
+
+class Mistake(NamedTuple):
+    """One that was found."""
+
+    what: str
+    """In a few words."""
+    told: str
+    """A sentence: where, by how much, and what to do."""
+
+
+class Logged(NamedTuple):
+    """What is looked at, NaN where nothing was logged."""
+
+    errors: Float[np.ndarray, "runs steps n"]
+    sigmas: Float[np.ndarray, "runs steps n"]
+    names: Sequence[str]
+    """Of the axes."""
+    runs: Sequence[str]
+    """Names of the runs."""
+    steps: Sequence[str]
+    """What the steps are called, as `step 7`, from 0, or `0.3 s`."""
+    factors: Sequence[Mapping[str, Any]]
+    """Of every axis, `sigma_factor` and `interval99`."""
+
+
+def mistakes(logged: Logged) -> tuple[Mistake, ...]:
+    """All that are found."""
+    kinds = [_is_angle(name) for name in logged.names]
+    return (*_unwrapped(logged, kinds), *_degrees(logged, kinds), *_interchanged(logged))
+
+
+def withheld(found: dict[str, Any]) -> dict[str, Any]:
+    """A verdict of which no word is believed, as the data are not what they are said to be."""
+    parts = {key: withheld(x) if isinstance(x, dict) else x for key, x in found.items()}
+    return parts | {"word": "cannot tell"} if "word" in found else parts
+
+
+def _is_angle(name: str) -> bool | None:
+    """By the name of an axis; None where that does not tell."""
+    return True if _ANGLES.fullmatch(name) else False if _LENGTHS.fullmatch(name) else None
+
+
+def _unwrapped(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake]:
+    """Angles whose errors are near a full turn, and never between that and none.
+
+    Of Gaussian errors with the σ that is claimed one number in 10¹⁵ is beyond 8 σ. Of one that is
+    an outlier for another reason the chance to be so near to a turn is 10 σ of 2π, .02 for 1°.
+    """
+    for axis, angle in enumerate(kinds):
+        if angle is False:
+            continue
+        e, sigma = logged.errors[..., axis], logged.sigmas[..., axis]
+        for period, turn, wrapped in _PERIODS:
+            run = _turned(e, sigma, period, _WIDEST[angle] * period / (2 * np.pi))
+            if not run.any():
+                continue
+            where = run[:, None] & (np.abs(e) > period / 2)
+            first = int(np.argmax(run))
+            step = int(np.argmax(where[first]))
+            others = f", and {where.sum() - 1} more" if where.sum() > 1 else ""
+            others += f" in {run.sum()} runs" if run.sum() > 1 else ""
+            yield Mistake(
+                f"an angle is not wrapped ({logged.names[axis]})",
+                f"errors of {logged.names[axis]} are off by full turns, near multiples of {turn} "
+                f"and nowhere between: {e[first, step]:.4g} at {logged.steps[step]} of "
+                f"{logged.runs[first]}{others}; wrap them to {wrapped}",
+            )
+            break
+
+
+def _turned(
+    e: Float[np.ndarray, "runs steps"],
+    sigma: Float[np.ndarray, "runs steps"],
+    period: float,
+    widest: float,
+) -> Bool[np.ndarray, " runs"]:
+    """Runs with an error near a full turn, of which no other is far from none or a full one.
+
+    None where most runs with errors as large have them anywhere.
+    """
+    there, turned = ~np.isnan(e), np.abs(e) > period / 2
+    small = there & ~turned
+    if not turned.any() or not (np.abs(e) < 1e3 * period)[turned].all():
+        return np.zeros(len(e), bool)
+    scale = float(np.median(sigma[there]))
+    if small.any():
+        scale = max(scale, float(np.sqrt(np.mean(e[small] ** 2))))
+    left = np.abs(e - period * np.round(e / period))
+    near = ~there | (left <= min(_NEAR * scale, widest))
+    far = ~turned | (np.abs(e) > _FAR * np.maximum(sigma, scale))
+    found = turned.any(axis=1) & near.all(axis=1) & far.all(axis=1)
+    return found & (found.sum() > turned.any(axis=1).sum() / 2)
+
+
+def _degrees(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake]:
+    """Errors in degrees with covariances in radians, or the other way round.
+
+    σ of the angles is wrong by 180/π, by an interval that excludes 5, and that of no length is.
+    Of axes without a meaning the interval must be narrow. A filter whose σ is wrong by less than 5
+    is never named, but with what its interval misses; one wrong by 40 to 80 times may be.
+    """
+    angles = [axis for axis, kind in enumerate(kinds) if kind]
+    asked = angles or [axis for axis, kind in enumerate(kinds) if kind is None]
+    lengths = [axis for axis, kind in enumerate(kinds) if kind is False]
+    for factor, errors, covariances in (
+        (DEGREES, "degrees", "radians"), (1 / DEGREES, "radians", "degrees"),
+    ):  # fmt: skip
+        found = [axis for axis in asked if _is_factor(logged.factors[axis], factor, bool(angles))]
+        if not found or (angles and found != angles):
+            continue
+        if any(_is_factor(logged.factors[axis], factor, True) for axis in lengths):
+            continue
+        names = ", ".join(logged.names[axis] for axis in found)
+        by = logged.factors[found[0]]["sigma_factor"]
+        yield Mistake(
+            f"degrees where radians belong ({names})",
+            f"errors of {names} look as if they were in {errors} and the covariances in "
+            f"{covariances}: σ should be {by:.3g} times as large, and {_told(factor)}; both in "
+            "radians are accepted",
+        )
+
+
+def _told(factor: float) -> str:
+    return f"180/π is {DEGREES:.3g}" if factor > 1 else f"π/180 is {1 / DEGREES:.3g}"
+
+
+def _is_factor(found: Mapping[str, Any], factor: float, known: bool) -> bool:
+    """Whether σ is wrong by just this factor; without an interval, of one run, only of what is
+    `known`, and only where it is too small, as one number can be small by chance."""
+    by, (low, high) = found["sigma_factor"], found["interval99"]
+    if not by or abs(np.log(by / factor)) > np.log(_NARROW):
+        return False
+    if low is None or high is None:
+        return known and factor > 1
+    apart = low > _WRONG if factor > 1 else high < 1 / _WRONG
+    return bool(low < factor < high and apart and (known or high < _NARROW * low))
+
+
+def _interchanged(logged: Logged) -> Iterator[Mistake]:
+    """Arrays (steps, runs): what is called a run is a step, and resembles the next one.
+
+    Runs may be numbered in any order. Where their own order makes neighbours more alike than all
+    of 10 000 drawn orders do, they are no independent runs; of independent ones once in 10 000
+    studies. Neighbouring steps must be half as alike at the most, so that in practice it is rarer.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        x = np.nan_to_num((logged.errors / logged.sigmas)[:_MANY, :_MANY])
+    x = x / np.hypot(1.0, x)  # an error that is far off counts as one that is somewhat so
+    runs, steps = (_products(np.swapaxes(x, 0, axis)) for axis in (0, 1))
+    ours, theirs = _alike(runs), _alike(steps)
+    if ours < _CORRELATED or theirs > ours / 2 or not _by_order(runs):
+        return
+    yield Mistake(
+        "runs and steps look interchanged",
+        f"neighbouring runs have errors that correlate by {ours:.2f}, neighbouring steps by "
+        f"{theirs:.2f}, as if the arrays were (steps, runs); (runs, steps, …) is accepted, of "
+        "independent runs",
+    )
+
+
+def _products(x: Float[np.ndarray, "k ..."]) -> Float[np.ndarray, "k k"]:
+    flat = x.reshape(len(x), -1)
+    return flat @ flat.T
+
+
+def _alike(products: Float[np.ndarray, "k k"]) -> float:
+    """Correlation of neighbours beyond that of any two."""
+    k = len(products)
+    if k < 3:
+        return 0.0
+    own = float(np.trace(products)) / k
+    any_two = (float(products.sum()) - own * k) / (k * (k - 1))
+    near = float(np.mean(np.diagonal(products, 1)))
+    return (near - any_two) / (own - any_two) if own > any_two else 0.0
+
+
+def _by_order(products: Float[np.ndarray, "k k"]) -> bool:
+    """Whether no other order that is drawn makes neighbours as alike."""
+    rng, k = np.random.default_rng(0), len(products)
+    own, drawn = float(np.sum(np.diagonal(products, 1))), round(1 / FALSE_ALARM) - 1
+    for _ in range(drawn):
+        order = rng.permutation(k)
+        if np.sum(products[order[1:], order[:-1]]) >= own - 1e-9 * abs(own):
+            return False
+    return True

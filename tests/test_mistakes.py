@@ -1,0 +1,176 @@
+"""Mistakes of logging are named; right data, and filters that are wrong themselves, are not."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import jaxslam
+from jaxslam.cli import main
+from jaxslam.evaluation import Convention, write_covariances
+from jaxslam.tum import write_tum
+
+NAMES = ("x", "y", "heading")
+SIGMA = np.array([0.1, 0.1, 0.02])
+DEGREES = np.array([1, 1, 180 / np.pi])
+
+
+def correlated(runs=20, steps=40, n=3, correlation=0.97, seed=0):
+    """Standard normal numbers (runs, steps, n) whose neighbouring steps correlate so much."""
+    rng = np.random.default_rng(seed)
+    now, result = rng.normal(size=(runs, n)), np.empty((runs, steps, n))
+    for step in range(steps):
+        result[:, step] = now
+        new = rng.normal(size=now.shape)
+        now = correlation * now + np.sqrt(1 - correlation**2) * new
+    return result
+
+
+def right(**of):
+    """Errors of a robot in the plane, and covariances that are theirs."""
+    errors = SIGMA * correlated(**of)
+    return errors, np.broadcast_to(np.diag(SIGMA**2), (*errors.shape, 3)).copy()
+
+
+def said(errors, covariances, names=NAMES):
+    """What is in the headline, of an evaluation that withholds its verdict everywhere."""
+    found = jaxslam.evaluate(errors, covariances, names=names)
+    if not found.mistakes:
+        return ""
+    written = json.loads(json.dumps(found.asdict(), allow_nan=False))
+    assert written["verdict"]["word"] == "cannot tell"
+    assert written["mistakes"] == [mistake.told for mistake in found.mistakes]
+    told = str(found).splitlines()
+    assert told[0] == found.headline
+    assert told[1 : 1 + len(found.mistakes)] == written["mistakes"]
+    assert not any(line.startswith("NEES") for line in told)
+    assert not any(word in found.headline for word in ("consistent", "confident", "lost"))
+    return found.headline
+
+
+# --- they are named -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("names", [NAMES, ()])
+@pytest.mark.parametrize("turns", [1, -1, 2])
+def test_an_angle_that_is_not_wrapped_is_named(names, turns):
+    name = names[2] if names else "3"
+    e, P = right()
+    e[3, 12:, 2] += turns * 2 * np.pi
+    assert said(e, P, names) == f"no verdict: an angle is not wrapped ({name})"
+    told = jaxslam.evaluate(e, P, names=names).mistakes[0].told
+    assert f"{e[3, 12, 2]:.4g} at step 12 of run 3, and 27 more; wrap them to (−π, π]" in told
+    e, P = right()
+    e[5, 7, 2] += turns * 2 * np.pi
+    assert "an angle is not wrapped" in said(e, P, names)
+    assert "an angle is not wrapped" in said(e[5:6], P[5:6], names)
+    assert "(1)" in said(e[..., 2:], P[..., 2:, 2:], ())
+
+
+def test_an_angle_in_degrees_is_wrapped_at_360():
+    e, P = right()
+    e, P = e * DEGREES, P * DEGREES * DEGREES[:, None]
+    assert said(e, P) == ""
+    e[3, 12:, 2] -= 360
+    assert said(e, P) == "no verdict: an angle is not wrapped (heading)"
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("names", "name"), [(NAMES, "heading"), ((), "3")])
+def test_degrees_for_radians_are_named(names, name, seed):
+    e, P = right(runs=60, seed=seed)
+    expected = f"no verdict: degrees where radians belong ({name})"
+    assert said(e * DEGREES, P, names) == expected
+    assert said(e, P * DEGREES * DEGREES[:, None], names) == expected
+    only = slice(2, 3)
+    assert "degrees" in said((e * DEGREES)[..., only], P[..., only, only], names[2:])
+
+
+def test_degrees_are_named_in_poses_too(tmp_path, capsys):
+    """A covariance file in degrees that does not say so."""
+    steps, rng = 60, np.random.default_rng(0)
+    sigma = np.array([0.1, 0.1, 0.1, 0.01, 0.02, 0.01])
+    times = np.arange(steps) / 10
+    truth = np.tile(np.eye(4), (steps, 1, 1))
+    truth[:, 0, 3] = times
+    for run in range(12):
+        e = sigma * rng.normal(size=(steps, 6))
+        estimate = truth.copy()
+        estimate[:, :3, 3] -= e[:, :3]
+        estimate[:, :3, :3] = Rotation.from_rotvec(-e[:, 3:]).as_matrix()
+        in_degrees = np.diag(sigma * np.repeat([1, 180 / np.pi], 3)) ** 2
+        folder = tmp_path / "runs" / f"run{run:02}"
+        folder.mkdir(parents=True)
+        write_tum(folder / "estimate.txt", times, estimate)
+        write_tum(folder / "truth.txt", times, truth)
+        P = np.tile(in_degrees, (steps, 1, 1))
+        write_covariances(folder / "covariance.txt", times, P, Convention("split", "mixed"))
+    main(["evaluate", str(tmp_path / "runs"), "--out", str(tmp_path / "out")])
+    out = capsys.readouterr().out
+    assert out.startswith("no verdict: degrees where radians belong (rx, ry, rz)\n")
+    assert "covariances in degrees" in out
+    written = json.loads((tmp_path / "out" / "evaluation.json").read_text())
+    assert written["verdict"]["word"] == "cannot tell"
+
+
+@pytest.mark.parametrize("runs", [1, 3, 20])
+@pytest.mark.parametrize("names", [NAMES, ()])
+def test_arrays_of_steps_and_runs_are_named(runs, names):
+    e, P = (np.swapaxes(x, 0, 1) for x in right(runs=runs, steps=60))
+    assert said(e, P, names) == "no verdict: runs and steps look interchanged"
+
+
+# --- and nothing else is ------------------------------------------------------------------------
+
+SIZES = [(1, 1), (1, 50), (2, 50), (3, 3), (5, 30), (8, 1), (10, 10), (20, 2), (30, 1), (30, 30)]
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.97])
+@pytest.mark.parametrize("size", [0.01, 1.0, 30.0])
+def test_right_data_raise_no_false_alarm(size, correlation):
+    """Of 500 studies .05 are expected to look interchanged, where each is allowed 1 in 10 000."""
+    for runs, steps in SIZES:
+        for seed in range(50):
+            n = 1 + seed % 3
+            e = size * correlated(runs, steps, n, correlation, seed)
+            P = np.broadcast_to(size**2 * np.eye(n), (*e.shape, n))
+            assert said(e, P, NAMES[3 - n :] if seed % 2 else ()) == "", (runs, steps, seed)
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.3, 3.0, 10.0, 20.0])
+def test_a_filter_whose_sigma_is_wrong_is_not_taken_for_a_log_that_is(factor):
+    for seed in range(30):
+        e, P = right(seed=seed)
+        assert said(factor * e, P) == ""
+        assert said(factor * e, P, ()) == ""
+        assert said(e * [factor, factor, 1], P) == ""
+
+
+def test_positions_anywhere_are_no_angles():
+    """Of a filter whose σ is 100 times too small, errors of metres, also of 6.28 m."""
+    for seed in range(30):
+        e = 4 * correlated(n=1, correlation=0.5, seed=seed)
+        assert "wrapped" not in said(e, np.full((*e.shape, 1), 0.03**2), ())
+        few = np.where(np.random.default_rng(seed).random(e.shape) < 0.02, 3 * e, 0.01 * e)
+        assert "wrapped" not in said(few, np.full((*e.shape, 1), 0.04**2), ())
+    e, P = right()
+    e[3, 12:, 0] += 2 * np.pi  # an outlier of a length, by its name
+    assert said(e, P) == ""
+
+
+def test_where_all_of_sigma_is_too_small_by_57_it_is_not_the_unit_of_angles():
+    e, P = right(runs=100)
+    assert said(57.3 * e, P) == ""
+
+
+def test_a_bias_that_all_runs_share_does_not_make_them_steps():
+    for seed in range(20):
+        e, P = right(seed=seed, correlation=0.9)
+        shared = correlated(1, 40, 3, 0.99, seed=1000 + seed)
+        assert said(e + 3 * SIGMA * shared, P) == ""
+
+
+def test_runs_that_are_ordered_by_their_scatter_are_still_runs():
+    e, P = right()
+    assert said(e * np.linspace(0.5, 2, 20)[:, None, None], P) == ""
