@@ -21,14 +21,16 @@ import threading
 import weakref
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from functools import cache
+from dataclasses import fields, is_dataclass
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
-from types import BuiltinFunctionType, FunctionType
+from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 from jax.extend.core import Jaxpr
 
@@ -76,8 +78,8 @@ class Program:
     """A pure function of pytrees, compiled once for each structure of its arguments.
 
     Arrays among their leaves (or `jax.ShapeDtypeStruct`, for `compile`) are data; everything else
-    is part of the program, and is to be hashable. What is traced may be `seen`, with the
-    arguments, before it is compiled.
+    is part of the program, is to be hashable, and is the same only by type and bits (`exactly`).
+    What is traced may be `seen`, with the arguments, before it is compiled.
     """
 
     def __init__(
@@ -105,11 +107,12 @@ class Program:
             self._made.clear()
 
     def _compiled(self, call: _Call) -> _Made:
+        key = exactly(call.key)
         with self._lock:
-            future = self._made.pop(call.key, None)
+            future = self._made.pop(key, None)
             if mine := future is None:
                 future = Future()
-            self._made[call.key] = future  # the last
+            self._made[key] = future  # the last
             while len(self._made) > MOST:
                 del self._made[next(iter(self._made))]
         if mine:
@@ -118,7 +121,7 @@ class Program:
             except BaseException as error:
                 future.set_exception(error)
                 with self._lock:
-                    self._made.pop(call.key, None)
+                    self._made.pop(key, None)
         return future.result()
 
     def _make(self, call: _Call) -> _Made:
@@ -176,6 +179,49 @@ class _Call(NamedTuple):
         rest = iter(arrays)
         leaves = [next(rest) if array else x for array, x in zip(are_arrays, kinds, strict=True)]
         return jax.tree.unflatten(structure, leaves)
+
+
+def exactly(value: Any) -> Any:
+    """A key that equals another's where both values are of one type and have the same bits.
+
+    `==` takes 2 for 2.0, True for 1 and −0.0 for 0.0, which programs do not, and NaN for nothing.
+    What is within tuples, modules, other objects that compare by value and structures of pytrees
+    is compared so too.
+    """
+    kind = type(value)
+    if isinstance(value, jax.tree_util.PyTreeDef):
+        return kind, exactly(value.node_data()), tuple(map(exactly, value.children()))
+    if isinstance(value, float | complex):
+        return kind, np.asarray(value, complex).tobytes()
+    if isinstance(value, np.generic | np.ndarray):
+        return kind, value.dtype, value.shape, value.tobytes()
+    if isinstance(value, dict):
+        return kind, tuple((exactly(k), exactly(x)) for k, x in value.items())
+    if isinstance(value, frozenset):
+        return kind, frozenset(map(exactly, value))
+    if isinstance(value, tuple | list):
+        return kind, tuple(map(exactly, value))
+    if isinstance(value, partial):
+        return kind, exactly((value.func, value.args, value.keywords))
+    if isinstance(value, MethodType):
+        return kind, value.__func__, exactly(value.__self__)
+    if kind.__eq__ is object.__eq__ or isinstance(value, type | FunctionType):
+        return value
+    if is_dataclass(value):
+        return kind, tuple(exactly(getattr(value, f.name, None)) for f in fields(value))
+    return kind, value, exactly(getattr(value, "__dict__", None))
+
+
+class Exact(NamedTuple):
+    """A value as an argument of a cache, which finds it by `exactly`."""
+
+    value: Any
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Exact) and exactly(self.value) == exactly(other.value)
+
+    def __hash__(self) -> int:
+        return hash(exactly(self.value))
 
 
 def wide() -> bool:

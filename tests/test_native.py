@@ -2,6 +2,7 @@
 
 import warnings
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +14,7 @@ from jaxslam.consistency import montecarlo
 from jaxslam.native import NotSupportedError, batched, build
 from jaxslam.native.build import compiler
 from jaxslam.native.elements import Elements
+from jaxslam.programs import Exact
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C++ compiler")
 RUNS = 11
@@ -200,3 +202,23 @@ def test_an_unknown_backend_is_refused():
     filters = jaxslam.make_filters("matched", ["world"], ["inverse_scaling"])
     with pytest.raises(ValueError, match="known: xla, native"):
         jaxslam.monte_carlo("matched", filters, runs=1, backend="tpu")
+
+
+class Powered(eqx.Module):
+    """A filter, as far as its key goes."""
+
+    numbers: jax.Array
+    power: object = eqx.field(static=True)
+
+
+def test_a_filters_fixed_parts_are_the_same_only_by_type_and_bits(monkeypatch):
+    """`x ** 2.0` is not the program of `x ** 2`."""
+    made = []
+    monkeypatch.setattr(montecarlo.native, "batched", lambda *given: made.append(given))
+    montecarlo._native.cache_clear()
+    for power in (2, 2.0, True, 1, 0.0, -0.0, float("nan"), float("nan"), 2, 2.0):
+        leaves, structure = jax.tree.flatten(Powered(None, power))
+        shapes = montecarlo._hashable((None, None, None))
+        montecarlo._native(Exact((tuple(leaves), structure, None, *shapes)))
+    montecarlo._native.cache_clear()
+    assert len(made) == 7

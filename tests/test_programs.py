@@ -1,8 +1,10 @@
 """Programs are made once for each structure, kept whole, and taken back only where they fit."""
 
+import dataclasses
 import operator
 import threading
 import time
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -197,6 +199,66 @@ def test_options_that_the_compiler_does_not_know_are_done_without():
 @pytest.mark.parametrize("options", [programs.ALONE, programs.BATCHED])
 def test_the_compiler_knows_the_options(options):
     jax.jit(jnp.sin).lower(0.0).compile(compiler_options=options["cpu"])
+
+
+class Static(eqx.Module):
+    """A module with a part that is no data."""
+
+    values: jax.Array
+    power: object = eqx.field(static=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """A part that compares by value."""
+
+    power: object
+
+
+NAN = float("nan")
+UNEQUAL = ((2, 2.0), (True, 1), (1.0, True), (-0.0, 0.0))
+PLACES = (
+    lambda x: (x,),
+    lambda x: (((x, "a"),),),
+    lambda x: (Choice(x),),
+    lambda x: (partial(max, x),),
+    lambda x: (Static(jnp.ones(2), x),),
+    lambda x: (Static(jnp.ones(2), Choice((x,))),),
+)
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("two", UNEQUAL, ids=repr)
+def test_parts_are_the_same_only_by_type_and_bits(place, two):
+    def told(*args):
+        traced.append(1)
+        return jnp.ones(())
+
+    program = Program(told)
+    for x in (*two, *two):
+        program(*place(x))
+    assert len(traced) == 2
+    program(*place(NAN))
+    program(*place(float("nan")))
+    assert len(traced) == 3
+
+
+@pytest.mark.parametrize("two", UNEQUAL, ids=repr)
+def test_kept_programs_are_the_same_only_by_type_and_bits(folder, two):
+    for x in (*two, *two):
+        Program(written)(Static(jnp.ones(2), x))
+    assert len(traced) == len(list(folder.iterdir())) == 2
+
+
+def written(module):
+    traced.append(1)
+    return module.values * module.power
+
+
+def test_the_sign_of_a_zero_is_part_of_a_program():
+    program = Program(lambda m: jnp.arctan2(m.power, -m.values))
+    angles = [float(program(Static(jnp.ones(2), x))[0]) for x in (0.0, -0.0)]
+    np.testing.assert_allclose(angles, [np.pi, -np.pi])
 
 
 class Own(eqx.Module):

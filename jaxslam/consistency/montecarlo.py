@@ -37,7 +37,7 @@ from jaxslam.consistency.sums import as_sums, keeps_records
 from jaxslam.geometry import Pose
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.sensors import AbstractSensor
-from jaxslam.programs import BATCHED, Program
+from jaxslam.programs import BATCHED, Exact, Program
 from jaxslam.simulation import (
     Room,
     Run,
@@ -233,7 +233,7 @@ class _Job(NamedTuple):
             numbers, structure = eqx.partition(slam, is_number)
             shapes = _hashable(_shapes((numbers, sensor, batch)))
             with _COMPILING:
-                program = _native(*_hashable(structure), self.room, *shapes)
+                program = _native(Exact((*_hashable(structure), self.room, *shapes)))
             if program is not None:
                 return partial(program, numbers, sensor, batch)
         _filter_batch.compile(slam, self.room, sensor, batch, np.int32(0))
@@ -292,9 +292,10 @@ def _hashable(tree: Any) -> tuple[tuple[Any, ...], Any]:
 
 
 @lru_cache(maxsize=32)
-def _native(leaves, structure, room: Room, shapes, of_data) -> Callable[..., Any] | None:
+def _native(given: Exact) -> Callable[..., Any] | None:
     """What computes as `_filter_batch` does, for a filter of this structure, whatever its numbers,
     and data of these shapes; None, with a warning, where the native backend cannot."""
+    leaves, structure, room, shapes, of_data = given.value
     static = jax.tree.unflatten(structure, leaves)
     numbers, sensor, runs = jax.tree.unflatten(of_data, shapes)
 
