@@ -64,7 +64,7 @@ def test_consistency_resumes_to_more_runs(tmp_path, capsys):
     assert (sums["medians_of"], first["medians_of"]) == (3, 6)
     with pytest.raises(SystemExit):
         main([*few, *in_sums, "--resume"])
-    assert "another reduced (True, now None)" in capsys.readouterr().err
+    assert "another reduced (True, now False)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -182,6 +182,8 @@ def test_a_reduced_study_says_the_same_but_for_its_medians(tmp_path):
     assert sum(x.nbytes for x in kept.values()) < 16 * 8 * 6 * 3
     with pytest.raises(ValueError, match="another reduced"):
         FolderStore(tmp_path, {}, resume=True)
+    with pytest.raises(ValueError, match=r"another reduced \(True, now False\)"):
+        jaxslam.monte_carlo(spoilt, slams, **sizes, store=store)
 
 
 def test_sums_of_something_else_are_refused():

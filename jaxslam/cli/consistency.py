@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,7 +17,6 @@ from jaxslam.consistency import (
     monte_carlo,
     summarise,
     table,
-    treatment,
 )
 from jaxslam.consistency.montecarlo import check_backend, check_sizes, divided
 from jaxslam.consistency.records import check_records, write_records
@@ -33,9 +31,6 @@ from jaxslam.simulation.scenario import (
     parse_override,
     scenario,
 )
-
-LAYOUT = 5
-"""Version of the records on disk, so that `--resume` never mixes two."""
 
 
 @dataclass(frozen=True)
@@ -128,17 +123,7 @@ class ConsistencyOptions:
         check_backend(self.backend)
         world = self._scenario()
         filters = make_filters(world, self.filters, self.landmarks, self.calibration)
-        manifest = {
-            "layout": LAYOUT,
-            "scenario": dataclasses.asdict(world),
-            "calibration": {name: treatment(f) for name, f in filters.items()},
-            "seed": self.seed,
-            "dtype": self.dtype,
-            "chunk": self.chunk,
-            **({} if self.backend == "xla" else {"backend": self.backend}),
-            **({"reduced": True} if self.reduce else {}),
-        }
-        store = FolderStore(self.out / "runs", manifest, resume=self.resume)
+        store = FolderStore(self.out / "runs", resume=self.resume)
         chunks = divided(self.runs, self.chunk)
         done = sum(len(c) for name in filters for c in chunks if store.has(name, c))
         with StudyBar(self.runs * len(filters), done) as progress:

@@ -29,6 +29,7 @@ from jaxslam import native
 from jaxslam.arrays import cast, is_number
 from jaxslam.consistency.beyond_scale import beyond_scale, reversal
 from jaxslam.consistency.cluster import as_tasks, connected
+from jaxslam.consistency.manifest import LAYOUT, Manifest, described, versions
 from jaxslam.consistency.recursion import Frame, run_through
 from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.consistency.store import MemoryStore, Records, Store
@@ -89,7 +90,8 @@ def monte_carlo(
     world.
 
     `progress(filter name, finished runs)` is called after every chunk, and with no runs before
-    the first, when the filter is to be compiled. Chunks that `store` already has are not run again.
+    the first, when the filter is to be compiled. Chunks that `store` already has are not run again;
+    it is told what decides them, and refuses what differs.
 
     With a `cluster`, the address of a Dask scheduler or a `distributed.Client`, the chunks are
     computed there and kept here; their seconds are of all together, compilation among them.
@@ -101,7 +103,7 @@ def monte_carlo(
     A `reduced` study keeps of every chunk but the first only sums over its runs, made where the
     chunk is computed: all of a summary but the medians, which are then the first chunk's.
 
-    Raises ValueError for sizes that make no sense.
+    Raises ValueError for sizes that make no sense, and for a store of another study.
     """
     if not filters or not isinstance(filters, Mapping):
         raise ValueError("no filters by name: a dict is accepted, as make_filters gives it")
@@ -114,6 +116,8 @@ def monte_carlo(
     with jax.enable_x64(dtype == "float64"), connected(cluster) as client:
         each = _side_by_side if client is None else partial(as_tasks, client)
         simulator = _Simulator(scenario, seed, dtype, min(chunk, runs), motion, sensor)
+        made_by = {**simulator.made_by, "chunk": int(chunk), "backend": backend, "reduced": reduced}
+        store.begin(made_by, {name: described(slam) for name, slam in filters.items()})
         missing = {name: [c for c in chunks if not store.has(name, c)] for name in filters}
         room = simulator.room(chunks, each) if any(missing.values()) else None
         for name, slam in filters.items():
@@ -146,6 +150,21 @@ class _Simulator:
         self.sensor = cast(sensor_of(scenario) if sensor is None else sensor, dtype)
         self._own = cast((motion, sensor), dtype)
         self._scenario, self._key = as_data(scenario, dtype), jax.random.key(seed)
+
+    @property
+    def made_by(self) -> Manifest:
+        """What decides which runs are drawn, in which layout their records are kept, and by which
+        versions they are made."""
+        scenario, seed, dtype, _, motion, sensor = self._given
+        return {
+            "layout": LAYOUT,
+            "version": versions(),
+            "scenario": described(scenario),
+            "motion": described(motion),
+            "sensor": described(sensor),
+            "seed": int(seed),
+            "dtype": dtype,
+        }
 
     def __reduce__(self) -> tuple[Any, ...]:
         """For another machine, which has no file of a trajectory, and makes its own key."""

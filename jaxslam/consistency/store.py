@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from jaxslam.consistency.manifest import Manifest, difference
 from jaxslam.files import read_arrays, read_json, write_atomically, write_json
 
 Records = dict[str, np.ndarray]
@@ -20,6 +22,11 @@ SUM = "sum_"
 class Store(Protocol):
     """Records by filter and chunk; a chunk is the range of its runs."""
 
+    def begin(self, made_by: Manifest, filters: Manifest) -> None:
+        """Say what decides the records that follow, and what each filter is. Raises ValueError
+        where others are kept."""
+        ...
+
     def has(self, filter_name: str, chunk: range) -> bool: ...
     def save(self, filter_name: str, chunk: range, records: Records) -> None: ...
     def load(
@@ -28,10 +35,20 @@ class Store(Protocol):
 
 
 class MemoryStore:
-    """Keeps everything, for small studies: `save` a chunk, does it `has` one, `load` it."""
+    """Keeps everything, for small studies: `begin` one, `save` a chunk, does it `has` one, `load`
+    it. Raises ValueError for a study other than the one whose records it keeps."""
 
     def __init__(self) -> None:
         self._records: dict[tuple[str, range], Records] = {}
+        self._made_by: Manifest = {}
+        self._filters: Manifest = {}
+
+    def begin(self, made_by: Manifest, filters: Manifest) -> None:
+        made_by, filters = _as_json(made_by), _as_json(filters)
+        if self._made_by:
+            _check_same("this store's records were", self._made_by, made_by, _ANOTHER_STORE)
+        _check_filters("this store's records were", self._filters, filters, _ANOTHER_STORE)
+        self._made_by, self._filters = made_by, {**self._filters, **filters}
 
     def has(self, filter_name: str, chunk: range) -> bool:
         return (filter_name, chunk) in self._records
@@ -45,38 +62,54 @@ class MemoryStore:
 
 
 class FolderStore:
-    """One file a chunk, written whole or not at all, beside a manifest of what made them: `save` a
-    chunk, does it `has` one, `load` it, which raises ValueError for a damaged file.
+    """One file a chunk, written whole or not at all, beside a manifest of what made them: `begin` a
+    study, `save` a chunk, does it `has` one, `load` it, which raises ValueError for a damaged file.
 
-    `manifest` holds whatever decides a run's result. A folder made with another manifest is
-    refused when `resume` is set, and emptied of its chunks otherwise.
+    A study says itself what decides its results; `manifest` is whatever else does. A folder that
+    was made otherwise is refused when `resume` is set, and emptied of the chunks of its manifest
+    if not. Other files are left alone: one in the place of a chunk, or of the manifest, is refused.
     """
 
-    def __init__(self, folder: Path, manifest: dict[str, Any], *, resume: bool) -> None:
-        self.folder = folder
-        path = folder / "manifest.json"
-        wanted = json.loads(json.dumps(manifest))
-        if resume and path.exists():
-            _check_same(path, read_json(path, "manifest", _as_manifest), wanted)
-            for unfinished in folder.glob("*/.*.npz"):  # by a process that was killed
-                unfinished.unlink(missing_ok=True)
-        else:
-            for old in folder.glob("*/*.npz"):
-                old.unlink()
-            folder.mkdir(parents=True, exist_ok=True)
-            write_json(path, wanted)
+    def __init__(
+        self, folder: Path, manifest: Manifest | None = None, *, resume: bool = False
+    ) -> None:
+        self.folder, self._path = folder, folder / "manifest.json"
+        self._manifest: Manifest = {"given": _as_json(manifest or {}), "made_by": {}, "filters": {}}
+        if self._path.exists():
+            found = read_json(self._path, "manifest", _as_manifest)
+            if resume:
+                self._check("given", found, self._manifest["given"])
+                self._manifest = found
+            for path in self._own(found, unfinished=resume):
+                path.unlink(missing_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(self._path, self._manifest)
+
+    def begin(self, made_by: Manifest, filters: Manifest) -> None:
+        made_by, filters = _as_json(made_by), _as_json(filters)
+        kept = self._manifest
+        if kept["made_by"]:
+            self._check("made_by", kept, made_by)
+        _check_filters(self._made, kept["filters"], filters, _ANOTHER_FOLDER)
+        for name in filters.keys() - kept["filters"].keys():
+            self._check_free(name)
+        self._keep({**kept, "made_by": made_by, "filters": {**kept["filters"], **filters}})
 
     def has(self, filter_name: str, chunk: range) -> bool:
-        return self._path(filter_name, chunk).exists()
+        return filter_name in self._manifest["filters"] and self._chunk(filter_name, chunk).exists()
 
     def save(self, filter_name: str, chunk: range, records: Records) -> None:
-        path = self._path(filter_name, chunk)
+        if filter_name not in self._manifest["filters"]:
+            self._check_free(filter_name)
+            named = {**self._manifest["filters"], filter_name: None}
+            self._keep({**self._manifest, "filters": named})
+        path = self._chunk(filter_name, chunk)
         path.parent.mkdir(parents=True, exist_ok=True)
         with write_atomically(path) as temporary, temporary.open("wb") as file:
             np.savez(file, allow_pickle=False, **records)
 
     def load(self, filter_name: str, chunk: range, names: Iterable[str] | None = None) -> Records:
-        path, names = self._path(filter_name, chunk), None if names is None else list(names)
+        path, names = self._chunk(filter_name, chunk), None if names is None else list(names)
         records = read_arrays(path, names)
         for name in names or ():
             if name not in records:
@@ -84,9 +117,53 @@ class FolderStore:
         _check_records(path, len(chunk), records)
         return records
 
-    def _path(self, filter_name: str, chunk: range) -> Path:
+    @property
+    def _made(self) -> str:
+        return f"cannot resume: {self._path} was"
+
+    def _check(self, key: str, found: Manifest, wanted: Manifest) -> None:
+        _check_same(self._made, found[key], wanted, _ANOTHER_FOLDER)
+
+    def _check_free(self, filter_name: str) -> None:
+        """Raise ValueError for files in the places of a filter's chunks, which nobody named."""
+        for path in _chunks(self.folder / _folder_of(filter_name)):
+            raise ValueError(f"{path} is of no study that is kept here; use another folder")
+
+    def _keep(self, manifest: Manifest) -> None:
+        """Named before it is written: what a manifest does not name is not its study's."""
+        if manifest != self._manifest:
+            write_json(self._path, manifest)
+            self._manifest = manifest
+
+    def _own(self, manifest: Manifest, *, unfinished: bool) -> list[Path]:
+        """The files of a manifest's chunks, or only those that a process began that was killed."""
+        folders = [self.folder / _folder_of(name) for name in manifest["filters"]]
+        begun = [path for folder in folders for path in _chunks(folder, _UNFINISHED)]
+        return begun if unfinished else [*begun, *(p for x in folders for p in _chunks(x))]
+
+    def _chunk(self, filter_name: str, chunk: range) -> Path:
         name = f"{chunk.start:07d}-{chunk.stop - 1:07d}.npz"
-        return self.folder / filter_name.replace("/", "-") / name
+        return self.folder / _folder_of(filter_name) / name
+
+
+_CHUNK = re.compile(r"\d{7,}-\d{7,}\.npz")
+_UNFINISHED = re.compile(rf"\.\d+\.{_CHUNK.pattern}")
+
+
+def _chunks(folder: Path, named: re.Pattern[str] = _CHUNK) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if named.fullmatch(path.name))
+
+
+def _folder_of(filter_name: str) -> str:
+    """A folder's name for each filter's, two never the same, even where upper case is lower: "/" is
+    "-", and what is not a-z, 0-9, _ or + is its bytes in UTF-8, as in a URL."""
+
+    def escaped(match: re.Match[str]) -> str:
+        return "".join(f"%{byte:02X}" for byte in match[0].encode())
+
+    return re.sub("[^a-z0-9_+/]", escaped, filter_name).replace("/", "-") or "%"
 
 
 _DAMAGED = "it is damaged; remove it, and run again with --resume"
@@ -100,17 +177,28 @@ def _check_records(path: Path, runs: int, records: Records) -> None:
         raise ValueError(f"{path} holds other records than those of {runs} runs: {_DAMAGED}")
 
 
-def _as_manifest(found: Any) -> dict[str, Any]:
-    if not isinstance(found, dict):
-        raise ValueError(f"holds a {type(found).__name__}; an object is accepted")
+_ANOTHER_FOLDER = "use another --out or leave --resume out"
+_ANOTHER_STORE = "use another store"
+
+
+def _as_json(manifest: Manifest) -> Manifest:
+    return json.loads(json.dumps(manifest))
+
+
+def _as_manifest(found: Any) -> Manifest:
+    keys = {"given", "made_by", "filters"}
+    if not isinstance(found, dict) or not all(isinstance(found.get(k), dict) for k in keys):
+        raise ValueError("is no manifest of this version; use another folder, or remove that one")
     return found
 
 
-def _check_same(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
-    for key in {**wanted, **found}:
-        now, then = wanted.get(key), found.get(key)
-        if now != then:
-            raise ValueError(
-                f"cannot resume: {path} was made with another {key} ({then!r}, now {now!r}); "
-                "use another --out or leave --resume out"
-            )
+def _check_same(what: str, then: Manifest, now: Manifest, advice: str) -> None:
+    if told := difference(then, now):
+        raise ValueError(f"{what} made with another {told}; {advice}")
+
+
+def _check_filters(what: str, kept: Manifest, given: Manifest, advice: str) -> None:
+    """Raise ValueError for a filter that has the name of another one."""
+    for name in kept.keys() & given.keys():
+        if told := difference(kept[name], given[name]):
+            raise ValueError(f"{what} made with another filter {name}: {told}; {advice}")

@@ -64,12 +64,19 @@ def find(trajectory: str) -> Path:
     )
 
 
-@lru_cache(maxsize=8)
 def sampled(path: Path, rate: float, steps: int) -> Trajectory:
     """The recording at `rate` Hz for runs of so many steps.
 
     Raises ValueError, naming the file, where it is no trajectory or has no such piece in it.
     """
+    file = path.stat()
+    return _sampled(path, rate, steps, (file.st_mtime_ns, file.st_size, file.st_ino))
+
+
+@lru_cache(maxsize=8)
+def _sampled(path: Path, rate: float, steps: int, version: tuple[int, ...]) -> Trajectory:
+    """Of one version of the file, which may be written anew."""
+    del version
     pieces = [_evenly(*piece, rate) for piece in _without_gaps(*read_tum(path))]
     ends = np.cumsum([len(piece) for piece in pieces])
     starts = [
