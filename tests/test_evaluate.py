@@ -309,6 +309,9 @@ def test_a_run_of_a_csv_file_may_lack_steps(tmp_path):
     np.testing.assert_allclose(found.nees, jaxslam.evaluate(e, P).nees, rtol=1e-12)
     assert "2 of 35 steps are not compared (run 4: 2)" in str(found)
     plot_evaluation(found, tmp_path / "evaluation.png")
+    by_name = "".join(f"7{line[1:]}\n" if line[0] == "4" else f"{line}\n" for line in kept)
+    (tmp_path / "log.csv").write_text(by_name)
+    assert "(run 7: 2)" in str(jaxslam.evaluate_log(tmp_path / "log.csv"))
 
 
 # --- files and the command ----------------------------------------------------------------------

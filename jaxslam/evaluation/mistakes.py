@@ -22,8 +22,12 @@ _WIDEST = {True: 1.0, None: 0.5}
 """Rad from a full turn, of an axis that is known for an angle and of one that may be."""
 _WRONG = 5.0
 """An axis whose σ may be right up to this factor is in its unit."""
-_NARROW = 2.0
-"""Interval of a factor, upper by lower end, that tells 57 from its neighbours."""
+_LIKE = 2.0
+"""A factor further from 57.3 than by so much is another one."""
+_SLACK = 1.25
+"""By which an interval may miss it: a 99 % interval of few runs does so more than once in 100."""
+_NARROW = 4.0
+"""Interval of a factor, upper by lower end, of an axis that may be an angle or not."""
 _CORRELATED = 0.3
 """Neighbours that correlate less may be strangers."""
 _MANY = 300
@@ -135,8 +139,8 @@ def _degrees(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake]:
     """Errors in degrees with covariances in radians, or the other way round.
 
     σ of the angles is wrong by 180/π, by an interval that excludes 5, and that of no length is.
-    Of axes without a meaning the interval must be narrow. A filter whose σ is wrong by less than 5
-    is never named, but with what its interval misses; one wrong by 40 to 80 times may be.
+    A filter whose σ is wrong by less than 5 is not named but where it is estimated at 29 or more
+    with an interval that excludes 5; one whose angles alone are wrong by 30 to 100 times may be.
     """
     angles = [axis for axis, kind in enumerate(kinds) if kind]
     asked = angles or [axis for axis, kind in enumerate(kinds) if kind is None]
@@ -167,12 +171,13 @@ def _is_factor(found: Mapping[str, Any], factor: float, known: bool) -> bool:
     """Whether σ is wrong by just this factor; without an interval, of one run, only of what is
     `known`, and only where it is too small, as one number can be small by chance."""
     by, (low, high) = found["sigma_factor"], found["interval99"]
-    if not by or abs(np.log(by / factor)) > np.log(_NARROW):
+    if not by or abs(np.log(by / factor)) > np.log(_LIKE):
         return False
     if low is None or high is None:
         return known and factor > 1
     apart = low > _WRONG if factor > 1 else high < 1 / _WRONG
-    return bool(low < factor < high and apart and (known or high < _NARROW * low))
+    near = low / _SLACK < factor < high * _SLACK
+    return bool(near and apart and (known or high < _NARROW * low))
 
 
 def _interchanged(logged: Logged) -> Iterator[Mistake]:
@@ -191,9 +196,9 @@ def _interchanged(logged: Logged) -> Iterator[Mistake]:
         return
     yield Mistake(
         "runs and steps look interchanged",
-        f"neighbouring runs have errors that correlate by {ours:.2f}, neighbouring steps by "
-        f"{theirs:.2f}, as if the arrays were (steps, runs); (runs, steps, …) is accepted, of "
-        "independent runs",
+        f"errors of neighbouring runs correlate by {ours:.2f} and those of neighbouring steps by "
+        f"{theirs:.2f}, as if steps came first and runs second; (runs, steps, …) is accepted, of "
+        "runs that are independent of each other",
     )
 
 
