@@ -46,7 +46,7 @@ from jaxslam.evaluation import (
     read_covariances,
 )
 from jaxslam.simulation.scenario import parse_override
-from jaxslam.simulation.trajectories import sampled
+from jaxslam.simulation.trajectories import _sampled
 from jaxslam.tum import read_tum
 from jaxslam.video.calibration import read_calibration
 from jaxslam.video.opening import open_source
@@ -147,7 +147,7 @@ def read_pieces(folder: Path, draw: np.random.Generator) -> Any:
 
 
 def read_sampled(path: Path) -> Any:
-    return sampled.__wrapped__(path, 20.0, 5)
+    return _sampled.__wrapped__(path, 20.0, 5, ())
 
 
 def read_header(path: Path) -> Any:

@@ -69,8 +69,9 @@ def sampled(path: Path, rate: float, steps: int) -> Trajectory:
 
     Raises ValueError, naming the file, where it is no trajectory or has no such piece in it.
     """
-    file = path.stat()
-    return _sampled(path, rate, steps, (file.st_mtime_ns, file.st_size, file.st_ino))
+    file = path.stat() if path.exists() else None
+    version = (file.st_mtime_ns, file.st_size, file.st_ino) if file else ()
+    return _sampled(path, rate, steps, version)
 
 
 @lru_cache(maxsize=8)
