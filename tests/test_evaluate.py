@@ -373,6 +373,7 @@ def lines(*rows):
         ("a.csv", lines(*((r, 9 * r + s, 1, 1) for r in range(3) for s in (0, 1))), "6 different"),
         ("a.csv", lines((0, 0, "nan", 1.0)), "line 1: numbers run"),
         ("a.csv", lines((0, 0, 1.0, -1.0)), "run 0, step 0 has variance -1"),
+        ("a.csv", lines((1, 1, 1, 1), (1, 2, 1, 1), (3, 2, 1, -1)), "run 3, step 2 has variance"),
         ("a.csv", "", "holds no errors"),
         ("a.csv", "run,step,e,P\n", "holds no errors"),
         ("a.npz", "nonsense", "not an npz file"),

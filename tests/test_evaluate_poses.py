@@ -659,7 +659,7 @@ STAMPS, LEFT = np.arange(6) / 10, Convention("left")
             lambda f: write_covariances(
                 f / "run01" / "covariance.txt", STAMPS, np.tile(-np.eye(6), (6, 1, 1)), Convention()
             ),
-            "run 1, step 0 has variance -1",
+            "runs: the covariance of run01, step 0 has variance -1",
         ),
     ],
 )

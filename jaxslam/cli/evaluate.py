@@ -20,7 +20,7 @@ class EvaluateOptions:
     """Arrays (FILE.npz with errors and covariances, innovations and covariances, or estimates,
     covariances and truths; FILE.csv with lines of run, step, errors, upper triangle), a trajectory
     in TUM format (t tx ty tz qx qy qz qw, s and m), or a folder: one run, or one a sub-folder, of
-    estimate.txt, covariance.txt and truth.txt."""
+    estimate.txt, covariance.txt and truth.txt. Runs need not be equally long."""
     covariance: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Covariances of the trajectory's poses, docs/covariance-format.md."""
     truth: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxslam.evaluation.convention import CHOICES
 from jaxslam.evaluation.evaluate import Evaluation, evaluate
@@ -50,8 +50,8 @@ def evaluate_log(
         for name, value in (("covariance", covariance), ("truth", truth)):
             if value is not None:
                 raise ValueError(f"{source}: a {name} file goes with a trajectory, not with arrays")
-        arrays, runs = (_npz(source), ()) if source.suffix == ".npz" else _csv(source)
-        found = named(source, lambda: _evaluate_arrays(arrays, stated, align, nis))
+        arrays, runs, steps = (_npz(source), (), ()) if source.suffix == ".npz" else _csv(source)
+        found = named(source, lambda: _evaluate_arrays(arrays, stated, align, nis), runs, steps)
         return replace(found, run_names=runs)
     if nis:
         raise ValueError(f"{source}: innovations come in an npz or CSV file, not in a trajectory")
@@ -97,10 +97,10 @@ _APART = 2
 _COLUMNS = "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"
 
 
-def _csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
+def _csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]:
     """Lines `run, step, n errors, n (n + 1)/2 of the upper triangle`; a first one of names.
 
-    The arrays, and what the runs are called in the file.
+    The arrays, and what runs and steps are called in the file.
     """
     row = "numbers run, step, n errors and the n (n + 1)/2 of the upper triangle row by row"
     comments, rows, lines = read_table(path, "log", "errors", row, None)
@@ -108,7 +108,7 @@ def _csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
     if n < 1 or 2 + n * (n + 3) // 2 != rows.shape[1]:
         raise ValueError(f"{path}: {rows.shape[1]} columns; {row} are accepted: {_COLUMNS} columns")
     places, runs, steps = _rectangle(path, rows[:, :2], lines)
-    e = np.full((len(runs), steps, n), np.nan)
+    e = np.full((len(runs), len(steps), n), np.nan)
     P = np.full((*e.shape, n), np.nan)
     e[places], triangle, upper = rows[:, 2 : 2 + n], np.empty((len(rows), n, n)), np.triu_indices(n)
     triangle[:, *upper] = triangle[:, *upper[::-1]] = rows[:, 2 + n :]
@@ -116,15 +116,16 @@ def _csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
     titles = words(comments[0]) if comments else []
     named = len(titles) == rows.shape[1] and not comments[0].lstrip().startswith("#")
     names = {"names": titles[2 : 2 + n]} if named else {}
-    return {"errors": e, "covariances": P, **names}, tuple(f"run {run:g}" for run in runs)
+    arrays = {"errors": e, "covariances": P, **names}
+    return arrays, tuple(f"run {x:g}" for x in runs), tuple(f"step {x:g}" for x in steps)
 
 
 def _rectangle(
     path: Path, places: Float[np.ndarray, "k 2"], lines: tuple[int, ...]
-) -> tuple[tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]], Float[np.ndarray, " r"], int]:
-    """The run and the step of every row, the runs' numbers, and how many steps there are.
+) -> tuple[tuple[np.ndarray, np.ndarray], Float[np.ndarray, " r"], Float[np.ndarray, " s"]]:
+    """The run and the step of every row, and the numbers of runs and of steps.
 
-    A run need not have all of them.
+    A run need not have all steps.
     """
     (runs, run), (steps, step) = (np.unique(x, return_inverse=True) for x in places.T)
     pairs, first = np.unique(places, axis=0, return_index=True)
@@ -138,4 +139,4 @@ def _rectangle(
             f"{path}: the runs have {len(steps)} different steps, and none more than {longest}; "
             "steps that are counted alike in all runs are accepted, as from the start of each"
         )
-    return (run, step), runs, len(steps)
+    return (run, step), runs, steps

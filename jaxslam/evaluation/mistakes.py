@@ -87,7 +87,7 @@ def _unwrapped(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake
     """Angles whose errors are near a full turn, and never between that and none.
 
     Of Gaussian errors with the σ that is claimed one number in 10¹⁵ is beyond 8 σ. Of one that is
-    an outlier for another reason the chance to be so near to a turn is 10 σ of 2π, .02 for 1°.
+    an outlier for another reason the chance to be so near to a turn is 10 σ of 2π, 1/36 for 1°.
     """
     for axis, angle in enumerate(kinds):
         if angle is False:

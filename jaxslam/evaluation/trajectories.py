@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
@@ -121,6 +122,7 @@ def evaluate_runs(runs: tuple[Run, ...], stated: dict[str, str], align: str) -> 
                 f"{runs[0].covariance} ({Convention(**read[0].said)})"
             )
     convention = stated_before(read[0].said, stated)
+    names = tuple(run.name for run in runs)
     longest = max(read, key=lambda one: len(one.times))
     found = named(
         runs[0].estimate if len(runs) == 1 else runs[0].estimate.parent.parent,
@@ -132,11 +134,11 @@ def evaluate_runs(runs: tuple[Run, ...], stated: dict[str, str], align: str) -> 
             align=align,
             times=longest.times,
         ),
+        names,
     )
     told = (*_left_out(read), *_other_times(read, longest))
     if not read[0].said and not stated:
         told += (f"the file does not say its convention; assumed: {convention}",)
-    names = tuple(run.name for run in runs)
     return replace(found, notes=(*found.notes, *told), run_names=names)
 
 
@@ -155,12 +157,21 @@ def stated_before(said: dict[str, str], stated: dict[str, str]) -> Convention:
     return Convention(**(said | stated))
 
 
-def named(source: Path, evaluation: Callable[[], Evaluation]) -> Evaluation:
-    """With the file's name in every error."""
+def named(
+    source: Path,
+    evaluation: Callable[[], Evaluation],
+    runs: Sequence[str] = (),
+    steps: Sequence[str] = (),
+) -> Evaluation:
+    """With the file's name in every error, and the names of runs and steps for their places."""
     try:
         return evaluation()
     except ValueError as error:
-        raise ValueError(f"{source}: {error}") from None
+        told = str(error)
+        for place, names in ((r"\brun (\d+)", runs), (r"\bstep (\d+)", steps)):
+            if names:
+                told = re.sub(place, lambda found, names=names: names[int(found[1])], told)
+        raise ValueError(f"{source}: {told}") from None
 
 
 def _left_out(read: list[_Logged]) -> Iterator[str]:
