@@ -111,6 +111,12 @@ class AbstractFilter(eqx.Module):
         pose, covariance = self.marginal(state, lambda scene: scene.pose)
         return difference(T_BC, pose), covariance
 
+    def unit_fixed(self, state: Any) -> Bool[Array, ""]:
+        """Whether poses from now on are in one unit; false while a start is being found out, and
+        every frame has another."""
+        del state
+        return jnp.ones((), bool)
+
 
 class AbstractStaged(AbstractFilter):
     """A filter whose frame can be taken in stages: all that a tracker asks for."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxslam.geometry import Pose, Scalar, retract, tangent_dim
-from jaxslam.linalg import cholesky, semidefinite_root
+from jaxslam.geometry import Pose, Scalar, retract, scaled
+from jaxslam.linalg import semidefinite_root
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.slam.filter import EkfSlam, scene_of_landmark
 from jaxslam.slam.protocol import AbstractFilter, Scene
@@ -21,34 +21,48 @@ def camera_pose(slam: AbstractFilter, state: Any) -> tuple[Pose, Float[Array, "t
     return slam.marginal(state, lambda scene: scene.pose)
 
 
-def camera_pose_in_unit(
-    slam: AbstractFilter, state: Any
-) -> tuple[Pose, Float[Array, "t t"], Scalar]:
-    """T_BC in metres, its covariance *given the scale*, and the variance of the log of the scale.
+class InUnit(NamedTuple):
+    """Where the camera is in the filter's own unit of length, and how long that is in metres."""
 
-    The camera's path is known much better than its size: with J of the pose by λ, the covariance of
-    `camera_pose` is `P + J var(λ) Jᵀ`, and P is what is returned. Of a filter in metres it is all.
+    pose: Pose
+    """T_BC, with its lengths in that unit."""
+    covariance: Float[Array, "t t"]
+    """In the right tangent of the pose: what is not known of the metre is no part of it."""
+    log_scale: Scalar
+    """Mean of the log of the unit in metres, Σλ; zero of a filter in metres."""
+    log_scale_variance: Scalar
+
+
+def camera_pose_in_unit(slam: AbstractFilter, state: Any) -> InUnit:
+    """T_BC in the filter's own unit, `(R, t e^−Σλ)`, and beside it Σλ, the log of that in metres.
+
+    The camera's path is known much better than its size: λ wanders while nothing tells of it, and a
+    path in metres is blown up and shrunk with it, but none in the unit of the state. Mean and
+    covariance of a Gaussian sum are those of the pose in the unit.
     """
 
     def both(scene: Scene):
-        return scene.pose, _log_scale(scene)
+        log_scale = _log_scale(scene)
+        return scaled(scene.pose, jnp.exp(-log_scale)), log_scale[None]
 
-    (pose, _), P = slam.marginal(state, both)
-    t = tangent_dim(pose)
-    return pose, _given_rest(P, t), jnp.sum(P[t:, t:])
+    (pose, log_scale), P = slam.marginal(state, both)
+    return InUnit(pose, P[:-1, :-1], log_scale[0], P[-1, -1])
 
 
 def landmarks_in_unit(
     slam: AbstractFilter, state: Any, slots: Int[Array, " m"]
 ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
-    """`landmarks_in_world`, with covariances given the scale."""
+    """`landmarks_in_world` in the filter's own unit of length, with covariances of these."""
 
-    def both(scene: Scene):
-        return jnp.concatenate([_point_in_world(scene), _log_scale(scene)])
+    def point(scene: Scene):
+        return jnp.exp(-_log_scale(scene)) * _point_in_world(scene)
 
-    values, P = slam.marginal(state, both, slots)
-    n = values.shape[1] - jax.eval_shape(lambda: slam.marginal(state, _log_scale)[0]).size
-    return values[:, :n], jax.vmap(lambda P: _given_rest(P, n))(P)
+    return slam.marginal(state, point, slots)
+
+
+def log_unit(slam: AbstractFilter, state: Any) -> Scalar:
+    """Mean of the log of the filter's unit of length in metres, Σλ."""
+    return slam.marginal(state, lambda scene: _log_scale(scene)[None])[0][0]
 
 
 def landmarks_in_camera(
@@ -130,18 +144,11 @@ def landmark_samples(
     return jax.vmap(of_slot)(slots, normal)
 
 
-def _log_scale(scene: Scene) -> Float[Array, " u"]:
-    return jnp.zeros(0) if scene.log_scale is None else scene.log_scale
-
-
-def _given_rest(P: Float[Array, "k k"], n: int) -> Float[Array, "n n"]:
-    """Covariance of the first n numbers, given the others."""
-    if n == len(P):
-        return P
-    # Where those are known there is nothing to subtract.
-    tiny = jnp.finfo(P.dtype).tiny * jnp.eye(len(P) - n, dtype=P.dtype)
-    half = cholesky(P[n:, n:] + tiny).whitening @ P[n:, :n]
-    return P[:n, :n] - half.T @ half
+def _log_scale(scene: Scene) -> Scalar:
+    """Σλ; zero of a filter in metres."""
+    if scene.log_scale is None:
+        return jnp.zeros((), scene.pose.translation().dtype)
+    return jnp.sum(scene.log_scale)
 
 
 def _point_in_world(scene: Scene) -> Float[Array, " n"]:

@@ -45,6 +45,12 @@ class Located:
         carried = A @ self.covariance @ A.T
         return Located(self.T_wc @ step.T_wc, (carried + carried.T) / 2 + step.covariance)
 
+    def scaled(self, scale: float) -> Located:
+        """In a unit of length that is 1/scale as long."""
+        T_wc, lengths = self.T_wc.copy(), np.array([scale] * 3 + [1.0] * 3)
+        T_wc[:3, 3] *= scale
+        return Located(T_wc, lengths[:, None] * self.covariance * lengths)
+
     def points(
         self, points: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:

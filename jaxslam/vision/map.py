@@ -30,6 +30,12 @@ class Prediction(NamedTuple):
     sides: Any = (0, 0)
     """How many landmarks are surely in front of the camera, and how many behind it."""
 
+    def enlarged(self, scale: float) -> Prediction:
+        """With all lengths so many times as large."""
+        T_wc = self.T_wc.copy()
+        T_wc[:3, 3] *= scale
+        return self._replace(T_wc=T_wc, omegas=self.omegas / scale)
+
 
 def to_search(
     landmarks: Mapping[int, Landmark],

@@ -24,7 +24,10 @@ _TURN, _DASH = 48, 4  # points on an ellipse, and on a dash or a gap of it
 _CROSS = np.array([[[-4.0, -4.0], [4.0, 4.0]], [[-4.0, 4.0], [4.0, -4.0]]])
 _SQUARE = np.array([[[-5.0, -5.0], [5.0, -5.0], [5.0, 5.0], [-5.0, 5.0], [-5.0, -5.0]]])
 _SYMBOL, _GAP = 20, 8  # widths in the legend, pixels
-_WIDEST = ("frame 12345  1234.56 s  map 12", "sigma: position 0.00123  0.123 deg  log scale 0.0123")
+_WIDEST = (
+    "frame 12345  1234.56 s  map 12  unit open",
+    "sigma: position 0.00123 units  0.123 deg  log scale 0.0123",
+)
 """Notes as long as they become, for which there is room in the legend."""
 
 

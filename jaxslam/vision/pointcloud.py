@@ -40,8 +40,8 @@ def write_ply(
     header = [
         "ply",
         "format ascii 1.0",
-        "comment landmarks in the world frame; every map has a unit of length of its own, and",
-        "comment covariances are given that unit",
+        "comment landmarks in the world frame; one unit of length a map, another in every map, as",
+        "comment in trajectory.txt, and covariances are of positions in that unit",
         f"element vertex {len(points)}",
         *(f"property float {name}" for name in _PROPERTIES),
         "property int id",

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxslam.files import read_arrays, write_atomically
 
-FORMAT = "jaxslam tracker 1"
+FORMAT = "jaxslam tracker 2"
 
 
 def write_record(

@@ -44,7 +44,7 @@ _MAP_EVERY = 10
 """Frames from one map of a recording to the next."""
 _COLUMNS = (
     "frame", "time", "state", "map", "matches", "nis", "nis_dof",
-    "sigma_position", "sigma_orientation", "sigma_log_scale",
+    "sigma_position", "sigma_orientation", "sigma_log_scale", "log_scale", "unit_fixed",
 )  # fmt: skip
 _KNOWN_DEPTH = 0.3
 """A point is put into the map where its σ is below this share of its distance."""
@@ -102,6 +102,7 @@ def describe(summary: dict[str, Any]) -> str:
         lines.append(
             f"{summary['maps']} maps, each in a unit of its own: frames.csv says where they begin"
         )
+    lines += [_unit_line(unit) for unit in summary["units"] if unit["sigma_log_scale"] is not None]
     camera = summary["calibration"]
     if "estimated" in camera:
         pairs = ((key, camera["estimated"][key], camera["sigma"][key]) for key in INTRINSICS)
@@ -199,13 +200,14 @@ def _overlay(frame: Frame, result: Tracked) -> np.ndarray:
 
 
 def _notes(result: Tracked) -> tuple[str, str]:
-    """Which frame it is, and the σ of its pose."""
+    """Which frame it is, and the σ of its pose in the map's unit."""
     camera, log_scale = result.camera, result.sigma_log_scale
     degrees = math.degrees(camera.sigma_orientation)
     scale = "" if log_scale is None else f"  log scale {log_scale:.3g}"
+    opening = "" if result.unit_fixed else "  unit open"
     return (
-        f"frame {result.index}  {result.time:.2f} s  map {result.map}",
-        f"sigma: position {camera.sigma_position:.3g}  {degrees:.3g} deg{scale}",
+        f"frame {result.index}  {result.time:.2f} s  map {result.map}{opening}",
+        f"sigma: position {camera.sigma_position:.3g} units  {degrees:.3g} deg{scale}",
     )
 
 
@@ -255,9 +257,10 @@ def write_frames(path: str | Path, history: list[Tracked]) -> None:
     `state` is `start` (of a map; where it is not the first, the camera is lost too), `tracked` or
     `lost`, `map` the number of the map, from 0. σ of position (map units) and orientation (rad)
     are roots of the summed variances of the three axes, zero in the first frame alone, which is
-    the world's, and given the scale of the map. `sigma_log_scale` is what the filter does not know
-    of that, σ of the logarithm of the map's unit; empty where it is in no doubt of it: then nobody
-    has measured it.
+    the world's, and of poses in the map's one unit. `log_scale` is the log of that unit in metres
+    as the filter believes it to be at this frame, and `sigma_log_scale` its σ; both empty where
+    the filter is in no doubt of it: then nobody has measured it. `unit_fixed` is 0 while the map's
+    start is being found out, when the filter changes its unit with every frame, else 1.
     """
     with write_atomically(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -266,7 +269,10 @@ def write_frames(path: str | Path, history: list[Tracked]) -> None:
 
 
 def _row(result: Tracked) -> list[Any]:
-    sigmas = result.camera.sigma_position, result.camera.sigma_orientation, result.sigma_log_scale
+    camera = result.camera
+    numbers = (
+        camera.sigma_position, camera.sigma_orientation, result.sigma_log_scale, result.log_scale,
+    )  # fmt: skip
     return [
         result.index,
         f"{result.time:.9f}",
@@ -275,7 +281,8 @@ def _row(result: Tracked) -> list[Any]:
         result.status.count("matched"),
         f"{result.nis:.6g}",
         result.nis_dof,
-        *("" if sigma is None else f"{sigma:.6g}" for sigma in sigmas),
+        *("" if number is None else f"{number:.6g}" for number in numbers),
+        int(result.unit_fixed),
     ]
 
 
@@ -308,6 +315,34 @@ def _scale_between_maps(settings: TrackerSettings) -> float:
     """
     depth = settings.depth
     return math.sqrt(2) * float(depth.sigma / depth.mean)
+
+
+def _units(history: list[Tracked]) -> list[dict[str, Any]]:
+    """Of every map: the frame from which on the filter's unit was fixed, and the log of the map's
+    unit in metres as it is believed at the map's end, with σ; null where there is no doubt."""
+    units = []
+    for number in range(history[-1].map + 1):
+        of_map = [result for result in history if result.map == number]
+        fixed = (result.index for result in of_map if result.unit_fixed)
+        last = of_map[-1]
+        units.append(
+            {
+                "map": number,
+                "fixed_at": next(fixed, None),
+                "log_scale": last.log_scale,
+                "sigma_log_scale": last.sigma_log_scale,
+            }
+        )
+    return units
+
+
+def _unit_line(unit: dict[str, Any]) -> str:
+    """What is known of a map's unit."""
+    length, times = math.exp(unit["log_scale"]), math.exp(unit["sigma_log_scale"])
+    return (
+        f"map {unit['map']}: one unit of length throughout, by the prior on depth {length:.2f} m, "
+        f"give or take a factor of {times:.2g} (1 sigma)"
+    )
 
 
 def _calibration(tracker: Tracker) -> dict[str, Any]:
@@ -345,6 +380,7 @@ def _summary(
         "lost": lost,
         "restarts": tracker.restarts,
         "maps": tracker.restarts + 1,
+        "units": _units(history),
         "failed_updates": dict(tracker.failed),
         "reversed_tests": tracker.reversed,
         "landmarks": {

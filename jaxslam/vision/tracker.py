@@ -18,6 +18,7 @@ from scipy.stats import binom
 from jaxslam.arrays import cast
 from jaxslam.files import one_line
 from jaxslam.forms.state import Features, Status
+from jaxslam.geometry import scaled
 from jaxslam.models.scale import Metre
 from jaxslam.models.sensors import Pinhole
 from jaxslam.names import CANNOT_TRACK
@@ -29,6 +30,7 @@ from jaxslam.slam.readouts import (
     camera_pose_in_unit,
     landmarks_in_unit,
     landmarks_on_sides,
+    log_unit,
 )
 from jaxslam.video.calibration import Calibration, as_fields, from_fields
 from jaxslam.video.pictures import as_grey
@@ -43,6 +45,7 @@ from jaxslam.vision.patches import Patch
 from jaxslam.vision.resume import grown, leaves, read_record, write_record
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.target import Sighting, Target, known_depths, sighted
+from jaxslam.vision.unit import Nearness, lengthened, nearness
 
 LEAST_MATCHES = 4
 """Fewer do not count as having tracked a frame, and are not believed."""
@@ -64,7 +67,7 @@ _LATELY = 3
 
 _NUMBERS = (
     "created", "deleted", "restarts", "reversed", "steps", "_time", "_unmeasured",
-    "_sigma_log_scale", "_proven", "_elsewhere",
+    "_sigma_log_scale", "_proven", "_elsewhere", "_log_unit", "_log_scale", "_unit_fixed",
 )  # fmt: skip
 """What a tracker counts and measures, one number each."""
 
@@ -76,7 +79,8 @@ class Tracked:
     index: int
     time: float
     camera: Located
-    """The camera in the world, which is the first camera; of a later map, by way of its start."""
+    """The camera in the world, which is the first camera; of a later map, by way of its start. All
+    of a map in one unit (docs/gauge.md), and the covariance is of the pose in that unit."""
     predicted: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     """Pixels of the landmarks searched, (k, 2)."""
     search: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 2)))
@@ -94,8 +98,14 @@ class Tracked:
     """Whether a map begins here; where it is not the first, the camera was lost too."""
     map: int = 0
     """Number of the map; each has a unit of length of its own."""
+    log_scale: float | None = None
+    """Log of the map's unit in metres as the filter now believes it to be, where it has a unit of
+    its own: e^log_scale times this pose is what it takes for metres."""
     sigma_log_scale: float | None = None
-    """σ of the logarithm of the map's unit, where the filter has one in doubt."""
+    """σ of that, where the filter is in doubt of it."""
+    unit_fixed: bool = True
+    """Whether the filter keeps its unit from here on. While a start is being found out it does not,
+    and the map's is carried over by the landmarks' distances, about which no covariance knows."""
 
     @property
     def T_wc(self) -> np.ndarray:
@@ -130,7 +140,8 @@ class Tracker:
     A camera that is lost moves as the filter predicts. One lost for long, or a filter whose
     covariance is not positive any more, begins a new map where the picture has the corners for
     it: exactly known in its own frame, and in the world as surely as its start is. Its unit of
-    length is another, which no covariance here knows of.
+    length is another, which no covariance here knows of. Within a map there is one unit, whatever
+    the filter makes of the scale meanwhile (docs/gauge.md).
 
     The mutable part is this object; all mathematics is in pure, jitted functions of the state.
     Raises ValueError for a filter that cannot track, or cannot begin with the target.
@@ -190,7 +201,10 @@ class Tracker:
             )
         self._time: float | None = None
         self._origin = self._camera = Located()
+        self._log_unit = self._log_scale = 0.0
         self._sigma_log_scale: float | None = None
+        self._unit_fixed = True
+        self._near: Nearness = {}
         self._unmeasured = 0
         self._proven = self._elsewhere = 0.0
         self._sets_out = made.sets_out_anywhere
@@ -340,6 +354,7 @@ class Tracker:
         )
         with jax.enable_x64(True):
             tracker._state = grown(tracker._state, arrays, "state")
+            tracker._near = tracker._nearness()
         return tracker
 
     def _first(self, frame: Frame) -> Tracked:
@@ -369,7 +384,7 @@ class Tracker:
         # A number of Python's would be compiled into the programs.
         dt = jnp.asarray(frame.time - (self._time or 0.0))
         predicted, prediction = _predict(self._slam, self._state, dt)
-        prediction = jax.device_get(prediction)
+        prediction = jax.device_get(prediction).enlarged(np.exp(self._log_unit))
         prediction = prediction._replace(T_wc=self._origin.T_wc @ prediction.T_wc)
         ahead, behind = prediction.sides
         if behind > ahead and behind >= LEAST_MATCHES:
@@ -564,6 +579,7 @@ class Tracker:
         state, result = _correct(self._slam, predicted[0], dt, nothing)
         if int(result[-1]) >= Status.NOT_POSITIVE:
             self._origin = self._camera
+            self._log_unit = -self._log_scale  # of the empty state, which is in metres
             predicted, _ = _predict(self._slam, self._empty_state(), dt)
             state, _ = _correct(self._slam, predicted[0], dt, nothing)
         self._state = state
@@ -654,18 +670,38 @@ class Tracker:
         slots = np.array(free[: len(corners)], int)
         new = _padded(slots, corners, s.wanted)
         self._state, reported = function(self._slam, self._state, new)
-        T_BC, covariance, log_scale = jax.device_get(reported)
-        self._camera = self._origin.then(Located(T_BC, covariance))
-        self._sigma_log_scale = float(np.sqrt(log_scale)) if log_scale > 0 else None
+        self._locate(*jax.device_get(reported), begins=function is not _renew_map)
         for slot, corner in zip(slots, corners, strict=True):
             patch = Patch.take(frame.image, corner)
             self.landmarks[int(slot)] = Landmark(self.created, patch, self._camera.T_wc, corner)
             self.created += 1
+        self._near = self._nearness()
         return corners
+
+    def _locate(self, pose, covariance, log_scale, variance, fixed, *, begins: bool) -> None:
+        """Take over what the filter says of its camera, in its unit, and of that unit."""
+        if begins:
+            self._log_unit = float(log_scale)
+        elif not self._unit_fixed:
+            found = [one.number for one in self.landmarks.values() if one.found]
+            self._log_unit += lengthened(self._near, self._nearness(), found)
+        self._unit_fixed = bool(fixed)
+        here = Located(pose, covariance).scaled(np.exp(self._log_unit))
+        self._camera = self._origin.then(here)
+        self._log_scale = float(log_scale) - self._log_unit
+        self._sigma_log_scale = float(np.sqrt(variance)) if variance > 0 else None
+
+    def _nearness(self) -> Nearness:
+        """Of all landmarks, as long as the filter's unit is not fixed."""
+        if self._unit_fixed:
+            return {}
+        points, _ = jax.device_get(_world_points(self._slam, self._state, self.settings.capacity))
+        return nearness({slot: one.number for slot, one in self.landmarks.items()}, points)
 
     def _recorded(self, slots: list[int]) -> Points:
         seen = jax.device_get(_world_points(self._slam, self._state, self.settings.capacity))
-        points, covariances = (of_slot[slots] for of_slot in seen)
+        unit = np.exp(self._log_unit)
+        points, covariances = seen[0][slots] * unit, seen[1][slots] * unit**2
         numbers = np.array([self.landmarks[slot].number for slot in slots], int)
         maps = np.full_like(numbers, self.restarts)
         _, in_map = Located(self._origin.T_wc).points(points, covariances)
@@ -677,7 +713,9 @@ class Tracker:
             frame.time,
             self._camera,
             map=self.restarts,
+            log_scale=None if self._sigma_log_scale is None else self._log_scale,
             sigma_log_scale=self._sigma_log_scale,
+            unit_fixed=self._unit_fixed,
             **found,
         )
 
@@ -728,16 +766,18 @@ def _remove(slam: AbstractStaged, state: Any, gone: Any) -> Any:
 
 @Program
 def _predict(slam: AbstractStaged, state: Any, dt: Any) -> tuple[tuple[Any, Any], Prediction]:
-    """The predicted state, as it is and as one Gaussian, and what that expects to see."""
+    """The predicted state, as it is and as one Gaussian, and what that expects to see, in the
+    filter's own unit."""
     slots = jnp.arange(slam.in_map(state).size)
     state = slam.predict(state, dt)
     one, gaussian = slam.gaussian(state, dt)
     seen = one.predict_features(gaussian, dt, slots)
     usable = seen.possible & jnp.isfinite(seen.covariance).all(axis=(1, 2))
-    pose = seen.pose.as_matrix()
+    metres = jnp.exp(log_unit(one, gaussian))
+    pose, omegas = scaled(seen.pose, 1 / metres).as_matrix(), metres * seen.omegas
     sides = landmarks_on_sides(one, gaussian, slots)
     prediction = Prediction(
-        seen.measured, seen.covariance, usable, pose, seen.points, seen.omegas, sides
+        seen.measured, seen.covariance, usable, pose, seen.points, omegas, sides
     )
     return (state, gaussian), prediction
 
@@ -785,9 +825,10 @@ def _renew_map(slam: AbstractStaged, state: Any, new: Features):
 
 
 def _reported(slam: AbstractStaged, state: Any):
-    """T_BC, its covariance given the scale and the variance of λ; zero of a filter without."""
-    T_BC, covariance, log_scale = camera_pose_in_unit(slam, state)
-    return T_BC.as_matrix(), covariance, log_scale
+    """T_BC in the filter's unit and its covariance, mean and variance of the log of that unit in
+    metres, and whether it is fixed."""
+    seen = camera_pose_in_unit(slam, state)
+    return seen.pose.as_matrix(), *seen[1:], slam.unit_fixed(state)
 
 
 @Program

@@ -18,8 +18,11 @@ from jaxslam.tum import write_tum
 TRACKED = Convention("split", "body")
 """The error whose covariances are written: position in the camera's axes, rotation vector."""
 
-_UNITS = "every map of frames.csv has a unit of its own"
-_GIVEN_SCALE = "given the scale of its map, of which sigma_log_scale of frames.csv is in doubt"
+_UNITS = "one unit of length a map, another in every map of frames.csv"
+_GIVEN_SCALE = (
+    "of poses in that unit, of which sigma_log_scale of frames.csv is in doubt; "
+    "where unit_fixed is 0 there, it is nearly the same unit"
+)
 
 
 class TrajectoryError(TypedDict):
@@ -45,7 +48,10 @@ class RelativeError(TypedDict):
 
 
 def write_trajectory(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> None:
-    """Write times (n,) in seconds and poses (n, 4, 4) in TUM format, whole or not at all."""
+    """Write times (n,) in seconds and poses (n, 4, 4) in TUM format, whole or not at all.
+
+    All poses of a map are in one unit of length (docs/gauge.md), and the header says so.
+    """
     write_tum(path, times, T_wc, _UNITS)
 
 
@@ -54,9 +60,10 @@ def write_covariances(
 ) -> None:
     """Write times (n,) and covariances (n, 6, 6) of the `TRACKED` error, whole or not at all.
 
-    That maps which follow one another have different units of length is not in it. The header says
-    whether these are covariances `given_scale`, of a filter with a unit of its own, or of poses in
-    a unit that the filter takes for exactly known.
+    They are of poses in the one unit of their map; that maps which follow one another have others
+    is not in them. The header says whether these are covariances `given_scale`, of a filter with a
+    unit of its own, of whose size in metres it is in doubt, or of poses in a unit that the filter
+    takes for exactly known.
     """
     convention = replace(TRACKED, scale="given" if given_scale else "marginal")
     scale = _GIVEN_SCALE if given_scale else "the filter has no doubt of its scale"

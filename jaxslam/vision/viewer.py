@@ -29,9 +29,9 @@ class Viewer:
 
     Along the timelines `frame` and `time` (s since the first frame): the picture with search
     ellipses of three standard deviations and matches by status, camera, path (grey where it was
-    lost), landmarks with their 1 σ ellipsoids, NIS by its degrees of freedom, the σ of
-    `frames.csv`, and the state where it changes. Raises `ValueError` without rerun, or for a name
-    that does not end in .rrd.
+    lost), landmarks with their 1 σ ellipsoids, NIS by its degrees of freedom, the σ and the
+    `log_scale` of `frames.csv`, and the state where it changes. All of a map is in one unit.
+    Raises `ValueError` without rerun, or for a name that does not end in .rrd.
     """
 
     def __init__(self, path: str | Path, calibration: Calibration) -> None:
@@ -128,6 +128,7 @@ class Viewer:
             "sigma/position": camera.sigma_position,
             "sigma/orientation": camera.sigma_orientation,
             "sigma/log_scale": result.sigma_log_scale,
+            "log_scale": result.log_scale,
         }
         for name, number in numbers.items():
             if number is not None:
@@ -153,9 +154,10 @@ def _layout() -> Any:
     beside = b.Vertical(
         b.Spatial2DView(origin=_IMAGE, name="picture"),
         b.TimeSeriesView(origin="nis", name="NIS by its degrees of freedom"),
-        b.TimeSeriesView(origin="sigma", name="sigma"),
+        b.TimeSeriesView(origin="sigma", name="sigma, of poses in the map's unit"),
+        b.TimeSeriesView(origin="log_scale", name="log of the map's unit in metres"),
         b.TextLogView(origin="state", name="state"),
-        row_shares=[4, 2, 2, 1],
+        row_shares=[4, 2, 2, 1, 1],
     )
     world = b.Spatial3DView(origin="world", name="map")
     return b.Blueprint(b.Horizontal(world, beside), collapse_panels=True)

@@ -76,6 +76,9 @@ class Checked(AbstractStaged):
     def pose_error(self, state: Any, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
         return self.base.pose_error(state, T_BC)
 
+    def unit_fixed(self, state: Any) -> Bool[Array, ""]:
+        return self.base.unit_fixed(state)
+
     @property
     def _noise(self) -> Any:
         inner: Any = innermost(self.base)

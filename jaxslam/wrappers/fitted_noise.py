@@ -131,6 +131,9 @@ class FittedNoise(AbstractStaged):
     def pose_error(self, state: NoiseState, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
         return self.base.pose_error(state.inner, T_BC)
 
+    def unit_fixed(self, state: NoiseState) -> Bool[Array, ""]:
+        return self.base.unit_fixed(state.inner)
+
     def fitted(self, state: NoiseState) -> Any:
         """The base filter with the σ that is believed now."""
         motion: Any = self._inner.motion

@@ -163,6 +163,9 @@ class FromRest(AbstractStaged):
     def pose_error(self, state: RestState, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
         return self.base.pose_error(state.sum, T_BC)
 
+    def unit_fixed(self, state: RestState) -> Bool[Array, ""]:
+        return ~state.open
+
     def _anew(
         self, state: RestState, frames: int, wanted: Bool[Array, ""], least: int
     ) -> RestState:

@@ -104,8 +104,8 @@ def test_the_legend_fits_its_width(width):
         matched=np.full((200, 2), np.nan),
         status=["matched", "unmatched", "outlier", "new"] * 50,
         notes=(
-            "frame 12345  1234.56 s  map 12",
-            "sigma: position 0.00123  0.123 deg  log scale 0.0123",
+            "frame 12345  1234.56 s  map 12  unit open",
+            "sigma: position 0.00123 units  0.123 deg  log scale 0.0123",
         ),
     )
     assert overlay.shape == (*overlay_size(width, 90)[::-1], 3)

@@ -29,7 +29,17 @@ def same(one, other):
             np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
     np.testing.assert_array_equal(one.T_wc, other.T_wc)
     np.testing.assert_array_equal(one.covariance, other.covariance)
-    names = ("index", "time", "state", "status", "nis", "nis_dof", "map", "sigma_log_scale")
+    names = (
+        "index",
+        "time",
+        "state",
+        "status",
+        "nis",
+        "nis_dof",
+        "map",
+        "sigma_log_scale",
+        "log_scale",
+    )
     for name in names:
         assert getattr(one, name) == getattr(other, name), name
 

@@ -188,7 +188,7 @@ def test_frames_csv_says_what_became_of_every_frame(tracked):
     out, _, summary = tracked
     rows = frames_of(out)
     columns = "frame,time,state,map,matches,nis,nis_dof,sigma_position,sigma_orientation"
-    assert ",".join(rows[0]) == columns + ",sigma_log_scale"
+    assert ",".join(rows[0]) == columns + ",sigma_log_scale,log_scale,unit_fixed"
     assert [row["state"] for row in rows] == ["start"] + ["tracked"] * (FRAMES - 1)
     assert {row["map"] for row in rows} == {"0"}
     assert summary["maps"] == 1
@@ -210,7 +210,10 @@ def test_frames_csv_says_what_became_of_every_frame(tracked):
             atol=0,
         )
     # This filter has no scale apart from the map.
-    assert {row["sigma_log_scale"] for row in rows} == {""}
+    assert {row["sigma_log_scale"] for row in rows} == {row["log_scale"] for row in rows} == {""}
+    assert {row["unit_fixed"] for row in rows} == {"1"}
+    unit = {"map": 0, "fixed_at": 0, "log_scale": None, "sigma_log_scale": None}
+    assert summary["units"] == [unit]
 
 
 DARK, LIGHT, END = 8, 14, 22
@@ -239,6 +242,7 @@ def test_a_camera_that_was_lost_for_long_begins_a_new_map(restarted):
     assert [row["state"] for row in rows] == states
     assert [int(row["map"]) for row in rows] == [0] * LIGHT + [1] * (END - LIGHT)
     assert summary["maps"] == 2
+    assert [(unit["map"], unit["fixed_at"]) for unit in summary["units"]] == [(0, 0), (1, LIGHT)]
     assert (summary["tracked"], summary["lost"]) == (END - 7, 7)
     # σ/ρ of the prior on an inverse depth is ½, in each of the two maps.
     assert summary["log_scale_sigma_between_maps"] == pytest.approx(np.sqrt(0.5), rel=1e-12)
@@ -462,6 +466,9 @@ def test_a_gaussian_sum_tracks_too():
     assert np.linalg.eigvalsh(summed.covariance)[0] > 0
     for result in (alone, summed):
         assert 0.999 * settings.unit_sigma < (result.sigma_log_scale or 0) < 2
+        assert result.log_scale is not None
+        assert abs(result.log_scale) < 1
+        assert result.unit_fixed
     assert not np.allclose(summed.T_wc, alone.T_wc, atol=1e-6)
 
 

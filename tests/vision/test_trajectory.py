@@ -15,6 +15,7 @@ from jaxslam.vision.trajectory import (
     pose_nees,
     relative_pose_error,
     write_covariances,
+    write_trajectory,
 )
 
 
@@ -262,7 +263,7 @@ def test_covariances_are_read_as_they_were_written_and_are_the_errors(tmp_path):
 
 @pytest.mark.parametrize(
     ("given", "words"),
-    [(True, "given the scale of its map, of which sigma_log_scale"), (False, "no doubt of its")],
+    [(True, "of poses in that unit, of which sigma_log_scale"), (False, "no doubt of its")],
 )
 def test_the_header_says_whether_scale_is_in_a_covariance(tmp_path, given, words):
     path = tmp_path / "covariance.txt"
@@ -270,6 +271,11 @@ def test_the_header_says_whether_scale_is_in_a_covariance(tmp_path, given, words
     header, _ = path.read_text().splitlines()
     assert header.startswith("# t xx xy")
     assert words in header
+    assert "one unit of length a map, another in every map" in header
+    assert f"scale={'given' if given else 'marginal'}" in header
+    assert "length=map" in header
+    write_trajectory(path, [0.0], np.eye(4)[None])
+    assert "one unit of length a map, another in every map" in path.read_text()
 
 
 def test_a_pose_that_is_known_exactly_has_a_nees_of_zero_if_it_is_right(tmp_path):

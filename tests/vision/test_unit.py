@@ -1,0 +1,292 @@
+"""A map has one unit of length, whatever its filter makes of the scale meanwhile."""
+
+import csv
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2")
+
+import jaxslam
+from jaxslam.geometry import scaled
+from jaxslam.slam.protocol import Scene
+from jaxslam.vision import tracker as programs
+from jaxslam.vision.located import Located, adjoint
+from jaxslam.vision.settings import TrackerSettings
+from jaxslam.vision.synthetic import synthetic_source
+from jaxslam.vision.track import write_frames
+from jaxslam.vision.tracker import Tracker
+from jaxslam.vision.unit import lengthened, nearness
+
+FRAMES, FIXED = 12, 5
+WANDER = 0.3 + 0.4 * np.sin(np.arange(FRAMES + 1))
+SETTINGS = TrackerSettings(
+    filter="world", wanted=12, spare=4, patience=2, least_success=0.6, lost_for=2
+)
+
+
+class Wandering(jaxslam.AbstractStaged):
+    """`world` in a unit of its own, another with every frame until that is fixed: `opening[k]`, the
+    log of it in metres, on top of which comes the `wander[k]` of what it believes of the metre."""
+
+    estimator: jaxslam.EkfSlam
+    wander: jnp.ndarray
+    opening: jnp.ndarray
+    fixed_at: int = eqx.field(static=True, default=0)
+
+    def init(self, capacity, first=None):
+        return {"inside": self.estimator.init(capacity, first), "frame": jnp.zeros((), int)}
+
+    def predict(self, state, control):
+        return state | {"inside": self.estimator.predict(state["inside"], control)}
+
+    def predict_features(self, state, control, slots):
+        seen = self.estimator.predict_features(state["inside"], control, slots)
+        larger = jnp.exp(self.wander[state["frame"]])
+        return seen._replace(pose=scaled(seen.pose, larger), omegas=seen.omegas / larger)
+
+    def update(self, state, control, seen):
+        inside, innovation = self.estimator.update(state["inside"], control, seen)
+        return state | {"inside": inside}, innovation
+
+    def compose(self, state, control):
+        return state | {"inside": self.estimator.compose(state["inside"], control)}
+
+    def close(self, state, new):
+        return {"inside": self.estimator.close(state["inside"], new), "frame": state["frame"] + 1}
+
+    def remove(self, state, gone):
+        return state | {"inside": self.estimator.remove(state["inside"], gone)}
+
+    def marginal(self, state, function, slots=None):
+        frame = state["frame"]
+        larger = jnp.exp(self.wander[frame])
+        logs = jnp.stack([self.wander[frame], self.opening[jnp.minimum(frame, self.fixed_at)]])
+
+        def believed(scene: Scene):
+            omega = None if scene.omega is None else scene.omega / larger
+            pose = scaled(scene.pose, larger)
+            return function(replace(scene, pose=pose, omega=omega, log_scale=logs))
+
+        return self.estimator.marginal(state["inside"], believed, slots)
+
+    def in_map(self, state):
+        return self.estimator.in_map(state["inside"])
+
+    def unit_fixed(self, state):
+        return state["frame"] >= self.fixed_at
+
+
+@dataclass
+class Run:
+    """A video, and what a tracker made of it."""
+
+    tracker: Tracker
+    results: list
+    predicted: list
+
+
+@pytest.fixture(scope="module")
+def video():
+    source = synthetic_source(frames=FRAMES, width=320, height=240)
+    return source.calibration, list(source)
+
+
+def half_hidden(frame):
+    """After the first frame the left of the picture is black: what was there is given up."""
+    image = frame.image.copy()
+    image[:, :160] *= frame.index == 0
+    return replace(frame, image=image)
+
+
+def wandering(calibration, opening, fixed_at):
+    world = SETTINGS.make_filter(calibration)
+    assert isinstance(world, jaxslam.EkfSlam)
+    wander = jnp.asarray(WANDER)
+    return Wandering(world, wander, jnp.asarray(opening), fixed_at)
+
+
+def run(calibration, frames, slam=None):
+    """Every frame through a tracker; and where it predicts the landmarks, in the world."""
+    tracker, predicted, whole = Tracker(calibration, SETTINGS, slam), [], programs.to_search
+
+    def noted(landmarks, prediction, *rest):
+        points = prediction.points / prediction.omegas[:, None]
+        T = prediction.T_wc
+        slots = sorted(landmarks)
+        predicted.append((T, points[slots] @ T[:3, :3].T + T[:3, 3]))
+        return whole(landmarks, prediction, *rest)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(programs, "to_search", noted)
+        results = [tracker.track(half_hidden(frame)) for frame in frames]
+    return Run(tracker, results, predicted)
+
+
+@pytest.fixture(scope="module")
+def plain(video):
+    return run(*video)
+
+
+@pytest.fixture(scope="module")
+def wanders(video):
+    return run(*video, wandering(video[0], [0.2], 0))
+
+
+@pytest.fixture(scope="module")
+def started(video):
+    opening = np.random.default_rng(1).normal(0, 0.5, FIXED + 1)
+    return run(*video, wandering(video[0], opening, FIXED))
+
+
+def same(found, expected, ratio, within=1e-6):
+    """All lengths of one are so many times those of the other; expected is in metres."""
+    lengths = np.array([ratio] * 3 + [1.0] * 3)
+    assert found.status == expected.status
+    T = expected.T_wc.copy()
+    T[:3, 3] *= ratio
+    np.testing.assert_allclose(found.T_wc, T, rtol=0, atol=within)
+    P = lengths[:, None] * expected.covariance * lengths
+    np.testing.assert_allclose(found.covariance, P, rtol=0, atol=10 * within * P.max())
+
+
+def test_a_path_is_in_one_unit_whatever_the_filter_takes_it_for(plain, wanders):
+    ratio = np.exp(0.3)  # what frame 0 took for metres
+    for found, expected in zip(wanders.results, plain.results, strict=True):
+        same(found, expected, ratio)
+        assert found.unit_fixed
+    assert wanders.tracker._log_scale == pytest.approx(WANDER[FRAMES - 1] - 0.3, rel=1e-9)
+
+
+def test_the_map_is_in_that_unit_too_with_what_left_it(plain, wanders):
+    assert plain.tracker.deleted > 0
+    found, expected = wanders.tracker.points(), plain.tracker.points()
+    ratio = np.exp(0.3)
+    np.testing.assert_array_equal(found.numbers, expected.numbers)
+    np.testing.assert_allclose(found.points, ratio * expected.points, rtol=1e-5, atol=1e-8)
+    for name in ("covariances", "in_map"):
+        some, other = getattr(found, name), getattr(expected, name)
+        np.testing.assert_allclose(some, ratio**2 * other, rtol=1e-4, atol=1e-6 * other.max())
+
+
+def test_where_a_landmark_was_seen_first_and_where_it_is_sought_are_in_that_unit(plain, wanders):
+    ratio = np.exp(0.3)
+    for slot, one in plain.tracker.landmarks.items():
+        first = wanders.tracker.landmarks[slot].first_camera
+        expected = one.first_camera.copy()
+        expected[:3, 3] *= ratio
+        np.testing.assert_allclose(first, expected, rtol=0, atol=1e-8)
+    for (T, points), (expected, others) in zip(wanders.predicted, plain.predicted, strict=True):
+        np.testing.assert_allclose(T[:3, 3], ratio * expected[:3, 3], rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(points, ratio * others, rtol=1e-5, atol=1e-8)
+
+
+def test_a_start_that_is_found_out_ends_in_one_unit(plain, started):
+    results = started.results
+    assert [result.unit_fixed for result in results] == [k >= FIXED for k in range(FRAMES)]
+    places = [np.linalg.norm(result.T_wc[:3, 3]) for result in results]
+    truth = [np.linalg.norm(result.T_wc[:3, 3]) for result in plain.results]
+    ratio = places[FIXED] / truth[FIXED]
+    for found, expected in list(zip(results, plain.results, strict=True))[FIXED:]:
+        # What changes the look of patches by 1e-4 moves matches by as little.
+        same(found, expected, ratio, within=1e-4)
+    # What this filter makes of the depths meanwhile changes by less than its units do.
+    shares = np.array(places[1:FIXED]) / truth[1:FIXED] / ratio
+    units = np.asarray(started.tracker._slam.opening)
+    assert np.abs(np.log(shares)).max() < 0.25 < np.abs(np.diff(units)).max()
+    # The log of the map's unit: what the filter takes for metres, by what is written.
+    expected = WANDER[FRAMES - 1] - np.log(ratio)
+    assert started.tracker._log_scale == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.parametrize("after", [3, 8])
+def test_a_loaded_tracker_keeps_the_unit_digit_by_digit(video, started, tmp_path, after):
+    """From within the start, and from after it."""
+    calibration, frames = video
+    slam = started.tracker.filter
+    tracker = Tracker(calibration, SETTINGS, slam)
+    for frame in frames[: after + 1]:
+        tracker.track(half_hidden(frame))
+    tracker.save(tmp_path / "t.npz")
+    loaded = Tracker.load(tmp_path / "t.npz", slam)
+    for frame in frames[after + 1 :]:
+        found, expected = loaded.track(half_hidden(frame)), started.results[frame.index]
+        np.testing.assert_array_equal(found.T_wc, expected.T_wc)
+        np.testing.assert_array_equal(found.covariance, expected.covariance)
+        assert (found.unit_fixed, found.status) == (expected.unit_fixed, expected.status)
+    assert loaded._log_unit == started.tracker._log_unit
+    assert loaded._log_scale == started.tracker._log_scale
+
+
+def test_a_map_begun_within_a_start_has_a_start_of_its_own(video):
+    calibration, frames = video
+    slam = wandering(calibration, np.linspace(0, 0.5, FRAMES + 1), FRAMES)
+    tracker, rng = Tracker(calibration, SETTINGS, slam), np.random.default_rng(0)
+    results = []
+    for frame in frames[:9]:
+        noise = rng.integers(0, 256, frame.image.shape, dtype=np.uint8)
+        results.append(tracker.track(replace(frame, image=noise) if frame.index >= 3 else frame))
+        if results[-1].map:
+            break
+    assert results[-1].starts
+    assert not results[-1].unit_fixed
+    # A metre, as the filter takes it at the start of that map.
+    assert tracker._log_unit == pytest.approx(WANDER[0], rel=1e-12)
+    assert set(tracker._near) == {one.number for one in tracker.landmarks.values()}
+
+
+def test_the_unit_is_that_in_which_the_mean_nearness_stays():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(6, 3))
+    points[4] = np.inf
+    points[5] = 0.0
+    numbers = dict(enumerate((7, 3, 9, 1, 2, 5)))
+    before, now = nearness(numbers, points), nearness(numbers, points / 1.7)
+    assert lengthened(before, now, numbers.values()) == pytest.approx(np.log(1.7), rel=1e-12)
+    # Products t ω with ω all alike at first, and known later: t is then as long as it was.
+    omegas = np.array([0.1, 0.2, 0.6])
+    flat = dict.fromkeys(range(3), 0.5)
+    known = dict(enumerate(omegas))
+    assert np.exp(-lengthened(flat, known, range(3))) * omegas.mean() == pytest.approx(0.5)
+    assert lengthened(before, now, []) == lengthened({}, now, [7]) == 0.0
+    assert lengthened({2: 0.0}, {2: 0.1}, [2]) == 0.0
+
+
+def test_a_pose_in_another_unit_has_the_errors_in_that_unit():
+    """`(T Exp(e)) scaled = T scaled · Exp(D e)`, and the covariance is that of D e."""
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(6, 6))
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.normal(size=3)
+    here = Located(T, root @ root.T)
+    there = here.scaled(2.5)
+    np.testing.assert_allclose(there.T_wc[:3, 3], 2.5 * T[:3, 3], rtol=1e-12)
+    np.testing.assert_array_equal(there.T_wc[:3, :3], T[:3, :3])
+    D = np.diag([2.5] * 3 + [1.0] * 3)
+    np.testing.assert_allclose(there.covariance, D @ root @ root.T @ D, rtol=1e-12)
+    # Carried on by a step, it is the same before and after.
+    step = Located(np.linalg.inv(T), root.T @ root)
+    one, other = here.then(step).scaled(2.5), there.then(step.scaled(2.5))
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-9, atol=1e-9)
+    assert adjoint(there.T_wc).shape == (6, 6)
+
+
+def test_frames_csv_says_what_the_unit_is_taken_for(wanders, started, tmp_path):
+    doubtful = [
+        replace(result, log_scale=0.1 * result.index, sigma_log_scale=0.5)
+        for result in started.results
+    ]
+    for history, log_scales in ((wanders.results, None), (doubtful, 0.1 * np.arange(FRAMES))):
+        write_frames(tmp_path / "frames.csv", history)
+        with (tmp_path / "frames.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        fixed = [int(result.unit_fixed) for result in history]
+        assert [int(row["unit_fixed"]) for row in rows] == fixed
+        found = [row["log_scale"] for row in rows]
+        if log_scales is None:
+            assert found == [""] * FRAMES
+        else:
+            np.testing.assert_allclose([float(x) for x in found], log_scales, rtol=1e-5)
