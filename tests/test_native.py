@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import jaxslam
-from jaxslam import linalg
+from jaxslam import linalg, programs
 from jaxslam.consistency import montecarlo
-from jaxslam.native import NotSupportedError, batched, build
+from jaxslam.native import NotSupportedError, batch, batched, build
+from jaxslam.native.batch import Batch
 from jaxslam.native.build import compiler
 from jaxslam.native.elements import Elements
 from jaxslam.programs import Exact
@@ -131,7 +132,7 @@ def test_what_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="other shapes or types"):
         batch(SHARED, DRAWN[:, :5])
     with pytest.raises(NotSupportedError, match="not supported by the native backend: fft"):
-        batched(lambda shared, A: jnp.fft.fft(A).real, SHARED, DRAWN)
+        batched(lambda shared, A: jnp.fft.rfft(A).real, SHARED, DRAWN)
 
 
 def test_without_a_compiler_it_says_so(monkeypatch):
@@ -145,6 +146,212 @@ def test_a_compiler_that_does_not_end_is_ended(monkeypatch):
     monkeypatch.setattr(build, "PATIENCE", 1e-3)
     with pytest.raises(ValueError, match="did not end within"):
         batched(lambda shared, A: A * 12345.0, SHARED, DRAWN)
+
+
+SPECIAL = np.round(4 * DRAWN[:, 0, :6]) / 4
+SPECIAL[1, 2], SPECIAL[2, :2], SPECIAL[3, 3] = np.nan, [np.inf, -np.inf], -0.0
+SPECIAL[4], SPECIAL[5, 1::3], SPECIAL[6] = 0.0, np.nan, [0.5, 1.5, 2.5, -0.5, -1.5, 0.25]
+
+
+def special_numbers(shared, x):
+    """Of ties the first, of NaN the first; halves away or to the even; remainders of ∞."""
+    return (
+        (jnp.argmax(x), jnp.argmin(x), jnp.argmax(x == x), jnp.max(x), jnp.min(x)),
+        (jax.lax.round(x), jnp.round(x), jnp.sign(x), jnp.isfinite(x), jnp.floor(x)),
+        (jnp.fmod(x, jnp.inf), jnp.fmod(x, 0.75), jnp.fmod(1e17, x), jnp.mod(x, -0.75)),
+    )
+
+
+def places_that_are_equal(shared, x):
+    """Numbers that are put to one place are all added there, or the last one stays."""
+    at = jnp.clip(jnp.nan_to_num(x), -1, 1).astype(int) + 1
+    return jnp.zeros(4).at[at].add(jnp.arange(6) + 0.5), jnp.ones(4).at[at].set(jnp.arange(6.0))
+
+
+def order_of_equals(shared, x):
+    """Equal keys, NaN and both zeros among them, keep the order that they had."""
+    tied = jnp.floor(x)
+    by_one = jax.lax.sort((tied, jnp.arange(6.0)), num_keys=1, is_stable=True)
+    rows = jnp.stack([tied, jnp.arange(6.0)[::-1] // 2, jnp.arange(6.0)])
+    return by_one, jax.lax.sort(tuple(rows), num_keys=2, is_stable=True), jnp.argsort(-tied)
+
+
+def places_outside(shared, x):
+    """What fills the places that are not there is of the type's own."""
+    at = (4 * jnp.nan_to_num(x, posinf=9.0, neginf=-9.0)).astype(int)
+    tables = jnp.arange(5.0), jnp.arange(5), jnp.arange(5, dtype=jnp.uint8), jnp.arange(5) > 2
+    return (
+        [table.at[at].get(mode=mode) for mode in ("fill", "clip") for table in tables],
+        [jax.lax.dynamic_slice(x, (at[k],), (3,)) for k in (0, 1)],
+        jax.lax.dynamic_update_slice(jnp.zeros(6), x[:2], (at[2],)),
+    )
+
+
+def last_row_of_a_long_loop(shared, x):
+    def turn(carry, t):
+        return carry * 0.5 + t, (carry[0] * t, carry)
+
+    _, (first, rows) = jax.lax.scan(turn, x, jnp.arange(4000.0))
+    return first[-1], rows[-1], rows[7, :2]
+
+
+def nothing_at_all(shared, x):
+    none = x[:0]
+    end, turns = jax.lax.scan(lambda c, t: (c + t, 2 * c), x[0], none)
+    return end, turns, jnp.cumsum(none), jnp.sum(none), jnp.max(none, initial=-jnp.inf), none @ none
+
+
+CERTAIN = (
+    special_numbers, places_that_are_equal, order_of_equals, places_outside,
+    last_row_of_a_long_loop, nothing_at_all,
+)  # fmt: skip
+
+
+def computed_again(monkeypatch):
+    """The runs that XLA has to compute, as they are."""
+    told, by_xla = [], Batch._by_xla
+
+    def noted(batch, shared, runs, doubted, made):
+        told.extend(doubted.tolist())
+        by_xla(batch, shared, runs, doubted, made)
+
+    monkeypatch.setattr(Batch, "_by_xla", noted)
+    return told
+
+
+def assert_equal(function, given):
+    found = batched(function, SHARED, given)(SHARED, given)
+    wanted = jax.vmap(function, (None, 0))(SHARED, given)
+    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        assert x.dtype == y.dtype
+        np.testing.assert_array_equal(x, y)
+
+
+@needs_compiler
+@pytest.mark.parametrize("function", CERTAIN, ids=lambda f: f.__name__)
+def test_special_numbers_are_the_same_to_the_bit(function, monkeypatch):
+    told = computed_again(monkeypatch)
+    assert_equal(function, SPECIAL)
+    assert not told
+
+
+def products_with_zero(shared, x):
+    sparse = jnp.where(jnp.eye(6) > 0, 2.0, 0.0)
+    return sparse @ x, 0.0 * x[:2], jnp.outer(x, x)[:, :, None] * jnp.zeros(2)
+
+
+def many_products_with_zero(shared, x):
+    A = jnp.outer(x, jnp.arange(6.0)) * jnp.ones((6, 6))
+    B = jnp.concatenate([jnp.eye(6), A, jnp.zeros((6, 6)), A], 1)
+    return B @ jnp.concatenate([A, A + 1, A, A]), B.T @ B
+
+
+def quotients_of_zero(shared, x):
+    return 0.0 / x[:3]
+
+
+def loop_with_products(shared, x):
+    """Of a run that has left the loop nothing is asked."""
+
+    def turn(carry):
+        n, y = carry
+        return n + 1, jnp.where(n > 2, jnp.inf, y) * jnp.array([1.0, 0.0, 1.0, 1.0, 0.0, 1.0])
+
+    return jax.lax.while_loop(lambda carry: carry[0] < jnp.where(x[0] > 0, 3, 5), turn, (0, x))
+
+
+def whole_numbers(shared, x):
+    n = (jnp.clip(jnp.nan_to_num(x), -2, 2) * 2**16).astype(jnp.int32)
+    return n * n, n - jnp.int32(2**31 - 1), jnp.sum(n * jnp.int32(2**14))
+
+
+def bytes_of_a_run(shared, x):
+    n = jnp.clip(jnp.nan_to_num(x), 0, 2).astype(jnp.uint8) * jnp.uint8(90)
+    return n[:2] + jnp.uint8(100), jnp.uint8(180) - n
+
+
+def truncated(shared, x):
+    return x.astype(jnp.int32), (100 * x).astype(jnp.uint8), (x < 0) + jnp.int8(0)
+
+
+def quotients_of_whole_numbers(shared, x):
+    n = jnp.clip(2 * jnp.nan_to_num(x[0]), -2, 2).astype(jnp.int32)
+    return jax.lax.div(jnp.int32(7), n), jax.lax.rem(jnp.int32(7), n)
+
+
+DOUBTED = (
+    products_with_zero, many_products_with_zero, quotients_of_zero, loop_with_products,
+    whole_numbers, bytes_of_a_run, truncated, quotients_of_whole_numbers,
+)  # fmt: skip
+
+
+@needs_compiler
+@pytest.mark.parametrize("function", DOUBTED, ids=lambda f: f.__name__)
+def test_runs_of_which_it_cannot_be_certain_are_computed_by_xla(function, monkeypatch):
+    told = computed_again(monkeypatch)
+    assert_equal(function, SPECIAL)
+    assert 0 < len(told) < RUNS
+
+
+@needs_compiler
+def test_integers_of_single_precision_are_whole(monkeypatch):
+    """Above 2²⁴ no float32 is odd."""
+    told = computed_again(monkeypatch)
+    given = np.array([[3, 5], [2**24, 1], [2**24 + 1, 0], [2**23, 2**23 + 1]], np.int32)
+    shared = np.ones(2, np.float32)
+
+    def sums(shared, n):
+        return jnp.sum(n) - n[0], n + 1, shared * n[0], jnp.zeros(2, int).at[n % 2].add(n)
+
+    with jax.enable_x64(False):
+        found = batched(sums, shared, given)(shared, given)
+        wanted = jax.vmap(sums, (None, 0))(shared, given)
+    for x, y in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(x, y)
+    assert told == [1, 2, 3]
+
+
+@needs_compiler
+def test_other_numbers_beside_are_refused():
+    with pytest.raises(NotSupportedError, match="float32 beside float64"):
+        batched(lambda shared, x: x.astype(jnp.float32).astype(float), SHARED, SPECIAL)
+    with pytest.raises(ValueError, match="integers"):
+        batched(lambda shared, x: x[0] + jnp.uint8(3) * jnp.uint8(90), SHARED, SPECIAL)
+
+
+@needs_compiler
+@pytest.mark.parametrize("damage", ["empty", "cut", "changed"])
+def test_a_damaged_library_is_built_anew(damage, tmp_path, monkeypatch):
+    monkeypatch.setattr(programs, "_kept_in", tmp_path)
+    built, compiled = [], build._compile
+    monkeypatch.setattr(build, "_compile", lambda *x: (built.append(1), compiled(*x)))
+
+    def function(shared, x):
+        return x[:2] + shared
+
+    for _ in range(2):
+        assert_equal(function, SPECIAL)
+    assert len(built) == 1
+    (path,) = tmp_path.glob("*.so")
+    whole = path.read_bytes()
+    middle = len(whole) // 2
+    changed = whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :]
+    path.unlink()  # it is loaded
+    path.write_bytes({"empty": b"", "cut": whole[:middle], "changed": changed}[damage])
+    for _ in range(2):
+        assert_equal(function, SPECIAL)
+    assert len(built) == 2
+
+
+@needs_compiler
+@pytest.mark.parametrize("error", [AssertionError("a number"), OSError("full"), KeyError(3)])
+def test_what_goes_wrong_within_is_a_value_error(error, monkeypatch):
+    def failing(*args):
+        raise error
+
+    monkeypatch.setattr(batch, "plan", failing)
+    with pytest.raises(ValueError, match=f"native backend has failed .{type(error).__name__}"):
+        batched(special_numbers, SHARED, SPECIAL)
 
 
 def test_zeros_cost_nothing_and_nothing_is_computed_twice():
@@ -207,7 +414,7 @@ def test_an_unknown_backend_is_refused():
 class Powered(eqx.Module):
     """A filter, as far as its key goes."""
 
-    numbers: jax.Array
+    numbers: jax.Array | None
     power: object = eqx.field(static=True)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -19,11 +20,15 @@ __all__ = ["Batch", "NotSupportedError", "batched"]
 
 
 class Batch:
-    """`jax.vmap(function, (None, 0))(shared, runs)`, to rounding; of NumPy's arrays."""
+    """`jax.vmap(function, (None, 0))(shared, runs)`, to rounding; of NumPy's arrays.
+
+    Runs in which it is not certain, because something was not finite that met a zero, or an integer
+    was too large for its type, are computed by XLA.
+    """
 
     def __init__(self, function: Callable[[Any, Any], Any], shared: Any, runs: Any) -> None:
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), runs)
-        self._given = _kinds((shared, one))
+        self._given, self._function = _kinds((shared, one)), function
         traced, self._shapes = program(function, *jax.tree.map(_kind, (shared, one)))
         inputs = [(x.dtype, own) for x, own in zip(*self._leaves(shared, one), strict=True)]
         outputs = jax.tree.leaves(self._shapes)
@@ -42,6 +47,8 @@ class Batch:
         count = len(jax.tree.leaves(runs)[0])
         leaves, structure = jax.tree.flatten(self._shapes)
         made = [np.empty((count, *x.shape), x.dtype) for x in leaves]
+        doubted = np.zeros(count, bool)
+        doubts = ctypes.c_void_p(doubted.ctypes.data)
         pointers = [(ctypes.c_void_p * len(x))(*(y.ctypes.data for y in x)) for x in (given, made)]
 
         def part(firsts) -> None:
@@ -49,7 +56,7 @@ class Batch:
             begin = ctypes.c_void_p(arena.ctypes.data + -arena.ctypes.data % BYTES)
             for first in firsts:
                 some = min(self._width, count - first)
-                self._run(begin, *pointers, ctypes.c_long(first), ctypes.c_long(some))
+                self._run(begin, *pointers, doubts, ctypes.c_long(first), ctypes.c_long(some))
 
         groups = range(0, count, self._width)
         parts = [groups[k::threads] for k in range(threads)]
@@ -58,7 +65,20 @@ class Batch:
         else:
             with ThreadPoolExecutor(threads) as pool:
                 list(pool.map(part, parts))
+        if doubted.any():
+            self._by_xla(shared, runs, np.flatnonzero(doubted), made)
         return jax.tree.unflatten(structure, made)
+
+    def _by_xla(self, shared: Any, runs: Any, doubted: np.ndarray, made: list[np.ndarray]) -> None:
+        """These runs; as many more as few sizes of a batch take."""
+        again = np.resize(doubted, 1 << (len(doubted) - 1).bit_length())
+        results = self._vmapped(shared, jax.tree.map(lambda x: np.asarray(x)[again], runs))
+        for x, result in zip(made, jax.tree.leaves(results), strict=True):
+            x[doubted] = np.asarray(result)[: len(doubted)]
+
+    @cached_property
+    def _vmapped(self) -> Callable[[Any, Any], Any]:
+        return jax.jit(jax.vmap(self._function, (None, 0)))
 
     @staticmethod
     def _leaves(shared, one):
@@ -81,6 +101,12 @@ def batched(function: Callable[[Any, Any], Any], shared: Any, runs: Any) -> Batc
     """A program for arguments of these shapes and types.
 
     Raises `NotSupportedError` for a function that has something for which there is no rule, and
-    ValueError without a C++ compiler.
+    ValueError without a C++ compiler, or where anything else goes wrong.
     """
-    return Batch(function, shared, runs)
+    try:
+        return Batch(function, shared, runs)
+    except ValueError:
+        raise
+    except Exception as error:  # of this backend, or the function's own, which XLA will tell
+        what = f"{type(error).__name__}: {error}"
+        raise ValueError(f"the native backend has failed ({what})") from error

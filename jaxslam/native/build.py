@@ -47,11 +47,28 @@ def built(source: Source) -> ctypes.CDLL:
         folder.mkdir(parents=True, exist_ok=True)
         with write_atomically(path) as temporary:
             _compile(command, source, temporary)
+            whole = _digest(temporary)
+        with write_atomically(_told(path)) as temporary:
+            temporary.write_text(whole)
     return ctypes.CDLL(str(path))
 
 
 def _trusted(path: Path) -> bool:
-    return path.exists() and (not hasattr(os, "getuid") or path.stat().st_uid == os.getuid())
+    """Whether it is there, whole and this user's."""
+    try:
+        own = not hasattr(os, "getuid") or path.stat().st_uid == os.getuid()
+        return own and _digest(path) == _told(path).read_text()
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _told(path: Path) -> Path:
+    """Where the digest of a library is."""
+    return path.with_suffix(".sha256")
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _compile(command: list[str], source: Source, path: Path) -> None:

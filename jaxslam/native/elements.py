@@ -4,6 +4,9 @@ An element is a number of one run: a constant, a variable, or an operation on el
 the traced function is an integer array of elements, so that slices, transposes, concatenations and
 whatever else only moves numbers cost nothing when the program runs, zeros are known to be zeros
 wherever they go, and what is computed twice is found.
+
+A product with a known zero is 0 only if the other number is finite. It is taken to be, and is a
+*suspect*: a run in which a suspect turns out not to be finite is not this program's to compute.
 """
 
 from __future__ import annotations
@@ -48,6 +51,15 @@ def _select(which, first, second):
     return np.where(which != 0, second, first)
 
 
+def _round_away(x):
+    whole = np.floor(np.abs(x))
+    return np.copysign(whole + (np.abs(x) - whole >= 0.5), x)
+
+
+def _within(x, low, high):
+    return np.where((low <= x) & (x <= high), 0.0, np.nan)
+
+
 OPERATIONS = {
     "copy": Operation("{0}", np.positive),
     "add": Operation("({0} + {1})", np.add, True),
@@ -72,7 +84,9 @@ OPERATIONS = {
     "abs": Operation("l_fabs({0})", np.abs),
     "floor": _called("floor", np.floor),
     "ceil": _called("ceil", np.ceil),
-    "round": _called("rint", np.rint),
+    "rem": Operation("l_fmod({0}, {1})", np.fmod),
+    "round_to_even": _called("rint", np.rint),
+    "round_away": _called("round", _round_away),
     "trunc": _called("trunc", np.trunc),
     "sign": Operation("l_sign({0})", np.sign),
     "sin": _called("sin", np.sin),
@@ -90,8 +104,16 @@ OPERATIONS = {
     "log1p": _called("log1p", np.log1p),
     "atan2": Operation("l_atan2({0}, {1})", np.arctan2),
     "pow": Operation("l_pow({0}, {1})", np.power),
+    "within": Operation("l_within({0}, {1}, {2})", _within),
+    "apart_from_zero": Operation(
+        "l_apart_from_zero({0})", lambda x: np.where(x * 0 == x, np.nan, 0)
+    ),
 }
-"""On numbers of one kind: integers are numbers without a fraction, and truth is 0 or 1."""
+"""On numbers of one kind: integers are numbers without a fraction, and truth is 0 or 1. `within` is
+0 for first operands from the second to the third, `apart_from_zero` for all but 0; else NaN."""
+TRUTHS = ("eq", "ne", "lt", "le", "gt", "ge", "and", "or", "not", "is_finite")
+BOUNDED = ("copy", "neg", "max", "min", "abs", "floor", "ceil", "trunc", "sign", "sin", "cos")
+"""Finite where all operands are."""
 NAMES = tuple(OPERATIONS)
 CODES = {name: code for code, name in enumerate(NAMES, start=2)}
 
@@ -106,9 +128,11 @@ class Elements:
         self._arguments = np.zeros((1024, 3), np.int32)
         self._value = np.zeros(1024)
         self._region = np.zeros(1024, np.int32)
+        self._finite = np.zeros(1024, bool)
         self._regions = 1
         self._known: list[dict[tuple[Any, ...], Any]] = [{}]
         self._inside = [0]
+        self._suspects: list[set[int]] = [set()]
         self._constants: dict[Any, int] = {}
         self.zero, self.one = (int(self.constant(x)) for x in (0.0, 1.0))
 
@@ -136,17 +160,22 @@ class Elements:
     def inside(self):
         """What is made here is not known outside: the body of a loop."""
         self._known.append({})
+        self._suspects.append(set())
         self._inside.append(self._regions)
         self._regions += 1
         try:
             yield
         finally:
             self._known.pop()
+            self._suspects.pop()
             self._inside.pop()
 
     def constant(self, values: Any) -> Refs:
-        """Elements for known numbers."""
-        values = np.asarray(values, self.dtype).astype(float)
+        """Elements for known numbers. Raises ValueError for integers that are none of these."""
+        given = np.asarray(values)
+        values = given.astype(self.dtype).astype(float)
+        if np.issubdtype(given.dtype, np.integer) and np.any(values != given):
+            raise ValueError("integers of so many digits are not supported by the native backend")
         unique, inverse = np.unique(values.ravel().view(np.int64), return_inverse=True)
         found = np.array([self._one_constant(int(bits)) for bits in unique], np.int32)
         return found[inverse].reshape(values.shape) if values.size else np.zeros(values.shape, int)
@@ -154,7 +183,8 @@ class Elements:
     def _one_constant(self, bits: int) -> int:
         if bits not in self._constants:
             self._constants[bits] = int(self._new(1, CONSTANT)[0])
-            self._value[self._constants[bits]] = np.int64(bits).view(float)
+            self._value[self._constants[bits]] = value = np.int64(bits).view(float)
+            self._finite[self._constants[bits]] = np.isfinite(value)
         return self._constants[bits]
 
     def variables(self, shape: tuple[int, ...]) -> Refs:
@@ -164,7 +194,7 @@ class Elements:
     def _new(self, count: int, code: int) -> Refs:
         start, self.size = self.size, self.size + count
         while self.size > len(self._code):
-            for name in ("_code", "_arguments", "_value", "_region"):
+            for name in ("_code", "_arguments", "_value", "_region", "_finite"):
                 old = getattr(self, name)
                 setattr(self, name, np.concatenate([old, np.zeros_like(old)]))
         self._code[start : self.size] = code
@@ -183,6 +213,23 @@ class Elements:
         """Values, where all are constant."""
         return self._value[refs] if np.all(self.is_constant(refs)) else None
 
+    def suspect(self, refs: Refs) -> None:
+        """These are to be finite, here."""
+        refs = np.ravel(refs)
+        self._suspects[-1].update(np.unique(refs[~self._finite[refs]]).tolist())
+
+    def finite(self, refs: Refs) -> None:
+        """These are known to be finite."""
+        self._finite[refs] = True
+
+    def suspects(self) -> Refs:
+        """Of the loop that is open, or of the program."""
+        return np.array(sorted(self._suspects[-1]), np.int32)
+
+    def region_now(self) -> int:
+        """The loop that is open."""
+        return self._inside[-1]
+
     def once(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
         """What was made by this name here or around, or what is made now."""
         for known in reversed(self._known):
@@ -196,14 +243,15 @@ class Elements:
         arrays = np.broadcast_arrays(*arguments)
         flat = [x.ravel() for x in arrays]
         result = np.full(flat[0].shape, -1, np.int32)
-        for where, instead in self._shortcuts(name, flat):
-            np.copyto(result, instead, where=where & (result < 0))
-        todo = result < 0
-        constant = todo & np.logical_and.reduce([self.is_constant(x) for x in flat])
+        constant = np.logical_and.reduce([self.is_constant(x) for x in flat])
         if constant.any():
             result[constant] = self._folded(name, [x[constant] for x in flat])
-        todo &= ~constant
         before = self.size
+        for where, instead in self._shortcuts(name, flat):
+            where = where & (result < 0)
+            np.copyto(result, instead, where=where)
+            self._suspected(name, flat, where & (result == self.zero))
+        todo = result < 0
         if todo.any():
             result[todo] = self._computed(name, [x[todo] for x in flat])
         return result.reshape(arrays[0].shape), np.arange(before, self.size, dtype=np.int32)
@@ -212,6 +260,16 @@ class Elements:
         with np.errstate(all="ignore"):
             values = OPERATIONS[name].value(*(self._value[x].astype(self.dtype) for x in arguments))
         return self.constant(values)
+
+    def _suspected(self, name: str, x: list[Refs], zero: np.ndarray) -> None:
+        """What has to be finite, and in a quotient not zero, where the result was said to be 0."""
+        if not zero.any():
+            return
+        if name == "mul":
+            for a in x:
+                self.suspect(a[zero])
+        elif name == "div":
+            self.suspect(self._computed("apart_from_zero", [x[1][zero]]))
 
     def _shortcuts(self, name: str, x: list[Refs]):
         """Where, and what is the result without computing it. A product with 0 is 0."""
@@ -226,7 +284,7 @@ class Elements:
             yield self.is_zero(x[1]), x[0]
         elif name == "div":
             yield x[1] == self.one, x[0]
-            yield self.is_zero(x[0]) & ~self.is_zero(x[1]), self.zero
+            yield self.is_zero(x[0]) & ~self.is_constant(x[1]), self.zero
         elif name == "select":
             yield self.is_zero(x[0]) | (x[1] == x[2]), x[1]
             yield self.is_constant(x[0]), x[2]
@@ -245,6 +303,12 @@ class Elements:
         missing = found < 0
         new = self._new(int(missing.sum()), code)
         self._arguments[new] = keys[missing]
+        if name in TRUTHS:
+            self._finite[new] = True
+        elif name in BOUNDED:
+            self._finite[new] = self._finite[keys[missing][:, : len(arguments)]].all(1)
+        elif name == "select":
+            self._finite[new] = self._finite[keys[missing][:, 1:]].all(1)
         found[missing] = new
         known = self._known[-1]
         for key, ref in zip(keys[missing].tolist(), new.tolist(), strict=True):

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxslam.native.elements import CONSTANT, NAMES, OPERATIONS, Refs
 from jaxslam.native.plan import Plan, arity
-from jaxslam.native.program import Apply, Loop, Product, Put, Sort, Take, While
+from jaxslam.native.program import Apply, Check, Loop, Product, Put, Sort, Take, While
 
 PRELUDE = Path(__file__).with_name("prelude.hpp")
 FEW = 4
@@ -100,6 +100,8 @@ class _Writer:
     def step(self, step: Any) -> str:
         if isinstance(step, Apply):
             return self.apply(step)
+        if isinstance(step, Check):
+            return self.check(step)
         self.local.clear()  # it writes where they were
         text = self.other(step)
         self.local.clear()  # and over what it has copied first
@@ -130,6 +132,13 @@ class _Writer:
                     f"{self.copied(step.made, step.given)} sort(m, {made}, {sizes}, {step.keys});"
                 )
         raise AssertionError(step)
+
+    def check(self, step: Check) -> str:
+        """Notes the runs in which a suspect is not finite."""
+        found = f"doubts(m, {self.tables(self.offset(step.refs))}, {step.refs.size})"
+        if step.where is not None:
+            found = f"(AT({int(self.offset(step.where.ravel())[0])}) != ZERO ? {found} : ZERO)"
+        return f"AT({self.doubt}) += {found};"
 
     def copied(self, to: Refs, source: Refs) -> str:
         """Numbers in memory at another place."""
@@ -257,8 +266,9 @@ class _Writer:
         return f"product<{M}, {N}, {sign}>(m, {', '.join(arguments)});"
 
     def or_trash(self, refs: Refs) -> np.ndarray:
-        """Bytes, of −1 where nothing is."""
-        return np.where(refs < 0, self.trash, self.plan.slot[refs] * BYTES)
+        """Bytes, of −1 where nothing is, and of what is not used."""
+        slots = self.plan.slot[refs]
+        return np.where((refs < 0) | (slots < 0), self.trash, slots * BYTES)
 
     def tiled(self, refs: Refs, size: int) -> str:
         """Places of a tile's rows for every k."""
@@ -269,6 +279,11 @@ class _Writer:
     def trash(self) -> int:
         """Where nothing is that is used."""
         return self.plan.slots * BYTES
+
+    @property
+    def doubt(self) -> int:
+        """NaN in the runs that are not to be computed by this program, else 0."""
+        return self.trash + BYTES
 
     def loop(self, step: Loop) -> str:
         """A loop in C++."""
@@ -295,7 +310,8 @@ class _Writer:
         """Numbers from a row of a table, or to it."""
         if not refs.size:
             return ""
-        places, here = self.offset(table), self.tables(self.offset(refs))
+        places = self.offset(table) if reading else self.or_trash(table)
+        here = self.tables(self.offset(refs))
         step = np.diff(places, axis=0)
         if np.all(step == (step[:1, :1] if len(step) else 0)):
             by = int(step[0, 0]) if len(step) else 0
@@ -330,7 +346,7 @@ class _Writer:
         lines.append(
             f"for (long e = 0; e < {constants.size}; ++e) AT({places}[e]) = C({values}[e]);"
         )
-        lines.append(f"AT({self.trash}) = ZERO;")
+        lines.append(f"AT({self.trash}) = AT({self.doubt}) = ZERO;")
         for k, (refs, (kind, own)) in enumerate(zip(program.inputs, inputs, strict=True)):
             if refs.size and self.plan.live[refs].any():
                 begin, each = int(self.offset(refs.ravel()[:1])[0]), int(own)
@@ -341,11 +357,14 @@ class _Writer:
             if refs.size:
                 at = self.tables(self.offset(refs))
                 lines.append(f"store<{_type(kind)}>(m, out[{k}], {refs.size}, {at}, first, count);")
-        size = (self.plan.slots + 1) * BYTES
+        lines.append(
+            f"for (long l = 0; l < count; ++l) doubted[first + l] = AT({self.doubt})[l] != 0;"
+        )
+        size = (self.plan.slots + 2) * BYTES
         return "\n".join([
             f'extern "C" long arena() {{ return {size}; }}',
-            'extern "C" void run(char *m, const void *const *in, void *const *out, long first, '
-            "long count) {", *lines, "}\n",
+            'extern "C" void run(char *m, const void *const *in, void *const *out, bool *doubted, '
+            "long first, long count) {", *lines, "}\n",
         ])  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from jaxslam.native.elements import CODES, CONSTANT, NAMES, OPERATIONS, VARIABLE
 from jaxslam.native.fuse import fused
 from jaxslam.native.program import (
     Apply,
+    Check,
     Loop,
     Product,
     Program,
@@ -55,16 +56,101 @@ class Plan:
 
 def plan(program: Program) -> Plan:
     """Liveness, expressions and places of a program."""
+    program = replace(program, steps=_checked(program))
     live, needed = _live(program)
     inlined, uses = _inlined(program, live, needed)
     form, forms = _forms(program, live, inlined)
     result = Plan(program, live, inlined, form, forms, np.full(live.size, -1, np.int64))
-    result.program = replace(program, steps=fused(result, uses))
+    result.program = replace(program, steps=_near(fused(result, uses)))
     _Places(result).assign()
     return result
 
 
-def _live(program: Program) -> tuple[np.ndarray, np.ndarray]:
+CARRIES = ("add", "sub", "mul", "neg", "copy")
+"""Operations whose result is not finite where an operand is not."""
+
+
+def _checked(program: Program) -> list[Any]:
+    """Steps that check, in place of suspects, what is computed of them and used anyway.
+
+    A sum, or a product, is finite only if its operands are: the last of a chain tells of all.
+    """
+    elements = program.elements
+    live, _ = _live(program, checks=False)
+    after = np.arange(elements.size)
+    codes = [CODES[name] for name in CARRIES]
+    made = np.flatnonzero(live & np.isin(elements.code, codes))
+    for k in range(2):
+        operands = elements.arguments[made, k]
+        binary = k == 0 or ~np.isin(elements.code[made], [CODES["neg"], CODES["copy"]])
+        same = (elements.region[operands] == elements.region[made]) & binary
+        after[operands[same]] = made[same]
+    each(program.steps, lambda step: _through_product(elements, live, step, after))
+    after[elements.code == CONSTANT] = np.flatnonzero(elements.code == CONSTANT)
+    while np.any(after != (farther := after[after])):
+        after = farther
+
+    def visit(steps):
+        return [one(step) for step in steps]
+
+    def one(step):
+        match step:
+            case Check():
+                here = elements.region[step.refs] == step.region
+                return replace(step, refs=np.unique(np.where(here, after[step.refs], step.refs)))
+            case Loop():
+                return replace(step, steps=visit(step.steps))
+            case While():
+                return replace(step, condition=visit(step.condition), steps=visit(step.steps))
+        return step
+
+    return visit(program.steps)
+
+
+def _through_product(elements, live, step, after) -> None:
+    """Of every number of a product's rows, a sum of which it is part."""
+    if not isinstance(step, Product):
+        return
+    alive = live[step.made] & (elements.region[step.made] == elements.region[step.made].flat[0])
+    there = [~elements.is_zero(x) for x in (step.left, step.right)]
+    sides = (step.left, there[1], alive, step.made), (step.right, there[0], alive.T, step.made.T)
+    for refs, other, used, made in sides:
+        for k in range(refs.shape[1]):
+            part = used & other[:, k]
+            of = made[np.arange(len(made)), part.argmax(1)]
+            same = part.any(1) & (elements.region[refs[:, k]] == elements.region[of])
+            after[refs[same, k]] = of[same]
+
+
+def _near(steps: list[Any]) -> list[Any]:
+    """Checks right after what they check was computed."""
+    checks = [step for step in steps if isinstance(step, Check)]
+    steps = [_near_within(step) for step in steps if not isinstance(step, Check)]
+    if not checks:
+        return steps
+    (check,) = checks
+    result = []
+    left = check.refs
+    for step in steps:
+        result.append(step)
+        if isinstance(step, Apply | Product):
+            here = np.intersect1d(left, step.made)
+            if here.size:
+                result.append(replace(check, refs=here))
+                left = np.setdiff1d(left, here)
+    return [*result, replace(check, refs=left)] if left.size else result
+
+
+def _near_within(step: Any) -> Any:
+    match step:
+        case Loop():
+            return replace(step, steps=_near(step.steps))
+        case While():
+            return replace(step, condition=_near(step.condition), steps=_near(step.steps))
+    return step
+
+
+def _live(program: Program, checks: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """Which elements are used, and which of them not only by operations."""
     elements = program.elements
     live, needed = (np.zeros(elements.size, bool) for _ in range(2))
@@ -96,6 +182,9 @@ def _live(program: Program) -> tuple[np.ndarray, np.ndarray]:
                     alive = live[step.made]
                     need(step.left[alive.any(1)])
                     need(step.right[alive.any(0)])
+                case Check():
+                    for refs in read_by(step) if checks else ():
+                        need(refs)
                 case _ if live[step.made].any():
                     live[step.made] = True
                     for refs in read_by(step):

@@ -34,6 +34,7 @@ extern "C" const char jaxslam_tables[] __attribute__((visibility("hidden")));
 EACH(floor, std::floor)
 EACH(ceil, std::ceil)
 EACH(rint, std::rint)
+EACH(round, std::round)
 EACH(trunc, std::trunc)
 EACH(sqrt, std::sqrt)
 EACH(fabs, std::fabs)
@@ -48,6 +49,7 @@ EACH(expm1, std::expm1)
 EACH(log1p, std::log1p)
 EACH_TWO(atan2, std::atan2)
 EACH_TWO(pow, std::pow)
+EACH_TWO(fmod, std::fmod)
 #if defined(VECTOR_MATH) && defined(__AVX512F__)
 extern "C" V VECTOR_MATH(sin)(V);
 extern "C" V VECTOR_MATH(cos)(V);
@@ -66,6 +68,8 @@ EACH(log, std::log)
 static inline V l_max(V x, V y) { return x != x ? x : (x > y ? x : y); }
 static inline V l_min(V x, V y) { return x != x ? x : (x < y ? x : y); }
 static inline V l_is_finite(V x) { return (x - x) == 0 ? ONE : ZERO; }
+static inline V l_within(V x, V low, V high) { return x >= low & x <= high ? ZERO : C(NAN); }
+static inline V l_apart_from_zero(V x) { return x > 0 | x < 0 ? ZERO : C(NAN); }
 static inline V l_sign(V x) { return x > 0 ? ONE : (x < 0 ? -ONE : x); }
 static inline bool l_any(V x) {
   for (int l = 0; l < W; ++l)
@@ -130,6 +134,13 @@ static void put(char *m, const int *made, const int *which, const int *values, i
       *place = ADD ? *place + x[l] : x[l];
     }
   }
+}
+
+// NaN where one of these is not finite.
+static inline V doubts(char *m, const int *which, int count) {
+  V sum = ZERO;
+  for (int e = 0; e < count; ++e) sum += AT(which[e]) * ZERO;
+  return sum;
 }
 
 static void copy(char *m, const int *to, const int *from, int count) {

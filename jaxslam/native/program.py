@@ -61,6 +61,17 @@ class Sort:
 
 
 @dataclass(frozen=True)
+class Check:
+    """A run in which one of these is not finite is not to be computed by this program."""
+
+    refs: Refs
+    region: int
+    """The loop in which they are checked."""
+    where: Refs | None
+    """Only in runs in which this is true."""
+
+
+@dataclass(frozen=True)
 class Loop:
     """`length` times: `carry ← after`; carry is `before` at first."""
 
@@ -113,6 +124,8 @@ def read_by(step: Any) -> list[Refs]:
             return [step.table, step.which, step.values]
         case Sort():
             return [step.given]
+        case Check():
+            return [step.refs, *([] if step.where is None else [step.where.ravel()])]
         case Loop() | While():
             return [step.before]
     return []
@@ -135,4 +148,6 @@ def written_by(step: Any) -> list[Refs]:
             return [step.carry, step.read, step.written]
         case While():
             return [step.carry]
+        case Check():
+            return []
     return [step.made[step.made >= 0]]

@@ -15,7 +15,7 @@ from jax.extend.core import ClosedJaxpr, Literal
 from jax.interpreters import partial_eval
 
 from jaxslam.native.elements import OPERATIONS, Elements, Refs
-from jaxslam.native.program import Apply, Loop, Product, Program, Put, Sort, Take, While
+from jaxslam.native.program import Apply, Check, Loop, Product, Program, Put, Sort, Take, While
 
 UNROLLED = 3000
 """Operations up to which all turns of a loop are written out: their indices are then known."""
@@ -47,8 +47,12 @@ def program(function: Callable[..., Any], *arguments: Any) -> tuple[Program, Any
     jaxpr, used = partial_eval.dce_jaxpr(traced.jaxpr, [True] * len(traced.out_avals))[:2]
     tracer = Tracer(Elements(_dtype([*leaves, *traced.out_avals])))
     inputs = [tracer.elements.variables(x.shape) for x in leaves]
+    for x, refs, needed in zip(leaves, inputs, used, strict=True):
+        if needed:
+            tracer.given(refs, x.dtype)
     given = [x for x, needed in zip(inputs, used, strict=True) if needed]
     outputs = tracer.run(jaxpr, traced.consts, given)
+    tracer.check()
     return Program(tracer.elements, tracer.steps, inputs, outputs), shapes
 
 
@@ -65,13 +69,55 @@ class Tracer:
     def __init__(self, elements: Elements) -> None:
         self.elements = elements
         self.steps: list[Any] = []
+        self.exact = 2 ** (np.finfo(elements.dtype).nmant + 1) - 1
+        """Up to here, integers are numbers."""
+        self.going: Refs | None = None
+        """Where the loops around are still going on."""
+        self.whole = False
+        """Whether sums are of integers."""
+
+    def check(self) -> None:
+        """What has been suspected here is checked."""
+        suspects = self.elements.suspects()
+        if suspects.size:
+            self.steps.append(Check(suspects, self.elements.region_now(), self.going))
+
+    def given(self, refs: Refs, dtype: Any) -> None:
+        """Numbers of this type come from outside."""
+        self.supported(dtype)
+        if np.dtype(dtype).kind != "f":
+            self.elements.finite(refs)
+        if np.issubdtype(dtype, np.integer) and np.iinfo(dtype).max > self.exact:
+            self.within(refs, -self.exact, self.exact)
+
+    def supported(self, dtype: Any) -> None:
+        """Raise `NotSupportedError` for numbers of another precision, or that are none."""
+        kind = getattr(dtype, "kind", "")
+        if not (dtype == self.elements.dtype or kind in ("b", "i", "u")):
+            numbers = self.elements.dtype
+            raise NotSupportedError(
+                f"{dtype} beside {numbers} is not supported by the native backend"
+            )
+
+    def within(self, refs: Refs, low: float, high: float) -> None:
+        """Suspect what is not from low to high."""
+        if not refs.size:
+            return
+        told = self.apply("within", refs, self.constant(float(low)), self.constant(float(high)))
+        if not np.all(self.elements.known(told[self.elements.is_constant(told)]) == 0):
+            raise NotSupportedError(
+                "integers that overflow are not supported by the native backend"
+            )
+        self.elements.suspect(told)
 
     def run(self, jaxpr: Any, constants: Sequence[Any], arguments: Sequence[Refs]) -> list[Refs]:
         """Results of a traced function."""
         values: dict[Any, Refs] = {}
 
         def read(x):
-            return self.elements.constant(x.val) if isinstance(x, Literal) else values[x]
+            if isinstance(x, Literal):
+                return self.elements.constant(np.asarray(x.val, x.aval.dtype))
+            return values[x]
 
         values.update(zip(jaxpr.constvars, map(self.elements.constant, constants), strict=True))
         values.update(zip(jaxpr.invars, arguments, strict=True))
@@ -87,7 +133,27 @@ class Tracer:
         return self.run(traced, (), arguments)
 
     def one(self, equation: Any, arguments: list[Refs]) -> list[Refs]:
-        """One operation, by its rule."""
+        """One operation, by its rule, and of integers only where they fit their type."""
+        name, avals = equation.primitive.name, [v.aval for v in equation.outvars]
+        if not any(name in known for known in (INNER, MOVES, RULES, OPERATIONS)):
+            raise NotSupportedError(f"not supported by the native backend: {name}")
+        for aval in avals if name not in INNER else ():
+            self.supported(aval.dtype)
+        if name not in ARITHMETIC:
+            return self.by_rule(equation, arguments)
+        if avals[0].dtype.kind == "b" and name != "convert_element_type":
+            raise NotSupportedError(f"not supported by the native backend: {name} of truth")
+        whole = avals[0].dtype.kind in ("i", "u")
+        self.whole = whole and name in SUMS
+        results = self.by_rule(equation, arguments)
+        self.whole = False
+        if whole and (name != "convert_element_type" or equation.invars[0].aval.dtype.kind != "b"):
+            limits = np.iinfo(avals[0].dtype)
+            self.within(results[0], max(limits.min, -self.exact), min(limits.max, self.exact))
+        return results
+
+    def by_rule(self, equation: Any, arguments: list[Refs]) -> list[Refs]:
+        """What an operation returns."""
         name, parameters = equation.primitive.name, equation.params
         if name in INNER and parameters.get("name") == "symmetric_part":
             return [_mirrored(arguments[0])]
@@ -99,8 +165,6 @@ class Tracer:
         if name in RULES:
             results = RULES[name](self, equation, arguments)
             return results if isinstance(results, list) else [results]
-        if name not in OPERATIONS:
-            raise NotSupportedError(f"not supported by the native backend: {name}")
         return [self.apply(name, *arguments)]
 
     def apply(self, name: str, *arguments: Refs) -> Refs:
@@ -108,6 +172,10 @@ class Tracer:
         result, made = self.elements.apply(name, *arguments)
         if made.size:
             self.steps.append(Apply(made))
+        if self.whole and name in ("add", "mul"):
+            self.whole = False
+            self.within(result, -self.exact, self.exact)
+            self.whole = True
         return result
 
     def constant(self, values: Any) -> Refs:
@@ -115,14 +183,24 @@ class Tracer:
         return self.elements.constant(values)
 
     @contextmanager
-    def aside(self):
-        """Steps that are made here are another list."""
-        outer, self.steps = self.steps, []
+    def aside(self, going: Refs | None = None):
+        """Steps that are made here are another list; for runs that are going on."""
+        outer, around = self.steps, self.going
+        self.steps = []
         with self.elements.inside():
+            if going is not None:
+                self.going = going if around is None else self.apply("and", going, around)
             yield self.steps
-        self.steps = outer
+            self.check()
+        self.steps, self.going = outer, around
 
 
+SUMS = ("reduce_sum", "reduce_prod", "cumsum", "cumprod", "dot_general")
+ARITHMETIC = (
+    *("add", "add_any", "sub", "mul", "neg", "abs", "sign", "div", "rem", "pow", "integer_pow"),
+    *("square", "convert_element_type", "scatter-add", *SUMS),
+)
+"""What takes integers out of the range of their type."""
 INNER = {
     "jit": "jaxpr",
     "pjit": "jaxpr",
@@ -199,7 +277,7 @@ MOVES: dict[str, Callable[..., Any]] = {
 
 def _iota(tracer, equation, _):
     p = equation.params
-    axis = np.arange(p["shape"][p["dimension"]])
+    axis = np.arange(p["shape"][p["dimension"]]).astype(p["dtype"])
     shape = [1] * len(p["shape"])
     shape[p["dimension"]] = -1
     return np.broadcast_to(tracer.constant(axis).reshape(shape), p["shape"])
@@ -230,10 +308,9 @@ def _div(tracer, equation, arguments):
     return tracer.apply("trunc", result) if whole else result
 
 
-def _rem(tracer, equation, arguments):
-    a, b = arguments
-    turns = tracer.apply("trunc", tracer.apply("div", a, b))
-    return tracer.apply("sub", a, tracer.apply("mul", turns, b))
+def _round(tracer, equation, arguments):
+    to_even = equation.params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN
+    return tracer.apply("round_to_even" if to_even else "round_away", *arguments)
 
 
 def _select(tracer, equation, arguments):
@@ -281,10 +358,18 @@ def _reduced(name, empty):
         kept = [k for k in range(x.ndim) if k not in axes]
         x = np.transpose(x, [*axes, *kept]).reshape(-1, *(x.shape[k] for k in kept))
         if not len(x):
-            return np.broadcast_to(tracer.constant(empty), x.shape[1:])
+            dtype, value = equation.outvars[0].aval.dtype, empty
+            if np.isinf(empty) and dtype.kind != "f":
+                limits = (0, 1) if dtype.kind == "b" else _limits(dtype)
+                value = limits[int(empty > 0)]
+            return np.broadcast_to(tracer.constant(value), x.shape[1:])
         return _folded(tracer, name, x)
 
     return rule
+
+
+def _limits(dtype):
+    return np.iinfo(dtype).min, np.iinfo(dtype).max
 
 
 def _folded(tracer, name, x):
@@ -296,13 +381,16 @@ def _folded(tracer, name, x):
     return x[0]
 
 
-def _arg(sign):
+def _arg(holds):
+    """Of the best the first, and NaN is better than all: `holds` says that the best still is."""
+
     def rule(tracer, equation, arguments):
         (x,), (axis,) = arguments, equation.params["axes"]
         x = np.moveaxis(x, axis, 0)
         best, index = x[0], np.broadcast_to(tracer.constant(0.0), x.shape[1:])
         for k in range(1, len(x)):
-            better = tracer.apply(sign, x[k], best)
+            better = tracer.apply("not", tracer.apply(holds, best, x[k]))
+            better = tracer.apply("and", better, tracer.apply("eq", best, best))
             best = tracer.apply("select", better, best, x[k])
             index = tracer.apply("select", better, index, tracer.constant(float(k)))
         return index
@@ -318,7 +406,7 @@ def _cumulative(name):
         sums = list(x[:1])
         for row in x[1:]:
             sums.append(tracer.apply(name, sums[-1], row))
-        result = np.array(sums[::-1] if p["reverse"] else sums).reshape(x.shape)
+        result = np.array(sums[::-1] if p["reverse"] else sums, np.int32).reshape(x.shape)
         return np.moveaxis(result, 0, p["axis"])
 
     return rule
@@ -349,6 +437,8 @@ def _dot(tracer, equation, arguments):
     terms = np.einsum("smk,snk->smn", a_there.astype(int), b_there.astype(int))
     thin = min(terms.shape[1:], default=0) == 1
     few = terms.max(initial=0) <= FEW_TERMS or terms.sum() <= FEW_PRODUCTS * len(a) or thin
+    constants = np.concatenate([x[tracer.elements.is_constant(x)] for x in (a, b)])
+    few = few or tracer.whole or not np.all(np.isfinite(tracer.elements.known(constants)))
     multiply = _written_out if few else _products
     result = multiply(tracer, a, b, terms)
     return result.reshape((*(arguments[0].shape[k] for k in batch_a), *own_a, *own_b))
@@ -363,6 +453,9 @@ def _written_out(tracer, a, b, terms):
 
 
 def _products(tracer, a, b, terms):
+    for x, y in ((a, b), (b, a)):
+        zero = tracer.elements.is_zero(x).any(1)
+        tracer.elements.suspect(y[np.broadcast_to(zero[:, None], y.shape)])
     return np.stack([_product(tracer, *x) for x in zip(a, b, terms, strict=True)])
 
 
@@ -474,9 +567,11 @@ def _gather(tracer, equation, arguments):
         return taken
     filling = p["fill_value"]
     if filling is None:
-        floating = np.issubdtype(equation.outvars[0].aval.dtype, np.inexact)
-        filling = np.nan if floating else 0
-    return tracer.apply("select", inside, tracer.constant(float(filling)), taken)
+        dtype = equation.outvars[0].aval.dtype
+        filling = {"f": np.nan, "b": True}.get(dtype.kind)
+        if filling is None:
+            filling = np.iinfo(dtype).min if dtype.kind == "i" else np.iinfo(dtype).max
+    return tracer.apply("select", inside, tracer.constant(filling), taken)
 
 
 def _drops(mode):
@@ -523,6 +618,10 @@ def _scatter(add):
             dict(batching), {axis: at[k] for axis, k in window.items()}, values.shape,
             "CLIP" not in str(p["mode"]),
         )  # fmt: skip
+        if add and equation.outvars[0].aval.dtype.kind != "f":
+            most = tracer.exact // (values.size + 1)
+            for refs in (x, values):
+                tracer.within(refs, -most, most)
         return _written(tracer, x, places, values, add, inside)
 
     return rule
@@ -578,6 +677,9 @@ def _unrolled(tracer, p, body, constants, carry, xs):
         carry = results[: len(carry)]
         outs.append(results[len(carry) :])
     outs = outs[::-1] if p["reverse"] else outs
+    if not outs:
+        made = p["jaxpr"].out_avals[len(carry) :]
+        return [*carry, *(np.zeros((0, *y.shape), np.int32) for y in made)]
     return [*carry, *(np.stack(x) for x in zip(*outs, strict=True))]
 
 
@@ -647,7 +749,7 @@ def _while(tracer, equation, arguments):
     carry = tracer.elements.variables(before.shape)
     with tracer.aside() as condition:
         (going,) = tracer.closed(p["cond_jaxpr"], [*of_condition, *_parted(carry, start)])
-        with tracer.aside() as steps:
+        with tracer.aside(going) as steps:
             after = tracer.closed(p["body_jaxpr"], [*of_body, *_parted(carry, start)])
             after = _own(tracer, _joined(after), carry)
     tracer.steps.append(While(condition, steps, carry, before, after, going.ravel()))
@@ -659,7 +761,7 @@ RULES: dict[str, Callable[..., Any]] = {
     "convert_element_type": _convert,
     "add_any": lambda tracer, equation, arguments: tracer.apply("add", *arguments),
     "div": _div,
-    "rem": _rem,
+    "round": _round,
     "select_n": _select,
     "integer_pow": _integer_pow,
     "square": _square,
@@ -672,8 +774,8 @@ RULES: dict[str, Callable[..., Any]] = {
     "reduce_min": _reduced("min", np.inf),
     "reduce_and": _reduced("and", 1.0),
     "reduce_or": _reduced("or", 0.0),
-    "argmax": _arg("gt"),
-    "argmin": _arg("lt"),
+    "argmax": _arg("ge"),
+    "argmin": _arg("le"),
     "cumsum": _cumulative("add"),
     "cumprod": _cumulative("mul"),
     "cummax": _cumulative("max"),
