@@ -2,6 +2,7 @@
 
 import ast
 import re
+import sys
 import tomllib
 from pathlib import Path
 
@@ -84,3 +85,31 @@ def test_the_workflow_calls_what_runs_here():
     workflow = (ROOT / ".github" / "workflows" / "ci.yml").read_text()
     assert "run: .ci/run\n" in workflow
     assert (ROOT / ".ci" / "run").stat().st_mode & 0o100
+
+
+def installed_by(extra: str, project: dict) -> set[str]:
+    """Distributions that the project names, alone or with an extra, those of other extras too."""
+    found = set()
+    for named in [*project["dependencies"], *project["optional-dependencies"][extra]]:
+        match = re.match(r"([\w-]+)(?:\[([\w,]+)\])?", named)
+        assert match is not None
+        name, extras = match.groups()
+        found.add(name)
+        for other in extras.split(",") if extras else ():
+            found |= installed_by(other, project)
+    return found
+
+
+def test_the_sites_extra_brings_what_its_pages_import():
+    """They are of all modules, which are imported."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    called = {"opencv-python-headless": "cv2"}
+    known = {called.get(name, name) for name in installed_by("docs", project)}
+    needed = set()
+    for path in (ROOT / "jaxslam").rglob("*.py"):
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ImportFrom):
+                needed.add(str(node.module).partition(".")[0])
+            elif isinstance(node, ast.Import):
+                needed |= {alias.name.partition(".")[0] for alias in node.names}
+    assert needed - set(sys.stdlib_module_names) <= known
