@@ -24,6 +24,7 @@ KEYS = {
     "schema", "version", "quantity", "runs", "steps", "dof", "time", "band95", "nees", "inside",
     "verdict", "outside3sigma", "rmse", "sigma", "axis_verdict", "convention", "alignment",
     "suggested", "identified", "notes", "runs_of_step", "band95_of_step",
+    "run_names", "lost_runs", "mistakes",
 }  # fmt: skip
 
 
@@ -139,6 +140,17 @@ def test_a_run_whose_nees_overflows_has_diverged():
     assert found.verdict["word"] == "lost"
     assert found.verdict["diverged"] == 1
     json.dumps(found.asdict(), allow_nan=False)
+
+
+def test_lost_runs_are_named():
+    e, P = drawn(runs=40)
+    e[[3, 17], 5] *= 30
+    found = jaxslam.evaluate(e, P)
+    assert found.lost_runs == found.asdict()["lost_runs"] == ["run 3", "run 17"]
+    assert "lost: run 3, run 17" in str(found).splitlines()
+    assert "lost:" not in str(jaxslam.evaluate(*drawn(runs=40)))
+    e *= 30
+    assert "and 20 more" in str(jaxslam.evaluate(e, P))
 
 
 # --- what is refused ----------------------------------------------------------------------------

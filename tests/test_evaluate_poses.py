@@ -499,6 +499,16 @@ def test_a_folder_of_runs_is_its_arrays(tmp_path, capsys):
     }  # fmt: skip
 
 
+def test_lost_runs_have_the_names_of_their_folders(tmp_path):
+    T, P, truth = (np.array(x) for x in logged(Convention(), runs=4))
+    truth[2, 3:, :3, 3] += 50.0
+    write_runs(tmp_path, T, P, truth, Convention())
+    found = jaxslam.evaluate_log(tmp_path)
+    assert found.asdict()["lost_runs"] == ["run02"]
+    assert found.asdict()["run_names"] == ["run00", "run01", "run02", "run03"]
+    assert "lost: run02" in str(found).splitlines()
+
+
 def test_poses_in_arrays_are_those_in_files(tmp_path):
     T, P, truth = logged(Convention("left"), runs=3)
     np.savez(tmp_path / "a.npz", estimates=T, covariances=P, truths=truth, error="left")

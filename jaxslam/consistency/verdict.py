@@ -233,6 +233,16 @@ def run_verdict(
     return Tally.of(nees, dof, fitted, logged).verdict()
 
 
+def lost_runs(
+    nees: Float[np.ndarray, "runs steps"],
+    dof: int,
+    logged: Bool[np.ndarray, "runs steps"] | None = None,
+) -> list[int]:
+    """Which runs are lost at any of their steps; what is `logged`, see `Tally.of`."""
+    lost = (~(nees <= lost_threshold(dof)) & _logged(nees, logged)).any(axis=1)
+    return [int(run) for run in np.flatnonzero(lost)]
+
+
 def not_disproved(found: dict[str, Any]) -> bool:
     """Whether a verdict lets a filter be consistent, be that shown or not."""
     return found["word"] in ("consistent", "cannot tell")

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.consistency.statistics import mean_band
-from jaxslam.consistency.verdict import headline, run_verdict, sentences
+from jaxslam.consistency.verdict import headline, lost_runs, run_verdict, sentences
 from jaxslam.evaluation.arrays import filled, normalised, paired, step_times, without_known
 from jaxslam.evaluation.convention import Convention
 from jaxslam.evaluation.identify import Identification
@@ -24,7 +24,9 @@ from jaxslam.lookup import chosen
 SCHEMA = 1
 SIGMAS = 3
 _TOLD = 3
-"""Runs that a sentence names."""
+"""Runs that a sentence names as examples."""
+_LISTED = 20
+"""Lost runs that are named in the text; the file names all."""
 OUTSIDE = 0.0027
 """Share of a Gaussian beyond ±3σ."""
 
@@ -103,6 +105,11 @@ class Evaluation:
         return np.sum(self.logged & self.finite[:, None], axis=0)
 
     @property
+    def lost_runs(self) -> list[str]:
+        """What the runs are called that are lost at any step."""
+        return [self._run(run) for run in lost_runs(self.nees, self.dof, self.logged)]
+
+    @property
     def mean(self) -> Float[np.ndarray, " steps"]:
         """Mean NEES of every step, over the runs that have it; NaN where no run is left."""
         return _mean(self.nees[self.finite], self.logged[self.finite])
@@ -171,6 +178,8 @@ class Evaluation:
             "band95_of_step": self.band95_of_step.tolist(),
             "inside": self.inside,
             "verdict": self.verdict,
+            "run_names": list(self.run_names),
+            "lost_runs": self.lost_runs,
             "outside3sigma": {n: float(self.outside3sigma[i]) for n, i in by_axis.items()},
             "rmse": {n: json_numbers(self.rmse[:, i]) for n, i in by_axis.items()},
             "sigma": {n: json_numbers(self.sigma[:, i]) for n, i in by_axis.items()},
@@ -196,6 +205,10 @@ class Evaluation:
     def __str__(self) -> str:
         told = [line.replace("NEES", self.quantity) for line in sentences(self.verdict)]
         doubt = [] if self.identified is None else [self.identified.sentence]
+        if self.lost_runs:
+            more = len(self.lost_runs) - _LISTED
+            which = ", ".join(self.lost_runs[:_LISTED]) + (f" and {more} more" if more > 0 else "")
+            told.append(f"lost: {which}")
         if self.mistakes:
             told, doubt = [self.headline, *(mistake.told for mistake in self.mistakes)], []
         return "\n".join([*told, *doubt, "", *self._table(), *self.remarks])
