@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 import tyro
 from pages import write_table
+from scipy.stats import chi2
 from starts import LIE
 
 from jaxslam.files import write_json
@@ -222,8 +223,10 @@ def measure(disturbed: Disturbed, settings: TrackerSettings, seed: int) -> dict[
     lies = believed & elsewhere
     known = np.flatnonzero(believed & ~elsewhere)
     poses, covariances = ([getattr(results[k], x) for k in known] for x in ("T_wc", "covariance"))
-    nees, _ = nees_beyond_scale(np.stack(poses), np.stack(covariances), disturbed.T_wc[known])
-    lies[known] = nees > LIE
+    fixed = np.array([results[k].unit_fixed for k in known])
+    stacked = np.stack(poses), np.stack(covariances), disturbed.T_wc[known]
+    nees, dof = nees_beyond_scale(*stacked, fixed).nees, np.where(fixed, 6, 5)
+    lies[known] = chi2.sf(nees, dof) < LIE
     during, after = np.isin(index, disturbed.during), index >= disturbed.during.stop
     late = after & (index >= len(index) - RATE)
     return {
@@ -235,7 +238,7 @@ def measure(disturbed: Disturbed, settings: TrackerSettings, seed: int) -> dict[
         "maps": tracker.restarts + 1,
         "reversed": tracker.reversed,
         "lies": float(lies.sum() / tracked.sum()),
-        "beyond_scale": float(np.median(nees)) / 5,
+        "beyond_scale": float(np.median(nees / dof)),
     }
 
 

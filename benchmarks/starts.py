@@ -31,8 +31,8 @@ from jaxslam.vision.trajectory import absolute_trajectory_error, nees_beyond_sca
 
 REFERENCE = 0.003, np.radians(0.06)
 """σ of the reference's position, of the farthest distance from the start, and orientation."""
-LIE = chi2.isf(2 * norm.sf(5), 5)
-"""NEES beyond scale of an error of 5 σ."""
+LIE = 2 * norm.sf(5)
+"""The share of NEES beyond scale that is larger than that of an error of 5 σ."""
 EVERY = 10
 """Frames from one that is looked at to the next."""
 
@@ -94,12 +94,14 @@ def outcome(source, frames, settings: TrackerSettings) -> Outcome:
     # In the unit of the map: as far as the estimate comes, where the reference does.
     far = np.linalg.norm(T_wc[first, :3, 3], axis=1).max()
     floor = np.diag([(REFERENCE[0] * far) ** 2] * 3 + [REFERENCE[1] ** 2] * 3)
-    nees, _ = nees_beyond_scale(T_wc[looked], P[looked] + floor, truth[looked])
+    fixed = np.array([results[k].unit_fixed for k in looked])
+    nees = nees_beyond_scale(T_wc[looked], P[looked] + floor, truth[looked], fixed).nees
+    dof = np.where(fixed, 6, 5)
     return whole._replace(
         sign=ate["sign"],
         error=100 * ate["rmse"] / ate["path_length"],
-        beyond=float(np.median(nees)) / 5,
-        lies=float(np.mean(nees > LIE)),
+        beyond=float(np.median(nees / dof)),
+        lies=float(np.mean(chi2.sf(nees, dof) < LIE)),
     )
 
 

@@ -26,7 +26,13 @@ from jaxslam.evaluation.alignment import (
     projected,
     similarity,
 )
-from jaxslam.evaluation.convention import CHOICES, alternatives, change, from_right
+from jaxslam.evaluation.convention import (
+    CHOICES,
+    alternatives,
+    change,
+    errors_beyond_scale,
+    from_right,
+)
 from jaxslam.evaluation.covariance_text import read_covariances, write_covariances
 from jaxslam.evaluation.identify import identify
 from jaxslam.geometry import PLANAR, SPATIAL, difference
@@ -758,6 +764,6 @@ def test_of_the_trackers_files_nees_is_given_the_scale(tmp_path):
     found = jaxslam.evaluate_log(tmp_path)
     assert found.convention == replace(trajectory.TRACKED, scale="given")
     assert (found.dof, found.steps) == (5, 299)
-    nees, _ = trajectory.nees_beyond_scale(T[1:], P[1:], truth[1:])
+    nees = errors_beyond_scale(trajectory.TRACKED, T[1:], truth[1:], P[1:]).nees
     np.testing.assert_allclose(found.nees[0], nees, rtol=1e-4)
     assert Tally.of(found.nees, 5).average.mean == pytest.approx(found.verdict["nees"])

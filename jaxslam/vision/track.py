@@ -46,6 +46,10 @@ _COLUMNS = (
     "frame", "time", "state", "map", "matches", "nis", "nis_dof",
     "sigma_position", "sigma_orientation", "sigma_log_scale", "log_scale", "unit_fixed",
 )  # fmt: skip
+TOO_SURE = (
+    "the intrinsics are estimated: sigma of them, and of poses with them, is known to be too small"
+)
+"""What is to be said wherever it stands."""
 _KNOWN_DEPTH = 0.3
 """A point is put into the map where its σ is below this share of its distance."""
 
@@ -107,6 +111,7 @@ def describe(summary: dict[str, Any]) -> str:
     if "estimated" in camera:
         pairs = ((key, camera["estimated"][key], camera["sigma"][key]) for key in INTRINSICS)
         lines.append("camera: " + ", ".join(f"{k} {x:.1f} ± {s:.1f}" for k, x, s in pairs))
+        lines.append(camera["caveat"])
     if "ate" in summary:
         ate = summary["ate"]
         share = ate["rmse"] / ate["path_length"] if ate["path_length"] else float("nan")
@@ -225,7 +230,9 @@ def _write(
     write_trajectory(out / "trajectory.txt", times, T_wc)
     scaled = any(result.sigma_log_scale is not None for result in history)
     covariances = [result.covariance for result in history]
-    write_covariances(out / "covariance.txt", times, covariances, given_scale=scaled)
+    camera = tracker.camera()
+    caveat = TOO_SURE if camera is not None and camera[0] == "estimated" else ""
+    write_covariances(out / "covariance.txt", times, covariances, given_scale=scaled, caveat=caveat)
     write_frames(out / "frames.csv", history)
     summary = _summary(source, tracker, history, seconds)
     write_json(out / "summary.json", summary, allow_nan=False)
@@ -357,6 +364,7 @@ def _calibration(tracker: Tracker) -> dict[str, Any]:
         sigma = np.sqrt(np.diagonal(covariance))
         result["estimated"] = dict(zip(INTRINSICS, mean.tolist(), strict=True))
         result["sigma"] = dict(zip(INTRINSICS, sigma.tolist(), strict=True))
+        result["caveat"] = f"{TOO_SURE}; docs/own-video.md says how much"
     return result
 
 

@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from jaxslam.consistency.beyond_scale import one_scale
 from jaxslam.evaluation import covariance_text
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, Similarity, similarity
 from jaxslam.evaluation.arrays import ROUNDING, exactly_known, normalised
@@ -56,18 +57,23 @@ def write_trajectory(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> Non
 
 
 def write_covariances(
-    path: str | Path, times: ArrayLike, covariances: ArrayLike, *, given_scale: bool = False
+    path: str | Path,
+    times: ArrayLike,
+    covariances: ArrayLike,
+    *,
+    given_scale: bool = False,
+    caveat: str = "",
 ) -> None:
     """Write times (n,) and covariances (n, 6, 6) of the `TRACKED` error, whole or not at all.
 
     They are of poses in the one unit of their map; that maps which follow one another have others
     is not in them. The header says whether these are covariances `given_scale`, of a filter with a
     unit of its own, of whose size in metres it is in doubt, or of poses in a unit that the filter
-    takes for exactly known.
+    takes for exactly known; and the caveat, if there is one.
     """
     convention = replace(TRACKED, scale="given" if given_scale else "marginal")
     scale = _GIVEN_SCALE if given_scale else "the filter has no doubt of its scale"
-    remark = f"{_UNITS}, taken as one; {scale}"
+    remark = "; ".join(filter(None, [f"{_UNITS}, taken as one", scale, caveat]))
     covariance_text.write_covariances(
         path, times, covariances, convention, length="map", remark=remark
     )
@@ -90,14 +96,39 @@ def pose_nees(
     return nees
 
 
+class BeyondScale(NamedTuple):
+    """Of n poses of a map against a reference of another scale."""
+
+    nees: Float[np.ndarray, " n"]
+    """NEES at the map's scale: 6 degrees of freedom each, less one for the map."""
+    scale: Float[np.ndarray, " n"]
+    """The scale of the reference's position that explains this pose alone best."""
+    sigma: Float[np.ndarray, " n"]
+    """What is claimed of the log of that."""
+    drift: Float[np.ndarray, " n"]
+    """Log of that by the map's; NaN where it has no part in it."""
+
+
 def nees_beyond_scale(
-    T_wc: ArrayLike, covariances: ArrayLike, reference: ArrayLike
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """The least NEES of each pose (n, 4, 4) over the scale s of the reference's position, and that
-    scale: `consistency.beyond_scale` of the `TRACKED` error."""
+    T_wc: ArrayLike, covariances: ArrayLike, reference: ArrayLike, fixed: ArrayLike | None = None
+) -> BeyondScale:
+    """NEES of poses (n, 4, 4) of one map at the one scale of the reference that explains them best:
+    `consistency.one_scale` of the `TRACKED` error.
+
+    Poses whose unit is not `fixed` (n,) are at their own best scale, with a degree of freedom less,
+    and have no part in the map's.
+    """
     arrays = (np.asarray(x, float) for x in (T_wc, reference, covariances))
     best = errors_beyond_scale(TRACKED, *arrays)
-    return np.asarray(best.nees), np.exp(np.asarray(best.log_scale))
+    one = one_scale(
+        np.asarray(best.nees),
+        np.asarray(best.log_scale),
+        np.asarray(best.sigma),
+        None if fixed is None else np.asarray(fixed, bool),
+    )
+    return BeyondScale(
+        one.nees, np.exp(np.asarray(best.log_scale)), np.asarray(best.sigma), one.drift
+    )
 
 
 def absolute_trajectory_error(

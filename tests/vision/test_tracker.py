@@ -20,6 +20,7 @@ from jaxslam.forms.state import Status
 from jaxslam.programs import Program
 from jaxslam.slam.readouts import landmarks_in_camera
 from jaxslam.tum import read_tum
+from jaxslam.video.calibration import from_field_of_view
 from jaxslam.video.opening import open_source
 from jaxslam.vision import tracker as programs
 from jaxslam.vision.landmarks import Landmark
@@ -27,7 +28,7 @@ from jaxslam.vision.located import Located, adjoint
 from jaxslam.vision.patches import STORED, Patch
 from jaxslam.vision.settings import TrackerSettings
 from jaxslam.vision.synthetic import synthetic_source
-from jaxslam.vision.track import describe, track
+from jaxslam.vision.track import TOO_SURE, describe, track
 from jaxslam.vision.tracker import LEAST_MATCHES, PROVEN, Tracked, Tracker
 from jaxslam.vision.trajectory import (
     absolute_trajectory_error,
@@ -418,6 +419,20 @@ def test_an_unknown_calibration_counts_in_the_first_frame_too():
     variance = 0.3**2 + 2.0**2 + (settings.focal_sigma * np.asarray(charts)[:, 0]) ** 2
     expected = variance / source.calibration.fx**2
     np.testing.assert_allclose(covariances[:, 0, 0], expected, rtol=1e-6, atol=0)
+
+
+def test_it_is_said_wherever_it_stands_that_estimated_intrinsics_are_too_sure(tmp_path):
+    source = synthetic_source(frames=3, width=320, height=240)
+    settings = TrackerSettings(filter="world", wanted=12, spare=4)
+    guessed = replace(source, calibration=from_field_of_view(320, 240))
+    summary = track(guessed, tmp_path, settings, overlay=False)
+    header = (tmp_path / "covariance.txt").read_text().splitlines()[0]
+    for said in (describe(summary), summary["calibration"]["caveat"], header):
+        assert TOO_SURE in said
+    known = track(source, tmp_path, settings, overlay=False)
+    header = (tmp_path / "covariance.txt").read_text().splitlines()[0]
+    assert "caveat" not in known["calibration"]
+    assert TOO_SURE not in describe(known) + header
 
 
 def test_an_interruption_leaves_the_files_of_the_frames_so_far(tmp_path):

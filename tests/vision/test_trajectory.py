@@ -274,6 +274,9 @@ def test_the_header_says_whether_scale_is_in_a_covariance(tmp_path, given, words
     assert "one unit of length a map, another in every map" in header
     assert f"scale={'given' if given else 'marginal'}" in header
     assert "length=map" in header
+    write_covariances(path, [0.0], np.eye(6)[None], given_scale=given, caveat="with care")
+    assert path.read_text().splitlines()[0] == header.removesuffix(")") + "; with care)"
+    assert read_covariances(path).said["scale"] == ("given" if given else "marginal")
     write_trajectory(path, [0.0], np.eye(4)[None])
     assert "one unit of length a map, another in every map" in path.read_text()
 
@@ -310,7 +313,7 @@ def test_as_many_covariances_as_times(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_beyond_scale_is_the_least_nees_over_the_scale_of_the_reference():
+def test_beyond_scale_is_the_least_nees_over_the_one_scale_of_the_reference():
     rng = np.random.default_rng(0)
     T = np.tile(np.eye(4), (5, 1, 1))
     T[:, :3, :3] = Rotation.from_rotvec(0.5 * rng.normal(size=(5, 3))).as_matrix()
@@ -319,16 +322,31 @@ def test_beyond_scale_is_the_least_nees_over_the_scale_of_the_reference():
     P = root @ np.swapaxes(root, 1, 2)
     reference = T.copy()
     reference[:, :3, 3] = 3.0 * (T[:, :3, 3] + 0.05 * rng.normal(size=(5, 3)))
-    nees, scale = nees_beyond_scale(T, P, reference)
+    found = nees_beyond_scale(T, P, reference)
 
     def at(s):
         scaled = reference.copy()
-        scaled[:, :3, 3] *= s[:, None]
+        scaled[:, :3, 3] *= np.reshape(s, (-1, 1))
         return pose_nees(T, P, scaled)
 
-    np.testing.assert_allclose(nees, at(scale), rtol=1e-9)
-    assert np.all(nees < at(1.01 * scale))
-    assert np.all(nees < at(0.99 * scale))
+    # Every pose at the map's scale; what the drift adds to its own best.
+    own, one = at(found.scale), (found.scale * np.exp(-found.drift))[0]
+    np.testing.assert_allclose(found.nees, at(one), rtol=1e-9)
+    assert own.sum() < found.nees.sum() < min(at(1.01 * one).sum(), at(0.99 * one).sum())
+    assert np.all(own <= np.minimum(at(1.01 * found.scale), at(0.99 * found.scale)))
+    step = found.scale * np.expm1(found.drift) / np.exp(found.drift)
+    np.testing.assert_allclose(
+        found.nees - own, (step / (found.scale * found.sigma)) ** 2, rtol=1e-6, atol=1e-9
+    )
+    # A pose in a unit that is not fixed has a scale of its own, and no part in that of the others.
+    fixed = np.arange(5) != 2
+    apart, others = (
+        nees_beyond_scale(T, P, reference, fixed),
+        nees_beyond_scale(T[fixed], P[fixed], reference[fixed]),
+    )
+    np.testing.assert_allclose(apart.nees[fixed], others.nees, rtol=1e-9)
+    assert apart.nees[2] == pytest.approx(own[2], rel=1e-9)
+    assert np.isnan(apart.drift[2])
 
 
 def test_a_reversed_path_is_not_explained_by_any_scale():
@@ -336,6 +354,6 @@ def test_a_reversed_path_is_not_explained_by_any_scale():
     T[0, :3, 3] = [1.0, 0, 0]
     reference = T.copy()
     reference[0, :3, 3] = [-2.0, 0, 0]
-    nees, scale = nees_beyond_scale(T, 0.01 * np.eye(6)[None], reference)
+    nees, scale, *_ = nees_beyond_scale(T, 0.01 * np.eye(6)[None], reference)
     assert scale[0] < 0.01
     np.testing.assert_allclose(nees, 100, rtol=0.01)
