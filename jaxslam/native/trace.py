@@ -356,7 +356,8 @@ def _reduced(name, empty):
     def rule(tracer, equation, arguments):
         (x,), axes = arguments, equation.params["axes"]
         kept = [k for k in range(x.ndim) if k not in axes]
-        x = np.transpose(x, [*axes, *kept]).reshape(-1, *(x.shape[k] for k in kept))
+        shape = math.prod(x.shape[k] for k in axes), *(x.shape[k] for k in kept)
+        x = np.transpose(x, [*axes, *kept]).reshape(shape)
         if not len(x):
             dtype, value = equation.outvars[0].aval.dtype, empty
             if np.isinf(empty) and dtype.kind != "f":
