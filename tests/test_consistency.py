@@ -166,9 +166,9 @@ def test_a_reduced_study_says_the_same_but_for_its_medians(tmp_path):
     whole = jaxslam.monte_carlo(spoilt, slams, **sizes)
     store = FolderStore(tmp_path, {"reduced": True}, resume=False)
     reduced = jaxslam.monte_carlo(spoilt, slams, **sizes, store=store, reduced=True)
-    medians = "nees_median", "error_median", "sigma_median", "medians_of", "seconds"
+    kept = "nees_median", "error_median", "sigma_median", "medians_of", "seconds", "lost_runs"
     found, wanted = (jaxslam.summarise(study) for study in (reduced, whole))
-    assert without(found, *medians) == without(wanted, *medians)
+    assert without(found, *kept) == without(wanted, *kept)
     assert (found["medians_of"], wanted["medians_of"]) == (6, 40)
     first = jaxslam.summarise(jaxslam.monte_carlo(spoilt, slams, runs=6, chunk=6))
     for name, f in found["filters"].items():
@@ -252,7 +252,7 @@ def test_a_diverged_run_is_counted_and_spoils_no_other():
     for key in ("lost", "lost_ever"):
         assert after[key][-1] == pytest.approx(before[key][-1] + 1 / 6)
     # It is not dropped from the verdict: of six runs there is no mean.
-    assert (before["verdict"]["word"], after["verdict"]["word"]) == ("consistent", "lost")
+    assert (before["verdict"]["word"], after["verdict"]["word"]) == ("cannot tell", "lost")
     assert after["verdict"]["nees"] is None
     table = jaxslam.table(summary)
     assert "1 of 6 runs diverged, no mean NEES: lost" in table
@@ -265,7 +265,12 @@ def test_a_run_that_comes_back_was_lost_ever():
     result = jaxslam.summarise(study)["filters"]["inverse_scaling"]
     assert result["lost"] == [0, 0, 0.5, 0, 0.25, 0]
     assert result["lost_ever"] == [0, 0, 0.5, 0.5, 0.5, 0.5]
-    assert result["verdict"]["lost"] == 0.5
+    assert (result["verdict"]["lost"], result["verdict"]["lost_runs"]) == (0.5, [1, 3])
+    # A step of so many is above the quantile of one step more often.
+    study = with_nees(jaxslam.monte_carlo(SCENARIO, filters(), runs=4, chunk=2), 1, 2, 22.0)
+    result = jaxslam.summarise(study)["filters"]["inverse_scaling"]
+    assert (result["lost"][2], result["lost_ever"][2]) == (0.25, 0)
+    assert result["verdict"]["lost_runs"] == []
 
 
 class OneLandmarkUnknown(jaxslam.EkfSlam):

@@ -7,13 +7,8 @@ import pytest
 from scipy import stats
 
 from jaxslam.consistency import Tally, lost_threshold, not_disproved, run_verdict
-from jaxslam.consistency.statistics import (
-    PowerSums,
-    chernoff_p_value,
-    chi2_p_value,
-    mean_interval,
-    mean_p_value,
-)
+from jaxslam.consistency.looks import Look
+from jaxslam.consistency.statistics import PowerSums, shortfall_limits, shortfall_p_value
 from jaxslam.consistency.verdict import sentences
 
 
@@ -36,25 +31,66 @@ def studies(count, runs, seed=0, **of):
 # --- how often it is wrong ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("steps", "correlation"), [(1, 0.0), (8, 0.0), (8, 0.9), (8, 0.995)])
-def test_a_consistent_filter_is_called_inconsistent_once_in_a_hundred_studies(steps, correlation):
-    """Half of the times on either side: of 3000 studies 15 ± 4 each, here with ± 4 σ."""
-    words = [
-        run_verdict(nees, 3)["word"]
-        for nees in studies(3000, 100, steps=steps, correlation=correlation)
-    ]
-    for side in ("over-confident", "under-confident"):
-        assert 3 <= words.count(side) <= 31, (side, words.count(side))
-    assert 12 <= 3000 - words.count("consistent") <= 50
+def limits(found):
+    """Of an interval, the upper one of which may be infinite."""
+    low, high = found["interval99"]
+    return low, np.inf if high is None else high
+
+
+def words(many, dof=3):
+    return [Tally.of(nees, dof).decisive().word for nees in many]
+
+
+@pytest.mark.parametrize("dof", [1, 6])
+@pytest.mark.parametrize("runs", [3, 10, 100])
+@pytest.mark.parametrize(("steps", "correlation"), [(1, 0.0), (8, 0.0), (8, 0.98)])
+def test_a_right_filter_is_called_inconsistent_in_less_than_one_of_a_hundred_studies(
+    dof, runs, steps, correlation
+):
+    """Of 400 studies 4 expected at most; 13 or more have a chance of 1 in 3000."""
+    many = studies(400, runs, dof=dof, steps=steps, correlation=correlation)
+    assert sum(word.endswith("confident") for word in words(many, dof)) < 13
+
+
+@pytest.mark.parametrize("runs", [1, 3, 10, 60, 200])
+@pytest.mark.parametrize("factor", [1.3, 1 / 1.3])
+def test_a_sigma_wrong_by_30_percent_is_not_called_consistent(runs, factor):
+    """Of 200 studies 2 are allowed, and 9 or more have a chance of 1 in 4000."""
+    for correlation in (0.0, 0.98):
+        many = factor**2 * studies(200, runs, steps=6, correlation=correlation)
+        assert words(many).count("consistent") < 9
+
+
+def test_with_runs_enough_a_right_filter_is_consistent_and_with_fewer_nobody_can_tell():
+    for runs, word in ((80, "consistent"), (10, "cannot tell")):
+        found = words(studies(200, runs))
+        assert found.count(word) > 185, (runs, found)
+    few = run_verdict(studies(1, 10)[0], 3)
+    assert few["word"] == "cannot tell"
+    told = words(studies(200, few["enough"], seed=1))
+    assert told.count("consistent") > 0.6 * 200
+    assert f"; about {few['enough']} runs would tell" in sentences(few)[0]
+
+
+@pytest.mark.parametrize("dof", [2, 3])
+def test_one_long_run_with_sigma_half_of_right_is_not_consistent(dof):
+    """However many steps: they may be all but one."""
+    many = 4 * studies(50, 1, dof=dof, steps=200, correlation=0.999)
+    assert words(many, dof).count("consistent") == 0
+
+
+def test_the_verdict_is_the_words_of_what_decides():
+    for nees in studies(40, 30) * np.linspace(0.5, 2, 40)[:, None, None]:
+        assert run_verdict(nees, 3)["word"] == Tally.of(nees, 3).decisive().word
 
 
 @pytest.mark.parametrize("dof", [3, 6])
-def test_a_sigma_wrong_by_5_percent_is_found_with_1000_runs(dof):
+def test_a_sigma_wrong_by_5_percent_is_found_with_2000_runs(dof):
     """In 95 of 100 studies, or more, though the steps of a run are all but one."""
     found = {"over-confident": 1.05, "under-confident": 1 / 1.05}
     for word, factor in found.items():
         verdicts = [
-            run_verdict(factor**2 * nees, dof) for nees in studies(60, 1000, dof=dof, steps=10)
+            run_verdict(factor**2 * nees, dof) for nees in studies(40, 2000, dof=dof, steps=10)
         ]
         assert np.mean([verdict["word"] == word for verdict in verdicts]) > 0.9
         low, high = np.array([verdict["interval99"] for verdict in verdicts]).T
@@ -62,56 +98,108 @@ def test_a_sigma_wrong_by_5_percent_is_found_with_1000_runs(dof):
         assert np.mean(high - low) < 0.08
 
 
-def test_the_interval_holds_the_mean_of_skewed_numbers_where_students_does_not():
+def test_the_interval_holds_the_mean_of_skewed_numbers():
     rng = np.random.default_rng(1)
-    numbers = np.exp(rng.normal(size=(3000, 100)))
-    mean = np.exp(0.5)
-    intervals = np.array([mean_interval(PowerSums.of(row), 0.99) for row in numbers])
-    missed = np.mean((intervals[:, 0] > mean) | (intervals[:, 1] < mean))
-    t = (numbers.mean(axis=1) - mean) / (numbers.std(axis=1, ddof=1) / 10)
-    missed_by_student = np.mean(np.abs(t) > stats.t.ppf(0.995, 99))
-    assert missed < 0.02 < 0.03 < missed_by_student
+    numbers, mean = np.exp(rng.normal(size=(1000, 100))), np.exp(0.5)
+    looks = [Look("", PowerSums.of(row), (1.0, 1.0), 0.01) for row in numbers]
+    low, high = np.array([look.interval for look in looks]).T
+    assert np.mean((low > mean) | (high < mean)) < 0.025
 
 
-def test_the_interval_is_that_of_resampled_runs():
-    """The cubic is the closed form of the studentised bootstrap, to second order."""
-    values = series(np.random.default_rng(2), 200).mean(axis=1)
-    n, mean, deviation = len(values), values.mean(), values.std(ddof=1)
-    drawn = values[np.random.default_rng(3).integers(0, n, (20000, n))]
-    t = (drawn.mean(axis=1) - mean) / (drawn.std(axis=1, ddof=1) / np.sqrt(n))
-    high, low = mean - np.quantile(t, [0.005, 0.995]) * deviation / np.sqrt(n)
-    found = mean_interval(PowerSums.of(values), 0.99)
-    np.testing.assert_allclose(found, (low, high), atol=0.05 * (high - low))
-
-
-def test_the_interval_and_its_p_value_say_the_same():
-    rng = np.random.default_rng(4)
-    for runs in (20, 200):
-        sums = PowerSums.of(rng.chisquare(3, runs))
-        for limit in mean_interval(sums, 0.99):
-            assert mean_p_value(sums, limit) == pytest.approx(0.01, rel=1e-6)
-        assert mean_p_value(sums, sums.mean) > 0.5
-
-
-def test_at_one_step_p_is_exact():
-    means = np.random.default_rng(5).chisquare(3 * 20, 5000) / 20
-    p = np.array([chi2_p_value(mean, 3, 20) for mean in means])
-    assert stats.kstest(p, "uniform").pvalue > 0.01
-    assert chi2_p_value(4.0, 3, 20) == pytest.approx(2 * stats.chi2.sf(80, 60), rel=1e-9)
-    verdict = run_verdict(np.column_stack([np.full(20, 9.0), np.full(20, 4.0)]), 3)
-    assert verdict["end"]["p"] == pytest.approx(chi2_p_value(4.0, 3, 20))
-    assert verdict["end"]["sigma_factor"] == pytest.approx(np.sqrt(4 / 3))
+@pytest.mark.parametrize("runs", [1, 2, 3, 20, 200])
+def test_word_interval_and_p_value_say_the_same(runs):
+    for scale in np.geomspace(0.2, 6, 40):
+        nees = scale * studies(1, runs, steps=6, seed=runs)[0]
+        found = run_verdict(nees, 3)
+        for each in (found, found["mean"], found["end"], *found["thirds"]):
+            low, high = limits(each)
+            assert (low <= 1 <= high) == (each["p"] >= 0.01) == not_disproved(each)
+            assert low <= each["sigma_factor"] <= high
+        assert found["p"] == min(
+            each["p"] for each in (found["mean"], found["end"], *found["thirds"])
+        )
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.9, 1.0])
-def test_the_bound_of_chernoff_is_one_for_every_correlation(correlation):
+def test_no_sum_is_in_the_tails_of_chi2_more_often_than_its_shortfall_lets_it(correlation):
     means = studies(4000, 5, steps=5, correlation=correlation).mean(axis=(1, 2))
-    p = np.array([chernoff_p_value(mean, 3, 5) for mean in means])
+    p = np.array([shortfall_p_value(mean, 3, 5) for mean in means])
     for level in (0.3, 0.1, 0.03):
         assert np.mean(p < level) < level
-    assert all(
-        chernoff_p_value(mean, 3, 5) > chi2_p_value(mean, 3, 5) for mean in (0.5, 2.0, 4.0, 9.0)
+
+
+def test_the_limits_are_the_expected_shortfall():
+    drawn = np.sort(np.random.default_rng(5).chisquare(6, 10**6))
+    low, high = shortfall_limits(6, 0.02)
+    assert drawn[: 10**4].mean() == pytest.approx(low, rel=0.01)
+    assert drawn[-(10**4) :].mean() == pytest.approx(high, rel=0.01)
+    for limit in (low, high):
+        assert shortfall_p_value(limit / 2, 3, 2) == pytest.approx(0.02, rel=1e-9)
+
+
+def test_the_interval_of_chi2_is_what_is_left_of_few_runs_and_that_of_scatter_of_many_steps():
+    three = Look("", PowerSums.of(np.array([3.0, 3.0, 3.0])), (3.0, 3.0), 0.01).interval
+    low, high = shortfall_limits(9, 0.01)
+    assert three == pytest.approx((9 / high, 9 / low))
+    wide = np.array([0.1, 0.1, 12.0, 0.1, 0.1])
+    t = stats.t.ppf(0.995, 4) * wide.std(ddof=1) / wide.mean() / np.sqrt(5)
+    assert t > 1
+    assert Look("", PowerSums.of(wide), (3.0, 3.0), 0.01).interval == (0.0, np.inf)
+    # Twenty runs of very many steps do not scatter: what they all have is proven.
+    alike = Look("", PowerSums.of(3.3 + 0.01 * np.arange(20)), (3.0, 3.0), 0.01)
+    assert alike.word == "over-confident"
+
+
+# --- opposite faults ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.98])
+def test_faults_that_cancel_in_the_mean_are_found_in_the_parts(correlation):
+    ramp = np.linspace(0.7, 1.3, 30)
+    nees = ramp * series(np.random.default_rng(4), 400, steps=30, correlation=correlation)
+    found = run_verdict(nees, 3)
+    assert found["mean"]["word"] == "consistent"
+    assert found["word"] in ("over-confident", "under-confident")
+    first, middle, last = (third["sigma_factor"] for third in found["thirds"])
+    assert first < 0.95 < middle < 1.05 < last
+    assert (found["thirds"][0]["word"], found["thirds"][2]["word"]) == (
+        "under-confident",
+        "over-confident",
     )
+    where = {"last step": "at the last step"}.get(found["of"], f"in the {found['of']}")
+    assert sentences(found)[0].startswith(f"{where} NEES {found['nees']:.2f}, σ too ")
+    assert sentences(found)[1].startswith("over all steps: NEES ")
+
+
+def test_the_end_alone_decides_where_only_it_is_wrong():
+    nees = studies(1, 100, steps=60, correlation=0.0)[0]
+    nees[:, -1] *= 3
+    found = run_verdict(nees, 3)
+    assert (found["word"], found["of"]) == ("over-confident", "last step")
+    assert found["nees"] == pytest.approx(nees[:, -1].mean())
+    assert found["interval99"] == found["end"]["interval99"]
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3])
+def test_short_runs_have_the_parts_that_they_have(steps):
+    nees = studies(1, 100, steps=steps, correlation=0.5)[0]
+    found = run_verdict(nees, 3)
+    assert len(found["thirds"]) == (3 if steps == 3 else 0)
+    assert found["end"]["nees"] == pytest.approx(nees[:, -1].mean())
+    assert found["word"] == "consistent"
+    if steps == 3:
+        thirds = [third["nees"] for third in found["thirds"]]
+        assert thirds == pytest.approx(list(nees.mean(axis=0)))
+
+
+def test_thirds_are_of_the_steps_that_each_run_has():
+    nees = np.arange(24.0).reshape(2, 12) + 1
+    logged = np.ones((2, 12), bool)
+    logged[1, [0, 3, 4, 5, 6, 7]] = False  # 2, 3; 9, 10; 11, 12 of the second run are left
+    thirds = run_verdict(nees, 3, logged=logged)["thirds"]
+    means = [(nees[0, 4 * i : 4 * i + 4].mean() + nees[1, at].mean()) / 2
+             for i, at in enumerate(([1, 2], [8, 9], [10, 11]))]  # fmt: skip
+    assert [third["nees"] for third in thirds] == pytest.approx(means)
 
 
 # --- lost runs ----------------------------------------------------------------------------------
@@ -129,31 +217,55 @@ def test_a_few_lost_runs_are_named_and_judged_apart():
     assert (verdict["lost"], verdict["never_lost"]["runs"]) == (0.003, 997)
     assert verdict["nees"] == pytest.approx(nees.mean())
     assert verdict["never_lost"]["nees"] == pytest.approx(nees[3:].mean())
-    # They scatter so much that the interval holds 1: only χ² tells that this is not chance.
-    assert verdict["interval99"][0] < 1
+    # They scatter so much that they may be worth nothing: only χ² tells that this is not chance.
+    assert 1 < verdict["interval99"][0] < 1.001
     assert verdict["p"] < 1e-9
+    assert verdict["lost_runs"] == [0, 1, 2]
     others = sentences(verdict)[2]
-    assert others.startswith("3 of 1000 runs were lost, the 997 never lost: NEES 2.98, σ right")
+    assert others.startswith(
+        "3 of 1000 runs were lost (numbers 0, 1, 2), the 997 never lost: NEES 2.98, σ right"
+    )
 
 
 def test_of_runs_that_are_chosen_by_their_nees_no_verdict_is_said():
     nees = consistent()
     nees[:11, 5] = 1e3
-    expected = f"11 of 1000 runs were lost, the 989 never lost: NEES {nees[11:].mean():.2f}"
+    named = "numbers 0, 1, 2, 3, 4, 5, 6, 7 and 3 more"
+    rest = f"the 989 never lost: NEES {nees[11:].mean():.2f}"
+    expected = f"11 of 1000 runs were lost ({named}), {rest}"
     assert sentences(run_verdict(nees, 3))[2] == expected
 
 
 def test_a_run_that_is_lost_and_comes_back_was_lost():
     nees = consistent()
-    nees[4, 7] = 22.0
-    assert run_verdict(nees, 3)["lost"] == 0.001
+    nees[4, 7] = 1.001 * lost_threshold(3, 20)
+    found = run_verdict(nees, 3)
+    assert (found["lost"], found["lost_runs"]) == (0.001, [4])
+
+
+@pytest.mark.parametrize("steps", [1, 1000])
+def test_of_right_runs_one_in_10000_is_lost_however_many_steps_they_have(steps):
+    """With independent steps exactly; the quantile of one step would lose 10 % of long runs."""
+    limit = lost_threshold(3, steps)
+    assert 1 - stats.chi2.cdf(limit, 3) ** steps == pytest.approx(1e-4, rel=1e-3)
+    nees = np.random.default_rng(13).chisquare(3, (2000, steps))
+    assert run_verdict(nees, 3)["lost"] <= 3 / 2000
+    assert lost_threshold(3) == pytest.approx(21.1, abs=0.05)
+
+
+def test_a_short_run_is_lost_by_the_quantile_of_its_own_steps():
+    nees = np.full((2, 1000), 3.0)
+    nees[:, 0] = 22.0
+    logged = np.ones(nees.shape, bool)
+    logged[1, 1:] = False
+    assert run_verdict(nees, 3, logged=logged)["lost_runs"] == [1]
 
 
 def test_without_lost_runs_a_consistent_filter_seems_better_by_less_than_half_a_percent():
     nees = series(np.random.default_rng(7), 20000, steps=60, correlation=0.97)
     verdict = run_verdict(nees, 3)
-    assert 0.995 < verdict["never_lost"]["nees"] / verdict["nees"] < 0.9995
-    assert 0.0005 < verdict["lost"] < 60e-4
+    assert 0.999 < verdict["never_lost"]["nees"] / verdict["nees"] < 1
+    assert 0 < verdict["lost"] < 3e-4
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -193,12 +305,22 @@ def test_anything_between_all_and_what_a_fit_leaves_is_right(mean, word, factor)
     nees *= mean / nees.mean()
     found = run_verdict(nees, 6, fitted=1.0)
     assert (found["word"], found["sigma_factor"]) == (word, pytest.approx(factor))
-    low, high = mean_interval(PowerSums.of(nees.mean(axis=1)), 0.99)
-    assert found["interval99"] == pytest.approx([np.sqrt(low / 6), np.sqrt(high / 5)])
+    total = nees.mean(axis=1).sum()
+    most, least = shortfall_limits(2000 * 6, 0.005)[1], shortfall_limits(2000 * 5, 0.005)[0]
+    expected = np.sqrt([total / most, total / least])
+    assert found["interval99"] == pytest.approx(list(expected), rel=0.02)
     assert not_disproved(found) is (word == "consistent")
 
 
-@pytest.mark.parametrize("runs", [1, 300])
+def test_what_may_be_fitted_is_no_proof_that_sigma_is_right():
+    """Of a drift of one dof only σ too small can be proven: with few runs that it is not cannot."""
+    nees = np.random.default_rng(11).chisquare(1, (400, 4))
+    assert run_verdict(nees, 1, fitted=1)["word"] == "consistent"
+    assert run_verdict(nees[:10], 1, fitted=1)["word"] == "cannot tell"
+    assert run_verdict(0.1 * nees[:30], 1, fitted=1)["word"] == "consistent"
+
+
+@pytest.mark.parametrize("runs", [1, 3, 300])
 def test_where_all_may_be_fitted_only_over_confidence_can_be_proven(runs):
     nees = np.random.default_rng(11).chisquare(1, (runs, 4))
     for factor in (0.0, 1e-6, 1.0):
@@ -255,20 +377,20 @@ def test_power_sums_have_the_moments_of_their_numbers():
     assert sums.skewness == pytest.approx(stats.skew(values))
 
 
-def test_one_run_has_no_interval_and_still_a_p_value():
+def test_one_run_has_an_interval_that_holds_for_any_correlation_of_its_steps():
     verdict = run_verdict(np.full((1, 4), 100.0), 3)
-    assert verdict["interval99"] == [None, None]
-    assert verdict["word"] == "over-confident"
-    assert (
-        sentences(verdict)[0] == "NEES 100, σ too small by 5.77 [–, –]: over-confident (p < 0.0001)"
-    )
-    assert run_verdict(np.full((1, 4), 3.5), 3)["word"] == "consistent"
+    low, high = verdict["interval99"]
+    assert (verdict["word"], verdict["p"] < 1e-9) == ("over-confident", True)
+    assert 2 < low < verdict["sigma_factor"] < 60 < high
+    least, most = shortfall_limits(3, 0.005)
+    assert (low, high) == pytest.approx((np.sqrt(100 / most), np.sqrt(100 / least)))
+    assert run_verdict(np.full((1, 4), 3.5), 3)["word"] == "cannot tell"
 
 
 @pytest.mark.parametrize(
     ("factor", "text"),
     [
-        (1.0, "σ right up to a factor 1.00 [0.98, 1.02]: consistent"),
+        (1.0, "σ right up to a factor 1.00 [0.96, 1.04]: consistent"),
         (1.26, "σ too small by 1.26 [1.23, 1.29]: over-confident"),
         (0.8, "σ too large by 1.25 [1.22, 1.28]: under-confident"),
     ],

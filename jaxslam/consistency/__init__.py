@@ -1,5 +1,6 @@
 """Is a filter consistent? Monte Carlo runs, NEES and NIS with exact bounds, and their summary."""
 
+from jaxslam.consistency.innovations import innovation_verdict
 from jaxslam.consistency.montecarlo import BACKENDS, CHUNK, DTYPES, monte_carlo
 from jaxslam.consistency.records import write_records
 from jaxslam.consistency.statistics import (
@@ -31,6 +32,7 @@ __all__ = [
     "Study",
     "Tally",
     "chi2_quantile",
+    "innovation_verdict",
     "lost_threshold",
     "mean_band",
     "monte_carlo",

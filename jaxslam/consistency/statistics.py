@@ -10,7 +10,7 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.special import gammainc, gammaincc, gammaincinv, stdtr, stdtrit
+from scipy.special import gammainc, gammaincc, gammainccinv, gammaincinv, stdtr
 
 from jaxslam.arrays import AnyArray
 from jaxslam.linalg import cholesky
@@ -53,27 +53,47 @@ def mean_band(dof: int, runs: int, confidence: float = CONFIDENCE) -> tuple[floa
     return low, high
 
 
-def lost_threshold(dof: int) -> float:
-    """NEES above which a run counts as lost; 21.1 for 3 degrees of freedom."""
-    return chi2_quantile(LOST_QUANTILE, dof)
+def lost_threshold(dof: int, steps: int = 1) -> float:
+    """NEES above which a run counts as lost; 21.1 for 3 degrees of freedom.
+
+    Of so many `steps` it is above it at any for one run in 10 000, or fewer if they are correlated.
+    """
+    return 2 * float(gammainccinv(dof / 2, (1 - LOST_QUANTILE) / steps))
 
 
-def chi2_p_value(mean: float, dof: float, runs: int) -> float:
-    """Two-sided, exact: of a mean NEES of `runs` independent runs at ONE time step."""
-    shape, value = runs * dof / 2, runs * mean / 2
-    return float(min(1.0, 2 * min(gammainc(shape, value), gammaincc(shape, value))))
+def shortfall_limits(dof: float, level: float) -> tuple[float, float]:
+    """Between which everything is, but for a share of `level`, that spreads no more than χ².
+
+    A sum of time averages of χ² does not, by Jensen `E f(Σ xₜ/T) ≤ E f(x)` for every convex f,
+    however the steps are correlated. Half of `level` is at most on each side, beyond χ²'s expected
+    shortfall `E[χ² | χ² in its tail]` (Meilijson and Nádas, Journal of Applied Probability 1979,
+    "Convex majorization with an application to the length of critical paths").
+    """
+    shape, tail = dof / 2, level / 2
+    least, most = float(gammaincinv(shape, tail)), float(gammainccinv(shape, tail))
+    return (
+        dof * float(gammainc(shape + 1, least)) / tail,
+        dof * float(gammaincc(shape + 1, most)) / tail,
+    )
 
 
-def chernoff_p_value(mean: float, dof: float, runs: int) -> float:
+def shortfall_p_value(mean: float, dof: float, runs: int) -> float:
     """Two-sided, a bound: of a mean NEES over runs *and* steps, however the steps are correlated.
 
-    By Jensen `E exp(λ (x₁ + … + x_T)/T) ≤ E exp(λ x)`, so that Chernoff's bound for χ²(N n) at N
-    times the mean, `exp(N n (log r − r + 1)/2)` with r = mean/n, holds for time averages too.
+    The level at which the sum is one of `shortfall_limits`.
     """
-    ratio = mean / dof
-    if ratio <= 0:
-        return 0.0
-    return min(1.0, 2 * math.exp(runs * dof / 2 * (math.log(ratio) - ratio + 1)))
+    total, above = runs * mean, bool(mean > dof)
+    low, high = _LEAST, 0.0  # of log p
+    for _ in range(60):
+        middle = (low + high) / 2
+        limit = shortfall_limits(runs * dof, math.exp(middle))[above]
+        within = total <= limit if above else total >= limit
+        low, high = (middle, high) if within else (low, middle)
+    return 0.0 if low == _LEAST else math.exp(high)
+
+
+_LEAST = math.log(1e-290)
+"""Of p; less is none."""
 
 
 @dataclass(frozen=True)
@@ -117,23 +137,13 @@ class PowerSums:
         return third / cubed if second > 1e-12 * m * m and cubed > 0 else 0.0
 
 
-def mean_interval(sums: PowerSums, confidence: float) -> tuple[float, float]:
-    """Two-sided interval of the mean that positive, skewed numbers are drawn with.
+def mean_p_value(sums: PowerSums, expected: float) -> float:
+    """Two-sided, of `expected` as the mean of skewed numbers; NaN for fewer than two.
 
     Student's t with its skewness removed by a cubic (Hall, Annals of Statistics 1992,
     "On the removal of skewness by transformation"): the studentised bootstrap to second order,
-    without resampling. NaN for fewer than two numbers.
+    without resampling.
     """
-    if sums.count < 2:
-        return math.nan, math.nan
-    scale, k = sums.deviation / math.sqrt(sums.count), sums.skewness / math.sqrt(sums.count)
-    quantile = float(stdtrit(sums.count - 1, (1 + confidence) / 2))
-    low, high = (sums.mean - scale * _skewed(q, k) for q in (quantile, -quantile))
-    return max(low, 0.0), high
-
-
-def mean_p_value(sums: PowerSums, expected: float) -> float:
-    """Two-sided, of `expected` as the mean: `mean_interval` turned round. NaN below two numbers."""
     if sums.count < 2:
         return math.nan
     away, k = sums.mean - expected, sums.skewness / math.sqrt(sums.count)
@@ -151,10 +161,3 @@ def _symmetric(t: float, k: float) -> float:
     """Hall's cubic `g(t) = t + k/6 + k t²/3 + k² t³/27`, with k = skewness/√n: monotone."""
     t = min(max(t, -_FAR), _FAR)
     return t + k / 6 + k * t**2 / 3 + k**2 * t**3 / 27
-
-
-def _skewed(x: float, k: float) -> float:
-    """Its inverse."""
-    if abs(k) < 1e-9:
-        return x
-    return 3 / k * (float(np.cbrt(1 + k * (x - k / 6))) - 1)

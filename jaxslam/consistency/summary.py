@@ -20,7 +20,7 @@ from jaxslam.consistency.sums import (
     survived,
     tally_of,
 )
-from jaxslam.consistency.verdict import Tally, sentences
+from jaxslam.consistency.verdict import Tally, lost_runs, sentences
 from jaxslam.files import json_numbers
 from jaxslam.forms.state import Status
 from jaxslam.simulation import Scenario
@@ -166,7 +166,10 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
     seconds = study.seconds[name]
     beyond = tally_of(sums, "beyond_scale", dof)
     return {
-        "verdict": tally_of(sums, "nees", dof).verdict(),
+        "verdict": {
+            **tally_of(sums, "nees", dof).verdict(),
+            "lost_runs": _lost_runs(study, name, dof),
+        },
         "dof": dof,
         "calibration": treatment(study.filters[name]),
         "survivors": healthy,
@@ -248,6 +251,17 @@ def tally(study: Study, name: str, record: str = "nees") -> Tally:
     return tally_of(_sums(study, name), record, study.scenario.world.tangent_dim)
 
 
+def _lost_runs(study: Study, name: str, dof: int) -> list[int] | None:
+    """Their numbers; None where not all records are kept."""
+    if study.reduced:
+        return None
+    return [
+        chunk.start + run
+        for chunk in study.chunks
+        for run in lost_runs(study.store.load(name, chunk, ("nees",))["nees"], dof)
+    ]
+
+
 def _sums(study: Study, name: str) -> Sums:
     """Of all chunks."""
     dof = study.scenario.world.tangent_dim
@@ -293,9 +307,9 @@ def table(summary: dict[str, Any] | Study) -> str:
             *(_row(f"{name:<{wide}}", f) for name, f in filters.items()),
             f"last of {summary['steps']} steps, {summary['runs']} runs of seed {summary['seed']}; "
             f"a consistent filter has mean NEES {next(iter(filters.values()))['dof']}; verdicts: "
-            "of time averages, [99 % interval]",
-            "lost: NEES above the 99.99 % quantile of χ² now, ever: at any step; others: mean of "
-            "those not lost now",
+            "of all steps, the last and each third together, [99 % interval]",
+            "lost: NEES above the 99.99 % quantile of χ² now, ever: at any step, with the quantile "
+            "of so many; others: mean of those not lost now",
             *(_scale_table(filters, wide) if summary["scale_free"] else ()),
             *_notes(filters),
         ]

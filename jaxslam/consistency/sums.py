@@ -71,6 +71,7 @@ def _sums(records: Records, dof: int) -> Sums:
     healthy = survived(records)
     good = {name: records[name][healthy] for name in RECORDS}
     kept = good["nees"] <= lost_threshold(dof)
+    ever = ~(good["nees"] <= lost_threshold(dof, good["nees"].shape[1]))
     finite = good["landmark_count"] - good["landmark_not_finite"]
     return {
         "tally_nees": Tally.of(records["nees"], dof).numbers(),
@@ -80,7 +81,7 @@ def _sums(records: Records, dof: int) -> Sums:
         "kept": kept.sum(axis=0),
         "kept_nees": np.where(kept, good["nees"], 0.0).sum(axis=0),
         "lost": (~kept).sum(axis=0),
-        "lost_ever": np.logical_or.accumulate(~kept, axis=1).sum(axis=0),
+        "lost_ever": np.logical_or.accumulate(ever, axis=1).sum(axis=0),
         **_of_scale(good, lost_threshold(dof - 1)),
         "nis": good["nis"].sum(axis=0),
         "nis_dof": good["nis_dof"].sum(axis=0),

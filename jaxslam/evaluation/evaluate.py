@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from jaxslam.consistency.innovations import innovation_verdict
 from jaxslam.consistency.statistics import mean_band
 from jaxslam.consistency.verdict import headline, lost_runs, run_verdict, sentences
 from jaxslam.evaluation.arrays import filled, normalised, paired, step_times, without_known
@@ -71,8 +72,14 @@ class Evaluation:
     @cached_property
     def verdict(self) -> dict[str, Any]:
         """Of one study over all steps, see `jaxslam.consistency.Tally.verdict`."""
-        found = run_verdict(self.nees, self.dof, logged=self.logged)
+        with np.errstate(over="ignore"):
+            found = self._verdict(self.nees, self.errors / self.sigmas, self.dof)
         return withheld(found) if self.mistakes else found
+
+    def _verdict(self, nees: np.ndarray, normalised: np.ndarray, dof: int) -> dict[str, Any]:
+        if self.quantity == "NIS":
+            return innovation_verdict(nees, normalised, dof)
+        return run_verdict(nees, dof, logged=self.logged)
 
     @cached_property
     def mistakes(self) -> tuple[Mistake, ...]:
@@ -87,7 +94,7 @@ class Evaluation:
         """The verdict in a line."""
         if self.mistakes:
             return f"no verdict: {', '.join(mistake.what for mistake in self.mistakes)}"
-        return headline(self.verdict).replace("NEES", self.quantity, 1)
+        return headline(self.verdict, self.quantity)
 
     @cached_property
     def logged(self) -> Bool[np.ndarray, "runs steps"]:
@@ -156,8 +163,9 @@ class Evaluation:
     def axis_verdict(self, axis: int) -> dict[str, Any]:
         """The verdict on one axis alone, of one degree of freedom."""
         with np.errstate(over="ignore"):
-            nees = (self.errors[..., axis] / self.sigmas[..., axis]) ** 2
-            return run_verdict(nees, 1, logged=self.logged)
+            normalised = self.errors[..., [axis]] / self.sigmas[..., [axis]]
+            nees = np.where(self.logged, normalised[..., 0] ** 2, np.nan)
+            return self._verdict(nees, normalised, 1)
 
     def asdict(self) -> dict[str, Any]:
         """The content of `evaluation.json`."""
@@ -203,12 +211,13 @@ class Evaluation:
         return path
 
     def __str__(self) -> str:
-        told = [line.replace("NEES", self.quantity) for line in sentences(self.verdict)]
+        # Lost runs are named below, as they are called here.
+        told = sentences(self.verdict | {"lost_runs": None}, self.quantity)
         doubt = [] if self.identified is None else [self.identified.sentence]
         if self.lost_runs:
             more = len(self.lost_runs) - _LISTED
             which = ", ".join(self.lost_runs[:_LISTED]) + (f" and {more} more" if more > 0 else "")
-            told.append(f"lost: {which}")
+            told.append(f"{'lost' if self.quantity == 'NEES' else 'outlying'}: {which}")
         if self.mistakes:
             told, doubt = [self.headline, *(mistake.told for mistake in self.mistakes)], []
         return "\n".join([*told, *doubt, "", *self._table(), *self.remarks])

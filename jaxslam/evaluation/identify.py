@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.consistency.statistics import PowerSums, mean_p_value
-from jaxslam.consistency.verdict import VERDICT_CONFIDENCE, run_verdict
+from jaxslam.consistency.verdict import VERDICT_CONFIDENCE, not_disproved, run_verdict
 from jaxslam.evaluation.convention import Convention
 
 NOTICEABLE = 0.05
@@ -91,7 +91,7 @@ def identify(
     if not finite:
         return Identification(stated, means, ())
     best = min(finite, key=lambda c: means[c])
-    if run_verdict(finite[best], dof, logged=~np.isnan(finite[best]))["word"] != "consistent":
+    if not not_disproved(run_verdict(finite[best], dof, logged=~np.isnan(finite[best]))):
         return Identification(stated, means, ())
     equal = tuple(c for c in finite if not _worse(finite[c], finite[best]))
     return Identification(stated, means, equal)

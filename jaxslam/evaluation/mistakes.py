@@ -74,7 +74,13 @@ def mistakes(logged: Logged) -> tuple[Mistake, ...]:
 
 def withheld(found: dict[str, Any]) -> dict[str, Any]:
     """A verdict of which no word is believed, as the data are not what they are said to be."""
-    parts = {key: withheld(x) if isinstance(x, dict) else x for key, x in found.items()}
+
+    def silent(part: Any) -> Any:
+        if isinstance(part, list):
+            return [silent(x) for x in part]
+        return withheld(part) if isinstance(part, dict) else part
+
+    parts = {key: silent(x) for key, x in found.items()}
     return parts | {"word": "cannot tell"} if "word" in found else parts
 
 
@@ -168,13 +174,12 @@ def _told(factor: float) -> str:
 
 
 def _is_factor(found: Mapping[str, Any], factor: float, known: bool) -> bool:
-    """Whether σ is wrong by just this factor; without an interval, of one run, only of what is
+    """Whether σ is wrong by just this factor; of one run, whose interval is wide, only of what is
     `known`, and only where it is too small, as one number can be small by chance."""
     by, (low, high) = found["sigma_factor"], found["interval99"]
     if not by or abs(np.log(by / factor)) > np.log(_LIKE):
         return False
-    if low is None or high is None:
-        return known and factor > 1
+    high = np.inf if high is None else high
     apart = low > _WRONG if factor > 1 else high < 1 / _WRONG
     near = low / _SLACK < factor < high * _SLACK
     return bool(near and apart and (known or high < _NARROW * low))
