@@ -165,7 +165,9 @@ def special_numbers(shared, x):
 def places_that_are_equal(shared, x):
     """Numbers that are put to one place are all added there, or the last one stays."""
     at = jnp.clip(jnp.nan_to_num(x), -1, 1).astype(int) + 1
-    return jnp.zeros(4).at[at].add(jnp.arange(6) + 0.5), jnp.ones(4).at[at].set(jnp.arange(6.0))
+    known = jnp.ones(3).at[jnp.array([1, 1, 0])].add(x[3:])
+    added = jnp.zeros(4).at[at].add(jnp.arange(6) + 0.5)
+    return known, added, jnp.ones(4).at[at].set(jnp.arange(6.0))
 
 
 def order_of_equals(shared, x):
@@ -298,11 +300,13 @@ def test_runs_of_which_it_cannot_be_certain_are_computed_by_xla(function, monkey
 def test_integers_of_single_precision_are_whole(monkeypatch):
     """Above 2²⁴ no float32 is odd."""
     told = computed_again(monkeypatch)
-    given = np.array([[3, 5], [2**24, 1], [2**24 + 1, 0], [2**23, 2**23 + 1]], np.int32)
+    given = np.array(
+        [[3, 5, 0], [2**24, 1, 0], [2**24 + 1, 0, 0], [2**23, 2**23 + 1, -(2**23)]], np.int32
+    )
     shared = np.ones(2, np.float32)
 
     def sums(shared, n):
-        return jnp.sum(n) - n[0], n + 1, shared * n[0], jnp.zeros(2, int).at[n % 2].add(n)
+        return jnp.sum(n), n + 1, shared * n[0]
 
     with jax.enable_x64(False):
         found = batched(sums, shared, given)(shared, given)
