@@ -14,6 +14,7 @@ from jaxslam.forms.form import curvature
 from jaxslam.forms.information import Information
 from jaxslam.forms.state import Features
 from jaxslam.landmarks import LANDMARKS
+from jaxslam.slam import association
 from jaxslam.slam.association import ASSOCIATIONS, GATE, Candidates, candidates
 from jaxslam.slam.filter import context_of
 
@@ -151,6 +152,31 @@ def test_joint_compatibility_finds_the_largest_set_there_is():
         believed = np.asarray(compiled["jcbb"](matches))
         assert believed.sum() == largest
         assert jointly_compatible(matches, believed)
+
+
+def independent(squares):
+    """Matches that have nothing to do with one another, each so far off, squared."""
+    r = jnp.zeros((M, 2)).at[: len(squares), 0].set(jnp.sqrt(jnp.asarray(squares)))
+    S = jnp.asarray(np.eye(2 * M).reshape(M, 2, M, 2))
+    return Candidates(r, S, jnp.arange(M) < len(squares), jnp.arange(M))
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_joint_compatibility_is_bounded_by_the_numbers_of_all_that_are_in(count):
+    """χ² of 2 for each: just below it all are believed, and just above one is not."""
+    bound = chi2.ppf(GATE, 2 * count)
+    for times, believed in ((0.999, count), (1.001, count - 1)):
+        matches = independent(np.full(count, times * bound / count))
+        assert np.sum(compiled["jcbb"](matches)) == believed
+
+
+@pytest.mark.parametrize("seed", [19, 58, 90])
+def test_a_first_match_that_was_wrong_does_not_stay_nor_what_it_kept_out(seed):
+    matches, bad = found(np.random.default_rng(seed), 0.3)
+    first = np.flatnonzero(bad)[0]
+    believed = np.asarray(jax.jit(association._grown_from)(matches, first))
+    assert not believed[bad].any()
+    assert believed[~bad].mean() > 0.9
 
 
 def test_sequential_ends_with_matches_that_all_fit_the_others():

@@ -115,6 +115,38 @@ def test_the_window_closes_and_the_sum_goes_on_alone():
     assert (steps_of(before) == 8).all()
 
 
+def poses_of(state):
+    return state.sum.members.core.pose.wxyz_xyz
+
+
+def covariances_of(state):
+    return state.sum.members.covariance
+
+
+@pytest.mark.parametrize(("sigma", "weight", "ready"), [
+    (0.029, 0.0, True), (0.031, 0.0, False), (0.029, np.log(0.99), False),
+])  # fmt: skip
+def test_a_window_may_close_where_one_translation_is_known_to_three_hundredths(
+    sigma, weight, ready
+):
+    slam: Any = standstill().filter(STARTED)
+    state = slam.init(standstill().capacity)
+    member = slam.base.likeliest(state.sum)
+    place = member.core.part("pose").start
+    part = jnp.arange(place, place + 3)
+    t = jnp.asarray([0.0, 0.6, -0.8])
+    pose, P = (x(state) for x in (poses_of, covariances_of))
+    P = P.at[:, part[:, None], part].set(sigma**2 / 3 * jnp.eye(3))
+    state = eqx.tree_at(poses_of, state, pose.at[:, -3:].set(t))
+    state = eqx.tree_at(covariances_of, state, P)
+    weights = jnp.array([weight, np.log(-np.expm1(weight)) if weight else -jnp.inf, -jnp.inf])
+    merged = jnp.full_like(state.record.merged, 2.0)
+    record = replace(state.record, last=jnp.full_like(state.record.last, 4), merged=merged)
+    state = replace(state, sum=replace(state.sum, log_weights=weights))
+    assert slam._ready(replace(state, record=record)) == ready
+    assert not slam._ready(state)  # of no frame yet
+
+
 def test_standing_teaches_nothing_and_then_the_motion_is_found():
     """The window keeps frame 0 and the newest, and stays open."""
     states = followed(STARTED, standing)

@@ -516,6 +516,39 @@ def test_the_filters_state_is_the_gaussian_of_the_mode(of, monkeypatch):
     assert np.linalg.eigvalsh(state.covariance).min() > -1e-12
 
 
+def test_the_filters_state_stands_at_the_mean_of_the_scale():
+    """As that of a mode all of whose lengths are so much longer."""
+    slam, record, *_ = case(*CASES[1])
+    at, m = minimum(*CASES[1]), FIRST.size
+
+    @quick_jit
+    def handed(at, shift):
+        first = Features(jnp.arange(m), record.measured[0], jnp.zeros(m, bool))
+        state = gauge_state(slam, record, at, shift, slam.init(m, first))
+        pose, covariance = slam.marginal(state, lambda scene: scene.pose)
+        return jnp.log(jnp.linalg.norm(pose.translation())), covariance
+
+    zero, shift = jnp.zeros(()), jnp.asarray(0.1)
+    x, y = rescaled(slam, record, at, shift)
+    found, expected = handed(at, shift), handed(replace(at, x=x, y=y), zero)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-12)
+    # What the rest makes of that takes some of it back.
+    assert 0.5 * shift < found[0] - handed(at, zero)[0] < shift
+
+
+@each(CASES[1:2])
+def test_the_evidence_of_a_mode_is_laplaces_with_every_unknown(of):
+    slam, record, *_ = case(*of)
+    at = minimum(*of)
+    zero = jnp.zeros(())
+    given = modes.Weighed(at, zero, zero, jnp.zeros((at.x.size, at.x.size)))
+    found = quick_jit(lambda given, record: modes._weighed(slam, given, record))(given, record)
+    r, A, _ = dense(slam, record, at.x, at.y)
+    expected = -(r @ r + np.linalg.slogdet(A)[1]) / 2
+    np.testing.assert_allclose(found.evidence, expected, rtol=1e-9)
+
+
 def test_a_mode_that_is_next_to_impossible_is_none(monkeypatch):
     """Of distinct minima those remain, as modes, whose evidence is not too far below the best."""
     costs = 2 * jnp.array([7.0, 0.0, 2 * modes.NEGLIGIBLE, 0.9 * modes.NEGLIGIBLE])
