@@ -5,6 +5,9 @@ convention, strongly anisotropic or not, errors drawn from them (or from others,
 a convention that is stated, mostly a wrong one. The answer is the convention of the errors, or that
 it cannot be told: where covariances look the same along all axes, where poses do not turn, or where
 σ is wrong under every convention.
+
+Then the convention is stated rightly and σ is wrong, by the same factor throughout or by others of
+position and rotation: no other convention should be suggested, nor the stated one be doubted.
 """
 
 from __future__ import annotations
@@ -53,6 +56,8 @@ class Options:
     """Constructed cases, six of ten with an answer."""
     runs: int = 50
     """Runs of each."""
+    sets: int = 100
+    """Cases with 50 runs of every wrong σ; with more runs so many fewer."""
     out: Path = Path("benchmarks/results")
     """Folder of conventions.json."""
 
@@ -125,6 +130,42 @@ def _series(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     return noise
 
 
+FACTORS = (0.7, 0.8, 0.9, 0.95, 1.0, 1.03, 1.06, 1.08, 1.12, 1.2, 1.35, 1.5)
+OPPOSITE = ((0.8, 1.25), (1.25, 0.8), (0.9, 1.1), (1.1, 0.9), (0.7, 1.5), (1.5, 0.7))
+"""Errors of position and rotation in σ that is claimed."""
+STUDIES = (50, 100, 300, 1500)
+"""Runs."""
+
+
+def with_factors(number: int, runs: int, position: float, rotation: float) -> Case:
+    """A convention that is stated rightly, and errors that are so many times their σ."""
+    rng = np.random.default_rng([number, runs])
+    geometry = (SPATIAL, SPATIAL, PLANAR)[number % 3]
+    kinds = alternatives(Convention(("right", "split")[rng.integers(2)]), geometry)
+    true = kinds[rng.integers(len(kinds))]
+    T = _poses(rng, geometry, runs, 1.0)
+    P = _covariances(rng, geometry, T.shape[:2], isotropic=False)
+    noise = _series(rng, (*T.shape[:2], P.shape[-1]))
+    errors = np.einsum("...ij,...j->...i", np.linalg.cholesky(P), noise)
+    turns = [name.startswith("r") for name in true.names(geometry)]
+    errors *= np.where(turns, rotation, position)
+    return Case("wrong σ", T, P, displaced(T, errors, true), true, true)
+
+
+def blamed(position: float, rotation: float, runs: int, sets: int) -> dict[str, float]:
+    """Shares of such cases in which another convention is suggested, or this doubted."""
+    wrong, doubtful = 0, 0
+    for number in range(sets):
+        case = with_factors(number, runs, position, rotation)
+        found = evaluate_poses(*case[1:4], case.stated).identified
+        wrong += found is not None and found.suggested is not None
+        doubtful += found is not None and found.doubtful
+    return {
+        "position": position, "rotation": rotation, "runs": runs, "sets": sets,
+        "suggested": wrong / sets, "doubtful": doubtful / sets,
+    }  # fmt: skip
+
+
 def judged(case: Case) -> str:
     """`right`, `guessed` where nothing or another should have been said, or `silent`."""
     found = evaluate_poses(case.estimates, case.covariances, case.truths, case.stated).identified
@@ -147,12 +188,20 @@ def main(options: Options) -> None:
     by_kind = {kind: Counter() for kind in dict.fromkeys(KINDS)}
     for case in cases:
         by_kind[case.kind][judged(case)] += 1
+    print(json.dumps({kind: dict(count) for kind, count in by_kind.items()}), flush=True)
     right = sum(count["right"] for count in by_kind.values())
+    blame = []
+    for position, rotation in (*((f, f) for f in FACTORS), *OPPOSITE):
+        for runs in STUDIES:
+            sets = max(options.sets * STUDIES[0] // runs, 1)
+            blame.append(blamed(position, rotation, runs, sets))
+            print(json.dumps(blame[-1]), flush=True)
     result = {
         "cases": options.cases,
         "runs": options.runs,
         "right": right / options.cases,
         "kinds": {kind: dict(count) for kind, count in by_kind.items()},
+        "wrong_sigma": blame,
     }
     options.out.mkdir(parents=True, exist_ok=True)
     write_json(options.out / "conventions.json", result)

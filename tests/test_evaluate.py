@@ -26,6 +26,7 @@ KEYS = {
     "verdict", "outside3sigma", "rmse", "sigma", "axis_verdict", "convention", "alignment",
     "suggested", "identified", "notes", "runs_of_step", "band95_of_step",
     "run_names", "lost_runs", "mistakes",
+    "fitted", "scale",
 }  # fmt: skip
 
 
@@ -502,7 +503,10 @@ def test_options_that_do_not_go_together_are_refused(tmp_path, capsys):
     np.savez(tmp_path / "a.npz", errors=e, covariances=P)
     arrays = str(tmp_path / "a.npz")
     refused(
-        [arrays, "--error", "left"], "conventions and alignments are of poses", tmp_path, capsys
+        [arrays, "--error", "left"],
+        "conventions, alignments, axes used are of poses",
+        tmp_path,
+        capsys,
     )
     refused([arrays, "--truth", arrays], "a truth file goes with a trajectory", tmp_path, capsys)
     write_tum(tmp_path / "t.txt", [0.0], np.eye(4)[None])

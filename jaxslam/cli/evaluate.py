@@ -64,6 +64,14 @@ class EvaluateOptions:
             "pose where its covariance is zero, else to all positions.",
         ),
     ] = "none"
+    axes_used: Annotated[
+        str,
+        tyro.conf.arg(
+            metavar="NAMES",
+            help="Axes of the poses that the filter estimates, as x,y,rz of a robot in the plane. "
+            "By default all whose errors are not zero throughout.",
+        ),
+    ] = ""
     nis: bool = False
     """The errors of a CSV or npz file are innovations, and the covariances theirs."""
     out: Path = Path("results")
@@ -93,5 +101,6 @@ class EvaluateOptions:
             truth=self.truth,
             stated={name: value for name, value in stated.items() if value is not None},
             align=self.align,
+            axes_used=self.axes_used,
             nis=self.nis,
         )

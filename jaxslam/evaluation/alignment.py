@@ -21,6 +21,9 @@ MAX_TIME_DIFFERENCE = 0.01
 """Poses further apart in time than this (s) are not compared; evo's default."""
 _SPLIT = Convention("split", "world")
 """The error in which gauge directions are written."""
+_CLEAR = 10
+"""A rotation about a line is told by positions that are so many σ off it, root of the mean squares:
+of four it has 6 % more σ than to first order, of ten 1 %."""
 
 
 class Similarity(NamedTuple):
@@ -49,12 +52,19 @@ class Similarity(NamedTuple):
         convention: Convention,
     ) -> Float[np.ndarray, "k t t"]:
         """Covariances of the poses in the other world, of errors in the same convention."""
-        split, n = converted(covariances, T_wc, convention, _SPLIT), len(self.translation)
-        J = np.eye(split.shape[-1])
+        J = self.derivative(T_wc, convention)
+        return J @ covariances @ np.swapaxes(J, -1, -2)
+
+    def derivative(
+        self, T_wc: Float[np.ndarray, "k d d"], convention: Convention
+    ) -> Float[np.ndarray, "k t t"]:
+        """J of `ξ there = J ξ here`, errors of the poses in the convention."""
+        here, n = change(T_wc, convention, _SPLIT), len(self.translation)
+        J = np.eye(here.shape[-1])
         J[:n, :n] = self.scale * self.rotation
         if n == 3:
             J[n:, n:] = self.rotation
-        return converted(J @ split @ J.T, self.moved(T_wc), _SPLIT, convention)
+        return change(self.moved(T_wc), _SPLIT, convention) @ J @ here
 
 
 def associated(
@@ -97,6 +107,39 @@ def similarity(
     return Similarity(rotation, mean_reference - scale * rotation @ mean_estimate, scale)
 
 
+def straight_line(
+    positions: Float[np.ndarray, "k n"], sigma: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, " n"] | None:
+    """The direction of the line that positions with these σ cannot be told from, None of others.
+
+    A fit of positions has then no hold on the rotation about it, and would fit that to noise.
+    """
+    _, singular, right = np.linalg.svd(positions - positions.mean(0))
+    if len(right) == 2 or singular[1] > _CLEAR * np.linalg.norm(sigma):
+        return None
+    return right[0]
+
+
+def turned_about(
+    fit: Similarity,
+    line: Float[np.ndarray, " 3"],
+    estimates: Float[np.ndarray, "k 4 4"],
+    reference: Float[np.ndarray, "k 4 4"],
+) -> Similarity:
+    """A fit whose rotation about a line of the estimate is that of all orientations, not of the
+    positions: Exp(φ line) makes `Σ tr R_refᵀ R_fit Exp(φ line) R_est` the greatest.
+
+    To first order `Σ lineᵀ δθ = 0`, of rotations along the axes of the estimate's world.
+    """
+    M = np.einsum("kij,klj->il", estimates[:, :3, :3], reference[:, :3, :3]) @ fit.rotation
+    K = -lever(line)
+    angle = np.arctan2(np.trace(K @ M), np.trace(M) - line @ M @ line)
+    turn = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+    rotation = fit.rotation @ turn
+    centre, target = estimates[:, :3, 3].mean(0), reference[:, :3, 3].mean(0)
+    return Similarity(rotation, target - fit.scale * rotation @ centre, fit.scale)
+
+
 def at_first_pose(
     estimate: Float[np.ndarray, "d d"], truth: Float[np.ndarray, "d d"]
 ) -> Similarity:
@@ -112,21 +155,35 @@ def projected(
     convention: Convention,
     *,
     scaled: bool,
+    line: Float[np.ndarray, " 3"] | None = None,
 ) -> Float[np.ndarray, "k t t"]:
-    """Covariances of aligned poses in the gauge of `similarity`, which is `Σ U_posᵀ e_pos = 0`.
+    """Covariances of aligned poses in the gauge of `similarity`, which is `Σ U_posᵀ e_pos = 0`, and
+    about a `line` that of `turned_about`.
 
     `covariances` are those of every pose, whose errors are then taken as independent of each
     other's, or the joint one of all. With W = (VᵀU)⁻¹ the k-th block of `Q P Qᵀ` is
     `P_kk − U_k W (VᵀP)_k − (…)ᵀ + U_k W VᵀPV Wᵀ U_kᵀ`.
     """
     U = gauge_directions(T_wc, scaled=scaled)
-    V = U.copy()
-    V[:, T_wc.shape[-1] - 1 :] = 0
+    V = _fitted(U, line)
     P, VP, VPV = _in_split(T_wc, covariances, convention, V)
     UW = U @ np.linalg.pinv(np.einsum("kta,ktb->ab", V, U))
     lost = UW @ VP
     result = P - lost - np.swapaxes(lost, 1, 2) + UW @ VPV @ np.swapaxes(UW, 1, 2)
     return converted(result, T_wc, _SPLIT, convention)
+
+
+def _fitted(
+    U: Float[np.ndarray, "k t g"], line: Float[np.ndarray, " 3"] | None
+) -> Float[np.ndarray, "k t g"]:
+    """V of the errors that a fit leaves as they are, `Σ Vᵀ e = 0`."""
+    n, V = 2 if U.shape[1] == 3 else 3, U.copy()
+    V[:, n:] = 0
+    if line is not None:
+        about = np.outer(line, line)
+        V[:, :3, 3:6] = V[:, :3, 3:6] @ (np.eye(3) - about)
+        V[:, 3:, 3:6] = about
+    return V
 
 
 def _in_split(

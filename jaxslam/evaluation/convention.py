@@ -27,7 +27,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxslam.consistency.beyond_scale import BeyondScale, beyond_scale
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, log
@@ -108,11 +108,13 @@ def errors_beyond_scale(
     convention: Convention,
     estimates: Float[np.ndarray, "*batch d d"],
     truths: Float[np.ndarray, "*batch d d"],
-    covariances: Float[np.ndarray, "*batch t t"],
+    covariances: Float[np.ndarray, "*batch m m"],
+    axes: Int[np.ndarray, " m"] | None = None,
 ) -> BeyondScale:
     """What of every pose's error is not one of scale (`consistency.beyond_scale`), of covariances
-    in the convention, about the origin of the world."""
+    in the convention, about the origin of the world; of some axes of the error, where told."""
     turn = turning(convention, estimates)
+    turn = turn if axes is None else turn[..., axes, :]
     return _in_float64(_beyond_scale, convention.error, estimates, truths, turn, covariances)
 
 

@@ -19,6 +19,7 @@ from jaxslam.evaluation.arrays import filled, normalised, paired, step_times, wi
 from jaxslam.evaluation.convention import Convention
 from jaxslam.evaluation.identify import Identification
 from jaxslam.evaluation.mistakes import Logged, Mistake, mistakes, withheld
+from jaxslam.evaluation.scale import Scale
 from jaxslam.files import json_numbers, write_json
 from jaxslam.lookup import chosen
 
@@ -58,6 +59,12 @@ class Evaluation:
     """Which convention would make the data consistent, where it was asked."""
     notes: tuple[str, ...] = ()
     """What was left out, and what was assumed."""
+    fitted: float = 0.0
+    """Degrees of freedom, at most, that a fit to a whole run took from every NEES: of its scale."""
+    axis_fitted: tuple[float, ...] = ()
+    """The same of every axis alone; empty where nothing was fitted."""
+    scale: Scale | None = None
+    """Scale of the runs and its drift, where poses are given the scale or aligned by Sim(3)."""
     run_names: tuple[str, ...] = ()
     """Of the runs, where they have names."""
 
@@ -71,15 +78,27 @@ class Evaluation:
 
     @cached_property
     def verdict(self) -> dict[str, Any]:
-        """Of one study over all steps, see `jaxslam.consistency.Tally.verdict`."""
-        with np.errstate(over="ignore"):
-            found = self._verdict(self.nees, self.errors / self.sigmas, self.dof)
-        return withheld(found) if self.mistakes else found
+        """Of one study over all steps, see `jaxslam.consistency.Tally.verdict`; over-confident too
+        where the scale drifts more than σ allows."""
+        found = self._of_nees
+        if self.mistakes:
+            return withheld(found)
+        if self.scale is None or not self.scale.disproved or found["word"] == "lost":
+            return found
+        p = min(found["p"], (self.scale.verdict or found)["p"])
+        return found | {"word": "over-confident", "p": p}
 
-    def _verdict(self, nees: np.ndarray, normalised: np.ndarray, dof: int) -> dict[str, Any]:
+    @cached_property
+    def _of_nees(self) -> dict[str, Any]:
+        with np.errstate(over="ignore"):
+            return self._verdict(self.nees, self.errors / self.sigmas, self.dof, self.fitted)
+
+    def _verdict(
+        self, nees: np.ndarray, normalised: np.ndarray, dof: int, fitted: float
+    ) -> dict[str, Any]:
         if self.quantity == "NIS":
             return innovation_verdict(nees, normalised, dof)
-        return run_verdict(nees, dof, logged=self.logged)
+        return run_verdict(nees, dof, fitted, self.logged)
 
     @cached_property
     def mistakes(self) -> tuple[Mistake, ...]:
@@ -94,7 +113,9 @@ class Evaluation:
         """The verdict in a line."""
         if self.mistakes:
             return f"no verdict: {', '.join(mistake.what for mistake in self.mistakes)}"
-        return headline(self.verdict, self.quantity)
+        told = headline(self._of_nees, self.quantity)
+        drifts = self.scale is not None and self.scale.disproved
+        return f"{told}; {self.scale.sentence}" if drifts and self.scale else told
 
     @cached_property
     def logged(self) -> Bool[np.ndarray, "runs steps"]:
@@ -124,13 +145,18 @@ class Evaluation:
     @property
     def band95(self) -> tuple[float, float]:
         """Exact bounds of the mean at one step of which no run is missing (`jaxslam.mean_band`)."""
-        return mean_band(self.dof, max(int(self.finite.sum()), 1))
+        return self._band(max(int(self.finite.sum()), 1))
 
     @property
     def band95_of_step(self) -> Float[np.ndarray, "steps 2"]:
         """The same of every step, of as many runs as have it."""
         counts, place = np.unique(np.maximum(self.runs_of_step, 1), return_inverse=True)
-        return np.array([mean_band(self.dof, int(count)) for count in counts])[place]
+        return np.array([self._band(int(count)) for count in counts])[place]
+
+    def _band(self, runs: int) -> tuple[float, float]:
+        """From that of all that may be fitted to that of nothing."""
+        left, high = int(self.dof - self.fitted), mean_band(self.dof, runs)[1]
+        return (mean_band(left, runs)[0] if left >= 1 else 0.0), high
 
     @property
     def inside(self) -> float:
@@ -165,7 +191,8 @@ class Evaluation:
         with np.errstate(over="ignore"):
             normalised = self.errors[..., [axis]] / self.sigmas[..., [axis]]
             nees = np.where(self.logged, normalised[..., 0] ** 2, np.nan)
-            return self._verdict(nees, normalised, 1)
+            fitted = self.axis_fitted[axis] if self.axis_fitted else 0.0
+            return self._verdict(nees, normalised, 1, fitted)
 
     def asdict(self) -> dict[str, Any]:
         """The content of `evaluation.json`."""
@@ -194,6 +221,8 @@ class Evaluation:
             "axis_verdict": {n: self.axis_verdict(i) for n, i in by_axis.items()},
             "convention": None if self.convention is None else asdict(self.convention),
             "alignment": self.alignment,
+            "fitted": self.fitted,
+            "scale": None if self.scale is None else self.scale.asdict(),
             "suggested": None if self.suggested is None else asdict(self.suggested),
             "identified": None if self.identified is None else self.identified.asdict(),
             "mistakes": [mistake.told for mistake in self.mistakes],
@@ -212,7 +241,10 @@ class Evaluation:
 
     def __str__(self) -> str:
         # Lost runs are named below, as they are called here.
-        told = sentences(self.verdict | {"lost_runs": None}, self.quantity)
+        more = sentences(self._of_nees | {"lost_runs": None}, self.quantity)[1:]
+        told = [self.headline, *more]
+        if self.scale is not None and not self.scale.disproved:
+            told.append(self.scale.sentence)
         doubt = [] if self.identified is None else [self.identified.sentence]
         if self.lost_runs:
             more = len(self.lost_runs) - _LISTED
@@ -250,12 +282,16 @@ class Evaluation:
         steps = f"{self.steps} step{'s' if self.steps > 1 else ''}"
         return [
             f"{runs} of {steps}; mean {self.quantity} of a consistent filter "
-            f"{self.dof}, at one step in {low:.3f}–{high:.3f} with 95 %; "
+            f"{self._expected}, at one step in {low:.3f}–{high:.3f} with 95 %; "
             f"{self.inside:.0%} of the steps are inside",
             _columns("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
             *(self._row(i) for i in range(len(self.names))),
             _columns("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}"),
         ]
+
+    @property
+    def _expected(self) -> str:
+        return f"{self.dof - self.fitted:g}–{self.dof}" if self.fitted else str(self.dof)
 
     def _row(self, axis: int) -> str:
         found = self.axis_verdict(axis)

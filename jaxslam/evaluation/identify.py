@@ -1,16 +1,22 @@
 """Which convention would make the data consistent, where exactly one does.
 
 A wrong convention keeps the determinant of a covariance, so that it raises the expected NEES, and
-the one with the least NEES is the most likely, whatever the filter's σ is wrong by. It is told
-from another where the runs' averages of NEES differ by more than they scatter, pair by pair; and it
-*makes the data consistent* where the verdict on it says so.
+the one with the least NEES is the most likely, whatever the filter's σ is wrong by. (Of a part of
+the axes the determinant may change: `NEES det(P)^(1/dof)` is compared.) It is told from another
+where the runs' averages of NEES differ by more than they scatter, pair by pair; and it *makes the
+data consistent* where nothing is proven against the NEES of all axes, nor of position or rotation
+alone.
+
+A scale that is fitted lowers NEES whatever the convention, of a right covariance that of the
+position from n to n − 1 at the least. Only where it lowers it further, so that no σ explains it, is
+the covariance one given the scale.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -21,9 +27,63 @@ from jaxslam.evaluation.convention import Convention
 
 NOTICEABLE = 0.05
 """NEES that differ by less than this share say the same of σ, to 2.5 %."""
-
+_PART_CONFIDENCE = 0.999
+"""Of what is said against position or rotation alone, after all axes together."""
 _TOLD = 3
 """Conventions that cannot be told, of which a sentence speaks."""
+_ALIKE = " (right and split errors are the same to first order)"
+
+
+class Tried(NamedTuple):
+    """What a convention makes of the data; NaN where nothing was logged."""
+
+    nees: Float[np.ndarray, "runs steps"]
+    dof: int
+    fitted: float = 0.0
+    """Degrees of freedom, at most, that a fit took from every NEES."""
+    log_determinant: float = 0.0
+    """Of the covariances, on average."""
+    position: Float[np.ndarray, "runs steps"] | None = None
+    """NEES of the position alone, where there is one."""
+    rotation: Float[np.ndarray, "runs steps"] | None = None
+    turns: int = 0
+    """Axes of the rotation."""
+
+    def last(self, steps: int) -> Tried:
+        """Of the last steps alone."""
+        position, rotation = (
+            None if x is None else x[:, -steps:] for x in (self.position, self.rotation)
+        )
+        return self._replace(nees=self.nees[:, -steps:], position=position, rotation=rotation)
+
+    @property
+    def finite(self) -> bool:
+        return not any(np.isinf(x).any() for x in self.nees_of_parts())
+
+    def nees_of_parts(self) -> list[Float[np.ndarray, "runs steps"]]:
+        """Of all axes, of the position and of the rotation."""
+        return [x for x in (self.nees, self.position, self.rotation) if x is not None]
+
+    @property
+    def whole(self) -> bool:
+        """Whether nothing is proven against all axes together."""
+        return not_disproved(_verdict(self.nees, self.dof, self.fitted))
+
+    @property
+    def consistent(self) -> bool:
+        """Whether nothing is proven against it."""
+        parts = (
+            (self.position, self.dof - self.turns, self.fitted),
+            (self.rotation, self.turns, 0.0),
+        )
+        return self.whole and all(
+            nees is None or _verdict(nees, dof, fitted)["p"] >= 1 - _PART_CONFIDENCE
+            for nees, dof, fitted in parts
+        )
+
+
+def _verdict(nees: Float[np.ndarray, "runs steps"], dof: int, fitted: float) -> dict[str, Any]:
+    return run_verdict(nees, dof, fitted, ~np.isnan(nees))
 
 
 @dataclass(frozen=True)
@@ -35,15 +95,20 @@ class Identification:
     """Mean NEES under every convention that was tried."""
     consistent: tuple[Convention, ...]
     """Those that cannot be told from the best, if that is consistent; else none."""
+    stands: bool = False
+    """Whether the data are consistent with the stated one too, be another the better."""
+    whole: bool = False
+    """Whether all axes together are: position or rotation alone may not be."""
 
     @property
     def convention(self) -> Convention | None:
-        """The only one that makes the data consistent; None where that cannot be told."""
+        """The only one that makes the data consistent, or fits them better than all others; None
+        where that cannot be told."""
         return self.consistent[0] if len(self.consistent) == 1 else None
 
     @property
     def doubtful(self) -> bool:
-        """Whether the stated convention is not among those that make the data consistent."""
+        """Whether the stated convention is not among those that fit the data best."""
         return bool(self.consistent) and self.stated not in self.consistent
 
     @property
@@ -54,13 +119,13 @@ class Identification:
     @property
     def sentence(self) -> str:
         """What was found, in a line."""
+        if not self.consistent and self.whole:
+            return "of position or rotation alone σ is wrong under every convention that was tried"
         if not self.consistent:
             return "no other convention of the covariance would make the data consistent"
+        alike = _ALIKE if self.consistent[0].error in ("right", "split") else ""
         if self.suggested is not None:
-            return (
-                f"the convention ({self.stated}) is doubtful: only with {self.suggested} would "
-                f"the data be consistent, NEES {self.nees[self.suggested]:.2f}"
-            )
+            return self._other(self.suggested) + alike
         apart = [str(c) for c in self.consistent if c != self.stated]
         others = "; ".join(apart[:_TOLD])
         if len(apart) > _TOLD:
@@ -69,7 +134,18 @@ class Identification:
             return f"the convention ({self.stated}) is doubtful, but these cannot be told: {others}"
         if others:
             return f"the convention ({self.stated}) cannot be told from: {others}"
-        return f"the convention ({self.stated}) is the only one that makes the data consistent"
+        return f"of {len(self.nees)} conventions the stated one ({self.stated}) fits best{alike}"
+
+    def _other(self, other: Convention) -> str:
+        if self.stands and self.stated in self.nees:
+            return (
+                f"the convention ({self.stated}) is doubtful: {other} fits the same runs better, "
+                f"NEES {self.nees[other]:.2f} instead of {self.nees[self.stated]:.2f}"
+            )
+        return (
+            f"the convention ({self.stated}) is doubtful: only with {other} would "
+            f"the data be consistent, NEES {self.nees[other]:.2f}"
+        )
 
     def asdict(self) -> dict[str, Any]:
         """For `evaluation.json`."""
@@ -82,19 +158,61 @@ class Identification:
 
 
 def identify(
-    stated: Convention, nees: Mapping[Convention, Float[np.ndarray, "runs steps"]], dof: int
+    stated: Convention,
+    tried: Mapping[Convention, Tried],
+    given: Callable[[], Mapping[Convention, Tried]] = dict,
 ) -> Identification:
-    """The convention from the NEES that each of them gives, of the same runs; NaN where nothing was
-    logged."""
-    finite = {c: x for c, x in nees.items() if not np.isinf(x).any()}
-    means = {c: float(np.nanmean(x)) for c, x in finite.items()}
-    if not finite:
-        return Identification(stated, means, ())
-    best = min(finite, key=lambda c: means[c])
-    if not not_disproved(run_verdict(finite[best], dof, logged=~np.isnan(finite[best]))):
-        return Identification(stated, means, ())
-    equal = tuple(c for c in finite if not _worse(finite[c], finite[best]))
-    return Identification(stated, means, equal)
+    """The convention from the NEES that each of them gives, of the same runs.
+
+    `given` the scale are those that come into question where none of the others does.
+    """
+    finite = _finite(tried)
+    own = finite.get(stated)
+    stands, whole = own is not None and own.consistent, own is not None and own.whole
+    best, equal = _best(finite)
+    if best is not None and best.consistent:
+        return Identification(stated, _means(finite), equal, stands, whole)
+    free = _finite(given())
+    best_free, equal = _best(free)
+    means = _means(finite | free)
+    if best_free is None or not best_free.consistent:
+        return Identification(stated, means, (), stands, whole)
+    if best is not None and not _scale_was_free(best, best_free):
+        return Identification(stated, means, (), stands, whole)
+    return Identification(stated, means, equal, stands, whole)
+
+
+def _finite(tried: Mapping[Convention, Tried]) -> dict[Convention, Tried]:
+    """Those that are finite, of the steps that all have: one may know a first pose exactly."""
+    steps = min((x.nees.shape[1] for x in tried.values()), default=0)
+    return {c: last for c, x in tried.items() if (last := x.last(steps)).finite}
+
+
+def _means(tried: Mapping[Convention, Tried]) -> dict[Convention, float]:
+    return {c: float(np.nanmean(x.nees)) for c, x in tried.items()}
+
+
+def _best(tried: Mapping[Convention, Tried]) -> tuple[Tried | None, tuple[Convention, ...]]:
+    """The most likely one, and all that cannot be told from it."""
+    if not tried:
+        return None, ()
+    weight = {c: np.exp(x.log_determinant / x.dof) for c, x in tried.items()}
+    best = min(tried, key=lambda c: weight[c] * float(np.nanmean(tried[c].nees)))
+    equal = tuple(
+        c
+        for c, x in tried.items()
+        if not _worse(weight[c] / weight[best] * x.nees, tried[best].nees)
+    )
+    return tried[best], equal
+
+
+def _scale_was_free(marginal: Tried, given: Tried) -> bool:
+    """Whether a fitted scale takes more from the NEES of positions than it does of any right one,
+    however wrong σ is."""
+    n = given.dof - given.turns
+    if n < 2 or marginal.position is None or given.position is None:
+        return False
+    return _worse(marginal.position, n / (n - 1) * given.position)
 
 
 def _worse(nees: Float[np.ndarray, "runs steps"], least: Float[np.ndarray, "runs steps"]) -> bool:

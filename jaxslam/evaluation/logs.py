@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ def evaluate_log(
     truth: str | Path | None = None,
     stated: Mapping[str, str] | None = None,
     align: str = "none",
+    axes_used: str | Sequence[str] = (),
     nis: bool = False,
 ) -> Evaluation:
     """The verdict on what a file or a folder holds.
@@ -40,10 +41,12 @@ def evaluate_log(
     `source` is an npz file of arrays, a CSV file of `run, step, errors, upper triangle` lines, a
     trajectory in TUM format with its `covariance` and `truth`, or a folder: one run, or one a
     sub-folder, of `estimate.txt`, `covariance.txt` and `truth.txt`. What is `stated` of the
-    convention (`error`, `axes`, `order`, `scale`) comes before what the files say. With `nis`
-    errors are innovations. Raises ValueError, naming the file.
+    convention (`error`, `axes`, `order`, `scale`) comes before what the files say. How poses are
+    aligned, and which axes are used, see `evaluate_poses`. With `nis` errors are innovations.
+    Raises ValueError, naming the file.
     """
     source, stated = Path(source), dict(stated or {})
+    how = {"align": align, "axes_used": axes_used}
     if not source.exists():
         raise ValueError(f"{source}: no such file or folder")
     if source.suffix in (".npz", ".csv"):
@@ -51,15 +54,15 @@ def evaluate_log(
             if value is not None:
                 raise ValueError(f"{source}: a {name} file goes with a trajectory, not with arrays")
         arrays, runs, steps = (_npz(source), (), ()) if source.suffix == ".npz" else _csv(source)
-        found = named(source, lambda: _evaluate_arrays(arrays, stated, align, nis), runs, steps)
+        found = named(source, lambda: _evaluate_arrays(arrays, stated, how, nis), runs, steps)
         return replace(found, run_names=runs)
     if nis:
         raise ValueError(f"{source}: innovations come in an npz or CSV file, not in a trajectory")
-    return evaluate_runs(runs_of(source, covariance, truth), stated, align)
+    return evaluate_runs(runs_of(source, covariance, truth), stated, how)
 
 
 def _evaluate_arrays(
-    arrays: dict[str, Any], stated: dict[str, str], align: str, nis: bool
+    arrays: dict[str, Any], stated: dict[str, str], how: dict[str, Any], nis: bool
 ) -> Evaluation:
     """Of errors, innovations or poses, by the names of the arrays."""
     held = [name for name in ("errors", "innovations", "estimates") if name in arrays]
@@ -71,11 +74,11 @@ def _evaluate_arrays(
         said = {name: str(arrays[name]) for name in CHOICES if name in arrays}
         convention = stated_before(said, stated)
         truths = arrays["truths"]
-        return evaluate_poses(arrays["estimates"], P, truths, convention, align=align, times=times)
-    if stated or align != "none":
+        return evaluate_poses(arrays["estimates"], P, truths, convention, times=times, **how)
+    if stated or how["align"] != "none" or how["axes_used"]:
         raise ValueError(
-            "conventions and alignments are of poses, and here are errors, which are what they "
-            "are; estimates, covariances and truths are accepted"
+            "conventions, alignments, axes used are of poses, and here are errors, which are what "
+            "they are; estimates, covariances and truths are accepted"
         )
     quantity = "NIS" if nis or held == ["innovations"] else "NEES"
     names = [str(name) for name in np.ravel(arrays.get("names", ()))]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -9,76 +11,35 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from jaxslam.evaluation.alignment import (
-    ALIGNMENTS,
-    Similarity,
-    at_first_pose,
-    projected,
-    similarity,
-)
-from jaxslam.evaluation.arrays import (
-    all_nan,
-    at,
-    check_every_run,
-    check_finite,
-    exactly_known,
-    filled,
-    normalised,
-    numbers,
-    step_times,
-    without_known,
-)
-from jaxslam.evaluation.convention import (
-    Convention,
-    alternatives,
-    errors_beyond_scale,
-    geometry_of,
-    pose_errors,
-)
+from jaxslam.evaluation.alignment import ALIGNMENTS
+from jaxslam.evaluation.arrays import filled, normalised, step_times, without_known
+from jaxslam.evaluation.axes import estimated, named
+from jaxslam.evaluation.convention import Convention, alternatives, geometry_of, pose_errors
 from jaxslam.evaluation.evaluate import Evaluation
-from jaxslam.evaluation.identify import Identification, identify
-from jaxslam.files import LARGEST
+from jaxslam.evaluation.identify import Identification, Tried, identify
+from jaxslam.evaluation.laid import laid
+from jaxslam.evaluation.pose_arrays import Poses, checked_poses
+from jaxslam.evaluation.scale import Scale, at_one_scale, of_aligned
+from jaxslam.geometry import Geometry
 from jaxslam.lookup import chosen
-from jaxslam.tum import not_rigid
 
-_RIGID = 1e-4
-"""How far from orthonormal a rotation may be: what rounding to six digits leaves is less."""
-_SINGULAR = 1e-12
-"""Of a variance, what is left of it where all of it is scale's."""
-_ENOUGH = 100
-"""Runs, by which conventions are told from each other."""
-BY_FIRST = "aligned by the first pose, which the covariances take for known"
-TO_ALL = "aligned to all positions, and the joint covariance projected to that gauge"
-INDEPENDENT = (
-    "aligned to all positions; the covariances are projected to that gauge as if the errors of "
-    "different poses were independent, as there is no joint covariance"
-)
 BEYOND = (
-    "NEES is given the scale, at that of the truth which explains each pose best; positions are "
-    "in the estimate's unit"
+    "NEES is given the scale, at the one of each run that explains all of its poses best; "
+    "positions are in the estimate's unit"
 )
-
-
-class Poses(NamedTuple):
-    """Runs of estimated poses T_wc, their covariances, and the truth."""
-
-    estimates: Float[np.ndarray, "runs steps d d"]
-    covariances: Float[np.ndarray, "runs steps t t"]
-    truths: Float[np.ndarray, "runs steps d d"]
-    logged: Bool[np.ndarray, "runs steps"]
-    """Which steps of which run there are; the others are identities, of unit covariance."""
-    joint: Float[np.ndarray, "runs steps*t steps*t"] | None = None
-    """The covariance of all poses of a run, where it is known."""
 
 
 class _Compared(NamedTuple):
     """What is evaluated: all of the steps whose poses are not known by definition."""
 
-    errors: np.ndarray
-    sigmas: np.ndarray
-    nees: np.ndarray
-    dof: int
+    errors: Float[np.ndarray, "runs steps m"]
+    covariances: Float[np.ndarray, "runs steps m m"]
+    nees: Float[np.ndarray, "runs steps"]
     start: int
+    logged: Bool[np.ndarray, "runs steps"]
+    fitted: float
+    axis_fitted: Float[np.ndarray, " m"]
+    scale: Scale | None
     notes: tuple[str, ...]
 
 
@@ -89,6 +50,7 @@ def evaluate_poses(
     convention: Convention | None = None,
     *,
     align: str = "none",
+    axes_used: str | Sequence[str] = (),
     times: ArrayLike | None = None,
 ) -> Evaluation:
     """The verdict on a filter from its poses T_wc, m, and the true ones.
@@ -98,9 +60,11 @@ def evaluate_poses(
     whose truth is all NaN is not compared. `covariances` are of every pose, (runs, steps, 6, 6), or
     of all poses of a run together, (runs, 6 steps, 6 steps), of the errors that the `convention`
     names. Where the estimate is of another world, `align` it by `se3` or `sim3`: by the first pose,
-    if that is exactly known, else to all positions. The covariance is transported with it. Whether
-    another convention would make the data consistent is tried too. Raises ValueError, naming run
-    and step.
+    if that is exactly known, else to all positions. The covariance is transported with it. Given
+    the scale of the world, or with `sim3`, NEES is at one scale a run, and the drift of scale is
+    judged beside it. Of a robot that moves in a plane `axes_used` are those that it estimates, as
+    ("x", "y", "rz"); by default all whose errors are not zero throughout. Whether another
+    convention would make the data consistent is tried too. Raises ValueError, naming run and step.
     """
     stated = convention or Convention()
     if not isinstance(stated, Convention):
@@ -109,193 +73,134 @@ def evaluate_poses(
         )
     chosen("align", [align], dict.fromkeys(ALIGNMENTS))
     poses = checked_poses(estimates, covariances, truths)
-    found = _compared(poses, stated, align)
+    at = step_times(times, poses.estimates.shape[1])
+    found = as_stated(poses, stated, align, named(axes_used, poses.estimates, stated))
+    start = len(at) - found.steps
+    return replace(
+        found,
+        times=at[start:],
+        timed=times is not None,
+        identified=_identified(poses, stated, align, found.names),
+    )
+
+
+def as_stated(
+    poses: Poses, stated: Convention, align: str = "none", used: tuple[str, ...] = ()
+) -> Evaluation:
+    """The verdict in the convention that is stated, without a look at others."""
+    told: tuple[str, ...] = ()
+    if not used:
+        used, told = estimated(poses, stated, align)
+    found = _compared(poses, stated, align, used)
     return Evaluation(
         quantity="NEES",
-        dof=found.dof,
-        nees=found.nees,
-        errors=found.errors,
-        sigmas=found.sigmas,
-        times=step_times(times, poses.estimates.shape[1])[found.start :],
-        timed=times is not None,
-        names=stated.names(geometry_of(poses.estimates)),
+        dof=len(used),
+        nees=filled(found.nees, found.logged, np.nan),
+        errors=filled(found.errors, found.logged, np.nan),
+        sigmas=filled(_sigmas(found.covariances), found.logged, np.nan),
+        times=step_times(None, poses.estimates.shape[1])[found.start :],
+        timed=False,
+        names=used,
         convention=stated,
         alignment=align,
-        identified=_identified(poses, stated, align, found),
-        notes=found.notes,
+        notes=(*told, *found.notes),
+        fitted=found.fitted,
+        axis_fitted=tuple(float(x) for x in found.axis_fitted),
+        scale=found.scale,
     )
 
 
-def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLike) -> Poses:
-    """Arrays that belong together. Raises ValueError, naming run and step."""
-    matrices = "(runs, steps, 4, 4), or (runs, steps, 3, 3) in the plane"
-    T, truth = (
-        _matrices(what, numbers(what, x, 4, matrices), matrices)
-        for what, x in (("estimates", estimates), ("truths", truths))
+def _sigmas(covariances: Float[np.ndarray, "*batch m m"]) -> Float[np.ndarray, "*batch m"]:
+    return np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
+
+
+def _compared(poses: Poses, convention: Convention, align: str, used: tuple[str, ...]) -> _Compared:
+    """Errors and covariances along axes of these names, aligned, at one scale where it is free."""
+    names = convention.names(geometry_of(poses.estimates))
+    axes = np.array([i for i, name in enumerate(names) if name in used])
+    world = laid(poses, convention, align, axes)
+    errors = pose_errors(convention, world.poses.estimates, world.poses.truths)[..., axes]
+    P = world.poses.covariances[..., axes[:, None], axes]
+    start, logged, known = without_known(errors, P, world.poses.logged)
+    later = _later(world.poses, start, logged)
+    errors, P = errors[:, start:], later.covariances[..., axes[:, None], axes]
+    fitted, axis_fitted, scale, notes = 0.0, np.zeros(len(axes)), None, (*known, *world.notes)
+    if world.given:
+        normalised(errors, P)  # refuses what is not positive definite, by run and step
+        errors, P, fitted, axis_fitted, scale = at_one_scale(later, convention, axes)
+        notes += (BEYOND,)
+    elif align == "sim3":
+        scale = of_aligned(later, convention, axes, _log_scales(poses, world.poses))
+    nees = normalised(errors, P)
+    return _Compared(errors, P, nees, start, later.logged, fitted, axis_fitted, scale, notes)
+
+
+def _later(poses: Poses, start: int, logged: Bool[np.ndarray, "runs steps"]) -> Poses:
+    """From a step on, those that have a part in the verdict."""
+    t, there = poses.covariances.shape[-1], logged[:, start:]
+    P = filled(poses.covariances[:, start:], there, np.eye(t))
+    joint = None if poses.joint is None else poses.joint[:, start * t :, start * t :]
+    return Poses(poses.estimates[:, start:], P, poses.truths[:, start:], there, joint)
+
+
+def _log_scales(before: Poses, after: Poses) -> Float[np.ndarray, " runs"]:
+    """log of the estimate's unit relative to the truth's, of what a Sim(n) did to each run."""
+    spreads = (
+        [np.linalg.norm(p[own] - p[own].mean(0)) for p, own in zip(x, before.logged, strict=True)]
+        for x in (before.estimates[..., :-1, -1], after.estimates[..., :-1, -1])
     )
-    if T.shape != truth.shape:
-        raise ValueError(f"estimates are {T.shape}, so truths must be too, not {truth.shape}")
-    runs, steps, t = *T.shape[:2], geometry_of(T).tangent_dim
-    each, joint = (runs, steps, t, t), (runs, steps * t, steps * t)
-    P = numbers("covariances", covariances, 3 if np.ndim(covariances) == 3 else 4, str(each))
-    if P.shape not in (each, joint):
-        raise ValueError(
-            f"covariances of {runs} runs of {steps} poses must be {each}, or the joint ones "
-            f"{joint}, not {P.shape}"
-        )
-    joints = P if P.shape == joint else None
-    if joints is not None:
-        blocks = joints.reshape(runs, steps, t, steps, t)
-        P = np.moveaxis(blocks[:, range(steps), :, range(steps)], 0, 1)
-    logged = ~(all_nan(T[..., :-1, :]) & all_nan(P) | all_nan(truth[..., :-1, :]))
-    check_every_run(logged)
-    if joints is not None:
-        joints = _joint(joints, np.repeat(logged, t, axis=1))
-    for what, x in (("estimates", T), ("truths", truth), ("covariances", P)):
-        check_finite(what, x, logged)
-        if (largest := np.abs(x[logged]).max()) > LARGEST:
-            raise ValueError(f"{what} hold {largest:.2g}; up to {LARGEST:.0e} is accepted")
-    T, truth = (filled(x, logged, np.eye(x.shape[-1])) for x in (T, truth))
-    _check_rigid("estimates", T)
-    _check_rigid("truths", truth)
-    return Poses(T, filled(P, logged, np.eye(t)), truth, logged, joints)
+    old, new = (np.log(spread) for spread in spreads)
+    return old - new
 
 
-def _joint(
-    P: Float[np.ndarray, "runs k k"], logged: Bool[np.ndarray, "runs k"]
-) -> Float[np.ndarray, "runs k k"]:
-    """Zero where one of two numbers was not logged. Raises ValueError for any that cannot be."""
-    P = np.where(logged[:, :, None] & logged[:, None], P, 0.0)
-    if not (np.abs(P) <= LARGEST).all():
-        run = int(np.argwhere(~(np.abs(P) <= LARGEST))[0, 0])
-        raise ValueError(
-            f"covariances of run {run} hold numbers that are not finite, or beyond {LARGEST:.0e}"
-        )
-    return P
-
-
-def _matrices(what: str, T: np.ndarray, accepted: str) -> np.ndarray:
-    if T.shape[-2:] not in ((3, 3), (4, 4)):
-        raise ValueError(f"{what} must be matrices {accepted}, not {T.shape}")
-    return T
-
-
-def _check_rigid(what: str, T: np.ndarray) -> None:
-    wrong = not_rigid(T, _RIGID)
-    if wrong.any():
-        place = at(np.argwhere(wrong)[0])
-        raise ValueError(f"{what} of {place} is no rigid motion [R t; 0 1] with R a rotation")
-
-
-def _compared(poses: Poses, convention: Convention, align: str) -> _Compared:
-    laid, given, notes = _laid(poses, convention, align)
-    errors = pose_errors(convention, laid.estimates, laid.truths)
-    start, logged, known = without_known(errors, laid.covariances, laid.logged)
-    later = Poses(*(x[:, start:] for x in laid[:3]), logged[:, start:])
-    t = errors.shape[-1]
-    later = later._replace(covariances=filled(later.covariances, later.logged, np.eye(t)))
-    errors, P = errors[:, start:], later.covariances
-    nees, dof = normalised(errors, P), t
-    sigmas = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
-    if given:
-        errors, sigmas, nees = _beyond_scale(later, convention)
-        dof, notes = t - 1, (*notes, BEYOND)
-    there = (filled(x, later.logged, np.nan) for x in (errors, sigmas, nees))
-    return _Compared(*there, dof, start, (*known, *notes))
-
-
-def _beyond_scale(
-    poses: Poses, convention: Convention
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Errors, σ and NEES at the scale of the truth that explains each pose best.
-
-    The covariance of what is left is P without its part along scale, `P − g gᵀ/(gᵀ P⁻¹ g)`.
-    """
-    best = errors_beyond_scale(convention, poses.estimates, poses.truths, poses.covariances)
-    n, scale = poses.truths.shape[-1] - 1, np.exp(np.asarray(best.log_scale))
-
-    def error(s):
-        truths = poses.truths.copy()
-        truths[..., :n, n] *= s[..., None]
-        return pose_errors(convention, poses.estimates, truths)
-
-    errors, sigma = error(scale), np.asarray(best.sigma)
-    slope = error(2 * scale) - errors  # times s: the error is affine in s
-    lost = np.where(np.isfinite(sigma), sigma, 0.0)[..., None] * slope
-    variance = np.diagonal(poses.covariances, axis1=-2, axis2=-1)
-    left = np.maximum(variance - lost**2, _SINGULAR * variance)
-    return errors, np.sqrt(left), np.asarray(best.nees)
-
-
-def _laid(poses: Poses, convention: Convention, align: str) -> tuple[Poses, bool, tuple[str, ...]]:
-    """The estimates laid on the truth, whether what is left is given the scale, and a word."""
-    given = convention.scale == "given"
-    if align == "none":
-        return poses, given, ()
-    first = poses.covariances[range(len(poses.logged)), np.argmax(poses.logged, axis=1)]
-    if exactly_known(first).all():
-        return _each_run(poses, convention, _by_first), given or align == "sim3", (BY_FIRST,)
-    if given and align == "se3":
-        raise ValueError(
-            "covariances given the scale are aligned by sim3, or by se3 where the first is zero"
-        )
-
-    def to_all(run: Poses, convention: Convention) -> Poses:
-        return _to_all(run, convention, scaled=align == "sim3")
-
-    notes = (TO_ALL if poses.joint is not None else INDEPENDENT,)
-    return _each_run(poses, convention, to_all), False, notes
-
-
-def _each_run(poses: Poses, convention: Convention, lay) -> Poses:
-    """Every run by itself, of the poses that were logged."""
-    laid = [x.copy() for x in poses[:3]]
-    for run, logged in enumerate(poses.logged):
-        joint = None
-        if poses.joint is not None:
-            rows = np.flatnonzero(np.repeat(logged, poses.covariances.shape[-1]))
-            joint = poses.joint[run][np.ix_(rows, rows)]
-        there = Poses(*(x[run, logged] for x in poses[:4]), joint)
-        for x, moved in zip(laid, lay(there, convention)[:3], strict=True):
-            x[run, logged] = moved
-    return Poses(*laid, poses.logged)
-
-
-def _by_first(run: Poses, convention: Convention) -> Poses:
-    """The first pose on its truth, and that position the origin, about which scales are."""
-    moved = _moved(run, convention, at_first_pose(run.estimates[0], run.truths[0]))
-    n = run.truths.shape[-1] - 1
-    away = Similarity(np.eye(n), -run.truths[0, :n, n], 1.0)
-    return _moved(moved, convention, away)._replace(truths=away.moved(run.truths))
-
-
-def _to_all(run: Poses, convention: Convention, *, scaled: bool) -> Poses:
-    n = run.truths.shape[-1] - 1
-    fit = similarity(run.estimates[:, :n, n], run.truths[:, :n, n], scaled=scaled)
-    P = run.covariances if run.joint is None else run.joint
-    run = run._replace(covariances=projected(run.estimates, P, convention, scaled=scaled))
-    return _moved(run, convention, fit)
-
-
-def _moved(run: Poses, convention: Convention, motion: Similarity) -> Poses:
-    """Estimates and covariances in another world."""
-    P = motion.moved_covariances(run.covariances, run.estimates, convention)
-    return run._replace(estimates=motion.moved(run.estimates), covariances=P)
-
-
-def _identified(poses: Poses, stated: Convention, align: str, found: _Compared) -> Identification:
-    """Among the conventions of the same scale; where none of them does, given the scale."""
-    few = Poses(*(x[:_ENOUGH] for x in poses[:4]))
-    if poses.joint is not None:
-        few = few._replace(joint=poses.joint[:_ENOUGH])
+def _identified(
+    poses: Poses, stated: Convention, align: str, used: tuple[str, ...]
+) -> Identification:
+    """Among the conventions of the same scale; given the scale, where none of them does."""
     geometry = geometry_of(poses.estimates)
-    nees = {
-        c: found.nees[:_ENOUGH] if c == stated else _compared(few, c, align).nees
-        for c in alternatives(stated, geometry)
-    }
-    same = identify(stated, nees, found.dof)
-    if same.consistent or found.dof < found.errors.shape[-1] or align != "none":
-        return same
-    others = alternatives(replace(stated, scale="given"), geometry)
-    given = identify(stated, {c: _compared(few, c, align).nees for c in others}, found.dof - 1)
-    return replace(given, nees=same.nees | given.nees)
+
+    def tried(conventions: Iterable[Convention]) -> dict[Convention, Tried]:
+        result = {}
+        for convention in conventions:
+            with suppress(ValueError):  # a wrong one may make no covariance of its numbers
+                found = _compared(poses, convention, align, used)
+                result[convention] = _tried(convention, geometry, found, used)
+        return result
+
+    same = _alternatives(stated, geometry, used)
+    if stated.scale == "given" or align != "none":
+        return identify(stated, tried(same))
+    given = [replace(convention, scale="given") for convention in same]
+    return identify(stated, tried(same), lambda: tried(given))
+
+
+def _alternatives(
+    stated: Convention, geometry: Geometry, used: tuple[str, ...]
+) -> list[Convention]:
+    """Those that differ: of one axis of rotation mixed is world, as in the plane."""
+    flat = sum(name.startswith("r") for name in used) < 2
+    other = "world" if stated.axes == "mixed" else "mixed"
+    return [c for c in alternatives(stated, geometry) if not flat or c.axes != other]
+
+
+def _tried(
+    convention: Convention, geometry: Geometry, found: _Compared, used: tuple[str, ...]
+) -> Tried:
+    """NEES of a convention: of all, of the position and of the rotation alone."""
+    names = [name for name in convention.names(geometry) if name in used]
+    turns = np.array([name.startswith("r") for name in names])
+
+    def of(block: np.ndarray) -> np.ndarray:
+        e, P = found.errors[..., block], found.covariances[..., block, :][..., block]
+        return filled(normalised(e, P), found.logged, np.nan)
+
+    determinant = np.linalg.slogdet(found.covariances[found.logged])[1].mean()
+    return Tried(
+        filled(found.nees, found.logged, np.nan),
+        len(names),
+        found.fitted,
+        float(determinant),
+        of(~turns) if (~turns).any() else None,
+        of(turns) if turns.any() else None,
+        int(turns.sum()),
+    )

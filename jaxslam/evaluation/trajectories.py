@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -112,8 +112,9 @@ def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
     return there[0] if there else None
 
 
-def evaluate_runs(runs: tuple[Run, ...], stated: dict[str, str], align: str) -> Evaluation:
-    """The verdict on them, in the convention that is stated, or else said in the files."""
+def evaluate_runs(runs: tuple[Run, ...], stated: dict[str, str], how: dict[str, Any]) -> Evaluation:
+    """The verdict on them, in the convention that is stated, or else said in the files; `how` they
+    are evaluated are options of `evaluate_poses`."""
     read = [_read(run) for run in runs]
     for one in read:
         if one.said != read[0].said:
@@ -131,8 +132,8 @@ def evaluate_runs(runs: tuple[Run, ...], stated: dict[str, str], align: str) -> 
             _filled_up([one.covariances.values for one in read]),
             _filled_up([one.truths.values for one in read]),
             convention,
-            align=align,
             times=longest.times,
+            **how,
         ),
         names,
     )

@@ -27,6 +27,8 @@ from jaxslam.plots.style import (
 )
 
 _PER_ROW = 3
+_MOST_LOG = 50.0
+"""Of a scale that is drawn."""
 _WIDEST = 12
 """Axes that are drawn; of more the first."""
 
@@ -59,15 +61,21 @@ def _column(evaluation: Evaluation) -> Figure:
 
 def _page(evaluation: Evaluation) -> Figure:
     axes = min(len(evaluation.names), _WIDEST)
-    rows = -(-axes // _PER_ROW)
+    panels = axes + (evaluation.scale is not None)
+    rows = -(-panels // _PER_ROW)
     figure = new_figure(11.5, 3.9 + 1.9 * rows)
-    figure.suptitle(evaluation.headline, x=0.01, ha="left", fontsize=12, weight="bold")
+    figure.suptitle(
+        evaluation.headline.replace("; ", "\n"), x=0.01, ha="left", fontsize=12, weight="bold"
+    )
     grid = figure.add_gridspec(1 + rows, _PER_ROW, height_ratios=[1.6, *[1] * rows])
     plot_nees(evaluation, ax=figure.add_subplot(grid[0, :2]))
     plot_outside(evaluation, ax=figure.add_subplot(grid[0, 2]))
     for axis in range(axes):
         place = grid[1 + axis // _PER_ROW, axis % _PER_ROW]
         plot_axis(evaluation, axis, ax=figure.add_subplot(place))
+    if evaluation.scale is not None:
+        place = grid[1 + axes // _PER_ROW, axes % _PER_ROW]
+        plot_scale(evaluation, ax=figure.add_subplot(place))
     return figure
 
 
@@ -143,6 +151,28 @@ def plot_axis(
     if evaluation.convention is not None:
         ax.set_ylabel("rad" if evaluation.names[axis].startswith("r") else "m, or map units")
     set_title(ax, f"{evaluation.names[axis]}: RMSE (solid), σ claimed (dashed)")
+    return _over_time(evaluation, ax)
+
+
+def plot_scale(evaluation: Evaluation, *, ax: Axes) -> Axes:
+    """Scale of every step relative to its run's: median and 95 % of the runs, beside ±2σ claimed.
+
+    Raises ValueError where the evaluation has none.
+    """
+    if evaluation.scale is None:
+        raise ValueError("no scale: the poses are neither given it nor aligned by Sim(3)")
+    (low, high), median, sigma = evaluation.scale.over_runs
+    percent = 100 * np.expm1(np.clip([low, median, high], -_MOST_LOG, _MOST_LOG))
+    ax.fill_between(evaluation.times, percent[0], percent[2], color=COLOURS[0], alpha=0.25, lw=0)
+    marker = "o" if evaluation.steps == 1 else None
+    ax.plot(evaluation.times, percent[1], lw=1.8, color=COLOURS[0], marker=marker)
+    for sign in (-2, 2):
+        claimed = 100 * np.expm1(np.clip(sign * sigma, -_MOST_LOG, _MOST_LOG))
+        ax.plot(evaluation.times, claimed, lw=1.4, ls="--", color=COLOURS[1])
+    largest = np.nanquantile(np.abs(percent), 0.9) if np.isfinite(percent).any() else 1.0
+    ax.set_ylim(-1.6 * largest - 1e-9, 1.6 * largest + 1e-9)
+    ax.set_ylabel("% off its run's")
+    set_title(ax, "scale: median, 95 % of runs; ±2σ claimed (dashed)")
     return _over_time(evaluation, ax)
 
 

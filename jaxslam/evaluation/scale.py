@@ -1,0 +1,253 @@
+"""Poses at the one scale of their run, and how far their scales drift from it.
+
+Where nothing tells the scale, the true positions of another, `s p`, explain an estimate as well,
+but one s for a whole run. An error is affine in s, `e(s) = e + g (s − 1)` with g = de/ds, so that
+`ŝ = 1 − gᵀ Σ⁻¹ e/(gᵀ Σ⁻¹ g)` of all poses of a run, Σ their joint covariance, or where there is
+none block by block (`consistency.beyond_scale.one_scale`). Of one pose alone it is ŝ_k, and
+log ŝ_k − log ŝ is its drift.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxslam.consistency.beyond_scale import one_scale
+from jaxslam.consistency.verdict import run_verdict
+from jaxslam.evaluation.convention import Convention, errors_beyond_scale, pose_errors
+from jaxslam.evaluation.laid import about
+from jaxslam.evaluation.pose_arrays import Poses
+from jaxslam.files import json_numbers
+
+DRIFT_CONFIDENCE = 0.999
+"""Of the verdict on drift: with that on NEES, which is one-sided where a fit took a degree of
+freedom, a right filter is called inconsistent once in a hundred studies all the same."""
+QUANTILES = (0.025, 0.5, 0.975)
+"""Of the runs' drifts, per step."""
+_LEFT = 1e-9
+"""Of a covariance, what is left of it where one pose alone tells the scale."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """The scale of every run, and how it drifts along it."""
+
+    log_scale: Float[np.ndarray, " runs"]
+    """Of the estimate relative to the truth; NaN where no pose tells it."""
+    drift: Float[np.ndarray, "runs steps"]
+    """log of a pose's own scale relative to its run's; NaN where it tells none."""
+    sigma: Float[np.ndarray, "runs steps"]
+    """What the filter claims of ŝ_k in log, or of the drift where all covariances are known."""
+    nees: Float[np.ndarray, "runs steps"]
+    """Of the drift; NaN where a pose tells no scale."""
+    fitted: float
+    """Degrees of freedom, at most, that the fit of the run's scale took from every drift."""
+
+    @property
+    def told(self) -> Bool[np.ndarray, "runs steps"]:
+        """Where there is a drift."""
+        return ~np.isnan(self.nees)
+
+    @cached_property
+    def verdict(self) -> dict[str, Any] | None:
+        """On the drift alone, of one degree of freedom; None where no run tells it."""
+        runs = self.told.any(axis=1)
+        if not runs.any():
+            return None
+        return run_verdict(self.nees[runs], 1, self.fitted, self.told[runs])
+
+    @property
+    def factor(self) -> float:
+        """Drift in its claimed σ, root of the mean square."""
+        found = self.verdict
+        return np.nan if found is None or found["nees"] is None else float(np.sqrt(found["nees"]))
+
+    @property
+    def rms(self) -> float:
+        """Drift along a run, root of the mean square weighted by what each pose tells of it."""
+        told = self.told & (self.sigma > 0)
+        if not told.any():
+            return np.nan
+        weight = self.sigma[told] ** -2
+        return float(np.sqrt(np.sum(weight * self.drift[told] ** 2) / np.sum(weight)))
+
+    @property
+    def disproved(self) -> bool:
+        """Whether the scale drifts more than σ allows, beyond doubt."""
+        found = self.verdict
+        return bool(
+            found is not None
+            and (found["nees"] is None or found["nees"] > 1)
+            and found["p"] < 1 - DRIFT_CONFIDENCE
+        )
+
+    @property
+    def sentence(self) -> str:
+        """`the scale drifts by 12 % (RMS) along a run, 5 times what σ allows: over-confident`."""
+        if self.verdict is None:
+            return "no pose tells a scale"
+        size = f"{100 * np.expm1(min(self.rms, 700.0)):.2g}"
+        told = f"the scale drifts by {size} % (RMS) along a run, {self.factor:.2g} times "
+        if self.disproved:
+            return told + "what σ allows: over-confident"
+        return told + "its σ: not more than σ allows"
+
+    @property
+    def over_runs(self) -> tuple[Float[np.ndarray, "2 steps"], np.ndarray, np.ndarray]:
+        """Drift of every step: between these two 95 % of the runs, their median, and its σ."""
+        there = np.asarray(self.told.any(axis=0))
+        low, median, high = (np.full(len(there), np.nan) for _ in QUANTILES)
+        sigma = np.full(len(there), np.nan)
+        if there.any():
+            drift = np.where(self.told, self.drift, np.nan)[:, there]
+            low[there], median[there], high[there] = np.nanquantile(drift, QUANTILES, axis=0)
+            sigma[there] = np.nanmedian(np.where(self.told, self.sigma, np.nan)[:, there], axis=0)
+        return np.stack([low, high]), median, sigma
+
+    def asdict(self) -> dict[str, Any]:
+        """For `evaluation.json`."""
+        (low, high), median, sigma = self.over_runs
+        return {
+            "log_scale": json_numbers(self.log_scale),
+            "drift": json_numbers(median),
+            "drift95": [json_numbers(low), json_numbers(high)],
+            "sigma": json_numbers(sigma),
+            "drift_rms": json_numbers(np.array([self.rms]))[0],
+            "drift_in_sigma": json_numbers(np.array([self.factor]))[0],
+            "fitted": self.fitted,
+            "verdict": self.verdict,
+            "disproved": self.disproved,
+        }
+
+
+class AtScale(NamedTuple):
+    """Runs at one scale each."""
+
+    errors: Float[np.ndarray, "runs steps m"]
+    covariances: Float[np.ndarray, "runs steps m m"]
+    """Of these errors: without the part that a fit to a joint covariance takes."""
+    fitted: float
+    """Degrees of freedom, at most, that the fit took from the NEES of a pose."""
+    axis_fitted: Float[np.ndarray, " m"]
+    """The same of every axis alone."""
+    scale: Scale
+
+
+def at_one_scale(poses: Poses, convention: Convention, axes: Int[np.ndarray, " m"]) -> AtScale:
+    """Errors along some axes at the scale of the truth that explains all poses of a run best."""
+    if poses.joint is not None:
+        return _jointly(poses, poses.joint, convention, axes)
+    P = poses.covariances[..., axes[:, None], axes]
+    own_nees, own_scale, sigma = _own_scales(convention, poses, P, axes)
+    found = one_scale(own_nees, own_scale, sigma, poses.logged)
+    s = np.exp(np.where(np.isfinite(found.log_scale), found.log_scale, 0.0))
+    errors, slope = _affine(poses, convention, axes)
+    known = np.where(np.isfinite(sigma), np.exp(own_scale) * sigma, 0.0)
+    share = (known[..., None] * slope) ** 2 / np.diagonal(P, axis1=-2, axis2=-1)
+    return AtScale(
+        errors + slope * (s - 1)[:, None, None],
+        P,
+        1.0,
+        np.clip(share[poses.logged].mean(axis=0), 0.0, 1.0),
+        Scale(found.log_scale, found.drift, sigma, found.normalised, 1.0),
+    )
+
+
+def _own_scales(
+    convention: Convention, poses: Poses, P: np.ndarray, axes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """NEES, log ŝ_k and its σ of every pose alone."""
+    found = errors_beyond_scale(convention, poses.estimates, poses.truths, P, axes)
+    return np.asarray(found.nees), np.asarray(found.log_scale), np.asarray(found.sigma)
+
+
+def _affine(
+    poses: Poses, convention: Convention, axes: Int[np.ndarray, " m"]
+) -> tuple[Float[np.ndarray, "runs steps m"], Float[np.ndarray, "runs steps m"]]:
+    """e and g = de/ds of the truth times s."""
+
+    def error(s: float) -> np.ndarray:
+        truths = poses.truths.copy()
+        truths[..., :-1, -1] *= s
+        return pose_errors(convention, poses.estimates, truths)[..., axes]
+
+    once = error(1.0)
+    return once, error(2.0) - once
+
+
+def _jointly(
+    poses: Poses,
+    joints: Float[np.ndarray, "runs k k"],
+    convention: Convention,
+    axes: Int[np.ndarray, " m"],
+) -> AtScale:
+    """By least squares with the joint covariance: exact, each NEES has all its degrees of freedom.
+
+    What is left of a run at its ŝ has the covariance `Σ − G Gᵀ/(Gᵀ Σ⁻¹ G)`.
+    """
+    e, G = _affine(poses, convention, axes)
+    t, m = poses.covariances.shape[-1], len(axes)
+    left = poses.covariances[..., axes[:, None], axes].copy()
+    own, (drift, sigma, nees) = left.copy(), (np.full(e.shape[:2], np.nan) for _ in range(3))
+    log_scale = np.full(len(e), np.nan)
+    for run, logged in enumerate(poses.logged):
+        rows = (np.flatnonzero(logged)[:, None] * t + axes).ravel()
+        joint = joints[run][np.ix_(rows, rows)]
+        s, information = _fitted(joint, e[run, logged].ravel(), G[run, logged].ravel(), run)
+        if information <= 0 or s <= 0:
+            continue
+        log_scale[run] = np.log(s)
+        e[run] += G[run] * (s - 1)
+        left[run] -= (G[run, :, :, None] * G[run, :, None]) / information
+    left += _LEFT * own
+    told = poses.logged & np.isfinite(log_scale)[:, None] & (np.abs(G).max(axis=-1) > 0)
+    h = np.linalg.solve(own[told], G[told][..., None])[..., 0]
+    h /= np.sum(h * G[told], axis=-1)[:, None]
+    away = np.sum(h * e[told], axis=-1)
+    variance = np.einsum("ki,kij,kj->k", h, left[told], h)
+    s = np.exp(np.broadcast_to(log_scale[:, None], told.shape)[told])
+    drift[told], sigma[told], nees[told] = -away / s, np.sqrt(variance) / s, away**2 / variance
+    return AtScale(e, left, 0.0, np.zeros(m), Scale(log_scale, drift, sigma, nees, 0.0))
+
+
+def _fitted(
+    joint: Float[np.ndarray, "k k"],
+    e: Float[np.ndarray, " k"],
+    G: Float[np.ndarray, " k"],
+    run: int,
+) -> tuple[float, float]:
+    """ŝ of a run, and what all its poses tell of it, Gᵀ Σ⁻¹ G. Raises ValueError."""
+    scaling = 1 / np.sqrt(np.maximum(np.diagonal(joint), np.finfo(float).tiny))
+    try:
+        L = np.linalg.cholesky(joint * scaling * scaling[:, None])
+    except np.linalg.LinAlgError:
+        raise ValueError(
+            f"the joint covariance of run {run} is not positive definite; NEES at one scale needs "
+            "one, or the covariances of the poses alone"
+        ) from None
+    residual, slope = np.linalg.solve(L, np.stack([e, G], axis=1) * scaling[:, None]).T
+    information = float(slope @ slope)
+    return (1 - float(slope @ residual) / information if information else 1.0), information
+
+
+def of_aligned(
+    poses: Poses,
+    convention: Convention,
+    axes: Int[np.ndarray, " m"],
+    log_scale: Float[np.ndarray, " runs"],
+) -> Scale:
+    """The drift of poses that a Sim(n) laid on the truth already, about the middle of each run."""
+    T, P, truth = (x.copy() for x in poses[:3])
+    for run, logged in enumerate(poses.logged):
+        one = Poses(T[run], P[run], truth[run], logged)
+        moved = about(one, convention, truth[run, logged, :-1, -1].mean(axis=0))
+        T[run], P[run], truth[run] = moved[:3]
+    moved = Poses(T, P, truth, poses.logged)
+    _, own_scale, sigma = _own_scales(convention, moved, P[..., axes[:, None], axes], axes)
+    told = poses.logged & np.isfinite(sigma)
+    drift, sigma = np.where(told, own_scale, np.nan), np.where(told, sigma, 1.0)
+    return Scale(log_scale, drift, sigma, (drift / sigma) ** 2, 0.0)
