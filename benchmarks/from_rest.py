@@ -4,9 +4,9 @@
     python benchmarks/from_rest.py --figure
 
 The camera sets out with a velocity that nobody told the filter. Results are added to
-`from_rest.json`; what it already has, of as many runs, is not measured again. The table in
-`docs/from-rest.md` is written from it, by `--page` alone from what is there. `--figure` draws one
-run beside it, whose modes live long.
+`from_rest.json`; what it already has, of as many runs, is not measured again. The tables of
+`docs/from-rest.md` and the sentences on them are written from it, by `--page` alone from what is
+there. `--figure` draws one run beside it, whose modes live long.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import tyro
 from pages import write_table
 
 import jaxslam
 from jaxslam.consistency.modes import modes_of_run
 from jaxslam.consistency.montecarlo import draw, filter_run
+from jaxslam.consistency.verdict import headline
 from jaxslam.files import write_json
 from jaxslam.plots.modes import plot_modes, worlds_of
 from jaxslam.simulation import sensor_of
@@ -36,8 +38,15 @@ TOLD = {"seed": 0, "run": 35, "steps": 40}
 SUM, EKF = "scale_gauge+mixture5+rest", "robocentric"
 """Its filters."""
 BEGIN = "<!-- from_rest.py -->"
-"""Behind this the page is written."""
-KEYS = ("dof", "band95", "nees", "nees_not_lost", "lost", "lost_ever", "rmse", "sigma")
+"""Behind this the tables are written …"""
+SAID = "<!-- from_rest.py, in words -->"
+"""… and behind this what they say."""
+KEYS = (
+    "dof", "band95", "nees", "nees_not_lost", "lost", "lost_ever", "rmse", "sigma", "reversed",
+    "verdict", "beyond_scale", "scale_drift",
+)  # fmt: skip
+SETTLED = 10
+"""The frame from which on the sentences speak."""
 
 
 @dataclass(frozen=True)
@@ -72,14 +81,10 @@ def measure(options: Options, scenario: str, name: str) -> dict[str, Any]:
         world, filters, runs=options.runs, seed=options.seed, chunk=options.chunk
     )
     ((_, found),) = jaxslam.summarise(study)["filters"].items()
-    beyond = found["beyond_scale"]
     return {
         "runs": options.runs,
         "seed": options.seed,
         **{key: found[key] for key in KEYS},
-        "beyond_scale": beyond["nees"],
-        "beyond_scale_dof": beyond["dof"],
-        "reversed": found["reversed"],
         "milliseconds_per_run": 1e3 * found["seconds"]["run"] / options.runs,
         "compile": found["seconds"]["compile"],
     }
@@ -92,7 +97,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
         dof = next(iter(filters.values()))["dof"]
         parts.append(
             f"`{scenario}`; ideal {dof}, the band of 95 % of means. "
-            "*Lost; mean NEES of the others* at frames:"
+            "*Lost; mean NEES of all, of the others* at frames:"
         )
         header = ["filter", "runs, band", *map(str, STEPS), "ever lost"]
         header += ["RMSE and σ at the end, m", "s a run"]
@@ -101,10 +106,45 @@ def table(results: dict[str, dict[str, Any]]) -> str:
     return "\n\n".join(parts)
 
 
+def sentences(results: dict[str, dict[str, Any]]) -> str:
+    """What the numbers of every filter that finds out its start say, in words: a list."""
+    return "\n".join(
+        f"- `{scenario}`, `{name}`: {_said(found)}"
+        for scenario, filters in results.items()
+        for name, found in filters.items()
+        if "+rest" in name
+    )
+
+
+def _said(found: dict[str, Any]) -> str:
+    runs, (low, high) = found["runs"], found["band95"]
+    counts = {key: [round(runs * (x or 0)) for x in found[key]] for key in ("lost", "reversed")}
+    frames = range(SETTLED, len(found["nees"]) + 1)
+    lost, reversed_ = (max(counts[key][k - 1] for k in frames) for key in ("lost", "reversed"))
+    above = sum(not (found["nees"][k - 1] or np.inf) <= high for k in frames)
+    below = sum((found["nees"][k - 1] or np.inf) < low for k in frames)
+    return (
+        f"of {runs} runs at most {lost} are lost and at most {reversed_} reversed at any of frames "
+        f"{SETTLED} to {frames[-1]}; the mean NEES of all runs (ideal {found['dof']}) is above its "
+        f"band at {above} of these {len(frames)} frames and below it at {below}. {_words(found)}"
+    )
+
+
+def _words(found: dict[str, Any]) -> str:
+    """The verdicts, where they were recorded."""
+    if "verdict" not in found:
+        return "The verdict was not recorded."
+    said = f"Over all frames: {headline(found['verdict'])}."
+    drift = found["scale_drift"]["verdict"]
+    said += f" At one scale a run: {headline(found['beyond_scale']['verdict'])}"
+    return said + (f"; on the drift of scale: {drift['word']}." if drift else ".")
+
+
 def _row(name: str, found: dict[str, Any]) -> list[str]:
     def at(step: int) -> str:
-        kept = found["nees_not_lost"][step - 1]
-        return f"{found['lost'][step - 1]:.1%}; {'–' if kept is None else format(kept, '.1f')}"
+        kept, all_ = (found[key][step - 1] for key in ("nees_not_lost", "nees"))
+        numbers = ("–" if x is None else _digits(x) for x in (all_, kept))
+        return f"{found['lost'][step - 1]:.1%}; {', '.join(numbers)}"
 
     rmse, sigma = (found[key]["position"][-1] for key in ("rmse", "sigma"))
     low, high = found["band95"]
@@ -116,6 +156,10 @@ def _row(name: str, found: dict[str, Any]) -> list[str]:
         f"{rmse:.3f}, {sigma:.3f}",
         f"{found['milliseconds_per_run'] / 1e3:.2g}",
     ]
+
+
+def _digits(value: float) -> str:
+    return f"{value:.1f}" if value < 100 else f"{value:.2g}"
 
 
 def draw_figure(options: Options) -> None:
@@ -144,6 +188,7 @@ def main(options: Options) -> None:
             results[scenario][name] = measure(options, scenario, name)
             write_json(options.out, results)
     write_table(options.docs, BEGIN, table(results))
+    write_table(options.docs, SAID, sentences(results))
 
 
 if __name__ == "__main__":

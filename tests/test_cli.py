@@ -38,7 +38,7 @@ def test_consistency_writes_what_others_read(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert printed.startswith("robocentric/inverse_scaling:\n    NEES ")
     assert "robocentric/inverse_depth" in printed
-    assert "given the scale" in printed
+    assert "at one scale a run" in printed
     left = {path.name for path in tmp_path.iterdir()}
     assert left == {"consistency.json", "consistency.png", "runs"}
 

@@ -22,6 +22,7 @@ from jaxslam.consistency import (
     sentences,
     tally,
 )
+from jaxslam.consistency.beyond_scale import one_scale_of
 from jaxslam.consistency.montecarlo import check_sizes, draw, filter_run
 from jaxslam.consistency.statistics import chi2_cdf, chi2_quantile, normalised_squared
 from jaxslam.consistency.sums import added
@@ -328,15 +329,22 @@ def test_the_summary_is_that_of_the_runs():
 def test_the_summary_beyond_scale_is_that_of_the_runs():
     study = jaxslam.monte_carlo(SCENARIO, filters(), runs=20, chunk=CHUNK)
     study = with_records(study, 7, 3, beyond_scale=50.0, log_scale=-2.0, reversed=1.0)
+    study = with_records(study, 4, 5, unit_fixed=0.0)
     result, runs = jaxslam.summarise(study)["filters"]["inverse_scaling"], all_runs(study)
-    beyond, scale = result["beyond_scale"], result["log_scale"]
-    assert beyond["dof"] == 2
-    assert beyond["band95"] == list(jaxslam.mean_band(2, 20))
-    np.testing.assert_allclose(beyond["nees"], runs["beyond_scale"].mean(axis=0))
-    np.testing.assert_allclose(beyond["nees_median"], np.median(runs["beyond_scale"], axis=0))
-    assert beyond["lost"] == [0, 0, 0, 0.05, 0, 0]  # 50 is beyond what χ² with 2 dof reaches
-    expected = run_verdict(runs["beyond_scale"], 2)
+    beyond, scale, drift = (result[k] for k in ("beyond_scale", "log_scale", "scale_drift"))
+    one = one_scale_of(runs)
+    assert beyond["dof"] == 3
+    assert beyond["band95"] == [jaxslam.mean_band(2, 20)[0], jaxslam.mean_band(3, 20)[1]]
+    np.testing.assert_allclose(beyond["nees"], one.nees.mean(axis=0))
+    np.testing.assert_allclose(beyond["nees_median"], np.median(one.nees, axis=0))
+    assert beyond["lost"] == [0, 0, 0, 0.05, 0, 0]  # 50 is beyond what χ² with 3 dof reaches
+    expected = run_verdict(one.nees, 3, fitted=1.0)
     assert beyond["verdict"]["nees"] == pytest.approx(expected["nees"])
+    assert drift["runs"] == [20] * 5 + [19]
+    np.testing.assert_allclose(drift["normalised_rms"], np.sqrt(np.nanmean(one.normalised, axis=0)))
+    np.testing.assert_allclose(drift["rms"], np.sqrt(np.nanmean(one.drift**2, axis=0)))
+    expected = run_verdict(one.normalised, 1, fitted=1.0, logged=np.isfinite(one.normalised))
+    assert drift["verdict"]["nees"] == pytest.approx(expected["nees"])
     error, sigma = runs["log_scale"], runs["log_scale_sigma"]
     for key, values in (("error", error), ("sigma", sigma), ("normalised", error / sigma)):
         key = "sigma" if key == "sigma" else f"{key}_rms"
@@ -364,7 +372,7 @@ def test_scale_is_reported_where_nothing_is_told_in_metres():
     titles = [axes.get_title() for axes in plot_consistency(study, summary).axes]
     fewer = [axes.get_title() for axes in plot_consistency(study, measured).axes]
     more = {title.split(":")[0].split(";")[0] for title in set(titles) - set(fewer)}
-    assert more == {"NEES given the scale", "scale"}
+    assert more == {"NEES at one scale a run", "scale"}
     result = summary["filters"]["inverse_scaling"]
     log_scale = next(
         axes
@@ -378,12 +386,12 @@ def test_scale_is_reported_where_nothing_is_told_in_metres():
     )
     row = next(
         line
-        for line in jaxslam.table(summary).split("given the scale")[1].splitlines()
+        for line in jaxslam.table(summary).split("at one scale a run")[1].splitlines()
         if line.startswith("inverse_scaling")
     )
     for value in (result["beyond_scale"]["nees"][-1], result["log_scale"]["error_rms"][-1]):
         assert f" {value:.3f}" in row
-    assert "given the scale" not in jaxslam.table(measured)
+    assert "at one scale a run" not in jaxslam.table(measured)
 
 
 def test_the_table_begins_with_the_verdicts_and_shows_the_plain_mean_beside_the_others():
@@ -394,7 +402,7 @@ def test_the_table_begins_with_the_verdicts_and_shows_the_plain_mean_beside_the_
     title, verdict, _, others, _, header, row, *_ = jaxslam.table(summary).splitlines()
     assert title == "inverse_scaling:"
     assert verdict.strip() == sentences(result["verdict"])[0]
-    assert others.strip().startswith("1 of 20 runs were lost, the 19 never lost: NEES")
+    assert others.strip().startswith("1 of 20 runs were lost (numbers 7), the 19 never lost: NEES")
     assert header.split()[:3] == ["filter/landmarks", "NEES", "mean"]
     assert f"{result['nees'][-1]:.3f}" in row
     assert f"{result['nees_not_lost'][-1]:.3f}" in row

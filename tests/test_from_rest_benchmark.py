@@ -6,7 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+
+from jaxslam.consistency import run_verdict
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
@@ -23,7 +26,9 @@ def found(**changed):
         "seed": 3,
         "dof": 3,
         "band95": [2.4, 3.7],
+        "nees": [4.0] * STEPS,
         "nees_not_lost": [3.0] * STEPS,
+        "reversed": [None] + [0.0] * (STEPS - 1),
         "lost": [0.25] * STEPS,
         "lost_ever": [0.5] * STEPS,
         "rmse": {"position": [0.1] * STEPS},
@@ -38,9 +43,40 @@ def test_a_row_says_at_every_frame_what_is_lost_and_how_true_the_others_are():
     nees[5], nees[-1] = 7.25, None
     row = table({"standstill": {"mine": found(nees_not_lost=nees)}}).splitlines()[-1]
     assert row.split(" | ") == [
-        "| `mine`", "50 (seed 3), 2.40–3.70", "25.0%; 3.0", "25.0%; 3.0", "25.0%; 7.2",
-        "25.0%; 3.0", "25.0%; 3.0", "25.0%; 3.0", "25.0%; –", "50.0%", "0.100, 0.200", "1.5 |",
+        "| `mine`", "50 (seed 3), 2.40–3.70", "25.0%; 4.0, 3.0", "25.0%; 4.0, 3.0",
+        "25.0%; 4.0, 7.2", "25.0%; 4.0, 3.0", "25.0%; 4.0, 3.0", "25.0%; 4.0, 3.0",
+        "25.0%; 4.0, –", "50.0%", "0.100, 0.200", "1.5 |",
     ]  # fmt: skip
+
+
+def test_the_sentences_are_of_the_numbers_of_all_runs():
+    nees: list[Any] = [3.0] * STEPS
+    lost, reversed_ = [0.0] * STEPS, [None, *[0.0] * (STEPS - 1)]
+    # A mean that does not exist is above the band.
+    nees[8], nees[9], nees[33], nees[40] = 9.0, 3.8, None, 2.3
+    lost[8], lost[33], reversed_[56] = 0.5, 0.1, 0.02
+    numbers = found(nees=nees, lost=lost, reversed=reversed_)
+    results = {"standstill": {"mine": numbers, "mine+rest8": numbers}}
+    (said,) = benchmark.sentences(results).splitlines()
+    assert said.startswith("- `standstill`, `mine+rest8`: of 50 runs at most 5 are lost")
+    assert "at most 1 reversed at any of frames 10 to 60" in said
+    assert "above its band at 2 of these 51 frames and below it at 1." in said
+    assert said.endswith("The verdict was not recorded.")
+    with_verdicts = {
+        "verdict": run_verdict(np.random.default_rng(0).chisquare(3, (50, STEPS)) * 2.0, 3),
+        "beyond_scale": {"verdict": run_verdict(np.full((50, STEPS), 2.5), 3, fitted=1.0)},
+        "scale_drift": {"verdict": None},
+    }
+    said = benchmark.sentences({"standstill": {"mine+rest8": numbers | with_verdicts}})
+    assert "over-confident" in said.split("Over all frames: ")[1].split("At one scale a run:")[0]
+
+
+def test_the_page_says_what_the_numbers_on_disk_say():
+    folder = Path(__file__).resolve().parents[1]
+    results = json.loads((folder / "benchmarks/results/from_rest.json").read_text())
+    page = (folder / "docs/from-rest.md").read_text()
+    for part in (table(results), benchmark.sentences(results)):
+        assert f"\n\n{part}\n\n" in page
 
 
 def test_the_table_stands_in_its_place_and_replaces_the_old_one(tmp_path):
@@ -69,7 +105,7 @@ def test_what_is_there_is_not_measured_again(tmp_path, monkeypatch):
         scenarios=("standstill",), filters=("mine",), runs=50, seed=3,
         out=tmp_path / "found.json", docs=tmp_path / "page.md",
     )  # fmt: skip
-    options.docs.write_text(f"{BEGIN}\n{END}\n")
+    options.docs.write_text(f"{BEGIN}\n{END}\n{benchmark.SAID}\n{END}\n")
     options.out.write_text(json.dumps({"standstill": {"mine": found()}}))
     monkeypatch.setattr(benchmark, "measure", lambda *_: found(runs=51, seed=3))
     main(options)

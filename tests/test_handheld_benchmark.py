@@ -14,9 +14,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 import handheld as benchmark
 
+from jaxslam.consistency.beyond_scale import one_scale_of
+
 
 def records(runs=50, steps=40):
-    """Of a consistent filter, of which one run is lost from step 20 on and one diverges there."""
+    """Of a consistent filter, of which one run is lost from step 20 on and one diverges there; the
+    scale is right in every run's own unit, which is fixed from step 12 on."""
     rng = np.random.default_rng(0)
     nees, sigma = rng.chisquare(5, (runs, steps)), rng.uniform(0.1, 0.3, (runs, steps))
     nees[3, 20:], nees[4, 20:] = 500.0, np.nan
@@ -26,6 +29,9 @@ def records(runs=50, steps=40):
         "beyond_scale": nees,
         "log_scale": sigma * rng.normal(size=sigma.shape),
         "log_scale_sigma": sigma,
+        "unit_log_scale": np.log(2.0) + 0.01 * rng.normal(size=sigma.shape),
+        "unit_log_scale_sigma": np.full_like(sigma, 0.01),
+        "unit_fixed": np.broadcast_to((np.arange(steps) >= 11) * 1.0, nees.shape),
         "reversed": away,
         "nis": np.full((runs, steps), 9.0),
         "nis_dof": np.full((runs, steps), 10.0),
@@ -36,11 +42,12 @@ def test_numbers_are_those_of_the_runs():
     given = records()
     found = benchmark.numbers(given)
     assert found["at"] == [10, 30, 40]
-    nees, error, sigma = (given[k] for k in ("beyond_scale", "log_scale", "log_scale_sigma"))
+    error, sigma, one = given["log_scale"], given["log_scale_sigma"], one_scale_of(given)
+    nees = one.nees
     good = np.arange(50) != 4
     for i, step in enumerate((9, 29, 39)):
         kept = good if step > 20 else np.ones(50, bool)
-        assert found["beyond_scale"][i] == pytest.approx(nees[kept, step].mean() / 5)
+        assert found["one_scale"][i] == pytest.approx(nees[kept, step].mean() / 6)
         assert found["lost"][i] == (0.04 if step > 20 else 0)
         rms = np.sqrt(np.mean(error[kept, step] ** 2))
         assert found["log_scale_rms"][i] == pytest.approx(rms)
@@ -48,7 +55,14 @@ def test_numbers_are_those_of_the_runs():
         assert found["log_scale_median"][i] == pytest.approx(median)
         rms = np.sqrt(np.mean((error[kept, step] / sigma[kept, step]) ** 2))
         assert found["log_scale_normalised"][i] == pytest.approx(rms)
-    assert found["beyond_scale_median"][0] == pytest.approx(np.median(nees[:, 9]) / 5)
+    own = given["beyond_scale"]
+    assert found["one_scale_median"][0] == pytest.approx(np.median(own[:, 9]) / 6)
+    assert found["own_scale_median"][0] == pytest.approx(np.median(own[:, 9]) / 5)
+    assert found["drift_rms"][0] is None  # no unit yet
+    assert found["drift_normalised_median"][0] is None
+    assert found["drift_rms"][1] == pytest.approx(np.sqrt(np.mean(one.drift[good, 29] ** 2)))
+    rms = np.sqrt(np.mean(one.normalised[good, 29]))
+    assert found["drift_normalised"][1] == pytest.approx(rms)
     assert found["log_scale_sigma"][0] == pytest.approx(np.median(sigma[:, 9]))
     # Of those that moved; the one that diverged, reversed as it is, does not count.
     assert found["reversed"] == [None, pytest.approx(4 / 49), pytest.approx(4 / 49)]
@@ -89,7 +103,7 @@ def test_everything_in_the_folder_is_measured_and_only_once(options, capsys, mon
         result = found[where]["robocentric/inverse_scaling"]
         assert (result["runs"], result["steps"]) == (runs, steps)
         assert result["at"] == [steps]
-        assert result["beyond_scale"][0] is not None
+        assert result["one_scale"][0] is not None
         assert where in options.docs.read_text()
     assert len(capsys.readouterr().out.splitlines()) == 2
 

@@ -1,14 +1,14 @@
 """What of the poses' errors is not one of scale, which pictures alone do not tell.
 
-The truth of another scale, `T(s) = (R, s t)`, explains them as well as the true one, s = 1, but only
-one scale for all poses of a map does: it is the gauge (Zhang, Gallego, Scaramuzza, RA-L 2018). The
-ratio of the scales of two poses is told by the pixels, and where it changes, the scale drifts.
+The truth of another scale, `T(s) = (R, s t)`, explains them as well as the true one, s = 1, but
+only with one s for all poses of a map: the gauge (Zhang, Gallego, Scaramuzza, RA-L 2018). The ratio
+of the scales of two poses is told by the pixels, and where it changes, the scale drifts.
 `beyond_scale` is of one pose alone; `one_scale` makes of all poses of a run the NEES at one scale.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import jax
@@ -24,6 +24,8 @@ STEPS = 3
 """Of Gauss–Newton in s: an error that is affine in s, as those of the package are, needs one."""
 SCALES = (1e-3, 1e3)
 """Least and greatest s that is tried: a reversed path is best explained by none, s = 0."""
+SCALE = ("beyond_scale", "unit_log_scale", "unit_log_scale_sigma", "unit_fixed")
+"""Records of a run of which `one_scale` is made."""
 NOTICEABLE = 0.01
 """Displacement from which on it can be said to be reversed, m."""
 
@@ -82,8 +84,7 @@ def beyond_scale(
 
 
 class OneScale(NamedTuple):
-    """Of runs at one scale each; with a fixed unit throughout, K poses of a run have K t − 1 degrees
-    of freedom together."""
+    """Of runs at one scale each: K poses of a run have K t − 1 degrees of freedom together."""
 
     nees: Float[np.ndarray, "*runs steps"]
     """`e(ŝ)ᵀ P⁻¹ e(ŝ)`: t degrees of freedom a pose, less at most one where the errors of scale are
@@ -91,8 +92,8 @@ class OneScale(NamedTuple):
     log_scale: Float[np.ndarray, "*runs"]
     """log ŝ of the run: NaN where no pose tells it."""
     drift: Float[np.ndarray, "*runs steps"]
-    """`log ŝ_k − log ŝ`: how far the scale of a pose is from that of its run; NaN before the unit is
-    fixed."""
+    """`log ŝ_k − log ŝ`: how far the scale of a pose is from that of its run; NaN before the unit
+    is fixed."""
     normalised: Float[np.ndarray, "*runs steps"]
     """The square of the drift in its claimed σ, the last term of `nees`: at most one degree of
     freedom."""
@@ -107,9 +108,9 @@ def one_scale(
     """NEES at the one scale of a run that explains all of its poses best, of a `BeyondScale` each.
 
     An error that is affine in s has `NEES_k(s) = NEES_k(ŝ_k) + w_k (s − ŝ_k)²`, with
-    `w = gᵀ P⁻¹ g` and g = de/ds, so that `ŝ = Σ w_k ŝ_k / Σ w_k` minimises the sum. A pose whose unit
-    is not `fixed` yet, while a start is still being found out, is of a unit of its own: it keeps its
-    own scale, and has no part in the run's.
+    `w = gᵀ P⁻¹ g` and g = de/ds, so that `ŝ = Σ w_k ŝ_k / Σ w_k` minimises the sum. A pose whose
+    unit is not `fixed` yet, while a start is still being found out, is of a unit of its own: it
+    keeps its own scale, and has no part in the run's.
     """
     own, s = np.asarray(nees, np.float64), np.exp(np.asarray(log_scale, np.float64))
     there = np.isfinite(own) & np.isfinite(s) & (True if fixed is None else np.asarray(fixed))
@@ -125,6 +126,12 @@ def one_scale(
         np.where(there & told, drift, np.nan),
         np.where(there & told, away, np.nan),
     )
+
+
+def one_scale_of(records: Mapping[str, np.ndarray]) -> OneScale:
+    """`one_scale` of the records (runs, steps) of a study, see `montecarlo.filter_run`."""
+    *own, fixed = (records[name] for name in SCALE)
+    return one_scale(*own, fixed > 0)
 
 
 def reversal(estimate: Pose, truth: Pose) -> Scalar:

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 Manifest = dict[str, Any]
-LAYOUT = 7
+LAYOUT = 8
 """Version of the records that are kept, which are never mixed with those of another."""
 MOST_NUMBERS = 64
 """Of an array that is told whole; of a larger one only a digest is."""

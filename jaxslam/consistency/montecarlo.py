@@ -27,7 +27,7 @@ from jaxtyping import Array, Int
 
 from jaxslam import native
 from jaxslam.arrays import cast, is_number
-from jaxslam.consistency.beyond_scale import beyond_scale, reversal
+from jaxslam.consistency.beyond_scale import SCALE, beyond_scale, reversal
 from jaxslam.consistency.cluster import as_tasks, connected
 from jaxslam.consistency.manifest import LAYOUT, Manifest, described, versions
 from jaxslam.consistency.recursion import Frame, run_through
@@ -35,8 +35,9 @@ from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.consistency.store import MemoryStore, Records, Store
 from jaxslam.consistency.summary import Seconds, Study
 from jaxslam.consistency.sums import as_sums, keeps_records
-from jaxslam.geometry import Pose
+from jaxslam.geometry import Pose, difference
 from jaxslam.models.motion import AbstractMotion
+from jaxslam.models.scale import Metre
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.programs import BATCHED, Exact, Program
 from jaxslam.simulation import (
@@ -52,8 +53,14 @@ from jaxslam.simulation import (
     simulate,
     trajectory_of,
 )
+from jaxslam.slam.filter import innermost
 from jaxslam.slam.protocol import AbstractFilter
-from jaxslam.slam.readouts import camera_pose, landmarks_from_above, landmarks_in_camera
+from jaxslam.slam.readouts import (
+    camera_pose,
+    camera_pose_in_unit,
+    landmarks_from_above,
+    landmarks_in_camera,
+)
 from jaxslam.watchdog import finished, lapack_calls
 
 DTYPES = ("float64", "float32")
@@ -416,8 +423,10 @@ def filter_run(
 ) -> tuple[dict[str, Array], Pose, Any]:
     """One filter on one simulated run: records of every step, estimated path, final state.
 
-    The records hold, per step: `nees` of the pose, and `beyond_scale` what is left of it at the
-    best scale of the truth; that `log_scale` and the `log_scale_sigma` that the filter claims;
+    The records hold, per step: `nees` of the pose; the `log_scale` of the truth at which it is the
+    least, and the `log_scale_sigma` that the filter claims of it, with the metre in doubt; the same
+    of the pose in the filter's own unit, `beyond_scale`, `unit_log_scale`, `unit_log_scale_sigma`,
+    from which `one_scale` makes NEES at one scale a run, and whether that unit is fixed yet;
     whether the displacement is `reversed`, NaN without one; `nis` and `nis_dof`; the update's
     `status`; `error` and `variance` of the camera's position (in camera axes) and orientation; the
     mean `landmark_nees` of the landmarks seen, in the sensor's chart, where it is finite, their
@@ -430,7 +439,7 @@ def filter_run(
         landmarks = _landmark_nees(slam, sensor, state, frame)
         records = {
             "nees": normalised_squared(*slam.pose_error(state, T_BC)),
-            **_scale(slam, state, T_BC),
+            **scale_records(slam, state, T_BC),
             "reversed": reversal(estimate, T_BC),
             "nis": innovation.nis,
             "nis_dof": innovation.nis_dof.astype(innovation.nis.dtype),
@@ -445,9 +454,24 @@ def filter_run(
     return records, path, state
 
 
-def _scale(slam: AbstractFilter, state: Any, T_BC: Pose) -> dict[str, Array]:
-    best = beyond_scale(partial(slam.pose_error, state), T_BC)
-    return {"beyond_scale": best.nees, "log_scale": best.log_scale, "log_scale_sigma": best.sigma}
+def scale_records(
+    slam: AbstractFilter, state: Any, T_BC: Pose, truth_sigma: np.ndarray | None = None
+) -> dict[str, Array]:
+    """Of one pose: the scale in metres, and `SCALE` in the filter's own unit; of a truth that is
+    itself known with σ only, see `beyond_scale`."""
+    metric = in_unit = beyond_scale(partial(slam.pose_error, state), T_BC, truth_sigma)
+    inner = innermost(slam)
+    if inner is not None and not isinstance(inner.scale, Metre):
+        seen = camera_pose_in_unit(slam, state)
+        in_unit = beyond_scale(
+            lambda truth: (difference(truth, seen.pose), seen.covariance), T_BC, truth_sigma
+        )
+    own = (*in_unit, slam.unit_fixed(state).astype(metric.nees.dtype))
+    return {
+        "log_scale": metric.log_scale,
+        "log_scale_sigma": metric.sigma,
+        **dict(zip(SCALE, own, strict=True)),
+    }
 
 
 def _camera_error(estimate: Pose, truth: Pose) -> Array:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxslam.consistency.beyond_scale import SCALE, one_scale_of
 from jaxslam.consistency.statistics import mean_band
 from jaxslam.consistency.store import Records, Store
 from jaxslam.consistency.sums import (
@@ -113,8 +114,11 @@ def summarise(study: Study) -> dict[str, Any]:
     is finite; of the surviving runs' `landmark_not_finite` had one that is not. `status` counts the
     runs in which an update said that something was wrong (`jaxslam.Status`).
 
-    `beyond_scale` is what NEES is at the scale of the truth that explains the estimate best, with
-    the same numbers; `log_scale` that scale's error, the σ claimed (root mean squares and medians)
+    `beyond_scale` is NEES at the one scale of every run that explains all of its poses best
+    (`beyond_scale.one_scale`), in the filter's own unit, with the same numbers: that scale takes
+    from one degree of freedom a run to one a pose, and band and verdict allow for both.
+    `scale_drift` is how far the scale of a pose is from that of its run, with the σ claimed of it;
+    `log_scale` the error of the scale in metres, the σ claimed (root mean squares and medians)
     and the error in σ; `reversed` the share of the displaced runs whose estimate points away from
     the truth. Where the sensor measures metres, or the motion is told in metres, they say little.
 
@@ -164,7 +168,6 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
         return dict(zip(("position", "orientation"), map(json_numbers, parts), strict=True))
 
     seconds = study.seconds[name]
-    beyond = tally_of(sums, "beyond_scale", dof)
     return {
         "verdict": {
             **tally_of(sums, "nees", dof).verdict(),
@@ -189,13 +192,14 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
             "orientation": json_numbers(_ratio(sums["outside"][:, n:].mean(axis=1), healthy)),
         },
         "beyond_scale": {
-            "dof": beyond.dof,
-            "band95": list(mean_band(beyond.dof, max(healthy, 1))),
+            "dof": dof,
+            "band95": [mean_band(dof - 1, max(healthy, 1))[0], high],
             "nees": json_numbers(sums["beyond_scale"] / max(healthy, 1)),
-            "nees_median": json_numbers(_median(study, name, "beyond_scale")),
+            "nees_median": json_numbers(_median(study, name, SCALE, _nees_at_one_scale)),
             "lost": json_numbers((sums["beyond_lost"] + sums["diverged"]) / study.runs),
-            "verdict": beyond.verdict(),
+            "verdict": tally_of(sums, "beyond_scale", dof).verdict(),
         },
+        "scale_drift": _drift(sums, dof),
         "log_scale": _log_scale(study, name, sums, healthy),
         "reversed": json_numbers(_ratio(sums["reversed"], sums["displaced"])),
         "landmark_nees": json_numbers(landmark),
@@ -218,6 +222,23 @@ def _by_step(found: dict[str, Any]) -> dict[str, list[float | None]]:
     return {**{key: found[key] for key in alone}, **parts}
 
 
+def _drift(sums: Sums, dof: int) -> dict[str, Any]:
+    """Root mean squares over the surviving runs whose unit is fixed; no verdict where none is."""
+    count = sums["drift_count"]
+    of_drift = tally_of(sums, "drift", dof)
+
+    def rms(of: str) -> list[float | None]:
+        return json_numbers(np.sqrt(_ratio(sums[of], count)))
+
+    return {
+        "rms": rms("squared_drift"),
+        "sigma": rms("drift_variance"),
+        "normalised_rms": rms("normalised_drift"),
+        "runs": [int(n) for n in count],
+        "verdict": of_drift.verdict() if of_drift.runs else None,
+    }
+
+
 def _log_scale(study: Study, name: str, sums: dict[str, Any], healthy: int) -> dict[str, Any]:
     """Root mean squares over the surviving runs; medians over all."""
 
@@ -226,9 +247,9 @@ def _log_scale(study: Study, name: str, sums: dict[str, Any], healthy: int) -> d
 
     return {
         "error_rms": rms("squared_log_scale"),
-        "error_median": json_numbers(_median(study, name, "log_scale", np.abs)),
+        "error_median": json_numbers(_median(study, name, ("log_scale",), np.abs)),
         "sigma": rms("log_scale_variance"),
-        "sigma_median": json_numbers(_median(study, name, "log_scale_sigma")),
+        "sigma_median": json_numbers(_median(study, name, ("log_scale_sigma",))),
         "normalised_rms": rms("normalised_log_scale"),
     }
 
@@ -246,8 +267,8 @@ def treatment(slam: Any) -> str | None:
 
 
 def tally(study: Study, name: str, record: str = "nees") -> Tally:
-    """What the verdict on one filter is made of, on the NEES of its poses or on what of it is
-    `beyond_scale`; tallies of other seeds may be added."""
+    """What the verdict on one filter is made of, on the NEES of its poses, on what of it is
+    `beyond_scale` or on the `drift` of the scale; tallies of other seeds may be added."""
     return tally_of(_sums(study, name), record, study.scenario.world.tangent_dim)
 
 
@@ -271,20 +292,25 @@ def _sums(study: Study, name: str) -> Sums:
 def _median(
     study: Study,
     name: str,
-    record: str = "nees",
-    of: Callable[[np.ndarray], np.ndarray] = lambda values: values,
+    records: tuple[str, ...] = ("nees",),
+    of: Callable[..., np.ndarray] = lambda values: values,
 ) -> np.ndarray:
-    """Median over all runs whose records are kept, diverged ones above everything."""
+    """Median of what is made of these records, over all runs whose records are kept, diverged ones
+    above everything."""
     medians, at_once = [], max(1, _VALUES_AT_ONCE // study.runs)
     for start in range(0, study.scenario.steps, at_once):
         part = slice(start, start + at_once)
-        columns = [
-            np.where(survived(records)[:, None], of(records[record]), np.inf)[:, part]
-            for chunk in study.whole
-            for records in [study.store.load(name, chunk, ("nees", record))]
-        ]
+        columns = []
+        for chunk in study.whole:
+            kept = study.store.load(name, chunk, ("nees", *records))
+            values = of(*(kept[record] for record in records))
+            columns.append(np.where(survived(kept)[:, None], values, np.inf)[:, part])
         medians.append(np.median(np.concatenate(columns), axis=0))
     return np.concatenate(medians)
+
+
+def _nees_at_one_scale(*records: np.ndarray) -> np.ndarray:
+    return one_scale_of(dict(zip(SCALE, records, strict=True))).nees
 
 
 def table(summary: dict[str, Any] | Study) -> str:
@@ -333,23 +359,27 @@ def _scale_table(filters: dict[str, Any], wide: int) -> Iterator[str]:
     """What of the poses' errors is not one of scale, and the scale's, at the last step."""
     yield ""
     yield (
-        f"{'given the scale':<{wide}}{'NEES mean':>10}{'95 % band':>14}{'median':>8}{'lost':>7}"
-        f"{'reversed':>10}{'log-scale error':>17}{'claimed σ':>11}{'error/σ':>9}  verdict"
+        f"{'at one scale a run':<{wide}}{'NEES mean':>10}{'95 % band':>14}{'median':>8}{'lost':>7}"
+        f"{'reversed':>10}{'drift':>8}{'drift/σ':>9}{'log-scale error':>17}{'claimed σ':>11}"
+        f"{'error/σ':>9}  verdict; on the drift"
     )
     for name, f in filters.items():
-        beyond, scale = f["beyond_scale"], f["log_scale"]
+        word = (f["scale_drift"]["verdict"] or {"word": "–"})["word"]
+        beyond, scale, drift = f["beyond_scale"], f["log_scale"], f["scale_drift"]
         low, high = beyond["band95"]
         yield (
             f"{name:<{wide}}{_last(beyond['nees'], 10, 3)}{f'{low:.3f}–{high:.3f}':>14}"
             f"{_last(beyond['nees_median'], 8, 2)}{_share(beyond['lost'][-1]):>7}"
-            f"{_share(f['reversed'][-1]):>10}{_last(scale['error_rms'], 17, 3)}"
+            f"{_share(f['reversed'][-1]):>10}{_last(drift['rms'], 8, 3)}"
+            f"{_last(drift['normalised_rms'], 9, 2)}{_last(scale['error_rms'], 17, 3)}"
             f"{_last(scale['sigma_median'], 11, 3)}{_last(scale['normalised_rms'], 9, 2)}"
-            f"  {beyond['verdict']['word']}"
+            f"  {beyond['verdict']['word']}; {word}"
         )
     dof = next(iter(filters.values()))["beyond_scale"]["dof"]
     yield (
-        f"at the scale of the truth that explains the estimate best: ideal NEES {dof}; reversed: "
-        "displaced away from the truth; error and error/σ of log-scale: rms, σ: median"
+        f"at the one scale of the truth that explains all poses of a run best: a right NEES is "
+        f"{dof - 1} to {dof}; reversed: displaced away from the truth; drift of log-scale along a "
+        "run, and its error in metres: rms, claimed σ: median"
     )
 
 

@@ -10,15 +10,16 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
+from jaxslam.consistency.beyond_scale import SCALE, OneScale, one_scale_of
 from jaxslam.consistency.statistics import lost_threshold
 from jaxslam.consistency.store import SUM, Records
 from jaxslam.consistency.verdict import Tally
 from jaxslam.forms.state import Status
 
 RECORDS = (
-    "nees", "beyond_scale", "log_scale", "log_scale_sigma", "reversed", "nis", "nis_dof", "status",
+    "nees", "log_scale", "log_scale_sigma", *SCALE, "reversed", "nis", "nis_dof", "status",
     "error", "variance", "landmark_nees", "landmark_count", "landmark_not_finite",
 )  # fmt: skip
 """What a summary reads of the records of a run."""
@@ -57,8 +58,10 @@ def added(each: Iterable[Sums]) -> Sums:
 
 
 def tally_of(sums: Sums, record: str, dof: int) -> Tally:
-    """What the verdict on `nees` or on `beyond_scale` is made of; `dof` is that of a pose."""
-    return Tally.of_numbers(sums[f"tally_{record}"], dof - (record == "beyond_scale"))
+    """What a verdict is made of: on `nees`, on what of it is `beyond_scale`, at one scale a run, or
+    on the `drift` of that scale. `dof` is that of a pose."""
+    own, fitted = {"nees": (dof, 0.0), "beyond_scale": (dof, 1.0), "drift": (1, 1.0)}[record]
+    return Tally.of_numbers(sums[f"tally_{record}"], own, fitted)
 
 
 def survived(records: Records) -> Bool[np.ndarray, " runs"]:
@@ -72,17 +75,19 @@ def _sums(records: Records, dof: int) -> Sums:
     good = {name: records[name][healthy] for name in RECORDS}
     kept = good["nees"] <= lost_threshold(dof)
     ever = ~(good["nees"] <= lost_threshold(dof, good["nees"].shape[1]))
+    scale = one_scale_of(records)
     finite = good["landmark_count"] - good["landmark_not_finite"]
     return {
         "tally_nees": Tally.of(records["nees"], dof).numbers(),
-        "tally_beyond_scale": Tally.of(records["beyond_scale"], dof - 1).numbers(),
+        "tally_beyond_scale": Tally.of(scale.nees, dof, 1.0).numbers(),
+        "tally_drift": _of_drift(scale.normalised).numbers(),
         "diverged": np.sum(~healthy),
         "nees": good["nees"].sum(axis=0),
         "kept": kept.sum(axis=0),
         "kept_nees": np.where(kept, good["nees"], 0.0).sum(axis=0),
         "lost": (~kept).sum(axis=0),
         "lost_ever": np.logical_or.accumulate(ever, axis=1).sum(axis=0),
-        **_of_scale(good, lost_threshold(dof - 1)),
+        **_of_scale(good, OneScale(*(x[healthy] for x in scale)), lost_threshold(dof)),
         "nis": good["nis"].sum(axis=0),
         "nis_dof": good["nis_dof"].sum(axis=0),
         "squared_error": (good["error"] ** 2).sum(axis=0),
@@ -99,14 +104,26 @@ def _sums(records: Records, dof: int) -> Sums:
     }
 
 
-def _of_scale(good: Records, threshold: float) -> Sums:
-    """Of what is beyond scale, of scale, and of the direction of the displacement."""
-    error, sigma = good["log_scale"], good["log_scale_sigma"]
+def _of_drift(normalised: Float[np.ndarray, "runs steps"]) -> Tally:
+    """Of the runs whose unit was ever fixed, from then on."""
+    told = np.isfinite(normalised)
+    ever = told.any(axis=1)
+    return Tally.of(normalised[ever], 1, 1.0, told[ever])
+
+
+def _of_scale(good: Records, one: OneScale, threshold: float) -> Sums:
+    """Of NEES at one scale a run and its drift, of the metre, and of the displacement's sign."""
+    error, sigma, own = good["log_scale"], good["log_scale_sigma"], good["unit_log_scale_sigma"]
+    drifts = np.isfinite(one.drift)
     with np.errstate(over="ignore"):  # no σ of a scale that nothing depends on
-        variance = sigma**2
+        variance, claimed = sigma**2, own**2
     return {
-        "beyond_scale": good["beyond_scale"].sum(axis=0),
-        "beyond_lost": (good["beyond_scale"] > threshold).sum(axis=0),
+        "beyond_scale": one.nees.sum(axis=0),
+        "beyond_lost": (one.nees > threshold).sum(axis=0),
+        "squared_drift": np.nansum(one.drift**2, axis=0),
+        "normalised_drift": np.nansum(one.normalised, axis=0),
+        "drift_variance": np.where(drifts, claimed, 0.0).sum(axis=0),
+        "drift_count": drifts.sum(axis=0),
         "squared_log_scale": (error**2).sum(axis=0),
         "log_scale_variance": variance.sum(axis=0),
         "normalised_log_scale": ((error / sigma) ** 2).sum(axis=0),

@@ -46,7 +46,7 @@ def plot_consistency(
     """Draw a study; `summary` is `summarise(study)`, made here if it is not given.
 
     Above: the mean NEES of every filter with its exact 95 % band, and the share of errors outside
-    ±3σ. Where the scale is free, below that: NEES given the scale, and the scale's own error.
+    ±3σ. Where the scale is free, below that: NEES at one scale a run, and the scale's own error.
     Below: the error of run 0 with ±3σ, axis by axis, and its map at the end. As one `column` for
     print, 3.4 in wide with letters of 8 pt, it is without run 0. Written to `path` where one is
     given.
@@ -198,16 +198,16 @@ def _with_scale(given: dict[str, Any] | Study) -> dict[str, Any]:
 def plot_beyond_scale(
     summary: dict[str, Any] | Study, *, ax: Axes, label: Labels | None = None
 ) -> Axes:
-    """Mean and median NEES at the scale of the truth that explains the estimate best.
+    """Mean and median NEES at the one scale of a run that explains all of its poses best.
 
     Where the scale is free; names at the ends of the lines, or those of `label`.
     """
     summary = _with_scale(summary)
     numbers = {name: f["beyond_scale"] for name, f in summary["filters"].items()}
     _plot_means(numbers, summary, ax, label)
-    ideal = f"ideal {next(iter(numbers.values()))['dof']}"
-    ax.set_ylabel(f"NEES ({ideal})")
-    set_title(ax, f"NEES given the scale; dotted: median{_of_some(summary)}")
+    dof = next(iter(numbers.values()))["dof"]
+    ax.set_ylabel(f"NEES (ideal {dof - 1} to {dof})")
+    set_title(ax, f"NEES at one scale a run; dotted: median{_of_some(summary)}")
     return ax
 
 
