@@ -974,3 +974,94 @@ def test_of_the_trackers_files_nees_is_given_the_scale(tmp_path):
     nees = one_scale(*(np.asarray(x) for x in best)).nees
     np.testing.assert_allclose(found.nees[0], nees, rtol=1e-4)
     assert Tally.of(found.nees, 6, 1.0).average.mean == pytest.approx(found.verdict["nees"])
+
+
+TRACKED = Convention("split", "body", scale="given")
+UNFIXED, FIXED, LOST = ("tracked", 0, 1.5), ("tracked", 1, 1.0), ("lost", 1, 4.0)
+"""State, unit_fixed, and the length of the unit in which the pose is written."""
+
+
+def tracked_run(folder, maps):
+    """Files of a folder as the tracker writes them: of each map its frames. Poses and truths."""
+    told = [(number, *frame) for number, frames in enumerate(maps) for frame in frames]
+    T, P, truth = (x[0].copy() for x in logged(TRACKED, runs=1, steps=len(told), spread=0.5))
+    T[0], truth[0], P[0] = np.eye(4), np.eye(4), 0  # known exactly
+    truth[:, :3, 3] *= np.array([unit for *_, unit in told])[:, None]
+    times = np.arange(len(told)) / 30
+    write_tum(folder / "trajectory.txt", times, T)
+    write_covariances(folder / "covariance.txt", times, P, TRACKED)
+    write_tum(folder / "groundtruth.txt", times, truth)
+    rows = [
+        f"{i},{times[i]:.9f},{state},{number},9,1.5,18,0.1,,,{fixed}"
+        for i, (number, state, fixed, _) in enumerate(told)
+    ]
+    header = "frame,time,state,map,matches,nis,nis_dof,sigma_position,log_scale,more,unit_fixed"
+    (folder / "frames.csv").write_text("\n".join([header, *rows]) + "\n")
+    return T[None], P[None], truth[None]
+
+
+def test_frames_that_the_tracker_says_nothing_of_the_unit_of_are_left_out(tmp_path):
+    first = [("start", 0, 1.5), *9 * [UNFIXED], *60 * [FIXED], *5 * [LOST]]
+    second = [("start", 0, 7.0), *20 * [("tracked", 1, 7.0)]]
+    arrays = tracked_run(tmp_path, [first, second])
+    found = jaxslam.evaluate_log(tmp_path, align="sim3")
+    own = [0, *range(10, 70)]
+    expected = jaxslam.evaluate_poses(*(x[:, own] for x in arrays), TRACKED, align="sim3")
+    np.testing.assert_allclose(found.nees[0, :60], expected.nees[0], rtol=1e-4)
+    assert found.logged.sum() == 60
+    assert found.alignment == "sim3"
+    told = str(found)
+    assert "aligned by the first pose" in told
+    assert "map 0, the longest, is evaluated: 21 of 96 poses are of other maps" in told
+    assert "5 of 96 poses are of frames that are lost" in told
+    assert "9 of 96 poses are from before the unit of their map was fixed" in told
+    (tmp_path / "frames.csv").unlink()
+    assert jaxslam.evaluate_log(tmp_path, align="sim3").verdict["nees"] > 10 * found.verdict["nees"]
+
+
+def test_a_later_map_that_is_the_longest_is_evaluated_in_its_own_unit(tmp_path):
+    first = [("start", 1, 1.0), *10 * [FIXED]]
+    arrays = tracked_run(tmp_path, [first, 40 * [("tracked", 1, 7.0)]])
+    found = jaxslam.evaluate_log(tmp_path, align="sim3")
+    expected = jaxslam.evaluate_poses(*(x[:, 11:] for x in arrays), TRACKED, align="sim3")
+    np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-4)
+    assert "map 1, the longest, is evaluated: 11 of 51 poses" in str(found)
+    with pytest.raises(ValueError, match=r"map is map 1, .*; align sim3 is accepted"):
+        jaxslam.evaluate_log(tmp_path)
+
+
+def test_of_several_videos_poses_that_are_left_out_are_counted_together(tmp_path):
+    for name, frames in (("a", [*30 * [FIXED], LOST]), ("b", [*40 * [FIXED], *2 * [LOST]])):
+        (tmp_path / name).mkdir()
+        tracked_run(tmp_path / name, [frames])
+    found = jaxslam.evaluate_log(tmp_path, align="sim3")
+    assert "3 of 73 poses are of frames that are lost" in str(found)
+    assert found.logged.sum(axis=1).tolist() == [29, 39]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "frame,time,state,map\n0,0,lost,0\n", "x;y\n1;2\n", "\0\udcff,\n" * 9]
+)
+def test_files_of_that_name_by_others_and_of_older_versions_say_nothing(text, tmp_path):
+    tracked_run(tmp_path, [20 * [FIXED]])
+    (tmp_path / "frames.csv").write_bytes(text.encode(errors="surrogateescape"))
+    assert jaxslam.evaluate_log(tmp_path).logged.all()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (",1\n", ",yes\n", r"frames\.csv, line 2: a finite time.* unit_fixed, 0 or 1"),
+        ("9,0.3", "9,nan0.3", r"frames\.csv, line 11: a finite time"),
+        (",1\n", ",0\n", "no pose is of a frame that is not lost and whose unit is fixed"),
+        ("\n0,0", "\n0,-9", "pose at 0.000 s; the frames of the trajectory beside it"),
+        ("tracked,0", "tracked,-1", "line 2: .* the number of a map"),
+    ],
+)
+def test_faults_in_the_trackers_file_are_named(old, new, message, tmp_path):
+    tracked_run(tmp_path, [20 * [FIXED]])
+    file = tmp_path / "frames.csv"
+    file.write_text(file.read_text().replace(old, new))
+    with pytest.raises(ValueError, match=message) as caught:
+        jaxslam.evaluate_log(tmp_path)
+    assert "\n" not in str(caught.value)

@@ -40,10 +40,11 @@ def evaluate_log(
 
     `source` is an npz file of arrays, a CSV file of `run, step, errors, upper triangle` lines, a
     trajectory in TUM format with its `covariance` and `truth`, or a folder: one run, or one a
-    sub-folder, of `estimate.txt`, `covariance.txt` and `truth.txt`. What is `stated` of the
-    convention (`error`, `axes`, `order`, `scale`) comes before what the files say. How poses are
-    aligned, and which axes are used, see `evaluate_poses`. With `nis` errors are innovations.
-    Raises ValueError, naming the file.
+    sub-folder, of `estimate.txt`, `covariance.txt` and `truth.txt`. Where the tracker's
+    `frames.csv` is beside a trajectory, its longest map is evaluated, without frames that are lost
+    or whose unit was not fixed yet. What is `stated` of the convention (`error`, `axes`, `order`,
+    `scale`) comes before what the files say. How poses are aligned, and which axes are used, see
+    `evaluate_poses`. With `nis` errors are innovations. Raises ValueError, naming the file.
     """
     source, stated = Path(source), dict(stated or {})
     how = {"align": align, "axes_used": axes_used}

@@ -12,9 +12,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, associated
+from jaxslam.evaluation.arrays import exactly_known
 from jaxslam.evaluation.convention import Convention
 from jaxslam.evaluation.covariance_text import read_covariances
 from jaxslam.evaluation.evaluate import Evaluation
+from jaxslam.evaluation.frames import Judged, judged, left_out
 from jaxslam.evaluation.poses import evaluate_poses
 from jaxslam.tum import check_seconds, read_tum
 
@@ -62,6 +64,8 @@ class _Logged(NamedTuple):
     covariances: _Found
     truths: _Found
     said: dict[str, str]
+    judged: Judged
+    """Those that a tracker's own word on its frames lets have a part in the verdict."""
 
 
 def runs_of(
@@ -116,13 +120,13 @@ def evaluate_runs(runs: tuple[Run, ...], stated: dict[str, str], how: dict[str, 
     """The verdict on them, in the convention that is stated, or else said in the files; `how` they
     are evaluated are options of `evaluate_poses`."""
     read = [_read(run) for run in runs]
+    convention = _convention_of(read, stated)
     for one in read:
-        if one.said != read[0].said:
+        if one.judged.map and convention.scale == "given" and how["align"] != "sim3":
             raise ValueError(
-                f"{one.run.covariance}: says another convention ({Convention(**one.said)}) than "
-                f"{runs[0].covariance} ({Convention(**read[0].said)})"
+                f"{one.run.estimate}: its longest map is map {one.judged.map}, in a unit of its "
+                "own; align sim3 is accepted"
             )
-    convention = stated_before(read[0].said, stated)
     names = tuple(run.name for run in runs)
     longest = max(read, key=lambda one: len(one.times))
     found = named(
@@ -130,17 +134,35 @@ def evaluate_runs(runs: tuple[Run, ...], stated: dict[str, str], how: dict[str, 
         lambda: evaluate_poses(
             _filled_up([one.estimates for one in read]),
             _filled_up([one.covariances.values for one in read]),
-            _filled_up([one.truths.values for one in read]),
+            _filled_up([_judged_truths(one) for one in read]),
             convention,
             times=longest.times,
             **how,
         ),
         names,
     )
-    told = (*_left_out(read), *_other_times(read, longest))
+    told = (
+        *_left_out(read), *left_out([one.judged for one in read]), *_other_times(read, longest)
+    )  # fmt: skip
     if not read[0].said and not stated:
         told += (f"the file does not say its convention; assumed: {convention}",)
     return replace(found, notes=(*found.notes, *told), run_names=names)
+
+
+def _convention_of(read: list[_Logged], stated: dict[str, str]) -> Convention:
+    """The one of all runs. Raises ValueError where their files say different ones."""
+    for one in read:
+        if one.said != read[0].said:
+            raise ValueError(
+                f"{one.run.covariance}: says another convention ({Convention(**one.said)}) than "
+                f"{read[0].run.covariance} ({Convention(**read[0].said)})"
+            )
+    return stated_before(read[0].said, stated)
+
+
+def _judged_truths(one: _Logged) -> Float[np.ndarray, "n 4 4"]:
+    """None of a pose that has no part in the verdict."""
+    return np.where(one.judged.poses[:, None, None], one.truths.values, np.nan)
 
 
 def _filled_up(runs: list[np.ndarray]) -> np.ndarray:
@@ -217,7 +239,9 @@ def _read(run: Run) -> _Logged:
         _check_times(path, told)
     covariances = _at_times(files[0], files[1], text.covariances)
     true = _at_times(files[0], files[2], truths)
-    read = _Logged(run, times, estimates, covariances, true, text.said)
+    known = exactly_known(covariances.values)
+    those = judged(run.estimate.parent, times, known)
+    read = _Logged(run, times, estimates, covariances, true, text.said, those)
     _check_share(read)
     return read
 
