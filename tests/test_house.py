@@ -14,10 +14,10 @@ from jaxslam.slam.protocol import AbstractFilter, AbstractStaged
 PACKAGE = Path(jaxslam.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 ORDER = (
-    "arrays", "lazy", "files", "programs", "tum", "linalg", "lookup", "watchdog", "progress",
-    "geometry", "least_squares", "native", "landmarks", "models", "forms", "slam", "delayed",
-    "remedies", "window", "wrappers", "simulation", "names", "consistency", "evaluation",
-    "posterior", "triangulation", "datasets", "plots", "video", "vision", "cli",
+    "arrays", "lazy", "extras", "files", "programs", "tum", "linalg", "lookup", "watchdog",
+    "progress", "geometry", "least_squares", "native", "landmarks", "models", "forms", "slam",
+    "delayed", "remedies", "window", "wrappers", "simulation", "names", "consistency",
+    "evaluation", "posterior", "triangulation", "datasets", "plots", "video", "vision", "cli",
 )  # fmt: skip
 """Rooms, each of which imports only those before it."""
 

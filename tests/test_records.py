@@ -75,5 +75,5 @@ def test_another_format_is_refused_before_anything_is_computed(tmp_path, capsys)
 def test_without_the_extra_it_is_named(study, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
-    with pytest.raises(ValueError, match=r"pip install 'jaxslam\[parquet\]'"):
+    with pytest.raises(ValueError, match=r"need the parquet extra .* pip install '\.\[parquet\]'$"):
         write_records(study, tmp_path / "records.parquet")

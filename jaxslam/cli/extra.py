@@ -8,6 +8,8 @@ import warnings
 from collections.abc import Generator
 from contextlib import contextmanager
 
+from jaxslam.extras import missing
+
 
 def require_vision(what: str) -> None:
     """Raise ValueError unless the vision extra is installed, which `what` needs."""
@@ -18,10 +20,7 @@ def require_vision(what: str) -> None:
         import cv2  # noqa: F401
         import evo  # noqa: F401
     except ImportError as error:
-        raise ValueError(
-            f"{what} needs the vision extra ({error.name} is missing): "
-            "pip install 'jaxslam[vision]'"
-        ) from None
+        raise missing(f"{what} needs", "vision", error) from None
 
 
 @contextmanager

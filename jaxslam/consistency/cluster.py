@@ -18,6 +18,7 @@ from typing import Any
 
 import jax
 
+from jaxslam.extras import missing
 from jaxslam.files import one_line
 from jaxslam.programs import wide
 
@@ -42,10 +43,7 @@ def connected(cluster: Any) -> Generator[Any]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise ValueError(
-            f"a cluster needs the cluster extra ({error.name} is missing): "
-            "pip install 'jaxslam[cluster]'"
-        ) from None
+        raise missing("a cluster needs", "cluster", error) from None
     try:
         client = Client(cluster, timeout=PATIENCE, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:  # no scheduler, no address, no cluster

@@ -18,6 +18,7 @@ import numpy as np
 
 from jaxslam.consistency.store import Records
 from jaxslam.consistency.summary import Study
+from jaxslam.extras import missing
 from jaxslam.files import write_atomically
 
 AXES = {
@@ -62,10 +63,7 @@ def check_records(path: str | Path) -> Path:
     try:
         import pyarrow.parquet  # noqa: F401
     except ImportError as error:
-        raise ValueError(
-            f"records need the parquet extra ({error.name} is missing): "
-            "pip install 'jaxslam[parquet]'"
-        ) from None
+        raise missing("records need", "parquet", error) from None
     return path
 
 

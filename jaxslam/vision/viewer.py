@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxslam.extras import missing
 from jaxslam.video.calibration import Calibration
 from jaxslam.video.source import Frame
 from jaxslam.vision.landmarks import Points
@@ -142,8 +143,8 @@ class Viewer:
 def _rerun() -> Any:
     try:
         import rerun
-    except ImportError:
-        raise ValueError("a recording needs rerun: pip install 'jaxslam[viewer]'") from None
+    except ImportError as error:
+        raise missing("a recording needs", "viewer", error) from None
     return rerun
 
 

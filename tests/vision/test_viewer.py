@@ -100,7 +100,7 @@ def test_an_interruption_leaves_what_was_seen(tmp_path):
 def test_without_rerun_it_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     source = synthetic_source(frames=FRAMES)
-    with pytest.raises(ValueError, match=r"needs rerun: pip install 'jaxslam\[viewer\]'"):
+    with pytest.raises(ValueError, match=r"needs the viewer extra \(rerun is missing\)"):
         track(source, tmp_path / "out", SETTINGS, viewer=tmp_path / "seen.rrd")
     assert not list(tmp_path.iterdir())
 

@@ -1,0 +1,47 @@
+"""Where an extra is missing, the error names one that there is, for a release and for a clone."""
+
+import ast
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import jaxslam
+from jaxslam.cli import main
+
+PACKAGE = Path(jaxslam.__file__).parent
+PROJECT = Path(__file__).parents[1] / "pyproject.toml"
+
+
+@pytest.mark.parametrize("command", ["track", "calibrate"])
+def test_a_command_that_looks_at_pictures_names_the_vision_extra(command, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(SystemExit) as ended:
+        main([command, "nowhere.mp4"])
+    assert ended.value.code == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].endswith(
+        "ing needs the vision extra (cv2 is missing): pip install 'jaxslam[vision]', "
+        "or in a clone pip install '.[vision]'"
+    )
+
+
+def calls():
+    """Extras that calls of `missing` name."""
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "missing":
+                yield ast.literal_eval(node.args[1])
+
+
+def test_every_extra_that_an_error_names_is_one_of_the_projects():
+    named, extras = set(calls()), tomllib.loads(PROJECT.read_text())["project"]
+    assert named >= {"vision", "viewer", "parquet", "cluster"}
+    assert named <= set(extras["optional-dependencies"])
+
+
+def test_how_an_extra_is_installed_is_said_in_one_place():
+    saying = [path.name for path in PACKAGE.rglob("*.py") if "'jaxslam[" in path.read_text()]
+    assert saying == ["extras.py"]
