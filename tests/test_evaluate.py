@@ -26,7 +26,7 @@ KEYS = {
     "verdict", "outside3sigma", "rmse", "sigma", "axis_verdict", "convention", "alignment",
     "suggested", "identified", "notes", "runs_of_step", "band95_of_step",
     "run_names", "lost_runs", "mistakes",
-    "fitted", "scale",
+    "fitted", "scale", "truth_sigma",
 }  # fmt: skip
 
 

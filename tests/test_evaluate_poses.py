@@ -33,9 +33,12 @@ from jaxslam.evaluation.convention import (
     change,
     errors_beyond_scale,
     from_right,
+    truth_derivatives,
 )
 from jaxslam.evaluation.covariance_text import read_covariances, write_covariances
 from jaxslam.evaluation.identify import Tried, identify
+from jaxslam.evaluation.pose_arrays import checked_poses
+from jaxslam.evaluation.truth import with_truth
 from jaxslam.geometry import PLANAR, SPATIAL, difference
 from jaxslam.plots.evaluation import plot_evaluation
 from jaxslam.tum import write_tum
@@ -1065,3 +1068,99 @@ def test_faults_in_the_trackers_file_are_named(old, new, message, tmp_path):
     with pytest.raises(ValueError, match=message) as caught:
         jaxslam.evaluate_log(tmp_path)
     assert "\n" not in str(caught.value)
+
+
+# --- a truth that is measured -------------------------------------------------------------------
+
+
+def measured(truth, sigma, seed=9):
+    """True poses as an instrument sees them, of that σ (m, degrees) along the axes of the body."""
+    n, t = truth.shape[-1] - 1, 6 if truth.shape[-1] == 4 else 3
+    each = np.where(np.arange(t) < n, sigma[0], np.radians(sigma[1]))
+    noise = each * np.random.default_rng(seed).normal(size=(*truth.shape[:2], t))
+    return benchmark.displaced(truth, noise, Convention())
+
+
+@pytest.mark.parametrize("geometry", [PLANAR, SPATIAL])
+@pytest.mark.parametrize("convention", EVERY[::5], ids=str)
+def test_a_right_filter_is_consistent_with_the_sigma_of_a_measured_truth(convention, geometry):
+    sigma, (T, P, truth) = (0.02, 1.5), logged(convention, geometry)
+    seen = measured(truth, sigma)
+    exact = jaxslam.evaluate_poses(T, P, seen, convention)
+    assert exact.verdict["word"] == "over-confident"
+    assert exact.asdict()["truth_sigma"] is None
+    found = jaxslam.evaluate_poses(T, P, seen, convention, truth_sigma=sigma)
+    assert consistent(found.nees, geometry.tangent_dim)
+    assert found.asdict()["truth_sigma"] == [0.02, 1.5]
+    assert "σ of the truth, 0.02 m and 1.5°, is a part of every σ claimed" in found.notes
+
+
+@pytest.mark.parametrize("geometry", [PLANAR, SPATIAL])
+@pytest.mark.parametrize("convention", EVERY[::5], ids=str)
+def test_derivatives_by_true_poses_are_those_of_the_error(convention, geometry):
+    """Of errors that are not small: by the truth, and by the pose on which the estimate is laid."""
+    t, h = geometry.tangent_dim, 1e-6
+    T, truth, first = (some(geometry, (3,), seed, 0.5) for seed in (0, 1, 2))
+    axes = {"right": "body", "left": "world", "split": "mixed"}[convention.error]
+    fixed = Convention(convention.error, axes, convention.order)  # does not turn with the estimate
+    J, M = truth_derivatives(fixed, T, truth, first)
+
+    def moved(poses, axis, sign):
+        return benchmark.displaced(poses, sign * h * np.tile(np.eye(t)[axis], (3, 1)), Convention())
+
+    for axis in range(t):
+        by_truth, by_first = (
+            [pose_errors(fixed, *arrays(sign)) for sign in (1, -1)]
+            for arrays in (
+                lambda sign: (T, moved(truth, axis, sign)),  # noqa: B023
+                lambda sign: (moved(first, axis, sign) @ np.linalg.inv(first) @ T, truth),  # noqa: B023
+            )
+        )
+        for D, (more, less) in ((J, by_truth), (M, by_first)):
+            np.testing.assert_allclose(D[..., axis], (more - less) / (2 * h), atol=1e-7)
+    turned = truth_derivatives(convention, T, truth, first)
+    N = change(T, fixed, convention)
+    np.testing.assert_allclose(turned[0], N @ J, atol=1e-12)
+
+
+def test_the_noise_of_a_first_true_pose_moves_all_and_metres_are_the_truths():
+    """A camera in a unit of its own, 4 m, laid on the first pose of a truth that is measured."""
+    sigma, (T, P, truth) = (0.08, 1.0), logged(TRACKED, runs=80, steps=12, spread=0.5)
+    P = P.copy()
+    P[:, 0], truth[:, 0] = 0, T[:, 0]
+    truth = Similarity(Rotation.from_rotvec([0.3, 1, 0]).as_matrix(), np.ones(3), 4.0).moved(truth)
+    seen = measured(truth, sigma)
+    exact = jaxslam.evaluate_poses(T, P, seen, TRACKED, align="sim3")
+    assert exact.verdict["word"] == "over-confident"
+    found = jaxslam.evaluate_poses(T, P, seen, TRACKED, align="sim3", truth_sigma=sigma)
+    assert 4.9 < found.nees.mean() < 6.1
+    assert found.verdict["word"] != "over-confident"
+
+
+def test_with_a_joint_covariance_the_first_true_poses_noise_is_common():
+    T, P, truth = logged(Convention(), runs=2, steps=3)
+    joint = np.stack([np.kron(np.eye(3), one[0]) for one in P])
+    poses, firsts, ones = checked_poses(T, joint, truth), truth[:, 0], np.ones(2)
+    found = with_truth(poses, Convention(), (0.1, 2.0), ones, firsts)
+    assert found.joint is not None
+    blocks = found.joint.reshape(2, 3, 6, 3, 6)
+    for k in range(3):
+        np.testing.assert_allclose(blocks[:, k, :, k], found.covariances[:, k], rtol=1e-9)
+    M = truth_derivatives(Convention(), T, truth, np.repeat(firsts[:, None], 3, axis=1))[1]
+    S = np.diag([0.1**2] * 3 + [np.radians(2.0) ** 2] * 3)
+    common = M[:, 1] @ S @ np.swapaxes(M[:, 2], 1, 2)
+    np.testing.assert_allclose(blocks[:, 1, :, 2], common, rtol=1e-9, atol=1e-15)
+    assert joint[0, 0, 0] == P[0, 0, 0, 0]
+
+
+def test_the_command_takes_the_sigma_of_the_truth(tmp_path, capsys):
+    run, out = one_run(tmp_path / "run"), tmp_path / "out"
+    main(["evaluate", str(run), "--truth-sigma", "0.05", "1", "--out", str(out)])
+    assert json.loads((out / "evaluation.json").read_text())["truth_sigma"] == [0.05, 1.0]
+    assert "σ of the truth, 0.05 m and 1°" in capsys.readouterr().out
+    for wrong in ((-1, 0), (1,), (np.nan, 1), (1, 2, 3)):
+        with pytest.raises(ValueError, match="truth_sigma must be two numbers, metres and degrees"):
+            jaxslam.evaluate_log(run, truth_sigma=wrong)
+    np.savez(tmp_path / "errors.npz", errors=np.ones((2, 3, 1)), covariances=np.ones((2, 3, 1, 1)))
+    with pytest.raises(ValueError, match="are of poses, and so is σ of a truth"):
+        jaxslam.evaluate_log(tmp_path / "errors.npz", truth_sigma=(1, 1))

@@ -72,6 +72,14 @@ class EvaluateOptions:
             "By default all whose errors are not zero throughout.",
         ),
     ] = ""
+    truth_sigma: Annotated[
+        tuple[float, float] | None,
+        tyro.conf.arg(
+            metavar="METRES DEGREES",
+            help="σ of the true poses themselves, of a measured truth, along the axes of the body. "
+            "It is added to the covariances. By default the truth is exact.",
+        ),
+    ] = None
     nis: bool = False
     """The errors of a CSV or npz file are innovations, and the covariances theirs."""
     out: Path = Path("results")
@@ -103,4 +111,5 @@ class EvaluateOptions:
             align=self.align,
             axes_used=self.axes_used,
             nis=self.nis,
+            truth_sigma=self.truth_sigma,
         )

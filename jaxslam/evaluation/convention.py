@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxslam.consistency.beyond_scale import BeyondScale, beyond_scale
-from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, log
+from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, exp, log
 from jaxslam.lookup import chosen
 
 CHOICES = {
@@ -116,6 +116,19 @@ def errors_beyond_scale(
     turn = turning(convention, estimates)
     turn = turn if axes is None else turn[..., axes, :]
     return _in_float64(_beyond_scale, convention.error, estimates, truths, turn, covariances)
+
+
+def truth_derivatives(
+    convention: Convention,
+    estimates: Float[np.ndarray, "*batch d d"],
+    truths: Float[np.ndarray, "*batch d d"],
+    firsts: Float[np.ndarray, "*batch d d"],
+) -> tuple[Float[np.ndarray, "*batch t t"], Float[np.ndarray, "*batch t t"]]:
+    """J of `ξ → ξ + J η` where the truth is T Exp(η) instead; and M, where instead the estimate is
+    laid on a pose F Exp(η) instead of F, one of `firsts`: it then is F Exp(η) F⁻¹ T̂."""
+    both = _in_float64(_truth_derivatives, convention.error, estimates, truths, firsts)
+    turn = turning(convention, estimates)
+    return turn @ both[0], turn @ both[1]
 
 
 def from_right(
@@ -225,3 +238,23 @@ def _beyond_scale(
         return beyond_scale(lambda true: (turn @ told(true), P), of(truth))
 
     return jax.vmap(one)(estimates, truths, turn, P)
+
+
+@eqx.filter_jit
+def _truth_derivatives(
+    error: str, geometry: Geometry, estimates: Array, truths: Array, firsts: Array
+) -> tuple[Array, Array]:
+    of, zero = geometry.group.from_matrix, jnp.zeros(geometry.tangent_dim, estimates.dtype)
+
+    def one(estimate, truth, first):
+        T, true, F = of(estimate), of(truth), of(first)
+
+        def by_truth(eta):
+            return _error(error, T, true @ exp(geometry.group, eta))
+
+        def by_first(eta):
+            return _error(error, F @ exp(geometry.group, eta) @ F.inverse() @ T, true)
+
+        return jax.jacfwd(by_truth)(zero), jax.jacfwd(by_first)(zero)
+
+    return jax.vmap(one)(estimates, truths, firsts)

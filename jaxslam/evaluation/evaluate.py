@@ -65,6 +65,8 @@ class Evaluation:
     """The same of every axis alone; empty where nothing was fitted."""
     scale: Scale | None = None
     """Scale of the runs and its drift, where poses are given the scale or aligned by Sim(3)."""
+    truth_sigma: tuple[float, float] | None = None
+    """σ of the truth that the covariances hold too, in metres and degrees; None of an exact one."""
     run_names: tuple[str, ...] = ()
     """Of the runs, where they have names."""
 
@@ -221,6 +223,7 @@ class Evaluation:
             "axis_verdict": {n: self.axis_verdict(i) for n, i in by_axis.items()},
             "convention": None if self.convention is None else asdict(self.convention),
             "alignment": self.alignment,
+            "truth_sigma": None if self.truth_sigma is None else list(self.truth_sigma),
             "fitted": self.fitted,
             "scale": None if self.scale is None else self.scale.asdict(),
             "suggested": None if self.suggested is None else asdict(self.suggested),

@@ -35,6 +35,7 @@ def evaluate_log(
     align: str = "none",
     axes_used: str | Sequence[str] = (),
     nis: bool = False,
+    truth_sigma: Sequence[float] | None = None,
 ) -> Evaluation:
     """The verdict on what a file or a folder holds.
 
@@ -43,11 +44,12 @@ def evaluate_log(
     sub-folder, of `estimate.txt`, `covariance.txt` and `truth.txt`. Where the tracker's
     `frames.csv` is beside a trajectory, its longest map is evaluated, without frames that are lost
     or whose unit was not fixed yet. What is `stated` of the convention (`error`, `axes`, `order`,
-    `scale`) comes before what the files say. How poses are aligned, and which axes are used, see
-    `evaluate_poses`. With `nis` errors are innovations. Raises ValueError, naming the file.
+    `scale`) comes before what the files say. How poses are aligned, which axes are used, and
+    what σ the truth has, see `evaluate_poses`. With `nis` errors are innovations. Raises
+    ValueError, naming the file.
     """
     source, stated = Path(source), dict(stated or {})
-    how = {"align": align, "axes_used": axes_used}
+    how = {"align": align, "axes_used": axes_used, "truth_sigma": truth_sigma}
     if not source.exists():
         raise ValueError(f"{source}: no such file or folder")
     if source.suffix in (".npz", ".csv"):
@@ -76,10 +78,10 @@ def _evaluate_arrays(
         convention = stated_before(said, stated)
         truths = arrays["truths"]
         return evaluate_poses(arrays["estimates"], P, truths, convention, times=times, **how)
-    if stated or how["align"] != "none" or how["axes_used"]:
+    if stated or how["align"] != "none" or how["axes_used"] or how["truth_sigma"] is not None:
         raise ValueError(
-            "conventions, alignments, axes used are of poses, and here are errors, which are what "
-            "they are; estimates, covariances and truths are accepted"
+            "conventions, alignments, axes used are of poses, and so is σ of a truth; here are "
+            "errors, which are what they are; estimates, covariances and truths are accepted"
         )
     quantity = "NIS" if nis or held == ["innovations"] else "NEES"
     names = [str(name) for name in np.ravel(arrays.get("names", ()))]

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.evaluation.alignment import ALIGNMENTS
@@ -17,9 +17,10 @@ from jaxslam.evaluation.axes import estimated, named
 from jaxslam.evaluation.convention import Convention, alternatives, geometry_of, pose_errors
 from jaxslam.evaluation.evaluate import Evaluation
 from jaxslam.evaluation.identify import Identification, Tried, identify
-from jaxslam.evaluation.laid import laid
+from jaxslam.evaluation.laid import BY_FIRST, Laid, laid
 from jaxslam.evaluation.pose_arrays import Poses, checked_poses
 from jaxslam.evaluation.scale import Scale, at_one_scale, of_aligned
+from jaxslam.evaluation.truth import checked_sigma, note, with_truth
 from jaxslam.geometry import Geometry
 from jaxslam.lookup import chosen
 
@@ -52,6 +53,7 @@ def evaluate_poses(
     align: str = "none",
     axes_used: str | Sequence[str] = (),
     times: ArrayLike | None = None,
+    truth_sigma: Sequence[float] | None = None,
 ) -> Evaluation:
     """The verdict on a filter from its poses T_wc, m, and the true ones.
 
@@ -63,8 +65,10 @@ def evaluate_poses(
     if that is exactly known, else to all positions. The covariance is transported with it. Given
     the scale of the world, or with `sim3`, NEES is at one scale a run, and the drift of scale is
     judged beside it. Of a robot that moves in a plane `axes_used` are those that it estimates, as
-    ("x", "y", "rz"); by default all whose errors are not zero throughout. Whether another
-    convention would make the data consistent is tried too. Raises ValueError, naming run and step.
+    ("x", "y", "rz"); by default all whose errors are not zero throughout. A truth that is measured
+    has a `truth_sigma`, of position (m) and orientation (degrees), along the axes of the body,
+    which is added to the covariances. Whether another convention would make the data consistent is
+    tried too. Raises ValueError, naming run and step.
     """
     stated = convention or Convention()
     if not isinstance(stated, Convention):
@@ -73,25 +77,29 @@ def evaluate_poses(
         )
     chosen("align", [align], dict.fromkeys(ALIGNMENTS))
     poses = checked_poses(estimates, covariances, truths)
-    at = step_times(times, poses.estimates.shape[1])
-    found = as_stated(poses, stated, align, named(axes_used, poses.estimates, stated))
+    at, sigma = step_times(times, poses.estimates.shape[1]), checked_sigma(truth_sigma)
+    found = as_stated(poses, stated, align, named(axes_used, poses.estimates, stated), sigma)
     start = len(at) - found.steps
     return replace(
         found,
         times=at[start:],
         timed=times is not None,
-        identified=_identified(poses, stated, align, found.names),
+        identified=_identified(poses, stated, align, found.names, sigma),
     )
 
 
 def as_stated(
-    poses: Poses, stated: Convention, align: str = "none", used: tuple[str, ...] = ()
+    poses: Poses,
+    stated: Convention,
+    align: str = "none",
+    used: tuple[str, ...] = (),
+    truth_sigma: tuple[float, float] | None = None,
 ) -> Evaluation:
     """The verdict in the convention that is stated, without a look at others."""
     told: tuple[str, ...] = ()
     if not used:
         used, told = estimated(poses, stated, align)
-    found = _compared(poses, stated, align, used)
+    found = _compared(poses, stated, align, used, truth_sigma)
     return Evaluation(
         quantity="NEES",
         dof=len(used),
@@ -107,6 +115,7 @@ def as_stated(
         fitted=found.fitted,
         axis_fitted=tuple(float(x) for x in found.axis_fitted),
         scale=found.scale,
+        truth_sigma=truth_sigma,
     )
 
 
@@ -114,7 +123,13 @@ def _sigmas(covariances: Float[np.ndarray, "*batch m m"]) -> Float[np.ndarray, "
     return np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
 
 
-def _compared(poses: Poses, convention: Convention, align: str, used: tuple[str, ...]) -> _Compared:
+def _compared(
+    poses: Poses,
+    convention: Convention,
+    align: str,
+    used: tuple[str, ...],
+    truth_sigma: tuple[float, float] | None,
+) -> _Compared:
     """Errors and covariances along axes of these names, aligned, at one scale where it is free."""
     names = convention.names(geometry_of(poses.estimates))
     axes = np.array([i for i, name in enumerate(names) if name in used])
@@ -127,6 +142,10 @@ def _compared(poses: Poses, convention: Convention, align: str, used: tuple[str,
     fitted, axis_fitted, scale, notes = 0.0, np.zeros(len(axes)), None, (*known, *world.notes)
     if world.given:
         normalised(errors, P)  # refuses what is not positive definite, by run and step
+    if truth_sigma is not None:
+        later = _with_truth(world, later, convention, axes, truth_sigma)
+        P, notes = later.covariances[..., axes[:, None], axes], (*notes, note(truth_sigma))
+    if world.given:
         errors, P, fitted, axis_fitted, scale = at_one_scale(later, convention, axes)
         notes += (BEYOND,)
     elif align == "sim3":
@@ -143,6 +162,21 @@ def _later(poses: Poses, start: int, logged: Bool[np.ndarray, "runs steps"]) -> 
     return Poses(poses.estimates[:, start:], P, poses.truths[:, start:], there, joint)
 
 
+def _with_truth(
+    world: Laid,
+    later: Poses,
+    convention: Convention,
+    axes: Int[np.ndarray, " m"],
+    truth_sigma: tuple[float, float],
+) -> Poses:
+    """With the σ of the truth, in the unit of the estimate where their ratio is free."""
+    first, log_scale = np.argmax(world.poses.logged, axis=1), np.zeros(len(later.logged))
+    firsts = world.poses.truths[range(len(first)), first] if BY_FIRST in world.notes else None
+    if world.given:
+        log_scale = np.nan_to_num(at_one_scale(later, convention, axes).scale.log_scale)
+    return with_truth(later, convention, truth_sigma, np.exp(log_scale), firsts)
+
+
 def _log_scales(before: Poses, after: Poses) -> Float[np.ndarray, " runs"]:
     """log of the estimate's unit relative to the truth's, of what a Sim(n) did to each run."""
     spreads = (
@@ -154,7 +188,11 @@ def _log_scales(before: Poses, after: Poses) -> Float[np.ndarray, " runs"]:
 
 
 def _identified(
-    poses: Poses, stated: Convention, align: str, used: tuple[str, ...]
+    poses: Poses,
+    stated: Convention,
+    align: str,
+    used: tuple[str, ...],
+    truth_sigma: tuple[float, float] | None,
 ) -> Identification:
     """Among the conventions of the same scale; given the scale, where none of them does."""
     geometry = geometry_of(poses.estimates)
@@ -163,7 +201,7 @@ def _identified(
         result = {}
         for convention in conventions:
             with suppress(ValueError):  # a wrong one may make no covariance of its numbers
-                found = _compared(poses, convention, align, used)
+                found = _compared(poses, convention, align, used, truth_sigma)
                 result[convention] = _tried(convention, geometry, found, used)
         return result
 
