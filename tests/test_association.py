@@ -170,6 +170,23 @@ def test_joint_compatibility_is_bounded_by_the_numbers_of_all_that_are_in(count)
         assert np.sum(compiled["jcbb"](matches)) == believed
 
 
+def test_ransac_rescues_what_only_all_of_low_innovation_together_explain():
+    """Residuals are θ + d φ, φ at four of its σ. Eighteen matches of small d hardly feel φ and
+    agree with one another. That of d = 10 fits none of them alone, but it fits them together, as
+    they tell φ; and a match that is off by itself fits neither (Civera et al. 2010)."""
+    d = np.append(np.tile([0.5, -0.5], 9), [10.0, 0.0])
+    S = np.zeros((M, 2, M, 2))
+    S[:, 0, :, 0] = 100.0**2 + np.outer(d, d) + np.eye(M)
+    S[:, 1, :, 1] = np.eye(M)
+    r = np.zeros((M, 2))
+    r[:, 0] = 7.0 + 4.0 * d
+    r[-1, 0] += 10.0
+    matches = Candidates(jnp.asarray(r), jnp.asarray(S), jnp.ones(M, bool), jnp.arange(M))
+    apart = np.asarray(association._distances_given_one(matches))
+    assert (apart[:18, 18] > matches.gate).all()
+    assert compiled["ransac"](matches).tolist() == [True] * 19 + [False]
+
+
 @pytest.mark.parametrize("seed", [19, 58, 90])
 def test_a_first_match_that_was_wrong_does_not_stay_nor_what_it_kept_out(seed):
     matches, bad = found(np.random.default_rng(seed), 0.3)

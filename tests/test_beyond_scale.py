@@ -9,6 +9,7 @@ import pytest
 from cases import Case, each_geometry, named, pose, quick_jit
 from scipy import stats
 
+from jaxslam.consistency import sums
 from jaxslam.consistency.beyond_scale import (
     NOTICEABLE,
     SCALES,
@@ -260,3 +261,15 @@ def test_poses_before_the_unit_is_fixed_keep_a_scale_of_their_own():
     nothing = one_scale(nees, log_scale, sigma, np.zeros_like(nees, bool))
     np.testing.assert_array_equal(nothing.nees, nees)
     assert np.isnan(nothing.log_scale).all()
+
+
+def test_what_is_claimed_of_drifts_is_summed_over_poses_that_have_one():
+    nees, log_scale, sigma = constructed(20, 0.0)
+    sigma = sigma * np.linspace(1, 2, 20)
+    fixed = np.broadcast_to(np.arange(20) >= 5, nees.shape)
+    one = one_scale(nees, log_scale, sigma, fixed)
+    ones = np.ones_like(nees)
+    records = {"log_scale": 0 * ones, "log_scale_sigma": ones, "reversed": np.nan * ones}
+    found = sums._of_scale({**records, "unit_log_scale_sigma": sigma}, one, 10.0)
+    np.testing.assert_array_equal(found["drift_count"], fixed.sum(axis=0))
+    np.testing.assert_allclose(found["drift_variance"], (fixed * sigma**2).sum(axis=0))

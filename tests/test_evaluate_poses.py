@@ -27,6 +27,7 @@ from jaxslam.evaluation.alignment import (
     projected,
     similarity,
 )
+from jaxslam.evaluation.axes import _constant, estimated
 from jaxslam.evaluation.convention import (
     CHOICES,
     alternatives,
@@ -38,6 +39,7 @@ from jaxslam.evaluation.convention import (
 from jaxslam.evaluation.covariance_text import read_covariances, write_covariances
 from jaxslam.evaluation.identify import Tried, identify
 from jaxslam.evaluation.pose_arrays import checked_poses
+from jaxslam.evaluation.scale import Scale
 from jaxslam.evaluation.truth import with_truth
 from jaxslam.geometry import PLANAR, SPATIAL, difference
 from jaxslam.plots.evaluation import plot_evaluation
@@ -356,6 +358,27 @@ def test_the_command_takes_axes_used(tmp_path, capsys):
         jaxslam.evaluate_log(tmp_path / "e.npz", axes_used="x")
 
 
+@pytest.mark.parametrize(("correlation", "left_out"), [(0.0, True), (0.3, False)])
+def test_an_axis_of_small_errors_is_estimated_where_it_is_correlated(correlation, left_out):
+    """Heights that are off by a millionth of their σ; with a correlation, they are told by x."""
+    T, P, truth, _ = planar(other=1.0)
+    T, P = T.copy(), P.copy()
+    T[..., 2, 3] += 1e-6 * np.random.default_rng(1).normal(size=T.shape[:2])
+    P[..., 0, 2] = P[..., 2, 0] = correlation * np.sqrt(P[..., 0, 0] * P[..., 2, 2])
+    used, notes = estimated(checked_poses(T, P, truth), Convention("split"), "none")
+    assert ("z" not in used) == left_out
+    assert notes
+
+
+def test_axes_whose_variance_never_changes_stand_out_only_beside_others():
+    T, P, truth, _ = planar()
+    assert not _constant(checked_poses(T, P, truth)).any()
+    growing = P * np.linspace(1, 2, P.shape[1])[:, None, None]
+    growing[..., 2, 2] = 1e-6
+    found = _constant(checked_poses(T, growing, truth))
+    assert found.tolist() == [False, False, True, False, False, False]
+
+
 # --- one scale a run ----------------------------------------------------------------------------
 
 
@@ -387,6 +410,24 @@ def test_a_drift_of_scale_is_over_confident_and_named(tmp_path):
     plot_evaluation(found, tmp_path / "evaluation.png")
     panels = [axes.get_title() for axes in plot_evaluation(found).axes]
     assert sum(title.startswith("scale") for title in panels) == 1
+
+
+@pytest.mark.parametrize(("factor", "disproved"), [(0.3, False), (3.0, True)])
+def test_a_drift_smaller_than_its_sigma_is_no_fault(factor, disproved):
+    """The verdict knows that σ is wrong both times; only a drift beyond it is named."""
+    drift = factor * np.random.default_rng(0).normal(size=(50, 10))
+    found = Scale(np.zeros(50), drift, np.ones_like(drift), drift**2, 0.0)
+    assert found.verdict is not None
+    assert found.verdict["p"] < 1e-6
+    assert found.disproved == disproved
+    assert ("over-confident" in found.sentence) == disproved
+
+
+def test_the_size_of_a_drift_is_that_of_the_poses_that_tell_it():
+    """A pose of σ = 1 tells a hundredth of what one of σ = 0.1 does."""
+    drift, sigma = np.array([[0.2, 1.0, np.nan]]), np.array([[0.1, 1.0, np.inf]])
+    found = Scale(np.zeros(1), drift, sigma, (drift / sigma) ** 2, 1.0)
+    assert found.rms == pytest.approx(np.sqrt((100 * 0.2**2 + 1) / 101), rel=1e-12)
 
 
 def test_with_the_joint_covariance_the_scale_is_the_exact_one():

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from jaxslam.consistency import Tally, lost_threshold, not_disproved, run_verdict
-from jaxslam.consistency.looks import Look
+from jaxslam.consistency.looks import VERDICT_CONFIDENCE, Look
 from jaxslam.consistency.statistics import PowerSums, shortfall_limits, shortfall_p_value
 from jaxslam.consistency.verdict import sentences
 
@@ -178,6 +178,17 @@ def test_the_end_alone_decides_where_only_it_is_wrong():
     assert (found["word"], found["of"]) == ("over-confident", "last step")
     assert found["nees"] == pytest.approx(nees[:, -1].mean())
     assert found["interval99"] == found["end"]["interval99"]
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3])
+def test_what_all_looks_may_fail_together_is_one_in_a_hundred(steps):
+    """Bonferroni: half for the mean over all steps, the other half shared by the parts."""
+    looks = Tally.of(np.random.default_rng(0).chisquare(3, (20, steps)), 3).looks()
+    levels = [look.level for look in looks]
+    assert sum(levels) == pytest.approx(1 - VERDICT_CONFIDENCE)
+    if steps > 1:
+        assert levels[0] == pytest.approx(sum(levels[1:]))
+    assert len(set(levels[1:])) == min(len(levels) - 1, 1)
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3])

@@ -453,6 +453,30 @@ def test_accelerations_whose_size_is_not_told_follow_the_scale():
     assert rest < s.squared - 1
 
 
+def test_the_mean_is_shifted_without_the_accelerations_whose_size_is_not_told():
+    """Neither their prior nor their volume has a part in where both balance."""
+    slam, record, *_ = case(*CASES[3])
+    at = minimum(*CASES[3])
+    fitted = replace(slam, motion=replace(slam.motion, noise_told=False))
+    local, s = quick_jit(reduced)(slam, record, at.x, at.y), quick_jit(scaling)(slam, record, at)
+    factor = cholesky(local.information)
+    layout, m = Layout.of(slam), record.frames - 1
+    free = np.zeros(at.x.size, bool)
+    free[layout.whole :].reshape(m, -1)[:, :3] = True
+    whole = scale._slope_of_volume(slam, local, s, factor, jnp.zeros_like(free))
+    told = scale._slope_of_volume(slam, local, s, factor, jnp.asarray(free))
+    by_x, _ = variances(local, factor.whitening)
+    np.testing.assert_allclose(whole - told, np.sum(1 - by_x[free]), rtol=1e-9)
+    shift = quick_jit(shift_of_scale)(fitted, record, at, local, factor)
+    assert 1e-3 < abs(shift) < scale.MOST_SHIFT
+
+    def prior(log_scale):
+        x, y = rescaled(slam, record, at, log_scale)
+        return (np.sum(x[~free] ** 2) + np.sum(y**2)) / 2
+
+    np.testing.assert_allclose((prior(shift + 1e-4) - prior(shift - 1e-4)) / 2e-4, told, rtol=1e-4)
+
+
 # What the filter goes on from
 
 
@@ -563,6 +587,21 @@ def test_a_mode_that_is_next_to_impossible_is_none(monkeypatch):
     weights = jax.nn.log_softmax(-costs / 2)[jnp.array([1, 0, 3])]
     np.testing.assert_allclose(found.log_weights, jnp.append(weights, -jnp.inf), rtol=1e-12)
     np.testing.assert_array_equal(found.minima.x[:3], at.x[jnp.array([1, 0, 3])])
+
+
+@pytest.mark.parametrize(("better", "worse", "count"), [(0.25, 4.0, 1), (4.0, 0.25, 2)])
+def test_minima_are_one_by_the_information_of_the_better(better, worse, count, monkeypatch):
+    """Two at the distance 1: less than one σ of the better, or two."""
+    at = jax.vmap(started)(jnp.array([[0.0, 0.0], [1.0, 0.0]]), jnp.zeros((2, 1, 3)))
+    at = replace(at, cost=jnp.array([2.0, 0.0]))
+
+    def weighed(slam, now, record):
+        told = jnp.where(now.minimum.cost == 0, better, worse) * jnp.eye(2)
+        return now._replace(evidence=-now.minimum.cost / 2, information=told)
+
+    monkeypatch.setattr(modes, "_weighed", weighed)
+    found = modes._likeliest(None, jnp.zeros(()), at, jnp.ones(2, bool), 2)
+    assert np.isfinite(found.log_weights).sum() == count
 
 
 def test_a_metre_that_is_not_known_stays_so_and_changes_nothing_else():

@@ -2,6 +2,8 @@
 
 import csv
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -253,6 +255,19 @@ def test_the_unit_is_that_in_which_the_mean_nearness_stays():
     assert np.exp(-lengthened(flat, known, range(3))) * omegas.mean() == pytest.approx(0.5)
     assert lengthened(before, now, []) == lengthened({}, now, [7]) == 0.0
     assert lengthened({2: 0.0}, {2: 0.1}, [2]) == 0.0
+
+
+def test_the_unit_is_told_by_landmarks_that_were_found_again_until_it_is_fixed():
+    """Landmark 8 was seen once: its depth is what the prior says, and says nothing."""
+    landmarks = {0: SimpleNamespace(number=7, found=2), 1: SimpleNamespace(number=8, found=0)}
+    tracker: Any = SimpleNamespace(
+        landmarks=landmarks, _near={7: 1.0, 8: 1.0}, _nearness=lambda: {7: 2.0, 8: 50.0},
+        _origin=Located(np.eye(4)), _log_unit=0.3, _unit_fixed=False,
+    )  # fmt: skip
+    for fixed, units in ((False, 1), (True, 2), (True, 2)):
+        Tracker._locate(tracker, np.eye(4), np.zeros((6, 6)), 1.0, 0.0, fixed, begins=False)
+        assert tracker._log_unit == pytest.approx(0.3 + units * np.log(2.0), rel=1e-12)
+        assert tracker._unit_fixed is fixed
 
 
 def test_a_pose_in_another_unit_has_the_errors_in_that_unit():
