@@ -10,7 +10,6 @@ writes it from what is there.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise
@@ -81,6 +80,8 @@ def measure(scenario: jaxslam.Scenario, name: str, seed: int, options: Options) 
         "layout": LAYOUT,
         "runs": options.runs,
         "tally": tally(study, key).asdict(),
+        "one_scale": tally(study, key, "beyond_scale").asdict(),
+        "drift": tally(study, key, "drift").asdict(),
         "nees": _rounded(f["nees"]),
         "lost": round(f["lost"][-1] * options.runs),
         "nees_median": _rounded(f["nees_median"][-1:])[0],
@@ -112,6 +113,7 @@ def pooled(seeds: Seeds) -> dict[str, Any]:
         "seeds": named(seeds),
         "runs": total.runs,
         "verdict": total.verdict(),
+        **_at_one_scale(one),
         "band95": mean_band(total.dof, max(sum(survivors), 1)),
         "nees": _weighed(np.array([seed["nees"] for seed in one], float), survivors),
         "lost": 1 - sum(kept) / total.runs,
@@ -119,6 +121,16 @@ def pooled(seeds: Seeds) -> dict[str, Any]:
         "nees_median": float(np.mean(_column(one, "nees_median"))),
         "nis_per_dof": float(np.mean(_column(one, "nis_per_dof"))),
         **{key: float(np.sqrt(_weighed(square, survivors))) for key, square in squared.items()},
+    }
+
+
+def _at_one_scale(one: list[dict[str, Any]]) -> dict[str, Any]:
+    """Verdicts on NEES at one scale a run and on the drift of scale, where seeds have both."""
+    if any("drift" not in seed for seed in one):
+        return {}
+    return {
+        key: reduce(add, (Tally.from_dict(seed[key]) for seed in one)).verdict()
+        for key in ("one_scale", "drift")
     }
 
 
@@ -142,8 +154,11 @@ def page(results: Results, verdicts: Path = VERDICTS) -> str:
         "all runs of its seeds. NEES is of the camera's pose (ideal mean 3, 6 in 6-DoF). *All",
         "steps*: the mean of the runs' time averages; *σ should be ×*: √(it/ideal), with its",
         "interval; *verdict*: of all steps, the last one and each third of them together, and",
-        "which part decided, if one did; *never lost*: the first two numbers of the runs lost at",
-        "no step (this choice makes a consistent filter's NEES low by up to .4 %). *Steps*: the",
+        "which part decided, if one did; *at one scale a run*: the verdict on NEES at the scale of",
+        "each run that explains its poses best, and on the drift of scale along it, of which only",
+        "over-confidence can be proven ([one unit a map](gauge.md)); *never lost*: the first two",
+        "numbers of the runs lost at no step (this choice makes a consistent filter's NEES low by",
+        "up to .4 %). *Steps*: the",
         "mean NEES of all runs, bold inside the exact 95 % band of so many; *lost*: runs above the",
         "99.99 % quantile of χ² at the last step, *ever*: at any; *others*: mean NEES of those not",
         "lost at the last step; median, RMSE and σ of the position there. –: a run diverged, and",
@@ -151,28 +166,34 @@ def page(results: Results, verdicts: Path = VERDICTS) -> str:
         "",
         *_of_verdicts(verdicts),
     ]
-    if any("thirds" not in seed["tally"] for seed in _seeds(results)):
+    if any(_old(seeds) for filters in results.values() for seeds in filters.values()):
         lines += [
             "",
-            "The studies below were tallied before a verdict looked at thirds, and *ever* by the",
-            "quantile of one step: their verdicts are of all steps and of the last one.",
+            "†: tallied before a verdict looked at thirds, *ever* by the quantile of one step, and",
+            "without drift: such a verdict is of all steps and of the last one.",
         ]
     for name, filters in results.items():
         lines += [
             "",
             f"## `{name}`",
             "",
-            "| filter | seeds × runs | NEES, all steps | σ should be × | verdict | never lost "
+            "| filter | seeds × runs | NEES, all steps | σ should be × | verdict "
+            "| at one scale a run; drift | never lost "
             f"| NEES at steps {', '.join(map(str, STEPS))}, last | lost | ever | others | median "
             "| RMSE m | σ m | NIS/dof |",
-            "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
-            *(_row(key, pooled(seeds), len(seeds)) for key, seeds in filters.items() if seeds),
+            "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+            *(
+                _row(key + " †" * _old(seeds), pooled(seeds), len(seeds))
+                for key, seeds in filters.items()
+                if seeds
+            ),
         ]
     return "\n".join(lines) + "\n"
 
 
-def _seeds(results: Results) -> Iterator[dict[str, Any]]:
-    return (seed for f in results.values() for seeds in f.values() for seed in seeds.values())
+def _old(seeds: Seeds) -> bool:
+    """Whether any of them was tallied without thirds and drift."""
+    return any("drift" not in seed for seed in seeds.values())
 
 
 def _of_verdicts(path: Path) -> list[str]:
@@ -204,11 +225,12 @@ def _row(name: str, p: dict[str, Any], seeds: int) -> str:
     low, high = p["band95"] if verdict["nees"] is not None else (np.inf, -np.inf)
     nees = [p["nees"][step] for step in (*(s - 1 for s in STEPS if s < len(p["nees"])), -1)]
     cells = [
-        f"`{name}`",
+        f"`{name}`{'' if 'drift' in p else ' †'}",
         f"{p['seeds']} × {p['runs'] / seeds:g}",
         _short(mean["nees"]),
         _factor(mean),
         f"{verdict['word']}{decided}",
+        "; ".join(p[key]["word"] for key in ("one_scale", "drift") if key in p) or "–",
         f"{_short(verdict['never_lost']['nees'])}, {_factor(verdict['never_lost'])}",
         " ".join(f"**{_short(n)}**" if low <= n <= high else _short(n) for n in nees),
         f"{p['lost']:.2%}",

@@ -21,8 +21,10 @@ NAME = "robocentric/inverse_scaling"
 def measured(nees):
     """What `measure` returns of runs with these NEES."""
     tally = Tally.of(nees, 3)
+    one, drift = Tally.of(nees, 3, 1.0), Tally.of(nees / 3, 1, 1.0)
     return {
         "layout": benchmark.LAYOUT, "runs": len(nees), "tally": tally.asdict(),
+        "one_scale": one.asdict(), "drift": drift.asdict(),
         "nees": list(nees.mean(axis=0)), "lost": int(np.sum(nees[:, -1] > 21.1)),
         "nees_not_lost": float(np.mean(nees[nees[:, -1] <= 21.1, -1])), "nees_median": 2.4,
         "rmse": 0.3, "sigma": 0.1, "nis_per_dof": 1.0, "microseconds_per_step": 1.0,
@@ -110,13 +112,13 @@ def test_a_row_says_what_was_lost_and_which_means_are_in_the_band():
     row = benchmark._row("x/y", benchmark.pooled({"4": measured(nees)}), 1)
     assert row.startswith("| `x/y` | 4 × 1000 | 3.85 | 1.133 [1.087, 1.181] |")
     assert "over-confident" in row
-    at_steps = row.split("|")[7].split()
+    at_steps = row.split("|")[8].split()
     assert all(float(value) > 3.3 for value in at_steps)
     assert "| 2.00% | 2.10% | 3.43 |" in row
     assert len(row.split("|")) == len(benchmark.page({"m": {}}).splitlines()[-1].split("|"))
     nees[:, 4] /= 1.2
     row = benchmark._row("x/y", benchmark.pooled({"4": measured(nees)}), 1)
-    assert row.split("|")[7].split()[0].startswith("**")
+    assert row.split("|")[8].split()[0].startswith("**")
 
 
 def test_a_row_names_the_part_that_decided():
@@ -129,10 +131,13 @@ def test_a_row_names_the_part_that_decided():
 
 def test_seeds_tallied_without_thirds_have_a_verdict_and_the_page_says_so():
     found = measured(np.random.default_rng(4).chisquare(3, (300, 12)))
-    old = found | {"tally": {k: v for k, v in found["tally"].items() if k != "thirds"}}
+    old = {k: v for k, v in found.items() if k not in ("one_scale", "drift")}
+    old["tally"] = {k: v for k, v in found["tally"].items() if k != "thirds"}
     assert benchmark.pooled({"0": old})["verdict"]["thirds"] == []
     for seed, told in ((found, False), (old, True)):
         page = benchmark.page({"matched": {NAME: {"0": seed}}})
+        assert (f"| `{NAME}` † | 0 × 300 |" in page) is told
+        assert ("| – |" in page) is told
         assert ("tallied before a verdict looked at thirds" in page) is told
 
 
