@@ -182,11 +182,7 @@ def page(results: Results, verdicts: Path = VERDICTS) -> str:
             f"| NEES at steps {', '.join(map(str, STEPS))}, last | lost | ever | others | median "
             "| RMSE m | σ m | NIS/dof |",
             "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
-            *(
-                _row(key + " †" * _old(seeds), pooled(seeds), len(seeds))
-                for key, seeds in filters.items()
-                if seeds
-            ),
+            *(_row(key, pooled(seeds), len(seeds)) for key, seeds in filters.items() if seeds),
         ]
     return "\n".join(lines) + "\n"
 
