@@ -10,6 +10,7 @@ writes it from what is there.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise
@@ -19,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import tyro
-from pages import END
+from pages import END, write_table
 from verdicts import BEGIN
 from verdicts import table as table_of_verdicts
 
@@ -33,6 +34,11 @@ Results = dict[str, dict[str, Seeds]]
 LAYOUT = 2
 """Of what `measure` returns; what has another is measured again."""
 VERDICTS = Path("benchmarks/results/verdicts.json")
+RESULTS = Path("docs/results.md")
+README = Path("README.md")
+"""Pages with a table of the paper's filter and the recommended one, behind `MARK`."""
+MARK = "<!-- consistency.py -->"
+IN_README = ("matched", "matched-loose", "matched-forward-loose")
 STEPS = (5, 10)
 """Steps whose mean NEES the page shows, beside the last."""
 
@@ -64,7 +70,7 @@ class Options:
     docs: Path = Path("docs/consistency.md")
     """The page."""
     page: bool = False
-    """Measure nothing; write the page."""
+    """Measure nothing; write the page, and the tables of the README and of docs/results.md."""
 
 
 def measure(scenario: jaxslam.Scenario, name: str, seed: int, options: Options) -> dict[str, Any]:
@@ -240,11 +246,35 @@ def _row(name: str, p: dict[str, Any], seeds: int) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _factor(found: dict[str, Any]) -> str:
+def recommended(results: Results, scenarios: Iterable[str]) -> str:
+    """The table of the paper's filter and the recommended one, by scenario."""
+    rows = [
+        "| scenario | filter | NEES: all; last | σ should be × | verdict | lost | RMSE, σ, m |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for scenario in scenarios:
+        for name, seeds in results[scenario].items():
+            label = "recommended" if "+scene50" in name else name.split("/")[0]
+            if label in ("robocentric", "recommended"):
+                rows.append(f"| `{scenario}` | `{label}` {_cells(pooled(seeds))}")
+    return "\n".join(rows)
+
+
+def _cells(p: dict[str, Any]) -> str:
+    verdict, mean = p["verdict"], p["verdict"]["mean"]
+    decided = "" if verdict["of"] == "all steps" else f" ({verdict['of']})"
+    return (
+        f"| {_short(mean['nees'])}; {_short(p['nees'][-1])} | {_factor(mean, 2)} "
+        f"| {verdict['word']}{decided} | {p['lost']:.1%} | {p['rmse']:.3f}, {p['sigma']:.3f} |"
+    )
+
+
+def _factor(found: dict[str, Any], digits: int = 3) -> str:
     factor, (low, high) = found["sigma_factor"], found["interval99"]
     if factor is None:
         return _short(factor)
-    return f"{factor:.3f} [{low:.3f}, {'–' if high is None else f'{high:.3f}'}]"
+    told = "–" if high is None else f"{high:.{digits}f}"
+    return f"{factor:.{digits}f} [{low:.{digits}f}, {told}]"
 
 
 def named(seeds: Seeds) -> str:
@@ -298,8 +328,12 @@ def main(options: Options) -> None:
                 found = measure(scenario, name, seed, options)
                 add_to(options.out, scenario_name, name, seed, found)
                 print(scenario_name, _row(name, pooled({str(seed): found}), 1), flush=True)
+    results = read(options.out)
     with write_atomically(options.docs) as path:
-        path.write_text(page(read(options.out)))
+        path.write_text(page(results))
+    if options.page:
+        write_table(README, MARK, recommended(results, IN_README))
+        write_table(RESULTS, MARK, recommended(results, results))
 
 
 if __name__ == "__main__":

@@ -149,3 +149,14 @@ def test_a_diverged_run_leaves_a_row_without_a_mean():
     row = benchmark._row("x/y", benchmark.pooled({"0": found}), 1)
     assert row.startswith("| `x/y` | 0 × 50 | – | – | lost | ")
     assert "**" not in row
+
+
+def test_the_tables_of_the_pages_say_what_the_numbers_on_disk_say():
+    folder = Path(__file__).resolve().parents[1]
+    results = benchmark.read(folder / "benchmarks/results/consistency.json")
+    for page, scenarios in (("README.md", benchmark.IN_README), ("docs/results.md", results)):
+        table = benchmark.recommended(results, scenarios)
+        assert f"{benchmark.MARK}\n\n{table}\n\n" in (folder / page).read_text(), page
+    assert (folder / "docs/consistency.md").read_text() == benchmark.page(
+        results, folder / "benchmarks/results/verdicts.json"
+    )

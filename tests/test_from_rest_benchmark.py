@@ -79,6 +79,30 @@ def test_the_page_says_what_the_numbers_on_disk_say():
         assert f"\n\n{part}\n\n" in page
 
 
+def test_other_pages_quote_the_numbers_on_disk():
+    folder = Path(__file__).resolve().parents[1]
+    results = json.loads((folder / "benchmarks/results/from_rest.json").read_text())
+    space = results["standstill-6dof"]["scale_gauge+scene50+mixture3+rest8"]
+    plane = results["standstill"]["scale_gauge+scene50+mixture5+rest"]
+    lost, above = zip(*(_at_most_lost_and_above(found) for found in (space, plane)), strict=True)
+    which = (folder / "docs/which-filter.md").read_text()
+    assert f"of {plane['runs']} runs at most {lost[1] / plane['runs']:.1%}" in which.replace(
+        " %", "%"
+    )
+    for runs in above:
+        assert f"above its band at {runs} of these 51 frames" in which
+    words = {5: "five", 10: "ten"}
+    assert f"of {space['runs']} runs at most {words[lost[0]]} lost" in which
+    page = (folder / "docs/results.md").read_text().replace("\n", " ")
+    assert f"of {space['runs']} simulated runs at most {words[lost[0]]} are lost" in page
+    assert f"of {plane['runs']} at most {words[lost[1]]}" in page
+
+
+def _at_most_lost_and_above(found):
+    lost = max(round(found["runs"] * x) for x in found["lost"][9:60])
+    return lost, sum(not x <= found["band95"][1] for x in found["nees"][9:60])
+
+
 def test_the_table_stands_in_its_place_and_replaces_the_old_one(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
