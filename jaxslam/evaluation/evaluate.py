@@ -285,7 +285,7 @@ class Evaluation:
         steps = f"{self.steps} step{'s' if self.steps > 1 else ''}"
         return [
             f"{runs} of {steps}; mean {self.quantity} of a consistent filter "
-            f"{self._expected}, at one step in {low:.3f}–{high:.3f} with 95 %; "
+            f"{self.expected}, at one step in {low:.3f}–{high:.3f} with 95 %; "
             f"{self.inside:.0%} of the steps are inside",
             _columns("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
             *(self._row(i) for i in range(len(self.names))),
@@ -293,7 +293,8 @@ class Evaluation:
         ]
 
     @property
-    def _expected(self) -> str:
+    def expected(self) -> str:
+        """The mean NEES of a consistent filter: `6`, or `5–6` where a scale was fitted."""
         return f"{self.dof - self.fitted:g}–{self.dof}" if self.fitted else str(self.dof)
 
     def _row(self, axis: int) -> str:

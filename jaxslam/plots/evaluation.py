@@ -97,7 +97,7 @@ def plot_nees(
     bottom, top = ax.get_ylim()
     ax.set_ylim(min(bottom, evaluation.dof / 2), max(top, evaluation.dof * 2))
     name_numbers(ax.yaxis)
-    ax.set_ylabel(f"mean {evaluation.quantity} (ideal {evaluation.dof})")
+    ax.set_ylabel(f"mean {evaluation.quantity} (ideal {evaluation.expected})")
     told = f"{evaluation.quantity} of {_runs(evaluation)}\ngrey: exact 95 % band of one step"
     set_title(ax, told)
     return _over_time(evaluation, ax)
