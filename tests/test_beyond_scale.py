@@ -21,6 +21,7 @@ from jaxslam.consistency.montecarlo import filter_run
 from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.geometry import PLANAR, difference, identity, joined, retract, scaled
 from jaxslam.simulation import sensor_of
+from jaxslam.slam.readouts import camera_pose_in_unit
 
 FALSE_ALARM = 1e-6
 """Share of seeds on which a statistical test here would fail although nothing is wrong."""
@@ -166,22 +167,28 @@ def test_of_a_filter_it_is_the_least_nees_over_all_scales(name):
     records, path, state = quick_jit(partial(filter_run, slam, case.room, sensor))(run)
     truth = jax.tree.map(lambda x: x[-1], run.poses)
 
-    P = slam.pose_error(state, truth)[1]
+    def error_in_unit(T):
+        seen = camera_pose_in_unit(slam, state)
+        return difference(T, seen.pose), seen.covariance
 
-    def nees(log_scale):
-        return normalised_squared(slam.pose_error(state, scaled(truth, jnp.exp(log_scale)))[0], P)
+    metric = partial(slam.pose_error, state)
+    in_unit = metric if name == "robocentric" else error_in_unit
+    for error, own in ((metric, ""), (in_unit, "unit_")):
+        P = error(truth)[1]
 
-    least, best = records["beyond_scale"][-1], records["log_scale"][-1]
-    around = best + np.linspace(-3.0, 3.0, 121)
-    over_scales = np.asarray(quick_jit(jax.vmap(nees))(around))
-    assert over_scales.argmin() == 60
-    np.testing.assert_allclose(over_scales[60], least, rtol=1e-6)
-    assert (records["beyond_scale"] <= records["nees"] * (1 + 1e-9)).all()
-    assert records["nees"][-1] > 1.001 * least  # the scale is wrong by something
-    # σ by the curvature of what is minimised, 2/σ², by differences.
-    h = 1e-3
-    curvature = (nees(best + h) - 2 * nees(best) + nees(best - h)) / h**2
-    np.testing.assert_allclose(curvature, 2 / records["log_scale_sigma"][-1] ** 2, rtol=0.02)
+        def nees(log_scale, error=error, P=P):
+            return normalised_squared(error(scaled(truth, jnp.exp(log_scale)))[0], P)
+
+        best, sigma = (records[f"{own}log_scale{end}"][-1] for end in ("", "_sigma"))
+        around = best + np.linspace(-3.0, 3.0, 121)
+        over_scales = np.asarray(quick_jit(jax.vmap(nees))(around))
+        assert over_scales.argmin() == 60
+        # σ by the curvature of what is minimised, 2/σ², by differences.
+        h = 1e-3
+        curvature = (nees(best + h) - 2 * nees(best) + nees(best - h)) / h**2
+        np.testing.assert_allclose(curvature, 2 / sigma**2, rtol=0.02)
+    np.testing.assert_allclose(over_scales[60], records["beyond_scale"][-1], rtol=1e-6)
+    assert records["nees"][-1] > 1.001 * over_scales[60]  # the scale is wrong by something
     t_est, t_true = (p.translation()[-1] for p in (path, run.poses))
     assert records["reversed"][-1] == float(t_est @ t_true < 0)
 

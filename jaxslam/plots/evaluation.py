@@ -154,8 +154,9 @@ def plot_axis(
     return _over_time(evaluation, ax)
 
 
-def plot_scale(evaluation: Evaluation, *, ax: Axes) -> Axes:
-    """Scale of every step relative to its run's: median and 95 % of the runs, beside ±2σ claimed.
+def plot_scale(evaluation: Evaluation, *, ax: Axes, label: str | None = None) -> Axes:
+    """Scale of every step relative to its run's: median, at whose end the `label` stands, and 95 %
+    of the runs, beside ±2σ claimed.
 
     Raises ValueError where the evaluation has none.
     """
@@ -166,6 +167,8 @@ def plot_scale(evaluation: Evaluation, *, ax: Axes) -> Axes:
     ax.fill_between(evaluation.times, percent[0], percent[2], color=COLOURS[0], alpha=0.25, lw=0)
     marker = "o" if evaluation.steps == 1 else None
     ax.plot(evaluation.times, percent[1], lw=1.8, color=COLOURS[0], marker=marker)
+    if label is not None:
+        label_end(ax, End(label, evaluation.times, percent[1], COLOURS[0]))
     for sign in (-2, 2):
         claimed = 100 * np.expm1(np.clip(sign * sigma, -_MOST_LOG, _MOST_LOG))
         ax.plot(evaluation.times, claimed, lw=1.4, ls="--", color=COLOURS[1])

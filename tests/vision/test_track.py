@@ -41,9 +41,10 @@ def fail(*_, **__):
 def test_a_filter_with_a_unit_of_its_own_says_so_beside_its_covariances(tmp_path, name, in_doubt):
     tracking.track(small(3), tmp_path, replace(SETTINGS, filter=name), overlay=False)
     header = (tmp_path / "covariance.txt").read_text().splitlines()[0]
-    assert ("given the scale of its map" in header) == in_doubt
-    last = (tmp_path / "frames.csv").read_text().splitlines()[-1].split(",")
-    assert (last[-1] != "") == in_doubt
+    assert ("of which sigma_log_scale of frames.csv is in doubt" in header) == in_doubt
+    titles, *_, last = (tmp_path / "frames.csv").read_text().splitlines()
+    last = dict(zip(titles.split(","), last.split(","), strict=True))
+    assert (last["sigma_log_scale"] != "") == in_doubt
 
 
 def test_the_overlay_can_be_left_out(tmp_path):
