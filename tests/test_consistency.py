@@ -417,7 +417,7 @@ def test_the_figure_is_titled_by_the_verdicts_and_by_what_was_lost():
     figure = plot_consistency(study, summary)
     verdict = sentences(summary["filters"]["inverse_scaling"]["verdict"])[0]
     told, world = figure.get_suptitle().splitlines()
-    assert told == f"inverse_scaling: {verdict}; lost 0.0% at the end, 5.0% ever"
+    assert told == f"inverse_scaling: {verdict}; 5.0% of the runs lost"
     assert world.startswith(SCENARIO.name)
     for axes in figure.axes[:4]:
         assert [text.get_text() for text in axes.texts] == ["inverse_scaling"]

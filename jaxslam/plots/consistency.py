@@ -246,8 +246,8 @@ def _title(summary: dict[str, Any]) -> str:
 
 
 def _verdict(f: dict[str, Any]) -> str:
-    now, ever = f["lost"][-1], f["lost_ever"][-1]
-    lost = f"; lost {now:.1%} at the end, {ever:.1%} ever" if ever else ""
+    ever = f["lost_ever"][-1]
+    lost = f"; {ever:.1%} of the runs lost" if ever else ""
     return headline(f["verdict"]) + lost
 
 
