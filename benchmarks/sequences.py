@@ -8,8 +8,8 @@ tracked, and synthetic videos of five seeds, of which the truth is known, and so
 pose at the one scale of its map. Elsewhere only NIS says whether a filter believes its measurements
 rightly: its mean per degree of freedom is 1 if pixels and motion are as assumed. How far the scale
 drifts, in what the filter claims of that, is told wherever there is a reference. Results go to
-`sequences.json`; `docs/sequences.md` is written from all of them, by `--only-page` from what is
-there.
+`sequences.json`; `docs/sequences.md` and a table of `docs/results.md` are written from all of them,
+by `--only-page` from what is there.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+from pages import write_table
 
 from jaxslam.files import write_atomically, write_json
 from jaxslam.names import FROM_REST
@@ -32,6 +33,9 @@ from jaxslam.vision.settings import TrackerSettings
 
 FRAMES = (30, 149)
 """Whose pose is compared with the truth, where that is known."""
+RESULTS, MARK = Path("docs/results.md"), "<!-- sequences.py -->"
+"""Where `summary` stands."""
+LANDMARKS = "inverse_scaling"
 SEEDS = range(5)
 """Of synthetic videos."""
 
@@ -165,6 +169,29 @@ def page(results: Results) -> str:
     return "\n".join(lines) + "\n"
 
 
+def summary(results: Results) -> str:
+    """The table of docs/results.md: the recommended filter beside `world`."""
+    rows = [
+        "| video | frames tracked | error; straight line | sign | orientation | in 1 s "
+        "| at one scale | drift of scale | `world` instead |",
+        "|---" * 9 + "|",
+    ]
+    for name, filters in results.items():
+        own, world = filters[f"{FROM_REST['spatial']}/{LANDMARKS}"], filters[f"world/{LANDMARKS}"]
+        nees = "–" if not own["beyond_scale"] else f"{own['beyond_scale']['mean']:.2g}"
+        rows.append(
+            f"| {name} | {own['tracked']} of {own['frames']} | {_share(own, 'error')}; "
+            f"{_share(own, 'straight_line')} | {own['sign']:.2f} | {own['orientation']:.2f}° "
+            f"| {own['relative'][0]:.1%} | {nees} | {own['drift'][1]:.2g} σ | {_beside(world)} |"
+        )
+    return "\n".join(rows)
+
+
+def _beside(r: dict[str, Any]) -> str:
+    told = f"{r['tracked']} of {r['frames']}"
+    return told if r["maps"] > 1 else f"{told}, {_share(r, 'error')}, sign {r['sign']:.2f}"
+
+
 def _row(key: str, r: dict[str, Any]) -> str:
     key = f"`{key}`" + ("" if "drift" in r else " †")
     nis = "–" if r["nis_per_dof"] is None else f"{r['nis_per_dof']:.2f}"
@@ -221,6 +248,7 @@ def main() -> None:
             write_json(options.out, results)
     with write_atomically(options.page) as path:
         path.write_text(page(results))
+    write_table(RESULTS, MARK, summary(results))
 
 
 if __name__ == "__main__":
