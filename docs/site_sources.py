@@ -15,7 +15,7 @@ ROOMS = (
     "evaluation", "consistency", "simulation", "names", "slam", "models", "landmarks", "forms",
     "remedies", "wrappers", "window", "delayed", "posterior", "triangulation", "datasets", "plots",
     "video", "vision", "cli", "geometry", "arrays", "lazy", "linalg", "least_squares", "lookup",
-    "files", "tum", "watchdog", "progress", "programs", "native",
+    "files", "tum", "extras", "watchdog", "progress", "programs", "native",
 )  # fmt: skip
 """Rooms and files of the package in the order of the site: what users meet first comes first."""
 
