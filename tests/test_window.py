@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -330,6 +331,42 @@ def test_a_minimum_is_found_within_the_tolerance(of):
     assert found.converged
     assert found.damping < 1
     assert found.cost - minimum(*of).cost < 10 * minimise.TOLERANCE
+
+
+@pytest.mark.parametrize(
+    ("promised", "gained", "settled"),
+    [(4.0, 0.5, True), (6.0, 0.5, False), (4.0, 1.5, False), (4.0, -0.5, False)],
+)
+def test_a_minimum_is_one_only_if_the_step_also_promised_little(
+    promised, gained, settled, monkeypatch
+):
+    """In tolerances. A step that gained little of the much that it promised was too long."""
+    slam, record, x, y = case()
+    x, unit = 0 * x, jnp.eye(x.size)
+    step = -jnp.sqrt(2 * promised * minimise.TOLERANCE) * unit[0]
+    told = SimpleNamespace(information=unit, gradient=-step)
+    now = replace(started(x, y), cost=jnp.ones(()), damping=jnp.zeros(()))
+    cost = now.cost - 2 * gained * minimise.TOLERANCE - step @ step
+    monkeypatch.setattr(minimise, "reduced", lambda *_: told)
+    monkeypatch.setattr(minimise, "landmarks", lambda *_: (y, cost))
+    after = minimise._step(slam, record, now)
+    assert after.converged == settled
+    np.testing.assert_allclose(after.x, step if gained > 0 else x, rtol=1e-12)
+
+
+def test_a_landmark_does_not_take_a_step_that_costs_more(monkeypatch):
+    """Of `|y|²`: one whose information is told rightly, and one whose steps are ten times as long
+    as they should be, until they are damped."""
+    slam, record, x, _ = case()
+    told, start = jnp.array([1.0, 0.1])[:, None, None], jnp.array([[3.0], [2.0]])
+    monkeypatch.setattr(
+        minimise, "landmark_slopes", lambda *of: (told, of[-1], jnp.sum(of[-1] ** 2, axis=1))
+    )
+    at = quick_jit(path)(slam, record, x)
+    y, cost = minimise.landmarks(slam, record, at, start, 1)
+    np.testing.assert_allclose(y, [[0.0], [2.0]], atol=1e-12)
+    np.testing.assert_allclose(cost, 4.0)
+    assert minimise.landmarks(slam, record, at, start, 9)[1] < 1
 
 
 def test_the_window_is_the_exact_posterior_of_a_run_and_has_its_minimum():

@@ -39,6 +39,12 @@ def test_a_landmark_is_judged_by_its_latest_searches(before, in_vain, goes):
     assert failing(landmarks, SETTINGS) == ([3] if goes else [])
 
 
+def test_a_landmark_at_the_least_success_is_kept():
+    least = SETTINGS.least_success
+    landmarks = {3: landmark(0, success=least), 4: landmark(1, success=np.nextafter(least, 0))}
+    assert failing(landmarks, SETTINGS) == [4]
+
+
 def test_where_a_landmark_was_found_last_is_noted():
     landmarks = {3: landmark(0), 4: landmark(1)}
     search(landmarks, [True, False], 1)
