@@ -23,14 +23,15 @@ import numpy as np
 import tyro
 
 import jaxslam
-from jaxslam.consistency import CHUNK, MemoryStore, Study, mean_band, normalised_squared, verdict
+from jaxslam._runtime.files import write_atomically, write_json
+from jaxslam.consistency import CHUNK, MemoryStore, Study
 from jaxslam.consistency.montecarlo import Seconds, check_sizes, filter_run
-from jaxslam.files import write_atomically, write_json
+from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.models.sensors import Pinhole
 from jaxslam.plots.calibration import plot_calibration
 from jaxslam.simulation import Room, Run, Scenario, Sightings, sensor_of, sightings, simulate
 from jaxslam.simulation.scenario import CALIBRATIONS, TRUE_CALIBRATIONS
-from jaxslam.slam.protocol import AbstractFilter
+from jaxslam.statistics import mean_band, normalised_squared, verdict
 
 TRUTH = {
     "white": "drawn in every frame",

@@ -15,7 +15,7 @@ from typing import Any
 import tyro
 
 import jaxslam
-from jaxslam.files import write_atomically, write_json
+from jaxslam._runtime.files import write_atomically, write_json
 from jaxslam.landmarks import table as landmark_table
 from jaxslam.plots.comparison import plot_comparison
 

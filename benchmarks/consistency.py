@@ -25,8 +25,9 @@ from verdicts import BEGIN
 from verdicts import table as table_of_verdicts
 
 import jaxslam
-from jaxslam.consistency import Tally, mean_band, tally
-from jaxslam.files import write_atomically
+from jaxslam._runtime.files import write_atomically
+from jaxslam.consistency import tally
+from jaxslam.statistics import Tally, mean_band
 
 Seeds = dict[str, dict[str, Any]]
 Results = dict[str, dict[str, Seeds]]

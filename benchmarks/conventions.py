@@ -25,10 +25,10 @@ import tyro
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
-from jaxslam.arrays import AnyArray
+from jaxslam._numerics.arrays import AnyArray
+from jaxslam._runtime.files import write_json
 from jaxslam.evaluation.convention import Convention, alternatives, geometry_of, turning
 from jaxslam.evaluation.poses import evaluate_poses
-from jaxslam.files import write_json
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, exp
 
 KINDS = ("anisotropic",) * 6 + ("isotropic", "still", "over-confident", "under-confident")

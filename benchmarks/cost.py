@@ -19,8 +19,8 @@ import numpy as np
 import tyro
 
 import jaxslam
+from jaxslam._runtime.files import write_json
 from jaxslam.consistency.montecarlo import filter_run
-from jaxslam.files import write_json
 from jaxslam.simulation import Room, sensor_of, sightings, simulate
 
 

@@ -24,12 +24,18 @@ from pages import write_table
 from scipy.stats import chi2
 from starts import LIE
 
-from jaxslam.files import write_json
-from jaxslam.video.source import Frame, Source
-from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.synthetic import add_noise, handheld_trajectory, render, room, synthetic_source
-from jaxslam.vision.tracker import Tracker
-from jaxslam.vision.trajectory import nees_beyond_scale
+from jaxslam._runtime.files import write_json
+from jaxslam.io.source import Frame, Source
+from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.synthetic import (
+    add_noise,
+    handheld_trajectory,
+    render,
+    room,
+    synthetic_source,
+)
+from jaxslam.tracking.tracker import Tracker
+from jaxslam.tracking.trajectory import nees_beyond_scale
 
 RATE = 30
 MARK = "<!-- by disturbances.py -->"

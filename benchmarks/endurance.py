@@ -19,11 +19,11 @@ import numpy as np
 import tyro
 from pages import write_table
 
-from jaxslam.files import write_json
-from jaxslam.video.opening import open_source
-from jaxslam.video.source import Frame
-from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.tracker import Tracker
+from jaxslam._runtime.files import write_json
+from jaxslam.io.opening import open_source
+from jaxslam.io.source import Frame
+from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.tracker import Tracker
 
 BLOCK = 1000
 """Frames of a row."""

@@ -28,13 +28,13 @@ import tyro
 from pages import write_table
 
 import jaxslam
-from jaxslam.arrays import cast
+from jaxslam._numerics.arrays import cast
+from jaxslam._runtime.files import read_json, write_json
 from jaxslam.consistency.montecarlo import DTYPES, draw, filter_run
-from jaxslam.consistency.statistics import lost_threshold
-from jaxslam.files import read_json, write_json
-from jaxslam.forms.state import Status
+from jaxslam.models.observations import Status
 from jaxslam.simulation import Scenario, sensor_of
 from jaxslam.simulation.scenario import BUILT_IN
+from jaxslam.statistics.bands import lost_threshold
 
 MARK = "<!-- by float32.py -->"
 RATIO, LOST = 0.02, 0.01

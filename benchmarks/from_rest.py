@@ -24,12 +24,12 @@ import tyro
 from pages import write_table
 
 import jaxslam
+from jaxslam._runtime.files import write_json
 from jaxslam.consistency.modes import modes_of_run
 from jaxslam.consistency.montecarlo import draw, filter_run
-from jaxslam.consistency.verdict import headline
-from jaxslam.files import write_json
 from jaxslam.plots.modes import plot_modes, worlds_of
 from jaxslam.simulation import sensor_of
+from jaxslam.statistics.verdict import headline
 
 STEPS = (1, 3, 6, 10, 20, 30, 60)
 """Frames of the table."""

@@ -24,9 +24,9 @@ import tyro
 from pages import write_table
 
 import jaxslam
+from jaxslam._runtime.files import write_json
+from jaxslam._runtime.watchdog import finished
 from jaxslam.consistency import FolderStore, MemoryStore
-from jaxslam.consistency.statistics import normalised_squared
-from jaxslam.files import write_json
 from jaxslam.geometry import Pose, difference
 from jaxslam.posterior import (
     SMC,
@@ -49,7 +49,7 @@ from jaxslam.posterior import (
 )
 from jaxslam.posterior.modes import LEAST_SHARE
 from jaxslam.posterior.summary import position_dim, summarise_filter, summarise_nees
-from jaxslam.watchdog import finished
+from jaxslam.statistics.bands import normalised_squared
 
 Records = dict[str, np.ndarray]
 

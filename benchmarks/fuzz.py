@@ -45,13 +45,13 @@ from jaxslam.evaluation import (
     evaluate_poses,
     read_covariances,
 )
+from jaxslam.io.calibration import read_calibration
+from jaxslam.io.opening import open_source
+from jaxslam.io.tum import read_tum
 from jaxslam.simulation.scenario import parse_override
 from jaxslam.simulation.trajectories import _sampled
-from jaxslam.tum import read_tum
-from jaxslam.video.calibration import read_calibration
-from jaxslam.video.opening import open_source
-from jaxslam.vision.resume import read_record
-from jaxslam.vision.target import read_target
+from jaxslam.tracking.resume import read_record
+from jaxslam.tracking.target import read_target
 
 MEMORY = 8 << 30
 """Bytes; what wants more than that for a few small files is a finding."""

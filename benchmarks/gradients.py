@@ -19,9 +19,9 @@ import numpy as np
 import tyro
 
 import jaxslam
+from jaxslam._runtime.files import write_atomically, write_json
 from jaxslam.consistency.likelihood import maximum_likelihood
 from jaxslam.consistency.montecarlo import draw
-from jaxslam.files import write_atomically, write_json
 
 NAMES = ("linear acceleration, m/s²", "angular acceleration, rad/s²", "pixel")
 MARK = "<!-- written by benchmarks/gradients.py -->"

@@ -24,17 +24,17 @@ import numpy as np
 import tyro
 
 import jaxslam
-from jaxslam.arrays import cast
-from jaxslam.consistency import lost_threshold
-from jaxslam.consistency.beyond_scale import SCALE, one_scale_of, reversal
+from jaxslam._numerics.arrays import cast
+from jaxslam._runtime.files import write_atomically, write_json
 from jaxslam.consistency.montecarlo import scale_records
 from jaxslam.consistency.recursion import Frame, run_through
 from jaxslam.datasets import tracks
-from jaxslam.files import write_atomically, write_json
+from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.readouts import camera_pose
 from jaxslam.simulation import Room, Run, Scenario, sightings
 from jaxslam.simulation.trajectories import folder
-from jaxslam.slam.protocol import AbstractFilter
-from jaxslam.slam.readouts import camera_pose
+from jaxslam.statistics import lost_threshold
+from jaxslam.statistics.beyond_scale import SCALE, one_scale_of, reversal
 
 DOF = 6
 """Of a pose in space; one scale a run takes from one of all its poses together to one of each."""

@@ -28,10 +28,10 @@ import numpy as np
 import tyro
 
 import jaxslam
+from jaxslam._runtime.files import write_json
 from jaxslam.consistency import montecarlo
-from jaxslam.files import write_json
+from jaxslam.filters.registry import FILTERS, MODIFIERS, make_filters
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.names import FILTERS, MODIFIERS, make_filters
 from jaxslam.simulation.scenario import BUILT_IN
 
 NAMES = [*FILTERS, "recommended"]

@@ -22,13 +22,13 @@ import numpy as np
 import tyro
 
 import jaxslam
-from jaxslam.consistency.statistics import lost_threshold, normalised_squared
-from jaxslam.files import write_json
-from jaxslam.linalg import cholesky
+from jaxslam._numerics.linalg import cholesky
+from jaxslam._runtime.files import write_json
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.readouts import camera_pose, landmarks_in_camera
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation import Room, Run, features, sensor_of, sightings
-from jaxslam.slam.filter import EkfSlam
-from jaxslam.slam.readouts import camera_pose, landmarks_in_camera
+from jaxslam.statistics.bands import lost_threshold, normalised_squared
 
 NEAR = {"inverse_depth": (1.1, 0.45), "least_inverse_depth": 0.225, "velocity": (0.4, 0.0, 0.0)}
 

@@ -1,4 +1,4 @@
-"""Batched Cholesky factors with their inverses: `jaxslam.linalg` against jaxlib's LAPACK.
+"""Batched Cholesky factors with their inverses: `jaxslam._numerics.linalg` against jaxlib's LAPACK.
 
     python benchmarks/linalg.py
 
@@ -18,8 +18,8 @@ import numpy as np
 import tyro
 from jax.scipy.linalg import solve_triangular
 
-from jaxslam.files import write_atomically, write_json
-from jaxslam.linalg import cholesky
+from jaxslam._numerics.linalg import cholesky
+from jaxslam._runtime.files import write_atomically, write_json
 
 SIZES = [(100, 3), (100, 12), (100, 24), (1700, 24), (1, 48), (100, 48), (100, 105), (20, 250)]
 """Matrices in a batch and their rows: poses, updates of 12 and 24 numbers, windows."""

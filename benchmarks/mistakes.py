@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import tyro
 
+from jaxslam._runtime.files import write_json
 from jaxslam.evaluation import evaluate
-from jaxslam.files import write_json
 
 SIGMA = np.array([0.1, 0.1, 0.02])
 UNITS = np.array([1, 1, 180 / np.pi])

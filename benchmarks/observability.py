@@ -17,8 +17,8 @@ import numpy as np
 import tyro
 
 import jaxslam
+from jaxslam._runtime.files import write_json
 from jaxslam.consistency import Study
-from jaxslam.files import write_json
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jaxslam.files import write_atomically
+from jaxslam._runtime.files import write_atomically
 
 END = "<!-- end -->"
 

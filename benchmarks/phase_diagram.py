@@ -25,12 +25,12 @@ from typing import Any
 import tyro
 
 import jaxslam
+from jaxslam._runtime.files import write_atomically
+from jaxslam._runtime.lookup import chosen
 from jaxslam.consistency import CHUNK
-from jaxslam.consistency.statistics import mean_band
-from jaxslam.consistency.verdict import LOST_BOUND, together, verdict
-from jaxslam.files import write_atomically
-from jaxslam.lookup import chosen
 from jaxslam.plots.phase import PhaseCell, plot_phase_diagram
+from jaxslam.statistics.bands import mean_band
+from jaxslam.statistics.verdict import LOST_BOUND, together, verdict
 
 ACCELERATION = (0.5, 0.5, 0.3)
 """σ of the white acceleration at scale 1, m/s² and rad/s²: that of `matched-loose`."""

@@ -23,8 +23,8 @@ import tyro
 from posterior_page import page
 
 import jaxslam
+from jaxslam._runtime.files import write_atomically, write_json
 from jaxslam.consistency import FolderStore, MemoryStore
-from jaxslam.files import write_atomically, write_json
 from jaxslam.plots.posterior import plot_posterior
 from jaxslam.posterior import (
     HMC,

@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 
 import jaxslam
-from jaxslam.files import write_json
+from jaxslam._runtime.files import write_json
 
 ROOM_WINDOWS = {"1–50": slice(0, 50), "51–100": slice(50, 100), "101–200": slice(100, 200)}
 # Their step 1 is our step 1; both leave out the start, which has no error.

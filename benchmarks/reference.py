@@ -21,7 +21,7 @@ import tyro
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from jaxslam.video.opening import open_source
+from jaxslam.io.opening import open_source
 
 CORNERS = 1500
 APART = 7.0

@@ -21,10 +21,10 @@ import tyro
 from conventions import displaced
 from scipy.spatial.transform import Rotation
 
+from jaxslam._runtime.files import write_json
 from jaxslam.evaluation.convention import Convention
 from jaxslam.evaluation.pose_arrays import checked_poses
 from jaxslam.evaluation.poses import as_stated
-from jaxslam.files import write_json
 
 SPLIT = Convention("split", "world")
 SIGMA = np.array([0.05] * 3 + [np.radians(0.5)] * 3)

@@ -27,9 +27,9 @@ from typing import Annotated, Any
 import tyro
 from pages import write_table
 
-from jaxslam.files import write_atomically, write_json
-from jaxslam.names import FROM_REST
-from jaxslam.vision.settings import TrackerSettings
+from jaxslam._runtime.files import write_atomically, write_json
+from jaxslam.filters.registry import FROM_REST
+from jaxslam.tracking.settings import TrackerSettings
 
 FRAMES = (30, 149)
 """Whose pose is compared with the truth, where that is known."""
@@ -68,7 +68,7 @@ class Options:
 
 def measure(source, settings: TrackerSettings, *, exact: bool) -> dict[str, Any]:
     """One filter on one sequence; `exact` where its reference is the truth."""
-    from jaxslam.vision.track import track
+    from jaxslam.tracking.track import track
 
     with tempfile.TemporaryDirectory() as folder:
         summary = track(source, folder, settings, overlay=False)
@@ -102,8 +102,8 @@ def _beyond_scale(source, folder: Path) -> tuple[dict[str, float], list[float] |
     import numpy as np
 
     from jaxslam.evaluation import read_covariances
-    from jaxslam.tum import read_tum
-    from jaxslam.vision.trajectory import nees_beyond_scale
+    from jaxslam.io.tum import read_tum
+    from jaxslam.tracking.trajectory import nees_beyond_scale
 
     times, T_wc = read_tum(folder / "trajectory.txt")
     covariances = read_covariances(folder / "covariance.txt").covariances
@@ -220,8 +220,8 @@ def _share(r: dict[str, Any], key: str) -> str:
 
 def _sources(options: Options) -> Iterator[tuple[Any, bool]]:
     """Sources, and whether their reference is exactly the truth."""
-    from jaxslam.video.opening import open_source
-    from jaxslam.vision.synthetic import synthetic_source
+    from jaxslam.io.opening import open_source
+    from jaxslam.tracking.synthetic import synthetic_source
 
     data = Path(os.environ.get("JAXSLAM_DATA", "../shared/data"))
     there = sorted(path.parent for path in data.glob("*/images"))

@@ -63,7 +63,7 @@ def generate(path: Path, runs: int) -> None:
 def compare(path: Path, out: Path) -> dict:
     """Ours beside theirs."""
     import jaxslam
-    from jaxslam.files import write_json
+    from jaxslam._runtime.files import write_json
 
     with np.load(path) as file:
         data = dict(file)

@@ -24,7 +24,8 @@ import numpy as np
 import tyro
 
 import jaxslam
-from jaxslam.consistency import lost_threshold, mean_band
+from jaxslam._runtime.files import write_atomically, write_json
+from jaxslam._runtime.lookup import chosen
 from jaxslam.consistency.montecarlo import filter_run
 from jaxslam.datasets.starry_night import (
     StarryNight,
@@ -35,16 +36,15 @@ from jaxslam.datasets.starry_night import (
     with_reversed_gyroscope,
     with_white_noise,
 )
-from jaxslam.files import write_atomically, write_json
+from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.registry import make_filter
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.lookup import chosen
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import AbstractMotion, BodyRates, ConstantVelocity
 from jaxslam.models.sensors import Pinhole
-from jaxslam.names import make_filter
 from jaxslam.plots.starry_night import plot_starry_night
 from jaxslam.simulation import Room, Run, sightings
-from jaxslam.slam.protocol import AbstractFilter
+from jaxslam.statistics import lost_threshold, mean_band
 
 VARIANTS = {
     "odometry": "measured velocities as odometry, the gyroscope reversed",

@@ -23,11 +23,11 @@ import tyro
 from pages import write_table
 from scipy.stats import chi2, norm
 
-from jaxslam.files import write_json
-from jaxslam.video.opening import open_source
-from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.tracker import Tracker
-from jaxslam.vision.trajectory import absolute_trajectory_error, nees_beyond_scale
+from jaxslam._runtime.files import write_json
+from jaxslam.io.opening import open_source
+from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.tracker import Tracker
+from jaxslam.tracking.trajectory import absolute_trajectory_error, nees_beyond_scale
 
 REFERENCE = 0.003, np.radians(0.06)
 """σ of the reference's position, of the farthest distance from the start, and orientation."""

@@ -22,12 +22,13 @@ import numpy as np
 import tyro
 
 import jaxslam
-from jaxslam.files import write_json
-from jaxslam.forms.state import Features, State
+from jaxslam._runtime.files import write_json
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.forms.state import State
+from jaxslam.filters.model import Context
 from jaxslam.geometry import difference, retract
+from jaxslam.models.observations import Features
 from jaxslam.simulation import Room, features, simulate
-from jaxslam.slam.filter import EkfSlam
-from jaxslam.slam.model import Context
 
 SEEN = 12
 """Landmarks measured in a frame."""

@@ -21,9 +21,9 @@ import numpy as np
 import tyro
 
 import jaxslam
+from jaxslam._runtime.files import write_atomically
 from jaxslam.consistency.recursion import run_through
 from jaxslam.evaluation.convention import Convention, converted, pose_errors
-from jaxslam.files import write_atomically
 from jaxslam.simulation.run import Room, sightings
 
 SPEED, TURN = 0.25, math.radians(1.5)

@@ -20,9 +20,9 @@ import numpy as np
 import tyro
 from pages import write_table
 
-from jaxslam.consistency import PowerSums, Tally, not_disproved
-from jaxslam.consistency.verdict import THIRDS
-from jaxslam.files import write_json
+from jaxslam._runtime.files import write_json
+from jaxslam.statistics import PowerSums, Tally, not_disproved
+from jaxslam.statistics.verdict import THIRDS
 
 BEGIN = "<!-- how often a verdict is wrong -->"
 STEPS = 12

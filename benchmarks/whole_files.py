@@ -14,10 +14,10 @@ import jaxslam
 from jaxslam.consistency import FolderStore, monte_carlo
 from jaxslam.datasets import starry_night
 from jaxslam.evaluation import Convention, write_covariances
-from jaxslam.tum import write_tum
-from jaxslam.video.calibration import Calibration, write_calibration
-from jaxslam.vision.resume import write_record
-from jaxslam.vision.synthetic import synthetic_source
+from jaxslam.io.calibration import Calibration, write_calibration
+from jaxslam.io.tum import write_tum
+from jaxslam.tracking.resume import write_record
+from jaxslam.tracking.synthetic import synthetic_source
 
 WIDTH, HEIGHT = 64, 48
 

@@ -12,10 +12,9 @@ from pathlib import Path
 import jaxslam
 
 ROOMS = (
-    "evaluation", "consistency", "simulation", "names", "slam", "models", "landmarks", "forms",
-    "remedies", "wrappers", "window", "delayed", "posterior", "triangulation", "datasets", "plots",
-    "video", "vision", "cli", "geometry", "arrays", "lazy", "linalg", "least_squares", "lookup",
-    "files", "tum", "extras", "watchdog", "progress", "programs", "native",
+    "evaluation", "consistency", "statistics", "simulation", "filters", "models", "landmarks",
+    "posterior", "triangulation", "datasets", "plots", "io", "tracking", "cli", "geometry",
+    "_numerics", "_runtime", "native",
 )  # fmt: skip
 """Rooms and files of the package in the order of the site: what users meet first comes first."""
 

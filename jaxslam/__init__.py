@@ -2,18 +2,30 @@
 
 The models are pure functions of one pose and one landmark; the filters, the Monte Carlo study
 and the tracker all run on the same ones. Plots, vision and the command line are imported only
-when they are asked for: `jaxslam.plots`, `jaxslam.vision`, `jaxslam.cli`; so are `jaxslam.Tracker`
-and `jaxslam.TrackerSettings`, which need the vision extra.
+when they are asked for: `jaxslam.plots`, `jaxslam.tracking`, `jaxslam.cli`; so are
+`jaxslam.Tracker` and `jaxslam.TrackerSettings`, which need the vision extra.
 """
 
 from typing import Any
 
-__version__ = "0.4.0.dev0"
-
-from jaxslam.arrays import cast
-from jaxslam.consistency import mean_band, monte_carlo, summarise, table
+from jaxslam._numerics.arrays import cast
+from jaxslam._version import __version__
+from jaxslam.consistency import monte_carlo, summarise, table
 from jaxslam.evaluation import Convention, Evaluation, evaluate, evaluate_log, evaluate_poses
-from jaxslam.forms.state import Features, Innovation, State, Status
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.forms.state import State
+from jaxslam.filters.protocol import AbstractFilter, AbstractStaged, Expected, Scene
+from jaxslam.filters.readouts import (
+    camera_pose,
+    landmark_samples,
+    landmarks_from_above,
+    landmarks_in_camera,
+    landmarks_in_world,
+)
+from jaxslam.filters.registry import FILTERS, make_filter, make_filters, recommended
+from jaxslam.filters.wrappers.bank import Bank
+from jaxslam.filters.wrappers.fixed_lag import FixedLag
+from jaxslam.filters.wrappers.mixture import Mixture
 from jaxslam.geometry import PLANAR, SPATIAL
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.calibration import (
@@ -27,22 +39,11 @@ from jaxslam.models.camera import Camera
 from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import AbstractMotion, BodyRates, ConstantVelocity, Odometry
+from jaxslam.models.observations import Capacity, Features, Innovation, Status
 from jaxslam.models.scale import Metre, ScaleGauge
 from jaxslam.models.sensors import AbstractSensor, Pinhole, Position, RangeBearing
-from jaxslam.names import FILTERS, make_filter, make_filters, recommended
 from jaxslam.simulation import Scenario, scenario, simulate
-from jaxslam.slam.filter import EkfSlam
-from jaxslam.slam.protocol import AbstractFilter, AbstractStaged, Capacity, Expected, Scene
-from jaxslam.slam.readouts import (
-    camera_pose,
-    landmark_samples,
-    landmarks_from_above,
-    landmarks_in_camera,
-    landmarks_in_world,
-)
-from jaxslam.wrappers.bank import Bank
-from jaxslam.wrappers.fixed_lag import FixedLag
-from jaxslam.wrappers.mixture import Mixture
+from jaxslam.statistics import mean_band
 
 __all__ = [
     "FILTERS",
@@ -109,11 +110,11 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "Tracker":
-        from jaxslam.vision.tracker import Tracker
+        from jaxslam.tracking.tracker import Tracker
 
         return Tracker
     if name == "TrackerSettings":
-        from jaxslam.vision.settings import TrackerSettings
+        from jaxslam.tracking.settings import TrackerSettings
 
         return TrackerSettings
     raise AttributeError(f"module 'jaxslam' has no attribute {name!r}")

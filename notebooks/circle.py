@@ -30,11 +30,11 @@ from IPython.display import display
 from scipy.stats import binomtest
 
 import jaxslam
-from jaxslam.consistency import chi2_quantile
 from jaxslam.consistency.montecarlo import filter_run
 from jaxslam.plots.landmarks import plot_landmark_clouds
 from jaxslam.plots.style import COLOURS, GREY, new_figure
 from jaxslam.simulation import Room, sensor_of, sightings, simulate
+from jaxslam.statistics import chi2_quantile
 
 REDUCED = bool(os.environ.get("JAXSLAM_REDUCED"))
 RUNS = 100 if REDUCED else 1000

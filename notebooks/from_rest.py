@@ -33,11 +33,11 @@ from IPython.display import display
 from scipy.optimize import least_squares
 
 import jaxslam
-from jaxslam.consistency import lost_threshold
 from jaxslam.consistency.modes import followed, modes_of_run
 from jaxslam.consistency.montecarlo import draw
 from jaxslam.plots.modes import plot_modes, worlds_of
 from jaxslam.simulation import sensor_of
+from jaxslam.statistics import lost_threshold
 
 jax.config.update("jax_enable_x64", True)
 REDUCED = bool(os.environ.get("JAXSLAM_REDUCED"))
@@ -117,8 +117,8 @@ for frame in FRAMES:
 # ## One camera, two worlds
 #
 # The Gaussian sum that starts from rest keeps all frames, looks for minima in all directions, and
-# keeps the distinct ones with their weights (`jaxslam/window`; in the filter's state they are
-# `state.modes`). Beside it an EKF, the paper's filter, on the same pixels.
+# keeps the distinct ones with their weights (`jaxslam/filters/window`; in the filter's state they
+# are `state.modes`). Beside it an EKF, the paper's filter, on the same pixels.
 
 # %%
 study = jaxslam.monte_carlo(scenario, {"EKF": ekf}, runs=max(RUNS, TOLD + 1), chunk=1)

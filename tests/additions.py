@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxslam
-from jaxslam.arrays import AnyArray, number_field
-from jaxslam.forms.blocks import residuals
-from jaxslam.forms.covariance import Covariance
+from jaxslam._numerics.arrays import AnyArray, number_field
+from jaxslam.filters.forms.blocks import residuals
+from jaxslam.filters.forms.covariance import Covariance
 from jaxslam.geometry import exp, homogeneous_apply
 from jaxslam.landmarks import Parametrization
 

@@ -13,17 +13,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.readouts import camera_pose
+from jaxslam.filters.registry import make_filter, scenario_pieces
 from jaxslam.geometry import GEOMETRIES
 from jaxslam.landmarks import INVERSE_SCALING, LANDMARKS
 from jaxslam.models.camera import Camera
 from jaxslam.models.coordinates import ROBOCENTRIC
 from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.observations import Capacity
 from jaxslam.models.sensors import Pinhole
-from jaxslam.names import make_filter, scenario_pieces
 from jaxslam.simulation import Room, features, scenario, sightings, simulate
-from jaxslam.slam.filter import EkfSlam
-from jaxslam.slam.protocol import Capacity
-from jaxslam.slam.readouts import camera_pose
 
 each_geometry = list(GEOMETRIES.values())
 each_landmark = list(LANDMARKS.values())

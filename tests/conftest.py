@@ -10,7 +10,7 @@ import jax
 import jaxtyping
 import pytest
 
-from jaxslam import programs
+from jaxslam._runtime import programs
 from jaxslam.consistency import montecarlo
 
 

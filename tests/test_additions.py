@@ -19,8 +19,8 @@ from additions import (
 from cases import quick_jit
 
 import jaxslam
-from jaxslam.consistency import not_disproved
-from jaxslam.names import scenario_pieces
+from jaxslam.filters.registry import scenario_pieces
+from jaxslam.statistics import not_disproved
 
 
 def verdict(scenario, slam, runs=40, **models):

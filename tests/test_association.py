@@ -1,4 +1,4 @@
-"""Tests of jaxslam.slam.association: what each lets through and keeps, on constructed ambiguity."""
+"""Tests of jaxslam.filters.association: what each lets through and keeps, where matches err."""
 
 from dataclasses import replace
 from functools import cache, partial
@@ -10,13 +10,13 @@ import pytest
 from cases import Case, quick_jit
 from scipy.stats import chi2
 
-from jaxslam.forms.form import curvature
-from jaxslam.forms.information import Information
-from jaxslam.forms.state import Features
+from jaxslam.filters import association
+from jaxslam.filters.association import ASSOCIATIONS, GATE, Candidates, candidates
+from jaxslam.filters.ekf import context_of
+from jaxslam.filters.forms.form import curvature
+from jaxslam.filters.forms.information import Information
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.slam import association
-from jaxslam.slam.association import ASSOCIATIONS, GATE, Candidates, candidates
-from jaxslam.slam.filter import context_of
+from jaxslam.models.observations import Features
 
 SIGMA = 0.3
 M = 20

@@ -10,18 +10,18 @@ from cases import Case, each_geometry, named, pose, quick_jit
 from scipy import stats
 
 from jaxslam.consistency import sums
-from jaxslam.consistency.beyond_scale import (
+from jaxslam.consistency.montecarlo import filter_run
+from jaxslam.filters.readouts import camera_pose_in_unit
+from jaxslam.geometry import PLANAR, difference, identity, joined, retract, scaled
+from jaxslam.simulation import sensor_of
+from jaxslam.statistics.bands import normalised_squared
+from jaxslam.statistics.beyond_scale import (
     NOTICEABLE,
     SCALES,
     beyond_scale,
     one_scale,
     reversal,
 )
-from jaxslam.consistency.montecarlo import filter_run
-from jaxslam.consistency.statistics import normalised_squared
-from jaxslam.geometry import PLANAR, difference, identity, joined, retract, scaled
-from jaxslam.simulation import sensor_of
-from jaxslam.slam.readouts import camera_pose_in_unit
 
 FALSE_ALARM = 1e-6
 """Share of seeds on which a statistical test here would fail although nothing is wrong."""

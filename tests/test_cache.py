@@ -9,7 +9,7 @@ import jax
 import pytest
 
 import jaxslam.cli
-from jaxslam import programs
+from jaxslam._runtime import programs
 from jaxslam.cli.cache import keep_programs
 
 FOLDER, ENABLED = "jax_compilation_cache_dir", "jax_enable_compilation_cache"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from cases import Case, quick_jit
 
-from jaxslam.consistency.statistics import lost_threshold
+from jaxslam.statistics.bands import lost_threshold
 
 RUNS = 8
 

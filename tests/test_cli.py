@@ -117,7 +117,7 @@ def test_the_library_imports_light_and_sets_nothing():
 import sys, jax
 before = dict(jax.config.values)
 import jaxslam
-heavy = {"matplotlib", "cv2", "evo", "tyro.cli", "jaxslam.vision", "jaxslam.video", "jaxslam.plots"}
+heavy = {"matplotlib", "cv2", "evo", "tyro.cli", "jaxslam.tracking", "jaxslam.io", "jaxslam.plots"}
 assert not heavy & set(sys.modules), heavy & set(sys.modules)
 assert dict(jax.config.values) == before
 from jax._src import xla_bridge

@@ -13,26 +13,19 @@ from cases import quick_jit
 from scipy.stats import chi2, norm
 
 import jaxslam
-from jaxslam.consistency import (
-    FolderStore,
-    MemoryStore,
-    lost_threshold,
-    montecarlo,
-    run_verdict,
-    sentences,
-    tally,
-)
-from jaxslam.consistency.beyond_scale import one_scale_of
+from jaxslam.consistency import FolderStore, MemoryStore, montecarlo, tally
 from jaxslam.consistency.montecarlo import check_sizes, draw, filter_run
-from jaxslam.consistency.statistics import chi2_cdf, chi2_quantile, normalised_squared
 from jaxslam.consistency.sums import added
-from jaxslam.names import scenario_pieces
+from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.registry import scenario_pieces
 from jaxslam.native.build import compiler
 from jaxslam.plots.consistency import plot_consistency, plot_outside
 from jaxslam.plots.style import new_figure
 from jaxslam.simulation import Room, sensor_of, sightings
 from jaxslam.simulation.run import in_order_of_appearance
-from jaxslam.slam.protocol import AbstractFilter
+from jaxslam.statistics import lost_threshold, run_verdict, sentences
+from jaxslam.statistics.bands import chi2_cdf, chi2_quantile, normalised_squared
+from jaxslam.statistics.beyond_scale import one_scale_of
 
 SCENARIO = jaxslam.scenario("matched-tight", steps=6, landmarks=5)
 CHUNK = 3

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxslam
-from jaxslam.consistency import Tally, mean_band, run_verdict
+from jaxslam.statistics import Tally, mean_band, run_verdict
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 

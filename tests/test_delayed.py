@@ -10,20 +10,20 @@ import pytest
 from cases import Case, quick_jit
 
 from jaxslam.consistency.montecarlo import filter_run
-from jaxslam.delayed import rays
-from jaxslam.delayed.alternatives import log_density
-from jaxslam.delayed.depth_particles import DepthParticles
-from jaxslam.delayed.rays import GaussianSum
-from jaxslam.forms.state import Features
+from jaxslam.filters.ekf import correct
+from jaxslam.filters.initialisation import rays
+from jaxslam.filters.initialisation.alternatives import log_density
+from jaxslam.filters.initialisation.depth_particles import DepthParticles
+from jaxslam.filters.initialisation.rays import GaussianSum
+from jaxslam.filters.readouts import landmarks_in_camera
+from jaxslam.filters.registry import make_filter, scenario_pieces
 from jaxslam.landmarks import CARTESIAN, INVERSE_SCALING
 from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.observations import Features
 from jaxslam.models.sensors import Pinhole
-from jaxslam.names import make_filter, scenario_pieces
 from jaxslam.simulation import Room, scenario
-from jaxslam.slam.filter import correct
-from jaxslam.slam.readouts import landmarks_in_camera
 
 FOCAL, CENTRE, SIGMA = 650.0, 320.0, 0.5
 DT, SPEED = 0.1, 0.4

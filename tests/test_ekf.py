@@ -1,4 +1,4 @@
-"""Tests of jaxslam.forms.covariance: dense filters and Jacobians, and what must not matter."""
+"""Tests of jaxslam.filters.forms.covariance: dense filters, Jacobians, and invariances."""
 
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -20,11 +20,13 @@ from cases import (
     run_filter,
 )
 
-from jaxslam.arrays import cast
-from jaxslam.forms import blocks
-from jaxslam.forms.blocks import Blocks, observed, placed
-from jaxslam.forms.covariance import Covariance
-from jaxslam.forms.state import Features, State, Status
+from jaxslam._numerics.arrays import cast
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.forms import blocks
+from jaxslam.filters.forms.blocks import Blocks, observed, placed
+from jaxslam.filters.forms.covariance import Covariance
+from jaxslam.filters.forms.state import State
+from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.geometry import PLANAR, SPATIAL, difference, retract
 from jaxslam.landmarks import INVERSE_SCALING, LANDMARKS
 from jaxslam.models.calibration import Known, White
@@ -32,9 +34,8 @@ from jaxslam.models.camera import Camera
 from jaxslam.models.coordinates import ROBOCENTRIC, WORLD
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.observations import Features, Status
 from jaxslam.models.sensors import Pinhole
-from jaxslam.slam.filter import EkfSlam
-from jaxslam.slam.model import COMPOSED, Context, Core
 
 EKF = Covariance()
 

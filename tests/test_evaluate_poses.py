@@ -17,8 +17,6 @@ from scipy.spatial.transform import Rotation
 
 import jaxslam
 from jaxslam.cli import main
-from jaxslam.consistency import VERDICTS, Tally, not_disproved
-from jaxslam.consistency.beyond_scale import one_scale
 from jaxslam.evaluation import Convention, converted, pose_errors
 from jaxslam.evaluation.alignment import (
     Similarity,
@@ -42,8 +40,10 @@ from jaxslam.evaluation.pose_arrays import checked_poses
 from jaxslam.evaluation.scale import Scale
 from jaxslam.evaluation.truth import with_truth
 from jaxslam.geometry import PLANAR, SPATIAL, difference
+from jaxslam.io.tum import write_tum
 from jaxslam.plots.evaluation import plot_evaluation
-from jaxslam.tum import write_tum
+from jaxslam.statistics import VERDICTS, Tally, not_disproved
+from jaxslam.statistics.beyond_scale import one_scale
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
@@ -1003,7 +1003,7 @@ def test_whatever_is_in_a_file_there_is_a_result_or_one_line(tmp_path_factory, t
 
 
 def test_of_the_trackers_files_nees_is_given_the_scale(tmp_path):
-    trajectory = pytest.importorskip("jaxslam.vision.trajectory")
+    trajectory = pytest.importorskip("jaxslam.tracking.trajectory")
     T, P, truth = logged(trajectory.TRACKED, runs=1, steps=300)
     T, P, truth = T[0], P[0].copy(), truth[0].copy()
     P[0], truth[0] = 0, T[0]

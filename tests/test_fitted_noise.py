@@ -12,8 +12,14 @@ from cases import Case, quick_jit
 from scipy.stats import multivariate_normal
 
 from jaxslam.consistency.recursion import run_through
+from jaxslam.filters.wrappers.adaptive_process_noise import (
+    FACTORS,
+    FittedNoise,
+    _foreseen,
+    _heard,
+    _told,
+)
 from jaxslam.models.motion import ConstantVelocity
-from jaxslam.wrappers.fitted_noise import FACTORS, FittedNoise, _foreseen, _heard, _told
 
 RUNS, STEPS = 16, 50
 

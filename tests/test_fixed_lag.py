@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from cases import Case, central, close, pose_run, quick_jit
 
-from jaxslam.forms.sensitivity import begin
+from jaxslam.filters.forms.sensitivity import begin
+from jaxslam.filters.readouts import camera_pose, landmarks_in_camera
+from jaxslam.filters.registry import make_filter
+from jaxslam.filters.wrappers.fixed_lag import FixedLag, _appended, _estimate
 from jaxslam.geometry import difference
+from jaxslam.models.observations import Capacity
 from jaxslam.models.sensors import Position
-from jaxslam.names import make_filter
-from jaxslam.slam.protocol import Capacity
-from jaxslam.slam.readouts import camera_pose, landmarks_in_camera
-from jaxslam.wrappers.fixed_lag import FixedLag, _appended, _estimate
 
 SHORT = {"steps": 6, "landmarks": 4}
 

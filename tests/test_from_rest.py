@@ -11,11 +11,18 @@ import numpy as np
 import pytest
 from cases import Case, quick_jit
 
-from jaxslam.consistency.statistics import lost_threshold
-from jaxslam.forms.state import Features
+from jaxslam.filters.window.record import empty
+from jaxslam.filters.wrappers.batch_initialisation import (
+    GIVEN_UP,
+    IN_TURN,
+    SEARCHES,
+    SIZES,
+    FromRest,
+    from_rest,
+)
 from jaxslam.models.calibration import Considered
-from jaxslam.window.record import empty
-from jaxslam.wrappers.from_rest import GIVEN_UP, IN_TURN, SEARCHES, SIZES, FromRest, from_rest
+from jaxslam.models.observations import Features
+from jaxslam.statistics.bands import lost_threshold
 
 RUNS, STEPS = 6, 12
 SUM = "scale_gauge+mixture3"

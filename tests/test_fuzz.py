@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 import jaxslam
-from jaxslam.files import read_arrays
+from jaxslam._runtime.files import read_arrays
 from jaxslam.simulation.scenario import parse_override
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))

@@ -10,11 +10,11 @@ import pytest
 from cases import Case, close, each_geometry, named, pose_run, quick_jit
 
 import jaxslam
-from jaxslam.forms.state import Innovation, Status
+from jaxslam.filters.registry import FROM_REST, RECOMMENDED, recommended_name
+from jaxslam.filters.wrappers.bank import BEHIND, BankState, _mixed, log_likelihoods, with_motion
+from jaxslam.filters.wrappers.mixture import _parts, _split_and_merged
 from jaxslam.models.motion import ConstantVelocity
-from jaxslam.names import FROM_REST, RECOMMENDED, recommended_name
-from jaxslam.wrappers.bank import BEHIND, BankState, _mixed, log_likelihoods, with_motion
-from jaxslam.wrappers.mixture import _parts, _split_and_merged
+from jaxslam.models.observations import Innovation, Status
 
 
 @cache

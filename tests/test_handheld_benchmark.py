@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 import handheld as benchmark
 
-from jaxslam.consistency.beyond_scale import one_scale_of
+from jaxslam.statistics.beyond_scale import one_scale_of
 
 
 def records(runs=50, steps=40):

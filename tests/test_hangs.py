@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 import hangs
 
-from jaxslam.names import make_filters
+from jaxslam.filters.registry import make_filters
 
 
 def process(alive: bool) -> SimpleNamespace:

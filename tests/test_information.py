@@ -9,21 +9,22 @@ import numpy as np
 import pytest
 from cases import close, each_geometry, named, quick_jit
 
-from jaxslam.forms import information
-from jaxslam.forms.covariance import Covariance
-from jaxslam.forms.information import EXACT_SIGMA, Information, InformationState
-from jaxslam.forms.state import Features, State
+from jaxslam.filters.ekf import context_of, reanchored
+from jaxslam.filters.forms import information
+from jaxslam.filters.forms.covariance import Covariance
+from jaxslam.filters.forms.information import EXACT_SIGMA, Information, InformationState
+from jaxslam.filters.forms.state import State
+from jaxslam.filters.readouts import camera_pose, landmarks_in_camera, landmarks_in_world
+from jaxslam.filters.registry import FILTERS
 from jaxslam.geometry import PLANAR, difference, exp, identity, joined, tangent_dim
 from jaxslam.landmarks import IMAGE_PLANE, INVERSE_SCALING
 from jaxslam.models.camera import Camera
 from jaxslam.models.coordinates import KEYFRAME_PARALLAX, KEYFRAME_TURN, keyframe_due
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.observations import Features
 from jaxslam.models.sensors import Pinhole
-from jaxslam.names import FILTERS
 from jaxslam.simulation.pieces import TREATMENTS
-from jaxslam.slam.filter import context_of, reanchored
-from jaxslam.slam.readouts import camera_pose, landmarks_in_camera, landmarks_in_world
 
 CAPACITY, STEPS, DT = 5, 10, 0.1
 # Landmark of each slot: the frame in which it is new, and that after which it is removed.

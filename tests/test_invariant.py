@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from cases import Case, close, named, pose, quick_jit
 
-from jaxslam.forms.blocks import shifted
-from jaxslam.forms.covariance import Covariance
+from jaxslam.filters.forms.blocks import shifted
+from jaxslam.filters.forms.covariance import Covariance
+from jaxslam.filters.model import COMPOSED
+from jaxslam.filters.remedies.gauge import act
 from jaxslam.geometry import PLANAR, SPATIAL, difference, exp, log
 from jaxslam.landmarks import CARTESIAN, INVERSE_DEPTH, INVERSE_SCALING
-from jaxslam.remedies.gauge import act
-from jaxslam.slam.model import COMPOSED
 
 NAMES = {PLANAR: "matched", SPATIAL: "matched-6dof"}
 

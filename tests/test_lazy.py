@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import lazy
-from jaxslam.lazy import at_places, each_alive, of_alive, repeated, when
+from jaxslam._numerics import conditional as lazy
+from jaxslam._numerics.conditional import at_places, each_alive, of_alive, repeated, when
 
 BATCH, PLACES = 20, 5
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.linalg import LEAF, cholesky, eigh, inverse, semidefinite_root
+from jaxslam._numerics.linalg import LEAF, cholesky, eigh, inverse, semidefinite_root
 
 SIZES = (1, 2, 3, 5, 12, LEAF, LEAF + 1, 2 * LEAF + 3, 105)
 

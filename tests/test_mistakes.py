@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import jaxslam
 from jaxslam.cli import main
 from jaxslam.evaluation import Convention, write_covariances
-from jaxslam.tum import write_tum
+from jaxslam.io.tum import write_tum
 
 NAMES = ("x", "y", "heading")
 SIGMA = np.array([0.1, 0.1, 0.02])

@@ -4,14 +4,14 @@ import sys
 
 import pytest
 
+from jaxslam._runtime.lookup import chosen
 from jaxslam.consistency import monte_carlo, summarise, table
+from jaxslam.filters.ekf import AtOnce, EkfSlam, innermost
+from jaxslam.filters.protocol import AbstractStaged
+from jaxslam.filters.registry import CANNOT_TRACK, FILTERS, MODIFIERS, make_filters
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.lookup import chosen
 from jaxslam.models.calibration import Known
-from jaxslam.names import CANNOT_TRACK, FILTERS, MODIFIERS, make_filters
 from jaxslam.simulation import scenario
-from jaxslam.slam.filter import AtOnce, EkfSlam, innermost
-from jaxslam.slam.protocol import AbstractStaged
 
 COLOURS = {"red": 1, "green": 2, "blue": 3}
 

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 import jaxslam
-from jaxslam import linalg, programs
+from jaxslam._numerics import linalg
+from jaxslam._runtime import programs
+from jaxslam._runtime.programs import Exact
 from jaxslam.consistency import montecarlo
 from jaxslam.native import NotSupportedError, batch, batched, build
 from jaxslam.native.batch import Batch
 from jaxslam.native.build import compiler
 from jaxslam.native.elements import Elements
-from jaxslam.programs import Exact
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C++ compiler")
 RUNS = 11

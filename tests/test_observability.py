@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from cases import a_filter, each_geometry, few_landmarks, named, pose, quick_jit
 
+from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.geometry import PLANAR, SPATIAL, difference, retract
 from jaxslam.models.coordinates import ROBOCENTRIC, WORLD
-from jaxslam.slam.model import COMPOSED, Context, Core
 
 STEPS, DT, COUNT = 8, 0.4, 7
 GAUGE = {PLANAR: 3, SPATIAL: 6}

@@ -14,8 +14,12 @@ import pytest
 from cases import Case, a_filter, close, each_landmark, named, pose, quick_jit
 from test_observability import GAUGE, nullity
 
-from jaxslam.forms.blocks import shifted
-from jaxslam.forms.covariance import Covariance
+from jaxslam.filters.forms.blocks import shifted
+from jaxslam.filters.forms.covariance import Covariance
+from jaxslam.filters.model import COMPOSED, Context, Core
+from jaxslam.filters.registry import make_filter, scenario_pieces
+from jaxslam.filters.remedies.gauge import act, unobservable_directions
+from jaxslam.filters.remedies.observability_constrained import transport
 from jaxslam.geometry import PLANAR, SPATIAL, SplitPose, difference, tangent_dim
 from jaxslam.landmarks import (
     CARTESIAN,
@@ -27,11 +31,7 @@ from jaxslam.landmarks import (
 )
 from jaxslam.models.coordinates import ROBOCENTRIC, WORLD
 from jaxslam.models.motion import Odometry
-from jaxslam.names import make_filter, scenario_pieces
-from jaxslam.remedies.gauge import act, unobservable_directions
-from jaxslam.remedies.observability_constrained import transport
 from jaxslam.simulation import scenario
-from jaxslam.slam.model import COMPOSED, Context, Core
 
 COUNT, STEPS, DT = 7, 8, 0.4
 

@@ -11,9 +11,9 @@ import pytest
 from cases import quick_jit
 
 import jaxslam
-from jaxslam.consistency import VERDICTS, mean_band, verdict
 from jaxslam.plots.phase import PhaseCell, plot_phase_diagram
 from jaxslam.simulation import as_data, simulate
+from jaxslam.statistics import VERDICTS, mean_band, verdict
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import programs
+from jaxslam._runtime import programs
+from jaxslam._runtime.programs import Program, forget, in_background, keep_in, wide
 from jaxslam.models.depth import InverseDepth
-from jaxslam.programs import Program, forget, in_background, keep_in, wide
 
 traced = []
 KNOWN = programs._known

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from jaxslam import progress
+from jaxslam._runtime import progress
 
 
 class Terminal(io.StringIO):

@@ -13,8 +13,8 @@ import tyro
 import jaxslam
 from jaxslam.cli import Command
 from jaxslam.evaluation import CHOICES, Convention, read_covariances
-from jaxslam.vision.synthetic import synthetic_source
-from jaxslam.vision.target import read_target
+from jaxslam.tracking.synthetic import synthetic_source
+from jaxslam.tracking.target import read_target
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

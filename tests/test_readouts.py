@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from cases import Case, quick_jit
 
-from jaxslam.slam.readouts import (
+from jaxslam.filters.readouts import (
     camera_pose,
     camera_pose_in_unit,
     landmarks_in_unit,
     landmarks_in_world,
     landmarks_on_sides,
 )
-from jaxslam.wrappers.bank import BankState
+from jaxslam.filters.wrappers.bank import BankState
 
 STEPS, COUNT = 4, 6
 

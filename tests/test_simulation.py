@@ -12,7 +12,7 @@ import pytest
 from cases import keys_used, quick_jit
 from scipy import stats
 
-from jaxslam.arrays import cast
+from jaxslam._numerics.arrays import cast
 from jaxslam.models.camera import Camera, project
 from jaxslam.models.motion import ConstantVelocity, Odometry
 from jaxslam.models.sensors import Pinhole, Position

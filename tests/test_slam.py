@@ -1,4 +1,4 @@
-"""Tests of jaxslam.slam.filter: composition, robocentric against world, and whole runs in JAX."""
+"""Tests of jaxslam.filters.ekf: composition, robocentric against world, and whole runs in JAX."""
 
 from dataclasses import replace
 from functools import cache, partial
@@ -21,9 +21,18 @@ from cases import (
     run_filter,
 )
 
-from jaxslam.arrays import cast
-from jaxslam.forms.covariance import Covariance, convert
-from jaxslam.forms.state import Features, State
+from jaxslam._numerics.arrays import cast
+from jaxslam.filters.ekf import EkfSlam, insert
+from jaxslam.filters.forms.covariance import Covariance, convert
+from jaxslam.filters.forms.state import State
+from jaxslam.filters.model import COMPOSED, Context, Core
+from jaxslam.filters.readouts import (
+    camera_pose,
+    landmarks_from_above,
+    landmarks_in_camera,
+    landmarks_in_world,
+)
+from jaxslam.filters.registry import make_filter, scenario_pieces
 from jaxslam.geometry import PLANAR, SPATIAL, joined, retract
 from jaxslam.landmarks import (
     INVERSE_DEPTH_TO_CARTESIAN,
@@ -32,18 +41,10 @@ from jaxslam.landmarks import (
 )
 from jaxslam.models.calibration import Estimated
 from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
+from jaxslam.models.observations import Features
 from jaxslam.models.scale import ScaleGauge
-from jaxslam.names import make_filter, scenario_pieces
 from jaxslam.simulation import scenario
 from jaxslam.simulation.pieces import TREATMENTS
-from jaxslam.slam.filter import EkfSlam, insert
-from jaxslam.slam.model import COMPOSED, Context, Core
-from jaxslam.slam.readouts import (
-    camera_pose,
-    landmarks_from_above,
-    landmarks_in_camera,
-    landmarks_in_world,
-)
 
 DT = 0.1
 

@@ -23,14 +23,14 @@ from jaxslam.datasets.starry_night import (
     with_reversed_gyroscope,
     with_white_noise,
 )
+from jaxslam.filters.registry import make_filter
 from jaxslam.models.motion import BodyRates
-from jaxslam.names import make_filter
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 import starry_night
 
-from jaxslam.slam.filter import EkfSlam
+from jaxslam.filters.ekf import EkfSlam
 
 FRAMES, LANDMARK_COUNT = 26, 6
 FOCAL, CENTRE = np.array([480.0, 490.0]), np.array([320.0, 240.0])

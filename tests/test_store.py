@@ -13,7 +13,7 @@ import pytest
 import jaxslam
 from jaxslam.consistency import FolderStore, MemoryStore, manifest
 from jaxslam.consistency.manifest import described, difference
-from jaxslam.tum import write_tum
+from jaxslam.io.tum import write_tum
 
 SCENARIO = jaxslam.scenario("matched-tight", steps=2, landmarks=3)
 SLAM: Any

@@ -16,6 +16,9 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 
 import jaxslam
+from jaxslam._runtime.watchdog import lapack_calls
+from jaxslam.filters.readouts import camera_pose
+from jaxslam.filters.wrappers.batch_initialisation import from_rest
 from jaxslam.geometry import difference, log, retract
 from jaxslam.posterior import (
     HMC,
@@ -55,9 +58,6 @@ from jaxslam.posterior.marginal import (
 )
 from jaxslam.posterior.problem import Unknowns, inverse_depths, log_likelihood, path_size, size
 from jaxslam.posterior.tempered import _trajectory, mean_information
-from jaxslam.slam.readouts import camera_pose
-from jaxslam.watchdog import lapack_calls
-from jaxslam.wrappers.from_rest import from_rest
 
 FEW = SMC(particles=800, moves=3)
 LOOSE = jaxslam.scenario("matched-loose", steps=3, landmarks=4)

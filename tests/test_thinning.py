@@ -1,4 +1,4 @@
-"""Tests of jaxslam.window.thinning: a full window goes on with every other frame."""
+"""Tests of jaxslam.filters.window.subsample: a full window goes on with every other frame."""
 
 from dataclasses import replace
 
@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from cases import quick_jit
 
+from jaxslam.filters.registry import scale_gauge, scenario_pieces
+from jaxslam.filters.window.minimise import started
+from jaxslam.filters.window.problem import Layout, path
+from jaxslam.filters.window.record import whole
+from jaxslam.filters.window.subsample import kept, thinned
 from jaxslam.landmarks import INVERSE_SCALING
 from jaxslam.models.calibration import Known, White
-from jaxslam.names import scale_gauge, scenario_pieces
 from jaxslam.simulation import scenario
-from jaxslam.window.minimise import started
-from jaxslam.window.problem import Layout, path
-from jaxslam.window.record import whole
-from jaxslam.window.thinning import kept, thinned
 
 FRAMES = 7
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxslam.consistency.recursion import run_through
 from jaxslam.datasets.tracks import read, window, windows
-from jaxslam.names import make_filters
+from jaxslam.filters.registry import make_filters
 from jaxslam.simulation import Room, gone, scenario, sightings
 
 SIGHTS = {0: range(0, 4), 1: range(0, 6), 2: range(0, 2), 3: range(1, 6), 4: range(2, 6)}

@@ -11,9 +11,9 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 import jaxslam
+from jaxslam.io.tum import poses
 from jaxslam.simulation import BUILT_IN, Trajectory, scenario, simulate, trajectory_of
 from jaxslam.simulation.trajectories import CUTOFF, GAP, find, sampled
-from jaxslam.tum import poses
 
 FALSE_ALARM = 1e-6
 """Share of seeds on which a statistical test here would fail although nothing is wrong."""

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxslam.consistency import Tally, lost_threshold, not_disproved, run_verdict
-from jaxslam.consistency.looks import VERDICT_CONFIDENCE, Look
-from jaxslam.consistency.statistics import PowerSums, shortfall_limits, shortfall_p_value
-from jaxslam.consistency.verdict import sentences
+from jaxslam.statistics import Tally, lost_threshold, not_disproved, run_verdict
+from jaxslam.statistics.bands import PowerSums, shortfall_limits, shortfall_p_value
+from jaxslam.statistics.looks import VERDICT_CONFIDENCE, Look
+from jaxslam.statistics.verdict import sentences
 
 
 def series(rng, runs, steps=20, dof=3, correlation=0.95):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxslam.consistency import Tally
+from jaxslam.statistics import Tally
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 

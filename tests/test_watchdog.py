@@ -13,17 +13,19 @@ import jax.numpy as jnp
 import pytest
 
 import jaxslam
-from jaxslam import posterior, watchdog
-from jaxslam.arrays import is_number
+from jaxslam import posterior
+from jaxslam._numerics.arrays import is_number
+from jaxslam._runtime import watchdog
+from jaxslam._runtime.watchdog import lapack_calls
 from jaxslam.consistency.montecarlo import _filter_batch
-from jaxslam.forms.covariance import Covariance
+from jaxslam.filters.forms.covariance import Covariance
 from jaxslam.simulation import Room, sensor_of, simulate
-from jaxslam.watchdog import lapack_calls
 
 MATRICES = """
 import jax, jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
-from jaxslam import linalg, watchdog
+from jaxslam._numerics import linalg
+from jaxslam._runtime import watchdog
 
 def lapack(A):
     return solve_triangular(jnp.linalg.cholesky(A), jnp.eye(24), lower=True)

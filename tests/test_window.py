@@ -1,4 +1,4 @@
-"""Tests of jaxslam.window: what is remembered, and least squares against dense algebra."""
+"""Tests of jaxslam.filters.window: what is remembered, and least squares against dense algebra."""
 
 from dataclasses import replace
 from functools import cache
@@ -12,22 +12,22 @@ import pytest
 from cases import close, quick_jit
 
 import jaxslam
-from jaxslam.forms.state import Features
+from jaxslam._numerics.linalg import cholesky
+from jaxslam.filters.registry import scale_gauge, scenario_pieces
+from jaxslam.filters.window import minimise, modes, scale
+from jaxslam.filters.window.minimise import minimised, started
+from jaxslam.filters.window.problem import Layout, path, reduced, residuals, sensitivities
+from jaxslam.filters.window.record import Record, begun, empty, removed, stepped, whole
+from jaxslam.filters.window.scale import rescaled, scaling, shift_of_scale, variances
+from jaxslam.filters.window.to_filter import gauge_state
 from jaxslam.geometry import jacobian
 from jaxslam.landmarks import INVERSE_SCALING
-from jaxslam.linalg import cholesky
 from jaxslam.models.calibration import Estimated, Known, White
 from jaxslam.models.depth import InverseDepth
-from jaxslam.names import scale_gauge, scenario_pieces
+from jaxslam.models.observations import Features
 from jaxslam.posterior import log_density, make_problem
 from jaxslam.posterior.laplace import minima
 from jaxslam.simulation import scenario
-from jaxslam.window import minimise, modes, scale
-from jaxslam.window.handover import gauge_state
-from jaxslam.window.minimise import minimised, started
-from jaxslam.window.problem import Layout, path, reduced, residuals, sensitivities
-from jaxslam.window.record import Record, begun, empty, removed, stepped, whole
-from jaxslam.window.scale import rescaled, scaling, shift_of_scale, variances
 
 FRAMES, FIRST = 5, jnp.array([0, 0, 0, 1, 0, 2])
 """Landmarks begin in three frames."""

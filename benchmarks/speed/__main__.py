@@ -37,8 +37,8 @@ from benchmarks.speed.workload import (
     ours,
     prepared,
 )
+from jaxslam._runtime.files import write_json
 from jaxslam.consistency import BACKENDS
-from jaxslam.files import write_json
 from jaxslam.native.build import compiler
 
 AGREEMENT = 1e-9

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from jaxslam.files import read_json, write_json
+from jaxslam._runtime.files import read_json, write_json
 
 AXES: dict[str, tuple[tuple[int, ...], dict[str, int]]] = {
     "runs": ((128, 512, 2048, 8192), {"steps": 100, "chunk": 128}),

@@ -14,15 +14,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxslam
-from jaxslam.arrays import cast, is_number
-from jaxslam.consistency.statistics import normalised_squared
-from jaxslam.forms.state import Features, State
+from jaxslam._numerics.arrays import cast, is_number
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.forms.state import State
+from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.geometry import Pose
+from jaxslam.models.observations import Features
 from jaxslam.native import batched
 from jaxslam.simulation import Scenario, features, simulate
 from jaxslam.simulation.run import Room
-from jaxslam.slam.filter import EkfSlam
-from jaxslam.slam.protocol import AbstractFilter
+from jaxslam.statistics.bands import normalised_squared
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from jaxslam import __version__
+from jaxslam._version import __version__
 from jaxslam.cli.cache import keep_programs
 from jaxslam.cli.calibrate import CalibrateOptions
 from jaxslam.cli.consistency import ConsistencyOptions

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jax
 
-from jaxslam.programs import keep_in
+from jaxslam._runtime.programs import keep_in
 
 _WORTH = 0.2
 """Programs that compile for so many seconds are kept; by default JAX keeps those of one second."""

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
+from jaxslam._runtime.files import write_atomically
 from jaxslam.cli.extra import one_line_warnings, require_vision
-from jaxslam.files import write_atomically
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class CalibrateOptions:
     def run(self) -> None:
         """Calibrate, print the numbers, write the files."""
         require_vision("calibrating")
-        from jaxslam.video.board import Board
+        from jaxslam.io.board import Board
 
         board = Board(self.board, self.columns, self.rows, self.square, self.dictionary)
         if self.board_video is None:
@@ -54,8 +54,8 @@ class CalibrateOptions:
         print(f"wrote {self.out / 'board.png'}: print it, and measure a square")
 
     def _calibrate(self, board, video: Path) -> None:
-        from jaxslam.progress import bar
-        from jaxslam.video.calibrate import calibrate, describe, write
+        from jaxslam._runtime.progress import bar
+        from jaxslam.io.calibrate import calibrate, describe, write
 
         with one_line_warnings(), bar(None, "picture") as shown:
             calibrated = calibrate(video, board, shown.update)

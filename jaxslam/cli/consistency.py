@@ -8,6 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
+from jaxslam._runtime.files import write_json
+from jaxslam._runtime.progress import StudyBar
 from jaxslam.consistency import (
     BACKENDS,
     CHUNK,
@@ -20,10 +22,8 @@ from jaxslam.consistency import (
 )
 from jaxslam.consistency.montecarlo import check_backend, check_sizes, divided
 from jaxslam.consistency.records import check_records, write_records
-from jaxslam.files import write_json
+from jaxslam.filters.registry import FILTERS, FROM_REST, MODIFIERS, RECOMMENDED, make_filters
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.names import FILTERS, FROM_REST, MODIFIERS, RECOMMENDED, make_filters
-from jaxslam.progress import StudyBar
 from jaxslam.simulation.scenario import (
     BUILT_IN,
     CALIBRATIONS,

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Generator
 from contextlib import contextmanager
 
-from jaxslam.extras import missing
+from jaxslam._runtime.extras import missing
 
 
 def require_vision(what: str) -> None:

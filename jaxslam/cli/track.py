@@ -9,11 +9,11 @@ from typing import Annotated
 import tyro
 
 from jaxslam.cli.extra import one_line_warnings, require_vision
+from jaxslam.filters.association import ASSOCIATIONS
+from jaxslam.filters.registry import FILTERS
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.names import FILTERS
 from jaxslam.simulation.scenario import CALIBRATIONS
-from jaxslam.slam.association import ASSOCIATIONS
-from jaxslam.vision.settings import METRIC, TrackerSettings
+from jaxslam.tracking.settings import METRIC, TrackerSettings
 
 _COMPILING = "compiling …"
 """What the bar says while the first frames wait for their programs."""
@@ -89,9 +89,9 @@ class TrackOptions:
     def run(self) -> None:
         """Track the video, print the summary, write its files."""
         require_vision("tracking")
-        from jaxslam.progress import bar
-        from jaxslam.vision.target import read_target
-        from jaxslam.vision.track import WARM_UP, describe, track
+        from jaxslam._runtime.progress import bar
+        from jaxslam.tracking.target import read_target
+        from jaxslam.tracking.track import WARM_UP, describe, track
 
         with one_line_warnings():
             source = self._source()
@@ -120,9 +120,9 @@ class TrackOptions:
             print(f"wrote {self.viewer}: rerun {self.viewer} shows it")
 
     def _source(self):
-        from jaxslam.video.opening import open_source
-        from jaxslam.video.source import resized, selected
-        from jaxslam.vision.synthetic import synthetic_source
+        from jaxslam.io.opening import open_source
+        from jaxslam.io.source import resized, selected
+        from jaxslam.tracking.synthetic import synthetic_source
 
         if self.source is not None:
             return open_source(

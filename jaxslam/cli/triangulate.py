@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from jaxslam.files import write_json
+from jaxslam._runtime.files import write_json
 from jaxslam.triangulation import CALIBRATIONS, Comparison, TwoViews, compare, summarise, table
 from jaxslam.triangulation.comparison import MEASUREMENTS, PARTICLES, check_sizes
 
@@ -54,7 +54,7 @@ class TriangulateOptions:
         print(f"wrote {self.out / 'triangulation.json'} and {self.out / 'triangulation.png'}")
 
     def _comparison(self) -> Comparison:
-        from jaxslam.progress import bar
+        from jaxslam._runtime.progress import bar
 
         views = TwoViews(
             depth=self.depth,

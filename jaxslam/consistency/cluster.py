@@ -18,9 +18,9 @@ from typing import Any
 
 import jax
 
-from jaxslam.extras import missing
-from jaxslam.files import one_line
-from jaxslam.programs import wide
+from jaxslam._runtime.extras import missing
+from jaxslam._runtime.files import one_line
+from jaxslam._runtime.programs import wide
 
 AHEAD = 3
 """Tasks given out for every thread of the cluster: one at work, the others on their way."""

@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxslam.arrays import AnyArray
+from jaxslam._numerics.arrays import AnyArray
 from jaxslam.consistency.recursion import run_through
+from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.simulation import Room, Run
-from jaxslam.slam.protocol import AbstractFilter
 
 MOST = 0.7
 """The most that a number of θ changes in one step: far from the maximum its curvature misleads."""

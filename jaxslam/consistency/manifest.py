@@ -25,7 +25,7 @@ MOST_NUMBERS = 64
 
 def versions() -> dict[str, str]:
     """Of the packages that decide the digits of a result."""
-    from jaxslam import __version__
+    from jaxslam._version import __version__
 
     return {"jaxslam": __version__, **{name: version(name) for name in ("jax", "jaxlib")}}
 

@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxslam.consistency.recursion import Frame, run_through
-from jaxslam.consistency.statistics import normalised_squared
-from jaxslam.forms.state import State
+from jaxslam.filters.forms.state import State
+from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.readouts import landmarks_from_above
+from jaxslam.filters.window.minimise import Minimum
+from jaxslam.filters.window.problem import path, residuals
+from jaxslam.filters.wrappers.batch_initialisation import FromRest, RestState
 from jaxslam.simulation import Room, Run
-from jaxslam.slam.protocol import AbstractFilter
-from jaxslam.slam.readouts import landmarks_from_above
-from jaxslam.window.minimise import Minimum
-from jaxslam.window.problem import path, residuals
-from jaxslam.wrappers.from_rest import FromRest, RestState
+from jaxslam.statistics.bands import normalised_squared
 
 ALIKE = 0.7
 """Cosine of two paths, from which on they are of one mode."""

@@ -26,20 +26,27 @@ from jax.extend.core import Jaxpr
 from jaxtyping import Array, Int
 
 from jaxslam import native
-from jaxslam.arrays import cast, is_number
-from jaxslam.consistency.beyond_scale import SCALE, beyond_scale, reversal
+from jaxslam._numerics.arrays import cast, is_number
+from jaxslam._runtime.programs import BATCHED, Exact, Program
+from jaxslam._runtime.watchdog import finished, lapack_calls
 from jaxslam.consistency.cluster import as_tasks, connected
 from jaxslam.consistency.manifest import LAYOUT, Manifest, described, versions
 from jaxslam.consistency.recursion import Frame, run_through
-from jaxslam.consistency.statistics import normalised_squared
 from jaxslam.consistency.store import MemoryStore, Records, Store
 from jaxslam.consistency.summary import Seconds, Study
 from jaxslam.consistency.sums import as_sums, keeps_records
+from jaxslam.filters.ekf import innermost
+from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.readouts import (
+    camera_pose,
+    camera_pose_in_unit,
+    landmarks_from_above,
+    landmarks_in_camera,
+)
 from jaxslam.geometry import Pose, difference
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.scale import Metre
 from jaxslam.models.sensors import AbstractSensor
-from jaxslam.programs import BATCHED, Exact, Program
 from jaxslam.simulation import (
     Room,
     Run,
@@ -53,15 +60,8 @@ from jaxslam.simulation import (
     simulate,
     trajectory_of,
 )
-from jaxslam.slam.filter import innermost
-from jaxslam.slam.protocol import AbstractFilter
-from jaxslam.slam.readouts import (
-    camera_pose,
-    camera_pose_in_unit,
-    landmarks_from_above,
-    landmarks_in_camera,
-)
-from jaxslam.watchdog import finished, lapack_calls
+from jaxslam.statistics.bands import normalised_squared
+from jaxslam.statistics.beyond_scale import SCALE, beyond_scale, reversal
 
 DTYPES = ("float64", "float32")
 BACKENDS = ("xla", "native")
@@ -356,7 +356,7 @@ def _warn_of_lapack(jaxpr: Jaxpr, args: tuple[Any, ...]) -> None:
     if calls := lapack_calls(jaxpr):
         warnings.warn(
             f"{type(args[0]).__name__} calls LAPACK in a batch ({', '.join(sorted(calls))}), "
-            "which can stand still on few processors: jaxslam.linalg has what does not",
+            "which can stand still on few processors: jaxslam._numerics.linalg has what does not",
             stacklevel=2,
         )
 

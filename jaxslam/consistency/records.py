@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxslam._runtime.extras import missing
+from jaxslam._runtime.files import write_atomically
 from jaxslam.consistency.store import Records
 from jaxslam.consistency.summary import Study
-from jaxslam.extras import missing
-from jaxslam.files import write_atomically
 
 AXES = {
     "planar": ("x", "z", "rotation"),
@@ -68,7 +68,7 @@ def check_records(path: str | Path) -> Path:
 
 
 def _made_by(study: Study) -> dict[str, Any]:
-    from jaxslam import __version__
+    from jaxslam._version import __version__
 
     scenario = dataclasses.asdict(study.scenario)
     return {

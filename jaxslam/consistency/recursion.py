@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.forms.state import Features, Innovation
+from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.geometry import Pose
+from jaxslam.models.observations import Features, Innovation
 from jaxslam.simulation import Room, Run, features, gone
-from jaxslam.slam.protocol import AbstractFilter
 
 
 class Frame(NamedTuple):

@@ -10,8 +10,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from jaxslam._runtime.files import read_arrays, read_json, write_atomically, write_json
 from jaxslam.consistency.manifest import Manifest, difference
-from jaxslam.files import read_arrays, read_json, write_atomically, write_json
 
 Records = dict[str, np.ndarray]
 SUM = "sum_"

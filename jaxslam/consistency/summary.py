@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxslam.consistency.beyond_scale import SCALE, one_scale_of
-from jaxslam.consistency.statistics import mean_band
+from jaxslam._runtime.files import json_numbers
 from jaxslam.consistency.store import Records, Store
 from jaxslam.consistency.sums import (
     RECORDS,
@@ -21,12 +20,13 @@ from jaxslam.consistency.sums import (
     survived,
     tally_of,
 )
-from jaxslam.consistency.verdict import Tally, lost_runs, sentences
-from jaxslam.files import json_numbers
-from jaxslam.forms.state import Status
+from jaxslam.filters.ekf import innermost
+from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.models.observations import Status
 from jaxslam.simulation import Scenario
-from jaxslam.slam.filter import innermost
-from jaxslam.slam.protocol import AbstractFilter
+from jaxslam.statistics.bands import mean_band
+from jaxslam.statistics.beyond_scale import SCALE, one_scale_of
+from jaxslam.statistics.verdict import Tally, lost_runs, sentences
 
 SCHEMA = 1
 _VALUES_AT_ONCE = 10**7
@@ -131,7 +131,7 @@ def summarise(study: Study) -> dict[str, Any]:
         raise ValueError(
             f"a study is summarised, as monte_carlo gives it, not {type(study).__name__}"
         )
-    from jaxslam import __version__
+    from jaxslam._version import __version__
 
     return {
         "schema": SCHEMA,

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxslam.consistency.beyond_scale import SCALE, OneScale, one_scale_of
-from jaxslam.consistency.statistics import lost_threshold
 from jaxslam.consistency.store import SUM, Records
-from jaxslam.consistency.verdict import Tally
-from jaxslam.forms.state import Status
+from jaxslam.models.observations import Status
+from jaxslam.statistics.bands import lost_threshold
+from jaxslam.statistics.beyond_scale import SCALE, OneScale, one_scale_of
+from jaxslam.statistics.verdict import Tally
 
 RECORDS = (
     "nees", "log_scale", "log_scale_sigma", *SCALE, "reversed", "nis", "nis_dof", "status",

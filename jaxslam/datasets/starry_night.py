@@ -20,7 +20,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxslam.files import check_real, read_arrays
+from jaxslam._runtime.files import check_real, read_arrays
 from jaxslam.models.camera import Camera, project
 from jaxslam.models.motion import VehicleRates
 from jaxslam.simulation import Run

@@ -16,10 +16,10 @@ import jaxlie
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.files import check_real, read_arrays
+from jaxslam._runtime.files import check_real, read_arrays
+from jaxslam.io.tum import read_tum
 from jaxslam.models.camera import Camera
 from jaxslam.simulation import Run
-from jaxslam.tum import read_tum
 
 MOVING = 1
 """What a track is marked with that contradicts a still scene."""

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from jaxslam.tum import check_seconds
+from jaxslam.io.tum import check_seconds
 
 ASYMMETRY = 1e-5
 """Of a covariance, in σ of its two axes: what rounding to six digits leaves is less."""

@@ -12,11 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxslam._runtime.lookup import chosen
 from jaxslam.evaluation.arrays import ROUNDING
 from jaxslam.evaluation.convention import Convention, geometry_of, pose_errors
 from jaxslam.evaluation.laid import laid
 from jaxslam.evaluation.pose_arrays import Poses
-from jaxslam.lookup import chosen
 
 _NOTHING = 1e-3
 """Errors that are less of σ at every pose are no errors."""

@@ -29,9 +29,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxslam.consistency.beyond_scale import BeyondScale, beyond_scale
+from jaxslam._runtime.lookup import chosen
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, exp, log
-from jaxslam.lookup import chosen
+from jaxslam.statistics.beyond_scale import BeyondScale, beyond_scale
 
 CHOICES = {
     "error": ("right", "left", "split"),

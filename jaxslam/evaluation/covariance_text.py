@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxslam._runtime.lookup import chosen, suggestion
 from jaxslam.evaluation.convention import CHOICES, Convention
 from jaxslam.geometry import SPATIAL
-from jaxslam.lookup import chosen, suggestion
-from jaxslam.tum import read_table, write_table
+from jaxslam.io.tum import read_table, write_table
 
 ANGLES = {"rad": 1.0, "deg": np.pi / 180}
 """Units of angles, in radians."""

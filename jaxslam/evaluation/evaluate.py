@@ -12,16 +12,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam.consistency.innovations import innovation_verdict
-from jaxslam.consistency.statistics import mean_band
-from jaxslam.consistency.verdict import headline, lost_runs, run_verdict, sentences
+from jaxslam._runtime.files import json_numbers, write_json
+from jaxslam._runtime.lookup import chosen
 from jaxslam.evaluation.arrays import filled, normalised, paired, step_times, without_known
 from jaxslam.evaluation.convention import Convention
 from jaxslam.evaluation.identify import Identification
 from jaxslam.evaluation.mistakes import Logged, Mistake, mistakes, withheld
 from jaxslam.evaluation.scale import Scale
-from jaxslam.files import json_numbers, write_json
-from jaxslam.lookup import chosen
+from jaxslam.statistics.bands import mean_band
+from jaxslam.statistics.innovations import innovation_verdict
+from jaxslam.statistics.verdict import headline, lost_runs, run_verdict, sentences
 
 SCHEMA = 1
 SIGMAS = 3
@@ -198,7 +198,7 @@ class Evaluation:
 
     def asdict(self) -> dict[str, Any]:
         """The content of `evaluation.json`."""
-        from jaxslam import __version__
+        from jaxslam._version import __version__
 
         by_axis = {name: i for i, name in enumerate(self.names)}
         return {

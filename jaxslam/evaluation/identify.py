@@ -21,9 +21,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.consistency.statistics import PowerSums, mean_p_value
-from jaxslam.consistency.verdict import VERDICT_CONFIDENCE, not_disproved, run_verdict
 from jaxslam.evaluation.convention import Convention
+from jaxslam.statistics.bands import PowerSums, mean_p_value
+from jaxslam.statistics.verdict import VERDICT_CONFIDENCE, not_disproved, run_verdict
 
 NOTICEABLE = 0.05
 """NEES that differ by less than this share say the same of σ, to 2.5 %."""

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam._runtime.files import read_arrays
+from jaxslam._runtime.lookup import suggestion
 from jaxslam.evaluation.convention import CHOICES
 from jaxslam.evaluation.evaluate import Evaluation, evaluate
 from jaxslam.evaluation.poses import evaluate_poses
 from jaxslam.evaluation.trajectories import evaluate_runs, named, runs_of, stated_before
-from jaxslam.files import read_arrays
-from jaxslam.lookup import suggestion
-from jaxslam.tum import read_table, words
+from jaxslam.io.tum import read_table, words
 
 _KEYS = (
     "errors", "innovations", "covariances", "estimates", "truths", "times", "names", *CHOICES,

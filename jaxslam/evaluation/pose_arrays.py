@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
+from jaxslam._runtime.files import LARGEST
 from jaxslam.evaluation.arrays import all_nan, at, check_every_run, check_finite, filled, numbers
 from jaxslam.evaluation.convention import geometry_of
-from jaxslam.files import LARGEST
-from jaxslam.tum import not_rigid
+from jaxslam.io.tum import not_rigid
 
 _RIGID = 1e-4
 """How far from orthonormal a rotation may be: what rounding to six digits leaves is less."""

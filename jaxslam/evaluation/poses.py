@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from jaxslam._runtime.lookup import chosen
 from jaxslam.evaluation.alignment import ALIGNMENTS
 from jaxslam.evaluation.arrays import filled, normalised, step_times, without_known
 from jaxslam.evaluation.axes import estimated, named
@@ -22,7 +23,6 @@ from jaxslam.evaluation.pose_arrays import Poses, checked_poses
 from jaxslam.evaluation.scale import Scale, at_one_scale, of_aligned
 from jaxslam.evaluation.truth import checked_sigma, note, with_truth
 from jaxslam.geometry import Geometry
-from jaxslam.lookup import chosen
 
 BEYOND = (
     "NEES is given the scale, at the one of each run that explains all of its poses best; "

@@ -16,12 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.consistency.beyond_scale import one_scale
-from jaxslam.consistency.verdict import run_verdict
+from jaxslam._runtime.files import json_numbers
 from jaxslam.evaluation.convention import Convention, errors_beyond_scale, pose_errors
 from jaxslam.evaluation.laid import about
 from jaxslam.evaluation.pose_arrays import Poses
-from jaxslam.files import json_numbers
+from jaxslam.statistics.beyond_scale import one_scale
+from jaxslam.statistics.verdict import run_verdict
 
 DRIFT_CONFIDENCE = 0.999
 """Of the verdict on drift: with that on NEES, which is one-sided where a fit took a degree of

@@ -18,7 +18,7 @@ from jaxslam.evaluation.covariance_text import read_covariances
 from jaxslam.evaluation.evaluate import Evaluation
 from jaxslam.evaluation.frames import Judged, judged, left_out
 from jaxslam.evaluation.poses import evaluate_poses
-from jaxslam.tum import check_seconds, read_tum
+from jaxslam.io.tum import check_seconds, read_tum
 
 ESTIMATES = ("estimate.txt", "trajectory.txt")
 COVARIANCES = ("covariance.txt",)

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam._runtime.files import LARGEST
 from jaxslam.evaluation.convention import Convention, geometry_of, truth_derivatives
 from jaxslam.evaluation.pose_arrays import Poses
-from jaxslam.files import LARGEST
 
 
 def checked_sigma(sigma: Sequence[float] | None) -> tuple[float, float] | None:

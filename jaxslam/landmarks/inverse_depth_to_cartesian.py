@@ -9,7 +9,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.arrays import Number
+from jaxslam._numerics.arrays import Number
 from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
 from jaxslam.landmarks import inverse_depth
 from jaxslam.landmarks.parametrization import Parameters, ParametersCovariance, Parametrization

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from jaxtyping import Array, Float
 
-from jaxslam.arrays import Number
+from jaxslam._numerics.arrays import Number
 from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
 
 Parameters = Float[Array, " d"]

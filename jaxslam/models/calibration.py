@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxslam.arrays import AnyArray, number_field
+from jaxslam._numerics.arrays import AnyArray, number_field
 from jaxslam.models.sensors import AbstractSensor
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxslam.arrays import AnyArray, check_shape, numbers, optional_numbers
+from jaxslam._numerics.arrays import AnyArray, check_shape, numbers, optional_numbers
 from jaxslam.geometry import Point, Scalar
 
 Pixel = Float[Array, " p"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 from jaxtyping import Float
 
-from jaxslam.arrays import AnyArray, Number, check_shape, number_field, optional_numbers
+from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field, optional_numbers
 
 
 class InverseDepth(eqx.Module):

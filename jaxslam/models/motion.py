@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxslam.arrays import AnyArray, Number, check_shape, number_field
+from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field
 from jaxslam.geometry import GEOMETRIES, Geometry, Pose, Scalar, exp, identity, joined
 
 Tangent = Float[Array, " t"]

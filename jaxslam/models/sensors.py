@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.arrays import AnyArray, Number, check_shape, number_field
+from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field
 from jaxslam.geometry import Homogeneous, Point
 from jaxslam.models.camera import Camera, bearing, project
 

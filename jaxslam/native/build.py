@@ -12,8 +12,8 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
-from jaxslam import programs
-from jaxslam.files import write_atomically
+from jaxslam._runtime import programs
+from jaxslam._runtime.files import write_atomically
 from jaxslam.native.emit import Source
 
 FLAGS = (

@@ -10,11 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jaxslam._runtime.lookup import chosen
 from jaxslam.consistency import Study, summarise
 from jaxslam.consistency.summary import as_summary
-from jaxslam.consistency.verdict import headline
 from jaxslam.evaluation.evaluate import OUTSIDE
-from jaxslam.lookup import chosen
 from jaxslam.plots.landmarks import region_from_above
 from jaxslam.plots.style import (
     COLUMN,
@@ -31,6 +30,7 @@ from jaxslam.plots.style import (
     set_title,
     short_names,
 )
+from jaxslam.statistics.verdict import headline
 
 _MEDIAN_OF_NORMAL = 0.6745
 """Median of |x| for a standard normal x."""

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 
-from jaxslam.consistency.statistics import chi2_quantile
 from jaxslam.plots.style import COLOURS
+from jaxslam.statistics.bands import chi2_quantile
 
 _FARTHEST = 1 / 60
 """Least inverse distance that is drawn, 1/m."""

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from jaxslam.arrays import AnyArray
+from jaxslam._numerics.arrays import AnyArray
 from jaxslam.consistency.modes import Modes, followed
 from jaxslam.plots.landmarks import region_from_above
 from jaxslam.plots.style import COLOURS, GREY, new_figure, save

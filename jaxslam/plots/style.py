@@ -20,7 +20,7 @@ from matplotlib.ticker import FixedLocator, NullFormatter
 from numpy.typing import ArrayLike
 from scipy.optimize import isotonic_regression
 
-from jaxslam.files import write_atomically
+from jaxslam._runtime.files import write_atomically
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Okabe and Ito's colours, distinct to the colour-blind."""

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxslam.filters.window.problem import Path, landmark_slopes
 from jaxslam.posterior.laplace import covariance_root
 from jaxslam.posterior.problem import (
     Problem,
@@ -31,7 +32,6 @@ from jaxslam.posterior.problem import (
     pixel_residuals,
     unknowns,
 )
-from jaxslam.window.problem import Path, landmark_slopes
 
 
 def centre(problem: Problem, mode: Float[Array, " n"]) -> Float[Array, " n"]:

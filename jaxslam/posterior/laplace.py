@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import optimistix
 from jaxtyping import Array, Bool, Float
 
+from jaxslam._numerics.least_squares import levenberg_marquardt
+from jaxslam._numerics.linalg import cholesky
+from jaxslam.filters.window.problem import Layout
 from jaxslam.geometry import Pose, difference
-from jaxslam.least_squares import levenberg_marquardt
-from jaxslam.linalg import cholesky
 from jaxslam.posterior.problem import (
     Problem,
     last,
@@ -20,7 +21,6 @@ from jaxslam.posterior.problem import (
     size,
     unknowns,
 )
-from jaxslam.window.problem import Layout
 
 SOLVER = levenberg_marquardt(1e-9)
 MOST_STEPS = 200

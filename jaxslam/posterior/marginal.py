@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax.scipy.special import log_ndtr, logsumexp
 from jaxtyping import Array, Bool, Float
 
+from jaxslam.filters.window.problem import Path, cholesky_each, landmark_slopes
 from jaxslam.posterior.problem import (
     Problem,
     Unknowns,
@@ -26,7 +27,6 @@ from jaxslam.posterior.problem import (
     truncated_normal,
     unknowns,
 )
-from jaxslam.window.problem import Path, cholesky_each, landmark_slopes
 
 
 class Landmarks(NamedTuple):

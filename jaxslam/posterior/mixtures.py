@@ -16,14 +16,14 @@ import jax.numpy as jnp
 from jax.scipy.special import digamma, gammaln, logsumexp
 from jaxtyping import Array, Float, Int
 
-from jaxslam.delayed.alternatives import log_density
+from jaxslam._numerics.linalg import cholesky
+from jaxslam.filters.initialisation.alternatives import log_density
+from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.readouts import camera_pose
+from jaxslam.filters.wrappers.bank import Bank, moments
+from jaxslam.filters.wrappers.batch_initialisation import FromRest
 from jaxslam.geometry import Pose, difference
-from jaxslam.linalg import cholesky
 from jaxslam.posterior.moments import covariance, mean_pose, pose_moments
-from jaxslam.slam.protocol import AbstractFilter
-from jaxslam.slam.readouts import camera_pose
-from jaxslam.wrappers.bank import Bank, moments
-from jaxslam.wrappers.from_rest import FromRest
 
 NEIGHBOUR = 8
 """Whose distance the entropy is estimated by; more than the copies that draws may have."""

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam._numerics.linalg import cholesky, eigh
 from jaxslam.geometry import Pose
-from jaxslam.linalg import cholesky, eigh
 from jaxslam.posterior.mixtures import PoseMixture, component_log_densities
 from jaxslam.posterior.moments import covariance
 

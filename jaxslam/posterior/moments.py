@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Float
 
+from jaxslam._numerics.linalg import cholesky
 from jaxslam.geometry import Pose, difference, retract
-from jaxslam.linalg import cholesky
 
 MEAN_ITERATIONS = 4
 

@@ -1,9 +1,9 @@
 """The generative model of a simulated run in whitened variables: what its posterior is made of.
 
-It is that of `jaxslam.window`, with all frames in the window and every landmark first seen in frame
-0. Its unknowns are one vector y here, standard normal a priori: those of the path (the initial
-velocity, and the white acceleration of every step), then the true pixels of all landmarks in frame
-0, then their inverse depths. With the measurements z of the later frames, `−log p(y | z) =
+It is that of `jaxslam.filters.window`, with all frames in the window and every landmark first seen
+in frame 0. Its unknowns are one vector y here, standard normal a priori: those of the path (the
+initial velocity, and the white acceleration of every step), then the true pixels of all landmarks
+in frame 0, then their inverse depths. With the measurements z of the later frames, `−log p(y | z) =
 ½ |r(y)|² + const` for the residuals `r = [y; (z − h(y))/σ_px]`, which is all that a sampler or a
 least-squares solver needs.
 
@@ -25,13 +25,13 @@ import jax.numpy as jnp
 from jax.scipy.special import log_ndtr, ndtri
 from jaxtyping import Array, Float
 
-from jaxslam.arrays import cast
+from jaxslam._numerics.arrays import cast
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.window import problem as window
+from jaxslam.filters.window.problem import Layout, Path
+from jaxslam.filters.window.record import Record, whole
 from jaxslam.geometry import Pose
 from jaxslam.simulation import Run, Scenario, depth_of, motion_of, sensor_of
-from jaxslam.slam.filter import EkfSlam
-from jaxslam.window import problem as window
-from jaxslam.window.problem import Layout, Path
-from jaxslam.window.record import Record, whole
 
 
 class Problem(eqx.Module):
@@ -57,7 +57,7 @@ class Problem(eqx.Module):
 
 
 class Unknowns(eqx.Module):
-    """The whitened numbers of `jaxslam.window`."""
+    """The whitened numbers of `jaxslam.filters.window`."""
 
     path: Float[Array, " N"]
     """The initial velocity and the accelerations, in σ of their prior."""

@@ -16,9 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxslam.arrays import cast
+from jaxslam._numerics.arrays import cast
+from jaxslam._runtime.watchdog import finished
 from jaxslam.consistency.montecarlo import filter_run
-from jaxslam.consistency.statistics import normalised_squared
+from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.readouts import camera_pose
 from jaxslam.geometry import Pose, difference, log
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.posterior.laplace import Laplace, laplace, minima, pose_gaussian, starts
@@ -43,9 +45,7 @@ from jaxslam.posterior.sampler import (
     sample,
 )
 from jaxslam.simulation import Room, Run, Scenario, as_data, sensor_of, simulate
-from jaxslam.slam.protocol import AbstractFilter
-from jaxslam.slam.readouts import camera_pose
-from jaxslam.watchdog import finished
+from jaxslam.statistics.bands import normalised_squared
 
 Records = dict[str, Array]
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxslam.consistency.statistics import lost_threshold, mean_band
 from jaxslam.posterior.ranks import ranks, uniformity
+from jaxslam.statistics.bands import lost_threshold, mean_band
 
 Arrays = Mapping[str, np.ndarray]
 

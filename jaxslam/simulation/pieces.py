@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from jaxslam.arrays import numbers
+from jaxslam._numerics.arrays import numbers
 from jaxslam.models.calibration import Considered, Estimated, Known, White
 from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth

@@ -10,10 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.forms.state import Features
 from jaxslam.geometry import Pose
 from jaxslam.models.camera import Camera
-from jaxslam.slam.protocol import Capacity
+from jaxslam.models.observations import Capacity, Features
 
 
 class Run(eqx.Module):

@@ -15,8 +15,8 @@ from typing import Any
 
 import equinox as eqx
 
+from jaxslam._runtime.lookup import suggestion
 from jaxslam.geometry import GEOMETRIES, Geometry
-from jaxslam.lookup import suggestion
 from jaxslam.simulation.trajectories import find
 
 Numbers = tuple[float, ...]

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial.transform import Rotation
 
-from jaxslam.arrays import AnyArray
+from jaxslam._numerics.arrays import AnyArray
+from jaxslam._runtime.lookup import suggestion
 from jaxslam.geometry import Pose
-from jaxslam.lookup import suggestion
-from jaxslam.tum import read_tum
+from jaxslam.io.tum import read_tum
 
 GAP = 0.15
 """Seconds without a pose that are not bridged; or one and a half of a recording's usual steps."""

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxslam.arrays import cast
+from jaxslam._numerics.arrays import cast
 from jaxslam.geometry import Pose, identity, retract
 from jaxslam.models.camera import Camera
 from jaxslam.models.motion import AbstractMotion

@@ -87,7 +87,7 @@ def compare(
 
 def summarise(comparison: Comparison) -> dict[str, Any]:
     """The content of `triangulation.json`, ready for `json.dumps`; what is infinite is None."""
-    from jaxslam import __version__
+    from jaxslam._version import __version__
 
     views = comparison.views
     return {

@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.forms.state import Features
+from jaxslam._numerics.linalg import semidefinite_root
+from jaxslam.filters.ekf import EkfSlam
 from jaxslam.landmarks import LANDMARKS, Parametrization
-from jaxslam.linalg import semidefinite_root
-from jaxslam.slam.filter import EkfSlam
+from jaxslam.models.observations import Features
 from jaxslam.triangulation.samples import Samples, draw
 from jaxslam.triangulation.truth import intersect
 from jaxslam.triangulation.views import NOISE_DIM, Given, TwoViews

@@ -17,17 +17,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxslam.arrays import AnyArray, cast
+from jaxslam._numerics.arrays import AnyArray, cast
+from jaxslam._runtime.lookup import suggestion
+from jaxslam.filters.ekf import EkfSlam
 from jaxslam.geometry import PLANAR
 from jaxslam.landmarks import Parametrization
-from jaxslam.lookup import suggestion
 from jaxslam.models.calibration import Estimated, Known, White
 from jaxslam.models.camera import Camera, project
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.sensors import Pinhole
 from jaxslam.simulation import Scenario
-from jaxslam.slam.filter import EkfSlam
 
 CALIBRATIONS = {"white": White, "shared": Estimated, "known": lambda sigma: Known()}
 """What the true intrinsics are, and how a filter that knows this treats them: drawn anew in each

@@ -3,7 +3,7 @@
 import pytest
 from pictures import HEIGHT, WIDTH
 
-from jaxslam.video.calibration import Calibration, write_calibration
+from jaxslam.io.calibration import Calibration, write_calibration
 
 
 @pytest.fixture

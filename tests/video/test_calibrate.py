@@ -8,10 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxslam.cli import main
-from jaxslam.video.board import Board, View, sharpness
-from jaxslam.video.calibrate import calibrate, covered, different, drawn_coverage
-from jaxslam.video.calibration import Calibration, read_calibration
-from jaxslam.vision.synthetic import add_noise
+from jaxslam.io.board import Board, View, sharpness
+from jaxslam.io.calibrate import calibrate, covered, different, drawn_coverage
+from jaxslam.io.calibration import Calibration, read_calibration
+from jaxslam.tracking.synthetic import add_noise
 
 CAMERA = Calibration(480, 360, 430.0, 428.0, 233.0, 184.0)
 PIXELS = 24

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from jaxslam.video.calibration import (
+from jaxslam.io.calibration import (
     Calibration,
     from_field_of_view,
     read_calibration,

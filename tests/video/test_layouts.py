@@ -6,8 +6,8 @@ import pytest
 from pictures import HEIGHT, WIDTH, brightness, picture, write_pictures
 from scipy.spatial.transform import Rotation
 
-from jaxslam.video.calibration import Calibration, write_calibration
-from jaxslam.video.opening import open_source
+from jaxslam.io.calibration import Calibration, write_calibration
+from jaxslam.io.opening import open_source
 
 
 def pose(seed):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from pictures import HEIGHT, WIDTH, brightness, picture
 
-from jaxslam.tum import write_tum
-from jaxslam.video.calibration import Calibration, from_field_of_view, write_calibration
-from jaxslam.video.opening import open_source
-from jaxslam.video.source import selected
+from jaxslam.io.calibration import Calibration, from_field_of_view, write_calibration
+from jaxslam.io.opening import open_source
+from jaxslam.io.source import selected
+from jaxslam.io.tum import write_tum
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from pictures import HEIGHT, WIDTH, brightness, picture
 
-from jaxslam.video import camera, file
-from jaxslam.video.opening import open_source
+from jaxslam.io import camera, file
+from jaxslam.io.opening import open_source
 
 RATE = 25.0
 

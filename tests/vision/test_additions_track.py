@@ -9,9 +9,9 @@ pytest.importorskip("cv2")
 from additions import PLAIN_HOMOGENEOUS, BiasedVelocity, DriftingFocal, Huber, Pixels
 
 import jaxslam
-from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.synthetic import synthetic_source
-from jaxslam.vision.tracker import Tracker
+from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.synthetic import synthetic_source
+from jaxslam.tracking.tracker import Tracker
 
 FRAMES = 8
 

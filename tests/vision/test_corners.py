@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxslam.vision.corners import detect_corners
-from jaxslam.vision.synthetic import synthetic_source
+from jaxslam.tracking.corners import detect_corners
+from jaxslam.tracking.synthetic import synthetic_source
 
 NOWHERE = np.empty((0, 2))
 

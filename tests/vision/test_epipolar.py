@@ -5,8 +5,8 @@ import pytest
 
 pytest.importorskip("cv2")
 
-from jaxslam.video.calibration import Calibration
-from jaxslam.vision.epipolar import of_one_motion
+from jaxslam.io.calibration import Calibration
+from jaxslam.tracking.epipolar import of_one_motion
 
 CAMERA = Calibration(640, 480, 500.0, 500.0, 319.5, 239.5, distortion=(-0.2, 0.05))
 PLAIN = Calibration(640, 480, 500.0, 500.0, 319.5, 239.5)

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxslam.geometry import exp, jacobian
-from jaxslam.tum import poses
-from jaxslam.vision.located import Located, adjoint
+from jaxslam.io.tum import poses
+from jaxslam.tracking.located import Located, adjoint
 
 
 def located(seed, sigma):

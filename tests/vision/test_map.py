@@ -5,14 +5,14 @@ import pytest
 
 pytest.importorskip("cv2")
 
-from jaxslam.video.calibration import Calibration
-from jaxslam.vision import tracker as programs
-from jaxslam.vision.landmarks import Landmark, Points
-from jaxslam.vision.map import Prediction, failing, in_view, note_found, to_search, worst_first
-from jaxslam.vision.patches import Patch
-from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.synthetic import synthetic_source
-from jaxslam.vision.tracker import Tracker
+from jaxslam.io.calibration import Calibration
+from jaxslam.tracking import tracker as programs
+from jaxslam.tracking.landmarks import Landmark, Points
+from jaxslam.tracking.map import Prediction, failing, in_view, note_found, to_search, worst_first
+from jaxslam.tracking.patches import Patch
+from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.synthetic import synthetic_source
+from jaxslam.tracking.tracker import Tracker
 
 CAMERA = Calibration(640, 480, 500.0, 500.0, 319.5, 239.5)
 SETTINGS = TrackerSettings(filter="world", wanted=5)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection, LineCollection
 
+from jaxslam.io.tum import poses
 from jaxslam.plots import tracking
 from jaxslam.plots.tracking import plot_map
-from jaxslam.tum import poses
 
 
 @pytest.fixture

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxslam.video.opening import open_source
-from jaxslam.vision import matching
-from jaxslam.vision.corners import detect_corners
-from jaxslam.vision.matching import PEAKS, match_patches
-from jaxslam.vision.patches import Patch
-from jaxslam.vision.synthetic import add_noise
+from jaxslam.io.opening import open_source
+from jaxslam.tracking import matching
+from jaxslam.tracking.corners import detect_corners
+from jaxslam.tracking.matching import PEAKS, match_patches
+from jaxslam.tracking.patches import Patch
+from jaxslam.tracking.synthetic import add_noise
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 NOWHERE = np.empty((0, 2))

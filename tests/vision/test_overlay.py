@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from jaxslam.plots.tracking import plot_map
-from jaxslam.vision.film import WAITING, Aside, OverlayWriter
-from jaxslam.vision.overlay import COLOURS, LEAST_RADIUS, draw_overlay, overlay_size
-from jaxslam.vision.pointcloud import write_ply
+from jaxslam.tracking.film import WAITING, Aside, OverlayWriter
+from jaxslam.tracking.overlay import COLOURS, LEAST_RADIUS, draw_overlay, overlay_size
+from jaxslam.tracking.pointcloud import write_ply
 
 GREY = np.full((120, 640), 100, np.uint8)
 NOTHING = np.full((1, 2), np.nan)

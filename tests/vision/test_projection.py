@@ -5,10 +5,10 @@ import pytest
 from matplotlib.collections import EllipseCollection
 from scipy.spatial.transform import Rotation
 
+from jaxslam.io.calibration import Calibration
 from jaxslam.plots.frames import Laid, plot_frames
-from jaxslam.video.calibration import Calibration
-from jaxslam.vision.pointcloud import Cloud, read_ply, write_ply
-from jaxslam.vision.projection import seen_from
+from jaxslam.tracking.pointcloud import Cloud, read_ply, write_ply
+from jaxslam.tracking.projection import seen_from
 
 LENS = Calibration(320, 240, 300.0, 310.0, 160.0, 118.0, (-0.2, 0.05, 1e-3, -2e-3))
 

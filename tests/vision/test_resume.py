@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 import jaxslam
-from jaxslam.video.calibration import from_field_of_view
-from jaxslam.video.pictures import as_grey
-from jaxslam.video.source import Frame
-from jaxslam.vision.landmarks import Landmark, stacked, unstacked
-from jaxslam.vision.patches import Patch
-from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.synthetic import synthetic_source
-from jaxslam.vision.tracker import Tracker
+from jaxslam.io.calibration import from_field_of_view
+from jaxslam.io.pictures import as_grey
+from jaxslam.io.source import Frame
+from jaxslam.tracking.landmarks import Landmark, stacked, unstacked
+from jaxslam.tracking.patches import Patch
+from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.synthetic import synthetic_source
+from jaxslam.tracking.tracker import Tracker
 
 FRAMES, HALF = 10, 5
 SETTINGS = TrackerSettings(filter="world", wanted=12, spare=4)

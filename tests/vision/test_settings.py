@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from jaxslam.io.calibration import Calibration, from_field_of_view
 from jaxslam.models.calibration import Estimated, Known, White
-from jaxslam.video.calibration import Calibration, from_field_of_view
-from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.synthetic import synthetic_source
-from jaxslam.vision.tracker import Tracker
+from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.synthetic import synthetic_source
+from jaxslam.tracking.tracker import Tracker
 
 STATED = Calibration(640, 480, 500.0, 500.0, 320.0, 240.0, sigma=(4.0, 3.0, 2.0, 1.0))
 PLAIN = Calibration(640, 480, 500.0, 500.0, 320.0, 240.0)

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxslam.video.calibration import Calibration
-from jaxslam.vision.synthetic import (
+from jaxslam.io.calibration import Calibration
+from jaxslam.tracking.synthetic import (
     NOISE,
     Quad,
     add_noise,

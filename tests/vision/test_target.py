@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxslam.cli import main
-from jaxslam.video.opening import open_source
-from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.synthetic import room, synthetic_source
-from jaxslam.vision.target import KnownPoint, Target, read_target, sighted
-from jaxslam.vision.tracker import Tracker
+from jaxslam.io.opening import open_source
+from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.synthetic import room, synthetic_source
+from jaxslam.tracking.target import KnownPoint, Target, read_target, sighted
+from jaxslam.tracking.tracker import Tracker
 
 FRAMES = 14
 TURN = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()

@@ -11,9 +11,9 @@ import tqdm.auto
 pytest.importorskip("cv2")
 
 from jaxslam.cli.track import TrackOptions
-from jaxslam.vision import track as tracking
-from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.synthetic import synthetic_source
+from jaxslam.tracking import track as tracking
+from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.synthetic import synthetic_source
 
 SETTINGS = TrackerSettings(filter="world", wanted=10, spare=4)
 NUMBERS = {"trajectory.txt", "covariance.txt", "frames.csv", "summary.json"}

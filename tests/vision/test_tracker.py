@@ -15,26 +15,26 @@ import pytest
 pytest.importorskip("cv2")
 
 import jaxslam
+from jaxslam._runtime.programs import Program
+from jaxslam._runtime.watchdog import lapack_calls
 from jaxslam.evaluation import read_covariances
-from jaxslam.forms.state import Status
-from jaxslam.programs import Program
-from jaxslam.slam.readouts import landmarks_in_camera
-from jaxslam.tum import read_tum
-from jaxslam.video.calibration import from_field_of_view
-from jaxslam.video.opening import open_source
-from jaxslam.vision import tracker as programs
-from jaxslam.vision.landmarks import Landmark
-from jaxslam.vision.located import Located, adjoint
-from jaxslam.vision.patches import STORED, Patch
-from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.synthetic import synthetic_source
-from jaxslam.vision.track import TOO_SURE, describe, track
-from jaxslam.vision.tracker import LEAST_MATCHES, PROVEN, Tracked, Tracker
-from jaxslam.vision.trajectory import (
+from jaxslam.filters.readouts import landmarks_in_camera
+from jaxslam.io.calibration import from_field_of_view
+from jaxslam.io.opening import open_source
+from jaxslam.io.tum import read_tum
+from jaxslam.models.observations import Status
+from jaxslam.tracking import tracker as programs
+from jaxslam.tracking.landmarks import Landmark
+from jaxslam.tracking.located import Located, adjoint
+from jaxslam.tracking.patches import STORED, Patch
+from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.synthetic import synthetic_source
+from jaxslam.tracking.track import TOO_SURE, describe, track
+from jaxslam.tracking.tracker import LEAST_MATCHES, PROVEN, Tracked, Tracker
+from jaxslam.tracking.trajectory import (
     absolute_trajectory_error,
     pose_nees,
 )
-from jaxslam.watchdog import lapack_calls
 
 FRAMES = 45
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxslam._runtime.files import write_atomically
 from jaxslam.evaluation import read_covariances
 from jaxslam.evaluation.arrays import exactly_known
-from jaxslam.files import write_atomically
-from jaxslam.tum import poses, read_tum, write_tum
-from jaxslam.vision.trajectory import (
+from jaxslam.io.tum import poses, read_tum, write_tum
+from jaxslam.tracking.trajectory import (
     absolute_trajectory_error,
     alignment,
     nees_beyond_scale,

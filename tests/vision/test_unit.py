@@ -13,15 +13,15 @@ import pytest
 pytest.importorskip("cv2")
 
 import jaxslam
+from jaxslam.filters.protocol import Scene
 from jaxslam.geometry import scaled
-from jaxslam.slam.protocol import Scene
-from jaxslam.vision import tracker as programs
-from jaxslam.vision.located import Located, adjoint
-from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.synthetic import synthetic_source
-from jaxslam.vision.track import write_frames
-from jaxslam.vision.tracker import Tracker
-from jaxslam.vision.unit import lengthened, nearness
+from jaxslam.tracking import tracker as programs
+from jaxslam.tracking.located import Located, adjoint
+from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.synthetic import synthetic_source
+from jaxslam.tracking.track import write_frames
+from jaxslam.tracking.tracker import Tracker
+from jaxslam.tracking.unit import lengthened, nearness
 
 FRAMES, FIXED = 12, 5
 WANDER = 0.3 + 0.4 * np.sin(np.arange(FRAMES + 1))

@@ -8,9 +8,9 @@ import pytest
 
 pytest.importorskip("cv2")
 
-from jaxslam.vision.settings import TrackerSettings
-from jaxslam.vision.synthetic import synthetic_source
-from jaxslam.vision.track import track
+from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.synthetic import synthetic_source
+from jaxslam.tracking.track import track
 
 SETTINGS = TrackerSettings(filter="world", wanted=10, spare=4)
 FRAMES = 4
@@ -114,5 +114,5 @@ def test_a_recording_ends_in_rrd(tmp_path):
 
 
 def test_tracking_without_a_recording_does_not_import_rerun():
-    code = "import sys, jaxslam.vision.track; assert 'rerun' not in sys.modules"
+    code = "import sys, jaxslam.tracking.track; assert 'rerun' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

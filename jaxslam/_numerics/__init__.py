@@ -1,0 +1,1 @@
+"""Small numerics in JAX that every room stands on: arrays, factorisations, least squares."""

@@ -1,0 +1,191 @@
+"""Factorisations of small matrices, written in JAX: batched by `vmap`, differentiable, no LAPACK.
+
+jaxlib's batched LAPACK kernels wait inside XLA's thread pool for pieces of work that only the same
+pool can do: two at once stand still for ever on two cores (docs/dead-lock.md). These loops take the
+same time within a third on a quiet machine, and a fraction of it on a loaded one (`python
+benchmarks/linalg.py`).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxslam._numerics.arrays import AnyArray
+
+LEAF = 32
+"""Rows of what is factored column by column; of more, the halves are, and joined by products."""
+UNROLLED = 4
+"""Rows up to which the loops over them are written out."""
+SWEEPS = 10
+"""Of Jacobi's method over all pairs; it converges quadratically, from about the fourth on."""
+
+
+class Cholesky(NamedTuple):
+    """`A = L Lᵀ`; all NaN unless A is positive definite."""
+
+    root: Float[Array, "n n"]
+    """L, lower triangular."""
+    whitening: Float[Array, "n n"]
+    """L⁻¹: `A⁻¹ = L⁻ᵀ L⁻¹`."""
+
+    @property
+    def positive(self) -> Bool[Array, ""]:
+        """Whether A is positive definite."""
+        return jnp.all(~jnp.isnan(jnp.diagonal(self.root)))
+
+    def solve(self, b: Float[AnyArray, "n ..."]) -> Float[Array, "n ..."]:
+        """A⁻¹ b."""
+        return self.whitening.T @ (self.whitening @ b)
+
+    def inverse(self) -> Float[Array, "n n"]:
+        """A⁻¹, symmetric."""
+        return self.whitening.T @ self.whitening
+
+    def log_det(self) -> Float[Array, ""]:
+        """log det A."""
+        return 2 * jnp.sum(jnp.log(jnp.diagonal(self.root)))
+
+
+@jax.custom_jvp
+def cholesky(A: Float[AnyArray, "n n"]) -> Cholesky:
+    """Both L and L⁻¹ of a symmetric A, of which the lower triangle is read."""
+    root, whitening = _factored(jnp.asarray(A))
+    positive = jnp.all(jnp.diagonal(root) > 0)
+    return Cholesky(*(jnp.where(positive, x, jnp.nan) for x in (root, whitening)))
+
+
+@cholesky.defjvp
+def _(primals, tangents):
+    """`dL = L Φ`, `dL⁻¹ = −Φ L⁻¹`, Φ the lower half of `L⁻¹ dA L⁻ᵀ` (Murray 2016, eq. 8)."""
+    (A,), (dA,) = primals, tangents
+    L, W = cholesky(A)
+    whitened = W @ ((dA + dA.T) / 2) @ W.T
+    half = jnp.tril(whitened) - jnp.diag(jnp.diagonal(whitened)) / 2
+    return Cholesky(L, W), Cholesky(L @ half, -half @ W)
+
+
+def _factored(A: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+    """L and L⁻¹ by halves: products of matrices, and leaves."""
+    n = A.shape[0]
+    if n <= LEAF:
+        return _factored_by_columns(A)
+    h = n // 2
+    L, W = _factored(A[:h, :h])
+    below = A[h:, :h] @ W.T
+    # A product with L⁻¹ is wrong by the condition of L; one refinement makes it as good as
+    # substitution, which matters where A is nearly singular.
+    below += (A[h:, :h] - below @ L.T) @ W.T
+    L_rest, W_rest = _factored(A[h:, h:] - below @ below.T)
+    none = jnp.zeros((h, n - h), A.dtype)
+    return (
+        jnp.block([[L, none], [below, L_rest]]),
+        jnp.block([[W, none], [-W_rest @ (below @ W), W_rest]]),
+    )
+
+
+def _factored_by_columns(A: Float[Array, "n n"]) -> tuple[Array, Array]:
+    """L column by column from the left, and then L⁻¹ row by row."""
+    n = A.shape[0]
+    index = jnp.arange(n)
+
+    def column(k, L):
+        left = jnp.where(index >= k, A[:, k] - L @ L[k], 0.0)
+        return L.at[:, k].set(left / jnp.sqrt(left[k]))
+
+    loop = partial(jax.lax.fori_loop, 0, n, init_val=jnp.zeros_like(A), unroll=n <= UNROLLED)
+    L = loop(column)
+
+    def row(k, W):
+        return W.at[k].set(((index == k) - L[k] @ W) / L[k, k])
+
+    return L, loop(row)
+
+
+class SemidefiniteRoot(NamedTuple):
+    """`P = L Lᵀ` of any rank."""
+
+    root: Float[Array, "n n"]
+    whitening: Float[Array, "n n"]
+    """Solves `L y = b` for b in the range of L; zero for what has no variance."""
+
+
+def semidefinite_root(P: Float[Array, "n n"]) -> SemidefiniteRoot:
+    """Cholesky's L of a covariance without full rank, to the precision of rounding.
+
+    Of the correlations with a jitter at rounding's size; what has no variance has a row of zeros.
+    """
+    variance = jnp.diagonal(P)
+    none = variance <= 0
+    sigma = jnp.sqrt(jnp.where(none, 0.0, variance))
+    unit = jnp.where(none, 1.0, sigma)
+    jitter = 10 * sigma.size * jnp.finfo(P.dtype).eps
+    correlation = P / (unit[:, None] * unit) + jnp.diag(jnp.where(none, 1.0, jitter))
+    L, W = cholesky(correlation)
+    return SemidefiniteRoot(sigma[:, None] * L, W / unit)
+
+
+@jax.jit
+def symmetric_part(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """`(A + Aᵀ) / 2` of what is symmetric but for rounding.
+
+    By its name the native backend knows that half of A is enough.
+    """
+    return (A + A.T) / 2
+
+
+def eigh(A: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """Eigenvalues, the least first, and eigenvectors as columns, by Jacobi's rotations.
+
+    For a few rows: n²/2 rotations a sweep, one after the other.
+    """
+    n = A.shape[0]
+    if n == 1:
+        return A[0], jnp.ones_like(A)
+    first, second = (jnp.asarray(i) for i in np.triu_indices(n, 1))
+
+    def rotated(k, carry):
+        A, V = carry
+        p, q = first[k % first.size], second[k % first.size]
+        turn = _annihilating(A[p, p], A[p, q], A[q, q])
+        both = jnp.stack([p, q])
+        A = A.at[both].set(turn.T @ A[both])
+        A = A.at[:, both].set(A[:, both] @ turn)
+        return A, V.at[:, both].set(V[:, both] @ turn)
+
+    start = (A + A.T) / 2, jnp.eye(n, dtype=A.dtype)
+    A, V = jax.lax.fori_loop(0, SWEEPS * first.size, rotated, start)
+    values = jnp.diagonal(A)
+    order = jnp.argsort(values)
+    return values[order], V[:, order]
+
+
+def _annihilating(a, b, c) -> Float[Array, "2 2"]:
+    """The rotation J for which `Jᵀ [a b; b c] J` is diagonal (Golub, Van Loan, §8.5.2)."""
+    away, square = jnp.abs(c - a), (c - a) ** 2 + 4 * b**2
+    none = square == 0
+    length = away + jnp.sqrt(jnp.where(none, 1.0, square))
+    tangent = jnp.where(c >= a, 2.0, -2.0) * b / length
+    cosine = 1 / jnp.sqrt(1 + tangent**2)
+    return cosine * jnp.array([[1.0, tangent], [-tangent, 1.0]])
+
+
+def inverse(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """A⁻¹ of any regular matrix, by Gauss–Jordan with row pivoting; not finite otherwise."""
+    n = A.shape[0]
+    index = jnp.arange(n)
+
+    def eliminated(k, both):
+        pivot = jnp.argmax(jnp.where(index >= k, jnp.abs(both[:, k]), -1.0))
+        row = both[pivot]
+        both = both.at[pivot].set(both[k])
+        row = row / row[k]
+        return (both - both[:, k, None] * row).at[k].set(row)
+
+    both = jnp.concatenate([A, jnp.eye(n, dtype=A.dtype)], axis=1)
+    return jax.lax.fori_loop(0, n, eliminated, both)[:, n:]

@@ -1,0 +1,1 @@
+"""What is no mathematics: files, kept programs, progress, look-ups, and the end of a hang."""

@@ -1,0 +1,370 @@
+"""Programs that are compiled before they are needed, and kept from one process to the next.
+
+JAX's cache of compiled programs spares the compiler; a program of ten thousand operations is still
+traced and lowered by Python, for seconds. Here the whole is kept, if a folder is told (`keep_in`):
+a file for each program, by all that it depends on. One that is damaged, or another user's, is
+compiled anew. Such a file is code, and what is around it a pickle: as for JAX's own cache, the
+folder is to be its user's alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import os
+import pickle
+import platform
+import secrets
+import sys
+import threading
+import weakref
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from dataclasses import fields, is_dataclass
+from functools import cache, partial
+from importlib.metadata import version
+from pathlib import Path
+from types import BuiltinFunctionType, FunctionType, MethodType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.serialize_executable import deserialize_and_load, serialize
+from jax.extend.core import Jaxpr
+
+from jaxslam._runtime.files import write_atomically
+
+Options = Mapping[str, Mapping[str, Any]]
+"""Of the compiler, by platform; done without where it does not know them."""
+
+# Without emitters of fusions it takes two thirds of the time, to programs that are as fast.
+BATCHED: Options = {"cpu": {"xla_cpu_use_fusion_emitters": False}}
+# Libraries of kernels whose threads wait for one another: matrices of one run are too small.
+ALONE: Options = {"cpu": {**BATCHED["cpu"], "xla_cpu_experimental_ynn_fusion_type": ""}}
+
+MOST = 32
+"""Structures of whose programs one keeps those that were used last."""
+PACKAGES = ("jax", "jaxlib", "equinox", "jaxlie", "lineax", "numpy", "optimistix")
+"""Whose versions are known: a program of anything else but these, Python's and this package's
+functions is not kept, as they may change without notice."""
+
+_kept_in: Path | None = None
+
+
+def keep_in(folder: Path | None) -> None:
+    """From now on keep every program that is made in this folder, and take it from there."""
+    global _kept_in
+    _kept_in = folder
+
+
+def kept_in() -> Path | None:
+    """The folder that was told."""
+    return _kept_in
+
+
+_all: weakref.WeakSet[Program] = weakref.WeakSet()
+
+
+def forget() -> None:
+    """Free all programs that were made, as `jax.clear_caches` does JAX's: each holds some of the
+    memory maps of which a process may have only so many."""
+    for program in _all:
+        program.forget()
+
+
+class Program:
+    """A pure function of pytrees, compiled once for each structure of its arguments.
+
+    Arrays among their leaves (or `jax.ShapeDtypeStruct`, for `compile`) are data; everything else
+    is part of the program, is to be hashable, and is the same only by type and bits (`exactly`).
+    What is traced may be `seen`, with the arguments, before it is compiled.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        options: Options = ALONE,
+        seen: Callable[[Jaxpr, tuple[Any, ...]], None] = lambda jaxpr, args: None,
+    ) -> None:
+        self.function, self.options, self.seen = function, options, seen
+        self._made: dict[Any, Future[_Made]] = {}
+        self._lock = threading.Lock()
+        _all.add(self)
+
+    def __call__(self, *args: Any) -> Any:
+        call = _Call.of(args)
+        return self._compiled(call)(call.arrays)
+
+    def compile(self, *args: Any) -> Any:
+        """Compile for such arguments, or wait for who does; what it returns, as shapes."""
+        return self._compiled(_Call.of(args)).shapes
+
+    def forget(self) -> None:
+        """Free what was made."""
+        with self._lock:
+            self._made.clear()
+
+    def _compiled(self, call: _Call) -> _Made:
+        key = exactly(call.key)
+        with self._lock:
+            future = self._made.pop(key, None)
+            if mine := future is None:
+                future = Future()
+            self._made[key] = future  # the last
+            while len(self._made) > MOST:
+                del self._made[next(iter(self._made))]
+        if mine:
+            try:
+                future.set_result(self._make(call))
+            except BaseException as error:
+                future.set_exception(error)
+                with self._lock:
+                    self._made.pop(key, None)
+        return future.result()
+
+    def _make(self, call: _Call) -> _Made:
+        folder, name = _kept_in, _name(self.function)
+        if folder is None:
+            return self._compile(call, name)
+        try:
+            key = _Pickled.of((self.function, call.key, _surroundings(), self.options))
+        except (pickle.PicklingError, AttributeError, TypeError):
+            return self._compile(call, name)  # of one's own
+        path = folder / f"{name}-{hashlib.sha256(key.data).hexdigest()}.program"
+        made = _read(path, key.functions)
+        if made is None:
+            # What JAX has read from its own cache cannot be written again: a name that it
+            # has never seen is not there.
+            made = self._compile(call, f"{name}_{secrets.token_hex(4)}")
+            _keep(path, made)
+        return made
+
+    def _compile(self, call: _Call, name: str) -> _Made:
+        structures = []
+
+        def flat(arrays):
+            leaves, structure = jax.tree.flatten(self.function(*call.arguments(arrays)))
+            structures.append(structure)
+            return leaves
+
+        flat.__name__ = name
+        shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in call.arrays]
+        traced = jax.jit(flat).trace(shapes)
+        self.seen(traced.jaxpr.jaxpr, call.arguments(shapes))
+        lowered = traced.lower()
+        after = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in lowered.out_info]
+        compiled = _with_options(lowered, self.options)
+        return _Made(compiled, jax.tree.unflatten(structures[-1], after))
+
+
+class _Call(NamedTuple):
+    """What a program is called with."""
+
+    arrays: list[Any]
+    key: Any
+    """Structure, and of every leaf its shape and type or, where it is no array, itself."""
+
+    @classmethod
+    def of(cls, args: tuple[Any, ...]) -> _Call:
+        leaves, structure = jax.tree.flatten(args)
+        kinds = tuple((x.shape, x.dtype.name) if _is_array(x) else x for x in leaves)
+        key = structure, tuple(map(_is_array, leaves)), kinds, wide()
+        return cls([x for x in leaves if _is_array(x)], key)
+
+    def arguments(self, arrays: list[Any]) -> tuple[Any, ...]:
+        """With these arrays in place of its own."""
+        structure, are_arrays, kinds, _ = self.key
+        rest = iter(arrays)
+        leaves = [next(rest) if array else x for array, x in zip(are_arrays, kinds, strict=True)]
+        return jax.tree.unflatten(structure, leaves)
+
+
+def exactly(value: Any) -> Any:
+    """A key that equals another's where both values are of one type and have the same bits.
+
+    `==` takes 2 for 2.0, True for 1 and −0.0 for 0.0, which programs do not, and NaN for nothing.
+    What is within tuples, modules, other objects that compare by value and structures of pytrees
+    is compared so too.
+    """
+    kind = type(value)
+    if isinstance(value, jax.tree_util.PyTreeDef):
+        return kind, exactly(value.node_data()), tuple(map(exactly, value.children()))
+    if isinstance(value, float | complex):
+        return kind, np.asarray(value, complex).tobytes()
+    if isinstance(value, np.generic | np.ndarray):
+        return kind, value.dtype, value.shape, value.tobytes()
+    if isinstance(value, dict):
+        return kind, tuple((exactly(k), exactly(x)) for k, x in value.items())
+    if isinstance(value, frozenset):
+        return kind, frozenset(map(exactly, value))
+    if isinstance(value, tuple | list):
+        return kind, tuple(map(exactly, value))
+    if isinstance(value, partial):
+        return kind, exactly((value.func, value.args, value.keywords))
+    if isinstance(value, MethodType):
+        return kind, value.__func__, exactly(value.__self__)
+    if kind.__eq__ is object.__eq__ or isinstance(value, type | FunctionType):
+        return value
+    if is_dataclass(value):
+        return kind, tuple(exactly(getattr(value, f.name, None)) for f in fields(value))
+    return kind, value, exactly(getattr(value, "__dict__", None))
+
+
+class Exact(NamedTuple):
+    """A value as an argument of a cache, which finds it by `exactly`."""
+
+    value: Any
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Exact) and exactly(self.value) == exactly(other.value)
+
+    def __hash__(self) -> int:
+        return hash(exactly(self.value))
+
+
+def wide() -> bool:
+    """Whether numbers are of 64 bits where this is asked."""
+    return bool(jnp.result_type(float) == jnp.float64)
+
+
+def _name(function: Callable[..., Any]) -> str:
+    return getattr(function, "__name__", type(function).__name__)
+
+
+def _is_array(leaf: Any) -> bool:
+    return hasattr(leaf, "shape") and hasattr(leaf, "dtype")
+
+
+class _Made(NamedTuple):
+    """A program of lists of arrays, and the structure of what it returns."""
+
+    compiled: jax.stages.Compiled
+    shapes: Any
+
+    def __call__(self, arrays: list[Any]) -> Any:
+        return jax.tree.unflatten(jax.tree.structure(self.shapes), self.compiled(arrays))
+
+
+def _with_options(lowered: jax.stages.Lowered, options: Options) -> jax.stages.Compiled:
+    own = options.get(jax.default_backend())
+    with contextlib.suppress(RuntimeError):
+        return lowered.compile(compiler_options=None if own is None else dict(own))
+    return lowered.compile()
+
+
+def in_background(*steps: Callable[[], Any]) -> threading.Thread:
+    """Take the steps one after the other, aside; those not begun when the process ends are left
+    out. What goes wrong will do so again where it is needed."""
+
+    @jax.enable_x64(wide())
+    def take() -> None:
+        for step in steps:
+            if threading.main_thread().is_alive():
+                with contextlib.suppress(Exception):
+                    step()
+
+    thread = threading.Thread(target=take)
+    thread.start()
+    return thread
+
+
+class _Pickled(NamedTuple):
+    """A pickle in which functions are only named; and these."""
+
+    data: bytes
+    functions: dict[str, FunctionType]
+
+    @classmethod
+    def of(cls, value: Any) -> _Pickled:
+        file = io.BytesIO()
+        pickler = _Pickler(file)
+        pickler.dump(value)
+        return cls(file.getvalue(), pickler.functions)
+
+
+class _Pickler(pickle.Pickler):
+    def __init__(self, file: io.BytesIO) -> None:
+        super().__init__(file, protocol=5)
+        # Equal things are to have equal pickles, be they one or two.
+        self.fast = True
+        self.functions: dict[str, FunctionType] = {}
+
+    def persistent_id(self, obj: Any) -> str | None:
+        if isinstance(obj, type | FunctionType | BuiltinFunctionType) and not _known(obj):
+            raise pickle.PicklingError(f"{obj.__qualname__} may change without notice")
+        if not isinstance(obj, FunctionType):
+            return None
+        if obj.__closure__:
+            raise pickle.PicklingError(f"{obj.__qualname__} has values that nothing tells")
+        name = f"{obj.__module__}.{obj.__qualname__}:{obj.__code__.co_firstlineno}"
+        self.functions[name] = obj
+        return name
+
+
+def _known(obj: type | FunctionType | BuiltinFunctionType) -> bool:
+    package = (obj.__module__ or "builtins").partition(".")[0]
+    return package in ("jaxslam", *PACKAGES) or package in sys.stdlib_module_names
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, data: bytes, functions: dict[str, FunctionType]) -> None:
+        super().__init__(io.BytesIO(data))
+        self._functions = functions
+
+    def persistent_load(self, pid: str) -> FunctionType:
+        return self._functions[pid]
+
+
+def _read(path: Path, functions: dict[str, FunctionType]) -> _Made | None:
+    """A program that was kept; None where there is none, or where it is not to be trusted."""
+    try:
+        if hasattr(os, "getuid") and path.stat().st_uid != os.getuid():
+            return None
+        digest, data = path.read_bytes().split(b"\n", 1)
+        if digest.decode() != hashlib.sha256(data).hexdigest():
+            return None
+        shapes, *program = _Unpickler(data, functions).load()
+        return _Made(deserialize_and_load(*program), shapes)
+    except Exception:  # of another version, of any kind
+        return None
+
+
+def _keep(path: Path, made: _Made) -> None:
+    try:
+        data = _Pickled.of((made.shapes, *serialize(made.compiled))).data
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with write_atomically(path) as temporary:
+            temporary.write_bytes(hashlib.sha256(data).hexdigest().encode() + b"\n" + data)
+    except Exception:  # a full disk, a program that cannot be written: compiled again next time
+        return
+
+
+def _surroundings() -> tuple[Any, ...]:
+    """All that a program depends on beside its function's arguments."""
+    device = jax.devices()[0]
+    config = jax.config.values
+    settings = sorted((name, str(x)) for name, x in config.items() if "cache" not in name)
+    where = device.client.platform_version, device.device_kind, len(jax.devices())
+    return _sources(), *where, settings, os.environ.get("XLA_FLAGS")
+
+
+@cache
+def _sources() -> tuple[str, ...]:
+    """What this package, those that it computes with and this processor are."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
+    versions = (version(name) for name in PACKAGES)
+    return digest.hexdigest(), platform.python_version(), *versions, *processor()
+
+
+def processor() -> tuple[str, ...]:
+    """What this machine's processor is, and what it can do."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    features = [line for line in lines if line.lower().startswith(("flags", "features"))]
+    return platform.machine(), platform.processor(), *features[:1]

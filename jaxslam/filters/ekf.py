@@ -1,0 +1,493 @@
+"""EKF-SLAM composed of its pieces: how the camera moves, what it measures, and what is kept.
+
+A frame is `predict`, `update`, `compose`, `close`. The motion is composed after the update, as the
+paper has it, or before. What the stages are made of are functions of this module, for filters
+that are built around this one and for the methods by which landmarks enter (`AbstractEntry`).
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam._numerics.arrays import AnyArray, cast, precision
+from jaxslam.filters.forms.covariance import Covariance, convert
+from jaxslam.filters.forms.form import AbstractForm, AbstractGaussian
+from jaxslam.filters.forms.state import State
+from jaxslam.filters.model import COMPOSED, Context, Core, SlamModel, View
+from jaxslam.filters.protocol import AbstractStaged, Expected, Scene
+from jaxslam.geometry import Pose, SplitPose, difference, identity, tangent_dim
+from jaxslam.landmarks import INVERSE_SCALING, Parametrization
+from jaxslam.models.calibration import AbstractCalibration, Known, check_calibration
+from jaxslam.models.coordinates import ROBOCENTRIC, Coordinates
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import AbstractMotion, check_control
+from jaxslam.models.observations import Capacity, Features, Innovation
+from jaxslam.models.scale import Metre, ScaleGauge
+from jaxslam.models.sensors import AbstractSensor
+
+
+class AbstractEntry(eqx.Module):
+    """What a method does with new landmarks and with those that it has not finished.
+
+    A *landmark* has one number for everybody outside; inside, it may own several slots of the
+    state. What a method remembers beside the Gaussian is `State.memory`.
+    """
+
+    @abstractmethod
+    def slots(self, landmarks: int) -> int:
+        """How many slots of the state so many landmarks need."""
+
+    @abstractmethod
+    def memory(self, landmarks: int, dtype: Any) -> Any:
+        """The memory of an empty map."""
+
+    @abstractmethod
+    def update(
+        self, slam: EkfSlam, state: Any, control: Any, features: Features
+    ) -> tuple[Any, Innovation]:
+        """Correct by the features of landmarks, finished or not."""
+
+    @abstractmethod
+    def initialise(self, slam: EkfSlam, state: Any, features: Features) -> Any:
+        """Begin new landmarks, seen from the current camera."""
+
+    @abstractmethod
+    def reported(self, state: Any) -> Any:
+        """The state with one slot, and one Gaussian, a landmark."""
+
+    @abstractmethod
+    def settled(self, state: Any) -> Bool[Array, " landmarks"]:
+        """Which landmarks are in the map as one Gaussian."""
+
+
+class AtOnce(AbstractEntry):
+    """A landmark is a Gaussian from its first measurement on (P22–P26)."""
+
+    def slots(self, landmarks):
+        return landmarks
+
+    def memory(self, landmarks, dtype):
+        del landmarks, dtype
+        return ()
+
+    def update(self, slam, state, control, features):
+        return correct(slam, state, control, features)
+
+    def initialise(self, slam, state, features):
+        return insert(slam, state, features)
+
+    def reported(self, state):
+        return state
+
+    def settled(self, state):
+        return state.active
+
+
+class EkfSlam(AbstractStaged):
+    """An EKF for SLAM. Its numbers are leaves: they can be batched and differentiated.
+
+    `jaxslam.EkfSlam(motion=ConstantVelocity(…), sensor=Pinhole(camera, 0.3))` is the paper's
+    filter of a camera whose calibration is known. Raises ValueError for pieces that do not go
+    together.
+    """
+
+    motion: AbstractMotion
+    sensor: AbstractSensor
+    landmark: Parametrization = eqx.field(static=True, default=INVERSE_SCALING)
+    """What is estimated of a landmark, one of `LANDMARKS`."""
+    coordinates: Coordinates = eqx.field(static=True, default=ROBOCENTRIC)
+    """Of which frame landmarks are: `ROBOCENTRIC`, `WORLD` or `KEYFRAME`."""
+    calibration: AbstractCalibration = Known()
+    depth: InverseDepth = InverseDepth.beyond(1.0)
+    """The prior on 1/z of a camera's landmarks."""
+    scale: Metre | ScaleGauge = Metre()
+    """The unit of length in the state."""
+    form: AbstractForm = Covariance()
+    """How the uncertainty is kept; a remedy is a form."""
+    entry: AbstractEntry = AtOnce()
+    """How landmarks enter the map."""
+
+    def __check_init__(self) -> None:
+        _check_pieces(self)
+        _check_gauge(self)
+        _check_entry(self)
+
+    @property
+    def model(self) -> SlamModel:
+        """The pure functions of core and landmark."""
+        return SlamModel(
+            self.motion, self.sensor, self.landmark, self.coordinates, self.calibration,
+            self.depth, self.scale,
+        )  # fmt: skip
+
+    @property
+    def gaussian_form(self) -> AbstractGaussian:
+        """The form, which keeps a Gaussian everywhere but inside a window."""
+        assert isinstance(self.form, AbstractGaussian)
+        return self.form
+
+    @property
+    def compose_first(self) -> bool:
+        """Whether the motion is composed before the update: where landmarks stay where they are."""
+        return not self.coordinates.moves_landmarks
+
+    def init(self, capacity: int | Capacity, first: Features | None = None) -> Any:
+        """An exactly known pose at the origin of B, the motion's start, an empty map.
+
+        Raises ValueError for a capacity that is none, and for features of another shape.
+        """
+        state = _empty(self, Capacity.of(capacity).landmarks, precision(self))
+        if first is None:
+            return state
+        check_features(self, first)
+        return self.close(_with_frames_calibration(self, state), first)
+
+    def predict(self, state: Any, control: Any) -> Any:
+        """Append this step's noise; move already where the motion is composed first."""
+        check_control(self.motion, control)
+        return composed_first(self, append_noise(self, state), control)
+
+    def predict_features(self, state: Any, control: Any, slots: Int[Array, " m"]) -> Expected:
+        context = context_of(self, control)
+        model, core = self.model, state.core
+        measured, covariance, possible = self.gaussian_form.predict_features(
+            model, state, slots, self.sensor.noise, context
+        )
+        if not self.compose_first:
+            core = model.compose_core(core, context)
+        view = model.view(state.core, context)
+        points, omegas = jax.vmap(model.metric_point, in_axes=(None, 0))(
+            view, state.landmarks[slots]
+        )
+        possible = possible & state.active[slots]
+        return Expected(measured, covariance, possible, model.camera_pose(core), points, omegas)
+
+    def update(self, state: Any, control: Any, seen: Features) -> tuple[Any, Innovation]:
+        """Correct by the features seen (P16, P17)."""
+        check_features(self, seen)
+        return self.entry.update(self, state, control, seen)
+
+    def update_mean(self, state: Any, control: Any, seen: Features) -> Any:
+        """`update` without its covariance: cheap enough to try many hypotheses."""
+        context = context_of(self, control)
+        return self.gaussian_form.update_mean(
+            self.model, state, seen, self.sensor.noise, context, _considered(self, state)
+        )
+
+    def compose(self, state: Any, control: Any) -> Any:
+        """Move into the new camera frame, after the update (P18–P21); convert landmarks; make the
+        camera a keyframe where one is due."""
+        if not self.compose_first:
+            state = self.form.compose(self.model, state, Context(control))
+        if self.coordinates.reanchor is not None:
+            due = self.model.reanchoring_due(state)
+            state = jax.lax.cond(due, lambda state: reanchored(self, state), lambda s: s, state)
+        if self.landmark.convert is None:
+            return state
+        return convert(self.model, state, COMPOSED)
+
+    def close(self, state: Any, new: Features) -> Any:
+        """Begin new landmarks seen from the current camera (P22–P26), and end the frame."""
+        check_features(self, new)
+        return _forgotten(self, self.entry.initialise(self, state, new))
+
+    def remove(self, state: Any, gone: Bool[AnyArray, " capacity"]) -> Any:
+        return self.gaussian_form.remove(state, gone)
+
+    def marginal(
+        self,
+        state: Any,
+        function: Callable[[Scene], Any],
+        slots: Int[Array, " m"] | None = None,
+    ) -> tuple[Any, Float[Array, "k k"] | Float[Array, "m k k"]]:
+        """Of the state at the end of a frame, to first order: `J P Jᵀ`."""
+        model = self.model
+        if slots is None:
+            return self.form.core_covariance(
+                lambda core: function(
+                    Scene(model.camera_pose(core), core=core, log_scale=core.log_scale)
+                ),
+                state,
+            )
+        view, landmark = scene_of_landmark(self, function, state.core)
+        return self.gaussian_form.landmark_covariance(
+            view, landmark, self.entry.reported(state), slots
+        )
+
+    def in_map(self, state: Any) -> Bool[Array, " capacity"]:
+        return self.entry.reported(state).active
+
+    def pose_error(self, state: Any, T_BC: Pose) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
+        """`T_true ⊟ T_est` of the pose that the coordinates hold, and its covariance."""
+        hold = self.coordinates
+        estimate, covariance = self.form.core_covariance(self.model.estimate, state)
+        return difference(hold.estimate(hold.hold(T_BC)), estimate), covariance
+
+
+def scene_of_landmark(
+    slam: EkfSlam, function: Callable[[Scene], Any], core: Core
+) -> tuple[Callable[[Core], Any], Callable[[Any, Array], Any]]:
+    """A function of a landmark's scene as one of a view, itself a function of the core, and of the
+    landmark. The view has the camera's pose only if the function asks for it."""
+    model, here = slam.model, slam.model.camera_pose(core)
+    needed = _asks_for_pose(function, here)
+
+    def view(core: Core) -> tuple[View, Pose | None]:
+        return model.view(core, COMPOSED), model.camera_pose(core) if needed else None
+
+    def landmark(view, landmark):
+        seen_from, T_BC = view
+        pose = T_BC if needed else here
+        seen = model.metric_point(seen_from, landmark)
+        return function(Scene(pose, *seen, log_scale=seen_from.log_scale))
+
+    return view, landmark
+
+
+def _asks_for_pose(function: Callable[[Scene], Any], pose: Pose) -> bool:
+    """Whether the value depends on the camera's pose: a derivative by it costs a third of one."""
+    point = jnp.ones_like(pose.translation())
+    program = jax.make_jaxpr(lambda *parts: function(Scene(*parts)))(pose, point, point[0]).jaxpr
+    used = {id(x) for step in program.eqns for x in step.invars} | {id(x) for x in program.outvars}
+    return any(id(x) in used for x in program.invars[: len(jax.tree.leaves(pose))])
+
+
+def append_noise(slam: EkfSlam, state: Any) -> Any:
+    """Append this step's motion noise and calibration error (P10, P11, P15)."""
+    start, sigma = state.core.part("noise").start, slam.model.noise_sigma
+    state = slam.form.augment(state, start, jnp.diag(sigma**2))
+    return _with_frames_calibration(slam, state)
+
+
+def composed_first(slam: EkfSlam, state: Any, control: Any) -> Any:
+    """Move already, where the motion is composed before the update."""
+    if not slam.compose_first:
+        return state
+    return slam.form.compose(slam.model, state, Context(control))
+
+
+def context_of(slam: EkfSlam, control: Any) -> Context:
+    """What a predicted state's functions are given: the motion that is not yet composed."""
+    return COMPOSED if slam.compose_first else Context(control)
+
+
+def correct(
+    slam: EkfSlam,
+    state: Any,
+    control: Any,
+    seen: Features,
+    share: Float[Array, " m"] | None = None,
+) -> tuple[Any, Any]:
+    """The Kalman update by features of slots, with a share ρ of each by R/ρ; and what the form
+    says that it compared."""
+    noise = slam.sensor.noise
+    if share is not None:
+        noise = noise / jnp.where(share > 0, share, 1.0)[:, None, None]
+    context = context_of(slam, control)
+    return slam.form.update(slam.model, state, seen, noise, context, _considered(slam, state))
+
+
+def begun(
+    slam: EkfSlam,
+    capacity: int | Capacity,
+    first: Features,
+    prior: tuple[Float[Array, "m q"], Float[Array, "m q"]],
+) -> Any:
+    """`init` of landmarks each of which has a prior of its own: mean and σ of 1/z."""
+    check_features(slam, first)
+    state = _with_frames_calibration(slam, slam.init(capacity))
+    return _forgotten(slam, insert(slam, state, first, prior))
+
+
+def insert(
+    slam: EkfSlam,
+    state: Any,
+    new: Features,
+    prior: tuple[Float[Array, "m q"], Float[Array, "m q"]] | None = None,
+) -> Any:
+    """Insert Gaussians into slots; 1/z has the filter's prior, or one for each slot."""
+    context = COMPOSED
+    prior = _depth_prior(slam, state) if prior is None else prior
+    if slam.landmark.anchored:
+        anchor = _free_anchor(state)
+        state = slam.form.change(state, slam.model.anchoring(anchor))
+        context = Context(None, anchor)
+    return slam.form.initialise(slam.model, state, new, slam.sensor.noise, prior, context)
+
+
+def reanchored(slam: EkfSlam, state: Any) -> Any:
+    """The current camera as the keyframe: landmarks move to it, and T_KC is known."""
+    change, t = slam.model.reanchoring(), slam.model.geometry.tangent_dim
+    return state if change is None else slam.form.know(slam.form.change(state, change), t, t)
+
+
+def check_features(slam: EkfSlam, features: Features) -> None:
+    """Raise ValueError unless they are measurements of the filter's sensor."""
+    m, p = features.slots.shape[-1], slam.sensor.size
+    wanted = {"slots": (m,), "measured": (m, p), "valid": (m,)}
+    for name, shape in wanted.items():
+        found = getattr(features, name).shape
+        if found[-len(shape) :] != shape:
+            raise ValueError(
+                f"features.{name} has shape {found}; {type(slam.sensor).__name__} measures "
+                f"{p} numbers of each of {m} landmarks: it needs {shape}"
+            )
+
+
+def innermost(slam: Any) -> EkfSlam | None:
+    """The `EkfSlam` that a filter is, or is built around; None where there is none."""
+    while slam is not None and not isinstance(slam, EkfSlam):
+        slam = getattr(slam, "base", None)
+    return slam
+
+
+def check_one_gaussian(base: Any, what: str, remedies: bool = False) -> None:
+    """Raise ValueError, saying of what, unless all that `base` knows is in one covariance.
+
+    With `remedies`, of a form that only looks after it in its own way as well.
+    """
+    if not isinstance(base, EkfSlam):
+        raise ValueError(f"{what} is around an EkfSlam, not around a {type(base).__name__}")
+    plain = type(base.form) is Covariance or (remedies and base.form.divisible)
+    for wrong, why in (
+        (not plain, "is for filters in covariance form"),
+        (not isinstance(base.entry, AtOnce), "does not know delayed landmarks"),
+        (base.landmark.convert is not None, f"cannot switch the form of {base.landmark.name}"),
+    ):
+        if wrong:
+            raise ValueError(f"{what} {why}")
+
+
+def _empty(slam: EkfSlam, capacity: int, dtype: Any) -> Any:
+    geometry, held = slam.motion.geometry, slam.coordinates.hold
+    slam = cast(slam, dtype)
+    variables, log_scale, covariance = slam.scale.start(slam.motion)
+    depth = slam.depth
+    unit = None if log_scale is None else depth.unit
+    if log_scale is not None and unit is not None:
+        log_scale = jnp.append(log_scale, 0.0)
+    core = Core(
+        pose=held(identity(geometry, dtype)),
+        motion=variables,
+        log_scale=log_scale,
+        noise=jnp.zeros(slam.model.noise_sigma.size, dtype),
+        calibration=jnp.zeros(slam.calibration.sigma.shape, dtype),
+        anchors=_no_anchors(slam, capacity, dtype),
+        depth_error=None if depth.common is None else jnp.zeros(1, dtype),
+    )
+    # An empty slot holds a point straight ahead: finite in every formula.
+    ahead = jnp.zeros(geometry.point_dim, dtype).at[-1].set(1.0)
+    empty = slam.landmark.initialise(ahead, depth.mean, jnp.asarray(slam.sensor.focal, dtype))
+    state = slam.gaussian_form.empty(core, jnp.tile(empty, (slam.entry.slots(capacity), 1)))
+    state = replace(state, memory=slam.entry.memory(capacity, dtype))
+    state = slam.form.know(state, 0, tangent_dim(core.pose))
+    state = slam.form.augment(state, core.part("motion").start, covariance)
+    if unit is not None:
+        variance = jnp.reshape(unit**2, (1, 1))
+        state = slam.form.augment(state, core.part("log_scale").start + 1, variance)
+    if depth.common is not None:
+        common = jnp.reshape(depth.common**2, (1, 1))
+        state = slam.form.augment(state, core.part("depth_error").start, common)
+    return state if slam.calibration.each_frame else _with_calibration(slam, state)
+
+
+def _no_anchors(slam: EkfSlam, capacity: int, dtype: Any) -> SplitPose | None:
+    if not slam.landmark.anchored:
+        return None
+    origin = SplitPose.of(identity(slam.motion.geometry, dtype))
+    return jax.tree.map(lambda x: jnp.tile(x, (capacity, 1)), origin)
+
+
+def _with_calibration(slam: EkfSlam, state: Any) -> Any:
+    covariance = jnp.diag(jnp.asarray(slam.calibration.sigma) ** 2)
+    return slam.form.augment(state, state.core.part("calibration").start, covariance)
+
+
+def _with_frames_calibration(slam: EkfSlam, state: Any) -> Any:
+    return _with_calibration(slam, state) if slam.calibration.each_frame else state
+
+
+def _forgotten(slam: EkfSlam, state: Any) -> Any:
+    """Without the frame's calibration error, where the next frame draws another."""
+    if not slam.calibration.each_frame:
+        return state
+    part = state.core.part("calibration")
+    core = replace(state.core, calibration=jnp.zeros_like(state.core.calibration))
+    return replace(slam.form.marginalise(state, part.start, part.stop - part.start), core=core)
+
+
+def _considered(slam: EkfSlam, state: Any) -> slice:
+    """The part of the core that updates leave as it is."""
+    return slice(0, 0) if slam.calibration.corrected else state.core.part("calibration")
+
+
+def _depth_prior(slam: EkfSlam, state: Any) -> tuple[Float[Array, " q"], Float[Array, " q"]]:
+    """Mean and σ of what a measurement hides of a landmark, its own part alone."""
+    hidden, depth = slam.sensor.hidden, slam.depth
+    mean, sigma = jnp.tile(depth.mean, hidden), jnp.tile(depth.sigma, hidden) * depth.own
+    variance: Any = None
+    if isinstance(slam.scale, ScaleGauge):
+        variance = slam.form.core_covariance(lambda core: core.log_scale, state)[1][0, 0]
+    return slam.scale.prior(mean, sigma, variance)
+
+
+def _free_anchor(state: State) -> Int[Array, ""]:
+    """One that no landmark refers to; there are as many anchors as landmarks."""
+    number = jnp.where(state.active, state.landmarks[:, -1].astype(int), state.active.size)
+    return jnp.argmin(jnp.zeros(state.active.size, bool).at[number].set(True, mode="drop"))
+
+
+def _check_pieces(slam: EkfSlam) -> None:
+    for name, kind in (
+        ("motion", AbstractMotion),
+        ("sensor", AbstractSensor),
+        ("landmark", Parametrization),
+        ("coordinates", Coordinates),
+        ("calibration", AbstractCalibration),
+        ("depth", InverseDepth),
+        ("form", AbstractForm),
+        ("entry", AbstractEntry),
+    ):
+        if not isinstance(getattr(slam, name), kind):
+            raise ValueError(f"{name} is a {kind.__name__}, not {getattr(slam, name)!r}")
+    n, found = slam.motion.geometry.point_dim, slam.sensor.point_dim
+    if found != n:
+        raise ValueError(
+            f"{type(slam.motion).__name__} moves in a {slam.motion.geometry.name} world, where "
+            f"points have {n} coordinates, and {type(slam.sensor).__name__} measures points of "
+            f"{found}"
+        )
+    check_calibration(slam.calibration, slam.sensor)
+    slam.form.check(slam)
+
+
+def _check_gauge(slam: EkfSlam) -> None:
+    motion, sensor = slam.motion, slam.sensor
+    if isinstance(slam.scale, ScaleGauge) and not (motion.has_velocity and sensor.hidden):
+        raise ValueError(
+            f"a scale gauge is for a camera with a velocity: {type(motion).__name__} and "
+            f"{type(sensor).__name__} measure metres"
+        )
+
+
+def _check_entry(slam: EkfSlam) -> None:
+    """Delayed initialisations have depths of their own, in metres, in place of the prior."""
+    if isinstance(slam.entry, AtOnce):
+        return
+    for wrong, what in (
+        (slam.depth.common is not None, "depths with a common part"),
+        (isinstance(slam.scale, ScaleGauge), "a scale gauge"),
+    ):
+        if wrong:
+            raise ValueError(
+                f"{what} cannot go with a delayed initialisation, which replaces the prior "
+                "on depth by depths of its own, in metres"
+            )

@@ -1,0 +1,250 @@
+"""What every form of the filter shares: one-landmark models, and their Jacobians in blocks.
+
+Every model is a function of ONE landmark and of a *view*, the few quantities of the core that a
+landmark depends on (the relative pose of the camera, its calibration). `jax.jacfwd` sees v + d
+inputs for a landmark and c once for the view; the chain rule and the blocks' places are slices,
+gathers and scatters. Nothing here knows what a pose, a camera or a parametrization is: a `Model`
+supplies the functions, and core and view are any pytrees of poses and vectors.
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam._numerics.linalg import cholesky
+from jaxslam.geometry import jacobian, nudge, retract, zero_tangent
+from jaxslam.models.observations import Features
+from jaxslam.native.trace import tracing
+
+Landmark = Callable[[Any, Array], Array]
+
+DENSE = 200
+"""Numbers up to which a product with all of J's zeros is faster than gathering what is not zero."""
+
+
+class Blocks(NamedTuple):
+    """Jacobian of k numbers for each of m landmarks; row block j touches the core and slot j.
+
+    The whole matrix is J = [by_view · view_by_core, …, by_landmark at its slot, …].
+    """
+
+    view_by_core: Float[Array, "v c"]
+    by_view: Float[Array, "m k v"]
+    by_landmark: Float[Array, "m k d"]
+
+
+@runtime_checkable
+class Model(Protocol):
+    """Pure functions on the core and one landmark; `context` is whatever data they need."""
+
+    @property
+    def moves_landmarks(self) -> bool:
+        """Whether composition changes landmarks (robocentric) or leaves them (world)."""
+        ...
+
+    def compose_core(self, core: Any, context: Any) -> Any:
+        """The core after the motion."""
+        ...
+
+    def view(self, core: Any, context: Any) -> Any:
+        """What the functions below need of the core."""
+        ...
+
+    def compose_landmark(self, view: Any, landmark: Array, context: Any) -> Array:
+        """One landmark after the motion, seen from before it; where `moves_landmarks`."""
+        ...
+
+    def observe(self, view: Any, landmark: Array, context: Any) -> tuple[Array, Array]:
+        """The predicted measurement, and whether one is possible (in front of the camera)."""
+        ...
+
+    def residual(self, measured: Array, predicted: Array) -> Array:
+        """What a measurement differs by from its prediction."""
+        ...
+
+    def initialise(self, view: Any, measured: Array, hidden: Array, context: Any) -> Array:
+        """A landmark from its first measurement and what that hides, of which a prior is given."""
+        ...
+
+    def convert(self, view: Any, landmark: Array, covariance: Array, context: Any) -> Array:
+        """The same landmark in another form, where its covariance recommends it."""
+        ...
+
+
+class Change(NamedTuple):
+    """A change of variables: new coordinates of the core, and of one landmark seen from the old.
+
+    The core's function may set parts of itself to a constant: their rows of its Jacobian are then
+    zero, which marginalises them.
+    """
+
+    core: Callable[[Any], Any]
+    view: Callable[[Any], Any]
+    """What of the old core a landmark's change depends on."""
+    landmark: Landmark | None
+    """`landmark(view, parameters)`; None where landmarks stay as they are."""
+
+
+def composition(model: Model, context: Any) -> Change:
+    """The motion as a change of variables: the core's (P18, P19), and a landmark's."""
+
+    def landmark(view, landmark):
+        return model.compose_landmark(view, landmark, context)
+
+    return Change(
+        core=lambda core: model.compose_core(core, context),
+        view=lambda core: model.view(core, context),
+        landmark=landmark if model.moves_landmarks else None,
+    )
+
+
+def residuals(
+    model: Model, state: Any, features: Features, context: Any
+) -> tuple[Float[Array, "m p"], Float[Array, "m p"], Bool[Array, " m"], Blocks]:
+    """Predictions, residuals, which features are used, and H; zero where one is not."""
+    predicted, in_front, H = observe(model, state, features.slots, context)
+    used = features.valid & in_front & state.active[features.slots]
+    difference = jax.vmap(model.residual)(features.measured, predicted)
+    residual = jnp.where(used[:, None], difference, 0.0)
+    return predicted, residual, used, masked(H, used)
+
+
+def observe(
+    model: Model, state: Any, slots: Int[Array, " m"], context: Any
+) -> tuple[Float[Array, "m p"], Bool[Array, " m"], Blocks]:
+    """Predicted measurements, whether they are possible, and H."""
+    return local_jacobians(
+        lambda core: model.view(core, context),
+        lambda view, landmark: model.observe(view, landmark, context),
+        state.core,
+        state.landmarks[slots],
+    )
+
+
+def new_landmarks(
+    model: Model,
+    state: Any,
+    features: Features,
+    noise: Float[Array, "p p"],
+    prior: tuple[Float[Array, "*m q"], Float[Array, "*m q"]],
+    context: Any,
+) -> tuple[Float[Array, "m d"], Blocks, Float[Array, "m d p+q"]]:
+    """Landmarks of first measurements (P22–P26): values, J by the view, and `J diag(R, σ²)^½`.
+
+    `by_landmark` is the identity: the error of landmark i is J of the core's and its own.
+    """
+    mean, sigma = (jnp.broadcast_to(x, (features.slots.size, x.shape[-1])) for x in prior)
+    view = model.view(state.core, context)
+    view_by_core = jacobian(lambda core: model.view(core, context), state.core)
+
+    def one(measured, mean, sigma):
+        def landmark(delta, measured, hidden):
+            value = model.initialise(nudge(view, delta), measured, hidden, context)
+            return value, value
+
+        (J_view, J_measured, J_hidden), value = jax.jacfwd(
+            landmark, argnums=(0, 1, 2), has_aux=True
+        )(zero_tangent(view), measured, mean)
+        return value, J_view, jnp.concatenate([J_measured @ root, J_hidden * sigma], axis=1)
+
+    root = cholesky(noise).root
+    new, J_view, own = jax.vmap(one)(features.measured, mean, sigma)
+    m, d = new.shape
+    identity = jnp.broadcast_to(jnp.eye(d, dtype=new.dtype), (m, d, d))
+    return new, Blocks(view_by_core, J_view, identity), own
+
+
+def indices(slots: Int[Array, " m"], state: Any) -> Int[Array, "m d"]:
+    """Where the landmarks in these slots are in the state's error; out of bounds stays so."""
+    d = state.landmarks.shape[1]
+    return state.core_dim + slots[:, None] * d + jnp.arange(d)
+
+
+def local_jacobians(view, function, core, landmarks, *data) -> tuple[Array, Any, Blocks]:
+    """Values, auxiliary outputs and blocks of `function(view, landmark) → (value, auxiliary)`.
+
+    `data` are further arguments of the function, one for each landmark: not differentiated.
+    """
+    view_by_core, view = jacobian(view, core), view(core)
+
+    def one(landmark, *data):
+        def moved(delta, landmark):
+            value, auxiliary = function(nudge(view, delta), landmark, *data)
+            return value, (value, auxiliary)
+
+        J, (value, auxiliary) = jax.jacfwd(moved, argnums=(0, 1), has_aux=True)(
+            zero_tangent(view), landmark
+        )
+        return value, auxiliary, J
+
+    value, auxiliary, (by_view, by_landmark) = jax.vmap(one)(landmarks, *data)
+    return value, auxiliary, Blocks(view_by_core, by_view, by_landmark)
+
+
+def without_auxiliary(function: Landmark) -> Callable[[Any, Array], tuple[Array, None]]:
+    """A function of view and landmark in the form that `local_jacobians` asks for."""
+    return lambda view, landmark: (function(view, landmark), None)
+
+
+def masked(J: Blocks, mask: Bool[Array, " m"]) -> Blocks:
+    """The blocks where the mask holds, zero elsewhere."""
+    mask = mask[:, None, None]
+    return J._replace(
+        by_view=jnp.where(mask, J.by_view, 0.0),
+        by_landmark=jnp.where(mask, J.by_landmark, 0.0),
+    )
+
+
+def placed(J: Blocks, slots: Int[Array, " m"], capacity: int) -> Float[Array, "mk n"]:
+    """The blocks in their places: dense, since products with it are then plain and fast."""
+    m, k, d = J.by_landmark.shape
+    here = slots[:, None] == jnp.arange(capacity)
+    own = jnp.where(here[:, None, :, None], J.by_landmark[:, :, None], 0.0)
+    shared = J.by_view @ J.view_by_core
+    return jnp.concatenate([shared.reshape(m * k, -1), own.reshape(m * k, capacity * d)], axis=1)
+
+
+def observed(J: Blocks, slots: Int[Array, " m"], B: Float[Array, "n r"]) -> Float[Array, "mk r"]:
+    """`J B` of blocks in these slots, of more than `DENSE` numbers without the zeros."""
+    c, d = J.view_by_core.shape[1], J.by_landmark.shape[-1]
+    if len(B) <= DENSE and not tracing():
+        return placed(J, slots, (len(B) - c) // d) @ B
+    own = B[c:].reshape(-1, d, B.shape[1])[slots]
+    by_view = J.by_view.reshape(-1, J.by_view.shape[-1]) @ (J.view_by_core @ B[:c])
+    return by_view + small_products(J.by_landmark, own).reshape(by_view.shape)
+
+
+def rows(J: Blocks, B: Float[Array, "n r"]) -> Float[Array, "nl r"]:
+    """`J B` for every landmark in order, without the zeros: J has a block for each."""
+    c, d = J.view_by_core.shape[1], J.by_landmark.shape[-1]
+    by_view = small_products(J.by_view, J.view_by_core @ B[:c])
+    by_landmark = small_products(J.by_landmark, B[c:].reshape(-1, d, B.shape[1]))
+    return (by_view + by_landmark).reshape(-1, B.shape[1])
+
+
+def small_products(A: Float[Array, "*m k j"], B: Float[Array, "*#m j r"]) -> Float[Array, "*m k r"]:
+    """`A B` for a small j as a sum over j, which XLA fuses to one vectorised loop.
+
+    Its batched product calls a matrix product for every small pair: twice the time on a CPU.
+    """
+    return functools.reduce(
+        operator.add, (A[..., i, None] * B[..., i, None, :] for i in range(A.shape[-1]))
+    )
+
+
+def shifted(state: Any, delta: Float[Array, " n"]) -> Any:
+    """`x ⊞ δ` for the core and all landmarks."""
+    c = state.core_dim
+    return replace(
+        state,
+        core=retract(state.core, delta[:c]),
+        landmarks=state.landmarks + delta[c:].reshape(state.landmarks.shape),
+    )

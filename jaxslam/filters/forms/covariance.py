@@ -1,0 +1,252 @@
+"""The extended Kalman filter on a core and many landmarks, its Jacobians assembled from blocks.
+
+The steps are the paper's: `augment` (P10, P11, P15), `update` (P16, P17), `compose` (P18–P21),
+`initialise` (P22–P26), and `remove`. The models and their blocks are those of
+`jaxslam.filters.forms.blocks`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxslam._numerics.arrays import AnyArray
+from jaxslam._numerics.linalg import cholesky, symmetric_part
+from jaxslam.filters.forms.blocks import (
+    Blocks,
+    Change,
+    Model,
+    indices,
+    local_jacobians,
+    masked,
+    new_landmarks,
+    observed,
+    residuals,
+    rows,
+    shifted,
+    without_auxiliary,
+)
+from jaxslam.filters.forms.form import AbstractGaussian
+from jaxslam.filters.forms.state import State
+from jaxslam.geometry import jacobian
+from jaxslam.models.observations import Features, Innovation, judged
+
+ROUNDING = 4.0
+"""Units in the last place of its own that every variance gets back in an update.
+
+Differences of matrices are positive up to rounding only, and what rounding takes from an
+unobserved direction in single precision adds up over hundreds of steps. With this, eigenvalues of
+the correlations stay above `−n ε` however many there are (measured over 600 steps).
+"""
+
+
+class Covariance(AbstractGaussian):
+    """Mean and covariance: the extended Kalman filter."""
+
+    divisible: ClassVar[bool] = True
+
+    def empty(self, core: Any, landmarks: Float[Array, "capacity d"]) -> State:
+        """A state that is exactly known, of slots that hold no landmark yet."""
+        capacity = landmarks.shape[0]
+        state = State(
+            core, landmarks, jnp.zeros(capacity, bool), jnp.zeros((0, 0), landmarks.dtype)
+        )
+        n = state.core_dim + landmarks.size
+        return replace(state, covariance=jnp.zeros((n, n), landmarks.dtype))
+
+    def augment(self, state: State, start: int, covariance: Float[Array, "k k"]) -> State:
+        if covariance.size == 0:
+            return state
+        part = slice(start, start + covariance.shape[0])
+        return replace(state, covariance=state.covariance.at[part, part].set(covariance))
+
+    def know(self, state: State, start: int, size: int) -> State:
+        # Their covariance is zero already.
+        del start, size
+        return state
+
+    def marginalise(self, state: State, start: int, size: int) -> State:
+        if size == 0:
+            return state
+        part = slice(start, start + size)
+        covariance = state.covariance.at[part, :].set(0.0).at[:, part].set(0.0)
+        return replace(state, covariance=covariance)
+
+    def update(
+        self,
+        model: Model,
+        state: State,
+        features: Features,
+        noise: Float[Array, "p p"] | Float[Array, "m p p"],
+        context: Any,
+        considered: slice = slice(0, 0),
+    ) -> tuple[State, Innovation]:
+        """The Kalman update by all features at once (P16, P17), in Joseph's form."""
+        return self.update_at(model, state, None, features, noise, context, considered)
+
+    def update_at(
+        self,
+        model: Model,
+        state: State,
+        offset: Float[Array, " n"] | None,
+        features: Features,
+        noise: Float[Array, "p p"] | Float[Array, "m p p"],
+        context: Any,
+        considered: slice = slice(0, 0),
+    ) -> tuple[State, Innovation]:
+        """`update` of the prediction x ⊞ offset, with H and the residuals of the state x.
+
+        A step of Gauss–Newton to the maximum of the posterior; None is no offset.
+        """
+        predicted, residual, used, blocks = residuals(model, state, features, context)
+        P = state.covariance
+        R = _noise_matrix(noise, used)
+        HP = observed(blocks, features.slots, P)
+        S = observed(blocks, features.slots, HP.T).T + R
+        factor = cholesky(S)
+        whitening = factor.whitening
+        K = ((HP.T @ whitening.T) @ whitening).at[considered].set(0.0)
+        if offset is not None:
+            moved = observed(blocks, features.slots, offset[:, None])
+            residual = residual - moved.reshape(residual.shape)
+        whitened = whitening @ residual.ravel()
+
+        # Joseph's (I - KH) P (I - KH)ᵀ + K R Kᵀ, multiplied out from the left: two products of
+        # rank m, and none of n × n matrices. An error of K then counts by its square only; what
+        # rounding does to the differences is made good by `ROUNDING`.
+        left = P - K @ HP
+        covariance = left + (K @ R - observed(blocks, features.slots, left.T).T) @ K.T
+        lost = ROUNDING * jnp.finfo(P.dtype).eps * jnp.diagonal(P).at[considered].set(0.0)
+        delta = K @ residual.ravel()
+        state = shifted(state, delta if offset is None else offset + delta)
+        state = replace(state, covariance=symmetric_part(covariance) + jnp.diag(lost))
+        variances = jnp.diagonal(covariance) + lost
+        status = judged(factor.positive & jnp.all(variances >= 0), variances, state.landmarks)
+        nis = whitened @ whitened
+        return state, Innovation(predicted, residual, S, used, nis, status, factor.log_det())
+
+    def update_mean(
+        self,
+        model: Model,
+        state: State,
+        features: Features,
+        noise: Float[Array, "p p"],
+        context: Any,
+        considered: slice = slice(0, 0),
+    ) -> State:
+        """The mean that `update` would give, with the covariance left as it is."""
+        _, residual, used, blocks = residuals(model, state, features, context)
+        HP = observed(blocks, features.slots, state.covariance)
+        S = observed(blocks, features.slots, HP.T).T + _noise_matrix(noise, used)
+        delta = HP.T @ cholesky(S).solve(residual.ravel())
+        return shifted(state, delta.at[considered].set(0.0))
+
+    def change(self, state: State, variables: Change) -> State:
+        """Write the state in other variables, `P ← J P Jᵀ`."""
+        core, J_core = variables.core(state.core), jacobian(variables.core, state.core)
+        if variables.landmark is None:
+            return _transformed(state, core, J_core, state.landmarks, None)
+        moved, _, J = local_jacobians(
+            variables.view, without_auxiliary(variables.landmark), state.core, state.landmarks
+        )
+        return _transformed(state, core, J_core, moved, J)
+
+    def initialise(
+        self,
+        model: Model,
+        state: State,
+        features: Features,
+        noise: Float[Array, "p p"],
+        prior: tuple[Float[Array, "*m q"], Float[Array, "*m q"]],
+        context: Any,
+    ) -> State:
+        """`P ← J diag(P, R, σ²) Jᵀ` (P22–P26)."""
+        if features.slots.size == 0:
+            return state
+        c, capacity = state.core_dim, state.active.size
+        new, J, root = new_landmarks(model, state, features, noise, prior, context)
+        own = root @ jnp.swapaxes(root, 1, 2)
+        slots = jnp.where(features.valid, features.slots, capacity)  # out of bounds: dropped
+        index = indices(slots, state)
+
+        def with_rows(P):
+            rows = J.by_view @ (J.view_by_core @ P[:c])
+            return P.at[index.ravel()].set(rows.reshape(index.size, -1), mode="drop")
+
+        covariance = with_rows(with_rows(state.covariance).T)
+        return replace(
+            state,
+            landmarks=state.landmarks.at[slots].set(new, mode="drop"),
+            active=state.active.at[slots].set(True, mode="drop"),
+            covariance=covariance.at[index[:, :, None], index[:, None, :]].add(own, mode="drop"),
+        )
+
+    def remove(self, state: State, gone: Bool[AnyArray, " capacity"]) -> State:
+        kept = jnp.repeat(~gone, state.landmarks.shape[1])
+        kept = jnp.concatenate([jnp.ones(state.core_dim, bool), kept])
+        covariance = jnp.where(kept[:, None] & kept[None, :], state.covariance, 0.0)
+        return replace(state, active=state.active & ~gone, covariance=covariance)
+
+    def local_covariance(self, state: State, J: Blocks, slots) -> Float[Array, "m k k"]:
+        """`J P Jᵀ` of every landmark's own rows: the diagonal blocks only."""
+        c, (capacity, d) = state.core_dim, state.landmarks.shape
+        P = state.covariance
+        P_view = J.view_by_core @ P[:c, :c] @ J.view_by_core.T
+        P_cross = (P[c:, :c] @ J.view_by_core.T).reshape(capacity, d, -1)[slots]
+        P_landmark = P[c:, c:].reshape(capacity, d, capacity, d)[slots, :, slots, :]
+
+        def one(by_view, by_landmark, P_cross, P_landmark):
+            cross = by_landmark @ P_cross @ by_view.T
+            own = by_landmark @ P_landmark @ by_landmark.T
+            return by_view @ P_view @ by_view.T + cross + cross.T + own
+
+        return jax.vmap(one)(J.by_view, J.by_landmark, P_cross, P_landmark)
+
+    def core_covariance(self, function: Callable[[Any], Any], state: State) -> tuple[Any, Array]:
+        c = state.core_dim
+        J = jacobian(function, state.core)
+        return function(state.core), J @ state.covariance[:c, :c] @ J.T
+
+
+def convert(model: Model, state: State, context: Any) -> State:
+    """Write landmarks in the form that the model now prefers, `P ← J P Jᵀ`."""
+    c, (capacity, d) = state.core_dim, state.landmarks.shape
+    blocks = state.covariance[c:, c:].reshape(capacity, d, capacity, d)
+    own = blocks[jnp.arange(capacity), :, jnp.arange(capacity), :]
+
+    def converted(view, landmark, covariance):
+        return model.convert(view, landmark, covariance, context), None
+
+    value, _, J = local_jacobians(
+        lambda core: model.view(core, context), converted, state.core, state.landmarks, own
+    )
+    J_core = jnp.eye(c, dtype=state.covariance.dtype)
+    return _transformed(state, state.core, J_core, value, J)
+
+
+def _transformed(state: State, core: Any, J_core: Array, landmarks: Array, J: Blocks | None):
+    """The state after a change of variables, of the core alone where J is None."""
+    c = state.core_dim
+    if J is not None:
+        J = masked(J, state.active)
+        landmarks = jnp.where(state.active[:, None], landmarks, state.landmarks)
+
+    def turned(P):
+        below = P[c:] if J is None else rows(J, P)
+        return jnp.concatenate([J_core @ P[:c], below])
+
+    covariance = turned(turned(state.covariance).T)
+    return replace(state, core=core, landmarks=landmarks, covariance=covariance)
+
+
+def _noise_matrix(noise, used):
+    """Block-diagonal R, with an identity block where a feature is not used."""
+    m, p = used.size, noise.shape[-1]
+    blocks = jnp.where(used[:, None, None], noise, jnp.eye(p, dtype=noise.dtype))
+    R = jnp.zeros((m, p, m, p), noise.dtype)
+    return R.at[jnp.arange(m), :, jnp.arange(m), :].set(blocks).reshape(m * p, m * p)

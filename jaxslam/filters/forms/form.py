@@ -1,0 +1,189 @@
+"""What a form of the filter is: how its uncertainty is kept, and what every step does to it.
+
+`Covariance` keeps P, `Information` its inverse, `Sensitivity` no distribution but derivatives. A
+state of each has `core`, `landmarks`, `active`, `memory` and `core_dim`. A remedy is a form that
+overrides `update`, or another function, of `Covariance`.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam._numerics.arrays import AnyArray
+from jaxslam.filters.forms.blocks import (
+    Blocks,
+    Change,
+    Landmark,
+    Model,
+    composition,
+    local_jacobians,
+    observe,
+    without_auxiliary,
+)
+from jaxslam.geometry import jacobian, nudge
+from jaxslam.models.observations import Features
+
+
+class AbstractForm(eqx.Module):
+    """The steps of a frame, on a state of its own."""
+
+    divisible: ClassVar[bool] = False
+    """Whether its state is a mean and a covariance of `x ⊞ δ`, to be divided and merged as such."""
+
+    def check(self, slam: Any) -> None:
+        """Raise ValueError for a filter of which this cannot be the form; any can be, here."""
+
+    @abstractmethod
+    def augment(self, state: Any, start: int, covariance: Float[Array, "k k"]) -> Any:
+        """Give k numbers of the core, from `start`, an independent covariance (P10, P11, P15).
+
+        Nothing may be known of them, as `marginalise` and `compose` leave them.
+        """
+
+    @abstractmethod
+    def know(self, state: Any, start: int, size: int) -> Any:
+        """Numbers of the core that are known exactly."""
+
+    @abstractmethod
+    def marginalise(self, state: Any, start: int, size: int) -> Any:
+        """Forget k numbers of the core; the caller resets their mean."""
+
+    @abstractmethod
+    def update(
+        self,
+        model: Model,
+        state: Any,
+        features: Features,
+        noise: Float[Array, "p p"] | Float[Array, "m p p"],
+        context: Any,
+        considered: slice = slice(0, 0),
+    ) -> tuple[Any, Any]:
+        """Correct by all features at once (P16, P17), and what was compared.
+
+        `noise` is the covariance R of one measurement, or one for each feature. A feature that is
+        not valid, not in the map or predicted behind the camera changes nothing. The `considered`
+        numbers of the core count with their covariance but have no gain (Schmidt, 1966).
+        """
+
+    def compose(self, model: Model, state: Any, context: Any) -> Any:
+        """Move the state over the motion (P18–P21)."""
+        return self.change(state, composition(model, context))
+
+    @abstractmethod
+    def change(self, state: Any, variables: Change) -> Any:
+        """Write the state in other variables."""
+
+    @abstractmethod
+    def initialise(
+        self,
+        model: Model,
+        state: Any,
+        features: Features,
+        noise: Float[Array, "p p"],
+        prior: tuple[Float[Array, "*m q"], Float[Array, "*m q"]],
+        context: Any,
+    ) -> Any:
+        """Insert landmarks from their first measurement (P22–P26).
+
+        `prior` is the mean and σ of what one measurement hides, for all or one for each. All new
+        landmarks share one core, so what is uncertain there (the pose of a world-centric filter,
+        the calibration) correlates them with it and with one another. Whatever was in their slots
+        must have been removed.
+        """
+
+    @abstractmethod
+    def core_covariance(
+        self, function: Callable[[Any], Any], state: Any
+    ) -> tuple[Any, Float[Array, "k k"]]:
+        """Value of a function of the core, and its first-order covariance in its tangent."""
+
+
+class AbstractGaussian(AbstractForm):
+    """A form that keeps a Gaussian: what it says can be asked at any time."""
+
+    innovation_covariance: ClassVar[bool] = True
+    """Whether its innovations have S: a likelihood is of no use without."""
+
+    @abstractmethod
+    def empty(self, core: Any, landmarks: Float[Array, "capacity d"]) -> Any:
+        """A state of slots that hold no landmark yet, and a core that is still to be augmented."""
+
+    @abstractmethod
+    def remove(self, state: Any, gone: Bool[AnyArray, " capacity"]) -> Any:
+        """Marginalise landmarks and free their slots."""
+
+    def update_mean(
+        self,
+        model: Model,
+        state: Any,
+        features: Features,
+        noise: Float[Array, "p p"],
+        context: Any,
+        considered: slice = slice(0, 0),
+    ) -> Any:
+        """The mean that `update` would give; what else is in the state means nothing."""
+        return self.update(model, state, features, noise, context, considered)[0]
+
+    @abstractmethod
+    def local_covariance(
+        self, state: Any, J: Blocks, slots: Int[Array, " m"]
+    ) -> Float[Array, "m k k"]:
+        """`J P Jᵀ` of every landmark's own rows: the diagonal blocks only."""
+
+    def predict_features(
+        self,
+        model: Model,
+        state: Any,
+        slots: Int[Array, " m"],
+        noise: Float[Array, "p p"],
+        context: Any,
+    ) -> tuple[Float[Array, "m p"], Float[Array, "m p p"], Bool[Array, " m"]]:
+        """Where landmarks should be seen: measurements, covariances of their innovations, possible
+        or not. These are the centres and the search ellipses of active search."""
+        predicted, in_front, H = observe(model, state, slots, context)
+        return predicted, self.local_covariance(state, H, slots) + noise, in_front
+
+    def landmark_covariance(
+        self,
+        view: Callable[[Any], Any],
+        function: Landmark,
+        state: Any,
+        slots: Int[Array, " m"],
+    ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
+        """Values and first-order covariances of `function(view(core), landmark)`, slot by slot."""
+        value, _, J = local_jacobians(
+            view, without_auxiliary(function), state.core, state.landmarks[slots]
+        )
+        return value, self.local_covariance(state, J, slots)
+
+    def joint_covariance(self, state: Any, slot: Int[Array, ""]) -> Float[Array, "k k"]:
+        """Of the core and one landmark, k = c + d numbers."""
+        c, d = state.core_dim, state.landmarks.shape[1]
+        index = jnp.concatenate([jnp.arange(c), c + slot * d + jnp.arange(d)])
+        return state.covariance[index[:, None], index]
+
+
+def curvature(
+    form: AbstractGaussian, model: Model, state: Any, slots: Int[Array, " m"], context: Any
+) -> tuple[Float[Array, "m p k k"], Float[Array, "m k k"]]:
+    """Second derivatives of every landmark's measurement by what it depends on, the view and the
+    landmark's own numbers, and the covariance of these."""
+    view = model.view(state.core, context)
+    view_by_core = jacobian(lambda core: model.view(core, context), state.core)
+    v, d, m = len(view_by_core), state.landmarks.shape[1], slots.size
+
+    def measured(delta, landmark):
+        return model.observe(nudge(view, delta[:v]), landmark + delta[v:], context)[0]
+
+    zero = jnp.zeros(v + d, state.landmarks.dtype)
+    hessian = jax.vmap(lambda landmark: jax.jacfwd(jax.jacfwd(measured))(zero, landmark))
+    eye = jnp.broadcast_to(jnp.eye(v + d, dtype=zero.dtype), (m, v + d, v + d))
+    itself = Blocks(view_by_core, eye[:, :, :v], eye[:, :, v:])
+    return hessian(state.landmarks[slots]), form.local_covariance(state, itself, slots)

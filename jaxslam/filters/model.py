@@ -1,0 +1,264 @@
+"""Monocular SLAM as a model for a form: coordinates × landmark × calibration × motion × sensor.
+
+Everything is written once, as pure functions of the core, or of a view of it and one landmark.
+What the core holds is what the pieces declare.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.filters.forms.blocks import Change
+from jaxslam.geometry import (
+    Geometry,
+    Pose,
+    SplitPose,
+    homogeneous_apply,
+    identity,
+    scaled,
+    tangent_dim,
+)
+from jaxslam.landmarks.parametrization import Parametrization
+from jaxslam.models.calibration import AbstractCalibration
+from jaxslam.models.coordinates import Coordinates, KeyframePose, keyframe_due
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import AbstractMotion
+from jaxslam.models.scale import Metre, ScaleGauge
+from jaxslam.models.sensors import AbstractSensor
+
+
+class Core(eqx.Module):
+    """What the filter estimates beside the landmarks, and the noises that one step appends."""
+
+    pose: Pose | SplitPose | KeyframePose
+    """T_CB in a robocentric filter, T_BC in a world-centric one, T_BK and T_KC in one with
+    keyframes: what the `Coordinates` hold."""
+    motion: Any
+    """What the motion model keeps: a velocity in the camera's own frame, a bias, nothing."""
+    log_scale: Float[Array, " u"] | None
+    """λ of a filter with a scale gauge, or None: lengths in the state are in units of `e^λ` of what
+    was told as metres. Behind it, where that is not known, the log of these metres in metres."""
+    noise: Float[Array, " q"]
+    """What drives this step's motion: the acceleration a (P10), or the odometry's error, and what
+    the calibration drifts by; zero before `predict` and after composition."""
+    calibration: Float[Array, " k"]
+    """δ, by which the calibration is off (P15); empty where it is known."""
+    anchors: SplitPose | None = None
+    """T_AF of the cameras F in which landmarks are written; a batch, or None."""
+    depth_error: Float[Array, " 1"] | None = None
+    """What the priors on 1/z of all landmarks have in common, in σ of one prior, or None."""
+
+    def part(self, name: str) -> slice:
+        """Where a field is in the tangent of the core."""
+        start = 0
+        for field in fields(self):
+            size = tangent_dim(getattr(self, field.name))
+            if field.name == name:
+                return slice(start, start + size)
+            start += size
+        raise KeyError(name)
+
+
+class Context(NamedTuple):
+    """Data of the model's functions beside core and landmark."""
+
+    control: Any
+    """The motion model's input for the motion between the map frame and the camera: seconds, or
+    the odometry's reading; None once the motion is composed."""
+    anchor: Int[Array, ""] | None = None
+    """Number of the anchor of new landmarks, the current camera."""
+
+
+COMPOSED = Context(None)
+"""The motion is composed."""
+
+
+class View(eqx.Module):
+    """What a landmark depends on beside itself."""
+
+    map_from_camera: Pose
+    """T_AC(k), the current camera in the map frame."""
+    calibration: Float[Array, " k"]
+    anchors: SplitPose | None = None
+    log_scale: Float[Array, " u"] | None = None
+    depth_error: Float[Array, " 1"] | None = None
+
+
+class SlamModel(eqx.Module):
+    """The one-landmark functions that a form of the filter asks for."""
+
+    motion: AbstractMotion
+    sensor: AbstractSensor
+    landmark: Parametrization = eqx.field(static=True)
+    coordinates: Coordinates = eqx.field(static=True)
+    calibration: AbstractCalibration
+    depth: InverseDepth
+    scale: Metre | ScaleGauge
+
+    @property
+    def geometry(self) -> Geometry:
+        return self.motion.geometry
+
+    @property
+    def moves_landmarks(self) -> bool:
+        return self.coordinates.moves_landmarks and not self.landmark.anchored
+
+    @property
+    def noise_sigma(self) -> Float[Array, " q"]:
+        """σ of what one step appends: the motion's noise, and the calibration's drift."""
+        drift = self.calibration.drift_sigma
+        own = jnp.asarray(self.motion.noise_sigma)
+        return jnp.concatenate([own, drift]) if drift.size else own
+
+    def displacement(self, core: Core, context: Context) -> Pose:
+        """The camera's motion in this step; the identity once it is composed."""
+        if context.control is None:
+            return identity(self.geometry, core.noise.dtype)
+        return self.motion.displacement(core.motion, self._noises(core)[0], context.control)
+
+    def _noises(self, core: Core) -> tuple[Float[Array, " q"], Float[Array, " w"]]:
+        """The motion's noise in the units of the state, and the calibration's."""
+        own = self.motion.noise_sigma.shape[-1]
+        noise, drift = core.noise[:own], core.noise[own:]
+        log_scale: Any = core.log_scale
+        return self.scale.noise(self.motion, core.motion, noise, log_scale), drift
+
+    def view(self, core: Core, context: Context) -> View:
+        """All that a landmark depends on."""
+        step = self.displacement(core, context)
+        T_AC = self.coordinates.map_from_camera(core.pose, step)
+        return View(T_AC, core.calibration, core.anchors, core.log_scale, core.depth_error)
+
+    def compose_core(self, core: Core, context: Context) -> Core:
+        """P18, P19. The noise has been used: it is marginalised."""
+        step, (noise, drift) = self.displacement(core, context), self._noises(core)
+        moved = self.coordinates.moves_landmarks
+        return replace(
+            core,
+            pose=self.coordinates.compose(core.pose, step),
+            anchors=_seen_from(step, core.anchors) if moved else core.anchors,
+            motion=self.motion.next(core.motion, noise, context.control),
+            calibration=self.calibration.next(core.calibration, drift),
+            noise=jnp.zeros_like(core.noise),
+        )
+
+    def camera_pose(self, core: Core) -> Pose:
+        """T_BC, in metres."""
+        return self.coordinates.camera_pose(self._metric_pose(core))
+
+    def estimate(self, core: Core) -> Pose | SplitPose:
+        """The one pose whose error is the filter's, in metres."""
+        return self.coordinates.estimate(self._metric_pose(core))
+
+    def _metric_pose(self, core: Core) -> Any:
+        """What is held of the pose, in metres."""
+        if core.log_scale is None:
+            return core.pose
+        return scaled(core.pose, jnp.exp(jnp.sum(core.log_scale)))
+
+    def compose_landmark(self, view: View, landmark: Array, context: Context) -> Array:
+        """The landmark in the new camera frame, for which the paper numbers no equation."""
+        del context
+        return self.landmark.transform(view.map_from_camera.inverse(), landmark)
+
+    def reanchoring(self) -> Change | None:
+        """The current camera becomes the map frame, its motion composed; None if it never does."""
+        reanchor, transform = self.coordinates.reanchor, self.landmark.transform
+        if reanchor is None:
+            return None
+
+        def core(core):
+            anchors = _seen_from(self._map_from_camera(core), core.anchors)
+            return replace(core, pose=reanchor(core.pose), anchors=anchors)
+
+        def landmark(T_AC, landmark):
+            return transform(T_AC.inverse(), landmark)
+
+        moved = None if self.landmark.anchored else landmark
+        return Change(core=core, view=self._map_from_camera, landmark=moved)
+
+    def reanchoring_due(self, state: Any) -> Bool[Array, ""]:
+        """Whether the camera is far from the map frame, its motion composed."""
+        points, omegas = jax.vmap(self.landmark.homogeneous)(state.landmarks)
+        inverse_distances = jnp.abs(omegas) / jnp.linalg.norm(points, axis=1)
+        counted = jnp.where(state.active, inverse_distances, 0.0)
+        return keyframe_due(self._map_from_camera(state.core), counted)
+
+    def _map_from_camera(self, core: Core) -> Pose:
+        """T_AC, once the motion is composed."""
+        return self.coordinates.map_from_camera(
+            core.pose, identity(self.geometry, core.noise.dtype)
+        )
+
+    def observe(self, view: View, landmark: Array, context: Context) -> tuple[Array, Array]:
+        """`h = proj(K T_AC⁻¹ X)` (P12, P14), and whether it is possible."""
+        del context
+        point, omega = self.camera_point(view, landmark)
+        sensor = self.sensor_of(view)
+        return sensor.measure(point, omega), sensor.possible(point)
+
+    def sensor_of(self, view: View) -> AbstractSensor:
+        """The sensor with the calibration's error of this step."""
+        return self.calibration.sensor(self.sensor, view.calibration)
+
+    def residual(self, measured: Array, predicted: Array) -> Array:
+        """What a measurement differs by from its prediction."""
+        return self.sensor.residual(measured, predicted)
+
+    def camera_point(self, view: View, landmark: Array) -> tuple[Array, Array]:
+        """The landmark in the current camera as a homogeneous point (X, ω)."""
+        point, omega = self.landmark.homogeneous(landmark)
+        T_CA = view.map_from_camera.inverse()
+        if self.landmark.anchored:
+            T_AF = jax.tree.map(lambda x: x[landmark[-1].astype(int)], view.anchors)
+            T_CA = T_CA @ T_AF.joined()
+        return homogeneous_apply(T_CA, point, omega), omega
+
+    def metric_point(self, view: View, landmark: Array) -> tuple[Array, Array]:
+        """`camera_point` in metres: with the gauge's scale, `ω e^−λ`."""
+        point, omega = self.camera_point(view, landmark)
+        return point, omega if view.log_scale is None else omega * jnp.exp(-jnp.sum(view.log_scale))
+
+    def convert(self, view: View, landmark: Array, covariance: Array, context: Context) -> Array:
+        """The same landmark in the form that its parametrization now prefers."""
+        del context
+        if self.landmark.convert is None:
+            return landmark
+        return self.landmark.convert(view.map_from_camera.translation(), landmark, covariance)
+
+    def initialise(self, view: View, measured: Array, hidden: Array, context: Context) -> Array:
+        """P22–P26: a landmark in the map frame from its first measurement and the prior."""
+        sensor = self.sensor_of(view)
+        if view.depth_error is not None:
+            hidden = hidden + self.depth.sigma * view.depth_error
+        point, omega = sensor.locate(measured, hidden)
+        if view.log_scale is not None:
+            omega = omega * jnp.exp(view.log_scale[0])
+        seen = self.landmark.initialise(point, omega, jnp.asarray(sensor.focal))
+        if self.landmark.anchored:
+            return seen.at[-1].set(context.anchor)
+        return self.landmark.transform(view.map_from_camera, seen)
+
+    def anchoring(self, anchor: Int[Array, ""]) -> Change:
+        """The current camera, its motion composed, becomes an anchor of landmarks."""
+
+        def core(core):
+            camera = SplitPose.of(self._map_from_camera(core))
+            anchors = jax.tree.map(lambda all, one: all.at[anchor].set(one), core.anchors, camera)
+            return replace(core, anchors=anchors)
+
+        return Change(core=core, view=self._map_from_camera, landmark=None)
+
+
+def _seen_from(T_AN: Pose, anchors: SplitPose | None) -> SplitPose | None:
+    """T_NF of all anchors F, from their T_AF and the new map frame N in the old one."""
+    if anchors is None:
+        return None
+    T_NA = T_AN.inverse()
+    return jax.vmap(lambda T_AF: SplitPose.of(T_NA @ T_AF.joined()))(anchors)

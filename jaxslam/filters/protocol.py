@@ -1,0 +1,154 @@
+"""What a filter is to those who run it: Monte Carlo studies, trackers, a loop of one's own.
+
+A filter is a module (a pytree that holds its numbers) with three functions, pure and on a state
+that is any pytree of arrays: `init`, `step`, `marginal`. One that can also stop within a frame,
+`AbstractStaged`, can track: features are sought where it predicts them.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam._numerics.arrays import AnyArray
+from jaxslam.geometry import Pose, difference
+from jaxslam.models.observations import Capacity, Features, Innovation
+
+
+class Scene(eqx.Module):
+    """What can be asked of a state: the camera, one landmark in it, and the filter's variables."""
+
+    pose: Pose
+    """T_BC, in metres."""
+    point: Any = None
+    """X of the landmark as a homogeneous point (X, ω) in the camera, n numbers; None without a
+    landmark."""
+    omega: Any = None
+    """ω, so that the point is X/ω metres."""
+    core: Any = None
+    """The filter's own variables; None where a landmark is asked for."""
+    log_scale: Any = None
+    """Numbers whose sum is the log of the filter's unit of length in metres; None of one that is in
+    metres."""
+
+
+class Expected(NamedTuple):
+    """What a filter expects to see in a frame that it has predicted, landmark by landmark."""
+
+    measured: Float[Array, "m p"]
+    covariance: Float[Array, "m p p"]
+    """Of the innovations: the search ellipses."""
+    possible: Bool[Array, " m"]
+    """In the map and in front of the camera."""
+    pose: Pose
+    """T_BC."""
+    points: Float[Array, "m n"]
+    """X of the homogeneous points (X, ω) in the predicted camera."""
+    omegas: Float[Array, " m"]
+
+
+class AbstractFilter(eqx.Module):
+    """A recursive estimator of a camera's pose and of a map."""
+
+    @abstractmethod
+    def init(self, capacity: int | Capacity, first: Features | None = None) -> Any:
+        """The state before the first motion: at the origin of B. With the features of frame 0, in
+        which everything is new, the state after it."""
+
+    @abstractmethod
+    def step(
+        self, state: Any, control: Any, seen: Features, new: Features
+    ) -> tuple[Any, Innovation]:
+        """One frame: `seen` are features of landmarks in the map, `new` those to insert."""
+
+    @abstractmethod
+    def marginal(
+        self,
+        state: Any,
+        function: Callable[[Scene], Any],
+        slots: Int[Array, " m"] | None = None,
+    ) -> tuple[Any, Float[Array, "k k"] | Float[Array, "m k k"]]:
+        """Mean and covariance of `function(scene)`, or of one for each landmark in `slots`.
+
+        The value is a vector, or a pytree of poses and vectors whose covariance is of its tangent
+        (without `slots`).
+        """
+
+    def in_map(self, state: Any) -> Bool[Array, " capacity"]:
+        """Which slots hold a landmark."""
+        return state.active
+
+    def pose_error(self, state: Any, T_BC: Pose) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
+        """The error against a true pose, in the coordinates in which the filter keeps it, and its
+        covariance: what NEES is made of."""
+        pose, covariance = self.marginal(state, lambda scene: scene.pose)
+        return difference(T_BC, pose), covariance
+
+    def unit_fixed(self, state: Any) -> Bool[Array, ""]:
+        """Whether poses from now on are in one unit; false while a start is being found out, and
+        every frame has another."""
+        del state
+        return jnp.ones((), bool)
+
+
+class AbstractStaged(AbstractFilter):
+    """A filter whose frame can be taken in stages: all that a tracker asks for."""
+
+    @property
+    def sets_out_anywhere(self) -> bool:
+        """Whether measurements of a start that no linear prediction expects are welcome: the filter
+        finds by itself what explains them. What stands around a filter, its `base`, does as that
+        does."""
+        return getattr(getattr(self, "base", None), "sets_out_anywhere", False)
+
+    @abstractmethod
+    def predict(self, state: Any, control: Any) -> Any:
+        """What is known before the frame's measurements."""
+
+    @abstractmethod
+    def predict_features(self, state: Any, control: Any, slots: Int[Array, " m"]) -> Expected:
+        """What a predicted state expects to see."""
+
+    @abstractmethod
+    def update(self, state: Any, control: Any, seen: Features) -> tuple[Any, Innovation]:
+        """Correct a predicted state by the features seen (P16, P17)."""
+
+    @abstractmethod
+    def compose(self, state: Any, control: Any) -> Any:
+        """Move into the new camera frame (P18–P21)."""
+
+    @abstractmethod
+    def close(self, state: Any, new: Features) -> Any:
+        """Insert new landmarks, seen from the current camera (P22–P26), and end the frame."""
+
+    @abstractmethod
+    def remove(self, state: Any, gone: Bool[AnyArray, " capacity"]) -> Any:
+        """Marginalise landmarks and free their slots."""
+
+    def step(
+        self, state: Any, control: Any, seen: Features, new: Features
+    ) -> tuple[Any, Innovation]:
+        """One frame by its stages."""
+        state = self.predict(state, control)
+        state, innovation = self.update(state, control, seen)
+        return self.close(self.compose(state, control), new), innovation
+
+    def moving(self, state: Any) -> Bool[Array, ""]:
+        """Whether the newest frame says anything of how the camera moves."""
+        del state
+        return jnp.ones((), bool)
+
+    def update_mean(self, state: Any, control: Any, seen: Features) -> Any:
+        """A state with the mean that `update` gives, to try hypotheses with; cheaper, if it can."""
+        return self.update(state, control, seen)[0]
+
+    def gaussian(self, state: Any, control: Any) -> tuple[AbstractStaged, Any]:
+        """A filter and a predicted state of it that is one Gaussian: what hypotheses are tried
+        on. The filter itself, unless its state is more than that."""
+        del control
+        return self, state

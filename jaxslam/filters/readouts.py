@@ -1,0 +1,155 @@
+"""What a filter's state says, of any filter: free functions of its `marginal`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxslam._numerics.linalg import semidefinite_root
+from jaxslam.filters.ekf import EkfSlam, scene_of_landmark
+from jaxslam.filters.protocol import AbstractFilter, Scene
+from jaxslam.geometry import Pose, Scalar, retract, scaled
+from jaxslam.models.sensors import AbstractSensor
+
+
+def camera_pose(slam: AbstractFilter, state: Any) -> tuple[Pose, Float[Array, "t t"]]:
+    """T_BC and its covariance in the right tangent: position in camera axes, orientation."""
+    return slam.marginal(state, lambda scene: scene.pose)
+
+
+class InUnit(NamedTuple):
+    """Where the camera is in the filter's own unit of length, and how long that is in metres."""
+
+    pose: Pose
+    """T_BC, with its lengths in that unit."""
+    covariance: Float[Array, "t t"]
+    """In the right tangent of the pose: what is not known of the metre is no part of it."""
+    log_scale: Scalar
+    """Mean of the log of the unit in metres, Σλ; zero of a filter in metres."""
+    log_scale_variance: Scalar
+
+
+def camera_pose_in_unit(slam: AbstractFilter, state: Any) -> InUnit:
+    """T_BC in the filter's own unit, `(R, t e^−Σλ)`, and beside it Σλ, the log of that in metres.
+
+    The camera's path is known much better than its size: λ wanders while nothing tells of it, and a
+    path in metres is blown up and shrunk with it, but none in the unit of the state. Mean and
+    covariance of a Gaussian sum are those of the pose in the unit.
+    """
+
+    def both(scene: Scene):
+        log_scale = _log_scale(scene)
+        return scaled(scene.pose, jnp.exp(-log_scale)), log_scale[None]
+
+    (pose, log_scale), P = slam.marginal(state, both)
+    return InUnit(pose, P[:-1, :-1], log_scale[0], P[-1, -1])
+
+
+def landmarks_in_unit(
+    slam: AbstractFilter, state: Any, slots: Int[Array, " m"]
+) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
+    """`landmarks_in_world` in the filter's own unit of length, with covariances of these."""
+
+    def point(scene: Scene):
+        return jnp.exp(-_log_scale(scene)) * _point_in_world(scene)
+
+    return slam.marginal(state, point, slots)
+
+
+def log_unit(slam: AbstractFilter, state: Any) -> Scalar:
+    """Mean of the log of the filter's unit of length in metres, Σλ."""
+    return slam.marginal(state, lambda scene: _log_scale(scene)[None])[0][0]
+
+
+def landmarks_in_camera(
+    slam: AbstractFilter, state: Any, slots: Int[Array, " m"], sensor: AbstractSensor
+) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
+    """The sensor's chart of landmarks, (x/z, y/z, 1/z) of a camera, with covariances."""
+    return slam.marginal(state, lambda scene: sensor.chart(scene.point, scene.omega), slots)
+
+
+def landmarks_from_above(
+    slam: AbstractFilter, state: Any, slots: Int[Array, " m"]
+) -> tuple[Float[Array, "m 2"], Float[Array, "m 2 2"]]:
+    """Azimuth (from z towards x, axes of B) and inverse horizontal distance from the camera.
+
+    A map seen from above: the point is `(sin θ, cos θ)/ρ` from the camera, and a Gaussian in
+    (θ, ρ) is drawn as the bent region that it is. The camera's pose is taken as known.
+    """
+    rotation = camera_pose(slam, state)[0].rotation()
+
+    def above(scene: Scene):
+        x, z = (rotation @ scene.point)[jnp.array([0, -1])]
+        return jnp.stack([jnp.atan2(x, z), scene.omega / jnp.hypot(x, z)])
+
+    return slam.marginal(state, above, slots)
+
+
+def landmarks_on_sides(
+    slam: AbstractFilter, state: Any, slots: Int[Array, " m"], sigmas: float = 2.0
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """How many landmarks are surely in front of infinity, 1/z > 0, and how many surely behind.
+
+    Pixels do not tell the one from the other: a world that is mostly behind is a reversed one.
+    """
+    inverse_depth, P = slam.marginal(
+        state, lambda scene: (scene.omega / scene.point[-1])[None], slots
+    )
+    sure = slam.in_map(state)[slots] & (inverse_depth[:, 0] ** 2 > sigmas**2 * P[:, 0, 0])
+    ahead = inverse_depth[:, 0] > 0
+    return jnp.sum(sure & ahead), jnp.sum(sure & ~ahead)
+
+
+def landmarks_in_world(
+    slam: AbstractFilter, state: Any, slots: Int[Array, " m"]
+) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
+    """Points in B and their covariances, the camera's uncertainty included.
+
+    Not finite for a landmark at infinity; far from Gaussian for one of unknown depth.
+    """
+    return slam.marginal(state, _point_in_world, slots)
+
+
+def landmark_samples(
+    slam: EkfSlam,
+    state: Any,
+    slots: Int[Array, " m"],
+    key: Array,
+    count: int = 1000,
+    function: Callable[[Scene], Float[Array, " k"]] | None = None,
+) -> Float[Array, "m count k"]:
+    """Draws of points in B, or of another function, from the Gaussian of a filter's state.
+
+    Nothing is linearised: this is the distribution that mean and covariance stand for. A draw
+    beyond infinity (ω < 0) comes out on the other side of the camera.
+    """
+    state = slam.entry.reported(state)
+    view, landmark = scene_of_landmark(slam, function or _point_in_world, state.core)
+    c, size = state.core_dim, state.core_dim + state.landmarks.shape[1]
+    normal = jax.random.normal(key, (slots.size, count, size), state.landmarks.dtype)
+
+    def of_slot(slot, draws):
+        root = semidefinite_root(slam.gaussian_form.joint_covariance(state, slot)).root
+
+        def one(draw):
+            delta = root @ draw
+            return landmark(view(retract(state.core, delta[:c])), state.landmarks[slot] + delta[c:])
+
+        return jax.vmap(one)(draws)
+
+    return jax.vmap(of_slot)(slots, normal)
+
+
+def _log_scale(scene: Scene) -> Scalar:
+    """Σλ; zero of a filter in metres."""
+    if scene.log_scale is None:
+        return jnp.zeros((), scene.pose.translation().dtype)
+    return jnp.sum(scene.log_scale)
+
+
+def _point_in_world(scene: Scene) -> Float[Array, " n"]:
+    return scene.pose @ (scene.point / scene.omega)

@@ -1,0 +1,274 @@
+"""Words for filters: what the command line, settings and tables of results call them.
+
+A name is a filter and its modifiers, `scale_gauge+scene50+mixture17`. What goes together is decided
+by the objects; here is only what each word makes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from jaxslam._runtime.lookup import chosen, listed
+from jaxslam.filters.association import TOLERANCE
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.forms.covariance import Covariance
+from jaxslam.filters.forms.form import AbstractForm
+from jaxslam.filters.forms.information import Information
+from jaxslam.filters.initialisation.depth_particles import with_depth_particles
+from jaxslam.filters.initialisation.rays import with_rays
+from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.remedies.first_estimates import FirstEstimates
+from jaxslam.filters.remedies.invariant import Invariant
+from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
+from jaxslam.filters.wrappers.adaptive_process_noise import MEMORY, FittedNoise
+from jaxslam.filters.wrappers.bank import Bank
+from jaxslam.filters.wrappers.batch_initialisation import from_rest
+from jaxslam.filters.wrappers.fixed_lag import LAG, FixedLag, iterated
+from jaxslam.filters.wrappers.gated import Checked
+from jaxslam.filters.wrappers.mixture import Mixture
+from jaxslam.landmarks import LANDMARKS, Parametrization
+from jaxslam.models.calibration import AbstractCalibration
+from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import AbstractMotion
+from jaxslam.models.scale import ScaleGauge
+from jaxslam.models.sensors import AbstractSensor
+from jaxslam.simulation.pieces import (
+    TREATMENTS,
+    calibration_sigma_of,
+    depth_of,
+    motion_of,
+    sensor_of,
+)
+from jaxslam.simulation.scenario import Scenario, as_scenario
+
+
+def robocentric(**pieces: Any) -> EkfSlam:
+    """The paper's filter: landmarks in the camera frame, composition after the update."""
+    return EkfSlam(coordinates=ROBOCENTRIC, **pieces)
+
+
+def world(**pieces: Any) -> EkfSlam:
+    """The classical filter: landmarks in the base frame, prediction composed first."""
+    return EkfSlam(coordinates=WORLD, **pieces)
+
+
+def keyframe(**pieces: Any) -> EkfSlam:
+    """Landmarks in the camera of the current keyframe, prediction composed first."""
+    return EkfSlam(coordinates=KEYFRAME, **pieces)
+
+
+def information(**pieces: Any) -> EkfSlam:
+    """`keyframe` in information form: the same estimates by sparse, additive updates."""
+    return EkfSlam(coordinates=KEYFRAME, form=Information(), **pieces)
+
+
+def scale_gauge(**pieces: Any) -> EkfSlam:
+    """The paper's filter in a unit of length of its own, whose size is estimated."""
+    return EkfSlam(coordinates=ROBOCENTRIC, scale=ScaleGauge(), **pieces)
+
+
+def world_gauge(**pieces: Any) -> EkfSlam:
+    """`scale_gauge` with landmarks in the base frame; its covariance is too small where the camera
+    turns."""
+    return EkfSlam(coordinates=WORLD, scale=ScaleGauge(), **pieces)
+
+
+def iterated_filter(**pieces: Any) -> FixedLag:
+    """The paper's filter, iterated: linearised at the maximum of the posterior of every frame."""
+    return iterated(robocentric(**pieces))
+
+
+def invariant(**pieces: Any) -> EkfSlam:
+    """`world` with the right-invariant error: landmarks' errors move with the pose's."""
+    return EkfSlam(coordinates=WORLD, form=Invariant(), **pieces)
+
+
+FILTERS: dict[str, Callable[..., AbstractFilter]] = {
+    "robocentric": robocentric,
+    "world": world,
+    "keyframe": keyframe,
+    "information": information,
+    "scale_gauge": scale_gauge,
+    "world_gauge": world_gauge,
+    "iterated": iterated_filter,
+    "invariant": invariant,
+}
+"""By name, of the pieces `motion`, `sensor`, `landmark`, `calibration`, `depth`."""
+
+
+def with_common_depth(slam: EkfSlam, percent: int | None) -> EkfSlam:
+    """The filter with priors on 1/z that are correlated, in percent; 50 by default.
+
+    Raises ValueError for a correlation of 1, with which all landmarks are as far away as the first.
+    """
+    correlation = 0.5 if percent is None else percent / 100
+    if correlation >= 1:
+        raise ValueError(f"a correlation of depths is from 0 to below 1, not {correlation}")
+    depth = replace(slam.depth, own=math.sqrt(1 - correlation), common=math.sqrt(correlation))
+    return replace(slam, depth=depth)
+
+
+def with_scene_depth(slam: EkfSlam, percent: int | None) -> EkfSlam:
+    """The filter that does not know how far away its scene is.
+
+    On top of the prior on 1/z of each landmark stands an error that is common to all, with a σ of
+    so many percent of one prior's; 100 by default. The first landmarks teach it to those that
+    follow.
+    """
+    common = 1.0 if percent is None else percent / 100
+    return replace(slam, depth=replace(slam.depth, common=common))
+
+
+def with_observability_constraint(slam: EkfSlam, steps: int | None) -> EkfSlam:
+    """The filter whose covariance is carried along the gauge, after each of so many steps of
+    Gauss–Newton in an update; 1 by default, as an EKF has. Raises ValueError."""
+    steps = 1 if steps is None else steps
+    if steps < 1:
+        raise ValueError(f"modifier oc takes a number of steps of at least 1, not {steps}")
+    return _with_form("oc", ObservabilityConstrained(steps))(slam, None)
+
+
+def _with_form(word: str, form: AbstractForm) -> Callable[[EkfSlam, int | None], EkfSlam]:
+    def remedied(slam: EkfSlam, number: int | None) -> EkfSlam:
+        if number is not None:
+            raise ValueError(f"modifier {word} takes no number, not {number}")
+        if type(slam.form) is not Covariance:
+            raise ValueError(f"{word} is for the plain EKF in covariance form")
+        return replace(slam, form=form)
+
+    return remedied
+
+
+_OF_ONE_FILTER: dict[str, Callable[[EkfSlam, int | None], EkfSlam]] = {
+    "particles": with_depth_particles,
+    "rays": with_rays,
+    "common": with_common_depth,
+    "scene": with_scene_depth,
+    "oc": with_observability_constraint,
+    "fej": _with_form("fej", FirstEstimates()),
+}
+_AROUND_ANY_FILTER: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
+    "lag": lambda slam, frames: FixedLag(slam, LAG if frames is None else frames),
+    "iterated": iterated,
+    "scales": lambda slam, count: Bank(slam, 9 if count is None else count, "speed"),
+    "directions": lambda slam, count: Bank(slam, 5 if count is None else count, "direction"),
+    "mixture": lambda slam, count: Mixture(slam, 9 if count is None else count),
+    "rest": from_rest,
+    "noise": lambda slam, frames: FittedNoise(slam, MEMORY if frames is None else frames),
+    "checked": lambda slam, percent: Checked(
+        slam, tolerance=TOLERANCE if percent is None else percent / 100
+    ),
+}
+MODIFIERS: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
+    **_OF_ONE_FILTER,
+    **_AROUND_ANY_FILTER,
+}
+"""What `+name` behind a filter's name makes of it, with the number that may follow the name: the
+greatest depth of a delayed initialisation, m (`particles`, `rays`); the correlation of depths in
+percent (`common`); σ of the scene's depth in percent of one landmark's (`scene`); frames (`lag`);
+steps of Gauss–Newton instead of convergence (`iterated`); members of a Gaussian sum (`scales`,
+`directions`, of a `mixture` at the most); frames of the longest window of a start (`rest`); frames
+of which the noise is remembered (`noise`); by how much a match may be off beyond its noise, in
+percent of that (`checked`); steps of Gauss–Newton in an update (`oc`); none for the remedy
+`fej`."""
+
+CANNOT_TRACK = ("iterated", "+lag", "+iterated", "+scales", "+directions", "+particles", "+rays")
+"""Filters and modifiers with which a frame cannot be taken in stages (`AbstractStaged`), or a
+landmark is not one Gaussian from the frame in which it is first seen."""
+
+RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gauge+scene50+mixture9"}
+"""The filter called `recommended`, by geometry, where the velocity is told."""
+FROM_REST = {
+    "planar": "scale_gauge+scene50+mixture5+rest",
+    "spatial": "scale_gauge+oc+scene50+mixture3+rest8",
+}
+"""The one where it is not: the camera sets out from rest, or nobody says how."""
+
+
+def recommended_name(motion: AbstractMotion) -> str:
+    """What `recommended` stands for, of those of docs/consistency.md and docs/from-rest.md: for a
+    velocity whose mean is less than 3 σ of it, a filter that looks for itself."""
+    geometry = motion.geometry
+    if not motion.has_velocity:
+        return RECOMMENDED[geometry.name]
+    mean, root = (np.asarray(x)[: geometry.point_dim] for x in motion.start())
+    told = mean @ mean > 3 * np.linalg.norm(mean @ root)
+    return (RECOMMENDED if told else FROM_REST)[geometry.name]
+
+
+def make_filter(name: str, **pieces: Any) -> AbstractFilter:
+    """One filter by its name, with its modifiers, of pieces as `EkfSlam` takes them.
+
+    Raises ValueError for a name that is not known, and for what does not go together.
+    """
+    if name == "recommended":
+        name = recommended_name(pieces["motion"])
+    base, *modifiers = name.split("+")
+    made: Any = chosen("filters", [base], FILTERS)[base](**pieces)
+    for modifier in modifiers:
+        word = modifier.rstrip("0123456789")
+        number = modifier[len(word) :]
+        modify = chosen("modifiers", [word], MODIFIERS)[word]
+        if word in _OF_ONE_FILTER and not isinstance(made, EkfSlam):
+            raise ValueError(f"in {name} the modifier {word} must stand before those of windows")
+        made = modify(made, int(number) if number else None)
+    return made
+
+
+def make_filters(
+    scenario: Scenario | str,
+    filters: str | Iterable[str],
+    landmarks: str | Iterable[str],
+    calibration: str | None = None,
+) -> dict[str, AbstractFilter]:
+    """Every named filter on every named parametrization, keyed `filter/landmarks`.
+
+    Their numbers are the scenario's, which may be given by name; one name may be given without a
+    list. A filter may be modified: `world+oc`, `scale_gauge+lag10`;
+    `recommended` stands for `recommended_name`. The calibration is treated as the scenario says,
+    unless another treatment is named. Raises ValueError.
+    """
+    scenario = as_scenario(scenario)
+    names = [
+        recommended_name(motion_of(scenario)) if name == "recommended" else name
+        for name in listed(filters)
+    ]
+    chosen("filters", [name.partition("+")[0] for name in names], FILTERS)
+    return {
+        f"{name}/{landmark.name}": make_filter(
+            name, landmark=landmark, **scenario_pieces(scenario, calibration)
+        )
+        for name in names
+        for landmark in chosen("landmarks", landmarks, LANDMARKS).values()
+    }
+
+
+def scenario_pieces(scenario: Scenario, calibration: str | None = None) -> dict[str, Any]:
+    """The pieces of a filter that fits the scenario, as `EkfSlam` takes them. Raises ValueError."""
+    word = scenario.calibration if calibration is None else calibration
+    treatment = chosen("calibration", [word], TREATMENTS)[word]
+    return {
+        "motion": motion_of(scenario),
+        "sensor": sensor_of(scenario),
+        "calibration": treatment(calibration_sigma_of(scenario)),
+        "depth": depth_of(scenario),
+    }
+
+
+def recommended(
+    motion: AbstractMotion,
+    sensor: AbstractSensor,
+    landmark: Parametrization = LANDMARKS["inverse_scaling"],
+    calibration: AbstractCalibration | None = None,
+    depth: InverseDepth | None = None,
+) -> AbstractFilter:
+    """The filter to take, of one's own pieces: `recommended_name`."""
+    pieces: Mapping[str, Any] = {"calibration": calibration, "depth": depth}
+    given = {name: piece for name, piece in pieces.items() if piece is not None}
+    return make_filter("recommended", motion=motion, sensor=sensor, landmark=landmark, **given)

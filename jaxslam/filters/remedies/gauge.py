@@ -1,0 +1,91 @@
+"""The gauge of SLAM: transformations of the whole state that no measurement can tell.
+
+Where the base frame is, is a convention; so is the unit of length where only bearings are measured
+and no motion is metric. The group's action on the state gives the unobservable directions,
+`N = ∂ action(s, x)/∂s` at s = 0, n × g: the Jacobians of a consistent filter have `H N = 0`, and
+take N of one step to N of the next (Huang, Mourikis, Roumeliotis, IJRR 2010; Hesch et al., IJRR
+2014).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxslam.filters.forms.state import State
+from jaxslam.filters.model import Core, SlamModel
+from jaxslam.geometry import Pose, SplitPose, identity, jacobian, joined, nudge
+from jaxslam.models.coordinates import ROBOCENTRIC, WORLD
+
+
+def check_gauge(model: SlamModel) -> None:
+    """Raise ValueError unless the gauge of the model's state is known."""
+    if model.coordinates not in (ROBOCENTRIC, WORLD):
+        raise ValueError(
+            "unobservable directions are known of robocentric and world filters, "
+            f"not {model.coordinates.name}"
+        )
+
+
+def scale_is_free(model: SlamModel) -> bool:
+    """Whether nothing that is measured holds a metre; what drives the motion is only noise."""
+    return model.motion.has_velocity and model.sensor.hidden > 0
+
+
+def gauge_dim(model: SlamModel) -> int:
+    """g: 3 or 6 for the base frame, and 1 for the scale where it is free."""
+    return model.geometry.tangent_dim + scale_is_free(model)
+
+
+def act(
+    model: SlamModel,
+    rigid: Pose,
+    factor: Float[Array, ""],
+    core: Core,
+    landmarks: Float[Array, "capacity d"],
+) -> tuple[Core, Float[Array, "capacity d"]]:
+    """The same camera among the same points: all enlarged by a factor, then moved in B.
+
+    What drives the motion is enlarged with it: its variance is prior knowledge, no measurement.
+    """
+    in_base = not model.coordinates.moves_landmarks
+    variables, noise = model.motion.enlarged(core.motion, core.noise, factor)
+
+    def enlarged(pose: Pose) -> Pose:
+        return joined(pose.rotation(), factor * pose.translation())
+
+    def anchor(T_AF: SplitPose) -> SplitPose:
+        pose = enlarged(T_AF.joined())
+        return SplitPose.of(rigid @ pose if in_base else pose)
+
+    def landmark(parameters):
+        parameters = model.landmark.scale(factor, parameters)
+        moved = in_base and not model.landmark.anchored
+        return model.landmark.transform(rigid, parameters) if moved else parameters
+
+    core = replace(
+        core,
+        pose=model.coordinates.hold(rigid @ enlarged(model.camera_pose(core))),
+        motion=variables,
+        noise=noise,
+        anchors=None if core.anchors is None else jax.vmap(anchor)(core.anchors),
+    )
+    return core, jax.vmap(landmark)(landmarks)
+
+
+def unobservable_directions(model: SlamModel, state: State) -> Float[Array, "n g"]:
+    """N: translation and rotation of everything in B, then its size; zero in empty slots."""
+    dtype, t = state.landmarks.dtype, model.geometry.tangent_dim
+    origin = identity(model.geometry, dtype)
+
+    def moved(s):
+        factor = 1 + jnp.sum(s[t:])
+        return act(model, nudge(origin, s[:t]), factor, state.core, state.landmarks)
+
+    N = jacobian(moved, jnp.zeros(gauge_dim(model), dtype))
+    held = jnp.repeat(state.active, state.landmarks.shape[1])
+    held = jnp.concatenate([jnp.ones(state.core_dim, bool), held])
+    return jnp.where(held[:, None], N, 0.0)

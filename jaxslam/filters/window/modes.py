@@ -1,0 +1,169 @@
+"""The modes of a window's posterior: where they are, and how much each is worth.
+
+A camera that sets out from rest leaves several: (t, v, ω) → −(t, v, ω) changes no pixel, and with
+the rotation that takes up the mean flow t → −t changes them little (the Necker cube). So the
+minimisation starts from rest and from translations in all directions; the distinct minima are kept,
+weighed by Laplace's `−½ |r|² − ½ log det A`, A the information of all unknowns.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxslam._numerics.conditional import each_alive
+from jaxslam._numerics.linalg import cholesky
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.window.minimise import Minimum, minimised, started, turned
+from jaxslam.filters.window.problem import Layout, reduced
+from jaxslam.filters.window.record import Record
+from jaxslam.filters.window.scale import enlarged, shift_of_scale
+
+SPEED = 1.2
+"""Starts move with so many σ of the prior on the initial velocity."""
+SEARCH_STEPS = 16
+"""Of Levenberg–Marquardt, from every start."""
+APART = 1.0
+"""Minima nearer than this in the better one's information, squared, are one."""
+
+NEGLIGIBLE = 100.0
+"""Of log evidence: a mode so much less likely than the likeliest is none."""
+
+
+class Modes(eqx.Module):
+    """A batch of minima, the likeliest first."""
+
+    minima: Minimum
+    log_weights: Float[Array, " modes"]
+    """Normalised; −∞ of places without a mode."""
+    shifts: Float[Array, " modes"]
+    """λ of every mode's mean, of which the maximum has 0."""
+
+
+def at_rest(slam: EkfSlam, record: Record, count: int, dtype: Any) -> Modes:
+    """Before anything is known: one mode, the prior's mean."""
+    size, m = Layout.of(slam).size(record.frames), record.first.size
+    q = slam.sensor.size + slam.sensor.hidden
+    x, y = jnp.zeros((count, size), dtype), jnp.zeros((count, m, q), dtype)
+    alone = jnp.where(jnp.arange(count) == 0, 0.0, -jnp.inf).astype(dtype)
+    return Modes(jax.vmap(started)(x, y), alone, jnp.zeros(count, dtype))
+
+
+def directions(n: int, count: int) -> np.ndarray:
+    """Unit vectors, evenly spread on a circle or (Fibonacci's lattice) on a sphere."""
+    index = np.arange(count) + 0.5
+    if n == 2:
+        angle = 2 * np.pi * index / count
+        return np.column_stack([np.cos(angle), np.sin(angle)])
+    height, angle = 1 - 2 * index / count, np.pi * (1 + 5**0.5) * index
+    ring = np.sqrt(1 - height**2)
+    return np.column_stack([ring * np.cos(angle), ring * np.sin(angle), height])
+
+
+def starts(
+    slam: EkfSlam, record: Record, likeliest: Minimum, wanted: Bool[Array, " starts"]
+) -> Minimum:
+    """The prior's mean, the reversal of what is likeliest, and translations in all directions,
+    those that are wanted with the rotations that fit them."""
+    n, dtype = slam.motion.geometry.point_dim, likeliest.x.dtype
+    rest = at_rest(slam, record, wanted.size, dtype).minima
+    away = np.concatenate([np.zeros((2, n)), SPEED * directions(n, wanted.size - 2)])
+    x, y = reversed_(slam, likeliest)
+    x, y = rest.x.at[:, :n].set(jnp.asarray(away, dtype)).at[1].set(x), rest.y.at[1].set(y)
+
+    def fitted(start, record):
+        x, y = start
+        return turned(slam, record, x, y), y
+
+    return jax.vmap(started)(*each_alive(fitted, (x, y), wanted, record))
+
+
+def reversed_(slam: EkfSlam, at: Minimum) -> tuple[Float[Array, " N"], Float[Array, "m q"]]:
+    """The other way, among points that are as much too near as they were too far."""
+    layout, p = Layout.of(slam), slam.sensor.size
+    x = enlarged(slam, at.x, jnp.asarray(-1.0, at.x.dtype))
+    common = slice(layout.start, layout.start + layout.common)
+    return x.at[common].multiply(-1), at.y.at[:, p:].multiply(-1)
+
+
+def sought(
+    slam: EkfSlam,
+    record: Record,
+    modes: Modes,
+    steps: int,
+    search: Bool[Array, " starts"] | None = None,
+) -> tuple[Modes, Bool[Array, ""]]:
+    """The modes with what has been measured since, each from where it is; and, of a search, what
+    is found beside them from those `starts` that it says.
+
+    Where nothing explains what was measured, the modes stay as they are, and the second is False.
+    """
+    alive = jnp.isfinite(modes.log_weights)
+    minima = jax.vmap(lambda m: started(m.x, m.y))(modes.minima)
+    most = jnp.full(len(alive), steps)
+    if search is not None:
+        likeliest = jax.tree.map(lambda leaf: leaf[0], minima)
+        found = starts(slam, record, likeliest, search)
+        minima = jax.tree.map(lambda *x: jnp.concatenate(x), minima, found)
+        alive = jnp.append(alive, search)
+        most = jnp.append(most, jnp.full(search.size, SEARCH_STEPS))
+
+    def further(both, record):
+        return minimised(slam, record, *both), both[1]
+
+    minima, _ = each_alive(further, (minima, most), alive, record)
+    after = _likeliest(slam, record, minima, alive, len(modes.log_weights))
+    explained = jnp.isfinite(after.log_weights[0])
+    return jax.tree.map(lambda new, old: jnp.where(explained, new, old), after, modes), explained
+
+
+class Weighed(NamedTuple):
+    """A minimum, its log evidence `−½ |r|² − ½ log det A`, what λ its mean has, and the
+    information of its path."""
+
+    minimum: Minimum
+    evidence: Float[Array, ""]
+    shift: Float[Array, ""]
+    information: Float[Array, "N N"]
+
+
+def _weighed(slam: EkfSlam, weighed: Weighed, record: Record) -> Weighed:
+    at = weighed.minimum
+    local = reduced(slam, record, at.x, at.y)
+    factor = cholesky(local.information)
+    own = jnp.sum(jax.vmap(lambda factor: factor.log_det())(local.landmarks))
+    value = -(at.cost + factor.log_det() + own) / 2
+    shift = shift_of_scale(slam, record, at, local, factor)
+    return Weighed(at, jnp.where(jnp.isfinite(value), value, -jnp.inf), shift, local.information)
+
+
+def _likeliest(slam, record, minima: Minimum, alive: Bool[Array, " k"], count: int) -> Modes:
+    """The likeliest of the minima that are distinct, weighed."""
+    k, size = minima.x.shape
+    none = jnp.full(k, -jnp.inf, minima.x.dtype)
+    begun = Weighed(
+        minima, none, jnp.zeros(k, none.dtype), jnp.zeros((k, size, size), minima.x.dtype)
+    )
+    _, value, shift, information = each_alive(
+        lambda weighed, record: _weighed(slam, weighed, record), begun, alive, record
+    )
+    best_first = jnp.argsort(-value)
+    value = value[best_first]
+    x, information = minima.x[best_first], information[best_first]
+    away = x[:, None] - x[None]
+    squared = jnp.einsum("ijn,jno,ijo->ij", away, information, away)
+    index = jnp.arange(k)
+    again = jnp.any((squared < APART) & (index < index[:, None]), axis=1)
+    value = jnp.where(again, -jnp.inf, value)
+    value = jnp.where(value < jnp.max(value) - NEGLIGIBLE, -jnp.inf, value)
+    kept = jnp.argsort(-value)[:count]
+    return Modes(
+        jax.tree.map(lambda leaf: leaf[best_first][kept], minima),
+        jax.nn.log_softmax(value[kept]),
+        shift[best_first][kept],
+    )

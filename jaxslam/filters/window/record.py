@@ -1,0 +1,172 @@
+"""What a window remembers: every measurement since its first frame, and which landmark it is of.
+
+**Standing teaches nothing** of how the camera will move. While all pixels are where they were first
+seen, the newest frame takes the place of the one before, and with the first motion the velocity is
+drawn anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam._numerics.arrays import AnyArray
+from jaxslam._numerics.linalg import cholesky
+from jaxslam.models.motion import AbstractMotion
+from jaxslam.models.observations import Features
+
+TIED = 0.8
+"""Share of the landmarks in view."""
+STILL = 5.0
+"""σ of χ², above its mean, up to which pixels are where they were."""
+
+
+class Record(eqx.Module):
+    """Frames 0 to `last` of at most F; the motion into frame k is the control k − 1."""
+
+    last: Int[Array, ""]
+    controls: Any
+    """Of F − 1 steps."""
+    merged: Float[Array, " steps"]
+    """Of how many steps of the process each is made; 1 until the window was thinned."""
+    restarted: Bool[Array, " steps"]
+    """In which the velocity is drawn anew: it stood before."""
+    standing: Bool[Array, ""]
+    """Whether nothing has moved since frame 0."""
+    measured: Float[Array, "F m p"]
+    """By slot of the landmark."""
+    seen: Bool[Array, "F m"]
+    first: Int[Array, " m"]
+    """The frame in which a slot's landmark was first seen."""
+
+    @property
+    def frames(self) -> int:
+        """F."""
+        return self.seen.shape[0]
+
+    @property
+    def steps(self) -> Float[Array, ""]:
+        """Of the process, since frame 0."""
+        happened = jnp.arange(self.merged.size) < self.last
+        return jnp.sum(jnp.where(happened, self.merged, 0.0))
+
+    @property
+    def full(self) -> Bool[Array, ""]:
+        return self.last == self.frames - 1
+
+    @property
+    def tied(self) -> Bool[Array, ""]:
+        """Whether most of what the newest frame sees was seen in the first half of the frames."""
+        seen = self.seen[self.last]
+        long = seen & (2 * self.first <= self.last)
+        return jnp.sum(long) >= TIED * jnp.sum(seen)
+
+    @property
+    def compared(self) -> Bool[Array, "F m"]:
+        """Where a measurement is of a landmark seen before."""
+        k = jnp.arange(self.frames)[:, None]
+        return self.seen & (k > self.first) & (k <= self.last)
+
+    @property
+    def first_measured(self) -> Float[Array, "m p"]:
+        """What every slot's landmark was first measured at."""
+        return self.measured[self.first, jnp.arange(self.first.size)]
+
+    def cut(self, frames: int) -> Record:
+        """The first frames alone, for a smaller problem."""
+        return Record(
+            jnp.minimum(self.last, frames - 1),
+            jax.tree.map(lambda x: x[: frames - 1], self.controls),
+            self.merged[: frames - 1],
+            self.restarted[: frames - 1],
+            self.standing,
+            self.measured[:frames],
+            self.seen[:frames],
+            self.first,
+        )
+
+
+def empty(motion: AbstractMotion, frames: int, landmarks: int, p: int, dtype: Any) -> Record:
+    """Of frame 0 in which nothing has been seen yet."""
+    still = motion.still(dtype)
+    return Record(
+        jnp.zeros((), int),
+        jax.tree.map(lambda x: jnp.tile(x, (frames - 1, *(1,) * x.ndim)), still),
+        jnp.ones(frames - 1, dtype),
+        jnp.zeros(frames - 1, bool),
+        jnp.ones((), bool),
+        jnp.zeros((frames, landmarks, p), dtype),
+        jnp.zeros((frames, landmarks), bool),
+        jnp.zeros(landmarks, int),
+    )
+
+
+def whole(
+    controls: Any,
+    measured: Float[Array, "F m p"],
+    seen: Bool[Array, "F m"],
+    first: Int[Array, " m"],
+) -> Record:
+    """A full record of frames that all moved."""
+    steps = len(seen) - 1
+    ones, no = jnp.ones(steps, measured.dtype), jnp.zeros(steps, bool)
+    moved = jnp.zeros((), bool)
+    return Record(jnp.asarray(steps), controls, ones, no, moved, measured, seen, first)
+
+
+def stepped(record: Record, control: Any, seen: Features, noise: Float[Array, "p p"]) -> Record:
+    """With one frame more and what it measured of known landmarks, of such a covariance. A full
+    record stays as it is."""
+    stood = record.standing & (record.last == 1)
+    stands = record.standing & _still(record, seen, noise)
+    k = jnp.where(stood & stands, 1, record.last + 1)  # beyond the end: dropped
+    controls = jax.tree.map(
+        lambda all, one: all.at[k - 1].set(one, mode="drop"), record.controls, control
+    )
+    restarted = record.restarted.at[k - 1].set(stood & ~stands, mode="drop")
+    # What the frame in this place saw is forgotten, but for where landmarks begin.
+    kept = record.seen & ((jnp.arange(record.frames) != k)[:, None] | (record.first == k))
+    last = jnp.minimum(k, record.frames - 1)
+    stepped = replace(
+        record, last=last, controls=controls, restarted=restarted, standing=stands, seen=kept
+    )
+    return _measured(stepped, k, seen)
+
+
+def _still(record: Record, seen: Features, noise: Float[Array, "p p"]) -> Bool[Array, ""]:
+    """Whether all that is seen, and that is something, is where it was first seen."""
+    moved = seen.measured - record.first_measured[seen.slots]
+    whitened = moved @ cholesky(2 * noise).whitening.T
+    squared = jnp.sum(jnp.where(seen.valid[:, None], whitened, 0.0) ** 2)
+    dof = jnp.sum(seen.valid) * moved.shape[1]
+    return (dof > 0) & (squared <= dof + STILL * jnp.sqrt(2 * dof))
+
+
+def begun(record: Record, new: Features) -> Record:
+    """With the landmarks that are first seen in the newest frame."""
+    slots = jnp.where(new.valid, new.slots, record.first.size)
+    record = replace(
+        record,
+        first=record.first.at[slots].set(record.last, mode="drop"),
+        seen=record.seen.at[:, slots].set(False, mode="drop"),
+    )
+    return _measured(record, record.last, new)
+
+
+def removed(record: Record, gone: Bool[AnyArray, " m"]) -> Record:
+    """Without what was measured of some landmarks."""
+    return replace(record, seen=record.seen & ~gone)
+
+
+def _measured(record: Record, k: Int[Array, ""], features: Features) -> Record:
+    slots = jnp.where(features.valid, features.slots, record.first.size)
+    return replace(
+        record,
+        measured=record.measured.at[k, slots].set(features.measured, mode="drop"),
+        seen=record.seen.at[k, slots].set(True, mode="drop"),
+    )

@@ -1,0 +1,98 @@
+"""A full window goes on with every other frame.
+
+While a camera only turns, parallax does not come, and what the first frames leave open stays open.
+So a window that is full keeps its first frame, its newest, and every other one between: two steps
+become one of their whole length, driven by the mean of both accelerations. The older a part of the
+window, the coarser it becomes, and it reaches back to frame 0 for ever.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Shaped
+
+from jaxslam._numerics.arrays import AnyArray
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.window.minimise import Minimum
+from jaxslam.filters.window.problem import Layout
+from jaxslam.filters.window.record import Record
+
+
+def kept(frames: int) -> Int[AnyArray, " k"]:
+    """Frames of a full window that stay: the first, and every other one back from the newest."""
+    return np.unique([0, *range(frames - 1, 0, -2)])
+
+
+def thinned(slam: EkfSlam, record: Record, minima: Minimum) -> tuple[Record, Minimum]:
+    """A full window with every other frame, and a batch of minima as its starts."""
+    fewer = _fewer(record)
+    same = jnp.asarray(kept(record.frames))[fewer.first] == record.first
+    x = jax.vmap(lambda x: _noises(slam, record, fewer, x))(minima.x)
+    # What is first seen later than it was has its error of depth, and another pixel's error.
+    p = slam.sensor.size
+    y = minima.y.at[..., :p].set(jnp.where(same[:, None], minima.y[..., :p], 0.0))
+    return fewer, replace(minima, x=x, y=y)
+
+
+def _fewer(record: Record) -> Record:
+    stay, frames = kept(record.frames), record.frames
+    measured, seen = _without_orphans(record)
+    seen = _padded(seen[stay], frames)
+    # Where the velocity is drawn anew, it stood before.
+    lasting = jax.tree.map(lambda x: jnp.where(_stood(record), 0.0, x), record.controls)
+    return Record(
+        jnp.asarray(len(stay) - 1, record.last.dtype),
+        jax.tree.map(lambda x: _sums(x, frames), lasting),
+        jnp.maximum(_sums(record.merged, frames), 1.0),
+        _sums(record.restarted.astype(int), frames) > 0,
+        record.standing,
+        _padded(measured[stay], frames),
+        seen,
+        jnp.argmax(seen, axis=0).astype(record.first.dtype),
+    )
+
+
+def _without_orphans(record: Record) -> tuple[Array, Array]:
+    """Measurements, and where they are; a landmark that no frame that stays has seen keeps its last
+    sight, as of the frame after it."""
+    seen = record.seen
+    last = (record.frames - 1) - jnp.argmax(seen[::-1], axis=0)
+    orphan = jnp.any(seen, axis=0) & ~jnp.any(seen[kept(record.frames)], axis=0)
+    slots, to = jnp.arange(last.size), jnp.where(orphan, last + 1, record.frames)
+    measured = record.measured.at[to, slots].set(record.measured[last, slots], mode="drop")
+    return measured, seen.at[to, slots].set(True, mode="drop")
+
+
+def _stood(record: Record) -> Bool[Array, " steps"]:
+    """Steps just before one in which the velocity is drawn anew."""
+    return jnp.append(record.restarted[1:], False)
+
+
+def _noises(slam: EkfSlam, record: Record, fewer: Record, x: Float[Array, " N"]) -> Any:
+    """Unknowns of the merged steps: `√(m₁ + m₂) n = √m₁ n₁ + √m₂ n₂` adds the same velocity; a
+    calibration that is drawn anew is that of the frame that stays, and so is a velocity."""
+    layout, frames = Layout.of(slam), record.frames
+    steps = x[layout.whole :].reshape(frames - 1, -1)
+    own, drawn = jnp.split(steps, [layout.step], axis=1)
+    roots = jnp.sqrt(jnp.stack([record.merged, fewer.merged]))[..., None]
+    added = _sums(roots[0] * own, frames) / roots[1]
+    anew = _sums(jnp.where(record.restarted[:, None], own, 0.0), frames)
+    own = jnp.where(fewer.restarted[:, None], anew, added)
+    drawn = _padded(drawn[kept(frames)[1:] - 1], frames - 1)
+    return x.at[layout.whole :].set(jnp.concatenate([own, drawn], axis=1).ravel())
+
+
+def _sums(steps: Shaped[Array, "steps ..."], frames: int) -> Shaped[Array, "steps ..."]:
+    """Over the steps between frames that stay; zero behind."""
+    segment = np.searchsorted(kept(frames), np.arange(frames - 1), side="right") - 1
+    return jax.ops.segment_sum(steps, segment, num_segments=frames - 1)
+
+
+def _padded(values: Array, frames: int) -> Array:
+    """To so many frames."""
+    return jnp.zeros((frames, *values.shape[1:]), values.dtype).at[: len(values)].set(values)

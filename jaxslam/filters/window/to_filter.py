@@ -1,0 +1,196 @@
+"""What a filter goes on from: the Gaussian of one mode at the window's newest frame.
+
+It stands at the mean of the scale (`jaxslam.filters.window.scale`), in the gauge in which λ is
+uncorrelated with everything that does not scale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxslam._numerics.linalg import Cholesky, cholesky
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.forms.blocks import shifted
+from jaxslam.filters.forms.state import State
+from jaxslam.filters.window.minimise import LANDMARK_STEPS, Minimum, landmarks
+from jaxslam.filters.window.problem import (
+    Layout,
+    Reduced,
+    located,
+    path,
+    reduced,
+)
+from jaxslam.filters.window.record import Record
+from jaxslam.filters.window.scale import Direction, rescaled, scaling, told
+from jaxslam.geometry import Scalar, identity, jacobian, scaled
+from jaxslam.models.scale import ScaleGauge
+
+
+def gauge_state(
+    slam: EkfSlam, record: Record, mode: Minimum, shift: Float[Array, ""], like: State
+) -> State:
+    """The filter's state of one mode whose mean has such a λ, in a unit that is a metre there."""
+    x, y = rescaled(slam, record, mode, shift)
+    y, _ = landmarks(slam, record, path(slam, record, x), y, LANDMARK_STEPS)
+    at = replace(mode, x=x, y=y)
+    local, s = reduced(slam, record, x, y), scaling(slam, record, at)
+    factor = cholesky(local.information)
+    # The rest moves to where it is likeliest at this scale.
+    step = factor.solve(local.gradient)
+    step = step - s.x * (s.x @ local.gradient) / s.squared
+    return _state(slam, record, at, step, local, s, factor, like)
+
+
+def _state(slam, record, at, step, local, s: Direction, factor: Cholesky, like: State) -> State:
+    """The Gaussian of x, and of what is left of every y given x, as one of the filter's numbers;
+    x moves back by a step."""
+    newest, by_x = _newest(slam, record, at, local)
+    scale = _scale(slam, local, s)
+    core, of_core = _core_rows(slam, newest, by_x, scale, like.core)
+    of_core = _less_told(of_core, like.core, jnp.sqrt(s.squared / told(slam, at, s)))
+    values, of_landmarks, own = _landmark_rows(slam, record, at, local, (newest, by_x), scale)
+    active = jnp.any(record.seen, axis=0)
+    rows = _stacked(of_core, of_landmarks, active)
+    own = jnp.where(active[:, None, None], own, 0.0)
+    landmarks = jnp.where(active[:, None], values, like.landmarks)
+    covariance = _with_metre(_covariance(local, factor, rows, own, scale), like)
+    return shifted(State(core, landmarks, active, covariance, like.memory), -rows.x @ step)
+
+
+class Rows(NamedTuple):
+    """Jacobians of the filter's numbers, by x and by λ: λ depends on what is left of every y given
+    x, and so do a landmark's numbers on its own."""
+
+    x: Float[Array, "*n N"]
+    unit: Float[Array, "*n"]
+
+
+def _scale(slam: EkfSlam, local: Reduced, s: Direction) -> Direction:
+    """Of λ, by x and by e, what is left of every y; zero in a filter without.
+
+    `y = ŷ − C (x − x̂) + e`.
+    """
+    squared = s.squared if isinstance(slam.scale, ScaleGauge) else jnp.inf
+    by_x = s.x - jnp.einsum("mq,mqn->n", s.y, local.coupling)
+    return Direction(by_x / squared, s.y / squared)
+
+
+def _newest(slam, record, at: Minimum, local: Reduced):
+    """(frame, motion's variables, common error) at the newest frame, and their Jacobian by x."""
+    layout, k = Layout.of(slam), record.last
+    frame = jax.tree.map(lambda leaf: leaf[k], local.path.frames)
+    eye = jnp.eye(at.x.size, dtype=at.x.dtype)
+    common = eye[layout.start : layout.start + layout.common]
+    by_x = jnp.concatenate([local.by_x.frame[k], local.by_x.motion[k], common])
+    return (frame, local.path.motion[k], local.path.common), by_x
+
+
+def _core_rows(slam, newest, by_x, scale: Direction, like) -> tuple[Any, Rows]:
+    """The filter's core and its Jacobians."""
+    zero = jnp.zeros(1, by_x.dtype)
+    J = jacobian(lambda both: _core(slam, like, *both), (newest, zero))
+    by_newest, unit = J[:, :-1], J[:, -1]
+    rows = by_newest @ by_x + jnp.outer(unit, scale.x)
+    return _core(slam, like, newest, zero), Rows(rows, unit)
+
+
+def _with_metre(covariance: Float[Array, "n n"], like: State) -> Float[Array, "n n"]:
+    """What is not known of the metre, behind λ, is as it was: nothing tells of it."""
+    part = like.core.part("log_scale")
+    metre = slice(part.start + 1, part.stop)
+    return covariance.at[metre, metre].set(like.covariance[metre, metre])
+
+
+def _less_told(rows: Rows, core, factor: Scalar) -> Rows:
+    """With σ of λ so many times as large; it is correlated with nothing."""
+    if core.log_scale is None:
+        return rows
+    place = core.part("log_scale").start
+    return Rows(*(row.at[place].multiply(factor) for row in rows))
+
+
+def _landmark_rows(
+    slam, record, at: Minimum, local: Reduced, newest, scale: Direction
+) -> tuple[Float[Array, "m d"], Rows, Float[Array, "m d q"]]:
+    """All landmarks and their Jacobians, the last by its own y each."""
+    (newest, by_x), zero = newest, jnp.zeros(1, at.x.dtype)
+    firsts = jax.tree.map(lambda leaf: leaf[record.first], local.path.frames)
+    of_firsts = local.by_x.frame[record.first]
+
+    def one(first, of_first, measured, y, coupling):
+        def of(everything):
+            newest, first, y, log_scale = everything
+            return _landmark(slam, newest, first, y, measured, log_scale)
+
+        everything = newest, first, y, zero
+        J = jacobian(of, everything)
+        ends = [len(by_x), len(by_x) + len(of_first), J.shape[1] - 1]
+        by_newest, by_first, by_y, unit = jnp.split(J, ends, axis=1)
+        rows = by_newest @ by_x + by_first @ of_first - by_y @ coupling
+        return of(everything), rows + unit * scale.x, by_y, unit[:, 0]
+
+    values, rows, by_own, units = jax.vmap(one)(
+        firsts, of_firsts, record.first_measured, at.y, local.coupling
+    )
+    return values, Rows(rows, units), by_own
+
+
+def _stacked(core: Rows, landmarks: Rows, active: Bool[Array, " m"]) -> Rows:
+    """Of the whole state; zero where no landmark is."""
+
+    def whole(of_core, of_each):
+        kept = jnp.where(active.reshape(-1, *(1,) * (of_each.ndim - 1)), of_each, 0.0)
+        return jnp.concatenate([of_core, kept.reshape(-1, *of_each.shape[2:])])
+
+    return Rows(*map(whole, core, landmarks))
+
+
+def _covariance(
+    local: Reduced, factor: Cholesky, rows: Rows, own: Float[Array, "m d q"], scale: Direction
+) -> Float[Array, "n n"]:
+    """Of numbers with these Jacobians. With B of their own y and u of λ, whose derivative by y is
+    s: `(B + u sᵀ) Λ⁻¹ (B + u sᵀ)ᵀ`, B and Λ in blocks."""
+    whitened = factor.whitening @ rows.x.T
+    B = jnp.einsum("mqo,mdo->mdq", local.landmarks.whitening, own)
+    s = jnp.einsum("mqo,mo->mq", local.landmarks.whitening, scale.y)
+    m, d, _ = own.shape
+    c, u = len(rows.unit) - m * d, rows.unit
+    across = jnp.pad(jnp.einsum("mdq,mq->md", B, s).ravel(), (c, 0)) + u * jnp.sum(s**2) / 2
+    covariance = whitened.T @ whitened + jnp.outer(u, across) + jnp.outer(across, u)
+    place = c + jnp.arange(m * d).reshape(m, d)
+    blocks = jnp.einsum("mdq,meq->mde", B, B)
+    return covariance.at[place[:, :, None], place[:, None]].add(blocks)
+
+
+def _core(slam: EkfSlam, like, newest, log_scale):
+    """The filter's core, with lengths in units of e^λ m."""
+    frame, variables, common = newest
+    unit = jnp.exp(-log_scale[0])
+    variables, _ = slam.motion.enlarged(variables, like.noise, unit)
+    kept = not slam.calibration.each_frame
+    return replace(
+        like,
+        pose=slam.coordinates.hold(scaled(frame.pose, unit)),
+        motion=variables,
+        log_scale=None if like.log_scale is None else like.log_scale.at[:1].set(log_scale),
+        calibration=frame.calibration if kept else like.calibration,
+        # The filter keeps c in σ of one landmark's prior.
+        depth_error=None if like.depth_error is None else slam.depth.common * common,
+    )
+
+
+def _landmark(slam: EkfSlam, newest, first, y, measured, log_scale):
+    """The landmark in the map frame of the newest camera, in units of e^λ m."""
+    frame, _, common = newest
+    seen, omega = located(slam, first.calibration, common, measured, y)
+    unit = jnp.exp(-log_scale[0])
+    held = slam.coordinates.hold(scaled(frame.pose, unit))
+    T_AC = slam.coordinates.map_from_camera(held, identity(slam.motion.geometry, y.dtype))
+    T_CF = frame.pose.inverse() @ first.pose
+    landmark = slam.landmark.initialise(seen, omega / unit, jnp.asarray(slam.sensor.focal))
+    return slam.landmark.transform(T_AC @ scaled(T_CF, unit), landmark)

@@ -1,0 +1,265 @@
+"""A Gaussian sum that sets out from rest: a growing window of all frames, until parallax is there.
+
+The initial velocity is unknown. The posterior of the first frames then has several modes, and a
+filter that linearises at its own estimate picks one of them by the first pixel's noise. Therefore
+all frames since frame 0 are kept and linearised again with every new one
+(`jaxslam.filters.window`), each mode for itself, and the members of the sum are the Gaussians of
+the modes, weighed by their evidence. When the translation is known to a fraction of itself, the
+sum goes on alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam._numerics.arrays import AnyArray, cast, precision
+from jaxslam._numerics.conditional import each_alive, when
+from jaxslam.filters.ekf import EkfSlam, innermost
+from jaxslam.filters.forms.state import State
+from jaxslam.filters.protocol import AbstractStaged, Expected
+from jaxslam.filters.window import record as window
+from jaxslam.filters.window.modes import Modes, at_rest, sought
+from jaxslam.filters.window.problem import Layout
+from jaxslam.filters.window.record import Record
+from jaxslam.filters.window.subsample import thinned
+from jaxslam.filters.window.to_filter import gauge_state
+from jaxslam.filters.wrappers.bank import BankState
+from jaxslam.filters.wrappers.mixture import Mixture
+from jaxslam.geometry import Pose
+from jaxslam.models.observations import Capacity, Features, Innovation
+
+SIZES = {"planar": (9, 25, 61), "spatial": (9, 31)}
+"""Frames of the windows that are compiled; the smallest that holds all is computed."""
+DIRECTIONS = {"planar": 16, "spatial": 8}
+"""In which the search sets out, from rest beside."""
+SEARCHES = {"planar": (1, 2, 3, 4, 6, 8, 11, 15, 20, 26, 34), "spatial": (1, 2, 3)}
+"""Frames after which minima are sought anew, from all starts …"""
+IN_TURN = {"planar": 0, "spatial": 1}
+"""… and from how many of them after every other frame, in turn: no frame waits for them all."""
+DIVIDED = {"planar": True, "spatial": False}
+"""Whether the sum is divided anew in every frame, or its members are the modes and what becomes of
+them: halves of a Gaussian, each linearised off its middle, can be worse than the whole."""
+GIVEN_UP = 10.0
+"""Of log evidence: modes so much less likely than the likeliest end with the window. What has been
+weighed without a linearisation is not to be overturned by one."""
+REFINEMENTS = 4
+"""Steps of Levenberg–Marquardt with every new frame, at the most."""
+LEAST_STEPS = 8
+"""Since frame 0 before the sum may go on alone."""
+KNOWN = 0.03
+"""σ of the translation, in translations, given the scale: below it parallax is there."""
+MOVED = 0.1
+"""The same, below which a camera has done more than turn."""
+
+
+class RestState(eqx.Module):
+    """The sum, and what it is begun anew from as long as the window is open."""
+
+    sum: BankState
+    record: Record
+    modes: Modes
+    open: Bool[Array, ""]
+
+
+class FromRest(AbstractStaged):
+    """The start of `base`."""
+
+    base: Mixture
+    sizes: tuple[int, ...] = eqx.field(static=True)
+    directions: int = eqx.field(static=True)
+    known: float = eqx.field(static=True, default=KNOWN)
+
+    def __check_init__(self) -> None:
+        if not isinstance(self.base, Mixture):
+            raise ValueError(
+                "a start from rest is of a Gaussian sum that divides itself (mixture), not of a "
+                f"{type(self.base).__name__}"
+            )
+        _check_base(self.base.base)
+        if min(self.sizes, default=0) < 3 or list(self.sizes) != sorted(set(self.sizes)):
+            raise ValueError(
+                "a start from rest keeps windows of 3 frames and more (frame 0 and at least 2 "
+                f"after it), each larger than the one before, not {self.sizes}"
+            )
+        if self.directions < 1:
+            raise ValueError(f"a search sets out in 1 direction at least, not {self.directions}")
+
+    @property
+    def sets_out_anywhere(self) -> bool:
+        """It does: the window looks for what explains a start."""
+        return True
+
+    def init(self, capacity: int | Capacity, first: Features | None = None) -> RestState:
+        ekf, count = self.base.base, self.base.count
+        dtype, (landmarks, *_) = precision(ekf), Capacity.of(capacity)
+        begun = window.empty(ekf.motion, self.sizes[-1], landmarks, ekf.sensor.size, dtype)
+        if first is not None:
+            begun = window.begun(begun, first)
+        member = ekf.init(capacity, first)
+        members = jax.tree.map(lambda x: jnp.tile(x, (count, *(1,) * x.ndim)), member)
+        modes = at_rest(cast(ekf, dtype), begun, count, dtype)
+        return RestState(BankState(members, modes.log_weights), begun, modes, jnp.ones((), bool))
+
+    def predict(self, state: RestState, control: Any) -> RestState:
+        return replace(state, sum=self.base.predict(state.sum, control))
+
+    def gaussian(self, state: RestState, control: Any):
+        return self.base.gaussian(state.sum, control)
+
+    def predict_features(self, state: RestState, control: Any, slots: Int[Array, " m"]) -> Expected:
+        return self.base.predict_features(state.sum, control, slots)
+
+    def update(
+        self, state: RestState, control: Any, seen: Features
+    ) -> tuple[RestState, Innovation]:
+        divided = DIVIDED[self.base.base.motion.geometry.name]
+        update = self.base.update if divided else self.base.corrected
+        after, innovation = update(state.sum, control, seen)
+        stepped = window.stepped(state.record, control, seen, self.base.base.sensor.noise)
+        return replace(state, sum=after, record=stepped), innovation
+
+    def compose(self, state: RestState, control: Any) -> RestState:
+        return replace(state, sum=self.base.compose(state.sum, control))
+
+    def close(self, state: RestState, new: Features) -> RestState:
+        """End the frame, and begin the sum anew from the window's modes while that is open."""
+        after = self.base.close(state.sum, new)
+        state = replace(state, sum=after, record=window.begun(state.record, new))
+        # Where nothing was ever seen there is nothing to begin anew from.
+        anew, least = state.open & jnp.any(state.record.seen), 1
+        for frames in self.sizes:
+            count = state.record.last + 1
+            wanted = anew & (count > least) & (count <= frames)
+            state = self._anew(state, frames, wanted, least)
+            least = frames
+        ready = self._ready(state)
+        state = replace(state, sum=_likely(state.sum, anew & ready), open=state.open & ~ready)
+        return when(state.open & state.record.full, self._thinned, state)
+
+    def moving(self, state: RestState) -> Bool[Array, ""]:
+        """It says so unless the camera has stood."""
+        return ~state.record.standing
+
+    def remove(self, state: RestState, gone: Bool[AnyArray, " capacity"]) -> RestState:
+        modes = state.modes
+        y = jnp.where(gone[:, None], 0.0, modes.minima.y)
+        return RestState(
+            self.base.remove(state.sum, gone),
+            window.removed(state.record, gone),
+            replace(modes, minima=replace(modes.minima, y=y)),
+            state.open,
+        )
+
+    def marginal(self, state: RestState, function, slots: Int[Array, " m"] | None = None):
+        return self.base.marginal(state.sum, function, slots)
+
+    def in_map(self, state: RestState) -> Bool[Array, " capacity"]:
+        return self.base.in_map(state.sum)
+
+    def pose_error(self, state: RestState, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
+        return self.base.pose_error(state.sum, T_BC)
+
+    def unit_fixed(self, state: RestState) -> Bool[Array, ""]:
+        return ~state.open
+
+    def _anew(
+        self, state: RestState, frames: int, wanted: Bool[Array, ""], least: int
+    ) -> RestState:
+        """The modes of a window of so many frames, more than `least`, and the sum of them."""
+        ekf, record = self.base.base, state.record.cut(frames)
+        size = Layout.of(ekf).size(frames)
+
+        def solved(state, record):
+            x = state.modes.minima.x
+            modes = replace(state.modes, minima=replace(state.modes.minima, x=x[:, :size]))
+            due = self._due(record, range(least, frames))
+            modes, explained = sought(ekf, record, modes, REFINEMENTS, due)
+            like = self.base.likeliest(state.sum)
+            members = _members(ekf, record, modes, state.sum.members, like)
+            begun = BankState(members, modes.log_weights)
+            begun = jax.tree.map(lambda new, old: jnp.where(explained, new, old), begun, state.sum)
+            x = x.at[:, :size].set(modes.minima.x)
+            modes = replace(modes, minima=replace(modes.minima, x=x))
+            return replace(state, sum=begun, modes=modes)
+
+        return when(wanted, solved, state, record)
+
+    def _due(self, record: Record, newest: range) -> Bool[Array, " starts"] | None:
+        """From which starts minima are sought after this frame; None where from none after any
+        that can be the newest one."""
+        name = self.base.base.motion.geometry.name
+        searches, together = [k for k in SEARCHES[name] if k in newest], IN_TURN[name]
+        if not searches and not together:
+            return None
+        count, steps = 2 + self.directions, record.steps.astype(int) - 4
+        turn = (jnp.arange(count) - 1 - together * steps) % count < together
+        whole = jnp.any(record.last == jnp.array(searches, int))
+        return (whole | turn) & ~record.standing
+
+    def _thinned(self, state: RestState) -> RestState:
+        record, minima = thinned(self.base.base, state.record, state.modes.minima)
+        return replace(state, record=record, modes=replace(state.modes, minima=minima))
+
+    def _ready(self, state: RestState) -> Bool[Array, ""]:
+        """Whether one mode is left whose translation is known; or, where there is no room, whether
+        there is a translation, or its landmarks leave the view."""
+        ekf, member = self.base.base, self.base.likeliest(state.sum)
+        part = member.core.part("pose")
+        n = ekf.motion.geometry.point_dim
+        position = slice(part.start, part.start + n)
+        variance = jnp.trace(member.covariance[position, position])
+        squared = jnp.sum(ekf.model.camera_pose(member.core).translation() ** 2)
+        known = variance < self.known**2 * squared
+        enough = state.record.steps >= LEAST_STEPS
+        alone = state.sum.log_weights[0] > -1e-3
+        moved = variance < MOVED**2 * squared
+        over = moved | ~state.record.tied
+        return (enough & alone & known) | (state.record.full & over)
+
+
+def _likely(members: BankState, now: Bool[Array, ""]) -> BankState:
+    """Without those that are `GIVEN_UP`, if that is now."""
+    unlikely = members.log_weights < jnp.max(members.log_weights) - GIVEN_UP
+    weights = jnp.where(now & unlikely, -jnp.inf, members.log_weights)
+    return replace(members, log_weights=weights)
+
+
+def _members(ekf: EkfSlam, record: Record, modes: Modes, members: State, like: State) -> State:
+    """The Gaussians of the modes; of what a window does not tell, as in a state that is up to date,
+    which members without weight are not."""
+
+    def begun(data, record, like):
+        mode, shift, _ = data
+        return mode, shift, gauge_state(ekf, record, mode, shift, like)
+
+    alive = jnp.isfinite(modes.log_weights)
+    return each_alive(begun, (modes.minima, modes.shifts, members), alive, record, like)[2]
+
+
+def _check_base(ekf: EkfSlam) -> None:
+    """Raise ValueError unless a window can say all that the filter keeps."""
+    for wrong, why in (
+        (not ekf.motion.has_velocity, f"of a velocity, which {type(ekf.motion).__name__} lacks"),
+        (not ekf.sensor.hidden, f"for a camera; {type(ekf.sensor).__name__} measures metres"),
+        (ekf.landmark.anchored, f"without anchors, which {ekf.landmark.name} has"),
+        (not ekf.calibration.corrected, "for a calibration that is known, white or estimated"),
+    ):
+        if wrong:
+            raise ValueError(f"a start from rest is {why}")
+
+
+def from_rest(base: Mixture, frames: int | None = None) -> FromRest:
+    """The sum with a start that looks for itself how the camera moves, within so many frames after
+    frame 0. Raises ValueError for what does not go together."""
+    inner = innermost(base)
+    name = "planar" if inner is None else inner.motion.geometry.name
+    sizes = SIZES[name]
+    if frames is not None:
+        sizes = (*(size for size in sizes if size < frames + 1), frames + 1)
+    return FromRest(base, sizes, DIRECTIONS[name])

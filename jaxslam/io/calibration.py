@@ -1,0 +1,187 @@
+"""A camera's calibration: pinhole with OpenCV's distortion, and the JSON file that holds it."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam._runtime.files import read_json, write_atomically
+
+MODEL = "pinhole"
+INTRINSICS = ("fx", "fy", "cx", "cy")
+_KEYS = ("width", "height", *INTRINSICS)
+GUESSED_FIELD_OF_VIEW = 65.0
+"""Degrees along the longer side: between a phone that films and a webcam."""
+_GUESSED_SHARE, _TOLD_SHARE, _CENTRE_SHARE = 0.15, 0.05, 0.02
+"""σ of a focal length that is guessed, and of one that a field of view tells (cropped by who knows
+what), as shares of it; σ of the principal point as a share of the longer side."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Pinhole intrinsics and OpenCV's distortion, for one image size.
+
+    `width`, `height`, `fx`, `fy`, `cx`, `cy` are in pixels, the centre of the first pixel is
+    (0, 0); `distortion` holds OpenCV's k1, k2, p1, p2, k3 (no unit), a shorter one is padded
+    with zeros. `sigma` are standard deviations of fx, fy, cx, cy, pixels; none where nobody
+    stated them. A `guessed` one has square pixels, so that fx and fy are off by one number.
+    Raises `ValueError` for numbers that cannot be a camera's.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    sigma: tuple[float, ...] = ()
+    guessed: bool = False
+
+    def __post_init__(self) -> None:
+        for key in _KEYS:
+            _require_number(key, getattr(self, key))
+        for key in ("width", "height"):
+            value = getattr(self, key)
+            if value != int(value):
+                raise ValueError(f"{key} is {value}; a whole number of pixels is accepted")
+            object.__setattr__(self, key, int(value))
+        for key in ("fx", "fy", "cx", "cy"):
+            object.__setattr__(self, key, float(getattr(self, key)))
+        for key in ("width", "height", "fx", "fy"):
+            if getattr(self, key) <= 0:
+                raise ValueError(f"{key} is {getattr(self, key)}; a positive number is accepted")
+        object.__setattr__(self, "distortion", _padded(self.distortion))
+        object.__setattr__(self, "sigma", _checked_sigma(self.sigma))
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """The pinhole matrix K in pixels: pixel (u, v, 1) ~ K (x, y, z)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def resized(self, width: int, height: int) -> "Calibration":
+        """Of the same pictures with so many pixels: u' + 1/2 = s (u + 1/2), s along each side.
+
+        Raises ValueError for a size that no picture has.
+        """
+        for name, pixels in (("width", width), ("height", height)):
+            if pixels < 1:
+                raise ValueError(f"{name} would be {pixels}; at least one pixel is accepted")
+        x, y = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=x * self.fx,
+            fy=y * self.fy,
+            cx=x * (self.cx + 0.5) - 0.5,
+            cy=y * (self.cy + 0.5) - 0.5,
+            sigma=tuple(s * sigma for s, sigma in zip((x, y, x, y), self.sigma, strict=False)),
+        )
+
+
+def from_field_of_view(width: int, height: int, degrees: float | None = None) -> Calibration:
+    """An ideal lens with a horizontal field of view, or with a usual one, its focal length unsure.
+
+    `f = (w/2) / tan(fov/2)`; the pixels are square, the axis goes through the middle.
+    """
+    if degrees is not None and not 0 < degrees < 180:
+        raise ValueError(f"fov is {degrees}°; more than 0 and less than 180 are accepted")
+    side, fov = (max(width, height), GUESSED_FIELD_OF_VIEW) if degrees is None else (width, degrees)
+    focal = side / 2 / math.tan(math.radians(fov) / 2)
+    of_focal = focal * (_GUESSED_SHARE if degrees is None else _TOLD_SHARE)
+    of_centre = _CENTRE_SHARE * max(width, height)
+    return Calibration(
+        width, height, focal, focal, (width - 1) / 2, (height - 1) / 2,
+        sigma=(of_focal, of_focal, of_centre, of_centre), guessed=True,
+    )  # fmt: skip
+
+
+def read_calibration(path: str | Path) -> Calibration:
+    """The calibration in a JSON file with model, width, height, fx, fy, cx, cy and distortion.
+
+    `sigma`, an object with fx, fy, cx, cy, and `guessed` may be there; further keys are ignored.
+    Raises `ValueError`, naming the file, where it is missing, is not JSON, or does not hold a
+    pinhole camera.
+    """
+    return read_json(path, "calibration", from_fields)
+
+
+def write_calibration(path: str | Path, calibration: Calibration, **further: Any) -> None:
+    """Write the JSON file that `read_calibration` reads, whole or not at all.
+
+    `further` keys are for people; one that is there already is merged into it.
+    """
+    fields = as_fields(calibration)
+    for key, value in further.items():
+        fields[key] = {**fields[key], **value} if key in fields else value
+    text = json.dumps(fields, indent=1, allow_nan=False) + "\n"
+    with write_atomically(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def as_fields(calibration: Calibration) -> dict[str, Any]:
+    """What the file holds; of what nobody stated, nothing."""
+    fields = {"model": MODEL, **asdict(calibration)}
+    fields["sigma"] = dict(zip(INTRINSICS, calibration.sigma, strict=False))
+    return {key: value for key, value in fields.items() if value or key not in ("sigma", "guessed")}
+
+
+def from_fields(fields: Any) -> Calibration:
+    """What `as_fields` was made of. Raises ValueError for what is no pinhole camera's."""
+    if not isinstance(fields, dict):
+        raise ValueError(f"holds a {type(fields).__name__}; a JSON object is accepted")
+    model = fields.get("model", MODEL)
+    if model != MODEL:
+        raise ValueError(f"camera model {model!r} is unknown; {MODEL!r} is accepted")
+    missing = [key for key in _KEYS if key not in fields]
+    if missing:
+        raise ValueError(f"{', '.join(missing)} missing; {', '.join(_KEYS)} are needed")
+    distortion = fields.get("distortion", [])
+    if not isinstance(distortion, list):
+        raise ValueError("distortion is not a list; OpenCV's k1, k2, p1, p2, k3 are accepted")
+    return Calibration(
+        **{key: fields[key] for key in _KEYS},
+        distortion=tuple(distortion),
+        sigma=_sigma_from(fields.get("sigma", {})),
+        guessed=fields.get("guessed") is True,
+    )
+
+
+def _sigma_from(sigma: Any) -> tuple[Any, ...]:
+    if not isinstance(sigma, dict) or (sigma and not sigma.keys() >= set(INTRINSICS)):
+        raise ValueError(f"sigma is {sigma!r}; one with {', '.join(INTRINSICS)} is accepted")
+    return tuple(sigma[key] for key in INTRINSICS) if sigma else ()
+
+
+def _require_number(name: str, value: object) -> None:
+    # bool is an int to Python, but `true` in the file is a mistake.
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise ValueError(f"{name} is {value!r}; a number is accepted")
+    if not abs(value) < math.inf or (isinstance(value, int) and abs(value) > 2**63):
+        raise ValueError(f"{name} is {value}; a finite number is accepted")
+
+
+def _checked_sigma(sigma: Sequence[float]) -> tuple[float, ...]:
+    if len(sigma) not in (0, 4):
+        raise ValueError(f"sigma has {len(sigma)} entries; of fx, fy, cx, cy are accepted")
+    for key, value in zip(INTRINSICS, sigma, strict=False):
+        _require_number(f"sigma of {key}", value)
+        if value < 0:
+            raise ValueError(f"sigma of {key} is {value}; at least zero is accepted")
+    return tuple(float(value) for value in sigma)
+
+
+def _padded(distortion: Sequence[float]) -> tuple[float, ...]:
+    if len(distortion) > 5:
+        raise ValueError(
+            f"distortion has {len(distortion)} entries; k1, k2, p1, p2, k3 at most are accepted"
+        )
+    for index, value in enumerate(distortion):
+        _require_number(f"distortion[{index}]", value)
+    return tuple(float(value) for value in distortion) + (0.0,) * (5 - len(distortion))

@@ -1,0 +1,90 @@
+"""A live camera: `0` is the first that the system has."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Condition, Thread
+from typing import Any
+
+import numpy as np
+
+from jaxslam.io.file import opened
+from jaxslam.io.pictures import as_grey
+from jaxslam.io.recording import Layout, Recording
+from jaxslam.io.source import Image
+
+PATIENCE = 5.0
+"""Seconds in which a camera must deliver a picture."""
+
+
+class Live:
+    """The newest picture of a camera, and when it came: seconds after it was opened.
+
+    A thread of its own fetches them, so that what a slow reader skips does not wait in a queue.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self._came = 0.0
+
+    def clock(self) -> float:
+        """When the picture came that `images` gave last, s."""
+        return self._came
+
+    def images(self) -> Iterator[Image]:
+        """Pictures as they come. Raises ValueError where none comes for `PATIENCE` seconds."""
+        with opened(self.number) as capture:
+            begun = time.monotonic()
+            newest = _Newest(capture)
+            try:
+                while True:
+                    came, image = newest.wait(self.number)
+                    self._came = came - begun
+                    yield as_grey(image)
+            finally:
+                newest.stop()
+
+
+class _Newest:
+    """What a capture delivered last, taken once."""
+
+    def __init__(self, capture: Any) -> None:
+        self._changed = Condition()
+        self._picture: tuple[float, np.ndarray] | None = None
+        self._running = True
+        self._thread = Thread(target=self._fetch, args=(capture,), daemon=True)
+        self._thread.start()
+
+    def wait(self, number: int) -> tuple[float, np.ndarray]:
+        with self._changed:
+            self._changed.wait_for(lambda: self._picture or not self._running, PATIENCE)
+            picture, self._picture = self._picture, None
+        if picture is None:
+            raise ValueError(f"camera {number} delivers no picture")
+        return picture
+
+    def stop(self) -> None:
+        self._running = False
+        self._thread.join(PATIENCE)
+
+    def _fetch(self, capture: Any) -> None:
+        while self._running:
+            found, image = capture.read()
+            with self._changed:
+                if found:
+                    self._picture = time.monotonic(), image
+                else:
+                    self._running = False
+                self._changed.notify()
+
+
+def _is_number(path: Path) -> bool:
+    return str(path).isdecimal() and not path.exists()
+
+
+def _open(path: Path, _rate: float) -> Recording:
+    live = Live(int(str(path)))
+    return Recording(f"camera {live.number}", np.zeros(0), live.images, clock=live.clock)
+
+
+CAMERA = Layout("the number of a camera (0)", _is_number, _open)

@@ -1,0 +1,100 @@
+"""EuRoC's layout (ASL): `mav0/cam0` with its `sensor.yaml`, and the body's true motion.
+
+Burri et al., IJRR 2016. The truth is of the body; the camera is at T_BS in it.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam._runtime.files import one_line
+from jaxslam.io.calibration import Calibration
+from jaxslam.io.recording import (
+    Layout,
+    Recording,
+    check_rigid,
+    finite_number,
+    fixed,
+    listed,
+    of_files,
+    read_table,
+    read_timestamps,
+    text_lines,
+)
+from jaxslam.io.source import Trajectory
+from jaxslam.io.tum import poses
+
+NANOSECONDS = 1e9
+TRUTH = "state_groundtruth_estimate0"
+
+
+def _open(path: Path, _rate: float) -> Recording:
+    root = _root(path)
+    camera = root / "cam0"
+    listing = camera / "data.csv"
+    times, names = read_timestamps(listing, NANOSECONDS, ",")
+    files = listed(listing, camera / "data", names)
+    yaml, truth = camera / "sensor.yaml", root / TRUTH / "data.csv"
+    calibration = fixed(read_sensor(yaml)) if yaml.is_file() else None
+    reference = _camera_truth(truth, yaml) if truth.is_file() and yaml.is_file() else None
+    return of_files(path, files, times, calibration, reference)
+
+
+def _root(path: Path) -> Path:
+    """The folder with `cam0`: `mav0`, or the one given."""
+    return path / "mav0" if (path / "mav0").is_dir() else path
+
+
+def read_sensor(path: Path) -> Calibration:
+    """The calibration in a `sensor.yaml`: pinhole, radial-tangential. Raises ValueError."""
+    text = "\n".join(line for _, line in text_lines(path))
+    for key, accepted in (
+        ("camera_model", "pinhole"),
+        ("distortion_model", "radial-tangential"),
+    ):
+        found = re.search(rf"^{key}:\s*([\w-]+)", text, re.MULTILINE)
+        if found and found[1] != accepted:
+            raise ValueError(f"{path}: {key} {found[1]!r} is unknown; {accepted!r} is accepted")
+    width, height = _numbers(path, text, "resolution", 2)
+    try:
+        return Calibration(
+            int(width),
+            int(height),
+            *_numbers(path, text, "intrinsics", 4),
+            distortion=tuple(_numbers(path, text, "distortion_coefficients", 4)),
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _camera_truth(truth: Path, yaml: Path) -> Trajectory:
+    """`T_WS = T_WB T_BS`, of rows `ns, px, py, pz, qw, qx, qy, qz`."""
+    text = "\n".join(line for _, line in text_lines(yaml))
+    T_BS = np.reshape(_numbers(yaml, text, "data", 16), (4, 4))
+    check_rigid(yaml, T_BS[None])
+    table = read_table(truth, 8, ",")
+    try:
+        T_WB = poses(table[:, 1:4], table[:, [5, 6, 7, 4]])
+    except ValueError as error:
+        raise ValueError(f"{truth}: {one_line(error)}") from None
+    check_rigid(truth, T_WB)
+    return Trajectory(table[:, 0] / NANOSECONDS, T_WB @ T_BS)
+
+
+def _numbers(path: Path, text: str, key: str, count: int) -> Float[np.ndarray, " n"]:
+    """The list of numbers `key: [1, 2, …]`, over as many lines as it takes."""
+    found = re.search(rf"^{key}:\s*\[([^\]]*)\]", text, re.MULTILINE)
+    words = found[1].split(",") if found else []
+    numbers = [number for word in words if (number := finite_number(word)) is not None]
+    if len(numbers) != count or len(words) != count:
+        raise ValueError(f"{path}: {key}: [{count} finite numbers] is missing")
+    return np.array(numbers)
+
+
+EUROC = Layout(
+    "EuRoC (mav0/cam0/data.csv)",
+    lambda path: (_root(path) / "cam0" / "data.csv").is_file(),
+    _open,
+)

@@ -1,0 +1,79 @@
+"""A video file, with the times that it gives its pictures itself."""
+
+import math
+import warnings
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam.io.pictures import as_grey
+from jaxslam.io.recording import Layout, Recording
+from jaxslam.io.source import Image
+
+VIDEO_TYPES = (".mp4", ".m4v", ".avi", ".mov", ".mkv", ".webm", ".mpg", ".mpeg")
+
+
+def _open(path: Path, _rate: float) -> Recording:
+    return Recording(path.name, read_times(path), lambda: _images(path))
+
+
+def read_times(path: Path) -> Float[np.ndarray, " n"]:
+    """The time of every picture that can be read, in seconds: a pass over the whole file.
+
+    Phones film at a rate that varies. A file whose times do not increase has those of its frame
+    rate, and a file with fewer pictures than it says ends early, with a warning each. Raises
+    ValueError where there is no picture.
+    """
+    with opened(path) as capture:
+        stated, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
+        times = []
+        while capture.grab():
+            times.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
+    if not times:
+        raise ValueError(f"{path}: cannot be read as a video")
+    if len(times) < stated:
+        warnings.warn(
+            f"{path}: says that it has {stated:.0f} pictures, of which {len(times)} can be read",
+            stacklevel=2,
+        )
+    wrong = np.flatnonzero(~(np.diff(times) > 0))
+    return _at_rate(path, times, int(wrong[0]) + 1, rate) if len(wrong) else np.array(times)
+
+
+def _at_rate(path: Path, times: list[float], wrong: int, rate: float) -> Float[np.ndarray, " n"]:
+    place = f"picture {wrong} is at {times[wrong]:.3f} s, after one at {times[wrong - 1]:.3f} s"
+    if not (math.isfinite(rate) and rate > 0):
+        raise ValueError(f"{path}: {place}, and no frame rate is stated")
+    warnings.warn(f"{path}: {place}; taken at {rate:g} frames a second instead", stacklevel=2)
+    return np.arange(len(times)) / rate
+
+
+@contextmanager
+def opened(where: Path | int) -> Generator[Any]:
+    """A capture of a file or of a camera's number, released at the end."""
+    capture = cv2.VideoCapture(where if isinstance(where, int) else str(where))
+    try:
+        yield capture
+    finally:
+        capture.release()
+
+
+def _images(path: Path) -> Iterator[Image]:
+    with opened(path) as capture:
+        while True:
+            found, image = capture.read()
+            if not found:
+                return
+            yield as_grey(image)
+
+
+VIDEO = Layout(
+    "a video file (" + ", ".join(VIDEO_TYPES) + ")",
+    lambda path: path.is_file() and path.suffix.lower() in VIDEO_TYPES,
+    _open,
+)

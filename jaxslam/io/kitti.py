@@ -1,0 +1,105 @@
+"""KITTI's odometry benchmark: a sequence's `times.txt`, `calib.txt`, images, and the poses.
+
+Geiger, Lenz, Urtasun, CVPR 2012. Of the cameras the left grey one is taken (`image_0`), or else
+the left colour one (`image_2`); poses are of the former.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam._runtime.files import LARGEST
+from jaxslam.io.calibration import Calibration
+from jaxslam.io.recording import (
+    Calibrator,
+    Layout,
+    Recording,
+    check_later,
+    check_rigid,
+    finite_number,
+    image_files,
+    of_files,
+    read_table,
+    text_lines,
+)
+from jaxslam.io.source import Trajectory
+
+CAMERAS = ("0", "2")
+
+
+def _open(path: Path, _rate: float) -> Recording:
+    camera = next(number for number in CAMERAS if (path / f"image_{number}").is_dir())
+    files = image_files(path / f"image_{camera}")
+    times = _read_times(path / "times.txt")
+    _check_count(path / "times.txt", len(times), len(files))
+    calib = path / "calib.txt"
+    projection = _projection(calib, camera) if calib.is_file() else None
+    calibration = None if projection is None else _calibrator(projection)
+    truth = next((file for file in _poses_of(path) if file.is_file()), None)
+    reference = None if truth is None else _camera_truth(truth, times, projection)
+    return of_files(path, files, times, calibration, reference)
+
+
+def _read_times(path: Path) -> Float[np.ndarray, " n"]:
+    times: list[float] = []
+    for (time,) in read_table(path, 1).tolist():
+        check_later(f"{path}, line {len(times) + 1}", time, times)
+        times.append(time)
+    return np.array(times)
+
+
+def _projection(path: Path, camera: str) -> Float[np.ndarray, "3 4"]:
+    """P of a line `P0: ` and twelve numbers: `pixel ~ P X`, X in the left grey camera's frame."""
+    for place, line in text_lines(path):
+        name, _, rest = line.partition(":")
+        if name.strip() == f"P{camera}":
+            numbers = [finite_number(word) for word in rest.split()]
+            if len(numbers) != 12 or None in numbers:
+                raise ValueError(f"{place}: P{camera}: and twelve numbers are accepted")
+            P = np.array(numbers, float).reshape(3, 4)
+            if not (np.abs(P).max() <= LARGEST and (np.diagonal(P) != 0).all()):
+                raise ValueError(f"{place}: no projection of a camera with a focal length")
+            return P
+    raise ValueError(f"{path}: has no line P{camera}: of the images image_{camera}")
+
+
+def _calibrator(P: Float[np.ndarray, "3 4"]) -> Calibrator:
+    """The images are rectified: K is the left part of P."""
+    numbers = float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2])
+    return lambda width, height: Calibration(width, height, *numbers)
+
+
+def _poses_of(path: Path) -> tuple[Path, Path]:
+    """Where a sequence's poses lie: beside its images, or in the benchmark's own folder."""
+    sequence = path.resolve()
+    return path / "poses.txt", sequence.parent.parent / "poses" / f"{sequence.name}.txt"
+
+
+def _camera_truth(
+    path: Path, times: Float[np.ndarray, " n"], P: Float[np.ndarray, "3 4"] | None
+) -> Trajectory:
+    """Rows of a 3x4 T_wc; camera c is at `-K⁻¹ P₄` in the left grey one, unturned."""
+    rows = read_table(path, 12).reshape(-1, 3, 4)
+    _check_count(path, len(rows), len(times))
+    T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
+    T_wc[:, :3] = rows
+    check_rigid(path, T_wc)
+    if P is not None:
+        T_wc[:, :3, 3] -= rows[:, :, :3] @ np.linalg.solve(P[:, :3], P[:, 3])
+    return Trajectory(times, T_wc)
+
+
+def _check_count(path: Path, found: int, images: int) -> None:
+    if found != images:
+        raise ValueError(f"{path}: holds {found} lines for {images} images")
+
+
+KITTI = Layout(
+    "KITTI odometry (times.txt and image_0/)",
+    lambda path: (
+        (path / "times.txt").is_file()
+        and any((path / f"image_{number}").is_dir() for number in CAMERAS)
+    ),
+    _open,
+)

@@ -1,0 +1,112 @@
+"""Open a video wherever it comes from, with the best calibration that is known."""
+
+import itertools
+import math
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+from jaxslam.io.calibration import (
+    GUESSED_FIELD_OF_VIEW,
+    Calibration,
+    from_field_of_view,
+    read_calibration,
+)
+from jaxslam.io.camera import CAMERA
+from jaxslam.io.euroc import EUROC
+from jaxslam.io.file import VIDEO
+from jaxslam.io.folder import PLAIN, TIMESTAMPED
+from jaxslam.io.kitti import KITTI
+from jaxslam.io.recording import Layout, Recording
+from jaxslam.io.seven_scenes import SEVEN_SCENES
+from jaxslam.io.source import Source, Trajectory, check_size, resized, selected
+from jaxslam.io.tum import read_tum
+from jaxslam.io.tum_rgbd import TUM_RGBD
+
+LAYOUTS = (CAMERA, VIDEO, TUM_RGBD, EUROC, KITTI, SEVEN_SCENES, TIMESTAMPED, PLAIN)
+"""The first that recognises a path opens it; a new layout is one file and one name."""
+
+
+def open_source(
+    path: str | Path,
+    *,
+    calibration: str | Path | None = None,
+    fov: float | None = None,
+    reference: str | Path | None = None,
+    rate: float = 30.0,
+    start: float = 0.0,
+    every: int = 1,
+    frames: int | None = None,
+    scale: float = 1.0,
+) -> Source:
+    """The video at `path`, in the first of `LAYOUTS` that recognises it.
+
+    `calibration` (JSON), `fov` (horizontal field of view, degrees) and `reference` (TUM
+    trajectory) override what the layout holds; where nothing is known of the camera, its
+    calibration is guessed, with a warning. `rate` is the frame rate in 1/s of a plain folder of
+    images. Taken is every `every`-th frame, from `start` seconds after the first on, `frames` of
+    them at the most, pictures and calibration `scale` times as large. Raises `ValueError`, naming
+    the file and line, for anything missing, unreadable or contradictory; the first image is read
+    here, later ones as the source is iterated over.
+    """
+    if calibration and fov is not None:
+        raise ValueError("a calibration and a field of view are given; one of them is accepted")
+    recording = open_recording(path, rate)
+    image = next(recording.images(), None)
+    if image is None:
+        raise ValueError(f"{path}: not a single frame can be read")
+    height, width = image.shape
+    camera = _calibration(recording, width, height, calibration, fov)
+    check_size(f"{recording.name}: image 0", image, camera)
+    source = Source(
+        recording.name, camera, recording.times, recording.images, recording.reference,
+        recording.clock,
+    )  # fmt: skip
+    if reference is not None:
+        source = replace(source, reference=Trajectory(*read_tum(reference)))
+    return resized(selected(source, start=start, every=every, frames=frames), scale)
+
+
+def open_recording(path: str | Path, rate: float = 30.0) -> Recording:
+    """What lies at `path`, before an image is read or a calibration chosen. Raises ValueError."""
+    path = Path(path)
+    if not (math.isfinite(rate) and rate > 0):
+        raise ValueError(f"rate is {rate}; a positive number of frames a second is accepted")
+    return _layout_of(path).open(path, rate)
+
+
+def _layout_of(path: Path) -> Layout:
+    layout = next((layout for layout in LAYOUTS if layout.recognises(path)), None)
+    if layout is not None:
+        return layout
+    if not path.exists():
+        raise ValueError(f"{path}: no such file or folder")
+    names = "; ".join(layout.name for layout in LAYOUTS)
+    raise ValueError(f"{path}: {_found(path)}, an unknown kind of source; accepted: {names}")
+
+
+def _found(path: Path) -> str:
+    """What is there, in a few words."""
+    if not path.is_dir():
+        return f"a file {path.suffix or 'without an ending'}"
+    names = [file.name + "/" * file.is_dir() for file in itertools.islice(path.iterdir(), 5)]
+    return f"a folder with {', '.join(sorted(names)) + ', …' if names else 'nothing in it'}"
+
+
+def _calibration(
+    recording: Recording, width: int, height: int, file: str | Path | None, fov: float | None
+) -> Calibration:
+    """The user's, or the layout's, or a guess."""
+    if file:
+        return read_calibration(file)
+    if fov is not None:
+        return from_field_of_view(width, height, fov)
+    if recording.calibration is not None:
+        return recording.calibration(width, height)
+    warnings.warn(
+        f"{recording.name}: comes without a calibration; a horizontal field of view of "
+        f"{GUESSED_FIELD_OF_VIEW:g}° is guessed, and estimated. Better: a calibration (docs/"
+        "own-video.md), or the camera's field of view",
+        stacklevel=3,
+    )
+    return from_field_of_view(width, height)

@@ -1,0 +1,198 @@
+"""What a layout says of a video, and what layouts share: image files, lists of times, tables."""
+
+import math
+import os
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam._runtime.files import LARGEST
+from jaxslam.io.calibration import Calibration, read_calibration
+from jaxslam.io.source import Image, Trajectory
+from jaxslam.io.tum import not_rigid
+
+IMAGE_TYPES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
+
+Calibrator = Callable[[int, int], Calibration]
+"""A calibration for images of so many pixels across and down."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A video before its first image is looked at; the fields are those of a `Source`.
+
+    `calibration` is what the layout knows of the camera, or None.
+    """
+
+    name: str
+    times: Float[np.ndarray, " n"]
+    images: Callable[[], Iterator[Image]]
+    calibration: Calibrator | None = None
+    reference: Trajectory | None = None
+    clock: Callable[[], float] | None = None
+
+
+class Layout(NamedTuple):
+    """A way videos lie on disk: its name, how it is recognised, how it is opened.
+
+    `open` gets the path and the frame rate (1/s) for layouts that hold no times.
+    """
+
+    name: str
+    recognises: Callable[[Path], bool]
+    open: Callable[[Path, float], Recording]
+
+
+def of_files(
+    path: Path,
+    files: list[Path],
+    times: Float[np.ndarray, " n"],
+    calibration: Calibrator | None = None,
+    reference: Trajectory | None = None,
+) -> Recording:
+    """A recording of image files of the folder `path`.
+
+    Its `calibration.json`, where it has one, is better than what the layout says.
+    """
+    calibration = calibration_beside(path) or calibration
+    name = path.resolve().name
+    return Recording(name, times, lambda: map(read_image, files), calibration, reference)
+
+
+def listed(listing: Path, folder: Path, names: list[str]) -> list[Path]:
+    """Files in a folder whose names a list holds. Raises ValueError for one that is missing."""
+    files = [folder / name for name in names]
+    for name, file in zip(names, files, strict=True):
+        if not os.path.isfile(file):  # which a name that no file can have is not either
+            raise ValueError(f"{listing}: names {name}, but {file} is missing")
+    return files
+
+
+def read_image(path: Path) -> Image:
+    """The image in a file as grey uint8 (height, width); `ValueError` names what cannot be read."""
+    try:
+        image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except (OSError, cv2.error):
+        image = None
+    if image is None:
+        raise ValueError(f"{path}: cannot be read as an image")
+    return image
+
+
+def image_files(path: Path) -> list[Path]:
+    """The images in a folder, numbers in their names compared as numbers (2 before 10)."""
+    files = [
+        file
+        for file in path.iterdir()
+        if file.suffix.lower() in IMAGE_TYPES and not file.name.startswith(".")
+    ]
+    return sorted(files, key=lambda file: _natural(file.name))
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    parts = re.split(r"(\d+)", name.lower())
+    return [(int(part), "") if part.isdecimal() else (0, part) for part in parts]
+
+
+def calibration_beside(path: Path) -> Calibrator | None:
+    """Of the file `calibration.json` in a folder; None where there is none."""
+    file = path / "calibration.json"
+    return fixed(read_calibration(file)) if file.is_file() else None
+
+
+def fixed(calibration: Calibration) -> Calibrator:
+    """A calibration that states its size itself."""
+    return lambda width, height: calibration
+
+
+def read_timestamps(
+    path: Path, ticks: float = 1.0, separator: str | None = None
+) -> tuple[Float[np.ndarray, " n"], list[str]]:
+    """Times in seconds and file names from lines `time file`; # starts a comment line.
+
+    A second has so many `ticks`. Raises `ValueError`, naming file and line, unless times are
+    finite and increase.
+    """
+    times: list[float] = []
+    names: list[str] = []
+    for place, line in text_lines(path):
+        time, name = _timestamp(place, line, separator)
+        check_later(place, time / ticks, times)
+        times.append(time / ticks)
+        names.append(name)
+    if not times:
+        raise ValueError(f"{path}: holds no lines of a time and a file")
+    return np.array(times), names
+
+
+def text_lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Lines that are neither empty nor comments, each with its place in words."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        raise ValueError(f"{path}: cannot be read as text") from None
+    for number, line in enumerate(lines, start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield f"{path}, line {number}", line.strip()
+
+
+def check_later(place: str, time: float, before: list[float]) -> None:
+    """Raise ValueError unless a time, in seconds, comes after those before."""
+    if before and time <= before[-1]:
+        raise ValueError(f"{place}: time {time} s does not come after {before[-1]} s")
+
+
+def check_rigid(path: Path, T: Float[np.ndarray, "n 4 4"]) -> None:
+    """Raise ValueError unless poses are turned and moved, and nothing else, by 1 %."""
+    wrong = not_rigid(T, 0.01) | ~(np.abs(T[:, :3, 3]).max(axis=1) <= LARGEST)
+    if wrong.any():
+        pose = int(np.argmax(wrong))
+        raise ValueError(f"{path}: pose {pose} is no rigid motion [R t] with R a rotation")
+
+
+def finite_number(word: str) -> float | None:
+    """The number that a word is, or None."""
+    try:
+        value = float(word)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def _timestamp(place: str, line: str, separator: str | None) -> tuple[float, str]:
+    words = line.split(separator, maxsplit=1)
+    time = finite_number(words[0])
+    if len(words) != 2 or time is None:
+        raise ValueError(f"{place}: a finite time and a file are accepted, not {line!r}")
+    return time, words[1].strip()
+
+
+def read_table(
+    path: Path, columns: int, separator: str | None = None, *, finite: bool = True
+) -> Float[np.ndarray, "n k"]:
+    """Rows of at least so many numbers, as text; `ValueError` names the line that is none.
+
+    Numbers beyond them are left out. All are finite, unless that is not asked for.
+    """
+    rows = [_row(place, line, columns, separator, finite) for place, line in text_lines(path)]
+    if not rows:
+        raise ValueError(f"{path}: holds no rows of {columns} numbers")
+    return np.array(rows)
+
+
+def _row(place: str, line: str, columns: int, separator: str | None, finite: bool) -> list[float]:
+    try:
+        row = [float(word) for word in line.split(separator)]
+    except ValueError:
+        row = []
+    if len(row) < columns:
+        raise ValueError(f"{place}: {columns} numbers are accepted")
+    if finite and not all(map(math.isfinite, row[:columns])):
+        raise ValueError(f"{place}: {columns} finite numbers are accepted")
+    return row[:columns]

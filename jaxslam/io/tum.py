@@ -1,0 +1,161 @@
+"""Trajectories as text in the format of TUM's benchmark: `t tx ty tz qx qy qz qw` a line.
+
+And what other files of a time and numbers a line have in common with them.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from jaxslam._runtime.files import LARGEST, write_atomically
+
+
+class Table(NamedTuple):
+    """Numbers as text: what its comments say, its rows and the lines that they stand on."""
+
+    comments: tuple[str, ...]
+    rows: Float[np.ndarray, "n k"]
+    lines: tuple[int, ...]
+
+
+def poses(translation: ArrayLike, quaternion: ArrayLike) -> Float[np.ndarray, "n 4 4"]:
+    """Poses from positions (n, 3) and quaternions x, y, z, w (n, 4), which get normalised."""
+    rotation = Rotation.from_quat(np.asarray(quaternion, dtype=float).reshape(-1, 4))
+    result = np.tile(np.eye(4), (len(rotation), 1, 1))
+    result[:, :3, :3] = rotation.as_matrix()
+    result[:, :3, 3] = translation
+    return result
+
+
+def read_tum(path: str | Path) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 4 4"]]:
+    """Times (n,) in seconds and poses T_wc (n, 4, 4) from lines `t tx ty tz qx qy qz qw`.
+
+    Empty lines and those that start with # are skipped. Raises `ValueError`, naming the file and
+    the line, for anything else that is not eight finite numbers with a non-zero quaternion.
+    """
+    columns = "t tx ty tz qx qy qz qw"
+    _, rows, lines = read_table(path, "trajectory", "poses", f"eight finite numbers {columns}", 8)
+    size = np.abs(rows[:, 4:]).max(axis=1)
+    if (zero := np.flatnonzero(size == 0)).size:
+        raise ValueError(f"{path}, line {lines[zero[0]]}: the quaternion is zero")
+    far = (np.abs(rows).max(axis=1) > LARGEST) | (size < 1 / LARGEST)
+    if (wrong := np.flatnonzero(far)).size:
+        raise ValueError(
+            f"{path}, line {lines[wrong[0]]}: numbers up to {LARGEST:.0e}, and a quaternion longer "
+            f"than {1 / LARGEST:.0e}, are accepted"
+        )
+    return rows[:, 0], poses(rows[:, 1:4], rows[:, 4:])
+
+
+_LATEST = 1e11
+"""Seconds since 1970 of the year 5138."""
+_SLOWEST = 1e3
+"""Seconds between two poses, more than a moving thing has."""
+
+
+def check_seconds(what: str, times: Float[np.ndarray, " n"]) -> None:
+    """Raise ValueError where times are too large to be seconds, since 1970 or from pose to pose."""
+    last = float(np.abs(times).max())
+    step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
+    if last <= _LATEST and step <= _SLOWEST:
+        return
+    by_size = ((1e17, "nanoseconds"), (1e14, "microseconds"), (0.0, "milliseconds"))
+    by_step = ((1e6, "nanoseconds"), (0.0, "microseconds"))
+    size, units = (last, by_size) if last > _LATEST else (step, by_step)
+    unit = next(unit for least, unit in units if size >= least)
+    told = f"up to {last:.3g}" if last > _LATEST else f"{step:.3g} from one to the next"
+    raise ValueError(f"{what}: times {told} look like {unit}; seconds are accepted")
+
+
+def not_rigid(T: Float[np.ndarray, "*k d d"], tolerance: float) -> Bool[np.ndarray, "*k"]:
+    """Which matrices are no [R t; 0 1] with R a rotation, to so much of its numbers."""
+    n = T.shape[-1] - 1
+    R = T[..., :n, :n]
+    with np.errstate(over="ignore", invalid="ignore"):
+        skewed = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(n)).max(axis=(-2, -1))
+        turned_over = ~(np.linalg.det(R) > 0)
+    last = (T[..., n, :] != np.eye(n + 1)[n]).any(axis=-1)
+    return ~(skewed <= tolerance) | turned_over | last
+
+
+def read_table(path: str | Path, what: str, holds: str, row: str, columns: int | None) -> Table:
+    """Lines of so many numbers, apart as in `words`, but for empty lines and comments (#).
+
+    With None of as many as the first has; a line of words before it is a comment too. Raises
+    `ValueError`, naming the file and the line: it is a `what` that holds `holds`, and a `row` of
+    it is what is accepted.
+    """
+    path = Path(path)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise ValueError(f"{path}: cannot read the {what} ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: not a text file") from None
+    told = {number: line for number, line in enumerate(lines, start=1) if line.strip()}
+    comments = {n: line for n, line in told.items() if line.lstrip().startswith("#")}
+    rows = {n: line for n, line in told.items() if n not in comments}
+    if columns is None and rows:
+        first = min(rows)
+        if not any(map(_is_number, words(rows[first]))):
+            comments = {first: rows.pop(first)} | comments
+        columns = len(words(rows[min(rows)])) if rows else 0
+    if not rows:
+        raise ValueError(f"{path}: holds no {holds}; lines of {row} are accepted")
+    table = [_row(path, number, line, row, columns or 0) for number, line in rows.items()]
+    return Table(tuple(comments.values()), np.array(table), tuple(rows))
+
+
+def words(line: str) -> list[str]:
+    """Apart by spaces, by commas, or by semicolons, as where a comma is in a number."""
+    return line.replace(";" if ";" in line else ",", " ").split()
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _row(path: Path, number: int, line: str, accepted: str, columns: int) -> list[float]:
+    told = words(line)
+    row = [float(word) for word in told] if all(map(_is_number, told)) else []
+    if len(row) != columns or not np.all(np.isfinite(row)):
+        raise ValueError(f"{path}, line {number}: {accepted} are accepted")
+    return row
+
+
+def write_tum(path: str | Path, times: ArrayLike, T_wc: ArrayLike, remark: str = "") -> None:
+    """Write times (n,) in seconds and poses (n, 4, 4) in TUM format, whole or not at all.
+
+    Quaternions are normalised, w comes last and is not negative. The `remark` is for the header.
+    """
+    T_wc = np.asarray(T_wc, dtype=float).reshape(-1, 4, 4)
+    table = np.empty((len(T_wc), 7))
+    table[:, :3] = T_wc[:, :3, 3]
+    if len(T_wc):  # Rotation refuses an empty stack
+        table[:, 3:] = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True)
+    remark = f"; {remark}" if remark else ""
+    header = f"tx ty tz qx qy qz qw (s; camera in the world frame{remark})"
+    write_table(path, header, times, table, "poses", ".9f")
+
+
+def write_table(
+    path: str | Path, header: str, times: ArrayLike, table: np.ndarray, what: str, number: str
+) -> None:
+    """A line of each time and row, under a comment that names the columns after the time."""
+    times = np.asarray(times, dtype=float)
+    if times.shape != (len(table),):
+        raise ValueError(
+            f"{len(times)} times for {len(table)} {what}; as many of each are accepted"
+        )
+    with write_atomically(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write(f"# t {header}\n")
+        for time, row in zip(times, table, strict=True):
+            file.write(f"{time:.9f} " + " ".join(format(value, number) for value in row) + "\n")

@@ -1,0 +1,91 @@
+"""What goes into a filter and what comes back: features, their capacity, innovation, status."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam._numerics.arrays import AnyArray
+
+
+class Capacity(NamedTuple):
+    """For how much a state has room; an `int` stands for as many of each."""
+
+    landmarks: int
+    """In the map: slots 0, …, landmarks − 1."""
+    seen: int
+    """In one frame, of landmarks in the map."""
+    new: int
+    """In one frame, of new ones."""
+
+    @staticmethod
+    def of(capacity: int | Capacity) -> Capacity:
+        """Raises ValueError for a number that is not a capacity."""
+        made = (
+            capacity if isinstance(capacity, Capacity) else Capacity(capacity, capacity, capacity)
+        )
+        for name, count in made._asdict().items():
+            if not isinstance(count, int) or count < 0 or (name == "landmarks" and count < 1):
+                raise ValueError(f"a capacity is of so many {name}, a whole number, not {count!r}")
+        return made
+
+
+class Features(eqx.Module):
+    """Measurements of landmarks: j is of the one in `slots[j]`, and counts where `valid[j]`.
+
+    Of one frame, or of some.
+    """
+
+    slots: Int[AnyArray, "*frames m"]
+    measured: Float[AnyArray, "*frames m p"]
+    """What the sensor says of each: of a camera a pixel, (u,) or (u, v)."""
+    valid: Bool[AnyArray, "*frames m"]
+
+
+class Status(IntEnum):
+    """What became of an update, the worse the greater."""
+
+    OK = 0
+    SOLVER_FAILED = 1
+    """An iteration ended before its goal; the result is what it had."""
+    NOT_POSITIVE = 2
+    """A covariance is not positive definite: what follows from it means nothing."""
+    DIVERGED = 3
+    """The mean or the covariance is not finite."""
+
+
+class Innovation(eqx.Module):
+    """What an update compared: the residual of every feature and their joint covariance S.
+
+    Features that were not used (not valid, or predicted behind the camera) have a zero residual
+    and an identity block in S, so that they add nothing to `nis`.
+    """
+
+    predicted: Float[Array, "m p"]
+    residual: Float[Array, "m p"]
+    covariance: Float[Array, "m*p m*p"] | None
+    """S; None where the form of the filter has no use for it."""
+    used: Bool[Array, " m"]
+    nis: Float[Array, ""]
+    """Normalised innovation squared `rᵀ S⁻¹ r`, χ² with `nis_dof` degrees of freedom."""
+    status: Int[Array, ""]
+    """A `Status`."""
+    log_det: Float[Array, ""] | None = None
+    """log det S; None where the form of the filter has no use for it."""
+
+    @property
+    def nis_dof(self) -> Int[Array, ""]:
+        """How many numbers were compared."""
+        return self.residual.shape[-1] * jnp.sum(self.used)
+
+
+def judged(positive: Bool[Array, ""], *finite: Array) -> Int[Array, ""]:
+    """The `Status` of an update whose matrix was factored, and whose results are these arrays."""
+    healthy = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in finite]))
+    status = jnp.where(positive, Status.OK, Status.NOT_POSITIVE)
+    # Without a factor nothing is finite: that is the cause, and the first to be told.
+    return jnp.where(healthy | ~positive, status, Status.DIVERGED)

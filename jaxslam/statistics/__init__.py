@@ -1,0 +1,33 @@
+"""Exact statistics of errors and their covariances: NEES and NIS, χ² bands, verdicts."""
+
+from jaxslam.statistics.bands import (
+    PowerSums,
+    chi2_quantile,
+    lost_threshold,
+    mean_band,
+    normalised_squared,
+)
+from jaxslam.statistics.innovations import innovation_verdict
+from jaxslam.statistics.verdict import (
+    VERDICTS,
+    Tally,
+    not_disproved,
+    run_verdict,
+    sentences,
+    verdict,
+)
+
+__all__ = [
+    "VERDICTS",
+    "PowerSums",
+    "Tally",
+    "chi2_quantile",
+    "innovation_verdict",
+    "lost_threshold",
+    "mean_band",
+    "normalised_squared",
+    "not_disproved",
+    "run_verdict",
+    "sentences",
+    "verdict",
+]

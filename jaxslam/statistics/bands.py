@@ -1,0 +1,163 @@
+"""Consistency statistics: NEES and its exact χ² bounds (Bar-Shalom, Li, Kirubarajan 2001, §5.4).
+
+And what holds for the mean of independent numbers of any distribution, from their power sums.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import astuple, dataclass
+
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.special import gammainc, gammaincc, gammainccinv, gammaincinv, stdtr
+
+from jaxslam._numerics.arrays import AnyArray
+from jaxslam._numerics.linalg import cholesky
+
+CONFIDENCE = 0.95
+LOST_QUANTILE = 0.9999
+"""A run whose NEES is above this quantile of χ² is lost: one in 10 000 of a consistent filter."""
+
+
+def normalised_squared(
+    error: Float[AnyArray, " n"], covariance: Float[AnyArray, "n n"]
+) -> Float[Array, ""]:
+    """`eᵀ P⁻¹ e`: the NEES of an error, the NIS of an innovation; NaN unless P is positive."""
+    whitened = cholesky(covariance).whitening @ error
+    return whitened @ whitened
+
+
+def chi2_quantile(probability: float, dof: float) -> float:
+    """The χ² value with the given probability below it."""
+    return 2 * float(gammaincinv(dof / 2, probability))
+
+
+def chi2_cdf(value: float, dof: float) -> float:
+    """The probability that χ² is below `value`."""
+    return float(gammainc(dof / 2, value / 2))
+
+
+def mean_band(dof: int, runs: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """Two-sided bounds of the mean NEES of `runs` independent runs at ONE time step.
+
+    `N · mean ~ χ²(N n)` exactly. The steps of a run are correlated: never pool them. Raises
+    ValueError without a run or a degree of freedom, and for no confidence between 0 and 1.
+    """
+    if dof < 1 or runs < 1:
+        raise ValueError(f"a band needs at least one run and one dof, not {runs} and {dof}")
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence must be between 0 and 1, not {confidence}")
+    tail = (1 - confidence) / 2
+    low, high = (chi2_quantile(q, runs * dof) / runs for q in (tail, 1 - tail))
+    return low, high
+
+
+def lost_threshold(dof: int, steps: int = 1) -> float:
+    """NEES above which a run counts as lost; 21.1 for 3 degrees of freedom.
+
+    Of so many `steps` it is above it at any for one run in 10 000, or fewer if they are correlated.
+    """
+    return 2 * float(gammainccinv(dof / 2, (1 - LOST_QUANTILE) / steps))
+
+
+def shortfall_limits(dof: float, level: float) -> tuple[float, float]:
+    """Between which everything is, but for a share of `level`, that spreads no more than χ².
+
+    A sum of time averages of χ² does not, by Jensen `E f(Σ xₜ/T) ≤ E f(x)` for every convex f,
+    however the steps are correlated. Half of `level` is at most on each side, beyond χ²'s expected
+    shortfall `E[χ² | χ² in its tail]` (Meilijson and Nádas, Journal of Applied Probability 1979,
+    "Convex majorization with an application to the length of critical paths").
+    """
+    shape, tail = dof / 2, level / 2
+    least, most = float(gammaincinv(shape, tail)), float(gammainccinv(shape, tail))
+    return (
+        dof * float(gammainc(shape + 1, least)) / tail,
+        dof * float(gammaincc(shape + 1, most)) / tail,
+    )
+
+
+def shortfall_p_value(mean: float, dof: float, runs: int) -> float:
+    """Two-sided, a bound: of a mean NEES over runs *and* steps, however the steps are correlated.
+
+    The level at which the sum is one of `shortfall_limits`.
+    """
+    total, above = runs * mean, bool(mean > dof)
+    low, high = _LEAST, 0.0  # of log p
+    for _ in range(60):
+        middle = (low + high) / 2
+        limit = shortfall_limits(runs * dof, math.exp(middle))[above]
+        within = total <= limit if above else total >= limit
+        low, high = (middle, high) if within else (low, middle)
+    return 0.0 if low == _LEAST else math.exp(high)
+
+
+_LEAST = math.log(1e-290)
+"""Of p; less is none."""
+
+
+@dataclass(frozen=True)
+class PowerSums:
+    """Of independent numbers: how many, and the sums of their first three powers. They add up.
+
+    `count` numbers x: `first` is Σ x, `second` Σ x², `third` Σ x³.
+    """
+
+    count: int = 0
+    first: float = 0.0
+    second: float = 0.0
+    third: float = 0.0
+
+    @staticmethod
+    def of(values: Float[np.ndarray, " n"]) -> PowerSums:
+        """Of these numbers."""
+        values = np.asarray(values, np.float64)
+        with np.errstate(over="ignore"):  # of a lost run's: no interval then
+            return PowerSums(values.size, *(float(np.sum(values**power)) for power in (1, 2, 3)))
+
+    def __add__(self, other: PowerSums) -> PowerSums:
+        return PowerSums(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
+
+    @property
+    def mean(self) -> float:
+        return self.first / self.count if self.count else math.nan
+
+    @property
+    def deviation(self) -> float:
+        """The standard deviation, with n − 1."""
+        central = self.second - self.count * self.mean * self.mean
+        return math.sqrt(max(central, 0.0) / (self.count - 1)) if self.count > 1 else math.nan
+
+    @property
+    def skewness(self) -> float:
+        n, m = self.count, self.mean
+        second = self.second / n - m * m
+        third = self.third / n - 3 * m * self.second / n + 2 * m * m * m
+        cubed = second * math.sqrt(max(second, 0.0))
+        return third / cubed if second > 1e-12 * m * m and cubed > 0 else 0.0
+
+
+def mean_p_value(sums: PowerSums, expected: float) -> float:
+    """Two-sided, of `expected` as the mean of skewed numbers; NaN for fewer than two.
+
+    Student's t with its skewness removed by a cubic (Hall, Annals of Statistics 1992,
+    "On the removal of skewness by transformation"): the studentised bootstrap to second order,
+    without resampling.
+    """
+    if sums.count < 2:
+        return math.nan
+    away, k = sums.mean - expected, sums.skewness / math.sqrt(sums.count)
+    if sums.deviation == 0:
+        return float(away == 0)
+    t = away / (sums.deviation / math.sqrt(sums.count))
+    return 2 * float(stdtr(sums.count - 1, -abs(_symmetric(t, k))))
+
+
+_FAR = 1e50
+"""Of a studentised mean: beyond it no power of it is a number."""
+
+
+def _symmetric(t: float, k: float) -> float:
+    """Hall's cubic `g(t) = t + k/6 + k t²/3 + k² t³/27`, with k = skewness/√n: monotone."""
+    t = min(max(t, -_FAR), _FAR)
+    return t + k / 6 + k * t**2 / 3 + k**2 * t**3 / 27

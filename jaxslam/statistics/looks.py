@@ -1,0 +1,186 @@
+"""One mean of independent runs beside that of a right filter: by how much σ may be wrong.
+
+Two intervals, each of which is narrow where the other is wide. *Of χ²*: as if the covariances of
+all runs were wrong by one factor, however the steps of a run are correlated. *Of the scatter*: as
+far apart as the runs themselves are, whatever they are drawn from.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+from scipy.special import stdtr, stdtrit
+
+from jaxslam.statistics.bands import PowerSums, shortfall_limits, shortfall_p_value
+
+VERDICT_CONFIDENCE = 0.99
+"""With which all intervals of a study hold together; a consistent filter is called inconsistent in
+less than one of 100 studies."""
+TOLERANCE = 1.3
+"""A σ wrong by this factor would have been seen, where a filter is called consistent."""
+_FEWEST = 3
+"""Numbers whose scatter says anything."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """At the mean of one number a run; factors are of σ², 1 where it is right."""
+
+    name: str
+    """Of what: `all steps`, `last step`, `first third` …"""
+    sums: PowerSums
+    right: tuple[float, float]
+    """The mean of a right filter is anywhere from the one to the other."""
+    level: float
+    """How often a right filter may be outside the interval."""
+
+    @property
+    def factor(self) -> float:
+        """By which σ² should be larger."""
+        mean = self.sums.mean
+        nearest = min(max(mean, self.right[0]), self.right[1])
+        return 1.0 if mean == nearest else mean / nearest
+
+    @cached_property
+    def interval(self) -> tuple[float, float]:
+        """That of the scatter, where it proves that σ is wrong; else what holds both intervals.
+
+        Without 1 where that of χ² proves it: a right filter is tested by each of them, while any
+        other factor says less of how runs scatter, and only both together exclude it.
+        """
+        model = self._of_chi2()
+        scatter = self._of_scatter()
+        if scatter is None:
+            return model
+        if scatter[0] > 1 or scatter[1] < 1:
+            return scatter
+        low, high = min(model[0], scatter[0]), max(model[1], scatter[1])
+        if model[0] > 1:
+            low = math.nextafter(1.0, 2.0)
+        if model[1] < 1:
+            high = math.nextafter(1.0, 0.0)
+        return low, high
+
+    def _of_chi2(self) -> tuple[float, float]:
+        """Factors with which the sum over N runs is not in a tail of χ²(N n)."""
+        total, n = self.sums.first, self.sums.count
+        _, most = _limits(n * self.right[1], self.level)
+        least, _ = _limits(n * self.right[0], self.level)
+        return total / most, total / least if least else math.inf
+
+    def _of_scatter(self) -> tuple[float, float] | None:
+        """Student's t, with the scatter s relative to the mean: `m (1 − δ)` to `m/(1 − δ)`.
+
+        δ = t s/(m √N). Relative to the mean, few runs that are all small are not alike.
+        """
+        relative = self._relative_error()
+        if relative is None:
+            return None
+        delta = _quantile(self.sums.count - 1, self.level) * relative
+        low, high = self.sums.mean * max(1 - delta, 0.0), math.inf
+        if delta < 1 and self.right[0]:
+            high = self.sums.mean / (1 - delta) / self.right[0]
+        return low / self.right[1], high
+
+    def _relative_error(self) -> float | None:
+        """Of the mean; None where the runs are too few to tell."""
+        if self.sums.count < _FEWEST or self.sums.mean <= 0:
+            return None
+        relative = self.sums.deviation / self.sums.mean / math.sqrt(self.sums.count)
+        return relative if math.isfinite(relative) else None
+
+    @property
+    def p(self) -> float:
+        """Of a right filter, at confidence 99 % all together: below .01 where it is disproved."""
+        mean, (low, high) = self.sums.mean, self.right
+        nearest = min(max(mean, low), high)
+        if mean == nearest:
+            return 1.0
+        p = shortfall_p_value(mean, nearest, self.sums.count)
+        relative = self._relative_error()
+        if relative is not None:
+            apart = 1 - min(mean, nearest) / max(mean, nearest)
+            t = apart / relative if relative else math.inf
+            p = min(p, 2 * float(stdtr(self.sums.count - 1, -t)))
+        return min(1.0, p * (1 - VERDICT_CONFIDENCE) / self.level)
+
+    @property
+    def disproved(self) -> bool:
+        """Whether σ is wrong beyond doubt."""
+        low, high = self.interval
+        return low > 1 or high < 1
+
+    @property
+    def word(self) -> str:
+        """That σ is right within `TOLERANCE`, or that it is wrong; `cannot tell` without proof."""
+        low, high = self.interval
+        if self.disproved:
+            return "over-confident" if low > 1 else "under-confident"
+        if not self.right[0]:  # only over-confidence can be told, and only it is to be excluded
+            low, high = 1.0, replace(self, right=(self.right[1], self.right[1])).interval[1]
+        told = low >= TOLERANCE**-2 and high <= TOLERANCE**2
+        return "consistent" if told else "cannot tell"
+
+    def asdict(self) -> dict[str, Any]:
+        """Numbers as a verdict has them, of σ."""
+        low, high = self.interval
+        return {
+            "nees": self.sums.mean,
+            "sigma_factor": math.sqrt(self.factor),
+            "interval99": [_root(low, upwards=low > 1), _root(high, upwards=high > 1)],
+            "p": self.p,
+            "word": self.word,
+        }
+
+    def enough(self) -> int:
+        """About how many runs would tell whether σ is right within `TOLERANCE`."""
+        runs = _enough(self.right[0] or self.right[1], self.level)
+        low, high = self.interval
+        if runs <= self.sums.count and low > 0 and math.isfinite(high):  # and they scatter more
+            wide = max(-math.log(low), math.log(high)) / (2 * math.log(TOLERANCE))
+            runs = max(runs, math.ceil(self.sums.count * max(wide, 1.0) ** 2))
+        digits = max(len(str(runs)) - 2, 0)
+        return math.ceil(runs / 10**digits) * 10**digits
+
+
+def _root(factor: float, *, upwards: bool) -> float | None:
+    """On the side of 1 that the factor is on, whatever is rounded."""
+    if not math.isfinite(factor):
+        return None
+    root = math.sqrt(factor)
+    if root == 1 != factor:
+        return math.nextafter(1.0, 2.0 if upwards else 0.0)
+    return root
+
+
+@lru_cache(maxsize=1024)
+def _quantile(dof: int, level: float) -> float:
+    """Of Student's t, two-sided."""
+    return float(stdtrit(dof, 1 - level / 2))
+
+
+@lru_cache(maxsize=1024)
+def _limits(dof: float, level: float) -> tuple[float, float]:
+    return shortfall_limits(dof, level) if dof else (0.0, 0.0)
+
+
+@lru_cache(maxsize=256)
+def _enough(dof: float, level: float) -> int:
+    """Runs whose interval of χ² is within `TOLERANCE` where the mean is off by its error."""
+
+    def told(runs: int) -> bool:
+        total = runs * dof
+        error = math.sqrt(2 * total)
+        least, most = shortfall_limits(total, level)
+        return total + error <= TOLERANCE**2 * least and most <= TOLERANCE**2 * (total - error)
+
+    low, high = 0, 1
+    while not told(high):
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if told(middle) else (middle, high)
+    return high

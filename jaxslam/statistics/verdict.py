@@ -1,0 +1,409 @@
+"""What NEES says of a filter: by how much its covariance is wrong, in one study and on a map.
+
+A `Tally` is the verdict on one study, over all its steps; `verdict` is that on one mean at one
+step, alone and as one of many comparisons.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, astuple, dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxslam.statistics.bands import (
+    CONFIDENCE,
+    PowerSums,
+    lost_threshold,
+    mean_band,
+)
+from jaxslam.statistics.looks import VERDICT_CONFIDENCE, Look
+
+VERDICTS = ("consistent", "under-confident", "over-confident", "lost", "cannot tell")
+LOST_BOUND = 0.01
+"""More lost runs than this share make a filter lost: 100 times what a consistent one loses."""
+THIRDS = ("first third", "second third", "last third")
+"""Of a run's steps."""
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What a study's verdict needs of its runs: numbers that add up, over chunks and over seeds.
+
+    The steps of a run are correlated, runs are not: each run gives one number, the average of
+    its NEES over time; that of each third of its steps; and its NEES at the end.
+    """
+
+    dof: int
+    """Degrees of freedom of one NEES."""
+    runs: int
+    diverged: int
+    """Runs with a NEES that is not finite: they have no average, and a study with one no mean."""
+    lost: int
+    """Runs lost at any step (`lost_threshold` of so many steps), diverged ones too."""
+    average: PowerSums
+    """Time averages of the runs that did not diverge."""
+    end: PowerSums
+    """NEES at the last step of the runs that did not diverge."""
+    never_lost: PowerSums
+    """Time averages of the runs never lost."""
+    fitted: float = 0.0
+    """Of every NEES between 0 and so many degrees of freedom were taken by a fit to the run."""
+    thirds: tuple[PowerSums, PowerSums, PowerSums] = (PowerSums(), PowerSums(), PowerSums())
+    """Averages over each third of the steps, of the runs that did not diverge and have three."""
+
+    @staticmethod
+    def of(
+        nees: Float[np.ndarray, "runs steps"],
+        dof: int,
+        fitted: float = 0.0,
+        logged: Bool[np.ndarray, "runs steps"] | None = None,
+    ) -> Tally:
+        """Of the NEES of runs, with so many degrees of freedom.
+
+        Where runs are not equally long, or have gaps, `logged` says which steps of each are there:
+        its average is over those, and its end is the last of them.
+
+        What one fit to a whole run takes from each of its NEES depends on how its errors are
+        correlated: of an unknown scale of K poses between 1/K and 1. With `fitted` the filter is
+        right where the mean is anywhere between `dof - fitted` and `dof`. Raises ValueError
+        unless `fitted` is from 0 to `dof`, and every run has a step.
+        """
+        if not 0 <= fitted <= dof:
+            raise ValueError(f"fitted must be from 0 to the {dof} degrees of freedom, not {fitted}")
+        nees = np.asarray(nees, np.float64)
+        there = _logged(nees, logged)
+        healthy = (np.isfinite(nees) | ~there).all(axis=1)
+        kept = np.ones(len(nees), bool)
+        kept[lost_runs(nees, dof, there)] = False
+        good, there, kept = nees[healthy], there[healthy], kept[healthy]
+        average = good.mean(axis=1, where=True if there.all() else there)
+        last = there.shape[1] - 1 - np.argmax(there[:, ::-1], axis=1)
+        return Tally(
+            dof,
+            len(nees),
+            int(np.sum(~healthy)),
+            int(len(nees) - np.sum(kept)),
+            PowerSums.of(average),
+            PowerSums.of(good[range(len(good)), last]),
+            PowerSums.of(average[kept]),
+            float(fitted),
+            _thirds(good, there),
+        )
+
+    @staticmethod
+    def from_dict(numbers: dict[str, Any]) -> Tally:
+        """Of what `asdict` made of it; one made without thirds has none."""
+        counts = (numbers[name] for name in ("dof", "runs", "diverged", "lost"))
+        sums = (PowerSums(**numbers[name]) for name in ("average", "end", "never_lost"))
+        first, second, last = (PowerSums(**x) for x in numbers.get("thirds", ({},) * 3))
+        return Tally(*counts, *sums, numbers.get("fitted", 0.0), (first, second, last))
+
+    @staticmethod
+    def of_numbers(numbers: Float[np.ndarray, " 27"], dof: int, fitted: float = 0.0) -> Tally:
+        """Of what `numbers` made of one tally, or of a sum of such."""
+        runs, diverged, lost = (int(x) for x in numbers[:3])
+        average, end, never_lost, *thirds = (
+            PowerSums(int(n), *map(float, rest)) for n, *rest in numbers[3:].reshape(6, 4)
+        )
+        first, second, last = thirds
+        counts = dof, runs, diverged, lost
+        return Tally(*counts, average, end, never_lost, fitted, (first, second, last))
+
+    def numbers(self) -> Float[np.ndarray, " 27"]:
+        """All that adds up, for `of_numbers`."""
+        each = (self.average, self.end, self.never_lost, *self.thirds)
+        sums = (x for part in each for x in astuple(part))
+        return np.array([self.runs, self.diverged, self.lost, *sums], np.float64)
+
+    def asdict(self) -> dict[str, Any]:
+        """Numbers as JSON has them, for `from_dict`."""
+        return asdict(self) | {"thirds": [asdict(third) for third in self.thirds]}
+
+    def __add__(self, other: Tally) -> Tally:
+        if self.dof != other.dof:
+            raise ValueError(f"runs of {self.dof} and of {other.dof} dof are not one study")
+        if self.fitted != other.fitted:
+            raise ValueError(
+                f"runs with {self.fitted} and {other.fitted} dof fitted are not one study"
+            )
+        both = self.numbers() + other.numbers()
+        return Tally.of_numbers(both, self.dof, self.fitted)
+
+    def looks(self) -> list[Look]:
+        """At all steps, the last one and each third, which hold together with 99 %.
+
+        Half of what a right filter may fail is that of the mean over all steps, where a study has
+        most to say, and the other half is shared by the parts (Bonferroni).
+        """
+        right = self.dof - self.fitted, float(self.dof)
+        parts = {} if self.end == self.average else {"last step": self.end}
+        parts |= {n: x for n, x in zip(THIRDS, self.thirds, strict=True) if x.count}
+        total = 1 - VERDICT_CONFIDENCE
+        share = total / 2 if parts else total
+        return [
+            Look("all steps", self.average, right, share),
+            *(Look(n, x, right, (total - share) / len(parts)) for n, x in parts.items()),
+        ]
+
+    def decisive(self) -> Look:
+        """That at all steps; or, where only parts show that σ is wrong, at the one that does most.
+
+        Raises ValueError where no run is left to look at.
+        """
+        if not self.average.count:
+            raise ValueError("every run diverged, so that there is no mean to look at")
+        looks = self.looks()
+        wrong = [look for look in looks if look.disproved]
+        if len(wrong) < 2 or wrong[0] is looks[0]:
+            return (wrong or looks)[0]
+        return min(wrong, key=lambda look: look.p)
+
+    def verdict(self) -> dict[str, Any]:
+        """The key `verdict` of `consistency.json`.
+
+        `sigma_factor` is √(nees/dof), by which every σ should be larger, with an interval of 99 %;
+        `p` that of a consistent filter. They are `of` the mean over all steps; or, where only that
+        at the last step or of a third of the steps shows that σ is wrong, of that. So the word is
+        over- or under-confident where the interval does not hold 1, and p < .01. Else it is
+        consistent where the interval is within `TOLERANCE` of 1, and `cannot tell` where it is
+        not: about `enough` runs would tell. `mean`, `end` and the `thirds` have their own, which
+        hold together: p is multiplied by how often was looked. With a diverged run no mean exists
+        and the word is lost. `never_lost` is the verdict on the runs never lost: robust, and low
+        by construction. `lost_runs` are their numbers, where they are known.
+
+        With `fitted` a NEES above dof is compared with dof, one below dof − fitted with that, and
+        one between them is right: its σ factor is 1, and the interval is from √(low/dof) to
+        √(high/(dof − fitted)), without an upper end where all may be fitted.
+        """
+        right = self.dof - self.fitted, float(self.dof)
+        kept = Look("never lost", self.never_lost, right, 1 - VERDICT_CONFIDENCE)
+        return {
+            **self._judged(),
+            "runs": self.runs,
+            "lost": self.lost / self.runs,
+            "lost_runs": None,
+            "diverged": self.diverged,
+            "never_lost": {
+                **(kept.asdict() if kept.sums.count else _NONE),
+                "runs": self.runs - self.lost,
+            },
+        }
+
+    def _judged(self) -> dict[str, Any]:
+        """The look that decides, and all of them."""
+        if self.diverged or not self.average.count:
+            return {**_NONE, "of": "all steps", "enough": None, "mean": _NONE, "end": _NONE,
+                    "thirds": []}  # fmt: skip
+        looks, name = self.looks(), self.decisive().name
+        told = {look.name: look.asdict() for look in looks}
+        mean = told["all steps"]
+        return {
+            **told[name],
+            "p": min(found["p"] for found in told.values()),
+            "of": name,
+            "enough": looks[0].enough() if told[name]["word"] == "cannot tell" else None,
+            "mean": mean,
+            "end": told.get("last step", mean),
+            "thirds": [told[third] for third in THIRDS if third in told],
+        }
+
+
+_NONE = {"nees": None, "sigma_factor": None, "interval99": [None, None], "p": 0.0, "word": "lost"}
+"""Where there is no mean."""
+
+
+def _logged(
+    nees: Float[np.ndarray, "runs steps"], logged: Bool[np.ndarray, "runs steps"] | None
+) -> Bool[np.ndarray, "runs steps"]:
+    """Which steps are there. Raises ValueError unless every run has one."""
+    there = np.ones(nees.shape, bool) if logged is None else np.asarray(logged, bool)
+    if there.shape != nees.shape or not there.any(axis=1).all():
+        raise ValueError(f"logged must be {nees.shape}, with a step of every run")
+    return there
+
+
+def lost_runs(
+    nees: Float[np.ndarray, "runs steps"],
+    dof: int,
+    logged: Bool[np.ndarray, "runs steps"] | None = None,
+) -> list[int]:
+    """Which runs are lost at any of their steps; what is `logged`, see `Tally.of`.
+
+    Of right ones one in 10 000 is, or fewer, however many steps they have. Raises ValueError for a
+    run without steps.
+    """
+    there = _logged(nees, logged)
+    steps, which = np.unique(there.sum(axis=1), return_inverse=True)
+    limits = np.array([lost_threshold(dof, int(n)) for n in steps])[which]
+    lost = (~(nees <= limits[:, None]) & there).any(axis=1)
+    return [int(run) for run in np.flatnonzero(lost)]
+
+
+def _thirds(
+    nees: Float[np.ndarray, "runs steps"], there: Bool[np.ndarray, "runs steps"]
+) -> tuple[PowerSums, PowerSums, PowerSums]:
+    """Of the averages over each third of the steps that are there."""
+    steps = there.sum(axis=1)
+    long, place = steps >= len(THIRDS), np.cumsum(there, axis=1) - 1
+    which = np.where(there, len(THIRDS) * place // steps[:, None], -1)[long]
+    first, second, last = (
+        PowerSums.of(nees[long].mean(axis=1, where=which == third)) for third in range(len(THIRDS))
+    )
+    return first, second, last
+
+
+def run_verdict(
+    nees: Float[np.ndarray, "runs steps"],
+    dof: int,
+    fitted: float = 0.0,
+    logged: Bool[np.ndarray, "runs steps"] | None = None,
+) -> dict[str, Any]:
+    """The verdict on one study from the NEES of its independent runs, see `Tally.verdict`; what is
+    `fitted` and `logged`, see `Tally.of`.
+
+    Raises ValueError unless there are runs, steps and degrees of freedom.
+    """
+    nees = np.asarray(nees, np.float64)
+    if nees.ndim != 2 or not nees.size or dof < 1:
+        raise ValueError(f"NEES must be (runs, steps) with dof ≥ 1, not {nees.shape} and {dof}")
+    found = Tally.of(nees, dof, fitted, logged).verdict()
+    return found | {"lost_runs": lost_runs(nees, dof, logged)}
+
+
+def not_disproved(found: dict[str, Any]) -> bool:
+    """Whether a verdict lets a filter be consistent, be that shown or not."""
+    return found["word"] in ("consistent", "cannot tell")
+
+
+def sentences(found: dict[str, Any], quantity: str = "NEES") -> list[str]:
+    """A verdict in words, and that at the last step; of the runs never lost, where some were.
+
+    Where more than a few were, the others are chosen by their NEES: no verdict is said of them.
+    """
+    told = [headline(found, quantity)]
+    if found["nees"] is not None:
+        if _part(found) != "all steps":
+            told.append(f"over all steps: {_said(found['mean'], quantity)}")
+        if _part(found) != "last step":
+            told.append(f"at the last step: {_said(found['end'], quantity)}")
+    if "white" in found and not found["diverged"]:
+        told += _of_whiteness(found)
+    if found["lost"]:
+        told.append(_of_lost(found, quantity))
+    return told
+
+
+def _of_lost(found: dict[str, Any], quantity: str) -> str:
+    """Which runs were lost, and what is said of the others."""
+    kept, runs = found["never_lost"], found["runs"]
+    lost = runs - kept["runs"]
+    word, others = "were lost", "never lost"
+    if quantity != "NEES":
+        word, others = f"have an outlying {quantity}", "others"
+    numbers = found.get("lost_runs")
+    which = f" ({_listed(numbers)})" if numbers else ""
+    if not kept["runs"]:
+        return f"{lost} of {runs} runs {word}, all of them"
+    few = lost / runs <= LOST_BOUND
+    said = _said(kept, quantity) if few else f"{quantity} {_digits(kept['nees'])}"
+    return f"{lost} of {runs} runs {word}{which}, the {kept['runs']} {others}: {said}"
+
+
+def _listed(numbers: list[int]) -> str:
+    told = ", ".join(map(str, numbers[:_TOLD]))
+    more = len(numbers) - _TOLD
+    return f"numbers {told} and {more} more" if more > 0 else f"numbers {told}"
+
+
+_TOLD = 8
+"""Lost runs that are named."""
+
+
+def _of_whiteness(found: dict[str, Any]) -> list[str]:
+    if found["samples"] == "steps":
+        return [f"innovations seem white (p = {found['white']:.2g}): every step is a sample"]
+    if found["white"] is None:
+        return ["steps are too few to tell whether innovations are white: every run is a sample"]
+    return [
+        f"innovations are not white (p = {found['white']:.2g}), as a right filter's are: steps are "
+        "no independent samples, so that every run is one"
+    ]
+
+
+def headline(found: dict[str, Any], quantity: str = "NEES") -> str:
+    """The verdict on all runs: `NEES 4.72, σ too small by 1.25 [1.24, 1.27]: over-confident`."""
+    if found["nees"] is None:
+        word = found["word"]
+        return f"{found['diverged']} of {found['runs']} runs diverged, no mean {quantity}: {word}"
+    part = _part(found)
+    where = {"all steps": "", "last step": "at the last step "}.get(part, f"in the {part} ")
+    said = f"{where}{_said(found, quantity)}"
+    if found.get("enough") is None:
+        return said
+    return f"{said}; about {found['enough']} {found.get('samples', 'runs')} would tell"
+
+
+def _part(found: dict[str, Any]) -> str:
+    """What decided; files of before there were parts have none."""
+    return found.get("of", "all steps")
+
+
+def _said(found: dict[str, Any], quantity: str) -> str:
+    factors, word = [found["sigma_factor"], *found["interval99"]], found["word"]
+    told = "right up to a factor" if word == "consistent" else "should be ×"
+    if word == "over-confident":
+        told = "too small by"
+    if word == "under-confident":
+        told, factors = "too large by", [_inverse(factors[i]) for i in (0, 2, 1)]
+    factor, low, high = ("–" if f is None else _digits(f) for f in factors)
+    p = f"p = {found['p']:.2g}" if found["p"] >= 1e-4 else "p < 0.0001"
+    said = f"{quantity} {_digits(found['nees'])}, σ {told} {factor} [{low}, {high}]"
+    return f"{said}: {word} ({p})"
+
+
+def _inverse(factor: float | None) -> float | None:
+    return 1 / factor if factor else None
+
+
+def _digits(value: float) -> str:
+    return f"{value:.2f}" if value < 100 else f"{value:.3g}"
+
+
+def verdict(
+    nees: float | None,
+    lost: float,
+    *,
+    dof: int,
+    runs: int,
+    diverged: int = 0,
+    comparisons: int = 1,
+    lost_bound: float = LOST_BOUND,
+) -> str:
+    """One of `VERDICTS` for a mean NEES over `runs` independent runs, `lost` a share of runs.
+
+    `lost` comes first; then a mean NEES below the 95 % band is under-confident (σ too large), one
+    above it over-confident. With m comparisons the band is Bonferroni's, at 1 − 0.05/m: it holds
+    all means of m consistent filters together in 95 % of cases, however they are correlated. A
+    mean that does not exist (None or NaN, or of runs of which one diverged) is lost.
+
+    Raises ValueError for numbers that make no sense.
+    """
+    if comparisons < 1:
+        raise ValueError(f"comparisons must be at least 1, not {comparisons}")
+    for name, share in (("lost", lost), ("lost_bound", lost_bound)):
+        if not 0 <= share <= 1:
+            raise ValueError(f"{name} must be a share from 0 to 1, not {share}")
+    if lost > lost_bound or diverged or nees is None or math.isnan(nees):
+        return "lost"
+    low, high = mean_band(dof, runs, together(comparisons))
+    if nees < low:
+        return "under-confident"
+    return "over-confident" if nees > high else "consistent"
+
+
+def together(comparisons: int) -> float:
+    """Confidence of each of m bands that hold together with 95 %, by Bonferroni."""
+    return 1 - (1 - CONFIDENCE) / comparisons

@@ -1,0 +1,128 @@
+"""What a tracker assumes of its camera's motion and scene, and how much it does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from jaxslam._runtime.lookup import chosen
+from jaxslam.filters.association import ASSOCIATIONS, TOLERANCE
+from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.registry import FILTERS, FROM_REST, make_filter
+from jaxslam.io.calibration import Calibration
+from jaxslam.landmarks import LANDMARKS
+from jaxslam.models.calibration import AbstractCalibration
+from jaxslam.models.camera import Camera
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.sensors import Pinhole
+from jaxslam.simulation.pieces import TREATMENTS
+
+METRIC = "world"
+"""The filter where a target says how long a metre is."""
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """What a tracker assumes and how much it does. Lengths are in the unit of `nearest_depth`:
+    a single camera does not see scale, so the map's unit is whatever that prior makes it."""
+
+    filter: str = FROM_REST["spatial"]
+    """Filter: a name of jaxslam.FILTERS, which may be modified, as in `robocentric+oc`.
+    `recommended` is the default: it finds out by itself how the camera sets out, and what it claims
+    is true most often (docs/sequences.md)."""
+    landmarks: str = "inverse_scaling"
+    """Landmark parametrization: a name of jaxslam.LANDMARKS."""
+    calibration: str | None = None
+    """Treatment of the calibration: a name of TREATMENTS. By default one that is guessed, from a
+    field of view, is estimated, and any other is known."""
+    association: str = "sequential"
+    """Which matches are believed: a name of jaxslam.filters.association.ASSOCIATIONS."""
+    tolerance: float = TOLERANCE
+    """σ of what cameras and patches do beyond their noise, in `pixel_sigma`: matches are tested
+    with it, and weighed without."""
+    wanted: int = 50
+    """Landmarks to keep in view."""
+    spare: int = 30
+    """Slots for landmarks that are out of view. They stay until new ones need the slots: then
+    those searched in vain go first, then the longest unseen and least known."""
+    new_per_frame: int = 8
+    """Landmarks created in one frame, at the most."""
+    nearest_depth: float = 1.0
+    """d_min: the prior on depth reaches from here to infinity (96 %)."""
+    unit_sigma: float = 1.0
+    """σ of the log of the unit of length, for filters with a scale of their own (`scale_gauge`):
+    nobody told it in metres."""
+    pixel_sigma: float = 0.3
+    """σ of a match, pixels."""
+    focal_sigma: float = 1.0
+    """σ of the focal lengths, pixels, of a calibration that states none and is not known."""
+    centre_sigma: float = 1.0
+    """σ of the principal point, pixels, of the same."""
+    velocity_sigma: float = 0.5
+    """σ of the initial linear velocity, 1/s."""
+    angular_velocity_sigma: float = 1.0
+    """σ of the initial angular velocity, rad/s."""
+    acceleration_sigma: float = 1.0
+    """σ of the linear acceleration, 1/s²."""
+    angular_acceleration_sigma: float = 6.0
+    """σ of the angular acceleration, rad/s²: a hand's, as in the scenarios `handheld-NAME`."""
+    border: int = 12
+    """Pixels along the image's edge where nothing is matched or created."""
+    spacing: float = 20.0
+    """Least distance of a new landmark to the others, pixels."""
+    absent_after: int = 5
+    """A landmark that so many searches in a row did not find counts as in view no more, and
+    keeps no new one away."""
+    patience: int = 10
+    """A landmark is judged by an average over about so many of its latest searches …"""
+    least_success: float = 0.35
+    """… and removed when fewer of them than this share found it; at first, all count as found."""
+    lost_for: int = 15
+    """Frames in a row without tracking after which a new map is begun."""
+
+    def __post_init__(self) -> None:
+        if self.filter == "recommended":
+            object.__setattr__(self, "filter", type(self).filter)
+        chosen("filter", [self.filter.partition("+")[0]], FILTERS)
+        chosen("landmarks", [self.landmarks], LANDMARKS)
+        chosen("association", [self.association], ASSOCIATIONS)
+        if self.calibration is not None:
+            chosen("calibration", [self.calibration], TREATMENTS)
+
+    @property
+    def capacity(self) -> int:
+        """Slots of the filter."""
+        return self.wanted + self.spare
+
+    @property
+    def depth(self) -> InverseDepth:
+        """The prior on the depth of new landmarks."""
+        return replace(InverseDepth.beyond(self.nearest_depth), unit=self.unit_sigma)
+
+    def make_filter(self, calibration: Calibration) -> AbstractFilter:
+        """The filter that is named, with these numbers. Raises ValueError."""
+        distorted = any(calibration.distortion)
+        camera = Camera(
+            (calibration.fx, calibration.fy),
+            (calibration.cx, calibration.cy),
+            calibration.distortion if distorted else None,
+        )
+        return make_filter(
+            self.filter,
+            motion=ConstantVelocity(
+                [self.acceleration_sigma] * 3 + [self.angular_acceleration_sigma] * 3,
+                [0.0] * 6,
+                [self.velocity_sigma] * 3 + [self.angular_velocity_sigma] * 3,
+            ),
+            sensor=Pinhole(camera, self.pixel_sigma),
+            landmark=LANDMARKS[self.landmarks],
+            calibration=self.treatment(calibration),
+            depth=self.depth,
+        )
+
+    def treatment(self, calibration: Calibration) -> AbstractCalibration:
+        """What the filter makes of a calibration, with the σ that it states or else with these."""
+        name = self.calibration or ("estimated" if calibration.guessed else "known")
+        stated = [self.focal_sigma] * 2 + [self.centre_sigma] * 2
+        sigma = list(calibration.sigma) or stated
+        return TREATMENTS[name](sigma[1:] if calibration.guessed else sigma)

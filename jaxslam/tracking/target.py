@@ -1,0 +1,270 @@
+"""Known points that the first picture sees, which give the map its metre.
+
+MonoSLAM's start (Davison, Reid, Molton, Stasse, PAMI 2007): a picture of known size on the wall.
+"""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from jaxslam._runtime.files import read_json
+from jaxslam.io.calibration import Calibration
+from jaxslam.io.recording import read_image
+
+LEAST_POINTS = 4
+_METRES = ("metre", "metres", "meter", "meters", "m")
+_ALIKE = 0.8
+"""Least correlation of a patch with the picture."""
+_COMBINATIONS = 2000
+"""Of places that the patches may be at; as many are tried, at the most."""
+_CORNER_REACH = 3
+"""Pixels to each side in which the corner that a patch shows is measured."""
+_NEAR_AND_FAR = 1.5
+"""Ratio of the points' greatest to their least depth: seen steeper, no patch would look like it."""
+_LARGEST_RMS, _LARGEST_FOUND = 2.0, 0.75
+"""Pixels: what is further off is no picture of the target; of patches, which corners make exact."""
+
+
+@dataclass(frozen=True)
+class KnownPoint:
+    """A corner whose position is known, and where it is in the first picture or how it looks."""
+
+    name: str
+    position: Float[np.ndarray, " 3"]
+    """In the target's own frame, m."""
+    pixel: Float[np.ndarray, " 2"] | None = None
+    patch: UInt8[np.ndarray, "h w"] | None = None
+    """The picture around it, about as large as it is seen; its corner is in the middle."""
+
+    def __post_init__(self) -> None:
+        if (self.pixel is None) == (self.patch is None):
+            raise ValueError(
+                f"point {self.name} needs a `pixel` [u, v] or a `patch`, an image file; one of them"
+            )
+
+
+@dataclass(frozen=True)
+class Target:
+    """At least four points, not on one line. Raises ValueError."""
+
+    points: tuple[KnownPoint, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.points) < LEAST_POINTS:
+            raise ValueError(f"has {len(self.points)} points; at least {LEAST_POINTS} are accepted")
+        from_middle = self.positions - self.positions.mean(axis=0)
+        extent = np.linalg.svd(from_middle, compute_uv=False)
+        if extent[1] < 1e-3 * extent[0] or not extent[0]:
+            raise ValueError("its points are on one line; at least a plane of them is accepted")
+
+    @property
+    def positions(self) -> Float[np.ndarray, "n 3"]:
+        return np.array([point.position for point in self.points])
+
+
+class Sighting(NamedTuple):
+    """Where a picture shows a target, and how far away its points are."""
+
+    pixels: Float[np.ndarray, "n 2"]
+    T_ct: Float[np.ndarray, "4 4"]
+    """The target's frame in the camera, m."""
+    inverse_depths: Float[np.ndarray, " n"]
+    """1/z, 1/m."""
+    sigma: Float[np.ndarray, " n"]
+    """σ of each; taken for independent, they cover the errors that all have in common."""
+    rms: float
+    """Of the reprojection error, pixels."""
+
+
+def read_target(path: str | Path) -> Target:
+    """The target in a JSON file: `{"points": [{"position": [x, y, z], "pixel": [u, v]}, …]}`.
+
+    Positions are in metres, in any frame. In place of `pixel`, a place in the first picture, a
+    point may have a `patch`, an image file beside the JSON's. Raises ValueError, naming file and
+    point, for anything else; further keys are ignored.
+    """
+    folder = Path(path).parent
+    return read_json(path, "target", lambda fields: _from_fields(fields, folder))
+
+
+def _from_fields(fields: Any, folder: Path) -> Target:
+    points = fields.get("points") if isinstance(fields, dict) else None
+    if not isinstance(points, list):
+        raise ValueError("holds no list of points; an object with `points` is accepted")
+    unit = fields.get("unit", "metre")
+    if unit not in _METRES:
+        raise ValueError(f"unit is {unit!r}; metre is accepted")
+    return Target(tuple(_point(index, point, folder) for index, point in enumerate(points)))
+
+
+def _point(index: int, fields: Any, folder: Path) -> KnownPoint:
+    if not isinstance(fields, dict):
+        raise ValueError(f"point {index} is {fields!r}; an object is accepted")
+    name = str(fields.get("name", index))
+    position = _numbers(f"position of point {name}", fields.get("position"), 3)
+    pixel, patch = fields.get("pixel"), fields.get("patch")
+    return KnownPoint(
+        name,
+        position,
+        None if pixel is None else _numbers(f"pixel of point {name}", pixel, 2),
+        None if patch is None else read_image(folder / str(patch)),
+    )
+
+
+def _numbers(what: str, value: Any, count: int) -> Float[np.ndarray, " n"]:
+    try:
+        numbers = np.array(value, float)
+    except (TypeError, ValueError, OverflowError):
+        numbers = np.zeros(0)
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise ValueError(f"{what} is {value!r}; {count} finite numbers are accepted")
+    return numbers
+
+
+def sighted(
+    target: Target,
+    image: UInt8[np.ndarray, "h w"],
+    calibration: Calibration,
+    pixel_sigma: float,
+) -> Sighting:
+    """The target in a picture, its pixels measured with `pixel_sigma`.
+
+    Patches are sought all over the picture; of the places where they may be, those are taken
+    that the target fits best from some pose. Raises ValueError where it is not in the picture.
+    """
+    combined = map(np.array, itertools.product(*_places(target, image)))
+    lens = _Lens(calibration.matrix, np.array(calibration.distortion))
+    positions = target.positions
+    pixels = min(combined, key=lambda pixels: _pose(positions, pixels, lens).rms)
+    pixels = _on_corners(target, image, pixels)
+    pose = _pose(positions, pixels, lens)
+    sought = any(point.patch is not None for point in target.points)
+    largest = _LARGEST_FOUND if sought else _LARGEST_RMS
+    if not pose.rms <= largest:
+        raise ValueError(
+            f"the first picture does not show the target: its points are off by {pose.rms:.2f} px "
+            f"(RMS); {largest:g} px are accepted"
+        )
+    return _sighting(positions, pixels, lens, pose, pixel_sigma)
+
+
+def _places(target: Target, image: np.ndarray) -> list[list[Float[np.ndarray, " 2"]]]:
+    """Where each point may be: its pixel, or where the picture is most like its patch."""
+    count = max(1, int(_COMBINATIONS ** (1 / len(target.points))))
+    return [_places_of(point, image, count) for point in target.points]
+
+
+def _places_of(point: KnownPoint, image: np.ndarray, count: int) -> list[Float[np.ndarray, " 2"]]:
+    name, patch = point.name, point.patch
+    if patch is None:
+        return [np.asarray(point.pixel)]
+    if any(small > large for small, large in zip(patch.shape, image.shape, strict=True)):
+        raise ValueError(f"the patch of point {name} is larger than the picture")
+    alike = cv2.matchTemplate(image, patch, cv2.TM_CCOEFF_NORMED)
+    highest = alike >= cv2.dilate(alike, np.ones((7, 7), np.uint8))
+    rows, columns = np.nonzero(highest & (alike > _ALIKE))
+    if not len(rows):
+        raise ValueError(f"the first picture shows nothing like the patch of point {name}")
+    order = np.argsort(-alike[rows, columns])[:count]
+    middle = (np.array(patch.shape[::-1]) - 1) / 2
+    return list(np.stack([columns, rows], 1)[order] + middle)
+
+
+def _on_corners(
+    target: Target, image: np.ndarray, pixels: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 2"]:
+    """The corners beside where patches were found; pixels that were given stay."""
+    found = np.array([point.patch is not None for point in target.points])
+    reach = (_CORNER_REACH, _CORNER_REACH)
+    end = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
+    start = pixels.astype(np.float32)[:, None]
+    corners = cv2.cornerSubPix(image, start.copy(), reach, (-1, -1), end)[:, 0]
+    return np.where(found[:, None], corners.astype(float), pixels)
+
+
+class _Lens(NamedTuple):
+    matrix: Float[np.ndarray, "3 3"]
+    distortion: Float[np.ndarray, " 5"]
+
+
+class _Pose(NamedTuple):
+    """The target's frame in the camera as OpenCV has it, and the RMS in pixels that it leaves."""
+
+    turn: np.ndarray
+    shift: np.ndarray
+    rms: float
+
+
+def _pose(
+    positions: Float[np.ndarray, "n 3"], pixels: Float[np.ndarray, "n 2"], lens: _Lens
+) -> _Pose:
+    """From which the points are seen there (PnP); an infinite RMS where there is none."""
+    found, turn, shift = cv2.solvePnP(positions, pixels, *lens, flags=cv2.SOLVEPNP_SQPNP)
+    if not found:
+        return _Pose(np.zeros(3), np.zeros(3), np.inf)
+    seen, _ = cv2.projectPoints(positions, turn, shift, *lens)
+    depths = _in_camera(positions, turn, shift)[:, 2]
+    if not 0 < depths.max() <= _NEAR_AND_FAR * depths.min():
+        return _Pose(turn, shift, np.inf)
+    return _Pose(turn, shift, float(np.sqrt(np.mean(np.sum((seen[:, 0] - pixels) ** 2, axis=1)))))
+
+
+def _in_camera(
+    positions: Float[np.ndarray, "n 3"], turn: np.ndarray, shift: np.ndarray
+) -> Float[np.ndarray, "n 3"]:
+    return positions @ cv2.Rodrigues(turn)[0].T + shift.ravel()
+
+
+def _sighting(
+    positions: Float[np.ndarray, "n 3"],
+    pixels: Float[np.ndarray, "n 2"],
+    lens: _Lens,
+    pose: _Pose,
+    pixel_sigma: float,
+) -> Sighting:
+    turn, shift = cv2.solvePnPRefineLM(positions, pixels, *lens, pose.turn, pose.shift)
+    J = cv2.projectPoints(positions, turn, shift, *lens)[1][:, :6]
+    covariance = pixel_sigma**2 * np.linalg.pinv(J.T @ J)
+    depths = _in_camera(positions, turn, shift)[:, 2]
+    T_ct = np.eye(4)
+    T_ct[:3, :3], T_ct[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
+    # n diag(P) ≥ P for any covariance P of n numbers.
+    sigma = np.sqrt(len(depths)) * _depth_sigma(positions, turn, covariance) / depths**2
+    return Sighting(pixels, T_ct, 1 / depths, sigma, pose.rms)
+
+
+def _depth_sigma(
+    positions: Float[np.ndarray, "n 3"], turn: np.ndarray, covariance: Float[np.ndarray, "6 6"]
+) -> Float[np.ndarray, " n"]:
+    """σ of `z = (R(turn) p + shift)_z`, given the covariance of turn and shift."""
+    _, of_turn = cv2.Rodrigues(turn)
+    of_row = np.asarray(of_turn)[:, 6:].reshape(3, 3)  # of R's third row, by turn
+    J = np.hstack([positions @ of_row.T, np.tile([0.0, 0.0, 1.0], (len(positions), 1))])
+    return np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J))
+
+
+def known_depths(
+    sighting: Sighting, count: int, mean: float, sigma: float
+) -> tuple[Float[np.ndarray, "count 1"], Float[np.ndarray, "count 1"]]:
+    """Mean and σ of 1/z of so many new landmarks: the target's points, then others."""
+    others = count - len(sighting.sigma)
+    means = np.append(sighting.inverse_depths, np.full(others, mean))
+    return means[:, None], np.append(sighting.sigma, np.full(others, sigma))[:, None]
+
+
+def as_summary(target: Target, sighting: Sighting) -> dict[str, Any]:
+    """For summary.json: lengths in metres, the target's frame in the first camera."""
+    names: Sequence[str] = [point.name for point in target.points]
+    return {
+        "points": names,
+        "pixels": sighting.pixels.tolist(),
+        "depths": (1 / sighting.inverse_depths).tolist(),
+        "reprojection_rms": sighting.rms,
+        "T_camera_target": sighting.T_ct.tolist(),
+    }
