@@ -5,6 +5,7 @@ import operator
 import threading
 import time
 from functools import partial
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxslam
 from jaxslam._runtime import programs
 from jaxslam._runtime.programs import Program, forget, in_background, keep_in, wide
 from jaxslam.models.depth import InverseDepth
@@ -172,6 +174,12 @@ def test_what_was_made_elsewhere_is_not_taken(folder, monkeypatch, what):
         )
     check(Program(scaled))
     assert len(traced) == len(list(folder.iterdir())) == 2
+
+
+def test_every_file_of_the_package_is_among_its_sources():
+    whole = Path(jaxslam.__file__).parent
+    assert programs.source_files() == sorted(whole.rglob("*.py"))
+    assert whole / "filters" / "ekf.py" in programs.source_files()
 
 
 def test_a_function_with_values_of_its_own_is_not_kept(folder):

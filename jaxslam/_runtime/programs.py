@@ -350,11 +350,16 @@ def _surroundings() -> tuple[Any, ...]:
     return _sources(), *where, settings, os.environ.get("XLA_FLAGS")
 
 
+def source_files() -> list[Path]:
+    """All Python files of this package, in order."""
+    return sorted(Path(__file__).parents[1].rglob("*.py"))
+
+
 @cache
 def _sources() -> tuple[str, ...]:
     """What this package, those that it computes with and this processor are."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
+    for path in source_files():
         digest.update(path.read_bytes())
     versions = (version(name) for name in PACKAGES)
     return digest.hexdigest(), platform.python_version(), *versions, *processor()
