@@ -1,15 +1,15 @@
 """Poses against the truth: conventions, their checker, alignments, text, folders of runs."""
 
 import json
-import sys
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
+import conventions as benchmark
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scale_drift
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
@@ -44,11 +44,6 @@ from jaxslam.io.tum import write_tum
 from jaxslam.plots.evaluation import plot_evaluation
 from jaxslam.statistics import VERDICTS, Tally, not_disproved
 from jaxslam.statistics.beyond_scale import one_scale
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
-import conventions as benchmark
-import scale_drift
 
 EVERY = [Convention(*c) for c in product(*list(CHOICES.values())[:3])]
 FALSE_ALARM = 1e-4

@@ -1,13 +1,9 @@
 """Tests of benchmarks/speed: all who are compared compute the same."""
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import jax
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.speed.__main__ import AGREEMENT, difference, flops, without_pose
 from benchmarks.speed.dynamax_ekf import TOLERANCE, by_dynamax, missing

@@ -1,15 +1,10 @@
-"""Random programs by the native backend and by XLA; `benchmarks/native_fuzz.py` runs more."""
-
-import sys
-from pathlib import Path
+"""Random programs by the native backend and by XLA; `native_fuzz.py` runs more."""
 
 import jax
 import jax.numpy as jnp
+import native_fuzz
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-import native_fuzz
 
 from jaxslam.native import batched
 from jaxslam.native.build import compiler

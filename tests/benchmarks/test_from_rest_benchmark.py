@@ -1,21 +1,17 @@
 """Tests of the benchmark of filters from rest: what its table says, and where it is written."""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import from_rest as benchmark
 import numpy as np
 import pytest
-
-from jaxslam.statistics import run_verdict
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
-import from_rest as benchmark
 from from_rest import BEGIN, Options, main, table
 from pages import END, write_table
+
+from jaxslam.statistics import run_verdict
 
 STEPS = 60
 
@@ -72,7 +68,7 @@ def test_the_sentences_are_of_the_numbers_of_all_runs():
 
 
 def test_the_page_says_what_the_numbers_on_disk_say():
-    folder = Path(__file__).resolve().parents[1]
+    folder = Path(__file__).resolve().parents[2]
     results = json.loads((folder / "benchmarks/results/from_rest.json").read_text())
     page = (folder / "docs/from-rest.md").read_text()
     for part in (table(results), benchmark.sentences(results)):
@@ -80,7 +76,7 @@ def test_the_page_says_what_the_numbers_on_disk_say():
 
 
 def test_other_pages_quote_the_numbers_on_disk():
-    folder = Path(__file__).resolve().parents[1]
+    folder = Path(__file__).resolve().parents[2]
     results = json.loads((folder / "benchmarks/results/from_rest.json").read_text())
     space = results["standstill-6dof"]["scale_gauge+scene50+mixture3+rest8"]
     plane = results["standstill"]["scale_gauge+scene50+mixture5+rest"]

@@ -2,9 +2,8 @@
 
 import dataclasses
 import json
-import sys
-from pathlib import Path
 
+import calibration
 import jax
 import numpy as np
 import pytest
@@ -12,10 +11,6 @@ from cases import quick_jit
 
 import jaxslam
 from jaxslam.simulation import simulate
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
-import calibration
 
 OPTIONS = calibration.Options(
     scenarios=("matched",), truths=("constant",), treatments=("estimated",), runs=3, steps=3

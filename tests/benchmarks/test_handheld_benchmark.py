@@ -2,17 +2,12 @@
 
 import dataclasses
 import json
-import sys
-from pathlib import Path
 
+import handheld as benchmark
 import numpy as np
 import pytest
 import test_tracks
 import test_trajectories
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
-import handheld as benchmark
 
 from jaxslam.statistics.beyond_scale import one_scale_of
 

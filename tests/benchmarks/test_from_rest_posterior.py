@@ -1,17 +1,13 @@
 """Tests of benchmarks/from_rest_posterior.py: what its summary says of records that are known."""
 
 import json
-import sys
 from pathlib import Path
 
+import from_rest_posterior as benchmark
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
-import from_rest_posterior as benchmark
 
 RUNS = 40
 

@@ -2,18 +2,14 @@
 
 import dataclasses
 import json
-import sys
 from pathlib import Path
 
+import consistency as benchmark
 import numpy as np
 import pytest
 
 import jaxslam
 from jaxslam.statistics import Tally, mean_band, run_verdict
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
-import consistency as benchmark
 
 NAME = "robocentric/inverse_scaling"
 
@@ -152,7 +148,7 @@ def test_a_diverged_run_leaves_a_row_without_a_mean():
 
 
 def test_the_tables_of_the_pages_say_what_the_numbers_on_disk_say():
-    folder = Path(__file__).resolve().parents[1]
+    folder = Path(__file__).resolve().parents[2]
     results = benchmark.read(folder / "benchmarks/results/consistency.json")
     for page, scenarios in (("README.md", benchmark.IN_README), ("docs/results.md", results)):
         table = benchmark.recommended(results, scenarios)

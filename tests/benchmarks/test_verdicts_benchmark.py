@@ -1,17 +1,12 @@
 """Tests of benchmarks/verdicts.py: it counts what the library says, of NEES as it says."""
 
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+import verdicts as benchmark
 
 from jaxslam.statistics import Tally
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
-import verdicts as benchmark
 
 
 @pytest.mark.parametrize("steps", [1, 2, 12])

@@ -1,6 +1,6 @@
 """Bad input, many times: everything that reads is given files that something happened to.
 
-`python benchmarks/fuzz.py --cases 100000`; `--first N --cases 1` repeats case N. Case i draws from
+`python tests/fuzz/fuzz.py --cases 100000`; `--first N --cases 1` repeats case N. Case i draws from
 (seed, i) alone. A case is good if it ends in a ValueError of one line, or in a result whose numbers
 are finite; a pickle in the data must not be run, and a command leaves whole files or none.
 """
@@ -35,7 +35,6 @@ from mutations import MARK, mutate_folder, mutated_array, mutated_text
 import jaxslam
 from jaxslam.cli import main as command
 from jaxslam.consistency import summarise
-from jaxslam.datasets import starry_night, tracks
 from jaxslam.evaluation import (
     CHOICES,
     Convention,
@@ -243,10 +242,6 @@ TARGETS: dict[str, Target] = {
     "open_source 7scenes": Target(given.write_seven_scenes, read_source()),
     "open_source pictures": Target(given.write_pictures, read_source()),
     "open_source film": Target(given.write_film, read_source("film.mp4"), 0.5),
-    "starry_night": Target(
-        given.write_starry_night, _file("starry_night.npz", starry_night.read), 0.2
-    ),
-    "tracks": Target(given.write_tracks, lambda folder, draw: tracks.read(folder)),
     "read_record": Target(given.write_record_of_two, _file("tracker.npz", read_header)),
     "Tracker.load": Target(given.write_tracker, _file("tracker.npz", read_tracker), 0.05),
     "resume": Target(lambda folder: given.small_study(folder) and None, read_resumed, 0.2),

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 import jaxslam
 from jaxslam.consistency import FolderStore, monte_carlo
-from jaxslam.datasets import starry_night
 from jaxslam.evaluation import Convention, write_covariances
 from jaxslam.io.calibration import Calibration, write_calibration
 from jaxslam.io.tum import write_tum
@@ -170,30 +169,6 @@ def write_film(folder: Path) -> None:
     for index in range(4):
         writer.write(cv2.cvtColor(_picture(index), cv2.COLOR_GRAY2BGR))
     writer.release()
-
-
-def write_starry_night(folder: Path) -> None:
-    def _sizes(shape: tuple[Any, ...]) -> list[int]:
-        return [{None: 6, -1: 4}.get(size, size) for size in shape]
-
-    draw = np.random.default_rng(0)
-    arrays: dict[str, Any] = {
-        name: draw.uniform(1.0, 2.0, _sizes(shape)) for name, shape in starry_night.SHAPES.items()
-    }
-    arrays["t"] = np.arange(6.0).reshape(arrays["t"].shape)
-    arrays["C_c_v"] = np.eye(3)
-    np.savez(folder / "starry_night.npz", **arrays)
-
-
-def write_tracks(folder: Path) -> None:
-    frame, track = (x.ravel() for x in np.mgrid[0:5, 0:4])
-    pixel = np.column_stack([track, frame]).astype(np.float32)
-    np.savez(
-        folder / "tracks.npz", frame=frame, track=track, pixel=pixel, moving=np.zeros(4, int),
-        times=np.arange(5) / 10, intrinsics=np.array([60.0, 60, 31, 23]),
-        image_size=np.array([WIDTH, HEIGHT]),
-    )  # fmt: skip
-    write_tum(folder / "groundtruth.txt", np.arange(5) / 10, _poses(5))
 
 
 SMALL = {"made_by": "fuzz", "seed": 0}

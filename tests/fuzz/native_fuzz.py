@@ -1,6 +1,6 @@
 """Random programs, by the native backend and by XLA: the same numbers, to the bit.
 
-`python benchmarks/native_fuzz.py --cases 500`; `--first N --cases 1` repeats case N. Case i draws
+`python tests/fuzz/native_fuzz.py --cases 500`; `--first N --cases 1` repeats case N. Case i draws
 from (seed, i) alone. Real numbers are multiples of 1/8, of which sums and products are exact in any
 order, and what transcendental functions return is rounded to them. Zeros of either sign are equal.
 """

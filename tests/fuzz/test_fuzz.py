@@ -1,8 +1,7 @@
 """Bad input, a thousand times: one clear line or a correct result, never anything else."""
 
-import sys
-from pathlib import Path
-
+import fuzz
+import mutations
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -12,10 +11,6 @@ from hypothesis.extra import numpy as arrays
 import jaxslam
 from jaxslam._runtime.files import read_arrays
 from jaxslam.simulation.scenario import parse_override
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-import fuzz
-import mutations
 
 pytestmark = pytest.mark.usefixtures("unchecked")
 
