@@ -1,11 +1,20 @@
 """Factorisations in JAX against NumPy's; and no program of the package may call LAPACK."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam._numerics.linalg import LEAF, cholesky, eigh, inverse, semidefinite_root
+from jaxslam._numerics.linalg import (
+    LEAF,
+    cholesky,
+    eigh,
+    inverse,
+    semidefinite_root,
+    symmetric_part,
+)
 
 SIZES = (1, 2, 3, 5, 12, LEAF, LEAF + 1, 2 * LEAF + 3, 105)
 
@@ -135,3 +144,16 @@ def test_inverse_is_numpys_and_needs_no_good_pivots(n):
 
 def test_inverse_of_a_singular_matrix_is_not_finite():
     assert not np.isfinite(inverse(jnp.ones((3, 3)))).all()
+
+
+def test_symmetric_part_is_the_mean_with_the_transpose_batched_and_differentiated():
+    """A primitive of its own, with its rules for `vmap`, `jvp`, `grad` and `jit`."""
+    A = np.random.default_rng(4).normal(size=(3, 3, 3))
+
+    def mean(A):
+        return (A + A.T) / 2
+
+    of_last_axis = partial(jax.vmap, in_axes=2, out_axes=1)
+    for transform in (jax.jit, jax.vmap, of_last_axis, jax.jacfwd, jax.jacrev):
+        given = jnp.asarray(A if transform in (jax.vmap, of_last_axis) else A[0])
+        np.testing.assert_array_equal(transform(symmetric_part)(given), transform(mean)(given))

@@ -116,6 +116,18 @@ def test_a_function_is_what_vmap_makes_of_it(function):
         np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-11)
 
 
+@jax.jit
+def symmetric_part(A):
+    """Anybody's, under the name of a function of the package."""
+    return jnp.tril(A)
+
+
+@needs_compiler
+def test_functions_are_not_known_by_their_names():
+    found = batched(lambda shared, A: symmetric_part(A), SHARED, DRAWN)(SHARED, DRAWN)
+    np.testing.assert_array_equal(found, np.tril(DRAWN))
+
+
 @needs_compiler
 def test_single_precision_is_single():
     given = DRAWN.astype(np.float32), SHARED.astype(np.float32)

@@ -14,6 +14,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.arrays import AnyArray
@@ -130,13 +132,28 @@ def semidefinite_root(P: Float[Array, "n n"]) -> SemidefiniteRoot:
     return SemidefiniteRoot(sigma[:, None] * L, W / unit)
 
 
-@jax.jit
-def symmetric_part(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """`(A + Aᵀ) / 2` of what is symmetric but for rounding.
+symmetric_part_p = Primitive("symmetric_part")
+"""A primitive, so that a compiler may have a rule for it: half of A is enough."""
 
-    By its name the native backend knows that half of A is enough.
-    """
-    return (A + A.T) / 2
+
+def symmetric_part(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Return `(A + Aᵀ) / 2` of what is symmetric but for rounding."""
+    return symmetric_part_p.bind(A)
+
+
+def _symmetric_parts(A: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
+    return (A + jnp.swapaxes(A, -1, -2)) / 2
+
+
+def _batched(arguments: tuple[Array], axes: tuple[int]) -> tuple[Array, int]:
+    return symmetric_part_p.bind(jnp.moveaxis(arguments[0], axes[0], 0)), 0
+
+
+symmetric_part_p.def_impl(jax.jit(_symmetric_parts))
+symmetric_part_p.def_abstract_eval(lambda A: A)
+mlir.register_lowering(symmetric_part_p, mlir.lower_fun(_symmetric_parts, multiple_results=False))
+ad.deflinear2(symmetric_part_p, lambda cotangent, _: [symmetric_part_p.bind(cotangent)])
+batching.primitive_batchers[symmetric_part_p] = _batched
 
 
 def eigh(A: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:

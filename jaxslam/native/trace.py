@@ -6,7 +6,6 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar
 from typing import Any
 
 import jax
@@ -14,6 +13,8 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 from jax.interpreters import partial_eval
 
+from jaxslam._numerics.linalg import symmetric_part_p
+from jaxslam._numerics.tracing import free_gathers
 from jaxslam.native.elements import OPERATIONS, Elements, Refs
 from jaxslam.native.program import Apply, Check, Loop, Product, Program, Put, Sort, Take, While
 
@@ -24,25 +25,14 @@ FEW_PRODUCTS = 400
 """A product of matrices with fewer is written out number by number."""
 
 
-_tracing = ContextVar("tracing", default=False)
-
-
-def tracing() -> bool:
-    """Whether what is traced now is for the native backend, where no index costs much."""
-    return _tracing.get()
-
-
 class NotSupportedError(ValueError):
     """A function that has something for which there is no rule."""
 
 
 def program(function: Callable[..., Any], *arguments: Any) -> tuple[Program, Any]:
     """The program of a function of such arguments, and the shapes of what it returns."""
-    token = _tracing.set(True)
-    try:
+    with free_gathers():
         traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
-    finally:
-        _tracing.reset(token)
     leaves = jax.tree.leaves(arguments)
     jaxpr, used = partial_eval.dce_jaxpr(traced.jaxpr, [True] * len(traced.out_avals))[:2]
     tracer = Tracer(Elements(_dtype([*leaves, *traced.out_avals])))
@@ -155,8 +145,6 @@ class Tracer:
     def by_rule(self, equation: Any, arguments: list[Refs]) -> list[Refs]:
         """What an operation returns."""
         name, parameters = equation.primitive.name, equation.params
-        if name in INNER and parameters.get("name") == "symmetric_part":
-            return [_mirrored(arguments[0])]
         if name in INNER:
             return self.closed(parameters[INNER[name]], arguments)
         if name in MOVES:
@@ -216,12 +204,6 @@ INNER = {
 """Functions within, by the parameter that holds them."""
 
 
-def _mirrored(x: Refs) -> Refs:
-    """The lower half above too."""
-    lower = np.tri(x.shape[-1], dtype=bool)
-    return np.where(lower, x, np.swapaxes(x, -1, -2))
-
-
 # What only moves numbers: functions of the primitive's parameters and of arrays of elements.
 
 
@@ -252,6 +234,12 @@ def _pad(p, x, filling):
     return x
 
 
+def _symmetric_part(p, x):
+    """The lower half above too."""
+    lower = np.tri(x.shape[-1], dtype=bool)
+    return np.where(lower, x, np.swapaxes(x, -1, -2))
+
+
 MOVES: dict[str, Callable[..., Any]] = {
     "broadcast_in_dim": _broadcast_in_dim,
     "reshape": lambda p, x: x.reshape(p["new_sizes"]),
@@ -269,6 +257,7 @@ MOVES: dict[str, Callable[..., Any]] = {
     "copy_p": lambda p, x: x,
     "stop_gradient": lambda p, x: x,
     "optimization_barrier": lambda p, *x: x,
+    symmetric_part_p.name: _symmetric_part,
 }
 
 

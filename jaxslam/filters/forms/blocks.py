@@ -20,9 +20,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.linalg import cholesky
+from jaxslam._numerics.tracing import gathers_are_free
 from jaxslam.geometry import jacobian, nudge, retract, zero_tangent
 from jaxslam.models.observations import Features
-from jaxslam.native.trace import tracing
 
 Landmark = Callable[[Any, Array], Array]
 
@@ -215,7 +215,7 @@ def placed(J: Blocks, slots: Int[Array, " m"], capacity: int) -> Float[Array, "m
 def observed(J: Blocks, slots: Int[Array, " m"], B: Float[Array, "n r"]) -> Float[Array, "mk r"]:
     """`J B` of blocks in these slots, of more than `DENSE` numbers without the zeros."""
     c, d = J.view_by_core.shape[1], J.by_landmark.shape[-1]
-    if len(B) <= DENSE and not tracing():
+    if len(B) <= DENSE and not gathers_are_free():
         return placed(J, slots, (len(B) - c) // d) @ B
     own = B[c:].reshape(-1, d, B.shape[1])[slots]
     by_view = J.by_view.reshape(-1, J.by_view.shape[-1]) @ (J.view_by_core @ B[:c])
