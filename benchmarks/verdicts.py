@@ -38,7 +38,7 @@ SHARE, TIMES = 0.01, 20.0
 class Options:
     """What to draw."""
 
-    runs: tuple[int, ...] = (1, 2, 3, 5, 10, 30, 100, 1000)
+    runs: tuple[int, ...] = (1, 2, 3, 5, 10, 30, 100, 200, 300, 1000)
     """Runs of a study."""
     dof: tuple[int, ...] = (1, 2, 3, 6)
     """Degrees of freedom of a NEES."""

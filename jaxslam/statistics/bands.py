@@ -53,7 +53,7 @@ def mean_band(dof: int, runs: int, confidence: float = CONFIDENCE) -> tuple[floa
     return low, high
 
 
-def lost_threshold(dof: int, steps: int = 1) -> float:
+def lost_threshold(dof: float, steps: int = 1) -> float:
     """NEES above which a run counts as lost; 21.1 for 3 degrees of freedom.
 
     Of so many `steps` it is above it at any for one run in 10 000, or fewer if they are correlated.
@@ -155,6 +155,13 @@ def mean_p_value(sums: PowerSums, expected: float) -> float:
 
 _FAR = 1e50
 """Of a studentised mean: beyond it no power of it is a number."""
+
+
+def skewed_limit(sums: PowerSums, t: float) -> float:
+    """How many standard errors above their mean that of numbers may be, `-g⁻¹(−t)` of `_symmetric`:
+    t of numbers that are not skewed."""
+    k = sums.skewness / math.sqrt(sums.count)
+    return 3 / k * (1 - math.cbrt(1 - k * (t + k / 6))) if k else t
 
 
 def _symmetric(t: float, k: float) -> float:

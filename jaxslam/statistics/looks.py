@@ -14,13 +14,23 @@ from typing import Any
 
 from scipy.special import stdtr, stdtrit
 
-from jaxslam.statistics.bands import PowerSums, shortfall_limits, shortfall_p_value
+from jaxslam.statistics.bands import (
+    PowerSums,
+    lost_threshold,
+    mean_p_value,
+    shortfall_limits,
+    shortfall_p_value,
+    skewed_limit,
+)
 
 VERDICT_CONFIDENCE = 0.99
 """With which all intervals of a study hold together; a consistent filter is called inconsistent in
 less than one of 100 studies."""
 TOLERANCE = 1.3
 """A σ wrong by this factor would have been seen, where a filter is called consistent."""
+UNSEEN = 3
+"""Of runs such as none among N is, there may be up to 3 in N (the rule of three: Hanley,
+Lippman-Hand, JAMA 1983)."""
 _FEWEST = 3
 """Numbers whose scatter says anything."""
 
@@ -49,8 +59,16 @@ class Look:
         """That of the scatter, where it proves that σ is wrong; else what holds both intervals.
 
         Without 1 where that of χ² proves it: a right filter is tested by each of them, while any
-        other factor says less of how runs scatter, and only both together exclude it.
+        other factor says less of how runs scatter, and only both together exclude it. Where neither
+        does, it reaches up as if `UNSEEN` more runs had just been lost.
         """
+        low, high = self._tested()
+        if low <= 1 <= high:
+            high += _unseen(self.sums.mean, self.right[1], self.sums.count)
+        return low, high
+
+    def _tested(self) -> tuple[float, float]:
+        """What holds both intervals, or what is left of them by which σ is proven to be wrong."""
         model = self._of_chi2()
         scatter = self._of_scatter()
         if scatter is None:
@@ -74,15 +92,18 @@ class Look:
     def _of_scatter(self) -> tuple[float, float] | None:
         """Student's t, with the scatter s relative to the mean: `m (1 − δ)` to `m/(1 − δ)`.
 
-        δ = t s/(m √N). Relative to the mean, few runs that are all small are not alike.
+        δ = t s/(m √N). Relative to the mean, few runs that are all small are not alike. Upwards to
+        Hall's limit for skewed numbers, where that is further: few runs of many are the large ones.
         """
         relative = self._relative_error()
         if relative is None:
             return None
-        delta = _quantile(self.sums.count - 1, self.level) * relative
+        t = _quantile(self.sums.count - 1, self.level)
+        delta = t * relative
         low, high = self.sums.mean * max(1 - delta, 0.0), math.inf
         if delta < 1 and self.right[0]:
-            high = self.sums.mean / (1 - delta) / self.right[0]
+            skewed = 1 + skewed_limit(self.sums, t) * relative
+            high = self.sums.mean * max(1 / (1 - delta), skewed) / self.right[0]
         return low / self.right[1], high
 
     def _relative_error(self) -> float | None:
@@ -104,7 +125,10 @@ class Look:
         if relative is not None:
             apart = 1 - min(mean, nearest) / max(mean, nearest)
             t = apart / relative if relative else math.inf
-            p = min(p, 2 * float(stdtr(self.sums.count - 1, -t)))
+            scattered = 2 * float(stdtr(self.sums.count - 1, -t))
+            if mean < nearest:
+                scattered = max(scattered, mean_p_value(self.sums, nearest))
+            p = min(p, scattered)
         return min(1.0, p * (1 - VERDICT_CONFIDENCE) / self.level)
 
     @property
@@ -137,7 +161,7 @@ class Look:
 
     def enough(self) -> int:
         """About how many runs would tell whether σ is right within `TOLERANCE`."""
-        runs = _enough(self.right[0] or self.right[1], self.level)
+        runs = _enough(self.right[0] or self.right[1], self.right[1], self.level)
         low, high = self.interval
         if runs <= self.sums.count and low > 0 and math.isfinite(high):  # and they scatter more
             wide = max(-math.log(low), math.log(high)) / (2 * math.log(TOLERANCE))
@@ -167,15 +191,21 @@ def _limits(dof: float, level: float) -> tuple[float, float]:
     return shortfall_limits(dof, level) if dof else (0.0, 0.0)
 
 
+def _unseen(mean: float, dof: float, runs: int) -> float:
+    """By how much `UNSEEN` more runs that are just lost would enlarge the factor of σ²."""
+    return UNSEEN * max(lost_threshold(dof) - mean, 0.0) / (runs + UNSEEN) / dof
+
+
 @lru_cache(maxsize=256)
-def _enough(dof: float, level: float) -> int:
+def _enough(least_dof: float, dof: float, level: float) -> int:
     """Runs whose interval of χ² is within `TOLERANCE` where the mean is off by its error."""
 
     def told(runs: int) -> bool:
-        total = runs * dof
+        total = runs * least_dof
         error = math.sqrt(2 * total)
         least, most = shortfall_limits(total, level)
-        return total + error <= TOLERANCE**2 * least and most <= TOLERANCE**2 * (total - error)
+        high = (total + error) / least + _unseen(dof, dof, runs)
+        return high <= TOLERANCE**2 and most <= TOLERANCE**2 * (total - error)
 
     low, high = 0, 1
     while not told(high):

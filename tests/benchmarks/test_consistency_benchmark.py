@@ -106,7 +106,7 @@ def test_a_row_says_what_was_lost_and_which_means_are_in_the_band():
     nees[:, 4:] *= 1.2  # from step 5
     nees[:20, 9:] = 100.0  # from step 10
     row = benchmark._row("x/y", benchmark.pooled({"4": measured(nees)}), 1)
-    assert row.startswith("| `x/y` | 4 × 1000 | 3.85 | 1.133 [1.087, 1.181] |")
+    assert row.startswith("| `x/y` | 4 × 1000 | 3.85 | 1.133 [1.087, 1.191] |")
     assert "over-confident" in row
     at_steps = row.split("|")[8].split()
     assert all(float(value) > 3.3 for value in at_steps)
