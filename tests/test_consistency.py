@@ -1,6 +1,7 @@
 """Tests of jaxslam.consistency: exact bands, chunking, divergence, resuming, the summary."""
 
 import time
+from collections import Counter
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -13,7 +14,7 @@ from cases import quick_jit
 from scipy.stats import chi2, norm
 
 import jaxslam
-from jaxslam.consistency import FolderStore, MemoryStore, montecarlo, tally
+from jaxslam.consistency import FolderStore, MemoryStore, montecarlo, summary, tally
 from jaxslam.consistency.montecarlo import check_sizes, draw, filter_run
 from jaxslam.consistency.sums import added
 from jaxslam.filters.protocol import AbstractFilter
@@ -317,6 +318,23 @@ def test_the_summary_is_that_of_the_runs():
     assert result["verdict"]["interval99"] == pytest.approx(expected["interval99"])
     assert result["verdict"]["end"]["p"] == pytest.approx(expected["end"]["p"])
     assert tally(study, "inverse_scaling").average.mean == pytest.approx(runs["nees"].mean())
+
+
+def test_a_summary_reads_every_chunk_once_for_sums_and_once_for_so_many_steps(monkeypatch):
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=20, chunk=CHUNK)
+    load, read = study.store.load, []
+
+    def counted(name, chunk, names=None):
+        read.append((name, chunk))
+        return load(name, chunk, names)
+
+    monkeypatch.setattr(study.store, "load", counted)
+    whole = jaxslam.summarise(study)
+    assert Counter(read) == {(n, chunk): 2 for n in study.filters for chunk in study.chunks}
+    monkeypatch.setattr(summary, "_VALUES_AT_ONCE", 20 * 4)  # of the six steps, four and two
+    read.clear()
+    assert jaxslam.summarise(study) == whole
+    assert set(Counter(read).values()) == {3}
 
 
 def test_the_summary_beyond_scale_is_that_of_the_runs():

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,7 +30,8 @@ from jaxslam.statistics.verdict import Tally, lost_runs, sentences
 
 SCHEMA = 1
 _VALUES_AT_ONCE = 10**7
-"""Of which the median holds all runs in memory: of as many steps as this makes."""
+"""Of each record of which medians hold all runs in memory: of as many steps as this makes."""
+_OF_MEDIANS = ("nees", "log_scale", "log_scale_sigma", *SCALE)
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ def summarise(study: Study) -> dict[str, Any]:
 def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
     geometry = study.scenario.world
     dof, n = geometry.tangent_dim, geometry.point_dim
-    sums = _sums(study, name)
+    (sums, lost), medians = _sums_and_lost(study, name), _medians(study, name)
     healthy = study.runs - int(sums["diverged"])
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = sums["nees"] / healthy
@@ -169,16 +170,13 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
 
     seconds = study.seconds[name]
     return {
-        "verdict": {
-            **tally_of(sums, "nees", dof).verdict(),
-            "lost_runs": _lost_runs(study, name, dof),
-        },
+        "verdict": {**tally_of(sums, "nees", dof).verdict(), "lost_runs": lost},
         "dof": dof,
         "calibration": treatment(study.filters[name]),
         "survivors": healthy,
         "band95": [low, high],
         "nees": json_numbers(mean),
-        "nees_median": json_numbers(_median(study, name)),
+        "nees_median": json_numbers(medians.nees),
         "nees_not_lost": json_numbers(kept),
         "lost": json_numbers((sums["lost"] + sums["diverged"]) / study.runs),
         "lost_ever": json_numbers((sums["lost_ever"] + sums["diverged"]) / study.runs),
@@ -195,12 +193,12 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
             "dof": dof,
             "band95": [mean_band(dof - 1, max(healthy, 1))[0], high],
             "nees": json_numbers(sums["beyond_scale"] / max(healthy, 1)),
-            "nees_median": json_numbers(_median(study, name, SCALE, _nees_at_one_scale)),
+            "nees_median": json_numbers(medians.at_one_scale),
             "lost": json_numbers((sums["beyond_lost"] + sums["diverged"]) / study.runs),
             "verdict": tally_of(sums, "beyond_scale", dof).verdict(),
         },
         "scale_drift": _drift(sums, dof),
-        "log_scale": _log_scale(study, name, sums, healthy),
+        "log_scale": _log_scale(sums, medians, healthy),
         "reversed": json_numbers(_ratio(sums["reversed"], sums["displaced"])),
         "landmark_nees": json_numbers(landmark),
         "landmark_dof": n,
@@ -239,7 +237,7 @@ def _drift(sums: Sums, dof: int) -> dict[str, Any]:
     }
 
 
-def _log_scale(study: Study, name: str, sums: dict[str, Any], healthy: int) -> dict[str, Any]:
+def _log_scale(sums: Sums, medians: _Medians, healthy: int) -> dict[str, Any]:
     """Root mean squares over the surviving runs; medians over all."""
 
     def rms(of: str) -> list[float | None]:
@@ -247,9 +245,9 @@ def _log_scale(study: Study, name: str, sums: dict[str, Any], healthy: int) -> d
 
     return {
         "error_rms": rms("squared_log_scale"),
-        "error_median": json_numbers(_median(study, name, ("log_scale",), np.abs)),
+        "error_median": json_numbers(medians.log_scale),
         "sigma": rms("log_scale_variance"),
-        "sigma_median": json_numbers(_median(study, name, ("log_scale_sigma",))),
+        "sigma_median": json_numbers(medians.log_scale_sigma),
         "normalised_rms": rms("normalised_log_scale"),
     }
 
@@ -272,45 +270,49 @@ def tally(study: Study, name: str, record: str = "nees") -> Tally:
     return tally_of(_sums(study, name), record, study.scenario.world.tangent_dim)
 
 
-def _lost_runs(study: Study, name: str, dof: int) -> list[int] | None:
-    """Their numbers; None where not all records are kept."""
-    if study.reduced:
-        return None
-    return [
-        chunk.start + run
-        for chunk in study.chunks
-        for run in lost_runs(study.store.load(name, chunk, ("nees",))["nees"], dof)
-    ]
-
-
 def _sums(study: Study, name: str) -> Sums:
     """Of all chunks."""
-    dof = study.scenario.world.tangent_dim
-    return added(sums_of(kept, dof) for kept in study.loaded(name))
+    return _sums_and_lost(study, name)[0]
 
 
-def _median(
-    study: Study,
-    name: str,
-    records: tuple[str, ...] = ("nees",),
-    of: Callable[..., np.ndarray] = lambda values: values,
-) -> np.ndarray:
-    """Median of what is made of these records, over all runs whose records are kept, diverged ones
-    above everything."""
+def _sums_and_lost(study: Study, name: str) -> tuple[Sums, list[int] | None]:
+    """Of all chunks; and the numbers of lost runs, None where not all records are kept."""
+    dof, lost = study.scenario.world.tangent_dim, []
+
+    def each() -> Iterator[Sums]:
+        for chunk, kept in zip(study.chunks, study.loaded(name), strict=True):
+            if not study.reduced:
+                lost.extend(chunk.start + run for run in lost_runs(kept["nees"], dof))
+            yield sums_of(kept, dof)
+
+    return added(each()), None if study.reduced else lost
+
+
+class _Medians(NamedTuple):
+    """Of every step, over all runs whose records are kept, diverged ones above everything."""
+
+    nees: np.ndarray
+    at_one_scale: np.ndarray
+    log_scale: np.ndarray
+    """Of its error's size."""
+    log_scale_sigma: np.ndarray
+
+
+def _medians(study: Study, name: str) -> _Medians:
+    """Every chunk is read once for as many steps as are held in memory."""
     medians, at_once = [], max(1, _VALUES_AT_ONCE // study.runs)
     for start in range(0, study.scenario.steps, at_once):
-        part = slice(start, start + at_once)
-        columns = []
+        part, columns = slice(start, start + at_once), []
         for chunk in study.whole:
-            kept = study.store.load(name, chunk, ("nees", *records))
-            values = of(*(kept[record] for record in records))
-            columns.append(np.where(survived(kept)[:, None], values, np.inf)[:, part])
-        medians.append(np.median(np.concatenate(columns), axis=0))
-    return np.concatenate(medians)
-
-
-def _nees_at_one_scale(*records: np.ndarray) -> np.ndarray:
-    return one_scale_of(dict(zip(SCALE, records, strict=True))).nees
+            kept = study.store.load(name, chunk, _OF_MEDIANS)
+            survivors = survived(kept)[:, None]
+            values = (
+                kept["nees"], one_scale_of(kept).nees, np.abs(kept["log_scale"]),
+                kept["log_scale_sigma"],
+            )  # fmt: skip
+            columns.append([np.where(survivors, x, np.inf)[:, part] for x in values])
+        medians.append([np.median(np.concatenate(x), axis=0) for x in zip(*columns, strict=True)])
+    return _Medians(*(np.concatenate(x) for x in zip(*medians, strict=True)))
 
 
 def table(summary: dict[str, Any] | Study) -> str:
@@ -334,8 +336,8 @@ def table(summary: dict[str, Any] | Study) -> str:
             f"last of {summary['steps']} steps, {summary['runs']} runs of seed {summary['seed']}; "
             f"a consistent filter has mean NEES {next(iter(filters.values()))['dof']}; verdicts: "
             "of all steps, the last and each third together, [99 % interval]",
-            "lost: NEES above the 99.99 % quantile of χ² now, ever: at any step, with the quantile "
-            "of so many; others: mean of those not lost now",
+            "lost: NEES above the 99.99 % quantile of χ² now; ever: at any step above the higher "
+            "quantile for so many, so that ever may be less; others: mean of those not lost now",
             *(_scale_table(filters, wide) if summary["scale_free"] else ()),
             *_notes(filters),
         ]
