@@ -17,7 +17,7 @@ from jaxslam.filters.wrappers.batch_initialisation import (
     IN_TURN,
     SEARCHES,
     SIZES,
-    FromRest,
+    BatchInitialisation,
     from_rest,
 )
 from jaxslam.models.calibration import Considered
@@ -295,12 +295,12 @@ def test_a_calibration_that_is_not_corrected_is_refused():
 @pytest.mark.parametrize("sizes", [(9, 9), (17, 9), ()])
 def test_windows_that_do_not_grow_are_refused(sizes):
     with pytest.raises(ValueError, match="each larger than the one before"):
-        FromRest(standstill().filter(SUM), sizes, 4)
+        BatchInitialisation(standstill().filter(SUM), sizes, 4)
 
 
 def test_a_search_in_no_direction_is_refused():
     with pytest.raises(ValueError, match="1 direction at least, not 0"):
-        FromRest(standstill().filter(SUM), (9,), 0)
+        BatchInitialisation(standstill().filter(SUM), (9,), 0)
 
 
 def test_windows_grow_up_to_the_frames_that_are_named():

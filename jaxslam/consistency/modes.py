@@ -16,7 +16,7 @@ from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import landmarks_from_above
 from jaxslam.filters.window.minimise import Minimum
 from jaxslam.filters.window.problem import path, residuals
-from jaxslam.filters.wrappers.batch_initialisation import FromRest, RestState
+from jaxslam.filters.wrappers.batch_initialisation import BatchInitialisation, RestState
 from jaxslam.simulation import Room, Run
 from jaxslam.statistics.bands import normalised_squared
 
@@ -48,7 +48,7 @@ def modes_of_run(slam: AbstractFilter, room: Room, run: Run) -> Modes:
     It ends where the sum goes on alone, or where frames of the window are merged. Raises
     ValueError for a filter without such a start.
     """
-    if not isinstance(slam, FromRest):
+    if not isinstance(slam, BatchInitialisation):
         raise ValueError(
             f"modes are those of a start from rest (+rest), not of {type(slam).__name__}"
         )
@@ -57,7 +57,7 @@ def modes_of_run(slam: AbstractFilter, room: Room, run: Run) -> Modes:
     return Modes(*(numbers[: whole.sum()] for numbers in told), nees)
 
 
-def _through(slam: FromRest, room: Room, run: Run) -> tuple[Any, Array, Array, Array]:
+def _through(slam: BatchInitialisation, room: Room, run: Run) -> tuple[Any, Array, Array, Array]:
     def told(state: RestState, _, frame: Frame):
         nees = normalised_squared(*slam.pose_error(state, frame.pose))
         return _told(slam, state), nees, state.record.last, state.open
@@ -69,7 +69,7 @@ _compiled = eqx.filter_jit(_through)
 """Once for all runs of a shape."""
 
 
-def _told(slam: FromRest, state: RestState) -> tuple[Array, ...]:
+def _told(slam: BatchInitialisation, state: RestState) -> tuple[Array, ...]:
     """The fields of `Modes` that are each mode's, of one frame."""
     ekf, record, modes = slam.base.base, state.record, state.modes
 

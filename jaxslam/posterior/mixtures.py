@@ -21,7 +21,7 @@ from jaxslam.filters.initialisation.alternatives import log_density
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.filters.wrappers.bank import Bank, moments
-from jaxslam.filters.wrappers.batch_initialisation import FromRest
+from jaxslam.filters.wrappers.batch_initialisation import BatchInitialisation
 from jaxslam.geometry import Pose, difference
 from jaxslam.posterior.moments import covariance, mean_pose, pose_moments
 
@@ -42,7 +42,7 @@ class PoseMixture(eqx.Module):
 
 def filter_mixture(slam: AbstractFilter, state: Any) -> PoseMixture:
     """T_BC as a filter has it: a Gaussian of every member of its sum; of another filter, one."""
-    if isinstance(slam, FromRest):
+    if isinstance(slam, BatchInitialisation):
         return filter_mixture(slam.base, state.sum)
     if isinstance(slam, Bank):
         of_member = jax.vmap(partial(camera_pose, slam.base))

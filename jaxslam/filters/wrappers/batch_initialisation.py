@@ -67,7 +67,7 @@ class RestState(eqx.Module):
     open: Bool[Array, ""]
 
 
-class FromRest(AbstractStaged):
+class BatchInitialisation(AbstractStaged):
     """The start of `base`."""
 
     base: Mixture
@@ -254,7 +254,7 @@ def _check_base(ekf: EkfSlam) -> None:
             raise ValueError(f"a start from rest is {why}")
 
 
-def from_rest(base: Mixture, frames: int | None = None) -> FromRest:
+def from_rest(base: Mixture, frames: int | None = None) -> BatchInitialisation:
     """The sum with a start that looks for itself how the camera moves, within so many frames after
     frame 0. Raises ValueError for what does not go together."""
     inner = innermost(base)
@@ -262,4 +262,4 @@ def from_rest(base: Mixture, frames: int | None = None) -> FromRest:
     sizes = SIZES[name]
     if frames is not None:
         sizes = (*(size for size in sizes if size < frames + 1), frames + 1)
-    return FromRest(base, sizes, DIRECTIONS[name])
+    return BatchInitialisation(base, sizes, DIRECTIONS[name])
