@@ -29,7 +29,7 @@ from jaxslam.filters.wrappers.adaptive_process_noise import MEMORY, FittedNoise
 from jaxslam.filters.wrappers.bank import Bank
 from jaxslam.filters.wrappers.batch_initialisation import from_rest
 from jaxslam.filters.wrappers.fixed_lag import LAG, FixedLag, iterated
-from jaxslam.filters.wrappers.gated import Checked
+from jaxslam.filters.wrappers.gated import Gated
 from jaxslam.filters.wrappers.mixture import Mixture
 from jaxslam.landmarks import LANDMARKS, Parametrization
 from jaxslam.models.calibration import AbstractCalibration
@@ -161,7 +161,7 @@ _AROUND_ANY_FILTER: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
     "mixture": lambda slam, count: Mixture(slam, 9 if count is None else count),
     "rest": from_rest,
     "noise": lambda slam, frames: FittedNoise(slam, MEMORY if frames is None else frames),
-    "checked": lambda slam, percent: Checked(
+    "checked": lambda slam, percent: Gated(
         slam, tolerance=TOLERANCE if percent is None else percent / 100
     ),
 }

@@ -18,7 +18,7 @@ from jaxslam.geometry import Pose
 from jaxslam.models.observations import Capacity, Features, Innovation
 
 
-class Checked(AbstractStaged):
+class Gated(AbstractStaged):
     """`base`, whose updates are by the features that an `Association` believes; its state."""
 
     base: AbstractStaged
