@@ -14,7 +14,7 @@ from scipy.stats import multivariate_normal
 from jaxslam.consistency.recursion import run_through
 from jaxslam.filters.wrappers.adaptive_process_noise import (
     FACTORS,
-    FittedNoise,
+    AdaptiveProcessNoise,
     _foreseen,
     _heard,
     _told,
@@ -35,7 +35,7 @@ def octaves(told):
     filter that is told so many times the σ with which the worlds move."""
     of = world()
     slam = of.filter("scale_gauge+noise")
-    assert isinstance(slam, FittedNoise)
+    assert isinstance(slam, AdaptiveProcessNoise)
     sigma = told * np.asarray(slam.base.motion.noise_sigma)
     slam = eqx.tree_at(lambda slam: slam.base.motion.noise_sigma, slam, sigma)
 

@@ -25,7 +25,7 @@ from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.remedies.first_estimates import FirstEstimates
 from jaxslam.filters.remedies.invariant import Invariant
 from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
-from jaxslam.filters.wrappers.adaptive_process_noise import MEMORY, FittedNoise
+from jaxslam.filters.wrappers.adaptive_process_noise import MEMORY, AdaptiveProcessNoise
 from jaxslam.filters.wrappers.bank import Bank
 from jaxslam.filters.wrappers.batch_initialisation import from_rest
 from jaxslam.filters.wrappers.fixed_lag import LAG, FixedLag, iterated
@@ -160,7 +160,7 @@ _AROUND_ANY_FILTER: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
     "directions": lambda slam, count: Bank(slam, 5 if count is None else count, "direction"),
     "mixture": lambda slam, count: Mixture(slam, 9 if count is None else count),
     "rest": from_rest,
-    "noise": lambda slam, frames: FittedNoise(slam, MEMORY if frames is None else frames),
+    "noise": lambda slam, frames: AdaptiveProcessNoise(slam, MEMORY if frames is None else frames),
     "checked": lambda slam, percent: Gated(
         slam, tolerance=TOLERANCE if percent is None else percent / 100
     ),

@@ -53,7 +53,7 @@ class NoiseState(eqx.Module):
     """What the filter had predicted of the velocity."""
 
 
-class FittedNoise(AbstractStaged):
+class AdaptiveProcessNoise(AbstractStaged):
     """`base` with a process noise whose two sizes are estimated."""
 
     base: AbstractStaged
