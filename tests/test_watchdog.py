@@ -67,7 +67,7 @@ def test_batched_lapack_ends_too_and_if_by_the_watchdog_says_where():
     """On jaxlib 0.10 it stands still on two processors; a jaxlib that does not may end well."""
     done = run("lapack", 2)
     if done.returncode != 0:
-        assert "StandsStill: six factorisations stands still: no thread has worked" in done.stderr
+        assert "DeadlockError: six factorisations stands still: no thread has worked" in done.stderr
 
 
 def test_the_watchdog_does_not_bark_at_what_works(monkeypatch):

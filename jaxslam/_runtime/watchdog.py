@@ -29,12 +29,12 @@ LAPACK = {"cholesky", "triangular_solve", "eigh", "eig", "svd", "qr", "geqrf", "
 """JAX's primitives that are LAPACK's kernels on a CPU."""
 
 
-class StandsStill(RuntimeError):
+class DeadlockError(RuntimeError):
     """A computation whose threads all sleep."""
 
 
 def finished(values: Values, where: str, patience: float = PATIENCE) -> Values:
-    """The arrays once they are computed; raises `StandsStill` if nothing works on them any more.
+    """The arrays once they are computed; raises `DeadlockError` if nothing works on them any more.
 
     What is watched is the processor time of this process, not the clock: a long computation is no
     dead-lock. On an accelerator the work is elsewhere, and nothing is watched. Threads that stand
@@ -58,7 +58,7 @@ def finished(values: Values, where: str, patience: float = PATIENCE) -> Values:
         looked, worked = now, time.process_time()
         if idle >= patience:
             atexit.register(_leave)
-            raise StandsStill(
+            raise DeadlockError(
                 f"{where} stands still: no thread has worked for {idle:.0f} s. Batched LAPACK "
                 "calls do this on few processors: where they are in code of your own, use "
                 "jaxslam._numerics.linalg, or set NPROC=8 in the environment"
