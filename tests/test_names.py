@@ -6,7 +6,7 @@ import pytest
 
 from jaxslam._runtime.lookup import chosen
 from jaxslam.consistency import monte_carlo, summarise, table
-from jaxslam.filters.ekf import AtOnce, EkfSlam, innermost
+from jaxslam.filters.ekf import EkfSlam, Undelayed, innermost
 from jaxslam.filters.protocol import AbstractStaged
 from jaxslam.filters.registry import CANNOT_TRACK, FILTERS, MODIFIERS, make_filters
 from jaxslam.landmarks import LANDMARKS
@@ -73,7 +73,9 @@ def tracks(name: str) -> bool:
     landmark = "cartesian" if name in of_points else "inverse_scaling"
     (slam,) = make_filters("matched-6dof", name, landmark).values()
     inner = innermost(slam)
-    return isinstance(slam, AbstractStaged) and (inner is None or isinstance(inner.entry, AtOnce))
+    return isinstance(slam, AbstractStaged) and (
+        inner is None or isinstance(inner.entry, Undelayed)
+    )
 
 
 def test_the_filters_that_cannot_track_are_those_that_the_error_names():

@@ -68,7 +68,7 @@ class AbstractEntry(eqx.Module):
         """Which landmarks are in the map as one Gaussian."""
 
 
-class AtOnce(AbstractEntry):
+class Undelayed(AbstractEntry):
     """A landmark is a Gaussian from its first measurement on (P22–P26)."""
 
     def slots(self, landmarks):
@@ -112,7 +112,7 @@ class EkfSlam(AbstractStaged):
     """The unit of length in the state."""
     form: AbstractForm = Covariance()
     """How the uncertainty is kept; a remedy is a form."""
-    entry: AbstractEntry = AtOnce()
+    entry: AbstractEntry = Undelayed()
     """How landmarks enter the map."""
 
     def __check_init__(self) -> None:
@@ -359,7 +359,7 @@ def check_one_gaussian(base: Any, what: str, remedies: bool = False) -> None:
     plain = type(base.form) is Covariance or (remedies and base.form.divisible)
     for wrong, why in (
         (not plain, "is for filters in covariance form"),
-        (not isinstance(base.entry, AtOnce), "does not know delayed landmarks"),
+        (not isinstance(base.entry, Undelayed), "does not know delayed landmarks"),
         (base.landmark.convert is not None, f"cannot switch the form of {base.landmark.name}"),
     ):
         if wrong:
@@ -480,7 +480,7 @@ def _check_gauge(slam: EkfSlam) -> None:
 
 def _check_entry(slam: EkfSlam) -> None:
     """Delayed initialisations have depths of their own, in metres, in place of the prior."""
-    if isinstance(slam.entry, AtOnce):
+    if isinstance(slam.entry, Undelayed):
         return
     for wrong, what in (
         (slam.depth.common is not None, "depths with a common part"),

@@ -19,7 +19,7 @@ from jaxslam._numerics.arrays import cast
 from jaxslam._runtime.files import one_line
 from jaxslam._runtime.programs import Program, in_background
 from jaxslam.filters.association import ASSOCIATIONS, Association, candidates, one_point_ransac
-from jaxslam.filters.ekf import AtOnce, EkfSlam, begun, innermost
+from jaxslam.filters.ekf import EkfSlam, Undelayed, begun, innermost
 from jaxslam.filters.protocol import AbstractStaged, Scene
 from jaxslam.filters.readouts import (
     camera_pose_in_unit,
@@ -182,7 +182,7 @@ class Tracker:
             )
         made = self.settings.make_filter(self.calibration) if self.filter is None else self.filter
         inner = innermost(made)
-        delayed = inner is not None and not isinstance(inner.entry, AtOnce)
+        delayed = inner is not None and not isinstance(inner.entry, Undelayed)
         if not isinstance(made, AbstractStaged) or delayed:
             raise ValueError(
                 f"filter {self.filter_name} cannot track: features are sought where a Gaussian "

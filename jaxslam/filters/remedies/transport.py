@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.linalg import eigh
-from jaxslam.filters.ekf import AtOnce
+from jaxslam.filters.ekf import Undelayed
 from jaxslam.models.scale import ScaleGauge
 
 _SINGULAR = 1e-12
@@ -38,7 +38,7 @@ def check_metric(slam: Any, remedy: str) -> None:
 
 def check_undelayed(slam: Any, remedy: str) -> None:
     """Raise ValueError unless landmarks are in the state from their first measurement on."""
-    if not isinstance(slam.entry, AtOnce):
+    if not isinstance(slam.entry, Undelayed):
         raise ValueError(f"{remedy} is for undelayed landmarks")
 
 
