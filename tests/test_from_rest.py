@@ -177,14 +177,14 @@ def test_standing_teaches_nothing_and_then_the_motion_is_found():
 @pytest.mark.parametrize("around", ["", "+checked", "+noise", "+checked+noise", "+noise+checked"])
 def test_what_stands_around_a_start_from_rest_says_what_it_says(around):
     slam: Any = standstill().filter(f"{STARTED}{around}")
-    assert slam.sets_out_anywhere
+    assert slam.ambiguous_start
     state = slam.init(standstill().capacity)
     for standing in (False, True):
         told = jnp.asarray(standing)
         state = eqx.tree_at(lambda s: getattr(s, "inner", s).record.standing, state, told)
         assert slam.moving(state) == (not standing)
     slam = standstill().filter(f"{SUM}{around}")
-    assert not slam.sets_out_anywhere
+    assert not slam.ambiguous_start
     assert slam.moving(slam.init(standstill().capacity))
 
 

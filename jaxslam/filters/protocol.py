@@ -100,11 +100,11 @@ class AbstractStaged(AbstractFilter):
     """A filter whose frame can be taken in stages: all that a tracker asks for."""
 
     @property
-    def sets_out_anywhere(self) -> bool:
+    def ambiguous_start(self) -> bool:
         """Whether measurements of a start that no linear prediction expects are welcome: the filter
         finds by itself what explains them. What stands around a filter, its `base`, does as that
         does."""
-        return getattr(getattr(self, "base", None), "sets_out_anywhere", False)
+        return getattr(getattr(self, "base", None), "ambiguous_start", False)
 
     @abstractmethod
     def predict(self, state: Any, control: Any) -> Any:

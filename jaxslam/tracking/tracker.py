@@ -207,7 +207,7 @@ class Tracker:
         self._near: Nearness = {}
         self._unmeasured = 0
         self._proven = self._elsewhere = 0.0
-        self._sets_out = made.sets_out_anywhere
+        self._sets_out = made.ambiguous_start
         with jax.enable_x64(True):
             self._slam: AbstractStaged = cast(made, jnp.float64)
             self._state = self._empty_state()
@@ -489,7 +489,7 @@ class Tracker:
 
         Where ellipses are wide, depth and direction make of a prediction what is not linear: those
         that agree but for that, and with one motion, are what a linear test is given. One that puts
-        out most of them is not believed: the filter `sets_out_anywhere`.
+        out most of them is not believed: the filter `ambiguous_start`.
         """
         for association in self._in_wide:
             believed = self._believed(predicted, dt, slots[owner], pixels, association)

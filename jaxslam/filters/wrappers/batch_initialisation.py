@@ -91,7 +91,7 @@ class BatchInitialisation(AbstractStaged):
             raise ValueError(f"a search sets out in 1 direction at least, not {self.directions}")
 
     @property
-    def sets_out_anywhere(self) -> bool:
+    def ambiguous_start(self) -> bool:
         """It does: the window looks for what explains a start."""
         return True
 
