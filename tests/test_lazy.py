@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam._numerics import conditional as lazy
-from jaxslam._numerics.conditional import at_places, each_alive, of_alive, repeated, when
+from jaxslam._numerics.conditional import at_places, map_where, of_alive, repeated, when
 
 BATCH, PLACES = 20, 5
 
@@ -62,7 +62,7 @@ def test_what_nobody_in_a_batch_wants_is_not_done(wanted):
 def test_only_the_living_are_worked_on():
     found, alive = [], jnp.array([True, False, False, True])
     values = jnp.arange(4.0)
-    after = done(jax.jit(lambda alive: each_alive(counted(found), values, alive))(alive))
+    after = done(jax.jit(lambda alive: map_where(counted(found), values, alive))(alive))
     np.testing.assert_array_equal(after, jnp.where(alive, 2 * values, values))
     assert len(found) == 2
 
@@ -73,7 +73,7 @@ def test_a_batch_is_worked_on_in_blocks_of_those_alive_wherever_they_are():
         jnp.zeros((16, 4), bool).at[jnp.array([2, 7, 7]), jnp.array([0, 1, 3])].set(True),
     )
     values = jnp.arange(64.0).reshape(16, 4)
-    after = done(jax.jit(jax.vmap(lambda v, a: each_alive(counted(found), v, a)))(values, alive))
+    after = done(jax.jit(jax.vmap(lambda v, a: map_where(counted(found), v, a)))(values, alive))
     np.testing.assert_array_equal(after, jnp.where(alive, 2 * values, values))
     assert len(found) == 16  # one block, and not 64
 
@@ -82,15 +82,15 @@ def test_a_batch_is_worked_on_in_blocks_of_those_alive_wherever_they_are():
 def test_a_batch_gives_what_each_gives_alone(least, monkeypatch):
     monkeypatch.setattr(lazy, "LEAST", least)
     values, alive, by = drawn()
-    in_batch = jax.jit(jax.vmap(lambda *given: each_alive(moved, *given)))(values, alive, by)
+    in_batch = jax.jit(jax.vmap(lambda *given: map_where(moved, *given)))(values, alive, by)
     check(in_batch, values, alive, by)
-    one_by_one = jax.jit(lambda *batch: jax.lax.map(lambda given: each_alive(moved, *given), batch))
+    one_by_one = jax.jit(lambda *batch: jax.lax.map(lambda given: map_where(moved, *given), batch))
     check(one_by_one(values, alive, by), values, alive, by)
 
 
 def test_what_a_function_is_closed_over_may_be_of_the_batch():
     def closed(values, alive, by):
-        return each_alive(lambda value: moved(value, by), values, alive)
+        return map_where(lambda value: moved(value, by), values, alive)
 
     values, alive, by = drawn()
     check(jax.jit(jax.vmap(closed))(values, alive, by), values, alive, by)
@@ -99,7 +99,7 @@ def test_what_a_function_is_closed_over_may_be_of_the_batch():
 def test_batches_of_batches():
     values, alive, by = drawn()
     parts = jax.tree.map(lambda x: x.reshape(4, -1, *x.shape[1:]), (values, alive, by))
-    after = jax.jit(jax.vmap(jax.vmap(lambda *given: each_alive(moved, *given))))(*parts)
+    after = jax.jit(jax.vmap(jax.vmap(lambda *given: map_where(moved, *given))))(*parts)
     check(jax.tree.map(lambda x: x.reshape(BATCH, *x.shape[2:]), after), values, alive, by)
 
 

@@ -30,11 +30,11 @@ def when(
 ) -> Value:
     """`function(value, *given)` if it is wanted, else the value."""
     one = jax.tree.map(lambda x: jnp.asarray(x)[None], value)
-    after = each_alive(function, one, wanted[None], *given)
+    after = map_where(function, one, wanted[None], *given)
     return jax.tree.map(lambda x: x[0], after)
 
 
-def each_alive(
+def map_where(
     function: Callable[..., Value], values: Value, alive: Bool[Array, " k"], *given: Any
 ) -> Value:
     """`function(value, *given)` of every value that is alive; the others stay as they are.

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxslam._numerics.conditional import each_alive
+from jaxslam._numerics.conditional import map_where
 from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.minimise import Minimum, minimised, started, turned
@@ -80,7 +80,7 @@ def starts(
         x, y = start
         return turned(slam, record, x, y), y
 
-    return jax.vmap(started)(*each_alive(fitted, (x, y), wanted, record))
+    return jax.vmap(started)(*map_where(fitted, (x, y), wanted, record))
 
 
 def reversed_(slam: EkfSlam, at: Minimum) -> tuple[Float[Array, " N"], Float[Array, "m q"]]:
@@ -116,7 +116,7 @@ def sought(
     def further(both, record):
         return minimised(slam, record, *both), both[1]
 
-    minima, _ = each_alive(further, (minima, most), alive, record)
+    minima, _ = map_where(further, (minima, most), alive, record)
     after = _likeliest(slam, record, minima, alive, len(modes.log_weights))
     explained = jnp.isfinite(after.log_weights[0])
     return jax.tree.map(lambda new, old: jnp.where(explained, new, old), after, modes), explained
@@ -149,7 +149,7 @@ def _likeliest(slam, record, minima: Minimum, alive: Bool[Array, " k"], count: i
     begun = Weighed(
         minima, none, jnp.zeros(k, none.dtype), jnp.zeros((k, size, size), minima.x.dtype)
     )
-    _, value, shift, information = each_alive(
+    _, value, shift, information = map_where(
         lambda weighed, record: _weighed(slam, weighed, record), begun, alive, record
     )
     best_first = jnp.argsort(-value)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.arrays import AnyArray, cast, precision
-from jaxslam._numerics.conditional import each_alive, when
+from jaxslam._numerics.conditional import map_where, when
 from jaxslam.filters.ekf import EkfSlam, innermost
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.protocol import AbstractStaged, Expected
@@ -239,7 +239,7 @@ def _members(ekf: EkfSlam, record: Record, modes: Modes, members: State, like: S
         return mode, shift, gauge_state(ekf, record, mode, shift, like)
 
     alive = jnp.isfinite(modes.log_weights)
-    return each_alive(begun, (modes.minima, modes.shifts, members), alive, record, like)[2]
+    return map_where(begun, (modes.minima, modes.shifts, members), alive, record, like)[2]
 
 
 def _check_base(ekf: EkfSlam) -> None:

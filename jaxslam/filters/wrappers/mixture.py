@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.arrays import AnyArray
-from jaxslam._numerics.conditional import at_places, each_alive, of_alive, repeated, zeros
+from jaxslam._numerics.conditional import at_places, map_where, of_alive, repeated, zeros
 from jaxslam._numerics.linalg import cholesky, eigh
 from jaxslam.filters.ekf import EkfSlam, append_noise, check_one_gaussian, composed_first
 from jaxslam.filters.forms.blocks import shifted
@@ -111,11 +111,11 @@ class Mixture(Bank, AbstractStaged):
         """Every member after a step with measurements, weighed by what it did not expect."""
         told = jax.eval_shape(step, _of(state.members, 0))[1]
         both = state.members, zeros(told, self.count)
-        members, innovations = each_alive(lambda both: step(both[0]), both, state.alive)
+        members, innovations = map_where(lambda both: step(both[0]), both, state.alive)
         return self._weighed(members, state.log_weights, innovations)
 
     def _each(self, function, state: BankState, *data: Any) -> BankState:
-        members = each_alive(function, state.members, state.alive, *data)
+        members = map_where(function, state.members, state.alive, *data)
         return BankState(members, state.log_weights)
 
     def compose(self, state: BankState, control: Any) -> BankState:
