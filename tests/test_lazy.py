@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam._numerics import conditional as lazy
-from jaxslam._numerics.conditional import at_places, map_where, of_alive, repeated, when
+from jaxslam._numerics.conditional import at_places, map_or_zero, map_where, repeated, when
 
 BATCH, PLACES = 20, 5
 
@@ -106,7 +106,7 @@ def test_batches_of_batches():
 def test_what_is_not_alive_has_no_result():
     values, alive, by = drawn()
     values["x"] = jnp.where(alive[..., None], values["x"], jnp.nan)
-    after = jax.jit(jax.vmap(lambda v, a, b: of_alive(moved, v, a, b)["x"]))(values, alive, by)
+    after = jax.jit(jax.vmap(lambda v, a, b: map_or_zero(moved, v, a, b)["x"]))(values, alive, by)
     expected = jnp.where(alive[..., None], by[:, None, None] * values["x"] + 1, 0.0)
     np.testing.assert_allclose(after, expected, rtol=1e-12)
 

@@ -49,7 +49,7 @@ def map_where(
     return at_places(_of_one(alone), values, _each_place(alive), alive, (), given)
 
 
-def of_alive(
+def map_or_zero(
     function: Callable[..., Any], values: Any, alive: Bool[Array, " k"], *given: Any
 ) -> Any:
     """`function(value, *given)` of every value that is alive; zeros for the others."""

@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.arrays import AnyArray
-from jaxslam._numerics.conditional import at_places, map_where, of_alive, repeated, zeros
+from jaxslam._numerics.conditional import at_places, map_or_zero, map_where, repeated, zeros
 from jaxslam._numerics.linalg import cholesky, eigh
 from jaxslam.filters.ekf import EkfSlam, append_noise, check_one_gaussian, composed_first
 from jaxslam.filters.forms.blocks import shifted
@@ -194,7 +194,7 @@ def _described(pixels: Pixels, member: State) -> tuple[Array, Array, Array]:
 
 
 def _parts(pixels: Pixels, state: BankState) -> _Parts:
-    return _Parts(state, *of_alive(partial(_described, pixels), state.members, state.alive))
+    return _Parts(state, *map_or_zero(partial(_described, pixels), state.members, state.alive))
 
 
 def _split_and_merged(pixels: Pixels, parts: _Parts) -> tuple[_Parts, Bool[Array, ""]]:
