@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 
 @dataclass(frozen=True)
-class Located:
+class PoseWithCovariance:
     """A pose and the covariance P of its error; by default the origin, known exactly."""
 
     T_wc: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
@@ -35,7 +35,7 @@ class Located:
         R = self.T_wc[:3, :3]
         return R @ self.covariance[:3, :3] @ R.T
 
-    def then(self, step: Located) -> Located:
+    def then(self, step: PoseWithCovariance) -> PoseWithCovariance:
         """The pose `T_wc T_step`, of a camera that is located relative to this one.
 
         `T Exp(e) T_s Exp(s) = T T_s Exp(A e) Exp(s)` with `A = Ad(T_s⁻¹)`, so that the covariance
@@ -43,13 +43,15 @@ class Located:
         """
         A = adjoint(np.linalg.inv(step.T_wc))
         carried = A @ self.covariance @ A.T
-        return Located(self.T_wc @ step.T_wc, (carried + carried.T) / 2 + step.covariance)
+        return PoseWithCovariance(
+            self.T_wc @ step.T_wc, (carried + carried.T) / 2 + step.covariance
+        )
 
-    def scaled(self, scale: float) -> Located:
+    def scaled(self, scale: float) -> PoseWithCovariance:
         """In a unit of length that is 1/scale as long."""
         T_wc, lengths = self.T_wc.copy(), np.array([scale] * 3 + [1.0] * 3)
         T_wc[:3, 3] *= scale
-        return Located(T_wc, lengths[:, None] * self.covariance * lengths)
+        return PoseWithCovariance(T_wc, lengths[:, None] * self.covariance * lengths)
 
     def points(
         self, points: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]

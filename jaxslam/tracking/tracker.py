@@ -38,7 +38,7 @@ from jaxslam.models.sensors import Pinhole
 from jaxslam.tracking.corners import detect_corners
 from jaxslam.tracking.epipolar import MINIMAL, of_one_motion
 from jaxslam.tracking.landmarks import NO_POINTS, Landmark, Points, joined, stacked, unstacked
-from jaxslam.tracking.located import Located
+from jaxslam.tracking.located import PoseWithCovariance
 from jaxslam.tracking.map import Prediction, failing, in_view, note_found, to_search, worst_first
 from jaxslam.tracking.matching import PEAKS, Match, match_patches
 from jaxslam.tracking.patches import Patch
@@ -78,7 +78,7 @@ class Tracked:
 
     index: int
     time: float
-    camera: Located
+    camera: PoseWithCovariance
     """The camera in the world, which is the first camera; of a later map, by way of its start. All
     of a map in one unit (docs/gauge.md), and the covariance is of the pose in that unit."""
     predicted: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
@@ -200,7 +200,7 @@ class Tracker:
                 "landmarks are wanted"
             )
         self._time: float | None = None
-        self._origin = self._camera = Located()
+        self._origin = self._camera = PoseWithCovariance()
         self._log_unit = self._log_scale = 0.0
         self._sigma_log_scale: float | None = None
         self._unit_fixed = True
@@ -350,7 +350,7 @@ class Tracker:
         tracker.landmarks = unstacked(arrays)
         tracker.finished = [Points(*(arrays[name] for name in Points._fields))]
         tracker._origin, tracker._camera = (
-            Located(arrays[f"poses/{i}"], arrays[f"poses/{i + 1}"]) for i in (0, 2)
+            PoseWithCovariance(arrays[f"poses/{i}"], arrays[f"poses/{i + 1}"]) for i in (0, 2)
         )
         with jax.enable_x64(True):
             tracker._state = grown(tracker._state, arrays, "state")
@@ -686,7 +686,7 @@ class Tracker:
             found = [one.number for one in self.landmarks.values() if one.found]
             self._log_unit += lengthened(self._near, self._nearness(), found)
         self._unit_fixed = bool(fixed)
-        here = Located(pose, covariance).scaled(np.exp(self._log_unit))
+        here = PoseWithCovariance(pose, covariance).scaled(np.exp(self._log_unit))
         self._camera = self._origin.then(here)
         self._log_scale = float(log_scale) - self._log_unit
         self._sigma_log_scale = float(np.sqrt(variance)) if variance > 0 else None
@@ -704,7 +704,7 @@ class Tracker:
         points, covariances = seen[0][slots] * unit, seen[1][slots] * unit**2
         numbers = np.array([self.landmarks[slot].number for slot in slots], int)
         maps = np.full_like(numbers, self.restarts)
-        _, in_map = Located(self._origin.T_wc).points(points, covariances)
+        _, in_map = PoseWithCovariance(self._origin.T_wc).points(points, covariances)
         return Points(numbers, maps, *self._origin.points(points, covariances), in_map)
 
     def _tracked(self, frame: Frame, **found) -> Tracked:

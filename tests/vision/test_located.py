@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxslam.geometry import exp, jacobian
 from jaxslam.io.tum import poses
-from jaxslam.tracking.located import Located, adjoint
+from jaxslam.tracking.located import PoseWithCovariance, adjoint
 
 
 def located(seed, sigma):
@@ -16,7 +16,7 @@ def located(seed, sigma):
     rng = np.random.default_rng(seed)
     pose = poses(rng.normal(0, 2, 3), Rotation.from_rotvec(rng.normal(0, 0.7, 3)).as_quat())[0]
     root = sigma * rng.normal(size=(6, 6))
-    return Located(pose, root @ root.T)
+    return PoseWithCovariance(pose, root @ root.T)
 
 
 def as_pose(matrix):
@@ -65,7 +65,7 @@ def test_what_follows_is_known_no_better_than_what_it_follows():
 
 def test_an_exactly_known_origin_changes_nothing():
     step = located(7, 0.1)
-    both = Located().then(step)
+    both = PoseWithCovariance().then(step)
     np.testing.assert_allclose(both.T_wc, step.T_wc, rtol=0, atol=1e-15)
     np.testing.assert_allclose(both.covariance, step.covariance, rtol=0, atol=1e-15)
     assert both.sigma_position == pytest.approx(np.sqrt(np.trace(step.covariance[:3, :3])))

@@ -25,7 +25,7 @@ from jaxslam.io.tum import read_tum
 from jaxslam.models.observations import Status
 from jaxslam.tracking import tracker as programs
 from jaxslam.tracking.landmarks import Landmark
-from jaxslam.tracking.located import Located, adjoint
+from jaxslam.tracking.located import PoseWithCovariance, adjoint
 from jaxslam.tracking.patches import STORED, Patch
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
@@ -171,7 +171,7 @@ def test_only_what_is_proven_and_moves_alike_contradicts_the_map():
 
 def test_innovations_are_of_all_that_was_found_believed_or_not(tracked):
     one = Tracked(
-        0, 0.0, Located(),
+        0, 0.0, PoseWithCovariance(),
         predicted=np.array([[10.0, 20.0], [5.0, 5.0], [0.0, 0.0]]),
         search=np.stack([np.diag([4.0, 1.0]), np.eye(2), np.array([[2.0, 1.0], [1.0, 2.0]])]),
         matched=np.array([[12.0, 21.0], [np.nan, np.nan], [1.0, 1.0]]),

@@ -16,7 +16,7 @@ import jaxslam
 from jaxslam.filters.protocol import Scene
 from jaxslam.geometry import scaled
 from jaxslam.tracking import tracker as programs
-from jaxslam.tracking.located import Located, adjoint
+from jaxslam.tracking.located import PoseWithCovariance, adjoint
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.track import write_frames
@@ -262,7 +262,7 @@ def test_the_unit_is_told_by_landmarks_that_were_found_again_until_it_is_fixed()
     landmarks = {0: SimpleNamespace(number=7, found=2), 1: SimpleNamespace(number=8, found=0)}
     tracker: Any = SimpleNamespace(
         landmarks=landmarks, _near={7: 1.0, 8: 1.0}, _nearness=lambda: {7: 2.0, 8: 50.0},
-        _origin=Located(np.eye(4)), _log_unit=0.3, _unit_fixed=False,
+        _origin=PoseWithCovariance(np.eye(4)), _log_unit=0.3, _unit_fixed=False,
     )  # fmt: skip
     for fixed, units in ((False, 1), (True, 2), (True, 2)):
         Tracker._locate(tracker, np.eye(4), np.zeros((6, 6)), 1.0, 0.0, fixed, begins=False)
@@ -276,14 +276,14 @@ def test_a_pose_in_another_unit_has_the_errors_in_that_unit():
     root = rng.normal(size=(6, 6))
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.normal(size=3)
-    here = Located(T, root @ root.T)
+    here = PoseWithCovariance(T, root @ root.T)
     there = here.scaled(2.5)
     np.testing.assert_allclose(there.T_wc[:3, 3], 2.5 * T[:3, 3], rtol=1e-12)
     np.testing.assert_array_equal(there.T_wc[:3, :3], T[:3, :3])
     D = np.diag([2.5] * 3 + [1.0] * 3)
     np.testing.assert_allclose(there.covariance, D @ root @ root.T @ D, rtol=1e-12)
     # Carried on by a step, it is the same before and after.
-    step = Located(np.linalg.inv(T), root.T @ root)
+    step = PoseWithCovariance(np.linalg.inv(T), root.T @ root)
     one, other = here.then(step).scaled(2.5), there.then(step.scaled(2.5))
     np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-9, atol=1e-9)
     assert adjoint(there.T_wc).shape == (6, 6)
