@@ -68,7 +68,7 @@ class Target:
         return np.array([point.position for point in self.points])
 
 
-class Sighting(NamedTuple):
+class TargetObservation(NamedTuple):
     """Where a picture shows a target, and how far away its points are."""
 
     pixels: Float[np.ndarray, "n 2"]
@@ -132,7 +132,7 @@ def sighted(
     image: UInt8[np.ndarray, "h w"],
     calibration: Calibration,
     pixel_sigma: float,
-) -> Sighting:
+) -> TargetObservation:
     """The target in a picture, its pixels measured with `pixel_sigma`.
 
     Patches are sought all over the picture; of the places where they may be, those are taken
@@ -227,7 +227,7 @@ def _sighting(
     lens: _Lens,
     pose: _Pose,
     pixel_sigma: float,
-) -> Sighting:
+) -> TargetObservation:
     turn, shift = cv2.solvePnPRefineLM(positions, pixels, *lens, pose.turn, pose.shift)
     J = cv2.projectPoints(positions, turn, shift, *lens)[1][:, :6]
     covariance = pixel_sigma**2 * np.linalg.pinv(J.T @ J)
@@ -236,7 +236,7 @@ def _sighting(
     T_ct[:3, :3], T_ct[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
     # n diag(P) ≥ P for any covariance P of n numbers.
     sigma = np.sqrt(len(depths)) * _depth_sigma(positions, turn, covariance) / depths**2
-    return Sighting(pixels, T_ct, 1 / depths, sigma, pose.rms)
+    return TargetObservation(pixels, T_ct, 1 / depths, sigma, pose.rms)
 
 
 def _depth_sigma(
@@ -250,7 +250,7 @@ def _depth_sigma(
 
 
 def known_depths(
-    sighting: Sighting, count: int, mean: float, sigma: float
+    sighting: TargetObservation, count: int, mean: float, sigma: float
 ) -> tuple[Float[np.ndarray, "count 1"], Float[np.ndarray, "count 1"]]:
     """Mean and σ of 1/z of so many new landmarks: the target's points, then others."""
     others = count - len(sighting.sigma)
@@ -258,7 +258,7 @@ def known_depths(
     return means[:, None], np.append(sighting.sigma, np.full(others, sigma))[:, None]
 
 
-def as_summary(target: Target, sighting: Sighting) -> dict[str, Any]:
+def as_summary(target: Target, sighting: TargetObservation) -> dict[str, Any]:
     """For summary.json: lengths in metres, the target's frame in the first camera."""
     names: Sequence[str] = [point.name for point in target.points]
     return {

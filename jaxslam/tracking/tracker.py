@@ -44,7 +44,7 @@ from jaxslam.tracking.matching import PEAKS, Match, match_patches
 from jaxslam.tracking.patches import Patch
 from jaxslam.tracking.resume import grown, leaves, read_record, write_record
 from jaxslam.tracking.settings import TrackerSettings
-from jaxslam.tracking.target import Sighting, Target, known_depths, sighted
+from jaxslam.tracking.target import Target, TargetObservation, known_depths, sighted
 from jaxslam.tracking.unit import Nearness, lengthened, nearness
 
 LEAST_MATCHES = 4
@@ -155,7 +155,7 @@ class Tracker:
     target: Target | None = None
     """Points of known positions, m, that the first frame sees: then the first map is in metres, the
     unit of `nearest_depth`. For an `EkfSlam` in metres, whose depths have nothing in common."""
-    sighting: Sighting | None = field(default=None, init=False)
+    sighting: TargetObservation | None = field(default=None, init=False)
     """Where the first frame saw the target."""
     landmarks: dict[int, Landmark] = field(default_factory=dict, init=False)
     """Those in the map, by their slot of the state."""
