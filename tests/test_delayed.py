@@ -14,7 +14,7 @@ from jaxslam.filters.ekf import correct
 from jaxslam.filters.initialisation import rays
 from jaxslam.filters.initialisation.alternatives import log_density
 from jaxslam.filters.initialisation.depth_particles import DepthParticles
-from jaxslam.filters.initialisation.rays import GaussianSum
+from jaxslam.filters.initialisation.rays import RaySum
 from jaxslam.filters.readouts import landmarks_in_camera
 from jaxslam.filters.registry import make_filter, scenario_pieces
 from jaxslam.landmarks import CARTESIAN, INVERSE_SCALING
@@ -52,7 +52,7 @@ def plain(base, motion_sigma=0.0, speed=SPEED, speed_sigma=0.0, depth=(0.2, 0.1)
 
 
 def the_filter(base, method, **numbers):
-    word = {DepthParticles: "particles", GaussianSum: "rays"}[type(method)]
+    word = {DepthParticles: "particles", RaySum: "rays"}[type(method)]
     return replace(plain(f"{base}+{word}", **numbers), entry=method)
 
 
@@ -156,7 +156,7 @@ def test_a_ray_that_no_particle_explains_is_dropped():
 
 
 def test_members_are_weighed_by_bayes_rule():
-    method = GaussianSum(nearest=1.0, farthest=15.0, threshold=0.0)
+    method = RaySum(nearest=1.0, farthest=15.0, threshold=0.0)
     slam, bearing = the_filter("robocentric", method), 0.2
     state, step = begun(slam, pixels(FOCAL * bearing + CENTRE))
     measured = seen_at(4.0, bearing, 1) + 0.3
@@ -174,7 +174,7 @@ def test_members_are_weighed_by_bayes_rule():
 @pytest.mark.parametrize("privilege", [0.0, 0.5, 1.0])
 def test_members_share_a_measurement_by_their_weights_to_the_privilege(privilege, monkeypatch):
     """ρ_i = Λ_i^μ / Σ Λ_j^μ (Solà et al. 2005): all shares together are one measurement."""
-    method = GaussianSum(nearest=1.0, farthest=15.0, threshold=0.0, privilege=privilege)
+    method = RaySum(nearest=1.0, farthest=15.0, threshold=0.0, privilege=privilege)
     slam = the_filter("robocentric", method)
     state, _ = begun(slam, pixels(FOCAL * 0.2 + CENTRE))
     shares = []
@@ -190,7 +190,7 @@ def test_members_share_a_measurement_by_their_weights_to_the_privilege(privilege
 
 
 def test_unlikely_members_are_pruned_until_one_is_left():
-    method = GaussianSum(nearest=1.0, farthest=15.0)
+    method = RaySum(nearest=1.0, farthest=15.0)
     slam = the_filter("world", method)
     state, step = begun(slam, pixels(CENTRE))
     assert state.active.sum() == method.members == 3
@@ -210,7 +210,7 @@ def test_unlikely_members_are_pruned_until_one_is_left():
 
 
 def test_one_member_is_the_plain_filter():
-    method = GaussianSum(nearest=1.4, farthest=1.5)
+    method = RaySum(nearest=1.4, farthest=1.5)
     assert method.members == 1
     depth = 1.4 / 0.7
     numbers = dict(motion_sigma=0.1, speed_sigma=0.05, depth=(1 / depth, 0.3 / depth))

@@ -32,7 +32,7 @@ from jaxslam.landmarks import CARTESIAN
 from jaxslam.models.observations import Features, Innovation
 
 
-class GaussianSum(AbstractEntry):
+class RaySum(AbstractEntry):
     """The method's numbers; `State.memory` holds the members' weights, one row a landmark.
 
     Landmark i owns the slots i G, …, i G + G − 1 of the state, of G members.
@@ -138,7 +138,7 @@ class GaussianSum(AbstractEntry):
 
 def with_rays(base: EkfSlam, farthest: int | None = None) -> EkfSlam:
     """The filter with rays of Gaussians up to `farthest`, m."""
-    rays = GaussianSum() if farthest is None else GaussianSum(farthest=farthest)
+    rays = RaySum() if farthest is None else RaySum(farthest=farthest)
     return with_entry(base, rays, CARTESIAN)
 
 
