@@ -295,7 +295,7 @@ def correct(
     return slam.form.update(slam.model, state, seen, noise, context, _considered(slam, state))
 
 
-def begun(
+def init_with_depths(
     slam: EkfSlam,
     capacity: int | Capacity,
     first: Features,

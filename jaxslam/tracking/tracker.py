@@ -19,7 +19,7 @@ from jaxslam._numerics.arrays import cast
 from jaxslam._runtime.files import one_line
 from jaxslam._runtime.programs import Program, in_background
 from jaxslam.filters.association import ASSOCIATIONS, Association, candidates, one_point_ransac
-from jaxslam.filters.ekf import EkfSlam, Undelayed, begun, innermost
+from jaxslam.filters.ekf import EkfSlam, Undelayed, init_with_depths, innermost
 from jaxslam.filters.protocol import AbstractStaged, Scene
 from jaxslam.filters.readouts import (
     camera_pose_in_unit,
@@ -814,7 +814,7 @@ def _begin_map(slam: AbstractStaged, state: Any, new: Features):
 
 @Program
 def _begin_known(depths: Any, slam: EkfSlam, state: Any, new: Features):
-    state = begun(slam, slam.in_map(state).size, new, depths)
+    state = init_with_depths(slam, slam.in_map(state).size, new, depths)
     return state, _reported(slam, state)
 
 
