@@ -87,7 +87,7 @@ def filter_run(slam: EkfSlam, room: Room, sensor: AbstractSensor, run: Run) -> d
     """One filter on one run: records of every step, and its landmarks at the last."""
     first, seen, new = features(run, room)
     state = slam.init(room.capacity, first)
-    settled = slam.entry.settled
+    settled = slam.entry.initialised
 
     def step(state, frame):
         seen, new, control, T_BC = frame

@@ -111,14 +111,14 @@ def test_a_ray_becomes_a_point_with_the_mean_and_variance_of_its_particles():
     method = DepthParticles(count=40)
     slam, bearing = the_filter("robocentric", method, speed=0.0), 0.2
     state, step = begun(slam, pixels(FOCAL * bearing + CENTRE))
-    assert not method.settled(step(state, DT, NONE, NONE)[0]).any()
+    assert not method.initialised(step(state, DT, NONE, NONE)[0]).any()
 
     distances = np.linspace(0.5, 5.0, 40)
     weights = np.exp(-(((distances - 2.0) / 0.3) ** 2) / 2)
     weights /= weights.sum()
     state = replace(state, memory=jnp.asarray(weights)[None])
     state, _ = step(state, DT, NONE, NONE)
-    assert method.settled(state).all()
+    assert method.initialised(state).all()
 
     mean = weights @ distances
     variance = weights @ (distances - mean) ** 2 + (distances[1] - distances[0]) ** 2 / 12
@@ -199,12 +199,12 @@ def test_unlikely_members_are_pruned_until_one_is_left():
         state, _ = step(state, DT, pixels(measured), NONE)
     np.testing.assert_array_equal(state.active, [False, True, False])
     np.testing.assert_array_equal(state.memory[0], [0.0, 1.0, 0.0])
-    assert method.settled(state).all()
+    assert method.initialised(state).all()
     first, left, last = np.split(np.asarray(state.covariance)[state.core_dim :], 3)
     assert left.any()
     assert not first.any(), "a pruned member leaves nothing"
     assert not last.any(), "a pruned member leaves nothing"
-    reported = slam.entry.reported(state)
+    reported = slam.entry.collapsed(state)
     np.testing.assert_array_equal(reported.landmarks[0], state.landmarks[1])
     np.testing.assert_array_equal(reported.covariance[-2:, -2:], left[:, -4:-2])
 

@@ -60,11 +60,11 @@ class AbstractEntry(eqx.Module):
         """Begin new landmarks, seen from the current camera."""
 
     @abstractmethod
-    def reported(self, state: Any) -> Any:
+    def collapsed(self, state: Any) -> Any:
         """The state with one slot, and one Gaussian, a landmark."""
 
     @abstractmethod
-    def settled(self, state: Any) -> Bool[Array, " landmarks"]:
+    def initialised(self, state: Any) -> Bool[Array, " landmarks"]:
         """Which landmarks are in the map as one Gaussian."""
 
 
@@ -84,10 +84,10 @@ class Undelayed(AbstractEntry):
     def initialise(self, slam, state, features):
         return insert(slam, state, features)
 
-    def reported(self, state):
+    def collapsed(self, state):
         return state
 
-    def settled(self, state):
+    def initialised(self, state):
         return state.active
 
 
@@ -219,11 +219,11 @@ class EkfSlam(AbstractStaged):
             )
         view, landmark = scene_of_landmark(self, function, state.core)
         return self.gaussian_form.landmark_covariance(
-            view, landmark, self.entry.reported(state), slots
+            view, landmark, self.entry.collapsed(state), slots
         )
 
     def in_map(self, state: Any) -> Bool[Array, " capacity"]:
-        return self.entry.reported(state).active
+        return self.entry.collapsed(state).active
 
     def pose_error(self, state: Any, T_BC: Pose) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
         """`T_true ⊟ T_est` of the pose that the coordinates hold, and its covariance."""

@@ -127,7 +127,7 @@ def landmark_samples(
     Nothing is linearised: this is the distribution that mean and covariance stand for. A draw
     beyond infinity (ω < 0) comes out on the other side of the camera.
     """
-    state = slam.entry.reported(state)
+    state = slam.entry.collapsed(state)
     view, landmark = scene_of_landmark(slam, function or _point_in_world, state.core)
     c, size = state.core_dim, state.core_dim + state.landmarks.shape[1]
     normal = jax.random.normal(key, (slots.size, count, size), state.landmarks.dtype)

@@ -101,12 +101,12 @@ class DepthParticles(AbstractEntry):
         slots = _kept(features, state)
         return replace(state, memory=state.memory.at[slots].set(1 / self.count, mode="drop"))
 
-    def reported(self, state: State) -> State:
+    def collapsed(self, state: State) -> State:
         """A pending ray with the mean and variance of its particles' inverse distance."""
         mean, variance = _moments(state.memory, 1 / self.depths(state.memory.dtype))
         return _with_inverse_depth(state, _pending(state), mean, variance)
 
-    def settled(self, state: State) -> Bool[Array, " landmarks"]:
+    def initialised(self, state: State) -> Bool[Array, " landmarks"]:
         return state.active & ~_pending(state)
 
     def _evidence(self, slam, state, control, features):

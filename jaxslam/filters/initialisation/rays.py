@@ -99,7 +99,7 @@ class RaySum(AbstractEntry):
         slots = jnp.where(features.valid, features.slots, state.memory.shape[0])
         return replace(state, memory=state.memory.at[slots].set(1 / self.members, mode="drop"))
 
-    def reported(self, state: State) -> State:
+    def collapsed(self, state: State) -> State:
         """The heaviest member of every ray."""
         c, d = state.core_dim, state.landmarks.shape[1]
         landmarks = jnp.arange(state.memory.shape[0])
@@ -113,7 +113,7 @@ class RaySum(AbstractEntry):
             covariance=state.covariance[index[:, None], index],
         )
 
-    def settled(self, state: State) -> Bool[Array, " landmarks"]:
+    def initialised(self, state: State) -> Bool[Array, " landmarks"]:
         return jnp.sum(state.active.reshape(-1, self.members), axis=1) == 1
 
     def _log_likelihood(self, slam, state, control, features):
