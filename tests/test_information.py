@@ -37,7 +37,7 @@ class AsExact(Covariance):
     def augment(self, state, start, covariance):
         return super().augment(state, start, information.representable(covariance))
 
-    def know(self, state, start, size):
+    def set_exact(self, state, start, size):
         return self.augment(state, start, jnp.zeros((size, size)))
 
 

@@ -318,7 +318,7 @@ def insert(
     prior = _depth_prior(slam, state) if prior is None else prior
     if slam.landmark.anchored:
         anchor = _free_anchor(state)
-        state = slam.form.change(state, slam.model.anchoring(anchor))
+        state = slam.form.reparametrise(state, slam.model.anchoring(anchor))
         context = Context(None, anchor)
     return slam.form.initialise(slam.model, state, new, slam.sensor.noise, prior, context)
 
@@ -326,7 +326,11 @@ def insert(
 def reanchored(slam: EkfSlam, state: Any) -> Any:
     """The current camera as the keyframe: landmarks move to it, and T_KC is known."""
     change, t = slam.model.reanchoring(), slam.model.geometry.tangent_dim
-    return state if change is None else slam.form.know(slam.form.change(state, change), t, t)
+    return (
+        state
+        if change is None
+        else slam.form.set_exact(slam.form.reparametrise(state, change), t, t)
+    )
 
 
 def check_features(slam: EkfSlam, features: Features) -> None:
@@ -388,7 +392,7 @@ def _empty(slam: EkfSlam, capacity: int, dtype: Any) -> Any:
     empty = slam.landmark.initialise(ahead, depth.mean, jnp.asarray(slam.sensor.focal, dtype))
     state = slam.gaussian_form.empty(core, jnp.tile(empty, (slam.entry.slots(capacity), 1)))
     state = replace(state, memory=slam.entry.memory(capacity, dtype))
-    state = slam.form.know(state, 0, tangent_dim(core.pose))
+    state = slam.form.set_exact(state, 0, tangent_dim(core.pose))
     state = slam.form.augment(state, core.part("motion").start, covariance)
     if unit is not None:
         variance = jnp.reshape(unit**2, (1, 1))

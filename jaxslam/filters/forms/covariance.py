@@ -65,7 +65,7 @@ class Covariance(AbstractGaussian):
         part = slice(start, start + covariance.shape[0])
         return replace(state, covariance=state.covariance.at[part, part].set(covariance))
 
-    def know(self, state: State, start: int, size: int) -> State:
+    def set_exact(self, state: State, start: int, size: int) -> State:
         # Their covariance is zero already.
         del start, size
         return state
@@ -146,7 +146,7 @@ class Covariance(AbstractGaussian):
         delta = HP.T @ cholesky(S).solve(residual.ravel())
         return shifted(state, delta.at[considered].set(0.0))
 
-    def change(self, state: State, variables: Change) -> State:
+    def reparametrise(self, state: State, variables: Change) -> State:
         """Write the state in other variables, `P ← J P Jᵀ`."""
         core, J_core = variables.core(state.core), jacobian(variables.core, state.core)
         if variables.landmark is None:

@@ -48,7 +48,7 @@ class AbstractForm(eqx.Module):
         """
 
     @abstractmethod
-    def know(self, state: Any, start: int, size: int) -> Any:
+    def set_exact(self, state: Any, start: int, size: int) -> Any:
         """Numbers of the core that are known exactly."""
 
     @abstractmethod
@@ -74,10 +74,10 @@ class AbstractForm(eqx.Module):
 
     def compose(self, model: Model, state: Any, context: Any) -> Any:
         """Move the state over the motion (P18–P21)."""
-        return self.change(state, composition(model, context))
+        return self.reparametrise(state, composition(model, context))
 
     @abstractmethod
-    def change(self, state: Any, variables: Change) -> Any:
+    def reparametrise(self, state: Any, variables: Change) -> Any:
         """Write the state in other variables."""
 
     @abstractmethod

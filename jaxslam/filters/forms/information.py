@@ -110,7 +110,7 @@ class Information(AbstractGaussian):
         information = cholesky(representable(covariance)).inverse()
         return replace(state, information=state.information.at[part, part].set(information))
 
-    def know(self, state: InformationState, start: int, size: int) -> InformationState:
+    def set_exact(self, state: InformationState, start: int, size: int) -> InformationState:
         """Numbers of the core that are known exactly: a variance of zero, as far as that can be."""
         return self.augment(state, start, jnp.zeros((size, size), state.information.dtype))
 
@@ -149,7 +149,7 @@ class Information(AbstractGaussian):
         status = judged(factor.positive, information, state.landmarks)
         return state, Innovation(predicted, residual, None, used, nis, status)
 
-    def change(self, state: InformationState, variables: Change) -> InformationState:
+    def reparametrise(self, state: InformationState, variables: Change) -> InformationState:
         """Write the state in other variables, `Λ ← J⁻ᵀ Λ J⁻¹`.
 
         Parts of the core that are set to a constant keep their old variables in the change, which

@@ -154,7 +154,7 @@ class Sensitivity(AbstractForm):
         """Forget k numbers of the core; the caller resets their value."""
         return replace(state, by_shared=state.by_shared.at[start : start + size].set(0.0))
 
-    def know(self, state: Point, start: int, size: int) -> Point:
+    def set_exact(self, state: Point, start: int, size: int) -> Point:
         """Nothing to do: what does not depend on the variables is known."""
         del start, size
         return state
@@ -184,7 +184,7 @@ class Sensitivity(AbstractForm):
             used,
         )
 
-    def change(self, state: Point, variables: Change) -> Point:
+    def reparametrise(self, state: Point, variables: Change) -> Point:
         """Write the state in other variables, `S ← J S`."""
         D, c = state.by_shared, state.core_dim
         core, J_core = variables.core(state.core), jacobian(variables.core, state.core)
