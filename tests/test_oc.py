@@ -54,7 +54,7 @@ def truth(model):
         drawn = jax.vmap(geometry.group.exp)(jnp.asarray(rng.uniform(-0.3, 0.3, (COUNT, t))))
         anchors = jax.vmap(SplitPose.of)(drawn)
     core = Core(
-        model.coordinates.hold(pose(geometry, 1)),
+        model.coordinates.from_base_pose(pose(geometry, 1)),
         jnp.asarray(velocity) if model.motion.has_velocity else (),
         None,
         jnp.zeros(t),

@@ -56,7 +56,7 @@ def composer(geometry, landmark, frame):
     context = Context(jnp.asarray(DT))
 
     def compose(pose, velocity, acceleration, parameters):
-        core = Core(frame.hold(pose), velocity, None, acceleration, jnp.zeros(0))
+        core = Core(frame.from_base_pose(pose), velocity, None, acceleration, jnp.zeros(0))
         moved = model.compose_core(core, context)
         if frame.moves_landmarks:
             view = model.view(core, context)
@@ -135,7 +135,7 @@ def test_in_a_gauge_the_noise_is_scaled_but_says_nothing_of_the_scale(geometry):
     velocity, noise = jnp.asarray(rng.normal(size=(2, geometry.tangent_dim)))
 
     def moved(log_scale, noise):
-        held = ROBOCENTRIC.hold(pose(geometry, 2))
+        held = ROBOCENTRIC.from_base_pose(pose(geometry, 2))
         core = Core(held, velocity, log_scale, noise, jnp.zeros(0))
         context = Context(jnp.asarray(DT))
         after = model.compose_core(core, context)
@@ -185,7 +185,7 @@ def test_in_a_gauge_lengths_are_told_in_metres():
 
     @quick_jit
     def told(log_scale):
-        held = slam.coordinates.hold(pose(PLANAR, 3))
+        held = slam.coordinates.from_base_pose(pose(PLANAR, 3))
         core = replace(state.core, pose=held, log_scale=log_scale[None])
         here = replace(state, core=core)
         return (
@@ -453,7 +453,7 @@ def convertible_state(model):
     geometry, rng = model.geometry, np.random.default_rng(6)
     t, p = geometry.tangent_dim, geometry.pixel_dim
     core = Core(
-        pose=model.coordinates.hold(pose(geometry, 11)),
+        pose=model.coordinates.from_base_pose(pose(geometry, 11)),
         motion=jnp.asarray(rng.normal(0, 0.5, t)),
         log_scale=None,
         noise=jnp.zeros(t),
@@ -594,7 +594,7 @@ def test_a_map_from_above_is_azimuth_and_inverse_distance_along_the_axes_of_the_
     @quick_jit
     def told():
         state = slam.init(2)
-        state = replace(state, core=replace(state.core, pose=slam.coordinates.hold(T_BC)))
+        state = replace(state, core=replace(state.core, pose=slam.coordinates.from_base_pose(T_BC)))
         ask = (slam, insert(slam, state, seen), jnp.arange(2))
         return landmarks_from_above(*ask)[0], landmarks_in_world(*ask)[0]
 
@@ -633,7 +633,7 @@ def test_an_unknown_calibration_is_refused_by_name():
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_a_frame_holds_every_pose_and_gives_it_back(geometry, frame):
     T = pose(geometry, 3, scale=1.0)
-    again = frame.camera_pose(frame.hold(T))
+    again = frame.camera_pose(frame.from_base_pose(T))
     np.testing.assert_allclose(again.as_matrix(), T.as_matrix(), rtol=0, atol=1e-14)
 
 
@@ -643,7 +643,7 @@ def test_pose_error_is_zero_at_the_truth_and_refers_to_the_covariance(kind):
     T_BC, delta = pose(PLANAR, 4), np.array([0.01, -0.02, 0.03])
     slam = case.filter(kind)
     state = slam.init(1)
-    held = slam.coordinates.hold(T_BC)
+    held = slam.coordinates.from_base_pose(T_BC)
     state = replace(state, core=replace(state.core, pose=held))
     state = slam.form.augment(state, 0, jnp.diag(jnp.array([1.0, 2.0, 3.0])))
     error, covariance = slam.pose_error(state, T_BC)

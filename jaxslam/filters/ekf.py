@@ -229,7 +229,7 @@ class EkfSlam(AbstractStaged):
         """`T_true ⊟ T_est` of the pose that the coordinates hold, and its covariance."""
         hold = self.coordinates
         estimate, covariance = self.form.core_covariance(self.model.estimate, state)
-        return difference(hold.estimate(hold.hold(T_BC)), estimate), covariance
+        return difference(hold.estimate(hold.from_base_pose(T_BC)), estimate), covariance
 
 
 def scene_of_landmark(
@@ -371,7 +371,7 @@ def check_one_gaussian(base: Any, what: str, remedies: bool = False) -> None:
 
 
 def _empty(slam: EkfSlam, capacity: int, dtype: Any) -> Any:
-    geometry, held = slam.motion.geometry, slam.coordinates.hold
+    geometry, held = slam.motion.geometry, slam.coordinates.from_base_pose
     slam = cast(slam, dtype)
     variables, log_scale, covariance = slam.scale.start(slam.motion)
     depth = slam.depth

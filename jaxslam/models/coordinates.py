@@ -34,7 +34,7 @@ class Coordinates:
     name: str
     moves_landmarks: bool
     """Whether composition moves landmarks."""
-    hold: Callable[[Pose], Any]
+    from_base_pose: Callable[[Pose], Any]
     """What the state holds of T_BC at the start: its error is this pytree's tangent."""
     camera_pose: Callable[[Any], Pose]
     """T_BC, the inverse of `hold`."""

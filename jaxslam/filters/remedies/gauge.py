@@ -68,7 +68,7 @@ def act(
 
     core = replace(
         core,
-        pose=model.coordinates.hold(rigid @ enlarged(model.camera_pose(core))),
+        pose=model.coordinates.from_base_pose(rigid @ enlarged(model.camera_pose(core))),
         motion=variables,
         noise=noise,
         anchors=None if core.anchors is None else jax.vmap(anchor)(core.anchors),

@@ -175,7 +175,7 @@ def _core(slam: EkfSlam, like, newest, log_scale):
     kept = not slam.calibration.each_frame
     return replace(
         like,
-        pose=slam.coordinates.hold(scaled(frame.pose, unit)),
+        pose=slam.coordinates.from_base_pose(scaled(frame.pose, unit)),
         motion=variables,
         log_scale=None if like.log_scale is None else like.log_scale.at[:1].set(log_scale),
         calibration=frame.calibration if kept else like.calibration,
@@ -189,7 +189,7 @@ def _landmark(slam: EkfSlam, newest, first, y, measured, log_scale):
     frame, _, common = newest
     seen, omega = located(slam, first.calibration, common, measured, y)
     unit = jnp.exp(-log_scale[0])
-    held = slam.coordinates.hold(scaled(frame.pose, unit))
+    held = slam.coordinates.from_base_pose(scaled(frame.pose, unit))
     T_AC = slam.coordinates.map_from_camera(held, identity(slam.motion.geometry, y.dtype))
     T_CF = frame.pose.inverse() @ first.pose
     landmark = slam.landmark.initialise(seen, omega / unit, jnp.asarray(slam.sensor.focal))
