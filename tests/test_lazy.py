@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam._numerics import conditional as lazy
-from jaxslam._numerics.conditional import at_places, map_or_zero, map_where, repeated, when
+from jaxslam._numerics.conditional import at_places, cond, map_or_zero, map_where, repeated
 
 BATCH, PLACES = 20, 5
 
@@ -51,7 +51,7 @@ def check(after, values, alive, by):
 @pytest.mark.parametrize("wanted", [[False] * 3, [True, False, True]])
 def test_what_nobody_in_a_batch_wants_is_not_done(wanted):
     found, values = [], jnp.arange(1.0, 4.0)
-    after = jax.jit(jax.vmap(lambda w, v: when(w, counted(found), v, jnp.asarray(0.5))))(
+    after = jax.jit(jax.vmap(lambda w, v: cond(w, counted(found), v, jnp.asarray(0.5))))(
         jnp.array(wanted), values
     )
     done(after)

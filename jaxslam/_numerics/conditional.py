@@ -25,7 +25,7 @@ LEAST = 8
 """Works in a block."""
 
 
-def when(
+def cond(
     wanted: Bool[Array, ""], function: Callable[..., Value], value: Value, *given: Any
 ) -> Value:
     """`function(value, *given)` if it is wanted, else the value."""

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.arrays import AnyArray, cast, precision
-from jaxslam._numerics.conditional import map_where, when
+from jaxslam._numerics.conditional import cond, map_where
 from jaxslam.filters.ekf import EkfSlam, innermost
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.protocol import AbstractStaged, Expected
@@ -140,7 +140,7 @@ class BatchInitialisation(AbstractStaged):
             least = frames
         ready = self._ready(state)
         state = replace(state, sum=_likely(state.sum, anew & ready), open=state.open & ~ready)
-        return when(state.open & state.record.full, self._thinned, state)
+        return cond(state.open & state.record.full, self._thinned, state)
 
     def moving(self, state: RestState) -> Bool[Array, ""]:
         """It says so unless the camera has stood."""
@@ -188,7 +188,7 @@ class BatchInitialisation(AbstractStaged):
             modes = replace(modes, minima=replace(modes.minima, x=x))
             return replace(state, sum=begun, modes=modes)
 
-        return when(wanted, solved, state, record)
+        return cond(wanted, solved, state, record)
 
     def _due(self, record: Record, newest: range) -> Bool[Array, " starts"] | None:
         """From which starts minima are sought after this frame; None where from none after any
