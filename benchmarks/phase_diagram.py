@@ -26,7 +26,7 @@ import tyro
 
 import jaxslam
 from jaxslam._runtime.files import write_atomically
-from jaxslam._runtime.lookup import chosen
+from jaxslam._runtime.lookup import lookup
 from jaxslam.consistency import CHUNK
 from jaxslam.plots.phase import PhaseCell, plot_phase_diagram
 from jaxslam.statistics.bands import mean_band
@@ -123,7 +123,7 @@ def worlds(options: Options) -> Iterator[tuple[str, jaxslam.Scenario]]:
     for name in ("accelerations", "velocities", "rest_velocities", "depths"):
         if not getattr(options, name):
             raise ValueError(f"{name} holds no value: an axis needs at least one")
-    for name, velocity in chosen("directions", options.directions, DIRECTIONS).items():
+    for name, velocity in lookup("directions", options.directions, DIRECTIONS).items():
         velocities = options.rest_velocities if name == REST else options.velocities
         for depth, a, v in itertools.product(options.depths, options.accelerations, velocities):
             yield (

@@ -25,7 +25,7 @@ import tyro
 
 import jaxslam
 from jaxslam._runtime.files import write_atomically, write_json
-from jaxslam._runtime.lookup import chosen
+from jaxslam._runtime.lookup import lookup
 from jaxslam.consistency.montecarlo import filter_run
 from jaxslam.datasets.starry_night import (
     StarryNight,
@@ -84,7 +84,7 @@ class Options:
     """Only write page and figure again."""
 
     def __post_init__(self) -> None:
-        chosen("variants", self.variants, VARIANTS)
+        lookup("variants", self.variants, VARIANTS)
         if self.steps < 1 or self.seeds < 1 or not self.nearest_depth > 0:
             raise ValueError(
                 "steps, seeds and nearest_depth must be positive, not "
@@ -107,7 +107,7 @@ def pieces(data: StarryNight, variant: str, nearest_depth: float) -> dict[str, A
 
 def filters_of(told: dict[str, Any], options: Options) -> dict[str, AbstractFilter]:
     """By name, `filter/landmarks`."""
-    landmarks = chosen("landmarks", options.landmarks, LANDMARKS)
+    landmarks = lookup("landmarks", options.landmarks, LANDMARKS)
     return {
         f"{name}/{landmark.name}": make_filter(name, landmark=landmark, **told)
         for name in options.filters

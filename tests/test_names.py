@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from jaxslam._runtime.lookup import chosen
+from jaxslam._runtime.lookup import lookup
 from jaxslam.consistency import monte_carlo, summarise, table
 from jaxslam.filters.ekf import EkfSlam, Undelayed, innermost
 from jaxslam.filters.protocol import AbstractStaged
@@ -17,8 +17,8 @@ COLOURS = {"red": 1, "green": 2, "blue": 3}
 
 
 def test_chosen_keeps_the_order_of_the_names():
-    assert list(chosen("colour", ["blue", "red"], COLOURS).items()) == [("blue", 3), ("red", 1)]
-    assert list(chosen("colour", iter(["green"]), COLOURS)) == ["green"]
+    assert list(lookup("colour", ["blue", "red"], COLOURS).items()) == [("blue", 3), ("red", 1)]
+    assert list(lookup("colour", iter(["green"]), COLOURS)) == ["green"]
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,7 @@ def test_chosen_keeps_the_order_of_the_names():
 )
 def test_a_name_that_is_not_known_is_refused_with_those_that_are(names, message):
     with pytest.raises(ValueError, match=message):
-        chosen("colour", names, COLOURS)
+        lookup("colour", names, COLOURS)
 
 
 def test_filters_are_made_of_every_pair_of_names():
@@ -63,7 +63,7 @@ def test_filters_of_unknown_names_are_refused(filters, landmarks, calibration, m
 def test_one_name_needs_no_list_and_a_scenario_goes_by_its_name():
     made = make_filters("matched", "robocentric", "inverse_scaling")
     assert list(made) == ["robocentric/inverse_scaling"]
-    assert list(chosen("colour", "red", COLOURS)) == ["red"]
+    assert list(lookup("colour", "red", COLOURS)) == ["red"]
     with pytest.raises(ValueError, match=r"unknown scenario 'matcht' \(did you mean matched\?\)"):
         make_filters("matcht", "robocentric", "inverse_scaling")
 

@@ -671,7 +671,7 @@ def test_the_landmarks_of_a_limited_frame_are_drawn_at_random_and_evenly():
     assert (used[:, 1:].sum(axis=2) == 3).all()
 
     def evenly(chosen, share):
-        """Is every one of `chosen`, [runs, …], chosen with this probability?"""
+        """Is every one of `lookup`, [runs, …], chosen with this probability?"""
         sigma = np.sqrt(share * (1 - share) / len(chosen))
         bound = stats.norm.isf(FALSE_ALARM / 2 / chosen[0].size) * sigma
         assert np.abs(chosen.mean(axis=0) - share).max() < bound

@@ -13,14 +13,14 @@ def suggestion(word: str, known: Iterable[str]) -> str:
     return f" (did you mean {close[0]}?)" if close else ""
 
 
-def listed(names: str | Iterable[str]) -> list[str]:
+def as_list(names: str | Iterable[str]) -> list[str]:
     """Names in a list; one alone may be given as it is."""
     return [names] if isinstance(names, str) else list(names)
 
 
-def chosen(kind: str, names: str | Iterable[str], known: Mapping[str, Any]) -> dict[str, Any]:
+def lookup(kind: str, names: str | Iterable[str], known: Mapping[str, Any]) -> dict[str, Any]:
     """The named entries of a table, in the order of the names. Raises ValueError."""
-    names = listed(names)
+    names = as_list(names)
     if not names:
         raise ValueError(f"{kind} needs at least one name; known: {', '.join(known)}")
     for name in names:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxslam._runtime.lookup import chosen
+from jaxslam._runtime.lookup import lookup
 from jaxslam.evaluation.arrays import ROUNDING
 from jaxslam.evaluation.convention import Convention, geometry_of, pose_errors
 from jaxslam.evaluation.laid import laid
@@ -32,7 +32,7 @@ def named(
     """
     told = axes.replace(",", " ").split() if isinstance(axes, str) else [str(x) for x in axes]
     names = convention.names(geometry_of(poses))
-    used = chosen("axes used", told, dict.fromkeys(names)) if told else {}
+    used = lookup("axes used", told, dict.fromkeys(names)) if told else {}
     return tuple(name for name in names if name in used)
 
 

@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxslam._runtime.lookup import chosen
+from jaxslam._runtime.lookup import lookup
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, exp, log
 from jaxslam.statistics.beyond_scale import BeyondScale, beyond_scale
 
@@ -63,7 +63,7 @@ class Convention:
         if not self.axes:
             object.__setattr__(self, "axes", NATURAL_AXES.get(self.error, "body"))
         for name, known in CHOICES.items():
-            chosen(name, [getattr(self, name)], dict.fromkeys(known))
+            lookup(name, [getattr(self, name)], dict.fromkeys(known))
 
     def __str__(self) -> str:
         return " ".join(f"{name}={value}" for name, value in asdict(self).items())

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxslam._runtime.lookup import chosen, suggestion
+from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.evaluation.convention import CHOICES, Convention
 from jaxslam.geometry import SPATIAL
 from jaxslam.io.tum import read_table, write_table
@@ -91,5 +91,5 @@ def _said(comments: str) -> dict[str, str]:
             raise ValueError(f"unknown key {key!r} in the header{meant}; known: {', '.join(_KEYS)}")
     known = {**CHOICES, "angle": tuple(ANGLES)}
     for key in known.keys() & said.keys():
-        chosen(key, [said[key]], dict.fromkeys(known[key]))
+        lookup(key, [said[key]], dict.fromkeys(known[key]))
     return {key: value for key, value in said.items() if key in _KEYS}

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import json_numbers, write_json
-from jaxslam._runtime.lookup import chosen
+from jaxslam._runtime.lookup import lookup
 from jaxslam.evaluation.arrays import filled, normalised, paired, step_times, without_known
 from jaxslam.evaluation.convention import Convention
 from jaxslam.evaluation.identify import Identification
@@ -335,7 +335,7 @@ def evaluate(
     at = step_times(times, e.shape[1])
     e, P, logged = e[:, start:], P[:, start:], logged[:, start:]
     return Evaluation(
-        quantity=next(iter(chosen("quantity", quantity, dict.fromkeys(("NEES", "NIS"))))),
+        quantity=next(iter(lookup("quantity", quantity, dict.fromkeys(("NEES", "NIS"))))),
         dof=e.shape[-1],
         nees=filled(normalised(e, filled(P, logged, np.eye(e.shape[-1]))), logged, np.nan),
         errors=filled(e, logged, np.nan),

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam._runtime.lookup import chosen
+from jaxslam._runtime.lookup import lookup
 from jaxslam.evaluation.alignment import ALIGNMENTS
 from jaxslam.evaluation.arrays import filled, normalised, step_times, without_known
 from jaxslam.evaluation.axes import estimated, named
@@ -75,7 +75,7 @@ def evaluate_poses(
         raise ValueError(
             f"a convention is a jaxslam.Convention, as Convention('right'), not {stated}"
         )
-    chosen("align", [align], dict.fromkeys(ALIGNMENTS))
+    lookup("align", [align], dict.fromkeys(ALIGNMENTS))
     poses = checked_poses(estimates, covariances, truths)
     at, sigma = step_times(times, poses.estimates.shape[1]), checked_sigma(truth_sigma)
     found = as_stated(poses, stated, align, named(axes_used, poses.estimates, stated), sigma)

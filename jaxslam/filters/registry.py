@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxslam._runtime.lookup import chosen, listed
+from jaxslam._runtime.lookup import as_list, lookup
 from jaxslam.filters.association import TOLERANCE
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.forms.covariance import Covariance
@@ -210,11 +210,11 @@ def make_filter(name: str, **pieces: Any) -> AbstractFilter:
     if name == "recommended":
         name = recommended_name(pieces["motion"])
     base, *modifiers = name.split("+")
-    made: Any = chosen("filters", [base], FILTERS)[base](**pieces)
+    made: Any = lookup("filters", [base], FILTERS)[base](**pieces)
     for modifier in modifiers:
         word = modifier.rstrip("0123456789")
         number = modifier[len(word) :]
-        modify = chosen("modifiers", [word], MODIFIERS)[word]
+        modify = lookup("modifiers", [word], MODIFIERS)[word]
         if word in _OF_ONE_FILTER and not isinstance(made, EkfSlam):
             raise ValueError(f"in {name} the modifier {word} must stand before those of windows")
         made = modify(made, int(number) if number else None)
@@ -237,22 +237,22 @@ def make_filters(
     scenario = as_scenario(scenario)
     names = [
         recommended_name(motion_of(scenario)) if name == "recommended" else name
-        for name in listed(filters)
+        for name in as_list(filters)
     ]
-    chosen("filters", [name.partition("+")[0] for name in names], FILTERS)
+    lookup("filters", [name.partition("+")[0] for name in names], FILTERS)
     return {
         f"{name}/{landmark.name}": make_filter(
             name, landmark=landmark, **scenario_pieces(scenario, calibration)
         )
         for name in names
-        for landmark in chosen("landmarks", landmarks, LANDMARKS).values()
+        for landmark in lookup("landmarks", landmarks, LANDMARKS).values()
     }
 
 
 def scenario_pieces(scenario: Scenario, calibration: str | None = None) -> dict[str, Any]:
     """The pieces of a filter that fits the scenario, as `EkfSlam` takes them. Raises ValueError."""
     word = scenario.calibration if calibration is None else calibration
-    treatment = chosen("calibration", [word], TREATMENTS)[word]
+    treatment = lookup("calibration", [word], TREATMENTS)[word]
     return {
         "motion": motion_of(scenario),
         "sensor": sensor_of(scenario),

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxslam._runtime.lookup import chosen
+from jaxslam._runtime.lookup import lookup
 from jaxslam.consistency import Study, summarise
 from jaxslam.consistency.summary import as_summary
 from jaxslam.evaluation.evaluate import OUTSIDE
@@ -153,7 +153,7 @@ def _styled(numbers: Mapping[str, Any]):
 def _name(ax: Axes, time: np.ndarray, lines: list, label: Labels | None) -> None:
     """Write the names of `(filter, values, colour)` at the ends of their lines."""
     names = [name for name, _, _ in lines]
-    chosen("label", label or names, dict.fromkeys(names))
+    lookup("label", label or names, dict.fromkeys(names))
     called = {**short_names(names), **(label or {})}
     label_ends(ax, [End(called[name], time, values, colour) for name, values, colour in lines])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from jaxslam._runtime.lookup import chosen
+from jaxslam._runtime.lookup import lookup
 from jaxslam.filters.association import ASSOCIATIONS, TOLERANCE
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.registry import FILTERS, FROM_REST, make_filter
@@ -83,11 +83,11 @@ class TrackerSettings:
     def __post_init__(self) -> None:
         if self.filter == "recommended":
             object.__setattr__(self, "filter", type(self).filter)
-        chosen("filter", [self.filter.partition("+")[0]], FILTERS)
-        chosen("landmarks", [self.landmarks], LANDMARKS)
-        chosen("association", [self.association], ASSOCIATIONS)
+        lookup("filter", [self.filter.partition("+")[0]], FILTERS)
+        lookup("landmarks", [self.landmarks], LANDMARKS)
+        lookup("association", [self.association], ASSOCIATIONS)
         if self.calibration is not None:
-            chosen("calibration", [self.calibration], TREATMENTS)
+            lookup("calibration", [self.calibration], TREATMENTS)
 
     @property
     def capacity(self) -> int:

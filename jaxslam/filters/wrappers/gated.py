@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.arrays import AnyArray
-from jaxslam._runtime.lookup import chosen
+from jaxslam._runtime.lookup import lookup
 from jaxslam.filters.association import ASSOCIATIONS, TOLERANCE, candidates
 from jaxslam.filters.ekf import innermost
 from jaxslam.filters.protocol import AbstractStaged, Expected
@@ -28,7 +28,7 @@ class Gated(AbstractStaged):
     """σ by which a match may be off beyond its noise, in that."""
 
     def __check_init__(self) -> None:
-        chosen("association", [self.association], ASSOCIATIONS)
+        lookup("association", [self.association], ASSOCIATIONS)
         if not isinstance(self.base, AbstractStaged) or innermost(self.base) is None:
             raise ValueError(
                 "features are checked before the update of a frame that has one, which "
