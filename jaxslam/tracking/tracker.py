@@ -38,10 +38,10 @@ from jaxslam.models.sensors import Pinhole
 from jaxslam.tracking.corners import detect_corners
 from jaxslam.tracking.epipolar import MINIMAL, of_one_motion
 from jaxslam.tracking.landmarks import NO_POINTS, Landmark, Points, joined, stacked, unstacked
-from jaxslam.tracking.located import PoseWithCovariance
 from jaxslam.tracking.map import Prediction, failing, in_view, note_found, to_search, worst_first
 from jaxslam.tracking.matching import PEAKS, Match, match_patches
 from jaxslam.tracking.patches import Patch
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 from jaxslam.tracking.resume import grown, leaves, read_record, write_record
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.target import Target, TargetObservation, known_depths, sighted

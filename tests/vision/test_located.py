@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxslam.geometry import exp, jacobian
 from jaxslam.io.tum import poses
-from jaxslam.tracking.located import PoseWithCovariance, adjoint
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, adjoint
 
 
 def located(seed, sigma):

@@ -25,8 +25,8 @@ from jaxslam.io.tum import read_tum
 from jaxslam.models.observations import Status
 from jaxslam.tracking import tracker as programs
 from jaxslam.tracking.landmarks import Landmark
-from jaxslam.tracking.located import PoseWithCovariance, adjoint
 from jaxslam.tracking.patches import STORED, Patch
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, adjoint
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.track import TOO_SURE, describe, track

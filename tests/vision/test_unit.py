@@ -16,7 +16,7 @@ import jaxslam
 from jaxslam.filters.protocol import Scene
 from jaxslam.geometry import scaled
 from jaxslam.tracking import tracker as programs
-from jaxslam.tracking.located import PoseWithCovariance, adjoint
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, adjoint
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.track import write_frames
