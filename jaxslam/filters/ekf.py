@@ -227,9 +227,11 @@ class EkfSlam(AbstractStaged):
 
     def pose_error(self, state: Any, T_BC: Pose) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
         """`T_true ⊟ T_est` of the pose that the coordinates hold, and its covariance."""
-        hold = self.coordinates
+        coordinates = self.coordinates
         estimate, covariance = self.form.core_covariance(self.model.estimate, state)
-        return difference(hold.estimate(hold.from_base_pose(T_BC)), estimate), covariance
+        return difference(
+            coordinates.estimate(coordinates.from_base_pose(T_BC)), estimate
+        ), covariance
 
 
 def scene_of_landmark(

@@ -37,7 +37,7 @@ class Coordinates:
     from_base_pose: Callable[[Pose], Any]
     """What the state holds of T_BC at the start: its error is this pytree's tangent."""
     camera_pose: Callable[[Any], Pose]
-    """T_BC, the inverse of `hold`."""
+    """T_BC, the inverse of `from_base_pose`."""
     estimate: Callable[[Any], Pose | SplitPose]
     """The one pose whose error is the filter's: what is held, where that is one pose."""
     map_from_camera: Callable[[Any, Pose], Pose]
@@ -86,7 +86,7 @@ def keyframe_due(T_KC: Pose, inverse_distances: Float[Array, " capacity"]) -> Bo
 ROBOCENTRIC = Coordinates(
     name="robocentric",
     moves_landmarks=True,
-    hold=lambda T_BC: T_BC.inverse(),
+    from_base_pose=lambda T_BC: T_BC.inverse(),
     camera_pose=lambda T_CB: T_CB.inverse(),
     estimate=lambda T_CB: T_CB,
     map_from_camera=lambda T_CB, step: step,
@@ -97,7 +97,7 @@ ROBOCENTRIC = Coordinates(
 WORLD = Coordinates(
     name="world",
     moves_landmarks=False,
-    hold=SplitPose.of,
+    from_base_pose=SplitPose.of,
     camera_pose=SplitPose.joined,
     estimate=lambda split: split,
     map_from_camera=lambda split, step: split.joined() @ step,
@@ -108,7 +108,7 @@ WORLD = Coordinates(
 KEYFRAME = Coordinates(
     name="keyframe",
     moves_landmarks=False,
-    hold=KeyframePose.at,
+    from_base_pose=KeyframePose.at,
     camera_pose=KeyframePose.camera_pose,
     estimate=KeyframePose.camera_pose,
     map_from_camera=lambda held, step: held.keyframe_from_camera @ step,
