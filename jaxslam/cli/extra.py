@@ -18,7 +18,6 @@ def require_vision(what: str) -> None:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     try:
         import cv2  # noqa: F401
-        import evo  # noqa: F401
     except ImportError as error:
         raise missing(f"{what} needs", "vision", error) from None
 

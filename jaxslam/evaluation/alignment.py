@@ -45,16 +45,6 @@ class Similarity(NamedTuple):
         result[..., :n, n] = self.scale * T_wc[..., :n, n] @ self.rotation.T + self.translation
         return result
 
-    def moved_covariances(
-        self,
-        covariances: Float[np.ndarray, "k t t"],
-        T_wc: Float[np.ndarray, "k d d"],
-        convention: Convention,
-    ) -> Float[np.ndarray, "k t t"]:
-        """Covariances of the poses in the other world, of errors in the same convention."""
-        J = self.derivative(T_wc, convention)
-        return J @ covariances @ np.swapaxes(J, -1, -2)
-
     def derivative(
         self, T_wc: Float[np.ndarray, "k d d"], convention: Convention
     ) -> Float[np.ndarray, "k t t"]:

@@ -33,11 +33,6 @@ def chi2_quantile(probability: float, dof: float) -> float:
     return 2 * float(gammaincinv(dof / 2, probability))
 
 
-def chi2_cdf(value: float, dof: float) -> float:
-    """The probability that χ² is below `value`."""
-    return float(gammainc(dof / 2, value / 2))
-
-
 def mean_band(dof: int, runs: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Two-sided bounds of the mean NEES of `runs` independent runs at ONE time step.
 

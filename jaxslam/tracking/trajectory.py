@@ -1,8 +1,8 @@
-"""Trajectories and their covariances as text, and their error against a reference, by `evo`."""
+"""Trajectories and their covariances as text, and their error against a reference."""
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 from jaxtyping import Float
@@ -10,9 +10,13 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from jaxslam.evaluation import covariance_text
-from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, Similarity, similarity
-from jaxslam.evaluation.arrays import ROUNDING, exactly_known, normalised
-from jaxslam.evaluation.convention import Convention, errors_beyond_scale, pose_errors
+from jaxslam.evaluation.alignment import (
+    MAX_TIME_DIFFERENCE,
+    Similarity,
+    associated,
+    similarity,
+)
+from jaxslam.evaluation.convention import Convention, errors_beyond_scale
 from jaxslam.io.tum import write_tum
 from jaxslam.statistics.beyond_scale import one_scale
 
@@ -79,23 +83,6 @@ def write_covariances(
     )
 
 
-def pose_nees(
-    T_wc: ArrayLike, covariances: ArrayLike, reference: ArrayLike
-) -> Float[np.ndarray, " n"]:
-    """`eᵀ P⁻¹ e` of poses (n, 4, 4), e the `TRACKED` error; ideally 6.
-
-    The reference has the world frame and the unit of the map, as a simulation's has. Of a pose
-    that is `exactly_known` it is 0 where the pose is right, to the rounding of the files, and
-    infinite where it is not. Raises `ValueError` for any other covariance that is not positive.
-    """
-    errors = pose_errors(TRACKED, *(np.asarray(T, float) for T in (T_wc, reference)))
-    covariances = np.asarray(covariances, float)
-    known = exactly_known(covariances)
-    nees = np.where(np.linalg.norm(errors, axis=1) <= ROUNDING, 0.0, np.inf)
-    nees[~known] = normalised(errors[None, ~known], covariances[None, ~known])[0]
-    return nees
-
-
 class BeyondScale(NamedTuple):
     """Of n poses of a map against a reference of another scale."""
 
@@ -137,10 +124,10 @@ def absolute_trajectory_error(
     reference_times: ArrayLike,
     reference: ArrayLike,
 ) -> TrajectoryError:
-    """The absolute trajectory error of the positions after a Sim(3) alignment, by `evo`.
+    """The absolute trajectory error of the positions after a Sim(3) alignment.
 
-    Times (n,) and (m,) in seconds, poses (n, 4, 4) and (m, 4, 4). `evo` pairs poses by their
-    times (`MAX_TIME_DIFFERENCE`) and aligns the estimate with scale (Umeyama's method).
+    Times (n,) and (m,) in seconds, poses (n, 4, 4) and (m, 4, 4). Poses are paired by their
+    times (`associated`), and the estimate is aligned with scale (Umeyama's method).
     `path_length` is the reference's over the paired poses, `extent` the diagonal of the box
     around them, `matched` their number.
 
@@ -153,23 +140,18 @@ def absolute_trajectory_error(
     Raises `ValueError` where fewer than three poses pair up or all positions of one trajectory
     coincide.
     """
-    from evo.core import metrics
-
-    paired, paired_reference = _paired(estimate_times, estimate, reference_times, reference)
-    estimated, true = np.stack(paired.poses_se3), np.stack(paired_reference.poses_se3)
-    _align(paired, paired_reference)
-    sign, angle = _by_orientation(estimated, true)
-    error = metrics.APE(metrics.PoseRelation.translation_part)
-    error.process_data((paired_reference, paired))
+    pairs = _paired(estimate_times, estimate, reference_times, reference)
+    positions, aligned = pairs.reference[:, :3, 3], pairs.aligned()
+    sign, angle = _by_orientation(pairs.estimate, pairs.reference)
     return {
         "alignment": "sim3",
-        "rmse": float(error.get_statistic(metrics.StatisticsType.rmse)),
-        "path_length": float(paired_reference.path_length),
-        "extent": float(np.linalg.norm(np.ptp(paired_reference.positions_xyz, axis=0))),
-        "matched": int(paired.num_poses),
+        "rmse": _rms(aligned[:, :3, 3] - positions),
+        "path_length": float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()),
+        "extent": float(np.linalg.norm(np.ptp(positions, axis=0))),
+        "matched": len(pairs.times),
         "sign": sign,
         "orientation_rmse": angle,
-        "straight_line": _straight_line(paired_reference.timestamps, true[:, :3, 3]),
+        "straight_line": _straight_line(pairs.times, positions),
     }
 
 
@@ -180,31 +162,28 @@ def relative_pose_error(
     reference: ArrayLike,
     seconds: float = 1.0,
 ) -> RelativeError:
-    """The relative pose error over `seconds`, by `evo`: how far a motion of that long is off.
+    """The relative pose error over `seconds`: how far a motion of that long is off.
 
     RMS over all pairs of poses so far apart: of the `translation`, in the reference's unit, and of
     the `rotation`, in degrees; `way` is the reference's own displacement, RMS. Of the alignment
     only its scale matters. Arguments are those of
     `absolute_trajectory_error`, and so is what is raised; also for a trajectory that is shorter.
     """
-    from evo.core import metrics
-
-    paired, paired_reference = _paired(estimate_times, estimate, reference_times, reference)
-    _align(paired, paired_reference)
-    apart = max(1, round(seconds / float(np.median(np.diff(paired_reference.timestamps)))))
-    if apart >= paired.num_poses:
+    pairs = _paired(estimate_times, estimate, reference_times, reference)
+    apart = max(1, round(seconds / float(np.median(np.diff(pairs.times)))))
+    if apart >= len(pairs.times):
         raise ValueError(f"no two poses of the trajectory are {seconds:g} s apart")
-
-    def rms(relation: Any) -> float:
-        error = metrics.RPE(relation, apart, metrics.Unit.frames, all_pairs=True)
-        error.process_data((paired_reference, paired))
-        return float(error.get_statistic(metrics.StatisticsType.rmse))
-
-    translation = rms(metrics.PoseRelation.translation_part)
-    rotation = rms(metrics.PoseRelation.rotation_angle_deg)
-    ways = paired_reference.positions_xyz[apart:] - paired_reference.positions_xyz[:-apart]
-    way = float(np.sqrt(np.mean(np.sum(ways**2, axis=1))))
-    return {"seconds": seconds, "translation": translation, "rotation": rotation, "way": way}
+    moved, true = (
+        np.linalg.inv(T[:-apart]) @ T[apart:] for T in (pairs.aligned(), pairs.reference)
+    )
+    error = np.linalg.inv(true) @ moved
+    angles = np.degrees(Rotation.from_matrix(error[:, :3, :3]).magnitude())
+    return {
+        "seconds": seconds,
+        "translation": _rms(error[:, :3, 3]),
+        "rotation": _rms(angles[:, None]),
+        "way": _rms(true[:, :3, 3]),
+    }
 
 
 def alignment(
@@ -215,7 +194,25 @@ def alignment(
 ) -> Similarity:
     """From the estimate's world to the reference's: that of `absolute_trajectory_error`, which is
     of the same arguments and raises the same."""
-    return _align(*_paired(estimate_times, estimate, reference_times, reference))
+    return _paired(estimate_times, estimate, reference_times, reference).alignment()
+
+
+class _Pairs(NamedTuple):
+    """Poses of the same time."""
+
+    times: Float[np.ndarray, " k"]
+    """Of the reference, s."""
+    estimate: Float[np.ndarray, "k 4 4"]
+    reference: Float[np.ndarray, "k 4 4"]
+
+    def alignment(self) -> Similarity:
+        """The Sim(3) that takes the estimate to where it fits best."""
+        positions = (T[:, :3, 3] for T in (self.estimate, self.reference))
+        return similarity(*positions, scaled=True)
+
+    def aligned(self) -> Float[np.ndarray, "k 4 4"]:
+        """The estimate in the reference's world."""
+        return self.alignment().moved(self.estimate)
 
 
 def _paired(
@@ -223,44 +220,23 @@ def _paired(
     estimate: ArrayLike,
     reference_times: ArrayLike,
     reference: ArrayLike,
-) -> tuple[Any, Any]:
-    """Estimate and reference as `evo` has them, pose by pose of the same time."""
-    from evo.core import sync
-
-    try:
-        paired_reference, paired = sync.associate_trajectories(
-            _evo_trajectory(reference_times, reference),
-            _evo_trajectory(estimate_times, estimate),
-            max_diff=MAX_TIME_DIFFERENCE,
+) -> _Pairs:
+    """Poses of the same time. Raises ValueError for fewer than three."""
+    times, T, true_times, true = (
+        np.asarray(x, float) for x in (estimate_times, estimate, reference_times, reference)
+    )
+    theirs, ours = associated(true_times, times)
+    if len(ours) < 3:
+        raise ValueError(
+            f"{len(ours)} poses of the trajectory are within {MAX_TIME_DIFFERENCE} s of one of the "
+            "reference's; at least three are needed"
         )
-    except sync.SyncException:
-        raise ValueError(_too_few(0)) from None
-    if paired.num_poses < 3:
-        raise ValueError(_too_few(paired.num_poses))
-    return paired, paired_reference
+    return _Pairs(true_times[theirs], T[ours], true[theirs])
 
 
-def _evo_trajectory(times: ArrayLike, T_wc: ArrayLike) -> Any:
-    from evo.core.trajectory import PoseTrajectory3D
-
-    T_wc = np.asarray(T_wc, dtype=float)
-    # evo reads the scalar first; poses_se3 alone would make it check float32 too strictly.
-    x, y, z, w = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat().T
-    return PoseTrajectory3D(T_wc[:, :3, 3], np.stack([w, x, y, z], 1), np.asarray(times, float))
-
-
-def _align(paired: Any, paired_reference: Any) -> Similarity:
-    """Move the estimate to where it fits best, in place; by what."""
-    from evo.core import lie_algebra
-    from evo.core.geometry import GeometryException
-
-    try:
-        return Similarity(*paired.align(paired_reference, correct_scale=True))
-    except GeometryException:  # a straight line, about which evo leaves the roll open: see below
-        found = similarity(paired.positions_xyz, paired_reference.positions_xyz, scaled=True)
-        paired.scale(found.scale)
-        paired.transform(lie_algebra.se3(found.rotation, found.translation))
-        return found
+def _rms(errors: Float[np.ndarray, "k n"]) -> float:
+    """Root of the mean of their squared lengths."""
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
 
 
 def _by_orientation(
@@ -280,11 +256,4 @@ def _straight_line(times: Float[np.ndarray, " n"], positions: Float[np.ndarray, 
     """RMS distance to the least squares line `a + b t`: any line can be aligned to any other."""
     centred, t = positions - positions.mean(0), times - times.mean()
     rest = centred - np.outer(t, t @ centred / (t @ t))
-    return float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
-
-
-def _too_few(count: int) -> str:
-    return (
-        f"{count} poses of the trajectory are within {MAX_TIME_DIFFERENCE} s of one of the "
-        "reference's; at least three are needed"
-    )
+    return _rms(rest)
