@@ -3,8 +3,9 @@
     python benchmarks/consistency.py --scenarios matched-loose --filters robocentric --seeds 0 1 2
 
 Results are added to `consistency.json` one seed at a time, also by several such commands at once;
-what it already has is not run again. `docs/consistency.md` pools all runs of a row. `--page` only
-writes it from what is there.
+seeds that a row already has are not run again. A row is one study of all runs of its seeds, which
+are as many of each; to measure it with more, remove it first. `--page` only writes
+`docs/consistency.md`, from what is there.
 """
 
 from __future__ import annotations
@@ -12,9 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import reduce
 from itertools import pairwise
-from operator import add
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +24,16 @@ from verdicts import BEGIN
 from verdicts import table as table_of_verdicts
 
 import jaxslam
-from jaxslam._runtime.files import write_atomically
+from jaxslam._runtime.files import json_numbers, write_atomically
 from jaxslam.consistency import tally
 from jaxslam.statistics import Tally, mean_band
 
-Seeds = dict[str, dict[str, Any]]
-Results = dict[str, dict[str, Seeds]]
-"""`results[scenario][filter/landmarks][seed]`: what `measure` returns."""
-LAYOUT = 2
-"""Of what `measure` returns; what has another is measured again."""
+Row = dict[str, Any]
+Results = dict[str, dict[str, Row]]
+"""`results[scenario][filter/landmarks]`: what `measure` returns of one seed, `together` of more."""
+LAYOUT = 3
+"""Of a row; what has another is measured again."""
+TALLIES = ("tally", "one_scale", "drift")
 VERDICTS = Path("benchmarks/results/verdicts.json")
 RESULTS = Path("docs/results.md")
 README = Path("README.md")
@@ -74,7 +74,7 @@ class Options:
     """Measure nothing; write the page, and the tables of the README and of docs/results.md."""
 
 
-def measure(scenario: jaxslam.Scenario, name: str, seed: int, options: Options) -> dict[str, Any]:
+def measure(scenario: jaxslam.Scenario, name: str, seed: int, options: Options) -> Row:
     """One filter on one seed: numbers from which those of many seeds follow."""
     frame, landmarks = name.rsplit("/", 1)
     filters = jaxslam.make_filters(scenario, [frame], [landmarks])
@@ -85,71 +85,69 @@ def measure(scenario: jaxslam.Scenario, name: str, seed: int, options: Options) 
     nis = np.sum(np.array(f["nis"], float)) / np.sum(np.array(f["nis_dof"], float))
     return {
         "layout": LAYOUT,
+        "seeds": [seed],
         "runs": options.runs,
         "tally": tally(study, key).asdict(),
         "one_scale": tally(study, key, "beyond_scale").asdict(),
         "drift": tally(study, key, "drift").asdict(),
-        "nees": _rounded(f["nees"]),
+        "nees": f["nees"],
         "lost": round(f["lost"][-1] * options.runs),
-        "nees_median": _rounded(f["nees_median"][-1:])[0],
+        "nees_median": f["nees_median"][-1],
         "nees_not_lost": f["nees_not_lost"][-1],
-        "rmse": _rounded(f["rmse"]["position"][-1:])[0],
-        "sigma": _rounded(f["sigma"]["position"][-1:])[0],
-        "nis_per_dof": round(float(nis), 4),
-        "microseconds_per_step": round(
-            1e6 * f["seconds"]["run"] / options.runs / scenario.steps, 1
-        ),
+        "rmse": f["rmse"]["position"][-1],
+        "sigma": f["sigma"]["position"][-1],
+        "nis_per_dof": float(nis),
+        "microseconds_per_step": 1e6 * f["seconds"]["run"] / options.runs / scenario.steps,
     }
 
 
-def _rounded(values: list[float | None]) -> list[float | None]:
-    return [None if value is None else float(f"{value:.5g}") for value in values]
+def together(one: Row, other: Row) -> Row:
+    """Rows of different seeds as one study; of medians, NIS and times the mean of the seeds'.
 
-
-def pooled(seeds: Seeds) -> dict[str, Any]:
-    """All runs of all seeds as one study; the median is the mean of the seeds'.
-
-    Of the runs that did not diverge, but for `lost` and the verdict: `band95` is of so many.
+    NEES, RMSE and σ are of the runs that did not diverge.
     """
-    one = list(seeds.values())
-    total = reduce(add, (Tally.from_dict(seed["tally"]) for seed in one))
-    survivors = [seed["runs"] - seed["tally"]["diverged"] for seed in one]
-    kept = [seed["runs"] - seed["lost"] for seed in one]
-    squared = {key: np.square(_column(one, key)) for key in ("rmse", "sigma")}
+    both = one, other
+    seeds = [len(row["seeds"]) for row in both]
+    survivors = [row["runs"] - row["tally"]["diverged"] for row in both]
+    kept = [row["runs"] - row["lost"] for row in both]
+
+    def mean(key: str, weights: list[int]) -> np.ndarray:
+        return _weighed(np.array([row[key] for row in both], float), weights)
+
+    def root(key: str) -> np.ndarray:
+        return np.sqrt(_weighed(np.array([row[key] for row in both], float) ** 2, survivors))
+
+    numbers = {
+        "nees_not_lost": mean("nees_not_lost", kept),
+        **{key: mean(key, seeds) for key in ("nees_median", "nis_per_dof")},
+        "microseconds_per_step": mean("microseconds_per_step", seeds),
+        **{key: root(key) for key in ("rmse", "sigma")},
+    }
     return {
-        "seeds": named(seeds),
-        "runs": total.runs,
-        "verdict": total.verdict(),
-        **_at_one_scale(one),
-        "band95": mean_band(total.dof, max(sum(survivors), 1)),
-        "nees": _weighed(np.array([seed["nees"] for seed in one], float), survivors),
-        "lost": 1 - sum(kept) / total.runs,
-        "nees_not_lost": float(_weighed(_column(one, "nees_not_lost"), kept)),
-        "nees_median": float(np.mean(_column(one, "nees_median"))),
-        "nis_per_dof": float(np.mean(_column(one, "nis_per_dof"))),
-        **{key: float(np.sqrt(_weighed(square, survivors))) for key, square in squared.items()},
+        "layout": LAYOUT,
+        "seeds": sorted(one["seeds"] + other["seeds"]),
+        "runs": one["runs"] + other["runs"],
+        "lost": one["lost"] + other["lost"],
+        **{
+            key: (Tally.from_dict(one[key]) + Tally.from_dict(other[key])).asdict()
+            for key in TALLIES
+            if key in one and key in other
+        },
+        "nees": json_numbers(mean("nees", survivors)),
+        **dict(zip(numbers, json_numbers(np.array(list(numbers.values()))), strict=True)),
     }
 
 
-def _at_one_scale(one: list[dict[str, Any]]) -> dict[str, Any]:
-    """Verdicts on NEES at one scale a run and on the drift of scale, where seeds have both."""
-    if any("drift" not in seed for seed in one):
-        return {}
-    return {
-        key: reduce(add, (Tally.from_dict(seed[key]) for seed in one)).verdict()
-        for key in ("one_scale", "drift")
-    }
-
-
-def _column(seeds: list[dict[str, Any]], key: str) -> np.ndarray:
-    return np.array([seed[key] for seed in seeds], float)
-
-
-def _weighed(values: np.ndarray, runs: list[int]) -> Any:
-    """The mean over seeds of so many runs; a seed without any has no value, and no weight."""
-    weights = np.array(runs, float).reshape(-1, *[1] * (values.ndim - 1))
+def _weighed(values: np.ndarray, weights: list[int]) -> np.ndarray:
+    """The mean over rows of such weights; one without any has no value."""
+    w = np.array(weights, float).reshape(-1, *[1] * (values.ndim - 1))
     with np.errstate(invalid="ignore"):
-        return np.where(weights > 0, values * weights, 0.0).sum(axis=0) / weights.sum()
+        return np.where(w > 0, values * w, 0.0).sum(axis=0) / w.sum()
+
+
+def verdicts_of(row: Row) -> dict[str, dict[str, Any]]:
+    """Of all steps, at one scale a run, and of the drift of scale, where a row has them."""
+    return {key: Tally.from_dict(row[key]).verdict() for key in TALLIES if key in row}
 
 
 def page(results: Results, verdicts: Path = VERDICTS) -> str:
@@ -174,7 +172,7 @@ def page(results: Results, verdicts: Path = VERDICTS) -> str:
         "",
         *_of_verdicts(verdicts),
     ]
-    if any(_old(seeds) for filters in results.values() for seeds in filters.values()):
+    if any("drift" not in row for filters in results.values() for row in filters.values()):
         lines += [
             "",
             "†: tallied before a verdict looked at thirds, *ever* by the quantile of one step, and",
@@ -190,14 +188,9 @@ def page(results: Results, verdicts: Path = VERDICTS) -> str:
             f"| NEES at steps {', '.join(map(str, STEPS))}, last | lost | ever | others | median "
             "| RMSE m | σ m | NIS/dof |",
             "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
-            *(_row(key, pooled(seeds), len(seeds)) for key, seeds in filters.items() if seeds),
+            *(_row(key, row) for key, row in filters.items()),
         ]
     return "\n".join(lines) + "\n"
-
-
-def _old(seeds: Seeds) -> bool:
-    """Whether any of them was tallied without thirds and drift."""
-    return any("drift" not in seed for seed in seeds.values())
 
 
 def _of_verdicts(path: Path) -> list[str]:
@@ -224,29 +217,38 @@ def _of_verdicts(path: Path) -> list[str]:
     ]
 
 
-def _row(name: str, p: dict[str, Any], seeds: int) -> str:
-    verdict, mean = p["verdict"], p["verdict"]["mean"]
+def _row(name: str, row: Row) -> str:
+    told = verdicts_of(row)
+    verdict, mean = told["tally"], told["tally"]["mean"]
     decided = "" if verdict["of"] == "all steps" else f" ({verdict['of']})"
-    low, high = p["band95"] if verdict["nees"] is not None else (np.inf, -np.inf)
-    nees = [p["nees"][step] for step in (*(s - 1 for s in STEPS if s < len(p["nees"])), -1)]
+    survivors = row["runs"] - row["tally"]["diverged"]
+    low, high = mean_band(row["tally"]["dof"], max(survivors, 1))
+    if verdict["nees"] is None:
+        low, high = np.inf, -np.inf
+    steps = (*(s - 1 for s in STEPS if s < len(row["nees"])), -1)
+    nees = [_number(row["nees"][step]) for step in steps]
     cells = [
-        f"`{name}`{'' if 'drift' in p else ' †'}",
-        f"{p['seeds']} × {p['runs'] / seeds:g}",
+        f"`{name}`{'' if 'drift' in row else ' †'}",
+        f"{named(row['seeds'])} × {row['runs'] / len(row['seeds']):g}",
         _short(mean["nees"]),
         _factor(mean),
         f"{verdict['word']}{decided}",
-        "; ".join(p[key]["word"] for key in ("one_scale", "drift") if key in p) or "–",
+        "; ".join(told[key]["word"] for key in TALLIES[1:] if key in told) or "–",
         f"{_short(verdict['never_lost']['nees'])}, {_factor(verdict['never_lost'])}",
         " ".join(f"**{_short(n)}**" if low <= n <= high else _short(n) for n in nees),
-        f"{p['lost']:.2%}",
+        f"{row['lost'] / row['runs']:.2%}",
         f"{verdict['lost']:.2%}",
-        _short(p["nees_not_lost"]),
-        _short(p["nees_median"]),
-        f"{p['rmse']:.3f}",
-        f"{p['sigma']:.3f}",
-        f"{p['nis_per_dof']:.2f}",
+        _short(row["nees_not_lost"]),
+        _short(row["nees_median"]),
+        f"{row['rmse']:.3f}",
+        f"{row['sigma']:.3f}",
+        f"{row['nis_per_dof']:.2f}",
     ]
     return f"| {' | '.join(cells)} |"
+
+
+def _number(value: float | None) -> float:
+    return np.nan if value is None else value
 
 
 def recommended(results: Results, scenarios: Iterable[str]) -> str:
@@ -256,19 +258,21 @@ def recommended(results: Results, scenarios: Iterable[str]) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for scenario in scenarios:
-        for name, seeds in results[scenario].items():
+        for name, row in results[scenario].items():
             label = "recommended" if "+scene50" in name else name.split("/")[0]
             if label in ("robocentric", "recommended"):
-                rows.append(f"| `{scenario}` | `{label}` {_cells(pooled(seeds))}")
+                rows.append(f"| `{scenario}` | `{label}` {_cells(row)}")
     return "\n".join(rows)
 
 
-def _cells(p: dict[str, Any]) -> str:
-    verdict, mean = p["verdict"], p["verdict"]["mean"]
+def _cells(row: Row) -> str:
+    verdict = verdicts_of(row)["tally"]
+    mean = verdict["mean"]
     decided = "" if verdict["of"] == "all steps" else f" ({verdict['of']})"
     return (
-        f"| {_short(mean['nees'])}; {_short(p['nees'][-1])} | {_factor(mean, 2)} "
-        f"| {verdict['word']}{decided} | {p['lost']:.1%} | {p['rmse']:.3f}, {p['sigma']:.3f} |"
+        f"| {_short(mean['nees'])}; {_short(row['nees'][-1])} | {_factor(mean, 2)} "
+        f"| {verdict['word']}{decided} | {row['lost'] / row['runs']:.1%} "
+        f"| {row['rmse']:.3f}, {row['sigma']:.3f} |"
     )
 
 
@@ -280,9 +284,9 @@ def _factor(found: dict[str, Any], digits: int = 3) -> str:
     return f"{factor:.{digits}f} [{low:.{digits}f}, {told}]"
 
 
-def named(seeds: Seeds) -> str:
+def named(seeds: Iterable[int]) -> str:
     """`0–9, 12`."""
-    numbers = sorted(map(int, seeds))
+    numbers = sorted(seeds)
     starts = [numbers[0], *(b for a, b in pairwise(numbers) if b > a + 1)]
     ends = [*(a for a, b in pairwise(numbers) if b > a + 1), numbers[-1]]
     ranges = zip(starts, ends, strict=True)
@@ -296,26 +300,39 @@ def _short(value: float | None) -> str:
 
 
 def read(path: Path) -> Results:
-    """The results of this layout that a file holds; none where there is no file."""
+    """The rows of this layout that a file holds; none where there is no file."""
     found: Results = json.loads(path.read_text()) if path.exists() else {}
     return {
-        scenario: {
-            name: {n: seed for n, seed in seeds.items() if seed.get("layout") == LAYOUT}
-            for name, seeds in filters.items()
-        }
+        scenario: {name: row for name, row in filters.items() if row.get("layout") == LAYOUT}
         for scenario, filters in found.items()
     }
 
 
-def add_to(path: Path, scenario: str, name: str, seed: int, found: dict[str, Any]) -> Seeds:
-    """Read the file anew, as others add to it, and write it with one seed more."""
+def add_to(path: Path, scenario: str, name: str, found: Row) -> None:
+    """Write the file, read anew as others add to it, with a seed more, unless it is there."""
     path.parent.mkdir(parents=True, exist_ok=True)
     results = read(path)
-    seeds = results.setdefault(scenario, {}).setdefault(name, {})
-    seeds[str(seed)] = found
+    filters = results.setdefault(scenario, {})
+    there = filters.get(name)
+    if there is None:
+        filters[name] = found
+    elif not set(found["seeds"]) & set(there["seeds"]):
+        filters[name] = together(there, found)
     with write_atomically(path) as temporary:
         temporary.write_text(json.dumps(results, separators=(",", ":"), allow_nan=False) + "\n")
-    return seeds
+
+
+def missing(row: Row | None, options: Options) -> list[int]:
+    """Seeds that a row does not have yet. Raises ValueError where it has other numbers of runs."""
+    if row is None:
+        return list(options.seeds)
+    each = row["runs"] / len(row["seeds"])
+    if each != options.runs:
+        raise ValueError(
+            f"there is a row with {each:g} runs of every seed, not {options.runs}: remove it from "
+            f"{options.out}, or write to another file (--out)"
+        )
+    return [seed for seed in options.seeds if seed not in row["seeds"]]
 
 
 def main(options: Options) -> None:
@@ -324,13 +341,10 @@ def main(options: Options) -> None:
     for scenario_name in () if options.page else options.scenarios:
         scenario = jaxslam.scenario(scenario_name)
         for name in names:
-            for seed in options.seeds:
-                done = read(options.out).get(scenario_name, {}).get(name, {})
-                if done.get(str(seed), {}).get("runs") == options.runs:
-                    continue
+            for seed in missing(read(options.out).get(scenario_name, {}).get(name), options):
                 found = measure(scenario, name, seed, options)
-                add_to(options.out, scenario_name, name, seed, found)
-                print(scenario_name, _row(name, pooled({str(seed): found}), 1), flush=True)
+                add_to(options.out, scenario_name, name, found)
+                print(scenario_name, _row(name, found), flush=True)
     results = read(options.out)
     with write_atomically(options.docs) as path:
         path.write_text(page(results))

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 import jaxslam
-from jaxslam.statistics import Tally, mean_band, run_verdict
+from jaxslam.statistics import Tally, run_verdict
 
 NAME = "robocentric/inverse_scaling"
 
 
-def measured(nees):
+def measured(nees, seed=0):
     """What `measure` returns of runs with these NEES."""
     tally = Tally.of(nees, 3)
     one, drift = Tally.of(nees, 3, 1.0), Tally.of(nees / 3, 1, 1.0)
     return {
-        "layout": benchmark.LAYOUT, "runs": len(nees), "tally": tally.asdict(),
+        "layout": benchmark.LAYOUT, "seeds": [seed], "runs": len(nees), "tally": tally.asdict(),
         "one_scale": one.asdict(), "drift": drift.asdict(),
         "nees": list(nees.mean(axis=0)), "lost": int(np.sum(nees[:, -1] > 21.1)),
         "nees_not_lost": float(np.mean(nees[nees[:, -1] <= 21.1, -1])), "nees_median": 2.4,
@@ -40,12 +40,29 @@ def test_pooled_seeds_are_one_study_of_all_their_runs():
     parts = [rng.chisquare(3, (runs, 12)) for runs in (100, 300)]
     parts[0][3, 4], parts[1][7, -1] = 50.0, 90.0
     whole = np.concatenate(parts)
-    p = benchmark.pooled({str(i): measured(nees) for i, nees in enumerate(parts)})
-    assert (p["seeds"], p["runs"], p["band95"]) == ("0–1", 400, mean_band(3, 400))
-    np.testing.assert_allclose(p["nees"], whole.mean(axis=0))
-    assert (p["lost"], p["verdict"]["lost"]) == (pytest.approx(1 / 400), 2 / 400)
-    assert p["verdict"]["interval99"] == pytest.approx(run_verdict(whole, 3)["interval99"])
-    assert p["nees_not_lost"] == pytest.approx(np.delete(whole, 107, axis=0)[:, -1].mean())
+    rows = [measured(nees, seed) for seed, nees in enumerate(parts)]
+    rows[1] |= {"nees_median": 3.2, "rmse": 0.5}
+    row = benchmark.together(*rows)
+    verdict = benchmark.verdicts_of(row)["tally"]
+    assert (row["seeds"], row["runs"], row["lost"]) == ([0, 1], 400, 1)
+    np.testing.assert_allclose(row["nees"], whole.mean(axis=0))
+    assert verdict["lost"] == 2 / 400
+    assert verdict["interval99"] == pytest.approx(run_verdict(whole, 3)["interval99"])
+    assert row["nees_not_lost"] == pytest.approx(np.delete(whole, 107, axis=0)[:, -1].mean())
+    assert row["nees_median"] == pytest.approx(2.8)
+    assert row["rmse"] == pytest.approx(np.sqrt((100 * 0.3**2 + 300 * 0.5**2) / 400))
+
+
+def test_seeds_are_one_study_in_any_order():
+    rng = np.random.default_rng(5)
+    a, b, c = (measured(rng.chisquare(3, (runs, 12)), i) for i, runs in enumerate((9, 20, 31)))
+    one = benchmark.together(benchmark.together(a, b), c)
+    other = benchmark.together(c, benchmark.together(b, a))
+    # Of medians each seed counts the same, however they were put together.
+    assert one["seeds"] == other["seeds"] == [0, 1, 2]
+    assert benchmark._row("x/y", one) == benchmark._row("x/y", other)
+    np.testing.assert_allclose(one["nees"], other["nees"])
+    assert json.loads(json.dumps(one, allow_nan=False)) == one
 
 
 def test_a_seed_is_measured_as_the_library_summarises_it(options):
@@ -56,12 +73,11 @@ def test_a_seed_is_measured_as_the_library_summarises_it(options):
     filters = jaxslam.make_filters(scenario, ["robocentric"], ["inverse_scaling"])
     study = jaxslam.monte_carlo(scenario, filters, runs=6, seed=2, chunk=4)
     expected = jaxslam.summarise(study)["filters"][NAME]
-    p = benchmark.pooled({"2": found})
-    assert p["verdict"] | {"lost_runs": []} == expected["verdict"]
-    np.testing.assert_allclose(p["nees"], expected["nees"], rtol=1e-4)
-    assert p["lost"] == pytest.approx(expected["lost"][-1])
+    assert benchmark.verdicts_of(found)["tally"] | {"lost_runs": []} == expected["verdict"]
+    assert (found["seeds"], found["nees"]) == ([2], expected["nees"])
+    assert found["lost"] / 6 == pytest.approx(expected["lost"][-1])
     for key in ("rmse", "sigma"):
-        assert p[key] == pytest.approx(expected[key]["position"][-1], rel=1e-4)
+        assert found[key] == expected[key]["position"][-1]
 
 
 def test_what_is_there_is_not_measured_again_and_others_may_add_to_it(options, monkeypatch):
@@ -70,22 +86,36 @@ def test_what_is_there_is_not_measured_again_and_others_may_add_to_it(options, m
     def measure(scenario, name, seed, options):
         asked.append(seed)
         if seed == 1:  # meanwhile another command
-            found = measured(rng.chisquare(3, (30, 4)))
-            benchmark.add_to(options.out, "circle", NAME, 7, found)
-        return measured(rng.chisquare(3, (30, 4)))
+            found = measured(rng.chisquare(3, (30, 4)), 7)
+            benchmark.add_to(options.out, "circle", NAME, found)
+        return measured(rng.chisquare(3, (30, 4)), seed)
 
     monkeypatch.setattr(benchmark, "measure", measure)
     benchmark.main(options)
     benchmark.main(dataclasses.replace(options, seeds=(0, 1, 3)))
     assert asked == [0, 1, 3]
     results = benchmark.read(options.out)
-    assert {name: set(filters[NAME]) for name, filters in results.items()} == {
-        "matched": {"0", "1", "3"},
-        "circle": {"7"},
+    assert {name: filters[NAME]["seeds"] for name, filters in results.items()} == {
+        "matched": [0, 1, 3],
+        "circle": [7],
     }
     page = options.docs.read_text()
     assert f"| `{NAME}` | 0–1, 3 × 30 |" in page
     assert f"| `{NAME}` | 7 × 30 |" in page
+
+
+def test_a_seed_that_another_command_added_counts_once(tmp_path):
+    rng, path = np.random.default_rng(0), tmp_path / "x.json"
+    for seed in (0, 1, 1):
+        benchmark.add_to(path, "matched", NAME, measured(rng.chisquare(3, (30, 4)), seed))
+    row = benchmark.read(path)["matched"][NAME]
+    assert (row["seeds"], row["runs"]) == ([0, 1], 60)
+
+
+def test_a_row_of_other_numbers_of_runs_is_not_mixed_with_these(options):
+    benchmark.add_to(options.out, "matched", NAME, measured(np.full((20, 4), 3.0)))
+    with pytest.raises(ValueError, match=r"a row with 20 runs of every seed, not 30: remove it"):
+        benchmark.main(options)
 
 
 def test_results_of_an_older_layout_are_measured_again(options, monkeypatch):
@@ -94,7 +124,7 @@ def test_results_of_an_older_layout_are_measured_again(options, monkeypatch):
 
     def measure(scenario, name, seed, options):
         asked.append(seed)
-        return measured(np.full((30, 4), 3.0))
+        return measured(np.full((30, 4), 3.0), seed)
 
     monkeypatch.setattr(benchmark, "measure", measure)
     benchmark.main(options)
@@ -105,7 +135,7 @@ def test_a_row_says_what_was_lost_and_which_means_are_in_the_band():
     nees = np.random.default_rng(1).chisquare(3, (1000, 12))
     nees[:, 4:] *= 1.2  # from step 5
     nees[:20, 9:] = 100.0  # from step 10
-    row = benchmark._row("x/y", benchmark.pooled({"4": measured(nees)}), 1)
+    row = benchmark._row("x/y", measured(nees, 4))
     assert row.startswith("| `x/y` | 4 × 1000 | 3.85 | 1.133 [1.087, 1.191] |")
     assert "over-confident" in row
     at_steps = row.split("|")[8].split()
@@ -113,25 +143,25 @@ def test_a_row_says_what_was_lost_and_which_means_are_in_the_band():
     assert "| 2.00% | 2.10% | 3.43 |" in row
     assert len(row.split("|")) == len(benchmark.page({"m": {}}).splitlines()[-1].split("|"))
     nees[:, 4] /= 1.2
-    row = benchmark._row("x/y", benchmark.pooled({"4": measured(nees)}), 1)
+    row = benchmark._row("x/y", measured(nees, 4))
     assert row.split("|")[8].split()[0].startswith("**")
 
 
 def test_a_row_names_the_part_that_decided():
     nees = np.random.default_rng(3).chisquare(3, (300, 12))
     nees[:, -1] *= 1.4
-    row = benchmark._row("x/y", benchmark.pooled({"0": measured(nees)}), 1)
+    row = benchmark._row("x/y", measured(nees))
     assert "| over-confident (last step) |" in row
     assert row.startswith(f"| `x/y` | 0 × 300 | {nees.mean():.2f} | ")
 
 
-def test_seeds_tallied_without_thirds_have_a_verdict_and_the_page_says_so():
+def test_rows_tallied_without_thirds_have_a_verdict_and_the_page_says_so():
     found = measured(np.random.default_rng(4).chisquare(3, (300, 12)))
     old = {k: v for k, v in found.items() if k not in ("one_scale", "drift")}
     old["tally"] = {k: v for k, v in found["tally"].items() if k != "thirds"}
-    assert benchmark.pooled({"0": old})["verdict"]["thirds"] == []
-    for seed, told in ((found, False), (old, True)):
-        page = benchmark.page({"matched": {NAME: {"0": seed}}})
+    assert benchmark.verdicts_of(old)["tally"]["thirds"] == []
+    for row, told in ((found, False), (old, True)):
+        page = benchmark.page({"matched": {NAME: row}})
         assert (f"| `{NAME}` † | 0 × 300 |" in page) is told
         assert ("| – |" in page) is told
         assert ("tallied before a verdict looked at thirds" in page) is told
@@ -142,7 +172,7 @@ def test_a_diverged_run_leaves_a_row_without_a_mean():
     broken = nees.copy()
     broken[4, 2:] = np.nan
     found = measured(nees) | {"tally": Tally.of(broken, 3).asdict()}
-    row = benchmark._row("x/y", benchmark.pooled({"0": found}), 1)
+    row = benchmark._row("x/y", found)
     assert row.startswith("| `x/y` | 0 × 50 | – | – | lost | ")
     assert "**" not in row
 
