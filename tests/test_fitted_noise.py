@@ -136,7 +136,7 @@ def test_the_filter_goes_on_with_the_root_of_the_mean_variance():
     ("name", "message"),
     [
         ("scale_gauge+noise0", "1 frame at least, not 0"),
-        ("robocentric+scales3+noise", "stages of a frame, which Bank lacks"),
+        ("robocentric+lag3+noise", "takes a frame in stages, which FixedLag does not"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from cases import Case, quick_jit
 
+from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.record import empty
 from jaxslam.filters.wrappers.batch_initialisation import (
     GIVEN_UP,
@@ -183,6 +184,9 @@ def test_what_stands_around_a_start_from_rest_says_what_it_says(around):
         told = jnp.asarray(standing)
         state = eqx.tree_at(lambda s: getattr(s, "inner", s).record.standing, state, told)
         assert slam.moving(state) == (not standing)
+        state = eqx.tree_at(lambda s: getattr(s, "inner", s).open, state, told)
+        assert slam.unit_fixed(state) == (not standing)
+    assert isinstance(slam.unwrapped, EkfSlam)
     slam = standstill().filter(f"{SUM}{around}")
     assert not slam.ambiguous_start
     assert slam.moving(slam.init(standstill().capacity))

@@ -11,8 +11,9 @@ from cases import Case, close, each_geometry, named, pose_run, quick_jit
 
 import jaxslam
 from jaxslam.filters.registry import FROM_REST, RECOMMENDED, recommended_name
-from jaxslam.filters.wrappers.bank import BEHIND, BankState, _mixed, log_likelihoods, with_motion
+from jaxslam.filters.wrappers.bank import BEHIND, BankState, _mixed, log_likelihoods
 from jaxslam.filters.wrappers.mixture import _parts, _split_and_merged
+from jaxslam.filters.wrappers.wrapper import with_motion
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Innovation, Status
 

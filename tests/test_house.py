@@ -10,6 +10,7 @@ from pathlib import Path
 import jaxslam
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
+from jaxslam.filters.wrappers.wrapper import AbstractWrapper
 
 PACKAGE = Path(jaxslam.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -102,6 +103,13 @@ def test_a_filter_is_three_functions_and_one_that_tracks_six_more():
     }  # fmt: skip
     methods = {n for n in public(EkfSlam) if callable(getattr(EkfSlam, n, None))}
     assert len(methods - set(EkfSlam.__dataclass_fields__)) <= 15
+
+
+def test_a_wrapper_hands_on_all_that_a_filter_says():
+    """Flags too: one that the protocol gains and the wrapper does not would be lost by nesting."""
+    said = {name for name in dir(AbstractStaged) if not name.startswith("_")}
+    own = {name for name in vars(AbstractWrapper) if not name.startswith("_")}
+    assert said - own == {"step"}  # made of the stages
 
 
 def test_importing_the_package_is_light():

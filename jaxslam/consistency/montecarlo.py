@@ -35,7 +35,7 @@ from jaxslam.consistency.recursion import Frame, run_through
 from jaxslam.consistency.store import MemoryStore, Records, Store
 from jaxslam.consistency.summary import Seconds, Study
 from jaxslam.consistency.sums import as_sums, keeps_records
-from jaxslam.filters.ekf import innermost
+from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import (
     camera_pose,
@@ -460,8 +460,8 @@ def scale_records(
     """Of one pose: the scale in metres, and `SCALE` in the filter's own unit; of a truth that is
     itself known with σ only, see `beyond_scale`."""
     metric = in_unit = beyond_scale(partial(slam.pose_error, state), T_BC, truth_sigma)
-    inner = innermost(slam)
-    if inner is not None and not isinstance(inner.scale, Metre):
+    inner = slam.unwrapped
+    if isinstance(inner, EkfSlam) and not isinstance(inner.scale, Metre):
         seen = camera_pose_in_unit(slam, state)
         in_unit = beyond_scale(
             lambda truth: (difference(truth, seen.pose), seen.covariance), T_BC, truth_sigma

@@ -20,7 +20,7 @@ from jaxslam.consistency.sums import (
     survived,
     tally_of,
 )
-from jaxslam.filters.ekf import innermost
+from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.models.observations import Status
 from jaxslam.simulation import Scenario
@@ -260,8 +260,8 @@ def _ratio(sums: np.ndarray, counts: Any) -> np.ndarray:
 
 def treatment(slam: Any) -> str | None:
     """How a filter treats its sensor's calibration, where it says so."""
-    inner = innermost(slam)
-    return None if inner is None else inner.calibration.name
+    inner = slam.unwrapped
+    return inner.calibration.name if isinstance(inner, EkfSlam) else None
 
 
 def tally(study: Study, name: str, record: str = "nees") -> Tally:

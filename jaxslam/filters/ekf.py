@@ -22,7 +22,7 @@ from jaxslam.filters.forms.covariance import Covariance, convert
 from jaxslam.filters.forms.form import AbstractForm, AbstractGaussian
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.model import COMPOSED, Context, Core, SlamModel, View
-from jaxslam.filters.protocol import AbstractStaged, Expected, Scene
+from jaxslam.filters.protocol import AbstractFilter, AbstractStaged, Expected, Scene
 from jaxslam.geometry import Pose, SplitPose, difference, identity, tangent_dim
 from jaxslam.landmarks import INVERSE_SCALING, Parametrization
 from jaxslam.models.calibration import AbstractCalibration, Known, check_calibration
@@ -174,13 +174,6 @@ class EkfSlam(AbstractStaged):
         """Correct by the features seen (P16, P17)."""
         check_features(self, seen)
         return self.entry.update(self, state, control, seen)
-
-    def update_mean(self, state: Any, control: Any, seen: Features) -> Any:
-        """`update` without its covariance: cheap enough to try many hypotheses."""
-        context = context_of(self, control)
-        return self.gaussian_form.update_mean(
-            self.model, state, seen, self.sensor.noise, context, _considered(self, state)
-        )
 
     def compose(self, state: Any, control: Any) -> Any:
         """Move into the new camera frame, after the update (P18–P21); convert landmarks; make the
@@ -348,11 +341,17 @@ def check_features(slam: EkfSlam, features: Features) -> None:
             )
 
 
-def innermost(slam: Any) -> EkfSlam | None:
-    """The `EkfSlam` that a filter is, or is built around; None where there is none."""
-    while slam is not None and not isinstance(slam, EkfSlam):
-        slam = getattr(slam, "base", None)
-    return slam
+def ekf_inside(slam: AbstractFilter, what: str) -> EkfSlam:
+    """The `EkfSlam` that a filter is, or is built around.
+
+    Raises ValueError, saying what is done with it ("noise is fitted"), where there is none.
+    """
+    inner = slam.unwrapped
+    if not isinstance(inner, EkfSlam):
+        raise ValueError(
+            f"{what} for an EkfSlam, and {type(slam).__name__} is none and is around none"
+        )
+    return inner
 
 
 def check_one_gaussian(base: Any, what: str, remedies: bool = False) -> None:

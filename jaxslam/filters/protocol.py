@@ -79,6 +79,12 @@ class AbstractFilter(eqx.Module):
         (without `slots`).
         """
 
+    @property
+    def unwrapped(self) -> AbstractFilter:
+        """The filter that this one is built around, at the end of all that stands around it; the
+        filter itself, unless it says otherwise."""
+        return self
+
     def in_map(self, state: Any) -> Bool[Array, " capacity"]:
         """Which slots hold a landmark."""
         return state.active
@@ -102,9 +108,8 @@ class AbstractStaged(AbstractFilter):
     @property
     def ambiguous_start(self) -> bool:
         """Whether measurements of a start that no linear prediction expects are welcome: the filter
-        finds by itself what explains them. What stands around a filter, its `base`, does as that
-        does."""
-        return getattr(getattr(self, "base", None), "ambiguous_start", False)
+        finds by itself what explains them."""
+        return False
 
     @abstractmethod
     def predict(self, state: Any, control: Any) -> Any:
@@ -142,10 +147,6 @@ class AbstractStaged(AbstractFilter):
         """Whether the newest frame says anything of how the camera moves."""
         del state
         return jnp.ones((), bool)
-
-    def update_mean(self, state: Any, control: Any, seen: Features) -> Any:
-        """A state with the mean that `update` gives, to try hypotheses with; cheaper, if it can."""
-        return self.update(state, control, seen)[0]
 
     def gaussian(self, state: Any, control: Any) -> tuple[AbstractStaged, Any]:
         """A filter and a predicted state of it that is one Gaussian: what hypotheses are tried

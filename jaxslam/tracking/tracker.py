@@ -19,7 +19,7 @@ from jaxslam._numerics.arrays import cast
 from jaxslam._runtime.files import one_line
 from jaxslam._runtime.programs import Program, in_background
 from jaxslam.filters.association import ASSOCIATIONS, Association, candidates, one_point_ransac
-from jaxslam.filters.ekf import EkfSlam, Undelayed, init_with_depths, innermost
+from jaxslam.filters.ekf import EkfSlam, Undelayed, init_with_depths
 from jaxslam.filters.protocol import AbstractStaged, Scene
 from jaxslam.filters.readouts import (
     camera_pose_in_unit,
@@ -181,8 +181,8 @@ class Tracker:
                 "which `jaxslam.io.calibration.read_calibration` reads from a file"
             )
         made = self.settings.make_filter(self.calibration) if self.filter is None else self.filter
-        inner = innermost(made)
-        delayed = inner is not None and not isinstance(inner.entry, Undelayed)
+        inner = made.unwrapped
+        delayed = isinstance(inner, EkfSlam) and not isinstance(inner.entry, Undelayed)
         if not isinstance(made, AbstractStaged) or delayed:
             raise ValueError(
                 f"filter {self.filter_name} cannot track: features are sought where a Gaussian "
@@ -283,8 +283,8 @@ class Tracker:
     def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
         """How the calibration is treated, and fx, fy, cx, cy with their covariance, pixels, as far
         as this map tells. None of a filter of one's own without a pinhole camera."""
-        inner = innermost(self._slam)
-        if inner is None or not isinstance(inner.sensor, Pinhole):
+        inner = self._slam.unwrapped
+        if not isinstance(inner, EkfSlam) or not isinstance(inner.sensor, Pinhole):
             return None
         with jax.enable_x64(True):
             mean, covariance = jax.device_get(_intrinsics(self._slam, inner, self._state))

@@ -130,22 +130,6 @@ class Covariance(AbstractGaussian):
         nis = whitened @ whitened
         return state, Innovation(predicted, residual, S, used, nis, status, factor.log_det())
 
-    def update_mean(
-        self,
-        model: Model,
-        state: State,
-        features: Features,
-        noise: Float[Array, "p p"],
-        context: Any,
-        considered: slice = slice(0, 0),
-    ) -> State:
-        """The mean that `update` would give, with the covariance left as it is."""
-        _, residual, used, blocks = residuals(model, state, features, context)
-        HP = observed(blocks, features.slots, state.covariance)
-        S = observed(blocks, features.slots, HP.T).T + _noise_matrix(noise, used)
-        delta = HP.T @ cholesky(S).solve(residual.ravel())
-        return shifted(state, delta.at[considered].set(0.0))
-
     def reparametrise(self, state: State, variables: Change) -> State:
         """Write the state in other variables, `P ← J P Jᵀ`."""
         core, J_core = variables.core(state.core), jacobian(variables.core, state.core)

@@ -119,18 +119,6 @@ class AbstractGaussian(AbstractForm):
     def remove(self, state: Any, gone: Bool[AnyArray, " capacity"]) -> Any:
         """Marginalise landmarks and free their slots."""
 
-    def update_mean(
-        self,
-        model: Model,
-        state: Any,
-        features: Features,
-        noise: Float[Array, "p p"],
-        context: Any,
-        considered: slice = slice(0, 0),
-    ) -> Any:
-        """The mean that `update` would give; what else is in the state means nothing."""
-        return self.update(model, state, features, noise, context, considered)[0]
-
     @abstractmethod
     def local_covariance(
         self, state: Any, J: Blocks, slots: Int[Array, " m"]

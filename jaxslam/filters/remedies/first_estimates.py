@@ -66,11 +66,6 @@ class FirstEstimates(Covariance):
         after = replace(after, landmarks=state.landmarks + correction)
         return after, replace(innovation, predicted=predicted)
 
-    def update_mean(self, model, state, features, noise, context, considered=slice(0, 0)):
-        start, moved, _ = _at_first(model, state, features, context)
-        after = super().update_mean(model, start, moved, noise, context, considered)
-        return replace(after, landmarks=state.landmarks + after.landmarks - start.landmarks)
-
     def initialise(self, model, state, features, noise, prior, context):
         after = super().initialise(model, state, features, noise, prior, context)
         slots = jnp.where(features.valid, features.slots, state.active.size)

@@ -55,10 +55,6 @@ class Invariant(Covariance):
         N_after, _ = _rigid_directions(model, after)
         return replace(after, covariance=carried(added.covariance, N_after - N, L)), innovation
 
-    def update_mean(self, model, state, features, noise, context, considered=slice(0, 0)):
-        added = super().update_mean(model, state, features, noise, context, considered)
-        return _retracted(model, state, added, *_rigid_directions(model, state))
-
 
 def _rigid_directions(
     model: SlamModel, state: State

@@ -22,14 +22,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
-from jaxslam._numerics.arrays import AnyArray, precision
+from jaxslam._numerics.arrays import precision
 from jaxslam._numerics.linalg import cholesky, eigh
-from jaxslam.filters.ekf import innermost
-from jaxslam.filters.protocol import AbstractStaged, Expected
-from jaxslam.filters.wrappers.bank import with_motion
-from jaxslam.geometry import Pose, jacobian
+from jaxslam.filters.ekf import EkfSlam, ekf_inside
+from jaxslam.filters.protocol import AbstractStaged
+from jaxslam.filters.wrappers.wrapper import AbstractWrapper, with_motion
+from jaxslam.geometry import jacobian
 from jaxslam.models.observations import Capacity, Features, Innovation
 
 MEMORY = 100
@@ -53,24 +53,26 @@ class NoiseState(eqx.Module):
     """What the filter had predicted of the velocity."""
 
 
-class AdaptiveProcessNoise(AbstractStaged):
+class AdaptiveProcessNoise(AbstractWrapper):
     """`base` with a process noise whose two sizes are estimated."""
 
     base: AbstractStaged
     memory: int = eqx.field(static=True, default=MEMORY)
 
     def __check_init__(self) -> None:
-        inner = innermost(self.base)
-        if inner is None or not isinstance(self.base, AbstractStaged):
+        motion = self._inner.motion
+        if not motion.has_velocity:
             raise ValueError(
-                f"noise is fitted in stages of a frame, which {type(self.base).__name__} lacks"
-            )
-        if not inner.motion.has_velocity:
-            raise ValueError(
-                f"the noise fitted is of a velocity, which {type(inner.motion).__name__} lacks"
+                f"the noise fitted is of a velocity, which {type(motion).__name__} lacks"
             )
         if self.memory < 1:
             raise ValueError(f"noise is remembered for 1 frame at least, not {self.memory}")
+
+    def base_state(self, state: NoiseState) -> Any:
+        return state.inner
+
+    def with_base_state(self, state: NoiseState, inner: Any) -> NoiseState:
+        return replace(state, inner=inner)
 
     def init(self, capacity: int | Capacity, first: Features | None = None) -> NoiseState:
         inner = self.base.init(capacity, first)
@@ -94,14 +96,6 @@ class AdaptiveProcessNoise(AbstractStaged):
             before,
         )
 
-    def predict_features(
-        self, state: NoiseState, control: Any, slots: Int[Array, " m"]
-    ) -> Expected:
-        return self.base.predict_features(state.inner, control, slots)
-
-    def gaussian(self, state: NoiseState, control: Any) -> tuple[AbstractStaged, Any]:
-        return self.base.gaussian(state.inner, control)
-
     def update(
         self, state: NoiseState, control: Any, seen: Features
     ) -> tuple[NoiseState, Innovation]:
@@ -116,24 +110,6 @@ class AdaptiveProcessNoise(AbstractStaged):
     def close(self, state: NoiseState, new: Features) -> NoiseState:
         return replace(state, inner=self.fitted(state).close(state.inner, new))
 
-    def moving(self, state: NoiseState) -> Bool[Array, ""]:
-        return self.base.moving(state.inner)
-
-    def remove(self, state: NoiseState, gone: Bool[AnyArray, " capacity"]) -> NoiseState:
-        return replace(state, inner=self.base.remove(state.inner, gone))
-
-    def marginal(self, state: NoiseState, function, slots: Int[Array, " m"] | None = None):
-        return self.base.marginal(state.inner, function, slots)
-
-    def in_map(self, state: NoiseState) -> Bool[Array, " capacity"]:
-        return self.base.in_map(state.inner)
-
-    def pose_error(self, state: NoiseState, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
-        return self.base.pose_error(state.inner, T_BC)
-
-    def unit_fixed(self, state: NoiseState) -> Bool[Array, ""]:
-        return self.base.unit_fixed(state.inner)
-
     def fitted(self, state: NoiseState) -> Any:
         """The base filter with the σ that is believed now."""
         motion: Any = self._inner.motion
@@ -141,8 +117,8 @@ class AdaptiveProcessNoise(AbstractStaged):
         return with_motion(self.base, replace(motion, noise_sigma=sigma, noise_told=False))
 
     @property
-    def _inner(self) -> Any:
-        return innermost(self.base)
+    def _inner(self) -> EkfSlam:
+        return ekf_inside(self.base, "noise is fitted")
 
     @property
     def _groups(self) -> tuple[slice, slice]:

@@ -20,11 +20,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.arrays import cast, precision
 from jaxslam._numerics.linalg import cholesky, eigh
-from jaxslam.filters.ekf import EkfSlam, innermost
+from jaxslam.filters.ekf import EkfSlam, ekf_inside
 from jaxslam.filters.initialisation.alternatives import log_density
 from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.wrappers.wrapper import with_motion
 from jaxslam.geometry import Pose, difference, retract
-from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.observations import Capacity, Features, Innovation, Status
 
 REACH = (2.5, 4.0)
@@ -133,13 +133,12 @@ class Bank(AbstractFilter):
         return jax.tree.map(lambda x: x[jnp.argmax(state.log_weights)], state.members)
 
     @property
+    def unwrapped(self) -> AbstractFilter:
+        return self.base.unwrapped
+
+    @property
     def _inner(self) -> EkfSlam:
-        inner = innermost(self.base)
-        if inner is None:
-            raise ValueError(
-                f"a Gaussian sum is of EkfSlam's, and {type(self.base).__name__} is built of none"
-            )
-        return inner
+        return ekf_inside(self.base, "a Gaussian sum is")
 
     def _weighed(
         self, members: Any, log_weights: Array, innovations: Innovation
@@ -179,13 +178,6 @@ class Bank(AbstractFilter):
         grid = np.array(list(itertools.product(line, repeat=directions)))
         weights = np.array([sum(w) for w in itertools.product(log_weight, repeat=directions)])
         return grid, weights - np.logaddexp.reduce(weights), float(sigma)
-
-
-def with_motion(slam: Any, motion: AbstractMotion) -> Any:
-    """The filter with another motion model inside."""
-    if isinstance(slam, EkfSlam):
-        return replace(slam, motion=motion)
-    return replace(slam, base=with_motion(slam.base, motion))
 
 
 def log_likelihoods(innovations: Innovation) -> Float[Array, " members"]:

@@ -16,13 +16,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool
 
 from jaxslam._numerics.arrays import AnyArray, cast, precision
 from jaxslam._numerics.conditional import cond, map_where
-from jaxslam.filters.ekf import EkfSlam, innermost
+from jaxslam.filters.ekf import EkfSlam, ekf_inside
 from jaxslam.filters.forms.state import State
-from jaxslam.filters.protocol import AbstractStaged, Expected
 from jaxslam.filters.window import record as window
 from jaxslam.filters.window.modes import Modes, at_rest, sought
 from jaxslam.filters.window.problem import Layout
@@ -31,7 +30,7 @@ from jaxslam.filters.window.subsample import thinned
 from jaxslam.filters.window.to_filter import gauge_state
 from jaxslam.filters.wrappers.bank import BankState
 from jaxslam.filters.wrappers.mixture import Mixture
-from jaxslam.geometry import Pose
+from jaxslam.filters.wrappers.wrapper import AbstractWrapper
 from jaxslam.models.observations import Capacity, Features, Innovation
 
 SIZES = {"planar": (9, 25, 61), "spatial": (9, 31)}
@@ -67,10 +66,10 @@ class RestState(eqx.Module):
     open: Bool[Array, ""]
 
 
-class BatchInitialisation(AbstractStaged):
+class BatchInitialisation(AbstractWrapper):
     """The start of `base`."""
 
-    base: Mixture
+    base: Mixture  # ty: ignore[incompatible-mutable-override]
     sizes: tuple[int, ...] = eqx.field(static=True)
     directions: int = eqx.field(static=True)
     known: float = eqx.field(static=True, default=KNOWN)
@@ -106,14 +105,11 @@ class BatchInitialisation(AbstractStaged):
         modes = at_rest(cast(ekf, dtype), begun, count, dtype)
         return RestState(BankState(members, modes.log_weights), begun, modes, jnp.ones((), bool))
 
-    def predict(self, state: RestState, control: Any) -> RestState:
-        return replace(state, sum=self.base.predict(state.sum, control))
+    def base_state(self, state: RestState) -> BankState:
+        return state.sum
 
-    def gaussian(self, state: RestState, control: Any):
-        return self.base.gaussian(state.sum, control)
-
-    def predict_features(self, state: RestState, control: Any, slots: Int[Array, " m"]) -> Expected:
-        return self.base.predict_features(state.sum, control, slots)
+    def with_base_state(self, state: RestState, inner: BankState) -> RestState:
+        return replace(state, sum=inner)
 
     def update(
         self, state: RestState, control: Any, seen: Features
@@ -123,9 +119,6 @@ class BatchInitialisation(AbstractStaged):
         after, innovation = update(state.sum, control, seen)
         stepped = window.stepped(state.record, control, seen, self.base.base.sensor.noise)
         return replace(state, sum=after, record=stepped), innovation
-
-    def compose(self, state: RestState, control: Any) -> RestState:
-        return replace(state, sum=self.base.compose(state.sum, control))
 
     def close(self, state: RestState, new: Features) -> RestState:
         """End the frame, and begin the sum anew from the window's modes while that is open."""
@@ -155,15 +148,6 @@ class BatchInitialisation(AbstractStaged):
             replace(modes, minima=replace(modes.minima, y=y)),
             state.open,
         )
-
-    def marginal(self, state: RestState, function, slots: Int[Array, " m"] | None = None):
-        return self.base.marginal(state.sum, function, slots)
-
-    def in_map(self, state: RestState) -> Bool[Array, " capacity"]:
-        return self.base.in_map(state.sum)
-
-    def pose_error(self, state: RestState, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
-        return self.base.pose_error(state.sum, T_BC)
 
     def unit_fixed(self, state: RestState) -> Bool[Array, ""]:
         return ~state.open
@@ -257,8 +241,7 @@ def _check_base(ekf: EkfSlam) -> None:
 def from_rest(base: Mixture, frames: int | None = None) -> BatchInitialisation:
     """The sum with a start that looks for itself how the camera moves, within so many frames after
     frame 0. Raises ValueError for what does not go together."""
-    inner = innermost(base)
-    name = "planar" if inner is None else inner.motion.geometry.name
+    name = ekf_inside(base, "a start from rest is").motion.geometry.name
     sizes = SIZES[name]
     if frames is not None:
         sizes = (*(size for size in sizes if size < frames + 1), frames + 1)

@@ -1,4 +1,4 @@
-"""A fixed-lag smoother around any filter: the last frames are linearised again and again.
+"""A fixed-lag smoother around an EKF: the last frames are linearised again and again.
 
 The filter's state L frames ago is a Gaussian; what has happened since is kept as it was measured.
 With every new frame the variables of the window, y (see `sensitivity`), move by Gauss–Newton
@@ -99,6 +99,10 @@ class FixedLag(AbstractFilter):
             )
         if not self.base.calibration.corrected:
             raise ValueError("a fixed lag cannot consider a calibration: estimate it")
+
+    @property
+    def unwrapped(self) -> AbstractFilter:
+        return self.base
 
     def init(self, capacity: int | Capacity, first: Features | None = None) -> LagState:
         """The base filter's, and an empty window. Frame 0 needs no smoothing: everything that is
