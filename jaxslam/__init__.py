@@ -23,9 +23,8 @@ from jaxslam.filters.readouts import (
     landmarks_in_world,
 )
 from jaxslam.filters.registry import FILTERS, make_filter, make_filters, recommended
-from jaxslam.filters.wrappers.bank import Bank
 from jaxslam.filters.wrappers.fixed_lag import FixedLag
-from jaxslam.filters.wrappers.mixture import Mixture
+from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
 from jaxslam.geometry import PLANAR, SPATIAL
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.calibration import (
@@ -58,7 +57,6 @@ __all__ = [
     "AbstractMotion",
     "AbstractSensor",
     "AbstractStaged",
-    "Bank",
     "BodyRates",
     "Camera",
     "Capacity",
@@ -71,11 +69,11 @@ __all__ = [
     "Expected",
     "Features",
     "FixedLag",
+    "GaussianSum",
     "Innovation",
     "InverseDepth",
     "Known",
     "Metre",
-    "Mixture",
     "Odometry",
     "Pinhole",
     "Position",

@@ -139,7 +139,7 @@ def test_a_window_may_close_where_one_translation_is_known_to_three_hundredths(
 ):
     slam: Any = standstill().filter(STARTED)
     state = slam.init(standstill().capacity)
-    member = slam.base.likeliest(state.sum)
+    member = state.sum.likeliest
     place = member.core.part("pose").start
     part = jnp.arange(place, place + 3)
     t = jnp.asarray([0.0, 0.6, -0.8])
@@ -271,8 +271,8 @@ def test_features_are_predicted_where_they_are_seen():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("scale_gauge+rest8", "Gaussian sum that divides itself .mixture., not of a EkfSlam"),
-        ("robocentric+directions3+rest8", "mixture., not of a Bank"),
+        ("scale_gauge+rest8", "Gaussian sum that is split .mixture., not of a EkfSlam"),
+        ("robocentric+directions3+rest8", "is split .mixture., not of a GaussianSum that is not"),
         ("scale_gauge+mixture3+rest1", r"3 frames and more .* not \(2,\)"),
         ("scale_gauge+mixture3+rest0", r"3 frames and more .* not \(1,\)"),
     ],

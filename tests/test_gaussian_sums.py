@@ -11,8 +11,8 @@ from cases import Case, close, each_geometry, named, pose_run, quick_jit
 
 import jaxslam
 from jaxslam.filters.registry import FROM_REST, RECOMMENDED, recommended_name
-from jaxslam.filters.wrappers.bank import BEHIND, BankState, _mixed, log_likelihoods
-from jaxslam.filters.wrappers.mixture import _parts, _split_and_merged
+from jaxslam.filters.wrappers.split_merge import _parts, _split_and_merged
+from jaxslam.filters.wrappers.sum_state import BEHIND, SumState, log_likelihoods, mixed
 from jaxslam.filters.wrappers.wrapper import with_motion
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Innovation, Status
@@ -55,7 +55,7 @@ def test_a_divided_prior_has_the_moments_of_the_whole(name):
     motion = of.pieces()["motion"]
     state = of.filter(name).init(of.capacity)
     weights, members = jnp.exp(state.log_weights), state.members
-    while isinstance(members, BankState):
+    while isinstance(members, SumState):
         weights = weights[..., None] * jnp.exp(members.log_weights)
         members = members.members
     weights = np.asarray(weights).ravel()
@@ -77,9 +77,9 @@ def test_a_member_without_weight_spoils_no_prediction():
     used, nis = jnp.ones((3, 2), bool), jnp.array([5.0, 45.0, jnp.nan])
     status = jnp.array([Status.OK, Status.OK, Status.DIVERGED])
     innovations = jax.vmap(Innovation)(predicted, -predicted, covariance, used, nis, status)
-    mixed = _mixed(innovations, jnp.log(jnp.array([0.75, 0.25, 0.0])), status[0])
-    np.testing.assert_allclose(mixed.predicted[:, 0], [1.5, 3.0])
-    np.testing.assert_allclose(mixed.residual, -mixed.predicted)
+    whole = mixed(innovations, jnp.log(jnp.array([0.75, 0.25, 0.0])), status[0])
+    np.testing.assert_allclose(whole.predicted[:, 0], [1.5, 3.0])
+    np.testing.assert_allclose(whole.residual, -whole.predicted)
 
 
 @pytest.mark.parametrize("name", ["matched", "matched-6dof"])
@@ -145,9 +145,8 @@ def moments(state):
 
 @pytest.mark.parametrize("likeliest", [0, 3])
 def test_of_a_sum_the_likeliest_member_is_reported(likeliest):
-    slam, state = case().filter("scale_gauge+mixture5"), some_sum()
-    state = replace(state, log_weights=jnp.log(jnp.full(5, 0.1).at[likeliest].set(0.6)))
-    found = slam.likeliest(state)
+    state = replace(some_sum(), log_weights=jnp.log(jnp.full(5, 0.1).at[likeliest].set(0.6)))
+    found = state.likeliest
     expected = jax.tree.map(lambda x: x[likeliest], state.members)
     jax.tree.map(np.testing.assert_array_equal, found, expected)
 
@@ -157,7 +156,7 @@ def test_a_sum_as_one_gaussian_has_its_moments():
     slam = case().filter("scale_gauge+mixture5")
     control = case().controls()[0]
     one = quick_jit(lambda s: slam.gaussian(s, control)[1])(state)
-    alone = BankState(jax.tree.map(lambda x: x[None], one), jnp.zeros(1))
+    alone = SumState(jax.tree.map(lambda x: x[None], one), jnp.zeros(1))
     for whole, single in zip(moments(state), moments(alone), strict=True):
         np.testing.assert_allclose(single, whole, rtol=1e-9, atol=1e-12 * np.abs(whole).max())
 
@@ -182,9 +181,9 @@ def test_of_members_that_predict_alike_the_surer_one_gains():
         predicted = slam.base.predict(one, control)
         pixels = slam.base.predict_features(predicted, control, seen.slots).measured
         data = (control, replace(seen, measured=pixels), nothing)
-        after, mixed = slam.step(BankState(members, jnp.log(weights)), *data)
+        after, whole = slam.step(SumState(members, jnp.log(weights)), *data)
         _, alone = jax.vmap(lambda member: slam.base.step(member, *data))(members)
-        return after.log_weights, alone, mixed.predicted - pixels
+        return after.log_weights, alone, whole.predicted - pixels
 
     weights = np.array([0.2, 0.5, 0.3])
     log_weights, alone, apart = weighed(weights)
@@ -225,7 +224,7 @@ def test_what_gains_nothing_is_not_split():
     def moved(member, by):
         return replace(member, core=replace(member.core, motion=member.core.motion + by))
 
-    state = BankState(jax.vmap(moved)(members, apart), jnp.log(jnp.full(5, 0.2)))
+    state = SumState(jax.vmap(moved)(members, apart), jnp.log(jnp.full(5, 0.2)))
     after = divided()(state)
     jax.tree.map(np.testing.assert_array_equal, after, state)
 
@@ -236,7 +235,7 @@ def test_members_without_weight_give_their_places():
     log_weights = jax.nn.log_softmax(state.log_weights.at[2:].set(-jnp.inf))
     covariance = state.members.covariance.at[2:].set(jnp.nan)
     with_covariance = jax.vmap(lambda member, P: replace(member, covariance=P))
-    state = BankState(with_covariance(state.members, covariance), log_weights)
+    state = SumState(with_covariance(state.members, covariance), log_weights)
     after = divided()(state)
     assert np.isfinite(after.log_weights).sum() == 3
     alive = np.isfinite(after.log_weights)
@@ -286,8 +285,16 @@ def test_a_velocity_is_told_that_is_3_sigma_from_rest():
     ("name", "landmarks", "message"),
     [
         ("robocentric+scales2", "inverse_scaling", "at least 3 members"),
-        ("robocentric+scales5+iterated", "inverse_scaling", "around an EkfSlam, not around a Bank"),
-        ("robocentric+lag5+mixture", "inverse_scaling", "around an EkfSlam, not around a FixedLag"),
+        (
+            "robocentric+scales5+iterated",
+            "inverse_scaling",
+            "around an EkfSlam, not around a GaussianSum",
+        ),
+        (
+            "robocentric+lag5+mixture",
+            "inverse_scaling",
+            "takes a frame in stages, which FixedLag does not",
+        ),
         ("world+particles+mixture", "cartesian", "delayed"),
         ("information+mixture", "cartesian", "covariance form|information form"),
         ("information+scales5", "cartesian", "which information does not have"),

@@ -16,7 +16,7 @@ from jaxslam.filters.readouts import (
     landmarks_in_world,
     landmarks_on_sides,
 )
-from jaxslam.filters.wrappers.bank import BankState
+from jaxslam.filters.wrappers.sum_state import SumState
 
 STEPS, COUNT = 4, 6
 
@@ -93,7 +93,7 @@ def test_members_that_differ_about_the_metre_agree_about_the_path_in_their_unit(
     state, bank = said("scale_gauge")[4], case().filter("scale_gauge+mixture3")
     away = jnp.array([-0.6, 0.0, 0.6])
     members = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(wandered(state, by) for by in away))
-    both = BankState(members, jnp.log(jnp.array([0.25, 0.5, 0.25])))
+    both = SumState(members, jnp.log(jnp.array([0.25, 0.5, 0.25])))
     one = in_unit(state)[0]
     summed = quick_jit(lambda state: camera_pose_in_unit(bank, state))(both)
     np.testing.assert_allclose(summed.pose.as_matrix(), one.pose.as_matrix(), atol=1e-12)

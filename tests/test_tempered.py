@@ -575,7 +575,7 @@ def test_a_start_from_rest_has_the_gaussians_of_its_sum_and_a_plain_filter_has_o
     jax.tree.map(
         np.testing.assert_array_equal, filter_mixture(start, begun), filter_mixture(slam, state)
     )
-    member = slam.likeliest(state)
+    member = state.likeliest
     mean, P = camera_pose(slam.base, member)
     one = filter_mixture(slam.base, member)
     assert one.weights.tolist() == [1.0]

@@ -71,7 +71,7 @@ _compiled = eqx.filter_jit(_through)
 
 def _told(slam: BatchInitialisation, state: RestState) -> tuple[Array, ...]:
     """The fields of `Modes` that are each mode's, of one frame."""
-    ekf, record, modes = slam.base.base, state.record, state.modes
+    ekf, record, modes = slam.ekf, state.record, state.modes
 
     def one(minimum: Minimum, member: State) -> tuple[Array, ...]:
         at = path(ekf, record, minimum.x)

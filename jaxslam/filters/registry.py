@@ -26,11 +26,10 @@ from jaxslam.filters.remedies.first_estimates import FirstEstimates
 from jaxslam.filters.remedies.invariant import Invariant
 from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
 from jaxslam.filters.wrappers.adaptive_process_noise import MEMORY, AdaptiveProcessNoise
-from jaxslam.filters.wrappers.bank import Bank
 from jaxslam.filters.wrappers.batch_initialisation import from_rest
 from jaxslam.filters.wrappers.fixed_lag import LAG, FixedLag, iterated
 from jaxslam.filters.wrappers.gated import Gated
-from jaxslam.filters.wrappers.mixture import Mixture
+from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
 from jaxslam.landmarks import LANDMARKS, Parametrization
 from jaxslam.models.calibration import AbstractCalibration
 from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
@@ -156,9 +155,13 @@ _OF_ONE_FILTER: dict[str, Callable[[EkfSlam, int | None], EkfSlam]] = {
 _AROUND_ANY_FILTER: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
     "lag": lambda slam, frames: FixedLag(slam, LAG if frames is None else frames),
     "iterated": iterated,
-    "scales": lambda slam, count: Bank(slam, 9 if count is None else count, "speed"),
-    "directions": lambda slam, count: Bank(slam, 5 if count is None else count, "direction"),
-    "mixture": lambda slam, count: Mixture(slam, 9 if count is None else count),
+    "scales": lambda slam, count: GaussianSum(
+        slam, 9 if count is None else count, "speed", split=False
+    ),
+    "directions": lambda slam, count: GaussianSum(
+        slam, 5 if count is None else count, "direction", split=False
+    ),
+    "mixture": lambda slam, count: GaussianSum(slam, 9 if count is None else count),
     "rest": from_rest,
     "noise": lambda slam, frames: AdaptiveProcessNoise(slam, MEMORY if frames is None else frames),
     "checked": lambda slam, percent: Gated(

@@ -20,8 +20,9 @@ from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.initialisation.alternatives import log_density
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import camera_pose
-from jaxslam.filters.wrappers.bank import Bank, moments
 from jaxslam.filters.wrappers.batch_initialisation import BatchInitialisation
+from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
+from jaxslam.filters.wrappers.sum_state import moments
 from jaxslam.geometry import Pose, difference
 from jaxslam.posterior.moments import covariance, mean_pose, pose_moments
 
@@ -44,7 +45,7 @@ def filter_mixture(slam: AbstractFilter, state: Any) -> PoseMixture:
     """T_BC as a filter has it: a Gaussian of every member of its sum; of another filter, one."""
     if isinstance(slam, BatchInitialisation):
         return filter_mixture(slam.base, state.sum)
-    if isinstance(slam, Bank):
+    if isinstance(slam, GaussianSum):
         of_member = jax.vmap(partial(camera_pose, slam.base))
         return PoseMixture(*of_member(state.members), jnp.exp(state.log_weights))
     mean, P = jax.tree.map(lambda x: x[None], camera_pose(slam, state))

@@ -28,8 +28,8 @@ from jaxslam.filters.window.problem import Layout
 from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.subsample import thinned
 from jaxslam.filters.window.to_filter import gauge_state
-from jaxslam.filters.wrappers.bank import BankState
-from jaxslam.filters.wrappers.mixture import Mixture
+from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
+from jaxslam.filters.wrappers.sum_state import SumState
 from jaxslam.filters.wrappers.wrapper import AbstractWrapper
 from jaxslam.models.observations import Capacity, Features, Innovation
 
@@ -60,7 +60,7 @@ MOVED = 0.1
 class RestState(eqx.Module):
     """The sum, and what it is begun anew from as long as the window is open."""
 
-    sum: BankState
+    sum: SumState
     record: Record
     modes: Modes
     open: Bool[Array, ""]
@@ -69,18 +69,18 @@ class RestState(eqx.Module):
 class BatchInitialisation(AbstractWrapper):
     """The start of `base`."""
 
-    base: Mixture  # ty: ignore[incompatible-mutable-override]
+    base: GaussianSum  # ty: ignore[incompatible-mutable-override]
     sizes: tuple[int, ...] = eqx.field(static=True)
     directions: int = eqx.field(static=True)
     known: float = eqx.field(static=True, default=KNOWN)
 
     def __check_init__(self) -> None:
-        if not isinstance(self.base, Mixture):
+        if not (isinstance(self.base, GaussianSum) and self.base.split):
             raise ValueError(
-                "a start from rest is of a Gaussian sum that divides itself (mixture), not of a "
-                f"{type(self.base).__name__}"
+                "a start from rest is of a Gaussian sum that is split (mixture), "
+                f"not of a {type(self.base).__name__} that is not"
             )
-        _check_base(self.base.base)
+        _check_base(self.ekf)
         if min(self.sizes, default=0) < 3 or list(self.sizes) != sorted(set(self.sizes)):
             raise ValueError(
                 "a start from rest keeps windows of 3 frames and more (frame 0 and at least 2 "
@@ -90,12 +90,17 @@ class BatchInitialisation(AbstractWrapper):
             raise ValueError(f"a search sets out in 1 direction at least, not {self.directions}")
 
     @property
+    def ekf(self) -> EkfSlam:
+        """Each member of the sum."""
+        return ekf_inside(self.base, "a start from rest is")
+
+    @property
     def ambiguous_start(self) -> bool:
         """It does: the window looks for what explains a start."""
         return True
 
     def init(self, capacity: int | Capacity, first: Features | None = None) -> RestState:
-        ekf, count = self.base.base, self.base.count
+        ekf, count = self.ekf, self.base.members
         dtype, (landmarks, *_) = precision(ekf), Capacity.of(capacity)
         begun = window.empty(ekf.motion, self.sizes[-1], landmarks, ekf.sensor.size, dtype)
         if first is not None:
@@ -103,21 +108,21 @@ class BatchInitialisation(AbstractWrapper):
         member = ekf.init(capacity, first)
         members = jax.tree.map(lambda x: jnp.tile(x, (count, *(1,) * x.ndim)), member)
         modes = at_rest(cast(ekf, dtype), begun, count, dtype)
-        return RestState(BankState(members, modes.log_weights), begun, modes, jnp.ones((), bool))
+        return RestState(SumState(members, modes.log_weights), begun, modes, jnp.ones((), bool))
 
-    def base_state(self, state: RestState) -> BankState:
+    def base_state(self, state: RestState) -> SumState:
         return state.sum
 
-    def with_base_state(self, state: RestState, inner: BankState) -> RestState:
+    def with_base_state(self, state: RestState, inner: SumState) -> RestState:
         return replace(state, sum=inner)
 
     def update(
         self, state: RestState, control: Any, seen: Features
     ) -> tuple[RestState, Innovation]:
-        divided = DIVIDED[self.base.base.motion.geometry.name]
-        update = self.base.update if divided else self.base.corrected
+        divided = DIVIDED[self.ekf.motion.geometry.name]
+        update = self.base.update if divided else self.base.update_members
         after, innovation = update(state.sum, control, seen)
-        stepped = window.stepped(state.record, control, seen, self.base.base.sensor.noise)
+        stepped = window.stepped(state.record, control, seen, self.ekf.sensor.noise)
         return replace(state, sum=after, record=stepped), innovation
 
     def close(self, state: RestState, new: Features) -> RestState:
@@ -156,7 +161,7 @@ class BatchInitialisation(AbstractWrapper):
         self, state: RestState, frames: int, wanted: Bool[Array, ""], least: int
     ) -> RestState:
         """The modes of a window of so many frames, more than `least`, and the sum of them."""
-        ekf, record = self.base.base, state.record.cut(frames)
+        ekf, record = self.ekf, state.record.cut(frames)
         size = Layout.of(ekf).size(frames)
 
         def solved(state, record):
@@ -164,9 +169,9 @@ class BatchInitialisation(AbstractWrapper):
             modes = replace(state.modes, minima=replace(state.modes.minima, x=x[:, :size]))
             due = self._due(record, range(least, frames))
             modes, explained = sought(ekf, record, modes, REFINEMENTS, due)
-            like = self.base.likeliest(state.sum)
+            like = state.sum.likeliest
             members = _members(ekf, record, modes, state.sum.members, like)
-            begun = BankState(members, modes.log_weights)
+            begun = SumState(members, modes.log_weights)
             begun = jax.tree.map(lambda new, old: jnp.where(explained, new, old), begun, state.sum)
             x = x.at[:, :size].set(modes.minima.x)
             modes = replace(modes, minima=replace(modes.minima, x=x))
@@ -177,7 +182,7 @@ class BatchInitialisation(AbstractWrapper):
     def _due(self, record: Record, newest: range) -> Bool[Array, " starts"] | None:
         """From which starts minima are sought after this frame; None where from none after any
         that can be the newest one."""
-        name = self.base.base.motion.geometry.name
+        name = self.ekf.motion.geometry.name
         searches, together = [k for k in SEARCHES[name] if k in newest], IN_TURN[name]
         if not searches and not together:
             return None
@@ -187,13 +192,13 @@ class BatchInitialisation(AbstractWrapper):
         return (whole | turn) & ~record.standing
 
     def _thinned(self, state: RestState) -> RestState:
-        record, minima = thinned(self.base.base, state.record, state.modes.minima)
+        record, minima = thinned(self.ekf, state.record, state.modes.minima)
         return replace(state, record=record, modes=replace(state.modes, minima=minima))
 
     def _ready(self, state: RestState) -> Bool[Array, ""]:
         """Whether one mode is left whose translation is known; or, where there is no room, whether
         there is a translation, or its landmarks leave the view."""
-        ekf, member = self.base.base, self.base.likeliest(state.sum)
+        ekf, member = self.ekf, state.sum.likeliest
         part = member.core.part("pose")
         n = ekf.motion.geometry.point_dim
         position = slice(part.start, part.start + n)
@@ -207,7 +212,7 @@ class BatchInitialisation(AbstractWrapper):
         return (enough & alone & known) | (state.record.full & over)
 
 
-def _likely(members: BankState, now: Bool[Array, ""]) -> BankState:
+def _likely(members: SumState, now: Bool[Array, ""]) -> SumState:
     """Without those that are `GIVEN_UP`, if that is now."""
     unlikely = members.log_weights < jnp.max(members.log_weights) - GIVEN_UP
     weights = jnp.where(now & unlikely, -jnp.inf, members.log_weights)
@@ -238,7 +243,7 @@ def _check_base(ekf: EkfSlam) -> None:
             raise ValueError(f"a start from rest is {why}")
 
 
-def from_rest(base: Mixture, frames: int | None = None) -> BatchInitialisation:
+def from_rest(base: GaussianSum, frames: int | None = None) -> BatchInitialisation:
     """The sum with a start that looks for itself how the camera moves, within so many frames after
     frame 0. Raises ValueError for what does not go together."""
     name = ekf_inside(base, "a start from rest is").motion.geometry.name

@@ -25,11 +25,7 @@ class AbstractWrapper(AbstractStaged):
     base: eqx.AbstractVar[AbstractStaged]
 
     def __check_init__(self) -> None:
-        if not isinstance(self.base, AbstractStaged):
-            raise ValueError(
-                f"{type(self).__name__} takes a frame in stages, which "
-                f"{type(self.base).__name__} does not"
-            )
+        check_staged(self, self.base)
 
     def base_state(self, state: Any) -> Any:
         """The base's state in the wrapper's."""
@@ -92,6 +88,14 @@ class AbstractWrapper(AbstractStaged):
 
     def unit_fixed(self, state: Any) -> Bool[Array, ""]:
         return self.base.unit_fixed(self.base_state(state))
+
+
+def check_staged(around: AbstractStaged, base: AbstractFilter) -> None:
+    """Raise ValueError unless what a filter is around takes a frame in stages too."""
+    if not isinstance(base, AbstractStaged):
+        raise ValueError(
+            f"{type(around).__name__} takes a frame in stages, which {type(base).__name__} does not"
+        )
 
 
 def with_motion(slam: Any, motion: AbstractMotion) -> Any:

@@ -1,0 +1,200 @@
+"""Splits and mergers of the members of a Gaussian sum.
+
+In every frame the member whose linearisation costs most is split, and the two whose merger costs
+least are merged (split and merge: Ueda et al. 2000; for filters Faubel et al. 2009). Where a split
+gains nothing there are fewer members, and only those that are there are computed.
+
+What costs is the product of the camera's displacement t with inverse depths. In a measurement
+h(X − ω t), with X and ω as they are at the estimate, errors of both neglect `−(∂h/∂X) δt δω`. So a
+member's cost is the squared pixels `tr(M P_t)`, with its own variance P_t of the displacement and
+
+    M = Σᵢ σ_ωᵢ² (∂h/∂X)ᵀ (∂h/∂X),   over the landmarks i in view.
+
+Splits and mergers keep the sum's mean and covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxslam._numerics.conditional import at_places, map_or_zero, repeated
+from jaxslam._numerics.linalg import cholesky, eigh
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.forms.blocks import shifted
+from jaxslam.filters.forms.state import State
+from jaxslam.filters.model import COMPOSED, Context
+from jaxslam.filters.wrappers.sum_state import SumState, member, moments
+from jaxslam.geometry import difference, jacobian, log
+from jaxslam.models.observations import Features
+
+WORTH = 3e-5
+"""What a split has to gain, in σ² of a measured pixel, summed over the landmarks; two members
+whose merger costs less than a quarter of it are one."""
+SPLIT = 0.8
+"""Halves of a split member are ± so many of its σ from its mean."""
+
+
+def divided(ekf: EkfSlam, state: SumState, control: Any, seen: Features, rounds: int) -> SumState:
+    """A predicted sum after at most so many splits and mergers."""
+    n = ekf.motion.geometry.point_dim
+
+    def displacement(core):
+        # Of the logarithm: a turn is not to be split for what it does to the translation.
+        return log(ekf.model.displacement(core, Context(control)))[:n]
+
+    cost = _root_of_cost(ekf, state.likeliest, seen)
+
+    def pixels(core):
+        return cost @ displacement(core)
+
+    return repeated(partial(_split_and_merged, pixels), _parts(pixels, state), rounds).sum
+
+
+def _root_of_cost(ekf: EkfSlam, likeliest: State, seen: Features) -> Float[Array, "n n"]:
+    """C with `CᵀC = M` of the landmarks that are seen, at the likeliest member."""
+    model = ekf.model
+
+    def view_of(core):
+        return model.view(core, COMPOSED)
+
+    def inverse_depth(view, landmark):
+        return model.camera_point(view, landmark)[1][None]
+
+    _, variances = ekf.gaussian_form.landmark_covariance(
+        view_of, inverse_depth, likeliest, seen.slots
+    )
+    view = view_of(likeliest.core)
+    sensor = model.sensor_of(view)
+    whitening = cholesky(sensor.noise).whitening
+
+    def by_point(landmark):
+        point, omega = model.camera_point(view, landmark)
+        return jax.jacfwd(lambda point: sensor.measure(point, omega))(point)
+
+    slopes = whitening @ jax.vmap(by_point)(likeliest.landmarks[seen.slots])
+    counted = jnp.where(seen.valid, variances[:, 0, 0], 0.0)
+    M = jnp.einsum("m,mpi,mpj->ij", counted, slopes, slopes)
+    # Nearly singular where one landmark is seen, and zero where none is.
+    total = jnp.maximum(jnp.trace(M), jnp.finfo(M.dtype).tiny)
+    eye = jnp.eye(ekf.motion.geometry.point_dim, dtype=M.dtype)
+    return jnp.sqrt(total) * cholesky(M / total + 1e-6 * eye).root.T
+
+
+class _Parts(NamedTuple):
+    """A sum, and functions of the core of every member: values, Jacobians, and covariances."""
+
+    sum: SumState
+    values: Float[Array, "k n"]
+    by_core: Float[Array, "k n c"]
+    covariances: Float[Array, "k n n"]
+
+
+Pixels = Callable[[Any], Float[Array, " n"]]
+
+
+def _described(pixels: Pixels, one: State) -> tuple[Array, Array, Array]:
+    by_core = jacobian(pixels, one.core)
+    c = by_core.shape[1]
+    return pixels(one.core), by_core, by_core @ one.covariance[:c, :c] @ by_core.T
+
+
+def _parts(pixels: Pixels, state: SumState) -> _Parts:
+    return _Parts(state, *map_or_zero(partial(_described, pixels), state.members, state.alive))
+
+
+def _split_and_merged(pixels: Pixels, parts: _Parts) -> tuple[_Parts, Bool[Array, ""]]:
+    """The member of the greatest cost split, and two of the others merged, if that is a gain; else
+    two merged, if that costs nothing; and whether any of it was done.
+
+    The cost of the sum is `Σ w tr(P)` of the members' `pixels(core)`, in σ of a pixel. A split
+    lessens it by `w δ² λ` with the greatest eigenvalue λ; a merger adds
+    `wᵢ wⱼ/(wᵢ + wⱼ) |pᵢ − pⱼ|²`, and nothing with a member without weight, whose place it frees.
+    """
+    weights = jnp.exp(parts.sum.log_weights)
+    costs = jnp.einsum("kii->k", parts.covariances)
+    split = jnp.argmax(jnp.where(weights > 0, weights * costs, 0.0))
+    gain = weights[split] * SPLIT**2 * eigh(parts.covariances[split])[0][-1]
+
+    tiny, index = jnp.finfo(weights.dtype).tiny, jnp.arange(weights.size)
+    shared = weights[:, None] * weights / jnp.maximum(weights[:, None] + weights, tiny)
+    apart = jnp.sum((parts.values[:, None] - parts.values) ** 2, axis=-1)
+    loss = jnp.where(shared > 0, shared * apart, 0.0)
+    pairs = index[:, None] < index
+    others, cost = _cheapest(loss, pairs & (index[:, None] != split) & (index != split))
+    alike, least = _cheapest(loss, pairs & (weights[:, None] > 0) & (weights > 0))
+    divided = (gain > cost) & (gain > WORTH)
+    due = divided | (least < WORTH / 4)
+
+    pair = jnp.where(divided, others, alike)
+    # A merger alone needs no third place, but places are different.
+    third = jnp.where(divided, split, jnp.argmax((index != pair[0]) & (index != pair[1])))
+    places = jnp.append(pair, third)[None]
+    return at_places(partial(_replaced, pixels), parts, places, due[None], given=divided), due
+
+
+def _replaced(pixels: Pixels, three: _Parts, _: Any, divided: Bool[Array, ""]) -> _Parts:
+    """The first two merged in the first place, and the third split into the others; if it is to be
+    split, or else the second place is free."""
+    members, log_weights = three.sum.members, three.sum.log_weights
+    merged = collapsed(member(members, np.s_[:2]), log_weights[:2])
+    halves = _halves(member(members, 2), three.by_core[2])
+    old = member(members, np.s_[1:])
+    two = jax.tree.map(lambda half, old: jnp.where(divided, half, old), halves, old)
+    half = log_weights[2] - jnp.log(2.0)
+    weights = jnp.where(divided, half, jnp.stack([-jnp.full_like(half, jnp.inf), log_weights[2]]))
+    members = jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), merged, two)
+    state = SumState(members, jnp.append(jnp.logaddexp(*log_weights[:2]), weights))
+    return _Parts(state, *jax.vmap(partial(_described, pixels))(members))
+
+
+def _cheapest(loss: Float[Array, "k k"], pairs: Bool[Array, "k k"]) -> tuple[Array, Array]:
+    """The pair that is merged at the least loss, and that; ∞ without a pair."""
+    loss = jnp.where(pairs, loss, jnp.inf)
+    pair = jnp.stack(jnp.unravel_index(jnp.argmin(loss), loss.shape))
+    return pair, loss[tuple(pair)]
+
+
+def _halves(parent: State, by_core: Float[Array, "n c"]) -> State:
+    """N(x, P) as ½ N(x + δ c, P − δ² c cᵀ) + ½ N(x − δ c, …), with `c = P g/√(gᵀ P g)`: a batch.
+
+    g is the combination of the `n` functions of the core that varies most.
+    """
+    c = by_core.shape[-1]
+    slopes = parent.covariance[:, :c] @ by_core.T
+    values, vectors = eigh(by_core @ slopes[:c])
+    variance = jnp.maximum(values[-1], 0.0)
+    sigma = jnp.sqrt(jnp.maximum(variance, jnp.finfo(variance.dtype).tiny))
+    away = SPLIT * slopes @ vectors[:, -1] / sigma
+    smaller = parent.covariance - jnp.outer(away, away)
+
+    def half(sign):
+        return replace(shifted(parent, sign * away), covariance=smaller)
+
+    return jax.vmap(half)(jnp.array([-1.0, 1.0], away.dtype))
+
+
+def collapsed(members: State, log_weights: Float[Array, " k"]) -> State:
+    """The Gaussian with the mean and the covariance of a sum, of any total weight.
+
+    The mean is to first order in the members' distances from the likeliest.
+    """
+    likeliest = jnp.argmax(log_weights)
+    centre = member(members, likeliest)
+    total = jax.nn.logsumexp(log_weights)
+    alone = jnp.where(jnp.arange(log_weights.size) == likeliest, 0.0, -jnp.inf)
+    log_weights = jnp.where(jnp.isfinite(total), log_weights - total, alone)
+
+    def away(one):
+        landmarks = (one.landmarks - centre.landmarks).ravel()
+        return jnp.concatenate([difference(one.core, centre.core), landmarks])
+
+    mean, covariance = moments(log_weights, jax.vmap(away)(members), members.covariance)
+    return replace(shifted(centre, mean), covariance=covariance)
