@@ -91,8 +91,11 @@ def test_consistency_resumes_to_more_runs(tmp_path, capsys):
         (["calibrate", "/no/such/film"], "/no/such/film: no such file or folder"),
         (["track", "--filter", "nothing"], "unknown filter 'nothing'"),
         (["track", "--filter", "world+nothing"], "unknown modifiers 'nothing'"),
-        (["track", "--filter", "scale_gauge+lag5"], "all do but iterated, +lag"),
-        (["track", "--filter", "world+rays", "--landmarks", "cartesian"], "cannot track"),
+        (["track", "--filter", "scale_gauge+lag5"], "FixedLag takes a frame as a whole"),
+        (
+            ["track", "--filter", "world+rays", "--landmarks", "cartesian"],
+            "RaySum begins a landmark",
+        ),
     ],
 )
 def test_a_mistake_ends_with_status_2_and_one_line(arguments, message, tmp_path, capsys):

@@ -1,14 +1,14 @@
 """Tests of the names that users give: of filters, of parametrizations, and what is refused."""
 
+import re
 import sys
 
 import pytest
 
 from jaxslam._runtime.lookup import lookup
 from jaxslam.consistency import monte_carlo, summarise, table
-from jaxslam.filters.ekf import EkfSlam, Undelayed
-from jaxslam.filters.protocol import AbstractStaged
-from jaxslam.filters.registry import CANNOT_TRACK, FILTERS, MODIFIERS, make_filters
+from jaxslam.filters.ekf import EkfSlam, check_can_track
+from jaxslam.filters.registry import FILTERS, make_filters
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.calibration import Known
 from jaxslam.simulation import scenario
@@ -68,21 +68,28 @@ def test_one_name_needs_no_list_and_a_scenario_goes_by_its_name():
         make_filters("matcht", "robocentric", "inverse_scaling")
 
 
-def tracks(name: str) -> bool:
-    of_points = {"information", "world+particles", "world+rays"}
-    landmark = "cartesian" if name in of_points else "inverse_scaling"
+@pytest.mark.parametrize(
+    ("name", "landmark", "wrong"),
+    [
+        ("iterated", "inverse_scaling", "FixedLag takes a frame as a whole"),
+        ("world+lag", "inverse_scaling", "FixedLag takes a frame as a whole"),
+        ("world+rays", "cartesian", "RaySum begins a landmark that is not one Gaussian"),
+        ("world+particles+checked", "cartesian", "DepthParticles begins a landmark"),
+        *((name, "cartesian", None) for name in FILTERS if name != "iterated"),
+        ("world+scales", "inverse_scaling", None),
+        ("world+directions+noise", "inverse_scaling", None),
+        ("scale_gauge+mixture3+rest+noise+checked", "inverse_scaling", None),
+    ],
+)
+def test_what_takes_a_frame_in_stages_and_each_landmark_as_a_gaussian_can_track(
+    name, landmark, wrong
+):
     (slam,) = make_filters("matched-6dof", name, landmark).values()
-    inner = slam.unwrapped
-    assert isinstance(inner, EkfSlam)
-    return isinstance(slam, AbstractStaged) and isinstance(inner.entry, Undelayed)
-
-
-def test_the_filters_that_cannot_track_are_those_that_the_error_names():
-    around = {word for word in MODIFIERS if word not in ("oc", "fej")}
-    assert {name for name in FILTERS if not tracks(name)} == {"iterated"}
-    below = {"rest": "world+mixture3"}
-    cannot = {f"+{word}" for word in around if not tracks(f"{below.get(word, 'world')}+{word}")}
-    assert {"iterated", *cannot} == set(CANNOT_TRACK)
+    if wrong is None:
+        check_can_track(slam, name)
+    else:
+        with pytest.raises(ValueError, match=f"filter {re.escape(name)} cannot track: {wrong}"):
+            check_can_track(slam, name)
 
 
 def test_a_study_prints_as_its_table_and_is_a_data_frame():

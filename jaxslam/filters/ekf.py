@@ -354,6 +354,21 @@ def ekf_inside(slam: AbstractFilter, what: str) -> EkfSlam:
     return inner
 
 
+def check_can_track(slam: AbstractFilter, name: str) -> None:
+    """Raise ValueError unless features can be sought where the filter of this name expects them."""
+    inner = slam.unwrapped
+    if not isinstance(slam, AbstractStaged):
+        wrong = f"{type(slam).__name__} takes a frame as a whole"
+    elif isinstance(inner, EkfSlam) and not isinstance(inner.entry, Undelayed):
+        wrong = f"{type(inner.entry).__name__} begins a landmark that is not one Gaussian"
+    else:
+        return
+    raise ValueError(
+        f"filter {name} cannot track: {wrong}; accepted is an `AbstractStaged`, whose frames are "
+        "taken in stages, with landmarks that are Gaussians from the first (`Undelayed`)"
+    )
+
+
 def check_one_gaussian(base: Any, what: str, remedies: bool = False) -> None:
     """Raise ValueError, saying of what, unless all that `base` knows is in one covariance.
 

@@ -181,10 +181,6 @@ of which the noise is remembered (`noise`); by how much a match may be off beyon
 percent of that (`checked`); steps of Gauss–Newton in an update (`oc`); none for the remedy
 `fej`."""
 
-CANNOT_TRACK = ("iterated", "+lag", "+iterated", "+scales", "+directions", "+particles", "+rays")
-"""Filters and modifiers with which a frame cannot be taken in stages (`AbstractStaged`), or a
-landmark is not one Gaussian from the frame in which it is first seen."""
-
 RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gauge+scene50+mixture9"}
 """The filter called `recommended`, by geometry, where the velocity is told."""
 FROM_REST = {

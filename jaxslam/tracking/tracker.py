@@ -19,7 +19,7 @@ from jaxslam._numerics.arrays import cast
 from jaxslam._runtime.files import one_line
 from jaxslam._runtime.programs import Program, in_background
 from jaxslam.filters.association import ASSOCIATIONS, Association, candidates, one_point_ransac
-from jaxslam.filters.ekf import EkfSlam, Undelayed, init_with_depths
+from jaxslam.filters.ekf import EkfSlam, check_can_track, init_with_depths
 from jaxslam.filters.protocol import AbstractStaged, Scene
 from jaxslam.filters.readouts import (
     camera_pose_in_unit,
@@ -27,7 +27,6 @@ from jaxslam.filters.readouts import (
     landmarks_on_sides,
     log_unit,
 )
-from jaxslam.filters.registry import CANNOT_TRACK
 from jaxslam.geometry import scaled
 from jaxslam.io.calibration import Calibration, as_fields, from_fields
 from jaxslam.io.pictures import as_grey
@@ -181,14 +180,8 @@ class Tracker:
                 "which `jaxslam.io.calibration.read_calibration` reads from a file"
             )
         made = self.settings.make_filter(self.calibration) if self.filter is None else self.filter
-        inner = made.unwrapped
-        delayed = isinstance(inner, EkfSlam) and not isinstance(inner.entry, Undelayed)
-        if not isinstance(made, AbstractStaged) or delayed:
-            raise ValueError(
-                f"filter {self.filter_name} cannot track: features are sought where a Gaussian "
-                "predicts them, before it is given the frame, from the frame in which they are "
-                f"first seen; all do but {', '.join(CANNOT_TRACK)}"
-            )
+        check_can_track(made, self.filter_name)
+        assert isinstance(made, AbstractStaged)
         if self.target is not None and not _keeps_metres(made):
             raise ValueError(
                 f"filter {self.filter_name} cannot begin with a target: one that is an EkfSlam, "
