@@ -15,16 +15,13 @@ from jaxslam.io.recording import (
     Layout,
     Recording,
     check_rigid,
-    finite_number,
     fixed,
     listed,
     of_files,
-    read_table,
     read_timestamps,
-    text_lines,
 )
 from jaxslam.io.source import Trajectory
-from jaxslam.io.tum import poses
+from jaxslam.io.tum import numbers, poses, read_table, text_lines
 
 NANOSECONDS = 1e9
 TRUTH = "state_groundtruth_estimate0"
@@ -49,7 +46,7 @@ def _root(path: Path) -> Path:
 
 def read_sensor(path: Path) -> Calibration:
     """The calibration in a `sensor.yaml`: pinhole, radial-tangential. Raises ValueError."""
-    text = "\n".join(line for _, line in text_lines(path))
+    text = "\n".join(text_lines(path).values())
     for key, accepted in (
         ("camera_model", "pinhole"),
         ("distortion_model", "radial-tangential"),
@@ -71,10 +68,11 @@ def read_sensor(path: Path) -> Calibration:
 
 def _camera_truth(truth: Path, yaml: Path) -> Trajectory:
     """`T_WS = T_WB T_BS`, of rows `ns, px, py, pz, qw, qx, qy, qz`."""
-    text = "\n".join(line for _, line in text_lines(yaml))
+    text = "\n".join(text_lines(yaml).values())
     T_BS = np.reshape(_numbers(yaml, text, "data", 16), (4, 4))
     check_rigid(yaml, T_BS[None])
-    table = read_table(truth, 8, ",")
+    columns = "eight finite numbers ns px py pz qw qx qy qz"
+    table = read_table(truth, "truth", "poses", columns, 8, spare=True).rows
     try:
         T_WB = poses(table[:, 1:4], table[:, [5, 6, 7, 4]])
     except ValueError as error:
@@ -87,10 +85,10 @@ def _numbers(path: Path, text: str, key: str, count: int) -> Float[np.ndarray, "
     """The list of numbers `key: [1, 2, …]`, over as many lines as it takes."""
     found = re.search(rf"^{key}:\s*\[([^\]]*)\]", text, re.MULTILINE)
     words = found[1].split(",") if found else []
-    numbers = [number for word in words if (number := finite_number(word)) is not None]
-    if len(numbers) != count or len(words) != count:
+    told = numbers(words, count)
+    if told is None:
         raise ValueError(f"{path}: {key}: [{count} finite numbers] is missing")
-    return np.array(numbers)
+    return np.array(told)
 
 
 EUROC = Layout(

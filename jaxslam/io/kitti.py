@@ -17,13 +17,11 @@ from jaxslam.io.recording import (
     Recording,
     check_later,
     check_rigid,
-    finite_number,
     image_files,
     of_files,
-    read_table,
-    text_lines,
 )
 from jaxslam.io.source import Trajectory
+from jaxslam.io.tum import numbers, read_table, text_lines
 
 CAMERAS = ("0", "2")
 
@@ -43,21 +41,22 @@ def _open(path: Path, _rate: float) -> Recording:
 
 def _read_times(path: Path) -> Float[np.ndarray, " n"]:
     times: list[float] = []
-    for (time,) in read_table(path, 1).tolist():
-        check_later(f"{path}, line {len(times) + 1}", time, times)
+    _, rows, lines = read_table(path, "times", "times", "finite times, s,", 1, spare=True)
+    for (time,), line in zip(rows.tolist(), lines, strict=True):
+        check_later(f"{path}, line {line}", time, times)
         times.append(time)
     return np.array(times)
 
 
 def _projection(path: Path, camera: str) -> Float[np.ndarray, "3 4"]:
     """P of a line `P0: ` and twelve numbers: `pixel ~ P X`, X in the left grey camera's frame."""
-    for place, line in text_lines(path):
+    for number, line in text_lines(path).items():
         name, _, rest = line.partition(":")
         if name.strip() == f"P{camera}":
-            numbers = [finite_number(word) for word in rest.split()]
-            if len(numbers) != 12 or None in numbers:
+            told, place = numbers(rest.split(), 12), f"{path}, line {number}"
+            if told is None:
                 raise ValueError(f"{place}: P{camera}: and twelve numbers are accepted")
-            P = np.array(numbers, float).reshape(3, 4)
+            P = np.array(told).reshape(3, 4)
             if not (np.abs(P).max() <= LARGEST and (np.diagonal(P) != 0).all()):
                 raise ValueError(f"{place}: no projection of a camera with a focal length")
             return P
@@ -80,7 +79,8 @@ def _camera_truth(
     path: Path, times: Float[np.ndarray, " n"], P: Float[np.ndarray, "3 4"] | None
 ) -> Trajectory:
     """Rows of a 3x4 T_wc; camera c is at `-K⁻¹ P₄` in the left grey one, unturned."""
-    rows = read_table(path, 12).reshape(-1, 3, 4)
+    row = "12 finite numbers, the rows of a 3x4 T_wc,"
+    rows = read_table(path, "poses", "poses", row, 12, spare=True).rows.reshape(-1, 3, 4)
     _check_count(path, len(rows), len(times))
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
     T_wc[:, :3] = rows

@@ -1,6 +1,5 @@
-"""What a layout says of a video, and what layouts share: image files, lists of times, tables."""
+"""What a layout says of a video, and what layouts share: image files and lists of times."""
 
-import math
 import os
 import re
 from collections.abc import Callable, Iterator
@@ -15,7 +14,7 @@ from jaxtyping import Float
 from jaxslam._runtime.files import LARGEST
 from jaxslam.io.calibration import Calibration, read_calibration
 from jaxslam.io.source import Image, Trajectory
-from jaxslam.io.tum import not_rigid
+from jaxslam.io.tum import not_rigid, numbers, text_lines
 
 IMAGE_TYPES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
 
@@ -121,7 +120,8 @@ def read_timestamps(
     """
     times: list[float] = []
     names: list[str] = []
-    for place, line in text_lines(path):
+    for number, line in text_lines(path).items():
+        place = f"{path}, line {number}"
         time, name = _timestamp(place, line, separator)
         check_later(place, time / ticks, times)
         times.append(time / ticks)
@@ -129,17 +129,6 @@ def read_timestamps(
     if not times:
         raise ValueError(f"{path}: holds no lines of a time and a file")
     return np.array(times), names
-
-
-def text_lines(path: Path) -> Iterator[tuple[str, str]]:
-    """Lines that are neither empty nor comments, each with its place in words."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError):
-        raise ValueError(f"{path}: cannot be read as text") from None
-    for number, line in enumerate(lines, start=1):
-        if line.strip() and not line.lstrip().startswith("#"):
-            yield f"{path}, line {number}", line.strip()
 
 
 def check_later(place: str, time: float, before: list[float]) -> None:
@@ -156,43 +145,9 @@ def check_rigid(path: Path, T: Float[np.ndarray, "n 4 4"]) -> None:
         raise ValueError(f"{path}: pose {pose} is no rigid motion [R t] with R a rotation")
 
 
-def finite_number(word: str) -> float | None:
-    """The number that a word is, or None."""
-    try:
-        value = float(word)
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
-
-
 def _timestamp(place: str, line: str, separator: str | None) -> tuple[float, str]:
     words = line.split(separator, maxsplit=1)
-    time = finite_number(words[0])
+    time = numbers(words[:1], 1)
     if len(words) != 2 or time is None:
         raise ValueError(f"{place}: a finite time and a file are accepted, not {line!r}")
-    return time, words[1].strip()
-
-
-def read_table(
-    path: Path, columns: int, separator: str | None = None, *, finite: bool = True
-) -> Float[np.ndarray, "n k"]:
-    """Rows of at least so many numbers, as text; `ValueError` names the line that is none.
-
-    Numbers beyond them are left out. All are finite, unless that is not asked for.
-    """
-    rows = [_row(place, line, columns, separator, finite) for place, line in text_lines(path)]
-    if not rows:
-        raise ValueError(f"{path}: holds no rows of {columns} numbers")
-    return np.array(rows)
-
-
-def _row(place: str, line: str, columns: int, separator: str | None, finite: bool) -> list[float]:
-    try:
-        row = [float(word) for word in line.split(separator)]
-    except ValueError:
-        row = []
-    if len(row) < columns:
-        raise ValueError(f"{place}: {columns} numbers are accepted")
-    if finite and not all(map(math.isfinite, row[:columns])):
-        raise ValueError(f"{place}: {columns} finite numbers are accepted")
-    return row[:columns]
+    return time[0], words[1].strip()

@@ -15,9 +15,9 @@ from jaxslam.io.recording import (
     check_rigid,
     fixed,
     of_files,
-    read_table,
 )
 from jaxslam.io.source import Trajectory
+from jaxslam.io.tum import read_table
 
 RATE = 30.0
 CAMERA = Calibration(640, 480, 585.0, 585.0, 320.0, 240.0)
@@ -50,7 +50,8 @@ def _truth(files: list[Path], times: np.ndarray) -> Trajectory | None:
 
 
 def _pose(path: Path) -> np.ndarray:
-    matrix = read_table(path, 4, finite=False)
+    row = "four numbers, a row of a 4x4 matrix,"
+    matrix = read_table(path, "pose", "pose", row, 4, finite=False, spare=True).rows
     if matrix.shape != (4, 4):
         raise ValueError(f"{path}: holds {len(matrix)} rows; a 4x4 matrix is accepted")
     return matrix

@@ -3,6 +3,8 @@
 And what other files of a time and numbers a line have in common with them.
 """
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -82,31 +84,56 @@ def not_rigid(T: Float[np.ndarray, "*k d d"], tolerance: float) -> Bool[np.ndarr
     return ~(skewed <= tolerance) | turned_over | last
 
 
-def read_table(path: str | Path, what: str, holds: str, row: str, columns: int | None) -> Table:
-    """Lines of so many numbers, apart as in `words`, but for empty lines and comments (#).
-
-    With None of as many as the first has; a line of words before it is a comment too. Raises
-    `ValueError`, naming the file and the line: it is a `what` that holds `holds`, and a `row` of
-    it is what is accepted.
-    """
+def text_lines(path: str | Path, what: str = "file", *, comments: bool = False) -> dict[int, str]:
+    """The lines of a text file that are not empty, by their numbers, from 1; with the `comments`
+    (#), or without. Raises ValueError for a file, called `what`, that is no text."""
     path = Path(path)
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
         raise ValueError(f"{path}: cannot read the {what} ({error.strerror})") from None
     except UnicodeDecodeError:
-        raise ValueError(f"{path}: not a text file") from None
-    told = {number: line for number, line in enumerate(lines, start=1) if line.strip()}
-    comments = {n: line for n, line in told.items() if line.lstrip().startswith("#")}
+        raise ValueError(f"{path}: cannot be read as text") from None
+    return {
+        number: line.strip()
+        for number, line in enumerate(lines, start=1)
+        if line.strip() and (comments or not _is_comment(line))
+    }
+
+
+def read_table(
+    path: str | Path,
+    what: str,
+    holds: str,
+    row: str,
+    columns: int | None,
+    *,
+    finite: bool = True,
+    spare: bool = False,
+) -> Table:
+    """Lines of so many numbers, apart as in `words`, but for empty lines and comments (#).
+
+    With None of as many as the first has; a line of words before it is a comment too. Rows may
+    have `spare` numbers, which are left out, and all are finite, unless that is not asked for.
+    Raises `ValueError`, naming the file and the line: it is a `what` that holds `holds`, and a
+    `row` of it is what is accepted.
+    """
+    told = text_lines(path, what, comments=True)
+    comments = {number: line for number, line in told.items() if _is_comment(line)}
     rows = {n: line for n, line in told.items() if n not in comments}
     if columns is None and rows:
         first = min(rows)
-        if not any(map(_is_number, words(rows[first]))):
+        if not any(numbers([word], 1, finite=False) for word in words(rows[first])):
             comments = {first: rows.pop(first)} | comments
         columns = len(words(rows[min(rows)])) if rows else 0
     if not rows:
         raise ValueError(f"{path}: holds no {holds}; lines of {row} are accepted")
-    table = [_row(path, number, line, row, columns or 0) for number, line in rows.items()]
+    table = []
+    for place, line in rows.items():
+        found = numbers(words(line)[: columns if spare else None], columns or 0, finite=finite)
+        if found is None:
+            raise ValueError(f"{path}, line {place}: {row} are accepted")
+        table.append(found)
     return Table(tuple(comments.values()), np.array(table), tuple(rows))
 
 
@@ -115,20 +142,18 @@ def words(line: str) -> list[str]:
     return line.replace(";" if ";" in line else ",", " ").split()
 
 
-def _is_number(word: str) -> bool:
+def numbers(told: Sequence[str], count: int, *, finite: bool = True) -> list[float] | None:
+    """So many words as numbers, finite unless that is not asked for; None where they are not."""
     try:
-        float(word)
+        found = [float(word) for word in told]
     except ValueError:
-        return False
-    return True
+        return None
+    whole = len(found) == count and (not finite or all(map(math.isfinite, found)))
+    return found if whole else None
 
 
-def _row(path: Path, number: int, line: str, accepted: str, columns: int) -> list[float]:
-    told = words(line)
-    row = [float(word) for word in told] if all(map(_is_number, told)) else []
-    if len(row) != columns or not np.all(np.isfinite(row)):
-        raise ValueError(f"{path}, line {number}: {accepted} are accepted")
-    return row
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith("#")
 
 
 def write_tum(path: str | Path, times: ArrayLike, T_wc: ArrayLike, remark: str = "") -> None:

@@ -174,10 +174,10 @@ def test_kitti_without_grey_images_gives_the_colour_camera_where_it_is(kitti):
     [
         ("times.txt", "0\n0.1\n", r"times\.txt: holds 2 lines for 3 images"),
         ("times.txt", "0\n0.1\n0.1\n", r"times\.txt, line 3: time 0\.1 s does not come after"),
-        ("times.txt", "0\nx\n0.1\n", r"times\.txt, line 2: 1 numbers are accepted"),
+        ("times.txt", "0\nx\n0.1\n", r"times\.txt, line 2: finite times, s, are accepted"),
         ("calib.txt", "P1: 1 2 3\n", r"calib\.txt: has no line P0:"),
         ("calib.txt", "P0: 1 2 3\n", r"calib\.txt, line 1: P0: and twelve numbers"),
-        ("poses.txt", "1 0 0 0 0 1 0 0 0 0 1\n", r"poses\.txt, line 1: 12 numbers"),
+        ("poses.txt", "1 0 0 0 0 1 0 0 0 0 1\n", r"poses\.txt, line 1: 12 finite numbers"),
         ("poses.txt", words(np.eye(4)[:3]) + "\n", r"poses\.txt: holds 1 lines for 3 images"),
     ],
 )
