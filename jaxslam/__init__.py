@@ -108,8 +108,12 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "Tracker":
-        from jaxslam.tracking.tracker import Tracker
+        try:
+            from jaxslam.tracking.tracker import Tracker
+        except ModuleNotFoundError as error:
+            from jaxslam._runtime.extras import missing
 
+            raise missing("a Tracker needs", "vision", error) from None
         return Tracker
     if name == "TrackerSettings":
         from jaxslam.tracking.settings import TrackerSettings
