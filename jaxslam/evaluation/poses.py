@@ -30,6 +30,15 @@ BEYOND = (
 )
 
 
+class _Options(NamedTuple):
+    """How poses are compared, beside their convention."""
+
+    align: str
+    used: tuple[str, ...]
+    """Names of axes."""
+    truth_sigma: tuple[float, float] | None
+
+
 class _Compared(NamedTuple):
     """What is evaluated: all of the steps whose poses are not known by definition."""
 
@@ -84,7 +93,7 @@ def evaluate_poses(
         found,
         times=at[start:],
         timed=times is not None,
-        identified=_identified(poses, stated, align, found.names, sigma),
+        identified=_identified(poses, stated, _Options(align, found.names, sigma)),
     )
 
 
@@ -99,7 +108,7 @@ def as_stated(
     told: tuple[str, ...] = ()
     if not used:
         used, told = estimated(poses, stated, align)
-    found = _compared(poses, stated, align, used, truth_sigma)
+    found = _compared(poses, stated, _Options(align, used, truth_sigma))
     return Evaluation(
         quantity="NEES",
         dof=len(used),
@@ -123,14 +132,9 @@ def _sigmas(covariances: Float[np.ndarray, "*batch m m"]) -> Float[np.ndarray, "
     return np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
 
 
-def _compared(
-    poses: Poses,
-    convention: Convention,
-    align: str,
-    used: tuple[str, ...],
-    truth_sigma: tuple[float, float] | None,
-) -> _Compared:
-    """Errors and covariances along axes of these names, aligned, at one scale where it is free."""
+def _compared(poses: Poses, convention: Convention, options: _Options) -> _Compared:
+    """Errors and covariances along the axes used, aligned, at one scale where it is free."""
+    align, used, truth_sigma = options
     names = convention.names(geometry_of(poses.estimates))
     axes = np.array([i for i, name in enumerate(names) if name in used])
     world = laid(poses, convention, align, axes)
@@ -187,26 +191,20 @@ def _log_scales(before: Poses, after: Poses) -> Float[np.ndarray, " runs"]:
     return old - new
 
 
-def _identified(
-    poses: Poses,
-    stated: Convention,
-    align: str,
-    used: tuple[str, ...],
-    truth_sigma: tuple[float, float] | None,
-) -> Identification:
+def _identified(poses: Poses, stated: Convention, options: _Options) -> Identification:
     """Among the conventions of the same scale; given the scale, where none of them does."""
-    geometry = geometry_of(poses.estimates)
+    geometry, used = geometry_of(poses.estimates), options.used
 
     def tried(conventions: Iterable[Convention]) -> dict[Convention, Tried]:
         result = {}
         for convention in conventions:
             with suppress(ValueError):  # a wrong one may make no covariance of its numbers
-                found = _compared(poses, convention, align, used, truth_sigma)
+                found = _compared(poses, convention, options)
                 result[convention] = _tried(convention, geometry, found, used)
         return result
 
     same = _alternatives(stated, geometry, used)
-    if stated.scale == "given" or align != "none":
+    if stated.scale == "given" or options.align != "none":
         return identify(stated, tried(same))
     given = [replace(convention, scale="given") for convention in same]
     return identify(stated, tried(same), lambda: tried(given))
