@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.protocol import AbstractStaged
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.filters.registry import make_filter, scenario_pieces
 from jaxslam.geometry import GEOMETRIES
@@ -191,3 +192,37 @@ def keys_used(monkeypatch, function):
         value = jax.block_until_ready(function())
         jax.effects_barrier()
     return value, found
+
+
+class Around(AbstractStaged):
+    """A filter that the package does not know, with a state of its own: it asks another."""
+
+    estimator: EkfSlam
+
+    def init(self, capacity, first=None):
+        return {"inside": self.estimator.init(capacity, first), "frame": jnp.zeros((), int)}
+
+    def predict(self, state, control):
+        return state | {"inside": self.estimator.predict(state["inside"], control)}
+
+    def predict_features(self, state, control, slots):
+        return self.estimator.predict_features(state["inside"], control, slots)
+
+    def update(self, state, control, seen):
+        inside, innovation = self.estimator.update(state["inside"], control, seen)
+        return state | {"inside": inside}, innovation
+
+    def compose(self, state, control):
+        return state | {"inside": self.estimator.compose(state["inside"], control)}
+
+    def close(self, state, new):
+        return {"inside": self.estimator.close(state["inside"], new), "frame": state["frame"] + 1}
+
+    def remove(self, state, gone):
+        return state | {"inside": self.estimator.remove(state["inside"], gone)}
+
+    def marginal(self, state, function, slots=None):
+        return self.estimator.marginal(state["inside"], function, slots)
+
+    def in_map(self, state):
+        return self.estimator.in_map(state["inside"])

@@ -14,6 +14,8 @@ import pytest
 
 pytest.importorskip("cv2")
 
+from cases import Around
+
 import jaxslam
 from jaxslam._runtime.programs import Program
 from jaxslam._runtime.watchdog import lapack_calls
@@ -484,41 +486,14 @@ def test_a_gaussian_sum_tracks_too():
     assert not np.allclose(summed.T_wc, alone.T_wc, atol=1e-6)
 
 
-class Outside(jaxslam.AbstractStaged):
-    """A filter that the package does not know, with a state of its own: it asks another."""
+class Outside(Around):
+    """One that says whenever it is compiled."""
 
-    estimator: jaxslam.EkfSlam
     compiles: Callable[[], None] = eqx.field(static=True)
-
-    def init(self, capacity, first=None):
-        return {"inside": self.estimator.init(capacity, first), "frames": jnp.zeros((), int)}
 
     def predict(self, state, control):
         self.compiles()
-        return state | {"inside": self.estimator.predict(state["inside"], control)}
-
-    def predict_features(self, state, control, slots):
-        return self.estimator.predict_features(state["inside"], control, slots)
-
-    def update(self, state, control, seen):
-        inside, innovation = self.estimator.update(state["inside"], control, seen)
-        return state | {"inside": inside}, innovation
-
-    def compose(self, state, control):
-        return state | {"inside": self.estimator.compose(state["inside"], control)}
-
-    def close(self, state, new):
-        inside = self.estimator.close(state["inside"], new)
-        return {"inside": inside, "frames": state["frames"] + 1}
-
-    def remove(self, state, gone):
-        return state | {"inside": self.estimator.remove(state["inside"], gone)}
-
-    def marginal(self, state, function, slots=None):
-        return self.estimator.marginal(state["inside"], function, slots)
-
-    def in_map(self, state):
-        return self.estimator.in_map(state["inside"])
+        return super().predict(state, control)
 
 
 def test_a_filter_of_ones_own_tracks_as_the_built_in_one_does():
@@ -543,7 +518,7 @@ def test_a_filter_of_ones_own_tracks_as_the_built_in_one_does():
         ):
             np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)
     assert found.status.count("matched") >= 10
-    assert own._state["frames"] == len(source) - 1
+    assert own._state["frame"] == len(source) - 1
     # Once for all frames, the intervals between which differ in their last digits.
     assert len(compiled) == 1 < len(set(np.diff(source.times)))
     for one, other in zip(own.points(), built_in.points(), strict=True):

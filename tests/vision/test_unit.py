@@ -12,6 +12,8 @@ import pytest
 
 pytest.importorskip("cv2")
 
+from cases import Around
+
 import jaxslam
 from jaxslam.filters.protocol import Scene
 from jaxslam.geometry import scaled
@@ -30,38 +32,18 @@ SETTINGS = TrackerSettings(
 )
 
 
-class Wandering(jaxslam.AbstractStaged):
+class Wandering(Around):
     """`world` in a unit of its own, another with every frame until that is fixed: `opening[k]`, the
     log of it in metres, on top of which comes the `wander[k]` of what it believes of the metre."""
 
-    estimator: jaxslam.EkfSlam
     wander: jnp.ndarray
     opening: jnp.ndarray
     fixed_at: int = eqx.field(static=True, default=0)
 
-    def init(self, capacity, first=None):
-        return {"inside": self.estimator.init(capacity, first), "frame": jnp.zeros((), int)}
-
-    def predict(self, state, control):
-        return state | {"inside": self.estimator.predict(state["inside"], control)}
-
     def predict_features(self, state, control, slots):
-        seen = self.estimator.predict_features(state["inside"], control, slots)
+        seen = super().predict_features(state, control, slots)
         larger = jnp.exp(self.wander[state["frame"]])
         return seen._replace(pose=scaled(seen.pose, larger), omegas=seen.omegas / larger)
-
-    def update(self, state, control, seen):
-        inside, innovation = self.estimator.update(state["inside"], control, seen)
-        return state | {"inside": inside}, innovation
-
-    def compose(self, state, control):
-        return state | {"inside": self.estimator.compose(state["inside"], control)}
-
-    def close(self, state, new):
-        return {"inside": self.estimator.close(state["inside"], new), "frame": state["frame"] + 1}
-
-    def remove(self, state, gone):
-        return state | {"inside": self.estimator.remove(state["inside"], gone)}
 
     def marginal(self, state, function, slots=None):
         frame = state["frame"]
@@ -73,10 +55,7 @@ class Wandering(jaxslam.AbstractStaged):
             pose = scaled(scene.pose, larger)
             return function(replace(scene, pose=pose, omega=omega, log_scale=logs))
 
-        return self.estimator.marginal(state["inside"], believed, slots)
-
-    def in_map(self, state):
-        return self.estimator.in_map(state["inside"])
+        return super().marginal(state, believed, slots)
 
     def unit_fixed(self, state):
         return state["frame"] >= self.fixed_at
