@@ -2,8 +2,8 @@
 
 `python benchmarks/calibration.py` runs every treatment (white, consider, estimated, known) where
 the intrinsics are drawn in every frame (`white`), once a run (`constant`) or exact (`nominal`),
-for a camera that turns and one that does not, and writes `benchmarks/results/calibration.json`,
-`docs/calibration.md` and `docs/calibration.png`. The file is whole after every world and truth.
+for a camera that turns and one that does not, and writes `calibration.json`, `docs/calibration.md`
+and `docs/calibration.png`.
 """
 
 from __future__ import annotations
@@ -20,15 +20,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
+from benchmark import RESULTS, Benchmark, number, table, write_page
+from figures.calibration import plot_calibration
 
 import jaxslam
-from jaxslam._runtime.files import write_atomically, write_json
 from jaxslam.consistency import CHUNK, MemoryStore, Study
 from jaxslam.consistency.montecarlo import Seconds, check_sizes, filter_run
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.models.sensors import Pinhole
-from jaxslam.plots.calibration import plot_calibration
 from jaxslam.simulation import Room, Run, Scenario, Sightings, sensor_of, sightings, simulate
 from jaxslam.simulation.scenario import CALIBRATIONS, TRUE_CALIBRATIONS
 from jaxslam.statistics import mean_band, normalised_squared, verdict
@@ -40,9 +39,9 @@ TRUTH = {
 }
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class CalibrationStudy(Benchmark):
+    """Treatments under truths in worlds."""
 
     scenarios: tuple[str, ...] = ("circle", "matched")
     """Worlds: by default one in which the camera turns, and one in which it only moves sideways."""
@@ -55,11 +54,7 @@ class Options:
     runs: int = 400
     seed: int = 0
     steps: int = 60
-    out: Path = Path("benchmarks/results/calibration.json")
-    docs: Path = Path("docs")
-    """Folder of calibration.md and calibration.png."""
-    page_only: bool = False
-    """Only write page and figure again."""
+    out: Path = RESULTS / "calibration.json"
 
     def __post_init__(self) -> None:
         for kind, names, known in (
@@ -70,28 +65,34 @@ class Options:
                 raise ValueError(f"{kind} must be some of {', '.join(known)}, not {names}")
         check_sizes(self.runs, self.seed, "float64", CHUNK)
 
+    def measure(self) -> Iterator[dict[str, Any]]:
+        """`{"scenarios": {scenario: {truth: {"filter/landmarks": {treatment: numbers}}}}}` and what
+        it is of, after every truth."""
+        results: dict[str, Any] = {}
+        of = {"schema": 1, "version": jaxslam.__version__, "device": jax.devices()[0].device_kind}
+        of |= {key: getattr(self, key) for key in ("runs", "seed", "steps", "truths", "treatments")}
+        for name in self.scenarios:
+            worlds = {
+                truth: jaxslam.scenario(name, steps=self.steps, true_calibration=truth)
+                for truth in self.truths
+            }
+            drawn = {truth: draw(scenario, self) for truth, scenario in worlds.items()}
+            # One room for all truths, so that a filter compiles once.
+            seen = [count for chunks in drawn.values() for _, count in chunks]
+            most = jax.tree.map(lambda *counts: max(1, *(int(c) for c in counts)), *seen)
+            room = Room(most.landmarks, most.first, most.known, most.new)
+            results[name] = {}
+            for truth, scenario in worlds.items():
+                runs = [chunk for chunk, _ in drawn[truth]]
+                results[name][truth] = _measure(scenario, runs, room, self)
+                yield {**of, "scenarios": results}
 
-def measure(options: Options) -> Iterator[dict[str, Any]]:
-    """`{scenario: {truth: {"filter/landmarks": {treatment: numbers}}}}`, after every truth."""
-    results: dict[str, Any] = {}
-    for name in options.scenarios:
-        worlds = {
-            truth: jaxslam.scenario(name, steps=options.steps, true_calibration=truth)
-            for truth in options.truths
-        }
-        drawn = {truth: draw(scenario, options) for truth, scenario in worlds.items()}
-        # One room for all truths, so that a filter compiles once.
-        seen = [count for chunks in drawn.values() for _, count in chunks]
-        most = jax.tree.map(lambda *counts: max(1, *(int(c) for c in counts)), *seen)
-        room = Room(most.landmarks, most.first, most.known, most.new)
-        results[name] = {}
-        for truth, scenario in worlds.items():
-            runs = [chunk for chunk, _ in drawn[truth]]
-            results[name][truth] = _measure(scenario, runs, room, options)
-            yield results
+    def report(self, results: dict[str, Any]) -> None:
+        plot_calibration(results, self.docs / "calibration.png")
+        write_page(self.docs / "calibration.md", page(results))
 
 
-def draw(scenario: Scenario, options: Options) -> list[tuple[Run, Sightings]]:
+def draw(scenario: Scenario, options: CalibrationStudy) -> list[tuple[Run, Sightings]]:
     """Chunks of runs, and what they see at the most."""
     key = jax.random.key(options.seed)
 
@@ -108,7 +109,9 @@ def _chunks(runs: int) -> tuple[range, ...]:
     return tuple(range(i, min(i + CHUNK, runs)) for i in range(0, runs, CHUNK))
 
 
-def _measure(scenario, runs: list[Run], room: Room, options: Options) -> dict[str, dict[str, Any]]:
+def _measure(
+    scenario, runs: list[Run], room: Room, options: CalibrationStudy
+) -> dict[str, dict[str, Any]]:
     results: dict[str, dict[str, Any]] = {}
     for treatment in options.treatments:
         filters = jaxslam.make_filters(scenario, options.filters, options.landmarks, treatment)
@@ -125,7 +128,7 @@ def _measure(scenario, runs: list[Run], room: Room, options: Options) -> dict[st
 
 
 def _run(
-    name, slam, scenario, runs: list[Run], room: Room, options: Options
+    name, slam, scenario, runs: list[Run], room: Room, options: CalibrationStudy
 ) -> tuple[Study, Mapping[str, np.ndarray]]:
     """The study of one filter, and the last error of its intrinsics with their covariance."""
     store, chunks, sensor = MemoryStore(), _chunks(options.runs), sensor_of(scenario)
@@ -234,7 +237,7 @@ def _conclusion(summary: dict[str, Any]) -> str:
         # Within a tenth of one another: that is what 200 runs scatter.
         good = [t for t, value in worst.items() if value <= 1.1 * least]
         named = " or ".join(f"`{t}`" for t in good)
-        numbers = ", ".join(f"{name} {_number(value)}" for name, value in worst.items())
+        numbers = ", ".join(f"{name} {number(value)}" for name, value in worst.items())
         best.append(f"{TRUTH[truth]}, {named} ({numbers})")
         if "known" in worst and truth != "nominal":
             costs.append(f"{worst['known'] / least:.0f} times ({TRUTH[truth]})")
@@ -262,81 +265,53 @@ def _worst(summary: dict[str, Any], truth: str) -> dict[str, float]:
 
 
 def _rows(by_truth: dict[str, Any]) -> str:
-    lines = [
-        "| truth | filter | treatment | NEES | median | lost | RMSE m | σ/RMSE | NIS per dof |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    header = (
+        "truth",
+        "filter",
+        "treatment",
+        "NEES",
+        "median",
+        "lost",
+        "RMSE m",
+        "σ/RMSE",
+        "NIS per dof",
+    )
+    rows = []
+    for truth, name, treatment, f in _each(by_truth):
+        mean = number(f["nees"])
+        rows.append(
+            (
+                *(truth, name, treatment),
+                f"**{mean}**" if f["verdict"] == "consistent" else mean,
+                number(f["nees_median"]),
+                f"{f['lost']:.1%}",
+                number(f["rmse_m"], ".3f"),
+                number(f["sigma_over_rmse"]),
+                number(f["nis_per_dof"]),
+            )
+        )
+    return table(header, rows)
+
+
+def _each(by_truth: dict[str, Any]) -> Iterator[tuple[str, str, str, dict[str, Any]]]:
     for truth, filters in by_truth.items():
         for name, by_treatment in filters.items():
             for treatment, f in by_treatment.items():
-                mean = _number(f["nees"])
-                cells = (
-                    f"**{mean}**" if f["verdict"] == "consistent" else mean,
-                    _number(f["nees_median"]),
-                    f"{f['lost']:.1%}",
-                    _number(f["rmse_m"], "{:.3f}"),
-                    _number(f["sigma_over_rmse"]),
-                    _number(f["nis_per_dof"]),
-                )
-                lines.append(f"| {truth} | {name} | {treatment} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+                yield truth, name, treatment, f
 
 
 def _estimates(by_truth: dict[str, Any]) -> str:
-    lines = [
-        "| truth | filter | RMSE of f, c, px | σ, px | NEES (ideal 2) | 95 % band |",
-        "|---|---|---|---|---|---|",
-    ]
-    for truth, filters in by_truth.items():
-        for name, by_treatment in filters.items():
-            f = by_treatment.get("estimated", {}).get("intrinsics")
-            if f is None or truth == "white":  # no constant to be right about
-                continue
-            rmse, sigma = (", ".join(f"{x:.2f}" for x in f[key]) for key in ("rmse_px", "sigma_px"))
-            low, high = f["band95"]
-            lines.append(
-                f"| {truth} | {name} | {rmse} | {sigma} | {_number(f['nees'])} | "
-                f"{low:.2f}–{high:.2f} |"
-            )
-    return "\n".join(lines) if len(lines) > 2 else ""
-
-
-def _number(value: float | None, form: str = "{:.2f}") -> str:
-    if value is None or not np.isfinite(value):
-        return "–"
-    return f"{value:.1e}" if abs(value) >= 1e4 else form.format(value)
-
-
-def main(options: Options) -> None:
-    """Measure, and write the three files after every truth."""
-    if options.page_only:
-        write(json.loads(options.out.read_text()), options)
-        return
-    jax.config.update("jax_enable_x64", True)
-    for folder in (options.out.parent, options.docs):
-        folder.mkdir(parents=True, exist_ok=True)
-    for results in measure(options):
-        summary = {
-            "schema": 1,
-            "version": jaxslam.__version__,
-            "runs": options.runs,
-            "seed": options.seed,
-            "steps": options.steps,
-            "truths": list(options.truths),
-            "treatments": list(options.treatments),
-            "device": jax.devices()[0].device_kind,
-            "scenarios": results,
-        }
-        write(summary, options)
-
-
-def write(summary: dict[str, Any], options: Options) -> None:
-    """The JSON file, the figure and the page."""
-    write_json(options.out, summary)
-    plot_calibration(summary, options.docs / "calibration.png")
-    with write_atomically(options.docs / "calibration.md") as path:
-        path.write_text(page(summary))
+    header = ("truth", "filter", "RMSE of f, c, px", "σ, px", "NEES (ideal 2)", "95 % band")
+    rows = []
+    for truth, name, _, numbers in _each(by_truth):
+        f = numbers["intrinsics"]
+        if f is None or truth == "white":  # no constant to be right about
+            continue
+        pixels = (", ".join(f"{x:.2f}" for x in f[key]) for key in ("rmse_px", "sigma_px"))
+        low, high = f["band95"]
+        rows.append((truth, name, *pixels, number(f["nees"]), f"{low:.2f}–{high:.2f}"))
+    return table(header, rows) if rows else ""
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    CalibrationStudy.run()

@@ -1,28 +1,29 @@
 """Every landmark parametrization in every frame: NEES, RMSE, σ/RMSE and time per step.
 
-`python benchmarks/comparison.py` runs them all, 1000 runs each, and writes
-`benchmarks/results/comparison.json`, `docs/comparison.png` and `docs/comparison.md`.
+`python benchmarks/comparison.py` runs them all, 1000 runs each, and writes `comparison.json`,
+`docs/comparison.png` and `docs/comparison.md`.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tyro
+import jax
+from benchmark import RESULTS, Benchmark, number, table, write_page
+from figures.comparison import plot_comparison
 
 import jaxslam
-from jaxslam._runtime.files import write_atomically, write_json
 from jaxslam.landmarks import table as landmark_table
-from jaxslam.plots.comparison import plot_comparison
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class Comparison(Benchmark):
+    """Parametrizations in frames in worlds."""
 
     scenarios: tuple[str, ...] = ("matched", "matched-loose", "matched-forward", "circle")
     """Simulated worlds."""
@@ -33,28 +34,28 @@ class Options:
     runs: int = 1000
     """Runs of every filter."""
     seed: int = 0
-    out: Path = Path("benchmarks/results")
-    """Folder of comparison.json."""
-    docs: Path = Path("docs")
-    """Folder of comparison.md and comparison.png."""
-    page_only: bool = False
-    """Only write page and figure again."""
+    out: Path = RESULTS / "comparison.json"
 
-
-def measure(options: Options) -> Iterator[dict[str, dict[str, Any]]]:
-    """`{scenario: {"filter/landmarks": numbers at the end}}`, yielded after every filter."""
-    results: dict[str, dict[str, Any]] = {name: {} for name in options.scenarios}
-    # Filter by filter, so that scenarios of one shape share its compiled program.
-    for landmarks in options.landmarks:
-        for frame in options.filters:
-            for name in options.scenarios:
-                numbers = _measure(name, frame, landmarks, options)
+    def measure(self) -> Iterator[dict[str, Any]]:
+        """`{"scenarios": {scenario: {"filter/landmarks": numbers at the end}}}` and what it is of,
+        after every filter."""
+        results: dict[str, dict[str, Any]] = {name: {} for name in self.scenarios}
+        of = {"schema": 1, "version": jaxslam.__version__, "runs": self.runs, "seed": self.seed}
+        of["device"] = jax.devices()[0].device_kind
+        # Filter by filter, so that scenarios of one shape share its compiled program.
+        for landmarks, frame in itertools.product(self.landmarks, self.filters):
+            for name in self.scenarios:
+                numbers = _measure(name, frame, landmarks, self)
                 results[name][f"{frame}/{landmarks}"] = numbers
                 print(name, f"{frame}/{landmarks}", json.dumps(numbers), flush=True)
-            yield results
+            yield {**of, "scenarios": results}
+
+    def report(self, results: dict[str, Any]) -> None:
+        plot_comparison(results["scenarios"], self.docs / "comparison.png")
+        write_page(self.docs / "comparison.md", page(results))
 
 
-def _measure(name: str, frame: str, landmarks: str, options: Options) -> dict[str, Any]:
+def _measure(name: str, frame: str, landmarks: str, options: Comparison) -> dict[str, Any]:
     scenario = jaxslam.scenario(name)
     filters = jaxslam.make_filters(scenario, [frame], [landmarks])
     study = jaxslam.monte_carlo(scenario, filters, runs=options.runs, seed=options.seed)
@@ -102,63 +103,28 @@ def page(summary: dict[str, Any]) -> str:
 
 
 def _rows(results: dict[str, Any], names: list[str], runs: int) -> str:
-    lines = [
-        "| filter | NEES mean | median | inside | lost | RMSE m | σ/RMSE | µs a step |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    header = "filter", "NEES mean", "median", "inside", "lost", "RMSE m", "σ/RMSE", "µs a step"
+    rows = []
     for name in names:
         if name not in results:
-            lines.append(f"| {name} | not measured |" + " – |" * 6)
+            rows.append([name, "not measured", *["–"] * 6])
             continue
         f = results[name]
-        cells = (
-            _number(f["nees"], "{:.2f}"),
-            _number(f["nees_median"], "{:.2f}"),
-            f"{f['inside']:.0%}",
-            f"{f['lost']:.1%}" + (f" ({f['diverged']} diverged)" if f["diverged"] else ""),
-            _number(f["rmse"], "{:.3f}"),
-            _number(f["sigma_over_rmse"], "{:.2f}"),
-            f"{f['microseconds_per_step']:.0f}",
-        )
         few = "" if f["runs"] == runs else f" ({f['runs']} runs)"
-        lines.append(f"| {name}{few} | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def _number(value: float | None, form: str) -> str:
-    if value is None:
-        return "–"
-    return f"{value:.1e}" if abs(value) >= 1e4 else form.format(value)
-
-
-def main(options: Options) -> None:
-    """Measure, and write the three files after every filter."""
-    if options.page_only:
-        write(json.loads((options.out / "comparison.json").read_text()), options)
-        return
-    import jax
-
-    for folder in (options.out, options.docs):
-        folder.mkdir(parents=True, exist_ok=True)
-    for results in measure(options):
-        summary = {
-            "schema": 1,
-            "version": jaxslam.__version__,
-            "runs": options.runs,
-            "seed": options.seed,
-            "device": jax.devices()[0].device_kind,
-            "scenarios": results,
-        }
-        write(summary, options)
-
-
-def write(summary: dict[str, Any], options: Options) -> None:
-    """The JSON file, the figure and the page."""
-    write_json(options.out / "comparison.json", summary)
-    plot_comparison(summary["scenarios"], options.docs / "comparison.png")
-    with write_atomically(options.docs / "comparison.md") as path:
-        path.write_text(page(summary))
+        diverged = f" ({f['diverged']} diverged)" if f["diverged"] else ""
+        rows.append(
+            [
+                f"{name}{few}",
+                *(number(f[key]) for key in ("nees", "nees_median")),
+                f"{f['inside']:.0%}",
+                f"{f['lost']:.1%}{diverged}",
+                number(f["rmse"], ".3f"),
+                number(f["sigma_over_rmse"]),
+                f"{f['microseconds_per_step']:.0f}",
+            ]
+        )
+    return table(header, rows)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    Comparison.run()

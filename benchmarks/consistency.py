@@ -21,7 +21,7 @@ import numpy as np
 import tyro
 from pages import END, write_table
 from verdicts import BEGIN
-from verdicts import table as table_of_verdicts
+from verdicts import as_table as table_of_verdicts
 
 import jaxslam
 from jaxslam._runtime.files import json_numbers, write_atomically

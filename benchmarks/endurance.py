@@ -4,7 +4,7 @@
 
 The frames of a sequence go to and fro at their own rate. Every thousand frames: the median and the
 99 % quantile of the time of one, the memory of the process, the landmarks that left the map.
-Results are written to `endurance.json`, and their table to `docs/stress.md`.
+Writes `endurance.json`, and the table of `docs/stress.md`.
 """
 
 from __future__ import annotations
@@ -13,13 +13,12 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
-from pages import write_table
+from benchmark import RESULTS, Benchmark, table, write_table
 
-from jaxslam._runtime.files import write_json
 from jaxslam.io.opening import open_source
 from jaxslam.io.source import Frame
 from jaxslam.tracking.settings import TrackerSettings
@@ -30,9 +29,9 @@ BLOCK = 1000
 MARK = "<!-- by endurance.py -->"
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class Endurance(Benchmark):
+    """A long video, and what tracks it."""
 
     sequence: Annotated[Path, tyro.conf.Positional] = Path("../shared/data/monoslam_desk")
     """Data set folder or video."""
@@ -40,10 +39,39 @@ class Options:
     """Frames in all."""
     filter: str = "recommended"
     """Filter."""
-    out: Path = Path("benchmarks/results/endurance.json")
-    """The results."""
-    page: Path = Path("docs/stress.md")
-    """The page."""
+    out: Path = RESULTS / "endurance.json"
+    double = False
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        """A row for every thousand frames."""
+        source = open_source(self.sequence)
+        tracker = Tracker(source.calibration, TrackerSettings(filter=self.filter))
+        tracker.compile()
+        rows, seconds, tracked = [], [], []
+        for frame in to_and_fro(list(source), self.frames):
+            start = time.perf_counter()
+            tracked.append(tracker.track(frame).state == "tracked")
+            seconds.append(time.perf_counter() - start)
+            if len(seconds) == BLOCK:
+                median, p99 = 1e3 * np.quantile(seconds, [0.5, 0.99])
+                row = frame.index + 1, np.mean(tracked), tracker.restarts + 1, median, p99
+                rows.append([round(float(x), 3) for x in (*row, resident(), tracker.deleted)])
+                print(rows[-1], flush=True)
+                seconds, tracked = [], []
+                yield {"sequence": source.name, "filter": tracker.filter_name, "rows": rows}
+
+    def report(self, results: dict[str, Any]) -> None:
+        header = (
+            "to frame",
+            "tracked",
+            "maps",
+            "ms a frame, p99",
+            "memory, MiB",
+            "landmarks that left",
+        )
+        of_row = "{:.0f}|{:.1%}|{:.0f}|{:.1f}, {:.0f}|{:.0f}|{:.0f}".format
+        rows = [of_row(*row).split("|") for row in results["rows"]]
+        write_table(self.docs / "stress.md", MARK, table(header, rows))
 
 
 def to_and_fro(frames: Sequence[Frame], count: int) -> Iterator[Frame]:
@@ -61,34 +89,5 @@ def resident() -> float:
     return int(next(line for line in lines if line.startswith("VmRSS")).split()[1]) / 1024
 
 
-def main() -> None:
-    """Print a row for every thousand frames, and write the results."""
-    options = tyro.cli(Options, description=__doc__)
-    source = open_source(options.sequence)
-    tracker = Tracker(source.calibration, TrackerSettings(filter=options.filter))
-    tracker.compile()
-    rows, seconds, tracked = [], [], []
-    for frame in to_and_fro(list(source), options.frames):
-        start = time.perf_counter()
-        tracked.append(tracker.track(frame).state == "tracked")
-        seconds.append(time.perf_counter() - start)
-        if len(seconds) == BLOCK:
-            median, p99 = 1e3 * np.quantile(seconds, [0.5, 0.99])
-            row = frame.index + 1, np.mean(tracked), tracker.restarts + 1, median, p99
-            rows.append([round(float(x), 3) for x in (*row, resident(), tracker.deleted)])
-            print(rows[-1], flush=True)
-            seconds, tracked = [], []
-    results = {"sequence": source.name, "filter": tracker.filter_name, "rows": rows}
-    write_json(options.out, results)
-    write_table(options.page, MARK, table(rows))
-
-
-def table(rows: list[list[float]]) -> str:
-    """As Markdown."""
-    head = "| to frame | tracked | maps | ms a frame, p99 | memory, MiB | landmarks that left |"
-    of_row = "| {:.0f} | {:.1%} | {:.0f} | {:.1f}, {:.0f} | {:.0f} | {:.0f} |"
-    return "\n".join([head, "|---" * 6 + "|", *(of_row.format(*row) for row in rows)])
-
-
 if __name__ == "__main__":
-    main()
+    Endurance.run()

@@ -1,6 +1,6 @@
 """Is single precision safe? NEES in float32 against float64, run by run on the same pixels.
 
-    python benchmarks/float32.py --out benchmarks/results/float32.json
+    python benchmarks/float32.py
 
 Runs are drawn in float64 and rounded, since a seed draws other numbers in another precision. A
 filter is *safe* in float32 in a scenario when a study says the same of it in both precisions:
@@ -16,6 +16,7 @@ not done again.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,12 +25,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-import tyro
-from pages import write_table
+from benchmark import RESULTS, Benchmark, table, write_table
 
 import jaxslam
 from jaxslam._numerics.arrays import cast
-from jaxslam._runtime.files import read_json, write_json
 from jaxslam.consistency.montecarlo import DTYPES, draw, filter_run
 from jaxslam.models.observations import Status
 from jaxslam.simulation import Scenario, sensor_of
@@ -41,18 +40,33 @@ RATIO, LOST = 0.02, 0.01
 """The most by which a mean NEES, relative, and a share of lost runs may differ."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to compare."""
+@dataclass(frozen=True, kw_only=True)
+class Float32(Benchmark):
+    """Runs in both precisions."""
 
-    out: Path
-    """JSON file."""
     scenarios: tuple[str, ...] = tuple(BUILT_IN)
     filters: tuple[str, ...] = ("robocentric", "world", "scale_gauge", "invariant", "recommended")
     """On Inverse Scaling."""
     runs: int = 200
-    page: Path = Path("docs/float32.md")
-    """The page."""
+    out: Path = RESULTS / "float32.json"
+    double = False
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        """Compare all that is not in the file yet."""
+        done = self.found() or {"runs": self.runs, "scenarios": {}}
+        if done["runs"] != self.runs:
+            raise ValueError(f"{self.out} is of {done['runs']} runs: write to another file")
+        for name in self.scenarios:
+            there = done["scenarios"].setdefault(name, {})
+            asked = tuple(f for f in self.filters if f"{f}/inverse_scaling" not in there)
+            there.update(measured(name, asked, self.runs))
+            yield done
+
+    def report(self, results: dict[str, Any]) -> None:
+        header = "scenario", "filter", "NEES, float64 / float32", "ever lost", "failed updates more"
+        scenarios = results["scenarios"].items()
+        rows = [row(name, full, r) for name, of in scenarios for full, r in of.items()]
+        write_table(self.docs / "float32.md", MARK, table([*header, ""], rows))
 
 
 @eqx.filter_jit
@@ -113,40 +127,18 @@ def measured(name: str, filters: tuple[str, ...], runs: int) -> dict[str, Any]:
         ((full, slam),) = made.items()
         of = {dtype: filtered(slam, scenario, room, batch, dtype) for dtype in DTYPES}
         result[full] = compared(of, scenario.world.tangent_dim)
-        print(row(name, full, result[full]), flush=True)
+        print(*row(name, full, result[full]), flush=True)
     return result
 
 
-def row(scenario: str, name: str, r: dict[str, Any]) -> str:
+def row(scenario: str, name: str, r: dict[str, Any]) -> tuple[str, ...]:
     """A line of the table."""
     word = "safe" if safe(r) else "**unsafe**"
     share = " / ".join(f"{r['lost'][dtype]:.1%}" for dtype in DTYPES)
     nees = " / ".join(f"{r['nees'][dtype]:.3f}" for dtype in DTYPES)
     name = name.removesuffix("/inverse_scaling")
-    return f"| `{scenario}` | `{name}` | {nees} | {share} | {r['failed']} | {word} |"
-
-
-def main() -> None:
-    """Compare all that is not in the file yet."""
-    options = tyro.cli(Options, description=__doc__)
-    done: dict[str, Any] = {"runs": options.runs, "scenarios": {}}
-    if options.out.exists():
-        done = read_json(options.out, "results", dict)
-        assert done["runs"] == options.runs, f"{options.out} is of {done['runs']} runs"
-    for name in options.scenarios:
-        there = done["scenarios"].setdefault(name, {})
-        asked = tuple(f for f in options.filters if f"{f}/inverse_scaling" not in there)
-        there.update(measured(name, asked, options.runs))
-        write_json(options.out, done)
-        write_table(options.page, MARK, table(done["scenarios"]))
-
-
-def table(scenarios: dict[str, dict[str, Any]]) -> str:
-    """Of all that was compared, as Markdown."""
-    head = "| scenario | filter | NEES, float64 / float32 | ever lost | failed updates more | |"
-    rows = [row(name, full, r) for name, of in scenarios.items() for full, r in of.items()]
-    return "\n".join([head, "|---" * 6 + "|", *rows])
+    return f"`{scenario}`", f"`{name}`", nees, share, str(r["failed"]), word
 
 
 if __name__ == "__main__":
-    main()
+    Float32.run()

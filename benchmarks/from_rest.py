@@ -21,13 +21,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from figures.modes import plot_modes, worlds_of
+from modes import modes_of_run
 from pages import write_table
 
 import jaxslam
 from jaxslam._runtime.files import write_json
-from jaxslam.consistency.modes import modes_of_run
 from jaxslam.consistency.montecarlo import draw, filter_run
-from jaxslam.plots.modes import plot_modes, worlds_of
 from jaxslam.simulation import sensor_of
 from jaxslam.statistics.verdict import headline
 

@@ -2,9 +2,9 @@
 
 `python benchmarks/from_rest_posterior.py` draws the posterior of simulated runs by tempered
 sequential Monte Carlo, each twice with other particles, runs filters on the same runs, and writes
-`benchmarks/results/from_rest_posterior.json`, anew after every chunk, and a table in
-`docs/from-rest.md`. `--cache FOLDER` keeps what was drawn, and the same command goes on with it;
-once all is drawn it measures the filters alone.
+`from_rest_posterior.json`, anew after every chunk, and a table in `docs/from-rest.md`. `--cache
+FOLDER` keeps what was drawn, and the same command goes on with it; once all is drawn it measures
+the filters alone.
 """
 
 from __future__ import annotations
@@ -20,15 +20,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
-from pages import write_table
-
-import jaxslam
-from jaxslam._runtime.files import write_json
-from jaxslam._runtime.watchdog import finished
-from jaxslam.consistency import FolderStore, MemoryStore
-from jaxslam.geometry import Pose, difference
-from jaxslam.posterior import (
+from benchmark import RESULTS, Benchmark, table, write_table
+from exact_posterior import (
     SMC,
     Draws,
     Study,
@@ -47,8 +40,13 @@ from jaxslam.posterior import (
     tempered_sample,
     uniformity,
 )
-from jaxslam.posterior.modes import LEAST_SHARE
-from jaxslam.posterior.summary import position_dim, summarise_filter, summarise_nees
+from exact_posterior.modes import LEAST_SHARE
+from exact_posterior.summary import position_dim, summarise_filter, summarise_nees
+
+import jaxslam
+from jaxslam._runtime.watchdog import finished
+from jaxslam.consistency import FolderStore, MemoryStore
+from jaxslam.geometry import Pose, difference
 from jaxslam.statistics.bands import normalised_squared
 
 Records = dict[str, np.ndarray]
@@ -71,9 +69,9 @@ THINNED = 8
 """One draw of so many is kept for the ranks."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class FromRestPosterior(Benchmark):
+    """The exact posterior from rest, and filters beside it."""
 
     steps: int = 10
     """Frames after the first; the posterior is taken at the last."""
@@ -89,16 +87,35 @@ class Options:
     """Measured on the same runs, and never kept."""
     cache: Path | None = None
     """Folder that keeps what was drawn, by chunks."""
-    out: Path = Path("benchmarks/results/from_rest_posterior.json")
-    docs: Path = Path("docs/from-rest.md")
-    """The page."""
+    out: Path = RESULTS / "from_rest_posterior.json"
 
     def __post_init__(self) -> None:
         if self.runs < 2 or self.chunk < 1:
             raise ValueError(f"at least 2 runs in chunks of 1, not {self.runs} and {self.chunk}")
 
+    def measure(self) -> Iterator[dict[str, Any]]:
+        """The summary of all runs so far, after every chunk."""
+        of = {"schema": 1, "version": jaxslam.__version__, **_settings(self)}
+        of["device"] = jax.devices()[0].device_kind
+        study, store = standstill(self), _store(self)
+        parts, others = [], {name: [] for name in self.filters}
+        for start in range(0, self.runs, self.chunk):
+            chunk = range(start, min(start + self.chunk, self.runs))
+            if not store.has("from_rest", chunk):
+                began = time.perf_counter()
+                store.save("from_rest", chunk, drawn(study, self, chunk))
+                print(f"{chunk.stop} runs, {time.perf_counter() - began:.0f} s", flush=True)
+            parts.append(store.load("from_rest", chunk))
+            for name, of_chunks in others.items():
+                of_chunks.append(beside(study, name, self, chunk, parts[-1]["poses"]))
+            filters = {name: _joined(of_chunks) for name, of_chunks in others.items()}
+            yield of | summarise(_joined(parts), filters)
 
-def standstill(options: Options) -> Study:
+    def report(self, results: dict[str, Any]) -> None:
+        write_table(self.docs / "from-rest.md", BEGIN, as_table(results))
+
+
+def standstill(options: FromRestPosterior) -> Study:
     """The study of a planar camera whose velocity is only known to be about 0."""
     scenario = jaxslam.scenario(
         "matched-loose",
@@ -110,7 +127,7 @@ def standstill(options: Options) -> Study:
     return Study(scenario, options.steps)
 
 
-def drawn(study: Study, options: Options, indices: range) -> Records:
+def drawn(study: Study, options: FromRestPosterior, indices: range) -> Records:
     """Records of runs, axes run, repeat; the program is the same for all chunks."""
     runs = draw_runs(study, options.seed, indices)
     problems = jax.vmap(partial(make_problem, study.scenario))(runs)
@@ -179,7 +196,9 @@ def _of_particles(draws: Draws) -> dict[str, jax.Array]:
     }
 
 
-def beside(study: Study, name: str, options: Options, indices: range, poses: np.ndarray) -> Records:
+def beside(
+    study: Study, name: str, options: FromRestPosterior, indices: range, poses: np.ndarray
+) -> Records:
     """Records of a filter on the same runs, beside parameters of the drawn T_BC, axes run, draw."""
     (slam,) = jaxslam.make_filters(study.scenario, [name], ["inverse_scaling"]).values()
     runs = draw_runs(study, options.seed, indices)
@@ -283,44 +302,24 @@ def _root_mean_square(values: np.ndarray) -> list[float]:
     return np.sqrt(np.mean(values**2, axis=0)).tolist()
 
 
-def measure(options: Options) -> Iterator[dict[str, Any]]:
-    """The summary of all runs so far, after every chunk."""
-    study, store = standstill(options), _store(options)
-    chunks = [
-        range(start, min(start + options.chunk, options.runs))
-        for start in range(0, options.runs, options.chunk)
-    ]
-    parts, others = [], {name: [] for name in options.filters}
-    for chunk in chunks:
-        if not store.has("from_rest", chunk):
-            start = time.perf_counter()
-            store.save("from_rest", chunk, drawn(study, options, chunk))
-            print(f"{chunk.stop} runs, {time.perf_counter() - start:.0f} s", flush=True)
-        parts.append(store.load("from_rest", chunk))
-        for name, of_chunks in others.items():
-            of_chunks.append(beside(study, name, options, chunk, parts[-1]["poses"]))
-        filters = {name: _joined(of_chunks) for name, of_chunks in others.items()}
-        yield summarise(_joined(parts), filters)
-
-
 def _joined(parts: Sequence[Records]) -> Records:
     """The records of all chunks, one after the other."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _store(options: Options) -> FolderStore | MemoryStore:
+def _store(options: FromRestPosterior) -> FolderStore | MemoryStore:
     if options.cache is None:
         return MemoryStore()
     return FolderStore(options.cache, _settings(options), resume=True)
 
 
-def _settings(options: Options) -> dict[str, Any]:
+def _settings(options: FromRestPosterior) -> dict[str, Any]:
     """What the numbers depend on."""
     given = dataclasses.asdict(options)
     return {name: given[name] for name in ("steps", "landmarks", "velocity_sigma", "seed", "smc")}
 
 
-def table(summary: dict[str, Any]) -> str:
+def as_table(summary: dict[str, Any]) -> str:
     """The exact posterior, the best sums of Gaussians, and the filters, on the same runs."""
     header = ["", "NEES", "RMSE, m", "over the exact one", "σ, m", "KL, nats", "reversed weight"]
     kl = {name: summary["kl"][f"pooled_kl_of_{name}"] for name in ("one_gaussian", "two_gaussians")}
@@ -330,8 +329,7 @@ def table(summary: dict[str, Any]) -> str:
         ["a Gaussian for each mode", "", "", "", "", _median(kl["two_gaussians"]), ""],
         *(_row(*item) for item in summary["filters"].items()),
     ]
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return table(header, rows)
 
 
 def _row(name: str, found: dict[str, Any]) -> list[str]:
@@ -352,21 +350,5 @@ def _median(quantiles: dict[str, float]) -> str:
     return f"{quantiles['median']:.2f}; {quantiles['worst_tenth']:.2f}"
 
 
-def main(options: Options) -> None:
-    """Measure, and write the file and the page after every chunk."""
-    jax.config.update("jax_enable_x64", True)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    for summary in measure(options):
-        written = {
-            "schema": 1,
-            "version": jaxslam.__version__,
-            **_settings(options),
-            "device": jax.devices()[0].device_kind,
-            **summary,
-        }
-        write_json(options.out, written)
-        write_table(options.docs, BEGIN, table(summary))
-
-
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    FromRestPosterior.run()

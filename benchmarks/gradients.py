@@ -3,33 +3,34 @@
     python benchmarks/gradients.py
 
 A filter that starts with wrong σ of the accelerations and of the pixels is differentiated by them
-through all frames of all runs, and climbs. Writes `benchmarks/results/gradients.json` and the table
-of `docs/gradients.md`.
+through all frames of all runs, and climbs. Writes `gradients.json` and the table of
+`docs/gradients.md`.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
+from benchmark import RESULTS, Benchmark, table, write_table
 
 import jaxslam
-from jaxslam._runtime.files import write_atomically, write_json
 from jaxslam.consistency.likelihood import maximum_likelihood
 from jaxslam.consistency.montecarlo import draw
 
 NAMES = ("linear acceleration, m/s²", "angular acceleration, rad/s²", "pixel")
-MARK = "<!-- written by benchmarks/gradients.py -->"
+MARK = "<!-- gradients.py -->"
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class Gradients(Benchmark):
+    """Noises by likelihood."""
 
     scenario: str = "matched-loose"
     """A planar scenario of a camera with a velocity."""
@@ -42,8 +43,52 @@ class Options:
     seed: int = 0
     start: tuple[float, float, float] = (3.0, 0.3, 2.0)
     """Factors by which the filter's σ are wrong at the start."""
-    out: Path = Path("benchmarks/results/gradients.json")
-    page: Path = Path("docs/gradients.md")
+    out: Path = RESULTS / "gradients.json"
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        scenario = jaxslam.scenario(self.scenario, inverse_depth=self.inverse_depth)
+        room, runs = draw(scenario, self.runs, seed=self.seed)
+        (slam,) = jaxslam.make_filters(scenario, [self.filter], ["inverse_scaling"]).values()
+        assert isinstance(slam, jaxslam.EkfSlam)
+        slam = jaxslam.cast(slam, jnp.float64)
+        truth = np.array([*np.asarray(slam.motion.noise_sigma)[[0, 2]], float(slam.sensor.sigma)])
+        start = np.log(truth * self.start)
+        began = time.perf_counter()
+        found = maximum_likelihood(
+            lambda theta: with_noises(slam, jnp.exp(theta)), start, room, runs
+        )
+        yield {
+            "version": jaxslam.__version__,
+            "scenario": self.scenario,
+            "filter": self.filter,
+            "inverse_depth": self.inverse_depth,
+            "runs": self.runs,
+            "steps": scenario.steps,
+            "seed": self.seed,
+            "names": NAMES,
+            "truth": truth.tolist(),
+            "start": np.exp(start).tolist(),
+            "found": np.exp(found.values).tolist(),
+            "relative_standard_error": found.standard_errors.tolist(),
+            "iterations": found.iterations,
+            "converged": found.converged,
+            "seconds": time.perf_counter() - began,
+        }
+
+    def report(self, results: dict[str, Any]) -> None:
+        header = "σ of", "truth", "start", "found", "standard error", "off by"
+        columns = [results[key] for key in ("names", "truth", "start", "found")]
+        rows = [
+            (
+                *(x if isinstance(x, str) else f"{x:.4g}" for x in row),
+                f"{error:.1%}",
+                f"{found / truth - 1:+.1%}",
+            )
+            for *row, error in zip(*columns, results["relative_standard_error"], strict=True)
+            for truth, found in [(row[1], row[3])]
+        ]
+        said = f"{_of_what(results)}\n\n{table(header, rows)}"
+        write_table(self.docs / "gradients.md", MARK, said)
 
 
 def with_noises(slam: jaxslam.EkfSlam, sigmas: jax.Array) -> jaxslam.EkfSlam:
@@ -53,67 +98,14 @@ def with_noises(slam: jaxslam.EkfSlam, sigmas: jax.Array) -> jaxslam.EkfSlam:
     return replace(slam, motion=motion, sensor=replace(slam.sensor, sigma=pixel))
 
 
-def measure(options: Options) -> dict[str, object]:
-    scenario = jaxslam.scenario(options.scenario, inverse_depth=options.inverse_depth)
-    room, runs = draw(scenario, options.runs, seed=options.seed)
-    (slam,) = jaxslam.make_filters(scenario, [options.filter], ["inverse_scaling"]).values()
-    assert isinstance(slam, jaxslam.EkfSlam)
-    slam = jaxslam.cast(slam, jnp.float64)
-    truth = np.array([*np.asarray(slam.motion.noise_sigma)[[0, 2]], float(slam.sensor.sigma)])
-    start = np.log(truth * options.start)
-    began = time.perf_counter()
-    found = maximum_likelihood(lambda theta: with_noises(slam, jnp.exp(theta)), start, room, runs)
-    return {
-        "version": jaxslam.__version__,
-        "scenario": options.scenario,
-        "filter": options.filter,
-        "inverse_depth": options.inverse_depth,
-        "runs": options.runs,
-        "steps": scenario.steps,
-        "seed": options.seed,
-        "names": NAMES,
-        "truth": truth.tolist(),
-        "start": np.exp(start).tolist(),
-        "found": np.exp(found.values).tolist(),
-        "relative_standard_error": found.standard_errors.tolist(),
-        "iterations": found.iterations,
-        "converged": found.converged,
-        "seconds": time.perf_counter() - began,
-    }
-
-
-def table(r: dict) -> str:
-    """The page's table."""
-    lines = [
+def _of_what(r: dict[str, Any]) -> str:
+    mean, sigma = r["inverse_depth"]
+    return (
         f"{r['runs']} runs of `{r['scenario']}`, {r['steps']} frames, seed {r['seed']}, filter "
-        f"`{r['filter']}`, prior on 1/z {r['inverse_depth'][0]:.3g} ± {r['inverse_depth'][1]:.3g} "
-        f"per m; "
-        f"{r['iterations']} steps, {r['seconds']:.0f} s with compilation on two cores.",
-        "",
-        "| σ of | truth | start | found | standard error | off by |",
-        "|---|---|---|---|---|---|",
-    ]
-    rows = zip(
-        r["names"], r["truth"], r["start"], r["found"], r["relative_standard_error"], strict=True
+        f"`{r['filter']}`, prior on 1/z {mean:.3g} ± {sigma:.3g} per m; {r['iterations']} steps, "
+        f"{r['seconds']:.0f} s with compilation on two cores."
     )
-    for name, truth, start, found, error in rows:
-        lines.append(
-            f"| {name} | {truth:.4g} | {start:.4g} | {found:.4g} | {error:.1%} "
-            f"| {found / truth - 1:+.1%} |"
-        )
-    return "\n".join(lines)
-
-
-def main(options: Options) -> None:
-    with jax.enable_x64(True):
-        results = measure(options)
-    write_json(options.out, results)
-    before, _, after = options.page.read_text().partition(MARK)
-    _, _, rest = after.partition(MARK)
-    with write_atomically(options.page) as path:
-        path.write_text(f"{before}{MARK}\n{table(results)}\n{MARK}{rest}")
-    print(table(results))
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    Gradients.run()

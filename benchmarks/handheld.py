@@ -21,6 +21,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+import tracks
 import tyro
 
 import jaxslam
@@ -28,7 +29,6 @@ from jaxslam._numerics.arrays import cast
 from jaxslam._runtime.files import write_atomically, write_json
 from jaxslam.consistency.montecarlo import scale_records
 from jaxslam.consistency.recursion import Frame, run_through
-from jaxslam.datasets import tracks
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.simulation import Room, Run, Scenario, sightings

@@ -10,20 +10,19 @@ a camera at 0.4 m/s; in the others points lie beyond it.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
+from benchmark import RESULTS, Benchmark, number, table
 
 import jaxslam
 from jaxslam._numerics.linalg import cholesky
-from jaxslam._runtime.files import write_json
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.readouts import camera_pose, landmarks_in_camera
 from jaxslam.models.sensors import AbstractSensor
@@ -33,9 +32,9 @@ from jaxslam.statistics.bands import lost_threshold, normalised_squared
 NEAR = {"inverse_depth": (1.1, 0.45), "least_inverse_depth": 0.225, "velocity": (0.4, 0.0, 0.0)}
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class Initialisation(Benchmark):
+    """Undelayed and delayed filters in the same worlds."""
 
     scenarios: tuple[str, ...] = ("near", "matched", "circle")
     """Built-in scenarios, or `near`."""
@@ -57,11 +56,27 @@ class Options:
     """Filter steps; the scenario's by default."""
     chunk: int = 50
     """Runs in one batch."""
-    out: Path = Path("benchmarks/results/initialisation.json")
-    """The JSON file."""
+    out: Path = RESULTS / "initialisation.json"
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        results = self.found()
+        for name in self.scenarios:
+            filters: dict[str, dict] = {}
+            results[name] = {"runs": self.runs, "seed": self.seed, "filters": filters}
+            for pair, numbers in measured(name, self):
+                filters[pair] = numbers
+                yield results
+
+    def report(self, results: dict[str, Any]) -> None:
+        rows = [
+            (name, pair, *_cells(f))
+            for name, of in results.items()
+            for pair, f in of["filters"].items()
+        ]
+        print(table(HEADER, rows), flush=True)
 
 
-def measure(world: str, options: Options) -> Iterator[tuple[str, dict]]:
+def measured(world: str, options: Initialisation) -> Iterator[tuple[str, dict]]:
     """All filters of one scenario."""
     fields = {} if options.steps is None else {"steps": options.steps}
     base, fields = ("matched", {**NEAR, **fields}) if world == "near" else (world, fields)
@@ -195,43 +210,24 @@ def _concatenated(parts: Iterator[dict]) -> dict[str, np.ndarray]:
 
 
 HEADER = (
-    f"{'scenario':<9}{'filter/landmarks':<35}{'NEES':>9}{'median':>8}{'lost':>7}{'RMSE m':>8}"
-    f"{'σ m':>7}{'σ/σ₀ ⅓':>8}{'end':>6}{'delay':>7}{'settled':>9}{'dropped':>9}{'bias/σ':>8}"
-    f"{'rms/σ':>8}"
-)
+    "scenario", "filter/landmarks", "NEES", "median", "lost", "RMSE m", "σ m", "σ/σ₀ ⅓", "end",
+    "delay", "settled", "dropped", "bias/σ", "rms/σ",
+)  # fmt: skip
 
 
-def line(scenario: str, pair: str, f: dict) -> str:
-    """One row of the table."""
+def _cells(f: dict[str, Any]) -> tuple[str, ...]:
     landmarks = f["landmarks"]["all"]
     return (
-        f"{scenario:<9}{pair:<35}{f['nees']:>9.3g}{f['nees_median']:>8.2f}{f['lost']:>7.1%}"
-        f"{f['rmse']:>8.3f}{f['sigma']:>7.3f}{f['sigma_ratio_third']:>8.2f}"
-        f"{f['sigma_ratio_end']:>6.2f}{_number(f['delay_mean'], 7, 1)}"
-        f"{landmarks['settled']:>9.1%}{landmarks['dropped']:>9.1%}"
-        f"{_number(landmarks['bias'], 8, 2)}{_number(landmarks['spread'], 8, 2)}"
+        number(f["nees"], ".3g"),
+        number(f["nees_median"]),
+        f"{f['lost']:.1%}",
+        *(number(f[key], ".3f") for key in ("rmse", "sigma")),
+        *(number(f[key]) for key in ("sigma_ratio_third", "sigma_ratio_end")),
+        number(f["delay_mean"], ".1f"),
+        *(f"{landmarks[key]:.1%}" for key in ("settled", "dropped")),
+        *(number(landmarks[key]) for key in ("bias", "spread")),
     )
 
 
-def _number(value: float | None, width: int, digits: int) -> str:
-    return f"{'–':>{width}}" if value is None else f"{value:>{width}.{digits}f}"
-
-
-def main() -> None:
-    """Measure, print and write."""
-    options = tyro.cli(Options, description=__doc__)
-    jax.config.update("jax_enable_x64", True)
-    print(HEADER)
-    results = json.loads(options.out.read_text()) if options.out.exists() else {}
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    for name in options.scenarios:
-        filters: dict[str, dict] = {}
-        results[name] = {"runs": options.runs, "seed": options.seed, "filters": filters}
-        for pair, numbers in measure(name, options):
-            filters[pair] = numbers
-            print(line(name, pair, numbers), flush=True)
-            write_json(options.out, results)
-
-
 if __name__ == "__main__":
-    main()
+    Initialisation.run()

@@ -2,31 +2,31 @@
 
     python benchmarks/linalg.py
 
-Both in one run, alternating, compilation apart; writes benchmarks/results/linalg.json and the table
-of docs/dead-lock.md. LAPACK's batches are run one program at a time: two at once can stand still.
+Both in one run, alternating, compilation apart; writes `linalg.json` and the table of
+`docs/dead-lock.md`. LAPACK's batches are run one program at a time: two at once can stand still.
 """
 
 from __future__ import annotations
 
 import statistics
 import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
+from benchmark import RESULTS, Benchmark, table, write_table
 from jax.scipy.linalg import solve_triangular
 
 from jaxslam._numerics.linalg import cholesky
-from jaxslam._runtime.files import write_atomically, write_json
 
 SIZES = [(100, 3), (100, 12), (100, 24), (1700, 24), (1, 48), (100, 48), (100, 105), (20, 250)]
 """Matrices in a batch and their rows: poses, updates of 12 and 24 numbers, windows."""
 REPEATS = 15
-HERE = Path(__file__).parent
-PAGE = HERE.parent / "docs" / "dead-lock.md"
-MARK = "<!-- benchmarks/linalg.py -->"
+MARK = "<!-- linalg.py -->"
 
 
 def by_lapack(A):
@@ -58,29 +58,30 @@ def measured(batch: int, n: int) -> dict[str, float]:
     return found
 
 
-def table(rows: list[dict[str, float]]) -> str:
-    lines = ["| matrices × rows | JAX, µs a matrix | LAPACK, µs | compile JAX, s | LAPACK, s |"]
-    lines.append("|---|---|---|---|---|")
-    for r in rows:
-        lines.append(
-            f"| {r['batch']} × {r['rows']} | {r['own_microseconds']:.2f} "
-            f"| {r['lapack_microseconds']:.2f} | {r['own_compile_seconds']:.1f} "
-            f"| {r['lapack_compile_seconds']:.1f} |"
-        )
-    return "\n".join(lines)
+@dataclass(frozen=True, kw_only=True)
+class Linalg(Benchmark):
+    """Both by the size of the batch."""
 
+    out: Path = RESULTS / "linalg.json"
 
-def main() -> None:
-    """Measure and write."""
-    with jax.enable_x64(True):
-        rows = [measured(*size) for size in SIZES]
-    write_json(HERE / "results" / "linalg.json", rows)
-    before, _, after = PAGE.read_text().partition(MARK)
-    rest = after.partition("\n\nThe larger sizes")
-    with write_atomically(PAGE) as path:
-        path.write_text(f"{before}{MARK}\n{table(rows)}{rest[1]}{rest[2]}")
-    print(table(rows))
+    def measure(self) -> Iterator[dict[str, Any]]:
+        rows = []
+        for size in SIZES:
+            rows.append(measured(*size))
+            yield {"rows": rows}
+
+    def report(self, results: dict[str, Any]) -> None:
+        header = "matrices × rows", "JAX, µs a matrix", "LAPACK, µs", "compile JAX, s", "LAPACK, s"
+        rows = [
+            (
+                f"{r['batch']} × {r['rows']}",
+                *(f"{r[f'{name}_microseconds']:.2f}" for name in ("own", "lapack")),
+                *(f"{r[f'{name}_compile_seconds']:.1f}" for name in ("own", "lapack")),
+            )
+            for r in results["rows"]
+        ]
+        write_table(self.docs / "dead-lock.md", MARK, table(header, rows))
 
 
 if __name__ == "__main__":
-    tyro.cli(main, description=__doc__)
+    Linalg.run()

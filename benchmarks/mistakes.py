@@ -7,14 +7,14 @@ with each of the mistakes of logging. Of the last it counts those that are named
 
 from __future__ import annotations
 
-import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import tyro
+from benchmark import RESULTS, Benchmark
 
-from jaxslam._runtime.files import write_json
 from jaxslam.evaluation import evaluate
 
 SIGMA = np.array([0.1, 0.1, 0.02])
@@ -28,16 +28,6 @@ KINDS = {
     "steps before runs": "interchanged",
 }
 """A word that names the mistake."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
-
-    studies: int = 1000
-    """Of every kind."""
-    out: Path = Path("benchmarks/results")
-    """Folder of mistakes.json."""
 
 
 def study(kind: str, number: int) -> tuple[np.ndarray, np.ndarray]:
@@ -72,19 +62,24 @@ def named(kind: str, number: int, names: tuple[str, ...]) -> bool:
     return len(found) == 1 and KINDS[kind] in found[0].what
 
 
-def main(options: Options) -> None:
-    """Count, print and write the shares."""
-    result = {
-        axes: {
-            kind: sum(named(kind, i, names) for i in range(options.studies)) / options.studies
-            for kind in KINDS
-        }
-        for axes, names in (("named axes", ("x", "y", "heading")), ("axes without names", ()))
-    }
-    options.out.mkdir(parents=True, exist_ok=True)
-    write_json(options.out / "mistakes.json", {"studies": options.studies, **result})
-    print(json.dumps(result, indent=1))
+@dataclass(frozen=True, kw_only=True)
+class Mistakes(Benchmark):
+    """Shares of the studies of which just what is wrong is said."""
+
+    studies: int = 1000
+    """Of every kind."""
+    out: Path = RESULTS / "mistakes.json"
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        result: dict[str, Any] = {"studies": self.studies}
+        axes = {"named axes": ("x", "y", "heading"), "axes without names": ()}
+        for words, names in axes.items():
+            result[words] = {
+                kind: sum(named(kind, i, names) for i in range(self.studies)) / self.studies
+                for kind in KINDS
+            }
+            yield result
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    Mistakes.run()

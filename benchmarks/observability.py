@@ -1,29 +1,28 @@
 """Filters that respect what cannot be observed, beside those that do not, with a single camera.
 
 `python benchmarks/observability.py` runs every frame plain, observability-constrained (`+oc`), with
-first-estimate Jacobians (`+fej`) and invariant, and writes `benchmarks/results/observability.json`.
+first-estimate Jacobians (`+fej`) and invariant, and writes `observability.json`.
 Rows that the file has with as many runs are not run again.
 """
 
 from __future__ import annotations
 
-import json
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
+from benchmark import RESULTS, Benchmark, number, table
 
 import jaxslam
-from jaxslam._runtime.files import write_json
 from jaxslam.consistency import Study
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class Observability(Benchmark):
+    """Every filter in every scenario; `--page` prints the table of what is there."""
 
     filters: tuple[str, ...] = (
         "robocentric/inverse_scaling",
@@ -48,23 +47,23 @@ class Options:
     runs: int = 200
     """Runs of every filter."""
     seed: int = 0
-    out: Path = Path("benchmarks/results/observability.json")
+    out: Path = RESULTS / "observability.json"
 
-
-def measure(options: Options, rows: dict[str, dict[str, Any]]) -> Iterator[None]:
-    """Add to `{scenario: {"filter/landmarks": numbers at the end}}`, and yield after every row."""
-    # Filter by filter, so that scenarios of one shape share its compiled program.
-    for name in options.filters:
-        for scenario in options.scenarios:
+    def measure(self) -> Iterator[dict[str, Any]]:
+        """Add to `{scenario: {"filter/landmarks": numbers at the end}}`."""
+        rows = self.found().get("scenarios", {})
+        # Filter by filter, so that scenarios of one shape share its compiled program.
+        for name, scenario in itertools.product(self.filters, self.scenarios):
             done = rows.setdefault(scenario, {})
-            if done.get(name, {}).get("runs") == options.runs:
-                continue
-            done[name] = _measure(name, scenario, options)
-            print(scenario, name, json.dumps(done[name]), flush=True)
-            yield
+            if done.get(name, {}).get("runs") != self.runs:
+                done[name] = _measure(name, scenario, self)
+                yield {"schema": 1, "scenarios": rows}
+
+    def report(self, results: dict[str, Any]) -> None:
+        print(as_table(results["scenarios"]), flush=True)
 
 
-def _measure(name: str, scenario_name: str, options: Options) -> dict[str, Any]:
+def _measure(name: str, scenario_name: str, options: Observability) -> dict[str, Any]:
     scenario = jaxslam.scenario(scenario_name)
     kind, landmarks = name.split("/")
     filters = jaxslam.make_filters(scenario, [kind], [landmarks])
@@ -102,42 +101,32 @@ def _along(study: Study, name: str) -> dict[str, float]:
     }
 
 
-def table(rows: dict[str, dict[str, Any]]) -> str:
+def as_table(rows: dict[str, dict[str, Any]]) -> str:
     """All scenarios as one Markdown table."""
+    header = (
+        "scenario",
+        "filter",
+        "NEES mean / median",
+        "lost",
+        "inside",
+        "RMSE / σ, m",
+        "along the path: median error / σ, m",
+    )
     lines = [
-        "| scenario | filter | NEES mean / median | lost | inside | RMSE / σ, m "
-        "| along the path: median error / σ, m |",
-        "|---|---|---|---|---|---|---|",
+        (
+            f"`{scenario}`" if i == 0 else "",
+            name,
+            f"{number(f['nees'])} / {number(f['nees_median'])}",
+            f"{f['lost']:.1%}",
+            f"{f['inside']:.0%}",
+            f"{number(f['rmse'], '.3f')} / {number(f['sigma'], '.3f')}",
+            f"{f['along']['error']:.3f} / {f['along']['sigma']:.3f}",
+        )
+        for scenario, filters in rows.items()
+        for i, (name, f) in enumerate(filters.items())
     ]
-    for scenario, filters in rows.items():
-        for i, (name, f) in enumerate(filters.items()):
-            cells = (
-                f"`{scenario}`" if i == 0 else "",
-                name,
-                f"{_number(f['nees'])} / {_number(f['nees_median'])}",
-                f"{f['lost']:.1%}",
-                f"{f['inside']:.0%}",
-                f"{_number(f['rmse'], 3)} / {_number(f['sigma'], 3)}",
-                f"{f['along']['error']:.3f} / {f['along']['sigma']:.3f}",
-            )
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def _number(value: float | None, digits: int = 2) -> str:
-    if value is None:
-        return "–"
-    return f"{value:.1e}" if value >= 1e4 else f"{value:.{digits}f}"
-
-
-def main(options: Options) -> None:
-    """Measure what is missing, write the file after every row, print the table."""
-    rows = json.loads(options.out.read_text())["scenarios"] if options.out.exists() else {}
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    for _ in measure(options, rows):
-        write_json(options.out, {"schema": 1, "scenarios": rows})
-    print(table(rows))
+    return table(header, lines)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    Observability.run()

@@ -1,15 +1,15 @@
 """How far is every filter from the exact posterior, and where does its excess NEES come from?
 
 `python benchmarks/posterior.py` samples the posterior of the same simulated runs that the filters
-meet and writes `benchmarks/results/posterior.json`, `docs/posterior.md` and `docs/posterior.png`,
+meet and writes `posterior.json`, `docs/posterior.md` and `docs/posterior.png`,
 anew after every scenario and step. `--cache FOLDER` keeps the draws: the same command with more
-filters then only runs those. `--page-only` makes page and figure from the JSON.
+filters then only runs those.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
+import itertools
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -19,14 +19,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
-from posterior_page import page
-
-import jaxslam
-from jaxslam._runtime.files import write_atomically, write_json
-from jaxslam.consistency import FolderStore, MemoryStore
-from jaxslam.plots.posterior import plot_posterior
-from jaxslam.posterior import (
+from benchmark import RESULTS, Benchmark, number, table, write_page
+from exact_posterior import (
     HMC,
     Study,
     against_filter,
@@ -35,16 +29,32 @@ from jaxslam.posterior import (
     pooled,
     reference,
 )
-from jaxslam.posterior.summary import summarise_filter, summarise_reference, summarise_sampler
+from exact_posterior.figure import plot_posterior
+from exact_posterior.summary import summarise_filter, summarise_reference, summarise_sampler
 
+import jaxslam
+from jaxslam.consistency import FolderStore, MemoryStore
+
+READING = """\
+The rows of a table are a sequence: the exact posterior's own mean and covariance, whose mean NEES
+is the number of degrees of freedom whatever its shape; the same with the prior on 1/z that the
+filters believe, which has mass at ω < 0; the Gaussian that Laplace puts at the mode of that; and
+the filters. What each row adds to the one before is the cost of that step: of the prior, of not
+being Gaussian, of recursion and linearisation."""
+
+STAGES = {
+    "exact": "exact posterior: its mean and covariance",
+    "gaussian_prior": "… with the whole Gaussian prior on 1/z",
+    "gaussian_prior_laplace": "… by MAP and Laplace",
+}
 SHOWN_DRAWS = 1000
 LEAST_CONVERGED = 0.9
 """Share of the runs; of fewer nothing is said, as those that converge are the easy ones."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class ExactPosterior(Benchmark):
+    """Filters beside the exact posterior of the same runs."""
 
     scenarios: tuple[str, ...] = ("matched-loose", "matched", "matched-forward-loose")
     """Simulated worlds of the matched family."""
@@ -69,12 +79,7 @@ class Options:
     """Starts of the batch MAP."""
     cache: Path | None = None
     """Folder that keeps the draws; resumed if it was made with the same numbers."""
-    page_only: bool = False
-    """Only write page and figure again."""
-    out: Path = Path("benchmarks/results")
-    """Folder of posterior.json."""
-    docs: Path = Path("docs")
-    """Folder of posterior.md and posterior.png."""
+    out: Path = RESULTS / "posterior.json"
 
     def __post_init__(self) -> None:
         if self.runs < 2 or self.chunk < 1:
@@ -83,19 +88,25 @@ class Options:
             if name.count("/") != 1:
                 raise ValueError(f"a filter is named filter/landmarks, not {name!r}")
 
+    def measure(self) -> Iterator[dict[str, Any]]:
+        """`{"scenarios": {scenario: {steps: numbers}}}` and what it is of, after every one."""
+        of = {"schema": 1, "version": jaxslam.__version__, "hmc": dataclasses.asdict(self.hmc)}
+        of |= {key: getattr(self, key) for key in ("landmarks", "runs", "seed", "starts")}
+        of["device"] = jax.devices()[0].device_kind
+        results: dict[str, Any] = {}
+        # All scenarios of one length share their compiled programs.
+        for steps, name in itertools.product(self.steps, self.scenarios):
+            scenario = jaxslam.scenario(name, steps=steps, landmarks=self.landmarks)
+            study = Study(scenario, steps, self.hmc, self.starts)
+            results.setdefault(name, {})[str(steps)] = _measure(study, self)
+            yield {**of, "scenarios": results}
 
-def measure(options: Options) -> Iterator[dict[str, Any]]:
-    """`{scenario: {steps: numbers}}`, yielded after every scenario and step."""
-    results: dict[str, Any] = {name: {} for name in options.scenarios}
-    for steps in options.steps:  # all scenarios of one length share their compiled programs
-        for name in options.scenarios:
-            scenario = jaxslam.scenario(name, steps=steps, landmarks=options.landmarks)
-            study = Study(scenario, steps, options.hmc, options.starts)
-            results[name][str(steps)] = _measure(study, options)
-            yield results
+    def report(self, results: dict[str, Any]) -> None:
+        plot_posterior(results, self.docs / "posterior.png")
+        write_page(self.docs / "posterior.md", page(results))
 
 
-def _measure(study: Study, options: Options) -> dict[str, Any]:
+def _measure(study: Study, options: ExactPosterior) -> dict[str, Any]:
     store, start = _store(study, options), time.perf_counter()
     chunks = [
         range(i, min(i + options.chunk, options.runs))
@@ -121,7 +132,7 @@ def _measure(study: Study, options: Options) -> dict[str, Any]:
     }
 
 
-def _store(study: Study, options: Options) -> FolderStore | MemoryStore:
+def _store(study: Study, options: ExactPosterior) -> FolderStore | MemoryStore:
     if options.cache is None:
         return MemoryStore()
     manifest = {
@@ -135,7 +146,7 @@ def _store(study: Study, options: Options) -> FolderStore | MemoryStore:
     return FolderStore(folder, manifest, resume=True)
 
 
-def _reference(study: Study, store, chunk: range, options: Options) -> dict[str, np.ndarray]:
+def _reference(study: Study, store, chunk: range, options: ExactPosterior) -> dict[str, np.ndarray]:
     """Records of both posteriors, `exact_…` and `gaussian_prior_…`, and the exact draws."""
     if not store.has("posterior", chunk):
         # The last chunk is padded by the runs that follow, to be of the same shape.
@@ -149,7 +160,9 @@ def _reference(study: Study, store, chunk: range, options: Options) -> dict[str,
     return store.load("posterior", chunk)
 
 
-def _filter(study: Study, name: str, chunks, reference, options: Options) -> dict[str, np.ndarray]:
+def _filter(
+    study: Study, name: str, chunks, reference, options: ExactPosterior
+) -> dict[str, np.ndarray]:
     frame, landmarks = name.split("/")
     (slam,) = jaxslam.make_filters(study.scenario, [frame], [landmarks]).values()
     parts = []
@@ -194,36 +207,96 @@ def _telling(study: Study, reference, used, filters) -> dict[str, Any]:
     }
 
 
-def main(options: Options) -> None:
-    """Measure, and write the three files after every scenario and step."""
-    for folder in (options.out, options.docs):
-        folder.mkdir(parents=True, exist_ok=True)
-    path = options.out / "posterior.json"
-    if options.page_only:
-        _write_docs(json.loads(path.read_text()), options)
-        return
-    jax.config.update("jax_enable_x64", True)
-    for results in measure(options):
-        summary = {
-            "schema": 1,
-            "version": jaxslam.__version__,
-            "landmarks": options.landmarks,
-            "runs": options.runs,
-            "seed": options.seed,
-            "hmc": dataclasses.asdict(options.hmc),
-            "starts": options.starts,
-            "device": jax.devices()[0].device_kind,
-            "scenarios": {name: by_step for name, by_step in results.items() if by_step},
-        }
-        write_json(path, summary)
-        _write_docs(summary, options)
+def page(summary: dict[str, Any]) -> str:
+    """The Markdown page: how to read it, the figure, then the tables."""
+    hmc = summary["hmc"]
+    parts = [
+        "# The exact posterior, and how far the filters are from it",
+        "Made by `python benchmarks/posterior.py`; do not edit. "
+        f"{summary['runs']} runs with {summary['landmarks']} landmarks, seed {summary['seed']}, "
+        f"float64; Hamiltonian Monte Carlo with {hmc['chains']} chains of {hmc['draws']} draws "
+        f"after {hmc['warmup']}; MAP from {summary['starts']} "
+        "starts. A row is over the runs of which both posteriors converged (R̂ ≤ 1.05 and 100 "
+        "effective draws of pose, velocity and density). All rows of a scenario and step are of "
+        "the same runs.",
+        READING,
+        "![Draws of one run, NEES and σ](posterior.png)",
+    ]
+    for scenario, by_step in summary["scenarios"].items():
+        for steps, numbers in by_step.items():
+            parts += [f"## `{scenario}`, step {steps}", *_section(numbers)]
+    return "\n\n".join(parts) + "\n"
 
 
-def _write_docs(summary: dict[str, Any], options: Options) -> None:
-    plot_posterior(summary, options.docs / "posterior.png")
-    with write_atomically(options.docs / "posterior.md") as temporary:
-        temporary.write_text(page(summary))
+def _section(numbers: dict[str, Any]) -> list[str]:
+    if "nees" not in numbers:
+        return [_not_converged(numbers)]
+    sampler, minima = numbers["sampler"]["exact"], numbers["minima"]["gaussian_prior"]
+    low, high = numbers["nees"]["exact"]["band95"]
+    calibration = numbers["calibration"]
+    sigma, rmse = numbers["sigma"]["exact"], numbers["rmse"]
+    p = ", ".join(
+        f"{name} {value:.2f}"
+        for name, value in zip(calibration["names"], calibration["p"], strict=True)
+    )
+    return [
+        f"{numbers['used']} of {numbers['runs']} runs converged (median R̂ "
+        f"{sampler['rhat_median']:.3f}, median effective draws {sampler['ess_median']:.0f}, "
+        f"{sampler['divergent']:.1%} of the transitions divergent, {sampler['leapfrogs']:.0f} "
+        f"leapfrog steps a draw). Exact σ (median): {1000 * sigma['position']:.1f} mm and "
+        f"{1000 * sigma['orientation']:.2f} mrad. RMSE of its mean: {1000 * rmse['position']:.1f} "
+        f"mm and {1000 * rmse['orientation']:.2f} mrad. Ranks of the truth uniform, p: {p}. "
+        f"Several minima of the MAP in {minima['runs_with_several']:.0%} of the runs; the start at "
+        f"the prior mean misses the best in {minima['prior_mean_missed_best']:.0%}.",
+        _rows(numbers, (low, high)),
+    ]
+
+
+def _not_converged(numbers: dict[str, Any]) -> str:
+    sampler = numbers["sampler"]["exact"]
+    return (
+        f"Only {numbers['used']} of {numbers['runs']} runs converged (median R̂ "
+        f"{sampler['rhat_median']:.2f}, median effective draws {sampler['ess_median']:.0f}, "
+        f"{sampler['divergent']:.1%} of the transitions divergent): the draws are not the "
+        "posterior's, and nothing is compared with them."
+    )
+
+
+def _rows(numbers: dict[str, Any], band: tuple[float, float]) -> str:
+    header = (
+        "", f"NEES, mean ± s.e. (band {band[0]:.2f}–{band[1]:.2f})", "median", "lost",
+        "σ/exact position, orientation", "RMSE/exact position, orientation", "KL median, mean",
+        "W₁/σ",
+    )  # fmt: skip
+    ratios = {"exact": ("1, 1", "1, 1"), "gaussian_prior": ("–", "–")}
+    ratios["gaussian_prior_laplace"] = _ratios(numbers["laplace"])
+    rows = [
+        (name, *_nees(numbers["nees"][key]), *ratios[key], "–", "–") for key, name in STAGES.items()
+    ]
+    for name, f in numbers["filters"].items():
+        kl = f"{_digits(f['kl']['median'])}, {_digits(f['kl']['mean'])}"
+        distances = ", ".join(_digits(value) for value in f["wasserstein"])
+        rows.append((name, *_nees(f["nees"]), *_ratios(f), kl, distances))
+    return table(header, rows)
+
+
+def _nees(nees: dict[str, Any]) -> tuple[str, str, str]:
+    mean = f"{_digits(nees['mean'])} ± {_digits(nees['standard_error'])}"
+    return mean, _digits(nees["median"]), f"{nees['lost']:.1%}"
+
+
+def _ratios(numbers: dict[str, Any]) -> tuple[str, str]:
+    position, orientation = numbers["position"], numbers["orientation"]
+    sigma, rmse = (
+        f"{_digits(position[key])}, {_digits(orientation[key])}"
+        for key in ("sigma_ratio", "rmse_ratio")
+    )
+    return sigma, rmse
+
+
+def _digits(value: float | None) -> str:
+    return number(value, ".3g")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    ExactPosterior.run()

@@ -8,16 +8,15 @@ with the interval in which 95 % of the means of that many of our runs lie.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import tyro
+from benchmark import RESULTS, Benchmark, table
 
 import jaxslam
-from jaxslam._runtime.files import write_json
 
 ROOM_WINDOWS = {"1–50": slice(0, 50), "51–100": slice(50, 100), "101–200": slice(100, 200)}
 # Their step 1 is our step 1; both leave out the start, which has no error.
@@ -85,9 +84,9 @@ TABLES = (
 )
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class Comparisons(Benchmark):
+    """Ours beside theirs."""
 
     scenarios: tuple[str, ...] = ("room", "positions", "positions-loose")
     """Which of the tables."""
@@ -98,42 +97,53 @@ class Options:
     seed: int = 0
     chunk: int = 10
     """Runs in one batch: few, since a map of 72 points is large."""
-    out: Path = Path("benchmarks/results")
-    """Folder of published-SCENARIO.json."""
+    out: Path = RESULTS / "published.json"
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        """`{scenario: {"filters": {"filter/landmarks": numbers}, …}}`, after every filter."""
+        results = self.found()
+        for theirs in (t for t in TABLES if t.scenario in self.scenarios):
+            dof = jaxslam.scenario(theirs.scenario).world.tangent_dim
+            kept = results.get(theirs.scenario, {}).get("filters", {}) if self.filters else {}
+            results[theirs.scenario] = {
+                "seed": self.seed,
+                "published_runs": theirs.runs,
+                "band95_of_published_runs": jaxslam.mean_band(dof, theirs.runs),
+                "filters": kept,
+            }
+            for name in self.filters or theirs.nees:
+                if name in theirs.nees:
+                    kept[name] = _measure(theirs, name, self)
+                    yield results
+
+    def report(self, results: dict[str, Any]) -> None:
+        for theirs in (t for t in TABLES if t.scenario in results):
+            header = ["filter", *(f"NEES, steps {label}" for label in theirs.windows), "RMSE m"]
+            rows = [_line(*row) for row in results[theirs.scenario]["filters"].items()]
+            print(
+                f"\n{theirs.scenario}: ours [95 % of the means of {theirs.runs} runs] (published)"
+            )
+            print(table(header, rows), flush=True)
 
 
-def measure(table: Published, options: Options, rows: dict[str, dict]) -> Iterator[dict]:
-    """Ours and theirs; yielded after every filter, with one more of the rows each time."""
-    scenario = jaxslam.scenario(table.scenario)
-    wanted = options.filters or tuple(table.nees)
-    for name, theirs in table.nees.items():
-        if name not in wanted:
-            continue
-        frame, landmarks = name.split("/")
-        filters = jaxslam.make_filters(scenario, [frame], [landmarks])
-        study = jaxslam.monte_carlo(
-            scenario, filters, runs=options.runs, seed=options.seed, chunk=options.chunk
-        )
-        records = [study.store.load(name, chunk, ("nees", "error")) for chunk in study.chunks]
-        nees = np.concatenate([record["nees"] for record in records])
-        error = np.concatenate([record["error"] for record in records])
-        seconds = study.seconds[name]
-        rows[name] = _compared(table, nees, theirs) | {
-            "runs": options.runs,
-            "rmse": _rmse(error, scenario.world.point_dim),
-            "published_rmse": table.rmse.get(name),
-            "diverged": int(np.sum(~np.isfinite(nees).all(axis=1))),
-            "seconds_per_run": round(seconds.run / options.runs, 4),
-        }
-        print(name, json.dumps(rows[name], ensure_ascii=False), flush=True)
-        dof = scenario.world.tangent_dim
-        yield {
-            "scenario": table.scenario,
-            "seed": options.seed,
-            "published_runs": table.runs,
-            "band95_of_published_runs": jaxslam.mean_band(dof, table.runs),
-            "filters": rows,
-        }
+def _measure(theirs: Published, name: str, options: Comparisons) -> dict[str, Any]:
+    """One filter, beside theirs."""
+    scenario = jaxslam.scenario(theirs.scenario)
+    frame, landmarks = name.split("/")
+    filters = jaxslam.make_filters(scenario, [frame], [landmarks])
+    study = jaxslam.monte_carlo(
+        scenario, filters, runs=options.runs, seed=options.seed, chunk=options.chunk
+    )
+    records = [study.store.load(name, chunk, ("nees", "error")) for chunk in study.chunks]
+    nees = np.concatenate([record["nees"] for record in records])
+    error = np.concatenate([record["error"] for record in records])
+    return _compared(theirs, nees, theirs.nees[name]) | {
+        "runs": options.runs,
+        "rmse": _rmse(error, scenario.world.point_dim),
+        "published_rmse": theirs.rmse.get(name),
+        "diverged": int(np.sum(~np.isfinite(nees).all(axis=1))),
+        "seconds_per_run": round(study.seconds[name].run / options.runs, 4),
+    }
 
 
 def _compared(table: Published, nees: np.ndarray, theirs: tuple[float, ...] | None) -> dict:
@@ -159,31 +169,15 @@ def _rmse(error: np.ndarray, n: int) -> float:
     return round(float(np.sqrt((error[:, -1, :n] ** 2).sum(axis=-1).mean())), 4)
 
 
-def _line(name: str, row: dict) -> str:
-    cells = []
+def _line(name: str, row: dict[str, Any]) -> list[str]:
+    cells = [name]
     for window in row["nees"].values():
         low, high = window["interval95"]
         theirs = f" ({window['published']})" if "published" in window else ""
         cells.append(f"{window['ours']:.2f} [{low:.2f}, {high:.2f}]{theirs}")
-    rmse = f"{row['rmse']:.3f}" + (f" ({row['published_rmse']})" if row["published_rmse"] else "")
-    return f"| {name} | {' | '.join(cells)} | {rmse} |"
-
-
-def main(options: Options) -> None:
-    """Measure every table, write its file, print it."""
-    for table in (table for table in TABLES if table.scenario in options.scenarios):
-        options.out.mkdir(parents=True, exist_ok=True)
-        file = options.out / f"published-{table.scenario}.json"
-        kept = options.filters and file.exists()
-        result = json.loads(file.read_text()) if kept else {"filters": {}}
-        for measured in measure(table, options, result["filters"]):
-            result = measured
-            write_json(file, result, ensure_ascii=False)
-        labels = " | ".join(f"NEES, steps {label}" for label in table.windows)
-        print(f"\n{table.scenario}: ours [95 % of the means of {table.runs} runs] (published)")
-        print(f"| filter | {labels} | RMSE m |\n|---|{'---|' * (len(table.windows) + 1)}")
-        print("\n".join(_line(name, row) for name, row in result["filters"].items()))
+    theirs = f" ({row['published_rmse']})" if row["published_rmse"] else ""
+    return [*cells, f"{row['rmse']:.3f}{theirs}"]
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    Comparisons.run()

@@ -10,18 +10,17 @@ says nothing.
 
 from __future__ import annotations
 
-import json
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import jax
 import numpy as np
-import tyro
+from benchmark import RESULTS, Benchmark
 from conventions import displaced
 from scipy.spatial.transform import Rotation
 
-from jaxslam._runtime.files import write_json
 from jaxslam.evaluation.convention import Convention
 from jaxslam.evaluation.pose_arrays import checked_poses
 from jaxslam.evaluation.poses import as_stated
@@ -32,21 +31,34 @@ RIGHT = ("independent", "common", "walk")
 DRIFTS = (0.05, 0.1, 0.2, float(np.log(4)))
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class ScaleDrift(Benchmark):
+    """Sets of runs, and how each is judged."""
 
     sets: int = 400
     """Sets of runs of every right kind; of every drift a quarter."""
     runs: int = 50
     steps: int = 100
     scale_sigma: float = 0.01
-    out: Path = Path("benchmarks/results")
-    """Folder of scale_drift.json."""
+    out: Path = RESULTS / "scale_drift.json"
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        cases = [(kind, 0.0, self.sets) for kind in RIGHT]
+        cases += [("drift", drift, max(self.sets // 4, 1)) for drift in DRIFTS]
+        result = []
+        for kind, drift, sets in cases:
+            found = [judged(kind, drift, self, seed) for seed in range(sets)]
+            words = Counter(word for word, _ in found)
+            shares = {word: count / sets for word, count in words.items()}
+            named = sum(drifts for _, drifts in found) / sets
+            result.append(
+                {"kind": kind, "drift": drift, "sets": sets, "words": shares, "named": named}
+            )
+            yield {"runs": self.runs, "cases": result}
 
 
 def constructed(
-    kind: str, drift: float, options: Options, seed: int
+    kind: str, drift: float, options: ScaleDrift, seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Estimates, covariances and truths; the first pose of every run is known."""
     rng = np.random.default_rng(seed)
@@ -86,7 +98,7 @@ def _circle(runs: int, steps: int) -> np.ndarray:
     return np.tile(T, (runs, 1, 1, 1))
 
 
-def judged(kind: str, drift: float, options: Options, seed: int) -> tuple[str, bool]:
+def judged(kind: str, drift: float, options: ScaleDrift, seed: int) -> tuple[str, bool]:
     """The word on a set, and whether the drift was named."""
     poses = checked_poses(*constructed(kind, drift, options, seed))
     found = as_stated(poses, SPLIT, "sim3")
@@ -95,22 +107,5 @@ def judged(kind: str, drift: float, options: Options, seed: int) -> tuple[str, b
     return found.verdict["word"], found.scale.disproved
 
 
-def main(options: Options) -> None:
-    """Judge all sets, print and write the shares."""
-    cases = [(kind, 0.0, options.sets) for kind in RIGHT]
-    cases += [("drift", drift, max(options.sets // 4, 1)) for drift in DRIFTS]
-    result = []
-    for kind, drift, sets in cases:
-        found = [judged(kind, drift, options, seed) for seed in range(sets)]
-        words = Counter(word for word, _ in found)
-        shares = {word: count / sets for word, count in words.items()}
-        named = sum(drifts for _, drifts in found) / sets
-        result.append({"kind": kind, "drift": drift, "sets": sets, "words": shares, "named": named})
-        print(json.dumps(result[-1]), flush=True)
-    options.out.mkdir(parents=True, exist_ok=True)
-    write_json(options.out / "scale_drift.json", {"runs": options.runs, "cases": result})
-
-
 if __name__ == "__main__":
-    jax.config.update("jax_platforms", "cpu")
-    main(tyro.cli(Options, description=__doc__))
+    ScaleDrift.run()

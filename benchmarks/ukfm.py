@@ -9,19 +9,19 @@ axes, its covariance that of the error `p − p̂` whatever the filter's own err
 
 from __future__ import annotations
 
-import json
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
+from benchmark import RESULTS, Benchmark, table
 
 import jaxslam
-from jaxslam._runtime.files import write_atomically
 from jaxslam.consistency.recursion import run_through
 from jaxslam.evaluation.convention import Convention, converted, pose_errors
 from jaxslam.simulation.run import Room, sightings
@@ -44,20 +44,33 @@ FIRST = 10
 RIGHT, MIXED = Convention("right"), Convention("split", "mixed")
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class Ukfm(Benchmark):
+    """Both filters; ours is printed beside theirs."""
 
     runs: int = 100
     """Runs of each filter."""
     seed: int = 0
     chunk: int = 25
     """Runs in one batch."""
-    out: Path = Path("benchmarks/results")
-    """Folder of ukfm.json."""
+    out: Path = RESULTS / "ukfm.json"
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        results = {}
+        for name in THEIRS:
+            results[name] = measured(name, self)
+            yield {"runs": self.runs, "seed": self.seed, "filters": results, "ukfm": THEIRS}
+
+    def report(self, results: dict[str, Any]) -> None:
+        rows = []
+        for name, found in results["filters"].items():
+            parts = zip((found["orientation"], found["position"]), THEIRS[name], strict=True)
+            rows.append((name, *(_cell(part, theirs) for part, theirs in parts)))
+        header = "filter", "orientation, NEES/dof (theirs)", "position (theirs)"
+        print(table(header, rows), flush=True)
 
 
-def poses_of(name: str, options: Options) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def poses_of(name: str, options: Ukfm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Estimated poses (runs, steps, 3, 3), covariances of the right error, and the truth."""
     scenario = jaxslam.scenario("positions", SETTING)
     slam = jaxslam.make_filters(scenario, [name.split("/")[0]], [name.split("/")[1]])[name]
@@ -81,7 +94,7 @@ def poses_of(name: str, options: Options) -> tuple[np.ndarray, np.ndarray, np.nd
     return estimates[:, FIRST:], covariances[:, FIRST:], truths[:, FIRST:]
 
 
-def measured(name: str, options: Options) -> dict:
+def measured(name: str, options: Ukfm) -> dict:
     """NEES/dof of orientation and of position, with the verdict on each."""
     T, P, truth = poses_of(name, options)
     P, errors = converted(P, T, RIGHT, MIXED), pose_errors(MIXED, T, truth)
@@ -101,24 +114,10 @@ def measured(name: str, options: Options) -> dict:
     return result | {"identified": str(whole.identified and whole.identified.convention)}
 
 
-def main(options: Options) -> None:
-    """Measure both filters, write and print ours beside theirs."""
-    jax.config.update("jax_enable_x64", True)
-    results = {name: measured(name, options) for name in THEIRS}
-    options.out.mkdir(parents=True, exist_ok=True)
-    with write_atomically(options.out / "ukfm.json") as path:
-        written = {"runs": options.runs, "seed": options.seed, "filters": results, "ukfm": THEIRS}
-        path.write_text(json.dumps(written, indent=1) + "\n")
-    print("| filter | orientation, NEES/dof (theirs) | position (theirs) |\n|---|---|---|")
-    for name, result in results.items():
-        parts = zip((result["orientation"], result["position"]), THEIRS[name], strict=True)
-        print(f"| {name} | {' | '.join(_cell(part, theirs) for part, theirs in parts)} |")
-
-
 def _cell(part: dict, theirs: float) -> str:
     low, high = part["interval95_of_100_runs"]
     return f"{part['nees']:.2f} [{low:.2f}, {high:.2f}] ({theirs})"
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    Ukfm.run()

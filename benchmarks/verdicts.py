@@ -17,10 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
-from pages import write_table
+from benchmark import RESULTS, Benchmark, table, write_table
 
-from jaxslam._runtime.files import write_json
 from jaxslam.statistics import PowerSums, Tally, not_disproved
 from jaxslam.statistics.verdict import THIRDS
 
@@ -34,9 +32,9 @@ SHARE, TIMES = 0.01, 20.0
 """Of heavy tails: so many runs have so many times the variance."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to draw."""
+@dataclass(frozen=True, kw_only=True)
+class Verdicts(Benchmark):
+    """Studies that are drawn, and what is said of them."""
 
     runs: tuple[int, ...] = (1, 2, 3, 5, 10, 30, 100, 200, 300, 1000)
     """Runs of a study."""
@@ -44,10 +42,18 @@ class Options:
     """Degrees of freedom of a NEES."""
     studies: int = 20000
     """Of a right filter; a fifth of them of one that is wrong, a tenth of those of 1000 runs."""
-    out: Path = Path("benchmarks/results/verdicts.json")
-    """The results."""
-    docs: Path = Path("docs/consistency.md")
-    """The page with the table."""
+    out: Path = RESULTS / "verdicts.json"
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        rng = np.random.default_rng(0)
+        yield {
+            "by_factor": by_factor(self, rng),
+            "ramps": ramps(self, rng),
+            "heavy": heavy(self, rng),
+        }
+
+    def report(self, results: dict[str, Any]) -> None:
+        write_table(self.docs / "consistency.md", BEGIN, as_table(results))
 
 
 def series(
@@ -106,7 +112,7 @@ def wrong_share(found: dict[str, float]) -> float:
     return sum(share for word, share in found.items() if not not_disproved({"word": word}))
 
 
-def by_factor(options: Options, rng: np.random.Generator) -> list[dict[str, Any]]:
+def by_factor(options: Verdicts, rng: np.random.Generator) -> list[dict[str, Any]]:
     """Words where σ is right, and where all of it is wrong by a factor."""
     rows = []
     for dof in options.dof:
@@ -124,7 +130,7 @@ def by_factor(options: Options, rng: np.random.Generator) -> list[dict[str, Any]
     return rows
 
 
-def ramps(options: Options, rng: np.random.Generator) -> list[dict[str, Any]]:
+def ramps(options: Verdicts, rng: np.random.Generator) -> list[dict[str, Any]]:
     """Opposite faults: NEES/dof from .7 at the beginning to 1.3 at the end, of 3 dof."""
     rows = []
     for runs in options.runs:
@@ -136,7 +142,7 @@ def ramps(options: Options, rng: np.random.Generator) -> list[dict[str, Any]]:
     return rows
 
 
-def heavy(options: Options, rng: np.random.Generator) -> list[dict[str, Any]]:
+def heavy(options: Verdicts, rng: np.random.Generator) -> list[dict[str, Any]]:
     """Heavy tails: how often the interval of the mean holds the truth, of 3 dof.
 
     `covered`: it does; `covered_or_not_told`: it does, or the word is `cannot tell`.
@@ -157,13 +163,19 @@ def heavy(options: Options, rng: np.random.Generator) -> list[dict[str, Any]]:
     return rows
 
 
-def table(results: dict[str, Any]) -> str:
-    """Markdown: the worst of all degrees of freedom and series, by the number of runs."""
-    lines = [
-        "| runs | right: inconsistent | σ wrong by 1.3: consistent | found, by 1.1 | by 1.3 | by 2 "
-        "| NEES/dof .7 → 1.3: found | heavy tails: truth in the interval |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+def as_table(results: dict[str, Any]) -> str:
+    """The worst of all degrees of freedom and series, by the number of runs."""
+    header = (
+        "runs",
+        "right: inconsistent",
+        "σ wrong by 1.3: consistent",
+        "found, by 1.1",
+        "by 1.3",
+        "by 2",
+        "NEES/dof .7 → 1.3: found",
+        "heavy tails: truth in the interval",
+    )
+    lines = []
     for runs in sorted({row["runs"] for row in results["by_factor"]}):
         cells = [row["words"] for row in results["by_factor"] if row["runs"] == runs]
         missed = [w[f].get("consistent", 0.0) for w in cells for f in ("1.3", "0.769")]
@@ -173,9 +185,8 @@ def table(results: dict[str, Any]) -> str:
         ramp = [wrong_share(row["words"]) for row in results["ramps"] if row["runs"] == runs]
         held = [row["covered"] for row in results["heavy"] if row["runs"] == runs]
         right = f"{max(wrong_share(w['1']) for w in cells):.2%}"
-        shown = [runs, right, f"{max(missed):.2%}", *found, _range(ramp), _range(held)]
-        lines.append(f"| {' | '.join(map(str, shown))} |")
-    return "\n".join(lines)
+        lines.append((runs, right, f"{max(missed):.2%}", *found, _range(ramp), _range(held)))
+    return table(header, lines)
 
 
 def _range(shares: list[float]) -> str:
@@ -183,18 +194,5 @@ def _range(shares: list[float]) -> str:
     return low if low == high else f"{low.removesuffix('%')}–{high}"
 
 
-def main(options: Options) -> None:
-    """Draw, and write."""
-    rng = np.random.default_rng(0)
-    results = {
-        "by_factor": by_factor(options, rng),
-        "ramps": ramps(options, rng),
-        "heavy": heavy(options, rng),
-    }
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    write_json(options.out, results)
-    write_table(options.docs, BEGIN, table(results))
-
-
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    Verdicts.run()

@@ -31,9 +31,7 @@ suppress_warnings = [
 autodoc_member_order, autodoc_preserve_defaults = "bysource", True
 autodoc_inherit_docstrings = False  # those of other packages are not written like ours
 autodoc_default_options = {"members": True, "no-value": True, "show-inheritance": True}
-autodoc_mock_imports = [
-    name for name in ("cv2", "rerun", "blackjax") if importlib.util.find_spec(name) is None
-]
+autodoc_mock_imports = [name for name in ("cv2", "rerun") if importlib.util.find_spec(name) is None]
 
 site_sources.write_tutorials(HERE.parent / "notebooks", HERE / "tutorials")
 site_sources.write_api(HERE / "api")

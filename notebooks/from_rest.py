@@ -25,6 +25,7 @@
 
 # %%
 import os
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -33,11 +34,13 @@ from IPython.display import display
 from scipy.optimize import least_squares
 
 import jaxslam
-from jaxslam.consistency.modes import followed, modes_of_run
 from jaxslam.consistency.montecarlo import draw
-from jaxslam.plots.modes import plot_modes, worlds_of
 from jaxslam.simulation import sensor_of
 from jaxslam.statistics import lost_threshold
+
+sys.path.append("../benchmarks")  # of the repository, beside this folder
+from figures.modes import plot_modes, worlds_of
+from modes import followed, modes_of_run
 
 jax.config.update("jax_enable_x64", True)
 REDUCED = bool(os.environ.get("JAXSLAM_REDUCED"))

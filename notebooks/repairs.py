@@ -154,5 +154,4 @@ for name in (SUM, RECOMMENDED):
 # them is enough to take a mean NEES out of its band; and where accelerations are very large, it
 # is a little over-confident. Where the prior on depth is wrong, as on `circle`, no filter that
 # believes it is consistent; `+scene50` learns how far away the landmarks are. Measured tables are
-# in `docs/consistency.md`, and where each filter holds at all is the map of
-# `docs/phase-diagram.md`.
+# in `docs/consistency.md`.

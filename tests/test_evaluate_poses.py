@@ -379,7 +379,7 @@ def test_axes_whose_variance_never_changes_stand_out_only_beside_others():
 
 @pytest.mark.parametrize("kind", scale_drift.RIGHT)
 def test_a_right_filter_is_consistent_at_one_scale_however_its_errors_are_common(kind):
-    options = scale_drift.Options(runs=30, steps=40)
+    options = scale_drift.ScaleDrift(runs=30, steps=40)
     for seed in range(3):
         word, named = scale_drift.judged(kind, 0.0, options, seed)
         assert word in ("consistent", "cannot tell")
@@ -388,7 +388,7 @@ def test_a_right_filter_is_consistent_at_one_scale_however_its_errors_are_common
 
 def test_a_drift_of_scale_is_over_confident_and_named(tmp_path):
     """Each pose at a scale of its own had hidden it, be it fourfold."""
-    options = scale_drift.Options(runs=30, steps=40)
+    options = scale_drift.ScaleDrift(runs=30, steps=40)
     for drift in (0.05, float(np.log(4))):
         for seed in range(3):
             assert scale_drift.judged("drift", drift, options, seed) == ("over-confident", True)

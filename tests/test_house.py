@@ -16,8 +16,8 @@ PACKAGE = Path(jaxslam.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 ORDER = (
     "_version", "_numerics", "_runtime", "geometry", "native", "landmarks", "models", "io",
-    "simulation", "statistics", "filters", "consistency", "evaluation", "posterior",
-    "triangulation", "datasets", "plots", "tracking", "cli",
+    "simulation", "statistics", "filters", "consistency", "evaluation",
+    "triangulation", "plots", "tracking", "cli",
 )  # fmt: skip
 """Rooms, each of which imports only those before it."""
 

@@ -60,7 +60,7 @@ def test_every_room_is_in_the_site():
     """In another order than that of imports: what users meet first comes first."""
     sources = ast.parse((ROOT / "docs" / "site_sources.py").read_text()).body
     (listed,) = [x.value for x in sources if isinstance(x, ast.Assign) and _name(x) == "ROOMS"]
-    assert sorted(ast.literal_eval(listed)) == sorted(ORDER)
+    assert sorted(ast.literal_eval(listed)) == sorted(set(ORDER) - {"_version"})
 
 
 def _name(assignment: ast.Assign) -> str | None:

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import pytest
 
 import jaxslam
-from jaxslam import posterior
 from jaxslam._numerics.arrays import is_number
 from jaxslam._runtime import watchdog
 from jaxslam._runtime.watchdog import lapack_calls
@@ -118,14 +117,6 @@ def test_no_study_of_a_filter_calls_lapack(name, scenario):
         return _filter_batch.function(eqx.combine(numbers, structure), Room(4, 4, 4, 4), *args)
 
     traced = jax.make_jaxpr(batch)(numbers, sensor_of(chosen), runs, 2)
-    assert lapack_calls(traced.jaxpr) == set()
-
-
-def test_no_posterior_calls_lapack():
-    chosen = jaxslam.scenario("matched", landmarks=3)
-    study = posterior.Study(chosen, steps=2, hmc=posterior.HMC(chains=2))
-    runs = posterior.draw_runs(study, 0, range(2))
-    traced = jax.make_jaxpr(lambda runs: posterior.reference(study, runs, 0, range(2)))(runs)
     assert lapack_calls(traced.jaxpr) == set()
 
 

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import close, quick_jit
+from exact_posterior import log_density, make_problem
+from exact_posterior.laplace import minima
 
 import jaxslam
 from jaxslam._numerics.linalg import cholesky
@@ -25,8 +27,6 @@ from jaxslam.landmarks import INVERSE_SCALING
 from jaxslam.models.calibration import Estimated, Known, White
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.observations import Features
-from jaxslam.posterior import log_density, make_problem
-from jaxslam.posterior.laplace import minima
 from jaxslam.simulation import scenario
 
 FRAMES, FIRST = 5, jnp.array([0, 0, 0, 1, 0, 2])

@@ -12,7 +12,7 @@ from cases import quick_jit
 import jaxslam
 from jaxslam.simulation import simulate
 
-OPTIONS = calibration.Options(
+OPTIONS = calibration.CalibrationStudy(
     scenarios=("matched",), truths=("constant",), treatments=("estimated",), runs=3, steps=3
 )
 
@@ -41,7 +41,7 @@ def test_a_run_says_which_camera_was_the_true_one():
 
 def test_the_study_is_that_of_the_library_and_writes_its_files(tmp_path):
     options = dataclasses.replace(OPTIONS, out=tmp_path / "r" / "c.json", docs=tmp_path / "docs")
-    calibration.main(options)
+    options()
     found = json.loads(options.out.read_text())
     filters = found["scenarios"]["matched"]["constant"]["robocentric/inverse_scaling"]
     assert set(filters) == {"estimated"}
@@ -86,4 +86,4 @@ def test_the_estimate_of_the_intrinsics_is_judged_by_its_covariance():
 )
 def test_options_that_make_no_sense_are_refused(fields, message):
     with pytest.raises(ValueError, match=message):
-        calibration.Options(**fields)
+        calibration.CalibrationStudy(**fields)

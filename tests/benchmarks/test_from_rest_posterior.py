@@ -92,7 +92,9 @@ def test_the_summary_says_of_a_filter_how_far_it_is_from_the_exact_posterior():
 
 def test_a_row_of_the_table_says_how_far_a_filter_is_from_the_exact_posterior():
     two = {"pooled_kl_of_two_gaussians": np.full(RUNS, 0.25)}
-    rows = benchmark.table(benchmark.summarise(records() | two, {"mine": of_filter()})).splitlines()
+    rows = benchmark.as_table(
+        benchmark.summarise(records() | two, {"mine": of_filter()})
+    ).splitlines()
     cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
     exact, one, two, mine = cells[2:]
     assert (exact[4], mine[4]) == (f"{np.sqrt(2):.3f}", f"{2 * np.sqrt(2):.3f}")
@@ -104,7 +106,7 @@ def test_a_row_of_the_table_says_how_far_a_filter_is_from_the_exact_posterior():
 
 
 def test_what_was_drawn_is_not_drawn_again_but_filters_are_measured_anew(tmp_path, monkeypatch):
-    options = benchmark.Options(
+    options = benchmark.FromRestPosterior(
         steps=3, landmarks=4, runs=4, chunk=2, filters=("robocentric",), cache=tmp_path,
     )  # fmt: skip
     asked = []
@@ -121,11 +123,11 @@ def test_what_was_drawn_is_not_drawn_again_but_filters_are_measured_anew(tmp_pat
 
     monkeypatch.setattr(benchmark, "drawn", drawn)
     monkeypatch.setattr(benchmark, "beside", beside)
-    *_, first = benchmark.measure(options)
+    *_, first = options.measure()
     measured = [("robocentric", range(i, i + 2), (2, 128, 4)) for i in (0, 2)]
     assert asked == [range(2), measured[0], range(2, 4), measured[1]]
     asked.clear()
-    *_, second = benchmark.measure(options)
+    *_, second = options.measure()
     assert asked == measured
     assert second == first
     assert first["runs"] == 4
@@ -143,7 +145,7 @@ def test_runs_that_did_not_reach_the_whole_likelihood_are_counted_and_left_out()
 
 
 def test_the_camera_is_at_rest_but_for_what_is_not_known():
-    study = benchmark.standstill(benchmark.Options(steps=6))
+    study = benchmark.standstill(benchmark.FromRestPosterior(steps=6))
     assert study.steps == 6
     assert study.scenario.velocity == (0.0, 0.0, 0.0)
     assert study.scenario.velocity_sigma == (0.5, 0.5, 0.2)
@@ -162,9 +164,9 @@ def test_no_key_is_used_twice_nor_by_the_simulator():
 
 def test_options_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match="at least 2 runs"):
-        benchmark.Options(runs=1)
+        benchmark.FromRestPosterior(runs=1)
     with pytest.raises(ValueError, match="velocity"):
-        benchmark.standstill(benchmark.Options(velocity_sigma=(0.5,)))
+        benchmark.standstill(benchmark.FromRestPosterior(velocity_sigma=(0.5,)))
 
 
 def test_the_file_in_the_repository_is_calibrated():

@@ -30,10 +30,9 @@ def test_nees_are_chi2_at_every_step_and_correlated_as_said(name):
 
 
 def test_the_command_writes_its_numbers_and_the_table_of_the_page(tmp_path):
-    page, out = tmp_path / "page.md", tmp_path / "verdicts.json"
+    page, out = tmp_path / "consistency.md", tmp_path / "verdicts.json"
     page.write_text(f"before\n{benchmark.BEGIN}\n\nold\n\n<!-- end -->\nafter\n")
-    options = benchmark.Options(runs=(3, 80), dof=(3,), studies=60, out=out, docs=page)
-    benchmark.main(options)
+    benchmark.Verdicts(runs=(3, 80), dof=(3,), studies=60, out=out, docs=tmp_path)()
     results = json.loads(out.read_text())
     cells = {(row["runs"], row["series"]): row["words"] for row in results["by_factor"]}
     assert len(cells) == 6

@@ -1,0 +1,102 @@
+"""What a benchmark is: options of a command, numbers that are measured, their file, their pages."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import jax
+import tyro
+
+from jaxslam._runtime.files import read_json, write_atomically, write_json
+
+RESULTS = Path("benchmarks/results")
+END = "<!-- end -->"
+"""Behind a table that a benchmark writes; before it stands a mark of its own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Benchmark(ABC):
+    """A benchmark is its options: `measure` finds the results, `report` writes its pages.
+
+    `Subclass.run()` is the command. What its file holds is written after every part, whole.
+    """
+
+    out: Path
+    """JSON file of the results."""
+    docs: Path = Path("docs")
+    """Folder of the pages."""
+    page: bool = False
+    """Measure nothing; write the pages from the results that are there."""
+
+    double: ClassVar[bool] = True
+    """Whether JAX computes in float64 wherever nothing else is said."""
+
+    @abstractmethod
+    def measure(self) -> Iterator[Any]:
+        """Yield the results so far, all of them, after every part."""
+
+    def report(self, results: Any) -> None:
+        """Write pages, figures, or a table on the screen; by default, print the results."""
+        print(json.dumps(results, indent=1, ensure_ascii=False), flush=True)
+
+    def found(self) -> dict[str, Any]:
+        """The results that are there; none where there is no file.
+
+        Raises ValueError, naming the file, where it holds something else.
+        """
+        return read_json(self.out, "results", dict) if self.out.exists() else {}
+
+    def __call__(self) -> None:
+        """Measure, write, report."""
+        for folder in (self.out.parent, self.docs):
+            folder.mkdir(parents=True, exist_ok=True)
+        if self.page:
+            self.report(self.found())
+            return
+        for results in self.measure():
+            write_json(self.out, results, ensure_ascii=False)
+            self.report(results)
+
+    @classmethod
+    def run(cls) -> None:
+        """The command line, which a file's first lines describe."""
+        jax.config.update("jax_enable_x64", cls.double)
+        tyro.cli(cls, description=sys.modules[cls.__module__].__doc__)()
+
+
+def write_page(path: Path, text: str) -> None:
+    """Write a whole page, or leave it as it was."""
+    with write_atomically(path) as temporary:
+        temporary.write_text(text)
+
+
+def write_table(page: Path, begin: str, table: str) -> None:
+    """Put the table after its mark on the page, in place of an older one.
+
+    Raises ValueError where the page has no such place.
+    """
+    before, mark, rest = page.read_text().partition(begin)
+    _, end, after = rest.partition(END)
+    if not mark or not end:
+        raise ValueError(f"the page has no place for the table: {begin} … {END}")
+    write_page(page, f"{before}{begin}\n\n{table}\n\n{END}{after}")
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table as Markdown."""
+    lines = (f"| {' | '.join(map(str, row))} |" for row in rows)
+    return "\n".join([f"| {' | '.join(header)} |", "|" + "---|" * len(header), *lines])
+
+
+def number(value: float | None, form: str = ".2f") -> str:
+    """A number in a table: – where there is none, and few digits where it is large."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    return f"{value:.1e}" if abs(value) >= 1e4 else format(value, form)

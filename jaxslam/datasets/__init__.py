@@ -1,1 +1,0 @@
-"""Readers of recorded data with truth, as runs for the filters of `jaxslam.consistency`."""

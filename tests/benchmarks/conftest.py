@@ -1,0 +1,8 @@
+"""Types and shapes of what benchmarks are built on are checked as the package's are."""
+
+from jaxtyping import install_import_hook
+
+install_import_hook(
+    ["exact_posterior", "figures", "modes", "tracks"],
+    "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
+)

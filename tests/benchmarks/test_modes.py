@@ -1,0 +1,189 @@
+"""Tests of the modes of a start from rest: what is told of them, which is which, their figure."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import modes as told
+import numpy as np
+import pytest
+from cases import Case, close, quick_jit
+from figures.modes import Worlds, plot_modes, worlds_of
+from modes import Modes, followed, given_scale, modes_of_run
+
+STEPS, WINDOW = 6, 4
+LEFT, RIGHT = np.array([-0.1, 0.0]), np.array([0.1, 0.01])
+
+
+@cache
+def standstill():
+    return Case("standstill", 1, landmarks=6, steps=STEPS)
+
+
+# --- which is which -----------------------------------------------------------------------------
+
+
+def modes_with(*frames):
+    """Modes of frames, each a dictionary of weights by the velocity of a straight path."""
+    count, window = max(map(len, frames)), len(frames) + 1
+    weights = np.zeros((len(frames), count))
+    paths = np.zeros((len(frames), count, window, 2))
+    for k, frame in enumerate(frames):
+        for i, (velocity, weight) in enumerate(frame.items()):
+            weights[k, i] = weight
+            steps = np.minimum(np.arange(window), k + 1)
+            paths[k, i] = steps[:, None] * np.array(velocity)
+    landmarks = np.tile([0.1, 0.2], (len(frames), count, 3, 1))
+    covariances = np.tile(1e-4 * np.eye(2), (len(frames), count, 3, 1, 1))
+    return Modes(weights, paths, landmarks, covariances, weights, np.full(len(frames), 3.0))
+
+
+def test_a_mode_keeps_its_number_when_others_overtake_it_and_when_its_scale_changes():
+    left, right = tuple(LEFT), tuple(RIGHT)
+    modes = modes_with(
+        {left: 0.6, right: 0.4},
+        {right: 0.7, tuple(1.5 * LEFT): 0.3},
+        {tuple(0.5 * RIGHT): 1.0},
+        {left: 0.5, (0.0, 0.1): 0.3, right: 0.2},
+    )
+    assert followed(modes).tolist() == [[0, 1, -1], [1, 0, -1], [1, -1, -1], [0, 2, 1]]
+
+
+def test_modes_that_move_the_same_way_are_one():
+    modes = modes_with({tuple(LEFT): 0.6, tuple(2 * LEFT): 0.4})
+    assert followed(modes).tolist() == [[0, 0]]
+
+
+# --- what is told -------------------------------------------------------------------------------
+
+
+@cache
+def through():
+    """The modes of one run, compiled quickly."""
+    slam, of = standstill().filter("scale_gauge+mixture3+rest4"), standstill()
+    quick = quick_jit(lambda slam, run: told._through(slam, of.room, run))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(told, "_compiled", lambda slam, room, run: quick(slam, run))
+        return modes_of_run(slam, of.room, of.run(0))
+
+
+def test_the_modes_of_a_run_end_where_frames_are_merged():
+    """The window of four frames after frame 0 is full in the fourth."""
+    modes = through()
+    assert modes.weights.shape == (WINDOW - 1, 3)
+    assert modes.nees.shape == (STEPS,)
+    np.testing.assert_allclose(modes.weights.sum(axis=1), 1.0, rtol=1e-9)
+    assert (np.diff(modes.weights, axis=1) <= 0).all()
+    assert np.isfinite(modes.nees).all()
+
+
+def test_every_mode_begins_at_the_origin_and_explains_the_pixels():
+    modes, points = through(), np.asarray(standstill().run(0).points)
+    azimuths = np.arctan2(points[:, 0], points[:, 1])
+    for k, i in np.argwhere(modes.weights > 0.01):
+        path = modes.paths[k, i]
+        assert not path[0].any()
+        assert np.abs(path[k + 1]).max() > 0
+        np.testing.assert_array_equal(path[k + 1 :], np.tile(path[k + 1], (len(path) - k - 1, 1)))
+        # A landmark stays on its ray, but for what the camera has moved.
+        np.testing.assert_allclose(modes.landmarks[k, i, :, 0], azimuths, atol=0.1)
+        assert 0 < modes.misfits[k, i] < 1.5
+
+
+def test_the_scale_given_is_conditioned_on():
+    """The inverse of the information's other rows and columns."""
+    slam, of = standstill().filter("scale_gauge"), standstill()
+    state = slam.init(of.capacity, jax.tree.map(lambda x: x[0], of.features[0]))
+    n = len(state.covariance)
+    root = np.random.default_rng(0).standard_normal((n, n))
+    P = root @ root.T + np.eye(n)
+    left = np.asarray(given_scale(replace(state, covariance=jnp.asarray(P))).covariance)
+    at = state.core.part("log_scale").start
+    others = np.delete(np.arange(n), at)
+    close(
+        left[np.ix_(others, others)],
+        np.linalg.inv(np.linalg.inv(P)[np.ix_(others, others)]),
+        1e-9,
+    )
+    assert np.abs(left[at]).max() < 1e-9 * np.abs(P).max()
+
+
+def test_a_filter_without_a_start_from_rest_is_refused():
+    of = standstill()
+    with pytest.raises(ValueError, match=r"start from rest \(\+rest\), not of EkfSlam"):
+        modes_of_run(of.filter("scale_gauge"), of.room, of.run(0))
+
+
+# --- the figure ---------------------------------------------------------------------------------
+
+
+def worlds():
+    """Left dies after the second of four frames; the filter is in it."""
+    left, right = tuple(LEFT), tuple(RIGHT)
+    alive = {right: 0.6, left: 0.4}
+    modes = modes_with(alive, {left: 0.75, right: 0.25}, {right: 1.0}, {right: 1.0})
+    steps = np.arange(5)[:, None]
+    return Worlds(
+        truth=steps * RIGHT,
+        points=np.array([[-1.0, 4.0], [0.5, 6.0], [1.0, 9.0]]),
+        weights=modes.weights,
+        numbers=followed(modes),
+        paths=modes.paths,
+        landmarks=modes.landmarks,
+        covariances=modes.covariances,
+        filtered=1.1 * (steps * LEFT)[1:],
+        filter_name="mine",
+        rate=30.0,
+    )
+
+
+def said(figure):
+    """What is written on it, row by row."""
+    return [[text.get_text() for axes in row.axes for text in axes.texts] for row in figure.subfigs]
+
+
+def drawn(axes):
+    """The points of every line."""
+    return [np.asarray(line.get_xydata()) for line in axes.lines]
+
+
+def test_the_figure_shows_who_lives_when_and_who_is_still_with_the_dead():
+    figure = plot_modes(worlds(), (1, 2, 4))
+    right, left, bands = said(figure)
+    assert right == ["60%", "25%", "100%"]
+    assert left == ["dead since frame 3;\nmine is still here", "40%", "75%"]
+    assert bands == ["goes right", "goes left"]
+    assert [row.get_supylabel() for row in figure.subfigs[:2]] == [
+        "the camera goes right",
+        "the camera goes left",
+    ]
+    titles = [axes.get_title() for axes in figure.subfigs[0].axes[:3]]
+    assert titles == ["frame 1, 0.03 s", "frame 2, 0.07 s", "frame 4, 0.13 s"]
+
+
+def test_the_paths_and_landmarks_of_the_figure_are_those_of_the_modes():
+    data = worlds()
+    row = plot_modes(data, (2,)).subfigs[0]
+    above, below = row.axes
+    way = data.paths[1, 1, :3]
+    assert any(line.shape == way.shape and np.allclose(line, way) for line in drawn(below))
+    camera, (azimuth, inverse) = data.paths[1, 1, 2], data.landmarks[1, 1, 0]
+    point = camera + np.array([np.sin(azimuth), np.cos(azimuth)]) / inverse
+    assert any(line.shape == (1, 2) and np.allclose(line, point) for line in drawn(above))
+
+
+def test_frames_without_modes_are_refused():
+    with pytest.raises(ValueError, match="known in frames 1 to 4"):
+        plot_modes(worlds(), (5, 9))
+
+
+def test_a_run_is_seen_from_above():
+    of, modes = standstill(), through()
+    path = np.asarray(of.run(0).poses.translation())[1:]
+    seen = worlds_of(of.run(0), modes, path, "mine", 30.0)
+    np.testing.assert_array_equal(seen.truth[1:], path)
+    np.testing.assert_array_equal(seen.filtered, path)
+    np.testing.assert_array_equal(seen.paths, modes.paths)
+    figure = plot_modes(seen, (1, 3))
+    assert figure.subfigs[-1].axes[0].get_xlabel() == "frame"
