@@ -23,6 +23,7 @@ from jaxslam.filters.readouts import (
     landmarks_in_world,
 )
 from jaxslam.filters.registry import FILTERS, make_filter, make_filters, recommended
+from jaxslam.filters.run import Frames, run
 from jaxslam.filters.wrappers.fixed_lag import FixedLag
 from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
 from jaxslam.geometry import PLANAR, SPATIAL
@@ -69,6 +70,7 @@ __all__ = [
     "Expected",
     "Features",
     "FixedLag",
+    "Frames",
     "GaussianSum",
     "Innovation",
     "InverseDepth",
@@ -99,6 +101,7 @@ __all__ = [
     "mean_band",
     "monte_carlo",
     "recommended",
+    "run",
     "scenario",
     "simulate",
     "summarise",

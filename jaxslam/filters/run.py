@@ -1,0 +1,73 @@
+"""A filter through frames, one after another in one compiled program."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.readouts import camera_pose
+from jaxslam.geometry import Pose
+from jaxslam.models.observations import Features, Innovation
+
+
+class Frames(NamedTuple):
+    """What a filter is given of the frames after frame 0: every array begins with their axis."""
+
+    control: PyTree
+    """The motion model's: seconds, the odometry's reading, …"""
+    seen: Features
+    """Of landmarks in the map."""
+    new: Features
+    """Of landmarks to insert."""
+    gone: Bool[Array, "*frames slots"] | None = None
+    """Slots whose landmark is removed before the frame; None where all stay."""
+
+
+class Estimates(NamedTuple):
+    """What a filter says after every frame."""
+
+    pose: Pose
+    """T_BC."""
+    covariance: Float[Array, "frames t t"]
+    """In the right tangent of the pose: position in camera axes, orientation."""
+    nis: Float[Array, " frames"]
+    nis_dof: Int[Array, " frames"]
+    status: Int[Array, " frames"]
+    """A `Status`."""
+
+
+def run(
+    slam: AbstractFilter,
+    frames: Any,
+    state: PyTree,
+    output: Callable[[PyTree, Innovation, Any], Any] | None = None,
+) -> tuple[PyTree, Any]:
+    """Return the last state, and the `Estimates` of every frame.
+
+    `frames` are `Frames`, or a pytree with these fields and others; `state` is that of `init`.
+    With an `output(state, innovation, frame)` its values are returned in place of the estimates.
+    Raises ValueError for slots to free and a filter that cannot remove landmarks.
+    """
+    if frames.gone is not None and not callable(getattr(slam, "remove", None)):
+        raise ValueError(
+            f"{type(slam).__name__} has no remove(state, gone): it cannot use slots again, as is "
+            "needed where landmarks come and go"
+        )
+
+    def estimates(state: PyTree, innovation: Innovation, _: Any) -> Estimates:
+        seen = innovation.nis, innovation.nis_dof, innovation.status
+        return Estimates(*camera_pose(slam, state), *seen)
+
+    collect = estimates if output is None else output
+
+    def step(state: PyTree, frame: Any) -> tuple[PyTree, Any]:
+        if frame.gone is not None:
+            state = slam.remove(state, frame.gone)  # ty: ignore[missing-attribute]
+        state, innovation = slam.step(state, frame.control, frame.seen, frame.new)
+        return state, collect(state, innovation, frame)
+
+    return jax.lax.scan(step, state, frames)
