@@ -24,8 +24,7 @@ from benchmark import RESULTS, Benchmark, number, table, write_page
 from figures.calibration import plot_calibration
 
 import jaxslam
-from jaxslam.consistency import CHUNK, MemoryStore, Study
-from jaxslam.consistency.montecarlo import Seconds, check_sizes, filter_run
+from jaxslam.consistency import CHUNK, MemoryStore, Seconds, Study, check_sizes, filter_run
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.models.sensors import Pinhole
 from jaxslam.simulation import Room, Run, Scenario, Sightings, sensor_of, sightings, simulate

@@ -20,7 +20,7 @@ import numpy as np
 from benchmark import RESULTS, Benchmark
 
 import jaxslam
-from jaxslam.consistency.montecarlo import filter_run
+from jaxslam.consistency import filter_run
 from jaxslam.simulation import Room, sensor_of, sightings, simulate
 
 

@@ -29,7 +29,7 @@ from benchmark import RESULTS, Benchmark, table, write_table
 
 import jaxslam
 from jaxslam._numerics.arrays import cast
-from jaxslam.consistency.montecarlo import DTYPES, draw, filter_run
+from jaxslam.consistency import DTYPES, draw, filter_run
 from jaxslam.models.observations import Status
 from jaxslam.simulation import Scenario, sensor_of
 from jaxslam.simulation.scenario import BUILT_IN

@@ -27,7 +27,7 @@ from pages import write_table
 
 import jaxslam
 from jaxslam._runtime.files import write_json
-from jaxslam.consistency.montecarlo import draw, filter_run
+from jaxslam.consistency import draw, filter_run
 from jaxslam.simulation import sensor_of
 from jaxslam.statistics.verdict import headline
 

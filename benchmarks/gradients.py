@@ -21,8 +21,8 @@ import numpy as np
 from benchmark import RESULTS, Benchmark, table, write_table
 
 import jaxslam
+from jaxslam.consistency import draw
 from jaxslam.consistency.likelihood import maximum_likelihood
-from jaxslam.consistency.montecarlo import draw
 
 NAMES = ("linear acceleration, m/s²", "angular acceleration, rad/s²", "pixel")
 MARK = "<!-- gradients.py -->"

@@ -27,8 +27,7 @@ import tyro
 import jaxslam
 from jaxslam._numerics.arrays import cast
 from jaxslam._runtime.files import write_atomically, write_json
-from jaxslam.consistency.montecarlo import scale_records
-from jaxslam.consistency.recursion import Frame, run_through
+from jaxslam.consistency import SimulatedFrame, run_through, scale_records
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.simulation import Room, Run, Scenario, sightings
@@ -161,7 +160,7 @@ def _recorded(data: tracks.Tracks, slam: AbstractFilter, options: Options) -> di
 def _through(slam: AbstractFilter, room: Room, runs: Run) -> dict[str, jax.Array]:
     """Records of a batch of windows, against a truth that is itself uncertain."""
 
-    def told(state: Any, innovation: Any, frame: Frame) -> dict[str, jax.Array]:
+    def told(state: Any, innovation: Any, frame: SimulatedFrame) -> dict[str, jax.Array]:
         estimate, _ = camera_pose(slam, state)
         return {
             **scale_records(slam, state, frame.pose, TRUTH_SIGMA),

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxslam.consistency.recursion import Frame, run_through
+from jaxslam.consistency import SimulatedFrame, run_through
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import landmarks_from_above
@@ -58,7 +58,7 @@ def modes_of_run(slam: AbstractFilter, room: Room, run: Run) -> Modes:
 
 
 def _through(slam: BatchInitialisation, room: Room, run: Run) -> tuple[Any, Array, Array, Array]:
-    def told(state: RestState, _, frame: Frame):
+    def told(state: RestState, _, frame: SimulatedFrame):
         nees = normalised_squared(*slam.pose_error(state, frame.pose))
         return _told(slam, state), nees, state.record.last, state.open
 

@@ -22,7 +22,7 @@ import numpy as np
 from benchmark import RESULTS, Benchmark, table
 
 import jaxslam
-from jaxslam.consistency.recursion import run_through
+from jaxslam.consistency import run_through
 from jaxslam.evaluation.convention import Convention, converted, pose_errors
 from jaxslam.simulation.run import Room, sightings
 
@@ -84,7 +84,7 @@ def poses_of(name: str, options: Ukfm) -> tuple[np.ndarray, np.ndarray, np.ndarr
     runs = draw(jnp.arange(options.runs))
     most = jax.tree.map(lambda x: int(jnp.max(x)), jax.vmap(sightings)(runs))
     room = Room(most.landmarks, most.first, most.known, most.new)
-    one = partial(run_through, slam, room, told=told)
+    one = partial(run_through, slam, room, output=told)
     batch = jax.jit(jax.vmap(lambda run: one(run)[1]))
     parts = [
         jax.device_get(batch(jax.tree.map(lambda x, i=i: x[i : i + options.chunk], runs)))

@@ -30,7 +30,7 @@ from IPython.display import display
 from scipy.stats import binomtest
 
 import jaxslam
-from jaxslam.consistency.montecarlo import filter_run
+from jaxslam.consistency import filter_run
 from jaxslam.plots.landmarks import plot_landmark_clouds
 from jaxslam.plots.style import COLOURS, GREY, new_figure
 from jaxslam.simulation import Room, sensor_of, sightings, simulate

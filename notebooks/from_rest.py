@@ -34,7 +34,7 @@ from IPython.display import display
 from scipy.optimize import least_squares
 
 import jaxslam
-from jaxslam.consistency.montecarlo import draw
+from jaxslam.consistency import draw
 from jaxslam.simulation import sensor_of
 from jaxslam.statistics import lost_threshold
 

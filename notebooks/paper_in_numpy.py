@@ -34,7 +34,7 @@ import numpy as np
 from IPython.display import display
 
 import jaxslam
-from jaxslam.consistency.montecarlo import draw
+from jaxslam.consistency import draw
 from jaxslam.plots.style import COLOURS, new_figure
 from jaxslam.simulation import features
 

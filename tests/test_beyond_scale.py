@@ -9,8 +9,7 @@ import pytest
 from cases import Case, each_geometry, named, pose, quick_jit
 from scipy import stats
 
-from jaxslam.consistency import sums
-from jaxslam.consistency.montecarlo import filter_run
+from jaxslam.consistency import filter_run, sums
 from jaxslam.filters.readouts import camera_pose_in_unit
 from jaxslam.geometry import PLANAR, difference, identity, joined, retract, scaled
 from jaxslam.simulation import sensor_of

@@ -12,7 +12,8 @@ import pytest
 
 import jaxslam
 from jaxslam.cli import main
-from jaxslam.consistency.montecarlo import _Job, _side_by_side, _Simulator, divided
+from jaxslam.consistency.montecarlo import ChunkTask, divided, in_threads
+from jaxslam.consistency.simulator import Simulator
 
 SCENARIO = jaxslam.scenario("matched-tight", steps=4, landmarks=3)
 RUNS, CHUNK = 120, 3
@@ -113,9 +114,9 @@ def test_what_computes_a_chunk_survives_a_pickle():
     cloudpickle = pytest.importorskip("cloudpickle")
     with jax.enable_x64(False):
         (name, slam) = next(iter(filters().items()))
-        simulator = _Simulator(SCENARIO, 5, "float32", 2, None, None)
-        job = _Job(name, slam, simulator, simulator.room(divided(4, 2), _side_by_side))
-        whole = cloudpickle.dumps(job)
+        simulator = Simulator(SCENARIO, 5, "float32", 2)
+        task = ChunkTask(name, slam, simulator, simulator.room(divided(4, 2), in_threads))
+        whole = cloudpickle.dumps(task)
         again = cloudpickle.loads(whole)
     assert len(whole) < 20_000
-    assert_same([again(range(2, 4))], [job(range(2, 4))])
+    assert_same([again(range(2, 4))], [task(range(2, 4))])

@@ -15,8 +15,18 @@ from scipy.special import gammainc
 from scipy.stats import chi2, norm
 
 import jaxslam
-from jaxslam.consistency import FolderStore, MemoryStore, montecarlo, summary, tally
-from jaxslam.consistency.montecarlo import check_sizes, draw, filter_run
+from jaxslam.consistency import (
+    FolderStore,
+    MemoryStore,
+    backends,
+    check_sizes,
+    draw,
+    filter_run,
+    montecarlo,
+    summary,
+    tally,
+)
+from jaxslam.consistency.simulator import Simulator
 from jaxslam.consistency.sums import added
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.registry import scenario_pieces
@@ -91,7 +101,7 @@ def test_chunks_do_not_matter_and_run_i_is_the_same_in_any_number_of_runs():
         np.testing.assert_allclose(values, whole[key][:5], rtol=1e-6, atol=1e-12, err_msg=key)
 
 
-def test_chunks_side_by_side_are_those_one_after_another(monkeypatch):
+def test_chunks_in_threads_are_those_one_after_another(monkeypatch):
     def computed(number):
         monkeypatch.setattr(montecarlo, "processors", lambda: number)
         return all_runs(jaxslam.monte_carlo(SCENARIO, filters(), runs=7, chunk=2))
@@ -110,11 +120,11 @@ def test_a_batch_in_parts_that_fit_the_cache_is_the_same(monkeypatch):
         return [study.store.load(name, study.chunks[0]) for name in study.filters]
 
     def at_once(bytes):
-        monkeypatch.setattr(montecarlo, "CACHE", bytes)
-        return montecarlo._at_once(room, batch)
+        monkeypatch.setattr(backends, "CACHE", bytes)
+        return backends._runs_in_cache(room, batch)
 
     room, batch = draw(SCENARIO, 7)
-    assert at_once(montecarlo.CACHE) >= 7
+    assert at_once(backends.CACHE) >= 7
     whole = computed()
     assert any(at_once(bytes) == 3 for bytes in range(0, 10**6, 100))
     for parts, records in zip(computed(), whole, strict=True):
@@ -129,14 +139,14 @@ def test_of_the_last_chunk_only_what_is_wanted_is_computed(backend, monkeypatch)
     """Three at a time by XLA, as soon as one of them is wanted; as many as are wanted natively."""
     if backend == "native" and compiler() is None:
         pytest.skip("no C++ compiler")
-    simulator = montecarlo._Simulator(SCENARIO, 0, "float64", 7, None, None)
+    simulator = Simulator(SCENARIO, 0, "float64", 7)
     room, batch = draw(SCENARIO, 7)
     n = 6 + 3 * room.landmarks
-    monkeypatch.setattr(montecarlo, "CACHE", 3 * 8 * n**2)
-    assert montecarlo._at_once(room, batch) == 3
+    monkeypatch.setattr(backends, "CACHE", 3 * 8 * n**2)
+    assert backends._runs_in_cache(room, batch) == 3
     montecarlo.forget()
     slam = filters()["inverse_scaling"]
-    program = montecarlo._Job("", slam, simulator, room, backend).program(batch)
+    program = montecarlo.ChunkTask("", slam, simulator, room, backend).program(batch)
     (all_of_them, sample), (some, same) = (program(np.int32(n)) for n in (7, 2))
     montecarlo.forget()
     for key, values in all_of_them.items():
@@ -198,10 +208,10 @@ def test_no_chunk_begins_after_an_error(monkeypatch):
         return chunk.stop
 
     monkeypatch.setattr(montecarlo, "processors", lambda: 1)
-    told, side_by_side = [], montecarlo._side_by_side
+    told = []
     chunks = [range(i, i + 1) for i in range(99)]
     with pytest.raises(ValueError, match="chunk 2"):
-        told.extend((chunk.start, stop) for chunk, stop in side_by_side(computed, chunks))
+        told.extend((chunk.start, stop) for chunk, stop in montecarlo.in_threads(computed, chunks))
     assert told == [(0, 1), (1, 2)]
     assert len(began) < 99
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from cases import Case, quick_jit
 
-from jaxslam.consistency.montecarlo import filter_run
+from jaxslam.consistency import filter_run
 from jaxslam.filters.ekf import correct
 from jaxslam.filters.initialisation import rays
 from jaxslam.filters.initialisation.alternatives import log_density

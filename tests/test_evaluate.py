@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import jaxslam
 from jaxslam.cli import main
-from jaxslam.consistency.recursion import run_through
+from jaxslam.consistency import run_through
 from jaxslam.evaluation.arrays import ASYMMETRY
 from jaxslam.io.tum import write_tum
 from jaxslam.plots.evaluation import plot_axis, plot_evaluation, plot_nees, plot_outside

@@ -11,7 +11,7 @@ import pytest
 from cases import Case, quick_jit
 from scipy.stats import multivariate_normal
 
-from jaxslam.consistency.recursion import run_through
+from jaxslam.consistency import run_through
 from jaxslam.filters.wrappers.adaptive_process_noise import (
     FACTORS,
     AdaptiveProcessNoise,

@@ -31,11 +31,12 @@ def room(module):
 def imports(path):
     """Modules of the package that a file imports, wherever it does so."""
     for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("jaxslam."):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("jaxslam"):
             for alias in node.names:
                 whole = f"{node.module}.{alias.name}"
-                is_file = (PACKAGE.parent / whole.replace(".", "/")).with_suffix(".py").exists()
-                yield whole if is_file else node.module
+                place = PACKAGE.parent / whole.replace(".", "/")
+                is_module = place.is_dir() or place.with_suffix(".py").exists()
+                yield whole if is_module else node.module
         if isinstance(node, ast.Import):
             yield from (a.name for a in node.names if a.name.startswith("jaxslam."))
 
@@ -60,6 +61,15 @@ def test_imports_go_one_way_between_rooms():
             if room(module) != own and ORDER.index(room(module)) > ORDER.index(own):
                 wrong.append(f"{path.relative_to(PACKAGE)} imports {module}")
     assert not wrong
+
+
+def test_only_the_table_of_backends_knows_the_compiler():
+    knowing = {
+        path.relative_to(PACKAGE).as_posix()
+        for path in FILES
+        if any(room(module) == "native" for module in imports(path))
+    }
+    assert {x for x in knowing if not x.startswith("native/")} == {"consistency/backends.py"}
 
 
 def test_no_files_import_one_another_in_a_circle():

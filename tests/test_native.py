@@ -12,7 +12,7 @@ import jaxslam
 from jaxslam._numerics import linalg
 from jaxslam._runtime import programs
 from jaxslam._runtime.programs import Exact
-from jaxslam.consistency import montecarlo
+from jaxslam.consistency import backends
 from jaxslam.native import NotSupportedError, batch, batched, build
 from jaxslam.native.batch import Batch
 from jaxslam.native.build import compiler
@@ -412,7 +412,7 @@ def test_a_study_falls_back_to_xla(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     scenario = jaxslam.scenario("matched", steps=6, landmarks=4)  # compiled above
     filters = jaxslam.make_filters(scenario, ["world"], ["inverse_depth"])
-    montecarlo._native.cache_clear()
+    backends._native_program.cache_clear()
     with pytest.warns(UserWarning, match="is computed by XLA"):
         study = jaxslam.monte_carlo(scenario, filters, runs=10, backend="native")
     with warnings.catch_warnings():
@@ -439,11 +439,11 @@ class Powered(eqx.Module):
 def test_a_filters_fixed_parts_are_the_same_only_by_type_and_bits(monkeypatch):
     """`x ** 2.0` is not the program of `x ** 2`."""
     made = []
-    monkeypatch.setattr(montecarlo.native, "batched", lambda *given: made.append(given))
-    montecarlo._native.cache_clear()
+    monkeypatch.setattr(jaxslam.native, "batched", lambda *given: made.append(given))
+    backends._native_program.cache_clear()
     for power in (2, 2.0, True, 1, 0.0, -0.0, float("nan"), float("nan"), 2, 2.0):
         leaves, structure = jax.tree.flatten(Powered(None, power))
-        shapes = montecarlo._hashable((None, None, None))
-        montecarlo._native(Exact((tuple(leaves), structure, None, *shapes)))
-    montecarlo._native.cache_clear()
+        shapes = backends._hashable((None, None, None))
+        backends._native_program(Exact((tuple(leaves), structure, None, *shapes)))
+    backends._native_program.cache_clear()
     assert len(made) == 7

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxslam
-from jaxslam.consistency import FolderStore, MemoryStore, manifest
+from jaxslam.consistency import FolderStore, MemoryStore, manifest, simulator
 from jaxslam.consistency.manifest import described, difference
 from jaxslam.io.tum import write_tum
 
@@ -34,7 +34,7 @@ class Begun(Exception):
 def begin(store, monkeypatch, **given):
     """A study that ends where its first run would be drawn, and what is kept of it by hand."""
     with monkeypatch.context() as context:
-        context.setattr(jaxslam.consistency.montecarlo._Simulator, "room", raised)
+        context.setattr(simulator.Simulator, "room", raised)
         with pytest.raises(Begun):
             study(store, **given)
     store.save(given.get("name", "mine"), CHUNK, RECORDS)
@@ -70,7 +70,7 @@ def test_a_store_of_another_study_is_refused(kind, tmp_path, monkeypatch):
             study(store(), **changed)
     for package in ("jaxslam", "jax", "jaxlib"):
         newer = {**manifest.versions(), package: "99"}
-        monkeypatch.setattr(jaxslam.consistency.montecarlo, "versions", lambda told=newer: told)
+        monkeypatch.setattr(simulator, "versions", lambda told=newer: told)
         with pytest.raises(ValueError, match=rf"another version\.{package} \(.*, now '99'\)"):
             study(store())
     monkeypatch.undo()

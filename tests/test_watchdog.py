@@ -16,7 +16,7 @@ import jaxslam
 from jaxslam._numerics.arrays import is_number
 from jaxslam._runtime import watchdog
 from jaxslam._runtime.watchdog import lapack_calls
-from jaxslam.consistency.montecarlo import _filter_batch
+from jaxslam.consistency.backends import _filter_batch
 from jaxslam.filters.forms.covariance import Covariance
 from jaxslam.simulation import Room, sensor_of, simulate
 

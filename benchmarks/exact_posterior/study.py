@@ -39,7 +39,7 @@ from exact_posterior.sampler import (
 )
 from jaxslam._numerics.arrays import cast
 from jaxslam._runtime.watchdog import finished
-from jaxslam.consistency.montecarlo import filter_run
+from jaxslam.consistency import filter_run
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.geometry import Pose, difference, log

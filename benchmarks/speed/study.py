@@ -39,7 +39,7 @@ class Options:
 
 
 def study_of(
-    work: Workload, backend: str, chunk: int = jaxslam.consistency.montecarlo.CHUNK
+    work: Workload, backend: str, chunk: int = jaxslam.consistency.CHUNK
 ) -> Callable[[], None]:
     """What computes a study of the workload and its summary, compiled when it is called first."""
     scenario = scenario_of(work)

@@ -20,7 +20,8 @@ from jaxslam.consistency import (
     summarise,
     table,
 )
-from jaxslam.consistency.montecarlo import check_backend, check_sizes, divided
+from jaxslam.consistency.backends import check_backend
+from jaxslam.consistency.montecarlo import check_sizes, divided
 from jaxslam.consistency.records import check_records, write_records
 from jaxslam.filters.registry import FILTERS, FROM_REST, MODIFIERS, RECOMMENDED, make_filters
 from jaxslam.landmarks import LANDMARKS

@@ -1,9 +1,11 @@
 """Is a filter consistent? Monte Carlo runs, NEES and NIS with exact bounds, and their summary."""
 
-from jaxslam.consistency.montecarlo import BACKENDS, CHUNK, DTYPES, monte_carlo
+from jaxslam.consistency.backends import BACKENDS
+from jaxslam.consistency.montecarlo import CHUNK, DTYPES, check_sizes, draw, monte_carlo
 from jaxslam.consistency.records import write_records
+from jaxslam.consistency.runs import SimulatedFrame, filter_run, run_through, scale_records
 from jaxslam.consistency.store import FolderStore, MemoryStore
-from jaxslam.consistency.summary import Study, summarise, table, tally, treatment
+from jaxslam.consistency.summary import Seconds, Study, summarise, table, tally, treatment
 
 __all__ = [
     "BACKENDS",
@@ -11,8 +13,15 @@ __all__ = [
     "DTYPES",
     "FolderStore",
     "MemoryStore",
+    "Seconds",
+    "SimulatedFrame",
     "Study",
+    "check_sizes",
+    "draw",
+    "filter_run",
     "monte_carlo",
+    "run_through",
+    "scale_records",
     "summarise",
     "table",
     "tally",

@@ -55,7 +55,7 @@ def connected(cluster: Any) -> Generator[Any]:
         yield client
 
 
-def as_tasks(
+def on_cluster(
     client: Any, function: Callable[[range], Any], chunks: list[range]
 ) -> Iterator[tuple[range, Any]]:
     """Chunks, in the order in which they are finished, with what the function makes of them.

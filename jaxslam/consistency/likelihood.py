@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import AnyArray
-from jaxslam.consistency.recursion import run_through
+from jaxslam.consistency.runs import run_through
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.simulation import Room, Run
 

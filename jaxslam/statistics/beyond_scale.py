@@ -129,7 +129,7 @@ def one_scale(
 
 
 def one_scale_of(records: Mapping[str, np.ndarray]) -> OneScale:
-    """`one_scale` of the records (runs, steps) of a study, see `montecarlo.filter_run`."""
+    """`one_scale` of the records (runs, steps) of a study, see `consistency.filter_run`."""
     *own, fixed = (records[name] for name in SCALE)
     return one_scale(*own, fixed > 0)
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tracks import read, window, windows
 
-from jaxslam.consistency.recursion import run_through
+from jaxslam.consistency import run_through
 from jaxslam.filters.registry import make_filters
 from jaxslam.simulation import Room, gone, scenario, sightings
 

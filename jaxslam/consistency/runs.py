@@ -1,0 +1,180 @@
+"""A filter on a simulated run: frame by frame, and the records of every step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.readouts import (
+    camera_pose,
+    camera_pose_in_unit,
+    landmarks_from_above,
+    landmarks_in_camera,
+)
+from jaxslam.geometry import Pose, difference
+from jaxslam.models.observations import Features, Innovation
+from jaxslam.models.scale import Metre
+from jaxslam.models.sensors import AbstractSensor
+from jaxslam.simulation import Room, Run, features, gone
+from jaxslam.statistics.bands import normalised_squared
+from jaxslam.statistics.beyond_scale import SCALE, beyond_scale, reversal
+
+Output = TypeVar("Output")
+
+
+class SimulatedFrame(NamedTuple):
+    """A frame of a run after frame 0: what a filter is given, and the truth."""
+
+    control: PyTree
+    seen: Features
+    new: Features
+    gone: Bool[Array, " slots"] | None
+    """Slots whose landmark will not be seen again; None where landmarks keep theirs."""
+    pose: Pose
+    """T_BC, true."""
+    points: Float[Array, "slots n"]
+    """In B, true: what the slots stand for now."""
+
+
+def run_through(
+    slam: AbstractFilter,
+    room: Room,
+    run: Run,
+    output: Callable[[PyTree, Innovation, SimulatedFrame], Output],
+) -> tuple[PyTree, Output]:
+    """Return the last state, and `output(state, innovation, frame)` of every frame but 0.
+
+    Landmarks that are gone are removed before the step. Raises ValueError for a filter that
+    cannot, where a run uses slots again.
+    """
+    first, seen, new = features(run, room)
+    left = gone(run, room)
+    if left is not None:
+        _check_removes(slam)
+    poses, points = jax.tree.map(lambda x: x[1:], (run.poses, run.points_by_frame))
+
+    def step(state, frame: SimulatedFrame):
+        if frame.gone is not None:
+            state = slam.remove(state, frame.gone)  # ty: ignore[missing-attribute]
+        state, innovation = slam.step(state, frame.control, frame.seen, frame.new)
+        return state, output(state, innovation, frame)
+
+    frames = SimulatedFrame(run.controls, seen, new, left, poses, points)
+    return jax.lax.scan(step, slam.init(room.capacity, first), frames)
+
+
+def _check_removes(slam: AbstractFilter) -> None:
+    if not callable(getattr(slam, "remove", None)):
+        raise ValueError(
+            f"{type(slam).__name__} has no remove(state, gone): it cannot use slots again, as is "
+            "needed where landmarks come and go"
+        )
+
+
+def filter_run(
+    slam: AbstractFilter, room: Room, sensor: AbstractSensor, run: Run
+) -> tuple[dict[str, Array], Pose, PyTree]:
+    """Return the records of every step of a simulated run, the estimated path, the last state.
+
+    The records hold, per step: `nees` of the pose; the `log_scale` of the truth at which it is the
+    least, and the `log_scale_sigma` that the filter claims of it, with the metre in doubt; the same
+    of the pose in the filter's own unit, `beyond_scale`, `unit_log_scale`, `unit_log_scale_sigma`,
+    from which `one_scale` makes NEES at one scale a run, and whether that unit is fixed yet;
+    whether the displacement is `reversed`, NaN without one; `nis` and `nis_dof`; the update's
+    `status`; `error` and `variance` of the camera's position (in camera axes) and orientation; the
+    mean `landmark_nees` of the landmarks seen, in the sensor's chart, where it is finite, their
+    number, and of how many it is not.
+    """
+
+    def records_and_pose(state, innovation, frame: SimulatedFrame):
+        T_BC = frame.pose
+        estimate, covariance = camera_pose(slam, state)
+        landmarks = _landmark_records(slam, sensor, state, frame)
+        records = {
+            "nees": normalised_squared(*slam.pose_error(state, T_BC)),
+            **scale_records(slam, state, T_BC),
+            "reversed": reversal(estimate, T_BC),
+            "nis": innovation.nis,
+            "nis_dof": innovation.nis_dof.astype(innovation.nis.dtype),
+            "status": innovation.status,
+            "error": _camera_error(estimate, T_BC),
+            "variance": jnp.diagonal(covariance),
+            **landmarks,
+        }
+        return records, estimate
+
+    state, (records, path) = run_through(slam, room, run, records_and_pose)
+    return records, path, state
+
+
+def scale_records(
+    slam: AbstractFilter, state: PyTree, T_BC: Pose, truth_sigma: np.ndarray | None = None
+) -> dict[str, Array]:
+    """Return the records of one pose's scale: in metres, and `SCALE` in the filter's own unit; of a
+    truth that is itself known with σ only, see `beyond_scale`."""
+    metric = in_unit = beyond_scale(partial(slam.pose_error, state), T_BC, truth_sigma)
+    inner = slam.unwrapped
+    if isinstance(inner, EkfSlam) and not isinstance(inner.scale, Metre):
+        seen = camera_pose_in_unit(slam, state)
+        in_unit = beyond_scale(
+            lambda truth: (difference(truth, seen.pose), seen.covariance), T_BC, truth_sigma
+        )
+    own = (*in_unit, slam.unit_fixed(state).astype(metric.nees.dtype))
+    return {
+        "log_scale": metric.log_scale,
+        "log_scale_sigma": metric.sigma,
+        **dict(zip(SCALE, own, strict=True)),
+    }
+
+
+def _camera_error(estimate: Pose, truth: Pose) -> Array:
+    """Position error in the estimated camera's axes, then `Log(R_est⁻¹ R_true)`."""
+    rotation = estimate.rotation().inverse()
+    return jnp.concatenate(
+        [
+            rotation @ (truth.translation() - estimate.translation()),
+            (rotation @ truth.rotation()).log(),
+        ]
+    )
+
+
+def _landmark_records(
+    slam: AbstractFilter, sensor: AbstractSensor, state: PyTree, frame: SimulatedFrame
+) -> dict[str, Array]:
+    """Of the landmarks seen that are in the map: the mean of what is finite, and both numbers."""
+    seen = frame.seen
+    counted = seen.valid & slam.in_map(state)[seen.slots]
+    truth = jax.vmap(frame.pose.inverse().apply)(frame.points[seen.slots])
+    truth = jax.vmap(sensor.chart)(truth, jnp.ones_like(truth[:, 0]))
+    chart, covariance = landmarks_in_camera(slam, state, seen.slots, sensor)
+    nees = jax.vmap(normalised_squared)(truth - chart, covariance)
+    finite = counted & jnp.isfinite(nees)
+    total = jnp.sum(jnp.where(finite, nees, 0.0))
+    return {
+        "landmark_nees": total / jnp.maximum(jnp.sum(finite), 1),
+        "landmark_count": jnp.sum(counted).astype(nees.dtype),
+        "landmark_not_finite": jnp.sum(counted & ~finite).astype(nees.dtype),
+    }
+
+
+def map_and_path(
+    slam: AbstractFilter, room: Room, path: Pose, state: PyTree, run: Run
+) -> dict[str, Array]:
+    """Return the map and the path that `filter_run` found in a run, and the true ones."""
+    landmarks, covariance = landmarks_from_above(slam, state, jnp.arange(room.landmarks))
+    return {
+        "path": jax.vmap(lambda pose: pose.as_matrix())(path),
+        "true_path": jax.vmap(lambda pose: pose.as_matrix())(run.poses),
+        "points": run.points_by_frame[-1],
+        "landmarks": landmarks,
+        "landmarks_covariance": covariance,
+        "active": slam.in_map(state),
+    }

@@ -1,0 +1,120 @@
+"""Simulated runs, chunk by chunk: run i is the same in any chunk, batch and number of runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from jaxslam._numerics.arrays import cast
+from jaxslam._runtime.programs import BATCHED, Program
+from jaxslam.consistency.manifest import LAYOUT, Manifest, described, versions
+from jaxslam.models.motion import AbstractMotion
+from jaxslam.models.sensors import AbstractSensor
+from jaxslam.simulation import (
+    Room,
+    Run,
+    Scenario,
+    Sightings,
+    Trajectory,
+    as_data,
+    sensor_of,
+    sightings,
+    simulate,
+    trajectory_of,
+)
+
+MapChunks = Callable[[Callable[[range], Any], list[range]], Iterator[tuple[range, Any]]]
+"""Applies a function to chunks, and yields each with the result, as they are finished."""
+
+
+class Simulator:
+    """Draws chunks of runs, all of one shape, so that everything compiles once.
+
+    Run i draws from `fold_in(key(seed), i)`. Raises ValueError for a scenario without a motion.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        seed: int,
+        dtype: str,
+        size: int,
+        motion: AbstractMotion | Trajectory | None = None,
+        sensor: AbstractSensor | None = None,
+    ) -> None:
+        motion = trajectory_of(scenario, dtype) if motion is None else motion
+        self._given = scenario, seed, dtype, size, motion, sensor
+        self.dtype, self.size = jnp.dtype(dtype), size
+        self.sensor = cast(sensor_of(scenario) if sensor is None else sensor, dtype)
+        self._own = cast((motion, sensor), dtype)
+        self._scenario, self._key = as_data(scenario, dtype), jax.random.key(seed)
+
+    @property
+    def made_by(self) -> Manifest:
+        """What decides which runs are drawn, in which layout their records are kept, and by which
+        versions they are made."""
+        scenario, seed, dtype, _, motion, sensor = self._given
+        return {
+            "layout": LAYOUT,
+            "version": versions(),
+            "scenario": described(scenario),
+            "motion": described(motion),
+            "sensor": described(sensor),
+            "seed": int(seed),
+            "dtype": dtype,
+        }
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For another machine, which has no file of a trajectory, and makes its own key."""
+        return Simulator, self._given
+
+    def __call__(self, chunk: range) -> tuple[Run, Sightings]:
+        """Return the chunk's runs, padded to `size` by the runs that follow."""
+        indices = chunk.start + jnp.arange(self.size)
+        return _draw(self._scenario, self._own, self._key, indices)
+
+    def max_sightings(self, chunk: range) -> Sightings:
+        """Return the most that any of the chunk's runs sees."""
+        with jax.enable_x64(self.dtype == "float64"):  # a thread's own
+            return jax.tree.map(np.max, jax.device_get(self(chunk)[1]))
+
+    def room(self, chunks: tuple[range, ...], map_chunks: MapChunks) -> Room:
+        """Return the room that holds every run of the study; no frame has more features than a run
+        has slots."""
+        seen = [most for _, most in map_chunks(self.max_sightings, list(chunks))]
+        most = jax.tree.map(lambda *counts: _rounded_up(int(max(counts))), *seen)
+        slots = self(chunks[0])[0].visible.shape[-1]
+        return Room(most.landmarks, *(min(n, slots) for n in (most.first, most.known, most.new)))
+
+
+def _rounded_up(count: int) -> int:
+    """At least one, and above four a multiple of four: other seeds then need no other program."""
+    return max(1, count) if count <= 4 else 4 * math.ceil(count / 4)
+
+
+@partial(Program, options=BATCHED)
+def _draw(
+    scenario: Scenario,
+    own: tuple[AbstractMotion | Trajectory | None, AbstractSensor | None],
+    key: Array,
+    indices: Int[Array, " runs"],
+) -> tuple[Run, Sightings]:
+    motion, sensor = own
+
+    def one(index):
+        run = simulate(scenario, jax.random.fold_in(key, index), motion=motion, sensor=sensor)
+        return run, sightings(run)
+
+    return jax.vmap(one)(indices)
+
+
+def forget() -> None:
+    """Free the programs that draw runs."""
+    _draw.forget()
