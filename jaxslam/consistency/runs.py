@@ -19,6 +19,7 @@ from jaxslam.filters.readouts import (
     landmarks_from_above,
     landmarks_in_camera,
 )
+from jaxslam.filters.run import run as run_filter
 from jaxslam.geometry import Pose, difference
 from jaxslam.models.observations import Features, Innovation
 from jaxslam.models.scale import Metre
@@ -31,16 +32,19 @@ Output = TypeVar("Output")
 
 
 class SimulatedFrame(NamedTuple):
-    """A frame of a run after frame 0: what a filter is given, and the truth."""
+    """What a filter is given of a frame after frame 0, and the truth; or of all those of a run."""
 
     control: PyTree
+    """The motion model's: seconds, the odometry's reading, …"""
     seen: Features
+    """Of landmarks in the map."""
     new: Features
-    gone: Bool[Array, " slots"] | None
+    """Of landmarks to insert."""
+    gone: Bool[Array, "*frames slots"] | None
     """Slots whose landmark will not be seen again; None where landmarks keep theirs."""
     pose: Pose
     """T_BC, true."""
-    points: Float[Array, "slots n"]
+    points: Float[Array, "*frames slots n"]
     """In B, true: what the slots stand for now."""
 
 
@@ -56,27 +60,9 @@ def run_through(
     cannot, where a run uses slots again.
     """
     first, seen, new = features(run, room)
-    left = gone(run, room)
-    if left is not None:
-        _check_removes(slam)
     poses, points = jax.tree.map(lambda x: x[1:], (run.poses, run.points_by_frame))
-
-    def step(state, frame: SimulatedFrame):
-        if frame.gone is not None:
-            state = slam.remove(state, frame.gone)  # ty: ignore[missing-attribute]
-        state, innovation = slam.step(state, frame.control, frame.seen, frame.new)
-        return state, output(state, innovation, frame)
-
-    frames = SimulatedFrame(run.controls, seen, new, left, poses, points)
-    return jax.lax.scan(step, slam.init(room.capacity, first), frames)
-
-
-def _check_removes(slam: AbstractFilter) -> None:
-    if not callable(getattr(slam, "remove", None)):
-        raise ValueError(
-            f"{type(slam).__name__} has no remove(state, gone): it cannot use slots again, as is "
-            "needed where landmarks come and go"
-        )
+    frames = SimulatedFrame(run.controls, seen, new, gone(run, room), poses, points)
+    return run_filter(slam, frames, slam.init(room.capacity, first), output)
 
 
 def filter_run(

@@ -36,10 +36,12 @@ _OF_MEDIANS = ("nees", "log_scale", "log_scale_sigma", *SCALE)
 
 @dataclass(frozen=True)
 class Seconds:
-    """Wall time of one filter over all its runs."""
+    """Wall time of one filter over all its runs, in seconds."""
 
     compile: float
+    """Until its program was there."""
     run: float
+    """From then on."""
 
 
 @dataclass(frozen=True, repr=False)
