@@ -90,8 +90,9 @@ class TrackOptions:
         """Track the video, print the summary, write its files."""
         require_vision("tracking")
         from jaxslam._runtime.progress import bar
+        from jaxslam.tracking.summary import WARM_UP, describe
         from jaxslam.tracking.target import read_target
-        from jaxslam.tracking.track import WARM_UP, describe, track
+        from jaxslam.tracking.track import track
 
         with one_line_warnings():
             source = self._source()

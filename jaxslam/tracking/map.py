@@ -1,97 +1,155 @@
-"""The map's upkeep: which landmarks to search, which are in view, and which to give up."""
+"""The map's upkeep: its landmarks and the filter's slots for them, where they are and which go."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
-from jaxslam.io.calibration import Calibration
-from jaxslam.tracking.landmarks import Landmark, Points
+from jaxslam.tracking.estimator import Estimator, Predicted
+from jaxslam.tracking.landmarks import Landmark, Points, joined
+from jaxslam.tracking.observations import Observations
+from jaxslam.tracking.patches import Patch
 from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.unit import MapInWorld, Nearness, nearness
 
-_MOST_SCALED = 2.0
-"""A patch that looks larger or smaller than at first by more is not like itself any more."""
-
-
-class Prediction(NamedTuple):
-    """What the filter expects to see, slot by slot; JAX's arrays, then NumPy's."""
-
-    pixels: Any
-    covariances: Any
-    usable: Any
-    """In the map and in front of the camera."""
-    T_wc: Any
-    points: Any
-    """Homogeneous points (X, ω) in the predicted camera."""
-    omegas: Any
-    sides: Any = (0, 0)
-    """How many landmarks are surely in front of the camera, and how many behind it."""
-
-    def enlarged(self, scale: float) -> Prediction:
-        """With all lengths so many times as large."""
-        T_wc = self.T_wc.copy()
-        T_wc[:3, 3] *= scale
-        return self._replace(T_wc=T_wc, omegas=self.omegas / scale)
+NO_SLOTS = np.zeros(0, int)
 
 
-def to_search(
-    landmarks: Mapping[int, Landmark],
-    prediction: Prediction,
-    calibration: Calibration,
-    settings: TrackerSettings,
-) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k 2 2"]]:
-    """Slots to search, and how the picture around each changed since its first view.
+@dataclass
+class Map:
+    """The landmarks of one map after another, beside the filter that estimates them."""
 
-    In front, in the picture, with a bearing that the lens can see, from where they still look
-    alike. Should there be more than can be measured, those come first that were found when they
-    were searched last, of them the longest known.
-    """
-    s, size = settings, np.array([calibration.width, calibration.height])
-    pixels = prediction.pixels
-    inside = np.all((pixels >= s.border) & (pixels < size - s.border), axis=1)
-    slots = np.flatnonzero(prediction.usable & inside)
-    affines = changes_of_view(landmarks, prediction, slots, calibration)
-    zoomed = np.abs(np.log(np.clip(np.linalg.det(affines), 1e-6, 1e6)))
-    alike = [
-        i
-        for i in np.flatnonzero(zoomed < 2 * np.log(_MOST_SCALED))
-        if landmarks[slots[i]].patch.covers(affines[i])
-    ]
-    absent = ~in_view(landmarks, slots, s)
-    alike.sort(key=lambda i: (absent[i], landmarks[slots[i]].number))
-    order = np.array(alike[: s.wanted], int)
-    return slots[order], affines[order]
+    settings: TrackerSettings
+    estimator: Estimator
+    place: MapInWorld = field(default_factory=MapInWorld)
+    landmarks: dict[int, Landmark] = field(default_factory=dict)
+    """Those in the map, by their slot of the state."""
+    finished: list[Points] = field(default_factory=list)
+    """Those that left it."""
+    number: int = 0
+    """Of the map, the first of which is 0."""
 
+    @property
+    def deleted(self) -> int:
+        """Landmarks that were given up so far."""
+        return sum(len(points.numbers) for points in self.finished)
 
-def changes_of_view(
-    landmarks: Mapping[int, Landmark],
-    prediction: Prediction,
-    slots: Int[np.ndarray, " k"],
-    calibration: Calibration,
-) -> Float[np.ndarray, "k 2 2"]:
-    """How the picture around each landmark changed since its first view; zero where it cannot
-    be told.
+    @property
+    def created(self) -> int:
+        """Landmarks so far."""
+        return self.deleted + len(self.landmarks)
 
-    The surface is taken to face the first camera; distortion is neglected, being nearly the
-    same over a patch.
-    """
-    first = np.array([landmarks[slot].first_camera for slot in slots]).reshape(-1, 4, 4)
-    T_first_now = np.linalg.inv(first) @ prediction.T_wc
-    X, omega = prediction.points[slots], prediction.omegas[slots]
-    start = np.einsum("kij,kj->ki", T_first_now[:, :3, :3], X)
-    start += omega[:, None] * T_first_now[:, :3, 3]
-    ahead = np.where(np.abs(start[:, 2:]) < 1e-9, 1e-9, start[:, 2:])
-    # One pixel to the right and down in the first view, on the plane through the point.
-    step = ahead[:, :, None] * np.eye(3)[None, :2] / [[[calibration.fx]]]
-    moved = X[:, None] + np.einsum("kji,kaj->kai", T_first_now[:, :3, :3], step)
-    pixel = X[:, :2] / X[:, 2:]
-    focal = np.array([calibration.fx, calibration.fy])
-    affine = (moved[..., :2] / moved[..., 2:] - pixel[:, None]) * focal
-    affine = np.swapaxes(affine, 1, 2)
-    return np.where(np.isfinite(affine).all(axis=(1, 2), keepdims=True), affine, 0.0)
+    def points(self) -> Points:
+        """All landmarks, those gone included."""
+        return joined([*self.finished, self._recorded(sorted(self.landmarks))])
+
+    def note(self, seen: Observations) -> None:
+        """Note what was found of the landmarks, and give up those that are searched in vain."""
+        note_found(self.landmarks, seen, self.settings)
+        self.give_up(failing(self.landmarks, self.settings))
+
+    def begin(
+        self,
+        image: UInt8[np.ndarray, "h w"],
+        pixels: Float[np.ndarray, "k 2"],
+        depths: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> None:
+        """Begin with landmarks at these pixels, a map that has none; `depths` as `Estimator`'s."""
+        slots = self._free(len(pixels))
+        self.place.begin(self.estimator.begin(slots, pixels, depths))
+        self._add(slots, image, pixels)
+
+    def renew(
+        self,
+        image: UInt8[np.ndarray, "h w"],
+        pixels: Float[np.ndarray, "k 2"],
+        kept: Int[np.ndarray, " n"] = NO_SLOTS,
+    ) -> None:
+        """New landmarks at these pixels, for which others than those in the slots `kept` make room.
+        Ends the filter's frame."""
+        self._make_room(len(pixels), kept)
+        slots = self._free(len(pixels))
+        report = self.estimator.renew(slots, pixels)
+        self.place.follow(report, self._nearness(), self._found_again())
+        self._add(slots, image, pixels)
+
+    def restart(self) -> None:
+        """Give up all landmarks: another map begins where the camera is."""
+        self.give_up(sorted(self.landmarks))
+        self.number += 1
+        self.place.restart()
+        self.estimator.clear()
+
+    def fall_back(self, predicted: Predicted) -> None:
+        """Give up all landmarks and go on by what prediction alone says of the camera: the update
+        had a covariance that is not positive. The landmarks are those of the frame before."""
+        self.give_up(sorted(self.landmarks))
+        self.coast(predicted)
+
+    def coast(self, predicted: Predicted) -> None:
+        """Go on without a measurement. Where that is broken too, the camera is as far from where it
+        was last as the prior on a start's velocity lets it be."""
+        if self.estimator.correct(predicted).failed:
+            self.place.restart_in_metres()
+            self.estimator.clear()
+            self.estimator.correct(self.estimator.predict(predicted.dt))
+
+    def give_up(self, slots: list[int], recorded: Points | None = None) -> None:
+        """Take landmarks out of the map, of which this is `recorded`."""
+        if slots:
+            self.finished.append(self._recorded(slots) if recorded is None else recorded)
+            for slot in slots:
+                del self.landmarks[slot]
+            self.estimator.remove(slots)
+
+    def measure_unit(self) -> None:
+        """Note how near the landmarks are now, by which the next frame's unit is told."""
+        self.place.near = self._nearness()
+
+    def _make_room(self, count: int, kept: Int[np.ndarray, " n"]) -> None:
+        """Give up landmarks, those `kept` apart, until there are slots for so many new ones."""
+        missing = count + len(self.landmarks) - self.settings.capacity
+        if missing <= 0:
+            return
+        slots = np.setdiff1d(list(self.landmarks), kept)
+        points = self._recorded(slots.tolist())
+        worst = worst_first([self.landmarks[slot] for slot in slots], points, self.settings)
+        self.give_up(slots[worst[:missing]].tolist(), points.only(worst[:missing]))
+
+    def _free(self, count: int) -> Int[np.ndarray, " n"]:
+        """The first free slots."""
+        free = [slot for slot in range(self.settings.capacity) if slot not in self.landmarks]
+        return np.array(free[:count], int)
+
+    def _add(
+        self,
+        slots: Int[np.ndarray, " k"],
+        image: UInt8[np.ndarray, "h w"],
+        pixels: Float[np.ndarray, "k 2"],
+    ) -> None:
+        first, camera = self.created, self.place.camera.T_wc
+        for number, (slot, pixel) in enumerate(zip(slots.tolist(), pixels, strict=True), first):
+            self.landmarks[slot] = Landmark(number, Patch.take(image, pixel), camera, pixel)
+        self.measure_unit()
+
+    def _nearness(self) -> Nearness:
+        """Of all landmarks, as long as the filter's unit is not fixed."""
+        if self.place.unit_fixed:
+            return {}
+        numbers = {slot: one.number for slot, one in self.landmarks.items()}
+        return nearness(numbers, self.estimator.points()[0])
+
+    def _found_again(self) -> list[int]:
+        return [one.number for one in self.landmarks.values() if one.found]
+
+    def _recorded(self, slots: list[int]) -> Points:
+        points, covariances = (part[slots] for part in self.estimator.points())
+        numbers = np.array([self.landmarks[slot].number for slot in slots], int)
+        maps = np.full_like(numbers, self.number)
+        return Points(numbers, maps, *self.place.points(points, covariances))
 
 
 def in_view(
@@ -106,20 +164,16 @@ def in_view(
 
 
 def note_found(
-    landmarks: Mapping[int, Landmark],
-    slots: Int[np.ndarray, " k"],
-    found: Bool[np.ndarray, " k"],
-    pixels: Float[np.ndarray, "k 2"],
-    settings: TrackerSettings,
+    landmarks: Mapping[int, Landmark], seen: Observations, settings: TrackerSettings
 ) -> None:
-    """Note which of the landmarks searched were found, and where.
+    """Note which of the landmarks searched were matched, and where.
 
     That nothing at all was found is the camera's failure, and held against no landmark.
     """
     for landmark in landmarks.values():
         landmark.unseen += 1
-    if found.any():
-        for slot, ok, pixel in zip(slots, found, pixels, strict=True):
+    if seen.matched.any():
+        for slot, ok, pixel in zip(seen.slots, seen.matched, seen.pixels, strict=True):
             landmarks[slot].searched(bool(ok), pixel, settings.patience)
 
 

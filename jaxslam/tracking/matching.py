@@ -3,8 +3,7 @@
 Positions are pixels (u, v) = (column, row), with pixel centres at whole numbers.
 """
 
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -24,12 +23,25 @@ _PEAKS_MARGIN = 0.12  # … with scores so far below the best one's
 _APART = 2  # pixels: nearer peaks are one place
 
 
-@dataclass(frozen=True)
-class Match:
-    """Where a patch was found: pixel (u, v), sub-pixel, and its correlation score up to 1."""
+class Matches(NamedTuple):
+    """m places that look like patches, in order of these, and the best first."""
 
-    pixel: Float[np.ndarray, " 2"]
-    score: float
+    owner: Int[np.ndarray, " m"]
+    """Which patch each looks like."""
+    pixels: Float[np.ndarray, "m 2"]
+    """(u, v), sub-pixel."""
+    scores: Float32[np.ndarray, " m"]
+    """Correlations, up to 1."""
+
+    def only(self, which: np.ndarray) -> "Matches":
+        """Some of them."""
+        return Matches(*(part[which] for part in self))
+
+    def first_of_each(self, count: int) -> Float[np.ndarray, "count 2"]:
+        """The first pixel of each of so many patches, NaN of those that have none."""
+        first = np.full((count, 2), np.nan)
+        first[self.owner[::-1]] = self.pixels[::-1]
+        return first
 
 
 def match_patches(
@@ -43,7 +55,7 @@ def match_patches(
     max_radius: float | None = None,
     ambiguity: float = 0.05,
     several: bool = True,
-) -> list[list[Match]]:
+) -> Matches:
     """Active search: the places most like each template within the ellipse of its prediction.
 
     Looks where (x - centre)' covariance^-1 (x - centre) <= `gate` (a quantile of chi2 with two
@@ -56,9 +68,8 @@ def match_patches(
     often is another place, `several` are told, up to `PEAKS`, best first, for who knows what else
     was found to choose from. None where the ellipse is outside the image.
     """
-    matches: list[list[Match]] = [[] for _ in templates]
-    if not matches:
-        return matches
+    if not len(templates):
+        return Matches(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, np.float32))
     whole, half = image.astype(np.float32), templates.shape[1] // 2
     ellipses = _Ellipses.of(centres, covariances, gate)
     reach = _WIDEST * image.shape[1] if max_radius is None else max_radius
@@ -72,12 +83,11 @@ def match_patches(
     in_wide = several & np.isin(peaks.owner, wide)
     alone = _alone(peaks.only(~in_wide), threshold, ambiguity)
     chosen = alone.joined(_several(peaks.only(in_wide)))
-    if len(chosen.owner):
-        starts = chosen.pixels + _quadratic_peaks(chosen.around)
-        pixels = refine(whole, templates[chosen.owner], starts)
-        for owner, pixel, score in zip(chosen.owner.tolist(), pixels, chosen.scores, strict=True):
-            matches[owner].append(Match(pixel, float(score)))
-    return matches
+    chosen = chosen.only(np.argsort(chosen.owner, kind="stable"))
+    pixels = chosen.pixels + _quadratic_peaks(chosen.around)
+    if len(pixels):
+        pixels = refine(whole, templates[chosen.owner], pixels)
+    return Matches(chosen.owner, pixels, chosen.scores)
 
 
 def refine(
@@ -227,7 +237,7 @@ class _Peaks(NamedTuple):
     scores: Float32[np.ndarray, " k"]
     around: Float32[np.ndarray, "k 9"]
 
-    def only(self, which: Any) -> "_Peaks":
+    def only(self, which: np.ndarray) -> "_Peaks":
         return _Peaks(*(part[which] for part in self))
 
     def joined(self, others: "_Peaks") -> "_Peaks":
@@ -280,7 +290,7 @@ def _several(peaks: _Peaks) -> _Peaks:
             and np.abs(peaks.pixels[better] - pixel).max(axis=1).min() > _APART
         ):
             kept.append(i)
-    return peaks.only(kept)
+    return peaks.only(np.array(kept, int))
 
 
 def _narrowed(

@@ -1,11 +1,15 @@
 """The picture of active search over a video frame."""
 
-from collections.abc import Sequence
+import math
 from functools import cache
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int32, UInt8
+
+from jaxslam.io.source import Frame
+from jaxslam.tracking.observations import Observations
+from jaxslam.tracking.report import Tracked
 
 # Okabe and Ito's colours, distinct to the colour-blind, as OpenCV's blue, green, red; and yet each
 # status has a shape of its own.
@@ -31,38 +35,56 @@ _WIDEST = (
 """Notes as long as they become, for which there is room in the legend."""
 
 
+def overlay_of(frame: Frame, result: Tracked) -> UInt8[np.ndarray, "h2 w 3"]:
+    """The picture of what was sought, found and begun in a frame."""
+    table = result.observations.with_new(result.created)
+    return draw_overlay(frame.image, table, _notes(result), _banner(result))
+
+
+def _notes(result: Tracked) -> tuple[str, str]:
+    """Which frame it is, and the σ of its pose in the map's unit."""
+    camera, log_scale = result.camera, result.sigma_log_scale
+    degrees = math.degrees(camera.sigma_orientation)
+    scale = "" if log_scale is None else f"  log scale {log_scale:.3g}"
+    opening = "" if result.unit_fixed else "  unit open"
+    return (
+        f"frame {result.index}  {result.time:.2f} s  map {result.map}{opening}",
+        f"sigma: position {camera.sigma_position:.3g} units  {degrees:.3g} deg{scale}",
+    )
+
+
+def _banner(result: Tracked) -> str:
+    """What nobody is to overlook: nothing while all is well."""
+    if result.starts:
+        return f"LOST: MAP {result.map} BEGINS" if result.lost else ""
+    return "" if result.state == "tracked" else result.state.upper()
+
+
 def draw_overlay(
     image: UInt8[np.ndarray, "h w"],
-    *,
-    predicted: Float[np.ndarray, "n 2"],
-    covariances: Float[np.ndarray, "n 2 2"],
-    matched: Float[np.ndarray, "n 2"],
-    status: Sequence[str],
+    table: Observations,
     notes: tuple[str, str] = ("", ""),
     banner: str = "",
 ) -> UInt8[np.ndarray, "h2 w 3"]:
     """The frame in blue, green, red with what the filter predicted and what was found there.
 
-    For each of n landmarks the ellipse of three standard deviations of its 2x2 covariance
-    (pixels^2) around the `predicted` pixel (u, v), at least of `LEAST_RADIUS`, and what was found
-    at the `matched` pixel, as its status, one of `COLOURS`, says: a dot ('matched') or a cross
-    ('outlier') with a line from the prediction, a square ('new'); 'unmatched', the ellipse is
-    dashed, and empty. What is not finite is not drawn. `banner` stands in large letters over the
-    picture. Below it are two `notes`, ASCII, and a legend that counts the statuses, in as many rows
-    as the width asks for. Raises `ValueError` for another status.
+    For each landmark the ellipse of three standard deviations around the pixel where it was
+    predicted, at least of `LEAST_RADIUS`, and what was found, as its label, one of `COLOURS`, says:
+    a dot ('matched') or a cross ('outlier') with a line from the prediction, a square ('new');
+    'unmatched', the ellipse is dashed, and empty. What is not finite is not drawn. `banner` stands
+    in large letters over the picture. Below it are two `notes`, ASCII, and a legend that counts the
+    labels, in as many rows as the width asks for. Raises `ValueError` for another label.
     """
-    names = np.array([str(name) for name in status], dtype="U16")
-    unknown = sorted(set(names.tolist()) - set(COLOURS))
+    unknown = sorted(set(table.labels.tolist()) - set(COLOURS))
     if unknown:
-        raise ValueError(f"status {unknown[0]!r} is unknown; {', '.join(COLOURS)} are accepted")
+        raise ValueError(f"label {unknown[0]!r} is unknown; {', '.join(COLOURS)} are accepted")
     # Less contrast, so that the lines stand out.
     canvas = cv2.cvtColor(cv2.convertScaleAbs(image, alpha=0.75, beta=20), cv2.COLOR_GRAY2BGR)
-    for name in COLOURS:
-        chosen = names == name
-        _draw(canvas, name, predicted[chosen], covariances[chosen], matched[chosen])
+    for label in COLOURS:
+        _draw(canvas, label, *table.labelled(label)[1:4])
     if banner:
         _draw_banner(canvas, banner)
-    counts = {name: int(np.sum(names == name)) for name in COLOURS}
+    counts = {label: len(table.labelled(label).slots) for label in COLOURS}
     return np.vstack([canvas, _legend(image.shape[1], notes, counts)])
 
 
@@ -78,7 +100,7 @@ def _draw(
     covariances: Float[np.ndarray, "k 2 2"],
     matched: Float[np.ndarray, "k 2"],
 ) -> None:
-    """k landmarks of one status."""
+    """Draw k landmarks of one label."""
     expected, found = np.isfinite(predicted).all(axis=1), np.isfinite(matched).all(axis=1)
     shaped = expected & np.isfinite(covariances).all(axis=(1, 2))
     ellipses = search_ellipses(predicted[shaped], covariances[shaped])

@@ -1,11 +1,20 @@
-"""A map's unit of length while the filter has none that lasts: its landmarks do not move."""
+"""Where a map is in the world, and its one unit of length.
+
+While the filter has no unit that lasts, the map's is carried over by its landmarks: they do not
+move.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
+
+from jaxslam.tracking.estimator import CameraReport
+from jaxslam.tracking.observations import Prediction
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 
 Nearness = Mapping[int, float]
 """By a landmark's number: one by its distance from where the map begins, in the filter's unit."""
@@ -29,3 +38,71 @@ def lengthened(before: Nearness, now: Nearness, among: Iterable[int]) -> float:
     pairs = np.array([(before[n], now[n]) for n in among if n in before and n in now])
     old, new = pairs[np.isfinite(pairs).all(axis=1)].sum(axis=0) if len(pairs) else (0.0, 0.0)
     return float(np.log(new / old)) if old > 0 and new > 0 else 0.0
+
+
+@dataclass
+class MapInWorld:
+    """Where a map begins in the world, where the camera is, and the unit of both."""
+
+    origin: PoseWithCovariance = field(default_factory=PoseWithCovariance)
+    """Where the map begins."""
+    camera: PoseWithCovariance = field(default_factory=PoseWithCovariance)
+    log_unit: float = 0.0
+    """Log of the filter's unit in the map's."""
+    log_scale: float = 0.0
+    """Log of the map's unit in metres, as the filter believes it to be …"""
+    sigma_log_scale: float | None = None
+    """… and its σ, where the filter is in doubt of it."""
+    unit_fixed: bool = True
+    """Whether the filter keeps its unit from here on."""
+    near: Nearness = field(default_factory=dict)
+    """Of all landmarks, as long as the filter's unit is not fixed."""
+
+    @property
+    def unit(self) -> float:
+        """The filter's unit of length in the map's."""
+        return float(np.exp(self.log_unit))
+
+    def begin(self, report: CameraReport) -> None:
+        """Take over what the filter says of the first camera of a map: the metre is the unit."""
+        self.log_unit = float(report.log_scale)
+        self._take(report)
+
+    def follow(self, report: CameraReport, near: Nearness, found: Iterable[int]) -> None:
+        """Take over what the filter says of its camera; how `near` the landmarks are to it now, by
+        the numbers of those that were found again, tells what became of its unit."""
+        if not self.unit_fixed:
+            self.log_unit += lengthened(self.near, near, found)
+        self._take(report)
+
+    def restart(self) -> None:
+        """Let what comes begin where the camera is."""
+        self.origin = self.camera
+
+    def restart_in_metres(self) -> None:
+        """The same of a filter whose state is empty, which is in metres."""
+        self.restart()
+        self.log_unit = -self.log_scale
+
+    def expected(self, view: Prediction) -> Prediction:
+        """What the filter expects, in the world and in the map's unit."""
+        T_wc = view.T_wc.copy()
+        T_wc[:3, 3] *= self.unit
+        return view._replace(T_wc=self.origin.T_wc @ T_wc, omegas=view.omegas / self.unit)
+
+    def points(
+        self, points: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The filter's points in the world with their covariances, and with those that are given
+        where the map begins."""
+        points, covariances = points * self.unit, covariances * self.unit**2
+        _, in_map = PoseWithCovariance(self.origin.T_wc).points(points, covariances)
+        return *self.origin.points(points, covariances), in_map
+
+    def _take(self, report: CameraReport) -> None:
+        self.unit_fixed = bool(report.unit_fixed)
+        here = PoseWithCovariance(report.T_wc, report.covariance).scaled(self.unit)
+        self.camera = self.origin.then(here)
+        self.log_scale = float(report.log_scale) - self.log_unit
+        variance = report.variance
+        self.sigma_log_scale = float(np.sqrt(variance)) if variance > 0 else None

@@ -15,7 +15,7 @@ from jaxslam.io.calibration import Calibration
 from jaxslam.io.source import Frame
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.overlay import COLOURS, search_ellipses
-from jaxslam.tracking.tracker import Tracked
+from jaxslam.tracking.report import Tracked
 
 _IMAGE = "world/camera/image"
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
@@ -93,20 +93,16 @@ class Viewer:
         rr = self._rerun
         jpeg = cv2.imencode(".jpg", frame.image, _JPEG)[1].tobytes()
         self._record.log(_IMAGE, rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
-        statuses = np.array(result.status, dtype="U16")
-        for status in ("matched", "unmatched", "outlier"):
-            of = statuses == status
-            lines = search_ellipses(result.predicted[of], result.search[of])
-            self._record.log(
-                f"{_IMAGE}/{status}/searched", rr.LineStrips2D(list(lines), colors=_rgb(status))
-            )
-            self._show_pixels(status, result.matched[of])
-        self._show_pixels("new", result.created)
-
-    def _show_pixels(self, status: str, pixels: np.ndarray) -> None:
-        found = pixels[np.isfinite(pixels).all(axis=1)]
-        points = self._rerun.Points2D(found, colors=_rgb(status), radii=3.0)
-        self._record.log(f"{_IMAGE}/{status}/found", points)
+        table = result.observations.with_new(result.created)
+        for label in COLOURS:
+            rows = table.labelled(label)
+            if label != "new":
+                lines = list(search_ellipses(rows.predicted, rows.covariances))
+                searched = rr.LineStrips2D(lines, colors=_rgb(label))
+                self._record.log(f"{_IMAGE}/{label}/searched", searched)
+            found = rows.pixels[np.isfinite(rows.pixels).all(axis=1)]
+            points = rr.Points2D(found, colors=_rgb(label), radii=3.0)
+            self._record.log(f"{_IMAGE}/{label}/found", points)
 
     def _show_camera(self, result: Tracked) -> None:
         T_wc, position = result.T_wc, result.T_wc[:3, 3]

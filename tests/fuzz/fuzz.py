@@ -49,7 +49,7 @@ from jaxslam.io.opening import open_source
 from jaxslam.io.tum import read_tum
 from jaxslam.simulation.scenario import parse_override
 from jaxslam.simulation.trajectories import _sampled
-from jaxslam.tracking.resume import read_record
+from jaxslam.tracking.persistence import read_record
 from jaxslam.tracking.target import read_target
 
 MEMORY = 8 << 30

@@ -15,7 +15,7 @@ from jaxslam.consistency import FolderStore, monte_carlo
 from jaxslam.evaluation import Convention, write_covariances
 from jaxslam.io.calibration import Calibration, write_calibration
 from jaxslam.io.tum import write_tum
-from jaxslam.tracking.resume import write_record
+from jaxslam.tracking.persistence import write_record
 from jaxslam.tracking.synthetic import synthetic_source
 
 WIDTH, HEIGHT = 64, 48

@@ -6,10 +6,13 @@ import pytest
 pytest.importorskip("cv2")
 
 from jaxslam.io.calibration import Calibration
-from jaxslam.tracking import tracker as programs
+from jaxslam.tracking import map as upkeep
+from jaxslam.tracking import search as searching
 from jaxslam.tracking.landmarks import Landmark, Points
-from jaxslam.tracking.map import Prediction, failing, in_view, note_found, to_search, worst_first
+from jaxslam.tracking.map import failing, in_view, note_found, worst_first
+from jaxslam.tracking.observations import Observations, Prediction
 from jaxslam.tracking.patches import Patch
+from jaxslam.tracking.search import to_search
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
@@ -24,9 +27,10 @@ def landmark(number, **counts):
 
 
 def search(landmarks, found, times):
-    slots = np.array(list(landmarks), int)
+    slots, labels = np.array(list(landmarks), int), np.where(found, "matched", "unmatched")
+    seen = Observations(slots, pixels=np.array([[7.0, 8.0]] * len(slots)), labels=labels)
     for _ in range(times):
-        note_found(landmarks, slots, np.array(found), np.array([[7.0, 8.0]] * len(slots)), SETTINGS)
+        note_found(landmarks, seen, SETTINGS)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +182,7 @@ def hiding(monkeypatch, hidden):
         usable = prediction.usable & ~np.isin(np.arange(len(prediction.usable)), slots)
         return to_search(landmarks, prediction._replace(usable=usable), *rest)
 
-    monkeypatch.setattr(programs, "to_search", search)
+    monkeypatch.setattr(searching, "to_search", search)
 
 
 def test_a_landmark_out_of_view_is_kept_while_there_are_slots_and_found_again(monkeypatch):
@@ -206,7 +210,7 @@ def test_slots_are_given_to_new_landmarks_when_none_is_free(monkeypatch):
         assert all(one.unseen > 0 for one in landmarks)
         return worst_first(landmarks, *rest)
 
-    monkeypatch.setattr(programs, "worst_first", worst)
+    monkeypatch.setattr(upkeep, "worst_first", worst)
     for frame in source:
         tracked = tracker.track(frame)
         kept.append({one.number for one in tracker.landmarks.values()})

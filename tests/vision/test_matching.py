@@ -1,6 +1,7 @@
 """Warped patches and active search, against positions known exactly."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -39,9 +40,27 @@ def picture(warp=((1, 0), (0, 1)), shift=(0.0, 0.0), size=121, sigma=2.0, seed=0
 CENTRE = np.array([60.0, 60.0])
 
 
+class Place(NamedTuple):
+    pixel: np.ndarray
+    score: float
+
+
+def places_of(image, templates, centres, covariances, **how):
+    """The places of each patch, of a table in their order."""
+    found = match_patches(image, templates, centres, covariances, **how)
+    assert np.all(np.diff(found.owner) >= 0)
+    places = [[] for _ in templates]
+    for owner, pixel, score in zip(*found, strict=True):
+        places[owner].append(Place(pixel, score))
+    first = found.first_of_each(len(templates))
+    for row, own in zip(first, places, strict=True):
+        np.testing.assert_array_equal(row, own[0].pixel if own else np.full(2, np.nan))
+    return places
+
+
 def match_patch(image, template, centre, covariance, **how):
     """The best place of one patch, if there is one."""
-    found = match_patches(image, template[None], centre[None], covariance[None], **how)[0]
+    (found,) = places_of(image, template[None], centre[None], covariance[None], **how)
     return found[0] if found else None
 
 
@@ -191,7 +210,7 @@ def test_many_patches_at_once_equal_one_by_one():
     templates[3] = 7.0  # flat: never found
     centres[5] = np.nan
     covariances = np.einsum("n,ij->nij", rng.uniform(2, 9, 12), np.eye(2))
-    together = match_patches(second, templates, centres, covariances)
+    together = places_of(second, templates, centres, covariances)
     together = [places[0] if places else None for places in together]
     for index, match in enumerate(together):
         alone = match_patch(second, templates[index], centres[index], covariances[index])
@@ -202,7 +221,8 @@ def test_many_patches_at_once_equal_one_by_one():
     assert together[3] is None
     assert together[5] is None
     assert sum(match is not None for match in together) >= 8
-    assert match_patches(second, templates[:0], centres[:0], covariances[:0]) == []
+    none = match_patches(second, templates[:0], centres[:0], covariances[:0])
+    assert [len(part) for part in none] == [0, 0, 0]
 
 
 def texture(width=640, height=480, seed=4):
@@ -245,9 +265,9 @@ def test_the_wide_search_finds_what_the_whole_one_finds(monkeypatch):
     places = rng.uniform((180, 180), (460, 300), (40, 2))
     templates = np.array([Patch.take(first, place).warped(np.eye(2)) for place in places])
     given = templates, places + rng.uniform(-90, 90, (40, 2)), np.tile(WIDE, (40, 1, 1))
-    wide = match_patches(second, *given)
+    wide = places_of(second, *given)
     monkeypatch.setattr(matching, "_NARROW", np.inf)
-    for (one, *_), (other,) in zip(wide, match_patches(second, *given), strict=True):
+    for (one, *_), (other,) in zip(wide, places_of(second, *given), strict=True):
         # The starts differ by the rounding of scores of single precision.
         np.testing.assert_allclose(one.pixel, other.pixel, rtol=0, atol=1e-3)
         assert one.score == pytest.approx(other.score, rel=1e-5)
@@ -261,7 +281,7 @@ def test_of_a_texture_that_is_there_twice_in_a_wide_ellipse_both_places_are_told
     image[v + shift[1] - 12 :, u + shift[0] - 12 :][:25, :25] = image[v - 12 :, u - 12 :][:25, :25]
     template = Patch.take(image, place).warped(np.eye(2))
     centre = place + np.array(shift) / 2
-    (places,) = match_patches(image, template[None], centre[None], WIDE[None])
+    (places,) = places_of(image, template[None], centre[None], WIDE[None])
     assert len(places) <= PEAKS
     scores = [match.score for match in places]
     assert scores == sorted(scores, reverse=True)

@@ -10,6 +10,8 @@ import pytest
 
 from jaxslam.plots.tracking import plot_map
 from jaxslam.tracking.film import WAITING, Aside, OverlayWriter
+from jaxslam.tracking.observations import NOTHING as EMPTY
+from jaxslam.tracking.observations import Observations
 from jaxslam.tracking.overlay import COLOURS, LEAST_RADIUS, draw_overlay, overlay_size
 from jaxslam.tracking.pointcloud import write_ply
 
@@ -24,13 +26,14 @@ def coloured(overlay, status):
 
 
 def draw(predicted, covariance, matched, status):
-    return draw_overlay(
-        GREY,
-        predicted=np.asarray(predicted, float).reshape(-1, 2),
-        covariances=np.asarray(covariance, float).reshape(-1, 2, 2),
-        matched=np.asarray(matched, float).reshape(-1, 2),
-        status=[status],
+    table = Observations(
+        np.zeros(1, int),
+        np.asarray(predicted, float).reshape(-1, 2),
+        np.asarray(covariance, float).reshape(-1, 2, 2),
+        np.asarray(matched, float).reshape(-1, 2),
+        np.array([status]),
     )
+    return draw_overlay(GREY, table)
 
 
 def lines(overlay):
@@ -97,17 +100,16 @@ def test_every_status_has_a_shape_of_its_own():
 def test_the_legend_fits_its_width(width):
     """All of it is written: the longest notes and counts end before the right edge."""
     image = np.full((90, width), 100, np.uint8)
-    overlay = draw_overlay(
-        image,
-        predicted=np.full((200, 2), np.nan),
-        covariances=np.full((200, 2, 2), np.nan),
-        matched=np.full((200, 2), np.nan),
-        status=["matched", "unmatched", "outlier", "new"] * 50,
-        notes=(
-            "frame 12345  1234.56 s  map 12  unit open",
-            "sigma: position 0.00123 units  0.123 deg  log scale 0.0123",
-        ),
+    nowhere = np.full((200, 2), np.nan)
+    labels = np.array(["matched", "unmatched", "outlier", "new"] * 50)
+    everything = Observations(
+        np.arange(200), nowhere, np.full((200, 2, 2), np.nan), nowhere, labels
     )
+    notes = (
+        "frame 12345  1234.56 s  map 12  unit open",
+        "sigma: position 0.00123 units  0.123 deg  log scale 0.0123",
+    )
+    overlay = draw_overlay(image, everything, notes)
     assert overlay.shape == (*overlay_size(width, 90)[::-1], 3)
     assert overlay.dtype == np.uint8
     strip = overlay[90:].max(axis=2)
@@ -122,15 +124,7 @@ def test_unknown_statuses_are_refused():
 
 
 def with_words(**words):
-    nothing = np.zeros((0, 2))
-    return draw_overlay(
-        GREY,
-        predicted=nothing,
-        covariances=np.zeros((0, 2, 2)),
-        matched=nothing,
-        status=[],
-        **words,
-    )
+    return draw_overlay(GREY, EMPTY, **words)
 
 
 def test_notes_stand_below_the_picture_and_a_banner_in_it():

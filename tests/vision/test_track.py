@@ -11,6 +11,7 @@ import tqdm.auto
 pytest.importorskip("cv2")
 
 from jaxslam.cli.track import TrackOptions
+from jaxslam.tracking import overlay, summary
 from jaxslam.tracking import track as tracking
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
@@ -61,7 +62,7 @@ def test_numbers_are_there_before_a_figure_is_drawn(tmp_path, monkeypatch):
 
 
 def test_an_overlay_that_cannot_be_drawn_ends_the_run_and_leaves_the_files(tmp_path, monkeypatch):
-    monkeypatch.setattr(tracking, "draw_overlay", fail)
+    monkeypatch.setattr(overlay, "draw_overlay", fail)
     with pytest.raises(ValueError, match="cannot draw"):
         tracking.track(small(3), tmp_path, SETTINGS)
     assert names(tmp_path) == NUMBERS | FIGURES
@@ -72,13 +73,13 @@ def test_the_map_shows_the_reference_in_its_own_frame_and_unit(tmp_path, monkeyp
     drawn = {}
     monkeypatch.setattr(tracking, "plot_map", lambda *data, **more: drawn.update(more, data=data))
     whole, source = small(40), small(12)
-    summary = tracking.track(
+    written = tracking.track(
         replace(source, reference=whole.reference), tmp_path, SETTINGS, overlay=False
     )
     estimate, reference = drawn["data"][0], drawn["reference"]
     assert estimate.shape == reference.shape
     # One factor between the lengths of the two worlds, and no turn between their shapes.
-    ate, true = summary["ate"], whole.reference
+    ate, true = written["ate"], whole.reference
     assert true is not None
     scale = length(true.T_wc[:12]) / length(reference)
     error = scale * (estimate - reference)[:, :3, 3]
@@ -90,8 +91,8 @@ def test_without_a_reference_that_fits_the_map_is_drawn_all_the_same(tmp_path):
     source = small(3)
     assert source.reference is not None
     late = source.reference._replace(times=source.reference.times + 100)
-    summary = tracking.track(replace(source, reference=late), tmp_path, SETTINGS, overlay=False)
-    assert "0 poses" in summary["no_ate"]
+    written = tracking.track(replace(source, reference=late), tmp_path, SETTINGS, overlay=False)
+    assert "0 poses" in written["no_ate"]
     assert names(tmp_path) == NUMBERS | FIGURES
 
 
@@ -114,9 +115,9 @@ def test_the_command_says_that_it_compiles_and_hands_over_what_is_wanted(monkeyp
 
     monkeypatch.setattr(tqdm.auto, "tqdm", Bar)
     monkeypatch.setattr(tracking, "track", tracked)
-    monkeypatch.setattr(tracking, "describe", str)
+    monkeypatch.setattr(summary, "describe", str)
     TrackOptions(overlay=False, viewer=Path("seen.rrd"), frames=5).run()
-    assert said == ["compiling …", (tracking.WARM_UP, "tracking")]
+    assert said == ["compiling …", (summary.WARM_UP, "tracking")]
     assert (asked["overlay"], asked["viewer"]) == (False, Path("seen.rrd"))
     printed = capsys.readouterr().out
     assert "summary.json" in printed

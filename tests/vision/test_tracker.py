@@ -25,14 +25,19 @@ from jaxslam.io.calibration import from_field_of_view
 from jaxslam.io.opening import open_source
 from jaxslam.io.tum import read_tum
 from jaxslam.models.observations import Status
-from jaxslam.tracking import tracker as programs
+from jaxslam.tracking import estimator as programs
+from jaxslam.tracking import policy as policies
 from jaxslam.tracking.landmarks import Landmark
+from jaxslam.tracking.observations import Observations
 from jaxslam.tracking.patches import STORED, Patch
+from jaxslam.tracking.policy import LEAST_MATCHES, PROVEN, Policy, more_than_chance
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, adjoint
+from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.summary import TOO_SURE, describe
 from jaxslam.tracking.synthetic import synthetic_source
-from jaxslam.tracking.track import TOO_SURE, describe, track
-from jaxslam.tracking.tracker import LEAST_MATCHES, PROVEN, Tracked, Tracker
+from jaxslam.tracking.track import track
+from jaxslam.tracking.tracker import Tracker
 from jaxslam.tracking.trajectory import (
     absolute_trajectory_error,
 )
@@ -138,24 +143,20 @@ def test_half_a_picture_that_moves_otherwise_is_not_believed_for_long():
 
 
 def test_only_what_is_proven_and_moves_alike_contradicts_the_map():
-    tracker = Tracker(
-        synthetic_source(frames=1).calibration, TrackerSettings(filter="world", wanted=40)
-    )
-    rng, slots = np.random.default_rng(0), np.arange(40)
+    policy = Policy(from_field_of_view(640, 480), TrackerSettings(wanted=40), ambiguous_start=False)
+    rng = np.random.default_rng(0)
     patch = Patch(np.zeros(2), np.zeros((STORED, STORED), np.float32))
     moved = np.tile([3.0, -1.0], (40, 1))
-    agreed = moved.copy()
-    agreed[20:] = np.nan
+    agree = np.arange(40) < 20
 
     def contradicted(aside, found):
-        tracker._proven = tracker._elsewhere = 0.0
-        one = {k: Landmark(k, patch, np.eye(4), np.zeros(2), found=found) for k in range(40)}
-        tracker.landmarks = one
+        policy.forget()
+        landmarks = [Landmark(k, patch, np.eye(4), np.zeros(2), found=found) for k in range(40)]
         answers = []
         for one in aside:
             now = moved.copy()
             now[20:] += one
-            answers.append(tracker._contradicted(slots, now, agreed))
+            answers.append(policy.contradicted(landmarks, now, agree))
         return answers
 
     alike = np.tile([5.0, 2.0], (20, 20, 1))
@@ -164,17 +165,19 @@ def test_only_what_is_proven_and_moves_alike_contradicts_the_map():
     # The sum of 20 directions at random is 4.5 long, RMS; the average of three, of 40, is rarely 8.
     assert sum(contradicted(rng.normal(0, 5, (300, 20, 2)), PROVEN)[3:]) <= 3
     # Where the whole frame is not believed, nothing is learnt from it.
-    agreed[:] = np.nan
+    agree[:] = False
     assert not any(contradicted(alike, found=PROVEN))
 
 
 def test_innovations_are_of_all_that_was_found_believed_or_not(tracked):
     one = Tracked(
-        0, 0.0, PoseWithCovariance(),
-        predicted=np.array([[10.0, 20.0], [5.0, 5.0], [0.0, 0.0]]),
-        search=np.stack([np.diag([4.0, 1.0]), np.eye(2), np.array([[2.0, 1.0], [1.0, 2.0]])]),
-        matched=np.array([[12.0, 21.0], [np.nan, np.nan], [1.0, 1.0]]),
-        status=["matched", "unmatched", "outlier"],
+        0, 0.0, PoseWithCovariance(), Observations(
+            np.arange(3),
+            np.array([[10.0, 20.0], [5.0, 5.0], [0.0, 0.0]]),
+            np.stack([np.diag([4.0, 1.0]), np.eye(2), np.array([[2.0, 1.0], [1.0, 2.0]])]),
+            np.array([[12.0, 21.0], [np.nan, np.nan], [1.0, 1.0]]),
+            np.array(["matched", "unmatched", "outlier"]),
+        ),
     )  # fmt: skip
     np.testing.assert_allclose(one.innovations, [2, 2 / 3], rtol=1e-12)
     ungated = tracked[2]["nis_ungated"]
@@ -342,7 +345,7 @@ def test_matches_too_few_to_believe_change_nothing(monkeypatch):
     agreed = whole.status.count("matched")
     assert agreed > LEAST_MATCHES
     for least in (agreed, agreed + 1):
-        monkeypatch.setattr(programs, "_more_than_chance", lambda searched, least=least: least)
+        monkeypatch.setattr(policies, "more_than_chance", lambda searched, least=least: least)
         result = second_frame()
         assert result.status.count("matched") == (agreed if least == agreed else 0)
     assert result.lost
@@ -355,7 +358,7 @@ def test_so_many_matches_are_not_there_by_chance(searched):
     """One in twenty landmarks is found by chance, a frame is believed by chance once in 1000."""
     rng = np.random.default_rng(0)
     chance = rng.binomial(searched, 0.05, size=200_000)
-    least = programs._more_than_chance(searched)
+    least = more_than_chance(searched)
     assert np.mean(chance >= least) < 1.2e-3
     assert least == LEAST_MATCHES or np.mean(chance >= least - 1) > 1e-3
 
@@ -366,9 +369,11 @@ def test_a_world_behind_the_camera_is_given_up():
     results = []
     for frame in source:
         if frame.index == 2:
-            state = tracker._state
+            state = tracker.map.estimator.state
             behind = state.landmarks.at[:, 3].multiply(-1)
-            tracker._state = replace(state, landmarks=behind, covariance=1e-6 * state.covariance)
+            tracker.map.estimator.state = replace(
+                state, landmarks=behind, covariance=1e-6 * state.covariance
+            )
         results.append(tracker.track(frame))
     assert [result.state for result in results] == ["start", "tracked", "start", "tracked"]
     assert [result.map for result in results] == [0, 0, 1, 1]
@@ -393,9 +398,9 @@ def test_nothing_is_believed_where_landmarks_are_expected_too_widely():
     first, second, third = source
     tracker.track(first)
     assert tracker.track(second).state == "tracked"
-    state = tracker._state
+    state = tracker.map.estimator.state
     turned = state.covariance.at[np.arange(3, 6), np.arange(3, 6)].add(0.3**2)
-    tracker._state = replace(state, covariance=turned)
+    tracker.map.estimator.state = replace(state, covariance=turned)
     assert tracker.track(third).state == "lost"
 
 
@@ -409,10 +414,10 @@ def test_an_unknown_calibration_counts_in_the_first_frame_too():
     for frame in source:
         tracker.track(frame)
     slots = jnp.array(sorted(tracker.landmarks))
-    slam = tracker._slam
+    slam = tracker.map.estimator.slam
     assert isinstance(slam, jaxslam.EkfSlam)
     charts, covariances = eqx.filter_jit(landmarks_in_camera)(
-        slam, tracker._state, slots, slam.sensor
+        slam, tracker.map.estimator.state, slots, slam.sensor
     )
     # u = f x/z + c, each of f, c and u with its own σ.
     variance = 0.3**2 + 2.0**2 + (settings.focal_sigma * np.asarray(charts)[:, 0]) ** 2
@@ -518,7 +523,7 @@ def test_a_filter_of_ones_own_tracks_as_the_built_in_one_does():
         ):
             np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)
     assert found.status.count("matched") >= 10
-    assert own._state["frame"] == len(source) - 1
+    assert own.map.estimator.state["frame"] == len(source) - 1
     # Once for all frames, the intervals between which differ in their last digits.
     assert len(compiled) == 1 < len(set(np.diff(source.times)))
     for one, other in zip(own.points(), built_in.points(), strict=True):

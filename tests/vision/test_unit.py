@@ -2,8 +2,6 @@
 
 import csv
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,13 +15,14 @@ from cases import Around
 import jaxslam
 from jaxslam.filters.protocol import Scene
 from jaxslam.geometry import scaled
-from jaxslam.tracking import tracker as programs
+from jaxslam.tracking import search as searching
+from jaxslam.tracking.estimator import CameraReport
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, adjoint
+from jaxslam.tracking.report import write_frames
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
-from jaxslam.tracking.track import write_frames
 from jaxslam.tracking.tracker import Tracker
-from jaxslam.tracking.unit import lengthened, nearness
+from jaxslam.tracking.unit import MapInWorld, lengthened, nearness
 
 FRAMES, FIXED = 12, 5
 WANDER = 0.3 + 0.4 * np.sin(np.arange(FRAMES + 1))
@@ -92,7 +91,7 @@ def wandering(calibration, opening, fixed_at):
 
 def run(calibration, frames, slam=None):
     """Every frame through a tracker; and where it predicts the landmarks, in the world."""
-    tracker, predicted, whole = Tracker(calibration, SETTINGS, slam), [], programs.to_search
+    tracker, predicted, whole = Tracker(calibration, SETTINGS, slam), [], searching.to_search
 
     def noted(landmarks, prediction, *rest):
         points = prediction.points / prediction.omegas[:, None]
@@ -102,7 +101,7 @@ def run(calibration, frames, slam=None):
         return whole(landmarks, prediction, *rest)
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(programs, "to_search", noted)
+        patched.setattr(searching, "to_search", noted)
         results = [tracker.track(half_hidden(frame)) for frame in frames]
     return Run(tracker, results, predicted)
 
@@ -139,7 +138,7 @@ def test_a_path_is_in_one_unit_whatever_the_filter_takes_it_for(plain, wanders):
     for found, expected in zip(wanders.results, plain.results, strict=True):
         same(found, expected, ratio)
         assert found.unit_fixed
-    assert wanders.tracker._log_scale == pytest.approx(WANDER[FRAMES - 1] - 0.3, rel=1e-9)
+    assert wanders.tracker.map.place.log_scale == pytest.approx(WANDER[FRAMES - 1] - 0.3, rel=1e-9)
 
 
 def test_the_map_is_in_that_unit_too_with_what_left_it(plain, wanders):
@@ -176,11 +175,11 @@ def test_a_start_that_is_found_out_ends_in_one_unit(plain, started):
         same(found, expected, ratio, within=1e-4)
     # What this filter makes of the depths meanwhile changes by less than its units do.
     shares = np.array(places[1:FIXED]) / truth[1:FIXED] / ratio
-    units = np.asarray(started.tracker._slam.opening)
+    units = np.asarray(started.tracker.map.estimator.slam.opening)
     assert np.abs(np.log(shares)).max() < 0.25 < np.abs(np.diff(units)).max()
     # The log of the map's unit: what the filter takes for metres, by what is written.
     expected = WANDER[FRAMES - 1] - np.log(ratio)
-    assert started.tracker._log_scale == pytest.approx(expected, abs=1e-3)
+    assert started.tracker.map.place.log_scale == pytest.approx(expected, abs=1e-3)
 
 
 @pytest.mark.parametrize("after", [3, 8])
@@ -198,8 +197,8 @@ def test_a_loaded_tracker_keeps_the_unit_digit_by_digit(video, started, tmp_path
         np.testing.assert_array_equal(found.T_wc, expected.T_wc)
         np.testing.assert_array_equal(found.covariance, expected.covariance)
         assert (found.unit_fixed, found.status) == (expected.unit_fixed, expected.status)
-    assert loaded._log_unit == started.tracker._log_unit
-    assert loaded._log_scale == started.tracker._log_scale
+    assert loaded.map.place.log_unit == started.tracker.map.place.log_unit
+    assert loaded.map.place.log_scale == started.tracker.map.place.log_scale
 
 
 def test_a_map_begun_within_a_start_has_a_start_of_its_own(video):
@@ -215,8 +214,8 @@ def test_a_map_begun_within_a_start_has_a_start_of_its_own(video):
     assert results[-1].starts
     assert not results[-1].unit_fixed
     # A metre, as the filter takes it at the start of that map.
-    assert tracker._log_unit == pytest.approx(WANDER[0], rel=1e-12)
-    assert set(tracker._near) == {one.number for one in tracker.landmarks.values()}
+    assert tracker.map.place.log_unit == pytest.approx(WANDER[0], rel=1e-12)
+    assert set(tracker.map.place.near) == {one.number for one in tracker.landmarks.values()}
 
 
 def test_the_unit_is_that_in_which_the_mean_nearness_stays():
@@ -238,15 +237,12 @@ def test_the_unit_is_that_in_which_the_mean_nearness_stays():
 
 def test_the_unit_is_told_by_landmarks_that_were_found_again_until_it_is_fixed():
     """Landmark 8 was seen once: its depth is what the prior says, and says nothing."""
-    landmarks = {0: SimpleNamespace(number=7, found=2), 1: SimpleNamespace(number=8, found=0)}
-    tracker: Any = SimpleNamespace(
-        landmarks=landmarks, _near={7: 1.0, 8: 1.0}, _nearness=lambda: {7: 2.0, 8: 50.0},
-        _origin=PoseWithCovariance(np.eye(4)), _log_unit=0.3, _unit_fixed=False,
-    )  # fmt: skip
+    place = MapInWorld(log_unit=0.3, unit_fixed=False, near={7: 1.0, 8: 1.0})
     for fixed, units in ((False, 1), (True, 2), (True, 2)):
-        Tracker._locate(tracker, np.eye(4), np.zeros((6, 6)), 1.0, 0.0, fixed, begins=False)
-        assert tracker._log_unit == pytest.approx(0.3 + units * np.log(2.0), rel=1e-12)
-        assert tracker._unit_fixed is fixed
+        report = CameraReport(np.eye(4), np.zeros((6, 6)), *np.array([1.0, 0.0]), np.array(fixed))
+        place.follow(report, {7: 2.0, 8: 50.0}, [7])
+        assert place.log_unit == pytest.approx(0.3 + units * np.log(2.0), rel=1e-12)
+        assert place.unit_fixed is fixed
 
 
 def test_a_pose_in_another_unit_has_the_errors_in_that_unit():

@@ -1,0 +1,311 @@
+"""The filter as a tracker runs it: its state, and compiled programs for fixed numbers of features.
+
+Features beyond those that there are have no valid pixel, so that no frame compiles anything anew.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxslam._numerics.arrays import cast
+from jaxslam._runtime.programs import Program, in_background
+from jaxslam.filters.association import ASSOCIATIONS, Association, candidates
+from jaxslam.filters.ekf import EkfSlam, init_with_depths
+from jaxslam.filters.protocol import AbstractStaged, Scene
+from jaxslam.filters.readouts import (
+    camera_pose_in_unit,
+    landmarks_in_unit,
+    landmarks_on_sides,
+    log_unit,
+)
+from jaxslam.geometry import scaled
+from jaxslam.models.observations import Features, Status
+from jaxslam.models.sensors import Pinhole
+from jaxslam.tracking.matching import PEAKS
+from jaxslam.tracking.observations import Prediction
+from jaxslam.tracking.settings import TrackerSettings
+
+_NOWHERE = np.zeros(0, int), np.zeros((0, 2))
+
+State = Any
+"""Of the filter: a pytree that only the filter knows."""
+Report = tuple[jax.Array, ...]
+"""A `CameraReport`, as a program returns it."""
+
+
+class Predicted(NamedTuple):
+    """A state of the filter before a frame's measurements, and what it expects of them."""
+
+    dt: jax.Array
+    """Since the frame before, s."""
+    state: State
+    gaussian: State
+    """The same as one Gaussian."""
+    view: Prediction
+    """In the filter's own unit, from where the map begins."""
+
+
+class Correction(NamedTuple):
+    """What an update made of the features."""
+
+    used: np.ndarray
+    """Whether each was used."""
+    nis: np.ndarray
+    nis_dof: np.ndarray
+    status: np.ndarray
+    """A `Status`."""
+
+    @property
+    def failed(self) -> bool:
+        """Whether the covariance is not positive afterwards: then nothing was corrected."""
+        return bool(self.status >= Status.NOT_POSITIVE)
+
+
+class CameraReport(NamedTuple):
+    """Where the filter says that its camera is, in its own unit, from where the map begins."""
+
+    T_wc: np.ndarray
+    covariance: np.ndarray
+    log_scale: np.ndarray
+    """Mean of the log of that unit in metres, and its variance."""
+    variance: np.ndarray
+    unit_fixed: np.ndarray
+
+
+@dataclass
+class Estimator:
+    """A filter and its state, which the methods replace. All are called in 64 bits."""
+
+    slam: AbstractStaged
+    settings: TrackerSettings
+    state: State = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.slam = cast(self.slam, jnp.float64)
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin with a map without landmarks."""
+        self.state = _empty(self.slam, self.settings.capacity)
+
+    def predict(self, seconds: float | jax.Array) -> Predicted:
+        """What the filter expects so many seconds after the frame before. Changes nothing."""
+        # A number of Python's would be compiled into the program.
+        dt = jnp.asarray(seconds)
+        (state, gaussian), view = _predict(self.slam, self.state, dt)
+        return Predicted(dt, state, gaussian, Prediction(*jax.device_get(view)))
+
+    def believes(
+        self,
+        predicted: Predicted,
+        slots: Int[np.ndarray, " m"],
+        pixels: Float[np.ndarray, "m 2"],
+        wide: Association | None = None,
+    ) -> Bool[np.ndarray, " m"]:
+        """Which matches agree, by an association for `wide` ellipses or the settings' own."""
+        return np.asarray(_believed(*self._belief(predicted, slots, pixels, wide)))[: len(slots)]
+
+    def correct(
+        self,
+        predicted: Predicted,
+        slots: Int[np.ndarray, " k"] = _NOWHERE[0],
+        pixels: Float[np.ndarray, "k 2"] = _NOWHERE[1],
+    ) -> Correction:
+        """Update a prediction by pixels, NaN where there is none, and move into the new camera.
+        Changes nothing where that has `failed`."""
+        features = self._features(slots, pixels)
+        state, correction = _correct(self.slam, predicted.state, predicted.dt, features)
+        correction = Correction(*jax.device_get(correction))
+        if not correction.failed:
+            self.state = state
+        return correction._replace(used=correction.used[: len(slots)])
+
+    def begin(
+        self,
+        slots: Int[np.ndarray, " k"],
+        pixels: Float[np.ndarray, "k 2"],
+        depths: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> CameraReport:
+        """Begin a map with landmarks at these pixels; `depths` are means and σ of 1/z of all
+        features, where they are known."""
+        start = _begin_map
+        if depths is not None:
+            start = partial(_begin_known, jax.tree.map(jnp.asarray, depths))
+        self.state, report = start(self.slam, self.state, self._features(slots, pixels))
+        return CameraReport(*jax.device_get(report))
+
+    def renew(self, slots: Int[np.ndarray, " k"], pixels: Float[np.ndarray, "k 2"]) -> CameraReport:
+        """End the frame with new landmarks at these pixels."""
+        self.state, report = _renew_map(self.slam, self.state, self._features(slots, pixels))
+        return CameraReport(*jax.device_get(report))
+
+    def remove(self, slots: list[int]) -> None:
+        """Marginalise the landmarks in these slots."""
+        gone = np.isin(np.arange(self.settings.capacity), slots)
+        self.state = _remove(self.slam, self.state, jnp.asarray(gone))
+
+    def points(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
+        """Landmarks with their covariances, in the filter's own unit, from where the map begins."""
+        return jax.device_get(_world_points(self.slam, self.state, self.settings.capacity))
+
+    def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
+        """How the calibration is treated, and fx, fy, cx, cy with their covariance, pixels. None of
+        a filter without a pinhole camera."""
+        inner = self.slam.unwrapped
+        if not isinstance(inner, EkfSlam) or not isinstance(inner.sensor, Pinhole):
+            return None
+        mean, covariance = jax.device_get(_intrinsics(self.slam, inner, self.state))
+        return inner.calibration.name, mean, covariance
+
+    def compile(self, wide: list[Association]) -> list[threading.Thread]:
+        """Have all programs compiled by two threads, in the order in which they are needed."""
+        slam, state, dt = self.slam, self.state, jnp.zeros(())
+        new = self._features(*_NOWHERE)
+        gone = jnp.zeros(self.settings.capacity, bool)
+
+        def predicted() -> Predicted:
+            (ahead, gaussian), view = _predict.compile(slam, state, dt)
+            return Predicted(dt, ahead, gaussian, Prediction(*view))
+
+        def believed(association: Association | None) -> None:
+            _believed.compile(*self._belief(predicted(), *_NOWHERE, association))
+
+        return [
+            in_background(
+                lambda: _begin_map.compile(slam, state, new),
+                *(partial(believed, one) for one in (*wide, None)),
+                lambda: _renew_map.compile(slam, state, new),
+                self.camera,
+            ),
+            in_background(
+                lambda: _correct.compile(slam, predicted().state, dt, new),
+                lambda: _world_points.compile(slam, state, self.settings.capacity),
+                lambda: _remove.compile(slam, state, gone),
+            ),
+        ]
+
+    def _belief(
+        self,
+        predicted: Predicted,
+        slots: Int[np.ndarray, " m"],
+        pixels: Float[np.ndarray, "m 2"],
+        wide: Association | None,
+    ) -> tuple[Any, ...]:
+        """What `_believed` is given."""
+        s, several = self.settings, wide is not None
+        features = _padded(slots, pixels, s.wanted * (PEAKS if several else 1))
+        tolerance = jnp.asarray(s.tolerance * s.pixel_sigma)
+        association = ASSOCIATIONS[s.association] if wide is None else wide
+        return self.slam, association, several, *predicted[1:3], predicted.dt, features, tolerance
+
+    def _features(self, slots: Int[np.ndarray, " k"], pixels: Float[np.ndarray, "k 2"]) -> Features:
+        return _padded(slots, pixels, self.settings.wanted)
+
+
+def _padded(slots: Int[np.ndarray, " k"], pixels: Float[np.ndarray, "k 2"], size: int) -> Features:
+    """Features of fixed number; NaN pixels and padding are not valid."""
+    missing = size - len(slots)
+    valid = np.pad(np.isfinite(pixels).all(axis=1), (0, missing))
+    pixels = np.pad(np.nan_to_num(pixels), ((0, missing), (0, 0)))
+    return Features(
+        jnp.asarray(np.pad(slots, (0, missing))), jnp.asarray(pixels), jnp.asarray(valid)
+    )
+
+
+@Program
+def _empty(slam: AbstractStaged, capacity: int) -> State:
+    return slam.init(capacity)
+
+
+@Program
+def _remove(slam: AbstractStaged, state: State, gone: jax.Array) -> State:
+    return slam.remove(state, gone)
+
+
+@Program
+def _predict(
+    slam: AbstractStaged, state: State, dt: jax.Array
+) -> tuple[tuple[State, State], tuple[Any, ...]]:
+    """The predicted state, as it is and as one Gaussian, and the `Prediction` of that."""
+    slots = jnp.arange(slam.in_map(state).size)
+    state = slam.predict(state, dt)
+    one, gaussian = slam.gaussian(state, dt)
+    seen = one.predict_features(gaussian, dt, slots)
+    usable = seen.possible & jnp.isfinite(seen.covariance).all(axis=(1, 2))
+    metres = jnp.exp(log_unit(one, gaussian))
+    pose, omegas = scaled(seen.pose, 1 / metres).as_matrix(), metres * seen.omegas
+    sides = landmarks_on_sides(one, gaussian, slots)
+    prediction = seen.measured, seen.covariance, usable, pose, seen.points, omegas, sides
+    return (state, gaussian), prediction
+
+
+@Program
+def _believed(
+    slam: AbstractStaged,
+    association: Association,
+    wide: bool,
+    state: State,
+    gaussian: State,
+    dt: jax.Array,
+    features: Features,
+    tolerance: jax.Array,
+) -> Bool[jax.Array, " m"]:
+    one, _ = slam.gaussian(state, dt)
+    return association(candidates(one, gaussian, dt, features, tolerance, curved=wide))
+
+
+@Program
+def _correct(
+    slam: AbstractStaged, state: State, dt: jax.Array, features: Features
+) -> tuple[State, tuple[jax.Array, ...]]:
+    state, innovation = slam.update(state, dt, features)
+    state = slam.compose(state, dt)
+    return state, (innovation.used, innovation.nis, innovation.nis_dof, innovation.status)
+
+
+@Program
+def _begin_map(slam: AbstractStaged, state: State, new: Features) -> tuple[State, Report]:
+    state = slam.init(slam.in_map(state).size, new)
+    return state, _reported(slam, state)
+
+
+@Program
+def _begin_known(
+    depths: tuple[jax.Array, jax.Array], slam: EkfSlam, state: State, new: Features
+) -> tuple[State, Report]:
+    state = init_with_depths(slam, slam.in_map(state).size, new, depths)
+    return state, _reported(slam, state)
+
+
+@Program
+def _renew_map(slam: AbstractStaged, state: State, new: Features) -> tuple[State, Report]:
+    state = slam.close(state, new)
+    return state, _reported(slam, state)
+
+
+def _reported(slam: AbstractStaged, state: State) -> Report:
+    seen = camera_pose_in_unit(slam, state)
+    return seen.pose.as_matrix(), *seen[1:], slam.unit_fixed(state)
+
+
+@Program
+def _intrinsics(slam: AbstractStaged, inner: EkfSlam, state: State) -> tuple[jax.Array, jax.Array]:
+    def intrinsics(scene: Scene) -> jax.Array:
+        sensor = inner.calibration.sensor(inner.sensor, scene.core.calibration)
+        assert isinstance(sensor, Pinhole)
+        return sensor.camera.intrinsics
+
+    return slam.marginal(state, intrinsics)
+
+
+@Program
+def _world_points(slam: AbstractStaged, state: State, capacity: int) -> tuple[jax.Array, jax.Array]:
+    return landmarks_in_unit(slam, state, jnp.arange(capacity))

@@ -1,0 +1,77 @@
+"""What a tracker expects to see in a frame and what it saw: tables, a row for each landmark."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+
+class Prediction(NamedTuple):
+    """What the filter expects to see, a row for each slot of its map."""
+
+    pixels: np.ndarray
+    """(n, 2)."""
+    covariances: np.ndarray
+    """Of the innovations, (n, 2, 2)."""
+    usable: np.ndarray
+    """Whether the slot holds a landmark in front of the camera, (n,)."""
+    T_wc: np.ndarray
+    """The predicted pose, (4, 4)."""
+    points: np.ndarray
+    """Homogeneous points (X, ω) in the predicted camera: X (n, 3)."""
+    omegas: np.ndarray
+    sides: tuple[int, int] = (0, 0)
+    """How many landmarks are surely in front of the camera, and how many behind it."""
+
+
+class Observations(NamedTuple):
+    """The k landmarks that were searched in one frame, a row each."""
+
+    slots: np.ndarray = np.zeros(0, int)
+    """Of the filter's map, (k,)."""
+    predicted: np.ndarray = np.zeros((0, 2))
+    """Pixels where they were expected, (k, 2)."""
+    covariances: np.ndarray = np.zeros((0, 2, 2))
+    """Of the innovations, (k, 2, 2)."""
+    pixels: np.ndarray = np.zeros((0, 2))
+    """Where they were found, (k, 2); NaN where they were not."""
+    labels: np.ndarray = np.zeros(0, "U9")
+    """`matched`, `unmatched` or `outlier`, (k,): an outlier was found, and is not believed."""
+
+    @property
+    def matched(self) -> Bool[np.ndarray, " k"]:
+        """Whether each was found and is believed."""
+        return self.labels == "matched"
+
+    @property
+    def believed(self) -> Float[np.ndarray, "k 2"]:
+        """Pixels of what is matched, NaN of the others."""
+        return np.where(self.matched[:, None], self.pixels, np.nan)
+
+    @property
+    def places(self) -> Float[np.ndarray, "k 2"]:
+        """Where each is, as far as is known: where it was matched, or else expected."""
+        return np.where(self.matched[:, None], self.pixels, self.predicted)
+
+    def labelled(self, label: str) -> Observations:
+        """The rows of one label."""
+        return Observations(*(part[self.labels == label] for part in self))
+
+    def with_new(self, pixels: Float[np.ndarray, "j 2"]) -> Observations:
+        """The table and below it landmarks that begin at these pixels, `new`: nothing was expected
+        there, and they have no slots."""
+        count = len(pixels)
+        nowhere, nothing = np.full((count, 2), np.nan), np.full((count, 2, 2), np.nan)
+        new = Observations(np.full(count, -1), nowhere, nothing, pixels, np.full(count, "new"))
+        return Observations(*map(np.concatenate, zip(self, new, strict=True)))
+
+    def but_for(self, used: Bool[np.ndarray, " k"]) -> Observations:
+        """The table in which matches that the filter did not use are outliers."""
+        refused = self.matched & ~used
+        return self._replace(labels=np.where(refused, "outlier", self.labels))
+
+
+NOTHING = Observations()
+"""Of a frame that was not searched."""

@@ -1,0 +1,163 @@
+"""A file from which a tracker goes on: a header of words and numbers, and arrays by name.
+
+The arrays are those of a pytree: the filter's state, the poses, the landmarks by their slots, and
+those that left the map.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Protocol, TypeVar, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam._runtime.files import one_line, read_arrays, write_atomically
+from jaxslam.io.calibration import Calibration, as_fields, from_fields
+from jaxslam.tracking.landmarks import NO_POINTS, Points, joined, stacked, unstacked
+from jaxslam.tracking.map import Map
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
+from jaxslam.tracking.settings import TrackerSettings
+
+FORMAT = "jaxslam tracker 2"
+
+NUMBERS = {
+    "restarts": "map.number",
+    "reversed": "reversed",
+    "steps": "steps",
+    "_time": "time",
+    "_unmeasured": "unmeasured",
+    "_sigma_log_scale": "map.place.sigma_log_scale",
+    "_proven": "policy.proven",
+    "_elsewhere": "policy.elsewhere",
+    "_log_unit": "map.place.log_unit",
+    "_log_scale": "map.place.log_scale",
+    "_unit_fixed": "map.place.unit_fixed",
+}
+"""What a tracker counts and measures, as the file calls it, and where it keeps it."""
+
+
+@runtime_checkable
+class Resumable(Protocol):
+    """What is kept of a tracker, beside its `NUMBERS`."""
+
+    calibration: Calibration
+    settings: TrackerSettings
+    failed: Counter[str]
+    map: Map
+
+
+T = TypeVar("T", bound=Resumable)
+
+
+def save(path: str | Path, tracker: Resumable, filter_name: str | None) -> None:
+    """Write a tracker, whole or not at all, with the name of a filter of one's own."""
+    kept, place = tracker.map, tracker.map.place
+    numbers = {name: attrgetter(where)(tracker) for name, where in NUMBERS.items()}
+    header = {
+        "calibration": as_fields(tracker.calibration),
+        "settings": asdict(tracker.settings),
+        "filter": filter_name,
+        "numbers": {"created": kept.created, "deleted": kept.deleted, **numbers},
+        "failed": dict(tracker.failed),
+    }
+    poses = [(pose.T_wc, pose.covariance) for pose in (place.origin, place.camera)]
+    arrays = {
+        **leaves(kept.estimator.state, "state"),
+        **leaves(poses, "poses"),
+        **stacked(kept.landmarks),
+        **joined([NO_POINTS, *kept.finished])._asdict(),
+    }
+    write_record(path, header, arrays)
+
+
+def load(
+    path: str | Path, make: Callable[[Calibration, TrackerSettings], T], *, own_filter: bool
+) -> T:
+    """The tracker in a file, of those that one can `make`, with a filter of one's own or without.
+
+    Raises ValueError for a file that is none, or of another filter.
+    """
+    header, arrays = read_record(path)
+    if header.get("filter") is not None and not own_filter:
+        raise ValueError(f"{path}: was saved with a filter {header['filter']}; give that")
+    try:
+        settings = TrackerSettings(**header["settings"])
+    except TypeError:
+        raise ValueError(f"{path}: was saved by another version, with other settings") from None
+    except KeyError:
+        raise ValueError(f"{path}: is damaged: it has no settings") from None
+    try:
+        tracker = make(from_fields(header["calibration"]), settings)
+        _restore(tracker, header, arrays)
+    except (KeyError, TypeError, IndexError, AttributeError) as error:
+        raise ValueError(f"{path}: is damaged ({one_line(error)})") from None
+    return tracker
+
+
+def _restore(
+    tracker: Resumable, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+) -> None:
+    """Make of a new tracker what was saved."""
+    kept, place, numbers = tracker.map, tracker.map.place, header["numbers"]
+    for name, where in NUMBERS.items():
+        piece, _, attribute = where.rpartition(".")
+        setattr(attrgetter(piece)(tracker) if piece else tracker, attribute, numbers[name])
+    tracker.failed.update(header["failed"])
+    kept.landmarks.update(unstacked(arrays))
+    kept.finished.append(Points(*(arrays[name] for name in Points._fields)))
+    place.origin, place.camera = (
+        PoseWithCovariance(arrays[f"poses/{i}"], arrays[f"poses/{i + 1}"]) for i in (0, 2)
+    )
+    with jax.enable_x64(True):
+        kept.estimator.state = grown(kept.estimator.state, arrays, "state")
+        kept.measure_unit()
+
+
+def write_record(
+    path: str | Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+) -> None:
+    """Write both as one .npz archive, whole or not at all. Numbers keep their last digit."""
+    text = json.dumps({"format": FORMAT, **header}, allow_nan=False)
+    with write_atomically(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, allow_pickle=False, header=np.array(text), **arrays)
+
+
+def read_record(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays. Raises ValueError, naming the file, for one of another kind."""
+    arrays = read_arrays(path)
+    try:
+        header = json.loads(str(arrays.pop("header")))
+    except (ValueError, KeyError):
+        header = {}
+    if not isinstance(header, dict):
+        header = {}
+    if header.get("format") != FORMAT:
+        raise ValueError(f"{path}: is no tracker's file ({FORMAT})")
+    return header, arrays
+
+
+def leaves(tree: Any, name: str) -> dict[str, np.ndarray]:
+    """The arrays of a pytree by `name` and their places."""
+    return {f"{name}/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
+
+
+def grown(like: Any, arrays: Mapping[str, np.ndarray], name: str) -> Any:
+    """The pytree that `leaves` were of, built as `like`. Raises ValueError where that differs."""
+    old, structure = jax.tree.flatten(like)
+    prefix = f"{name}/"
+    found = [arrays.get(f"{prefix}{i}") for i in range(len(old))]
+    count = sum(key.startswith(prefix) for key in arrays)
+    same = [
+        new is not None and (new.shape, new.dtype) == (leaf.shape, leaf.dtype)
+        for new, leaf in zip(found, old, strict=True)
+    ]
+    if count != len(old) or not all(same):
+        raise ValueError("the state in the file is of another filter than the one that goes on")
+    return jax.tree.unflatten(structure, [jnp.asarray(new) for new in found])

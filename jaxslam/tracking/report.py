@@ -1,0 +1,148 @@
+"""What a tracker says of each frame, and its file."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam._runtime.files import write_atomically
+from jaxslam.io.source import Frame
+from jaxslam.tracking.map import Map
+from jaxslam.tracking.observations import NOTHING, Observations
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
+
+_COLUMNS = (
+    "frame", "time", "state", "map", "matches", "nis", "nis_dof",
+    "sigma_position", "sigma_orientation", "sigma_log_scale", "log_scale", "unit_fixed",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What became of one frame; k landmarks were searched, j created."""
+
+    index: int
+    time: float
+    camera: PoseWithCovariance
+    """The camera in the world, which is the first camera; of a later map, by way of its start. All
+    of a map in one unit (docs/gauge.md), and the covariance is of the pose in that unit."""
+    observations: Observations = NOTHING
+    """Of the landmarks searched."""
+    created: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    """Pixels of new landmarks, (j, 2)."""
+    nis: float = 0.0
+    nis_dof: int = 0
+    lost: bool = False
+    starts: bool = False
+    """Whether a map begins here; where it is not the first, the camera was lost too."""
+    map: int = 0
+    """Number of the map; each has a unit of length of its own."""
+    log_scale: float | None = None
+    """Log of the map's unit in metres as the filter now believes it to be, where it has a unit of
+    its own: e^log_scale times this pose is what it takes for metres."""
+    sigma_log_scale: float | None = None
+    """σ of that, where the filter is in doubt of it."""
+    unit_fixed: bool = True
+    """Whether the filter keeps its unit from here on. While a start is being found out it does not,
+    and the map's is carried over by the landmarks' distances, about which no covariance knows."""
+
+    @classmethod
+    def of(cls, frame: Frame, map: Map, observations: Observations = NOTHING, **found) -> Tracked:
+        """What became of a frame, after which the map is this one; `found` are other fields."""
+        place, doubt = map.place, map.place.sigma_log_scale
+        return cls(
+            frame.index,
+            frame.time,
+            place.camera,
+            observations,
+            map=map.number,
+            log_scale=None if doubt is None else place.log_scale,
+            sigma_log_scale=doubt,
+            unit_fixed=place.unit_fixed,
+            **found,
+        )
+
+    @property
+    def T_wc(self) -> np.ndarray:
+        """(4, 4)."""
+        return self.camera.T_wc
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(6, 6) in the right tangent of T_wc: position in camera axes, rotation."""
+        return self.camera.covariance
+
+    @property
+    def predicted(self) -> np.ndarray:
+        """Pixels of the landmarks searched, (k, 2)."""
+        return self.observations.predicted
+
+    @property
+    def search(self) -> np.ndarray:
+        """Their innovation covariances, (k, 2, 2)."""
+        return self.observations.covariances
+
+    @property
+    def matched(self) -> np.ndarray:
+        """Where they were found, (k, 2), NaN where they were not."""
+        return self.observations.pixels
+
+    @property
+    def status(self) -> list[str]:
+        """`matched`, `unmatched` or `outlier`, k of them."""
+        return self.observations.labels.tolist()
+
+    @property
+    def innovations(self) -> Float[np.ndarray, " f"]:
+        """Squared innovations `νᵀ S⁻¹ ν` of the f landmarks that were found, before any was tested
+        for agreement: of two degrees of freedom each where the prediction is right."""
+        seen = self.observations
+        found = np.isfinite(seen.pixels[:, 0])
+        off = (seen.pixels - seen.predicted)[found]
+        return np.einsum(
+            "ki,ki->k", off, np.linalg.solve(seen.covariances[found], off[..., None])[..., 0]
+        )
+
+    @property
+    def state(self) -> str:
+        """`start` of a map, `lost` or `tracked`."""
+        return "start" if self.starts else "lost" if self.lost else "tracked"
+
+
+def write_frames(path: str | Path, history: list[Tracked]) -> None:
+    """Write what became of every frame as CSV, whole or not at all.
+
+    `state` is `start` (of a map; where it is not the first, the camera is lost too), `tracked` or
+    `lost`, `map` the number of the map, from 0. σ of position (map units) and orientation (rad)
+    are roots of the summed variances of the three axes, zero in the first frame alone, which is
+    the world's, and of poses in the map's one unit. `log_scale` is the log of that unit in metres
+    as the filter believes it to be at this frame, and `sigma_log_scale` its σ; both empty where
+    the filter is in no doubt of it: then nobody has measured it. `unit_fixed` is 0 while the map's
+    start is being found out, when the filter changes its unit with every frame, else 1.
+    """
+    with write_atomically(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(_COLUMNS)
+        writer.writerows(_row(result) for result in history)
+
+
+def _row(result: Tracked) -> list[object]:
+    camera = result.camera
+    numbers = (
+        camera.sigma_position, camera.sigma_orientation, result.sigma_log_scale, result.log_scale,
+    )  # fmt: skip
+    return [
+        result.index,
+        f"{result.time:.9f}",
+        result.state,
+        result.map,
+        result.status.count("matched"),
+        f"{result.nis:.6g}",
+        result.nis_dof,
+        *("" if number is None else f"{number:.6g}" for number in numbers),
+        int(result.unit_fixed),
+    ]

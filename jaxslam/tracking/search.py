@@ -1,0 +1,105 @@
+"""Active search: the landmarks that a frame may show, and the places that look like them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from jaxslam.io.calibration import Calibration
+from jaxslam.tracking.landmarks import Landmark
+from jaxslam.tracking.map import in_view
+from jaxslam.tracking.matching import Matches, match_patches
+from jaxslam.tracking.observations import Observations, Prediction
+from jaxslam.tracking.patches import WINDOW
+from jaxslam.tracking.settings import TrackerSettings
+
+_MOST_SCALED = 2.0
+"""A patch that looks larger or smaller than at first by more is not like itself any more."""
+
+
+def search(
+    image: UInt8[np.ndarray, "h w"],
+    landmarks: Mapping[int, Landmark],
+    prediction: Prediction,
+    calibration: Calibration,
+    settings: TrackerSettings,
+    *,
+    several: bool,
+) -> tuple[Observations, Matches]:
+    """The landmarks searched, none of them matched yet, and the places found in their ellipses.
+
+    A match's `owner` is the row of its landmark; `several` places are told of a wide ellipse where
+    that is asked.
+    """
+    slots, affines = to_search(landmarks, prediction, calibration, settings)
+    seen = Observations(
+        slots,
+        prediction.pixels[slots],
+        prediction.covariances[slots],
+        np.full((len(slots), 2), np.nan),
+        np.full(len(slots), "unmatched"),
+    )
+    warped = [
+        landmarks[slot].patch.warped(affine) for slot, affine in zip(slots, affines, strict=True)
+    ]
+    templates = np.array(warped, np.float32).reshape(-1, WINDOW, WINDOW)
+    return seen, match_patches(image, templates, seen.predicted, seen.covariances, several=several)
+
+
+def to_search(
+    landmarks: Mapping[int, Landmark],
+    prediction: Prediction,
+    calibration: Calibration,
+    settings: TrackerSettings,
+) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k 2 2"]]:
+    """Slots to search, and how the picture around each changed since its first view.
+
+    In front, in the picture, with a bearing that the lens can see, from where they still look
+    alike. Should there be more than can be measured, those come first that were found when they
+    were searched last, of them the longest known.
+    """
+    s, size = settings, np.array([calibration.width, calibration.height])
+    pixels = prediction.pixels
+    inside = np.all((pixels >= s.border) & (pixels < size - s.border), axis=1)
+    slots = np.flatnonzero(prediction.usable & inside)
+    affines = changes_of_view(landmarks, prediction, slots, calibration)
+    zoomed = np.abs(np.log(np.clip(np.linalg.det(affines), 1e-6, 1e6)))
+    alike = [
+        i
+        for i in np.flatnonzero(zoomed < 2 * np.log(_MOST_SCALED))
+        if landmarks[slots[i]].patch.covers(affines[i])
+    ]
+    absent = ~in_view(landmarks, slots, s)
+    alike.sort(key=lambda i: (absent[i], landmarks[slots[i]].number))
+    order = np.array(alike[: s.wanted], int)
+    return slots[order], affines[order]
+
+
+def changes_of_view(
+    landmarks: Mapping[int, Landmark],
+    prediction: Prediction,
+    slots: Int[np.ndarray, " k"],
+    calibration: Calibration,
+) -> Float[np.ndarray, "k 2 2"]:
+    """How the picture around each landmark changed since its first view; zero where it cannot
+    be told.
+
+    The surface is taken to face the first camera; distortion is neglected, being nearly the
+    same over a patch.
+    """
+    first = np.array([landmarks[slot].first_camera for slot in slots]).reshape(-1, 4, 4)
+    T_first_now = np.linalg.inv(first) @ prediction.T_wc
+    X, omega = prediction.points[slots], prediction.omegas[slots]
+    start = np.einsum("kij,kj->ki", T_first_now[:, :3, :3], X)
+    start += omega[:, None] * T_first_now[:, :3, 3]
+    ahead = np.where(np.abs(start[:, 2:]) < 1e-9, 1e-9, start[:, 2:])
+    # One pixel to the right and down in the first view, on the plane through the point.
+    step = ahead[:, :, None] * np.eye(3)[None, :2] / [[[calibration.fx]]]
+    moved = X[:, None] + np.einsum("kji,kaj->kai", T_first_now[:, :3, :3], step)
+    pixel = X[:, :2] / X[:, 2:]
+    focal = np.array([calibration.fx, calibration.fy])
+    affine = (moved[..., :2] / moved[..., 2:] - pixel[:, None]) * focal
+    affine = np.swapaxes(affine, 1, 2)
+    return np.where(np.isfinite(affine).all(axis=(1, 2), keepdims=True), affine, 0.0)

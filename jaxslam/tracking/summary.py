@@ -1,0 +1,241 @@
+"""The summary of a tracked video: how well it went, of what, and how far from a reference."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
+from scipy.stats import chi2
+
+from jaxslam._version import __version__
+from jaxslam.io.calibration import INTRINSICS, as_fields
+from jaxslam.io.source import Source, Trajectory
+from jaxslam.tracking.landmarks import Points
+from jaxslam.tracking.report import Tracked
+from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.target import as_summary
+from jaxslam.tracking.tracker import Tracker
+from jaxslam.tracking.trajectory import (
+    absolute_trajectory_error,
+    alignment,
+    relative_pose_error,
+)
+
+SCHEMA = 1
+WARM_UP = 3
+"""Frames in which functions are compiled; they count in `seconds.start`, not in the quantiles."""
+TOO_SURE = (
+    "the intrinsics are estimated: sigma of them, and of poses with them, is known to be too small"
+)
+"""What is to be said wherever it stands."""
+_KNOWN_DEPTH = 0.3
+"""A point is put into the map where its σ is below this share of its distance."""
+
+Summary = dict[str, Any]
+"""As JSON has it."""
+
+
+def summarised(
+    source: Source, tracker: Tracker, history: Sequence[Tracked], seconds: list[float]
+) -> Summary:
+    lost = sum(result.lost for result in history)
+    updates = history[1:]
+    dof = sum(result.nis_dof for result in updates)
+    count = max(len(updates), 1)
+    later = seconds[WARM_UP:] or seconds
+    summary = {
+        "schema": SCHEMA,
+        "version": __version__,
+        "source": source.name,
+        "filter": tracker.filter_name,
+        "settings": asdict(tracker.settings),
+        "calibration": _calibration(tracker),
+        "frames": len(history),
+        "tracked": len(history) - lost,
+        "lost": lost,
+        "restarts": tracker.restarts,
+        "maps": tracker.restarts + 1,
+        "units": _units(history),
+        "failed_updates": dict(tracker.failed),
+        "reversed_tests": tracker.reversed,
+        "landmarks": {
+            "mean": float(np.mean([len(result.status) for result in updates] or [0])),
+            "created": tracker.created,
+            "deleted": tracker.deleted,
+        },
+        "matches_per_frame": sum(result.nis_dof for result in updates) / 2 / count,
+        "nis": {"mean": sum(result.nis for result in updates) / count, "dof": dof / count},
+        "nis_ungated": _ungated(updates),
+        "seconds": {
+            "total": sum(seconds),
+            "start": sum(seconds[:WARM_UP]),
+            "per_frame_median": float(np.median(later)),
+            "per_frame_p99": float(np.quantile(later, 0.99)),
+        },
+    }
+    if tracker.target is not None and tracker.sighting is not None:
+        summary["target"] = as_summary(tracker.target, tracker.sighting)
+    if tracker.restarts:
+        summary["log_scale_sigma_between_maps"] = _scale_between_maps(tracker.settings)
+    return summary | _errors(source, history)
+
+
+def describe(summary: Summary) -> str:
+    """The summary in a few lines."""
+    nis, seconds = summary["nis"], summary["seconds"]
+    per_dof = nis["mean"] / nis["dof"] if nis["dof"] else float("nan")
+    lines = [
+        f"{summary['source']}: {summary['tracked']} of {summary['frames']} frames tracked, "
+        f"{summary['matches_per_frame']:.1f} matches a frame, NIS per dof {per_dof:.2f}",
+        f"{seconds['per_frame_median'] * 1e3:.0f} ms a frame (median), "
+        f"{seconds['total']:.1f} s in all, {seconds['start']:.1f} s of them to start",
+    ]
+    if summary["maps"] > 1:
+        lines.append(
+            f"{summary['maps']} maps, each in a unit of its own: frames.csv says where they begin"
+        )
+    lines += [_unit_line(unit) for unit in summary["units"] if unit["sigma_log_scale"] is not None]
+    camera = summary["calibration"]
+    if "estimated" in camera:
+        pairs = ((key, camera["estimated"][key], camera["sigma"][key]) for key in INTRINSICS)
+        lines.append("camera: " + ", ".join(f"{k} {x:.1f} ± {s:.1f}" for k, x, s in pairs))
+        lines.append(camera["caveat"])
+    if "ate" in summary:
+        ate = summary["ate"]
+        share = ate["rmse"] / ate["path_length"] if ate["path_length"] else float("nan")
+        lines.append(
+            f"absolute trajectory error after {ate['alignment']} alignment: {ate['rmse']:.4f} on "
+            f"a path of {ate['path_length']:.2f}, {share:.2%} (a straight line's "
+            f"{ate['straight_line']:.4f}); sign {ate['sign']:.2f}, "
+            f"orientation {ate['orientation_rmse']:.2f}°"
+        )
+    if "no_ate" in summary:
+        lines.append(f"no trajectory error: {summary['no_ate']}")
+    return "\n".join(lines)
+
+
+def known_points(tracker: Tracker, history: Sequence[Tracked]) -> Points:
+    """The landmarks whose depth became known in their maps."""
+    landmarks = tracker.points()
+    with np.errstate(invalid="ignore"):  # of unknown depth, a variance can be anything
+        sigma = np.sqrt(np.trace(landmarks.in_map, axis1=1, axis2=2))
+        known = np.isfinite(sigma) & (sigma < _KNOWN_DEPTH * _distances(landmarks, history))
+    return landmarks.only(known)
+
+
+def _distances(landmarks: Points, history: Sequence[Tracked]) -> Float[np.ndarray, " n"]:
+    """To the nearest camera of their map; zero of a landmark that is nowhere."""
+    cameras = trajectory_of(history).T_wc[:, :3, 3]
+    maps = np.array([result.map for result in history])
+    distances = np.zeros(len(landmarks.numbers))
+    somewhere = np.isfinite(landmarks.points).all(axis=1)
+    for number in np.unique(landmarks.maps):
+        those = somewhere & (landmarks.maps == number)
+        distances[those] = KDTree(cameras[maps == number]).query(landmarks.points[those])[0]
+    return distances
+
+
+def trajectory_of(history: Sequence[Tracked]) -> Trajectory:
+    """The poses of the frames at their times."""
+    times = np.array([result.time for result in history])
+    return Trajectory(times, np.stack([result.T_wc for result in history]))
+
+
+def reference_in_map(source: Source, history: Sequence[Tracked]) -> np.ndarray | None:
+    """What of the reference is of the time of these frames, (m, 4, 4), aligned as for its error."""
+    if source.reference is None:
+        return None
+    trajectory, (times, T_wc) = trajectory_of(history), source.reference
+    try:
+        there = alignment(*trajectory, *source.reference)
+    except ValueError:
+        return None
+    same = (times >= trajectory.times[0]) & (times <= trajectory.times[-1])
+    return there.inverse().moved(T_wc[same])
+
+
+def _scale_between_maps(settings: TrackerSettings) -> float:
+    """σ of the logarithm of the ratio of two maps' units, as far as the prior on depth tells.
+
+    A unit is known as well as what all depths of a scene have in common: at the worst as one of
+    them, σ/ρ of its inverse depth, in each of the two maps.
+    """
+    depth = settings.depth
+    return math.sqrt(2) * float(depth.sigma / depth.mean)
+
+
+def _units(history: Sequence[Tracked]) -> list[Summary]:
+    """Of every map: the frame from which on the filter's unit was fixed, and the log of the map's
+    unit in metres as it is believed at the map's end, with σ; null where there is no doubt."""
+    units = []
+    for number in range(history[-1].map + 1):
+        of_map = [result for result in history if result.map == number]
+        fixed = (result.index for result in of_map if result.unit_fixed)
+        last = of_map[-1]
+        units.append(
+            {
+                "map": number,
+                "fixed_at": next(fixed, None),
+                "log_scale": last.log_scale,
+                "sigma_log_scale": last.sigma_log_scale,
+            }
+        )
+    return units
+
+
+def _unit_line(unit: Summary) -> str:
+    """What is known of a map's unit."""
+    length, times = math.exp(unit["log_scale"]), math.exp(unit["sigma_log_scale"])
+    return (
+        f"map {unit['map']}: one unit of length throughout, by the prior on depth {length:.2f} m, "
+        f"give or take a factor of {times:.2g} (1 sigma)"
+    )
+
+
+def _calibration(tracker: Tracker) -> Summary:
+    """What the camera was taken for, and where it is estimated, what it is in the end with σ."""
+    camera = tracker.camera()
+    given = as_fields(tracker.calibration)
+    if camera is None:
+        return {"given": given}
+    treatment, mean, covariance = camera
+    result = {"treatment": treatment, "given": given}
+    if treatment == "estimated":
+        sigma = np.sqrt(np.diagonal(covariance))
+        result["estimated"] = dict(zip(INTRINSICS, mean.tolist(), strict=True))
+        result["sigma"] = dict(zip(INTRINSICS, sigma.tolist(), strict=True))
+        result["caveat"] = f"{TOO_SURE}; docs/own-video.md says how much"
+    return result
+
+
+def _ungated(updates: Sequence[Tracked]) -> Summary:
+    """What the predictions are worth: squared innovations of all that was found, wrong matches and
+    all, by the median of χ² of 2 degrees of freedom, and the share beyond its 95 %."""
+    squared = np.concatenate([np.zeros(0), *(result.innovations for result in updates)])
+    if not len(squared):
+        return {"matches": 0, "median": None, "beyond95": None}
+    return {
+        "matches": len(squared),
+        "median": float(np.median(squared) / chi2.median(2)),
+        "beyond95": float(np.mean(squared > chi2.ppf(0.95, 2))),
+    }
+
+
+def _errors(source: Source, history: Sequence[Tracked]) -> Summary:
+    """The trajectory error, where there is a reference, or why it cannot be told."""
+    if source.reference is None:
+        return {}
+    trajectories = *trajectory_of(history), *source.reference
+    try:
+        errors: Summary = {"ate": absolute_trajectory_error(*trajectories)}
+    except ValueError as error:  # of few frames, or of a camera that stood still
+        return {"no_ate": str(error)}
+    with suppress(ValueError):  # of less than a second
+        errors["rpe"] = relative_pose_error(*trajectories)
+    return errors
