@@ -25,7 +25,10 @@ from scipy.stats import chi2
 from starts import LIE
 
 from jaxslam._runtime.files import write_json
+from jaxslam.evaluation.convention import errors_beyond_scale
 from jaxslam.io.source import Frame, Source
+from jaxslam.statistics.beyond_scale import one_scale
+from jaxslam.tracking.policy import Policy
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import (
     add_noise,
@@ -35,7 +38,7 @@ from jaxslam.tracking.synthetic import (
     synthetic_source,
 )
 from jaxslam.tracking.tracker import Tracker
-from jaxslam.tracking.trajectory import nees_beyond_scale
+from jaxslam.tracking.trajectory import TRACKED
 
 RATE = 30
 MARK = "<!-- by disturbances.py -->"
@@ -54,28 +57,34 @@ class Disturbed(NamedTuple):
     """Share of the matches of which the place is any other in the ellipse."""
 
 
-class Confused(Tracker):
-    """A tracker whose search errs."""
+@dataclass
+class Confused(Policy):
+    """A policy whose search errs in some frames, as often as its share says."""
 
-    def confuse(self, during: range, share: float, seed: int) -> None:
-        """From now on, in these frames, as often as that."""
-        self._during, self._share, self._rng = during, share, np.random.default_rng(seed)
+    during: range = range(0)
+    share: float = 0.0
+    seed: int = 0
+    frame: int = 0
+    """The one that comes."""
 
-    def _search(self, frame, prediction, slots, affines):
-        found = super()._search(frame, prediction, slots, affines)
-        if frame.index not in self._during:
-            return found
-        wrong = self._rng.random(len(found)) < self._share
-        return [
-            [self._elsewhere_of(m, prediction, slot) for m in places] if w else places
-            for places, w, slot in zip(found, wrong, slots, strict=True)
-        ]
+    def __post_init__(self) -> None:
+        self._rng = np.random.default_rng(self.seed)
 
-    def _elsewhere_of(self, match, prediction, slot):
+    def judged(self, seen, matches, landmarks, agree, *, lost):
+        """With wrong places in that of the true ones."""
+        if self.frame in self.during:
+            wrong = self._rng.random(len(seen.slots)) < self.share
+            pixels = [
+                self._elsewhere(seen, owner) if wrong[owner] else pixel
+                for owner, pixel in zip(matches.owner, matches.pixels, strict=True)
+            ]
+            matches = matches._replace(pixels=np.array(pixels).reshape(-1, 2))
+        return super().judged(seen, matches, landmarks, agree, lost=lost)
+
+    def _elsewhere(self, seen, row):
         angle, radius = self._rng.uniform(0, 2 * np.pi), 3 * np.sqrt(self._rng.random())
         aside = radius * np.array([np.cos(angle), np.sin(angle)])
-        root = np.linalg.cholesky(prediction.covariances[slot])
-        return replace(match, pixel=prediction.pixels[slot] + root @ aside)
+        return seen.predicted[row] + np.linalg.cholesky(seen.covariances[row]) @ aside
 
 
 def black(seed: int) -> Disturbed:
@@ -219,9 +228,14 @@ def _rendered(T_wc: np.ndarray, seed: int) -> Iterator[Frame]:
 
 def measure(disturbed: Disturbed, settings: TrackerSettings, seed: int) -> dict[str, float]:
     """What becomes of a tracker: shares of the frames meanwhile, and in the last second."""
-    tracker = Confused(_source(1, seed).calibration, settings)
-    tracker.confuse(disturbed.during if disturbed.wrong else range(0), disturbed.wrong, seed)
-    results = [tracker.track(frame) for frame in disturbed.frames]
+    tracker = Tracker(_source(1, seed).calibration, settings)
+    own, during = tracker.policy, disturbed.during if disturbed.wrong else range(0)
+    pieces = own.calibration, own.settings, own.ambiguous_start
+    tracker.policy = policy = Confused(*pieces, during=during, share=disturbed.wrong, seed=seed)
+    results = []
+    for frame in disturbed.frames:
+        policy.frame = frame.index
+        results.append(tracker.track(frame))
     tracked = np.array([result.state == "tracked" for result in results])
     believed = tracked & [result.map == 0 for result in results]
     index = np.arange(len(results))
@@ -230,8 +244,9 @@ def measure(disturbed: Disturbed, settings: TrackerSettings, seed: int) -> dict[
     known = np.flatnonzero(believed & ~elsewhere)
     poses, covariances = ([getattr(results[k], x) for k in known] for x in ("T_wc", "covariance"))
     fixed = np.array([results[k].unit_fixed for k in known])
-    stacked = np.stack(poses), np.stack(covariances), disturbed.T_wc[known]
-    nees, dof = nees_beyond_scale(*stacked, fixed).nees, np.where(fixed, 6, 5)
+    stacked = np.stack(poses), disturbed.T_wc[known], np.stack(covariances)
+    best = errors_beyond_scale(TRACKED, *stacked)
+    nees, dof = one_scale(*best, fixed).nees, np.where(fixed, 6, 5)
     lies[known] = chi2.sf(nees, dof) < LIE
     during, after = np.isin(index, disturbed.during), index >= disturbed.during.stop
     late = after & (index >= len(index) - RATE)

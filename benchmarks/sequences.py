@@ -102,8 +102,10 @@ def _beyond_scale(source, folder: Path) -> tuple[dict[str, float], list[float] |
     import numpy as np
 
     from jaxslam.evaluation import read_covariances
+    from jaxslam.evaluation.convention import errors_beyond_scale
     from jaxslam.io.tum import read_tum
-    from jaxslam.tracking.trajectory import nees_beyond_scale
+    from jaxslam.statistics.beyond_scale import one_scale
+    from jaxslam.tracking.trajectory import TRACKED
 
     times, T_wc = read_tum(folder / "trajectory.txt")
     covariances = read_covariances(folder / "covariance.txt").covariances
@@ -116,8 +118,9 @@ def _beyond_scale(source, folder: Path) -> tuple[dict[str, float], list[float] |
         return {}, None
     truth = reference.T_wc[[np.argmin(np.abs(reference.times - time)) for time in times]]
     truth = np.linalg.inv(truth[0]) @ truth
-    found = nees_beyond_scale(T_wc[first], covariances[first], truth[first])
-    drift, normalised = found.drift, found.drift / found.sigma
+    best = errors_beyond_scale(TRACKED, T_wc[first], truth[first], covariances[first])
+    found = one_scale(*best)
+    drift, normalised = found.drift, found.drift / np.asarray(best.sigma)
     nees = dict(zip(np.flatnonzero(first).tolist(), found.nees / 6, strict=True))
     at = {str(frame): float(f"{nees[frame]:.3g}") for frame in FRAMES if frame in nees}
     at["mean"] = float(f"{np.mean(found.nees / 6):.3g}")

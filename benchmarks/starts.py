@@ -24,10 +24,12 @@ from pages import write_table
 from scipy.stats import chi2, norm
 
 from jaxslam._runtime.files import write_json
+from jaxslam.evaluation.convention import errors_beyond_scale
 from jaxslam.io.opening import open_source
+from jaxslam.statistics.beyond_scale import one_scale
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.tracker import Tracker
-from jaxslam.tracking.trajectory import absolute_trajectory_error, nees_beyond_scale
+from jaxslam.tracking.trajectory import TRACKED, absolute_trajectory_error
 
 REFERENCE = 0.003, np.radians(0.06)
 """σ of the reference's position, of the farthest distance from the start, and orientation."""
@@ -95,7 +97,8 @@ def outcome(source, frames, settings: TrackerSettings) -> Outcome:
     far = np.linalg.norm(T_wc[first, :3, 3], axis=1).max()
     floor = np.diag([(REFERENCE[0] * far) ** 2] * 3 + [REFERENCE[1] ** 2] * 3)
     fixed = np.array([results[k].unit_fixed for k in looked])
-    nees = nees_beyond_scale(T_wc[looked], P[looked] + floor, truth[looked], fixed).nees
+    best = errors_beyond_scale(TRACKED, T_wc[looked], truth[looked], P[looked] + floor)
+    nees = one_scale(*best, fixed).nees
     dof = np.where(fixed, 6, 5)
     return whole._replace(
         sign=ate["sign"],

@@ -18,13 +18,13 @@ from jaxslam.filters.readouts import camera_pose, landmarks_in_camera, landmarks
 from jaxslam.filters.registry import FILTERS
 from jaxslam.geometry import PLANAR, difference, exp, identity, joined, tangent_dim
 from jaxslam.landmarks import IMAGE_PLANE, INVERSE_SCALING
+from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.camera import Camera
 from jaxslam.models.coordinates import KEYFRAME_PARALLAX, KEYFRAME_TURN, keyframe_due
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Features
 from jaxslam.models.sensors import Pinhole
-from jaxslam.simulation.pieces import TREATMENTS
 
 CAPACITY, STEPS, DT = 5, 10, 0.1
 # Landmark of each slot: the frame in which it is new, and that after which it is removed.

@@ -39,12 +39,11 @@ from jaxslam.landmarks import (
     LANDMARKS,
     PARALLAX_ANGLE,
 )
-from jaxslam.models.calibration import Estimated
+from jaxslam.models.calibration import TREATMENTS, Estimated
 from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.models.observations import Features
 from jaxslam.models.scale import ScaleGauge
 from jaxslam.simulation import scenario
-from jaxslam.simulation.pieces import TREATMENTS
 
 DT = 0.1
 

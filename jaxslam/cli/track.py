@@ -12,7 +12,7 @@ from jaxslam.cli.extra import one_line_warnings, require_vision
 from jaxslam.filters.association import ASSOCIATIONS
 from jaxslam.filters.registry import FILTERS
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.simulation.scenario import CALIBRATIONS
+from jaxslam.models.calibration import TREATMENTS
 from jaxslam.tracking.settings import METRIC, TrackerSettings
 
 _COMPILING = "compiling …"
@@ -64,7 +64,7 @@ class TrackOptions:
     calibration_treatment: Annotated[
         str | None,
         tyro.conf.arg(
-            help=f"How the filter treats it: {', '.join(CALIBRATIONS)}. By default one that a "
+            help=f"How the filter treats it: {', '.join(TREATMENTS)}. By default one that a "
             "field of view tells, or that is guessed, is estimated, and any other is known."
         ),
     ] = TrackerSettings.calibration

@@ -31,14 +31,13 @@ from jaxslam.filters.wrappers.fixed_lag import LAG, FixedLag, iterated
 from jaxslam.filters.wrappers.gated import Gated
 from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
 from jaxslam.landmarks import LANDMARKS, Parametrization
-from jaxslam.models.calibration import AbstractCalibration
+from jaxslam.models.calibration import TREATMENTS, AbstractCalibration
 from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.scale import ScaleGauge
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation.pieces import (
-    TREATMENTS,
     calibration_sigma_of,
     depth_of,
     motion_of,

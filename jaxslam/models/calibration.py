@@ -96,3 +96,12 @@ def check_calibration(treatment: AbstractCalibration, sensor: AbstractSensor) ->
             f"the calibration {name} with {count[0]} numbers does not fit the sensor "
             f"{type(sensor).__name__}: {error}"
         ) from None
+
+
+TREATMENTS = {
+    "white": White,
+    "consider": Considered,
+    "estimated": Estimated,
+    "known": lambda sigma: Known(),
+}
+"""Treatments of a calibration whose numbers have these σ."""

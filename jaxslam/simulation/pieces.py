@@ -6,20 +6,11 @@ from dataclasses import replace
 from typing import Any
 
 from jaxslam._numerics.arrays import numbers
-from jaxslam.models.calibration import Considered, Estimated, Known, White
 from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import AbstractMotion, ConstantVelocity, Odometry
 from jaxslam.models.sensors import AbstractSensor, Pinhole, Position
 from jaxslam.simulation.scenario import Scenario
-
-TREATMENTS = {
-    "white": White,
-    "consider": Considered,
-    "estimated": Estimated,
-    "known": lambda sigma: Known(),
-}
-"""Treatments of a calibration whose numbers have these σ."""
 
 
 def motion_of(scenario: Scenario) -> AbstractMotion:

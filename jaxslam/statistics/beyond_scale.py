@@ -100,10 +100,10 @@ class OneScale(NamedTuple):
 
 
 def one_scale(
-    nees: Float[np.ndarray, "*runs steps"],
-    log_scale: Float[np.ndarray, "*runs steps"],
-    sigma: Float[np.ndarray, "*runs steps"],
-    fixed: Bool[np.ndarray, "*runs steps"] | None = None,
+    nees: Float[AnyArray, "*runs steps"],
+    log_scale: Float[AnyArray, "*runs steps"],
+    sigma: Float[AnyArray, "*runs steps"],
+    fixed: Bool[AnyArray, "*runs steps"] | None = None,
 ) -> OneScale:
     """NEES at the one scale of a run that explains all of its poses best, of a `BeyondScale` each.
 

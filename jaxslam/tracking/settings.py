@@ -10,12 +10,11 @@ from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.registry import FILTERS, FROM_REST, make_filter
 from jaxslam.io.calibration import Calibration
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.models.calibration import AbstractCalibration
+from jaxslam.models.calibration import TREATMENTS, AbstractCalibration
 from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.sensors import Pinhole
-from jaxslam.simulation.pieces import TREATMENTS
 
 METRIC = "world"
 """The filter where a target says how long a metre is."""

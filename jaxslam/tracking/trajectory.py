@@ -16,9 +16,8 @@ from jaxslam.evaluation.alignment import (
     associated,
     similarity,
 )
-from jaxslam.evaluation.convention import Convention, errors_beyond_scale
+from jaxslam.evaluation.convention import Convention
 from jaxslam.io.tum import write_tum
-from jaxslam.statistics.beyond_scale import one_scale
 
 TRACKED = Convention("split", "body")
 """The error whose covariances are written: position in the camera's axes, rotation vector."""
@@ -80,41 +79,6 @@ def write_covariances(
     remark = "; ".join(filter(None, [f"{_UNITS}, taken as one", scale, caveat]))
     covariance_text.write_covariances(
         path, times, covariances, convention, length="map", remark=remark
-    )
-
-
-class BeyondScale(NamedTuple):
-    """Of n poses of a map against a reference of another scale."""
-
-    nees: Float[np.ndarray, " n"]
-    """NEES at the map's scale: 6 degrees of freedom each, less one for the map."""
-    scale: Float[np.ndarray, " n"]
-    """The scale of the reference's position that explains this pose alone best."""
-    sigma: Float[np.ndarray, " n"]
-    """What is claimed of the log of that."""
-    drift: Float[np.ndarray, " n"]
-    """Log of that by the map's; NaN where it has no part in it."""
-
-
-def nees_beyond_scale(
-    T_wc: ArrayLike, covariances: ArrayLike, reference: ArrayLike, fixed: ArrayLike | None = None
-) -> BeyondScale:
-    """NEES of poses (n, 4, 4) of one map at the one scale of the reference that explains them best:
-    `consistency.one_scale` of the `TRACKED` error.
-
-    Poses whose unit is not `fixed` (n,) are at their own best scale, with a degree of freedom less,
-    and have no part in the map's.
-    """
-    arrays = (np.asarray(x, float) for x in (T_wc, reference, covariances))
-    best = errors_beyond_scale(TRACKED, *arrays)
-    one = one_scale(
-        np.asarray(best.nees),
-        np.asarray(best.log_scale),
-        np.asarray(best.sigma),
-        None if fixed is None else np.asarray(fixed, bool),
-    )
-    return BeyondScale(
-        one.nees, np.exp(np.asarray(best.log_scale)), np.asarray(best.sigma), one.drift
     )
 
 

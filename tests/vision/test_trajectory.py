@@ -7,12 +7,13 @@ from scipy.spatial.transform import Rotation
 from jaxslam._runtime.files import write_atomically
 from jaxslam.evaluation import pose_errors, read_covariances
 from jaxslam.evaluation.arrays import exactly_known
+from jaxslam.evaluation.convention import errors_beyond_scale
 from jaxslam.io.tum import poses, read_tum, write_tum
+from jaxslam.statistics.beyond_scale import one_scale
 from jaxslam.tracking.trajectory import (
     TRACKED,
     absolute_trajectory_error,
     alignment,
-    nees_beyond_scale,
     relative_pose_error,
     write_covariances,
     write_trajectory,
@@ -340,6 +341,12 @@ def test_as_many_covariances_as_times(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def nees_beyond_scale(T_wc, covariances, reference, fixed=None):
+    """Of tracked poses: each at its own best scale, and all at the one of those that are fixed."""
+    best = errors_beyond_scale(TRACKED, T_wc, reference, covariances)
+    return one_scale(*best, fixed), np.exp(best.log_scale), np.asarray(best.sigma)
+
+
 def test_beyond_scale_is_the_least_nees_over_the_one_scale_of_the_reference():
     rng = np.random.default_rng(0)
     T = np.tile(np.eye(4), (5, 1, 1))
@@ -349,7 +356,7 @@ def test_beyond_scale_is_the_least_nees_over_the_one_scale_of_the_reference():
     P = root @ np.swapaxes(root, 1, 2)
     reference = T.copy()
     reference[:, :3, 3] = 3.0 * (T[:, :3, 3] + 0.05 * rng.normal(size=(5, 3)))
-    found = nees_beyond_scale(T, P, reference)
+    found, scale, sigma = nees_beyond_scale(T, P, reference)
 
     def at(s):
         scaled = reference.copy()
@@ -357,20 +364,18 @@ def test_beyond_scale_is_the_least_nees_over_the_one_scale_of_the_reference():
         return pose_nees(T, P, scaled)
 
     # Every pose at the map's scale; what the drift adds to its own best.
-    own, one = at(found.scale), (found.scale * np.exp(-found.drift))[0]
+    own, one = at(scale), (scale * np.exp(-found.drift))[0]
     np.testing.assert_allclose(found.nees, at(one), rtol=1e-9)
     assert own.sum() < found.nees.sum() < min(at(1.01 * one).sum(), at(0.99 * one).sum())
-    assert np.all(own <= np.minimum(at(1.01 * found.scale), at(0.99 * found.scale)))
-    step = found.scale * np.expm1(found.drift) / np.exp(found.drift)
+    assert np.all(own <= np.minimum(at(1.01 * scale), at(0.99 * scale)))
+    step = scale * np.expm1(found.drift) / np.exp(found.drift)
     np.testing.assert_allclose(
-        found.nees - own, (step / (found.scale * found.sigma)) ** 2, rtol=1e-6, atol=1e-9
+        found.nees - own, (step / (scale * sigma)) ** 2, rtol=1e-6, atol=1e-9
     )
     # A pose in a unit that is not fixed has a scale of its own, and no part in that of the others.
     fixed = np.arange(5) != 2
-    apart, others = (
-        nees_beyond_scale(T, P, reference, fixed),
-        nees_beyond_scale(T[fixed], P[fixed], reference[fixed]),
-    )
+    apart, *_ = nees_beyond_scale(T, P, reference, fixed)
+    others, *_ = nees_beyond_scale(T[fixed], P[fixed], reference[fixed])
     np.testing.assert_allclose(apart.nees[fixed], others.nees, rtol=1e-9)
     assert apart.nees[2] == pytest.approx(own[2], rel=1e-9)
     assert np.isnan(apart.drift[2])
@@ -381,6 +386,6 @@ def test_a_reversed_path_is_not_explained_by_any_scale():
     T[0, :3, 3] = [1.0, 0, 0]
     reference = T.copy()
     reference[0, :3, 3] = [-2.0, 0, 0]
-    nees, scale, *_ = nees_beyond_scale(T, 0.01 * np.eye(6)[None], reference)
+    found, scale, _ = nees_beyond_scale(T, 0.01 * np.eye(6)[None], reference)
     assert scale[0] < 0.01
-    np.testing.assert_allclose(nees, 100, rtol=0.01)
+    np.testing.assert_allclose(found.nees, 100, rtol=0.01)
