@@ -1,4 +1,4 @@
-"""What the commands that look at pictures share: their libraries, and warnings of one line."""
+"""The imports and the one-line warnings that the commands on pictures share."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class Board:
 
     @property
     def corners(self) -> Float32[np.ndarray, "n 3"]:
-        """Where four squares meet, row by row, m."""
+        """The points where four squares meet, row by row, m."""
         y, x = np.mgrid[1 : self.rows, 1 : self.columns]
         return self._on_board(np.stack([x.ravel(), y.ravel()], 1))
 
@@ -109,7 +109,7 @@ class Board:
         return self._refined(image, pixels), self.corners
 
     def _refined(self, image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """At the saddle of the grey levels: three times as exact as where they were detected."""
+        """The saddles of the grey levels: three times as exact as where they were detected."""
         grid = pixels.reshape(self.rows - 1, self.columns - 1, 2)
         apart = min(np.linalg.norm(np.diff(grid, axis=a), axis=2).min() for a in (0, 1))
         reach = int(np.clip(_REACH * apart, 2, 10))
@@ -123,7 +123,7 @@ class Board:
         )  # fmt: skip
 
     def _outline(self, pixels: np.ndarray, points: np.ndarray) -> np.ndarray | None:
-        """Of the whole board, by the homography of the corners seen."""
+        """The outline of the whole board, by the homography of the corners seen."""
         H, _ = cv2.findHomography(points[:, :2], pixels)
         if H is None:
             return None

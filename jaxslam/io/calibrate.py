@@ -126,7 +126,7 @@ def _least_squares(views: Sequence[View], size: tuple[int, int]) -> Any:
 
 
 def covered(views: Iterable[View], calibration: Calibration) -> Bool[np.ndarray, "rows columns"]:
-    """Which cells of a grid over the picture hold a corner."""
+    """The cells of a grid over the picture that hold a corner."""
     cells = np.zeros(_CELLS[::-1], bool)
     for view in views:
         column, row = _cell(view.pixels, calibration).T

@@ -65,7 +65,7 @@ class Calibration:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def resized(self, width: int, height: int) -> "Calibration":
-        """Of the same pictures with so many pixels: u' + 1/2 = s (u + 1/2), s along each side.
+        """The calibration of the same pictures at another size: u' + 1/2 = s (u + 1/2).
 
         Raises ValueError for a size that no picture has.
         """
@@ -126,14 +126,17 @@ def write_calibration(path: str | Path, calibration: Calibration, **further: Any
 
 
 def as_fields(calibration: Calibration) -> dict[str, Any]:
-    """What the file holds; of what nobody stated, nothing."""
+    """The fields of the file; those that nobody stated are left out."""
     fields = {"model": MODEL, **asdict(calibration)}
     fields["sigma"] = dict(zip(INTRINSICS, calibration.sigma, strict=False))
     return {key: value for key, value in fields.items() if value or key not in ("sigma", "guessed")}
 
 
 def from_fields(fields: Any) -> Calibration:
-    """What `as_fields` was made of. Raises ValueError for what is no pinhole camera's."""
+    """The calibration of these fields, the inverse of `as_fields`.
+
+    Raises ValueError for what is no pinhole camera's.
+    """
     if not isinstance(fields, dict):
         raise ValueError(f"holds a {type(fields).__name__}; a JSON object is accepted")
     model = fields.get("model", MODEL)

@@ -28,7 +28,7 @@ class Live:
         self._came = 0.0
 
     def clock(self) -> float:
-        """When the picture came that `images` gave last, s."""
+        """The time of the picture that `images` gave last, s."""
         return self._came
 
     def images(self) -> Iterator[Image]:
@@ -46,7 +46,7 @@ class Live:
 
 
 class _Newest:
-    """What a capture delivered last, taken once."""
+    """The newest picture of a capture, taken once."""
 
     def __init__(self, capture: Any) -> None:
         self._changed = Condition()

@@ -70,7 +70,7 @@ def _calibrator(P: Float[np.ndarray, "3 4"]) -> Calibrator:
 
 
 def _poses_of(path: Path) -> tuple[Path, Path]:
-    """Where a sequence's poses lie: beside its images, or in the benchmark's own folder."""
+    """The file of a sequence's poses: beside its images, or in the benchmark's own folder."""
     sequence = path.resolve()
     return path / "poses.txt", sequence.parent.parent / "poses" / f"{sequence.name}.txt"
 

@@ -68,7 +68,7 @@ def open_source(
 
 
 def open_recording(path: str | Path, rate: float = 30.0) -> Recording:
-    """What lies at `path`, before an image is read or a calibration chosen. Raises ValueError."""
+    """The recording at `path`, before an image is read. Raises ValueError."""
     path = Path(path)
     if not (math.isfinite(rate) and rate > 0):
         raise ValueError(f"rate is {rate}; a positive number of frames a second is accepted")
@@ -86,7 +86,7 @@ def _layout_of(path: Path) -> Layout:
 
 
 def _found(path: Path) -> str:
-    """What is there, in a few words."""
+    """A few words on what was found."""
     if not path.is_dir():
         return f"a file {path.suffix or 'without an ending'}"
     names = [file.name + "/" * file.is_dir() for file in itertools.islice(path.iterdir(), 5)]

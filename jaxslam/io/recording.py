@@ -1,4 +1,4 @@
-"""What a layout says of a video, and what layouts share: image files and lists of times."""
+"""Recordings, and what layouts of videos share: image files and lists of times."""
 
 import os
 import re
@@ -100,7 +100,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 
 def calibration_beside(path: Path) -> Calibrator | None:
-    """Of the file `calibration.json` in a folder; None where there is none."""
+    """The calibration in a folder's `calibration.json`; None where there is none."""
     file = path / "calibration.json"
     return fixed(read_calibration(file)) if file.is_file() else None
 

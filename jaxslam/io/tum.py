@@ -74,7 +74,7 @@ def check_seconds(what: str, times: Float[np.ndarray, " n"]) -> None:
 
 
 def not_rigid(T: Float[np.ndarray, "*k d d"], tolerance: float) -> Bool[np.ndarray, "*k"]:
-    """Which matrices are no [R t; 0 1] with R a rotation, to so much of its numbers."""
+    """The mask of matrices that are no [R t; 0 1] with R a rotation, to a tolerance."""
     n = T.shape[-1] - 1
     R = T[..., :n, :n]
     with np.errstate(over="ignore", invalid="ignore"):

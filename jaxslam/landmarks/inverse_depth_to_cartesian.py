@@ -19,7 +19,7 @@ LINEARITY = 0.1
 
 
 def initialise(point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " 2*n+1"]:
-    """As Unified Inverse Depth, not converted."""
+    """The landmark of Unified Inverse Depth, not converted."""
     return jnp.append(inverse_depth.initialise(point, omega, focal), 0.0)
 
 
@@ -47,7 +47,7 @@ def scale(factor: Number, landmark: Parameters) -> Parameters:
 
 
 def convert(camera: Point, landmark: Parameters, covariance: ParametersCovariance) -> Parameters:
-    """To Cartesian where `L_d < 0.1`: σ_d = σ_ρ/ρ², α the parallax, d the present distance."""
+    """Convert to Cartesian where `L_d < 0.1`: σ_d = σ_ρ/ρ², α the parallax, d the distance."""
     point, rho = inverse_depth.homogeneous(landmark[:-1])
     safe = jnp.where(rho > 0, rho, 1.0)
     position = point / safe

@@ -1,4 +1,4 @@
-"""What a landmark parametrization is: pure functions on one landmark, and what they mean."""
+"""The interface of a landmark parametrization: pure functions on one landmark."""
 
 from __future__ import annotations
 

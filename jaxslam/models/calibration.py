@@ -1,4 +1,4 @@
-"""How a filter treats the uncertainty of its sensor's calibration.
+"""Treatments of the uncertainty of its sensor's calibration.
 
 A treatment adds the numbers δ to the state, by which the sensor's own are off, and says what
 becomes of them. One of your own is one class with the fields and functions of

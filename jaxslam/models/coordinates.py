@@ -1,4 +1,4 @@
-"""Where landmarks live: in the camera, in the base frame, or in the camera of a keyframe.
+"""The frame in which landmarks are held: the camera, the base frame, or the camera of a keyframe.
 
 `Coordinates` are a few functions of what the state *holds* of the pose. The map frame A, in which
 landmarks are expressed, is the camera C itself (robocentric), the base B (world), or the camera K
@@ -29,7 +29,7 @@ because a landmark's depth is nearly linear only in a camera near the keyframe."
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Where landmarks live, as functions of what is held and a displacement `T_{k-1,k}`."""
+    """The frame in which landmarks are held, as functions of the pose and a displacement."""
 
     name: str
     moves_landmarks: bool
@@ -65,7 +65,7 @@ class KeyframePose(eqx.Module):
         return self.base_from_keyframe @ self.keyframe_from_camera
 
     def moved(self, step: Pose) -> KeyframePose:
-        """After a displacement of the camera."""
+        """The pose after a displacement of the camera."""
         T_KC = (self.keyframe_from_camera @ step).normalize()
         return KeyframePose(self.base_from_keyframe, T_KC)
 

@@ -1,4 +1,4 @@
-"""What is known of a new landmark's depth, which a camera hides: a prior on 1/z."""
+"""The prior on 1/z of a new landmark, whose depth a camera does not measure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a camera moves between two frames: models of a displacement, driven by white noise.
+"""Motion models of a camera: the displacement between two frames, driven by white noise.
 
 A model says what a *control* makes of the variables that it keeps in the state and of this step's
 noise. The control is data: the seconds of the step, the odometry's reading, or the rates of a
@@ -40,7 +40,7 @@ class AbstractMotion(eqx.Module):
 
         @property
         def noise_told(self) -> bool:
-            """Of a model with a velocity: whether σ is a fact about metres."""
+            """Whether σ is known in metres, of a model with a velocity."""
 
     def start(self) -> tuple[Any, Float[Array, "v v"]]:
         """The variables before the first step, and a root of their covariance, `P = R Rᵀ`."""

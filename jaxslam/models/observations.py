@@ -1,4 +1,4 @@
-"""What goes into a filter and what comes back: features, their capacity, innovation, status."""
+"""The observations of a filter and what it says of them: features, innovation, status."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jaxslam._numerics.arrays import AnyArray
 
 
 class Capacity(NamedTuple):
-    """For how much a state has room; an `int` stands for as many of each."""
+    """The capacity of a state; an `int` stands for as many of each."""
 
     landmarks: int
     """In the map: slots 0, …, landmarks − 1."""
@@ -47,7 +47,7 @@ class Features(eqx.Module):
 
 
 class Status(IntEnum):
-    """What became of an update, the worse the greater."""
+    """The outcome of an update, the worse the greater."""
 
     OK = 0
     SOLVER_FAILED = 1
@@ -59,7 +59,7 @@ class Status(IntEnum):
 
 
 class Innovation(eqx.Module):
-    """What an update compared: the residual of every feature and their joint covariance S.
+    """The innovation of an update: the residual of every feature and their joint covariance S.
 
     Features that were not used (not valid, or predicted behind the camera) have a zero residual
     and an identity block in S, so that they add nothing to `nis`.
@@ -79,7 +79,7 @@ class Innovation(eqx.Module):
 
     @property
     def nis_dof(self) -> Int[Array, ""]:
-        """How many numbers were compared."""
+        """The number of numbers that were compared."""
         return self.residual.shape[-1] * jnp.sum(self.used)
 
 

@@ -1,4 +1,4 @@
-"""What is measured of a point: its pixel, its position, or range and bearing from the sensor.
+"""Measurement models of a point: its pixel, its position, or range and bearing from the sensor.
 
 A sensor is data: its numbers can be batched, perturbed by the uncertainty of its calibration and
 differentiated. One of your own is one class with the functions of `AbstractSensor`.
@@ -34,7 +34,7 @@ class AbstractSensor(eqx.Module):
 
         @property
         def size(self) -> int:
-            """How many numbers a measurement has, p."""
+            """The size p of a measurement."""
 
         @property
         def point_dim(self) -> int:
@@ -58,7 +58,7 @@ class AbstractSensor(eqx.Module):
         return point / omega
 
     def residual(self, measured: Measurement, predicted: Measurement) -> Measurement:
-        """What a measurement differs by; a sensor of angles wraps them."""
+        """The residual of a measurement; a sensor of angles wraps them."""
         return measured - predicted
 
     @property

@@ -119,7 +119,7 @@ def plot_nees(summary: dict[str, Any] | Study, *, ax: Axes, label: Labels | None
 
 
 def _of_some(summary: dict[str, Any]) -> str:
-    """Of which runs the medians are, where it is not all."""
+    """The text that says of which runs the medians are, where it is not all."""
     some = summary.get("medians_of", summary["runs"])  # not in earlier versions
     return "" if some == summary["runs"] else f" of the first {some} runs"
 

@@ -104,7 +104,7 @@ def plot_nees(
 
 
 def _runs(evaluation: Evaluation) -> str:
-    """Of how many runs the means are."""
+    """The text that says of how many runs the means are."""
     least = int(evaluation.runs_of_step.min())
     if 0 < least < evaluation.finite.sum():
         return f"{least} to {evaluation.runs} runs"
@@ -112,7 +112,7 @@ def _runs(evaluation: Evaluation) -> str:
 
 
 def _band(evaluation: Evaluation, ax: Axes) -> None:
-    """Where the mean of a consistent filter is; wider at steps that fewer runs have."""
+    """Draw where the mean of a consistent filter is; wider at steps that fewer runs have."""
     if evaluation.logged.all():
         ax.axhspan(*evaluation.band95, color=GREY, alpha=0.25, lw=0)
         return

@@ -136,7 +136,7 @@ def draw_dots(
 
 
 class End(NamedTuple):
-    """What a line is called, and where it ends."""
+    """The name of a line, and the place where it ends."""
 
     label: str
     x: Float[np.ndarray, " n"]

@@ -38,7 +38,7 @@ class _Panel:
 
     @property
     def size(self) -> float:
-        """Of the longest side of the box, the hidden one too."""
+        """The length of the longest side of the box, the hidden one too."""
         return float(np.max(self.box[1] - self.box[0]))
 
     @property
@@ -50,7 +50,7 @@ class _Panel:
     def seen(
         self, points: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
     ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
-        """What is seen of them from here."""
+        """The points that are seen from here."""
         return points[:, self.plane], covariances[:, self.plane][:, :, self.plane]
 
 
@@ -160,8 +160,9 @@ def _lines(
 
 
 def _panels(path: _Box, everything: _Box) -> tuple[Figure, list[tuple[Axes, _Panel]]]:
-    """From above and from behind, one above the other, x to the right; what is deeper than wide
-    from above and from the side, z to the right. Over them the path alone, where it is small."""
+    """Two panels, one above the other: from above and from behind, x to the right; of what is
+    deeper than wide from above and from the side, z to the right. Over them the path alone, where
+    it is small."""
     across, _, deep = everything[1] - everything[0]
     above, upright = ([2, 0], [2, 1]) if deep > across else ([0, 2], [0, 1])
     panels = [

@@ -67,7 +67,7 @@ def _distributions(comparison: Comparison) -> dict[str, Samples]:
 
 
 def _depths(comparison: Comparison) -> Limits:
-    """Of the axes of depth, m."""
+    """The range of the axes of depth, m."""
     farthest = _FARTHEST * comparison.views.depth
     return _limits(_distributions(comparison), lambda of: of.z, farthest)
 
@@ -179,7 +179,7 @@ def plot_density(comparison: Comparison, *, ax: Axes, label: Labels | None = Non
 
 
 def plot_difference(comparison: Comparison, *, ax: Axes, label: Labels | None = None) -> Axes:
-    """How far each distribution function of the depth is from triangulation's."""
+    """Draw how far each distribution function of the depth is from triangulation's."""
     distributions, styles = _distributions(comparison), _styles(comparison)
     axes, limits, named = ax, _depths(comparison), label or {}
     depths = np.linspace(*limits, 400)

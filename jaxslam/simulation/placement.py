@@ -1,4 +1,4 @@
-"""Where a simulated world's landmarks are: all at once, or thrown as the camera moves."""
+"""Placement of the landmarks of a simulated world: all at once, or thrown as the camera moves."""
 
 from __future__ import annotations
 

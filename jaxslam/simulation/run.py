@@ -45,7 +45,7 @@ class Run(eqx.Module):
 
 
 class Sightings(eqx.Module):
-    """How many landmarks a run sees, at the most: the capacities that a filter needs."""
+    """The largest numbers of landmarks that a run sees: the capacities that a filter needs."""
 
     landmarks: Int[Array, ""]
     """Ever; or the slots that they share."""
@@ -67,7 +67,7 @@ class Room(NamedTuple):
 
     @property
     def capacity(self) -> Capacity:
-        """Of a filter."""
+        """The capacity of a filter."""
         return Capacity(self.landmarks, self.known, self.new)
 
 

@@ -76,7 +76,7 @@ def sampled(path: Path, rate: float, steps: int) -> Trajectory:
 
 @lru_cache(maxsize=8)
 def _sampled(path: Path, rate: float, steps: int, version: tuple[int, ...]) -> Trajectory:
-    """Of one version of the file, which may be written anew."""
+    """The samples of one version of the file, which may be written anew."""
     del version
     pieces = [_evenly(*piece, rate) for piece in _without_gaps(*read_tum(path))]
     ends = np.cumsum([len(piece) for piece in pieces])

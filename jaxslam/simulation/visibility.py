@@ -1,4 +1,4 @@
-"""What of a world is measured: what a sensor can see, and limits on how much of it."""
+"""The part of a world that is measured: what a sensor sees, up to a limit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxslam.simulation.scenario import Scenario
 
 
 def in_image(scenario: Scenario, points, pixels) -> Bool[Array, " l"]:
-    """In front of the camera and inside the picture."""
+    """Whether a point is in front of the camera and inside the picture."""
     inside = jnp.all((pixels >= 0) & (pixels < jnp.stack(scenario.image)), axis=-1)
     return inside & (points[:, -1] > scenario.visible_depth)
 

@@ -121,7 +121,7 @@ def _by_noise(s: Scenario, motion: AbstractMotion, key: Array) -> tuple[Pose, An
 
 
 def _recorded(s: Scenario, trajectory: Trajectory, key: Array) -> tuple[Pose, Any]:
-    """From a start drawn at random, after the frames in which the camera stands still."""
+    """A recorded path from a random start, after the frames in which the camera stands still."""
     still = min(s.still_frames, s.steps)
     if trajectory.steps != s.steps - still:
         raise ValueError(f"a trajectory for {trajectory.steps} steps, not {s.steps - still}")

@@ -188,7 +188,7 @@ def _spread(of: Samples) -> dict[str, Any]:
 
 
 def _summarise_distances(comparison: Comparison, name: str) -> dict[str, Any]:
-    """By truth, coordinate and measure: at the exact pixels, and the mean over measured ones."""
+    """Distances by truth, coordinate and measure: at the exact pixels, and their mean."""
     return {
         truth: {
             c: {

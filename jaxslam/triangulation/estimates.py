@@ -1,4 +1,4 @@
-"""What estimators make of two measured pixels: a Gaussian of the landmark's parameters.
+"""Estimates from two measured pixels: a Gaussian of the landmark's parameters.
 
 Inverse Scaling and Unified Inverse Depth come out of the library's own robocentric filter, a
 Cartesian point out of classical first-order triangulation. Each Gaussian is in parameters of its

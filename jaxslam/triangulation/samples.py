@@ -45,7 +45,7 @@ class Samples(NamedTuple):
 
     @property
     def effective(self) -> float:
-        """How many samples of equal weight are worth as much, `(Σw)² / Σw²`."""
+        """The effective number of samples, `(Σw)² / Σw²`."""
         return float(self.weight.sum() ** 2 / (self.weight**2).sum())
 
 
@@ -57,7 +57,7 @@ class Marginal(NamedTuple):
 
 
 class Distance(NamedTuple):
-    """How far two distributions of one coordinate are from one another."""
+    """The distance between two distributions of one coordinate."""
 
     ks: float
     """Kolmogorov and Smirnov's: the largest difference of the distribution functions."""

@@ -1,4 +1,4 @@
-"""Where the point can be, given two measured pixels: exactly, by particles.
+"""The posterior of a point given two measured pixels: exact, by particles.
 
 Two answers are called the truth. *Triangulation* is the paper's: every particle is where two rays
 meet, through the measured pixels less their noise and intrinsics as they may be. *Posterior* is
@@ -21,7 +21,7 @@ from jaxslam.triangulation.views import Given, TwoViews, errors
 def intersect(
     calibration: str, given: Given, normal: Float[Array, " 6"]
 ) -> tuple[Float[Array, " 2"], Float[Array, ""], Float[Array, ""]]:
-    """Where two rays meet: (x, z, ω) = (b₂, 1, (b₁ − b₂)/baseline) with bearings b = (u − c)/f.
+    """The point where two rays meet: (x, z, ω) = (b₂, 1, (b₁ − b₂)/baseline), b = (u − c)/f.
 
     In the second camera, with the errors that belong to the standard normal numbers; at infinity
     or beyond where the rays do not meet (ω ≤ 0). Third, the logarithm of the posterior's density

@@ -68,7 +68,7 @@ class TwoViews:
 
     @property
     def pixels(self) -> tuple[float, float]:
-        """Where both views see the point with the nominal camera and without noise."""
+        """The pixels at which both views see the point, with the nominal camera and no noise."""
         return self.pixel, self.pixel - self.focal * self.baseline / self.depth
 
     @property
@@ -77,7 +77,7 @@ class TwoViews:
         return (self.pixels[1] - self.centre) / self.focal * self.depth, self.depth
 
     def given(self, pixels: Float[Array, " 2"]) -> Given:
-        """What the estimates are given, of these two measured pixels."""
+        """The data of an estimate from these two measured pixels."""
         sigma = np.array([self.focal_sigma, self.centre_sigma])
         sensor = Pinhole(Camera([self.focal], [self.centre]), self.pixel_sigma)
         depth = InverseDepth.beyond(self.nearest_depth)
