@@ -21,7 +21,6 @@ from jaxslam.filters.wrappers.batch_initialisation import (
     BatchInitialisation,
     from_rest,
 )
-from jaxslam.models.calibration import Considered
 from jaxslam.models.observations import Features
 from jaxslam.statistics.bands import lost_threshold
 
@@ -286,14 +285,6 @@ def test_what_cannot_start_from_rest_is_refused(name, message):
 def test_a_landmark_with_an_anchor_is_refused():
     with pytest.raises(ValueError, match="without anchors, which framed_homogeneous has"):
         standstill().filter(STARTED, "framed_homogeneous")
-
-
-def test_a_calibration_that_is_not_corrected_is_refused():
-    base = standstill().filter(SUM)
-    considered = Considered([3.0] * 2 + [2.0] * 2)
-    base = eqx.tree_at(lambda base: base.base.calibration, base, considered)
-    with pytest.raises(ValueError, match="calibration that is known, white or estimated"):
-        from_rest(base, 8)
 
 
 @pytest.mark.parametrize("sizes", [(9, 9), (17, 9), ()])

@@ -24,7 +24,7 @@ from jaxslam.filters.window.scale import rescaled, scaling, shift_of_scale, vari
 from jaxslam.filters.window.to_filter import gauge_state
 from jaxslam.geometry import jacobian
 from jaxslam.landmarks import INVERSE_SCALING
-from jaxslam.models.calibration import Estimated, Known, White
+from jaxslam.models.calibration import Considered, Estimated, Known, White
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.observations import Features
 from jaxslam.simulation import scenario
@@ -575,6 +575,30 @@ def test_the_filters_state_is_the_gaussian_of_the_mode(of, monkeypatch):
     s = scaling(slam, record, at)
     np.testing.assert_allclose(state.covariance[part, part], 1 / s.squared, rtol=1e-9)
     assert np.linalg.eigvalsh(state.covariance).min() > -1e-12
+
+
+def test_a_calibration_that_is_considered_is_found_by_the_window_and_then_left():
+    slam, record, *_ = case(*CASES[2])
+    at, m = minimum(*CASES[2]), FIRST.size
+    considered = replace(slam, calibration=Considered(slam.calibration.sigma))
+
+    @quick_jit
+    def handed(at, treated, measured):
+        every, shift = jnp.arange(m), jnp.zeros(())
+        first = Features(every, record.measured[0], jnp.zeros(m, bool))
+        state = gauge_state(treated, record, at, shift, treated.init(m, first))
+        seen = Features(every, measured, jnp.ones(m, bool))
+        return state, treated.step(state, jnp.asarray(0.2), seen, first)[0]
+
+    measured = record.measured[record.last] + 1.0
+    (estimated, moved), (found, left) = (handed(at, x, measured) for x in (slam, considered))
+    part = found.core.part("calibration")
+    np.testing.assert_allclose(found.core.calibration, estimated.core.calibration, rtol=1e-9)
+    np.testing.assert_allclose(found.covariance, estimated.covariance, atol=1e-12)
+    assert np.abs(found.core.calibration).max() > 1e-3
+    np.testing.assert_array_equal(left.core.calibration, found.core.calibration)
+    np.testing.assert_allclose(left.covariance[part, part], found.covariance[part, part])
+    assert np.abs(moved.core.calibration - found.core.calibration).max() > 1e-3
 
 
 def test_the_filters_state_stands_at_the_mean_of_the_scale():

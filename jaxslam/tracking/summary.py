@@ -105,7 +105,7 @@ def describe(summary: Summary) -> str:
     if "estimated" in camera:
         pairs = ((key, camera["estimated"][key], camera["sigma"][key]) for key in INTRINSICS)
         lines.append("camera: " + ", ".join(f"{k} {x:.1f} ± {s:.1f}" for k, x, s in pairs))
-        lines.append(camera["caveat"])
+        lines += [camera["caveat"]] if "caveat" in camera else []
     if "ate" in summary:
         ate = summary["ate"]
         share = ate["rmse"] / ate["path_length"] if ate["path_length"] else float("nan")
@@ -199,17 +199,19 @@ def _unit_line(unit: Summary) -> str:
 
 
 def _calibration(tracker: Tracker) -> Summary:
-    """What the camera was taken for, and where it is estimated, what it is in the end with σ."""
+    """What the camera was taken for, and where it is estimated or considered, what it is in the end
+    with σ: what is considered was found by the start, and left since."""
     camera = tracker.camera()
     given = as_fields(tracker.calibration)
     if camera is None:
         return {"given": given}
     treatment, mean, covariance = camera
     result = {"treatment": treatment, "given": given}
-    if treatment == "estimated":
+    if treatment in ("estimated", "consider"):
         sigma = np.sqrt(np.diagonal(covariance))
         result["estimated"] = dict(zip(INTRINSICS, mean.tolist(), strict=True))
         result["sigma"] = dict(zip(INTRINSICS, sigma.tolist(), strict=True))
+    if treatment == "estimated":
         result["caveat"] = f"{TOO_SURE}; docs/own-video.md says how much"
     return result
 

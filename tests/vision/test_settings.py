@@ -6,6 +6,7 @@ import pytest
 from jaxslam.io.calibration import Calibration, from_field_of_view
 from jaxslam.models.calibration import Estimated, Known, White
 from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.summary import _calibration
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
 
@@ -58,6 +59,14 @@ def test_a_guessed_focal_length_is_estimated_while_the_camera_moves():
     # Two σ of the guess; measured: 16 and 16 pixels.
     assert abs(cx - 159.5) < 25.6
     assert abs(cy - 119.5) < 25.6
+
+
+def test_a_considered_camera_is_reported_with_its_sigma_and_without_a_caveat():
+    settings = TrackerSettings(filter="world", wanted=10, calibration="consider")
+    told = _calibration(Tracker(GUESSED, settings))
+    assert (told["treatment"], told["estimated"]["fx"]) == ("consider", GUESSED.fx)
+    assert told["sigma"]["fx"] == pytest.approx(GUESSED.sigma[0])
+    assert "caveat" not in told
 
 
 def test_a_known_camera_is_reported_as_it_is():

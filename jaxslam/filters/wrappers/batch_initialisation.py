@@ -237,7 +237,6 @@ def _check_base(ekf: EkfSlam) -> None:
         (not ekf.motion.has_velocity, f"of a velocity, which {type(ekf.motion).__name__} lacks"),
         (not ekf.sensor.hidden, f"for a camera; {type(ekf.sensor).__name__} measures metres"),
         (ekf.landmark.anchored, f"without anchors, which {ekf.landmark.name} has"),
-        (not ekf.calibration.corrected, "for a calibration that is known, white or estimated"),
     ):
         if wrong:
             raise ValueError(f"a start from rest is {why}")
