@@ -91,7 +91,7 @@ def test_a_study_on_a_cluster_is_the_same_although_a_worker_is_killed(processes,
 
 def test_nobody_at_an_address_is_said_in_one_line(tmp_path, capsys, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("jaxslam.consistency.cluster.PATIENCE", 0.5)
+    monkeypatch.setattr("jaxslam.consistency.cluster.ANSWER_SECONDS", 0.5)
     command = ["consistency", "--scenario", "matched-tight", "--out", str(tmp_path / "out")]
     with pytest.raises(SystemExit) as stop:
         main([*command, "--cluster", "tcp://127.0.0.1:9"])

@@ -156,7 +156,7 @@ def test_without_a_compiler_it_says_so(monkeypatch):
 
 @needs_compiler
 def test_a_compiler_that_does_not_end_is_ended(monkeypatch):
-    monkeypatch.setattr(build, "PATIENCE", 1e-3)
+    monkeypatch.setattr(build, "LIMIT_SECONDS", 1e-3)
     with pytest.raises(ValueError, match="did not end within"):
         batched(lambda shared, A: A * 12345.0, SHARED, DRAWN)
 

@@ -16,7 +16,7 @@ class Terminal(io.StringIO):
 def written(monkeypatch, file, patience=0.0):
     """What 20 steps write."""
     monkeypatch.setattr(sys, "stderr", file)
-    monkeypatch.setattr(progress, "PATIENCE", patience)
+    monkeypatch.setattr(progress, "LINE_SECONDS", patience)
     with progress.bar(20, "run", "waiting") as shown:
         for _ in range(20):
             shown.update(1)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxslam
 from jaxslam.io.tum import poses
-from jaxslam.simulation import BUILT_IN, Trajectory, scenario, simulate, trajectory_of
+from jaxslam.simulation import BUILT_IN, RecordedMotion, scenario, simulate, trajectory_of
 from jaxslam.simulation.trajectories import CUTOFF, GAP, find, sampled
 
 FALSE_ALARM = 1e-6
@@ -179,7 +179,7 @@ def test_what_is_no_trajectory_is_refused(data, tmp_path):
         scenario("matched", trajectory="walk")
     with pytest.raises(ValueError, match="trajectory: odometry has the nominal motion"):
         scenario("room", trajectory="walk")
-    assert isinstance(trajectory_of(scenario("handheld-walk", steps=5)), Trajectory)
+    assert isinstance(trajectory_of(scenario("handheld-walk", steps=5)), RecordedMotion)
 
 
 def test_every_trajectory_of_the_shared_data_is_one(shared_data, monkeypatch):

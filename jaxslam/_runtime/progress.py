@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-PATIENCE = 10.0
+LINE_SECONDS = 10.0
 """Seconds between two lines of a log; what takes less has none."""
 
 
@@ -13,7 +13,7 @@ def bar(total: int | None, unit: str, desc: str | None = None, done: int = 0) ->
     """A bar of tqdm with the time left, to be updated and closed, or used in a `with` block; so
     many are `done` already.
 
-    Where standard error is neither a terminal nor a notebook's it is lines, `PATIENCE` apart: a
+    Where standard error is neither a terminal nor a notebook's it is lines, `LINE_SECONDS` apart: a
     file would keep all that is drawn over at a terminal.
     """
     from tqdm.auto import tqdm
@@ -22,7 +22,7 @@ def bar(total: int | None, unit: str, desc: str | None = None, done: int = 0) ->
         return tqdm(total=total, unit=unit, desc=desc, initial=done)
     return tqdm(
         total=total, unit=unit, desc=desc, initial=done, file=_Lines(sys.stderr), ncols=80,
-        ascii=True, delay=PATIENCE, mininterval=PATIENCE, maxinterval=PATIENCE,
+        ascii=True, delay=LINE_SECONDS, mininterval=LINE_SECONDS, maxinterval=LINE_SECONDS,
     )  # fmt: skip
 
 

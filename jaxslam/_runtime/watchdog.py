@@ -14,11 +14,11 @@ from jax.extend.core import Jaxpr, subjaxprs
 
 Values = TypeVar("Values")
 
-PATIENCE = 120.0
+DEADLOCK_SECONDS = 120.0
 """Seconds without any work after which a computation counts as standing still."""
-LOOK = 1.0
+LOOK_SECONDS = 1.0
 """Seconds between two looks at the processor time."""
-BUSY = 0.01
+BUSY_SHARE = 0.01
 """Share of one processor below which a process does not work. One that computes has far more on
 however loaded a machine, and one whose threads wait for one another has none."""
 
@@ -33,7 +33,7 @@ class DeadlockError(RuntimeError):
     """A computation whose threads all sleep."""
 
 
-def finished(values: Values, where: str, patience: float = PATIENCE) -> Values:
+def finished(values: Values, where: str, patience: float = DEADLOCK_SECONDS) -> Values:
     """The arrays once they are computed; raises `DeadlockError` if nothing works on them any more.
 
     What is watched is the processor time of this process, not the clock: a long computation is no
@@ -50,11 +50,11 @@ def finished(values: Values, where: str, patience: float = PATIENCE) -> Values:
     while not all(x.is_ready() for x in arrays):
         now = time.monotonic()
         time.sleep(min(0.05, (now - began) / 50 + 1e-4))
-        if now - looked < LOOK:
+        if now - looked < LOOK_SECONDS:
             continue
-        busy = time.process_time() - worked > BUSY * (now - looked)
+        busy = time.process_time() - worked > BUSY_SHARE * (now - looked)
         # A process that was stopped and goes on has one long pause, which counts as one look.
-        idle = 0.0 if busy else idle + min(now - looked, 2 * LOOK)
+        idle = 0.0 if busy else idle + min(now - looked, 2 * LOOK_SECONDS)
         looked, worked = now, time.process_time()
         if idle >= patience:
             atexit.register(_leave)

@@ -26,7 +26,7 @@ AHEAD = 3
 """Tasks given out for every thread of the cluster: one at work, the others on their way."""
 AT_LEAST = 64
 """Tasks given out however few threads there are, so that a cluster that adapts sees work."""
-PATIENCE = 10.0
+ANSWER_SECONDS = 10.0
 """Seconds in which a scheduler has to answer."""
 
 
@@ -45,7 +45,7 @@ def connected(cluster: Any) -> Generator[Any]:
     except ImportError as error:
         raise missing("a cluster needs", "cluster", error) from None
     try:
-        client = Client(cluster, timeout=PATIENCE, set_as_default=False)
+        client = Client(cluster, timeout=ANSWER_SECONDS, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:  # no scheduler, no address, no cluster
         raise ValueError(
             f"no Dask scheduler answers at {cluster!r} ({one_line(error)}); accepted: the address "

@@ -32,7 +32,7 @@ from jaxslam.consistency.sums import as_sums, keeps_records
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.sensors import AbstractSensor
-from jaxslam.simulation import Room, Run, Scenario, Trajectory, as_scenario
+from jaxslam.simulation import RecordedMotion, Room, Run, Scenario, as_scenario
 
 DTYPES = ("float64", "float32")
 CHUNK = 100
@@ -53,14 +53,14 @@ def monte_carlo(
     backend: str = "xla",
     store: Store | None = None,
     progress: Callable[[str, int], None] = lambda name, done: None,
-    motion: AbstractMotion | Trajectory | None = None,
+    motion: AbstractMotion | RecordedMotion | None = None,
     sensor: AbstractSensor | None = None,
     cluster: Any = None,
     reduced: bool = False,
 ) -> Study:
     """Run every filter on the same simulated runs.
 
-    The runs are the scenario's, which may be given by name; with a `motion` (or a `Trajectory`)
+    The runs are the scenario's, which may be given by name; with a `motion` (or a `RecordedMotion`)
     or a `sensor` of one's own the truth moves, or is measured, as that says, in the scenario's
     world.
 

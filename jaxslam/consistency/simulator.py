@@ -18,11 +18,11 @@ from jaxslam.consistency.manifest import LAYOUT, Manifest, described, versions
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation import (
+    RecordedMotion,
     Room,
     Run,
     Scenario,
     Sightings,
-    Trajectory,
     as_data,
     sensor_of,
     sightings,
@@ -46,7 +46,7 @@ class Simulator:
         seed: int,
         dtype: str,
         size: int,
-        motion: AbstractMotion | Trajectory | None = None,
+        motion: AbstractMotion | RecordedMotion | None = None,
         sensor: AbstractSensor | None = None,
     ) -> None:
         motion = trajectory_of(scenario, dtype) if motion is None else motion
@@ -102,7 +102,7 @@ def _rounded_up(count: int) -> int:
 @partial(Program, options=BATCHED)
 def _draw(
     scenario: Scenario,
-    own: tuple[AbstractMotion | Trajectory | None, AbstractSensor | None],
+    own: tuple[AbstractMotion | RecordedMotion | None, AbstractSensor | None],
     key: Array,
     indices: Int[Array, " runs"],
 ) -> tuple[Run, Sightings]:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from jaxslam._runtime import programs
 from jaxslam._runtime.files import write_atomically
-from jaxslam.native.emit import Source
+from jaxslam.native.emit import CppSource
 
 FLAGS = (
     *("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math"),
@@ -22,7 +22,7 @@ FLAGS = (
 )
 
 
-PATIENCE = 900.0
+LIMIT_SECONDS = 900.0
 """Seconds that a compiler may take."""
 
 
@@ -34,7 +34,7 @@ def compiler() -> list[str] | None:
     return None if found is None else [found, *told[1:]]
 
 
-def built(source: Source) -> ctypes.CDLL:
+def built(source: CppSource) -> ctypes.CDLL:
     """The library of a program. Raises ValueError without a compiler, or where it fails."""
     command = compiler()
     if command is None:
@@ -71,16 +71,16 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _compile(command: list[str], source: Source, path: Path) -> None:
+def _compile(command: list[str], source: CppSource, path: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         file, tables = (Path(folder) / name for name in ("program.cpp", "tables"))
         file.write_text(source.text)
         tables.write_bytes(source.tables)
         arguments = [*command, *FLAGS, f'-DTABLES="{tables}"', str(file), "-o", str(path), "-lm"]
         try:
-            done = subprocess.run(arguments, capture_output=True, text=True, timeout=PATIENCE)
+            done = subprocess.run(arguments, capture_output=True, text=True, timeout=LIMIT_SECONDS)
         except subprocess.TimeoutExpired:
-            raise ValueError(f"the C++ compiler did not end within {PATIENCE:.0f} s") from None
+            raise ValueError(f"the C++ compiler did not end within {LIMIT_SECONDS:.0f} s") from None
     if done.returncode:
         raise ValueError(f"the C++ compiler failed: {done.stderr[-2000:]}")
 

@@ -22,14 +22,14 @@ BYTES = 64
 """Of a vector."""
 
 
-class Source(NamedTuple):
+class CppSource(NamedTuple):
     """A program in C++, and the constant arrays that it finds in the file `TABLES`."""
 
     text: str
     tables: bytes
 
 
-def source(plan: Plan, kinds: tuple[list[tuple[Any, bool]], list[Any]]) -> Source:
+def source(plan: Plan, kinds: tuple[list[tuple[Any, bool]], list[Any]]) -> CppSource:
     """The whole program; `kinds` are the types of what goes in, and whether every run has its
     own, and the types of what comes out."""
     writer = _Writer(plan)
@@ -41,7 +41,7 @@ def source(plan: Plan, kinds: tuple[list[tuple[Any, bool]], list[Any]]) -> Sourc
     head = [f"#define SCALAR {scalar}", f"#define WIDTH {width}"]
     head += ["#if defined(__x86_64__) && defined(__gnu_linux__)"]
     head += [f"#define VECTOR_MATH(x) {letter}", "#endif", PRELUDE.read_text()]
-    return Source("\n".join([*head, *writer.functions, entry]), writer.tables.data)
+    return CppSource("\n".join([*head, *writer.functions, entry]), writer.tables.data)
 
 
 class _Tables:

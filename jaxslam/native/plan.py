@@ -13,9 +13,9 @@ from jaxslam.native.fuse import fused
 from jaxslam.native.program import (
     Apply,
     Check,
+    ElementProgram,
     Loop,
     Product,
-    Program,
     While,
     read_by,
     read_in_turn,
@@ -30,7 +30,7 @@ LONGEST = 24
 class Plan:
     """By element."""
 
-    program: Program
+    program: ElementProgram
     live: np.ndarray
     """Whether anything depends on it."""
     inlined: np.ndarray
@@ -54,7 +54,7 @@ class Plan:
         return found
 
 
-def plan(program: Program) -> Plan:
+def plan(program: ElementProgram) -> Plan:
     """Liveness, expressions and places of a program."""
     program = replace(program, steps=_checked(program))
     live, needed = _live(program)
@@ -70,7 +70,7 @@ CARRIES = ("add", "sub", "mul", "neg", "copy")
 """Operations whose result is not finite where an operand is not."""
 
 
-def _checked(program: Program) -> list[Any]:
+def _checked(program: ElementProgram) -> list[Any]:
     """Steps that check, in place of suspects, what is computed of them and used anyway.
 
     A sum, or a product, is finite only if its operands are: the last of a chain tells of all.
@@ -150,7 +150,7 @@ def _near_within(step: Any) -> Any:
     return step
 
 
-def _live(program: Program, checks: bool = True) -> tuple[np.ndarray, np.ndarray]:
+def _live(program: ElementProgram, checks: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """Which elements are used, and which of them not only by operations."""
     elements = program.elements
     live, needed = (np.zeros(elements.size, bool) for _ in range(2))
@@ -196,7 +196,7 @@ def _live(program: Program, checks: bool = True) -> tuple[np.ndarray, np.ndarray
     return live, needed
 
 
-def _inlined(program: Program, live, needed) -> tuple[np.ndarray, np.ndarray]:
+def _inlined(program: ElementProgram, live, needed) -> tuple[np.ndarray, np.ndarray]:
     """Operations that only one other operation uses, in the same loop; and numbers of uses.
 
     What is added to a product of matrices is not among them, but part of that product.
@@ -220,7 +220,7 @@ def _mark(step: Any, product: np.ndarray) -> None:
         product[step.made] = True
 
 
-def _forms(program: Program, live, inlined) -> tuple[np.ndarray, list[tuple[int, ...]]]:
+def _forms(program: ElementProgram, live, inlined) -> tuple[np.ndarray, list[tuple[int, ...]]]:
     """Expressions; what is too long for one is taken apart."""
     elements = program.elements
     form, size = np.zeros(elements.size, np.int64), np.zeros(elements.size, np.int64)

@@ -103,7 +103,7 @@ class While:
 
 
 @dataclass(frozen=True)
-class Program:
+class ElementProgram:
     """A function of arrays: elements, how they are computed, and what goes in and out."""
 
     elements: Elements

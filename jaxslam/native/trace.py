@@ -16,7 +16,17 @@ from jax.interpreters import partial_eval
 from jaxslam._numerics.linalg import symmetric_part_p
 from jaxslam._numerics.tracing import free_gathers
 from jaxslam.native.elements import OPERATIONS, Elements, Refs
-from jaxslam.native.program import Apply, Check, Loop, Product, Program, Put, Sort, Take, While
+from jaxslam.native.program import (
+    Apply,
+    Check,
+    ElementProgram,
+    Loop,
+    Product,
+    Put,
+    Sort,
+    Take,
+    While,
+)
 
 UNROLLED = 3000
 """Operations up to which all turns of a loop are written out: their indices are then known."""
@@ -29,7 +39,7 @@ class NotSupportedError(ValueError):
     """A function that has something for which there is no rule."""
 
 
-def program(function: Callable[..., Any], *arguments: Any) -> tuple[Program, Any]:
+def program(function: Callable[..., Any], *arguments: Any) -> tuple[ElementProgram, Any]:
     """The program of a function of such arguments, and the shapes of what it returns."""
     with free_gathers():
         traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
@@ -43,7 +53,7 @@ def program(function: Callable[..., Any], *arguments: Any) -> tuple[Program, Any
     given = [x for x, needed in zip(inputs, used, strict=True) if needed]
     outputs = tracer.run(jaxpr, traced.consts, given)
     tracer.check()
-    return Program(tracer.elements, tracer.steps, inputs, outputs), shapes
+    return ElementProgram(tracer.elements, tracer.steps, inputs, outputs), shapes
 
 
 def _dtype(avals: Sequence[Any]) -> np.dtype:

@@ -8,16 +8,16 @@ from jaxslam.simulation.pieces import (
 )
 from jaxslam.simulation.run import Room, Run, Sightings, features, gone, sightings
 from jaxslam.simulation.scenario import BUILT_IN, Scenario, as_scenario, scenario
-from jaxslam.simulation.trajectories import Trajectory
+from jaxslam.simulation.trajectories import RecordedMotion
 from jaxslam.simulation.world import as_data, simulate, trajectory_of
 
 __all__ = [
     "BUILT_IN",
+    "RecordedMotion",
     "Room",
     "Run",
     "Scenario",
     "Sightings",
-    "Trajectory",
     "as_data",
     "as_scenario",
     "calibration_sigma_of",

@@ -28,7 +28,7 @@ LEAST = 5
 """Poses of a piece that a spline needs."""
 
 
-class Trajectory(eqx.Module):
+class RecordedMotion(eqx.Module):
     """A recorded motion at the frames of a run, with everything that a run can start from."""
 
     poses: Float[AnyArray, "poses 7"]
@@ -64,7 +64,7 @@ def find(trajectory: str) -> Path:
     )
 
 
-def sampled(path: Path, rate: float, steps: int) -> Trajectory:
+def sampled(path: Path, rate: float, steps: int) -> RecordedMotion:
     """The recording at `rate` Hz for runs of so many steps.
 
     Raises ValueError, naming the file, where it is no trajectory or has no such piece in it.
@@ -75,7 +75,7 @@ def sampled(path: Path, rate: float, steps: int) -> Trajectory:
 
 
 @lru_cache(maxsize=8)
-def _sampled(path: Path, rate: float, steps: int, version: tuple[int, ...]) -> Trajectory:
+def _sampled(path: Path, rate: float, steps: int, version: tuple[int, ...]) -> RecordedMotion:
     """The samples of one version of the file, which may be written anew."""
     del version
     pieces = [_evenly(*piece, rate) for piece in _without_gaps(*read_tum(path))]
@@ -89,7 +89,7 @@ def _sampled(path: Path, rate: float, steps: int, version: tuple[int, ...]) -> T
         raise ValueError(
             f"{path} has no {steps / rate:.3g} s without a gap: its longest piece has {longest:.3g}"
         )
-    return Trajectory(np.concatenate(pieces), starts, steps)
+    return RecordedMotion(np.concatenate(pieces), starts, steps)
 
 
 def _without_gaps(times: Float[np.ndarray, " n"], T: Float[np.ndarray, "n 4 4"]):

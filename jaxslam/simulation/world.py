@@ -18,7 +18,7 @@ from jaxslam.simulation.pieces import calibration_sigma_of, motion_of, sensor_of
 from jaxslam.simulation.placement import PLACEMENT, thrown
 from jaxslam.simulation.run import Run, in_order_of_appearance
 from jaxslam.simulation.scenario import Scenario, as_scenario
-from jaxslam.simulation.trajectories import Trajectory, find, sampled
+from jaxslam.simulation.trajectories import RecordedMotion, find, sampled
 from jaxslam.simulation.visibility import limited, visible
 
 
@@ -36,7 +36,7 @@ def simulate(
     key: Array,
     dtype: Any = None,
     *,
-    motion: AbstractMotion | Trajectory | None = None,
+    motion: AbstractMotion | RecordedMotion | None = None,
     sensor: AbstractSensor | None = None,
 ) -> Run:
     """Draw one run: a pure function of the scenario's numbers and of the key (`jax.random.key`).
@@ -76,7 +76,7 @@ def simulate(
     return in_order_of_appearance(run) if new is None else run
 
 
-def trajectory_of(scenario: Scenario, dtype: Any = None) -> Trajectory | None:
+def trajectory_of(scenario: Scenario, dtype: Any = None) -> RecordedMotion | None:
     """Along what the scenario's camera moves, where that is recorded.
 
     Raises ValueError where its file is none, or has no piece that is long enough.
@@ -88,9 +88,11 @@ def trajectory_of(scenario: Scenario, dtype: Any = None) -> Trajectory | None:
     return cast(sampled(path, float(scenario.rate), moving), dtype or jnp.result_type(float))
 
 
-def _path(s: Scenario, motion: AbstractMotion | Trajectory | None, key: Array) -> tuple[Pose, Any]:
+def _path(
+    s: Scenario, motion: AbstractMotion | RecordedMotion | None, key: Array
+) -> tuple[Pose, Any]:
     """The true poses, and what the filter is told of every step."""
-    if isinstance(motion, Trajectory):
+    if isinstance(motion, RecordedMotion):
         return _recorded(s, motion, key)
     if motion is None and s.motion == "odometry":
         return _by_odometry(s, key)
@@ -120,7 +122,7 @@ def _by_noise(s: Scenario, motion: AbstractMotion, key: Array) -> tuple[Pose, An
     return _with_start(origin, poses, still), _every_step(s, control)
 
 
-def _recorded(s: Scenario, trajectory: Trajectory, key: Array) -> tuple[Pose, Any]:
+def _recorded(s: Scenario, trajectory: RecordedMotion, key: Array) -> tuple[Pose, Any]:
     """A recorded path from a random start, after the frames in which the camera stands still."""
     still = min(s.still_frames, s.steps)
     if trajectory.steps != s.steps - still:
