@@ -11,6 +11,7 @@ import numpy as np
 import jaxslam
 from jaxslam._numerics.arrays import AnyArray, number_field
 from jaxslam.filters.forms.blocks import residuals
+from jaxslam.filters.forms.correction import AbstractCorrection, kalman_update
 from jaxslam.filters.forms.covariance import Covariance
 from jaxslam.geometry import exp, homogeneous_apply
 from jaxslam.landmarks import Parametrization
@@ -160,15 +161,15 @@ class DriftingFocal(jaxslam.AbstractCalibration):
         return replace(nominal, camera=replace(camera, focal=camera.focal * (1 + delta[0])))
 
 
-class Huber(Covariance):
+class Huber(AbstractCorrection):
     """Measurements that are off by more than k σ count with less weight (Huber 1964)."""
 
     k: float = eqx.field(static=True, default=2.0)
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         _, residual, _, _ = residuals(model, state, features, context)
-        expected = self.predict_features(model, state, features.slots, noise, context)[1]
+        expected = Covariance().predict_features(model, state, features.slots, noise, context)[1]
         sigma = jnp.sqrt(jnp.trace(expected, axis1=1, axis2=2) / residual.shape[1])
         off = jnp.linalg.norm(residual, axis=1) / sigma / self.k
         weighted = noise * jnp.maximum(off, 1.0)[:, None, None]
-        return super().update(model, state, features, weighted, context, considered)
+        return kalman_update(model, state, None, features, weighted, context, considered)

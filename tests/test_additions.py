@@ -19,6 +19,7 @@ from additions import (
 from cases import quick_jit
 
 import jaxslam
+from jaxslam.filters.forms.covariance import Covariance
 from jaxslam.filters.registry import scenario_pieces
 from jaxslam.statistics import not_disproved
 
@@ -110,7 +111,7 @@ def test_a_treatment_of_ones_own_is_studied():
 
 def test_a_remedy_of_ones_own_resists_outliers():
     scenario = jaxslam.scenario("matched-tight", steps=8)
-    plain, robust = paper(scenario), paper(scenario, form=Huber())
+    plain, robust = paper(scenario), paper(scenario, form=Covariance(Huber()))
     assert not_disproved(verdict(scenario, robust))
     new = jaxslam.Features(
         jnp.array([0, 1]), jnp.array([[300.0], [350.0]]), jnp.array([True, True])

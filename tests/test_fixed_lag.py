@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from cases import Case, central, close, pose_run, quick_jit
 
+from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.forms.sensitivity import begin
 from jaxslam.filters.readouts import camera_pose, landmarks_in_camera
 from jaxslam.filters.registry import make_filter
@@ -138,6 +139,27 @@ def test_an_iterated_filter_uses_a_measurement_once():
     _, iterated_P = landmarks_in_camera(base, state, slot, robocentric.sensor)
     _, plain_P = landmarks_in_camera(robocentric, plain, slot, robocentric.sensor)
     np.testing.assert_allclose(iterated_P, plain_P, rtol=0.02)
+
+
+@pytest.mark.parametrize("coordinates", ["robocentric", "scale_gauge"])
+def test_the_iterated_filter_in_stages_is_the_window_of_one_frame(coordinates):
+    """After the first frame, of which both have the same prior: three steps of Gauss–Newton."""
+    of = case("matched-loose", steps=1)
+    staged, window, plain = (
+        of.filter(f"{coordinates}{steps}") for steps in ("+iterated3", "+lag1+iterated3", "")
+    )
+    assert isinstance(staged, EkfSlam)
+    found, expected, once = (pose_run(of, slam)[1] for slam in (staged, window, plain))
+    away = (expected[0].inverse() @ found[0]).log() / np.sqrt(np.diagonal(expected[1][0]))
+    np.testing.assert_allclose(away, 0, atol=1e-6)
+    close(found[1], expected[1], 1e-6)
+    assert np.abs((expected[0].inverse() @ once[0]).log()).max() > 1e-6
+    assert np.abs(found[1] / once[1] - 1).max() > 1e-4
+
+
+def test_an_update_has_one_step_at_least():
+    with pytest.raises(ValueError, match="an update takes a number of steps of at least 1, not 0"):
+        case().filter("world+iterated0")
 
 
 def test_absorbing_the_oldest_frame_keeps_its_point_and_all_that_is_known_of_the_newest():

@@ -1,11 +1,14 @@
 """The structure that a newcomer may rely on: imports one way, short functions, small rooms."""
 
 import ast
+import importlib
 import os
 import statistics
 import subprocess
 import sys
 from pathlib import Path
+
+import equinox as eqx
 
 import jaxslam
 from jaxslam.filters.ekf import EkfSlam
@@ -113,6 +116,26 @@ def test_a_filter_is_three_functions_and_one_that_tracks_six_more():
     }  # fmt: skip
     methods = {n for n in public(EkfSlam) if callable(getattr(EkfSlam, n, None))}
     assert len(methods - set(EkfSlam.__dataclass_fields__)) <= 15
+
+
+def modules(cls=eqx.Module):
+    """Every class of the package below one; of files that are there without an extra."""
+    for below in cls.__subclasses__():
+        if below.__module__.startswith("jaxslam."):
+            yield below
+        yield from modules(below)
+
+
+def test_a_class_is_abstract_or_final():
+    """As in equinox: what a class does is then read in one place."""
+    for path in (PACKAGE / "filters").rglob("*.py"):
+        parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+        importlib.import_module(".".join(parts).removesuffix(".__init__"))
+    found = set(modules())
+    assert len(found) > 50
+    for cls in found:
+        for above in cls.__mro__[1:]:
+            assert above not in found or above.__name__.startswith("Abstract"), (cls, above)
 
 
 def test_a_wrapper_hands_on_all_that_a_filter_says():

@@ -11,8 +11,8 @@ from cases import Case, close, named, pose, quick_jit
 
 from jaxslam.filters.forms.blocks import shifted
 from jaxslam.filters.forms.covariance import Covariance
+from jaxslam.filters.forms.gauge import act
 from jaxslam.filters.model import COMPOSED
-from jaxslam.filters.remedies.gauge import act
 from jaxslam.geometry import PLANAR, SPATIAL, difference, exp, log
 from jaxslam.landmarks import CARTESIAN, INVERSE_DEPTH, INVERSE_SCALING
 

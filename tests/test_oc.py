@@ -16,10 +16,10 @@ from test_observability import GAUGE, nullity
 
 from jaxslam.filters.forms.blocks import shifted
 from jaxslam.filters.forms.covariance import Covariance
+from jaxslam.filters.forms.gauge import act, unobservable_directions
+from jaxslam.filters.forms.observability_constrained import transport
 from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.filters.registry import make_filter, scenario_pieces
-from jaxslam.filters.remedies.gauge import act, unobservable_directions
-from jaxslam.filters.remedies.observability_constrained import transport
 from jaxslam.geometry import PLANAR, SPATIAL, SplitPose, difference, tangent_dim
 from jaxslam.landmarks import (
     CARTESIAN,

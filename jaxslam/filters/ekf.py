@@ -111,7 +111,7 @@ class EkfSlam(AbstractStaged):
     scale: Metre | ScaleGauge = Metre()
     """The unit of length in the state."""
     form: AbstractForm = Covariance()
-    """How the uncertainty is kept; a remedy is a form."""
+    """How the uncertainty is kept; a remedy is a correction of the covariance form."""
     entry: AbstractEntry = Undelayed()
     """How landmarks enter the map."""
 
@@ -369,14 +369,14 @@ def check_can_track(slam: AbstractFilter, name: str) -> None:
     )
 
 
-def check_one_gaussian(base: Any, what: str, remedies: bool = False) -> None:
+def check_one_gaussian(base: Any, what: str, corrected: bool = False) -> None:
     """Raise ValueError, saying of what, unless all that `base` knows is in one covariance.
 
-    With `remedies`, of a form that only looks after it in its own way as well.
+    `corrected` by something else than the plain update is accepted too, on demand.
     """
     if not isinstance(base, EkfSlam):
         raise ValueError(f"{what} is around an EkfSlam, not around a {type(base).__name__}")
-    plain = type(base.form) is Covariance or (remedies and base.form.divisible)
+    plain = base.form.plain or (corrected and base.form.divisible)
     for wrong, why in (
         (not plain, "is for filters in covariance form"),
         (not isinstance(base.entry, Undelayed), "does not know delayed landmarks"),

@@ -15,19 +15,19 @@ import numpy as np
 
 from jaxslam._runtime.lookup import as_list, lookup
 from jaxslam.filters.association import TOLERANCE
-from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.ekf import EkfSlam, check_one_gaussian
+from jaxslam.filters.forms.correction import AbstractCorrection, Standard
 from jaxslam.filters.forms.covariance import Covariance
-from jaxslam.filters.forms.form import AbstractForm
+from jaxslam.filters.forms.first_estimates import FirstEstimates
 from jaxslam.filters.forms.information import Information
+from jaxslam.filters.forms.invariant import Invariant
+from jaxslam.filters.forms.observability_constrained import ObservabilityConstrained
 from jaxslam.filters.initialisation.depth_particles import with_depth_particles
 from jaxslam.filters.initialisation.rays import with_rays
 from jaxslam.filters.protocol import AbstractFilter
-from jaxslam.filters.remedies.first_estimates import FirstEstimates
-from jaxslam.filters.remedies.invariant import Invariant
-from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
 from jaxslam.filters.wrappers.adaptive_process_noise import MEMORY, AdaptiveProcessNoise
 from jaxslam.filters.wrappers.batch_initialisation import from_rest
-from jaxslam.filters.wrappers.fixed_lag import LAG, FixedLag, iterated
+from jaxslam.filters.wrappers.fixed_lag import LAG, FixedLag, to_maximum
 from jaxslam.filters.wrappers.gated import Gated
 from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
 from jaxslam.landmarks import LANDMARKS, Parametrization
@@ -79,12 +79,12 @@ def world_gauge(**pieces: Any) -> EkfSlam:
 
 def iterated_filter(**pieces: Any) -> FixedLag:
     """The paper's filter, iterated: linearised at the maximum of the posterior of every frame."""
-    return iterated(robocentric(**pieces))
+    return to_maximum(robocentric(**pieces))
 
 
 def invariant(**pieces: Any) -> EkfSlam:
     """`world` with the right-invariant error: landmarks' errors move with the pose's."""
-    return EkfSlam(coordinates=WORLD, form=Invariant(), **pieces)
+    return EkfSlam(coordinates=WORLD, form=Covariance(Invariant()), **pieces)
 
 
 FILTERS: dict[str, Callable[..., AbstractFilter]] = {
@@ -126,21 +126,30 @@ def with_scene_depth(slam: EkfSlam, percent: int | None) -> EkfSlam:
 def with_observability_constraint(slam: EkfSlam, steps: int | None) -> EkfSlam:
     """The filter whose covariance is carried along the gauge, after each of so many steps of
     Gauss–Newton in an update; 1 by default, as an EKF has. Raises ValueError."""
-    steps = 1 if steps is None else steps
-    if steps < 1:
-        raise ValueError(f"modifier oc takes a number of steps of at least 1, not {steps}")
-    return _with_form("oc", ObservabilityConstrained(steps))(slam, None)
+    oc = ObservabilityConstrained() if steps is None else ObservabilityConstrained(steps)
+    return _with_correction("oc", oc)(slam, None)
 
 
-def _with_form(word: str, form: AbstractForm) -> Callable[[EkfSlam, int | None], EkfSlam]:
-    def remedied(slam: EkfSlam, number: int | None) -> EkfSlam:
+def _with_correction(
+    word: str, correction: AbstractCorrection
+) -> Callable[[EkfSlam, int | None], EkfSlam]:
+    def corrected(slam: EkfSlam, number: int | None) -> EkfSlam:
         if number is not None:
             raise ValueError(f"modifier {word} takes no number, not {number}")
-        if type(slam.form) is not Covariance:
+        if not slam.form.plain:
             raise ValueError(f"{word} is for the plain EKF in covariance form")
-        return replace(slam, form=form)
+        return replace(slam, form=Covariance(correction))
 
-    return remedied
+    return corrected
+
+
+def iterated(base: EkfSlam | FixedLag, steps: int | None) -> EkfSlam | FixedLag:
+    """The filter, linearised at the maximum of the posterior of every frame, or of its window; or
+    after so many steps of Gauss–Newton, as the iterated EKF, which can track. Raises ValueError."""
+    if steps is None or isinstance(base, FixedLag):
+        return to_maximum(base, steps)
+    check_one_gaussian(base, "an iterated filter")
+    return replace(base, form=Covariance(Standard(steps)))
 
 
 _OF_ONE_FILTER: dict[str, Callable[[EkfSlam, int | None], EkfSlam]] = {
@@ -149,7 +158,7 @@ _OF_ONE_FILTER: dict[str, Callable[[EkfSlam, int | None], EkfSlam]] = {
     "common": with_common_depth,
     "scene": with_scene_depth,
     "oc": with_observability_constraint,
-    "fej": _with_form("fej", FirstEstimates()),
+    "fej": _with_correction("fej", FirstEstimates()),
 }
 _AROUND_ANY_FILTER: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
     "lag": lambda slam, frames: FixedLag(slam, LAG if frames is None else frames),

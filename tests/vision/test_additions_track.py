@@ -9,6 +9,7 @@ pytest.importorskip("cv2")
 from additions import PLAIN_HOMOGENEOUS, BiasedVelocity, DriftingFocal, Huber, Pixels
 
 import jaxslam
+from jaxslam.filters.forms.covariance import Covariance
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
@@ -28,7 +29,7 @@ def pieces_of(kind, calibration):
         "sensor": jaxslam.Pinhole(camera, 0.3),
         "calibration": DriftingFocal([0.01], [0.001]),
         "landmark": PLAIN_HOMOGENEOUS,
-        "form": Huber(3.0),
+        "form": Covariance(Huber(3.0)),
     }
 
 

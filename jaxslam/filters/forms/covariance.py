@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.arrays import AnyArray
-from jaxslam._numerics.linalg import cholesky, symmetric_part
 from jaxslam.filters.forms.blocks import (
     Blocks,
     Change,
@@ -25,30 +24,33 @@ from jaxslam.filters.forms.blocks import (
     local_jacobians,
     masked,
     new_landmarks,
-    observed,
-    residuals,
     rows,
-    shifted,
     without_auxiliary,
 )
+from jaxslam.filters.forms.correction import AbstractCorrection, Standard
 from jaxslam.filters.forms.form import AbstractGaussian
 from jaxslam.filters.forms.state import State
 from jaxslam.geometry import jacobian
-from jaxslam.models.observations import Features, Innovation, judged
-
-ROUNDING = 4.0
-"""Units in the last place of its own that every variance gets back in an update.
-
-Differences of matrices are positive up to rounding only, and what rounding takes from an
-unobserved direction in single precision adds up over hundreds of steps. With this, eigenvalues of
-the correlations stay above `−n ε` however many there are (measured over 600 steps).
-"""
+from jaxslam.models.observations import Features, Innovation
 
 
 class Covariance(AbstractGaussian):
     """Mean and covariance: the extended Kalman filter."""
 
-    divisible: ClassVar[bool] = True
+    correction: AbstractCorrection = Standard()
+
+    @property
+    def plain(self) -> bool:
+        """Whether an update is that of the extended Kalman filter, and nothing else."""
+        return isinstance(self.correction, Standard) and self.correction.steps == 1
+
+    @property
+    def divisible(self) -> bool:
+        return self.correction.divisible
+
+    def check(self, slam: Any) -> None:
+        """Raise ValueError for a filter that cannot be corrected so."""
+        self.correction.check(slam)
 
     def empty(self, core: Any, landmarks: Float[Array, "capacity d"]) -> State:
         """A state that is exactly known, of slots that hold no landmark yet."""
@@ -57,7 +59,8 @@ class Covariance(AbstractGaussian):
             core, landmarks, jnp.zeros(capacity, bool), jnp.zeros((0, 0), landmarks.dtype)
         )
         n = state.core_dim + landmarks.size
-        return replace(state, covariance=jnp.zeros((n, n), landmarks.dtype))
+        state = replace(state, covariance=jnp.zeros((n, n), landmarks.dtype))
+        return self.correction.remember(state, jnp.arange(capacity))
 
     def augment(self, state: State, start: int, covariance: Float[Array, "k k"]) -> State:
         if covariance.size == 0:
@@ -86,49 +89,7 @@ class Covariance(AbstractGaussian):
         context: Any,
         considered: slice = slice(0, 0),
     ) -> tuple[State, Innovation]:
-        """The Kalman update by all features at once (P16, P17), in Joseph's form."""
-        return self.update_at(model, state, None, features, noise, context, considered)
-
-    def update_at(
-        self,
-        model: Model,
-        state: State,
-        offset: Float[Array, " n"] | None,
-        features: Features,
-        noise: Float[Array, "p p"] | Float[Array, "m p p"],
-        context: Any,
-        considered: slice = slice(0, 0),
-    ) -> tuple[State, Innovation]:
-        """`update` of the prediction x ⊞ offset, with H and the residuals of the state x.
-
-        A step of Gauss–Newton to the maximum of the posterior; None is no offset.
-        """
-        predicted, residual, used, blocks = residuals(model, state, features, context)
-        P = state.covariance
-        R = _noise_matrix(noise, used)
-        HP = observed(blocks, features.slots, P)
-        S = observed(blocks, features.slots, HP.T).T + R
-        factor = cholesky(S)
-        whitening = factor.whitening
-        K = ((HP.T @ whitening.T) @ whitening).at[considered].set(0.0)
-        if offset is not None:
-            moved = observed(blocks, features.slots, offset[:, None])
-            residual = residual - moved.reshape(residual.shape)
-        whitened = whitening @ residual.ravel()
-
-        # Joseph's (I - KH) P (I - KH)ᵀ + K R Kᵀ, multiplied out from the left: two products of
-        # rank m, and none of n × n matrices. An error of K then counts by its square only; what
-        # rounding does to the differences is made good by `ROUNDING`.
-        left = P - K @ HP
-        covariance = left + (K @ R - observed(blocks, features.slots, left.T).T) @ K.T
-        lost = ROUNDING * jnp.finfo(P.dtype).eps * jnp.diagonal(P).at[considered].set(0.0)
-        delta = K @ residual.ravel()
-        state = shifted(state, delta if offset is None else offset + delta)
-        state = replace(state, covariance=symmetric_part(covariance) + jnp.diag(lost))
-        variances = jnp.diagonal(covariance) + lost
-        status = judged(factor.positive & jnp.all(variances >= 0), variances, state.landmarks)
-        nis = whitened @ whitened
-        return state, Innovation(predicted, residual, S, used, nis, status, factor.log_det())
+        return self.correction.update(model, state, features, noise, context, considered)
 
     def reparametrise(self, state: State, variables: Change) -> State:
         """Write the state in other variables, `P ← J P Jᵀ`."""
@@ -163,12 +124,13 @@ class Covariance(AbstractGaussian):
             return P.at[index.ravel()].set(rows.reshape(index.size, -1), mode="drop")
 
         covariance = with_rows(with_rows(state.covariance).T)
-        return replace(
+        state = replace(
             state,
             landmarks=state.landmarks.at[slots].set(new, mode="drop"),
             active=state.active.at[slots].set(True, mode="drop"),
             covariance=covariance.at[index[:, :, None], index[:, None, :]].add(own, mode="drop"),
         )
+        return self.correction.remember(state, slots)
 
     def remove(self, state: State, gone: Bool[AnyArray, " capacity"]) -> State:
         kept = jnp.repeat(~gone, state.landmarks.shape[1])
@@ -226,11 +188,3 @@ def _transformed(state: State, core: Any, J_core: Array, landmarks: Array, J: Bl
 
     covariance = turned(turned(state.covariance).T)
     return replace(state, core=core, landmarks=landmarks, covariance=covariance)
-
-
-def _noise_matrix(noise, used):
-    """Block-diagonal R, with an identity block where a feature is not used."""
-    m, p = used.size, noise.shape[-1]
-    blocks = jnp.where(used[:, None, None], noise, jnp.eye(p, dtype=noise.dtype))
-    R = jnp.zeros((m, p, m, p), noise.dtype)
-    return R.at[jnp.arange(m), :, jnp.arange(m), :].set(blocks).reshape(m * p, m * p)

@@ -1,8 +1,8 @@
 """What a form of the filter is: how its uncertainty is kept, and what every step does to it.
 
 `Covariance` keeps P, `Information` its inverse, `Sensitivity` no distribution but derivatives. A
-state of each has `core`, `landmarks`, `active`, `memory` and `core_dim`. A remedy is a form that
-overrides `update`, or another function, of `Covariance`.
+state of each has `core`, `landmarks`, `active`, `memory` and `core_dim`. A remedy is a correction
+of `Covariance` (`correction.py`).
 """
 
 from __future__ import annotations
@@ -34,8 +34,15 @@ from jaxslam.models.observations import Features
 class AbstractForm(eqx.Module):
     """The steps of a frame, on a state of its own."""
 
-    divisible: ClassVar[bool] = False
-    """Whether its state is a mean and a covariance of `x ⊞ δ`, to be divided and merged as such."""
+    @property
+    def plain(self) -> bool:
+        """Whether it is the extended Kalman filter in covariance form, as it is."""
+        return False
+
+    @property
+    def divisible(self) -> bool:
+        """Whether its state is a mean and a covariance of `x ⊞ δ`, to be divided and merged."""
+        return False
 
     def check(self, slam: Any) -> None:
         """Raise ValueError for a filter of which this cannot be the form; any can be, here."""

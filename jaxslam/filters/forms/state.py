@@ -25,6 +25,9 @@ class State(eqx.Module):
     memory: Any = ()
     """What an `AbstractEntry` remembers of landmarks beside the Gaussian: any pytree."""
 
+    first: Float[Array, "capacity d"] | None = None
+    """Landmarks as they were inserted; where a correction is by first estimates."""
+
     @property
     def core_dim(self) -> int:
         """c, the size of the core's tangent."""

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam.filters.ekf import AbstractEntry, EkfSlam
-from jaxslam.filters.forms.covariance import Covariance
 from jaxslam.landmarks import CARTESIAN
 from jaxslam.landmarks.parametrization import Parametrization
 
@@ -18,7 +17,7 @@ def with_entry(slam: EkfSlam, entry: AbstractEntry, landmark: Parametrization) -
 
     Raises ValueError where the filter's landmarks are not Cartesian, or have no depth to find.
     """
-    if type(slam.form) is not Covariance:
+    if not slam.form.plain:
         raise ValueError("a delayed initialisation is for filters in covariance form")
     if slam.landmark is not CARTESIAN:
         raise ValueError(

@@ -249,7 +249,7 @@ class FixedLag(AbstractFilter):
         return solution.value, solution.result == optx.RESULTS.successful
 
 
-def iterated(base: EkfSlam | FixedLag, steps: int | None = None) -> FixedLag:
+def to_maximum(base: EkfSlam | FixedLag, steps: int | None = None) -> FixedLag:
     """The filter, linearised at the maximum of the posterior; or after so many steps of
     Gauss–Newton. With no lag it is the iterated EKF: one frame, always on the original prior."""
     lagged = base if isinstance(base, FixedLag) else FixedLag(base, 1)

@@ -67,7 +67,7 @@ class GaussianSum(AbstractStaged):
     def __check_init__(self) -> None:
         check_staged(self, self.base)
         if self.split:
-            check_one_gaussian(self.base, "a mixture", remedies=True)
+            check_one_gaussian(self.base, "a mixture", corrected=True)
         if self.members < 3:
             raise ValueError(f"a Gaussian sum has at least 3 members, not {self.members}")
         if self.along not in ALONG:

@@ -9,26 +9,29 @@ both frames, and the scale of a monocular filter, in metres or in a unit of its 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.filters.forms.covariance import Covariance
+from jaxslam.filters.forms.correction import AbstractCorrection, check_steps, gauss_newton
+from jaxslam.filters.forms.gauge import check_gauge, scale_is_free, unobservable_directions
 from jaxslam.filters.forms.state import State
+from jaxslam.filters.forms.transport import carried, check_undelayed, read_from, read_scale_too
 from jaxslam.filters.model import SlamModel
-from jaxslam.filters.remedies.gauge import check_gauge, scale_is_free, unobservable_directions
-from jaxslam.filters.remedies.transport import carried, check_undelayed, read_from, read_scale_too
-from jaxslam.geometry import difference, tangent_dim
+from jaxslam.geometry import tangent_dim
 
 
-class ObservabilityConstrained(Covariance):
+class ObservabilityConstrained(AbstractCorrection):
     """The covariance carried along the gauge after every update, and between the steps of one."""
 
     steps: int = eqx.field(static=True, default=1)
     """Of Gauss–Newton in an update: an EKF has one. Where a second goes far from the first, as of
     a camera whose acceleration is large, the first would be wrong, and carried on."""
+
+    def __check_init__(self) -> None:
+        check_steps(self.steps, "modifier oc")
 
     def check(self, slam: Any) -> None:
         """Raise ValueError where there is nothing to constrain, or N is not known."""
@@ -36,30 +39,13 @@ class ObservabilityConstrained(Covariance):
         check_gauge(slam.model)
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
-        at, offset = state, None
-        for _ in range(self.steps - 1):
-            at = follow(
-                model, at, self._mean(model, at, offset, features, noise, context, considered)
-            )
-            offset = apart(state, at)
-        after, innovation = self.update_at(model, at, offset, features, noise, context, considered)
-        return follow(model, at, after), innovation
-
-    def _mean(self, model, at, offset, *data) -> State:
-        """The mean that a step gives, with the covariance as it was."""
-        after, _ = self.update_at(model, at, offset, *data)
-        return replace(after, covariance=at.covariance)
+        data = features, noise, context, considered
+        return gauss_newton(model, state, self.steps, partial(follow, model), *data)
 
 
 def follow(model: SlamModel, before: State, after: State) -> State:
     """`after` an update, with its covariance carried from N(before) to N(after)."""
     return replace(after, covariance=carried(after.covariance, *transport(model, before, after)))
-
-
-def apart(state: State, origin: State) -> Float[Array, " n"]:
-    """`state ⊟ origin`."""
-    landmarks = (state.landmarks - origin.landmarks).ravel()
-    return jnp.concatenate([difference(state.core, origin.core), landmarks])
 
 
 def transport(

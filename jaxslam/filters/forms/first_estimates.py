@@ -13,26 +13,18 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import jax
-from jax import numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.filters.forms.covariance import Covariance
+from jaxslam.filters.forms.correction import AbstractCorrection, kalman_update
+from jaxslam.filters.forms.observability_constrained import follow
 from jaxslam.filters.forms.state import State
+from jaxslam.filters.forms.transport import check_metric, check_undelayed
 from jaxslam.filters.model import SlamModel
-from jaxslam.filters.remedies.observability_constrained import follow
-from jaxslam.filters.remedies.transport import check_metric, check_undelayed
 from jaxslam.models.coordinates import WORLD
 from jaxslam.models.observations import Features
 
 
-class FirstEstimateState(State):
-    """A state that remembers how every landmark was first estimated."""
-
-    first: Float[Array, "capacity d"] | None = None
-    """Landmarks as they were inserted."""
-
-
-class FirstEstimates(Covariance):
+class FirstEstimates(AbstractCorrection):
     """Residuals of the estimate, H of the first estimates, and `transport` of the core."""
 
     divisible: ClassVar[bool] = False
@@ -52,30 +44,23 @@ class FirstEstimates(Covariance):
                 f"{slam.landmark.name}"
             )
 
-    def empty(self, core, landmarks):
-        state = super().empty(core, landmarks)
-        return FirstEstimateState(
-            state.core, landmarks, state.active, state.covariance, first=landmarks
-        )
-
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         start, moved, predicted = _at_first(model, state, features, context)
-        after, innovation = super().update(model, start, moved, noise, context, considered)
+        after, innovation = kalman_update(model, start, None, moved, noise, context, considered)
         correction = after.landmarks - start.landmarks
         after = follow(model, start, replace(after, landmarks=start.landmarks))
         after = replace(after, landmarks=state.landmarks + correction)
         return after, replace(innovation, predicted=predicted)
 
-    def initialise(self, model, state, features, noise, prior, context):
-        after = super().initialise(model, state, features, noise, prior, context)
-        slots = jnp.where(features.valid, features.slots, state.active.size)
-        new = after.landmarks[features.slots]
-        return replace(after, first=state.first.at[slots].set(new, mode="drop"))
+    def remember(self, state, slots):
+        first = state.landmarks if state.first is None else state.first
+        new = state.landmarks[slots]
+        return replace(state, first=first.at[slots].set(new, mode="drop"))
 
 
 def _at_first(
-    model: SlamModel, state: FirstEstimateState, features: Features, context: Any
-) -> tuple[FirstEstimateState, Features, Float[Array, "m p"]]:
+    model: SlamModel, state: State, features: Features, context: Any
+) -> tuple[State, Features, Float[Array, "m p"]]:
     """The state whose landmarks are the first estimates, measurements moved so that its residuals
     are those of the estimate, and the predictions of the estimate."""
     view = model.view(state.core, context)

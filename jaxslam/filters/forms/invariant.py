@@ -27,16 +27,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam.filters.forms.blocks import shifted
-from jaxslam.filters.forms.covariance import Covariance
+from jaxslam.filters.forms.correction import AbstractCorrection, kalman_update
+from jaxslam.filters.forms.gauge import act, unobservable_directions
 from jaxslam.filters.forms.state import State
+from jaxslam.filters.forms.transport import carried, check_metric, check_undelayed, read_from
 from jaxslam.filters.model import SlamModel
-from jaxslam.filters.remedies.gauge import act, unobservable_directions
-from jaxslam.filters.remedies.transport import carried, check_metric, check_undelayed, read_from
 from jaxslam.geometry import difference, exp, tangent_dim
 from jaxslam.models.coordinates import WORLD
 
 
-class Invariant(Covariance):
+class Invariant(AbstractCorrection):
     """The EKF whose correction is read as a ξ."""
 
     def check(self, slam: Any) -> None:
@@ -49,7 +49,7 @@ class Invariant(Covariance):
             )
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
-        added, innovation = super().update(model, state, features, noise, context, considered)
+        added, innovation = kalman_update(model, state, None, features, noise, context, considered)
         N, L = _rigid_directions(model, state)
         after = _retracted(model, state, added, N, L)
         N_after, _ = _rigid_directions(model, after)

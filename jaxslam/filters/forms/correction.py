@@ -1,0 +1,152 @@
+"""How the covariance form corrects by measurements: the Kalman update, and what keeps to it.
+
+A correction is a piece of `Covariance`. Each of the others is in a file of its own:
+`first_estimates`, `invariant`, `observability_constrained`.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam._numerics.linalg import cholesky, symmetric_part
+from jaxslam.filters.forms.blocks import Model, observed, residuals, shifted
+from jaxslam.filters.forms.state import State
+from jaxslam.geometry import difference
+from jaxslam.models.observations import Features, Innovation, judged
+
+ROUNDING = 4.0
+"""Units in the last place of its own that every variance gets back in an update.
+
+Differences of matrices are positive up to rounding only, and what rounding takes from an
+unobserved direction in single precision adds up over hundreds of steps. With this, eigenvalues of
+the correlations stay above `−n ε` however many there are (measured over 600 steps).
+"""
+
+
+class AbstractCorrection(eqx.Module):
+    """What an update makes of the features seen."""
+
+    divisible: ClassVar[bool] = True
+    """Whether the state is then a mean and a covariance of `x ⊞ δ`, to be divided and merged."""
+
+    def check(self, slam: Any) -> None:
+        """Raise ValueError for a filter that cannot be corrected so; any can be, here."""
+
+    @abstractmethod
+    def update(
+        self,
+        model: Any,
+        state: State,
+        features: Features,
+        noise: Float[Array, "p p"] | Float[Array, "m p p"],
+        context: Any,
+        considered: slice = slice(0, 0),
+    ) -> tuple[State, Innovation]:
+        """Correct by all features at once, as `AbstractForm.update` says."""
+
+    def remember(self, state: State, slots: Int[Array, " m"]) -> State:
+        """Keep what is needed of landmarks that were just written in these slots, of which those
+        out of bounds are none."""
+        del slots
+        return state
+
+
+class Standard(AbstractCorrection):
+    """The extended Kalman filter's (P16, P17); of several steps, the iterated one's (Bell, Cathey:
+    The Iterated Kalman Filter Update as a Gauss–Newton Method, IEEE TAC 1993)."""
+
+    steps: int = eqx.field(static=True, default=1)
+    """Of Gauss–Newton to the maximum of the posterior, all on the prior of the frame."""
+
+    def __check_init__(self) -> None:
+        check_steps(self.steps, "an update")
+
+    def update(self, model, state, features, noise, context, considered=slice(0, 0)):
+        data = features, noise, context, considered
+        return gauss_newton(model, state, self.steps, lambda before, after: after, *data)
+
+
+def check_steps(steps: int, what: str) -> None:
+    """Raise ValueError for less than one step of Gauss–Newton."""
+    if steps < 1:
+        raise ValueError(f"{what} takes a number of steps of at least 1, not {steps}")
+
+
+def gauss_newton(
+    model: Model,
+    state: State,
+    steps: int,
+    corrected: Callable[[State, State], State],
+    *data: Any,
+) -> tuple[State, Innovation]:
+    """So many steps to the maximum of the posterior. Every step, from `before` to `after`, is what
+    is `corrected(before, after)` of it. `data` are what `kalman_update` asks for."""
+    at, offset = state, None
+    for _ in range(steps - 1):
+        after, _ = kalman_update(model, at, offset, *data)
+        at = corrected(at, replace(after, covariance=at.covariance))
+        offset = _apart(state, at)
+    after, innovation = kalman_update(model, at, offset, *data)
+    return corrected(at, after), innovation
+
+
+def _apart(state: State, origin: State) -> Float[Array, " n"]:
+    """`state ⊟ origin`."""
+    landmarks = (state.landmarks - origin.landmarks).ravel()
+    return jnp.concatenate([difference(state.core, origin.core), landmarks])
+
+
+def kalman_update(
+    model: Model,
+    state: State,
+    offset: Float[Array, " n"] | None,
+    features: Features,
+    noise: Float[Array, "p p"] | Float[Array, "m p p"],
+    context: Any,
+    considered: slice = slice(0, 0),
+) -> tuple[State, Innovation]:
+    """The update by all features at once (P16, P17), in Joseph's form, of the prediction
+    x ⊞ offset, with H and the residuals of the state x; None is no offset."""
+    predicted, residual, used, blocks = residuals(model, state, features, context)
+    P = state.covariance
+    R = _noise_matrix(noise, used)
+    HP = observed(blocks, features.slots, P)
+    S = observed(blocks, features.slots, HP.T).T + R
+    factor = cholesky(S)
+    whitening = factor.whitening
+    K = ((HP.T @ whitening.T) @ whitening).at[considered].set(0.0)
+    if offset is not None:
+        moved = observed(blocks, features.slots, offset[:, None])
+        residual = residual - moved.reshape(residual.shape)
+    whitened = whitening @ residual.ravel()
+
+    # Joseph's (I - KH) P (I - KH)ᵀ + K R Kᵀ, multiplied out from the left: two products of
+    # rank m, and none of n × n matrices. An error of K then counts by its square only; what
+    # rounding does to the differences is made good by `ROUNDING`.
+    left = P - K @ HP
+    covariance = left + (K @ R - observed(blocks, features.slots, left.T).T) @ K.T
+    lost = ROUNDING * jnp.finfo(P.dtype).eps * jnp.diagonal(P).at[considered].set(0.0)
+    delta = K @ residual.ravel()
+    state = shifted(state, delta if offset is None else offset + delta)
+    state = replace(state, covariance=symmetric_part(covariance) + jnp.diag(lost))
+    variances = jnp.diagonal(covariance) + lost
+    status = judged(factor.positive & jnp.all(variances >= 0), variances, state.landmarks)
+    nis = whitened @ whitened
+    return state, Innovation(predicted, residual, S, used, nis, status, factor.log_det())
+
+
+def _noise_matrix(
+    noise: Float[Array, "p p"] | Float[Array, "m p p"], used: Bool[Array, " m"]
+) -> Float[Array, "mp mp"]:
+    """Block-diagonal R, with an identity block where a feature is not used."""
+    m, p = used.size, noise.shape[-1]
+    blocks = jnp.where(used[:, None, None], noise, jnp.eye(p, dtype=noise.dtype))
+    R = jnp.zeros((m, p, m, p), noise.dtype)
+    return R.at[jnp.arange(m), :, jnp.arange(m), :].set(blocks).reshape(m * p, m * p)
