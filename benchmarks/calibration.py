@@ -149,7 +149,7 @@ def _run(
 def _batch(slam: AbstractFilter, room: Room, sensor: Pinhole, runs: Run):
     def one(run: Run):
         records, _, state = filter_run(slam, room, sensor, run)
-        estimate, covariance = slam.marginal(state, lambda scene: scene.core.calibration)
+        estimate, covariance = slam.marginal(state, lambda view: view.core.calibration)
         true = jax.tree.map(lambda x: x[-1], run.cameras).intrinsics
         error = true - sensor.camera.intrinsics
         if estimate.size:  # a known calibration has no estimate

@@ -14,7 +14,13 @@ from jaxslam.consistency import monte_carlo, summarise, table
 from jaxslam.evaluation import Convention, Evaluation, evaluate, evaluate_log, evaluate_poses
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.forms.state import State
-from jaxslam.filters.protocol import AbstractFilter, AbstractStaged, Expected, Scene
+from jaxslam.filters.protocol import (
+    AbstractFilter,
+    AbstractStaged,
+    CameraView,
+    Expected,
+    LandmarkView,
+)
 from jaxslam.filters.readouts import (
     camera_pose,
     landmark_samples,
@@ -60,6 +66,7 @@ __all__ = [
     "AbstractStaged",
     "BodyRates",
     "Camera",
+    "CameraView",
     "Capacity",
     "Considered",
     "ConstantVelocity",
@@ -75,6 +82,7 @@ __all__ = [
     "Innovation",
     "InverseDepth",
     "Known",
+    "LandmarkView",
     "Metre",
     "Odometry",
     "Pinhole",
@@ -82,7 +90,6 @@ __all__ = [
     "RangeBearing",
     "ScaleGauge",
     "Scenario",
-    "Scene",
     "State",
     "Status",
     "White",

@@ -221,8 +221,11 @@ class Around(AbstractStaged):
     def remove(self, state, gone):
         return state | {"inside": self.estimator.remove(state["inside"], gone)}
 
-    def marginal(self, state, function, slots=None):
-        return self.estimator.marginal(state["inside"], function, slots)
+    def marginal(self, state, function):
+        return self.estimator.marginal(state["inside"], function)
+
+    def landmark_marginal(self, state, function, slots):
+        return self.estimator.landmark_marginal(state["inside"], function, slots)
 
     def in_map(self, state):
         return self.estimator.in_map(state["inside"])

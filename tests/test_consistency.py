@@ -282,10 +282,8 @@ def test_a_run_that_comes_back_was_lost_ever():
 class OneLandmarkUnknown(jaxslam.EkfSlam):
     """A filter that has no covariance for slot 0."""
 
-    def marginal(self, state, function, slots=None):
-        value, covariance = super().marginal(state, function, slots)
-        if slots is None:
-            return value, covariance
+    def landmark_marginal(self, state, function, slots):
+        value, covariance = super().landmark_marginal(state, function, slots)
         return value, jnp.where((slots == 0)[:, None, None], jnp.nan, covariance)
 
 
@@ -531,7 +529,7 @@ def test_a_slot_used_again_is_as_good_as_one_of_its_own(name):
 
 
 class WithoutRemove(AbstractFilter):
-    """A filter of three functions."""
+    """A filter of four functions."""
 
     base: jaxslam.EkfSlam
 
@@ -541,8 +539,11 @@ class WithoutRemove(AbstractFilter):
     def step(self, state, control, seen, new):
         return self.base.step(state, control, seen, new)
 
-    def marginal(self, state, function, slots=None):
-        return self.base.marginal(state, function, slots)
+    def marginal(self, state, function):
+        return self.base.marginal(state, function)
+
+    def landmark_marginal(self, state, function, slots):
+        return self.base.landmark_marginal(state, function, slots)
 
 
 def test_a_filter_that_cannot_remove_landmarks_cannot_use_slots_again():

@@ -80,7 +80,7 @@ def pose_of(name, of=standstill):
     def one(state, run):
         truth = jax.tree.map(lambda x: x[-1], run.poses)
         error, P = slam.pose_error(state, truth)
-        pose, _ = slam.marginal(state, lambda scene: scene.pose)
+        pose, _ = slam.marginal(state, lambda view: view.pose)
         along = pose.translation() @ truth.translation()
         return error, P, along
 
@@ -165,7 +165,7 @@ def test_standing_teaches_nothing_and_then_the_motion_is_found():
     @quick_jit
     @jax.vmap
     def log_scale(state):
-        return standing().filter(STARTED).marginal(state, lambda scene: scene.core.log_scale)[1]
+        return standing().filter(STARTED).marginal(state, lambda view: view.core.log_scale)[1]
 
     sigma = [np.sqrt(np.asarray(log_scale(state))) for state in (first, last)]
     assert (sigma[1] > 0.9 * sigma[0]).all()
@@ -201,7 +201,7 @@ def test_without_landmarks_the_camera_is_known_less_with_every_frame():
         control, *seen = frame(k)
         unseen = (eqx.tree_at(lambda f: f.valid, f, jnp.zeros_like(f.valid)) for f in seen)
         state, _ = step(state, control, *unseen)
-        P = quick_jit(jax.vmap(lambda s: slam.marginal(s, lambda scene: scene.pose)))(state)[1]
+        P = quick_jit(jax.vmap(lambda s: slam.marginal(s, lambda view: view.pose)))(state)[1]
         sigmas.append(np.sqrt(np.einsum("rii->r", np.asarray(P))))
     assert (np.diff(sigmas, axis=0) > 0.5 * sigmas[0]).all()
 

@@ -109,10 +109,11 @@ def public(cls):
     }
 
 
-def test_a_filter_is_three_functions_and_one_that_tracks_six_more():
-    assert AbstractFilter.__abstractmethods__ == {"init", "step", "marginal"}
+def test_a_filter_is_four_functions_and_one_that_tracks_six_more():
+    assert AbstractFilter.__abstractmethods__ == {"init", "step", "marginal", "landmark_marginal"}
     assert AbstractStaged.__abstractmethods__ == {
-        "init", "marginal", "predict", "predict_features", "update", "compose", "close", "remove",
+        "init", "marginal", "landmark_marginal", "predict", "predict_features", "update", "compose",
+        "close", "remove",
     }  # fmt: skip
     methods = {n for n in public(EkfSlam) if callable(getattr(EkfSlam, n, None))}
     assert len(methods - set(EkfSlam.__dataclass_fields__)) <= 15

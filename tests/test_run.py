@@ -61,8 +61,11 @@ class OnlySteps(jaxslam.AbstractFilter):
     def step(self, state, control, seen, new):
         return self.base.step(state, control, seen, new)
 
-    def marginal(self, state, function, slots=None):
-        return self.base.marginal(state, function, slots)
+    def marginal(self, state, function):
+        return self.base.marginal(state, function)
+
+    def landmark_marginal(self, state, function, slots):
+        return self.base.landmark_marginal(state, function, slots)
 
 
 def test_slots_are_not_freed_of_a_filter_that_cannot_remove():

@@ -166,7 +166,7 @@ def begun_with(slam, velocity, sigma):
 def test_in_a_gauge_inverse_depths_have_the_moments_of_a_product_with_a_log_normal():
     """`E e^λ ρ = e^(λ + P/2) ρ0` and `E (e^λ ρ)² = e^(2λ + 2P) (ρ0² + σ²)`, exactly."""
     slam, state = in_gauge()
-    log_scale, P = slam.marginal(state, lambda scene: scene.core.log_scale)
+    log_scale, P = slam.marginal(state, lambda view: view.core.log_scale)
     log_scale, P = float(log_scale[0]), float(P[0, 0])
     assert P > 0.1
     mean, sigma = float(slam.depth.mean), float(slam.depth.sigma)

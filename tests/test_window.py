@@ -529,11 +529,10 @@ def test_the_filters_state_is_the_gaussian_of_the_mode(of, monkeypatch):
     def handed(at):
         first = Features(jnp.arange(m), record.measured[0], jnp.zeros(m, bool))
         state = gauge_state(slam, record, at, jnp.zeros(()), slam.init(m, first))
-        told = slam.marginal(state, lambda scene: scene.pose)
-        points = slam.marginal(
-            state, lambda scene: jnp.append(scene.point, scene.omega) / scene.point[-1],
-            jnp.arange(m),
-        )  # fmt: skip
+        told = slam.marginal(state, lambda view: view.pose)
+        points = slam.landmark_marginal(
+            state, lambda view: jnp.append(view.point, view.omega) / view.point[-1], jnp.arange(m)
+        )
         return state, told, points
 
     def of_window(u):
@@ -610,7 +609,7 @@ def test_the_filters_state_stands_at_the_mean_of_the_scale():
     def handed(at, shift):
         first = Features(jnp.arange(m), record.measured[0], jnp.zeros(m, bool))
         state = gauge_state(slam, record, at, shift, slam.init(m, first))
-        pose, covariance = slam.marginal(state, lambda scene: scene.pose)
+        pose, covariance = slam.marginal(state, lambda view: view.pose)
         return jnp.log(jnp.linalg.norm(pose.translation())), covariance
 
     zero, shift = jnp.zeros(()), jnp.asarray(0.1)

@@ -21,8 +21,14 @@ from jaxslam._numerics.arrays import AnyArray, cast, precision
 from jaxslam.filters.forms.covariance import Covariance, convert
 from jaxslam.filters.forms.form import AbstractForm, AbstractGaussian
 from jaxslam.filters.forms.state import State
-from jaxslam.filters.model import COMPOSED, Context, Core, SlamModel, View
-from jaxslam.filters.protocol import AbstractFilter, AbstractStaged, Expected, Scene
+from jaxslam.filters.model import COMPOSED, Context, Core, SlamModel
+from jaxslam.filters.protocol import (
+    AbstractFilter,
+    AbstractStaged,
+    CameraView,
+    Expected,
+    LandmarkView,
+)
 from jaxslam.geometry import Pose, SplitPose, difference, identity, tangent_dim
 from jaxslam.landmarks import INVERSE_SCALING, Parametrization
 from jaxslam.models.calibration import AbstractCalibration, Known, check_calibration
@@ -196,23 +202,24 @@ class EkfSlam(AbstractStaged):
         return self.gaussian_form.remove(state, gone)
 
     def marginal(
+        self, state: Any, function: Callable[[CameraView], Any]
+    ) -> tuple[Any, Float[Array, "k k"]]:
+        """Of the state at the end of a frame, to first order: `J P Jᵀ`."""
+
+        def of_core(core: Core) -> Any:
+            return function(CameraView(self.model.camera_pose(core), core, core.log_scale))
+
+        return self.form.core_covariance(of_core, state)
+
+    def landmark_marginal(
         self,
         state: Any,
-        function: Callable[[Scene], Any],
-        slots: Int[Array, " m"] | None = None,
-    ) -> tuple[Any, Float[Array, "k k"] | Float[Array, "m k k"]]:
-        """Of the state at the end of a frame, to first order: `J P Jᵀ`."""
-        model = self.model
-        if slots is None:
-            return self.form.core_covariance(
-                lambda core: function(
-                    Scene(model.camera_pose(core), core=core, log_scale=core.log_scale)
-                ),
-                state,
-            )
-        view, landmark = scene_of_landmark(self, function, state.core)
+        function: Callable[[LandmarkView], Float[Array, " k"]],
+        slots: Int[Array, " m"],
+    ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
+        """The same of landmarks."""
         return self.gaussian_form.landmark_covariance(
-            view, landmark, self.entry.collapsed(state), slots
+            composed, of_landmark(self, function), self.entry.collapsed(state), slots
         )
 
     def in_map(self, state: Any) -> Bool[Array, " capacity"]:
@@ -227,32 +234,23 @@ class EkfSlam(AbstractStaged):
         ), covariance
 
 
-def scene_of_landmark(
-    slam: EkfSlam, function: Callable[[Scene], Any], core: Core
-) -> tuple[Callable[[Core], Any], Callable[[Any, Array], Any]]:
-    """A function of a landmark's scene as one of a view, itself a function of the core, and of the
-    landmark. The view has the camera's pose only if the function asks for it."""
-    model, here = slam.model, slam.model.camera_pose(core)
-    needed = _asks_for_pose(function, here)
-
-    def view(core: Core) -> tuple[View, Pose | None]:
-        return model.view(core, COMPOSED), model.camera_pose(core) if needed else None
-
-    def landmark(view, landmark):
-        seen_from, T_BC = view
-        pose = T_BC if needed else here
-        seen = model.metric_point(seen_from, landmark)
-        return function(Scene(pose, *seen, log_scale=seen_from.log_scale))
-
-    return view, landmark
+def composed(core: Core) -> Core:
+    """Of a core what the camera and its landmarks depend on once the motion is composed."""
+    nothing = core.noise[:0]
+    return replace(core, motion=None, noise=nothing, calibration=nothing, depth_error=None)
 
 
-def _asks_for_pose(function: Callable[[Scene], Any], pose: Pose) -> bool:
-    """Whether the value depends on the camera's pose: a derivative by it costs a third of one."""
-    point = jnp.ones_like(pose.translation())
-    program = jax.make_jaxpr(lambda *parts: function(Scene(*parts)))(pose, point, point[0]).jaxpr
-    used = {id(x) for step in program.eqns for x in step.invars} | {id(x) for x in program.outvars}
-    return any(id(x) in used for x in program.invars[: len(jax.tree.leaves(pose))])
+def of_landmark(
+    slam: EkfSlam, function: Callable[[LandmarkView], Float[Array, " k"]]
+) -> Callable[[Core, Array], Float[Array, " k"]]:
+    """A function of a landmark's view as one of the core, as `composed` leaves it, and of the
+    landmark."""
+
+    def value(core: Core, landmark: Array) -> Float[Array, " k"]:
+        seen = slam.model.metric_point(slam.model.view(core, COMPOSED), landmark)
+        return function(LandmarkView(slam.model.camera_pose(core), *seen, core.log_scale))
+
+    return value
 
 
 def append_noise(slam: EkfSlam, state: Any) -> Any:

@@ -1,8 +1,8 @@
 """What a filter is to those who run it: Monte Carlo studies, trackers, a loop of one's own.
 
-A filter is a module (a pytree that holds its numbers) with three functions, pure and on a state
-that is any pytree of arrays: `init`, `step`, `marginal`. One that can also stop within a frame,
-`AbstractStaged`, can track: features are sought where it predicts them.
+A filter is a module (a pytree that holds its numbers) with four functions, pure and on a state
+that is any pytree of arrays: `init`, `step`, `marginal`, `landmark_marginal`. One that can also
+stop within a frame, `AbstractStaged`, can track: features are sought where it predicts them.
 """
 
 from __future__ import annotations
@@ -20,21 +20,29 @@ from jaxslam.geometry import Pose, difference
 from jaxslam.models.observations import Capacity, Features, Innovation
 
 
-class Scene(eqx.Module):
-    """What can be asked of a state: the camera, one landmark in it, and the filter's variables."""
+class CameraView(eqx.Module):
+    """What can be asked of the camera."""
 
     pose: Pose
     """T_BC, in metres."""
-    point: Any = None
-    """X of the landmark as a homogeneous point (X, ω) in the camera, n numbers; None without a
-    landmark."""
-    omega: Any = None
-    """ω, so that the point is X/ω metres."""
     core: Any = None
-    """The filter's own variables; None where a landmark is asked for."""
-    log_scale: Any = None
+    """The filter's own variables; None of one that has none to show."""
+    log_scale: Float[Array, " u"] | None = None
     """Numbers whose sum is the log of the filter's unit of length in metres; None of one that is in
     metres."""
+
+
+class LandmarkView(eqx.Module):
+    """What can be asked of one landmark."""
+
+    pose: Pose
+    """T_BC, in metres."""
+    point: Float[Array, " n"]
+    """X of the landmark as a homogeneous point (X, ω) in the camera."""
+    omega: Float[Array, ""]
+    """ω, so that the point is X/ω metres."""
+    log_scale: Float[Array, " u"] | None = None
+    """As `CameraView` has it."""
 
 
 class Expected(NamedTuple):
@@ -68,16 +76,19 @@ class AbstractFilter(eqx.Module):
 
     @abstractmethod
     def marginal(
+        self, state: Any, function: Callable[[CameraView], Any]
+    ) -> tuple[Any, Float[Array, "k k"]]:
+        """Mean and covariance of `function(view)` of the camera: of a vector, or of a pytree of
+        poses and vectors, whose covariance is of its tangent."""
+
+    @abstractmethod
+    def landmark_marginal(
         self,
         state: Any,
-        function: Callable[[Scene], Any],
-        slots: Int[Array, " m"] | None = None,
-    ) -> tuple[Any, Float[Array, "k k"] | Float[Array, "m k k"]]:
-        """Mean and covariance of `function(scene)`, or of one for each landmark in `slots`.
-
-        The value is a vector, or a pytree of poses and vectors whose covariance is of its tangent
-        (without `slots`).
-        """
+        function: Callable[[LandmarkView], Float[Array, " k"]],
+        slots: Int[Array, " m"],
+    ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
+        """Mean and covariance of `function(view)` of the landmark in each of these slots."""
 
     @property
     def unwrapped(self) -> AbstractFilter:
@@ -92,7 +103,7 @@ class AbstractFilter(eqx.Module):
     def pose_error(self, state: Any, T_BC: Pose) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
         """The error against a true pose, in the coordinates in which the filter keeps it, and its
         covariance: what NEES is made of."""
-        pose, covariance = self.marginal(state, lambda scene: scene.pose)
+        pose, covariance = self.marginal(state, lambda view: view.pose)
         return difference(T_BC, pose), covariance
 
     def unit_fixed(self, state: Any) -> Bool[Array, ""]:

@@ -1,4 +1,4 @@
-"""What a filter's state says, of any filter: free functions of its `marginal`."""
+"""What a filter's state says, of any filter: free functions of its marginals."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxslam._numerics.linalg import semidefinite_root
-from jaxslam.filters.ekf import EkfSlam, scene_of_landmark
-from jaxslam.filters.protocol import AbstractFilter, Scene
+from jaxslam.filters.ekf import EkfSlam, composed, of_landmark
+from jaxslam.filters.protocol import AbstractFilter, CameraView, LandmarkView
 from jaxslam.geometry import Pose, Scalar, retract, scaled
 from jaxslam.models.sensors import AbstractSensor
 
 
 def camera_pose(slam: AbstractFilter, state: Any) -> tuple[Pose, Float[Array, "t t"]]:
     """T_BC and its covariance in the right tangent: position in camera axes, orientation."""
-    return slam.marginal(state, lambda scene: scene.pose)
+    return slam.marginal(state, lambda view: view.pose)
 
 
 class InUnit(NamedTuple):
@@ -41,9 +41,9 @@ def camera_pose_in_unit(slam: AbstractFilter, state: Any) -> InUnit:
     covariance of a Gaussian sum are those of the pose in the unit.
     """
 
-    def both(scene: Scene):
-        log_scale = _log_scale(scene)
-        return scaled(scene.pose, jnp.exp(-log_scale)), log_scale[None]
+    def both(view: CameraView):
+        log_scale = _log_scale(view)
+        return scaled(view.pose, jnp.exp(-log_scale)), log_scale[None]
 
     (pose, log_scale), P = slam.marginal(state, both)
     return InUnit(pose, P[:-1, :-1], log_scale[0], P[-1, -1])
@@ -54,22 +54,22 @@ def landmarks_in_unit(
 ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
     """`landmarks_in_world` in the filter's own unit of length, with covariances of these."""
 
-    def point(scene: Scene):
-        return jnp.exp(-_log_scale(scene)) * _point_in_world(scene)
+    def point(view: LandmarkView):
+        return jnp.exp(-_log_scale(view)) * _point_in_world(view)
 
-    return slam.marginal(state, point, slots)
+    return slam.landmark_marginal(state, point, slots)
 
 
 def log_unit(slam: AbstractFilter, state: Any) -> Scalar:
     """Mean of the log of the filter's unit of length in metres, Σλ."""
-    return slam.marginal(state, lambda scene: _log_scale(scene)[None])[0][0]
+    return slam.marginal(state, lambda view: _log_scale(view)[None])[0][0]
 
 
 def landmarks_in_camera(
     slam: AbstractFilter, state: Any, slots: Int[Array, " m"], sensor: AbstractSensor
 ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
     """The sensor's chart of landmarks, (x/z, y/z, 1/z) of a camera, with covariances."""
-    return slam.marginal(state, lambda scene: sensor.chart(scene.point, scene.omega), slots)
+    return slam.landmark_marginal(state, lambda view: sensor.chart(view.point, view.omega), slots)
 
 
 def landmarks_from_above(
@@ -82,11 +82,11 @@ def landmarks_from_above(
     """
     rotation = camera_pose(slam, state)[0].rotation()
 
-    def above(scene: Scene):
-        x, z = (rotation @ scene.point)[jnp.array([0, -1])]
-        return jnp.stack([jnp.atan2(x, z), scene.omega / jnp.hypot(x, z)])
+    def above(view: LandmarkView):
+        x, z = (rotation @ view.point)[jnp.array([0, -1])]
+        return jnp.stack([jnp.atan2(x, z), view.omega / jnp.hypot(x, z)])
 
-    return slam.marginal(state, above, slots)
+    return slam.landmark_marginal(state, above, slots)
 
 
 def landmarks_on_sides(
@@ -96,8 +96,8 @@ def landmarks_on_sides(
 
     Pixels do not tell the one from the other: a world that is mostly behind is a reversed one.
     """
-    inverse_depth, P = slam.marginal(
-        state, lambda scene: (scene.omega / scene.point[-1])[None], slots
+    inverse_depth, P = slam.landmark_marginal(
+        state, lambda view: (view.omega / view.point[-1])[None], slots
     )
     sure = slam.in_map(state)[slots] & (inverse_depth[:, 0] ** 2 > sigmas**2 * P[:, 0, 0])
     ahead = inverse_depth[:, 0] > 0
@@ -111,7 +111,7 @@ def landmarks_in_world(
 
     Not finite for a landmark at infinity; far from Gaussian for one of unknown depth.
     """
-    return slam.marginal(state, _point_in_world, slots)
+    return slam.landmark_marginal(state, _point_in_world, slots)
 
 
 def landmark_samples(
@@ -120,7 +120,7 @@ def landmark_samples(
     slots: Int[Array, " m"],
     key: Array,
     count: int = 1000,
-    function: Callable[[Scene], Float[Array, " k"]] | None = None,
+    function: Callable[[LandmarkView], Float[Array, " k"]] | None = None,
 ) -> Float[Array, "m count k"]:
     """Draws of points in B, or of another function, from the Gaussian of a filter's state.
 
@@ -128,7 +128,7 @@ def landmark_samples(
     beyond infinity (ω < 0) comes out on the other side of the camera.
     """
     state = slam.entry.collapsed(state)
-    view, landmark = scene_of_landmark(slam, function or _point_in_world, state.core)
+    value = of_landmark(slam, function or _point_in_world)
     c, size = state.core_dim, state.core_dim + state.landmarks.shape[1]
     normal = jax.random.normal(key, (slots.size, count, size), state.landmarks.dtype)
 
@@ -137,19 +137,20 @@ def landmark_samples(
 
         def one(draw):
             delta = root @ draw
-            return landmark(view(retract(state.core, delta[:c])), state.landmarks[slot] + delta[c:])
+            core = composed(retract(state.core, delta[:c]))
+            return value(core, state.landmarks[slot] + delta[c:])
 
         return jax.vmap(one)(draws)
 
     return jax.vmap(of_slot)(slots, normal)
 
 
-def _log_scale(scene: Scene) -> Scalar:
+def _log_scale(view: CameraView | LandmarkView) -> Scalar:
     """Σλ; zero of a filter in metres."""
-    if scene.log_scale is None:
-        return jnp.zeros((), scene.pose.translation().dtype)
-    return jnp.sum(scene.log_scale)
+    if view.log_scale is None:
+        return jnp.zeros((), view.pose.translation().dtype)
+    return jnp.sum(view.log_scale)
 
 
-def _point_in_world(scene: Scene) -> Float[Array, " n"]:
-    return scene.pose @ (scene.point / scene.omega)
+def _point_in_world(view: LandmarkView) -> Float[Array, " n"]:
+    return view.pose @ (view.point / view.omega)

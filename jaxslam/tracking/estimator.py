@@ -19,7 +19,7 @@ from jaxslam._numerics.arrays import cast
 from jaxslam._runtime.programs import Program, in_background
 from jaxslam.filters.association import ASSOCIATIONS, Association, candidates
 from jaxslam.filters.ekf import EkfSlam, init_with_depths
-from jaxslam.filters.protocol import AbstractStaged, Scene
+from jaxslam.filters.protocol import AbstractStaged, CameraView
 from jaxslam.filters.readouts import (
     camera_pose_in_unit,
     landmarks_in_unit,
@@ -298,8 +298,8 @@ def _reported(slam: AbstractStaged, state: State) -> Report:
 
 @Program
 def _intrinsics(slam: AbstractStaged, inner: EkfSlam, state: State) -> tuple[jax.Array, jax.Array]:
-    def intrinsics(scene: Scene) -> jax.Array:
-        sensor = inner.calibration.sensor(inner.sensor, scene.core.calibration)
+    def intrinsics(view: CameraView) -> jax.Array:
+        sensor = inner.calibration.sensor(inner.sensor, view.core.calibration)
         assert isinstance(sensor, Pinhole)
         return sensor.camera.intrinsics
 

@@ -13,7 +13,6 @@ pytest.importorskip("cv2")
 from cases import Around
 
 import jaxslam
-from jaxslam.filters.protocol import Scene
 from jaxslam.geometry import scaled
 from jaxslam.tracking import search as searching
 from jaxslam.tracking.estimator import CameraReport
@@ -44,17 +43,22 @@ class Wandering(Around):
         larger = jnp.exp(self.wander[state["frame"]])
         return seen._replace(pose=scaled(seen.pose, larger), omegas=seen.omegas / larger)
 
-    def marginal(self, state, function, slots=None):
+    def marginal(self, state, function):
+        return super().marginal(state, lambda view: function(self.larger(state, view)))
+
+    def landmark_marginal(self, state, function, slots):
+        def believed(view):
+            view = self.larger(state, view)
+            return function(replace(view, omega=view.omega / jnp.exp(view.log_scale[0])))
+
+        return super().landmark_marginal(state, believed, slots)
+
+    def larger(self, state, view):
+        """In metres of which the truth says how long they are, and logs that say so."""
         frame = state["frame"]
-        larger = jnp.exp(self.wander[frame])
         logs = jnp.stack([self.wander[frame], self.opening[jnp.minimum(frame, self.fixed_at)]])
-
-        def believed(scene: Scene):
-            omega = None if scene.omega is None else scene.omega / larger
-            pose = scaled(scene.pose, larger)
-            return function(replace(scene, pose=pose, omega=omega, log_scale=logs))
-
-        return super().marginal(state, believed, slots)
+        pose = scaled(view.pose, jnp.exp(self.wander[frame]))
+        return replace(view, pose=pose, log_scale=logs)
 
     def unit_fixed(self, state):
         return state["frame"] >= self.fixed_at

@@ -127,7 +127,7 @@ class AdaptiveProcessNoise(AbstractWrapper):
         return slice(0, geometry.point_dim), slice(geometry.point_dim, geometry.tangent_dim)
 
     def _velocity(self, inner: Any) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
-        return self.base.marginal(inner, lambda scene: scene.core.motion)
+        return self.base.marginal(inner, lambda view: view.core.motion)
 
     def _factors(self, state: NoiseState) -> Float[Array, " t"]:
         """Of σ: the roots of the mean variances."""

@@ -11,6 +11,7 @@ With a lag of one frame, iterated, it is the iterated EKF: always on the origina
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -25,7 +26,7 @@ from jaxslam._numerics.linalg import Cholesky, cholesky, semidefinite_root
 from jaxslam.filters.ekf import EkfSlam, check_features, check_one_gaussian, correct
 from jaxslam.filters.forms.sensitivity import Compared, Distribution, Point, Sensitivity, begin
 from jaxslam.filters.forms.state import State
-from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.protocol import AbstractFilter, CameraView, LandmarkView
 from jaxslam.geometry import Pose, retract
 from jaxslam.models.motion import check_control
 from jaxslam.models.observations import Capacity, Features, Innovation, Status, judged
@@ -161,9 +162,19 @@ class FixedLag(AbstractFilter):
             self.base.remove(state.estimate, gone),
         )
 
-    def marginal(self, state: LagState, function, slots: Int[Array, " m"] | None = None):
+    def marginal(
+        self, state: LagState, function: Callable[[CameraView], Any]
+    ) -> tuple[Any, Float[Array, "k k"]]:
         """Of the newest state, as the base filter's; so are the following."""
-        return self.base.marginal(state.estimate, function, slots)
+        return self.base.marginal(state.estimate, function)
+
+    def landmark_marginal(
+        self,
+        state: LagState,
+        function: Callable[[LandmarkView], Float[Array, " k"]],
+        slots: Int[Array, " m"],
+    ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
+        return self.base.landmark_marginal(state.estimate, function, slots)
 
     def in_map(self, state: LagState) -> Bool[Array, " capacity"]:
         return self.base.in_map(state.estimate)

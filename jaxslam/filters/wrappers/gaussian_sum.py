@@ -30,7 +30,13 @@ from jaxslam.filters.ekf import (
     composed_first,
     ekf_inside,
 )
-from jaxslam.filters.protocol import AbstractFilter, AbstractStaged, Expected
+from jaxslam.filters.protocol import (
+    AbstractFilter,
+    AbstractStaged,
+    CameraView,
+    Expected,
+    LandmarkView,
+)
 from jaxslam.filters.wrappers.split_merge import collapsed, divided
 from jaxslam.filters.wrappers.sum_state import SumState, member, moments, weighed
 from jaxslam.filters.wrappers.wrapper import check_staged, with_motion
@@ -175,18 +181,28 @@ class GaussianSum(AbstractStaged):
     def remove(self, state: SumState, gone: Bool[AnyArray, " capacity"]) -> SumState:
         return self._each(lambda one: self.base.remove(one, gone), state)
 
-    def marginal(self, state: SumState, function, slots: Int[Array, " m"] | None = None):
-        """The sum's mean and covariance: of a value, in the tangent at its likeliest member."""
-        values, covariances = jax.vmap(lambda one: self.base.marginal(one, function, slots))(
-            state.members
-        )
-        if slots is not None:
-            of_each = jax.vmap(moments, in_axes=(None, 1, 1))
-            return of_each(state.log_weights, values, covariances)
+    def marginal(
+        self, state: SumState, function: Callable[[CameraView], Any]
+    ) -> tuple[Any, Float[Array, "k k"]]:
+        """The sum's mean and covariance, in the tangent at the value of its likeliest member."""
+        each = jax.vmap(lambda one: self.base.marginal(one, function))
+        values, covariances = each(state.members)
         likeliest = SumState(values, state.log_weights).likeliest
         away = jax.vmap(difference, in_axes=(0, None))(values, likeliest)
         mean, covariance = moments(state.log_weights, away, covariances)
         return retract(likeliest, mean), covariance
+
+    def landmark_marginal(
+        self,
+        state: SumState,
+        function: Callable[[LandmarkView], Float[Array, " k"]],
+        slots: Int[Array, " m"],
+    ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
+        """The sum's mean and covariance of every landmark."""
+        each = jax.vmap(lambda one: self.base.landmark_marginal(one, function, slots))
+        values, covariances = each(state.members)
+        of_landmark = jax.vmap(moments, in_axes=(None, 1, 1))
+        return of_landmark(state.log_weights, values, covariances)
 
     def in_map(self, state: SumState) -> Bool[Array, " capacity"]:
         """The likeliest member's."""

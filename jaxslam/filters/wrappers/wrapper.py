@@ -9,7 +9,13 @@ import equinox as eqx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.arrays import AnyArray
-from jaxslam.filters.protocol import AbstractFilter, AbstractStaged, Expected, Scene
+from jaxslam.filters.protocol import (
+    AbstractFilter,
+    AbstractStaged,
+    CameraView,
+    Expected,
+    LandmarkView,
+)
 from jaxslam.geometry import Pose
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.observations import Capacity, Features, Innovation
@@ -73,12 +79,17 @@ class AbstractWrapper(AbstractStaged):
         return self.base.moving(self.base_state(state))
 
     def marginal(
+        self, state: Any, function: Callable[[CameraView], Any]
+    ) -> tuple[Any, Float[Array, "k k"]]:
+        return self.base.marginal(self.base_state(state), function)
+
+    def landmark_marginal(
         self,
         state: Any,
-        function: Callable[[Scene], Any],
-        slots: Int[Array, " m"] | None = None,
-    ) -> tuple[Any, Float[Array, "k k"] | Float[Array, "m k k"]]:
-        return self.base.marginal(self.base_state(state), function, slots)
+        function: Callable[[LandmarkView], Float[Array, " k"]],
+        slots: Int[Array, " m"],
+    ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
+        return self.base.landmark_marginal(self.base_state(state), function, slots)
 
     def in_map(self, state: Any) -> Bool[Array, " capacity"]:
         return self.base.in_map(self.base_state(state))
