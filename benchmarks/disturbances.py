@@ -25,7 +25,7 @@ from scipy.stats import chi2
 from starts import LIE
 
 from jaxslam._runtime.files import write_json
-from jaxslam.evaluation.convention import errors_beyond_scale
+from jaxslam.evaluation import errors_beyond_scale
 from jaxslam.io.source import Frame, Source
 from jaxslam.statistics.beyond_scale import one_scale
 from jaxslam.tracking.policy import Policy

@@ -22,7 +22,7 @@ from conventions import displaced
 from scipy.spatial.transform import Rotation
 
 from jaxslam.evaluation.convention import Convention
-from jaxslam.evaluation.pose_arrays import checked_poses
+from jaxslam.evaluation.inputs import checked_poses
 from jaxslam.evaluation.poses import as_stated
 
 SPLIT = Convention("split", "world")

@@ -101,8 +101,7 @@ def _beyond_scale(source, folder: Path) -> tuple[dict[str, float], list[float] |
     as a mean; and RMS of the drift of scale, itself and in its claimed σ."""
     import numpy as np
 
-    from jaxslam.evaluation import read_covariances
-    from jaxslam.evaluation.convention import errors_beyond_scale
+    from jaxslam.evaluation import errors_beyond_scale, read_covariances
     from jaxslam.io.tum import read_tum
     from jaxslam.statistics.beyond_scale import one_scale
     from jaxslam.tracking.trajectory import TRACKED

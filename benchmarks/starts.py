@@ -24,7 +24,7 @@ from pages import write_table
 from scipy.stats import chi2, norm
 
 from jaxslam._runtime.files import write_json
-from jaxslam.evaluation.convention import errors_beyond_scale
+from jaxslam.evaluation import errors_beyond_scale
 from jaxslam.io.opening import open_source
 from jaxslam.statistics.beyond_scale import one_scale
 from jaxslam.tracking.settings import TrackerSettings

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 import jaxslam
 from jaxslam.cli import main
 from jaxslam.consistency import run_through
-from jaxslam.evaluation.arrays import ASYMMETRY
+from jaxslam.evaluation.inputs import ASYMMETRY
 from jaxslam.io.tum import write_tum
 from jaxslam.plots.evaluation import plot_axis, plot_evaluation, plot_nees, plot_outside
 from jaxslam.plots.style import new_figure
 from jaxslam.statistics import normalised_squared, run_verdict
-from jaxslam.statistics.innovations import whiteness_p_value
+from jaxslam.statistics.bands import whiteness_p_value
 
 KEYS = {
     "schema", "version", "quantity", "runs", "steps", "dof", "time", "band95", "nees", "inside",

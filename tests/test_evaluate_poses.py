@@ -25,20 +25,19 @@ from jaxslam.evaluation.alignment import (
     projected,
     similarity,
 )
-from jaxslam.evaluation.axes import _constant, estimated
 from jaxslam.evaluation.convention import (
     CHOICES,
     alternatives,
     change,
-    errors_beyond_scale,
     from_right,
+    read_covariances,
     truth_derivatives,
+    write_covariances,
 )
-from jaxslam.evaluation.covariance_text import read_covariances, write_covariances
-from jaxslam.evaluation.identify import Tried, identify
-from jaxslam.evaluation.pose_arrays import checked_poses
-from jaxslam.evaluation.scale import Scale
-from jaxslam.evaluation.truth import with_truth
+from jaxslam.evaluation.convention_search import Tried, identify
+from jaxslam.evaluation.inputs import checked_poses
+from jaxslam.evaluation.poses import _constant, estimated, with_truth
+from jaxslam.evaluation.scale import Scale, errors_beyond_scale
 from jaxslam.geometry import PLANAR, SPATIAL, difference
 from jaxslam.io.tum import write_tum
 from jaxslam.plots.evaluation import plot_evaluation
@@ -921,7 +920,10 @@ STAMPS, LEFT = np.arange(6) / 10, Convention("left")
             ),
             "says another convention",
         ),
-        (lambda f: (f / "run01" / "covariance.txt").write_bytes(b"\xff\xfe"), "not a text file"),
+        (
+            lambda f: (f / "run01" / "covariance.txt").write_bytes(b"\xff\xfe"),
+            "cannot be read as text",
+        ),
         (
             lambda f: write_covariances(
                 f / "run01" / "covariance.txt", STAMPS, np.tile(-np.eye(6), (6, 1, 1)), Convention()

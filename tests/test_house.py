@@ -94,6 +94,28 @@ def test_no_files_import_one_another_in_a_circle():
         visit(name, [])
 
 
+def files_of(module):
+    """The file of a module, and those of the rooms that it is in, without the package's own."""
+    path = PACKAGE.parent / module.replace(".", "/")
+    path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    yield path
+    yield from (up / "__init__.py" for up in path.parents if PACKAGE in up.parents)
+
+
+def test_evaluation_needs_few_files():
+    """Geometry, statistics and text alone: what judges a filter is not what filters."""
+    reached, left = set(), set((PACKAGE / "evaluation").glob("*.py"))
+    while left:
+        path = left.pop()
+        reached.add(path)
+        left |= {file for module in imports(path) for file in files_of(module)} - reached
+    rooms = {path.relative_to(PACKAGE).with_suffix("").parts[0] for path in reached}
+    assert rooms <= {
+        "_numerics", "_runtime", "_version", "evaluation", "geometry", "io", "statistics"
+    }  # fmt: skip
+    assert len(reached) <= 25, sorted(str(path.relative_to(PACKAGE)) for path in reached)
+
+
 def test_rooms_and_functions_are_small():
     lines = {}
     for path in FILES:

@@ -1,11 +1,18 @@
 """Anybody's filter: errors and covariances, from arrays or files, to a verdict."""
 
-from jaxslam.evaluation.convention import CHOICES, Convention, converted, pose_errors
-from jaxslam.evaluation.covariance_text import read_covariances, write_covariances
-from jaxslam.evaluation.evaluate import Evaluation, evaluate
-from jaxslam.evaluation.identify import Identification
-from jaxslam.evaluation.logs import evaluate_log
+from jaxslam.evaluation.convention import (
+    CHOICES,
+    Convention,
+    converted,
+    pose_errors,
+    read_covariances,
+    write_covariances,
+)
+from jaxslam.evaluation.convention_search import Identification
+from jaxslam.evaluation.log_files import evaluate_log
 from jaxslam.evaluation.poses import evaluate_poses
+from jaxslam.evaluation.result import Evaluation, evaluate
+from jaxslam.evaluation.scale import errors_beyond_scale
 
 __all__ = [
     "CHOICES",
@@ -13,6 +20,7 @@ __all__ = [
     "Evaluation",
     "Identification",
     "converted",
+    "errors_beyond_scale",
     "evaluate",
     "evaluate_log",
     "evaluate_poses",

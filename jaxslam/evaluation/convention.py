@@ -18,20 +18,22 @@ All matrices that change one into another have determinant one: a wrong conventi
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, dataclass
-from functools import partial
 from itertools import product
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
-from jaxslam._runtime.lookup import lookup
+from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, exp, log
-from jaxslam.statistics.beyond_scale import BeyondScale, beyond_scale
+from jaxslam.io.tum import read_table, write_table
 
 CHOICES = {
     "error": ("right", "left", "split"),
@@ -102,20 +104,6 @@ def pose_errors(
     """The error of every pose in the convention."""
     error = _in_float64(_errors, convention.error, estimates, truths)
     return np.einsum("...ij,...j->...i", turning(convention, estimates), error)
-
-
-def errors_beyond_scale(
-    convention: Convention,
-    estimates: Float[np.ndarray, "*batch d d"],
-    truths: Float[np.ndarray, "*batch d d"],
-    covariances: Float[np.ndarray, "*batch m m"],
-    axes: Int[np.ndarray, " m"] | None = None,
-) -> BeyondScale:
-    """What of every pose's error is not one of scale (`consistency.beyond_scale`), of covariances
-    in the convention, about the origin of the world; of some axes of the error, where told."""
-    turn = turning(convention, estimates)
-    turn = turn if axes is None else turn[..., axes, :]
-    return _in_float64(_beyond_scale, convention.error, estimates, truths, turn, covariances)
 
 
 def truth_derivatives(
@@ -228,19 +216,6 @@ def _errors(error: str, geometry: Geometry, estimates: Array, truths: Array) -> 
 
 
 @eqx.filter_jit
-def _beyond_scale(
-    error: str, geometry: Geometry, estimates: Array, truths: Array, turn: Array, P: Array
-) -> BeyondScale:
-    of = geometry.group.from_matrix
-
-    def one(estimate, truth, turn, P):
-        told = partial(_error, error, of(estimate))
-        return beyond_scale(lambda true: (turn @ told(true), P), of(truth))
-
-    return jax.vmap(one)(estimates, truths, turn, P)
-
-
-@eqx.filter_jit
 def _truth_derivatives(
     error: str, geometry: Geometry, estimates: Array, truths: Array, firsts: Array
 ) -> tuple[Array, Array]:
@@ -258,3 +233,81 @@ def _truth_derivatives(
         return jax.jacfwd(by_truth)(zero), jax.jacfwd(by_first)(zero)
 
     return jax.vmap(one)(estimates, truths, firsts)
+
+
+ANGLES = {"rad": 1.0, "deg": np.pi / 180}
+"""Units of angles, in radians."""
+_WORDS = (*CHOICES, "angle", "length")
+_ROWS, _COLUMNS = np.triu_indices(6)
+
+
+class CovarianceText(NamedTuple):
+    """What a file says: angles in radians, lengths in the file's own unit."""
+
+    times: Float[np.ndarray, " n"]
+    covariances: Float[np.ndarray, "n 6 6"]
+    said: dict[str, str]
+    """The words of its header that are of a `Convention`."""
+
+    @property
+    def convention(self) -> Convention:
+        """What the header says, and where it says nothing the default."""
+        return Convention(**self.said)
+
+
+def write_covariances(
+    path: str | Path,
+    times: ArrayLike,
+    covariances: ArrayLike,
+    convention: Convention,
+    *,
+    length: str = "m",
+    remark: str = "",
+) -> None:
+    """Write times (n,) in seconds and covariances (n, 6, 6), of m and rad, whole or not at all.
+
+    `length` names another unit of length, in one word; the `remark` is for people.
+    """
+    table = np.asarray(covariances, dtype=float).reshape(-1, 6, 6)[:, _ROWS, _COLUMNS]
+    names = convention.names(SPATIAL)
+    pairs = " ".join(f"{names[i]}{names[j]}" for i, j in zip(_ROWS, _COLUMNS, strict=True))
+    remark = f"; {remark}" if remark else ""
+    header = f"{pairs} ({convention} angle=rad length={length}{remark})"
+    write_table(path, header, times, table, "covariances", ".9e")
+
+
+def read_covariances(path: str | Path) -> CovarianceText:
+    """What `write_covariances` wrote, or somebody else.
+
+    Raises `ValueError`, naming the file, for a line that is not 22 finite numbers, or a word of the
+    header that is not known.
+    """
+    row = "22 finite numbers, the time and the upper triangle row by row,"
+    comments, rows, _ = read_table(path, "covariances", "covariances", row, 1 + len(_ROWS))
+    try:
+        said = _said(" ".join(comments))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    covariances = np.zeros((len(rows), 6, 6))
+    covariances[:, _ROWS, _COLUMNS] = covariances[:, _COLUMNS, _ROWS] = rows[:, 1:]
+    unit, said = ANGLES[said.pop("angle", "rad")], {k: v for k, v in said.items() if k in CHOICES}
+    scale = np.array([unit if name.startswith("r") else 1.0 for name in _names(said)])
+    return CovarianceText(rows[:, 0], scale[:, None] * covariances * scale, said)
+
+
+def _names(said: dict[str, str]) -> tuple[str, ...]:
+    return Convention(**said).names(SPATIAL)
+
+
+def _said(comments: str) -> dict[str, str]:
+    """The words `key=value` of a header. Raises ValueError for those that nobody understands."""
+    said = dict(re.findall(r"\b([a-z]+)=([^\s,;()]+)", comments))
+    for key in said:
+        if meant := suggestion(key, _WORDS) if key not in _WORDS else "":
+            raise ValueError(
+                f"unknown key {key!r} in the header{meant}; known: {', '.join(_WORDS)}"
+            )
+    known = {**CHOICES, "angle": tuple(ANGLES)}
+    for key in known.keys() & said.keys():
+        lookup(key, [said[key]], dict.fromkeys(known[key]))
+    return {key: value for key, value in said.items() if key in _WORDS}

@@ -11,17 +11,28 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup
-from jaxslam.evaluation.alignment import ALIGNMENTS
-from jaxslam.evaluation.arrays import filled, normalised, step_times, without_known
-from jaxslam.evaluation.axes import estimated, named
-from jaxslam.evaluation.convention import Convention, alternatives, geometry_of, pose_errors
-from jaxslam.evaluation.evaluate import Evaluation
-from jaxslam.evaluation.identify import Identification, Tried, identify
-from jaxslam.evaluation.laid import BY_FIRST, Laid, laid
-from jaxslam.evaluation.pose_arrays import Poses, checked_poses
+from jaxslam.evaluation.alignment import ALIGNMENTS, BY_FIRST, Aligned, aligned
+from jaxslam.evaluation.convention import (
+    Convention,
+    alternatives,
+    geometry_of,
+    pose_errors,
+    truth_derivatives,
+)
+from jaxslam.evaluation.convention_search import Identification, Tried, identify
+from jaxslam.evaluation.inputs import (
+    ROUNDING,
+    Poses,
+    checked_poses,
+    filled,
+    normalised,
+    step_times,
+    without_known,
+)
+from jaxslam.evaluation.result import Evaluation
 from jaxslam.evaluation.scale import Scale, at_one_scale, of_aligned
-from jaxslam.evaluation.truth import checked_sigma, note, with_truth
 from jaxslam.geometry import Geometry
 
 BEYOND = (
@@ -39,7 +50,7 @@ class _Options(NamedTuple):
     truth_sigma: tuple[float, float] | None
 
 
-class _Compared(NamedTuple):
+class _PoseErrors(NamedTuple):
     """What is evaluated: all of the steps whose poses are not known by definition."""
 
     errors: Float[np.ndarray, "runs steps m"]
@@ -87,7 +98,7 @@ def evaluate_poses(
     lookup("align", [align], dict.fromkeys(ALIGNMENTS))
     poses = checked_poses(estimates, covariances, truths)
     at, sigma = step_times(times, poses.estimates.shape[1]), checked_sigma(truth_sigma)
-    found = as_stated(poses, stated, align, named(axes_used, poses.estimates, stated), sigma)
+    found = as_stated(poses, stated, align, axes_named(axes_used, poses.estimates, stated), sigma)
     start = len(at) - found.steps
     return replace(
         found,
@@ -132,12 +143,12 @@ def _sigmas(covariances: Float[np.ndarray, "*batch m m"]) -> Float[np.ndarray, "
     return np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
 
 
-def _compared(poses: Poses, convention: Convention, options: _Options) -> _Compared:
+def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseErrors:
     """Errors and covariances along the axes used, aligned, at one scale where it is free."""
     align, used, truth_sigma = options
     names = convention.names(geometry_of(poses.estimates))
     axes = np.array([i for i, name in enumerate(names) if name in used])
-    world = laid(poses, convention, align, axes)
+    world = aligned(poses, convention, align, axes)
     errors = pose_errors(convention, world.poses.estimates, world.poses.truths)[..., axes]
     P = world.poses.covariances[..., axes[:, None], axes]
     start, logged, known = without_known(errors, P, world.poses.logged)
@@ -148,14 +159,14 @@ def _compared(poses: Poses, convention: Convention, options: _Options) -> _Compa
         normalised(errors, P)  # refuses what is not positive definite, by run and step
     if truth_sigma is not None:
         later = _with_truth(world, later, convention, axes, truth_sigma)
-        P, notes = later.covariances[..., axes[:, None], axes], (*notes, note(truth_sigma))
+        P, notes = later.covariances[..., axes[:, None], axes], (*notes, _truth_remark(truth_sigma))
     if world.given:
         errors, P, fitted, axis_fitted, scale = at_one_scale(later, convention, axes)
         notes += (BEYOND,)
     elif align == "sim3":
         scale = of_aligned(later, convention, axes, _log_scales(poses, world.poses))
     nees = normalised(errors, P)
-    return _Compared(errors, P, nees, start, later.logged, fitted, axis_fitted, scale, notes)
+    return _PoseErrors(errors, P, nees, start, later.logged, fitted, axis_fitted, scale, notes)
 
 
 def _later(poses: Poses, start: int, logged: Bool[np.ndarray, "runs steps"]) -> Poses:
@@ -167,7 +178,7 @@ def _later(poses: Poses, start: int, logged: Bool[np.ndarray, "runs steps"]) -> 
 
 
 def _with_truth(
-    world: Laid,
+    world: Aligned,
     later: Poses,
     convention: Convention,
     axes: Int[np.ndarray, " m"],
@@ -220,7 +231,7 @@ def _alternatives(
 
 
 def _tried(
-    convention: Convention, geometry: Geometry, found: _Compared, used: tuple[str, ...]
+    convention: Convention, geometry: Geometry, found: _PoseErrors, used: tuple[str, ...]
 ) -> Tried:
     """NEES of a convention: of all, of the position and of the rotation alone."""
     names = [name for name in convention.names(geometry) if name in used]
@@ -240,3 +251,119 @@ def _tried(
         of(turns) if turns.any() else None,
         int(turns.sum()),
     )
+
+
+_NOTHING = 1e-3
+"""Errors that are less of σ at every pose are no errors."""
+_UNCORRELATED = 1e-6
+
+
+def axes_named(
+    axes: str | Sequence[str], poses: Float[np.ndarray, "runs steps d d"], convention: Convention
+) -> tuple[str, ...]:
+    """The axes that are used, in the order of a covariance; none where nobody said.
+
+    Raises ValueError.
+    """
+    told = axes.replace(",", " ").split() if isinstance(axes, str) else [str(x) for x in axes]
+    names = convention.names(geometry_of(poses))
+    used = lookup("axes used", told, dict.fromkeys(names)) if told else {}
+    return tuple(name for name in names if name in used)
+
+
+def estimated(
+    poses: Poses, convention: Convention, align: str
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the axes that are estimated, and a word on those that are not.
+
+    An axis is left out where all its errors are zero, as far as nine decimals tell; or are less
+    than a thousandth of σ, and have no correlation with those of other axes.
+    """
+    names = convention.names(geometry_of(poses.estimates))
+    world = aligned(poses, convention, align, ~_constant(poses)).poses
+    e = pose_errors(convention, world.estimates, world.truths)[poses.logged]
+    P = world.covariances[poses.logged]
+    sigma = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
+    alone = _alone(P, sigma)
+    none = (np.abs(e) <= ROUNDING).all(axis=0)
+    none |= alone & (np.abs(e) <= _NOTHING * sigma).all(axis=0)
+    if none.all() or not none.any():
+        return names, ()
+    left, used = (
+        tuple(name for name, out in zip(names, none, strict=True) if out == which)
+        for which in (True, False)
+    )
+    return used, (
+        f"{', '.join(left)}: errors are zero throughout, so that nothing was estimated; left out, "
+        f"as with --axes-used {','.join(used)}",
+    )
+
+
+def _alone(P: np.ndarray, sigma: np.ndarray) -> Bool[np.ndarray, " t"]:
+    """Which axes have no correlation with any other."""
+    scale = np.where(sigma > 0, sigma, 1.0)
+    correlation = np.abs(P) / scale[:, :, None] / scale[:, None] * (1 - np.eye(P.shape[-1]))
+    return (correlation <= _UNCORRELATED).all(axis=(0, 1))
+
+
+def _constant(poses: Poses) -> Bool[np.ndarray, " t"]:
+    """Which axes have the same variance at every pose: none of them, where all have."""
+    variance = np.diagonal(poses.covariances[poses.logged], axis1=1, axis2=2)
+    same = np.ptp(variance, axis=0) <= 1e-9 * np.abs(variance).max(axis=0)
+    return same & ~same.all()
+
+
+def checked_sigma(sigma: Sequence[float] | None) -> tuple[float, float] | None:
+    """σ of a truth's position (m) and of its orientation (degrees). Raises ValueError."""
+    if sigma is None:
+        return None
+    try:
+        told = np.asarray(sigma, np.float64)
+    except (ValueError, TypeError):
+        told = np.empty(0)
+    if told.shape != (2,) or not ((told >= 0) & (told <= LARGEST)).all():
+        raise ValueError(
+            f"truth_sigma must be two numbers, metres and degrees, not negative, not {sigma}"
+        )
+    return float(told[0]), float(told[1])
+
+
+def _truth_remark(sigma: tuple[float, float]) -> str:
+    """What is said of it beside the verdict."""
+    return f"σ of the truth, {sigma[0]:g} m and {sigma[1]:g}°, is a part of every σ claimed"
+
+
+def with_truth(
+    poses: Poses,
+    convention: Convention,
+    sigma: tuple[float, float],
+    scale: Float[np.ndarray, " runs"],
+    firsts: Float[np.ndarray, "runs d d"] | None,
+) -> Poses:
+    """Covariances of errors against a truth with that σ, along the axes of the true body.
+
+    `P + J S Jᵀ` with S the diagonal of σ² and J the derivative of the error by a small motion of
+    the true pose; positions of a truth are `scale` times as large in the estimate's unit. Where
+    the estimate was laid on the `firsts` of the true poses, their errors move all of a run:
+    `P + J S Jᵀ + M S Mᵀ`, M the derivative by a motion of that one.
+    """
+    n, t = poses.truths.shape[-1] - 1, geometry_of(poses.truths).tangent_dim
+    truths = poses.truths.copy()
+    truths[..., :n, n] *= scale[:, None, None]
+    at = truths if firsts is None else np.broadcast_to(firsts[:, None], truths.shape)
+    J, M = truth_derivatives(convention, poses.estimates, truths, at)
+    S = np.ones((len(truths), 1, t)) * np.radians(sigma[1])
+    S[..., :n] = sigma[0] * scale[:, None, None]
+    J, M = J * S[..., None, :], M * S[..., None, :]
+    P, joint = poses.covariances + J @ np.swapaxes(J, -1, -2), poses.joint
+    if firsts is not None:
+        P = P + M @ np.swapaxes(M, -1, -2)
+    if joint is not None:
+        joint = joint.copy()
+        steps = np.arange(truths.shape[1])
+        blocks = joint.reshape(len(joint), len(steps), t, len(steps), t)
+        blocks[:, steps, :, steps] += np.swapaxes(J @ np.swapaxes(J, -1, -2), 0, 1)
+        if firsts is not None:
+            M = M.reshape(len(M), -1, t)
+            joint += M @ np.swapaxes(M, -1, -2)
+    return poses._replace(covariances=P, joint=joint)

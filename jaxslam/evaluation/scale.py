@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxslam._runtime.files import json_numbers
-from jaxslam.evaluation.convention import Convention, errors_beyond_scale, pose_errors
-from jaxslam.evaluation.laid import about
-from jaxslam.evaluation.pose_arrays import Poses
-from jaxslam.statistics.beyond_scale import one_scale
+from jaxslam.evaluation.alignment import about
+from jaxslam.evaluation.convention import Convention, pose_errors
+from jaxslam.evaluation.inputs import Poses
+from jaxslam.statistics.beyond_scale import SCALES, BeyondScale, one_scale
 from jaxslam.statistics.verdict import run_verdict
 
 DRIFT_CONFIDENCE = 0.999
@@ -142,11 +142,12 @@ def at_one_scale(poses: Poses, convention: Convention, axes: Int[np.ndarray, " m
     if poses.joint is not None:
         return _jointly(poses, poses.joint, convention, axes)
     P = poses.covariances[..., axes[:, None], axes]
-    own_nees, own_scale, sigma = _own_scales(convention, poses, P, axes)
-    found = one_scale(own_nees, own_scale, sigma, poses.logged)
+    errors, slope = (x[..., axes] for x in _affine(convention, poses.estimates, poses.truths))
+    own = _own_scales(errors, slope, P)
+    found = one_scale(*own, poses.logged)
     s = np.exp(np.where(np.isfinite(found.log_scale), found.log_scale, 0.0))
-    errors, slope = _affine(poses, convention, axes)
-    known = np.where(np.isfinite(sigma), np.exp(own_scale) * sigma, 0.0)
+    sigma = own.sigma
+    known = np.where(np.isfinite(sigma), np.exp(own.log_scale) * sigma, 0.0)
     share = (known[..., None] * slope) ** 2 / np.diagonal(P, axis1=-2, axis2=-1)
     return AtScale(
         errors + slope * (s - 1)[:, None, None],
@@ -157,26 +158,47 @@ def at_one_scale(poses: Poses, convention: Convention, axes: Int[np.ndarray, " m
     )
 
 
-def _own_scales(
-    convention: Convention, poses: Poses, P: np.ndarray, axes: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """NEES, log ŝ_k and its σ of every pose alone."""
-    found = errors_beyond_scale(convention, poses.estimates, poses.truths, P, axes)
-    return np.asarray(found.nees), np.asarray(found.log_scale), np.asarray(found.sigma)
+def errors_beyond_scale(
+    convention: Convention,
+    estimates: Float[np.ndarray, "*batch d d"],
+    truths: Float[np.ndarray, "*batch d d"],
+    covariances: Float[np.ndarray, "*batch t t"],
+) -> BeyondScale:
+    """What of every pose's error is not one of scale, about the origin of the world, of covariances
+    in the convention."""
+    e, g = _affine(convention, estimates, truths)
+    return _own_scales(e, g, covariances)
 
 
 def _affine(
-    poses: Poses, convention: Convention, axes: Int[np.ndarray, " m"]
-) -> tuple[Float[np.ndarray, "runs steps m"], Float[np.ndarray, "runs steps m"]]:
-    """e and g = de/ds of the truth times s."""
+    convention: Convention,
+    estimates: Float[np.ndarray, "*batch d d"],
+    truths: Float[np.ndarray, "*batch d d"],
+) -> tuple[Float[np.ndarray, "*batch t"], Float[np.ndarray, "*batch t"]]:
+    """e and g = de/ds of the truth times s: every error is `e + g (s − 1)`."""
+    twice = truths.copy()
+    twice[..., :-1, -1] *= 2.0
+    once = pose_errors(convention, estimates, truths)
+    return once, pose_errors(convention, estimates, twice) - once
 
-    def error(s: float) -> np.ndarray:
-        truths = poses.truths.copy()
-        truths[..., :-1, -1] *= s
-        return pose_errors(convention, poses.estimates, truths)[..., axes]
 
-    once = error(1.0)
-    return once, error(2.0) - once
+def _own_scales(
+    errors: Float[np.ndarray, "*batch m"],
+    slope: Float[np.ndarray, "*batch m"],
+    covariances: Float[np.ndarray, "*batch m m"],
+) -> BeyondScale:
+    """Of every pose alone, at the scale in `SCALES` that explains it best: ŝ = 1 − gᵀ P⁻¹ e/
+    (gᵀ P⁻¹ g)."""
+    sigma = np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
+    L = np.linalg.cholesky(covariances / sigma[..., :, None] / sigma[..., None, :])
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        both = np.stack([errors / sigma, slope / sigma], axis=-1)
+        e, g = np.moveaxis(np.linalg.solve(L, both), -1, 0)
+        curvature = np.sum(g * g, axis=-1)
+        step = np.sum(g * e, axis=-1) / np.where(curvature > 0, curvature, 1.0)
+        s = np.clip(1.0 - step, *SCALES)
+        nees = np.sum((e + g * (s - 1)[..., None]) ** 2, axis=-1)
+        return BeyondScale(nees, np.log(s), 1 / (s * np.sqrt(curvature)))
 
 
 def _jointly(
@@ -189,7 +211,7 @@ def _jointly(
 
     What is left of a run at its ŝ has the covariance `Σ − G Gᵀ/(Gᵀ Σ⁻¹ G)`.
     """
-    e, G = _affine(poses, convention, axes)
+    e, G = (x[..., axes] for x in _affine(convention, poses.estimates, poses.truths))
     t, m = poses.covariances.shape[-1], len(axes)
     left = poses.covariances[..., axes[:, None], axes].copy()
     own, (drift, sigma, nees) = left.copy(), (np.full(e.shape[:2], np.nan) for _ in range(3))
@@ -246,8 +268,8 @@ def of_aligned(
         one = Poses(T[run], P[run], truth[run], logged)
         moved = about(one, convention, truth[run, logged, :-1, -1].mean(axis=0))
         T[run], P[run], truth[run] = moved[:3]
-    moved = Poses(T, P, truth, poses.logged)
-    _, own_scale, sigma = _own_scales(convention, moved, P[..., axes[:, None], axes], axes)
+    e, g = (x[..., axes] for x in _affine(convention, T, truth))
+    _, own_scale, sigma = _own_scales(e, g, P[..., axes[:, None], axes])
     told = poses.logged & np.isfinite(sigma)
     drift, sigma = np.where(told, own_scale, np.nan), np.where(told, sigma, 1.0)
     return Scale(log_scale, drift, sigma, (drift / sigma) ** 2, 0.0)

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from jaxslam._runtime.lookup import lookup
 from jaxslam.consistency import Study, summarise
 from jaxslam.consistency.summary import as_summary
-from jaxslam.evaluation.evaluate import OUTSIDE
+from jaxslam.evaluation.result import OUTSIDE
 from jaxslam.plots.landmarks import region_from_above
 from jaxslam.plots.style import (
     COLUMN,

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxslam.evaluation import Evaluation
-from jaxslam.evaluation.evaluate import OUTSIDE
+from jaxslam.evaluation.result import OUTSIDE
 from jaxslam.plots.style import (
     COLOURS,
     COLUMN,

@@ -7,10 +7,10 @@ from jaxslam.statistics.bands import (
     mean_band,
     normalised_squared,
 )
-from jaxslam.statistics.innovations import innovation_verdict
 from jaxslam.statistics.verdict import (
     VERDICTS,
     Tally,
+    innovation_verdict,
     not_disproved,
     run_verdict,
     sentences,

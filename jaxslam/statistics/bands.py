@@ -16,6 +16,9 @@ from jaxslam._numerics.arrays import AnyArray
 from jaxslam._numerics.linalg import cholesky
 
 CONFIDENCE = 0.95
+_LAGS = 10
+_LEAST_PAIRS = 20
+"""Pairs of steps of which a correlation is told."""
 LOST_QUANTILE = 0.9999
 """A run whose NEES is above this quantile of χ² is lost: one in 10 000 of a consistent filter."""
 
@@ -163,3 +166,30 @@ def _symmetric(t: float, k: float) -> float:
     """Hall's cubic `g(t) = t + k/6 + k t²/3 + k² t³/27`, with k = skewness/√n: monotone."""
     t = min(max(t, -_FAR), _FAR)
     return t + k / 6 + k * t**2 / 3 + k**2 * t**3 / 27
+
+
+def whiteness_p_value(
+    nis: Float[np.ndarray, "runs steps"], normalised: Float[np.ndarray, "runs steps n"]
+) -> float | None:
+    """Of white innovations, by their autocorrelations and by those of NIS; None of too few.
+
+    Of each axis, and of NIS about its mean, `Q = Σₗ rₗ² Nₗ`, the Nₗ pairs of steps l apart having
+    the correlation rₗ, is χ² (Ljung and Box, Biometrika 1978; of all runs); the least p of them by
+    Bonferroni. The mean of innovations is not taken away: one with a bias is not white.
+    """
+    lags = min(_LAGS, nis.shape[1] // 4)
+    there = ~np.isnan(nis)
+    if not lags or np.sum(there[:, 1:] & there[:, :-1]) < _LEAST_PAIRS:
+        return None
+    series = [*np.moveaxis(normalised, -1, 0), nis - np.mean(nis, where=there)]
+    with np.errstate(over="ignore", invalid="ignore"):
+        p = [_portmanteau(np.where(there, x, 0.0), there, lags) for x in series]
+    return min(1.0, len(p) * float(np.nanmin(p)))
+
+
+def _portmanteau(values: np.ndarray, there: np.ndarray, lags: int) -> float:
+    total, power = 0.0, np.sum(values**2) / np.sum(there)
+    for lag in range(1, lags + 1):
+        pairs = max(np.sum(there[:, lag:] & there[:, :-lag]), 1)
+        total += (np.sum(values[:, lag:] * values[:, :-lag]) / power) ** 2 / pairs
+    return float(gammaincc(lags / 2, total / 2))

@@ -37,11 +37,11 @@ PoseError = Callable[[Pose], tuple[Float[Array, " t"], Float[Array, "t t"]]]
 class BeyondScale(NamedTuple):
     """Of one pose with t degrees of freedom, where `e(s)ᵀ P⁻¹ e(s)` is the smallest."""
 
-    nees: Scalar
+    nees: Float[AnyArray, "*batch"]
     """That smallest value: χ² with t − 1 degrees of freedom for a consistent filter."""
-    log_scale: Scalar
+    log_scale: Float[AnyArray, "*batch"]
     """log ŝ: the estimate's scale relative to the truth's."""
-    sigma: Scalar
+    sigma: Float[AnyArray, "*batch"]
     """What the filter claims of log ŝ, `(gᵀ P⁻¹ g)^(−1/2)` with g = de/d log s; infinite where
     nothing depends on s."""
 

@@ -18,6 +18,7 @@ from jaxslam.statistics.bands import (
     PowerSums,
     lost_threshold,
     mean_band,
+    whiteness_p_value,
 )
 from jaxslam.statistics.looks import VERDICT_CONFIDENCE, Look
 
@@ -407,3 +408,46 @@ def verdict(
 def together(comparisons: int) -> float:
     """Confidence of each of m bands that hold together with 95 %, by Bonferroni."""
     return 1 - (1 - CONFIDENCE) / comparisons
+
+
+def innovation_verdict(
+    nis: Float[np.ndarray, "runs steps"], normalised: Float[np.ndarray, "runs steps n"], dof: int
+) -> dict[str, Any]:
+    """As `run_verdict`, of every step (`samples`: steps) where innovations seem white, else of
+    every run: innovations, which need no truth, are white of a right filter, so that every step is
+    a sample of its own (Bar-Shalom, Li, Kirubarajan 2001, §5.4.2).
+
+    `normalised` are innovations over their σ; steps that a run lacks are NaN in `nis`. `white` is
+    the p of `whiteness_p_value`, None where steps are too few or a NIS is not finite. A run that
+    has a NIS above the quantile of lost runs is outlying: nothing is lost.
+    """
+    found = run_verdict(nis, dof, logged=~np.isnan(nis))
+    p = None if found["diverged"] else whiteness_p_value(nis, normalised)
+    white = p is not None and p >= 1 - VERDICT_CONFIDENCE
+    if white:
+        found |= _of_steps(nis, dof, found["lost_runs"]).verdict() | {
+            "lost_runs": found["lost_runs"]
+        }
+    word = "outlying" if found["word"] == "lost" else found["word"]
+    return found | {"word": word, "samples": "steps" if white else "runs", "white": p}
+
+
+def _of_steps(nis: Float[np.ndarray, "runs steps"], dof: int, outlying: list[int]) -> Tally:
+    """A tally to which every step is a run, but for the counts of runs."""
+    there = ~np.isnan(nis)
+    steps = there.sum(axis=1, keepdims=True)
+    third = len(THIRDS) * (np.cumsum(there, axis=1) - 1) // steps
+    first, second, last = (PowerSums.of(nis[there & (third == i)]) for i in range(len(THIRDS)))
+    kept = np.ones(len(nis), bool)
+    kept[outlying] = False
+    at_end = nis[range(len(nis)), nis.shape[1] - 1 - np.argmax(there[:, ::-1], axis=1)]
+    return Tally(
+        dof=dof,
+        runs=len(nis),
+        diverged=0,
+        lost=len(outlying),
+        average=PowerSums.of(nis[there]),
+        end=PowerSums.of(at_end),
+        never_lost=PowerSums.of(nis[there & kept[:, None]]),
+        thirds=(first, second, last),
+    )

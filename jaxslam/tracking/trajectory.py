@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from jaxslam.evaluation import covariance_text
+from jaxslam.evaluation import write_covariances as write_pose_covariances
 from jaxslam.evaluation.alignment import (
     MAX_TIME_DIFFERENCE,
     Similarity,
@@ -77,9 +77,7 @@ def write_covariances(
     convention = replace(TRACKED, scale="given" if given_scale else "marginal")
     scale = _GIVEN_SCALE if given_scale else "the filter has no doubt of its scale"
     remark = "; ".join(filter(None, [f"{_UNITS}, taken as one", scale, caveat]))
-    covariance_text.write_covariances(
-        path, times, covariances, convention, length="map", remark=remark
-    )
+    write_pose_covariances(path, times, covariances, convention, length="map", remark=remark)
 
 
 def absolute_trajectory_error(

@@ -5,9 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxslam._runtime.files import write_atomically
-from jaxslam.evaluation import pose_errors, read_covariances
-from jaxslam.evaluation.arrays import exactly_known
-from jaxslam.evaluation.convention import errors_beyond_scale
+from jaxslam.evaluation import errors_beyond_scale, pose_errors, read_covariances
+from jaxslam.evaluation.inputs import exactly_known
 from jaxslam.io.tum import poses, read_tum, write_tum
 from jaxslam.statistics.beyond_scale import one_scale
 from jaxslam.tracking.trajectory import (

@@ -14,14 +14,19 @@ from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import json_numbers, write_json
 from jaxslam._runtime.lookup import lookup
-from jaxslam.evaluation.arrays import filled, normalised, paired, step_times, without_known
 from jaxslam.evaluation.convention import Convention
-from jaxslam.evaluation.identify import Identification
-from jaxslam.evaluation.mistakes import Logged, Mistake, mistakes, withheld
+from jaxslam.evaluation.convention_search import Identification
+from jaxslam.evaluation.inputs import filled, normalised, paired, step_times, without_known
+from jaxslam.evaluation.sanity_checks import Logged, Mistake, mistakes, withheld
 from jaxslam.evaluation.scale import Scale
 from jaxslam.statistics.bands import mean_band
-from jaxslam.statistics.innovations import innovation_verdict
-from jaxslam.statistics.verdict import headline, lost_runs, run_verdict, sentences
+from jaxslam.statistics.verdict import (
+    headline,
+    innovation_verdict,
+    lost_runs,
+    run_verdict,
+    sentences,
+)
 
 SCHEMA = 1
 SIGMAS = 3

@@ -1,24 +1,91 @@
-"""Runs as files: trajectories with covariances and truths, paired by time, to a verdict."""
+"""Logs as files, to a verdict: arrays in npz or CSV; trajectories, covariances and truths."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, associated
-from jaxslam.evaluation.arrays import exactly_known
-from jaxslam.evaluation.convention import Convention
-from jaxslam.evaluation.covariance_text import read_covariances
-from jaxslam.evaluation.evaluate import Evaluation
-from jaxslam.evaluation.frames import Judged, judged, left_out
+from jaxslam.evaluation.convention import CHOICES, Convention, read_covariances
+from jaxslam.evaluation.inputs import exactly_known, read_csv, read_npz
 from jaxslam.evaluation.poses import evaluate_poses
+from jaxslam.evaluation.result import Evaluation, evaluate
 from jaxslam.io.tum import check_seconds, read_tum
+
+_CONTENTS = (
+    "errors and covariances, innovations and covariances, or estimates, covariances and truths"
+)
+
+
+def evaluate_log(
+    source: str | Path,
+    *,
+    covariance: str | Path | None = None,
+    truth: str | Path | None = None,
+    stated: Mapping[str, str] | None = None,
+    align: str = "none",
+    axes_used: str | Sequence[str] = (),
+    nis: bool = False,
+    truth_sigma: Sequence[float] | None = None,
+) -> Evaluation:
+    """The verdict on what a file or a folder holds.
+
+    `source` is an npz file of arrays, a CSV file of `run, step, errors, upper triangle` lines, a
+    trajectory in TUM format with its `covariance` and `truth`, or a folder: one run, or one a
+    sub-folder, of `estimate.txt`, `covariance.txt` and `truth.txt`. Where the tracker's
+    `frames.csv` is beside a trajectory, its longest map is evaluated, without frames that are lost
+    or whose unit was not fixed yet. What is `stated` of the convention (`error`, `axes`, `order`,
+    `scale`) comes before what the files say. How poses are aligned, which axes are used, and
+    what σ the truth has, see `evaluate_poses`. With `nis` errors are innovations. Raises
+    ValueError, naming the file.
+    """
+    source, stated = Path(source), dict(stated or {})
+    how = {"align": align, "axes_used": axes_used, "truth_sigma": truth_sigma}
+    if not source.exists():
+        raise ValueError(f"{source}: no such file or folder")
+    if source.suffix in (".npz", ".csv"):
+        for name, value in (("covariance", covariance), ("truth", truth)):
+            if value is not None:
+                raise ValueError(f"{source}: a {name} file goes with a trajectory, not with arrays")
+        arrays, runs, steps = (
+            (read_npz(source), (), ()) if source.suffix == ".npz" else read_csv(source)
+        )
+        found = named(source, lambda: _evaluate_arrays(arrays, stated, how, nis), runs, steps)
+        return replace(found, run_names=runs)
+    if nis:
+        raise ValueError(f"{source}: innovations come in an npz or CSV file, not in a trajectory")
+    return evaluate_runs(runs_of(source, covariance, truth), stated, how)
+
+
+def _evaluate_arrays(
+    arrays: dict[str, Any], stated: dict[str, str], how: dict[str, Any], nis: bool
+) -> Evaluation:
+    """Of errors, innovations or poses, by the names of the arrays."""
+    held = [name for name in ("errors", "innovations", "estimates") if name in arrays]
+    needed = {"covariances", *(["truths"] if held == ["estimates"] else [])}
+    if len(held) != 1 or not needed <= arrays.keys():
+        raise ValueError(f"holds {', '.join(arrays)}; {_CONTENTS} are accepted")
+    times, P = arrays.get("times"), arrays["covariances"]
+    if held == ["estimates"]:
+        said = {name: str(arrays[name]) for name in CHOICES if name in arrays}
+        convention = stated_before(said, stated)
+        truths = arrays["truths"]
+        return evaluate_poses(arrays["estimates"], P, truths, convention, times=times, **how)
+    if stated or how["align"] != "none" or how["axes_used"] or how["truth_sigma"] is not None:
+        raise ValueError(
+            "conventions, alignments, axes used are of poses, and so is σ of a truth; here are "
+            "errors, which are what they are; estimates, covariances and truths are accepted"
+        )
+    quantity = "NIS" if nis or held == ["innovations"] else "NEES"
+    names = [str(name) for name in np.ravel(arrays.get("names", ()))]
+    return evaluate(arrays[held[0]], P, times=times, names=names, quantity=quantity)
+
 
 ESTIMATES = ("estimate.txt", "trajectory.txt")
 COVARIANCES = ("covariance.txt",)
@@ -28,7 +95,7 @@ LEAST_SHARE = 0.5
 _WITHIN = f"within {MAX_TIME_DIFFERENCE} s"
 
 
-class Run(NamedTuple):
+class RunFiles(NamedTuple):
     """One trajectory: what it is called, and where its files are."""
 
     name: str
@@ -41,7 +108,7 @@ _File: TypeAlias = tuple[Path, np.ndarray]
 """Where it is, and its times."""
 
 
-class _Found(NamedTuple):
+class _AtTimes(NamedTuple):
     """What a file holds, at the times of the estimate; NaN where it holds nothing."""
 
     times: Float[np.ndarray, " m"]
@@ -55,22 +122,22 @@ class _Found(NamedTuple):
         return ~np.isnan(self.values[:, 0, 0])
 
 
-class _Logged(NamedTuple):
+class _RunLog(NamedTuple):
     """A run, pose by pose of its estimate."""
 
-    run: Run
+    run: RunFiles
     times: Float[np.ndarray, " n"]
     estimates: Float[np.ndarray, "n 4 4"]
-    covariances: _Found
-    truths: _Found
+    covariances: _AtTimes
+    truths: _AtTimes
     said: dict[str, str]
-    judged: Judged
+    evaluated: EvaluatedPoses
     """Those that a tracker's own word on its frames lets have a part in the verdict."""
 
 
 def runs_of(
     source: Path, covariance: str | Path | None, truth: str | Path | None
-) -> tuple[Run, ...]:
+) -> tuple[RunFiles, ...]:
     """The files of every run. Raises ValueError where one is not there, or two could be meant."""
     if not source.is_dir():
         for name, value in (("covariance", covariance), ("truth", truth)):
@@ -79,7 +146,7 @@ def runs_of(
                     f"{source}: a trajectory needs a {name} file beside it (--{name} FILE); "
                     "arrays come as .npz or .csv"
                 )
-        return (Run(source.stem, source, Path(str(covariance)), Path(str(truth))),)
+        return (RunFiles(source.stem, source, Path(str(covariance)), Path(str(truth))),)
     folders = sorted(x for x in source.iterdir() if x.is_dir() and x.name[0] != ".")
     if _only(source, ESTIMATES) is not None:
         if runs := [folder.name for folder in folders if _only(folder, ESTIMATES) is not None]:
@@ -95,7 +162,7 @@ def runs_of(
     return tuple(_run(folder, None, truth) for folder in folders)
 
 
-def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) -> Run:
+def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) -> RunFiles:
     def found(given: str | Path | None, names: tuple[str, ...]) -> Path:
         path = _only(folder, names) if given is None else Path(given)
         if path is None:
@@ -103,7 +170,7 @@ def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) 
         return path
 
     files = found(None, ESTIMATES), found(covariance, COVARIANCES), found(truth, TRUTHS)
-    return Run(folder.resolve().name, *files)
+    return RunFiles(folder.resolve().name, *files)
 
 
 def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
@@ -116,15 +183,17 @@ def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
     return there[0] if there else None
 
 
-def evaluate_runs(runs: tuple[Run, ...], stated: dict[str, str], how: dict[str, Any]) -> Evaluation:
+def evaluate_runs(
+    runs: tuple[RunFiles, ...], stated: dict[str, str], how: dict[str, Any]
+) -> Evaluation:
     """The verdict on them, in the convention that is stated, or else said in the files; `how` they
     are evaluated are options of `evaluate_poses`."""
     read = [_read(run) for run in runs]
     convention = _convention_of(read, stated)
     for one in read:
-        if one.judged.map and convention.scale == "given" and how["align"] != "sim3":
+        if one.evaluated.map and convention.scale == "given" and how["align"] != "sim3":
             raise ValueError(
-                f"{one.run.estimate}: its longest map is map {one.judged.map}, in a unit of its "
+                f"{one.run.estimate}: its longest map is map {one.evaluated.map}, in a unit of its "
                 "own; align sim3 is accepted"
             )
     names = tuple(run.name for run in runs)
@@ -134,7 +203,7 @@ def evaluate_runs(runs: tuple[Run, ...], stated: dict[str, str], how: dict[str, 
         lambda: evaluate_poses(
             _filled_up([one.estimates for one in read]),
             _filled_up([one.covariances.values for one in read]),
-            _filled_up([_judged_truths(one) for one in read]),
+            _filled_up([_evaluated_truths(one) for one in read]),
             convention,
             times=longest.times,
             **how,
@@ -142,14 +211,14 @@ def evaluate_runs(runs: tuple[Run, ...], stated: dict[str, str], how: dict[str, 
         names,
     )
     told = (
-        *_left_out(read), *left_out([one.judged for one in read]), *_other_times(read, longest)
+        *_left_out(read), *left_out([one.evaluated for one in read]), *_other_times(read, longest)
     )  # fmt: skip
     if not read[0].said and not stated:
         told += (f"the file does not say its convention; assumed: {convention}",)
     return replace(found, notes=(*found.notes, *told), run_names=names)
 
 
-def _convention_of(read: list[_Logged], stated: dict[str, str]) -> Convention:
+def _convention_of(read: list[_RunLog], stated: dict[str, str]) -> Convention:
     """The one of all runs. Raises ValueError where their files say different ones."""
     for one in read:
         if one.said != read[0].said:
@@ -160,9 +229,9 @@ def _convention_of(read: list[_Logged], stated: dict[str, str]) -> Convention:
     return stated_before(read[0].said, stated)
 
 
-def _judged_truths(one: _Logged) -> Float[np.ndarray, "n 4 4"]:
+def _evaluated_truths(one: _RunLog) -> Float[np.ndarray, "n 4 4"]:
     """None of a pose that has no part in the verdict."""
-    return np.where(one.judged.poses[:, None, None], one.truths.values, np.nan)
+    return np.where(one.evaluated.poses[:, None, None], one.truths.values, np.nan)
 
 
 def _filled_up(runs: list[np.ndarray]) -> np.ndarray:
@@ -197,7 +266,7 @@ def named(
         raise ValueError(f"{source}: {told}") from None
 
 
-def _left_out(read: list[_Logged]) -> Iterator[str]:
+def _left_out(read: list[_RunLog]) -> Iterator[str]:
     """A sentence for everything in the files that has no part in the verdict."""
     logged = sum(len(one.times) for one in read)
     kinds = ("covariance", [x.covariances for x in read]), ("truth", [x.truths for x in read])
@@ -214,10 +283,10 @@ def _left_out(read: list[_Logged]) -> Iterator[str]:
         yield f"runs have {shortest} to {longest} poses"
 
 
-def _other_times(read: list[_Logged], longest: _Logged) -> Iterator[str]:
+def _other_times(read: list[_RunLog], longest: _RunLog) -> Iterator[str]:
     """Steps are counted; a word where they are not at the same times after the first pose."""
 
-    def since(one: _Logged, steps: int) -> np.ndarray:
+    def since(one: _RunLog, steps: int) -> np.ndarray:
         return one.times[:steps] - one.times[0]
 
     for one in read:
@@ -230,7 +299,7 @@ def _other_times(read: list[_Logged], longest: _Logged) -> Iterator[str]:
             return
 
 
-def _read(run: Run) -> _Logged:
+def _read(run: RunFiles) -> _RunLog:
     """One run, pose by pose of its estimate. Raises ValueError where few can be compared."""
     times, estimates = read_tum(run.estimate)
     text, (true_times, truths) = read_covariances(run.covariance), read_tum(run.truth)
@@ -240,8 +309,8 @@ def _read(run: Run) -> _Logged:
     covariances = _at_times(files[0], files[1], text.covariances)
     true = _at_times(files[0], files[2], truths)
     known = exactly_known(covariances.values)
-    those = judged(run.estimate.parent, times, known)
-    read = _Logged(run, times, estimates, covariances, true, text.said, those)
+    those = evaluated_poses(run.estimate.parent, times, known)
+    read = _RunLog(run, times, estimates, covariances, true, text.said, those)
     _check_share(read)
     return read
 
@@ -263,7 +332,7 @@ def _check_times(path: Path, times: Float[np.ndarray, " n"]) -> None:
         )
 
 
-def _at_times(ours: _File, theirs: _File, values: Float[np.ndarray, "m ..."]) -> _Found:
+def _at_times(ours: _File, theirs: _File, values: Float[np.ndarray, "m ..."]) -> _AtTimes:
     """The values at our times. Raises ValueError where there is none."""
     (path, times), (other, other_times) = ours, theirs
     at, of = associated(times, other_times)
@@ -273,10 +342,10 @@ def _at_times(ours: _File, theirs: _File, values: Float[np.ndarray, "m ..."]) ->
     result = np.full((len(times), *values.shape[1:]), np.nan)
     nearest_last = np.argsort(-np.abs(times[at] - other_times[of]), kind="stable")
     result[at[nearest_last]] = values[of[nearest_last]]
-    return _Found(other_times, result, len(np.unique(of)))
+    return _AtTimes(other_times, result, len(np.unique(of)))
 
 
-def _check_share(read: _Logged) -> None:
+def _check_share(read: _RunLog) -> None:
     """Raise ValueError where most of a run would not be compared."""
     others = (read.run.covariance, read.covariances), (read.run.truth, read.truths)
     there = read.covariances.there & read.truths.there
@@ -303,3 +372,124 @@ def _held(times: Float[np.ndarray, " n"]) -> str:
 
 def _span(times: Float[np.ndarray, " n"]) -> float:
     return float(times[-1] - times[0]) if len(times) else 0.0
+
+
+FRAMES = "frames.csv"
+_NEEDED = ("time", "state", "map", "unit_fixed")
+_MOST_MAPS = 1_000_000
+
+
+class FrameLog(NamedTuple):
+    """Of all frames of a video, docs/gauge.md."""
+
+    times: Float[np.ndarray, " k"]
+    lost: Bool[np.ndarray, " k"]
+    maps: Int[np.ndarray, " k"]
+    """The number of the map. Each has a unit of length of its own."""
+    fixed: Bool[np.ndarray, " k"]
+    """Whether the unit of the map is; before that it changes with the frames."""
+
+
+class EvaluatedPoses(NamedTuple):
+    """Which poses of a run have a part in the verdict, and how many have none."""
+
+    poses: Bool[np.ndarray, " n"]
+    map: int = 0
+    """The one that is evaluated."""
+    elsewhere: int = 0
+    """Poses of other maps."""
+    lost: int = 0
+    opening: int = 0
+    """Poses from before the unit of the map was fixed."""
+
+
+def evaluated_poses(
+    folder: Path, times: Float[np.ndarray, " n"], known: Bool[np.ndarray, " n"]
+) -> EvaluatedPoses:
+    """Of poses at these times, what the tracker's file in the folder leaves to be evaluated.
+
+    It is the longest map, without frames that are lost or whose unit is not fixed. A pose that is
+    `known` exactly stays: it is where the map begins, and has a place in any unit. All poses
+    where there is no such file. Raises ValueError where it is of other times, or nothing is left.
+    """
+    path = folder / FRAMES
+    frames = read_frames(path)
+    if frames is None:
+        return EvaluatedPoses(np.ones(len(times), bool))
+    order = np.argsort(frames.times, kind="stable")
+    place = np.interp(times, frames.times[order], np.arange(len(order)))
+    nearest = order[np.rint(place).astype(int)]
+    away = np.abs(frames.times[nearest] - times)
+    if away.max() > MAX_TIME_DIFFERENCE:
+        raise ValueError(
+            f"{path}: no frame is within {MAX_TIME_DIFFERENCE} s of the pose at "
+            f"{times[np.argmax(away)]:.3f} s; the frames of the trajectory beside it are accepted"
+        )
+    _, lost, maps, fixed = (x[nearest] for x in frames)
+    usable = fixed & ~lost
+    if not usable.any():
+        raise ValueError(f"{path}: no pose is of a frame that is not lost and whose unit is fixed")
+    number = int(np.argmax(np.bincount(maps[usable])))
+    own = maps == number
+    opening = own & ~lost & ~fixed & ~known
+    return EvaluatedPoses(
+        own & ~lost & ~opening, number, *(int(x.sum()) for x in (~own, own & lost, opening))
+    )
+
+
+def read_frames(path: Path) -> FrameLog | None:
+    """What the file of a tracker says; None where there is none, or another one of its name.
+
+    Raises ValueError, naming the line, for what a tracker does not write.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return None
+    titles = [word.strip() for word in lines[0].split(",")] if lines else []
+    if not set(_NEEDED) <= set(titles):
+        return None
+    places, rows = [titles.index(name) for name in _NEEDED], []
+    for number, line in enumerate(lines[1:], start=2):
+        if line.strip():
+            told = line.split(",")
+            row = _row([told[place] for place in places if place < len(told)])
+            if row is None:
+                raise ValueError(
+                    f"{path}, line {number}: a finite time, a state, the number of a map and "
+                    "unit_fixed, 0 or 1, are accepted"
+                )
+            rows.append(row)
+    if not rows:
+        raise ValueError(f"{path}: holds no frames")
+    return FrameLog(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def _row(told: list[str]) -> tuple[float, bool, int, bool] | None:
+    """Numbers of a frame, in the order of `FrameLog`; None of what is no frame."""
+    try:
+        time, state, number, fixed = told
+        row = float(time), state == "lost", int(number), bool(("0", "1").index(fixed.strip()))
+    except ValueError:
+        return None
+    return row if np.isfinite(row[0]) and 0 <= row[2] <= _MOST_MAPS else None
+
+
+def left_out(runs: Sequence[EvaluatedPoses]) -> Iterator[str]:
+    """A sentence for every reason why poses of the runs are not evaluated."""
+    logged = sum(len(one.poses) for one in runs)
+    if elsewhere := sum(one.elsewhere for one in runs):
+        which = (
+            f"map {runs[0].map}, the longest," if len(runs) == 1 else "of each run the longest map"
+        )
+        yield (
+            f"{which} is evaluated: {elsewhere} of {logged} poses are of other maps, each in a "
+            "unit of its own, and are left out"
+        )
+    if lost := sum(one.lost for one in runs):
+        yield f"{lost} of {logged} poses are of frames that are lost, and are left out"
+    if opening := sum(one.opening for one in runs):
+        yield (
+            f"{opening} of {logged} poses are from before the unit of their map was fixed, and are "
+            "left out"
+        )

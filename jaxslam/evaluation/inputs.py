@@ -1,14 +1,23 @@
-"""Errors and covariances as somebody else's program logged them: checked, named, whitened."""
+"""Errors, poses and covariances as somebody else's program logged them: read, and checked."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from jaxslam.io.tum import check_seconds
+from jaxslam._runtime.files import LARGEST, read_arrays
+from jaxslam._runtime.lookup import suggestion
+from jaxslam.evaluation.convention import CHOICES, geometry_of
+from jaxslam.io.tum import check_seconds, not_rigid, read_table, words
+
+_KEYS = (
+    "errors", "innovations", "covariances", "estimates", "truths", "times", "names", *CHOICES,
+)  # fmt: skip
+
 
 ASYMMETRY = 1e-5
 """Of a covariance, in σ of its two axes: what rounding to six digits leaves is less."""
@@ -120,7 +129,7 @@ def exactly_known(
     return ~np.any(covariances, axis=(-2, -1))
 
 
-class Compared(NamedTuple):
+class EvaluatedSteps(NamedTuple):
     """The steps that have a part in a verdict."""
 
     start: int
@@ -135,7 +144,7 @@ def without_known(
     errors: Float[np.ndarray, "runs steps n"],
     covariances: Float[np.ndarray, "runs steps n n"],
     logged: Bool[np.ndarray, "runs steps"],
-) -> Compared:
+) -> EvaluatedSteps:
     """All steps that were logged but those at the beginning of a run that it knows by definition.
 
     Raises ValueError where one is wrong all the same, or where of a run nothing else is left.
@@ -158,7 +167,7 @@ def without_known(
         )
     left = logged & ~before
     start = int(np.argmax(left.any(axis=0)))
-    return Compared(start, left, _left_out(known & before, start))
+    return EvaluatedSteps(start, left, _left_out(known & before, start))
 
 
 def _left_out(known: Bool[np.ndarray, "runs steps"], start: int) -> tuple[str, ...]:
@@ -213,3 +222,140 @@ def _refuse(place: Any, fault: str) -> NoReturn:
     raise ValueError(
         f"the covariance of {at(place)} {fault}; a symmetric, positive definite one is accepted"
     )
+
+
+_RIGID = 1e-4
+"""How far from orthonormal a rotation may be: what rounding to six digits leaves is less."""
+
+
+class Poses(NamedTuple):
+    """Runs of estimated poses T_wc, their covariances, and the truth."""
+
+    estimates: Float[np.ndarray, "runs steps d d"]
+    covariances: Float[np.ndarray, "runs steps t t"]
+    truths: Float[np.ndarray, "runs steps d d"]
+    logged: Bool[np.ndarray, "runs steps"]
+    """Which steps of which run there are; the others are identities, of unit covariance."""
+    joint: Float[np.ndarray, "runs steps*t steps*t"] | None = None
+    """The covariance of all poses of a run, where it is known."""
+
+
+def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLike) -> Poses:
+    """Arrays that belong together. Raises ValueError, naming run and step."""
+    matrices = "(runs, steps, 4, 4), or (runs, steps, 3, 3) in the plane"
+    T, truth = (
+        _matrices(what, numbers(what, x, 4, matrices), matrices)
+        for what, x in (("estimates", estimates), ("truths", truths))
+    )
+    if T.shape != truth.shape:
+        raise ValueError(f"estimates are {T.shape}, so truths must be too, not {truth.shape}")
+    runs, steps, t = *T.shape[:2], geometry_of(T).tangent_dim
+    each, joint = (runs, steps, t, t), (runs, steps * t, steps * t)
+    P = numbers("covariances", covariances, 3 if np.ndim(covariances) == 3 else 4, str(each))
+    if P.shape not in (each, joint):
+        raise ValueError(
+            f"covariances of {runs} runs of {steps} poses must be {each}, or the joint ones "
+            f"{joint}, not {P.shape}"
+        )
+    joints = P if P.shape == joint else None
+    if joints is not None:
+        blocks = joints.reshape(runs, steps, t, steps, t)
+        P = np.moveaxis(blocks[:, range(steps), :, range(steps)], 0, 1)
+    logged = ~(all_nan(T[..., :-1, :]) & all_nan(P) | all_nan(truth[..., :-1, :]))
+    check_every_run(logged)
+    if joints is not None:
+        joints = _joint(joints, np.repeat(logged, t, axis=1))
+    for what, x in (("estimates", T), ("truths", truth), ("covariances", P)):
+        check_finite(what, x, logged)
+        if (largest := np.abs(x[logged]).max()) > LARGEST:
+            raise ValueError(f"{what} hold {largest:.2g}; up to {LARGEST:.0e} is accepted")
+    T, truth = (filled(x, logged, np.eye(x.shape[-1])) for x in (T, truth))
+    _check_rigid("estimates", T)
+    _check_rigid("truths", truth)
+    return Poses(T, filled(P, logged, np.eye(t)), truth, logged, joints)
+
+
+def _joint(
+    P: Float[np.ndarray, "runs k k"], logged: Bool[np.ndarray, "runs k"]
+) -> Float[np.ndarray, "runs k k"]:
+    """Zero where one of two numbers was not logged. Raises ValueError for any that cannot be."""
+    P = np.where(logged[:, :, None] & logged[:, None], P, 0.0)
+    if not (np.abs(P) <= LARGEST).all():
+        run = int(np.argwhere(~(np.abs(P) <= LARGEST))[0, 0])
+        raise ValueError(
+            f"covariances of run {run} hold numbers that are not finite, or beyond {LARGEST:.0e}"
+        )
+    return P
+
+
+def _matrices(what: str, T: np.ndarray, accepted: str) -> np.ndarray:
+    if T.shape[-2:] not in ((3, 3), (4, 4)):
+        raise ValueError(f"{what} must be matrices {accepted}, not {T.shape}")
+    return T
+
+
+def _check_rigid(what: str, T: np.ndarray) -> None:
+    wrong = not_rigid(T, _RIGID)
+    if wrong.any():
+        place = at(np.argwhere(wrong)[0])
+        raise ValueError(f"{what} of {place} is no rigid motion [R t; 0 1] with R a rotation")
+
+
+def read_npz(path: Path) -> dict[str, Any]:
+    """The arrays of a file; nothing in it is run."""
+    arrays: dict[str, Any] = dict(read_arrays(path))
+    for name in arrays:
+        if name not in _KEYS:
+            meant = suggestion(name, _KEYS)
+            raise ValueError(f"{path}: unknown array {name!r}{meant}; known: {', '.join(_KEYS)}")
+    return arrays
+
+
+_APART = 2
+"""Runs whose steps together are more than so many times those of the longest do not share them."""
+_COLUMNS = "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"
+
+
+def read_csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]:
+    """Lines `run, step, n errors, n (n + 1)/2 of the upper triangle`; a first one of names.
+
+    The arrays, and what runs and steps are called in the file.
+    """
+    row = "numbers run, step, n errors and the n (n + 1)/2 of the upper triangle row by row"
+    comments, rows, lines = read_table(path, "log", "errors", row, None)
+    n = round((np.sqrt(9 + 8 * (rows.shape[1] - 2)) - 3) / 2) if rows.shape[1] > 3 else 0
+    if n < 1 or 2 + n * (n + 3) // 2 != rows.shape[1]:
+        raise ValueError(f"{path}: {rows.shape[1]} columns; {row} are accepted: {_COLUMNS} columns")
+    places, runs, steps = _rectangle(path, rows[:, :2], lines)
+    e = np.full((len(runs), len(steps), n), np.nan)
+    P = np.full((*e.shape, n), np.nan)
+    e[places], triangle, upper = rows[:, 2 : 2 + n], np.empty((len(rows), n, n)), np.triu_indices(n)
+    triangle[:, *upper] = triangle[:, *upper[::-1]] = rows[:, 2 + n :]
+    P[places] = triangle
+    titles = words(comments[0]) if comments else []
+    named = len(titles) == rows.shape[1] and not comments[0].lstrip().startswith("#")
+    names = {"names": titles[2 : 2 + n]} if named else {}
+    arrays = {"errors": e, "covariances": P, **names}
+    return arrays, tuple(f"run {x:g}" for x in runs), tuple(f"step {x:g}" for x in steps)
+
+
+def _rectangle(
+    path: Path, places: Float[np.ndarray, "k 2"], lines: tuple[int, ...]
+) -> tuple[tuple[np.ndarray, np.ndarray], Float[np.ndarray, " r"], Float[np.ndarray, " s"]]:
+    """The run and the step of every row, and the numbers of runs and of steps.
+
+    A run need not have all steps.
+    """
+    (runs, run), (steps, step) = (np.unique(x, return_inverse=True) for x in places.T)
+    pairs, first = np.unique(places, axis=0, return_index=True)
+    if len(pairs) < len(places):
+        twice = np.setdiff1d(np.arange(len(places)), first)[0]
+        r, s = places[twice]
+        raise ValueError(f"{path}, line {lines[twice]}: run {r:g}, step {s:g} comes twice")
+    longest = int(np.bincount(run).max())
+    if len(steps) > _APART * longest:
+        raise ValueError(
+            f"{path}: the runs have {len(steps)} different steps, and none more than {longest}; "
+            "steps that are counted alike in all runs are accepted, as from the start of each"
+        )
+    return (run, step), runs, steps
