@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import jaxslam
+from jaxslam._runtime.progress import bar
 from jaxslam.cli import main
 
 PACKAGE = Path(jaxslam.__file__).parent
@@ -36,6 +37,35 @@ def test_a_tracker_without_opencv_names_the_vision_extra(monkeypatch):
         jaxslam.Tracker  # noqa: B018
 
 
+@pytest.mark.parametrize("library", ["tyro", "tqdm"])
+def test_the_command_line_without_its_libraries_names_the_cli_extra(library, monkeypatch, capsys):
+    for module in ("jaxslam.cli.commands", "jaxslam.cli.evaluate"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    monkeypatch.setitem(sys.modules, library, None)
+    main(["--version"])
+    with pytest.raises(SystemExit) as ended:
+        main(["evaluate", "nowhere.npz"])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == (
+        f"jaxslam: the command line needs the cli extra ({library} is missing): "
+        "pip install 'jaxslam[cli]', or in a clone pip install '.[cli]'\n"
+    )
+
+
+def test_a_bar_without_tqdm_names_the_cli_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "tqdm.auto", None)
+    with pytest.raises(ValueError, match=r"a bar of progress needs the cli extra \(tqdm"):
+        bar(3, "run")
+
+
+def test_the_core_brings_mathematics_and_figures_alone():
+    core = tomllib.loads(PROJECT.read_text())["project"]["dependencies"]
+    assert {name.partition(">")[0] for name in core} <= {
+        "equinox", "jax", "jaxlie", "jaxtyping", "lineax", "matplotlib", "numpy", "optimistix",
+        "scipy",
+    }  # fmt: skip
+
+
 def calls():
     """Extras that calls of `missing` name."""
     for path in PACKAGE.rglob("*.py"):
@@ -46,7 +76,7 @@ def calls():
 
 def test_every_extra_that_an_error_names_is_one_of_the_projects():
     named, extras = set(calls()), tomllib.loads(PROJECT.read_text())["project"]
-    assert named >= {"vision", "viewer", "parquet", "cluster"}
+    assert named >= {"cli", "vision", "viewer", "parquet", "cluster"}
     assert named <= set(extras["optional-dependencies"])
 
 

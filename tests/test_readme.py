@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 import jaxslam
-from jaxslam.cli import Command
+from jaxslam.cli.commands import Command
 from jaxslam.evaluation import CHOICES, Convention, read_covariances
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.target import read_target

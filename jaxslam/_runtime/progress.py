@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from typing import Any
 
+from jaxslam._runtime.extras import missing
+
 LINE_SECONDS = 10.0
 """Seconds between two lines of a log; what takes less has none."""
 
@@ -14,10 +16,12 @@ def bar(total: int | None, unit: str, desc: str | None = None, done: int = 0) ->
     many are `done` already.
 
     Where standard error is neither a terminal nor a notebook's it is lines, `LINE_SECONDS` apart: a
-    file would keep all that is drawn over at a terminal.
+    file would keep all that is drawn over at a terminal. Raises ValueError without the extra `cli`.
     """
-    from tqdm.auto import tqdm
-
+    try:
+        from tqdm.auto import tqdm
+    except ImportError as error:
+        raise missing("a bar of progress needs", "cli", error) from None
     if sys.stderr.isatty() or "ipykernel" in sys.modules:
         return tqdm(total=total, unit=unit, desc=desc, initial=done)
     return tqdm(

@@ -5,50 +5,11 @@ from __future__ import annotations
 import signal
 import sys
 import textwrap
-from typing import Annotated
+from typing import NoReturn
 
-import tyro
-
+from jaxslam._runtime.extras import missing
 from jaxslam._version import __version__
 from jaxslam.cli.cache import keep_programs
-from jaxslam.cli.calibrate import CalibrateOptions
-from jaxslam.cli.consistency import ConsistencyOptions
-from jaxslam.cli.evaluate import EvaluateOptions
-from jaxslam.cli.track import TrackOptions
-from jaxslam.cli.triangulate import TriangulateOptions
-
-Command = (
-    Annotated[
-        ConsistencyOptions,
-        tyro.conf.subcommand(
-            "consistency", description="Simulate many runs of filters: are they consistent?"
-        ),
-    ]
-    | Annotated[
-        EvaluateOptions,
-        tyro.conf.subcommand(
-            "evaluate", description="Errors and covariances of your own filter: is it consistent?"
-        ),
-    ]
-    | Annotated[
-        TrackOptions,
-        tyro.conf.subcommand(
-            "track", description="Track a camera through a video: trajectory, map, overlay."
-        ),
-    ]
-    | Annotated[
-        CalibrateOptions,
-        tyro.conf.subcommand(
-            "calibrate", description="Film a board: the camera's calibration, and how sure it is."
-        ),
-    ]
-    | Annotated[
-        TriangulateOptions,
-        tyro.conf.subcommand(
-            "triangulate", description="A point seen twice: what is known of its depth, and is it?"
-        ),
-    ]
-)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -57,13 +18,13 @@ def main(arguments: list[str] | None = None) -> None:
     if given == ["--version"]:
         print(f"jaxslam {__version__}")
         return
-    options = tyro.cli(
-        Command,
-        args=given,
-        prog="jaxslam",
-        description="Monocular EKF-SLAM whose uncertainty can be believed. --version says which.",
-        config=(tyro.conf.OmitArgPrefixes, tyro.conf.HelptextFromCommentsOff),
-    )
+    try:
+        import tqdm  # noqa: F401
+
+        from jaxslam.cli.commands import parse
+    except ImportError as error:
+        _fail(2, str(missing("the command line needs", "cli", error)))
+    options = parse(given)
     signal.signal(signal.SIGTERM, _interrupt)
     keep_programs()
     try:
@@ -80,6 +41,6 @@ def _interrupt(*_) -> None:
     raise KeyboardInterrupt
 
 
-def _fail(status: int, message: str) -> None:
+def _fail(status: int, message: str) -> NoReturn:
     print(f"jaxslam: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(status)
