@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
@@ -15,6 +16,13 @@ import jax
 import tyro
 
 from jaxslam._runtime.files import read_json, write_atomically, write_json
+
+
+def data_folder() -> Path:
+    """The folder of recordings: $JAXSLAM_DATA, or else the one beside a clone, which is then set,
+    so that scenarios named after a recording find it too."""
+    return Path(os.environ.setdefault("JAXSLAM_DATA", "../shared/data"))
+
 
 RESULTS = Path("benchmarks/results")
 END = "<!-- end -->"

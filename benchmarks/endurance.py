@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import tyro
-from benchmark import RESULTS, Benchmark, table, write_table
+from benchmark import RESULTS, Benchmark, data_folder, table, write_table
 
 from jaxslam.io.opening import open_source
 from jaxslam.io.source import Frame
@@ -33,7 +33,9 @@ MARK = "<!-- by endurance.py -->"
 class Endurance(Benchmark):
     """A long video, and what tracks it."""
 
-    sequence: Annotated[Path, tyro.conf.Positional] = Path("../shared/data/monoslam_desk")
+    sequence: Annotated[Path, tyro.conf.Positional] = field(
+        default_factory=lambda: data_folder() / "monoslam_desk"
+    )
     """Data set folder or video."""
     frames: int = 10_000
     """Frames in all."""

@@ -23,6 +23,7 @@ import jax
 import numpy as np
 import tracks
 import tyro
+from benchmark import data_folder
 
 import jaxslam
 from jaxslam._numerics.arrays import cast
@@ -31,7 +32,6 @@ from jaxslam.consistency import SimulatedFrame, run_through, scale_records
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.simulation import Room, Run, Scenario, sightings
-from jaxslam.simulation.trajectories import folder
 from jaxslam.statistics import lost_threshold
 from jaxslam.statistics.beyond_scale import SCALE, one_scale_of, reversal
 
@@ -103,19 +103,20 @@ def _studies(options: Options) -> Iterator[tuple[str, str, dict[str, int], Any]]
     """Of what, by which filter, of how many runs, and the function that measures it."""
     simulated = {"runs": options.runs, "steps": options.steps, "seed": options.seed}
     recorded = {"runs": options.starts, "steps": options.frames}
+    data = data_folder()  # where scenarios find them too
     for trajectory in options.trajectories or _known("trajectories/*.txt", "kitti_format"):
         chosen = jaxslam.scenario(f"handheld-{trajectory}", steps=options.steps)
         for name, slam in _filters(chosen, options).items():
             yield chosen.name, name, simulated, partial(_simulated, chosen, name, slam, options)
     for drive in options.drives or _known("kitti_tracks/*/tracks.npz"):
-        data = tracks.read(folder().parent / "kitti_tracks" / drive)
-        for name, slam in _filters(on_the_road(data), options).items():
-            yield f"tracks-{drive}", name, recorded, partial(_recorded, data, slam, options)
+        drove = tracks.read(data / "kitti_tracks" / drive)
+        for name, slam in _filters(on_the_road(drove), options).items():
+            yield f"tracks-{drive}", name, recorded, partial(_recorded, drove, slam, options)
 
 
 def _known(pattern: str, without: str = " ") -> list[str]:
     """Names in the data folder: of files, or of the folders that hold them."""
-    paths = sorted(folder().parent.glob(pattern))
+    paths = sorted(data_folder().glob(pattern))
     return [p.parent.name if p.suffix == ".npz" else p.stem for p in paths if without not in p.stem]
 
 

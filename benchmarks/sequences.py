@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+from benchmark import data_folder
 from pages import write_table
 
 from jaxslam._runtime.files import write_atomically, write_json
@@ -225,8 +226,7 @@ def _sources(options: Options) -> Iterator[tuple[Any, bool]]:
     from jaxslam.io.opening import open_source
     from jaxslam.tracking.synthetic import synthetic_source
 
-    data = Path(os.environ.get("JAXSLAM_DATA", "../shared/data"))
-    there = sorted(path.parent for path in data.glob("*/images"))
+    there = sorted(path.parent for path in data_folder().glob("*/images"))
     yield from ((open_source(path), False) for path in options.sequences or there)
     if not options.sequences:
         yield from ((synthetic_source(frames=150, seed=seed), True) for seed in SEEDS)

@@ -13,13 +13,13 @@ it is, `benchmarks/reference.py` says. Results are added to `starts.json`, and t
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import tyro
+from benchmark import data_folder
 from pages import write_table
 from scipy.stats import chi2, norm
 
@@ -148,9 +148,10 @@ def _row(name: str, result: dict[str, Any]) -> str:
 def main() -> None:
     """Print a line for each start, and write the results."""
     options = tyro.cli(Options, description=__doc__)
-    data = Path(os.environ.get("JAXSLAM_DATA", "../shared/data"))
     results = json.loads(options.out.read_text()) if options.out.exists() else {}
-    for sequence in options.sequences or sorted(path.parent for path in data.glob("*/images")):
+    for sequence in options.sequences or sorted(
+        path.parent for path in data_folder().glob("*/images")
+    ):
         results[sequence.name] = starts(sequence, options)
         write_json(options.out, results)
     print(table(results))

@@ -107,6 +107,17 @@ def data(tmp_path, monkeypatch):
     return tmp_path / "trajectories" / "walk.txt"
 
 
+def test_no_folder_of_data_is_looked_into_unless_it_is_said(data, tmp_path, monkeypatch):
+    for name in ("clone", "shared"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "shared" / "data").symlink_to(tmp_path)
+    monkeypatch.chdir(tmp_path / "clone")
+    scenario("handheld-walk", steps=5)
+    monkeypatch.delenv("JAXSLAM_DATA")
+    with pytest.raises(ValueError, match="JAXSLAM_DATA, a folder of data, is not set"):
+        scenario("handheld-walk", steps=5)
+
+
 def test_a_scenario_is_named_after_its_trajectory(data, tmp_path):
     chosen = scenario("handheld-walk", steps=30)
     assert chosen == dataclasses.replace(

@@ -43,7 +43,7 @@ class ConsistencyOptions:
         tyro.conf.arg(
             metavar="NAME",
             help="A TOML file with the fields of a scenario, handheld-NAME of a trajectory in "
-            "$JAXSLAM_DATA/trajectories (../shared/data by default; any TUM file by --set "
+            "$JAXSLAM_DATA/trajectories (any TUM file by --set "
             f"trajectory=FILE), or one of: {', '.join(BUILT_IN)}.",
         ),
     ] = "circle"

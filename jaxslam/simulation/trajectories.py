@@ -46,18 +46,19 @@ class RecordedMotion(eqx.Module):
         return jax.vmap(lambda T: (origin @ T).normalize())(T_WC)
 
 
-def folder() -> Path:
-    """Where recordings are sought by name: `trajectories` in $JAXSLAM_DATA, or ../shared/data."""
-    return Path(os.environ.get("JAXSLAM_DATA", "../shared/data")) / "trajectories"
-
-
 def find(trajectory: str) -> Path:
-    """The file of a recording: a file, or the name of one in `folder()`. Raises ValueError."""
-    for path in (Path(trajectory), folder() / f"{trajectory}.txt"):
+    """The file of a recording: a file, or the name of one in `$JAXSLAM_DATA/trajectories`.
+
+    Raises ValueError, which says what there is, or that the variable is not set.
+    """
+    data = os.environ.get("JAXSLAM_DATA")
+    folder = Path(data) / "trajectories" if data else None
+    for path in (Path(trajectory), *([folder / f"{trajectory}.txt"] if folder else [])):
         if path.is_file():
             return path
-    known = sorted(path.stem for path in folder().glob("*.txt"))
-    there = f"in {folder()}: {', '.join(known)}" if known else f"none is in {folder()}"
+    known = sorted(path.stem for path in folder.glob("*.txt")) if folder else []
+    there = f"in {folder}: {', '.join(known)}" if known else f"none is in {folder}"
+    there = there if folder else "JAXSLAM_DATA, a folder of data, is not set"
     raise ValueError(
         f"no trajectory {trajectory!r}{suggestion(trajectory, known)}; a TUM file is accepted, "
         f"and the name of one in $JAXSLAM_DATA/trajectories ({there})"
