@@ -21,27 +21,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from benchmark import RESULTS, Benchmark, table, write_table
-from exact_posterior import (
-    SMC,
-    Draws,
-    Study,
-    against_filter,
-    draw_runs,
-    gaussian_sum,
-    halves,
-    make_problem,
-    mixture_divergence,
-    mixture_of_modes,
-    pool,
-    pose_moments,
-    ranks,
-    reversed_draws,
-    second_mode,
-    tempered_sample,
-    uniformity,
-)
-from exact_posterior.modes import LEAST_SHARE
+from exact_posterior.mixtures import mixture_divergence, mixture_of_modes
+from exact_posterior.modes import LEAST_SHARE, halves, reversed_draws, second_mode
+from exact_posterior.moments import pose_moments
+from exact_posterior.multimodal import Draws, pool, tempered_sample
+from exact_posterior.problem import make_problem
+from exact_posterior.ranks import ranks, uniformity
+from exact_posterior.study import Study, against_filter, draw_runs, gaussian_sum
 from exact_posterior.summary import position_dim, summarise_filter, summarise_nees
+from exact_posterior.tempered import SMC
 
 import jaxslam
 from jaxslam._runtime.watchdog import finished

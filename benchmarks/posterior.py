@@ -1,8 +1,8 @@
 """How far is every filter from the exact posterior, and where does its excess NEES come from?
 
 `python benchmarks/posterior.py` samples the posterior of the same simulated runs that the filters
-meet and writes `posterior.json`, `docs/posterior.md` and `docs/posterior.png`,
-anew after every scenario and step. `--cache FOLDER` keeps the draws: the same command with more
+meet and writes `posterior.json` and a table in `docs/repairs.md`, anew after every scenario and
+step. `--cache FOLDER` keeps the draws: the same command with more
 filters then only runs those.
 """
 
@@ -19,35 +19,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark import RESULTS, Benchmark, number, table, write_page
-from exact_posterior import (
-    HMC,
-    Study,
-    against_filter,
-    converged,
-    draw_runs,
-    pooled,
-    reference,
-)
-from exact_posterior.figure import plot_posterior
+from benchmark import RESULTS, Benchmark, number, table, write_table
+from exact_posterior.sampler import HMC
+from exact_posterior.study import Study, against_filter, converged, draw_runs, pooled, reference
 from exact_posterior.summary import summarise_filter, summarise_reference, summarise_sampler
 
 import jaxslam
 from jaxslam.consistency import FolderStore, MemoryStore
 
-READING = """\
-The rows of a table are a sequence: the exact posterior's own mean and covariance, whose mean NEES
-is the number of degrees of freedom whatever its shape; the same with the prior on 1/z that the
-filters believe, which has mass at ω < 0; the Gaussian that Laplace puts at the mode of that; and
-the filters. What each row adds to the one before is the cost of that step: of the prior, of not
-being Gaussian, of recursion and linearisation."""
-
-STAGES = {
-    "exact": "exact posterior: its mean and covariance",
-    "gaussian_prior": "… with the whole Gaussian prior on 1/z",
-    "gaussian_prior_laplace": "… by MAP and Laplace",
-}
-SHOWN_DRAWS = 1000
+MARK = "<!-- posterior.py -->"
 LEAST_CONVERGED = 0.9
 """Share of the runs; of fewer nothing is said, as those that converge are the easy ones."""
 
@@ -56,15 +36,20 @@ LEAST_CONVERGED = 0.9
 class ExactPosterior(Benchmark):
     """Filters beside the exact posterior of the same runs."""
 
-    scenarios: tuple[str, ...] = ("matched-loose", "matched", "matched-forward-loose")
+    scenarios: tuple[str, ...] = (
+        "matched-loose", "matched-forward-loose", "matched-turn-loose", "matched",
+    )  # fmt: skip
     """Simulated worlds of the matched family."""
     steps: tuple[int, ...] = (5,)
     """Steps at which the posterior is taken, each a problem of its own."""
     filters: tuple[str, ...] = (
-        "robocentric/inverse_scaling",
-        "world/inverse_scaling",
         "robocentric/inverse_depth",
+        "robocentric/inverse_scaling",
         "scale_gauge/inverse_scaling",
+        "scale_gauge+lag20/inverse_scaling",
+        "scale_gauge+directions9/inverse_scaling",
+        "scale_gauge+mixture17/inverse_scaling",
+        "scale_gauge+scene50+mixture17/inverse_scaling",
     )
     """`filter/landmarks`."""
     landmarks: int = 6
@@ -102,8 +87,7 @@ class ExactPosterior(Benchmark):
             yield {**of, "scenarios": results}
 
     def report(self, results: dict[str, Any]) -> None:
-        plot_posterior(results, self.docs / "posterior.png")
-        write_page(self.docs / "posterior.md", page(results))
+        write_table(self.docs / "repairs.md", MARK, as_table(results["scenarios"]))
 
 
 def _measure(study: Study, options: ExactPosterior) -> dict[str, Any]:
@@ -127,7 +111,6 @@ def _measure(study: Study, options: ExactPosterior) -> dict[str, Any]:
     return {
         **summary,
         "filters": {name: summarise_filter(own, records, used) for name, own in by_filter.items()},
-        "telling": _telling(study, records, used, by_filter),
         "seconds": seconds,
     }
 
@@ -176,126 +159,38 @@ def _filter(
     return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
-def _telling(study: Study, reference, used, filters) -> dict[str, Any]:
-    """One run for the figure: the one whose first filter is the median in NEES of the used."""
-    nees = next(iter(filters.values()))["nees"]
-    order = np.argsort(np.where(used, nees, np.inf))
-    run = int(order[int(used.sum()) // 2])
-    n = study.scenario.world.point_dim
-    draws = reference["exact_draws"][run, :, :n]
-    shown = np.linspace(0, len(draws) - 1, min(SHOWN_DRAWS, len(draws))).astype(int)
-    center = reference["exact_position"][run]
-    laplace = {k: reference[f"gaussian_prior_laplace_{k}"][run] for k in ("position", "covariance")}
-    gaussians = {
-        "MAP + Laplace": laplace,
-        **{
-            k: {"position": f["position"][run], "covariance": f["covariance"][run]}
-            for k, f in filters.items()
-        },
+def as_table(scenarios: dict[str, Any]) -> str:
+    """KL from the exact posterior, σ of position over the exact one, mean NEES."""
+    found = {
+        f"`{name}`, step {steps}": numbers
+        for name, by_step in scenarios.items()
+        for steps, numbers in by_step.items()
+        if "nees" in numbers
     }
-    return {
-        "run": run,
-        "truth": (reference["exact_truth"][run, :n] + center).tolist(),
-        "draws": np.round(draws[shown] + center, 5).tolist(),
-        "gaussians": {
-            name: {
-                "mean": np.asarray(g["position"]).tolist(),
-                "covariance": np.asarray(g["covariance"])[:n, :n].tolist(),
-            }
-            for name, g in gaussians.items()
-        },
-    }
-
-
-def page(summary: dict[str, Any]) -> str:
-    """The Markdown page: how to read it, the figure, then the tables."""
-    hmc = summary["hmc"]
-    parts = [
-        "# The exact posterior, and how far the filters are from it",
-        "Made by `python benchmarks/posterior.py`; do not edit. "
-        f"{summary['runs']} runs with {summary['landmarks']} landmarks, seed {summary['seed']}, "
-        f"float64; Hamiltonian Monte Carlo with {hmc['chains']} chains of {hmc['draws']} draws "
-        f"after {hmc['warmup']}; MAP from {summary['starts']} "
-        "starts. A row is over the runs of which both posteriors converged (R̂ ≤ 1.05 and 100 "
-        "effective draws of pose, velocity and density). All rows of a scenario and step are of "
-        "the same runs.",
-        READING,
-        "![Draws of one run, NEES and σ](posterior.png)",
-    ]
-    for scenario, by_step in summary["scenarios"].items():
-        for steps, numbers in by_step.items():
-            parts += [f"## `{scenario}`, step {steps}", *_section(numbers)]
-    return "\n\n".join(parts) + "\n"
-
-
-def _section(numbers: dict[str, Any]) -> list[str]:
-    if "nees" not in numbers:
-        return [_not_converged(numbers)]
-    sampler, minima = numbers["sampler"]["exact"], numbers["minima"]["gaussian_prior"]
-    low, high = numbers["nees"]["exact"]["band95"]
-    calibration = numbers["calibration"]
-    sigma, rmse = numbers["sigma"]["exact"], numbers["rmse"]
-    p = ", ".join(
-        f"{name} {value:.2f}"
-        for name, value in zip(calibration["names"], calibration["p"], strict=True)
-    )
-    return [
-        f"{numbers['used']} of {numbers['runs']} runs converged (median R̂ "
-        f"{sampler['rhat_median']:.3f}, median effective draws {sampler['ess_median']:.0f}, "
-        f"{sampler['divergent']:.1%} of the transitions divergent, {sampler['leapfrogs']:.0f} "
-        f"leapfrog steps a draw). Exact σ (median): {1000 * sigma['position']:.1f} mm and "
-        f"{1000 * sigma['orientation']:.2f} mrad. RMSE of its mean: {1000 * rmse['position']:.1f} "
-        f"mm and {1000 * rmse['orientation']:.2f} mrad. Ranks of the truth uniform, p: {p}. "
-        f"Several minima of the MAP in {minima['runs_with_several']:.0%} of the runs; the start at "
-        f"the prior mean misses the best in {minima['prior_mean_missed_best']:.0%}.",
-        _rows(numbers, (low, high)),
-    ]
-
-
-def _not_converged(numbers: dict[str, Any]) -> str:
-    sampler = numbers["sampler"]["exact"]
-    return (
-        f"Only {numbers['used']} of {numbers['runs']} runs converged (median R̂ "
-        f"{sampler['rhat_median']:.2f}, median effective draws {sampler['ess_median']:.0f}, "
-        f"{sampler['divergent']:.1%} of the transitions divergent): the draws are not the "
-        "posterior's, and nothing is compared with them."
-    )
-
-
-def _rows(numbers: dict[str, Any], band: tuple[float, float]) -> str:
-    header = (
-        "", f"NEES, mean ± s.e. (band {band[0]:.2f}–{band[1]:.2f})", "median", "lost",
-        "σ/exact position, orientation", "RMSE/exact position, orientation", "KL median, mean",
-        "W₁/σ",
-    )  # fmt: skip
-    ratios = {"exact": ("1, 1", "1, 1"), "gaussian_prior": ("–", "–")}
-    ratios["gaussian_prior_laplace"] = _ratios(numbers["laplace"])
+    names = list(dict.fromkeys(name for numbers in found.values() for name in numbers["filters"]))
     rows = [
-        (name, *_nees(numbers["nees"][key]), *ratios[key], "–", "–") for key, name in STAGES.items()
+        ("exact posterior", *(_cell(None, 1, n["nees"]["exact"]) for n in found.values())),
+        (
+            "MAP and Laplace",
+            *(
+                _cell(None, _sigma(n["laplace"]), n["nees"]["gaussian_prior_laplace"])
+                for n in found.values()
+            ),
+        ),
     ]
-    for name, f in numbers["filters"].items():
-        kl = f"{_digits(f['kl']['median'])}, {_digits(f['kl']['mean'])}"
-        distances = ", ".join(_digits(value) for value in f["wasserstein"])
-        rows.append((name, *_nees(f["nees"]), *_ratios(f), kl, distances))
-    return table(header, rows)
+    for name in names:
+        of = (numbers["filters"].get(name) for numbers in found.values())
+        cells = (_cell(f["kl"]["mean"], _sigma(f), f["nees"]) if f else "–" for f in of)
+        rows.append((f"`{name}`", *cells))
+    return table(["", *found], rows)
 
 
-def _nees(nees: dict[str, Any]) -> tuple[str, str, str]:
-    mean = f"{_digits(nees['mean'])} ± {_digits(nees['standard_error'])}"
-    return mean, _digits(nees["median"]), f"{nees['lost']:.1%}"
+def _cell(kl: float | None, sigma: float, nees: dict[str, Any]) -> str:
+    return f"{number(kl)}; {number(sigma)}; {number(nees['mean'], '.1f')}"
 
 
-def _ratios(numbers: dict[str, Any]) -> tuple[str, str]:
-    position, orientation = numbers["position"], numbers["orientation"]
-    sigma, rmse = (
-        f"{_digits(position[key])}, {_digits(orientation[key])}"
-        for key in ("sigma_ratio", "rmse_ratio")
-    )
-    return sigma, rmse
-
-
-def _digits(value: float | None) -> str:
-    return number(value, ".3g")
+def _sigma(numbers: dict[str, Any]) -> float:
+    return numbers["position"]["sigma_ratio"]
 
 
 if __name__ == "__main__":

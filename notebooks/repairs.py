@@ -149,7 +149,7 @@ for name in (SUM, RECOMMENDED):
 # Straight ahead the window's *maximum* of the posterior is not its mean: an inverse depth that
 # multiplies the unknown direction makes an amplitude of it, and a maximum is drawn towards the
 # larger amplitudes. The sum goes to the mean: five frames in, it is nearly the exact posterior
-# (0.07 nats from it, where the plain filter is 0.85; `docs/posterior.md`), at some twenty times
+# (0.07 nats from it, where the plain filter is 0.85; `docs/repairs.md`), at some twenty times
 # the cost of the plain filter. Later a few runs in a thousand are lost all the same, and one of
 # them is enough to take a mean NEES out of its band; and where accelerations are very large, it
 # is a little over-confident. Where the prior on depth is wrong, as on `circle`, no filter that

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import close, quick_jit
-from exact_posterior import log_density, make_problem
 from exact_posterior.laplace import minima
+from exact_posterior.problem import log_density, make_problem
 
 import jaxslam
 from jaxslam._numerics.linalg import cholesky

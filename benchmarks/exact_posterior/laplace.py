@@ -68,13 +68,6 @@ def minima(
     return jax.vmap(from_start)(initial)
 
 
-def map_estimate(problem: Problem, initial: Float[Array, "s n"]) -> Laplace:
-    """The best of the minima from all starts, with the Gauss–Newton covariance there."""
-    modes, values, converged = minima(problem, initial)
-    best = jnp.argmax(values)
-    return laplace(problem, modes[best], converged[best])
-
-
 def laplace(problem: Problem, mode: Float[Array, " n"], converged: Bool[Array, ""]) -> Laplace:
     """The Gaussian at a mode."""
     J = jax.jacfwd(lambda y: residuals(problem, y))(mode)

@@ -23,7 +23,6 @@ from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.filters.wrappers.batch_initialisation import BatchInitialisation
 from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
-from jaxslam.filters.wrappers.sum_state import moments
 from jaxslam.geometry import Pose, difference
 
 NEIGHBOUR = 8
@@ -98,16 +97,6 @@ def mixture_divergence(draws: Pose, mixture: PoseMixture) -> Float[Array, ""]:
     """`KL(p ‖ q)` in nats, p the density of the draws and q the mixture's."""
     _, _, tangents = pose_moments(draws)
     return cross_entropy(draws, mixture) - entropy(tangents)
-
-
-def mixture_moments(mixture: PoseMixture) -> tuple[Pose, Float[Array, "t t"]]:
-    """Mean and covariance of the sum, in the right tangent at that mean.
-
-    The covariances of the Gaussians are taken as they are: the angles between them are small.
-    """
-
-    mean, away = mean_pose(mixture.means, mixture.weights)
-    return mean, moments(jnp.log(mixture.weights), away, mixture.covariances)[1]
 
 
 def mixture_of_modes(draws: Pose, labels: Int[Array, " s"], count: int) -> PoseMixture:

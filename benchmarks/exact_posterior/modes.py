@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import ndtr
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from exact_posterior.mixtures import PoseMixture, component_log_densities
+from exact_posterior.mixtures import PoseMixture
 from exact_posterior.moments import covariance
 from jaxslam._numerics.linalg import cholesky, eigh
 from jaxslam.geometry import Pose
@@ -107,13 +107,3 @@ def second_mode(points: Float[Array, "s k"], group: Bool[Array, " s"]) -> Float[
     """Weight of a group of draws as a mode; 0 where no valley is between it and the rest."""
     apart = valley(points, group) <= DEEPEST_VALLEY
     return jnp.where(apart, jnp.mean(group, dtype=points.dtype), 0.0)
-
-
-def nearest_mode(T_BC: Pose, modes: PoseMixture) -> Int[Array, " s"]:
-    """The mode, of those given, by whose Gaussian and weight each draw is likeliest."""
-    return jnp.argmax(component_log_densities(modes, T_BC), axis=1)
-
-
-def mode_weights(labels: Int[Array, " s"], count: int) -> Float[Array, " count"]:
-    """Share of the draws that have each of the labels 0 to count − 1."""
-    return jnp.mean(labels[:, None] == jnp.arange(count), axis=0)

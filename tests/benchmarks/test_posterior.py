@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import cache, partial
-from importlib import import_module
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,41 +10,43 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import close, each_geometry, keys_used, named, pose, quick_jit
-from exact_posterior import (
-    HMC,
-    Study,
-    against_filter,
-    check_scenario,
-    diagnose,
-    draw_runs,
-    first_steps,
-    gaussian_divergence,
-    given_bound,
-    log_density,
-    make_problem,
-    map_estimate,
-    pooled,
-    pose_gaussian,
-    pose_moments,
-    ranks,
-    reference,
-    residuals,
-    sample,
-    sampler,
-    starts,
-    uniformity,
-    unknowns,
-    wasserstein,
-)
+from exact_posterior import sampler
 from exact_posterior.conditional import (
     centre,
     conditional_log_density,
     conditional_unknowns,
     whitening_root,
 )
-from exact_posterior.moments import covariance, in_base_axes, to_base_axes
-from exact_posterior.problem import size, truncated_normal
-from exact_posterior.study import _modes, _sample
+from exact_posterior.laplace import pose_gaussian, starts
+from exact_posterior.moments import (
+    covariance,
+    gaussian_divergence,
+    in_base_axes,
+    pose_moments,
+    to_base_axes,
+    wasserstein,
+)
+from exact_posterior.problem import (
+    check_scenario,
+    first_steps,
+    log_density,
+    make_problem,
+    residuals,
+    size,
+    truncated_normal,
+    unknowns,
+)
+from exact_posterior.ranks import ranks, uniformity
+from exact_posterior.sampler import HMC, diagnose, given_bound, sample
+from exact_posterior.study import (
+    Study,
+    _modes,
+    _sample,
+    against_filter,
+    draw_runs,
+    pooled,
+    reference,
+)
 from jaxlie import SE2
 from scipy.linalg import expm
 from scipy.stats import norm, truncnorm
@@ -253,19 +254,6 @@ def test_on_a_nearly_linear_problem_map_hmc_and_the_filter_agree():
     assert np.all(np.abs(records["error"] - base) < 0.02 * np.sqrt(np.diagonal(P_base)))
     assert 0 <= records["kl"] < 0.05
     assert np.all(records["wasserstein"] < 0.2)
-
-
-def test_of_the_minima_the_best_is_the_map_estimate(monkeypatch):
-    problem, _ = problem_of(LOOSE)
-    ends, values = jnp.stack([draw(problem, seed) for seed in range(3)]), jnp.array([-9.0, -2, -5])
-    minima = ends, values, jnp.array([False, True, False])
-    module = import_module("exact_posterior.laplace")  # a function has its name
-    monkeypatch.setattr(module, "minima", lambda *problem: minima)
-    found = quick_jit(map_estimate)(problem, 0 * ends)
-    np.testing.assert_array_equal(found.mode, ends[1])
-    assert found.converged
-    J = quick_jit(jax.jacfwd(partial(residuals, problem)))(ends[1])
-    np.testing.assert_allclose(found.root.T @ (J.T @ J) @ found.root, np.eye(len(J.T)), atol=1e-8)
 
 
 def test_at_the_mode_the_conditional_variables_have_the_laplace_approximation():

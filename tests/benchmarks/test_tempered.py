@@ -11,44 +11,41 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import central, quick_jit
-from exact_posterior import (
-    HMC,
-    SMC,
-    PoseMixture,
-    Study,
-    cross_entropy,
-    draw_runs,
-    entropy,
-    filter_mixture,
-    gaussian_sum,
-    halves,
-    main_direction,
-    make_problem,
-    map_estimate,
-    mixture_divergence,
-    mixture_moments,
-    mixture_of_modes,
-    mode_weights,
-    nearest_mode,
-    pool,
-    pooled,
-    pose_moments,
-    reversed_draws,
-    sample,
-    second_mode,
-    share_against,
-    starts,
-    tempered,
-    tempered_sample,
-    valley,
-)
+from exact_posterior.laplace import minima, starts
 from exact_posterior.marginal import (
     landmark_draws,
     marginal_log_likelihood,
     path_unknowns,
 )
-from exact_posterior.problem import Unknowns, inverse_depths, log_likelihood, path_size, size
-from exact_posterior.tempered import _trajectory, mean_information
+from exact_posterior.mixtures import (
+    PoseMixture,
+    cross_entropy,
+    entropy,
+    filter_mixture,
+    mixture_divergence,
+    mixture_of_modes,
+)
+from exact_posterior.modes import (
+    halves,
+    main_direction,
+    reversed_draws,
+    second_mode,
+    share_against,
+    valley,
+)
+from exact_posterior.moments import mean_pose, pose_moments
+from exact_posterior.multimodal import pool, tempered_sample
+from exact_posterior.problem import (
+    Unknowns,
+    inverse_depths,
+    log_likelihood,
+    make_problem,
+    path_size,
+    size,
+)
+from exact_posterior.sampler import HMC, sample
+from exact_posterior.study import Study, draw_runs, gaussian_sum, pooled
+from exact_posterior.tempered import SMC, _trajectory, mean_information, tempered
 from jaxlie import SE2
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
@@ -57,6 +54,7 @@ import jaxslam
 from jaxslam._runtime.watchdog import lapack_calls
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.filters.wrappers.batch_initialisation import from_rest
+from jaxslam.filters.wrappers.sum_state import moments
 from jaxslam.geometry import difference, log, retract
 
 FEW = SMC(particles=800, moves=3)
@@ -324,8 +322,8 @@ def on_one_mode():
 
     @quick_jit
     def chains(problem):
-        mode = map_estimate(problem, starts(problem, modes_key, 1))
-        return sample(study.hmc, problem, mode.mode, chains_key)
+        modes, _, _ = minima(problem, starts(problem, modes_key, 1))
+        return sample(study.hmc, problem, modes[0], chains_key)
 
     particles = replace(FEW, particles=1500)
     return quick_jit(partial(tempered_sample, particles))(problem, key), chains(problem)
@@ -450,17 +448,6 @@ def modes_of(share, apart, sigma=0.1):
     return PoseMixture(means, jnp.stack([P, P]), jnp.array([1 - share, share]))
 
 
-def test_draws_go_to_the_nearest_of_given_modes():
-    poses, other = two_sided(0.2, 0.5)
-    labels = nearest_mode(poses, modes_of(0.2, 0.5))
-    np.testing.assert_array_equal(labels, other)
-    np.testing.assert_allclose(mode_weights(labels, 3), [0.8, 0.2, 0.0])
-    # A mode of little weight loses what lies half-way.
-    half_way = SE2.from_xy_theta(*jnp.array([[0.004], [-0.003], [0.0]]))
-    assert nearest_mode(half_way, modes_of(0.5, 0.5)) == 1
-    assert nearest_mode(half_way, modes_of(0.001, 0.5)) == 0
-
-
 def test_the_entropy_of_gaussian_draws_is_the_gaussians():
     rng = np.random.default_rng(0)
     L = np.array([[1.0, 0, 0], [2.0, 0.1, 0], [0, 0, 1e-3]])
@@ -482,6 +469,12 @@ def test_the_divergence_from_a_sum_of_gaussians_is_that_of_its_weights_where_mod
     # Without the second mode all of its draws are as unlikely as they are far away.
     alone = cross_entropy(poses, modes_of(0.0, 1.0))
     assert alone - cross_entropy(poses, modes_of(0.2, 1.0)) > 0.2 * 100
+
+
+def mixture_moments(mixture):
+    """Mean and covariance of a sum, in the right tangent at that mean."""
+    mean, away = mean_pose(mixture.means, mixture.weights)
+    return mean, moments(jnp.log(mixture.weights), away, mixture.covariances)[1]
 
 
 def test_the_sum_of_the_modes_of_the_draws_has_their_moments():
