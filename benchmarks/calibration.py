@@ -2,8 +2,8 @@
 
 `python benchmarks/calibration.py` runs every treatment (white, consider, estimated, known) where
 the intrinsics are drawn in every frame (`white`), once a run (`constant`) or exact (`nominal`),
-for a camera that turns and one that does not, and writes `calibration.json`, `docs/calibration.md`
-and `docs/calibration.png`.
+for a camera that turns and one that does not, and writes `calibration.json` and
+`docs/calibration.md`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from benchmark import RESULTS, Benchmark, number, table, write_page
-from figures.calibration import plot_calibration
 
 import jaxslam
 from jaxslam.consistency import CHUNK, MemoryStore, Seconds, Study, check_sizes, filter_run
@@ -87,7 +86,6 @@ class CalibrationStudy(Benchmark):
                 yield {**of, "scenarios": results}
 
     def report(self, results: dict[str, Any]) -> None:
-        plot_calibration(results, self.docs / "calibration.png")
         write_page(self.docs / "calibration.md", page(results))
 
 
@@ -214,7 +212,6 @@ def page(summary: dict[str, Any]) -> str:
         "A filter may be inconsistent for other reasons: `known` under the truth `nominal` is what "
         "is left of it when the calibration plays no part.",
         _conclusion(summary),
-        "![Mean NEES of every treatment under every truth](calibration.png)",
     ]
     for name, by_truth in summary["scenarios"].items():
         parts += [f"## `{name}`", _rows(by_truth)]

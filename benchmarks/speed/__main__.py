@@ -1,6 +1,6 @@
 """Microseconds of a run's step: ours, by XLA and native, beside NumPy, dynamax, and C++ with Eigen.
 
-    python -m benchmarks.speed --out FILE.json
+    python -m benchmarks.speed
 
 The same pixels and controls for all, whose results are compared first; beside the filter alone
 stand whole studies: drawing, every record, statistics. All in one process on one processor, in
@@ -10,20 +10,19 @@ turns; the median counts, and compilation is apart. C++ needs a compiler, and th
 
 from __future__ import annotations
 
-import json
 import os
 import resource
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-import tyro
 
+from benchmarks.benchmark import RESULTS, Benchmark
 from benchmarks.speed.dynamax_ekf import TOLERANCE, by_dynamax, missing
 from benchmarks.speed.eigen import build, by_hand
 from benchmarks.speed.loop import by_loop
@@ -37,7 +36,6 @@ from benchmarks.speed.workload import (
     ours,
     prepared,
 )
-from jaxslam._runtime.files import write_json
 from jaxslam.consistency import BACKENDS
 from jaxslam.native.build import compiler
 
@@ -50,12 +48,10 @@ LOOP_RUNS = 4
 """The loop of NumPy is slow, and its time is the same for every run."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class Speed(Benchmark):
+    """All who compute the same filter, in turns."""
 
-    out: Path
-    """JSON file."""
     workloads: tuple[str, ...] = tuple(WORKLOADS)
     """A is planar with 12 landmarks, B has six degrees of freedom and 30 landmarks."""
     runs: int = 1024
@@ -64,6 +60,22 @@ class Options:
     """At most so many."""
     repeats: int = 5
     """Turns; the median counts."""
+    out: Path = RESULTS / "speed.json"
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        with tempfile.TemporaryDirectory() as folder:
+            library = build(Path(folder))
+            if isinstance(library, str):
+                print(f"without C++: {library}")
+            result: dict[str, Any] = {"dgemm_gflops": round(dgemm(), 1)}
+            for name in self.workloads:
+                work = WORKLOADS[name].reduced(self.runs, self.steps)
+                result[name] = measured(work, library, self.repeats, result["dgemm_gflops"])
+                result["peak_memory_MiB"] = (
+                    resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+                )
+                result["load"] = os.getloadavg()
+                yield result
 
 
 def first(inputs: Inputs, runs: int) -> Inputs:
@@ -179,27 +191,8 @@ def measured(work: Workload, library: Any, repeats: int, product: float) -> dict
     }
 
 
-def main() -> None:
-    """Measure, compare, write."""
-    options = tyro.cli(Options, description=__doc__)
-    jax.config.update("jax_enable_x64", True)
-    with tempfile.TemporaryDirectory() as folder:
-        library = build(Path(folder))
-        if isinstance(library, str):
-            print(f"without C++: {library}")
-        result: dict[str, Any] = {"dgemm_gflops": round(dgemm(), 1)}
-        for name in options.workloads:
-            work = WORKLOADS[name].reduced(options.runs, options.steps)
-            product = result["dgemm_gflops"]
-            result[name] = measured(work, library, options.repeats, product)
-    result["peak_memory_MiB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-    result["load"] = os.getloadavg()
-    write_json(options.out, result)
-    print(json.dumps(result, indent=1))
-
-
 if __name__ == "__main__":
     # Before JAX starts its threads, which are as many as there are processors to use.
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    main()
+    Speed.run()

@@ -1,6 +1,6 @@
 """How the time and the memory of a whole study grow, one axis at a time.
 
-    python -m benchmarks.speed.sweep --out FILE.json
+    python -m benchmarks.speed.sweep
 
 Every point is a process of its own (`benchmarks.speed.study`), which ends or is ended. The
 exponent of an axis along which there is more to do is the slope of log seconds over log size by
@@ -10,18 +10,19 @@ size. JSON is written after every point, and what is there already is not measur
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
 
-from jaxslam._runtime.files import read_json, write_json
+from benchmarks.benchmark import RESULTS, Benchmark
 
 AXES: dict[str, tuple[tuple[int, ...], dict[str, int]]] = {
     "runs": ((128, 512, 2048, 8192), {"steps": 100, "chunk": 128}),
@@ -37,15 +38,30 @@ LIMIT = 900.0
 """Seconds of a process."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class Sweep(Benchmark):
+    """Studies along every axis."""
 
-    out: Path
-    """JSON file."""
     axes: tuple[str, ...] = tuple(AXES)
     backends: tuple[str, ...] = ("xla", "native")
     workload: str = "A"
+    out: Path = RESULTS / "sweep.json"
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        result = self.found()
+        for axis, backend in itertools.product(self.axes, self.backends):
+            sizes, others = AXES[axis]
+            found = result.setdefault(axis, {}).setdefault(backend, {"points": {}})
+            points = found["points"]
+            for size in sizes:
+                if "seconds" not in points.get(str(size), {}):
+                    given = {"workload": self.workload, "backend": backend, **others, axis: size}
+                    points[str(size)] = point(**given)
+                    yield result
+            known = [n for n in sizes if "seconds" in points[str(n)]]
+            if axis in GROWING and len(known) > 1:
+                found |= growth(known, [points[str(n)]["seconds"] for n in known])
+            yield result
 
 
 def point(**options: Any) -> dict[str, Any]:
@@ -69,29 +85,5 @@ def growth(sizes: list[int], seconds: list[float]) -> dict[str, float]:
     return {"exponent": round(float(exponent), 3), "worst": round(float(worst), 3)}
 
 
-def main() -> None:
-    """Measure, write."""
-    options = tyro.cli(Options, description=__doc__)
-    result: dict[str, Any] = (
-        read_json(options.out, "measurements", dict) if options.out.exists() else {}
-    )
-    for axis in options.axes:
-        sizes, others = AXES[axis]
-        for backend in options.backends:
-            found = result.setdefault(axis, {}).setdefault(backend, {"points": {}})
-            points = found["points"]
-            for size in sizes:
-                if "seconds" in points.get(str(size), {}):
-                    continue
-                given = {"workload": options.workload, "backend": backend, **others, axis: size}
-                points[str(size)] = point(**given)
-                print(f"{backend}, {axis} {size}: {points[str(size)]}", flush=True)
-                write_json(options.out, result)
-            known = [n for n in sizes if "seconds" in points[str(n)]]
-            if axis in GROWING and len(known) > 1:
-                found |= growth(known, [points[str(n)]["seconds"] for n in known])
-            write_json(options.out, result)
-
-
 if __name__ == "__main__":
-    main()
+    Sweep.run()
