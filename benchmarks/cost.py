@@ -20,8 +20,8 @@ import numpy as np
 from benchmark import RESULTS, Benchmark
 
 import jaxslam
-from jaxslam.consistency import filter_run
-from jaxslam.simulation import Room, sensor_of, sightings, simulate
+from jaxslam.consistency import draw, filter_run
+from jaxslam.simulation import Room, sensor_of
 
 
 @eqx.filter_jit
@@ -56,10 +56,7 @@ class Cost(Benchmark):
 
     def measure(self) -> Iterator[dict[str, Any]]:
         scenario = jaxslam.scenario(self.scenario)
-        keys = jax.random.split(jax.random.key(0), self.batch)
-        runs = jax.jit(jax.vmap(partial(simulate, scenario)))(keys)
-        most = jax.tree.map(lambda x: int(np.max(x)), jax.vmap(sightings)(runs))
-        room = Room(most.landmarks, most.first, most.known, max(1, most.new))
+        room, runs = draw(scenario, self.batch)
         sensor = sensor_of(scenario)
 
         compiled, compile_seconds = {}, {}

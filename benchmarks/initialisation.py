@@ -23,10 +23,11 @@ from benchmark import RESULTS, Benchmark, number, table
 
 import jaxslam
 from jaxslam._numerics.linalg import cholesky
+from jaxslam.consistency.montecarlo import draw
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.readouts import camera_pose, landmarks_in_camera
 from jaxslam.models.sensors import AbstractSensor
-from jaxslam.simulation import Room, Run, features, sensor_of, sightings
+from jaxslam.simulation import Room, Run, features, sensor_of
 from jaxslam.statistics.bands import lost_threshold, normalised_squared
 
 NEAR = {"inverse_depth": (1.1, 0.45), "least_inverse_depth": 0.225, "velocity": (0.4, 0.0, 0.0)}
@@ -81,12 +82,8 @@ def measured(world: str, options: Initialisation) -> Iterator[tuple[str, dict]]:
     fields = {} if options.steps is None else {"steps": options.steps}
     base, fields = ("matched", {**NEAR, **fields}) if world == "near" else (world, fields)
     scenario = jaxslam.scenario(base, fields)
-    key = jax.random.key(options.seed)
-    draw = jax.jit(jax.vmap(lambda i: jaxslam.simulate(scenario, jax.random.fold_in(key, i))))
-    runs = draw(jnp.arange(options.runs))
-    most = jax.tree.map(lambda x: int(jnp.max(x)), jax.vmap(sightings)(runs))
-    room, sensor = Room(most.landmarks, most.first, most.known, most.new), sensor_of(scenario)
-    reference = None
+    room, runs = draw(scenario, options.runs, seed=options.seed)
+    sensor, reference = sensor_of(scenario), None
     for pair in options.filters:
         name, landmark = pair.split("/")
         slam = jaxslam.make_filters(scenario, [name], [landmark])[pair]

@@ -17,14 +17,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from benchmark import RESULTS, Benchmark, table
 
 import jaxslam
-from jaxslam.consistency import run_through
+from jaxslam.consistency import draw, run_through
 from jaxslam.evaluation.convention import Convention, converted, pose_errors
-from jaxslam.simulation.run import Room, sightings
 
 SPEED, TURN = 0.25, math.radians(1.5)
 SETTING = {
@@ -74,16 +72,12 @@ def poses_of(name: str, options: Ukfm) -> tuple[np.ndarray, np.ndarray, np.ndarr
     """Estimated poses (runs, steps, 3, 3), covariances of the right error, and the truth."""
     scenario = jaxslam.scenario("positions", SETTING)
     slam = jaxslam.make_filters(scenario, [name.split("/")[0]], [name.split("/")[1]])[name]
-    key = jax.random.key(options.seed)
+    room, runs = draw(scenario, options.runs, seed=options.seed)
 
     def told(state, innovation, frame):
         estimate, covariance = jaxslam.camera_pose(slam, state)
         return estimate.as_matrix(), covariance, frame.pose.as_matrix()
 
-    draw = jax.jit(jax.vmap(lambda i: jaxslam.simulate(scenario, jax.random.fold_in(key, i))))
-    runs = draw(jnp.arange(options.runs))
-    most = jax.tree.map(lambda x: int(jnp.max(x)), jax.vmap(sightings)(runs))
-    room = Room(most.landmarks, most.first, most.known, most.new)
     one = partial(run_through, slam, room, output=told)
     batch = jax.jit(jax.vmap(lambda run: one(run)[1]))
     parts = [
