@@ -114,8 +114,7 @@ def reference(study: Study, runs: Run, seed: int, indices: range) -> tuple[Recor
         problems = jax.vmap(partial(make_problem, study.scenario, truncated=truncated))(runs)
         # Both from the same starts: what differs is the prior's.
         where = f"{kind} posterior of {study.scenario.name}, runs {indices}"
-        modes, found = finished(_modes(study.starts, problems, modes_keys), where)
-        record(f"{kind}_map", found)
+        modes = finished(_modes(study.starts, problems, modes_keys), where)
         record(f"{kind}_laplace", _laplace_errors(problems, modes, runs))
     where = f"chains of {study.scenario.name}, runs {indices}"
     chains = finished(_sample(study.hmc, problems, modes.mode, chains_keys), where)
@@ -138,15 +137,11 @@ def _keys(seed: int, indices: range) -> tuple[Array, Array]:
 
 
 @partial(jax.jit, static_argnums=0)
-def _modes(count: int, problems: Problem, keys: Array) -> tuple[Laplace, Records]:
+def _modes(count: int, problems: Problem, keys: Array) -> Laplace:
     def one(problem, key):
         ends, values, converged = minima(problem, starts(problem, key, count))
         best = jnp.argmax(values)
-        found = {
-            "log_density": values,
-            "converged": converged,
-        }
-        return laplace(problem, ends[best], converged[best]), found
+        return laplace(problem, ends[best], converged[best])
 
     return jax.vmap(one)(problems, keys)
 
@@ -189,10 +184,8 @@ def _posterior_errors(chains: Chains, runs: Run) -> Records:
         watched = jnp.column_stack([tangents, velocity, chains.log_density.ravel()])
         rhat, ess = diagnose(watched.reshape(*shape, -1))
         behind = jnp.any(chains.inverse_depths < 0, axis=-1)
-        nees_of_draws = jax.vmap(lambda d: normalised_squared(d, P))(tangents)
         return {
             "nees": normalised_squared(difference(truth.inverse(), T_CB), P),
-            "nees_variance": jnp.var(nees_of_draws),
             "error": _base_error(truth, estimate),
             "covariance": covariance(base),
             "position": estimate.translation(),

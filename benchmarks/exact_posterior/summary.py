@@ -16,8 +16,6 @@ Arrays = Mapping[str, np.ndarray]
 KINDS = ("exact", "gaussian_prior")
 KEPT = 99
 """Draws that a truth is ranked among; their chains are nearly uncorrelated when so thinned."""
-APART = 1.0
-"""Two ends of the solver are different minima if their log densities differ by more, nats."""
 
 
 def summarise_nees(nees: Float[np.ndarray, " runs"], dof: int) -> dict[str, Any]:
@@ -52,17 +50,12 @@ def summarise_reference(records: Arrays, used: Bool[np.ndarray, " runs"]) -> dic
     return {
         **summarise_sampler(records, used),
         "calibration": _calibration(r),
-        "minima": {kind: _minima(r, kind) for kind in KINDS},
-        "behind_infinity": float(r["gaussian_prior_behind_infinity"].mean()),
         "nees": {
             "exact": summarise_nees(r["exact_nees"], dof),
             "gaussian_prior": summarise_nees(r["gaussian_prior_nees"], dof),
             "gaussian_prior_laplace": summarise_nees(r["gaussian_prior_laplace_nees"], dof),
             "exact_laplace": summarise_nees(r["exact_laplace_nees"], dof),
         },
-        "exact_nees_spread": float(np.sqrt(r["exact_nees_variance"].sum()) / len(r["exact_nees"])),
-        "sigma": {kind: _sigmas(r[f"{kind}_covariance"]) for kind in KINDS},
-        "rmse": _rmse(r["exact_error"]),
         "laplace": against_exact(
             {k.removeprefix("gaussian_prior_laplace_"): v for k, v in r.items()}, r
         ),
@@ -125,35 +118,6 @@ def _calibration(r: Arrays) -> dict[str, Any]:
         "names": names,
         "histograms": histograms.tolist(),
         "p": [float(value) for value in p],
-    }
-
-
-def _minima(r: Arrays, kind: str) -> dict[str, float]:
-    values = np.where(r[f"{kind}_map_converged"], r[f"{kind}_map_log_density"], np.nan)
-    best = np.nanmax(np.where(np.isfinite(values), values, np.nan), axis=1, keepdims=True)
-    worse = np.isfinite(values) & (values < best - APART)
-    return {
-        "starts": values.shape[1],
-        "not_converged": float(np.mean(~r[f"{kind}_map_converged"])),
-        "impossible": float(np.mean(np.isneginf(values))),
-        "runs_with_several": float(np.mean(np.any(worse, axis=1))),
-        "prior_mean_missed_best": float(np.mean(~(values[:, :1] >= best - APART))),
-    }
-
-
-def _sigmas(P: Float[np.ndarray, "runs t t"]) -> dict[str, float]:
-    n = position_dim(P.shape[-1])
-    return {
-        "position": float(np.median(_sigma(P, slice(0, n)))),
-        "orientation": float(np.median(_sigma(P, slice(n, None)))),
-    }
-
-
-def _rmse(errors: Float[np.ndarray, "runs t"]) -> dict[str, float]:
-    n = position_dim(errors.shape[1])
-    return {
-        "position": float(np.sqrt(np.mean(np.sum(errors[:, :n] ** 2, axis=1)))),
-        "orientation": float(np.sqrt(np.mean(np.sum(errors[:, n:] ** 2, axis=1)))),
     }
 
 

@@ -218,7 +218,7 @@ def nearly_linear():
     runs = draw_runs(replace(SMALL, scenario=NEARLY_LINEAR), 0, range(40))
     problems = jax.vmap(partial(make_problem, NEARLY_LINEAR, truncated=False))(runs)
     starts_keys, chains_keys = jax.random.split(jax.random.key(2), (2, 40))
-    modes, _ = _modes(SMALL.starts, problems, starts_keys)
+    modes = _modes(SMALL.starts, problems, starts_keys)
     chains = _sample(SMALL.hmc, problems, modes.mode, chains_keys)
     return jax.tree.map(lambda x: x[0], (problems, runs, modes, chains))
 
@@ -368,7 +368,7 @@ def keys_of_reference(monkeypatch, study, runs, seed, indices):
 
     def modes(count, problems, keys):
         given["starts"] = keys
-        return SimpleNamespace(mode=None), {}
+        return SimpleNamespace(mode=None)
 
     def chains(settings, problems, modes, keys):
         given["chains"] = keys
