@@ -61,16 +61,21 @@ class Benchmark(ABC):
         """
         return read_json(self.out, "results", dict) if self.out.exists() else {}
 
+    def save(self, results: Any) -> None:
+        """Write the results, whole or not at all."""
+        write_json(self.out, results, ensure_ascii=False)
+
     def __call__(self) -> None:
-        """Measure, write, report."""
+        """Measure, write, report; where there is nothing to be measured, report what is there."""
         for folder in (self.out.parent, self.docs):
             folder.mkdir(parents=True, exist_ok=True)
-        if self.page:
-            self.report(self.found())
-            return
-        for results in self.measure():
-            write_json(self.out, results, ensure_ascii=False)
+        measured = False
+        for results in () if self.page else self.measure():
+            measured = True
+            self.save(results)
             self.report(results)
+        if not measured:  # all was there
+            self.report(self.found())
 
     @classmethod
     def run(cls) -> None:
