@@ -1,10 +1,9 @@
-"""How far a Gaussian on a pose is from draws of the posterior: NEES, σ, KL and Wasserstein."""
+"""How far a Gaussian on a pose is from draws of the posterior: moments and KL."""
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import ndtri
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.linalg import cholesky
@@ -47,17 +46,6 @@ def gaussian_divergence(draws: Float[Array, "s k"], P: Float[Array, "k k"]) -> F
     factor = cholesky(P)
     log_ratio = factor.log_det() - cholesky(S).log_det()
     return (jnp.trace(factor.solve(S)) + m @ factor.solve(m) - m.size + log_ratio) / 2
-
-
-def wasserstein(
-    draws: Float[Array, "s k"], mean: Float[Array, " k"], variance: Float[Array, " k"]
-) -> Float[Array, " k"]:
-    """Wasserstein-1 distance of each coordinate to N(mean, variance), by their quantiles."""
-    count = len(draws)
-    quantiles = ndtri((jnp.arange(count) + 0.5) / count)[:, None]
-    return jnp.mean(
-        jnp.abs(jnp.sort(draws, axis=0) - mean - jnp.sqrt(variance) * quantiles), axis=0
-    )
 
 
 def in_base_axes(poses: Pose, estimate: Pose) -> Float[Array, "s t"]:

@@ -68,7 +68,6 @@ def of_filter():
         "kl": np.full(RUNS, 1.5),
         "error": 2 * exact["pooled_error"],
         "covariance": 4 * exact["pooled_covariance"],
-        "wasserstein": np.full((RUNS, 3), 0.5),
         "kl_of_sum": np.linspace(0, 1, RUNS),
         "reversed": draws + np.where(np.arange(RUNS) % 2, 0.1, 0.0),
         "exact_reversed": draws,
