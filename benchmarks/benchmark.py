@@ -17,16 +17,15 @@ import tyro
 
 from jaxslam._runtime.files import read_json, write_atomically, write_json
 
+RESULTS = Path("benchmarks/results")
+END = "<!-- end -->"
+"""Behind a table that a benchmark writes; before it stands a mark of its own."""
+
 
 def data_folder() -> Path:
     """The folder of recordings: $JAXSLAM_DATA, or else the one beside a clone, which is then set,
     so that scenarios named after a recording find it too."""
     return Path(os.environ.setdefault("JAXSLAM_DATA", "../shared/data"))
-
-
-RESULTS = Path("benchmarks/results")
-END = "<!-- end -->"
-"""Behind a table that a benchmark writes; before it stands a mark of its own."""
 
 
 @dataclass(frozen=True, kw_only=True)

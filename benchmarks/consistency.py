@@ -10,16 +10,16 @@ are as many of each; to measure it with more, remove it first. `--page` only wri
 
 from __future__ import annotations
 
+import itertools
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
-from pages import END, write_table
+from benchmark import END, RESULTS, Benchmark, write_page, write_table
 from verdicts import BEGIN
 from verdicts import as_table as table_of_verdicts
 
@@ -34,19 +34,16 @@ Results = dict[str, dict[str, Row]]
 LAYOUT = 3
 """Of a row; what has another is measured again."""
 TALLIES = ("tally", "one_scale", "drift")
-VERDICTS = Path("benchmarks/results/verdicts.json")
-RESULTS = Path("docs/results.md")
-README = Path("README.md")
-"""Pages with a table of the paper's filter and the recommended one, behind `MARK`."""
+VERDICTS = RESULTS / "verdicts.json"
 MARK = "<!-- consistency.py -->"
 IN_README = ("matched", "matched-loose", "matched-forward-loose")
 STEPS = (5, 10)
 """Steps whose mean NEES the page shows, beside the last."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class Consistency(Benchmark):
+    """Filters in scenarios on seeds."""
 
     scenarios: tuple[str, ...] = (
         "matched-tight", "matched", "matched-loose", "matched-very-loose", "matched-forward",
@@ -66,15 +63,33 @@ class Options:
     """Seeds. What is measured already is not measured again."""
     chunk: int = 25
     """Runs in one batch."""
-    out: Path = Path("benchmarks/results/consistency.json")
-    """The results, added to."""
-    docs: Path = Path("docs/consistency.md")
-    """The page."""
-    page: bool = False
-    """Measure nothing; write the page, and the tables of the README and of docs/results.md."""
+    out: Path = RESULTS / "consistency.json"
+
+    def found(self) -> Results:
+        return read(self.out)
+
+    def measure(self) -> Iterator[Results]:
+        for scenario_name in self.scenarios:
+            scenario = jaxslam.scenario(scenario_name)
+            for name in itertools.product(self.filters, self.landmarks):
+                name = "/".join(name)
+                for seed in missing(self.found().get(scenario_name, {}).get(name), self):
+                    found = measure(scenario, name, seed, self)
+                    add_to(self.out, scenario_name, name, found)
+                    print(scenario_name, _row(name, found), flush=True)
+        yield self.found()
+
+    def save(self, results: Results) -> None:
+        """`add_to` has done it, as other commands add to the file too."""
+
+    def report(self, results: Results) -> None:
+        write_page(self.docs / "consistency.md", page(results))
+        if self.page:
+            write_table(self.docs.parent / "README.md", MARK, recommended(results, IN_README))
+            write_table(self.docs / "results.md", MARK, recommended(results, results))
 
 
-def measure(scenario: jaxslam.Scenario, name: str, seed: int, options: Options) -> Row:
+def measure(scenario: jaxslam.Scenario, name: str, seed: int, options: Consistency) -> Row:
     """One filter on one seed: numbers from which those of many seeds follow."""
     frame, landmarks = name.rsplit("/", 1)
     filters = jaxslam.make_filters(scenario, [frame], [landmarks])
@@ -322,7 +337,7 @@ def add_to(path: Path, scenario: str, name: str, found: Row) -> None:
         temporary.write_text(json.dumps(results, separators=(",", ":"), allow_nan=False) + "\n")
 
 
-def missing(row: Row | None, options: Options) -> list[int]:
+def missing(row: Row | None, options: Consistency) -> list[int]:
     """Seeds that a row does not have yet. Raises ValueError where it has other numbers of runs."""
     if row is None:
         return list(options.seeds)
@@ -335,23 +350,5 @@ def missing(row: Row | None, options: Options) -> list[int]:
     return [seed for seed in options.seeds if seed not in row["seeds"]]
 
 
-def main(options: Options) -> None:
-    """Measure and write."""
-    names = [f"{f}/{landmarks}" for f in options.filters for landmarks in options.landmarks]
-    for scenario_name in () if options.page else options.scenarios:
-        scenario = jaxslam.scenario(scenario_name)
-        for name in names:
-            for seed in missing(read(options.out).get(scenario_name, {}).get(name), options):
-                found = measure(scenario, name, seed, options)
-                add_to(options.out, scenario_name, name, found)
-                print(scenario_name, _row(name, found), flush=True)
-    results = read(options.out)
-    with write_atomically(options.docs) as path:
-        path.write_text(page(results))
-    if options.page:
-        write_table(README, MARK, recommended(results, IN_README))
-        write_table(RESULTS, MARK, recommended(results, results))
-
-
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    Consistency.run()

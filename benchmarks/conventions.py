@@ -14,19 +14,19 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
-import tyro
+from benchmark import RESULTS, Benchmark
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from jaxslam._numerics.arrays import AnyArray
-from jaxslam._runtime.files import write_json
 from jaxslam.evaluation.convention import Convention, alternatives, geometry_of, turning
 from jaxslam.evaluation.poses import evaluate_poses
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, exp
@@ -48,9 +48,9 @@ class Case(NamedTuple):
     answer: Convention | None
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class Conventions(Benchmark):
+    """Constructed cases, and how each is judged."""
 
     cases: int = 200
     """Constructed cases, six of ten with an answer."""
@@ -58,8 +58,30 @@ class Options:
     """Runs of each."""
     sets: int = 100
     """Cases with 50 runs of every wrong σ; with more runs so many fewer."""
-    out: Path = Path("benchmarks/results")
-    """Folder of conventions.json."""
+    out: Path = RESULTS / "conventions.json"
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        cases = [constructed(number, self.runs) for number in range(self.cases)]
+        by_kind = {kind: Counter() for kind in dict.fromkeys(KINDS)}
+        for case in cases:
+            by_kind[case.kind][judged(case)] += 1
+        right = sum(count["right"] for count in by_kind.values())
+        result: dict[str, Any] = {
+            "cases": self.cases,
+            "runs": self.runs,
+            "right": right / self.cases,
+        }
+        result["kinds"] = {kind: dict(count) for kind, count in by_kind.items()}
+        result["wrong_sigma"] = []
+        for position, rotation in (*((f, f) for f in FACTORS), *OPPOSITE):
+            for runs in STUDIES:
+                sets = max(self.sets * STUDIES[0] // runs, 1)
+                result["wrong_sigma"].append(blamed(position, rotation, runs, sets))
+                yield result
+
+    def report(self, results: dict[str, Any]) -> None:
+        *_, last = results["wrong_sigma"]
+        print(json.dumps({**results, "wrong_sigma": last}), flush=True)
 
 
 def constructed(number: int, runs: int) -> Case:
@@ -182,31 +204,5 @@ def _kind(convention: Convention | None) -> Convention | None:
     return replace(convention, error="right")
 
 
-def main(options: Options) -> None:
-    """Judge every case, print and write the shares."""
-    cases = [constructed(number, options.runs) for number in range(options.cases)]
-    by_kind = {kind: Counter() for kind in dict.fromkeys(KINDS)}
-    for case in cases:
-        by_kind[case.kind][judged(case)] += 1
-    print(json.dumps({kind: dict(count) for kind, count in by_kind.items()}), flush=True)
-    right = sum(count["right"] for count in by_kind.values())
-    blame = []
-    for position, rotation in (*((f, f) for f in FACTORS), *OPPOSITE):
-        for runs in STUDIES:
-            sets = max(options.sets * STUDIES[0] // runs, 1)
-            blame.append(blamed(position, rotation, runs, sets))
-            print(json.dumps(blame[-1]), flush=True)
-    result = {
-        "cases": options.cases,
-        "runs": options.runs,
-        "right": right / options.cases,
-        "kinds": {kind: dict(count) for kind, count in by_kind.items()},
-        "wrong_sigma": blame,
-    }
-    options.out.mkdir(parents=True, exist_ok=True)
-    write_json(options.out / "conventions.json", result)
-    print(json.dumps(result, indent=1))
-
-
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    Conventions.run()

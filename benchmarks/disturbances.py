@@ -11,7 +11,6 @@ error of 5 σ; after a cut, any frame that is: the camera is elsewhere. Results 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,12 +18,10 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import tyro
-from pages import write_table
+from benchmark import RESULTS, Benchmark, table, write_table
 from scipy.stats import chi2
 from starts import LIE
 
-from jaxslam._runtime.files import write_json
 from jaxslam.evaluation import errors_beyond_scale
 from jaxslam.io.source import Frame, Source
 from jaxslam.statistics.beyond_scale import one_scale
@@ -184,9 +181,9 @@ DISTURBANCES: dict[str, tuple[Callable[[int], Disturbed], str]] = {
 """By name, and in words."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class Disturbances(Benchmark):
+    """Videos that are disturbed."""
 
     only: tuple[str, ...] = tuple(DISTURBANCES)
     """Disturbances."""
@@ -194,10 +191,20 @@ class Options:
     """Videos of each."""
     filter: str = "recommended"
     """Filter."""
-    out: Path = Path("benchmarks/results/disturbances.json")
-    """The results, added to."""
-    page: Path = Path("docs/stress.md")
-    """The page."""
+    out: Path = RESULTS / "disturbances.json"
+    double = False
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        results, settings = self.found(), TrackerSettings(filter=self.filter)
+        for name in self.only:
+            results[name] = []
+            for seed in range(FIRST_SEED, FIRST_SEED + self.seeds):
+                results[name].append(measure(DISTURBANCES[name][0](seed), settings, seed))
+                print(name, seed, results[name][-1], flush=True)
+            yield results
+
+    def report(self, results: dict[str, Any]) -> None:
+        write_table(self.docs / "stress.md", MARK, as_table(results))
 
 
 def _source(frames: int, seed: int) -> Source:
@@ -263,39 +270,28 @@ def measure(disturbed: Disturbed, settings: TrackerSettings, seed: int) -> dict[
     }
 
 
-def table(results: dict[str, list[dict[str, float]]]) -> str:
+def as_table(results: dict[str, list[dict[str, float]]]) -> str:
     """As Markdown, a row for each disturbance."""
-    lines = [
-        "| what | videos | tracked meanwhile | in the last second | in the first map | maps "
-        "| beyond scale | lies |",
-        "|---" * 8 + "|",
-    ]
+    header = (
+        "what",
+        "videos",
+        "tracked meanwhile",
+        "in the last second",
+        "in the first map",
+        "maps",
+        "beyond scale",
+        "lies",
+    )
+    rows = []
     for name, (_, words) in DISTURBANCES.items():
-        if name in results:
-            rows = results[name]
-            mean = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
-            lines.append(
-                f"| {words} | {len(rows)} | {mean['tracked_during']:.0%} "
-                f"| {mean['tracked_at_end']:.0%} | {mean['in_first_map_at_end']:.0%} "
-                f"| {mean['maps']:.2g} | {mean['beyond_scale']:.2g} | {mean['lies']:.1%} |"
-            )
-    return "\n".join(lines)
-
-
-def main() -> None:
-    """Print a line for each video, and write the results."""
-    options = tyro.cli(Options, description=__doc__)
-    settings = TrackerSettings(filter=options.filter)
-    results: dict[str, Any] = json.loads(options.out.read_text()) if options.out.exists() else {}
-    for name in options.only:
-        results[name] = []
-        for seed in range(FIRST_SEED, FIRST_SEED + options.seeds):
-            results[name].append(measure(DISTURBANCES[name][0](seed), settings, seed))
-            print(name, seed, results[name][-1], flush=True)
-        write_json(options.out, results)
-    print(table(results))
-    write_table(options.page, MARK, table(results))
+        if of := results.get(name):
+            mean = {key: float(np.mean([row[key] for row in of])) for key in of[0]}
+            shares = ("tracked_during", "tracked_at_end", "in_first_map_at_end")
+            numbers = (f"{mean[key]:.2g}" for key in ("maps", "beyond_scale"))
+            row = (words, len(of), *(f"{mean[key]:.0%}" for key in shares), *numbers)
+            rows.append((*row, f"{mean['lies']:.1%}"))
+    return table(header, rows)
 
 
 if __name__ == "__main__":
-    main()
+    Disturbances.run()

@@ -11,7 +11,8 @@ there. `--figure` draws one run beside it, whose modes live long.
 
 from __future__ import annotations
 
-import json
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
+from benchmark import RESULTS, Benchmark, table, write_table
 from figures.modes import plot_modes, worlds_of
 from modes import modes_of_run
-from pages import write_table
 
 import jaxslam
-from jaxslam._runtime.files import write_json
 from jaxslam.consistency import draw, filter_run
 from jaxslam.simulation import sensor_of
 from jaxslam.statistics.verdict import headline
@@ -49,9 +48,9 @@ SETTLED = 10
 """The frame from which on the sentences speak."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class FromRest(Benchmark):
+    """Filters that are not told how the camera sets out."""
 
     scenarios: tuple[str, ...] = ("standstill", "standstill-6dof")
     """Scenarios."""
@@ -63,17 +62,27 @@ class Options:
     """One that nothing was chosen by."""
     chunk: int = 1
     """Runs in one batch. Windows of different lengths wait for one another in a batch."""
-    out: Path = Path("benchmarks/results/from_rest.json")
-    """The results, added to."""
-    docs: Path = Path("docs/from-rest.md")
-    """The page."""
-    page: bool = False
-    """Only write the page."""
     figure: bool = False
     """Only draw the figure."""
+    out: Path = RESULTS / "from_rest.json"
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        if self.figure:
+            draw_figure(self)
+            return
+        results = self.found()
+        for scenario, name in itertools.product(self.scenarios, self.filters):
+            there = results.setdefault(scenario, {}).get(name, {})
+            if (there.get("runs"), there.get("seed")) != (self.runs, self.seed):
+                results[scenario][name] = measure(self, scenario, name)
+                yield results
+
+    def report(self, results: dict[str, Any]) -> None:
+        write_table(self.docs / "from-rest.md", BEGIN, as_table(results))
+        write_table(self.docs / "from-rest.md", SAID, sentences(results))
 
 
-def measure(options: Options, scenario: str, name: str) -> dict[str, Any]:
+def measure(options: FromRest, scenario: str, name: str) -> dict[str, Any]:
     """One filter in one scenario."""
     world = jaxslam.scenario(scenario)
     filters = jaxslam.make_filters(world, [name], ["inverse_scaling"])
@@ -90,7 +99,7 @@ def measure(options: Options, scenario: str, name: str) -> dict[str, Any]:
     }
 
 
-def table(results: dict[str, dict[str, Any]]) -> str:
+def as_table(results: dict[str, dict[str, Any]]) -> str:
     """The numbers of all filters, one table a scenario."""
     parts = []
     for scenario, filters in results.items():
@@ -101,8 +110,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
         )
         header = ["filter", "runs, band", *map(str, STEPS), "ever lost"]
         header += ["RMSE and σ at the end, m", "s a run"]
-        rows = [header, ["---"] * len(header), *(_row(*item) for item in filters.items())]
-        parts.append("\n".join(f"| {' | '.join(row)} |" for row in rows))
+        parts.append(table(header, (_row(*item) for item in filters.items())))
     return "\n\n".join(parts)
 
 
@@ -162,7 +170,7 @@ def _digits(value: float) -> str:
     return f"{value:.1f}" if value < 100 else f"{value:.2g}"
 
 
-def draw_figure(options: Options) -> None:
+def draw_figure(options: FromRest) -> None:
     """The modes of one run, beside the page."""
     with jax.enable_x64(True):
         scenario = jaxslam.scenario("standstill", steps=TOLD["steps"])
@@ -173,23 +181,8 @@ def draw_figure(options: Options) -> None:
         _, path, _ = eqx.filter_jit(filter_run)(ekf, room, sensor_of(scenario), run)
         modes = modes_of_run(rest, room, run)
     worlds = worlds_of(run, modes, path.translation(), "the EKF", scenario.rate)
-    plot_modes(worlds, path=options.docs.with_suffix(".png"))
-
-
-def main(options: Options) -> None:
-    if options.figure:
-        draw_figure(options)
-        return
-    results = json.loads(options.out.read_text()) if options.out.exists() else {}
-    wanted = [] if options.page else [(s, f) for s in options.scenarios for f in options.filters]
-    for scenario, name in wanted:
-        there = results.setdefault(scenario, {}).get(name, {})
-        if (there.get("runs"), there.get("seed")) != (options.runs, options.seed):
-            results[scenario][name] = measure(options, scenario, name)
-            write_json(options.out, results)
-    write_table(options.docs, BEGIN, table(results))
-    write_table(options.docs, SAID, sentences(results))
+    plot_modes(worlds, path=options.docs / "from-rest.png")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    FromRest.run()

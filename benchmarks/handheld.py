@@ -11,7 +11,6 @@ what it already has, of as many runs, is not run again. `docs/handheld.md` is wr
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -22,12 +21,10 @@ import equinox as eqx
 import jax
 import numpy as np
 import tracks
-import tyro
-from benchmark import data_folder
+from benchmark import RESULTS, Benchmark, data_folder, table, write_page
 
 import jaxslam
 from jaxslam._numerics.arrays import cast
-from jaxslam._runtime.files import write_atomically, write_json
 from jaxslam.consistency import SimulatedFrame, run_through, scale_records
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import camera_pose
@@ -53,9 +50,9 @@ TRUTH_SIGMA = np.array([0.1] * 3 + [np.radians(0.1)] * 3)
 RECORDS = ("log_scale", "log_scale_sigma", *SCALE, "reversed", "nis", "nis_dof")
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class Handheld(Benchmark):
+    """Filters along trajectories and drives."""
 
     filters: tuple[str, ...] = ("world", "robocentric", "scale_gauge+scene50+mixture9")
     """Filters, with modifiers."""
@@ -77,29 +74,23 @@ class Options:
     """Of the simulated runs."""
     chunk: int = 25
     """Runs in one batch."""
-    out: Path = Path("benchmarks/results/handheld.json")
-    """The results, added to."""
-    docs: Path = Path("docs/handheld.md")
-    """The page."""
-    page: bool = False
-    """Only write the page."""
+    out: Path = RESULTS / "handheld.json"
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        """Add what is not measured yet, one filter at a time."""
+        results = self.found()
+        for where, name, wanted, measure in _studies(self):
+            found = results.setdefault(where, {}).get(name)
+            if not found or any(found.get(key) != value for key, value in wanted.items()):
+                results[where][name] = {**wanted, **measure()}
+                print(f"{where} {name}: {' | '.join(_row(results[where][name], -1))}", flush=True)
+                yield results
+
+    def report(self, results: dict[str, Any]) -> None:
+        write_page(self.docs / "handheld.md", page(results))
 
 
-def main(options: Options) -> None:
-    """Measure what is not measured yet, one filter at a time, and write the page."""
-    results = json.loads(options.out.read_text()) if options.out.exists() else {}
-    for where, name, wanted, measure in () if options.page else _studies(options):
-        found = results.setdefault(where, {}).get(name)
-        if found and all(found.get(key) == value for key, value in wanted.items()):
-            continue
-        results[where][name] = {**wanted, **measure()}
-        print(f"{where} {name}: {_row(results[where][name], -1)}", flush=True)
-        write_json(options.out, results, allow_nan=False)
-    with write_atomically(options.docs) as path:
-        path.write_text(page(results))
-
-
-def _studies(options: Options) -> Iterator[tuple[str, str, dict[str, int], Any]]:
+def _studies(options: Handheld) -> Iterator[tuple[str, str, dict[str, int], Any]]:
     """Of what, by which filter, of how many runs, and the function that measures it."""
     simulated = {"runs": options.runs, "steps": options.steps, "seed": options.seed}
     recorded = {"runs": options.starts, "steps": options.frames}
@@ -120,7 +111,7 @@ def _known(pattern: str, without: str = " ") -> list[str]:
     return [p.parent.name if p.suffix == ".npz" else p.stem for p in paths if without not in p.stem]
 
 
-def _filters(scenario: Scenario, options: Options) -> dict[str, AbstractFilter]:
+def _filters(scenario: Scenario, options: Handheld) -> dict[str, AbstractFilter]:
     return jaxslam.make_filters(scenario, list(options.filters), [options.landmarks])
 
 
@@ -140,7 +131,7 @@ def on_the_road(data: tracks.Tracks) -> Scenario:
 
 
 def _simulated(
-    scenario: Scenario, name: str, slam: AbstractFilter, options: Options
+    scenario: Scenario, name: str, slam: AbstractFilter, options: Handheld
 ) -> dict[str, Any]:
     study = jaxslam.monte_carlo(
         scenario, {name: slam}, runs=options.runs, seed=options.seed, chunk=options.chunk
@@ -149,7 +140,7 @@ def _simulated(
     return numbers({key: np.concatenate([part[key] for part in parts]) for key in RECORDS})
 
 
-def _recorded(data: tracks.Tracks, slam: AbstractFilter, options: Options) -> dict[str, Any]:
+def _recorded(data: tracks.Tracks, slam: AbstractFilter, options: Handheld) -> dict[str, Any]:
     with jax.enable_x64(True):
         runs = tracks.windows(data, options.frames, options.starts)
         most = jax.tree.map(lambda x: max(1, int(x.max())), jax.vmap(sightings)(runs))
@@ -233,30 +224,28 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def _row(found: dict[str, Any], i: int) -> str:
+def _row(found: dict[str, Any], i: int) -> list[str]:
     """One step's numbers, as the page has them."""
 
     def shown(key: str, form: str) -> str:
         value = found[key][i]
         return "–" if value is None else format(value, form if abs(value) < 1e3 else ".1e")
 
-    return " | ".join(
-        [
-            str(found["at"][i]),
-            shown("one_scale", ".2f"),
-            shown("one_scale_median", ".2f"),
-            shown("own_scale_median", ".2f"),
-            shown("lost", ".0%"),
-            shown("drift_rms", ".3f"),
-            shown("drift_normalised", ".1f"),
-            shown("drift_normalised_median", ".2f"),
-            shown("log_scale_rms", ".2f"),
-            shown("log_scale_median", ".2f"),
-            shown("log_scale_sigma", ".2f"),
-            shown("log_scale_normalised", ".1f"),
-            shown("reversed", ".0%"),
-        ]
-    )
+    return [
+        str(found["at"][i]),
+        shown("one_scale", ".2f"),
+        shown("one_scale_median", ".2f"),
+        shown("own_scale_median", ".2f"),
+        shown("lost", ".0%"),
+        shown("drift_rms", ".3f"),
+        shown("drift_normalised", ".1f"),
+        shown("drift_normalised_median", ".2f"),
+        shown("log_scale_rms", ".2f"),
+        shown("log_scale_median", ".2f"),
+        shown("log_scale_sigma", ".2f"),
+        shown("log_scale_normalised", ".1f"),
+        shown("reversed", ".0%"),
+    ]
 
 
 def page(results: dict[str, Any]) -> str:
@@ -265,11 +254,12 @@ def page(results: dict[str, Any]) -> str:
     for where, filters in sorted(results.items()):
         runs = next(iter(filters.values()))["runs"]
         lines += [f"## {where}", "", f"{runs} runs.", ""]
-        lines += ["| filter | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
+        rows = []
         for name, found in filters.items():
             label = f"{name}, NIS {found['nis']:.2f}" if found["nis"] is not None else name
-            for i in range(len(found["at"])):
-                lines.append(f"| {label if i == 0 else ''} | {_row(found, i)} |")
+            steps = range(len(found["at"]))
+            rows += [(label if i == 0 else "", *_row(found, i)) for i in steps]
+        lines.append(table(["filter", *COLUMNS], rows))
         lines.append("")
     return "\n".join(lines).rstrip() + "\n"
 
@@ -305,4 +295,4 @@ steps.
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    Handheld.run()

@@ -12,18 +12,16 @@ it is, `benchmarks/reference.py` says. Results are added to `starts.json`, and t
 
 from __future__ import annotations
 
-import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import tyro
-from benchmark import data_folder
-from pages import write_table
+from benchmark import RESULTS, Benchmark, data_folder, table, write_table
 from scipy.stats import chi2, norm
 
-from jaxslam._runtime.files import write_json
 from jaxslam.evaluation import errors_beyond_scale
 from jaxslam.io.opening import open_source
 from jaxslam.statistics.beyond_scale import one_scale
@@ -42,9 +40,9 @@ EVERY = 10
 MARK = "<!-- by starts.py -->"
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class Starts(Benchmark):
+    """Trackers that begin at other places of a sequence."""
 
     sequences: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Data set folders with a reference; by default all there are in $JAXSLAM_DATA."""
@@ -54,10 +52,17 @@ class Options:
     """Frames that are tracked from each; of a video that is not much longer, half of it."""
     filter: str = "recommended"
     """Filter."""
-    out: Path = Path("benchmarks/results/starts.json")
-    """The results, added to."""
-    page: Path = Path("docs/stress.md")
-    """The page."""
+    out: Path = RESULTS / "starts.json"
+    double = False
+
+    def measure(self) -> Iterator[dict[str, Any]]:
+        results, there = self.found(), data_folder().glob("*/images")
+        for sequence in self.sequences or sorted(path.parent for path in there):
+            results[sequence.name] = starts(sequence, self)
+            yield results
+
+    def report(self, results: dict[str, Any]) -> None:
+        write_table(self.docs / "stress.md", MARK, as_table(results))
 
 
 class Outcome(NamedTuple):
@@ -108,7 +113,7 @@ def outcome(source, frames, settings: TrackerSettings) -> Outcome:
     )
 
 
-def starts(sequence: Path, options: Options) -> dict[str, Any]:
+def starts(sequence: Path, options: Starts) -> dict[str, Any]:
     """Outcomes from all starts of one sequence, printed as they come."""
     source = open_source(sequence)
     if source.reference is None:
@@ -126,37 +131,35 @@ def starts(sequence: Path, options: Options) -> dict[str, Any]:
     return {"filter": settings.filter, "frames": frames, "starts": found}
 
 
-def table(results: dict[str, dict[str, Any]]) -> str:
+def as_table(results: dict[str, dict[str, Any]]) -> str:
     """Of all sequences, as Markdown."""
-    head = (
-        "| sequence | starts of frames | tracked | maps | reversed | error, median, worst "
-        "| beyond scale | lies |"
+    header = (
+        "sequence",
+        "starts of frames",
+        "tracked",
+        "maps",
+        "reversed",
+        "error, median, worst",
+        "beyond scale",
+        "lies",
     )
-    return "\n".join([head, "|---" * 8 + "|", *(_row(n, r) for n, r in results.items())])
+    return table(header, (_row(name, result) for name, result in results.items()))
 
 
-def _row(name: str, result: dict[str, Any]) -> str:
+def _row(name: str, result: dict[str, Any]) -> list[str]:
     of_start = np.array(list(result["starts"].values()), float)
     tracked, maps, sign, error, beyond, lies = of_start.T
-    return (
-        f"| {name} | {len(of_start)} of {result['frames']} | {tracked.mean():.1%} "
-        f"| {maps.mean():.2g} | {np.sum(sign < 0)} | {np.nanmedian(error):.2f} %, "
-        f"{np.nanmax(error):.1f} % | {np.nanmedian(beyond):.2g} | {np.nanmean(lies):.1%} |"
-    )
-
-
-def main() -> None:
-    """Print a line for each start, and write the results."""
-    options = tyro.cli(Options, description=__doc__)
-    results = json.loads(options.out.read_text()) if options.out.exists() else {}
-    for sequence in options.sequences or sorted(
-        path.parent for path in data_folder().glob("*/images")
-    ):
-        results[sequence.name] = starts(sequence, options)
-        write_json(options.out, results)
-    print(table(results))
-    write_table(options.page, MARK, table(results))
+    return [
+        name,
+        f"{len(of_start)} of {result['frames']}",
+        f"{tracked.mean():.1%}",
+        f"{maps.mean():.2g}",
+        f"{np.sum(sign < 0)}",
+        f"{np.nanmedian(error):.2f} %, {np.nanmax(error):.1f} %",
+        f"{np.nanmedian(beyond):.2g}",
+        f"{np.nanmean(lies):.1%}",
+    ]
 
 
 if __name__ == "__main__":
-    main()
+    Starts.run()

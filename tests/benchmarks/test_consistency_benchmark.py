@@ -29,9 +29,9 @@ def measured(nees, seed=0):
 
 @pytest.fixture
 def options(tmp_path):
-    return benchmark.Options(
+    return benchmark.Consistency(
         scenarios=("matched",), filters=("robocentric",), runs=30, seeds=(0, 1),
-        out=tmp_path / "x.json", docs=tmp_path / "x.md",
+        out=tmp_path / "x.json", docs=tmp_path,
     )  # fmt: skip
 
 
@@ -91,15 +91,15 @@ def test_what_is_there_is_not_measured_again_and_others_may_add_to_it(options, m
         return measured(rng.chisquare(3, (30, 4)), seed)
 
     monkeypatch.setattr(benchmark, "measure", measure)
-    benchmark.main(options)
-    benchmark.main(dataclasses.replace(options, seeds=(0, 1, 3)))
+    options()
+    dataclasses.replace(options, seeds=(0, 1, 3))()
     assert asked == [0, 1, 3]
     results = benchmark.read(options.out)
     assert {name: filters[NAME]["seeds"] for name, filters in results.items()} == {
         "matched": [0, 1, 3],
         "circle": [7],
     }
-    page = options.docs.read_text()
+    page = (options.docs / "consistency.md").read_text()
     assert f"| `{NAME}` | 0–1, 3 × 30 |" in page
     assert f"| `{NAME}` | 7 × 30 |" in page
 
@@ -115,7 +115,7 @@ def test_a_seed_that_another_command_added_counts_once(tmp_path):
 def test_a_row_of_other_numbers_of_runs_is_not_mixed_with_these(options):
     benchmark.add_to(options.out, "matched", NAME, measured(np.full((20, 4), 3.0)))
     with pytest.raises(ValueError, match=r"a row with 20 runs of every seed, not 30: remove it"):
-        benchmark.main(options)
+        options()
 
 
 def test_results_of_an_older_layout_are_measured_again(options, monkeypatch):
@@ -127,7 +127,7 @@ def test_results_of_an_older_layout_are_measured_again(options, monkeypatch):
         return measured(np.full((30, 4), 3.0), seed)
 
     monkeypatch.setattr(benchmark, "measure", measure)
-    benchmark.main(options)
+    options()
     assert asked == [0, 1]
 
 

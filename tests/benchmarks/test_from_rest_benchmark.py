@@ -7,9 +7,8 @@ from typing import Any
 
 import from_rest as benchmark
 import numpy as np
-import pytest
-from from_rest import BEGIN, Options, main, table
-from pages import END, write_table
+from benchmark import END
+from from_rest import BEGIN, FromRest, as_table
 
 from jaxslam.statistics import run_verdict
 
@@ -37,7 +36,7 @@ def found(**changed):
 def test_a_row_says_at_every_frame_what_is_lost_and_how_true_the_others_are():
     nees: list[Any] = [3.0] * STEPS
     nees[5], nees[-1] = 7.25, None
-    row = table({"standstill": {"mine": found(nees_not_lost=nees)}}).splitlines()[-1]
+    row = as_table({"standstill": {"mine": found(nees_not_lost=nees)}}).splitlines()[-1]
     assert row.split(" | ") == [
         "| `mine`", "50 (seed 3), 2.40–3.70", "25.0%; 4.0, 3.0", "25.0%; 4.0, 3.0",
         "25.0%; 4.0, 7.2", "25.0%; 4.0, 3.0", "25.0%; 4.0, 3.0", "25.0%; 4.0, 3.0",
@@ -71,7 +70,7 @@ def test_the_page_says_what_the_numbers_on_disk_say():
     folder = Path(__file__).resolve().parents[2]
     results = json.loads((folder / "benchmarks/results/from_rest.json").read_text())
     page = (folder / "docs/from-rest.md").read_text()
-    for part in (table(results), benchmark.sentences(results)):
+    for part in (as_table(results), benchmark.sentences(results)):
         assert f"\n\n{part}\n\n" in page
 
 
@@ -99,36 +98,16 @@ def _at_most_lost_and_above(found):
     return lost, sum(not x <= found["band95"][1] for x in found["nees"][9:60])
 
 
-def test_the_table_stands_in_its_place_and_replaces_the_old_one(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
-    write_table(page, BEGIN, table({"standstill": {"mine": found()}}))
-    new = page.read_text()
-    assert new.startswith("before\n")
-    assert new.endswith("\nafter\n")
-    assert "old" not in new
-    assert "`mine`" in new
-    write_table(page, BEGIN, table({"standstill": {"mine": found()}}))
-    assert page.read_text() == new
-
-
-def test_a_page_without_a_place_is_refused(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text(f"a page with {END}")
-    with pytest.raises(ValueError, match="no place for the table"):
-        write_table(page, BEGIN, "a table")
-    assert page.read_text() == f"a page with {END}"
-
-
 def test_what_is_there_is_not_measured_again(tmp_path, monkeypatch):
-    options = Options(
+    options = FromRest(
         scenarios=("standstill",), filters=("mine",), runs=50, seed=3,
-        out=tmp_path / "found.json", docs=tmp_path / "page.md",
+        out=tmp_path / "found.json", docs=tmp_path,
     )  # fmt: skip
-    options.docs.write_text(f"{BEGIN}\n{END}\n{benchmark.SAID}\n{END}\n")
+    page = tmp_path / "from-rest.md"
+    page.write_text(f"{BEGIN}\n{END}\n{benchmark.SAID}\n{END}\n")
     options.out.write_text(json.dumps({"standstill": {"mine": found()}}))
     monkeypatch.setattr(benchmark, "measure", lambda *_: found(runs=51, seed=3))
-    main(options)
-    assert "50 (seed 3)" in options.docs.read_text()
-    main(replace(options, runs=51))
-    assert "51 (seed 3)" in options.docs.read_text()
+    options()
+    assert "50 (seed 3)" in page.read_text()
+    replace(options, runs=51)()
+    assert "51 (seed 3)" in page.read_text()

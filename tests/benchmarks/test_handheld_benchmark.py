@@ -84,14 +84,14 @@ def options(tmp_path, monkeypatch):
     times = np.arange(0, 2, 0.02)
     test_trajectories.write(tmp_path / "trajectories" / "walk.txt", times)
     test_tracks.write(tmp_path / "kitti_tracks" / "street")
-    return benchmark.Options(
+    return benchmark.Handheld(
         filters=("robocentric",), runs=2, steps=3, starts=2, frames=4,
-        out=tmp_path / "x.json", docs=tmp_path / "x.md",
+        out=tmp_path / "x.json", docs=tmp_path,
     )  # fmt: skip
 
 
 def test_everything_in_the_folder_is_measured_and_only_once(options, capsys, monkeypatch):
-    benchmark.main(options)
+    options()
     found = json.loads(options.out.read_text())
     assert set(found) == {"handheld-walk", "tracks-street"}
     for where, (runs, steps) in {"handheld-walk": (2, 3), "tracks-street": (2, 4)}.items():
@@ -99,15 +99,15 @@ def test_everything_in_the_folder_is_measured_and_only_once(options, capsys, mon
         assert (result["runs"], result["steps"]) == (runs, steps)
         assert result["at"] == [steps]
         assert result["one_scale"][0] is not None
-        assert where in options.docs.read_text()
+        assert where in (options.docs / "handheld.md").read_text()
     assert len(capsys.readouterr().out.splitlines()) == 2
 
     def again(*_):
         raise AssertionError("what is there already was measured again")
 
     monkeypatch.setattr(benchmark, "numbers", again)
-    benchmark.main(options)
+    options()
     with pytest.raises(AssertionError, match="again"):
-        benchmark.main(dataclasses.replace(options, runs=3))
-    benchmark.main(dataclasses.replace(options, page=True, filters=("nonsense",)))
+        dataclasses.replace(options, runs=3)()
+    dataclasses.replace(options, page=True, filters=("nonsense",))()
     assert json.loads(options.out.read_text()) == found
