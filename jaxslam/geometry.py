@@ -51,11 +51,6 @@ class Geometry:
         """Coordinates of a pixel: u, or (u, v)."""
         return self.point_dim - 1
 
-    @property
-    def rotation_dim(self) -> int:
-        """Degrees of freedom of an orientation: 1 or 3."""
-        return self.tangent_dim - self.point_dim
-
 
 PLANAR = Geometry("planar", jaxlie.SE2, 2)
 SPATIAL = Geometry("spatial", jaxlie.SE3, 3)

@@ -10,7 +10,7 @@ from cases import quick_jit
 
 from jaxslam.filters.registry import scale_gauge, scenario_pieces
 from jaxslam.filters.window.minimise import started
-from jaxslam.filters.window.problem import Layout, path
+from jaxslam.filters.window.problem import PathLayout, path
 from jaxslam.filters.window.record import whole
 from jaxslam.filters.window.subsample import kept, thinned
 from jaxslam.landmarks import INVERSE_SCALING
@@ -36,7 +36,7 @@ def full(frames=FRAMES):
 
 def unknowns(slam, record, count=2):
     draw = np.random.default_rng(3)
-    size, m = Layout.of(slam).size(record.frames), record.first.size
+    size, m = PathLayout.of(slam).size(record.frames), record.first.size
     x, y = draw.standard_normal((count, size)), draw.standard_normal((count, m, 3))
     return jax.vmap(started)(jnp.asarray(x), jnp.asarray(y))
 
@@ -82,8 +82,8 @@ def test_the_variance_that_merged_steps_add_to_the_velocity_is_that_of_both():
         def velocity(x):
             return quick_jit(path)(slam, of, x).motion[of.last]
 
-        J = jax.jacfwd(velocity)(jnp.zeros(Layout.of(slam).size(FRAMES)))[
-            :, Layout.of(slam).whole :
+        J = jax.jacfwd(velocity)(jnp.zeros(PathLayout.of(slam).size(FRAMES)))[
+            :, PathLayout.of(slam).whole :
         ]
         return J @ J.T
 
@@ -101,7 +101,7 @@ def test_a_velocity_drawn_anew_stays_drawn_anew(restart):
     assert fewer.restarted.tolist() == [k == step for k in range(FRAMES - 1)]
     length = 0.1 if restart == 1 else 0.2
     np.testing.assert_allclose(fewer.controls[step], length)
-    layout = Layout.of(slam)
+    layout = PathLayout.of(slam)
     was = minima.x[:, layout.whole + restart * layout.step :][:, : layout.step]
     now = starts.x[:, layout.whole + step * layout.step :][:, : layout.step]
     np.testing.assert_array_equal(now, was)

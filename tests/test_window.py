@@ -18,7 +18,7 @@ from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.registry import scale_gauge, scenario_pieces
 from jaxslam.filters.window import minimise, modes, scale
 from jaxslam.filters.window.minimise import minimised, started
-from jaxslam.filters.window.problem import Layout, path, reduced, residuals, sensitivities
+from jaxslam.filters.window.problem import PathLayout, path, reduced, residuals, sensitivities
 from jaxslam.filters.window.record import Record, begun, empty, removed, stepped, whole
 from jaxslam.filters.window.scale import rescaled, scaling, shift_of_scale, variances
 from jaxslam.filters.window.to_filter import gauge_state
@@ -63,7 +63,7 @@ def case(name="standstill", treatment=Known, common=None, last=FRAMES - 1):
     """Pixels by the model itself at unknowns drawn from the prior, and noise on them."""
     slam = filter_of(name, treatment, common)
     draw = np.random.default_rng(5)
-    m, p, N = FIRST.size, slam.sensor.size, Layout.of(slam).size(FRAMES)
+    m, p, N = FIRST.size, slam.sensor.size, PathLayout.of(slam).size(FRAMES)
     x = jnp.asarray(0.5 * draw.standard_normal(N)).at[0].set(1.5)
     y = jnp.asarray(0.5 * draw.standard_normal((m, p + 1)))
     seen = (jnp.arange(FRAMES)[:, None] >= FIRST) & (jnp.arange(FRAMES)[:, None] <= last)
@@ -227,7 +227,7 @@ def test_what_moved_at_once_never_stood():
 def test_a_velocity_drawn_anew_does_not_depend_on_the_one_before():
     slam, record, x, _ = case("standstill-6dof", White, None, 3)
     record = replace(record, restarted=record.restarted.at[1].set(True))
-    layout = Layout.of(slam)
+    layout = PathLayout.of(slam)
     own = slice(layout.whole + layout.step + layout.each, None)
     there = quick_jit(path)(slam, record, x)
     mean, root = slam.motion.start()
@@ -441,7 +441,7 @@ def test_of_common_errors_scaling_is_the_shortest():
     at = minimum("standstill", White, 0.5)
     s = quick_jit(scaling)(slam, record, at)
     # What changes no depth: the common error up, and every own one down.
-    p, start = slam.sensor.size, Layout.of(slam).start
+    p, start = slam.sensor.size, PathLayout.of(slam).start
     free = s.x[start] - jnp.sum(s.y[:, p:]) * slam.depth.common / slam.depth.own
     assert abs(free) < 1e-9
     assert abs(s.x[start]) > 1e-3
@@ -482,7 +482,7 @@ def test_accelerations_whose_size_is_not_told_follow_the_scale():
     at = started(x, y)
     fitted = replace(slam, motion=replace(slam.motion, noise_told=False))
     s = quick_jit(scaling)(slam, record, at)
-    layout = Layout.of(slam)
+    layout = PathLayout.of(slam)
     steps = at.x[layout.whole :].reshape(record.frames - 1, -1)[:, :3]
     np.testing.assert_allclose(scale.told(slam, at, s), s.squared, rtol=1e-12)
     rest = s.squared - jnp.sum(steps**2)
@@ -497,7 +497,7 @@ def test_the_mean_is_shifted_without_the_accelerations_whose_size_is_not_told():
     fitted = replace(slam, motion=replace(slam.motion, noise_told=False))
     local, s = quick_jit(reduced)(slam, record, at.x, at.y), quick_jit(scaling)(slam, record, at)
     factor = cholesky(local.information)
-    layout, m = Layout.of(slam), record.frames - 1
+    layout, m = PathLayout.of(slam), record.frames - 1
     free = np.zeros(at.x.size, bool)
     free[layout.whole :].reshape(m, -1)[:, :3] = True
     whole = scale._slope_of_volume(slam, local, s, factor, jnp.zeros_like(free))

@@ -19,7 +19,7 @@ from exact_posterior.problem import (
 )
 from jaxslam._numerics.least_squares import levenberg_marquardt
 from jaxslam._numerics.linalg import cholesky
-from jaxslam.filters.window.problem import Layout
+from jaxslam.filters.window.problem import PathLayout
 from jaxslam.geometry import Pose, difference
 
 SOLVER = levenberg_marquardt(1e-9)
@@ -41,7 +41,7 @@ class Laplace(eqx.Module):
 
 def starts(problem: Problem, key: Array, count: int) -> Float[Array, "count n"]:
     """The prior mean, then draws of velocity and depths from the prior, without accelerations."""
-    n, start = size(problem), Layout.of(problem.slam).start
+    n, start = size(problem), PathLayout.of(problem.slam).start
     drawn = jnp.arange(n)
     drawn = (drawn < start) | (drawn >= n - problem.landmarks)
     draws = jax.random.normal(key, (count, n), problem.record.measured.dtype)

@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 from jaxslam._numerics.arrays import cast
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window import problem as window
-from jaxslam.filters.window.problem import Layout, Path
+from jaxslam.filters.window.problem import Path, PathLayout
 from jaxslam.filters.window.record import Record, whole
 from jaxslam.geometry import Pose
 from jaxslam.simulation import Run, Scenario, depth_of, motion_of, sensor_of
@@ -123,7 +123,7 @@ def make_problem(scenario: Scenario, run: Run, *, truncated: bool = True) -> Pro
 
 def path_size(problem: Problem) -> int:
     """How many of the whitened variables are the path's."""
-    return Layout.of(problem.slam).size(problem.record.frames)
+    return PathLayout.of(problem.slam).size(problem.record.frames)
 
 
 def size(problem: Problem) -> int:

@@ -1,0 +1,36 @@
+"""Filters, and what they are made of: forms, corrections, wrappers; for filters of one's own."""
+
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.forms.correction import AbstractCorrection, Standard, kalman_update
+from jaxslam.filters.forms.covariance import Covariance
+from jaxslam.filters.forms.first_estimates import FirstEstimates
+from jaxslam.filters.forms.information import Information
+from jaxslam.filters.forms.invariant import Invariant
+from jaxslam.filters.forms.observability_constrained import ObservabilityConstrained
+from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
+from jaxslam.filters.wrappers.adaptive_process_noise import AdaptiveProcessNoise
+from jaxslam.filters.wrappers.batch_initialisation import BatchInitialisation
+from jaxslam.filters.wrappers.fixed_lag import FixedLag
+from jaxslam.filters.wrappers.gated import Gated
+from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
+from jaxslam.filters.wrappers.wrapper import AbstractWrapper
+
+__all__ = [
+    "AbstractCorrection",
+    "AbstractFilter",
+    "AbstractStaged",
+    "AbstractWrapper",
+    "AdaptiveProcessNoise",
+    "BatchInitialisation",
+    "Covariance",
+    "EkfSlam",
+    "FirstEstimates",
+    "FixedLag",
+    "Gated",
+    "GaussianSum",
+    "Information",
+    "Invariant",
+    "ObservabilityConstrained",
+    "Standard",
+    "kalman_update",
+]

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
+from dataclasses import fields, replace
+from typing import Any, get_args, get_type_hints
 
 import equinox as eqx
 import jax
@@ -129,10 +129,7 @@ class EkfSlam(AbstractStaged):
     @property
     def model(self) -> SlamModel:
         """The pure functions of core and landmark."""
-        return SlamModel(
-            self.motion, self.sensor, self.landmark, self.coordinates, self.calibration,
-            self.depth, self.scale,
-        )  # fmt: skip
+        return SlamModel(**{piece.name: getattr(self, piece.name) for piece in fields(SlamModel)})
 
     @property
     def gaussian_form(self) -> AbstractGaussian:
@@ -464,18 +461,10 @@ def _free_anchor(state: State) -> Int[Array, ""]:
 
 
 def _check_pieces(slam: EkfSlam) -> None:
-    for name, kind in (
-        ("motion", AbstractMotion),
-        ("sensor", AbstractSensor),
-        ("landmark", Parametrization),
-        ("coordinates", Coordinates),
-        ("calibration", AbstractCalibration),
-        ("depth", InverseDepth),
-        ("form", AbstractForm),
-        ("entry", AbstractEntry),
-    ):
+    for name, kind in get_type_hints(EkfSlam).items():
         if not isinstance(getattr(slam, name), kind):
-            raise ValueError(f"{name} is a {kind.__name__}, not {getattr(slam, name)!r}")
+            wanted = " or a ".join(one.__name__ for one in get_args(kind) or (kind,))
+            raise ValueError(f"{name} is a {wanted}, not {getattr(slam, name)!r}")
     n, found = slam.motion.geometry.point_dim, slam.sensor.point_dim
     if found != n:
         raise ValueError(

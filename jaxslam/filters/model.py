@@ -79,7 +79,7 @@ COMPOSED = Context(None)
 """The motion is composed."""
 
 
-class View(eqx.Module):
+class CameraInMap(eqx.Module):
     """What a landmark depends on beside itself."""
 
     map_from_camera: Pose
@@ -129,11 +129,11 @@ class SlamModel(eqx.Module):
         log_scale: Any = core.log_scale
         return self.scale.noise(self.motion, core.motion, noise, log_scale), drift
 
-    def view(self, core: Core, context: Context) -> View:
+    def view(self, core: Core, context: Context) -> CameraInMap:
         """All that a landmark depends on."""
         step = self.displacement(core, context)
         T_AC = self.coordinates.map_from_camera(core.pose, step)
-        return View(T_AC, core.calibration, core.anchors, core.log_scale, core.depth_error)
+        return CameraInMap(T_AC, core.calibration, core.anchors, core.log_scale, core.depth_error)
 
     def compose_core(self, core: Core, context: Context) -> Core:
         """P18, P19. The noise has been used: it is marginalised."""
@@ -162,7 +162,7 @@ class SlamModel(eqx.Module):
             return core.pose
         return scaled(core.pose, jnp.exp(jnp.sum(core.log_scale)))
 
-    def compose_landmark(self, view: View, landmark: Array, context: Context) -> Array:
+    def compose_landmark(self, view: CameraInMap, landmark: Array, context: Context) -> Array:
         """The landmark in the new camera frame, for which the paper numbers no equation."""
         del context
         return self.landmark.transform(view.map_from_camera.inverse(), landmark)
@@ -196,14 +196,14 @@ class SlamModel(eqx.Module):
             core.pose, identity(self.geometry, core.noise.dtype)
         )
 
-    def observe(self, view: View, landmark: Array, context: Context) -> tuple[Array, Array]:
+    def observe(self, view: CameraInMap, landmark: Array, context: Context) -> tuple[Array, Array]:
         """`h = proj(K T_AC⁻¹ X)` (P12, P14), and whether it is possible."""
         del context
         point, omega = self.camera_point(view, landmark)
         sensor = self.sensor_of(view)
         return sensor.measure(point, omega), sensor.possible(point)
 
-    def sensor_of(self, view: View) -> AbstractSensor:
+    def sensor_of(self, view: CameraInMap) -> AbstractSensor:
         """The sensor with the calibration's error of this step."""
         return self.calibration.sensor(self.sensor, view.calibration)
 
@@ -211,7 +211,7 @@ class SlamModel(eqx.Module):
         """What a measurement differs by from its prediction."""
         return self.sensor.residual(measured, predicted)
 
-    def camera_point(self, view: View, landmark: Array) -> tuple[Array, Array]:
+    def camera_point(self, view: CameraInMap, landmark: Array) -> tuple[Array, Array]:
         """The landmark in the current camera as a homogeneous point (X, ω)."""
         point, omega = self.landmark.homogeneous(landmark)
         T_CA = view.map_from_camera.inverse()
@@ -220,19 +220,23 @@ class SlamModel(eqx.Module):
             T_CA = T_CA @ T_AF.joined()
         return homogeneous_apply(T_CA, point, omega), omega
 
-    def metric_point(self, view: View, landmark: Array) -> tuple[Array, Array]:
+    def metric_point(self, view: CameraInMap, landmark: Array) -> tuple[Array, Array]:
         """`camera_point` in metres: with the gauge's scale, `ω e^−λ`."""
         point, omega = self.camera_point(view, landmark)
         return point, omega if view.log_scale is None else omega * jnp.exp(-jnp.sum(view.log_scale))
 
-    def convert(self, view: View, landmark: Array, covariance: Array, context: Context) -> Array:
+    def convert(
+        self, view: CameraInMap, landmark: Array, covariance: Array, context: Context
+    ) -> Array:
         """The same landmark in the form that its parametrization now prefers."""
         del context
         if self.landmark.convert is None:
             return landmark
         return self.landmark.convert(view.map_from_camera.translation(), landmark, covariance)
 
-    def initialise(self, view: View, measured: Array, hidden: Array, context: Context) -> Array:
+    def initialise(
+        self, view: CameraInMap, measured: Array, hidden: Array, context: Context
+    ) -> Array:
         """P22–P26: a landmark in the map frame from its first measurement and the prior."""
         sensor = self.sensor_of(view)
         if view.depth_error is not None:

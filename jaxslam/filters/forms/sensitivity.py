@@ -114,7 +114,7 @@ class Point(eqx.Module):
         return jnp.concatenate([core, landmarks.by_variables(before)])
 
 
-class Compared(NamedTuple):
+class WhitenedResiduals(NamedTuple):
     """A frame's measurements, whitened by R; zero where one is not used."""
 
     predicted: Float[Array, "m p"]
@@ -167,7 +167,7 @@ class Sensitivity(AbstractForm):
         noise: Float[Array, "p p"],
         context: Any,
         considered: slice = slice(0, 0),
-    ) -> tuple[Point, Compared]:
+    ) -> tuple[Point, WhitenedResiduals]:
         """Compare with the features seen; the state stays as it is."""
         del considered
         predicted, residual, used, H = residuals(model, state, features, context)
@@ -177,7 +177,7 @@ class Sensitivity(AbstractForm):
         shared += small_products(H.by_landmark, landmarks[slots])
         own = small_products(H.by_landmark, state.by_own[slots])
         whitening = cholesky(noise).whitening.astype(shared.dtype)
-        return state, Compared(
+        return state, WhitenedResiduals(
             predicted,
             (residual @ whitening.T).ravel(),
             Derivative(whitening @ shared, whitening @ own, slots),

@@ -20,7 +20,7 @@ from jaxslam._numerics.conditional import map_where
 from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.minimise import Minimum, minimised, started, turned
-from jaxslam.filters.window.problem import Layout, reduced
+from jaxslam.filters.window.problem import PathLayout, reduced
 from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.scale import enlarged, shift_of_scale
 
@@ -47,7 +47,7 @@ class Modes(eqx.Module):
 
 def at_rest(slam: EkfSlam, record: Record, count: int, dtype: Any) -> Modes:
     """Before anything is known: one mode, the prior's mean."""
-    size, m = Layout.of(slam).size(record.frames), record.first.size
+    size, m = PathLayout.of(slam).size(record.frames), record.first.size
     q = slam.sensor.size + slam.sensor.hidden
     x, y = jnp.zeros((count, size), dtype), jnp.zeros((count, m, q), dtype)
     alone = jnp.where(jnp.arange(count) == 0, 0.0, -jnp.inf).astype(dtype)
@@ -85,7 +85,7 @@ def starts(
 
 def reversed_(slam: EkfSlam, at: Minimum) -> tuple[Float[Array, " N"], Float[Array, "m q"]]:
     """The other way, among points that are as much too near as they were too far."""
-    layout, p = Layout.of(slam), slam.sensor.size
+    layout, p = PathLayout.of(slam), slam.sensor.size
     x = enlarged(slam, at.x, jnp.asarray(-1.0, at.x.dtype))
     common = slice(layout.start, layout.start + layout.common)
     return x.at[common].multiply(-1), at.y.at[:, p:].multiply(-1)

@@ -24,7 +24,7 @@ from jaxslam.filters.window.record import Record
 from jaxslam.geometry import Pose, Scalar, homogeneous_apply, identity, jacobian, nudge, retract
 
 
-class Frame(eqx.Module):
+class CalibratedPose(eqx.Module):
     """What a measurement depends on beside the landmark; of one frame, or of all."""
 
     pose: Pose
@@ -35,14 +35,14 @@ class Frame(eqx.Module):
 class Path(eqx.Module):
     """What x stands for."""
 
-    frames: Frame
+    frames: CalibratedPose
     motion: Float[Array, "F v"]
     """The motion's variables after every step."""
     common: Float[Array, " c"]
     """The error that all depths have in common; empty where there is none."""
 
 
-class Layout(NamedTuple):
+class PathLayout(NamedTuple):
     """How many numbers of x are of what."""
 
     start: int
@@ -55,12 +55,12 @@ class Layout(NamedTuple):
     """Calibration drawn in every frame."""
 
     @staticmethod
-    def of(slam: EkfSlam) -> Layout:
+    def of(slam: EkfSlam) -> PathLayout:
         _, root = slam.motion.start()
         own = slam.calibration.sigma.size
         each = own if slam.calibration.each_frame else 0
         common = 0 if slam.depth.common is None else 1
-        return Layout(len(root), common, own - each, slam.model.noise_sigma.size, each)
+        return PathLayout(len(root), common, own - each, slam.model.noise_sigma.size, each)
 
     @property
     def whole(self) -> int:
@@ -74,7 +74,7 @@ class Layout(NamedTuple):
 
 def path(slam: EkfSlam, record: Record, x: Float[Array, " N"]) -> Path:
     """Poses, velocities and calibrations of all frames. After the last, nothing moves."""
-    layout, motion = Layout.of(slam), slam.motion
+    layout, motion = PathLayout.of(slam), slam.motion
     mean, root = motion.start()
     ends = [layout.start, layout.start + layout.common, layout.whole - layout.each, layout.whole]
     start, common, once, first, steps = jnp.split(x, ends)
@@ -94,7 +94,7 @@ def path(slam: EkfSlam, record: Record, x: Float[Array, " N"]) -> Path:
     poses, variables, deltas = jax.tree.map(
         lambda one, more: jnp.concatenate([one[None], more]), begun, later
     )
-    return Path(Frame(poses, deltas), variables, common)
+    return Path(CalibratedPose(poses, deltas), variables, common)
 
 
 def _driven_by(record: Record) -> tuple[Any, Float[Array, " steps"], Bool[Array, " steps"]]:
@@ -108,7 +108,7 @@ def _moved(slam: EkfSlam, state, control, merged: Scalar, restarted: Bool[Array,
     The mean of m white accelerations has σ/√m, the sum of m drifts √m σ. A velocity that is drawn
     anew has the numbers of an acceleration, and no acceleration.
     """
-    (pose, variables, delta), layout, motion = state, Layout.of(slam), slam.motion
+    (pose, variables, delta), layout, motion = state, PathLayout.of(slam), slam.motion
     own = motion.noise_sigma.shape[-1]
     noise, drift = jnp.split(slam.model.noise_sigma * numbers[: layout.step], [own])
     noise, drift = noise / jnp.sqrt(merged), drift * jnp.sqrt(merged)
@@ -292,7 +292,7 @@ def sensitivities(slam: EkfSlam, record: Record, x: Float[Array, " N"], at: Path
 
     _, later = jax.lax.scan(move, begun, (_slopes(slam, record, x, at), driving))
     every = jnp.concatenate([begun[None], later])
-    t, v = slam.motion.geometry.tangent_dim, Layout.of(slam).start
+    t, v = slam.motion.geometry.tangent_dim, PathLayout.of(slam).start
     frame = jnp.concatenate([every[:, :t], every[:, t + v :]], axis=1)
     return Sensitivities(frame, every[:, t : t + v])
 
@@ -301,7 +301,7 @@ def _driven(
     slam: EkfSlam, record: Record, x: Float[Array, " N"]
 ) -> tuple[Float[Array, "s N"], Float[Array, "steps w N"]]:
     """Jacobians by x of (pose, motion, calibration) in frame 0, and of what drives every step."""
-    layout, eye = Layout.of(slam), jnp.eye(x.size, dtype=x.dtype)
+    layout, eye = PathLayout.of(slam), jnp.eye(x.size, dtype=x.dtype)
     ends = [layout.start, layout.start + layout.common, layout.whole]
     start, _, drawn, driving = jnp.split(eye, ends)
     _, root = slam.motion.start()
@@ -317,7 +317,7 @@ def _slopes(
     """Jacobian of every step by the state before it and by what drives it, d = s + w numbers."""
     states = at.frames.pose, at.motion, at.frames.calibration
     before = jax.tree.map(lambda leaf: leaf[:-1], states)
-    numbers = x[Layout.of(slam).whole :].reshape(record.frames - 1, -1)
+    numbers = x[PathLayout.of(slam).whole :].reshape(record.frames - 1, -1)
 
     def local(state, numbers, *given):
         return jacobian(lambda both: _moved(slam, both[0], *given, both[1]), (state, numbers))
@@ -452,7 +452,7 @@ def reduced(
 
 def _to_x(slam: EkfSlam, S: Sensitivities) -> Float[Array, "z N"]:
     """Jacobian by x of all frames' tangents and the common error."""
-    layout, size = Layout.of(slam), S.frame.shape[-1]
+    layout, size = PathLayout.of(slam), S.frame.shape[-1]
     eye = jnp.eye(size, dtype=S.frame.dtype)
     common = eye[layout.start : layout.start + layout.common]
     return jnp.concatenate([S.frame.reshape(-1, size), common])

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam._numerics.linalg import Cholesky, cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.minimise import Minimum
-from jaxslam.filters.window.problem import Layout, Reduced, hidden
+from jaxslam.filters.window.problem import PathLayout, Reduced, hidden
 from jaxslam.filters.window.record import Record
 from jaxslam.geometry import Scalar
 
@@ -47,7 +47,7 @@ def rescaled(
 ) -> tuple[Float[Array, " N"], Float[Array, "m q"]]:
     """The likeliest unknowns with all lengths e^λ times as large: the same pixels."""
     factor, p = jnp.exp(log_scale), slam.sensor.size
-    layout = Layout.of(slam)
+    layout = PathLayout.of(slam)
     place = slice(layout.start, layout.start + layout.common)
     there = hidden(slam, at.x[place], at.y[:, p:]) / factor
     begun = jnp.any(record.seen, axis=0)[:, None]
@@ -71,7 +71,7 @@ def _shared(
 
 def enlarged(slam: EkfSlam, x: Float[Array, " N"], factor: Scalar) -> Float[Array, " N"]:
     """The path with all lengths so many times as large; −1 goes the other way."""
-    layout, motion = Layout.of(slam), slam.motion
+    layout, motion = PathLayout.of(slam), slam.motion
     mean, root = motion.start()
     steps = x[layout.whole :].reshape(-1, layout.step + layout.each)
     own = motion.noise_sigma.shape[-1]
@@ -97,7 +97,7 @@ def told(slam: EkfSlam, at: Minimum, s: Direction) -> Float[Array, ""]:
 
 def _untold(slam: EkfSlam, x: Float[Array, " N"], s: Direction) -> Float[Array, " N"]:
     """Accelerations that scale and whose size is not told; zero elsewhere."""
-    layout = Layout.of(slam)
+    layout = PathLayout.of(slam)
     if slam.motion.noise_told:
         return jnp.zeros_like(x)
     own = slam.motion.noise_sigma.shape[-1]
@@ -141,7 +141,7 @@ def shift_of_scale(
 def _slope_of_volume(slam, local: Reduced, s: Direction, factor: Cholesky, untold) -> Scalar:
     """`−½ d log det A/dλ`."""
     of_x, of_y = variances(local, factor.whitening)
-    layout, p = Layout.of(slam), slam.sensor.size
+    layout, p = PathLayout.of(slam), slam.sensor.size
     place = jnp.arange(of_x.size) - layout.start
     of_depth = (place >= 0) & (place < layout.common)
     sign = jnp.where((s.x == 0) | untold, 0.0, jnp.where(of_depth, -1.0, 1.0))

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.minimise import Minimum
-from jaxslam.filters.window.problem import Layout
+from jaxslam.filters.window.problem import PathLayout
 from jaxslam.filters.window.record import Record
 
 
@@ -74,9 +74,9 @@ def _stood(record: Record) -> Bool[Array, " steps"]:
 
 
 def _noises(slam: EkfSlam, record: Record, fewer: Record, x: Float[Array, " N"]) -> Any:
-    """Unknowns of the merged steps: `√(m₁ + m₂) n = √m₁ n₁ + √m₂ n₂` adds the same velocity; a
+    """PathLayout of the merged steps: `√(m₁ + m₂) n = √m₁ n₁ + √m₂ n₂` adds the same velocity; a
     calibration that is drawn anew is that of the frame that stays, and so is a velocity."""
-    layout, frames = Layout.of(slam), record.frames
+    layout, frames = PathLayout.of(slam), record.frames
     steps = x[layout.whole :].reshape(frames - 1, -1)
     own, drawn = jnp.split(steps, [layout.step], axis=1)
     roots = jnp.sqrt(jnp.stack([record.merged, fewer.merged]))[..., None]

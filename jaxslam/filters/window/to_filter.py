@@ -19,7 +19,7 @@ from jaxslam.filters.forms.blocks import shifted
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.window.minimise import LANDMARK_STEPS, Minimum, landmarks
 from jaxslam.filters.window.problem import (
-    Layout,
+    PathLayout,
     Reduced,
     located,
     path,
@@ -82,7 +82,7 @@ def _scale(slam: EkfSlam, local: Reduced, s: Direction) -> Direction:
 
 def _newest(slam, record, at: Minimum, local: Reduced):
     """(frame, motion's variables, common error) at the newest frame, and their Jacobian by x."""
-    layout, k = Layout.of(slam), record.last
+    layout, k = PathLayout.of(slam), record.last
     frame = jax.tree.map(lambda leaf: leaf[k], local.path.frames)
     eye = jnp.eye(at.x.size, dtype=at.x.dtype)
     common = eye[layout.start : layout.start + layout.common]

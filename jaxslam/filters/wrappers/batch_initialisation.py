@@ -24,7 +24,7 @@ from jaxslam.filters.ekf import EkfSlam, ekf_inside
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.window import record as window
 from jaxslam.filters.window.modes import Modes, at_rest, sought
-from jaxslam.filters.window.problem import Layout
+from jaxslam.filters.window.problem import PathLayout
 from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.subsample import thinned
 from jaxslam.filters.window.to_filter import gauge_state
@@ -162,7 +162,7 @@ class BatchInitialisation(AbstractWrapper):
     ) -> RestState:
         """The modes of a window of so many frames, more than `least`, and the sum of them."""
         ekf, record = self.ekf, state.record.cut(frames)
-        size = Layout.of(ekf).size(frames)
+        size = PathLayout.of(ekf).size(frames)
 
         def solved(state, record):
             x = state.modes.minima.x

@@ -24,7 +24,13 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam._numerics.linalg import Cholesky, cholesky, semidefinite_root
 from jaxslam.filters.ekf import EkfSlam, check_features, check_one_gaussian, correct
-from jaxslam.filters.forms.sensitivity import Compared, Distribution, Point, Sensitivity, begin
+from jaxslam.filters.forms.sensitivity import (
+    Distribution,
+    Point,
+    Sensitivity,
+    WhitenedResiduals,
+    begin,
+)
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.protocol import AbstractFilter, CameraView, LandmarkView
 from jaxslam.geometry import Pose, retract
@@ -32,12 +38,12 @@ from jaxslam.models.motion import check_control
 from jaxslam.models.observations import Capacity, Features, Innovation, Status, judged
 
 LAG = 10
-"""Frames of a lag whose number is not said."""
+"""LagFrames of a lag whose number is not said."""
 MOST_STEPS = 30
 """Of Levenberg–Marquardt in one frame."""
 
 
-class Frames(eqx.Module):
+class LagFrames(eqx.Module):
     """What happened in some frames, the oldest first, or in one."""
 
     happened: Bool[Array, "*frames"]
@@ -53,7 +59,7 @@ class LagState(eqx.Module):
     before: Distribution
     variables: Float[Array, " N"]
     """Where the window is linearised."""
-    frames: Frames
+    frames: LagFrames
     estimate: State
     """Mean and covariance of the newest state."""
 
@@ -64,7 +70,7 @@ class NormalEquations(NamedTuple):
     newest: Point
     sensitivity: Float[Array, "n N"]
     """Of the newest point, S."""
-    last: Compared
+    last: WhitenedResiduals
     """What the newest frame compared."""
     slope: Float[Array, "mp N"]
     """Of the newest frame, A."""
@@ -126,7 +132,7 @@ class FixedLag(AbstractFilter):
         check_control(self.base.motion, control)
         before, variables = self._absorbed(state)
         solved = jnp.asarray(True)
-        frames = _appended(state.frames, Frames(jnp.ones((), bool), control, seen, new))
+        frames = _appended(state.frames, LagFrames(jnp.ones((), bool), control, seen, new))
         if self.converge:
             variables, solved = self._maximum(before, variables, frames)
         window = self._normal_equations(before, variables, frames)
@@ -187,7 +193,7 @@ class FixedLag(AbstractFilter):
         core = state.core
         return core.noise.size + (core.calibration.size if self.base.calibration.each_frame else 0)
 
-    def _no_frames(self, state: State, known: int, new: int) -> Frames:
+    def _no_frames(self, state: State, known: int, new: int) -> LagFrames:
         dtype, base = state.landmarks.dtype, self.base
 
         def features(count):
@@ -199,9 +205,11 @@ class FixedLag(AbstractFilter):
 
         still = base.motion.still(dtype)
         control = jax.tree.map(lambda x: jnp.tile(x, (self.frames, *(1,) * x.ndim)), still)
-        return Frames(jnp.zeros(self.frames, bool), control, features(known), features(new))
+        return LagFrames(jnp.zeros(self.frames, bool), control, features(known), features(new))
 
-    def _advance(self, before: Distribution, point: Point, frame: Frames) -> tuple[Point, Compared]:
+    def _advance(
+        self, before: Distribution, point: Point, frame: LagFrames
+    ) -> tuple[Point, WhitenedResiduals]:
         """One frame of the base filter, as a function of the variables."""
         base = replace(self.base, form=Sensitivity(before, frame.happened))
         check_features(base, frame.seen)
@@ -223,7 +231,7 @@ class FixedLag(AbstractFilter):
             gradient,
         )
 
-    def _through(self, before, variables, frames) -> tuple[Point, Compared]:
+    def _through(self, before, variables, frames) -> tuple[Point, WhitenedResiduals]:
         """The window, frame by frame."""
         return jax.lax.scan(partial(self._advance, before), begin(before, variables), frames)
 
@@ -269,7 +277,7 @@ def to_maximum(base: EkfSlam | FixedLag, steps: int | None = None) -> FixedLag:
     return replace(lagged, iterations=steps)
 
 
-def _appended(frames: Frames, newest: Frames) -> Frames:
+def _appended(frames: LagFrames, newest: LagFrames) -> LagFrames:
     return jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), frames, newest)
 
 
