@@ -9,14 +9,13 @@ pose at the one scale of its map. Elsewhere only NIS says whether a filter belie
 rightly: its mean per degree of freedom is 1 if pixels and motion are as assumed. How far the scale
 drifts, in what the filter claims of that, is told wherever there is a reference. Results go to
 `sequences.json`; `docs/sequences.md` and a table of `docs/results.md` are written from all of them,
-by `--only-page` from what is there.
+by `--page` from what is there.
 """
 
 from __future__ import annotations
 
 import csv
 import itertools
-import json
 import os
 import tempfile
 from collections.abc import Iterator
@@ -25,17 +24,16 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+from benchmark import Benchmark, RESULTS, write_page, write_table
 from benchmark import data_folder
-from pages import write_table
 
-from jaxslam._runtime.files import write_atomically, write_json
 from jaxslam.filters.registry import FROM_REST
 from jaxslam.tracking.settings import TrackerSettings
 
 FRAMES = (30, 149)
 """Whose pose is compared with the truth, where that is known."""
-RESULTS, MARK = Path("docs/results.md"), "<!-- sequences.py -->"
-"""Where `summary` stands."""
+MARK = "<!-- sequences.py -->"
+"""Where `summary` stands in `docs/results.md`."""
 LANDMARKS = "inverse_scaling"
 SEEDS = range(5)
 """Of synthetic videos."""
@@ -47,9 +45,9 @@ Results = dict[str, dict[str, dict[str, Any]]]
 """`results[sequence][filter/landmarks]`, and `/white` where the calibration is not `known`."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
+@dataclass(frozen=True, kw_only=True)
+class Sequences(Benchmark):
+    """Filters on sequences."""
 
     sequences: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Data set folders or videos with their calibration beside them; by default all there are."""
@@ -59,12 +57,26 @@ class Options:
     """Landmark parametrizations."""
     calibrations: tuple[str, ...] = ("known",)
     """Treatments of the calibration: known or white."""
-    out: Path = Path("benchmarks/results/sequences.json")
-    """The results, added to."""
-    page: Path = Path("docs/sequences.md")
-    """The page."""
-    only_page: bool = False
-    """Measure nothing."""
+    out: Path = RESULTS / "sequences.json"
+    double = False
+
+    def measure(self) -> Iterator[Results]:
+        results: Results = self.found()
+        for source, exact in _sources(self):
+            done = results.setdefault(source.name, {})
+            for name, landmarks, calibration in itertools.product(
+                self.filters, self.landmarks, self.calibrations
+            ):
+                settings = TrackerSettings(name, landmarks, calibration)
+                key = f"{settings.filter}/{landmarks}"
+                key += "" if calibration == "known" else f"/{calibration}"
+                done[key] = measure(source, settings, exact=exact)
+                print(source.name, key, done[key], flush=True)
+                yield results
+
+    def report(self, results: Results) -> None:
+        write_page(self.docs / "sequences.md", page(results))
+        write_table(self.docs / "results.md", MARK, summary(results))
 
 
 def measure(source, settings: TrackerSettings, *, exact: bool) -> dict[str, Any]:
@@ -221,7 +233,7 @@ def _share(r: dict[str, Any], key: str) -> str:
     return f"{r[key] / r['path']:.2%}"
 
 
-def _sources(options: Options) -> Iterator[tuple[Any, bool]]:
+def _sources(options: Sequences) -> Iterator[tuple[Any, bool]]:
     """Sources, and whether their reference is exactly the truth."""
     from jaxslam.io.opening import open_source
     from jaxslam.tracking.synthetic import synthetic_source
@@ -232,26 +244,6 @@ def _sources(options: Options) -> Iterator[tuple[Any, bool]]:
         yield from ((synthetic_source(frames=150, seed=seed), True) for seed in SEEDS)
 
 
-def main() -> None:
-    """Measure and write."""
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-    options = tyro.cli(Options, description=__doc__)
-    results: Results = json.loads(options.out.read_text()) if options.out.exists() else {}
-    for source, exact in () if options.only_page else _sources(options):
-        done = results.setdefault(source.name, {})
-        for name, landmarks, calibration in itertools.product(
-            options.filters, options.landmarks, options.calibrations
-        ):
-            settings = TrackerSettings(name, landmarks, calibration)
-            key = f"{settings.filter}/{landmarks}"
-            key += "" if calibration == "known" else f"/{calibration}"
-            done[key] = measure(source, settings, exact=exact)
-            print(source.name, key, done[key], flush=True)
-            write_json(options.out, results)
-    with write_atomically(options.page) as path:
-        path.write_text(page(results))
-    write_table(RESULTS, MARK, summary(results))
-
-
 if __name__ == "__main__":
-    main()
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    Sequences.run()
