@@ -1,7 +1,7 @@
 """Every landmark parametrization in every frame: NEES, RMSE, σ/RMSE and time per step.
 
-`python benchmarks/comparison.py` runs them all, 1000 runs each, and writes `comparison.json`,
-`docs/comparison.png` and `docs/comparison.md`.
+`python benchmarks/comparison.py` runs them all, 1000 runs each, and writes `comparison.json`
+and `docs/comparison.md`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from typing import Any
 
 import jax
 from benchmark import RESULTS, Benchmark, number, table, write_page
-from figures.comparison import plot_comparison
 
 import jaxslam
 from jaxslam.landmarks import table as landmark_table
@@ -51,7 +50,6 @@ class Comparison(Benchmark):
             yield {**of, "scenarios": results}
 
     def report(self, results: dict[str, Any]) -> None:
-        plot_comparison(results["scenarios"], self.docs / "comparison.png")
         write_page(self.docs / "comparison.md", page(results))
 
 
@@ -88,7 +86,6 @@ def page(summary: dict[str, Any]) -> str:
         "*inside* is the share of steps at which it is there; a run is *lost* when its NEES is "
         "above the 99.99 % quantile of χ². NEES, lost, RMSE and σ are those of the last step; the "
         "time is that of one step of one run in a batch, on a machine that other programs share.",
-        "![Mean NEES and σ/RMSE of every parametrization in both frames](comparison.png)",
         "## The parametrizations",
         landmark_table(jaxslam.LANDMARKS.values()),
     ]

@@ -22,8 +22,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from benchmark import RESULTS, Benchmark, table, write_table
-from figures.modes import plot_modes, worlds_of
 from modes import modes_of_run
+from modes_figure import plot_modes, worlds_of
 
 import jaxslam
 from jaxslam.consistency import draw, filter_run

@@ -24,8 +24,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from benchmark import Benchmark, RESULTS, write_page, write_table
-from benchmark import data_folder
+from benchmark import RESULTS, Benchmark, data_folder, write_page, write_table
 
 from jaxslam.filters.registry import FROM_REST
 from jaxslam.tracking.settings import TrackerSettings

@@ -25,7 +25,6 @@ from jaxslam.plots.evaluation import plot_evaluation
 from jaxslam.plots.style import (
     COLUMN,
     End,
-    draw_dots,
     label_ends,
     name_numbers,
     new_figure,
@@ -103,18 +102,6 @@ def test_ticks_are_round_numbers_written_out(low, high, told):
     figure.draw_without_rendering()
     ticks = zip(axes.get_yticks(), axes.get_yticklabels(), strict=True)
     assert [label.get_text() for value, label in ticks if low <= value <= high][: len(told)] == told
-
-
-def test_what_is_beyond_the_axes_is_an_arrow_with_its_number():
-    axes = new_figure(4, 3).subplots()
-    draw_dots(axes, np.array([3.0, 2e5, np.nan, 1000.0]), np.arange(4), 1000.0, colour="k")
-    (dots,) = (line for line in axes.lines if line.get_marker() == "o")
-    np.testing.assert_array_equal(dots.get_xydata(), [[3.0, 0], [1000.0, 3]])
-    assert [(text.get_text(), text.xy) for text in annotations(axes)] == [
-        ("2e5", (1000.0, 1)),
-        ("no mean", (1000.0, 2)),
-    ]
-    assert axes.get_xlim()[1] >= 1000
 
 
 def test_filters_are_named_by_what_tells_them_apart():

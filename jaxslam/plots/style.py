@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import FixedLocator, NullFormatter
-from numpy.typing import ArrayLike
 from scipy.optimize import isotonic_regression
 
 from jaxslam._runtime.files import write_atomically
@@ -32,9 +31,6 @@ LETTERS = 8.0
 """Points: of labels at lines, and of everything in print."""
 MEDIAN_DASH = (0, (1, 2))
 """Of the medians, where a line is a mean."""
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
-MOST_NEES = 1000.0
-"""On an axis of dots; what is beyond is an arrow with a number."""
 _FITTING = 50
 """Characters in a line of a column."""
 _POWERS = range(-9, 13)
@@ -97,42 +93,6 @@ def name_numbers(axis: Axis) -> None:
     axis.set_major_locator(FixedLocator([d * 10.0**power for power in _POWERS for d in digits]))
     axis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_minor_formatter(NullFormatter())
-
-
-def same_x(axes: Iterable[Axes]) -> None:
-    """One scale for axes that are compared."""
-    axes = list(axes)
-    limits = np.array([each.get_xlim() for each in axes])
-    for each in axes:
-        each.set_xlim(limits.min(), limits.max())
-        if each.get_xscale() == "log":
-            name_numbers(each.xaxis)
-
-
-def draw_dots(
-    axes: Axes,
-    values: ArrayLike,
-    rows: ArrayLike,
-    most: float,
-    *,
-    colour: str,
-    marker: str = "o",
-    label: str | None = None,
-) -> None:
-    """A dot for each value along x; of one beyond `most` an arrow to there, and the number.
-
-    What is not finite is an arrow as well, without a number: there is none.
-    """
-    values, rows = np.asarray(values, float), np.asarray(rows, float)
-    inside = values <= most
-    axes.plot(values[inside], rows[inside], marker, color=colour, ms=6, ls="none", label=label)
-    axes.plot(np.full(np.sum(~inside), most), rows[~inside], ls="none")  # the axes reach it
-    for value, row in zip(values[~inside], rows[~inside], strict=True):
-        told = f"{value:.0e}".replace("e+0", "e") if np.isfinite(value) else "no mean"
-        axes.annotate(
-            told, (most, row), (-26, 0), textcoords="offset points", ha="right", va="center",
-            color=colour, fontsize=7, arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.4},
-        )  # fmt: skip
 
 
 class End(NamedTuple):

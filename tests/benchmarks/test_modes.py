@@ -9,8 +9,8 @@ import modes as told
 import numpy as np
 import pytest
 from cases import Case, close, quick_jit
-from figures.modes import Worlds, plot_modes, worlds_of
 from modes import Modes, followed, given_scale, modes_of_run
+from modes_figure import Worlds, plot_modes, worlds_of
 
 STEPS, WINDOW = 6, 4
 LEFT, RIGHT = np.array([-0.1, 0.0]), np.array([0.1, 0.01])
