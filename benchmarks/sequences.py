@@ -80,7 +80,7 @@ class Sequences(Benchmark):
 
 def measure(source, settings: TrackerSettings, *, exact: bool) -> dict[str, Any]:
     """One filter on one sequence; `exact` where its reference is the truth."""
-    from jaxslam.tracking.track import track
+    from jaxslam.tracking.video import track
 
     with tempfile.TemporaryDirectory() as folder:
         summary = track(source, folder, settings, overlay=False)

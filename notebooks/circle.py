@@ -31,8 +31,7 @@ from scipy.stats import binomtest
 
 import jaxslam
 from jaxslam.consistency import filter_run
-from jaxslam.plots.landmarks import plot_landmark_clouds
-from jaxslam.plots.style import COLOURS, GREY, new_figure
+from jaxslam.plots import COLOURS, GREY, new_figure, plot_landmark_clouds
 from jaxslam.simulation import Room, sensor_of, sightings, simulate
 from jaxslam.statistics import chi2_quantile
 

@@ -30,7 +30,7 @@ import numpy as np
 from IPython.display import display
 
 import jaxslam
-from jaxslam.plots.consistency import plot_consistency
+from jaxslam.plots import plot_consistency
 
 RUNS = 200 if os.environ.get("JAXSLAM_REDUCED") else 1000
 

@@ -27,8 +27,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import jaxslam
-from jaxslam.consistency import draw
-from jaxslam.consistency.likelihood import log_likelihood, maximum_likelihood
+from jaxslam.consistency import draw, log_likelihood, maximum_likelihood
 
 jax.config.update("jax_enable_x64", True)
 REDUCED = bool(os.environ.get("JAXSLAM_REDUCED"))

@@ -35,7 +35,7 @@ from IPython.display import display
 
 import jaxslam
 from jaxslam.consistency import draw
-from jaxslam.plots.style import COLOURS, new_figure
+from jaxslam.plots import COLOURS, new_figure
 from jaxslam.simulation import features
 
 # %% tags=["filter"]

@@ -26,7 +26,7 @@ import numpy as np
 from IPython.display import display
 
 import jaxslam
-from jaxslam.plots.style import GREY, line_style
+from jaxslam.plots import GREY, line_style
 
 RUNS = 100 if os.environ.get("JAXSLAM_REDUCED") else 1000
 

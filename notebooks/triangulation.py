@@ -37,7 +37,7 @@ import os
 import numpy as np
 from IPython.display import display
 
-from jaxslam.plots.triangulation import plot_triangulation
+from jaxslam.plots import plot_triangulation
 from jaxslam.triangulation import CALIBRATIONS, ESTIMATES, TwoViews, compare, summarise, table
 
 REDUCED = bool(os.environ.get("JAXSLAM_REDUCED"))

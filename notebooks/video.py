@@ -30,15 +30,9 @@ from pathlib import Path
 import cv2
 from IPython.display import Image, display
 
-from jaxslam.io.opening import open_source
-from jaxslam.io.tum import read_tum
-from jaxslam.plots.frames import Laid, plot_frames
-from jaxslam.plots.style import new_figure
-from jaxslam.tracking.pointcloud import read_ply
-from jaxslam.tracking.projection import seen_from
-from jaxslam.tracking.settings import TrackerSettings
-from jaxslam.tracking.synthetic import synthetic_source
-from jaxslam.tracking.track import describe, track
+from jaxslam.io import open_source, read_tum
+from jaxslam.plots import Laid, new_figure, plot_frames
+from jaxslam.tracking import TrackerSettings, describe, read_ply, seen_from, synthetic_source, track
 
 VIDEO = os.environ.get("JAXSLAM_VIDEO")
 FRAMES = 60 if os.environ.get("JAXSLAM_REDUCED") else 300

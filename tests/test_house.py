@@ -3,12 +3,14 @@
 import ast
 import importlib
 import os
+import re
 import statistics
 import subprocess
 import sys
 from pathlib import Path
 
 import equinox as eqx
+import pytest
 
 import jaxslam
 from jaxslam.filters.ekf import EkfSlam
@@ -23,6 +25,11 @@ ORDER = (
     "triangulation", "plots", "tracking", "cli",
 )  # fmt: skip
 """Rooms, each of which imports only those before it."""
+IMPORT = re.compile(
+    r"^ *(?:from (?P<of>jaxslam[\w.]*) import (?P<names>\([^)]*\)|.*)"
+    r"|import (?P<all>jaxslam[\w.]*))",
+    re.MULTILINE,
+)
 
 
 def room(module):
@@ -166,6 +173,35 @@ def test_a_wrapper_hands_on_all_that_a_filter_says():
     said = {name for name in dir(AbstractStaged) if not name.startswith("_")}
     own = {name for name in vars(AbstractWrapper) if not name.startswith("_")}
     assert said - own == {"step"}  # made of the stages
+
+
+PAGES = [
+    PACKAGE.parent / "README.md",
+    *PACKAGE.parent.glob("docs/*.md"),
+    *PACKAGE.parent.glob("notebooks/*.py"),
+]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_pages_import_what_rooms_export_and_nothing_else(page):
+    for found in IMPORT.finditer(page.read_text()):
+        module, names = found["of"] or found["all"], found["names"]
+        assert module.count(".") <= 1, found[0]
+        assert "._" not in module, found[0]
+        exported = getattr(importlib.import_module(module), "__all__", None)
+        if names and exported is not None:
+            told = {name.split(" as ")[0].strip() for name in names.strip("() \n,").split(",")}
+            assert told <= set(exported), found[0]
+
+
+@pytest.mark.parametrize("room", ["io", "plots", "tracking"])
+def test_a_room_has_what_it_exports(room):
+    pytest.importorskip("cv2")
+    found = importlib.import_module(f"jaxslam.{room}")
+    for name in found.__all__:
+        assert getattr(found, name).__name__ == name if callable(getattr(found, name)) else True
+    with pytest.raises(AttributeError, match="has no attribute 'nobody'"):
+        found.nobody  # noqa: B018
 
 
 def test_importing_the_package_is_light():

@@ -92,7 +92,7 @@ class TrackOptions:
         from jaxslam._runtime.progress import bar
         from jaxslam.tracking.summary import WARM_UP, describe
         from jaxslam.tracking.target import read_target
-        from jaxslam.tracking.track import track
+        from jaxslam.tracking.video import track
 
         with one_line_warnings():
             source = self._source()

@@ -1,6 +1,7 @@
 """Is a filter consistent? Monte Carlo runs, NEES and NIS with exact bounds, and their summary."""
 
 from jaxslam.consistency.backends import BACKENDS
+from jaxslam.consistency.likelihood import log_likelihood, maximum_likelihood
 from jaxslam.consistency.montecarlo import CHUNK, DTYPES, check_sizes, draw, monte_carlo
 from jaxslam.consistency.records import write_records
 from jaxslam.consistency.runs import SimulatedFrame, filter_run, run_through, scale_records
@@ -19,6 +20,8 @@ __all__ = [
     "check_sizes",
     "draw",
     "filter_run",
+    "log_likelihood",
+    "maximum_likelihood",
     "monte_carlo",
     "run_through",
     "scale_records",

@@ -7,6 +7,7 @@ from jaxslam.statistics.bands import (
     mean_band,
     normalised_squared,
 )
+from jaxslam.statistics.beyond_scale import one_scale
 from jaxslam.statistics.verdict import (
     VERDICTS,
     Tally,
@@ -27,6 +28,7 @@ __all__ = [
     "mean_band",
     "normalised_squared",
     "not_disproved",
+    "one_scale",
     "run_verdict",
     "sentences",
     "verdict",

@@ -12,7 +12,7 @@ pytest.importorskip("cv2")
 
 from jaxslam.cli.track import TrackOptions
 from jaxslam.tracking import overlay, summary
-from jaxslam.tracking import track as tracking
+from jaxslam.tracking import video as tracking
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 

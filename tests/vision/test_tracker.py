@@ -36,11 +36,11 @@ from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.summary import TOO_SURE, describe
 from jaxslam.tracking.synthetic import synthetic_source
-from jaxslam.tracking.track import track
 from jaxslam.tracking.tracker import Tracker
 from jaxslam.tracking.trajectory import (
     absolute_trajectory_error,
 )
+from jaxslam.tracking.video import track
 
 FRAMES = 45
 

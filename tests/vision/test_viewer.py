@@ -10,7 +10,7 @@ pytest.importorskip("cv2")
 
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
-from jaxslam.tracking.track import track
+from jaxslam.tracking.video import track
 
 SETTINGS = TrackerSettings(filter="world", wanted=10, spare=4)
 FRAMES = 4
