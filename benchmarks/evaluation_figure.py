@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import re
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +15,6 @@ import tyro
 
 from jaxslam.evaluation import Evaluation
 from jaxslam.plots.evaluation import plot_evaluation
-
-
-@dataclass(frozen=True)
-class Options:
-    """Where the page is."""
-
-    docs: Path = Path("docs")
-    """Folder of evaluate.md and evaluate.png."""
 
 
 def evaluation_of(page: str) -> Evaluation:
@@ -35,11 +26,11 @@ def evaluation_of(page: str) -> Evaluation:
     return names["found"]
 
 
-def main(options: Options) -> None:
-    """Run the snippet, draw what it found."""
-    found = evaluation_of((options.docs / "evaluate.md").read_text())
-    plot_evaluation(found, options.docs / "evaluate.png")
+def main(docs: Path = Path("docs")) -> None:
+    """Draw what the first snippet of evaluate.md finds, in a folder of pages."""
+    found = evaluation_of((docs / "evaluate.md").read_text())
+    plot_evaluation(found, docs / "evaluate.png")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    tyro.cli(main)

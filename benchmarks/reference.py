@@ -11,9 +11,7 @@ baseline the rotation is not known.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import cv2
 import numpy as np
@@ -30,18 +28,6 @@ RETURNED = 0.3
 """Pixels: a corner that is followed back to farther from where it was is none."""
 NEAR = 1.0
 """Pixels from its epipolar line within which a corner agrees."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """What to measure."""
-
-    sequence: Annotated[Path, tyro.conf.Positional]
-    """Data set folder with a reference."""
-    frames: int = 15
-    """Frames that are compared."""
-    every: int = 1
-    """Frames from one to the next."""
 
 
 def followed(
@@ -67,20 +53,25 @@ def rotation(
     return R, float(np.mean(near > 0))
 
 
-def main() -> None:
-    """Print, frame by frame, how far the reference is turned against the pictures."""
-    options = tyro.cli(Options, description=__doc__)
-    source = open_source(options.sequence)
+def main(sequence: tyro.conf.Positional[Path], frames: int = 15, every: int = 1) -> None:
+    """Print, frame by frame, how far the reference is turned against the pictures.
+
+    Args:
+        sequence: Data set folder with a reference.
+        frames: Frames that are compared.
+        every: Frames from one to the next.
+    """
+    source = open_source(sequence)
     if source.reference is None:
-        raise SystemExit(f"{options.sequence}: there is no reference")
+        raise SystemExit(f"{sequence}: there is no reference")
     K, distortion = source.calibration.matrix, np.array(source.calibration.distortion, float)
     whole, line = np.eye(3), "{:5d}  {:7d}  {:5.2f}  {:14.3f}  {:20.2f}".format
-    frames = [f for f in source if f.index % options.every == 0][: options.frames]
-    nearest = [np.argmin(np.abs(source.reference.times - frame.time)) for frame in frames]
+    compared = [f for f in source if f.index % every == 0][:frames]
+    nearest = [np.argmin(np.abs(source.reference.times - frame.time)) for frame in compared]
     truth = source.reference.T_wc[nearest]
     print("frame  corners  agree  this step, deg  since the first, deg")
-    for i in range(1, len(frames)):
-        corners = followed(frames[i - 1].image, frames[i].image)
+    for i in range(1, len(compared)):
+        corners = followed(compared[i - 1].image, compared[i].image)
         R, agree = rotation(*(cv2.undistortPoints(x, K, distortion, P=K) for x in corners), K)
         whole = R @ whole
         step, since = (np.linalg.inv(truth[i]) @ truth[j] for j in (i - 1, 0))
@@ -89,8 +80,8 @@ def main() -> None:
             for ours, T in ((R, step), (whole, since))
         ]
         count = len(corners[0])
-        print(line(frames[i].index, count, agree, *degrees))
+        print(line(compared[i].index, count, agree, *degrees))
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)
