@@ -1,132 +1,46 @@
 """jaxslam: monocular EKF-SLAM whose uncertainty can be believed.
 
 The models are pure functions of one pose and one landmark; the filters, the Monte Carlo study
-and the tracker all run on the same ones. Plots, vision and the command line are imported only
-when they are asked for: `jaxslam.plots`, `jaxslam.tracking`, `jaxslam.cli`; so are
-`jaxslam.Tracker` and `jaxslam.TrackerSettings`, which need the vision extra.
+and the tracker all run on the same ones. Every name of `__init__.pyi` is imported when it is
+first asked for, so that evaluating a trajectory needs no filter, and a filter no camera. The
+vision extra is needed by `jaxslam.Tracker` and `jaxslam.TrackerSettings`.
 """
 
+import ast
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
-from jaxslam._numerics.arrays import cast
-from jaxslam._version import __version__
-from jaxslam.consistency import monte_carlo, summarise, table
-from jaxslam.evaluation import Convention, Evaluation, evaluate, evaluate_log, evaluate_poses
-from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.forms.state import State
-from jaxslam.filters.protocol import (
-    AbstractFilter,
-    AbstractStaged,
-    CameraView,
-    Expected,
-    LandmarkView,
-)
-from jaxslam.filters.readouts import (
-    camera_pose,
-    landmark_samples,
-    landmarks_from_above,
-    landmarks_in_camera,
-    landmarks_in_world,
-)
-from jaxslam.filters.registry import FILTERS, make_filter, make_filters, recommended
-from jaxslam.filters.run import Frames, run
-from jaxslam.filters.wrappers.fixed_lag import FixedLag
-from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
-from jaxslam.geometry import PLANAR, SPATIAL
-from jaxslam.landmarks import LANDMARKS
-from jaxslam.models.calibration import (
-    AbstractCalibration,
-    Considered,
-    Estimated,
-    Known,
-    White,
-)
-from jaxslam.models.camera import Camera
-from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
-from jaxslam.models.depth import InverseDepth
-from jaxslam.models.motion import AbstractMotion, BodyRates, ConstantVelocity, Odometry
-from jaxslam.models.observations import Capacity, Features, Innovation, Status
-from jaxslam.models.scale import Metre, ScaleGauge
-from jaxslam.models.sensors import AbstractSensor, Pinhole, Position, RangeBearing
-from jaxslam.simulation import Scenario, scenario, simulate
-from jaxslam.statistics import mean_band
-
-__all__ = [
-    "FILTERS",
-    "KEYFRAME",
-    "LANDMARKS",
-    "PLANAR",
-    "ROBOCENTRIC",
-    "SPATIAL",
-    "WORLD",
-    "AbstractCalibration",
-    "AbstractFilter",
-    "AbstractMotion",
-    "AbstractSensor",
-    "AbstractStaged",
-    "BodyRates",
-    "Camera",
-    "CameraView",
-    "Capacity",
-    "Considered",
-    "ConstantVelocity",
-    "Convention",
-    "EkfSlam",
-    "Estimated",
-    "Evaluation",
-    "Expected",
-    "Features",
-    "FixedLag",
-    "Frames",
-    "GaussianSum",
-    "Innovation",
-    "InverseDepth",
-    "Known",
-    "LandmarkView",
-    "Metre",
-    "Odometry",
-    "Pinhole",
-    "Position",
-    "RangeBearing",
-    "ScaleGauge",
-    "Scenario",
-    "State",
-    "Status",
-    "White",
-    "__version__",
-    "camera_pose",
-    "cast",
-    "evaluate",
-    "evaluate_log",
-    "evaluate_poses",
-    "landmark_samples",
-    "landmarks_from_above",
-    "landmarks_in_camera",
-    "landmarks_in_world",
-    "make_filter",
-    "make_filters",
-    "mean_band",
-    "monte_carlo",
-    "recommended",
-    "run",
-    "scenario",
-    "simulate",
-    "summarise",
-    "table",
-]
+_STUB = ast.parse(Path(__file__).with_suffix(".pyi").read_text())
+_MODULE_OF = {
+    alias.name: node.module
+    for node in _STUB.body
+    if isinstance(node, ast.ImportFrom) and node.module
+    for alias in node.names
+}
+(__all__,) = (ast.literal_eval(x.value) for x in _STUB.body if isinstance(x, ast.Assign))
 
 
 def __getattr__(name: str) -> Any:
-    if name == "Tracker":
-        try:
-            from jaxslam.tracking.tracker import Tracker
-        except ModuleNotFoundError as error:
-            from jaxslam._runtime.extras import missing
-
-            raise missing("a Tracker needs", "vision", error) from None
-        return Tracker
-    if name == "TrackerSettings":
-        from jaxslam.tracking.settings import TrackerSettings
-
-        return TrackerSettings
+    module = f"jaxslam.{name}"
+    if name in _MODULE_OF:
+        return _imported(name)
+    if not name.startswith("__") and find_spec(module) is not None:
+        return import_module(module)
     raise AttributeError(f"module 'jaxslam' has no attribute {name!r}")
+
+
+def _imported(name: str) -> Any:
+    try:
+        return getattr(import_module(_MODULE_OF[name]), name)
+    except ModuleNotFoundError as error:
+        if name != "Tracker":
+            raise
+        from jaxslam._runtime.extras import missing
+
+        raise missing("a Tracker needs", "vision", error) from None
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "Tracker", "TrackerSettings"]

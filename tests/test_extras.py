@@ -31,7 +31,7 @@ def test_a_command_that_looks_at_pictures_names_the_vision_extra(command, monkey
 
 def test_a_tracker_without_opencv_names_the_vision_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
-    for name in ("tracker", "corners"):  # as before they were first imported
+    for name in ("tracker", "start", "corners"):  # as before they were first imported
         monkeypatch.delitem(sys.modules, f"jaxslam.tracking.{name}", raising=False)
     with pytest.raises(ValueError, match=r"a Tracker needs the vision extra \(cv2 is missing\)"):
         jaxslam.Tracker  # noqa: B018

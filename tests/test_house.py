@@ -2,7 +2,6 @@
 
 import ast
 import importlib
-import os
 import re
 import statistics
 import subprocess
@@ -204,13 +203,34 @@ def test_a_room_has_what_it_exports(room):
         found.nobody  # noqa: B018
 
 
-def test_importing_the_package_is_light():
-    """No figures, commands, bars or solvers; no device, no configuration; 1.5 s of processor."""
-    program = (
-        "import sys, time, resource; import jaxslam; import jax;"
-        "heavy = {'matplotlib', 'tyro', 'tqdm', 'optimistix', 'cv2', 'evo'} & set(sys.modules);"
-        "assert not heavy, heavy;"
-        "assert not jax._src.xla_bridge._backends;"
-        "assert not jax.config.jax_enable_x64"
+def modules_after(statement):
+    """The modules that a new process has imported after the statement."""
+    program = f"import sys; {statement}; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", program], check=True, capture_output=True, text=True, timeout=120
     )
-    subprocess.run([sys.executable, "-c", program], check=True, env=os.environ, timeout=120)
+    return done.stdout.split()
+
+
+def test_importing_the_package_imports_no_other():
+    assert not {"jax", "numpy", "equinox"} & set(modules_after("import jaxslam"))
+
+
+def test_evaluating_needs_no_filter_and_a_study_no_compiler():
+    def rooms(statement):
+        return {room(module) for module in modules_after(statement) if "jaxslam." in module}
+
+    filters = {"filters", "models", "landmarks", "simulation", "consistency", "native", "tracking"}
+    assert not filters & rooms("from jaxslam import evaluate, evaluate_poses, evaluate_log")
+    beside = {"native", "tracking", "plots", "cli", "triangulation", "evaluation"}
+    assert not beside & rooms("from jaxslam import make_filters, monte_carlo, summarise, run")
+
+
+def test_the_public_names_are_light():
+    """No figures, commands, bars or solvers; no device, no configuration."""
+    modules = modules_after(
+        "from jaxslam import *; import jax;"
+        "assert not jax._src.xla_bridge._backends; assert not jax.config.jax_enable_x64"
+    )
+    heavy = {"matplotlib", "tyro", "tqdm", "optimistix", "cv2", "evo", "pandas"}
+    assert not (heavy | {"scipy.special", "scipy.spatial"}) & set(modules)

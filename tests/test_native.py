@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxslam
+from jaxslam import native
 from jaxslam._numerics import linalg
 from jaxslam._runtime import programs
 from jaxslam._runtime.programs import Exact
@@ -439,7 +440,7 @@ class Powered(eqx.Module):
 def test_a_filters_fixed_parts_are_the_same_only_by_type_and_bits(monkeypatch):
     """`x ** 2.0` is not the program of `x ** 2`."""
     made = []
-    monkeypatch.setattr(jaxslam.native, "batched", lambda *given: made.append(given))
+    monkeypatch.setattr(native, "batched", lambda *given: made.append(given))
     backends._native_program.cache_clear()
     for power in (2, 2.0, True, 1, 0.0, -0.0, float("nan"), float("nan"), 2, 2.0):
         leaves, structure = jax.tree.flatten(Powered(None, power))

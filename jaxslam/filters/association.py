@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Array, Bool, Float, Int
-from scipy.special import gammaincinv
 
 from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.ekf import EkfSlam, context_of
@@ -354,4 +354,4 @@ def _squared(r: Float[Array, "m p"], S: Float[Array, "m p p"]) -> Float[Array, "
 
 def _chi2_quantile(dof: Any) -> Any:
     """The χ² value below which a true match is with probability `GATE`."""
-    return 2 * gammaincinv(np.asarray(dof) / 2, GATE)
+    return 2 * scipy.special.gammaincinv(np.asarray(dof) / 2, GATE)

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from jaxslam._runtime.files import LARGEST, write_atomically
 
@@ -24,8 +23,19 @@ class Table(NamedTuple):
     lines: tuple[int, ...]
 
 
+def quaternions(R: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
+    """Return rotation matrices as quaternions x, y, z, w, of which w is not negative."""
+    from scipy.spatial.transform import Rotation
+
+    if not len(R):  # Rotation refuses an empty stack
+        return np.empty((0, 4))
+    return Rotation.from_matrix(R).as_quat(canonical=True)
+
+
 def poses(translation: ArrayLike, quaternion: ArrayLike) -> Float[np.ndarray, "n 4 4"]:
     """Poses from positions (n, 3) and quaternions x, y, z, w (n, 4), which get normalised."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
     rotation = Rotation.from_quat(np.asarray(quaternion, dtype=float).reshape(-1, 4))
     result = np.tile(np.eye(4), (len(rotation), 1, 1))
     result[:, :3, :3] = rotation.as_matrix()
@@ -164,8 +174,7 @@ def write_tum(path: str | Path, times: ArrayLike, T_wc: ArrayLike, remark: str =
     T_wc = np.asarray(T_wc, dtype=float).reshape(-1, 4, 4)
     table = np.empty((len(T_wc), 7))
     table[:, :3] = T_wc[:, :3, 3]
-    if len(T_wc):  # Rotation refuses an empty stack
-        table[:, 3:] = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True)
+    table[:, 3:] = quaternions(T_wc[:, :3, :3])
     remark = f"; {remark}" if remark else ""
     header = f"tx ty tz qx qy qz qw (s; camera in the world frame{remark})"
     write_table(path, header, times, table, "poses", ".9f")

@@ -12,12 +12,11 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.spatial.transform import Rotation
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam._runtime.lookup import suggestion
 from jaxslam.geometry import Pose
-from jaxslam.io.tum import read_tum
+from jaxslam.io.tum import quaternions, read_tum
 
 GAP = 0.15
 """Seconds without a pose that are not bridged; or one and a half of a recording's usual steps."""
@@ -102,7 +101,7 @@ def _without_gaps(times: Float[np.ndarray, " n"], T: Float[np.ndarray, "n 4 4"])
     for part in np.split(np.arange(times.size), gaps):
         if part.size >= LEAST:
             # Neighbours have quaternions of one sign, of the two that say the same.
-            turns = Rotation.from_matrix(T[part, :3, :3]).as_quat()
+            turns = quaternions(T[part, :3, :3])
             flips = np.cumprod(np.sign(np.sum(turns[1:] * turns[:-1], axis=1)))
             turns[1:] *= flips[:, None]
             yield times[part], np.hstack([T[part, :3, 3], turns])

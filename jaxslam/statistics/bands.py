@@ -9,8 +9,8 @@ import math
 from dataclasses import astuple, dataclass
 
 import numpy as np
+import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Array, Float
-from scipy.special import gammainc, gammaincc, gammainccinv, gammaincinv, stdtr
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam._numerics.linalg import cholesky
@@ -33,7 +33,7 @@ def normalised_squared(
 
 def chi2_quantile(probability: float, dof: float) -> float:
     """The χ² value with the given probability below it."""
-    return 2 * float(gammaincinv(dof / 2, probability))
+    return 2 * float(scipy.special.gammaincinv(dof / 2, probability))
 
 
 def mean_band(dof: int, runs: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
@@ -56,7 +56,7 @@ def lost_threshold(dof: float, steps: int = 1) -> float:
 
     Of so many `steps` it is above it at any for one run in 10 000, or fewer if they are correlated.
     """
-    return 2 * float(gammainccinv(dof / 2, (1 - LOST_QUANTILE) / steps))
+    return 2 * float(scipy.special.gammainccinv(dof / 2, (1 - LOST_QUANTILE) / steps))
 
 
 def shortfall_limits(dof: float, level: float) -> tuple[float, float]:
@@ -68,10 +68,13 @@ def shortfall_limits(dof: float, level: float) -> tuple[float, float]:
     "Convex majorization with an application to the length of critical paths").
     """
     shape, tail = dof / 2, level / 2
-    least, most = float(gammaincinv(shape, tail)), float(gammainccinv(shape, tail))
+    least, most = (
+        float(scipy.special.gammaincinv(shape, tail)),
+        float(scipy.special.gammainccinv(shape, tail)),
+    )
     return (
-        dof * float(gammainc(shape + 1, least)) / tail,
-        dof * float(gammaincc(shape + 1, most)) / tail,
+        dof * float(scipy.special.gammainc(shape + 1, least)) / tail,
+        dof * float(scipy.special.gammaincc(shape + 1, most)) / tail,
     )
 
 
@@ -148,7 +151,7 @@ def mean_p_value(sums: PowerSums, expected: float) -> float:
     if sums.deviation == 0:
         return float(away == 0)
     t = away / (sums.deviation / math.sqrt(sums.count))
-    return 2 * float(stdtr(sums.count - 1, -abs(_symmetric(t, k))))
+    return 2 * float(scipy.special.stdtr(sums.count - 1, -abs(_symmetric(t, k))))
 
 
 _FAR = 1e50
@@ -192,4 +195,4 @@ def _portmanteau(values: np.ndarray, there: np.ndarray, lags: int) -> float:
     for lag in range(1, lags + 1):
         pairs = max(np.sum(there[:, lag:] & there[:, :-lag]), 1)
         total += (np.sum(values[:, lag:] * values[:, :-lag]) / power) ** 2 / pairs
-    return float(gammaincc(lags / 2, total / 2))
+    return float(scipy.special.gammaincc(lags / 2, total / 2))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
-from scipy.special import stdtr, stdtrit
+import scipy  # of which `special` is imported when it is first used
 
 from jaxslam.statistics.bands import (
     PowerSums,
@@ -125,7 +125,7 @@ class Look:
         if relative is not None:
             apart = 1 - min(mean, nearest) / max(mean, nearest)
             t = apart / relative if relative else math.inf
-            scattered = 2 * float(stdtr(self.sums.count - 1, -t))
+            scattered = 2 * float(scipy.special.stdtr(self.sums.count - 1, -t))
             if mean < nearest:
                 scattered = max(scattered, mean_p_value(self.sums, nearest))
             p = min(p, scattered)
@@ -183,7 +183,7 @@ def _root(factor: float, *, upwards: bool) -> float | None:
 @lru_cache(maxsize=1024)
 def _quantile(dof: int, level: float) -> float:
     """Of Student's t, two-sided."""
-    return float(stdtrit(dof, 1 - level / 2))
+    return float(scipy.special.stdtrit(dof, 1 - level / 2))
 
 
 @lru_cache(maxsize=1024)

@@ -1,0 +1,110 @@
+"""The public names and their modules, for type checkers and for `__init__.py`, which reads them."""
+
+from jaxslam._numerics.arrays import cast
+from jaxslam._version import __version__
+from jaxslam.consistency import monte_carlo, summarise, table
+from jaxslam.evaluation import Convention, Evaluation, evaluate, evaluate_log, evaluate_poses
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.forms.state import State
+from jaxslam.filters.protocol import (
+    AbstractFilter,
+    AbstractStaged,
+    CameraView,
+    Expected,
+    LandmarkView,
+)
+from jaxslam.filters.readouts import (
+    camera_pose,
+    landmark_samples,
+    landmarks_from_above,
+    landmarks_in_camera,
+    landmarks_in_world,
+)
+from jaxslam.filters.registry import FILTERS, make_filter, make_filters, recommended
+from jaxslam.filters.run import Frames, run
+from jaxslam.filters.wrappers.fixed_lag import FixedLag
+from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
+from jaxslam.geometry import PLANAR, SPATIAL
+from jaxslam.landmarks import LANDMARKS
+from jaxslam.models.calibration import (
+    AbstractCalibration,
+    Considered,
+    Estimated,
+    Known,
+    White,
+)
+from jaxslam.models.camera import Camera
+from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import AbstractMotion, BodyRates, ConstantVelocity, Odometry
+from jaxslam.models.observations import Capacity, Features, Innovation, Status
+from jaxslam.models.scale import Metre, ScaleGauge
+from jaxslam.models.sensors import AbstractSensor, Pinhole, Position, RangeBearing
+from jaxslam.simulation import Scenario, scenario, simulate
+from jaxslam.statistics import mean_band
+from jaxslam.tracking.settings import TrackerSettings as TrackerSettings
+from jaxslam.tracking.tracker import Tracker as Tracker
+
+__all__ = [
+    "FILTERS",
+    "KEYFRAME",
+    "LANDMARKS",
+    "PLANAR",
+    "ROBOCENTRIC",
+    "SPATIAL",
+    "WORLD",
+    "AbstractCalibration",
+    "AbstractFilter",
+    "AbstractMotion",
+    "AbstractSensor",
+    "AbstractStaged",
+    "BodyRates",
+    "Camera",
+    "CameraView",
+    "Capacity",
+    "Considered",
+    "ConstantVelocity",
+    "Convention",
+    "EkfSlam",
+    "Estimated",
+    "Evaluation",
+    "Expected",
+    "Features",
+    "FixedLag",
+    "Frames",
+    "GaussianSum",
+    "Innovation",
+    "InverseDepth",
+    "Known",
+    "LandmarkView",
+    "Metre",
+    "Odometry",
+    "Pinhole",
+    "Position",
+    "RangeBearing",
+    "ScaleGauge",
+    "Scenario",
+    "State",
+    "Status",
+    "White",
+    "__version__",
+    "camera_pose",
+    "cast",
+    "evaluate",
+    "evaluate_log",
+    "evaluate_poses",
+    "landmark_samples",
+    "landmarks_from_above",
+    "landmarks_in_camera",
+    "landmarks_in_world",
+    "make_filter",
+    "make_filters",
+    "mean_band",
+    "monte_carlo",
+    "recommended",
+    "run",
+    "scenario",
+    "simulate",
+    "summarise",
+    "table",
+]
