@@ -34,16 +34,16 @@ class Map:
 
     @property
     def deleted(self) -> int:
-        """Landmarks that were given up so far."""
+        """The number of landmarks that were given up so far."""
         return sum(len(points.numbers) for points in self.finished)
 
     @property
     def created(self) -> int:
-        """Landmarks so far."""
+        """The number of landmarks so far."""
         return self.deleted + len(self.landmarks)
 
     def points(self) -> Points:
-        """All landmarks, those gone included."""
+        """Return all landmarks, those gone included."""
         return joined([*self.finished, self._recorded(sorted(self.landmarks))])
 
     def note(self, seen: Observations) -> None:
@@ -86,8 +86,10 @@ class Map:
     def fall_back(self, predicted: Predicted) -> None:
         """Give up all landmarks and go on by what prediction alone says of the camera: the update
         had a covariance that is not positive. The landmarks are those of the frame before."""
-        self.give_up(sorted(self.landmarks))
+        slots = sorted(self.landmarks)
+        recorded = self._recorded(slots)
         self.coast(predicted)
+        self.give_up(slots, recorded)
 
     def coast(self, predicted: Predicted) -> None:
         """Go on without a measurement. Where that is broken too, the camera is as far from where it
@@ -136,7 +138,7 @@ class Map:
         self.measure_unit()
 
     def _nearness(self) -> Nearness:
-        """Of all landmarks, as long as the filter's unit is not fixed."""
+        """Return the nearness of all landmarks, as long as the filter's unit is not fixed."""
         if self.place.unit_fixed:
             return {}
         numbers = {slot: one.number for slot, one in self.landmarks.items()}

@@ -333,6 +333,27 @@ def test_a_filter_that_fails_is_begun_anew_from_what_prediction_says(broken, mon
     assert np.all(added[second, -1] > start.covariance[:3, :3].diagonal().min())
 
 
+def test_a_filter_that_fails_in_the_dark_begins_anew_when_there_is_light(monkeypatch):
+    """Until then the filter has no landmarks that the map has given up."""
+    source = synthetic_source(frames=5, width=320, height=240)
+    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=4))
+    whole, results = programs._correct, []
+
+    def failing(*arguments):
+        state, (*result, status) = whole(*arguments)
+        fails = frame.index == 2 and not tracker.failed
+        return state, (*result, Status.NOT_POSITIVE if fails else status)
+
+    monkeypatch.setattr(programs, "_correct", failing)
+    for frame in source:
+        dark = frame.index in (2, 3)
+        image = np.zeros_like(frame.image) if dark else frame.image
+        results.append(tracker.track(replace(frame, image=image)))
+    assert [result.state for result in results] == ["start", "tracked", "lost", "lost", "start"]
+    assert len(results[3].predicted) == 0
+    assert tracker.created == len(tracker.points().numbers)
+
+
 def test_matches_too_few_to_believe_change_nothing(monkeypatch):
     source = synthetic_source(frames=2)
     settings = TrackerSettings(filter="world", wanted=12, spare=4)
