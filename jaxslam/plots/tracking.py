@@ -116,29 +116,6 @@ def plot_map(
     return figure
 
 
-def plot_path(
-    trajectory: ArrayLike,
-    *,
-    ax: Axes,
-    label: str = "estimate",
-    lost: ArrayLike = (),
-    unit: str = "m",
-) -> Axes:
-    """The path of poses T_wc (n, 4, 4) from above: x to the right, z up, in `unit`.
-
-    Ticks point where the camera looks; dotted where it was `lost`, true or false for each pose.
-    """
-    poses = np.asarray(trajectory, dtype=float).reshape(-1, 4, 4)
-    hidden = np.resize(np.asarray(lost, dtype=bool), len(poses))
-    panel = _Panel("from above", [0, 2], _view(poses[:, :3, 3], np.empty((0, 3))))
-    estimate, *predicted = _lines(poses, hidden, np.empty(0, int))
-    for name, line, colour, style in [(label, *estimate[1:]), *predicted]:
-        ax.plot(*line[:, panel.plane].T, style, color=colour, lw=1.6, label=name)
-    _draw_directions(ax, panel, poses)
-    _set_axes(ax, panel, unit)
-    return ax
-
-
 def _lines(
     poses: Float[np.ndarray, "n 4 4"], lost: Bool[np.ndarray, " n"], begun: Int[np.ndarray, " b"]
 ) -> list[tuple[str, np.ndarray, str, str]]:

@@ -1,26 +1,30 @@
-"""Image patches, tracking and what is written of it; needs the extra `vision`."""
+"""A camera tracked through a video, and what is written of it; needs the extra `vision`."""
 
 from importlib import import_module
 from typing import Any
 
 _MODULES = {
+    "Tracked": "report",
     "Tracker": "tracker",
     "TrackerSettings": "settings",
     "track": "video",
     "describe": "summary",
     "synthetic_source": "synthetic",
     "read_ply": "pointcloud",
-    "seen_from": "projection",
+    "read_target": "target",
+    "seen_from": "pointcloud",
     "absolute_trajectory_error": "trajectory",
     "relative_pose_error": "trajectory",
 }
 """Where each name is that is imported only when it is asked for."""
 __all__ = [
+    "Tracked",
     "Tracker",
     "TrackerSettings",
     "absolute_trajectory_error",
     "describe",
     "read_ply",
+    "read_target",
     "relative_pose_error",
     "seen_from",
     "synthetic_source",

@@ -4,10 +4,28 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+from jaxslam.tracking.settings import TrackerSettings
+
 _CELLS = (8, 6)  # columns and rows of the grid that corners are spread over
 _BLOCK = 5  # side of the window that a corner's strength is summed over, in pixels
 _QUALITY = 0.01  # weakest corner, as a share of the strongest one's least eigenvalue
 _MIN_EIGENVALUE = 2e-5  # weakest corner at all, where the strongest one is only noise
+
+
+def bare_corners(
+    image: UInt8[np.ndarray, "h w"],
+    settings: TrackerSettings,
+    occupied: Float[np.ndarray, "k 2"] | None = None,
+) -> Float[np.ndarray, "n 2"]:
+    """Corners where the picture is bare; for a whole map where nothing says what is `occupied`."""
+    s, wanted = settings, settings.wanted
+    if occupied is None:
+        occupied = np.zeros((0, 2))
+    else:
+        wanted = min(s.new_per_frame, s.wanted - len(occupied))
+    return detect_corners(
+        image, wanted, occupied=occupied, min_distance=s.spacing, border=2 * s.border
+    ).astype(float)
 
 
 def detect_corners(
@@ -18,7 +36,7 @@ def detect_corners(
     min_distance: float,
     border: int,
 ) -> Float32[np.ndarray, "n 2"]:
-    """Up to `count` new Shi-Tomasi corners (n, 2), sub-pixel, spread over the image.
+    """Return up to `count` new Shi-Tomasi corners (n, 2), sub-pixel, spread over the image.
 
     Each one is the strongest of the cell of a grid that holds fewest points so far, `occupied`
     ones included. None is within `min_distance` pixels of another one or of an occupied point,
@@ -75,7 +93,7 @@ def _within(points: Float32[np.ndarray, "n 2"], shape: tuple[int, ...], border: 
 def _farther(
     points: Float32[np.ndarray, "n 2"], others: Float32[np.ndarray, "k 2"], distance: float
 ) -> np.ndarray:
-    """Whether each point is as far as that from all others."""
+    """Return whether each point is as far as that from all others."""
     x, y = (points[:, None, i] - others[:, i] for i in (0, 1))
     return np.all(x * x + y * y >= distance**2, axis=1)
 

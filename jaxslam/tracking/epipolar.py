@@ -17,7 +17,7 @@ def of_one_motion(
     calibration: Calibration,
     sigma: float,
 ) -> Bool[np.ndarray, " m"]:
-    """Those near the epipolar lines of the essential matrix with the most of them near, by
+    """Return those near the epipolar lines of the essential matrix with the most of them near, by
     MAGSAC++ (Barath et al., CVPR 2020) in OpenCV; `sigma` is a pixel's. None of fewer than six.
 
     Neither a prior on depth nor one on the motion is needed, and no linear prediction.

@@ -6,6 +6,7 @@ Features beyond those that there are have no valid pixel, so that no frame compi
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -54,7 +55,7 @@ class Predicted(NamedTuple):
 
 
 class Correction(NamedTuple):
-    """What an update made of the features."""
+    """The outcome of an update."""
 
     used: np.ndarray
     """Whether each was used."""
@@ -70,7 +71,7 @@ class Correction(NamedTuple):
 
 
 class CameraReport(NamedTuple):
-    """Where the filter says that its camera is, in its own unit, from where the map begins."""
+    """The filter's estimate of its camera, in its own unit, from where the map begins."""
 
     T_wc: np.ndarray
     covariance: np.ndarray
@@ -97,7 +98,8 @@ class Estimator:
         self.state = _empty(self.slam, self.settings.capacity)
 
     def predict(self, seconds: float | jax.Array) -> Predicted:
-        """What the filter expects so many seconds after the frame before. Changes nothing."""
+        """Return what the filter expects so many seconds after the frame before. Changes
+        nothing."""
         # A number of Python's would be compiled into the program.
         dt = jnp.asarray(seconds)
         (state, gaussian), view = _predict(self.slam, self.state, dt)
@@ -121,7 +123,7 @@ class Estimator:
     ) -> Correction:
         """Update a prediction by pixels, NaN where there is none, and move into the new camera.
         Changes nothing where that has `failed`."""
-        features = self._features(slots, pixels)
+        features = _padded(slots, pixels, self.settings.wanted)
         state, correction = _correct(self.slam, predicted.state, predicted.dt, features)
         correction = Correction(*jax.device_get(correction))
         if not correction.failed:
@@ -136,16 +138,14 @@ class Estimator:
     ) -> CameraReport:
         """Begin a map with landmarks at these pixels; `depths` are means and σ of 1/z of all
         features, where they are known."""
-        start = _begin_map
-        if depths is not None:
-            start = partial(_begin_known, jax.tree.map(jnp.asarray, depths))
-        self.state, report = start(self.slam, self.state, self._features(slots, pixels))
-        return CameraReport(*jax.device_get(report))
+        if depths is None:
+            return self._created(_begin_map, slots, pixels)
+        known = jax.tree.map(jnp.asarray, depths)
+        return self._created(partial(_begin_known, known), slots, pixels)
 
     def renew(self, slots: Int[np.ndarray, " k"], pixels: Float[np.ndarray, "k 2"]) -> CameraReport:
         """End the frame with new landmarks at these pixels."""
-        self.state, report = _renew_map(self.slam, self.state, self._features(slots, pixels))
-        return CameraReport(*jax.device_get(report))
+        return self._created(_renew_map, slots, pixels)
 
     def remove(self, slots: list[int]) -> None:
         """Marginalise the landmarks in these slots."""
@@ -157,8 +157,8 @@ class Estimator:
         return jax.device_get(_world_points(self.slam, self.state, self.settings.capacity))
 
     def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
-        """How the calibration is treated, and fx, fy, cx, cy with their covariance, pixels. None of
-        a filter without a pinhole camera."""
+        """Return how the calibration is treated, and fx, fy, cx, cy with their covariance, pixels.
+        None of a filter without a pinhole camera."""
         inner = self.slam.unwrapped
         if not isinstance(inner, EkfSlam) or not isinstance(inner.sensor, Pinhole):
             return None
@@ -166,9 +166,9 @@ class Estimator:
         return inner.calibration.name, mean, covariance
 
     def compile(self, wide: list[Association]) -> list[threading.Thread]:
-        """Have all programs compiled by two threads, in the order in which they are needed."""
+        """Start two threads that compile all programs in the order in which they are needed."""
         slam, state, dt = self.slam, self.state, jnp.zeros(())
-        new = self._features(*_NOWHERE)
+        new = _padded(*_NOWHERE, self.settings.wanted)
         gone = jnp.zeros(self.settings.capacity, bool)
 
         def predicted() -> Predicted:
@@ -199,15 +199,22 @@ class Estimator:
         pixels: Float[np.ndarray, "m 2"],
         wide: Association | None,
     ) -> tuple[Any, ...]:
-        """What `_believed` is given."""
+        """Return what `_believed` is given."""
         s, several = self.settings, wide is not None
         features = _padded(slots, pixels, s.wanted * (PEAKS if several else 1))
         tolerance = jnp.asarray(s.tolerance * s.pixel_sigma)
         association = ASSOCIATIONS[s.association] if wide is None else wide
         return self.slam, association, several, *predicted[1:3], predicted.dt, features, tolerance
 
-    def _features(self, slots: Int[np.ndarray, " k"], pixels: Float[np.ndarray, "k 2"]) -> Features:
-        return _padded(slots, pixels, self.settings.wanted)
+    def _created(
+        self,
+        create: Callable[..., tuple[State, Report]],
+        slots: Int[np.ndarray, " k"],
+        pixels: Float[np.ndarray, "k 2"],
+    ) -> CameraReport:
+        new = _padded(slots, pixels, self.settings.wanted)
+        self.state, report = create(self.slam, self.state, new)
+        return CameraReport(*jax.device_get(report))
 
 
 def _padded(slots: Int[np.ndarray, " k"], pixels: Float[np.ndarray, "k 2"], size: int) -> Features:

@@ -28,7 +28,7 @@ class Aside:
         return self
 
     def give(self, function: Callable[..., Any], *arguments: Any) -> None:
-        """Have `function(*arguments)` done, some time."""
+        """Queue `function(*arguments)`."""
         while self._waiting and (len(self._waiting) >= WAITING or self._waiting[0].done()):
             self._waiting.popleft().result()
         self._waiting.append(self._thread.submit(function, *arguments))

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxslam.tracking.patches import STORED, Patch
 
@@ -16,7 +15,7 @@ _COUNTS = ("number", "missed", "unseen", "found")
 
 @dataclass
 class Landmark:
-    """What the picture side remembers of the landmark in a slot."""
+    """The appearance and the record of the landmark in a slot."""
 
     number: int
     patch: Patch
@@ -72,42 +71,32 @@ def joined(parts: list[Points]) -> Points:
 
 
 def stacked(landmarks: Mapping[int, Landmark]) -> dict[str, np.ndarray]:
-    """Arrays of k landmarks in order of their entries, for a file."""
-    kept = list(landmarks.values())
-    cameras = [landmark.first_camera for landmark in kept]
-    counts = [[getattr(landmark, name) for name in _COUNTS] for landmark in kept]
-    patches = [landmark.patch for landmark in kept]
+    """Return arrays of k landmarks in order of their entries, for a file."""
+    kept, count = list(landmarks.values()), len(landmarks)
+    counts = [[getattr(one, name) for name in _COUNTS] for one in kept]
     return {
         "slots": np.array(list(landmarks), int),
-        "counts": np.array(counts, int).reshape(-1, len(_COUNTS)),
-        "success": np.array([landmark.success for landmark in kept], float),
-        "first_cameras": np.array(cameras, float).reshape(-1, 4, 4),
-        "seen_at": np.array([landmark.seen_at for landmark in kept], float).reshape(-1, 2),
-        "pixels": np.array([patch.pixel for patch in patches], float).reshape(-1, 2),
-        "stored": np.array([patch.stored for patch in patches], np.float32).reshape(
-            -1, STORED, STORED
+        "counts": np.array(counts, int).reshape(count, len(_COUNTS)),
+        "success": np.array([one.success for one in kept], float),
+        "first_cameras": np.array([one.first_camera for one in kept]).reshape(count, 4, 4),
+        "seen_at": np.array([one.seen_at for one in kept], float).reshape(count, 2),
+        "pixels": np.array([one.patch.pixel for one in kept], float).reshape(count, 2),
+        "stored": np.array([one.patch.stored for one in kept], np.float32).reshape(
+            count, STORED, STORED
         ),
     }
 
 
 def unstacked(arrays: Mapping[str, np.ndarray]) -> dict[int, Landmark]:
-    """What `stacked` was made of."""
-    rows = zip(*(arrays[name] for name in _FIELDS), strict=True)
-    return {int(slot): _restored(*row) for slot, *row in rows}
-
-
-_FIELDS = ("slots", "counts", "success", "first_cameras", "seen_at", "pixels", "stored")
-
-
-def _restored(
-    counts: np.ndarray,
-    success: float,
-    first_camera: Float[np.ndarray, "4 4"],
-    seen_at: Float[np.ndarray, " 2"],
-    pixel: Float[np.ndarray, " 2"],
-    stored: np.ndarray,
-) -> Landmark:
-    patch, named = Patch(pixel, stored), dict(zip(_COUNTS, counts.tolist(), strict=True))
-    return Landmark(
-        patch=patch, first_camera=first_camera, seen_at=seen_at, success=float(success), **named
-    )
+    """Return what `stacked` was made of."""
+    landmarks = {}
+    names = ("slots", "counts", "success", "first_cameras", "seen_at", "pixels", "stored")
+    for slot, counts, success, first_camera, seen_at, pixel, stored in zip(
+        *(arrays[name] for name in names), strict=True
+    ):
+        number, *others = counts.tolist()
+        patch = Patch(pixel, stored)
+        landmarks[int(slot)] = Landmark(
+            number, patch, first_camera, seen_at, float(success), *others
+        )
+    return landmarks

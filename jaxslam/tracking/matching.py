@@ -9,6 +9,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
+GATE = 9.21
+"""The 99 % quantile of χ² with two degrees of freedom."""
+THRESHOLD = 0.8
+"""Least correlation of a match."""
 _ITERATIONS = 3
 _MAX_SHIFT = 1.5  # pixels: a refinement that moves further than this has left its peak
 _WIDEST = 0.25  # of the picture's width: an ellipse is searched no further from its centre
@@ -50,19 +54,17 @@ def match_patches(
     centres: Float[np.ndarray, "n 2"],
     covariances: Float[np.ndarray, "n 2 2"],
     *,
-    gate: float = 9.21,
-    threshold: float = 0.8,
     max_radius: float | None = None,
     ambiguity: float = 0.05,
     several: bool = True,
 ) -> Matches:
     """Active search: the places most like each template within the ellipse of its prediction.
 
-    Looks where (x - centre)' covariance^-1 (x - centre) <= `gate` (a quantile of chi2 with two
+    Looks where (x - centre)' covariance^-1 (x - centre) <= `GATE` (a quantile of chi2 with two
     degrees of freedom), at most `max_radius` pixels from the centre along each axis (by default
     a quarter of the image's width: a wider ellipse is cut there), for peaks of the zero-mean
     normalised cross-correlation, and refines them to sub-pixel. In a narrow ellipse that is the
-    best peak; none where it does not reach `threshold`, or where a second one comes within
+    best peak; none where it does not reach `THRESHOLD`, or where a second one comes within
     `ambiguity` of its score (0: never ambiguous). A wide ellipse is searched in the image of half
     the size, and around the highest peaks there again in the whole one; as the best of many peaks
     often is another place, `several` are told, up to `PEAKS`, best first, for who knows what else
@@ -71,17 +73,17 @@ def match_patches(
     if not len(templates):
         return Matches(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, np.float32))
     whole, half = image.astype(np.float32), templates.shape[1] // 2
-    ellipses = _Ellipses.of(centres, covariances, gate)
+    ellipses = _Ellipses.of(centres, covariances)
     reach = _WIDEST * image.shape[1] if max_radius is None else max_radius
     boxes = _boxes_around(ellipses, reach, half, image.shape)
-    least = threshold - ambiguity
+    least = THRESHOLD - ambiguity
     wide = boxes.owner[boxes.large()]
     boxes = _narrowed(image, templates, ellipses, boxes, least)
     peaks = _peaks(whole, templates, boxes, least)
     peaks = peaks.only(ellipses.hold(peaks.owner, peaks.pixels))
     peaks = peaks.only(np.lexsort((-peaks.scores, peaks.owner)))
     in_wide = several & np.isin(peaks.owner, wide)
-    alone = _alone(peaks.only(~in_wide), threshold, ambiguity)
+    alone = _alone(peaks.only(~in_wide), ambiguity)
     chosen = alone.joined(_several(peaks.only(in_wide)))
     chosen = chosen.only(np.argsort(chosen.owner, kind="stable"))
     pixels = chosen.pixels + _quadratic_peaks(chosen.around)
@@ -133,7 +135,7 @@ def _windows(
 def _gauss_newton_steps(
     templates: Float32[np.ndarray, "n window window"],
 ) -> Float32[np.ndarray, "n 2 m"]:
-    """What takes each window of unit norm to the shift (2,) it shows against its template.
+    """Return what takes each window of unit norm to the shift (2,) it shows against its template.
 
     The rows are orthogonal to constants and to the template's inside (m values), so they see
     the residual without its mean and gain. Zero for a template without texture in two
@@ -158,37 +160,36 @@ def _gauss_newton_steps(
 
 
 class _Ellipses(NamedTuple):
-    """n ellipses (x - centre)' covariance^-1 (x - centre) <= gate; NaN for one that is none."""
+    """n ellipses (x - centre)' covariance^-1 (x - centre) <= GATE; NaN for one that is none."""
 
     centres: Float[np.ndarray, "n 2"]
     uu: Float[np.ndarray, " n"]
     uv: Float[np.ndarray, " n"]
     vv: Float[np.ndarray, " n"]
-    gate: float
 
     @classmethod
     def of(
-        cls, centres: Float[np.ndarray, "n 2"], covariances: Float[np.ndarray, "n 2 2"], gate: float
+        cls, centres: Float[np.ndarray, "n 2"], covariances: Float[np.ndarray, "n 2 2"]
     ) -> "_Ellipses":
         # Half a pixel's diagonal wider, else a tiny ellipse could hold no whole pixel.
-        uu, vv = covariances[:, 0, 0] + 0.5 / gate, covariances[:, 1, 1] + 0.5 / gate
+        uu, vv = covariances[:, 0, 0] + 0.5 / GATE, covariances[:, 1, 1] + 0.5 / GATE
         uv = covariances[:, 0, 1]
         some = (uu > 0) & (vv > 0) & (uu * vv > uv * uv)
         centres = np.where((some & np.isfinite(centres).all(axis=1))[:, None], centres, np.nan)
-        return cls(centres, uu, uv, vv, gate)
+        return cls(centres, uu, uv, vv)
 
     def reach(self) -> Float[np.ndarray, "n 2"]:
-        """How far each goes from its centre along u and v, pixels."""
+        """Return how far each goes from its centre along u and v, pixels."""
         variances = np.stack([self.uu, self.vv], axis=1)
-        return np.sqrt(self.gate * np.maximum(variances, 0.0))
+        return np.sqrt(GATE * np.maximum(variances, 0.0))
 
     def hold(
         self, which: Int[np.ndarray, " m"], pixels: Int[np.ndarray, "m 2"]
     ) -> Bool[np.ndarray, " m"]:
-        """Whether each pixel lies within the ellipse that `which` says."""
+        """Return whether each pixel lies within the ellipse that `which` says."""
         x, y = (pixels - self.centres[which]).T
         uu, uv, vv = self.uu[which], self.uv[which], self.vv[which]
-        return (vv * x - 2 * uv * y) * x + uu * y * y <= self.gate * (uu * vv - uv * uv)
+        return (vv * x - 2 * uv * y) * x + uu * y * y <= GATE * (uu * vv - uv * uv)
 
 
 class _Boxes(NamedTuple):
@@ -211,15 +212,15 @@ class _Boxes(NamedTuple):
         return self.sizes.prod(axis=1) > _NARROW
 
     def large_enough(self) -> "_Boxes":
-        """Those of three pixels each way: a peak needs a neighbour on either side."""
+        """Return those of three pixels each way: a peak needs a neighbour on either side."""
         return self.only(np.all(self.sizes >= 3, axis=1))
 
 
 def _boxes_around(
     ellipses: _Ellipses, max_reach: float, half: int, shape: tuple[int, ...]
 ) -> _Boxes:
-    """What to score for each ellipse: all of it, and one pixel more all around to tell a peak on
-    the rim by; as far as windows of `half` pixels to each side are within the picture."""
+    """Return what to score for each ellipse: all of it, and one pixel more all around to tell a
+    peak on the rim by; as far as windows of `half` pixels to each side are within the picture."""
     some = np.flatnonzero(np.isfinite(ellipses.centres + ellipses.reach()).all(axis=1))
     middle, reach = ellipses.centres[some], np.minimum(ellipses.reach()[some], max_reach)
     last = np.array(shape[::-1]) - 1 - half
@@ -269,18 +270,19 @@ def _peaks(
     return found.only(found.scores == around.max(axis=1))
 
 
-def _alone(peaks: _Peaks, threshold: float, ambiguity: float) -> _Peaks:
+def _alone(peaks: _Peaks, ambiguity: float) -> _Peaks:
     """The best peak of each patch, of those that have one which is high enough and alone; of peaks
     in order of patches, best first."""
     _, first, of = np.unique(peaks.owner, return_index=True, return_inverse=True)
     best = peaks.only(first)
     apart = (np.abs(peaks.pixels - best.pixels[of]) > _APART).any(axis=1)
     rivals = peaks.owner[apart & (peaks.scores > best.scores[of] - ambiguity)]
-    return best.only((best.scores >= threshold) & ~np.isin(best.owner, rivals))
+    return best.only((best.scores >= THRESHOLD) & ~np.isin(best.owner, rivals))
 
 
 def _several(peaks: _Peaks) -> _Peaks:
-    """Up to `PEAKS` peaks of each patch, apart from one another; of peaks in the same order."""
+    """Return up to `PEAKS` peaks of each patch, apart from one another; of peaks in the same
+    order."""
     kept: list[int] = []
     for i, (owner, pixel, score) in enumerate(zip(*peaks[:3], strict=True)):
         better = [j for j in kept[-PEAKS:] if peaks.owner[j] == owner]
@@ -382,7 +384,7 @@ _QUADRATIC = np.linalg.pinv(
 
 
 def _quadratic_peaks(around: Float32[np.ndarray, "k 9"]) -> Float[np.ndarray, "k 2"]:
-    """Where paraboloids fitted to 3x3 scores peak, from the middle one, within one pixel."""
+    """Return where paraboloids fitted to 3x3 scores peak, from the middle one, within one pixel."""
     _, bx, by, cxx, cxy, cyy = _QUADRATIC @ around.T
     determinant = 4 * cxx * cyy - cxy**2
     peaked = (cxx < 0) & (determinant > 0)

@@ -1,4 +1,4 @@
-"""What a tracker expects to see in a frame and what it saw: tables, a row for each landmark."""
+"""The tables of a frame, a row for each landmark: what is expected, and what was seen."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 
 class Prediction(NamedTuple):
-    """What the filter expects to see, a row for each slot of its map."""
+    """The view that the filter expects, a row for each slot of its map."""
 
     pixels: np.ndarray
     """(n, 2)."""
@@ -47,7 +47,7 @@ class Observations(NamedTuple):
 
     @property
     def believed(self) -> Float[np.ndarray, "k 2"]:
-        """Pixels of what is matched, NaN of the others."""
+        """The pixels of what is matched, NaN of the others."""
         return np.where(self.matched[:, None], self.pixels, np.nan)
 
     @property

@@ -54,7 +54,7 @@ def _notes(result: Tracked) -> tuple[str, str]:
 
 
 def _banner(result: Tracked) -> str:
-    """What nobody is to overlook: nothing while all is well."""
+    """Return what nobody is to overlook: nothing while all is well."""
     if result.starts:
         return f"LOST: MAP {result.map} BEGINS" if result.lost else ""
     return "" if result.state == "tracked" else result.state.upper()
@@ -112,7 +112,7 @@ def _draw(
 def _draw_marks(
     canvas: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "k 2"], status: str
 ) -> None:
-    """Where landmarks were found."""
+    """Mark where landmarks were found."""
     if status in ("outlier", "new"):
         shape = _CROSS if status == "outlier" else _SQUARE
         lines = pixels[:, None, None] + shape
@@ -142,7 +142,7 @@ def _dashes(lines: Float[np.ndarray, "k p 2"]) -> Float[np.ndarray, "d q 2"]:
 def _draw_lines(
     canvas: UInt8[np.ndarray, "h w 3"], lines: Float[np.ndarray, "k p 2"], status: str
 ) -> None:
-    """With a dark seam, so that they stand out on what is bright too."""
+    """Draw lines with a dark seam, so that they stand out on what is bright too."""
     fixed = list(_fixed(lines))
     cv2.polylines(canvas, fixed, False, (0, 0, 0), 3, cv2.LINE_8, _SHIFT)
     cv2.polylines(canvas, fixed, False, COLOURS[status], 1, cv2.LINE_AA, _SHIFT)
@@ -177,7 +177,7 @@ def _legend(
 
 
 def _draw_symbol(strip: UInt8[np.ndarray, "strip w 3"], status: str, x: int, y: int) -> None:
-    """What a landmark of this status looks like."""
+    """Draw what a landmark of this status looks like."""
     centre, nothing = np.array([[x + 7.0, y]]), np.full((1, 2), np.nan)
     away = {"matched": 2.0, "outlier": 5.0, "new": 0.0}
     found = centre + np.array([away[status], 0.0]) if status in away else nothing

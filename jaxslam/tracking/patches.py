@@ -19,42 +19,30 @@ class Patch:
     """The neighbourhood of a landmark in the image where it was first seen.
 
     `pixel` (u, v) is where; `stored` is the grey patch sampled with that sub-pixel position in
-    its very centre, float32 (stored, stored); `window` the side of the part that is matched.
+    its very centre, float32 (`STORED`, `STORED`), of whose middle `WINDOW` pixels are matched.
     """
 
     pixel: Float[np.ndarray, " 2"]
     stored: Float32[np.ndarray, "stored stored"] = field(repr=False)
-    window: int = WINDOW
 
     @classmethod
-    def take(
-        cls,
-        image: UInt8[np.ndarray, "h w"],
-        pixel: Float[np.ndarray, " 2"],
-        window: int = WINDOW,
-        stored: int = STORED,
-    ) -> "Patch":
-        """The patch around `pixel`; beyond the image's edge its last row or column repeats."""
-        if window % 2 == 0 or stored % 2 == 0 or not 3 <= window <= stored:
-            raise ValueError(
-                f"window {window}, stored {stored}: odd sides, 3 <= window <= stored, are accepted"
-            )
-        pixel = np.asarray(pixel, dtype=float)
-        sampled = cv2.getRectSubPix(
-            image, (stored, stored), (float(pixel[0]), float(pixel[1])), patchType=cv2.CV_32F
-        )
-        return cls(pixel, sampled, window)
+    def take(cls, image: UInt8[np.ndarray, "h w"], pixel: Float[np.ndarray, " 2"]) -> "Patch":
+        """Cut out the patch around `pixel`; beyond the image's edge its last row or column
+        repeats."""
+        u, v = pixel.tolist()
+        size = (STORED, STORED)
+        return cls(pixel, cv2.getRectSubPix(image, size, (u, v), patchType=cv2.CV_32F))
 
     def covers(self, affine: Float[np.ndarray, "2 2"]) -> bool:
-        """Whether `warped` finds all it needs within the stored patch."""
+        """Return whether `warped` finds all it needs within the stored patch."""
         inverse = _inverse(affine)
         if inverse is None:
             return False
         reach = max(abs(inverse[0]) + abs(inverse[1]), abs(inverse[2]) + abs(inverse[3]))
-        return reach * (self.window // 2) <= self.stored.shape[0] // 2
+        return reach * (WINDOW // 2) <= STORED // 2
 
     def warped(self, affine: Float[np.ndarray, "2 2"]) -> Float32[np.ndarray, "window window"]:
-        """How the window looks after the image around the patch was mapped by `affine`.
+        """Return how the window looks after the image around the patch was mapped by `affine`.
 
         `affine` takes pixel offsets in the first image to those in the present one, so the
         result at offset x is the stored patch at affine^-1 x. Where the patch shrinks it is
@@ -64,7 +52,7 @@ class Patch:
         if inverse is None:
             raise ValueError("the affine map is singular; an invertible 2x2 matrix is accepted")
         a, b, c, d = inverse
-        centre, middle = self.stored.shape[0] // 2, self.window // 2
+        centre, middle = STORED // 2, WINDOW // 2
         stored = self.stored
         squares, determinant = a * a + b * b + c * c + d * d, a * d - b * c
         # The square of the inverse's largest singular value: how much the patch shrinks.
@@ -76,7 +64,7 @@ class Patch:
             np.array(
                 [[a, b, centre - (a + b) * middle], [c, d, centre - (c + d) * middle]], np.float64
             ),
-            (self.window, self.window),
+            (WINDOW, WINDOW),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,
         )

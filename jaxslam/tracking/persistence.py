@@ -45,7 +45,7 @@ NUMBERS = {
 
 @runtime_checkable
 class Resumable(Protocol):
-    """What is kept of a tracker, beside its `NUMBERS`."""
+    """The parts of a tracker that are kept, beside its `NUMBERS`."""
 
     calibration: Calibration
     settings: TrackerSettings

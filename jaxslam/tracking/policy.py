@@ -121,8 +121,9 @@ class Policy:
         moved: Float[np.ndarray, "k 2"],
         agree: Bool[np.ndarray, " k"],
     ) -> bool:
-        """Whether too many proven landmarks are found elsewhere than those that agree; `moved` is
-        where all were found from where they were expected, NaN of those that were not."""
+        """Return whether too many proven landmarks are found elsewhere than those that agree;
+        `moved` is where all were found from where they were expected, NaN of those that were
+        not."""
         if agree.any():
             proven = np.array([one.found >= PROVEN for one in landmarks], bool)
             proven &= np.isfinite(moved[:, 0])
@@ -141,7 +142,8 @@ class Policy:
         agree: Agreement,
         least: int,
     ) -> Int[np.ndarray, " m"]:
-        """Those that agree, of landmarks with several places each, if they are `least` at least.
+        """Return those that agree, of landmarks with several places each, if they are `least` at
+        least.
 
         Where ellipses are wide, depth and direction make of a prediction what is not linear: those
         that agree but for that, and with one motion, are what a linear test is given. One that puts
@@ -176,7 +178,7 @@ class Policy:
         return lately, rigid
 
     def _astray(self, ellipses: Float[np.ndarray, "k 2 2"]) -> bool:
-        """Whether most landmarks are expected too widely."""
+        """Return whether most landmarks are expected too widely."""
         if not len(ellipses):
             return False
         longest = np.sqrt(np.linalg.eigvalsh(ellipses)[:, -1])
@@ -189,7 +191,7 @@ def more_than_chance(searched: int) -> int:
 
 
 def _alone(owner: Int[np.ndarray, " m"], among: Bool[np.ndarray, " m"]) -> Int[np.ndarray, " n"]:
-    """Those among these whose owner has no other one there."""
+    """Return those among these whose owner has no other one there."""
     some = np.flatnonzero(among)
     _, of, count = np.unique(owner[some], return_inverse=True, return_counts=True)
     return some[count[of] == 1]

@@ -1,4 +1,4 @@
-"""Where a camera is and how surely, and what is known relative to it carried into the world.
+"""A camera's pose with its covariance, and what is known relative to it, in the world.
 
 `T_wc` takes the camera's coordinates to the world's. The true pose is `T_wc Exp(e)`, e ~ N(0, P):
 position in the camera's axes, then rotation.
@@ -31,7 +31,7 @@ class PoseWithCovariance:
 
     @property
     def position_covariance(self) -> Float[np.ndarray, "3 3"]:
-        """Of the position, in the world's axes."""
+        """The covariance of the position, in the world's axes."""
         R = self.T_wc[:3, :3]
         return R @ self.covariance[:3, :3] @ R.T
 
@@ -48,7 +48,7 @@ class PoseWithCovariance:
         )
 
     def scaled(self, scale: float) -> PoseWithCovariance:
-        """In a unit of length that is 1/scale as long."""
+        """Return the pose in a unit of length that is 1/scale as long."""
         T_wc, lengths = self.T_wc.copy(), np.array([scale] * 3 + [1.0] * 3)
         T_wc[:3, 3] *= scale
         return PoseWithCovariance(T_wc, lengths[:, None] * self.covariance * lengths)

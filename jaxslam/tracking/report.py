@@ -1,4 +1,4 @@
-"""What a tracker says of each frame, and its file."""
+"""The report of a tracker on each frame, and its file."""
 
 from __future__ import annotations
 
@@ -23,10 +23,12 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class Tracked:
-    """What became of one frame; k landmarks were searched, j created."""
+    """The result of one frame; k landmarks were searched, j created."""
 
     index: int
+    """Of the frame in its video."""
     time: float
+    """Of the frame, s."""
     camera: PoseWithCovariance
     """The camera in the world, which is the first camera; of a later map, by way of its start. All
     of a map in one unit (docs/gauge.md), and the covariance is of the pose in that unit."""
@@ -35,7 +37,9 @@ class Tracked:
     created: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     """Pixels of new landmarks, (j, 2)."""
     nis: float = 0.0
+    """The normalised innovation squared of all matches …"""
     nis_dof: int = 0
+    """… and its degrees of freedom: two for each match."""
     lost: bool = False
     starts: bool = False
     """Whether a map begins here; where it is not the first, the camera was lost too."""
@@ -52,7 +56,8 @@ class Tracked:
 
     @classmethod
     def of(cls, frame: Frame, map: Map, observations: Observations = NOTHING, **found) -> Tracked:
-        """What became of a frame, after which the map is this one; `found` are other fields."""
+        """Return what became of a frame, after which the map is this one; `found` are other
+        fields."""
         place, doubt = map.place, map.place.sigma_log_scale
         return cls(
             frame.index,
@@ -68,27 +73,27 @@ class Tracked:
 
     @property
     def T_wc(self) -> np.ndarray:
-        """(4, 4)."""
+        """The camera's pose, (4, 4)."""
         return self.camera.T_wc
 
     @property
     def covariance(self) -> np.ndarray:
-        """(6, 6) in the right tangent of T_wc: position in camera axes, rotation."""
+        """The covariance (6, 6) in the right tangent of T_wc: position in camera axes, rotation."""
         return self.camera.covariance
 
     @property
     def predicted(self) -> np.ndarray:
-        """Pixels of the landmarks searched, (k, 2)."""
+        """The pixels where the landmarks searched were expected, (k, 2)."""
         return self.observations.predicted
 
     @property
     def search(self) -> np.ndarray:
-        """Their innovation covariances, (k, 2, 2)."""
+        """The innovation covariances of these landmarks, (k, 2, 2)."""
         return self.observations.covariances
 
     @property
     def matched(self) -> np.ndarray:
-        """Where they were found, (k, 2), NaN where they were not."""
+        """The pixels where they were found, (k, 2), NaN where they were not."""
         return self.observations.pixels
 
     @property

@@ -83,8 +83,8 @@ def changes_of_view(
     slots: Int[np.ndarray, " k"],
     calibration: Calibration,
 ) -> Float[np.ndarray, "k 2 2"]:
-    """How the picture around each landmark changed since its first view; zero where it cannot
-    be told.
+    """Return how the picture around each landmark changed since its first view; zero where it
+    cannot be told.
 
     The surface is taken to face the first camera; distortion is neglected, being nearly the
     same over a patch.

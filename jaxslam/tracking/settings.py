@@ -1,4 +1,4 @@
-"""What a tracker assumes of its camera's motion and scene, and how much it does."""
+"""The settings of a tracker: what it assumes of motion and scene, and how much it does."""
 
 from __future__ import annotations
 
@@ -22,8 +22,11 @@ METRIC = "world"
 
 @dataclass(frozen=True)
 class TrackerSettings:
-    """What a tracker assumes and how much it does. Lengths are in the unit of `nearest_depth`:
-    a single camera does not see scale, so the map's unit is whatever that prior makes it."""
+    """The assumptions of a tracker and how much it does.
+
+    Lengths are in the unit of `nearest_depth`: a single camera does not see scale, so the map's
+    unit is whatever that prior makes it.
+    """
 
     filter: str = FROM_REST["spatial"]
     """Filter: a name of jaxslam.FILTERS, which may be modified, as in `robocentric+oc`.
@@ -120,7 +123,8 @@ class TrackerSettings:
         )
 
     def treatment(self, calibration: Calibration) -> AbstractCalibration:
-        """What the filter makes of a calibration, with the σ that it states or else with these."""
+        """Return what the filter makes of a calibration, with the σ that it states or else with
+        these."""
         name = self.calibration or ("estimated" if calibration.guessed else "known")
         stated = [self.focal_sigma] * 2 + [self.centre_sigma] * 2
         sigma = list(calibration.sigma) or stated

@@ -1,4 +1,4 @@
-"""How a map starts: with which filter, at which corners, and with known points if there are any."""
+"""The start of a first map: a filter that can track, and known points if there are any."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from jaxslam.filters.ekf import EkfSlam, check_can_track
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
 from jaxslam.io.calibration import Calibration
 from jaxslam.models.scale import Metre
-from jaxslam.tracking.corners import detect_corners
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.target import Target, TargetObservation, known_depths, sighted
 
@@ -35,24 +34,8 @@ def trackable(
 
 
 def _keeps_metres(slam: AbstractStaged) -> bool:
-    """Whether depths in metres can be told to a filter, landmark by landmark."""
+    """Return whether depths in metres can be told to a filter, landmark by landmark."""
     return isinstance(slam, EkfSlam) and isinstance(slam.scale, Metre) and slam.depth.common is None
-
-
-def bare_corners(
-    image: UInt8[np.ndarray, "h w"],
-    settings: TrackerSettings,
-    occupied: Float[np.ndarray, "k 2"] | None = None,
-) -> Float[np.ndarray, "n 2"]:
-    """Corners where the picture is bare; for a whole map where nothing says what is `occupied`."""
-    s, wanted = settings, settings.wanted
-    if occupied is None:
-        occupied = np.zeros((0, 2))
-    else:
-        wanted = min(s.new_per_frame, s.wanted - len(occupied))
-    return detect_corners(
-        image, wanted, occupied=occupied, min_distance=s.spacing, border=2 * s.border
-    ).astype(float)
 
 
 def with_target(
@@ -62,8 +45,8 @@ def with_target(
     calibration: Calibration,
     settings: TrackerSettings,
 ) -> tuple[TargetObservation, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Where a picture shows a target; pixels to start landmarks at, of its points first and of the
-    corners away from them; and mean and σ of 1/z of as many as are wanted."""
+    """Return where a picture shows a target; pixels to start landmarks at, of its points first and
+    of the corners away from them; and mean and σ of 1/z of as many as are wanted."""
     s = settings
     seen = sighted(target, image, calibration, s.pixel_sigma)
     distances = np.linalg.norm(corners[:, None] - seen.pixels, axis=2)

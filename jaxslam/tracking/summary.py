@@ -130,7 +130,7 @@ def known_points(tracker: Tracker, history: Sequence[Tracked]) -> Points:
 
 
 def _distances(landmarks: Points, history: Sequence[Tracked]) -> Float[np.ndarray, " n"]:
-    """To the nearest camera of their map; zero of a landmark that is nowhere."""
+    """Return distances to the nearest camera of their map; zero of a landmark that is nowhere."""
     cameras = trajectory_of(history).T_wc[:, :3, 3]
     maps = np.array([result.map for result in history])
     distances = np.zeros(len(landmarks.numbers))
@@ -148,7 +148,8 @@ def trajectory_of(history: Sequence[Tracked]) -> Trajectory:
 
 
 def reference_in_map(source: Source, history: Sequence[Tracked]) -> np.ndarray | None:
-    """What of the reference is of the time of these frames, (m, 4, 4), aligned as for its error."""
+    """Return what of the reference is of the time of these frames, (m, 4, 4), aligned as for its
+    error."""
     if source.reference is None:
         return None
     trajectory, (times, T_wc) = trajectory_of(history), source.reference
@@ -190,7 +191,7 @@ def _units(history: Sequence[Tracked]) -> list[Summary]:
 
 
 def _unit_line(unit: Summary) -> str:
-    """What is known of a map's unit."""
+    """Return what is known of a map's unit."""
     length, times = math.exp(unit["log_scale"]), math.exp(unit["sigma_log_scale"])
     return (
         f"map {unit['map']}: one unit of length throughout, by the prior on depth {length:.2f} m, "
@@ -199,8 +200,8 @@ def _unit_line(unit: Summary) -> str:
 
 
 def _calibration(tracker: Tracker) -> Summary:
-    """What the camera was taken for, and where it is estimated or considered, what it is in the end
-    with σ: what is considered was found by the start, and left since."""
+    """Return what the camera was taken for, and where it is estimated or considered, what it is in
+    the end with σ: what is considered was found by the start, and left since."""
     camera = tracker.camera()
     given = as_fields(tracker.calibration)
     if camera is None:
@@ -217,8 +218,8 @@ def _calibration(tracker: Tracker) -> Summary:
 
 
 def _ungated(updates: Sequence[Tracked]) -> Summary:
-    """What the predictions are worth: squared innovations of all that was found, wrong matches and
-    all, by the median of χ² of 2 degrees of freedom, and the share beyond its 95 %."""
+    """Return what the predictions are worth: squared innovations of all that was found, wrong
+    matches and all, by the median of χ² of 2 degrees of freedom, and the share beyond its 95 %."""
     squared = np.concatenate([np.zeros(0), *(result.innovations for result in updates)])
     if not len(squared):
         return {"matches": 0, "median": None, "beyond95": None}

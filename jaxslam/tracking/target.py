@@ -69,7 +69,7 @@ class Target:
 
 
 class TargetObservation(NamedTuple):
-    """Where a picture shows a target, and how far away its points are."""
+    """The place of a target in a picture, and how far away its points are."""
 
     pixels: Float[np.ndarray, "n 2"]
     T_ct: Float[np.ndarray, "4 4"]
@@ -155,7 +155,7 @@ def sighted(
 
 
 def _places(target: Target, image: np.ndarray) -> list[list[Float[np.ndarray, " 2"]]]:
-    """Where each point may be: its pixel, or where the picture is most like its patch."""
+    """Return where each point may be: its pixel, or where the picture is most like its patch."""
     count = max(1, int(_COMBINATIONS ** (1 / len(target.points))))
     return [_places_of(point, image, count) for point in target.points]
 
@@ -204,7 +204,8 @@ class _Pose(NamedTuple):
 def _pose(
     positions: Float[np.ndarray, "n 3"], pixels: Float[np.ndarray, "n 2"], lens: _Lens
 ) -> _Pose:
-    """From which the points are seen there (PnP); an infinite RMS where there is none."""
+    """Return the pose from which the points are seen there (PnP); an infinite RMS where there is
+    none."""
     found, turn, shift = cv2.solvePnP(positions, pixels, *lens, flags=cv2.SOLVEPNP_SQPNP)
     if not found:
         return _Pose(np.zeros(3), np.zeros(3), np.inf)
@@ -259,7 +260,8 @@ def known_depths(
 
 
 def as_summary(target: Target, sighting: TargetObservation) -> dict[str, Any]:
-    """For summary.json: lengths in metres, the target's frame in the first camera."""
+    """Return an entry of summary.json: lengths in metres, the target's frame in the first
+    camera."""
     names: Sequence[str] = [point.name for point in target.points]
     return {
         "points": names,

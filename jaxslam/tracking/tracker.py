@@ -16,6 +16,7 @@ from jaxslam.io.pictures import as_grey
 from jaxslam.io.source import Frame, check_size
 from jaxslam.models.observations import Status
 from jaxslam.tracking import persistence
+from jaxslam.tracking.corners import bare_corners
 from jaxslam.tracking.estimator import Estimator
 from jaxslam.tracking.landmarks import Landmark, Points
 from jaxslam.tracking.map import Map, in_view
@@ -23,7 +24,7 @@ from jaxslam.tracking.observations import NOTHING, Observations
 from jaxslam.tracking.policy import LEAST_MATCHES, Policy
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
-from jaxslam.tracking.start import bare_corners, trackable, with_target
+from jaxslam.tracking.start import trackable, with_target
 from jaxslam.tracking.target import Target, TargetObservation
 
 
@@ -85,22 +86,22 @@ class Tracker:
 
     @property
     def landmarks(self) -> dict[int, Landmark]:
-        """Those in the map, by their slot of the state."""
+        """The landmarks in the map, by their slot of the filter's state."""
         return self.map.landmarks
 
     @property
     def created(self) -> int:
-        """Landmarks so far."""
+        """The number of landmarks so far."""
         return self.map.created
 
     @property
     def deleted(self) -> int:
-        """Those of them that were given up."""
+        """The number of landmarks that were given up."""
         return self.map.deleted
 
     @property
     def restarts(self) -> int:
-        """Maps begun after the first."""
+        """The number of maps begun after the first."""
         return self.map.number
 
     def track(self, frame: Frame) -> Tracked:
@@ -131,13 +132,13 @@ class Tracker:
                 thread.join()
 
     def points(self) -> Points:
-        """All landmarks, those gone included."""
+        """Return all landmarks, those gone included."""
         with jax.enable_x64(True):
             return self.map.points()
 
     def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
-        """How the calibration is treated, and fx, fy, cx, cy with their covariance, pixels, as far
-        as this map tells. None of a filter of one's own without a pinhole camera."""
+        """Return how the calibration is treated, and fx, fy, cx, cy with their covariance, pixels,
+        as far as this map tells. None of a filter of one's own without a pinhole camera."""
         with jax.enable_x64(True):
             return self.map.estimator.camera()
 
@@ -160,7 +161,7 @@ class Tracker:
         return persistence.load(path, partial(cls, filter=filter), own_filter=filter is not None)
 
     def _first(self, frame: Frame) -> Tracked:
-        """The first frame of all, which begins the first map."""
+        """Begin the first map with the first frame."""
         self.map.estimator.compile(self.policy.in_wide)
         pixels, depths = bare_corners(frame.image, self.settings), None
         if self.target is not None:
@@ -171,7 +172,7 @@ class Tracker:
         return Tracked.of(frame, self.map, created=pixels, starts=True)
 
     def _next(self, frame: Frame, before: float) -> Tracked:
-        """A frame after one of the time `before`."""
+        """Track a frame after one of the time `before`."""
         predicted = self.map.estimator.predict(frame.time - before)
         ahead, behind = predicted.view.sides
         if behind > ahead and behind >= LEAST_MATCHES:

@@ -30,7 +30,7 @@ _GIVEN_SCALE = (
 
 
 class TrajectoryError(TypedDict):
-    """What `absolute_trajectory_error` returns; lengths in the reference's unit."""
+    """The result of `absolute_trajectory_error`; lengths in the reference's unit."""
 
     alignment: str
     rmse: float
@@ -43,7 +43,7 @@ class TrajectoryError(TypedDict):
 
 
 class RelativeError(TypedDict):
-    """What `relative_pose_error` returns."""
+    """The result of `relative_pose_error`."""
 
     seconds: float
     translation: float
@@ -128,8 +128,8 @@ def relative_pose_error(
 
     RMS over all pairs of poses so far apart: of the `translation`, in the reference's unit, and of
     the `rotation`, in degrees; `way` is the reference's own displacement, RMS. Of the alignment
-    only its scale matters. Arguments are those of
-    `absolute_trajectory_error`, and so is what is raised; also for a trajectory that is shorter.
+    only its scale matters. Arguments are those of `absolute_trajectory_error`. Raises `ValueError`
+    as it does, and for a trajectory that is shorter.
     """
     pairs = _paired(estimate_times, estimate, reference_times, reference)
     apart = max(1, round(seconds / float(np.median(np.diff(pairs.times)))))
@@ -154,8 +154,8 @@ def alignment(
     reference_times: ArrayLike,
     reference: ArrayLike,
 ) -> Similarity:
-    """From the estimate's world to the reference's: that of `absolute_trajectory_error`, which is
-    of the same arguments and raises the same."""
+    """Return the similarity from the estimate's world to the reference's: that of
+    `absolute_trajectory_error`, of the same arguments; it raises the same."""
     return _paired(estimate_times, estimate, reference_times, reference).alignment()
 
 

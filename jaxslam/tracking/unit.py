@@ -1,4 +1,4 @@
-"""Where a map is in the world, and its one unit of length.
+"""The place of a map in the world, and its one unit of length.
 
 While the filter has no unit that lasts, the map's is carried over by its landmarks: they do not
 move.
@@ -42,7 +42,7 @@ def lengthened(before: Nearness, now: Nearness, among: Iterable[int]) -> float:
 
 @dataclass
 class MapInWorld:
-    """Where a map begins in the world, where the camera is, and the unit of both."""
+    """The place where a map begins in the world, that of the camera, and the unit of both."""
 
     origin: PoseWithCovariance = field(default_factory=PoseWithCovariance)
     """Where the map begins."""
@@ -85,7 +85,7 @@ class MapInWorld:
         self.log_unit = -self.log_scale
 
     def expected(self, view: Prediction) -> Prediction:
-        """What the filter expects, in the world and in the map's unit."""
+        """Return what the filter expects, in the world and in the map's unit."""
         T_wc = view.T_wc.copy()
         T_wc[:3, 3] *= self.unit
         return view._replace(T_wc=self.origin.T_wc @ T_wc, omegas=view.omegas / self.unit)

@@ -90,7 +90,7 @@ def _shown(
     viewer: Viewer | None,
     history: list[Tracked],
 ) -> Generator[Callable[[Frame], None]]:
-    """What shows the newest frame, as film and in the viewer, aside from the tracking."""
+    """Return what shows the newest frame, as film and in the viewer, aside from the tracking."""
     with ExitStack() as stack:
         writer = None if film is None else stack.enter_context(_writer(source, film))
         recording = None if viewer is None else stack.enter_context(viewer)

@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.plots.frames import Laid, plot_frames
-from jaxslam.tracking.pointcloud import Cloud, read_ply, write_ply
-from jaxslam.tracking.projection import seen_from
+from jaxslam.tracking.pointcloud import Cloud, read_ply, seen_from, write_ply
 
 LENS = Calibration(320, 240, 300.0, 310.0, 160.0, 118.0, (-0.2, 0.05, 1e-3, -2e-3))
 

@@ -114,5 +114,5 @@ def test_a_recording_ends_in_rrd(tmp_path):
 
 
 def test_tracking_without_a_recording_does_not_import_rerun():
-    code = "import sys, jaxslam.tracking.track; assert 'rerun' not in sys.modules"
+    code = "import sys, jaxslam.tracking.video; assert 'rerun' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
