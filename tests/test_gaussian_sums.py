@@ -194,6 +194,31 @@ def test_of_members_that_predict_alike_the_surer_one_gains():
     np.testing.assert_allclose(np.exp(log_weights), expected / expected.sum(), rtol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["world+scales3", "robocentric+directions3+scales3"])
+def test_a_sum_that_is_not_split_is_taken_in_stages_as_by_its_step(name):
+    """And where it expects features is where its members do, by their weights."""
+    of = case()
+    slam, control = of.filter(name), of.controls()[0]
+    first, known, new = of.frames(0)
+    frame = jax.tree.map(lambda x: x[0], (known, new))
+
+    def both(first):
+        state = slam.init(of.capacity, first)
+        staged = jaxslam.AbstractStaged.step(slam, state, control, *frame)
+        predicted = slam.predict(state, control)
+        slots = jnp.arange(of.capacity)
+        one = slam.predict_features(predicted, control, slots).measured
+        each = jax.vmap(lambda member: slam.base.predict_features(member, control, slots).measured)
+        return staged, slam.step(state, control, *frame), one, each(predicted.members), state
+
+    staged, stepped, one, each, state = quick_jit(both)(first)
+    for a, b in zip(jax.tree.leaves(staged), jax.tree.leaves(stepped), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+    mean = np.tensordot(np.exp(state.log_weights), each, 1)
+    np.testing.assert_allclose(one, mean, atol=0.05 * np.ptp(each, axis=0).max())
+    assert np.ptp(each, axis=0).max() > 1
+
+
 @cache
 def divided():
     return quick_jit(lambda state: _split_and_merged(pixels, _parts(pixels, state))[0].sum)

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.arrays import AnyArray, cast, precision
+from jaxslam.filters.forms.blocks import Prior
 from jaxslam.filters.forms.covariance import Covariance, convert
 from jaxslam.filters.forms.form import AbstractForm, AbstractGaussian
 from jaxslam.filters.forms.state import State
@@ -285,24 +286,14 @@ def correct(
     return slam.form.update(slam.model, state, seen, noise, context, _considered(slam, state))
 
 
-def init_with_depths(
-    slam: EkfSlam,
-    capacity: int | Capacity,
-    first: Features,
-    prior: tuple[Float[Array, "m q"], Float[Array, "m q"]],
-) -> Any:
+def init_with_depths(slam: EkfSlam, capacity: int | Capacity, first: Features, prior: Prior) -> Any:
     """`init` of landmarks each of which has a prior of its own: mean and σ of 1/z."""
     check_features(slam, first)
     state = _with_frames_calibration(slam, slam.init(capacity))
     return _forgotten(slam, insert(slam, state, first, prior))
 
 
-def insert(
-    slam: EkfSlam,
-    state: Any,
-    new: Features,
-    prior: tuple[Float[Array, "m q"], Float[Array, "m q"]] | None = None,
-) -> Any:
+def insert(slam: EkfSlam, state: Any, new: Features, prior: Prior | None = None) -> Any:
     """Insert Gaussians into slots; 1/z has the filter's prior, or one for each slot."""
     context = COMPOSED
     prior = _depth_prior(slam, state) if prior is None else prior

@@ -25,6 +25,10 @@ from jaxslam.geometry import jacobian, nudge, retract, zero_tangent
 from jaxslam.models.observations import Features
 
 Landmark = Callable[[Any, Array], Array]
+Noise = Float[Array, "p p"] | Float[Array, "m p p"]
+"""R of one measurement, or one of each of m."""
+Prior = tuple[Float[Array, "*m q"], Float[Array, "*m q"]]
+"""Mean and σ of what one measurement hides, for all landmarks or for each."""
 
 DENSE = 200
 """Numbers up to which a product with all of J's zeros is faster than gathering what is not zero."""
@@ -130,12 +134,7 @@ def observe(
 
 
 def new_landmarks(
-    model: Model,
-    state: Any,
-    features: Features,
-    noise: Float[Array, "p p"],
-    prior: tuple[Float[Array, "*m q"], Float[Array, "*m q"]],
-    context: Any,
+    model: Model, state: Any, features: Features, noise: Noise, prior: Prior, context: Any
 ) -> tuple[Float[Array, "m d"], Blocks, Float[Array, "m d p+q"]]:
     """Landmarks of first measurements (P22–P26): values, J by the view, and `J diag(R, σ²)^½`.
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.linalg import cholesky, symmetric_part
-from jaxslam.filters.forms.blocks import Model, observed, residuals, shifted
+from jaxslam.filters.forms.blocks import Model, Noise, observed, residuals, shifted
 from jaxslam.filters.forms.state import State
 from jaxslam.geometry import difference
 from jaxslam.models.observations import Features, Innovation, judged
@@ -45,7 +45,7 @@ class AbstractCorrection(eqx.Module):
         model: Any,
         state: State,
         features: Features,
-        noise: Float[Array, "p p"] | Float[Array, "m p p"],
+        noise: Noise,
         context: Any,
         considered: slice = slice(0, 0),
     ) -> tuple[State, Innovation]:
@@ -108,7 +108,7 @@ def kalman_update(
     state: State,
     offset: Float[Array, " n"] | None,
     features: Features,
-    noise: Float[Array, "p p"] | Float[Array, "m p p"],
+    noise: Noise,
     context: Any,
     considered: slice = slice(0, 0),
 ) -> tuple[State, Innovation]:
@@ -142,9 +142,7 @@ def kalman_update(
     return state, Innovation(predicted, residual, S, used, nis, status, factor.log_det())
 
 
-def _noise_matrix(
-    noise: Float[Array, "p p"] | Float[Array, "m p p"], used: Bool[Array, " m"]
-) -> Float[Array, "mp mp"]:
+def _noise_matrix(noise: Noise, used: Bool[Array, " m"]) -> Float[Array, "mp mp"]:
     """Block-diagonal R, with an identity block where a feature is not used."""
     m, p = used.size, noise.shape[-1]
     blocks = jnp.where(used[:, None, None], noise, jnp.eye(p, dtype=noise.dtype))

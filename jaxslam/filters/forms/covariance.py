@@ -20,6 +20,8 @@ from jaxslam.filters.forms.blocks import (
     Blocks,
     Change,
     Model,
+    Noise,
+    Prior,
     indices,
     local_jacobians,
     masked,
@@ -85,7 +87,7 @@ class Covariance(AbstractGaussian):
         model: Model,
         state: State,
         features: Features,
-        noise: Float[Array, "p p"] | Float[Array, "m p p"],
+        noise: Noise,
         context: Any,
         considered: slice = slice(0, 0),
     ) -> tuple[State, Innovation]:
@@ -106,8 +108,8 @@ class Covariance(AbstractGaussian):
         model: Model,
         state: State,
         features: Features,
-        noise: Float[Array, "p p"],
-        prior: tuple[Float[Array, "*m q"], Float[Array, "*m q"]],
+        noise: Noise,
+        prior: Prior,
         context: Any,
     ) -> State:
         """`P ← J diag(P, R, σ²) Jᵀ` (P22–P26)."""

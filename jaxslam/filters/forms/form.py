@@ -22,6 +22,8 @@ from jaxslam.filters.forms.blocks import (
     Change,
     Landmark,
     Model,
+    Noise,
+    Prior,
     composition,
     local_jacobians,
     observe,
@@ -68,7 +70,7 @@ class AbstractForm(eqx.Module):
         model: Model,
         state: Any,
         features: Features,
-        noise: Float[Array, "p p"] | Float[Array, "m p p"],
+        noise: Noise,
         context: Any,
         considered: slice = slice(0, 0),
     ) -> tuple[Any, Any]:
@@ -89,13 +91,7 @@ class AbstractForm(eqx.Module):
 
     @abstractmethod
     def initialise(
-        self,
-        model: Model,
-        state: Any,
-        features: Features,
-        noise: Float[Array, "p p"],
-        prior: tuple[Float[Array, "*m q"], Float[Array, "*m q"]],
-        context: Any,
+        self, model: Model, state: Any, features: Features, noise: Noise, prior: Prior, context: Any
     ) -> Any:
         """Insert landmarks from their first measurement (P22–P26).
 
@@ -133,12 +129,7 @@ class AbstractGaussian(AbstractForm):
         """`J P Jᵀ` of every landmark's own rows: the diagonal blocks only."""
 
     def predict_features(
-        self,
-        model: Model,
-        state: Any,
-        slots: Int[Array, " m"],
-        noise: Float[Array, "p p"],
-        context: Any,
+        self, model: Model, state: Any, slots: Int[Array, " m"], noise: Noise, context: Any
     ) -> tuple[Float[Array, "m p"], Float[Array, "m p p"], Bool[Array, " m"]]:
         """Where landmarks should be seen: measurements, covariances of their innovations, possible
         or not. These are the centres and the search ellipses of active search."""

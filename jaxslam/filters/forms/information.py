@@ -27,6 +27,8 @@ from jaxslam.filters.forms.blocks import (
     Blocks,
     Change,
     Model,
+    Noise,
+    Prior,
     indices,
     local_jacobians,
     masked,
@@ -126,7 +128,7 @@ class Information(AbstractGaussian):
         model: Model,
         state: InformationState,
         features: Features,
-        noise: Float[Array, "p p"],
+        noise: Noise,
         context: Any,
         considered: slice = slice(0, 0),
     ) -> tuple[InformationState, Innovation]:
@@ -180,8 +182,8 @@ class Information(AbstractGaussian):
         model: Model,
         state: InformationState,
         features: Features,
-        noise: Float[Array, "p p"],
-        prior: tuple[Float[Array, " q"], Float[Array, " q"]],
+        noise: Noise,
+        prior: Prior,
         context: Any,
     ) -> InformationState:
         """Insert landmarks from their first measurement (P22–P26): information `N⁻¹` on `y − J x`.

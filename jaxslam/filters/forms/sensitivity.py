@@ -28,6 +28,8 @@ from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.forms.blocks import (
     Change,
     Model,
+    Noise,
+    Prior,
     indices,
     local_jacobians,
     masked,
@@ -164,7 +166,7 @@ class Sensitivity(AbstractForm):
         model: Model,
         state: Point,
         features: Features,
-        noise: Float[Array, "p p"],
+        noise: Noise,
         context: Any,
         considered: slice = slice(0, 0),
     ) -> tuple[Point, WhitenedResiduals]:
@@ -208,8 +210,8 @@ class Sensitivity(AbstractForm):
         model: Model,
         state: Point,
         features: Features,
-        noise: Float[Array, "p p"],
-        prior: tuple[Float[Array, "*m q"], Float[Array, "*m q"]],
+        noise: Noise,
+        prior: Prior,
         context: Any,
     ) -> Point:
         """Landmarks as the filter begins them, and off by what the variables of their slots say.
