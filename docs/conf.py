@@ -25,7 +25,6 @@ myst_enable_extensions = ["dollarmath", "deflist", "colon_fence"]
 myst_heading_anchors = 3
 suppress_warnings = [
     "myst.header",  # pages of results begin their sections where they like
-    "ref.python",  # classes of one name in two rooms: annotations do not say which
 ]
 
 autodoc_member_order, autodoc_preserve_defaults = "bysource", True

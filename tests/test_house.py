@@ -122,6 +122,15 @@ def test_evaluation_needs_few_files():
     assert len(reached) <= 25, sorted(str(path.relative_to(PACKAGE)) for path in reached)
 
 
+def test_no_two_classes_have_one_name():
+    places = {}
+    for path in FILES:
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(path.relative_to(PACKAGE).as_posix())
+    assert not {name: files for name, files in places.items() if len(files) > 1}
+
+
 def test_rooms_and_functions_are_small():
     lines = {}
     for path in FILES:

@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxslam.native.build import built
 from jaxslam.native.emit import BYTES, source
@@ -19,6 +20,10 @@ from jaxslam.native.trace import NotSupportedError, program
 __all__ = ["Batch", "NotSupportedError", "batched"]
 
 
+Kinds = tuple[jax.tree_util.PyTreeDef, tuple[tuple[tuple[int, ...], np.dtype], ...]]
+"""The structure of a pytree, and the shapes and types of its leaves."""
+
+
 class Batch:
     """`jax.vmap(function, (None, 0))(shared, runs)`, to rounding; of NumPy's arrays.
 
@@ -26,7 +31,9 @@ class Batch:
     was too large for its type, are computed by XLA.
     """
 
-    def __init__(self, function: Callable[[Any, Any], Any], shared: Any, runs: Any) -> None:
+    def __init__(
+        self, function: Callable[[PyTree, PyTree], PyTree], shared: PyTree, runs: PyTree
+    ) -> None:
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), runs)
         self._given, self._function = _kinds((shared, one)), function
         traced, self._shapes = program(function, *jax.tree.map(_kind, (shared, one)))
@@ -38,7 +45,7 @@ class Batch:
         self._arena = library.arena()
         self._width = BYTES // traced.elements.dtype.itemsize
 
-    def __call__(self, shared: Any, runs: Any, *, threads: int = 1) -> Any:
+    def __call__(self, shared: PyTree, runs: PyTree, *, threads: int = 1) -> PyTree:
         """The results of all runs; the same whatever the number of threads."""
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), runs)
         if _kinds((shared, one)) != self._given:
@@ -69,7 +76,9 @@ class Batch:
             self._by_xla(shared, runs, np.flatnonzero(doubted), made)
         return jax.tree.unflatten(structure, made)
 
-    def _by_xla(self, shared: Any, runs: Any, doubted: np.ndarray, made: list[np.ndarray]) -> None:
+    def _by_xla(
+        self, shared: PyTree, runs: PyTree, doubted: np.ndarray, made: list[np.ndarray]
+    ) -> None:
         """These runs; as many more as few sizes of a batch take."""
         again = np.resize(doubted, 1 << (len(doubted) - 1).bit_length())
         results = self._vmapped(shared, jax.tree.map(lambda x: np.asarray(x)[again], runs))
@@ -77,7 +86,7 @@ class Batch:
             x[doubted] = np.asarray(result)[: len(doubted)]
 
     @cached_property
-    def _vmapped(self) -> Callable[[Any, Any], Any]:
+    def _vmapped(self) -> Callable[[PyTree, PyTree], PyTree]:
         return jax.jit(jax.vmap(self._function, (None, 0)))
 
     @staticmethod
@@ -92,12 +101,14 @@ def _kind(x: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(np.shape(x), x.dtype)
 
 
-def _kinds(tree: Any) -> Any:
+def _kinds(
+    tree: PyTree,
+) -> tuple[jax.tree_util.PyTreeDef, tuple[tuple[tuple[int, ...], np.dtype], ...]]:
     leaves, structure = jax.tree.flatten(tree)
     return structure, tuple((np.shape(x), np.dtype(x.dtype)) for x in leaves)
 
 
-def batched(function: Callable[[Any, Any], Any], shared: Any, runs: Any) -> Batch:
+def batched(function: Callable[[PyTree, PyTree], PyTree], shared: PyTree, runs: PyTree) -> Batch:
     """A program for arguments of these shapes and types.
 
     Raises `NotSupportedError` for a function that has something for which there is no rule, and

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxslam.native.elements import CONSTANT, NAMES, OPERATIONS, Refs
 from jaxslam.native.plan import Plan, arity
-from jaxslam.native.program import Apply, Check, Loop, Product, Put, Sort, Take, While
+from jaxslam.native.program import Apply, Check, Loop, Product, Put, Sort, Step, Take, While
 
 PRELUDE = Path(__file__).with_name("prelude.hpp")
 FEW = 4
@@ -82,7 +82,7 @@ class _Writer:
         assert np.all(slots >= 0), "a number is not in memory"
         return slots * BYTES
 
-    def function(self, steps: list[Any]) -> str:
+    def function(self, steps: list[Step]) -> str:
         """Calls of functions that take these steps."""
         calls = []
         for k in range(0, len(steps), TOGETHER):
@@ -97,7 +97,7 @@ class _Writer:
             calls.append(f"{name}(m);")
         return " ".join(calls)
 
-    def step(self, step: Any) -> str:
+    def step(self, step: Step) -> str:
         if isinstance(step, Apply):
             return self.apply(step)
         if isinstance(step, Check):
@@ -107,7 +107,7 @@ class _Writer:
         self.local.clear()  # and over what it has copied first
         return text
 
-    def other(self, step: Any) -> str:
+    def other(self, step: Take | Put | Sort | Loop | While | Product) -> str:
         match step:
             case Loop():
                 return self.loop(step)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from jaxslam.native.program import (
     ElementProgram,
     Loop,
     Product,
+    Step,
     While,
     read_by,
     read_in_turn,
@@ -70,7 +70,7 @@ CARRIES = ("add", "sub", "mul", "neg", "copy")
 """Operations whose result is not finite where an operand is not."""
 
 
-def _checked(program: ElementProgram) -> list[Any]:
+def _checked(program: ElementProgram) -> list[Step]:
     """Steps that check, in place of suspects, what is computed of them and used anyway.
 
     A sum, or a product, is finite only if its operands are: the last of a chain tells of all.
@@ -122,7 +122,7 @@ def _through_product(elements, live, step, after) -> None:
             after[refs[same, k]] = of[same]
 
 
-def _near(steps: list[Any]) -> list[Any]:
+def _near(steps: list[Step]) -> list[Step]:
     """Checks right after what they check was computed."""
     checks = [step for step in steps if isinstance(step, Check)]
     steps = [_near_within(step) for step in steps if not isinstance(step, Check)]
@@ -141,7 +141,7 @@ def _near(steps: list[Any]) -> list[Any]:
     return [*result, replace(check, refs=left)] if left.size else result
 
 
-def _near_within(step: Any) -> Any:
+def _near_within(step: Step) -> Step:
     match step:
         case Loop():
             return replace(step, steps=_near(step.steps))
@@ -215,7 +215,7 @@ def _inlined(program: ElementProgram, live, needed) -> tuple[np.ndarray, np.ndar
     return once & (elements.region == elements.region[user]), uses
 
 
-def _mark(step: Any, product: np.ndarray) -> None:
+def _mark(step: Step, product: np.ndarray) -> None:
     if isinstance(step, Product):
         product[step.made] = True
 
@@ -247,7 +247,7 @@ def _forms(program: ElementProgram, live, inlined) -> tuple[np.ndarray, list[tup
     return form, list(forms)
 
 
-def each(steps: list[Any], visit: Callable[[Any], None]) -> None:
+def each(steps: list[Step], visit: Callable[[Step], None]) -> None:
     """Every step in the order of the program, a loop before what is in it."""
     for step in steps:
         visit(step)
@@ -255,7 +255,7 @@ def each(steps: list[Any], visit: Callable[[Any], None]) -> None:
             each(inner, visit)
 
 
-def inside(step: Any) -> list[list[Any]]:
+def inside(step: Step) -> list[list[Step]]:
     """The lists of steps in a step."""
     match step:
         case Loop():

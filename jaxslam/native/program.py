@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 from jaxslam.native.elements import Elements, Refs
 
@@ -75,7 +75,7 @@ class Check:
 class Loop:
     """`length` times: `carry ← after`; carry is `before` at first."""
 
-    steps: list[Any]
+    steps: list[Step]
     length: int
     reverse: bool
     carry: Refs
@@ -93,8 +93,8 @@ class Loop:
 class While:
     """`carry ← after` as long as `going`, in every run for itself."""
 
-    condition: list[Any]
-    steps: list[Any]
+    condition: list[Step]
+    steps: list[Step]
     carry: Refs
     before: Refs
     after: Refs
@@ -102,17 +102,20 @@ class While:
     """One."""
 
 
+Step: TypeAlias = Apply | Product | Take | Put | Sort | Check | Loop | While
+
+
 @dataclass(frozen=True)
 class ElementProgram:
     """A function of arrays: elements, how they are computed, and what goes in and out."""
 
     elements: Elements
-    steps: list[Any]
+    steps: list[Step]
     inputs: list[Refs]
     outputs: list[Refs]
 
 
-def read_by(step: Any) -> list[Refs]:
+def read_by(step: Step) -> list[Refs]:
     """Elements that have to be in memory for a step that is not an `Apply`; a loop's last."""
     match step:
         case Product():
@@ -131,7 +134,7 @@ def read_by(step: Any) -> list[Refs]:
     return []
 
 
-def read_in_turn(step: Any) -> list[Refs]:
+def read_in_turn(step: Step) -> list[Refs]:
     """What a loop reads in every turn, beside its steps."""
     match step:
         case Loop():
@@ -141,7 +144,7 @@ def read_in_turn(step: Any) -> list[Refs]:
     return []
 
 
-def written_by(step: Any) -> list[Refs]:
+def written_by(step: Step) -> list[Refs]:
     """Elements that a step writes itself."""
     match step:
         case Loop():

@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from jax.interpreters import partial_eval
 
 from jaxslam._numerics.linalg import symmetric_part_p
@@ -24,6 +24,7 @@ from jaxslam.native.program import (
     Product,
     Put,
     Sort,
+    Step,
     Take,
     While,
 )
@@ -68,7 +69,7 @@ class Tracer:
 
     def __init__(self, elements: Elements) -> None:
         self.elements = elements
-        self.steps: list[Any] = []
+        self.steps: list[Step] = []
         self.exact = 2 ** (np.finfo(elements.dtype).nmant + 1) - 1
         """Up to here, integers are numbers."""
         self.going: Refs | None = None
@@ -110,7 +111,7 @@ class Tracer:
             )
         self.elements.suspect(told)
 
-    def run(self, jaxpr: Any, constants: Sequence[Any], arguments: Sequence[Refs]) -> list[Refs]:
+    def run(self, jaxpr: Jaxpr, constants: Sequence[Any], arguments: Sequence[Refs]) -> list[Refs]:
         """Results of a traced function."""
         values: dict[Any, Refs] = {}
 
@@ -126,7 +127,7 @@ class Tracer:
             values.update(zip(equation.outvars, results, strict=True))
         return [read(x) for x in jaxpr.outvars]
 
-    def closed(self, traced: Any, arguments: Sequence[Refs]) -> list[Refs]:
+    def closed(self, traced: ClosedJaxpr | Jaxpr, arguments: Sequence[Refs]) -> list[Refs]:
         """Results of a function within."""
         if isinstance(traced, ClosedJaxpr):
             return self.run(traced.jaxpr, traced.consts, arguments)
@@ -152,7 +153,7 @@ class Tracer:
             self.within(results[0], max(limits.min, -self.exact), min(limits.max, self.exact))
         return results
 
-    def by_rule(self, equation: Any, arguments: list[Refs]) -> list[Refs]:
+    def by_rule(self, equation: JaxprEqn, arguments: list[Refs]) -> list[Refs]:
         """What an operation returns."""
         name, parameters = equation.primitive.name, equation.params
         if name in INNER:
