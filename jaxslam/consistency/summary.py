@@ -28,6 +28,8 @@ from jaxslam.statistics.bands import mean_band
 from jaxslam.statistics.beyond_scale import SCALE, one_scale_of
 from jaxslam.statistics.verdict import Tally, lost_runs, sentences
 
+Summary = dict[str, Any]
+"""The content of `consistency.json`, or what it says of one filter."""
 SCHEMA = 1
 _VALUES_AT_ONCE = 10**7
 """Of each record of which medians hold all runs in memory: of as many steps as this makes."""
@@ -100,14 +102,14 @@ class Study:
         return pandas.concat(frames, keys=list(self.filters), names=["filter", "row"])
 
 
-def as_summary(given: Study | dict[str, Any]) -> dict[str, Any]:
+def as_summary(given: Study | Summary) -> Summary:
     """A summary, or that of a study. Raises ValueError for anything else."""
     if isinstance(given, dict) and "filters" in given:
         return given
     return summarise(given)  # ty: ignore[invalid-argument-type]
 
 
-def summarise(study: Study) -> dict[str, Any]:
+def summarise(study: Study) -> Summary:
     """The content of `consistency.json`, ready for `json.dumps`.
 
     A run diverges when its NEES is not finite, or its covariance not positive definite, at any
@@ -152,7 +154,7 @@ def summarise(study: Study) -> dict[str, Any]:
     }
 
 
-def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
+def _summarise_filter(study: Study, name: str) -> Summary:
     geometry = study.scenario.world
     dof, n = geometry.tangent_dim, geometry.point_dim
     (sums, lost), medians = _sums_and_lost(study, name), _medians(study, name)
@@ -211,7 +213,7 @@ def _summarise_filter(study: Study, name: str) -> dict[str, Any]:
     }
 
 
-def _by_step(found: dict[str, Any]) -> dict[str, list[float | None]]:
+def _by_step(found: Summary) -> dict[str, list[float | None]]:
     """Columns of a filter's numbers that have one value a step."""
     alone = ("nees", "nees_median", "nees_not_lost", "lost", "lost_ever", "nis", "nis_dof")
     parts = {
@@ -222,7 +224,7 @@ def _by_step(found: dict[str, Any]) -> dict[str, list[float | None]]:
     return {**{key: found[key] for key in alone}, **parts}
 
 
-def _drift(sums: Sums, dof: int) -> dict[str, Any]:
+def _drift(sums: Sums, dof: int) -> Summary:
     """Root mean squares over the surviving runs whose unit is fixed; no verdict where none is."""
     count = sums["drift_count"]
     of_drift = tally_of(sums, "drift", dof)
@@ -239,7 +241,7 @@ def _drift(sums: Sums, dof: int) -> dict[str, Any]:
     }
 
 
-def _log_scale(sums: Sums, medians: _Medians, healthy: int) -> dict[str, Any]:
+def _log_scale(sums: Sums, medians: _Medians, healthy: int) -> Summary:
     """Root mean squares over the surviving runs; medians over all."""
 
     def rms(of: str) -> list[float | None]:
@@ -254,13 +256,13 @@ def _log_scale(sums: Sums, medians: _Medians, healthy: int) -> dict[str, Any]:
     }
 
 
-def _ratio(sums: np.ndarray, counts: Any) -> np.ndarray:
+def _ratio(sums: np.ndarray, counts: np.ndarray | int) -> np.ndarray:
     """NaN where nothing was counted."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return sums / counts
 
 
-def treatment(slam: Any) -> str | None:
+def treatment(slam: AbstractFilter) -> str | None:
     """How a filter treats its sensor's calibration, where it says so."""
     inner = slam.unwrapped
     return inner.calibration.name if isinstance(inner, EkfSlam) else None
@@ -317,7 +319,7 @@ def _medians(study: Study, name: str) -> _Medians:
     return _Medians(*(np.concatenate(x) for x in zip(*medians, strict=True)))
 
 
-def table(summary: dict[str, Any] | Study) -> str:
+def table(summary: Summary | Study) -> str:
     """The verdict on every filter, then the numbers of the last step, one filter a line.
 
     Of a `summary`, or of a study, which is summarised here.
@@ -346,7 +348,7 @@ def table(summary: dict[str, Any] | Study) -> str:
     )
 
 
-def _row(name: str, f: dict[str, Any]) -> str:
+def _row(name: str, f: Summary) -> str:
     with np.errstate(invalid="ignore"):  # a filter that compares nothing has no NIS
         nis = np.nansum(np.array(f["nis"], float)) / np.nansum(np.array(f["nis_dof"], float))
     band = f"{f['band95'][0]:.3f}–{f['band95'][1]:.3f}"
@@ -359,7 +361,7 @@ def _row(name: str, f: dict[str, Any]) -> str:
     )
 
 
-def _scale_table(filters: dict[str, Any], wide: int) -> Iterator[str]:
+def _scale_table(filters: Summary, wide: int) -> Iterator[str]:
     """What of the poses' errors is not one of scale, and the scale's, at the last step."""
     yield ""
     yield (
@@ -387,7 +389,7 @@ def _scale_table(filters: dict[str, Any], wide: int) -> Iterator[str]:
     )
 
 
-def _notes(filters: dict[str, Any]) -> Iterator[str]:
+def _notes(filters: Summary) -> Iterator[str]:
     """What the means of the table leave out."""
     for name, f in filters.items():
         if f["diverged"]:
