@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -143,7 +143,7 @@ class ConsistencyOptions:
             )
 
     def _scenario(self) -> Scenario:
-        overrides: dict[str, Any] = dict(parse_override(text) for text in self.set)
+        overrides: dict[str, object] = dict(parse_override(text) for text in self.set)
         if self.steps is not None:
             overrides["steps"] = self.steps
         return scenario(self.scenario, overrides)

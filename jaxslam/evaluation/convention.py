@@ -19,10 +19,11 @@ All matrices that change one into another have determinant one: a wrong conventi
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -35,6 +36,7 @@ from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, exp, log
 from jaxslam.io.tum import read_table, write_table
 
+Result = TypeVar("Result")
 CHOICES = {
     "error": ("right", "left", "split"),
     "axes": ("body", "world", "mixed"),
@@ -185,7 +187,9 @@ def lever(p: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n r"]:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _in_float64(function: Any, error: str, *arrays: Float[np.ndarray, "*batch _ _"]) -> Any:
+def _in_float64(
+    function: Callable[..., Result], error: str, *arrays: Float[np.ndarray, "*batch _ _"]
+) -> Result:
     """A function of poses, over all of them, as NumPy's arrays.
 
     Their number is filled up to a power of two, so that few programs serve logs of all sizes.

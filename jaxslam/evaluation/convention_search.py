@@ -23,7 +23,7 @@ from jaxtyping import Float
 
 from jaxslam.evaluation.convention import Convention
 from jaxslam.statistics.bands import PowerSums, mean_p_value
-from jaxslam.statistics.verdict import VERDICT_CONFIDENCE, not_disproved, run_verdict
+from jaxslam.statistics.verdict import VERDICT_CONFIDENCE, Verdict, not_disproved, run_verdict
 
 NOTICEABLE = 0.05
 """NEES that differ by less than this share say the same of σ, to 2.5 %."""
@@ -82,7 +82,7 @@ class Tried(NamedTuple):
         )
 
 
-def _verdict(nees: Float[np.ndarray, "runs steps"], dof: int, fitted: float) -> dict[str, Any]:
+def _verdict(nees: Float[np.ndarray, "runs steps"], dof: int, fitted: float) -> Verdict:
     return run_verdict(nees, dof, fitted, ~np.isnan(nees))
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -72,7 +73,7 @@ def check_every_run(logged: Bool[np.ndarray, "runs steps"]) -> None:
         raise ValueError(f"run {run} has no step: all of it is NaN; runs with a step are accepted")
 
 
-def at(place: Any) -> str:
+def at(place: Sequence[int | np.integer] | np.ndarray) -> str:
     """`run 3, step 17`, counted from 0."""
     return f"run {place[0]}, step {place[1]}"
 
@@ -218,7 +219,7 @@ def _factors(correlation: Float[np.ndarray, "runs steps n n"]) -> np.ndarray:
         _refuse(place, f"has an eigenvalue {least[tuple(place)]:.3g} times its variances")
 
 
-def _refuse(place: Any, fault: str) -> NoReturn:
+def _refuse(place: Sequence[int | np.integer] | np.ndarray, fault: str) -> NoReturn:
     raise ValueError(
         f"the covariance of {at(place)} {fault}; a symmetric, positive definite one is accepted"
     )
@@ -301,9 +302,9 @@ def _check_rigid(what: str, T: np.ndarray) -> None:
         raise ValueError(f"{what} of {place} is no rigid motion [R t; 0 1] with R a rotation")
 
 
-def read_npz(path: Path) -> dict[str, Any]:
+def read_npz(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a file; nothing in it is run."""
-    arrays: dict[str, Any] = dict(read_arrays(path))
+    arrays = read_arrays(path)
     for name in arrays:
         if name not in _KEYS:
             meant = suggestion(name, _KEYS)
@@ -316,7 +317,7 @@ _APART = 2
 _COLUMNS = "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"
 
 
-def read_csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]:
+def read_csv(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...], tuple[str, ...]]:
     """Lines `run, step, n errors, n (n + 1)/2 of the upper triangle`; a first one of names.
 
     The arrays, and what runs and steps are called in the file.
@@ -334,7 +335,7 @@ def read_csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...], tuple[str, ..
     P[places] = triangle
     titles = words(comments[0]) if comments else []
     named = len(titles) == rows.shape[1] and not comments[0].lstrip().startswith("#")
-    names = {"names": titles[2 : 2 + n]} if named else {}
+    names = {"names": np.array(titles[2 : 2 + n])} if named else {}
     arrays = {"errors": e, "covariances": P, **names}
     return arrays, tuple(f"run {x:g}" for x in runs), tuple(f"step {x:g}" for x in steps)
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, TypedDict
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -21,6 +21,14 @@ from jaxslam.io.tum import check_seconds, read_tum
 _CONTENTS = (
     "errors and covariances, innovations and covariances, or estimates, covariances and truths"
 )
+
+
+class PoseOptions(TypedDict):
+    """How poses are evaluated, see `evaluate_poses`."""
+
+    align: str
+    axes_used: str | Sequence[str]
+    truth_sigma: Sequence[float] | None
 
 
 def evaluate_log(
@@ -46,7 +54,7 @@ def evaluate_log(
     ValueError, naming the file.
     """
     source, stated = Path(source), dict(stated or {})
-    how = {"align": align, "axes_used": axes_used, "truth_sigma": truth_sigma}
+    how: PoseOptions = {"align": align, "axes_used": axes_used, "truth_sigma": truth_sigma}
     if not source.exists():
         raise ValueError(f"{source}: no such file or folder")
     if source.suffix in (".npz", ".csv"):
@@ -64,7 +72,7 @@ def evaluate_log(
 
 
 def _evaluate_arrays(
-    arrays: dict[str, Any], stated: dict[str, str], how: dict[str, Any], nis: bool
+    arrays: dict[str, np.ndarray], stated: dict[str, str], how: PoseOptions, nis: bool
 ) -> Evaluation:
     """Of errors, innovations or poses, by the names of the arrays."""
     held = [name for name in ("errors", "innovations", "estimates") if name in arrays]
@@ -184,7 +192,7 @@ def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
 
 
 def evaluate_runs(
-    runs: tuple[RunFiles, ...], stated: dict[str, str], how: dict[str, Any]
+    runs: tuple[RunFiles, ...], stated: dict[str, str], how: PoseOptions
 ) -> Evaluation:
     """The verdict on them, in the convention that is stated, or else said in the files; `how` they
     are evaluated are options of `evaluate_poses`."""

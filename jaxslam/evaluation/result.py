@@ -21,6 +21,7 @@ from jaxslam.evaluation.sanity_checks import Logged, Mistake, mistakes, withheld
 from jaxslam.evaluation.scale import Scale
 from jaxslam.statistics.bands import mean_band
 from jaxslam.statistics.verdict import (
+    Verdict,
     headline,
     innovation_verdict,
     lost_runs,
@@ -84,7 +85,7 @@ class Evaluation:
         return self.nees.shape[1]
 
     @cached_property
-    def verdict(self) -> dict[str, Any]:
+    def verdict(self) -> Verdict:
         """Of one study over all steps, see `jaxslam.consistency.Tally.verdict`; over-confident too
         where the scale drifts more than σ allows."""
         found = self._of_nees
@@ -96,13 +97,13 @@ class Evaluation:
         return found | {"word": "over-confident", "p": p}
 
     @cached_property
-    def _of_nees(self) -> dict[str, Any]:
+    def _of_nees(self) -> Verdict:
         with np.errstate(over="ignore"):
             return self._verdict(self.nees, self.errors / self.sigmas, self.dof, self.fitted)
 
     def _verdict(
         self, nees: np.ndarray, normalised: np.ndarray, dof: int, fitted: float
-    ) -> dict[str, Any]:
+    ) -> Verdict:
         if self.quantity == "NIS":
             return innovation_verdict(nees, normalised, dof)
         return run_verdict(nees, dof, fitted, self.logged)
@@ -193,7 +194,7 @@ class Evaluation:
         """Another convention, the only one that would make the data consistent."""
         return None if self.identified is None else self.identified.suggested
 
-    def axis_verdict(self, axis: int) -> dict[str, Any]:
+    def axis_verdict(self, axis: int) -> Verdict:
         """The verdict on one axis alone, of one degree of freedom."""
         with np.errstate(over="ignore"):
             normalised = self.errors[..., [axis]] / self.sigmas[..., [axis]]

@@ -6,11 +6,13 @@ Each is told from what a filter can do by itself, and says how rarely it is seen
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+
+from jaxslam.statistics.verdict import Verdict
 
 FALSE_ALARM = 1e-4
 """Studies of right runs that are taken for ones with runs and steps interchanged, at the most."""
@@ -62,7 +64,7 @@ class Logged(NamedTuple):
     """Names of the runs."""
     steps: Sequence[str]
     """What the steps are called, as `step 7`, from 0, or `0.3 s`."""
-    factors: Sequence[Mapping[str, Any]]
+    factors: Sequence[Verdict]
     """Of every axis, `sigma_factor` and `interval99`."""
 
 
@@ -72,7 +74,7 @@ def mistakes(logged: Logged) -> tuple[Mistake, ...]:
     return (*_unwrapped(logged, kinds), *_degrees(logged, kinds), *_interchanged(logged))
 
 
-def withheld(found: dict[str, Any]) -> dict[str, Any]:
+def withheld(found: Verdict) -> Verdict:
     """A verdict of which no word is believed, as the data are not what they are said to be."""
 
     def silent(part: Any) -> Any:
@@ -173,7 +175,7 @@ def _told(factor: float) -> str:
     return f"180/π is {DEGREES:.3g}" if factor > 1 else f"π/180 is {1 / DEGREES:.3g}"
 
 
-def _is_factor(found: Mapping[str, Any], factor: float, known: bool) -> bool:
+def _is_factor(found: Verdict, factor: float, known: bool) -> bool:
     """Whether σ is wrong by just this factor; of one run, whose interval is wide, only of what is
     `known`, and only where it is too small, as one number can be small by chance."""
     by, (low, high) = found["sigma_factor"], found["interval99"]

@@ -21,7 +21,7 @@ from jaxslam.evaluation.alignment import about
 from jaxslam.evaluation.convention import Convention, pose_errors
 from jaxslam.evaluation.inputs import Poses
 from jaxslam.statistics.beyond_scale import SCALES, BeyondScale, one_scale
-from jaxslam.statistics.verdict import run_verdict
+from jaxslam.statistics.verdict import Verdict, run_verdict
 
 DRIFT_CONFIDENCE = 0.999
 """Of the verdict on drift: with that on NEES, which is one-sided where a fit took a degree of
@@ -53,7 +53,7 @@ class Scale:
         return ~np.isnan(self.nees)
 
     @cached_property
-    def verdict(self) -> dict[str, Any] | None:
+    def verdict(self) -> Verdict | None:
         """On the drift alone, of one degree of freedom; None where no run tells it."""
         runs = self.told.any(axis=1)
         if not runs.any():

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -66,7 +66,7 @@ class Board:
         return np.pad(self.square * squares, ((0, 0), (0, 1))).astype(np.float32)
 
     @cached_property
-    def _charuco(self) -> Any:
+    def _charuco(self) -> cv2.aruco.CharucoBoard:
         dictionary = cv2.aruco.getPredefinedDictionary(
             getattr(cv2.aruco, f"DICT_{self.dictionary}")
         )
@@ -74,7 +74,7 @@ class Board:
         return cv2.aruco.CharucoBoard(size, self.square, MARKER_SHARE * self.square, dictionary)
 
     @cached_property
-    def _detector(self) -> Any:
+    def _detector(self) -> cv2.aruco.CharucoDetector:
         return cv2.aruco.CharucoDetector(self._charuco)
 
     def drawn(self, pixels: int = 100) -> UInt8[np.ndarray, "h w"]:
@@ -119,7 +119,7 @@ class Board:
     def _find_charuco(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         pixels, numbers, *_ = self._detector.detectBoard(image)
         return _NOTHING if numbers is None else (
-            pixels.reshape(-1, 2), self.corners[np.ravel(numbers)]
+            pixels.reshape(-1, 2), self.corners[np.ravel(numbers).astype(int)]
         )  # fmt: skip
 
     def _outline(self, pixels: np.ndarray, points: np.ndarray) -> np.ndarray | None:

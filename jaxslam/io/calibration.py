@@ -132,7 +132,7 @@ def as_fields(calibration: Calibration) -> dict[str, Any]:
     return {key: value for key, value in fields.items() if value or key not in ("sigma", "guessed")}
 
 
-def from_fields(fields: Any) -> Calibration:
+def from_fields(fields: object) -> Calibration:
     """The calibration of these fields, the inverse of `as_fields`.
 
     Raises ValueError for what is no pinhole camera's.
@@ -156,7 +156,7 @@ def from_fields(fields: Any) -> Calibration:
     )
 
 
-def _sigma_from(sigma: Any) -> tuple[Any, ...]:
+def _sigma_from(sigma: object) -> tuple[float, ...]:
     if not isinstance(sigma, dict) or (sigma and not sigma.keys() >= set(INTRINSICS)):
         raise ValueError(f"sigma is {sigma!r}; one with {', '.join(INTRINSICS)} is accepted")
     return tuple(sigma[key] for key in INTRINSICS) if sigma else ()

@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Condition, Thread
-from typing import Any
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -45,10 +45,19 @@ class Live:
                 newest.stop()
 
 
+@runtime_checkable
+class Capture(Protocol):
+    """What gives pictures one after another, as `cv2.VideoCapture` does."""
+
+    def read(self) -> tuple[bool, np.ndarray]:
+        """Whether there is another one, and the picture."""
+        ...
+
+
 class _Newest:
     """The newest picture of a capture, taken once."""
 
-    def __init__(self, capture: Any) -> None:
+    def __init__(self, capture: Capture) -> None:
         self._changed = Condition()
         self._picture: tuple[float, np.ndarray] | None = None
         self._running = True
@@ -67,7 +76,7 @@ class _Newest:
         self._running = False
         self._thread.join(PATIENCE)
 
-    def _fetch(self, capture: Any) -> None:
+    def _fetch(self, capture: Capture) -> None:
         while self._running:
             found, image = capture.read()
             with self._changed:

@@ -5,7 +5,6 @@ import warnings
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -54,7 +53,7 @@ def _at_rate(path: Path, times: list[float], wrong: int, rate: float) -> Float[n
 
 
 @contextmanager
-def opened(where: Path | int) -> Generator[Any]:
+def opened(where: Path | int) -> Generator[cv2.VideoCapture]:
     """A capture of a file or of a camera's number, released at the end."""
     capture = cv2.VideoCapture(where if isinstance(where, int) else str(where))
     try:

@@ -1,17 +1,16 @@
 """Pictures as people have them, made what the tracker looks at: grey, 8 bits."""
 
-from typing import Any
-
 import cv2
 import numpy as np
 from jaxtyping import UInt8
+from numpy.typing import ArrayLike
 
 _ACCEPTED = (
     "a picture is uint8, or floats from 0 to 1, of shape (height, width) or (height, width, 3)"
 )
 
 
-def as_grey(image: Any) -> UInt8[np.ndarray, "height width"]:
+def as_grey(image: ArrayLike) -> UInt8[np.ndarray, "height width"]:
     """The picture in grey, uint8; one that is so already is itself.
 
     Colours come in OpenCV's order: blue, green, red. Raises ValueError for anything else, with

@@ -251,7 +251,9 @@ def _verdict(f: dict[str, Any]) -> str:
     return headline(f["verdict"]) + lost
 
 
-def _plot_errors(axes: list[Axes], samples: dict[str, Any], time: np.ndarray, n: int) -> None:
+def _plot_errors(
+    axes: list[Axes], samples: Mapping[str, Mapping[str, np.ndarray]], time: np.ndarray, n: int
+) -> None:
     positions = ["x", "z"] if n == 2 else ["x", "y", "z"]
     rotations = ["θ"] if n == 2 else ["rotation about x", "rotation about y", "rotation about z"]
     for axis, ax in enumerate(axes):
@@ -273,7 +275,7 @@ def _plot_errors(axes: list[Axes], samples: dict[str, Any], time: np.ndarray, n:
             ax.set_xlabel("time, s")
 
 
-def _plot_map(axes: Axes, samples: dict[str, Any]) -> None:
+def _plot_map(axes: Axes, samples: Mapping[str, Mapping[str, np.ndarray]]) -> None:
     first = next(iter(samples.values()))
     truth = first["sample_true_path"][:, :-1, -1]
     seen = first["sample_active"].nonzero()[0]

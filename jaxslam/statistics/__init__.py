@@ -11,6 +11,7 @@ from jaxslam.statistics.beyond_scale import one_scale
 from jaxslam.statistics.verdict import (
     VERDICTS,
     Tally,
+    Verdict,
     innovation_verdict,
     not_disproved,
     run_verdict,
@@ -22,6 +23,7 @@ __all__ = [
     "VERDICTS",
     "PowerSums",
     "Tally",
+    "Verdict",
     "chi2_quantile",
     "innovation_verdict",
     "lost_threshold",

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, TypeAlias
 
 import scipy  # of which `special` is imported when it is first used
 
@@ -23,6 +23,8 @@ from jaxslam.statistics.bands import (
     skewed_limit,
 )
 
+Verdict: TypeAlias = dict[str, Any]
+"""As JSON has it, with the keys that `Tally.verdict` says."""
 VERDICT_CONFIDENCE = 0.99
 """With which all intervals of a study hold together; a consistent filter is called inconsistent in
 less than one of 100 studies."""
@@ -148,7 +150,7 @@ class Look:
         told = low >= TOLERANCE**-2 and high <= TOLERANCE**2
         return "consistent" if told else "cannot tell"
 
-    def asdict(self) -> dict[str, Any]:
+    def asdict(self) -> Verdict:
         """Numbers as a verdict has them, of σ."""
         low, high = self.interval
         return {

@@ -20,7 +20,7 @@ from jaxslam.statistics.bands import (
     mean_band,
     whiteness_p_value,
 )
-from jaxslam.statistics.looks import VERDICT_CONFIDENCE, Look
+from jaxslam.statistics.looks import VERDICT_CONFIDENCE, Look, Verdict
 
 VERDICTS = ("consistent", "under-confident", "over-confident", "lost", "cannot tell")
 LOST_BOUND = 0.01
@@ -162,7 +162,7 @@ class Tally:
             return (wrong or looks)[0]
         return min(wrong, key=lambda look: look.p)
 
-    def verdict(self) -> dict[str, Any]:
+    def verdict(self) -> Verdict:
         """The key `verdict` of `consistency.json`.
 
         `sigma_factor` is √(nees/dof), by which every σ should be larger, with an interval of 99 %;
@@ -193,7 +193,7 @@ class Tally:
             },
         }
 
-    def _judged(self) -> dict[str, Any]:
+    def _judged(self) -> Verdict:
         """The look that decides, and all of them."""
         if self.diverged or not self.average.count:
             return {**_NONE, "of": "all steps", "enough": None, "mean": _NONE, "end": _NONE,
@@ -261,7 +261,7 @@ def run_verdict(
     dof: int,
     fitted: float = 0.0,
     logged: Bool[np.ndarray, "runs steps"] | None = None,
-) -> dict[str, Any]:
+) -> Verdict:
     """The verdict on one study from the NEES of its independent runs, see `Tally.verdict`; what is
     `fitted` and `logged`, see `Tally.of`.
 
@@ -274,12 +274,12 @@ def run_verdict(
     return found | {"lost_runs": lost_runs(nees, dof, logged)}
 
 
-def not_disproved(found: dict[str, Any]) -> bool:
+def not_disproved(found: Verdict) -> bool:
     """Whether a verdict lets a filter be consistent, be that shown or not."""
     return found["word"] in ("consistent", "cannot tell")
 
 
-def sentences(found: dict[str, Any], quantity: str = "NEES") -> list[str]:
+def sentences(found: Verdict, quantity: str = "NEES") -> list[str]:
     """A verdict in words, and that at the last step; of the runs never lost, where some were.
 
     Where more than a few were, the others are chosen by their NEES: no verdict is said of them.
@@ -297,7 +297,7 @@ def sentences(found: dict[str, Any], quantity: str = "NEES") -> list[str]:
     return told
 
 
-def _of_lost(found: dict[str, Any], quantity: str) -> str:
+def _of_lost(found: Verdict, quantity: str) -> str:
     """Which runs were lost, and what is said of the others."""
     kept, runs = found["never_lost"], found["runs"]
     lost = runs - kept["runs"]
@@ -323,7 +323,7 @@ _TOLD = 8
 """Lost runs that are named."""
 
 
-def _of_whiteness(found: dict[str, Any]) -> list[str]:
+def _of_whiteness(found: Verdict) -> list[str]:
     if found["samples"] == "steps":
         return [f"innovations seem white (p = {found['white']:.2g}): every step is a sample"]
     if found["white"] is None:
@@ -334,7 +334,7 @@ def _of_whiteness(found: dict[str, Any]) -> list[str]:
     ]
 
 
-def headline(found: dict[str, Any], quantity: str = "NEES") -> str:
+def headline(found: Verdict, quantity: str = "NEES") -> str:
     """The verdict on all runs: `NEES 4.72, σ too small by 1.25 [1.24, 1.27]: over-confident`."""
     if found["nees"] is None:
         word = found["word"]
@@ -347,12 +347,12 @@ def headline(found: dict[str, Any], quantity: str = "NEES") -> str:
     return f"{said}; about {found['enough']} {found.get('samples', 'runs')} would tell"
 
 
-def _part(found: dict[str, Any]) -> str:
+def _part(found: Verdict) -> str:
     """What decided; files of before there were parts have none."""
     return found.get("of", "all steps")
 
 
-def _said(found: dict[str, Any], quantity: str) -> str:
+def _said(found: Verdict, quantity: str) -> str:
     factors, word = [found["sigma_factor"], *found["interval99"]], found["word"]
     told = "right up to a factor" if word == "consistent" else "should be ×"
     if word == "over-confident":
@@ -412,7 +412,7 @@ def together(comparisons: int) -> float:
 
 def innovation_verdict(
     nis: Float[np.ndarray, "runs steps"], normalised: Float[np.ndarray, "runs steps n"], dof: int
-) -> dict[str, Any]:
+) -> Verdict:
     """As `run_verdict`, of every step (`samples`: steps) where innovations seem white, else of
     every run: innovations, which need no truth, are white of a right filter, so that every step is
     a sample of its own (Bar-Shalom, Li, Kirubarajan 2001, §5.4.2).
