@@ -162,9 +162,7 @@ def page(results: Results) -> str:
         "orientations: −1 is a world behind the camera. *Orientation*: its RMS error, in degrees.",
         "*In 1 s*: the relative pose error over one second, in percent of the way made in it, and",
         "in degrees. A camera that is lost for 15 frames begins a new *map*, in another unit of",
-        "length. Times, without the overlay, are of a machine that others used too. A row with †",
-        "was measured when every frame was still in metres by the λ of its own, and *at one scale*",
-        "was of the best scale of every pose.",
+        "length. Times, without the overlay, are of a machine that others used too.",
     ]
     for name, filters in results.items():
         one = next(iter(filters.values()))
@@ -207,22 +205,21 @@ def _beside(r: dict[str, Any]) -> str:
 
 
 def _row(key: str, r: dict[str, Any]) -> str:
-    key = f"`{key}`" + ("" if "drift" in r else " †")
     nis = "–" if r["nis_per_dof"] is None else f"{r['nis_per_dof']:.2f}"
     nees = ", ".join(f"{x:.3g}" for x in (r["beyond_scale"] or {}).values()) or "–"
-    drift = "–" if not r.get("drift") else f"{r['drift'][0]:.1%}, {r['drift'][1]:.2f} σ"
+    drift = "–" if not r["drift"] else f"{r['drift'][0]:.1%}, {r['drift'][1]:.2f} σ"
     ungated = "–"
-    if r.get("ungated"):
+    if r["ungated"]:
         median, beyond = r["ungated"]
         ungated = f"{median:.2f}, {beyond:.1%}"
     error = ("–", "–", "–", "–")
     if r["error"] is not None:
         error = _share(r, "error"), f"{r['sign']:.2f}", f"{r['orientation']:.1f}°", "–"
-    if r.get("relative"):
+    if r["relative"]:
         translation, rotation = r["relative"]
         error = *error[:3], f"{translation:.1%}, {rotation:.2f}°"
     return (
-        f"| {key} | {r['tracked']} | {r['maps']} | {r['matches_per_frame']:.1f} | {nis} "
+        f"| `{key}` | {r['tracked']} | {r['maps']} | {r['matches_per_frame']:.1f} | {nis} "
         f"| {ungated} | {nees} | {drift} | {' | '.join(error)} | {r['milliseconds']:.0f}, "
         f"{r['milliseconds_p99']:.0f} |"
     )
