@@ -6,8 +6,8 @@ import json
 import handheld as benchmark
 import numpy as np
 import pytest
+import recordings
 import test_tracks
-import test_trajectories
 
 from jaxslam.statistics.beyond_scale import one_scale_of
 
@@ -82,7 +82,7 @@ def options(tmp_path, monkeypatch):
     (tmp_path / "trajectories").mkdir()
     (tmp_path / "kitti_tracks" / "street").mkdir(parents=True)
     times = np.arange(0, 2, 0.02)
-    test_trajectories.write(tmp_path / "trajectories" / "walk.txt", times)
+    recordings.write(tmp_path / "trajectories" / "walk.txt", times)
     test_tracks.write(tmp_path / "kitti_tracks" / "street")
     return benchmark.Handheld(
         filters=("robocentric",), runs=2, steps=3, starts=2, frames=4,

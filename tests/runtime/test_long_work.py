@@ -14,7 +14,7 @@ import pytest
 from jaxslam.cli import main
 
 KILLS = 2
-"""In the tests; `python tests/test_long_work.py 20` does twenty."""
+"""In the tests; `python tests/runtime/test_long_work.py 20` does twenty."""
 COMMAND = [
     "consistency", "--scenario", "matched-tight", "--landmarks", "inverse_scaling", "--steps", "5",
     "--set", "landmarks=3", "--runs", "600", "--chunk", "10",

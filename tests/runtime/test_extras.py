@@ -12,7 +12,7 @@ from jaxslam._runtime.progress import bar
 from jaxslam.cli import main
 
 PACKAGE = Path(jaxslam.__file__).parent
-PROJECT = Path(__file__).parents[1] / "pyproject.toml"
+PROJECT = Path(__file__).parents[2] / "pyproject.toml"
 
 
 @pytest.mark.parametrize("command", ["track", "calibrate"])
