@@ -3,9 +3,7 @@
 What looks at pictures needs the extra `vision`, and is imported when it is asked for.
 """
 
-from importlib import import_module
-from typing import Any
-
+from jaxslam._runtime.exports import exported
 from jaxslam.io.tum import read_tum, write_tum
 
 _MODULES = {
@@ -19,21 +17,5 @@ _MODULES = {
     "write_calibration": "calibration",
 }
 """Where each name is that is imported only when it is asked for."""
-__all__ = [
-    "Calibration",
-    "Frame",
-    "Source",
-    "Trajectory",
-    "open_recording",
-    "open_source",
-    "read_calibration",
-    "read_tum",
-    "write_calibration",
-    "write_tum",
-]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+__all__ = ["read_tum", "write_tum", *_MODULES]
+__getattr__ = exported(__name__, _MODULES)

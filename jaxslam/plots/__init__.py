@@ -1,7 +1,6 @@
 """Figures, drawn by matplotlib without its global state."""
 
-from importlib import import_module
-from typing import Any
+from jaxslam._runtime.exports import exported
 
 _MODULES = {
     "plot_consistency": "consistency",
@@ -16,21 +15,5 @@ _MODULES = {
     "new_figure": "style",
 }
 """Where each name is that is imported only when it is asked for."""
-__all__ = [
-    "COLOURS",
-    "GREY",
-    "Laid",
-    "line_style",
-    "new_figure",
-    "plot_consistency",
-    "plot_evaluation",
-    "plot_frames",
-    "plot_landmark_clouds",
-    "plot_triangulation",
-]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+__all__ = [*_MODULES]
+__getattr__ = exported(__name__, _MODULES)

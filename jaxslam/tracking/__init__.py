@@ -1,7 +1,6 @@
 """A camera tracked through a video, and what is written of it; needs the extra `vision`."""
 
-from importlib import import_module
-from typing import Any
+from jaxslam._runtime.exports import exported
 
 _MODULES = {
     "Tracked": "report",
@@ -17,22 +16,5 @@ _MODULES = {
     "relative_pose_error": "trajectory",
 }
 """Where each name is that is imported only when it is asked for."""
-__all__ = [
-    "Tracked",
-    "Tracker",
-    "TrackerSettings",
-    "absolute_trajectory_error",
-    "describe",
-    "read_ply",
-    "read_target",
-    "relative_pose_error",
-    "seen_from",
-    "synthetic_source",
-    "track",
-]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+__all__ = [*_MODULES]
+__getattr__ = exported(__name__, _MODULES)
