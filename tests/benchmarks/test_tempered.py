@@ -119,6 +119,7 @@ def test_the_trace_says_what_happened_in_every_round():
     assert 0.5 < np.mean(trace.acceptance[:rounds]) < 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("first", "expected"), [(0.5, 0.5), (0.1, 0.1)])
 def test_modes_have_their_weights(first, expected):
     """Two modes of σ 0.05 at ±1 in three dimensions: no chain would ever cross. The particles part
@@ -251,6 +252,7 @@ def true_path(scenario):
     return jnp.concatenate([first, accelerations.ravel()])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("truncated", [True, False])
 def test_the_likelihood_of_a_path_is_the_integral_over_its_landmarks(truncated):
     problem, y = problem_of(REST, truncated=truncated), true_path(REST)
@@ -278,6 +280,7 @@ def bent():
     return marginal_log_likelihood(problem, y), by_quadrature(problem, y), draws
 
 
+@pytest.mark.slow
 def test_the_weight_of_a_path_makes_its_likelihood_exact_where_pixels_are_bent():
     """Bounds: 5 standard errors of 20 000 draws."""
     value, (expected, _), (_, log_weights) = bent()
@@ -300,6 +303,7 @@ def test_weighted_landmarks_have_their_exact_moments():
     assert omega.min() > BENT.least_inverse_depth
 
 
+@pytest.mark.slow
 def test_a_path_with_a_landmark_behind_the_camera_is_impossible():
     problem = problem_of(REST)
     y = jnp.zeros(path_size(problem))
@@ -334,6 +338,7 @@ def depths_of(draws):
     return jax.vmap(partial(inverse_depths, problem_of(LOOSE)))(draws.unknowns)
 
 
+@pytest.mark.slow
 def test_on_a_problem_of_one_mode_particles_and_chains_agree():
     """In the last pose, the velocity and the depths; bounds are 5 of what 400 draws would err."""
     draws, chains = on_one_mode()

@@ -93,6 +93,7 @@ def test_the_normalised_square_is_the_mahalanobis_distance_and_nan_if_there_is_n
     assert np.isnan(normalised_squared(e, -P))
 
 
+@pytest.mark.slow
 def test_chunks_do_not_matter_and_run_i_is_the_same_in_any_number_of_runs():
     whole = all_runs(jaxslam.monte_carlo(SCENARIO, filters(), runs=7, chunk=CHUNK))
     chunked = all_runs(jaxslam.monte_carlo(SCENARIO, filters(), runs=5, chunk=2))
@@ -111,6 +112,7 @@ def test_chunks_in_threads_are_those_one_after_another(monkeypatch):
         np.testing.assert_array_equal(values, together[key], err_msg=key)
 
 
+@pytest.mark.slow
 def test_a_batch_in_parts_that_fit_the_cache_is_the_same(monkeypatch):
     """Seven runs, three at a time: the last part has two of them again."""
 
@@ -134,6 +136,7 @@ def test_a_batch_in_parts_that_fit_the_cache_is_the_same(monkeypatch):
     montecarlo.forget()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["xla", "native"])
 def test_of_the_last_chunk_only_what_is_wanted_is_computed(backend, monkeypatch):
     """Three at a time by XLA, as soon as one of them is wanted; as many as are wanted natively."""
@@ -164,6 +167,7 @@ def without(summary, *gone):
     return {key: without(value, *gone) for key, value in summary.items() if key not in gone}
 
 
+@pytest.mark.slow
 def test_a_reduced_study_says_the_same_but_for_its_medians(tmp_path):
     """One run diverges, others are lost: all that is counted has something to count."""
     sizes: dict[str, Any] = {"runs": 40, "chunk": 6}
@@ -216,6 +220,7 @@ def test_no_chunk_begins_after_an_error(monkeypatch):
     assert len(began) < 99
 
 
+@pytest.mark.slow
 def test_filters_meet_the_same_worlds():
     study = jaxslam.monte_carlo(
         SCENARIO, filters(names=("inverse_scaling", "inverse_depth")), runs=CHUNK
@@ -265,6 +270,7 @@ def test_a_diverged_run_is_counted_and_spoils_no_other():
     assert "means and band are of the 5 runs that did not diverge" in table
 
 
+@pytest.mark.slow
 def test_a_run_that_comes_back_was_lost_ever():
     study = jaxslam.monte_carlo(SCENARIO, filters(), runs=4, chunk=2)
     study = with_nees(with_nees(study, 1, 2, 30.0), 3, [2, 4], 25.0)
@@ -414,6 +420,7 @@ def test_scale_is_reported_where_nothing_is_told_in_metres():
     assert "at one scale a run" not in jaxslam.table(measured)
 
 
+@pytest.mark.slow
 def test_the_table_begins_with_the_verdicts_and_shows_the_plain_mean_beside_the_others():
     study = jaxslam.monte_carlo(SCENARIO, filters(), runs=20)
     study = with_nees(study, 7, slice(4, None), 400.0)
@@ -514,6 +521,7 @@ def records_of(slam, sensor, run):
     return quick_jit(partial(filter_run, slam, room, sensor))(run)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["robocentric", "scale_gauge+mixture3"])
 def test_a_slot_used_again_is_as_good_as_one_of_its_own(name):
     """What is not seen again says no more: without it a filter goes on as with it."""
@@ -546,6 +554,7 @@ class WithoutRemove(AbstractFilter):
         return self.base.landmark_marginal(state, function, slots)
 
 
+@pytest.mark.slow
 def test_a_filter_that_cannot_remove_landmarks_cannot_use_slots_again():
     for name, refused in (("handheld", True), ("matched-6dof", False)):
         scenario = jaxslam.scenario(name, steps=2, landmarks=3)
@@ -564,6 +573,7 @@ def test_no_frame_has_room_for_more_features_than_there_are_landmarks():
     assert room == Room(landmarks=32, first=30, known=30, new=1)
 
 
+@pytest.mark.slow
 @pytest.mark.statistics
 @pytest.mark.parametrize("name", ["matched-tight", "matched-6dof-tight"])
 def test_with_tight_noise_the_mean_nees_is_within_its_bounds(name):
@@ -583,6 +593,7 @@ def test_with_tight_noise_the_mean_nees_is_within_its_bounds(name):
         np.testing.assert_allclose(landmark.mean(), result["landmark_dof"], rtol=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.statistics
 def test_with_loose_noise_unified_inverse_depth_is_the_more_over_confident():
     scenario = jaxslam.scenario("matched-loose", steps=40)

@@ -321,6 +321,7 @@ def test_a_wrong_convention_of_a_planar_robot_is_found_too():
         assert jaxslam.evaluate_poses(*poses, stated).suggested == Convention("split")
 
 
+@pytest.mark.slow
 def test_axes_used_may_be_said_and_the_first_pose_known_on_them():
     T, P, truth, nees = planar()
     found = jaxslam.evaluate_poses(T, P, truth, Convention("split"), axes_used="rz,x")
@@ -472,6 +473,7 @@ def elsewhere(T, P, convention, motion):
     return motion.moved(flat).reshape(shape), moved.reshape(P.shape)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("convention", EVERY[::5], ids=str)
 @pytest.mark.parametrize("scale", [1.0, 0.3])
 def test_alignment_by_all_positions_undoes_a_motion_of_the_world(convention, scale):
@@ -501,6 +503,7 @@ def test_a_moved_covariance_is_that_of_moved_errors():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scaled", [False, True])
 def test_the_oblique_projection_is_what_alignment_does_to_errors(scaled):
     """A joint covariance with most of its errors common to all poses, as a SLAM's: the NEES of
@@ -546,6 +549,7 @@ def test_the_projected_covariance_of_independent_errors_is_the_joint_ones():
         np.testing.assert_allclose(projected(T, P, split, scaled=True)[k], block, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("convention", [Convention("left"), Convention("split")])
 def test_an_estimate_that_begins_at_a_known_pose_is_aligned_there(convention):
     T, P, truth = logged(convention)
@@ -573,6 +577,7 @@ def test_given_the_scale_and_se3_go_together_only_where_the_first_pose_is_known(
         jaxslam.evaluate_poses(*logged(Convention()), align="rigid")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("align", ["se3", "sim3"])
 def test_the_rotation_about_a_straight_line_is_not_fitted_to_noise(align):
     """Ten metres straight on, each pose with an error of 5 cm and .01 rad, of its own."""
@@ -633,6 +638,7 @@ def test_pairs_and_fits_are_those_of_evo():
 # --- runs that are not equally long ---------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joint", [False, True])
 @pytest.mark.parametrize("align", ["none", "se3", "sim3"])
 def test_poses_that_were_not_logged_change_nothing_of_the_others(align, joint):
@@ -1125,6 +1131,7 @@ def measured(truth, sigma, seed=9):
     return benchmark.displaced(truth, noise, Convention())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("geometry", [PLANAR, SPATIAL])
 @pytest.mark.parametrize("convention", EVERY[::5], ids=str)
 def test_a_right_filter_is_consistent_with_the_sigma_of_a_measured_truth(convention, geometry):
@@ -1167,6 +1174,7 @@ def test_derivatives_by_true_poses_are_those_of_the_error(convention, geometry):
     np.testing.assert_allclose(turned[0], N @ J, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_noise_of_a_first_true_pose_moves_all_and_metres_are_the_truths():
     """A camera in a unit of its own, 4 m, laid on the first pose of a truth that is measured."""
     sigma, (T, P, truth) = (0.08, 1.0), logged(TRACKED, runs=80, steps=12, spread=0.5)

@@ -26,6 +26,7 @@ def case(name="matched-loose", **fields):
     return Case(name, **{**SHORT, **fields})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["robocentric", "scale_gauge", "world"])
 def test_where_nothing_is_uncertain_all_are_one_filter(name):
     """With tiny noise every filter is linear: the lag and the gauge change nothing."""
@@ -45,6 +46,7 @@ def test_where_nothing_is_uncertain_all_are_one_filter(name):
     np.testing.assert_allclose(lagged_nis, plain_nis, rtol=5e-3)
 
 
+@pytest.mark.slow
 def test_one_frame_of_lag_is_the_filter_itself_at_the_first_step():
     """Nothing has been absorbed, and one Gauss–Newton step from the prediction is the EKF's."""
     of = case()
@@ -59,6 +61,7 @@ def test_one_frame_of_lag_is_the_filter_itself_at_the_first_step():
     close(lagged_P, plain_P, 0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("landmarks", ["inverse_scaling", "inverse_depth"])
 @pytest.mark.parametrize(
     ("name", "scenario_name"),
@@ -90,6 +93,7 @@ def test_the_sensitivities_are_the_derivatives(name, scenario_name, landmarks):
     close(slope.by_variables(state.before), A, 2e-5)
 
 
+@pytest.mark.slow
 def test_the_estimate_of_a_window_that_holds_everything_is_the_maximum_of_the_posterior():
     """Converged, with no frame absorbed: the gradient of ½|y|² + ½ Σ|r|² is zero there."""
     of = case()
@@ -124,6 +128,7 @@ def test_a_frame_is_linearised_as_often_as_is_said(monkeypatch, iterations):
     assert len(linearised) == iterations
 
 
+@pytest.mark.slow
 def test_an_iterated_filter_uses_a_measurement_once():
     """Position sensor, nothing moves: a scalar prior of 1 and a noise of 1 end at P = 1/2.
 
@@ -141,6 +146,7 @@ def test_an_iterated_filter_uses_a_measurement_once():
     np.testing.assert_allclose(iterated_P, plain_P, rtol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coordinates", ["robocentric", "scale_gauge"])
 def test_the_iterated_filter_in_stages_is_the_window_of_one_frame(coordinates):
     """After the first frame, of which both have the same prior: three steps of Gauss–Newton."""

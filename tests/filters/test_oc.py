@@ -94,6 +94,7 @@ def moved(model, core, landmarks):
     return model.compose_core(core, here), landmarks
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("geometry", "landmark", "frame"),
     [(PLANAR, landmark, WORLD) for landmark in each_landmark]
@@ -124,6 +125,7 @@ def test_the_gauge_changes_no_measurement_now_or_after_a_motion(geometry, landma
     np.testing.assert_allclose(difference(actual[0], expected[0]), 0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD], ids=named)
 @pytest.mark.parametrize("landmark", [INVERSE_SCALING, FRAMED_HOMOGENEOUS], ids=named)
 def test_directions_are_the_derivative_of_the_action(landmark, frame):
@@ -196,6 +198,7 @@ def window(model, constrained):
     return np.vstack(rows), N
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("geometry", "landmark", "frame", "motion"),
     [
@@ -251,7 +254,7 @@ def run_with_gauge(slam, geometry, directions):
         def step(state, frame):
             state, innovation = slam.step(state, *frame)
             # Where the filter's directions are those of landmarks' first estimates.
-            at = replace(state, landmarks=getattr(state, "first", state.landmarks))
+            at = state if state.first is None else replace(state, landmarks=state.first)
             N = unobservable_directions(slam.model, at)[:, :directions]
             kept = state.core, state.landmarks, state.covariance
             return state, (*kept, N, innovation.nis)
@@ -282,6 +285,7 @@ REMEDIES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "geometry", "landmark"), REMEDIES)
 def test_uncertainty_of_the_gauge_changes_no_estimate_ever(name, geometry, landmark):
     """Through whole steps: K and the mean are the same, and P keeps what was added, N Σ Nᵀ."""
@@ -308,6 +312,7 @@ def test_with_odometry_a_robocentric_filter_has_nothing_to_constrain():
         np.testing.assert_allclose(x, y, rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_where_the_heading_is_known_all_are_the_kalman_filter():
     """Relative positions at a known heading are linear: one filter in every coordinates."""
     case = Case("positions", steps=8, landmarks=6, odometry_sigma=(0.05, 0.05, 0.0))
@@ -320,6 +325,7 @@ def test_where_the_heading_is_known_all_are_the_kalman_filter():
             np.testing.assert_allclose(x, y, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["robocentric+oc", "world+oc", "world+fej", "invariant"])
 def test_a_frame_without_measurements_changes_nothing(name):
     """Neither the mean nor the covariance, but for `ROUNDING`: remedies are of corrections."""

@@ -211,6 +211,7 @@ def tight():
     return Case("matched-tight", runs=5, seed=3)
 
 
+@pytest.mark.slow
 def test_robocentric_and_world_agree_where_the_problem_is_linear():
     """What differs is of second order in the noise, hence of first order in units of σ."""
     case = tight()
@@ -331,6 +332,7 @@ def near():
     return Case("matched-tight", steps=10, landmarks=5, inverse_depth=[0.2, 0.01])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("landmark", [name for name in LANDMARKS if name != "inverse_scaling"])
 def test_every_parametrization_is_the_same_filter_where_the_problem_is_linear(landmark):
     case = near()
@@ -414,6 +416,7 @@ def test_single_precision_is_near_double():
     assert np.abs(single_nis - nis).max() < 0.06
 
 
+@pytest.mark.slow
 def test_a_run_can_be_differentiated_by_its_noise():
     """d(position, σ and NIS)/d(acceleration σ), backwards through every step."""
     case = Case("matched-tight", steps=4, landmarks=4)

@@ -266,6 +266,7 @@ def test_a_record_is_cut_to_its_first_frames():
 # The quadratic
 
 
+@pytest.mark.slow
 @each_case
 def test_what_is_reduced_is_the_schur_complement_of_the_dense_problem(of):
     slam, record, x, y = case(*of)
@@ -284,6 +285,7 @@ def test_what_is_reduced_is_the_schur_complement_of_the_dense_problem(of):
     close(roots @ roots.transpose(0, 2, 1), own, 1e-8)
 
 
+@pytest.mark.slow
 @each_case
 def test_sensitivities_are_the_derivatives_of_the_path(of):
     slam, record, x, _ = case(*of)
@@ -310,6 +312,7 @@ def test_sensitivities_are_the_derivatives_of_the_path(of):
 # Minima
 
 
+@pytest.mark.slow
 @each_case
 def test_a_minimum_costs_less_than_the_truth_and_has_no_gradient(of):
     slam, record, x, y = case(*of)
@@ -369,6 +372,7 @@ def test_a_landmark_does_not_take_a_step_that_costs_more(monkeypatch):
     assert minimise.landmarks(slam, record, at, start, 9)[1] < 1
 
 
+@pytest.mark.slow
 def test_the_window_is_the_exact_posterior_of_a_run_and_has_its_minimum():
     chosen = scenario("matched-loose", steps=3, landmarks=4)
     run = jaxslam.simulate(chosen, jax.random.key(0))
@@ -447,6 +451,7 @@ def test_of_common_errors_scaling_is_the_shortest():
     assert abs(s.x[start]) > 1e-3
 
 
+@pytest.mark.slow
 @each([CASES[3], CASES[4]])
 def test_the_mean_is_shifted_by_the_volume_of_the_rest(of):
     """`½ d log det A/dλ`, against differences of it; the prior balances that at the shift."""
@@ -517,6 +522,7 @@ def test_the_mean_is_shifted_without_the_accelerations_whose_size_is_not_told():
 # What the filter goes on from
 
 
+@pytest.mark.slow
 @each(CASES[2:4])
 def test_the_filters_state_is_the_gaussian_of_the_mode(of, monkeypatch):
     """Marginals in metres are those of the dense inverse; λ has the variance 1/|s|²."""
@@ -576,6 +582,7 @@ def test_the_filters_state_is_the_gaussian_of_the_mode(of, monkeypatch):
     assert np.linalg.eigvalsh(state.covariance).min() > -1e-12
 
 
+@pytest.mark.slow
 def test_a_calibration_that_is_considered_is_found_by_the_window_and_then_left():
     slam, record, *_ = case(*CASES[2])
     at, m = minimum(*CASES[2]), FIRST.size
@@ -600,6 +607,7 @@ def test_a_calibration_that_is_considered_is_found_by_the_window_and_then_left()
     assert np.abs(moved.core.calibration - found.core.calibration).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_the_filters_state_stands_at_the_mean_of_the_scale():
     """As that of a mode all of whose lengths are so much longer."""
     slam, record, *_ = case(*CASES[1])
@@ -664,6 +672,7 @@ def test_minima_are_one_by_the_information_of_the_better(better, worse, count, m
     assert np.isfinite(found.log_weights).sum() == count
 
 
+@pytest.mark.slow
 def test_a_metre_that_is_not_known_stays_so_and_changes_nothing_else():
     slam, record, x, y = case("standstill-6dof", White, None, 3)
     unknown = replace(slam, depth=replace(slam.depth, unit=0.4))

@@ -148,6 +148,7 @@ def test_scale_enlarges_the_point_and_commutes_with_a_turn(landmark, geometry):
     np.testing.assert_allclose(transform(turn, enlarged), turned, rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.slow
 @with_geometry
 @every_landmark
 def test_derivatives_agree_with_central_differences(landmark, geometry):
@@ -175,6 +176,7 @@ def test_derivatives_agree_with_central_differences(landmark, geometry):
         close(central(quick_jit(function), at), exact, relative=1e-8)
 
 
+@pytest.mark.slow
 @with_geometry
 @at_infinity
 def test_a_point_at_infinity_is_nothing_special(landmark, geometry):

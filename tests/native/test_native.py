@@ -107,6 +107,7 @@ CASES = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("function", CASES, ids=lambda f: f.__name__)
 def test_a_function_is_what_vmap_makes_of_it(function):
@@ -392,6 +393,7 @@ FILTERS = (
 )
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize(("name", "landmark"), FILTERS)
 def test_a_study_has_the_same_records(name, landmark):
@@ -409,6 +411,7 @@ def test_a_study_has_the_same_records(name, landmark):
             np.testing.assert_allclose(found[key], value, rtol=1e-9, atol=1e-9 * scale)
 
 
+@pytest.mark.slow
 def test_a_study_falls_back_to_xla(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     scenario = jaxslam.scenario("matched", steps=6, landmarks=4)  # compiled above

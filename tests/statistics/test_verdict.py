@@ -47,6 +47,7 @@ def words(many, dof=3):
     return [Tally.of(nees, dof).decisive().word for nees in many]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dof", [1, 6])
 @pytest.mark.parametrize("runs", [3, 10, 100])
 @pytest.mark.parametrize(("steps", "correlation"), [(1, 0.0), (8, 0.0), (8, 0.98)])
@@ -145,6 +146,7 @@ def test_word_interval_and_p_value_say_the_same(runs):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("correlation", [0.0, 0.9, 1.0])
 def test_no_sum_is_in_the_tails_of_chi2_more_often_than_its_shortfall_lets_it(correlation):
     means = studies(4000, 5, steps=5, correlation=correlation).mean(axis=(1, 2))
