@@ -1,4 +1,4 @@
-"""Which matches agree with the filter and with one another: data association as pure functions.
+"""The matches that agree with the filter and with one another: data association, pure functions.
 
 All that decides is in the innovations of a predicted state: the residuals r of the matches and
 their joint covariance S, measurement noise included. What the matches of a set L say of another
@@ -91,7 +91,7 @@ def candidates(
 
     `tolerance` is a σ, in the unit of a measurement, by which each may be off beyond its noise.
     Of a `curved` measurement, the covariance has the terms of second order of each match by
-    itself, where an `EkfSlam` tells them: what depth does to it, of a camera that may have set
+    itself, where an `EkfSlam` gives them: what depth does to it, of a camera that may have set
     out in any direction.
     Raises ValueError for a filter whose innovations have no covariance.
     """
@@ -128,7 +128,7 @@ def everything(found: Candidates) -> Bool[Array, " m"]:
 
 
 def individual(found: Candidates) -> Bool[Array, " m"]:
-    """What is within its own ellipse."""
+    """The matches that are within their own ellipses."""
     return found.distances() < found.gate
 
 
@@ -215,7 +215,7 @@ ASSOCIATIONS: dict[str, Association] = {
 
 
 class _Node(NamedTuple):
-    """Where the search of `joint_compatibility` is: those before `depth` are in or out."""
+    """A node of the search of `joint_compatibility`: the matches before `depth` are in or out."""
 
     depth: Any
     taken: Any
@@ -240,7 +240,7 @@ def _whitened(found: Candidates, node: _Node):
 
 
 def _next_branch(depth, taken, within, most):
-    """Back to the last match that was in, and out with it, until more than `most` are possible;
+    """Go back to the last match that was in, and put it out, until more than `most` are possible;
     the depth is m where they never are."""
     m = taken.size
     still = jnp.append(jnp.cumsum(within[::-1])[::-1], 0)
@@ -258,14 +258,14 @@ def _next_branch(depth, taken, within, most):
 
 
 def _grown_from(found: Candidates, first: Array) -> Bool[Array, " m"]:
-    """What `sequential` makes of one start."""
+    """The matches that `sequential` keeps from one start."""
     begun = jnp.zeros_like(found.valid).at[first].set(found.valid[first])
     kept = _snooped(found, _grown(found.without(first), begun))
     return _snooped(found, kept | (found.valid & (_distances_given(found, kept) < found.gate)))
 
 
 def _grown(rest: Candidates, kept: Bool[Array, " m"]) -> Bool[Array, " m"]:
-    """With what fits best, as long as one fits."""
+    """The matches `kept` and, one after the other, the best of the rest as long as one fits."""
 
     def added(state):
         rest, kept = state
@@ -292,7 +292,7 @@ def _distances_given_one(found: Candidates) -> Float[Array, "m m"]:
 
 
 def _distances_given(found: Candidates, believed: Bool[Array, " m"]) -> Float[Array, " m"]:
-    """Of all, given that those are true; of these nothing that means anything."""
+    """The distances of all, given that the believed are true; meaningless for the believed."""
     m, p = found.residual.shape
     S, r = found.covariance.reshape(m * p, m * p), found.residual.ravel()
     known = jnp.repeat(believed, p)
@@ -342,7 +342,7 @@ def _eliminated(A: Float[Array, "m p m p"], match: Any) -> Float[Array, "m p m p
 
 
 def _inverse(A: Float[Array, "p p"]) -> Float[Array, "p p"]:
-    """Of a positive A; of any other it is not a number."""
+    """The inverse of a positive A; NaN for any other."""
     return cholesky(A).inverse()
 
 

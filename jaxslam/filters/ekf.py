@@ -42,7 +42,7 @@ from jaxslam.models.sensors import AbstractSensor
 
 
 class AbstractEntry(eqx.Module):
-    """What a method does with new landmarks and with those that it has not finished.
+    """The treatment of new landmarks, and of those whose initialisation is not finished.
 
     A *landmark* has one number for everybody outside; inside, it may own several slots of the
     state. What a method remembers beside the Gaussian is `State.memory`.
@@ -50,7 +50,7 @@ class AbstractEntry(eqx.Module):
 
     @abstractmethod
     def slots(self, landmarks: int) -> int:
-        """How many slots of the state so many landmarks need."""
+        """The number of slots of the state that so many landmarks need."""
 
     @abstractmethod
     def memory(self, landmarks: int, dtype: Any) -> Any:
@@ -72,7 +72,7 @@ class AbstractEntry(eqx.Module):
 
     @abstractmethod
     def initialised(self, state: Any) -> Bool[Array, " landmarks"]:
-        """Which landmarks are in the map as one Gaussian."""
+        """Whether each landmark is in the map as one Gaussian."""
 
 
 class Undelayed(AbstractEntry):
@@ -202,7 +202,7 @@ class EkfSlam(AbstractStaged):
     def marginal(
         self, state: Any, function: Callable[[CameraView], Any]
     ) -> tuple[Any, Float[Array, "k k"]]:
-        """Of the state at the end of a frame, to first order: `J P Jᵀ`."""
+        """The marginal of the state at the end of a frame, to first order: `J P Jᵀ`."""
 
         def of_core(core: Core) -> Any:
             return function(CameraView(self.model.camera_pose(core), core, core.log_scale))
@@ -233,7 +233,7 @@ class EkfSlam(AbstractStaged):
 
 
 def composed(core: Core) -> Core:
-    """Of a core what the camera and its landmarks depend on once the motion is composed."""
+    """The part of a core on which camera and landmarks depend once the motion is composed."""
     nothing = core.noise[:0]
     return replace(core, motion=None, noise=nothing, calibration=nothing, depth_error=None)
 
@@ -266,7 +266,7 @@ def composed_first(slam: EkfSlam, state: Any, control: Any) -> Any:
 
 
 def context_of(slam: EkfSlam, control: Any) -> Context:
-    """What a predicted state's functions are given: the motion that is not yet composed."""
+    """The context of a predicted state's functions: the motion that is not yet composed."""
     return COMPOSED if slam.compose_first else Context(control)
 
 
@@ -422,7 +422,7 @@ def _with_frames_calibration(slam: EkfSlam, state: Any) -> Any:
 
 
 def _forgotten(slam: EkfSlam, state: Any) -> Any:
-    """Without the frame's calibration error, where the next frame draws another."""
+    """The state without the frame's calibration error, where the next frame draws another."""
     if not slam.calibration.each_frame:
         return state
     part = state.core.part("calibration")

@@ -34,7 +34,7 @@ from jaxslam.models.sensors import AbstractSensor
 
 
 class Core(eqx.Module):
-    """What the filter estimates beside the landmarks, and the noises that one step appends."""
+    """The estimate of everything but the landmarks, and the noises that one step appends."""
 
     pose: Pose | SplitPose | KeyframePose
     """T_CB in a robocentric filter, T_BC in a world-centric one, T_BK and T_KC in one with
@@ -43,7 +43,7 @@ class Core(eqx.Module):
     """What the motion model keeps: a velocity in the camera's own frame, a bias, nothing."""
     log_scale: Float[Array, " u"] | None
     """λ of a filter with a scale gauge, or None: lengths in the state are in units of `e^λ` of what
-    was told as metres. Behind it, where that is not known, the log of these metres in metres."""
+    was given as metres. Behind it, where that is not known, the log of these metres in metres."""
     noise: Float[Array, " q"]
     """What drives this step's motion: the acceleration a (P10), or the odometry's error, and what
     the calibration drifts by; zero before `predict` and after composition."""
@@ -55,7 +55,7 @@ class Core(eqx.Module):
     """What the priors on 1/z of all landmarks have in common, in σ of one prior, or None."""
 
     def part(self, name: str) -> slice:
-        """Where a field is in the tangent of the core."""
+        """The slice of a field in the tangent of the core."""
         start = 0
         for field in fields(self):
             size = tangent_dim(getattr(self, field.name))
@@ -80,7 +80,7 @@ COMPOSED = Context(None)
 
 
 class CameraInMap(eqx.Module):
-    """What a landmark depends on beside itself."""
+    """The quantities beside itself on which a landmark depends."""
 
     map_from_camera: Pose
     """T_AC(k), the current camera in the map frame."""
@@ -157,7 +157,7 @@ class SlamModel(eqx.Module):
         return self.coordinates.estimate(self._metric_pose(core))
 
     def _metric_pose(self, core: Core) -> Any:
-        """What is held of the pose, in metres."""
+        """The pose as the core holds it, in metres."""
         if core.log_scale is None:
             return core.pose
         return scaled(core.pose, jnp.exp(jnp.sum(core.log_scale)))
@@ -208,7 +208,7 @@ class SlamModel(eqx.Module):
         return self.calibration.sensor(self.sensor, view.calibration)
 
     def residual(self, measured: Array, predicted: Array) -> Array:
-        """What a measurement differs by from its prediction."""
+        """The difference of a measurement from its prediction."""
         return self.sensor.residual(measured, predicted)
 
     def camera_point(self, view: CameraInMap, landmark: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""What a filter is to those who run it: Monte Carlo studies, trackers, a loop of one's own.
+"""The interface of a filter to its users: Monte Carlo studies, trackers, a loop of one's own.
 
 A filter is a module (a pytree that holds its numbers) with four functions, pure and on a state
 that is any pytree of arrays: `init`, `step`, `marginal`, `landmark_marginal`. One that can also
@@ -21,7 +21,7 @@ from jaxslam.models.observations import Capacity, Features, Innovation
 
 
 class CameraView(eqx.Module):
-    """What can be asked of the camera."""
+    """The quantities that can be asked of the camera."""
 
     pose: Pose
     """T_BC, in metres."""
@@ -33,7 +33,7 @@ class CameraView(eqx.Module):
 
 
 class LandmarkView(eqx.Module):
-    """What can be asked of one landmark."""
+    """The quantities that can be asked of one landmark."""
 
     pose: Pose
     """T_BC, in metres."""
@@ -46,13 +46,13 @@ class LandmarkView(eqx.Module):
 
 
 class Expected(NamedTuple):
-    """What a filter expects to see in a frame that it has predicted, landmark by landmark."""
+    """The features that a filter expects in a frame that it has predicted, landmark by landmark."""
 
     measured: Float[Array, "m p"]
     covariance: Float[Array, "m p p"]
-    """Of the innovations: the search ellipses."""
+    """The covariances of the innovations: the search ellipses."""
     possible: Bool[Array, " m"]
-    """In the map and in front of the camera."""
+    """Whether each is in the map and in front of the camera."""
     pose: Pose
     """T_BC."""
     points: Float[Array, "m n"]
@@ -97,7 +97,7 @@ class AbstractFilter(eqx.Module):
         return self
 
     def in_map(self, state: Any) -> Bool[Array, " capacity"]:
-        """Which slots hold a landmark."""
+        """Whether each slot holds a landmark."""
         return state.active
 
     def pose_error(self, state: Any, T_BC: Pose) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
@@ -124,11 +124,11 @@ class AbstractStaged(AbstractFilter):
 
     @abstractmethod
     def predict(self, state: Any, control: Any) -> Any:
-        """What is known before the frame's measurements."""
+        """Predict the state before the frame's measurements."""
 
     @abstractmethod
     def predict_features(self, state: Any, control: Any, slots: Int[Array, " m"]) -> Expected:
-        """What a predicted state expects to see."""
+        """The features that a predicted state expects to see."""
 
     @abstractmethod
     def update(self, state: Any, control: Any, seen: Features) -> tuple[Any, Innovation]:

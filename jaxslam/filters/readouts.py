@@ -1,4 +1,4 @@
-"""What a filter's state says, of any filter: free functions of its marginals."""
+"""The readouts of a filter's state, of any filter: free functions of its marginals."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def camera_pose(slam: AbstractFilter, state: Any) -> tuple[Pose, Float[Array, "t
 
 
 class InUnit(NamedTuple):
-    """Where the camera is in the filter's own unit of length, and how long that is in metres."""
+    """The camera's pose in the filter's own unit of length, and that unit in metres."""
 
     pose: Pose
     """T_BC, with its lengths in that unit."""
@@ -36,7 +36,7 @@ class InUnit(NamedTuple):
 def camera_pose_in_unit(slam: AbstractFilter, state: Any) -> InUnit:
     """T_BC in the filter's own unit, `(R, t e^−Σλ)`, and beside it Σλ, the log of that in metres.
 
-    The camera's path is known much better than its size: λ wanders while nothing tells of it, and a
+    The camera's path is known much better than its size: λ wanders while nothing observes it, and a
     path in metres is blown up and shrunk with it, but none in the unit of the state. Mean and
     covariance of a Gaussian sum are those of the pose in the unit.
     """
@@ -92,9 +92,9 @@ def landmarks_from_above(
 def landmarks_on_sides(
     slam: AbstractFilter, state: Any, slots: Int[Array, " m"], sigmas: float = 2.0
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """How many landmarks are surely in front of infinity, 1/z > 0, and how many surely behind.
+    """The numbers of landmarks surely in front of infinity, 1/z > 0, and surely behind.
 
-    Pixels do not tell the one from the other: a world that is mostly behind is a reversed one.
+    Pixels do not distinguish the two: a world that is mostly behind is a reversed one.
     """
     inverse_depth, P = slam.landmark_marginal(
         state, lambda view: (view.omega / view.point[-1])[None], slots

@@ -190,16 +190,16 @@ percent of that (`checked`); steps of Gauss–Newton in an update (`oc`); none f
 `fej`."""
 
 RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gauge+scene50+mixture9"}
-"""The filter called `recommended`, by geometry, where the velocity is told."""
+"""The filter called `recommended`, by geometry, where the velocity is given."""
 FROM_REST = {
     "planar": "scale_gauge+scene50+mixture5+rest",
     "spatial": "scale_gauge+oc+scene50+mixture3+rest8",
 }
-"""The one where it is not: the camera sets out from rest, or nobody says how."""
+"""The one where it is not: the camera starts from rest, or its velocity is unknown."""
 
 
 def recommended_name(motion: AbstractMotion) -> str:
-    """What `recommended` stands for, of those of docs/consistency.md and docs/from-rest.md: for a
+    """The filter called `recommended`, one of docs/consistency.md and docs/from-rest.md: for a
     velocity whose mean is less than 3 σ of it, a filter that looks for itself."""
     geometry = motion.geometry
     if not motion.has_velocity:

@@ -15,7 +15,7 @@ from jaxslam.models.observations import Features, Innovation
 
 
 class Frames(NamedTuple):
-    """What a filter is given of the frames after frame 0: every array begins with their axis."""
+    """The inputs of a filter in the frames after frame 0: every array begins with their axis."""
 
     control: PyTree
     """The motion model's: seconds, the odometry's reading, …"""
@@ -28,7 +28,7 @@ class Frames(NamedTuple):
 
 
 class Estimates(NamedTuple):
-    """What a filter says after every frame."""
+    """The estimates of a filter after every frame."""
 
     pose: Pose
     """T_BC."""

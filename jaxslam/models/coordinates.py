@@ -103,7 +103,7 @@ WORLD = Coordinates(
     map_from_camera=lambda split, step: split.joined() @ step,
     compose=lambda split, step: SplitPose.of((split.joined() @ step).normalize()),
 )
-"""A = B: the state holds T_BC, position and orientation apart."""
+"""A = B: the state holds T_BC, position and orientation separately."""
 
 KEYFRAME = Coordinates(
     name="keyframe",

@@ -11,7 +11,7 @@ from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field
 class InverseDepth(eqx.Module):
     """`1/z = mean + σ (own e_i + common c)`, with e_i of every landmark and one c, standard normal.
 
-    c is estimated with everything else: the first landmarks tell those that follow how far away
+    c is estimated with everything else: the first landmarks inform those that follow how far away
     the scene is.
     """
 
@@ -23,9 +23,9 @@ class InverseDepth(eqx.Module):
     common: Float[AnyArray, ""] | None = eqx.field(converter=optional_numbers, default=None)
     """None where landmarks have nothing in common."""
     unit: Float[AnyArray, ""] | None = eqx.field(converter=optional_numbers, default=None)
-    """σ of the log of the metre in which all of this was meant, and whatever else is told: a filter
-    with a unit of its own (`ScaleGauge`) claims no more of the scale, whatever it sees. None where
-    it was the metre."""
+    """σ of the log of the metre in which all of this was meant, and whatever else is given: a
+    filter with a unit of its own (`ScaleGauge`) claims no more of the scale, whatever it sees. None
+    where it was the metre."""
 
     def __check_init__(self) -> None:
         for name in ("mean", "sigma", "own"):

@@ -25,7 +25,7 @@ class AbstractMotion(eqx.Module):
     """A motion model. What it keeps in the state is any pytree of poses and vectors."""
 
     has_velocity: ClassVar[bool] = False
-    """Whether its variables are a velocity, linear and angular, and nothing that it is told is in
+    """Whether its variables are a velocity, linear and angular, and nothing that it is given is in
     metres: then the scale is free, and a Gaussian sum can divide it."""
 
     if TYPE_CHECKING:  # a field or a property of each model
@@ -60,13 +60,13 @@ class AbstractMotion(eqx.Module):
         """The control with which nothing moves."""
 
     def nominal_control(self, velocity: Float[Array, " t"], seconds: Number) -> Any:
-        """The control of a step at a constant velocity: what a simulation tells the model."""
+        """The control of a step at a constant velocity: what a simulation gives the model."""
         raise NotImplementedError(f"{type(self).__name__} does not say how to simulate it")
 
     def enlarged(
         self, variables: Any, noise: Float[Array, " q"], factor: Scalar
     ) -> tuple[Any, Float[Array, " q"]]:
-        """Variables and noise in a unit of length that is 1/factor; a model that is told metres
+        """Variables and noise in a unit of length that is 1/factor; a model that is given metres
         has no other."""
         del factor
         return variables, noise

@@ -87,5 +87,5 @@ def judged(positive: Bool[Array, ""], *finite: Array) -> Int[Array, ""]:
     """The `Status` of an update whose matrix was factored, and whose results are these arrays."""
     healthy = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in finite]))
     status = jnp.where(positive, Status.OK, Status.NOT_POSITIVE)
-    # Without a factor nothing is finite: that is the cause, and the first to be told.
+    # Without a factor nothing is finite: that is the cause, and the first to be reported.
     return jnp.where(healthy | ~positive, status, Status.DIVERGED)

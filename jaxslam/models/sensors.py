@@ -24,7 +24,7 @@ class AbstractSensor(eqx.Module):
     """A measurement model of one homogeneous point (X, ω) in the sensor's frame."""
 
     hidden: ClassVar[int] = 0
-    """How many numbers of a point one measurement does not tell: the size of their prior, q."""
+    """The count of numbers of a point that one measurement hides: the size of their prior, q."""
 
     if TYPE_CHECKING:  # a field or a property of each sensor
 

@@ -1,4 +1,4 @@
-"""What every form of the filter shares: one-landmark models, and their Jacobians in blocks.
+"""The base of every form of the filter: one-landmark models, and their Jacobians in blocks.
 
 Every model is a function of ONE landmark and of a *view*, the few quantities of the core that a
 landmark depends on (the relative pose of the camera, its calibration). `jax.jacfwd` sees v + d
@@ -59,7 +59,7 @@ class Model(Protocol):
         ...
 
     def view(self, core: Any, context: Any) -> Any:
-        """What the functions below need of the core."""
+        """The part of the core that the functions below need."""
         ...
 
     def compose_landmark(self, view: Any, landmark: Array, context: Any) -> Array:
@@ -71,7 +71,7 @@ class Model(Protocol):
         ...
 
     def residual(self, measured: Array, predicted: Array) -> Array:
-        """What a measurement differs by from its prediction."""
+        """The difference of a measurement from its prediction."""
         ...
 
     def initialise(self, view: Any, measured: Array, hidden: Array, context: Any) -> Array:
@@ -162,7 +162,7 @@ def new_landmarks(
 
 
 def indices(slots: Int[Array, " m"], state: Any) -> Int[Array, "m d"]:
-    """Where the landmarks in these slots are in the state's error; out of bounds stays so."""
+    """The places of the landmarks in these slots in the state's error; out of bounds stays so."""
     d = state.landmarks.shape[1]
     return state.core_dim + slots[:, None] * d + jnp.arange(d)
 

@@ -1,4 +1,4 @@
-"""How the covariance form corrects by measurements: the Kalman update, and what keeps to it.
+"""The corrections of the covariance form by measurements: the Kalman update and its base class.
 
 A correction is a piece of `Covariance`. Each of the others is in a file of its own:
 `first_estimates`, `invariant`, `observability_constrained`.
@@ -31,7 +31,7 @@ the correlations stay above `−n ε` however many there are (measured over 600 
 
 
 class AbstractCorrection(eqx.Module):
-    """What an update makes of the features seen."""
+    """A correction of the state by the features seen."""
 
     divisible: ClassVar[bool] = True
     """Whether the state is then a mean and a covariance of `x ⊞ δ`, to be divided and merged."""

@@ -1,4 +1,4 @@
-"""What a form of the filter is: how its uncertainty is kept, and what every step does to it.
+"""The form of a filter: how its uncertainty is kept, and what every step does to it.
 
 `Covariance` keeps P, `Information` its inverse, `Sensitivity` no distribution but derivatives. A
 state of each has `core`, `landmarks`, `active`, `memory` and `core_dim`. A remedy is a correction
@@ -131,7 +131,7 @@ class AbstractGaussian(AbstractForm):
     def predict_features(
         self, model: Model, state: Any, slots: Int[Array, " m"], noise: Noise, context: Any
     ) -> tuple[Float[Array, "m p"], Float[Array, "m p p"], Bool[Array, " m"]]:
-        """Where landmarks should be seen: measurements, covariances of their innovations, possible
+        """The predicted features: measurements, covariances of their innovations, possible
         or not. These are the centres and the search ellipses of active search."""
         predicted, in_front, H = observe(model, state, slots, context)
         return predicted, self.local_covariance(state, H, slots) + noise, in_front
@@ -150,7 +150,7 @@ class AbstractGaussian(AbstractForm):
         return value, self.local_covariance(state, J, slots)
 
     def joint_covariance(self, state: Any, slot: Int[Array, ""]) -> Float[Array, "k k"]:
-        """Of the core and one landmark, k = c + d numbers."""
+        """The joint covariance of the core and one landmark, k = c + d numbers."""
         c, d = state.core_dim, state.landmarks.shape[1]
         index = jnp.concatenate([jnp.arange(c), c + slot * d + jnp.arange(d)])
         return state.covariance[index[:, None], index]

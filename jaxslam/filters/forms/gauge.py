@@ -1,4 +1,4 @@
-"""The gauge of SLAM: transformations of the whole state that no measurement can tell.
+"""The gauge of SLAM: transformations of the whole state that no measurement observes.
 
 Where the base frame is, is a convention; so is the unit of length where only bearings are measured
 and no motion is metric. The group's action on the state gives the unobservable directions,

@@ -299,7 +299,7 @@ def _without(information: Float[Array, "n n"], start: int, gone: Bool[Array, " k
 
 
 def _present(information: Float[Array, "n n"]) -> Bool[Array, " n"]:
-    """Which numbers are in the state."""
+    """Whether each number is in the state."""
     return jnp.diagonal(information) != 0
 
 

@@ -61,7 +61,7 @@ class Distribution(eqx.Module):
 
 
 class Derivative(NamedTuple):
-    """Of k numbers for each of m landmarks, in blocks as sparse as they are."""
+    """The derivative of k numbers for each of m landmarks, in blocks as sparse as they are."""
 
     by_shared: Float[Array, "m k r"]
     """By the error of the core before the frames, and by their noise."""

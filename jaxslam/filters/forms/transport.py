@@ -54,7 +54,7 @@ def left_inverse(N: Float[Array, "n g"]) -> Float[Array, "g n"]:
 
 
 def read_from(N: Float[Array, "n g"], count: int) -> Float[Array, "g n"]:
-    """L: the gauge that the first `count` numbers of an error tell."""
+    """The gauge L that is read from the first `count` numbers of an error."""
     return left_inverse(N.at[count:].set(0.0))
 
 

@@ -1,4 +1,4 @@
-"""What delayed initialisations share: Bayes' rule on the alternative depths of a landmark."""
+"""The base of delayed initialisations: Bayes' rule on the alternative depths of a landmark."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def _initialise(point, omega, focal):
 
 
 def _convert(camera, landmark, covariance):
-    """To Cartesian as soon as ρ has a variance."""
+    """Convert a landmark to Cartesian as soon as ρ has a variance."""
     del camera
     point, omega = INVERSE_DEPTH_TO_CARTESIAN.homogeneous(landmark)
     position = point / omega
@@ -57,7 +57,7 @@ class DepthParticles(AbstractEntry):
     farthest: float = eqx.field(static=True, default=5.0)
     """The range of distances along a ray, m."""
     count: int = eqx.field(static=True, default=100)
-    """Particles of a ray. Where a step of the camera moves the pixels of neighbouring ones apart by
+    """Particles of a ray. Where a step of the camera separates the pixels of neighbouring ones by
     many σ, none may explain a measurement between them."""
     agreement: float = eqx.field(static=True, default=0.3)
     """A ray becomes a point where σ_d / mean_d is below this."""

@@ -32,7 +32,7 @@ LANDMARK_STEPS = 3
 
 
 class Minimum(eqx.Module):
-    """Where a minimisation stands; or a batch of them."""
+    """The state of a minimisation, or of a batch of them."""
 
     x: Float[Array, "*k N"]
     y: Float[Array, "*k m q"]
@@ -43,7 +43,7 @@ class Minimum(eqx.Module):
 
 
 def started(x: Float[Array, " N"], y: Float[Array, "m q"]) -> Minimum:
-    """Before the first step."""
+    """The state of a minimisation before the first step."""
     cost, damping = jnp.asarray(jnp.inf, x.dtype), jnp.asarray(1e-3, x.dtype)
     return Minimum(x, y, cost, damping, jnp.asarray(False))
 
@@ -54,7 +54,7 @@ def minimised(
     start: Minimum,
     steps: int | Int[Array, ""],
 ) -> Minimum:
-    """After at most so many steps."""
+    """The state of a minimisation after at most so many steps."""
 
     def going(carry):
         step, now = carry

@@ -1,6 +1,6 @@
 """The modes of a window's posterior: where they are, and how much each is worth.
 
-A camera that sets out from rest leaves several: (t, v, ω) → −(t, v, ω) changes no pixel, and with
+A camera that starts from rest leaves several: (t, v, ω) → −(t, v, ω) changes no pixel, and with
 the rotation that takes up the mean flow t → −t changes them little (the Necker cube). So the
 minimisation starts from rest and from translations in all directions; the distinct minima are kept,
 weighed by Laplace's `−½ |r|² − ½ log det A`, A the information of all unknowns.
@@ -46,7 +46,7 @@ class Modes(eqx.Module):
 
 
 def at_rest(slam: EkfSlam, record: Record, count: int, dtype: Any) -> Modes:
-    """Before anything is known: one mode, the prior's mean."""
+    """The modes before anything is known: one, the prior's mean."""
     size, m = PathLayout.of(slam).size(record.frames), record.first.size
     q = slam.sensor.size + slam.sensor.hidden
     x, y = jnp.zeros((count, size), dtype), jnp.zeros((count, m, q), dtype)

@@ -25,7 +25,7 @@ from jaxslam.geometry import Pose, Scalar, homogeneous_apply, identity, jacobian
 
 
 class CalibratedPose(eqx.Module):
-    """What a measurement depends on beside the landmark; of one frame, or of all."""
+    """The dependences of a measurement beside the landmark; of one frame, or of all."""
 
     pose: Pose
     """T_BC, B the camera of frame 0."""
@@ -33,7 +33,7 @@ class CalibratedPose(eqx.Module):
 
 
 class Path(eqx.Module):
-    """What x stands for."""
+    """The quantities that x stands for."""
 
     frames: CalibratedPose
     motion: Float[Array, "F v"]
@@ -43,7 +43,7 @@ class Path(eqx.Module):
 
 
 class PathLayout(NamedTuple):
-    """How many numbers of x are of what."""
+    """The layout of x: the count of numbers for each quantity."""
 
     start: int
     common: int
@@ -98,7 +98,7 @@ def path(slam: EkfSlam, record: Record, x: Float[Array, " N"]) -> Path:
 
 
 def _driven_by(record: Record) -> tuple[Any, Float[Array, " steps"], Bool[Array, " steps"]]:
-    """What is known of every step: the arguments of `_moved` before the last."""
+    """The known quantities of every step: the arguments of `_moved` before the last."""
     return record.controls, record.merged, record.restarted
 
 
@@ -162,7 +162,7 @@ class Sight(NamedTuple):
 
 
 def sights(slam: EkfSlam, record: Record, at: Path, y: Float[Array, "m q"]) -> Sight:
-    """Of all landmarks, from the frames in which they were first seen."""
+    """The sights of all landmarks, from the frames in which they were first seen."""
     calibrations = at.frames.calibration[record.first]
 
     def one(measured, calibration, y):
@@ -252,8 +252,8 @@ def _by_first(seen: Seen, relative) -> Float[Array, "F m p h"]:
 def landmark_slopes(
     slam: EkfSlam, record: Record, at: Path, y: Float[Array, "m q"]
 ) -> tuple[Float[Array, "m q q"], Float[Array, "m q"], Float[Array, " m"]]:
-    """Of every landmark given the path: information, gradient, and |y|² + |r|², which is ∞ if it
-    is measured and cannot be seen."""
+    """The information, gradient and |y|² + |r|² of every landmark given the path; the last is ∞
+    if it is measured and cannot be seen."""
     sight, relative = sights(slam, record, at, y), _relative(record, at)
     seen = _seen(slam, record, at, relative, sight)
     B = jnp.einsum("kmpo,moq->kmpq", _by_first(seen, relative), sight.by_y)
@@ -358,7 +358,7 @@ def linearised(slam: EkfSlam, record: Record, at: Path, y: Float[Array, "m q"]) 
 
 
 def _in_first(record: Record, each: Float[Array, "m ..."]) -> Float[Array, "F ..."]:
-    """What every landmark adds to the frame in which it was first seen."""
+    """The sum of what landmarks add to the frames in which they were first seen."""
     return jnp.einsum("m...,mf->f...", each, _is_first(record, each.dtype))
 
 
@@ -459,5 +459,5 @@ def _to_x(slam: EkfSlam, S: Sensitivities) -> Float[Array, "z N"]:
 
 
 def cholesky_each(A: Float[Array, "m q q"]) -> Cholesky:
-    """Of every landmark."""
+    """The Cholesky factors of every landmark's matrix."""
     return jax.vmap(cholesky)(A)

@@ -1,4 +1,4 @@
-"""What a window remembers: every measurement since its first frame, and which landmark it is of.
+"""The record of a window: every measurement since its first frame, and its landmark.
 
 **Standing teaches nothing** of how the camera will move. While all pixels are where they were first
 seen, the newest frame takes the place of the one before, and with the first motion the velocity is
@@ -51,7 +51,7 @@ class Record(eqx.Module):
 
     @property
     def steps(self) -> Float[Array, ""]:
-        """Of the process, since frame 0."""
+        """The number of steps of the process since frame 0."""
         happened = jnp.arange(self.merged.size) < self.last
         return jnp.sum(jnp.where(happened, self.merged, 0.0))
 
@@ -68,13 +68,13 @@ class Record(eqx.Module):
 
     @property
     def compared(self) -> Bool[Array, "F m"]:
-        """Where a measurement is of a landmark seen before."""
+        """Whether each measurement is of a landmark seen before."""
         k = jnp.arange(self.frames)[:, None]
         return self.seen & (k > self.first) & (k <= self.last)
 
     @property
     def first_measured(self) -> Float[Array, "m p"]:
-        """What every slot's landmark was first measured at."""
+        """The first measurement of every slot's landmark."""
         return self.measured[self.first, jnp.arange(self.first.size)]
 
     def cut(self, frames: int) -> Record:
@@ -92,7 +92,7 @@ class Record(eqx.Module):
 
 
 def empty(motion: AbstractMotion, frames: int, landmarks: int, p: int, dtype: Any) -> Record:
-    """Of frame 0 in which nothing has been seen yet."""
+    """The record of a frame 0 in which nothing has been seen yet."""
     still = motion.still(dtype)
     return Record(
         jnp.zeros((), int),
@@ -120,8 +120,8 @@ def whole(
 
 
 def stepped(record: Record, control: Any, seen: Features, noise: Float[Array, "p p"]) -> Record:
-    """With one frame more and what it measured of known landmarks, of such a covariance. A full
-    record stays as it is."""
+    """The record with one frame more and its measurements of known landmarks, of such a
+    covariance. A full record stays as it is."""
     stood = record.standing & (record.last == 1)
     stands = record.standing & _still(record, seen, noise)
     k = jnp.where(stood & stands, 1, record.last + 1)  # beyond the end: dropped
@@ -148,7 +148,7 @@ def _still(record: Record, seen: Features, noise: Float[Array, "p p"]) -> Bool[A
 
 
 def begun(record: Record, new: Features) -> Record:
-    """With the landmarks that are first seen in the newest frame."""
+    """The record with the landmarks that are first seen in the newest frame."""
     slots = jnp.where(new.valid, new.slots, record.first.size)
     record = replace(
         record,
@@ -159,7 +159,7 @@ def begun(record: Record, new: Features) -> Record:
 
 
 def removed(record: Record, gone: Bool[AnyArray, " m"]) -> Record:
-    """Without what was measured of some landmarks."""
+    """The record without the measurements of some landmarks."""
     return replace(record, seen=record.seen & ~gone)
 
 

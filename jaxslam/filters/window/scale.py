@@ -1,4 +1,4 @@
-"""The scale of a window, which no pixel tells.
+"""The scale of a window, which no pixel observes.
 
 **A gauge.** No measurement changes with λ in `(t, v, a, ω) → (e^λ t, e^λ v, e^λ a, e^−λ ω)`: with s
 the derivative of all whitened unknowns u by λ, the information A = I + JᵀJ has A s = s. So
@@ -6,7 +6,7 @@ the derivative of all whitened unknowns u by λ, the information A = I + JᵀJ h
 scale.
 
 **The mean is not the maximum.** Along λ the density has the volume of all the rest, det A(λ)^−½,
-and `½ d log det A/dλ = Σ_ω (1 − var) − Σ_a (1 − var)`: every inverse depth that the pixels tell
+and `½ d log det A/dλ = Σ_ω (1 − var) − Σ_a (1 − var)`: every inverse depth that the pixels give
 draws the mean to smaller scales, every acceleration to larger ones.
 """
 
@@ -91,12 +91,12 @@ def scaling(slam: EkfSlam, record: Record, at: Minimum) -> Direction:
 
 
 def told(slam: EkfSlam, at: Minimum, s: Direction) -> Float[Array, ""]:
-    """1/variance of λ: |s|², without the accelerations where their size is not told."""
+    """1/variance of λ: |s|², without the accelerations where their size is not given."""
     return s.squared - jnp.sum(_untold(slam, at.x, s) ** 2)
 
 
 def _untold(slam: EkfSlam, x: Float[Array, " N"], s: Direction) -> Float[Array, " N"]:
-    """Accelerations that scale and whose size is not told; zero elsewhere."""
+    """The accelerations that scale and whose size is not given; zero elsewhere."""
     layout = PathLayout.of(slam)
     if slam.motion.noise_told:
         return jnp.zeros_like(x)
@@ -120,7 +120,7 @@ def shift_of_scale(
     slam: EkfSlam, record: Record, at: Minimum, local: Reduced, factor: Cholesky
 ) -> Float[Array, ""]:
     """λ of the mean, of a density that has its maximum at 0: where the prior and the volume of the
-    rest balance, all lengths enlarged alike. Accelerations whose size is not told follow."""
+    rest balance, all lengths enlarged alike. Accelerations whose size is not given follow."""
     s = scaling(slam, record, at)
     untold = _untold(slam, at.x, s) != 0
     slope = _slope_of_volume(slam, local, s, factor, untold)

@@ -94,5 +94,5 @@ def _sums(steps: Shaped[Array, "steps ..."], frames: int) -> Shaped[Array, "step
 
 
 def _padded(values: Array, frames: int) -> Array:
-    """To so many frames."""
+    """The values, padded with zeros to so many frames."""
     return jnp.zeros((frames, *values.shape[1:]), values.dtype).at[: len(values)].set(values)

@@ -1,4 +1,4 @@
-"""What a filter goes on from: the Gaussian of one mode at the window's newest frame.
+"""The state from which a filter goes on: the Gaussian of one mode at the newest frame.
 
 It stands at the mean of the scale (`jaxslam.filters.window.scale`), in the gauge in which λ is
 uncorrelated with everything that does not scale.
@@ -71,7 +71,7 @@ class Rows(NamedTuple):
 
 
 def _scale(slam: EkfSlam, local: Reduced, s: Direction) -> Direction:
-    """Of λ, by x and by e, what is left of every y; zero in a filter without.
+    """The derivative of λ by x and by e, what is left of every y; zero in a filter without.
 
     `y = ŷ − C (x − x̂) + e`.
     """
@@ -100,14 +100,14 @@ def _core_rows(slam, newest, by_x, scale: Direction, like) -> tuple[Any, Rows]:
 
 
 def _with_metre(covariance: Float[Array, "n n"], like: State) -> Float[Array, "n n"]:
-    """What is not known of the metre, behind λ, is as it was: nothing tells of it."""
+    """The covariance with that of the metre, behind λ, as it was: nothing observes it."""
     part = like.core.part("log_scale")
     metre = slice(part.start + 1, part.stop)
     return covariance.at[metre, metre].set(like.covariance[metre, metre])
 
 
 def _less_told(rows: Rows, core, factor: Scalar) -> Rows:
-    """With σ of λ so many times as large; it is correlated with nothing."""
+    """The rows with σ of λ so many times as large; it is correlated with nothing."""
     if core.log_scale is None:
         return rows
     place = core.part("log_scale").start
@@ -141,7 +141,7 @@ def _landmark_rows(
 
 
 def _stacked(core: Rows, landmarks: Rows, active: Bool[Array, " m"]) -> Rows:
-    """Of the whole state; zero where no landmark is."""
+    """The rows of the whole state; zero where no landmark is."""
 
     def whole(of_core, of_each):
         kept = jnp.where(active.reshape(-1, *(1,) * (of_each.ndim - 1)), of_each, 0.0)
@@ -153,8 +153,8 @@ def _stacked(core: Rows, landmarks: Rows, active: Bool[Array, " m"]) -> Rows:
 def _covariance(
     local: Reduced, factor: Cholesky, rows: Rows, own: Float[Array, "m d q"], scale: Direction
 ) -> Float[Array, "n n"]:
-    """Of numbers with these Jacobians. With B of their own y and u of λ, whose derivative by y is
-    s: `(B + u sᵀ) Λ⁻¹ (B + u sᵀ)ᵀ`, B and Λ in blocks."""
+    """The covariance of numbers with these Jacobians. With B of their own y and u of λ, whose
+    derivative by y is s: `(B + u sᵀ) Λ⁻¹ (B + u sᵀ)ᵀ`, B and Λ in blocks."""
     whitened = factor.whitening @ rows.x.T
     B = jnp.einsum("mqo,mdo->mdq", local.landmarks.whitening, own)
     s = jnp.einsum("mqo,mo->mq", local.landmarks.whitening, scale.y)

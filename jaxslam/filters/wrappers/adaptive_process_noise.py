@@ -1,10 +1,10 @@
 """The size of the process noise, found while the filter runs.
 
-Nobody knows what accelerations a hand will have. σ of the linear ones and of the angular ones are
-each the one that was told times a factor of a grid; every factor has a weight. What a frame's
+The accelerations of a hand are unknown. σ of the linear ones and of the angular ones are
+each the one that was given times a factor of a grid; every factor has a weight. What a frame's
 measurements say of one frame's acceleration is next to nothing, and of the velocity much: so every
 factor has a Kalman filter of the velocity alone, as small as that, which is fed with what each
-update of the whole filter has told of it,
+update of the whole filter has learned of it,
 
     Λ = V⁺⁻¹ − V⁻⁻¹,  η = V⁺⁻¹ v⁺ − V⁻⁻¹ v⁻,
 
@@ -35,9 +35,9 @@ from jaxslam.models.observations import Capacity, Features, Innovation
 MEMORY = 100
 """Frames after which what they said of the noise has faded to 1/e."""
 FACTORS = 2.0 ** np.arange(-4, 5)
-"""Of σ; so far may it be from what was told."""
+"""The factors of σ; so far may it be from what was given."""
 TOLD = np.log(3.0)
-"""σ of the log of what was told."""
+"""σ of the log of what was given."""
 
 
 class NoiseState(eqx.Module):
@@ -84,7 +84,7 @@ class AdaptiveProcessNoise(AbstractWrapper):
         return NoiseState(inner, log_weights, *every, (velocity, covariance))
 
     def predict(self, state: NoiseState, control: Any) -> NoiseState:
-        """Of every factor's velocity too."""
+        """Predict the base filter, and every factor's velocity too."""
         state = self._begun_anew(state)
         factors = self._factors(state)
         foreseen = jax.vmap(partial(_foreseen, self._inner.motion, control))
@@ -130,13 +130,13 @@ class AdaptiveProcessNoise(AbstractWrapper):
         return self.base.marginal(inner, lambda view: view.core.motion)
 
     def _factors(self, state: NoiseState) -> Float[Array, " t"]:
-        """Of σ: the roots of the mean variances."""
+        """The factors of σ: the roots of the mean variances."""
         linear, angular = jnp.sqrt(jnp.exp(state.log_weights) @ jnp.asarray(FACTORS**2))
         (_, n), (_, t) = ((part.start, part.stop) for part in self._groups)
         return jnp.where(jnp.arange(t) < n, linear, angular)
 
     def _begun_anew(self, state: NoiseState) -> NoiseState:
-        """With the velocity that was told at first, if the camera has not moved."""
+        """The state with the velocity given at first, if the camera has not moved."""
         velocity, root = self._inner.motion.start()
         moving = self.moving(state)
         return replace(
@@ -169,7 +169,7 @@ class AdaptiveProcessNoise(AbstractWrapper):
 
 
 def _foreseen(motion: Any, control: Any, factors, velocity, covariance):
-    """Mean and covariance one step on, with so many times the noise that was told."""
+    """Mean and covariance one step on, with so many times the noise that was given."""
     zero = jnp.zeros_like(velocity)
     slope = jacobian(lambda noise: motion.next(velocity, noise, control), zero)
     root = slope * factors * motion.noise_sigma
@@ -185,7 +185,7 @@ def _part(part: slice, v: Float[Array, " t"], V: Float[Array, "t t"]):
 
 
 class Told(NamedTuple):
-    """What an update said of the velocity: `exp(ηᵀ v − ½ vᵀ Λ v)`, v counted from a place."""
+    """The likelihood of the velocity in an update: `exp(ηᵀ v − ½ vᵀ Λ v)`, v from a place."""
 
     place: Float[Array, " d"]
     vector: Float[Array, " d"]
@@ -193,7 +193,7 @@ class Told(NamedTuple):
 
 
 def _told(before, after) -> Told:
-    """What an update learned; in directions in which it learned nothing, nothing."""
+    """The information that an update gained; zero in directions in which it gained none."""
     (v, V), (now, P) = before, after
     W = cholesky(V).whitening
     shares, vectors = eigh(W @ P @ W.T)
@@ -204,7 +204,7 @@ def _told(before, after) -> Told:
 
 
 def _heard(told: Told, v: Float[Array, " d"], V: Float[Array, "d d"]):
-    """Log likelihood of what was told, and the velocity after it."""
+    """The log likelihood of what an update learned, and the velocity after it."""
     d, prior = v - told.place, cholesky(V)
     information = prior.inverse()
     after = cholesky(information + told.information)

@@ -1,4 +1,4 @@
-"""A Gaussian sum that sets out from rest: a growing window of all frames, until parallax is there.
+"""A Gaussian sum that starts from rest: a growing window of all frames, until parallax is there.
 
 The initial velocity is unknown. The posterior of the first frames then has several modes, and a
 filter that linearises at its own estimate picks one of them by the first pixel's noise. Therefore
@@ -36,7 +36,7 @@ from jaxslam.models.observations import Capacity, Features, Innovation
 SIZES = {"planar": (9, 25, 61), "spatial": (9, 31)}
 """Frames of the windows that are compiled; the smallest that holds all is computed."""
 DIRECTIONS = {"planar": 16, "spatial": 8}
-"""In which the search sets out, from rest beside."""
+"""The number of directions in which the search starts, besides the start from rest."""
 SEARCHES = {"planar": (1, 2, 3, 4, 6, 8, 11, 15, 20, 26, 34), "spatial": (1, 2, 3)}
 """Frames after which minima are sought anew, from all starts …"""
 IN_TURN = {"planar": 0, "spatial": 1}
@@ -58,7 +58,7 @@ MOVED = 0.1
 
 
 class RestState(eqx.Module):
-    """The sum, and what it is begun anew from as long as the window is open."""
+    """The sum, and what it is initialised anew from as long as the window is open."""
 
     sum: SumState
     record: Record
@@ -180,8 +180,8 @@ class BatchInitialisation(AbstractWrapper):
         return cond(wanted, solved, state, record)
 
     def _due(self, record: Record, newest: range) -> Bool[Array, " starts"] | None:
-        """From which starts minima are sought after this frame; None where from none after any
-        that can be the newest one."""
+        """The starts from which minima are sought after this frame; None where there are none
+        after any that can be the newest one."""
         name = self.ekf.motion.geometry.name
         searches, together = [k for k in SEARCHES[name] if k in newest], IN_TURN[name]
         if not searches and not together:
@@ -213,14 +213,14 @@ class BatchInitialisation(AbstractWrapper):
 
 
 def _likely(members: SumState, now: Bool[Array, ""]) -> SumState:
-    """Without those that are `GIVEN_UP`, if that is now."""
+    """The members without those that are `GIVEN_UP`, if that is now."""
     unlikely = members.log_weights < jnp.max(members.log_weights) - GIVEN_UP
     weights = jnp.where(now & unlikely, -jnp.inf, members.log_weights)
     return replace(members, log_weights=weights)
 
 
 def _members(ekf: EkfSlam, record: Record, modes: Modes, members: State, like: State) -> State:
-    """The Gaussians of the modes; of what a window does not tell, as in a state that is up to date,
+    """The Gaussians of the modes; of what a window leaves open, as in a state that is up to date,
     which members without weight are not."""
 
     def begun(data, record, like):

@@ -44,7 +44,7 @@ MOST_STEPS = 30
 
 
 class LagFrames(eqx.Module):
-    """What happened in some frames, the oldest first, or in one."""
+    """The events of some frames, the oldest first, or of one."""
 
     happened: Bool[Array, "*frames"]
     """False in the places of frames that are not there yet: nothing moves in them."""
@@ -171,7 +171,7 @@ class FixedLag(AbstractFilter):
     def marginal(
         self, state: LagState, function: Callable[[CameraView], Any]
     ) -> tuple[Any, Float[Array, "k k"]]:
-        """Of the newest state, as the base filter's; so are the following."""
+        """The marginal of the newest state, as the base filter's; so are the following."""
         return self.base.marginal(state.estimate, function)
 
     def landmark_marginal(
@@ -189,7 +189,7 @@ class FixedLag(AbstractFilter):
         return self.base.pose_error(state.estimate, T_BC)
 
     def _noises(self, state: State | Distribution) -> int:
-        """How many variables a frame has of its own."""
+        """The number of variables that a frame has of its own."""
         core = state.core
         return core.noise.size + (core.calibration.size if self.base.calibration.each_frame else 0)
 

@@ -139,7 +139,7 @@ class GaussianSum(AbstractStaged):
         return self._measured(stepped, state)
 
     def predict(self, state: SumState, control: Any) -> SumState:
-        """Of every member; a sum that is split composes later, in `update`, where that is first."""
+        """Predict each member; a split sum composes later, in `update`, where that is first."""
         if not self.split:
             return self._each(lambda one: self.base.predict(one, control), state)
         check_control(self._ekf.motion, control)
@@ -155,7 +155,7 @@ class GaussianSum(AbstractStaged):
         return base, collapsed(members, state.log_weights)
 
     def predict_features(self, state: SumState, control: Any, slots: Int[Array, " m"]) -> Expected:
-        """Of the sum as one Gaussian."""
+        """The features that the sum as one Gaussian expects."""
         base, one = self.gaussian(state, control)
         return base.predict_features(one, control, slots)
 
@@ -209,7 +209,7 @@ class GaussianSum(AbstractStaged):
         return self.base.in_map(state.likeliest)
 
     def pose_error(self, state: SumState, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
-        """Of the sum's mean, to first order in the members' distances, with its covariance."""
+        """The error of the sum's mean, to first order in the members' distances; its covariance."""
         errors, covariances = jax.vmap(self.base.pose_error, in_axes=(0, None))(state.members, T_BC)
         return moments(state.log_weights, errors, covariances)
 

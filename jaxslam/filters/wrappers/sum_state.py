@@ -52,7 +52,7 @@ def weighed(
 
 
 def log_likelihoods(innovations: Innovation) -> Float[Array, " members"]:
-    """Of every member `log N(r; 0, S)` of all that is measured, up to a constant of them all.
+    """The `log N(r; 0, S)` of all that is measured, member by member, up to a common constant.
 
     A landmark that is measured and predicted behind the camera has no residual: that is no merit,
     and without it the density is of fewer numbers than another member's. In its place stands the

@@ -1,4 +1,4 @@
-"""What stands around a filter: everything is handed on, and a wrapper says only what it changes."""
+"""The wrapper of a filter: everything is handed on, and a wrapper says only what it changes."""
 
 from __future__ import annotations
 
