@@ -156,8 +156,8 @@ def without_known(
         run, step = np.argwhere(wrong)[0]
         raise ValueError(
             f"the covariance of {at((run, step))} is zero, and its error is not: "
-            f"{np.abs(errors[run, step]).max():.3g}; a positive definite one is accepted, and poses "
-            "in another frame or unit than the truth's need an alignment (--align se3, sim3)"
+            f"{np.abs(errors[run, step]).max():.3g}; a positive definite one is accepted, and "
+            "poses in another frame or unit than the truth's need an alignment (--align se3, sim3)"
         )
     if (known == logged).all():
         raise ValueError("all covariances are zero; positive definite ones are accepted")

@@ -3,7 +3,7 @@
 What looks at pictures needs the extra `vision`, and is imported when it is asked for.
 """
 
-from jaxslam._runtime.exports import exported
+from jaxslam._runtime import exported
 from jaxslam.io.tum import read_tum, write_tum
 
 _MODULES = {

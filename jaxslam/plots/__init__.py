@@ -1,6 +1,6 @@
 """Figures, drawn by matplotlib without its global state."""
 
-from jaxslam._runtime.exports import exported
+from jaxslam._runtime import exported
 
 _MODULES = {
     "plot_consistency": "consistency",

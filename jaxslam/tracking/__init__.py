@@ -1,6 +1,6 @@
 """A camera tracked through a video, and what is written of it; needs the extra `vision`."""
 
-from jaxslam._runtime.exports import exported
+from jaxslam._runtime import exported
 
 _MODULES = {
     "Tracked": "report",

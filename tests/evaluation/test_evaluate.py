@@ -197,7 +197,7 @@ def test_steps_that_are_known_by_definition_are_left_out():
     assert "the first step is known exactly" in str(found)
     np.testing.assert_array_equal(found.nees, jaxslam.evaluate(e[:, 1:], P[:, 1:]).nees)
     e[3, 0, 1] = 0.2
-    with pytest.raises(ValueError, match=r"run 3, step 0 is zero, and its error is not: 0\.2.*--align"):
+    with pytest.raises(ValueError, match=r"run 3, step 0 is zero.* is not: 0\.2.*--align"):
         jaxslam.evaluate(e, P)
     with pytest.raises(ValueError, match="all covariances are zero"):
         jaxslam.evaluate(0 * e, 0 * P)
