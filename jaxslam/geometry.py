@@ -81,7 +81,7 @@ def tangent_dim(tree: Any) -> int:
 
 
 class SplitPose(eqx.Module):
-    """A pose whose position and orientation are perturbed apart: `t + δt`, `R Exp(δθ)`.
+    """A pose whose position and orientation are perturbed separately: `t + δt`, `R Exp(δθ)`.
 
     The error state of the classical EKF-SLAM: the position's error is along the axes of the
     frame that the pose maps to, not turned with the estimated orientation.
@@ -206,7 +206,7 @@ def _third(s):
 
 
 def _angle_by_sine(s, cosine):
-    """x / sin(x) for x in [0, π/2] with sin² x = s and the given cosine, not negative."""
+    """Return x / sin(x) for x in [0, π/2] with sin² x = s and the given cosine, not negative."""
     small = s < _SMALL * 0.04
     ratio = s / jnp.where(small, cosine, 1.0) ** 2
     series = jnp.zeros_like(s)
@@ -231,7 +231,7 @@ def retract(tree: Any, delta: Float[Array, " t"]) -> Any:
 
 
 def difference(tree: Any, origin: Any) -> Float[Array, " t"]:
-    """`tree ⊟ origin`, the inverse of `retract`: `retract(origin, difference(tree, origin))`."""
+    """Return `tree ⊟ origin`, the inverse of `retract`: `tree = origin ⊞ (tree ⊟ origin)`."""
     return _compared(tree, origin, log)
 
 

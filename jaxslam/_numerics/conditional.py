@@ -170,8 +170,8 @@ def repeated(
 def _once(
     wanted: Bool[Array, ""], function: Callable[..., Value], value: Value, *given: Any
 ) -> Value:
-    """What the function needs is given to it through the counter of the loop, or the compiler
-    would move the work out of a loop that does not change it."""
+    """Apply the function once if wanted. What it needs is indexed by the loop's counter, or the
+    compiler would move the work out of a loop that does not change it."""
     stacked = jax.tree.map(lambda x: jnp.stack([x, x]), given)
 
     def once(carry):
@@ -202,7 +202,7 @@ def _in_blocks(
     shared: Any,
     batched: Any,
 ) -> Any:
-    """Of a batch b: what is wanted, wherever it is, block by block."""
+    """Compute what is wanted of a batch b, wherever it is, block by block."""
     b, w = wanted.shape
     k = jax.tree.leaves(values)[0].shape[1]
     size = min(b * w, max(LEAST, b * min(w, PARTS) // PARTS))

@@ -43,7 +43,7 @@ class NormalCholesky(lineax.AbstractLinearSolver):
 
 
 def levenberg_marquardt(tolerance: float) -> optimistix.LevenbergMarquardt:
-    """For `optimistix.least_squares`; the tolerance is relative and absolute."""
+    """Return a solver for `optimistix.least_squares`; the tolerance is relative and absolute."""
     return optimistix.LevenbergMarquardt(
         rtol=tolerance, atol=tolerance, linear_solver=NormalCholesky()
     )

@@ -50,7 +50,7 @@ class Cholesky(NamedTuple):
         return self.whitening.T @ self.whitening
 
     def log_det(self) -> Float[Array, ""]:
-        """log det A."""
+        """The logarithm log det A."""
         return 2 * jnp.sum(jnp.log(jnp.diagonal(self.root)))
 
 

@@ -1,4 +1,4 @@
-"""What a program is traced for, where a function's best form depends on it."""
+"""The purpose for which a program is traced, where a function's best form depends on it."""
 
 from __future__ import annotations
 

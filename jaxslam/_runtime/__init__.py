@@ -1,4 +1,4 @@
-"""What is no mathematics: files, kept programs, progress, look-ups, and the end of a hang."""
+"""The tools without mathematics: files, kept programs, progress, look-ups and the watchdog."""
 
 from __future__ import annotations
 

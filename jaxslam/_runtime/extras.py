@@ -1,4 +1,4 @@
-"""What is said where a library of an extra is missing: which extra, and how to install it."""
+"""The error where a library of an extra is missing: which extra, and how to install it."""
 
 from __future__ import annotations
 

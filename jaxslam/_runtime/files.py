@@ -39,8 +39,8 @@ def write_atomically(path: str | Path) -> Generator[Path, None, None]:
 
 
 def read_json(path: str | Path, what: str, parse: Callable[[Any], T]) -> T:
-    """What `parse` makes of a JSON file. Raises ValueError, naming the file, where it cannot be
-    read (`what` says of what), is not JSON, or is refused by `parse`."""
+    """Return what `parse` makes of a JSON file. Raises ValueError, naming the file, where it cannot
+    be read (`what` says of what), is not JSON, or is refused by `parse`."""
     path = Path(path)
     try:
         fields = json.loads(path.read_text(encoding="utf-8"))
@@ -112,10 +112,10 @@ def check_real(what: str, x: np.ndarray) -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """What an error says, on one line that is not too long."""
+    """Return an error's message, on one line that is not too long."""
     return textwrap.shorten(str(error), 200, placeholder=" …")
 
 
 def json_numbers(values: np.ndarray) -> list[float | None]:
-    """For JSON, which has no NaN."""
+    """Return numbers for JSON, which has no NaN: None instead."""
     return [float(value) if np.isfinite(value) else None for value in values]

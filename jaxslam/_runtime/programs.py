@@ -1,7 +1,7 @@
 """Programs that are compiled before they are needed, and kept from one process to the next.
 
 JAX's cache of compiled programs spares the compiler; a program of ten thousand operations is still
-traced and lowered by Python, for seconds. Here the whole is kept, if a folder is told (`keep_in`):
+traced and lowered by Python, for seconds. Here the whole is kept, if a folder is given (`keep_in`):
 a file for each program, by all that it depends on. One that is damaged, or another user's, is
 compiled anew. Such a file is code, and what is around it a pickle: as for JAX's own cache, the
 folder is to be its user's alone.
@@ -54,13 +54,13 @@ _kept_in: Path | None = None
 
 
 def keep_in(folder: Path | None) -> None:
-    """From now on keep every program that is made in this folder, and take it from there."""
+    """Keep every program that is made from now on in this folder, and load it from there."""
     global _kept_in
     _kept_in = folder
 
 
 def kept_in() -> Path | None:
-    """The folder that was told."""
+    """The folder that was given."""
     return _kept_in
 
 
@@ -160,7 +160,7 @@ class Program:
 
 
 class _Call(NamedTuple):
-    """What a program is called with."""
+    """The arguments with which a program is called."""
 
     arrays: list[Any]
     key: Any
@@ -174,7 +174,7 @@ class _Call(NamedTuple):
         return cls([x for x in leaves if _is_array(x)], key)
 
     def arguments(self, arrays: list[Any]) -> tuple[Any, ...]:
-        """With these arrays in place of its own."""
+        """Return the arguments, with these arrays in place of the call's own."""
         structure, are_arrays, kinds, _ = self.key
         rest = iter(arrays)
         leaves = [next(rest) if array else x for array, x in zip(are_arrays, kinds, strict=True)]
@@ -255,7 +255,7 @@ def _with_options(lowered: jax.stages.Lowered, options: Options) -> jax.stages.C
 
 
 def in_background(*steps: Callable[[], Any]) -> threading.Thread:
-    """Take the steps one after the other, aside; those not begun when the process ends are left
+    """Take the steps one after the other, aside; those not started when the process ends are left
     out. What goes wrong will do so again where it is needed."""
 
     @jax.enable_x64(wide())
@@ -357,7 +357,7 @@ def source_files() -> list[Path]:
 
 @cache
 def _sources() -> tuple[str, ...]:
-    """What this package, those that it computes with and this processor are."""
+    """Return what identifies this package, those that it computes with and this processor."""
     digest = hashlib.sha256()
     for path in source_files():
         digest.update(path.read_bytes())
@@ -366,7 +366,7 @@ def _sources() -> tuple[str, ...]:
 
 
 def processor() -> tuple[str, ...]:
-    """What this machine's processor is, and what it can do."""
+    """Return the kind and name of this machine's processor, and its features."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

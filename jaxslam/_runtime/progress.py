@@ -1,4 +1,4 @@
-"""What moves while one waits: a bar at a terminal and in a notebook, lines in a log."""
+"""The display of progress: a bar at a terminal and in a notebook, lines in a log."""
 
 from __future__ import annotations
 

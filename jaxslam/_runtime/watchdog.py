@@ -67,7 +67,7 @@ def finished(values: Values, where: str, patience: float = DEADLOCK_SECONDS) -> 
 
 
 def lapack_calls(jaxpr: Jaxpr) -> set[str]:
-    """Which of `LAPACK` a traced program calls, however deep: `jax.make_jaxpr(f)(x).jaxpr`."""
+    """Return which of `LAPACK` a program `jax.make_jaxpr(f)(x).jaxpr` calls, however deep."""
     own = {equation.primitive.name for equation in jaxpr.eqns} & LAPACK
     return own.union(*(lapack_calls(inner) for inner in subjaxprs(jaxpr)))
 

@@ -14,7 +14,7 @@ _WORTH = 0.2
 
 
 def keep_programs() -> None:
-    """Keep programs in the user's cache folder, or where JAX was told to keep them.
+    """Keep programs in the user's cache folder, or where JAX is set to keep them.
 
     That is `$XDG_CACHE_HOME/jaxslam`, `~/.cache/jaxslam` by default. JAX's own variables
     JAX_COMPILATION_CACHE_DIR (another folder) and JAX_ENABLE_COMPILATION_CACHE (false: none) come

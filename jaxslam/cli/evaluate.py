@@ -1,4 +1,4 @@
-"""`jaxslam evaluate`: is a filter consistent, whoever's it is?"""
+"""The command `jaxslam evaluate`: test whether any filter is consistent."""
 
 from __future__ import annotations
 

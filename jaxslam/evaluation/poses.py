@@ -193,7 +193,7 @@ def _with_truth(
 
 
 def _log_scales(before: Poses, after: Poses) -> Float[np.ndarray, " runs"]:
-    """log of the estimate's unit relative to the truth's, of what a Sim(n) did to each run."""
+    """The log of the estimate's unit relative to the truth's, of what a Sim(n) did to each run."""
     spreads = (
         [np.linalg.norm(p[own] - p[own].mean(0)) for p, own in zip(x, before.logged, strict=True)]
         for x in (before.estimates[..., :-1, -1], after.estimates[..., :-1, -1])

@@ -175,7 +175,7 @@ def _affine(
     estimates: Float[np.ndarray, "*batch d d"],
     truths: Float[np.ndarray, "*batch d d"],
 ) -> tuple[Float[np.ndarray, "*batch t"], Float[np.ndarray, "*batch t"]]:
-    """e and g = de/ds of the truth times s: every error is `e + g (s − 1)`."""
+    """Return e and g = de/ds of the truth times s: every error is `e + g (s − 1)`."""
     twice = truths.copy()
     twice[..., :-1, -1] *= 2.0
     once = pose_errors(convention, estimates, truths)

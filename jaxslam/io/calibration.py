@@ -28,8 +28,8 @@ class Calibration:
 
     `width`, `height`, `fx`, `fy`, `cx`, `cy` are in pixels, the centre of the first pixel is
     (0, 0); `distortion` holds OpenCV's k1, k2, p1, p2, k3 (no unit), a shorter one is padded
-    with zeros. `sigma` are standard deviations of fx, fy, cx, cy, pixels; none where nobody
-    stated them. A `guessed` one has square pixels, so that fx and fy are off by one number.
+    with zeros. `sigma` are standard deviations of fx, fy, cx, cy, pixels; none where they
+    are unknown. A `guessed` one has square pixels, so that fx and fy are off by one number.
     Raises `ValueError` for numbers that cannot be a camera's.
     """
 
@@ -126,7 +126,7 @@ def write_calibration(path: str | Path, calibration: Calibration, **further: Any
 
 
 def as_fields(calibration: Calibration) -> dict[str, Any]:
-    """The fields of the file; those that nobody stated are left out."""
+    """The fields of the file; those not stated are left out."""
     fields = {"model": MODEL, **asdict(calibration)}
     fields["sigma"] = dict(zip(INTRINSICS, calibration.sigma, strict=False))
     return {key: value for key, value in fields.items() if value or key not in ("sigma", "guessed")}

@@ -47,7 +47,7 @@ class Live:
 
 @runtime_checkable
 class Capture(Protocol):
-    """What gives pictures one after another, as `cv2.VideoCapture` does."""
+    """A source of pictures one after another, as `cv2.VideoCapture` does."""
 
     def read(self) -> tuple[bool, np.ndarray]:
         """Whether there is another one, and the picture."""

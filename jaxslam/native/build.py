@@ -1,4 +1,4 @@
-"""From C++ to a library that is loaded, kept in the cache folder as other programs are."""
+"""Compile C++ to a library and load it; it is kept in the cache folder as other programs are."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _trusted(path: Path) -> bool:
 
 
 def _told(path: Path) -> Path:
-    """Where the digest of a library is."""
+    """Return the path of a library's digest."""
     return path.with_suffix(".sha256")
 
 
@@ -92,7 +92,7 @@ def _version(command: tuple[str, ...]) -> str:
 
 @cache
 def _own_folder() -> Path:
-    """Of this process, where nothing is to be kept."""
+    """Make a temporary folder of this process, for when nothing is to be kept."""
     folder = tempfile.TemporaryDirectory(prefix="jaxslam-native-")
     _folders.append(folder)
     return Path(folder.name)

@@ -1,4 +1,4 @@
-"""What a program computes, number by number: arrays are arrays of *elements*.
+"""The numbers that a program computes, one by one: arrays are arrays of *elements*.
 
 An element is a number of one run: a constant, a variable, or an operation on elements. An array of
 the traced function is an integer array of elements, so that slices, transposes, concatenations and
@@ -28,7 +28,7 @@ CONSTANT, VARIABLE = 0, 1
 
 
 class Operation(NamedTuple):
-    """In C++, of operands {0}, {1}, {2}, and in NumPy."""
+    """An operation as C++ text with operands {0}, {1}, {2}, and as a NumPy function."""
 
     text: str
     value: Callable[..., Any]
@@ -138,7 +138,7 @@ class Elements:
 
     @property
     def code(self) -> np.ndarray:
-        """Of every element CONSTANT, VARIABLE or one of `CODES`."""
+        """The code of every element: CONSTANT, VARIABLE or one of `CODES`."""
         return self._code[: self.size]
 
     @property
@@ -148,17 +148,17 @@ class Elements:
 
     @property
     def value(self) -> np.ndarray:
-        """Of constants."""
+        """The value of every element that is a constant."""
         return self._value[: self.size]
 
     @property
     def region(self) -> np.ndarray:
-        """In which loop it is computed."""
+        """The loop in which every element is computed."""
         return self._region[: self.size]
 
     @contextmanager
     def inside(self):
-        """What is made here is not known outside: the body of a loop."""
+        """Open the body of a loop: elements made inside are not known outside."""
         self._known.append({})
         self._suspects.append(set())
         self._inside.append(self._regions)
@@ -202,11 +202,11 @@ class Elements:
         return np.arange(start, self.size, dtype=np.int32)
 
     def is_constant(self, refs: Refs) -> Any:
-        """Where they are."""
+        """Return which of the elements are constants."""
         return self._code[refs] == CONSTANT
 
     def is_zero(self, refs: Refs) -> Any:
-        """Where they are zero, of either sign."""
+        """Return which of the elements are zero, of either sign."""
         return self.is_constant(refs) & (self._value[refs] == 0)
 
     def known(self, refs: Refs) -> Any:
@@ -223,7 +223,7 @@ class Elements:
         self._finite[refs] = True
 
     def suspects(self) -> Refs:
-        """Of the loop that is open, or of the program."""
+        """The suspects of the open loop, or of the program where none is open."""
         return np.array(sorted(self._suspects[-1]), np.int32)
 
     def region_now(self) -> int:
@@ -231,7 +231,7 @@ class Elements:
         return self._inside[-1]
 
     def once(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
-        """What was made by this name here or around, or what is made now."""
+        """Return what was made under this key here or in an enclosing loop, or make it now."""
         for known in reversed(self._known):
             if key in known:
                 return known[key]
@@ -262,7 +262,7 @@ class Elements:
         return self.constant(values)
 
     def _suspected(self, name: str, x: list[Refs], zero: np.ndarray) -> None:
-        """What has to be finite, and in a quotient not zero, where the result was said to be 0."""
+        """Suspect what must be finite, and in a quotient not zero, for results taken to be 0."""
         if not zero.any():
             return
         if name == "mul":

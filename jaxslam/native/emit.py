@@ -165,7 +165,7 @@ class _Writer:
         return f"C({_number(self.elements.value[refs[0]])})"
 
     def text(self, form: int) -> str:
-        """Of an expression, its leaves as {0}, {1}, …"""
+        """Return the text of an expression, with its leaves as {0}, {1}, …."""
         if form not in self.texts:
             self.texts[form] = self._text(form, 0)[0]
         return self.texts[form]
@@ -228,11 +228,11 @@ class _Writer:
         return f"const V {name} = {text.format(*names)}; AT({to[e]}) = {name};"
 
     def wanted(self, step: Product) -> np.ndarray:
-        """Which numbers of a product are used."""
+        """Return which numbers of a product are used."""
         return (step.made >= 0) & self.plan.live[step.made]
 
     def product(self, step: Product) -> str:
-        """By the tiles that cost least, of what is not zero."""
+        """Return the code of a product, by the cheapest tiles and without what is zero."""
         alive = self.wanted(step)
         rows, columns = alive.any(1), alive.any(0)
         made = np.where(alive, step.made, -1)[np.ix_(rows, columns)]
@@ -277,7 +277,7 @@ class _Writer:
 
     @property
     def trash(self) -> int:
-        """Where nothing is that is used."""
+        """The offset of memory that is written but never read."""
         return self.plan.slots * BYTES
 
     @property
@@ -382,7 +382,7 @@ def _type(kind: Any) -> str:
 
 
 def _inner(arrays: np.ndarray) -> int:
-    """The longest stretch, of equal length everywhere, in which places are equally far apart."""
+    """The longest stretch, of equal length everywhere, in which places are evenly spaced."""
     n = arrays.shape[1]
     for size in [k for k in range(n, 2, -1) if n % k == 0]:
         steps = np.diff(arrays.reshape(len(arrays), -1, size), axis=2)

@@ -42,7 +42,7 @@ def _steps(plan: Any, uses: np.ndarray, steps: list[Any]) -> list[Any]:
 
 
 def _apply(plan: Any, uses, step: Apply, owner, result: list[Any]) -> Apply:
-    """What remains; products are appended to the result, and those that they replace are gone."""
+    """Append fused products to the result, and return the step without what they replace."""
     made = step.made[plan.live[step.made] & ~plan.inlined[step.made]]
     gone = []
     for form in np.unique(plan.form[made]).tolist():
@@ -61,7 +61,7 @@ def _apply(plan: Any, uses, step: Apply, owner, result: list[Any]) -> Apply:
 
 
 def _terms(plan: Any, form: int) -> Terms | None:
-    """Of a sum of numbers and of products of two; None for another expression."""
+    """Return the terms of a sum of numbers and of products of two, else None."""
     names = {CODES[name]: name for name in ("add", "sub", "mul", "neg")}
 
     def visit(operand: int, leaf: int) -> tuple[Terms | None, int]:
@@ -134,7 +134,7 @@ def _factors(refs: Refs, terms: Terms, sources: list[Refs]) -> list[Product] | N
 
 
 def _parts(row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """Of pairs of a row and a column, those that hang together have one number."""
+    """Number the connected components of pairs of a row and a column."""
     part = np.arange(row.size)
     while True:
         before = part

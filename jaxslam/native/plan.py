@@ -1,4 +1,4 @@
-"""What of a program is computed at all, what is kept in memory and where."""
+"""The plan of a program: what is computed at all, what is kept in memory and where."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LONGEST = 24
 
 @dataclass
 class Plan:
-    """By element."""
+    """The plan of a program, element by element."""
 
     program: ElementProgram
     live: np.ndarray
@@ -45,7 +45,7 @@ class Plan:
     """In all."""
 
     def leaves(self, refs: Refs) -> list[Refs]:
-        """What is read from memory for elements of one form, in the order of its text."""
+        """Return what elements of one form read from memory, in the order of its text."""
         code, *operands = self.forms[self.form[refs[0]]]
         found = []
         for k, operand in enumerate(operands[: arity(code)]):
@@ -108,7 +108,7 @@ def _checked(program: ElementProgram) -> list[Step]:
 
 
 def _through_product(elements, live, step, after) -> None:
-    """Of every number of a product's rows, a sum of which it is part."""
+    """Note, for every number of a product's rows, a sum of which it is part."""
     if not isinstance(step, Product):
         return
     alive = live[step.made] & (elements.region[step.made] == elements.region[step.made].flat[0])
@@ -151,7 +151,7 @@ def _near_within(step: Step) -> Step:
 
 
 def _live(program: ElementProgram, checks: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Which elements are used, and which of them not only by operations."""
+    """Return which elements are used, and which of them not only by operations."""
     elements = program.elements
     live, needed = (np.zeros(elements.size, bool) for _ in range(2))
     arguments = elements.arguments
@@ -221,7 +221,7 @@ def _mark(step: Step, product: np.ndarray) -> None:
 
 
 def _forms(program: ElementProgram, live, inlined) -> tuple[np.ndarray, list[tuple[int, ...]]]:
-    """Expressions; what is too long for one is taken apart."""
+    """Form the expressions; what is too long for one is split."""
     elements = program.elements
     form, size = np.zeros(elements.size, np.int64), np.zeros(elements.size, np.int64)
     forms: dict[tuple[int, ...], int] = {}

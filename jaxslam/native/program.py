@@ -135,7 +135,7 @@ def read_by(step: Step) -> list[Refs]:
 
 
 def read_in_turn(step: Step) -> list[Refs]:
-    """What a loop reads in every turn, beside its steps."""
+    """Return what a loop reads in every turn, besides its steps."""
     match step:
         case Loop():
             return [step.rows, step.after, step.results]

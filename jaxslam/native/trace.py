@@ -1,4 +1,4 @@
-"""From a traced function to a program on elements: a rule for every primitive."""
+"""The translation of a traced function to a program on elements: a rule for every primitive."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Tracer:
         """Whether sums are of integers."""
 
     def check(self) -> None:
-        """What has been suspected here is checked."""
+        """Append a check of what has been suspected here."""
         suspects = self.elements.suspects()
         if suspects.size:
             self.steps.append(Check(suspects, self.elements.region_now(), self.going))
@@ -154,7 +154,7 @@ class Tracer:
         return results
 
     def by_rule(self, equation: JaxprEqn, arguments: list[Refs]) -> list[Refs]:
-        """What an operation returns."""
+        """Return the results of an operation, by the rule of its primitive."""
         name, parameters = equation.primitive.name, equation.params
         if name in INNER:
             return self.closed(parameters[INNER[name]], arguments)
@@ -383,7 +383,10 @@ def _folded(tracer, name, x):
 
 
 def _arg(holds):
-    """Of the best the first, and NaN is better than all: `holds` says that the best still is."""
+    """Return the rule of argmax or argmin: the first of the best, with NaN better than all.
+
+    `holds` says that the best still is.
+    """
 
     def rule(tracer, equation, arguments):
         (x,), (axis,) = arguments, equation.params["axes"]
@@ -485,7 +488,7 @@ def _dynamic_update_slice(tracer, equation, arguments):
 
 
 def _places(tracer, starts, sizes):
-    """For every number of a window that starts there, where it is along each axis."""
+    """Return the index along each axis of every number of a window with these starts."""
     return [
         tracer.apply("add", np.broadcast_to(start, sizes), tracer.constant(offset))
         for start, offset in zip(starts, np.indices(sizes), strict=True)
@@ -498,7 +501,7 @@ def _clipped(tracer, index, last):
 
 
 def _linear(tracer, shape, places):
-    """Where numbers are in an array that is written row by row."""
+    """Return the flat indices of numbers in an array that is stored row by row."""
     strides = np.cumprod([1, *shape[:0:-1]])[::-1] if shape else ()
     terms = [
         tracer.apply("mul", place, tracer.constant(float(stride)))
@@ -521,7 +524,7 @@ def _taken(tracer, x, places):
 
 
 def _written(tracer, x, places, values, add, inside=None):
-    """x with values at places; those that are not inside are dropped."""
+    """Return x with values at places; those that are not inside are dropped."""
     which = _linear(tracer, x.shape, places)
     which = np.broadcast_to(which, values.shape)
     if inside is not None:
@@ -536,7 +539,7 @@ def _written(tracer, x, places, values, add, inside=None):
 
 
 def _moved(tracer, x, which, values, add):
-    """At places that are known."""
+    """Write or add values at places that are known."""
     flat, there = x.ravel().copy(), which >= 0
     which, values = which[there], values[there]
     if add and len(set(which)) < len(which):

@@ -119,7 +119,7 @@ def plot_map(
 def _lines(
     poses: Float[np.ndarray, "n 4 4"], lost: Bool[np.ndarray, " n"], begun: Int[np.ndarray, " b"]
 ) -> list[tuple[str, np.ndarray, str, str]]:
-    """Name, points, colour and style: the estimate, and apart where the camera was lost."""
+    """Name, points, colour and style: the estimate, and separately where the camera was lost."""
     positions = poses[:, :3, 3]
 
     def broken(hidden: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A scenario's numbers as the pieces of a filter: those of the truth, which the filter is told."""
+"""A scenario's numbers as the pieces of a filter: those of the truth, which the filter is given."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class Scenario(eqx.Module):
     one in $JAXSLAM_DATA/trajectories. Empty: it moves as the filter's prior says."""
     still_frames: int = _structural(0)
     """`velocity`: the camera first stands exactly still for so many steps, then moves off with the
-    velocity drawn. The filter is not told."""
+    velocity drawn. The filter does not know it."""
     motion: str = _structural("velocity")
     """The filter's motion model. `velocity`: constant velocity, with accelerations drawn.
     `odometry`: the nominal motion is the true one, and its noisy reading the filter's input."""
@@ -84,7 +84,7 @@ class Scenario(eqx.Module):
     inverse_depth: Numbers = ()
     """Mean and σ of the filter's prior on 1/z, 1/m, where they are not those of d_min."""
     scale_sigma: float = _structural(0.0)
-    """σ of the log of the metre in which the filter is told all this; 0 where it is a metre. Only a
+    """σ of the log of the metre in which all this is given; 0 where it is a metre. Only a
     filter with a unit of its own (`scale_gauge`) can heed it."""
     least_inverse_depth: float = 0.001
     """`prior`: truth is drawn from the prior truncated above this, 1/m."""
@@ -115,7 +115,7 @@ class Scenario(eqx.Module):
     pixel_sigma: float = 0.3
     """σ of a measured pixel coordinate."""
     calibration: str = _structural("known")
-    """How the filter treats its calibration, unless told otherwise."""
+    """How the filter treats its calibration, unless stated otherwise."""
     true_calibration: str = _structural("nominal")
     """The true intrinsics: `nominal`, or drawn `white` (every frame) or `constant` (every run)."""
 
@@ -129,7 +129,7 @@ class Scenario(eqx.Module):
 
     @property
     def scale_free(self) -> bool:
-        """Whether nothing is measured or told in metres: only priors know the scale."""
+        """Whether nothing is measured or given in metres: only priors know the scale."""
         return self.motion == "velocity" and self.sensor == "camera"
 
 

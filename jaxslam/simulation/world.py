@@ -91,7 +91,7 @@ def trajectory_of(scenario: Scenario, dtype: Any = None) -> RecordedMotion | Non
 def _path(
     s: Scenario, motion: AbstractMotion | RecordedMotion | None, key: Array
 ) -> tuple[Pose, Any]:
-    """The true poses, and what the filter is told of every step."""
+    """The true poses, and what the filter is given at every step."""
     if isinstance(motion, RecordedMotion):
         return _recorded(s, motion, key)
     if motion is None and s.motion == "odometry":

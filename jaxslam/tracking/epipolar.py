@@ -1,4 +1,4 @@
-"""Which matches of two pictures can be those of one rigid scene, whatever its depths."""
+"""The test of which matches of two pictures can be of one rigid scene, whatever its depths."""
 
 import cv2
 import numpy as np

@@ -112,7 +112,7 @@ class Estimator:
         pixels: Float[np.ndarray, "m 2"],
         wide: Association | None = None,
     ) -> Bool[np.ndarray, " m"]:
-        """Which matches agree, by an association for `wide` ellipses or the settings' own."""
+        """Return which matches agree, by an association for `wide` ellipses or the settings'."""
         return np.asarray(_believed(*self._belief(predicted, slots, pixels, wide)))[: len(slots)]
 
     def correct(

@@ -108,11 +108,11 @@ class Map:
             self.estimator.remove(slots)
 
     def measure_unit(self) -> None:
-        """Note how near the landmarks are now, by which the next frame's unit is told."""
+        """Note how near the landmarks are now, by which the next frame's unit is found."""
         self.place.near = self._nearness()
 
     def _make_room(self, count: int, kept: Int[np.ndarray, " n"]) -> None:
-        """Give up landmarks, those `kept` apart, until there are slots for so many new ones."""
+        """Give up landmarks, except those `kept`, until there are slots for so many new ones."""
         missing = count + len(self.landmarks) - self.settings.capacity
         if missing <= 0:
             return
@@ -157,7 +157,7 @@ class Map:
 def in_view(
     landmarks: Mapping[int, Landmark], slots: Sequence[int] | np.ndarray, settings: TrackerSettings
 ) -> Bool[np.ndarray, " k"]:
-    """Which of the slots hold landmarks that are found, but for a few searches at the most.
+    """Return which of the slots hold landmarks that are found, but for a few searches at most.
 
     Only these are among the landmarks wanted, and keep new ones at a distance.
     """

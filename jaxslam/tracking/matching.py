@@ -67,7 +67,7 @@ def match_patches(
     best peak; none where it does not reach `THRESHOLD`, or where a second one comes within
     `ambiguity` of its score (0: never ambiguous). A wide ellipse is searched in the image of half
     the size, and around the highest peaks there again in the whole one; as the best of many peaks
-    often is another place, `several` are told, up to `PEAKS`, best first, for who knows what else
+    often is another place, `several` are given, up to `PEAKS`, best first, for who knows what else
     was found to choose from. None where the ellipse is outside the image.
     """
     if not len(templates):
@@ -208,7 +208,7 @@ class _Boxes(NamedTuple):
         return _Boxes(*(part[which] for part in self))
 
     def large(self) -> Bool[np.ndarray, " m"]:
-        """Which are searched in the picture of half the size first."""
+        """The patches that are first searched in the picture of half the size."""
         return self.sizes.prod(axis=1) > _NARROW
 
     def large_enough(self) -> "_Boxes":
@@ -251,7 +251,7 @@ def _peaks(
     boxes: _Boxes,
     least: float,
 ) -> _Peaks:
-    """The local maxima within each box, its rim apart, that reach `least`."""
+    """The local maxima within each box, its rim excluded, that reach `least`."""
     (width, _), half = boxes.sizes.max(axis=0, initial=3), templates.shape[1] // 2
     tops = np.concatenate([[0], np.cumsum(boxes.sizes[:, 1])])
     # One below another, so that peaks are looked for in all of them at once.

@@ -52,7 +52,7 @@ class Observations(NamedTuple):
 
     @property
     def places(self) -> Float[np.ndarray, "k 2"]:
-        """Where each is, as far as is known: where it was matched, or else expected."""
+        """The place of each, as far as is known: where it was matched, or else expected."""
         return np.where(self.matched[:, None], self.pixels, self.predicted)
 
     def labelled(self, label: str) -> Observations:

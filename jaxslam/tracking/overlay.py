@@ -36,13 +36,13 @@ _WIDEST = (
 
 
 def overlay_of(frame: Frame, result: Tracked) -> UInt8[np.ndarray, "h2 w 3"]:
-    """The picture of what was sought, found and begun in a frame."""
+    """The picture of what was sought, found and initialised in a frame."""
     table = result.observations.with_new(result.created)
     return draw_overlay(frame.image, table, _notes(result), _banner(result))
 
 
 def _notes(result: Tracked) -> tuple[str, str]:
-    """Which frame it is, and the σ of its pose in the map's unit."""
+    """Return the frame's number, and the σ of its pose in the map's unit."""
     camera, log_scale = result.camera, result.sigma_log_scale
     degrees = math.degrees(camera.sigma_orientation)
     scale = "" if log_scale is None else f"  log scale {log_scale:.3g}"
@@ -54,7 +54,7 @@ def _notes(result: Tracked) -> tuple[str, str]:
 
 
 def _banner(result: Tracked) -> str:
-    """Return what nobody is to overlook: nothing while all is well."""
+    """Return the warnings of a frame: nothing while all is well."""
     if result.starts:
         return f"LOST: MAP {result.map} BEGINS" if result.lost else ""
     return "" if result.state == "tracked" else result.state.upper()

@@ -1,4 +1,4 @@
-"""Which matches of a frame are believed: those that agree, are more than chance, and do not
+"""The choice of matches to believe: those that agree, are more than chance, and do not
 contradict what the map has proven."""
 
 from __future__ import annotations
@@ -165,8 +165,8 @@ class Policy:
     def _rigid(
         self, landmarks: list[Landmark], pixels: Float[np.ndarray, "m 2"]
     ) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
-        """Which landmarks were seen when any was seen last, and which of these agree with one
-        motion since then."""
+        """Return which landmarks were seen when any was seen last, and which of these agree with
+        one motion since then."""
         s = self.settings
         unseen = np.array([one.unseen for one in landmarks], int)
         before = np.array([one.seen_at for one in landmarks]).reshape(-1, 2)

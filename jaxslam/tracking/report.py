@@ -126,8 +126,8 @@ def write_frames(path: str | Path, history: list[Tracked]) -> None:
     are roots of the summed variances of the three axes, zero in the first frame alone, which is
     the world's, and of poses in the map's one unit. `log_scale` is the log of that unit in metres
     as the filter believes it to be at this frame, and `sigma_log_scale` its σ; both empty where
-    the filter is in no doubt of it: then nobody has measured it. `unit_fixed` is 0 while the map's
-    start is being found out, when the filter changes its unit with every frame, else 1.
+    the filter is in no doubt of it: there it has not been measured. `unit_fixed` is 0 while the
+    map's start is being found out, when the filter changes its unit with every frame, else 1.
     """
     with write_atomically(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")

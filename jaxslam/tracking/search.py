@@ -30,7 +30,7 @@ def search(
 ) -> tuple[Observations, Matches]:
     """The landmarks searched, none of them matched yet, and the places found in their ellipses.
 
-    A match's `owner` is the row of its landmark; `several` places are told of a wide ellipse where
+    A match's `owner` is the row of its landmark; `several` are given for a wide ellipse where
     that is asked.
     """
     slots, affines = to_search(landmarks, prediction, calibration, settings)
@@ -84,7 +84,7 @@ def changes_of_view(
     calibration: Calibration,
 ) -> Float[np.ndarray, "k 2 2"]:
     """Return how the picture around each landmark changed since its first view; zero where it
-    cannot be told.
+    cannot be determined.
 
     The surface is taken to face the first camera; distortion is neglected, being nearly the
     same over a patch.

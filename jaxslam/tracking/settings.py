@@ -53,7 +53,7 @@ class TrackerSettings:
     """d_min: the prior on depth reaches from here to infinity (96 %)."""
     unit_sigma: float = 1.0
     """σ of the log of the unit of length, for filters with a scale of their own (`scale_gauge`):
-    nobody told it in metres."""
+    it is unknown in metres."""
     pixel_sigma: float = 0.3
     """σ of a match, pixels."""
     focal_sigma: float = 1.0
@@ -76,11 +76,11 @@ class TrackerSettings:
     """A landmark that so many searches in a row did not find counts as in view no more, and
     keeps no new one away."""
     patience: int = 10
-    """A landmark is judged by an average over about so many of its latest searches …"""
+    """A landmark is evaluated by an average over about so many of its latest searches …"""
     least_success: float = 0.35
     """… and removed when fewer of them than this share found it; at first, all count as found."""
     lost_for: int = 15
-    """Frames in a row without tracking after which a new map is begun."""
+    """Frames in a row without tracking after which a new map is initialised."""
 
     def __post_init__(self) -> None:
         if self.filter == "recommended":

@@ -34,7 +34,7 @@ def trackable(
 
 
 def _keeps_metres(slam: AbstractStaged) -> bool:
-    """Return whether depths in metres can be told to a filter, landmark by landmark."""
+    """Return whether depths in metres can be given to a filter, landmark by landmark."""
     return isinstance(slam, EkfSlam) and isinstance(slam.scale, Metre) and slam.depth.common is None
 
 

@@ -172,8 +172,8 @@ def _scale_between_maps(settings: TrackerSettings) -> float:
 
 
 def _units(history: Sequence[Tracked]) -> list[Summary]:
-    """Of every map: the frame from which on the filter's unit was fixed, and the log of the map's
-    unit in metres as it is believed at the map's end, with σ; null where there is no doubt."""
+    """Return, for every map, the frame from which on the filter's unit was fixed, and the log of
+    the map's unit in metres as believed at its end, with σ; null where there is no doubt."""
     units = []
     for number in range(history[-1].map + 1):
         of_map = [result for result in history if result.map == number]
@@ -231,7 +231,7 @@ def _ungated(updates: Sequence[Tracked]) -> Summary:
 
 
 def _errors(source: Source, history: Sequence[Tracked]) -> Summary:
-    """The trajectory error, where there is a reference, or why it cannot be told."""
+    """The trajectory error, where there is a reference, or why it cannot be computed."""
     if source.reference is None:
         return {}
     trajectories = *trajectory_of(history), *source.reference

@@ -51,7 +51,7 @@ class KnownPoint:
 
 @dataclass(frozen=True)
 class Target:
-    """At least four points, not on one line. Raises ValueError."""
+    """A target of at least four points, not on one line. Raises ValueError."""
 
     points: tuple[KnownPoint, ...]
 

@@ -101,7 +101,7 @@ class Tracker:
 
     @property
     def restarts(self) -> int:
-        """The number of maps begun after the first."""
+        """The number of maps initialised after the first."""
         return self.map.number
 
     def track(self, frame: Frame) -> Tracked:

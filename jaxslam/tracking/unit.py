@@ -21,8 +21,8 @@ Nearness = Mapping[int, float]
 
 
 def nearness(numbers: Mapping[int, int], points: Float[np.ndarray, "n 3"]) -> Nearness:
-    """Of landmarks whose numbers are given by their slots, at points in the frame in which the map
-    begins."""
+    """Return the nearness of landmarks, whose numbers are given by their slots, at points in the
+    frame in which the map begins."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # at infinity, or nowhere
         near = 1 / np.linalg.norm(points, axis=1)
     return {number: float(near[slot]) for slot, number in numbers.items()}
