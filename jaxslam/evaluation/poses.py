@@ -155,7 +155,7 @@ def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseE
     later = _later(world.poses, start, logged)
     errors, P = errors[:, start:], later.covariances[..., axes[:, None], axes]
     fitted, axis_fitted, scale, notes = 0.0, np.zeros(len(axes)), None, (*known, *world.notes)
-    if world.given:
+    if world.given or align == "sim3":
         normalised(errors, P)  # refuses what is not positive definite, by run and step
     if truth_sigma is not None:
         later = _with_truth(world, later, convention, axes, truth_sigma)
