@@ -88,6 +88,7 @@ def biased(scenario):
     return BiasedVelocity(s.acceleration_sigma, s.velocity, s.velocity_sigma, (0.5, 0.5, 0.3))
 
 
+@pytest.mark.slow
 def test_a_motion_with_a_bias_is_studied_and_learns_it():
     scenario = jaxslam.scenario("matched", steps=15)
     motion = biased(scenario)
@@ -96,6 +97,7 @@ def test_a_motion_with_a_bias_is_studied_and_learns_it():
     assert verdict(scenario, paper(scenario), motion=motion)["word"] == "over-confident"
 
 
+@pytest.mark.slow
 def test_a_treatment_of_ones_own_is_studied():
     scenario = jaxslam.scenario("matched", steps=10)
     drifting = DriftingFocal([0.005], [0.001])
@@ -109,6 +111,7 @@ def test_a_treatment_of_ones_own_is_studied():
     assert sigma["drifting"] > sigma["known"]
 
 
+@pytest.mark.slow
 def test_a_remedy_of_ones_own_resists_outliers():
     scenario = jaxslam.scenario("matched-tight", steps=8)
     plain, robust = paper(scenario), paper(scenario, form=Covariance(Huber()))

@@ -5,6 +5,8 @@ import re
 import runpy
 from pathlib import Path
 
+import pytest
+
 import jaxslam
 
 ROOT = Path(__file__).parents[1]
@@ -48,6 +50,7 @@ def definitions(path: Path) -> set[str]:
     return names
 
 
+@pytest.mark.slow
 def test_the_papers_filter_in_numpy_is_the_librarys():
     """Frame by frame, where landmarks come and go and where the filter breaks."""
     results = runpy.run_path(str(NOTEBOOK))["results"]

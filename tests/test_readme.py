@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import tyro
 
 import jaxslam
@@ -33,18 +34,21 @@ def run_example(document: str) -> str:
     return examples(document)[0]
 
 
+@pytest.mark.slow
 def test_the_library_example_runs_and_prints_a_table(capsys):
     snippet = run_example("README.md")
     assert len(snippet.strip().splitlines()) <= 13
     assert "robocentric/inverse_scaling" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_filter_of_ones_own_takes_part_in_a_study(capsys):
     run_example("docs/own-filter.md")
     lines = capsys.readouterr().out.splitlines()
     assert ": consistent (p = " in lines[lines.index("mine:") + 1]
 
 
+@pytest.mark.slow
 def test_a_log_of_ones_own_goes_through_the_filter(capsys):
     """And a sensor and a motion of one's own, with consistent numbers."""
     assert len(examples("docs/own-data.md")) == 3
@@ -64,6 +68,7 @@ def test_the_papers_filter_is_put_together_of_its_equations(capsys):
     assert capsys.readouterr().out.startswith("(47, 47)")
 
 
+@pytest.mark.slow
 def test_a_filter_has_gradients(capsys):
     run_example("docs/gradients.md")
     assert "by the pixel's σ" in capsys.readouterr().out
@@ -82,6 +87,7 @@ def test_errors_of_any_filter_have_a_verdict(capsys, tmp_path, monkeypatch):
     assert sum(line.startswith("axis ") for line in out.splitlines()) == 2  # two tables
 
 
+@pytest.mark.slow
 def test_a_landmark_of_ones_own_goes_into_the_papers_filter(capsys):
     run_example("docs/own-landmark.md")
     lines = capsys.readouterr().out.splitlines()
@@ -100,6 +106,7 @@ def test_a_study_is_kept_in_files(capsys, tmp_path, monkeypatch):
     assert [file.stat().st_mtime_ns for file in files] == written
 
 
+@pytest.mark.slow
 def test_single_precision_is_a_choice(capsys):
     run_example("docs/float32.md")
     double, single = capsys.readouterr().out.splitlines()
@@ -107,12 +114,14 @@ def test_single_precision_is_a_choice(capsys):
     assert single.endswith("diverged 0")
 
 
+@pytest.mark.slow
 def test_the_sites_first_page_has_ten_lines(capsys):
     snippet = run_example("docs/index.md")
     assert len(snippet.strip().splitlines()) <= 10
     assert "scale_gauge+mixture9/inverse_scaling" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_film_goes_through_the_tracker_in_python(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     source = synthetic_source(frames=6, width=320, height=240)

@@ -39,6 +39,7 @@ def test_a_run_says_which_camera_was_the_true_one():
     assert (intrinsics["nominal"] == [650, 320]).all()
 
 
+@pytest.mark.slow
 def test_the_study_is_that_of_the_library_and_writes_its_files(tmp_path):
     options = dataclasses.replace(OPTIONS, out=tmp_path / "r" / "c.json", docs=tmp_path / "docs")
     options()

@@ -65,6 +65,7 @@ def test_seeds_are_one_study_in_any_order():
     assert json.loads(json.dumps(one, allow_nan=False)) == one
 
 
+@pytest.mark.slow
 def test_a_seed_is_measured_as_the_library_summarises_it(options):
     scenario = jaxslam.scenario("matched", steps=3, landmarks=4)
     options = dataclasses.replace(options, runs=6, chunk=4)

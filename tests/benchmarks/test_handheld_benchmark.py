@@ -90,6 +90,7 @@ def options(tmp_path, monkeypatch):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_everything_in_the_folder_is_measured_and_only_once(options, capsys, monkeypatch):
     options()
     found = json.loads(options.out.read_text())

@@ -68,6 +68,7 @@ def through():
         return modes_of_run(slam, of.room, of.run(0))
 
 
+@pytest.mark.slow
 def test_the_modes_of_a_run_end_where_frames_are_merged():
     """The window of four frames after frame 0 is full in the fourth."""
     modes = through()

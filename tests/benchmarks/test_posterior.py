@@ -146,6 +146,7 @@ def test_without_a_bound_the_truncated_normal_is_the_normal():
     np.testing.assert_allclose(truncated_normal(y, jnp.asarray(-jnp.inf)), y, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", [LOOSE, SPATIAL], ids=["planar", "spatial"])
 def test_residuals_and_their_jacobian_are_those_of_a_dense_computation(scenario):
     problem, _ = problem_of(scenario)
@@ -176,6 +177,7 @@ def test_a_landmark_that_is_not_visible_tells_nothing_and_one_behind_is_impossib
     assert log_density(problem, past) == -jnp.inf
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("truncated", [True, False])
 def test_the_conditional_variables_have_the_jacobian_that_they_claim(truncated):
     problem, _ = problem_of(LOOSE, truncated=truncated)
@@ -222,6 +224,7 @@ def nearly_linear():
     return jax.tree.map(lambda x: x[0], (problems, runs, modes, chains))
 
 
+@pytest.mark.slow
 def test_on_a_nearly_linear_problem_map_hmc_and_the_filter_agree():
     problem, run, mode, chains = nearly_linear()
     assert bool(mode.converged)
@@ -254,6 +257,7 @@ def test_on_a_nearly_linear_problem_map_hmc_and_the_filter_agree():
     assert 0 <= records["kl"] < 0.05
 
 
+@pytest.mark.slow
 def test_at_the_mode_the_conditional_variables_have_the_laplace_approximation():
     problem, _, mode, _ = nearly_linear()
     root = whitening_root(problem, mode.mode)
@@ -402,6 +406,7 @@ def test_chains_and_starts_use_no_key_of_the_simulator_and_none_twice(monkeypatc
     assert len({*simulated, *sampled}) == len(simulated) + len(sampled)
 
 
+@pytest.mark.slow
 @pytest.mark.statistics
 def test_the_posterior_is_calibrated():
     """Ranks and NEES over 40 problems; false alarms: 0.4 % by six ranks, 0.1 % by the NEES."""
@@ -504,6 +509,7 @@ def test_a_run_cut_short_is_its_beginning():
     assert len(short.controls) == 2
 
 
+@pytest.mark.slow
 def test_no_posterior_calls_lapack():
     chosen = jaxslam.scenario("matched", landmarks=3)
     study = Study(chosen, steps=2, hmc=HMC(chains=2))

@@ -23,6 +23,7 @@ VERDICT_KEYS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_consistency_writes_what_others_read(tmp_path, capsys):
     main([*SMALL, "--chunk", "3", "--out", str(tmp_path), "--set", "pixel_sigma=0.4"])
     summary = json.loads((tmp_path / "consistency.json").read_text())

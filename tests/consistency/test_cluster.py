@@ -59,6 +59,7 @@ def processes():
         process.wait(30)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(180)
 def test_a_study_on_a_cluster_is_the_same_although_a_worker_is_killed(processes, tmp_path):
     address, workers = processes
@@ -109,6 +110,7 @@ def test_without_the_extra_a_study_says_what_to_install(monkeypatch):
         jaxslam.monte_carlo(SCENARIO, filters(), runs=2, cluster="tcp://127.0.0.1:9")
 
 
+@pytest.mark.slow
 def test_what_computes_a_chunk_survives_a_pickle():
     """In whatever precision the process is: this one's is float64."""
     cloudpickle = pytest.importorskip("cloudpickle")

@@ -31,6 +31,7 @@ def scaled(slam, acceleration, pixel, focal=1.0):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["robocentric", "world", "scale_gauge"])
 def test_gradients_through_a_run_are_those_of_central_differences(case, name):
     slam, run = jaxslam.cast(case.filter(name), jnp.float64), case.run(0)
@@ -51,6 +52,7 @@ def test_gradients_through_a_run_are_those_of_central_differences(case, name):
         np.testing.assert_allclose(derivative, central, rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_every_number_of_a_filter_has_a_derivative(case):
     slam = jaxslam.cast(case.filter("robocentric", calibration="white"), jnp.float64)
     found = eqx.filter_jit(gradient)(slam, case.room, case.run(0))

@@ -21,6 +21,7 @@ def study(request):
     return jaxslam.monte_carlo(scenario, filters, runs=RUNS, seed=4, chunk=CHUNK)
 
 
+@pytest.mark.slow
 def test_every_number_of_every_step_is_in_the_file(study, tmp_path):
     write_records(study, tmp_path / "new" / "records.parquet")
     rows = parquet.read_table(tmp_path / "new" / "records.parquet").to_pandas()
@@ -53,6 +54,7 @@ def test_a_file_says_what_made_it_and_holds_a_chunk_at_a_time(study, tmp_path):
     assert made_by["scenario"]["landmarks"] == 4
 
 
+@pytest.mark.slow
 def test_the_command_writes_it_and_resumes_to_the_same(tmp_path):
     sizes = "--scenario matched --steps 3 --runs 4 --chunk 2 --landmarks inverse_scaling"
     command = ["consistency", *sizes.split(), "--out", str(tmp_path)]

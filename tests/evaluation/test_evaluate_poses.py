@@ -386,6 +386,7 @@ def test_a_right_filter_is_consistent_at_one_scale_however_its_errors_are_common
         assert not named
 
 
+@pytest.mark.slow
 def test_a_drift_of_scale_is_over_confident_and_named(tmp_path):
     """Each pose at a scale of its own had hidden it, be it fourfold."""
     options = scale_drift.ScaleDrift(runs=30, steps=40)
@@ -731,6 +732,7 @@ def write_runs(folder, T, P, truth, convention, times=None):
         write_tum(own / "truth.txt", times + 0.004, truth[run])
 
 
+@pytest.mark.slow
 def test_a_folder_of_runs_is_its_arrays(tmp_path, capsys):
     convention = Convention("split", "mixed", "rotation-first")
     T, P, truth = logged(convention, runs=12)

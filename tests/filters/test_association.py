@@ -252,6 +252,7 @@ def test_a_tolerance_is_noise_of_each_match_by_itself():
     np.testing.assert_array_equal(some.residual, none.residual)
 
 
+@pytest.mark.slow
 def test_of_a_curved_measurement_the_spread_of_a_moving_camera_is_told():
     """Against samples: what a linear prediction leaves out of each match's covariance."""
     slam, state, control, pixels = matched()

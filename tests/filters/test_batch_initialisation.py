@@ -88,6 +88,7 @@ def pose_of(name, of=standstill):
     return np.einsum("ri,ri->r", error, np.linalg.solve(P, error[..., None])[..., 0]), along
 
 
+@pytest.mark.slow
 def test_from_rest_no_run_is_lost_and_none_goes_backwards():
     """Of those in which the sum alone loses some. Six degrees of freedom: NEES is 6 ± 1.4."""
     nees, along = pose_of(STARTED)
@@ -102,6 +103,7 @@ def steps_of(state):
     return jax.vmap(lambda record: record.steps)(state.record)
 
 
+@pytest.mark.slow
 def test_the_window_closes_and_the_sum_goes_on_alone():
     """Where the camera has moved enough; where it has not, with every other frame."""
     states = followed(STARTED)
@@ -154,6 +156,7 @@ def test_a_window_may_close_where_one_translation_is_known_to_three_hundredths(
     assert not slam._ready(state)  # of no frame yet
 
 
+@pytest.mark.slow
 def test_standing_teaches_nothing_and_then_the_motion_is_found():
     """The window keeps frame 0 and the newest, and stays open."""
     states = followed(STARTED, standing)

@@ -168,6 +168,7 @@ def test_an_update_has_one_step_at_least():
         case().filter("world+iterated0")
 
 
+@pytest.mark.slow
 def test_absorbing_the_oldest_frame_keeps_its_point_and_all_that_is_known_of_the_newest():
     """Marginalisation is exact at one point of linearisation: a frame in which nothing happens
     after that leaves the newest mean and covariance as they were."""
@@ -201,6 +202,7 @@ def test_absorbing_the_oldest_frame_keeps_its_point_and_all_that_is_known_of_the
     close(found.covariance, expected.covariance, 1e-6)
 
 
+@pytest.mark.slow
 def test_a_removed_landmark_leaves_nothing_behind():
     of = case()
     slam = of.filter("scale_gauge+lag3")

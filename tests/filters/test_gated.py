@@ -46,6 +46,7 @@ def nees_with_wrong_matches(name, share):
     return nees, np.asarray(used)[wrong].mean() if wrong.any() else 0.0
 
 
+@pytest.mark.slow
 def test_wrong_matches_are_not_believed():
     nees, believed = nees_with_wrong_matches("robocentric+checked", 0.3)
     assert believed < 0.05
@@ -55,6 +56,7 @@ def test_wrong_matches_are_not_believed():
     assert np.median(alone) > lost_threshold(6)
 
 
+@pytest.mark.slow
 def test_right_matches_are():
     nees, _ = nees_with_wrong_matches("robocentric+checked", 0.0)
     assert nees.mean() == pytest.approx(

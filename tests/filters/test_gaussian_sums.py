@@ -332,6 +332,7 @@ def test_what_makes_no_sense_is_refused(name, landmarks, message):
         case("matched").filter(name, landmarks)
 
 
+@pytest.mark.slow
 @pytest.mark.statistics
 def test_the_recommended_filter_is_consistent_where_the_papers_is_not():
     """40 runs straight ahead with loose noise, 30 steps: IS is lost; this one is in the band."""

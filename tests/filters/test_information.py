@@ -144,6 +144,7 @@ def agree(P, Q, relative):
     np.testing.assert_allclose(Q / scale, P / scale, rtol=0, atol=relative)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_a_run_in_information_form_is_the_run_in_covariance_form(geometry):
     (states, covariances, nis, poses), others = both_forms(geometry)

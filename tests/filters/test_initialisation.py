@@ -171,6 +171,7 @@ def test_members_are_weighed_by_bayes_rule():
     np.testing.assert_allclose(state.memory[0], likelihood / likelihood.sum(), rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("privilege", [0.0, 0.5, 1.0])
 def test_members_share_a_measurement_by_their_weights_to_the_privilege(privilege, monkeypatch):
     """ρ_i = Λ_i^μ / Σ Λ_j^μ (Solà et al. 2005): all shares together are one measurement."""
@@ -256,6 +257,7 @@ def two_runs():
     return Case("matched", runs=2, steps=3, landmarks=3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["world+particles30", "robocentric+rays"])
 def test_a_batch_is_its_runs(name):
     case = two_runs()

@@ -52,6 +52,7 @@ def said(name, unit=None):
     return quick_jit(run)(*of.frames(0), of.controls())
 
 
+@pytest.mark.slow
 def test_in_the_unit_nothing_depends_on_what_is_known_of_the_metre():
     metric, (given, variance), points, points_given, _ = said("scale_gauge")
     wide, (same, wider), wide_points, same_points, _ = said("scale_gauge", 1.0)

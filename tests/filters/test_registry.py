@@ -94,6 +94,7 @@ def test_what_takes_a_frame_in_stages_and_each_landmark_as_a_gaussian_can_track(
             check_can_track(slam, name)
 
 
+@pytest.mark.slow
 def test_a_study_prints_as_its_table_and_is_a_data_frame():
     study = monte_carlo(
         scenario("matched-tight", steps=3),

@@ -27,6 +27,7 @@ ANY_ARRAY = arrays.arrays(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_broken_files_end_in_one_line_or_in_a_result(tmp_path):
     """Every reader, in turn, of files and arrays to which something has happened."""
     cases = fuzz.Fuzz(tmp_path)

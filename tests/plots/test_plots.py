@@ -111,6 +111,7 @@ def test_filters_are_named_by_what_tells_them_apart():
         assert short_names(names) == {name: name for name in names}
 
 
+@pytest.mark.slow
 def test_a_column_for_print_has_its_width_its_letters_and_nothing_outside(study, tmp_path):
     for figure in (
         plot_evaluation(evaluation(), column=True),

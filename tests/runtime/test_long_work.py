@@ -63,6 +63,7 @@ def assert_resumes_to_the_same(folder, seed, kills):
 _BOTH = ("whole", "killed")
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_study_that_is_killed_resumes_to_the_same(tmp_path, monkeypatch):
     told = jax.config.values["jax_compilation_cache_dir"]

@@ -63,6 +63,7 @@ def test_factorisations_in_jax_end_with_any_number_of_processors(processors):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_batched_lapack_ends_too_and_if_by_the_watchdog_says_where():
     """On jaxlib 0.10 it stands still on two processors; a jaxlib that does not may end well."""
     done = run("lapack", 2)
@@ -101,6 +102,7 @@ FILTERS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "scenario"),
     [*((name, "circle") for name in FILTERS), ("scale_gauge+mixture3", "matched-6dof")],

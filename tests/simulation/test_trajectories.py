@@ -142,6 +142,7 @@ def test_the_truth_moves_along_it_and_the_filter_is_told_the_seconds_only():
     assert np.abs(np.asarray(other.poses.as_matrix()) - T).max() > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("data")
 def test_a_study_may_go_along_a_trajectory_of_ones_own(tmp_path):
     own = sampled(write(tmp_path / "own.txt", np.arange(0, 3, 0.02)), 30.0, 4)

@@ -158,6 +158,7 @@ def test_the_noise_of_the_truth_is_of_the_scale_of_the_estimate(geometry):
     assert bare.nees > 2 * one(noises[0], 0 * own_noises[0]).nees
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["robocentric", "scale_gauge+mixture3"])
 def test_of_a_filter_it_is_the_least_nees_over_all_scales(name):
     case = Case("standstill", steps=8)
@@ -202,6 +203,7 @@ def constructed(steps, drift, *, common=0.0, runs=60, sigma=0.01, seed=0):
     return rng.chisquare(5, (runs, steps)), np.log(s), np.full((runs, steps), sigma)
 
 
+@pytest.mark.slow
 def test_one_scale_is_the_least_sum_over_the_run():
     geometry, K = PLANAR, 7
     truths = [pose(geometry, seed) for seed in range(K)]

@@ -185,6 +185,7 @@ def hiding(monkeypatch, hidden):
     monkeypatch.setattr(searching, "to_search", search)
 
 
+@pytest.mark.slow
 def test_a_landmark_out_of_view_is_kept_while_there_are_slots_and_found_again(monkeypatch):
     source = synthetic_source(frames=25, **SMALL)
     there = [frame.image for frame in source]

@@ -52,6 +52,7 @@ def test_step_is_track_with_the_frames_counted(video):
     assert one.steps == other.steps == 3
 
 
+@pytest.mark.slow
 def test_a_loaded_tracker_goes_on_digit_by_digit(video, tmp_path):
     calibration, frames = video
     settings = TrackerSettings(filter="scale_gauge+mixture3", wanted=12, spare=4, patience=2)

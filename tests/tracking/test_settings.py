@@ -39,6 +39,7 @@ def test_an_unknown_treatment_is_refused():
         TrackerSettings(calibration="maybe")
 
 
+@pytest.mark.slow
 def test_a_guessed_focal_length_is_estimated_while_the_camera_moves():
     source = synthetic_source(frames=45, width=320, height=240)
     true = source.calibration.fx

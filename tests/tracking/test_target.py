@@ -103,6 +103,7 @@ def trackers(video, card):
     return told, alone, last
 
 
+@pytest.mark.slow
 def test_the_map_is_in_metres(video, trackers):
     source, _ = video
     assert source.reference is not None

@@ -38,6 +38,7 @@ def fail(*_, **__):
     raise ValueError("cannot draw")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "in_doubt"), [("scale_gauge+mixture3", True), ("world", False)])
 def test_a_filter_with_a_unit_of_its_own_says_so_beside_its_covariances(tmp_path, name, in_doubt):
     tracking.track(small(3), tmp_path, replace(SETTINGS, filter=name), overlay=False)

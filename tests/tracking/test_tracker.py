@@ -64,6 +64,7 @@ def tracked(tmp_path_factory):
     return out, source, track(source, out, TrackerSettings(filter="world", wanted=30))
 
 
+@pytest.mark.slow
 def test_the_synthetic_camera_is_tracked(tracked):
     _, _, summary = tracked
     assert summary["tracked"] == summary["frames"] == FRAMES
@@ -75,6 +76,7 @@ def test_the_synthetic_camera_is_tracked(tracked):
     assert 0.1 < summary["nis"]["mean"] / summary["nis"]["dof"] < 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name_of_filter", ["world", "robocentric+mixture3"])
 def test_the_tracker_calls_no_lapack(name_of_filter, monkeypatch):
     """In none of its programs; unbatched calls are slow where OpenBLAS has threads of its own."""
@@ -126,6 +128,7 @@ def test_the_files_hold_every_frame_and_agree_with_the_summary(tracked):
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_half_a_picture_that_moves_otherwise_is_not_believed_for_long():
     """Its corners become landmarks; then those that were there before are found elsewhere."""
     source, states = synthetic_source(frames=80, seed=4), []
@@ -289,6 +292,7 @@ def test_nothing_but_the_first_frame_is_known_exactly(restarted):
         assert np.all(sigmas[LIGHT:] > 2 * sigmas[DARK - 1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("broken", ["update", "prediction"])
 def test_a_filter_that_fails_is_begun_anew_from_what_prediction_says(broken, monkeypatch):
     """Its covariance is not positive after a frame's update, or even without one."""
@@ -401,6 +405,7 @@ def test_a_world_behind_the_camera_is_given_up():
     assert tracker.reversed == 1
 
 
+@pytest.mark.slow
 def test_what_a_lost_camera_sees_is_not_put_into_its_map():
     source, rng = synthetic_source(frames=5), np.random.default_rng(0)
     tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=20, spare=20))
@@ -446,6 +451,7 @@ def test_an_unknown_calibration_counts_in_the_first_frame_too():
     np.testing.assert_allclose(covariances[:, 0, 0], expected, rtol=1e-6, atol=0)
 
 
+@pytest.mark.slow
 def test_it_is_said_wherever_it_stands_that_estimated_intrinsics_are_too_sure(tmp_path):
     source = synthetic_source(frames=3, width=320, height=240)
     settings = TrackerSettings(filter="world", wanted=12, spare=4)
@@ -489,6 +495,7 @@ def test_a_frame_must_be_later_than_the_one_before():
         tracker.track(frame)
 
 
+@pytest.mark.slow
 def test_a_gaussian_sum_tracks_too():
     """Its members share one search, and give another estimate than one filter does.
 
@@ -575,6 +582,7 @@ def test_unknown_names_are_refused(options):
         TrackerSettings(**options)
 
 
+@pytest.mark.slow
 def test_a_real_sequence_is_tracked(shared_data, tmp_path):
     source = shortened(open_source(shared_data / "costado"), 60)
     summary = track(source, tmp_path, TrackerSettings(filter="world", wanted=30))

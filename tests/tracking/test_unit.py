@@ -137,6 +137,7 @@ def same(found, expected, ratio, within=1e-6):
     np.testing.assert_allclose(found.covariance, P, rtol=0, atol=10 * within * P.max())
 
 
+@pytest.mark.slow
 def test_a_path_is_in_one_unit_whatever_the_filter_takes_it_for(plain, wanders):
     ratio = np.exp(0.3)  # what frame 0 took for metres
     for found, expected in zip(wanders.results, plain.results, strict=True):
