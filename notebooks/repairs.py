@@ -89,7 +89,7 @@ def table(results):
 #   first ones how far away the scene is. With it the filter is the one called `recommended`.
 
 # %%
-SUM, RECOMMENDED = "scale_gauge+mixture17", jaxslam.filters.registry.RECOMMENDED["planar"]
+SUM, RECOMMENDED = "scale_gauge+mixture17", jaxslam.filters.RECOMMENDED["planar"]
 sideways = study(
     "matched-loose", ["robocentric", "robocentric+oc", "scale_gauge", SUM, RECOMMENDED]
 )

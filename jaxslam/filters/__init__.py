@@ -8,6 +8,7 @@ from jaxslam.filters.forms.information import Information
 from jaxslam.filters.forms.invariant import Invariant
 from jaxslam.filters.forms.observability_constrained import ObservabilityConstrained
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
+from jaxslam.filters.registry import MODIFIERS, RECOMMENDED, scenario_pieces
 from jaxslam.filters.wrappers.adaptive_process_noise import AdaptiveProcessNoise
 from jaxslam.filters.wrappers.batch_initialisation import BatchInitialisation
 from jaxslam.filters.wrappers.fixed_lag import FixedLag
@@ -16,6 +17,8 @@ from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
 from jaxslam.filters.wrappers.wrapper import AbstractWrapper
 
 __all__ = [
+    "MODIFIERS",
+    "RECOMMENDED",
     "AbstractCorrection",
     "AbstractFilter",
     "AbstractStaged",
@@ -33,4 +36,5 @@ __all__ = [
     "ObservabilityConstrained",
     "Standard",
     "kalman_update",
+    "scenario_pieces",
 ]
