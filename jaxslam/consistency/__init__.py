@@ -1,4 +1,4 @@
-"""Is a filter consistent? Monte Carlo runs, NEES and NIS with exact bounds, and their summary."""
+"""The consistency of filters: Monte Carlo runs, NEES and NIS with exact bounds, their summary."""
 
 from jaxslam.consistency.backends import BACKENDS
 from jaxslam.consistency.likelihood import log_likelihood, maximum_likelihood

@@ -1,4 +1,4 @@
-"""What computes a batch of runs: XLA, or a program in C++ that is made from the same functions."""
+"""The backends for a batch of runs: XLA, or a C++ program generated from the same functions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation import Room, Run
 
 CACHE = 3 * 2**19
-"""Bytes of covariances that a processor works on: about what its second cache holds."""
+"""The bytes of covariances that a processor works on: about what its second cache holds."""
 
 Records = dict[str, Array]
 BatchProgram = Callable[[np.integer], tuple[Records, Records]]
@@ -54,8 +54,10 @@ def _filter_batch(
     runs: Run,
     wanted: Int[Array, ""],
 ) -> tuple[Records, Records]:
-    """A batch in parts that fit the cache. Of the last chunk only the first runs are `wanted`:
-    where there are none of them in a part, it is not computed."""
+    """Compute a batch in parts that fit the cache.
+
+    Of the last chunk only the first runs are `wanted`: a part without any is not computed.
+    """
 
     def part(runs):
         records, path, state = jax.vmap(partial(filter_run, slam, room, sensor))(runs)
@@ -83,7 +85,7 @@ def _filter_batch(
 
 
 def _runs_in_cache(room: Room, runs: Run) -> int:
-    """Runs whose covariances stay in a processor's cache; all where there is no such."""
+    """The number of runs whose covariances fit a processor's cache; all where there is none."""
     if jax.default_backend() != "cpu":
         return len(runs.visible)
     n = 2 * runs.poses.tangent_dim + room.landmarks * (runs.points.shape[-1] + 1)
@@ -91,8 +93,7 @@ def _runs_in_cache(room: Room, runs: Run) -> int:
 
 
 def by_native(slam: AbstractFilter, room: Room, sensor: AbstractSensor, runs: Run) -> BatchProgram:
-    """Return the program in C++ for a filter on a batch of runs; XLA's, with a warning, where there
-    is none."""
+    """Return the C++ program for a filter on a batch of runs; with a warning XLA's if none."""
     numbers, structure = eqx.partition(slam, is_number)
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (numbers, sensor, runs))
     with _compiling:  # two threads that ask for one program wait for it
@@ -112,8 +113,10 @@ def _hashable(tree: PyTree) -> tuple[tuple[PyTree, ...], jax.tree_util.PyTreeDef
 
 @lru_cache(maxsize=32)
 def _native_program(key: Exact) -> Callable[..., tuple[Records, Records]] | None:
-    """For a filter of this structure, whatever its numbers, and data of these shapes; None, with a
-    warning, where the native backend cannot."""
+    """The program for a filter of this structure, whatever its numbers, and data of these shapes.
+
+    None, with a warning, where the native backend cannot compile it.
+    """
     from jaxslam.native import batched
 
     leaves, structure, room, shapes, of_data = key.value
@@ -143,7 +146,7 @@ BACKENDS: dict[str, Callable[[AbstractFilter, Room, AbstractSensor, Run], BatchP
     "xla": by_xla,
     "native": by_native,
 }
-"""What compiles a filter for a batch of runs."""
+"""The functions that compile a filter for a batch of runs."""
 
 
 def check_backend(backend: str) -> None:

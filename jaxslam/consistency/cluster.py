@@ -1,4 +1,4 @@
-"""Chunks as tasks of a Dask cluster, on however many machines.
+"""The chunks as tasks of a Dask cluster, on however many machines.
 
 A task is a pickle of what computes a chunk, and the chunk. Results are taken as they come, and no
 more tasks are given out than keep the workers busy, so that neither the scheduler nor a worker's
@@ -23,9 +23,9 @@ from jaxslam._runtime.files import one_line
 from jaxslam._runtime.programs import wide
 
 AHEAD = 3
-"""Tasks given out for every thread of the cluster: one at work, the others on their way."""
+"""The tasks given out for every thread of the cluster: one at work, the others on their way."""
 AT_LEAST = 64
-"""Tasks given out however few threads there are, so that a cluster that adapts sees work."""
+"""The tasks given out however few threads there are, so that a cluster that adapts sees work."""
 ANSWER_SECONDS = 10.0
 """Seconds in which a scheduler has to answer."""
 
@@ -34,7 +34,7 @@ ANSWER_SECONDS = 10.0
 def connected(cluster: Any) -> Generator[Any]:
     """A `distributed.Client` of a scheduler's address, of a Dask cluster, or as it is given.
 
-    None for None. What was connected here is closed. Raises ValueError where nobody answers, or
+    None for None. What was connected here is closed. Raises ValueError if no scheduler answers, or
     where the extra is missing.
     """
     if cluster is None or hasattr(cluster, "submit"):
@@ -58,7 +58,7 @@ def connected(cluster: Any) -> Generator[Any]:
 def on_cluster(
     client: Any, function: Callable[[range], Any], chunks: list[range]
 ) -> Iterator[tuple[range, Any]]:
-    """Chunks, in the order in which they are finished, with what the function makes of them.
+    """Yield chunks, in the order in which they are finished, with the function's results.
 
     Raises OSError where the scheduler is lost; what the function raises comes through.
     """
@@ -94,7 +94,7 @@ def _pickled(function: Callable[[range], Any]) -> bytes:
 
 
 def _computed(whole: bytes, as_wide: bool, chunk: range) -> Any:
-    """On the worker. The pickle comes with every task, as a worker may come at any time."""
+    """Compute on the worker; every task carries the pickle, as workers may join at any time."""
     with jax.enable_x64(as_wide):  # a thread's own
         return _unpickled(whole)(chunk)
 

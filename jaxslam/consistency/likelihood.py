@@ -1,4 +1,4 @@
-"""What measurements say of a filter's own numbers: their likelihood, and its maximum.
+"""The likelihood of a filter's own numbers given the measurements, and its maximum.
 
 A filter's innovations are independent if it is right, so that the measurements of a run have the
 log likelihood `−½ Σ (rᵀ S⁻¹ r + log det S)`, up to a constant (Schweppe 1965). A filter is a pytree
@@ -26,7 +26,7 @@ MOST = 0.7
 
 
 STEP = 1e-4
-"""Of the central differences of the gradient, in θ."""
+"""The step of the central differences of the gradient, in θ."""
 
 
 class Estimate(NamedTuple):
@@ -34,16 +34,19 @@ class Estimate(NamedTuple):
 
     values: Float[np.ndarray, " k"]
     standard_errors: Float[np.ndarray, " k"]
-    """By the scatter of the runs' scores (White 1982): they hold for a wrong model too."""
+    """Standard errors by the scatter of the runs' scores (White 1982), which hold for a wrong model
+    too."""
     log_likelihood: float
-    """Of all runs."""
+    """The log likelihood of all runs."""
     iterations: int
     converged: bool
 
 
 def log_likelihood(slam: AbstractFilter, room: Room, run: Run) -> Float[Array, ""]:
-    """Of all that is measured in a run after frame 0, up to a constant that is the same for all
-    filters that use the same measurements."""
+    """The log likelihood of all that is measured in a run after frame 0, up to a constant.
+
+    The constant is the same for all filters that use the same measurements.
+    """
 
     def term(state, innovation, frame):
         del state, frame
@@ -63,11 +66,11 @@ def maximum_likelihood(
     most_iterations: int = 30,
     chunk: int = 64,
 ) -> Estimate:
-    """θ for which the filters `filter_of(θ)` explain a batch of runs best.
+    """Find θ for which the filters `filter_of(θ)` explain a batch of runs best.
 
-    By Newton's method with the observed information, the central differences of the gradient, until
-    a step is below `tolerance` standard errors. Take logarithms for θ where numbers are positive.
-    Raises ValueError for an empty batch of runs.
+    Newton's method with the observed information, the central differences of the gradient, runs
+    until a step is below `tolerance` standard errors. Take logarithms for θ where numbers are
+    positive. Raises ValueError for an empty batch of runs.
     """
     count = jax.tree.leaves(runs)[0].shape[0]
     if not count:
@@ -112,5 +115,5 @@ def maximum_likelihood(
 
 
 def gradient(slam: Any, room: Room, run: Run) -> Any:
-    """Of the run's log likelihood by every number of the filter: a filter of derivatives."""
+    """The gradient of the run's log likelihood by every number of the filter, as a filter."""
     return eqx.filter_grad(lambda slam: log_likelihood(slam, room, run))(slam)

@@ -1,4 +1,4 @@
-"""What decides the results of a study, as JSON: so that what is kept of two is never mixed."""
+"""The manifest of all that decides a study's results, as JSON, so that no two are ever mixed."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ import numpy as np
 
 Manifest = dict[str, Any]
 LAYOUT = 8
-"""Version of the records that are kept, which are never mixed with those of another."""
+"""The version of the records that are kept, which are never mixed with those of another."""
 MOST_NUMBERS = 64
-"""Of an array that is told whole; of a larger one only a digest is."""
+"""The largest array that is written whole; of a larger one there is a digest."""
 
 
 def versions() -> dict[str, str]:
-    """Of the packages that decide the digits of a result."""
+    """The versions of the packages that decide the digits of a result."""
     from jaxslam._version import __version__
 
     return {"jaxslam": __version__, **{name: version(name) for name in ("jax", "jaxlib")}}
 
 
 def described(value: Any) -> Any:
-    """What a filter, a model, or any value of numbers, names and functions consists of, as JSON:
-    equal for equal ones, in every process.
+    """Describe a filter, a model, or any value of numbers, names and functions as JSON.
 
-    Of large arrays and of functions that are not of this package there is a digest.
+    Descriptions of equal values are equal, in every process. Of large arrays and of functions that
+    are not of this package there is a digest.
     """
     if isinstance(value, str | bool | int | float | None):
         return value
@@ -59,8 +59,7 @@ def described(value: Any) -> Any:
 
 
 def difference(then: Any, now: Any) -> str | None:
-    """The first part in which two manifests differ, with what it was and what it is; None where
-    they are the same."""
+    """The first part in which two manifests differ, then and now; None where they are the same."""
     return next(_differences("", then, now), None)
 
 
@@ -92,7 +91,7 @@ def _function(function: FunctionType) -> Any:
     function = inspect.unwrap(function)
     name = _name(function)
     if name.startswith("jaxslam.") and not function.__closure__:
-        return name  # the version tells what it does
+        return name  # the version says what it does
     closed = [described(cell.cell_contents) for cell in function.__closure__ or ()]
     return {"name": name, "code": _digest(function.__code__), "closed": closed}
 

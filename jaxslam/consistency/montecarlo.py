@@ -36,9 +36,9 @@ from jaxslam.simulation import RecordedMotion, Room, Run, Scenario, as_scenario
 
 DTYPES = ("float64", "float32")
 CHUNK = 100
-"""Runs that are drawn, handed out and kept together."""
+"""The runs that are drawn, handed out and kept together."""
 MOST_RUNS = 10**8
-"""Of a study."""
+"""The most runs of a study."""
 Result = TypeVar("Result")
 
 
@@ -66,7 +66,7 @@ def monte_carlo(
 
     `progress(filter name, finished runs)` is called after every chunk, and with no runs before
     the first, when the filter is to be compiled. Chunks that `store` already has are not run again;
-    it is told what decides them, and refuses what differs.
+    it is given what decides them, and refuses what differs.
 
     With a `cluster`, the address of a Dask scheduler or a `distributed.Client`, the chunks are
     computed there and kept here; their seconds are of all together, compilation among them.
@@ -103,7 +103,7 @@ def monte_carlo(
 
 
 def divided(runs: int, chunk: int) -> tuple[range, ...]:
-    """So many runs in chunks."""
+    """Divide so many runs into chunks."""
     return tuple(range(i, min(i + chunk, runs)) for i in range(0, runs, chunk))
 
 
@@ -122,7 +122,7 @@ def draw(
 
 
 class ChunkTask(NamedTuple):
-    """Computes a chunk of a filter's records, here or on another machine."""
+    """A task that computes a chunk of a filter's records, here or on another machine."""
 
     name: str
     slam: AbstractFilter
@@ -143,7 +143,7 @@ class ChunkTask(NamedTuple):
         return as_sums(records, batch.poses.tangent_dim)
 
     def program(self, batch: Run) -> BatchProgram:
-        """Compiled, by the first thread that asks."""
+        """Return the program, compiled by the first thread that asks."""
         assert self.room is not None, "a chunk is computed after the room for it is known"
         slam = cast(self.slam, self.simulator.dtype)
         return BACKENDS[self.backend](slam, self.room, self.simulator.sensor, batch)
@@ -172,10 +172,10 @@ def _run_filter(
 def in_threads(
     function: Callable[[range], Result], chunks: list[range]
 ) -> Iterator[tuple[range, Result]]:
-    """Chunks, as they are finished, with what the function makes of them.
+    """Yield chunks, as they are finished, with the function's results.
 
-    On a CPU one in each processor: a program's matrices are too small to be divided. What has not
-    begun is dropped on an error.
+    On a CPU one runs in each processor: a program's matrices are too small to be divided. What has
+    not started is dropped on an error.
     """
     alone = jax.default_backend() != "cpu" or len(chunks) == 1
     with ThreadPoolExecutor(1 if alone else processors()) as pool:
@@ -188,15 +188,17 @@ def in_threads(
 
 
 def processors() -> int:
-    """How many this process may use."""
+    """The number of processors that this process may use."""
     if hasattr(os, "sched_getaffinity"):  # not everywhere
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def forget() -> None:
-    """Free the programs of all studies, each of which holds some of the memory maps of which a
-    process may have only so many."""
+    """Free the programs of all studies.
+
+    Each holds some of the memory maps of which a process may have only so many.
+    """
     backends.forget()
     forget_draws()
 

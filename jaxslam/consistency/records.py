@@ -1,4 +1,4 @@
-"""Every step of every run as a row of one Parquet file, for tools that read tables.
+"""A Parquet file with every step of every run as a row, for tools that read tables.
 
     filter, run, step, time, nees, beyond_scale, …, error_x, …, variance_x, …
 
@@ -25,15 +25,15 @@ AXES = {
     "planar": ("x", "z", "rotation"),
     "spatial": ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z"),
 }
-"""Of `error` and `variance`: of the camera's position in its axes, m, and orientation, rad."""
+"""The axes of `error` and `variance`: the camera's position in its axes, m; orientation, rad."""
 
 
 def write_records(study: Study, path: str | Path) -> None:
-    """Write what `filter_run` tells of every step of every run, a row each: the filter's name, the
-    run, the step (from 1), its time in s, and one column for every number.
+    """Write the records of `filter_run`, one row for every step of every run.
 
-    Raises ValueError for a name that does not end in .parquet, without the parquet extra, and for
-    a reduced study, which has no such records.
+    The columns are the filter's name, the run, the step (from 1), its time in s, and one for every
+    number. Raises ValueError for a name that does not end in .parquet, without the parquet extra,
+    and for a reduced study, which has no such records.
     """
     path = check_records(path)
     if study.reduced:
@@ -56,7 +56,7 @@ def write_records(study: Study, path: str | Path) -> None:
 
 
 def check_records(path: str | Path) -> Path:
-    """The path, if it can be written. Raises ValueError."""
+    """Return the path, if it can be written. Raises ValueError."""
     path = Path(path)
     if path.suffix != ".parquet":
         raise ValueError(f"records are written as Parquet, FILE.parquet, not as {path.name}")

@@ -32,20 +32,20 @@ Output = TypeVar("Output")
 
 
 class SimulatedFrame(NamedTuple):
-    """What a filter is given of a frame after frame 0, and the truth; or of all those of a run."""
+    """The data that a filter is given of a frame after frame 0, and the truth; or of all frames."""
 
     control: PyTree
     """The motion model's: seconds, the odometry's reading, …"""
     seen: Features
-    """Of landmarks in the map."""
+    """The features of landmarks in the map."""
     new: Features
-    """Of landmarks to insert."""
+    """The features of landmarks to insert."""
     gone: Bool[Array, "*frames slots"] | None
     """Slots whose landmark will not be seen again; None where landmarks keep theirs."""
     pose: Pose
-    """T_BC, true."""
+    """The true T_BC."""
     points: Float[Array, "*frames slots n"]
-    """In B, true: what the slots stand for now."""
+    """The true points in B that the slots stand for now."""
 
 
 def run_through(
@@ -104,8 +104,10 @@ def filter_run(
 def scale_records(
     slam: AbstractFilter, state: PyTree, T_BC: Pose, truth_sigma: np.ndarray | None = None
 ) -> dict[str, Array]:
-    """Return the records of one pose's scale: in metres, and `SCALE` in the filter's own unit; of a
-    truth that is itself known with σ only, see `beyond_scale`."""
+    """Return the records of one pose's scale: in metres, and `SCALE` in the filter's own unit.
+
+    For a truth that is itself known with σ only see `beyond_scale`.
+    """
     metric = in_unit = beyond_scale(partial(slam.pose_error, state), T_BC, truth_sigma)
     inner = slam.unwrapped
     if isinstance(inner, EkfSlam) and not isinstance(inner.scale, Metre):
@@ -122,7 +124,7 @@ def scale_records(
 
 
 def _camera_error(estimate: Pose, truth: Pose) -> Array:
-    """Position error in the estimated camera's axes, then `Log(R_est⁻¹ R_true)`."""
+    """The position error in the estimated camera's axes, then `Log(R_est⁻¹ R_true)`."""
     rotation = estimate.rotation().inverse()
     return jnp.concatenate(
         [
@@ -135,7 +137,7 @@ def _camera_error(estimate: Pose, truth: Pose) -> Array:
 def _landmark_records(
     slam: AbstractFilter, sensor: AbstractSensor, state: PyTree, frame: SimulatedFrame
 ) -> dict[str, Array]:
-    """Of the landmarks seen that are in the map: the mean of what is finite, and both numbers."""
+    """The mean of the finite NEES of the landmarks seen that are in the map, and both counts."""
     seen = frame.seen
     counted = seen.valid & slam.in_map(state)[seen.slots]
     truth = jax.vmap(frame.pose.inverse().apply)(frame.points[seen.slots])

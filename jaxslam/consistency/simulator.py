@@ -1,4 +1,4 @@
-"""Simulated runs, chunk by chunk: run i is the same in any chunk, batch and number of runs."""
+"""The simulated runs, chunk by chunk: run i is the same in any chunk, batch and number of runs."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from jaxslam.simulation import (
 )
 
 MapChunks = Callable[[Callable[[range], Any], list[range]], Iterator[tuple[range, Any]]]
-"""Applies a function to chunks, and yields each with the result, as they are finished."""
+"""A function that applies another to chunks, and yields each with its result when finished."""
 
 
 class Simulator:
-    """Draws chunks of runs, all of one shape, so that everything compiles once.
+    """A source of chunks of runs, all of one shape, so that everything compiles once.
 
     Run i draws from `fold_in(key(seed), i)`. Raises ValueError for a scenario without a motion.
     """
@@ -58,8 +58,7 @@ class Simulator:
 
     @property
     def made_by(self) -> Manifest:
-        """What decides which runs are drawn, in which layout their records are kept, and by which
-        versions they are made."""
+        """The manifest of the runs that are drawn, the layout of records, and the versions."""
         scenario, seed, dtype, _, motion, sensor = self._given
         return {
             "layout": LAYOUT,
@@ -72,7 +71,7 @@ class Simulator:
         }
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """For another machine, which has no file of a trajectory, and makes its own key."""
+        """Pickle for another machine, which has no file of a trajectory, and makes its own key."""
         return Simulator, self._given
 
     def __call__(self, chunk: range) -> tuple[Run, Sightings]:
@@ -86,8 +85,10 @@ class Simulator:
             return jax.tree.map(np.max, jax.device_get(self(chunk)[1]))
 
     def room(self, chunks: tuple[range, ...], map_chunks: MapChunks) -> Room:
-        """Return the room that holds every run of the study; no frame has more features than a run
-        has slots."""
+        """Return the room that holds every run of the study.
+
+        No frame has more features than a run has slots.
+        """
         seen = [most for _, most in map_chunks(self.max_sightings, list(chunks))]
         most = jax.tree.map(lambda *counts: _rounded_up(int(max(counts))), *seen)
         slots = self(chunks[0])[0].visible.shape[-1]
@@ -95,7 +96,7 @@ class Simulator:
 
 
 def _rounded_up(count: int) -> int:
-    """At least one, and above four a multiple of four: other seeds then need no other program."""
+    """Round up to one at least, above four to a multiple of four: seeds then share a program."""
     return max(1, count) if count <= 4 else 4 * math.ceil(count / 4)
 
 

@@ -1,4 +1,4 @@
-"""Where the records of simulated runs are kept: in memory, or in a folder to resume from."""
+"""The stores of the records of simulated runs: in memory, or in a folder to resume from."""
 
 from __future__ import annotations
 
@@ -15,16 +15,18 @@ from jaxslam.consistency.manifest import Manifest, difference
 
 Records = dict[str, np.ndarray]
 SUM = "sum_"
-"""Before the names of sums over the runs of a chunk."""
+"""The prefix of the names of sums over the runs of a chunk."""
 
 
 @runtime_checkable
 class Store(Protocol):
-    """Records by filter and chunk; a chunk is the range of its runs."""
+    """A store of records by filter and chunk; a chunk is the range of its runs."""
 
     def begin(self, made_by: Manifest, filters: Manifest) -> None:
-        """Say what decides the records that follow, and what each filter is. Raises ValueError
-        where others are kept."""
+        """Say what decides the records that follow, and what each filter is.
+
+        Raises ValueError where others are kept.
+        """
         ...
 
     def has(self, filter_name: str, chunk: range) -> bool: ...
@@ -35,8 +37,11 @@ class Store(Protocol):
 
 
 class MemoryStore:
-    """Keeps everything, for small studies: `begin` one, `save` a chunk, does it `has` one, `load`
-    it. Raises ValueError for a study other than the one whose records it keeps."""
+    """A store in memory, for small studies.
+
+    `begin` a study, `save` a chunk, ask whether it `has` one, `load` it. Raises ValueError for a
+    study other than the one whose records it keeps.
+    """
 
     def __init__(self) -> None:
         self._records: dict[tuple[str, range], Records] = {}
@@ -62,12 +67,13 @@ class MemoryStore:
 
 
 class FolderStore:
-    """One file a chunk, written whole or not at all, beside a manifest of what made them: `begin` a
-    study, `save` a chunk, does it `has` one, `load` it, which raises ValueError for a damaged file.
+    """A folder of one file a chunk, written whole or not at all, beside a manifest of their origin.
 
-    A study says itself what decides its results; `manifest` is whatever else does. A folder that
-    was made otherwise is refused when `resume` is set, and emptied of the chunks of its manifest
-    if not. Other files are left alone: one in the place of a chunk, or of the manifest, is refused.
+    `begin` a study, `save` a chunk, ask whether it `has` one, `load` it, which raises ValueError
+    for a damaged file. A study says itself what decides its results; `manifest` is whatever else
+    does. A folder that was made otherwise is refused when `resume` is set, and emptied of the
+    chunks of its manifest if not. Other files are left alone: one in the place of a chunk, or of
+    the manifest, is refused.
     """
 
     def __init__(
@@ -125,18 +131,18 @@ class FolderStore:
         _check_same(self._made, found[key], wanted, _ANOTHER_FOLDER)
 
     def _check_free(self, filter_name: str) -> None:
-        """Raise ValueError for files in the places of a filter's chunks, which nobody named."""
+        """Raise ValueError for files in the places of a filter's chunks that no manifest names."""
         for path in _chunks(self.folder / _folder_of(filter_name)):
             raise ValueError(f"{path} is of no study that is kept here; use another folder")
 
     def _keep(self, manifest: Manifest) -> None:
-        """Named before it is written: what a manifest does not name is not its study's."""
+        """Keep a manifest before the chunks it names: what it does not name is not its study's."""
         if manifest != self._manifest:
             write_json(self._path, manifest)
             self._manifest = manifest
 
     def _own(self, manifest: Manifest, *, unfinished: bool) -> list[Path]:
-        """The files of a manifest's chunks, or only those that a process began that was killed."""
+        """The files of a manifest's chunks, or only those that a killed process left unfinished."""
         folders = [self.folder / _folder_of(name) for name in manifest["filters"]]
         begun = [path for folder in folders for path in _chunks(folder, _UNFINISHED)]
         return begun if unfinished else [*begun, *(p for x in folders for p in _chunks(x))]
@@ -157,8 +163,10 @@ def _chunks(folder: Path, named: re.Pattern[str] = _CHUNK) -> list[Path]:
 
 
 def _folder_of(filter_name: str) -> str:
-    """A folder's name for each filter's, two never the same, even where upper case is lower: "/" is
-    "-", and what is not a-z, 0-9, _ or + is its bytes in UTF-8, as in a URL."""
+    """A folder's name for each filter's, never the same for two, even where case is ignored.
+
+    "/" is "-", and what is not a-z, 0-9, _ or + is its bytes in UTF-8, as in a URL.
+    """
 
     def escaped(match: re.Match[str]) -> str:
         return "".join(f"%{byte:02X}" for byte in match[0].encode())

@@ -1,4 +1,4 @@
-"""What a study says: per step and per filter, the numbers of `consistency.json` and its table."""
+"""The summary of a study: per step and filter, the numbers of `consistency.json` and its table."""
 
 from __future__ import annotations
 
@@ -32,42 +32,42 @@ Summary = dict[str, Any]
 """The content of `consistency.json`, or what it says of one filter."""
 SCHEMA = 1
 _VALUES_AT_ONCE = 10**7
-"""Of each record of which medians hold all runs in memory: of as many steps as this makes."""
+"""The most values of a record in memory for medians: all runs, and as many steps as fit."""
 _OF_MEDIANS = ("nees", "log_scale", "log_scale_sigma", *SCALE)
 
 
 @dataclass(frozen=True)
 class Seconds:
-    """Wall time of one filter over all its runs, in seconds."""
+    """The wall time of one filter over all its runs, in seconds."""
 
     compile: float
-    """Until its program was there."""
+    """Seconds until its program was there."""
     run: float
-    """From then on."""
+    """Seconds from then on."""
 
 
 @dataclass(frozen=True, repr=False)
 class Study:
-    """Finished runs: where their records are, and what is needed to read them."""
+    """The finished runs of a study: the store of their records, and what is needed to read them."""
 
     scenario: Scenario
     """The world that was simulated."""
     filters: Mapping[str, AbstractFilter]
-    """By the names under which their records are kept."""
+    """The filters by the names under which their records are kept."""
     runs: int
-    """Of every filter, on the same worlds."""
+    """The number of runs of every filter, on the same worlds."""
     seed: int
-    """Of all draws."""
+    """The seed of all draws."""
     dtype: str
     """`float64` or `float32`."""
     chunks: tuple[range, ...]
-    """Runs that were computed, and are kept, together."""
+    """The runs that were computed, and are kept, together."""
     store: Store
-    """Where the records are."""
+    """The store that has the records."""
     seconds: Mapping[str, Seconds]
-    """What each filter took."""
+    """The time that each filter took."""
     device: str
-    """On which it was computed."""
+    """The device on which it was computed."""
     reduced: bool = False
     """Whether of all chunks but the first only sums are kept."""
 
@@ -77,17 +77,17 @@ class Study:
         return tuple(chunk for chunk in self.chunks if keeps_records(chunk, self.reduced))
 
     def loaded(self, name: str) -> Iterator[Records]:
-        """Of every chunk, what a summary reads of what is kept of a filter."""
+        """Yield of every chunk the records of a filter that a summary reads."""
         for chunk in self.chunks:
             whole = keeps_records(chunk, self.reduced)
             yield self.store.load(name, chunk, RECORDS if whole else None)
 
     def __repr__(self) -> str:
-        """Its table, so that a study prints as what it found."""
+        """Return its table, so that a study prints as its result."""
         return table(summarise(self))
 
     def to_pandas(self) -> Any:
-        """A `pandas.DataFrame` of what every step of every filter says, one row each.
+        """Return a `pandas.DataFrame` with a row for every step of every filter.
 
         Raises ValueError where pandas is not installed.
         """
@@ -125,7 +125,7 @@ def summarise(study: Study) -> Summary:
     `scale_drift` is how far the scale of a pose is from that of its run, with the σ claimed of it;
     `log_scale` the error of the scale in metres, the σ claimed (root mean squares and medians)
     and the error in σ; `reversed` the share of the displaced runs whose estimate points away from
-    the truth. Where the sensor measures metres, or the motion is told in metres, they say little.
+    the truth. Where the sensor measures metres, or the motion is given in metres, they say little.
 
     `outside3sigma` is the share of errors beyond three of the claimed σ, axis by axis and then the
     mean of the axes: 0.27 % of Gaussian errors.
@@ -214,7 +214,7 @@ def _summarise_filter(study: Study, name: str) -> Summary:
 
 
 def _by_step(found: Summary) -> dict[str, list[float | None]]:
-    """Columns of a filter's numbers that have one value a step."""
+    """The columns of a filter's numbers that have one value a step."""
     alone = ("nees", "nees_median", "nees_not_lost", "lost", "lost_ever", "nis", "nis_dof")
     parts = {
         f"{kind}_{k}": v
@@ -225,7 +225,7 @@ def _by_step(found: Summary) -> dict[str, list[float | None]]:
 
 
 def _drift(sums: Sums, dof: int) -> Summary:
-    """Root mean squares over the surviving runs whose unit is fixed; no verdict where none is."""
+    """The root mean squares over the surviving runs whose unit is fixed; no verdict without any."""
     count = sums["drift_count"]
     of_drift = tally_of(sums, "drift", dof)
 
@@ -242,7 +242,7 @@ def _drift(sums: Sums, dof: int) -> Summary:
 
 
 def _log_scale(sums: Sums, medians: _Medians, healthy: int) -> Summary:
-    """Root mean squares over the surviving runs; medians over all."""
+    """The root mean squares over the surviving runs; medians over all."""
 
     def rms(of: str) -> list[float | None]:
         return json_numbers(np.sqrt(_ratio(sums[of], healthy)))
@@ -257,30 +257,33 @@ def _log_scale(sums: Sums, medians: _Medians, healthy: int) -> Summary:
 
 
 def _ratio(sums: np.ndarray, counts: np.ndarray | int) -> np.ndarray:
-    """NaN where nothing was counted."""
+    """Divide sums by counts, NaN where nothing was counted."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return sums / counts
 
 
 def treatment(slam: AbstractFilter) -> str | None:
-    """How a filter treats its sensor's calibration, where it says so."""
+    """The treatment of the sensor's calibration by a filter, where it says so."""
     inner = slam.unwrapped
     return inner.calibration.name if isinstance(inner, EkfSlam) else None
 
 
 def tally(study: Study, name: str, record: str = "nees") -> Tally:
-    """What the verdict on one filter is made of, on the NEES of its poses, on what of it is
-    `beyond_scale` or on the `drift` of the scale; tallies of other seeds may be added."""
+    """The tally for the verdict on one filter; tallies of other seeds may be added.
+
+    It is of the `nees` of its poses, of the part that is `beyond_scale`, or of the `drift` of the
+    scale.
+    """
     return tally_of(_sums(study, name), record, study.scenario.world.tangent_dim)
 
 
 def _sums(study: Study, name: str) -> Sums:
-    """Of all chunks."""
+    """The sums of all chunks."""
     return _sums_and_lost(study, name)[0]
 
 
 def _sums_and_lost(study: Study, name: str) -> tuple[Sums, list[int] | None]:
-    """Of all chunks; and the numbers of lost runs, None where not all records are kept."""
+    """The sums of all chunks, and the numbers of lost runs, None where not all records are kept."""
     dof, lost = study.scenario.world.tangent_dim, []
 
     def each() -> Iterator[Sums]:
@@ -293,17 +296,17 @@ def _sums_and_lost(study: Study, name: str) -> tuple[Sums, list[int] | None]:
 
 
 class _Medians(NamedTuple):
-    """Of every step, over all runs whose records are kept, diverged ones above everything."""
+    """The medians of every step, over all runs whose records are kept, diverged ones infinite."""
 
     nees: np.ndarray
     at_one_scale: np.ndarray
     log_scale: np.ndarray
-    """Of its error's size."""
+    """The median of its error's size."""
     log_scale_sigma: np.ndarray
 
 
 def _medians(study: Study, name: str) -> _Medians:
-    """Every chunk is read once for as many steps as are held in memory."""
+    """Compute the medians, reading every chunk once for as many steps as are held in memory."""
     medians, at_once = [], max(1, _VALUES_AT_ONCE // study.runs)
     for start in range(0, study.scenario.steps, at_once):
         part, columns = slice(start, start + at_once), []
@@ -322,7 +325,7 @@ def _medians(study: Study, name: str) -> _Medians:
 def table(summary: Summary | Study) -> str:
     """The verdict on every filter, then the numbers of the last step, one filter a line.
 
-    Of a `summary`, or of a study, which is summarised here.
+    It is that of a `summary`, or of a study, which is summarised here.
     """
     summary = as_summary(summary)
     filters = summary["filters"]
@@ -362,7 +365,7 @@ def _row(name: str, f: Summary) -> str:
 
 
 def _scale_table(filters: Summary, wide: int) -> Iterator[str]:
-    """What of the poses' errors is not one of scale, and the scale's, at the last step."""
+    """The table of errors that are not of scale, and of those of the scale, at the last step."""
     yield ""
     yield (
         f"{'at one scale a run':<{wide}}{'NEES mean':>10}{'95 % band':>14}{'median':>8}{'lost':>7}"
@@ -390,7 +393,7 @@ def _scale_table(filters: Summary, wide: int) -> Iterator[str]:
 
 
 def _notes(filters: Summary) -> Iterator[str]:
-    """What the means of the table leave out."""
+    """Remarks on what the means of the table leave out."""
     for name, f in filters.items():
         if f["diverged"]:
             yield f"{name}: means and band are of the {f['survivors']} runs that did not diverge"

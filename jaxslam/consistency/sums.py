@@ -1,4 +1,4 @@
-"""What a chunk of runs adds to a summary: sums over its runs, which add up over chunks.
+"""The sums over a chunk of runs that a summary needs, which add up over chunks.
 
 A study may keep them in place of the records (`monte_carlo(..., reduced=True)`): its memory, its
 files and what travels from a cluster then do not grow with the runs of a chunk.
@@ -22,7 +22,7 @@ RECORDS = (
     "nees", "log_scale", "log_scale_sigma", *SCALE, "reversed", "nis", "nis_dof", "status",
     "error", "variance", "landmark_nees", "landmark_count", "landmark_not_finite",
 )  # fmt: skip
-"""What a summary reads of the records of a run."""
+"""The records of a run that a summary reads."""
 
 Sums = dict[str, Any]
 
@@ -33,22 +33,22 @@ def keeps_records(chunk: range, reduced: bool) -> bool:
 
 
 def as_sums(records: Records, dof: int) -> Records:
-    """A chunk's records as what a store keeps instead of them: sums, by their names after `sum_`.
+    """Return the sums that a store keeps in place of a chunk's records, their names after `sum_`.
 
-    `dof` is that of a pose. Of the runs that did not diverge, but for `diverged`, the numbers of
-    updates by status, and the tallies of the verdicts.
+    `dof` is that of a pose. Sums are of the runs that did not diverge, but for `diverged`, the
+    numbers of updates by status, and the tallies of the verdicts.
     """
     return {f"{SUM}{name}": np.asarray(value) for name, value in _sums(records, dof).items()}
 
 
 def sums_of(kept: Records, dof: int) -> Sums:
-    """Of a chunk, whichever of both a store has kept."""
+    """The sums of a chunk, of which a store has kept either sums or records."""
     own = {name.removeprefix(SUM): x for name, x in kept.items() if name.startswith(SUM)}
     return own or _sums(kept, dof)
 
 
 def added(each: Iterable[Sums]) -> Sums:
-    """Of all chunks. Raises ValueError for chunks that hold other sums than the first."""
+    """Add the sums of all chunks. Raises ValueError for chunks with other sums than the first."""
     total: Sums = {}
     for part in each:
         if total and total.keys() != part.keys():
@@ -58,14 +58,17 @@ def added(each: Iterable[Sums]) -> Sums:
 
 
 def tally_of(sums: Sums, record: str, dof: int) -> Tally:
-    """What a verdict is made of: on `nees`, on what of it is `beyond_scale`, at one scale a run, or
-    on the `drift` of that scale. `dof` is that of a pose."""
+    """The tally for a verdict; `dof` is that of a pose.
+
+    It is of `nees`, of the part that is `beyond_scale`, at one scale a run, or of the `drift` of
+    that scale.
+    """
     own, fitted = {"nees": (dof, 0.0), "beyond_scale": (dof, 1.0), "drift": (1, 1.0)}[record]
     return Tally.of_numbers(sums[f"tally_{record}"], own, fitted)
 
 
 def survived(records: Records) -> Bool[np.ndarray, " runs"]:
-    """Which runs did not diverge."""
+    """A mask of the runs that did not diverge."""
     return np.asarray(np.isfinite(records["nees"]).all(axis=1))
 
 
@@ -105,14 +108,14 @@ def _sums(records: Records, dof: int) -> Sums:
 
 
 def _of_drift(normalised: Float[np.ndarray, "runs steps"]) -> Tally:
-    """Of the runs whose unit was ever fixed, from then on."""
+    """The tally of drift of the runs whose unit was ever fixed, from then on."""
     told = np.isfinite(normalised)
     ever = told.any(axis=1)
     return Tally.of(normalised[ever], 1, 1.0, told[ever])
 
 
 def _of_scale(good: Records, one: OneScale, threshold: float) -> Sums:
-    """Of NEES at one scale a run and its drift, of the metre, and of the displacement's sign."""
+    """The sums of NEES at one scale a run and its drift, of the metric scale, and of reversals."""
     error, sigma, own = good["log_scale"], good["log_scale_sigma"], good["unit_log_scale_sigma"]
     drifts = np.isfinite(one.drift)
     with np.errstate(over="ignore"):  # no σ of a scale that nothing depends on

@@ -1,6 +1,6 @@
-"""Trajectories of different worlds, and what becomes of a covariance when one is laid on the other.
+"""The alignment of trajectories of different worlds, and of their covariances.
 
-A trajectory that nothing ties to the world is known up to a rigid motion, and of pictures alone up
+A trajectory that nothing ties to the world is known up to a rigid motion, and from images alone up
 to a similarity: a gauge. A covariance is of errors in one gauge, and aligning the trajectory to
 the truth is a change of gauge (Zhang, Gallego, Scaramuzza, RA-L 2018): to first order the errors e
 of all poses become `e − U (Vᵀ U)⁻¹ Vᵀ e`, the oblique projection along the gauge's directions U
@@ -20,28 +20,28 @@ from jaxslam.evaluation.inputs import Poses, exactly_known
 
 ALIGNMENTS = ("none", "se3", "sim3")
 MAX_TIME_DIFFERENCE = 0.01
-"""Poses further apart in time than this (s) are not compared; evo's default."""
+"""The largest time difference of poses that are compared, s; evo's default."""
 _SPLIT = Convention("split", "world")
 """The error in which gauge directions are written."""
 _CLEAR = 10
-"""A rotation about a line is told by positions that are so many σ off it, root of the mean squares:
+"""A rotation about a line is fixed by positions so many σ off it, root of the mean squares:
 of four it has 6 % more σ than to first order, of ten 1 %."""
 
 
 class Similarity(NamedTuple):
-    """`x → s R x + t`, of world frames: a Sim(n)."""
+    """A similarity `x → s R x + t` of world frames: an element of Sim(n)."""
 
     rotation: Float[np.ndarray, "n n"]
     translation: Float[np.ndarray, " n"]
     scale: float
 
     def inverse(self) -> Similarity:
-        """`x → R' (x − t)/s`."""
+        """Return `x → R' (x − t)/s`."""
         back = self.rotation.T
         return Similarity(back, -back @ self.translation / self.scale, 1 / self.scale)
 
     def moved(self, T_wc: Float[np.ndarray, "*batch d d"]) -> Float[np.ndarray, "*batch d d"]:
-        """The poses in the other world."""
+        """Return the poses in the other world."""
         n, result = T_wc.shape[-1] - 1, T_wc.copy()
         result[..., :n, :n] = self.rotation @ T_wc[..., :n, :n]
         result[..., :n, n] = self.scale * T_wc[..., :n, n] @ self.rotation.T + self.translation
@@ -50,7 +50,7 @@ class Similarity(NamedTuple):
     def derivative(
         self, T_wc: Float[np.ndarray, "k d d"], convention: Convention
     ) -> Float[np.ndarray, "k t t"]:
-        """J of `ξ there = J ξ here`, errors of the poses in the convention."""
+        """Return J of `ξ there = J ξ here`, errors of the poses in the convention."""
         here, n = change(T_wc, convention, _SPLIT), len(self.translation)
         J = np.eye(here.shape[-1])
         J[:n, :n] = self.scale * self.rotation
@@ -62,9 +62,9 @@ class Similarity(NamedTuple):
 def associated(
     first: Float[np.ndarray, " n"], second: Float[np.ndarray, " m"]
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Places of the times that belong together, as evo pairs them.
+    """The indices of the times that belong together, as evo pairs them.
 
-    To each of the shorter the nearest of the longer, within `MAX_TIME_DIFFERENCE`.
+    Each of the shorter has the nearest of the longer, within `MAX_TIME_DIFFERENCE`.
     """
     if len(first) < len(second):
         return associated(second, first)[::-1]
@@ -102,9 +102,9 @@ def similarity(
 def straight_line(
     positions: Float[np.ndarray, "k n"], sigma: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, " n"] | None:
-    """The direction of the line that positions with these σ cannot be told from, None of others.
+    """The direction of a line that fits positions with these σ; None where none does.
 
-    A fit of positions has then no hold on the rotation about it, and would fit that to noise.
+    A fit of positions then does not determine the rotation about it, and would fit that to noise.
     """
     _, singular, right = np.linalg.svd(positions - positions.mean(0))
     if len(right) == 2 or singular[1] > _CLEAR * np.linalg.norm(sigma):
@@ -118,10 +118,10 @@ def turned_about(
     estimates: Float[np.ndarray, "k 4 4"],
     reference: Float[np.ndarray, "k 4 4"],
 ) -> Similarity:
-    """A fit whose rotation about a line of the estimate is that of all orientations, not of the
-    positions: Exp(φ line) makes `Σ tr R_refᵀ R_fit Exp(φ line) R_est` the greatest.
+    """A fit whose rotation about a line is that of all orientations, not of the positions.
 
-    To first order `Σ lineᵀ δθ = 0`, of rotations along the axes of the estimate's world.
+    Exp(φ line) makes `Σ tr R_refᵀ R_fit Exp(φ line) R_est` the greatest. To first order
+    `Σ lineᵀ δθ = 0`, of rotations along the axes of the estimate's world.
     """
     M = np.einsum("kij,klj->il", estimates[:, :3, :3], reference[:, :3, :3]) @ fit.rotation
     K = -lever(line)
@@ -149,12 +149,11 @@ def projected(
     scaled: bool,
     line: Float[np.ndarray, " 3"] | None = None,
 ) -> Float[np.ndarray, "k t t"]:
-    """Covariances of aligned poses in the gauge of `similarity`, which is `Σ U_posᵀ e_pos = 0`, and
-    about a `line` that of `turned_about`.
+    """The covariances of aligned poses in the gauge of `similarity`, `Σ U_posᵀ e_pos = 0`.
 
-    `covariances` are those of every pose, whose errors are then taken as independent of each
-    other's, or the joint one of all. With W = (VᵀU)⁻¹ the k-th block of `Q P Qᵀ` is
-    `P_kk − U_k W (VᵀP)_k − (…)ᵀ + U_k W VᵀPV Wᵀ U_kᵀ`.
+    About a `line` it is that of `turned_about`. `covariances` are those of every pose, whose errors
+    are then taken as independent of each other's, or the joint one of all. With W = (VᵀU)⁻¹ the
+    k-th block of `Q P Qᵀ` is `P_kk − U_k W (VᵀP)_k − (…)ᵀ + U_k W VᵀPV Wᵀ U_kᵀ`.
     """
     U = gauge_directions(T_wc, scaled=scaled)
     V = _fitted(U, line)
@@ -168,7 +167,7 @@ def projected(
 def _fitted(
     U: Float[np.ndarray, "k t g"], line: Float[np.ndarray, " 3"] | None
 ) -> Float[np.ndarray, "k t g"]:
-    """V of the errors that a fit leaves as they are, `Σ Vᵀ e = 0`."""
+    """Return V of the errors that a fit leaves as they are, `Σ Vᵀ e = 0`."""
     n, V = 2 if U.shape[1] == 3 else 3, U.copy()
     V[:, n:] = 0
     if line is not None:
@@ -181,7 +180,7 @@ def _fitted(
 def _in_split(
     T_wc: np.ndarray, covariances: np.ndarray, convention: Convention, V: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """P of every pose, (VᵀP) at every pose, and VᵀPV."""
+    """Return P of every pose, (VᵀP) at every pose, and VᵀPV."""
     count, t = V.shape[:2]
     if covariances.ndim == 3:
         P = converted(covariances, T_wc, convention, _SPLIT)
@@ -197,8 +196,10 @@ def _in_split(
 def gauge_directions(
     T_wc: Float[np.ndarray, "k d d"], *, scaled: bool
 ) -> Float[np.ndarray, "k t g"]:
-    """Errors (split, world) of the poses by a translation, a rotation about the origin and, where
-    wanted, the log of a scale: what no measurement within the trajectory tells."""
+    """The errors (split, world) of the poses by a change of gauge, which no measurement determines.
+
+    They are a translation, a rotation about the origin and, if wanted, the log of a scale.
+    """
     n, t = T_wc.shape[-1] - 1, geometry_of(T_wc).tangent_dim
     positions = T_wc[:, :n, n]
     U = np.zeros((len(T_wc), t, t + scaled))
@@ -236,8 +237,11 @@ def aligned(
     align: str,
     axes: Int[np.ndarray, " m"] | Bool[np.ndarray, " t"],
 ) -> Aligned:
-    """The estimates aligned by `none`, `se3` or `sim3`; the first pose is known where it has no
-    variance on these `axes` of the covariances. Raises ValueError for what does not go together."""
+    """The estimates aligned by `none`, `se3` or `sim3`.
+
+    The first pose is known where it has no variance on these `axes` of the covariances. Raises
+    ValueError for what does not go together.
+    """
     given = convention.scale == "given"
     if align == "none":
         return Aligned(poses, given)
@@ -261,7 +265,7 @@ def aligned(
 
 
 def _runs(poses: Poses) -> Iterator[Poses]:
-    """Every run by itself, of the poses that were logged."""
+    """Yield every run by itself, of the poses that were logged."""
     for run, logged in enumerate(poses.logged):
         joint = None
         if poses.joint is not None:
@@ -286,13 +290,13 @@ def _each_run(
 
 
 def _by_first(run: Poses, convention: Convention) -> Poses:
-    """The first pose on its truth, and that position the origin, about which scales are."""
+    """Align the first pose to its truth; its position becomes the origin, also of scaling."""
     moved = _moved(run, convention, at_first_pose(run.estimates[0], run.truths[0]))
     return about(moved, convention, run.truths[0, :-1, -1])
 
 
 def about(run: Poses, convention: Convention, centre: Float[np.ndarray, " n"]) -> Poses:
-    """Estimates and truths of a run in the world whose origin is that point."""
+    """Return estimates and truths of a run in the world whose origin is that point."""
     away = Similarity(np.eye(len(centre)), -centre, 1.0)
     return _moved(run, convention, away)._replace(truths=away.moved(run.truths))
 
@@ -317,7 +321,7 @@ def _line(run: Poses, convention: Convention) -> Float[np.ndarray, " n"] | None:
 
 
 def _moved(run: Poses, convention: Convention, motion: Similarity) -> Poses:
-    """Estimates and covariances in another world."""
+    """Return estimates and covariances in another world."""
     J = motion.derivative(run.estimates, convention)
     P, joint = J @ run.covariances @ np.swapaxes(J, 1, 2), run.joint
     if joint is not None:

@@ -1,4 +1,4 @@
-"""Of which error of a pose a covariance is: the choices that nobody writes down.
+"""The convention of a pose covariance: the choice of error, which is seldom documented.
 
 An estimate T̂ = (R̂, p̂) maps body coordinates to the world, T = (R, p) is the truth, and
 
@@ -44,24 +44,24 @@ CHOICES = {
     "scale": ("marginal", "given"),
 }
 NATURAL_AXES = {"right": "body", "left": "world", "split": "world"}
-"""Axes of an error of which nobody says more; of `split` those of ROS."""
+"""The default axes of an error; of `split` those of ROS."""
 _OWN_AXES = {"right": ("body", "body"), "left": ("world", "world"), "split": ("world", "body")}
-"""Axes along which position and rotation of the errors come out, before they are turned."""
+"""The axes along which position and rotation of the errors come out, before they are turned."""
 _PARTS = {"body": ("body", "body"), "world": ("world", "world"), "mixed": ("world", "body")}
 
 
 @dataclass(frozen=True)
 class Convention:
-    """Of which error a covariance is. Raises ValueError, naming what is accepted."""
+    """The error that a covariance is of. Raises ValueError, naming what is accepted."""
 
     error: str = "right"
     """`right`, `left` or `split`."""
     axes: str = ""
-    """By default the error's own (`NATURAL_AXES`)."""
+    """`body`, `world` or `mixed`; by default the error's own (`NATURAL_AXES`)."""
     order: str = "position-first"
-    """Or `rotation-first`: of the rows of a covariance."""
+    """The order of the rows of a covariance: this, or `rotation-first`."""
     scale: str = "marginal"
-    """Or `given`: the covariance is that of a world whose scale is known."""
+    """`marginal`, or `given`: the covariance is that of a world whose scale is known."""
 
     def __post_init__(self) -> None:
         if not self.axes:
@@ -73,7 +73,7 @@ class Convention:
         return " ".join(f"{name}={value}" for name, value in asdict(self).items())
 
     def names(self, geometry: Geometry) -> tuple[str, ...]:
-        """Of the numbers of an error, in their order."""
+        """The names of the components of an error, in their order."""
         position, turn = ("x", "y", "z"), ("rx", "ry", "rz")
         if geometry is PLANAR:
             position, turn = ("x", "y"), ("r",)
@@ -83,8 +83,8 @@ class Convention:
 def alternatives(convention: Convention, geometry: Geometry) -> tuple[Convention, ...]:
     """All conventions that differ to first order, this one among them, of the same scale.
 
-    The stated one keeps its kind of error, as right and split are not told apart. In the plane no
-    axes turn a rotation, and mixed is world.
+    The stated one keeps its kind of error, as right and split are not distinguished. In the plane
+    no axes turn a rotation, and mixed is world.
     """
     ours = convention.error if convention.error != "left" else "right"
     turned = convention.axes if convention.axes != "body" else "world"
@@ -94,7 +94,7 @@ def alternatives(convention: Convention, geometry: Geometry) -> tuple[Convention
 
 
 def geometry_of(poses: Float[np.ndarray, "*batch d d"]) -> Geometry:
-    """That of matrices (…, 3, 3) or (…, 4, 4)."""
+    """The geometry of matrices (…, 3, 3) or (…, 4, 4)."""
     return SPATIAL if poses.shape[-1] == 4 else PLANAR
 
 
@@ -114,8 +114,11 @@ def truth_derivatives(
     truths: Float[np.ndarray, "*batch d d"],
     firsts: Float[np.ndarray, "*batch d d"],
 ) -> tuple[Float[np.ndarray, "*batch t t"], Float[np.ndarray, "*batch t t"]]:
-    """J of `ξ → ξ + J η` where the truth is T Exp(η) instead; and M, where instead the estimate is
-    laid on a pose F Exp(η) instead of F, one of `firsts`: it then is F Exp(η) F⁻¹ T̂."""
+    """Return J of `ξ → ξ + J η` where the truth is T Exp(η) instead, and M.
+
+    M is that where instead the estimate is aligned to a pose F Exp(η) instead of F, one of
+    `firsts`: it then is F Exp(η) F⁻¹ T̂.
+    """
     both = _in_float64(_truth_derivatives, convention.error, estimates, truths, firsts)
     turn = turning(convention, estimates)
     return turn @ both[0], turn @ both[1]
@@ -124,7 +127,7 @@ def truth_derivatives(
 def from_right(
     convention: Convention, estimates: Float[np.ndarray, "*batch d d"]
 ) -> Float[np.ndarray, "*batch t t"]:
-    """M of `ξ = M ξ_right` to first order: `P = M P_right Mᵀ` is the covariance's."""
+    """Return M of `ξ = M ξ_right` to first order: `P = M P_right Mᵀ` is the covariance's."""
     n = estimates.shape[-1] - 1
     R, p = estimates[..., :n, :n], estimates[..., :n, n]
     M = np.zeros((*R.shape[:-2], *(2 * [geometry_of(estimates).tangent_dim])))
@@ -141,7 +144,7 @@ def converted(
     old: Convention,
     new: Convention,
 ) -> Float[np.ndarray, "*batch t t"]:
-    """Covariances of poses, of one convention, in another."""
+    """Convert covariances of poses from one convention to another."""
     J = change(poses, old, new)
     return J @ covariances @ np.swapaxes(J, -1, -2)
 
@@ -149,14 +152,14 @@ def converted(
 def change(
     poses: Float[np.ndarray, "*batch d d"], old: Convention, new: Convention
 ) -> Float[np.ndarray, "*batch t t"]:
-    """J of `ξ_new = J ξ_old`, to first order."""
+    """Return J of `ξ_new = J ξ_old`, to first order."""
     return from_right(new, poses) @ np.linalg.inv(from_right(old, poses))
 
 
 def turning(
     convention: Convention, estimates: Float[np.ndarray, "*batch d d"]
 ) -> Float[np.ndarray, "*batch t t"]:
-    """What turns an error as it comes out to the axes and the order of the convention."""
+    """The matrix that turns an error as computed to the axes and the order of the convention."""
     n, t = estimates.shape[-1] - 1, geometry_of(estimates).tangent_dim
     R = estimates[..., :n, :n]
     N = np.zeros((*R.shape[:-2], t, t))
@@ -173,12 +176,12 @@ def _turned(R: np.ndarray, old: str, new: str) -> np.ndarray:
 
 
 def _rotation_matrix(R: np.ndarray) -> np.ndarray:
-    """What turns a rotation vector: R, or in the plane nothing."""
+    """The matrix that turns a rotation vector: R, or 1 in the plane."""
     return R if R.shape[-1] == 3 else np.ones((*R.shape[:-2], 1, 1))
 
 
 def lever(p: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n r"]:
-    """How a small turn about the origin moves points p: `ω ↦ ω × p`."""
+    """The motion of points p by a small rotation about the origin: `ω ↦ ω × p`."""
     zero = np.zeros(p.shape[:-1])
     if p.shape[-1] == 2:
         return np.stack([-p[..., 1], p[..., 0]], axis=-1)[..., None]
@@ -190,7 +193,7 @@ def lever(p: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n r"]:
 def _in_float64(
     function: Callable[..., Result], error: str, *arrays: Float[np.ndarray, "*batch _ _"]
 ) -> Result:
-    """A function of poses, over all of them, as NumPy's arrays.
+    """Apply a function of poses to all of them, as NumPy's arrays.
 
     Their number is filled up to a power of two, so that few programs serve logs of all sizes.
     """
@@ -204,7 +207,7 @@ def _in_float64(
 
 
 def _error(error: str, estimate: Pose, truth: Pose) -> Float[Array, " t"]:
-    """Of one pose, along its own axes (`_OWN_AXES`), position first."""
+    """The error of one pose, along its own axes (`_OWN_AXES`), position first."""
     if error == "left":
         return log(truth @ estimate.inverse())
     if error == "right":
@@ -246,7 +249,7 @@ _ROWS, _COLUMNS = np.triu_indices(6)
 
 
 class CovarianceText(NamedTuple):
-    """What a file says: angles in radians, lengths in the file's own unit."""
+    """The content of a file: angles in radians, lengths in the file's own unit."""
 
     times: Float[np.ndarray, " n"]
     covariances: Float[np.ndarray, "n 6 6"]
@@ -255,7 +258,7 @@ class CovarianceText(NamedTuple):
 
     @property
     def convention(self) -> Convention:
-        """What the header says, and where it says nothing the default."""
+        """The convention of the header, and the default where it is silent."""
         return Convention(**self.said)
 
 
@@ -281,7 +284,7 @@ def write_covariances(
 
 
 def read_covariances(path: str | Path) -> CovarianceText:
-    """What `write_covariances` wrote, or somebody else.
+    """Read covariances as `write_covariances`, or another program, wrote them.
 
     Raises `ValueError`, naming the file, for a line that is not 22 finite numbers, or a word of the
     header that is not known.
@@ -304,7 +307,7 @@ def _names(said: dict[str, str]) -> tuple[str, ...]:
 
 
 def _said(comments: str) -> dict[str, str]:
-    """The words `key=value` of a header. Raises ValueError for those that nobody understands."""
+    """The words `key=value` of a header. Raises ValueError for misspelt keys and unknown values."""
     said = dict(re.findall(r"\b([a-z]+)=([^\s,;()]+)", comments))
     for key in said:
         if meant := suggestion(key, _WORDS) if key not in _WORDS else "":

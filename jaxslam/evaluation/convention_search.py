@@ -1,11 +1,11 @@
-"""Which convention would make the data consistent, where exactly one does.
+"""A search for the one convention that would make the data consistent.
 
 A wrong convention keeps the determinant of a covariance, so that it raises the expected NEES, and
 the one with the least NEES is the most likely, whatever the filter's σ is wrong by. (Of a part of
-the axes the determinant may change: `NEES det(P)^(1/dof)` is compared.) It is told from another
-where the runs' averages of NEES differ by more than they scatter, pair by pair; and it *makes the
-data consistent* where nothing is proven against the NEES of all axes, nor of position or rotation
-alone.
+the axes the determinant may change: `NEES det(P)^(1/dof)` is compared.) It is distinguished from
+another where the runs' averages of NEES differ by more than they scatter, pair by pair; and it
+*makes the data consistent* where nothing is proven against the NEES of all axes, nor of position or
+rotation alone.
 
 A scale that is fitted lowers NEES whatever the convention, of a right covariance that of the
 position from n to n − 1 at the least. Only where it lowers it further, so that no σ explains it, is
@@ -28,29 +28,29 @@ from jaxslam.statistics.verdict import VERDICT_CONFIDENCE, Verdict, not_disprove
 NOTICEABLE = 0.05
 """NEES that differ by less than this share say the same of σ, to 2.5 %."""
 _PART_CONFIDENCE = 0.999
-"""Of what is said against position or rotation alone, after all axes together."""
+"""The confidence of what is said against position or rotation alone, after all axes together."""
 _TOLD = 3
-"""Conventions that cannot be told, of which a sentence speaks."""
+"""The most indistinguishable conventions that a sentence names."""
 _ALIKE = " (right and split errors are the same to first order)"
 
 
 class Tried(NamedTuple):
-    """What a convention makes of the data; NaN where nothing was logged."""
+    """The NEES of the data under a convention; NaN where nothing was logged."""
 
     nees: Float[np.ndarray, "runs steps"]
     dof: int
     fitted: float = 0.0
-    """Degrees of freedom, at most, that a fit took from every NEES."""
+    """The most degrees of freedom that a fit took from every NEES."""
     log_determinant: float = 0.0
-    """Of the covariances, on average."""
+    """The log determinant of the covariances, on average."""
     position: Float[np.ndarray, "runs steps"] | None = None
-    """NEES of the position alone, where there is one."""
+    """The NEES of the position alone, where there is one."""
     rotation: Float[np.ndarray, "runs steps"] | None = None
     turns: int = 0
-    """Axes of the rotation."""
+    """The number of axes of the rotation."""
 
     def last(self, steps: int) -> Tried:
-        """Of the last steps alone."""
+        """Return the same of the last steps alone."""
         position, rotation = (
             None if x is None else x[:, -steps:] for x in (self.position, self.rotation)
         )
@@ -61,7 +61,7 @@ class Tried(NamedTuple):
         return not any(np.isinf(x).any() for x in self.nees_of_parts())
 
     def nees_of_parts(self) -> list[Float[np.ndarray, "runs steps"]]:
-        """Of all axes, of the position and of the rotation."""
+        """The NEES of all axes, of the position and of the rotation."""
         return [x for x in (self.nees, self.position, self.rotation) if x is not None]
 
     @property
@@ -88,13 +88,13 @@ def _verdict(nees: Float[np.ndarray, "runs steps"], dof: int, fitted: float) -> 
 
 @dataclass(frozen=True)
 class Identification:
-    """What the data say of the convention that was stated."""
+    """The verdict of the data on the convention that was stated."""
 
     stated: Convention
     nees: dict[Convention, float]
-    """Mean NEES under every convention that was tried."""
+    """The mean NEES under every convention that was tried."""
     consistent: tuple[Convention, ...]
-    """Those that cannot be told from the best, if that is consistent; else none."""
+    """The conventions not distinguishable from the best, if that is consistent; else none."""
     stands: bool = False
     """Whether the data are consistent with the stated one too, be another the better."""
     whole: bool = False
@@ -102,8 +102,7 @@ class Identification:
 
     @property
     def convention(self) -> Convention | None:
-        """The only one that makes the data consistent, or fits them better than all others; None
-        where that cannot be told."""
+        """The only one that makes the data consistent, or fits them best; None if unknown."""
         return self.consistent[0] if len(self.consistent) == 1 else None
 
     @property
@@ -118,7 +117,7 @@ class Identification:
 
     @property
     def sentence(self) -> str:
-        """What was found, in a line."""
+        """The result in a line."""
         if not self.consistent and self.whole:
             return "of position or rotation alone σ is wrong under every convention that was tried"
         if not self.consistent:
@@ -148,7 +147,7 @@ class Identification:
         )
 
     def asdict(self) -> dict[str, Any]:
-        """For `evaluation.json`."""
+        """Return the content for `evaluation.json`."""
         return {
             "stated": asdict(self.stated),
             "convention": None if self.convention is None else asdict(self.convention),
@@ -164,7 +163,7 @@ def identify(
 ) -> Identification:
     """The convention from the NEES that each of them gives, of the same runs.
 
-    `given` the scale are those that come into question where none of the others does.
+    Those `given` the scale are tried where none of the others makes the data consistent.
     """
     finite = _finite(tried)
     own = finite.get(stated)
@@ -183,7 +182,7 @@ def identify(
 
 
 def _finite(tried: Mapping[Convention, Tried]) -> dict[Convention, Tried]:
-    """Those that are finite, of the steps that all have: one may know a first pose exactly."""
+    """The finite ones, over the steps that all have: one may know a first pose exactly."""
     steps = min((x.nees.shape[1] for x in tried.values()), default=0)
     return {c: last for c, x in tried.items() if (last := x.last(steps)).finite}
 
@@ -193,7 +192,7 @@ def _means(tried: Mapping[Convention, Tried]) -> dict[Convention, float]:
 
 
 def _best(tried: Mapping[Convention, Tried]) -> tuple[Tried | None, tuple[Convention, ...]]:
-    """The most likely one, and all that cannot be told from it."""
+    """The most likely one, and all that cannot be distinguished from it."""
     if not tried:
         return None, ()
     weight = {c: np.exp(x.log_determinant / x.dof) for c, x in tried.items()}
@@ -207,8 +206,7 @@ def _best(tried: Mapping[Convention, Tried]) -> tuple[Tried | None, tuple[Conven
 
 
 def _scale_was_free(marginal: Tried, given: Tried) -> bool:
-    """Whether a fitted scale takes more from the NEES of positions than it does of any right one,
-    however wrong σ is."""
+    """Whether a fitted scale takes more from the NEES of positions than any wrong σ explains."""
     n = given.dof - given.turns
     if n < 2 or marginal.position is None or given.position is None:
         return False

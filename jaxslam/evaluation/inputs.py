@@ -1,4 +1,4 @@
-"""Errors, poses and covariances as somebody else's program logged them: read, and checked."""
+"""The errors, poses and covariances that another program logged: read, and checked."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _KEYS = (
 
 
 ASYMMETRY = 1e-5
-"""Of a covariance, in σ of its two axes: what rounding to six digits leaves is less."""
+"""The largest asymmetry of a covariance, in σ of its axes: rounding to six digits makes less."""
 ROUNDING = 1e-8
 """Nine decimals of two files: their poses can differ by 4e-9 (map units, rad), and be the same."""
 
@@ -53,7 +53,7 @@ def check_finite(
 
 
 def all_nan(array: Float[np.ndarray, "runs steps ..."]) -> Bool[np.ndarray, "runs steps"]:
-    """Where every number of a step is NaN, so that nothing was logged."""
+    """A mask of the steps whose every number is NaN, so that nothing was logged."""
     return np.asarray(np.isnan(array).all(axis=tuple(range(2, array.ndim))))
 
 
@@ -62,7 +62,7 @@ def filled(
     logged: Bool[np.ndarray, "runs steps"],
     value: ArrayLike,
 ) -> Float[np.ndarray, "runs steps ..."]:
-    """With a value at every step that was not logged."""
+    """Return the array with a value at every step that was not logged."""
     return np.where(logged.reshape(*logged.shape, *[1] * (array.ndim - 2)), array, value)
 
 
@@ -74,21 +74,21 @@ def check_every_run(logged: Bool[np.ndarray, "runs steps"]) -> None:
 
 
 def at(place: Sequence[int | np.integer] | np.ndarray) -> str:
-    """`run 3, step 17`, counted from 0."""
+    """Name a place as `run 3, step 17`, counted from 0."""
     return f"run {place[0]}, step {place[1]}"
 
 
 class Paired(NamedTuple):
-    """Errors and covariances that belong together."""
+    """The errors and covariances that belong together."""
 
     errors: Float[np.ndarray, "runs steps n"]
     covariances: Float[np.ndarray, "runs steps n n"]
     logged: Bool[np.ndarray, "runs steps"]
-    """Which steps of which run are there; the others are zeros, with a covariance of one."""
+    """A mask of the steps of every run that are there; the others are zeros, of unit covariance."""
 
 
 def paired(errors: ArrayLike, covariances: ArrayLike) -> Paired:
-    """Errors and covariances, and where they are.
+    """Return errors and covariances, and a mask of the steps that have them.
 
     A step whose error and covariance are both all NaN was not logged. Raises ValueError, naming
     run and step, for any other number that is not finite, and for a run without a step.
@@ -106,7 +106,7 @@ def paired(errors: ArrayLike, covariances: ArrayLike) -> Paired:
 
 
 def step_times(times: ArrayLike | None, steps: int) -> Float[np.ndarray, " steps"]:
-    """Seconds of every step; its number where nobody told. Raises ValueError."""
+    """The time of every step in seconds; its number where times are unknown. Raises ValueError."""
     if times is None:
         return np.arange(1.0, steps + 1)
     try:
@@ -123,9 +123,9 @@ def step_times(times: ArrayLike | None, steps: int) -> Float[np.ndarray, " steps
 def exactly_known(
     covariances: Float[np.ndarray, "*batch n n"],
 ) -> Bool[np.ndarray, "*batch"]:
-    """Which covariances are zero: what is known by definition, as a first camera at the origin.
+    """A mask of the covariances that are zero, of what is known by definition.
 
-    It has no degree of freedom, and no part in a NEES.
+    A first camera at the origin is: it has no degree of freedom, and no part in a NEES.
     """
     return ~np.any(covariances, axis=(-2, -1))
 
@@ -134,9 +134,9 @@ class EvaluatedSteps(NamedTuple):
     """The steps that have a part in a verdict."""
 
     start: int
-    """Before it no run has one."""
+    """The first step at which any run has one."""
     logged: Bool[np.ndarray, "runs steps"]
-    """Which, of all steps."""
+    """A mask of them, among all steps."""
     notes: tuple[str, ...]
     """A word on those that are known by definition."""
 
@@ -146,7 +146,7 @@ def without_known(
     covariances: Float[np.ndarray, "runs steps n n"],
     logged: Bool[np.ndarray, "runs steps"],
 ) -> EvaluatedSteps:
-    """All steps that were logged but those at the beginning of a run that it knows by definition.
+    """The steps that were logged, but for those that a run knows by definition at its beginning.
 
     Raises ValueError where one is wrong all the same, or where of a run nothing else is left.
     """
@@ -186,7 +186,7 @@ def _left_out(known: Bool[np.ndarray, "runs steps"], start: int) -> tuple[str, .
 def normalised(
     errors: Float[np.ndarray, "runs steps n"], covariances: Float[np.ndarray, "runs steps n n"]
 ) -> Float[np.ndarray, "runs steps"]:
-    """`eᵀ P⁻¹ e`, by a Cholesky factor of the correlations.
+    """Return `eᵀ P⁻¹ e`, by a Cholesky factor of the correlations.
 
     Raises ValueError, naming run and step, unless every P is symmetric and positive definite.
     """
@@ -227,7 +227,7 @@ def _refuse(place: Sequence[int | np.integer] | np.ndarray, fault: str) -> NoRet
 
 
 _RIGID = 1e-4
-"""How far from orthonormal a rotation may be: what rounding to six digits leaves is less."""
+"""The tolerance of a rotation's orthonormality: rounding to six digits makes less."""
 
 
 class Poses(NamedTuple):
@@ -237,13 +237,13 @@ class Poses(NamedTuple):
     covariances: Float[np.ndarray, "runs steps t t"]
     truths: Float[np.ndarray, "runs steps d d"]
     logged: Bool[np.ndarray, "runs steps"]
-    """Which steps of which run there are; the others are identities, of unit covariance."""
+    """A mask of the steps that are there; the others are identities, of unit covariance."""
     joint: Float[np.ndarray, "runs steps*t steps*t"] | None = None
     """The covariance of all poses of a run, where it is known."""
 
 
 def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLike) -> Poses:
-    """Arrays that belong together. Raises ValueError, naming run and step."""
+    """Return the poses of arrays that belong together. Raises ValueError, naming run and step."""
     matrices = "(runs, steps, 4, 4), or (runs, steps, 3, 3) in the plane"
     T, truth = (
         _matrices(what, numbers(what, x, 4, matrices), matrices)
@@ -280,7 +280,7 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
 def _joint(
     P: Float[np.ndarray, "runs k k"], logged: Bool[np.ndarray, "runs k"]
 ) -> Float[np.ndarray, "runs k k"]:
-    """Zero where one of two numbers was not logged. Raises ValueError for any that cannot be."""
+    """Zero the covariance of steps not logged. Raises ValueError for non-finite or huge numbers."""
     P = np.where(logged[:, :, None] & logged[:, None], P, 0.0)
     if not (np.abs(P) <= LARGEST).all():
         run = int(np.argwhere(~(np.abs(P) <= LARGEST))[0, 0])
@@ -314,14 +314,14 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 _APART = 2
-"""Runs whose steps together are more than so many times those of the longest do not share them."""
+"""The most different steps of all runs, relative to those of the longest, that runs may share."""
 _COLUMNS = "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"
 
 
 def read_csv(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...], tuple[str, ...]]:
-    """Lines `run, step, n errors, n (n + 1)/2 of the upper triangle`; a first one of names.
+    """Read lines `run, step, n errors, n (n + 1)/2 of the upper triangle`; a first one of names.
 
-    The arrays, and what runs and steps are called in the file.
+    Returns the arrays, and the names of runs and steps in the file.
     """
     row = "numbers run, step, n errors and the n (n + 1)/2 of the upper triangle row by row"
     comments, rows, lines = read_table(path, "log", "errors", row, None)

@@ -1,4 +1,4 @@
-"""Logs as files, to a verdict: arrays in npz or CSV; trajectories, covariances and truths."""
+"""The verdict on logs in files: arrays in npz or CSV; trajectories, covariances and truths."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _CONTENTS = (
 
 
 class PoseOptions(TypedDict):
-    """How poses are evaluated, see `evaluate_poses`."""
+    """The options for evaluating poses, see `evaluate_poses`."""
 
     align: str
     axes_used: str | Sequence[str]
@@ -49,8 +49,8 @@ def evaluate_log(
     sub-folder, of `estimate.txt`, `covariance.txt` and `truth.txt`. Where the tracker's
     `frames.csv` is beside a trajectory, its longest map is evaluated, without frames that are lost
     or whose unit was not fixed yet. What is `stated` of the convention (`error`, `axes`, `order`,
-    `scale`) comes before what the files say. How poses are aligned, which axes are used, and
-    what σ the truth has, see `evaluate_poses`. With `nis` errors are innovations. Raises
+    `scale`) comes before what the files say. For the alignment of poses, the axes used and the
+    σ of the truth see `evaluate_poses`. With `nis` errors are innovations. Raises
     ValueError, naming the file.
     """
     source, stated = Path(source), dict(stated or {})
@@ -74,7 +74,7 @@ def evaluate_log(
 def _evaluate_arrays(
     arrays: dict[str, np.ndarray], stated: dict[str, str], how: PoseOptions, nis: bool
 ) -> Evaluation:
-    """Of errors, innovations or poses, by the names of the arrays."""
+    """The verdict on errors, innovations or poses, by the names of the arrays."""
     held = [name for name in ("errors", "innovations", "estimates") if name in arrays]
     needed = {"covariances", *(["truths"] if held == ["estimates"] else [])}
     if len(held) != 1 or not needed <= arrays.keys():
@@ -99,12 +99,12 @@ ESTIMATES = ("estimate.txt", "trajectory.txt")
 COVARIANCES = ("covariance.txt",)
 TRUTHS = ("truth.txt", "groundtruth.txt")
 LEAST_SHARE = 0.5
-"""Of the poses that could be compared, and of the time of the estimate, so much must be."""
+"""The share of the comparable poses, and of the estimate's time, that must be compared."""
 _WITHIN = f"within {MAX_TIME_DIFFERENCE} s"
 
 
 class RunFiles(NamedTuple):
-    """One trajectory: what it is called, and where its files are."""
+    """The name of one trajectory, and the paths of its files."""
 
     name: str
     estimate: Path
@@ -113,17 +113,17 @@ class RunFiles(NamedTuple):
 
 
 _File: TypeAlias = tuple[Path, np.ndarray]
-"""Where it is, and its times."""
+"""A path, and the times in its file."""
 
 
 class _AtTimes(NamedTuple):
-    """What a file holds, at the times of the estimate; NaN where it holds nothing."""
+    """The content of a file at the times of the estimate; NaN where it holds nothing."""
 
     times: Float[np.ndarray, " m"]
-    """Its own."""
+    """The file's own times."""
     values: Float[np.ndarray, "n d d"]
     used: int
-    """How many of its own are at times of the estimate."""
+    """The number of its own times that are times of the estimate."""
 
     @property
     def there(self) -> Bool[np.ndarray, " n"]:
@@ -140,7 +140,7 @@ class _RunLog(NamedTuple):
     truths: _AtTimes
     said: dict[str, str]
     evaluated: EvaluatedPoses
-    """Those that a tracker's own word on its frames lets have a part in the verdict."""
+    """The poses that have a part in the verdict, by the tracker's own record of its frames."""
 
 
 def runs_of(
@@ -194,8 +194,10 @@ def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
 def evaluate_runs(
     runs: tuple[RunFiles, ...], stated: dict[str, str], how: PoseOptions
 ) -> Evaluation:
-    """The verdict on them, in the convention that is stated, or else said in the files; `how` they
-    are evaluated are options of `evaluate_poses`."""
+    """The verdict on runs, in the convention that is stated, or else said in the files.
+
+    `how` are the options of `evaluate_poses`.
+    """
     read = [_read(run) for run in runs]
     convention = _convention_of(read, stated)
     for one in read:
@@ -227,7 +229,7 @@ def evaluate_runs(
 
 
 def _convention_of(read: list[_RunLog], stated: dict[str, str]) -> Convention:
-    """The one of all runs. Raises ValueError where their files say different ones."""
+    """The convention of all runs. Raises ValueError where their files say different ones."""
     for one in read:
         if one.said != read[0].said:
             raise ValueError(
@@ -238,12 +240,12 @@ def _convention_of(read: list[_RunLog], stated: dict[str, str]) -> Convention:
 
 
 def _evaluated_truths(one: _RunLog) -> Float[np.ndarray, "n 4 4"]:
-    """None of a pose that has no part in the verdict."""
+    """The true poses, NaN for those that have no part in the verdict."""
     return np.where(one.evaluated.poses[:, None, None], one.truths.values, np.nan)
 
 
 def _filled_up(runs: list[np.ndarray]) -> np.ndarray:
-    """All of them in one array, with NaN behind those that are shorter than the longest."""
+    """Stack all runs in one array, with NaN behind those that are shorter than the longest."""
     result = np.full((len(runs), max(map(len, runs)), *runs[0].shape[1:]), np.nan)
     for whole, run in zip(result, runs, strict=True):
         whole[: len(run)] = run
@@ -251,7 +253,7 @@ def _filled_up(runs: list[np.ndarray]) -> np.ndarray:
 
 
 def stated_before(said: dict[str, str], stated: dict[str, str]) -> Convention:
-    """What is stated before what is said; axes that were said are of the error that was."""
+    """The convention as stated, else as in the files; a stated error overrides their axes too."""
     if "error" in stated:
         said = {name: value for name, value in said.items() if name != "axes"}
     return Convention(**(said | stated))
@@ -263,7 +265,7 @@ def named(
     runs: Sequence[str] = (),
     steps: Sequence[str] = (),
 ) -> Evaluation:
-    """With the file's name in every error, and the names of runs and steps for their places."""
+    """Evaluate, with the names of file, runs and steps in every error."""
     try:
         return evaluation()
     except ValueError as error:
@@ -292,7 +294,7 @@ def _left_out(read: list[_RunLog]) -> Iterator[str]:
 
 
 def _other_times(read: list[_RunLog], longest: _RunLog) -> Iterator[str]:
-    """Steps are counted; a word where they are not at the same times after the first pose."""
+    """A remark where steps, which are counted, are not at the same times after the first pose."""
 
     def since(one: _RunLog, steps: int) -> np.ndarray:
         return one.times[:steps] - one.times[0]
@@ -308,7 +310,7 @@ def _other_times(read: list[_RunLog], longest: _RunLog) -> Iterator[str]:
 
 
 def _read(run: RunFiles) -> _RunLog:
-    """One run, pose by pose of its estimate. Raises ValueError where few can be compared."""
+    """Read one run, pose by pose of its estimate. Raises ValueError where few can be compared."""
     times, estimates = read_tum(run.estimate)
     text, (true_times, truths) = read_covariances(run.covariance), read_tum(run.truth)
     files = (run.estimate, times), (run.covariance, text.times), (run.truth, true_times)
@@ -388,37 +390,38 @@ _MOST_MAPS = 1_000_000
 
 
 class FrameLog(NamedTuple):
-    """Of all frames of a video, docs/gauge.md."""
+    """The log of all frames of a video, docs/gauge.md."""
 
     times: Float[np.ndarray, " k"]
     lost: Bool[np.ndarray, " k"]
     maps: Int[np.ndarray, " k"]
     """The number of the map. Each has a unit of length of its own."""
     fixed: Bool[np.ndarray, " k"]
-    """Whether the unit of the map is; before that it changes with the frames."""
+    """Whether the unit of the map is fixed; before that it changes with the frames."""
 
 
 class EvaluatedPoses(NamedTuple):
-    """Which poses of a run have a part in the verdict, and how many have none."""
+    """A mask of the poses of a run that have a part in the verdict, and counts of the others."""
 
     poses: Bool[np.ndarray, " n"]
     map: int = 0
-    """The one that is evaluated."""
+    """The map that is evaluated."""
     elsewhere: int = 0
-    """Poses of other maps."""
+    """The number of poses of other maps."""
     lost: int = 0
     opening: int = 0
-    """Poses from before the unit of the map was fixed."""
+    """The number of poses from before the unit of the map was fixed."""
 
 
 def evaluated_poses(
     folder: Path, times: Float[np.ndarray, " n"], known: Bool[np.ndarray, " n"]
 ) -> EvaluatedPoses:
-    """Of poses at these times, what the tracker's file in the folder leaves to be evaluated.
+    """The poses at these times that the tracker's file in the folder leaves to be evaluated.
 
-    It is the longest map, without frames that are lost or whose unit is not fixed. A pose that is
-    `known` exactly stays: it is where the map begins, and has a place in any unit. All poses
-    where there is no such file. Raises ValueError where it is of other times, or nothing is left.
+    They are of the longest map, without frames that are lost or whose unit is not fixed. A pose
+    that is `known` exactly stays: it is where the map begins, and has a place in any unit. All
+    poses where there is no such file. Raises ValueError where it is of other times, or nothing is
+    left.
     """
     path = folder / FRAMES
     frames = read_frames(path)
@@ -446,7 +449,7 @@ def evaluated_poses(
 
 
 def read_frames(path: Path) -> FrameLog | None:
-    """What the file of a tracker says; None where there is none, or another one of its name.
+    """Read the file of a tracker; None where there is none, or another one of its name.
 
     Raises ValueError, naming the line, for what a tracker does not write.
     """
@@ -474,7 +477,7 @@ def read_frames(path: Path) -> FrameLog | None:
 
 
 def _row(told: list[str]) -> tuple[float, bool, int, bool] | None:
-    """Numbers of a frame, in the order of `FrameLog`; None of what is no frame."""
+    """The numbers of a frame, in the order of `FrameLog`; None of what is no frame."""
     try:
         time, state, number, fixed = told
         row = float(time), state == "lost", int(number), bool(("0", "1").index(fixed.strip()))

@@ -1,4 +1,4 @@
-"""Poses against the truth: aligned, their errors and covariances in a convention, evaluated."""
+"""The evaluation of poses against the truth: aligned, with their errors in a convention."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ BEYOND = (
 
 
 class _Options(NamedTuple):
-    """How poses are compared, beside their convention."""
+    """The options by which poses are compared, beside their convention."""
 
     align: str
     used: tuple[str, ...]
-    """Names of axes."""
+    """The names of the axes."""
     truth_sigma: tuple[float, float] | None
 
 
 class _PoseErrors(NamedTuple):
-    """What is evaluated: all of the steps whose poses are not known by definition."""
+    """The errors that are evaluated: of all steps whose poses are not known by definition."""
 
     errors: Float[np.ndarray, "runs steps m"]
     covariances: Float[np.ndarray, "runs steps m m"]
@@ -84,7 +84,7 @@ def evaluate_poses(
     names. Where the estimate is of another world, `align` it by `se3` or `sim3`: by the first pose,
     if that is exactly known, else to all positions. The covariance is transported with it. Given
     the scale of the world, or with `sim3`, NEES is at one scale a run, and the drift of scale is
-    judged beside it. Of a robot that moves in a plane `axes_used` are those that it estimates, as
+    tested beside it. Of a robot that moves in a plane `axes_used` are those that it estimates, as
     ("x", "y", "rz"); by default all whose errors are not zero throughout. A truth that is measured
     has a `truth_sigma`, of position (m) and orientation (degrees), along the axes of the body,
     which is added to the covariances. Whether another convention would make the data consistent is
@@ -144,7 +144,7 @@ def _sigmas(covariances: Float[np.ndarray, "*batch m m"]) -> Float[np.ndarray, "
 
 
 def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseErrors:
-    """Errors and covariances along the axes used, aligned, at one scale where it is free."""
+    """The errors and covariances along the axes used, aligned, at one scale where it is free."""
     align, used, truth_sigma = options
     names = convention.names(geometry_of(poses.estimates))
     axes = np.array([i for i, name in enumerate(names) if name in used])
@@ -170,7 +170,7 @@ def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseE
 
 
 def _later(poses: Poses, start: int, logged: Bool[np.ndarray, "runs steps"]) -> Poses:
-    """From a step on, those that have a part in the verdict."""
+    """The poses from a step on that have a part in the verdict."""
     t, there = poses.covariances.shape[-1], logged[:, start:]
     P = filled(poses.covariances[:, start:], there, np.eye(t))
     joint = None if poses.joint is None else poses.joint[:, start * t :, start * t :]
@@ -184,7 +184,7 @@ def _with_truth(
     axes: Int[np.ndarray, " m"],
     truth_sigma: tuple[float, float],
 ) -> Poses:
-    """With the σ of the truth, in the unit of the estimate where their ratio is free."""
+    """Add the σ of the truth, in the unit of the estimate where their ratio is free."""
     first, log_scale = np.argmax(world.poses.logged, axis=1), np.zeros(len(later.logged))
     firsts = world.poses.truths[range(len(first)), first] if BY_FIRST in world.notes else None
     if world.given:
@@ -203,7 +203,7 @@ def _log_scales(before: Poses, after: Poses) -> Float[np.ndarray, " runs"]:
 
 
 def _identified(poses: Poses, stated: Convention, options: _Options) -> Identification:
-    """Among the conventions of the same scale; given the scale, where none of them does."""
+    """Identify the convention among those of the same scale; else among those given the scale."""
     geometry, used = geometry_of(poses.estimates), options.used
 
     def tried(conventions: Iterable[Convention]) -> dict[Convention, Tried]:
@@ -224,7 +224,7 @@ def _identified(poses: Poses, stated: Convention, options: _Options) -> Identifi
 def _alternatives(
     stated: Convention, geometry: Geometry, used: tuple[str, ...]
 ) -> list[Convention]:
-    """Those that differ: of one axis of rotation mixed is world, as in the plane."""
+    """The conventions that differ: with one axis of rotation mixed is world, as in the plane."""
     flat = sum(name.startswith("r") for name in used) < 2
     other = "world" if stated.axes == "mixed" else "mixed"
     return [c for c in alternatives(stated, geometry) if not flat or c.axes != other]
@@ -233,7 +233,7 @@ def _alternatives(
 def _tried(
     convention: Convention, geometry: Geometry, found: _PoseErrors, used: tuple[str, ...]
 ) -> Tried:
-    """NEES of a convention: of all, of the position and of the rotation alone."""
+    """The NEES of a convention: of all axes, of the position and of the rotation alone."""
     names = [name for name in convention.names(geometry) if name in used]
     turns = np.array([name.startswith("r") for name in names])
 
@@ -261,7 +261,7 @@ _UNCORRELATED = 1e-6
 def axes_named(
     axes: str | Sequence[str], poses: Float[np.ndarray, "runs steps d d"], convention: Convention
 ) -> tuple[str, ...]:
-    """The axes that are used, in the order of a covariance; none where nobody said.
+    """The axes that are used, in the order of a covariance; none where they are not given.
 
     Raises ValueError.
     """
@@ -274,9 +274,9 @@ def axes_named(
 def estimated(
     poses: Poses, convention: Convention, align: str
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the axes that are estimated, and a word on those that are not.
+    """The names of the axes that are estimated, and a word on those that are not.
 
-    An axis is left out where all its errors are zero, as far as nine decimals tell; or are less
+    An axis is left out where all its errors are zero, to nine decimals; or are less
     than a thousandth of σ, and have no correlation with those of other axes.
     """
     names = convention.names(geometry_of(poses.estimates))
@@ -300,21 +300,21 @@ def estimated(
 
 
 def _alone(P: np.ndarray, sigma: np.ndarray) -> Bool[np.ndarray, " t"]:
-    """Which axes have no correlation with any other."""
+    """A mask of the axes that have no correlation with any other."""
     scale = np.where(sigma > 0, sigma, 1.0)
     correlation = np.abs(P) / scale[:, :, None] / scale[:, None] * (1 - np.eye(P.shape[-1]))
     return (correlation <= _UNCORRELATED).all(axis=(0, 1))
 
 
 def _constant(poses: Poses) -> Bool[np.ndarray, " t"]:
-    """Which axes have the same variance at every pose: none of them, where all have."""
+    """A mask of the axes with the same variance at every pose: none of them, where all have."""
     variance = np.diagonal(poses.covariances[poses.logged], axis1=1, axis2=2)
     same = np.ptp(variance, axis=0) <= 1e-9 * np.abs(variance).max(axis=0)
     return same & ~same.all()
 
 
 def checked_sigma(sigma: Sequence[float] | None) -> tuple[float, float] | None:
-    """σ of a truth's position (m) and of its orientation (degrees). Raises ValueError."""
+    """The σ of a truth's position (m) and of its orientation (degrees). Raises ValueError."""
     if sigma is None:
         return None
     try:
@@ -329,7 +329,7 @@ def checked_sigma(sigma: Sequence[float] | None) -> tuple[float, float] | None:
 
 
 def _truth_remark(sigma: tuple[float, float]) -> str:
-    """What is said of it beside the verdict."""
+    """A remark on it beside the verdict."""
     return f"σ of the truth, {sigma[0]:g} m and {sigma[1]:g}°, is a part of every σ claimed"
 
 
@@ -340,11 +340,11 @@ def with_truth(
     scale: Float[np.ndarray, " runs"],
     firsts: Float[np.ndarray, "runs d d"] | None,
 ) -> Poses:
-    """Covariances of errors against a truth with that σ, along the axes of the true body.
+    """The covariances of errors against a truth with that σ, along the axes of the true body.
 
     `P + J S Jᵀ` with S the diagonal of σ² and J the derivative of the error by a small motion of
     the true pose; positions of a truth are `scale` times as large in the estimate's unit. Where
-    the estimate was laid on the `firsts` of the true poses, their errors move all of a run:
+    the estimate was aligned to the `firsts` of the true poses, their errors move all of a run:
     `P + J S Jᵀ + M S Mᵀ`, M the derivative by a motion of that one.
     """
     n, t = poses.truths.shape[-1] - 1, geometry_of(poses.truths).tangent_dim

@@ -1,4 +1,4 @@
-"""Is a filter consistent? From its errors and covariances, whoever's it is."""
+"""The consistency of a filter, of any program, from its errors and covariances."""
 
 from __future__ import annotations
 
@@ -32,49 +32,49 @@ from jaxslam.statistics.verdict import (
 SCHEMA = 1
 SIGMAS = 3
 _TOLD = 3
-"""Runs that a sentence names as examples."""
+"""The most runs that a sentence names as examples."""
 _LISTED = 20
-"""Lost runs that are named in the text; the file names all."""
+"""The most lost runs that are named in the text; the file names all."""
 OUTSIDE = 0.0027
-"""Share of a Gaussian beyond ±3σ."""
+"""The share of a Gaussian beyond ±3σ."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What errors and covariances say of a filter; printed, it is its verdict and its table."""
+    """The evaluation of a filter by its errors and covariances; prints as verdict and table."""
 
     quantity: str
-    """NEES, or NIS of innovations."""
+    """`NEES`, or `NIS` of innovations."""
     dof: int
-    """Degrees of freedom: the NEES that a consistent filter has on average."""
+    """The degrees of freedom: the NEES that a consistent filter has on average."""
     nees: Float[np.ndarray, "runs steps"]
-    """Of every run and step; infinite of one that diverged, NaN where nothing was logged."""
+    """The NEES of every run and step; infinite if diverged, NaN where nothing was logged."""
     errors: Float[np.ndarray, "runs steps n"]
     sigmas: Float[np.ndarray, "runs steps n"]
-    """What the filter claims of every error."""
+    """The σ that the filter claims of every error."""
     times: Float[np.ndarray, " steps"]
     timed: bool
-    """Whether they are seconds, or numbers of steps as nobody told times."""
+    """Whether they are seconds, or numbers of steps as times are unknown."""
     names: tuple[str, ...]
-    """Of the axes."""
+    """The names of the axes."""
     convention: Convention | None = None
-    """Of the covariances, where they are of poses."""
+    """The convention of the covariances, where they are of poses."""
     alignment: str = "none"
-    """By which the estimates were laid on the truth: `none`, `se3` or `sim3`."""
+    """The alignment of the estimates to the truth: `none`, `se3` or `sim3`."""
     identified: Identification | None = None
-    """Which convention would make the data consistent, where it was asked."""
+    """The convention that would make the data consistent, where it was searched for."""
     notes: tuple[str, ...] = ()
-    """What was left out, and what was assumed."""
+    """Remarks on what was left out, and what was assumed."""
     fitted: float = 0.0
-    """Degrees of freedom, at most, that a fit to a whole run took from every NEES: of its scale."""
+    """The most degrees of freedom that a fit of the scale of a run took from every NEES."""
     axis_fitted: tuple[float, ...] = ()
     """The same of every axis alone; empty where nothing was fitted."""
     scale: Scale | None = None
-    """Scale of the runs and its drift, where poses are given the scale or aligned by Sim(3)."""
+    """The scale of the runs and its drift, where poses are given the scale or aligned by Sim(3)."""
     truth_sigma: tuple[float, float] | None = None
-    """σ of the truth that the covariances hold too, in metres and degrees; None of an exact one."""
+    """The σ of the truth that the covariances hold too, m and degrees; None of an exact one."""
     run_names: tuple[str, ...] = ()
-    """Of the runs, where they have names."""
+    """The names of the runs, where they have any."""
 
     @property
     def runs(self) -> int:
@@ -86,8 +86,10 @@ class Evaluation:
 
     @cached_property
     def verdict(self) -> Verdict:
-        """Of one study over all steps, see `jaxslam.consistency.Tally.verdict`; over-confident too
-        where the scale drifts more than σ allows."""
+        """The verdict on one study over all steps, see `jaxslam.statistics.Tally.verdict`.
+
+        It is over-confident too where the scale drifts more than σ allows.
+        """
         found = self._of_nees
         if self.mistakes:
             return withheld(found)
@@ -110,7 +112,7 @@ class Evaluation:
 
     @cached_property
     def mistakes(self) -> tuple[Mistake, ...]:
-        """Of logging, as far as they are recognised; then no verdict is said."""
+        """The mistakes of logging that are recognised; with any there is no verdict."""
         numbers = [f"{time:g} s" if self.timed else f"step {time - 1:g}" for time in self.times]
         factors = [self.axis_verdict(axis) for axis in range(len(self.names))]
         runs = [self._run(run) for run in range(self.runs)]
@@ -127,32 +129,35 @@ class Evaluation:
 
     @cached_property
     def logged(self) -> Bool[np.ndarray, "runs steps"]:
-        """Which steps of which run there are."""
+        """A mask of the steps of every run that are there."""
         return ~np.isnan(self.nees)
 
     @cached_property
     def finite(self) -> Bool[np.ndarray, " runs"]:
-        """Which runs did not diverge: what means and band are of, as in `consistency.json`."""
+        """A mask of the runs that did not diverge, which means and band are of.
+
+        It is that of `consistency.json`.
+        """
         return np.asarray((np.isfinite(self.nees) | ~self.logged).all(axis=1))
 
     @cached_property
     def runs_of_step(self) -> Int[np.ndarray, " steps"]:
-        """How many runs a step's mean and band are of."""
+        """The number of runs that a step's mean and band are of."""
         return np.sum(self.logged & self.finite[:, None], axis=0)
 
     @property
     def lost_runs(self) -> list[str]:
-        """What the runs are called that are lost at any step."""
+        """The names of the runs that are lost at any step."""
         return [self._run(run) for run in lost_runs(self.nees, self.dof, self.logged)]
 
     @property
     def mean(self) -> Float[np.ndarray, " steps"]:
-        """Mean NEES of every step, over the runs that have it; NaN where no run is left."""
+        """The mean NEES of every step, over the runs that have it; NaN where no run is left."""
         return _mean(self.nees[self.finite], self.logged[self.finite])
 
     @property
     def band95(self) -> tuple[float, float]:
-        """Exact bounds of the mean at one step of which no run is missing (`jaxslam.mean_band`)."""
+        """The exact bounds of the mean at one step that no run lacks (`jaxslam.mean_band`)."""
         return self._band(max(int(self.finite.sum()), 1))
 
     @property
@@ -162,36 +167,36 @@ class Evaluation:
         return np.array([self._band(int(count)) for count in counts])[place]
 
     def _band(self, runs: int) -> tuple[float, float]:
-        """From that of all that may be fitted to that of nothing."""
+        """The band, its low end with all that may be fitted, its high end with nothing fitted."""
         left, high = int(self.dof - self.fitted), mean_band(self.dof, runs)[1]
         return (mean_band(left, runs)[0] if left >= 1 else 0.0), high
 
     @property
     def inside(self) -> float:
-        """Share of the steps that a run has whose mean is in its band."""
+        """The share of the steps that any run has whose mean is in its band."""
         low, high = self.band95_of_step.T
         inside = np.sum((self.mean >= low) & (self.mean <= high))
         return float(inside / max(np.count_nonzero(self.runs_of_step), 1))
 
     @property
     def rmse(self) -> Float[np.ndarray, "steps n"]:
-        """Of every step and axis."""
+        """The root mean square error of every step and axis."""
         return _rms(self.errors, self.logged)
 
     @property
     def sigma(self) -> Float[np.ndarray, "steps n"]:
-        """Claimed, of every step and axis: the root of the mean variance."""
+        """The claimed σ of every step and axis: the root of the mean variance."""
         return _rms(self.sigmas, self.logged)
 
     @property
     def outside3sigma(self) -> Float[np.ndarray, " n"]:
-        """Share of the errors of every axis beyond ±3σ; .27 % of Gaussian ones are."""
+        """The share of the errors of every axis beyond ±3σ; .27 % of Gaussian ones are."""
         beyond = np.abs(self.errors) > SIGMAS * self.sigmas
         return np.sum(beyond, axis=(0, 1)) / np.sum(self.logged)
 
     @property
     def suggested(self) -> Convention | None:
-        """Another convention, the only one that would make the data consistent."""
+        """The only convention that would make the data consistent, if not the stated one."""
         return None if self.identified is None else self.identified.suggested
 
     def axis_verdict(self, axis: int) -> Verdict:
@@ -239,7 +244,10 @@ class Evaluation:
         }
 
     def save(self, folder: str | Path) -> Path:
-        """Write `evaluation.json` into a folder, which is made; its path. Raises ValueError."""
+        """Write `evaluation.json` into a folder, made if missing; return its path.
+
+        Raises ValueError.
+        """
         path = Path(folder) / "evaluation.json"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -249,7 +257,7 @@ class Evaluation:
         return path
 
     def __str__(self) -> str:
-        # Lost runs are named below, as they are called here.
+        # Lost runs are named below, by their names here.
         more = sentences(self._of_nees | {"lost_runs": None}, self.quantity)[1:]
         told = [self.headline, *more]
         if self.scale is not None and not self.scale.disproved:
@@ -265,7 +273,7 @@ class Evaluation:
 
     @property
     def remarks(self) -> list[str]:
-        """All notes: what is missing, what was left out, what was assumed."""
+        """All remarks: what is missing, what was left out, what was assumed."""
         return [*self._missing(), *self.notes]
 
     def _missing(self) -> list[str]:
@@ -327,14 +335,15 @@ def evaluate(
     names: Sequence[str] = (),
     quantity: str = "NEES",
 ) -> Evaluation:
-    """The verdict on a filter from its errors (runs, steps, n) and their covariances (runs, steps,
-    n, n), or from innovations and theirs with `quantity="NIS"`, which needs no truth.
+    """The verdict on a filter from its errors and their covariances.
 
-    Runs are independent of each other, steps of a run need not be. `times` (steps,) are seconds and
-    `names` (n,) those of the axes. Runs need not be equally long: where an error and its covariance
-    are both all NaN, nothing was logged. Steps at the beginning that a run knows exactly, with a
-    covariance of zero, are left out. Raises ValueError, naming run and step, for what else is not
-    finite, not symmetric or not positive definite.
+    `errors` are (runs, steps, n) and `covariances` (runs, steps, n, n); with `quantity="NIS"` they
+    are innovations and theirs, which needs no truth. Runs are independent of each other, steps of a
+    run need not be. `times` (steps,) are seconds and `names` (n,) those of the axes. Runs need not
+    be equally long: where an error and its covariance are both all NaN, nothing was logged. Steps
+    at the beginning that a run knows exactly, with a covariance of zero, are left out. Raises
+    ValueError, naming run and step, for what else is not finite, not symmetric or not positive
+    definite.
     """
     e, P, logged = paired(errors, covariances)
     start, logged, notes = without_known(e, P, logged)
@@ -354,7 +363,7 @@ def evaluate(
 
 
 def _rms(values: np.ndarray, there: np.ndarray | None = None) -> Any:
-    """Root of the mean square over the first axis; infinite where it overflows."""
+    """The root of the mean square over the first axis; infinite where it overflows."""
     with np.errstate(over="ignore"):
         return np.sqrt(np.mean(values**2, axis=0) if there is None else _mean(values**2, there))
 
@@ -362,7 +371,7 @@ def _rms(values: np.ndarray, there: np.ndarray | None = None) -> Any:
 def _mean(
     values: Float[np.ndarray, "runs steps ..."], there: Bool[np.ndarray, "runs steps"]
 ) -> Float[np.ndarray, "steps ..."]:
-    """Over the runs that have a step; NaN where none has it."""
+    """The mean over the runs that have a step; NaN where none has it."""
     count = np.sum(there, axis=0).reshape(-1, *[1] * (values.ndim - 2))
     total = np.sum(filled(values, there, 0.0), axis=0)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -1,6 +1,7 @@
-"""Mistakes of logging, which make the numbers of a right filter wrong, recognised and named.
+"""The detection of mistakes of logging, which make the numbers of a right filter wrong.
 
-Each is told from what a filter can do by itself, and says how rarely it is seen by chance.
+Each check distinguishes a mistake from what a filter can do by itself, and states how rarely it
+raises a false alarm.
 """
 
 from __future__ import annotations
@@ -15,25 +16,25 @@ from jaxtyping import Bool, Float
 from jaxslam.statistics.verdict import Verdict
 
 FALSE_ALARM = 1e-4
-"""Studies of right runs that are taken for ones with runs and steps interchanged, at the most."""
+"""The largest share of right studies taken for ones with runs and steps interchanged."""
 DEGREES = 180 / np.pi
 _PERIODS = ((2 * np.pi, "2π", "(−π, π]"), (360.0, "360°", "(−180°, 180°]"))
 _FAR, _NEAR = 8.0, 5.0
 """An error beyond so many σ is not one of its axis; within so many of a full turn it is."""
 _WIDEST = {True: 1.0, None: 0.5}
-"""Rad from a full turn, of an axis that is known for an angle and of one that may be."""
+"""The distance from a full turn, rad, for an axis known to be an angle and one that may be."""
 _WRONG = 5.0
 """An axis whose σ may be right up to this factor is in its unit."""
 _LIKE = 2.0
 """A factor further from 57.3 than by so much is another one."""
 _SLACK = 1.25
-"""By which an interval may miss it: a 99 % interval of few runs does so more than once in 100."""
+"""The factor by which a 99 % interval may miss it: one of few runs does more than once in 100."""
 _NARROW = 4.0
-"""Interval of a factor, upper by lower end, of an axis that may be an angle or not."""
+"""The widest interval of a factor, upper by lower end, of an axis that may be an angle or not."""
 _CORRELATED = 0.3
 """Neighbours that correlate less may be strangers."""
 _MANY = 300
-"""Runs and steps that are looked at for correlations."""
+"""The most runs and steps whose correlations are tested."""
 _ANGLES = re.compile(
     r"r[xyz]|rot.*|[θφψαβ].*|.*(theta|phi|psi|heading|yaw|roll|pitch|angle|orient|bearing"
     r"|attitude|azimuth|elevation).*",
@@ -45,37 +46,37 @@ _LENGTHS = re.compile(
 
 
 class Mistake(NamedTuple):
-    """One that was found."""
+    """A mistake that was found."""
 
     what: str
-    """In a few words."""
+    """A name in a few words."""
     told: str
     """A sentence: where, by how much, and what to do."""
 
 
 class Logged(NamedTuple):
-    """What is looked at, NaN where nothing was logged."""
+    """The data that are checked, NaN where nothing was logged."""
 
     errors: Float[np.ndarray, "runs steps n"]
     sigmas: Float[np.ndarray, "runs steps n"]
     names: Sequence[str]
-    """Of the axes."""
+    """The names of the axes."""
     runs: Sequence[str]
-    """Names of the runs."""
+    """The names of the runs."""
     steps: Sequence[str]
-    """What the steps are called, as `step 7`, from 0, or `0.3 s`."""
+    """The names of the steps, as `step 7`, from 0, or `0.3 s`."""
     factors: Sequence[Verdict]
-    """Of every axis, `sigma_factor` and `interval99`."""
+    """The verdict on every axis, with `sigma_factor` and `interval99`."""
 
 
 def mistakes(logged: Logged) -> tuple[Mistake, ...]:
-    """All that are found."""
+    """Return all mistakes that are found."""
     kinds = [_is_angle(name) for name in logged.names]
     return (*_unwrapped(logged, kinds), *_degrees(logged, kinds), *_interchanged(logged))
 
 
 def withheld(found: Verdict) -> Verdict:
-    """A verdict of which no word is believed, as the data are not what they are said to be."""
+    """Return a verdict with every word withheld, as the data are not what they are said to be."""
 
     def silent(part: Any) -> Any:
         if isinstance(part, list):
@@ -87,12 +88,12 @@ def withheld(found: Verdict) -> Verdict:
 
 
 def _is_angle(name: str) -> bool | None:
-    """By the name of an axis; None where that does not tell."""
+    """Whether the name of an axis is that of an angle; None where that is not clear."""
     return True if _ANGLES.fullmatch(name) else False if _LENGTHS.fullmatch(name) else None
 
 
 def _unwrapped(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake]:
-    """Angles whose errors are near a full turn, and never between that and none.
+    """Find angles whose errors are near a full turn, and never between that and none.
 
     Of Gaussian errors with the σ that is claimed one number in 10¹⁵ is beyond 8 σ. Of one that is
     an outlier for another reason the chance to be so near to a turn is 10 σ of 2π, 1/36 for 1°.
@@ -125,7 +126,7 @@ def _turned(
     period: float,
     widest: float,
 ) -> Bool[np.ndarray, " runs"]:
-    """Runs with an error near a full turn, of which no other is far from none or a full one.
+    """A mask of the runs with an error near a full turn, and no other far from none or a full one.
 
     None where most runs with errors as large have them anywhere.
     """
@@ -144,7 +145,7 @@ def _turned(
 
 
 def _degrees(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake]:
-    """Errors in degrees with covariances in radians, or the other way round.
+    """Find errors in degrees with covariances in radians, or the other way round.
 
     σ of the angles is wrong by 180/π, by an interval that excludes 5, and that of no length is.
     A filter whose σ is wrong by less than 5 is not named but where it is estimated at 29 or more
@@ -176,8 +177,11 @@ def _told(factor: float) -> str:
 
 
 def _is_factor(found: Verdict, factor: float, known: bool) -> bool:
-    """Whether σ is wrong by just this factor; of one run, whose interval is wide, only of what is
-    `known`, and only where it is too small, as one number can be small by chance."""
+    """Whether σ is wrong by just this factor.
+
+    Of one run, whose interval is wide, only for what is `known`, and only where σ is too small, as
+    one number can be small by chance.
+    """
     by, (low, high) = found["sigma_factor"], found["interval99"]
     if not by or abs(np.log(by / factor)) > np.log(_LIKE):
         return False
@@ -188,7 +192,7 @@ def _is_factor(found: Verdict, factor: float, known: bool) -> bool:
 
 
 def _interchanged(logged: Logged) -> Iterator[Mistake]:
-    """Arrays (steps, runs): what is called a run is a step, and resembles the next one.
+    """Find arrays (steps, runs), where what is called a run is a step, and resembles the next one.
 
     Runs may be numbered in any order. Where their own order makes neighbours more alike than all
     of 10 000 drawn orders do, they are no independent runs; of independent ones once in 10 000
@@ -215,7 +219,7 @@ def _products(x: Float[np.ndarray, "k ..."]) -> Float[np.ndarray, "k k"]:
 
 
 def _alike(products: Float[np.ndarray, "k k"]) -> float:
-    """Correlation of neighbours beyond that of any two."""
+    """The correlation of neighbours beyond that of any two."""
     k = len(products)
     if k < 3:
         return 0.0

@@ -1,10 +1,10 @@
-"""Poses at the one scale of their run, and how far their scales drift from it.
+"""The poses at the one scale of their run, and the drift of their scales from it.
 
-Where nothing tells the scale, the true positions of another, `s p`, explain an estimate as well,
-but one s for a whole run. An error is affine in s, `e(s) = e + g (s − 1)` with g = de/ds, so that
-`ŝ = 1 − gᵀ Σ⁻¹ e/(gᵀ Σ⁻¹ g)` of all poses of a run, Σ their joint covariance, or where there is
-none block by block (`consistency.beyond_scale.one_scale`). Of one pose alone it is ŝ_k, and
-log ŝ_k − log ŝ is its drift.
+Where nothing determines the scale, the true positions of another, `s p`, explain an estimate as
+well, but one s for a whole run. An error is affine in s, `e(s) = e + g (s − 1)` with g = de/ds, so
+that `ŝ = 1 − gᵀ Σ⁻¹ e/(gᵀ Σ⁻¹ g)` of all poses of a run, Σ their joint covariance, or where there
+is none block by block (`statistics.beyond_scale.one_scale`). Of one pose alone it is ŝ_k, and log
+ŝ_k − log ŝ is its drift.
 """
 
 from __future__ import annotations
@@ -24,37 +24,37 @@ from jaxslam.statistics.beyond_scale import SCALES, BeyondScale, one_scale
 from jaxslam.statistics.verdict import Verdict, run_verdict
 
 DRIFT_CONFIDENCE = 0.999
-"""Of the verdict on drift: with that on NEES, which is one-sided where a fit took a degree of
-freedom, a right filter is called inconsistent once in a hundred studies all the same."""
+"""The confidence of the verdict on drift: with that on NEES, which is one-sided where a fit took a
+degree of freedom, a right filter is called inconsistent once in a hundred studies all the same."""
 QUANTILES = (0.025, 0.5, 0.975)
-"""Of the runs' drifts, per step."""
+"""The quantiles of the runs' drifts, per step."""
 _LEFT = 1e-9
-"""Of a covariance, what is left of it where one pose alone tells the scale."""
+"""The share of a covariance that is left where one pose alone determines the scale."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """The scale of every run, and how it drifts along it."""
+    """The scale of every run, and its drift along the run."""
 
     log_scale: Float[np.ndarray, " runs"]
-    """Of the estimate relative to the truth; NaN where no pose tells it."""
+    """The log scale of the estimate relative to the truth; NaN where no pose determines it."""
     drift: Float[np.ndarray, "runs steps"]
-    """log of a pose's own scale relative to its run's; NaN where it tells none."""
+    """The log of a pose's own scale relative to its run's; NaN where it determines none."""
     sigma: Float[np.ndarray, "runs steps"]
-    """What the filter claims of ŝ_k in log, or of the drift where all covariances are known."""
+    """The σ that the filter claims of log ŝ_k, or of the drift where all covariances are known."""
     nees: Float[np.ndarray, "runs steps"]
-    """Of the drift; NaN where a pose tells no scale."""
+    """The NEES of the drift; NaN where a pose determines no scale."""
     fitted: float
-    """Degrees of freedom, at most, that the fit of the run's scale took from every drift."""
+    """The most degrees of freedom that the fit of the run's scale took from every drift."""
 
     @property
     def told(self) -> Bool[np.ndarray, "runs steps"]:
-        """Where there is a drift."""
+        """A mask of the poses that have a drift."""
         return ~np.isnan(self.nees)
 
     @cached_property
     def verdict(self) -> Verdict | None:
-        """On the drift alone, of one degree of freedom; None where no run tells it."""
+        """The verdict on the drift alone, of one degree of freedom; None if no run has one."""
         runs = self.told.any(axis=1)
         if not runs.any():
             return None
@@ -62,13 +62,13 @@ class Scale:
 
     @property
     def factor(self) -> float:
-        """Drift in its claimed σ, root of the mean square."""
+        """The drift in its claimed σ, root of the mean square."""
         found = self.verdict
         return np.nan if found is None or found["nees"] is None else float(np.sqrt(found["nees"]))
 
     @property
     def rms(self) -> float:
-        """Drift along a run, root of the mean square weighted by what each pose tells of it."""
+        """The drift along a run, root of the mean square weighted by each pose's information."""
         told = self.told & (self.sigma > 0)
         if not told.any():
             return np.nan
@@ -87,7 +87,7 @@ class Scale:
 
     @property
     def sentence(self) -> str:
-        """`the scale drifts by 12 % (RMS) along a run, 5 times what σ allows: over-confident`."""
+        """A sentence: `the scale drifts by 12 % (RMS) along a run, 5 times what σ allows …`."""
         if self.verdict is None:
             return "no pose tells a scale"
         size = f"{100 * np.expm1(min(self.rms, 700.0)):.2g}"
@@ -98,7 +98,7 @@ class Scale:
 
     @property
     def over_runs(self) -> tuple[Float[np.ndarray, "2 steps"], np.ndarray, np.ndarray]:
-        """Drift of every step: between these two 95 % of the runs, their median, and its σ."""
+        """The drift of every step: the limits of 95 % of the runs, their median, and its σ."""
         there = np.asarray(self.told.any(axis=0))
         low, median, high = (np.full(len(there), np.nan) for _ in QUANTILES)
         sigma = np.full(len(there), np.nan)
@@ -109,7 +109,7 @@ class Scale:
         return np.stack([low, high]), median, sigma
 
     def asdict(self) -> dict[str, Any]:
-        """For `evaluation.json`."""
+        """Return the content for `evaluation.json`."""
         (low, high), median, sigma = self.over_runs
         return {
             "log_scale": json_numbers(self.log_scale),
@@ -125,20 +125,20 @@ class Scale:
 
 
 class AtScale(NamedTuple):
-    """Runs at one scale each."""
+    """The errors of runs at one scale each."""
 
     errors: Float[np.ndarray, "runs steps m"]
     covariances: Float[np.ndarray, "runs steps m m"]
-    """Of these errors: without the part that a fit to a joint covariance takes."""
+    """The covariances of these errors: without the part that a fit to a joint covariance takes."""
     fitted: float
-    """Degrees of freedom, at most, that the fit took from the NEES of a pose."""
+    """The most degrees of freedom that the fit took from the NEES of a pose."""
     axis_fitted: Float[np.ndarray, " m"]
     """The same of every axis alone."""
     scale: Scale
 
 
 def at_one_scale(poses: Poses, convention: Convention, axes: Int[np.ndarray, " m"]) -> AtScale:
-    """Errors along some axes at the scale of the truth that explains all poses of a run best."""
+    """Return errors along some axes at the true scale that explains all poses of a run best."""
     if poses.joint is not None:
         return _jointly(poses, poses.joint, convention, axes)
     P = poses.covariances[..., axes[:, None], axes]
@@ -164,8 +164,10 @@ def errors_beyond_scale(
     truths: Float[np.ndarray, "*batch d d"],
     covariances: Float[np.ndarray, "*batch t t"],
 ) -> BeyondScale:
-    """What of every pose's error is not one of scale, about the origin of the world, of covariances
-    in the convention."""
+    """The part of every pose's error that is not one of scale, about the origin of the world.
+
+    The covariances are in the convention.
+    """
     e, g = _affine(convention, estimates, truths)
     return _own_scales(e, g, covariances)
 
@@ -187,8 +189,7 @@ def _own_scales(
     slope: Float[np.ndarray, "*batch m"],
     covariances: Float[np.ndarray, "*batch m m"],
 ) -> BeyondScale:
-    """Of every pose alone, at the scale in `SCALES` that explains it best: ŝ = 1 − gᵀ P⁻¹ e/
-    (gᵀ P⁻¹ g)."""
+    """The scale in `SCALES` that explains each pose alone best, `ŝ = 1 − gᵀ P⁻¹ e/(gᵀ P⁻¹ g)`."""
     sigma = np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
     L = np.linalg.cholesky(covariances / sigma[..., :, None] / sigma[..., None, :])
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -207,7 +208,7 @@ def _jointly(
     convention: Convention,
     axes: Int[np.ndarray, " m"],
 ) -> AtScale:
-    """By least squares with the joint covariance: exact, each NEES has all its degrees of freedom.
+    """Fit one scale by the joint covariance: exact, each NEES has all its degrees of freedom.
 
     What is left of a run at its ŝ has the covariance `Σ − G Gᵀ/(Gᵀ Σ⁻¹ G)`.
     """
@@ -242,7 +243,7 @@ def _fitted(
     G: Float[np.ndarray, " k"],
     run: int,
 ) -> tuple[float, float]:
-    """ŝ of a run, and what all its poses tell of it, Gᵀ Σ⁻¹ G. Raises ValueError."""
+    """The ŝ of a run, and the information of all its poses on it, Gᵀ Σ⁻¹ G. Raises ValueError."""
     scaling = 1 / np.sqrt(np.maximum(np.diagonal(joint), np.finfo(float).tiny))
     try:
         L = np.linalg.cholesky(joint * scaling * scaling[:, None])
@@ -262,7 +263,7 @@ def of_aligned(
     axes: Int[np.ndarray, " m"],
     log_scale: Float[np.ndarray, " runs"],
 ) -> Scale:
-    """The drift of poses that a Sim(n) laid on the truth already, about the middle of each run."""
+    """The drift of poses that a Sim(n) has aligned to the truth, about the middle of each run."""
     T, P, truth = (x.copy() for x in poses[:3])
     for run, logged in enumerate(poses.logged):
         one = Poses(T[run], P[run], truth[run], logged)

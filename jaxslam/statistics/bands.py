@@ -1,6 +1,7 @@
 """Consistency statistics: NEES and its exact χ² bounds (Bar-Shalom, Li, Kirubarajan 2001, §5.4).
 
-And what holds for the mean of independent numbers of any distribution, from their power sums.
+It also has what holds for the mean of independent numbers of any distribution, from their power
+sums.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from jaxslam._numerics.linalg import cholesky
 CONFIDENCE = 0.95
 _LAGS = 10
 _LEAST_PAIRS = 20
-"""Pairs of steps of which a correlation is told."""
+"""The fewest pairs of steps from which a correlation is estimated."""
 LOST_QUANTILE = 0.9999
 """A run whose NEES is above this quantile of χ² is lost: one in 10 000 of a consistent filter."""
 
@@ -37,7 +38,7 @@ def chi2_quantile(probability: float, dof: float) -> float:
 
 
 def mean_band(dof: int, runs: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Two-sided bounds of the mean NEES of `runs` independent runs at ONE time step.
+    """The two-sided bounds of the mean NEES of `runs` independent runs at ONE time step.
 
     `N · mean ~ χ²(N n)` exactly. The steps of a run are correlated: never pool them. Raises
     ValueError without a run or a degree of freedom, and for no confidence between 0 and 1.
@@ -52,15 +53,15 @@ def mean_band(dof: int, runs: int, confidence: float = CONFIDENCE) -> tuple[floa
 
 
 def lost_threshold(dof: float, steps: int = 1) -> float:
-    """NEES above which a run counts as lost; 21.1 for 3 degrees of freedom.
+    """The NEES above which a run counts as lost; 21.1 for 3 degrees of freedom.
 
-    Of so many `steps` it is above it at any for one run in 10 000, or fewer if they are correlated.
+    With so many `steps` one run in 10 000 exceeds it at any step, fewer if they are correlated.
     """
     return 2 * float(scipy.special.gammainccinv(dof / 2, (1 - LOST_QUANTILE) / steps))
 
 
 def shortfall_limits(dof: float, level: float) -> tuple[float, float]:
-    """Between which everything is, but for a share of `level`, that spreads no more than χ².
+    """The limits of everything, but for a share of `level`, that spreads no more than χ².
 
     A sum of time averages of χ² does not, by Jensen `E f(Σ xₜ/T) ≤ E f(x)` for every convex f,
     however the steps are correlated. Half of `level` is at most on each side, beyond χ²'s expected
@@ -79,9 +80,9 @@ def shortfall_limits(dof: float, level: float) -> tuple[float, float]:
 
 
 def shortfall_p_value(mean: float, dof: float, runs: int) -> float:
-    """Two-sided, a bound: of a mean NEES over runs *and* steps, however the steps are correlated.
+    """A bound of the two-sided p of a mean NEES over runs *and* steps, correlated in any way.
 
-    The level at which the sum is one of `shortfall_limits`.
+    It is the level at which the sum is one of `shortfall_limits`.
     """
     total, above = runs * mean, bool(mean > dof)
     low, high = _LEAST, 0.0  # of log p
@@ -94,12 +95,12 @@ def shortfall_p_value(mean: float, dof: float, runs: int) -> float:
 
 
 _LEAST = math.log(1e-290)
-"""Of p; less is none."""
+"""The least log p; anything below it counts as zero."""
 
 
 @dataclass(frozen=True)
 class PowerSums:
-    """Of independent numbers: how many, and the sums of their first three powers. They add up.
+    """The count of independent numbers and the sums of their first three powers. They add up.
 
     `count` numbers x: `first` is Σ x, `second` Σ x², `third` Σ x³.
     """
@@ -111,7 +112,7 @@ class PowerSums:
 
     @staticmethod
     def of(values: Float[np.ndarray, " n"]) -> PowerSums:
-        """Of these numbers."""
+        """Return the power sums of these numbers."""
         values = np.asarray(values, np.float64)
         with np.errstate(over="ignore"):  # of a lost run's: no interval then
             return PowerSums(values.size, *(float(np.sum(values**power)) for power in (1, 2, 3)))
@@ -139,7 +140,7 @@ class PowerSums:
 
 
 def mean_p_value(sums: PowerSums, expected: float) -> float:
-    """Two-sided, of `expected` as the mean of skewed numbers; NaN for fewer than two.
+    """The two-sided p of `expected` as the mean of skewed numbers; NaN for fewer than two.
 
     Student's t with its skewness removed by a cubic (Hall, Annals of Statistics 1992,
     "On the removal of skewness by transformation"): the studentised bootstrap to second order,
@@ -155,12 +156,14 @@ def mean_p_value(sums: PowerSums, expected: float) -> float:
 
 
 _FAR = 1e50
-"""Of a studentised mean: beyond it no power of it is a number."""
+"""The largest studentised mean: the powers of a larger one overflow."""
 
 
 def skewed_limit(sums: PowerSums, t: float) -> float:
-    """How many standard errors above their mean that of numbers may be, `-g⁻¹(−t)` of `_symmetric`:
-    t of numbers that are not skewed."""
+    """The standard errors by which a mean may be too high, `-g⁻¹(−t)` of `_symmetric`.
+
+    It is t for numbers that are not skewed.
+    """
     k = sums.skewness / math.sqrt(sums.count)
     return 3 / k * (1 - math.cbrt(1 - k * (t + k / 6))) if k else t
 
@@ -174,7 +177,7 @@ def _symmetric(t: float, k: float) -> float:
 def whiteness_p_value(
     nis: Float[np.ndarray, "runs steps"], normalised: Float[np.ndarray, "runs steps n"]
 ) -> float | None:
-    """Of white innovations, by their autocorrelations and by those of NIS; None of too few.
+    """The p of white innovations, by their autocorrelations and those of NIS; None of too few.
 
     Of each axis, and of NIS about its mean, `Q = Σₗ rₗ² Nₗ`, the Nₗ pairs of steps l apart having
     the correlation rₗ, is χ² (Ljung and Box, Biometrika 1978; of all runs); the least p of them by

@@ -1,8 +1,8 @@
-"""What of the poses' errors is not one of scale, which pictures alone do not tell.
+"""The part of the poses' errors that is not one of scale, which images alone do not determine.
 
 The truth of another scale, `T(s) = (R, s t)`, explains them as well as the true one, s = 1, but
 only with one s for all poses of a map: the gauge (Zhang, Gallego, Scaramuzza, RA-L 2018). The ratio
-of the scales of two poses is told by the pixels, and where it changes, the scale drifts.
+of the scales of two poses is given by the pixels, and where it changes, the scale drifts.
 `beyond_scale` is of one pose alone; `one_scale` makes of all poses of a run the NEES at one scale.
 """
 
@@ -21,13 +21,13 @@ from jaxslam._numerics.linalg import cholesky
 from jaxslam.geometry import Pose, Scalar, retract, scaled, zero_tangent
 
 STEPS = 3
-"""Of Gauss–Newton in s: an error that is affine in s, as those of the package are, needs one."""
+"""Steps of Gauss–Newton in s: an error that is affine in s, as those of the package, needs one."""
 SCALES = (1e-3, 1e3)
-"""Least and greatest s that is tried: a reversed path is best explained by none, s = 0."""
+"""The least and the greatest s that are tried: no s > 0 explains a reversed path best."""
 SCALE = ("beyond_scale", "unit_log_scale", "unit_log_scale_sigma", "unit_fixed")
-"""Records of a run of which `one_scale` is made."""
+"""The records of a run from which `one_scale` is computed."""
 NOTICEABLE = 0.01
-"""Displacement from which on it can be said to be reversed, m."""
+"""The least displacement that can be called reversed, m."""
 
 
 PoseError = Callable[[Pose], tuple[Float[Array, " t"], Float[Array, "t t"]]]
@@ -35,15 +35,15 @@ PoseError = Callable[[Pose], tuple[Float[Array, " t"], Float[Array, "t t"]]]
 
 
 class BeyondScale(NamedTuple):
-    """Of one pose with t degrees of freedom, where `e(s)ᵀ P⁻¹ e(s)` is the smallest."""
+    """The scale of one pose, of t degrees of freedom, at which `e(s)ᵀ P⁻¹ e(s)` is the smallest."""
 
     nees: Float[AnyArray, "*batch"]
     """That smallest value: χ² with t − 1 degrees of freedom for a consistent filter."""
     log_scale: Float[AnyArray, "*batch"]
-    """log ŝ: the estimate's scale relative to the truth's."""
+    """The log ŝ: the estimate's scale relative to the truth's."""
     sigma: Float[AnyArray, "*batch"]
-    """What the filter claims of log ŝ, `(gᵀ P⁻¹ g)^(−1/2)` with g = de/d log s; infinite where
-    nothing depends on s."""
+    """The σ that the filter claims of log ŝ, `(gᵀ P⁻¹ g)^(−1/2)` with g = de/d log s; infinite
+    where nothing depends on s."""
 
 
 def beyond_scale(
@@ -84,15 +84,15 @@ def beyond_scale(
 
 
 class OneScale(NamedTuple):
-    """Of runs at one scale each: K poses of a run have K t − 1 degrees of freedom together."""
+    """The NEES of runs at one scale each: K poses of a run have K t − 1 degrees of freedom."""
 
     nees: Float[np.ndarray, "*runs steps"]
     """`e(ŝ)ᵀ P⁻¹ e(ŝ)`: t degrees of freedom a pose, less at most one where the errors of scale are
     common to the run, as the fit then takes out more than the one degree of freedom of its own."""
     log_scale: Float[np.ndarray, "*runs"]
-    """log ŝ of the run: NaN where no pose tells it."""
+    """The log ŝ of the run: NaN where no pose determines it."""
     drift: Float[np.ndarray, "*runs steps"]
-    """`log ŝ_k − log ŝ`: how far the scale of a pose is from that of its run; NaN before the unit
+    """`log ŝ_k − log ŝ`: the distance of a pose's scale from that of its run; NaN before the unit
     is fixed."""
     normalised: Float[np.ndarray, "*runs steps"]
     """The square of the drift in its claimed σ, the last term of `nees`: at most one degree of
@@ -135,8 +135,10 @@ def one_scale_of(records: Mapping[str, np.ndarray]) -> OneScale:
 
 
 def reversal(estimate: Pose, truth: Pose) -> Scalar:
-    """1 if the estimated displacement from the origin points away from the true one, else 0; NaN
-    unless the true one is `NOTICEABLE`."""
+    """Return 1 if the estimated displacement from the origin points away from the true one, else 0.
+
+    NaN unless the true one is `NOTICEABLE`.
+    """
     true = truth.translation()
     against = (estimate.translation() @ true < 0).astype(true.dtype)
     return jnp.where(true @ true > NOTICEABLE**2, against, jnp.nan)

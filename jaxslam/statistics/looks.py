@@ -1,8 +1,8 @@
 """One mean of independent runs beside that of a right filter: by how much σ may be wrong.
 
-Two intervals, each of which is narrow where the other is wide. *Of χ²*: as if the covariances of
-all runs were wrong by one factor, however the steps of a run are correlated. *Of the scatter*: as
-far apart as the runs themselves are, whatever they are drawn from.
+There are two intervals, each of which is narrow where the other is wide. That of χ² takes the
+covariances of all runs to be wrong by one factor, however the steps of a run are correlated. That
+of the scatter is as wide as the runs themselves scatter, whatever they are drawn from.
 """
 
 from __future__ import annotations
@@ -24,45 +24,45 @@ from jaxslam.statistics.bands import (
 )
 
 Verdict: TypeAlias = dict[str, Any]
-"""As JSON has it, with the keys that `Tally.verdict` says."""
+"""A verdict as JSON has it, with the keys that `Tally.verdict` lists."""
 VERDICT_CONFIDENCE = 0.99
-"""With which all intervals of a study hold together; a consistent filter is called inconsistent in
-less than one of 100 studies."""
+"""The confidence with which all intervals of a study hold together: a consistent filter is called
+inconsistent in less than one of 100 studies."""
 TOLERANCE = 1.3
 """A σ wrong by this factor would have been seen, where a filter is called consistent."""
 UNSEEN = 3
-"""Of runs such as none among N is, there may be up to 3 in N (the rule of three: Hanley,
+"""The runs in N that may be of a kind that none among N is (the rule of three: Hanley,
 Lippman-Hand, JAMA 1983)."""
 _FEWEST = 3
-"""Numbers whose scatter says anything."""
+"""The fewest numbers whose scatter says anything."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """At the mean of one number a run; factors are of σ², 1 where it is right."""
+    """A test of the mean of one number a run; factors are of σ², 1 where it is right."""
 
     name: str
-    """Of what: `all steps`, `last step`, `first third` …"""
+    """The steps that it is of: `all steps`, `last step`, `first third` …"""
     sums: PowerSums
     right: tuple[float, float]
     """The mean of a right filter is anywhere from the one to the other."""
     level: float
-    """How often a right filter may be outside the interval."""
+    """The probability that a right filter is outside the interval."""
 
     @property
     def factor(self) -> float:
-        """By which σ² should be larger."""
+        """The factor by which σ² should be larger."""
         mean = self.sums.mean
         nearest = min(max(mean, self.right[0]), self.right[1])
         return 1.0 if mean == nearest else mean / nearest
 
     @cached_property
     def interval(self) -> tuple[float, float]:
-        """That of the scatter, where it proves that σ is wrong; else what holds both intervals.
+        """The interval of the scatter where it proves that σ is wrong; else one that holds both.
 
-        Without 1 where that of χ² proves it: a right filter is tested by each of them, while any
-        other factor says less of how runs scatter, and only both together exclude it. Where neither
-        does, it reaches up as if `UNSEEN` more runs had just been lost.
+        It excludes 1 where that of χ² proves it: a right filter is tested by each of them, while
+        any other factor says less of how runs scatter, and only both together exclude it. Where
+        neither does, it reaches up as if `UNSEEN` more runs had just been lost.
         """
         low, high = self._tested()
         if low <= 1 <= high:
@@ -70,7 +70,7 @@ class Look:
         return low, high
 
     def _tested(self) -> tuple[float, float]:
-        """What holds both intervals, or what is left of them by which σ is proven to be wrong."""
+        """An interval that holds both, or what is left of them where σ is proven to be wrong."""
         model = self._of_chi2()
         scatter = self._of_scatter()
         if scatter is None:
@@ -85,17 +85,18 @@ class Look:
         return low, high
 
     def _of_chi2(self) -> tuple[float, float]:
-        """Factors with which the sum over N runs is not in a tail of χ²(N n)."""
+        """The range of factors with which the sum over N runs is not in a tail of χ²(N n)."""
         total, n = self.sums.first, self.sums.count
         _, most = _limits(n * self.right[1], self.level)
         least, _ = _limits(n * self.right[0], self.level)
         return total / most, total / least if least else math.inf
 
     def _of_scatter(self) -> tuple[float, float] | None:
-        """Student's t, with the scatter s relative to the mean: `m (1 − δ)` to `m/(1 − δ)`.
+        """The interval of Student's t, by the relative scatter: `m (1 − δ)` to `m/(1 − δ)`.
 
-        δ = t s/(m √N). Relative to the mean, few runs that are all small are not alike. Upwards to
-        Hall's limit for skewed numbers, where that is further: few runs of many are the large ones.
+        δ = t s/(m √N), s the scatter. Relative to the mean, few runs that are all small are not
+        alike. Upwards to Hall's limit for skewed numbers, where that is further: few runs of many
+        are the large ones.
         """
         relative = self._relative_error()
         if relative is None:
@@ -109,7 +110,7 @@ class Look:
         return low / self.right[1], high
 
     def _relative_error(self) -> float | None:
-        """Of the mean; None where the runs are too few to tell."""
+        """The relative standard error of the mean; None where the runs are too few."""
         if self.sums.count < _FEWEST or self.sums.mean <= 0:
             return None
         relative = self.sums.deviation / self.sums.mean / math.sqrt(self.sums.count)
@@ -117,7 +118,7 @@ class Look:
 
     @property
     def p(self) -> float:
-        """Of a right filter, at confidence 99 % all together: below .01 where it is disproved."""
+        """The p of a right filter, at 99 % confidence all together: below .01 if disproved."""
         mean, (low, high) = self.sums.mean, self.right
         nearest = min(max(mean, low), high)
         if mean == nearest:
@@ -141,17 +142,17 @@ class Look:
 
     @property
     def word(self) -> str:
-        """That σ is right within `TOLERANCE`, or that it is wrong; `cannot tell` without proof."""
+        """The word for σ, right within `TOLERANCE` or wrong; `cannot tell` without proof."""
         low, high = self.interval
         if self.disproved:
             return "over-confident" if low > 1 else "under-confident"
-        if not self.right[0]:  # only over-confidence can be told, and only it is to be excluded
+        if not self.right[0]:  # only over-confidence can be proven, and only it is to be excluded
             low, high = 1.0, replace(self, right=(self.right[1], self.right[1])).interval[1]
         told = low >= TOLERANCE**-2 and high <= TOLERANCE**2
         return "consistent" if told else "cannot tell"
 
     def asdict(self) -> Verdict:
-        """Numbers as a verdict has them, of σ."""
+        """Return the numbers as a verdict has them, of σ."""
         low, high = self.interval
         return {
             "nees": self.sums.mean,
@@ -162,7 +163,7 @@ class Look:
         }
 
     def enough(self) -> int:
-        """About how many runs would tell whether σ is right within `TOLERANCE`."""
+        """Estimate how many runs would show whether σ is right within `TOLERANCE`."""
         runs = _enough(self.right[0] or self.right[1], self.right[1], self.level)
         low, high = self.interval
         if runs <= self.sums.count and low > 0 and math.isfinite(high):  # and they scatter more
@@ -173,7 +174,7 @@ class Look:
 
 
 def _root(factor: float, *, upwards: bool) -> float | None:
-    """On the side of 1 that the factor is on, whatever is rounded."""
+    """The root of a factor, on the same side of 1 as the factor however it is rounded."""
     if not math.isfinite(factor):
         return None
     root = math.sqrt(factor)
@@ -184,7 +185,7 @@ def _root(factor: float, *, upwards: bool) -> float | None:
 
 @lru_cache(maxsize=1024)
 def _quantile(dof: int, level: float) -> float:
-    """Of Student's t, two-sided."""
+    """The two-sided quantile of Student's t."""
     return float(scipy.special.stdtrit(dof, 1 - level / 2))
 
 
@@ -194,13 +195,13 @@ def _limits(dof: float, level: float) -> tuple[float, float]:
 
 
 def _unseen(mean: float, dof: float, runs: int) -> float:
-    """By how much `UNSEEN` more runs that are just lost would enlarge the factor of σ²."""
+    """The amount by which `UNSEEN` more runs that are just lost would enlarge the factor of σ²."""
     return UNSEEN * max(lost_threshold(dof) - mean, 0.0) / (runs + UNSEEN) / dof
 
 
 @lru_cache(maxsize=256)
 def _enough(least_dof: float, dof: float, level: float) -> int:
-    """Runs whose interval of χ² is within `TOLERANCE` where the mean is off by its error."""
+    """The number of runs whose χ² interval is within `TOLERANCE`, the mean off by its error."""
 
     def told(runs: int) -> bool:
         total = runs * least_dof

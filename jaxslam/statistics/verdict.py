@@ -1,4 +1,4 @@
-"""What NEES says of a filter: by how much its covariance is wrong, in one study and on a map.
+"""The verdict of NEES on a filter: the factor by which σ is wrong, in one study and on a map.
 
 A `Tally` is the verdict on one study, over all its steps; `verdict` is that on one mean at one
 step, alone and as one of many comparisons.
@@ -26,12 +26,12 @@ VERDICTS = ("consistent", "under-confident", "over-confident", "lost", "cannot t
 LOST_BOUND = 0.01
 """More lost runs than this share make a filter lost: 100 times what a consistent one loses."""
 THIRDS = ("first third", "second third", "last third")
-"""Of a run's steps."""
+"""The names of the thirds of a run's steps."""
 
 
 @dataclass(frozen=True)
 class Tally:
-    """What a study's verdict needs of its runs: numbers that add up, over chunks and over seeds.
+    """The numbers of its runs that a study's verdict needs, which add up over chunks and seeds.
 
     The steps of a run are correlated, runs are not: each run gives one number, the average of
     its NEES over time; that of each third of its steps; and its NEES at the end.
@@ -51,7 +51,7 @@ class Tally:
     never_lost: PowerSums
     """Time averages of the runs never lost."""
     fitted: float = 0.0
-    """Of every NEES between 0 and so many degrees of freedom were taken by a fit to the run."""
+    """The degrees of freedom, from 0 to so many, that a fit to the run took from every NEES."""
     thirds: tuple[PowerSums, PowerSums, PowerSums] = (PowerSums(), PowerSums(), PowerSums())
     """Averages over each third of the steps, of the runs that did not diverge and have three."""
 
@@ -62,7 +62,7 @@ class Tally:
         fitted: float = 0.0,
         logged: Bool[np.ndarray, "runs steps"] | None = None,
     ) -> Tally:
-        """Of the NEES of runs, with so many degrees of freedom.
+        """Return the tally of the NEES of runs, with so many degrees of freedom.
 
         Where runs are not equally long, or have gaps, `logged` says which steps of each are there:
         its average is over those, and its end is the last of them.
@@ -96,7 +96,7 @@ class Tally:
 
     @staticmethod
     def from_dict(numbers: dict[str, Any]) -> Tally:
-        """Of what `asdict` made of it; one made without thirds has none."""
+        """Return the tally that `asdict` wrote; one written without thirds has none."""
         counts = (numbers[name] for name in ("dof", "runs", "diverged", "lost"))
         sums = (PowerSums(**numbers[name]) for name in ("average", "end", "never_lost"))
         first, second, last = (PowerSums(**x) for x in numbers.get("thirds", ({},) * 3))
@@ -104,7 +104,7 @@ class Tally:
 
     @staticmethod
     def of_numbers(numbers: Float[np.ndarray, " 27"], dof: int, fitted: float = 0.0) -> Tally:
-        """Of what `numbers` made of one tally, or of a sum of such."""
+        """Return the tally of what `numbers` gave of one, or of a sum of such."""
         runs, diverged, lost = (int(x) for x in numbers[:3])
         average, end, never_lost, *thirds = (
             PowerSums(int(n), *map(float, rest)) for n, *rest in numbers[3:].reshape(6, 4)
@@ -114,13 +114,13 @@ class Tally:
         return Tally(*counts, average, end, never_lost, fitted, (first, second, last))
 
     def numbers(self) -> Float[np.ndarray, " 27"]:
-        """All that adds up, for `of_numbers`."""
+        """Return all that adds up, for `of_numbers`."""
         each = (self.average, self.end, self.never_lost, *self.thirds)
         sums = (x for part in each for x in astuple(part))
         return np.array([self.runs, self.diverged, self.lost, *sums], np.float64)
 
     def asdict(self) -> dict[str, Any]:
-        """Numbers as JSON has them, for `from_dict`."""
+        """Return the numbers as JSON has them, for `from_dict`."""
         return asdict(self) | {"thirds": [asdict(third) for third in self.thirds]}
 
     def __add__(self, other: Tally) -> Tally:
@@ -134,7 +134,7 @@ class Tally:
         return Tally.of_numbers(both, self.dof, self.fitted)
 
     def looks(self) -> list[Look]:
-        """At all steps, the last one and each third, which hold together with 99 %.
+        """The looks at all steps, the last one and each third, which hold together with 99 %.
 
         Half of what a right filter may fail is that of the mean over all steps, where a study has
         most to say, and the other half is shared by the parts (Bonferroni).
@@ -150,7 +150,7 @@ class Tally:
         ]
 
     def decisive(self) -> Look:
-        """That at all steps; or, where only parts show that σ is wrong, at the one that does most.
+        """The look at all steps; or, where only parts show that σ is wrong, at the clearest part.
 
         Raises ValueError where no run is left to look at.
         """
@@ -170,8 +170,8 @@ class Tally:
         at the last step or of a third of the steps shows that σ is wrong, of that. So the word is
         over- or under-confident where the interval does not hold 1, and p < .01. Else it is
         consistent where the interval is within `TOLERANCE` of 1, and `cannot tell` where it is
-        not: about `enough` runs would tell. `mean`, `end` and the `thirds` have their own, which
-        hold together: p is multiplied by how often was looked. With a diverged run no mean exists
+        not: about `enough` runs would show it. `mean`, `end` and the `thirds` have their own, which
+        hold together: p is corrected for the number of looks. With a diverged run no mean exists
         and the word is lost. `never_lost` is the verdict on the runs never lost: robust, and low
         by construction. `lost_runs` are their numbers, where they are known.
 
@@ -213,13 +213,13 @@ class Tally:
 
 
 _NONE = {"nees": None, "sigma_factor": None, "interval99": [None, None], "p": 0.0, "word": "lost"}
-"""Where there is no mean."""
+"""The verdict where there is no mean."""
 
 
 def _logged(
     nees: Float[np.ndarray, "runs steps"], logged: Bool[np.ndarray, "runs steps"] | None
 ) -> Bool[np.ndarray, "runs steps"]:
-    """Which steps are there. Raises ValueError unless every run has one."""
+    """A mask of the steps that are there. Raises ValueError unless every run has one."""
     there = np.ones(nees.shape, bool) if logged is None else np.asarray(logged, bool)
     if there.shape != nees.shape or not there.any(axis=1).all():
         raise ValueError(f"logged must be {nees.shape}, with a step of every run")
@@ -231,10 +231,10 @@ def lost_runs(
     dof: int,
     logged: Bool[np.ndarray, "runs steps"] | None = None,
 ) -> list[int]:
-    """Which runs are lost at any of their steps; what is `logged`, see `Tally.of`.
+    """The numbers of the runs lost at any of their steps; for `logged` see `Tally.of`.
 
-    Of right ones one in 10 000 is, or fewer, however many steps they have. Raises ValueError for a
-    run without steps.
+    Of right runs one in 10 000 is lost, or fewer, however many steps they have. Raises ValueError
+    for a run without steps.
     """
     there = _logged(nees, logged)
     steps, which = np.unique(there.sum(axis=1), return_inverse=True)
@@ -246,7 +246,7 @@ def lost_runs(
 def _thirds(
     nees: Float[np.ndarray, "runs steps"], there: Bool[np.ndarray, "runs steps"]
 ) -> tuple[PowerSums, PowerSums, PowerSums]:
-    """Of the averages over each third of the steps that are there."""
+    """The power sums of the averages over each third of the steps that are there."""
     steps = there.sum(axis=1)
     long, place = steps >= len(THIRDS), np.cumsum(there, axis=1) - 1
     which = np.where(there, len(THIRDS) * place // steps[:, None], -1)[long]
@@ -262,10 +262,10 @@ def run_verdict(
     fitted: float = 0.0,
     logged: Bool[np.ndarray, "runs steps"] | None = None,
 ) -> Verdict:
-    """The verdict on one study from the NEES of its independent runs, see `Tally.verdict`; what is
-    `fitted` and `logged`, see `Tally.of`.
+    """The verdict on one study from the NEES of its independent runs, see `Tally.verdict`.
 
-    Raises ValueError unless there are runs, steps and degrees of freedom.
+    For `fitted` and `logged` see `Tally.of`. Raises ValueError unless there are runs, steps and
+    degrees of freedom.
     """
     nees = np.asarray(nees, np.float64)
     if nees.ndim != 2 or not nees.size or dof < 1:
@@ -298,7 +298,7 @@ def sentences(found: Verdict, quantity: str = "NEES") -> list[str]:
 
 
 def _of_lost(found: Verdict, quantity: str) -> str:
-    """Which runs were lost, and what is said of the others."""
+    """A sentence on the runs that were lost, and on the others."""
     kept, runs = found["never_lost"], found["runs"]
     lost = runs - kept["runs"]
     word, others = "were lost", "never lost"
@@ -320,7 +320,7 @@ def _listed(numbers: list[int]) -> str:
 
 
 _TOLD = 8
-"""Lost runs that are named."""
+"""The most lost runs that are named."""
 
 
 def _of_whiteness(found: Verdict) -> list[str]:
@@ -348,7 +348,7 @@ def headline(found: Verdict, quantity: str = "NEES") -> str:
 
 
 def _part(found: Verdict) -> str:
-    """What decided; files of before there were parts have none."""
+    """The part that decided; older files, from before there were parts, have none."""
     return found.get("of", "all steps")
 
 
@@ -413,9 +413,11 @@ def together(comparisons: int) -> float:
 def innovation_verdict(
     nis: Float[np.ndarray, "runs steps"], normalised: Float[np.ndarray, "runs steps n"], dof: int
 ) -> Verdict:
-    """As `run_verdict`, of every step (`samples`: steps) where innovations seem white, else of
-    every run: innovations, which need no truth, are white of a right filter, so that every step is
-    a sample of its own (Bar-Shalom, Li, Kirubarajan 2001, §5.4.2).
+    """The verdict on innovations, of every step where they seem white, else of every run.
+
+    It is that of `run_verdict`; `samples` says whether steps or runs are counted. Innovations,
+    which need no truth, are white if the filter is right, so that every step is a sample of its own
+    (Bar-Shalom, Li, Kirubarajan 2001, §5.4.2).
 
     `normalised` are innovations over their σ; steps that a run lacks are NaN in `nis`. `white` is
     the p of `whiteness_p_value`, None where steps are too few or a NIS is not finite. A run that
