@@ -143,14 +143,21 @@ def plot_functions():
 
 @pytest.mark.parametrize("plot", list(plot_functions()))
 def test_what_draws_a_figure_returns_it_and_what_draws_axes_takes_them(plot):
-    """A whole figure may be written; anything less draws into axes of one's own, by a name."""
+    """Whole figures are made of functions that draw into axes of one's own, by a name."""
     taken, returned = inspect.signature(plot).parameters, inspect.signature(plot).return_annotation
     if returned in ("Figure", Figure):
         assert "path" in taken
+        room = importlib.import_module(plot.__module__)
+        if room.__name__ != "jaxslam.plots.tracking":  # a map's panels share their limits
+            assert any("ax" in inspect.signature(f).parameters for f in public_plots(room))
     else:
         assert returned in ("Axes", Axes)
         for name in ("ax", "label"):
             assert taken[name].kind is inspect.Parameter.KEYWORD_ONLY
+
+
+def public_plots(module):
+    return [value for name, value in vars(module).items() if name.startswith("plot_")]
 
 
 def test_a_study_is_drawn_and_tabled_as_its_summary_is(study):
