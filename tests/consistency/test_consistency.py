@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import quick_jit
+from cases import WithoutRemove, quick_jit
 from scipy.special import gammainc
 from scipy.stats import chi2, norm
 
@@ -28,7 +28,6 @@ from jaxslam.consistency import (
 )
 from jaxslam.consistency.simulator import Simulator
 from jaxslam.consistency.sums import added
-from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.registry import scenario_pieces
 from jaxslam.native.build import compiler
 from jaxslam.plots.consistency import plot_consistency, plot_outside
@@ -534,24 +533,6 @@ def test_a_slot_used_again_is_as_good_as_one_of_its_own(name):
     for key in ("nees", "nis", "error", "variance", "landmark_nees", "landmark_count"):
         # Sums in another order, through a covariance that spans 1e9.
         np.testing.assert_allclose(found[key], expected[key], rtol=1e-5, atol=1e-9, err_msg=key)
-
-
-class WithoutRemove(AbstractFilter):
-    """A filter of four functions."""
-
-    base: jaxslam.EkfSlam
-
-    def init(self, capacity, first=None):
-        return self.base.init(capacity, first)
-
-    def step(self, state, control, seen, new):
-        return self.base.step(state, control, seen, new)
-
-    def marginal(self, state, function):
-        return self.base.marginal(state, function)
-
-    def landmark_marginal(self, state, function, slots):
-        return self.base.landmark_marginal(state, function, slots)
 
 
 @pytest.mark.slow
