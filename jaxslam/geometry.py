@@ -12,19 +12,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 Pose = jaxlie.SE2 | jaxlie.SE3
+Rotation = jaxlie.SO2 | jaxlie.SO3
 Point = Float[Array, " n"]
 Scalar = Float[Array, ""]
 Homogeneous = tuple[Point, Scalar]
 """(X, ω), the point X/ω; at infinity where ω is 0."""
+Tree = TypeVar("Tree")
+"""A pytree of poses and arrays."""
 
 
 @dataclass(frozen=True)
@@ -62,20 +65,20 @@ def identity(geometry: Geometry, dtype) -> Pose:
     return jax.tree.map(lambda x: x.astype(dtype), geometry.group.identity())
 
 
-def _is_pose(leaf: Any) -> bool:
+def _is_pose(leaf: PyTree) -> bool:
     return isinstance(leaf, jaxlie.MatrixLieGroup)
 
 
-def _sizes(leaves: list[Any]) -> list[int]:
+def _sizes(leaves: list[PyTree]) -> list[int]:
     return [_pose_size(leaf) if _is_pose(leaf) else leaf.size for leaf in leaves]
 
 
-def _pose_size(leaf: Any) -> int:
+def _pose_size(leaf: jaxlie.MatrixLieGroup) -> int:
     """A pose may be a batch of poses, whose tangents follow one another."""
     return leaf.tangent_dim * math.prod(leaf.get_batch_axes())
 
 
-def tangent_dim(tree: Any) -> int:
+def tangent_dim(tree: PyTree) -> int:
     """Size of the tangent of a pytree of poses and arrays, in the order of its leaves."""
     return sum(_sizes(jax.tree.leaves(tree, is_leaf=_is_pose)))
 
@@ -88,7 +91,7 @@ class SplitPose(eqx.Module):
     """
 
     translation: Float[Array, " n"]
-    rotation: jaxlie.SO2 | jaxlie.SO3
+    rotation: Rotation
 
     @staticmethod
     def of(pose: Pose) -> SplitPose:
@@ -98,14 +101,14 @@ class SplitPose(eqx.Module):
         return joined(self.rotation, self.translation)
 
 
-def joined(rotation: jaxlie.SO2 | jaxlie.SO3, translation: Float[Array, " n"]) -> Pose:
+def joined(rotation: Rotation, translation: Float[Array, " n"]) -> Pose:
     """The pose (R, t)."""
     if isinstance(rotation, jaxlie.SO2):
         return jaxlie.SE2.from_rotation_and_translation(rotation, translation)
     return jaxlie.SE3.from_rotation_and_translation(rotation, translation)
 
 
-def scaled(tree: Any, scale: Scalar) -> Any:
+def scaled(tree: Tree, scale: Scalar) -> Tree:
     """A pytree of poses, the lengths in them times `scale`."""
 
     def one(pose):
@@ -126,7 +129,7 @@ def homogeneous_apply(
     return T_ab.rotation() @ point + omega * T_ab.translation()
 
 
-def exp(group: type[jaxlie.MatrixLieGroup], delta: Float[Array, " t"]) -> Any:
+def exp(group: type[jaxlie.MatrixLieGroup], delta: Float[Array, " t"]) -> PyTree:
     """`Exp(δ)` of SO(n) or SE(n), with derivatives that are exact at and near zero rotation.
 
     SE(3): `t = v + B ω×v + C ω×(ω×v)`, B = (1 − cos θ)/θ², C = (θ − sin θ)/θ³ (Barfoot, State
@@ -155,7 +158,7 @@ def _turn(omega: Float[Array, " 3"]) -> jaxlie.SO3:
     return jaxlie.SO3(jnp.concatenate([_cos(s / 4)[None], _sinc(s / 4) * omega / 2]))
 
 
-def log(pose: Any) -> Float[Array, " t"]:
+def log(pose: Pose | Rotation) -> Float[Array, " t"]:
     """`Log(T)`, the inverse of `exp`: exact to rounding at small angles, for θ below π."""
     if isinstance(pose, jaxlie.SO2):
         return pose.as_radians()[None]
@@ -225,17 +228,17 @@ def _inverse_third(s):
     return _even(s, series, lambda s: (1 - jnp.sqrt(s) / 2 / jnp.tan(jnp.sqrt(s) / 2)) / s)
 
 
-def retract(tree: Any, delta: Float[Array, " t"]) -> Any:
+def retract(tree: Tree, delta: Float[Array, " t"]) -> Tree:
     """`tree ⊞ δ`: poses by `T Exp(δ)`, vectors by addition, δ split in the order of the leaves."""
     return _moved(tree, delta, lambda T, part: T @ exp(type(T), part))
 
 
-def difference(tree: Any, origin: Any) -> Float[Array, " t"]:
+def difference(tree: PyTree, origin: PyTree) -> Float[Array, " t"]:
     """Return `tree ⊟ origin`, the inverse of `retract`: `tree = origin ⊞ (tree ⊟ origin)`."""
     return _compared(tree, origin, log)
 
 
-def jacobian(function: Callable[[Any], Any], tree: Any) -> Float[Array, "k t"]:
+def jacobian(function: Callable[[PyTree], PyTree], tree: PyTree) -> Float[Array, "k t"]:
     """Jacobian of `δ ↦ f(x ⊞ δ) ⊟ f(x)` at δ = 0, by `jax.jacfwd`."""
     value = function(tree)
 
@@ -245,7 +248,7 @@ def jacobian(function: Callable[[Any], Any], tree: Any) -> Float[Array, "k t"]:
     return jax.jacfwd(error)(zero_tangent(tree))
 
 
-def nudge(tree: Any, delta: Float[Array, " t"]) -> Any:
+def nudge(tree: Tree, delta: Float[Array, " t"]) -> Tree:
     """`retract` to first order, `T (I + δ^)`: the same derivative at δ = 0, and only there.
 
     Jacobians are taken through it: without the trigonometry of Exp and its guards they compile
@@ -254,12 +257,12 @@ def nudge(tree: Any, delta: Float[Array, " t"]) -> Any:
     return _moved(tree, delta, lambda T, part: T @ _first_order_exp(type(T), part))
 
 
-def zero_tangent(tree: Any) -> Float[Array, " t"]:
+def zero_tangent(tree: PyTree) -> Float[Array, " t"]:
     """δ = 0, in the dtype of the tree."""
     return jnp.zeros(tangent_dim(tree), jnp.result_type(*jax.tree.leaves(tree)))
 
 
-def _first_order_exp(group: type[jaxlie.MatrixLieGroup], delta: Float[Array, " t"]) -> Any:
+def _first_order_exp(group: type[jaxlie.MatrixLieGroup], delta: Float[Array, " t"]) -> PyTree:
     if group is jaxlie.SO2:
         return jaxlie.SO2(jnp.concatenate([jnp.ones(1, delta.dtype), delta]))
     if group is jaxlie.SO3:
@@ -268,7 +271,7 @@ def _first_order_exp(group: type[jaxlie.MatrixLieGroup], delta: Float[Array, " t
     return joined(_first_order_exp(turn, delta[n:]), delta[:n])
 
 
-def _first_order_log(step: Any) -> Float[Array, " t"]:
+def _first_order_log(step: Pose | Rotation) -> Float[Array, " t"]:
     if isinstance(step, jaxlie.SO2):
         return step.unit_complex[1:]
     if isinstance(step, jaxlie.SO3):
@@ -276,7 +279,7 @@ def _first_order_log(step: Any) -> Float[Array, " t"]:
     return jnp.concatenate([step.translation(), _first_order_log(step.rotation())])
 
 
-def _moved(tree: Any, delta: Float[Array, " t"], move: Callable[[Any, Array], Any]) -> Any:
+def _moved(tree: Tree, delta: Float[Array, " t"], move: Callable[[PyTree, Array], PyTree]) -> Tree:
     leaves, structure = jax.tree.flatten(tree, is_leaf=_is_pose)
     moved, start = [], 0
     for leaf, size in zip(leaves, _sizes(leaves), strict=True):
@@ -291,7 +294,7 @@ def _moved(tree: Any, delta: Float[Array, " t"], move: Callable[[Any, Array], An
     return jax.tree.unflatten(structure, moved)
 
 
-def _compared(tree: Any, origin: Any, log: Callable[[Any], Array]) -> Float[Array, " t"]:
+def _compared(tree: PyTree, origin: PyTree, log: Callable[[PyTree], Array]) -> Float[Array, " t"]:
     leaves = jax.tree.leaves(tree, is_leaf=_is_pose)
     origins = jax.tree.leaves(origin, is_leaf=_is_pose)
 

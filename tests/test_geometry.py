@@ -244,7 +244,7 @@ def test_scaling_a_pose_scales_its_lengths_and_nothing_else(geometry, split):
     T = pose(geometry, 1)
     twice = scaled({"pose": SplitPose.of(T) if split else T}, jnp.asarray(2.0))["pose"]
     assert isinstance(twice, SplitPose if split else geometry.group)
-    twice = twice.joined() if split else twice
+    twice = twice.joined() if isinstance(twice, SplitPose) else twice
     np.testing.assert_allclose(twice.translation(), 2 * T.translation(), rtol=1e-15)
     rotation = T.rotation().as_matrix()
     np.testing.assert_allclose(twice.rotation().as_matrix(), rotation, rtol=0, atol=1e-15)

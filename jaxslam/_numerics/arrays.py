@@ -13,7 +13,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jax.typing import ArrayLike, DTypeLike
+from jaxtyping import Float, PyTree
 
 T = TypeVar("T")
 
@@ -27,7 +28,7 @@ Number = Float[AnyArray, ""] | float
 """One number as a caller has it: Python's, or an array's."""
 
 
-def numbers(values: Any) -> AnyArray:
+def numbers(values: PyTree) -> AnyArray:
     """An array of floating-point numbers; JAX's arrays are left as they are."""
     if isinstance(values, jax.Array):
         return values
@@ -38,7 +39,7 @@ def numbers(values: Any) -> AnyArray:
     return np.asarray(values, np.float64)
 
 
-def optional_numbers(values: Any) -> AnyArray | None:
+def optional_numbers(values: PyTree) -> AnyArray | None:
     """`numbers`, or None."""
     return None if values is None else numbers(values)
 
@@ -48,12 +49,12 @@ def number_field(**options: Any) -> Any:
     return eqx.field(converter=numbers, **options)
 
 
-def is_number(leaf: Any) -> bool:
+def is_number(leaf: PyTree) -> bool:
     """Whether a leaf is data, to be traced, batched and differentiated."""
     return isinstance(leaf, jax.Array | np.ndarray | jax.ShapeDtypeStruct)
 
 
-def cast(tree: T, dtype: Any) -> T:
+def cast(tree: T, dtype: DTypeLike) -> T:
     """A filter, or any module, with all its floating-point numbers in one precision.
 
     Raises ValueError for a name of none.
@@ -69,7 +70,7 @@ def cast(tree: T, dtype: Any) -> T:
     return jax.tree.map(one, tree)
 
 
-def precision(tree: Any) -> Any:
+def precision(tree: PyTree) -> np.dtype:
     """The dtype of a module's numbers as JAX computes with them now.
 
     Warns where they are float64 and JAX, `jax_enable_x64` being off, makes them float32: a filter
@@ -87,7 +88,7 @@ def precision(tree: Any) -> Any:
     return dtype
 
 
-def check_shape(what: str, array: Any, *shapes: tuple[int, ...]) -> None:
+def check_shape(what: str, array: ArrayLike, *shapes: tuple[int, ...]) -> None:
     """Raise ValueError, naming the number, unless it has one of these shapes."""
     if np.shape(array) not in shapes:
         wanted = " or ".join(str(shape) for shape in shapes)

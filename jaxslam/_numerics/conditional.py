@@ -8,13 +8,13 @@ blocks, so that the work is that of those who want it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Int, PyTree
 
 Value = TypeVar("Value")
 
@@ -26,7 +26,7 @@ LEAST = 8
 
 
 def cond(
-    wanted: Bool[Array, ""], function: Callable[..., Value], value: Value, *given: Any
+    wanted: Bool[Array, ""], function: Callable[..., Value], value: Value, *given: PyTree
 ) -> Value:
     """`function(value, *given)` if it is wanted, else the value."""
     one = jax.tree.map(lambda x: jnp.asarray(x)[None], value)
@@ -35,7 +35,7 @@ def cond(
 
 
 def map_where(
-    function: Callable[..., Value], values: Value, alive: Bool[Array, " k"], *given: Any
+    function: Callable[..., Value], values: Value, alive: Bool[Array, " k"], *given: PyTree
 ) -> Value:
     """`function(value, *given)` of every value that is alive; the others stay as they are.
 
@@ -50,8 +50,8 @@ def map_where(
 
 
 def map_or_zero(
-    function: Callable[..., Any], values: Any, alive: Bool[Array, " k"], *given: Any
-) -> Any:
+    function: Callable[..., PyTree], values: PyTree, alive: Bool[Array, " k"], *given: PyTree
+) -> PyTree:
     """`function(value, *given)` of every value that is alive; zeros for the others."""
     first = jax.tree.map(lambda x: x[0], values)
     none = zeros(jax.eval_shape(function, first, *given), alive.size)
@@ -62,7 +62,7 @@ def map_or_zero(
     return at_places(_of_one(alone), none, _each_place(alive), alive, values, given)
 
 
-def zeros(shapes: Any, k: int) -> Any:
+def zeros(shapes: PyTree, k: int) -> PyTree:
     """So many of what has these shapes."""
     return jax.tree.map(lambda x: jnp.zeros((k, *x.shape), x.dtype), shapes)
 
@@ -71,7 +71,7 @@ def _each_place(alive: Bool[Array, " k"]) -> Int[Array, "k 1"]:
     return jnp.arange(alive.size)[:, None]
 
 
-def _of_one(function: Callable[..., Any]) -> Callable[..., Any]:
+def _of_one(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
     def alone(values, beside, given):
         one = jax.tree.map(lambda x: x[0], (values, beside))
         return jax.tree.map(lambda x: x[None], function(*one, given))
@@ -80,12 +80,12 @@ def _of_one(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def at_places(
-    function: Callable[[Value, Any, Any], Value],
+    function: Callable[[Value, PyTree, PyTree], Value],
     values: Value,
     places: Int[Array, "w r"],
     wanted: Bool[Array, " w"],
-    beside: Any = (),
-    given: Any = (),
+    beside: PyTree = (),
+    given: PyTree = (),
 ) -> Value:
     """The values after each of w works that is wanted.
 
@@ -168,7 +168,7 @@ def repeated(
 
 
 def _once(
-    wanted: Bool[Array, ""], function: Callable[..., Value], value: Value, *given: Any
+    wanted: Bool[Array, ""], function: Callable[..., Value], value: Value, *given: PyTree
 ) -> Value:
     """Apply the function once if wanted. What it needs is indexed by the loop's counter, or the
     compiler would move the work out of a loop that does not change it."""
@@ -184,7 +184,7 @@ def _once(
     return jax.lax.while_loop(due, once, (jnp.zeros((), int), value))[1]
 
 
-def _spread(size: int, batched: Any, values: Any) -> Any:
+def _spread(size: int, batched: PyTree, values: PyTree) -> PyTree:
     """A batch of so many of all of them."""
 
     def one(is_batched, x):
@@ -194,14 +194,14 @@ def _spread(size: int, batched: Any, values: Any) -> Any:
 
 
 def _in_blocks(
-    call: Callable[..., Any],
-    values: Any,
-    beside: Any,
+    call: Callable[..., PyTree],
+    values: PyTree,
+    beside: PyTree,
     places: Int[Array, "b w r"],
     wanted: Bool[Array, "b w"],
-    shared: Any,
-    batched: Any,
-) -> Any:
+    shared: PyTree,
+    batched: PyTree,
+) -> PyTree:
     """Compute what is wanted of a batch b, wherever it is, block by block."""
     b, w = wanted.shape
     k = jax.tree.leaves(values)[0].shape[1]

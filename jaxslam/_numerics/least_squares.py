@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import lineax
 import optimistix
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxslam._numerics.linalg import Cholesky, cholesky
 
@@ -20,7 +18,7 @@ class NormalCholesky(lineax.AbstractLinearSolver):
     """
 
     def init(
-        self, operator: lineax.AbstractLinearOperator, options: dict[str, Any]
+        self, operator: lineax.AbstractLinearOperator, options: dict[str, PyTree]
     ) -> tuple[Float[Array, "m n"], Cholesky]:
         del options
         A = operator.as_matrix()

@@ -9,10 +9,10 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
 from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.protocol import AbstractFilter, Belief
 from jaxslam.filters.readouts import (
     camera_pose,
     camera_pose_in_unit,
@@ -21,6 +21,7 @@ from jaxslam.filters.readouts import (
 )
 from jaxslam.filters.run import run as run_filter
 from jaxslam.geometry import Pose, difference
+from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features, Innovation
 from jaxslam.models.scale import Metre
 from jaxslam.models.sensors import AbstractSensor
@@ -34,7 +35,7 @@ Output = TypeVar("Output")
 class SimulatedFrame(NamedTuple):
     """The data that a filter is given of a frame after frame 0, and the truth; or of all frames."""
 
-    control: PyTree
+    control: Control
     """The motion model's: seconds, the odometry's reading, …"""
     seen: Features
     """The features of landmarks in the map."""
@@ -52,8 +53,8 @@ def run_through(
     slam: AbstractFilter,
     room: Room,
     run: Run,
-    output: Callable[[PyTree, Innovation, SimulatedFrame], Output],
-) -> tuple[PyTree, Output]:
+    output: Callable[[Belief, Innovation, SimulatedFrame], Output],
+) -> tuple[Belief, Output]:
     """Return the last state, and `output(state, innovation, frame)` of every frame but 0.
 
     Landmarks that are gone are removed before the step. Raises ValueError for a filter that
@@ -67,7 +68,7 @@ def run_through(
 
 def filter_run(
     slam: AbstractFilter, room: Room, sensor: AbstractSensor, run: Run
-) -> tuple[dict[str, Array], Pose, PyTree]:
+) -> tuple[dict[str, Array], Pose, Belief]:
     """Return the records of every step of a simulated run, the estimated path, the last state.
 
     The records hold, per step: `nees` of the pose; the `log_scale` of the truth at which it is the
@@ -102,7 +103,7 @@ def filter_run(
 
 
 def scale_records(
-    slam: AbstractFilter, state: PyTree, T_BC: Pose, truth_sigma: np.ndarray | None = None
+    slam: AbstractFilter, state: Belief, T_BC: Pose, truth_sigma: np.ndarray | None = None
 ) -> dict[str, Array]:
     """Return the records of one pose's scale: in metres, and `SCALE` in the filter's own unit.
 
@@ -135,7 +136,7 @@ def _camera_error(estimate: Pose, truth: Pose) -> Array:
 
 
 def _landmark_records(
-    slam: AbstractFilter, sensor: AbstractSensor, state: PyTree, frame: SimulatedFrame
+    slam: AbstractFilter, sensor: AbstractSensor, state: Belief, frame: SimulatedFrame
 ) -> dict[str, Array]:
     """The mean of the finite NEES of the landmarks seen that are in the map, and both counts."""
     seen = frame.seen
@@ -154,7 +155,7 @@ def _landmark_records(
 
 
 def map_and_path(
-    slam: AbstractFilter, room: Room, path: Pose, state: PyTree, run: Run
+    slam: AbstractFilter, room: Room, path: Pose, state: Belief, run: Run
 ) -> dict[str, Array]:
     """Return the map and the path that `filter_run` found in a run, and the true ones."""
     landmarks, covariance = landmarks_from_above(slam, state, jnp.arange(room.landmarks))

@@ -14,7 +14,7 @@ at most one of them is believed, as they differ by more than their noise.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +22,13 @@ import numpy as np
 import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam._numerics.arrays import Number
 from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.ekf import EkfSlam, context_of
 from jaxslam.filters.forms.form import curvature
-from jaxslam.filters.protocol import AbstractStaged
-from jaxslam.models.observations import Features
+from jaxslam.filters.protocol import AbstractStaged, Belief
+from jaxslam.models.motion import Control
+from jaxslam.models.observations import Features, Slots
 
 GATE = 0.99
 """Share of true matches that a test lets through."""
@@ -60,7 +62,7 @@ class Candidates(NamedTuple):
         own = jnp.einsum("mpmq->mpq", self.covariance)
         return jnp.where(self.valid, _squared(self.residual, own), jnp.inf)
 
-    def without(self, match: Any) -> Candidates:
+    def without(self, match: Int[Array, ""]) -> Candidates:
         """The others, given that this one is true."""
         S = self.covariance
         gain = S[:, :, match] @ _inverse(S[match, :, match])
@@ -80,10 +82,10 @@ Association = Callable[[Candidates], Bool[Array, " m"]]
 
 def candidates(
     slam: AbstractStaged,
-    state: Any,
-    control: Any,
+    state: Belief,
+    control: Control,
     features: Features,
-    tolerance: Any = 0.0,
+    tolerance: Number = 0.0,
     *,
     curved: bool = False,
 ) -> Candidates:
@@ -112,7 +114,7 @@ def candidates(
 
 
 def _second_order(
-    slam: EkfSlam, state: Any, control: Any, slots: Int[Array, " m"]
+    slam: EkfSlam, state: Belief, control: Control, slots: Slots
 ) -> Float[Array, "m p p"]:
     """`½ tr(∂²h_a Q ∂²h_b Q)`, Q of what one measurement depends on (Bar-Shalom, Li, Kirubarajan,
     *Estimation with Applications to Tracking and Navigation*, 2001, §10.3.2)."""
@@ -217,14 +219,14 @@ ASSOCIATIONS: dict[str, Association] = {
 class _Node(NamedTuple):
     """A node of the search of `joint_compatibility`: the matches before `depth` are in or out."""
 
-    depth: Any
-    taken: Any
-    whitening: Any
+    depth: Int[Array, ""]
+    taken: Bool[Array, " m"]
+    whitening: Float[Array, "m*p m*p"]
     """`S_LL^(-1/2)` in the rows of what is taken."""
-    squares: Any
+    squares: Float[Array, " m"]
     """What each added to the distance of those before it."""
-    best: Any
-    count: Any
+    best: Bool[Array, " m"]
+    count: Int[Array, ""]
 
 
 def _whitened(found: Candidates, node: _Node):
@@ -334,7 +336,7 @@ def _snooped(found: Candidates, kept: Bool[Array, " m"]) -> Bool[Array, " m"]:
     return jax.lax.while_loop(fails, put_out, (information, kept))[1]
 
 
-def _eliminated(A: Float[Array, "m p m p"], match: Any) -> Float[Array, "m p m p"]:
+def _eliminated(A: Float[Array, "m p m p"], match: Int[Array, ""]) -> Float[Array, "m p m p"]:
     """`A − A_:i A_ii⁻¹ A_i:`."""
     across = A[:, :, match]
     gain = across @ _inverse(A[match, :, match])
@@ -352,6 +354,6 @@ def _squared(r: Float[Array, "m p"], S: Float[Array, "m p p"]) -> Float[Array, "
     return jnp.where(jnp.isnan(squared), jnp.inf, squared)
 
 
-def _chi2_quantile(dof: Any) -> Any:
+def _chi2_quantile(dof: int | np.ndarray) -> np.ndarray | np.floating:
     """The χ² value below which a true match is with probability `GATE`."""
     return 2 * scipy.special.gammaincinv(np.asarray(dof) / 2, GATE)

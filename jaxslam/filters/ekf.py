@@ -10,12 +10,13 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import fields, replace
-from typing import Any, get_args, get_type_hints
+from typing import get_args, get_type_hints
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jax.typing import DTypeLike
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.arrays import AnyArray, cast, precision
 from jaxslam.filters.forms.blocks import Prior
@@ -26,18 +27,24 @@ from jaxslam.filters.model import COMPOSED, Context, Core, SlamModel
 from jaxslam.filters.protocol import (
     AbstractFilter,
     AbstractStaged,
+    Belief,
     CameraView,
+    EachMoments,
     Expected,
     LandmarkView,
+    Moments,
+    OfCamera,
+    OfLandmark,
+    PoseError,
 )
 from jaxslam.geometry import Pose, SplitPose, difference, identity, tangent_dim
 from jaxslam.landmarks import INVERSE_SCALING, Parametrization
 from jaxslam.models.calibration import AbstractCalibration, Known, check_calibration
 from jaxslam.models.coordinates import ROBOCENTRIC, Coordinates
 from jaxslam.models.depth import InverseDepth
-from jaxslam.models.motion import AbstractMotion, check_control
-from jaxslam.models.observations import Capacity, Features, Innovation
-from jaxslam.models.scale import Metre, ScaleGauge
+from jaxslam.models.motion import AbstractMotion, Control, check_control
+from jaxslam.models.observations import Capacity, Features, Innovation, Slots
+from jaxslam.models.scale import Metre, ScaleGauge, prior_in_gauge
 from jaxslam.models.sensors import AbstractSensor
 
 
@@ -53,25 +60,25 @@ class AbstractEntry(eqx.Module):
         """The number of slots of the state that so many landmarks need."""
 
     @abstractmethod
-    def memory(self, landmarks: int, dtype: Any) -> Any:
+    def memory(self, landmarks: int, dtype: DTypeLike) -> PyTree:
         """The memory of an empty map."""
 
     @abstractmethod
     def update(
-        self, slam: EkfSlam, state: Any, control: Any, features: Features
-    ) -> tuple[Any, Innovation]:
+        self, slam: EkfSlam, state: Belief, control: Control, features: Features
+    ) -> tuple[Belief, Innovation]:
         """Correct by the features of landmarks, finished or not."""
 
     @abstractmethod
-    def initialise(self, slam: EkfSlam, state: Any, features: Features) -> Any:
+    def initialise(self, slam: EkfSlam, state: Belief, features: Features) -> Belief:
         """Begin new landmarks, seen from the current camera."""
 
     @abstractmethod
-    def collapsed(self, state: Any) -> Any:
+    def collapsed(self, state: Belief) -> Belief:
         """The state with one slot, and one Gaussian, a landmark."""
 
     @abstractmethod
-    def initialised(self, state: Any) -> Bool[Array, " landmarks"]:
+    def initialised(self, state: Belief) -> Bool[Array, " landmarks"]:
         """Whether each landmark is in the map as one Gaussian."""
 
 
@@ -143,7 +150,7 @@ class EkfSlam(AbstractStaged):
         """Whether the motion is composed before the update: where landmarks stay where they are."""
         return not self.coordinates.moves_landmarks
 
-    def init(self, capacity: int | Capacity, first: Features | None = None) -> Any:
+    def init(self, capacity: int | Capacity, first: Features | None = None) -> Belief:
         """An exactly known pose at the origin of B, the motion's start, an empty map.
 
         Raises ValueError for a capacity that is none, and for features of another shape.
@@ -154,12 +161,12 @@ class EkfSlam(AbstractStaged):
         check_features(self, first)
         return self.close(_with_frames_calibration(self, state), first)
 
-    def predict(self, state: Any, control: Any) -> Any:
+    def predict(self, state: Belief, control: Control) -> Belief:
         """Append this step's noise; move already where the motion is composed first."""
         check_control(self.motion, control)
         return composed_first(self, append_noise(self, state), control)
 
-    def predict_features(self, state: Any, control: Any, slots: Int[Array, " m"]) -> Expected:
+    def predict_features(self, state: Belief, control: Control, slots: Slots) -> Expected:
         context = context_of(self, control)
         model, core = self.model, state.core
         measured, covariance, possible = self.gaussian_form.predict_features(
@@ -174,12 +181,12 @@ class EkfSlam(AbstractStaged):
         possible = possible & state.active[slots]
         return Expected(measured, covariance, possible, model.camera_pose(core), points, omegas)
 
-    def update(self, state: Any, control: Any, seen: Features) -> tuple[Any, Innovation]:
+    def update(self, state: Belief, control: Control, seen: Features) -> tuple[Belief, Innovation]:
         """Correct by the features seen (P16, P17)."""
         check_features(self, seen)
         return self.entry.update(self, state, control, seen)
 
-    def compose(self, state: Any, control: Any) -> Any:
+    def compose(self, state: Belief, control: Control) -> Belief:
         """Move into the new camera frame, after the update (P18–P21); convert landmarks; make the
         camera a keyframe where one is due."""
         if not self.compose_first:
@@ -191,39 +198,32 @@ class EkfSlam(AbstractStaged):
             return state
         return convert(self.model, state, COMPOSED)
 
-    def close(self, state: Any, new: Features) -> Any:
+    def close(self, state: Belief, new: Features) -> Belief:
         """Begin new landmarks seen from the current camera (P22–P26), and end the frame."""
         check_features(self, new)
         return _forgotten(self, self.entry.initialise(self, state, new))
 
-    def remove(self, state: Any, gone: Bool[AnyArray, " capacity"]) -> Any:
+    def remove(self, state: Belief, gone: Bool[AnyArray, " capacity"]) -> Belief:
         return self.gaussian_form.remove(state, gone)
 
-    def marginal(
-        self, state: Any, function: Callable[[CameraView], Any]
-    ) -> tuple[Any, Float[Array, "k k"]]:
+    def marginal(self, state: Belief, function: OfCamera) -> Moments:
         """The marginal of the state at the end of a frame, to first order: `J P Jᵀ`."""
 
-        def of_core(core: Core) -> Any:
+        def of_core(core: Core) -> PyTree:
             return function(CameraView(self.model.camera_pose(core), core, core.log_scale))
 
         return self.form.core_covariance(of_core, state)
 
-    def landmark_marginal(
-        self,
-        state: Any,
-        function: Callable[[LandmarkView], Float[Array, " k"]],
-        slots: Int[Array, " m"],
-    ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
+    def landmark_marginal(self, state: Belief, function: OfLandmark, slots: Slots) -> EachMoments:
         """The same of landmarks."""
         return self.gaussian_form.landmark_covariance(
             composed, of_landmark(self, function), self.entry.collapsed(state), slots
         )
 
-    def in_map(self, state: Any) -> Bool[Array, " capacity"]:
+    def in_map(self, state: Belief) -> Bool[Array, " capacity"]:
         return self.entry.collapsed(state).active
 
-    def pose_error(self, state: Any, T_BC: Pose) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
+    def pose_error(self, state: Belief, T_BC: Pose) -> PoseError:
         """`T_true ⊟ T_est` of the pose that the coordinates hold, and its covariance."""
         coordinates = self.coordinates
         estimate, covariance = self.form.core_covariance(self.model.estimate, state)
@@ -251,32 +251,32 @@ def of_landmark(
     return value
 
 
-def append_noise(slam: EkfSlam, state: Any) -> Any:
+def append_noise(slam: EkfSlam, state: Belief) -> Belief:
     """Append this step's motion noise and calibration error (P10, P11, P15)."""
     start, sigma = state.core.part("noise").start, slam.model.noise_sigma
     state = slam.form.augment(state, start, jnp.diag(sigma**2))
     return _with_frames_calibration(slam, state)
 
 
-def composed_first(slam: EkfSlam, state: Any, control: Any) -> Any:
+def composed_first(slam: EkfSlam, state: Belief, control: Control) -> Belief:
     """Move already, where the motion is composed before the update."""
     if not slam.compose_first:
         return state
     return slam.form.compose(slam.model, state, Context(control))
 
 
-def context_of(slam: EkfSlam, control: Any) -> Context:
+def context_of(slam: EkfSlam, control: Control) -> Context:
     """The context of a predicted state's functions: the motion that is not yet composed."""
     return COMPOSED if slam.compose_first else Context(control)
 
 
 def correct(
     slam: EkfSlam,
-    state: Any,
-    control: Any,
+    state: Belief,
+    control: Control,
     seen: Features,
     share: Float[Array, " m"] | None = None,
-) -> tuple[Any, Any]:
+) -> tuple[Belief, PyTree]:
     """The Kalman update by features of slots, with a share ρ of each by R/ρ; and what the form
     says that it compared."""
     noise = slam.sensor.noise
@@ -286,14 +286,16 @@ def correct(
     return slam.form.update(slam.model, state, seen, noise, context, _considered(slam, state))
 
 
-def init_with_depths(slam: EkfSlam, capacity: int | Capacity, first: Features, prior: Prior) -> Any:
+def init_with_depths(
+    slam: EkfSlam, capacity: int | Capacity, first: Features, prior: Prior
+) -> Belief:
     """`init` of landmarks each of which has a prior of its own: mean and σ of 1/z."""
     check_features(slam, first)
     state = _with_frames_calibration(slam, slam.init(capacity))
     return _forgotten(slam, insert(slam, state, first, prior))
 
 
-def insert(slam: EkfSlam, state: Any, new: Features, prior: Prior | None = None) -> Any:
+def insert(slam: EkfSlam, state: Belief, new: Features, prior: Prior | None = None) -> Belief:
     """Insert Gaussians into slots; 1/z has the filter's prior, or one for each slot."""
     context = COMPOSED
     prior = _depth_prior(slam, state) if prior is None else prior
@@ -304,7 +306,7 @@ def insert(slam: EkfSlam, state: Any, new: Features, prior: Prior | None = None)
     return slam.form.initialise(slam.model, state, new, slam.sensor.noise, prior, context)
 
 
-def reanchored(slam: EkfSlam, state: Any) -> Any:
+def reanchored(slam: EkfSlam, state: Belief) -> Belief:
     """The current camera as the keyframe: landmarks move to it, and T_KC is known."""
     change, t = slam.model.reanchoring(), slam.model.geometry.tangent_dim
     return (
@@ -355,7 +357,7 @@ def check_can_track(slam: AbstractFilter, name: str) -> None:
     )
 
 
-def check_one_gaussian(base: Any, what: str, corrected: bool = False) -> None:
+def check_one_gaussian(base: AbstractFilter, what: str, corrected: bool = False) -> None:
     """Raise ValueError, saying of what, unless all that `base` knows is in one covariance.
 
     `corrected` by something else than the plain update is accepted too, on demand.
@@ -372,7 +374,7 @@ def check_one_gaussian(base: Any, what: str, corrected: bool = False) -> None:
             raise ValueError(f"{what} {why}")
 
 
-def _empty(slam: EkfSlam, capacity: int, dtype: Any) -> Any:
+def _empty(slam: EkfSlam, capacity: int, dtype: DTypeLike) -> Belief:
     geometry, held = slam.motion.geometry, slam.coordinates.from_base_pose
     slam = cast(slam, dtype)
     variables, log_scale, covariance = slam.scale.start(slam.motion)
@@ -405,23 +407,23 @@ def _empty(slam: EkfSlam, capacity: int, dtype: Any) -> Any:
     return state if slam.calibration.each_frame else _with_calibration(slam, state)
 
 
-def _no_anchors(slam: EkfSlam, capacity: int, dtype: Any) -> SplitPose | None:
+def _no_anchors(slam: EkfSlam, capacity: int, dtype: DTypeLike) -> SplitPose | None:
     if not slam.landmark.anchored:
         return None
     origin = SplitPose.of(identity(slam.motion.geometry, dtype))
     return jax.tree.map(lambda x: jnp.tile(x, (capacity, 1)), origin)
 
 
-def _with_calibration(slam: EkfSlam, state: Any) -> Any:
+def _with_calibration(slam: EkfSlam, state: Belief) -> Belief:
     covariance = jnp.diag(jnp.asarray(slam.calibration.sigma) ** 2)
     return slam.form.augment(state, state.core.part("calibration").start, covariance)
 
 
-def _with_frames_calibration(slam: EkfSlam, state: Any) -> Any:
+def _with_frames_calibration(slam: EkfSlam, state: Belief) -> Belief:
     return _with_calibration(slam, state) if slam.calibration.each_frame else state
 
 
-def _forgotten(slam: EkfSlam, state: Any) -> Any:
+def _forgotten(slam: EkfSlam, state: Belief) -> Belief:
     """The state without the frame's calibration error, where the next frame draws another."""
     if not slam.calibration.each_frame:
         return state
@@ -430,19 +432,19 @@ def _forgotten(slam: EkfSlam, state: Any) -> Any:
     return replace(slam.form.marginalise(state, part.start, part.stop - part.start), core=core)
 
 
-def _considered(slam: EkfSlam, state: Any) -> slice:
+def _considered(slam: EkfSlam, state: Belief) -> slice:
     """The part of the core that updates leave as it is."""
     return slice(0, 0) if slam.calibration.corrected else state.core.part("calibration")
 
 
-def _depth_prior(slam: EkfSlam, state: Any) -> tuple[Float[Array, " q"], Float[Array, " q"]]:
+def _depth_prior(slam: EkfSlam, state: Belief) -> tuple[Float[Array, " q"], Float[Array, " q"]]:
     """Mean and σ of what a measurement hides of a landmark, its own part alone."""
     hidden, depth = slam.sensor.hidden, slam.depth
     mean, sigma = jnp.tile(depth.mean, hidden), jnp.tile(depth.sigma, hidden) * depth.own
-    variance: Any = None
-    if isinstance(slam.scale, ScaleGauge):
-        variance = slam.form.core_covariance(lambda core: core.log_scale, state)[1][0, 0]
-    return slam.scale.prior(mean, sigma, variance)
+    if not isinstance(slam.scale, ScaleGauge):
+        return mean, sigma
+    _, variance = slam.form.core_covariance(lambda core: core.log_scale, state)
+    return prior_in_gauge(mean, sigma, variance[0, 0])
 
 
 def _free_anchor(state: State) -> Int[Array, ""]:

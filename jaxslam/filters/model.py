@@ -7,7 +7,7 @@ What the core holds is what the pieces declare.
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.filters.forms.blocks import Change
+from jaxslam.filters.protocol import Belief
 from jaxslam.geometry import (
     Geometry,
     Pose,
@@ -28,8 +29,8 @@ from jaxslam.landmarks.parametrization import Parametrization
 from jaxslam.models.calibration import AbstractCalibration
 from jaxslam.models.coordinates import Coordinates, KeyframePose, keyframe_due
 from jaxslam.models.depth import InverseDepth
-from jaxslam.models.motion import AbstractMotion
-from jaxslam.models.scale import Metre, ScaleGauge
+from jaxslam.models.motion import AbstractMotion, Control, Variables
+from jaxslam.models.scale import Metre, ScaleGauge, noise_in_gauge
 from jaxslam.models.sensors import AbstractSensor
 
 
@@ -39,7 +40,7 @@ class Core(eqx.Module):
     pose: Pose | SplitPose | KeyframePose
     """T_CB in a robocentric filter, T_BC in a world-centric one, T_BK and T_KC in one with
     keyframes: what the `Coordinates` hold."""
-    motion: Any
+    motion: Variables
     """What the motion model keeps: a velocity in the camera's own frame, a bias, nothing."""
     log_scale: Float[Array, " u"] | None
     """λ of a filter with a scale gauge, or None: lengths in the state are in units of `e^λ` of what
@@ -68,7 +69,7 @@ class Core(eqx.Module):
 class Context(NamedTuple):
     """Data of the model's functions beside core and landmark."""
 
-    control: Any
+    control: Control
     """The motion model's input for the motion between the map frame and the camera: seconds, or
     the odometry's reading; None once the motion is composed."""
     anchor: Int[Array, ""] | None = None
@@ -126,8 +127,9 @@ class SlamModel(eqx.Module):
         """The motion's noise in the units of the state, and the calibration's."""
         own = self.motion.noise_sigma.shape[-1]
         noise, drift = core.noise[:own], core.noise[own:]
-        log_scale: Any = core.log_scale
-        return self.scale.noise(self.motion, core.motion, noise, log_scale), drift
+        if core.log_scale is not None:
+            noise = noise_in_gauge(self.motion, core.motion, noise, core.log_scale)
+        return noise, drift
 
     def view(self, core: Core, context: Context) -> CameraInMap:
         """All that a landmark depends on."""
@@ -156,7 +158,7 @@ class SlamModel(eqx.Module):
         """The one pose whose error is the filter's, in metres."""
         return self.coordinates.estimate(self._metric_pose(core))
 
-    def _metric_pose(self, core: Core) -> Any:
+    def _metric_pose(self, core: Core) -> Pose | SplitPose | KeyframePose:
         """The pose as the core holds it, in metres."""
         if core.log_scale is None:
             return core.pose
@@ -183,7 +185,7 @@ class SlamModel(eqx.Module):
         moved = None if self.landmark.anchored else landmark
         return Change(core=core, view=self._map_from_camera, landmark=moved)
 
-    def reanchoring_due(self, state: Any) -> Bool[Array, ""]:
+    def reanchoring_due(self, state: Belief) -> Bool[Array, ""]:
         """Whether the camera is far from the map frame, its motion composed."""
         points, omegas = jax.vmap(self.landmark.homogeneous)(state.landmarks)
         inverse_distances = jnp.abs(omegas) / jnp.linalg.norm(points, axis=1)

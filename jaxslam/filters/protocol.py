@@ -9,15 +9,26 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam.geometry import Pose, difference
-from jaxslam.models.observations import Capacity, Features, Innovation
+from jaxslam.models.motion import Control
+from jaxslam.models.observations import Capacity, Features, Innovation, Slots
+
+Belief = PyTree
+"""Of a filter: a pytree of arrays that only the filter knows."""
+Moments = tuple[PyTree, Float[Array, "k k"]]
+"""Mean and covariance of a vector, or of a pytree of poses and vectors, whose covariance is of its
+tangent."""
+EachMoments = tuple[Float[Array, "m k"], Float[Array, "m k k"]]
+"""Means and covariances of some landmarks."""
+PoseError = tuple[Float[Array, " t"], Float[Array, "t t"]]
+"""The error of a pose, and its covariance."""
 
 
 class CameraView(eqx.Module):
@@ -25,7 +36,7 @@ class CameraView(eqx.Module):
 
     pose: Pose
     """T_BC, in metres."""
-    core: Any = None
+    core: PyTree = None
     """The filter's own variables; None of one that has none to show."""
     log_scale: Float[Array, " u"] | None = None
     """Numbers whose sum is the log of the filter's unit of length in metres; None of one that is in
@@ -43,6 +54,12 @@ class LandmarkView(eqx.Module):
     """ω, so that the point is X/ω metres."""
     log_scale: Float[Array, " u"] | None = None
     """As `CameraView` has it."""
+
+
+OfCamera = Callable[[CameraView], PyTree]
+"""A function of the camera: a vector, or a pytree of poses and vectors."""
+OfLandmark = Callable[[LandmarkView], Float[Array, " k"]]
+"""A function of one landmark."""
 
 
 class Expected(NamedTuple):
@@ -64,30 +81,22 @@ class AbstractFilter(eqx.Module):
     """A recursive estimator of a camera's pose and of a map."""
 
     @abstractmethod
-    def init(self, capacity: int | Capacity, first: Features | None = None) -> Any:
+    def init(self, capacity: int | Capacity, first: Features | None = None) -> Belief:
         """The state before the first motion: at the origin of B. With the features of frame 0, in
         which everything is new, the state after it."""
 
     @abstractmethod
     def step(
-        self, state: Any, control: Any, seen: Features, new: Features
-    ) -> tuple[Any, Innovation]:
+        self, state: Belief, control: Control, seen: Features, new: Features
+    ) -> tuple[Belief, Innovation]:
         """One frame: `seen` are features of landmarks in the map, `new` those to insert."""
 
     @abstractmethod
-    def marginal(
-        self, state: Any, function: Callable[[CameraView], Any]
-    ) -> tuple[Any, Float[Array, "k k"]]:
-        """Mean and covariance of `function(view)` of the camera: of a vector, or of a pytree of
-        poses and vectors, whose covariance is of its tangent."""
+    def marginal(self, state: Belief, function: OfCamera) -> Moments:
+        """Mean and covariance of `function(view)` of the camera."""
 
     @abstractmethod
-    def landmark_marginal(
-        self,
-        state: Any,
-        function: Callable[[LandmarkView], Float[Array, " k"]],
-        slots: Int[Array, " m"],
-    ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
+    def landmark_marginal(self, state: Belief, function: OfLandmark, slots: Slots) -> EachMoments:
         """Mean and covariance of `function(view)` of the landmark in each of these slots."""
 
     @property
@@ -96,17 +105,17 @@ class AbstractFilter(eqx.Module):
         filter itself, unless it says otherwise."""
         return self
 
-    def in_map(self, state: Any) -> Bool[Array, " capacity"]:
+    def in_map(self, state: Belief) -> Bool[Array, " capacity"]:
         """Whether each slot holds a landmark."""
         return state.active
 
-    def pose_error(self, state: Any, T_BC: Pose) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
+    def pose_error(self, state: Belief, T_BC: Pose) -> PoseError:
         """The error against a true pose, in the coordinates in which the filter keeps it, and its
         covariance: what NEES is made of."""
         pose, covariance = self.marginal(state, lambda view: view.pose)
         return difference(T_BC, pose), covariance
 
-    def unit_fixed(self, state: Any) -> Bool[Array, ""]:
+    def unit_fixed(self, state: Belief) -> Bool[Array, ""]:
         """Whether poses from now on are in one unit; false while a start is being found out, and
         every frame has another."""
         del state
@@ -123,43 +132,43 @@ class AbstractStaged(AbstractFilter):
         return False
 
     @abstractmethod
-    def predict(self, state: Any, control: Any) -> Any:
+    def predict(self, state: Belief, control: Control) -> Belief:
         """Predict the state before the frame's measurements."""
 
     @abstractmethod
-    def predict_features(self, state: Any, control: Any, slots: Int[Array, " m"]) -> Expected:
+    def predict_features(self, state: Belief, control: Control, slots: Slots) -> Expected:
         """The features that a predicted state expects to see."""
 
     @abstractmethod
-    def update(self, state: Any, control: Any, seen: Features) -> tuple[Any, Innovation]:
+    def update(self, state: Belief, control: Control, seen: Features) -> tuple[Belief, Innovation]:
         """Correct a predicted state by the features seen (P16, P17)."""
 
     @abstractmethod
-    def compose(self, state: Any, control: Any) -> Any:
+    def compose(self, state: Belief, control: Control) -> Belief:
         """Move into the new camera frame (P18–P21)."""
 
     @abstractmethod
-    def close(self, state: Any, new: Features) -> Any:
+    def close(self, state: Belief, new: Features) -> Belief:
         """Insert new landmarks, seen from the current camera (P22–P26), and end the frame."""
 
     @abstractmethod
-    def remove(self, state: Any, gone: Bool[AnyArray, " capacity"]) -> Any:
+    def remove(self, state: Belief, gone: Bool[AnyArray, " capacity"]) -> Belief:
         """Marginalise landmarks and free their slots."""
 
     def step(
-        self, state: Any, control: Any, seen: Features, new: Features
-    ) -> tuple[Any, Innovation]:
+        self, state: Belief, control: Control, seen: Features, new: Features
+    ) -> tuple[Belief, Innovation]:
         """One frame by its stages."""
         state = self.predict(state, control)
         state, innovation = self.update(state, control, seen)
         return self.close(self.compose(state, control), new), innovation
 
-    def moving(self, state: Any) -> Bool[Array, ""]:
+    def moving(self, state: Belief) -> Bool[Array, ""]:
         """Whether the newest frame says anything of how the camera moves."""
         del state
         return jnp.ones((), bool)
 
-    def gaussian(self, state: Any, control: Any) -> tuple[AbstractStaged, Any]:
+    def gaussian(self, state: Belief, control: Control) -> tuple[AbstractStaged, Belief]:
         """A filter and a predicted state of it that is one Gaussian: what hypotheses are tried
         on. The filter itself, unless its state is more than that."""
         del control

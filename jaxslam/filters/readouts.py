@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +11,13 @@ from jaxtyping import Array, Float, Int
 
 from jaxslam._numerics.linalg import semidefinite_root
 from jaxslam.filters.ekf import EkfSlam, composed, of_landmark
-from jaxslam.filters.protocol import AbstractFilter, CameraView, LandmarkView
+from jaxslam.filters.protocol import AbstractFilter, Belief, CameraView, LandmarkView
 from jaxslam.geometry import Pose, Scalar, retract, scaled
+from jaxslam.models.observations import Slots
 from jaxslam.models.sensors import AbstractSensor
 
 
-def camera_pose(slam: AbstractFilter, state: Any) -> tuple[Pose, Float[Array, "t t"]]:
+def camera_pose(slam: AbstractFilter, state: Belief) -> tuple[Pose, Float[Array, "t t"]]:
     """T_BC and its covariance in the right tangent: position in camera axes, orientation."""
     return slam.marginal(state, lambda view: view.pose)
 
@@ -33,7 +34,7 @@ class InUnit(NamedTuple):
     log_scale_variance: Scalar
 
 
-def camera_pose_in_unit(slam: AbstractFilter, state: Any) -> InUnit:
+def camera_pose_in_unit(slam: AbstractFilter, state: Belief) -> InUnit:
     """T_BC in the filter's own unit, `(R, t e^−Σλ)`, and beside it Σλ, the log of that in metres.
 
     The camera's path is known much better than its size: λ wanders while nothing observes it, and a
@@ -50,7 +51,7 @@ def camera_pose_in_unit(slam: AbstractFilter, state: Any) -> InUnit:
 
 
 def landmarks_in_unit(
-    slam: AbstractFilter, state: Any, slots: Int[Array, " m"]
+    slam: AbstractFilter, state: Belief, slots: Slots
 ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
     """`landmarks_in_world` in the filter's own unit of length, with covariances of these."""
 
@@ -60,20 +61,20 @@ def landmarks_in_unit(
     return slam.landmark_marginal(state, point, slots)
 
 
-def log_unit(slam: AbstractFilter, state: Any) -> Scalar:
+def log_unit(slam: AbstractFilter, state: Belief) -> Scalar:
     """Mean of the log of the filter's unit of length in metres, Σλ."""
     return slam.marginal(state, lambda view: _log_scale(view)[None])[0][0]
 
 
 def landmarks_in_camera(
-    slam: AbstractFilter, state: Any, slots: Int[Array, " m"], sensor: AbstractSensor
+    slam: AbstractFilter, state: Belief, slots: Slots, sensor: AbstractSensor
 ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
     """The sensor's chart of landmarks, (x/z, y/z, 1/z) of a camera, with covariances."""
     return slam.landmark_marginal(state, lambda view: sensor.chart(view.point, view.omega), slots)
 
 
 def landmarks_from_above(
-    slam: AbstractFilter, state: Any, slots: Int[Array, " m"]
+    slam: AbstractFilter, state: Belief, slots: Slots
 ) -> tuple[Float[Array, "m 2"], Float[Array, "m 2 2"]]:
     """Azimuth (from z towards x, axes of B) and inverse horizontal distance from the camera.
 
@@ -90,7 +91,7 @@ def landmarks_from_above(
 
 
 def landmarks_on_sides(
-    slam: AbstractFilter, state: Any, slots: Int[Array, " m"], sigmas: float = 2.0
+    slam: AbstractFilter, state: Belief, slots: Slots, sigmas: float = 2.0
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """The numbers of landmarks surely in front of infinity, 1/z > 0, and surely behind.
 
@@ -105,7 +106,7 @@ def landmarks_on_sides(
 
 
 def landmarks_in_world(
-    slam: AbstractFilter, state: Any, slots: Int[Array, " m"]
+    slam: AbstractFilter, state: Belief, slots: Slots
 ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
     """Points in B and their covariances, the camera's uncertainty included.
 
@@ -116,8 +117,8 @@ def landmarks_in_world(
 
 def landmark_samples(
     slam: EkfSlam,
-    state: Any,
-    slots: Int[Array, " m"],
+    state: Belief,
+    slots: Slots,
     key: Array,
     count: int = 1000,
     function: Callable[[LandmarkView], Float[Array, " k"]] | None = None,

@@ -7,7 +7,7 @@ by the objects; here is only what each word makes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -45,44 +45,47 @@ from jaxslam.simulation.pieces import (
 )
 from jaxslam.simulation.scenario import Scenario, as_scenario
 
+Piece = Any
+"""Of a filter, as `EkfSlam` takes it: `motion`, `sensor`, `landmark`, `calibration`, `depth`."""
 
-def robocentric(**pieces: Any) -> EkfSlam:
+
+def robocentric(**pieces: Piece) -> EkfSlam:
     """The paper's filter: landmarks in the camera frame, composition after the update."""
     return EkfSlam(coordinates=ROBOCENTRIC, **pieces)
 
 
-def world(**pieces: Any) -> EkfSlam:
+def world(**pieces: Piece) -> EkfSlam:
     """The classical filter: landmarks in the base frame, prediction composed first."""
     return EkfSlam(coordinates=WORLD, **pieces)
 
 
-def keyframe(**pieces: Any) -> EkfSlam:
+def keyframe(**pieces: Piece) -> EkfSlam:
     """Landmarks in the camera of the current keyframe, prediction composed first."""
     return EkfSlam(coordinates=KEYFRAME, **pieces)
 
 
-def information(**pieces: Any) -> EkfSlam:
+def information(**pieces: Piece) -> EkfSlam:
     """`keyframe` in information form: the same estimates by sparse, additive updates."""
     return EkfSlam(coordinates=KEYFRAME, form=Information(), **pieces)
 
 
-def scale_gauge(**pieces: Any) -> EkfSlam:
+def scale_gauge(**pieces: Piece) -> EkfSlam:
     """The paper's filter in a unit of length of its own, whose size is estimated."""
     return EkfSlam(coordinates=ROBOCENTRIC, scale=ScaleGauge(), **pieces)
 
 
-def world_gauge(**pieces: Any) -> EkfSlam:
+def world_gauge(**pieces: Piece) -> EkfSlam:
     """`scale_gauge` with landmarks in the base frame; its covariance is too small where the camera
     turns."""
     return EkfSlam(coordinates=WORLD, scale=ScaleGauge(), **pieces)
 
 
-def iterated_filter(**pieces: Any) -> FixedLag:
+def iterated_filter(**pieces: Piece) -> FixedLag:
     """The paper's filter, iterated: linearised at the maximum of the posterior of every frame."""
     return to_maximum(robocentric(**pieces))
 
 
-def invariant(**pieces: Any) -> EkfSlam:
+def invariant(**pieces: Piece) -> EkfSlam:
     """`world` with the right-invariant error: landmarks' errors move with the pose's."""
     return EkfSlam(coordinates=WORLD, form=Covariance(Invariant()), **pieces)
 
@@ -97,7 +100,7 @@ FILTERS: dict[str, Callable[..., AbstractFilter]] = {
     "iterated": iterated_filter,
     "invariant": invariant,
 }
-"""By name, of the pieces `motion`, `sensor`, `landmark`, `calibration`, `depth`."""
+"""By name, of pieces."""
 
 
 def with_common_depth(slam: EkfSlam, percent: int | None) -> EkfSlam:
@@ -160,7 +163,7 @@ _OF_ONE_FILTER: dict[str, Callable[[EkfSlam, int | None], EkfSlam]] = {
     "oc": with_observability_constraint,
     "fej": _with_correction("fej", FirstEstimates()),
 }
-_AROUND_ANY_FILTER: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
+_AROUND_ANY_FILTER: dict[str, Callable[..., AbstractFilter]] = {
     "lag": lambda slam, frames: FixedLag(slam, LAG if frames is None else frames),
     "iterated": iterated,
     "scales": lambda slam, count: GaussianSum(
@@ -176,7 +179,7 @@ _AROUND_ANY_FILTER: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
         slam, tolerance=TOLERANCE if percent is None else percent / 100
     ),
 }
-MODIFIERS: dict[str, Callable[[Any, int | None], AbstractFilter]] = {
+MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
     **_OF_ONE_FILTER,
     **_AROUND_ANY_FILTER,
 }
@@ -209,7 +212,7 @@ def recommended_name(motion: AbstractMotion) -> str:
     return (RECOMMENDED if told else FROM_REST)[geometry.name]
 
 
-def make_filter(name: str, **pieces: Any) -> AbstractFilter:
+def make_filter(name: str, **pieces: Piece) -> AbstractFilter:
     """One filter by its name, with its modifiers, of pieces as `EkfSlam` takes them.
 
     Raises ValueError for a name that is not known, and for what does not go together.
@@ -217,7 +220,7 @@ def make_filter(name: str, **pieces: Any) -> AbstractFilter:
     if name == "recommended":
         name = recommended_name(pieces["motion"])
     base, *modifiers = name.split("+")
-    made: Any = lookup("filters", [base], FILTERS)[base](**pieces)
+    made: AbstractFilter = lookup("filters", [base], FILTERS)[base](**pieces)
     for modifier in modifiers:
         word = modifier.rstrip("0123456789")
         number = modifier[len(word) :]
@@ -256,7 +259,7 @@ def make_filters(
     }
 
 
-def scenario_pieces(scenario: Scenario, calibration: str | None = None) -> dict[str, Any]:
+def scenario_pieces(scenario: Scenario, calibration: str | None = None) -> dict[str, Piece]:
     """The pieces of a filter that fits the scenario, as `EkfSlam` takes them. Raises ValueError."""
     word = scenario.calibration if calibration is None else calibration
     treatment = lookup("calibration", [word], TREATMENTS)[word]
@@ -276,6 +279,6 @@ def recommended(
     depth: InverseDepth | None = None,
 ) -> AbstractFilter:
     """The filter to take, of one's own pieces: `recommended_name`."""
-    pieces: Mapping[str, Any] = {"calibration": calibration, "depth": depth}
-    given = {name: piece for name, piece in pieces.items() if piece is not None}
+    given = {"calibration": calibration, "depth": depth}
+    given = {name: piece for name, piece in given.items() if piece is not None}
     return make_filter("recommended", motion=motion, sensor=sensor, landmark=landmark, **given)

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.protocol import AbstractFilter, Belief
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.geometry import Pose
+from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features, Innovation
 
 
 class Frames(NamedTuple):
     """The inputs of a filter in the frames after frame 0: every array begins with their axis."""
 
-    control: PyTree
+    control: Control
     """The motion model's: seconds, the odometry's reading, …"""
     seen: Features
     """Of landmarks in the map."""
@@ -42,10 +43,10 @@ class Estimates(NamedTuple):
 
 def run(
     slam: AbstractFilter,
-    frames: Any,
-    state: PyTree,
-    output: Callable[[PyTree, Innovation, Any], Any] | None = None,
-) -> tuple[PyTree, Any]:
+    frames: PyTree,
+    state: Belief,
+    output: Callable[[Belief, Innovation, PyTree], PyTree] | None = None,
+) -> tuple[Belief, PyTree]:
     """Return the last state, and the `Estimates` of every frame.
 
     `frames` are `Frames`, or a pytree with these fields and others; `state` is that of `init`.
@@ -58,13 +59,13 @@ def run(
             "needed where landmarks come and go"
         )
 
-    def estimates(state: PyTree, innovation: Innovation, _: Any) -> Estimates:
+    def estimates(state: Belief, innovation: Innovation, _: PyTree) -> Estimates:
         seen = innovation.nis, innovation.nis_dof, innovation.status
         return Estimates(*camera_pose(slam, state), *seen)
 
     collect = estimates if output is None else output
 
-    def step(state: PyTree, frame: Any) -> tuple[PyTree, Any]:
+    def step(state: Belief, frame: PyTree) -> tuple[Belief, PyTree]:
         if frame.gone is not None:
             state = slam.remove(state, frame.gone)  # ty: ignore[missing-attribute]
         state, innovation = slam.step(state, frame.control, frame.seen, frame.new)

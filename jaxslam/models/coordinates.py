@@ -10,14 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam.geometry import Pose, SplitPose, log
+
+Held = PyTree
+"""What a state holds of the pose."""
 
 KEYFRAME_TURN = 0.05
 """A camera that has turned more than this from its keyframe becomes the next one, rad."""
@@ -34,17 +36,17 @@ class Coordinates:
     name: str
     moves_landmarks: bool
     """Whether composition moves landmarks."""
-    from_base_pose: Callable[[Pose], Any]
+    from_base_pose: Callable[[Pose], Held]
     """What the state holds of T_BC at the start: its error is this pytree's tangent."""
-    camera_pose: Callable[[Any], Pose]
+    camera_pose: Callable[[Held], Pose]
     """T_BC, the inverse of `from_base_pose`."""
-    estimate: Callable[[Any], Pose | SplitPose]
+    estimate: Callable[[Held], Pose | SplitPose]
     """The one pose whose error is the filter's: what is held, where that is one pose."""
-    map_from_camera: Callable[[Any, Pose], Pose]
+    map_from_camera: Callable[[Held, Pose], Pose]
     """T_AC(k), from what was held at k−1 and the displacement."""
-    compose: Callable[[Any, Pose], Any]
+    compose: Callable[[Held, Pose], Held]
     """What is held at k, from that at k−1 and the displacement."""
-    reanchor: Callable[[Any], Any] | None = None
+    reanchor: Callable[[Held], Held] | None = None
     """What is held once the current camera is the map frame; None where that never changes."""
 
 

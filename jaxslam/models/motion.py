@@ -6,19 +6,24 @@ vehicle. A model of your own is one class with the functions of `AbstractMotion`
 """
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float, PyTree
 
 from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field
 from jaxslam.geometry import GEOMETRIES, Geometry, Pose, Scalar, exp, identity, joined
 
 Tangent = Float[Array, " t"]
 """A velocity, or a displacement: linear, then angular."""
+Variables = PyTree
+"""Of a model in the state: poses and vectors."""
+Control = PyTree
+"""A model's input for one step, or for each of some."""
 
 
 class AbstractMotion(eqx.Module):
@@ -42,30 +47,32 @@ class AbstractMotion(eqx.Module):
         def noise_told(self) -> bool:
             """Whether σ is known in metres, of a model with a velocity."""
 
-    def start(self) -> tuple[Any, Float[Array, "v v"]]:
+    def start(self) -> tuple[Variables, Float[Array, "v v"]]:
         """The variables before the first step, and a root of their covariance, `P = R Rᵀ`."""
         return (), jnp.zeros((0, 0))
 
     @abstractmethod
-    def displacement(self, variables: Any, noise: Float[Array, " q"], control: Any) -> Pose:
+    def displacement(
+        self, variables: Variables, noise: Float[Array, " q"], control: Control
+    ) -> Pose:
         """T_{k-1,k}, the pose of C_k in C_{k-1}."""
 
-    def next(self, variables: Any, noise: Float[Array, " q"], control: Any) -> Any:
+    def next(self, variables: Variables, noise: Float[Array, " q"], control: Control) -> Variables:
         """The variables after the step; as they were, unless a model says otherwise."""
         del noise, control
         return variables
 
     @abstractmethod
-    def still(self, dtype: Any = None) -> Any:
+    def still(self, dtype: DTypeLike | None = None) -> Control:
         """The control with which nothing moves."""
 
-    def nominal_control(self, velocity: Float[Array, " t"], seconds: Number) -> Any:
+    def nominal_control(self, velocity: Float[Array, " t"], seconds: Number) -> Control:
         """The control of a step at a constant velocity: what a simulation gives the model."""
         raise NotImplementedError(f"{type(self).__name__} does not say how to simulate it")
 
     def enlarged(
-        self, variables: Any, noise: Float[Array, " q"], factor: Scalar
-    ) -> tuple[Any, Float[Array, " q"]]:
+        self, variables: Variables, noise: Float[Array, " q"], factor: Scalar
+    ) -> tuple[Variables, Float[Array, " q"]]:
         """Variables and noise in a unit of length that is 1/factor; a model that is given metres
         has no other."""
         del factor
@@ -119,7 +126,7 @@ class ConstantVelocity(AbstractMotion):
         """`v_k = v_{k-1} + a Δt` (P8), linear then angular, in the camera's own frame."""
         return variables + noise * control
 
-    def still(self, dtype: Any = None) -> Scalar:
+    def still(self, dtype: DTypeLike | None = None) -> Scalar:
         return jnp.zeros((), dtype)
 
     def nominal_control(self, velocity: Tangent, seconds: Number) -> Number:
@@ -154,7 +161,7 @@ class Odometry(AbstractMotion):
         moved, turned = jnp.split(control + noise, [self.geometry.point_dim])
         return joined(exp(self.geometry.rotation_group, turned), moved)
 
-    def still(self, dtype: Any = None) -> Tangent:
+    def still(self, dtype: DTypeLike | None = None) -> Tangent:
         return jnp.zeros(self.geometry.tangent_dim, dtype)
 
     def nominal_control(self, velocity: Tangent, seconds: Number) -> Tangent:
@@ -193,12 +200,12 @@ class BodyRates(AbstractMotion):
         step = joined(exp(self.geometry.rotation_group, turned), moved)
         return control.camera.inverse() @ step @ control.camera
 
-    def still(self, dtype: Any = None) -> VehicleRates:
+    def still(self, dtype: DTypeLike | None = None) -> VehicleRates:
         zero = jnp.zeros(self.geometry.tangent_dim, dtype)
         return VehicleRates(zero, jnp.zeros((), dtype), identity(self.geometry, zero.dtype))
 
 
-def check_control(motion: AbstractMotion, control: Any) -> None:
+def check_control(motion: AbstractMotion, control: Control) -> None:
     """Raise ValueError unless a control has the structure and shapes that the model asks for."""
     wanted = jax.eval_shape(motion.still)
     found = jax.tree.structure(control), [np.shape(x) for x in jax.tree.leaves(control)]
@@ -209,7 +216,7 @@ def check_control(motion: AbstractMotion, control: Any) -> None:
         )
 
 
-def _described(control: Any) -> str:
+def _described(control: Control) -> str:
     shapes = [str(np.shape(x)) for x in jax.tree.leaves(control)]
     kind = "an array" if len(shapes) == 1 else f"{type(control).__name__} with arrays"
     return f"{kind} of shape {', '.join(shapes)}"

@@ -11,6 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.arrays import AnyArray
 
+Slots = Int[Array, " m"]
+"""Places of landmarks in the state; one out of bounds is none."""
+
 
 class Capacity(NamedTuple):
     """The capacity of a state; an `int` stands for as many of each."""

@@ -2,38 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam.geometry import Scalar
-from jaxslam.models.motion import AbstractMotion
+from jaxslam.models.motion import AbstractMotion, Variables
 
 
 class Metre(eqx.Module):
     """Lengths in the state are metres: there is no λ."""
 
-    def start(self, motion: AbstractMotion) -> tuple[Any, None, Float[Array, "v v"]]:
+    def start(self, motion: AbstractMotion) -> tuple[Variables, None, Float[Array, "v v"]]:
         """Mean of the motion's variables, no λ, and their covariance."""
         variables, root = motion.start()
         return variables, None, root @ root.T
-
-    def noise(
-        self, motion: AbstractMotion, variables: Any, noise: Float[Array, " q"], log_scale: None
-    ) -> Float[Array, " q"]:
-        """The step's noise, m/s² or m, as it is."""
-        del motion, variables, log_scale
-        return noise
-
-    def prior(
-        self, mean: Float[Array, " q"], sigma: Float[Array, " q"], variance: Scalar | None
-    ) -> tuple[Float[Array, " q"], Float[Array, " q"]]:
-        """Mean and σ of 1/z in the state's unit."""
-        del variance
-        return mean, sigma
 
 
 class ScaleGauge(eqx.Module):
@@ -48,32 +32,32 @@ class ScaleGauge(eqx.Module):
         mean, covariance = velocity_in_gauge(velocity, root, motion.geometry.point_dim)
         return mean[:-1], mean[-1:], covariance
 
-    def noise(
-        self,
-        motion: AbstractMotion,
-        variables: Float[Array, " v"],
-        noise: Float[Array, " q"],
-        log_scale: Float[Array, " u"],
-    ) -> Float[Array, " q"]:
-        """The step's noise in the units of the state.
 
-        λ is frozen at its estimate: the noise's amplitude says nothing about scale, but its
-        derivative by λ would pretend so.
-        """
-        unit = jnp.exp(-jax.lax.stop_gradient(log_scale[0]))
-        return motion.enlarged(variables, noise, unit)[1]
+def noise_in_gauge(
+    motion: AbstractMotion,
+    variables: Float[Array, " v"],
+    noise: Float[Array, " q"],
+    log_scale: Float[Array, " u"],
+) -> Float[Array, " q"]:
+    """The step's noise in the units of the state.
 
-    def prior(
-        self, mean: Float[Array, " q"], sigma: Float[Array, " q"], variance: Scalar
-    ) -> tuple[Float[Array, " q"], Float[Array, " q"]]:
-        """Mean and σ of 1/z such that `e^λ/z`, linear in λ, has its exact first two moments.
+    λ is frozen at its estimate: the noise's amplitude says nothing about scale, but its
+    derivative by λ would pretend so.
+    """
+    unit = jnp.exp(-jax.lax.stop_gradient(log_scale[0]))
+    return motion.enlarged(variables, noise, unit)[1]
 
-        `E e^λ ρ = ρ0 e^(λ + P/2)` for a ρ ~ N(ρ0, σ²) and λ of variance P; the slope by λ is the
-        mean, and the variance that it leaves is `e^2λ ((ρ0² + σ²) e^2P − ρ0² e^P (1 + P))`.
-        """
-        P = variance
-        left = (mean**2 + sigma**2) * jnp.exp(2 * P) - mean**2 * jnp.exp(P) * (1 + P)
-        return mean * jnp.exp(P / 2), jnp.sqrt(left)
+
+def prior_in_gauge(
+    mean: Float[Array, " q"], sigma: Float[Array, " q"], P: Scalar
+) -> tuple[Float[Array, " q"], Float[Array, " q"]]:
+    """Mean and σ of 1/z such that `e^λ/z`, linear in λ, has its exact first two moments.
+
+    `E e^λ ρ = ρ0 e^(λ + P/2)` for a ρ ~ N(ρ0, σ²) and λ of variance P; the slope by λ is the
+    mean, and the variance that it leaves is `e^2λ ((ρ0² + σ²) e^2P − ρ0² e^P (1 + P))`.
+    """
+    left = (mean**2 + sigma**2) * jnp.exp(2 * P) - mean**2 * jnp.exp(P) * (1 + P)
+    return mean * jnp.exp(P / 2), jnp.sqrt(left)
 
 
 def velocity_in_gauge(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,7 +11,7 @@ from matplotlib.figure import Figure
 
 from jaxslam._runtime.lookup import lookup
 from jaxslam.consistency import Study, summarise
-from jaxslam.consistency.summary import as_summary
+from jaxslam.consistency.summary import Summary, as_summary
 from jaxslam.evaluation.result import OUTSIDE
 from jaxslam.plots.landmarks import region_from_above
 from jaxslam.plots.style import (
@@ -38,7 +37,7 @@ _MEDIAN_OF_NORMAL = 0.6745
 
 def plot_consistency(
     study: Study,
-    summary: dict[str, Any] | None = None,
+    summary: Summary | None = None,
     path: str | Path | None = None,
     *,
     column: bool = False,
@@ -58,7 +57,7 @@ def plot_consistency(
     return figure
 
 
-def _column(summary: dict[str, Any]) -> Figure:
+def _column(summary: Summary) -> Figure:
     drawn = [plot_nees, plot_outside]
     if summary["scale_free"]:
         drawn += [plot_beyond_scale, plot_log_scale]
@@ -71,7 +70,7 @@ def _column(summary: dict[str, Any]) -> Figure:
     return figure
 
 
-def _page(study: Study, summary: dict[str, Any]) -> Figure:
+def _page(study: Study, summary: Summary) -> Figure:
     geometry = study.scenario.world
     rows, free = geometry.tangent_dim // 3, summary["scale_free"]
     heights = [2.1, *[1.3] * free, *[1.1] * rows]
@@ -102,7 +101,7 @@ Labels = Mapping[str, str]
 """What filters are called at the ends of their lines: `{"robocentric/inverse_depth": "UID"}`."""
 
 
-def plot_nees(summary: dict[str, Any] | Study, *, ax: Axes, label: Labels | None = None) -> Axes:
+def plot_nees(summary: Summary | Study, *, ax: Axes, label: Labels | None = None) -> Axes:
     """Mean NEES of every filter over time with its exact 95 % band, and the medians, dotted.
 
     `summary` is of `summarise`, or a study. Names stand at the ends of the lines; a filter may be
@@ -118,14 +117,14 @@ def plot_nees(summary: dict[str, Any] | Study, *, ax: Axes, label: Labels | None
     return ax
 
 
-def _of_some(summary: dict[str, Any]) -> str:
+def _of_some(summary: Summary) -> str:
     """The text that says of which runs the medians are, where it is not all."""
     some = summary.get("medians_of", summary["runs"])  # not in earlier versions
     return "" if some == summary["runs"] else f" of the first {some} runs"
 
 
 def _plot_means(
-    numbers: dict[str, dict[str, Any]], summary: dict[str, Any], ax: Axes, label: Labels | None
+    numbers: dict[str, Summary], summary: Summary, ax: Axes, label: Labels | None
 ) -> None:
     """Means with the band of the first, and medians, over time."""
     time, first = np.array(summary["time"]), next(iter(numbers.values()))
@@ -145,7 +144,7 @@ def _plot_means(
     _name(ax, time, lines, label)
 
 
-def _styled(numbers: Mapping[str, Any]):
+def _styled(numbers: Mapping[str, Summary]):
     """Filters and their numbers, with the style of their lines."""
     return [(item, line_style(i)) for i, item in enumerate(numbers.items())]
 
@@ -158,7 +157,7 @@ def _name(ax: Axes, time: np.ndarray, lines: list, label: Labels | None) -> None
     label_ends(ax, [End(called[name], time, values, colour) for name, values, colour in lines])
 
 
-def plot_outside(summary: dict[str, Any] | Study, *, ax: Axes, label: Labels | None = None) -> Axes:
+def plot_outside(summary: Summary | Study, *, ax: Axes, label: Labels | None = None) -> Axes:
     """Share of errors outside ±3σ over time, of the position (solid) and the orientation (thin).
 
     Names stand at the ends of the position's lines; a filter may be called otherwise by `label`.
@@ -187,7 +186,7 @@ def _over_time(axes: Axes, time: np.ndarray) -> None:
     axes.grid(alpha=0.25, which="major")
 
 
-def _with_scale(given: dict[str, Any] | Study) -> dict[str, Any]:
+def _with_scale(given: Summary | Study) -> Summary:
     """A summary that has the scale's error. Raises ValueError where the scale is no unknown."""
     summary = as_summary(given)
     if not summary["scale_free"]:
@@ -195,9 +194,7 @@ def _with_scale(given: dict[str, Any] | Study) -> dict[str, Any]:
     return summary
 
 
-def plot_beyond_scale(
-    summary: dict[str, Any] | Study, *, ax: Axes, label: Labels | None = None
-) -> Axes:
+def plot_beyond_scale(summary: Summary | Study, *, ax: Axes, label: Labels | None = None) -> Axes:
     """Mean and median NEES at the one scale of a run that explains all of its poses best.
 
     Where the scale is free; names at the ends of the lines, or those of `label`.
@@ -211,9 +208,7 @@ def plot_beyond_scale(
     return ax
 
 
-def plot_log_scale(
-    summary: dict[str, Any] | Study, *, ax: Axes, label: Labels | None = None
-) -> Axes:
+def plot_log_scale(summary: Summary | Study, *, ax: Axes, label: Labels | None = None) -> Axes:
     """The error of log-scale and what it should be by the σ claimed: medians, as one reversed run,
     which no scale explains, has an error and a σ beyond all others.
 
@@ -238,14 +233,14 @@ def plot_log_scale(
     return ax
 
 
-def _title(summary: dict[str, Any]) -> str:
+def _title(summary: Summary) -> str:
     """The verdict on every filter, how many of its runs were lost, and what was run."""
     verdicts = (f"{name}: {_verdict(f)}" for name, f in summary["filters"].items())
     told = f"{summary['runs']} runs, seed {summary['seed']}; over all steps, [99 % interval]"
     return "\n".join([*verdicts, f"{summary['scenario']['name']}, {told}"])
 
 
-def _verdict(f: dict[str, Any]) -> str:
+def _verdict(f: Summary) -> str:
     ever = f["lost_ever"][-1]
     lost = f"; {ever:.1%} of the runs lost" if ever else ""
     return headline(f["verdict"]) + lost

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
-from jaxslam._numerics.arrays import numbers
+from jaxslam._numerics.arrays import AnyArray, numbers
 from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import AbstractMotion, ConstantVelocity, Odometry
@@ -27,7 +26,7 @@ def sensor_of(scenario: Scenario) -> AbstractSensor:
     return Pinhole(Camera(scenario.focal, scenario.centre), scenario.pixel_sigma)
 
 
-def calibration_sigma_of(scenario: Scenario) -> Any:
+def calibration_sigma_of(scenario: Scenario) -> AnyArray:
     """σ of (f, c) or (fx, fy, cx, cy), pixels."""
     p = scenario.world.pixel_dim
     return numbers((scenario.focal_sigma,) * p + (scenario.centre_sigma,) * p)

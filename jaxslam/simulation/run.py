@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.geometry import Pose
 from jaxslam.models.camera import Camera
+from jaxslam.models.motion import Control
 from jaxslam.models.observations import Capacity, Features
 
 
@@ -31,7 +32,7 @@ class Run(eqx.Module):
     """With noise."""
     visible: Bool[Array, "frames landmarks"]
     """Which points are measured."""
-    controls: Any
+    controls: Control
     """The motion model's input of every step: seconds, or a reading."""
     cameras: Camera
     """The true camera of every frame."""

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array
 
 from jaxslam._numerics.arrays import cast
 from jaxslam.geometry import Pose, identity, retract
 from jaxslam.models.camera import Camera
-from jaxslam.models.motion import AbstractMotion
+from jaxslam.models.motion import AbstractMotion, Control
 from jaxslam.models.sensors import AbstractSensor, Pinhole
 from jaxslam.simulation.pieces import calibration_sigma_of, motion_of, sensor_of
 from jaxslam.simulation.placement import PLACEMENT, thrown
@@ -22,7 +22,7 @@ from jaxslam.simulation.trajectories import RecordedMotion, find, sampled
 from jaxslam.simulation.visibility import limited, visible
 
 
-def as_data(scenario: Scenario, dtype: Any = None) -> Scenario:
+def as_data(scenario: Scenario, dtype: DTypeLike | None = None) -> Scenario:
     """The scenario with its numbers as arrays and without its name: what a program is made for."""
     if any(isinstance(number, jax.Array) for number in jax.tree.leaves(scenario)):
         return scenario
@@ -34,7 +34,7 @@ def as_data(scenario: Scenario, dtype: Any = None) -> Scenario:
 def simulate(
     scenario: Scenario | str,
     key: Array,
-    dtype: Any = None,
+    dtype: DTypeLike | None = None,
     *,
     motion: AbstractMotion | RecordedMotion | None = None,
     sensor: AbstractSensor | None = None,
@@ -76,7 +76,7 @@ def simulate(
     return in_order_of_appearance(run) if new is None else run
 
 
-def trajectory_of(scenario: Scenario, dtype: Any = None) -> RecordedMotion | None:
+def trajectory_of(scenario: Scenario, dtype: DTypeLike | None = None) -> RecordedMotion | None:
     """Along what the scenario's camera moves, where that is recorded.
 
     Raises ValueError where its file is none, or has no piece that is long enough.
@@ -90,7 +90,7 @@ def trajectory_of(scenario: Scenario, dtype: Any = None) -> RecordedMotion | Non
 
 def _path(
     s: Scenario, motion: AbstractMotion | RecordedMotion | None, key: Array
-) -> tuple[Pose, Any]:
+) -> tuple[Pose, Control]:
     """The true poses, and what the filter is given at every step."""
     if isinstance(motion, RecordedMotion):
         return _recorded(s, motion, key)
@@ -99,7 +99,7 @@ def _path(
     return _by_noise(s, motion_of(s) if motion is None else motion, key)
 
 
-def _by_noise(s: Scenario, motion: AbstractMotion, key: Array) -> tuple[Pose, Any]:
+def _by_noise(s: Scenario, motion: AbstractMotion, key: Array) -> tuple[Pose, Control]:
     """The start and the noises of a motion model from the filter's prior (P8, P9).
 
     In frames in which the camera stands still, neither pose nor variables move.
@@ -122,7 +122,7 @@ def _by_noise(s: Scenario, motion: AbstractMotion, key: Array) -> tuple[Pose, An
     return _with_start(origin, poses, still), _every_step(s, control)
 
 
-def _recorded(s: Scenario, trajectory: RecordedMotion, key: Array) -> tuple[Pose, Any]:
+def _recorded(s: Scenario, trajectory: RecordedMotion, key: Array) -> tuple[Pose, Control]:
     """A recorded path from a random start, after the frames in which the camera stands still."""
     still = min(s.still_frames, s.steps)
     if trajectory.steps != s.steps - still:
@@ -133,7 +133,7 @@ def _recorded(s: Scenario, trajectory: RecordedMotion, key: Array) -> tuple[Pose
     return _with_start(origin, poses, still), _every_step(s, control)
 
 
-def _every_step(s: Scenario, control: Any) -> Any:
+def _every_step(s: Scenario, control: Control) -> Control:
     return jax.tree.map(lambda x: jnp.full((s.steps, *x.shape), x), control)
 
 

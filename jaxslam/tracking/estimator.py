@@ -9,18 +9,18 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam._numerics.arrays import cast
 from jaxslam._runtime.programs import Program, in_background
 from jaxslam.filters.association import ASSOCIATIONS, Association, candidates
 from jaxslam.filters.ekf import EkfSlam, init_with_depths
-from jaxslam.filters.protocol import AbstractStaged, CameraView
+from jaxslam.filters.protocol import AbstractStaged, Belief, CameraView
 from jaxslam.filters.readouts import (
     camera_pose_in_unit,
     landmarks_in_unit,
@@ -36,8 +36,6 @@ from jaxslam.tracking.settings import TrackerSettings
 
 _NOWHERE = np.zeros(0, int), np.zeros((0, 2))
 
-State = Any
-"""Of the filter: a pytree that only the filter knows."""
 Report = tuple[jax.Array, ...]
 """A `CameraReport`, as a program returns it."""
 
@@ -47,8 +45,8 @@ class Predicted(NamedTuple):
 
     dt: jax.Array
     """Since the frame before, s."""
-    state: State
-    gaussian: State
+    state: Belief
+    gaussian: Belief
     """The same as one Gaussian."""
     view: Prediction
     """In the filter's own unit, from where the map begins."""
@@ -87,7 +85,7 @@ class Estimator:
 
     slam: AbstractStaged
     settings: TrackerSettings
-    state: State = field(init=False)
+    state: Belief = field(init=False)
 
     def __post_init__(self) -> None:
         self.slam = cast(self.slam, jnp.float64)
@@ -198,7 +196,7 @@ class Estimator:
         slots: Int[np.ndarray, " m"],
         pixels: Float[np.ndarray, "m 2"],
         wide: Association | None,
-    ) -> tuple[Any, ...]:
+    ) -> tuple[PyTree, ...]:
         """Return what `_believed` is given."""
         s, several = self.settings, wide is not None
         features = _padded(slots, pixels, s.wanted * (PEAKS if several else 1))
@@ -208,7 +206,7 @@ class Estimator:
 
     def _created(
         self,
-        create: Callable[..., tuple[State, Report]],
+        create: Callable[..., tuple[Belief, Report]],
         slots: Int[np.ndarray, " k"],
         pixels: Float[np.ndarray, "k 2"],
     ) -> CameraReport:
@@ -228,19 +226,19 @@ def _padded(slots: Int[np.ndarray, " k"], pixels: Float[np.ndarray, "k 2"], size
 
 
 @Program
-def _empty(slam: AbstractStaged, capacity: int) -> State:
+def _empty(slam: AbstractStaged, capacity: int) -> Belief:
     return slam.init(capacity)
 
 
 @Program
-def _remove(slam: AbstractStaged, state: State, gone: jax.Array) -> State:
+def _remove(slam: AbstractStaged, state: Belief, gone: jax.Array) -> Belief:
     return slam.remove(state, gone)
 
 
 @Program
 def _predict(
-    slam: AbstractStaged, state: State, dt: jax.Array
-) -> tuple[tuple[State, State], tuple[Any, ...]]:
+    slam: AbstractStaged, state: Belief, dt: jax.Array
+) -> tuple[tuple[Belief, Belief], tuple[PyTree, ...]]:
     """The predicted state, as it is and as one Gaussian, and the `Prediction` of that."""
     slots = jnp.arange(slam.in_map(state).size)
     state = slam.predict(state, dt)
@@ -259,8 +257,8 @@ def _believed(
     slam: AbstractStaged,
     association: Association,
     wide: bool,
-    state: State,
-    gaussian: State,
+    state: Belief,
+    gaussian: Belief,
     dt: jax.Array,
     features: Features,
     tolerance: jax.Array,
@@ -271,40 +269,40 @@ def _believed(
 
 @Program
 def _correct(
-    slam: AbstractStaged, state: State, dt: jax.Array, features: Features
-) -> tuple[State, tuple[jax.Array, ...]]:
+    slam: AbstractStaged, state: Belief, dt: jax.Array, features: Features
+) -> tuple[Belief, tuple[jax.Array, ...]]:
     state, innovation = slam.update(state, dt, features)
     state = slam.compose(state, dt)
     return state, (innovation.used, innovation.nis, innovation.nis_dof, innovation.status)
 
 
 @Program
-def _begin_map(slam: AbstractStaged, state: State, new: Features) -> tuple[State, Report]:
+def _begin_map(slam: AbstractStaged, state: Belief, new: Features) -> tuple[Belief, Report]:
     state = slam.init(slam.in_map(state).size, new)
     return state, _reported(slam, state)
 
 
 @Program
 def _begin_known(
-    depths: tuple[jax.Array, jax.Array], slam: EkfSlam, state: State, new: Features
-) -> tuple[State, Report]:
+    depths: tuple[jax.Array, jax.Array], slam: EkfSlam, state: Belief, new: Features
+) -> tuple[Belief, Report]:
     state = init_with_depths(slam, slam.in_map(state).size, new, depths)
     return state, _reported(slam, state)
 
 
 @Program
-def _renew_map(slam: AbstractStaged, state: State, new: Features) -> tuple[State, Report]:
+def _renew_map(slam: AbstractStaged, state: Belief, new: Features) -> tuple[Belief, Report]:
     state = slam.close(state, new)
     return state, _reported(slam, state)
 
 
-def _reported(slam: AbstractStaged, state: State) -> Report:
+def _reported(slam: AbstractStaged, state: Belief) -> Report:
     seen = camera_pose_in_unit(slam, state)
     return seen.pose.as_matrix(), *seen[1:], slam.unit_fixed(state)
 
 
 @Program
-def _intrinsics(slam: AbstractStaged, inner: EkfSlam, state: State) -> tuple[jax.Array, jax.Array]:
+def _intrinsics(slam: AbstractStaged, inner: EkfSlam, state: Belief) -> tuple[jax.Array, jax.Array]:
     def intrinsics(view: CameraView) -> jax.Array:
         sensor = inner.calibration.sensor(inner.sensor, view.core.calibration)
         assert isinstance(sensor, Pinhole)
@@ -314,5 +312,7 @@ def _intrinsics(slam: AbstractStaged, inner: EkfSlam, state: State) -> tuple[jax
 
 
 @Program
-def _world_points(slam: AbstractStaged, state: State, capacity: int) -> tuple[jax.Array, jax.Array]:
+def _world_points(
+    slam: AbstractStaged, state: Belief, capacity: int
+) -> tuple[jax.Array, jax.Array]:
     return landmarks_in_unit(slam, state, jnp.arange(capacity))

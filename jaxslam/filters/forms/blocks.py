@@ -13,18 +13,19 @@ import functools
 import operator
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.linalg import cholesky
 from jaxslam._numerics.tracing import gathers_are_free
+from jaxslam.filters.protocol import Belief
 from jaxslam.geometry import jacobian, nudge, retract, zero_tangent
-from jaxslam.models.observations import Features
+from jaxslam.models.observations import Features, Slots
 
-Landmark = Callable[[Any, Array], Array]
+Landmark = Callable[[PyTree, Array], Array]
 Noise = Float[Array, "p p"] | Float[Array, "m p p"]
 """R of one measurement, or one of each of m."""
 Prior = tuple[Float[Array, "*m q"], Float[Array, "*m q"]]
@@ -54,19 +55,19 @@ class Model(Protocol):
         """Whether composition changes landmarks (robocentric) or leaves them (world)."""
         ...
 
-    def compose_core(self, core: Any, context: Any) -> Any:
+    def compose_core(self, core: PyTree, context: PyTree) -> PyTree:
         """The core after the motion."""
         ...
 
-    def view(self, core: Any, context: Any) -> Any:
+    def view(self, core: PyTree, context: PyTree) -> PyTree:
         """The part of the core that the functions below need."""
         ...
 
-    def compose_landmark(self, view: Any, landmark: Array, context: Any) -> Array:
+    def compose_landmark(self, view: PyTree, landmark: Array, context: PyTree) -> Array:
         """One landmark after the motion, seen from before it; where `moves_landmarks`."""
         ...
 
-    def observe(self, view: Any, landmark: Array, context: Any) -> tuple[Array, Array]:
+    def observe(self, view: PyTree, landmark: Array, context: PyTree) -> tuple[Array, Array]:
         """The predicted measurement, and whether one is possible (in front of the camera)."""
         ...
 
@@ -74,11 +75,11 @@ class Model(Protocol):
         """The difference of a measurement from its prediction."""
         ...
 
-    def initialise(self, view: Any, measured: Array, hidden: Array, context: Any) -> Array:
+    def initialise(self, view: PyTree, measured: Array, hidden: Array, context: PyTree) -> Array:
         """A landmark from its first measurement and what that hides, of which a prior is given."""
         ...
 
-    def convert(self, view: Any, landmark: Array, covariance: Array, context: Any) -> Array:
+    def convert(self, view: PyTree, landmark: Array, covariance: Array, context: PyTree) -> Array:
         """The same landmark in another form, where its covariance recommends it."""
         ...
 
@@ -90,14 +91,14 @@ class Change(NamedTuple):
     zero, which marginalises them.
     """
 
-    core: Callable[[Any], Any]
-    view: Callable[[Any], Any]
+    core: Callable[[PyTree], PyTree]
+    view: Callable[[PyTree], PyTree]
     """What of the old core a landmark's change depends on."""
     landmark: Landmark | None
     """`landmark(view, parameters)`; None where landmarks stay as they are."""
 
 
-def composition(model: Model, context: Any) -> Change:
+def composition(model: Model, context: PyTree) -> Change:
     """The motion as a change of variables: the core's (P18, P19), and a landmark's."""
 
     def landmark(view, landmark):
@@ -111,7 +112,7 @@ def composition(model: Model, context: Any) -> Change:
 
 
 def residuals(
-    model: Model, state: Any, features: Features, context: Any
+    model: Model, state: Belief, features: Features, context: PyTree
 ) -> tuple[Float[Array, "m p"], Float[Array, "m p"], Bool[Array, " m"], Blocks]:
     """Predictions, residuals, which features are used, and H; zero where one is not."""
     predicted, in_front, H = observe(model, state, features.slots, context)
@@ -122,7 +123,7 @@ def residuals(
 
 
 def observe(
-    model: Model, state: Any, slots: Int[Array, " m"], context: Any
+    model: Model, state: Belief, slots: Slots, context: PyTree
 ) -> tuple[Float[Array, "m p"], Bool[Array, " m"], Blocks]:
     """Predicted measurements, whether they are possible, and H."""
     return local_jacobians(
@@ -134,7 +135,7 @@ def observe(
 
 
 def new_landmarks(
-    model: Model, state: Any, features: Features, noise: Noise, prior: Prior, context: Any
+    model: Model, state: Belief, features: Features, noise: Noise, prior: Prior, context: PyTree
 ) -> tuple[Float[Array, "m d"], Blocks, Float[Array, "m d p+q"]]:
     """Landmarks of first measurements (P22–P26): values, J by the view, and `J diag(R, σ²)^½`.
 
@@ -161,13 +162,13 @@ def new_landmarks(
     return new, Blocks(view_by_core, J_view, identity), own
 
 
-def indices(slots: Int[Array, " m"], state: Any) -> Int[Array, "m d"]:
+def indices(slots: Slots, state: Belief) -> Int[Array, "m d"]:
     """The places of the landmarks in these slots in the state's error; out of bounds stays so."""
     d = state.landmarks.shape[1]
     return state.core_dim + slots[:, None] * d + jnp.arange(d)
 
 
-def local_jacobians(view, function, core, landmarks, *data) -> tuple[Array, Any, Blocks]:
+def local_jacobians(view, function, core, landmarks, *data) -> tuple[Array, PyTree, Blocks]:
     """Values, auxiliary outputs and blocks of `function(view, landmark) → (value, auxiliary)`.
 
     `data` are further arguments of the function, one for each landmark: not differentiated.
@@ -188,7 +189,7 @@ def local_jacobians(view, function, core, landmarks, *data) -> tuple[Array, Any,
     return value, auxiliary, Blocks(view_by_core, by_view, by_landmark)
 
 
-def without_auxiliary(function: Landmark) -> Callable[[Any, Array], tuple[Array, None]]:
+def without_auxiliary(function: Landmark) -> Callable[[PyTree, Array], tuple[Array, None]]:
     """A function of view and landmark in the form that `local_jacobians` asks for."""
     return lambda view, landmark: (function(view, landmark), None)
 
@@ -202,7 +203,7 @@ def masked(J: Blocks, mask: Bool[Array, " m"]) -> Blocks:
     )
 
 
-def placed(J: Blocks, slots: Int[Array, " m"], capacity: int) -> Float[Array, "mk n"]:
+def placed(J: Blocks, slots: Slots, capacity: int) -> Float[Array, "mk n"]:
     """The blocks in their places: dense, since products with it are then plain and fast."""
     m, k, d = J.by_landmark.shape
     here = slots[:, None] == jnp.arange(capacity)
@@ -211,7 +212,7 @@ def placed(J: Blocks, slots: Int[Array, " m"], capacity: int) -> Float[Array, "m
     return jnp.concatenate([shared.reshape(m * k, -1), own.reshape(m * k, capacity * d)], axis=1)
 
 
-def observed(J: Blocks, slots: Int[Array, " m"], B: Float[Array, "n r"]) -> Float[Array, "mk r"]:
+def observed(J: Blocks, slots: Slots, B: Float[Array, "n r"]) -> Float[Array, "mk r"]:
     """`J B` of blocks in these slots, of more than `DENSE` numbers without the zeros."""
     c, d = J.view_by_core.shape[1], J.by_landmark.shape[-1]
     if len(B) <= DENSE and not gathers_are_free():
@@ -239,7 +240,7 @@ def small_products(A: Float[Array, "*m k j"], B: Float[Array, "*#m j r"]) -> Flo
     )
 
 
-def shifted(state: Any, delta: Float[Array, " n"]) -> Any:
+def shifted(state: Belief, delta: Float[Array, " n"]) -> Belief:
     """`x ⊞ δ` for the core and all landmarks."""
     c = state.core_dim
     return replace(

@@ -13,13 +13,13 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam._numerics.linalg import cholesky, symmetric_part
 from jaxslam.filters.forms.blocks import Model, Noise, observed, residuals, shifted
 from jaxslam.filters.forms.state import State
 from jaxslam.geometry import difference
-from jaxslam.models.observations import Features, Innovation, judged
+from jaxslam.models.observations import Features, Innovation, Slots, judged
 
 ROUNDING = 4.0
 """Units in the last place of its own that every variance gets back in an update.
@@ -42,16 +42,16 @@ class AbstractCorrection(eqx.Module):
     @abstractmethod
     def update(
         self,
-        model: Any,
+        model: Model,
         state: State,
         features: Features,
         noise: Noise,
-        context: Any,
+        context: PyTree,
         considered: slice = slice(0, 0),
     ) -> tuple[State, Innovation]:
         """Correct by all features at once, as `AbstractForm.update` says."""
 
-    def remember(self, state: State, slots: Int[Array, " m"]) -> State:
+    def remember(self, state: State, slots: Slots) -> State:
         """Keep what is needed of landmarks that were just written in these slots, of which those
         out of bounds are none."""
         del slots
@@ -84,7 +84,7 @@ def gauss_newton(
     state: State,
     steps: int,
     corrected: Callable[[State, State], State],
-    *data: Any,
+    *data: PyTree,
 ) -> tuple[State, Innovation]:
     """So many steps to the maximum of the posterior. Every step, from `before` to `after`, is what
     is `corrected(before, after)` of it. `data` are what `kalman_update` asks for."""
@@ -109,7 +109,7 @@ def kalman_update(
     offset: Float[Array, " n"] | None,
     features: Features,
     noise: Noise,
-    context: Any,
+    context: PyTree,
     considered: slice = slice(0, 0),
 ) -> tuple[State, Innovation]:
     """The update by all features at once (P16, P17), in Joseph's form, of the prediction

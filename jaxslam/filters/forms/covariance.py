@@ -7,13 +7,12 @@ The steps are the paper's: `augment` (P10, P11, P15), `update` (P16, P17), `comp
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam.filters.forms.blocks import (
@@ -30,8 +29,9 @@ from jaxslam.filters.forms.blocks import (
     without_auxiliary,
 )
 from jaxslam.filters.forms.correction import AbstractCorrection, Standard
-from jaxslam.filters.forms.form import AbstractGaussian
+from jaxslam.filters.forms.form import AbstractGaussian, OfCore
 from jaxslam.filters.forms.state import State
+from jaxslam.filters.protocol import Moments
 from jaxslam.geometry import jacobian
 from jaxslam.models.observations import Features, Innovation
 
@@ -54,7 +54,7 @@ class Covariance(AbstractGaussian):
         """Raise ValueError for a filter that cannot be corrected so."""
         self.correction.check(slam)
 
-    def empty(self, core: Any, landmarks: Float[Array, "capacity d"]) -> State:
+    def empty(self, core: PyTree, landmarks: Float[Array, "capacity d"]) -> State:
         """A state that is exactly known, of slots that hold no landmark yet."""
         capacity = landmarks.shape[0]
         state = State(
@@ -88,7 +88,7 @@ class Covariance(AbstractGaussian):
         state: State,
         features: Features,
         noise: Noise,
-        context: Any,
+        context: PyTree,
         considered: slice = slice(0, 0),
     ) -> tuple[State, Innovation]:
         return self.correction.update(model, state, features, noise, context, considered)
@@ -110,7 +110,7 @@ class Covariance(AbstractGaussian):
         features: Features,
         noise: Noise,
         prior: Prior,
-        context: Any,
+        context: PyTree,
     ) -> State:
         """`P ← J diag(P, R, σ²) Jᵀ` (P22–P26)."""
         if features.slots.size == 0:
@@ -155,13 +155,13 @@ class Covariance(AbstractGaussian):
 
         return jax.vmap(one)(J.by_view, J.by_landmark, P_cross, P_landmark)
 
-    def core_covariance(self, function: Callable[[Any], Any], state: State) -> tuple[Any, Array]:
+    def core_covariance(self, function: OfCore, state: State) -> Moments:
         c = state.core_dim
         J = jacobian(function, state.core)
         return function(state.core), J @ state.covariance[:c, :c] @ J.T
 
 
-def convert(model: Model, state: State, context: Any) -> State:
+def convert(model: Model, state: State, context: PyTree) -> State:
     """Write landmarks in the form that the model now prefers, `P ← J P Jᵀ`."""
     c, (capacity, d) = state.core_dim, state.landmarks.shape
     blocks = state.covariance[c:, c:].reshape(capacity, d, capacity, d)
@@ -177,7 +177,7 @@ def convert(model: Model, state: State, context: Any) -> State:
     return _transformed(state, state.core, J_core, value, J)
 
 
-def _transformed(state: State, core: Any, J_core: Array, landmarks: Array, J: Blocks | None):
+def _transformed(state: State, core: PyTree, J_core: Array, landmarks: Array, J: Blocks | None):
     """The state after a change of variables, of the core alone where J is None."""
     c = state.core_dim
     if J is not None:

@@ -10,16 +10,17 @@ of unknown depth is bad, and remains the linearisation point for good.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 from jaxtyping import Array, Float
 
+from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.forms.correction import AbstractCorrection, kalman_update
 from jaxslam.filters.forms.observability_constrained import follow
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.forms.transport import check_metric, check_undelayed
-from jaxslam.filters.model import SlamModel
+from jaxslam.filters.model import Context, SlamModel
 from jaxslam.models.coordinates import WORLD
 from jaxslam.models.observations import Features
 
@@ -29,7 +30,7 @@ class FirstEstimates(AbstractCorrection):
 
     divisible: ClassVar[bool] = False
 
-    def check(self, slam: Any) -> None:
+    def check(self, slam: EkfSlam) -> None:
         """Raise ValueError for filters whose landmarks have no first estimate to keep."""
         check_metric(slam, "fej")
         check_undelayed(slam, "fej")
@@ -59,7 +60,7 @@ class FirstEstimates(AbstractCorrection):
 
 
 def _at_first(
-    model: SlamModel, state: State, features: Features, context: Any
+    model: SlamModel, state: State, features: Features, context: Context
 ) -> tuple[State, Features, Float[Array, "m p"]]:
     """The state whose landmarks are the first estimates, measurements moved so that its residuals
     are those of the estimate, and the predictions of the estimate."""

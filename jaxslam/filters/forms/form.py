@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam.filters.forms.blocks import (
@@ -29,8 +29,12 @@ from jaxslam.filters.forms.blocks import (
     observe,
     without_auxiliary,
 )
+from jaxslam.filters.protocol import Belief, Moments
 from jaxslam.geometry import jacobian, nudge
-from jaxslam.models.observations import Features
+from jaxslam.models.observations import Features, Slots
+
+OfCore = Callable[[PyTree], PyTree]
+"""A function of the core, which is a pytree of poses and vectors, as is its value."""
 
 
 class AbstractForm(eqx.Module):
@@ -50,30 +54,30 @@ class AbstractForm(eqx.Module):
         """Raise ValueError for a filter of which this cannot be the form; any can be, here."""
 
     @abstractmethod
-    def augment(self, state: Any, start: int, covariance: Float[Array, "k k"]) -> Any:
+    def augment(self, state: Belief, start: int, covariance: Float[Array, "k k"]) -> Belief:
         """Give k numbers of the core, from `start`, an independent covariance (P10, P11, P15).
 
         Nothing may be known of them, as `marginalise` and `compose` leave them.
         """
 
     @abstractmethod
-    def set_exact(self, state: Any, start: int, size: int) -> Any:
+    def set_exact(self, state: Belief, start: int, size: int) -> Belief:
         """Numbers of the core that are known exactly."""
 
     @abstractmethod
-    def marginalise(self, state: Any, start: int, size: int) -> Any:
+    def marginalise(self, state: Belief, start: int, size: int) -> Belief:
         """Forget k numbers of the core; the caller resets their mean."""
 
     @abstractmethod
     def update(
         self,
         model: Model,
-        state: Any,
+        state: Belief,
         features: Features,
         noise: Noise,
-        context: Any,
+        context: PyTree,
         considered: slice = slice(0, 0),
-    ) -> tuple[Any, Any]:
+    ) -> tuple[Belief, PyTree]:
         """Correct by all features at once (P16, P17), and what was compared.
 
         `noise` is the covariance R of one measurement, or one for each feature. A feature that is
@@ -81,18 +85,24 @@ class AbstractForm(eqx.Module):
         numbers of the core count with their covariance but have no gain (Schmidt, 1966).
         """
 
-    def compose(self, model: Model, state: Any, context: Any) -> Any:
+    def compose(self, model: Model, state: Belief, context: PyTree) -> Belief:
         """Move the state over the motion (P18–P21)."""
         return self.reparametrise(state, composition(model, context))
 
     @abstractmethod
-    def reparametrise(self, state: Any, variables: Change) -> Any:
+    def reparametrise(self, state: Belief, variables: Change) -> Belief:
         """Write the state in other variables."""
 
     @abstractmethod
     def initialise(
-        self, model: Model, state: Any, features: Features, noise: Noise, prior: Prior, context: Any
-    ) -> Any:
+        self,
+        model: Model,
+        state: Belief,
+        features: Features,
+        noise: Noise,
+        prior: Prior,
+        context: PyTree,
+    ) -> Belief:
         """Insert landmarks from their first measurement (P22–P26).
 
         `prior` is the mean and σ of what one measurement hides, for all or one for each. All new
@@ -102,9 +112,7 @@ class AbstractForm(eqx.Module):
         """
 
     @abstractmethod
-    def core_covariance(
-        self, function: Callable[[Any], Any], state: Any
-    ) -> tuple[Any, Float[Array, "k k"]]:
+    def core_covariance(self, function: OfCore, state: Belief) -> Moments:
         """Value of a function of the core, and its first-order covariance in its tangent."""
 
 
@@ -115,21 +123,19 @@ class AbstractGaussian(AbstractForm):
     """Whether its innovations have S: a likelihood is of no use without."""
 
     @abstractmethod
-    def empty(self, core: Any, landmarks: Float[Array, "capacity d"]) -> Any:
+    def empty(self, core: PyTree, landmarks: Float[Array, "capacity d"]) -> Belief:
         """A state of slots that hold no landmark yet, and a core that is still to be augmented."""
 
     @abstractmethod
-    def remove(self, state: Any, gone: Bool[AnyArray, " capacity"]) -> Any:
+    def remove(self, state: Belief, gone: Bool[AnyArray, " capacity"]) -> Belief:
         """Marginalise landmarks and free their slots."""
 
     @abstractmethod
-    def local_covariance(
-        self, state: Any, J: Blocks, slots: Int[Array, " m"]
-    ) -> Float[Array, "m k k"]:
+    def local_covariance(self, state: Belief, J: Blocks, slots: Slots) -> Float[Array, "m k k"]:
         """`J P Jᵀ` of every landmark's own rows: the diagonal blocks only."""
 
     def predict_features(
-        self, model: Model, state: Any, slots: Int[Array, " m"], noise: Noise, context: Any
+        self, model: Model, state: Belief, slots: Slots, noise: Noise, context: PyTree
     ) -> tuple[Float[Array, "m p"], Float[Array, "m p p"], Bool[Array, " m"]]:
         """The predicted features: measurements, covariances of their innovations, possible
         or not. These are the centres and the search ellipses of active search."""
@@ -137,11 +143,7 @@ class AbstractGaussian(AbstractForm):
         return predicted, self.local_covariance(state, H, slots) + noise, in_front
 
     def landmark_covariance(
-        self,
-        view: Callable[[Any], Any],
-        function: Landmark,
-        state: Any,
-        slots: Int[Array, " m"],
+        self, view: Callable[[PyTree], PyTree], function: Landmark, state: Belief, slots: Slots
     ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
         """Values and first-order covariances of `function(view(core), landmark)`, slot by slot."""
         value, _, J = local_jacobians(
@@ -149,7 +151,7 @@ class AbstractGaussian(AbstractForm):
         )
         return value, self.local_covariance(state, J, slots)
 
-    def joint_covariance(self, state: Any, slot: Int[Array, ""]) -> Float[Array, "k k"]:
+    def joint_covariance(self, state: Belief, slot: Int[Array, ""]) -> Float[Array, "k k"]:
         """The joint covariance of the core and one landmark, k = c + d numbers."""
         c, d = state.core_dim, state.landmarks.shape[1]
         index = jnp.concatenate([jnp.arange(c), c + slot * d + jnp.arange(d)])
@@ -157,7 +159,7 @@ class AbstractGaussian(AbstractForm):
 
 
 def curvature(
-    form: AbstractGaussian, model: Model, state: Any, slots: Int[Array, " m"], context: Any
+    form: AbstractGaussian, model: Model, state: Belief, slots: Slots, context: PyTree
 ) -> tuple[Float[Array, "m p k k"], Float[Array, "m k k"]]:
     """Second derivatives of every landmark's measurement by what it depends on, the view and the
     landmark's own numbers, and the covariance of these."""

@@ -12,14 +12,13 @@ their blocks and the linearisation points are the covariance form's, and so are 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam._numerics.linalg import Cholesky, cholesky, inverse
@@ -39,7 +38,8 @@ from jaxslam.filters.forms.blocks import (
     small_products,
     without_auxiliary,
 )
-from jaxslam.filters.forms.form import AbstractGaussian
+from jaxslam.filters.forms.form import AbstractGaussian, OfCore
+from jaxslam.filters.protocol import Moments
 from jaxslam.geometry import jacobian, tangent_dim
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.observations import Features, Innovation, judged
@@ -57,11 +57,11 @@ class InformationState(eqx.Module):
     steps. Everything else is positive definite.
     """
 
-    core: Any
+    core: PyTree
     landmarks: Float[Array, "capacity d"]
     active: Bool[Array, " capacity"]
     information: Float[Array, "n n"]
-    memory: Any = ()
+    memory: PyTree = ()
 
     @property
     def core_dim(self) -> int:
@@ -95,7 +95,7 @@ class Information(AbstractGaussian):
         if not slam.calibration.corrected:
             raise ValueError("the information form cannot consider a calibration: estimate it")
 
-    def empty(self, core: Any, landmarks: Float[Array, "capacity d"]) -> InformationState:
+    def empty(self, core: PyTree, landmarks: Float[Array, "capacity d"]) -> InformationState:
         """A state of slots that hold no landmark yet, and a core that is still to be augmented."""
         n = tangent_dim(core) + landmarks.size
         active = jnp.zeros(landmarks.shape[0], bool)
@@ -129,7 +129,7 @@ class Information(AbstractGaussian):
         state: InformationState,
         features: Features,
         noise: Noise,
-        context: Any,
+        context: PyTree,
         considered: slice = slice(0, 0),
     ) -> tuple[InformationState, Innovation]:
         """`Λ ← Λ + Σ HᵢᵀR⁻¹Hᵢ` and the mean by `Λ δ = b = Σ HᵢᵀR⁻¹rᵢ`, all features at once.
@@ -184,7 +184,7 @@ class Information(AbstractGaussian):
         features: Features,
         noise: Noise,
         prior: Prior,
-        context: Any,
+        context: PyTree,
     ) -> InformationState:
         """Insert landmarks from their first measurement (P22–P26): information `N⁻¹` on `y − J x`.
 
@@ -223,9 +223,7 @@ class Information(AbstractGaussian):
         whitened = whitened.reshape(-1, m, k)
         return jnp.einsum("nmk,nml->mkl", whitened, whitened)
 
-    def core_covariance(
-        self, function: Callable[[Any], Any], state: InformationState
-    ) -> tuple[Any, Float[Array, "k k"]]:
+    def core_covariance(self, function: OfCore, state: InformationState) -> Moments:
         J = jacobian(function, state.core)
         J = jnp.pad(J, ((0, 0), (0, state.landmarks.size)))
         whitened = _whitened(state, J)

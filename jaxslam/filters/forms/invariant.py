@@ -21,11 +21,11 @@ same update, exactly where `transform` is affine in the landmark, else to first 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.forms.blocks import shifted
 from jaxslam.filters.forms.correction import AbstractCorrection, kalman_update
 from jaxslam.filters.forms.gauge import act, unobservable_directions
@@ -39,7 +39,7 @@ from jaxslam.models.coordinates import WORLD
 class Invariant(AbstractCorrection):
     """The EKF whose correction is read as a ξ."""
 
-    def check(self, slam: Any) -> None:
+    def check(self, slam: EkfSlam) -> None:
         """Raise ValueError unless the filter is a plain world-centric one."""
         check_metric(slam, "invariant")
         check_undelayed(slam, "invariant")

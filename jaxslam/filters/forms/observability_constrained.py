@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.forms.correction import AbstractCorrection, check_steps, gauss_newton
 from jaxslam.filters.forms.gauge import check_gauge, scale_is_free, unobservable_directions
 from jaxslam.filters.forms.state import State
@@ -33,7 +33,7 @@ class ObservabilityConstrained(AbstractCorrection):
     def __check_init__(self) -> None:
         check_steps(self.steps, "modifier oc")
 
-    def check(self, slam: Any) -> None:
+    def check(self, slam: EkfSlam) -> None:
         """Raise ValueError where there is nothing to constrain, or N is not known."""
         check_undelayed(slam, "oc")
         check_gauge(slam.model)

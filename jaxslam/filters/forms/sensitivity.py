@@ -15,14 +15,13 @@ the covariance before, which is dense, makes S and A of them where they are aske
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.forms.blocks import (
@@ -39,15 +38,16 @@ from jaxslam.filters.forms.blocks import (
     small_products,
     without_auxiliary,
 )
-from jaxslam.filters.forms.form import AbstractForm
+from jaxslam.filters.forms.form import AbstractForm, OfCore
+from jaxslam.filters.protocol import Moments
 from jaxslam.geometry import difference, jacobian, retract, tangent_dim
-from jaxslam.models.observations import Features
+from jaxslam.models.observations import Features, Slots
 
 
 class Distribution(eqx.Module):
     """A state `x0 ⊞ (m + L y)` with y ~ N(0, I)."""
 
-    core: Any
+    core: PyTree
     landmarks: Float[Array, "capacity d"]
     active: Bool[Array, " capacity"]
     offset: Float[Array, " n"]
@@ -67,7 +67,7 @@ class Derivative(NamedTuple):
     """By the error of the core before the frames, and by their noise."""
     by_own: Float[Array, "m k d"]
     """By the landmark's own error before, or by the variables with which it entered."""
-    slots: Int[Array, " m"]
+    slots: Slots
 
     def by_variables(self, before: Distribution) -> Float[Array, "mk N"]:
         """The derivative by y."""
@@ -90,7 +90,7 @@ class Point(eqx.Module):
     empty slot has none.
     """
 
-    core: Any
+    core: PyTree
     landmarks: Float[Array, "capacity d"]
     active: Bool[Array, " capacity"]
     by_shared: Float[Array, "n r"]
@@ -101,7 +101,7 @@ class Point(eqx.Module):
     """y."""
     used: Int[Array, ""]
     """How many of the variables have been used: the next noise begins there."""
-    memory: Any = ()
+    memory: PyTree = ()
 
     @property
     def core_dim(self) -> int:
@@ -167,7 +167,7 @@ class Sensitivity(AbstractForm):
         state: Point,
         features: Features,
         noise: Noise,
-        context: Any,
+        context: PyTree,
         considered: slice = slice(0, 0),
     ) -> tuple[Point, WhitenedResiduals]:
         """Compare with the features seen; the state stays as it is."""
@@ -212,7 +212,7 @@ class Sensitivity(AbstractForm):
         features: Features,
         noise: Noise,
         prior: Prior,
-        context: Any,
+        context: PyTree,
     ) -> Point:
         """Landmarks as the filter begins them, and off by what the variables of their slots say.
 
@@ -239,7 +239,7 @@ class Sensitivity(AbstractForm):
             by_own=state.by_own.at[slots].set(free, mode="drop"),
         )
 
-    def core_covariance(self, function: Callable[[Any], Any], state: Point) -> tuple[Any, Array]:
+    def core_covariance(self, function: OfCore, state: Point) -> Moments:
         """Value of a function of the core, and the covariance that y ~ N(0, I) gives it."""
         core = self.before.by_variables(state.by_shared[: state.core_dim])
         root = jacobian(function, state.core) @ core

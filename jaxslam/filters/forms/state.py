@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam.geometry import tangent_dim
 
@@ -17,12 +15,12 @@ class State(eqx.Module):
     columns of inactive slots are zero.
     """
 
-    core: Any
+    core: PyTree
     """Pytree of poses and vectors, whose tangent has c numbers."""
     landmarks: Float[Array, "capacity d"]
     active: Bool[Array, " capacity"]
     covariance: Float[Array, "n n"]
-    memory: Any = ()
+    memory: PyTree = ()
     """What an `AbstractEntry` remembers of landmarks beside the Gaussian: any pytree."""
 
     first: Float[Array, "capacity d"] | None = None

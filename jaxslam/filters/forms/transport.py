@@ -13,13 +13,11 @@ Tian and He (arXiv:2502.05008, 2025).
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.linalg import eigh
-from jaxslam.filters.ekf import Undelayed
+from jaxslam.filters.ekf import EkfSlam, Undelayed
 from jaxslam.models.scale import ScaleGauge
 
 _SINGULAR = 1e-12
@@ -30,13 +28,13 @@ _SUREST = 1e-4
 """Relative error below which none is surer than another."""
 
 
-def check_metric(slam: Any, remedy: str) -> None:
+def check_metric(slam: EkfSlam, remedy: str) -> None:
     """Raise ValueError unless metres are the unit of the filter's state."""
     if isinstance(slam.scale, ScaleGauge):
         raise ValueError(f"{remedy} is for filters without a scale gauge")
 
 
-def check_undelayed(slam: Any, remedy: str) -> None:
+def check_undelayed(slam: EkfSlam, remedy: str) -> None:
     """Raise ValueError unless landmarks are in the state from their first measurement on."""
     if not isinstance(slam.entry, Undelayed):
         raise ValueError(f"{remedy} is for undelayed landmarks")
@@ -75,7 +73,7 @@ def read_scale_too(
     scale, place = N[:, -1], jnp.arange(N.shape[0])
     size = scale - N[:, :-1] @ (frame @ scale)
 
-    def of(part: slice, weight: Any = 1.0) -> Float[Array, "h n"]:
+    def of(part: slice, weight: Array | float = 1.0) -> Float[Array, "h n"]:
         inside = (place >= part.start) & (place < part.stop)
         return _with_scale(N, frame, jnp.where(inside, size / weight, 0.0))
 

@@ -11,11 +11,11 @@ explain it, and it may become a point there, wrong and certain of it; otherwise 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.filters.ekf import AbstractEntry, EkfSlam, correct, insert
@@ -27,6 +27,7 @@ from jaxslam.filters.initialisation.alternatives import (
     with_entry,
 )
 from jaxslam.landmarks import INVERSE_DEPTH_TO_CARTESIAN
+from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features, Innovation
 
 
@@ -69,18 +70,18 @@ class DepthParticles(AbstractEntry):
         if self.count < 2:
             raise ValueError(f"a ray needs at least 2 depth particles, not {self.count}")
 
-    def depths(self, dtype: Any = None) -> Float[Array, " count"]:
+    def depths(self, dtype: DTypeLike | None = None) -> Float[Array, " count"]:
         """The particles' distances along the ray, m."""
         return jnp.linspace(self.nearest, self.farthest, self.count, dtype=dtype)
 
     def slots(self, landmarks: int) -> int:
         return landmarks
 
-    def memory(self, landmarks: int, dtype: Any) -> Float[Array, "landmarks count"]:
+    def memory(self, landmarks: int, dtype: DTypeLike) -> Float[Array, "landmarks count"]:
         return jnp.full((landmarks, self.count), 1 / self.count, dtype)
 
     def update(
-        self, slam: EkfSlam, state: State, control: Any, features: Features
+        self, slam: EkfSlam, state: State, control: Control, features: Features
     ) -> tuple[State, Innovation]:
         """Correct by the points; then weigh the particles of rays in the corrected state."""
         waiting = features.valid & _pending(state)[features.slots]

@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.filters.ekf import AbstractEntry, EkfSlam, correct, insert
@@ -29,6 +29,7 @@ from jaxslam.filters.initialisation.alternatives import (
     with_entry,
 )
 from jaxslam.landmarks import CARTESIAN
+from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features, Innovation
 
 
@@ -61,18 +62,18 @@ class RaySum(AbstractEntry):
         covered = (1 - self.alpha) / (1 + self.alpha) * self.farthest / self.nearest
         return 1 + max(0, math.ceil(math.log(covered, self.beta)))
 
-    def depths(self, dtype: Any = None) -> Float[Array, " members"]:
+    def depths(self, dtype: DTypeLike | None = None) -> Float[Array, " members"]:
         """`s_1 = s_min / (1 − α)`, `s_{i+1} = β s_i`, along the optical axis, m."""
         return self.nearest / (1 - self.alpha) * self.beta ** jnp.arange(self.members, dtype=dtype)
 
     def slots(self, landmarks: int) -> int:
         return landmarks * self.members
 
-    def memory(self, landmarks: int, dtype: Any) -> Float[Array, "landmarks members"]:
+    def memory(self, landmarks: int, dtype: DTypeLike) -> Float[Array, "landmarks members"]:
         return jnp.full((landmarks, self.members), 1 / self.members, dtype)
 
     def update(
-        self, slam: EkfSlam, state: State, control: Any, features: Features
+        self, slam: EkfSlam, state: State, control: Control, features: Features
     ) -> tuple[State, Innovation]:
         """Weigh the members, prune, and correct by those that are left."""
         likelihood = self._log_likelihood(slam, state, control, features)

@@ -8,12 +8,13 @@ weighed by Laplace's `−½ |r|² − ½ log det A`, A the information of all un
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.conditional import map_where
@@ -45,7 +46,7 @@ class Modes(eqx.Module):
     """λ of every mode's mean, of which the maximum has 0."""
 
 
-def at_rest(slam: EkfSlam, record: Record, count: int, dtype: Any) -> Modes:
+def at_rest(slam: EkfSlam, record: Record, count: int, dtype: DTypeLike) -> Modes:
     """The modes before anything is known: one, the prior's mean."""
     size, m = PathLayout.of(slam).size(record.frames), record.first.size
     q = slam.sensor.size + slam.sensor.hidden

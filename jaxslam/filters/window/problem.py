@@ -11,17 +11,19 @@ A landmark depends on x and on its own y alone: given x the landmarks are elimin
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.linalg import Cholesky, cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.record import Record
 from jaxslam.geometry import Pose, Scalar, homogeneous_apply, identity, jacobian, nudge, retract
+from jaxslam.models.motion import Control
 
 
 class CalibratedPose(eqx.Module):
@@ -97,7 +99,7 @@ def path(slam: EkfSlam, record: Record, x: Float[Array, " N"]) -> Path:
     return Path(CalibratedPose(poses, deltas), variables, common)
 
 
-def _driven_by(record: Record) -> tuple[Any, Float[Array, " steps"], Bool[Array, " steps"]]:
+def _driven_by(record: Record) -> tuple[Control, Float[Array, " steps"], Bool[Array, " steps"]]:
     """The known quantities of every step: the arguments of `_moved` before the last."""
     return record.controls, record.merged, record.restarted
 
@@ -362,7 +364,7 @@ def _in_first(record: Record, each: Float[Array, "m ..."]) -> Float[Array, "F ..
     return jnp.einsum("m...,mf->f...", each, _is_first(record, each.dtype))
 
 
-def _is_first(record: Record, dtype: Any) -> Float[Array, "m F"]:
+def _is_first(record: Record, dtype: DTypeLike) -> Float[Array, "m F"]:
     return (record.first[:, None] == jnp.arange(record.frames)).astype(dtype)
 
 

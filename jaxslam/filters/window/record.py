@@ -8,16 +8,16 @@ drawn anew.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam._numerics.linalg import cholesky
-from jaxslam.models.motion import AbstractMotion
+from jaxslam.models.motion import AbstractMotion, Control
 from jaxslam.models.observations import Features
 
 TIED = 0.8
@@ -30,7 +30,7 @@ class Record(eqx.Module):
     """Frames 0 to `last` of at most F; the motion into frame k is the control k − 1."""
 
     last: Int[Array, ""]
-    controls: Any
+    controls: Control
     """Of F − 1 steps."""
     merged: Float[Array, " steps"]
     """Of how many steps of the process each is made; 1 until the window was thinned."""
@@ -91,7 +91,7 @@ class Record(eqx.Module):
         )
 
 
-def empty(motion: AbstractMotion, frames: int, landmarks: int, p: int, dtype: Any) -> Record:
+def empty(motion: AbstractMotion, frames: int, landmarks: int, p: int, dtype: DTypeLike) -> Record:
     """The record of a frame 0 in which nothing has been seen yet."""
     still = motion.still(dtype)
     return Record(
@@ -107,7 +107,7 @@ def empty(motion: AbstractMotion, frames: int, landmarks: int, p: int, dtype: An
 
 
 def whole(
-    controls: Any,
+    controls: Control,
     measured: Float[Array, "F m p"],
     seen: Bool[Array, "F m"],
     first: Int[Array, " m"],
@@ -119,7 +119,7 @@ def whole(
     return Record(jnp.asarray(steps), controls, ones, no, moved, measured, seen, first)
 
 
-def stepped(record: Record, control: Any, seen: Features, noise: Float[Array, "p p"]) -> Record:
+def stepped(record: Record, control: Control, seen: Features, noise: Float[Array, "p p"]) -> Record:
     """The record with one frame more and its measurements of known landmarks, of such a
     covariance. A full record stays as it is."""
     stood = record.standing & (record.last == 1)

@@ -9,7 +9,6 @@ window, the coarser it becomes, and it reaches back to frame 0 for ever.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -73,7 +72,9 @@ def _stood(record: Record) -> Bool[Array, " steps"]:
     return jnp.append(record.restarted[1:], False)
 
 
-def _noises(slam: EkfSlam, record: Record, fewer: Record, x: Float[Array, " N"]) -> Any:
+def _noises(
+    slam: EkfSlam, record: Record, fewer: Record, x: Float[Array, " N"]
+) -> Float[Array, " N"]:
     """PathLayout of the merged steps: `√(m₁ + m₂) n = √m₁ n₁ + √m₂ n₂` adds the same velocity; a
     calibration that is drawn anew is that of the frame that stays, and so is a velocity."""
     layout, frames = PathLayout.of(slam), record.frames

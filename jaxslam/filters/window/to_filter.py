@@ -7,7 +7,7 @@ uncorrelated with everything that does not scale.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from jaxslam._numerics.linalg import Cholesky, cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.forms.blocks import shifted
 from jaxslam.filters.forms.state import State
+from jaxslam.filters.model import Core
 from jaxslam.filters.window.minimise import LANDMARK_STEPS, Minimum, landmarks
 from jaxslam.filters.window.problem import (
     PathLayout,
@@ -90,7 +91,7 @@ def _newest(slam, record, at: Minimum, local: Reduced):
     return (frame, local.path.motion[k], local.path.common), by_x
 
 
-def _core_rows(slam, newest, by_x, scale: Direction, like) -> tuple[Any, Rows]:
+def _core_rows(slam, newest, by_x, scale: Direction, like) -> tuple[Core, Rows]:
     """The filter's core and its Jacobians."""
     zero = jnp.zeros(1, by_x.dtype)
     J = jacobian(lambda both: _core(slam, like, *both), (newest, zero))

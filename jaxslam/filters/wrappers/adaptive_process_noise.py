@@ -16,20 +16,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import precision
 from jaxslam._numerics.linalg import cholesky, eigh
 from jaxslam.filters.ekf import EkfSlam, ekf_inside
-from jaxslam.filters.protocol import AbstractStaged
+from jaxslam.filters.protocol import AbstractStaged, Belief
 from jaxslam.filters.wrappers.wrapper import AbstractWrapper, with_motion
 from jaxslam.geometry import jacobian
+from jaxslam.models.motion import AbstractMotion, Control
 from jaxslam.models.observations import Capacity, Features, Innovation
 
 MEMORY = 100
@@ -43,7 +45,7 @@ TOLD = np.log(3.0)
 class NoiseState(eqx.Module):
     """The filter's own state, and what is believed of its noise."""
 
-    inner: Any
+    inner: Belief
     log_weights: Float[Array, "2 factors"]
     """Of the factors of the linear and of the angular σ."""
     velocity: Float[Array, "factors t"]
@@ -68,10 +70,10 @@ class AdaptiveProcessNoise(AbstractWrapper):
         if self.memory < 1:
             raise ValueError(f"noise is remembered for 1 frame at least, not {self.memory}")
 
-    def base_state(self, state: NoiseState) -> Any:
+    def base_state(self, state: NoiseState) -> Belief:
         return state.inner
 
-    def with_base_state(self, state: NoiseState, inner: Any) -> NoiseState:
+    def with_base_state(self, state: NoiseState, inner: Belief) -> NoiseState:
         return replace(state, inner=inner)
 
     def init(self, capacity: int | Capacity, first: Features | None = None) -> NoiseState:
@@ -83,7 +85,7 @@ class AdaptiveProcessNoise(AbstractWrapper):
         )
         return NoiseState(inner, log_weights, *every, (velocity, covariance))
 
-    def predict(self, state: NoiseState, control: Any) -> NoiseState:
+    def predict(self, state: NoiseState, control: Control) -> NoiseState:
         """Predict the base filter, and every factor's velocity too."""
         state = self._begun_anew(state)
         factors = self._factors(state)
@@ -97,12 +99,12 @@ class AdaptiveProcessNoise(AbstractWrapper):
         )
 
     def update(
-        self, state: NoiseState, control: Any, seen: Features
+        self, state: NoiseState, control: Control, seen: Features
     ) -> tuple[NoiseState, Innovation]:
         inner, innovation = self.fitted(state).update(state.inner, control, seen)
         return replace(state, inner=inner), innovation
 
-    def compose(self, state: NoiseState, control: Any) -> NoiseState:
+    def compose(self, state: NoiseState, control: Control) -> NoiseState:
         """Compose, and learn from what the velocity has become."""
         state = replace(state, inner=self.fitted(state).compose(state.inner, control))
         return self._learned(state)
@@ -110,9 +112,9 @@ class AdaptiveProcessNoise(AbstractWrapper):
     def close(self, state: NoiseState, new: Features) -> NoiseState:
         return replace(state, inner=self.fitted(state).close(state.inner, new))
 
-    def fitted(self, state: NoiseState) -> Any:
+    def fitted(self, state: NoiseState) -> AbstractStaged:
         """The base filter with the σ that is believed now."""
-        motion: Any = self._inner.motion
+        motion = self._inner.motion
         sigma = self._factors(state) * jnp.asarray(motion.noise_sigma)
         return with_motion(self.base, replace(motion, noise_sigma=sigma, noise_told=False))
 
@@ -126,7 +128,7 @@ class AdaptiveProcessNoise(AbstractWrapper):
         geometry = self._inner.motion.geometry
         return slice(0, geometry.point_dim), slice(geometry.point_dim, geometry.tangent_dim)
 
-    def _velocity(self, inner: Any) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
+    def _velocity(self, inner: Belief) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
         return self.base.marginal(inner, lambda view: view.core.motion)
 
     def _factors(self, state: NoiseState) -> Float[Array, " t"]:
@@ -168,7 +170,7 @@ class AdaptiveProcessNoise(AbstractWrapper):
         )
 
 
-def _foreseen(motion: Any, control: Any, factors, velocity, covariance):
+def _foreseen(motion: AbstractMotion, control: Control, factors, velocity, covariance):
     """Mean and covariance one step on, with so many times the noise that was given."""
     zero = jnp.zeros_like(velocity)
     slope = jacobian(lambda noise: motion.next(velocity, noise, control), zero)
@@ -176,7 +178,7 @@ def _foreseen(motion: Any, control: Any, factors, velocity, covariance):
     return motion.next(velocity, zero, control), covariance + root @ root.T
 
 
-def _prior(dtype: Any) -> Float[Array, " factors"]:
+def _prior(dtype: DTypeLike) -> Float[Array, " factors"]:
     return jax.nn.log_softmax(jnp.asarray(-((np.log(FACTORS) / TOLD) ** 2) / 2, dtype))
 
 

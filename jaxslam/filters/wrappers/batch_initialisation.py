@@ -11,7 +11,6 @@ sum goes on alone.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -31,6 +30,7 @@ from jaxslam.filters.window.to_filter import gauge_state
 from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
 from jaxslam.filters.wrappers.sum_state import SumState
 from jaxslam.filters.wrappers.wrapper import AbstractWrapper
+from jaxslam.models.motion import Control
 from jaxslam.models.observations import Capacity, Features, Innovation
 
 SIZES = {"planar": (9, 25, 61), "spatial": (9, 31)}
@@ -117,7 +117,7 @@ class BatchInitialisation(AbstractWrapper):
         return replace(state, sum=inner)
 
     def update(
-        self, state: RestState, control: Any, seen: Features
+        self, state: RestState, control: Control, seen: Features
     ) -> tuple[RestState, Innovation]:
         divided = DIVIDED[self.ekf.motion.geometry.name]
         update = self.base.update if divided else self.base.update_members

@@ -11,15 +11,14 @@ With a lag of one frame, iterated, it is the iterated EKF: always on the origina
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam._numerics.linalg import Cholesky, cholesky, semidefinite_root
@@ -32,10 +31,17 @@ from jaxslam.filters.forms.sensitivity import (
     begin,
 )
 from jaxslam.filters.forms.state import State
-from jaxslam.filters.protocol import AbstractFilter, CameraView, LandmarkView
+from jaxslam.filters.protocol import (
+    AbstractFilter,
+    EachMoments,
+    Moments,
+    OfCamera,
+    OfLandmark,
+    PoseError,
+)
 from jaxslam.geometry import Pose, retract
-from jaxslam.models.motion import check_control
-from jaxslam.models.observations import Capacity, Features, Innovation, Status, judged
+from jaxslam.models.motion import Control, check_control
+from jaxslam.models.observations import Capacity, Features, Innovation, Slots, Status, judged
 
 LAG = 10
 """LagFrames of a lag whose number is not said."""
@@ -48,7 +54,7 @@ class LagFrames(eqx.Module):
 
     happened: Bool[Array, "*frames"]
     """False in the places of frames that are not there yet: nothing moves in them."""
-    control: Any
+    control: Control
     seen: Features
     new: Features
 
@@ -126,7 +132,7 @@ class FixedLag(AbstractFilter):
         return LagState(before, jnp.zeros(size, root.dtype), frames, state)
 
     def step(
-        self, state: LagState, control: Any, seen: Features, new: Features
+        self, state: LagState, control: Control, seen: Features, new: Features
     ) -> tuple[LagState, Innovation]:
         """Absorb the oldest frame of the window, add this one, and smooth."""
         check_control(self.base.motion, control)
@@ -168,24 +174,17 @@ class FixedLag(AbstractFilter):
             self.base.remove(state.estimate, gone),
         )
 
-    def marginal(
-        self, state: LagState, function: Callable[[CameraView], Any]
-    ) -> tuple[Any, Float[Array, "k k"]]:
+    def marginal(self, state: LagState, function: OfCamera) -> Moments:
         """The marginal of the newest state, as the base filter's; so are the following."""
         return self.base.marginal(state.estimate, function)
 
-    def landmark_marginal(
-        self,
-        state: LagState,
-        function: Callable[[LandmarkView], Float[Array, " k"]],
-        slots: Int[Array, " m"],
-    ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
+    def landmark_marginal(self, state: LagState, function: OfLandmark, slots: Slots) -> EachMoments:
         return self.base.landmark_marginal(state.estimate, function, slots)
 
     def in_map(self, state: LagState) -> Bool[Array, " capacity"]:
         return self.base.in_map(state.estimate)
 
-    def pose_error(self, state: LagState, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
+    def pose_error(self, state: LagState, T_BC: Pose) -> PoseError:
         return self.base.pose_error(state.estimate, T_BC)
 
     def _noises(self, state: State | Distribution) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,8 +10,9 @@ import jax.numpy as jnp
 from jaxslam._runtime.lookup import lookup
 from jaxslam.filters.association import ASSOCIATIONS, TOLERANCE, candidates
 from jaxslam.filters.ekf import ekf_inside
-from jaxslam.filters.protocol import AbstractStaged
+from jaxslam.filters.protocol import AbstractStaged, Belief
 from jaxslam.filters.wrappers.wrapper import AbstractWrapper
+from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features, Innovation
 
 
@@ -29,7 +29,7 @@ class Gated(AbstractWrapper):
         lookup("association", [self.association], ASSOCIATIONS)
         ekf_inside(self.base, "features are checked")
 
-    def update(self, state: Any, control: Any, seen: Features) -> tuple[Any, Innovation]:
+    def update(self, state: Belief, control: Control, seen: Features) -> tuple[Belief, Innovation]:
         """Correct by what agrees; the others count as not seen."""
         one, gaussian = self.base.gaussian(state, control)
         noise = ekf_inside(self.base, "features are checked").sensor.noise

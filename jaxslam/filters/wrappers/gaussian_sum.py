@@ -12,13 +12,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam._numerics.arrays import AnyArray, cast, precision
 from jaxslam._numerics.conditional import map_where, zeros
@@ -33,16 +33,20 @@ from jaxslam.filters.ekf import (
 from jaxslam.filters.protocol import (
     AbstractFilter,
     AbstractStaged,
-    CameraView,
+    Belief,
+    EachMoments,
     Expected,
-    LandmarkView,
+    Moments,
+    OfCamera,
+    OfLandmark,
+    PoseError,
 )
 from jaxslam.filters.wrappers.split_merge import collapsed, divided
 from jaxslam.filters.wrappers.sum_state import SumState, member, moments, weighed
 from jaxslam.filters.wrappers.wrapper import check_staged, with_motion
 from jaxslam.geometry import Pose, difference, retract
-from jaxslam.models.motion import check_control
-from jaxslam.models.observations import Capacity, Features, Innovation
+from jaxslam.models.motion import Control, check_control
+from jaxslam.models.observations import Capacity, Features, Innovation, Slots
 
 REACH = (2.5, 4.0)
 """The members' means are spread over ± so many σ of the prior, at the least and at the most."""
@@ -125,7 +129,7 @@ class GaussianSum(AbstractStaged):
         return SumState(jax.vmap(begun)(jnp.asarray(grid, dtype)), jnp.asarray(weights, dtype))
 
     def step(
-        self, state: SumState, control: Any, seen: Features, new: Features
+        self, state: SumState, control: Control, seen: Features, new: Features
     ) -> tuple[SumState, Innovation]:
         """Every member's step; a sum that is split is divided once the frame's noise is there."""
         if not self.split:
@@ -138,14 +142,14 @@ class GaussianSum(AbstractStaged):
 
         return self._measured(stepped, state)
 
-    def predict(self, state: SumState, control: Any) -> SumState:
+    def predict(self, state: SumState, control: Control) -> SumState:
         """Predict each member; a split sum composes later, in `update`, where that is first."""
         if not self.split:
             return self._each(lambda one: self.base.predict(one, control), state)
         check_control(self._ekf.motion, control)
         return self._each(lambda one: append_noise(self._ekf, one), state)
 
-    def gaussian(self, state: SumState, control: Any) -> tuple[AbstractStaged, Any]:
+    def gaussian(self, state: SumState, control: Control) -> tuple[AbstractStaged, Belief]:
         """The base filter, and the predicted sum's mean and covariance."""
         if self.split:
             one = collapsed(state.members, state.log_weights)
@@ -154,24 +158,26 @@ class GaussianSum(AbstractStaged):
         members = jax.vmap(lambda one: self.base.gaussian(one, control)[1])(state.members)
         return base, collapsed(members, state.log_weights)
 
-    def predict_features(self, state: SumState, control: Any, slots: Int[Array, " m"]) -> Expected:
+    def predict_features(self, state: SumState, control: Control, slots: Slots) -> Expected:
         """The features that the sum as one Gaussian expects."""
         base, one = self.gaussian(state, control)
         return base.predict_features(one, control, slots)
 
-    def update(self, state: SumState, control: Any, seen: Features) -> tuple[SumState, Innovation]:
+    def update(
+        self, state: SumState, control: Control, seen: Features
+    ) -> tuple[SumState, Innovation]:
         """Split and merge, correct every member and weigh it."""
         if self.split:
             state = self._divided(state, control, seen)
         return self.update_members(state, control, seen)
 
     def update_members(
-        self, state: SumState, control: Any, seen: Features
+        self, state: SumState, control: Control, seen: Features
     ) -> tuple[SumState, Innovation]:
         """Correct every member as it is, and weigh it."""
         return self._measured(lambda one: self._updated(one, control, seen), state)
 
-    def compose(self, state: SumState, control: Any) -> SumState:
+    def compose(self, state: SumState, control: Control) -> SumState:
         """Every member's; so are the following."""
         return self._each(lambda one: self.base.compose(one, control), state)
 
@@ -181,9 +187,7 @@ class GaussianSum(AbstractStaged):
     def remove(self, state: SumState, gone: Bool[AnyArray, " capacity"]) -> SumState:
         return self._each(lambda one: self.base.remove(one, gone), state)
 
-    def marginal(
-        self, state: SumState, function: Callable[[CameraView], Any]
-    ) -> tuple[Any, Float[Array, "k k"]]:
+    def marginal(self, state: SumState, function: OfCamera) -> Moments:
         """The sum's mean and covariance, in the tangent at the value of its likeliest member."""
         each = jax.vmap(lambda one: self.base.marginal(one, function))
         values, covariances = each(state.members)
@@ -192,12 +196,7 @@ class GaussianSum(AbstractStaged):
         mean, covariance = moments(state.log_weights, away, covariances)
         return retract(likeliest, mean), covariance
 
-    def landmark_marginal(
-        self,
-        state: SumState,
-        function: Callable[[LandmarkView], Float[Array, " k"]],
-        slots: Int[Array, " m"],
-    ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
+    def landmark_marginal(self, state: SumState, function: OfLandmark, slots: Slots) -> EachMoments:
         """The sum's mean and covariance of every landmark."""
         each = jax.vmap(lambda one: self.base.landmark_marginal(one, function, slots))
         values, covariances = each(state.members)
@@ -208,26 +207,26 @@ class GaussianSum(AbstractStaged):
         """The likeliest member's."""
         return self.base.in_map(state.likeliest)
 
-    def pose_error(self, state: SumState, T_BC: Pose) -> tuple[Float[Array, " t"], Array]:
+    def pose_error(self, state: SumState, T_BC: Pose) -> PoseError:
         """The error of the sum's mean, to first order in the members' distances; its covariance."""
         errors, covariances = jax.vmap(self.base.pose_error, in_axes=(0, None))(state.members, T_BC)
         return moments(state.log_weights, errors, covariances)
 
-    def _divided(self, state: SumState, control: Any, seen: Features) -> SumState:
+    def _divided(self, state: SumState, control: Control, seen: Features) -> SumState:
         return divided(self._ekf, state, control, seen, self.rounds)
 
-    def _updated(self, one: Any, control: Any, seen: Features) -> tuple[Any, Innovation]:
+    def _updated(self, one: Belief, control: Control, seen: Features) -> tuple[Belief, Innovation]:
         if self.split:
             one = composed_first(self._ekf, one, control)
         return self.base.update(one, control, seen)
 
-    def _each(self, function: Callable[[Any], Any], state: SumState) -> SumState:
+    def _each(self, function: Callable[[PyTree], PyTree], state: SumState) -> SumState:
         if self.split:
             return replace(state, members=map_where(function, state.members, state.alive))
         return replace(state, members=jax.vmap(function)(state.members))
 
     def _measured(
-        self, step: Callable[[Any], tuple[Any, Innovation]], state: SumState
+        self, step: Callable[[Belief], tuple[Belief, Innovation]], state: SumState
     ) -> tuple[SumState, Innovation]:
         """Every member after a step with measurements, weighed by what it did not expect."""
         if not self.split:

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,9 +30,10 @@ from jaxslam._numerics.linalg import cholesky, eigh
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.forms.blocks import shifted
 from jaxslam.filters.forms.state import State
-from jaxslam.filters.model import COMPOSED, Context
+from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.filters.wrappers.sum_state import SumState, member, moments
 from jaxslam.geometry import difference, jacobian, log
+from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features
 
 WORTH = 3e-5
@@ -42,7 +43,9 @@ SPLIT = 0.8
 """Halves of a split member are ± so many of its σ from its mean."""
 
 
-def divided(ekf: EkfSlam, state: SumState, control: Any, seen: Features, rounds: int) -> SumState:
+def divided(
+    ekf: EkfSlam, state: SumState, control: Control, seen: Features, rounds: int
+) -> SumState:
     """A predicted sum after at most so many splits and mergers."""
     n = ekf.motion.geometry.point_dim
 
@@ -97,7 +100,7 @@ class _Parts(NamedTuple):
     covariances: Float[Array, "k n n"]
 
 
-Pixels = Callable[[Any], Float[Array, " n"]]
+Pixels = Callable[[Core], Float[Array, " n"]]
 
 
 def _described(pixels: Pixels, one: State) -> tuple[Array, Array, Array]:
@@ -140,7 +143,7 @@ def _split_and_merged(pixels: Pixels, parts: _Parts) -> tuple[_Parts, Bool[Array
     return at_places(partial(_replaced, pixels), parts, places, due[None], given=divided), due
 
 
-def _replaced(pixels: Pixels, three: _Parts, _: Any, divided: Bool[Array, ""]) -> _Parts:
+def _replaced(pixels: Pixels, three: _Parts, _: tuple[()], divided: Bool[Array, ""]) -> _Parts:
     """The first two merged in the first place, and the third split into the others; if it is to be
     split, or else the second place is free."""
     members, log_weights = three.sum.members, three.sum.log_weights

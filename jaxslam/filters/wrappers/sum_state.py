@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.initialisation.alternatives import log_density
+from jaxslam.filters.protocol import Belief
 from jaxslam.models.observations import Innovation, Status
 
 BEHIND = 1e-4
@@ -22,7 +21,7 @@ as much as a residual of four σ has beyond it."""
 class SumState(eqx.Module):
     """The members' states, a batch, and the logarithms of their weights."""
 
-    members: Any
+    members: Belief
     log_weights: Float[Array, " members"]
 
     @property
@@ -31,18 +30,18 @@ class SumState(eqx.Module):
         return jnp.isfinite(self.log_weights)
 
     @property
-    def likeliest(self) -> Any:
+    def likeliest(self) -> Belief:
         """The state of the member of the greatest weight."""
         return member(self.members, jnp.argmax(self.log_weights))
 
 
-def member(members: Any, k: Any) -> Any:
+def member(members: PyTree, k: int | slice | Int[Array, ""]) -> PyTree:
     """The k-th of a batch, or those of a slice."""
     return jax.tree.map(lambda x: x[k], members)
 
 
 def weighed(
-    members: Any, log_weights: Float[Array, " members"], innovations: Innovation
+    members: Belief, log_weights: Float[Array, " members"], innovations: Innovation
 ) -> tuple[SumState, Innovation]:
     """The members weighed by the likelihoods of their innovations, and the sum's innovation."""
     after = jax.nn.log_softmax(log_weights + log_likelihoods(innovations))

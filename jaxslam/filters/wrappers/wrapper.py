@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import equinox as eqx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam.filters.protocol import (
     AbstractFilter,
     AbstractStaged,
-    CameraView,
+    Belief,
+    EachMoments,
     Expected,
-    LandmarkView,
+    Moments,
+    OfCamera,
+    OfLandmark,
+    PoseError,
 )
 from jaxslam.geometry import Pose
-from jaxslam.models.motion import AbstractMotion
-from jaxslam.models.observations import Capacity, Features, Innovation
+from jaxslam.models.motion import AbstractMotion, Control
+from jaxslam.models.observations import Capacity, Features, Innovation, Slots
 
 
 class AbstractWrapper(AbstractStaged):
@@ -33,11 +34,11 @@ class AbstractWrapper(AbstractStaged):
     def __check_init__(self) -> None:
         check_staged(self, self.base)
 
-    def base_state(self, state: Any) -> Any:
+    def base_state(self, state: Belief) -> Belief:
         """The base's state in the wrapper's."""
         return state
 
-    def with_base_state(self, state: Any, inner: Any) -> Any:
+    def with_base_state(self, state: Belief, inner: Belief) -> Belief:
         """The wrapper's state with another one of the base in it."""
         del state
         return inner
@@ -50,54 +51,47 @@ class AbstractWrapper(AbstractStaged):
     def ambiguous_start(self) -> bool:
         return self.base.ambiguous_start
 
-    def init(self, capacity: int | Capacity, first: Features | None = None) -> Any:
+    def init(self, capacity: int | Capacity, first: Features | None = None) -> Belief:
         return self.base.init(capacity, first)
 
-    def predict(self, state: Any, control: Any) -> Any:
+    def predict(self, state: Belief, control: Control) -> Belief:
         return self.with_base_state(state, self.base.predict(self.base_state(state), control))
 
-    def predict_features(self, state: Any, control: Any, slots: Int[Array, " m"]) -> Expected:
+    def predict_features(self, state: Belief, control: Control, slots: Slots) -> Expected:
         return self.base.predict_features(self.base_state(state), control, slots)
 
-    def gaussian(self, state: Any, control: Any) -> tuple[AbstractStaged, Any]:
+    def gaussian(self, state: Belief, control: Control) -> tuple[AbstractStaged, Belief]:
         return self.base.gaussian(self.base_state(state), control)
 
-    def update(self, state: Any, control: Any, seen: Features) -> tuple[Any, Innovation]:
+    def update(self, state: Belief, control: Control, seen: Features) -> tuple[Belief, Innovation]:
         inner, innovation = self.base.update(self.base_state(state), control, seen)
         return self.with_base_state(state, inner), innovation
 
-    def compose(self, state: Any, control: Any) -> Any:
+    def compose(self, state: Belief, control: Control) -> Belief:
         return self.with_base_state(state, self.base.compose(self.base_state(state), control))
 
-    def close(self, state: Any, new: Features) -> Any:
+    def close(self, state: Belief, new: Features) -> Belief:
         return self.with_base_state(state, self.base.close(self.base_state(state), new))
 
-    def remove(self, state: Any, gone: Bool[AnyArray, " capacity"]) -> Any:
+    def remove(self, state: Belief, gone: Bool[AnyArray, " capacity"]) -> Belief:
         return self.with_base_state(state, self.base.remove(self.base_state(state), gone))
 
-    def moving(self, state: Any) -> Bool[Array, ""]:
+    def moving(self, state: Belief) -> Bool[Array, ""]:
         return self.base.moving(self.base_state(state))
 
-    def marginal(
-        self, state: Any, function: Callable[[CameraView], Any]
-    ) -> tuple[Any, Float[Array, "k k"]]:
+    def marginal(self, state: Belief, function: OfCamera) -> Moments:
         return self.base.marginal(self.base_state(state), function)
 
-    def landmark_marginal(
-        self,
-        state: Any,
-        function: Callable[[LandmarkView], Float[Array, " k"]],
-        slots: Int[Array, " m"],
-    ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
+    def landmark_marginal(self, state: Belief, function: OfLandmark, slots: Slots) -> EachMoments:
         return self.base.landmark_marginal(self.base_state(state), function, slots)
 
-    def in_map(self, state: Any) -> Bool[Array, " capacity"]:
+    def in_map(self, state: Belief) -> Bool[Array, " capacity"]:
         return self.base.in_map(self.base_state(state))
 
-    def pose_error(self, state: Any, T_BC: Pose) -> tuple[Float[Array, " t"], Float[Array, "t t"]]:
+    def pose_error(self, state: Belief, T_BC: Pose) -> PoseError:
         return self.base.pose_error(self.base_state(state), T_BC)
 
-    def unit_fixed(self, state: Any) -> Bool[Array, ""]:
+    def unit_fixed(self, state: Belief) -> Bool[Array, ""]:
         return self.base.unit_fixed(self.base_state(state))
 
 
@@ -109,6 +103,6 @@ def check_staged(around: AbstractStaged, base: AbstractFilter) -> None:
         )
 
 
-def with_motion(slam: Any, motion: AbstractMotion) -> Any:
+def with_motion(slam: AbstractStaged, motion: AbstractMotion) -> AbstractStaged:
     """The filter with another motion model inside."""
     return eqx.tree_at(lambda slam: slam.unwrapped.motion, slam, motion)
