@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.arrays import AnyArray, cast, precision
 from jaxslam.filters.forms.blocks import Prior
-from jaxslam.filters.forms.covariance import Covariance, convert
+from jaxslam.filters.forms.covariance import Covariance
 from jaxslam.filters.forms.form import AbstractForm, AbstractGaussian
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.model import COMPOSED, Context, Core, SlamModel
@@ -196,7 +196,7 @@ class EkfSlam(AbstractStaged):
             state = jax.lax.cond(due, lambda state: reanchored(self, state), lambda s: s, state)
         if self.landmark.convert is None:
             return state
-        return convert(self.model, state, COMPOSED)
+        return self.gaussian_form.convert(self.model, state, COMPOSED)
 
     def close(self, state: Belief, new: Features) -> Belief:
         """Begin new landmarks seen from the current camera (P22–P26), and end the frame."""

@@ -23,7 +23,7 @@ from cases import (
 
 from jaxslam._numerics.arrays import cast
 from jaxslam.filters.ekf import EkfSlam, insert
-from jaxslam.filters.forms.covariance import Covariance, convert
+from jaxslam.filters.forms.covariance import Covariance
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.filters.readouts import (
@@ -516,8 +516,8 @@ def test_a_conversion_changes_neither_points_nor_what_is_known_of_them(geometry,
 
     def both():
         state = convertible_state(model)
-        converted = convert(model, state, COMPOSED)
-        again = convert(model, converted, COMPOSED)
+        converted = Covariance().convert(model, state, COMPOSED)
+        again = Covariance().convert(model, converted, COMPOSED)
         return state, converted, again, known(state), known(converted)
 
     state, converted, again, before, after = quick_jit(both)()

@@ -84,6 +84,19 @@ class Model(Protocol):
         ...
 
 
+class NewLandmarks(NamedTuple):
+    """Landmarks of first measurements."""
+
+    values: Float[Array, "m d"]
+    slots: Slots
+    """Out of bounds for what is not valid."""
+    J: Blocks
+    """Their Jacobians, of which `by_landmark` is the identity: the error of one is J of the core's
+    and its own."""
+    root: Float[Array, "m d p+q"]
+    """`J diag(R, σ²)^½` by measurement and prior."""
+
+
 class Change(NamedTuple):
     """A change of variables: new coordinates of the core, and of one landmark seen from the old.
 
@@ -136,11 +149,8 @@ def observe(
 
 def new_landmarks(
     model: Model, state: Belief, features: Features, noise: Noise, prior: Prior, context: PyTree
-) -> tuple[Float[Array, "m d"], Blocks, Float[Array, "m d p+q"]]:
-    """Landmarks of first measurements (P22–P26): values, J by the view, and `J diag(R, σ²)^½`.
-
-    `by_landmark` is the identity: the error of landmark i is J of the core's and its own.
-    """
+) -> NewLandmarks:
+    """Landmarks of first measurements (P22–P26), with their errors."""
     mean, sigma = (jnp.broadcast_to(x, (features.slots.size, x.shape[-1])) for x in prior)
     view = model.view(state.core, context)
     view_by_core = jacobian(lambda core: model.view(core, context), state.core)
@@ -159,7 +169,8 @@ def new_landmarks(
     new, J_view, own = jax.vmap(one)(features.measured, mean, sigma)
     m, d = new.shape
     identity = jnp.broadcast_to(jnp.eye(d, dtype=new.dtype), (m, d, d))
-    return new, Blocks(view_by_core, J_view, identity), own
+    slots = jnp.where(features.valid, features.slots, state.active.size)
+    return NewLandmarks(new, slots, Blocks(view_by_core, J_view, identity), own)
 
 
 def indices(slots: Slots, state: Belief) -> Int[Array, "m d"]:
@@ -187,6 +198,13 @@ def local_jacobians(view, function, core, landmarks, *data) -> tuple[Array, PyTr
 
     value, auxiliary, (by_view, by_landmark) = jax.vmap(one)(landmarks, *data)
     return value, auxiliary, Blocks(view_by_core, by_view, by_landmark)
+
+
+def changed_landmarks(state, view, function, *data) -> tuple[Float[Array, "capacity d"], Blocks]:
+    """All landmarks after a `function` as `local_jacobians` asks for; as they are, with Jacobians
+    of zero, in slots that hold none."""
+    values, _, J = local_jacobians(view, function, state.core, state.landmarks, *data)
+    return jnp.where(state.active[:, None], values, state.landmarks), masked(J, state.active)
 
 
 def without_auxiliary(function: Landmark) -> Callable[[PyTree, Array], tuple[Array, None]]:
@@ -222,12 +240,19 @@ def observed(J: Blocks, slots: Slots, B: Float[Array, "n r"]) -> Float[Array, "m
     return by_view + small_products(J.by_landmark, own).reshape(by_view.shape)
 
 
-def rows(J: Blocks, B: Float[Array, "n r"]) -> Float[Array, "nl r"]:
-    """`J B` for every landmark in order, without the zeros: J has a block for each."""
-    c, d = J.view_by_core.shape[1], J.by_landmark.shape[-1]
+def product(
+    J_core: Float[Array, "c c"], J: Blocks | None, B: Float[Array, "n r"]
+) -> Float[Array, "n r"]:
+    """`J B` of a change of the core and of every landmark in order, without the zeros; of the core
+    alone where J is None."""
+    c = len(J_core)
+    if J is None:
+        return jnp.concatenate([J_core @ B[:c], B[c:]])
     by_view = small_products(J.by_view, J.view_by_core @ B[:c])
+    d = J.by_landmark.shape[-1]
     by_landmark = small_products(J.by_landmark, B[c:].reshape(-1, d, B.shape[1]))
-    return (by_view + by_landmark).reshape(-1, B.shape[1])
+    below = (by_view + by_landmark).reshape(-1, B.shape[1])
+    return jnp.concatenate([J_core @ B[:c], below])
 
 
 def small_products(A: Float[Array, "*m k j"], B: Float[Array, "*#m j r"]) -> Float[Array, "*m k r"]:

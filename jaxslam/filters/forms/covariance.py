@@ -15,25 +15,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam._numerics.arrays import AnyArray
-from jaxslam.filters.forms.blocks import (
-    Blocks,
-    Change,
-    Model,
-    Noise,
-    Prior,
-    indices,
-    local_jacobians,
-    masked,
-    new_landmarks,
-    rows,
-    without_auxiliary,
-)
+from jaxslam.filters.forms.blocks import Blocks, NewLandmarks, indices, product
 from jaxslam.filters.forms.correction import AbstractCorrection, Standard
 from jaxslam.filters.forms.form import AbstractGaussian, OfCore
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.protocol import Moments
 from jaxslam.geometry import jacobian
-from jaxslam.models.observations import Features, Innovation
 
 
 class Covariance(AbstractGaussian):
@@ -82,57 +69,26 @@ class Covariance(AbstractGaussian):
         covariance = state.covariance.at[part, :].set(0.0).at[:, part].set(0.0)
         return replace(state, covariance=covariance)
 
-    def update(
-        self,
-        model: Model,
-        state: State,
-        features: Features,
-        noise: Noise,
-        context: PyTree,
-        considered: slice = slice(0, 0),
-    ) -> tuple[State, Innovation]:
+    def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         return self.correction.update(model, state, features, noise, context, considered)
 
-    def reparametrise(self, state: State, variables: Change) -> State:
-        """Write the state in other variables, `P ← J P Jᵀ`."""
-        core, J_core = variables.core(state.core), jacobian(variables.core, state.core)
-        if variables.landmark is None:
-            return _transformed(state, core, J_core, state.landmarks, None)
-        moved, _, J = local_jacobians(
-            variables.view, without_auxiliary(variables.landmark), state.core, state.landmarks
-        )
-        return _transformed(state, core, J_core, moved, J)
+    def transformed(self, state: State, J_core: Float[Array, "c c"], J: Blocks | None) -> State:
+        """`P ← J P Jᵀ`."""
+        half = product(J_core, J, state.covariance)
+        return replace(state, covariance=product(J_core, J, half.T))
 
-    def initialise(
-        self,
-        model: Model,
-        state: State,
-        features: Features,
-        noise: Noise,
-        prior: Prior,
-        context: PyTree,
-    ) -> State:
+    def with_new(self, state: State, new: NewLandmarks) -> State:
         """`P ← J diag(P, R, σ²) Jᵀ` (P22–P26)."""
-        if features.slots.size == 0:
-            return state
-        c, capacity = state.core_dim, state.active.size
-        new, J, root = new_landmarks(model, state, features, noise, prior, context)
-        own = root @ jnp.swapaxes(root, 1, 2)
-        slots = jnp.where(features.valid, features.slots, capacity)  # out of bounds: dropped
-        index = indices(slots, state)
+        c, index = state.core_dim, indices(new.slots, state)
+        own = new.root @ jnp.swapaxes(new.root, 1, 2)
 
         def with_rows(P):
-            rows = J.by_view @ (J.view_by_core @ P[:c])
+            rows = new.J.by_view @ (new.J.view_by_core @ P[:c])
             return P.at[index.ravel()].set(rows.reshape(index.size, -1), mode="drop")
 
         covariance = with_rows(with_rows(state.covariance).T)
-        state = replace(
-            state,
-            landmarks=state.landmarks.at[slots].set(new, mode="drop"),
-            active=state.active.at[slots].set(True, mode="drop"),
-            covariance=covariance.at[index[:, :, None], index[:, None, :]].add(own, mode="drop"),
-        )
-        return self.correction.remember(state, slots)
+        covariance = covariance.at[index[:, :, None], index[:, None, :]].add(own, mode="drop")
+        return self.correction.remember(replace(state, covariance=covariance), new.slots)
 
     def remove(self, state: State, gone: Bool[AnyArray, " capacity"]) -> State:
         kept = jnp.repeat(~gone, state.landmarks.shape[1])
@@ -159,34 +115,3 @@ class Covariance(AbstractGaussian):
         c = state.core_dim
         J = jacobian(function, state.core)
         return function(state.core), J @ state.covariance[:c, :c] @ J.T
-
-
-def convert(model: Model, state: State, context: PyTree) -> State:
-    """Write landmarks in the form that the model now prefers, `P ← J P Jᵀ`."""
-    c, (capacity, d) = state.core_dim, state.landmarks.shape
-    blocks = state.covariance[c:, c:].reshape(capacity, d, capacity, d)
-    own = blocks[jnp.arange(capacity), :, jnp.arange(capacity), :]
-
-    def converted(view, landmark, covariance):
-        return model.convert(view, landmark, covariance, context), None
-
-    value, _, J = local_jacobians(
-        lambda core: model.view(core, context), converted, state.core, state.landmarks, own
-    )
-    J_core = jnp.eye(c, dtype=state.covariance.dtype)
-    return _transformed(state, state.core, J_core, value, J)
-
-
-def _transformed(state: State, core: PyTree, J_core: Array, landmarks: Array, J: Blocks | None):
-    """The state after a change of variables, of the core alone where J is None."""
-    c = state.core_dim
-    if J is not None:
-        J = masked(J, state.active)
-        landmarks = jnp.where(state.active[:, None], landmarks, state.landmarks)
-
-    def turned(P):
-        below = P[c:] if J is None else rows(J, P)
-        return jnp.concatenate([J_core @ P[:c], below])
-
-    covariance = turned(turned(state.covariance).T)
-    return replace(state, core=core, landmarks=landmarks, covariance=covariance)

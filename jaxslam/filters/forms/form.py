@@ -1,14 +1,14 @@
 """The form of a filter: how its uncertainty is kept, and what every step does to it.
 
-`Covariance` keeps P, `Information` its inverse, `Sensitivity` no distribution but derivatives. A
-state of each has `core`, `landmarks`, `active`, `memory` and `core_dim`. A remedy is a correction
-of `Covariance` (`correction.py`).
+`Covariance` keeps P, `Information` its inverse, `Sensitivity` no distribution but derivatives, each
+in an `AbstractState` of its own. A remedy is a correction of `Covariance` (`correction.py`).
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -22,10 +22,13 @@ from jaxslam.filters.forms.blocks import (
     Change,
     Landmark,
     Model,
+    NewLandmarks,
     Noise,
     Prior,
+    changed_landmarks,
     composition,
     local_jacobians,
+    new_landmarks,
     observe,
     without_auxiliary,
 )
@@ -89,11 +92,21 @@ class AbstractForm(eqx.Module):
         """Move the state over the motion (P18–P21)."""
         return self.reparametrise(state, composition(model, context))
 
-    @abstractmethod
     def reparametrise(self, state: Belief, variables: Change) -> Belief:
         """Write the state in other variables."""
+        core, J_core = variables.core(state.core), jacobian(variables.core, state.core)
+        if variables.landmark is None:
+            return replace(self.transformed(state, J_core, None), core=core)
+        landmarks, J = changed_landmarks(
+            state, variables.view, without_auxiliary(variables.landmark)
+        )
+        return replace(self.transformed(state, J_core, J), core=core, landmarks=landmarks)
 
     @abstractmethod
+    def transformed(self, state: Belief, J_core: Float[Array, "c c"], J: Blocks | None) -> Belief:
+        """The uncertainty after a change of variables with these Jacobians, which are zero in empty
+        slots; of the core alone where J is None."""
+
     def initialise(
         self,
         model: Model,
@@ -110,6 +123,16 @@ class AbstractForm(eqx.Module):
         the calibration) correlates them with it and with one another. Whatever was in their slots
         must have been removed.
         """
+        if features.slots.size == 0:
+            return state
+        new = new_landmarks(model, state, features, noise, prior, context)
+        landmarks = state.landmarks.at[new.slots].set(new.values, mode="drop")
+        active = state.active.at[new.slots].set(True, mode="drop")
+        return self.with_new(replace(state, landmarks=landmarks, active=active), new)
+
+    @abstractmethod
+    def with_new(self, state: Belief, new: NewLandmarks) -> Belief:
+        """The uncertainty of landmarks that were just written into their slots."""
 
     @abstractmethod
     def core_covariance(self, function: OfCore, state: Belief) -> Moments:
@@ -150,6 +173,22 @@ class AbstractGaussian(AbstractForm):
             view, without_auxiliary(function), state.core, state.landmarks[slots]
         )
         return value, self.local_covariance(state, J, slots)
+
+    def convert(self, model: Model, state: Belief, context: PyTree) -> Belief:
+        """Write landmarks in the form that the model now prefers."""
+        c, (capacity, d) = state.core_dim, state.landmarks.shape
+        blocks = state.covariance[c:, c:].reshape(capacity, d, capacity, d)
+        own = blocks[jnp.arange(capacity), :, jnp.arange(capacity), :]
+
+        def converted(view, landmark, covariance):
+            return model.convert(view, landmark, covariance, context), None
+
+        def view(core):
+            return model.view(core, context)
+
+        landmarks, J = changed_landmarks(state, view, converted, own)
+        state = self.transformed(state, jnp.eye(c, dtype=state.landmarks.dtype), J)
+        return replace(state, landmarks=landmarks)
 
     def joint_covariance(self, state: Belief, slot: Int[Array, ""]) -> Float[Array, "k k"]:
         """The joint covariance of the core and one landmark, k = c + d numbers."""

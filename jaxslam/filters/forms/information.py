@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
@@ -24,25 +23,20 @@ from jaxslam._numerics.arrays import AnyArray
 from jaxslam._numerics.linalg import Cholesky, cholesky, inverse
 from jaxslam.filters.forms.blocks import (
     Blocks,
-    Change,
-    Model,
-    Noise,
-    Prior,
+    NewLandmarks,
     indices,
-    local_jacobians,
     masked,
-    new_landmarks,
     placed,
     residuals,
     shifted,
     small_products,
-    without_auxiliary,
 )
 from jaxslam.filters.forms.form import AbstractGaussian, OfCore
+from jaxslam.filters.forms.state import AbstractState
 from jaxslam.filters.protocol import Moments
 from jaxslam.geometry import jacobian, tangent_dim
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.models.observations import Features, Innovation, judged
+from jaxslam.models.observations import Innovation, judged
 
 EXACT_SIGMA = 1e-6
 """Least σ that Λ represents: a micrometre, a microradian. A smaller one, as of the pose at the
@@ -50,23 +44,15 @@ start, counts as this one. Next to what a step of motion adds it is nothing, and
 precision no digit that matters is lost to 1/σ²."""
 
 
-class InformationState(eqx.Module):
-    """Mean and information matrix; as `State` but for the last.
+class InformationState(AbstractState):
+    """Mean and information matrix.
 
     Rows and columns of what is not in the state are zero: inactive slots, and the noises between
     steps. Everything else is positive definite.
     """
 
-    core: PyTree
-    landmarks: Float[Array, "capacity d"]
-    active: Bool[Array, " capacity"]
     information: Float[Array, "n n"]
     memory: PyTree = ()
-
-    @property
-    def core_dim(self) -> int:
-        """c, the size of the core's tangent."""
-        return tangent_dim(self.core)
 
     @property
     def covariance(self) -> Float[Array, "n n"]:
@@ -123,15 +109,7 @@ class Information(AbstractGaussian):
         information = _without(state.information, start, jnp.ones(size, bool))
         return replace(state, information=information)
 
-    def update(
-        self,
-        model: Model,
-        state: InformationState,
-        features: Features,
-        noise: Noise,
-        context: PyTree,
-        considered: slice = slice(0, 0),
-    ) -> tuple[InformationState, Innovation]:
+    def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         """`Λ ← Λ + Σ HᵢᵀR⁻¹Hᵢ` and the mean by `Λ δ = b = Σ HᵢᵀR⁻¹rᵢ`, all features at once.
 
         Blocks between two landmarks stay as they are, bit for bit. The NIS needs no S:
@@ -151,62 +129,33 @@ class Information(AbstractGaussian):
         status = judged(factor.positive, information, state.landmarks)
         return state, Innovation(predicted, residual, None, used, nis, status)
 
-    def reparametrise(self, state: InformationState, variables: Change) -> InformationState:
-        """Write the state in other variables, `Λ ← J⁻ᵀ Λ J⁻¹`.
+    def transformed(
+        self, state: InformationState, J_core: Float[Array, "c c"], J: Blocks | None
+    ) -> InformationState:
+        """`Λ ← J⁻ᵀ Λ J⁻¹`.
 
         Parts of the core that are set to a constant keep their old variables in the change, which
         is then invertible, and are marginalised after it.
         """
-        c = state.core_dim
-        core, J_core = variables.core(state.core), jacobian(variables.core, state.core)
         spent = jnp.all(J_core == 0, axis=1)
         core_inverse = inverse(J_core + jnp.diag(spent.astype(J_core.dtype)))
-        landmarks, J = state.landmarks, None
-        if variables.landmark is not None:
-            moved, _, forward = local_jacobians(
-                variables.view, without_auxiliary(variables.landmark), state.core, state.landmarks
-            )
-            landmarks = jnp.where(state.active[:, None], moved, state.landmarks)
-            J = _inverted(forward, core_inverse, state.active)
+        back = None if J is None else _inverted(J, core_inverse, state.active)
 
         def rows(matrix):
-            return _transposed_rows(core_inverse, J, matrix, c)
+            return _transposed_rows(core_inverse, back, matrix, state.core_dim)
 
         information = _without(rows(rows(state.information).T), 0, spent)
-        return replace(
-            state, core=core, landmarks=landmarks, information=(information + information.T) / 2
-        )
+        return replace(state, information=(information + information.T) / 2)
 
-    def initialise(
-        self,
-        model: Model,
-        state: InformationState,
-        features: Features,
-        noise: Noise,
-        prior: Prior,
-        context: PyTree,
-    ) -> InformationState:
-        """Insert landmarks from their first measurement (P22–P26): information `N⁻¹` on `y − J x`.
-
-        y is the landmark, x the core, N the covariance of y given x: the same sum as an update's.
-        Whatever was in their slots must have been removed.
-        """
-        if features.slots.size == 0:
-            return state
-        new, J, root = new_landmarks(model, state, features, noise, prior, context)
-        own = small_products(root, jnp.swapaxes(root, 1, 2))
-        capacity = state.active.size
-        slots = jnp.where(features.valid, features.slots, capacity)  # out of bounds: dropped
-        difference = masked(J._replace(by_view=-J.by_view), features.valid)
-        identity = jnp.eye(new.shape[1], dtype=own.dtype)
-        own = jnp.where(features.valid[:, None, None], own, identity)
+    def with_new(self, state: InformationState, new: NewLandmarks) -> InformationState:
+        """Information `N⁻¹` on `y − J x`, of the landmark y, the core x and the covariance N of y
+        given x: the same sum as an update's."""
+        valid = new.slots < state.active.size
+        own = small_products(new.root, jnp.swapaxes(new.root, 1, 2))
+        own = jnp.where(valid[:, None, None], own, jnp.eye(own.shape[-1], dtype=own.dtype))
         weight = jax.vmap(lambda N: cholesky(N).inverse())(own)
-        return replace(
-            state,
-            landmarks=state.landmarks.at[slots].set(new, mode="drop"),
-            active=state.active.at[slots].set(True, mode="drop"),
-            information=_added(state, difference, slots, weight),
-        )
+        difference = masked(new.J._replace(by_view=-new.J.by_view), valid)
+        return replace(state, information=_added(state, difference, new.slots, weight))
 
     def remove(
         self, state: InformationState, gone: Bool[AnyArray, " capacity"]
@@ -262,11 +211,10 @@ def _pulled_back(state, J: Blocks, slots, weighted: Float[Array, "m k"]) -> Floa
 
 
 def _inverted(J: Blocks, core_inverse: Float[Array, "c c"], active) -> Blocks:
-    """Blocks of the inverse change; the identity in inactive slots."""
+    """Blocks of the inverse change of one that is zero in inactive slots; the identity there."""
     identity = jnp.eye(J.by_landmark.shape[-1], dtype=core_inverse.dtype)
     own = jax.vmap(inverse)(jnp.where(active[:, None, None], J.by_landmark, identity))
-    by_view = jnp.where(active[:, None, None], J.by_view, 0.0)
-    return Blocks(J.view_by_core @ core_inverse, -small_products(own, by_view), own)
+    return Blocks(J.view_by_core @ core_inverse, -small_products(own, J.by_view), own)
 
 
 def _transposed_rows(core: Float[Array, "c c"], J: Blocks | None, B, c: int):

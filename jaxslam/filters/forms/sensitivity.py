@@ -25,23 +25,18 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.forms.blocks import (
-    Change,
-    Model,
-    Noise,
-    Prior,
+    Blocks,
+    NewLandmarks,
     indices,
-    local_jacobians,
-    masked,
-    new_landmarks,
+    product,
     residuals,
-    rows,
     small_products,
-    without_auxiliary,
 )
 from jaxslam.filters.forms.form import AbstractForm, OfCore
+from jaxslam.filters.forms.state import AbstractState
 from jaxslam.filters.protocol import Moments
 from jaxslam.geometry import difference, jacobian, retract, tangent_dim
-from jaxslam.models.observations import Features, Slots
+from jaxslam.models.observations import Slots
 
 
 class Distribution(eqx.Module):
@@ -83,16 +78,13 @@ class Derivative(NamedTuple):
         return jnp.concatenate([first @ root, shared[:, c:]], axis=1)
 
 
-class Point(eqx.Module):
+class Point(AbstractState):
     """The state at one y. Variables: n of the state before, then those of each frame's noise.
 
     A landmark that enters takes the first of the n that its slot has: they are free, since an
     empty slot has none.
     """
 
-    core: PyTree
-    landmarks: Float[Array, "capacity d"]
-    active: Bool[Array, " capacity"]
     by_shared: Float[Array, "n r"]
     """∂x by the error of the core before, and by the frames' noise."""
     by_own: Float[Array, "capacity d d"]
@@ -102,10 +94,6 @@ class Point(eqx.Module):
     used: Int[Array, ""]
     """How many of the variables have been used: the next noise begins there."""
     memory: PyTree = ()
-
-    @property
-    def core_dim(self) -> int:
-        return tangent_dim(self.core)
 
     def sensitivity(self, before: Distribution) -> Float[Array, "n N"]:
         """S, where the frames began with this distribution."""
@@ -161,15 +149,7 @@ class Sensitivity(AbstractForm):
         del start, size
         return state
 
-    def update(
-        self,
-        model: Model,
-        state: Point,
-        features: Features,
-        noise: Noise,
-        context: PyTree,
-        considered: slice = slice(0, 0),
-    ) -> tuple[Point, WhitenedResiduals]:
+    def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         """Compare with the features seen; the state stays as it is."""
         del considered
         predicted, residual, used, H = residuals(model, state, features, context)
@@ -186,56 +166,28 @@ class Sensitivity(AbstractForm):
             used,
         )
 
-    def reparametrise(self, state: Point, variables: Change) -> Point:
-        """Write the state in other variables, `S ← J S`."""
-        D, c = state.by_shared, state.core_dim
-        core, J_core = variables.core(state.core), jacobian(variables.core, state.core)
-        above = J_core @ D[:c]
-        if variables.landmark is None:
-            return replace(state, core=core, by_shared=jnp.concatenate([above, D[c:]]))
-        moved, _, J = local_jacobians(
-            variables.view, without_auxiliary(variables.landmark), state.core, state.landmarks
-        )
-        J = masked(J, state.active)
-        return replace(
-            state,
-            core=core,
-            landmarks=jnp.where(state.active[:, None], moved, state.landmarks),
-            by_shared=jnp.concatenate([above, rows(J, D)]),
-            by_own=small_products(J.by_landmark, state.by_own),
-        )
+    def transformed(self, state: Point, J_core: Float[Array, "c c"], J: Blocks | None) -> Point:
+        """`S ← J S`."""
+        by_own = state.by_own if J is None else small_products(J.by_landmark, state.by_own)
+        return replace(state, by_shared=product(J_core, J, state.by_shared), by_own=by_own)
 
-    def initialise(
-        self,
-        model: Model,
-        state: Point,
-        features: Features,
-        noise: Noise,
-        prior: Prior,
-        context: PyTree,
-    ) -> Point:
+    def with_new(self, state: Point, new: NewLandmarks) -> Point:
         """Landmarks as the filter begins them, and off by what the variables of their slots say.
 
         The deviation is linear in them, with a σ that does not depend on the rest of the state.
         Were it differentiated by the scale of a gauge, the maximum of the posterior would be off
         by about N σ_λ² after N landmarks: the score of an amplitude has no mean of zero.
         """
-        if features.slots.size == 0:
-            return state
-        new, J, root = new_landmarks(model, state, features, noise, prior, context)
-        k = root.shape[-1]
-        own = state.variables[indices(features.slots, state)[:, :k]]
-        new = new + small_products(root, own[:, :, None])[:, :, 0]
-
-        D, c, (capacity, d) = state.by_shared, state.core_dim, state.landmarks.shape
-        slots = jnp.where(features.valid, features.slots, capacity)  # out of bounds: dropped
-        shared = J.by_view @ (J.view_by_core @ D[:c])
-        free = jnp.pad(root, ((0, 0), (0, 0), (0, d - k)))
+        slots, J, (_, d, k) = new.slots, new.J, new.root.shape
+        index = indices(slots, state)
+        own = state.variables[index[:, :k]]
+        away = small_products(new.root, own[:, :, None])[:, :, 0]
+        shared = J.by_view @ (J.view_by_core @ state.by_shared[: state.core_dim])
+        free = jnp.pad(new.root, ((0, 0), (0, 0), (0, d - k)))
         return replace(
             state,
-            landmarks=state.landmarks.at[slots].set(new, mode="drop"),
-            active=state.active.at[slots].set(True, mode="drop"),
-            by_shared=D.at[indices(slots, state)].set(shared, mode="drop"),
+            landmarks=state.landmarks.at[slots].add(away, mode="drop"),
+            by_shared=state.by_shared.at[index].set(shared, mode="drop"),
             by_own=state.by_own.at[slots].set(free, mode="drop"),
         )
 

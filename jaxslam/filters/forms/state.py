@@ -1,4 +1,4 @@
-"""The state of a filter: a core on a manifold, landmarks of fixed capacity, one covariance."""
+"""The state of a form: a core on a manifold, landmarks of fixed capacity, an uncertainty."""
 
 from __future__ import annotations
 
@@ -8,25 +8,29 @@ from jaxtyping import Array, Bool, Float, PyTree
 from jaxslam.geometry import tangent_dim
 
 
-class State(eqx.Module):
-    """Mean and covariance. Everything has a fixed shape; `active` says which slots hold a landmark.
+class AbstractState(eqx.Module):
+    """A mean, to which a form adds its uncertainty, and `memory`, what an `AbstractEntry` remembers
+    beside: any pytree. Everything has a fixed shape.
 
-    The error is ordered (core, landmark 0, landmark 1, …), n = c + capacity · d numbers. Rows and
-    columns of inactive slots are zero.
+    The error is ordered (core, landmark 0, landmark 1, …), n = c + capacity · d numbers.
     """
 
     core: PyTree
-    """Pytree of poses and vectors, whose tangent has c numbers."""
+    """Poses and vectors, whose tangent has c numbers."""
     landmarks: Float[Array, "capacity d"]
     active: Bool[Array, " capacity"]
-    covariance: Float[Array, "n n"]
-    memory: PyTree = ()
-    """What an `AbstractEntry` remembers of landmarks beside the Gaussian: any pytree."""
-
-    first: Float[Array, "capacity d"] | None = None
-    """Landmarks as they were inserted; where a correction is by first estimates."""
+    """Which slots hold a landmark."""
 
     @property
     def core_dim(self) -> int:
         """c, the size of the core's tangent."""
         return tangent_dim(self.core)
+
+
+class State(AbstractState):
+    """Mean and covariance; rows and columns of inactive slots are zero."""
+
+    covariance: Float[Array, "n n"]
+    memory: PyTree = ()
+    first: Float[Array, "capacity d"] | None = None
+    """Landmarks as they were inserted; where a correction is by first estimates."""
