@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ from jaxslam.filters.wrappers.gated import Gated
 from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
 from jaxslam.landmarks import LANDMARKS, Parametrization
 from jaxslam.models.calibration import TREATMENTS, AbstractCalibration
-from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
+from jaxslam.models.coordinates import KEYFRAME, WORLD
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.scale import ScaleGauge
@@ -49,58 +50,24 @@ Piece = Any
 """Of a filter, as `EkfSlam` takes it: `motion`, `sensor`, `landmark`, `calibration`, `depth`."""
 
 
-def robocentric(**pieces: Piece) -> EkfSlam:
-    """The paper's filter: landmarks in the camera frame, composition after the update."""
-    return EkfSlam(coordinates=ROBOCENTRIC, **pieces)
-
-
-def world(**pieces: Piece) -> EkfSlam:
-    """The classical filter: landmarks in the base frame, prediction composed first."""
-    return EkfSlam(coordinates=WORLD, **pieces)
-
-
-def keyframe(**pieces: Piece) -> EkfSlam:
-    """Landmarks in the camera of the current keyframe, prediction composed first."""
-    return EkfSlam(coordinates=KEYFRAME, **pieces)
-
-
-def information(**pieces: Piece) -> EkfSlam:
-    """`keyframe` in information form: the same estimates by sparse, additive updates."""
-    return EkfSlam(coordinates=KEYFRAME, form=Information(), **pieces)
-
-
-def scale_gauge(**pieces: Piece) -> EkfSlam:
-    """The paper's filter in a unit of length of its own, whose size is estimated."""
-    return EkfSlam(coordinates=ROBOCENTRIC, scale=ScaleGauge(), **pieces)
-
-
-def world_gauge(**pieces: Piece) -> EkfSlam:
-    """`scale_gauge` with landmarks in the base frame; its covariance is too small where the camera
-    turns."""
-    return EkfSlam(coordinates=WORLD, scale=ScaleGauge(), **pieces)
-
-
-def iterated_filter(**pieces: Piece) -> FixedLag:
-    """The paper's filter, iterated: linearised at the maximum of the posterior of every frame."""
-    return to_maximum(robocentric(**pieces))
-
-
-def invariant(**pieces: Piece) -> EkfSlam:
-    """`world` with the right-invariant error: landmarks' errors move with the pose's."""
-    return EkfSlam(coordinates=WORLD, form=Covariance(Invariant()), **pieces)
-
-
 FILTERS: dict[str, Callable[..., AbstractFilter]] = {
-    "robocentric": robocentric,
-    "world": world,
-    "keyframe": keyframe,
-    "information": information,
-    "scale_gauge": scale_gauge,
-    "world_gauge": world_gauge,
-    "iterated": iterated_filter,
-    "invariant": invariant,
+    "robocentric": EkfSlam,
+    "world": partial(EkfSlam, coordinates=WORLD),
+    "keyframe": partial(EkfSlam, coordinates=KEYFRAME),
+    "information": partial(EkfSlam, coordinates=KEYFRAME, form=Information()),
+    "scale_gauge": partial(EkfSlam, scale=ScaleGauge()),
+    "world_gauge": partial(EkfSlam, coordinates=WORLD, scale=ScaleGauge()),
+    "iterated": lambda **pieces: to_maximum(EkfSlam(**pieces)),
+    "invariant": partial(EkfSlam, coordinates=WORLD, form=Covariance(Invariant())),
 }
-"""By name, of pieces."""
+"""By name, of pieces: the paper's filter, with landmarks in the camera frame and composition after
+the update (`robocentric`); the classical one, in the base frame and composed first (`world`); one
+in the camera of the current keyframe (`keyframe`), and the same estimates by sparse, additive
+updates (`information`); the paper's in a unit of length of its own, whose size is estimated
+(`scale_gauge`), and the classical one so, whose covariance is too small where the camera turns
+(`world_gauge`); the paper's, linearised at the maximum of the posterior of every frame
+(`iterated`); the classical one with the right-invariant error: landmarks' errors move with the
+pose's (`invariant`)."""
 
 
 def with_common_depth(slam: EkfSlam, percent: int | None) -> EkfSlam:

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from cases import quick_jit
 
-from jaxslam.filters.registry import scale_gauge, scenario_pieces
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.registry import scenario_pieces
 from jaxslam.filters.window.minimise import started
 from jaxslam.filters.window.problem import PathLayout, path
 from jaxslam.filters.window.record import whole
 from jaxslam.filters.window.subsample import kept, thinned
 from jaxslam.landmarks import INVERSE_SCALING
 from jaxslam.models.calibration import Known, White
+from jaxslam.models.scale import ScaleGauge
 from jaxslam.simulation import scenario
 
 FRAMES = 7
@@ -23,7 +25,8 @@ FRAMES = 7
 def filter_of(treatment=Known):
     made = scenario_pieces(scenario("standstill-6dof"), "known")
     calibration = treatment() if treatment is Known else treatment(np.array([3.0] * 2 + [2.0] * 2))
-    return scale_gauge(**{**made, "calibration": calibration}, landmark=INVERSE_SCALING)
+    slam = EkfSlam(scale=ScaleGauge(), **made, landmark=INVERSE_SCALING)
+    return replace(slam, calibration=calibration)
 
 
 def full(frames=FRAMES):

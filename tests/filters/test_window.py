@@ -15,7 +15,8 @@ from exact_posterior.problem import log_density, make_problem
 
 import jaxslam
 from jaxslam._numerics.linalg import cholesky
-from jaxslam.filters.registry import scale_gauge, scenario_pieces
+from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.registry import scenario_pieces
 from jaxslam.filters.window import minimise, modes, scale
 from jaxslam.filters.window.minimise import minimised, started
 from jaxslam.filters.window.problem import PathLayout, path, reduced, residuals, sensitivities
@@ -27,6 +28,7 @@ from jaxslam.landmarks import INVERSE_SCALING
 from jaxslam.models.calibration import Considered, Estimated, Known, White
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.observations import Features
+from jaxslam.models.scale import ScaleGauge
 from jaxslam.simulation import scenario
 
 FRAMES, FIRST = 5, jnp.array([0, 0, 0, 1, 0, 2])
@@ -53,9 +55,8 @@ def filter_of(name, treatment, common):
     sigma = np.array([3.0] * p + [2.0] * p)
     depth = InverseDepth(0.25, 0.05, 0.8, common)
     calibration = Known() if treatment is Known else treatment(sigma)
-    return scale_gauge(
-        **{**made, "depth": depth, "calibration": calibration}, landmark=INVERSE_SCALING
-    )
+    slam = EkfSlam(scale=ScaleGauge(), **made, landmark=INVERSE_SCALING)
+    return replace(slam, depth=depth, calibration=calibration)
 
 
 @cache
@@ -377,7 +378,7 @@ def test_the_window_is_the_exact_posterior_of_a_run_and_has_its_minimum():
     chosen = scenario("matched-loose", steps=3, landmarks=4)
     run = jaxslam.simulate(chosen, jax.random.key(0))
     problem = make_problem(chosen, run, truncated=False)
-    slam = scale_gauge(**scenario_pieces(chosen), landmark=INVERSE_SCALING)
+    slam = EkfSlam(scale=ScaleGauge(), **scenario_pieces(chosen), landmark=INVERSE_SCALING)
     everywhere = jnp.arange(4)
     record = empty(slam.motion, 4, 4, 1, jnp.float64)
     record = begun(record, Features(everywhere, run.measured[0], run.visible[0]))

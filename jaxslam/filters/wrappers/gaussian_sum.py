@@ -31,7 +31,6 @@ from jaxslam.filters.ekf import (
     ekf_inside,
 )
 from jaxslam.filters.protocol import (
-    AbstractFilter,
     AbstractStaged,
     Belief,
     EachMoments,
@@ -43,7 +42,7 @@ from jaxslam.filters.protocol import (
 )
 from jaxslam.filters.wrappers.split_merge import collapsed, divided
 from jaxslam.filters.wrappers.sum_state import SumState, member, moments, weighed
-from jaxslam.filters.wrappers.wrapper import check_staged, with_motion
+from jaxslam.filters.wrappers.wrapper import AbstractWrapper, with_motion
 from jaxslam.geometry import Pose, difference, retract
 from jaxslam.models.motion import Control, check_control
 from jaxslam.models.observations import Capacity, Features, Innovation, Slots
@@ -57,7 +56,7 @@ OVERLAP = 0.5
 ALONG = ("speed", "direction")
 
 
-class GaussianSum(AbstractStaged):
+class GaussianSum(AbstractWrapper):
     """`members` filters `base` for each direction in which the velocity's prior is divided; split
     and merged in every frame, at most `members` for one direction.
 
@@ -75,7 +74,7 @@ class GaussianSum(AbstractStaged):
     start, and `base` is an `EkfSlam`."""
 
     def __check_init__(self) -> None:
-        check_staged(self, self.base)
+        super().__check_init__()
         if self.split:
             check_one_gaussian(self.base, "a mixture", corrected=True)
         if self.members < 3:
@@ -94,16 +93,12 @@ class GaussianSum(AbstractStaged):
             )
 
     @property
-    def unwrapped(self) -> AbstractFilter:
-        return self.base.unwrapped
-
-    @property
-    def ambiguous_start(self) -> bool:
-        return self.base.ambiguous_start
-
-    @property
     def _ekf(self) -> EkfSlam:
         return ekf_inside(self.base, "a Gaussian sum is")
+
+    def base_state(self, state: SumState) -> Belief:
+        """The likeliest member's."""
+        return state.likeliest
 
     @property
     def rounds(self) -> int:
@@ -202,10 +197,6 @@ class GaussianSum(AbstractStaged):
         values, covariances = each(state.members)
         of_landmark = jax.vmap(moments, in_axes=(None, 1, 1))
         return of_landmark(state.log_weights, values, covariances)
-
-    def in_map(self, state: SumState) -> Bool[Array, " capacity"]:
-        """The likeliest member's."""
-        return self.base.in_map(state.likeliest)
 
     def pose_error(self, state: SumState, T_BC: Pose) -> PoseError:
         """The error of the sum's mean, to first order in the members' distances; its covariance."""

@@ -32,7 +32,11 @@ class AbstractWrapper(AbstractStaged):
     base: eqx.AbstractVar[AbstractStaged]
 
     def __check_init__(self) -> None:
-        check_staged(self, self.base)
+        if not isinstance(self.base, AbstractStaged):
+            raise ValueError(
+                f"{type(self).__name__} takes a frame in stages, which {type(self.base).__name__} "
+                "does not"
+            )
 
     def base_state(self, state: Belief) -> Belief:
         """The base's state in the wrapper's."""
@@ -93,14 +97,6 @@ class AbstractWrapper(AbstractStaged):
 
     def unit_fixed(self, state: Belief) -> Bool[Array, ""]:
         return self.base.unit_fixed(self.base_state(state))
-
-
-def check_staged(around: AbstractStaged, base: AbstractFilter) -> None:
-    """Raise ValueError unless what a filter is around takes a frame in stages too."""
-    if not isinstance(base, AbstractStaged):
-        raise ValueError(
-            f"{type(around).__name__} takes a frame in stages, which {type(base).__name__} does not"
-        )
 
 
 def with_motion(slam: AbstractStaged, motion: AbstractMotion) -> AbstractStaged:
