@@ -8,7 +8,6 @@ that are built around this one and for the methods by which landmarks enter (`Ab
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import get_args, get_type_hints
 
@@ -19,7 +18,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.arrays import AnyArray, cast, precision
-from jaxslam.filters.forms.blocks import Prior
+from jaxslam.filters.forms.blocks import Landmark, Prior
 from jaxslam.filters.forms.covariance import Covariance
 from jaxslam.filters.forms.form import AbstractForm, AbstractGaussian
 from jaxslam.filters.forms.state import State
@@ -238,9 +237,7 @@ def composed(core: Core) -> Core:
     return replace(core, motion=None, noise=nothing, calibration=nothing, depth_error=None)
 
 
-def of_landmark(
-    slam: EkfSlam, function: Callable[[LandmarkView], Float[Array, " k"]]
-) -> Callable[[Core, Array], Float[Array, " k"]]:
+def of_landmark(slam: EkfSlam, function: OfLandmark) -> Landmark:
     """A function of a landmark's view as one of the core, as `composed` leaves it, and of the
     landmark."""
 
@@ -437,7 +434,7 @@ def _considered(slam: EkfSlam, state: Belief) -> slice:
     return slice(0, 0) if slam.calibration.corrected else state.core.part("calibration")
 
 
-def _depth_prior(slam: EkfSlam, state: Belief) -> tuple[Float[Array, " q"], Float[Array, " q"]]:
+def _depth_prior(slam: EkfSlam, state: Belief) -> Prior:
     """Mean and σ of what a measurement hides of a landmark, its own part alone."""
     hidden, depth = slam.sensor.hidden, slam.depth
     mean, sigma = jnp.tile(depth.mean, hidden), jnp.tile(depth.sigma, hidden) * depth.own

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -11,7 +10,14 @@ from jaxtyping import Array, Float, Int
 
 from jaxslam._numerics.linalg import semidefinite_root
 from jaxslam.filters.ekf import EkfSlam, composed, of_landmark
-from jaxslam.filters.protocol import AbstractFilter, Belief, CameraView, LandmarkView
+from jaxslam.filters.protocol import (
+    AbstractFilter,
+    Belief,
+    CameraView,
+    EachMoments,
+    LandmarkView,
+    OfLandmark,
+)
 from jaxslam.geometry import Pose, Scalar, retract, scaled
 from jaxslam.models.observations import Slots
 from jaxslam.models.sensors import AbstractSensor
@@ -50,9 +56,7 @@ def camera_pose_in_unit(slam: AbstractFilter, state: Belief) -> InUnit:
     return InUnit(pose, P[:-1, :-1], log_scale[0], P[-1, -1])
 
 
-def landmarks_in_unit(
-    slam: AbstractFilter, state: Belief, slots: Slots
-) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
+def landmarks_in_unit(slam: AbstractFilter, state: Belief, slots: Slots) -> EachMoments:
     """`landmarks_in_world` in the filter's own unit of length, with covariances of these."""
 
     def point(view: LandmarkView):
@@ -68,14 +72,12 @@ def log_unit(slam: AbstractFilter, state: Belief) -> Scalar:
 
 def landmarks_in_camera(
     slam: AbstractFilter, state: Belief, slots: Slots, sensor: AbstractSensor
-) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
+) -> EachMoments:
     """The sensor's chart of landmarks, (x/z, y/z, 1/z) of a camera, with covariances."""
     return slam.landmark_marginal(state, lambda view: sensor.chart(view.point, view.omega), slots)
 
 
-def landmarks_from_above(
-    slam: AbstractFilter, state: Belief, slots: Slots
-) -> tuple[Float[Array, "m 2"], Float[Array, "m 2 2"]]:
+def landmarks_from_above(slam: AbstractFilter, state: Belief, slots: Slots) -> EachMoments:
     """Azimuth (from z towards x, axes of B) and inverse horizontal distance from the camera.
 
     A map seen from above: the point is `(sin θ, cos θ)/ρ` from the camera, and a Gaussian in
@@ -105,9 +107,7 @@ def landmarks_on_sides(
     return jnp.sum(sure & ahead), jnp.sum(sure & ~ahead)
 
 
-def landmarks_in_world(
-    slam: AbstractFilter, state: Belief, slots: Slots
-) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
+def landmarks_in_world(slam: AbstractFilter, state: Belief, slots: Slots) -> EachMoments:
     """Points in B and their covariances, the camera's uncertainty included.
 
     Not finite for a landmark at infinity; far from Gaussian for one of unknown depth.
@@ -121,7 +121,7 @@ def landmark_samples(
     slots: Slots,
     key: Array,
     count: int = 1000,
-    function: Callable[[LandmarkView], Float[Array, " k"]] | None = None,
+    function: OfLandmark | None = None,
 ) -> Float[Array, "m count k"]:
     """Draws of points in B, or of another function, from the Gaussian of a filter's state.
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import Number
 from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
+from jaxslam.landmarks.inverse_depth import pack, unpack
 from jaxslam.landmarks.parametrization import Parameters, Parametrization
 
 
@@ -19,34 +20,25 @@ def initialise(point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " 2*n
     """C = 0, `m = X/|X|`, `ρ = ω/|X|`. `focal` is not used."""
     del focal
     length = jnp.linalg.norm(point)
-    return _pack(jnp.zeros_like(point), point / length, omega / length)
+    return pack(jnp.zeros_like(point), point / length, omega / length)
 
 
 def transform(T_ab: Pose, landmark: Parameters) -> Parameters:
     """`C' = R C + t`, `m' = R m`, `ρ' = ρ`."""
-    anchor, ray, rho = _unpack(landmark)
-    return _pack(T_ab @ anchor, T_ab.rotation() @ ray, rho)
+    anchor, ray, rho = unpack(landmark)
+    return pack(T_ab @ anchor, T_ab.rotation() @ ray, rho)
 
 
 def homogeneous(landmark: Parameters) -> Homogeneous:
     """`(ρ C + m, ρ)`."""
-    anchor, ray, rho = _unpack(landmark)
+    anchor, ray, rho = unpack(landmark)
     return rho * anchor + ray, rho
 
 
 def scale(factor: Number, landmark: Parameters) -> Parameters:
     """`C' = s C`, `m' = m`, `ρ' = ρ/s`."""
-    anchor, ray, rho = _unpack(landmark)
-    return _pack(factor * anchor, ray, rho / factor)
-
-
-def _pack(anchor: Point, ray: Point, rho: Scalar) -> Float[Array, " 2*n+1"]:
-    return jnp.concatenate([anchor, ray, rho[None]])
-
-
-def _unpack(landmark: Parameters) -> tuple[Point, Point, Scalar]:
-    n = landmark.size // 2
-    return landmark[:n], landmark[n:-1], landmark[-1]
+    anchor, ray, rho = unpack(landmark)
+    return pack(factor * anchor, ray, rho / factor)
 
 
 ANCHORED_HOMOGENEOUS = Parametrization(

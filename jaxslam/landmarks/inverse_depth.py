@@ -26,14 +26,14 @@ def initialise(point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " 2*n
     """
     del focal
     inverse_distance = omega / jnp.linalg.norm(point)
-    return _pack(jnp.zeros_like(point), angles_of(point), inverse_distance)
+    return pack(jnp.zeros_like(point), angles_of(point), inverse_distance)
 
 
 def transform(T_ab: Pose, landmark: Parameters) -> Parameters:
     """`C' = R C + t`, `m(θ', φ') = R m(θ, φ)`, `ρ' = ρ`. Singular where the ray is vertical."""
     anchor, angles, inverse_distance = unpack(landmark)
     ray = T_ab.rotation() @ ray_of(angles)
-    return _pack(T_ab @ anchor, angles_of(ray), inverse_distance)
+    return pack(T_ab @ anchor, angles_of(ray), inverse_distance)
 
 
 def homogeneous(landmark: Parameters) -> Homogeneous:
@@ -45,15 +45,16 @@ def homogeneous(landmark: Parameters) -> Homogeneous:
 def scale(factor: Number, landmark: Parameters) -> Parameters:
     """`C' = s C`, `ρ' = ρ/s`."""
     anchor, angles, inverse_distance = unpack(landmark)
-    return _pack(factor * anchor, angles, inverse_distance / factor)
+    return pack(factor * anchor, angles, inverse_distance / factor)
 
 
-def _pack(anchor: Point, angles: Angles, inverse_distance: Scalar) -> Float[Array, " 2*n"]:
+def pack(anchor: Point, angles: Angles, inverse_distance: Scalar) -> Parameters:
+    """(C, ray, ρ), the ray by its angles or otherwise, as one vector."""
     return jnp.concatenate([anchor, angles, inverse_distance[None]])
 
 
 def unpack(landmark: Parameters) -> tuple[Point, Angles, Scalar]:
-    """(C, (θ, φ), ρ)."""
+    """The inverse of `pack`."""
     n = landmark.size // 2
     return landmark[:n], landmark[n:-1], landmark[-1]
 

@@ -32,7 +32,7 @@ from jaxslam.filters.forms.blocks import (
     observe,
     without_auxiliary,
 )
-from jaxslam.filters.protocol import Belief, Moments
+from jaxslam.filters.protocol import Belief, EachMoments, Moments
 from jaxslam.geometry import jacobian, nudge
 from jaxslam.models.observations import Features, Slots
 
@@ -167,7 +167,7 @@ class AbstractGaussian(AbstractForm):
 
     def landmark_covariance(
         self, view: Callable[[PyTree], PyTree], function: Landmark, state: Belief, slots: Slots
-    ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"]]:
+    ) -> EachMoments:
         """Values and first-order covariances of `function(view(core), landmark)`, slot by slot."""
         value, _, J = local_jacobians(
             view, without_auxiliary(function), state.core, state.landmarks[slots]

@@ -78,7 +78,9 @@ class RaySum(AbstractEntry):
         """Weigh the members, prune, and correct by those that are left."""
         likelihood = self._log_likelihood(slam, state, control, features)
         weights = reweighted(state.memory[features.slots], likelihood)
-        weights = jnp.where(weights < self.threshold * _heaviest(weights), 0.0, weights)
+        weights = jnp.where(
+            weights < self.threshold * jnp.max(weights, axis=1, keepdims=True), 0.0, weights
+        )
         weights = weights / jnp.sum(weights, axis=1, keepdims=True)
         kept = jnp.where(features.valid, features.slots, state.memory.shape[0])
         memory = state.memory.at[kept].set(weights, mode="drop")
@@ -141,7 +143,3 @@ def with_rays(base: EkfSlam, farthest: int | None = None) -> EkfSlam:
     """The filter with rays of Gaussians up to `farthest`, m."""
     rays = RaySum() if farthest is None else RaySum(farthest=farthest)
     return with_entry(base, rays, CARTESIAN)
-
-
-def _heaviest(weights):
-    return jnp.max(weights, axis=1, keepdims=True)

@@ -17,6 +17,8 @@ from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.problem import (
     Path,
+    X,
+    Y,
     cholesky_each,
     landmark_slopes,
     path,
@@ -42,7 +44,7 @@ class Minimum(eqx.Module):
     converged: Bool[Array, "*k"]
 
 
-def started(x: Float[Array, " N"], y: Float[Array, "m q"]) -> Minimum:
+def started(x: X, y: Y) -> Minimum:
     """The state of a minimisation before the first step."""
     cost, damping = jnp.asarray(jnp.inf, x.dtype), jnp.asarray(1e-3, x.dtype)
     return Minimum(x, y, cost, damping, jnp.asarray(False))
@@ -94,8 +96,8 @@ def _step(slam: EkfSlam, record: Record, now: Minimum) -> Minimum:
 
 
 def landmarks(
-    slam: EkfSlam, record: Record, at: Path, y: Float[Array, "m q"], steps: int
-) -> tuple[Float[Array, "m q"], Float[Array, ""]]:
+    slam: EkfSlam, record: Record, at: Path, y: Y, steps: int
+) -> tuple[Y, Float[Array, ""]]:
     """Every landmark at its best given the path, by damped Gauss–Newton; and |y|² + |r|²."""
     eye = jnp.eye(y.shape[1], dtype=y.dtype)
 
@@ -121,9 +123,7 @@ def landmarks(
     return y, jnp.sum(cost)
 
 
-def turned(
-    slam: EkfSlam, record: Record, x: Float[Array, " N"], y: Float[Array, "m q"], steps: int = 4
-) -> Float[Array, " N"]:
+def turned(slam: EkfSlam, record: Record, x: X, y: Y, steps: int = 4) -> X:
     """The start of the motion with the rotation that fits its translation best.
 
     Only the initial angular velocity moves: it takes up the mean flow.

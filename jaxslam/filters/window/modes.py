@@ -21,7 +21,7 @@ from jaxslam._numerics.conditional import map_where
 from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.minimise import Minimum, minimised, started, turned
-from jaxslam.filters.window.problem import PathLayout, reduced
+from jaxslam.filters.window.problem import PathLayout, X, Y, reduced
 from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.scale import enlarged, shift_of_scale
 
@@ -84,7 +84,7 @@ def starts(
     return jax.vmap(started)(*map_where(fitted, (x, y), wanted, record))
 
 
-def reversed_(slam: EkfSlam, at: Minimum) -> tuple[Float[Array, " N"], Float[Array, "m q"]]:
+def reversed_(slam: EkfSlam, at: Minimum) -> tuple[X, Y]:
     """The other way, among points that are as much too near as they were too far."""
     layout, p = PathLayout.of(slam), slam.sensor.size
     x = enlarged(slam, at.x, jnp.asarray(-1.0, at.x.dtype))

@@ -25,6 +25,11 @@ from jaxslam.filters.window.record import Record
 from jaxslam.geometry import Pose, Scalar, homogeneous_apply, identity, jacobian, nudge, retract
 from jaxslam.models.motion import Control
 
+X = Float[Array, " N"]
+"""x, of what all landmarks have in common."""
+Y = Float[Array, "m q"]
+"""y, of each landmark."""
+
 
 class CalibratedPose(eqx.Module):
     """The dependences of a measurement beside the landmark; of one frame, or of all."""
@@ -74,7 +79,7 @@ class PathLayout(NamedTuple):
         return self.whole + (frames - 1) * (self.step + self.each)
 
 
-def path(slam: EkfSlam, record: Record, x: Float[Array, " N"]) -> Path:
+def path(slam: EkfSlam, record: Record, x: X) -> Path:
     """Poses, velocities and calibrations of all frames. After the last, nothing moves."""
     layout, motion = PathLayout.of(slam), slam.motion
     mean, root = motion.start()
@@ -163,7 +168,7 @@ class Sight(NamedTuple):
     by_y: Float[Array, "h q"]
 
 
-def sights(slam: EkfSlam, record: Record, at: Path, y: Float[Array, "m q"]) -> Sight:
+def sights(slam: EkfSlam, record: Record, at: Path, y: Y) -> Sight:
     """The sights of all landmarks, from the frames in which they were first seen."""
     calibrations = at.frames.calibration[record.first]
 
@@ -213,6 +218,16 @@ class Seen(NamedTuple):
     """(X, ω) in the camera."""
 
 
+def _compared(slam: EkfSlam, record: Record, at: Path, y: Y) -> tuple[Sight, Seen, Array]:
+    """The sights, what is seen of them in every frame, and its Jacobian by (X, ω) in the camera of
+    the first sight."""
+    sight, relative = sights(slam, record, at, y), _relative(record, at)
+    seen = _seen(slam, record, at, relative, sight)
+    by_point, by_omega = seen.by_point[..., :-1], seen.by_point[..., -1]
+    by_sight = jnp.einsum("kmpn,kmno->kmpo", by_point, relative)
+    return sight, seen, by_sight.at[..., -1].add(by_omega)
+
+
 def _seen(slam: EkfSlam, record: Record, at: Path, relative, sight: Sight) -> Seen:
     whitening = cholesky(slam.sensor.noise).whitening
 
@@ -244,21 +259,13 @@ def _seen(slam: EkfSlam, record: Record, at: Path, relative, sight: Sight) -> Se
     )
 
 
-def _by_first(seen: Seen, relative) -> Float[Array, "F m p h"]:
-    """Jacobian of the residuals by (X, ω) in the camera of the first sight."""
-    by_point, by_omega = seen.by_point[..., :-1], seen.by_point[..., -1]
-    E = jnp.einsum("kmpn,kmno->kmpo", by_point, relative)
-    return E.at[..., -1].add(by_omega)
-
-
 def landmark_slopes(
-    slam: EkfSlam, record: Record, at: Path, y: Float[Array, "m q"]
-) -> tuple[Float[Array, "m q q"], Float[Array, "m q"], Float[Array, " m"]]:
+    slam: EkfSlam, record: Record, at: Path, y: Y
+) -> tuple[Float[Array, "m q q"], Y, Float[Array, " m"]]:
     """The information, gradient and |y|² + |r|² of every landmark given the path; the last is ∞
     if it is measured and cannot be seen."""
-    sight, relative = sights(slam, record, at, y), _relative(record, at)
-    seen = _seen(slam, record, at, relative, sight)
-    B = jnp.einsum("kmpo,moq->kmpq", _by_first(seen, relative), sight.by_y)
+    sight, seen, by_sight = _compared(slam, record, at, y)
+    B = jnp.einsum("kmpo,moq->kmpq", by_sight, sight.by_y)
     information = jnp.einsum("kmpq,kmpo->mqo", B, B) + jnp.eye(y.shape[1], dtype=y.dtype)
     gradient = jnp.einsum("kmpq,kmp->mq", B, seen.residual) + y
     cost = jnp.sum(seen.residual**2, axis=(0, 2)) + jnp.sum(y**2, axis=1)
@@ -266,12 +273,10 @@ def landmark_slopes(
     return information, gradient, jnp.where(possible, cost, jnp.inf)
 
 
-def residuals(
-    slam: EkfSlam, record: Record, at: Path, y: Float[Array, "m q"]
-) -> Float[Array, "F m p"]:
+def residuals(slam: EkfSlam, record: Record, at: Path, y: Y) -> Float[Array, "F m p"]:
     """`(z − h)/σ` of all measurements that are compared, zero elsewhere."""
-    sight, relative = sights(slam, record, at, y), _relative(record, at)
-    return _seen(slam, record, at, relative, sight).residual
+    sight = sights(slam, record, at, y)
+    return _seen(slam, record, at, _relative(record, at), sight).residual
 
 
 class Sensitivities(NamedTuple):
@@ -282,7 +287,7 @@ class Sensitivities(NamedTuple):
     motion: Float[Array, "F v N"]
 
 
-def sensitivities(slam: EkfSlam, record: Record, x: Float[Array, " N"], at: Path) -> Sensitivities:
+def sensitivities(slam: EkfSlam, record: Record, x: X, at: Path) -> Sensitivities:
     """Step by step, by the chain rule."""
     begun, driving = _driven(slam, record, x)
     states = len(begun)
@@ -300,7 +305,7 @@ def sensitivities(slam: EkfSlam, record: Record, x: Float[Array, " N"], at: Path
 
 
 def _driven(
-    slam: EkfSlam, record: Record, x: Float[Array, " N"]
+    slam: EkfSlam, record: Record, x: X
 ) -> tuple[Float[Array, "s N"], Float[Array, "steps w N"]]:
     """Jacobians by x of (pose, motion, calibration) in frame 0, and of what drives every step."""
     layout, eye = PathLayout.of(slam), jnp.eye(x.size, dtype=x.dtype)
@@ -313,9 +318,7 @@ def _driven(
     return begun, driving.reshape(record.frames - 1, -1, x.size)
 
 
-def _slopes(
-    slam: EkfSlam, record: Record, x: Float[Array, " N"], at: Path
-) -> Float[Array, "steps s d"]:
+def _slopes(slam: EkfSlam, record: Record, x: X, at: Path) -> Float[Array, "steps s d"]:
     """Jacobian of every step by the state before it and by what drives it, d = s + w numbers."""
     states = at.frames.pose, at.motion, at.frames.calibration
     before = jax.tree.map(lambda leaf: leaf[:-1], states)
@@ -341,11 +344,9 @@ class Linear(NamedTuple):
     by_y: Float[Array, "F m p q"]
 
 
-def linearised(slam: EkfSlam, record: Record, at: Path, y: Float[Array, "m q"]) -> Linear:
+def linearised(slam: EkfSlam, record: Record, at: Path, y: Y) -> Linear:
     """The residuals at a path and landmarks."""
-    sight, relative = sights(slam, record, at, y), _relative(record, at)
-    seen = _seen(slam, record, at, relative, sight)
-    by_sight = _by_first(seen, relative)
+    sight, seen, by_sight = _compared(slam, record, at, y)
     here = jax.vmap(jax.vmap(lambda X: _by_motion(slam, X[:-1], X[-1])))(seen.points)
     # T_C Exp(δ) moves a point by −δ in the camera's axes.
     by_pose = -jnp.einsum("kmpn,kmnt->kmpt", seen.by_point, here)
@@ -409,9 +410,7 @@ def _with_landmarks(record: Record, J: Linear) -> Float[Array, "z m q"]:
     return jnp.concatenate([own.reshape(-1, *own.shape[2:]), common])
 
 
-def _of_landmarks(
-    y: Float[Array, "m q"], J: Linear
-) -> tuple[Float[Array, "m q q"], Float[Array, "m q"]]:
+def _of_landmarks(y: Y, J: Linear) -> tuple[Float[Array, "m q q"], Y]:
     """Information and gradient of every landmark given the path."""
     information = jnp.einsum("kmpq,kmpo->mqo", J.by_y, J.by_y) + jnp.eye(y.shape[1], dtype=y.dtype)
     return information, jnp.einsum("kmpq,kmp->mq", J.by_y, J.residual) + y
@@ -431,9 +430,7 @@ class Reduced(NamedTuple):
     """C, so that y given x has the mean ŷ − C (x − x̂)."""
 
 
-def reduced(
-    slam: EkfSlam, record: Record, x: Float[Array, " N"], y: Float[Array, "m q"]
-) -> Reduced:
+def reduced(slam: EkfSlam, record: Record, x: X, y: Y) -> Reduced:
     """One linearisation: normal equations by the frames' tangents, without the landmarks; then
     by x."""
     at = path(slam, record, x)

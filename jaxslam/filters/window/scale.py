@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam._numerics.linalg import Cholesky, cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.minimise import Minimum
-from jaxslam.filters.window.problem import PathLayout, Reduced, hidden
+from jaxslam.filters.window.problem import PathLayout, Reduced, X, Y, hidden
 from jaxslam.filters.window.record import Record
 from jaxslam.geometry import Scalar
 
@@ -34,8 +34,8 @@ SHIFTS = 8
 class Direction(NamedTuple):
     """A derivative of the whitened unknowns."""
 
-    x: Float[Array, " N"]
-    y: Float[Array, "m q"]
+    x: X
+    y: Y
 
     @property
     def squared(self) -> Float[Array, ""]:
@@ -44,7 +44,7 @@ class Direction(NamedTuple):
 
 def rescaled(
     slam: EkfSlam, record: Record, at: Minimum, log_scale: Float[Array, ""]
-) -> tuple[Float[Array, " N"], Float[Array, "m q"]]:
+) -> tuple[X, Y]:
     """The likeliest unknowns with all lengths e^λ times as large: the same pixels."""
     factor, p = jnp.exp(log_scale), slam.sensor.size
     layout = PathLayout.of(slam)
@@ -69,7 +69,7 @@ def _shared(
     return common[None], own - ratio * common
 
 
-def enlarged(slam: EkfSlam, x: Float[Array, " N"], factor: Scalar) -> Float[Array, " N"]:
+def enlarged(slam: EkfSlam, x: X, factor: Scalar) -> X:
     """The path with all lengths so many times as large; −1 goes the other way."""
     layout, motion = PathLayout.of(slam), slam.motion
     mean, root = motion.start()
@@ -95,7 +95,7 @@ def told(slam: EkfSlam, at: Minimum, s: Direction) -> Float[Array, ""]:
     return s.squared - jnp.sum(_untold(slam, at.x, s) ** 2)
 
 
-def _untold(slam: EkfSlam, x: Float[Array, " N"], s: Direction) -> Float[Array, " N"]:
+def _untold(slam: EkfSlam, x: X, s: Direction) -> X:
     """The accelerations that scale and whose size is not given; zero elsewhere."""
     layout = PathLayout.of(slam)
     if slam.motion.noise_told:
@@ -106,9 +106,7 @@ def _untold(slam: EkfSlam, x: Float[Array, " N"], s: Direction) -> Float[Array, 
     return jnp.where(own & (s.x != 0), x, 0.0)
 
 
-def variances(
-    local: Reduced, whitening: Float[Array, "N N"]
-) -> tuple[Float[Array, " N"], Float[Array, "m q"]]:
+def variances(local: Reduced, whitening: Float[Array, "N N"]) -> tuple[X, Y]:
     """Diagonals of A⁻¹: of x, and of y."""
     by_x = jnp.sum(whitening**2, axis=0)
     spread = jnp.einsum("mqn,on->mqo", local.coupling, whitening)

@@ -13,12 +13,12 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Array, Bool, Int, Shaped
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.minimise import Minimum
-from jaxslam.filters.window.problem import PathLayout
+from jaxslam.filters.window.problem import PathLayout, X
 from jaxslam.filters.window.record import Record
 
 
@@ -72,9 +72,7 @@ def _stood(record: Record) -> Bool[Array, " steps"]:
     return jnp.append(record.restarted[1:], False)
 
 
-def _noises(
-    slam: EkfSlam, record: Record, fewer: Record, x: Float[Array, " N"]
-) -> Float[Array, " N"]:
+def _noises(slam: EkfSlam, record: Record, fewer: Record, x: X) -> X:
     """PathLayout of the merged steps: `√(m₁ + m₂) n = √m₁ n₁ + √m₂ n₂` adds the same velocity; a
     calibration that is drawn anew is that of the frame that stays, and so is a velocity."""
     layout, frames = PathLayout.of(slam), record.frames

@@ -152,7 +152,7 @@ class AdaptiveProcessNoise(AbstractWrapper):
         after, told_first = self._velocity(state.inner), _prior(state.log_weights.dtype)
 
         def of(part, log_weights):
-            told = _told(_part(part, *state.before), _part(part, *after))
+            told = _told(*((v[part], V[part, part]) for v, V in (state.before, after)))
             heard = jax.vmap(partial(_heard, told))
             evidence, v, V = heard(state.velocity[:, part], state.covariance[:, part, part])
             learned = self.moving(state) & jnp.all(jnp.isfinite(evidence))
@@ -180,10 +180,6 @@ def _foreseen(motion: AbstractMotion, control: Control, factors, velocity, covar
 
 def _prior(dtype: DTypeLike) -> Float[Array, " factors"]:
     return jax.nn.log_softmax(jnp.asarray(-((np.log(FACTORS) / TOLD) ** 2) / 2, dtype))
-
-
-def _part(part: slice, v: Float[Array, " t"], V: Float[Array, "t t"]):
-    return v[part], V[part, part]
 
 
 class Told(NamedTuple):
