@@ -51,16 +51,18 @@ class AbstractEntry(eqx.Module):
     """The treatment of new landmarks, and of those whose initialisation is not finished.
 
     A *landmark* has one number for everybody outside; inside, it may own several slots of the
-    state. What a method remembers beside the Gaussian is `State.memory`.
+    state. What a method remembers beside the Gaussian is `State.memory`. Unless a method says
+    otherwise, a landmark has one slot, and is a Gaussian from the first.
     """
 
-    @abstractmethod
     def slots(self, landmarks: int) -> int:
         """The number of slots of the state that so many landmarks need."""
+        return landmarks
 
-    @abstractmethod
     def memory(self, landmarks: int, dtype: DTypeLike) -> PyTree:
         """The memory of an empty map."""
+        del landmarks, dtype
+        return ()
 
     @abstractmethod
     def update(
@@ -72,36 +74,23 @@ class AbstractEntry(eqx.Module):
     def initialise(self, slam: EkfSlam, state: Belief, features: Features) -> Belief:
         """Begin new landmarks, seen from the current camera."""
 
-    @abstractmethod
     def collapsed(self, state: Belief) -> Belief:
         """The state with one slot, and one Gaussian, a landmark."""
+        return state
 
-    @abstractmethod
     def initialised(self, state: Belief) -> Bool[Array, " landmarks"]:
         """Whether each landmark is in the map as one Gaussian."""
+        return state.active
 
 
 class Undelayed(AbstractEntry):
     """A landmark is a Gaussian from its first measurement on (P22–P26)."""
-
-    def slots(self, landmarks):
-        return landmarks
-
-    def memory(self, landmarks, dtype):
-        del landmarks, dtype
-        return ()
 
     def update(self, slam, state, control, features):
         return correct(slam, state, control, features)
 
     def initialise(self, slam, state, features):
         return insert(slam, state, features)
-
-    def collapsed(self, state):
-        return state
-
-    def initialised(self, state):
-        return state.active
 
 
 class EkfSlam(AbstractStaged):

@@ -57,11 +57,6 @@ class Covariance(AbstractGaussian):
         part = slice(start, start + covariance.shape[0])
         return replace(state, covariance=state.covariance.at[part, part].set(covariance))
 
-    def set_exact(self, state: State, start: int, size: int) -> State:
-        # Their covariance is zero already.
-        del start, size
-        return state
-
     def marginalise(self, state: State, start: int, size: int) -> State:
         if size == 0:
             return state

@@ -63,9 +63,10 @@ class AbstractForm(eqx.Module):
         Nothing may be known of them, as `marginalise` and `compose` leave them.
         """
 
-    @abstractmethod
     def set_exact(self, state: Belief, start: int, size: int) -> Belief:
-        """Numbers of the core that are known exactly."""
+        """Numbers of the core that are known exactly: nothing to do where nothing was unknown."""
+        del start, size
+        return state
 
     @abstractmethod
     def marginalise(self, state: Belief, start: int, size: int) -> Belief:

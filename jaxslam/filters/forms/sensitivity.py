@@ -144,11 +144,6 @@ class Sensitivity(AbstractForm):
         """Forget k numbers of the core; the caller resets their value."""
         return replace(state, by_shared=state.by_shared.at[start : start + size].set(0.0))
 
-    def set_exact(self, state: Point, start: int, size: int) -> Point:
-        """Nothing to do: what does not depend on the variables is known."""
-        del start, size
-        return state
-
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         """Compare with the features seen; the state stays as it is."""
         del considered

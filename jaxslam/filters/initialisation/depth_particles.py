@@ -74,9 +74,6 @@ class DepthParticles(AbstractEntry):
         """The particles' distances along the ray, m."""
         return jnp.linspace(self.nearest, self.farthest, self.count, dtype=dtype)
 
-    def slots(self, landmarks: int) -> int:
-        return landmarks
-
     def memory(self, landmarks: int, dtype: DTypeLike) -> Float[Array, "landmarks count"]:
         return jnp.full((landmarks, self.count), 1 / self.count, dtype)
 
