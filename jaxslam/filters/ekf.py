@@ -28,6 +28,7 @@ from jaxslam.filters.protocol import (
     AbstractStaged,
     Belief,
     CameraView,
+    Corrected,
     EachMoments,
     Expected,
     LandmarkView,
@@ -42,7 +43,7 @@ from jaxslam.models.calibration import AbstractCalibration, Known, check_calibra
 from jaxslam.models.coordinates import ROBOCENTRIC, Coordinates
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import AbstractMotion, Control, check_control
-from jaxslam.models.observations import Capacity, Features, Innovation, Slots
+from jaxslam.models.observations import Capacity, Features, Slots
 from jaxslam.models.scale import Metre, ScaleGauge, prior_in_gauge
 from jaxslam.models.sensors import AbstractSensor
 
@@ -67,7 +68,7 @@ class AbstractEntry(eqx.Module):
     @abstractmethod
     def update(
         self, slam: EkfSlam, state: Belief, control: Control, features: Features
-    ) -> tuple[Belief, Innovation]:
+    ) -> Corrected:
         """Correct by the features of landmarks, finished or not."""
 
     @abstractmethod
@@ -169,7 +170,7 @@ class EkfSlam(AbstractStaged):
         possible = possible & state.active[slots]
         return Expected(measured, covariance, possible, model.camera_pose(core), points, omegas)
 
-    def update(self, state: Belief, control: Control, seen: Features) -> tuple[Belief, Innovation]:
+    def update(self, state: Belief, control: Control, seen: Features) -> Corrected:
         """Correct by the features seen (P16, P17)."""
         check_features(self, seen)
         return self.entry.update(self, state, control, seen)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam._numerics.arrays import AnyArray
-from jaxslam.geometry import Pose, difference
+from jaxslam.geometry import Pose, Scalar, difference
 from jaxslam.models.motion import Control
 from jaxslam.models.observations import Capacity, Features, Innovation, Slots
 
@@ -27,6 +27,8 @@ Moments = tuple[PyTree, Float[Array, "k k"]]
 tangent."""
 EachMoments = tuple[Float[Array, "m k"], Float[Array, "m k k"]]
 """Means and covariances of some landmarks."""
+Corrected = tuple[Belief, Innovation]
+"""A belief after an update, and what the update made of it."""
 PoseError = tuple[Float[Array, " t"], Float[Array, "t t"]]
 """The error of a pose, and its covariance."""
 
@@ -50,7 +52,7 @@ class LandmarkView(eqx.Module):
     """T_BC, in metres."""
     point: Float[Array, " n"]
     """X of the landmark as a homogeneous point (X, ω) in the camera."""
-    omega: Float[Array, ""]
+    omega: Scalar
     """ω, so that the point is X/ω metres."""
     log_scale: Float[Array, " u"] | None = None
     """As `CameraView` has it."""
@@ -86,9 +88,7 @@ class AbstractFilter(eqx.Module):
         which everything is new, the state after it."""
 
     @abstractmethod
-    def step(
-        self, state: Belief, control: Control, seen: Features, new: Features
-    ) -> tuple[Belief, Innovation]:
+    def step(self, state: Belief, control: Control, seen: Features, new: Features) -> Corrected:
         """One frame: `seen` are features of landmarks in the map, `new` those to insert."""
 
     @abstractmethod
@@ -140,7 +140,7 @@ class AbstractStaged(AbstractFilter):
         """The features that a predicted state expects to see."""
 
     @abstractmethod
-    def update(self, state: Belief, control: Control, seen: Features) -> tuple[Belief, Innovation]:
+    def update(self, state: Belief, control: Control, seen: Features) -> Corrected:
         """Correct a predicted state by the features seen (P16, P17)."""
 
     @abstractmethod
@@ -155,9 +155,7 @@ class AbstractStaged(AbstractFilter):
     def remove(self, state: Belief, gone: Bool[AnyArray, " capacity"]) -> Belief:
         """Marginalise landmarks and free their slots."""
 
-    def step(
-        self, state: Belief, control: Control, seen: Features, new: Features
-    ) -> tuple[Belief, Innovation]:
+    def step(self, state: Belief, control: Control, seen: Features, new: Features) -> Corrected:
         """One frame by its stages."""
         state = self.predict(state, control)
         state, innovation = self.update(state, control, seen)

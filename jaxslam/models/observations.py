@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.arrays import AnyArray
+from jaxslam.geometry import Scalar
 
 Slots = Int[Array, " m"]
 """Places of landmarks in the state; one out of bounds is none."""
@@ -73,11 +74,11 @@ class Innovation(eqx.Module):
     covariance: Float[Array, "m*p m*p"] | None
     """S; None where the form of the filter has no use for it."""
     used: Bool[Array, " m"]
-    nis: Float[Array, ""]
+    nis: Scalar
     """Normalised innovation squared `rᵀ S⁻¹ r`, χ² with `nis_dof` degrees of freedom."""
     status: Int[Array, ""]
     """A `Status`."""
-    log_det: Float[Array, ""] | None = None
+    log_det: Scalar | None = None
     """log det S; None where the form of the filter has no use for it."""
 
     @property

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxslam._numerics.linalg import semidefinite_root
 from jaxslam.filters.ekf import EkfSlam
+from jaxslam.geometry import Scalar
 from jaxslam.landmarks import LANDMARKS, Parametrization
 from jaxslam.models.observations import Features
 from jaxslam.triangulation.samples import Samples, draw
@@ -70,7 +71,7 @@ def triangulated(calibration: str, given: Given) -> Gaussian:
 
 def pushed(
     landmark: Parametrization, gaussian: Gaussian, normal: Float[Array, " k"]
-) -> tuple[Float[Array, " 2"], Float[Array, ""], Float[Array, ""]]:
+) -> tuple[Float[Array, " 2"], Scalar, Scalar]:
     """One sample of a Gaussian of a landmark, as a homogeneous point, with weight 1.
 
     `gaussian` holds the mean and a root of the covariance.

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxslam.geometry import Scalar
 from jaxslam.models.camera import bearing
 from jaxslam.triangulation.samples import Samples, draw
 from jaxslam.triangulation.views import Given, TwoViews, errors
@@ -20,7 +21,7 @@ from jaxslam.triangulation.views import Given, TwoViews, errors
 
 def intersect(
     calibration: str, given: Given, normal: Float[Array, " 6"]
-) -> tuple[Float[Array, " 2"], Float[Array, ""], Float[Array, ""]]:
+) -> tuple[Float[Array, " 2"], Scalar, Scalar]:
     """The point where two rays meet: (x, z, ω) = (b₂, 1, (b₁ − b₂)/baseline), b = (u − c)/f.
 
     In the second camera, with the errors that belong to the standard normal numbers; at infinity

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.model import Core, SlamModel
-from jaxslam.geometry import Pose, SplitPose, identity, jacobian, joined, nudge
+from jaxslam.geometry import Pose, Scalar, SplitPose, identity, jacobian, joined, nudge
 from jaxslam.models.coordinates import ROBOCENTRIC, WORLD
 
 
@@ -41,11 +41,7 @@ def gauge_dim(model: SlamModel) -> int:
 
 
 def act(
-    model: SlamModel,
-    rigid: Pose,
-    factor: Float[Array, ""],
-    core: Core,
-    landmarks: Float[Array, "capacity d"],
+    model: SlamModel, rigid: Pose, factor: Scalar, core: Core, landmarks: Float[Array, "capacity d"]
 ) -> tuple[Core, Float[Array, "capacity d"]]:
     """The same camera among the same points: all enlarged by a factor, then moved in B.
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam.filters.ekf import AbstractEntry, EkfSlam
+from jaxslam.geometry import Scalar
 from jaxslam.landmarks import CARTESIAN
 from jaxslam.landmarks.parametrization import Parametrization
 
@@ -41,7 +42,7 @@ def check_range(nearest: float, farthest: float) -> None:
 
 def log_density(
     residual: Float[Array, " p"], covariance: Float[Array, "p p"]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+) -> tuple[Scalar, Scalar]:
     """`log N(r; 0, S)` without its constant, and `rᵀ S⁻¹ r`.
 
     One coordinate after another, each given those before it: S is tiny and there are many.

@@ -26,9 +26,10 @@ from jaxslam.filters.initialisation.alternatives import (
     reweighted,
     with_entry,
 )
+from jaxslam.filters.protocol import Corrected
 from jaxslam.landmarks import INVERSE_DEPTH_TO_CARTESIAN
 from jaxslam.models.motion import Control
-from jaxslam.models.observations import Features, Innovation
+from jaxslam.models.observations import Features
 
 
 def _initialise(point, omega, focal):
@@ -79,7 +80,7 @@ class DepthParticles(AbstractEntry):
 
     def update(
         self, slam: EkfSlam, state: State, control: Control, features: Features
-    ) -> tuple[State, Innovation]:
+    ) -> Corrected:
         """Correct by the points; then weigh the particles of rays in the corrected state."""
         waiting = features.valid & _pending(state)[features.slots]
         points = replace(features, valid=features.valid & ~waiting)

@@ -28,9 +28,10 @@ from jaxslam.filters.initialisation.alternatives import (
     reweighted,
     with_entry,
 )
+from jaxslam.filters.protocol import Corrected
 from jaxslam.landmarks import CARTESIAN
 from jaxslam.models.motion import Control
-from jaxslam.models.observations import Features, Innovation
+from jaxslam.models.observations import Features
 
 
 class RaySum(AbstractEntry):
@@ -74,7 +75,7 @@ class RaySum(AbstractEntry):
 
     def update(
         self, slam: EkfSlam, state: State, control: Control, features: Features
-    ) -> tuple[State, Innovation]:
+    ) -> Corrected:
         """Weigh the members, prune, and correct by those that are left."""
         likelihood = self._log_likelihood(slam, state, control, features)
         weights = reweighted(state.memory[features.slots], likelihood)

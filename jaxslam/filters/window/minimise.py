@@ -26,6 +26,7 @@ from jaxslam.filters.window.problem import (
     residuals,
 )
 from jaxslam.filters.window.record import Record
+from jaxslam.geometry import Scalar
 
 TOLERANCE = 1e-3
 """Of half the sum of squares: a minimum is found when a step gains less."""
@@ -95,9 +96,7 @@ def _step(slam: EkfSlam, record: Record, now: Minimum) -> Minimum:
     )
 
 
-def landmarks(
-    slam: EkfSlam, record: Record, at: Path, y: Y, steps: int
-) -> tuple[Y, Float[Array, ""]]:
+def landmarks(slam: EkfSlam, record: Record, at: Path, y: Y, steps: int) -> tuple[Y, Scalar]:
     """Every landmark at its best given the path, by damped Gauss–Newton; and |y|² + |r|²."""
     eye = jnp.eye(y.shape[1], dtype=y.dtype)
 

@@ -24,6 +24,7 @@ from jaxslam.filters.window.minimise import Minimum, minimised, started, turned
 from jaxslam.filters.window.problem import PathLayout, X, Y, reduced
 from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.scale import enlarged, shift_of_scale
+from jaxslam.geometry import Scalar
 
 SPEED = 1.2
 """Starts move with so many σ of the prior on the initial velocity."""
@@ -128,8 +129,8 @@ class Weighed(NamedTuple):
     information of its path."""
 
     minimum: Minimum
-    evidence: Float[Array, ""]
-    shift: Float[Array, ""]
+    evidence: Scalar
+    shift: Scalar
     information: Float[Array, "N N"]
 
 

@@ -137,7 +137,7 @@ def located(
     common: Float[Array, " c"],
     measured: Float[Array, " p"],
     y: Float[Array, " q"],
-) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+) -> tuple[Float[Array, " n"], Scalar]:
     """The homogeneous point of a landmark, in the camera of the frame that first measured it."""
     sensor, p = slam.calibration.sensor(slam.sensor, calibration), measured.size
     pixel = measured + cholesky(sensor.noise).root @ y[:p]
@@ -160,7 +160,7 @@ class Sight(NamedTuple):
     """
 
     point: Float[Array, " n"]
-    omega: Float[Array, ""]
+    omega: Scalar
     by_pose: Float[Array, "h t"]
     """Of (X, ω), by the tangent of that camera's pose."""
     by_calibration: Float[Array, "h k"]
@@ -184,7 +184,7 @@ def sights(slam: EkfSlam, record: Record, at: Path, y: Y) -> Sight:
     return jax.vmap(one)(record.first_measured, calibrations, y)
 
 
-def _by_motion(slam: EkfSlam, point: Float[Array, " n"], omega: Float[Array, ""]) -> Array:
+def _by_motion(slam: EkfSlam, point: Float[Array, " n"], omega: Scalar) -> Array:
     """Jacobian of the homogeneous point (Exp(δ) X, ω) by δ at 0."""
     still = identity(slam.motion.geometry, point.dtype)
 

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam._numerics.linalg import cholesky
+from jaxslam.geometry import Scalar
 from jaxslam.models.motion import AbstractMotion, Control
 from jaxslam.models.observations import Features
 
@@ -50,7 +51,7 @@ class Record(eqx.Module):
         return self.seen.shape[0]
 
     @property
-    def steps(self) -> Float[Array, ""]:
+    def steps(self) -> Scalar:
         """The number of steps of the process since frame 0."""
         happened = jnp.arange(self.merged.size) < self.last
         return jnp.sum(jnp.where(happened, self.merged, 0.0))

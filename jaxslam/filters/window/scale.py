@@ -38,13 +38,11 @@ class Direction(NamedTuple):
     y: Y
 
     @property
-    def squared(self) -> Float[Array, ""]:
+    def squared(self) -> Scalar:
         return jnp.sum(self.x**2) + jnp.sum(self.y**2)
 
 
-def rescaled(
-    slam: EkfSlam, record: Record, at: Minimum, log_scale: Float[Array, ""]
-) -> tuple[X, Y]:
+def rescaled(slam: EkfSlam, record: Record, at: Minimum, log_scale: Scalar) -> tuple[X, Y]:
     """The likeliest unknowns with all lengths e^λ times as large: the same pixels."""
     factor, p = jnp.exp(log_scale), slam.sensor.size
     layout = PathLayout.of(slam)
@@ -90,7 +88,7 @@ def scaling(slam: EkfSlam, record: Record, at: Minimum) -> Direction:
     return Direction(x, y)
 
 
-def told(slam: EkfSlam, at: Minimum, s: Direction) -> Float[Array, ""]:
+def told(slam: EkfSlam, at: Minimum, s: Direction) -> Scalar:
     """1/variance of λ: |s|², without the accelerations where their size is not given."""
     return s.squared - jnp.sum(_untold(slam, at.x, s) ** 2)
 
@@ -116,7 +114,7 @@ def variances(local: Reduced, whitening: Float[Array, "N N"]) -> tuple[X, Y]:
 
 def shift_of_scale(
     slam: EkfSlam, record: Record, at: Minimum, local: Reduced, factor: Cholesky
-) -> Float[Array, ""]:
+) -> Scalar:
     """λ of the mean, of a density that has its maximum at 0: where the prior and the volume of the
     rest balance, all lengths enlarged alike. Accelerations whose size is not given follow."""
     s = scaling(slam, record, at)

@@ -32,9 +32,7 @@ from jaxslam.geometry import Scalar, identity, jacobian, scaled
 from jaxslam.models.scale import ScaleGauge
 
 
-def gauge_state(
-    slam: EkfSlam, record: Record, mode: Minimum, shift: Float[Array, ""], like: State
-) -> State:
+def gauge_state(slam: EkfSlam, record: Record, mode: Minimum, shift: Scalar, like: State) -> State:
     """The filter's state of one mode whose mean has such a λ, in a unit that is a metre there."""
     x, y = rescaled(slam, record, mode, shift)
     y, _ = landmarks(slam, record, path(slam, record, x), y, LANDMARK_STEPS)

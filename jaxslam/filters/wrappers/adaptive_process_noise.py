@@ -28,11 +28,11 @@ from jaxtyping import Array, Float
 from jaxslam._numerics.arrays import precision
 from jaxslam._numerics.linalg import cholesky, eigh
 from jaxslam.filters.ekf import EkfSlam, ekf_inside
-from jaxslam.filters.protocol import AbstractStaged, Belief
+from jaxslam.filters.protocol import AbstractStaged, Belief, Corrected
 from jaxslam.filters.wrappers.wrapper import AbstractWrapper, with_motion
 from jaxslam.geometry import jacobian
 from jaxslam.models.motion import AbstractMotion, Control
-from jaxslam.models.observations import Capacity, Features, Innovation
+from jaxslam.models.observations import Capacity, Features
 
 MEMORY = 100
 """Frames after which what they said of the noise has faded to 1/e."""
@@ -98,9 +98,7 @@ class AdaptiveProcessNoise(AbstractWrapper):
             before,
         )
 
-    def update(
-        self, state: NoiseState, control: Control, seen: Features
-    ) -> tuple[NoiseState, Innovation]:
+    def update(self, state: NoiseState, control: Control, seen: Features) -> Corrected:
         inner, innovation = self.fitted(state).update(state.inner, control, seen)
         return replace(state, inner=inner), innovation
 

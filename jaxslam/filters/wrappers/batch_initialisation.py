@@ -21,6 +21,7 @@ from jaxslam._numerics.arrays import AnyArray, cast, precision
 from jaxslam._numerics.conditional import cond, map_where
 from jaxslam.filters.ekf import EkfSlam, ekf_inside
 from jaxslam.filters.forms.state import State
+from jaxslam.filters.protocol import Corrected
 from jaxslam.filters.window import record as window
 from jaxslam.filters.window.modes import Modes, at_rest, sought
 from jaxslam.filters.window.problem import PathLayout
@@ -31,7 +32,7 @@ from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
 from jaxslam.filters.wrappers.sum_state import SumState
 from jaxslam.filters.wrappers.wrapper import AbstractWrapper
 from jaxslam.models.motion import Control
-from jaxslam.models.observations import Capacity, Features, Innovation
+from jaxslam.models.observations import Capacity, Features
 
 SIZES = {"planar": (9, 25, 61), "spatial": (9, 31)}
 """Frames of the windows that are compiled; the smallest that holds all is computed."""
@@ -116,9 +117,7 @@ class BatchInitialisation(AbstractWrapper):
     def with_base_state(self, state: RestState, inner: SumState) -> RestState:
         return replace(state, sum=inner)
 
-    def update(
-        self, state: RestState, control: Control, seen: Features
-    ) -> tuple[RestState, Innovation]:
+    def update(self, state: RestState, control: Control, seen: Features) -> Corrected:
         divided = DIVIDED[self.ekf.motion.geometry.name]
         update = self.base.update if divided else self.base.update_members
         after, innovation = update(state.sum, control, seen)

@@ -33,6 +33,7 @@ from jaxslam.filters.forms.sensitivity import (
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.protocol import (
     AbstractFilter,
+    Corrected,
     EachMoments,
     Moments,
     OfCamera,
@@ -131,9 +132,7 @@ class FixedLag(AbstractFilter):
         size = n + self.frames * self._noises(state)
         return LagState(before, jnp.zeros(size, root.dtype), frames, state)
 
-    def step(
-        self, state: LagState, control: Control, seen: Features, new: Features
-    ) -> tuple[LagState, Innovation]:
+    def step(self, state: LagState, control: Control, seen: Features, new: Features) -> Corrected:
         """Absorb the oldest frame of the window, add this one, and smooth."""
         check_control(self.base.motion, control)
         before, variables = self._absorbed(state)

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from jaxslam._runtime.lookup import lookup
 from jaxslam.filters.association import ASSOCIATIONS, TOLERANCE, candidates
 from jaxslam.filters.ekf import ekf_inside
-from jaxslam.filters.protocol import AbstractStaged, Belief
+from jaxslam.filters.protocol import AbstractStaged, Belief, Corrected
 from jaxslam.filters.wrappers.wrapper import AbstractWrapper
 from jaxslam.models.motion import Control
-from jaxslam.models.observations import Features, Innovation
+from jaxslam.models.observations import Features
 
 
 class Gated(AbstractWrapper):
@@ -29,7 +29,7 @@ class Gated(AbstractWrapper):
         lookup("association", [self.association], ASSOCIATIONS)
         ekf_inside(self.base, "features are checked")
 
-    def update(self, state: Belief, control: Control, seen: Features) -> tuple[Belief, Innovation]:
+    def update(self, state: Belief, control: Control, seen: Features) -> Corrected:
         """Correct by what agrees; the others count as not seen."""
         one, gaussian = self.base.gaussian(state, control)
         noise = ekf_inside(self.base, "features are checked").sensor.noise

@@ -33,6 +33,7 @@ from jaxslam.filters.ekf import (
 from jaxslam.filters.protocol import (
     AbstractStaged,
     Belief,
+    Corrected,
     EachMoments,
     Expected,
     Moments,
@@ -45,7 +46,7 @@ from jaxslam.filters.wrappers.sum_state import SumState, member, moments, weighe
 from jaxslam.filters.wrappers.wrapper import AbstractWrapper, with_motion
 from jaxslam.geometry import Pose, difference, retract
 from jaxslam.models.motion import Control, check_control
-from jaxslam.models.observations import Capacity, Features, Innovation, Slots
+from jaxslam.models.observations import Capacity, Features, Slots
 
 REACH = (2.5, 4.0)
 """The members' means are spread over ± so many σ of the prior, at the least and at the most."""
@@ -123,9 +124,7 @@ class GaussianSum(AbstractWrapper):
 
         return SumState(jax.vmap(begun)(jnp.asarray(grid, dtype)), jnp.asarray(weights, dtype))
 
-    def step(
-        self, state: SumState, control: Control, seen: Features, new: Features
-    ) -> tuple[SumState, Innovation]:
+    def step(self, state: SumState, control: Control, seen: Features, new: Features) -> Corrected:
         """Every member's step; a sum that is split is divided once the frame's noise is there."""
         if not self.split:
             return self._measured(lambda one: self.base.step(one, control, seen, new), state)
@@ -158,17 +157,13 @@ class GaussianSum(AbstractWrapper):
         base, one = self.gaussian(state, control)
         return base.predict_features(one, control, slots)
 
-    def update(
-        self, state: SumState, control: Control, seen: Features
-    ) -> tuple[SumState, Innovation]:
+    def update(self, state: SumState, control: Control, seen: Features) -> Corrected:
         """Split and merge, correct every member and weigh it."""
         if self.split:
             state = self._divided(state, control, seen)
         return self.update_members(state, control, seen)
 
-    def update_members(
-        self, state: SumState, control: Control, seen: Features
-    ) -> tuple[SumState, Innovation]:
+    def update_members(self, state: SumState, control: Control, seen: Features) -> Corrected:
         """Correct every member as it is, and weigh it."""
         return self._measured(lambda one: self._updated(one, control, seen), state)
 
@@ -206,7 +201,7 @@ class GaussianSum(AbstractWrapper):
     def _divided(self, state: SumState, control: Control, seen: Features) -> SumState:
         return divided(self._ekf, state, control, seen, self.rounds)
 
-    def _updated(self, one: Belief, control: Control, seen: Features) -> tuple[Belief, Innovation]:
+    def _updated(self, one: Belief, control: Control, seen: Features) -> Corrected:
         if self.split:
             one = composed_first(self._ekf, one, control)
         return self.base.update(one, control, seen)
@@ -216,9 +211,7 @@ class GaussianSum(AbstractWrapper):
             return replace(state, members=map_where(function, state.members, state.alive))
         return replace(state, members=jax.vmap(function)(state.members))
 
-    def _measured(
-        self, step: Callable[[Belief], tuple[Belief, Innovation]], state: SumState
-    ) -> tuple[SumState, Innovation]:
+    def _measured(self, step: Callable[[Belief], Corrected], state: SumState) -> Corrected:
         """Every member after a step with measurements, weighed by what it did not expect."""
         if not self.split:
             members, innovations = jax.vmap(step)(state.members)

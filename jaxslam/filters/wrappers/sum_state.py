@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.initialisation.alternatives import log_density
-from jaxslam.filters.protocol import Belief
+from jaxslam.filters.protocol import Belief, Corrected
 from jaxslam.models.observations import Innovation, Status
 
 BEHIND = 1e-4
@@ -42,7 +42,7 @@ def member(members: PyTree, k: int | slice | Int[Array, ""]) -> PyTree:
 
 def weighed(
     members: Belief, log_weights: Float[Array, " members"], innovations: Innovation
-) -> tuple[SumState, Innovation]:
+) -> Corrected:
     """The members weighed by the likelihoods of their innovations, and the sum's innovation."""
     after = jax.nn.log_softmax(log_weights + log_likelihoods(innovations))
     # The sum fails with the likeliest member, as one that has failed is weighed no more.

@@ -10,6 +10,7 @@ from jaxslam.filters.protocol import (
     AbstractFilter,
     AbstractStaged,
     Belief,
+    Corrected,
     EachMoments,
     Expected,
     Moments,
@@ -19,7 +20,7 @@ from jaxslam.filters.protocol import (
 )
 from jaxslam.geometry import Pose
 from jaxslam.models.motion import AbstractMotion, Control
-from jaxslam.models.observations import Capacity, Features, Innovation, Slots
+from jaxslam.models.observations import Capacity, Features, Slots
 
 
 class AbstractWrapper(AbstractStaged):
@@ -67,7 +68,7 @@ class AbstractWrapper(AbstractStaged):
     def gaussian(self, state: Belief, control: Control) -> tuple[AbstractStaged, Belief]:
         return self.base.gaussian(self.base_state(state), control)
 
-    def update(self, state: Belief, control: Control, seen: Features) -> tuple[Belief, Innovation]:
+    def update(self, state: Belief, control: Control, seen: Features) -> Corrected:
         inner, innovation = self.base.update(self.base_state(state), control, seen)
         return self.with_base_state(state, inner), innovation
 
