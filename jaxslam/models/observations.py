@@ -49,6 +49,10 @@ class Features(eqx.Module):
     """What the sensor says of each: of a camera a pixel, (u,) or (u, v)."""
     valid: Bool[AnyArray, "*frames m"]
 
+    def places(self, count: int) -> Int[Array, "*frames m"]:
+        """The slots, and `count`, which is out of bounds, for what is not valid."""
+        return jnp.where(self.valid, self.slots, count)
+
 
 class Status(IntEnum):
     """The outcome of an update, the worse the greater."""

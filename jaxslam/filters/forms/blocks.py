@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jaxslam._numerics.linalg import cholesky
 from jaxslam._numerics.tracing import gathers_are_free
 from jaxslam.filters.protocol import Belief
-from jaxslam.geometry import jacobian, nudge, retract, zero_tangent
+from jaxslam.geometry import difference, jacobian, nudge, retract, zero_tangent
 from jaxslam.models.observations import Features, Slots
 
 Landmark = Callable[[PyTree, Array], Array]
@@ -169,7 +169,7 @@ def new_landmarks(
     new, J_view, own = jax.vmap(one)(features.measured, mean, sigma)
     m, d = new.shape
     identity = jnp.broadcast_to(jnp.eye(d, dtype=new.dtype), (m, d, d))
-    slots = jnp.where(features.valid, features.slots, state.active.size)
+    slots = features.places(state.active.size)
     return NewLandmarks(new, slots, Blocks(view_by_core, J_view, identity), own)
 
 
@@ -273,3 +273,9 @@ def shifted(state: Belief, delta: Float[Array, " n"]) -> Belief:
         core=retract(state.core, delta[:c]),
         landmarks=state.landmarks + delta[c:].reshape(state.landmarks.shape),
     )
+
+
+def apart(state: Belief, origin: Belief) -> Float[Array, " n"]:
+    """`state ⊟ origin`, the inverse of `shifted`."""
+    landmarks = (state.landmarks - origin.landmarks).ravel()
+    return jnp.concatenate([difference(state.core, origin.core), landmarks])

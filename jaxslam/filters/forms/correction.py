@@ -16,9 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam._numerics.linalg import cholesky, symmetric_part
-from jaxslam.filters.forms.blocks import Model, Noise, observed, residuals, shifted
+from jaxslam.filters.forms.blocks import Model, Noise, apart, observed, residuals, shifted
 from jaxslam.filters.forms.state import State
-from jaxslam.geometry import difference
 from jaxslam.models.observations import Features, Innovation, Slots, judged
 
 ROUNDING = 4.0
@@ -92,15 +91,9 @@ def gauss_newton(
     for _ in range(steps - 1):
         after, _ = kalman_update(model, at, offset, *data)
         at = corrected(at, replace(after, covariance=at.covariance))
-        offset = _apart(state, at)
+        offset = apart(state, at)
     after, innovation = kalman_update(model, at, offset, *data)
     return corrected(at, after), innovation
-
-
-def _apart(state: State, origin: State) -> Float[Array, " n"]:
-    """`state ⊟ origin`."""
-    landmarks = (state.landmarks - origin.landmarks).ravel()
-    return jnp.concatenate([difference(state.core, origin.core), landmarks])
 
 
 def kalman_update(

@@ -86,8 +86,7 @@ class Covariance(AbstractGaussian):
         return self.correction.remember(replace(state, covariance=covariance), new.slots)
 
     def remove(self, state: State, gone: Bool[AnyArray, " capacity"]) -> State:
-        kept = jnp.repeat(~gone, state.landmarks.shape[1])
-        kept = jnp.concatenate([jnp.ones(state.core_dim, bool), kept])
+        kept = state.numbers(~gone)
         covariance = jnp.where(kept[:, None] & kept[None, :], state.covariance, 0.0)
         return replace(state, active=state.active & ~gone, covariance=covariance)
 

@@ -82,6 +82,4 @@ def unobservable_directions(model: SlamModel, state: State) -> Float[Array, "n g
         return act(model, nudge(origin, s[:t]), factor, state.core, state.landmarks)
 
     N = jacobian(moved, jnp.zeros(gauge_dim(model), dtype))
-    held = jnp.repeat(state.active, state.landmarks.shape[1])
-    held = jnp.concatenate([jnp.ones(state.core_dim, bool), held])
-    return jnp.where(held[:, None], N, 0.0)
+    return jnp.where(state.numbers(state.active)[:, None], N, 0.0)

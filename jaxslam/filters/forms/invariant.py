@@ -26,13 +26,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.forms.blocks import shifted
+from jaxslam.filters.forms.blocks import apart, shifted
 from jaxslam.filters.forms.correction import AbstractCorrection, kalman_update
 from jaxslam.filters.forms.gauge import act, unobservable_directions
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.forms.transport import carried, check_metric, check_undelayed, read_from
 from jaxslam.filters.model import SlamModel
-from jaxslam.geometry import difference, exp, tangent_dim
+from jaxslam.geometry import exp, tangent_dim
 from jaxslam.models.coordinates import WORLD
 
 
@@ -68,9 +68,7 @@ def _retracted(
     model: SlamModel, before: State, added: State, N: Float[Array, "n t"], L: Float[Array, "t n"]
 ) -> State:
     """`x ⊞ ξ` with `ξ = B(x)⁻¹ δ`, from the state `added` = x + δ."""
-    delta = jnp.concatenate(
-        [difference(added.core, before.core), (added.landmarks - before.landmarks).ravel()]
-    )
+    delta = apart(added, before)
     rigid = L @ delta
     half, one = exp(model.geometry.group, rigid / 2), jnp.ones((), delta.dtype)
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
@@ -30,28 +29,26 @@ from jaxslam.filters.forms.blocks import (
     indices,
     product,
     residuals,
+    shifted,
     small_products,
 )
 from jaxslam.filters.forms.form import AbstractForm, OfCore
 from jaxslam.filters.forms.state import AbstractState
 from jaxslam.filters.protocol import Moments
-from jaxslam.geometry import difference, jacobian, retract, tangent_dim
+from jaxslam.geometry import difference, jacobian, retract
 from jaxslam.models.observations import Slots
 
 
-class Distribution(eqx.Module):
+class Distribution(AbstractState):
     """A state `x0 ⊞ (m + L y)` with y ~ N(0, I)."""
 
-    core: PyTree
-    landmarks: Float[Array, "capacity d"]
-    active: Bool[Array, " capacity"]
     offset: Float[Array, " n"]
     root: Float[Array, "n n"]
     """L; rows and columns of zeros where a slot is empty."""
 
     def by_variables(self, by_shared: Float[Array, "k r"]) -> Float[Array, "k N"]:
         """Derivatives by y, from those by the error of the core before and by the noise."""
-        c = self.offset.size - self.landmarks.size
+        c = self.core_dim
         return jnp.concatenate([by_shared[:, :c] @ self.root[:c], by_shared[:, c:]], axis=1)
 
 
@@ -66,8 +63,7 @@ class Derivative(NamedTuple):
 
     def by_variables(self, before: Distribution) -> Float[Array, "mk N"]:
         """The derivative by y."""
-        (m, k, d), capacity = self.by_own.shape, before.active.size
-        c = before.offset.size - capacity * d
+        (m, k, d), capacity, c = self.by_own.shape, before.active.size, before.core_dim
         here = self.slots[:, None] == jnp.arange(capacity)
         own = jnp.where(here[:, None, :, None], self.by_own[:, :, None], 0.0)
         shared = self.by_shared.reshape(m * k, -1)
@@ -195,16 +191,15 @@ class Sensitivity(AbstractForm):
 
 def begin(before: Distribution, variables: Float[Array, " N"]) -> Point:
     """The state before the frames."""
-    n, c = before.offset.size, tangent_dim(before.core)
+    n, c, d = before.offset.size, before.core_dim, before.landmarks.shape[1]
     delta = before.offset + before.root @ variables[:n]
-    core = retract(before.core, delta[:c])
+    start = shifted(before, delta)
 
     def moved(further):
-        return difference(retract(before.core, delta[:c] + further), core)
+        return difference(retract(before.core, delta[:c] + further), start.core)
 
     J = jax.jacfwd(moved)(jnp.zeros(c, delta.dtype))
     by_shared = jnp.pad(J, ((0, n - c), (0, variables.size - n)))
-    (_, d), landmarks = before.landmarks.shape, before.landmarks
     by_own = jnp.where(before.active[:, None, None], jnp.eye(d, dtype=delta.dtype), 0.0)
-    landmarks = landmarks + delta[c:].reshape(landmarks.shape)
-    return Point(core, landmarks, before.active, by_shared, by_own, variables, jnp.asarray(n))
+    own = by_shared, by_own, variables, jnp.asarray(n)
+    return Point(start.core, start.landmarks, before.active, *own)

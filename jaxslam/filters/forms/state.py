@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxslam._numerics.arrays import AnyArray
 from jaxslam.geometry import tangent_dim
 
 
@@ -25,6 +27,11 @@ class AbstractState(eqx.Module):
     def core_dim(self) -> int:
         """c, the size of the core's tangent."""
         return tangent_dim(self.core)
+
+    def numbers(self, slots: Bool[AnyArray, " capacity"]) -> Bool[Array, " n"]:
+        """Whether each number of the error is the core's, or of a landmark in these slots."""
+        own = jnp.repeat(slots, self.landmarks.shape[1])
+        return jnp.concatenate([jnp.ones(self.core_dim, bool), own])
 
 
 class State(AbstractState):

@@ -87,7 +87,7 @@ class DepthParticles(AbstractEntry):
         state, innovation = correct(slam, state, control, points)
         rays = replace(features, valid=waiting)
         likelihood, squared = self._evidence(slam, state, control, rays)
-        slots = _kept(rays, state)
+        slots = rays.places(state.active.size)
         weights = reweighted(state.memory[features.slots], likelihood)
         state = replace(state, memory=state.memory.at[slots].set(weights, mode="drop"))
         lost = jnp.all(squared > self.lost, axis=1)
@@ -97,7 +97,7 @@ class DepthParticles(AbstractEntry):
     def initialise(self, slam: EkfSlam, state: State, features: Features) -> State:
         """Begin rays, with particles of equal weight."""
         state = insert(slam, state, features)
-        slots = _kept(features, state)
+        slots = features.places(state.active.size)
         return replace(state, memory=state.memory.at[slots].set(1 / self.count, mode="drop"))
 
     def collapsed(self, state: State) -> State:
@@ -144,11 +144,6 @@ def with_depth_particles(base: EkfSlam, farthest: int | None = None) -> EkfSlam:
 
 def _pending(state: State) -> Bool[Array, " landmarks"]:
     return state.active & (state.landmarks[:, -1] < 0.5)
-
-
-def _kept(features: Features, state: State):
-    """Slots of the valid features; the others are out of bounds."""
-    return jnp.where(features.valid, features.slots, state.active.size)
 
 
 def _moments(weights, values):

@@ -83,7 +83,7 @@ class RaySum(AbstractEntry):
             weights < self.threshold * jnp.max(weights, axis=1, keepdims=True), 0.0, weights
         )
         weights = weights / jnp.sum(weights, axis=1, keepdims=True)
-        kept = jnp.where(features.valid, features.slots, state.memory.shape[0])
+        kept = features.places(state.memory.shape[0])
         memory = state.memory.at[kept].set(weights, mode="drop")
         state = slam.gaussian_form.remove(replace(state, memory=memory), memory.ravel() == 0)
         share = jnp.where(weights > 0, weights**self.privilege, 0.0)
@@ -100,7 +100,7 @@ class RaySum(AbstractEntry):
         prior = (inverse_depth, self.alpha * inverse_depth)
         members = self._of_members(features, every)
         state = insert(slam, state, members, prior)
-        slots = jnp.where(features.valid, features.slots, state.memory.shape[0])
+        slots = features.places(state.memory.shape[0])
         return replace(state, memory=state.memory.at[slots].set(1 / self.members, mode="drop"))
 
     def collapsed(self, state: State) -> State:

@@ -150,7 +150,7 @@ def _still(record: Record, seen: Features, noise: Float[Array, "p p"]) -> Bool[A
 
 def begun(record: Record, new: Features) -> Record:
     """The record with the landmarks that are first seen in the newest frame."""
-    slots = jnp.where(new.valid, new.slots, record.first.size)
+    slots = new.places(record.first.size)
     record = replace(
         record,
         first=record.first.at[slots].set(record.last, mode="drop"),
@@ -165,7 +165,7 @@ def removed(record: Record, gone: Bool[AnyArray, " m"]) -> Record:
 
 
 def _measured(record: Record, k: Int[Array, ""], features: Features) -> Record:
-    slots = jnp.where(features.valid, features.slots, record.first.size)
+    slots = features.places(record.first.size)
     return replace(
         record,
         measured=record.measured.at[k, slots].set(features.measured, mode="drop"),

@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam._numerics.linalg import Cholesky, cholesky, semidefinite_root
 from jaxslam.filters.ekf import EkfSlam, check_features, check_one_gaussian, correct
+from jaxslam.filters.forms.blocks import shifted
 from jaxslam.filters.forms.sensitivity import (
     Distribution,
     Point,
@@ -40,7 +41,7 @@ from jaxslam.filters.protocol import (
     OfLandmark,
     PoseError,
 )
-from jaxslam.geometry import Pose, retract
+from jaxslam.geometry import Pose
 from jaxslam.models.motion import Control, check_control
 from jaxslam.models.observations import Capacity, Features, Innovation, Slots, Status, judged
 
@@ -153,9 +154,7 @@ class FixedLag(AbstractFilter):
     def remove(self, state: LagState, gone: Bool[AnyArray, " capacity"]) -> LagState:
         """Marginalise landmarks, with what the window measured of them, and free their slots."""
         before, frames = state.before, state.frames
-        n, c = before.offset.size, state.estimate.core_dim
-        kept = jnp.repeat(~gone, before.landmarks.shape[1])
-        kept = jnp.concatenate([jnp.ones(c, bool), kept])
+        n, kept = before.offset.size, before.numbers(~gone)
         before = replace(
             before,
             active=before.active & ~gone,
@@ -281,15 +280,9 @@ def _appended(frames: LagFrames, newest: LagFrames) -> LagFrames:
 
 def _estimate(window: NormalEquations) -> State:
     """The newest state, to first order in the step that is left."""
-    point, S = window.newest, window.sensitivity
-    delta, c = S @ window.step(), point.core_dim
-    V = window.information.whitening @ S.T
-    return State(
-        retract(point.core, delta[:c]),
-        point.landmarks + delta[c:].reshape(point.landmarks.shape),
-        point.active,
-        V.T @ V,
-    )
+    S = window.sensitivity
+    point, V = shifted(window.newest, S @ window.step()), window.information.whitening @ S.T
+    return State(point.core, point.landmarks, point.active, V.T @ V)
 
 
 def _innovation(window: NormalEquations, noise: Float[Array, "p p"]) -> Innovation:

@@ -28,11 +28,11 @@ from jaxtyping import Array, Bool, Float
 from jaxslam._numerics.conditional import at_places, map_or_zero, repeated
 from jaxslam._numerics.linalg import cholesky, eigh
 from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.forms.blocks import shifted
+from jaxslam.filters.forms.blocks import apart, shifted
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.filters.wrappers.sum_state import SumState, member, moments
-from jaxslam.geometry import difference, jacobian, log
+from jaxslam.geometry import jacobian, log
 from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features
 
@@ -195,9 +195,6 @@ def collapsed(members: State, log_weights: Float[Array, " k"]) -> State:
     alone = jnp.where(jnp.arange(log_weights.size) == likeliest, 0.0, -jnp.inf)
     log_weights = jnp.where(jnp.isfinite(total), log_weights - total, alone)
 
-    def away(one):
-        landmarks = (one.landmarks - centre.landmarks).ravel()
-        return jnp.concatenate([difference(one.core, centre.core), landmarks])
-
-    mean, covariance = moments(log_weights, jax.vmap(away)(members), members.covariance)
+    away = jax.vmap(apart, in_axes=(0, None))(members, centre)
+    mean, covariance = moments(log_weights, away, members.covariance)
     return replace(shifted(centre, mean), covariance=covariance)
