@@ -151,11 +151,18 @@ def test_the_house_does_not_grow():
     }
     assert len({(above, below) for above, below in arrows if above != below}) <= 70
     ours = [path for path in FILES if "native" not in path.parts]
-    assert sum(len(path.read_text().splitlines()) for path in ours) <= 26_100
+    assert sum(len(path.read_text().splitlines()) for path in ours) <= 25_880
     for path in FILES:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ClassDef):
                 assert (node.end_lineno or 0) - node.lineno < 300, (path, node.name)
+
+
+def test_annotations_say_what_a_thing_is():
+    """`Any` is for what truly may be anything: a JSON file, an argument handed on."""
+    lines = [line for path in FILES for line in path.read_text().splitlines()]
+    assert sum(bool(re.search(r": Any\b", line)) for line in lines) <= 60
+    assert sum(len(re.findall(r"\bAny\b", line)) for line in lines) <= 240
 
 
 def public(cls):
