@@ -149,7 +149,7 @@ class Information(AbstractGaussian):
 
     def with_new(self, state: InformationState, new: NewLandmarks) -> InformationState:
         """Information `N⁻¹` on `y − J x`, of the landmark y, the core x and the covariance N of y
-        given x: the same sum as an update's."""
+        given x: the same sum as an update's (P22–P26)."""
         valid = new.slots < state.active.size
         own = small_products(new.root, jnp.swapaxes(new.root, 1, 2))
         own = jnp.where(valid[:, None, None], own, jnp.eye(own.shape[-1], dtype=own.dtype))

@@ -11,8 +11,7 @@ from jaxslam.geometry import tangent_dim
 
 
 class AbstractState(eqx.Module):
-    """A mean, to which a form adds its uncertainty, and `memory`, what an `AbstractEntry` remembers
-    beside: any pytree. Everything has a fixed shape.
+    """A mean, to which a form adds its uncertainty, and `memory`. Everything has a fixed shape.
 
     The error is ordered (core, landmark 0, landmark 1, …), n = c + capacity · d numbers.
     """
@@ -39,5 +38,6 @@ class State(AbstractState):
 
     covariance: Float[Array, "n n"]
     memory: PyTree = ()
+    """What an `AbstractEntry` remembers of landmarks beside the Gaussian: any pytree."""
     first: Float[Array, "capacity d"] | None = None
     """Landmarks as they were inserted; where a correction is by first estimates."""
