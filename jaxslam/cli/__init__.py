@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import textwrap
@@ -10,6 +11,9 @@ from typing import NoReturn
 from jaxslam._runtime.extras import missing
 from jaxslam._version import __version__
 from jaxslam.cli.cache import keep_programs
+
+_BROKEN_PIPE = 141
+"""The exit status of a command that SIGPIPE ends, as a shell has it."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -29,8 +33,12 @@ def main(arguments: list[str] | None = None) -> None:
     keep_programs()
     try:
         options.run()
+        sys.stdout.flush()
     except ValueError as error:
         _fail(2, str(error))
+    except BrokenPipeError:  # whoever read standard output has enough, as `head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # it is flushed at the end
+        sys.exit(_BROKEN_PIPE)
     except OSError as error:  # a path that is too long, a folder that may not be written
         _fail(2, f"{textwrap.shorten(str(error.filename), 80)}: {error.strerror or error}")
     except KeyboardInterrupt as interrupt:

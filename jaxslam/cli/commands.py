@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any, Union
 
 import tyro
 
@@ -12,42 +12,29 @@ from jaxslam.cli.evaluate import EvaluateOptions
 from jaxslam.cli.track import TrackOptions
 from jaxslam.cli.triangulate import TriangulateOptions
 
-Command = (
-    Annotated[
-        ConsistencyOptions,
-        tyro.conf.subcommand(
-            "consistency", description="Simulate many runs of filters: are they consistent?"
-        ),
-    ]
-    | Annotated[
-        EvaluateOptions,
-        tyro.conf.subcommand(
-            "evaluate", description="Errors and covariances of your own filter: is it consistent?"
-        ),
-    ]
-    | Annotated[
-        TrackOptions,
-        tyro.conf.subcommand(
-            "track", description="Track a camera through a video: trajectory, map, overlay."
-        ),
-    ]
-    | Annotated[
-        CalibrateOptions,
-        tyro.conf.subcommand(
-            "calibrate", description="Film a board: the camera's calibration, and how sure it is."
-        ),
-    ]
-    | Annotated[
-        TriangulateOptions,
-        tyro.conf.subcommand(
-            "triangulate", description="A point seen twice: what is known of its depth, and is it?"
-        ),
-    ]
-)
+_COMMANDS = {
+    "consistency": (ConsistencyOptions, "Simulate many runs of filters: are they consistent?"),
+    "evaluate": (
+        EvaluateOptions, "Errors and covariances of your own filter: is it consistent?",
+    ),
+    "track": (TrackOptions, "Track a camera through a video: trajectory, map, overlay."),
+    "calibrate": (
+        CalibrateOptions, "Film a board: the camera's calibration, and how sure it is.",
+    ),
+    "triangulate": (
+        TriangulateOptions, "A point seen twice: what is known of its depth, and is it?",
+    ),
+}  # fmt: skip
+Command: Any = Union[  # noqa: UP007 (of a table)
+    tuple(
+        Annotated[options, tyro.conf.subcommand(name, description=told)]
+        for name, (options, told) in _COMMANDS.items()
+    )
+]
 
 
-def parse(arguments: list[str]) -> Command:
-    """The options of a command line, which ends with status 2 where it is none."""
+def parse(arguments: list[str]) -> Any:
+    """The options of a command line, to be `run`; it ends with status 2 where it is none."""
     return tyro.cli(
         Command,
         args=arguments,

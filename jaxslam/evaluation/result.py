@@ -301,9 +301,11 @@ class Evaluation:
             f"{runs} of {steps}; mean {self.quantity} of a consistent filter "
             f"{self.expected}, at one step in {low:.3f}–{high:.3f} with 95 %; "
             f"{self.inside:.0%} of the steps are inside",
-            _columns("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
-            *(self._row(i) for i in range(len(self.names))),
-            _columns("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}"),
+            *_in_columns(
+                ("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
+                *(self._row(i) for i in range(len(self.names))),
+                ("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}"),
+            ),
         ]
 
     @property
@@ -311,7 +313,7 @@ class Evaluation:
         """The mean NEES of a consistent filter: `6`, or `5–6` where a scale was fitted."""
         return f"{self.dof - self.fitted:g}–{self.dof}" if self.fitted else str(self.dof)
 
-    def _row(self, axis: int) -> str:
+    def _row(self, axis: int) -> tuple[str, ...]:
         found = self.axis_verdict(axis)
         there = self.logged.any(axis=0)
         rmse, sigma = (f"{_rms(x[there, axis]):.4g}" for x in (self.rmse, self.sigma))
@@ -320,11 +322,18 @@ class Evaluation:
             for x in (found["sigma_factor"], *found["interval99"])
         )
         outside = f"{self.outside3sigma[axis]:.2%}"
-        return _columns(self.names[axis], rmse, sigma, factor, f"[{low}, {high}]", outside)
+        return self.names[axis], rmse, sigma, factor, f"[{low}, {high}]", outside
 
 
-def _columns(*cells: str) -> str:
-    return f"{cells[0]:<14}" + "".join(f"{cell:>17}" for cell in cells[1:])
+def _in_columns(*rows: tuple[str, ...]) -> list[str]:
+    """Lines of cells, as wide as the longest of their column needs, two spaces apart at least."""
+    first, *others = (max(len(cell) + 2 for cell in column) for column in zip(*rows, strict=True))
+    wide = [max(width, 17) for width in others]
+    return [
+        f"{name:<{max(first, 14)}}"
+        + "".join(f"{cell:>{width}}" for cell, width in zip(cells, wide, strict=True))
+        for name, *cells in rows
+    ]
 
 
 def evaluate(

@@ -111,6 +111,26 @@ def test_a_mistake_ends_with_status_2_and_one_line(arguments, message, tmp_path,
     assert not (tmp_path / "out").exists()
 
 
+def test_a_reader_that_has_enough_ends_a_command_quietly():
+    """As `jaxslam evaluate … | head -1`, whatever is still in the buffer."""
+    code = """
+import types, jaxslam.cli, jaxslam.cli.commands as commands
+def run():
+    for line in range(100_000):
+        print("line", line)
+commands.parse = lambda given: types.SimpleNamespace(run=run)
+jaxslam.cli.main([])
+"""
+    command = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert command.stdout is not None
+    assert command.stdout.readline() == "line 0\n"
+    command.stdout.close()
+    _, error = command.communicate(timeout=60)
+    assert (command.returncode, error) == (141, "")
+
+
 def test_the_version_is_told(capsys):
     main(["--version"])
     assert capsys.readouterr().out == f"jaxslam {jaxslam.__version__}\n"

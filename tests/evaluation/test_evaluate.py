@@ -1,6 +1,7 @@
 """Errors and covariances of anybody's filter: the verdict, the files, the command, bad input."""
 
 import json
+import re
 import time
 from dataclasses import replace
 
@@ -210,6 +211,16 @@ def test_a_run_whose_nees_overflows_has_diverged():
     assert found.verdict["word"] == "lost"
     assert found.verdict["diverged"] == 1
     json.dumps(found.asdict(), allow_nan=False)
+
+
+def test_columns_of_the_table_never_run_together():
+    e, P = drawn()
+    name = "an axis of so long a name"
+    e[..., 0] *= 1.5e8
+    found = jaxslam.evaluate(e, P, names=[name, *"bc"])
+    (row,) = (line for line in str(found).splitlines() if line.startswith(name))
+    cells = re.split(" {2,}", row)
+    assert [len(cells), cells[0], cells[4][0], cells[4][-1]] == [6, name, "[", "]"]
 
 
 def test_lost_runs_are_named():
