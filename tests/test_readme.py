@@ -68,12 +68,6 @@ def test_the_papers_filter_is_put_together_of_its_equations(capsys):
     assert capsys.readouterr().out.startswith("(47, 47)")
 
 
-@pytest.mark.slow
-def test_a_filter_has_gradients(capsys):
-    run_example("docs/gradients.md")
-    assert "by the pixel's σ" in capsys.readouterr().out
-
-
 def test_errors_of_any_filter_have_a_verdict(capsys, tmp_path, monkeypatch):
     """And trajectories with covariances have one, by way of their files."""
     monkeypatch.chdir(tmp_path)
@@ -104,14 +98,6 @@ def test_a_study_is_kept_in_files(capsys, tmp_path, monkeypatch):
     written = [file.stat().st_mtime_ns for file in files]
     run_example("docs/large-studies.md")  # goes on from there: nothing is run again
     assert [file.stat().st_mtime_ns for file in files] == written
-
-
-@pytest.mark.slow
-def test_single_precision_is_a_choice(capsys):
-    run_example("docs/float32.md")
-    double, single = capsys.readouterr().out.splitlines()
-    assert double.endswith("diverged 0")
-    assert single.endswith("diverged 0")
 
 
 @pytest.mark.slow

@@ -1,9 +1,7 @@
 """Factorisations of small matrices, written in JAX: batched by `vmap`, differentiable, no LAPACK.
 
 jaxlib's batched LAPACK kernels wait inside XLA's thread pool for pieces of work that only the same
-pool can do: two at once stand still for ever on two cores (docs/dead-lock.md). These loops take the
-same time within a third on a quiet machine, and a fraction of it on a loaded one (`python
-benchmarks/linalg.py`).
+pool can do: two at once stand still for ever on two cores (docs/faq.md).
 """
 
 from __future__ import annotations
