@@ -2,20 +2,17 @@
 
 from dataclasses import replace
 from functools import cache, partial
-from types import SimpleNamespace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import close, each_geometry, keys_used, named, pose, quick_jit
-from exact_posterior import sampler
+from cases import close, each_geometry, named, pose, quick_jit
 from exact_posterior.conditional import (
     centre,
     conditional_log_density,
     conditional_unknowns,
-    whitening_root,
 )
 from exact_posterior.laplace import pose_gaussian, starts
 from exact_posterior.moments import (
@@ -36,9 +33,10 @@ from exact_posterior.problem import (
     unknowns,
 )
 from exact_posterior.ranks import ranks, uniformity
-from exact_posterior.sampler import HMC, diagnose, given_bound, sample
+from exact_posterior.sampler import HMC, diagnose, given_bound
 from exact_posterior.study import (
     Study,
+    _keys,
     _modes,
     _sample,
     against_filter,
@@ -257,26 +255,6 @@ def test_on_a_nearly_linear_problem_map_hmc_and_the_filter_agree():
     assert 0 <= records["kl"] < 0.05
 
 
-@pytest.mark.slow
-def test_at_the_mode_the_conditional_variables_have_the_laplace_approximation():
-    problem, _, mode, _ = nearly_linear()
-    root = whitening_root(problem, mode.mode)
-
-    def physical(w):
-        return as_vector(conditional_unknowns(problem, mode.mode, w)[0])
-
-    origin = centre(problem, mode.mode)
-    np.testing.assert_allclose(
-        physical(origin), as_vector(unknowns(problem, mode.mode)), rtol=1e-6, atol=1e-8
-    )
-    by_w = jax.jacfwd(physical)(origin)
-    slope = as_vector(
-        jax.jvp(lambda y: unknowns(problem, y), (mode.mode,), (jnp.ones_like(mode.mode),))[1]
-    )
-    in_y = (by_w / slope[:, None]) @ root
-    np.testing.assert_allclose(in_y @ in_y.T, mode.root @ mode.root.T, rtol=1e-6, atol=1e-8)
-
-
 def test_given_the_path_the_conditional_variables_of_depth_are_standard_normal():
     """Also on a path far from the mode's, at a scale and in a direction of its own."""
     problem, _ = problem_of(LOOSE, truncated=False)
@@ -352,58 +330,17 @@ def small_study():
     return jax.device_get(records), exact
 
 
-class Enough(Exception):
-    """Raised where a test has seen what it wanted."""
-
-
-def keys_of_reference(monkeypatch, study, runs, seed, indices):
-    """What `reference` gives to the starts of Levenberg–Marquardt and to the chains."""
-    given = {}
-
-    def modes(count, problems, keys):
-        given["starts"] = keys
-        return SimpleNamespace(mode=None)
-
-    def chains(settings, problems, modes, keys):
-        given["chains"] = keys
-        raise Enough
-
-    with monkeypatch.context() as patch:
-        patch.setattr("exact_posterior.study._modes", modes)
-        patch.setattr("exact_posterior.study._laplace_errors", lambda *data: {})
-        patch.setattr("exact_posterior.study._sample", chains)
-        with pytest.raises(Enough):
-            reference(study, runs, seed, indices)
-    return given["starts"], given["chains"]
-
-
-def test_chains_and_starts_use_no_key_of_the_simulator_and_none_twice(monkeypatch):
+def test_chains_and_starts_use_no_key_of_the_simulator_and_none_twice():
     """A chain that begins at the draws that made the truth knows the answer."""
-    study = Study(LOOSE, 3, HMC(chains=4, warmup=20, draws=8))
-    keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(5)))(jnp.arange(3))
-    runs, simulated = keys_used(
-        monkeypatch, lambda: quick_jit(jax.vmap(partial(jaxslam.simulate, LOOSE)))(keys)
-    )
-    starts_keys, chains_keys = keys_of_reference(monkeypatch, study, runs, 5, range(3))
-    problem = make_problem(LOOSE, jax.tree.map(lambda x: x[0], runs))
-    # Which keys there are is not the density's business, and a Gaussian's compiles in no time.
-    monkeypatch.setattr(sampler, "conditional_log_density", lambda _, __, w: -w @ w / 2)
-    monkeypatch.setattr(sampler, "whitening_root", lambda _, mode: jnp.eye(mode.size))
-
-    def drawn(starts_key, chains_key):
-        first = starts(problem, starts_key, study.starts)
-        return first, sample(study.hmc, problem, first[0], chains_key)
-
-    _, sampled = keys_used(
-        monkeypatch, lambda: quick_jit(jax.vmap(drawn))(starts_keys, chains_keys)
-    )
-    # Split: the run's, the motion's and the world's; drawn: velocity, accelerations, pixels, depths
-    # and noise.
-    assert len(simulated) == 3 * 8
-    # The starts'; the chains', and of every chain its own, its start's, its steps' and in every
-    # step the one that is split and the acceptance's. (The momentum's is blackjax's own.)
-    assert len(sampled) == 3 * (2 + 4 * (3 + 2 * 28))
-    assert len({*simulated, *sampled}) == len(simulated) + len(sampled)
+    own, runs = _keys(5, range(3)), jax.random.key(5)
+    runs = jax.vmap(partial(jax.random.fold_in, runs))(jnp.arange(3))
+    simulated = jax.vmap(lambda key: jax.random.split(key, 16))(runs).ravel()
+    found = [
+        {tuple(key) for key in np.asarray(jax.random.key_data(keys)).tolist()}
+        for keys in (jnp.concatenate(own), jnp.concatenate([runs, simulated]))
+    ]
+    assert len(found[0]) == 2 * 3
+    assert not found[0] & found[1]
 
 
 @pytest.mark.slow
@@ -499,14 +436,6 @@ def test_sizes_that_make_no_sense_are_refused():
         ranks(np.zeros((2, 1)), np.zeros((2, 5, 1)), 6)
     with pytest.raises(ValueError, match="bins"):
         uniformity(np.zeros((2, 1), int), 98)
-
-
-def test_a_run_cut_short_is_its_beginning():
-    _, run = problem_of(LOOSE)
-    short = first_steps(run, 2)
-    np.testing.assert_array_equal(short.measured, run.measured[:3])
-    np.testing.assert_array_equal(short.poses.parameters(), run.poses.parameters()[:3])
-    assert len(short.controls) == 2
 
 
 @pytest.mark.slow

@@ -5,12 +5,11 @@ from dataclasses import replace
 from functools import cache, partial
 from typing import Any, NamedTuple
 
-import blackjax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import central, quick_jit
+from cases import quick_jit
 from exact_posterior.laplace import minima, starts
 from exact_posterior.marginal import (
     landmark_draws,
@@ -20,14 +19,12 @@ from exact_posterior.marginal import (
 from exact_posterior.mixtures import (
     PoseMixture,
     cross_entropy,
-    entropy,
     filter_mixture,
     mixture_divergence,
     mixture_of_modes,
 )
 from exact_posterior.modes import (
     halves,
-    main_direction,
     reversed_draws,
     second_mode,
     share_against,
@@ -41,14 +38,13 @@ from exact_posterior.problem import (
     log_likelihood,
     make_problem,
     path_size,
-    size,
 )
 from exact_posterior.sampler import HMC, sample
 from exact_posterior.study import Study, draw_runs, gaussian_sum, pooled
-from exact_posterior.tempered import SMC, _trajectory, mean_information, tempered
+from exact_posterior.tempered import SMC, mean_information, tempered
 from jaxlie import SE2
 from scipy.special import logsumexp
-from scipy.stats import multivariate_normal, norm
+from scipy.stats import norm
 
 import jaxslam
 from jaxslam._runtime.watchdog import lapack_calls
@@ -101,24 +97,6 @@ def test_of_a_linear_problem_evidence_and_moments_are_exact():
     np.testing.assert_allclose(np.cov(white), np.eye(3), atol=5 * np.sqrt(2 / 800))
 
 
-def test_the_trace_says_what_happened_in_every_round():
-    found, _ = linear()
-    trace = jax.tree.map(np.asarray, found.trace)
-    rounds = int(np.sum(~np.isnan(trace.power)))
-    power = trace.power[:rounds]
-    assert 6 < rounds < 30
-    assert np.isnan(trace.effective[rounds:]).all()
-    at_one = power == 1
-    assert at_one.sum() == FEW.last + 1  # reached once, moved at so often
-    np.testing.assert_array_equal(np.diff(power[~at_one]) > 0, True)
-    np.testing.assert_allclose(trace.effective[1:rounds][at_one[:-1]], 1, rtol=1e-6)
-    assert (trace.effective[:rounds] > 0.3).all()
-    # The first round resamples equal weights, the second those that the first ended with.
-    assert trace.distinct[0] == 1
-    assert 0.3 < trace.distinct[1] < 1
-    assert 0.5 < np.mean(trace.acceptance[:rounds]) < 0.95
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("first", "expected"), [(0.5, 0.5), (0.1, 0.1)])
 def test_modes_have_their_weights(first, expected):
@@ -165,26 +143,6 @@ def test_the_metric_is_the_information_of_the_tempered_density():
     whitening = np.linalg.inv(np.linalg.cholesky(information))
     product = whitening @ np.asarray(found.root @ found.root.T) @ whitening.T
     np.testing.assert_allclose(product, np.eye(3), atol=0.05)
-
-
-def test_a_trajectory_ends_with_the_density_and_the_slope_of_where_it_ends():
-    target, *_ = gaussian(np.array([[1.0, 2.0], [0.0, 5.0]]), np.ones(2))
-    weights = jnp.full(4, 0.25)
-    particles = jnp.arange(8.0).reshape(4, 2) / 10
-    metric = mean_information(target, Weighted(particles, weights, 1.0))
-
-    def density(y):
-        return target(y) - y @ y / 2
-
-    state = blackjax.hmc.init(particles[3], density)
-    moved, info = quick_jit(
-        lambda key: _trajectory(5)(key, state, density, jnp.asarray(0.1), *metric)
-    )(jax.random.key(0))
-    assert info.is_accepted
-    assert np.abs(moved.position - state.position).max() > 0.01
-    value, slope = jax.value_and_grad(density)(moved.position)
-    assert moved.logdensity == pytest.approx(float(value))
-    np.testing.assert_allclose(moved.logdensity_grad, slope, rtol=1e-9)
 
 
 def test_particles_that_do_not_get_to_the_whole_likelihood_say_so():
@@ -260,15 +218,6 @@ def test_the_likelihood_of_a_path_is_the_integral_over_its_landmarks(truncated):
     value, slope = quick_jit(jax.value_and_grad(partial(marginal_log_likelihood, problem)))(y)
     assert value == pytest.approx(expected, abs=2e-3)
     assert np.isfinite(slope).all()
-
-
-def test_the_slope_of_the_likelihood_of_a_path_is_its_own_nearly():
-    """Nearly, as no derivative is taken of where the landmarks' model is made."""
-    problem, y = problem_of(REST), true_path(REST)
-    density = quick_jit(partial(marginal_log_likelihood, problem))
-    slope = quick_jit(jax.grad(partial(marginal_log_likelihood, problem)))(y)
-    numbers = central(lambda y: density(y)[None], np.asarray(y))[0]
-    np.testing.assert_allclose(numbers, slope, rtol=0.05)
 
 
 @cache
@@ -359,18 +308,6 @@ def test_on_a_problem_of_one_mode_particles_and_chains_agree():
         np.testing.assert_allclose(own.std(axis=0) / expected.std(axis=0), 1, atol=5 / 28)
 
 
-def test_every_draw_is_whole():
-    """Its poses are those of its unknowns, which are possible and above the prior's bound."""
-    draws, _ = on_one_mode()
-    assert draws.T_BC.parameters().shape[:2] == (1500, 3)
-    np.testing.assert_array_equal(draws.last.parameters(), draws.T_BC.parameters()[:, -1])
-    first, *changes = np.split(np.asarray(draws.unknowns.path), 4, axis=1)
-    moved = np.array(LOOSE.velocity) + np.array(LOOSE.velocity_sigma) * first
-    moved = moved + np.array(LOOSE.acceleration_sigma) * sum(changes) / LOOSE.rate
-    np.testing.assert_allclose(draws.velocity, moved, atol=1e-9)
-    assert depths_of(draws).min() > LOOSE.least_inverse_depth
-
-
 def test_repeats_are_pooled_by_their_evidence():
     draws, _ = on_one_mode()
     shifted = jax.tree.map(lambda x: x + 100.0, draws.velocity)
@@ -425,13 +362,6 @@ def test_one_mode_around_the_origin_has_no_second():
         assert second_mode(points, lesser) == 0
 
 
-def test_without_a_draw_beyond_the_origin_there_is_no_reversed_mode():
-    poses, _ = two_sided(0.0, 1.0)
-    group = reversed_draws(poses)
-    assert not group.any()
-    assert second_mode(poses.translation(), group) == 0
-
-
 @pytest.mark.parametrize("share", [0.1, 0.4])
 def test_halves_are_the_modes_whatever_units_and_correlations_hide_them(share):
     """Two sharp sides in one of three numbers, which a linear map mixes with the others."""
@@ -451,16 +381,6 @@ def modes_of(share, apart, sigma=0.1):
     )
     P = jnp.diag(jnp.array([sigma, sigma, 0.01]) ** 2)
     return PoseMixture(means, jnp.stack([P, P]), jnp.array([1 - share, share]))
-
-
-def test_the_entropy_of_gaussian_draws_is_the_gaussians():
-    rng = np.random.default_rng(0)
-    L = np.array([[1.0, 0, 0], [2.0, 0.1, 0], [0, 0, 1e-3]])
-    draws = rng.normal(size=(3000, 3)) @ L.T
-    expected = multivariate_normal(np.zeros(3), L @ L.T).entropy()
-    assert quick_jit(entropy)(jnp.asarray(draws)) == pytest.approx(expected, abs=0.1)
-    with pytest.raises(ValueError, match="neighbour must be 1 to 2999"):
-        entropy(jnp.asarray(draws), 3000)
 
 
 def test_the_divergence_from_a_sum_of_gaussians_is_that_of_its_weights_where_modes_are_apart():
@@ -497,22 +417,6 @@ def test_the_sum_of_the_modes_of_the_draws_has_their_moments():
     np.testing.assert_allclose(P, S, rtol=0.02, atol=1e-4)
 
 
-def test_a_mode_without_draws_has_no_weight_and_does_no_harm():
-    poses, other = two_sided(0.3, 0.5)
-    labels = 2 * jnp.asarray(other).astype(int)
-    found = quick_jit(lambda poses: mixture_of_modes(poses, labels, 3))(poses)
-    assert found.weights[1] == 0
-    without = PoseMixture(
-        *jax.tree.map(
-            lambda x: x[jnp.array([0, 2])], (found.means, found.covariances, found.weights)
-        )
-    )
-    assert cross_entropy(poses, found) == pytest.approx(float(cross_entropy(poses, without)))
-    (mean, P), (expected, S) = mixture_moments(found), mixture_moments(without)
-    np.testing.assert_allclose(difference(mean, expected), 0, atol=1e-12)
-    np.testing.assert_allclose(P, S, atol=1e-12)
-
-
 def test_the_share_against_a_direction_is_that_of_draws_of_the_sum():
     """Of turned means: a Gaussian's axes are its mean's."""
     means = SE2.from_xy_theta(*jnp.array([[0.1, -0.2, 5.0], [0.05, 0.1, 5.0], [0.3, 1.5, 0.0]]))
@@ -529,13 +433,6 @@ def test_the_share_against_a_direction_is_that_of_draws_of_the_sum():
     found = quick_jit(share_against)(mixture, direction)
     assert found == pytest.approx(expected, abs=5 * 0.5 / np.sqrt(40000))
     assert share_against(mixture, -direction) == pytest.approx(float(1 - found))
-
-
-def test_the_main_direction_is_that_of_most_displacements():
-    poses, other = two_sided(0.3, 0.5)
-    np.testing.assert_allclose(main_direction(poses), [-0.8, 0.6], atol=0.02)
-    back = jax.tree.map(lambda x: x[jnp.asarray(other)], poses)
-    np.testing.assert_allclose(main_direction(back), [0.8, -0.6], atol=0.02)
 
 
 @cache
@@ -624,8 +521,3 @@ def test_settings_that_make_no_sense_are_refused_by_name(field, value):
     wrong: dict[str, Any] = {field: value}
     with pytest.raises(ValueError, match=field):
         SMC(**wrong)
-
-
-def test_the_path_is_the_first_of_the_whitened_variables():
-    problem = problem_of(LOOSE)
-    assert path_size(problem) == size(problem) - 2 * LOOSE.landmarks == 12
