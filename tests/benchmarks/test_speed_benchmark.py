@@ -10,7 +10,6 @@ from benchmarks.speed.dynamax_ekf import TOLERANCE, by_dynamax, missing
 from benchmarks.speed.eigen import build, by_hand
 from benchmarks.speed.loop import by_loop
 from benchmarks.speed.study import study_of
-from benchmarks.speed.sweep import growth, point
 from benchmarks.speed.workload import WORKLOADS, ours, prepared
 
 
@@ -70,14 +69,3 @@ def test_a_study_of_the_workload_is_whole(monkeypatch):
     (study,) = asked
     assert (study.runs, study.scenario.steps, study.scenario.landmarks) == (4, 2, 3)
     assert [len(chunk) for chunk in study.chunks] == [3, 1]
-
-
-def test_growth_is_a_slope_and_the_worst_of_all():
-    assert growth([1, 10, 100], [2.0, 20.0, 200.0]) == {"exponent": 1.0, "worst": 0.0}
-    found = growth([1, 10, 100], [3.0, 20.0, 200.0])
-    assert found["exponent"] < 1
-    assert found["worst"] == pytest.approx(0.5)
-
-
-def test_a_study_that_fails_is_told_of():
-    assert "a few" in point(runs="a few")["error"]
