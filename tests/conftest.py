@@ -11,7 +11,7 @@ import jaxtyping
 import pytest
 
 from jaxslam._runtime import programs
-from jaxslam.consistency import montecarlo
+from jaxslam.consistency import backends
 
 
 def _flags_that_are_known(*flags: str) -> str:
@@ -54,7 +54,7 @@ def unchecked():
 def _compiled_programs_are_freed():
     """A process may hold only so many memory maps, and every compiled program takes some."""
     yield
-    montecarlo.forget()
     programs.forget()
+    backends._native_program.cache_clear()
     jax.clear_caches()
     gc.collect()

@@ -153,9 +153,3 @@ def check_backend(backend: str) -> None:
     """Raise ValueError for a backend that is not known."""
     if backend not in BACKENDS:
         raise ValueError(f"unknown backend {backend!r}; known: {', '.join(BACKENDS)}")
-
-
-def forget() -> None:
-    """Free the programs of all filters."""
-    _filter_batch.forget()
-    _native_program.cache_clear()

@@ -8,9 +8,8 @@ of its numbers: this differentiates by any of them, through the whole run.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -112,8 +111,3 @@ def maximum_likelihood(
         errors = np.sqrt(np.sum((by_run - by_run.mean(axis=0)) ** 2, axis=0))
         converged = bool(np.all(np.abs(change) < tolerance * errors))
     return Estimate(theta, errors, float(values.sum()), iteration, converged)
-
-
-def gradient(slam: Any, room: Room, run: Run) -> Any:
-    """The gradient of the run's log likelihood by every number of the filter, as a filter."""
-    return eqx.filter_grad(lambda slam: log_likelihood(slam, room, run))(slam)

@@ -20,12 +20,10 @@ import numpy as np
 
 from jaxslam._numerics.arrays import cast
 from jaxslam._runtime.watchdog import finished
-from jaxslam.consistency import backends
 from jaxslam.consistency.backends import BACKENDS, BatchProgram, check_backend
 from jaxslam.consistency.cluster import connected, on_cluster
 from jaxslam.consistency.manifest import described
 from jaxslam.consistency.simulator import MapChunks, Simulator
-from jaxslam.consistency.simulator import forget as forget_draws
 from jaxslam.consistency.store import MemoryStore, Records, Store
 from jaxslam.consistency.summary import Seconds, Study
 from jaxslam.consistency.sums import as_sums, keeps_records
@@ -192,15 +190,6 @@ def processors() -> int:
     if hasattr(os, "sched_getaffinity"):  # not everywhere
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def forget() -> None:
-    """Free the programs of all studies.
-
-    Each holds some of the memory maps of which a process may have only so many.
-    """
-    backends.forget()
-    forget_draws()
 
 
 def check_sizes(runs: Any, seed: Any, dtype: str, chunk: Any) -> None:

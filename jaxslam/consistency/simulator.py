@@ -114,8 +114,3 @@ def _draw(
         return run, sightings(run)
 
     return jax.vmap(one)(indices)
-
-
-def forget() -> None:
-    """Free the programs that draw runs."""
-    _draw.forget()

@@ -45,15 +45,11 @@ class MemoryStore:
 
     def __init__(self) -> None:
         self._records: dict[tuple[str, range], Records] = {}
-        self._made_by: Manifest = {}
-        self._filters: Manifest = {}
+        self._manifest: Manifest = {"made_by": {}, "filters": {}}
 
     def begin(self, made_by: Manifest, filters: Manifest) -> None:
-        made_by, filters = _as_json(made_by), _as_json(filters)
-        if self._made_by:
-            _check_same("this store's records were", self._made_by, made_by, _ANOTHER_STORE)
-        _check_filters("this store's records were", self._filters, filters, _ANOTHER_STORE)
-        self._made_by, self._filters = made_by, {**self._filters, **filters}
+        what = "this store's records were"
+        self._manifest = _joined(what, self._manifest, made_by, filters, "use another store")
 
     def has(self, filter_name: str, chunk: range) -> bool:
         return (filter_name, chunk) in self._records
@@ -84,7 +80,8 @@ class FolderStore:
         if self._path.exists():
             found = read_json(self._path, "manifest", _as_manifest)
             if resume:
-                self._check("given", found, self._manifest["given"])
+                given = self._manifest["given"]
+                _check_same(self._made, found["given"], given, _ANOTHER_FOLDER)
                 self._manifest = found
             for path in self._own(found, unfinished=resume):
                 path.unlink(missing_ok=True)
@@ -92,14 +89,10 @@ class FolderStore:
         write_json(self._path, self._manifest)
 
     def begin(self, made_by: Manifest, filters: Manifest) -> None:
-        made_by, filters = _as_json(made_by), _as_json(filters)
-        kept = self._manifest
-        if kept["made_by"]:
-            self._check("made_by", kept, made_by)
-        _check_filters(self._made, kept["filters"], filters, _ANOTHER_FOLDER)
-        for name in filters.keys() - kept["filters"].keys():
+        joined = _joined(self._made, self._manifest, made_by, filters, _ANOTHER_FOLDER)
+        for name in filters.keys() - self._manifest["filters"].keys():
             self._check_free(name)
-        self._keep({**kept, "made_by": made_by, "filters": {**kept["filters"], **filters}})
+        self._keep(joined)
 
     def has(self, filter_name: str, chunk: range) -> bool:
         return filter_name in self._manifest["filters"] and self._chunk(filter_name, chunk).exists()
@@ -126,9 +119,6 @@ class FolderStore:
     @property
     def _made(self) -> str:
         return f"cannot resume: {self._path} was"
-
-    def _check(self, key: str, found: Manifest, wanted: Manifest) -> None:
-        _check_same(self._made, found[key], wanted, _ANOTHER_FOLDER)
 
     def _check_free(self, filter_name: str) -> None:
         """Raise ValueError for files in the places of a filter's chunks that no manifest names."""
@@ -186,7 +176,6 @@ def _check_records(path: Path, runs: int, records: Records) -> None:
 
 
 _ANOTHER_FOLDER = "use another --out or leave --resume out"
-_ANOTHER_STORE = "use another store"
 
 
 def _as_json(manifest: Manifest) -> Manifest:
@@ -205,8 +194,15 @@ def _check_same(what: str, then: Manifest, now: Manifest, advice: str) -> None:
         raise ValueError(f"{what} made with another {told}; {advice}")
 
 
-def _check_filters(what: str, kept: Manifest, given: Manifest, advice: str) -> None:
-    """Raise ValueError for a filter that has the name of another one."""
-    for name in kept.keys() & given.keys():
-        if told := difference(kept[name], given[name]):
+def _joined(
+    what: str, kept: Manifest, made_by: Manifest, filters: Manifest, advice: str
+) -> Manifest:
+    """What is kept with a study joined to it. Raises ValueError for one that is made otherwise, or
+    a filter that has the name of another one."""
+    made_by, filters = _as_json(made_by), _as_json(filters)
+    if kept["made_by"]:
+        _check_same(what, kept["made_by"], made_by, advice)
+    for name in kept["filters"].keys() & filters.keys():
+        if told := difference(kept["filters"][name], filters[name]):
             raise ValueError(f"{what} made with another filter {name}: {told}; {advice}")
+    return {**kept, "made_by": made_by, "filters": {**kept["filters"], **filters}}

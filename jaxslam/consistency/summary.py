@@ -228,14 +228,10 @@ def _drift(sums: Sums, dof: int) -> Summary:
     """The root mean squares over the surviving runs whose unit is fixed; no verdict without any."""
     count = sums["drift_count"]
     of_drift = tally_of(sums, "drift", dof)
-
-    def rms(of: str) -> list[float | None]:
-        return json_numbers(np.sqrt(_ratio(sums[of], count)))
-
     return {
-        "rms": rms("squared_drift"),
-        "sigma": rms("drift_variance"),
-        "normalised_rms": rms("normalised_drift"),
+        "rms": _rms(sums["squared_drift"], count),
+        "sigma": _rms(sums["drift_variance"], count),
+        "normalised_rms": _rms(sums["normalised_drift"], count),
         "runs": [int(n) for n in count],
         "verdict": of_drift.verdict() if of_drift.runs else None,
     }
@@ -243,17 +239,17 @@ def _drift(sums: Sums, dof: int) -> Summary:
 
 def _log_scale(sums: Sums, medians: _Medians, healthy: int) -> Summary:
     """The root mean squares over the surviving runs; medians over all."""
-
-    def rms(of: str) -> list[float | None]:
-        return json_numbers(np.sqrt(_ratio(sums[of], healthy)))
-
     return {
-        "error_rms": rms("squared_log_scale"),
+        "error_rms": _rms(sums["squared_log_scale"], healthy),
         "error_median": json_numbers(medians.log_scale),
-        "sigma": rms("log_scale_variance"),
+        "sigma": _rms(sums["log_scale_variance"], healthy),
         "sigma_median": json_numbers(medians.log_scale_sigma),
-        "normalised_rms": rms("normalised_log_scale"),
+        "normalised_rms": _rms(sums["normalised_log_scale"], healthy),
     }
+
+
+def _rms(squares: np.ndarray, counts: np.ndarray | int) -> list[float | None]:
+    return json_numbers(np.sqrt(_ratio(squares, counts)))
 
 
 def _ratio(sums: np.ndarray, counts: np.ndarray | int) -> np.ndarray:

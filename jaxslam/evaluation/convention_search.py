@@ -169,16 +169,14 @@ def identify(
     own = finite.get(stated)
     stands, whole = own is not None and own.consistent, own is not None and own.whole
     best, equal = _best(finite)
-    if best is not None and best.consistent:
-        return Identification(stated, _means(finite), equal, stands, whole)
-    free = _finite(given())
-    best_free, equal = _best(free)
-    means = _means(finite | free)
-    if best_free is None or not best_free.consistent:
-        return Identification(stated, means, (), stands, whole)
-    if best is not None and not _scale_was_free(best, best_free):
-        return Identification(stated, means, (), stands, whole)
-    return Identification(stated, means, equal, stands, whole)
+    if best is None or not best.consistent:
+        free = _finite(given())
+        best_free, equal = _best(free)
+        finite |= free
+        fits = best_free is not None and best_free.consistent
+        if not fits or (best is not None and not _scale_was_free(best, best_free)):
+            equal = ()
+    return Identification(stated, _means(finite), equal, stands, whole)
 
 
 def _finite(tried: Mapping[Convention, Tried]) -> dict[Convention, Tried]:

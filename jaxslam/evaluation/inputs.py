@@ -183,6 +183,17 @@ def _left_out(known: Bool[np.ndarray, "runs steps"], start: int) -> tuple[str, .
     return (f"at the beginning of runs {many} known exactly, and left out",)
 
 
+def sigmas(covariances: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch n"]:
+    """The roots of the variances."""
+    return np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
+
+
+def correlations(covariances: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
+    """The covariances over the σ of both axes."""
+    sigma = sigmas(covariances)
+    return covariances / sigma[..., :, None] / sigma[..., None, :]
+
+
 def normalised(
     errors: Float[np.ndarray, "runs steps n"], covariances: Float[np.ndarray, "runs steps n n"]
 ) -> Float[np.ndarray, "runs steps"]:
@@ -195,9 +206,9 @@ def normalised(
         run, step, axis = np.argwhere(variance <= 0)[0]
         told = f"variance {variance[run, step, axis]:.3g} at place {axis}"
         _refuse((run, step), f"has {told}")
-    sigma = np.sqrt(variance)
+    sigma = sigmas(covariances)
     with np.errstate(over="ignore"):
-        correlation = covariances / sigma[..., :, None] / sigma[..., None, :]
+        correlation = correlations(covariances)
     if not np.isfinite(correlation).all():
         place = tuple(np.argwhere(~np.isfinite(correlation))[0])
         _refuse(place[:2], f"has {covariances[place]:.3g} where its variances allow less")

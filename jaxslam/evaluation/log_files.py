@@ -385,7 +385,6 @@ def _span(times: Float[np.ndarray, " n"]) -> float:
 
 
 FRAMES = "frames.csv"
-_NEEDED = ("time", "state", "map", "unit_fixed")
 _MOST_MAPS = 1_000_000
 
 
@@ -406,11 +405,8 @@ class EvaluatedPoses(NamedTuple):
     poses: Bool[np.ndarray, " n"]
     map: int = 0
     """The map that is evaluated."""
-    elsewhere: int = 0
-    """The number of poses of other maps."""
-    lost: int = 0
-    opening: int = 0
-    """The number of poses from before the unit of the map was fixed."""
+    others: tuple[int, int, int] = (0, 0, 0)
+    """The poses of other maps, those that are lost, and those from before the unit was fixed."""
 
 
 def evaluated_poses(
@@ -443,9 +439,8 @@ def evaluated_poses(
     number = int(np.argmax(np.bincount(maps[usable])))
     own = maps == number
     opening = own & ~lost & ~fixed & ~known
-    return EvaluatedPoses(
-        own & ~lost & ~opening, number, *(int(x.sum()) for x in (~own, own & lost, opening))
-    )
+    others = int(np.sum(~own)), int(np.sum(own & lost)), int(np.sum(opening))
+    return EvaluatedPoses(own & ~lost & ~opening, number, others)
 
 
 def read_frames(path: Path) -> FrameLog | None:
@@ -457,50 +452,42 @@ def read_frames(path: Path) -> FrameLog | None:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         return None
-    titles = [word.strip() for word in lines[0].split(",")] if lines else []
-    if not set(_NEEDED) <= set(titles):
+    titles, *rows = [[word.strip() for word in line.split(",")] for line in lines] or [[]]
+    if not {"time", "state", "map", "unit_fixed"} <= set(titles):
         return None
-    places, rows = [titles.index(name) for name in _NEEDED], []
-    for number, line in enumerate(lines[1:], start=2):
-        if line.strip():
-            told = line.split(",")
-            row = _row([told[place] for place in places if place < len(told)])
-            if row is None:
-                raise ValueError(
-                    f"{path}, line {number}: a finite time, a state, the number of a map and "
-                    "unit_fixed, 0 or 1, are accepted"
-                )
-            rows.append(row)
-    if not rows:
+    table = [
+        _frame(f"{path}, line {number}", dict(zip(titles, row, strict=False)))
+        for number, row in enumerate(rows, start=2)
+        if row != [""]
+    ]
+    if not table:
         raise ValueError(f"{path}: holds no frames")
-    return FrameLog(*(np.array(column) for column in zip(*rows, strict=True)))
+    return FrameLog(*(np.array(column) for column in zip(*table, strict=True)))
 
 
-def _row(told: list[str]) -> tuple[float, bool, int, bool] | None:
-    """The numbers of a frame, in the order of `FrameLog`; None of what is no frame."""
+def _frame(place: str, told: dict[str, str]) -> tuple[float, bool, int, bool]:
+    """The numbers of a frame, in the order of `FrameLog`. Raises ValueError for what is none."""
     try:
-        time, state, number, fixed = told
-        row = float(time), state == "lost", int(number), bool(("0", "1").index(fixed.strip()))
-    except ValueError:
-        return None
-    return row if np.isfinite(row[0]) and 0 <= row[2] <= _MOST_MAPS else None
+        time, number, fixed = float(told["time"]), int(told["map"]), told["unit_fixed"]
+        if np.isfinite(time) and 0 <= number <= _MOST_MAPS and fixed in ("0", "1"):
+            return time, told["state"] == "lost", number, fixed == "1"
+    except (ValueError, KeyError):
+        pass
+    raise ValueError(
+        f"{place}: a finite time, a state, the number of a map and unit_fixed, 0 or 1, are accepted"
+    )
 
 
 def left_out(runs: Sequence[EvaluatedPoses]) -> Iterator[str]:
     """A sentence for every reason why poses of the runs are not evaluated."""
     logged = sum(len(one.poses) for one in runs)
-    if elsewhere := sum(one.elsewhere for one in runs):
-        which = (
-            f"map {runs[0].map}, the longest," if len(runs) == 1 else "of each run the longest map"
-        )
-        yield (
-            f"{which} is evaluated: {elsewhere} of {logged} poses are of other maps, each in a "
-            "unit of its own, and are left out"
-        )
-    if lost := sum(one.lost for one in runs):
-        yield f"{lost} of {logged} poses are of frames that are lost, and are left out"
-    if opening := sum(one.opening for one in runs):
-        yield (
-            f"{opening} of {logged} poses are from before the unit of their map was fixed, and are "
-            "left out"
-        )
+    which = f"map {runs[0].map}, the longest," if len(runs) == 1 else "of each run the longest map"
+    reasons = (
+        (f"{which} is evaluated: ", "of other maps, each in a unit of its own"),
+        ("", "of frames that are lost"),
+        ("", "from before the unit of their map was fixed"),
+    )
+    counts = np.sum([one.others for one in runs], axis=0)
+    for (first, reason), count in zip(reasons, counts, strict=True):
+        if count:
+            yield f"{first}{count} of {logged} poses are {reason}, and are left out"

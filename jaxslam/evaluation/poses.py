@@ -28,6 +28,7 @@ from jaxslam.evaluation.inputs import (
     checked_poses,
     filled,
     normalised,
+    sigmas,
     step_times,
     without_known,
 )
@@ -125,7 +126,7 @@ def as_stated(
         dof=len(used),
         nees=filled(found.nees, found.logged, np.nan),
         errors=filled(found.errors, found.logged, np.nan),
-        sigmas=filled(_sigmas(found.covariances), found.logged, np.nan),
+        sigmas=filled(sigmas(found.covariances), found.logged, np.nan),
         times=step_times(None, poses.estimates.shape[1])[found.start :],
         timed=False,
         names=used,
@@ -137,10 +138,6 @@ def as_stated(
         scale=found.scale,
         truth_sigma=truth_sigma,
     )
-
-
-def _sigmas(covariances: Float[np.ndarray, "*batch m m"]) -> Float[np.ndarray, "*batch m"]:
-    return np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
 
 
 def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseErrors:

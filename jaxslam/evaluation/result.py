@@ -16,7 +16,14 @@ from jaxslam._runtime.files import json_numbers, write_json
 from jaxslam._runtime.lookup import lookup
 from jaxslam.evaluation.convention import Convention
 from jaxslam.evaluation.convention_search import Identification
-from jaxslam.evaluation.inputs import filled, normalised, paired, step_times, without_known
+from jaxslam.evaluation.inputs import (
+    filled,
+    normalised,
+    paired,
+    sigmas,
+    step_times,
+    without_known,
+)
 from jaxslam.evaluation.sanity_checks import Logged, Mistake, mistakes, withheld
 from jaxslam.evaluation.scale import Scale
 from jaxslam.statistics.bands import mean_band
@@ -363,7 +370,7 @@ def evaluate(
         dof=e.shape[-1],
         nees=filled(normalised(e, filled(P, logged, np.eye(e.shape[-1]))), logged, np.nan),
         errors=filled(e, logged, np.nan),
-        sigmas=filled(np.sqrt(np.diagonal(P, axis1=-2, axis2=-1)), logged, np.nan),
+        sigmas=filled(sigmas(P), logged, np.nan),
         times=at[start:],
         timed=times is not None,
         names=_names(names, e.shape[-1]),

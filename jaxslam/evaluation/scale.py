@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from jaxslam._runtime.files import json_numbers
 from jaxslam.evaluation.alignment import about
 from jaxslam.evaluation.convention import Convention, pose_errors
-from jaxslam.evaluation.inputs import Poses
+from jaxslam.evaluation.inputs import Poses, correlations, sigmas
 from jaxslam.statistics.beyond_scale import SCALES, BeyondScale, one_scale
 from jaxslam.statistics.verdict import Verdict, run_verdict
 
@@ -190,8 +190,7 @@ def _own_scales(
     covariances: Float[np.ndarray, "*batch m m"],
 ) -> BeyondScale:
     """The scale in `SCALES` that explains each pose alone best, `ŝ = 1 − gᵀ P⁻¹ e/(gᵀ P⁻¹ g)`."""
-    sigma = np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
-    L = np.linalg.cholesky(covariances / sigma[..., :, None] / sigma[..., None, :])
+    sigma, L = sigmas(covariances), np.linalg.cholesky(correlations(covariances))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         both = np.stack([errors / sigma, slope / sigma], axis=-1)
         e, g = np.moveaxis(np.linalg.solve(L, both), -1, 0)

@@ -4,24 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxslam.io.recording import (
-    Layout,
-    Recording,
-    image_files,
-    listed,
-    of_files,
-    read_timestamps,
-)
-from jaxslam.io.source import Trajectory
-from jaxslam.io.tum import read_tum
+from jaxslam.io.recording import Layout, Recording, image_files, of_files, of_listing
 
 
 def _open_timestamped(path: Path, _rate: float) -> Recording:
-    listing = path / "timestamps.txt"
-    times, names = read_timestamps(listing)
-    truth = path / "groundtruth.txt"
-    reference = Trajectory(*read_tum(truth)) if truth.is_file() else None
-    return of_files(path, listed(listing, path / "images", names), times, reference=reference)
+    return of_listing(path, path / "timestamps.txt", path / "images")
 
 
 def _open_plain(path: Path, rate: float) -> Recording:

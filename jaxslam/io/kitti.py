@@ -15,7 +15,7 @@ from jaxslam.io.recording import (
     Calibrator,
     Layout,
     Recording,
-    check_later,
+    check_increasing,
     check_rigid,
     image_files,
     of_files,
@@ -40,12 +40,9 @@ def _open(path: Path, _rate: float) -> Recording:
 
 
 def _read_times(path: Path) -> Float[np.ndarray, " n"]:
-    times: list[float] = []
     _, rows, lines = read_table(path, "times", "times", "finite times, s,", 1, spare=True)
-    for (time,), line in zip(rows.tolist(), lines, strict=True):
-        check_later(f"{path}, line {line}", time, times)
-        times.append(time)
-    return np.array(times)
+    check_increasing(path, lines, rows[:, 0])
+    return rows[:, 0]
 
 
 def _projection(path: Path, camera: str) -> Float[np.ndarray, "3 4"]:

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from jaxtyping import Float
 from jaxslam._runtime.files import LARGEST
 from jaxslam.io.calibration import Calibration, read_calibration
 from jaxslam.io.source import Image, Trajectory
-from jaxslam.io.tum import not_rigid, numbers, text_lines
+from jaxslam.io.tum import not_rigid, numbers, read_tum, text_lines
 
 IMAGE_TYPES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
 
@@ -62,6 +62,17 @@ def of_files(
     calibration = calibration_beside(path) or calibration
     name = path.resolve().name
     return Recording(name, times, lambda: map(read_image, files), calibration, reference)
+
+
+def of_listing(
+    path: Path, listing: Path, folder: Path, calibration: Calibrator | None = None
+) -> Recording:
+    """A recording of the files in a folder that a list of times names, `groundtruth.txt` in `path`
+    being the true trajectory where it is there."""
+    times, names = read_timestamps(listing)
+    truth = path / "groundtruth.txt"
+    reference = Trajectory(*read_tum(truth)) if truth.is_file() else None
+    return of_files(path, listed(listing, folder, names), times, calibration, reference)
 
 
 def listed(listing: Path, folder: Path, names: list[str]) -> list[Path]:
@@ -118,23 +129,22 @@ def read_timestamps(
     A second has so many `ticks`. Raises `ValueError`, naming file and line, unless times are
     finite and increase.
     """
-    times: list[float] = []
-    names: list[str] = []
-    for number, line in text_lines(path).items():
-        place = f"{path}, line {number}"
-        time, name = _timestamp(place, line, separator)
-        check_later(place, time / ticks, times)
-        times.append(time / ticks)
-        names.append(name)
-    if not times:
+    lines = text_lines(path)
+    if not lines:
         raise ValueError(f"{path}: holds no lines of a time and a file")
-    return np.array(times), names
+    told = [_timestamp(f"{path}, line {n}", line, separator) for n, line in lines.items()]
+    times = np.array([time for time, _ in told]) / ticks
+    check_increasing(path, list(lines), times)
+    return times, [name for _, name in told]
 
 
-def check_later(place: str, time: float, before: list[float]) -> None:
-    """Raise ValueError unless a time, in seconds, comes after those before."""
-    if before and time <= before[-1]:
-        raise ValueError(f"{place}: time {time} s does not come after {before[-1]} s")
+def check_increasing(path: Path, lines: Sequence[int], times: Float[np.ndarray, " n"]) -> None:
+    """Raise ValueError, naming the line, unless times, in seconds, increase."""
+    for i in np.flatnonzero(~(np.diff(times) > 0))[:1]:
+        before, time = times[i : i + 2].tolist()
+        raise ValueError(
+            f"{path}, line {lines[i + 1]}: time {time} s does not come after {before} s"
+        )
 
 
 def check_rigid(path: Path, T: Float[np.ndarray, "n 4 4"]) -> None:

@@ -8,17 +8,7 @@ import re
 from pathlib import Path
 
 from jaxslam.io.calibration import Calibration
-from jaxslam.io.recording import (
-    Calibrator,
-    Layout,
-    Recording,
-    fixed,
-    listed,
-    of_files,
-    read_timestamps,
-)
-from jaxslam.io.source import Trajectory
-from jaxslam.io.tum import read_tum
+from jaxslam.io.recording import Calibrator, Layout, Recording, fixed, of_listing
 
 INTRINSICS = {
     "1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
@@ -29,11 +19,7 @@ INTRINSICS = {
 
 
 def _open(path: Path, _rate: float) -> Recording:
-    listing = path / "rgb.txt"
-    times, names = read_timestamps(listing)
-    truth = path / "groundtruth.txt"
-    reference = Trajectory(*read_tum(truth)) if truth.is_file() else None
-    return of_files(path, listed(listing, path, names), times, _published(path), reference)
+    return of_listing(path, path / "rgb.txt", path, _published(path))
 
 
 def _published(path: Path) -> Calibrator | None:

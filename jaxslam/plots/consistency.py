@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 
 from jaxslam._runtime.lookup import lookup
 from jaxslam.consistency import Study, summarise
@@ -51,10 +53,7 @@ def plot_consistency(
     given.
     """
     summary = summarise(study) if summary is None else summary
-    figure = _column(summary) if column else _page(study, summary)
-    if path is not None:
-        save(figure, path)
-    return figure
+    return save(_column(summary) if column else _page(study, summary), path)
 
 
 def _column(summary: Summary) -> Figure:
@@ -127,34 +126,42 @@ def _plot_means(
     numbers: dict[str, Summary], summary: Summary, ax: Axes, label: Labels | None
 ) -> None:
     """Means with the band of the first, and medians, over time."""
-    time, first = np.array(summary["time"]), next(iter(numbers.values()))
+    first = next(iter(numbers.values()))
     ax.axhspan(*first["band95"], color=GREY, alpha=0.25, lw=0)
     ax.axhline(first["dof"], color=GREY, lw=0.8)
-    lines = []
-    for (name, f), style in _styled(numbers):
-        mean, median = (np.array(f[key], float) for key in ("nees", "nees_median"))
-        ax.plot(time, mean, lw=1.8, **style)
-        ax.plot(time, median, color=style["color"], lw=0.9, ls=MEDIAN_DASH)
-        lines.append((name, mean, style["color"]))
+    pairs = {name: (f["nees"], f["nees_median"]) for name, f in numbers.items()}
+    lines = _plot_pairs(pairs, summary, ax, label, lw=0.9, ls=MEDIAN_DASH)
     ax.set_yscale("log")
     bottom, top = ax.get_ylim()
     ax.set_ylim(min(bottom, first["dof"] / 2), max(top, first["dof"] * 1.5))
     name_numbers(ax.yaxis)
-    _over_time(ax, time)
-    _name(ax, time, lines, label)
+    label_ends(ax, lines)
 
 
-def _styled(numbers: Mapping[str, Summary]):
-    """Filters and their numbers, with the style of their lines."""
-    return [(item, line_style(i)) for i, item in enumerate(numbers.items())]
+def _plot_pairs(
+    pairs: Mapping[str, Sequence[ArrayLike]],
+    summary: Summary,
+    ax: Axes,
+    label: Labels | None,
+    **second: Any,
+) -> list[End]:
+    """Two lines of every filter over time, the `second` in a style of its own.
 
-
-def _name(ax: Axes, time: np.ndarray, lines: list, label: Labels | None) -> None:
-    """Write the names of `(filter, values, colour)` at the ends of their lines."""
-    names = [name for name, _, _ in lines]
-    lookup("label", label or names, dict.fromkeys(names))
-    called = {**short_names(names), **(label or {})}
-    label_ends(ax, [End(called[name], time, values, colour) for name, values, colour in lines])
+    Returns the ends of the first, to be named when the limits of the axes are set.
+    """
+    lookup("label", label or pairs, dict.fromkeys(pairs))
+    called = {**short_names(list(pairs)), **(label or {})}
+    time, lines = np.array(summary["time"]), []
+    for i, (name, pair) in enumerate(pairs.items()):
+        style = line_style(i)
+        values, others = (np.array(x, float) for x in pair)
+        ax.plot(time, values, lw=1.8, **style)
+        ax.plot(time, others, color=style["color"], **{"ls": style["linestyle"], **second})
+        lines.append(End(called[name], time, values, style["color"]))
+    ax.set_xlim(0, time[-1])
+    ax.set_xlabel("time, s")
+    ax.grid(alpha=0.25, which="major")
+    return lines
 
 
 def plot_outside(summary: Summary | Study, *, ax: Axes, label: Labels | None = None) -> Axes:
@@ -163,27 +170,19 @@ def plot_outside(summary: Summary | Study, *, ax: Axes, label: Labels | None = N
     Names stand at the ends of the position's lines; a filter may be called otherwise by `label`.
     """
     summary = as_summary(summary)
-    time, lines = np.array(summary["time"]), []
-    for (name, f), style in _styled(summary["filters"]):
-        position, orientation = (
-            100 * np.array(f["outside3sigma"][part], float) for part in ("position", "orientation")
-        )
-        ax.plot(time, position, lw=1.8, **style)
-        ax.plot(time, orientation, lw=0.8, **style)
-        lines.append((name, position, style["color"]))
+    percent = {}
+    for name, f in summary["filters"].items():
+        outside = f["outside3sigma"]
+        percent[name] = [
+            100 * np.array(outside[part], float) for part in ("position", "orientation")
+        ]
+    lines = _plot_pairs(percent, summary, ax, label, lw=0.8)
     ax.axhline(100 * OUTSIDE, color=GREY, lw=0.8)
     ax.set_ylim(0, max(1.0, ax.get_ylim()[1]))
-    _over_time(ax, time)
     ax.set_ylabel("% of errors")
     set_title(ax, "outside ±3σ: position, orientation (thin)\ngrey: 0.27 % of Gaussian errors")
-    _name(ax, time, lines, label)
+    label_ends(ax, lines)
     return ax
-
-
-def _over_time(axes: Axes, time: np.ndarray) -> None:
-    axes.set_xlim(0, time[-1])
-    axes.set_xlabel("time, s")
-    axes.grid(alpha=0.25, which="major")
 
 
 def _with_scale(given: Summary | Study) -> Summary:
@@ -215,21 +214,17 @@ def plot_log_scale(summary: Summary | Study, *, ax: Axes, label: Labels | None =
     Where the scale is free; names at the ends of the lines, or those of `label`.
     """
     summary = _with_scale(summary)
-    time, lines = np.array(summary["time"]), []
-    for (name, f), style in _styled(summary["filters"]):
-        error, sigma = (
-            np.array(f["log_scale"][key], float) for key in ("error_median", "sigma_median")
-        )
-        ax.plot(time, error, lw=1.8, **style)
-        ax.plot(time, _MEDIAN_OF_NORMAL * sigma, color=style["color"], lw=0.9, ls=(0, (4, 2)))
-        lines.append((name, error, style["color"]))
+    pairs = {}
+    for name, f in summary["filters"].items():
+        sigma = np.array(f["log_scale"]["sigma_median"], float)
+        pairs[name] = f["log_scale"]["error_median"], _MEDIAN_OF_NORMAL * sigma
+    lines = _plot_pairs(pairs, summary, ax, label, lw=0.9, ls=(0, (4, 2)))
     ax.set_yscale("log")
     name_numbers(ax.yaxis)
-    _over_time(ax, time)
     ax.set_ylabel("error of ln(scale)")
     of = _of_some(summary) or " of the runs"
     set_title(ax, f"scale: median error{of}\ndashed: by the σ claimed, 0.67 of its median")
-    _name(ax, time, lines, label)
+    label_ends(ax, lines)
     return ax
 
 

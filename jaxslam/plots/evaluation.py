@@ -42,10 +42,7 @@ def plot_evaluation(
     ±3σ, axis by axis. Below: RMSE and claimed σ of every axis. As one `column` for print, 3.4 in
     wide with letters of 8 pt, it is what is above.
     """
-    figure = _column(evaluation) if column else _page(evaluation)
-    if path is not None:
-        save(figure, path)
-    return figure
+    return save(_column(evaluation) if column else _page(evaluation), path)
 
 
 def _column(evaluation: Evaluation) -> Figure:

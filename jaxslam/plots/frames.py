@@ -48,9 +48,7 @@ def plot_frames(frames: Sequence[Laid], path: str | Path | None = None) -> Figur
         ax.axis("off")
     for ax, frame in zip(axes, frames, strict=False):
         plot_frame(frame, ax=ax)
-    if path is not None:
-        save(figure, path)
-    return figure
+    return save(figure, path)
 
 
 def plot_frame(frame: Laid, *, ax: Axes, label: str | None = None) -> Axes:

@@ -33,16 +33,22 @@ def plot_landmark_clouds(
     dots = np.asarray(samples)[..., plane].reshape(-1, 2)
     axes.plot(*dots.T, ",", color=colour, alpha=0.5, rasterized=True)
     axes.plot([], [], ".", color=colour, label=f"{label}: draws")
-    angle = np.linspace(0, 2 * np.pi, 121)
-    circle = np.sqrt(chi2_quantile(0.95, 2)) * np.stack([np.cos(angle), np.sin(angle)])
     for i, (mean, covariance) in enumerate(zip(means, covariances, strict=True)):
-        values, vectors = np.linalg.eigh(np.asarray(covariance)[np.ix_(plane, plane)])
-        ellipse = np.asarray(mean)[plane, None] + vectors @ (
-            np.sqrt(np.maximum(values, 0))[:, None] * circle
-        )
+        flat = np.asarray(covariance)[np.ix_(plane, plane)]
+        ellipse = _ellipse(np.asarray(mean)[plane], flat, 0.95)
         name = f"{label}: 95 % ellipse to first order" if i == 0 else None
         axes.plot(*ellipse, color=colour, lw=1.0, label=name)
     return axes
+
+
+def _ellipse(
+    mean: Float[np.ndarray, " 2"], covariance: Float[np.ndarray, "2 2"], share: float
+) -> Float[np.ndarray, "2 k"]:
+    """The outline of so much of a Gaussian in the plane."""
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.linspace(0, 2 * np.pi, 181)
+    circle = np.sqrt(chi2_quantile(share, 2)) * np.stack([np.cos(angle), np.sin(angle)])
+    return mean[:, None] + vectors @ (np.sqrt(np.maximum(values, 0))[:, None] * circle)
 
 
 def region_from_above(
@@ -52,10 +58,7 @@ def region_from_above(
 
     It is an ellipse bent into the plane; what reaches behind the camera ends in front of it, far.
     """
-    values, vectors = np.linalg.eigh(covariance)
-    angle = np.linspace(0, 2 * np.pi, 181)
-    circle = np.sqrt(chi2_quantile(share, 2)) * np.stack([np.cos(angle), np.sin(angle)])
-    azimuth, inverse = mean[:, None] + vectors @ (np.sqrt(np.maximum(values, 0))[:, None] * circle)
+    azimuth, inverse = _ellipse(mean, covariance, share)
     distance = 1 / np.maximum(inverse, _FARTHEST)
     return distance * np.stack([np.sin(azimuth), np.cos(azimuth)])
 

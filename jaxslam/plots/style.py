@@ -62,10 +62,13 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def save(figure: Figure, path: str | Path) -> None:
-    """Write the figure whole or not at all; a PDF with TrueType letters, as publishers ask."""
-    with write_atomically(path) as temporary, mpl.rc_context({"pdf.fonttype": 42}):
-        figure.savefig(temporary, dpi=150)
+def save(figure: Figure, path: str | Path | None) -> Figure:
+    """Return the figure, written where a path is given, whole or not at all; a PDF with TrueType
+    letters, as publishers ask."""
+    if path is not None:
+        with write_atomically(path) as temporary, mpl.rc_context({"pdf.fonttype": 42}):
+            figure.savefig(temporary, dpi=150)
+    return figure
 
 
 def column_title(text: str) -> str:

@@ -111,9 +111,7 @@ def plot_map(
         _set_axes(axis, panel, unit)
     entries = panels[-1][0].get_legend_handles_labels()
     figure.legend(*entries, loc="outside lower center", ncols=2, fontsize=8)
-    if path is not None:
-        save(figure, path)
-    return figure
+    return save(figure, path)
 
 
 def _lines(

@@ -57,9 +57,7 @@ def plot_triangulation(comparison: Comparison, path: str | Path | None = None) -
         f"{views.nearest_depth:g} m",
         fontsize=11,
     )
-    if path is not None:
-        save(figure, path)
-    return figure
+    return save(figure, path)
 
 
 def _distributions(comparison: Comparison) -> dict[str, Samples]:

@@ -15,6 +15,7 @@ from scipy.special import gammainc
 from scipy.stats import chi2, norm
 
 import jaxslam
+from jaxslam._runtime import programs
 from jaxslam.consistency import (
     FolderStore,
     MemoryStore,
@@ -116,7 +117,7 @@ def test_a_batch_in_parts_that_fit_the_cache_is_the_same(monkeypatch):
     """Seven runs, three at a time: the last part has two of them again."""
 
     def computed():
-        montecarlo.forget()
+        programs.forget()
         study = jaxslam.monte_carlo(SCENARIO, filters(), runs=7, chunk=7)
         return [study.store.load(name, study.chunks[0]) for name in study.filters]
 
@@ -132,7 +133,7 @@ def test_a_batch_in_parts_that_fit_the_cache_is_the_same(monkeypatch):
         assert parts.keys() == records.keys()
         for key, values in records.items():
             np.testing.assert_allclose(parts[key], values, rtol=1e-6, atol=1e-12, err_msg=key)
-    montecarlo.forget()
+    programs.forget()
 
 
 @pytest.mark.slow
@@ -146,11 +147,11 @@ def test_of_the_last_chunk_only_what_is_wanted_is_computed(backend, monkeypatch)
     n = 6 + 3 * room.landmarks
     monkeypatch.setattr(backends, "CACHE", 3 * 8 * n**2)
     assert backends._runs_in_cache(room, batch) == 3
-    montecarlo.forget()
+    programs.forget()
     slam = filters()["inverse_scaling"]
     program = montecarlo.ChunkTask("", slam, simulator, room, backend).program(batch)
     (all_of_them, sample), (some, same) = (program(np.int32(n)) for n in (7, 2))
-    montecarlo.forget()
+    programs.forget()
     for key, values in all_of_them.items():
         np.testing.assert_array_equal(some[key][:2], values[:2], err_msg=key)
     jax.tree.map(np.testing.assert_array_equal, sample, same)

@@ -10,7 +10,7 @@ import pytest
 from cases import Case, quick_jit
 
 import jaxslam
-from jaxslam.consistency.likelihood import gradient, log_likelihood, maximum_likelihood
+from jaxslam.consistency.likelihood import log_likelihood, maximum_likelihood
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def scaled(slam, acceleration, pixel, focal=1.0):
 @pytest.mark.parametrize("name", ["robocentric", "world", "scale_gauge"])
 def test_gradients_through_a_run_are_those_of_central_differences(case, name):
     slam, run = jaxslam.cast(case.filter(name), jnp.float64), case.run(0)
-    found = eqx.filter_jit(gradient)(slam, case.room, run)
+    found = eqx.filter_jit(eqx.filter_grad(log_likelihood))(slam, case.room, run)
 
     @quick_jit
     def value(factors):
@@ -55,7 +55,7 @@ def test_gradients_through_a_run_are_those_of_central_differences(case, name):
 @pytest.mark.slow
 def test_every_number_of_a_filter_has_a_derivative(case):
     slam = jaxslam.cast(case.filter("robocentric", calibration="white"), jnp.float64)
-    found = eqx.filter_jit(gradient)(slam, case.room, case.run(0))
+    found = eqx.filter_jit(eqx.filter_grad(log_likelihood))(slam, case.room, case.run(0))
     leaves = jax.tree.leaves(found)
     assert len(leaves) == len(jax.tree.leaves(slam))
     assert all(np.isfinite(x).all() for x in leaves)

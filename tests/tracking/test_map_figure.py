@@ -7,19 +7,16 @@ import pytest
 from matplotlib.collections import EllipseCollection, LineCollection
 
 from jaxslam.io.tum import poses
-from jaxslam.plots import tracking
 from jaxslam.plots.tracking import plot_map
 
 
 @pytest.fixture
-def drawn(monkeypatch):
+def drawn():
     """What draws a map, and returns its axes by title."""
-    figures = []
-    monkeypatch.setattr(tracking, "save", lambda figure, path: figures.append(figure))
 
     def draw(*data, **more):
-        plot_map(*data, path="map.png", **more)
-        return {axis.get_title().split(":")[0]: axis for axis in figures[-1].axes}
+        figure = plot_map(*data, **more)
+        return {axis.get_title().split(":")[0]: axis for axis in figure.axes}
 
     return draw
 
