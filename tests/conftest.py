@@ -29,7 +29,9 @@ if not jax.config.values["jax_compilation_cache_dir"]:  # commands would keep pr
 gc.disable()  # else a tenth of the time: tracing makes many objects. Collected after every file.
 # Tests compile much and compute little.
 jax.config.update("jax_disable_most_optimizations", True)
-os.environ["XLA_FLAGS"] = _flags_that_are_known("--xla_cpu_use_fusion_emitters=false")
+os.environ["XLA_FLAGS"] = _flags_that_are_known(
+    "--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"
+)
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
