@@ -8,6 +8,7 @@ from pathlib import Path
 
 import jax
 import jaxtyping
+import numpy as np
 import pytest
 
 from jaxslam._runtime import programs
@@ -52,11 +53,27 @@ def unchecked():
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
+MOST_MAPS = 25_000
+"""Of the 65 530 memory maps that a process has by default: a file of tests adds a few thousand."""
+
+
+def _memory_maps() -> float:
+    """How many this process holds; where the system does not tell, as if too many."""
+    try:
+        return Path("/proc/self/maps").read_bytes().count(b"\n")
+    except OSError:
+        return np.inf
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _compiled_programs_are_freed():
-    """A process may hold only so many memory maps, and every compiled program takes some."""
+    """A process may hold only so many memory maps, and every compiled program takes some; until
+    then files share what they have compiled."""
     yield
-    programs.forget()
-    backends._native_program.cache_clear()
-    jax.clear_caches()
+    if _memory_maps() > MOST_MAPS:
+        programs.forget()
+        backends._native_program.cache_clear()
+        jax.clear_caches()
+        gc.unfreeze()
     gc.collect()
+    gc.freeze()  # what is kept is not looked through after every file
