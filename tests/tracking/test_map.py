@@ -202,8 +202,8 @@ def test_a_landmark_out_of_view_is_kept_while_there_are_slots_and_found_again(mo
 
 def test_slots_are_given_to_new_landmarks_when_none_is_free(monkeypatch):
     source = synthetic_source(frames=12, **SMALL)
-    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=2))
-    hiding(monkeypatch, lambda number: number < 6)
+    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=4))
+    hiding(monkeypatch, lambda number: number < 8)
     kept, asked = [], []
 
     def worst(landmarks, *rest):
@@ -215,17 +215,17 @@ def test_slots_are_given_to_new_landmarks_when_none_is_free(monkeypatch):
     for frame in source:
         tracked = tracker.track(frame)
         kept.append({one.number for one in tracker.landmarks.values()})
-    # Six new ones in the place of six that are not seen, of which two have slots.
-    assert sum(number < 6 for number in kept[1]) == 2
-    assert all(len(numbers) == 14 for numbers in kept[1:])
+    # Eight new ones in the place of eight that are not seen, of which four have slots.
+    assert sum(number < 8 for number in kept[1]) == 4
+    assert all(len(numbers) == 16 for numbers in kept[1:])
     assert tracked.status.count("matched") >= 9
-    assert len(asked) >= 6
-    assert len(tracker.points().numbers) == tracker.created == 14 + tracker.deleted
+    assert len(asked) >= 8
+    assert len(tracker.points().numbers) == tracker.created == 16 + tracker.deleted
 
 
 def test_what_is_covered_makes_room_for_new_landmarks_elsewhere():
     source = synthetic_source(frames=16, **SMALL)
-    settings = TrackerSettings(filter="world", wanted=12, spare=12, spacing=8.0)
+    settings = TrackerSettings(filter="world", wanted=12, spare=4, spacing=8.0)
     tracker = Tracker(source.calibration, settings)
     for frame in source:
         frame.image[:, :160][frame.index >= 5] = 0

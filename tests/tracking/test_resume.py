@@ -117,7 +117,7 @@ def test_a_calibration_that_is_estimated_is_saved_with_it(video, tmp_path):
 
 def test_a_filter_of_ones_own_is_given_again(video, tmp_path):
     calibration, frames = video
-    own = TrackerSettings(filter="robocentric").make_filter(calibration)
+    own = TrackerSettings(filter="world", acceleration_sigma=2.0).make_filter(calibration)
     assert isinstance(own, jaxslam.EkfSlam)
     tracker = Tracker(calibration, SETTINGS, own)
     tracker.track(frames[0])
@@ -126,7 +126,7 @@ def test_a_filter_of_ones_own_is_given_again(video, tmp_path):
         Tracker.load(tmp_path / "t.npz")
     loaded = Tracker.load(tmp_path / "t.npz", own)
     same(tracker.track(frames[1]), loaded.track(frames[1]))
-    longer = TrackerSettings(filter="robocentric", landmarks="inverse_depth")
+    longer = TrackerSettings(filter="world", landmarks="inverse_depth")
     other = longer.make_filter(calibration)
     assert isinstance(other, jaxslam.EkfSlam)
     with pytest.raises(ValueError, match="the state in the file is of another filter"):

@@ -17,7 +17,7 @@ from jaxslam.tracking.tracker import Tracker
 
 FRAMES = 14
 TURN = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
-SMALL = TrackerSettings(filter="world", wanted=20, spare=4)
+SMALL = TrackerSettings(filter="world", wanted=12, spare=4)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_the_sigma_of_the_depths_covers_what_pixels_do(video, card):
 def trackers(video, card):
     """With a target and without, both with a prior on depth that is far off."""
     source, frames = video
-    settings = TrackerSettings(filter="world", wanted=20, spare=4, nearest_depth=3.0)
+    settings = TrackerSettings(filter="world", wanted=12, spare=4, nearest_depth=3.0)
     told = Tracker(source.calibration, settings, target=target(card, frames[0].image))
     alone = Tracker(source.calibration, settings)
     for frame in frames:

@@ -16,7 +16,7 @@ from jaxslam.tracking import video as tracking
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 
-SETTINGS = TrackerSettings(filter="world", wanted=10, spare=4)
+SETTINGS = TrackerSettings(filter="world", wanted=12, spare=4)
 NUMBERS = {"trajectory.txt", "covariance.txt", "frames.csv", "summary.json"}
 FIGURES = {"map.ply", "map.png"}
 

@@ -42,7 +42,9 @@ from jaxslam.tracking.trajectory import (
 )
 from jaxslam.tracking.video import track
 
-FRAMES = 45
+FRAMES = 15
+SMALL = TrackerSettings(filter="world", wanted=12, spare=4)
+"""Most tests' settings: of one size the programs are the same."""
 
 
 def shortened(source, frames):
@@ -61,13 +63,14 @@ def frames_of(out):
 def tracked(tmp_path_factory):
     out = tmp_path_factory.mktemp("tracked")
     source = synthetic_source(frames=FRAMES)
-    return out, source, track(source, out, TrackerSettings(filter="world", wanted=30))
+    return out, source, track(source, out, SMALL)
 
 
 @pytest.mark.slow
-def test_the_synthetic_camera_is_tracked(tracked):
-    _, _, summary = tracked
-    assert summary["tracked"] == summary["frames"] == FRAMES
+def test_the_synthetic_camera_is_tracked(tmp_path):
+    settings = TrackerSettings(filter="world", wanted=30)
+    summary = track(synthetic_source(frames=45), tmp_path, settings)
+    assert summary["tracked"] == summary["frames"] == 45
     assert summary["restarts"] == 0
     assert summary["matches_per_frame"] > 20
     # Measured 0.5 %; a tracker that loses rotation or scale is above 5 %.
@@ -237,7 +240,7 @@ def restarted(tmp_path_factory):
         for index, (here, there) in enumerate(both):
             yield here if index < DARK else there if index >= LIGHT else np.zeros_like(here)
 
-    settings = TrackerSettings(filter="world", wanted=30, lost_for=LIGHT - DARK - 1)
+    settings = replace(SMALL, lost_for=LIGHT - DARK - 1)
     return out, track(replace(source, images=images), out, settings)
 
 
@@ -297,7 +300,7 @@ def test_nothing_but_the_first_frame_is_known_exactly(restarted):
 def test_a_filter_that_fails_is_begun_anew_from_what_prediction_says(broken, monkeypatch):
     """Its covariance is not positive after a frame's update, or even without one."""
     source = synthetic_source(frames=5)
-    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=4))
+    tracker = Tracker(source.calibration, SMALL)
     whole, failures = programs._correct, 1 if broken == "update" else 2
 
     def failing(*arguments):
@@ -340,7 +343,7 @@ def test_a_filter_that_fails_is_begun_anew_from_what_prediction_says(broken, mon
 def test_a_filter_that_fails_in_the_dark_begins_anew_when_there_is_light(monkeypatch):
     """Until then the filter has no landmarks that the map has given up."""
     source = synthetic_source(frames=5, width=320, height=240)
-    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=4))
+    tracker = Tracker(source.calibration, SMALL)
     whole, results = programs._correct, []
 
     def failing(*arguments):
@@ -360,7 +363,7 @@ def test_a_filter_that_fails_in_the_dark_begins_anew_when_there_is_light(monkeyp
 
 def test_matches_too_few_to_believe_change_nothing(monkeypatch):
     source = synthetic_source(frames=2)
-    settings = TrackerSettings(filter="world", wanted=12, spare=4)
+    settings = SMALL
 
     def second_frame():
         tracker = Tracker(source.calibration, settings)
@@ -390,7 +393,7 @@ def test_so_many_matches_are_not_there_by_chance(searched):
 
 def test_a_world_behind_the_camera_is_given_up():
     source = synthetic_source(frames=4)
-    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=4))
+    tracker = Tracker(source.calibration, SMALL)
     results = []
     for frame in source:
         if frame.index == 2:
@@ -420,7 +423,7 @@ def test_what_a_lost_camera_sees_is_not_put_into_its_map():
 
 def test_nothing_is_believed_where_landmarks_are_expected_too_widely():
     source = synthetic_source(frames=3)
-    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=4))
+    tracker = Tracker(source.calibration, SMALL)
     first, second, third = source
     tracker.track(first)
     assert tracker.track(second).state == "tracked"
@@ -433,9 +436,7 @@ def test_nothing_is_believed_where_landmarks_are_expected_too_widely():
 def test_an_unknown_calibration_counts_in_the_first_frame_too():
     """Bearings of the landmarks that it creates are as unsure as pixel and principal point."""
     source = synthetic_source(frames=1)
-    settings = TrackerSettings(
-        filter="world", wanted=12, spare=4, calibration="white", centre_sigma=2.0
-    )
+    settings = replace(SMALL, calibration="white", centre_sigma=2.0)
     tracker = Tracker(source.calibration, settings)
     for frame in source:
         tracker.track(frame)
@@ -454,7 +455,7 @@ def test_an_unknown_calibration_counts_in_the_first_frame_too():
 @pytest.mark.slow
 def test_it_is_said_wherever_it_stands_that_estimated_intrinsics_are_too_sure(tmp_path):
     source = synthetic_source(frames=3, width=320, height=240)
-    settings = TrackerSettings(filter="world", wanted=12, spare=4)
+    settings = SMALL
     guessed = replace(source, calibration=from_field_of_view(320, 240))
     summary = track(guessed, tmp_path, settings, overlay=False)
     header = (tmp_path / "covariance.txt").read_text().splitlines()[0]
@@ -475,12 +476,7 @@ def test_an_interruption_leaves_the_files_of_the_frames_so_far(tmp_path):
 
     seen = 0
     with pytest.raises(KeyboardInterrupt):
-        track(
-            synthetic_source(frames=20),
-            tmp_path,
-            TrackerSettings(filter="world", wanted=10),
-            progress=stop,
-        )
+        track(synthetic_source(frames=20), tmp_path, SMALL, progress=stop)
     assert len(read_tum(tmp_path / "trajectory.txt")[0]) == 4
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 4
     assert len(list(tmp_path.iterdir())) == 7
@@ -488,7 +484,7 @@ def test_an_interruption_leaves_the_files_of_the_frames_so_far(tmp_path):
 
 def test_a_frame_must_be_later_than_the_one_before():
     source = synthetic_source(frames=2)
-    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=10))
+    tracker = Tracker(source.calibration, SMALL)
     frame = next(iter(source))
     tracker.track(frame)
     with pytest.raises(ValueError, match="not later than the one before"):
@@ -502,7 +498,7 @@ def test_a_gaussian_sum_tracks_too():
     With a scale of their own, in a unit that nobody told.
     """
     source = synthetic_source(frames=10)
-    settings = TrackerSettings(filter="world", wanted=12, spare=4)
+    settings = SMALL
     one = Tracker(source.calibration, replace(settings, filter="scale_gauge"))
     some = Tracker(source.calibration, replace(settings, filter="scale_gauge+mixture3"))
     for frame in source:
@@ -530,6 +526,7 @@ class Outside(Around):
 
 
 def test_a_filter_of_ones_own_tracks_as_the_built_in_one_does():
+    """And its programs can be compiled before the first frame."""
     source = synthetic_source(frames=12)
     settings = TrackerSettings(wanted=12, spare=4, filter="robocentric")  # not the one that tracks
     world = replace(settings, filter="world").make_filter(source.calibration)
@@ -537,6 +534,9 @@ def test_a_filter_of_ones_own_tracks_as_the_built_in_one_does():
     compiled = []
     own = Tracker(source.calibration, settings, Outside(world, lambda: compiled.append(1)))
     built_in = Tracker(source.calibration, replace(settings, filter="world"))
+    own.compile()
+    assert len(compiled) == 1
+    assert own.steps == own.created == len(own.landmarks) == 0
     for frame in source:
         found, expected = own.track(frame), built_in.track(frame)
         assert found.status == expected.status
@@ -556,20 +556,6 @@ def test_a_filter_of_ones_own_tracks_as_the_built_in_one_does():
     assert len(compiled) == 1 < len(set(np.diff(source.times)))
     for one, other in zip(own.points(), built_in.points(), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-8)
-
-
-def test_programs_can_be_compiled_before_the_first_frame():
-    source = synthetic_source(frames=3)
-    settings, compiled = TrackerSettings(wanted=8, spare=4, filter="world"), []
-    world = settings.make_filter(source.calibration)
-    assert isinstance(world, jaxslam.EkfSlam)
-    tracker = Tracker(source.calibration, settings, Outside(world, lambda: compiled.append(1)))
-    tracker.compile()
-    assert len(compiled) == 1
-    assert tracker.steps == tracker.created == len(tracker.landmarks) == 0
-    for frame in source:
-        tracker.track(frame)
-    assert len(compiled) == 1
 
 
 def test_the_default_is_the_recommended_filter():

@@ -3,7 +3,6 @@
 import csv
 from dataclasses import dataclass, replace
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -36,7 +35,7 @@ class Wandering(Around):
 
     wander: jnp.ndarray
     opening: jnp.ndarray
-    fixed_at: int = eqx.field(static=True, default=0)
+    fixed_at: jnp.ndarray
 
     def predict_features(self, state, control, slots):
         seen = super().predict_features(state, control, slots)
@@ -89,8 +88,8 @@ def half_hidden(frame):
 def wandering(calibration, opening, fixed_at):
     world = SETTINGS.make_filter(calibration)
     assert isinstance(world, jaxslam.EkfSlam)
-    wander = jnp.asarray(WANDER)
-    return Wandering(world, wander, jnp.asarray(opening), fixed_at)
+    opening = np.pad(opening, (0, FRAMES + 1 - len(opening)), "edge")  # one program for all
+    return Wandering(world, *map(jnp.asarray, (WANDER, opening, fixed_at)))
 
 
 def run(calibration, frames, slam=None):

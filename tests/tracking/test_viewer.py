@@ -12,7 +12,7 @@ from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.video import track
 
-SETTINGS = TrackerSettings(filter="world", wanted=10, spare=4)
+SETTINGS = TrackerSettings(filter="world", wanted=12, spare=4)
 FRAMES = 4
 
 
