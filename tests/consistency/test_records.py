@@ -14,7 +14,9 @@ from jaxslam.consistency import write_records
 STEPS, RUNS, CHUNK = 3, 5, 2
 
 
-@pytest.fixture(scope="module", params=["matched", "matched-6dof"])
+@pytest.fixture(
+    scope="module", params=["matched", pytest.param("matched-6dof", marks=pytest.mark.slow)]
+)
 def study(request):
     scenario = jaxslam.scenario(request.param, steps=STEPS, landmarks=4)
     filters = jaxslam.make_filters(scenario, ["robocentric", "world"], ["inverse_scaling"])

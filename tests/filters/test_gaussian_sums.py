@@ -23,20 +23,32 @@ def case(name="matched-loose", **fields):
     return Case(name, **{"steps": 6, "landmarks": 4, **fields})
 
 
-@pytest.mark.parametrize(
-    ("modifier", "tolerance"), [("scales5", 0.05), ("directions5", 0.05), ("mixture9", 0.15)]
-)
-def test_a_sum_for_a_linear_problem_is_its_filter(modifier, tolerance):
-    """To the error of the sum's shape: halves of a Gaussian have its moments, not its tails."""
-    of = case(
+@cache
+def linear():
+    return case(
         "matched",
         velocity_sigma=(0.01, 0.01, 1e-6),
         acceleration_sigma=(1e-5,) * 3,
         inverse_depth=(1 / 6, 1e-7),
         pixel_sigma=0.3,
     )
-    _, (plain, plain_P, _, _) = pose_run(of, of.filter("robocentric"))
-    _, (sum_, sum_P, _, _) = pose_run(of, of.filter(f"robocentric+{modifier}"))
+
+
+@cache
+def poses(of, name):
+    """Every step's pose and its covariance of such a filter."""
+    return pose_run(of, of.filter(name))[1][:2]
+
+
+@pytest.mark.parametrize(("modifier", "tolerance"), [
+    ("scales5", 0.05),
+    pytest.param("directions5", 0.05, marks=pytest.mark.slow),  # divided otherwise, no more
+    ("mixture9", 0.15),
+])  # fmt: skip
+def test_a_sum_for_a_linear_problem_is_its_filter(modifier, tolerance):
+    """To the error of the sum's shape: halves of a Gaussian have its moments, not its tails."""
+    plain, plain_P = poses(linear(), "robocentric")
+    sum_, sum_P = poses(linear(), f"robocentric+{modifier}")
     sigma = np.sqrt(np.diagonal(plain_P, axis1=1, axis2=2))
     away = jax.vmap(lambda a, b: (a.inverse() @ b).log())(plain, sum_)
     assert np.abs(away / sigma).max() < tolerance
@@ -267,12 +279,13 @@ def test_members_without_weight_give_their_places():
     assert np.isfinite(np.asarray(after.members.covariance)[alive]).all()
 
 
-@pytest.mark.parametrize("name", ["world+mixture3", "robocentric+mixture3"])
+@pytest.mark.parametrize(
+    "name", ["world+mixture3", pytest.param("robocentric+mixture3", marks=pytest.mark.slow)]
+)
 def test_a_mixture_is_of_any_frame(name):
-    of = case()
-    _, (poses, covariances, _, _) = pose_run(of, of.filter(name))
-    _, (plain, _, _, _) = pose_run(of, of.filter(name.partition("+")[0]))
-    away = jax.vmap(lambda a, b: (a.inverse() @ b).log())(plain, poses)
+    found, covariances = poses(case(), name)
+    plain, _ = poses(case(), name.partition("+")[0])
+    away = jax.vmap(lambda a, b: (a.inverse() @ b).log())(plain, found)
     sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     assert 1e-6 < np.abs(away / sigma).max() < 1
 

@@ -16,7 +16,7 @@ from jaxslam.filters.forms.information import EXACT_SIGMA, Information, Informat
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.readouts import camera_pose, landmarks_in_camera, landmarks_in_world
 from jaxslam.filters.registry import FILTERS
-from jaxslam.geometry import PLANAR, difference, exp, identity, joined, tangent_dim
+from jaxslam.geometry import PLANAR, SPATIAL, difference, exp, identity, joined, tangent_dim
 from jaxslam.landmarks import IMAGE_PLANE, INVERSE_SCALING
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.camera import Camera
@@ -122,13 +122,11 @@ def compiled(kind, geometry, form=None, calibration="white", scale=1.0):
 
 
 @cache
-def both_forms(geometry):
-    """The same run in both, exact quantities being known to 0.1 mm: a well-conditioned Λ."""
-    data = (jnp.array(1e-2), *world(geometry))
+def followed(kind, geometry, form=None):
+    """A run, exact quantities being known to 0.1 mm: a well-conditioned Λ."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(information, "EXACT_SIGMA", 1e-4)
-        covariance_form = compiled("keyframe", geometry, AsExact())(*data)
-        return covariance_form, compiled("information", geometry)(*data)
+        return compiled(kind, geometry, form)(jnp.array(1e-2), *world(geometry))
 
 
 def sigmas(P):
@@ -147,7 +145,8 @@ def agree(P, Q, relative):
 @pytest.mark.slow
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_a_run_in_information_form_is_the_run_in_covariance_form(geometry):
-    (states, covariances, nis, poses), others = both_forms(geometry)
+    states, covariances, nis, poses = followed("keyframe", geometry, AsExact())
+    others = followed("information", geometry)
     for k in range(STEPS):
         state, other = (jax.tree.map(lambda x, k=k: x[k], x) for x in (states, others[0]))
         shift = difference(
@@ -160,17 +159,23 @@ def test_a_run_in_information_form_is_the_run_in_covariance_form(geometry):
     np.testing.assert_array_equal(others[0].active, states.active)
 
 
-@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+in_the_plane_quickly = pytest.mark.parametrize(
+    "geometry", [PLANAR, pytest.param(SPATIAL, marks=pytest.mark.slow)], ids=named
+)
+"""Where the run is the subject: in space it takes as long again, by the same functions."""
+
+
+@in_the_plane_quickly
 def test_the_run_has_keyframes_new_landmarks_and_removed_ones(geometry):
-    states = both_forms(geometry)[1][0]
+    states = followed("information", geometry)[0]
     keyframes = np.asarray(states.core.pose.base_from_keyframe.translation())
     assert np.sum(np.abs(np.diff(keyframes[:, 0])) > 0.05) == 2
     assert np.asarray(states.active).sum(axis=1).tolist() == [3, 3, 4, 4, 3, 4, 4, 4, 4, 4]
 
 
-@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+@in_the_plane_quickly
 def test_what_is_not_in_the_state_has_no_information_at_all(geometry):
-    states = both_forms(geometry)[1][0]
+    states = followed("information", geometry)[0]
     last = jax.tree.map(lambda x: x[-1], states)
     t, c = geometry.tangent_dim, last.core_dim
     absent = np.zeros(len(last.information), bool)
