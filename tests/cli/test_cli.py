@@ -9,7 +9,7 @@ import pytest
 import jaxslam
 from jaxslam.cli import main
 
-SMALL = ["consistency", "--scenario", "matched-tight", "--steps", "5", "--runs", "6"]
+SMALL = ["consistency", "--scenario", "matched-tight", "--steps", "6", "--runs", "6"]
 FILTER_KEYS = {
     "dof", "band95", "nees", "nees_median", "lost", "inside", "nis", "nis_dof", "rmse", "sigma",
     "landmark_nees", "landmark_dof", "landmark_not_finite", "diverged", "seconds", "lost_ever",
@@ -28,13 +28,13 @@ def test_consistency_writes_what_others_read(tmp_path, capsys):
     main([*SMALL, "--chunk", "3", "--out", str(tmp_path), "--set", "pixel_sigma=0.4"])
     summary = json.loads((tmp_path / "consistency.json").read_text())
     assert summary["schema"] == 1
-    assert (summary["runs"], summary["steps"], summary["seed"]) == (6, 5, 0)
+    assert (summary["runs"], summary["steps"], summary["seed"]) == (6, 6, 0)
     assert summary["scenario"]["pixel_sigma"] == 0.4
     assert set(summary["filters"]) == {"robocentric/inverse_scaling", "robocentric/inverse_depth"}
     for result in summary["filters"].values():
         assert result.keys() >= FILTER_KEYS
         assert result["verdict"].keys() >= VERDICT_KEYS
-        assert len(result["nees"]) == len(result["lost"]) == len(result["lost_ever"]) == 5
+        assert len(result["nees"]) == len(result["lost"]) == len(result["lost_ever"]) == 6
     assert (tmp_path / "consistency.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
     assert printed.startswith("robocentric/inverse_scaling:\n    NEES ")
@@ -45,7 +45,7 @@ def test_consistency_writes_what_others_read(tmp_path, capsys):
 
 
 def test_consistency_resumes_to_more_runs(tmp_path, capsys):
-    few = [*SMALL, "--chunk", "3", "--landmarks", "inverse_scaling"]
+    few = [*SMALL, "--chunk", "2", "--landmarks", "inverse_scaling", "--set", "landmarks=5"]
     chunked = [*few, "--out", str(tmp_path)]
     main(chunked)
     first = json.loads((tmp_path / "consistency.json").read_text())
@@ -62,7 +62,7 @@ def test_consistency_resumes_to_more_runs(tmp_path, capsys):
     main([*few, *in_sums, "--reduce"])
     sums = json.loads((tmp_path / "sums" / "consistency.json").read_text())
     assert sums["filters"][name]["nees"] == first["filters"][name]["nees"]
-    assert (sums["medians_of"], first["medians_of"]) == (3, 6)
+    assert (sums["medians_of"], first["medians_of"]) == (2, 6)
     with pytest.raises(SystemExit):
         main([*few, *in_sums, "--resume"])
     assert "another reduced (True, now False)" in capsys.readouterr().err

@@ -40,7 +40,7 @@ from jaxslam.statistics.bands import chi2_quantile, normalised_squared
 from jaxslam.statistics.beyond_scale import one_scale_of
 
 SCENARIO = jaxslam.scenario("matched-tight", steps=6, landmarks=5)
-CHUNK = 3
+CHUNK = 2
 """Of most tests: studies whose chunks are of one size share their compiled programs."""
 
 
@@ -95,8 +95,8 @@ def test_the_normalised_square_is_the_mahalanobis_distance_and_nan_if_there_is_n
 
 @pytest.mark.slow
 def test_chunks_do_not_matter_and_run_i_is_the_same_in_any_number_of_runs():
-    whole = all_runs(jaxslam.monte_carlo(SCENARIO, filters(), runs=7, chunk=CHUNK))
-    chunked = all_runs(jaxslam.monte_carlo(SCENARIO, filters(), runs=5, chunk=2))
+    whole = all_runs(jaxslam.monte_carlo(SCENARIO, filters(), runs=7, chunk=3))
+    chunked = all_runs(jaxslam.monte_carlo(SCENARIO, filters(), runs=5, chunk=CHUNK))
     for key, values in chunked.items():
         # The same sums by another batch: rounding of 1e-16 through a covariance that spans 1e9.
         np.testing.assert_allclose(values, whole[key][:5], rtol=1e-6, atol=1e-12, err_msg=key)
@@ -105,7 +105,7 @@ def test_chunks_do_not_matter_and_run_i_is_the_same_in_any_number_of_runs():
 def test_chunks_in_threads_are_those_one_after_another(monkeypatch):
     def computed(number):
         monkeypatch.setattr(montecarlo, "processors", lambda: number)
-        return all_runs(jaxslam.monte_carlo(SCENARIO, filters(), runs=7, chunk=2))
+        return all_runs(jaxslam.monte_carlo(SCENARIO, filters(), runs=7, chunk=CHUNK))
 
     alone, together = computed(1), computed(3)
     for key, values in alone.items():
@@ -272,14 +272,14 @@ def test_a_diverged_run_is_counted_and_spoils_no_other():
 
 @pytest.mark.slow
 def test_a_run_that_comes_back_was_lost_ever():
-    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=4, chunk=2)
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=4, chunk=CHUNK)
     study = with_nees(with_nees(study, 1, 2, 30.0), 3, [2, 4], 25.0)
     result = jaxslam.summarise(study)["filters"]["inverse_scaling"]
     assert result["lost"] == [0, 0, 0.5, 0, 0.25, 0]
     assert result["lost_ever"] == [0, 0, 0.5, 0.5, 0.5, 0.5]
     assert (result["verdict"]["lost"], result["verdict"]["lost_runs"]) == (0.5, [1, 3])
     # A step of so many is above the quantile of one step more often.
-    study = with_nees(jaxslam.monte_carlo(SCENARIO, filters(), runs=4, chunk=2), 1, 2, 22.0)
+    study = with_nees(jaxslam.monte_carlo(SCENARIO, filters(), runs=4, chunk=CHUNK), 1, 2, 22.0)
     result = jaxslam.summarise(study)["filters"]["inverse_scaling"]
     assert (result["lost"][2], result["lost_ever"][2]) == (0.25, 0)
     assert result["verdict"]["lost_runs"] == []
@@ -295,8 +295,8 @@ class OneLandmarkUnknown(jaxslam.EkfSlam):
 
 def test_a_landmark_without_a_finite_nees_is_counted_and_spoils_no_other():
     one, base = OneLandmarkUnknown(**scenario_pieces(SCENARIO)), filters()["inverse_scaling"]
-    study = jaxslam.monte_carlo(SCENARIO, {"name": one}, runs=3, chunk=2)
-    whole = jaxslam.monte_carlo(SCENARIO, {"name": base}, runs=3, chunk=2)
+    study = jaxslam.monte_carlo(SCENARIO, {"name": one}, runs=3, chunk=CHUNK)
+    whole = jaxslam.monte_carlo(SCENARIO, {"name": base}, runs=3, chunk=CHUNK)
     summary = jaxslam.summarise(study)
     found, expected = (jaxslam.summarise(s)["filters"]["name"] for s in (study, whole))
     assert expected["landmark_not_finite"] == [0] * 6
@@ -381,7 +381,7 @@ def test_the_summary_beyond_scale_is_that_of_the_runs():
 
 
 def test_only_runs_that_moved_can_be_reversed():
-    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=4, chunk=2)
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=4, chunk=CHUNK)
     study = with_records(study, slice(0, 3), 0, reversed=np.nan)
     study = with_records(with_records(study, 3, 0, reversed=1.0), slice(None), 1, reversed=np.nan)
     result = jaxslam.summarise(study)["filters"]["inverse_scaling"]
@@ -392,7 +392,7 @@ def test_scale_is_reported_where_nothing_is_told_in_metres():
     assert SCENARIO.scale_free
     assert not jaxslam.scenario("positions").scale_free
     assert not jaxslam.scenario("room").scale_free
-    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=4, chunk=2)
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=4, chunk=CHUNK)
     summary = jaxslam.summarise(study)
     measured = {**summary, "scale_free": False}
     titles = [axes.get_title() for axes in plot_consistency(study, summary).axes]
@@ -422,7 +422,7 @@ def test_scale_is_reported_where_nothing_is_told_in_metres():
 
 @pytest.mark.slow
 def test_the_table_begins_with_the_verdicts_and_shows_the_plain_mean_beside_the_others():
-    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=20)
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=20, chunk=CHUNK)
     study = with_nees(study, 7, slice(4, None), 400.0)
     summary = jaxslam.summarise(study)
     result = summary["filters"]["inverse_scaling"]
@@ -438,7 +438,7 @@ def test_the_table_begins_with_the_verdicts_and_shows_the_plain_mean_beside_the_
 
 
 def test_the_figure_is_titled_by_the_verdicts_and_by_what_was_lost():
-    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=20)
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=20, chunk=CHUNK)
     study = with_nees(study, 7, 2, 400.0)
     summary = jaxslam.summarise(study)
     figure = plot_consistency(study, summary)
@@ -453,7 +453,7 @@ def test_the_figure_is_titled_by_the_verdicts_and_by_what_was_lost():
 def test_a_study_resumes_from_its_folder_and_refuses_another(tmp_path):
     manifest = {"seed": 0}
     store = FolderStore(tmp_path, manifest, resume=False)
-    whole = jaxslam.monte_carlo(SCENARIO, filters(), runs=6, chunk=2, store=store)
+    whole = jaxslam.monte_carlo(SCENARIO, filters(), runs=6, chunk=CHUNK, store=store)
     expected = jaxslam.summarise(whole)["filters"]["inverse_scaling"]
     next(tmp_path.glob("*/0000002-*.npz")).unlink()
     done = []
@@ -461,7 +461,7 @@ def test_a_study_resumes_from_its_folder_and_refuses_another(tmp_path):
         SCENARIO,
         filters(),
         runs=6,
-        chunk=2,
+        chunk=CHUNK,
         store=FolderStore(tmp_path, manifest, resume=True),
         progress=lambda name, runs: done.append(runs),
     )
@@ -588,14 +588,13 @@ def test_with_loose_noise_unified_inverse_depth_is_the_more_over_confident():
 
 
 def test_the_share_outside_three_sigma_is_counted_and_drawn():
-    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=20)
-    chunk = study.chunks[0]
-    records = dict(study.store.load("inverse_scaling", chunk))
-    error, variance = np.zeros_like(records["error"]), np.ones_like(records["variance"])
-    error[:5, 2, 0] = 3.01  # of a quarter of the runs, on one of two axes of the position
-    error[:, 3, 2] = -2.99
-    error[:2, 4, 2] = -40.0
-    study.store.save("inverse_scaling", chunk, {**records, "error": error, "variance": variance})
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=20, chunk=CHUNK)
+    whole = slice(None)
+    study = with_records(study, whole, whole, error=0.0, variance=1.0)
+    # Of a quarter of the runs, on one of two axes of the position.
+    study = with_records(study, slice(5), 2, error=[3.01, 0, 0])
+    study = with_records(study, whole, 3, error=[0, 0, -2.99])
+    study = with_records(study, slice(2), 4, error=[0, 0, -40.0])
     summary = jaxslam.summarise(study)
     outside = summary["filters"]["inverse_scaling"]["outside3sigma"]
     assert outside["position"] == [0, 0, 5 / 40, 0, 0, 0]

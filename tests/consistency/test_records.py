@@ -11,14 +11,14 @@ import jaxslam
 from jaxslam.cli import main
 from jaxslam.consistency import write_records
 
-STEPS, RUNS, CHUNK = 3, 5, 2
+STEPS, RUNS, CHUNK = 6, 5, 2
 
 
 @pytest.fixture(
-    scope="module", params=["matched", pytest.param("matched-6dof", marks=pytest.mark.slow)]
+    scope="module", params=["matched-tight", pytest.param("matched-6dof", marks=pytest.mark.slow)]
 )
 def study(request):
-    scenario = jaxslam.scenario(request.param, steps=STEPS, landmarks=4)
+    scenario = jaxslam.scenario(request.param, steps=STEPS, landmarks=5)
     filters = jaxslam.make_filters(scenario, ["robocentric", "world"], ["inverse_scaling"])
     return jaxslam.monte_carlo(scenario, filters, runs=RUNS, seed=4, chunk=CHUNK)
 
@@ -53,7 +53,7 @@ def test_a_file_says_what_made_it_and_holds_a_chunk_at_a_time(study, tmp_path):
     assert file.num_row_groups == len(study.filters) * len(study.chunks)
     made_by = json.loads(file.schema_arrow.metadata[b"jaxslam"])
     assert made_by["seed"] == 4
-    assert made_by["scenario"]["landmarks"] == 4
+    assert made_by["scenario"]["landmarks"] == 5
 
 
 @pytest.mark.slow

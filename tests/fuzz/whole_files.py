@@ -183,7 +183,9 @@ def small_study(folder: Path) -> Any:
 
 def write_tracker(folder: Path) -> None:
     source = synthetic_source(frames=1, width=160, height=120)
-    tracker = jaxslam.Tracker(source.calibration, jaxslam.TrackerSettings(filter="world", wanted=4))
+    tracker = jaxslam.Tracker(
+        source.calibration, jaxslam.TrackerSettings(filter="world", wanted=12, spare=4)
+    )
     for frame in source:
         tracker.track(frame)
     tracker.save(folder / "tracker.npz")

@@ -35,9 +35,9 @@ from jaxslam.plots.style import (
 
 @pytest.fixture(scope="module")
 def study():
-    scenario = jaxslam.scenario("matched", steps=5)
+    scenario = jaxslam.scenario("matched-tight", steps=6, landmarks=5)
     filters = jaxslam.make_filters(scenario, "robocentric", ["inverse_scaling", "inverse_depth"])
-    return jaxslam.monte_carlo(scenario, filters, runs=4)
+    return jaxslam.monte_carlo(scenario, filters, runs=4, chunk=2)
 
 
 def evaluation():
