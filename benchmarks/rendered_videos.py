@@ -1,19 +1,13 @@
-"""Rendered videos with what real ones have, and their exact truth: see `KINDS`.
-
-    python benchmarks/rendered_videos.py /tmp/videos orbit street+blur --seeds 0
-
-writes their pictures into folders of their own, for whoever looks at them.
-"""
+"""Rendered videos with what real ones have, and their exact truth: see `KINDS`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-import tyro
 from jaxtyping import Float
 from ray_caster import MATERIALS, Body, Paint, as_image, render
 from scipy.spatial.transform import Rotation
@@ -254,20 +248,3 @@ KINDS = {
     "look-around": Kind(500, 20, _room, _looking, "a slow walk that looks round, ±75°"),
     "street": Kind(140, 10, _street, _driving, "a car at 10 m/s with a bend of 90°"),
 }
-
-
-def main(
-    folder: Annotated[Path, tyro.conf.Positional],
-    names: Annotated[tuple[str, ...], tyro.conf.Positional] = tuple(KINDS),
-    seeds: tuple[int, ...] = (0,),
-    frames: int | None = None,
-) -> None:
-    """Render videos into folders."""
-    for seed in seeds:
-        for name in names:
-            rendered = sum(1 for _ in rendered_source(name, seed, frames, folder))
-            print(f"{name}, seed {seed}: {rendered} frames", flush=True)
-
-
-if __name__ == "__main__":
-    tyro.cli(main, description=__doc__)

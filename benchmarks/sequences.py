@@ -33,6 +33,8 @@ FRAMES = (30, 149)
 """Whose pose is compared with the truth, where that is known."""
 MARK = "<!-- sequences.py -->"
 """Where `summary` stands in `docs/results.md`."""
+RENDERED = "\n## Rendered videos\n"
+"""Where the part of `docs/sequences.md` begins that is of `rendered.py`."""
 LANDMARKS = "inverse_scaling"
 SEEDS = range(5)
 """Of synthetic videos."""
@@ -74,7 +76,9 @@ class Sequences(Benchmark):
                 yield results
 
     def report(self, results: Results) -> None:
-        write_page(self.docs / "sequences.md", page(results))
+        path = self.docs / "sequences.md"
+        _, mark, rest = path.read_text().partition(RENDERED) if path.exists() else ("", "", "")
+        write_page(path, page(results) + mark + rest)
         write_table(self.docs / "results.md", MARK, summary(results))
 
 
@@ -113,6 +117,21 @@ def _beyond_scale(source, folder: Path) -> tuple[dict[str, float], list[float] |
     as a mean; and RMS of the drift of scale, itself and in its claimed σ."""
     import numpy as np
 
+    poses = beyond_scale(source, folder)
+    if poses is None:
+        return {}, None
+    frames, found, normalised = poses
+    nees = dict(zip(frames.tolist(), found.nees / 6, strict=True))
+    at = {str(frame): float(f"{nees[frame]:.3g}") for frame in FRAMES if frame in nees}
+    at["mean"] = float(f"{np.mean(found.nees / 6):.3g}")
+    return at, [float(f"{np.sqrt(np.nanmean(x**2)):.3g}") for x in (found.drift, normalised)]
+
+
+def beyond_scale(source, folder: Path):
+    """The frames of the first map whose unit is fixed, what their poses are worth at its one scale
+    (`OneScale`), and their drift of scale in its claimed σ; None where nothing is to be said."""
+    import numpy as np
+
     from jaxslam.evaluation import errors_beyond_scale, read_covariances
     from jaxslam.io.tum import read_tum
     from jaxslam.statistics.beyond_scale import one_scale
@@ -126,16 +145,12 @@ def _beyond_scale(source, folder: Path) -> tuple[dict[str, float], list[float] |
     first[0] = False  # known exactly
     reference = source.reference
     if reference is None or not first.any():
-        return {}, None
+        return None
     truth = reference.T_wc[[np.argmin(np.abs(reference.times - time)) for time in times]]
     truth = np.linalg.inv(truth[0]) @ truth
     best = errors_beyond_scale(TRACKED, T_wc[first], truth[first], covariances[first])
     found = one_scale(*best)
-    drift, normalised = found.drift, found.drift / np.asarray(best.sigma)
-    nees = dict(zip(np.flatnonzero(first).tolist(), found.nees / 6, strict=True))
-    at = {str(frame): float(f"{nees[frame]:.3g}") for frame in FRAMES if frame in nees}
-    at["mean"] = float(f"{np.mean(found.nees / 6):.3g}")
-    return at, [float(f"{np.sqrt(np.nanmean(x**2)):.3g}") for x in (drift, normalised)]
+    return np.flatnonzero(first), found, found.drift / np.asarray(best.sigma)
 
 
 def page(results: Results) -> str:

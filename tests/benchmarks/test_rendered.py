@@ -1,8 +1,12 @@
-"""Tests of benchmarks/ray_caster.py and rendered_videos.py: the truth is that of the pixels."""
+"""Tests of benchmarks/ray_caster.py and its videos: the truth is that of the pixels."""
+
+import json
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import rendered
 import rendered_videos as benchmark
 from numpy.testing import assert_allclose
 from ray_caster import Body, Paint, render
@@ -107,3 +111,10 @@ def test_cameras_move_as_their_kinds_say():
 def test_unknown_kinds_and_modifiers_are_refused():
     with pytest.raises(ValueError, match=r"boxes, orbit, turn, .* are accepted"):
         benchmark.rendered_source("orbit+fog", 0)
+
+
+def test_the_page_has_the_numbers_on_disk():
+    folder = Path(__file__).resolve().parents[2]
+    results = json.loads((folder / "benchmarks/results/rendered.json").read_text())
+    page = (folder / "docs/sequences.md").read_text()
+    assert f"{rendered.MARK}\n\n{rendered.as_table(results)}\n\n" in page

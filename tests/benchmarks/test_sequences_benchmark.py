@@ -14,7 +14,8 @@ def on_disk():
 
 def test_the_pages_have_the_numbers_on_disk():
     results = on_disk()
-    assert (FOLDER / "docs/sequences.md").read_text() == benchmark.page(results)
+    own, _, _ = (FOLDER / "docs/sequences.md").read_text().partition(benchmark.RENDERED)
+    assert own == benchmark.page(results)
     table = benchmark.summary(results)
     assert f"{benchmark.MARK}\n\n{table}\n\n" in (FOLDER / "docs/results.md").read_text()
 

@@ -1,0 +1,121 @@
+"""The tracker on rendered videos that have what real ones have, and an exact truth.
+
+    python benchmarks/rendered.py --videos /tmp/videos
+    python benchmarks/rendered.py --only orbit turn+blur --seeds 0 1
+
+The settings are those of `jaxslam track`. Results are added to `rendered.json`, and their table to
+`docs/sequences.md`.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from benchmark import RESULTS, Benchmark, number, table, write_table
+from rendered_videos import KINDS, rendered_source
+from scipy.stats import chi2
+from sequences import beyond_scale
+from starts import LIE
+
+from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.video import track
+
+MARK = "<!-- by rendered.py -->"
+"""Where the table stands in `docs/sequences.md`."""
+VIDEOS = (*KINDS, "turn+blur+exposure")
+
+COLUMNS = {
+    "maps": ".0f",
+    "matches_per_frame": ".1f",
+    "error": ".2%",
+    "straight_line": ".2%",
+    "sign": ".2f",
+    "orientation": ".1f",
+    "beyond_scale": ".2g",
+    "median_beyond_scale": ".2g",
+    "lies": ".0%",
+    "drift": ".2g",
+}
+"""Of the table, in its order."""
+
+Results = dict[str, dict[str, dict[str, Any]]]
+"""`results[video][seed]`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rendered(Benchmark):
+    """The default tracker on rendered videos."""
+
+    only: tuple[str, ...] = VIDEOS
+    """Kinds of videos, with +blur or +exposure."""
+    seeds: tuple[int, ...] = (0,)
+    """One video each."""
+    videos: Path | None = None
+    """A folder that keeps the pictures, since rendering is slow."""
+    out: Path = RESULTS / "rendered.json"
+    double = False
+
+    def measure(self) -> Iterator[Results]:
+        results: Results = self.found()
+        for seed in self.seeds:
+            for name in self.only:
+                done = measure(rendered_source(name, seed, folder=self.videos))
+                results.setdefault(name, {})[str(seed)] = done
+                print(name, seed, done, flush=True)
+                yield results
+
+    def report(self, results: Results) -> None:
+        write_table(self.docs / "sequences.md", MARK, as_table(results))
+
+
+def measure(source) -> dict[str, Any]:
+    """The numbers of one video."""
+    with tempfile.TemporaryDirectory() as folder:
+        summary = track(source, folder, TrackerSettings(), overlay=False)
+        poses = beyond_scale(source, Path(folder))
+    numbers = {key: summary[key] for key in ("frames", "tracked", "maps", "matches_per_frame")}
+    ate = summary.get("ate")
+    if ate and ate["path_length"]:
+        numbers["error"] = ate["rmse"] / ate["path_length"]
+        numbers["straight_line"] = ate["straight_line"] / ate["path_length"]
+        numbers["sign"] = ate["sign"]
+        numbers["orientation"] = ate["orientation_rmse"]
+    if poses:
+        _, found, normalised = poses
+        numbers["beyond_scale"] = float(np.mean(found.nees / 6))
+        numbers["median_beyond_scale"] = float(np.median(found.nees / 6))
+        numbers["lies"] = float(np.mean(chi2.sf(found.nees, 6) < LIE))
+        numbers["drift"] = float(np.sqrt(np.nanmean(normalised**2)))
+    return {key: float(f"{value:.4g}") for key, value in numbers.items()}
+
+
+def as_table(results: Results) -> str:
+    """As Markdown, a row for each video."""
+    header = (
+        "video",
+        "frames",
+        "lost",
+        "maps",
+        "matches a frame",
+        "error",
+        "straight line",
+        "sign",
+    )
+    header += ("orientation, °", "at one scale", "its median", "lies", "drift, σ")
+    rows = []
+    for name, seeds in results.items():
+        words = KINDS[name.partition("+")[0]].words
+        for seed, r in seeds.items():
+            shown = (number(r.get(key), form) for key, form in COLUMNS.items())
+            what = f"`{name}`, seed {seed}: {words}", f"{r['frames']:.0f}"
+            rows.append((*what, f"{1 - r['tracked'] / r['frames']:.0%}", *shown))
+    return table(header, rows)
+
+
+if __name__ == "__main__":
+    Rendered.run()
