@@ -67,7 +67,7 @@ class Confused(Policy):
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng(self.seed)
 
-    def judged(self, seen, matches, landmarks, agree, *, lost):
+    def agreeing(self, seen, matches, landmarks, agree, *, lost):
         """With wrong places in that of the true ones."""
         if self.frame in self.during:
             wrong = self._rng.random(len(seen.slots)) < self.share
@@ -76,7 +76,7 @@ class Confused(Policy):
                 for owner, pixel in zip(matches.owner, matches.pixels, strict=True)
             ]
             matches = matches._replace(pixels=np.array(pixels).reshape(-1, 2))
-        return super().judged(seen, matches, landmarks, agree, lost=lost)
+        return super().agreeing(seen, matches, landmarks, agree, lost=lost)
 
     def _elsewhere(self, seen, row):
         angle, radius = self._rng.uniform(0, 2 * np.pi), 3 * np.sqrt(self._rng.random())

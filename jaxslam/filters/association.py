@@ -108,12 +108,12 @@ def candidates(
     S = S.reshape(m, p, m, p)
     if curved and isinstance(slam, EkfSlam):
         i = jnp.arange(m)
-        S = S.at[i, :, i].add(_second_order(slam, state, control, features.slots))
+        S = S.at[i, :, i].add(second_order(slam, state, control, features.slots))
     first_alike = jnp.argmax(features.slots == features.slots[:, None], axis=1)
     return Candidates(innovation.residual, S, innovation.used, first_alike)
 
 
-def _second_order(
+def second_order(
     slam: EkfSlam, state: Belief, control: Control, slots: Slots
 ) -> Float[Array, "m p p"]:
     """`½ tr(∂²h_a Q ∂²h_b Q)`, Q of what one measurement depends on (Bar-Shalom, Li, Kirubarajan,

@@ -18,7 +18,13 @@ from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam._numerics.arrays import cast
 from jaxslam._runtime.programs import Program, in_background
-from jaxslam.filters.association import ASSOCIATIONS, Association, candidates
+from jaxslam.filters.association import (
+    ASSOCIATIONS,
+    Association,
+    Candidates,
+    candidates,
+    second_order,
+)
 from jaxslam.filters.ekf import EkfSlam, init_with_depths
 from jaxslam.filters.protocol import AbstractStaged, Belief, CameraView
 from jaxslam.filters.readouts import (
@@ -48,6 +54,8 @@ class Predicted(NamedTuple):
     state: Belief
     gaussian: Belief
     """The same as one Gaussian."""
+    joint: np.ndarray
+    """The covariance of the innovations of all slots, (n, 2, n, 2)."""
     view: Prediction
     """In the filter's own unit, from where the map begins."""
 
@@ -100,8 +108,9 @@ class Estimator:
         nothing."""
         # A number of Python's would be compiled into the program.
         dt = jnp.asarray(seconds)
-        (state, gaussian), view = _predict(self.slam, self.state, dt)
-        return Predicted(dt, state, gaussian, Prediction(*jax.device_get(view)))
+        (state, gaussian), joint, view = _predict(self.slam, self.state, dt)
+        joint, view = jax.device_get((joint, view))
+        return Predicted(dt, state, gaussian, joint, Prediction(*view))
 
     def believes(
         self,
@@ -111,7 +120,36 @@ class Estimator:
         wide: Association | None = None,
     ) -> Bool[np.ndarray, " m"]:
         """Return which matches agree, by an association for `wide` ellipses or the settings'."""
-        return np.asarray(_believed(*self._belief(predicted, slots, pixels, wide)))[: len(slots)]
+        S, several = predicted.joint, wide is not None
+        R, i = self.settings.pixel_sigma**2 * np.eye(2), np.arange(len(slots))
+        S = S[slots][:, :, slots]
+        same = slots[:, None] == slots
+        # Two matches of one landmark share all but their noise.
+        first, second = np.nonzero(same & ~np.eye(len(slots), dtype=bool))
+        S[first, :, second] -= R
+        if several:
+            S[i, :, i] += np.asarray(_curved(self.slam, *predicted[1:3], predicted.dt))[slots]
+        S[i, :, i] += (self.settings.tolerance * self.settings.pixel_sigma) ** 2 * np.eye(2)
+        found = pixels - predicted.view.pixels[slots], S, predicted.view.usable[slots], slots
+        association = ASSOCIATIONS[self.settings.association] if wide is None else wide
+        return np.asarray(_believed(association, *self._of_fixed_size(*found, several)))[
+            : len(slots)
+        ]
+
+    def given(
+        self, predicted: Predicted, slots: Int[np.ndarray, " k"], pixels: Float[np.ndarray, "k 2"]
+    ) -> Prediction:
+        """Return what the filter expects of the frame given that it shows these landmarks at these
+        pixels, to first order. Changes nothing."""
+        view, (n, p, _, _) = predicted.view, predicted.joint.shape
+        S = predicted.joint.reshape(n * p, n * p)
+        known = (p * slots[:, None] + np.arange(p)).ravel()
+        residual = (pixels - view.pixels[slots]).ravel()
+        gain = np.linalg.solve(S[np.ix_(known, known)], S[known]).T
+        # The noise of a pixel that is known is no part of what else is to be expected there.
+        moved = (gain @ residual).reshape(n, p)
+        left = np.einsum("npk,nqk->npq", gain.reshape(n, p, -1), S[:, known].reshape(n, p, -1))
+        return view._replace(pixels=view.pixels + moved, covariances=view.covariances - left)
 
     def correct(
         self,
@@ -170,11 +208,16 @@ class Estimator:
         gone = jnp.zeros(self.settings.capacity, bool)
 
         def predicted() -> Predicted:
-            (ahead, gaussian), view = _predict.compile(slam, state, dt)
-            return Predicted(dt, ahead, gaussian, Prediction(*view))
+            (ahead, gaussian), joint, view = _predict.compile(slam, state, dt)
+            return Predicted(dt, ahead, gaussian, joint, Prediction(*view))
 
         def believed(association: Association | None) -> None:
-            _believed.compile(*self._belief(predicted(), *_NOWHERE, association))
+            nothing = np.zeros((0, 2)), np.zeros((0, 2, 0, 2)), np.zeros(0, bool), np.zeros(0, int)
+            several = association is not None
+            one = association or ASSOCIATIONS[self.settings.association]
+            _believed.compile(one, *self._of_fixed_size(*nothing, several))
+            if several:
+                _curved.compile(slam, *predicted()[1:3], dt)
 
         return [
             in_background(
@@ -190,19 +233,26 @@ class Estimator:
             ),
         ]
 
-    def _belief(
+    def _of_fixed_size(
         self,
-        predicted: Predicted,
+        residual: Float[np.ndarray, "m 2"],
+        covariance: Float[np.ndarray, "m 2 m 2"],
+        valid: Bool[np.ndarray, " m"],
         slots: Int[np.ndarray, " m"],
-        pixels: Float[np.ndarray, "m 2"],
-        wide: Association | None,
-    ) -> tuple[PyTree, ...]:
-        """Return what `_believed` is given."""
-        s, several = self.settings, wide is not None
-        features = _padded(slots, pixels, s.wanted * (PEAKS if several else 1))
-        tolerance = jnp.asarray(s.tolerance * s.pixel_sigma)
-        association = ASSOCIATIONS[s.association] if wide is None else wide
-        return self.slam, association, several, *predicted[1:3], predicted.dt, features, tolerance
+        several: bool,
+    ) -> tuple[np.ndarray, ...]:
+        """Return the parts of `Candidates`, as many as there can be: those added are not valid."""
+        m, size = len(slots), self.settings.wanted * (PEAKS if several else 1)
+        padded = np.tile(np.eye(2)[:, None], (size, 1, size, 1)) * np.eye(size)[:, None, :, None]
+        padded[:m, :, :m] = covariance
+        landmark = np.argmax(slots == slots[:, None], axis=1) if m else slots
+        more = (0, size - m)
+        return (
+            np.pad(residual, (more, (0, 0))),
+            padded,
+            np.pad(valid, more),
+            np.pad(landmark, more, mode="constant", constant_values=size - 1),
+        )
 
     def _created(
         self,
@@ -238,33 +288,40 @@ def _remove(slam: AbstractStaged, state: Belief, gone: jax.Array) -> Belief:
 @Program
 def _predict(
     slam: AbstractStaged, state: Belief, dt: jax.Array
-) -> tuple[tuple[Belief, Belief], tuple[PyTree, ...]]:
-    """The predicted state, as it is and as one Gaussian, and the `Prediction` of that."""
-    slots = jnp.arange(slam.in_map(state).size)
+) -> tuple[tuple[Belief, Belief], jax.Array, tuple[PyTree, ...]]:
+    """The predicted state, as it is and as one Gaussian, and of that the covariance of all
+    innovations and the `Prediction`."""
     state = slam.predict(state, dt)
     one, gaussian = slam.gaussian(state, dt)
+    slots = jnp.arange(slam.in_map(state).size)
     seen = one.predict_features(gaussian, dt, slots)
     usable = seen.possible & jnp.isfinite(seen.covariance).all(axis=(1, 2))
+    joint = candidates(one, gaussian, dt, Features(slots, seen.measured, usable)).covariance
     metres = jnp.exp(log_unit(one, gaussian))
     pose, omegas = scaled(seen.pose, 1 / metres).as_matrix(), metres * seen.omegas
     sides = landmarks_on_sides(one, gaussian, slots)
     prediction = seen.measured, seen.covariance, usable, pose, seen.points, omegas, sides
-    return (state, gaussian), prediction
+    return (state, gaussian), joint, prediction
 
 
 @Program
 def _believed(
-    slam: AbstractStaged,
     association: Association,
-    wide: bool,
-    state: Belief,
-    gaussian: Belief,
-    dt: jax.Array,
-    features: Features,
-    tolerance: jax.Array,
+    residual: jax.Array,
+    covariance: jax.Array,
+    valid: jax.Array,
+    landmark: jax.Array,
 ) -> Bool[jax.Array, " m"]:
+    return association(Candidates(residual, covariance, valid, landmark))
+
+
+@Program
+def _curved(slam: AbstractStaged, state: Belief, gaussian: Belief, dt: jax.Array) -> jax.Array:
+    """The terms of second order of every slot's measurement, (n, 2, 2)."""
     one, _ = slam.gaussian(state, dt)
-    return association(candidates(one, gaussian, dt, features, tolerance, curved=wide))
+    if not isinstance(one, EkfSlam):
+        return jnp.zeros(())
+    return second_order(one, gaussian, dt, jnp.arange(slam.in_map(state).size))
 
 
 @Program

@@ -2,10 +2,28 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+
+
+class Lost(StrEnum):
+    """The reasons why a camera is lost in a frame (docs/own-video.md)."""
+
+    NOTHING_EXPECTED = "nothing expected"
+    """No landmark of the map is expected in the picture, where it would look as it did."""
+    FEW_AGREE = "few agree"
+    """No more matches agree than would by chance."""
+    CONTRADICTED = "contradicted"
+    """Too many proven landmarks are found elsewhere, all moved alike."""
+    REFUSED = "refused"
+    """The filter used none of the matches."""
+    NOT_POSITIVE = "not positive"
+    """The update's covariance was not positive."""
+    REVERSED = "reversed"
+    """Most of the map turned out to be behind the camera."""
 
 
 class Prediction(NamedTuple):

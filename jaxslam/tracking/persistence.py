@@ -36,6 +36,7 @@ NUMBERS = {
     "_sigma_log_scale": "map.place.sigma_log_scale",
     "_proven": "policy.proven",
     "_elsewhere": "policy.elsewhere",
+    "_contradictions": "policy.contradictions",
     "_log_unit": "map.place.log_unit",
     "_log_scale": "map.place.log_scale",
     "_unit_fixed": "map.place.unit_fixed",

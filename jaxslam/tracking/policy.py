@@ -17,8 +17,8 @@ from jaxslam.tracking.epipolar import MINIMAL, of_one_motion
 from jaxslam.tracking.estimator import Predicted
 from jaxslam.tracking.landmarks import Landmark
 from jaxslam.tracking.map import Map
-from jaxslam.tracking.matching import Matches
-from jaxslam.tracking.observations import Observations
+from jaxslam.tracking.matching import GATE, Matches
+from jaxslam.tracking.observations import Lost, Observations, Prediction
 from jaxslam.tracking.search import search
 from jaxslam.tracking.settings import TrackerSettings
 
@@ -26,17 +26,25 @@ LEAST_MATCHES = 4
 """Fewer do not count as having tracked a frame, and are not believed."""
 CHANCE = 0.05
 """Of a landmark that is not in the picture to have a match all the same that agrees …"""
+CHANCE_LOST = 0.1
+"""… where the camera was lost before, and is searched for widely …"""
 BY_CHANCE = 1e-3
 """… and of a frame to be believed although its landmarks are not there."""
-ASTRAY = np.radians(10.0)
-"""σ of the directions in which landmarks are expected from which on none is believed: one linear
-update from there would be wrong, and sure."""
+WIDE = 6.0
+"""σ of the places where most landmarks are expected, pixels, from which on they are searched twice:
+the second time given what agreed …"""
+NARROW = 1.5
+"""… with this σ beside what is still unknown then, pixels, …"""
+EXPLAINED = 0.8
+"""… where a linear prediction explains this share of it."""
 PROVEN = 10
 """A landmark that was found so often is where the map says: one that is then found elsewhere
 contradicts it …"""
-CONTRADICTED = 0.2
+CONTRADICTED = 0.15
 """… and no frame is believed while more than this share of them do, of at least `PROVEN`, in one
-direction: half of the picture may be a lorry's, or the map is wrong. Chance matches have none."""
+direction: half of the picture may be a lorry's, or the map is wrong …"""
+_AT_RANDOM = 1.73
+"""… not counting what n directions at random sum to: 95 % of such sums are shorter than this √n."""
 _LATELY = 3
 """Frames over which that share is an average."""
 
@@ -57,10 +65,13 @@ class Policy:
     """Proven landmarks found in a frame, on an average of the latest …"""
     elsewhere: float = 0.0
     """… and how many of them were found elsewhere, in one direction."""
+    contradictions: int = 0
+    """The latest frames, in a row, that were not believed for that."""
 
     def forget(self) -> None:
         """Begin with a new map."""
         self.proven = self.elsewhere = 0.0
+        self.contradictions = 0
 
     @property
     def in_wide(self) -> list[Association]:
@@ -71,18 +82,32 @@ class Policy:
 
     def observed(
         self, image: UInt8[np.ndarray, "h w"], map: Map, predicted: Predicted, *, lost: bool
-    ) -> Observations:
-        """The landmarks that a picture is searched for, and which matches of them are believed."""
+    ) -> tuple[Observations, Lost | None]:
+        """The landmarks that a picture is searched for, and which matches of them are believed; or
+        why none are. What was known before the search is what the table says of each."""
         expected = map.place.expected(predicted.view)
+        look = partial(search, image, map.landmarks)
         # One linear update from matches that no linear prediction expects would be wrong, and sure.
         several = self.ambiguous_start
-        searched = search(
-            image, map.landmarks, expected, self.calibration, self.settings, several=several
-        )
+        searched = look(expected, self.calibration, self.settings, several=several)
         agree = partial(map.estimator.believes, predicted)
-        return self.judged(*searched, map.landmarks, agree, lost=lost)
+        seen = self.agreeing(*searched, map.landmarks, agree, lost=lost)
+        if seen.matched.any() and _sigma(seen.covariances) > WIDE:
+            given = map.estimator.given(
+                predicted, seen.slots[seen.matched], seen.pixels[seen.matched]
+            )
+            closer = self._closer(seen, map.place.expected(given))
+            if _explained(seen, closer):
+                searched = look(closer, self.calibration, self.settings, several=False)
+                seen = self.agreeing(*searched, map.landmarks, agree, lost=lost)
+        reason = self.reason(seen, map.landmarks)
+        if reason is not None:
+            labels = np.where(seen.matched, "outlier", seen.labels)
+            seen = seen._replace(labels=labels)
+        prior = expected.pixels[seen.slots], expected.covariances[seen.slots]
+        return seen._replace(predicted=prior[0], covariances=prior[1]), reason
 
-    def judged(
+    def agreeing(
         self,
         seen: Observations,
         matches: Matches,
@@ -91,29 +116,47 @@ class Policy:
         *,
         lost: bool,
     ) -> Observations:
-        """The table with the places that are believed, `matched`, and the first one of each other
+        """The table with the places that agree, `matched`, and the first one of each other
         landmark that was found, an `outlier`. A camera that was `lost` needs more of them."""
         rows = len(seen.slots)
         labels = np.full(rows, "unmatched")
         labels[matches.owner] = "outlier"
-        if self._astray(seen.covariances):
-            return seen._replace(labels=labels)
-        least = more_than_chance(rows)
-        if lost:
-            # A camera that was lost searches ever wider, and something always looks alike.
-            least = max(least, rows // 2)
+        # A camera that was lost searches ever wider, and something always looks alike.
+        least = more_than_chance(rows, CHANCE_LOST if lost else CHANCE)
         if len(matches.owner) > len(np.unique(matches.owner)):
             chosen = self._of_several(seen.slots, matches, landmarks, agree, least)
         else:
             chosen = np.flatnonzero(agree(seen.slots[matches.owner], matches.pixels))
         agreed = matches.only(chosen).first_of_each(rows)
-        if np.isfinite(agreed[:, 0]).sum() < least:
-            agreed[:] = np.nan
-        pixels = np.where(np.isfinite(agreed), agreed, matches.first_of_each(rows))
-        believed, moved = np.isfinite(agreed[:, 0]), pixels - seen.predicted
-        if not self.contradicted([landmarks[slot] for slot in seen.slots], moved, believed):
-            labels[believed] = "matched"
+        believed = np.isfinite(agreed[:, 0])
+        if believed.sum() < least:
+            believed[:] = False
+        labels[believed] = "matched"
+        pixels = np.where(believed[:, None], agreed, matches.first_of_each(rows))
         return seen._replace(pixels=pixels, labels=labels)
+
+    def _closer(self, seen: Observations, given: Prediction) -> Prediction:
+        """Return the prediction given what is matched, as far as it is to be trusted."""
+        # To first order a turn moves all pixels alike; to second, by its square / 2f more.
+        turned = np.median(seen.pixels[seen.matched] - seen.predicted[seen.matched], axis=0)
+        sigma = NARROW + turned @ turned / (2 * self.calibration.fx)
+        return given._replace(covariances=given.covariances + sigma**2 * np.eye(2))
+
+    def reason(self, seen: Observations, landmarks: Mapping[int, Landmark]) -> Lost | None:
+        """Return why nothing of a table is believed, if so."""
+        if not len(seen.slots):
+            return Lost.NOTHING_EXPECTED
+        if not seen.matched.any():
+            return Lost.FEW_AGREE
+        moved = seen.pixels - seen.predicted
+        contradicted = self.contradicted(
+            [landmarks[slot] for slot in seen.slots], moved, seen.matched
+        )
+        self.contradictions = self.contradictions + 1 if contradicted else 0
+        if self.contradictions > self.settings.lost_for:
+            # What contradicts for so long is wrong itself: it is not found, and goes.
+            self.forget()
+        return Lost.CONTRADICTED if self.contradictions else None
 
     def contradicted(
         self,
@@ -130,7 +173,8 @@ class Policy:
             aside = moved[proven & ~agree] - np.median(moved[agree], axis=0)
             directions = aside / np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-9)
             self.proven += (proven.sum() - self.proven) / _LATELY
-            alike = float(np.linalg.norm(directions.sum(axis=0)))
+            at_random = _AT_RANDOM * np.sqrt(len(directions))
+            alike = max(float(np.linalg.norm(directions.sum(axis=0))) - at_random, 0.0)
             self.elsewhere += (alike - self.elsewhere) / _LATELY
         return bool(self.elsewhere > CONTRADICTED * max(self.proven, PROVEN))
 
@@ -177,17 +221,26 @@ class Policy:
         )
         return lately, rigid
 
-    def _astray(self, ellipses: Float[np.ndarray, "k 2 2"]) -> bool:
-        """Return whether most landmarks are expected too widely."""
-        if not len(ellipses):
-            return False
-        longest = np.sqrt(np.linalg.eigvalsh(ellipses)[:, -1])
-        return bool(np.median(longest) > ASTRAY * self.calibration.fx)
+
+def _sigma(ellipses: Float[np.ndarray, "k 2 2"]) -> float:
+    """Return how widely most landmarks are expected: the median of the ellipses' longer σ,
+    pixels."""
+    return float(np.median(np.sqrt(np.linalg.eigvalsh(ellipses)[:, -1])))
 
 
-def more_than_chance(searched: int) -> int:
+def _explained(seen: Observations, given: Prediction) -> bool:
+    """Return whether a linear prediction given what is believed explains most of that."""
+    slots = seen.slots[seen.matched]
+    off = seen.pixels[seen.matched] - given.pixels[slots]
+    squared = np.einsum(
+        "ki,ki->k", off, np.linalg.solve(given.covariances[slots], off[..., None])[..., 0]
+    )
+    return bool(np.mean(squared < GATE) > 0.8)
+
+
+def more_than_chance(searched: int, chance: float = CHANCE) -> int:
     """Matches of so many landmarks searched that do not agree by chance."""
-    return max(LEAST_MATCHES, int(binom.isf(BY_CHANCE, searched, CHANCE)) + 1)
+    return max(LEAST_MATCHES, int(binom.isf(BY_CHANCE, searched, chance)) + 1)
 
 
 def _alone(owner: Int[np.ndarray, " m"], among: Bool[np.ndarray, " m"]) -> Int[np.ndarray, " n"]:

@@ -12,12 +12,12 @@ from jaxtyping import Float
 from jaxslam._runtime.files import write_atomically
 from jaxslam.io.source import Frame
 from jaxslam.tracking.map import Map
-from jaxslam.tracking.observations import NOTHING, Observations
+from jaxslam.tracking.observations import NOTHING, Lost, Observations
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 
 _COLUMNS = (
     "frame", "time", "state", "map", "matches", "nis", "nis_dof",
-    "sigma_position", "sigma_orientation", "sigma_log_scale", "log_scale", "unit_fixed",
+    "sigma_position", "sigma_orientation", "sigma_log_scale", "log_scale", "unit_fixed", "reason",
 )  # fmt: skip
 
 
@@ -40,7 +40,8 @@ class Tracked:
     """The normalised innovation squared of all matches …"""
     nis_dof: int = 0
     """… and its degrees of freedom: two for each match."""
-    lost: bool = False
+    reason: Lost | None = None
+    """Why the camera is lost, if it is."""
     starts: bool = False
     """Whether a map begins here; where it is not the first, the camera was lost too."""
     map: int = 0
@@ -70,6 +71,11 @@ class Tracked:
             unit_fixed=place.unit_fixed,
             **found,
         )
+
+    @property
+    def lost(self) -> bool:
+        """Whether nothing in the frame tells where the camera is."""
+        return self.reason is not None
 
     @property
     def T_wc(self) -> np.ndarray:
@@ -128,6 +134,7 @@ def write_frames(path: str | Path, history: list[Tracked]) -> None:
     as the filter believes it to be at this frame, and `sigma_log_scale` its σ; both empty where
     the filter is in no doubt of it: there it has not been measured. `unit_fixed` is 0 while the
     map's start is being found out, when the filter changes its unit with every frame, else 1.
+    `reason` is why the camera is lost (`Lost`), empty where it is not.
     """
     with write_atomically(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -150,4 +157,5 @@ def _row(result: Tracked) -> list[object]:
         result.nis_dof,
         *("" if number is None else f"{number:.6g}" for number in numbers),
         int(result.unit_fixed),
+        result.reason or "",
     ]

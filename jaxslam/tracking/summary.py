@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
@@ -59,6 +60,7 @@ def summarised(
         "frames": len(history),
         "tracked": len(history) - lost,
         "lost": lost,
+        "lost_reasons": dict(Counter(result.reason for result in history if result.reason)),
         "restarts": tracker.restarts,
         "maps": tracker.restarts + 1,
         "units": _units(history),

@@ -20,7 +20,7 @@ from jaxslam.tracking.corners import bare_corners
 from jaxslam.tracking.estimator import Estimator
 from jaxslam.tracking.landmarks import Landmark, Points
 from jaxslam.tracking.map import Map, in_view
-from jaxslam.tracking.observations import NOTHING, Observations
+from jaxslam.tracking.observations import NOTHING, Lost, Observations
 from jaxslam.tracking.policy import LEAST_MATCHES, Policy
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
@@ -178,38 +178,43 @@ class Tracker:
         if behind > ahead and behind >= LEAST_MATCHES:
             self.reversed += 1
             self.map.coast(predicted)
-            return self._lost(frame)
-        seen = self.policy.observed(frame.image, self.map, predicted, lost=self.unmeasured > 0)
+            return self._lost(frame, Lost.REVERSED)
+        seen, reason = self.policy.observed(
+            frame.image, self.map, predicted, lost=self.unmeasured > 0
+        )
         correction = self.map.estimator.correct(predicted, seen.slots, seen.believed)
         if correction.failed:
             self.failed[Status(int(correction.status)).name.lower()] += 1
             self.map.fall_back(predicted)
-            return self._lost(frame)
+            return self._lost(frame, Lost.NOT_POSITIVE)
         seen = seen.but_for(correction.used)
         self.map.note(seen)
-        lost = not seen.matched.any()
-        self.unmeasured = self.unmeasured + 1 if lost else 0
+        if reason is None and not seen.matched.any():
+            reason = Lost.REFUSED
+        # A map that is contradicted is not given up for it: the camera sees it.
+        if reason is not Lost.CONTRADICTED:
+            self.unmeasured = 0 if reason is None else self.unmeasured + 1
         if not self.landmarks or self.unmeasured > self.settings.lost_for:
-            return self._lost(frame, seen)
+            return self._lost(frame, reason or Lost.NOTHING_EXPECTED, seen)
         kept = in_view(self.landmarks, seen.slots, self.settings)
         # What a lost camera sees may be another place: it is not put into this map.
         created = np.zeros((0, 2))
-        if not lost:
+        if reason is None:
             created = bare_corners(frame.image, self.settings, seen.places[kept])
         self.map.renew(frame.image, created, seen.slots[kept])
         nis, nis_dof = float(correction.nis), int(correction.nis_dof)
         return Tracked.of(
-            frame, self.map, seen, created=created, nis=nis, nis_dof=nis_dof, lost=lost
+            frame, self.map, seen, created=created, nis=nis, nis_dof=nis_dof, reason=reason
         )
 
-    def _lost(self, frame: Frame, seen: Observations = NOTHING) -> Tracked:
+    def _lost(self, frame: Frame, reason: Lost, seen: Observations = NOTHING) -> Tracked:
         """Begin a new map at the camera as it is predicted, or wait for a picture with corners."""
         corners = bare_corners(frame.image, self.settings)
         self.map.renew(frame.image, corners[:0])
         if len(corners) < LEAST_MATCHES:
-            return Tracked.of(frame, self.map, seen, lost=True)
+            return Tracked.of(frame, self.map, seen, reason=reason)
         self.map.restart()
         self.map.begin(frame.image, corners)
         self.unmeasured = 0
         self.policy.forget()
-        return Tracked.of(frame, self.map, seen, created=corners, lost=True, starts=True)
+        return Tracked.of(frame, self.map, seen, created=corners, reason=reason, starts=True)
