@@ -90,7 +90,8 @@ def measure(source) -> dict[str, Any]:
         numbers["beyond_scale"] = float(np.mean(found.nees / 6))
         numbers["median_beyond_scale"] = float(np.median(found.nees / 6))
         numbers["lies"] = float(np.mean(chi2.sf(found.nees, 6) < LIE))
-        numbers["drift"] = float(np.sqrt(np.nanmean(normalised**2)))
+        if np.isfinite(normalised).any():  # a camera on the spot has no scale
+            numbers["drift"] = float(np.sqrt(np.nanmean(normalised**2)))
     return {key: float(f"{value:.4g}") for key, value in numbers.items()}
 
 
