@@ -262,13 +262,11 @@ def correct(
     state: Belief,
     control: Control,
     seen: Features,
-    share: Float[Array, " m"] | None = None,
 ) -> tuple[Belief, PyTree]:
-    """The Kalman update by features of slots, with a share ρ of each by R/ρ; and what the form
-    says that it compared."""
+    """The Kalman update by features of slots, and what the form says that it compared."""
     noise = slam.sensor.noise
-    if share is not None:
-        noise = noise / jnp.where(share > 0, share, 1.0)[:, None, None]
+    if seen.noise_factor is not None:
+        noise = noise * seen.noise_factor[:, None, None]
     context = context_of(slam, control)
     return slam.form.update(slam.model, state, seen, noise, context, _considered(slam, state))
 

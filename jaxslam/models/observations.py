@@ -48,6 +48,9 @@ class Features(eqx.Module):
     measured: Float[AnyArray, "*frames m p"]
     """What the sensor says of each: of a camera a pixel, (u,) or (u, v)."""
     valid: Bool[AnyArray, "*frames m"]
+    noise_factor: Float[AnyArray, "*frames m"] | None = None
+    """κ of each: its noise in an update is κ R, R the sensor's, as where a patch fits badly; None
+    is 1."""
 
     def places(self, count: int) -> Int[Array, "*frames m"]:
         """The slots, and `count`, which is out of bounds, for what is not valid."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -36,8 +36,8 @@ from jaxslam.filters.readouts import (
 from jaxslam.geometry import scaled
 from jaxslam.models.observations import Features, Status
 from jaxslam.models.sensors import Pinhole
-from jaxslam.tracking.matching import PEAKS
-from jaxslam.tracking.observations import Prediction
+from jaxslam.tracking.matching import PEAKS, Matches
+from jaxslam.tracking.observations import NOTHING, Observations, Prediction
 from jaxslam.tracking.settings import TrackerSettings
 
 _NOWHERE = np.zeros(0, int), np.zeros((0, 2))
@@ -116,50 +116,60 @@ class Estimator:
         self,
         predicted: Predicted,
         slots: Int[np.ndarray, " m"],
-        pixels: Float[np.ndarray, "m 2"],
+        matches: Matches,
         wide: Association | None = None,
     ) -> Bool[np.ndarray, " m"]:
-        """Return which matches agree, by an association for `wide` ellipses or the settings'."""
-        S, several = predicted.joint, wide is not None
+        """Return which matches, of landmarks in these slots, agree, by an association for `wide`
+        ellipses or the settings'."""
+        association = ASSOCIATIONS[self.settings.association] if wide is None else wide
+        found = self.candidates(predicted, slots, matches, curved=wide is not None)
+        believed = _believed(association, *self._of_fixed_size(*found, wide is not None))
+        return np.asarray(believed)[: len(slots)]
+
+    def candidates(
+        self,
+        predicted: Predicted,
+        slots: Int[np.ndarray, " m"],
+        matches: Matches,
+        *,
+        curved: bool,
+    ) -> tuple[np.ndarray, ...]:
+        """Return the innovations of matches, as `Candidates` has them: residuals, covariance, and
+        which are valid; and their slots."""
         R, i = self.settings.pixel_sigma**2 * np.eye(2), np.arange(len(slots))
-        S = S[slots][:, :, slots]
+        S = predicted.joint[slots][:, :, slots]
         same = slots[:, None] == slots
         # Two matches of one landmark share all but their noise.
         first, second = np.nonzero(same & ~np.eye(len(slots), dtype=bool))
         S[first, :, second] -= R
-        if several:
+        if curved:
             S[i, :, i] += np.asarray(_curved(self.slam, *predicted[1:3], predicted.dt))[slots]
-        S[i, :, i] += (self.settings.tolerance * self.settings.pixel_sigma) ** 2 * np.eye(2)
-        found = pixels - predicted.view.pixels[slots], S, predicted.view.usable[slots], slots
-        association = ASSOCIATIONS[self.settings.association] if wide is None else wide
-        return np.asarray(_believed(association, *self._of_fixed_size(*found, several)))[
-            : len(slots)
-        ]
+        more = self.settings.noise_factors(matches.variances) - 1 + self.settings.tolerance**2
+        S[i, :, i] += more[:, None, None] * R
+        view = predicted.view
+        return matches.pixels - view.pixels[slots], S, view.usable[slots], slots
 
-    def given(
-        self, predicted: Predicted, slots: Int[np.ndarray, " k"], pixels: Float[np.ndarray, "k 2"]
-    ) -> Prediction:
-        """Return what the filter expects of the frame given that it shows these landmarks at these
-        pixels, to first order. Changes nothing."""
+    def given(self, predicted: Predicted, seen: Observations) -> Prediction:
+        """Return what the filter expects of the frame given that it shows what was seen, to first
+        order. Changes nothing."""
         view, (n, p, _, _) = predicted.view, predicted.joint.shape
         S = predicted.joint.reshape(n * p, n * p)
-        known = (p * slots[:, None] + np.arange(p)).ravel()
-        residual = (pixels - view.pixels[slots]).ravel()
-        gain = np.linalg.solve(S[np.ix_(known, known)], S[known]).T
+        known = (p * seen.slots[:, None] + np.arange(p)).ravel()
+        residual = (seen.pixels - view.pixels[seen.slots]).ravel()
+        more = (self.settings.noise_factors(seen.variances) - 1) * self.settings.pixel_sigma**2
+        of_known = S[np.ix_(known, known)] + np.diag(np.repeat(more, p))
+        gain = np.linalg.solve(of_known, S[known]).T
         # The noise of a pixel that is known is no part of what else is to be expected there.
         moved = (gain @ residual).reshape(n, p)
         left = np.einsum("npk,nqk->npq", gain.reshape(n, p, -1), S[:, known].reshape(n, p, -1))
         return view._replace(pixels=view.pixels + moved, covariances=view.covariances - left)
 
-    def correct(
-        self,
-        predicted: Predicted,
-        slots: Int[np.ndarray, " k"] = _NOWHERE[0],
-        pixels: Float[np.ndarray, "k 2"] = _NOWHERE[1],
-    ) -> Correction:
-        """Update a prediction by pixels, NaN where there is none, and move into the new camera.
-        Changes nothing where that has `failed`."""
-        features = _padded(slots, pixels, self.settings.wanted)
+    def correct(self, predicted: Predicted, seen: Observations = NOTHING) -> Correction:
+        """Update a prediction by what is matched, and move into the new camera. Changes nothing
+        where that has `failed`."""
+        slots, wanted = seen.slots, self.settings.wanted
+        factors = self.settings.noise_factors(seen.variances)
+        features = _measured(_padded(slots, seen.believed, wanted), factors)
         state, correction = _correct(self.slam, predicted.state, predicted.dt, features)
         correction = Correction(*jax.device_get(correction))
         if not correction.failed:
@@ -227,7 +237,7 @@ class Estimator:
                 self.camera,
             ),
             in_background(
-                lambda: _correct.compile(slam, predicted().state, dt, new),
+                lambda: _correct.compile(slam, predicted().state, dt, _measured(new, np.zeros(0))),
                 lambda: _world_points.compile(slam, state, self.settings.capacity),
                 lambda: _remove.compile(slam, state, gone),
             ),
@@ -273,6 +283,13 @@ def _padded(slots: Int[np.ndarray, " k"], pixels: Float[np.ndarray, "k 2"], size
     return Features(
         jnp.asarray(np.pad(slots, (0, missing))), jnp.asarray(pixels), jnp.asarray(valid)
     )
+
+
+def _measured(features: Features, factors: Float[np.ndarray, " k"]) -> Features:
+    """The features with these factors of their noise."""
+    missing = len(features.slots) - len(factors)
+    more = jnp.asarray(np.pad(factors, (0, missing), constant_values=1.0))
+    return replace(features, noise_factor=more)
 
 
 @Program

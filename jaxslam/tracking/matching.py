@@ -36,16 +36,23 @@ class Matches(NamedTuple):
     """(u, v), sub-pixel."""
     scores: Float32[np.ndarray, " m"]
     """Correlations, up to 1."""
+    variances: Float[np.ndarray, " m"]
+    """Of each pixel's u and v, pixels², as the difference of the two windows tells
+    (`position_variances`)."""
 
     def only(self, which: np.ndarray) -> "Matches":
         """Some of them."""
         return Matches(*(part[which] for part in self))
 
-    def first_of_each(self, count: int) -> Float[np.ndarray, "count 2"]:
-        """The first pixel of each of so many patches, NaN of those that have none."""
-        first = np.full((count, 2), np.nan)
+    def first_of_each(
+        self, count: int
+    ) -> tuple[Float[np.ndarray, "count 2"], Float[np.ndarray, " count"]]:
+        """The first pixel of each of so many patches, and its variance; NaN and zero of those that
+        have none."""
+        first, variances = np.full((count, 2), np.nan), np.zeros(count)
         first[self.owner[::-1]] = self.pixels[::-1]
-        return first
+        variances[self.owner[::-1]] = self.variances[::-1]
+        return first, variances
 
 
 def match_patches(
@@ -71,7 +78,7 @@ def match_patches(
     was found to choose from. None where the ellipse is outside the image.
     """
     if not len(templates):
-        return Matches(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, np.float32))
+        return Matches(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, np.float32), np.zeros(0))
     whole, half = image.astype(np.float32), templates.shape[1] // 2
     ellipses = _Ellipses.of(centres, covariances)
     reach = _WIDEST * image.shape[1] if max_radius is None else max_radius
@@ -87,9 +94,11 @@ def match_patches(
     chosen = alone.joined(_several(peaks.only(in_wide)))
     chosen = chosen.only(np.argsort(chosen.owner, kind="stable"))
     pixels = chosen.pixels + _quadratic_peaks(chosen.around)
+    variances = np.zeros(len(pixels))
     if len(pixels):
         pixels = refine(whole, templates[chosen.owner], pixels)
-    return Matches(chosen.owner, pixels, chosen.scores)
+        variances = position_variances(whole, templates[chosen.owner], pixels)
+    return Matches(chosen.owner, pixels, chosen.scores, variances)
 
 
 def refine(
@@ -103,7 +112,7 @@ def refine(
     gain and offset do not matter); inverse compositional, so that the gradient is the
     template's. One that does not converge stays where it is.
     """
-    steps = _gauss_newton_steps(templates)
+    steps, _ = _gauss_newton_steps(templates)
     side = templates.shape[1] - 2
     positions = pixels
     for _ in range(_ITERATIONS):
@@ -115,6 +124,28 @@ def refine(
         positions = np.clip(positions - shifts, pixels - 2 * _MAX_SHIFT, pixels + 2 * _MAX_SHIFT)
     gone = np.abs(positions - pixels).max(axis=1) > _MAX_SHIFT
     return np.where(gone[:, None], pixels, positions)
+
+
+def position_variances(
+    image: Float32[np.ndarray, "h w"],
+    templates: Float32[np.ndarray, "n window window"],
+    pixels: Float[np.ndarray, "n 2"],
+) -> Float[np.ndarray, " n"]:
+    """The variance of u and v of places found, pixels², where what is left of each window is white.
+
+    Of windows of m pixels with unit norm, whose gradients are g, with a correlation ρ, the residual
+    has the variance `s² = 2 (1 − ρ)/m` a pixel and least squares the covariance `s² (Σ g gᵀ)⁻¹`;
+    half the trace is returned. What is left of a patch that was warped wrongly, or has two depths,
+    is not white: its errors are larger (`settings.FIT`).
+    """
+    steps, target = _gauss_newton_steps(templates)
+    windows = _windows(image, pixels, templates.shape[1] - 2)
+    windows -= windows.mean(axis=1, keepdims=True)
+    norms = np.sqrt(np.einsum("ni,ni->n", windows, windows) + 1e-6)
+    correlations = np.einsum("ni,ni->n", windows, target) / norms
+    # With steps A = (g gᵀ)⁻¹ g, (g gᵀ)⁻¹ is A Aᵀ.
+    inverse = np.einsum("nim,nim->n", steps, steps)
+    return np.maximum(1 - correlations, 0.0) / windows.shape[1] * inverse
 
 
 def _windows(
@@ -134,8 +165,9 @@ def _windows(
 
 def _gauss_newton_steps(
     templates: Float32[np.ndarray, "n window window"],
-) -> Float32[np.ndarray, "n 2 m"]:
-    """Return what takes each window of unit norm to the shift (2,) it shows against its template.
+) -> tuple[Float32[np.ndarray, "n 2 m"], Float32[np.ndarray, "n m"]]:
+    """Return what takes each window of unit norm to the shift (2,) it shows against its template,
+    and the templates' insides as such windows.
 
     The rows are orthogonal to constants and to the template's inside (m values), so they see
     the residual without its mean and gain. Zero for a template without texture in two
@@ -156,7 +188,7 @@ def _gauss_newton_steps(
     determinant = xx * yy - xy * xy
     adjugate = np.stack([yy, -xy, -xy, xx], axis=1).reshape(-1, 2, 2)
     inverse = np.where(determinant > 1e-8, 1 / np.maximum(determinant, 1e-8), 0.0)
-    return (adjugate * inverse[:, None, None]) @ gradient
+    return (adjugate * inverse[:, None, None]) @ gradient, target[:, 0]
 
 
 class _Ellipses(NamedTuple):

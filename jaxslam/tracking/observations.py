@@ -55,6 +55,8 @@ class Observations(NamedTuple):
     """Of the innovations, (k, 2, 2)."""
     pixels: np.ndarray = np.zeros((0, 2))
     """Where they were found, (k, 2); NaN where they were not."""
+    variances: np.ndarray = np.zeros(0)
+    """Of u and v of these, pixels², as `Matches` has them, (k,); zero where none was found."""
     labels: np.ndarray = np.zeros(0, "U9")
     """`matched`, `unmatched` or `outlier`, (k,): an outlier was found, and is not believed."""
 
@@ -82,7 +84,8 @@ class Observations(NamedTuple):
         there, and they have no slots."""
         count = len(pixels)
         nowhere, nothing = np.full((count, 2), np.nan), np.full((count, 2, 2), np.nan)
-        new = Observations(np.full(count, -1), nowhere, nothing, pixels, np.full(count, "new"))
+        labels = np.full(count, "new")
+        new = Observations(np.full(count, -1), nowhere, nothing, pixels, np.zeros(count), labels)
         return Observations(*map(np.concatenate, zip(self, new, strict=True)))
 
     def but_for(self, used: Bool[np.ndarray, " k"]) -> Observations:

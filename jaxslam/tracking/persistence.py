@@ -25,7 +25,7 @@ from jaxslam.tracking.map import Map
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 from jaxslam.tracking.settings import TrackerSettings
 
-FORMAT = "jaxslam tracker 2"
+FORMAT = "jaxslam tracker 3"
 
 NUMBERS = {
     "restarts": "map.number",

@@ -50,7 +50,7 @@ _LATELY = 3
 
 
 Agreement = Callable[..., Bool[np.ndarray, " m"]]
-"""A filter's judgement of matches by slots and pixels, `Estimator.believes` of one prediction."""
+"""A filter's judgement of matches and their slots, `Estimator.believes` of one prediction."""
 
 
 @dataclass
@@ -93,9 +93,7 @@ class Policy:
         agree = partial(map.estimator.believes, predicted)
         seen = self.agreeing(*searched, map.landmarks, agree, lost=lost)
         if seen.matched.any() and _sigma(seen.covariances) > WIDE:
-            given = map.estimator.given(
-                predicted, seen.slots[seen.matched], seen.pixels[seen.matched]
-            )
+            given = map.estimator.given(predicted, seen.labelled("matched"))
             closer = self._closer(seen, map.place.expected(given))
             if _explained(seen, closer):
                 searched = look(closer, self.calibration, self.settings, several=False)
@@ -126,14 +124,18 @@ class Policy:
         if len(matches.owner) > len(np.unique(matches.owner)):
             chosen = self._of_several(seen.slots, matches, landmarks, agree, least)
         else:
-            chosen = np.flatnonzero(agree(seen.slots[matches.owner], matches.pixels))
-        agreed = matches.only(chosen).first_of_each(rows)
+            chosen = np.flatnonzero(agree(seen.slots[matches.owner], matches))
+        agreed, variances = matches.only(chosen).first_of_each(rows)
         believed = np.isfinite(agreed[:, 0])
         if believed.sum() < least:
             believed[:] = False
         labels[believed] = "matched"
-        pixels = np.where(believed[:, None], agreed, matches.first_of_each(rows))
-        return seen._replace(pixels=pixels, labels=labels)
+        first, others = matches.first_of_each(rows)
+        return seen._replace(
+            pixels=np.where(believed[:, None], agreed, first),
+            variances=np.where(believed, variances, others),
+            labels=labels,
+        )
 
     def _closer(self, seen: Observations, given: Prediction) -> Prediction:
         """Return the prediction given what is matched, as far as it is to be trusted."""
@@ -194,12 +196,12 @@ class Policy:
         out most of them is not believed: the filter is one of an `ambiguous_start`.
         """
         for association in self.in_wide:
-            places = np.flatnonzero(agree(slots[matches.owner], matches.pixels, association))
+            places = np.flatnonzero(agree(slots[matches.owner], matches, association))
             some = matches.only(places)
             lately, rigid = self._rigid([landmarks[slots[row]] for row in some.owner], some.pixels)
             tested = places[_alone(some.owner, rigid | ~lately)]
             rigid = np.isin(tested, places[rigid])
-            linear = agree(slots[matches.owner[tested]], matches.pixels[tested])
+            linear = agree(slots[matches.owner[tested]], matches.only(tested))
             predictable = 2 * (linear & rigid).sum() >= rigid.sum()
             best = tested[linear if predictable else rigid]
             if len(best) >= least + (0 if predictable else MINIMAL):

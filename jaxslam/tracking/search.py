@@ -39,6 +39,7 @@ def search(
         prediction.pixels[slots],
         prediction.covariances[slots],
         np.full((len(slots), 2), np.nan),
+        np.zeros(len(slots)),
         np.full(len(slots), "unmatched"),
     )
     warped = [

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+from jaxtyping import Float
+
 from jaxslam._runtime.lookup import lookup
 from jaxslam.filters.association import ASSOCIATIONS, TOLERANCE
 from jaxslam.filters.protocol import AbstractFilter
@@ -16,6 +19,9 @@ from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.sensors import Pinhole
 
+FIT = 36.0
+"""The variance of a match by what it would be if its window's residual were white: distances from
+epipolar lines, rendered and real, are 5 to 8 times that σ at every quality of fit."""
 METRIC = "world"
 """The filter where a target says how long a metre is."""
 
@@ -55,7 +61,7 @@ class TrackerSettings:
     """σ of the log of the unit of length, for filters with a scale of their own (`scale_gauge`):
     it is unknown in metres."""
     pixel_sigma: float = 0.3
-    """σ of a match, pixels."""
+    """σ of a match whose window fits, pixels; of the others it is larger (`noise_factors`)."""
     focal_sigma: float = 1.0
     """σ of the focal lengths, pixels, of a calibration that states none and is not known."""
     centre_sigma: float = 1.0
@@ -100,6 +106,11 @@ class TrackerSettings:
     def depth(self) -> InverseDepth:
         """The prior on the depth of new landmarks."""
         return replace(InverseDepth.beyond(self.nearest_depth), unit=self.unit_sigma)
+
+    def noise_factors(self, variances: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """Return by how much more variance than that of `pixel_sigma` matches have whose windows
+        tell these, pixels²."""
+        return np.maximum(FIT * variances / self.pixel_sigma**2, 1.0)
 
     def make_filter(self, calibration: Calibration) -> AbstractFilter:
         """The filter that is named, with these numbers. Raises ValueError."""

@@ -182,7 +182,7 @@ class Tracker:
         seen, reason = self.policy.observed(
             frame.image, self.map, predicted, lost=self.unmeasured > 0
         )
-        correction = self.map.estimator.correct(predicted, seen.slots, seen.believed)
+        correction = self.map.estimator.correct(predicted, seen)
         if correction.failed:
             self.failed[Status(int(correction.status)).name.lower()] += 1
             self.map.fall_back(predicted)

@@ -234,7 +234,7 @@ def test_federated_shares_of_copies_of_one_landmark_are_one_update():
     state = replace(state, covariance=state.covariance[copies[:, None], copies])
     corrected = quick_jit(partial(correct, slam))
     seen = pixels(322.0, 322.0)
-    shared, _ = corrected(state, DT, seen, jnp.array([0.3, 0.7]))
+    shared, _ = corrected(state, DT, replace(seen, noise_factor=1 / jnp.array([0.3, 0.7])))
     alone, _ = corrected(state, DT, replace(seen, valid=jnp.array([True, False])))
     np.testing.assert_allclose(shared.landmarks, alone.landmarks, rtol=1e-9)
     np.testing.assert_allclose(shared.covariance, alone.covariance, rtol=1e-6, atol=1e-12)

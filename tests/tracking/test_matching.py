@@ -50,9 +50,9 @@ def places_of(image, templates, centres, covariances, **how):
     found = match_patches(image, templates, centres, covariances, **how)
     assert np.all(np.diff(found.owner) >= 0)
     places = [[] for _ in templates]
-    for owner, pixel, score in zip(*found, strict=True):
+    for owner, pixel, score, _ in zip(*found, strict=True):
         places[owner].append(Place(pixel, score))
-    first = found.first_of_each(len(templates))
+    first, _ = found.first_of_each(len(templates))
     for row, own in zip(first, places, strict=True):
         np.testing.assert_array_equal(row, own[0].pixel if own else np.full(2, np.nan))
     return places
@@ -105,6 +105,21 @@ def test_match_is_exact_to_a_tenth_of_a_pixel():
         errors.append(match.pixel - CENTRE - shift)
     assert np.sqrt(np.mean(np.square(errors))) < 0.05
     assert np.abs(np.mean(errors, axis=0)).max() < 0.02
+
+
+def test_the_variance_of_a_place_is_that_of_its_errors_where_pixels_are_noise():
+    """Noise on the picture and on the template, as in the tracker; a worse one says so."""
+    told, errors = [], []
+    for sigma in (3.0, 9.0):
+        template = Patch.take(picture(sigma=0.0), CENTRE).warped(np.eye(2))[None]
+        found = [
+            match_patches(picture(sigma=sigma, seed=seed), template, CENTRE[None], np.eye(2)[None])
+            for seed in range(60)
+        ]
+        told.append(np.mean([one.variances for one in found]))
+        errors.append(np.mean([(one.pixels - CENTRE) ** 2 for one in found]))
+    np.testing.assert_allclose(told, errors, rtol=0.4)
+    assert told[1] > 5 * told[0]
 
 
 def test_match_does_not_depend_on_gain_and_offset():
@@ -220,7 +235,7 @@ def test_many_patches_at_once_equal_one_by_one():
     assert together[5] is None
     assert sum(match is not None for match in together) >= 8
     none = match_patches(second, templates[:0], centres[:0], covariances[:0])
-    assert [len(part) for part in none] == [0, 0, 0]
+    assert [len(part) for part in none] == [0] * 4
 
 
 def texture(width=640, height=480, seed=4):

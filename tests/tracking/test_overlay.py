@@ -31,6 +31,7 @@ def draw(predicted, covariance, matched, status):
         np.asarray(predicted, float).reshape(-1, 2),
         np.asarray(covariance, float).reshape(-1, 2, 2),
         np.asarray(matched, float).reshape(-1, 2),
+        np.zeros(1),
         np.array([status]),
     )
     return draw_overlay(GREY, table)
@@ -103,7 +104,7 @@ def test_the_legend_fits_its_width(width):
     nowhere = np.full((200, 2), np.nan)
     labels = np.array(["matched", "unmatched", "outlier", "new"] * 50)
     everything = Observations(
-        np.arange(200), nowhere, np.full((200, 2, 2), np.nan), nowhere, labels
+        np.arange(200), nowhere, np.full((200, 2, 2), np.nan), nowhere, np.zeros(200), labels
     )
     notes = (
         "frame 12345  1234.56 s  map 12  unit open",

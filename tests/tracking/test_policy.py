@@ -25,17 +25,18 @@ LANDMARKS = {slot: Landmark(slot, PATCH, np.eye(4), np.zeros(2)) for slot in SLO
 def table(sigma=2.0):
     covariances = np.tile(sigma**2 * np.eye(2), (COUNT, 1, 1))
     nowhere, labels = np.full((COUNT, 2), np.nan), np.full(COUNT, "unmatched")
-    return Observations(SLOTS, PLACES, covariances, nowhere, labels)
+    return Observations(SLOTS, PLACES, covariances, nowhere, np.zeros(COUNT), labels)
 
 
 def agreeing(found, agreeing, lost=False, sigma=2.0):
     """Of landmarks found a pixel aside, those agree whose rows are told."""
     owner = np.array(found, int)
-    matches = Matches(owner, PLACES[owner] + ASIDE, np.ones(len(owner), np.float32))
+    scores, variances = np.ones(len(owner), np.float32), np.zeros(len(owner))
+    matches = Matches(owner, PLACES[owner] + ASIDE, scores, variances)
     policy = Policy(CAMERA, TrackerSettings(), ambiguous_start=False)
 
-    def agree(slots, pixels):
-        np.testing.assert_array_equal(pixels, matches.pixels)
+    def agree(slots, those):
+        assert those is matches
         return np.isin(slots, SLOTS[list(agreeing)])
 
     return policy.agreeing(table(sigma), matches, LANDMARKS, agree, lost=lost)

@@ -185,6 +185,7 @@ def test_innovations_are_of_all_that_was_found_believed_or_not(tracked):
             np.array([[10.0, 20.0], [5.0, 5.0], [0.0, 0.0]]),
             np.stack([np.diag([4.0, 1.0]), np.eye(2), np.array([[2.0, 1.0], [1.0, 2.0]])]),
             np.array([[12.0, 21.0], [np.nan, np.nan], [1.0, 1.0]]),
+            np.zeros(3),
             np.array(["matched", "unmatched", "outlier"]),
         ),
     )  # fmt: skip

@@ -180,7 +180,7 @@ def test_a_start_that_is_found_out_ends_in_one_unit(plain, started):
     # What this filter makes of the depths meanwhile changes by less than its units do.
     shares = np.array(places[1:FIXED]) / truth[1:FIXED] / ratio
     units = np.asarray(started.tracker.map.estimator.slam.opening)
-    assert np.abs(np.log(shares)).max() < 0.25 < np.abs(np.diff(units)).max()
+    assert np.abs(np.log(shares)).max() < 0.3 < np.abs(np.diff(units)).max()
     # The log of the map's unit: what the filter takes for metres, by what is written.
     expected = WANDER[FRAMES - 1] - np.log(ratio)
     assert started.tracker.map.place.log_scale == pytest.approx(expected, abs=1e-3)

@@ -88,11 +88,11 @@ class RaySum(AbstractEntry):
         state = slam.gaussian_form.remove(replace(state, memory=memory), memory.ravel() == 0)
         share = jnp.where(weights > 0, weights**self.privilege, 0.0)
         share = share / jnp.sum(share, axis=1, keepdims=True)
-        return correct(slam, state, control, self._of_members(features, share > 0), share.ravel())
+        return correct(slam, state, control, self._of_members(features, share))
 
     def initialise(self, slam: EkfSlam, state: State, features: Features) -> State:
         """Begin rays, with members of equal weight."""
-        every = jnp.ones((features.slots.size, self.members), bool)
+        every = jnp.ones((features.slots.size, self.members))
         inverse_depth = jnp.tile(1 / self.depths(features.measured.dtype), features.slots.size)[
             :, None
         ]
@@ -131,12 +131,13 @@ class RaySum(AbstractEntry):
     def _slots_of(self, features: Features) -> Int[Array, "m members"]:
         return features.slots[:, None] * self.members + jnp.arange(self.members)
 
-    def _of_members(self, features: Features, which: Bool[Array, "m members"]) -> Features:
-        """The same measurement for each of a landmark's members."""
+    def _of_members(self, features: Features, share: Float[Array, "m members"]) -> Features:
+        """The same measurement for each of a landmark's members, for a share ρ with noise R/ρ."""
         return Features(
             self._slots_of(features).ravel(),
             jnp.repeat(features.measured, self.members, axis=0),
-            (features.valid[:, None] & which).ravel(),
+            (features.valid[:, None] & (share > 0)).ravel(),
+            1 / jnp.where(share > 0, share, 1.0).ravel(),
         )
 
 

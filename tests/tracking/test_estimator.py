@@ -1,0 +1,102 @@
+"""What the tracker makes of a prediction's joint covariance, against the filter's own update."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2")
+
+from jaxslam.filters.association import candidates
+from jaxslam.models.observations import Features
+from jaxslam.tracking.matching import Matches
+from jaxslam.tracking.observations import Observations
+from jaxslam.tracking.settings import FIT, TrackerSettings
+from jaxslam.tracking.synthetic import synthetic_source
+from jaxslam.tracking.tracker import Tracker
+
+SMALL = TrackerSettings(filter="world", wanted=12, spare=4)
+
+
+@pytest.fixture(scope="module")
+def estimator():
+    """Of a tracker after two frames."""
+    source = synthetic_source(frames=2)
+    tracker = Tracker(source.calibration, SMALL)
+    for frame in source:
+        tracker.track(frame)
+    return tracker.map.estimator
+
+
+def found(predicted, slots, aside, variances):
+    """Matches of these slots, so many pixels from where they are expected."""
+    count = len(slots)
+    pixels = predicted.view.pixels[slots] + aside
+    return Matches(np.arange(count), pixels, np.ones(count, np.float32), np.array(variances))
+
+
+def test_matches_are_tested_as_innovations_of_the_filter_with_their_own_noise(estimator):
+    slots = np.array([0, 3, 3, 5])  # one landmark was found twice
+    variances = np.array([0.0, 1.0, 2.0, 3.0]) * SMALL.pixel_sigma**2 / FIT
+    aside = np.array([[0.1, 0.0], [0.2, -0.1], [2.0, 1.0], [0.0, 0.3]])
+    with jax.enable_x64(True):
+        predicted = estimator.predict(1 / 30)
+        matches = found(predicted, slots, aside, variances)
+        residual, S, valid, _ = estimator.candidates(predicted, slots, matches, curved=False)
+        factors = jnp.array([1.0, 1.0, 2.0, 3.0])
+        features = Features(jnp.array(slots), jnp.array(matches.pixels), jnp.ones(4, bool), factors)
+        tolerance = SMALL.tolerance * SMALL.pixel_sigma
+        direct = candidates(estimator.slam, predicted.gaussian, predicted.dt, features, tolerance)
+    np.testing.assert_allclose(residual, direct.residual, atol=1e-9)
+    np.testing.assert_allclose(S, direct.covariance, rtol=1e-9, atol=1e-9)
+    assert valid.all()
+
+
+def test_what_is_expected_given_a_match_is_what_the_filter_expects_after_it(estimator):
+    """To first order: of a match a hundredth of a pixel aside, as exactly as may be."""
+    slots, aside = np.array([1, 4]), np.array([[0.01, 0.0], [-0.005, 0.01]])
+    variances = np.array([0.0, 4.0]) * SMALL.pixel_sigma**2 / FIT
+    with jax.enable_x64(True):
+        predicted = estimator.predict(1 / 30)
+        matches = found(predicted, slots, aside, variances)
+        seen = Observations(
+            slots,
+            predicted.view.pixels[slots],
+            predicted.view.covariances[slots],
+            matches.pixels,
+            variances,
+            np.full(2, "matched"),
+        )
+        given = estimator.given(predicted, seen)
+        features = Features(
+            jnp.array(slots), jnp.array(matches.pixels), jnp.ones(2, bool), jnp.array([1.0, 4.0])
+        )
+        state, _ = estimator.slam.update(predicted.gaussian, predicted.dt, features)
+        after = estimator.slam.predict_features(state, predicted.dt, jnp.arange(SMALL.capacity))
+    others = np.setdiff1d(np.flatnonzero(predicted.view.usable), slots)
+    moved = given.pixels - predicted.view.pixels
+    assert np.abs(moved[others]).max() > 1e-3
+    np.testing.assert_allclose(
+        moved[others], (after.measured - predicted.view.pixels)[others], atol=1e-5
+    )
+    np.testing.assert_allclose(
+        given.covariances[others], after.covariance[others], rtol=1e-3, atol=1e-4
+    )
+
+
+def test_noise_that_is_larger_by_a_factor_is_of_a_worse_sensor(estimator):
+    slots, aside = np.array([0, 2, 6]), np.array([[0.2, 0.1], [0.0, -0.3], [0.4, 0.0]])
+    with jax.enable_x64(True):
+        predicted = estimator.predict(1 / 30)
+        pixels = jnp.array(predicted.view.pixels[slots] + aside)
+        features = Features(jnp.array(slots), pixels, jnp.ones(3, bool), jnp.full(3, 4.0))
+        state, _ = estimator.slam.update(predicted.gaussian, predicted.dt, features)
+        sensor = replace(estimator.slam.sensor, sigma=2 * SMALL.pixel_sigma)
+        worse = replace(estimator.slam, sensor=sensor)
+        other, _ = worse.update(
+            predicted.gaussian, predicted.dt, replace(features, noise_factor=None)
+        )
+    np.testing.assert_allclose(state.covariance, other.covariance, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(state.landmarks, other.landmarks, rtol=1e-9)
