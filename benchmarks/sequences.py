@@ -177,7 +177,9 @@ def page(results: Results) -> str:
         "orientations: −1 is a world behind the camera. *Orientation*: its RMS error, in degrees.",
         "*In 1 s*: the relative pose error over one second, in percent of the way made in it, and",
         "in degrees. A camera that is lost for 15 frames begins a new *map*, in another unit of",
-        "length. Times, without the overlay, are of a machine that others used too.",
+        "length. Times, without the overlay, are of a machine that others used too. The rows of",
+        "other filters than the first are of the tracker before it weighed matches by their fit",
+        "and searched wide ellipses twice.",
     ]
     for name, filters in results.items():
         one = next(iter(filters.values()))
