@@ -97,7 +97,8 @@ class Policy:
             closer = self._closer(seen, map.place.expected(given))
             if _explained(seen, closer):
                 searched = look(closer, self.calibration, self.settings, several=False)
-                seen = self.agreeing(*searched, map.landmarks, agree, lost=lost)
+                again = self.agreeing(*searched, map.landmarks, agree, lost=lost)
+                seen = again if again.matched.any() else seen
         reason = self.reason(seen, map.landmarks)
         if reason is not None:
             labels = np.where(seen.matched, "outlier", seen.labels)
