@@ -98,6 +98,9 @@ def describe(summary: Summary) -> str:
         f"{seconds['per_frame_median'] * 1e3:.0f} ms a frame (median), "
         f"{seconds['total']:.1f} s in all, {seconds['start']:.1f} s of them to start",
     ]
+    if summary["lost"]:
+        reasons = (f"{count} {reason}" for reason, count in summary["lost_reasons"].items())
+        lines.append(f"{summary['lost']} frames lost: {', '.join(reasons)}")
     if summary["maps"] > 1:
         lines.append(
             f"{summary['maps']} maps, each in a unit of its own: frames.csv says where they begin"

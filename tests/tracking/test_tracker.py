@@ -256,9 +256,12 @@ def test_a_camera_that_was_lost_for_long_begins_a_new_map(restarted):
     states = ["start", *["tracked"] * 7, *["lost"] * 6, "start", *["tracked"] * 7]
     assert [row["state"] for row in rows] == states
     assert [int(row["map"]) for row in rows] == [0] * LIGHT + [1] * (END - LIGHT)
+    lost = [DARK <= index <= LIGHT for index in range(END)]
     assert summary["maps"] == 2
     assert [(unit["map"], unit["fixed_at"]) for unit in summary["units"]] == [(0, 0), (1, LIGHT)]
     assert (summary["tracked"], summary["lost"]) == (END - 7, 7)
+    assert [row["reason"] for row in rows] == ["few agree" if state else "" for state in lost]
+    assert "7 frames lost: 7 few agree" in describe(summary)
     # σ/ρ of the prior on an inverse depth is ½, in each of the two maps.
     assert summary["log_scale_sigma_between_maps"] == pytest.approx(np.sqrt(0.5), rel=1e-12)
     assert "2 maps, each in a unit of its own" in describe(summary)
