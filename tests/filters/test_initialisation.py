@@ -181,7 +181,7 @@ def test_members_share_a_measurement_by_their_weights_to_the_privilege(privilege
     shares = []
 
     def recorded(*data):
-        shares.append(data[-1])
+        shares.append(1 / data[-1].noise_factor)
         return correct(*data)
 
     monkeypatch.setattr(rays, "correct", recorded)

@@ -37,9 +37,7 @@ def said(name, unit=None):
     def run(first, known, new, controls):
         state = slam.init(of.capacity, first)
         for k in range(STEPS):
-            at = [
-                replace(f, **{n: getattr(f, n)[k] for n in f.__annotations__}) for f in (known, new)
-            ]
+            at = jax.tree.map(lambda x, k=k: x[k], (known, new))
             state, _ = slam.step(state, controls[k], *at)
         return (
             camera_pose(slam, state)[1],

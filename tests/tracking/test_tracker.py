@@ -101,8 +101,8 @@ def test_the_tracker_calls_no_lapack(name_of_filter, monkeypatch):
         tracker.track(frame)
     tracker.points()
     tracker.camera()
-    # A map that begins with known points is begun by the same functions.
-    assert calls.keys() | {"_remove", "_begin_known"} == jitted.keys()
+    # Known points begin a map by the same functions, and no ellipse is curved in three frames.
+    assert calls.keys() | {"_remove", "_begin_known", "_curved"} == jitted.keys()
     assert len(calls) >= 6
     assert set().union(*calls.values()) == set()
 
