@@ -25,6 +25,7 @@ from jaxslam.tracking.tracker import Tracker
 from jaxslam.tracking.trajectory import (
     absolute_trajectory_error,
     alignment,
+    orientation_error,
     relative_pose_error,
 )
 
@@ -49,7 +50,7 @@ def summarised(
     updates = history[1:]
     dof = sum(result.nis_dof for result in updates)
     count = max(len(updates), 1)
-    later = seconds[WARM_UP:] or seconds
+    later = seconds[WARM_UP:] or seconds or [0.0]
     summary = {
         "schema": SCHEMA,
         "version": __version__,
@@ -121,7 +122,9 @@ def describe(summary: Summary) -> str:
             f"orientation {ate['orientation_rmse']:.2f}°"
         )
     if "no_ate" in summary:
-        lines.append(f"no trajectory error: {summary['no_ate']}")
+        turned = summary.get("orientation_rmse")
+        angle = "" if turned is None else f"; orientation {turned:.2f}°"
+        lines.append(f"no trajectory error: {summary['no_ate']}{angle}")
     return "\n".join(lines)
 
 
@@ -243,7 +246,10 @@ def _errors(source: Source, history: Sequence[Tracked]) -> Summary:
     try:
         errors: Summary = {"ate": absolute_trajectory_error(*trajectories)}
     except ValueError as error:  # of few frames, or of a camera that stood still
-        return {"no_ate": str(error)}
+        errors = {"no_ate": str(error)}
+        with suppress(ValueError):  # it may have turned
+            errors["orientation_rmse"] = orientation_error(*trajectories)
+        return errors
     with suppress(ValueError):  # of less than a second
         errors["rpe"] = relative_pose_error(*trajectories)
     return errors

@@ -104,17 +104,29 @@ def absolute_trajectory_error(
     """
     pairs = _paired(estimate_times, estimate, reference_times, reference)
     positions, aligned = pairs.reference[:, :3, 3], pairs.aligned()
-    sign, angle = _by_orientation(pairs.estimate, pairs.reference)
+    turn, angle = _by_orientation(pairs.estimate, pairs.reference)
     return {
         "alignment": "sim3",
         "rmse": _rms(aligned[:, :3, 3] - positions),
         "path_length": float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()),
         "extent": float(np.linalg.norm(np.ptp(positions, axis=0))),
         "matched": len(pairs.times),
-        "sign": sign,
+        "sign": _sign(turn, pairs.estimate[:, :3, 3], positions),
         "orientation_rmse": angle,
         "straight_line": _straight_line(pairs.times, positions),
     }
+
+
+def orientation_error(
+    estimate_times: ArrayLike,
+    estimate: ArrayLike,
+    reference_times: ArrayLike,
+    reference: ArrayLike,
+) -> float:
+    """The `orientation_rmse` of `absolute_trajectory_error`, of the same arguments, also of cameras
+    that only turn. Raises ValueError where fewer than three poses pair up."""
+    pairs = _paired(estimate_times, estimate, reference_times, reference)
+    return _by_orientation(pairs.estimate, pairs.reference)[1]
 
 
 def relative_pose_error(
@@ -203,15 +215,21 @@ def _rms(errors: Float[np.ndarray, "k n"]) -> float:
 
 def _by_orientation(
     estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]
-) -> tuple[float, float]:
-    """`sign` and `orientation_rmse`, by the mean rotation from estimated to true orientations."""
+) -> tuple[Rotation, float]:
+    """Return the mean rotation from estimated to true orientations, and `orientation_rmse`."""
     true, estimated = (Rotation.from_matrix(T[:, :3, :3]) for T in (reference, estimate))
     turn = (true * estimated.inv()).mean()
     angles = (true.inv() * turn * estimated).magnitude()
-    positions, turned = reference[:, :3, 3], turn.apply(estimate[:, :3, 3])
-    a, b = positions - positions.mean(0), turned - turned.mean(0)
-    sign = np.sum(a * b) / np.sqrt(np.sum(a**2) * np.sum(b**2))
-    return float(sign), float(np.degrees(np.sqrt(np.mean(angles**2))))
+    return turn, float(np.degrees(np.sqrt(np.mean(angles**2))))
+
+
+def _sign(
+    turn: Rotation, estimate: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "n 3"]
+) -> float:
+    """Return the correlation of the positions after that rotation."""
+    turned = turn.apply(estimate)
+    a, b = reference - reference.mean(0), turned - turned.mean(0)
+    return float(np.sum(a * b) / np.sqrt(np.sum(a**2) * np.sum(b**2)))
 
 
 def _straight_line(times: Float[np.ndarray, " n"], positions: Float[np.ndarray, "n 3"]) -> float:

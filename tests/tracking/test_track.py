@@ -97,6 +97,20 @@ def test_without_a_reference_that_fits_the_map_is_drawn_all_the_same(tmp_path):
     assert names(tmp_path) == NUMBERS | FIGURES
 
 
+def test_a_camera_that_turned_on_the_spot_is_told_its_orientation_error(tmp_path):
+    source = small(4)
+    assert source.reference is not None
+    still = source.reference.T_wc.copy()
+    still[:, :3, 3] = 0
+    reference = source.reference._replace(T_wc=still)
+    written = tracking.track(
+        replace(source, reference=reference), tmp_path, SETTINGS, overlay=False
+    )
+    assert 0 < written["orientation_rmse"] < 1
+    told = f"in one place; a Sim(3) needs a motion; orientation {written['orientation_rmse']:.2f}°"
+    assert told in summary.describe(written)
+
+
 def test_the_command_says_that_it_compiles_and_hands_over_what_is_wanted(monkeypatch, capsys):
     said, asked = [], {}
 

@@ -13,6 +13,7 @@ from jaxslam.tracking.trajectory import (
     TRACKED,
     absolute_trajectory_error,
     alignment,
+    orientation_error,
     relative_pose_error,
     write_covariances,
     write_trajectory,
@@ -182,6 +183,18 @@ def test_orientation_error_is_the_angle_that_one_rotation_leaves():
     turned[::2, :3, :3], turned[1::2, :3, :3] = turn, turn.T
     result = absolute_trajectory_error(times, turned, times, same)
     assert result["orientation_rmse"] == pytest.approx(5, abs=1e-6)
+
+
+def test_a_camera_that_only_turns_has_an_orientation_error_too():
+    times, reference = wave()
+    reference[:, :3, 3] = 0
+    turn = Rotation.from_rotvec([0, np.radians(5), 0]).as_matrix()
+    estimate = reference.copy()
+    estimate[::2, :3, :3] = reference[::2, :3, :3] @ turn
+    estimate[1::2, :3, :3] = reference[1::2, :3, :3] @ turn.T
+    with pytest.raises(ValueError, match="in one place"):
+        absolute_trajectory_error(times, estimate, times, reference)
+    assert 4.5 < orientation_error(times, estimate, times, reference) <= 5
 
 
 def test_relative_error_is_that_of_a_second_in_the_references_unit():
