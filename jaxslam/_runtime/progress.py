@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from typing import Any
 
 from jaxslam._runtime.extras import missing
 
 LINE_SECONDS = 10.0
 """Seconds between two lines of a log; what takes less has none."""
+_UNTIMED = "{desc}: {n_fmt}/{total_fmt} [{elapsed}]"
 
 
 def bar(total: int | None, unit: str, desc: str | None = None, done: int = 0) -> Any:
@@ -28,6 +32,26 @@ def bar(total: int | None, unit: str, desc: str | None = None, done: int = 0) ->
         total=total, unit=unit, desc=desc, initial=done, file=_Lines(sys.stderr), ncols=80,
         ascii=True, delay=LINE_SECONDS, mininterval=LINE_SECONDS, maxinterval=LINE_SECONDS,
     )  # fmt: skip
+
+
+@contextmanager
+def warming_bar(
+    total: int | None, unit: str, first: str, warm_up: int, then: str
+) -> Generator[Callable[[int], None]]:
+    """Return the update of a bar that says `first`, and no time left, until `warm_up` are done;
+    `then` what is left is judged by what follows."""
+    with bar(total, unit, first) as shown:
+        smoothing, shown.smoothing, shown.bar_format = shown.smoothing, 0.0, _UNTIMED
+
+        def update(count: int) -> None:
+            shown.update(count)
+            if shown.n == warm_up:
+                shown.smoothing, shown.bar_format = smoothing, None
+                shown.initial = shown.last_print_n = shown.n
+                shown.start_t = shown.last_print_t = time.time()
+                shown.set_description(then)
+
+        yield update
 
 
 class StudyBar:

@@ -89,7 +89,7 @@ class TrackOptions:
     def run(self) -> None:
         """Track the video, print the summary, write its files."""
         require_vision("tracking")
-        from jaxslam._runtime.progress import bar
+        from jaxslam._runtime.progress import warming_bar
         from jaxslam.tracking.summary import WARM_UP, describe
         from jaxslam.tracking.target import read_target
         from jaxslam.tracking.video import track
@@ -98,13 +98,7 @@ class TrackOptions:
             source = self._source()
         target = None if self.target is None else read_target(self.target)
         total = len(source) or self.frames
-        with bar(total, "frame", _COMPILING) as shown:
-
-            def progress(frames: int) -> None:
-                shown.update(frames)
-                if shown.n == WARM_UP:
-                    shown.set_description("tracking")
-
+        with warming_bar(total, "frame", _COMPILING, WARM_UP, "tracking") as progress:
             summary = track(
                 source,
                 self.out,

@@ -40,6 +40,23 @@ def test_what_is_short_leaves_no_line_in_a_log(monkeypatch):
     assert written(monkeypatch, io.StringIO(), patience=10.0) == ""
 
 
+def test_no_time_is_left_to_tell_before_it_is_warm(monkeypatch):
+    """A step of an hour, which compiles, says nothing of those that come after it."""
+    now = [0.0]
+    monkeypatch.setattr("time.time", lambda: now[0])
+    monkeypatch.setattr("tqdm.std.time", lambda: now[0])
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with progress.warming_bar(10, "frame", "compiling", 2, "tracking") as update:
+        for seconds in (3600, 3600, 1, 1):
+            now[0] += seconds
+            update(1)
+    cold, warm = terminal.getvalue().split("tracking", 1)
+    assert "compiling: 1/10 [1:00:00]" in cold
+    assert "<" not in cold.replace("0/10 [00:00<?", "")
+    assert "4/10 [00:02<00:06" in warm
+
+
 def test_a_study_moves_a_bar_to_its_end(monkeypatch):
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
