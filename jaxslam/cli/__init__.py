@@ -6,11 +6,11 @@ import os
 import signal
 import sys
 import textwrap
+import threading
 from typing import NoReturn
 
 from jaxslam._runtime.extras import missing
 from jaxslam._version import __version__
-from jaxslam.cli.cache import keep_programs
 
 _BROKEN_PIPE = 141
 """The exit status of a command that SIGPIPE ends, as a shell has it."""
@@ -23,16 +23,7 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"jaxslam {__version__}")
         return
     try:
-        import tqdm  # noqa: F401
-
-        from jaxslam.cli.commands import parse
-    except ImportError as error:
-        _fail(2, str(missing("the command line needs", "cli", error)))
-    options = parse(given)
-    signal.signal(signal.SIGTERM, _interrupt)
-    keep_programs()
-    try:
-        options.run()
+        _run(given)
         sys.stdout.flush()
     except ValueError as error:
         _fail(2, str(error))
@@ -42,7 +33,22 @@ def main(arguments: list[str] | None = None) -> None:
     except OSError as error:  # a path that is too long, a folder that may not be written
         _fail(2, f"{textwrap.shorten(str(error.filename), 80)}: {error.strerror or error}")
     except KeyboardInterrupt as interrupt:
-        _fail(130, f"interrupted{f': {interrupt}' if str(interrupt) else ''}")
+        told = f": {interrupt}" if str(interrupt) else ""
+        _fail(130, f"interrupted{told}")
+
+
+def _run(given: list[str]) -> None:
+    try:
+        import tqdm  # noqa: F401
+
+        from jaxslam.cli.cache import keep_programs
+        from jaxslam.cli.commands import parse
+    except ImportError as error:
+        _fail(2, str(missing("the command line needs", "cli", error)))
+    options = parse(given)
+    signal.signal(signal.SIGTERM, _interrupt)
+    keep_programs()
+    options.run()
 
 
 def _interrupt(*_) -> None:
@@ -51,4 +57,8 @@ def _interrupt(*_) -> None:
 
 def _fail(status: int, message: str) -> NoReturn:
     print(f"jaxslam: {' '.join(message.split())}", file=sys.stderr)
-    sys.exit(status)
+    if all(thread.daemon for thread in set(threading.enumerate()) - {threading.main_thread()}):
+        sys.exit(status)
+    # Else Python would wait for a program that is compiled aside, for a minute.
+    sys.stdout.flush()
+    os._exit(status)

@@ -52,9 +52,10 @@ def track(
     summary.
 
     An interruption (KeyboardInterrupt) or an unreadable frame (ValueError) leaves all of them for
-    the frames so far, and is raised again. `slam` is a filter of one's own, in place of the one
-    that the settings name. `target`, known points that the first frame sees, makes the map metric.
-    `viewer` is a file for the rerun viewer, FILE.rrd, written beside the others.
+    the frames so far, and is raised again; an interruption of the first frame or the second leaves
+    none. `slam` is a filter of one's own, in place of the one that the settings name. `target`,
+    known points that the first frame sees, makes the map metric. `viewer` is a file for the rerun
+    viewer, FILE.rrd, written beside the others.
     """
     recording = None if viewer is None else Viewer(viewer, source.calibration)
     tracker = Tracker(source.calibration, settings or TrackerSettings(), slam, target)
@@ -75,8 +76,9 @@ def track(
                 seconds.append(now - start)
                 start = now
                 progress(1)
-    except BaseException:
-        if history:
+    except BaseException as error:
+        # After the first frame there is nothing to tell yet, and what tells it may be compiling.
+        if len(history) > isinstance(error, KeyboardInterrupt):
             _write(source, tracker, history, seconds, out)
         raise
     return _write(source, tracker, history, seconds, out)

@@ -131,6 +131,21 @@ jaxslam.cli.main([])
     assert (command.returncode, error) == (141, "")
 
 
+def test_an_interrupted_command_waits_for_nothing_that_compiles():
+    code = """
+import threading, time, jaxslam.cli
+def interrupted(given):
+    threading.Thread(target=time.sleep, args=(100,)).start()
+    raise KeyboardInterrupt
+jaxslam.cli._run = interrupted
+jaxslam.cli.main([])
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (ended.returncode, ended.stderr) == (130, "jaxslam: interrupted\n")
+
+
 def test_the_version_is_told(capsys):
     main(["--version"])
     assert capsys.readouterr().out == f"jaxslam {jaxslam.__version__}\n"

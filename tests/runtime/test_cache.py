@@ -72,7 +72,7 @@ def test_a_folder_that_cannot_be_made_is_done_without(told, tmp_path):
 
 def test_commands_keep_programs_and_an_import_does_not(monkeypatch, tmp_path):
     called = []
-    monkeypatch.setattr(jaxslam.cli, "keep_programs", lambda: called.append(1))
+    monkeypatch.setattr("jaxslam.cli.cache.keep_programs", lambda: called.append(1))
     with pytest.raises(SystemExit):
         jaxslam.cli.main(["consistency", "--runs", "0", "--out", str(tmp_path)])
     assert called == [1]
