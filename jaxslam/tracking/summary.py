@@ -92,10 +92,15 @@ def summarised(
 def describe(summary: Summary) -> str:
     """The summary in a few lines."""
     nis, seconds = summary["nis"], summary["seconds"]
-    per_dof = nis["mean"] / nis["dof"] if nis["dof"] else float("nan")
+    if not summary["landmarks"]["created"]:
+        return (
+            f"{summary['source']}: no map was begun, as nothing was seen: in none of its "
+            f"{summary['frames']} frames were there corners enough. Are they dark, or of one grey?"
+        )
+    per_dof = f", NIS per dof {nis['mean'] / nis['dof']:.2f}" if nis["dof"] else ""
     lines = [
         f"{summary['source']}: {summary['tracked']} of {summary['frames']} frames tracked, "
-        f"{summary['matches_per_frame']:.1f} matches a frame, NIS per dof {per_dof:.2f}",
+        f"{summary['matches_per_frame']:.1f} matches a frame{per_dof}",
         f"{seconds['per_frame_median'] * 1e3:.0f} ms a frame (median), "
         f"{seconds['total']:.1f} s in all, {seconds['start']:.1f} s of them to start",
     ]

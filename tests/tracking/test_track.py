@@ -97,6 +97,29 @@ def test_without_a_reference_that_fits_the_map_is_drawn_all_the_same(tmp_path):
     assert names(tmp_path) == NUMBERS | FIGURES
 
 
+def test_a_video_in_which_nothing_is_seen_is_told_so(tmp_path):
+    source = small(4)
+
+    def black():
+        for image in source.images():
+            yield np.zeros_like(image)
+
+    written = tracking.track(replace(source, images=black), tmp_path, SETTINGS, overlay=False)
+    told = summary.describe(written)
+    assert "no map was begun, as nothing was seen: in none of its 4 frames" in told
+    assert "nan" not in told
+
+
+def test_an_interruption_of_the_start_waits_for_no_program(tmp_path, monkeypatch):
+    def stop(frames):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tracking, "_write", fail)
+    with pytest.raises(KeyboardInterrupt):
+        tracking.track(small(3), tmp_path, SETTINGS, overlay=False, progress=stop)
+    assert not names(tmp_path)
+
+
 def test_a_camera_that_turned_on_the_spot_is_told_its_orientation_error(tmp_path):
     source = small(4)
     assert source.reference is not None
