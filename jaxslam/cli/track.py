@@ -45,8 +45,9 @@ class TrackOptions:
     """Where to begin, seconds after the first frame: at the frame that is nearest."""
     every: int = 1
     """Track every n-th frame only."""
-    scale: float = 1.0
-    """Make pictures, and their calibration, so many times as large: 0.5 for half the size."""
+    scale: float | None = None
+    """Make pictures, and their calibration, so many times as large: 0.5 for half the size. By
+    default, and without a target, those above 1280 pixels are halved, or a third and so on."""
     seed: int = 0
     """Seed of the synthetic video; nothing else is random."""
     rate: float = 30.0
@@ -129,7 +130,8 @@ class TrackOptions:
                 start=self.start,
                 every=self.every,
                 frames=self.frames,
-                scale=self.scale,
+                # A target's pixels are those of the pictures as they are.
+                scale=1.0 if self.scale is None and self.target else self.scale,
             )
         if self.calibration or self.fov is not None or self.reference or self.target:
             raise ValueError(
@@ -139,7 +141,8 @@ class TrackOptions:
         source = synthetic_source(
             frames=150 if self.frames is None else self.frames, seed=self.seed
         )
-        return resized(selected(source, start=self.start, every=self.every), self.scale)
+        part = selected(source, start=self.start, every=self.every)
+        return part if self.scale is None else resized(part, self.scale)
 
     def _settings(self):
         metric = self.filter == "recommended" and self.target is not None

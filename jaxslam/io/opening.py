@@ -25,6 +25,8 @@ from jaxslam.io.tum_rgbd import TUM_RGBD
 
 LAYOUTS = (CAMERA, VIDEO, TUM_RGBD, EUROC, KITTI, SEVEN_SCENES, TIMESTAMPED, PLAIN)
 """The first that recognises a path opens it; a new layout is one file and one name."""
+WIDEST = 1280
+"""Pixels along the longer side up to which pictures are taken as they are."""
 
 
 def open_source(
@@ -37,7 +39,7 @@ def open_source(
     start: float = 0.0,
     every: int = 1,
     frames: int | None = None,
-    scale: float = 1.0,
+    scale: float | None = None,
 ) -> Source:
     """The video at `path`, in the first of `LAYOUTS` that recognises it.
 
@@ -45,9 +47,10 @@ def open_source(
     trajectory) override what the layout holds; where nothing is known of the camera, its
     calibration is guessed, with a warning. `rate` is the frame rate in 1/s of a plain folder of
     images. Taken is every `every`-th frame, from `start` seconds after the first on, `frames` of
-    them at the most, pictures and calibration `scale` times as large. Raises `ValueError`, naming
-    the file and line, for anything missing, unreadable or contradictory; the first image is read
-    here, later ones as the source is iterated over.
+    them at the most, pictures and calibration `scale` times as large: by default those of more than
+    `WIDEST` pixels are made a half as large, or a third and so on, with a warning. Raises
+    `ValueError`, naming the file and line, for anything missing, unreadable or contradictory; the
+    first image is read here, later ones as the source is iterated over.
     """
     if calibration and fov is not None:
         raise ValueError("a calibration and a field of view are given; one of them is accepted")
@@ -64,6 +67,8 @@ def open_source(
     )  # fmt: skip
     if reference is not None:
         source = replace(source, reference=Trajectory(*read_tum(reference)))
+    if scale is None:
+        scale = _scale_for(recording.name, width, height)
     return resized(selected(source, start=start, every=every, frames=frames), scale)
 
 
@@ -91,6 +96,18 @@ def _found(path: Path) -> str:
         return f"a file {path.suffix or 'without an ending'}"
     names = [file.name + "/" * file.is_dir() for file in itertools.islice(path.iterdir(), 5)]
     return f"a folder with {', '.join(sorted(names)) + ', …' if names else 'nothing in it'}"
+
+
+def _scale_for(name: str, width: int, height: int) -> float:
+    """Return by how much pictures are made smaller that are too large to be tracked well."""
+    part = math.ceil(max(width, height) / WIDEST)
+    if part > 1:
+        warnings.warn(
+            f"{name}: pictures of {width}x{height} are tracked at 1/{part} of their size, which is "
+            "faster, and better for patches of so many pixels; a scale of 1 keeps them",
+            stacklevel=3,
+        )
+    return 1 / part
 
 
 def _calibration(

@@ -206,6 +206,28 @@ def test_a_smaller_picture_and_its_calibration_see_a_point_in_the_same_direction
     np.testing.assert_allclose(centre, (source.calibration.matrix @ ray)[:2], rtol=0, atol=0.05)
 
 
+@pytest.mark.parametrize(
+    ("size", "tracked"),
+    [((1280, 960), (1280, 960)), ((1920, 1080), (960, 540)), ((1080, 2700), (360, 900))],
+)
+def test_pictures_too_large_are_made_smaller_with_their_calibration(tmp_path, size, tracked):
+    camera = Calibration(size[0], size[1], 1000.0, 1000.0, 500.0, 500.0)
+    write_calibration(tmp_path / "calibration.json", camera)
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "0.png"), np.zeros(size[::-1], np.uint8))
+    set_lines(tmp_path, "0 0.png")
+    if size == tracked:
+        source = open_source(tmp_path)
+    else:
+        part = size[0] // tracked[0]
+        told = f"pictures of {size[0]}x{size[1]} are tracked at 1/{part} of their size"
+        with pytest.warns(UserWarning, match=told):
+            source = open_source(tmp_path)
+    assert source.calibration == camera.resized(*tracked)
+    assert next(iter(source)).image.shape == tracked[::-1]
+    assert open_source(tmp_path, scale=1).calibration == camera
+
+
 def test_a_picture_of_another_size_is_refused_before_it_is_scaled(folder, calibration):
     cv2.imwrite(str(folder / "frame5.png"), np.zeros((HEIGHT, WIDTH + 2), np.uint8))
     source = open_source(folder, calibration=calibration, scale=0.5)

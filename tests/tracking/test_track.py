@@ -10,6 +10,8 @@ import tqdm.auto
 
 pytest.importorskip("cv2")
 
+import cv2
+
 from jaxslam.cli.track import TrackOptions
 from jaxslam.tracking import overlay, summary
 from jaxslam.tracking import video as tracking
@@ -161,3 +163,12 @@ def test_the_command_says_that_it_compiles_and_hands_over_what_is_wanted(monkeyp
     assert "summary.json" in printed
     assert "seen.rrd" in printed
     assert "overlay.mp4" not in printed
+
+
+def test_the_pixels_of_a_target_are_those_of_the_pictures_as_they_are(tmp_path):
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((30, 1400), np.uint8))
+    asked = TrackOptions(tmp_path, fov=60.0, target=tmp_path / "target.json")
+    assert asked._source().calibration.width == 1400
+    assert replace(asked, scale=0.5)._source().calibration.width == 700
+    with pytest.warns(UserWarning, match="1/2 of their size"):
+        assert replace(asked, target=None)._source().calibration.width == 700
