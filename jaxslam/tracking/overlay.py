@@ -21,6 +21,7 @@ COLOURS = {
 }
 SIGMAS = 3.0  # the ellipses' size
 LEAST_RADIUS = 4.0  # pixels, of an ellipse: a smaller one would not be seen
+_WIDE, _FAINT = 40.0, 0.3  # pixels: wider ones, which all cross, are drawn so opaquely
 ROW = 18  # height of the legend's rows below the image, in pixels
 _SHIFT = 4  # OpenCV's drawing takes whole numbers: sixteenths of a pixel
 _FONT, _LIGHT, _DARK = cv2.FONT_HERSHEY_SIMPLEX, (235, 235, 235), 20
@@ -104,7 +105,10 @@ def _draw(
     expected, found = np.isfinite(predicted).all(axis=1), np.isfinite(matched).all(axis=1)
     shaped = expected & np.isfinite(covariances).all(axis=(1, 2))
     ellipses = search_ellipses(predicted[shaped], covariances[shaped])
-    _draw_lines(canvas, _dashes(ellipses) if status == "unmatched" else ellipses, status)
+    radii = np.linalg.norm(ellipses - predicted[shaped, None], axis=2).max(axis=1, initial=0.0)
+    for draw, some in ((_draw_faintly, radii > _WIDE), (_draw_lines, radii <= _WIDE)):
+        lines = ellipses[some]
+        draw(canvas, _dashes(lines) if status == "unmatched" else lines, status)
     _draw_lines(canvas, np.stack([predicted, matched], axis=1)[expected & found], status)
     _draw_marks(canvas, matched[found], status)
 
@@ -146,6 +150,15 @@ def _draw_lines(
     fixed = list(_fixed(lines))
     cv2.polylines(canvas, fixed, False, (0, 0, 0), 3, cv2.LINE_8, _SHIFT)
     cv2.polylines(canvas, fixed, False, COLOURS[status], 1, cv2.LINE_AA, _SHIFT)
+
+
+def _draw_faintly(
+    canvas: UInt8[np.ndarray, "h w 3"], lines: Float[np.ndarray, "k p 2"], status: str
+) -> None:
+    """Draw thin lines through which the picture is seen."""
+    over = canvas.copy()
+    cv2.polylines(over, list(_fixed(lines)), False, COLOURS[status], 1, cv2.LINE_AA, _SHIFT)
+    cv2.addWeighted(over, _FAINT, canvas, 1 - _FAINT, 0, dst=canvas)
 
 
 def _fixed(pixels: Float[np.ndarray, "*k 2"]) -> Int32[np.ndarray, "*k 2"]:
