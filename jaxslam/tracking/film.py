@@ -45,9 +45,9 @@ class OverlayWriter:
     """An MP4 file written frame by frame, complete at any end of the `with` block.
 
     Frames go to a temporary name beside `path`, which becomes `path` when the block ends, by an
-    exception or an interruption too; without a single frame nothing is left. `size` is width
-    and height in pixels of the frames to come (MP4 drops the last row or column of an odd one),
-    `rate` in 1/s. Raises `ValueError` where the file cannot be opened or a frame has another size.
+    exception or an interruption too, but for one after the first. `size` is width and height in
+    pixels of the frames to come (MP4 drops the last row or column of an odd one), `rate` in 1/s.
+    Raises `ValueError` where the file cannot be opened or a frame has another size.
     """
 
     def __init__(self, path: str | Path, size: tuple[int, int], rate: float) -> None:
@@ -82,7 +82,7 @@ class OverlayWriter:
 
     def __exit__(self, *raised: object) -> None:
         self._writer.release()
-        if self.frames:
+        if self.frames > (KeyboardInterrupt in raised):
             self._temporary.replace(self.path)
         else:
             self._temporary.unlink(missing_ok=True)

@@ -118,8 +118,15 @@ def test_an_interruption_of_the_start_waits_for_no_program(tmp_path, monkeypatch
 
     monkeypatch.setattr(tracking, "_write", fail)
     with pytest.raises(KeyboardInterrupt):
-        tracking.track(small(3), tmp_path, SETTINGS, overlay=False, progress=stop)
+        tracking.track(small(3), tmp_path, SETTINGS, progress=stop)
     assert not names(tmp_path)
+
+
+def test_what_ends_before_a_frame_is_timed_leaves_the_files_all_the_same(tmp_path, monkeypatch):
+    monkeypatch.setattr(tracking.Aside, "give", fail)
+    with pytest.raises(ValueError, match="cannot draw"):
+        tracking.track(small(3), tmp_path, SETTINGS)
+    assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 1
 
 
 def test_a_camera_that_turned_on_the_spot_is_told_its_orientation_error(tmp_path):
