@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from jaxslam._runtime.programs import _Call, exactly
 from jaxslam.io.calibration import Calibration, from_field_of_view
 from jaxslam.models.calibration import Estimated, Known, White
 from jaxslam.tracking.settings import TrackerSettings
@@ -60,6 +61,20 @@ def test_a_guessed_focal_length_is_estimated_while_the_camera_moves():
     # Two σ of the guess; measured: 16 and 16 pixels.
     assert abs(cx - 159.5) < 25.6
     assert abs(cy - 119.5) < 25.6
+
+
+def test_all_guesses_have_one_set_of_programs_and_so_have_all_lenses_that_are_known():
+    """What is told of a lens is data: another size, field of view or σ compiles nothing anew."""
+
+    def programs(*calibrations):
+        filters = [TrackerSettings().make_filter(calibration) for calibration in calibrations]
+        return {exactly(_Call.of((slam,)).key) for slam in filters}
+
+    guesses = programs(GUESSED, from_field_of_view(640, 480, 50.0), from_field_of_view(1280, 720))
+    known = programs(PLAIN, STATED, Calibration(320, 240, 250.0, 260.0, 160.0, 120.0))
+    assert len(guesses) == len(known) == 1
+    # One state has three numbers more than the other.
+    assert guesses != known
 
 
 def test_a_considered_camera_is_reported_with_its_sigma_and_without_a_caveat():
