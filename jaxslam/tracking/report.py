@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -51,6 +52,8 @@ class Tracked:
     its own: e^log_scale times this pose is what it takes for metres."""
     sigma_log_scale: float | None = None
     """σ of that, where the filter is in doubt of it."""
+    sights: Mapping[int, np.ndarray] = field(default_factory=dict)
+    """Pixels of the landmarks that were matched or created, by their numbers."""
     unit_fixed: bool = True
     """Whether the filter keeps its unit from here on. While a start is being found out it does not,
     and the map's is carried over by the landmarks' distances, about which no covariance knows."""
@@ -68,6 +71,7 @@ class Tracked:
             map=map.number,
             log_scale=None if doubt is None else place.log_scale,
             sigma_log_scale=doubt,
+            sights={one.number: one.seen_at for one in map.landmarks.values() if not one.unseen},
             unit_fixed=place.unit_fixed,
             **found,
         )

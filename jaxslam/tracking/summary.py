@@ -17,6 +17,7 @@ from scipy.stats import chi2
 from jaxslam._version import __version__
 from jaxslam.io.calibration import INTRINSICS, as_fields
 from jaxslam.io.source import Source, Trajectory
+from jaxslam.tracking.focal import CLEAR, better_focal
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
@@ -57,7 +58,7 @@ def summarised(
         "source": source.name,
         "filter": tracker.filter_name,
         "settings": asdict(tracker.settings),
-        "calibration": _calibration(tracker),
+        "calibration": _calibration(tracker) | _better_focal(tracker, history),
         "frames": len(history),
         "tracked": len(history) - lost,
         "lost": lost,
@@ -117,6 +118,13 @@ def describe(summary: Summary) -> str:
         pairs = ((key, camera["estimated"][key], camera["sigma"][key]) for key in INTRINSICS)
         lines.append("camera: " + ", ".join(f"{k} {x:.1f} ± {s:.1f}" for k, x, s in pairs))
         lines += [camera["caveat"]] if "caveat" in camera else []
+    if "better_focal" in camera:
+        better, fx = camera["better_focal"], camera["given"]["fx"]
+        lines.append(
+            f"a focal length fx of {fx * better['factor']:.0f} fits the matches better than the "
+            f"{fx:.0f} given, and leaves {1 - better['squares_left']:.0%} less of their squared "
+            "errors. Is the calibration that of this camera, zoom and size?"
+        )
     if "ate" in summary:
         ate = summary["ate"]
         share = ate["rmse"] / ate["path_length"] if ate["path_length"] else float("nan")
@@ -228,6 +236,15 @@ def _calibration(tracker: Tracker) -> Summary:
     if treatment == "estimated":
         result["caveat"] = f"{TOO_SURE}; docs/own-video.md says how much"
     return result
+
+
+def _better_focal(tracker: Tracker, history: Sequence[Tracked]) -> Summary:
+    """Return by what factor focal lengths that are taken for known fit much better, if so."""
+    camera = tracker.camera()
+    if camera is None or camera[0] != "known":
+        return {}
+    factor, left = better_focal(history, tracker.points(), tracker.calibration)
+    return {"better_focal": {"factor": factor, "squares_left": left}} if left < CLEAR else {}
 
 
 def _ungated(updates: Sequence[Tracked]) -> Summary:

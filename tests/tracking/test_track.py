@@ -13,10 +13,12 @@ pytest.importorskip("cv2")
 import cv2
 
 from jaxslam.cli.track import TrackOptions
+from jaxslam.io.calibration import from_field_of_view
 from jaxslam.tracking import overlay, summary
 from jaxslam.tracking import video as tracking
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
+from jaxslam.tracking.tracker import Tracker
 
 SETTINGS = TrackerSettings(filter="world", wanted=12, spare=4)
 NUMBERS = {"trajectory.txt", "covariance.txt", "frames.csv", "summary.json"}
@@ -127,6 +129,23 @@ def test_what_ends_before_a_frame_is_timed_leaves_the_files_all_the_same(tmp_pat
     with pytest.raises(ValueError, match="cannot draw"):
         tracking.track(small(3), tmp_path, SETTINGS)
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 1
+
+
+@pytest.mark.parametrize(("left", "said"), [(0.5, True), (0.9, False)])
+def test_a_focal_length_that_does_not_fit_is_told(tmp_path, monkeypatch, left, said):
+    monkeypatch.setattr(summary, "better_focal", lambda *_: (1 / 1.2, left))
+    written = tracking.track(small(3), tmp_path, SETTINGS, overlay=False)
+    told = (
+        "a focal length fx of 109 fits the matches better than the 131 given, and leaves 50% less"
+    )
+    assert (told in summary.describe(written)) == said
+    assert ("better_focal" in written["calibration"]) == said
+
+
+def test_a_focal_length_that_is_estimated_is_not_tried(monkeypatch):
+    monkeypatch.setattr(summary, "better_focal", fail)
+    guessed = Tracker(from_field_of_view(160, 120), SETTINGS)
+    assert summary._better_focal(guessed, []) == {}
 
 
 def test_a_camera_that_turned_on_the_spot_is_told_its_orientation_error(tmp_path):
