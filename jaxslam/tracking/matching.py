@@ -3,6 +3,7 @@
 Positions are pixels (u, v) = (column, row), with pixel centres at whole numbers.
 """
 
+import math
 from typing import NamedTuple
 
 import cv2
@@ -14,6 +15,9 @@ GATE = 9.21
 THRESHOLD = 0.8
 """Least correlation of a match."""
 _ITERATIONS = 3
+_MAP_SIGMA = 0.2  # of a map's elements: a patch does not face its first camera
+_PRECISION = 2.4e-4 / _MAP_SIGMA**2  # by s² of ρ = .98
+_MOST_MAPPED = 0.5  # by which elements of a map differ from the identity's
 _MAX_SHIFT = 1.5  # pixels: a refinement that moves further than this has left its peak
 _WIDEST = 0.25  # of the picture's width: an ellipse is searched no further from its centre
 _NARROW = 91**2  # pixels: boxes of more are searched in the picture of half the size first
@@ -38,7 +42,7 @@ class Matches(NamedTuple):
     """Correlations, up to 1."""
     variances: Float[np.ndarray, " m"]
     """Of each pixel's u and v, pixels², as the difference of the two windows tells
-    (`position_variances`)."""
+    (`refine`)."""
 
     def only(self, which: np.ndarray) -> "Matches":
         """Some of them."""
@@ -96,99 +100,115 @@ def match_patches(
     pixels = chosen.pixels + _quadratic_peaks(chosen.around)
     variances = np.zeros(len(pixels))
     if len(pixels):
-        pixels = refine(whole, templates[chosen.owner], pixels)
-        variances = position_variances(whole, templates[chosen.owner], pixels)
+        pixels, _, variances = refine(whole, templates[chosen.owner], pixels)
     return Matches(chosen.owner, pixels, chosen.scores, variances)
+
+
+class Fit(NamedTuple):
+    """How n templates fit a picture."""
+
+    pixels: Float[np.ndarray, "n 2"]
+    """Where, sub-pixel."""
+    maps: Float[np.ndarray, "n 2 2"]
+    """Offsets in the templates to those in the picture."""
+    variances: Float[np.ndarray, " n"]
+    """Of each pixel's u and v, pixels²."""
 
 
 def refine(
     image: Float32[np.ndarray, "h w"],
     templates: Float32[np.ndarray, "n window window"],
     pixels: Float[np.ndarray, "n 2"],
-) -> Float[np.ndarray, "n 2"]:
-    """The positions near `pixels` that fit the templates best, by Gauss-Newton.
+) -> Fit:
+    """The places near `pixels` and the affine maps with which templates fit best, by Gauss-Newton.
 
     Minimises the squared difference of the two windows, each made zero-mean with unit norm (so
-    gain and offset do not matter); inverse compositional, so that the gradient is the
-    template's. One that does not converge stays where it is.
+    gain and offset do not matter), with a prior of the map, the identity with a σ of `_MAP_SIGMA`;
+    inverse compositional (Baker & Matthews 2004), so that the gradient J is the template's. One
+    that does not converge stays where it is. A patch that was warped as if it faced its first
+    camera is found where it is all the same.
+
+    Of windows of m pixels with a correlation ρ, the residual has the variance `s² = 2 (1 − ρ)/m` a
+    pixel and least squares the covariance `s² (Jᵀ J + Λ)⁻¹`, whatever the map; half the trace of
+    the place's is returned. What is left of a patch with two depths is not white: its errors are
+    larger (`settings.FIT`).
     """
-    steps, _ = _gauss_newton_steps(templates)
-    side = templates.shape[1] - 2
-    positions = pixels
+    known = _Templates.of(templates)
+    places, maps, identity = pixels, np.tile(np.eye(2), (len(pixels), 1, 1)), np.eye(2)
     for _ in range(_ITERATIONS):
-        windows = _windows(image, positions, side)
+        windows, _ = known.compared(image, places, maps)
+        slope = np.einsum("nkm,nm->nk", known.jacobian, windows)
+        slope[:, 2:] += _PRECISION * (maps - identity).reshape(-1, 4)
+        step = np.einsum("nkl,nl->nk", known.inverse, slope)
+        maps = maps @ np.linalg.inv(identity + step[:, 2:].reshape(-1, 2, 2))
+        maps = np.clip(maps, identity - _MOST_MAPPED, identity + _MOST_MAPPED)
+        places = places - np.einsum("nij,nj->ni", maps, step[:, :2])
+        places = np.clip(places, pixels - 2 * _MAX_SHIFT, pixels + 2 * _MAX_SHIFT)
+    gone = np.abs(places - pixels).max(axis=1) > _MAX_SHIFT
+    places = np.where(gone[:, None], pixels, places)
+    maps = np.where(gone[:, None, None], identity, maps)
+    windows, likeness = known.compared(image, places, maps)
+    s2 = 2 * np.maximum(1 - likeness, 0.0) / windows.shape[1]
+    return Fit(places, maps, s2 * np.trace(known.inverse[:, :2, :2], axis1=1, axis2=2) / 2)
+
+
+class _Templates(NamedTuple):
+    """The insides of n templates, as windows of m pixels with unit norm and mean zero."""
+
+    inside: Float32[np.ndarray, "n m"]
+    jacobian: Float32[np.ndarray, "n 6 m"]
+    """How they change with a shift, (u, v), and a map, row by row. Orthogonal to constants and to
+    the inside, so that it sees a residual without its mean and gain."""
+    inverse: Float[np.ndarray, "n 6 6"]
+    """Of the square of it with the prior. Zero of a template without texture in two directions."""
+
+    @classmethod
+    def of(cls, templates: Float32[np.ndarray, "n window window"]) -> "_Templates":
+        n, side = len(templates), templates.shape[1] - 2
+        inside = templates[:, 1:-1, 1:-1].reshape(n, 1, -1)
+        inside = inside - inside.mean(axis=2, keepdims=True)
+        norm = np.sqrt(np.sum(inside**2, axis=2, keepdims=True) + 1e-6)
+        inside /= norm
+        across = templates[:, 1:-1, 2:] - templates[:, 1:-1, :-2]
+        down = templates[:, 2:, 1:-1] - templates[:, :-2, 1:-1]
+        gradient = np.stack([across, down], axis=1).reshape(n, 2, -1) * (0.5 / norm)
+        of_map = gradient[:, :, None] * _offsets(side).astype(np.float32)
+        jacobian = np.concatenate([gradient, of_map.reshape(n, 4, -1)], axis=1)
+        jacobian -= jacobian.mean(axis=2, keepdims=True)
+        jacobian -= (jacobian @ inside.transpose(0, 2, 1)) * inside
+        square = (jacobian @ jacobian.transpose(0, 2, 1)).astype(float)
+        textured = np.linalg.det(square[:, :2, :2]) > 1e-8
+        square += np.diag([1e-9] * 2 + [_PRECISION] * 4)
+        return cls(inside[:, 0], jacobian, np.linalg.inv(square) * textured[:, None, None])
+
+    def compared(
+        self,
+        image: Float32[np.ndarray, "h w"],
+        pixels: Float[np.ndarray, "n 2"],
+        maps: Float[np.ndarray, "n 2 2"],
+    ) -> tuple[Float32[np.ndarray, "n m"], Float32[np.ndarray, " n"]]:
+        """Return the picture's windows at these places, and their correlations ρ."""
+        windows = _windows(image, pixels, maps, math.isqrt(self.inside.shape[1]))
         windows -= windows.mean(axis=1, keepdims=True)
-        norms = np.sqrt(np.einsum("ni,ni->n", windows, windows) + 1e-6)
-        # The steps ignore what of a window is like its template, so there is nothing to subtract.
-        shifts = (steps @ windows[:, :, None])[:, :, 0] / norms[:, None]
-        positions = np.clip(positions - shifts, pixels - 2 * _MAX_SHIFT, pixels + 2 * _MAX_SHIFT)
-    gone = np.abs(positions - pixels).max(axis=1) > _MAX_SHIFT
-    return np.where(gone[:, None], pixels, positions)
-
-
-def position_variances(
-    image: Float32[np.ndarray, "h w"],
-    templates: Float32[np.ndarray, "n window window"],
-    pixels: Float[np.ndarray, "n 2"],
-) -> Float[np.ndarray, " n"]:
-    """The variance of u and v of places found, pixels², where what is left of each window is white.
-
-    Of windows of m pixels with unit norm, whose gradients are g, with a correlation ρ, the residual
-    has the variance `s² = 2 (1 − ρ)/m` a pixel and least squares the covariance `s² (Σ g gᵀ)⁻¹`;
-    half the trace is returned. What is left of a patch that was warped wrongly, or has two depths,
-    is not white: its errors are larger (`settings.FIT`).
-    """
-    steps, target = _gauss_newton_steps(templates)
-    windows = _windows(image, pixels, templates.shape[1] - 2)
-    windows -= windows.mean(axis=1, keepdims=True)
-    norms = np.sqrt(np.einsum("ni,ni->n", windows, windows) + 1e-6)
-    correlations = np.einsum("ni,ni->n", windows, target) / norms
-    # With steps A = (g gᵀ)⁻¹ g, (g gᵀ)⁻¹ is A Aᵀ.
-    inverse = np.einsum("nim,nim->n", steps, steps)
-    return np.maximum(1 - correlations, 0.0) / windows.shape[1] * inverse
+        windows /= np.sqrt(np.einsum("ni,ni->n", windows, windows) + 1e-6)[:, None]
+        return windows, np.einsum("ni,ni->n", windows, self.inside)
 
 
 def _windows(
-    image: Float32[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"], side: int
+    image: Float32[np.ndarray, "h w"],
+    pixels: Float[np.ndarray, "n 2"],
+    maps: Float[np.ndarray, "n 2 2"],
+    side: int,
 ) -> Float32[np.ndarray, "n m"]:
-    """The squares of `side` pixels around sub-pixel positions, row by row (m = side²)."""
+    """The squares of `side` pixels, mapped, around sub-pixel places, row by row (m = side²)."""
+    u, v = (pixels.T[:, :, None] + np.moveaxis(maps @ _offsets(side), 1, 0)).astype(np.float32)
+    return cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _offsets(side: int) -> Int[np.ndarray, "2 m"]:
+    """Of the pixels of a window from its middle."""
     line = np.arange(side) - side // 2
-    u, v = pixels[:, :1] + np.tile(line, side), pixels[:, 1:] + np.repeat(line, side)
-    return cv2.remap(
-        image,
-        u.astype(np.float32),
-        v.astype(np.float32),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
-
-
-def _gauss_newton_steps(
-    templates: Float32[np.ndarray, "n window window"],
-) -> tuple[Float32[np.ndarray, "n 2 m"], Float32[np.ndarray, "n m"]]:
-    """Return what takes each window of unit norm to the shift (2,) it shows against its template,
-    and the templates' insides as such windows.
-
-    The rows are orthogonal to constants and to the template's inside (m values), so they see
-    the residual without its mean and gain. Zero for a template without texture in two
-    directions.
-    """
-    inside = templates[:, 1:-1, 1:-1]
-    target = inside.reshape(len(templates), 1, -1)
-    target = target - target.mean(axis=2, keepdims=True)
-    norm = np.sqrt(np.sum(target**2, axis=2, keepdims=True) + 1e-6)
-    target /= norm
-    across = templates[:, 1:-1, 2:] - templates[:, 1:-1, :-2]
-    down = templates[:, 2:, 1:-1] - templates[:, :-2, 1:-1]
-    gradient = np.stack([across, down], axis=1).reshape(len(templates), 2, -1) * (0.5 / norm)
-    gradient -= gradient.mean(axis=2, keepdims=True)
-    gradient -= (gradient @ target.transpose(0, 2, 1)) * target
-    hessian = gradient @ gradient.transpose(0, 2, 1)
-    (xx, xy), (_, yy) = hessian.transpose(1, 2, 0)
-    determinant = xx * yy - xy * xy
-    adjugate = np.stack([yy, -xy, -xy, xx], axis=1).reshape(-1, 2, 2)
-    inverse = np.where(determinant > 1e-8, 1 / np.maximum(determinant, 1e-8), 0.0)
-    return (adjugate * inverse[:, None, None]) @ gradient, target[:, 0]
+    return np.stack([np.tile(line, side), np.repeat(line, side)])
 
 
 class _Ellipses(NamedTuple):

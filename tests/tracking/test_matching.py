@@ -122,6 +122,22 @@ def test_the_variance_of_a_place_is_that_of_its_errors_where_pixels_are_noise():
     assert told[1] > 5 * told[0]
 
 
+@pytest.mark.parametrize("warp", [[[1.2, 0.05], [-0.05, 0.85]], [[0.85, 0.15], [0.1, 1.05]]])
+def test_a_patch_that_is_not_seen_as_it_was_expected_is_where_it_is(warp):
+    """As one that does not face its first camera, after a turn about it."""
+    centres = np.random.default_rng(3).uniform(45, 75, (20, 2))
+    first, second = picture(), picture(warp, seed=1)
+    templates = np.array([Patch.take(first, at).warped(np.eye(2)) for at in centres])
+    truth = CENTRE + (centres - CENTRE) @ np.transpose(warp)
+    found = match_patches(second, templates, truth, np.tile(np.eye(2), (20, 1, 1)))
+    errors = np.linalg.norm(found.pixels - truth[found.owner], axis=1)
+    assert len(errors) >= 12
+    assert np.median(errors) < 0.06
+    fit = matching.refine(second.astype(np.float32), templates, truth)
+    off = np.abs(fit.maps - warp).max(axis=(1, 2))
+    assert np.median(off) < 0.03
+
+
 def test_match_does_not_depend_on_gain_and_offset():
     template = Patch.take(picture(sigma=0.0), CENTRE).warped(np.eye(2))
     bright = cv2.convertScaleAbs(picture(shift=(2.3, -1.6), sigma=0.0), alpha=0.5, beta=100)
