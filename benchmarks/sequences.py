@@ -26,7 +26,6 @@ from typing import Annotated, Any
 import tyro
 from benchmark import RESULTS, Benchmark, data_folder, write_page, write_table
 
-from jaxslam.filters.registry import FROM_REST
 from jaxslam.tracking.settings import TrackerSettings
 
 FRAMES = (30, 149)
@@ -39,7 +38,9 @@ LANDMARKS = "inverse_scaling"
 SEEDS = range(5)
 """Of synthetic videos."""
 
-WORLD_CENTRIC = FROM_REST["spatial"].replace("scale_gauge", "world_gauge")
+OWN = TrackerSettings().filter
+"""The recommended filter."""
+WORLD_CENTRIC = OWN.replace("scale_gauge", "world_gauge")
 """The recommended filter with landmarks in the base frame."""
 
 Results = dict[str, dict[str, dict[str, Any]]]
@@ -206,7 +207,7 @@ def summary(results: Results) -> str:
         "|---" * 9 + "|",
     ]
     for name, filters in results.items():
-        own, world = filters[f"{FROM_REST['spatial']}/{LANDMARKS}"], filters[f"world/{LANDMARKS}"]
+        own, world = filters[f"{OWN}/{LANDMARKS}"], filters[f"world/{LANDMARKS}"]
         nees = "–" if not own["beyond_scale"] else f"{own['beyond_scale']['mean']:.2g}"
         rows.append(
             f"| {name} | {own['tracked']} of {own['frames']} | {_share(own, 'error')}; "

@@ -19,6 +19,7 @@ from jaxslam.filters.association import TOLERANCE
 from jaxslam.filters.ekf import EkfSlam, check_one_gaussian
 from jaxslam.filters.forms.correction import AbstractCorrection, Standard
 from jaxslam.filters.forms.covariance import Covariance
+from jaxslam.filters.forms.drift import Drifting
 from jaxslam.filters.forms.first_estimates import FirstEstimates
 from jaxslam.filters.forms.information import Information
 from jaxslam.filters.forms.invariant import Invariant
@@ -100,6 +101,15 @@ def with_observability_constraint(slam: EkfSlam, steps: int | None) -> EkfSlam:
     return _with_correction("oc", oc)(slam, None)
 
 
+def with_drift(slam: EkfSlam, percent: int | None) -> EkfSlam:
+    """The filter that knows its landmarks to drift, between two frames by so many percent of the σ
+    of a measurement; 10 by default. Raises ValueError."""
+    if not isinstance(slam.form, Covariance):
+        raise ValueError("drift is for the covariance form")
+    share = 0.1 if percent is None else percent / 100
+    return replace(slam, form=Covariance(Drifting(slam.form.correction, share)))
+
+
 def _with_correction(
     word: str, correction: AbstractCorrection
 ) -> Callable[[EkfSlam, int | None], EkfSlam]:
@@ -129,6 +139,7 @@ _OF_ONE_FILTER: dict[str, Callable[[EkfSlam, int | None], EkfSlam]] = {
     "scene": with_scene_depth,
     "oc": with_observability_constraint,
     "fej": _with_correction("fej", FirstEstimates()),
+    "drift": with_drift,
 }
 _AROUND_ANY_FILTER: dict[str, Callable[..., AbstractFilter]] = {
     "lag": lambda slam, frames: FixedLag(slam, LAG if frames is None else frames),
@@ -156,7 +167,8 @@ percent (`common`); σ of the scene's depth in percent of one landmark's (`scene
 steps of Gauss–Newton instead of convergence (`iterated`); members of a Gaussian sum (`scales`,
 `directions`, of a `mixture` at the most); frames of the longest window of a start (`rest`); frames
 of which the noise is remembered (`noise`); by how much a match may be off beyond its noise, in
-percent of that (`checked`); steps of Gauss–Newton in an update (`oc`); none for the remedy
+percent of that (`checked`); by how much a landmark drifts between frames, in percent of the same
+(`drift`); steps of Gauss–Newton in an update (`oc`); none for the remedy
 `fej`."""
 
 RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gauge+scene50+mixture9"}

@@ -114,6 +114,13 @@ class Scenario(eqx.Module):
     """σ of each coordinate of the principal point, pixels."""
     pixel_sigma: float = 0.3
     """σ of a measured pixel coordinate."""
+    drift_sigma: float = _structural(0.0)
+    """σ of an error of a landmark's measurements that stays from frame to frame, pixels or m, as
+    of a patch that turns; no filter is told."""
+    drift_frames: float = 20.0
+    """Frames after which 1/e of it is left."""
+    drift_wrong: float = 0.0
+    """Share of the landmarks of which it is ten times as large."""
     calibration: str = _structural("known")
     """How the filter treats its calibration, unless stated otherwise."""
     true_calibration: str = _structural("nominal")
@@ -305,12 +312,12 @@ _NOISE_OF = {"velocity": "acceleration_sigma", "odometry": "odometry_sigma"}
 _POSITIVE = (
     "rate", "steps", "landmarks", "ring_radius", "nearest_depth", "image", "focal",
     "pixel_sigma", "least_inverse_depth", "visible_depth", "depth_range",
-    "acceleration_sigma", "position_sigma",
+    "acceleration_sigma", "position_sigma", "drift_frames",
 )  # fmt: skip
 _NOT_NEGATIVE = (
     "velocity_sigma", "focal_sigma", "centre_sigma", "odometry_sigma", "range",
     "scale_sigma", "still_frames", "first_frame", "first_landmarks", "new_landmarks",
-    "known_landmarks",
+    "known_landmarks", "drift_sigma", "drift_wrong",
 )  # fmt: skip
 
 
@@ -409,6 +416,18 @@ def _built_in():
         placement="rays",
         nearest_depth=1.0,
         scale_sigma=0.4,
+        **_SPATIAL,
+    )
+    yield Scenario(
+        name="drifting-patches",
+        steps=150,
+        velocity=(1.2, 0.0, 0.0, 0.0, 0.0, 0.0),
+        velocity_sigma=_SPATIAL_NOISE["-loose"][1],
+        acceleration_sigma=_SPATIAL_NOISE["-loose"][0],
+        placement="rays",
+        nearest_depth=1.0,
+        drift_sigma=0.2,
+        drift_wrong=0.05,
         **_SPATIAL,
     )
     yield from _family(

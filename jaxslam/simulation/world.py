@@ -71,9 +71,27 @@ def simulate(
     # A key of its own, so that a limit changes nothing else of a run.
     seen = limited(s, jax.random.fold_in(pixel_key, 1), seen)
     noise = jax.random.normal(pixel_key, measured.shape, measured.dtype)
-    measured += sensor.sigma * noise
+    measured += sensor.sigma * noise + _drift(s, jax.random.fold_in(pixel_key, 2), measured)
     run = Run(poses, points, measured, seen, controls, cameras, new)
     return in_order_of_appearance(run) if new is None else run
+
+
+def _drift(s: Scenario, key: Array, measured: Array) -> Array | float:
+    """What stays of the errors of a landmark from frame to frame, `b ← ρ b + √(1 − ρ²) σ n`; a
+    share of the landmarks has ten times as much."""
+    if not s.drift_sigma:
+        return 0.0
+    first_key, key, share_key = jax.random.split(key, 3)
+    stays = jnp.exp(-1 / jnp.asarray(s.drift_frames, measured.dtype))
+    noises = jax.random.normal(key, measured.shape, measured.dtype)
+
+    def later(drift, noise):
+        return stays * drift + jnp.sqrt(1 - stays**2) * noise, drift
+
+    start = jax.random.normal(first_key, measured.shape[1:], measured.dtype)
+    _, drifts = jax.lax.scan(later, start, noises)
+    wrong = jax.random.uniform(share_key, measured.shape[1:2]) < s.drift_wrong
+    return s.drift_sigma * jnp.where(wrong, 10.0, 1.0)[:, None] * drifts
 
 
 def trajectory_of(scenario: Scenario, dtype: DTypeLike | None = None) -> RecordedMotion | None:

@@ -1,0 +1,50 @@
+"""Tests of landmarks that drift."""
+
+import jax
+import numpy as np
+import pytest
+from cases import Case, quick_jit
+
+from jaxslam.filters.forms.covariance import Covariance
+from jaxslam.filters.forms.drift import Drifting
+from jaxslam.filters.forms.observability_constrained import ObservabilityConstrained
+from jaxslam.filters.registry import make_filter, scenario_pieces
+from jaxslam.landmarks import CARTESIAN
+from jaxslam.simulation import scenario
+
+
+@pytest.mark.parametrize("landmark", ["inverse_scaling", "inverse_depth"])
+def test_a_feature_is_expected_by_so_much_less_surely(landmark):
+    """`H (P + H⁺ share² R H⁺ᵀ) Hᵀ + R` is `S + share² R`."""
+    of = Case("matched-6dof", 1, steps=1, landmarks=4)
+    first, known, _ = of.frames(0)
+    seen = jax.tree.map(lambda x: x[0], known)
+
+    def compared(name):
+        slam = of.filter(name, landmark)
+
+        def run(first, seen):
+            state = slam.predict(slam.init(of.capacity, first), of.controls()[0])
+            return slam.update(state, of.controls()[0], seen)[1]
+
+        return quick_jit(run)(first, seen), slam.sensor.noise
+
+    (fixed, R), (drifting, _) = compared("robocentric"), compared("robocentric+drift30")
+    m, p = fixed.used.size, len(R)
+    more = np.asarray(drifting.covariance - fixed.covariance).reshape(m, p, m, p)
+    assert fixed.used.all()
+    expected = np.einsum("ij,kl->ikjl", np.eye(m), 0.3**2 * R)
+    np.testing.assert_allclose(more, expected, atol=1e-9)
+    assert drifting.nis < fixed.nis
+
+
+def test_it_is_a_piece_around_any_correction():
+    pieces = scenario_pieces(scenario("matched-6dof"))
+    slam = make_filter("scale_gauge+oc+drift", **pieces)
+    assert isinstance(slam.form, Covariance)
+    assert isinstance(slam.form.correction, Drifting)
+    assert isinstance(slam.form.correction.correction, ObservabilityConstrained)
+    assert slam.form.correction.share == 0.1
+    pieces["landmark"] = CARTESIAN
+    with pytest.raises(ValueError, match="drift is for the covariance form"):
+        make_filter("information+drift", **pieces)
