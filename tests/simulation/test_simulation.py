@@ -440,18 +440,17 @@ def test_pixel_noise_has_the_stated_sigma():
 
 
 def test_errors_of_patches_stay_as_long_as_they_should():
-    drift = {"drift_sigma": 0.2, "drift_frames": 5.0}
-    chosen = scenario("matched-6dof", pixel_sigma=1e-9, **drift)
+    chosen = scenario("matched-6dof", pixel_sigma=1e-9, drift_sigma=0.2, drift_frames=5.0)
     runs = batch(chosen, 10)
     ideal, _ = pixels_without_noise(runs, chosen)
-    seen = np.asarray(runs.visible).all(axis=1)[:, None, :, None]
+    seen = np.all(runs.visible, axis=1)[:, None, :, None]
     errors = np.asarray(runs.measured - ideal) / 0.2
     pairs = np.broadcast_to(seen, errors[:, 1:].shape)
     white = (errors[:, 1:] - np.exp(-1 / 5) * errors[:, :-1]) / np.sqrt(1 - np.exp(-2 / 5))
     two_sided(np.sum(white[pairs] ** 2), pairs.sum())
     first = np.broadcast_to(seen[:, 0], errors[:, 0].shape)
     two_sided(np.sum(errors[:, 0][first] ** 2), first.sum())
-    worse = batch(scenario("matched-6dof", pixel_sigma=1e-9, drift_wrong=1.0, **drift), 10)
+    worse = batch(dataclasses.replace(chosen, drift_wrong=1.0), 10)
     tenfold = np.asarray(worse.measured - ideal) / 0.2
     np.testing.assert_allclose(tenfold, 10 * errors, atol=1e-5)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -32,8 +32,10 @@ the correlations stay above `−n ε` however many there are (measured over 600 
 class AbstractCorrection(eqx.Module):
     """A correction of the state by the features seen."""
 
-    divisible: ClassVar[bool] = True
-    """Whether the state is then a mean and a covariance of `x ⊞ δ`, to be divided and merged."""
+    @property
+    def divisible(self) -> bool:
+        """Whether the state then is mean and covariance of `x ⊞ δ`, to be divided and merged."""
+        return True
 
     def check(self, slam: Any) -> None:
         """Raise ValueError for a filter that cannot be corrected so; any can be, here."""

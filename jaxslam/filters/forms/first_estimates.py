@@ -10,7 +10,6 @@ of unknown depth is bad, and remains the linearisation point for good.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar
 
 import jax
 from jaxtyping import Array, Float
@@ -28,7 +27,9 @@ from jaxslam.models.observations import Features
 class FirstEstimates(AbstractCorrection):
     """Residuals of the estimate, H of the first estimates, and `transport` of the core."""
 
-    divisible: ClassVar[bool] = False
+    @property
+    def divisible(self) -> bool:
+        return False
 
     def check(self, slam: EkfSlam) -> None:
         """Raise ValueError for filters whose landmarks have no first estimate to keep."""
