@@ -178,9 +178,7 @@ def page(results: Results) -> str:
         "orientations: −1 is a world behind the camera. *Orientation*: its RMS error, in degrees.",
         "*In 1 s*: the relative pose error over one second, in percent of the way made in it, and",
         "in degrees. A camera that is lost for 15 frames begins a new *map*, in another unit of",
-        "length. Times, without the overlay, are of a machine that others used too. The rows of",
-        "other filters than the first are of the tracker before it weighed matches by their fit",
-        "and searched wide ellipses twice.",
+        "length. Times, without the overlay, are of a machine that others used too.",
     ]
     for name, filters in results.items():
         one = next(iter(filters.values()))
@@ -207,7 +205,9 @@ def summary(results: Results) -> str:
         "|---" * 9 + "|",
     ]
     for name, filters in results.items():
-        own, world = filters[f"{OWN}/{LANDMARKS}"], filters[f"world/{LANDMARKS}"]
+        own, world = (filters.get(f"{one}/{LANDMARKS}") for one in (OWN, "world"))
+        if own is None or world is None:  # not measured yet
+            continue
         nees = "–" if not own["beyond_scale"] else f"{own['beyond_scale']['mean']:.2g}"
         rows.append(
             f"| {name} | {own['tracked']} of {own['frames']} | {_share(own, 'error')}; "

@@ -151,7 +151,7 @@ class Estimator:
 
     def given(self, predicted: Predicted, seen: Observations) -> Prediction:
         """Return what the filter expects of the frame given that it shows what was seen, to first
-        order. Changes nothing."""
+        order and neglecting that landmarks drift. Changes nothing."""
         view, (n, p, _, _) = predicted.view, predicted.joint.shape
         S = predicted.joint.reshape(n * p, n * p)
         known = (p * seen.slots[:, None] + np.arange(p)).ravel()
