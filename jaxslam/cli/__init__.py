@@ -18,7 +18,15 @@ _BROKEN_PIPE = 141
 
 def main(arguments: list[str] | None = None) -> None:
     """Run a command. A mistake of the user's ends with exit status 2 and one line."""
-    given = sys.argv[1:] if arguments is None else arguments
+    try:
+        _main(sys.argv[1:] if arguments is None else arguments)
+    except SystemExit as end:
+        if arguments is None and end.code:
+            _leave(end.code)
+        raise
+
+
+def _main(given: list[str]) -> None:
     if given == ["--version"]:
         print(f"jaxslam {__version__}")
         return
@@ -57,8 +65,13 @@ def _interrupt(*_) -> None:
 
 def _fail(status: int, message: str) -> NoReturn:
     print(f"jaxslam: {' '.join(message.split())}", file=sys.stderr)
-    if all(thread.daemon for thread in set(threading.enumerate()) - {threading.main_thread()}):
-        sys.exit(status)
-    # Else Python would wait for a program that is compiled aside, for a minute.
-    sys.stdout.flush()
-    os._exit(status)
+    sys.exit(status)
+
+
+def _leave(status: int | str) -> None:
+    """End the process at once where Python would wait for a program that is compiled aside, for a
+    minute."""
+    others = set(threading.enumerate()) - {threading.main_thread()}
+    if isinstance(status, int) and not all(thread.daemon for thread in others):
+        sys.stdout.flush()
+        os._exit(status)

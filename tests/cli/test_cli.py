@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import threading
 
 import pytest
 
@@ -138,12 +139,27 @@ def interrupted(given):
     threading.Thread(target=time.sleep, args=(100,)).start()
     raise KeyboardInterrupt
 jaxslam.cli._run = interrupted
-jaxslam.cli.main([])
+jaxslam.cli.main()
 """
     ended = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
     )
     assert (ended.returncode, ended.stderr) == (130, "jaxslam: interrupted\n")
+
+
+def test_a_command_within_a_program_does_not_end_it(capsys):
+    """Nor a notebook's kernel, whatever goes on in other threads."""
+    done = threading.Event()
+    other = threading.Thread(target=done.wait, args=(60,))
+    other.start()
+    try:
+        with pytest.raises(SystemExit) as ended:
+            main(["evaluate", "nowhere.csv"])
+        assert ended.value.code == 2
+        assert "nowhere.csv" in capsys.readouterr().err
+    finally:
+        done.set()
+        other.join()
 
 
 def test_the_version_is_told(capsys):
