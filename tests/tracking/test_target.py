@@ -95,7 +95,7 @@ def test_the_sigma_of_the_depths_covers_what_pixels_do(video, card):
 def trackers(video, card):
     """With a target and without, both with a prior on depth that is far off."""
     source, frames = video
-    settings = TrackerSettings(filter="world", wanted=12, spare=4, nearest_depth=3.0)
+    settings = TrackerSettings(filter="world", wanted=12, spare=4, nearest_depth=5.0)
     told = Tracker(source.calibration, settings, target=target(card, frames[0].image))
     alone = Tracker(source.calibration, settings)
     for frame in frames:
@@ -109,9 +109,9 @@ def test_the_map_is_in_metres(video, trackers):
     assert source.reference is not None
     moved = np.linalg.norm(source.reference.T_wc[-1][:3, 3])
     told, alone = (np.linalg.norm(tracked.T_wc[:3, 3]) / moved for tracked in trackers[2])
-    # The second has no metre: measured 1.65, in half a second.
+    # The second has no metre.
     assert 0.8 < told < 1.2
-    assert alone > 1.4
+    assert alone > 2
 
 
 def test_the_targets_points_are_the_first_landmarks_and_have_their_places(card, trackers):
