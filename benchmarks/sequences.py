@@ -26,6 +26,7 @@ from typing import Annotated, Any
 import tyro
 from benchmark import RESULTS, Benchmark, data_folder, write_page, write_table
 
+from jaxslam.filters.registry import ON_VIDEO
 from jaxslam.tracking.settings import TrackerSettings
 
 FRAMES = (30, 149)
@@ -38,9 +39,7 @@ LANDMARKS = "inverse_scaling"
 SEEDS = range(5)
 """Of synthetic videos."""
 
-OWN = TrackerSettings().filter
-"""The recommended filter."""
-WORLD_CENTRIC = OWN.replace("scale_gauge", "world_gauge")
+WORLD_CENTRIC = ON_VIDEO.replace("scale_gauge", "world_gauge")
 """The recommended filter with landmarks in the base frame."""
 
 Results = dict[str, dict[str, dict[str, Any]]]
@@ -205,7 +204,7 @@ def summary(results: Results) -> str:
         "|---" * 9 + "|",
     ]
     for name, filters in results.items():
-        own, world = (filters.get(f"{one}/{LANDMARKS}") for one in (OWN, "world"))
+        own, world = (filters.get(f"{one}/{LANDMARKS}") for one in (ON_VIDEO, "world"))
         if own is None or world is None:  # not measured yet
             continue
         nees = "–" if not own["beyond_scale"] else f"{own['beyond_scale']['mean']:.2g}"

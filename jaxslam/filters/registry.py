@@ -105,7 +105,7 @@ def with_drift(slam: EkfSlam, percent: int | None) -> EkfSlam:
     """The filter that knows its landmarks to drift, between two frames by so many percent of the σ
     of a measurement; 10 by default. Raises ValueError."""
     if not isinstance(slam.form, Covariance):
-        raise ValueError("drift is for the covariance form")
+        raise ValueError(f"drift is for the covariance form, not for {type(slam.form).__name__}")
     share = 0.1 if percent is None else percent / 100
     return replace(slam, form=Covariance(Drifting(slam.form.correction, share)))
 
@@ -178,6 +178,8 @@ FROM_REST = {
     "spatial": "scale_gauge+oc+scene50+mixture3+rest8",
 }
 """The one where it is not: the camera starts from rest, or its velocity is unknown."""
+ON_VIDEO = FROM_REST["spatial"].replace("+mixture", "+drift+mixture")
+"""The one of the tracker: what is measured are patches."""
 
 
 def recommended_name(motion: AbstractMotion) -> str:

@@ -156,6 +156,8 @@ def _draw_faintly(
     canvas: UInt8[np.ndarray, "h w 3"], lines: Float[np.ndarray, "k p 2"], status: str
 ) -> None:
     """Draw thin lines through which the picture is seen."""
+    if not len(lines):
+        return
     over = canvas.copy()
     cv2.polylines(over, list(_fixed(lines)), False, COLOURS[status], 1, cv2.LINE_AA, _SHIFT)
     cv2.addWeighted(over, _FAINT, canvas, 1 - _FAINT, 0, dst=canvas)

@@ -58,7 +58,7 @@ def summarised(
         "source": source.name,
         "filter": tracker.filter_name,
         "settings": asdict(tracker.settings),
-        "calibration": _calibration(tracker) | _better_focal(tracker, history),
+        "calibration": _calibration(tracker, history),
         "frames": len(history),
         "tracked": len(history) - lost,
         "lost": lost,
@@ -220,9 +220,10 @@ def _unit_line(unit: Summary) -> str:
     )
 
 
-def _calibration(tracker: Tracker) -> Summary:
+def _calibration(tracker: Tracker, history: Sequence[Tracked]) -> Summary:
     """Return what the camera was taken for, and where it is estimated or considered, what it is in
-    the end with σ: what is considered was found by the start, and left since."""
+    the end with σ: what is considered was found by the start, and left since. Where it is known,
+    by what factor focal lengths fit much better, if so."""
     camera = tracker.camera()
     given = as_fields(tracker.calibration)
     if camera is None:
@@ -235,16 +236,11 @@ def _calibration(tracker: Tracker) -> Summary:
         result["sigma"] = dict(zip(INTRINSICS, sigma.tolist(), strict=True))
     if treatment == "estimated":
         result["caveat"] = f"{TOO_SURE}; docs/own-video.md says how much"
+    if treatment == "known":
+        factor, left = better_focal(history, tracker.points(), tracker.calibration)
+        if left < CLEAR:
+            result["better_focal"] = {"factor": factor, "squares_left": left}
     return result
-
-
-def _better_focal(tracker: Tracker, history: Sequence[Tracked]) -> Summary:
-    """Return by what factor focal lengths that are taken for known fit much better, if so."""
-    camera = tracker.camera()
-    if camera is None or camera[0] != "known":
-        return {}
-    factor, left = better_focal(history, tracker.points(), tracker.calibration)
-    return {"better_focal": {"factor": factor, "squares_left": left}} if left < CLEAR else {}
 
 
 def _ungated(updates: Sequence[Tracked]) -> Summary:

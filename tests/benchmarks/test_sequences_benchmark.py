@@ -24,7 +24,7 @@ def test_the_sentences_on_covariances_are_of_the_numbers_on_disk():
     page = " ".join((FOLDER / "docs/results.md").read_text().split())
     own, world = (
         [filters[f"{name}/{benchmark.LANDMARKS}"] for filters in on_disk().values()]
-        for name in (benchmark.OWN, "world")
+        for name in (benchmark.ON_VIDEO, "world")
     )
     means, others = (
         sorted(r["beyond_scale"]["mean"] for r in x if r["beyond_scale"]) for x in (own, world)

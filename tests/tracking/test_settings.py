@@ -79,7 +79,7 @@ def test_all_guesses_have_one_set_of_programs_and_so_have_all_lenses_that_are_kn
 
 def test_a_considered_camera_is_reported_with_its_sigma_and_without_a_caveat():
     settings = TrackerSettings(filter="world", wanted=10, calibration="consider")
-    told = _calibration(Tracker(GUESSED, settings))
+    told = _calibration(Tracker(GUESSED, settings), [])
     assert (told["treatment"], told["estimated"]["fx"]) == ("consider", GUESSED.fx)
     assert told["sigma"]["fx"] == pytest.approx(GUESSED.sigma[0])
     assert "caveat" not in told
