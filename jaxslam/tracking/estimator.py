@@ -149,15 +149,18 @@ class Estimator:
         view = predicted.view
         return matches.pixels - view.pixels[slots], S, view.usable[slots], slots
 
+    def nis(self, predicted: Predicted, seen: Observations) -> tuple[float, int]:
+        """Return the NIS `rᵀ S⁻¹ r` of what was seen, all together, and its degrees of freedom."""
+        S, residual = self._innovations(predicted, seen)
+        return float(residual @ np.linalg.solve(S, residual)), len(residual)
+
     def given(self, predicted: Predicted, seen: Observations) -> Prediction:
         """Return what the filter expects of the frame given that it shows what was seen, to first
         order and neglecting that landmarks drift. Changes nothing."""
         view, (n, p, _, _) = predicted.view, predicted.joint.shape
         S = predicted.joint.reshape(n * p, n * p)
         known = (p * seen.slots[:, None] + np.arange(p)).ravel()
-        residual = (seen.pixels - view.pixels[seen.slots]).ravel()
-        more = (self.settings.noise_factors(seen.variances) - 1) * self.settings.pixel_sigma**2
-        of_known = S[np.ix_(known, known)] + np.diag(np.repeat(more, p))
+        of_known, residual = self._innovations(predicted, seen)
         gain = np.linalg.solve(of_known, S[known]).T
         # The noise of a pixel that is known is no part of what else is to be expected there.
         moved = (gain @ residual).reshape(n, p)
@@ -263,6 +266,16 @@ class Estimator:
             np.pad(valid, more),
             np.pad(landmark, more, mode="constant", constant_values=size - 1),
         )
+
+    def _innovations(
+        self, predicted: Predicted, seen: Observations
+    ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, " m"]]:
+        """Return the joint covariance of what was seen, and by how much it is not as expected."""
+        size = 2 * len(seen.slots)
+        S = predicted.joint[seen.slots][:, :, seen.slots].reshape(size, size)
+        more = (self.settings.noise_factors(seen.variances) - 1) * self.settings.pixel_sigma**2
+        residual = seen.pixels - predicted.view.pixels[seen.slots]
+        return S + np.diag(np.repeat(more, 2)), residual.ravel()
 
     def _created(
         self,

@@ -17,7 +17,7 @@ class Lost(StrEnum):
     FEW_AGREE = "few agree"
     """No more matches agree than would by chance."""
     CONTRADICTED = "contradicted"
-    """Too many proven landmarks are found elsewhere, all moved alike."""
+    """The proven landmarks that were found do not tell one motion of the camera."""
     REFUSED = "refused"
     """The filter used none of the matches."""
     NOT_POSITIVE = "not positive"
@@ -77,7 +77,11 @@ class Observations(NamedTuple):
 
     def labelled(self, label: str) -> Observations:
         """The rows of one label."""
-        return Observations(*(part[self.labels == label] for part in self))
+        return self.only(self.labels == label)
+
+    def only(self, which: np.ndarray) -> Observations:
+        """Some of the rows."""
+        return Observations(*(part[which] for part in self))
 
     def with_new(self, pixels: Float[np.ndarray, "j 2"]) -> Observations:
         """The table and below it landmarks that begin at these pixels, `new`: nothing was expected

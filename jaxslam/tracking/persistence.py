@@ -25,7 +25,7 @@ from jaxslam.tracking.map import Map
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 from jaxslam.tracking.settings import TrackerSettings
 
-FORMAT = "jaxslam tracker 3"
+FORMAT = "jaxslam tracker 4"
 
 NUMBERS = {
     "restarts": "map.number",
@@ -34,9 +34,7 @@ NUMBERS = {
     "_time": "time",
     "_unmeasured": "unmeasured",
     "_sigma_log_scale": "map.place.sigma_log_scale",
-    "_proven": "policy.proven",
-    "_elsewhere": "policy.elsewhere",
-    "_contradictions": "policy.contradictions",
+    "_doubtful": "policy.doubtful",
     "_log_unit": "map.place.log_unit",
     "_log_scale": "map.place.log_scale",
     "_unit_fixed": "map.place.unit_fixed",

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from scipy.stats import binom
+from scipy.stats import binom, chi2
 
 from jaxslam.filters.association import ASSOCIATIONS, Association, one_point_ransac
 from jaxslam.io.calibration import Calibration
@@ -38,19 +38,22 @@ NARROW = 1.5
 EXPLAINED = 0.8
 """… where a linear prediction explains this share of it."""
 PROVEN = 10
-"""A landmark that was found so often is where the map says: one that is then found elsewhere
-contradicts it …"""
-CONTRADICTED = 0.15
-"""… and no frame is believed while more than this share of them do, of at least `PROVEN`, in one
-direction: half of the picture may be a lorry's, or the map is wrong …"""
-_AT_RANDOM = 1.73
-"""… not counting what n directions at random sum to: 95 % of such sums are shorter than this √n."""
-_LATELY = 3
-"""Frames over which that share is an average."""
+"""A landmark that was found so often is where the map says: the others are believed only if all
+together they are likely, given the proven ones, …"""
+TOGETHER = 0.01
+"""… more than so much; and no frame is where the proven ones are less likely than `BY_CHANCE`, …"""
+ANOTHER = 1 / 3
+"""… or as many of them as this share of those that agree do so with another motion: half of the
+picture may be a lorry's, or the map is wrong …"""
+MOST = 2 / 3
+"""… nor are those after such a frame, until of the proven landmarks searched more than this share
+agree."""
 
 
 Agreement = Callable[..., Bool[np.ndarray, " m"]]
 """A filter's judgement of matches and their slots, `Estimator.believes` of one prediction."""
+Surprise = Callable[[Observations], tuple[float, int]]
+"""NIS of what was seen and its degrees of freedom, `Estimator.nis` of one prediction."""
 
 
 @dataclass
@@ -61,17 +64,12 @@ class Policy:
     settings: TrackerSettings
     ambiguous_start: bool
     """Whether the filter welcomes matches of a start that no linear prediction expects."""
-    proven: float = 0.0
-    """Proven landmarks found in a frame, on an average of the latest …"""
-    elsewhere: float = 0.0
-    """… and how many of them were found elsewhere, in one direction."""
-    contradictions: int = 0
-    """The latest frames, in a row, that were not believed for that."""
+    doubtful: bool = False
+    """Whether two motions of the camera were as likely when there were matches last."""
 
     def forget(self) -> None:
         """Begin with a new map."""
-        self.proven = self.elsewhere = 0.0
-        self.contradictions = 0
+        self.doubtful = False
 
     @property
     def in_wide(self) -> list[Association]:
@@ -99,7 +97,11 @@ class Policy:
                 searched = look(closer, self.calibration, self.settings, several=False)
                 again = self.agreeing(*searched, map.landmarks, agree, lost=lost)
                 seen = again if again.matched.any() else seen
-        reason = self.reason(seen, map.landmarks)
+        nis = partial(map.estimator.nis, predicted)
+        if not self._likely_given_proven(seen, map.landmarks, nis):
+            of_proven = partial(_of_proven, map.landmarks, agree)
+            seen = self.agreeing(*searched, map.landmarks, of_proven, lost=lost)
+        reason = self.reason(seen, map.landmarks, agree, nis)
         if reason is not None:
             labels = np.where(seen.matched, "outlier", seen.labels)
             seen = seen._replace(labels=labels)
@@ -145,41 +147,43 @@ class Policy:
         sigma = NARROW + turned @ turned / (2 * self.calibration.fx)
         return given._replace(covariances=given.covariances + sigma**2 * np.eye(2))
 
-    def reason(self, seen: Observations, landmarks: Mapping[int, Landmark]) -> Lost | None:
+    def _likely_given_proven(
+        self, seen: Observations, landmarks: Mapping[int, Landmark], nis: Surprise
+    ) -> bool:
+        """Return whether what is matched of landmarks that are not proven is likely, all together,
+        given what is matched of those that are: each by itself may be within its gate, and all of
+        them be moved alike."""
+        matched = seen.labelled("matched")
+        whole, dof = nis(matched)
+        old, known = nis(matched.only(proven(matched.slots, landmarks)))
+        asked = 2 * LEAST_MATCHES <= known < dof
+        return not asked or bool(chi2.sf(whole - old, dof - known) > TOGETHER)
+
+    def reason(
+        self, seen: Observations, landmarks: Mapping[int, Landmark], agree: Agreement, nis: Surprise
+    ) -> Lost | None:
         """Return why nothing of a table is believed, if so."""
         if not len(seen.slots):
             return Lost.NOTHING_EXPECTED
         if not seen.matched.any():
             return Lost.FEW_AGREE
-        moved = seen.pixels - seen.predicted
-        contradicted = self.contradicted(
-            [landmarks[slot] for slot in seen.slots], moved, seen.matched
-        )
-        self.contradictions = self.contradictions + 1 if contradicted else 0
-        if self.contradictions > self.settings.lost_for:
-            # What contradicts for so long is wrong itself: it is not found, and goes.
-            self.forget()
-        return Lost.CONTRADICTED if self.contradictions else None
+        known = seen.only(proven(seen.slots, landmarks))
+        agreed = known.labelled("matched")
+        few = len(agreed.slots) <= MOST * len(known.slots)
+        another = self._another(known.labelled("outlier"), len(agreed.slots), agree)
+        self.doubtful = another or (self.doubtful and few)
+        unlikely = chi2.sf(*nis(agreed)) < BY_CHANCE
+        return Lost.CONTRADICTED if self.doubtful or unlikely else None
 
-    def contradicted(
-        self,
-        landmarks: list[Landmark],
-        moved: Float[np.ndarray, "k 2"],
-        agree: Bool[np.ndarray, " k"],
-    ) -> bool:
-        """Return whether too many proven landmarks are found elsewhere than those that agree;
-        `moved` is where all were found from where they were expected, NaN of those that were
-        not."""
-        if agree.any():
-            proven = np.array([one.found >= PROVEN for one in landmarks], bool)
-            proven &= np.isfinite(moved[:, 0])
-            aside = moved[proven & ~agree] - np.median(moved[agree], axis=0)
-            directions = aside / np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-9)
-            self.proven += (proven.sum() - self.proven) / _LATELY
-            at_random = _AT_RANDOM * np.sqrt(len(directions))
-            alike = max(float(np.linalg.norm(directions.sum(axis=0))) - at_random, 0.0)
-            self.elsewhere += (alike - self.elsewhere) / _LATELY
-        return bool(self.elsewhere > CONTRADICTED * max(self.proven, PROVEN))
+    def _another(self, others: Observations, agreed: int, agree: Agreement) -> bool:
+        """Return whether most of these, and many beside those that `agreed`, do so with another
+        motion of the camera: then it cannot be told which is the world's."""
+        rows = np.arange(len(others.slots))
+        least = max(MOST * len(rows), ANOTHER * agreed, LEAST_MATCHES)
+        if len(rows) < least:
+            return False
+        matches = Matches(rows, others.pixels, np.ones(len(rows), np.float32), others.variances)
+        return bool(agree(others.slots, matches).sum() >= least)
 
     def _of_several(
         self,
@@ -251,3 +255,24 @@ def _alone(owner: Int[np.ndarray, " m"], among: Bool[np.ndarray, " m"]) -> Int[n
     some = np.flatnonzero(among)
     _, of, count = np.unique(owner[some], return_inverse=True, return_counts=True)
     return some[count[of] == 1]
+
+
+def proven(
+    slots: Int[np.ndarray, " k"], landmarks: Mapping[int, Landmark]
+) -> Bool[np.ndarray, " k"]:
+    """Return which of the slots hold landmarks that are proven."""
+    return np.array([landmarks[slot].found >= PROVEN for slot in slots], bool)
+
+
+def _of_proven(
+    landmarks: Mapping[int, Landmark],
+    agree: Agreement,
+    slots: Int[np.ndarray, " m"],
+    matches: Matches,
+    *association: Association,
+) -> Bool[np.ndarray, " m"]:
+    """Return which matches of proven landmarks agree; none of the others does."""
+    believed = proven(slots, landmarks)
+    old = np.flatnonzero(believed)
+    believed[old] = agree(slots[old], matches.only(old), *association)
+    return believed

@@ -191,9 +191,7 @@ class Tracker:
         self.map.note(seen)
         if reason is None and not seen.matched.any():
             reason = Lost.REFUSED
-        # A map that is contradicted is not given up for it: the camera sees it.
-        if reason is not Lost.CONTRADICTED:
-            self.unmeasured = 0 if reason is None else self.unmeasured + 1
+        self.unmeasured = 0 if reason is None else self.unmeasured + 1
         if not self.landmarks or self.unmeasured > self.settings.lost_for:
             return self._lost(frame, reason or Lost.NOTHING_EXPECTED, seen)
         kept = in_view(self.landmarks, seen.slots, self.settings)

@@ -1,7 +1,11 @@
 """Which matches are believed, of a table of what was searched and a table of what was found."""
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 pytest.importorskip("cv2")
 
@@ -10,7 +14,7 @@ from jaxslam.tracking.landmarks import Landmark
 from jaxslam.tracking.matching import Matches
 from jaxslam.tracking.observations import NOTHING, Lost, Observations
 from jaxslam.tracking.patches import STORED, Patch
-from jaxslam.tracking.policy import CHANCE_LOST, PROVEN, Policy, more_than_chance
+from jaxslam.tracking.policy import BY_CHANCE, CHANCE_LOST, PROVEN, Policy, more_than_chance
 from jaxslam.tracking.settings import TrackerSettings
 
 COUNT = 20
@@ -69,23 +73,83 @@ def test_what_the_filter_did_not_use_is_an_outlier_and_new_landmarks_are_rows_be
     assert len(longer.slots) == COUNT + 1
 
 
-def test_what_contradicts_for_long_is_put_out_and_the_map_stays():
-    """After as many frames as a lost camera waits, those that agree are the map."""
-    policy = Policy(CAMERA, TrackerSettings(lost_for=5), ambiguous_start=False)
-    landmarks = {
-        slot: Landmark(slot, PATCH, np.eye(4), np.zeros(2), found=PROVEN) for slot in SLOTS.tolist()
+def proven_landmarks(count=COUNT):
+    return {
+        slot: replace(LANDMARKS[slot], found=PROVEN if row < count else PROVEN - 1)
+        for row, slot in enumerate(SLOTS.tolist())
     }
-    labels = np.where(np.arange(COUNT) < 10, "matched", "outlier")
-    moved = PLACES + np.where(np.arange(COUNT) < 10, 0.0, 5.0)[:, None] * ASIDE
-    seen = table()._replace(pixels=moved, labels=labels)
-    reasons = [policy.reason(seen, landmarks) for _ in range(10)]
-    first = reasons.index(Lost.CONTRADICTED)
-    assert reasons[first : first + 6] == [Lost.CONTRADICTED] * 5 + [None]
+
+
+def likely(seen):
+    """NIS of pixels that are expected where they are found."""
+    return 0.0, 2 * len(seen.slots)
+
+
+def nothing(slots, matches):
+    """No motion that these agree with."""
+    return np.zeros(len(slots), bool)
+
+
+def everything(slots, matches):
+    """They all agree with one motion."""
+    return np.ones(len(slots), bool)
+
+
+def found(matched, outliers):
+    labels = np.full(COUNT, "unmatched")
+    labels[:matched], labels[matched : matched + outliers] = "matched", "outlier"
+    return table()._replace(pixels=PLACES + ASIDE, labels=labels)
+
+
+def test_proven_landmarks_that_agree_with_another_motion_contradict():
+    """As many as a third of those that agree, and most of those that do not."""
+    half = np.arange(COUNT) % 2 == 0
+
+    def judged(matched, outliers, agree=everything, count=COUNT):
+        policy = Policy(CAMERA, TrackerSettings(), ambiguous_start=False)
+        return policy.reason(found(matched, outliers), proven_landmarks(count), agree, likely)
+
+    assert judged(12, 8) is judged(15, 5) is Lost.CONTRADICTED
+    assert judged(16, 4) is None
+    assert judged(12, 8, nothing) is None
+    assert judged(12, 8, lambda slots, _: half[: len(slots)]) is None
+    assert judged(12, 8, count=15) is None  # three of the eight are proven
+
+
+def test_after_a_contradiction_most_of_the_proven_landmarks_must_agree():
+    """The picture's other half may have gone from where it is looked for."""
+    policy = Policy(CAMERA, TrackerSettings(), ambiguous_start=False)
+
+    def judged(*counts):
+        return policy.reason(found(*counts), proven_landmarks(), everything, likely)
+
+    assert judged(10, 0) is None
+    assert judged(10, 10) is Lost.CONTRADICTED
+    assert judged(13, 0) is Lost.CONTRADICTED
+    assert judged(14, 0) is None
+    assert judged(10, 0) is None
+    assert judged(10, 10) is Lost.CONTRADICTED
+    policy.forget()
+    assert judged(10, 0) is None
+
+
+def test_proven_landmarks_that_are_improbable_together_contradict():
+    policy = Policy(CAMERA, TrackerSettings(), ambiguous_start=False)
+    for count, reason in ((COUNT, Lost.CONTRADICTED), (0, None)):
+        for beyond, expected in ((1.01, reason), (0.99, None)):
+            worst = beyond * chi2.isf(BY_CHANCE, 2 * COUNT)
+
+            def nis(seen, worst=worst):
+                return worst * (len(seen.slots) == COUNT), 2 * len(seen.slots)
+
+            seen, landmarks = found(COUNT, 0), proven_landmarks(count)
+            assert policy.reason(seen, landmarks, everything, nis) is expected
 
 
 def test_a_frame_without_expected_landmarks_and_one_without_matches_say_so():
     policy = Policy(CAMERA, TrackerSettings(), ambiguous_start=False)
-    assert policy.reason(NOTHING, {}) is Lost.NOTHING_EXPECTED
-    assert policy.reason(table(), LANDMARKS) is Lost.FEW_AGREE
+    judged = partial(policy.reason, agree=nothing, nis=likely)
+    assert judged(NOTHING, {}) is Lost.NOTHING_EXPECTED
+    assert judged(table(), LANDMARKS) is Lost.FEW_AGREE
     seen = table()._replace(pixels=PLACES, labels=np.full(COUNT, "matched"))
-    assert policy.reason(seen, LANDMARKS) is None
+    assert judged(seen, LANDMARKS) is None
