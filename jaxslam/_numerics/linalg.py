@@ -73,6 +73,8 @@ def _(primals, tangents):
 def _factored(A: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
     """L and L⁻¹ by halves: products of matrices, and leaves."""
     n = A.shape[0]
+    if n == 0:
+        return A, A
     if n <= LEAF:
         return _factored_by_columns(A)
     h = n // 2

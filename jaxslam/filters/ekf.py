@@ -18,7 +18,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.arrays import AnyArray, cast, precision
-from jaxslam.filters.forms.blocks import Landmark, Prior
+from jaxslam.filters.forms.blocks import Change, Landmark, Prior
 from jaxslam.filters.forms.covariance import Covariance
 from jaxslam.filters.forms.form import AbstractForm, AbstractGaussian
 from jaxslam.filters.forms.state import State
@@ -40,7 +40,7 @@ from jaxslam.filters.protocol import (
 from jaxslam.geometry import Pose, SplitPose, difference, identity, tangent_dim
 from jaxslam.landmarks import INVERSE_SCALING, Parametrization
 from jaxslam.models.calibration import AbstractCalibration, Known, check_calibration
-from jaxslam.models.coordinates import ROBOCENTRIC, Coordinates
+from jaxslam.models.coordinates import ROBOCENTRIC, SUBMAP, Coordinates, KeyframePose
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import AbstractMotion, Control, check_control
 from jaxslam.models.observations import Capacity, Features, Slots
@@ -107,7 +107,7 @@ class EkfSlam(AbstractStaged):
     landmark: Parametrization = eqx.field(static=True, default=INVERSE_SCALING)
     """What is estimated of a landmark, one of `LANDMARKS`."""
     coordinates: Coordinates = eqx.field(static=True, default=ROBOCENTRIC)
-    """Of which frame landmarks are: `ROBOCENTRIC`, `WORLD` or `KEYFRAME`."""
+    """Of which frame landmarks are: `ROBOCENTRIC`, `WORLD`, `KEYFRAME` or `SUBMAP`."""
     calibration: AbstractCalibration = Known()
     depth: InverseDepth = InverseDepth.beyond(1.0)
     """The prior on 1/z of a camera's landmarks."""
@@ -224,7 +224,9 @@ class EkfSlam(AbstractStaged):
 def composed(core: Core) -> Core:
     """The part of a core on which camera and landmarks depend once the motion is composed."""
     nothing = core.noise[:0]
-    return replace(core, motion=None, noise=nothing, calibration=nothing, depth_error=None)
+    return replace(
+        core, motion=None, noise=nothing, calibration=nothing, depth_error=None, base_motion=None
+    )
 
 
 def of_landmark(slam: EkfSlam, function: OfLandmark) -> Landmark:
@@ -301,6 +303,17 @@ def reanchored(slam: EkfSlam, state: Belief) -> Belief:
     )
 
 
+def rebased(slam: EkfSlam, state: Belief) -> Belief:
+    """The current camera as the one in which a submap begins: `T_BK ← T_BK T_KC`, T_KC is the
+    identity, and the motion's variables are kept as they are now."""
+
+    def core(core: Core) -> Core:
+        pose = KeyframePose.at(core.pose.camera_pose().normalize())
+        return replace(core, pose=pose, base_motion=core.motion)
+
+    return slam.form.reparametrise(state, Change(core=core, view=lambda core: (), landmark=None))
+
+
 def check_features(slam: EkfSlam, features: Features) -> None:
     """Raise ValueError unless they are measurements of the filter's sensor."""
     m, p = features.slots.shape[-1], slam.sensor.size
@@ -375,6 +388,7 @@ def _empty(slam: EkfSlam, capacity: int, dtype: DTypeLike) -> Belief:
         calibration=jnp.zeros(slam.calibration.sigma.shape, dtype),
         anchors=_no_anchors(slam, capacity, dtype),
         depth_error=None if depth.common is None else jnp.zeros(1, dtype),
+        base_motion=variables if slam.coordinates is SUBMAP else None,
     )
     # An empty slot holds a point straight ahead: finite in every formula.
     ahead = jnp.zeros(geometry.point_dim, dtype).at[-1].set(1.0)
@@ -389,6 +403,8 @@ def _empty(slam: EkfSlam, capacity: int, dtype: DTypeLike) -> Belief:
     if depth.common is not None:
         common = jnp.reshape(depth.common**2, (1, 1))
         state = slam.form.augment(state, core.part("depth_error").start, common)
+    if slam.coordinates is SUBMAP:
+        state = rebased(slam, state)
     return state if slam.calibration.each_frame else _with_calibration(slam, state)
 
 

@@ -54,6 +54,8 @@ class Core(eqx.Module):
     """T_AF of the cameras F in which landmarks are written; a batch, or None."""
     depth_error: Float[Array, " 1"] | None = None
     """What the priors on 1/z of all landmarks have in common, in σ of one prior, or None."""
+    base_motion: Variables | None = None
+    """What the motion model kept in the camera in which the submap began; None without submaps."""
 
     def part(self, name: str) -> slice:
         """The slice of a field in the tangent of the core."""

@@ -107,6 +107,18 @@ WORLD = Coordinates(
 )
 """A = B: the state holds T_BC, position and orientation separately."""
 
+SUBMAP = Coordinates(
+    name="submap",
+    moves_landmarks=True,
+    from_base_pose=KeyframePose.at,
+    camera_pose=KeyframePose.camera_pose,
+    estimate=KeyframePose.camera_pose,
+    map_from_camera=lambda held, step: step,
+    compose=KeyframePose.moved,
+)
+"""A = C, as in a robocentric filter: the state holds T_BK and T_KC, K the camera in which the
+current submap began (`jaxslam.filters.submaps`)."""
+
 KEYFRAME = Coordinates(
     name="keyframe",
     moves_landmarks=False,

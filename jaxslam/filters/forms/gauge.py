@@ -18,14 +18,14 @@ from jaxtyping import Array, Float
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.model import Core, SlamModel
 from jaxslam.geometry import Pose, Scalar, SplitPose, identity, jacobian, joined, nudge
-from jaxslam.models.coordinates import ROBOCENTRIC, WORLD
+from jaxslam.models.coordinates import ROBOCENTRIC, SUBMAP, WORLD, KeyframePose
 
 
 def check_gauge(model: SlamModel) -> None:
     """Raise ValueError unless the gauge of the model's state is known."""
-    if model.coordinates not in (ROBOCENTRIC, WORLD):
+    if model.coordinates not in (ROBOCENTRIC, SUBMAP, WORLD):
         raise ValueError(
-            "unobservable directions are known of robocentric and world filters, "
+            "unobservable directions are known of robocentric (submap) and world filters, "
             f"not {model.coordinates.name}"
         )
 
@@ -62,10 +62,18 @@ def act(
         moved = in_base and not model.landmark.anchored
         return model.landmark.transform(rigid, parameters) if moved else parameters
 
+    def held(pose):
+        if isinstance(pose, KeyframePose):
+            in_keyframe = enlarged(pose.keyframe_from_camera)
+            return KeyframePose(rigid @ enlarged(pose.base_from_keyframe), in_keyframe)
+        return model.coordinates.from_base_pose(rigid @ enlarged(model.camera_pose(core)))
+
+    kept = core.base_motion
     core = replace(
         core,
-        pose=model.coordinates.from_base_pose(rigid @ enlarged(model.camera_pose(core))),
+        pose=held(core.pose),
         motion=variables,
+        base_motion=None if kept is None else model.motion.enlarged(kept, core.noise, factor)[0],
         noise=noise,
         anchors=None if core.anchors is None else jax.vmap(anchor)(core.anchors),
     )

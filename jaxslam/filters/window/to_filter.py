@@ -180,6 +180,7 @@ def _core(slam: EkfSlam, like, newest, log_scale):
         calibration=frame.calibration if kept else like.calibration,
         # The filter keeps c in σ of one landmark's prior.
         depth_error=None if like.depth_error is None else slam.depth.common * common,
+        base_motion=None if like.base_motion is None else variables,
     )
 
 

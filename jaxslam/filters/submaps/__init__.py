@@ -1,0 +1,1 @@
+"""Conditionally independent submaps of a filter, the chain that they are, and loops in it."""

@@ -1,0 +1,154 @@
+"""Loops: a landmark of one submap is one of another, and what the whole chain learns of it.
+
+The posterior of the chain's white numbers y, whose prior is N(0, I), is that of a least squares
+problem with few residuals c(y) of many numbers. Gauss–Newton is then in the space of the residuals,
+
+    y ← −Jᵀ S⁻¹ (c − J y),   S = J Jᵀ + R,
+
+(the dual form of Bell's step, SIAM J. Optim. 4, 1994), linear in the length of the chain; so is the
+covariance `I − Jᵀ S⁻¹ J`. The filter is told nothing of it: where the submaps are is learnt, and
+what is in them, and a loop that turned out wrong is one residual less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from jaxslam._numerics.linalg import Cholesky, cholesky
+from jaxslam.filters.association import Candidates, joint_compatibility
+from jaxslam.filters.forms.state import State
+from jaxslam.filters.submaps.chain import Chain, OfChain, base_poses
+from jaxslam.geometry import homogeneous_apply
+
+STEPS = 20
+"""Of Gauss–Newton, at the most …"""
+SMALLEST = 1e-10
+"""… until the white numbers move by less than this share of their length."""
+SAME = 1e-5
+"""σ of the distance of a point from itself, as a share of its distance from the camera: none, but
+for rounding."""
+
+
+class Loops(eqx.Module):
+    """m pairs of landmarks of two submaps each, which are the same points."""
+
+    submaps: Int[Array, "m 2"]
+    """Places in the chain, counted from the oldest submap."""
+    slots: Int[Array, "m 2"]
+    """Of each landmark in the state of its submap."""
+    valid: Bool[Array, " m"]
+    """A pair that is not says nothing."""
+
+
+class Posterior(eqx.Module):
+    """A chain with what loops say of it."""
+
+    chain: Chain
+    y: Float[Array, "N n"]
+    """The white numbers at the maximum."""
+    states: State
+    """The submaps there, a batch; their covariances are those before."""
+    slope: Float[Array, "k N n"]
+    """J of the loops' residuals at the maximum."""
+    factor: Cholesky
+    """S of the residuals."""
+    converged: Bool[Array, ""]
+
+    def marginal(self, function: OfChain) -> tuple[PyTree, Float[Array, "j j"]]:
+        """Return mean and covariance of a function of all submaps' states, to first order."""
+        value, rows = self.chain.linearised(function, self.states)
+        rows, slope = (x.reshape(len(x), self.y.size) for x in (rows, self.slope))
+        known = self.factor.whitening @ (slope @ rows.T)
+        return value, rows @ rows.T - known.T @ known
+
+
+def separation(chain: Chain, loops: Loops, states: State) -> Float[Array, "m n"]:
+    """The distances of two landmarks each that should be none, as shares of their distance.
+
+    Both are homogeneous points (X, ω) in the camera of the second, compared on the unit sphere
+    with ω in units of the second's distance, in the n directions across it: a point at infinity
+    has a direction, and no distance.
+    """
+    poses = base_poses(chain, states)
+
+    def one(submaps, slots):
+        def point(k):
+            landmark = states.landmarks[submaps[k], slots[k]]
+            pose = jax.tree.map(lambda x: x[submaps[k]], poses)
+            return pose, *chain.slam.landmark.homogeneous(landmark)
+
+        (T_BP, X_p, w_p), (T_BQ, X_q, w_q) = point(0), point(1)
+        distance = jnp.linalg.norm(X_q) / jnp.maximum(jnp.abs(w_q), 1e-6)
+        unit = jax.lax.stop_gradient(distance)
+        there = homogeneous_apply(T_BQ.inverse() @ T_BP, X_p, w_p)
+        first, second = _direction(there, w_p * unit), _direction(X_q, w_q * unit)
+        return _across(jax.lax.stop_gradient(second)).T @ (first - second)
+
+    values = jax.vmap(one)(loops.submaps, loops.slots)
+    return jnp.where(loops.valid[:, None], values, 0.0)
+
+
+def _direction(point: Float[Array, " n"], omega: Float[Array, ""]) -> Float[Array, " n+1"]:
+    both = jnp.append(point, omega)
+    return both / jnp.linalg.norm(both)
+
+
+def _across(v: Float[Array, " n+1"]) -> Float[Array, "n+1 n"]:
+    """An orthonormal basis of what is orthogonal to a unit vector: Householder's reflection."""
+    w = v.at[-1].add(jnp.where(v[-1] < 0, -1.0, 1.0))
+    return (jnp.eye(v.size) - 2 * jnp.outer(w, w) / (w @ w))[:, :-1]
+
+
+def close(chain: Chain, loops: Loops, sigma: float = SAME) -> Posterior:
+    """Return the chain in which the landmarks of these pairs are the same."""
+    return posterior(chain, lambda states: separation(chain, loops, states).ravel(), sigma)
+
+
+def posterior(
+    chain: Chain, residual: Callable[[State], Float[Array, " k"]], sigma: float
+) -> Posterior:
+    """Return the chain in which a residual of all states is zero, but for an error of this σ."""
+
+    def linear(y: Float[Array, "N n"]):
+        states = chain.at(y)
+        value, rows = chain.linearised(residual, states)
+        J = rows.reshape(len(value), y.size)
+        return states, value, rows, J, cholesky(J @ J.T + sigma**2 * jnp.eye(len(value)))
+
+    def step(carry):
+        y, _, count = carry
+        _, value, _, J, factor = linear(y)
+        new = -(J.T @ factor.solve(value - J @ y.ravel())).reshape(y.shape)
+        moved = jnp.linalg.norm(new - y) > SMALLEST * (1 + jnp.linalg.norm(new))
+        return new, moved, count + 1
+
+    def going_on(carry):
+        return carry[1] & (carry[2] < STEPS)
+
+    zero = jnp.zeros(chain.shape, chain.links.root.dtype)
+    y, moved, _ = jax.lax.while_loop(going_on, step, (zero, jnp.asarray(True), 0))
+    states, _, rows, _, factor = linear(y)
+    return Posterior(chain, y, states, rows, factor, ~moved)
+
+
+def agreeing(
+    chain: Chain,
+    loops: Loops,
+    association: Callable[[Candidates], Bool[Array, " m"]] = joint_compatibility,
+    sigma: float = SAME,
+) -> Loops:
+    """Return the loops of which those are valid that agree with the chain and with one another."""
+    states = chain.links.state
+    value, rows = chain.linearised(lambda states: separation(chain, loops, states).ravel(), states)
+    J, m = rows.reshape(len(value), -1), len(loops.valid)
+    S = J @ J.T + sigma**2 * jnp.eye(len(value))
+    first = jnp.argmax(jnp.all(loops.slots[:, None] == loops.slots, axis=-1), axis=1)
+    found = Candidates(
+        value.reshape(m, -1), S.reshape(m, value.size // m, m, -1), loops.valid, first
+    )
+    return eqx.tree_at(lambda loops: loops.valid, loops, association(found))
