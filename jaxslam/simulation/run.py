@@ -38,6 +38,8 @@ class Run(eqx.Module):
     """The true camera of every frame."""
     new: Bool[Array, "frames landmarks"] | None = None
     """Which of the visible are seen for the first time, where slots are used again."""
+    identity: Int[Array, "frames landmarks"] | None = None
+    """Which point each slot stands for, where one that comes back is a new landmark."""
 
     @property
     def points_by_frame(self) -> Float[Array, "frames landmarks n"]:
@@ -131,4 +133,32 @@ def in_order_of_appearance(run: Run) -> Run:
         points=run.points[order],
         measured=run.measured[:, order],
         visible=run.visible[:, order],
+    )
+
+
+def in_shared_slots(run: Run, count: int) -> Run:
+    """The run in so many slots: a point has one for as long as it is seen, and another, as a new
+    landmark, when it comes back. Where more are seen, those that come first in the run have one."""
+    none = jnp.full(count, -1)
+
+    def frame(held: Int[Array, " slots"], seen: Bool[Array, " landmarks"]):
+        stays = (held >= 0) & seen[held]
+        has_one = jnp.zeros_like(seen).at[jnp.where(stays, held, seen.size)].set(True, mode="drop")
+        waiting = seen & ~has_one
+        # The k-th free slot is for the k-th that waits.
+        rank = jnp.cumsum(~stays) - 1
+        order = jnp.argsort(~waiting, stable=True)
+        comes = ~stays & (rank < jnp.sum(waiting))
+        held = jnp.where(stays, held, jnp.where(comes, order[rank], -1))
+        return held, (held, comes)
+
+    _, (held, new) = jax.lax.scan(frame, none, run.visible)
+    pick = jax.vmap(lambda values, held: values[held])
+    return replace(
+        run,
+        points=run.points[held],
+        measured=pick(run.measured, held),
+        visible=held >= 0,
+        new=new,
+        identity=held,
     )

@@ -27,7 +27,7 @@ CALIBRATIONS = ("white", "consider", "estimated", "known")
 """The paper's independent draw of every frame; constant and correlated but not corrected
 (Schmidt); constant and estimated; exact."""
 TRUE_CALIBRATIONS = ("nominal", "white", "constant")
-PLACEMENTS = ("prior", "ring", "room", "rays")
+PLACEMENTS = ("prior", "ring", "room", "cloud", "rays")
 ROOM_LANDMARKS = 72
 LARGEST_WHOLE = 2**31 - 1
 
@@ -69,14 +69,18 @@ class Scenario(eqx.Module):
     placement: str = _structural("prior")
     """`prior`: every landmark seen in frame 0, at a uniform pixel and an inverse depth from the
     filter's prior. `ring`: evenly on a horizontal circle around the centre of the nominal path.
-    `room`: 72 points along the walls of a square room, on two levels (slamtb). `rays`: always as
+    `room`: 72 points along the walls of a square room, on two levels (slamtb). `cloud`: along the
+    true path, each on a random ray of a random frame; seen up to the greatest depth. `rays`: always as
     many in view; for one that leaves, which is gone for good, another is thrown along a random ray
     of the camera there."""
     landmarks: int = _structural(12)
+    in_view: int = _structural(0)
+    """At most so many landmarks are measured at once, and one that leaves the view is a new one
+    when it is seen again: a filter needs slots for no more. 0: every landmark has its own slot."""
     first_pixels: tuple[Numbers, ...] = ((20.0, 620.0),)
     """`prior`, `rays`: the interval of each pixel coordinate at first sight."""
     depth_range: Numbers = (1.0, 6.0)
-    """`rays`: least and greatest depth at first sight, m; uniform in between."""
+    """`rays`, `cloud`: least and greatest depth on the ray, m; uniform in between."""
     ring_radius: float = 8.0
     """`ring`: its radius, m."""
     nearest_depth: float = 3.0
@@ -294,18 +298,32 @@ def _check_placement(s: Scenario) -> None:
         )
     if s.placement == "rays":
         _check_rays(s)
-    if s.placement == "ring" and s.geometry != "planar":
-        raise ValueError("scenario field placement: ring is only for a planar geometry")
-    if s.placement == "ring" and s.velocity[-1] == 0:
-        raise ValueError("placement ring needs a nominal path that turns: velocity[-1] is 0")
+    if s.placement == "cloud" and s.sensor != "camera":
+        raise ValueError(f"placement cloud is for a camera, not for a {s.sensor} sensor")
+    if s.in_view and (s.placement == "rays" or _limits(s)):
+        raise ValueError(
+            "scenario field in_view: not with placement rays, first_landmarks, new_landmarks or "
+            "known_landmarks"
+        )
+    if s.placement == "ring" and s.velocity[-1 if s.geometry == "planar" else 4] == 0:
+        raise ValueError(
+            "placement ring needs a nominal path that turns: velocity[-1], in space velocity[4], "
+            "is 0"
+        )
 
 
 def _check_rays(s: Scenario) -> None:
     if s.sensor != "camera":
         raise ValueError(f"placement rays is for a camera, not for a {s.sensor} sensor")
-    for field in ("first_frame", "first_landmarks", "new_landmarks", "known_landmarks"):
+    for field in ("first_frame", *_limits(s)):
         if getattr(s, field):
             raise ValueError(f"scenario field {field}: placement rays has no limits; use 0")
+
+
+def _limits(s: Scenario) -> list[str]:
+    """The fields by which a scenario limits what is measured."""
+    fields = ("first_landmarks", "new_landmarks", "known_landmarks")
+    return [field for field in fields if getattr(s, field)]
 
 
 _NOISE_OF = {"velocity": "acceleration_sigma", "odometry": "odometry_sigma"}
@@ -317,7 +335,7 @@ _POSITIVE = (
 _NOT_NEGATIVE = (
     "velocity_sigma", "focal_sigma", "centre_sigma", "odometry_sigma", "range",
     "scale_sigma", "still_frames", "first_frame", "first_landmarks", "new_landmarks",
-    "known_landmarks", "drift_sigma", "drift_wrong",
+    "known_landmarks", "drift_sigma", "drift_wrong", "in_view",
 )  # fmt: skip
 
 
@@ -439,6 +457,26 @@ def _built_in():
         landmarks=36,
         calibration="white",
         true_calibration="white",
+    )
+    laps: dict[str, Any] = {"rate": 10.0, "steps": 1050, "placement": "ring"}
+    yield Scenario(
+        name="laps",
+        velocity=(0.0, 1.2, 0.3),
+        acceleration_sigma=(0.02,) * 3,
+        landmarks=144,
+        in_view=24,
+        **laps,
+    )
+    yield Scenario(
+        name="laps-6dof",
+        velocity=(0.0, 0.0, 1.2, 0.0, -0.3, 0.0),
+        velocity_sigma=(0.0,) * 6,
+        acceleration_sigma=(0.1,) * 6,
+        motion="odometry",
+        odometry_sigma=(0.005,) * 3 + (math.radians(0.05),) * 3,
+        in_view=20,
+        **laps,
+        **(_SPATIAL | {"landmarks": 144}),
     )
     yield from _with_odometry()
 

@@ -27,7 +27,8 @@ def _in_range(scenario: Scenario, points, measured) -> Bool[Array, " l"]:
 def visible(s: Scenario, sensor: AbstractSensor, points, measured) -> Bool[Array, " l"]:
     """A camera sees what is in its picture; another sensor what is in its range."""
     if isinstance(sensor, Pinhole):
-        return in_image(s, points, measured)
+        near = points[:, -1] <= s.depth_range[-1] if s.placement == "cloud" else True
+        return in_image(s, points, measured) & near
     return _in_range(s, points, measured) & jax.vmap(sensor.possible)(points)
 
 

@@ -16,7 +16,7 @@ from jaxslam.models.motion import AbstractMotion, Control
 from jaxslam.models.sensors import AbstractSensor, Pinhole
 from jaxslam.simulation.pieces import calibration_sigma_of, motion_of, sensor_of
 from jaxslam.simulation.placement import PLACEMENT, thrown
-from jaxslam.simulation.run import Run, in_order_of_appearance
+from jaxslam.simulation.run import Run, in_order_of_appearance, in_shared_slots
 from jaxslam.simulation.scenario import Scenario, as_scenario
 from jaxslam.simulation.trajectories import RecordedMotion, find, sampled
 from jaxslam.simulation.visibility import limited, visible
@@ -57,7 +57,7 @@ def simulate(
             raise ValueError(f"placement rays is for a Pinhole, not for {type(sensor).__name__}")
         points, new = thrown(s, world_key, poses, sensors)
     else:
-        points, new = PLACEMENT[s.placement](s, world_key), None
+        points, new = PLACEMENT[s.placement](s, world_key, poses), None
     one = jnp.ones((), points.dtype)
 
     def frame(pose: Pose, sensor, points):
@@ -73,6 +73,8 @@ def simulate(
     noise = jax.random.normal(pixel_key, measured.shape, measured.dtype)
     measured += sensor.sigma * noise + _drift(s, jax.random.fold_in(pixel_key, 2), measured)
     run = Run(poses, points, measured, seen, controls, cameras, new)
+    if s.in_view:
+        return in_shared_slots(run, s.in_view)
     return in_order_of_appearance(run) if new is None else run
 
 

@@ -144,7 +144,7 @@ class Submaps(AbstractWrapper):
         # A landmark in whose place another comes is seen no more.
         gone = jnp.zeros(capacity, bool).at[new.slots].set(new.valid)
         state = self.remove(state, gone)
-        state = cond(self._due(state, new), lambda state: self._handed_over(state), state)
+        state = self._handed_over(state, self._due(state, new))
         free = jnp.argsort(state.numbers >= 0, stable=True)
         rank = jnp.cumsum(new.valid) - 1
         own = jnp.where(new.valid, free[rank], state.numbers.size)
@@ -176,25 +176,28 @@ class Submaps(AbstractWrapper):
         full = jnp.sum(state.numbers < 0) < jnp.sum(new.valid)
         return full | (left & self.unit_fixed(state))
 
-    def _handed_over(self, state: SubmapsState) -> SubmapsState:
+    def _handed_over(self, state: SubmapsState, due: Bool[Array, ""]) -> SubmapsState:
         """Freeze the submap, and begin the next one. Where a start is still being found out there
         is nothing that could be frozen: what is out of view is then forgotten."""
-        _, one = self.base.gaussian(state.inner, None)
-        size = state.numbers.size
-        carried = jnp.zeros(size, bool).at[state.slots].set(True, mode="drop")
-        ended = self.unit_fixed(state)
+        carried = jnp.zeros(state.numbers.size, bool).at[state.slots].set(True, mode="drop")
+        ended = due & self.unit_fixed(state)
+
+        def frozen(_, inner):
+            return Frozen(self.base.gaussian(inner, None)[1], carried, state.numbers)
+
+        def begun(inner):
+            inner = self.base.remove(inner, ~carried)
+            return _each_gaussian(inner, lambda one: rebased(self.ekf, one))
+
+        # Apart from what is conditional: a batch would copy all that is kept in every frame.
         place = state.count % self.history
-
-        def kept(all, newest):
-            return all.at[place].set(jnp.where(ended, newest, all[place]))
-
-        frozen = jax.tree.map(kept, state.frozen, Frozen(one, carried, state.numbers))
-        inner = self.base.remove(state.inner, ~carried)
+        before = jax.tree.map(lambda x: x[place], state.frozen)
+        newest = cond(ended, frozen, before, state.inner)
         return replace(
             state,
-            inner=_each_gaussian(inner, lambda one: rebased(self.ekf, one)),
-            numbers=jnp.where(carried, state.numbers, -1),
-            frozen=frozen,
+            inner=cond(due, begun, state.inner),
+            numbers=jnp.where(due & ~carried, -1, state.numbers),
+            frozen=jax.tree.map(lambda all, one: all.at[place].set(one), state.frozen, newest),
             count=state.count + ended,
         )
 
