@@ -458,24 +458,26 @@ def _built_in():
         calibration="white",
         true_calibration="white",
     )
-    laps: dict[str, Any] = {"rate": 10.0, "steps": 1050, "placement": "ring"}
     yield Scenario(
         name="laps",
+        steps=3150,
         velocity=(0.0, 1.2, 0.3),
         acceleration_sigma=(0.02,) * 3,
+        placement="ring",
         landmarks=144,
         in_view=24,
-        **laps,
     )
     yield Scenario(
         name="laps-6dof",
+        rate=10.0,
+        steps=1050,
+        placement="ring",
         velocity=(0.0, 0.0, 1.2, 0.0, -0.3, 0.0),
         velocity_sigma=(0.0,) * 6,
         acceleration_sigma=(0.1,) * 6,
         motion="odometry",
         odometry_sigma=(0.005,) * 3 + (math.radians(0.05),) * 3,
         in_view=20,
-        **laps,
         **(_SPATIAL | {"landmarks": 144}),
     )
     yield from _with_odometry()

@@ -13,6 +13,7 @@ what is in them, and a loop that turned out wrong is one residual less.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -20,15 +21,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.linalg import Cholesky, cholesky
-from jaxslam.filters.association import Candidates, joint_compatibility
+from jaxslam.filters.association import Association, Candidates, joint_compatibility
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.submaps.chain import Chain, OfChain, base_poses
 from jaxslam.geometry import homogeneous_apply
 
-STEPS = 20
+STEPS = 10
 """Of Gauss–Newton, at the most …"""
-SMALLEST = 1e-10
-"""… until the white numbers move by less than this share of their length."""
+SMALLEST = 1e-4
+"""… until no white number moves by more than this share of its σ."""
 SAME = 1e-5
 """σ of the distance of a point from itself, as a share of its distance from the camera: none, but
 for rounding."""
@@ -89,7 +90,9 @@ def separation(chain: Chain, loops: Loops, states: State) -> Float[Array, "m n"]
         first, second = _direction(there, w_p * unit), _direction(X_q, w_q * unit)
         return _across(jax.lax.stop_gradient(second)).T @ (first - second)
 
-    values = jax.vmap(one)(loops.submaps, loops.slots)
+    # What is no pair is compared with itself, in the submap that is there for sure.
+    there = jnp.where(loops.valid[:, None], loops.submaps, chain.shape[0] - 1)
+    values = jax.vmap(one)(there, loops.slots)
     return jnp.where(loops.valid[:, None], values, 0.0)
 
 
@@ -124,8 +127,7 @@ def posterior(
         y, _, count = carry
         _, value, _, J, factor = linear(y)
         new = -(J.T @ factor.solve(value - J @ y.ravel())).reshape(y.shape)
-        moved = jnp.linalg.norm(new - y) > SMALLEST * (1 + jnp.linalg.norm(new))
-        return new, moved, count + 1
+        return new, jnp.any(jnp.abs(new - y) > SMALLEST), count + 1
 
     def going_on(carry):
         return carry[1] & (carry[2] < STEPS)
@@ -137,18 +139,17 @@ def posterior(
 
 
 def agreeing(
-    chain: Chain,
+    known: Posterior,
     loops: Loops,
-    association: Callable[[Candidates], Bool[Array, " m"]] = joint_compatibility,
+    association: Association = joint_compatibility,
     sigma: float = SAME,
 ) -> Loops:
-    """Return the loops of which those are valid that agree with the chain and with one another."""
-    states = chain.links.state
-    value, rows = chain.linearised(lambda states: separation(chain, loops, states).ravel(), states)
-    J, m = rows.reshape(len(value), -1), len(loops.valid)
-    S = J @ J.T + sigma**2 * jnp.eye(len(value))
-    first = jnp.argmax(jnp.all(loops.slots[:, None] == loops.slots, axis=-1), axis=1)
-    found = Candidates(
-        value.reshape(m, -1), S.reshape(m, value.size // m, m, -1), loops.valid, first
-    )
-    return eqx.tree_at(lambda loops: loops.valid, loops, association(found))
+    """Return the loops of which those are valid that agree with all that is known, earlier loops
+    included, and with one another."""
+    m = len(loops.valid)
+    value, S = known.marginal(lambda states: separation(known.chain, loops, states).ravel())
+    S += sigma**2 * jnp.eye(value.size)
+    same = jnp.all(loops.slots[:, None] == loops.slots, axis=-1)
+    first = jnp.argmax(same & jnp.all(loops.submaps[:, None] == loops.submaps, axis=-1), axis=1)
+    found = Candidates(value.reshape(m, -1), S.reshape(m, -1, m, value.size // m), loops.valid, first)
+    return replace(loops, valid=association(found))
