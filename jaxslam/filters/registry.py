@@ -27,6 +27,7 @@ from jaxslam.filters.forms.observability_constrained import ObservabilityConstra
 from jaxslam.filters.initialisation.depth_particles import with_depth_particles
 from jaxslam.filters.initialisation.rays import with_rays
 from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.submaps.handover import SPARE, with_submaps
 from jaxslam.filters.wrappers.adaptive_process_noise import MEMORY, AdaptiveProcessNoise
 from jaxslam.filters.wrappers.batch_initialisation import from_rest
 from jaxslam.filters.wrappers.fixed_lag import LAG, FixedLag, to_maximum
@@ -153,6 +154,7 @@ _AROUND_ANY_FILTER: dict[str, Callable[..., AbstractFilter]] = {
     "mixture": lambda slam, count: GaussianSum(slam, 9 if count is None else count),
     "rest": from_rest,
     "noise": lambda slam, frames: AdaptiveProcessNoise(slam, MEMORY if frames is None else frames),
+    "submaps": lambda slam, spare: with_submaps(slam, SPARE if spare is None else spare),
     "checked": lambda slam, percent: Gated(
         slam, tolerance=TOLERANCE if percent is None else percent / 100
     ),
@@ -166,7 +168,8 @@ greatest depth of a delayed initialisation, m (`particles`, `rays`); the correla
 percent (`common`); σ of the scene's depth in percent of one landmark's (`scene`); frames (`lag`);
 steps of Gauss–Newton instead of convergence (`iterated`); members of a Gaussian sum (`scales`,
 `directions`, of a `mixture` at the most); frames of the longest window of a start (`rest`); frames
-of which the noise is remembered (`noise`); by how much a match may be off beyond its noise, in
+of which the noise is remembered (`noise`); slots for landmarks out of view until their submap ends
+(`submaps`); by how much a match may be off beyond its noise, in
 percent of that (`checked`); by how much a landmark drifts between frames, in percent of the same
 (`drift`); steps of Gauss–Newton in an update (`oc`); none for the remedy
 `fej`."""
@@ -198,9 +201,7 @@ def make_filter(name: str, **pieces: Piece) -> AbstractFilter:
 
     Raises ValueError for a name that is not known, and for what does not go together.
     """
-    if name == "recommended":
-        name = recommended_name(pieces["motion"])
-    base, *modifiers = name.split("+")
+    base, *modifiers = _spelt_out(name, pieces["motion"]).split("+")
     made: AbstractFilter = lookup("filters", [base], FILTERS)[base](**pieces)
     for modifier in modifiers:
         word = modifier.rstrip("0123456789")
@@ -210,6 +211,12 @@ def make_filter(name: str, **pieces: Piece) -> AbstractFilter:
             raise ValueError(f"in {name} the modifier {word} must stand before those of windows")
         made = modify(made, int(number) if number else None)
     return made
+
+
+def _spelt_out(name: str, motion: AbstractMotion) -> str:
+    """The name with `recommended_name` in the place of `recommended`."""
+    base, plus, modifiers = name.partition("+")
+    return (recommended_name(motion) if base == "recommended" else base) + plus + modifiers
 
 
 def make_filters(
@@ -226,10 +233,7 @@ def make_filters(
     unless another treatment is named. Raises ValueError.
     """
     scenario = as_scenario(scenario)
-    names = [
-        recommended_name(motion_of(scenario)) if name == "recommended" else name
-        for name in as_list(filters)
-    ]
+    names = [_spelt_out(name, motion_of(scenario)) for name in as_list(filters)]
     lookup("filters", [name.partition("+")[0] for name in names], FILTERS)
     return {
         f"{name}/{landmark.name}": make_filter(

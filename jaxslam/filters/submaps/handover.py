@@ -43,6 +43,9 @@ PARALLAX = 0.5
 TURN = 0.5
 """… or turned by so many radians: most of what it began with is then out of view."""
 
+SPARE = 24
+"""Slots beyond those of the landmarks in view, unless a number is given."""
+
 
 class Frozen(eqx.Module):
     """The joint Gaussian at the end of a submap; or a batch of them, the oldest first."""
@@ -202,7 +205,7 @@ class Submaps(AbstractWrapper):
         )
 
 
-def with_submaps(slam: AbstractStaged, spare: int, history: int = 1) -> Submaps:
+def with_submaps(slam: AbstractStaged, spare: int = SPARE, history: int = 1) -> Submaps:
     """The filter with submaps: all that is around its `EkfSlam` stays. Raises ValueError."""
     return Submaps(_in_submaps(slam), spare, history)
 
