@@ -8,6 +8,7 @@ that are built around this one and for the methods by which landmarks enter (`Ab
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import get_args, get_type_hints
 
@@ -312,6 +313,17 @@ def rebased(slam: EkfSlam, state: Belief) -> Belief:
         return replace(core, pose=pose, base_motion=core.motion)
 
     return slam.form.reparametrise(state, Change(core=core, view=lambda core: (), landmark=None))
+
+
+def each_gaussian(belief: Belief, function: Callable[[State], State]) -> Belief:
+    """The belief with a function of every Gaussian in it, of which sums have batches."""
+
+    def one(node: PyTree) -> PyTree:
+        if not isinstance(node, State):
+            return node
+        return jax.vmap(function)(node) if node.covariance.ndim == 3 else function(node)
+
+    return jax.tree.map(one, belief, is_leaf=lambda node: isinstance(node, State))
 
 
 def check_features(slam: EkfSlam, features: Features) -> None:

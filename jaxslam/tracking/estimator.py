@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
@@ -25,7 +26,7 @@ from jaxslam.filters.association import (
     candidates,
     second_order,
 )
-from jaxslam.filters.ekf import EkfSlam, init_with_depths
+from jaxslam.filters.ekf import EkfSlam, each_gaussian, init_with_depths
 from jaxslam.filters.protocol import AbstractStaged, Belief, CameraView
 from jaxslam.filters.readouts import (
     camera_pose_in_unit,
@@ -33,7 +34,7 @@ from jaxslam.filters.readouts import (
     landmarks_on_sides,
     log_unit,
 )
-from jaxslam.geometry import scaled
+from jaxslam.geometry import log, scaled
 from jaxslam.models.observations import Features, Status
 from jaxslam.models.sensors import Pinhole
 from jaxslam.tracking.matching import PEAKS, Matches
@@ -179,6 +180,25 @@ class Estimator:
             self.state = state
         return correction._replace(used=correction.used[: len(slots)])
 
+    @property
+    def displaceable(self) -> bool:
+        """Whether the filter has a velocity, by which a camera can be elsewhere at once."""
+        inner = self.slam.unwrapped
+        return isinstance(inner, EkfSlam) and inner.motion.has_velocity
+
+    def displaced(
+        self, T: Float[np.ndarray, "4 4"], sigma: Float[np.ndarray, " 6"], seconds: float
+    ) -> Predicted:
+        """Return what the filter expects of a camera that is at T from its latest one, in its own
+        unit, known with this σ: it has moved there within so many seconds. Changes the state."""
+        dt = jnp.asarray(seconds)
+        self.state = _moving(self.slam, self.state, jnp.asarray(T), jnp.asarray(sigma), dt)
+        return self.predict(dt)
+
+    def at_rest(self) -> None:
+        """Forget how the camera moves: it does as at a start."""
+        self.state = _at_rest(self.slam, self.state)
+
     def begin(
         self,
         slots: Int[np.ndarray, " k"],
@@ -313,6 +333,36 @@ def _empty(slam: AbstractStaged, capacity: int) -> Belief:
 @Program
 def _remove(slam: AbstractStaged, state: Belief, gone: jax.Array) -> Belief:
     return slam.remove(state, gone)
+
+
+@Program
+def _moving(
+    slam: AbstractStaged, state: Belief, T: jax.Array, sigma: jax.Array, dt: jax.Array
+) -> Belief:
+    velocity = log(jaxlie.SE3.from_matrix(T)) / dt
+    return _with_velocity(slam, state, velocity, jnp.diag((sigma / dt) ** 2))
+
+
+@Program
+def _at_rest(slam: AbstractStaged, state: Belief) -> Belief:
+    velocity, root = slam.unwrapped.motion.start()
+    return _with_velocity(slam, state, velocity, root @ root.T)
+
+
+def _with_velocity(
+    slam: AbstractStaged, state: Belief, velocity: jax.Array, covariance: jax.Array
+) -> Belief:
+    """Every Gaussian with another velocity, of which nothing was known."""
+    ekf = slam.unwrapped
+    assert isinstance(ekf, EkfSlam)
+
+    def one(state: Belief) -> Belief:
+        part = state.core.part("motion")
+        state = ekf.form.marginalise(state, part.start, len(covariance))
+        state = replace(state, core=replace(state.core, motion=velocity))
+        return ekf.form.augment(state, part.start, covariance)
+
+    return each_gaussian(state, one)
 
 
 @Program

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +31,8 @@ class Landmark:
     """Frames since it was found."""
     found: int = 0
     """Searches that found it."""
+    looks: np.ndarray = field(default_factory=lambda: np.zeros((0, 32), np.uint8))
+    """Its latest descriptors, by which it is known again where nothing says where it is."""
 
     def searched(self, found: bool, pixel: np.ndarray, patience: float) -> None:
         """Count one search, that found it at this pixel or not; `success` is an average over about

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from jaxslam.filters.protocol import Belief
 from jaxslam.tracking.estimator import Estimator, Predicted
 from jaxslam.tracking.landmarks import Landmark, Points, joined
 from jaxslam.tracking.observations import Observations
@@ -16,6 +17,20 @@ from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.unit import MapInWorld, Nearness, nearness
 
 NO_SLOTS = np.zeros(0, int)
+
+
+KEPT = 8
+"""Maps that were left, and are known again."""
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """A map as it was in the latest frame in which it was seen."""
+
+    number: int
+    state: Belief
+    landmarks: dict[int, Landmark]
+    place: MapInWorld
 
 
 @dataclass
@@ -31,6 +46,12 @@ class Map:
     """Those that left it."""
     number: int = 0
     """Of the map, the first of which is 0."""
+    latest: int = 0
+    """The greatest number so far."""
+    seen: Remembered | None = None
+    """The map as it was last seen, once its unit is fixed …"""
+    left: list[Remembered] = field(default_factory=list)
+    """… and others, the latest last."""
 
     @property
     def deleted(self) -> int:
@@ -79,9 +100,42 @@ class Map:
     def restart(self) -> None:
         """Give up all landmarks: another map begins where the camera is."""
         self.give_up(sorted(self.landmarks))
-        self.number += 1
+        self.left = [*self.left, *([] if self.seen is None else [self.seen])][-KEPT:]
+        self.seen = None
+        self.latest += 1
+        self.number = self.latest
         self.place.restart()
         self.estimator.clear()
+
+    def remember(self) -> None:
+        """Note the map as it is now, to come back to it; not while a start is being found out."""
+        if self.place.unit_fixed:
+            self.seen = self.now()
+
+    def now(self) -> Remembered:
+        """Return the map as it is."""
+        kept = {slot: replace(one) for slot, one in self.landmarks.items()}
+        return Remembered(self.number, self.estimator.state, kept, replace(self.place))
+
+    def known(self) -> list[Remembered]:
+        """Return this map as it was last seen, and those that were left, the latest first."""
+        return [*([] if self.seen is None else [self.seen]), *reversed(self.left)]
+
+    def become(self, known: Remembered) -> None:
+        """Be the map that was remembered."""
+        self.number, self.estimator.state = known.number, known.state
+        self.landmarks = {slot: replace(one) for slot, one in known.landmarks.items()}
+        self.place = replace(known.place)
+
+    def come_back(self, known: Remembered) -> None:
+        """Leave this map for one that was remembered."""
+        if known.number != self.number:
+            self.give_up(sorted(self.landmarks))
+            left = [one for one in self.left if one.number != known.number]
+            self.left = [*left, *([] if self.seen is None else [self.seen])][-KEPT:]
+        self.become(known)
+        back = [one.number for one in known.landmarks.values()]
+        self.finished = [points.only(~np.isin(points.numbers, back)) for points in self.finished]
 
     def fall_back(self, predicted: Predicted) -> None:
         """Give up all landmarks and go on by what prediction alone says of the camera: the update

@@ -45,6 +45,8 @@ class Tracked:
     """Why the camera is lost, if it is."""
     starts: bool = False
     """Whether a map begins here; where it is not the first, the camera was lost too."""
+    returns: bool = False
+    """Whether the camera, which was lost, is known to be back in a map that it had seen before."""
     map: int = 0
     """Number of the map; each has a unit of length of its own."""
     log_scale: float | None = None

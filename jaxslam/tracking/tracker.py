@@ -17,11 +17,12 @@ from jaxslam.io.source import Frame, check_size
 from jaxslam.models.observations import Status
 from jaxslam.tracking import persistence
 from jaxslam.tracking.corners import bare_corners
-from jaxslam.tracking.estimator import Estimator
+from jaxslam.tracking.estimator import Correction, Estimator
 from jaxslam.tracking.landmarks import Landmark, Points
 from jaxslam.tracking.map import Map, in_view
 from jaxslam.tracking.observations import NOTHING, Lost, Observations
 from jaxslam.tracking.policy import LEAST_MATCHES, Policy
+from jaxslam.tracking.relocalisation import NOTED_EVERY, known_again, note_looks
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.start import trackable, with_target
@@ -102,7 +103,7 @@ class Tracker:
     @property
     def restarts(self) -> int:
         """The number of maps initialised after the first."""
-        return self.map.number
+        return self.map.latest
 
     def track(self, frame: Frame) -> Tracked:
         """Predict, search, update, and renew the map. Raises ValueError, and changes nothing, for
@@ -182,6 +183,10 @@ class Tracker:
         seen, reason = self.policy.observed(
             frame.image, self.map, predicted, lost=self.unmeasured > 0
         )
+        if reason is not None and self.unmeasured:
+            found = known_again(frame.image, self.map, self.policy)
+            if found is not None:
+                return self._back(frame, *found)
         correction = self.map.estimator.correct(predicted, seen)
         if correction.failed:
             self.failed[Status(int(correction.status)).name.lower()] += 1
@@ -200,10 +205,28 @@ class Tracker:
         if reason is None:
             created = bare_corners(frame.image, self.settings, seen.places[kept])
         self.map.renew(frame.image, created, seen.slots[kept])
+        if reason is None:
+            self._remember(frame, seen)
         nis, nis_dof = float(correction.nis), int(correction.nis_dof)
         return Tracked.of(
             frame, self.map, seen, created=created, nis=nis, nis_dof=nis_dof, reason=reason
         )
+
+    def _remember(self, frame: Frame, seen: Observations) -> None:
+        """Note what the map looks like, to know it again."""
+        if self.steps % NOTED_EVERY == 0:
+            note_looks(self.landmarks, frame.image, seen.slots[seen.matched], seen.places[seen.matched])
+        self.map.remember()
+
+    def _back(self, frame: Frame, seen: Observations, correction: Correction) -> Tracked:
+        """Go on in a map in which the camera was found again."""
+        self.map.note(seen)
+        self.map.renew(frame.image, np.zeros((0, 2)))
+        self.map.estimator.at_rest()
+        self.unmeasured = 0
+        self.policy.forget()
+        nis, nis_dof = float(correction.nis), int(correction.nis_dof)
+        return Tracked.of(frame, self.map, seen, nis=nis, nis_dof=nis_dof, returns=True)
 
     def _lost(self, frame: Frame, reason: Lost, seen: Observations = NOTHING) -> Tracked:
         """Begin a new map at the camera as it is predicted, or wait for a picture with corners."""

@@ -19,7 +19,13 @@ from jaxtyping import Array, Bool, Int
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam._numerics.conditional import cond
-from jaxslam.filters.ekf import EkfSlam, check_one_gaussian, ekf_inside, rebased
+from jaxslam.filters.ekf import (
+    EkfSlam,
+    check_one_gaussian,
+    each_gaussian,
+    ekf_inside,
+    rebased,
+)
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.protocol import (
     AbstractFilter,
@@ -30,7 +36,6 @@ from jaxslam.filters.protocol import (
     Expected,
     OfLandmark,
 )
-from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
 from jaxslam.filters.wrappers.wrapper import AbstractWrapper
 from jaxslam.geometry import log
 from jaxslam.models.coordinates import SUBMAP
@@ -190,7 +195,7 @@ class Submaps(AbstractWrapper):
 
         def begun(inner):
             inner = self.base.remove(inner, ~carried)
-            return _each_gaussian(inner, lambda one: rebased(self.ekf, one))
+            return each_gaussian(inner, lambda one: rebased(self.ekf, one))
 
         # Apart from what is conditional: a batch would copy all that is kept in every frame.
         place = state.count % self.history
@@ -235,14 +240,3 @@ def _placed(state: SubmapsState, new: Features, own: Slots) -> SubmapsState:
         numbers=state.numbers.at[own].set(number, mode="drop"),
         created=state.created + jnp.sum(new.valid),
     )
-
-
-def _each_gaussian(belief: Belief, function) -> Belief:
-    """The belief with the function of every Gaussian in it, of which sums have batches."""
-
-    def one(node):
-        if not isinstance(node, State):
-            return node
-        return jax.vmap(function)(node) if node.covariance.ndim == 3 else function(node)
-
-    return jax.tree.map(one, belief, is_leaf=lambda node: isinstance(node, State))
