@@ -119,7 +119,9 @@ def measured(options: Submaps, name: str) -> dict[str, Any]:
     changed = {"placement": "cloud", "landmarks": 3000, "in_view": 30} if name in LONGER else {}
     scenario = jaxslam.scenario(name, {**changed, **LONGER.get(name, {})})
     if options.steps:
-        scenario = jaxslam.scenario(name, {**changed, **LONGER.get(name, {}), "steps": options.steps})
+        scenario = jaxslam.scenario(
+            name, {**changed, **LONGER.get(name, {}), "steps": options.steps}
+        )
     word = "robocentric+oc" if scenario.motion == "odometry" else FILTER[scenario.geometry]
     (slam,) = jaxslam.make_filters(scenario, [word], ["inverse_scaling"]).values()
     runs = max(2, options.runs // 10) if name in LONGER else options.runs
@@ -127,9 +129,14 @@ def measured(options: Submaps, name: str) -> dict[str, Any]:
     for start in range(0, runs, size):
         found += of_chunk(options, scenario, slam, range(start, min(start + size, runs)))
     t = scenario.world.tangent_dim
-    keys = [key for key in found[0] if key not in ("pairs", "wrong", "true_believed", "wrong_believed")]
+    keys = [
+        key for key in found[0] if key not in ("pairs", "wrong", "true_believed", "wrong_believed")
+    ]
     all_of = {key: np.array([one[key] for one in found]) for key in keys}
-    pairs = {key: sum(one[key] for one in found) for key in ("pairs", "wrong", "true_believed", "wrong_believed")}
+    pairs = {
+        key: sum(one[key] for one in found)
+        for key in ("pairs", "wrong", "true_believed", "wrong_believed")
+    }
     lost = all_of["nees_filter"] * t > lost_threshold(t)
     good = ~lost & np.isfinite(all_of["rmse_closed"])
     return {
@@ -140,7 +147,11 @@ def measured(options: Submaps, name: str) -> dict[str, Any]:
         "wrong_believed": int(pairs["wrong_believed"]),
         "wrong_pairs": int(pairs["wrong"]),
         **{key: float(np.mean(all_of[key][good])) for key in keys if not key.startswith("rmse")},
-        **{key: float(np.sqrt(np.mean(all_of[key][good] ** 2))) for key in keys if key.startswith("rmse")},
+        **{
+            key: float(np.sqrt(np.mean(all_of[key][good] ** 2)))
+            for key in keys
+            if key.startswith("rmse")
+        },
     }
 
 

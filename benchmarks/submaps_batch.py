@@ -76,7 +76,10 @@ def _system(slam: EkfSlam, run: Run, dt: float, poses: Pose, points, common: flo
         both = np.hstack([points[who[first]], np.full((len(first), 1), common)])
         value, J = _prior(slam, _at(path, frames[first]), both)
         by = [columns[frames[first]], np.hstack([of_point[who[first]], last])]
-        parts += [(value, J, by), (np.array([[common / sigma]]), [np.array([[[1 / sigma]]])], [last[:1]])]
+        parts += [
+            (value, J, by),
+            (np.array([[common / sigma]]), [np.array([[[1 / sigma]]])], [last[:1]]),
+        ]
     three = [np.maximum(np.arange(1, K + 1) - back, 0) for back in (2, 1, 0)]
     value, J = _driven(slam, dt, *(_at(path, k) for k in three), run.controls, np.arange(K) == 0)
     parts.append((value, J, [columns[k] for k in three]))

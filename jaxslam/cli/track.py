@@ -36,9 +36,12 @@ class TrackOptions:
     data set's own."""
     target: Path | None = None
     """JSON file of known points that the first frame sees: the map is in metres."""
+    map: Path | None = None
+    """The map.npz of another video by the same camera: this one is localised in its map, and goes
+    on with it, by its settings."""
     out: Path = Path("results")
-    """Folder for trajectory.txt, covariance.txt, frames.csv, summary.json, map.ply, map.png and
-    overlay.mp4."""
+    """Folder for trajectory.txt, covariance.txt, frames.csv, summary.json, map.ply, map.npz,
+    map.png and overlay.mp4."""
     frames: int | None = None
     """Frames to track, at the most; of the synthetic video 150 by default."""
     start: float = 0.0
@@ -97,6 +100,10 @@ class TrackOptions:
 
         with one_line_warnings():
             source = self._source()
+        if self.map is not None and self.target is not None:
+            raise ValueError(
+                "--map and --target: a map that is saved has its unit; give one of them"
+            )
         target = None if self.target is None else read_target(self.target)
         total = len(source) or self.frames
         with warming_bar(total, "frame", _COMPILING, WARM_UP, "tracking") as progress:
@@ -105,12 +112,15 @@ class TrackOptions:
                 self.out,
                 self._settings(),
                 target=target,
+                known=self.map,
                 overlay=self.overlay,
                 viewer=self.viewer,
                 progress=progress,
             )
         print(describe(summary))
-        written = "trajectory.txt, covariance.txt, frames.csv, summary.json, map.ply, map.png"
+        written = (
+            "trajectory.txt, covariance.txt, frames.csv, summary.json, map.ply, map.npz, map.png"
+        )
         print(f"wrote {written}{', overlay.mp4' if self.overlay else ''} in {self.out}")
         if self.viewer is not None:
             print(f"wrote {self.viewer}: rerun {self.viewer} shows it")

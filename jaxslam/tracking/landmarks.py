@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxslam.tracking.patches import STORED, Patch
 
+NO_LOOKS = np.zeros((0, 32), np.uint8)
 _COUNTS = ("number", "missed", "unseen", "found")
 
 
@@ -31,7 +32,7 @@ class Landmark:
     """Frames since it was found."""
     found: int = 0
     """Searches that found it."""
-    looks: np.ndarray = field(default_factory=lambda: np.zeros((0, 32), np.uint8))
+    looks: np.ndarray = field(default_factory=NO_LOOKS.copy)
     """Its latest descriptors, by which it is known again where nothing says where it is."""
 
     def searched(self, found: bool, pixel: np.ndarray, patience: float) -> None:
@@ -83,6 +84,8 @@ def stacked(landmarks: Mapping[int, Landmark]) -> dict[str, np.ndarray]:
         "first_cameras": np.array([one.first_camera for one in kept]).reshape(count, 4, 4),
         "seen_at": np.array([one.seen_at for one in kept], float).reshape(count, 2),
         "pixels": np.array([one.patch.pixel for one in kept], float).reshape(count, 2),
+        "looks": np.concatenate([one.looks for one in kept] or [NO_LOOKS]),
+        "look_counts": np.array([len(one.looks) for one in kept], int),
         "stored": np.array([one.patch.stored for one in kept], np.float32).reshape(
             count, STORED, STORED
         ),
@@ -93,12 +96,13 @@ def unstacked(arrays: Mapping[str, np.ndarray]) -> dict[int, Landmark]:
     """Return what `stacked` was made of."""
     landmarks = {}
     names = ("slots", "counts", "success", "first_cameras", "seen_at", "pixels", "stored")
-    for slot, counts, success, first_camera, seen_at, pixel, stored in zip(
-        *(arrays[name] for name in names), strict=True
+    looks = np.split(arrays["looks"], np.cumsum(arrays["look_counts"])[:-1])
+    for look, slot, counts, success, first_camera, seen_at, pixel, stored in zip(
+        looks[: len(arrays["slots"])], *(arrays[name] for name in names), strict=True
     ):
         number, *others = counts.tolist()
         patch = Patch(pixel, stored)
         landmarks[int(slot)] = Landmark(
-            number, patch, first_camera, seen_at, float(success), *others
+            number, patch, first_camera, seen_at, float(success), *others, look
         )
     return landmarks

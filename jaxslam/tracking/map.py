@@ -100,12 +100,22 @@ class Map:
     def restart(self) -> None:
         """Give up all landmarks: another map begins where the camera is."""
         self.give_up(sorted(self.landmarks))
-        self.left = [*self.left, *([] if self.seen is None else [self.seen])][-KEPT:]
-        self.seen = None
+        self._keep()
         self.latest += 1
         self.number = self.latest
         self.place.restart()
         self.estimator.clear()
+
+    def leave(self) -> None:
+        """Give up all landmarks: what comes next is in another world, unless it is known."""
+        self.restart()
+        self.place = MapInWorld()
+
+    def _keep(self) -> None:
+        """Keep the map as it was last seen among those that were left."""
+        if self.seen is not None:
+            self.left = [*self.left, self.seen][-KEPT:]
+        self.seen = None
 
     def remember(self) -> None:
         """Note the map as it is now, to come back to it; not while a start is being found out."""
@@ -131,8 +141,8 @@ class Map:
         """Leave this map for one that was remembered."""
         if known.number != self.number:
             self.give_up(sorted(self.landmarks))
-            left = [one for one in self.left if one.number != known.number]
-            self.left = [*left, *([] if self.seen is None else [self.seen])][-KEPT:]
+            self._keep()
+            self.left = [one for one in self.left if one.number != known.number]
         self.become(known)
         back = [one.number for one in known.landmarks.values()]
         self.finished = [points.only(~np.isin(points.numbers, back)) for points in self.finished]

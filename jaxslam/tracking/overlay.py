@@ -56,6 +56,8 @@ def _notes(result: Tracked) -> tuple[str, str]:
 
 def _banner(result: Tracked) -> str:
     """Return the warnings of a frame: nothing while all is well."""
+    if result.relocalised:
+        return f"PLACE KNOWN AGAIN: MAP {result.map}"
     if result.starts:
         return f"LOST: MAP {result.map} BEGINS" if result.lost else ""
     return "" if result.state == "tracked" else result.state.upper()

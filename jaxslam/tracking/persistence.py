@@ -21,18 +21,21 @@ import numpy as np
 from jaxslam._runtime.files import one_line, read_arrays, write_atomically
 from jaxslam.io.calibration import Calibration, as_fields, from_fields
 from jaxslam.tracking.landmarks import NO_POINTS, Points, joined, stacked, unstacked
-from jaxslam.tracking.map import Map
+from jaxslam.tracking.map import Map, Remembered
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.unit import MapInWorld
 
-FORMAT = "jaxslam tracker 4"
+FORMAT = "jaxslam tracker 5"
 
 NUMBERS = {
-    "restarts": "map.number",
+    "map": "map.number",
+    "restarts": "map.latest",
     "reversed": "reversed",
     "steps": "steps",
     "_time": "time",
     "_unmeasured": "unmeasured",
+    "_searching": "searching",
     "_sigma_log_scale": "map.place.sigma_log_scale",
     "_doubtful": "policy.doubtful",
     "_log_unit": "map.place.log_unit",
@@ -40,6 +43,10 @@ NUMBERS = {
     "_unit_fixed": "map.place.unit_fixed",
 }
 """What a tracker counts and measures, as the file calls it, and where it keeps it."""
+
+
+_OF_PLACE = ("log_unit", "log_scale", "sigma_log_scale", "unit_fixed")
+"""Numbers of a `MapInWorld`."""
 
 
 @runtime_checkable
@@ -57,7 +64,7 @@ T = TypeVar("T", bound=Resumable)
 
 def save(path: str | Path, tracker: Resumable, filter_name: str | None) -> None:
     """Write a tracker, whole or not at all, with the name of a filter of one's own."""
-    kept, place = tracker.map, tracker.map.place
+    kept = tracker.map
     numbers = {name: attrgetter(where)(tracker) for name, where in NUMBERS.items()}
     header = {
         "calibration": as_fields(tracker.calibration),
@@ -66,13 +73,16 @@ def save(path: str | Path, tracker: Resumable, filter_name: str | None) -> None:
         "numbers": {"created": kept.created, "deleted": kept.deleted, **numbers},
         "failed": dict(tracker.failed),
     }
-    poses = [(pose.T_wc, pose.covariance) for pose in (place.origin, place.camera)]
-    arrays = {
-        **leaves(kept.estimator.state, "state"),
-        **leaves(poses, "poses"),
-        **stacked(kept.landmarks),
-        **joined([NO_POINTS, *kept.finished])._asdict(),
-    }
+    # The map as it is, and those that it may come back to.
+    remembered = [kept.now(), *kept.known()]
+    header["known"] = [
+        {"number": one.number, **{name: getattr(one.place, name) for name in _OF_PLACE}}
+        for one in remembered[1:]
+    ]
+    header["seen"] = kept.seen is not None
+    arrays = dict(joined([NO_POINTS, *kept.finished])._asdict())
+    for i, one in enumerate(remembered):
+        arrays |= {f"{i}/{name}": array for name, array in _arrays(one).items()}
     write_record(path, header, arrays)
 
 
@@ -109,14 +119,34 @@ def _restore(
         piece, _, attribute = where.rpartition(".")
         setattr(attrgetter(piece)(tracker) if piece else tracker, attribute, numbers[name])
     tracker.failed.update(header["failed"])
-    kept.landmarks.update(unstacked(arrays))
     kept.finished.append(Points(*(arrays[name] for name in Points._fields)))
-    place.origin, place.camera = (
-        PoseWithCovariance(arrays[f"poses/{i}"], arrays[f"poses/{i + 1}"]) for i in (0, 2)
-    )
+    places = [{name: getattr(place, name) for name in _OF_PLACE}, *header["known"]]
     with jax.enable_x64(True):
-        kept.estimator.state = grown(kept.estimator.state, arrays, "state")
+        like = kept.estimator.state
+        now, *known = [
+            _remembered({"number": kept.number, **told}, arrays, i, like)
+            for i, told in enumerate(places)
+        ]
+        kept.become(now)
         kept.measure_unit()
+    kept.seen = known.pop(0) if header["seen"] else None
+    kept.left = known[::-1]
+
+
+def _arrays(one: Remembered) -> dict[str, np.ndarray]:
+    poses = [(pose.T_wc, pose.covariance) for pose in (one.place.origin, one.place.camera)]
+    return {**leaves(one.state, "state"), **leaves(poses, "poses"), **stacked(one.landmarks)}
+
+
+def _remembered(
+    told: Mapping[str, Any], arrays: Mapping[str, np.ndarray], i: int, like: Any
+) -> Remembered:
+    """The i-th of the maps in the file, of a filter whose state is `like` it."""
+    prefix = f"{i}/"
+    own = {key.removeprefix(prefix): x for key, x in arrays.items() if key.startswith(prefix)}
+    origin, camera = (PoseWithCovariance(own[f"poses/{k}"], own[f"poses/{k + 1}"]) for k in (0, 2))
+    place = MapInWorld(origin, camera, **{name: told[name] for name in _OF_PLACE})
+    return Remembered(told["number"], grown(like, own, "state"), unstacked(own), place)
 
 
 def write_record(

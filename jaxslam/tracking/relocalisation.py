@@ -9,6 +9,7 @@ each where it expects it from there, is the camera back.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -47,7 +48,9 @@ def describe(
     image: UInt8[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"]
 ) -> tuple[UInt8[np.ndarray, "n 32"], Bool[np.ndarray, " n"]]:
     """Return upright ORB descriptors of these pixels, and which have one: not those at the edge."""
-    keys = [cv2.KeyPoint(float(u), float(v), 31.0, 0.0, 1.0, 0, i) for i, (u, v) in enumerate(pixels)]
+    keys = [
+        cv2.KeyPoint(float(u), float(v), 31.0, 0.0, 1.0, 0, i) for i, (u, v) in enumerate(pixels)
+    ]
     kept, found = cv2.ORB_create().compute(image, keys)
     descriptors, there = np.zeros((len(pixels), 32), np.uint8), np.zeros(len(pixels), bool)
     if found is not None:
@@ -123,7 +126,7 @@ def known_again(
     now = map.now()
     for known in map.known():
         map.become(known)
-        found = _found(image, map, policy)
+        found = _found(image, map, replace(policy))  # what is only tried is no memory of its
         after = map.now()
         map.become(now)
         if found is not None:

@@ -18,7 +18,7 @@ from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 
 _COLUMNS = (
     "frame", "time", "state", "map", "matches", "nis", "nis_dof",
-    "sigma_position", "sigma_orientation", "sigma_log_scale", "log_scale", "unit_fixed", "reason",
+    "sigma_position", "sigma_orientation", "sigma_log_scale", "log_scale", "unit_fixed", "reason", "relocalised",
 )  # fmt: skip
 
 
@@ -45,7 +45,7 @@ class Tracked:
     """Why the camera is lost, if it is."""
     starts: bool = False
     """Whether a map begins here; where it is not the first, the camera was lost too."""
-    returns: bool = False
+    relocalised: bool = False
     """Whether the camera, which was lost, is known to be back in a map that it had seen before."""
     map: int = 0
     """Number of the map; each has a unit of length of its own."""
@@ -140,7 +140,8 @@ def write_frames(path: str | Path, history: list[Tracked]) -> None:
     as the filter believes it to be at this frame, and `sigma_log_scale` its σ; both empty where
     the filter is in no doubt of it: there it has not been measured. `unit_fixed` is 0 while the
     map's start is being found out, when the filter changes its unit with every frame, else 1.
-    `reason` is why the camera is lost (`Lost`), empty where it is not.
+    `reason` is why the camera is lost (`Lost`), empty where it is not; `relocalised` is 1 where a
+    camera that was lost is known to be back in a map that it had seen, whose number it then is.
     """
     with write_atomically(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -164,4 +165,5 @@ def _row(result: Tracked) -> list[object]:
         *("" if number is None else f"{number:.6g}" for number in numbers),
         int(result.unit_fixed),
         result.reason or "",
+        int(result.relocalised),
     ]

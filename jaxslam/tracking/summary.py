@@ -64,7 +64,8 @@ def summarised(
         "lost": lost,
         "lost_reasons": dict(Counter(result.reason for result in history if result.reason)),
         "restarts": tracker.restarts,
-        "maps": tracker.restarts + 1,
+        "maps": max(1, len({result.map for result in history if result.starts or not result.lost})),
+        "relocalised": sum(result.relocalised for result in history),
         "units": _units(history),
         "failed_updates": dict(tracker.failed),
         "reversed_tests": tracker.reversed,
@@ -108,6 +109,9 @@ def describe(summary: Summary) -> str:
     if summary["lost"]:
         reasons = (f"{count} {reason}" for reason, count in summary["lost_reasons"].items())
         lines.append(f"{summary['lost']} frames lost: {', '.join(reasons)}")
+    if summary["relocalised"]:
+        times = "once" if summary["relocalised"] == 1 else f"{summary['relocalised']} times"
+        lines.append(f"known again {times}, after it was lost, in a map that it had seen")
     if summary["maps"] > 1:
         lines.append(
             f"{summary['maps']} maps, each in a unit of its own: frames.csv says where they begin"

@@ -62,6 +62,8 @@ class Tracker:
     """Frames given so far."""
     unmeasured: int = field(default=0, init=False)
     """The latest of them, in a row, in which no landmark was measured."""
+    searching: bool = field(default=False, init=False)
+    """Whether no map has begun, as one that is known may be found."""
     failed: Counter[str] = field(default_factory=Counter, init=False)
     """How many updates ended in which `Status` that says that their result means nothing."""
     reversed: int = field(default=0, init=False)
@@ -161,9 +163,45 @@ class Tracker:
         """
         return persistence.load(path, partial(cls, filter=filter), own_filter=filter is not None)
 
+    @classmethod
+    def localising(
+        cls, path: str | Path, calibration: Calibration, filter: AbstractStaged | None = None
+    ) -> Tracker:
+        """A tracker of another video that looks for the maps which were saved, and goes on in the
+        first that it finds; where it finds none in as many frames as a camera may be lost, it
+        begins its own. Raises ValueError as `load`, and for a map of another camera."""
+        tracker = cls.load(path, filter)
+        if tracker.calibration != calibration:
+            theirs, ours = (
+                f"{one.width} × {one.height}, fx {one.fx:g}, {one.model}"
+                for one in (tracker.calibration, calibration)
+            )
+            raise ValueError(f"{path}: is a map of another camera ({theirs}) than this ({ours})")
+        with jax.enable_x64(True):
+            tracker.map.leave()
+        tracker.time, tracker.steps, tracker.unmeasured = None, 0, 1
+        tracker.searching = True
+        tracker.policy.forget()
+        return tracker
+
+    def _searching(self, frame: Frame) -> Tracked:
+        """Look for a map that is known; begin another where there was none for long."""
+        found = known_again(frame.image, self.map, self.policy)
+        if found is not None:
+            return self._back(frame, *found)
+        self.unmeasured += 1
+        corners = bare_corners(frame.image, self.settings)
+        if self.unmeasured <= self.settings.lost_for or len(corners) < LEAST_MATCHES:
+            return Tracked.of(frame, self.map, reason=Lost.NOTHING_EXPECTED)
+        self.map.begin(frame.image, corners)
+        self.unmeasured, self.searching = 0, False
+        return Tracked.of(frame, self.map, created=corners, starts=True)
+
     def _first(self, frame: Frame) -> Tracked:
         """Begin the first map with the first frame."""
         self.map.estimator.compile(self.policy.in_wide)
+        if self.searching:
+            return self._searching(frame)
         pixels, depths = bare_corners(frame.image, self.settings), None
         if self.target is not None:
             self.sighting, pixels, depths = with_target(
@@ -174,6 +212,8 @@ class Tracker:
 
     def _next(self, frame: Frame, before: float) -> Tracked:
         """Track a frame after one of the time `before`."""
+        if self.searching:
+            return self._searching(frame)
         predicted = self.map.estimator.predict(frame.time - before)
         ahead, behind = predicted.view.sides
         if behind > ahead and behind >= LEAST_MATCHES:
@@ -215,7 +255,9 @@ class Tracker:
     def _remember(self, frame: Frame, seen: Observations) -> None:
         """Note what the map looks like, to know it again."""
         if self.steps % NOTED_EVERY == 0:
-            note_looks(self.landmarks, frame.image, seen.slots[seen.matched], seen.places[seen.matched])
+            note_looks(
+                self.landmarks, frame.image, seen.slots[seen.matched], seen.places[seen.matched]
+            )
         self.map.remember()
 
     def _back(self, frame: Frame, seen: Observations, correction: Correction) -> Tracked:
@@ -223,10 +265,10 @@ class Tracker:
         self.map.note(seen)
         self.map.renew(frame.image, np.zeros((0, 2)))
         self.map.estimator.at_rest()
-        self.unmeasured = 0
+        self.unmeasured, self.searching = 0, False
         self.policy.forget()
         nis, nis_dof = float(correction.nis), int(correction.nis_dof)
-        return Tracked.of(frame, self.map, seen, nis=nis, nis_dof=nis_dof, returns=True)
+        return Tracked.of(frame, self.map, seen, nis=nis, nis_dof=nis_dof, relocalised=True)
 
     def _lost(self, frame: Frame, reason: Lost, seen: Observations = NOTHING) -> Tracked:
         """Begin a new map at the camera as it is predicted, or wait for a picture with corners."""

@@ -43,22 +43,28 @@ def track(
     *,
     slam: AbstractStaged | None = None,
     target: Target | None = None,
+    known: str | Path | None = None,
     overlay: bool = True,
     viewer: str | Path | None = None,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> dict[str, Any]:
     """Track `source`, write `trajectory.txt`, `covariance.txt`, `frames.csv`, `summary.json`,
-    `map.ply`, `map.png` and, if wanted, `overlay.mp4` into the folder `out`, and return the
+    `map.ply`, `map.npz`, `map.png` and, if wanted, `overlay.mp4` into the folder `out`, and return the
     summary.
 
     An interruption (KeyboardInterrupt) or an unreadable frame (ValueError) leaves all of them for
     the frames so far, and is raised again; an interruption of the first frame or the second leaves
     none. `slam` is a filter of one's own, in place of the one that the settings name. `target`,
-    known points that the first frame sees, makes the map metric. `viewer` is a file for the rerun
+    known points that the first frame sees, makes the map metric. `known` is the `map.npz` of another
+    video by the same camera, which is gone on with where it is known again, with its settings.
+    `viewer` is a file for the rerun
     viewer, FILE.rrd, written beside the others.
     """
     recording = None if viewer is None else Viewer(viewer, source.calibration)
-    tracker = Tracker(source.calibration, settings or TrackerSettings(), slam, target)
+    if known is None:
+        tracker = Tracker(source.calibration, settings or TrackerSettings(), slam, target)
+    else:
+        tracker = Tracker.localising(known, source.calibration, slam)
     if source.clock is not None:
         tracker.compile()
     out = Path(out)
@@ -136,6 +142,7 @@ def _write(
     write_frames(out / "frames.csv", history)
     summary = summarised(source, tracker, history, seconds)
     write_json(out / "summary.json", summary, allow_nan=False)
+    tracker.save(out / "map.npz")
     _draw_map(known_points(tracker, history), history, reference_in_map(source, history), out)
     return summary
 

@@ -151,5 +151,7 @@ def agreeing(
     S += sigma**2 * jnp.eye(value.size)
     same = jnp.all(loops.slots[:, None] == loops.slots, axis=-1)
     first = jnp.argmax(same & jnp.all(loops.submaps[:, None] == loops.submaps, axis=-1), axis=1)
-    found = Candidates(value.reshape(m, -1), S.reshape(m, -1, m, value.size // m), loops.valid, first)
+    found = Candidates(
+        value.reshape(m, -1), S.reshape(m, -1, m, value.size // m), loops.valid, first
+    )
     return replace(loops, valid=association(found))

@@ -4,13 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
 from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.registry import make_filters
 from jaxslam.filters.run import Frames, run
 from jaxslam.filters.submaps.chain import base_poses, chain
-from jaxslam.filters.submaps.closing import Loops, posterior
+from jaxslam.filters.submaps.closing import posterior
 from jaxslam.filters.submaps.handover import with_submaps
-from jaxslam.landmarks import CARTESIAN, INVERSE_DEPTH
+from jaxslam.landmarks import CARTESIAN
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Capacity, Features
 from jaxslam.models.sensors import Position
@@ -40,7 +40,9 @@ class Linear:
             positions.append(positions[-1] + DT * v)
         self.points = np.array(positions)[::2] + rng.uniform(-3, 3, (LANDMARKS, 2))
         self.points[-3] = self.points[1]  # the loop
-        self.seen = np.array([[2 * j <= k < 2 * j + LIFE for j in range(LANDMARKS)] for k in range(FRAMES)])
+        self.seen = np.array(
+            [[2 * j <= k < 2 * j + LIFE for j in range(LANDMARKS)] for k in range(FRAMES)]
+        )
         noise = SIGMA * rng.normal(size=(FRAMES, LANDMARKS, 2))
         self.measured = self.points - np.array(positions)[:, None] + noise
 
@@ -52,11 +54,13 @@ class Linear:
                 first = np.arange(LANDMARKS) * 2 == k
                 these = np.flatnonzero(self.seen[k] & (first if name == "new" else ~first))
                 pad = size - len(these)
-                rows[name].append((
-                    np.pad(these % SLOTS, (0, pad)),
-                    np.pad(self.measured[k, these], ((0, pad), (0, 0))),
-                    np.pad(np.ones(len(these), bool), (0, pad)),
-                ))
+                rows[name].append(
+                    (
+                        np.pad(these % SLOTS, (0, pad)),
+                        np.pad(self.measured[k, these], ((0, pad), (0, 0))),
+                        np.pad(np.ones(len(these), bool), (0, pad)),
+                    )
+                )
         seen, new = (Features(*map(np.array, zip(*rows[name], strict=True))) for name in rows)
         gone = np.zeros((FRAMES, SLOTS), bool)
         for k in range(1, FRAMES):
@@ -116,7 +120,9 @@ def everything(chain):
     def values(states):
         poses = base_poses(chain, states)
         apply = jax.vmap(jax.vmap(lambda pose, point: pose @ point, in_axes=(None, 0)))
-        return jnp.concatenate([poses.translation().ravel(), apply(poses, states.landmarks).ravel()])
+        return jnp.concatenate(
+            [poses.translation().ravel(), apply(poses, states.landmarks).ravel()]
+        )
 
     return values
 
@@ -125,11 +131,17 @@ def rows_of(chain, ended):
     """Where `everything` has what the batch solution has, and where that is there."""
     numbers, N = np.asarray(chain.links.numbers), chain.shape[0]
     submaps, slots = np.nonzero(numbers >= 0)
-    mine = np.r_[np.arange(2 * N), *(2 * N + 2 * (s * numbers.shape[1] + i) + np.arange(2)
-                                     for s, i in zip(submaps, slots, strict=True))]
-    theirs = np.r_[*(2 * k + np.arange(2) for k in ended),
-                   *(2 * (FRAMES + numbers[s, i]) + np.arange(2)
-                     for s, i in zip(submaps, slots, strict=True))]
+    mine = np.r_[
+        np.arange(2 * N),
+        *(
+            2 * N + 2 * (s * numbers.shape[1] + i) + np.arange(2)
+            for s, i in zip(submaps, slots, strict=True)
+        ),
+    ]
+    theirs = np.r_[
+        *(2 * k + np.arange(2) for k in ended),
+        *(2 * (FRAMES + numbers[s, i]) + np.arange(2) for s, i in zip(submaps, slots, strict=True)),
+    ]
     return mine.astype(int), theirs.astype(int)
 
 
@@ -154,9 +166,7 @@ def test_a_chain_is_the_one_gaussian_of_everything(linear, smoothed, closed):
     places = [[place_of(chained, j) for j in pair] for pair in pairs]
 
     def residual(states):
-        return jnp.concatenate(
-            [jnp.zeros(0), *(same(states, chained, *pair) for pair in places)]
-        )
+        return jnp.concatenate([jnp.zeros(0), *(same(states, chained, *pair) for pair in places)])
 
     after = jax.jit(lambda: posterior(chained, residual, sigma))()
     value, covariance = jax.jit(lambda: after.marginal(everything(chained)))()
