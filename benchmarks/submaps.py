@@ -45,7 +45,8 @@ from jaxslam.statistics import lost_threshold, normalised_squared, one_scale
 from jaxslam.statistics.beyond_scale import beyond_scale
 
 MARK = "<!-- by submaps.py -->"
-FILTER = {"planar": "scale_gauge+oc+scene50", "spatial": "scale_gauge+oc+scene50"}
+FILTER = "scale_gauge+oc+scene50"
+COUNTS = ("pairs", "wrong", "true_believed", "wrong_believed")
 LAPS = 5
 """Times that loops are looked for, evenly over a run."""
 LONGER = {
@@ -116,41 +117,36 @@ def page(results: dict[str, Any]) -> str:
 
 def measured(options: Submaps, name: str) -> dict[str, Any]:
     """The numbers of one scenario."""
-    changed = {"placement": "cloud", "landmarks": 3000, "in_view": 30} if name in LONGER else {}
-    scenario = jaxslam.scenario(name, {**changed, **LONGER.get(name, {})})
+    changed: dict[str, Any] = {}
+    if name in LONGER:
+        changed = {"placement": "cloud", "landmarks": 3000, "in_view": 30, **LONGER[name]}
     if options.steps:
-        scenario = jaxslam.scenario(
-            name, {**changed, **LONGER.get(name, {}), "steps": options.steps}
-        )
-    word = "robocentric+oc" if scenario.motion == "odometry" else FILTER[scenario.geometry]
+        changed["steps"] = options.steps
+    scenario = jaxslam.scenario(name, changed)
+    word = "robocentric+oc" if scenario.motion == "odometry" else FILTER
     (slam,) = jaxslam.make_filters(scenario, [word], ["inverse_scaling"]).values()
     runs = max(2, options.runs // 10) if name in LONGER else options.runs
     found, size = [], min(options.chunk, runs)
     for start in range(0, runs, size):
         found += of_chunk(options, scenario, slam, range(start, min(start + size, runs)))
-    t = scenario.world.tangent_dim
-    keys = [
-        key for key in found[0] if key not in ("pairs", "wrong", "true_believed", "wrong_believed")
-    ]
-    all_of = {key: np.array([one[key] for one in found]) for key in keys}
-    pairs = {
-        key: sum(one[key] for one in found)
-        for key in ("pairs", "wrong", "true_believed", "wrong_believed")
-    }
+    return {"filter": word, **averages(found, scenario.world.tangent_dim)}
+
+
+def averages(found: list[dict[str, Any]], t: int) -> dict[str, Any]:
+    """Over runs that the filter without submaps has not lost."""
+    all_of = {key: np.array([one[key] for one in found]) for key in found[0]}
     lost = all_of["nees_filter"] * t > lost_threshold(t)
     good = ~lost & np.isfinite(all_of["rmse_closed"])
+    count = {key: int(all_of.pop(key).sum()) for key in COUNTS}
     return {
-        "filter": word,
         "used": int(good.sum()),
         "lost": float(lost.mean()),
-        "recall": pairs["true_believed"] / max(1, pairs["pairs"] - pairs["wrong"]),
-        "wrong_believed": int(pairs["wrong_believed"]),
-        "wrong_pairs": int(pairs["wrong"]),
-        **{key: float(np.mean(all_of[key][good])) for key in keys if not key.startswith("rmse")},
+        "recall": count["true_believed"] / max(1, count["pairs"] - count["wrong"]),
+        "wrong_believed": count["wrong_believed"],
+        "wrong_pairs": count["wrong"],
         **{
-            key: float(np.sqrt(np.mean(all_of[key][good] ** 2)))
-            for key in keys
-            if key.startswith("rmse")
+            key: float(np.sqrt(np.mean(x[good] ** 2)) if "rmse" in key else np.mean(x[good]))
+            for key, x in all_of.items()
         },
     }
 
@@ -190,7 +186,7 @@ def of_chunk(options, scenario: Scenario, slam, indices: range) -> list[dict[str
     ours, states = _filtered(around, room, runs)
     rows = []
     for i in range(len(indices)):
-        run, state, told = jax.tree.map(lambda x: x[i], (runs, states, ours))
+        run, state, told = jax.tree.map(lambda x, i=i: x[i], (runs, states, ours))
         row = of_run(options, scenario, around, run, state, told, indices[i])
         rows.append({"nees_filter": float(plain.nees[i, -1]), **row})
         print(indices[i], {k: round(float(v), 3) for k, v in rows[-1].items()}, flush=True)

@@ -45,9 +45,10 @@ def _points(run: Run) -> np.ndarray:
     return of_each
 
 
-def _moved(poses: Pose, points, common: float, step) -> tuple[Pose, np.ndarray, float]:
+def _moved(poses, points, common: float, step) -> tuple[Pose, np.ndarray, float]:
     delta, of_points = np.split(step[:-1], [step.size - 1 - points.size])
-    moved = jax.vmap(retract)(poses, delta.reshape(*poses.get_batch_axes(), -1))
+    delta = jnp.asarray(delta).reshape(*poses.get_batch_axes(), -1)
+    moved = jax.vmap(lambda T, delta: retract(T, delta))(poses, delta)
     moved = jax.vmap(lambda T: T.normalize())(moved)
     return moved, points + of_points.reshape(points.shape), common + step[-1]
 

@@ -101,9 +101,7 @@ class TrackOptions:
         with one_line_warnings():
             source = self._source()
         if self.map is not None and self.target is not None:
-            raise ValueError(
-                "--map and --target: a map that is saved has its unit; give one of them"
-            )
+            raise ValueError("give --map or --target, not both: a saved map has its unit")
         target = None if self.target is None else read_target(self.target)
         total = len(source) or self.frames
         with warming_bar(total, "frame", _COMPILING, WARM_UP, "tracking") as progress:

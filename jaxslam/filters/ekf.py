@@ -309,7 +309,7 @@ def rebased(slam: EkfSlam, state: Belief) -> Belief:
     identity, and the motion's variables are kept as they are now."""
 
     def core(core: Core) -> Core:
-        pose = KeyframePose.at(core.pose.camera_pose().normalize())
+        pose = KeyframePose.at(slam.coordinates.camera_pose(core.pose).normalize())
         return replace(core, pose=pose, base_motion=core.motion)
 
     return slam.form.reparametrise(state, Change(core=core, view=lambda core: (), landmark=None))

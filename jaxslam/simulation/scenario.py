@@ -70,9 +70,9 @@ class Scenario(eqx.Module):
     """`prior`: every landmark seen in frame 0, at a uniform pixel and an inverse depth from the
     filter's prior. `ring`: evenly on a horizontal circle around the centre of the nominal path.
     `room`: 72 points along the walls of a square room, on two levels (slamtb). `cloud`: along the
-    true path, each on a random ray of a random frame; seen up to the greatest depth. `rays`: always as
-    many in view; for one that leaves, which is gone for good, another is thrown along a random ray
-    of the camera there."""
+    true path, each on a random ray of a random frame; seen up to the greatest depth. `rays`: always
+    as many in view; for one that leaves, which is gone for good, another is thrown along a random
+    ray of the camera there."""
     landmarks: int = _structural(12)
     in_view: int = _structural(0)
     """At most so many landmarks are measured at once, and one that leaves the view is a new one
@@ -405,6 +405,7 @@ def _family(family: str, noises: Mapping[str, tuple[Numbers, Numbers]], **fields
 
 
 def _built_in():
+    around: dict[str, Any] = {**_SPATIAL, "landmarks": 144}
     yield from _family("matched", _PLANAR_NOISE)
     towards = {suffix: _PLANAR_NOISE[suffix] for suffix in ("", "-loose")}
     yield from _family("matched-forward", towards, velocity=(0.0, 1.2, 0.0))
@@ -478,7 +479,7 @@ def _built_in():
         motion="odometry",
         odometry_sigma=(0.005,) * 3 + (math.radians(0.05),) * 3,
         in_view=20,
-        **(_SPATIAL | {"landmarks": 144}),
+        **around,
     )
     yield from _with_odometry()
 

@@ -26,7 +26,7 @@ from jaxslam.filters.association import (
     candidates,
     second_order,
 )
-from jaxslam.filters.ekf import EkfSlam, each_gaussian, init_with_depths
+from jaxslam.filters.ekf import EkfSlam, each_gaussian, ekf_inside, init_with_depths
 from jaxslam.filters.protocol import AbstractStaged, Belief, CameraView
 from jaxslam.filters.readouts import (
     camera_pose_in_unit,
@@ -345,7 +345,7 @@ def _moving(
 
 @Program
 def _at_rest(slam: AbstractStaged, state: Belief) -> Belief:
-    velocity, root = slam.unwrapped.motion.start()
+    velocity, root = ekf_inside(slam, "a camera is at rest").motion.start()
     return _with_velocity(slam, state, velocity, root @ root.T)
 
 
@@ -353,8 +353,7 @@ def _with_velocity(
     slam: AbstractStaged, state: Belief, velocity: jax.Array, covariance: jax.Array
 ) -> Belief:
     """Every Gaussian with another velocity, of which nothing was known."""
-    ekf = slam.unwrapped
-    assert isinstance(ekf, EkfSlam)
+    ekf = ekf_inside(slam, "a camera is elsewhere")
 
     def one(state: Belief) -> Belief:
         part = state.core.part("motion")

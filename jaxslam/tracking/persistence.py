@@ -17,6 +17,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxslam._runtime.files import one_line, read_arrays, write_atomically
 from jaxslam.io.calibration import Calibration, as_fields, from_fields
@@ -139,7 +140,7 @@ def _arrays(one: Remembered) -> dict[str, np.ndarray]:
 
 
 def _remembered(
-    told: Mapping[str, Any], arrays: Mapping[str, np.ndarray], i: int, like: Any
+    told: Mapping[str, Any], arrays: Mapping[str, np.ndarray], i: int, like: PyTree
 ) -> Remembered:
     """The i-th of the maps in the file, of a filter whose state is `like` it."""
     prefix = f"{i}/"

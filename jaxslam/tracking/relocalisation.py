@@ -37,7 +37,7 @@ TURN, SHIFT = 0.01, 0.02
 SURE = 0.3
 """σ of a point by its distance, of those from which a pose is found."""
 SECONDS = 1 / 30
-"""In which a camera moves there: as quickly as between two frames, so that no acceleration matters."""
+"""In which a camera moves there: between two frames, so that no acceleration matters."""
 NOTED_EVERY = 5
 """Frames between two in which landmarks are described."""
 LOOKS = 3
@@ -48,10 +48,9 @@ def describe(
     image: UInt8[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"]
 ) -> tuple[UInt8[np.ndarray, "n 32"], Bool[np.ndarray, " n"]]:
     """Return upright ORB descriptors of these pixels, and which have one: not those at the edge."""
-    keys = [
-        cv2.KeyPoint(float(u), float(v), 31.0, 0.0, 1.0, 0, i) for i, (u, v) in enumerate(pixels)
-    ]
-    kept, found = cv2.ORB_create().compute(image, keys)
+    places = enumerate(pixels.astype(float).tolist())
+    keys = [cv2.KeyPoint(u, v, 31.0, 0.0, 1.0, 0, i) for i, (u, v) in places]
+    kept, found = cv2.ORB.create().compute(image, keys)
     descriptors, there = np.zeros((len(pixels), 32), np.uint8), np.zeros(len(pixels), bool)
     if found is not None:
         which = [key.class_id for key in kept]
@@ -108,9 +107,8 @@ def pose_of(
     )  # fmt: skip
     if not found or inside is None or len(inside) < FEWEST:
         return None
-    turn, shift = cv2.solvePnPRefineLM(
-        points[inside[:, 0]], pixels[inside[:, 0]], K, distortion, turn, shift
-    )
+    which = inside[:, 0].astype(int)
+    turn, shift = cv2.solvePnPRefineLM(points[which], pixels[which], K, distortion, turn, shift)
     T_cw = np.eye(4)
     T_cw[:3, :3], T_cw[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
     return np.linalg.inv(T_cw)

@@ -18,7 +18,8 @@ from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 
 _COLUMNS = (
     "frame", "time", "state", "map", "matches", "nis", "nis_dof",
-    "sigma_position", "sigma_orientation", "sigma_log_scale", "log_scale", "unit_fixed", "reason", "relocalised",
+    "sigma_position", "sigma_orientation", "sigma_log_scale", "log_scale", "unit_fixed", "reason",
+    "relocalised",
 )  # fmt: skip
 
 

@@ -173,7 +173,7 @@ class Tracker:
         tracker = cls.load(path, filter)
         if tracker.calibration != calibration:
             theirs, ours = (
-                f"{one.width} × {one.height}, fx {one.fx:g}, {one.model}"
+                f"{one.width} × {one.height}, fx {one.fx:g}"
                 for one in (tracker.calibration, calibration)
             )
             raise ValueError(f"{path}: is a map of another camera ({theirs}) than this ({ours})")
@@ -255,9 +255,8 @@ class Tracker:
     def _remember(self, frame: Frame, seen: Observations) -> None:
         """Note what the map looks like, to know it again."""
         if self.steps % NOTED_EVERY == 0:
-            note_looks(
-                self.landmarks, frame.image, seen.slots[seen.matched], seen.places[seen.matched]
-            )
+            matched = seen.labelled("matched")
+            note_looks(self.landmarks, frame.image, matched.slots, matched.pixels)
         self.map.remember()
 
     def _back(self, frame: Frame, seen: Observations, correction: Correction) -> Tracked:

@@ -49,16 +49,15 @@ def track(
     progress: Callable[[int], None] = lambda frames: None,
 ) -> dict[str, Any]:
     """Track `source`, write `trajectory.txt`, `covariance.txt`, `frames.csv`, `summary.json`,
-    `map.ply`, `map.npz`, `map.png` and, if wanted, `overlay.mp4` into the folder `out`, and return the
-    summary.
+    `map.ply`, `map.npz`, `map.png` and, if wanted, `overlay.mp4` into the folder `out`, and
+    return the summary.
 
     An interruption (KeyboardInterrupt) or an unreadable frame (ValueError) leaves all of them for
     the frames so far, and is raised again; an interruption of the first frame or the second leaves
     none. `slam` is a filter of one's own, in place of the one that the settings name. `target`,
-    known points that the first frame sees, makes the map metric. `known` is the `map.npz` of another
-    video by the same camera, which is gone on with where it is known again, with its settings.
-    `viewer` is a file for the rerun
-    viewer, FILE.rrd, written beside the others.
+    known points that the first frame sees, makes the map metric. `known` is the `map.npz` of
+    another video by the same camera: this one goes on with that map where it is known again, by its
+    settings. `viewer` is a file for the rerun viewer, FILE.rrd, written beside the others.
     """
     recording = None if viewer is None else Viewer(viewer, source.calibration)
     if known is None:

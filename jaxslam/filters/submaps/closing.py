@@ -96,12 +96,12 @@ def separation(chain: Chain, loops: Loops, states: State) -> Float[Array, "m n"]
     return jnp.where(loops.valid[:, None], values, 0.0)
 
 
-def _direction(point: Float[Array, " n"], omega: Float[Array, ""]) -> Float[Array, " n+1"]:
+def _direction(point: Float[Array, " n"], omega: Float[Array, ""]) -> Float[Array, " m"]:
     both = jnp.append(point, omega)
     return both / jnp.linalg.norm(both)
 
 
-def _across(v: Float[Array, " n+1"]) -> Float[Array, "n+1 n"]:
+def _across(v: Float[Array, " m"]) -> Float[Array, "m m-1"]:
     """An orthonormal basis of what is orthogonal to a unit vector: Householder's reflection."""
     w = v.at[-1].add(jnp.where(v[-1] < 0, -1.0, 1.0))
     return (jnp.eye(v.size) - 2 * jnp.outer(w, w) / (w @ w))[:, :-1]

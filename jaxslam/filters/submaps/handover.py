@@ -86,14 +86,14 @@ class Submaps(AbstractWrapper):
 
     base: AbstractStaged
     spare: int = eqx.field(static=True)
-    """Slots beyond those of the landmarks in view: of what is seen no more until the submap ends."""
+    """Slots beyond those of the landmarks in view: of what is out of view until the submap ends."""
     history: int = eqx.field(static=True, default=1)
     """Submaps that the state keeps. A tracker takes each as it ends; a batch of runs keeps all."""
 
     def __check_init__(self) -> None:
         super().__check_init__()
         ekf = self.ekf
-        check_one_gaussian(ekf, "submaps are", corrected=True)
+        check_one_gaussian(ekf, "a filter with submaps", corrected=True)
         if ekf.coordinates is not SUBMAP or ekf.landmark.anchored:
             raise ValueError(
                 "submaps are of a filter in SUBMAP coordinates, whose landmarks have no anchor; "
@@ -210,12 +210,12 @@ class Submaps(AbstractWrapper):
         )
 
 
-def with_submaps(slam: AbstractStaged, spare: int = SPARE, history: int = 1) -> Submaps:
+def with_submaps(slam: AbstractFilter, spare: int = SPARE, history: int = 1) -> Submaps:
     """The filter with submaps: all that is around its `EkfSlam` stays. Raises ValueError."""
     return Submaps(_in_submaps(slam), spare, history)
 
 
-def _in_submaps(slam: AbstractFilter) -> AbstractFilter:
+def _in_submaps(slam: AbstractFilter) -> AbstractStaged:
     if isinstance(slam, EkfSlam):
         return replace(slam, coordinates=SUBMAP)
     if not isinstance(slam, AbstractWrapper):

@@ -40,9 +40,8 @@ class Linear:
             positions.append(positions[-1] + DT * v)
         self.points = np.array(positions)[::2] + rng.uniform(-3, 3, (LANDMARKS, 2))
         self.points[-3] = self.points[1]  # the loop
-        self.seen = np.array(
-            [[2 * j <= k < 2 * j + LIFE for j in range(LANDMARKS)] for k in range(FRAMES)]
-        )
+        age = np.arange(FRAMES)[:, None] - 2 * np.arange(LANDMARKS)
+        self.seen = (age >= 0) & (age < LIFE)
         noise = SIGMA * rng.normal(size=(FRAMES, LANDMARKS, 2))
         self.measured = self.points - np.array(positions)[:, None] + noise
 
@@ -67,7 +66,7 @@ class Linear:
             for j in np.flatnonzero(self.seen[k - 1] & ~self.seen[k]):
                 gone[k, j % SLOTS] = True
         first = jax.tree.map(lambda x: x[0], new)
-        frames = Frames(np.full(FRAMES, DT), seen, new, gone)
+        frames = Frames(np.full(FRAMES, DT), seen, new, jnp.asarray(gone))
         return jax.tree.map(lambda x: jnp.asarray(x)[1:], frames), first
 
     def batch(self, same=()):
@@ -120,9 +119,8 @@ def everything(chain):
     def values(states):
         poses = base_poses(chain, states)
         apply = jax.vmap(jax.vmap(lambda pose, point: pose @ point, in_axes=(None, 0)))
-        return jnp.concatenate(
-            [poses.translation().ravel(), apply(poses, states.landmarks).ravel()]
-        )
+        points = apply(poses, states.landmarks)
+        return jnp.concatenate([poses.translation().ravel(), points.ravel()])
 
     return values
 
