@@ -1,0 +1,160 @@
+"""A camera that was lost is back in a map that it knows; in another place it is not."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from jaxslam.tracking import relocalisation
+from jaxslam.tracking.landmarks import Landmark
+from jaxslam.tracking.patches import Patch
+from jaxslam.tracking.relocalisation import candidates, describe, note_looks, pose_of
+from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.synthetic import synthetic_source
+from jaxslam.tracking.tracker import Tracker
+
+SETTINGS = TrackerSettings(filter="world", wanted=50, lost_for=5)
+
+
+def interrupted(source, during, image):
+    """The source's frames, with another picture in some."""
+    for frame in source:
+        yield replace(frame, image=image(frame)) if frame.index in during else frame
+
+
+def test_after_black_frames_the_camera_is_back_in_its_map():
+    source = synthetic_source(frames=70, seed=3)
+    tracker = Tracker(source.calibration, SETTINGS)
+    during = range(35, 60)
+    black = np.zeros((source.calibration.height, source.calibration.width), np.uint8)
+    tracked = [tracker.track(f) for f in interrupted(source, during, lambda frame: black)]
+    assert [one.index for one in tracked if one.lost] == [*during]
+    assert [one.index for one in tracked if one.relocalised] == [60]
+    assert {one.map for one in tracked} == {0}
+    assert tracker.restarts == 0
+    seen = [one for one in tracked if not one.lost]
+    T = np.array([one.T_wc[:3, 3] for one in seen])
+    truth = (
+        source.reference.T_wc[[one.index for one in seen], :3, 3] - source.reference.T_wc[0, :3, 3]
+    )
+    truth = truth @ source.reference.T_wc[0, :3, :3]
+    scale = np.sum(T * truth) / np.sum(T * T)
+    away = np.linalg.norm(scale * T - truth, axis=1)
+    assert away[35:].max() < 3 * away[:35].max()
+
+
+def test_another_room_is_another_map_and_the_first_is_known_again():
+    source, other = (
+        synthetic_source(frames=85, seed=3),
+        list(synthetic_source(frames=85, seed=1003)),
+    )
+    tracker, during = Tracker(source.calibration, SETTINGS), range(35, 65)
+    frames = interrupted(source, during, lambda frame: other[frame.index].image)
+    tracked = [tracker.track(frame) for frame in frames]
+    maps = [one.map for one in tracked]
+    begins = [one.index for one in tracked if one.starts]
+    assert len(begins) == 2
+    assert during.start < begins[1] < during.stop
+    assert maps[begins[1] : during.stop] == [1] * (during.stop - begins[1])
+    (back,) = [one.index for one in tracked if one.relocalised]
+    assert during.stop <= back <= during.stop + 5
+    assert maps[back:] == [0] * (len(maps) - back)
+    assert not any(one.lost for one in tracked[back:])
+    # Every landmark is told of once, in the map that it is of.
+    points = tracker.points()
+    assert len(set(points.numbers.tolist())) == len(points.numbers) == tracker.created
+    assert set(points.maps.tolist()) == {0, 1}
+    # A map that comes next has a number of its own.
+    tracker.map.restart()
+    assert tracker.map.number == 2
+
+
+def source_frame(source):
+    """A frame of it."""
+    return next(iter(source))
+
+
+def test_a_saved_map_is_gone_on_with_in_another_video(tmp_path):
+    source = synthetic_source(frames=60, seed=4)
+    frames, tracker = list(source), Tracker(source.calibration, SETTINGS)
+    tracked = [tracker.track(frame) for frame in frames[:40]]
+    tracker.save(tmp_path / "map.npz")
+    later = Tracker.localising(tmp_path / "map.npz", source.calibration)
+    black = np.zeros_like(frames[0].image)
+    first = later.step(black, 0.0)
+    assert first.lost
+    assert later.searching
+    found = [later.step(frame.image, 1 + k / 30) for k, frame in enumerate(frames[45:])]
+    assert found[0].relocalised
+    assert not any(one.lost for one in found)
+    assert {one.map for one in found} == {0}
+    tracked += [tracker.track(frame) for frame in frames[40:]]
+    apart = np.linalg.norm(found[-1].T_wc[:3, 3] - tracked[-1].T_wc[:3, 3])
+    assert apart < 4 * tracked[-1].camera.sigma_position
+    assert found[-1].camera.sigma_position < 3 * tracked[-1].camera.sigma_position
+
+
+def test_where_no_map_is_known_another_begins(tmp_path):
+    source, other = synthetic_source(frames=40, seed=4), synthetic_source(frames=12, seed=77)
+    tracker = Tracker(source.calibration, SETTINGS)
+    for frame in source:
+        tracker.track(frame)
+    tracker.save(tmp_path / "map.npz")
+    later = Tracker.localising(tmp_path / "map.npz", source.calibration)
+    found = [later.track(frame) for frame in other]
+    assert [one.starts for one in found] == [k == SETTINGS.lost_for - 1 for k in range(12)]
+    assert not any(one.relocalised for one in found)
+    assert {one.map for one in found} == {1}
+
+
+def test_a_map_of_another_camera_is_refused(tmp_path):
+    source = synthetic_source(frames=2, seed=4)
+    tracker = Tracker(source.calibration, SETTINGS)
+    tracker.track(source_frame(source))
+    tracker.save(tmp_path / "map.npz")
+    wrong = replace(source.calibration, fx=source.calibration.fx * 1.1)
+    with pytest.raises(
+        ValueError, match=r"a map of another camera \(640 × 480, fx .* than this"
+    ):
+        Tracker.localising(tmp_path / "map.npz", wrong)
+
+
+def test_a_pose_is_found_among_wrong_matches_and_none_among_wrong_ones_alone():
+    rng, calibration = np.random.default_rng(0), synthetic_source(frames=2).calibration
+    points = rng.uniform([-2, -2, 3], [2, 2, 8], (40, 3))
+    T_wc = np.eye(4)
+    T_wc[:3, :3], T_wc[:3, 3] = cv2.Rodrigues(np.array([0.1, -0.2, 0.05]))[0], [0.3, -0.1, 0.5]
+    T_cw = np.linalg.inv(T_wc)
+    lens = calibration.matrix, np.array(calibration.distortion, float)
+    pixels = cv2.projectPoints(points, cv2.Rodrigues(T_cw[:3, :3])[0], T_cw[:3, 3], *lens)[0][:, 0]
+    pixels += rng.normal(0, 0.5, pixels.shape)
+    pixels[:20] = rng.uniform(0, 480, (20, 2))
+    found = pose_of(points, pixels, calibration)
+    assert np.abs(found - T_wc).max() < 0.03
+    assert pose_of(points[:20], pixels[:20], calibration) is None
+    assert pose_of(points[:5], pixels[:5], calibration) is None
+
+
+def test_landmarks_are_known_by_their_looks():
+    """In a picture that is moved; a picture of noise has none of them."""
+    source = synthetic_source(frames=2, seed=5)
+    image = source_frame(source).image
+    corners = cv2.goodFeaturesToTrack(image, 40, 0.01, 20)[:, 0].astype(float)
+    landmarks = {
+        2 * i: Landmark(i, Patch.take(image, corner), np.eye(4), corner)
+        for i, corner in enumerate(corners)
+    }
+    there = describe(image, corners)[1]
+    assert there.mean() > 0.7
+    assert not describe(image, np.array([[3.0, 3.0]]))[1].any()
+    for _ in range(relocalisation.LOOKS + 2):
+        note_looks(landmarks, image, np.arange(len(corners)) * 2, corners)
+    assert {len(one.looks) for one in landmarks.values()} == {0, relocalisation.LOOKS}
+    slots, pixels = candidates(landmarks, np.roll(image, (5, 12), axis=(0, 1)))
+    moved = pixels - corners[slots // 2] - [12, 5]
+    assert np.mean(np.linalg.norm(moved, axis=1) < 2) > 0.8
+    assert len(slots) > 0.5 * there.sum()
+    noise = np.random.default_rng(1).integers(0, 255, image.shape, dtype=np.uint8)
+    assert len(candidates(landmarks, noise)[0]) < relocalisation.FEWEST
+    assert len(candidates(landmarks, np.zeros_like(image))[0]) == 0
