@@ -223,7 +223,8 @@ class Tracker:
         seen, reason = self.policy.observed(
             frame.image, self.map, predicted, lost=self.unmeasured > 0
         )
-        if reason is not None and self.unmeasured:
+        # Where two motions contradict each other, a place that is known says no more of them.
+        if reason in (Lost.NOTHING_EXPECTED, Lost.FEW_AGREE) and self.unmeasured:
             found = known_again(frame.image, self.map, self.policy)
             if found is not None:
                 return self._back(frame, *found)

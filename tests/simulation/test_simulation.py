@@ -175,6 +175,15 @@ for suffix, slip in (("", 0.02), ("-loose", 0.04)):
         "position_sigma": 0.1,
         "first_frame": 1,
     }
+EXPECTED["laps"] = {
+    "geometry": "planar", "rate": 30.0, "steps": 3150, "velocity": (0.0, 1.2, 0.3),
+    "acceleration_sigma": (0.02,) * 3, "placement": "ring", "landmarks": 144, "in_view": 24,
+}  # fmt: skip
+EXPECTED["laps-6dof"] = {
+    "geometry": "spatial", "rate": 10.0, "steps": 1050, "motion": "odometry",
+    "velocity": (0.0, 0.0, 1.2, 0.0, -0.3, 0.0), "velocity_sigma": (0.0,) * 6,
+    "placement": "ring", "landmarks": 144, "in_view": 20,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", EXPECTED)
@@ -875,3 +884,49 @@ def test_visible_means_inside_the_picture_and_in_front():
     assert not visible[outside].any()
     assert inside.any()
     assert (seen[..., -1] < 0).any()
+
+
+def test_landmarks_that_share_slots_are_new_when_they_come_back():
+    """A slot is one point's for as long as that is seen, and what it measures is that point's."""
+    run = simulate(scenario("laps", steps=900, in_view=6), jax.random.key(0))
+    who, new = np.asarray(run.identity), np.asarray(run.new)
+    seen = np.asarray(run.visible)
+    np.testing.assert_array_equal(seen, who >= 0)
+    stays = seen[1:] & ~new[1:]
+    np.testing.assert_array_equal(who[1:][stays], who[:-1][stays])
+    for row in who[::50]:
+        held = row[row >= 0].tolist()
+        assert len(set(held)) == len(held)
+    again = [point for point in set(who[new].tolist()) if np.sum(who[new] == point) > 1]
+    assert len(again) > 20
+    frame, slot = 450, int(np.flatnonzero(seen[450])[0])
+    pose = jax.tree.map(lambda x: x[frame], run.poses)
+    x, z = pose.inverse() @ run.points[frame, slot]
+    assert abs(float(run.measured[frame, slot, 0]) - (650 * x / z + 320)) < 3
+
+
+def test_a_cloud_is_along_the_path_and_seen_near_it():
+    chosen = scenario(
+        "matched-6dof", placement="cloud", landmarks=200, in_view=20, steps=60, depth_range=[1, 4]
+    )
+    run = simulate(chosen, jax.random.key(1))
+    depths = []
+    for k in (0, 30, 60):
+        T_CB = jax.tree.map(lambda x, k=k: x[k], run.poses).inverse()
+        depths.append(np.asarray(jax.vmap(T_CB.apply)(run.points[k]))[run.visible[k], 2])
+    assert min(map(len, depths)) >= 10
+    assert np.concatenate(depths).max() <= 4
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"placement": "rays", "in_view": 5}, "in_view: not with placement rays"),
+        ({"known_landmarks": 3, "in_view": 5}, "in_view: not with placement rays"),
+        ({"in_view": -1}, "in_view must not be negative"),
+        ({"placement": "cloud", "sensor": "position"}, "cloud is for a camera"),
+    ],
+)
+def test_worlds_that_are_seen_again_are_checked(fields, message):
+    with pytest.raises(ValueError, match=message):
+        scenario("matched", fields)

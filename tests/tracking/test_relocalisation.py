@@ -29,8 +29,9 @@ def test_after_black_frames_the_camera_is_back_in_its_map():
     during = range(35, 60)
     black = np.zeros((source.calibration.height, source.calibration.width), np.uint8)
     tracked = [tracker.track(f) for f in interrupted(source, during, lambda frame: black)]
-    assert [one.index for one in tracked if one.lost] == [*during]
-    assert [one.index for one in tracked if one.relocalised] == [60]
+    (back,) = [one.index for one in tracked if one.relocalised]
+    assert during.stop <= back <= during.stop + 2
+    assert [one.index for one in tracked if one.lost] == [*range(during.start, back)]
     assert {one.map for one in tracked} == {0}
     assert tracker.restarts == 0
     seen = [one for one in tracked if not one.lost]
@@ -114,9 +115,7 @@ def test_a_map_of_another_camera_is_refused(tmp_path):
     tracker.track(source_frame(source))
     tracker.save(tmp_path / "map.npz")
     wrong = replace(source.calibration, fx=source.calibration.fx * 1.1)
-    with pytest.raises(
-        ValueError, match=r"a map of another camera \(640 × 480, fx .* than this"
-    ):
+    with pytest.raises(ValueError, match=r"a map of another camera \(640 × 480, fx .* than this"):
         Tracker.localising(tmp_path / "map.npz", wrong)
 
 

@@ -21,7 +21,7 @@ from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
 
 SETTINGS = TrackerSettings(filter="world", wanted=12, spare=4)
-NUMBERS = {"trajectory.txt", "covariance.txt", "frames.csv", "summary.json"}
+NUMBERS = {"trajectory.txt", "covariance.txt", "frames.csv", "summary.json", "map.npz"}
 FIGURES = {"map.ply", "map.png"}
 
 

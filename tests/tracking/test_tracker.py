@@ -99,8 +99,10 @@ def test_the_tracker_calls_no_lapack(name_of_filter, monkeypatch):
         tracker.track(frame)
     tracker.points()
     tracker.camera()
-    # Known points begin a map by the same functions, and no ellipse is curved in three frames.
-    assert calls.keys() | {"_remove", "_begin_known", "_curved"} == jitted.keys()
+    # Known points begin a map by the same functions, no ellipse is curved in three frames, and
+    # no camera is lost.
+    unused = {"_remove", "_begin_known", "_curved", "_moving", "_at_rest"}
+    assert calls.keys() | unused == jitted.keys()
     assert len(calls) >= 6
     assert set().union(*calls.values()) == set()
 
@@ -124,12 +126,11 @@ def test_the_files_hold_every_frame_and_agree_with_the_summary(tracked):
     assert json.loads((out / "summary.json").read_text())["frames"] == FRAMES
     assert (out / "map.ply").read_text().startswith("ply")
     assert {path.name for path in out.iterdir()} == {
-        "trajectory.txt", "covariance.txt", "frames.csv", "map.ply", "map.png", "overlay.mp4",
-        "summary.json",
+        "trajectory.txt", "covariance.txt", "frames.csv", "map.ply", "map.npz", "map.png",
+        "overlay.mp4", "summary.json",
     }  # fmt: skip
 
 
-@pytest.mark.slow
 def track_a_lorry(seed, picture):
     """Track 60 frames and 24 in which the left half is of `picture(frame)`, pulled aside. Returns
     how far, at most, the tracked poses of the first map are off, m, before and in these, at the
@@ -151,6 +152,7 @@ def track_a_lorry(seed, picture):
     return off[before].max(), off[~before].max(initial=0.0), tracker
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 4, 6])
 def test_half_a_picture_that_moves_otherwise_is_not_believed(seed):
     """Its corners become landmarks, each of which fits somehow; together they do not."""
@@ -160,6 +162,7 @@ def test_half_a_picture_that_moves_otherwise_is_not_believed(seed):
     assert tracker.restarts == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 4])
 def test_a_map_of_which_one_half_drives_off_ends(seed):
     """Which half is the world's, nobody can tell."""
@@ -191,9 +194,11 @@ def test_frames_csv_says_what_became_of_every_frame(tracked):
     out, _, summary = tracked
     rows = frames_of(out)
     columns = "frame,time,state,map,matches,nis,nis_dof,sigma_position,sigma_orientation"
-    assert ",".join(rows[0]) == columns + ",sigma_log_scale,log_scale,unit_fixed,reason"
+    assert ",".join(rows[0]) == columns + ",sigma_log_scale,log_scale,unit_fixed,reason,relocalised"
     assert [row["state"] for row in rows] == ["start"] + ["tracked"] * (FRAMES - 1)
     assert {row["reason"] for row in rows} == {""}
+    assert {row["relocalised"] for row in rows} == {"0"}
+    assert summary["relocalised"] == 0
     assert summary["lost_reasons"] == {}
     assert {row["map"] for row in rows} == {"0"}
     assert summary["maps"] == 1
@@ -487,7 +492,7 @@ def test_an_interruption_leaves_the_files_of_the_frames_so_far(tmp_path):
         track(synthetic_source(frames=20), tmp_path, SMALL, progress=stop)
     assert len(read_tum(tmp_path / "trajectory.txt")[0]) == 4
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 4
-    assert len(list(tmp_path.iterdir())) == 7
+    assert len(list(tmp_path.iterdir())) == 8
 
 
 def test_a_frame_must_be_later_than_the_one_before():
