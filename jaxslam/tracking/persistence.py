@@ -37,6 +37,7 @@ NUMBERS = {
     "_time": "time",
     "_unmeasured": "unmeasured",
     "_searching": "searching",
+    "_elsewhere": "elsewhere",
     "_sigma_log_scale": "map.place.sigma_log_scale",
     "_doubtful": "policy.doubtful",
     "_log_unit": "map.place.log_unit",

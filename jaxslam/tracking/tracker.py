@@ -62,6 +62,8 @@ class Tracker:
     """Frames given so far."""
     unmeasured: int = field(default=0, init=False)
     """The latest of them, in a row, in which no landmark was measured."""
+    elsewhere: bool = field(default=False, init=False)
+    """Whether the map was out of view in one of them."""
     searching: bool = field(default=False, init=False)
     """Whether no map has begun, as one that is known may be found."""
     failed: Counter[str] = field(default_factory=Counter, init=False)
@@ -223,8 +225,11 @@ class Tracker:
         seen, reason = self.policy.observed(
             frame.image, self.map, predicted, lost=self.unmeasured > 0
         )
-        # Where two motions contradict each other, a place that is known says no more of them.
-        if reason in (Lost.NOTHING_EXPECTED, Lost.FEW_AGREE) and self.unmeasured:
+        # Of two motions that contradict each other a place that is known says no more: it is one of
+        # both.
+        self.elsewhere |= reason in (Lost.NOTHING_EXPECTED, Lost.FEW_AGREE)
+        self.elsewhere &= reason is not None
+        if self.elsewhere and self.unmeasured:
             found = known_again(frame.image, self.map, self.policy)
             if found is not None:
                 return self._back(frame, *found)

@@ -17,6 +17,12 @@ from jaxslam.tracking.tracker import Tracker
 SETTINGS = TrackerSettings(filter="world", wanted=50, lost_for=5)
 
 
+def trajectory_of(source):
+    """The truth, which a synthetic video has."""
+    assert source.reference is not None
+    return source.reference
+
+
 def interrupted(source, during, image):
     """The source's frames, with another picture in some."""
     for frame in source:
@@ -36,10 +42,8 @@ def test_after_black_frames_the_camera_is_back_in_its_map():
     assert tracker.restarts == 0
     seen = [one for one in tracked if not one.lost]
     T = np.array([one.T_wc[:3, 3] for one in seen])
-    truth = (
-        source.reference.T_wc[[one.index for one in seen], :3, 3] - source.reference.T_wc[0, :3, 3]
-    )
-    truth = truth @ source.reference.T_wc[0, :3, :3]
+    T_wc = trajectory_of(source).T_wc
+    truth = (T_wc[[one.index for one in seen], :3, 3] - T_wc[0, :3, 3]) @ T_wc[0, :3, :3]
     scale = np.sum(T * truth) / np.sum(T * T)
     away = np.linalg.norm(scale * T - truth, axis=1)
     assert away[35:].max() < 3 * away[:35].max()
@@ -127,9 +131,10 @@ def test_a_pose_is_found_among_wrong_matches_and_none_among_wrong_ones_alone():
     T_cw = np.linalg.inv(T_wc)
     lens = calibration.matrix, np.array(calibration.distortion, float)
     pixels = cv2.projectPoints(points, cv2.Rodrigues(T_cw[:3, :3])[0], T_cw[:3, 3], *lens)[0][:, 0]
-    pixels += rng.normal(0, 0.5, pixels.shape)
+    pixels = pixels + rng.normal(0, 0.5, pixels.shape)
     pixels[:20] = rng.uniform(0, 480, (20, 2))
     found = pose_of(points, pixels, calibration)
+    assert found is not None
     assert np.abs(found - T_wc).max() < 0.03
     assert pose_of(points[:20], pixels[:20], calibration) is None
     assert pose_of(points[:5], pixels[:5], calibration) is None
