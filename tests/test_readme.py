@@ -119,6 +119,12 @@ def test_a_film_goes_through_the_tracker_in_python(tmp_path, monkeypatch):
     assert Path("tracker.npz").stat().st_size > 0
 
 
+@pytest.mark.slow
+def test_old_cameras_of_submaps_have_covariances(capsys):
+    run_example("docs/submaps.md")
+    assert capsys.readouterr().out == "4 cameras\n"
+
+
 def test_every_snippet_of_every_page_runs():
     """Each document with snippets is run by a test of this file; what is not run says why."""
     tests = Path(__file__).read_text()

@@ -9,6 +9,18 @@ from jaxslam.filters.forms.invariant import Invariant
 from jaxslam.filters.forms.observability_constrained import ObservabilityConstrained
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
 from jaxslam.filters.registry import MODIFIERS, RECOMMENDED, scenario_pieces
+from jaxslam.filters.submaps import (
+    Chain,
+    Loops,
+    Posterior,
+    Submaps,
+    agreeing,
+    base_poses,
+    chain,
+    close,
+    posterior,
+    with_submaps,
+)
 from jaxslam.filters.wrappers.adaptive_process_noise import AdaptiveProcessNoise
 from jaxslam.filters.wrappers.batch_initialisation import BatchInitialisation
 from jaxslam.filters.wrappers.fixed_lag import FixedLag
@@ -25,6 +37,7 @@ __all__ = [
     "AbstractWrapper",
     "AdaptiveProcessNoise",
     "BatchInitialisation",
+    "Chain",
     "Covariance",
     "EkfSlam",
     "FirstEstimates",
@@ -33,8 +46,17 @@ __all__ = [
     "GaussianSum",
     "Information",
     "Invariant",
+    "Loops",
     "ObservabilityConstrained",
+    "Posterior",
     "Standard",
+    "Submaps",
+    "agreeing",
+    "base_poses",
+    "chain",
+    "close",
     "kalman_update",
+    "posterior",
     "scenario_pieces",
+    "with_submaps",
 ]
