@@ -25,7 +25,7 @@ def check_gauge(model: SlamModel) -> None:
     """Raise ValueError unless the gauge of the model's state is known."""
     if model.coordinates not in (ROBOCENTRIC, SUBMAP, WORLD):
         raise ValueError(
-            "unobservable directions are known of robocentric (submap) and world filters, "
+            "unobservable directions are known of robocentric and world filters, "
             f"not {model.coordinates.name}"
         )
 
