@@ -43,6 +43,9 @@ NOTED_EVERY = 5
 LOOKS = 3
 """Descriptors of a landmark that are kept, of different frames."""
 
+Corners = tuple[Float[np.ndarray, "n 2"], UInt8[np.ndarray, "n 32"]]
+"""Of a picture: pixels and descriptors."""
+
 
 def describe(
     image: UInt8[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"]
@@ -71,17 +74,21 @@ def note_looks(
             one.looks = np.concatenate([one.looks, descriptor[None]])[-LOOKS:]
 
 
+def described_corners(image: UInt8[np.ndarray, "h w"]) -> Corners:
+    """Return the corners of a picture, (n, 2), and their descriptors."""
+    found = cv2.goodFeaturesToTrack(image, CORNERS, 0.01, 7)
+    corners = np.zeros((0, 2)) if found is None else found[:, 0].astype(float)
+    descriptors, there = describe(image, corners)
+    return corners[there], descriptors[there]
+
+
 def candidates(
-    landmarks: Mapping[int, Landmark], image: UInt8[np.ndarray, "h w"]
+    landmarks: Mapping[int, Landmark], corners: Corners
 ) -> tuple[np.ndarray, Float[np.ndarray, "m 2"]]:
     """Return slots of landmarks that look like corners of a picture, and these corners."""
     owner = np.repeat(list(landmarks), [len(one.looks) for one in landmarks.values()])
-    corners = cv2.goodFeaturesToTrack(image, CORNERS, 0.01, 7)
-    if corners is None or len(owner) == 0 or len(corners) < FEWEST:
-        return np.zeros(0, int), np.zeros((0, 2))
-    descriptors, there = describe(image, corners[:, 0])
-    pixels, descriptors = corners[there, 0].astype(float), descriptors[there]
-    if len(pixels) < FEWEST:
+    pixels, descriptors = corners
+    if len(owner) == 0 or len(pixels) < FEWEST:
         return np.zeros(0, int), np.zeros((0, 2))
     looks = np.concatenate([one.looks for one in landmarks.values()])
     two = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(looks, descriptors, 2)
@@ -121,10 +128,12 @@ def known_again(
     the `map`, corrected by them. None, and nothing changes, where it shows none that is known."""
     if not map.estimator.displaceable:
         return None
-    now = map.now()
+    now, corners = map.now(), described_corners(image)
     for known in map.known():
         map.become(known)
-        found = _found(image, map, replace(policy))  # what is only tried is no memory of its
+        found = _found(
+            image, corners, map, replace(policy)
+        )  # what is only tried is no memory of its
         after = map.now()
         map.become(now)
         if found is not None:
@@ -134,10 +143,10 @@ def known_again(
 
 
 def _found(
-    image: UInt8[np.ndarray, "h w"], map: Map, policy: Policy
+    image: UInt8[np.ndarray, "h w"], corners: Corners, map: Map, policy: Policy
 ) -> tuple[Observations, Correction] | None:
     """The landmarks of this map in a picture, and what they make of it."""
-    slots, pixels = candidates(map.landmarks, image)
+    slots, pixels = candidates(map.landmarks, corners)
     points, covariances = (part[slots] for part in map.estimator.points())
     with np.errstate(invalid="ignore"):  # at infinity
         sigma = np.sqrt(np.trace(covariances, axis1=1, axis2=2))

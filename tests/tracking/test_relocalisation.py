@@ -9,7 +9,13 @@ import pytest
 from jaxslam.tracking import relocalisation
 from jaxslam.tracking.landmarks import Landmark
 from jaxslam.tracking.patches import Patch
-from jaxslam.tracking.relocalisation import candidates, describe, note_looks, pose_of
+from jaxslam.tracking.relocalisation import (
+    candidates,
+    describe,
+    described_corners,
+    note_looks,
+    pose_of,
+)
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
@@ -155,10 +161,10 @@ def test_landmarks_are_known_by_their_looks():
     for _ in range(relocalisation.LOOKS + 2):
         note_looks(landmarks, image, np.arange(len(corners)) * 2, corners)
     assert {len(one.looks) for one in landmarks.values()} == {0, relocalisation.LOOKS}
-    slots, pixels = candidates(landmarks, np.roll(image, (5, 12), axis=(0, 1)))
+    slots, pixels = candidates(landmarks, described_corners(np.roll(image, (5, 12), axis=(0, 1))))
     moved = pixels - corners[slots // 2] - [12, 5]
     assert np.mean(np.linalg.norm(moved, axis=1) < 2) > 0.8
     assert len(slots) > 0.5 * there.sum()
     noise = np.random.default_rng(1).integers(0, 255, image.shape, dtype=np.uint8)
-    assert len(candidates(landmarks, noise)[0]) < relocalisation.FEWEST
-    assert len(candidates(landmarks, np.zeros_like(image))[0]) == 0
+    assert len(candidates(landmarks, described_corners(noise))[0]) < relocalisation.FEWEST
+    assert len(candidates(landmarks, described_corners(np.zeros_like(image)))[0]) == 0
