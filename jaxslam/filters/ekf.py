@@ -309,8 +309,8 @@ def rebased(slam: EkfSlam, state: Belief) -> Belief:
     identity, and the motion's variables are kept as they are now."""
 
     def core(core: Core) -> Core:
-        pose = KeyframePose.at(slam.coordinates.camera_pose(core.pose).normalize())
-        return replace(core, pose=pose, base_motion=core.motion)
+        assert isinstance(core.pose, KeyframePose)
+        return replace(core, pose=core.pose.reanchored(), base_motion=core.motion)
 
     return slam.form.reparametrise(state, Change(core=core, view=lambda core: (), landmark=None))
 

@@ -189,10 +189,13 @@ class SlamModel(eqx.Module):
 
     def reanchoring_due(self, state: Belief) -> Bool[Array, ""]:
         """Whether the camera is far from the map frame, its motion composed."""
+        return keyframe_due(self._map_from_camera(state.core), self.inverse_distances(state))
+
+    def inverse_distances(self, state: Belief) -> Float[Array, " capacity"]:
+        """Of the landmarks from the origin of the map frame; zero in empty slots."""
         points, omegas = jax.vmap(self.landmark.homogeneous)(state.landmarks)
         inverse_distances = jnp.abs(omegas) / jnp.linalg.norm(points, axis=1)
-        counted = jnp.where(state.active, inverse_distances, 0.0)
-        return keyframe_due(self._map_from_camera(state.core), counted)
+        return jnp.where(state.active, inverse_distances, 0.0)
 
     def _map_from_camera(self, core: Core) -> Pose:
         """T_AC, once the motion is composed."""

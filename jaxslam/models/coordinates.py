@@ -76,13 +76,18 @@ class KeyframePose(eqx.Module):
         return KeyframePose.at(self.camera_pose().normalize())
 
 
-def keyframe_due(T_KC: Pose, inverse_distances: Float[Array, " capacity"]) -> Bool[Array, ""]:
+def keyframe_due(
+    T_KC: Pose,
+    inverse_distances: Float[Array, " capacity"],
+    least_turn: float = KEYFRAME_TURN,
+    least_parallax: float = KEYFRAME_PARALLAX,
+) -> Bool[Array, ""]:
     """Whether the camera has left its keyframe; distances (of landmarks in K) that are not to
     count are infinite."""
     count = jnp.maximum(jnp.sum(inverse_distances != 0), 1)
     parallax = jnp.linalg.norm(T_KC.translation()) * jnp.sum(inverse_distances) / count
     turn = jnp.linalg.norm(log(T_KC.rotation()))
-    return (turn > KEYFRAME_TURN) | (parallax > KEYFRAME_PARALLAX)
+    return (turn > least_turn) | (parallax > least_parallax)
 
 
 ROBOCENTRIC = Coordinates(

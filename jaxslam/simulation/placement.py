@@ -57,16 +57,10 @@ def _on_ring(s: Scenario, key: Array, poses: Pose) -> Float[Array, "l n"]:
 
 def _along_path(s: Scenario, key: Array, poses: Pose) -> Float[Array, "l n"]:
     """On random rays of the cameras of random frames, at depths that are uniform."""
-    frame_key, pixel_key, depth_key = jax.random.split(key, 3)
+    frame_key, key = jax.random.split(key)
     frames = jax.random.randint(frame_key, (s.landmarks,), 0, s.steps + 1)
-    pixels, (least, greatest) = _random_pixels(s, pixel_key), s.depth_range
-    depths = least + (greatest - least) * jax.random.uniform(
-        depth_key, (s.landmarks,), pixels.dtype
-    )
-    seen = _on_rays(Camera(s.focal, s.centre), pixels, 1 / depths)
-    return jax.vmap(lambda frame, point: jax.tree.map(lambda x: x[frame], poses) @ point)(
-        frames, seen
-    )
+    points = _thrown(s, key, Camera(s.focal, s.centre))
+    return jax.vmap(type(poses).apply)(jax.tree.map(lambda x: x[frames], poses), points)
 
 
 def _in_room(s: Scenario, key: Array, poses: Pose) -> Float[Array, "72 3"]:
@@ -103,7 +97,8 @@ def thrown(
         seen_from = jax.vmap(pose.inverse().apply)(points)
         measured = jax.vmap(sensor.measure, in_axes=(0, None))(seen_from, one)
         new = is_first | ~in_image(s, seen_from, measured)
-        points = jnp.where(new[:, None], _thrown_from(s, key, pose, sensor.camera), points)
+        fresh = jax.vmap(pose.apply)(_thrown(s, key, sensor.camera))
+        points = jnp.where(new[:, None], fresh, points)
         return points, (points, new)
 
     frames = s.steps + 1
@@ -113,9 +108,10 @@ def thrown(
     return jax.lax.scan(frame, nowhere, (keys, poses, sensors, is_first))[1]
 
 
-def _thrown_from(s: Scenario, key: Array, pose: Pose, camera: Camera) -> Float[Array, "l n"]:
+def _thrown(s: Scenario, key: Array, camera: Camera) -> Float[Array, "l n"]:
+    """Points along random rays of a camera, in that."""
     pixel_key, depth_key = jax.random.split(key)
     pixels, (least, greatest) = _random_pixels(s, pixel_key), s.depth_range
     share = jax.random.uniform(depth_key, (s.landmarks,), pixels.dtype)
     depths = least + (greatest - least) * share
-    return jax.vmap(pose.apply)(_on_rays(camera, pixels, 1 / depths))
+    return _on_rays(camera, pixels, 1 / depths)

@@ -12,6 +12,7 @@ what is in them, and a loop that turned out wrong is one residual less.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -50,12 +51,10 @@ class Posterior(eqx.Module):
     """A chain with what loops say of it."""
 
     chain: Chain
-    y: Float[Array, "N n"]
-    """The white numbers at the maximum."""
     states: State
-    """The submaps there, a batch; their covariances are those before."""
+    """The submaps at the maximum, a batch; their covariances are those before."""
     slope: Float[Array, "k N n"]
-    """J of the loops' residuals at the maximum."""
+    """J of the loops' residuals there."""
     factor: Cholesky
     """S of the residuals."""
     converged: Bool[Array, ""]
@@ -63,7 +62,7 @@ class Posterior(eqx.Module):
     def marginal(self, function: OfChain) -> tuple[PyTree, Float[Array, "j j"]]:
         """Return mean and covariance of a function of all submaps' states, to first order."""
         value, rows = self.chain.linearised(function, self.states)
-        rows, slope = (x.reshape(len(x), self.y.size) for x in (rows, self.slope))
+        rows, slope = (x.reshape(len(x), math.prod(self.chain.shape)) for x in (rows, self.slope))
         known = self.factor.whitening @ (slope @ rows.T)
         return value, rows @ rows.T - known.T @ known
 
@@ -135,7 +134,7 @@ def posterior(
     zero = jnp.zeros(chain.shape, chain.links.root.dtype)
     y, moved, _ = jax.lax.while_loop(going_on, step, (zero, jnp.asarray(True), 0))
     states, _, rows, _, factor = linear(y)
-    return Posterior(chain, y, states, rows, factor, ~moved)
+    return Posterior(chain, states, rows, factor, ~moved)
 
 
 def agreeing(

@@ -37,8 +37,7 @@ from jaxslam.filters.protocol import (
     OfLandmark,
 )
 from jaxslam.filters.wrappers.wrapper import AbstractWrapper
-from jaxslam.geometry import log
-from jaxslam.models.coordinates import SUBMAP
+from jaxslam.models.coordinates import SUBMAP, keyframe_due
 from jaxslam.models.motion import Control
 from jaxslam.models.observations import Capacity, Features, Slots
 
@@ -143,8 +142,7 @@ class Submaps(AbstractWrapper):
         return seen._replace(possible=seen.possible & (own < state.numbers.size))
 
     def update(self, state: SubmapsState, control: Control, seen: Features) -> Corrected:
-        inner, innovation = self.base.update(state.inner, control, _of_base(state, seen))
-        return replace(state, inner=inner), innovation
+        return super().update(state, control, _of_base(state, seen))
 
     def close(self, state: SubmapsState, new: Features) -> SubmapsState:
         """End the submap where that is due, and insert new landmarks into slots that are free."""
@@ -172,15 +170,9 @@ class Submaps(AbstractWrapper):
         return state.slots < state.numbers.size
 
     def _due(self, state: SubmapsState, new: Features) -> Bool[Array, ""]:
-        ekf = self.ekf
         _, one = self.base.gaussian(state.inner, None)
         T_KC = one.core.pose.keyframe_from_camera
-        points, omegas = jax.vmap(ekf.landmark.homogeneous)(one.landmarks)
-        near = jnp.where(one.active, jnp.abs(omegas) / jnp.linalg.norm(points, axis=1), 0.0)
-        moved = jnp.linalg.norm(T_KC.translation()) * jnp.sum(near)
-        left = (moved > PARALLAX * jnp.sum(one.active)) | (
-            jnp.linalg.norm(log(T_KC.rotation())) > TURN
-        )
+        left = keyframe_due(T_KC, self.ekf.model.inverse_distances(one), TURN, PARALLAX)
         full = jnp.sum(state.numbers < 0) < jnp.sum(new.valid)
         return full | (left & self.unit_fixed(state))
 
