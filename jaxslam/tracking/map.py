@@ -49,7 +49,7 @@ class Map:
     latest: int = 0
     """The greatest number so far."""
     seen: Remembered | None = None
-    """The map as it was last seen, once its unit is fixed …"""
+    """The map as it was last seen, while the camera is lost and its unit is fixed …"""
     left: list[Remembered] = field(default_factory=list)
     """… and others, the latest last."""
 
@@ -108,6 +108,7 @@ class Map:
 
     def leave(self) -> None:
         """Give up all landmarks: what comes next is in another world, unless it is known."""
+        self.remember()
         self.restart()
         self.place = MapInWorld()
 
@@ -118,8 +119,9 @@ class Map:
         self.seen = None
 
     def remember(self) -> None:
-        """Note the map as it is now, to come back to it; not while a start is being found out."""
-        if self.place.unit_fixed:
+        """Note the map as it was in the frame before this one, in which the camera is lost, to come
+        back to it; not while a start is being found out."""
+        if self.seen is None and self.place.unit_fixed:
             self.seen = self.now()
 
     def now(self) -> Remembered:
@@ -144,6 +146,7 @@ class Map:
             self._keep()
             self.left = [one for one in self.left if one.number != known.number]
         self.become(known)
+        self.seen = None
         back = [one.number for one in known.landmarks.values()]
         self.finished = [points.only(~np.isin(points.numbers, back)) for points in self.finished]
 

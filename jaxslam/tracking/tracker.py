@@ -220,11 +220,14 @@ class Tracker:
         ahead, behind = predicted.view.sides
         if behind > ahead and behind >= LEAST_MATCHES:
             self.reversed += 1
+            self.map.seen = None  # nobody is to come back to it
             self.map.coast(predicted)
             return self._lost(frame, Lost.REVERSED)
         seen, reason = self.policy.observed(
             frame.image, self.map, predicted, lost=self.unmeasured > 0
         )
+        if reason is not None:
+            self.map.remember()
         # Of two motions that contradict each other a place that is known says no more: it is one of
         # both.
         self.elsewhere |= reason in (Lost.NOTHING_EXPECTED, Lost.FEW_AGREE)
@@ -235,6 +238,7 @@ class Tracker:
                 return self._back(frame, *found)
         correction = self.map.estimator.correct(predicted, seen)
         if correction.failed:
+            self.map.remember()
             self.failed[Status(int(correction.status)).name.lower()] += 1
             self.map.fall_back(predicted)
             return self._lost(frame, Lost.NOT_POSITIVE)
@@ -243,6 +247,8 @@ class Tracker:
         if reason is None and not seen.matched.any():
             reason = Lost.REFUSED
         self.unmeasured = 0 if reason is None else self.unmeasured + 1
+        if reason is None:
+            self.map.seen = None
         if not self.landmarks or self.unmeasured > self.settings.lost_for:
             return self._lost(frame, reason or Lost.NOTHING_EXPECTED, seen)
         kept = in_view(self.landmarks, seen.slots, self.settings)
@@ -251,19 +257,13 @@ class Tracker:
         if reason is None:
             created = bare_corners(frame.image, self.settings, seen.places[kept])
         self.map.renew(frame.image, created, seen.slots[kept])
-        if reason is None:
-            self._remember(frame, seen)
+        if reason is None and self.steps % NOTED_EVERY == 0:
+            matched = seen.labelled("matched")
+            note_looks(self.landmarks, frame.image, matched.slots, matched.pixels)
         nis, nis_dof = float(correction.nis), int(correction.nis_dof)
         return Tracked.of(
             frame, self.map, seen, created=created, nis=nis, nis_dof=nis_dof, reason=reason
         )
-
-    def _remember(self, frame: Frame, seen: Observations) -> None:
-        """Note what the map looks like, to know it again."""
-        if self.steps % NOTED_EVERY == 0:
-            matched = seen.labelled("matched")
-            note_looks(self.landmarks, frame.image, matched.slots, matched.pixels)
-        self.map.remember()
 
     def _back(self, frame: Frame, seen: Observations, correction: Correction) -> Tracked:
         """Go on in a map in which the camera was found again."""

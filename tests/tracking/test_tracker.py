@@ -410,6 +410,7 @@ def test_a_world_behind_the_camera_is_given_up():
     assert [result.state for result in results] == ["start", "tracked", "start", "tracked"]
     assert [result.map for result in results] == [0, 0, 1, 1]
     assert tracker.reversed == 1
+    assert tracker.map.left == []  # nobody is to come back to it
 
 
 @pytest.mark.slow
