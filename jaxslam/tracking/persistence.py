@@ -30,7 +30,6 @@ from jaxslam.tracking.unit import MapInWorld
 FORMAT = "jaxslam tracker 5"
 
 NUMBERS = {
-    "map": "map.number",
     "restarts": "map.latest",
     "reversed": "reversed",
     "steps": "steps",
@@ -38,11 +37,7 @@ NUMBERS = {
     "_unmeasured": "unmeasured",
     "_searching": "searching",
     "_elsewhere": "elsewhere",
-    "_sigma_log_scale": "map.place.sigma_log_scale",
     "_doubtful": "policy.doubtful",
-    "_log_unit": "map.place.log_unit",
-    "_log_scale": "map.place.log_scale",
-    "_unit_fixed": "map.place.unit_fixed",
 }
 """What a tracker counts and measures, as the file calls it, and where it keeps it."""
 
@@ -77,9 +72,9 @@ def save(path: str | Path, tracker: Resumable, filter_name: str | None) -> None:
     }
     # The map as it is, and those that it may come back to.
     remembered = [kept.now(), *kept.known()]
-    header["known"] = [
+    header["maps"] = [
         {"number": one.number, **{name: getattr(one.place, name) for name in _OF_PLACE}}
-        for one in remembered[1:]
+        for one in remembered
     ]
     header["seen"] = kept.seen is not None
     arrays = dict(joined([NO_POINTS, *kept.finished])._asdict())
@@ -116,19 +111,15 @@ def _restore(
     tracker: Resumable, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
 ) -> None:
     """Make of a new tracker what was saved."""
-    kept, place, numbers = tracker.map, tracker.map.place, header["numbers"]
+    kept, numbers = tracker.map, header["numbers"]
     for name, where in NUMBERS.items():
         piece, _, attribute = where.rpartition(".")
         setattr(attrgetter(piece)(tracker) if piece else tracker, attribute, numbers[name])
     tracker.failed.update(header["failed"])
     kept.finished.append(Points(*(arrays[name] for name in Points._fields)))
-    places = [{name: getattr(place, name) for name in _OF_PLACE}, *header["known"]]
     with jax.enable_x64(True):
         like = kept.estimator.state
-        now, *known = [
-            _remembered({"number": kept.number, **told}, arrays, i, like)
-            for i, told in enumerate(places)
-        ]
+        now, *known = [_remembered(told, arrays, i, like) for i, told in enumerate(header["maps"])]
         kept.become(now)
         kept.measure_unit()
     kept.seen = known.pop(0) if header["seen"] else None
