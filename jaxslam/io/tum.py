@@ -4,7 +4,7 @@ And what other files of a time and numbers a line have in common with them.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -51,16 +51,21 @@ def read_tum(path: str | Path) -> tuple[Float[np.ndarray, " n"], Float[np.ndarra
     """
     columns = "t tx ty tz qx qy qz qw"
     _, rows, lines = read_table(path, "trajectory", "poses", f"eight finite numbers {columns}", 8)
-    size = np.abs(rows[:, 4:]).max(axis=1)
+    return rows[:, 0], rows_as_poses(lambda i: f"{path}, line {lines[i]}", rows)
+
+
+def rows_as_poses(place: Callable[[int], str], rows: np.ndarray) -> Float[np.ndarray, "n 4 4"]:
+    """Poses from rows `t tx ty tz qx qy qz qw …`. Raises ValueError, naming the place."""
+    size = np.abs(rows[:, 4:8]).max(axis=1)
     if (zero := np.flatnonzero(size == 0)).size:
-        raise ValueError(f"{path}, line {lines[zero[0]]}: the quaternion is zero")
-    far = (np.abs(rows).max(axis=1) > LARGEST) | (size < 1 / LARGEST)
+        raise ValueError(f"{place(zero[0])}: the quaternion is zero; a rotation's is accepted")
+    far = ~((np.abs(rows).max(axis=1) <= LARGEST) & (size >= 1 / LARGEST))  # or not finite
     if (wrong := np.flatnonzero(far)).size:
         raise ValueError(
-            f"{path}, line {lines[wrong[0]]}: numbers up to {LARGEST:.0e}, and a quaternion longer "
-            f"than {1 / LARGEST:.0e}, are accepted"
+            f"{place(wrong[0])}: finite numbers up to {LARGEST:.0e}, and a quaternion "
+            f"longer than {1 / LARGEST:.0e}, are accepted"
         )
-    return rows[:, 0], poses(rows[:, 1:4], rows[:, 4:])
+    return poses(rows[:, 1:4], rows[:, 4:8])
 
 
 _LATEST = 1e11

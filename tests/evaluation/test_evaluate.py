@@ -519,7 +519,7 @@ def test_options_that_do_not_go_together_are_refused(tmp_path, capsys):
         tmp_path,
         capsys,
     )
-    refused([arrays, "--truth", arrays], "a truth file goes with a trajectory", tmp_path, capsys)
+    refused([arrays, "--truth", arrays], "--truth goes with a trajectory", tmp_path, capsys)
     write_tum(tmp_path / "t.txt", [0.0], np.eye(4)[None])
     for_poses = [str(tmp_path / "t.txt"), "--nis"]
     refused(for_poses, "innovations come in an npz or CSV file", tmp_path, capsys)

@@ -838,7 +838,7 @@ FILES = ("estimate.txt", "covariance.txt", "truth.txt")
         ),
         (
             {"shown": dict.fromkeys(FILES, lambda t: f"{t:g}")},
-            "its 40 lines have 1 different times, as if printed with too few digits",
+            "its 40 poses have 1 different times, as if printed with too few digits",
         ),
         (
             {"shown": {"truth.txt": lambda t: f"{t + (t > 1.4e9 + 0.7) * 0.03:.9f}"}},
