@@ -24,8 +24,10 @@ class TrackOptions:
     """Options of the command; every field is an option."""
 
     source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
-    """Video file, folder of images, data set folder (TUM RGB-D, EuRoC, KITTI odometry, 7-Scenes) or
-    the number of a camera, 0. Without it: a synthetic video."""
+    """Video file, folder of images, data set folder (TUM RGB-D, EuRoC, KITTI odometry, 7-Scenes),
+    bag of ROS 1 or 2, or the number of a camera, 0. Without it: a synthetic video."""
+    topic: str | None = None
+    """Of a bag: the topic of its pictures; by default the only one that has any."""
     calibration: Path | None = None
     """Camera's JSON file: model, width, height, fx, fy, cx, cy, distortion (OpenCV's order)."""
     fov: float | None = None
@@ -130,7 +132,7 @@ class TrackOptions:
 
         if self.source is not None:
             return open_source(
-                self.source,
+                self.source if self.topic is None else f"{self.source}:{self.topic}",
                 calibration=self.calibration,
                 fov=self.fov,
                 reference=self.reference,
@@ -141,10 +143,10 @@ class TrackOptions:
                 # A target's pixels are those of the pictures as they are.
                 scale=1.0 if self.scale is None and self.target else self.scale,
             )
-        if self.calibration or self.fov is not None or self.reference or self.target:
+        if self.calibration or self.fov is not None or self.reference or self.target or self.topic:
             raise ValueError(
-                "--calibration, --fov, --reference and --target need a SOURCE: the synthetic video "
-                "has its own"
+                "--calibration, --fov, --reference, --target and --topic need a SOURCE: the "
+                "synthetic video has its own"
             )
         source = synthetic_source(
             frames=150 if self.frames is None else self.frames, seed=self.seed

@@ -41,7 +41,7 @@ def _open(path: Path, _rate: float) -> Recording:
 
 def _read_times(path: Path) -> Float[np.ndarray, " n"]:
     _, rows, lines = read_table(path, "times", "times", "finite times, s,", 1, spare=True)
-    check_increasing(path, lines, rows[:, 0])
+    check_increasing(f"{path}, line", lines, rows[:, 0])
     return rows[:, 0]
 
 

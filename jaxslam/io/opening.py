@@ -18,12 +18,13 @@ from jaxslam.io.file import VIDEO
 from jaxslam.io.folder import PLAIN, TIMESTAMPED
 from jaxslam.io.kitti import KITTI
 from jaxslam.io.recording import Layout, Recording
+from jaxslam.io.ros_images import ROS
 from jaxslam.io.seven_scenes import SEVEN_SCENES
 from jaxslam.io.source import Source, Trajectory, check_size, resized, selected
 from jaxslam.io.tum import read_tum
 from jaxslam.io.tum_rgbd import TUM_RGBD
 
-LAYOUTS = (CAMERA, VIDEO, TUM_RGBD, EUROC, KITTI, SEVEN_SCENES, TIMESTAMPED, PLAIN)
+LAYOUTS = (CAMERA, VIDEO, TUM_RGBD, EUROC, KITTI, SEVEN_SCENES, TIMESTAMPED, PLAIN, ROS)
 """The first that recognises a path opens it; a new layout is one file and one name."""
 WIDEST = 1280
 """Pixels along the longer side up to which pictures are taken as they are."""

@@ -87,11 +87,20 @@ def listed(listing: Path, folder: Path, names: list[str]) -> list[Path]:
 def read_image(path: Path) -> Image:
     """The image in a file as grey uint8 (height, width); `ValueError` names what cannot be read."""
     try:
-        image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
-    except (OSError, cv2.error):
+        data = np.fromfile(path, np.uint8)
+    except OSError:
+        data = np.empty(0, np.uint8)
+    return decoded(path, data)
+
+
+def decoded(place: Path | str, data: np.ndarray) -> Image:
+    """The image in the bytes of a PNG, JPEG or the like; `ValueError` names the place."""
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+    except cv2.error:
         image = None
     if image is None:
-        raise ValueError(f"{path}: cannot be read as an image")
+        raise ValueError(f"{place}: cannot be read as an image")
     return image
 
 
@@ -134,17 +143,15 @@ def read_timestamps(
         raise ValueError(f"{path}: holds no lines of a time and a file")
     told = [_timestamp(f"{path}, line {n}", line, separator) for n, line in lines.items()]
     times = np.array([time for time, _ in told]) / ticks
-    check_increasing(path, list(lines), times)
+    check_increasing(f"{path}, line", list(lines), times)
     return times, [name for _, name in told]
 
 
-def check_increasing(path: Path, lines: Sequence[int], times: Float[np.ndarray, " n"]) -> None:
-    """Raise ValueError, naming the line, unless times, in seconds, increase."""
+def check_increasing(place: str, lines: Sequence[int], times: Float[np.ndarray, " n"]) -> None:
+    """Raise ValueError, naming the place and its number, unless times, in seconds, increase."""
     for i in np.flatnonzero(~(np.diff(times) > 0))[:1]:
         before, time = times[i : i + 2].tolist()
-        raise ValueError(
-            f"{path}, line {lines[i + 1]}: time {time} s does not come after {before} s"
-        )
+        raise ValueError(f"{place} {lines[i + 1]}: time {time} s does not come after {before} s")
 
 
 def check_rigid(path: Path, T: Float[np.ndarray, "n 4 4"]) -> None:

@@ -1,0 +1,266 @@
+"""Pictures in bags of ROS: every encoding, the lens beside them, and bags that are damaged."""
+
+import warnings
+
+import cv2
+import numpy as np
+import pytest
+from bags import EPOCH, KINDS, ros_of, write_bag
+from pictures import HEIGHT, WIDTH, brightness, picture
+
+from jaxslam.cli.track import TrackOptions
+from jaxslam.io import ros_images
+from jaxslam.io.calibration import Calibration
+from jaxslam.io.opening import open_recording, open_source
+from jaxslam.io.ros import POSES, WITH_COVARIANCE, chosen, read_poses
+
+SIZE = HEIGHT, WIDTH
+K = np.array([[60.0, 0, 31], [0, 61, 23], [0, 0, 1]])
+D = (-0.1, 0.02, 0.001, -0.002, 0.003)
+STAMPS = EPOCH + np.array([0.0, 0.1, 0.25, 0.3])
+TOPIC = "/camera/image_raw"
+
+
+def pictures(r, stamps=STAMPS):
+    return [r.image(t, picture(i), "mono8") for i, t in enumerate(stamps)]
+
+
+def info(r, **how):
+    given = {"size": SIZE, "K": K, "D": D} | how
+    return [r.camera_info(STAMPS[0], **given)]
+
+
+def film(path, name=TOPIC, beside="/camera/camera_info", **more):
+    r = ros_of(path)
+    topics = {name: pictures(r)} | ({beside: info(r)} if beside else {})
+    return write_bag(path, topics | more)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_topic_is_a_calibrated_video(name, tmp_path):
+    bag = film(tmp_path / name)
+    source = open_source(bag)
+    assert source.name == f"{bag}:{TOPIC}"
+    np.testing.assert_allclose(source.times, STAMPS, rtol=0, atol=1e-6)
+    assert brightness(source) == [5, 15, 25, 35]
+    assert source.calibration == Calibration(WIDTH, HEIGHT, 60.0, 61.0, 31.0, 23.0, D)
+    part = TrackOptions(source=bag, topic="camera/image_raw", start=0.1, every=2)._source()
+    assert [frame.index for frame in part] == [1, 3]
+    assert brightness(part) == [15, 35]
+    named = open_recording(f"{bag}:{TOPIC}")  # as for a board
+    assert [int(image[0, 0]) for image in named.images()] == [5, 15, 25, 35]
+
+
+def test_pictures_are_read_as_they_are_asked_for(tmp_path, monkeypatch):
+    bag, read, as_image = film(tmp_path / "run.mcap"), [], ros_images.as_image
+
+    def counted(place, message):
+        read.append(place)
+        return as_image(place, message)
+
+    monkeypatch.setattr(ros_images, "as_image", counted)
+    source = open_source(bag)
+    assert len(read) == 1  # which tells the size
+    frames = iter(source)
+    next(frames)
+    assert len(read) == 2
+
+
+COLOUR = {"r": 200, "g": 100, "b": 30}
+LUMA = round(0.299 * 200 + 0.587 * 100 + 0.114 * 30)
+
+
+def colour(order):
+    return np.tile(np.array([COLOUR.get(x, 255) for x in order], np.uint8), (*SIZE, 1))
+
+
+def mosaic(pattern):
+    tile = np.array([COLOUR[x] for x in pattern], np.uint8).reshape(2, 2)
+    return np.tile(tile, (HEIGHT // 2, WIDTH // 2))
+
+
+@pytest.mark.parametrize("name", ["run.bag", "run.mcap"])
+@pytest.mark.parametrize(
+    ("encoding", "data", "big"),
+    [
+        ("mono8", np.full(SIZE, LUMA, np.uint8), 0),
+        ("8UC1", np.full(SIZE, LUMA, np.uint8), 0),
+        ("mono16", np.full(SIZE, 256 * LUMA + 77, "<u2"), 0),
+        ("mono16", np.full(SIZE, 256 * LUMA + 77, ">u2"), 1),
+        ("rgb8", colour("rgb"), 0),
+        ("bgr8", colour("bgr"), 0),
+        ("8UC3", colour("bgr"), 0),
+        ("rgba8", colour("rgba"), 0),
+        ("bgra8", colour("bgra"), 0),
+        *[(f"bayer_{x}8", mosaic(x), 0) for x in ("rggb", "bggr", "gbrg", "grbg")],
+        *[(f"bayer_{x}16", mosaic(x) * np.uint16(256), 0) for x in ("rggb", "bggr")],
+    ],
+)
+@pytest.mark.parametrize("spare", [0, 6])
+def test_every_encoding_is_made_grey(name, encoding, data, big, spare, tmp_path):
+    r, step = ros_of(name), data.nbytes // HEIGHT + spare
+    told = [r.image(STAMPS[0], data, encoding, step=step, big=big)]
+    bag = write_bag(tmp_path / name, {TOPIC: told})
+    (frame,) = open_source(bag, fov=60)
+    assert frame.image.shape == SIZE
+    assert frame.image.dtype == np.uint8
+    np.testing.assert_allclose(frame.image, LUMA, rtol=0, atol=1)
+
+
+@pytest.mark.parametrize("form", [".jpg", ".png"])
+def test_compressed_pictures_have_the_lens_of_their_camera(form, tmp_path):
+    r = ros_of("run.bag")
+    data = cv2.imencode(form, np.ascontiguousarray(colour("bgr")))[1]
+    topics = {
+        f"{TOPIC}/compressed": [r.compressed(STAMPS[0], data)],
+        "/camera/camera_info": info(r),
+    }
+    source = open_source(write_bag(tmp_path / "run.bag", topics))
+    (frame,) = source
+    np.testing.assert_allclose(frame.image, LUMA, rtol=0, atol=2)
+    assert source.calibration.fx == 60
+
+
+@pytest.mark.parametrize("name", ["run.bag", "run.mcap"])
+def test_rectified_pictures_have_the_projection_and_no_distortion(name, tmp_path):
+    r = ros_of(name)
+    P = [[50, 0, 30, 0], [0, 50, 20, 0], [0, 0, 1, 0]]
+    told = info(r, P=P, model="equidistant")
+    bag = write_bag(
+        tmp_path / name, {"/camera/image_rect": pictures(r), "/camera/camera_info": told}
+    )
+    assert open_source(bag).calibration == Calibration(WIDTH, HEIGHT, 50.0, 50.0, 30.0, 20.0)
+
+
+def test_without_a_lens_it_is_guessed(tmp_path):
+    r = ros_of("run.mcap")
+    zero = info(r, K=np.zeros((3, 3)), D=(), model="")
+    for name, beside in (
+        ("none.mcap", {}),
+        ("zero.mcap", {"/camera/camera_info": zero}),
+        ("other.mcap", {"/left/camera_info": info(r)}),
+    ):
+        bag = write_bag(tmp_path / name, {TOPIC: pictures(r)} | beside)
+        with pytest.warns(UserWarning, match=f"{name}:{TOPIC}: comes without a calibration"):
+            assert open_source(bag).calibration.guessed
+
+
+def refused(message, *given, **more):
+    with pytest.raises(ValueError, match=message) as caught:
+        list(open_source(*given, **more))
+    assert "\n" not in str(caught.value)
+
+
+def test_another_lens_is_refused_unless_a_calibration_is_given(tmp_path, calibration):
+    r = ros_of("run.bag")
+    told = info(r, model="equidistant")
+    bag = write_bag(tmp_path / "run.bag", {TOPIC: pictures(r), "/camera/camera_info": told})
+    refused("run.bag:/camera/camera_info: distortion 'equidistant' is unknown; plumb_bob or", bag)
+    assert len(list(open_source(bag, calibration=calibration))) == 4
+    told = info(r, K=np.diag([-1.0, 1, 1]))
+    bag = write_bag(tmp_path / "k.bag", {TOPIC: pictures(r), "/camera/camera_info": told})
+    refused("k.bag:/camera/camera_info: fx is -1.0; a positive number is accepted", bag)
+
+
+def test_topics_of_pictures_are_listed(tmp_path):
+    r = ros_of("run.bag")
+    bag = film(tmp_path / "run.bag", **{"/right/image_raw": pictures(r)})
+    refused(r"2 topics fit --topic; name one .* /camera/image_raw \(sensor_msgs/Image, 4 m", bag)
+    refused(r"no other topics fit --topic /x; .*/camera/camera_info \(sensor", f"{bag}:/x")
+    assert brightness(open_source(f"{bag}:/right/image_raw", fov=60)) == [5, 15, 25, 35]
+    empty = write_bag(tmp_path / "no.mcap", {}, empty=[("/i", "sensor_msgs/Image")])
+    refused(r"no\.mcap: no other topics fit .* are /i \(sensor_msgs/Image, 0 messages\)", empty)
+    refused("x.mp4:/x: no such file", tmp_path / "x.mp4:/x")
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        (
+            lambda r: [r.image(STAMPS[0], np.zeros(SIZE, np.uint16), "16UC1")],
+            "message 0: encoding '16UC1' is unknown; mono, bgr",
+        ),
+        (
+            lambda r: [r.image(STAMPS[0], picture(0), "bgr8", width=WIDTH)],
+            "message 0: 3072 bytes in rows of 64 are no 64x48 picture in bgr8",
+        ),
+        (
+            lambda r: [r.image(STAMPS[0], picture(0)[:, :0], "mono8")],
+            "message 0: 0 bytes in rows of 0 are no 0x48 picture",
+        ),
+        (
+            lambda r: [r.compressed(STAMPS[0], np.zeros(9, np.uint8))],
+            "message 0: cannot be read as an image",
+        ),
+        (
+            lambda r: [r.compressed(STAMPS[0], np.zeros(0, np.uint8))],
+            "message 0: cannot be read as an image",
+        ),
+        (lambda r: pictures(r, STAMPS[::-1]), "message 1: time .* does not come after"),
+        (lambda r: pictures(r, 0 * STAMPS), "message 1: time 0.0* s does not come after"),
+        (
+            lambda r: [*pictures(r), r.image(STAMPS[-1] + 1, picture(0)[:10], "mono8")],
+            "image 4 is 64x10, the calibration is for 64x48",
+        ),
+    ],
+)
+def test_bad_pictures_are_refused_in_one_line(told, message, tmp_path):
+    bag = write_bag(tmp_path / "run.bag", {TOPIC: told(ros_of("run.bag"))})
+    refused(message, bag, fov=60)
+
+
+def damaged(draw, data):
+    """Bytes after one to three were changed, or a part was cut off, out, or in twice."""
+    i, j = sorted(int(x) for x in draw.integers(0, len(data) + 1, 2))
+    kind = draw.integers(5)
+    if kind == 0:
+        return data[:i]
+    if kind == 1:
+        return data[:i] + data[j:]
+    if kind == 2:
+        return data[:j] + data[i:]
+    changed = np.frombuffer(data, np.uint8).copy()
+    places = draw.integers(0, len(data), int(draw.integers(1, 4)))
+    changed[places] = draw.integers(0, 256, len(places))
+    return changed.tobytes()
+
+
+def read_all(bag):
+    """Read all that the commands read; what was refused."""
+    said = []
+    for read in (
+        lambda: read_poses(chosen(bag, "/odom", WITH_COVARIANCE, "--estimate")),
+        lambda: read_poses(chosen(bag, "/gt", POSES, "--truth")),
+        lambda: list(open_source(f"{bag}:{TOPIC}")),
+    ):
+        try:
+            read()
+        except ValueError as error:
+            said.append(str(error))
+            assert said[-1]
+            assert "\n" not in said[-1]
+            assert "run" in said[-1]
+    return said
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_damaged_bags_end_in_one_line_or_are_read(name, tmp_path):
+    r = ros_of(name)
+    T, P = np.eye(4), np.eye(6)
+    more = {
+        "/odom": [r.odometry(t, T, P) for t in STAMPS],
+        "/gt": [r.path(STAMPS, [T] * len(STAMPS))],
+    }
+    bag = film(tmp_path / name, **more)
+    assert not read_all(bag)
+    files = [bag] if bag.is_file() else sorted(bag.iterdir())
+    whole, draw, refusals = [file.read_bytes() for file in files], np.random.default_rng(0), 0
+    for case in range(75):
+        for file, data in zip(files, whole, strict=True):
+            file.write_bytes(data)
+        which = case % len(files)
+        files[which].write_bytes(damaged(draw, whole[which]))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            refusals += bool(read_all(bag))
+    assert 20 < refusals <= 75
