@@ -57,7 +57,7 @@ def chosen(bag: Path, named: str, types: Sequence[str], option: str, other: str 
     held: Counter[Topic] = Counter()
     with _opened(bag) as (reader, _):
         for x in reader.connections:
-            held[Topic(bag, x.topic, x.msgtype)] += x.msgcount
+            held[Topic(bag, str(x.topic), str(x.msgtype))] += int(x.msgcount)  # of YAML: anything
     own, other = named.strip("/"), other.strip("/")
     fit = [x for x in held if x.type in types and held[x] and x.name.strip("/") != other]
     fit = [x for x in fit if not own or x.name.strip("/") == own]

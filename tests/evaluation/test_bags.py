@@ -256,6 +256,16 @@ def test_what_is_no_bag_is_refused_in_one_line(name, tmp_path):
     refused("nowhere.*: (no such file|cannot be read)", tmp_path / f"nowhere{bag.suffix}")
 
 
+@pytest.mark.parametrize("name", ["", "true", "1.5", "[1]"])
+def test_a_topic_whose_name_in_the_metadata_is_none_is_no_estimate(name, tmp_path):
+    bag = whole(tmp_path / "run")
+    text = (bag / "metadata.yaml").read_text()
+    assert "name: /odometry\n" in text
+    (bag / "metadata.yaml").write_text(text.replace("name: /odometry\n", f"name: {name}\n"))
+    refused("run(:None|:True|:1.5|:.1.)?: ", bag)
+    refused("run: no other topics fit --estimate /odometry", bag, estimate="/odometry")
+
+
 def test_without_the_library_the_error_says_what_to_install(tmp_path, monkeypatch, capsys):
     bag = whole(tmp_path / "run.mcap")
     monkeypatch.setitem(sys.modules, "rosbags", None)

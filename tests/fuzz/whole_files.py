@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from bags import EPOCH, ros_of
+from bags import write_bag as written
 from scipy.spatial.transform import Rotation
 
 import jaxslam
@@ -49,6 +52,28 @@ def write_errors(folder: Path) -> None:
 def write_pose_arrays(folder: Path) -> None:
     said: dict[str, Any] = {"error": "right", "axes": "body"}
     np.savez(folder / "runs.npz", allow_pickle=False, **pose_arrays(), **said)
+
+
+def write_bag(name: str) -> Callable[[Path], None]:
+    """A bag of estimates, truths, pictures and their lens."""
+
+    def write(folder: Path) -> None:
+        r, held = ros_of(name), pose_arrays()
+        told = list(
+            zip(EPOCH + np.arange(5) / 10, held["estimates"][0], held["truths"][0], strict=True)
+        )
+        K = np.diag([60.0, 60.0, 1.0])
+        topics = {
+            "/odom": [r.odometry(t, T, 1e-4 * np.eye(6)) for t, T, _ in told],
+            "/gt": [r.pose_stamped(t, T) for t, _, T in told],
+            "/camera/image": [
+                r.image(t, np.zeros((48, 64), np.uint8), "mono8") for t, _, _ in told
+            ],
+            "/camera/camera_info": [r.camera_info(told[0][0], (48, 64), K, np.zeros(5))],
+        }
+        written(folder / name, topics)
+
+    return write
 
 
 def write_csv(folder: Path) -> None:
