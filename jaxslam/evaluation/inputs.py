@@ -151,6 +151,8 @@ def without_known(
     Raises ValueError where one is wrong all the same, or where of a run nothing else is left.
     """
     known = exactly_known(covariances) & logged
+    if (known == logged).all():
+        raise ValueError("all covariances are zero; positive definite ones are accepted")
     wrong = known & (np.abs(errors).max(axis=-1) > ROUNDING)
     if wrong.any():
         run, step = np.argwhere(wrong)[0]
@@ -159,8 +161,6 @@ def without_known(
             f"{np.abs(errors[run, step]).max():.3g}; a positive definite one is accepted, and "
             "poses in another frame or unit than the truth's need an alignment (--align se3, sim3)"
         )
-    if (known == logged).all():
-        raise ValueError("all covariances are zero; positive definite ones are accepted")
     before = np.logical_and.accumulate(known | ~logged, axis=1)
     if before.all(axis=1).any():
         run = int(np.argmax(before.all(axis=1)))

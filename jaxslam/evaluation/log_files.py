@@ -56,7 +56,8 @@ def evaluate_log(
     σ of the truth see `evaluate_poses`. With `nis` errors are innovations. Raises
     ValueError, naming the file.
     """
-    source, stated = Path(source), dict(stated or {})
+    (source, topic), stated = ros.bag_and_topic(source) or (Path(source), ""), dict(stated or {})
+    estimate = estimate or topic or None
     how: PoseOptions = {"align": align, "axes_used": axes_used, "truth_sigma": truth_sigma}
     if not source.exists():
         raise ValueError(f"{source}: no such file or folder")
@@ -104,8 +105,7 @@ TRUTHS = ("truth.txt", "groundtruth.txt")
 LEAST_SHARE = 0.5
 """The share of the comparable poses, and of the estimate's time, that must be compared."""
 _WITHIN = f"within {MAX_TIME_DIFFERENCE} s"
-ROS = {"error": "split", "axes": "world"}
-"""The convention of geometry_msgs/PoseWithCovariance, as ROS documents it."""
+ROS = {"error": "split", "axes": "world"}  # as PoseWithCovariance is documented
 Place: TypeAlias = Path | ros.Topic
 
 

@@ -65,8 +65,8 @@ def chosen(bag: Path, named: str, types: Sequence[str], option: str, other: str 
         return fit[0]
     told = ", ".join(f"{x.name} ({x.type}, {held[x]} messages)" for x in sorted(fit or held))
     told = f"messages of {', '.join(types)}; there are {told or 'none'}".replace("/msg/", "/")
-    fault = f"{len(fit) or 'no other'} topics fit {option} {named}".rstrip()
-    raise ValueError(f"{bag}: {fault}; name one with {' '.join(told.split())}")
+    which = f"{len(fit) or 'no'}{' other' * bool(other)} topics fit {option} {named}".strip()
+    raise ValueError(f"{bag}: {which}; name one with {' '.join(told.split())}")
 
 
 def messages(topic: Topic) -> Iterator[Message]:
