@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from jaxslam.plots.landmarks import draw_ellipses
 from jaxslam.plots.style import COLOURS, GREY, new_figure, save
 
-_TRAJECTORY, _REFERENCE, _LANDMARKS, _BEGUN = COLOURS[:4]
+_TRAJECTORY, _REFERENCE, _LANDMARKS, _BEGUN, _LOOPS = COLOURS[:5]
 _CHI2_95 = 5.991  # 95 % quantile of chi-squared with two degrees of freedom
 _SIGMAS_95 = math.sqrt(_CHI2_95)
 _MARGIN = 0.06  # around what is shown, as a share of its size
@@ -65,6 +65,8 @@ def plot_map(
     lost: ArrayLike = (),
     begun: ArrayLike = (),
     begun_covariances: ArrayLike = (),
+    loops: ArrayLike = (),
+    before: ArrayLike = (),
 ) -> Figure:
     """Draw the map from above (x and z) and from behind or the side (y); written to `path` where
     one is given.
@@ -77,7 +79,8 @@ def plot_map(
     too. Where `lost`, true or false for each pose, the line is dotted: there nothing was measured.
     At the poses `begun` a new map begins: the line breaks and is marked, with the 95 % of
     `begun_covariances` (b, 3, 3) of where that is; the landmarks' covariances are then to be those
-    given where their map begins.
+    given where their map begins. `loops` (l, 2, 3) are pairs of places where a loop was closed, and
+    `before` the poses as they were without.
     """
     poses = np.asarray(trajectory, dtype=float).reshape(-1, 4, 4)
     points = np.asarray(points, dtype=float).reshape(-1, 3)
@@ -90,6 +93,9 @@ def plot_map(
     if reference is not None:
         true = np.asarray(reference, dtype=float).reshape(-1, 4, 4)[:, :3, 3]
         lines.insert(0, ("reference", true, _REFERENCE, "--"))
+    old = np.asarray(before, dtype=float).reshape(-1, 4, 4)[:, :3, 3]
+    if len(old):
+        lines.append(("before loops were closed", old, GREY, "-."))
     shown = np.concatenate([line for _, line, _, _ in lines])
     low, high = _view(shown, points)
     inside = np.all((points >= low) & (points <= high), axis=1)
@@ -104,6 +110,7 @@ def plot_map(
         if len(poses):
             start = poses[0, panel.plane, 3]
             axis.plot(*start, "o", color=_TRAJECTORY, ms=6, mfc="white", label="start")
+        _draw_loops(axis, panel, np.asarray(loops, dtype=float).reshape(-1, 2, 3))
         if len(begun):
             _draw_begun(axis, panel, poses[begun, :3, 3], begun_covariances)
         counts = f": {_counts(inside, hidden)}" if panel.with_landmarks else ""
@@ -212,6 +219,13 @@ def _draw_landmarks(
     draw_ellipses(axis, points[shown], covariances[shown], _SIGMAS_95, _LANDMARKS)
     axis.plot(*points.T, ".", color=_LANDMARKS, ms=3.5, label="landmarks, 95 % in their maps")
     return int((~shown).sum())
+
+
+def _draw_loops(axis: Axes, panel: _Panel, loops: Float[np.ndarray, "l 2 3"]) -> None:
+    """Join the places where a loop was closed."""
+    for i, ends in enumerate(loops[:, :, panel.plane]):
+        label = "a loop closed" if i == 0 else None
+        axis.plot(*ends.T, "s-", color=_LOOPS, ms=2.5, lw=1.0, label=label, zorder=3)
 
 
 def _draw_begun(

@@ -39,6 +39,7 @@ from jaxslam.models.observations import Features, Status
 from jaxslam.models.sensors import Pinhole
 from jaxslam.tracking.matching import PEAKS, Matches
 from jaxslam.tracking.observations import NOTHING, Observations, Prediction
+from jaxslam.tracking.places.submaps import left
 from jaxslam.tracking.settings import TrackerSettings
 
 _NOWHERE = np.zeros(0, int), np.zeros((0, 2))
@@ -86,6 +87,8 @@ class CameraReport(NamedTuple):
     """Mean of the log of that unit in metres, and its variance."""
     variance: np.ndarray
     unit_fixed: np.ndarray
+    left: np.ndarray
+    """Whether the camera has left the scene in which its submap began."""
 
 
 @dataclass
@@ -434,7 +437,7 @@ def _renew_map(slam: AbstractStaged, state: Belief, new: Features) -> tuple[Beli
 
 def _reported(slam: AbstractStaged, state: Belief) -> Report:
     seen = camera_pose_in_unit(slam, state)
-    return seen.pose.as_matrix(), *seen[1:], slam.unit_fixed(state)
+    return seen.pose.as_matrix(), *seen[1:], slam.unit_fixed(state), left(slam, state)
 
 
 @Program

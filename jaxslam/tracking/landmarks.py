@@ -50,7 +50,9 @@ class Points(NamedTuple):
 
     numbers: np.ndarray
     maps: np.ndarray
-    """Numbers of their maps."""
+    """Numbers of their maps …"""
+    submaps: np.ndarray
+    """… and of the submaps in which they were then."""
     points: np.ndarray
     """(n, 3); not finite for one at infinity."""
     covariances: np.ndarray
@@ -63,9 +65,8 @@ class Points(NamedTuple):
         return Points(*(part[which] for part in self))
 
 
-NO_POINTS = Points(
-    np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3))
-)
+_NONE = np.zeros(0, int)
+NO_POINTS = Points(_NONE, _NONE, _NONE, np.zeros((0, 3)), *[np.zeros((0, 3, 3))] * 2)
 
 
 def joined(parts: list[Points]) -> Points:

@@ -8,11 +8,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from jaxslam.filters.protocol import Belief
+from jaxslam.filters.protocol import AbstractStaged, Belief
 from jaxslam.tracking.estimator import Estimator, Predicted
 from jaxslam.tracking.landmarks import Landmark, Points, joined
 from jaxslam.tracking.observations import Observations
 from jaxslam.tracking.patches import Patch
+from jaxslam.tracking.places.descriptors import note_looks
+from jaxslam.tracking.places.submaps import Compared, Graph, LoopClosure, Submap, handed_over
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.unit import MapInWorld, Nearness, nearness
 
@@ -31,6 +33,14 @@ class Remembered:
     state: Belief
     landmarks: dict[int, Landmark]
     place: MapInWorld
+    submaps: tuple[Submap, ...] = ()
+    loops: tuple[LoopClosure, ...] = ()
+
+    def graph(self, settings: TrackerSettings, slam: AbstractStaged) -> Graph:
+        """Return its submaps and loops, of this filter."""
+        numbers = slot_numbers(self.landmarks, settings.capacity)
+        present, _ = handed_over(slam, self.state, numbers, self.place.camera)
+        return Graph(slam, self.submaps, present, self.loops, settings.wanted)
 
 
 @dataclass
@@ -52,6 +62,12 @@ class Map:
     """The map as it was last seen, while the camera is lost and its unit is fixed …"""
     left: list[Remembered] = field(default_factory=list)
     """… and others, the latest last."""
+    submaps: tuple[Submap, ...] = ()
+    """Of this map, those that ended …"""
+    loops: tuple[LoopClosure, ...] = ()
+    """… and the loops that join them."""
+    charted: dict[int, Landmark] = field(default_factory=dict)
+    """The landmarks of all submaps that ended, by their numbers, as they were last."""
 
     @property
     def deleted(self) -> int:
@@ -66,6 +82,10 @@ class Map:
     def points(self) -> Points:
         """Return all landmarks, those gone included."""
         return joined([*self.finished, self._recorded(sorted(self.landmarks))])
+
+    def graph(self) -> Graph:
+        """Return the submaps and loops of this map."""
+        return self.now().graph(self.settings, self.estimator.slam)
 
     def note(self, seen: Observations) -> None:
         """Note what was found of the landmarks, and give up those that are searched in vain."""
@@ -96,6 +116,26 @@ class Map:
         report = self.estimator.renew(slots, pixels)
         self.place.follow(report, self._nearness(), self._found_again())
         self._add(slots, image, pixels)
+        if report.left and self.place.unit_fixed and self.seen is None:
+            self._hand_over(image)
+
+    def _hand_over(self, image: UInt8[np.ndarray, "h w"]) -> None:
+        """End the submap at the camera, where this picture was taken."""
+        note_looks(self.landmarks.values(), image)
+        estimator, numbers = self.estimator, slot_numbers(self.landmarks, self.settings.capacity)
+        ended, state = handed_over(estimator.slam, estimator.state, numbers, self.place.camera)
+        estimator.state = state
+        self.submaps = (*self.submaps, ended)
+        self.charted |= {one.number: replace(one) for one in self.landmarks.values()}
+
+    def learn(self, loop: LoopClosure, compared: Compared) -> None:
+        """Take over what a loop says, that ends at the camera."""
+        self.loops = (*self.loops, loop)
+        moved = self.place.correct(compared.T_bc, compared.covariance)
+        for one in self.landmarks.values():
+            one.first_camera = moved @ one.first_camera
+        *before, ended = self.submaps
+        self.submaps = (*before, replace(ended, camera=self.place.camera))
 
     def restart(self) -> None:
         """Give up all landmarks: another map begins where the camera is."""
@@ -104,6 +144,7 @@ class Map:
         self.latest += 1
         self.number = self.latest
         self.place.restart()
+        self.submaps, self.loops = (), ()
         self.estimator.clear()
 
     def leave(self) -> None:
@@ -127,7 +168,8 @@ class Map:
     def now(self) -> Remembered:
         """Return the map as it is."""
         kept = {slot: replace(one) for slot, one in self.landmarks.items()}
-        return Remembered(self.number, self.estimator.state, kept, replace(self.place))
+        place, state = replace(self.place), self.estimator.state
+        return Remembered(self.number, state, kept, place, self.submaps, self.loops)
 
     def known(self) -> list[Remembered]:
         """Return this map as it was last seen, and those that were left, the latest first."""
@@ -138,6 +180,7 @@ class Map:
         self.number, self.estimator.state = known.number, known.state
         self.landmarks = {slot: replace(one) for slot, one in known.landmarks.items()}
         self.place = replace(known.place)
+        self.submaps, self.loops = known.submaps, known.loops
 
     def come_back(self, known: Remembered) -> None:
         """Leave this map for one that was remembered."""
@@ -163,6 +206,7 @@ class Map:
         was last as the prior on a start's velocity lets it be."""
         if self.estimator.correct(predicted).failed:
             self.place.restart_in_metres()
+            self.submaps, self.loops = (), ()
             self.estimator.clear()
             self.estimator.correct(self.estimator.predict(predicted.dt))
 
@@ -218,7 +262,15 @@ class Map:
         points, covariances = (part[slots] for part in self.estimator.points())
         numbers = np.array([self.landmarks[slot].number for slot in slots], int)
         maps = np.full_like(numbers, self.number)
-        return Points(numbers, maps, *self.place.points(points, covariances))
+        submaps = np.full_like(numbers, len(self.submaps))
+        return Points(numbers, maps, submaps, *self.place.points(points, covariances))
+
+
+def slot_numbers(landmarks: Mapping[int, Landmark], capacity: int) -> Int[np.ndarray, " slots"]:
+    """Return the numbers of the landmarks in the slots, −1 for none."""
+    numbers = np.full(capacity, -1)
+    numbers[list(landmarks)] = [one.number for one in landmarks.values()]
+    return numbers
 
 
 def in_view(

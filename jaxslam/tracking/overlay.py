@@ -58,6 +58,8 @@ def _banner(result: Tracked) -> str:
     """Return the warnings of a frame: nothing while all is well."""
     if result.relocalised:
         return f"PLACE KNOWN AGAIN: MAP {result.map}"
+    if result.loop is not None:
+        return f"PLACE KNOWN AGAIN: SUBMAP {result.loop}"
     if result.starts:
         return f"LOST: MAP {result.map} BEGINS" if result.lost else ""
     return "" if result.state == "tracked" else result.state.upper()

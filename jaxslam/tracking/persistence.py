@@ -17,21 +17,22 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from jaxslam._runtime.files import one_line, read_arrays, write_atomically
 from jaxslam.io.calibration import Calibration, as_fields, from_fields
 from jaxslam.tracking.landmarks import NO_POINTS, Points, joined, stacked, unstacked
 from jaxslam.tracking.map import Map, Remembered
+from jaxslam.tracking.places.submaps import Submap, no_loop, shapes
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.unit import MapInWorld
 
-FORMAT = "jaxslam tracker 5"
+FORMAT = "jaxslam tracker 6"
 
 NUMBERS = {
     "restarts": "map.latest",
     "reversed": "reversed",
+    "refused": "refused",
     "steps": "steps",
     "_time": "time",
     "_unmeasured": "unmeasured",
@@ -43,7 +44,9 @@ NUMBERS = {
 
 
 _OF_PLACE = ("log_unit", "log_scale", "sigma_log_scale", "unit_fixed")
-"""Numbers of a `MapInWorld`."""
+"""Numbers of a `MapInWorld` …"""
+_POSES = ("origin", "camera", "here", "told", "known")
+"""… and its poses."""
 
 
 @runtime_checkable
@@ -73,11 +76,17 @@ def save(path: str | Path, tracker: Resumable, filter_name: str | None) -> None:
     # The map as it is, and those that it may come back to.
     remembered = [kept.now(), *kept.known()]
     header["maps"] = [
-        {"number": one.number, **{name: getattr(one.place, name) for name in _OF_PLACE}}
+        {
+            "number": one.number,
+            "submaps": len(one.submaps),
+            "loops": len(one.loops),
+            **{name: getattr(one.place, name) for name in _OF_PLACE},
+        }
         for one in remembered
     ]
     header["seen"] = kept.seen is not None
     arrays = dict(joined([NO_POINTS, *kept.finished])._asdict())
+    arrays |= {f"charted/{name}": array for name, array in stacked(kept.charted).items()}
     for i, one in enumerate(remembered):
         arrays |= {f"{i}/{name}": array for name, array in _arrays(one).items()}
     write_record(path, header, arrays)
@@ -118,8 +127,8 @@ def _restore(
     tracker.failed.update(header["failed"])
     kept.finished.append(Points(*(arrays[name] for name in Points._fields)))
     with jax.enable_x64(True):
-        like = kept.estimator.state
-        now, *known = [_remembered(told, arrays, i, like) for i, told in enumerate(header["maps"])]
+        kept.charted = unstacked(_of(arrays, "charted"))
+        now, *known = [_remembered(told, arrays, i, kept) for i, told in enumerate(header["maps"])]
         kept.become(now)
         kept.measure_unit()
     kept.seen = known.pop(0) if header["seen"] else None
@@ -127,19 +136,46 @@ def _restore(
 
 
 def _arrays(one: Remembered) -> dict[str, np.ndarray]:
-    poses = [(pose.T_wc, pose.covariance) for pose in (one.place.origin, one.place.camera)]
-    return {**leaves(one.state, "state"), **leaves(poses, "poses"), **stacked(one.landmarks)}
+    poses = [_pair(getattr(one.place, name)) for name in _POSES]
+    arrays = {**leaves(one.state, "state"), **leaves(poses, "poses"), **stacked(one.landmarks)}
+    for i, submap in enumerate(one.submaps):
+        parts = submap.frozen, submap.points, submap.covariances, *_pair(submap.camera)
+        arrays |= leaves(parts, f"submap {i}")
+    for i, loop in enumerate(one.loops):
+        arrays |= leaves(loop, f"loop {i}")
+    return arrays
+
+
+def _pair(pose: PoseWithCovariance) -> tuple[np.ndarray, np.ndarray]:
+    return pose.T_wc, pose.covariance
+
+
+def _of(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
+    """The arrays whose names begin with this one, without it."""
+    prefix = f"{name}/"
+    return {key.removeprefix(prefix): x for key, x in arrays.items() if key.startswith(prefix)}
 
 
 def _remembered(
-    told: Mapping[str, Any], arrays: Mapping[str, np.ndarray], i: int, like: PyTree
+    told: Mapping[str, Any], arrays: Mapping[str, np.ndarray], i: int, kept: Map
 ) -> Remembered:
-    """The i-th of the maps in the file, of a filter whose state is `like` it."""
-    prefix = f"{i}/"
-    own = {key.removeprefix(prefix): x for key, x in arrays.items() if key.startswith(prefix)}
-    origin, camera = (PoseWithCovariance(own[f"poses/{k}"], own[f"poses/{k + 1}"]) for k in (0, 2))
-    place = MapInWorld(origin, camera, **{name: told[name] for name in _OF_PLACE})
-    return Remembered(told["number"], grown(like, own, "state"), unstacked(own), place)
+    """The i-th of the maps in the file, of a tracker that keeps such maps."""
+    own, like, slam = _of(arrays, str(i)), kept.estimator.state, kept.estimator.slam
+    place = MapInWorld(**{name: told[name] for name in _OF_PLACE})
+    for k, name in enumerate(_POSES):
+        pose = PoseWithCovariance(own[f"poses/{2 * k}"], own[f"poses/{2 * k + 1}"])
+        setattr(place, name, pose)
+    submaps, loops = (), ()
+    if told["submaps"]:
+        pose = np.zeros((4, 4)), np.zeros((6, 6))
+        ended = *shapes(slam, like, kept.settings.capacity), *pose
+        parts = [jax.device_get(grown(ended, own, f"submap {k}")) for k in range(told["submaps"])]
+        submaps = tuple(Submap(*of[:3], PoseWithCovariance(*of[3:])) for of in parts)
+        d = submaps[0].frozen.state.landmarks.shape[1]
+        loop = no_loop(kept.settings.wanted, d)
+        loops = tuple(jax.device_get(grown(loop, own, f"loop {k}")) for k in range(told["loops"]))
+    state = grown(like, own, "state")
+    return Remembered(told["number"], state, unstacked(own), place, submaps, loops)
 
 
 def write_record(

@@ -73,6 +73,12 @@ def adjoint(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
     return np.block([[R, _cross(T[:3, 3]) @ R], [np.zeros((3, 3)), R]])
 
 
+def positive(P: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Return the nearest symmetric matrix that has no negative eigenvalue."""
+    values, vectors = np.linalg.eigh((P + P.T) / 2)
+    return P if values[0] >= 0 else (vectors * np.maximum(values, 0)) @ vectors.T
+
+
 def _cross(v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     """`[v]×`, the matrix of the cross product with v from the left."""
     return -np.cross(v[..., None, :], np.eye(3))

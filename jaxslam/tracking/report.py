@@ -19,7 +19,7 @@ from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 _COLUMNS = (
     "frame", "time", "state", "map", "matches", "nis", "nis_dof",
     "sigma_position", "sigma_orientation", "sigma_log_scale", "log_scale", "unit_fixed", "reason",
-    "relocalised",
+    "relocalised", "submap", "loop",
 )  # fmt: skip
 
 
@@ -48,6 +48,10 @@ class Tracked:
     """Whether a map begins here; where it is not the first, the camera was lost too."""
     relocalised: bool = False
     """Whether the camera, which was lost, is known to be back in a map that it had seen before."""
+    loop: int | None = None
+    """Number of the submap whose landmarks the frame shows again, where that closes a loop."""
+    submap: int = 0
+    """Number of the submap within its map."""
     map: int = 0
     """Number of the map; each has a unit of length of its own."""
     log_scale: float | None = None
@@ -72,6 +76,7 @@ class Tracked:
             place.camera,
             observations,
             map=map.number,
+            submap=len(map.submaps),
             log_scale=None if doubt is None else place.log_scale,
             sigma_log_scale=doubt,
             sights={one.number: one.seen_at for one in map.landmarks.values() if not one.unseen},
@@ -143,6 +148,8 @@ def write_frames(path: str | Path, history: list[Tracked]) -> None:
     map's start is being found out, when the filter changes its unit with every frame, else 1.
     `reason` is why the camera is lost (`Lost`), empty where it is not; `relocalised` is 1 where a
     camera that was lost is known to be back in a map that it had seen, whose number it then is.
+    `submap` counts the submaps of a map, and `loop` is the number of an earlier one that is known
+    again at this frame.
     """
     with write_atomically(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -167,4 +174,6 @@ def _row(result: Tracked) -> list[object]:
         int(result.unit_fixed),
         result.reason or "",
         int(result.relocalised),
+        result.submap,
+        "" if result.loop is None else result.loop,
     ]

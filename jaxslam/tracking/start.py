@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxslam.filters.ekf import EkfSlam, check_can_track
+from jaxslam.filters.ekf import EkfSlam, check_can_track, check_one_gaussian
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
+from jaxslam.filters.submaps.handover import in_submaps
 from jaxslam.io.calibration import Calibration
+from jaxslam.models.coordinates import ROBOCENTRIC
 from jaxslam.models.scale import Metre
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.target import Target, TargetObservation, known_depths, sighted
@@ -30,7 +32,19 @@ def trackable(
             f"the target has {len(target.points)} points, and {settings.wanted} "
             "landmarks are wanted"
         )
-    return made
+    return _handing_over(made)
+
+
+def _handing_over(made: AbstractStaged) -> AbstractStaged:
+    """The filter with submaps where it is robocentric and one Gaussian, or a sum of them."""
+    inner = made.unwrapped
+    if not isinstance(inner, EkfSlam) or inner.coordinates is not ROBOCENTRIC:
+        return made
+    try:
+        check_one_gaussian(inner, "a map of submaps", corrected=True)
+    except ValueError:
+        return made
+    return made if inner.landmark.anchored else in_submaps(made)
 
 
 def _keeps_metres(slam: AbstractStaged) -> bool:

@@ -45,7 +45,11 @@ Summary = dict[str, Any]
 
 
 def summarised(
-    source: Source, tracker: Tracker, history: Sequence[Tracked], seconds: list[float]
+    source: Source,
+    tracker: Tracker,
+    history: Sequence[Tracked],
+    points: Points,
+    seconds: list[float],
 ) -> Summary:
     lost = sum(result.lost for result in history)
     updates = history[1:]
@@ -58,7 +62,7 @@ def summarised(
         "source": source.name,
         "filter": tracker.filter_name,
         "settings": asdict(tracker.settings),
-        "calibration": _calibration(tracker, history),
+        "calibration": _calibration(tracker, history, points),
         "frames": len(history),
         "tracked": len(history) - lost,
         "lost": lost,
@@ -66,6 +70,9 @@ def summarised(
         "restarts": tracker.restarts,
         "maps": max(1, len({result.map for result in history if result.starts or not result.lost})),
         "relocalised": sum(result.relocalised for result in history),
+        "submaps": len({(result.map, result.submap) for result in history}),
+        "loops": sum(result.loop is not None for result in history),
+        "loops_refused": tracker.refused,
         "units": _units(history),
         "failed_updates": dict(tracker.failed),
         "reversed_tests": tracker.reversed,
@@ -112,6 +119,9 @@ def describe(summary: Summary) -> str:
     if summary["relocalised"]:
         times = "once" if summary["relocalised"] == 1 else f"{summary['relocalised']} times"
         lines.append(f"known again {times}, after it was lost, in a map that it had seen")
+    if summary["loops"]:
+        times = "one place" if summary["loops"] == 1 else f"{summary['loops']} places"
+        lines.append(f"{times} known again: a loop is closed, and all cameras are corrected by it")
     if summary["maps"] > 1:
         lines.append(
             f"{summary['maps']} maps, each in a unit of its own: frames.csv says where they begin"
@@ -145,9 +155,8 @@ def describe(summary: Summary) -> str:
     return "\n".join(lines)
 
 
-def known_points(tracker: Tracker, history: Sequence[Tracked]) -> Points:
+def known_points(landmarks: Points, history: Sequence[Tracked]) -> Points:
     """The landmarks whose depth became known in their maps."""
-    landmarks = tracker.points()
     with np.errstate(invalid="ignore"):  # of unknown depth, a variance can be anything
         sigma = np.sqrt(np.trace(landmarks.in_map, axis1=1, axis2=2))
         known = np.isfinite(sigma) & (sigma < _KNOWN_DEPTH * _distances(landmarks, history))
@@ -224,7 +233,7 @@ def _unit_line(unit: Summary) -> str:
     )
 
 
-def _calibration(tracker: Tracker, history: Sequence[Tracked]) -> Summary:
+def _calibration(tracker: Tracker, history: Sequence[Tracked], points: Points) -> Summary:
     """Return what the camera was taken for, and where it is estimated or considered, what it is in
     the end with σ: what is considered was found by the start, and left since. Where it is known,
     by what factor focal lengths fit much better, if so."""
@@ -241,7 +250,7 @@ def _calibration(tracker: Tracker, history: Sequence[Tracked]) -> Summary:
     if treatment == "estimated":
         result["caveat"] = f"{TOO_SURE}; docs/own-video.md says how much"
     if treatment == "known":
-        factor, left = better_focal(history, tracker.points(), tracker.calibration)
+        factor, left = better_focal(history, points, tracker.calibration)
         if left < CLEAR:
             result["better_focal"] = {"factor": factor, "squares_left": left}
     return result

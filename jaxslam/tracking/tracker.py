@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -21,8 +22,11 @@ from jaxslam.tracking.estimator import Correction, Estimator
 from jaxslam.tracking.landmarks import Landmark, Points
 from jaxslam.tracking.map import Map, in_view
 from jaxslam.tracking.observations import NOTHING, Lost, Observations
+from jaxslam.tracking.places.closing import close_loop
+from jaxslam.tracking.places.descriptors import note_looks
+from jaxslam.tracking.places.relocalisation import NOTED_EVERY, known_again
+from jaxslam.tracking.places.smoothing import after_loops
 from jaxslam.tracking.policy import LEAST_MATCHES, Policy
-from jaxslam.tracking.relocalisation import NOTED_EVERY, known_again, note_looks
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.start import trackable, with_target
@@ -68,6 +72,8 @@ class Tracker:
     """Whether no map has begun, as one that is known may be found."""
     failed: Counter[str] = field(default_factory=Counter, init=False)
     """How many updates ended in which `Status` that says that their result means nothing."""
+    refused: int = field(default=0, init=False)
+    """Places that looked like earlier ones, and that cannot be these."""
     reversed: int = field(default=0, init=False)
     """Maps that turned out to lie behind the camera, and were given up."""
     map: Map = field(init=False, repr=False)
@@ -140,6 +146,12 @@ class Tracker:
         """Return all landmarks, those gone included."""
         with jax.enable_x64(True):
             return self.map.points()
+
+    def after_loops(self, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
+        """Return the frames so far, and all landmarks, as the loops that closed later have them:
+        the same ones where none did."""
+        with jax.enable_x64(True):
+            return after_loops(self.map, history)
 
     def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
         """Return how the calibration is treated, and fx, fy, cx, cy with their covariance, pixels,
@@ -256,14 +268,19 @@ class Tracker:
         created = np.zeros((0, 2))
         if reason is None:
             created = bare_corners(frame.image, self.settings, seen.places[kept])
+        ended = len(self.map.submaps)
         self.map.renew(frame.image, created, seen.slots[kept])
+        closed = None
+        if len(self.map.submaps) > ended:
+            closed = close_loop(frame.image, self.map, self.calibration)
+            self.refused += closed is not None and not closed.believed
         if reason is None and self.steps % NOTED_EVERY == 0:
-            matched = seen.labelled("matched")
-            note_looks(self.landmarks, frame.image, matched.slots, matched.pixels)
+            note_looks(self.landmarks.values(), frame.image)
         nis, nis_dof = float(correction.nis), int(correction.nis_dof)
-        return Tracked.of(
-            frame, self.map, seen, created=created, nis=nis, nis_dof=nis_dof, reason=reason
-        )
+        found = {"nis": nis, "nis_dof": nis_dof, "reason": reason}
+        if closed is not None and closed.believed:
+            found["loop"] = closed.submap
+        return Tracked.of(frame, self.map, seen, created=created, **found)
 
     def _back(self, frame: Frame, seen: Observations, correction: Correction) -> Tracked:
         """Go on in a map in which the camera was found again."""

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxslam.tracking.estimator import CameraReport
 from jaxslam.tracking.observations import Prediction
-from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, adjoint, positive
 
 Nearness = Mapping[int, float]
 """By a landmark's number: one by its distance from where the map begins, in the filter's unit."""
@@ -57,6 +57,12 @@ class MapInWorld:
     """Whether the filter keeps its unit from here on."""
     near: Nearness = field(default_factory=dict)
     """Of all landmarks, as long as the filter's unit is not fixed."""
+    told: PoseWithCovariance = field(default_factory=PoseWithCovariance)
+    """A camera from where the map begins, as the filter had it when a loop closed …"""
+    known: PoseWithCovariance = field(default_factory=PoseWithCovariance)
+    """… and as it was known then."""
+    here: PoseWithCovariance = field(default_factory=PoseWithCovariance)
+    """The camera from where the map begins, as the filter has it now."""
 
     @property
     def unit(self) -> float:
@@ -75,9 +81,20 @@ class MapInWorld:
             self.log_unit += lengthened(self.near, near, found)
         self._take(report)
 
+    def correct(
+        self, T_bc: Float[np.ndarray, "4 4"], covariance: Float[np.ndarray, "6 6"]
+    ) -> Float[np.ndarray, "4 4"]:
+        """Take over what a loop says of the present camera, in the filter's unit: T from the world
+        as it was to the world as it is now."""
+        before = self.camera.T_wc
+        self.told, self.known = self.here, PoseWithCovariance(T_bc, covariance).scaled(self.unit)
+        self._set(self.here)
+        return self.camera.T_wc @ np.linalg.inv(before)
+
     def restart(self) -> None:
         """Let what comes begin where the camera is."""
         self.origin = self.camera
+        self.told = self.known = PoseWithCovariance()
 
     def restart_in_metres(self) -> None:
         """The same of a filter whose state is empty, which is in metres."""
@@ -88,21 +105,39 @@ class MapInWorld:
         """Return what the filter expects, in the world and in the map's unit."""
         T_wc = view.T_wc.copy()
         T_wc[:3, 3] *= self.unit
-        return view._replace(T_wc=self.origin.T_wc @ T_wc, omegas=view.omegas / self.unit)
+        T_wc = self.origin.T_wc @ self._moved @ T_wc
+        return view._replace(T_wc=T_wc, omegas=view.omegas / self.unit)
 
     def points(
         self, points: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The filter's points in the world with their covariances, and with those that are given
         where the map begins."""
-        points, covariances = points * self.unit, covariances * self.unit**2
+        moved = PoseWithCovariance(self._moved)
+        points, covariances = moved.points(points * self.unit, covariances * self.unit**2)
         _, in_map = PoseWithCovariance(self.origin.T_wc).points(points, covariances)
         return *self.origin.points(points, covariances), in_map
 
     def _take(self, report: CameraReport) -> None:
         self.unit_fixed = bool(report.unit_fixed)
-        here = PoseWithCovariance(report.T_wc, report.covariance).scaled(self.unit)
-        self.camera = self.origin.then(here)
+        self._set(PoseWithCovariance(report.T_wc, report.covariance).scaled(self.unit))
         self.log_scale = float(report.log_scale) - self.log_unit
         variance = report.variance
         self.sigma_log_scale = float(np.sqrt(variance)) if variance > 0 else None
+
+    @property
+    def _moved(self) -> Float[np.ndarray, "4 4"]:
+        """By how much a loop moved what is here, from where the map begins."""
+        return self.known.T_wc @ np.linalg.inv(self.told.T_wc)
+
+    def _set(self, here: PoseWithCovariance) -> None:
+        """Take over where the filter has its camera, from where the map begins.
+
+        Of what it did not know when a loop closed, that is left which was not known then.
+        """
+        self.here = here
+        T_now, T_told = here.T_wc, self.told.T_wc
+        A = adjoint(np.linalg.inv(T_now) @ T_told)
+        since = positive(here.covariance - A @ self.told.covariance @ A.T)
+        covariance = since + A @ self.known.covariance @ A.T
+        self.camera = self.origin.then(PoseWithCovariance(self._moved @ T_now, covariance))

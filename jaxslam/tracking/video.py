@@ -109,13 +109,13 @@ def _shown(
             if recording is not None:
                 aside.give(recording.show, frame, history[-1])
                 if len(history) % _MAP_EVERY == 0:
-                    aside.give(recording.show_map, known_points(tracker, history))
+                    aside.give(recording.show_map, known_points(tracker.points(), history))
 
         try:
             yield show
         finally:
             if recording is not None and history:
-                aside.give(recording.show_map, known_points(tracker, history))
+                aside.give(recording.show_map, known_points(tracker.points(), history))
 
 
 def _writer(source: Source, path: Path) -> OverlayWriter:
@@ -131,6 +131,8 @@ def _film(writer: OverlayWriter, frame: Frame, result: Tracked) -> None:
 def _write(
     source: Source, tracker: Tracker, history: list[Tracked], seconds: list[float], out: Path
 ) -> dict[str, Any]:
+    before = history
+    history, points = tracker.after_loops(history)
     times, T_wc = trajectory_of(history)
     write_trajectory(out / "trajectory.txt", times, T_wc)
     scaled = any(result.sigma_log_scale is not None for result in history)
@@ -139,17 +141,28 @@ def _write(
     caveat = TOO_SURE if camera is not None and camera[0] == "estimated" else ""
     write_covariances(out / "covariance.txt", times, covariances, given_scale=scaled, caveat=caveat)
     write_frames(out / "frames.csv", history)
-    summary = summarised(source, tracker, history, seconds)
+    summary = summarised(source, tracker, history, points, seconds)
     write_json(out / "summary.json", summary, allow_nan=False)
     tracker.save(out / "map.npz")
-    _draw_map(known_points(tracker, history), history, reference_in_map(source, history), out)
+    known = known_points(points, history)
+    _draw_map(known, history, before, reference_in_map(source, history), out)
     return summary
 
 
 def _draw_map(
-    known: Points, history: list[Tracked], reference: np.ndarray | None, out: Path
+    known: Points,
+    history: list[Tracked],
+    before: list[Tracked],
+    reference: np.ndarray | None,
+    out: Path,
 ) -> None:
     write_ply(out / "map.ply", known.points, known.covariances, known.numbers, known.maps)
+    ends = {(r.map, r.submap - 1): r.T_wc[:3, 3] for r in reversed(history)}
+    loops = [
+        (r.T_wc[:3, 3], ends[r.map, r.loop])
+        for r in history
+        if r.loop is not None and (r.map, r.loop) in ends
+    ]
     begun = [place for place, result in enumerate(history) if result.starts and result.map]
     plot_map(
         trajectory_of(history).T_wc,
@@ -161,4 +174,6 @@ def _draw_map(
         lost=[result.lost for result in history],
         begun=begun,
         begun_covariances=[history[place].camera.position_covariance for place in begun],
+        loops=loops,
+        before=trajectory_of(before).T_wc[: len(before) if loops else 0],
     )

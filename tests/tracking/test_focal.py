@@ -39,7 +39,9 @@ def video(seed=0, turn=0.15, move=1.0, frames=30, points=60):
             Tracked(index, t[index], PoseWithCovariance(T_wc), sights=dict(enumerate(pixels)))
         )
     nothing = np.zeros((points, 3, 3))
-    return history, Points(np.arange(points), np.zeros(points, int), places, nothing, nothing)
+    return history, Points(
+        np.arange(points), *[np.zeros(points, int)] * 2, places, nothing, nothing
+    )
 
 
 def times(factor):

@@ -155,7 +155,9 @@ def test_the_worst_known_and_longest_unseen_go_first():
     ]
     covariances = sigmas[:, None, None] ** 2 * np.eye(3) / 3
     places = np.tile([0.0, 0.0, 2.0], (6, 1))
-    points = Points(np.arange(6), np.zeros(6, int), places, covariances, covariances)
+    points = Points(
+        np.arange(6), np.zeros(6, int), np.zeros(6, int), places, covariances, covariances
+    )
     assert worst_first(landmarks, points, SETTINGS).tolist() == [4, 2, 3, 1, 5, 0]
 
 
@@ -164,7 +166,9 @@ def test_a_depth_that_is_hardly_known_is_worth_as_little_as_one_that_is_not_know
     landmarks = [landmark(0, unseen=40), landmark(1, unseen=60)]
     covariances = np.array([5.0, np.nan])[:, None, None] ** 2 * np.eye(3) / 3
     places = np.tile([0.0, 0.0, 2.0], (2, 1))
-    points = Points(np.arange(2), np.zeros(2, int), places, covariances, covariances)
+    points = Points(
+        np.arange(2), np.zeros(2, int), np.zeros(2, int), places, covariances, covariances
+    )
     absent = SETTINGS.absent_after + 1
     for one in landmarks:
         one.missed = absent

@@ -6,16 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxslam.tracking import relocalisation
 from jaxslam.tracking.landmarks import Landmark
 from jaxslam.tracking.patches import Patch
-from jaxslam.tracking.relocalisation import (
+from jaxslam.tracking.places.descriptors import (
+    LOOKS,
     candidates,
     describe,
     described_corners,
     note_looks,
-    pose_of,
 )
+from jaxslam.tracking.places.relocalisation import FEWEST, pose_of
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
@@ -141,7 +141,8 @@ def test_a_pose_is_found_among_wrong_matches_and_none_among_wrong_ones_alone():
     pixels[:20] = rng.uniform(0, 480, (20, 2))
     found = pose_of(points, pixels, calibration)
     assert found is not None
-    assert np.abs(found - T_wc).max() < 0.03
+    assert np.abs(found[0] - T_wc).max() < 0.03
+    assert set(found[1].tolist()) == set(range(20, 40))
     assert pose_of(points[:20], pixels[:20], calibration) is None
     assert pose_of(points[:5], pixels[:5], calibration) is None
 
@@ -158,13 +159,13 @@ def test_landmarks_are_known_by_their_looks():
     there = describe(image, corners)[1]
     assert there.mean() > 0.7
     assert not describe(image, np.array([[3.0, 3.0]]))[1].any()
-    for _ in range(relocalisation.LOOKS + 2):
-        note_looks(landmarks, image, np.arange(len(corners)) * 2, corners)
-    assert {len(one.looks) for one in landmarks.values()} == {0, relocalisation.LOOKS}
+    for _ in range(LOOKS + 2):
+        note_looks(landmarks.values(), image)
+    assert {len(one.looks) for one in landmarks.values()} == {0, LOOKS}
     slots, pixels = candidates(landmarks, described_corners(np.roll(image, (5, 12), axis=(0, 1))))
     moved = pixels - corners[slots // 2] - [12, 5]
     assert np.mean(np.linalg.norm(moved, axis=1) < 2) > 0.8
     assert len(slots) > 0.5 * there.sum()
     noise = np.random.default_rng(1).integers(0, 255, image.shape, dtype=np.uint8)
-    assert len(candidates(landmarks, described_corners(noise))[0]) < relocalisation.FEWEST
+    assert len(candidates(landmarks, described_corners(noise))[0]) < FEWEST
     assert len(candidates(landmarks, described_corners(np.zeros_like(image)))[0]) == 0

@@ -194,7 +194,10 @@ def test_frames_csv_says_what_became_of_every_frame(tracked):
     out, _, summary = tracked
     rows = frames_of(out)
     columns = "frame,time,state,map,matches,nis,nis_dof,sigma_position,sigma_orientation"
-    assert ",".join(rows[0]) == columns + ",sigma_log_scale,log_scale,unit_fixed,reason,relocalised"
+    assert (
+        ",".join(rows[0])
+        == columns + ",sigma_log_scale,log_scale,unit_fixed,reason,relocalised,submap,loop"
+    )
     assert [row["state"] for row in rows] == ["start"] + ["tracked"] * (FRAMES - 1)
     assert {row["reason"] for row in rows} == {""}
     assert {row["relocalised"] for row in rows} == {"0"}

@@ -243,7 +243,9 @@ def test_the_unit_is_told_by_landmarks_that_were_found_again_until_it_is_fixed()
     """Landmark 8 was seen once: its depth is what the prior says, and says nothing."""
     place = MapInWorld(log_unit=0.3, unit_fixed=False, near={7: 1.0, 8: 1.0})
     for fixed, units in ((False, 1), (True, 2), (True, 2)):
-        report = CameraReport(np.eye(4), np.zeros((6, 6)), *np.array([1.0, 0.0]), np.array(fixed))
+        report = CameraReport(
+            np.eye(4), np.zeros((6, 6)), *np.array([1.0, 0.0]), *np.array([fixed, False])
+        )
         place.follow(report, {7: 2.0, 8: 50.0}, [7])
         assert place.log_unit == pytest.approx(0.3 + units * np.log(2.0), rel=1e-12)
         assert place.unit_fixed is fixed

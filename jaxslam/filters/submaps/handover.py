@@ -204,15 +204,16 @@ class Submaps(AbstractWrapper):
 
 def with_submaps(slam: AbstractFilter, spare: int = SPARE, history: int = 1) -> Submaps:
     """The filter with submaps: all that is around its `EkfSlam` stays. Raises ValueError."""
-    return Submaps(_in_submaps(slam), spare, history)
+    return Submaps(in_submaps(slam), spare, history)
 
 
-def _in_submaps(slam: AbstractFilter) -> AbstractStaged:
+def in_submaps(slam: AbstractFilter) -> AbstractStaged:
+    """The same filter in `SUBMAP` coordinates. Raises ValueError for one that is not in stages."""
     if isinstance(slam, EkfSlam):
         return replace(slam, coordinates=SUBMAP)
     if not isinstance(slam, AbstractWrapper):
         raise ValueError(f"{type(slam).__name__} has no submaps: it is not in stages")
-    return replace(slam, base=_in_submaps(slam.base))
+    return replace(slam, base=in_submaps(slam.base))
 
 
 def _of_base(state: SubmapsState, features: Features) -> Features:

@@ -1,0 +1,136 @@
+"""The end of a loop: a picture shows landmarks of an earlier submap.
+
+Descriptors say which corners may be which landmarks, a pose with RANSAC which can be, all at once,
+and their patches, searched for from there, where they are to a part of a pixel. A loop is believed
+where the chain of submaps, with its covariance, says that it can be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from scipy.stats import chi2
+
+from jaxslam.io.calibration import Calibration
+from jaxslam.tracking.map import Map
+from jaxslam.tracking.observations import Prediction
+from jaxslam.tracking.places.descriptors import candidates, described_corners
+from jaxslam.tracking.places.relocalisation import (
+    FEWEST,
+    MOST_OF,
+    SURE,
+    pose_of,
+)
+from jaxslam.tracking.places.submaps import Submap, loop_of
+from jaxslam.tracking.pointcloud import seen_from
+from jaxslam.tracking.search import search
+
+TRIED = 3
+"""Submaps, those of the most candidates."""
+WITHIN = 3.0
+"""σ of the place of a landmark seen from the pose that its descriptors tell, pixels."""
+PIXEL = 1.0
+"""σ of a landmark where its patch is found, pixels: it is seen from elsewhere, or later."""
+GATE = 0.999
+"""Quantile of a loop's NIS beyond which it is not believed."""
+
+
+class Closed(NamedTuple):
+    """A place that was known again."""
+
+    submap: int
+    """The number of the submap that it is of."""
+    nis: float
+    """Of where it is, with six degrees of freedom."""
+
+    @property
+    def believed(self) -> bool:
+        """Whether it can be there."""
+        return self.nis < chi2.ppf(GATE, 6)
+
+
+def close_loop(
+    image: UInt8[np.ndarray, "h w"], map: Map, calibration: Calibration
+) -> Closed | None:
+    """Return which earlier submap the picture at the end of the latest one shows: if that is
+    believed, the `map` has learnt of it."""
+    *earlier, latest = map.submaps
+    corners = described_corners(image)
+    kept = map.charted.keys() - set(latest.numbers.tolist())
+    slots, pixels = candidates({number: map.charted[number] for number in kept}, corners)
+    by_number = dict(zip(slots.tolist(), pixels, strict=True))
+    shown = [sum(n in by_number for n in one.numbers.tolist()) for one in earlier]
+    for p in np.argsort(shown)[::-1][:TRIED].tolist():
+        if shown[p] < FEWEST:
+            return None
+        found = _seen_in(image, earlier[p], by_number, map, calibration)
+        if found is None:
+            continue
+        which = p, len(earlier)
+        loop = loop_of(map.estimator.slam, map.submaps, which, *found, PIXEL, map.settings.wanted)
+        compared = map.graph().with_loop(loop)
+        closed = Closed(p, float(compared.nis))
+        if closed.believed:
+            map.learn(loop, compared)
+        return closed
+    return None
+
+
+def _seen_in(
+    image: UInt8[np.ndarray, "h w"],
+    submap: Submap,
+    by_number: Mapping[int, Float[np.ndarray, " 2"]],
+    map: Map,
+    calibration: Calibration,
+) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "4 4"]] | None:
+    """The slots of the landmarks of a submap in a picture, and where its camera is from the last of
+    the submap."""
+    with np.errstate(invalid="ignore"):  # at infinity
+        sigma = np.sqrt(np.trace(submap.covariances, axis1=1, axis2=2))
+        sure = sigma < SURE * np.linalg.norm(submap.points, axis=1)
+    sure &= submap.frozen.carried
+    numbers = submap.numbers.tolist()
+    known = [slot for slot, n in enumerate(numbers) if sure[slot] and n in by_number]
+    at = np.array([by_number[numbers[slot]] for slot in known]).reshape(-1, 2)
+    posed = pose_of(submap.points[known], at, calibration)
+    if posed is None:
+        return None
+    landmarks = {s: map.charted[numbers[s]] for s in np.flatnonzero(sure).tolist()}
+    seen, matches = search(
+        image,
+        landmarks,
+        _expected(submap, posed[0], sure, map.place.unit, calibration),
+        calibration,
+        map.settings,
+        several=False,
+    )
+    if len(matches.owner) < max(FEWEST, MOST_OF * len(seen.slots)):
+        return None
+    slots = seen.slots[matches.owner]
+    posed = pose_of(submap.points[slots], matches.pixels, calibration)
+    return None if posed is None else (slots[posed[1]], posed[0])
+
+
+def _expected(
+    submap: Submap,
+    T: Float[np.ndarray, "4 4"],
+    sure: Bool[np.ndarray, " slots"],
+    unit: float,
+    calibration: Calibration,
+) -> Prediction:
+    """What a camera at T from the last one of a submap sees of its landmarks."""
+    pixels, spread = seen_from(T, submap.points, submap.covariances, calibration)
+    in_unit = T.copy()
+    in_unit[:3, 3] *= unit
+    X = (submap.points - T[:3, 3]) @ T[:3, :3] * unit
+    return Prediction(
+        pixels,
+        spread + WITHIN**2 * np.eye(2),
+        sure & np.isfinite(pixels[:, 0]),
+        submap.camera.T_wc @ in_unit,
+        X,
+        np.ones(len(X)),
+    )

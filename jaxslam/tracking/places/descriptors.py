@@ -1,0 +1,70 @@
+"""What landmarks and corners look like: OpenCV's ORB descriptors (Rublee et al., ICCV 2011)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from jaxslam.tracking.landmarks import Landmark
+
+CORNERS = 600
+"""Of a picture, which are compared."""
+RATIO = 0.85
+"""The distance of the likest descriptor by that of the next, at the most."""
+LOOKS = 3
+"""Descriptors of a landmark that are kept, of different frames."""
+
+Corners = tuple[Float[np.ndarray, "n 2"], UInt8[np.ndarray, "n 32"]]
+"""Of a picture: pixels and descriptors."""
+
+
+def describe(
+    image: UInt8[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"]
+) -> tuple[UInt8[np.ndarray, "n 32"], Bool[np.ndarray, " n"]]:
+    """Return upright ORB descriptors of these pixels, and which have one: not those at the edge."""
+    places = enumerate(pixels.astype(float).tolist())
+    keys = [cv2.KeyPoint(u, v, 31.0, 0.0, 1.0, 0, i) for i, (u, v) in places]
+    kept, found = cv2.ORB.create().compute(image, keys)
+    descriptors, there = np.zeros((len(pixels), 32), np.uint8), np.zeros(len(pixels), bool)
+    if found is not None:
+        which = [key.class_id for key in kept]
+        descriptors[which], there[which] = found, True
+    return descriptors, there
+
+
+def note_looks(landmarks: Iterable[Landmark], image: UInt8[np.ndarray, "h w"]) -> None:
+    """Note what landmarks look like in the latest picture, those that it shows."""
+    shown = [one for one in landmarks if not one.unseen]
+    pixels = np.array([one.seen_at for one in shown]).reshape(-1, 2)
+    for one, descriptor, there in zip(shown, *describe(image, pixels), strict=True):
+        if there:
+            one.looks = np.concatenate([one.looks, descriptor[None]])[-LOOKS:]
+
+
+def described_corners(image: UInt8[np.ndarray, "h w"]) -> Corners:
+    """Return the corners of a picture, (n, 2), and their descriptors."""
+    found = cv2.goodFeaturesToTrack(image, CORNERS, 0.01, 7)
+    corners = np.zeros((0, 2)) if found is None else found[:, 0].astype(float)
+    descriptors, there = describe(image, corners)
+    return corners[there], descriptors[there]
+
+
+def candidates(
+    landmarks: Mapping[int, Landmark], corners: Corners
+) -> tuple[np.ndarray, Float[np.ndarray, "m 2"]]:
+    """Return the keys of landmarks that look like corners of a picture, and these corners."""
+    owner = np.repeat(list(landmarks), [len(one.looks) for one in landmarks.values()])
+    pixels, descriptors = corners
+    if len(owner) == 0 or len(pixels) < 2:
+        return np.zeros(0, int), np.zeros((0, 2))
+    looks = np.concatenate([one.looks for one in landmarks.values()])
+    two = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(looks, descriptors, 2)
+    best: dict[int, tuple[float, int]] = {}
+    for first, second in (pair for pair in two if len(pair) == 2):
+        slot = int(owner[first.queryIdx])
+        if first.distance < RATIO * second.distance:
+            best[slot] = min(best.get(slot, (np.inf, 0)), (first.distance, first.trainIdx))
+    return np.array(list(best), int), pixels[[corner for _, corner in best.values()]]

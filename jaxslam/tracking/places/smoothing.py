@@ -1,0 +1,141 @@
+"""What loops say of the frames before them: every camera and landmark, when all is known.
+
+Between two hand-overs a camera keeps its place from the first one, but for what the loops, and all
+that was seen later, say of the second: as much of that as of the way is behind it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from jaxslam.tracking.landmarks import Points
+from jaxslam.tracking.map import Map, Remembered
+from jaxslam.tracking.places.submaps import Graph, Solved
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, adjoint
+from jaxslam.tracking.report import Tracked
+
+
+def after_loops(map: Map, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
+    """Return the frames and landmarks as they are known now, after all loops; those of maps without
+    a loop as they are."""
+    frames, points = list(history), map.points()
+    for one in (map.now(), *map.known()):
+        if one.loops:
+            graph = one.graph(map.settings, map.estimator.slam)
+            parts = _parts(one, graph, graph.solved())
+            frames, points = _moved(parts, frames), _seen_from(parts, points)
+    return frames, points
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A submap of a map, in the world and in the map's unit, when all is known."""
+
+    map: int
+    number: int
+    reported: np.ndarray
+    """T of the camera with which it began, as it was reported …"""
+    begins: PoseWithCovariance
+    """… and as it is known now."""
+    way: PoseWithCovariance
+    """Its last camera from there, as the filter had it."""
+    ends: PoseWithCovariance
+    """Its last camera as it is known now."""
+    numbers: np.ndarray
+    """Of its landmarks, (slots,)."""
+    points: np.ndarray
+    """These from its last camera, as they are known now, (slots, 3)."""
+    covariances: np.ndarray
+    """Given where that is."""
+
+    def at(self, T_wc: np.ndarray, share: float) -> PoseWithCovariance:
+        """Return where a camera is, reported at T, with this share of the way behind it."""
+        T_here = np.linalg.inv(self.reported) @ T_wc
+        bent = np.linalg.inv(self.begins.T_wc) @ self.ends.T_wc @ np.linalg.inv(self.way.T_wc)
+        T = self.begins.T_wc @ _part_of(bent, share) @ T_here
+        first, last = (
+            _carried(end.covariance, np.linalg.inv(T) @ end.T_wc)
+            for end in (self.begins, self.ends)
+        )
+        between = share * (1 - share) * self.way.covariance
+        return PoseWithCovariance(T, (1 - share) * first + share * last + between)
+
+
+def _carried(P: Float[np.ndarray, "6 6"], T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
+    """Return the covariance of a camera from which the one of this covariance is at T."""
+    A = adjoint(T)
+    return A @ P @ A.T
+
+
+def _part_of(T: Float[np.ndarray, "4 4"], share: float) -> Float[np.ndarray, "4 4"]:
+    part = np.eye(4)
+    turn = Rotation.from_matrix(T[:3, :3]).as_rotvec()
+    part[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix()
+    part[:3, 3] = share * T[:3, 3]
+    return part
+
+
+def _parts(one: Remembered, graph: Graph, solved: Solved) -> list[_Part]:
+    """All submaps of a map, the present one last."""
+    place, unit = one.place, one.place.unit
+    submaps = [*graph.submaps, graph.present]
+    ways = [submap.way.scaled(unit) for submap in submaps]
+    # A start that was found out is told from its last camera on.
+    T_first = np.linalg.inv(place.origin.T_wc) @ submaps[0].camera.T_wc
+    ways[0] = replace(ways[0], T_wc=T_first)
+    known = [
+        place.origin.then(PoseWithCovariance(T, P).scaled(unit))
+        for T, P in zip(solved.T_bc, solved.covariances, strict=True)
+    ]
+    begins = [place.origin, *known[:-1]]
+    reported = [place.origin.T_wc, *(submap.camera.T_wc for submap in one.submaps)]
+    return [
+        _Part(
+            one.number,
+            i,
+            reported[i],
+            begins[i],
+            ways[i],
+            known[i],
+            submap.numbers,
+            unit * solved.points[i],
+            unit**2 * submap.covariances,
+        )
+        for i, submap in enumerate(submaps)
+    ]
+
+
+def _moved(parts: list[_Part], frames: list[Tracked]) -> list[Tracked]:
+    """The frames with the cameras of these submaps as they are known now."""
+    moved = list(frames)
+    where = np.array([(frame.map, frame.submap) for frame in frames])
+    for part in parts:
+        own = np.flatnonzero((where == (part.map, part.number)).all(axis=1))
+        later = np.flatnonzero((where == (part.map, part.number + 1)).all(axis=1))
+        if len(own):
+            last = later[0] if len(later) else own[-1]
+            shares = (own - own[0]) / max(last - own[0], 1)
+            for i, share in zip(own.tolist(), shares.tolist(), strict=True):
+                moved[i] = replace(frames[i], camera=part.at(frames[i].T_wc, share))
+    return moved
+
+
+def _seen_from(parts: list[_Part], points: Points) -> Points:
+    """The landmarks as the last of these submaps has them that has them. One that no submap has at
+    its end is moved with the camera of the submap in which it was given up."""
+    X, P, in_map = points.points.copy(), points.covariances.copy(), points.in_map.copy()
+    for part in parts:
+        own = np.flatnonzero((points.maps == part.map) & (points.submaps == part.number))
+        moved = PoseWithCovariance(part.begins.T_wc @ np.linalg.inv(part.reported))
+        in_map[own] = moved.points(X[own], in_map[own])[1]
+        X[own], P[own] = moved.points(X[own], P[own])
+    for part in parts:
+        _, here, there = np.intersect1d(points.numbers, part.numbers, return_indices=True)
+        X[here], P[here] = part.ends.points(part.points[there], part.covariances[there])
+        in_map[here] = P[here]
+    return points._replace(points=X, covariances=P, in_map=in_map)

@@ -1,0 +1,298 @@
+"""The submaps of a map as the tracker keeps them: what ends is frozen, and a loop corrects all.
+
+A filter in `SUBMAP` coordinates hands over when the camera has left the scene in which its submap
+began (`jaxslam.filters.submaps`). A landmark that is given up before the next hand-over is one that
+the next submap says nothing of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from jaxslam._numerics.arrays import AnyArray
+from jaxslam._runtime.programs import Program
+from jaxslam.filters.ekf import EkfSlam, each_gaussian, ekf_inside, rebased
+from jaxslam.filters.forms.state import State
+from jaxslam.filters.model import COMPOSED, CameraInMap
+from jaxslam.filters.protocol import AbstractStaged, Belief, LandmarkView
+from jaxslam.filters.submaps.chain import Chain, base_poses, chained
+from jaxslam.filters.submaps.closing import Posterior, posterior
+from jaxslam.filters.submaps.handover import PARALLAX, TURN, Frozen
+from jaxslam.geometry import difference, retract
+from jaxslam.models.coordinates import SUBMAP, KeyframePose, keyframe_due
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
+
+LEAST = 8
+"""Submaps, and loops, for which a program is compiled: twice as many where there are more."""
+
+
+@dataclass(frozen=True)
+class Submap:
+    """A submap that ended."""
+
+    frozen: Frozen
+    """Landmarks, and the covariance of all, in the filter's unit; their numbers are the map's."""
+    points: Float[np.ndarray, "slots 3"]
+    """The landmarks in its last camera …"""
+    covariances: Float[np.ndarray, "slots 3 3"]
+    """… given where that is."""
+    camera: PoseWithCovariance
+    """Its last camera in the world, as it was reported."""
+
+    @property
+    def numbers(self) -> Int[np.ndarray, " slots"]:
+        """Of the landmarks in the slots; −1 where none is."""
+        return np.asarray(self.frozen.numbers)
+
+    @property
+    def way(self) -> PoseWithCovariance:
+        """Its last camera from the one in which it began."""
+        core = self.frozen.state.core
+        T_KC, own = core.pose.keyframe_from_camera, core.part("pose")
+        P = self.frozen.state.covariance[own, own][6:, 6:]
+        return PoseWithCovariance(np.asarray(T_KC.as_matrix()), np.asarray(P))
+
+
+class LoopClosure(eqx.Module):
+    """The camera at the end of a submap q, as it is found from landmarks of an earlier one, p.
+
+    With h the pixels, T that of q in p by these and X the landmarks, `A = ∂h/∂T`, `B = ∂h/∂X`, a
+    pixel's noise leaves of them `R (T_PQ ⊟ T) + Qᵀ B (X − X̄) ~ N(0, σ²)`, with `A = Q R`.
+    """
+
+    submaps: Int[AnyArray, "*L 2"]
+    """p and q."""
+    slots: Int[AnyArray, "*L m"]
+    """The landmarks of p …"""
+    landmarks: Float[AnyArray, "*L m d"]
+    """… as they were then, X̄."""
+    T: Float[AnyArray, "*L 4 4"]
+    by_pose: Float[AnyArray, "*L 6 6"]
+    """R/σ."""
+    by_landmarks: Float[AnyArray, "*L 6 m d"]
+    """Qᵀ B/σ; zero of a place that stands for no landmark."""
+
+
+class Compared(NamedTuple):
+    """A loop compared with what is known without it."""
+
+    nis: np.ndarray
+    """Of six degrees of freedom."""
+    T_bc: Float[np.ndarray, "4 4"]
+    """The present camera, given the loop to first order, from where the map begins …"""
+    covariance: Float[np.ndarray, "6 6"]
+    """… in the filter's unit."""
+
+
+class Solved(NamedTuple):
+    """The cameras at the ends of submaps, and the present one behind them, given all loops."""
+
+    T_bc: Float[np.ndarray, "n 4 4"]
+    """From where the map begins, in the filter's unit."""
+    covariances: Float[np.ndarray, "n 6 6"]
+    points: Float[np.ndarray, "n slots 3"]
+    """Landmarks in these cameras."""
+
+
+def handed_over(
+    slam: AbstractStaged, state: Belief, numbers: np.ndarray, camera: PoseWithCovariance
+) -> tuple[Submap, Belief]:
+    """The submap that ends at this camera in the world, and the state of the next one; `numbers`
+    are those of the landmarks in the slots, −1 for none."""
+    (frozen, *landmarks), state = _handed_over(slam, state, jnp.asarray(numbers))
+    return Submap(frozen, *jax.device_get(landmarks), camera), state
+
+
+def shapes(slam: AbstractStaged, state: Belief, capacity: int) -> PyTree:
+    """Of the arrays of a submap that ended: `frozen`, `points` and `covariances`."""
+    return jax.eval_shape(_handed_over.function, slam, state, jnp.zeros(capacity, int))[0]
+
+
+def left(slam: AbstractStaged, state: Belief) -> Bool[Array, ""]:
+    """Whether the camera has left the scene in which its submap began; never without submaps."""
+    inner = slam.unwrapped
+    if not isinstance(inner, EkfSlam) or inner.coordinates is not SUBMAP:
+        return jnp.zeros((), bool)
+    _, one = slam.gaussian(state, None)
+    assert isinstance(one.core.pose, KeyframePose)
+    T_KC = one.core.pose.keyframe_from_camera
+    return keyframe_due(T_KC, inner.model.inverse_distances(one), TURN, PARALLAX)
+
+
+def loop_of(
+    slam: AbstractStaged,
+    submaps: Sequence[Submap],
+    which: tuple[int, int],
+    slots: Int[np.ndarray, " k"],
+    T: Float[np.ndarray, "4 4"],
+    sigma: float,
+    most: int,
+) -> LoopClosure:
+    """The loop that k landmarks of submap p close, `most` of them at the most, seen from a camera
+    at T from p's last one: that is the last one of submap q. σ of a pixel."""
+    p, q = which
+    k = min(len(slots), most)
+    padded = np.pad(slots[:k], (0, most - k))
+    X, there = submaps[p].frozen.state.landmarks[padded], np.arange(most) < k
+    calibration = submaps[q].frozen.state.core.calibration
+    by = _slopes(ekf_inside(slam, "loops are"), X, there, calibration, T, np.asarray(sigma))
+    return LoopClosure(np.array(which), padded, X, T, *by)
+
+
+@dataclass(frozen=True)
+class Graph:
+    """The submaps of a map, and the loops that join them."""
+
+    slam: AbstractStaged
+    submaps: Sequence[Submap]
+    present: Submap
+    """The one that goes on, as it would be if it ended now."""
+    loops: Sequence[LoopClosure]
+    most: int
+    """Landmarks of a loop."""
+
+    def with_loop(self, new: LoopClosure) -> Compared:
+        """A loop compared with all that is known, and what it says of the present camera."""
+        (chain, loops), more = self._padded()
+        new = replace(new, submaps=new.submaps + more)
+        return Compared(*jax.device_get(_compared(_given(chain, loops), new)))
+
+    def solved(self) -> Solved:
+        """All cameras."""
+        (chain, loops), more = self._padded()
+        known = _solved(_given(chain, loops))
+        return Solved(*(np.asarray(part)[more:] for part in known))
+
+    def _padded(self) -> tuple[tuple[Chain, LoopClosure], int]:
+        """The chain of all submaps, with some in front that are none, and the loops in it, with
+        some behind them that say nothing; and how many are in front. Sizes are few, since each has
+        programs of its own."""
+        ended, last = [one.frozen for one in self.submaps], self.present.frozen
+        # A landmark goes on that is still there when the next submap ends.
+        later = [one.numbers for one in (*ended, last)[1:]]
+        ended = [
+            replace(one, carried=jnp.asarray(one.carried & (one.numbers == after)))
+            for one, after in zip(ended, later, strict=True)
+        ]
+        more = _size(len(ended)) - len(ended)
+        there = jnp.arange(more + len(ended) + 1) >= more
+        frozen = _stacked([*[last] * more, *ended, last])
+        nothing = no_loop(self.most, last.state.landmarks.shape[1], len(there) - 1)
+        loops = [replace(one, submaps=one.submaps + more) for one in self.loops]
+        loops += [nothing] * (_size(len(loops)) - len(loops))
+        return (
+            _chained(ekf_inside(self.slam, "submaps are"), frozen, there),
+            _stacked(loops),
+        ), more
+
+
+def _size(count: int) -> int:
+    """As many as there are, or more: a power of two."""
+    return max(LEAST, 1 << max(count - 1, 0).bit_length())
+
+
+def _stacked(trees: Sequence[PyTree]) -> PyTree:
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *trees)
+
+
+def no_loop(most: int, d: int, submap: int = 0) -> LoopClosure:
+    """A loop that says nothing, of landmarks of d numbers each."""
+    of_landmarks = np.zeros((most, d)), np.eye(4), np.zeros((6, 6)), np.zeros((6, most, d))
+    return LoopClosure(np.full(2, submap), np.zeros(most, int), *of_landmarks)
+
+
+def _row(tree: PyTree, k: int | Array) -> PyTree:
+    return jax.tree.map(lambda x: x[k], tree)
+
+
+@Program
+def _handed_over(
+    slam: AbstractStaged, state: Belief, numbers: Array
+) -> tuple[tuple[Frozen, Array, Array], Belief]:
+    ekf = ekf_inside(slam, "submaps are")
+    _, one = slam.gaussian(state, None)
+
+    def point(view: LandmarkView) -> Array:
+        assert view.log_scale is None or view.log_scale.ndim == 1
+        metres = 0.0 if view.log_scale is None else jnp.sum(view.log_scale)
+        return jnp.exp(-metres) * view.point / view.omega
+
+    there = one.active & (numbers >= 0)
+    points = slam.landmark_marginal(state, point, jnp.arange(numbers.size))
+    return (Frozen(one, there, numbers), *points), each_gaussian(state, lambda x: rebased(ekf, x))
+
+
+@Program
+def _chained(ekf: EkfSlam, frozen: Frozen, there: Bool[Array, " N"]) -> Chain:
+    return chained(ekf, frozen, there)
+
+
+@Program
+def _slopes(
+    ekf: EkfSlam, X: Array, there: Array, calibration: Array, T: Array, sigma: Array
+) -> tuple[Float[Array, "6 6"], Float[Array, "6 m d"]]:
+    """R/σ and Qᵀ B/σ of a loop."""
+    T_PQ = jaxlie.SE3.from_matrix(T)
+
+    def pixels(delta: Array, X: Array) -> Array:
+        view = CameraInMap(T_PQ @ jaxlie.SE3.exp(delta), calibration)
+        seen = jax.vmap(lambda one: ekf.model.observe(view, one, COMPOSED)[0])(X)
+        return jnp.where(there[:, None], seen, 0.0).ravel() / sigma
+
+    by_pose, by_landmarks = jax.jacfwd(pixels, (0, 1))(jnp.zeros(6), X)
+    Q, R = jnp.linalg.qr(by_pose)
+    return R, jnp.tensordot(Q, by_landmarks, (0, 0))
+
+
+def _error(chain: Chain, loop: LoopClosure, states: State) -> Float[Array, " 6"]:
+    """What a loop says is noise, of variance 1."""
+    poses = base_poses(chain, states)
+    T_BP, T_BQ = (_row(poses, submap) for submap in loop.submaps)
+    moved = difference(T_BP.inverse() @ T_BQ, jaxlie.SE3.from_matrix(loop.T))
+    X = states.landmarks[loop.submaps[0], loop.slots]
+    return loop.by_pose @ moved + jnp.tensordot(loop.by_landmarks, X - loop.landmarks, 2)
+
+
+@Program
+def _given(chain: Chain, loops: LoopClosure) -> Posterior:
+    def errors(states: State) -> Array:
+        return jax.vmap(lambda loop: _error(chain, loop, states))(loops).ravel()
+
+    return posterior(chain, errors, 1.0)
+
+
+@Program
+def _compared(known: Posterior, new: LoopClosure) -> tuple[Array, Array, Array]:
+    def both(states: State) -> PyTree:
+        camera = _row(base_poses(known.chain, states), -1)
+        return camera, _error(known.chain, new, states)
+
+    (T_BC, error), P = known.marginal(both)
+    S = P[6:, 6:] + jnp.eye(6)
+    gain = jnp.linalg.solve(S, P[6:, :6]).T
+    T_BC, left = retract(T_BC, -gain @ error), P[:6, :6] - gain @ P[6:, :6]
+    return error @ jnp.linalg.solve(S, error), T_BC.as_matrix(), left
+
+
+@Program
+def _solved(known: Posterior) -> tuple[Array, Array, Array]:
+    chain = known.chain
+
+    def one(k: Array) -> tuple[Array, Array]:
+        def camera(states: State) -> PyTree:
+            return _row(base_poses(chain, states), k)
+
+        T_BC, P = known.marginal(camera)
+        return T_BC.as_matrix(), P
+
+    X, omega = jax.vmap(jax.vmap(chain.slam.landmark.homogeneous))(known.states.landmarks)
+    return *jax.lax.map(one, jnp.arange(chain.shape[0])), X / omega[..., None]
