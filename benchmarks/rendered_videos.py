@@ -72,7 +72,7 @@ def rendered_source(
 
 def _picture(kind: Kind, bodies: list[Body], modifiers: list[str], seed: int, index: int) -> Image:
     """The picture of a frame, which is exposed about its time, with the noise of a sensor."""
-    time, sky = index / kind.rate, 245.0 if kind.scene in (_on_white, _street) else 110.0
+    time, sky = index / kind.rate, 245.0 if kind.scene in (_on_white, _street, _block) else 110.0
     offsets = np.zeros(1)
     if "blur" in modifiers:
         offsets = SHUTTER / kind.rate * ((np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5)
@@ -179,6 +179,45 @@ def _street(rng: np.random.Generator) -> list[Body]:
     return bodies
 
 
+_SIDE, _CORNER = 9.0, 3.0
+"""Of a block: metres of a straight side, and the radius of the way round its corners."""
+
+
+def _round(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places x, z on the way round a block after metres of way, and the heading there, rad."""
+    arc = _CORNER * np.pi / 2
+    sides, rest = np.divmod(way, _SIDE + arc)
+    turned = np.maximum(rest - _SIDE, 0) / _CORNER
+    ahead = np.minimum(rest, _SIDE) + _CORNER * np.sin(turned)
+    aside = _CORNER * (1 - np.cos(turned))
+    place = np.array([-_SIDE / 2 - _CORNER, -_SIDE / 2]), sides * np.pi / 2
+    start, heading = place
+    side = np.stack([start[0] + aside, start[1] + ahead], -1)
+    c, s = np.cos(heading), np.sin(heading)
+    turn = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)
+    return (turn @ side[..., None])[..., 0], heading + turned
+
+
+def _block(rng: np.random.Generator) -> list[Body]:
+    """A block of houses and those on the other side of the street round it, with things between."""
+    bodies = [Body((0, _FLOOR + 1, 0), (60, 1, 60), Paint(2, 110.0, 35.0, 22.0))]
+    round_way = 4 * (_SIDE + _CORNER * np.pi / 2)
+    for way in np.arange(0.0, round_way, 3.2):
+        (middle,), (heading,) = _round(np.array([way]))
+        aside = np.array([np.cos(heading), -np.sin(heading)])
+        for side, away in ((1, 3.6), (-1, 5.5)):
+            if side > 0 and np.abs(middle).max() - np.abs(middle).min() < _CORNER + 2:
+                continue  # the corner of the block
+            height = rng.uniform(2, 4)
+            x, z = middle + side * aside * (away + rng.uniform(0, 0.8))
+            half = (rng.uniform(0.8, 1.1), height, rng.uniform(1.1, 1.5))
+            bodies.append(Body((x, _FLOOR - height, z), half, _paint(rng, 60.0, 80.0), heading))
+            x, z = middle + side * aside * rng.uniform(1.7, 2.2)
+            thing = rng.uniform(0.15, 0.45, 3)
+            bodies.append(Body((x, _FLOOR - thing[1], z), thing, _paint(rng, 120.0), heading))
+    return bodies
+
+
 def _posed(position: np.ndarray, yaw, pitch=0.0, roll=0.0) -> Poses:
     """Poses at positions (n, 3) of cameras that look to the right by yaw, up by pitch, in rad."""
     angles = np.stack(np.broadcast_arrays(yaw, pitch, roll), -1)
@@ -240,11 +279,22 @@ def _driving(times: np.ndarray, rng: np.random.Generator) -> Poses:
     return _posed(np.stack([place[:, 0], y, place[:, 1]], 1), heading, pitch, roll)
 
 
+def _walking(times: np.ndarray, rng: np.random.Generator) -> Poses:
+    """1.5 m/s round a block, looking ahead."""
+    sway = _sway(times, rng, 0.03, 0.02, 0.02, 0.01)
+    x, y, pitch, roll = sway
+    place, heading = _round(1.5 * times + 2.0)
+    aside = np.stack([np.cos(heading), -np.sin(heading)], -1) * x[..., None]
+    place = place + aside
+    return _posed(np.stack([place[:, 0], y, place[:, 1]], 1), heading, pitch, roll)
+
+
 KINDS = {
     "boxes": Kind(150, 30, _room, _swaying, "a hand sways in a room of things"),
     "orbit": Kind(200, 10, _on_white, _orbiting, "once round an object on white"),
     "turn": Kind(150, 30, _room, _turning, "a walk with a turn of 60°/s"),
     "spin": Kind(600, 10, _room, _spinning, "turning on the spot at 30°/s for 60 s"),
     "look-around": Kind(500, 20, _room, _looking, "a slow walk that looks round, ±75°"),
+    "block": Kind(480, 10, _block, _walking, "a walk round a block, and on for a third of it"),
     "street": Kind(140, 10, _street, _driving, "a car at 10 m/s with a bend of 90°"),
 }

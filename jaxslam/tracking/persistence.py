@@ -165,17 +165,18 @@ def _remembered(
     for k, name in enumerate(_POSES):
         pose = PoseWithCovariance(own[f"poses/{2 * k}"], own[f"poses/{2 * k + 1}"])
         setattr(place, name, pose)
-    submaps, loops = (), ()
+    submaps, loops = [], []
     if told["submaps"]:
         pose = np.zeros((4, 4)), np.zeros((6, 6))
         ended = *shapes(slam, like, kept.settings.capacity), *pose
-        parts = [jax.device_get(grown(ended, own, f"submap {k}")) for k in range(told["submaps"])]
-        submaps = tuple(Submap(*of[:3], PoseWithCovariance(*of[3:])) for of in parts)
-        d = submaps[0].frozen.state.landmarks.shape[1]
-        loop = no_loop(kept.settings.wanted, d)
-        loops = tuple(jax.device_get(grown(loop, own, f"loop {k}")) for k in range(told["loops"]))
+        for k in range(told["submaps"]):
+            frozen, *rest = grown(ended, own, f"submap {k}")
+            points, covariances, *pose = map(np.asarray, rest)
+            submaps.append(Submap(frozen, points, covariances, PoseWithCovariance(*pose)))
+        nothing = no_loop(kept.settings.wanted, submaps[0].frozen.state.landmarks.shape[1])
+        loops += [grown(nothing, own, f"loop {k}") for k in range(told["loops"])]
     state = grown(like, own, "state")
-    return Remembered(told["number"], state, unstacked(own), place, submaps, loops)
+    return Remembered(told["number"], state, unstacked(own), place, tuple(submaps), tuple(loops))
 
 
 def write_record(

@@ -28,6 +28,9 @@ from jaxslam.tracking.places.submaps import Submap, loop_of
 from jaxslam.tracking.pointcloud import seen_from
 from jaxslam.tracking.search import search
 
+APART = 3
+"""Submaps from the end of one loop to that of the next, at the least: what a loop costs grows with
+their number."""
 TRIED = 3
 """Submaps, those of the most candidates."""
 WITHIN = 3.0
@@ -49,7 +52,7 @@ class Closed(NamedTuple):
     @property
     def believed(self) -> bool:
         """Whether it can be there."""
-        return self.nis < chi2.ppf(GATE, 6)
+        return bool(self.nis < chi2.ppf(GATE, 6))
 
 
 def close_loop(
@@ -58,6 +61,8 @@ def close_loop(
     """Return which earlier submap the picture at the end of the latest one shows: if that is
     believed, the `map` has learnt of it."""
     *earlier, latest = map.submaps
+    if map.loops and len(earlier) - int(map.loops[-1].submaps[1]) < APART:
+        return None
     corners = described_corners(image)
     kept = map.charted.keys() - set(latest.numbers.tolist())
     slots, pixels = candidates({number: map.charted[number] for number in kept}, corners)
@@ -91,7 +96,7 @@ def _seen_in(
     with np.errstate(invalid="ignore"):  # at infinity
         sigma = np.sqrt(np.trace(submap.covariances, axis1=1, axis2=2))
         sure = sigma < SURE * np.linalg.norm(submap.points, axis=1)
-    sure &= submap.frozen.carried
+    sure &= np.asarray(submap.frozen.carried)
     numbers = submap.numbers.tolist()
     known = [slot for slot, n in enumerate(numbers) if sure[slot] and n in by_number]
     at = np.array([by_number[numbers[slot]] for slot in known]).reshape(-1, 2)

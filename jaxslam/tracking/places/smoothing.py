@@ -84,10 +84,7 @@ def _parts(one: Remembered, graph: Graph, solved: Solved) -> list[_Part]:
     """All submaps of a map, the present one last."""
     place, unit = one.place, one.place.unit
     submaps = [*graph.submaps, graph.present]
-    ways = [submap.way.scaled(unit) for submap in submaps]
-    # A start that was found out is told from its last camera on.
-    T_first = np.linalg.inv(place.origin.T_wc) @ submaps[0].camera.T_wc
-    ways[0] = replace(ways[0], T_wc=T_first)
+    told = [PoseWithCovariance(), *(submap.told.scaled(unit) for submap in submaps)]
     known = [
         place.origin.then(PoseWithCovariance(T, P).scaled(unit))
         for T, P in zip(solved.T_bc, solved.covariances, strict=True)
@@ -100,7 +97,7 @@ def _parts(one: Remembered, graph: Graph, solved: Solved) -> list[_Part]:
             i,
             reported[i],
             begins[i],
-            ways[i],
+            replace(told[i + 1], T_wc=np.linalg.inv(told[i].T_wc) @ told[i + 1].T_wc),
             known[i],
             submap.numbers,
             unit * solved.points[i],

@@ -54,12 +54,13 @@ class Submap:
         return np.asarray(self.frozen.numbers)
 
     @property
-    def way(self) -> PoseWithCovariance:
-        """Its last camera from the one in which it began."""
+    def told(self) -> PoseWithCovariance:
+        """Its last camera from where the map begins, as the filter had it, with the covariance that
+        it has from where the submap begins."""
         core = self.frozen.state.core
-        T_KC, own = core.pose.keyframe_from_camera, core.part("pose")
+        T_BC, own = core.pose.camera_pose(), core.part("pose")
         P = self.frozen.state.covariance[own, own][6:, 6:]
-        return PoseWithCovariance(np.asarray(T_KC.as_matrix()), np.asarray(P))
+        return PoseWithCovariance(np.asarray(T_BC.as_matrix()), np.asarray(P))
 
 
 class LoopClosure(eqx.Module):

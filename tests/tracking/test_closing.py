@@ -1,0 +1,185 @@
+"""A camera that is back at the start knows it, and where it has been is corrected by that."""
+
+from dataclasses import replace
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from jaxslam.io.source import Source, Trajectory
+from jaxslam.tracking.places import closing, submaps
+from jaxslam.tracking.places.closing import close_loop
+from jaxslam.tracking.places.submaps import loop_of
+from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.synthetic import add_noise, render, room, synthetic_source
+from jaxslam.tracking.tracker import Tracker
+from jaxslam.tracking.trajectory import absolute_trajectory_error
+
+SETTINGS = TrackerSettings(filter="scale_gauge+oc", wanted=24, spare=2)
+FRAMES = 110
+
+
+def to_and_fro(seed=2):
+    """A camera that slides along the room's wall by 4 m, and back."""
+    like = synthetic_source(frames=FRAMES, seed=seed)
+    T_wc = np.tile(np.eye(4), (FRAMES, 1, 1))
+    T_wc[:, 0, 3] = -2.0 * np.cos(2 * np.pi * np.arange(FRAMES) / (FRAMES - 1))
+    T_wc[:, 2, 3] = -1.5
+    calibration, quads = like.calibration, room(seed, like.calibration.fx)
+
+    def images():
+        for index, pose in enumerate(T_wc):
+            yield add_noise(render(quads, pose, calibration), np.random.default_rng([seed, index]))
+
+    return Source("to and fro", calibration, like.times, images, Trajectory(like.times, T_wc))
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    """A tracker that has been there and back, its frames, and its file before the last ten."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(submaps, "PARALLAX", 0.15)  # several submaps in a short video
+        source, path = to_and_fro(), tmp_path_factory.mktemp("walk") / "map.npz"
+        tracker = Tracker(source.calibration, SETTINGS)
+        frames = list(source)
+        history = [tracker.track(frame) for frame in frames[:-10]]
+        tracker.save(path)
+        history += [tracker.track(frame) for frame in frames[-10:]]
+        yield tracker, history, source, path
+
+
+def error(source, history):
+    T_wc = np.stack([one.T_wc for one in history])
+    return absolute_trajectory_error(source.times, T_wc, source.times, source.reference.T_wc)
+
+
+def test_a_camera_that_returns_closes_loops_which_correct_its_way(walk):
+    tracker, history, source, _ = walk
+    closed = [one for one in history if one.loop is not None]
+    assert len(closed) == len(tracker.map.loops) >= 2
+    assert tracker.refused == 0
+    # Only on the way back, and in places of the way out.
+    x = source.reference.T_wc[:, 0, 3]
+    for one in closed:
+        assert one.index > FRAMES / 2
+        before = [x[old.index] for old in history if old.submap == one.loop + 1]
+        assert abs(x[one.index] - before[0]) < 1.0
+    corrected, points = tracker.after_loops(history)
+    assert error(source, corrected)["rmse"] < 0.8 * error(source, history)["rmse"]
+    assert [one.index for one in corrected] == [one.index for one in history]
+    # No camera jumps where none did, and all covariances are positive.
+    steps, raw = (
+        np.linalg.norm(np.diff([one.T_wc[:3, 3] for one in some], axis=0), axis=1)
+        for some in (corrected, history)
+    )
+    others = [one.loop is None for one in history[1:]]
+    assert np.abs(steps - raw)[others].max() < 0.2 * raw[others].max()
+    assert min(np.linalg.eigvalsh(one.covariance)[0] for one in corrected[1:]) > 0
+    # The end is known better than without, and the landmarks are where they were, nearly.
+    assert corrected[-1].camera.sigma_position < history[closed[0].index - 1].camera.sigma_position
+    raw = tracker.points()
+    assert points.numbers.tolist() == raw.numbers.tolist()
+    near = np.linalg.norm(points.points, axis=1) < 20
+    moved = np.linalg.norm(points.points - raw.points, axis=1)[near]
+    assert 0 < np.median(moved) < 0.1
+
+
+def test_submaps_and_loops_are_saved_and_go_on(walk):
+    tracker, history, source, path = walk
+    again = Tracker.load(path)
+    assert len(again.map.submaps) >= 5
+    assert len(again.map.loops) >= 1
+    last = [again.track(frame) for frame in list(source)[-10:]]
+    assert np.array_equal([one.T_wc for one in last], [one.T_wc for one in history[-10:]])
+    assert np.array_equal(
+        [one.covariance for one in last], [one.covariance for one in history[-10:]]
+    )
+    ours, theirs = (one.after_loops(history)[0] for one in (again, tracker))
+    assert np.array_equal([one.T_wc for one in ours], [one.T_wc for one in theirs])
+
+
+def test_a_loop_that_cannot_be_is_refused(walk):
+    """The same landmarks, as if they had been seen by a camera two metres away."""
+    tracker, *_ = walk
+    loop, graph = tracker.map.loops[0], tracker.map.graph()
+    known = replace(graph, loops=())
+    with jax.enable_x64(True):
+        assert float(known.with_loop(loop).nis) < chi2.ppf(closing.GATE, 6)
+        T = np.array(loop.T)
+        T[0, 3] += 2.0
+        assert float(known.with_loop(replace(loop, T=jnp.asarray(T))).nis) > 1000
+
+
+def test_where_nothing_returns_no_loop_is_looked_for(walk):
+    """A picture of noise shows no earlier submap."""
+    tracker, *_ = walk
+    noise = np.random.default_rng(0).integers(0, 255, (480, 640), dtype=np.uint8)
+    before = tracker.map.loops
+    with jax.enable_x64(True):
+        assert close_loop(noise, tracker.map, tracker.calibration) is None
+    assert tracker.map.loops is before
+
+
+def test_a_loop_weighs_as_the_pixels_do(walk):
+    """`R (T_PQ ⊟ T) + Qᵀ B (X − X̄)`: moved landmarks move the camera as least squares do."""
+    tracker, *_ = walk
+    p, q, calibration = 0, len(tracker.map.submaps) - 1, tracker.calibration
+    ended, rng = tracker.map.submaps[p], np.random.default_rng(1)
+    slots = np.flatnonzero((ended.numbers >= 0) & np.isfinite(ended.points).all(axis=1))[:15]
+    T = np.eye(4)
+    T[:3, 3] = [0.1, -0.05, 0.02]
+    slam, wanted = tracker.map.estimator.slam, SETTINGS.wanted
+    with jax.enable_x64(True):
+        loop = loop_of(slam, tracker.map.submaps, (p, q), slots, T, 0.5, wanted)
+    X = np.asarray(ended.frozen.state.landmarks)[slots]
+    pixels = seen_by(calibration, T, X[:, :3] / X[:, 3:])
+    moved = X.copy()
+    moved[:, :3] += 1e-4 * rng.normal(size=(len(X), 3))
+    turn, shift = (x.copy() for x in camera_of(T))
+    turn, shift = cv2.solvePnPRefineLM(
+        moved[:, :3] / moved[:, 3:], pixels, calibration.matrix, np.zeros(4), turn, shift
+    )
+    T_cw = np.eye(4)
+    T_cw[:3, :3], T_cw[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+    step = np.linalg.inv(T) @ np.linalg.inv(T_cw)
+    expected = np.concatenate([step[:3, 3], Rotation.from_matrix(step[:3, :3]).as_rotvec()])
+    delta = np.zeros((wanted, 4))
+    delta[: len(X)] = moved - X
+    by = np.tensordot(np.asarray(loop.by_landmarks), delta, 2)
+    found = -np.linalg.solve(np.asarray(loop.by_pose), by)
+    assert np.abs(found - expected).max() < 0.02 * np.abs(expected).max()
+    # R is the root of the pose's information, σ of a pixel being .5.
+    J = np.stack(
+        [
+            (seen_by(calibration, T @ small(i, 1e-4), X[:, :3] / X[:, 3:]) - pixels).ravel() / 1e-4
+            for i in range(6)
+        ],
+        axis=1,
+    )
+    R = np.asarray(loop.by_pose)
+    assert np.allclose(R.T @ R, J.T @ J / 0.25, rtol=1e-3, atol=2e-3 * np.abs(J.T @ J).max())
+
+
+def camera_of(T):
+    T_cw = np.linalg.inv(T)
+    return cv2.Rodrigues(T_cw[:3, :3])[0], T_cw[:3, 3:].copy()
+
+
+def seen_by(calibration, T, points):
+    turn, shift = camera_of(T)
+    flat = np.ascontiguousarray(points)
+    return cv2.projectPoints(flat, turn, shift, calibration.matrix, np.zeros(4))[0][:, 0]
+
+
+def small(i, size):
+    """A step along one of the six directions."""
+    T = np.eye(4)
+    if i < 3:
+        T[i, 3] = size
+    else:
+        T[:3, :3] = Rotation.from_rotvec(size * np.eye(3)[i - 3]).as_matrix()
+    return T
