@@ -40,6 +40,9 @@ def better_focal(
         chosen = [history[i] for i in np.unique(np.linspace(first, last, _VIEWS).astype(int))]
         seen = [one for one in chosen if not one.lost and one.map == chosen[-1].map]
         views, places = _shared(seen, points)
+        # A camera that turned away shares nothing with the others.
+        sharing = [i for i, (which, _) in enumerate(views) if len(which)]
+        seen, views = [seen[i] for i in sharing], [views[i] for i in sharing]
         unknown = 6 * len(views) + places.size
         if 2 * sum(len(which) for which, _ in views) > 1.2 * unknown:
             T_wc = np.array([one.T_wc for one in seen])

@@ -67,6 +67,14 @@ def test_where_nothing_tells_nothing_is_said():
     assert better_focal(history[:1], points, times(FACTOR))[1] == 1
 
 
+def test_a_view_that_shares_nothing_is_left_out():
+    history, points = video()
+    history[-1].sights.clear()
+    factor, left = better_focal(history, points, times(FACTOR))
+    assert factor == 1 / FACTOR
+    assert left < CLEAR
+
+
 def test_landmarks_at_infinity_and_outliers_do_no_harm():
     history, points = video()
     points.points[:5] = np.inf

@@ -31,6 +31,8 @@ from jaxslam.geometry import difference, retract
 from jaxslam.models.coordinates import SUBMAP, KeyframePose, keyframe_due
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 
+SUPPOSED = 2
+"""Loops that are as expected, before there is any."""
 LEAST = 8
 """Submaps, and loops, for which a program is compiled: twice as many where there are more."""
 
@@ -81,6 +83,8 @@ class LoopClosure(eqx.Module):
     """R/σ."""
     by_landmarks: Float[AnyArray, "*L 6 m d"]
     """Qᵀ B/σ; zero of a place that stands for no landmark."""
+    nis: Float[AnyArray, "*L"]
+    """Of the loop given those before it, with six degrees of freedom."""
 
 
 class Compared(NamedTuple):
@@ -146,7 +150,7 @@ def loop_of(
     X, there = submaps[p].frozen.state.landmarks[padded], np.arange(most) < k
     calibration = submaps[q].frozen.state.core.calibration
     by = _slopes(ekf_inside(slam, "loops are"), X, there, calibration, T, np.asarray(sigma))
-    return LoopClosure(np.array(which), padded, X, T, *by)
+    return LoopClosure(np.array(which), padded, X, T, *by, np.zeros(()))
 
 
 @dataclass(frozen=True)
@@ -165,13 +169,15 @@ class Graph:
         """A loop compared with all that is known, and what it says of the present camera."""
         (chain, loops), more = self._padded()
         new = replace(new, submaps=new.submaps + more)
-        return Compared(*jax.device_get(_compared(_given(chain, loops), new)))
+        found = Compared(*jax.device_get(_compared(_given(chain, loops), new)))
+        factor = _factor([*(one.nis for one in self.loops), found.nis])
+        return found._replace(covariance=factor * found.covariance)
 
     def solved(self) -> Solved:
         """All cameras."""
         (chain, loops), more = self._padded()
-        known = _solved(_given(chain, loops))
-        return Solved(*(np.asarray(part)[more:] for part in known))
+        T_bc, P, points = (np.asarray(x)[more:] for x in _solved(_given(chain, loops)))
+        return Solved(T_bc, _factor([one.nis for one in self.loops]) * P, points)
 
     def _padded(self) -> tuple[tuple[Chain, LoopClosure], int]:
         """The chain of all submaps, with some in front that are none, and the loops in it, with
@@ -196,6 +202,14 @@ class Graph:
         ), more
 
 
+def _factor(nis: Sequence[AnyArray]) -> float:
+    """By how much more the chain's variances are than the filter says, where its loops tell: the
+    variance of unit weight of a least squares adjustment, which is 1 before, as well known as by
+    `SUPPOSED` loops."""
+    count = len(nis) + SUPPOSED
+    return max(1.0, (float(np.sum(nis)) / 6 + SUPPOSED) / count)
+
+
 def _size(count: int) -> int:
     """As many as there are, or more: a power of two."""
     return max(LEAST, 1 << max(count - 1, 0).bit_length())
@@ -208,7 +222,7 @@ def _stacked(trees: Sequence[PyTree]) -> PyTree:
 def no_loop(most: int, d: int, submap: int = 0) -> LoopClosure:
     """A loop that says nothing, of landmarks of d numbers each."""
     of_landmarks = np.zeros((most, d)), np.eye(4), np.zeros((6, 6)), np.zeros((6, most, d))
-    return LoopClosure(np.full(2, submap), np.zeros(most, int), *of_landmarks)
+    return LoopClosure(np.full(2, submap), np.zeros(most, int), *of_landmarks, np.zeros(()))
 
 
 def _row(tree: PyTree, k: int | Array) -> PyTree:
