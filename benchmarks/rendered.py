@@ -31,7 +31,9 @@ VIDEOS = (*KINDS, "turn+blur+exposure")
 
 COLUMNS = {
     "maps": ".0f",
+    "loops": ".0f",
     "matches_per_frame": ".1f",
+    "before": ".2%",
     "error": ".2%",
     "straight_line": ".2%",
     "sign": ".2f",
@@ -78,10 +80,12 @@ def measure(source) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         summary = track(source, folder, TrackerSettings(), overlay=False)
         poses = beyond_scale(source, Path(folder))
-    numbers = {key: summary[key] for key in ("frames", "tracked", "maps", "matches_per_frame")}
+    numbers = {key: summary[key] for key in ("frames", "tracked", "maps", "loops", "matches_per_frame")}
     ate = summary.get("ate")
     if ate and ate["path_length"]:
         numbers["error"] = ate["rmse"] / ate["path_length"]
+        if summary["loops"]:
+            numbers["before"] = summary["ate_before_loops"]["rmse"] / ate["path_length"]
         numbers["straight_line"] = ate["straight_line"] / ate["path_length"]
         numbers["sign"] = ate["sign"]
         numbers["orientation"] = ate["orientation_rmse"]
@@ -102,7 +106,9 @@ def as_table(results: Results) -> str:
         "frames",
         "lost",
         "maps",
+        "loops",
         "matches a frame",
+        "before loops",
         "error",
         "straight line",
         "sign",

@@ -292,6 +292,7 @@ def _walking(times: np.ndarray, rng: np.random.Generator) -> Poses:
 KINDS = {
     "boxes": Kind(150, 30, _room, _swaying, "a hand sways in a room of things"),
     "orbit": Kind(200, 10, _on_white, _orbiting, "once round an object on white"),
+    "orbit-twice": Kind(400, 10, _on_white, _orbiting, "twice round an object on white"),
     "turn": Kind(150, 30, _room, _turning, "a walk with a turn of 60°/s"),
     "spin": Kind(600, 10, _room, _spinning, "turning on the spot at 30°/s for 60 s"),
     "look-around": Kind(500, 20, _room, _looking, "a slow walk that looks round, ±75°"),

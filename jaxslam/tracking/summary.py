@@ -51,6 +51,7 @@ def summarised(
     points: Points,
     seconds: list[float],
 ) -> Summary:
+    """Of frames and landmarks as they are known after all loops."""
     lost = sum(result.lost for result in history)
     updates = history[1:]
     dof = sum(result.nis_dof for result in updates)
@@ -95,7 +96,7 @@ def summarised(
         summary["target"] = as_summary(tracker.target, tracker.sighting)
     if tracker.restarts:
         summary["log_scale_sigma_between_maps"] = _scale_between_maps(tracker.settings)
-    return summary | _errors(source, history)
+    return summary | trajectory_errors(source, history)
 
 
 def describe(summary: Summary) -> str:
@@ -269,7 +270,7 @@ def _ungated(updates: Sequence[Tracked]) -> Summary:
     }
 
 
-def _errors(source: Source, history: Sequence[Tracked]) -> Summary:
+def trajectory_errors(source: Source, history: Sequence[Tracked]) -> Summary:
     """The trajectory error, where there is a reference, or why it cannot be computed."""
     if source.reference is None:
         return {}

@@ -25,6 +25,7 @@ from jaxslam.tracking.summary import (
     known_points,
     reference_in_map,
     summarised,
+    trajectory_errors,
     trajectory_of,
 )
 from jaxslam.tracking.target import Target
@@ -142,6 +143,8 @@ def _write(
     write_covariances(out / "covariance.txt", times, covariances, given_scale=scaled, caveat=caveat)
     write_frames(out / "frames.csv", history)
     summary = summarised(source, tracker, history, points, seconds)
+    if summary["loops"] and "ate" in summary:
+        summary["ate_before_loops"] = trajectory_errors(source, before).get("ate")
     write_json(out / "summary.json", summary, allow_nan=False)
     tracker.save(out / "map.npz")
     known = known_points(points, history)

@@ -145,6 +145,11 @@ def test_a_pose_is_found_among_wrong_matches_and_none_among_wrong_ones_alone():
     assert set(found[1].tolist()) == set(range(20, 40))
     assert pose_of(points[:20], pixels[:20], calibration) is None
     assert pose_of(points[:5], pixels[:5], calibration) is None
+    # In any unit of length; points that are all one have none.
+    small = pose_of(1e-3 * points, pixels, calibration)
+    assert small is not None
+    assert np.abs(small[0][:3, 3] - 1e-3 * T_wc[:3, 3]).max() < 1e-4
+    assert pose_of(np.tile(points[:1], (20, 1)), pixels[20:], calibration) is None
 
 
 def test_landmarks_are_known_by_their_looks():

@@ -45,16 +45,22 @@ def pose_of(
     if len(points) < FEWEST:
         return None
     K, distortion = calibration.matrix, np.array(calibration.distortion, float)
-    found, turn, shift, inside = cv2.solvePnPRansac(
-        points, pixels, K, distortion, iterationsCount=500, reprojectionError=PIXELS,
-        flags=cv2.SOLVEPNP_SQPNP,
-    )  # fmt: skip
+    # OpenCV refuses, by exception, a sample of points that are one, by an absolute distance.
+    unit = max(float(points.std()), 1e-12) / 10
+    points = points / unit
+    try:
+        found, turn, shift, inside = cv2.solvePnPRansac(
+            points, pixels, K, distortion, iterationsCount=500, reprojectionError=PIXELS,
+            flags=cv2.SOLVEPNP_SQPNP,
+        )  # fmt: skip
+    except cv2.error:
+        return None
     if not found or inside is None or len(inside) < FEWEST:
         return None
     which = inside[:, 0].astype(int)
     turn, shift = cv2.solvePnPRefineLM(points[which], pixels[which], K, distortion, turn, shift)
     T_cw = np.eye(4)
-    T_cw[:3, :3], T_cw[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+    T_cw[:3, :3], T_cw[:3, 3] = cv2.Rodrigues(turn)[0], unit * shift[:, 0]
     return np.linalg.inv(T_cw), which
 
 
