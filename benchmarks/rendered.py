@@ -80,7 +80,9 @@ def measure(source) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         summary = track(source, folder, TrackerSettings(), overlay=False)
         poses = beyond_scale(source, Path(folder))
-    numbers = {key: summary[key] for key in ("frames", "tracked", "maps", "loops", "matches_per_frame")}
+    numbers = {
+        key: summary[key] for key in ("frames", "tracked", "maps", "loops", "matches_per_frame")
+    }
     ate = summary.get("ate")
     if ate and ate["path_length"]:
         numbers["error"] = ate["rmse"] / ate["path_length"]

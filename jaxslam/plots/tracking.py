@@ -95,7 +95,7 @@ def plot_map(
         lines.insert(0, ("reference", true, _REFERENCE, "--"))
     old = np.asarray(before, dtype=float).reshape(-1, 4, 4)[:, :3, 3]
     if len(old):
-        lines.append(("before loops were closed", old, GREY, "-."))
+        lines.insert(0, ("before loops were closed", old, GREY, ":"))
     shown = np.concatenate([line for _, line, _, _ in lines])
     low, high = _view(shown, points)
     inside = np.all((points >= low) & (points <= high), axis=1)

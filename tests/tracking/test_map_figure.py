@@ -143,3 +143,16 @@ def test_titles_labels_and_legend_have_room(drawn, length, width):
     whole = figure.bbox
     assert all(box.y0 >= whole.y0 and box.y1 <= whole.y1 for box in boxes)
     assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+
+
+def test_loops_join_two_places_and_the_path_without_them_lies_below(drawn):
+    before = path_along_x(length=1.2)
+    ends = np.array([[[0.9, 0.0, 0.0], [0.1, 0.0, 0.0]], [[1.0, 0.0, 0.0], [0.2, 0.0, 0.0]]])
+    axis = drawn(path_along_x(), *wall(), loops=ends, before=before)["from above"]
+    assert line(axis, "a loop closed") == pytest.approx(ends[0][:, [2, 0]])
+    assert line(axis, "before loops were closed") == pytest.approx(before[:, [2, 0], 3])
+    labels = [one.get_label() for one in axis.lines]
+    assert labels.index("before loops were closed") < labels.index("estimate")
+    assert "a loop closed" not in [
+        one.get_label() for one in drawn(path_along_x(), *wall())["from above"].lines
+    ]

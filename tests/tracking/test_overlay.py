@@ -3,17 +3,21 @@
 import re
 import threading
 import time
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from jaxslam.plots.tracking import plot_map
+from jaxslam.tracking import overlay
 from jaxslam.tracking.film import WAITING, Aside, OverlayWriter
 from jaxslam.tracking.observations import NOTHING as EMPTY
 from jaxslam.tracking.observations import Observations
 from jaxslam.tracking.overlay import COLOURS, LEAST_RADIUS, draw_overlay, overlay_size
 from jaxslam.tracking.pointcloud import write_ply
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
+from jaxslam.tracking.report import Tracked
 
 GREY = np.full((120, 640), 100, np.uint8)
 NOTHING = np.full((1, 2), np.nan)
@@ -322,3 +326,9 @@ def test_map_is_drawn_with_and_without_landmarks_and_reference(tmp_path):
     assert landmarks(full) > 200
     assert landmarks(bare) == 0
     assert sorted(file.name for file in tmp_path.iterdir()) == ["bare.png", "full.png", "two.png"]
+
+
+def test_a_place_that_is_known_again_is_said_in_the_picture():
+    known = Tracked(3, 0.1, PoseWithCovariance(), loop=4)
+    assert overlay._banner(known) == "PLACE KNOWN AGAIN: SUBMAP 4"
+    assert overlay._banner(replace(known, loop=None)) == ""

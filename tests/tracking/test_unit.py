@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("cv2")
 
 from cases import Around
+from scipy.spatial.transform import Rotation
 
 import jaxslam
 from jaxslam.geometry import scaled
@@ -286,3 +287,40 @@ def test_frames_csv_says_what_the_unit_is_taken_for(wanders, started, tmp_path):
             assert found == [""] * FRAMES
         else:
             np.testing.assert_allclose([float(x) for x in found], log_scales, rtol=1e-5)
+
+
+def test_what_a_loop_says_of_the_camera_is_kept_and_grows_with_what_is_not_known_since():
+    """Frozen errors of odometry, T_bc = E S with S since: what is left is the posterior of E and
+    all of S."""
+    rng = np.random.default_rng(4)
+
+    def pose(size):
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_rotvec(size * rng.normal(size=3)).as_matrix()
+        T[:3, 3] = size * rng.normal(size=3)
+        return T
+
+    unit, (T_then, T_since, T_moved) = 1.3, (pose(s) for s in (1.0, 0.5, 0.05))
+    then, since, known = (np.diag(rng.uniform(a, 2 * a, 6)) for a in (0.1, 0.01, 0.001))
+
+    def report(T, P):
+        return CameraReport(T, P, *np.zeros(2), *np.array([True, False]))
+
+    place = MapInWorld(log_unit=np.log(unit))
+    place.follow(report(T_then, then), {}, [])
+    before = place.camera.T_wc
+    moved = place.correct(T_moved @ T_then, known)
+    there = PoseWithCovariance(T_moved @ T_then, known).scaled(unit)
+    assert place.camera.T_wc == pytest.approx(there.T_wc, abs=1e-12)
+    assert place.camera.covariance == pytest.approx(there.covariance, abs=1e-12)
+    assert moved @ before == pytest.approx(place.camera.T_wc, abs=1e-12)
+    A = adjoint(np.linalg.inv(T_since))
+    place.follow(report(T_then @ T_since, A @ then @ A.T + since), {}, [])
+    expected = PoseWithCovariance(T_moved @ T_then @ T_since, A @ known @ A.T + since).scaled(unit)
+    assert place.camera.T_wc == pytest.approx(expected.T_wc, abs=1e-12)
+    assert place.camera.covariance == pytest.approx(expected.covariance, abs=1e-12)
+    # What the filter expects and its landmarks are moved alike.
+    points, covariances = rng.normal(size=(3, 3)), np.tile(0.01 * np.eye(3), (3, 1, 1))
+    there, spread, _ = place.points(points, covariances)
+    assert there == pytest.approx(unit * points @ moved[:3, :3].T + moved[:3, 3], abs=1e-9)
+    assert np.linalg.eigvalsh(spread) == pytest.approx(np.full((3, 3), 0.01 * unit**2))
