@@ -33,7 +33,7 @@ COLUMNS = {
     "maps": ".0f",
     "loops": ".0f",
     "matches_per_frame": ".1f",
-    "before": ".2%",
+    "causal": ".2%",
     "error": ".2%",
     "straight_line": ".2%",
     "sign": ".2f",
@@ -86,8 +86,7 @@ def measure(source) -> dict[str, Any]:
     ate = summary.get("ate")
     if ate and ate["path_length"]:
         numbers["error"] = ate["rmse"] / ate["path_length"]
-        if summary["loops"]:
-            numbers["before"] = summary["ate_before_loops"]["rmse"] / ate["path_length"]
+        numbers["causal"] = summary["ate_causal"]["rmse"] / ate["path_length"]
         numbers["straight_line"] = ate["straight_line"] / ate["path_length"]
         numbers["sign"] = ate["sign"]
         numbers["orientation"] = ate["orientation_rmse"]
@@ -110,8 +109,8 @@ def as_table(results: Results) -> str:
         "maps",
         "loops",
         "matches a frame",
-        "before loops",
-        "error",
+        "error frame by frame",
+        "error at the end",
         "straight line",
         "sign",
     )

@@ -127,6 +127,8 @@ class Map:
         estimator.state = state
         self.submaps = (*self.submaps, ended)
         self.charted |= {one.number: replace(one) for one in self.landmarks.values()}
+        if len(self.submaps) == 1:
+            self.graph().compile()
 
     def learn(self, loop: LoopClosure, compared: Compared) -> None:
         """Take over what a loop says, that ends at the camera."""

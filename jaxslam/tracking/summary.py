@@ -51,7 +51,7 @@ def summarised(
     points: Points,
     seconds: list[float],
 ) -> Summary:
-    """Of frames and landmarks as they are known after all loops."""
+    """Of frames and landmarks as they are known at the end."""
     lost = sum(result.lost for result in history)
     updates = history[1:]
     dof = sum(result.nis_dof for result in updates)

@@ -25,7 +25,7 @@ from jaxslam.tracking.observations import NOTHING, Lost, Observations
 from jaxslam.tracking.places.closing import close_loop
 from jaxslam.tracking.places.descriptors import note_looks
 from jaxslam.tracking.places.relocalisation import NOTED_EVERY, known_again
-from jaxslam.tracking.places.smoothing import after_loops
+from jaxslam.tracking.places.smoothing import smoothed
 from jaxslam.tracking.policy import LEAST_MATCHES, Policy
 from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
@@ -147,11 +147,11 @@ class Tracker:
         with jax.enable_x64(True):
             return self.map.points()
 
-    def after_loops(self, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
-        """Return the frames so far, and all landmarks, as the loops that closed later have them:
-        the same ones where none did."""
+    def smoothed(self, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
+        """Return the frames so far, and all landmarks, as all that was seen later has them, the
+        loops that closed included (docs/submaps.md)."""
         with jax.enable_x64(True):
-            return after_loops(self.map, history)
+            return smoothed(self.map, history)
 
     def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
         """Return how the calibration is treated, and fx, fy, cx, cy with their covariance, pixels,

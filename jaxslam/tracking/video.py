@@ -85,9 +85,9 @@ def track(
     except BaseException as error:
         # After the first frame there is nothing to tell yet, and what tells it may be compiling.
         if len(history) > isinstance(error, KeyboardInterrupt):
-            _write(source, tracker, history, seconds, out)
+            _write(source, tracker, history, seconds, out, smooth=False)
         raise
-    return _write(source, tracker, history, seconds, out)
+    return _write(source, tracker, history, seconds, out, smooth=True)
 
 
 @contextmanager
@@ -130,10 +130,18 @@ def _film(writer: OverlayWriter, frame: Frame, result: Tracked) -> None:
 
 
 def _write(
-    source: Source, tracker: Tracker, history: list[Tracked], seconds: list[float], out: Path
+    source: Source,
+    tracker: Tracker,
+    history: list[Tracked],
+    seconds: list[float],
+    out: Path,
+    *,
+    smooth: bool,
 ) -> dict[str, Any]:
-    before = history
-    history, points = tracker.after_loops(history)
+    """Of frames as they are known at the end, if `smooth`: whoever interrupts does not wait."""
+    before, points = history, tracker.points()
+    if smooth:
+        history, points = tracker.smoothed(history)
     times, T_wc = trajectory_of(history)
     write_trajectory(out / "trajectory.txt", times, T_wc)
     scaled = any(result.sigma_log_scale is not None for result in history)
@@ -143,8 +151,8 @@ def _write(
     write_covariances(out / "covariance.txt", times, covariances, given_scale=scaled, caveat=caveat)
     write_frames(out / "frames.csv", history)
     summary = summarised(source, tracker, history, points, seconds)
-    if summary["loops"] and "ate" in summary:
-        summary["ate_before_loops"] = trajectory_errors(source, before).get("ate")
+    if "ate" in summary:
+        summary["ate_causal"] = trajectory_errors(source, before).get("ate")
     write_json(out / "summary.json", summary, allow_nan=False)
     tracker.save(out / "map.npz")
     known = known_points(points, history)

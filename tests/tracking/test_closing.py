@@ -42,6 +42,7 @@ def walk(tmp_path_factory):
     """A tracker that has been there and back, its frames, and its file before the last ten."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(submaps, "PARALLAX", 0.15)  # several submaps in a short video
+        patch.setattr(closing, "APART", 1)
         source, path = to_and_fro(), tmp_path_factory.mktemp("walk") / "map.npz"
         tracker = Tracker(source.calibration, SETTINGS)
         frames = list(source)
@@ -67,7 +68,7 @@ def test_a_camera_that_returns_closes_loops_which_correct_its_way(walk):
         assert one.index > FRAMES / 2
         before = [x[old.index] for old in history if old.submap == one.loop + 1]
         assert abs(x[one.index] - before[0]) < 1.0
-    corrected, points = tracker.after_loops(history)
+    corrected, points = tracker.smoothed(history)
     assert error(source, corrected)["rmse"] < 0.8 * error(source, history)["rmse"]
     assert [one.index for one in corrected] == [one.index for one in history]
     # No camera jumps where none did, and all covariances are positive.
@@ -97,7 +98,7 @@ def test_submaps_and_loops_are_saved_and_go_on(walk):
     assert np.array_equal(
         [one.covariance for one in last], [one.covariance for one in history[-10:]]
     )
-    ours, theirs = (one.after_loops(history)[0] for one in (again, tracker))
+    ours, theirs = (one.smoothed(history)[0] for one in (again, tracker))
     assert np.array_equal([one.T_wc for one in ours], [one.T_wc for one in theirs])
 
 

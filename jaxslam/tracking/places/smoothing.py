@@ -1,7 +1,7 @@
-"""What loops say of the frames before them: every camera and landmark, when all is known.
+"""Smoothing: every camera and landmark of a map as it is known at the end, loops included.
 
-Between two hand-overs a camera keeps its place from the first one, but for what the loops, and all
-that was seen later, say of the second: as much of that as of the way is behind it.
+Between two hand-overs a camera keeps its place from the first one, but for what all that was seen
+later says of the second: as much of that as of the way is behind it.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, adjoint
 from jaxslam.tracking.report import Tracked
 
 
-def after_loops(map: Map, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
-    """Return the frames and landmarks as they are known now, after all loops; those of maps without
-    a loop as they are."""
+def smoothed(map: Map, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
+    """Return the frames and landmarks as they are known now; those of maps of one submap, and of
+    those that nobody can come back to, as they are."""
     frames, points = list(history), map.points()
     for one in (map.now(), *map.known()):
-        if one.loops:
+        if one.submaps:
             graph = one.graph(map.settings, map.estimator.slam)
             parts = _parts(one, graph, graph.solved())
             frames, points = _moved(parts, frames), _seen_from(parts, points)

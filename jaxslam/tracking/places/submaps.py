@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.arrays import AnyArray
-from jaxslam._runtime.programs import Program
+from jaxslam._numerics.linalg import cholesky
+from jaxslam._runtime.programs import Program, in_background
 from jaxslam.filters.ekf import EkfSlam, each_gaussian, ekf_inside, rebased
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.model import COMPOSED, CameraInMap
@@ -167,20 +168,40 @@ class Graph:
 
     def with_loop(self, new: LoopClosure) -> Compared:
         """A loop compared with all that is known, and what it says of the present camera."""
-        (chain, loops), more = self._padded()
+        known, more = self._known()
         new = replace(new, submaps=new.submaps + more)
-        found = Compared(*jax.device_get(_compared(_given(chain, loops), new)))
+        found = Compared(*jax.device_get(_compared(known, new)))
         factor = _factor([*(one.nis for one in self.loops), found.nis])
         return found._replace(covariance=factor * found.covariance)
 
     def solved(self) -> Solved:
         """All cameras."""
-        (chain, loops), more = self._padded()
-        T_bc, P, points = (np.asarray(x)[more:] for x in _solved(_given(chain, loops)))
+        known, more = self._known()
+        T_bc, P, points = (np.asarray(x)[more:] for x in _solved(known))
         return Solved(T_bc, _factor([one.nis for one in self.loops]) * P, points)
 
-    def _padded(self) -> tuple[tuple[Chain, LoopClosure], int]:
-        """The chain of all submaps, with some in front that are none, and the loops in it, with
+    def compile(self) -> None:
+        """Compile what a graph of this size needs, aside."""
+        links, loops, _ = self._padded()
+        nothing = jax.tree.map(lambda x: x[0], loops)
+
+        def known() -> PyTree:
+            return _unlooped.compile(_chained.compile(*links))
+
+        in_background(
+            lambda: _solved.compile(known()),
+            lambda: _compared.compile(known(), nothing),
+            lambda: _given.compile(_chained.compile(*links), loops),
+        )
+
+    def _known(self) -> tuple[Posterior, int]:
+        """The chain given its loops, and how many submaps are in front that are none."""
+        links, loops, more = self._padded()
+        chain = _chained(*links)
+        return (_given(chain, loops) if self.loops else _unlooped(chain)), more
+
+    def _padded(self) -> tuple[tuple[EkfSlam, Frozen, Array], LoopClosure, int]:
+        """What the chain of all submaps is made of, with some in front that are none; its loops, with
         some behind them that say nothing; and how many are in front. Sizes are few, since each has
         programs of its own."""
         ended, last = [one.frozen for one in self.submaps], self.present.frozen
@@ -196,10 +217,7 @@ class Graph:
         nothing = no_loop(self.most, last.state.landmarks.shape[1], len(there) - 1)
         loops = [replace(one, submaps=one.submaps + more) for one in self.loops]
         loops += [nothing] * (_size(len(loops)) - len(loops))
-        return (
-            _chained(ekf_inside(self.slam, "submaps are"), frozen, there),
-            _stacked(loops),
-        ), more
+        return (ekf_inside(self.slam, "submaps are"), frozen, there), _stacked(loops), more
 
 
 def _factor(nis: Sequence[AnyArray]) -> float:
@@ -275,6 +293,15 @@ def _error(chain: Chain, loop: LoopClosure, states: State) -> Float[Array, " 6"]
     moved = difference(T_BP.inverse() @ T_BQ, jaxlie.SE3.from_matrix(loop.T))
     X = states.landmarks[loop.submaps[0], loop.slots]
     return loop.by_pose @ moved + jnp.tensordot(loop.by_landmarks, X - loop.landmarks, 2)
+
+
+@Program
+def _unlooped(chain: Chain) -> Posterior:
+    """As `_given` has it of a chain without loops."""
+    count = 6 * LEAST
+    nothing = jnp.zeros((count, *chain.shape))
+    states, alone = chain.at(nothing[0]), cholesky(jnp.eye(count))
+    return Posterior(chain, states, nothing, alone, jnp.ones((), bool))
 
 
 @Program
