@@ -201,9 +201,9 @@ class Graph:
         return (_given(chain, loops) if self.loops else _unlooped(chain)), more
 
     def _padded(self) -> tuple[tuple[EkfSlam, Frozen, Array], LoopClosure, int]:
-        """What the chain of all submaps is made of, with some in front that are none; its loops, with
-        some behind them that say nothing; and how many are in front. Sizes are few, since each has
-        programs of its own."""
+        """What the chain of all submaps is made of, with some in front that are none; its loops,
+        with some behind them that say nothing; and how many are in front. Sizes are few, since each
+        has programs of its own."""
         ended, last = [one.frozen for one in self.submaps], self.present.frozen
         # A landmark goes on that is still there when the next submap ends.
         later = [one.numbers for one in (*ended, last)[1:]]
