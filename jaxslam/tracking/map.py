@@ -23,6 +23,8 @@ NO_SLOTS = np.zeros(0, int)
 
 KEPT = 8
 """Maps that were left, and are known again."""
+MOST = 128
+"""Submaps of a map: the last one does not end. Memory and the cost of a loop grow with them."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,8 @@ class Map:
         report = self.estimator.renew(slots, pixels)
         self.place.follow(report, self._nearness(), self._found_again())
         self._add(slots, image, pixels)
-        if report.left and self.place.unit_fixed and self.seen is None:
+        more = self.place.unit_fixed and self.seen is None and len(self.submaps) < MOST
+        if report.left and more:
             self._hand_over(image)
 
     def _hand_over(self, image: UInt8[np.ndarray, "h w"]) -> None:

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxslam.io.source import Source, Trajectory
+from jaxslam.tracking import map as maps
 from jaxslam.tracking.places import closing, submaps
 from jaxslam.tracking.places.closing import close_loop
 from jaxslam.tracking.places.submaps import loop_of
@@ -183,3 +184,16 @@ def small(i, size):
     else:
         T[:3, :3] = Rotation.from_rotvec(size * np.eye(3)[i - 3]).as_matrix()
     return T
+
+
+def test_a_map_has_so_many_submaps_and_goes_on_in_the_last(walk, monkeypatch):
+    *_, source, path = walk
+    frames = list(source)[-11:-60:-1]
+    for most in (maps.MOST, None):
+        again = Tracker.load(path)
+        before = len(again.map.submaps)
+        monkeypatch.setattr(maps, "MOST", most or before)
+        for frame in frames:
+            again.step(frame.image, again.time + 1 / 30)
+        assert not again.unmeasured
+        assert (len(again.map.submaps) > before) == (most is not None)

@@ -29,8 +29,8 @@ from jaxslam.tracking.pointcloud import seen_from
 from jaxslam.tracking.search import search
 
 APART = 3
-"""Submaps from the end of one loop to that of the next, at the least: what a loop costs grows with
-their number."""
+"""Submaps from the end of one loop to that of the next, at the least, and an eighth of all: what a
+loop costs grows with their number."""
 TRIED = 3
 """Submaps, those of the most candidates."""
 WITHIN = 3.0
@@ -62,7 +62,8 @@ def close_loop(
     """Return which earlier submap the picture at the end of the latest one shows: if that is
     believed, the `map` has learnt of it."""
     *earlier, latest = map.submaps
-    if map.loops and len(earlier) - int(map.loops[-1].submaps[1]) < APART:
+    apart = max(APART, len(earlier) // 8)
+    if map.loops and len(earlier) - int(map.loops[-1].submaps[1]) < apart:
         return None
     corners = described_corners(image)
     kept = map.charted.keys() - set(latest.numbers.tolist())
