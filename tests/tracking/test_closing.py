@@ -193,7 +193,7 @@ def test_a_map_has_so_many_submaps_and_goes_on_in_the_last(walk, monkeypatch):
         again = Tracker.load(path)
         before = len(again.map.submaps)
         monkeypatch.setattr(maps, "MOST", most or before)
-        for frame in frames:
-            again.step(frame.image, again.time + 1 / 30)
+        for i, frame in enumerate(frames, 1):
+            again.step(frame.image, FRAMES / 30 + i / 30)
         assert not again.unmeasured
         assert (len(again.map.submaps) > before) == (most is not None)
