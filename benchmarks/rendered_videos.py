@@ -190,9 +190,10 @@ def _round(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     turned = np.maximum(rest - _SIDE, 0) / _CORNER
     ahead = np.minimum(rest, _SIDE) + _CORNER * np.sin(turned)
     aside = _CORNER * (1 - np.cos(turned))
-    place = np.array([-_SIDE / 2 - _CORNER, -_SIDE / 2]), sides * np.pi / 2
-    start, heading = place
-    side = np.stack([start[0] + aside, start[1] + ahead], -1)
+    side, heading = (
+        np.stack([aside - _SIDE / 2 - _CORNER, ahead - _SIDE / 2], -1),
+        sides * np.pi / 2,
+    )
     c, s = np.cos(heading), np.sin(heading)
     turn = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)
     return (turn @ side[..., None])[..., 0], heading + turned
@@ -281,8 +282,7 @@ def _driving(times: np.ndarray, rng: np.random.Generator) -> Poses:
 
 def _walking(times: np.ndarray, rng: np.random.Generator) -> Poses:
     """1.5 m/s round a block, looking ahead."""
-    sway = _sway(times, rng, 0.03, 0.02, 0.02, 0.01)
-    x, y, pitch, roll = sway
+    x, y, pitch, roll = _sway(times, rng, 0.03, 0.02, 0.02, 0.01)
     place, heading = _round(1.5 * times + 2.0)
     aside = np.stack([np.cos(heading), -np.sin(heading)], -1) * x[..., None]
     place = place + aside

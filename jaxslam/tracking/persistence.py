@@ -167,8 +167,7 @@ def _remembered(
         setattr(place, name, pose)
     submaps, loops = [], []
     if told["submaps"]:
-        pose = np.zeros((4, 4)), np.zeros((6, 6))
-        ended = *shapes(slam, like, kept.settings.capacity), *pose
+        ended = *shapes(slam, like, kept.settings.capacity), np.zeros((4, 4)), np.zeros((6, 6))
         for k in range(told["submaps"]):
             frozen, *rest = grown(ended, own, f"submap {k}")
             points, covariances, *pose = map(np.asarray, rest)

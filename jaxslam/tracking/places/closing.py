@@ -18,12 +18,7 @@ from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.map import Map
 from jaxslam.tracking.observations import Prediction
 from jaxslam.tracking.places.descriptors import candidates, described_corners
-from jaxslam.tracking.places.relocalisation import (
-    FEWEST,
-    MOST_OF,
-    SURE,
-    pose_of,
-)
+from jaxslam.tracking.places.relocalisation import FEWEST, MOST_OF, pose_of, well_known
 from jaxslam.tracking.places.submaps import Submap, loop_of
 from jaxslam.tracking.pointcloud import seen_from
 from jaxslam.tracking.search import search
@@ -65,10 +60,12 @@ def close_loop(
     apart = max(APART, len(earlier) // 8)
     if map.loops and len(earlier) - int(map.loops[-1].submaps[1]) < apart:
         return None
-    corners = described_corners(image)
     kept = map.charted.keys() - set(latest.numbers.tolist())
-    slots, pixels = candidates({number: map.charted[number] for number in kept}, corners)
-    by_number = dict(zip(slots.tolist(), pixels, strict=True))
+    if not kept:
+        return None
+    gone = {number: map.charted[number] for number in kept}
+    numbers, pixels = candidates(gone, described_corners(image))
+    by_number = dict(zip(numbers.tolist(), pixels, strict=True))
     shown = [sum(n in by_number for n in one.numbers.tolist()) for one in earlier]
     for p in np.argsort(shown)[::-1][:TRIED].tolist():
         if shown[p] < FEWEST:
@@ -95,10 +92,7 @@ def _seen_in(
 ) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "4 4"]] | None:
     """The slots of the landmarks of a submap in a picture, and where its camera is from the last of
     the submap."""
-    with np.errstate(invalid="ignore"):  # at infinity
-        sigma = np.sqrt(np.trace(submap.covariances, axis1=1, axis2=2))
-        sure = sigma < SURE * np.linalg.norm(submap.points, axis=1)
-    sure &= np.asarray(submap.frozen.carried)
+    sure = well_known(submap.points, submap.covariances) & np.asarray(submap.frozen.carried)
     numbers = submap.numbers.tolist()
     known = [slot for slot, n in enumerate(numbers) if sure[slot] and n in by_number]
     at = np.array([by_number[numbers[slot]] for slot in known]).reshape(-1, 2)

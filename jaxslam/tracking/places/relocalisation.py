@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.estimator import Correction
@@ -35,6 +35,15 @@ SECONDS = 1 / 30
 """In which a camera moves there: between two frames, so that no acceleration matters."""
 NOTED_EVERY = 5
 """Frames between two in which landmarks are described."""
+
+
+def well_known(
+    points: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
+) -> Bool[np.ndarray, " n"]:
+    """Return which points a pose may be found from."""
+    with np.errstate(invalid="ignore"):  # at infinity
+        sigma = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+        return sigma < SURE * np.linalg.norm(points, axis=1)
 
 
 def pose_of(
@@ -91,9 +100,7 @@ def _found(
     """The landmarks of this map in a picture, and what they make of it."""
     slots, pixels = candidates(map.landmarks, corners)
     points, covariances = (part[slots] for part in map.estimator.points())
-    with np.errstate(invalid="ignore"):  # at infinity
-        sigma = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
-        sure = sigma < SURE * np.linalg.norm(points, axis=1)
+    sure = well_known(points, covariances)
     posed = pose_of(points[sure], pixels[sure], policy.calibration)
     if posed is None:
         return None
