@@ -18,6 +18,7 @@ project_copyright = "the authors of jaxslam, Apache-2.0"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx.ext.mathjax"]
 html_theme, html_title = "furo", f"jaxslam {release}"
 html_copy_source = False
+html_static_path = html_css_files = ["site.css"]
 
 # Notebooks are executed before they are committed, and again, short, by .ci/run.
 nb_execution_mode = "off"
