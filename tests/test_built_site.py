@@ -26,7 +26,7 @@ WIDE_TABLES = {
     "comparison.html", "consistency.html", "from-rest.html", "handheld.html", "results.html",
     "rivals.html", "sequences.html", "stress.html", "own-video.html", "calibration.html",
 }  # fmt: skip
-"""Pages with tables that do not fit the text's width on a laptop; this list only becomes shorter."""
+"""Pages with tables wider than the text on a laptop; this list only becomes shorter."""
 
 pytestmark = pytest.mark.skipif(not SITE.is_dir(), reason="JAXSLAM_SITE names no built site")
 needs_browser = pytest.mark.skipif(BROWSER is None, reason="Chromium is not installed")
