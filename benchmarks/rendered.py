@@ -29,22 +29,6 @@ MARK = "<!-- by rendered.py -->"
 """Where the table stands in `docs/sequences.md`."""
 VIDEOS = (*KINDS, "turn+blur+exposure")
 
-COLUMNS = {
-    "maps": ".0f",
-    "loops": ".0f",
-    "matches_per_frame": ".1f",
-    "causal": ".2%",
-    "error": ".2%",
-    "straight_line": ".2%",
-    "sign": ".2f",
-    "orientation": ".1f",
-    "beyond_scale": ".2g",
-    "median_beyond_scale": ".2g",
-    "lies": ".0%",
-    "drift": ".2g",
-}
-"""Of the table, in its order."""
-
 Results = dict[str, dict[str, dict[str, Any]]]
 """`results[video][seed]`."""
 
@@ -101,28 +85,32 @@ def measure(source) -> dict[str, Any]:
 
 
 def as_table(results: Results) -> str:
-    """As Markdown, a row for each video."""
-    header = (
-        "video",
-        "frames",
-        "lost",
-        "maps",
-        "loops",
-        "matches a frame",
-        "error frame by frame",
-        "error at the end",
-        "straight line",
-        "sign",
-    )
-    header += ("orientation, °", "at one scale", "its median", "lies", "drift, σ")
-    rows = []
-    for name, seeds in results.items():
-        words = KINDS[name.partition("+")[0]].words
-        for seed, r in seeds.items():
-            shown = (number(r.get(key), form) for key, form in COLUMNS.items())
-            what = f"`{name}`, seed {seed}: {words}", f"{r['frames']:.0f}"
-            rows.append((*what, f"{1 - r['tracked'] / r['frames']:.0%}", *shown))
-    return table(header, rows)
+    """As Markdown: what the kinds are, and a row for each video."""
+    kinds = dict.fromkeys(name.partition("+")[0] for name in results)
+    said = "; ".join(f"`{kind}`, {KINDS[kind].words}" for kind in kinds)
+    header = ("video, seed", "frames lost; maps", "loops", "error as it went; at the end")
+    header += ("straight line", "orientation", "NEES/dof: mean; median", "beyond 5 σ", "drift")
+    videos = ((name, seed, r) for name, seeds in results.items() for seed, r in seeds.items())
+    return f"The videos: {said}.\n\n{table(header, (_row(*video) for video in videos))}"
+
+
+def _row(name: str, seed: str, r: dict[str, Any]) -> list[str]:
+    """The numbers of one video; a camera on the spot has no path, and so no error in its share."""
+
+    def shown(key: str, form: str, unit: str = "") -> str:
+        return number(r.get(key), form) + (unit if key in r else "")
+
+    return [
+        f"`{name}`, {seed}",
+        f"{1 - r['tracked'] / r['frames']:.0%}; {r['maps']:.0f}",
+        shown("loops", ".0f"),
+        "; ".join(shown(key, ".2%") for key in ("causal", "error")),
+        shown("straight_line", ".1%"),
+        shown("orientation", ".1f", "°"),
+        "; ".join(shown(key, ".2g") for key in ("beyond_scale", "median_beyond_scale")),
+        shown("lies", ".0%"),
+        shown("drift", ".2g", " σ"),
+    ]
 
 
 if __name__ == "__main__":

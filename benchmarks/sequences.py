@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from benchmark import RESULTS, Benchmark, data_folder, write_page, write_table
+from benchmark import RESULTS, Benchmark, data_folder, number, table, write_table
 
 from jaxslam.filters.registry import ON_VIDEO
 from jaxslam.tracking.settings import TrackerSettings
@@ -33,14 +33,13 @@ FRAMES = (30, 149)
 """Whose pose is compared with the truth, where that is known."""
 MARK = "<!-- sequences.py -->"
 """Where `summary` stands in `docs/results.md`."""
-RENDERED = "\n## Rendered videos\n"
-"""Where the part of `docs/sequences.md` begins that is of `rendered.py`."""
 LANDMARKS = "inverse_scaling"
 SEEDS = range(5)
 """Of synthetic videos."""
 
 WORLD_CENTRIC = ON_VIDEO.replace("scale_gauge", "world_gauge")
 """The recommended filter with landmarks in the base frame."""
+OWN = f"{ON_VIDEO}/{LANDMARKS}"
 
 Results = dict[str, dict[str, dict[str, Any]]]
 """`results[sequence][filter/landmarks]`, and `/white` where the calibration is not `known`."""
@@ -76,9 +75,8 @@ class Sequences(Benchmark):
                 yield results
 
     def report(self, results: Results) -> None:
-        path = self.docs / "sequences.md"
-        _, mark, rest = path.read_text().partition(RENDERED) if path.exists() else ("", "", "")
-        write_page(path, page(results) + mark + rest)
+        for mark, part in PARTS.items():
+            write_table(self.docs / "sequences.md", mark, part(results))
         write_table(self.docs / "results.md", MARK, summary(results))
 
 
@@ -153,95 +151,113 @@ def beyond_scale(source, folder: Path):
     return np.flatnonzero(first), found, found.drift / np.asarray(best.sigma)
 
 
-def page(results: Results) -> str:
-    """The Markdown page."""
-    lines = [
-        "# The tracker on sequences",
-        "",
-        "Made by `python benchmarks/sequences.py`; do not edit. Settings are those of `jaxslam",
-        "track` for all; only the filter changes. *NIS/dof*: mean normalised innovation squared",
-        "of the matches by its degrees of freedom, 1 where pixels (σ 0.3) and motion are as",
-        "assumed; the tests of the matches take large innovations out, which makes it smaller,",
-        "and a camera that sets out fast makes it larger: no linear prediction is for that frame.",
-        "*Ungated*: squared innovations of all that was found, what is not believed included:",
-        "their median by that of χ², ideally 1, and the share beyond its 95 %, ideally 5 %; less",
-        "where the camera did less than its σ allows, more by wrong matches. *At one scale*: NEES",
-        "of the pose at the one scale of its map that explains all of them best, by 6 degrees of",
-        "freedom, at frames 30 and 149 and as a mean of those with a fixed unit, ideally 1; where",
-        "the truth is known exactly. *Drift*: RMS of the log of the scale of one pose by that",
-        "of the map, in percent and in the σ that the filter claims of it, at most about 1 where",
-        "it claims rightly ([gauge.md](gauge.md)); the real references have errors of their own.",
-        "*Error*: RMS of the trajectory, which is smoothed where the filter has submaps",
-        "([submaps.md](submaps.md#loops-in-a-video)), after the best similarity, in percent of the",
-        "path; a",
-        "*straight line* at constant speed, which looks at no picture, has the error beside the",
-        "title. *Sign*: the correlation of true with estimated positions, turned by the",
-        "orientations: −1 is a world behind the camera. *Orientation*: its RMS error, in degrees.",
-        "*In 1 s*: the relative pose error over one second, in percent of the way made in it, and",
-        "in degrees. A camera that is lost for 15 frames begins a new *map*, in another unit of",
-        "length. Times, without the overlay, are of a machine that others used too.",
+SHORT = {
+    ON_VIDEO: "recommended",
+    WORLD_CENTRIC: "world_gauge",
+    "robocentric": "robocentric",
+    "world": "world",
+}
+"""Filters as the tables name them, in their order."""
+
+
+def words(results: Results) -> str:
+    """What the recommended filter reaches, in words."""
+    own = {name: f[OWN] for name, f in results.items() if OWN in f and f[OWN]["error"]}
+    frames = sum(r["frames"] for r in own.values())
+    tracked = sum(r["tracked"] for r in own.values())
+    errors = {name: r["error"] / r["path"] for name, r in own.items()}
+    worst = max(errors, key=lambda name: errors[name])
+    median = sorted(errors.values())[len(errors) // 2]
+    straight = [f"`{name}`" for name, r in own.items() if r["straight_line"] <= r["error"]]
+    return (
+        f"`jaxslam track` follows {tracked} of {frames} frames of {len(own)} videos with one "
+        f"setting for all. After alignment by a similarity, the RMS error of the trajectory is "
+        f"{median:.2%} of the path on the median video, and {errors[worst]:.2%} on the worst, "
+        f"`{worst}`. A straight line at constant speed, which uses no image, is at least as good "
+        f"on {' and '.join(straight) or 'none'}."
+    ).replace("%", " %")
+
+
+def errors_table(results: Results) -> str:
+    """The error of every filter on every video, and of a straight line."""
+    return _by_filter(results, _error, "straight line", lambda r: _share(r, "straight_line"))
+
+
+def claims_table(results: Results) -> str:
+    """How right every filter is about its error, where that is known."""
+    return _by_filter(results, _claims)
+
+
+def _by_filter(results: Results, cell, beside: str = "", other=None) -> str:
+    """A row for each video, a column for each filter that was measured on all."""
+    keys = {name: f"{name}/{LANDMARKS}" for name in SHORT}
+    keys = {n: key for n, key in keys.items() if all(key in f for f in results.values())}
+    rows = [
+        [name, *([other(next(iter(found.values())))] if other else [])]
+        + [cell(found[key]) for key in keys.values()]
+        for name, found in results.items()
     ]
-    for name, filters in results.items():
-        one = next(iter(filters.values()))
-        title = f"{name}, {one['frames']} frames"
-        if one["error"] is not None:
-            title += f", a straight line {_share(one, 'straight_line')}"
-        lines += [
-            "",
-            f"## {title}",
-            "",
-            "| filter | tracked | maps | matches a frame | NIS/dof | ungated | at one scale "
-            "| drift | error | sign | orientation | in 1 s | ms a frame, p99 |",
-            "|---" * 13 + "|",
-            *(_row(key, row) for key, row in filters.items()),
-        ]
-    return "\n".join(lines) + "\n"
+    return table(["video", *([beside] if other else []), *(f"`{SHORT[n]}`" for n in keys)], rows)
+
+
+def _error(r: dict[str, Any]) -> str:
+    if r["error"] is None:
+        return "–"
+    lost = f"; {r['tracked']} of {r['frames']} frames, {r['maps']} maps" if r["maps"] > 1 else ""
+    return _share(r, "error") + lost
+
+
+def _claims(r: dict[str, Any]) -> str:
+    drift = f"{r['drift'][1]:.2f} σ" if r["drift"] else "–"
+    return f"{r['beyond_scale']['mean']:.2g}; {drift}" if r["beyond_scale"] else drift
+
+
+def details_table(results: Results) -> str:
+    """All else of the recommended filter."""
+    header = ("video", "matches a frame", "sign", "orientation", "in 1 s", "NIS/dof", "ungated")
+    header += ("NEES, frames 30, 149", "drift", "ms a frame, p99")
+    return table(header, (_details(n, f[OWN]) for n, f in results.items() if OWN in f))
+
+
+def _details(name: str, r: dict[str, Any]) -> list[str]:
+    nees = [r["beyond_scale"][str(k)] for k in FRAMES] if r["beyond_scale"] else []
+    turn, relative = f"{r['orientation']:.1f}°", r["relative"]
+    return [
+        name,
+        f"{r['matches_per_frame']:.1f}",
+        f"{r['sign']:.2f}",
+        turn,
+        f"{relative[0]:.1%}, {relative[1]:.2f}°" if relative else "–",
+        number(r["nis_per_dof"]),
+        f"{r['ungated'][0]:.2f}, {r['ungated'][1]:.1%}" if r["ungated"] else "–",
+        ", ".join(f"{x:.3g}" for x in nees) or "–",
+        f"{r['drift'][0]:.1%}" if r["drift"] else "–",
+        f"{r['milliseconds']:.0f}, {r['milliseconds_p99']:.0f}",
+    ]
 
 
 def summary(results: Results) -> str:
-    """The table of docs/results.md: the recommended filter beside `world`."""
-    rows = [
-        "| video | frames tracked | error; straight line | sign | orientation | in 1 s "
-        "| at one scale | drift of scale | `world` instead |",
-        "|---" * 9 + "|",
-    ]
+    """The table of docs/results.md: the recommended filter."""
+    header = ("video", "frames tracked", "error", "straight line", "orientation", "in 1 s")
+    rows = []
     for name, filters in results.items():
-        own, world = (filters.get(f"{one}/{LANDMARKS}") for one in (ON_VIDEO, "world"))
-        if own is None or world is None:  # not measured yet
+        if not (r := filters.get(OWN)) or not r["error"]:  # not measured, or without a reference
             continue
-        nees = "–" if not own["beyond_scale"] else f"{own['beyond_scale']['mean']:.2g}"
-        rows.append(
-            f"| {name} | {own['tracked']} of {own['frames']} | {_share(own, 'error')}; "
-            f"{_share(own, 'straight_line')} | {own['sign']:.2f} | {own['orientation']:.2f}° "
-            f"| {own['relative'][0]:.1%} | {nees} | {own['drift'][1]:.2g} σ | {_beside(world)} |"
-        )
-    return "\n".join(rows)
+        nees = "–" if not r["beyond_scale"] else f"{r['beyond_scale']['mean']:.2g}"
+        error, straight = (_share(r, key) for key in ("error", "straight_line"))
+        turn, moved = f"{r['orientation']:.2f}°", f"{r['relative'][0]:.1%}"
+        frames, drift = f"{r['tracked']} of {r['frames']}", f"{r['drift'][1]:.2g} σ"
+        rows.append((name, frames, error, straight, turn, moved, nees, drift))
+    return table((*header, "NEES/dof", "drift of scale"), rows)
 
 
-def _beside(r: dict[str, Any]) -> str:
-    told = f"{r['tracked']} of {r['frames']}"
-    return told if r["maps"] > 1 else f"{told}, {_share(r, 'error')}, sign {r['sign']:.2f}"
-
-
-def _row(key: str, r: dict[str, Any]) -> str:
-    nis = "–" if r["nis_per_dof"] is None else f"{r['nis_per_dof']:.2f}"
-    nees = ", ".join(f"{x:.3g}" for x in (r["beyond_scale"] or {}).values()) or "–"
-    drift = "–" if not r["drift"] else f"{r['drift'][0]:.1%}, {r['drift'][1]:.2f} σ"
-    ungated = "–"
-    if r["ungated"]:
-        median, beyond = r["ungated"]
-        ungated = f"{median:.2f}, {beyond:.1%}"
-    error = ("–", "–", "–", "–")
-    if r["error"] is not None:
-        error = _share(r, "error"), f"{r['sign']:.2f}", f"{r['orientation']:.1f}°", "–"
-    if r["relative"]:
-        translation, rotation = r["relative"]
-        error = *error[:3], f"{translation:.1%}, {rotation:.2f}°"
-    return (
-        f"| `{key}` | {r['tracked']} | {r['maps']} | {r['matches_per_frame']:.1f} | {nis} "
-        f"| {ungated} | {nees} | {drift} | {' | '.join(error)} | {r['milliseconds']:.0f}, "
-        f"{r['milliseconds_p99']:.0f} |"
-    )
+PARTS = {
+    "<!-- sequences.py, in words -->": words,
+    "<!-- sequences.py, errors -->": errors_table,
+    "<!-- sequences.py, claims -->": claims_table,
+    "<!-- sequences.py, details -->": details_table,
+}
+"""Marks of `docs/sequences.md`, and what stands behind each."""
 
 
 def _share(r: dict[str, Any], key: str) -> str:

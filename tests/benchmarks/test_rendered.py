@@ -118,3 +118,16 @@ def test_the_page_has_the_numbers_on_disk():
     results = json.loads((folder / "benchmarks/results/rendered.json").read_text())
     page = (folder / "docs/sequences.md").read_text()
     assert f"{rendered.MARK}\n\n{rendered.as_table(results)}\n\n" in page
+
+
+def test_the_page_says_how_large_the_errors_are():
+    folder = Path(__file__).resolve().parents[2]
+    results = json.loads((folder / "benchmarks/results/rendered.json").read_text())
+    videos = [one for seeds in results.values() for one in seeds.values()]
+    errors = [one["error"] for one in videos if "error" in one]
+    page = " ".join((folder / "docs/sequences.md").read_text().split())
+    said = f"{100 * min(errors):.2f} to {100 * max(errors):.2f} % of the path"
+    assert f"On {len(errors)} rendered videos" in page
+    assert said in page
+    assert {one["maps"] for one in videos} == {1.0}
+    assert all(one["sign"] > 0.99 for one in videos if "sign" in one)

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import sequences as benchmark
+from benchmark import END
 
 FOLDER = Path(__file__).resolve().parents[2]
 
@@ -14,10 +15,25 @@ def on_disk():
 
 def test_the_pages_have_the_numbers_on_disk():
     results = on_disk()
-    own, _, _ = (FOLDER / "docs/sequences.md").read_text().partition(benchmark.RENDERED)
-    assert own == benchmark.page(results)
+    page = (FOLDER / "docs/sequences.md").read_text()
+    for mark, part in benchmark.PARTS.items():
+        assert f"{mark}\n\n{part(results)}\n\n{END}" in page
     table = benchmark.summary(results)
     assert f"{benchmark.MARK}\n\n{table}\n\n" in (FOLDER / "docs/results.md").read_text()
+
+
+def test_every_filter_of_the_numbers_has_a_column():
+    results = on_disk()
+    columns = len(benchmark.errors_table(results).splitlines()[0].split(" | ")) - 2
+    assert columns == len(benchmark.SHORT)
+    assert all(len(filters) == columns for filters in results.values())
+
+
+def test_a_video_that_was_lost_says_so_beside_its_error():
+    found = {"error": 0.5, "path": 10.0, "tracked": 9, "frames": 51, "maps": 3}
+    assert benchmark._error(found) == "5.00%; 9 of 51 frames, 3 maps"
+    assert benchmark._error(found | {"maps": 1}) == "5.00%"
+    assert benchmark._error(found | {"error": None}) == "–"
 
 
 def test_the_sentences_on_covariances_are_of_the_numbers_on_disk():
@@ -35,4 +51,4 @@ def test_the_sentences_on_covariances_are_of_the_numbers_on_disk():
     assert f"is {drifts[0]:.2g} to {drifts[-1]:.2g} of its claimed σ" in page
     (drift, normalised), *_ = (r["drift"] for r in own)
     assert 1 / 8 < normalised < 1 / 6
-    assert f"strays by {drift:.1%} (RMS), a seventh".replace("%", " %") in page
+    assert f"varies by {drift:.1%} (RMS), a seventh".replace("%", " %") in page
