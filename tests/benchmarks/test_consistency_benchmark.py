@@ -7,6 +7,7 @@ from pathlib import Path
 import consistency as benchmark
 import numpy as np
 import pytest
+from verdicts import wrong_share
 
 import jaxslam
 from jaxslam.statistics import Tally, run_verdict
@@ -101,8 +102,9 @@ def test_what_is_there_is_not_measured_again_and_others_may_add_to_it(options, m
         "circle": [7],
     }
     page = (options.docs / "consistency.md").read_text()
-    assert f"| `{NAME}` | 0–1, 3 × 30 |" in page
-    assert f"| `{NAME}` | 7 × 30 |" in page
+    assert "all runs of seeds 0–1, 3, 7." in page
+    assert "| `robocentric` | 90 |" in page
+    assert "| `robocentric` | 30 |" in page
 
 
 def test_a_seed_that_another_command_added_counts_once(tmp_path):
@@ -137,15 +139,16 @@ def test_a_row_says_what_was_lost_and_which_means_are_in_the_band():
     nees[:, 4:] *= 1.2  # from step 5
     nees[:20, 9:] = 100.0  # from step 10
     row = benchmark._row("x/y", measured(nees, 4))
-    assert row.startswith("| `x/y` | 4 × 1000 | 3.85 | 1.133 [1.087, 1.191] |")
+    assert row.startswith("| `x/y` | 1000 | 3.85 | 1.133 [1.087, 1.191] |")
     assert "over-confident" in row
-    at_steps = row.split("|")[8].split()
+    at_steps = row.split("|")[7].split()
     assert all(float(value) > 3.3 for value in at_steps)
-    assert "| 2.00% | 2.10% | 3.43 |" in row
-    assert len(row.split("|")) == len(benchmark.page({"m": {}}).splitlines()[-1].split("|"))
+    assert "| 3.43; 2.40 | 2.00%; 2.10% |" in row
+    header = benchmark.page({"m": {}}, Path("none")).splitlines()[-1]
+    assert len(row.split("|")) == len(header.split("|"))
     nees[:, 4] /= 1.2
     row = benchmark._row("x/y", measured(nees, 4))
-    assert row.split("|")[8].split()[0].startswith("**")
+    assert row.split("|")[7].split()[0].startswith("**")
 
 
 def test_a_row_names_the_part_that_decided():
@@ -153,7 +156,7 @@ def test_a_row_names_the_part_that_decided():
     nees[:, -1] *= 1.4
     row = benchmark._row("x/y", measured(nees))
     assert "| over-confident (last step) |" in row
-    assert row.startswith(f"| `x/y` | 0 × 300 | {nees.mean():.2f} | ")
+    assert row.startswith(f"| `x/y` | 300 | {nees.mean():.2f} | ")
 
 
 def test_rows_tallied_without_thirds_have_a_verdict_and_the_page_says_so():
@@ -163,9 +166,9 @@ def test_rows_tallied_without_thirds_have_a_verdict_and_the_page_says_so():
     assert benchmark.verdicts_of(old)["tally"]["thirds"] == []
     for row, told in ((found, False), (old, True)):
         page = benchmark.page({"matched": {NAME: row}})
-        assert (f"| `{NAME}` † | 0 × 300 |" in page) is told
+        assert ("| `robocentric` † | 300 |" in page) is told
         assert ("| – |" in page) is told
-        assert ("tallied before a verdict looked at thirds" in page) is told
+        assert ("before verdicts looked at thirds" in page) is told
 
 
 def test_a_diverged_run_leaves_a_row_without_a_mean():
@@ -174,8 +177,24 @@ def test_a_diverged_run_leaves_a_row_without_a_mean():
     broken[4, 2:] = np.nan
     found = measured(nees) | {"tally": Tally.of(broken, 3).asdict()}
     row = benchmark._row("x/y", found)
-    assert row.startswith("| `x/y` | 0 × 50 | – | – | lost | ")
+    assert row.startswith("| `x/y` | 50 | – | – | lost | ")
     assert "**" not in row
+
+
+def test_filters_have_short_names_in_tables():
+    assert benchmark.label("scale_gauge+scene50+mixture17/inverse_scaling") == "recommended"
+    assert benchmark.label("scale_gauge+mixture17/inverse_scaling") == "+mixture17"
+    assert benchmark.label("scale_gauge/inverse_scaling") == "scale_gauge"
+    assert benchmark.label("world/cartesian") == "world/cartesian"
+
+
+def test_the_page_says_how_rarely_a_verdict_is_wrong():
+    folder = Path(__file__).resolve().parents[2]
+    found = json.loads((folder / "benchmarks/results/verdicts.json").read_text())["by_factor"]
+    assert max(wrong_share(row["words"]["1"]) for row in found) < 0.011
+    for runs, factors in {300: ("1.3", "0.769"), 100: ("2", "0.5")}.items():
+        shares = [wrong_share(r["words"][f]) for r in found if r["runs"] == runs for f in factors]
+        assert min(shares) > 0.995
 
 
 def test_the_tables_of_the_pages_say_what_the_numbers_on_disk_say():
