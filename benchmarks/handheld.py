@@ -5,8 +5,8 @@
 Simulates runs along every trajectory in $JAXSLAM_DATA/trajectories (../shared/data by default), as
 `jaxslam consistency --scenario handheld-NAME` does, and runs the same filters on the tracks of real
 drives in $JAXSLAM_DATA/kitti_tracks. Results are added to `handheld.json` one filter at a time;
-what it already has, of as many runs, is not run again. `docs/handheld.md` is written from it, by
-`--page` alone from what is there.
+what it already has, of as many runs, is not run again. The table of `docs/handheld.md` is written
+from it, by `--page` alone from what is there.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import tracks
-from benchmark import RESULTS, Benchmark, data_folder, table, write_page
+from benchmark import RESULTS, Benchmark, data_folder, table, write_table
 
 import jaxslam
 from jaxslam._numerics.arrays import cast
@@ -47,6 +47,8 @@ STREET_NEAREST_DEPTH = 17.0
 """Whose prior on 1/z, N(0.029, 0.015²) 1/m, is that of the points of 2011_09_30_0020."""
 TRUTH_SIGMA = np.array([0.1] * 3 + [np.radians(0.1)] * 3)
 """Of the true poses of the drives, m and rad."""
+MARK = "<!-- by handheld.py -->"
+"""Where the table stands in `docs/handheld.md`."""
 RECORDS = ("log_scale", "log_scale_sigma", *SCALE, "reversed", "nis", "nis_dof")
 
 
@@ -83,11 +85,11 @@ class Handheld(Benchmark):
             found = results.setdefault(where, {}).get(name)
             if not found or any(found.get(key) != value for key, value in wanted.items()):
                 results[where][name] = {**wanted, **measure()}
-                print(f"{where} {name}: {' | '.join(_row(results[where][name], -1))}", flush=True)
+                print(f"{name}: {' | '.join(_row(where, results[where][name]))}", flush=True)
                 yield results
 
     def report(self, results: dict[str, Any]) -> None:
-        write_page(self.docs / "handheld.md", page(results))
+        write_table(self.docs / "handheld.md", MARK, as_table(results))
 
 
 def _studies(options: Handheld) -> Iterator[tuple[str, str, dict[str, int], Any]]:
@@ -219,79 +221,48 @@ def _for_json(values: np.ndarray) -> list[float | None]:
 
 
 COLUMNS = (
-    "step", "NEES/dof", "median", "at a scale of its own", "lost", "drift", "drift/σ", "median",
-    "log-scale rms", "median", "σ claimed", "error/σ", "reversed",
+    "path", "NEES/dof: mean; median", "median at earlier steps", "lost", "drift",
+    "log-scale error", "reversed", "NIS",
 )  # fmt: skip
 
 
-def _row(found: dict[str, Any], i: int) -> list[str]:
-    """One step's numbers, as the page has them."""
+def _row(where: str, found: dict[str, Any]) -> list[str]:
+    """One path: the numbers of the last step, and how NEES came there."""
 
-    def shown(key: str, form: str) -> str:
+    def shown(key: str, form: str, unit: str = "", i: int = -1) -> str:
         value = found[key][i]
-        return "–" if value is None else format(value, form if abs(value) < 1e3 else ".1e")
+        return "–" if value is None else f"{format(value, form if value < 1e3 else '.1e')}{unit}"
 
+    before = range(len(found["at"]) - 1)
     return [
-        str(found["at"][i]),
-        shown("one_scale", ".2f"),
-        shown("one_scale_median", ".2f"),
-        shown("own_scale_median", ".2f"),
+        where.removeprefix("handheld-"),
+        f"{shown('one_scale', '.2f')}; {shown('one_scale_median', '.2f')}",
+        " ".join(shown("one_scale_median", ".2f", i=i) for i in before) or "–",
         shown("lost", ".0%"),
-        shown("drift_rms", ".3f"),
-        shown("drift_normalised", ".1f"),
-        shown("drift_normalised_median", ".2f"),
-        shown("log_scale_rms", ".2f"),
-        shown("log_scale_median", ".2f"),
-        shown("log_scale_sigma", ".2f"),
-        shown("log_scale_normalised", ".1f"),
+        shown("drift_normalised", ".1f", " σ"),
+        shown("log_scale_normalised", ".1f", " σ"),
         shown("reversed", ".0%"),
+        "–" if found["nis"] is None else f"{found['nis']:.2f}",
     ]
 
 
-def page(results: dict[str, Any]) -> str:
-    """`docs/handheld.md`."""
-    lines = [_HEAD]
-    for where, filters in sorted(results.items()):
-        runs = next(iter(filters.values()))["runs"]
-        lines += [f"## {where}", "", f"{runs} runs.", ""]
-        rows = []
-        for name, found in filters.items():
-            label = f"{name}, NIS {found['nis']:.2f}" if found["nis"] is not None else name
-            steps = range(len(found["at"]))
-            rows += [(label if i == 0 else "", *_row(found, i)) for i in steps]
-        lines.append(table(["filter", *COLUMNS], rows))
-        lines.append("")
-    return "\n".join(lines).rstrip() + "\n"
+def as_table(results: dict[str, Any]) -> str:
+    """A table for each filter: a row for each path, simulated ones first."""
+    names = sorted({name for filters in results.values() for name in filters})
+    parts = []
+    for name in names:
+        those = {where: f[name] for where, f in sorted(results.items()) if name in f}
+        rows = (_row(where, found) for where, found in those.items())
+        counts = {
+            f"{found['runs']} runs of {found['steps']} steps ({_kind(where)})"
+            for where, found in those.items()
+        }
+        parts += [f"`{name}`, {', '.join(sorted(counts))}:", table(COLUMNS, rows)]
+    return "\n\n".join(parts)
 
 
-_HEAD = """# A camera along real trajectories
-
-Written by `python benchmarks/handheld.py`; all numbers are in `benchmarks/results/handheld.json`.
-
-*handheld-NAME*: simulated runs of a camera along a recorded trajectory, from starts drawn at
-random, 30 landmarks in view at depths from 1 to 6 m (a car: 5 to 50 m), pixel σ 0.3. No filter is
-told where the camera is going: its prior is a velocity of 0 ± 1 m/s and 0 ± 1 rad/s with white
-accelerations of 4 m/s² and 6 rad/s² (a car: ± 10 m/s), and on 1/z N(0.5, 0.25²) (a car: 0.1,
-0.05). The metre in which it is told all this is itself uncertain, by 40 %.
-
-*tracks-DRIVE*: recorded tracks of points in real pictures, at most 40 at a time, known movers
-left out, pixel σ 1, at 10 Hz, points beyond 17 m and a velocity of 0 ± 10 m/s; the truth's own σ
-of 0.1 m and 0.1° is added to the filter's.
-
-*NEES/dof* is that of the pose at the one scale of the run that explains all of its poses best, in
-the filter's own unit of length, by all six degrees of freedom (a right filter has .83 to 1, as the
-fit of the scale takes from one degree of freedom a run to one a pose; [one unit a map](gauge.md)),
-and its median over the runs. *At a scale of its own* is the median of the number that this page
-had before: every pose at the scale that suits it best, by five degrees of freedom, which forgives a
-scale that drifts. *Lost* is the share of runs above the 99.99 % quantile of χ². *Drift* is how far
-the log of a pose's scale is from that of its run, rms; *drift/σ* the same in the σ that the filter
-claims of it, rms and median of its size (a right filter has at most 1 and .67). While the start is
-still being found out, a frame has a unit of its own and no drift. Then the error of the log of the
-scale in metres (a run reversed from its start counts as 6.9, the greatest that is tried), the
-median of its size, the median σ that the filter claims of it and the error in σ (rms, ideal 1);
-*reversed* is the share of runs displaced away from the truth. NIS is per number measured, over all
-steps.
-"""
+def _kind(where: str) -> str:
+    return "tracks" if where.startswith("tracks-") else "simulated"
 
 
 if __name__ == "__main__":

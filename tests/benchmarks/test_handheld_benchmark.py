@@ -2,12 +2,15 @@
 
 import dataclasses
 import json
+from pathlib import Path
+from typing import Any
 
 import handheld as benchmark
 import numpy as np
 import pytest
 import recordings
 import test_tracks
+from benchmark import END
 
 from jaxslam.statistics.beyond_scale import one_scale_of
 
@@ -65,20 +68,38 @@ def test_numbers_are_those_of_the_runs():
     assert json.loads(json.dumps(found, allow_nan=False)) == found
 
 
-def test_the_page_has_every_step_of_every_filter():
-    results = {"handheld-a": {"one": {"runs": 50, "steps": 40, **benchmark.numbers(records())}}}
-    page = benchmark.page(results)
-    assert "## handheld-a\n\n50 runs." in page
-    rows = [line for line in page.splitlines() if line.startswith("| ")][1:]
-    assert [row.split(" | ")[1] for row in rows] == ["10", "30", "40"]
-    assert rows[0].startswith("| one, NIS 0.90 | 10 | ")
-    assert "4%" in rows[1]
+def test_the_table_has_a_row_for_every_path():
+    found: dict[str, Any] = {"runs": 50, "steps": 40, **benchmark.numbers(records())}
+    told = benchmark.as_table({"handheld-a": {"one": found}, "tracks-b": {"one": found}})
+    assert told.startswith("`one`, 50 runs of 40 steps (simulated), 50 runs of 40 steps (tracks):")
+    rows = [line.split(" | ") for line in told.splitlines() if line.startswith("| ")][1:]
+    assert [row[0] for row in rows] == ["| a", "| tracks-b"]
+    one, median = found["one_scale"][-1], found["one_scale_median"]
+    assert rows[0][1] == f"{one:.2f}; {median[-1]:.2f}"
+    assert rows[0][2] == f"{median[0]:.2f} {median[1]:.2f}"
+    assert (rows[0][3], rows[0][-1]) == ("4%", "0.90 |")
+
+
+def test_the_page_has_the_numbers_on_disk():
+    folder = Path(__file__).resolve().parents[2]
+    results = json.loads((folder / "benchmarks/results/handheld.json").read_text())
+    page = " ".join((folder / "docs/handheld.md").read_text().split())
+    assert " ".join(benchmark.as_table(results).split()) in page
+    found = {where: next(iter(filters.values())) for where, filters in results.items()}
+    own = sorted(f["one_scale_median"][-1] for w, f in found.items() if w.startswith("handheld"))
+    assert f"is {own[0]:.1f} to {own[-1]:.1f} per degree of freedom" in page
+    assert (len(own), sum(x < 0.95 for x in own)) == (12, 7)
+    drifts = sorted(f["drift_normalised"][-1] for w, f in found.items() if w.startswith("handheld"))
+    assert f"is {drifts[0]:.1f} to {drifts[-2]:.1f} of its claimed σ" in page
+    (lost,) = (f["lost"][-1] for w, f in found.items() if w.startswith("tracks"))
+    assert f"{lost:.0%} of the runs are lost".replace("%", " %") in page
 
 
 @pytest.fixture
 def options(tmp_path, monkeypatch):
     """A folder of one trajectory and one drive."""
     monkeypatch.setenv("JAXSLAM_DATA", str(tmp_path))
+    (tmp_path / "handheld.md").write_text(f"{benchmark.MARK}\n{END}\n")
     (tmp_path / "trajectories").mkdir()
     (tmp_path / "kitti_tracks" / "street").mkdir(parents=True)
     times = np.arange(0, 2, 0.02)
@@ -100,7 +121,7 @@ def test_everything_in_the_folder_is_measured_and_only_once(options, capsys, mon
         assert (result["runs"], result["steps"]) == (runs, steps)
         assert result["at"] == [steps]
         assert result["one_scale"][0] is not None
-        assert where in (options.docs / "handheld.md").read_text()
+        assert where.removeprefix("handheld-") in (options.docs / "handheld.md").read_text()
     assert len(capsys.readouterr().out.splitlines()) == 2
 
     def again(*_):
