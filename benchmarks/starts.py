@@ -135,13 +135,13 @@ def as_table(results: dict[str, dict[str, Any]]) -> str:
     """Of all sequences, as Markdown."""
     header = (
         "sequence",
-        "starts of frames",
+        "starts × frames",
         "tracked",
         "maps",
         "reversed",
         "error, median, worst",
-        "beyond scale",
-        "lies",
+        "NEES/dof",
+        "beyond 5 σ",
     )
     return table(header, (_row(name, result) for name, result in results.items()))
 
@@ -151,7 +151,7 @@ def _row(name: str, result: dict[str, Any]) -> list[str]:
     tracked, maps, sign, error, beyond, lies = of_start.T
     return [
         name,
-        f"{len(of_start)} of {result['frames']}",
+        f"{len(of_start)} × {result['frames']}",
         f"{tracked.mean():.1%}",
         f"{maps.mean():.2g}",
         f"{np.sum(sign < 0)}",
