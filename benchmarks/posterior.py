@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from benchmark import RESULTS, Benchmark, number, table, write_table
+from consistency import label
 from exact_posterior.sampler import HMC
 from exact_posterior.study import Study, against_filter, converged, draw_runs, pooled, reference
 from exact_posterior.summary import summarise_filter, summarise_reference, summarise_sampler
@@ -181,7 +182,7 @@ def as_table(scenarios: dict[str, Any]) -> str:
     for name in names:
         of = (numbers["filters"].get(name) for numbers in found.values())
         cells = (_cell(f["kl"]["mean"], _sigma(f), f["nees"]) if f else "–" for f in of)
-        rows.append((f"`{name}`", *cells))
+        rows.append((f"`{label(name)}`", *cells))
     return table(["", *found], rows)
 
 
