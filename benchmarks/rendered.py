@@ -87,11 +87,11 @@ def measure(source) -> dict[str, Any]:
 def as_table(results: Results) -> str:
     """As Markdown: what the kinds are, and a row for each video."""
     kinds = dict.fromkeys(name.partition("+")[0] for name in results)
-    said = "; ".join(f"`{kind}`, {KINDS[kind].words}" for kind in kinds)
+    said = "\n".join(f"- `{kind}`: {KINDS[kind].words}" for kind in kinds)
     header = ("video, seed", "frames lost; maps", "loops", "error as it went; at the end")
     header += ("straight line", "orientation", "NEES/dof: mean; median", "beyond 5 σ", "drift")
     videos = ((name, seed, r) for name, seeds in results.items() for seed, r in seeds.items())
-    return f"The videos: {said}.\n\n{table(header, (_row(*video) for video in videos))}"
+    return f"{said}\n\n{table(header, (_row(*video) for video in videos))}"
 
 
 def _row(name: str, seed: str, r: dict[str, Any]) -> list[str]:

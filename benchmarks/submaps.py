@@ -97,8 +97,8 @@ class Submaps(Benchmark):
 def page(results: dict[str, Any]) -> str:
     """The table of all scenarios."""
     header = (
-        "scenario", "runs", "NEES now: one filter, submaps, after loops", "of old cameras: before, "
-        "after", "RMSE, m: before, after, batch", "lost", "loops: true, wrong believed",
+        "scenario", "runs", "NEES now: one filter, submaps, after loops", "NEES of old cameras: "
+        "before, after", "RMSE, m: before, after, batch", "lost", "loops: found, wrong",
     )  # fmt: skip
     rows = []
     for name, r in results.items():

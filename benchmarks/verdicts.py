@@ -167,13 +167,13 @@ def as_table(results: dict[str, Any]) -> str:
     """The worst of all degrees of freedom and series, by the number of runs."""
     header = (
         "runs",
-        "right: inconsistent",
-        "σ wrong by 1.3: consistent",
-        "found, by 1.1",
+        "consistent filter called inconsistent",
+        "σ wrong by 1.3 called consistent",
+        "σ wrong by 1.1 found",
         "by 1.3",
         "by 2",
-        "NEES/dof .7 → 1.3: found",
-        "heavy tails: truth in the interval",
+        "opposite faults found",
+        "heavy tails, truth in interval",
     )
     lines = []
     for runs in sorted({row["runs"] for row in results["by_factor"]}):
