@@ -190,8 +190,8 @@ def page(results: Results, verdicts: Path = VERDICTS) -> str:
         "- *NEES at steps*: the mean over all runs, bold inside its exact 95 % band.",
         "- *Lost*: the share of runs above the 99.99 % quantile of χ² at the last step; *ever*:",
         "  above a higher quantile, for so many steps, at any step.",
-        "- *Without lost; median*, RMSE and σ are of the last step. –: a run diverged, so there is",
-        "  no mean.",
+        "- *RMSE; σ* are those of the position at the last step. –: a run diverged, so there is no",
+        "  mean. Medians and means without lost runs are in `benchmarks/results/consistency.json`.",
     ]
     if any("drift" not in row for row in rows):
         lines += [
@@ -204,9 +204,8 @@ def page(results: Results, verdicts: Path = VERDICTS) -> str:
             f"## `{name}`",
             "",
             "| filter | runs | NEES, all steps | σ should be × | verdict | at one scale; drift "
-            f"| NEES at steps {', '.join(map(str, STEPS))}, last | without lost; median "
-            "| lost; ever | RMSE; σ, m |",
-            "|---|---|---|---|---|---|---|---|---|---|",
+            f"| NEES at steps {', '.join(map(str, STEPS))}, last | lost; ever | RMSE; σ, m |",
+            "|---|---|---|---|---|---|---|---|---|",
             *(_row(key, row) for key, row in filters.items()),
         ]
     return "\n".join([*lines, *_of_verdicts(verdicts)]) + "\n"
@@ -287,11 +286,10 @@ def _row(name: str, row: Row) -> str:
         f"`{label(name)}`{'' if 'drift' in row else ' †'}",
         f"{row['runs']}",
         _short(mean["nees"]),
-        _factor(mean),
+        _factor(mean, 2),
         f"{verdict['word']}{decided}",
         "; ".join(brief) or "–",
         " ".join(f"**{_short(n)}**" if low <= n <= high else _short(n) for n in nees),
-        f"{_short(row['nees_not_lost'])}; {_short(row['nees_median'])}",
         f"{row['lost'] / row['runs']:.2%}; {verdict['lost']:.2%}",
         f"{row['rmse']:.3f}; {row['sigma']:.3f}",
     ]

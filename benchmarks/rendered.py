@@ -88,8 +88,8 @@ def as_table(results: Results) -> str:
     """As Markdown: what the kinds are, and a row for each video."""
     kinds = dict.fromkeys(name.partition("+")[0] for name in results)
     said = "\n".join(f"- `{kind}`: {KINDS[kind].words}" for kind in kinds)
-    header = ("video, seed", "frames lost; maps", "loops", "error as it went; at the end")
-    header += ("straight line", "orientation", "NEES/dof: mean; median", "beyond 5 σ", "drift")
+    header = ("video, seed", "lost; maps", "loops", "error: as it went; at the end")
+    header += ("orientation", "NEES/dof: mean; median", "beyond 5 σ", "drift")
     videos = ((name, seed, r) for name, seeds in results.items() for seed, r in seeds.items())
     return f"{said}\n\n{table(header, (_row(*video) for video in videos))}"
 
@@ -101,11 +101,10 @@ def _row(name: str, seed: str, r: dict[str, Any]) -> list[str]:
         return number(r.get(key), form) + (unit if key in r else "")
 
     return [
-        f"`{name}`, {seed}",
+        f"{name.replace('+', ' + ')}, {seed}",
         f"{1 - r['tracked'] / r['frames']:.0%}; {r['maps']:.0f}",
         shown("loops", ".0f"),
         "; ".join(shown(key, ".2%") for key in ("causal", "error")),
-        shown("straight_line", ".1%"),
         shown("orientation", ".1f", "°"),
         "; ".join(shown(key, ".2g") for key in ("beyond_scale", "median_beyond_scale")),
         shown("lies", ".0%"),

@@ -136,8 +136,7 @@ def as_table(results: dict[str, dict[str, Any]]) -> str:
     header = (
         "sequence",
         "starts × frames",
-        "tracked",
-        "maps",
+        "tracked; maps",
         "reversed",
         "error, median, worst",
         "NEES/dof",
@@ -152,8 +151,7 @@ def _row(name: str, result: dict[str, Any]) -> list[str]:
     return [
         name,
         f"{len(of_start)} × {result['frames']}",
-        f"{tracked.mean():.1%}",
-        f"{maps.mean():.2g}",
+        f"{tracked.mean():.1%}; {maps.mean():.2g}",
         f"{np.sum(sign < 0)}",
         f"{np.nanmedian(error):.2f} %, {np.nanmax(error):.1f} %",
         f"{np.nanmedian(beyond):.2g}",
