@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,20 +84,16 @@ def page(summary: dict[str, Any]) -> str:
     few = ", ".join(str(n) for n in sorted(counts - {runs}))
     parts = [
         ANSWER,
-        "Mean NEES at the last step, whose ideal value is 3, and the share of runs lost there "
-        "(NEES above the 99.99 % quantile of χ²). The 95 % band of the mean of "
-        f"{runs} runs is {low:.2f}–{high:.2f}.",
-        _table(results, runs, _nees),
+        "Mean NEES at the last step, whose ideal value is 3; the share of runs lost there (NEES "
+        "above the 99.99 % quantile of χ²); σ over the RMSE of the position, ideally 1. "
+        f"The 95 % band of the mean NEES of {runs} runs is {low:.2f}–{high:.2f}.",
+        _table(results, runs),
         f"†: fewer runs, {few or 'none'} in place of {runs}.",
-        "## Error, σ and time",
-        "RMSE of the position at the last step in m; σ/RMSE, which is 1 for a right σ; µs a step "
-        "of one run in a batch, on a machine that other programs shared.",
-        _table(results, runs, _errors),
         "## The parametrizations",
         landmark_table(jaxslam.LANDMARKS.values()),
-        f"`python benchmarks/comparison.py` writes this page from {runs} runs of every filter on "
-        f"the same worlds (seed {summary['seed']}, {summary['device']}, float64). The median NEES "
-        "and the share of steps inside the band are in `benchmarks/results/comparison.json`.",
+        f"`python benchmarks/comparison.py` writes this page, with seed {summary['seed']} for all "
+        "filters. RMSE, medians, the share of steps inside the band and times are in "
+        "`benchmarks/results/comparison.json`.",
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -111,28 +107,20 @@ most runs outside of `circle`. In a world frame Inverse Scaling is far worse, wh
 parametrizations hardly change."""
 
 
-def _nees(found: dict[str, Any]) -> str:
-    return f"{number(found['nees'])}; {found['lost']:.1%}{_diverged(found)}"
+def _cell(found: dict[str, Any] | None, runs: int) -> str:
+    if found is None:
+        return "–"
+    diverged = f" ({found['diverged']} diverged)" if found["diverged"] else ""
+    few = "" if found["runs"] == runs else " †"
+    ratio = number(found["sigma_over_rmse"])
+    return f"{number(found['nees'])}; {found['lost']:.0%}{diverged}; {ratio}{few}"
 
 
-def _diverged(found: dict[str, Any]) -> str:
-    return f" ({found['diverged']} diverged)" if found["diverged"] else ""
-
-
-def _errors(found: dict[str, Any]) -> str:
-    rmse, ratio = number(found["rmse"], ".3f"), number(found["sigma_over_rmse"])
-    return f"{rmse}; {ratio}; {found['microseconds_per_step']:.0f}"
-
-
-def _table(
-    results: dict[str, dict[str, Any]], runs: int, cell: Callable[[dict[str, Any]], str]
-) -> str:
+def _table(results: dict[str, dict[str, Any]], runs: int) -> str:
     """A row for each filter, a column for each scenario."""
-    names = list(dict.fromkeys(name for filters in results.values() for name in filters))
     rows = []
-    for name in names:
-        found = (filters.get(name) for filters in results.values())
-        cells = (f"{cell(f)}{' †' if f['runs'] != runs else ''}" if f else "–" for f in found)
+    for name in dict.fromkeys(name for filters in results.values() for name in filters):
+        cells = (_cell(filters.get(name), runs) for filters in results.values())
         rows.append([name.replace("/", " "), *cells])
     return table(["frame, landmark", *(f"`{name}`" for name in results)], rows)
 

@@ -8,7 +8,7 @@ tracked, and synthetic videos of five seeds, of which the truth is known, and so
 pose at the one scale of its map. Elsewhere only NIS says whether a filter believes its measurements
 rightly: its mean per degree of freedom is 1 if pixels and motion are as assumed. How far the scale
 drifts, in what the filter claims of that, is told wherever there is a reference. Results go to
-`sequences.json`; `docs/sequences.md` and a table of `docs/results.md` are written from all of them,
+`sequences.json`; `docs/sequences.md` and what `docs/results.md` says are written from all of them,
 by `--page` from what is there.
 """
 
@@ -31,8 +31,8 @@ from jaxslam.tracking.settings import TrackerSettings
 
 FRAMES = (30, 149)
 """Whose pose is compared with the truth, where that is known."""
-MARK = "<!-- sequences.py -->"
-"""Where `summary` stands in `docs/results.md`."""
+MARK = "<!-- sequences.py, in words -->"
+"""Where `words` stand in both pages."""
 LANDMARKS = "inverse_scaling"
 SEEDS = range(5)
 """Of synthetic videos."""
@@ -77,7 +77,7 @@ class Sequences(Benchmark):
     def report(self, results: Results) -> None:
         for mark, part in PARTS.items():
             write_table(self.docs / "sequences.md", mark, part(results))
-        write_table(self.docs / "results.md", MARK, summary(results))
+        write_table(self.docs / "results.md", MARK, words(results))
 
 
 def measure(source, settings: TrackerSettings, *, exact: bool) -> dict[str, Any]:
@@ -168,13 +168,14 @@ def words(results: Results) -> str:
     errors = {name: r["error"] / r["path"] for name, r in own.items()}
     worst = max(errors, key=lambda name: errors[name])
     median = sorted(errors.values())[len(errors) // 2]
+    upright = all(r["sign"] > 0 for r in own.values())
     straight = [f"`{name}`" for name, r in own.items() if r["straight_line"] <= r["error"]]
     return (
         f"`jaxslam track` follows {tracked} of {frames} frames of {len(own)} videos with one "
         f"setting for all. After alignment by a similarity, the RMS error of the trajectory is "
         f"{median:.2%} of the path on the median video, and {errors[worst]:.2%} on the worst, "
         f"`{worst}`. A straight line at constant speed, which uses no image, is at least as good "
-        f"on {' and '.join(straight) or 'none'}."
+        f"on {' and '.join(straight) or 'none'}.{' No world is reversed.' * upright}"
     ).replace("%", " %")
 
 
@@ -214,7 +215,7 @@ def _claims(r: dict[str, Any]) -> str:
 
 def details_table(results: Results) -> str:
     """All else of the recommended filter."""
-    header = ("video", "matches", "sign", "in 1 s", "NIS/dof", "ungated", "drift", "ms; p99")
+    header = ("video", "matches", "orientation", "in 1 s", "NIS/dof", "ungated", "drift", "ms; p99")
     return table(header, (_details(n, f[OWN]) for n, f in results.items() if OWN in f))
 
 
@@ -223,7 +224,7 @@ def _details(name: str, r: dict[str, Any]) -> list[str]:
     return [
         name,
         f"{r['matches_per_frame']:.1f}",
-        f"{r['sign']:.2f}",
+        f"{r['orientation']:.1f}°",
         f"{relative[0]:.1%}, {relative[1]:.2f}°" if relative else "–",
         number(r["nis_per_dof"]),
         f"{r['ungated'][0]:.2f}, {r['ungated'][1]:.1%}" if r["ungated"] else "–",
@@ -232,23 +233,8 @@ def _details(name: str, r: dict[str, Any]) -> list[str]:
     ]
 
 
-def summary(results: Results) -> str:
-    """The table of docs/results.md: the recommended filter."""
-    header = ("video", "tracked", "error; straight line", "orientation", "in 1 s", "NEES/dof")
-    rows = []
-    for name, filters in results.items():
-        if not (r := filters.get(OWN)) or not r["error"]:  # not measured, or without a reference
-            continue
-        nees = "–" if not r["beyond_scale"] else f"{r['beyond_scale']['mean']:.2g}"
-        error, straight = (_share(r, key) for key in ("error", "straight_line"))
-        turn, moved = f"{r['orientation']:.2f}°", f"{r['relative'][0]:.1%}"
-        frames, drift = f"{r['tracked']} of {r['frames']}", f"{r['drift'][1]:.2g} σ"
-        rows.append((name, frames, f"{error}; {straight}", turn, moved, nees, drift))
-    return table((*header, "drift of scale"), rows)
-
-
 PARTS = {
-    "<!-- sequences.py, in words -->": words,
+    MARK: words,
     "<!-- sequences.py, errors -->": errors_table,
     "<!-- sequences.py, claims -->": claims_table,
     "<!-- sequences.py, details -->": details_table,

@@ -144,8 +144,8 @@ def test_a_row_says_what_was_lost_and_which_means_are_in_the_band():
     at_steps = row.split("|")[7].split()
     assert all(float(value) > 3.3 for value in at_steps)
     assert "| 2.00%; 2.10% |" in row
-    header = benchmark.page({"m": {}}, Path("none")).splitlines()[-1]
-    assert len(row.split("|")) == len(header.split("|"))
+    lines = [row, *benchmark.page({"m": {}}, Path("none")).splitlines()[-3:]]
+    assert {line.count("|") for line in lines} == {benchmark.COLUMNS + 1}
     nees[:, 4] /= 1.2
     row = benchmark._row("x/y", measured(nees, 4))
     assert row.split("|")[7].split()[0].startswith("**")
@@ -200,8 +200,10 @@ def test_the_page_says_how_rarely_a_verdict_is_wrong():
 def test_the_tables_of_the_pages_say_what_the_numbers_on_disk_say():
     folder = Path(__file__).resolve().parents[2]
     results = benchmark.read(folder / "benchmarks/results/consistency.json")
-    for page, scenarios in (("README.md", benchmark.IN_README), ("docs/results.md", results)):
-        table = benchmark.recommended(results, scenarios)
+    for page, table in {
+        "README.md": benchmark.recommended(results, benchmark.IN_README),
+        "docs/results.md": benchmark.beside(results),
+    }.items():
         assert f"{benchmark.MARK}\n\n{table}\n\n" in (folder / page).read_text(), page
     assert (folder / "docs/consistency.md").read_text() == benchmark.page(
         results, folder / "benchmarks/results/verdicts.json"
