@@ -1,0 +1,89 @@
+"""The pages are in plain English, as far as that can be checked."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+LONGEST = 45
+"""Words of a sentence."""
+DIALECT = {
+    r"told (apart|nothing|of)|tells? nothing|(is|are|was|were|not) told": "given, known; shows",
+    r"sets? out\b": "starts",
+    r"beyond doubt": "certain",
+    r"nobody|somebody|anybody": "name who, or use the passive",
+    r"stands? still": "hangs; is at rest",
+    r"(is|are|was|were) laid on": "is aligned with",
+    r"at the (most|least)": "at most, at least",
+    r"give or take": "a factor of",
+    r"(made|rendered|drawn) on the spot": "say where",
+    r"all the same": "nevertheless",
+    r"in silence": "silently",
+    r"the very same": "the same",
+    r"(one|once) a (run|map|line|page|frame|step|question|pose)": "per",
+    r"(is|are|was|were) to be \w+ed": "must be",
+    r"begun|mended|by oversight|beware": "started; repaired; by mistake; note",
+    r"of one's own|of ones own": "your own",
+    r"what (is|was) (it|this) worth": "how well this works",
+    r"upon|whilst|thereof|therein|whereof|thereby": "on, while, of it",
+    r"apart from each other|far from one another": "apart",
+}
+"""Words that no technical writer of English uses so, and what to write."""
+AMERICAN = (
+    r"\b(\w+(?<!horiz)(?<!s)ization|(?:in)?itializ\w+|lineariz\w+|marginaliz\w+|normaliz\w+"
+    r"|optimiz\w+|recogniz\w+|summariz\w+|minimiz\w+|maximiz\w+|localiz\w+|behavior\w*|color\w*"
+    r"|center\w*|neighbor\w*|labeled|modeled|modeling|gray|meters?|favor\w*|analyze\w*)\b"
+)
+"""Spellings that would mix with those of the pages: British, but for *parametrization*."""
+SPELT_SO = re.compile("parametri[sz]ation|Relocalization|-optimiz", re.IGNORECASE)
+
+EXCEPTIONS: dict[str, int] = {}
+"""Pages that break so many rules at most. This list only becomes shorter, its numbers smaller."""
+
+
+def prose(text: str) -> list[str]:
+    """Paragraphs, items of lists and headings, without code, tables and generated output."""
+    text = re.sub(r"```.*?```|<!--.*?-->|\$\$.*?\$\$|\{py:obj\}|^---$.*?^---$", "", text, flags=re.S | re.M)
+    blocks, found = re.split(r"\n\s*\n|\n(?=\s*[-*] |\s*\d+\. |#|\||: )", text), []
+    for block in blocks:
+        first = block.strip("\n")
+        if not first or first.startswith("    ") or first.lstrip().startswith("|"):
+            continue
+        words = re.sub(r"^\s*([-*:#]+|\d+\.)\s", "", first)
+        words = re.sub(r"!?\[([^]]*)\]\([^)]*\)", r"\1", words)
+        words = re.sub(r"`[^`]*`|\$[^$]*\$", "CODE", words)
+        found.append(" ".join(words.replace("*", "").split()))
+    return found
+
+
+def sentences(paragraph: str) -> list[str]:
+    """A full stop, question or exclamation mark ends one, and so does an abbreviated list."""
+    return re.split(r"(?<=[.!?])[)”\"]?\s+(?=[A-Z“\"(])", paragraph)
+
+
+def broken(text: str) -> list[str]:
+    """What is against the rules."""
+    wrong = []
+    for paragraph in prose(text):
+        for sentence in sentences(paragraph):
+            count = len(re.findall(r"\w[\w’'-]*", sentence))
+            if count > LONGEST:
+                wrong.append(f"{count} words: {sentence[:60]} …")
+        for words, better in DIALECT.items():
+            for match in re.finditer(rf"\b(?:{words})\b", paragraph, re.IGNORECASE):
+                wrong.append(f"“{match[0]}” ({better}): … {paragraph[max(match.start() - 30, 0):][:70]} …")
+        for match in re.finditer(AMERICAN, paragraph):
+            if not SPELT_SO.search(match[0]):
+                wrong.append(f"American spelling: {match[0]}")
+        for match in re.finditer(r"\b([a-z]+) \1\b", paragraph):
+            wrong.append(f"a word twice: {match[0]}")
+    return wrong
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_pages_keep_the_rules(page):
+    found = broken(page.read_text())
+    assert len(found) <= EXCEPTIONS.get(page.name, 0), "\n".join(["", *found])
