@@ -26,9 +26,8 @@ def anchors(path: Path) -> set[str]:
 def broken(path: Path) -> list[str]:
     """Links and pictures of a document that lead nowhere in the repository."""
     wrong = []
-    for link in re.findall(
-        r"\]\(([^)\s]+)\)", re.sub(r"```.*?```", "", path.read_text(), flags=re.S)
-    ):
+    text = re.sub(r"```.*?```", "", path.read_text(), flags=re.S)
+    for link in re.findall(r"""(?:\]\(|src=")([^)"\s]+)[)"]""", text):
         place, _, anchor = link.partition("#")
         target = (path.parent / place).resolve() if place else path
         if "://" in link or place.startswith("tutorials/"):
@@ -45,9 +44,9 @@ def test_links_lead_to_what_is_there(document):
 
 def test_a_link_that_leads_nowhere_is_found(tmp_path):
     (tmp_path / "a.md").write_text(
-        "# One, two\n[x](b.md) [y](#one-two) [z](#three) [w](a.md#one-two)"
+        '# One, two\n[x](b.md) [y](#one-two) [z](#three) [w](a.md#one-two) <img src="c.png">'
     )
-    assert broken(tmp_path / "a.md") == ["b.md", "#three"]
+    assert broken(tmp_path / "a.md") == ["b.md", "#three", "c.png"]
 
 
 def test_every_page_and_notebook_is_in_the_site():
