@@ -100,6 +100,14 @@ def cut(seed: int) -> Disturbed:
     return Disturbed(_changed(source, during, lambda f: other[f.index].image), T_wc, during)
 
 
+def cut_back(seed: int) -> Disturbed:
+    """3 s of another room, and this one again, a little further on."""
+    source, other, during = _source(240, seed), list(_source(240, seed + 1000)), range(80, 170)
+    T_wc = _of(source, during)[0].copy()
+    T_wc[during.start : during.stop] = np.nan
+    return Disturbed(_changed(source, during, lambda f: other[f.index].image), T_wc, during)
+
+
 def hand(seed: int) -> Disturbed:
     """A hand, blurred, goes across in front of the lens."""
     source, during = _source(180, seed), range(60, 100)
@@ -171,6 +179,7 @@ def _set_out(count: int, seed: int) -> np.ndarray:
 DISTURBANCES: dict[str, tuple[Callable[[int], Disturbed], str]] = {
     "black": (black, "5 s black"),
     "cut": (cut, "a cut to another room"),
+    "cut_back": (cut_back, "3 s of another room, and back"),
     "hand": (hand, "a hand in front, 1.3 s"),
     "scattered": (scattered, "half of the matches wrong, each differently, 4 s"),
     "half_wrong": (half_wrong, "half of the image moves differently, 4 s"),

@@ -20,9 +20,10 @@ import tyro
 from benchmark import RESULTS, Benchmark, data_folder, table, write_table
 
 from jaxslam.io.opening import open_source
-from jaxslam.io.source import Frame
+from jaxslam.io.source import Frame, Source
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.tracker import Tracker
+from jaxslam.tracking.trajectory import absolute_trajectory_error
 
 BLOCK = 1000
 """Frames of a row."""
@@ -49,15 +50,20 @@ class Endurance(Benchmark):
         source = open_source(self.sequence)
         tracker = Tracker(source.calibration, TrackerSettings(filter=self.filter))
         tracker.compile()
-        rows, seconds, tracked = [], [], []
-        for frame in to_and_fro(list(source), self.frames):
-            start = time.perf_counter()
-            tracked.append(tracker.track(frame).state == "tracked")
-            seconds.append(time.perf_counter() - start)
+        rows, seconds, tracked, cameras = [], [], [], {}
+        still = to_and_fro(list(source), self.frames)
+        for index, (frame, when) in enumerate(still):
+            start = time.process_time()
+            result = tracker.track(frame)
+            seconds.append(time.process_time() - start)
+            tracked.append(result.state == "tracked")
+            if tracked[-1] and result.map == 0:
+                cameras[index] = when, result.T_wc
             if len(seconds) == BLOCK:
                 median, p99 = 1e3 * np.quantile(seconds, [0.5, 0.99])
                 row = frame.index + 1, np.mean(tracked), tracker.restarts + 1, median, p99
-                rows.append([round(float(x), 3) for x in (*row, resident(), tracker.deleted)])
+                row = *row, resident(), tracker.deleted, _error(cameras, source)
+                rows.append([round(float(x), 3) for x in row])
                 print(rows[-1], flush=True)
                 seconds, tracked = [], []
                 yield {"sequence": source.name, "filter": tracker.filter_name, "rows": rows}
@@ -76,13 +82,27 @@ class Endurance(Benchmark):
         write_table(self.docs / "stress.md", MARK, table(header, rows))
 
 
-def to_and_fro(frames: Sequence[Frame], count: int) -> Iterator[Frame]:
-    """So many frames: the first to the last, back to the first, and so on, at an even rate."""
+def _error(cameras: dict[int, tuple[float, np.ndarray]], source: Source) -> float:
+    """RMS of all positions of the first map so far, aligned by one Sim(3), in percent of the
+    length of the sequence once through; NaN without a reference."""
+    if source.reference is None:
+        return np.nan
+    times, true = source.reference
+    pairs = [(T, true[np.argmin(np.abs(times - when))]) for when, T in cameras.values()]
+    each = np.arange(len(pairs), dtype=float)
+    estimate, reference = (np.array(part) for part in zip(*pairs, strict=True))
+    error = absolute_trajectory_error(each, estimate, each, reference)["rmse"]
+    return 100 * error / float(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum())
+
+
+def to_and_fro(frames: Sequence[Frame], count: int) -> Iterator[tuple[Frame, float]]:
+    """So many frames, and when each was taken: the first to the last, back to the first, and so
+    on, at an even rate."""
     period = (frames[-1].time - frames[0].time) / (len(frames) - 1)
     there_and_back = [*range(len(frames)), *range(len(frames) - 2, 0, -1)]
     for index in range(count):
-        image = frames[there_and_back[index % len(there_and_back)]].image
-        yield Frame(index, index * period, image)
+        taken = frames[there_and_back[index % len(there_and_back)]]
+        yield Frame(index, index * period, taken.image), taken.time
 
 
 def resident() -> float:

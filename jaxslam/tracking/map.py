@@ -32,16 +32,23 @@ class Remembered:
     """A map as it was in the latest frame in which it was seen."""
 
     number: int
+    submap: int
+    """The number of the submap that goes on."""
     state: Belief
     landmarks: dict[int, Landmark]
     place: MapInWorld
     submaps: tuple[Submap, ...] = ()
+    """Those that ended …"""
     loops: tuple[LoopClosure, ...] = ()
+    """… the loops that join them …"""
+    earlier: tuple[Remembered, ...] = ()
+    """… and the map as it was when each of them had just ended."""
 
     def graph(self, settings: TrackerSettings, slam: AbstractStaged) -> Graph:
         """Return its submaps and loops, of this filter."""
         numbers = slot_numbers(self.landmarks, settings.capacity)
-        present, _ = handed_over(slam, self.state, numbers, self.place.camera)
+        camera = self.place.camera
+        present, _ = handed_over(slam, self.state, numbers, camera, number=self.submap)
         return Graph(slam, self.submaps, present, self.loops, settings.wanted)
 
 
@@ -64,10 +71,16 @@ class Map:
     """The map as it was last seen, while the camera is lost and its unit is fixed …"""
     left: list[Remembered] = field(default_factory=list)
     """… and others, the latest last."""
+    submap: int = 0
+    """The number of the submap, the first of all maps being 0 …"""
+    latest_submap: int = 0
+    """… and the greatest so far."""
     submaps: tuple[Submap, ...] = ()
-    """Of this map, those that ended …"""
+    """Of this map, those that ended, …"""
     loops: tuple[LoopClosure, ...] = ()
-    """… and the loops that join them."""
+    """… the loops that join them, …"""
+    earlier: tuple[Remembered, ...] = ()
+    """… and the map as it was when each had just ended."""
     charted: dict[int, Landmark] = field(default_factory=dict)
     """The landmarks of all submaps that ended, by their numbers, as they were last."""
 
@@ -88,6 +101,11 @@ class Map:
     def graph(self) -> Graph:
         """Return the submaps and loops of this map."""
         return self.now().graph(self.settings, self.estimator.slam)
+
+    def described(self) -> dict[int, Landmark]:
+        """Return the landmarks of all maps that are known, by their numbers."""
+        latest = [one for known in self.known() for one in known.landmarks.values()]
+        return self.charted | {one.number: one for one in latest}
 
     def note(self, seen: Observations) -> None:
         """Note what was found of the landmarks, and give up those that are searched in vain."""
@@ -126,9 +144,14 @@ class Map:
         """End the submap at the camera, where this picture was taken."""
         note_looks(self.landmarks.values(), image)
         estimator, numbers = self.estimator, slot_numbers(self.landmarks, self.settings.capacity)
-        ended, state = handed_over(estimator.slam, estimator.state, numbers, self.place.camera)
+        camera = self.place.camera
+        ended, state = handed_over(
+            estimator.slam, estimator.state, numbers, camera, number=self.submap
+        )
         estimator.state = state
         self.submaps = (*self.submaps, ended)
+        self._begin_submap()
+        self.earlier = (*self.earlier, self.now())
         self.charted |= {one.number: replace(one) for one in self.landmarks.values()}
         if len(self.submaps) == 1:
             self.graph().compile()
@@ -141,6 +164,12 @@ class Map:
             one.first_camera = moved @ one.first_camera
         *before, ended = self.submaps
         self.submaps = (*before, replace(ended, camera=self.place.camera))
+        self.earlier = (*self.earlier[:-1], replace(self.now(), earlier=self.earlier[:-1]))
+
+    def _begin_submap(self) -> None:
+        """Give a number to the submap that begins."""
+        self.latest_submap += 1
+        self.submap = self.latest_submap
 
     def restart(self) -> None:
         """Give up all landmarks: another map begins where the camera is."""
@@ -149,8 +178,7 @@ class Map:
         self.latest += 1
         self.number = self.latest
         self.place.restart()
-        self.submaps, self.loops = (), ()
-        self.estimator.clear()
+        self._begin_chain()
 
     def leave(self) -> None:
         """Give up all landmarks: what comes next is in another world, unless it is known."""
@@ -174,29 +202,50 @@ class Map:
         """Return the map as it is."""
         kept = {slot: replace(one) for slot, one in self.landmarks.items()}
         place, state = replace(self.place), self.estimator.state
-        return Remembered(self.number, state, kept, place, self.submaps, self.loops)
+        chain = self.submaps, self.loops, self.earlier
+        return Remembered(self.number, self.submap, state, kept, place, *chain)
 
     def known(self) -> list[Remembered]:
         """Return this map as it was last seen, and those that were left, the latest first."""
         return [*([] if self.seen is None else [self.seen]), *reversed(self.left)]
 
+    def places(self) -> list[Remembered]:
+        """Return the maps that are `known`, and these as each submap of them began."""
+        latest = self.known()
+        earlier = {id(one): one for known in latest for one in known.earlier[::-1]}
+        return [*latest, *earlier.values()]
+
     def become(self, known: Remembered) -> None:
         """Be the map that was remembered."""
-        self.number, self.estimator.state = known.number, known.state
+        self.number, self.submap, self.estimator.state = known.number, known.submap, known.state
         self.landmarks = {slot: replace(one) for slot, one in known.landmarks.items()}
         self.place = replace(known.place)
-        self.submaps, self.loops = known.submaps, known.loops
+        self.submaps, self.loops, self.earlier = known.submaps, known.loops, known.earlier
 
-    def come_back(self, known: Remembered) -> None:
-        """Leave this map for one that was remembered."""
-        if known.number != self.number:
+    def come_back(self, known: Remembered, found: Remembered) -> None:
+        """Leave this map for one that was `known`, as it is now that it is `found`.
+
+        Where that is an earlier submap, the next one is of another branch than what came after it,
+        which is kept as one more map that was left.
+        """
+        latest = any(known is one for one in self.known())
+        if known is not self.seen:
             self.give_up(sorted(self.landmarks))
             self._keep()
-            self.left = [one for one in self.left if one.number != known.number]
-        self.become(known)
+        self.left = [one for one in self.left if one is not known]
+        self.become(found)
+        if not latest:
+            self.earlier = (*known.earlier, known)
+            self._begin_submap()
         self.seen = None
-        back = [one.number for one in known.landmarks.values()]
+        back = [one.number for one in found.landmarks.values()]
         self.finished = [points.only(~np.isin(points.numbers, back)) for points in self.finished]
+
+    def _begin_chain(self) -> None:
+        """Begin with nothing."""
+        self._begin_submap()
+        self.submaps, self.loops, self.earlier = (), (), ()
+        self.estimator.clear()
 
     def fall_back(self, predicted: Predicted) -> None:
         """Give up all landmarks and go on by what prediction alone says of the camera: the update
@@ -211,8 +260,7 @@ class Map:
         was last as the prior on a start's velocity lets it be."""
         if self.estimator.correct(predicted).failed:
             self.place.restart_in_metres()
-            self.submaps, self.loops = (), ()
-            self.estimator.clear()
+            self._begin_chain()
             self.estimator.correct(self.estimator.predict(predicted.dt))
 
     def give_up(self, slots: list[int], recorded: Points | None = None) -> None:
@@ -267,7 +315,7 @@ class Map:
         points, covariances = (part[slots] for part in self.estimator.points())
         numbers = np.array([self.landmarks[slot].number for slot in slots], int)
         maps = np.full_like(numbers, self.number)
-        submaps = np.full_like(numbers, len(self.submaps))
+        submaps = np.full_like(numbers, self.submap)
         return Points(numbers, maps, submaps, *self.place.points(points, covariances))
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from operator import attrgetter
 from pathlib import Path
@@ -27,10 +27,11 @@ from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.unit import MapInWorld
 
-FORMAT = "jaxslam tracker 6"
+FORMAT = "jaxslam tracker 7"
 
 NUMBERS = {
     "restarts": "map.latest",
+    "submaps": "map.latest_submap",
     "reversed": "reversed",
     "refused": "refused",
     "steps": "steps",
@@ -73,22 +74,36 @@ def save(path: str | Path, tracker: Resumable, filter_name: str | None) -> None:
         "numbers": {"created": kept.created, "deleted": kept.deleted, **numbers},
         "failed": dict(tracker.failed),
     }
-    # The map as it is, and those that it may come back to.
-    remembered = [kept.now(), *kept.known()]
+    # The map as it is, those that it may come back to, and all as their submaps began: once each.
+    latest = [kept.now(), *kept.known()]
+    maps = _Once(one for last in latest for one in (*last.earlier, last))
+    submaps = _Once(one for map in maps.all for one in map.submaps)
+    loops = _Once(one for map in maps.all for one in map.loops)
     header["maps"] = [
         {
             "number": one.number,
-            "submaps": len(one.submaps),
-            "loops": len(one.loops),
+            "submap": one.submap,
+            "submaps": submaps.places(one.submaps),
+            "loops": loops.places(one.loops),
+            "earlier": maps.places(one.earlier),
             **{name: getattr(one.place, name) for name in _OF_PLACE},
         }
-        for one in remembered
+        for one in maps.all
     ]
-    header["seen"] = kept.seen is not None
+    header["submaps"] = [one.number for one in submaps.all]
+    header["loops"] = len(loops.all)
+    header["latest"], header["seen"] = maps.places(latest), kept.seen is not None
     arrays = dict(joined([NO_POINTS, *kept.finished])._asdict())
     arrays |= {f"charted/{name}": array for name, array in stacked(kept.charted).items()}
-    for i, one in enumerate(remembered):
-        arrays |= {f"{i}/{name}": array for name, array in _arrays(one).items()}
+    for i, one in enumerate(maps.all):
+        poses = [_pair(getattr(one.place, name)) for name in _POSES]
+        own = leaves(one.state, "state") | leaves(poses, "poses") | stacked(one.landmarks)
+        arrays |= {f"{i}/{name}": array for name, array in own.items()}
+    for i, submap in enumerate(submaps.all):
+        parts = submap.frozen, submap.points, submap.covariances, *_pair(submap.camera)
+        arrays |= leaves(parts, f"submap {i}")
+    for i, loop in enumerate(loops.all):
+        arrays |= leaves(loop, f"loop {i}")
     write_record(path, header, arrays)
 
 
@@ -128,22 +143,24 @@ def _restore(
     kept.finished.append(Points(*(arrays[name] for name in Points._fields)))
     with jax.enable_x64(True):
         kept.charted = unstacked(_of(arrays, "charted"))
-        now, *known = [_remembered(told, arrays, i, kept) for i, told in enumerate(header["maps"])]
+        maps = _remembered(header, arrays, kept)
+        now, *known = [maps[place] for place in header["latest"]]
         kept.become(now)
         kept.measure_unit()
     kept.seen = known.pop(0) if header["seen"] else None
     kept.left = known[::-1]
 
 
-def _arrays(one: Remembered) -> dict[str, np.ndarray]:
-    poses = [_pair(getattr(one.place, name)) for name in _POSES]
-    arrays = {**leaves(one.state, "state"), **leaves(poses, "poses"), **stacked(one.landmarks)}
-    for i, submap in enumerate(one.submaps):
-        parts = submap.frozen, submap.points, submap.covariances, *_pair(submap.camera)
-        arrays |= leaves(parts, f"submap {i}")
-    for i, loop in enumerate(one.loops):
-        arrays |= leaves(loop, f"loop {i}")
-    return arrays
+class _Once:
+    """Objects, of which several maps may have the same, each once."""
+
+    def __init__(self, some: Iterable[Any]) -> None:
+        self.all = list({id(one): one for one in some}.values())
+
+    def places(self, some: Iterable[Any]) -> list[int]:
+        """Return where these are."""
+        place = {id(one): i for i, one in enumerate(self.all)}
+        return [place[id(one)] for one in some]
 
 
 def _pair(pose: PoseWithCovariance) -> tuple[np.ndarray, np.ndarray]:
@@ -157,25 +174,33 @@ def _of(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
 
 
 def _remembered(
-    told: Mapping[str, Any], arrays: Mapping[str, np.ndarray], i: int, kept: Map
-) -> Remembered:
-    """The i-th of the maps in the file, of a tracker that keeps such maps."""
-    own, like, slam = _of(arrays, str(i)), kept.estimator.state, kept.estimator.slam
-    place = MapInWorld(**{name: told[name] for name in _OF_PLACE})
-    for k, name in enumerate(_POSES):
-        pose = PoseWithCovariance(own[f"poses/{2 * k}"], own[f"poses/{2 * k + 1}"])
-        setattr(place, name, pose)
-    submaps, loops = [], []
-    if told["submaps"]:
-        ended = *shapes(slam, like, kept.settings.capacity), np.zeros((4, 4)), np.zeros((6, 6))
-        for k in range(told["submaps"]):
-            frozen, *rest = grown(ended, own, f"submap {k}")
+    header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], kept: Map
+) -> list[Remembered]:
+    """All maps in the file, of a tracker that keeps such maps."""
+    like, slam, settings = kept.estimator.state, kept.estimator.slam, kept.settings
+    submaps, loops, maps = [], [], []
+    if header["submaps"]:
+        ended = *shapes(slam, like, settings.capacity), np.zeros((4, 4)), np.zeros((6, 6))
+        for k, number in enumerate(header["submaps"]):
+            frozen, *rest = grown(ended, arrays, f"submap {k}")
             points, covariances, *pose = map(np.asarray, rest)
-            submaps.append(Submap(frozen, points, covariances, PoseWithCovariance(*pose)))
-        nothing = no_loop(kept.settings.wanted, submaps[0].frozen.state.landmarks.shape[1])
-        loops += [grown(nothing, own, f"loop {k}") for k in range(told["loops"])]
-    state = grown(like, own, "state")
-    return Remembered(told["number"], state, unstacked(own), place, tuple(submaps), tuple(loops))
+            camera = PoseWithCovariance(*pose)
+            submaps.append(Submap(frozen, points, covariances, camera, number))
+        nothing = no_loop(settings.wanted, submaps[0].frozen.state.landmarks.shape[1])
+        loops += [grown(nothing, arrays, f"loop {k}") for k in range(header["loops"])]
+    for i, told in enumerate(header["maps"]):
+        own = _of(arrays, str(i))
+        place = MapInWorld(**{name: told[name] for name in _OF_PLACE})
+        for k, name in enumerate(_POSES):
+            pose = PoseWithCovariance(own[f"poses/{2 * k}"], own[f"poses/{2 * k + 1}"])
+            setattr(place, name, pose)
+        chain = (
+            tuple(of_all[k] for k in told[name])
+            for name, of_all in (("submaps", submaps), ("loops", loops), ("earlier", maps))
+        )
+        numbers, state = (told["number"], told["submap"]), grown(like, own, "state")
+        maps.append(Remembered(*numbers, state, unstacked(own), place, *chain))
+    return maps
 
 
 def write_record(

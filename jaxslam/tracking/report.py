@@ -51,7 +51,7 @@ class Tracked:
     loop: int | None = None
     """Number of the submap whose landmarks the frame shows again, where that closes a loop."""
     submap: int = 0
-    """Number of the submap within its map."""
+    """Number of the submap, among those of all maps."""
     map: int = 0
     """Number of the map; each has a unit of length of its own."""
     log_scale: float | None = None
@@ -76,7 +76,7 @@ class Tracked:
             place.camera,
             observations,
             map=map.number,
-            submap=len(map.submaps),
+            submap=map.submap,
             log_scale=None if doubt is None else place.log_scale,
             sigma_log_scale=doubt,
             sights={one.number: one.seen_at for one in map.landmarks.values() if not one.unseen},
@@ -148,8 +148,8 @@ def write_frames(path: str | Path, history: list[Tracked]) -> None:
     map's start is being found out, when the filter changes its unit with every frame, else 1.
     `reason` is why the camera is lost (`Lost`), empty where it is not; `relocalised` is 1 where a
     camera that was lost is known to be back in a map that it had seen, whose number it then is.
-    `submap` counts the submaps of a map, and `loop` is the number of an earlier one that is known
-    again at this frame.
+    `submap` is the number of the submap, from 0 through all maps, and `loop` that of an earlier one
+    of the map that is known again at this frame.
     """
     with write_atomically(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")

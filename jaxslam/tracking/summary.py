@@ -71,7 +71,7 @@ def summarised(
         "restarts": tracker.restarts,
         "maps": max(1, len({result.map for result in history if result.starts or not result.lost})),
         "relocalised": sum(result.relocalised for result in history),
-        "submaps": len({(result.map, result.submap) for result in history}),
+        "submaps": len({result.submap for result in history}),
         "loops": sum(result.loop is not None for result in history),
         "loops_refused": tracker.refused,
         "units": _units(history),

@@ -168,12 +168,8 @@ def _draw_map(
     out: Path,
 ) -> None:
     write_ply(out / "map.ply", known.points, known.covariances, known.numbers, known.maps)
-    ends = {(r.map, r.submap - 1): r.T_wc[:3, 3] for r in reversed(history)}
-    loops = [
-        (r.T_wc[:3, 3], ends[r.map, r.loop])
-        for r in history
-        if r.loop is not None and (r.map, r.loop) in ends
-    ]
+    ends = {r.submap: r.T_wc[:3, 3] for r in history}
+    loops = [(r.T_wc[:3, 3], ends[r.loop]) for r in history if r.loop in ends]
     begun = [place for place, result in enumerate(history) if result.starts and result.map]
     plot_map(
         trajectory_of(history).T_wc,

@@ -197,3 +197,45 @@ def test_a_map_has_so_many_submaps_and_goes_on_in_the_last(walk, monkeypatch):
             again.step(frame.image, FRAMES / 30 + i / 30)
         assert not again.unmeasured
         assert (len(again.map.submaps) > before) == (most is not None)
+
+
+def test_a_lost_camera_is_back_in_an_earlier_submap(monkeypatch, tmp_path):
+    """At the far end of its walk the camera is covered, and uncovered where it began."""
+    monkeypatch.setattr(submaps, "PARALLAX", 0.15)
+    source = to_and_fro()
+    frames, tracker = list(source), Tracker(source.calibration, SETTINGS)
+    out, black = frames[: FRAMES // 2], np.zeros((480, 640), np.uint8)
+    shown = [*(frame.image for frame in out), *[black] * 3, *(frames[k].image for k in range(6, 36))]
+    true = [*range(len(out)), *[-1] * 3, *range(6, 36)]
+    history = []
+    for k, image in enumerate(shown):
+        history.append(tracker.step(image, k / 30))
+        if k == 70:
+            tracker.save(tmp_path / "map.npz")
+    ended = {one.submap for one in history[: len(out)]}
+    assert len(ended) >= 4
+    (back,) = [k for k, one in enumerate(history) if one.relocalised]
+    assert back <= len(out) + 4
+    assert not any(one.lost for one in history[back:])
+    assert {one.map for one in history} == {0}
+    assert tracker.restarts == 0
+    # It is a submap of its own, behind the one that was known again, and goes on from there.
+    assert history[back].submap not in ended
+    assert len(tracker.map.submaps) < len(ended)
+    assert [len(one.submaps) for one in tracker.map.left] == [len(ended) - 1]
+    seen = [k for k, one in enumerate(history) if not one.lost]
+    smooth, points = tracker.smoothed(history)
+    T_wc = source.reference.T_wc[[true[k] for k in seen]]
+    each = np.arange(len(seen), dtype=float)
+    for some in (history, smooth):
+        T = np.stack([some[k].T_wc for k in seen])
+        assert absolute_trajectory_error(each, T, each, T_wc)["rmse"] < 0.05
+        assert min(np.linalg.eigvalsh(some[k].covariance)[0] for k in seen[1:]) > 0
+    assert len(set(points.numbers.tolist())) == len(points.numbers) == tracker.created
+    again = Tracker.load(tmp_path / "map.npz")
+    assert [len(one.submaps) for one in again.map.left] == [len(ended) - 1]
+    assert all(a is b for a, b in zip(again.map.earlier[0].submaps, again.map.submaps))
+    rest = [again.step(image, k / 30) for k, image in enumerate(shown) if k > 70]
+    assert np.array_equal([one.T_wc for one in rest], [one.T_wc for one in history[71:]])
+    later = again.smoothed(history)[0]
+    assert np.array_equal([one.T_wc for one in later], [one.T_wc for one in smooth])

@@ -18,7 +18,13 @@ from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.map import Map
 from jaxslam.tracking.observations import Prediction
 from jaxslam.tracking.places.descriptors import candidates, described_corners
-from jaxslam.tracking.places.relocalisation import FEWEST, MOST_OF, pose_of, well_known
+from jaxslam.tracking.places.relocalisation import (
+    FEWEST,
+    MOST_OF,
+    TRIED,
+    pose_of,
+    well_known,
+)
 from jaxslam.tracking.places.submaps import Submap, loop_of
 from jaxslam.tracking.pointcloud import seen_from
 from jaxslam.tracking.search import search
@@ -26,8 +32,6 @@ from jaxslam.tracking.search import search
 APART = 3
 """Submaps from the end of one loop to that of the next, at the least, and an eighth of all: what a
 loop costs grows with their number."""
-TRIED = 3
-"""Submaps, those of the most candidates."""
 WITHIN = 3.0
 """σ of the place of a landmark seen from the pose that its descriptors tell, pixels."""
 PIXEL = 1.0
@@ -41,7 +45,7 @@ class Closed(NamedTuple):
     """A place that was known again."""
 
     submap: int
-    """The number of the submap that it is of."""
+    """The number of the submap that it is of, among those of all maps."""
     nis: float
     """Of where it is, with six degrees of freedom."""
 
@@ -76,7 +80,7 @@ def close_loop(
         which = p, len(earlier)
         loop = loop_of(map.estimator.slam, map.submaps, which, *found, PIXEL, map.settings.wanted)
         compared = map.graph().with_loop(loop)
-        closed = Closed(p, float(compared.nis))
+        closed = Closed(earlier[p].number, float(compared.nis))
         if closed.believed:
             map.learn(loop, compared)
         return closed

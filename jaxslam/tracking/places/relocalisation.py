@@ -8,6 +8,7 @@ is the camera back.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import cv2
@@ -18,7 +19,7 @@ from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.estimator import Correction
 from jaxslam.tracking.map import Map
 from jaxslam.tracking.observations import Observations
-from jaxslam.tracking.places.descriptors import Corners, candidates, described_corners
+from jaxslam.tracking.places.descriptors import candidates, described_corners
 from jaxslam.tracking.policy import Policy
 
 FEWEST = 12
@@ -33,6 +34,8 @@ SURE = 0.3
 """σ of a point by its distance, of those from which a pose is found."""
 SECONDS = 1 / 30
 """In which a camera moves there: between two frames, so that no acceleration matters."""
+TRIED = 3
+"""Places that are looked at in a frame, those of the most candidates."""
 NOTED_EVERY = 5
 """Frames between two in which landmarks are described."""
 
@@ -76,29 +79,40 @@ def pose_of(
 def known_again(
     image: UInt8[np.ndarray, "h w"], map: Map, policy: Policy
 ) -> tuple[Observations, Correction] | None:
-    """Return what is found of the landmarks in the first map that the picture shows: that is then
-    the `map`, corrected by them. None, and nothing changes, where it shows none that is known."""
+    """Return what is found of the landmarks in the first place that the picture shows, of those of
+    which it shows the most candidates: that is then the `map`, corrected by them. None, and nothing
+    changes, where it shows none that is known."""
     if not map.estimator.displaceable:
         return None
-    now, corners = map.now(), described_corners(image)
-    for known in map.known():
-        map.become(known)
-        found = _found(
-            image, corners, map, replace(policy)
-        )  # what is only tried is no memory of its
+    numbers, pixels = candidates(map.described(), described_corners(image))
+    by_number = dict(zip(numbers.tolist(), pixels, strict=True))
+    now, places = map.now(), map.places()
+    shown = [sum(x.number in by_number for x in one.landmarks.values()) for one in places]
+    for which in np.argsort(np.negative(shown), stable=True)[:TRIED].tolist():
+        if shown[which] < FEWEST:
+            return None
+        map.become(places[which])
+        # What is only tried is no memory of the policy's.
+        found = _found(image, by_number, map, replace(policy))
         after = map.now()
         map.become(now)
         if found is not None:
-            map.come_back(after)
+            map.come_back(places[which], after)
             return found
     return None
 
 
 def _found(
-    image: UInt8[np.ndarray, "h w"], corners: Corners, map: Map, policy: Policy
+    image: UInt8[np.ndarray, "h w"],
+    by_number: Mapping[int, Float[np.ndarray, " 2"]],
+    map: Map,
+    policy: Policy,
 ) -> tuple[Observations, Correction] | None:
-    """The landmarks of this map in a picture, and what they make of it."""
-    slots, pixels = candidates(map.landmarks, corners)
+    """The landmarks of this map in a picture that shows some at these pixels, and what they make of
+    it."""
+    known = {slot: one.number for slot, one in map.landmarks.items() if one.number in by_number}
+    slots = np.array(list(known), int)
+    pixels = np.array([by_number[number] for number in known.values()]).reshape(-1, 2)
     points, covariances = (part[slots] for part in map.estimator.points())
     sure = well_known(points, covariances)
     posed = pose_of(points[sure], pixels[sure], policy.calibration)

@@ -23,12 +23,16 @@ from jaxslam.tracking.report import Tracked
 def smoothed(map: Map, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
     """Return the frames and landmarks as they are known now; those of maps of one submap, and of
     those that nobody can come back to, as they are."""
-    frames, points = list(history), map.points()
-    for one in (map.now(), *map.known()):
+    before = map.points()
+    frames, points = list(history), before
+    # What branches off is of two: the way from there on, and what led there as the latest has it.
+    for one in (*map.known()[::-1], map.now()):
         if one.submaps:
             graph = one.graph(map.settings, map.estimator.slam)
             parts = _parts(one, graph, graph.solved())
-            frames, points = _moved(parts, frames), _seen_from(parts, points)
+            for i, camera in _cameras(parts, history).items():
+                frames[i] = replace(history[i], camera=camera)
+            points = _seen_from(parts, before, points)
     return frames, points
 
 
@@ -36,8 +40,8 @@ def smoothed(map: Map, history: Sequence[Tracked]) -> tuple[list[Tracked], Point
 class _Part:
     """A submap of a map, in the world and in the map's unit, when all is known."""
 
-    map: int
     number: int
+    """Among those of all maps."""
     reported: np.ndarray
     """T of the camera with which it began, as it was reported …"""
     begins: PoseWithCovariance
@@ -53,8 +57,9 @@ class _Part:
     covariances: np.ndarray
     """Given where that is."""
 
-    def at(self, T_wc: np.ndarray, share: float) -> PoseWithCovariance:
-        """Return where a camera is, reported at T, with this share of the way behind it."""
+    def at(self, T_wc: np.ndarray, share: float, *, elsewhere: bool) -> PoseWithCovariance:
+        """Return where a camera is, reported at T, with this share of the way behind it, which may
+        begin `elsewhere` than where the submap before ended."""
         T_here = np.linalg.inv(self.reported) @ T_wc
         bent = np.linalg.inv(self.begins.T_wc) @ self.ends.T_wc @ np.linalg.inv(self.way.T_wc)
         T = self.begins.T_wc @ _part_of(bent, share) @ T_here
@@ -62,7 +67,7 @@ class _Part:
             _carried(end.covariance, np.linalg.inv(T) @ end.T_wc)
             for end in (self.begins, self.ends)
         )
-        between = share * (1 - share) * self.way.covariance
+        between = (1 if elsewhere else share) * (1 - share) * self.way.covariance
         return PoseWithCovariance(T, (1 - share) * first + share * last + between)
 
 
@@ -93,8 +98,7 @@ def _parts(one: Remembered, graph: Graph, solved: Solved) -> list[_Part]:
     reported = [place.origin.T_wc, *(submap.camera.T_wc for submap in one.submaps)]
     return [
         _Part(
-            one.number,
-            i,
+            submap.number,
             reported[i],
             begins[i],
             replace(told[i + 1], T_wc=np.linalg.inv(told[i].T_wc) @ told[i + 1].T_wc),
@@ -107,30 +111,31 @@ def _parts(one: Remembered, graph: Graph, solved: Solved) -> list[_Part]:
     ]
 
 
-def _moved(parts: list[_Part], frames: list[Tracked]) -> list[Tracked]:
-    """The frames with the cameras of these submaps as they are known now."""
-    moved = list(frames)
-    where = np.array([(frame.map, frame.submap) for frame in frames])
+def _cameras(parts: list[_Part], history: Sequence[Tracked]) -> dict[int, PoseWithCovariance]:
+    """The cameras of these submaps as they are known now, by the frames' places in the history."""
+    known = {}
+    where = np.array([frame.submap for frame in history])
     for part in parts:
-        own = np.flatnonzero((where == (part.map, part.number)).all(axis=1))
-        later = np.flatnonzero((where == (part.map, part.number + 1)).all(axis=1))
+        own = np.flatnonzero(where == part.number)
         if len(own):
-            last = later[0] if len(later) else own[-1]
-            shares = (own - own[0]) / max(last - own[0], 1)
-            for i, share in zip(own.tolist(), shares.tolist(), strict=True):
-                moved[i] = replace(frames[i], camera=part.at(frames[i].T_wc, share))
-    return moved
+            last = own[-1] + (part is not parts[-1])
+            elsewhere = history[own[0]].relocalised
+            for i in own.tolist():
+                share = (i - own[0]) / max(last - own[0], 1)
+                known[i] = part.at(history[i].T_wc, share, elsewhere=elsewhere)
+    return known
 
 
-def _seen_from(parts: list[_Part], points: Points) -> Points:
+def _seen_from(parts: list[_Part], before: Points, points: Points) -> Points:
     """The landmarks as the last of these submaps has them that has them. One that no submap has at
-    its end is moved with the camera of the submap in which it was given up."""
+    its end is moved, from where it was `before`, with the camera of the submap in which it was
+    given up."""
     X, P, in_map = points.points.copy(), points.covariances.copy(), points.in_map.copy()
     for part in parts:
-        own = np.flatnonzero((points.maps == part.map) & (points.submaps == part.number))
+        own = np.flatnonzero(points.submaps == part.number)
         moved = PoseWithCovariance(part.begins.T_wc @ np.linalg.inv(part.reported))
-        in_map[own] = moved.points(X[own], in_map[own])[1]
-        X[own], P[own] = moved.points(X[own], P[own])
+        _, in_map[own] = moved.points(before.points[own], before.in_map[own])
+        X[own], P[own] = moved.points(before.points[own], before.covariances[own])
     for part in parts:
         _, here, there = np.intersect1d(points.numbers, part.numbers, return_indices=True)
         X[here], P[here] = part.ends.points(part.points[there], part.covariances[there])

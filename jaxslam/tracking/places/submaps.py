@@ -50,6 +50,8 @@ class Submap:
     """… given where that is."""
     camera: PoseWithCovariance
     """Its last camera in the world, as it was reported."""
+    number: int
+    """Its number among those of all maps."""
 
     @property
     def numbers(self) -> Int[np.ndarray, " slots"]:
@@ -110,12 +112,17 @@ class Solved(NamedTuple):
 
 
 def handed_over(
-    slam: AbstractStaged, state: Belief, numbers: np.ndarray, camera: PoseWithCovariance
+    slam: AbstractStaged,
+    state: Belief,
+    numbers: np.ndarray,
+    camera: PoseWithCovariance,
+    *,
+    number: int,
 ) -> tuple[Submap, Belief]:
-    """The submap that ends at this camera in the world, and the state of the next one; `numbers`
-    are those of the landmarks in the slots, −1 for none."""
+    """The submap of this number that ends at this camera in the world, and the state of the next
+    one; `numbers` are those of the landmarks in the slots, −1 for none."""
     (frozen, *landmarks), state = _handed_over(slam, state, jnp.asarray(numbers))
-    return Submap(frozen, *jax.device_get(landmarks), camera), state
+    return Submap(frozen, *jax.device_get(landmarks), camera, number), state
 
 
 def shapes(slam: AbstractStaged, state: Belief, capacity: int) -> PyTree:
