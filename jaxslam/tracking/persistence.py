@@ -22,6 +22,7 @@ from jaxslam._runtime.files import one_line, read_arrays, write_atomically
 from jaxslam.io.calibration import Calibration, as_fields, from_fields
 from jaxslam.tracking.landmarks import NO_POINTS, Points, joined, stacked, unstacked
 from jaxslam.tracking.map import Map, Remembered
+from jaxslam.tracking.places.joining import Join
 from jaxslam.tracking.places.submaps import Submap, no_loop, shapes
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 from jaxslam.tracking.settings import TrackerSettings
@@ -57,6 +58,7 @@ class Resumable(Protocol):
     calibration: Calibration
     settings: TrackerSettings
     failed: Counter[str]
+    joins: tuple[Join, ...]
     map: Map
 
 
@@ -92,6 +94,7 @@ def save(path: str | Path, tracker: Resumable, filter_name: str | None) -> None:
     ]
     header["submaps"] = [one.number for one in submaps.all]
     header["loops"] = len(loops.all)
+    header["joins"] = [{**asdict(one), "moved": one.moved.tolist()} for one in tracker.joins]
     header["latest"], header["seen"] = maps.places(latest), kept.seen is not None
     arrays = dict(joined([NO_POINTS, *kept.finished])._asdict())
     arrays |= {f"charted/{name}": array for name, array in stacked(kept.charted).items()}
@@ -140,6 +143,9 @@ def _restore(
         piece, _, attribute = where.rpartition(".")
         setattr(attrgetter(piece)(tracker) if piece else tracker, attribute, numbers[name])
     tracker.failed.update(header["failed"])
+    tracker.joins = tuple(
+        Join(**one | {"moved": np.array(one["moved"])}) for one in header["joins"]
+    )
     kept.finished.append(Points(*(arrays[name] for name in Points._fields)))
     with jax.enable_x64(True):
         kept.charted = unstacked(_of(arrays, "charted"))

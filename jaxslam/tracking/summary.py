@@ -74,6 +74,10 @@ def summarised(
         "submaps": len({result.submap for result in history}),
         "loops": sum(result.loop is not None for result in history),
         "loops_refused": tracker.refused,
+        "joined": [
+            {"map": one.map, "to": one.to, "log_ratio": one.log_ratio, "sigma": one.sigma}
+            for one in tracker.joins
+        ],
         "units": _units(history),
         "failed_updates": dict(tracker.failed),
         "reversed_tests": tracker.reversed,
@@ -123,6 +127,10 @@ def describe(summary: Summary) -> str:
     if summary["loops"]:
         times = "one place" if summary["loops"] == 1 else f"{summary['loops']} places"
         lines.append(f"{times} known again: a loop is closed, and all cameras are corrected by it")
+    for one in summary["joined"]:
+        lines.append(
+            f"map {one['map']} is part of map {one['to']}, its unit known to {one['sigma']:.1%}"
+        )
     if summary["maps"] > 1:
         lines.append(
             f"{summary['maps']} maps, each in a unit of its own: frames.csv says where they begin"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from jaxslam.tracking.map import Map, in_view
 from jaxslam.tracking.observations import NOTHING, Lost, Observations
 from jaxslam.tracking.places.closing import close_loop
 from jaxslam.tracking.places.descriptors import note_looks
+from jaxslam.tracking.places.joining import LOOKED_EVERY, Join, join_of, joined, known_elsewhere
 from jaxslam.tracking.places.relocalisation import NOTED_EVERY, known_again
 from jaxslam.tracking.places.smoothing import smoothed
 from jaxslam.tracking.policy import LEAST_MATCHES, Policy
@@ -76,6 +77,8 @@ class Tracker:
     """Places that looked like earlier ones, and that cannot be these."""
     reversed: int = field(default=0, init=False)
     """Maps that turned out to lie behind the camera, and were given up."""
+    joins: tuple[Join, ...] = field(default=(), init=False)
+    """Maps that turned out to be of one world."""
     map: Map = field(init=False, repr=False)
     """Its landmarks and where it is in the world."""
     policy: Policy = field(init=False, repr=False)
@@ -148,10 +151,10 @@ class Tracker:
             return self.map.points()
 
     def smoothed(self, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
-        """Return the frames so far, and all landmarks, as all that was seen later has them, the
-        loops that closed included (docs/submaps.md)."""
+        """Return the frames so far, and all landmarks, as all that was seen later has them: loops
+        that closed, and maps that were joined, included (docs/submaps.md)."""
         with jax.enable_x64(True):
-            return smoothed(self.map, history)
+            return joined(self.joins, *smoothed(self.map, history))
 
     def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
         """Return how the calibration is treated, and fx, fy, cx, cy with their covariance, pixels,
@@ -195,6 +198,7 @@ class Tracker:
             tracker.map.leave()
         tracker.time, tracker.steps, tracker.unmeasured = None, 0, 1
         tracker.searching = True
+        tracker.joins = tuple(replace(one, step=-1) for one in tracker.joins)
         tracker.policy.forget()
         return tracker
 
@@ -228,6 +232,7 @@ class Tracker:
         """Track a frame after one of the time `before`."""
         if self.searching:
             return self._searching(frame)
+        last = self.map.place.camera.T_wc
         predicted = self.map.estimator.predict(frame.time - before)
         ahead, behind = predicted.view.sides
         if behind > ahead and behind >= LEAST_MATCHES:
@@ -270,6 +275,10 @@ class Tracker:
             created = bare_corners(frame.image, self.settings, seen.places[kept])
         ended = len(self.map.submaps)
         self.map.renew(frame.image, created, seen.slots[kept])
+        if reason is None and self.steps % LOOKED_EVERY == 0:
+            found = known_elsewhere(frame.image, self.map, self.policy, self.joins)
+            if found is not None:
+                return self._joined(frame, last, *found)
         closed = None
         if len(self.map.submaps) > ended:
             closed = close_loop(frame.image, self.map, self.calibration)
@@ -281,6 +290,16 @@ class Tracker:
         if closed is not None and closed.believed:
             found["loop"] = closed.submap
         return Tracked.of(frame, self.map, seen, created=created, **found)
+
+    def _joined(
+        self, frame: Frame, last: np.ndarray, seen: Observations, correction: Correction
+    ) -> Tracked:
+        """Go on in another map, which this one is joined to; `last` is T of the camera before."""
+        before = self.map.left[-1]
+        tracked = self._back(frame, seen, correction)
+        join = join_of(before, self.map, self.steps, last)
+        self.joins += () if join is None else (join,)
+        return tracked
 
     def _back(self, frame: Frame, seen: Observations, correction: Correction) -> Tracked:
         """Go on in a map in which the camera was found again."""

@@ -17,7 +17,7 @@ from jaxslam.tracking.places.submaps import loop_of
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import add_noise, render, room, synthetic_source
 from jaxslam.tracking.tracker import Tracker
-from jaxslam.tracking.trajectory import absolute_trajectory_error
+from jaxslam.tracking.trajectory import absolute_trajectory_error, alignment
 
 SETTINGS = TrackerSettings(filter="scale_gauge+oc", wanted=24, spare=2)
 FRAMES = 110
@@ -205,7 +205,11 @@ def test_a_lost_camera_is_back_in_an_earlier_submap(monkeypatch, tmp_path):
     source = to_and_fro()
     frames, tracker = list(source), Tracker(source.calibration, SETTINGS)
     out, black = frames[: FRAMES // 2], np.zeros((480, 640), np.uint8)
-    shown = [*(frame.image for frame in out), *[black] * 3, *(frames[k].image for k in range(6, 36))]
+    shown = [
+        *(frame.image for frame in out),
+        *[black] * 3,
+        *(frames[k].image for k in range(6, 36)),
+    ]
     true = [*range(len(out)), *[-1] * 3, *range(6, 36)]
     history = []
     for k, image in enumerate(shown):
@@ -234,8 +238,52 @@ def test_a_lost_camera_is_back_in_an_earlier_submap(monkeypatch, tmp_path):
     assert len(set(points.numbers.tolist())) == len(points.numbers) == tracker.created
     again = Tracker.load(tmp_path / "map.npz")
     assert [len(one.submaps) for one in again.map.left] == [len(ended) - 1]
-    assert all(a is b for a, b in zip(again.map.earlier[0].submaps, again.map.submaps))
+    assert all(
+        a is b for a, b in zip(again.map.earlier[0].submaps, again.map.submaps, strict=False)
+    )
     rest = [again.step(image, k / 30) for k, image in enumerate(shown) if k > 70]
     assert np.array_equal([one.T_wc for one in rest], [one.T_wc for one in history[71:]])
     later = again.smoothed(history)[0]
     assert np.array_equal([one.T_wc for one in later], [one.T_wc for one in smooth])
+
+
+def test_two_maps_are_joined_where_the_second_sees_the_first(monkeypatch, tmp_path):
+    """The camera is covered, uncovered at the far end, and comes back from there."""
+    monkeypatch.setattr(submaps, "PARALLAX", 0.15)
+    source = to_and_fro()
+    frames, black = list(source), np.zeros((480, 640), np.uint8)
+    tracker = Tracker(source.calibration, replace(SETTINGS, lost_for=5))
+    true, history = [*range(22), *[-1] * 8, *range(55, 100)], []
+    for k, which in enumerate(true):
+        image = black if which < 0 else frames[which].image
+        history.append(tracker.step(image, k / 30))
+    (back,) = [k for k, one in enumerate(history) if one.relocalised]
+    assert [one.map for one in history if not one.lost] == [0] * 22 + [1] * (back - 31) + [0] * (
+        len(history) - back
+    )
+    (join,) = tracker.joins
+    assert (join.map, join.to, join.step) == (1, 0, back)
+    # The units are those of truth by each map's own scale.
+    T_wc = source.reference.T_wc[true]
+    tracked = np.array([not one.lost for one in history])
+    scales = []
+    for number in (0, 1):
+        own = np.flatnonzero(tracked & (np.array([one.map for one in history]) == number))
+        T = np.stack([history[k].T_wc for k in own])
+        scales.append(alignment(own / 30, T, own / 30, T_wc[own]).scale)
+    assert abs(np.log(scales[1] / scales[0]) - join.log_ratio) < 3 * join.sigma < 0.6
+    smooth, points = tracker.smoothed(history)
+    assert {one.map for one in smooth} == {0}
+    assert set(points.maps.tolist()) == {0}
+    own = np.flatnonzero(tracked)
+    T = np.stack([smooth[k].T_wc for k in own])
+    assert absolute_trajectory_error(own / 30, T, own / 30, T_wc[own])["rmse"] < 0.05
+    assert min(np.linalg.eigvalsh(smooth[k].covariance)[0] for k in own[1:]) > 0
+    # Farther from where they were joined it is known less.
+    sigma = np.array([smooth[k].camera.sigma_position for k in range(31, back)])
+    assert sigma[0] > 2 * sigma[-1]
+    tracker.save(tmp_path / "map.npz")
+    again = Tracker.load(tmp_path / "map.npz")
+    assert np.array_equal(
+        [one.T_wc for one in again.smoothed(history)[0]], [one.T_wc for one in smooth]
+    )

@@ -8,7 +8,7 @@ is the camera back.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import replace
 
 import cv2
@@ -77,16 +77,16 @@ def pose_of(
 
 
 def known_again(
-    image: UInt8[np.ndarray, "h w"], map: Map, policy: Policy
+    image: UInt8[np.ndarray, "h w"], map: Map, policy: Policy, but: Container[int] = ()
 ) -> tuple[Observations, Correction] | None:
     """Return what is found of the landmarks in the first place that the picture shows, of those of
-    which it shows the most candidates: that is then the `map`, corrected by them. None, and nothing
-    changes, where it shows none that is known."""
+    which it shows the most candidates, and of all maps `but` some: that is then the `map`,
+    corrected by them. None, and nothing changes, where it shows none that is known."""
     if not map.estimator.displaceable:
         return None
     numbers, pixels = candidates(map.described(), described_corners(image))
     by_number = dict(zip(numbers.tolist(), pixels, strict=True))
-    now, places = map.now(), map.places()
+    now, places = map.now(), [one for one in map.places() if one.number not in but]
     shown = [sum(x.number in by_number for x in one.landmarks.values()) for one in places]
     for which in np.argsort(np.negative(shown), stable=True)[:TRIED].tolist():
         if shown[which] < FEWEST:

@@ -130,10 +130,16 @@ def shapes(slam: AbstractStaged, state: Belief, capacity: int) -> PyTree:
     return jax.eval_shape(_handed_over.function, slam, state, jnp.zeros(capacity, int))[0]
 
 
+def in_submaps(slam: AbstractStaged) -> bool:
+    """Whether a filter has submaps."""
+    inner = slam.unwrapped
+    return isinstance(inner, EkfSlam) and inner.coordinates is SUBMAP
+
+
 def left(slam: AbstractStaged, state: Belief) -> Bool[Array, ""]:
     """Whether the camera has left the scene in which its submap began; never without submaps."""
     inner = slam.unwrapped
-    if not isinstance(inner, EkfSlam) or inner.coordinates is not SUBMAP:
+    if not isinstance(inner, EkfSlam) or not in_submaps(slam):
         return jnp.zeros((), bool)
     _, one = slam.gaussian(state, None)
     assert isinstance(one.core.pose, KeyframePose)
