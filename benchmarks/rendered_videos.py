@@ -72,7 +72,10 @@ def rendered_source(
 
 def _picture(kind: Kind, bodies: list[Body], modifiers: list[str], seed: int, index: int) -> Image:
     """The picture of a frame, which is exposed about its time, with the noise of a sensor."""
-    time, sky = index / kind.rate, 245.0 if kind.scene in (_on_white, _street, _block) else 110.0
+    time, sky = (
+        index / kind.rate,
+        245.0 if kind.scene in (_on_white, _street, _block, _row) else 110.0,
+    )
     offsets = np.zeros(1)
     if "blur" in modifiers:
         offsets = SHUTTER / kind.rate * ((np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5)
@@ -219,6 +222,23 @@ def _block(rng: np.random.Generator) -> list[Body]:
     return bodies
 
 
+_APART = 2.5
+"""Metres between two houses of a row."""
+
+
+def _row(rng: np.random.Generator) -> list[Body]:
+    """Houses in a row, each the same to the last thing before it."""
+    bodies = [Body((20, _FLOOR + 1, 0), (60, 1, 30), Paint(2, 110.0, 35.0, 22.0))]
+    wall, front = _paint(rng, 60.0, 80.0), [_paint(rng, 120.0) for _ in range(5)]
+    sizes, x = rng.uniform(0.12, 0.4, (5, 3)), rng.uniform(-1.1, 1.1, 5)
+    z = rng.uniform(2.0, 3.2, 5)
+    for start in np.arange(-10 * _APART, 31 * _APART, _APART):
+        bodies.append(Body((start, -1.0, 4.5), (_APART / 2 - 0.1, 2.4, 0.8), wall))
+        for half, aside, away, paint in zip(sizes, x, z, front, strict=True):
+            bodies.append(Body((start + aside, _FLOOR - half[1], away), half, paint))
+    return bodies
+
+
 def _posed(position: np.ndarray, yaw, pitch=0.0, roll=0.0) -> Poses:
     """Poses at positions (n, 3) of cameras that look to the right by yaw, up by pitch, in rad."""
     angles = np.stack(np.broadcast_arrays(yaw, pitch, roll), -1)
@@ -289,6 +309,12 @@ def _walking(times: np.ndarray, rng: np.random.Generator) -> Poses:
     return _posed(np.stack([place[:, 0], y, place[:, 1]], 1), heading, pitch, roll)
 
 
+def _passing(times: np.ndarray, rng: np.random.Generator) -> Poses:
+    """1.2 m/s along a row of houses, looking at them and a little ahead."""
+    x, y, yaw, pitch, roll = _sway(times, rng, 0.03, 0.02, 0.05, 0.02, 0.01)
+    return _posed(np.stack([1.2 * times + x, y, 0 * x], 1), np.radians(25) + yaw, pitch, roll)
+
+
 KINDS = {
     "boxes": Kind(150, 30, _room, _swaying, "a hand sways in a room of things"),
     "orbit": Kind(200, 10, _on_white, _orbiting, "once round an object on white"),
@@ -297,5 +323,6 @@ KINDS = {
     "spin": Kind(600, 10, _room, _spinning, "turning on the spot at 30°/s for 60 s"),
     "look-around": Kind(500, 20, _room, _looking, "a slow walk that looks round, ±75°"),
     "block": Kind(480, 10, _block, _walking, "a walk round a block, and on for a third of it"),
+    "row": Kind(400, 10, _row, _passing, "a walk past houses that are all alike, 48 m"),
     "street": Kind(140, 10, _street, _driving, "a car at 10 m/s with a bend of 90°"),
 }

@@ -103,6 +103,20 @@ def test_submaps_and_loops_are_saved_and_go_on(walk):
     assert np.array_equal([one.T_wc for one in ours], [one.T_wc for one in theirs])
 
 
+def test_another_video_may_begin_anywhere_in_a_saved_map(walk):
+    """Near the far end of the walk, which the latest submap does not show."""
+    *_, source, path = walk
+    later = Tracker.localising(path, source.calibration)
+    frames = list(source)[60:70]
+    found = [later.step(frame.image, frame.time) for frame in frames]
+    assert found[0].relocalised
+    assert not any(one.lost for one in found)
+    assert {one.map for one in found} == {0}
+    smooth, _ = later.smoothed(found)
+    way = np.diff([one.T_wc[:3, 3] for one in smooth], axis=0)
+    assert np.linalg.norm(way, axis=1).max() < 0.05  # it goes on and does not jump
+
+
 def test_a_loop_that_cannot_be_is_refused(walk):
     """The same landmarks, as if they had been seen by a camera two metres away."""
     tracker, *_ = walk
