@@ -169,6 +169,7 @@ def page(results: Results, verdicts: Path = VERDICTS) -> str:
     """The Markdown page, with the table of `verdicts.py` where that was run."""
     rows = [row for filters in results.values() for row in filters.values()]
     seeds = f"seeds {named({s for row in rows for s in row['seeds']})}" if rows else "its seeds"
+    counts = sorted({row["runs"] for row in rows}) or [0]
     lines = [
         "# Which filter is consistent in which scenario?",
         "",
@@ -177,7 +178,7 @@ def page(results: Results, verdicts: Path = VERDICTS) -> str:
         "All filters use Inverse Scaling. `recommended` is `scale_gauge+scene50+mixture17`, in",
         "space `mixture9`; a name that begins with `+` continues `scale_gauge`. What the filters",
         "do is on [another page](repairs.md). Written by `python benchmarks/consistency.py`; a row",
-        f"is one study of all runs of {seeds}.",
+        f"is one study of {counts[0]} to {counts[-1]} runs of {seeds}.",
         "",
         "- *NEES* is of the camera pose; a consistent filter has 3 on average, 6 in space.",
         "- *σ should be ×*: √(NEES/ideal) over all steps, with its 99 % interval.",
@@ -185,8 +186,8 @@ def page(results: Results, verdicts: Path = VERDICTS) -> str:
         "  the part that decided.",
         "- *At one scale; drift*: the verdict on NEES at the scale of each run that explains its",
         "  poses best, and on the drift of scale, of which only over-confidence can be proven",
-        "  ([gauge.md](gauge.md)). *Yes* is consistent, *over* and *under* are over-confident and",
-        "  under-confident, *?* cannot be decided.",
+        "  ([units of length](gauge.md)). *Yes* is consistent, *over* and *under* are over-confident",
+        "  and under-confident, *?* cannot be decided.",
         "- *NEES at steps*: the mean over all runs, bold inside its exact 95 % band.",
         "- *Lost*: the share of runs above the 99.99 % quantile of χ² at the last step; *ever*:",
         "  above a higher quantile, for so many steps, at any step.",
@@ -200,7 +201,7 @@ def page(results: Results, verdicts: Path = VERDICTS) -> str:
         ]
     lines += [
         "",
-        "| scenario, filter | runs | NEES, all steps | σ should be × | verdict "
+        "| scenario, filter | NEES, all steps | σ should be × | verdict "
         f"| at one scale; drift | NEES at steps {', '.join(map(str, STEPS))}, last "
         "| lost; ever | RMSE; σ, m |",
         f"|{'---|' * COLUMNS}",
@@ -268,7 +269,7 @@ def _of_verdicts(path: Path) -> list[str]:
     ]
 
 
-COLUMNS = 9
+COLUMNS = 8
 BRIEF = {"consistent": "yes", "over-confident": "over", "under-confident": "under"}
 
 
@@ -285,7 +286,6 @@ def _row(name: str, row: Row) -> str:
     brief = (BRIEF.get(told[key]["word"], "?") for key in TALLIES[1:] if key in told)
     cells = [
         f"`{label(name)}`{'' if 'drift' in row else ' †'}",
-        f"{row['runs']}",
         _short(mean["nees"]),
         _factor(mean, 2),
         f"{verdict['word']}{decided}",
@@ -316,7 +316,7 @@ def recommended(results: Results, scenarios: Iterable[str]) -> str:
 
 def beside(results: Results) -> str:
     """The same numbers in short, a row for each scenario."""
-    header = "| scenario | `robocentric`: σ should be ×; lost | `recommended`: the same; verdict |"
+    header = "| scenario | `robocentric`: σ should be ×; lost | `recommended`: σ should be ×; lost; verdict |"
     rows = [header, "|---|---|---|"]
     for scenario, filters in results.items():
         of = {label(name): row for name, row in filters.items()}

@@ -108,7 +108,7 @@ def _row(name: str, seed: str, r: dict[str, Any]) -> list[str]:
         shown("orientation", ".1f", "°"),
         "; ".join(shown(key, ".2g") for key in ("beyond_scale", "median_beyond_scale")),
         shown("lies", ".0%"),
-        shown("drift", ".2g", " σ"),
+        shown("drift", ".2g", "\u00a0σ"),
     ]
 
 

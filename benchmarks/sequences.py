@@ -198,7 +198,7 @@ def _by_filter(results: Results, cell, beside: str = "", other=None) -> str:
         + [cell(found[key]) for key in keys.values()]
         for name, found in results.items()
     ]
-    return table(["video", *([beside] if other else []), *(f"`{SHORT[n]}`" for n in keys)], rows)
+    return table(["video", *([beside] if other else []), *(SHORT[n] for n in keys)], rows)
 
 
 def _error(r: dict[str, Any]) -> str:
