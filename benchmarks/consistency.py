@@ -186,8 +186,8 @@ def page(results: Results, verdicts: Path = VERDICTS) -> str:
         "  the part that decided.",
         "- *At one scale; drift*: the verdict on NEES at the scale of each run that explains its",
         "  poses best, and on the drift of scale, of which only over-confidence can be proven",
-        "  ([units of length](gauge.md)). *Yes* is consistent, *over* and *under* are over-confident",
-        "  and under-confident, *?* cannot be decided.",
+        "  ([units of length](gauge.md)). *Yes* is consistent, *over* and *under* are",
+        "  over-confident and under-confident, *?* cannot be decided.",
         "- *NEES at steps*: the mean over all runs, bold inside its exact 95 % band.",
         "- *Lost*: the share of runs above the 99.99 % quantile of χ² at the last step; *ever*:",
         "  above a higher quantile, for so many steps, at any step.",
@@ -316,8 +316,8 @@ def recommended(results: Results, scenarios: Iterable[str]) -> str:
 
 def beside(results: Results) -> str:
     """The same numbers in short, a row for each scenario."""
-    header = "| scenario | `robocentric`: σ should be ×; lost | `recommended`: σ should be ×; lost; verdict |"
-    rows = [header, "|---|---|---|"]
+    columns = "`robocentric`: σ should be ×; lost | `recommended`: σ should be ×; lost; verdict"
+    rows = [f"| scenario | {columns} |", "|---|---|---|"]
     for scenario, filters in results.items():
         of = {label(name): row for name, row in filters.items()}
         told = {name: verdicts_of(of[name])["tally"] for name in ("robocentric", "recommended")}
