@@ -85,29 +85,35 @@ def measure(source) -> dict[str, Any]:
 
 
 def as_table(results: Results) -> str:
-    """As Markdown: what the kinds are, and a row for each video."""
+    """As Markdown: what the kinds are, and a row for each, with the range over its seeds."""
     kinds = dict.fromkeys(name.partition("+")[0] for name in results)
     said = "\n".join(f"- `{kind}`: {KINDS[kind].words}" for kind in kinds)
-    header = ("video, seed", "lost; maps", "loops", "error: as it went; at the end")
-    header += ("orientation", "NEES/dof: mean; median", "beyond 5 σ", "drift")
-    videos = ((name, seed, r) for name, seeds in results.items() for seed, r in seeds.items())
-    return f"{said}\n\n{table(header, (_row(*video) for video in videos))}"
+    header = ("video", "seeds", "lost; maps", "loops", "error as it went", "at the end")
+    header += ("orientation", "NEES/dof", "beyond 5 σ", "drift")
+    rows = (_row(name, list(seeds.values())) for name, seeds in results.items())
+    return f"{said}\n\n{table(header, rows)}"
 
 
-def _row(name: str, seed: str, r: dict[str, Any]) -> list[str]:
-    """The numbers of one video; a camera on the spot has no path, and so no error in its share."""
+def _row(name: str, videos: list[dict[str, Any]]) -> list[str]:
+    """The numbers of a kind; a camera on the spot has no path, and so no error in its share."""
 
-    def shown(key: str, form: str, unit: str = "") -> str:
-        return number(r.get(key), form) + (unit if key in r else "")
+    def shown(key: str, form: str, unit: str = "", times: float = 1.0) -> str:
+        values = [times * video[key] for video in videos if key in video]
+        if not values:
+            return "–"
+        ends = dict.fromkeys(number(x, form) for x in (min(values), max(values)))
+        return "–".join(ends) + unit
 
+    lost = [1 - video["tracked"] / video["frames"] for video in videos]
     return [
-        f"{name.replace('+', ' + ')}, {seed}",
-        f"{1 - r['tracked'] / r['frames']:.0%}; {r['maps']:.0f}",
+        name.replace("+", " + "),
+        str(len(videos)),
+        f"{max(lost):.0%}; {shown('maps', '.0f')}",
         shown("loops", ".0f"),
-        "; ".join(shown(key, ".2%") for key in ("causal", "error")),
+        *(shown(key, ".2f", " %", 100) for key in ("causal", "error")),
         shown("orientation", ".1f", "°"),
-        "; ".join(shown(key, ".2g") for key in ("beyond_scale", "median_beyond_scale")),
-        shown("lies", ".0%"),
+        shown("beyond_scale", ".2g"),
+        shown("lies", ".0f", " %", 100),
         shown("drift", ".2g", "\u00a0σ"),
     ]
 

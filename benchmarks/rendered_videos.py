@@ -316,13 +316,13 @@ def _passing(times: np.ndarray, rng: np.random.Generator) -> Poses:
 
 
 KINDS = {
-    "boxes": Kind(150, 30, _room, _swaying, "a hand sways in a room of things"),
-    "orbit": Kind(200, 10, _on_white, _orbiting, "once round an object on white"),
-    "orbit-twice": Kind(400, 10, _on_white, _orbiting, "twice round an object on white"),
+    "boxes": Kind(150, 30, _room, _swaying, "a hand-held camera sways in a furnished room"),
+    "orbit": Kind(200, 10, _on_white, _orbiting, "once round an object on a white background"),
+    "orbit-twice": Kind(400, 10, _on_white, _orbiting, "twice round an object on a white background"),
     "turn": Kind(150, 30, _room, _turning, "a walk with a turn of 60°/s"),
-    "spin": Kind(600, 10, _room, _spinning, "turning on the spot at 30°/s for 60 s"),
-    "look-around": Kind(500, 20, _room, _looking, "a slow walk that looks round, ±75°"),
-    "block": Kind(480, 10, _block, _walking, "a walk round a block, and on for a third of it"),
+    "spin": Kind(600, 10, _room, _spinning, "a minute of pure rotation at 30°/s"),
+    "look-around": Kind(500, 20, _room, _looking, "a slow walk with looks to both sides, ±75°"),
+    "block": Kind(480, 10, _block, _walking, "a walk round a block, one and a third times"),
     "row": Kind(400, 10, _row, _passing, "a walk past houses that are all alike, 48 m"),
     "street": Kind(140, 10, _street, _driving, "a car at 10 m/s with a bend of 90°"),
 }

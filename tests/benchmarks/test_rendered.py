@@ -120,6 +120,13 @@ def test_the_page_has_the_numbers_on_disk():
     assert f"{rendered.MARK}\n\n{rendered.as_table(results)}\n\n" in page
 
 
+def test_a_kind_of_which_one_video_differs_shows_the_range():
+    one = {"frames": 100.0, "tracked": 100.0, "maps": 1.0, "error": 0.001, "beyond_scale": 0.5}
+    other = one | {"tracked": 90.0, "error": 0.02, "lies": 0.031}
+    row = rendered.as_table({"turn+blur": {"0": one, "1": other}}).splitlines()[-1]
+    assert row.startswith("| turn + blur | 2 | 10%; 1 | – | – | 0.10–2.00 % | – | 0.5 | 3 % | – |")
+
+
 def test_the_page_says_how_large_the_errors_are():
     folder = Path(__file__).resolve().parents[2]
     results = json.loads((folder / "benchmarks/results/rendered.json").read_text())
