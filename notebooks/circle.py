@@ -12,7 +12,7 @@
 # ---
 
 # %% [markdown]
-# # The map and the pose error on a circle (Figs 3 and 4 of the paper)
+# # Map and pose error on a circle (Figs 3 and 4 of the paper)
 #
 # *Monocular SLAM with Inverse Scaling Parametrization* (BMVC 2008) shows the maps that Unified
 # Inverse Depth (UID) and Inverse Scaling (IS) end with after a simple trajectory (Fig. 3), and the

@@ -12,7 +12,7 @@
 # ---
 
 # %% [markdown]
-# # Is the filter consistent?
+# # How to run a consistency study
 #
 # A filter is consistent when its error is as large as its covariance says. For the pose error
 # $e$ with covariance $P$, the normalised estimation error squared $e^\top P^{-1} e$ (NEES) then

@@ -12,16 +12,16 @@
 # ---
 
 # %% [markdown]
-# # The Necker cube of SLAM: a camera sets out, and nobody told it how
+# # Why an unknown velocity allows two worlds (a Necker cube)
 #
 # A wire cube on paper turns over while one looks at it: the near corner becomes the far one. A
-# camera that sets out from rest sees the same. Its first pixels fit two worlds, one in which it
+# camera that starts from rest sees the same. Its first pixels fit two worlds, one in which it
 # went left and one in which it went right, and for some time nothing but the noise tells them
 # apart. A filter that holds one Gaussian holds one of the two worlds, and never learns that there
 # was another.
 #
 # One planar camera, twelve landmarks, thirty frames a second. The velocity has mean zero and σ 0.5
-# m/s: all that is told.
+# m/s, and nothing else is known of it.
 
 # %%
 import os
@@ -185,8 +185,8 @@ for frame in FRAMES:
 
 # %% [markdown]
 # The EKF loses most of its runs, most of these in the first frames, by a coin that it never knew it
-# tossed. The sum says "left or right" as long as nobody can know. Larger studies, in the plane and
-# in space, and what still fails are in `docs/from-rest.md`.
+# tossed. The sum says "left or right" while the pixels do not decide. Larger studies, planar and
+# in 6-DoF, and what still fails are in `docs/from-rest.md`.
 
 # %%
 assert np.abs(behind - seen).max() < 1e-9

@@ -12,7 +12,7 @@
 # ---
 
 # %% [markdown]
-# # Which noise would explain these measurements?
+# # How to estimate noise levels by gradients
 #
 # A filter is a pytree of its numbers, and a run of it is a differentiable function. Here the σ of
 # the accelerations and of the pixels of a simulated camera are found from what the camera measured,

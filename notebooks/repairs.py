@@ -12,7 +12,7 @@
 # ---
 
 # %% [markdown]
-# # Why the filter breaks, what repairs it, and what remains
+# # Why the paper's filter becomes over-confident, and what helps
 #
 # With loose noise the robocentric Inverse Scaling filter believes too much of itself. Here is why,
 # sideways and straight ahead, and what helps. The truth is drawn from the filter's own prior, so
@@ -76,7 +76,7 @@ def table(results):
 # No bearing tells the scale. It is known from the prior on speed and depth, and should stay as
 # uncertain as they are. But the prediction multiplies velocity by inverse depth, and linearises
 # the product where the estimate happens to be. Every update moves the estimate, so the direction
-# that the Jacobians leave unseen turns a little, and a little is learnt of the scale that nobody
+# that the Jacobians leave unseen turns a little, and a little is learnt of the scale, never
 # measured.
 #
 # - `+oc` carries the covariance along with that direction (observability constraint).
@@ -150,7 +150,7 @@ for name in (SUM, RECOMMENDED):
 # multiplies the unknown direction makes an amplitude of it, and a maximum is drawn towards the
 # larger amplitudes. The sum goes to the mean: five frames in, it is nearly the exact posterior
 # (0.07 nats from it, where the plain filter is 0.85; `docs/repairs.md`), at some twenty times
-# the cost of the plain filter. Later a few runs in a thousand are lost all the same, and one of
+# the cost of the plain filter. Later a few runs in a thousand are still lost, and one of
 # them is enough to take a mean NEES out of its band; and where accelerations are very large, it
 # is a little over-confident. Where the prior on depth is wrong, as on `circle`, no filter that
 # believes it is consistent; `+scene50` learns how far away the landmarks are. Measured tables are

@@ -12,7 +12,7 @@
 # ---
 
 # %% [markdown]
-# # A point seen twice
+# # How uncertain is the depth of a point seen from two places?
 #
 # How well does a Gaussian say what two views know of a point? Figs 1 and 2 of *Monocular SLAM with
 # Inverse Scaling Parametrization* (Marzorati et al., BMVC 2008) answer with a planar 1-D camera,
@@ -196,7 +196,7 @@ for calibration in ("white", "shared"):
 # ## Where the statement holds
 #
 # A sweep over depth, baseline, pixel and $d_{min}$, wherever both views see the point and the prior
-# does not deny it ($z \ge d_{min}$), at exact pixels: the share of settings in which each part of
+# does not deny it ($z \ge d_{min}$), at exact pixels. It shows how often each part of
 # the statement is true of the KS distance, ties within the accuracy of the particles included.
 
 # %%

@@ -12,7 +12,7 @@
 # ---
 
 # %% [markdown]
-# # A camera carried by hand (Fig. 5 of the paper)
+# # Tracking a handheld camera (Fig. 5 of the paper)
 #
 # Fig. 5 of *Monocular SLAM with Inverse Scaling Parametrization* shows a grey video of a handheld
 # camera: the trajectory in 6-DoF, landmarks with their ellipsoids, and frames with the predicted

@@ -8,6 +8,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
 
 LONGEST = 45
 """Words of a sentence."""
@@ -89,9 +90,18 @@ def broken(text: str) -> list[str]:
     return wrong
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def written(page: Path) -> str:
+    """The Markdown of a page, or of a notebook's cells."""
+    text = page.read_text()
+    if page.suffix == ".py":
+        cells = re.findall(r"^# %% \[markdown\].*?\n((?:#.*\n)+)", text, re.MULTILINE)
+        text = "\n".join(re.sub("^# ?", "", cell, flags=re.MULTILINE) for cell in cells)
+    return text
+
+
+@pytest.mark.parametrize("page", [*PAGES, *NOTEBOOKS], ids=lambda path: path.name)
 def test_pages_keep_the_rules(page):
-    found = broken(page.read_text())
+    found = broken(written(page))
     assert len(found) <= EXCEPTIONS.get(page.name, 0), "\n".join(["", *found])
 
 
@@ -111,7 +121,8 @@ def test_a_page_that_breaks_the_rules_is_found():
 
 
 def test_titles_are_short_and_each_is_of_one_page():
-    titles = [re.search(r"^# (.*)$", page.read_text(), re.MULTILINE) for page in PAGES]
+    pages = [*PAGES, *NOTEBOOKS]
+    titles = [re.search(r"^# (.*)$", written(page), re.MULTILINE) for page in pages]
     found = [title[1] for title in titles if title]
     assert max(map(len, found)) <= 65
     assert len(set(found) - {"jaxslam"}) == len([t for t in found if t != "jaxslam"])
