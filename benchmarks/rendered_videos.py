@@ -318,7 +318,7 @@ def _passing(times: np.ndarray, rng: np.random.Generator) -> Poses:
 KINDS = {
     "boxes": Kind(150, 30, _room, _swaying, "a hand-held camera sways in a furnished room"),
     "orbit": Kind(200, 10, _on_white, _orbiting, "once round an object on a white background"),
-    "orbit-twice": Kind(400, 10, _on_white, _orbiting, "twice round an object on a white background"),
+    "orbit-twice": Kind(400, 10, _on_white, _orbiting, "twice round such an object"),
     "turn": Kind(150, 30, _room, _turning, "a walk with a turn of 60°/s"),
     "spin": Kind(600, 10, _room, _spinning, "a minute of pure rotation at 30°/s"),
     "look-around": Kind(500, 20, _room, _looking, "a slow walk with looks to both sides, ±75°"),
