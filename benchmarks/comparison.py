@@ -88,7 +88,7 @@ def page(summary: dict[str, Any]) -> str:
         "above the 99.99 % quantile of χ²); σ over the RMSE of the position, ideally 1. "
         f"The 95 % band of the mean NEES of {runs} runs is {low:.2f}–{high:.2f}.",
         _table(results, runs),
-        f"†: fewer runs, {few or 'none'} in place of {runs}.",
+        f"†: fewer runs, {few or 'none'} instead of {runs}.",
         "## The parametrizations",
         landmark_table(jaxslam.LANDMARKS.values()),
         f"`python benchmarks/comparison.py` writes this page, with seed {summary['seed']} for all "

@@ -30,4 +30,4 @@ def test_rows_of_fewer_runs_have_a_mark():
     page = benchmark.page(on_disk())
     row = next(line for line in page.splitlines() if line.startswith("| world image_plane "))
     assert row.count(" †") == 4
-    assert "†: fewer runs, 200 in place of 1000." in page
+    assert "†: fewer runs, 200 instead of 1000." in page
