@@ -34,6 +34,14 @@ def bar(total: int | None, unit: str, desc: str | None = None, done: int = 0) ->
     )  # fmt: skip
 
 
+def _begin_timing(shown: Any, desc: str) -> None:
+    """Judge the time left by what is done from now on: what came before it had to compile."""
+    shown.bar_format = None
+    shown.initial = shown.last_print_n = shown.n
+    shown.start_t = shown.last_print_t = time.time()
+    shown.set_description(desc)
+
+
 @contextmanager
 def warming_bar(
     total: int | None, unit: str, first: str, warm_up: int, then: str
@@ -46,20 +54,20 @@ def warming_bar(
         def update(count: int) -> None:
             shown.update(count)
             if shown.n == warm_up:
-                shown.smoothing, shown.bar_format = smoothing, None
-                shown.initial = shown.last_print_n = shown.n
-                shown.start_t = shown.last_print_t = time.time()
-                shown.set_description(then)
+                shown.smoothing = smoothing
+                _begin_timing(shown, then)
 
         yield update
 
 
 class StudyBar:
     """A bar for `monte_carlo(…, progress=StudyBar(runs × filters))`, closed when all are done; so
-    many are `done` already. It says what is compiled."""
+    many are `done` already. While a filter is compiled it says so, and no time left, which is then
+    judged by the runs of that filter alone."""
 
     def __init__(self, total: int, done: int = 0) -> None:
         self._bar = bar(total, "run", done=done)
+        self._bar.smoothing, self._compiling = 0.0, ""  # chunks end several at a time
 
     def __enter__(self) -> StudyBar:
         return self
@@ -68,8 +76,16 @@ class StudyBar:
         self._bar.close()
 
     def __call__(self, name: str, runs: int) -> None:
-        """So many more runs of this filter are done; none: it is now compiled."""
-        self._bar.set_description(name if runs else f"{name}, compiling", refresh=not runs)
+        """So many more runs of this filter are done; none: it is now compiled, and at the next
+        call, whatever that says, it has been."""
+        if not runs and name != self._compiling:
+            self._compiling, self._bar.bar_format = name, _UNTIMED
+            self._bar.set_description_str(f"{name}, compiling")
+            return
+        if not runs:
+            _begin_timing(self._bar, name)
+        elif name != self._bar.desc.removesuffix(": "):  # on a cluster
+            self._bar.set_description(name, refresh=False)
         self._bar.update(runs)
         if self._bar.n >= self._bar.total:
             self._bar.close()

@@ -7,13 +7,15 @@ import signal
 import sys
 import textwrap
 import threading
-from typing import NoReturn
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import Any, NoReturn
 
 from jaxslam._runtime.extras import missing
 from jaxslam._version import __version__
 
-_BROKEN_PIPE = 141
-"""The exit status of a command that SIGPIPE ends, as a shell has it."""
+_INTERRUPTED, _BROKEN_PIPE = 130, 141
+"""The exit status of a command that SIGINT, or SIGPIPE, ends, as a shell has it."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -42,24 +44,63 @@ def _main(given: list[str]) -> None:
         _fail(2, f"{textwrap.shorten(str(error.filename), 80)}: {error.strerror or error}")
     except KeyboardInterrupt as interrupt:
         told = f": {interrupt}" if str(interrupt) else ""
-        _fail(130, f"interrupted{told}")
+        _fail(_INTERRUPTED, f"interrupted{told}")
 
 
 def _run(given: list[str]) -> None:
-    try:
-        import tqdm  # noqa: F401
+    with _interruptions():
+        try:
+            import tqdm  # noqa: F401
 
-        from jaxslam.cli.cache import keep_programs
-        from jaxslam.cli.commands import parse
-    except ImportError as error:
-        _fail(2, str(missing("the command line needs", "cli", error)))
-    options = parse(given)
-    signal.signal(signal.SIGTERM, _interrupt)
-    keep_programs()
-    options.run()
+            from jaxslam.cli.cache import keep_programs
+            from jaxslam.cli.commands import parse
+        except ImportError as error:
+            if _interrupted.is_set():
+                raise
+            _fail(2, str(missing("the command line needs", "cli", error)))
+        options = parse(given)
+        keep_programs()
+        if _interrupted.is_set():  # a library that was imported has printed it, and gone on
+            raise KeyboardInterrupt
+        options.run()
+
+
+_interrupted = threading.Event()
+_AGAIN = 0.01
+"""Seconds after which an interruption comes once more, then to somebody."""
+
+
+@contextmanager
+def _interruptions() -> Generator[None]:
+    """Ctrl-C and SIGTERM end the block by KeyboardInterrupt, wherever they come.
+
+    Python has nobody to raise it to where an object ends: it then comes once more. A library that
+    is being imported, or that calls back, may make an error of its own of it.
+    """
+    _interrupted.clear()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as behind nohup, or in a script's `&`
+            signal.signal(number, _interrupt)
+    before = sys.unraisablehook
+
+    def swallowed(told: Any) -> None:
+        if not isinstance(told.exc_value, KeyboardInterrupt):
+            return before(told)
+        return threading.Timer(_AGAIN, os.kill, (os.getpid(), signal.SIGINT)).start()
+
+    sys.unraisablehook = swallowed
+    try:
+        yield
+    except Exception:
+        if _interrupted.is_set():
+            raise KeyboardInterrupt from None
+        raise
+    finally:
+        sys.unraisablehook = before
 
 
 def _interrupt(*_) -> None:
+    _interrupted.set()
     raise KeyboardInterrupt
 
 
@@ -70,8 +111,9 @@ def _fail(status: int, message: str) -> NoReturn:
 
 def _leave(status: int | str) -> None:
     """End the process at once where Python would wait for a program that is compiled aside, for a
-    minute."""
+    minute, or dies of an interruption that was heard."""
     others = set(threading.enumerate()) - {threading.main_thread()}
-    if isinstance(status, int) and not all(thread.daemon for thread in others):
+    waits = not all(thread.daemon for thread in others)
+    if isinstance(status, int) and (waits or status == _INTERRUPTED):
         sys.stdout.flush()
         os._exit(status)

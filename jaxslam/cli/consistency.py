@@ -125,22 +125,31 @@ class ConsistencyOptions:
         world = self._scenario()
         filters = make_filters(world, self.filters, self.landmarks, self.calibration)
         store = FolderStore(self.out / "runs", resume=self.resume)
-        chunks = divided(self.runs, self.chunk)
-        done = sum(len(c) for name in filters for c in chunks if store.has(name, c))
-        with StudyBar(self.runs * len(filters), done) as progress:
-            return monte_carlo(
-                world,
-                filters,
-                runs=self.runs,
-                seed=self.seed,
-                dtype=self.dtype,
-                chunk=self.chunk,
-                backend=self.backend,
-                store=store,
-                progress=progress,
-                cluster=self.cluster,
-                reduced=self.reduce,
-            )
+        total = self.runs * len(filters)
+
+        def kept() -> int:
+            chunks = divided(self.runs, self.chunk)
+            return sum(len(c) for name in filters for c in chunks if store.has(name, c))
+
+        with StudyBar(total, kept()) as progress:
+            try:
+                return monte_carlo(
+                    world,
+                    filters,
+                    runs=self.runs,
+                    seed=self.seed,
+                    dtype=self.dtype,
+                    chunk=self.chunk,
+                    backend=self.backend,
+                    store=store,
+                    progress=progress,
+                    cluster=self.cluster,
+                    reduced=self.reduce,
+                )
+            except KeyboardInterrupt:
+                told = f"{kept()} of {total} runs are kept in {self.out}"
+                told += "; the same command with --resume goes on from there"
+                raise KeyboardInterrupt(told) from None
 
     def _scenario(self) -> Scenario:
         overrides: dict[str, object] = dict(parse_override(text) for text in self.set)

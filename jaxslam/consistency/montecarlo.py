@@ -62,9 +62,10 @@ def monte_carlo(
     or a `sensor` of one's own the truth moves, or is measured, as that says, in the scenario's
     world.
 
-    `progress(filter name, finished runs)` is called after every chunk, and with no runs before
-    the first, when the filter is to be compiled. Chunks that `store` already has are not run again;
-    it is given what decides them, and refuses what differs.
+    `progress(filter name, finished runs)` is called after every chunk, and with no runs twice: when
+    the filter is to be compiled, and when it is (not with a `cluster`). An interruption is raised
+    at once, and leaves in `store` the chunks that are finished. Chunks that `store` already has are
+    not run again; it is given what decides them, and refuses what differs.
 
     With a `cluster`, the address of a Dask scheduler or a `distributed.Client`, the chunks are
     computed there and kept here; their seconds are of all together, compilation among them.
@@ -140,6 +141,11 @@ class ChunkTask(NamedTuple):
             return {**records, **{f"sample_{k}": v for k, v in sample.items()}}
         return as_sums(records, batch.poses.tangent_dim)
 
+    def compile(self, chunk: range) -> None:
+        """Compile the program for chunks of this size."""
+        with jax.enable_x64(self.simulator.dtype == "float64"):
+            self.program(self.simulator(chunk)[0])
+
     def program(self, batch: Run) -> BatchProgram:
         """Return the program, compiled by the first thread that asks."""
         assert self.room is not None, "a chunk is computed after the room for it is known"
@@ -159,7 +165,8 @@ def _run_filter(
     progress(task.name, 0)
     start = time.perf_counter()
     if map_chunks is in_threads:
-        task.program(task.simulator(chunks[0])[0])
+        list(in_threads(task.compile, chunks[:1]))  # aside: XLA's compiler hears no interruption
+        progress(task.name, 0)
     compiled_at = time.perf_counter()
     for chunk, records in map_chunks(task, chunks):
         store.save(task.name, chunk, records)
@@ -173,16 +180,16 @@ def in_threads(
     """Yield chunks, as they are finished, with the function's results.
 
     On a CPU one runs in each processor: a program's matrices are too small to be divided. What has
-    not started is dropped on an error.
+    not started is dropped on an error, and what has is not waited for.
     """
     alone = jax.default_backend() != "cpu" or len(chunks) == 1
-    with ThreadPoolExecutor(1 if alone else processors()) as pool:
+    pool = ThreadPoolExecutor(1 if alone else processors())
+    try:
         waiting = {pool.submit(function, chunk): chunk for chunk in chunks}
-        try:
-            for future in as_completed(waiting):
-                yield waiting.pop(future), future.result()  # what was yielded is not kept
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+        for future in as_completed(waiting):
+            yield waiting.pop(future), future.result()  # what was yielded is not kept
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def processors() -> int:

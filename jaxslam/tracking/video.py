@@ -86,6 +86,9 @@ def track(
         # After the first frame there is nothing to tell yet, and what tells it may be compiling.
         if len(history) > isinstance(error, KeyboardInterrupt):
             _write(source, tracker, history, seconds, out, smooth=False)
+            if isinstance(error, KeyboardInterrupt):
+                told = f"{out} has the files of the {len(history)} frames so far"
+                raise KeyboardInterrupt(told) from None
         raise
     return _write(source, tracker, history, seconds, out, smooth=True)
 

@@ -147,6 +147,53 @@ jaxslam.cli.main()
     assert (ended.returncode, ended.stderr) == (130, "jaxslam: interrupted\n")
 
 
+@pytest.mark.parametrize("swallowed", ["as an object ends", "by an import", "as another error"])
+def test_an_interruption_is_heard_wherever_it_comes(swallowed):
+    code = f"""
+import os, signal, sys, time, types, jaxslam.cli, jaxslam.cli.commands as commands
+swallowed = "{swallowed}"
+def pressed():
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(60)
+class Ends:
+    def __del__(self):
+        pressed()
+def parse(given):
+    try:
+        pressed() if swallowed == "by an import" else None
+    except KeyboardInterrupt:
+        pass
+    return types.SimpleNamespace(run=run)
+def run():
+    try:
+        Ends() if swallowed == "as an object ends" else pressed()
+        time.sleep(60)
+    except KeyboardInterrupt:
+        if swallowed == "as another error":
+            raise RuntimeError("a callback failed") from None
+        raise
+commands.parse = parse
+jaxslam.cli.main()
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=50, check=False
+    )
+    assert (ended.returncode, ended.stderr) == (130, "jaxslam: interrupted\n")
+
+
+def test_an_interrupted_study_says_what_is_kept_and_how_to_go_on(tmp_path, monkeypatch, capsys):
+    def interrupted(world, filters, *, store, chunk, **more):
+        store.save(next(iter(filters)), range(chunk), {})
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("jaxslam.cli.consistency.monte_carlo", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        main([*SMALL, "--chunk", "2", "--out", str(tmp_path)])
+    assert ended.value.code == 130
+    told = f"jaxslam: interrupted: 2 of 12 runs are kept in {tmp_path}; the same command with "
+    assert capsys.readouterr().err.splitlines()[-1] == f"{told}--resume goes on from there"
+
+
 def test_a_command_within_a_program_does_not_end_it(capsys):
     """Nor a notebook's kernel, whatever goes on in other threads."""
     done = threading.Event()

@@ -1,7 +1,9 @@
 """Tests of jaxslam.consistency: exact bands, chunking, divergence, resuming, the summary."""
 
+import threading
 import time
 from collections import Counter
+from collections.abc import Generator
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -218,6 +220,19 @@ def test_no_chunk_begins_after_an_error(monkeypatch):
         told.extend((chunk.start, stop) for chunk, stop in montecarlo.in_threads(computed, chunks))
     assert told == [(0, 1), (1, 2)]
     assert len(began) < 99
+
+
+def test_an_interruption_waits_for_no_chunk(monkeypatch):
+    """Nor for a compiler, which runs as one: neither hears it."""
+    let_go = threading.Event()
+    monkeypatch.setattr(montecarlo, "processors", lambda: 2)
+    found = montecarlo.in_threads(lambda c: c.start and let_go.wait(60), [range(2), range(2, 4)])
+    assert next(found)[0] == range(2)
+    assert isinstance(found, Generator)
+    with pytest.raises(KeyboardInterrupt):
+        found.throw(KeyboardInterrupt)  # as of one who waits for the next
+    assert not let_go.is_set()
+    let_go.set()
 
 
 @pytest.mark.slow
@@ -465,7 +480,7 @@ def test_a_study_resumes_from_its_folder_and_refuses_another(tmp_path):
         store=FolderStore(tmp_path, manifest, resume=True),
         progress=lambda name, runs: done.append(runs),
     )
-    assert done == [0, 2]  # compiled, then run
+    assert done == [0, 0, 2]  # compiled from here, to here, and run
     resumed = jaxslam.summarise(again)["filters"]["inverse_scaling"]
     assert resumed["nees"] == expected["nees"]
     with pytest.raises(ValueError, match=r"cannot resume: .* another seed"):

@@ -72,12 +72,34 @@ def test_a_study_says_what_is_compiled_and_where_it_goes_on(monkeypatch):
     monkeypatch.setattr(sys, "stderr", terminal)
     with progress.StudyBar(10, done=4) as move:
         move("a", 0)
-        assert "a, compiling" in terminal.getvalue()
-        assert "4/10" in terminal.getvalue()
+        assert "a, compiling: 4/10" in terminal.getvalue()
+        move("a", 0)
         move("a", 6)
     last = terminal.getvalue().split("\r")[-1]
     assert last.startswith("a: 100%")
     assert "10/10" in last
+
+
+def test_the_time_left_of_a_study_is_that_of_its_runs(monkeypatch):
+    """Neither an hour of compiling nor the runs of another filter are in it."""
+    now = [0.0]
+    monkeypatch.setattr("time.time", lambda: now[0])
+    monkeypatch.setattr("tqdm.std.time", lambda: now[0])
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with progress.StudyBar(40) as move:
+        for seconds, name, runs in (
+            (0, "a", 0), (3600, "a", 0), (5, "a", 10), (5, "a", 10),
+            (1, "b", 0), (3600, "b", 0), (2, "b", 10), (0, "b", 5),
+        ):  # fmt: skip
+            now[0] += seconds
+            move(name, runs)
+    told = terminal.getvalue().split("\r")
+    cold = [line.split("[")[1].strip() for line in told if "compiling" in line]
+    assert cold == ["00:00]", "00:11]"]
+    assert "a:  50%|#####     | 20/40 [00:10<00:10" in terminal.getvalue().replace("█", "#")
+    assert "30/40 [00:02<00:02" in terminal.getvalue()
+    assert not [line for line in told if "1:00:" in line]
 
 
 @pytest.mark.parametrize("total", [None, 3])

@@ -492,7 +492,7 @@ def test_an_interruption_leaves_the_files_of_the_frames_so_far(tmp_path):
             raise KeyboardInterrupt
 
     seen = 0
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt, match="has the files of the 4 frames so far"):
         track(synthetic_source(frames=20), tmp_path, SMALL, progress=stop)
     assert len(read_tum(tmp_path / "trajectory.txt")[0]) == 4
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 4
