@@ -28,7 +28,9 @@ def __getattr__(name: str) -> Any:
         return _imported(name)
     if not name.startswith("__") and find_spec(module) is not None:
         return import_module(module)
-    raise AttributeError(f"module 'jaxslam' has no attribute {name!r}")
+    from jaxslam._runtime.lookup import suggestion
+
+    raise AttributeError(f"module 'jaxslam' has no attribute {name!r}{suggestion(name, __dir__())}")
 
 
 def _imported(name: str) -> Any:

@@ -25,7 +25,7 @@ from jaxslam.filters.run import Frames, run
 from jaxslam.filters.wrappers.fixed_lag import FixedLag
 from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
 from jaxslam.geometry import PLANAR, SPATIAL
-from jaxslam.landmarks import LANDMARKS
+from jaxslam.landmarks import LANDMARKS, Parametrization, check_landmark
 from jaxslam.models.calibration import (
     AbstractCalibration,
     Considered,
@@ -79,6 +79,7 @@ __all__ = [
     "LandmarkView",
     "Metre",
     "Odometry",
+    "Parametrization",
     "Pinhole",
     "Position",
     "RangeBearing",
@@ -90,6 +91,7 @@ __all__ = [
     "__version__",
     "camera_pose",
     "cast",
+    "check_landmark",
     "evaluate",
     "evaluate_log",
     "evaluate_poses",

@@ -116,3 +116,27 @@ def test_single_precision_by_oversight_warns_once_and_by_choice_never():
         "assert not seen, seen\n"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=200)
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("scenarios", "scenario"),
+        ("Paramterization", "Parametrization"),
+        ("montecarlo", "monte_carlo"),
+    ],
+)
+def test_a_guessed_name_is_told_the_right_one(name, meant):
+    with pytest.raises(AttributeError, match=rf"no attribute '{name}' \(did you mean {meant}\?\)"):
+        getattr(jaxslam, name)
+
+
+def test_one_filter_takes_its_landmark_by_name():
+    pieces: dict[str, Any] = {"motion": PLANAR, "sensor": jaxslam.Pinhole(CAMERA, 0.3)}
+    made = jaxslam.make_filter("robocentric", landmark="inverse_depth", **pieces)
+    assert isinstance(made, jaxslam.EkfSlam)
+    assert made.landmark is jaxslam.LANDMARKS["inverse_depth"]
+    with pytest.raises(ValueError, match=r"inverse_scale.* \(did you mean inverse_scaling\?\)"):
+        jaxslam.make_filter("robocentric", landmark="inverse_scale", **pieces)
+    with pytest.raises(ValueError, match=r"make_filter lacks motion, sensor; .* make_filters"):
+        jaxslam.make_filter("robocentric", landmark="inverse_scaling")

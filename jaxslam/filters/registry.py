@@ -199,8 +199,16 @@ def recommended_name(motion: AbstractMotion) -> str:
 def make_filter(name: str, **pieces: Piece) -> AbstractFilter:
     """One filter by its name, with its modifiers, of pieces as `EkfSlam` takes them.
 
-    Raises ValueError for a name that is not known, and for what does not go together.
+    The `landmark` may be named. Raises ValueError for a name that is not known, a piece that is
+    missing, and what does not go together.
     """
+    if missing := [piece for piece in ("motion", "sensor") if piece not in pieces]:
+        raise ValueError(
+            f"make_filter lacks {', '.join(missing)}; the pieces of EkfSlam are accepted, or "
+            "make_filters(scenario, filters, landmarks) makes them of a scenario"
+        )
+    if isinstance(named := pieces.get("landmark"), str):
+        pieces["landmark"] = lookup("landmark", named, LANDMARKS)[named]
     base, *modifiers = _spelt_out(name, pieces["motion"]).split("+")
     made: AbstractFilter = lookup("filters", [base], FILTERS)[base](**pieces)
     for modifier in modifiers:

@@ -2,6 +2,7 @@
 
 from jaxslam.landmarks.anchored_homogeneous import ANCHORED_HOMOGENEOUS
 from jaxslam.landmarks.cartesian import CARTESIAN
+from jaxslam.landmarks.check import check_landmark
 from jaxslam.landmarks.framed_homogeneous import FRAMED_HOMOGENEOUS
 from jaxslam.landmarks.image_plane import IMAGE_PLANE
 from jaxslam.landmarks.inverse_depth import INVERSE_DEPTH
@@ -39,5 +40,6 @@ __all__ = [
     "PARALLAX_ANGLE",
     "UNIT_HOMOGENEOUS",
     "Parametrization",
+    "check_landmark",
     "table",
 ]
