@@ -61,10 +61,16 @@ def _column(summary: Summary) -> Figure:
     if summary["scale_free"]:
         drawn += [plot_beyond_scale, plot_log_scale]
     title = column_title(_title(summary))
-    figure = new_figure(COLUMN, 0.15 * len(title.splitlines()) + 1.9 * len(drawn))
+    lines = len(title.splitlines()) + len(summary["filters"]) + 2
+    figure = new_figure(COLUMN, 0.14 * lines + 1.25 * len(drawn))
     figure.suptitle(title, x=0.02, ha="left")
-    for plot, ax in zip(drawn, figure.subplots(len(drawn), 1), strict=True):
+    axes = figure.subplots(len(drawn), 1, sharex=True)
+    for plot, ax in zip(drawn, axes, strict=True):
         plot(summary, ax=ax)
+    for ax in axes[:-1]:  # time, and a legend, stand below all
+        ax.set_xlabel("")
+        if (legend := ax.get_legend()) is not None:
+            legend.remove()
     for_print(figure)
     return figure
 

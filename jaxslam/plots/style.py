@@ -15,8 +15,10 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from matplotlib.ticker import FixedLocator, NullFormatter
+from matplotlib.transforms import offset_copy
 from scipy.optimize import isotonic_regression
 
 from jaxslam._runtime.files import write_atomically
@@ -36,6 +38,12 @@ _FITTING = 50
 _POWERS = range(-9, 13)
 _DIGITS = ((4, (1, 1.5, 2, 3, 4, 5, 7)), (20, (1, 2, 3, 5)), (500, (1, 2, 5)), (np.inf, (1,)))
 """Of the numbers named on an axis whose ends differ by a factor of so much at the most."""
+_LETTER_WIDTH = 0.55
+"""In sizes of the letters, about."""
+_MOST_FOR_NAMES = 0.3
+"""The share of a figure's width that names at lines may take."""
+_BELOW = -0.42
+"""Inches from the axes to what stands below the numbers and the name of x."""
 _SPACED = 1.25
 """Height of a line of text, in sizes of its letters."""
 
@@ -121,18 +129,29 @@ def label_ends(axes: Axes, ends: Sequence[End]) -> None:
     """Write each line's name to the right of the axes, in its colour, where it ends.
 
     Names that would lie on one another are moved apart, as little as that takes, and joined to
-    their line. To be called when the limits of the axes are set; a line without a number gets
-    none.
+    their line. Where they would take too much of the figure's width they stand in a legend below.
+    To be called when the limits of the axes are set; a line without a number gets none.
     """
     ends = [end for end in ends if np.isfinite(end.y).any()]
+    longest = max((len(end.label) for end in ends), default=0)
+    room = axes.figure.bbox.width / axes.figure.dpi
+    if longest * _LETTER_WIDTH * LETTERS / 72 > _MOST_FOR_NAMES * room:
+        lines = [Line2D([], [], color=end.colour, lw=1.8) for end in ends]
+        below = offset_copy(axes.transAxes, axes.get_figure(root=True), y=_BELOW, units="inches")
+        axes.legend(
+            lines, [end.label for end in ends], loc="upper left", bbox_to_anchor=(0, 0),
+            bbox_transform=below, labelcolor="linecolor", fontsize=LETTERS, frameon=False,
+            borderpad=0, handlelength=1.0, borderaxespad=0, labelspacing=0.2,
+        )  # fmt: skip
+        return
     last = [np.flatnonzero(np.isfinite(end.y))[-1] for end in ends]
     points = np.array([(end.x[i], end.y[i]) for end, i in zip(ends, last, strict=True)])
     if not ends:
         return
     pixels = axes.transData.transform(points)
     heights = np.clip(axes.transAxes.inverted().transform(pixels)[:, 1], 0, 1)
-    room = _SPACED * LETTERS / 72 / _height(axes)
-    for end, point, height in zip(ends, points, _apart(heights, room), strict=True):
+    apart = _SPACED * LETTERS / 72 / _height(axes)
+    for end, point, height in zip(ends, points, _apart(heights, apart), strict=True):
         axes.annotate(
             end.label, tuple(point), (1.02, height), textcoords=axes.transAxes, color=end.colour,
             fontsize=LETTERS, va="center", annotation_clip=False,

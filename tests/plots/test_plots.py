@@ -104,6 +104,23 @@ def test_ticks_are_round_numbers_written_out(low, high, told):
     assert [label.get_text() for value, label in ticks if low <= value <= high][: len(told)] == told
 
 
+def test_long_names_leave_most_of_a_column_to_the_lines(tmp_path):
+    figure = new_figure(COLUMN, 2.6)
+    axes = figure.subplots()
+    axes.plot([0, 2], [0, 1])
+    axes.set_xlabel("time, s")
+    label_ends(axes, [end._replace(label=f"{end.label} of a long name") for end in ends([1, 2])])
+    save(figure, tmp_path / "long.png")
+    assert axes.get_position().width > 0.8
+    legend = axes.get_legend()
+    assert legend is not None
+    assert [text.get_text()[:6] for text in legend.get_texts()] == ["line 0", "line 1"]
+    named, drawn = axes.xaxis.label.get_window_extent(), legend.get_window_extent()
+    assert figure.bbox.y0 <= drawn.y0 < drawn.y1 <= named.y0 + 2
+    assert drawn.x0 >= figure.bbox.x0
+    assert drawn.x1 <= figure.bbox.x1
+
+
 def test_filters_are_named_by_what_tells_them_apart():
     assert short_names(["a/x", "b/x"]) == {"a/x": "a", "b/x": "b"}
     assert short_names(["a/x", "a/y"]) == {"a/x": "x", "a/y": "y"}
@@ -121,6 +138,7 @@ def test_a_column_for_print_has_its_width_its_letters_and_nothing_outside(study,
         save(figure, tmp_path / "figure.pdf")
         shown = [text for text in figure.findobj(Text) if text.get_text() and text.get_visible()]
         assert {text.get_fontsize() for text in shown} == {8.0}
+        assert figure.get_figheight() <= 7.0
         drawn = figure.get_tightbbox()  # inches
         assert -0.01 <= drawn.x0 < drawn.x1 <= COLUMN + 0.01
         written = (tmp_path / "figure.pdf").read_bytes()
