@@ -34,7 +34,7 @@ def bar(total: int | None, unit: str, desc: str | None = None, done: int = 0) ->
     )  # fmt: skip
 
 
-def _begin_timing(shown: Any, desc: str) -> None:
+def _begin_timing(shown, desc: str) -> None:
     """Judge the time left by what is done from now on: what came before it had to compile."""
     shown.bar_format = None
     shown.initial = shown.last_print_n = shown.n

@@ -9,7 +9,7 @@ import textwrap
 import threading
 from collections.abc import Generator
 from contextlib import contextmanager
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from jaxslam._runtime.extras import missing
 from jaxslam._version import __version__
@@ -83,7 +83,7 @@ def _interruptions() -> Generator[None]:
             signal.signal(number, _interrupt)
     before = sys.unraisablehook
 
-    def swallowed(told: Any) -> None:
+    def swallowed(told) -> None:
         if not isinstance(told.exc_value, KeyboardInterrupt):
             return before(told)
         return threading.Timer(_AGAIN, os.kill, (os.getpid(), signal.SIGINT)).start()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -91,7 +91,7 @@ class Study:
         """Return `summarise(study)`, the content of `consistency.json`."""
         return summarise(self)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> NoReturn:
         drawn = " (jaxslam.plots.plot_consistency(study) draws it)"
         meant = drawn if name.startswith("plot") else suggestion(name, dir(type(self)))
         raise AttributeError(f"a Study has no attribute {name!r}{meant}")
