@@ -130,11 +130,16 @@ def _said(found: dict[str, Any]) -> str:
     above = sum(not (found["nees"][k - 1] or np.inf) <= high for k in frames)
     below = sum((found["nees"][k - 1] or np.inf) < low for k in frames)
     return (
-        f"of {runs} runs (seed {found['seed']}) at most {lost} are lost and at most {reversed_} "
+        f"of {runs} runs (seed {found['seed']}) {_at_most(lost)} lost and {_at_most(reversed_)} "
         f"reversed at any of frames {SETTLED} to {frames[-1]}. The mean NEES of all runs (ideal "
         f"{found['dof']}) is above its band at {above} of these {len(frames)} frames and below it "
         f"at {below}. {_words(found)}"
     )
+
+
+def _at_most(count: int) -> str:
+    """So many runs, and their verb."""
+    return "none is" if count == 0 else f"at most {count} {'is' if count == 1 else 'are'}"
 
 
 def _words(found: dict[str, Any]) -> str:

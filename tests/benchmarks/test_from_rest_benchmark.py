@@ -53,7 +53,7 @@ def test_the_sentences_are_of_the_numbers_of_all_runs():
     results = {"standstill": {"mine": numbers, "mine+rest8": numbers}}
     (said,) = benchmark.sentences(results).splitlines()
     assert said.startswith("- `standstill`, `mine+rest8`: of 50 runs (seed 3) at most 5 are lost")
-    assert "at most 1 reversed at any of frames 10 to 60" in said
+    assert "at most 1 is reversed at any of frames 10 to 60" in said
     assert "above its band at 2 of these 51 frames and below it at 1." in said
     assert said.endswith("The verdict was not recorded.")
     with_verdicts = {
