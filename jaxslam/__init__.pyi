@@ -36,7 +36,7 @@ from jaxslam.models.calibration import (
 from jaxslam.models.camera import Camera
 from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.models.depth import InverseDepth
-from jaxslam.models.motion import AbstractMotion, BodyRates, ConstantVelocity, Odometry
+from jaxslam.models.motion import AbstractMotion, ConstantVelocity, Odometry
 from jaxslam.models.observations import Capacity, Features, Innovation, Status
 from jaxslam.models.scale import Metre, ScaleGauge
 from jaxslam.models.sensors import AbstractSensor, Pinhole, Position, RangeBearing
@@ -58,7 +58,6 @@ __all__ = [
     "AbstractMotion",
     "AbstractSensor",
     "AbstractStaged",
-    "BodyRates",
     "Camera",
     "CameraView",
     "Capacity",

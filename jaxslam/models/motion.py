@@ -1,8 +1,8 @@
 """Motion models of a camera: the displacement between two frames, driven by white noise.
 
 A model says what a *control* makes of the variables that it keeps in the state and of this step's
-noise. The control is data: the seconds of the step, the odometry's reading, or the rates of a
-vehicle. A model of your own is one class with the functions of `AbstractMotion`.
+noise. The control is data: the seconds of the step, or the odometry's reading. A model of your own
+is one class with the functions of `AbstractMotion`.
 """
 
 from abc import abstractmethod
@@ -16,7 +16,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, PyTree
 
 from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field
-from jaxslam.geometry import GEOMETRIES, Geometry, Pose, Scalar, exp, identity, joined
+from jaxslam.geometry import GEOMETRIES, Geometry, Pose, Scalar, exp, joined
 
 Tangent = Float[Array, " t"]
 """A velocity, or a displacement: linear, then angular."""
@@ -166,43 +166,6 @@ class Odometry(AbstractMotion):
 
     def nominal_control(self, velocity: Tangent, seconds: Number) -> Tangent:
         return velocity * seconds
-
-
-class VehicleRates(eqx.Module):
-    """The control of `BodyRates`: what a vehicle V measures of its motion, and its camera; in one
-    step, or in some."""
-
-    rates: Float[Array, "*steps t"]
-    """Linear and angular velocity in the axes of V at k−1, m/s and rad/s."""
-    seconds: Float[Array, "*steps"]
-    camera: Pose
-    """T_VC, the camera on the vehicle."""
-
-
-class BodyRates(AbstractMotion):
-    """Odometry of a vehicle that carries the camera off its centre; the control is `VehicleRates`.
-
-    The lever arm correlates what the camera sees of the rates' errors.
-    """
-
-    noise_sigma: Float[AnyArray, " t"] = number_field()
-    """σ of the white error of the rates, m/s and rad/s."""
-
-    @property
-    def geometry(self) -> Geometry:
-        return geometry_of(self.noise_sigma, "the sigma of a vehicle's rates")
-
-    def displacement(self, variables: tuple[()], noise: Tangent, control: VehicleRates) -> Pose:
-        """`T_{k-1,k} = T_VC⁻¹ (R = Exp(ω Δt), t = v Δt) T_VC` with (v, ω) = rates + w."""
-        del variables
-        displaced = (control.rates + noise) * control.seconds
-        moved, turned = jnp.split(displaced, [self.geometry.point_dim])
-        step = joined(exp(self.geometry.rotation_group, turned), moved)
-        return control.camera.inverse() @ step @ control.camera
-
-    def still(self, dtype: DTypeLike | None = None) -> VehicleRates:
-        zero = jnp.zeros(self.geometry.tangent_dim, dtype)
-        return VehicleRates(zero, jnp.zeros((), dtype), identity(self.geometry, zero.dtype))
 
 
 def check_control(motion: AbstractMotion, control: Control) -> None:

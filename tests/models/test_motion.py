@@ -8,8 +8,8 @@ import pytest
 from cases import each_geometry, named, quick_jit
 from scipy.spatial.transform import Rotation
 
-from jaxslam.geometry import PLANAR, exp, identity
-from jaxslam.models.motion import BodyRates, ConstantVelocity, Odometry, VehicleRates, check_control
+from jaxslam.geometry import PLANAR
+from jaxslam.models.motion import ConstantVelocity, Odometry, check_control
 from jaxslam.simulation import scenario
 from jaxslam.simulation.pieces import motion_of
 from jaxslam.simulation.scenario import MOTIONS
@@ -64,37 +64,9 @@ def test_odometry_goes_straight_and_then_turns_by_its_reading_and_error(geometry
     np.testing.assert_allclose(step.translation(), reading[:n] + error[:n], rtol=1e-15)
 
 
-@pytest.mark.parametrize("geometry", each_geometry, ids=named)
-def test_rates_of_a_vehicle_are_the_odometry_of_a_camera_at_its_centre(geometry):
-    rates, error = (reading_of(geometry, x) for x in (READING, ERROR))
-    seconds = jnp.asarray(0.2)
-    control = VehicleRates(jnp.asarray(rates), seconds, identity(geometry, jnp.dtype(float)))
-    step = displacement(BodyRates(sigmas(geometry)))((), error, control)
-    expected = displacement(Odometry(sigmas(geometry)))((), 0.2 * error, 0.2 * rates)
-    np.testing.assert_allclose(step.as_matrix(), expected.as_matrix(), atol=1e-15)
-
-
-@pytest.mark.parametrize("geometry", each_geometry, ids=named)
-def test_a_vehicle_that_turns_moves_the_camera_by_its_lever_arm(geometry):
-    """T_WC after the step, by way of the vehicle, is that by way of the camera."""
-    rates = jnp.asarray(reading_of(geometry, READING))
-    T_VC = exp(geometry.group, jnp.asarray(reading_of(geometry, 3 * ERROR + 0.2)))
-    still = jnp.zeros(geometry.tangent_dim)
-    moved = displacement(BodyRates(sigmas(geometry)))
-    control = VehicleRates(rates, jnp.asarray(0.5), T_VC)
-    step = moved((), still, control)
-    vehicle = displacement(Odometry(sigmas(geometry)))((), still, 0.5 * rates)
-    np.testing.assert_allclose((T_VC @ step).as_matrix(), (vehicle @ T_VC).as_matrix(), atol=1e-14)
-    # A vehicle that only turns moves a camera off its centre.
-    turning = rates.at[: geometry.point_dim].set(0.0)
-    control = VehicleRates(turning, jnp.asarray(0.5), T_VC)
-    step = moved((), still, control)
-    assert np.linalg.norm(step.translation()) > 0.01
-
-
 def models(geometry):
     sigma = sigmas(geometry)
-    return [ConstantVelocity(sigma, sigma, sigma), Odometry(sigma), BodyRates(sigma)]
+    return [ConstantVelocity(sigma, sigma, sigma), Odometry(sigma)]
 
 
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
