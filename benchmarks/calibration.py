@@ -28,7 +28,8 @@ from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.models.sensors import Pinhole
 from jaxslam.simulation import Room, Run, Scenario, Sightings, sensor_of, sightings, simulate
 from jaxslam.simulation.scenario import CALIBRATIONS, TRUE_CALIBRATIONS
-from jaxslam.statistics import mean_band, normalised_squared, verdict
+from jaxslam.statistics import mean_band, normalised_squared
+from jaxslam.statistics.verdict import LOST_BOUND
 
 TRUTH = {
     "white": "drawn in every frame",
@@ -168,12 +169,21 @@ def _numbers(f: dict[str, Any], runs: int) -> dict[str, Any]:
         "dof": f["dof"],
         "lost": lost,
         "diverged": f["diverged"],
-        "verdict": verdict(nees, lost, dof=f["dof"], runs=runs, diverged=f["diverged"]),
+        "verdict": "lost" if f["diverged"] else _verdict(nees, lost, mean_band(f["dof"], runs)),
         "rmse_m": rmse,
         "sigma_over_rmse": sigma / rmse if rmse and sigma else None,
         "nis_per_dof": float(np.nansum(np.array(f["nis"], float)))
         / float(np.nansum(np.array(f["nis_dof"], float))),
     }
+
+
+def _verdict(nees: float | None, lost: float, band: tuple[float, float]) -> str:
+    """What a mean NEES says of σ, beside its 95 % band; `lost` is the share of runs lost."""
+    if lost > LOST_BOUND or nees is None:
+        return "lost"
+    if nees < band[0]:
+        return "under-confident"
+    return "over-confident" if nees > band[1] else "consistent"
 
 
 def _intrinsics(last: Mapping[str, np.ndarray]) -> dict[str, Any]:

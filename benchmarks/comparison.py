@@ -17,7 +17,6 @@ import jax
 from benchmark import RESULTS, Benchmark, number, table, write_page
 
 import jaxslam
-from jaxslam.landmarks import table as landmark_table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +89,7 @@ def page(summary: dict[str, Any]) -> str:
         _table(results, runs),
         f"†: fewer runs, {few or 'none'} instead of {runs}.",
         "## The parametrizations",
-        landmark_table(jaxslam.LANDMARKS.values()),
+        _parametrizations(),
         f"`python benchmarks/comparison.py` writes this page, with seed {summary['seed']} for all "
         "filters. RMSE, medians, the share of steps inside the band and times are in "
         "`benchmarks/results/comparison.json`.",
@@ -114,6 +113,16 @@ def _cell(found: dict[str, Any] | None, runs: int) -> str:
     few = "" if found["runs"] == runs else " †"
     ratio = number(found["sigma_over_rmse"])
     return f"{number(found['nees'])}; {found['lost']:.0%}{diverged}; {ratio}{few}"
+
+
+def _parametrizations() -> str:
+    """All of them, as a Markdown table."""
+    rows = [
+        f"| `{p.name}` | {p.parameters} | {p.size(3)} ({p.size(2)}) | {p.point} | {p.source} |"
+        for p in jaxslam.LANDMARKS.values()
+    ]
+    head = "| name | parameters | numbers, spatial (planar) | point | source |"
+    return "\n".join([head, "|---|---|---|---|---|", *rows])
 
 
 def _table(results: dict[str, dict[str, Any]], runs: int) -> str:

@@ -16,7 +16,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam._runtime.files import check_real, read_arrays
+from jaxslam._runtime.files import LARGEST, read_arrays
 from jaxslam.io.tum import read_tum
 from jaxslam.models.camera import Camera
 from jaxslam.simulation import Run
@@ -89,12 +89,22 @@ def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
         wanted = tuple(sizes.setdefault(n, x.size) if isinstance(n, str) else n for n in shape)
         if x.shape != wanted:
             raise ValueError(f"{path}: {name} must have the shape {wanted}, not {x.shape}")
-        check_real(f"{path}: {name}", x)
+        _check_real(f"{path}: {name}", x)
         if name in _NUMBERS and x.dtype.kind not in "iu":
             raise ValueError(f"{path}: {name} must hold whole numbers, not {x.dtype}")
     for name, count in (("frame", sizes["frames"]), ("track", sizes["tracks"])):
         if ((arrays[name] < 0) | (arrays[name] >= count)).any():
             raise ValueError(f"{path}: {name} holds a number that is not from 0 to {count - 1}")
+
+
+def _check_real(what: str, x: np.ndarray) -> None:
+    """Raise ValueError unless an array that was read holds finite real numbers."""
+    if x.dtype.kind not in "fiu":
+        raise ValueError(f"{what} holds {x.dtype}; real numbers are accepted")
+    if not np.isfinite(x).all():
+        raise ValueError(f"{what} holds a number that is not finite")
+    if x.size and (most := float(np.abs(x).max())) > LARGEST:
+        raise ValueError(f"{what} holds {most:.2g}; up to {LARGEST:.0e} is accepted")
 
 
 def window(

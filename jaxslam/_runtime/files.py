@@ -101,16 +101,6 @@ _NOT_ARRAYS = (
 """What a broken archive, or an array with a broken header, ends in."""
 
 
-def check_real(what: str, x: np.ndarray) -> None:
-    """Raise ValueError unless an array that was read holds finite real numbers."""
-    if x.dtype.kind not in "fiu":
-        raise ValueError(f"{what} holds {x.dtype}; real numbers are accepted")
-    if not np.isfinite(x).all():
-        raise ValueError(f"{what} holds a number that is not finite")
-    if x.size and (most := float(np.abs(x).max())) > LARGEST:
-        raise ValueError(f"{what} holds {most:.2g}; up to {LARGEST:.0e} is accepted")
-
-
 def one_line(error: BaseException) -> str:
     """Return an error's message, on one line that is not too long."""
     return textwrap.shorten(str(error), 200, placeholder=" …")

@@ -9,7 +9,7 @@ from jaxslam.landmarks.inverse_depth import INVERSE_DEPTH
 from jaxslam.landmarks.inverse_depth_to_cartesian import INVERSE_DEPTH_TO_CARTESIAN
 from jaxslam.landmarks.inverse_scaling import INVERSE_SCALING
 from jaxslam.landmarks.parallax_angle import PARALLAX_ANGLE
-from jaxslam.landmarks.parametrization import Parametrization, table
+from jaxslam.landmarks.parametrization import Parametrization
 from jaxslam.landmarks.unit_homogeneous import UNIT_HOMOGENEOUS
 
 LANDMARKS: dict[str, Parametrization] = {
@@ -41,5 +41,4 @@ __all__ = [
     "UNIT_HOMOGENEOUS",
     "Parametrization",
     "check_landmark",
-    "table",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from jaxtyping import Array, Float
@@ -44,13 +44,3 @@ class Parametrization:
     """Whether the parameters are in the frame of the camera that saw the point first, an *anchor*
     that the state holds once for all landmarks of that camera. The last parameter is then a
     constant, the anchor's number, and `transform` is not used."""
-
-
-def table(parametrizations: Iterable[Parametrization]) -> str:
-    """The parametrizations as a Markdown table."""
-    rows = [
-        f"| `{p.name}` | {p.parameters} | {p.size(3)} ({p.size(2)}) | {p.point} | {p.source} |"
-        for p in parametrizations
-    ]
-    head = "| name | parameters | numbers, spatial (planar) | point | source |"
-    return "\n".join([head, "|---|---|---|---|---|", *rows])

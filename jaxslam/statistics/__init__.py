@@ -9,18 +9,15 @@ from jaxslam.statistics.bands import (
 )
 from jaxslam.statistics.beyond_scale import one_scale
 from jaxslam.statistics.verdict import (
-    VERDICTS,
     Tally,
     Verdict,
     innovation_verdict,
     not_disproved,
     run_verdict,
     sentences,
-    verdict,
 )
 
 __all__ = [
-    "VERDICTS",
     "PowerSums",
     "Tally",
     "Verdict",
@@ -33,5 +30,4 @@ __all__ = [
     "one_scale",
     "run_verdict",
     "sentences",
-    "verdict",
 ]

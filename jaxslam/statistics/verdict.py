@@ -1,12 +1,7 @@
-"""The verdict of NEES on a filter: the factor by which σ is wrong, in one study and on a map.
-
-A `Tally` is the verdict on one study, over all its steps; `verdict` is that on one mean at one
-step, alone and as one of many comparisons.
-"""
+"""The verdict of NEES on a filter: the factor by which σ is wrong, in one study, over all steps."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
@@ -14,15 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxslam.statistics.bands import (
-    CONFIDENCE,
     PowerSums,
     lost_threshold,
-    mean_band,
     whiteness_p_value,
 )
 from jaxslam.statistics.looks import VERDICT_CONFIDENCE, Look, Verdict
 
-VERDICTS = ("consistent", "under-confident", "over-confident", "lost", "cannot tell")
 LOST_BOUND = 0.01
 """More lost runs than this share make a filter lost: 100 times what a consistent one loses."""
 THIRDS = ("first third", "second third", "last third")
@@ -371,43 +363,6 @@ def _inverse(factor: float | None) -> float | None:
 
 def _digits(value: float) -> str:
     return f"{value:.2f}" if value < 100 else f"{value:.3g}"
-
-
-def verdict(
-    nees: float | None,
-    lost: float,
-    *,
-    dof: int,
-    runs: int,
-    diverged: int = 0,
-    comparisons: int = 1,
-    lost_bound: float = LOST_BOUND,
-) -> str:
-    """One of `VERDICTS` for a mean NEES over `runs` independent runs, `lost` a share of runs.
-
-    `lost` comes first; then a mean NEES below the 95 % band is under-confident (σ too large), one
-    above it over-confident. With m comparisons the band is Bonferroni's, at 1 − 0.05/m: it holds
-    all means of m consistent filters together in 95 % of cases, however they are correlated. A
-    mean that does not exist (None or NaN, or of runs of which one diverged) is lost.
-
-    Raises ValueError for numbers that make no sense.
-    """
-    if comparisons < 1:
-        raise ValueError(f"comparisons must be at least 1, not {comparisons}")
-    for name, share in (("lost", lost), ("lost_bound", lost_bound)):
-        if not 0 <= share <= 1:
-            raise ValueError(f"{name} must be a share from 0 to 1, not {share}")
-    if lost > lost_bound or diverged or nees is None or math.isnan(nees):
-        return "lost"
-    low, high = mean_band(dof, runs, together(comparisons))
-    if nees < low:
-        return "under-confident"
-    return "over-confident" if nees > high else "consistent"
-
-
-def together(comparisons: int) -> float:
-    """Confidence of each of m bands that hold together with 95 %, by Bonferroni."""
-    return 1 - (1 - CONFIDENCE) / comparisons
 
 
 def innovation_verdict(

@@ -41,7 +41,7 @@ from jaxslam.evaluation.scale import Scale, errors_beyond_scale
 from jaxslam.geometry import PLANAR, SPATIAL, difference
 from jaxslam.io.tum import write_tum
 from jaxslam.plots.evaluation import plot_evaluation
-from jaxslam.statistics import VERDICTS, Tally, not_disproved
+from jaxslam.statistics import Tally, not_disproved
 from jaxslam.statistics.beyond_scale import one_scale
 
 EVERY = [Convention(*c) for c in product(*list(CHOICES.values())[:3])]
@@ -235,7 +235,7 @@ def test_a_covariance_given_the_scale_is_found_where_the_truth_has_another():
     assert not_disproved(given.verdict)
     assert "given the scale" in str(given)
     for axis in range(6):
-        assert given.axis_verdict(axis)["word"] in {*VERDICTS} - {"lost"}
+        assert given.axis_verdict(axis)["word"] != "lost"
 
 
 @pytest.mark.parametrize(("position", "rotation"), [(1.25, 0.8), (0.8, 1.25), (1.08, 1.08)])
