@@ -4,7 +4,6 @@ from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.forms.correction import AbstractCorrection, Standard, kalman_update
 from jaxslam.filters.forms.covariance import Covariance
 from jaxslam.filters.forms.first_estimates import FirstEstimates
-from jaxslam.filters.forms.information import Information
 from jaxslam.filters.forms.invariant import Invariant
 from jaxslam.filters.forms.observability_constrained import ObservabilityConstrained
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
@@ -44,7 +43,6 @@ __all__ = [
     "FixedLag",
     "Gated",
     "GaussianSum",
-    "Information",
     "Invariant",
     "Loops",
     "ObservabilityConstrained",

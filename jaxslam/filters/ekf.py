@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jaxslam._numerics.arrays import AnyArray, cast, precision
 from jaxslam.filters.forms.blocks import Change, Landmark, Prior
 from jaxslam.filters.forms.covariance import Covariance
-from jaxslam.filters.forms.form import AbstractForm, AbstractGaussian
+from jaxslam.filters.forms.form import AbstractForm
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.model import COMPOSED, Context, Core, SlamModel
 from jaxslam.filters.protocol import (
@@ -38,7 +38,7 @@ from jaxslam.filters.protocol import (
     OfLandmark,
     PoseError,
 )
-from jaxslam.geometry import Pose, SplitPose, difference, identity, tangent_dim
+from jaxslam.geometry import Pose, SplitPose, difference, identity
 from jaxslam.landmarks import INVERSE_SCALING, Parametrization
 from jaxslam.models.calibration import AbstractCalibration, Known, check_calibration
 from jaxslam.models.coordinates import ROBOCENTRIC, SUBMAP, Coordinates, KeyframePose
@@ -130,9 +130,9 @@ class EkfSlam(AbstractStaged):
         return SlamModel(**{piece.name: getattr(self, piece.name) for piece in fields(SlamModel)})
 
     @property
-    def gaussian_form(self) -> AbstractGaussian:
+    def gaussian_form(self) -> Covariance:
         """The form, which keeps a Gaussian everywhere but inside a window."""
-        assert isinstance(self.form, AbstractGaussian)
+        assert isinstance(self.form, Covariance)
         return self.form
 
     @property
@@ -296,12 +296,8 @@ def insert(slam: EkfSlam, state: Belief, new: Features, prior: Prior | None = No
 
 def reanchored(slam: EkfSlam, state: Belief) -> Belief:
     """The current camera as the keyframe: landmarks move to it, and T_KC is known."""
-    change, t = slam.model.reanchoring(), slam.model.geometry.tangent_dim
-    return (
-        state
-        if change is None
-        else slam.form.set_exact(slam.form.reparametrise(state, change), t, t)
-    )
+    change = slam.model.reanchoring()
+    return state if change is None else slam.form.reparametrise(state, change)
 
 
 def rebased(slam: EkfSlam, state: Belief) -> Belief:
@@ -407,7 +403,6 @@ def _empty(slam: EkfSlam, capacity: int, dtype: DTypeLike) -> Belief:
     empty = slam.landmark.initialise(ahead, depth.mean, jnp.asarray(slam.sensor.focal, dtype))
     state = slam.gaussian_form.empty(core, jnp.tile(empty, (slam.entry.slots(capacity), 1)))
     state = replace(state, memory=slam.entry.memory(capacity, dtype))
-    state = slam.form.set_exact(state, 0, tangent_dim(core.pose))
     state = slam.form.augment(state, core.part("motion").start, covariance)
     if unit is not None:
         variance = jnp.reshape(unit**2, (1, 1))

@@ -21,7 +21,6 @@ from jaxslam.filters.forms.correction import AbstractCorrection, Standard
 from jaxslam.filters.forms.covariance import Covariance
 from jaxslam.filters.forms.drift import Drifting
 from jaxslam.filters.forms.first_estimates import FirstEstimates
-from jaxslam.filters.forms.information import Information
 from jaxslam.filters.forms.invariant import Invariant
 from jaxslam.filters.forms.observability_constrained import ObservabilityConstrained
 from jaxslam.filters.initialisation.depth_particles import with_depth_particles
@@ -56,7 +55,6 @@ FILTERS: dict[str, Callable[..., AbstractFilter]] = {
     "robocentric": EkfSlam,
     "world": partial(EkfSlam, coordinates=WORLD),
     "keyframe": partial(EkfSlam, coordinates=KEYFRAME),
-    "information": partial(EkfSlam, coordinates=KEYFRAME, form=Information()),
     "scale_gauge": partial(EkfSlam, scale=ScaleGauge()),
     "world_gauge": partial(EkfSlam, coordinates=WORLD, scale=ScaleGauge()),
     "iterated": lambda **pieces: to_maximum(EkfSlam(**pieces)),
@@ -64,12 +62,11 @@ FILTERS: dict[str, Callable[..., AbstractFilter]] = {
 }
 """By name, of pieces: the paper's filter, with landmarks in the camera frame and composition after
 the update (`robocentric`); the classical one, in the base frame and composed first (`world`); one
-in the camera of the current keyframe (`keyframe`), and the same estimates by sparse, additive
-updates (`information`); the paper's in a unit of length of its own, whose size is estimated
-(`scale_gauge`), and the classical one so, whose covariance is too small where the camera turns
-(`world_gauge`); the paper's, linearised at the maximum of the posterior of every frame
-(`iterated`); the classical one with the right-invariant error: landmarks' errors move with the
-pose's (`invariant`)."""
+in the camera of the current keyframe (`keyframe`); the paper's in a unit of length of its own,
+whose size is estimated (`scale_gauge`), and the classical one so, whose covariance is too small
+where the camera turns (`world_gauge`); the paper's, linearised at the maximum of the posterior of
+every frame (`iterated`); the classical one with the right-invariant error: landmarks' errors move
+with the pose's (`invariant`)."""
 
 
 def with_common_depth(slam: EkfSlam, percent: int | None) -> EkfSlam:
@@ -104,11 +101,9 @@ def with_observability_constraint(slam: EkfSlam, steps: int | None) -> EkfSlam:
 
 def with_drift(slam: EkfSlam, percent: int | None) -> EkfSlam:
     """The filter that knows its landmarks to drift, between two frames by so many percent of the σ
-    of a measurement; 10 by default. Raises ValueError."""
-    if not isinstance(slam.form, Covariance):
-        raise ValueError(f"drift is for the covariance form, not for {type(slam.form).__name__}")
+    of a measurement; 10 by default."""
     share = 0.1 if percent is None else percent / 100
-    return replace(slam, form=Covariance(Drifting(slam.form.correction, share)))
+    return replace(slam, form=Covariance(Drifting(slam.gaussian_form.correction, share)))
 
 
 def _with_correction(

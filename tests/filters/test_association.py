@@ -13,9 +13,9 @@ from scipy.stats import chi2
 from jaxslam.filters import association
 from jaxslam.filters.association import ASSOCIATIONS, GATE, Candidates, candidates
 from jaxslam.filters.ekf import context_of
-from jaxslam.filters.forms.form import curvature
-from jaxslam.filters.forms.information import Information
-from jaxslam.landmarks import LANDMARKS
+from jaxslam.filters.forms.covariance import curvature
+from jaxslam.filters.protocol import AbstractStaged
+from jaxslam.filters.wrappers.wrapper import AbstractWrapper
 from jaxslam.models.observations import Features
 
 SIGMA = 0.3
@@ -275,10 +275,20 @@ def test_of_a_curved_measurement_the_spread_of_a_moving_camera_is_told():
         np.testing.assert_allclose(np.cov(bent.T), extra, atol=0.05 * np.trace(extra))
 
 
+class WithoutCovariance(AbstractWrapper):
+    """A filter that does not say how its innovations are correlated."""
+
+    base: AbstractStaged
+
+    def update(self, state, control, seen):
+        after, innovation = super().update(state, control, seen)
+        return after, replace(innovation, covariance=None)
+
+
 def test_a_filter_without_the_covariance_of_its_innovations_is_refused():
     case = Case("matched-6dof", steps=1, landmarks=6)
     slam, control, first = matched()[0], case.controls()[0], case.frames(0)[0]
-    slam = replace(slam, form=Information(), landmark=LANDMARKS["image_plane"])
+    slam = WithoutCovariance(slam)
     state = jax.eval_shape(lambda: slam.predict(slam.init(case.capacity, first), control))
     with pytest.raises(ValueError, match="innovations have no covariance"):
         jax.eval_shape(lambda state: candidates(slam, state, control, first), state)

@@ -10,7 +10,6 @@ from jaxslam.filters.forms.covariance import Covariance
 from jaxslam.filters.forms.drift import Drifting
 from jaxslam.filters.forms.observability_constrained import ObservabilityConstrained
 from jaxslam.filters.registry import make_filter, scenario_pieces
-from jaxslam.landmarks import CARTESIAN
 from jaxslam.simulation import scenario
 
 
@@ -47,6 +46,3 @@ def test_it_is_a_piece_around_any_correction():
     assert isinstance(slam.form.correction, Drifting)
     assert isinstance(slam.form.correction.correction, ObservabilityConstrained)
     assert slam.form.correction.share == 0.1
-    pieces["landmark"] = CARTESIAN
-    with pytest.raises(ValueError, match="drift is for the covariance form"):
-        make_filter("information+drift", **pieces)

@@ -260,7 +260,6 @@ def test_depths_have_their_own_variance_and_what_is_common(modifier, own, common
     ("name", "landmarks", "calibration", "message"),
     [
         ("robocentric+lag0", "inverse_scaling", "known", "at least 1 frame"),
-        ("information+lag5", "cartesian", "known", "covariance form"),
         ("robocentric+lag5", "inverse_scaling", "consider", "cannot consider"),
         ("world+lag5", "inverse_depth_to_cartesian", "known", "cannot switch the form"),
         ("world+particles+lag5", "cartesian", "known", "delayed"),

@@ -334,8 +334,6 @@ def test_a_velocity_is_told_that_is_3_sigma_from_rest():
             "takes a frame in stages, which FixedLag does not",
         ),
         ("world+particles+mixture", "cartesian", "delayed"),
-        ("information+mixture", "cartesian", "covariance form|information form"),
-        ("information+scales5", "cartesian", "which information does not have"),
         ("world+mixture", "inverse_depth_to_cartesian", "cannot switch the form"),
     ],
 )

@@ -350,7 +350,6 @@ def test_a_frame_without_measurements_changes_nothing(name):
     ("name", "landmark", "message"),
     [
         ("keyframe+oc", "image_plane", "known of robocentric and world filters, not keyframe"),
-        ("information+oc", "image_plane", "is for the plain EKF in covariance form"),
         ("invariant+oc", "cartesian", "is for the plain EKF in covariance form"),
         ("world+fej+oc", "cartesian", "is for the plain EKF in covariance form"),
         ("world+particles+oc", "cartesian", "oc is for undelayed landmarks"),

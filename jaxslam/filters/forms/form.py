@@ -1,7 +1,7 @@
 """The form of a filter: how its uncertainty is kept, and what every step does to it.
 
-`Covariance` keeps P, `Information` its inverse, `Sensitivity` no distribution but derivatives, each
-in an `AbstractState` of its own. A remedy is a correction of `Covariance` (`correction.py`).
+`Covariance` keeps a Gaussian, `Sensitivity` no distribution but derivatives, each in an
+`AbstractState` of its own. A remedy is a correction of `Covariance` (`correction.py`).
 """
 
 from __future__ import annotations
@@ -9,32 +9,26 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, PyTree
 
-from jaxslam._numerics.arrays import AnyArray
 from jaxslam.filters.forms.blocks import (
     Blocks,
     Change,
-    Landmark,
     Model,
     NewLandmarks,
     Noise,
     Prior,
     changed_landmarks,
     composition,
-    local_jacobians,
     new_landmarks,
-    observe,
     without_auxiliary,
 )
-from jaxslam.filters.protocol import Belief, EachMoments, Moments
-from jaxslam.geometry import jacobian, nudge
-from jaxslam.models.observations import Features, Slots
+from jaxslam.filters.protocol import Belief, Moments
+from jaxslam.geometry import jacobian
+from jaxslam.models.observations import Features
 
 OfCore = Callable[[PyTree], PyTree]
 """A function of the core, which is a pytree of poses and vectors, as is its value."""
@@ -62,11 +56,6 @@ class AbstractForm(eqx.Module):
 
         Nothing may be known of them, as `marginalise` and `compose` leave them.
         """
-
-    def set_exact(self, state: Belief, start: int, size: int) -> Belief:
-        """Numbers of the core that are known exactly: nothing to do where nothing was unknown."""
-        del start, size
-        return state
 
     @abstractmethod
     def marginalise(self, state: Belief, start: int, size: int) -> Belief:
@@ -138,80 +127,3 @@ class AbstractForm(eqx.Module):
     @abstractmethod
     def core_covariance(self, function: OfCore, state: Belief) -> Moments:
         """Value of a function of the core, and its first-order covariance in its tangent."""
-
-
-class AbstractGaussian(AbstractForm):
-    """A form that keeps a Gaussian: what it says can be asked at any time."""
-
-    innovation_covariance: ClassVar[bool] = True
-    """Whether its innovations have S: a likelihood is of no use without."""
-
-    @abstractmethod
-    def empty(self, core: PyTree, landmarks: Float[Array, "capacity d"]) -> Belief:
-        """A state of slots that hold no landmark yet, and a core that is still to be augmented."""
-
-    @abstractmethod
-    def remove(self, state: Belief, gone: Bool[AnyArray, " capacity"]) -> Belief:
-        """Marginalise landmarks and free their slots."""
-
-    @abstractmethod
-    def local_covariance(self, state: Belief, J: Blocks, slots: Slots) -> Float[Array, "m k k"]:
-        """`J P Jᵀ` of every landmark's own rows: the diagonal blocks only."""
-
-    def predict_features(
-        self, model: Model, state: Belief, slots: Slots, noise: Noise, context: PyTree
-    ) -> tuple[Float[Array, "m p"], Float[Array, "m p p"], Bool[Array, " m"]]:
-        """The predicted features: measurements, covariances of their innovations, possible
-        or not. These are the centres and the search ellipses of active search."""
-        predicted, in_front, H = observe(model, state, slots, context)
-        return predicted, self.local_covariance(state, H, slots) + noise, in_front
-
-    def landmark_covariance(
-        self, view: Callable[[PyTree], PyTree], function: Landmark, state: Belief, slots: Slots
-    ) -> EachMoments:
-        """Values and first-order covariances of `function(view(core), landmark)`, slot by slot."""
-        value, _, J = local_jacobians(
-            view, without_auxiliary(function), state.core, state.landmarks[slots]
-        )
-        return value, self.local_covariance(state, J, slots)
-
-    def convert(self, model: Model, state: Belief, context: PyTree) -> Belief:
-        """Write landmarks in the form that the model now prefers."""
-        c, (capacity, d) = state.core_dim, state.landmarks.shape
-        blocks = state.covariance[c:, c:].reshape(capacity, d, capacity, d)
-        own = blocks[jnp.arange(capacity), :, jnp.arange(capacity), :]
-
-        def converted(view, landmark, covariance):
-            return model.convert(view, landmark, covariance, context), None
-
-        def view(core):
-            return model.view(core, context)
-
-        landmarks, J = changed_landmarks(state, view, converted, own)
-        state = self.transformed(state, jnp.eye(c, dtype=state.landmarks.dtype), J)
-        return replace(state, landmarks=landmarks)
-
-    def joint_covariance(self, state: Belief, slot: Int[Array, ""]) -> Float[Array, "k k"]:
-        """The joint covariance of the core and one landmark, k = c + d numbers."""
-        c, d = state.core_dim, state.landmarks.shape[1]
-        index = jnp.concatenate([jnp.arange(c), c + slot * d + jnp.arange(d)])
-        return state.covariance[index[:, None], index]
-
-
-def curvature(
-    form: AbstractGaussian, model: Model, state: Belief, slots: Slots, context: PyTree
-) -> tuple[Float[Array, "m p k k"], Float[Array, "m k k"]]:
-    """Second derivatives of every landmark's measurement by what it depends on, the view and the
-    landmark's own numbers, and the covariance of these."""
-    view = model.view(state.core, context)
-    view_by_core = jacobian(lambda core: model.view(core, context), state.core)
-    v, d, m = len(view_by_core), state.landmarks.shape[1], slots.size
-
-    def measured(delta, landmark):
-        return model.observe(nudge(view, delta[:v]), landmark + delta[v:], context)[0]
-
-    zero = jnp.zeros(v + d, state.landmarks.dtype)
-    hessian = jax.vmap(lambda landmark: jax.jacfwd(jax.jacfwd(measured))(zero, landmark))
-    eye = jnp.broadcast_to(jnp.eye(v + d, dtype=zero.dtype), (m, v + d, v + d))
-    itself = Blocks(view_by_core, eye[:, :, :v], eye[:, :, v:])
-    return hessian(state.landmarks[slots]), form.local_covariance(state, itself, slots)

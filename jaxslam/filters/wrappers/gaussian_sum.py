@@ -61,8 +61,8 @@ class GaussianSum(AbstractWrapper):
     """`members` filters `base` for each direction in which the velocity's prior is divided; split
     and merged in every frame, at most `members` for one direction.
 
-    Raises ValueError for fewer than 3, another division, and a base that has no velocity or no
-    covariance of its innovation, or, to be split, is more than one Gaussian.
+    Raises ValueError for fewer than 3, another division, and a base that has no velocity, or, to be
+    split, is more than one Gaussian.
     """
 
     base: AbstractStaged
@@ -82,16 +82,9 @@ class GaussianSum(AbstractWrapper):
             raise ValueError(f"a Gaussian sum has at least 3 members, not {self.members}")
         if self.along not in ALONG:
             raise ValueError(f"unknown division {self.along!r}; known: {', '.join(ALONG)}")
-        ekf = self._ekf
-        if not ekf.gaussian_form.innovation_covariance:
-            raise ValueError(
-                "a Gaussian sum weighs its members by the covariance of the innovation, "
-                f"which {type(ekf.form).__name__.lower()} does not have"
-            )
-        if not ekf.motion.has_velocity:
-            raise ValueError(
-                f"a Gaussian sum divides a velocity: {type(ekf.motion).__name__} has none"
-            )
+        motion = self._ekf.motion
+        if not motion.has_velocity:
+            raise ValueError(f"a Gaussian sum divides a velocity: {type(motion).__name__} has none")
 
     @property
     def _ekf(self) -> EkfSlam:

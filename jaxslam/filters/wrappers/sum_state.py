@@ -58,8 +58,8 @@ def log_likelihoods(innovations: Innovation) -> Float[Array, " members"]:
     least density that a member with the landmark in front gives it, times `BEHIND`. A member that
     has diverged has none.
     """
-    assert innovations.covariance is not None, "members in information form have no S"
-    assert innovations.log_det is not None, "nor its determinant"
+    assert innovations.covariance is not None, "a sum weighs its members by S"
+    assert innovations.log_det is not None, "and by its determinant"
     k, m, p = innovations.residual.shape
     joint = -(innovations.nis + innovations.log_det) / 2
     blocks = innovations.covariance.reshape(k, m, p, m, p)
@@ -91,7 +91,7 @@ def mixed(
     innovations: Innovation, log_weights: Float[Array, " members"], status: Int[Array, ""]
 ) -> Innovation:
     """The sum's innovation: its first two moments, without members that have failed."""
-    assert innovations.covariance is not None, "members in information form have no S"
+    assert innovations.covariance is not None, "a sum weighs its members by S"
     failed = innovations.status >= Status.NOT_POSITIVE
     healthy = jax.nn.log_softmax(jnp.where(failed, -jnp.inf, log_weights))
     log_weights = jnp.where(jnp.any(failed), healthy, log_weights)
