@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import AnyArray, check_shape, numbers, optional_numbers
-from jaxslam.geometry import Point, Scalar
+from jaxslam.geometry import Point
 
 Pixel = Float[Array, " p"]
 """A pixel, or normalised coordinates."""
@@ -80,7 +80,13 @@ def distort(ideal: Pixel, distortion: Float[AnyArray, " 5"] | None) -> Pixel:
     """OpenCV's radial-tangential model on normalised coordinates (x/z, y/z)."""
     if distortion is None:
         return ideal
-    radial, tangential = _distortion_terms(ideal, distortion)
+    k1, k2, p1, p2, k3 = distortion
+    x, y = ideal
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    tangential = jnp.stack(
+        [2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y]
+    )
     return ideal * radial + tangential
 
 
@@ -96,16 +102,3 @@ def undistort(distorted: Pixel, distortion: Float[AnyArray, " 5"] | None) -> Pix
         return ideal - correction / (a * d - b * c), None
 
     return jax.lax.scan(step, distorted, length=UNDISTORT_ITERATIONS)[0]
-
-
-def _distortion_terms(
-    ideal: Float[Array, " 2"], distortion: Float[AnyArray, " 5"]
-) -> tuple[Scalar, Float[Array, " 2"]]:
-    k1, k2, p1, p2, k3 = distortion
-    x, y = ideal
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    tangential = jnp.stack(
-        [2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y]
-    )
-    return radial, tangential

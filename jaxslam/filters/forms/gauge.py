@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.model import Core, SlamModel
-from jaxslam.geometry import Pose, Scalar, SplitPose, identity, jacobian, joined, nudge
+from jaxslam.geometry import Pose, Scalar, SplitPose, identity, jacobian, nudge, scaled
 from jaxslam.models.coordinates import ROBOCENTRIC, SUBMAP, WORLD, KeyframePose
 
 
@@ -50,12 +50,9 @@ def act(
     in_base = not model.coordinates.moves_landmarks
     variables, noise = model.motion.enlarged(core.motion, core.noise, factor)
 
-    def enlarged(pose: Pose) -> Pose:
-        return joined(pose.rotation(), factor * pose.translation())
-
     def anchor(T_AF: SplitPose) -> SplitPose:
-        pose = enlarged(T_AF.joined())
-        return SplitPose.of(rigid @ pose if in_base else pose)
+        enlarged = scaled(T_AF, factor)
+        return SplitPose.of(rigid @ enlarged.joined()) if in_base else enlarged
 
     def landmark(parameters):
         parameters = model.landmark.scale(factor, parameters)
@@ -64,9 +61,9 @@ def act(
 
     def held(pose):
         if isinstance(pose, KeyframePose):
-            in_keyframe = enlarged(pose.keyframe_from_camera)
-            return KeyframePose(rigid @ enlarged(pose.base_from_keyframe), in_keyframe)
-        return model.coordinates.from_base_pose(rigid @ enlarged(model.camera_pose(core)))
+            enlarged = scaled(pose, factor)
+            return replace(enlarged, base_from_keyframe=rigid @ enlarged.base_from_keyframe)
+        return model.coordinates.from_base_pose(rigid @ scaled(model.camera_pose(core), factor))
 
     kept = core.base_motion
     core = replace(
