@@ -29,16 +29,8 @@ from submaps_batch import batch_positions
 import jaxslam
 from jaxslam.consistency import run_through
 from jaxslam.evaluation.alignment import similarity
-from jaxslam.filters.submaps import (
-    Chain,
-    Loops,
-    SubmapsState,
-    agreeing,
-    base_poses,
-    chain,
-    close,
-    with_submaps,
-)
+from jaxslam.filters import Chain, Loops, agreeing, base_poses, chain, close, with_submaps
+from jaxslam.filters.submaps.handover import SubmapsState
 from jaxslam.geometry import difference, scaled
 from jaxslam.simulation import Room, Run, Scenario, simulate
 from jaxslam.statistics import lost_threshold, normalised_squared, one_scale

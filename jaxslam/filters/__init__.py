@@ -8,18 +8,9 @@ from jaxslam.filters.forms.invariant import Invariant
 from jaxslam.filters.forms.observability_constrained import ObservabilityConstrained
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
 from jaxslam.filters.registry import MODIFIERS, RECOMMENDED, scenario_pieces
-from jaxslam.filters.submaps import (
-    Chain,
-    Loops,
-    Posterior,
-    Submaps,
-    agreeing,
-    base_poses,
-    chain,
-    close,
-    posterior,
-    with_submaps,
-)
+from jaxslam.filters.submaps.chain import Chain, base_poses, chain
+from jaxslam.filters.submaps.closing import Loops, Posterior, agreeing, close, posterior
+from jaxslam.filters.submaps.handover import Submaps, with_submaps
 from jaxslam.filters.wrappers.adaptive_process_noise import AdaptiveProcessNoise
 from jaxslam.filters.wrappers.batch_initialisation import BatchInitialisation
 from jaxslam.filters.wrappers.fixed_lag import FixedLag

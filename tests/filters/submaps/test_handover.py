@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from jaxslam.consistency import run_through
+from jaxslam.filters import Submaps, with_submaps
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.readouts import camera_pose, landmarks_in_world
 from jaxslam.filters.registry import make_filters
-from jaxslam.filters.submaps import Submaps, with_submaps
 from jaxslam.geometry import difference
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.observations import Features
