@@ -170,12 +170,12 @@ def sequential(found: Candidates) -> Bool[Array, " m"]:
     return jax.lax.while_loop(wanted, another, (jnp.zeros((), int), none))[1]
 
 
-def joint_compatibility(found: Candidates, most: int = MOST_NODES) -> Bool[Array, " m"]:
+def joint_compatibility(found: Candidates) -> Bool[Array, " m"]:
     """The largest set that is jointly compatible, `r_Lᵀ S_LL⁻¹ r_L < χ²(p |L|)`, by branch and
     bound (JCBB: Neira, Tardós, 2001).
 
     Matches are tried from the best fitting on, each first in and then out. The search ends after
-    `most` nodes, with the best set until then.
+    `MOST_NODES` nodes, with the best set until then.
     """
     m, p = found.residual.shape
     alone = found.distances()
@@ -197,7 +197,7 @@ def joint_compatibility(found: Candidates, most: int = MOST_NODES) -> Bool[Array
         return _Node(depth, taken, W, squares, best, node.count + 1)
 
     def going(node: _Node):
-        return (node.depth < m) & (node.count < most)
+        return (node.depth < m) & (node.count < MOST_NODES)
 
     none, zero = jnp.zeros(m, bool), jnp.zeros((), int)
     nothing = jnp.zeros_like(ordered.residual)

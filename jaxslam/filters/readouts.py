@@ -93,16 +93,16 @@ def landmarks_from_above(slam: AbstractFilter, state: Belief, slots: Slots) -> E
 
 
 def landmarks_on_sides(
-    slam: AbstractFilter, state: Belief, slots: Slots, sigmas: float = 2.0
+    slam: AbstractFilter, state: Belief, slots: Slots
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """The numbers of landmarks surely in front of infinity, 1/z > 0, and surely behind.
+    """The numbers of landmarks surely, by 2σ, in front of infinity, 1/z > 0, and surely behind.
 
     Pixels do not distinguish the two: a world that is mostly behind is a reversed one.
     """
     inverse_depth, P = slam.landmark_marginal(
         state, lambda view: (view.omega / view.point[-1])[None], slots
     )
-    sure = slam.in_map(state)[slots] & (inverse_depth[:, 0] ** 2 > sigmas**2 * P[:, 0, 0])
+    sure = slam.in_map(state)[slots] & (inverse_depth[:, 0] ** 2 > 4 * P[:, 0, 0])
     ahead = inverse_depth[:, 0] > 0
     return jnp.sum(sure & ahead), jnp.sum(sure & ~ahead)
 

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.linalg import Cholesky, cholesky
-from jaxslam.filters.association import Association, Candidates, joint_compatibility
+from jaxslam.filters.association import Candidates, joint_compatibility
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.submaps.chain import Chain, OfChain, base_poses
 from jaxslam.geometry import homogeneous_apply
@@ -106,9 +106,9 @@ def _across(v: Float[Array, " m"]) -> Float[Array, "m m-1"]:
     return (jnp.eye(v.size) - 2 * jnp.outer(w, w) / (w @ w))[:, :-1]
 
 
-def close(chain: Chain, loops: Loops, sigma: float = SAME) -> Posterior:
+def close(chain: Chain, loops: Loops) -> Posterior:
     """Return the chain in which the landmarks of these pairs are the same."""
-    return posterior(chain, lambda states: separation(chain, loops, states).ravel(), sigma)
+    return posterior(chain, lambda states: separation(chain, loops, states).ravel(), SAME)
 
 
 def posterior(
@@ -137,20 +137,15 @@ def posterior(
     return Posterior(chain, states, rows, factor, ~moved)
 
 
-def agreeing(
-    known: Posterior,
-    loops: Loops,
-    association: Association = joint_compatibility,
-    sigma: float = SAME,
-) -> Loops:
-    """Return the loops of which those are valid that agree with all that is known, earlier loops
-    included, and with one another."""
+def agreeing(known: Posterior, loops: Loops) -> Loops:
+    """Return the loops of which those are valid that are jointly compatible with all that is known,
+    earlier loops included, and with one another."""
     m = len(loops.valid)
     value, S = known.marginal(lambda states: separation(known.chain, loops, states).ravel())
-    S += sigma**2 * jnp.eye(value.size)
+    S += SAME**2 * jnp.eye(value.size)
     same = jnp.all(loops.slots[:, None] == loops.slots, axis=-1)
     first = jnp.argmax(same & jnp.all(loops.submaps[:, None] == loops.submaps, axis=-1), axis=1)
     found = Candidates(
         value.reshape(m, -1), S.reshape(m, -1, m, value.size // m), loops.valid, first
     )
-    return replace(loops, valid=association(found))
+    return replace(loops, valid=joint_compatibility(found))

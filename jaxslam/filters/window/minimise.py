@@ -32,6 +32,8 @@ TOLERANCE = 1e-3
 """Of half the sum of squares: a minimum is found when a step gains less."""
 LANDMARK_STEPS = 3
 """Of the landmarks, for every step of the path."""
+TURN_STEPS = 4
+"""Of the rotation that fits a start."""
 
 
 class Minimum(eqx.Module):
@@ -122,7 +124,7 @@ def landmarks(slam: EkfSlam, record: Record, at: Path, y: Y, steps: int) -> tupl
     return y, jnp.sum(cost)
 
 
-def turned(slam: EkfSlam, record: Record, x: X, y: Y, steps: int = 4) -> X:
+def turned(slam: EkfSlam, record: Record, x: X, y: Y) -> X:
     """The start of the motion with the rotation that fits its translation best.
 
     Only the initial angular velocity moves: it takes up the mean flow.
@@ -138,5 +140,5 @@ def turned(slam: EkfSlam, record: Record, x: X, y: Y, steps: int = 4) -> X:
         information = J.T @ J + 1e-6 * jnp.eye(t - n, dtype=x.dtype)
         return turn - cholesky(information).solve(J.T @ r), None
 
-    turn, _ = jax.lax.scan(once, jnp.zeros(t - n, x.dtype), length=steps)
+    turn, _ = jax.lax.scan(once, jnp.zeros(t - n, x.dtype), length=TURN_STEPS)
     return x.at[n:t].add(jnp.where(jnp.all(jnp.isfinite(turn)), turn, 0.0))

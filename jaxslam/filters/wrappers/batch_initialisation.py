@@ -73,7 +73,6 @@ class BatchInitialisation(AbstractWrapper):
     base: GaussianSum  # ty: ignore[incompatible-mutable-override]
     sizes: tuple[int, ...] = eqx.field(static=True)
     directions: int = eqx.field(static=True)
-    known: float = eqx.field(static=True, default=KNOWN)
 
     def __check_init__(self) -> None:
         if not (isinstance(self.base, GaussianSum) and self.base.split):
@@ -203,7 +202,7 @@ class BatchInitialisation(AbstractWrapper):
         position = slice(part.start, part.start + n)
         variance = jnp.trace(member.covariance[position, position])
         squared = jnp.sum(ekf.model.camera_pose(member.core).translation() ** 2)
-        known = variance < self.known**2 * squared
+        known = variance < KNOWN**2 * squared
         enough = state.record.steps >= LEAST_STEPS
         alone = state.sum.log_weights[0] > -1e-3
         moved = variance < MOVED**2 * squared
