@@ -42,24 +42,11 @@ def map_where(
     `values` is a pytree of arrays whose first axis is k; the function returns what it is given.
     """
 
-    def alone(value, beside, given):
-        del beside
-        return function(value, *given)
+    def alone(values, given):
+        one = jax.tree.map(lambda x: x[0], values)
+        return jax.tree.map(lambda x: x[None], function(one, *given))
 
-    return at_places(_of_one(alone), values, _each_place(alive), alive, (), given)
-
-
-def map_or_zero(
-    function: Callable[..., PyTree], values: PyTree, alive: Bool[Array, " k"], *given: PyTree
-) -> PyTree:
-    """`function(value, *given)` of every value that is alive; zeros for the others."""
-    first = jax.tree.map(lambda x: x[0], values)
-    none = zeros(jax.eval_shape(function, first, *given), alive.size)
-
-    def alone(_, value, given):
-        return function(value, *given)
-
-    return at_places(_of_one(alone), none, _each_place(alive), alive, values, given)
+    return at_places(alone, values, jnp.arange(alive.size)[:, None], alive, given)
 
 
 def zeros(shapes: PyTree, k: int) -> PyTree:
@@ -67,53 +54,32 @@ def zeros(shapes: PyTree, k: int) -> PyTree:
     return jax.tree.map(lambda x: jnp.zeros((k, *x.shape), x.dtype), shapes)
 
 
-def _each_place(alive: Bool[Array, " k"]) -> Int[Array, "k 1"]:
-    return jnp.arange(alive.size)[:, None]
-
-
-def _of_one(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    def alone(values, beside, given):
-        one = jax.tree.map(lambda x: x[0], (values, beside))
-        return jax.tree.map(lambda x: x[None], function(*one, given))
-
-    return alone
-
-
 def at_places(
-    function: Callable[[Value, PyTree, PyTree], Value],
+    function: Callable[[Value, PyTree], Value],
     values: Value,
     places: Int[Array, "w r"],
     wanted: Bool[Array, " w"],
-    beside: PyTree = (),
-    given: PyTree = (),
+    given: PyTree,
 ) -> Value:
     """The values after each of w works that is wanted.
 
-    `values` is a pytree of arrays of one first axis, and so is what stands `beside` and is only
-    read. A work takes the r values in its places to what is there afterwards,
-    `function(those, those beside, given)`. No two works have one place.
+    `values` is a pytree of arrays of one first axis. A work takes the r values in its places to
+    what is there afterwards, `function(those, given)`. No two works have one place.
     """
     r = places.shape[1]
-    rows = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct((r, *x.shape[1:]), x.dtype), (values, beside)
-    )
-    closed = eqx.filter_closure_convert(function, *rows, given)
+    rows = jax.tree.map(lambda x: jax.ShapeDtypeStruct((r, *x.shape[1:]), x.dtype), values)
+    closed = eqx.filter_closure_convert(function, rows, given)
     arrays, static = eqx.partition(closed, eqx.is_array)
 
     def call(rows, shared):
         arrays, given = shared
-        return eqx.combine(arrays, static)(*rows, given)
+        return eqx.combine(arrays, static)(rows, given)
 
     @custom_vmap
-    def work(values, beside, places, wanted, shared):
+    def work(values, places, wanted, shared):
         def one(values, data):
             place, wanted = data
-            old, next_to = jax.tree.map(lambda x: x[place], (values, beside))
-
-            def replaced(old, next_to, shared):
-                return call((old, next_to), shared)
-
-            new = _once(wanted, replaced, old, next_to, shared)
+            new = _once(wanted, call, jax.tree.map(lambda x: x[place], values), shared)
             return jax.tree.map(lambda x, new: x.at[place].set(new), values, new), None
 
         return jax.lax.scan(one, values, (places, wanted))[0]
@@ -124,7 +90,7 @@ def at_places(
         after = _in_blocks(call, *spread, data[-1], batched[-1])
         return after, jax.tree.map(lambda _: True, after)
 
-    return work(values, beside, places, wanted, (arrays, given))
+    return work(values, places, wanted, (arrays, given))
 
 
 def repeated(
@@ -196,7 +162,6 @@ def _spread(size: int, batched: PyTree, values: PyTree) -> PyTree:
 def _in_blocks(
     call: Callable[..., PyTree],
     values: PyTree,
-    beside: PyTree,
     places: Int[Array, "b w r"],
     wanted: Bool[Array, "b w"],
     shared: PyTree,
@@ -209,14 +174,14 @@ def _in_blocks(
     count = jnp.sum(wanted)
     works = jnp.flatnonzero(wanted, size=b * w + size, fill_value=b * w)
     places = (places + k * jnp.arange(b)[:, None, None]).reshape(b * w, -1)
-    flat, beside = jax.tree.map(lambda x: x.reshape(b * k, *x.shape[2:]), (values, beside))
+    flat = jax.tree.map(lambda x: x.reshape(b * k, *x.shape[2:]), values)
     axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
 
     def block(carry):
         done, flat = carry
         work = jax.lax.dynamic_slice(works, (done,), (size,))
         place = places[work]
-        rows = jax.tree.map(lambda x: x[place], (flat, beside))
+        rows = jax.tree.map(lambda x: x[place], flat)
         own = jax.tree.map(lambda each, x: x[work // w] if each else x, batched, shared)
         after = jax.vmap(call, in_axes=(0, axes))(rows, own)
         place = jnp.where((work < b * w)[:, None], place, b * k)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam._numerics import conditional as lazy
-from jaxslam._numerics.conditional import at_places, cond, map_or_zero, map_where, repeated
+from jaxslam._numerics.conditional import at_places, cond, map_where, repeated
 
 BATCH, PLACES = 20, 5
 
@@ -103,29 +103,21 @@ def test_batches_of_batches():
     check(jax.tree.map(lambda x: x.reshape(BATCH, *x.shape[2:]), after), values, alive, by)
 
 
-def test_what_is_not_alive_has_no_result():
-    values, alive, by = drawn()
-    values["x"] = jnp.where(alive[..., None], values["x"], jnp.nan)
-    after = jax.jit(jax.vmap(lambda v, a, b: map_or_zero(moved, v, a, b)["x"]))(values, alive, by)
-    expected = jnp.where(alive[..., None], by[:, None, None] * values["x"] + 1, 0.0)
-    np.testing.assert_allclose(after, expected, rtol=1e-12)
-
-
 @pytest.mark.parametrize("in_batch", [False, True])
 def test_a_work_may_be_of_several_places(in_batch):
-    """Two values change places, beside a third array that is only read."""
-    values, beside = jnp.arange(24.0).reshape(4, 6), 100.0 * jnp.ones((4, 6))
+    """Two values change places."""
+    values = jnp.arange(24.0).reshape(4, 6)
     places = jnp.array([[[0, 5], [1, 2]], [[3, 1], [4, 5]], [[0, 1], [2, 3]], [[5, 4], [3, 2]]])
     wanted = jnp.array([[True, False], [True, True], [False, False], [False, True]])
 
-    def swapped(two, hundred, sign):
-        return two[::-1] + sign * hundred
+    def swapped(two, added):
+        return two[::-1] + added
 
-    def work(values, beside, places, wanted):
-        return at_places(swapped, values, places, wanted, beside, jnp.asarray(-1.0))
+    def work(values, places, wanted):
+        return at_places(swapped, values, places, wanted, jnp.asarray(-100.0))
 
     each = jax.vmap(work) if in_batch else lambda *x: jnp.stack(list(map(work, *x)))
-    after = np.asarray(each(values, beside, places, wanted))
+    after = np.asarray(each(values, places, wanted))
     expected = np.array(values)
     for run in range(4):
         for place, due in zip(np.asarray(places[run]), wanted[run], strict=True):

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxslam._numerics.conditional import at_places, map_or_zero, repeated
+from jaxslam._numerics.conditional import at_places, map_where, repeated, zeros
 from jaxslam._numerics.linalg import cholesky, eigh
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.forms.blocks import apart, shifted
@@ -103,14 +103,23 @@ class _Parts(NamedTuple):
 Pixels = Callable[[Core], Float[Array, " n"]]
 
 
-def _described(pixels: Pixels, one: State) -> tuple[Array, Array, Array]:
-    by_core = jacobian(pixels, one.core)
-    c = by_core.shape[1]
-    return pixels(one.core), by_core, by_core @ one.covariance[:c, :c] @ by_core.T
+def _described(
+    pixels: Pixels, core: Core, covariance: Float[Array, "c c"]
+) -> tuple[Array, Array, Array]:
+    by_core = jacobian(pixels, core)
+    return pixels(core), by_core, by_core @ covariance @ by_core.T
 
 
 def _parts(pixels: Pixels, state: SumState) -> _Parts:
-    return _Parts(state, *map_or_zero(partial(_described, pixels), state.members, state.alive))
+    cores, c = state.members.core, state.likeliest.core_dim
+    covariances = state.members.covariance[:, :c, :c]
+    told = jax.eval_shape(partial(_described, pixels), state.likeliest.core, covariances[0])
+
+    def described(of):
+        return *of[:2], _described(pixels, *of[:2])
+
+    of = cores, covariances, zeros(told, len(covariances))
+    return _Parts(state, *map_where(described, of, state.alive)[2])
 
 
 def _split_and_merged(pixels: Pixels, parts: _Parts) -> tuple[_Parts, Bool[Array, ""]]:
@@ -140,22 +149,25 @@ def _split_and_merged(pixels: Pixels, parts: _Parts) -> tuple[_Parts, Bool[Array
     # A merger alone needs no third place, but places are different.
     third = jnp.where(divided, split, jnp.argmax((index != pair[0]) & (index != pair[1])))
     places = jnp.append(pair, third)[None]
-    return at_places(partial(_replaced, pixels), parts, places, due[None], given=divided), due
+    return at_places(partial(_replaced, pixels), parts, places, due[None], divided), due
 
 
-def _replaced(pixels: Pixels, three: _Parts, _: tuple[()], divided: Bool[Array, ""]) -> _Parts:
+def _replaced(pixels: Pixels, three: _Parts, divided: Bool[Array, ""]) -> _Parts:
     """The first two merged in the first place, and the third split into the others; if it is to be
     split, or else the second place is free."""
     members, log_weights = three.sum.members, three.sum.log_weights
     merged = collapsed(member(members, np.s_[:2]), log_weights[:2])
-    halves = _halves(member(members, 2), three.by_core[2])
+    by_core = three.by_core[2]
+    halves = _halves(member(members, 2), by_core)
     old = member(members, np.s_[1:])
     two = jax.tree.map(lambda half, old: jnp.where(divided, half, old), halves, old)
     half = log_weights[2] - jnp.log(2.0)
     weights = jnp.where(divided, half, jnp.stack([-jnp.full_like(half, jnp.inf), log_weights[2]]))
     members = jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), merged, two)
     state = SumState(members, jnp.append(jnp.logaddexp(*log_weights[:2]), weights))
-    return _Parts(state, *jax.vmap(partial(_described, pixels))(members))
+    c = by_core.shape[-1]
+    described = jax.vmap(partial(_described, pixels))
+    return _Parts(state, *described(members.core, members.covariance[:, :c, :c]))
 
 
 def _cheapest(loss: Float[Array, "k k"], pairs: Bool[Array, "k k"]) -> tuple[Array, Array]:
