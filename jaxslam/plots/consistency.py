@@ -82,8 +82,9 @@ def _page(study: Study, summary: Summary) -> Figure:
     figure = new_figure(12.5, 1.0 + 0.2 * len(study.filters) + 2.1 * sum(heights))
     # Over the whole width, as the verdicts are longer than the axes that they are on.
     figure.suptitle(_title(summary), x=0.01, ha="left", fontsize=11)
-    # Each row by itself, as the room that names take is of its own.
-    grid = figure.add_gridspec(len(heights) - rows + 1, 1, height_ratios=_last(heights, rows))
+    # Each row by itself, as the room that names take is of its own; those of run 0 are one.
+    ratios = [*heights[:-rows], sum(heights[-rows:])]
+    grid = figure.add_gridspec(len(heights) - rows + 1, 1, height_ratios=ratios)
     places = [figure.add_subfigure(cell) for cell in grid]
     plots = [(plot_nees, plot_outside), *[(plot_beyond_scale, plot_log_scale)] * free]
     for place, pair in zip(places, plots, strict=False):
@@ -95,11 +96,6 @@ def _page(study: Study, summary: Summary) -> Figure:
     _plot_errors(axes, samples, np.array(summary["time"]), geometry.point_dim)
     _plot_map(places[-1].add_subplot(grid[:, 3]), samples)
     return figure
-
-
-def _last(heights: list[float], rows: int) -> list[float]:
-    """The last rows as one."""
-    return [*heights[:-rows], sum(heights[-rows:])]
 
 
 Labels = Mapping[str, str]
@@ -236,15 +232,13 @@ def plot_log_scale(summary: Summary | Study, *, ax: Axes, label: Labels | None =
 
 def _title(summary: Summary) -> str:
     """The verdict on every filter, how many of its runs were lost, and what was run."""
-    verdicts = (f"{name}: {_verdict(f)}" for name, f in summary["filters"].items())
+    verdicts = []
+    for name, f in summary["filters"].items():
+        ever = f["lost_ever"][-1]
+        lost = f"; {ever:.1%} of the runs lost" if ever else ""
+        verdicts.append(f"{name}: {headline(f['verdict'])}{lost}")
     told = f"{summary['runs']} runs, seed {summary['seed']}; over all steps, [99 % interval]"
     return "\n".join([*verdicts, f"{summary['scenario']['name']}, {told}"])
-
-
-def _verdict(f: Summary) -> str:
-    ever = f["lost_ever"][-1]
-    lost = f"; {ever:.1%} of the runs lost" if ever else ""
-    return headline(f["verdict"]) + lost
 
 
 def _plot_errors(

@@ -34,11 +34,6 @@ class Samples(NamedTuple):
     weight: Values
 
     @property
-    def unweighted(self) -> Samples:
-        """The same points, all of the same weight."""
-        return self._replace(weight=np.ones_like(self.weight))
-
-    @property
     def beyond_infinity(self) -> float:
         """Share of the points that are at infinity or beyond (ω ≤ 0)."""
         return float(self.weight[np.isinf(self.z)].sum() / self.weight.sum())

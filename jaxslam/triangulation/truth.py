@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxslam.geometry import Scalar
@@ -43,4 +44,5 @@ def particles(
 ) -> dict[str, Samples]:
     """`triangulation` and `posterior` given two measured pixels."""
     posterior = draw(intersect, views.calibration, views.given(pixels), count, seed)
-    return {"triangulation": posterior.unweighted, "posterior": posterior}
+    alike = posterior._replace(weight=np.ones_like(posterior.weight))
+    return {"triangulation": alike, "posterior": posterior}
