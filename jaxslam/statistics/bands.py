@@ -60,35 +60,33 @@ def lost_threshold(dof: float, steps: int = 1) -> float:
     return 2 * float(scipy.special.gammainccinv(dof / 2, (1 - LOST_QUANTILE) / steps))
 
 
-def shortfall_limits(dof: float, level: float) -> tuple[float, float]:
-    """The limits of everything, but for a share of `level`, that spreads no more than χ².
+def shortfall_limit(dof: float, level: float, *, above: bool) -> float:
+    """The upper or the lower limit of everything, but for a share of `level`, that spreads no more
+    than χ².
 
     A sum of time averages of χ² does not, by Jensen `E f(Σ xₜ/T) ≤ E f(x)` for every convex f,
     however the steps are correlated. Half of `level` is at most on each side, beyond χ²'s expected
     shortfall `E[χ² | χ² in its tail]` (Meilijson and Nádas, Journal of Applied Probability 1979,
     "Convex majorization with an application to the length of critical paths").
     """
-    shape, tail = dof / 2, level / 2
-    least, most = (
-        float(scipy.special.gammaincinv(shape, tail)),
-        float(scipy.special.gammainccinv(shape, tail)),
-    )
-    return (
-        dof * float(scipy.special.gammainc(shape + 1, least)) / tail,
-        dof * float(scipy.special.gammaincc(shape + 1, most)) / tail,
-    )
+    special, shape, tail = scipy.special, dof / 2, level / 2
+    if above:
+        share = special.gammaincc(shape + 1, special.gammainccinv(shape, tail))
+    else:
+        share = special.gammainc(shape + 1, special.gammaincinv(shape, tail))
+    return dof * float(share) / tail
 
 
 def shortfall_p_value(mean: float, dof: float, runs: int) -> float:
     """A bound of the two-sided p of a mean NEES over runs *and* steps, correlated in any way.
 
-    It is the level at which the sum is one of `shortfall_limits`.
+    It is the level at which the sum is a `shortfall_limit`.
     """
     total, above = runs * mean, bool(mean > dof)
     low, high = _LEAST, 0.0  # of log p
     for _ in range(60):
         middle = (low + high) / 2
-        limit = shortfall_limits(runs * dof, math.exp(middle))[above]
+        limit = shortfall_limit(runs * dof, math.exp(middle), above=above)
         within = total <= limit if above else total >= limit
         low, high = (middle, high) if within else (low, middle)
     return 0.0 if low == _LEAST else math.exp(high)

@@ -18,7 +18,7 @@ from jaxslam.statistics.bands import (
     PowerSums,
     lost_threshold,
     mean_p_value,
-    shortfall_limits,
+    shortfall_limit,
     shortfall_p_value,
     skewed_limit,
 )
@@ -87,8 +87,8 @@ class Look:
     def _of_chi2(self) -> tuple[float, float]:
         """The range of factors with which the sum over N runs is not in a tail of χ²(N n)."""
         total, n = self.sums.first, self.sums.count
-        _, most = _limits(n * self.right[1], self.level)
-        least, _ = _limits(n * self.right[0], self.level)
+        most = _limit(n * self.right[1], self.level, above=True)
+        least = _limit(n * self.right[0], self.level, above=False)
         return total / most, total / least if least else math.inf
 
     def _of_scatter(self) -> tuple[float, float] | None:
@@ -190,8 +190,8 @@ def _quantile(dof: int, level: float) -> float:
 
 
 @lru_cache(maxsize=1024)
-def _limits(dof: float, level: float) -> tuple[float, float]:
-    return shortfall_limits(dof, level) if dof else (0.0, 0.0)
+def _limit(dof: float, level: float, *, above: bool) -> float:
+    return shortfall_limit(dof, level, above=above) if dof else 0.0
 
 
 def _unseen(mean: float, dof: float, runs: int) -> float:
@@ -206,7 +206,7 @@ def _enough(least_dof: float, dof: float, level: float) -> int:
     def told(runs: int) -> bool:
         total = runs * least_dof
         error = math.sqrt(2 * total)
-        least, most = shortfall_limits(total, level)
+        least, most = (shortfall_limit(total, level, above=above) for above in (False, True))
         high = (total + error) / least + _unseen(dof, dof, runs)
         return high <= TOLERANCE**2 and most <= TOLERANCE**2 * (total - error)
 

@@ -10,12 +10,16 @@ from jaxslam.statistics import Tally, lost_threshold, not_disproved, run_verdict
 from jaxslam.statistics.bands import (
     PowerSums,
     mean_p_value,
-    shortfall_limits,
+    shortfall_limit,
     shortfall_p_value,
     skewed_limit,
 )
 from jaxslam.statistics.looks import VERDICT_CONFIDENCE, Look
 from jaxslam.statistics.verdict import sentences
+
+
+def shortfalls(dof, level):
+    return tuple(shortfall_limit(dof, level, above=above) for above in (False, True))
 
 
 def series(rng, runs, steps=20, dof=3, correlation=0.95):
@@ -157,7 +161,7 @@ def test_no_sum_is_in_the_tails_of_chi2_more_often_than_its_shortfall_lets_it(co
 
 def test_the_limits_are_the_expected_shortfall():
     drawn = np.sort(np.random.default_rng(5).chisquare(6, 10**6))
-    low, high = shortfall_limits(6, 0.02)
+    low, high = shortfalls(6, 0.02)
     assert drawn[: 10**4].mean() == pytest.approx(low, rel=0.01)
     assert drawn[-(10**4) :].mean() == pytest.approx(high, rel=0.01)
     for limit in (low, high):
@@ -166,7 +170,7 @@ def test_the_limits_are_the_expected_shortfall():
 
 def test_the_interval_of_chi2_is_what_is_left_of_few_runs_and_that_of_scatter_of_many_steps():
     three = Look("", PowerSums.of(np.array([3.0, 3.0, 3.0])), (3.0, 3.0), 0.01).interval
-    low, high = shortfall_limits(9, 0.01)
+    low, high = shortfalls(9, 0.01)
     # Upwards as if there were three more runs that are just lost.
     unseen = 3 * (lost_threshold(3) - 3) / (3 + 3) / 3
     assert three == pytest.approx((9 / high, 9 / low + unseen))
@@ -346,7 +350,7 @@ def test_anything_between_all_and_what_a_fit_leaves_is_right(mean, word, factor)
     found = run_verdict(nees, 6, fitted=1.0)
     assert (found["word"], found["sigma_factor"]) == (word, pytest.approx(factor))
     total = nees.mean(axis=1).sum()
-    most, least = shortfall_limits(2000 * 6, 0.005)[1], shortfall_limits(2000 * 5, 0.005)[0]
+    most, least = shortfalls(2000 * 6, 0.005)[1], shortfalls(2000 * 5, 0.005)[0]
     expected = np.sqrt([total / most, total / least])
     assert found["interval99"] == pytest.approx(list(expected), rel=0.02)
     assert not_disproved(found) is (word == "consistent")
@@ -422,7 +426,7 @@ def test_one_run_has_an_interval_that_holds_for_any_correlation_of_its_steps():
     low, high = verdict["interval99"]
     assert (verdict["word"], verdict["p"] < 1e-9) == ("over-confident", True)
     assert 2 < low < verdict["sigma_factor"] < 60 < high
-    least, most = shortfall_limits(3, 0.005)
+    least, most = shortfalls(3, 0.005)
     assert (low, high) == pytest.approx((np.sqrt(100 / most), np.sqrt(100 / least)))
     assert run_verdict(np.full((1, 4), 3.5), 3)["word"] == "cannot tell"
 
