@@ -19,8 +19,9 @@ class EvaluateOptions:
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """Arrays (FILE.npz with errors and covariances, innovations and covariances, or estimates,
     covariances and truths; FILE.csv with lines of run, step, errors, upper triangle), a trajectory
-    in TUM format (t tx ty tz qx qy qz qw, s and m), or a folder: one run, or one a sub-folder, of
-    estimate.txt, covariance.txt and truth.txt; or ROS bags. Runs need not be equally long."""
+    (t tx ty tz qx qy qz qw, s and m; t x y θ; OpenVINS; KITTI), or a folder: one run, or one a
+    sub-folder, of estimate.txt, covariance.txt and truth.txt, or of OpenVINS's state_estimate.txt,
+    state_deviation.txt and state_groundtruth.txt; or ROS bags. Runs need not be equally long."""
     covariance: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Covariances of the trajectory's poses, docs/covariance-format.md."""
     truth: Annotated[str | None, tyro.conf.arg(metavar="FILE|TOPIC")] = None
@@ -83,6 +84,9 @@ class EvaluateOptions:
             "It is added to the covariances. By default the truth is exact.",
         ),
     ] = None
+    innovations: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Innovations of the same filter and their covariances (npz or CSV): NEES and NIS together say
+    whether Q or R is wrong."""
     nis: bool = False
     """The errors of a CSV or npz file are innovations, and the covariances theirs."""
     out: Path = Path("results")
@@ -116,4 +120,5 @@ class EvaluateOptions:
             axes_used=self.axes_used,
             nis=self.nis,
             truth_sigma=self.truth_sigma,
+            innovations=self.innovations,
         )

@@ -11,7 +11,7 @@ from jaxslam.evaluation.convention import (
 from jaxslam.evaluation.convention_search import Identification
 from jaxslam.evaluation.log_files import evaluate_log
 from jaxslam.evaluation.poses import evaluate_poses
-from jaxslam.evaluation.result import Evaluation, evaluate
+from jaxslam.evaluation.result import Evaluation, advice, evaluate, evaluate_nees
 from jaxslam.evaluation.scale import errors_beyond_scale
 
 __all__ = [
@@ -19,10 +19,12 @@ __all__ = [
     "Convention",
     "Evaluation",
     "Identification",
+    "advice",
     "converted",
     "errors_beyond_scale",
     "evaluate",
     "evaluate_log",
+    "evaluate_nees",
     "evaluate_poses",
     "pose_errors",
     "read_covariances",

@@ -32,9 +32,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, exp, log
-from jaxslam.io.tum import read_table, write_table
+from jaxslam.io.tum import read_table, width, write_table
 
 Result = TypeVar("Result")
 CHOICES = {
@@ -246,13 +247,17 @@ ANGLES = {"rad": 1.0, "deg": np.pi / 180}
 """Units of angles, in radians."""
 _WORDS = (*CHOICES, "angle", "length")
 _ROWS, _COLUMNS = np.triu_indices(6)
+MIXED = {"error": "split", "axes": "mixed"}
+"""The convention of OpenVINS: the position in the world's axes, the rotation in the body's."""
+_DEVIATIONS, _OF_CAMERA = 18, 14
+"""Numbers of a line of OpenVINS's deviations, and more for each camera."""
 
 
 class CovarianceText(NamedTuple):
     """The content of a file: angles in radians, lengths in the file's own unit."""
 
     times: Float[np.ndarray, " n"]
-    covariances: Float[np.ndarray, "n 6 6"]
+    covariances: Float[np.ndarray, "n t t"]
     said: dict[str, str]
     """The words of its header that are of a `Convention`."""
 
@@ -283,27 +288,50 @@ def write_covariances(
     write_table(path, header, times, table, "covariances", ".9e")
 
 
-def read_covariances(path: str | Path) -> CovarianceText:
-    """Read covariances as `write_covariances`, or another program, wrote them.
+def read_covariances(path: str | Path, t: int = 6) -> CovarianceText:
+    """Read covariances (n, t, t) as `write_covariances`, or another program, wrote them.
 
-    Raises `ValueError`, naming the file, for a line that is not 22 finite numbers, or a word of the
-    header that is not known.
+    After its time a line has the upper triangle row by row, all t² numbers row by row, or t σ; or
+    it is one of OpenVINS's deviations, `t σ_q σ_p` and more. With t = 3 they are of x, y, θ. Raises
+    `ValueError`, naming the file, for a line of other numbers, or that are not finite, and for a
+    word of the header that is not known.
     """
-    row = "22 finite numbers, the time and the upper triangle row by row,"
-    comments, rows, _ = read_table(path, "covariances", "covariances", row, 1 + len(_ROWS))
+    rows_of, columns_of = np.triu_indices(t)
+    triangle, columns = len(rows_of), width(Path(path))
+    kinds = {
+        1 + triangle: f"{1 + triangle} finite numbers, the time and the upper triangle row by row,",
+        1 + t * t: f"{1 + t * t} finite numbers, the time and the covariance row by row,",
+        1 + t: f"{1 + t} finite numbers, the time and a σ of each axis,",
+    }
+    deviations = t == 6 and columns >= _DEVIATIONS and (columns - _DEVIATIONS) % _OF_CAMERA == 0
+    if deviations:
+        kinds[columns] = f"{columns} finite numbers, OpenVINS's time and deviations,"
+    columns = columns if columns in kinds else 1 + triangle
+    comments, rows, _ = read_table(path, "covariances", "covariances", kinds[columns], columns)
     try:
-        said = _said(" ".join(comments))
+        said = {**(MIXED if deviations else {}), **_said(" ".join(comments))}
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    covariances = np.zeros((len(rows), 6, 6))
-    covariances[:, _ROWS, _COLUMNS] = covariances[:, _COLUMNS, _ROWS] = rows[:, 1:]
+    P = np.zeros((len(rows), t, t))
+    if deviations:
+        P[:, range(6), range(6)] = _squared(path, rows[:, [4, 5, 6, 1, 2, 3]])
+    elif columns == 1 + t:
+        P[:, range(t), range(t)] = _squared(path, rows[:, 1:])
+    elif columns == 1 + t * t:
+        P = rows[:, 1:].reshape(-1, t, t)
+    else:
+        P[:, rows_of, columns_of] = P[:, columns_of, rows_of] = rows[:, 1:]
     unit, said = ANGLES[said.pop("angle", "rad")], {k: v for k, v in said.items() if k in CHOICES}
-    scale = np.array([unit if name.startswith("r") else 1.0 for name in _names(said)])
-    return CovarianceText(rows[:, 0], scale[:, None] * covariances * scale, said)
+    names = Convention(**said).names(SPATIAL if t == 6 else PLANAR)
+    scale = np.array([unit if name.startswith("r") else 1.0 for name in names])
+    return CovarianceText(rows[:, 0], scale[:, None] * P * scale, said)
 
 
-def _names(said: dict[str, str]) -> tuple[str, ...]:
-    return Convention(**said).names(SPATIAL)
+def _squared(path: str | Path, sigma: Float[np.ndarray, "n t"]) -> Float[np.ndarray, "n t"]:
+    wrong = ~((sigma >= 0) & (sigma <= LARGEST))
+    if wrong.any():
+        raise ValueError(f"{path}: a σ is {sigma[wrong][0]:.3g}; 0 to {LARGEST:.0e} is accepted")
+    return sigma**2
 
 
 def _said(comments: str) -> dict[str, str]:

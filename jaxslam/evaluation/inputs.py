@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple, NoReturn
@@ -16,7 +17,8 @@ from jaxslam.evaluation.convention import CHOICES, geometry_of
 from jaxslam.io.tum import check_seconds, not_rigid, read_table, words
 
 _KEYS = (
-    "errors", "innovations", "covariances", "estimates", "truths", "times", "names", *CHOICES,
+    "errors", "innovations", "covariances", "sigmas", "estimates", "truths", "nees", "nis", "dof",
+    "times", "names", *CHOICES,
 )  # fmt: skip
 
 
@@ -253,12 +255,34 @@ class Poses(NamedTuple):
     """The covariance of all poses of a run, where it is known."""
 
 
+def of_sigmas(sigmas: ArrayLike) -> Float[np.ndarray, "runs steps n n"]:
+    """The diagonal covariances of σ (runs, steps, n). Raises ValueError for a negative one."""
+    sigma = numbers("sigmas", sigmas, 3, "(runs, steps, n)")
+    if (sigma < 0).any():
+        place = np.argwhere(sigma < 0)[0]
+        raise ValueError(
+            f"sigmas of {at(place)} hold {sigma[tuple(place)]:.3g}; 0 or more is accepted"
+        )
+    with np.errstate(over="ignore"):
+        squared = sigma[..., None] * sigma[..., None, :]
+    there = all_nan(sigma)[..., None, None] | np.eye(sigma.shape[-1], dtype=bool)
+    return np.where(there, squared, 0.0)
+
+
+def of_xytheta(poses: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Matrices of poses x, y, θ in the plane; NaN of NaN."""
+    x, y, angle = np.moveaxis(poses, -1, 0)
+    with np.errstate(invalid="ignore"):
+        c, s, zero = np.cos(angle), np.sin(angle), 0 * angle
+    rows = (c, -s, x), (s, c, y), (zero, zero, zero + 1)
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
 def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLike) -> Poses:
     """Return the poses of arrays that belong together. Raises ValueError, naming run and step."""
-    matrices = "(runs, steps, 4, 4), or (runs, steps, 3, 3) in the plane"
+    matrices = "(runs, steps, 4, 4), or (runs, steps, 3, 3) or (runs, steps, 3) in the plane"
     T, truth = (
-        _matrices(what, numbers(what, x, 4, matrices), matrices)
-        for what, x in (("estimates", estimates), ("truths", truths))
+        _matrices(what, x, matrices) for what, x in (("estimates", estimates), ("truths", truths))
     )
     if T.shape != truth.shape:
         raise ValueError(f"estimates are {T.shape}, so truths must be too, not {truth.shape}")
@@ -301,8 +325,11 @@ def _joint(
     return P
 
 
-def _matrices(what: str, T: np.ndarray, accepted: str) -> np.ndarray:
-    if T.shape[-2:] not in ((3, 3), (4, 4)):
+def _matrices(what: str, given: ArrayLike, accepted: str) -> np.ndarray:
+    T = numbers(what, given, 3 if np.ndim(given) == 3 else 4, accepted)
+    if T.ndim == 3 and T.shape[-1] == 3:
+        T = of_xytheta(T)
+    if T.ndim != 4 or T.shape[-2:] not in ((3, 3), (4, 4)):
         raise ValueError(f"{what} must be matrices {accepted}, not {T.shape}")
     return T
 
@@ -327,29 +354,88 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
 _APART = 2
 """The most different steps of all runs, relative to those of the longest, that runs may share."""
 _COLUMNS = "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"
+_STEP_FIRST = ("step", "steps", "time", "t", "k", "frame", "timestamp")
+"""First words of a table without a column of runs."""
+_SIGMA = re.compile(r"(σ|sigma|std|sd)", re.IGNORECASE)
+
+
+class _Columns(NamedTuple):
+    """Where a table has what: so many columns before, n of errors, and what the others are."""
+
+    before: int
+    n: int
+    kind: str
+    """`upper`, `full` or `σ` of covariances; `nees` or `nis`, which is followed by `dof`."""
 
 
 def read_csv(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...], tuple[str, ...]]:
     """Read lines `run, step, n errors, n (n + 1)/2 of the upper triangle`; a first one of names.
 
-    Returns the arrays, and the names of runs and steps in the file.
+    In place of the triangle there may be all n² numbers, row by row, or n σ, whose names then begin
+    with `sigma`. Where the first name is `step`, or `time`, there is one run and no column of runs.
+    Names `run, step, nees, dof` (or `nis`) are of these alone. Returns the arrays, and the names of
+    runs and steps in the file.
     """
     row = "numbers run, step, n errors and the n (n + 1)/2 of the upper triangle row by row"
     comments, rows, lines = read_table(path, "log", "errors", row, None)
-    n = round((np.sqrt(9 + 8 * (rows.shape[1] - 2)) - 3) / 2) if rows.shape[1] > 3 else 0
-    if n < 1 or 2 + n * (n + 3) // 2 != rows.shape[1]:
-        raise ValueError(f"{path}: {rows.shape[1]} columns; {row} are accepted: {_COLUMNS} columns")
-    places, runs, steps = _rectangle(path, rows[:, :2], lines)
-    e = np.full((len(runs), len(steps), n), np.nan)
-    P = np.full((*e.shape, n), np.nan)
-    e[places], triangle, upper = rows[:, 2 : 2 + n], np.empty((len(rows), n, n)), np.triu_indices(n)
-    triangle[:, *upper] = triangle[:, *upper[::-1]] = rows[:, 2 + n :]
-    P[places] = triangle
     titles = words(comments[0]) if comments else []
     named = len(titles) == rows.shape[1] and not comments[0].lstrip().startswith("#")
-    names = {"names": np.array(titles[2 : 2 + n])} if named else {}
-    arrays = {"errors": e, "covariances": P, **names}
+    titles = titles if named else []
+    found = _columns(titles, rows)
+    if found is None:
+        raise ValueError(
+            f"{path}: {rows.shape[1]} columns; {row} are accepted: {_COLUMNS} columns; or all n² "
+            "numbers, n σ named sigma…, or nees and dof by these names"
+        )
+    before, n, kind = found
+    told = rows[:, :2] if before == 2 else np.column_stack([np.zeros(len(rows)), rows[:, 0]])
+    places, runs, steps = _rectangle(path, told, lines)
+
+    def placed(values: np.ndarray) -> np.ndarray:
+        result = np.full((len(runs), len(steps), *values.shape[1:]), np.nan)
+        result[places] = values
+        return result
+
+    if kind in ("nees", "nis"):
+        dof = np.unique(rows[:, before + 1])
+        if len(dof) > 1 or dof[0] != round(dof[0]):
+            raise ValueError(f"{path}: dof is {dof[0]:g} and others; one whole number is accepted")
+        arrays = {kind: placed(rows[:, before]), "dof": dof[0].astype(int)}
+    else:
+        P = _matrices_of(rows[:, before + n :], n, kind)
+        arrays = {"errors": placed(rows[:, before : before + n]), "covariances": placed(P)}
+        if named:
+            arrays["names"] = np.array(titles[before : before + n])
     return arrays, tuple(f"run {x:g}" for x in runs), tuple(f"step {x:g}" for x in steps)
+
+
+def _columns(titles: list[str], rows: Float[np.ndarray, "k c"]) -> _Columns | None:
+    low = [title.lower() for title in titles]
+    before = 1 if low and low[0] in _STEP_FIRST and "run" not in low[1:2] else 2
+    left = rows.shape[1] - before
+    if low[before:] in (["nees", "dof"], ["nis", "dof"]):
+        return _Columns(before, 0, low[before])
+    half = left // 2
+    if left > 0 and left == 2 * half and all(_SIGMA.match(x) for x in low[before + half :]) and low:
+        return _Columns(before, half, "σ")
+    upper = round((np.sqrt(9 + 8 * left) - 3) / 2) if left > 1 else 0
+    full = round((np.sqrt(1 + 4 * left) - 1) / 2) if left > 1 else 0
+    if full > 1 and full * (full + 1) == left:
+        P = _matrices_of(rows[:, before + full :], full, "full")
+        # 20 numbers are 4 and 16, or 5 and a triangle of 15, which is not symmetric so.
+        if upper * (upper + 3) != 2 * left or (np.swapaxes(P, 1, 2) == P).all():
+            return _Columns(before, full, "full")
+    return _Columns(before, upper, "upper") if upper and upper * (upper + 3) == 2 * left else None
+
+
+def _matrices_of(told: Float[np.ndarray, "k c"], n: int, kind: str) -> Float[np.ndarray, "k n n"]:
+    if kind == "full":
+        return told.reshape(-1, n, n)
+    if kind == "σ":
+        return of_sigmas(told[None])[0]
+    P, upper = np.empty((len(told), n, n)), np.triu_indices(n)
+    P[:, *upper] = P[:, *upper[::-1]] = told
+    return P
 
 
 def _rectangle(

@@ -12,16 +12,25 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, associated
-from jaxslam.evaluation.convention import CHOICES, Convention, CovarianceText, read_covariances
-from jaxslam.evaluation.inputs import exactly_known, read_csv, read_npz
+from jaxslam.evaluation.convention import (
+    CHOICES,
+    MIXED,
+    Convention,
+    CovarianceText,
+    geometry_of,
+    read_covariances,
+)
+from jaxslam.evaluation.inputs import exactly_known, of_sigmas, read_csv, read_npz
 from jaxslam.evaluation.poses import evaluate_poses
-from jaxslam.evaluation.result import Evaluation, evaluate
+from jaxslam.evaluation.result import Evaluation, advice, evaluate, evaluate_nees
 from jaxslam.io import ros
-from jaxslam.io.tum import check_seconds
+from jaxslam.io.tum import WITH_COVARIANCE, check_seconds, width
 
 _CONTENTS = (
-    "errors and covariances, innovations and covariances, or estimates, covariances and truths"
+    "errors and covariances, innovations and covariances, or estimates, covariances and truths "
+    "(σ in place of covariances), or nees or nis, and dof,"
 )
+_ALONE = ("nees", "nis")
 
 
 class PoseOptions(TypedDict):
@@ -43,6 +52,7 @@ def evaluate_log(
     axes_used: str | Sequence[str] = (),
     nis: bool = False,
     truth_sigma: Sequence[float] | None = None,
+    innovations: str | Path | None = None,
 ) -> Evaluation:
     """The verdict on what a file or a folder holds.
 
@@ -53,9 +63,23 @@ def evaluate_log(
     `frames.csv` is beside a trajectory, its longest map is evaluated, without frames that are lost
     or whose unit was not fixed yet. What is `stated` of the convention (`error`, `axes`, `order`,
     `scale`) comes before what the files say. For the alignment of poses, the axes used and the
-    σ of the truth see `evaluate_poses`. With `nis` errors are innovations. Raises
-    ValueError, naming the file.
+    σ of the truth see `evaluate_poses`. With `nis` errors are innovations. The
+    `innovations` of the same filter, in an npz or CSV file, say what to turn (`advice`), and so do
+    those alone. Text files may be of other programs (`jaxslam.io.tum.read_log`,
+    `read_covariances`). Raises ValueError, naming the file.
     """
+    if innovations is not None:
+        if nis:
+            raise ValueError(
+                "--nis says that errors are innovations; --innovations FILE goes without"
+            )
+        beside = evaluate_log(innovations, nis=True)
+        own = evaluate_log(
+            source, covariance=covariance, truth=truth, estimate=estimate, stated=stated,
+            align=align, axes_used=axes_used, truth_sigma=truth_sigma,
+        )  # fmt: skip
+        told = f"{beside.headline.partition(':')[0]} (of innovations); {advice(beside, own)}"
+        return replace(own, notes=(*own.notes, told))
     (source, topic), stated = ros.bag_and_topic(source) or (Path(source), ""), dict(stated or {})
     estimate = estimate or topic or None
     how: PoseOptions = {"align": align, "axes_used": axes_used, "truth_sigma": truth_sigma}
@@ -69,7 +93,8 @@ def evaluate_log(
             (read_npz(source), (), ()) if source.suffix == ".npz" else read_csv(source)
         )
         found = named(source, lambda: _evaluate_arrays(arrays, stated, how, nis), runs, steps)
-        return replace(found, run_names=runs)
+        told = (advice(found),) if found.quantity == "NIS" and found.names else ()
+        return replace(found, run_names=runs, notes=(*found.notes, *told))
     if nis:
         raise ValueError(f"{source}: innovations come in an npz or CSV file, not in a trajectory")
     return evaluate_runs(source, runs_of(source, covariance, truth, estimate), stated, how)
@@ -79,29 +104,47 @@ def _evaluate_arrays(
     arrays: dict[str, np.ndarray], stated: dict[str, str], how: PoseOptions, nis: bool
 ) -> Evaluation:
     """The verdict on errors, innovations or poses, by the names of the arrays."""
-    held = [name for name in ("errors", "innovations", "estimates") if name in arrays]
-    needed = {"covariances", *(["truths"] if held == ["estimates"] else [])}
+    held = [name for name in (*_ALONE, "errors", "innovations", "estimates") if name in arrays]
+    if "sigmas" in arrays and "covariances" not in arrays:
+        arrays = {**arrays, "covariances": of_sigmas(arrays["sigmas"])}
+    of_poses = ["truths"] if held == ["estimates"] else []
+    needed = {"dof"} if held and held[0] in _ALONE else {"covariances", *of_poses}
     if len(held) != 1 or not needed <= arrays.keys():
         raise ValueError(f"holds {', '.join(arrays)}; {_CONTENTS} are accepted")
-    times, P = arrays.get("times"), arrays["covariances"]
+    times = arrays.get("times")
+    if held[0] in _ALONE:
+        _refuse_options(stated, how)
+        quantity = "NIS" if nis else held[0].upper()
+        return evaluate_nees(arrays[held[0]], _whole(arrays["dof"]), times=times, quantity=quantity)
+    P = arrays["covariances"]
     if held == ["estimates"]:
         said = {name: str(arrays[name]) for name in CHOICES if name in arrays}
         convention = stated_before(said, stated)
         truths = arrays["truths"]
         return evaluate_poses(arrays["estimates"], P, truths, convention, times=times, **how)
-    if stated or how["align"] != "none" or how["axes_used"] or how["truth_sigma"] is not None:
-        raise ValueError(
-            "conventions, alignments, axes used are of poses, and so is σ of a truth; here are "
-            "errors, which are what they are; estimates, covariances and truths are accepted"
-        )
+    _refuse_options(stated, how)
     quantity = "NIS" if nis or held == ["innovations"] else "NEES"
     names = [str(name) for name in np.ravel(arrays.get("names", ()))]
     return evaluate(arrays[held[0]], P, times=times, names=names, quantity=quantity)
 
 
-ESTIMATES = ("estimate.txt", "trajectory.txt")
-COVARIANCES = ("covariance.txt",)
-TRUTHS = ("truth.txt", "groundtruth.txt")
+def _whole(number: np.ndarray) -> int:
+    """The whole number that an array holds, or 0."""
+    told = number.ravel()[0] if number.size == 1 and number.dtype.kind in "iuf" else 0.5
+    return int(told) if np.isfinite(told) and told % 1 == 0 else 0
+
+
+def _refuse_options(stated: dict[str, str], how: PoseOptions) -> None:
+    if stated or how["align"] != "none" or how["axes_used"] or how["truth_sigma"] is not None:
+        raise ValueError(
+            "conventions, alignments, axes used are of poses, and so is σ of a truth; here are "
+            "errors, which are what they are; estimates, covariances and truths are accepted"
+        )
+
+
+ESTIMATES = ("estimate.txt", "trajectory.txt", "state_estimate.txt")
+COVARIANCES = ("covariance.txt", "state_deviation.txt")
+TRUTHS = ("truth.txt", "groundtruth.txt", "state_groundtruth.txt")
 LEAST_SHARE = 0.5
 """The share of the comparable poses, and of the estimate's time, that must be compared."""
 _WITHIN = f"within {MAX_TIME_DIFFERENCE} s"
@@ -141,7 +184,7 @@ class _RunLog(NamedTuple):
 
     run: RunFiles
     times: Float[np.ndarray, " n"]
-    estimates: Float[np.ndarray, "n 4 4"]
+    estimates: Float[np.ndarray, "n d d"]
     covariances: _AtTimes
     truths: _AtTimes
     said: dict[str, str]
@@ -164,6 +207,7 @@ def runs_of(
     if estimate is not None:
         raise ValueError(f"{source}: an estimate's topic is of {ros.BAG}; this is none")
     if not source.is_dir():
+        covariance = covariance or _own_covariances(source)
         for name, value in (("covariance", covariance), ("truth", truth)):
             if value is None:
                 raise ValueError(
@@ -186,6 +230,11 @@ def runs_of(
     return tuple(_run(folder, None, truth) for folder in folders)
 
 
+def _own_covariances(estimate: Path) -> Path | None:
+    """The file itself, where its lines have the covariances of their poses too."""
+    return estimate if width(estimate) == WITH_COVARIANCE else None
+
+
 def _truth_of(given: str, bag: Path | None = None, estimate: str = "") -> Place:
     """A file, or a topic: of the bag that is named with it, or else of the estimate's."""
     parts = ros.bag_and_topic(given) if given else None
@@ -204,7 +253,8 @@ def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) 
         return path
 
     true = found(None, TRUTHS) if truth is None else _truth_of(str(truth))
-    files = found(None, ESTIMATES), found(covariance, COVARIANCES), true
+    estimate = found(None, ESTIMATES)
+    files = estimate, found(covariance or _own_covariances(estimate), COVARIANCES), true
     return RunFiles(folder.resolve().name, *files)
 
 
@@ -233,6 +283,8 @@ def evaluate_runs(
                 f"{one.run.estimate}: its longest map is map {one.evaluated.map}, in a unit of its "
                 "own; align sim3 is accepted"
             )
+    if len({one.estimates.shape[1:] for one in read}) > 1:
+        raise ValueError(f"{source}: runs of the plane and of space; of one of them are accepted")
     names = tuple(run.name for run in runs)
     longest = max(read, key=lambda one: len(one.times))
     found = named(
@@ -266,7 +318,7 @@ def _convention_of(read: list[_RunLog], stated: dict[str, str]) -> Convention:
     return stated_before(read[0].said, stated)
 
 
-def _evaluated_truths(one: _RunLog) -> Float[np.ndarray, "n 4 4"]:
+def _evaluated_truths(one: _RunLog) -> Float[np.ndarray, "n d d"]:
     """The true poses, NaN for those that have no part in the verdict."""
     return np.where(one.evaluated.poses[:, None, None], one.truths.values, np.nan)
 
@@ -340,7 +392,14 @@ def _read(run: RunFiles) -> _RunLog:
     """Read one run, pose by pose of its estimate. Raises ValueError where few can be compared."""
     at, (times, estimates, P) = run.covariance, ros.read_poses(run.estimate)
     true_times, truths, _ = ros.read_poses(run.truth)
-    text = read_covariances(at) if isinstance(at, Path) else CovarianceText(times, P, ROS)
+    if geometry_of(truths) is not geometry_of(estimates):
+        raise ValueError(
+            f"{run.truth}: poses of the plane and of space; of one of them is accepted"
+        )
+    if at == run.estimate:
+        text = CovarianceText(times, P, MIXED if isinstance(at, Path) else ROS)
+    else:
+        text = read_covariances(Path(str(at)), geometry_of(estimates).tangent_dim)
     files = (run.estimate, times), (run.covariance, text.times), (run.truth, true_times)
     for path, told in files:
         _check_times(path, told)

@@ -17,8 +17,11 @@ from jaxslam._runtime.lookup import lookup
 from jaxslam.evaluation.convention import Convention
 from jaxslam.evaluation.convention_search import Identification
 from jaxslam.evaluation.inputs import (
+    at,
+    check_every_run,
     filled,
     normalised,
+    numbers,
     paired,
     sigmas,
     step_times,
@@ -40,6 +43,7 @@ SCHEMA = 1
 SIGMAS = 3
 _TOLD = 3
 """The most runs that a sentence names as examples."""
+_MOST_DOF = 1_000_000
 _LISTED = 20
 """The most lost runs that are named in the text; the file names all."""
 OUTSIDE = 0.0027
@@ -113,6 +117,8 @@ class Evaluation:
     def _verdict(
         self, nees: np.ndarray, normalised: np.ndarray, dof: int, fitted: float
     ) -> Verdict:
+        if self.quantity == "NIS" and not normalised.shape[-1]:
+            return run_verdict(nees, dof, logged=self.logged) | {"samples": "runs"}
         if self.quantity == "NIS":
             return innovation_verdict(nees, normalised, dof)
         return run_verdict(nees, dof, fitted, self.logged)
@@ -312,7 +318,7 @@ class Evaluation:
                 ("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
                 *(self._row(i) for i in range(len(self.names))),
                 ("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}"),
-            ),
+            )[: None if self.names else 0],
         ]
 
     @property
@@ -363,7 +369,7 @@ def evaluate(
     """
     e, P, logged = paired(errors, covariances)
     start, logged, notes = without_known(e, P, logged)
-    at = step_times(times, e.shape[1])
+    seconds = step_times(times, e.shape[1])
     e, P, logged = e[:, start:], P[:, start:], logged[:, start:]
     return Evaluation(
         quantity=next(iter(lookup("quantity", quantity, dict.fromkeys(("NEES", "NIS"))))),
@@ -371,10 +377,39 @@ def evaluate(
         nees=filled(normalised(e, filled(P, logged, np.eye(e.shape[-1]))), logged, np.nan),
         errors=filled(e, logged, np.nan),
         sigmas=filled(sigmas(P), logged, np.nan),
-        times=at[start:],
+        times=seconds[start:],
         timed=times is not None,
         names=_names(names, e.shape[-1]),
         notes=notes,
+    )
+
+
+def evaluate_nees(
+    nees: ArrayLike, dof: int, *, times: ArrayLike | None = None, quantity: str = "NEES"
+) -> Evaluation:
+    """The verdict on a filter from its NEES alone, `nees` (runs, steps), of `dof` degrees of freedom.
+
+    With `quantity="NIS"` it is that of innovations, whose runs are the samples. `times` (steps,)
+    are seconds. A step that is NaN was not logged. Raises ValueError, naming run and step, for a
+    NEES that is negative.
+    """
+    values = numbers(quantity, nees, 2, "(runs, steps), with one run nees[None]")
+    if dof not in range(1, _MOST_DOF + 1):
+        raise ValueError(f"dof must be one whole number from 1 to {_MOST_DOF}")
+    check_every_run(~np.isnan(values))
+    if (values < 0).any():
+        run, step = np.argwhere(values < 0)[0]
+        raise ValueError(f"{quantity} of {at((run, step))} is {values[run, step]:.3g}; 0 or more")
+    none = np.empty((*values.shape, 0))
+    return Evaluation(
+        quantity=next(iter(lookup("quantity", quantity, dict.fromkeys(("NEES", "NIS"))))),
+        dof=int(dof),
+        nees=values,
+        errors=none,
+        sigmas=none,
+        times=step_times(times, values.shape[1]),
+        timed=times is not None,
+        names=(),
     )
 
 
@@ -398,3 +433,63 @@ def _names(names: Sequence[str], n: int) -> tuple[str, ...]:
     if len(told) != n or len(set(told)) != n:
         raise ValueError(f"names must be {n} different ones, one an axis, not {list(told)}")
     return told
+
+
+_CLEAR = 3.0
+"""Of a correlation, in σ of white innovations: one in 370 of a right filter."""
+_LEAST = 0.02
+"""A correlation that is smaller says nothing of the gain, however many steps show it."""
+
+
+def neighbours_correlate(nis: Evaluation) -> float | None:
+    """The correlation of innovations, over their σ, with those of the next step; None if unclear.
+
+    `ρ = Σ zₜ·zₜ₊₁ / Σ zₜ²`. The innovations of an optimal gain are white; with a gain too small the
+    estimate lags, and neighbours have one sign; with one too large it overshoots (Mehra 1970).
+    """
+    z = np.nan_to_num(nis.errors / nis.sigmas)
+    squared = float(np.sum(z**2))
+    pairs = np.count_nonzero(nis.logged[:, 1:] & nis.logged[:, :-1]) * z.shape[-1]
+    if not np.isfinite(squared) or squared == 0 or not pairs:
+        return None
+    rho = float(np.sum(z[:, 1:] * z[:, :-1]) / squared)
+    return rho if abs(rho) > max(_LEAST, _CLEAR / np.sqrt(pairs)) else None
+
+
+def advice(nis: Evaluation, nees: Evaluation | None = None) -> str:
+    """What to turn, of the innovations of a filter and, where there is a truth, of its errors.
+
+    R and Q are the covariances of the noise of the measurement and of the motion. S, which NIS
+    tests, grows with both. The gain, which the correlation of innovations tests, grows with Q and
+    falls with R. Both together tell one from the other. What NEES alone says is no noise's fault:
+    NIS sees only what is measured. Of a filter whose model is linear, right but for one of them.
+    """
+    word, rho = nis.verdict["word"], neighbours_correlate(nis)
+    size = {"over-confident": "too small", "outlying": "too small", "under-confident": "too large"}
+    if nis.mistakes or word not in (*size, "consistent"):
+        return "innovations cannot tell what to turn; more steps or runs would"
+    if word == "consistent" and rho is None:
+        return f"NIS is right and innovations are white: Q and R fit each other{_of_nees(nees)}"
+    gain = "" if rho is None else f", and the gain too {'small' if rho > 0 else 'large'}"
+    seen = "" if rho is None else f" (innovations of neighbouring steps correlate by {rho:.2f})"
+    if word == "consistent":
+        what = "Q too small and R too large" if rho and rho > 0 else "Q too large and R too small"
+        return f"NIS is right{gain}{seen}: try {what}, by factors that cancel in S"
+    wrong = size[word]
+    if rho is None:
+        what = f"Q and R, and P with them, {wrong} by one factor"
+    else:
+        what = f"{'Q' if (rho > 0) == (wrong == 'too small') else 'R'} {wrong}"
+    return f"NIS says that S is {wrong}{gain}{seen}: most likely {what}"
+
+
+def _of_nees(nees: Evaluation | None) -> str:
+    word = None if nees is None else nees.verdict["word"]
+    if word in ("over-confident", "lost"):
+        return (
+            "; NEES is too large all the same: look at the model (linearisation, biases, errors "
+            "that are correlated), at P of the start, and at directions that nothing measures"
+        )
+    if word == "under-confident":
+        return "; NEES is too small all the same: P of the start, or noise of what nothing measures"
+    return "; NEES is right too" if word == "consistent" else ""

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxslam._runtime.extras import missing
 from jaxslam._runtime.files import one_line
-from jaxslam.io.tum import read_tum, rows_as_poses
+from jaxslam.io.tum import read_log, rows_as_poses
 
 Message: TypeAlias = Any
 """A message, with the fields of its ROS type as attributes."""
@@ -101,12 +101,13 @@ def seconds(message: Message) -> float:
 
 
 def read_poses(place: Path | Topic) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times (n,) in s, poses (n, 4, 4) in m of a TUM file or a topic, and the topic's covariances.
+    """Times (n,) in s, poses (n, 4, 4) in m of a text file (`read_log`) or a topic, and the
+    covariances that are with them, if any.
 
     Of paths the last one is read. Raises ValueError, naming the place of what is no pose.
     """
     if isinstance(place, Path):
-        return *read_tum(place), np.empty((0, 6, 6))
+        return read_log(place)
     stamped = messages(place)
     if place.type == "nav_msgs/msg/Path":
         stamped = (pose for path in deque(stamped, 1) for pose in path.poses)

@@ -1,6 +1,6 @@
 """Trajectories as text in the format of TUM's benchmark: `t tx ty tz qx qy qz qw` a line.
 
-And what other files of a time and numbers a line have in common with them.
+And those of other programs, and what files of a time and numbers a line have in common.
 """
 
 import math
@@ -198,3 +198,96 @@ def write_table(
         file.write(f"# t {header}\n")
         for time, row in zip(times, table, strict=True):
             file.write(f"{time:.9f} " + " ".join(format(value, number) for value in row) + "\n")
+
+
+WITH_COVARIANCE = 20
+"""Numbers of a line of OpenVINS's `pose_to_file`: `t p q`, and the upper triangles of Pr and Pp."""
+_STATE, _CAMERA = 19, 15
+"""Numbers of a line of OpenVINS's states, and more for each camera."""
+_TUM = 8
+_ROWS = {
+    4: "four finite numbers t x y θ (s, m, rad)",
+    12: "12 finite numbers, the rows of a 3x4 T_wc (KITTI),",
+    WITH_COVARIANCE: "20 finite numbers t tx ty tz qx qy qz qw, 6 of Pr and 6 of Pp (OpenVINS),",
+}
+
+
+def width(path: Path) -> int:
+    """How many numbers, or words, the first line has that is no comment; 0 of an empty file."""
+    for line in text_lines(path).values():
+        return len(words(line))
+    return 0
+
+
+def read_log(
+    path: Path,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n d d"], Float[np.ndarray, "m t t"]]:
+    """Times (n,) in s, poses (n, 4, 4), or (n, 3, 3) in the plane, in m, and their covariances.
+
+    A line is `t tx ty tz qx qy qz qw` (TUM), `t x y θ`, the rows of a 3x4 T_wc (KITTI; times are
+    those of `times.txt` beside it, else the number of the line, from 0), `t p q` with the upper
+    triangles of the covariances of orientation and position (OpenVINS's `pose_to_file`), or `t q p`
+    and more (its states). Its quaternions of JPL have the numbers of Hamilton's, of the body in the
+    world. Covariances (n, 6, 6), of the error `split` along `mixed` axes, position first, are those
+    of `pose_to_file`; other files have none, (0, 6, 6). Raises ValueError, naming file and line.
+    """
+    none, columns = np.empty((0, 6, 6)), width(path)
+    if columns >= _STATE and (columns - _STATE) % _CAMERA == 0:
+        row = f"{columns} finite numbers t, q, p and the rest of OpenVINS's state"
+    elif columns in _ROWS:
+        row = _ROWS[columns]
+    else:
+        return *read_tum(path), none
+    _, rows, lines = read_table(path, "trajectory", "poses", row, columns)
+    if columns == 4:
+        return rows[:, 0], _planar(path, rows, lines), none
+    if columns == 12:
+        return _times(path, len(rows)), _matrices(path, rows, lines), none
+    if columns != WITH_COVARIANCE:
+        rows = rows[:, [0, 5, 6, 7, 1, 2, 3, 4]]
+    T = rows_as_poses(lambda i: f"{path}, line {lines[i]}", rows[:, :_TUM])
+    return rows[:, 0], T, _blocks(rows[:, _TUM:]) if columns == WITH_COVARIANCE else none
+
+
+def _planar(path: Path, rows: np.ndarray, lines: tuple[int, ...]) -> Float[np.ndarray, "n 3 3"]:
+    far = np.flatnonzero(np.abs(rows).max(axis=1) > LARGEST)
+    if far.size:
+        raise ValueError(f"{path}, line {lines[far[0]]}: numbers up to {LARGEST:.0e} are accepted")
+    T = np.tile(np.eye(3), (len(rows), 1, 1))
+    c, s = np.cos(rows[:, 3]), np.sin(rows[:, 3])
+    T[:, :2, :2] = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+    T[:, :2, 2] = rows[:, 1:3]
+    return T
+
+
+def _matrices(path: Path, rows: np.ndarray, lines: tuple[int, ...]) -> Float[np.ndarray, "n 4 4"]:
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, :3] = rows.reshape(-1, 3, 4)
+    wrong = np.flatnonzero(not_rigid(T, 1e-3) | ~(np.abs(rows).max(axis=1) <= LARGEST))
+    if wrong.size:
+        place = f"{path}, line {lines[wrong[0]]}"
+        raise ValueError(
+            f"{place}: no rigid motion [R t] with R a rotation; {_ROWS[12]} are accepted"
+        )
+    left, _, right = np.linalg.svd(T[:, :3, :3])  # rounding to six digits, taken away
+    T[:, :3, :3] = left @ right
+    return T
+
+
+def _times(path: Path, poses: int) -> Float[np.ndarray, " n"]:
+    beside = path.parent / "times.txt"
+    if not beside.is_file():
+        return np.arange(float(poses))
+    times = read_table(beside, "times", "times", "finite times, s,", 1).rows[:, 0]
+    if len(times) != poses:
+        raise ValueError(f"{beside}: holds {len(times)} times for {poses} poses of {path}")
+    return times
+
+
+def _blocks(rows: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "n 6 6"]:
+    """Covariances, position first, of the triangles of the orientation's and the position's."""
+    P = np.zeros((len(rows), 6, 6))
+    i, j = np.triu_indices(3)
+    P[:, 3 + i, 3 + j] = P[:, 3 + j, 3 + i] = rows[:, :6]
+    P[:, i, j] = P[:, j, i] = rows[:, 6:]
+    return P

@@ -46,7 +46,7 @@ def plot_evaluation(
 
 
 def _column(evaluation: Evaluation) -> Figure:
-    shown = min(len(evaluation.names), _WIDEST)
+    shown = max(1, min(len(evaluation.names), _WIDEST))
     figure = new_figure(COLUMN, 3.0 + 0.16 * shown)
     figure.suptitle(column_title(evaluation.headline), x=0.02, ha="left")
     above, below = figure.subplots(2, 1, height_ratios=[1.9, 0.16 * shown])
@@ -120,6 +120,9 @@ def _band(evaluation: Evaluation, ax: Axes) -> None:
 def plot_outside(evaluation: Evaluation, *, ax: Axes, label: str | None = None) -> Axes:
     """Share of the errors of every axis outside ±3σ, beside the .27 % of Gaussian ones."""
     shares = 100 * evaluation.outside3sigma[:_WIDEST]
+    if not len(shares):
+        ax.set_axis_off()  # of a NEES alone
+        return ax
     places = np.arange(len(shares))
     ax.barh(places, shares, color=COLOURS[0], label=label)
     for place, share in zip(places, shares, strict=True):

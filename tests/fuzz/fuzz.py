@@ -223,6 +223,18 @@ TARGETS: dict[str, Target] = {
     "evaluate_log poses": Target(given.write_pose_arrays, _file("runs.npz", evaluate_log)),
     "evaluate_log csv": Target(given.write_csv, _file("runs.csv", evaluate_log)),
     "evaluate_log folder": Target(given.write_run, read_trajectories),
+    "evaluate_log openvins": Target(given.write_run_of(34), read_trajectories),
+    "evaluate_log with covariances": Target(given.write_run_of(20), read_trajectories),
+    "evaluate_log kitti": Target(given.write_run_of(12), read_trajectories),
+    "evaluate_log planar": Target(given.write_run_of(4), read_trajectories),
+    "evaluate_log sigmas": Target(given.write_sigmas, _file("runs.npz", evaluate_log)),
+    "evaluate_log nees": Target(given.write_nees, _file("runs.npz", evaluate_log)),
+    "evaluate_log csv nees": Target(
+        given.write_csv_of("run,step,nees,dof", 2), _file("runs.csv", evaluate_log)
+    ),
+    "evaluate_log csv sigmas": Target(
+        given.write_csv_of("run,step,x,y,sigma_x,sigma_y", 4), _file("runs.csv", evaluate_log)
+    ),
     "evaluate_log bag": Target(given.write_bag("run.bag"), _file("run.bag", evaluate_log)),
     "evaluate_log mcap": Target(given.write_bag("run.mcap"), _file("run.mcap", evaluate_log)),
     "evaluate_log ros2": Target(given.write_bag("run"), _file("run", evaluate_log)),

@@ -98,6 +98,57 @@ def write_run(folder: Path) -> None:
         write_covariances(place / "covariance.txt", times, P, Convention("right"))
 
 
+def write_run_of(columns: int) -> Callable[[Path], None]:
+    """A run whose poses, and covariances, are of so many numbers a line: other programs' files."""
+
+    def write(folder: Path) -> None:
+        arrays, times = pose_arrays(), np.arange(5) / 10
+        P = arrays["covariances"][0]
+        names = ("state_estimate", "state_deviation", "state_groundtruth")
+        names = names if columns == 34 else ("estimate", "covariance", "truth")
+        for name, T in zip(names[::2], (arrays["estimates"][0], arrays["truths"][0]), strict=True):
+            q, p = Rotation.from_matrix(T[:, :3, :3]).as_quat(), T[:, :3, 3]
+            rows = {
+                4: [times, p[:, :2], 0.1 * times],
+                12: [T[:, :3].reshape(5, 12)],
+                20: [times, p, q, P[:, :3, :3][:, *np.triu_indices(3)], P[:, 0, :6] + 1e-4],
+                34: [times, q, p, np.zeros((5, 26))],
+            }[columns]
+            np.savetxt(folder / f"{name}.txt", np.column_stack(rows))
+        deviations = {4: 3, 12: 6, 34: 31}.get(columns)
+        if columns == 20:
+            write_tum(folder / "truth.txt", times, arrays["truths"][0])
+        if columns == 12:
+            np.savetxt(folder / "times.txt", times)
+        if deviations is not None:
+            rows = [times, 0.01 * np.ones((5, deviations))]
+            np.savetxt(folder / f"{names[1]}.txt", np.column_stack(rows))
+
+    return write
+
+
+def write_csv_of(header: str, columns: int) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        draw = np.random.default_rng(0)
+        rows = [[run, step, *draw.uniform(0.5, 1.5, columns)] for run in (0, 1) for step in (0, 1)]
+        if "dof" in header:
+            rows = [[*row[:-1], 3] for row in rows]
+        text = "\n".join(",".join(map(str, row)) for row in rows)
+        (folder / "runs.csv").write_text(f"{header}\n{text}\n")
+
+    return write
+
+
+def write_nees(folder: Path) -> None:
+    np.savez(folder / "runs.npz", nees=np.random.default_rng(0).chisquare(3, (4, 5)), dof=3)
+
+
+def write_sigmas(folder: Path) -> None:
+    errors, P = errors_and_covariances()
+    sigmas = np.sqrt(np.diagonal(P, axis1=2, axis2=3))
+    np.savez(folder / "runs.npz", errors=errors, sigmas=sigmas)
+
+
 def write_trajectory(folder: Path) -> None:
     write_tum(folder / "t.txt", np.arange(30) / 30, _poses(30))
 
