@@ -400,7 +400,7 @@ def read_csv(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...], tuple[
         dof = np.unique(rows[:, before + 1])
         if len(dof) > 1 or dof[0] != round(dof[0]):
             raise ValueError(f"{path}: dof is {dof[0]:g} and others; one whole number is accepted")
-        arrays = {kind: placed(rows[:, before]), "dof": dof[0].astype(int)}
+        arrays = {kind: placed(rows[:, before]), "dof": dof[:1].astype(int)}
     else:
         P = _matrices_of(rows[:, before + n :], n, kind)
         arrays = {"errors": placed(rows[:, before : before + n]), "covariances": placed(P)}

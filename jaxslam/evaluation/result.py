@@ -387,7 +387,7 @@ def evaluate(
 def evaluate_nees(
     nees: ArrayLike, dof: int, *, times: ArrayLike | None = None, quantity: str = "NEES"
 ) -> Evaluation:
-    """The verdict on a filter from its NEES alone, `nees` (runs, steps), of `dof` degrees of freedom.
+    """The verdict on a filter from its `nees` (runs, steps) alone, of `dof` degrees of freedom.
 
     With `quantity="NIS"` it is that of innovations, whose runs are the samples. `times` (steps,)
     are seconds. A step that is NaN was not logged. Raises ValueError, naming run and step, for a

@@ -86,8 +86,8 @@ def test_a_log_beside_its_innovations_is_told_what_to_turn(tmp_path):
     found = evaluate_log(tmp_path / "errors.npz", innovations=tmp_path / "nis.npz")
     assert found.remarks[-1] == (
         "NIS 1.22, σ too small by 1.10 [1.07, 1.14] (of innovations); NIS says that S is too "
-        "small, and the gain too small (innovations of neighbouring steps correlate by 0.20): most likely "
-        "Q too small"
+        "small, and the gain too small (innovations of neighbouring steps correlate by 0.20): most "
+        "likely Q too small"
     )
     alone = evaluate_log(tmp_path / "nis.npz")
     assert alone.remarks[-1].endswith("most likely Q too small")
