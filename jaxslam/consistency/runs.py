@@ -144,7 +144,9 @@ def _landmark_records(
     truth = jax.vmap(frame.pose.inverse().apply)(frame.points[seen.slots])
     truth = jax.vmap(sensor.chart)(truth, jnp.ones_like(truth[:, 0]))
     chart, covariance = landmarks_in_camera(slam, state, seen.slots, sensor)
-    nees = jax.vmap(normalised_squared)(truth - chart, covariance)
+    error = jnp.where(counted[:, None], truth - chart, 0.0)  # nothing is made of the others
+    covariance = jnp.where(counted[:, None, None], covariance, jnp.eye(error.shape[1]))
+    nees = jax.vmap(normalised_squared)(error, covariance)
     finite = counted & jnp.isfinite(nees)
     total = jnp.sum(jnp.where(finite, nees, 0.0))
     return {
