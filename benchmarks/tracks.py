@@ -79,6 +79,16 @@ def read(folder: str | Path) -> Tracks:
     )
 
 
+def _check_real(what: str, x: np.ndarray) -> None:
+    """Raise ValueError unless an array that was read holds finite real numbers."""
+    if x.dtype.kind not in "fiu":
+        raise ValueError(f"{what} holds {x.dtype}; real numbers are accepted")
+    if not np.isfinite(x).all():
+        raise ValueError(f"{what} holds a number that is not finite")
+    if x.size and (most := float(np.abs(x).max())) > LARGEST:
+        raise ValueError(f"{what} holds {most:.2g}; up to {LARGEST:.0e} is accepted")
+
+
 def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Raise ValueError, naming the file, for arrays that are none of a drive."""
     if missing := [name for name in _SHAPES if name not in arrays]:

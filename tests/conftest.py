@@ -72,7 +72,7 @@ def _compiled_programs_are_freed():
     yield
     if _memory_maps() > MOST_MAPS:
         programs.forget()
-        backends._native_program.cache_clear()
+        backends.native_programs().forget()
         jax.clear_caches()
         gc.unfreeze()
     gc.collect()

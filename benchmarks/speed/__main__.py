@@ -42,7 +42,9 @@ from jaxslam.native.build import compiler
 AGREEMENT = 1e-9
 """In double precision, of every NEES, and of the last covariance relative to its largest entry."""
 SINGLE = "native_float32"
-OURS = ("jaxslam", "native", SINGLE, *(f"study_{name}" for name in BACKENDS))
+STUDIES = (*BACKENDS, "auto")
+"""Backends of whole studies: what is built for the second is there for the default."""
+OURS = ("jaxslam", "native", SINGLE, *(f"study_{name}" for name in STUDIES))
 """The filter alone, and whole studies of it: drawing, every record, statistics."""
 LOOP_RUNS = 4
 """The loop of NumPy is slow, and its time is the same for every run."""
@@ -168,7 +170,7 @@ def measured(work: Workload, library: Any, repeats: int, product: float) -> dict
     filters, compile_seconds = contestants(prepared(work), library)
     results = {name: call() for name, call in filters.items()}
     runs = {name: len(of[0]) for name, of in results.items()}
-    studies = {f"study_{name}": name for name in BACKENDS if name == "xla" or name in filters}
+    studies = {f"study_{name}": name for name in STUDIES if name != "native" or name in filters}
     calls = {**filters, **{key: study_of(work, name) for key, name in studies.items()}}
     for key in studies:
         calls[key]()  # compiles

@@ -26,7 +26,7 @@ from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from types import BuiltinFunctionType, FunctionType, MethodType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +41,9 @@ Options = Mapping[str, Mapping[str, Any]]
 
 # Without emitters of fusions it takes two thirds of the time, to programs that are as fast.
 BATCHED: Options = {"cpu": {"xla_cpu_use_fusion_emitters": False}}
+# Slow programs, in half of that time again.
+_LEAST = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+QUICK: Options = {"cpu": {**BATCHED["cpu"], **_LEAST}}
 # Libraries of kernels whose threads wait for one another: matrices of one run are too small.
 ALONE: Options = {"cpu": {**BATCHED["cpu"], "xla_cpu_experimental_ynn_fusion_type": ""}}
 
@@ -50,6 +53,7 @@ PACKAGES = ("jax", "jaxlib", "equinox", "jaxlie", "lineax", "numpy", "optimistix
 """Whose versions are known: a program of anything else but these, Python's and this package's
 functions is not kept, as they may change without notice."""
 
+T = TypeVar("T")
 _kept_in: Path | None = None
 
 
@@ -125,20 +129,16 @@ class Program:
         return future.result()
 
     def _make(self, call: _Call) -> _Made:
-        folder, name = _kept_in, _name(self.function)
-        if folder is None:
+        name = _name(self.function)
+        place = place_of(name, (self.function, call.key, self.options))
+        if place is None:
             return self._compile(call, name)
-        try:
-            key = _Pickled.of((self.function, call.key, _surroundings(), self.options))
-        except (pickle.PicklingError, AttributeError, TypeError):
-            return self._compile(call, name)  # of one's own
-        path = folder / f"{name}-{hashlib.sha256(key.data).hexdigest()}.program"
-        made = _read(path, key.functions)
+        made = read(*place, lambda shapes, *own: _Made(deserialize_and_load(*own), shapes))
         if made is None:
             # What JAX has read from its own cache cannot be written again: a name that it
             # has never seen is not there.
             made = self._compile(call, f"{name}_{secrets.token_hex(4)}")
-            _keep(path, made)
+            keep(place[0], lambda: (made.shapes, *serialize(made.compiled)))
         return made
 
     def _compile(self, call: _Call, name: str) -> _Made:
@@ -233,7 +233,7 @@ def _name(function: Callable[..., Any]) -> str:
     return getattr(function, "__name__", type(function).__name__)
 
 
-def _is_array(leaf: Any) -> bool:
+def _is_array(leaf: object) -> bool:
     return hasattr(leaf, "shape") and hasattr(leaf, "dtype")
 
 
@@ -277,7 +277,7 @@ class _Pickled(NamedTuple):
     functions: dict[str, FunctionType]
 
     @classmethod
-    def of(cls, value: Any) -> _Pickled:
+    def of(cls, value: object) -> _Pickled:
         file = io.BytesIO()
         pickler = _Pickler(file)
         pickler.dump(value)
@@ -317,23 +317,37 @@ class _Unpickler(pickle.Unpickler):
         return self._functions[pid]
 
 
-def _read(path: Path, functions: dict[str, FunctionType]) -> _Made | None:
-    """A program that was kept; None where there is none, or where it is not to be trusted."""
+def place_of(name: str, key: object) -> tuple[Path, dict[str, FunctionType]] | None:
+    """Where to `keep` what depends on a key, this package and this machine, and to `read` it.
+
+    None where nothing is kept, or the key may change without notice.
+    """
+    if _kept_in is None:
+        return None
+    try:
+        data, functions = _Pickled.of((key, _surroundings()))
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return None
+    return _kept_in / f"{name}-{hashlib.sha256(data).hexdigest()}.program", functions
+
+
+def read(path: Path, functions: dict[str, FunctionType], load: Callable[..., T]) -> T | None:
+    """What was kept, by its parts; None where there is none, or where it is not to be trusted."""
     try:
         if hasattr(os, "getuid") and path.stat().st_uid != os.getuid():
             return None
         digest, data = path.read_bytes().split(b"\n", 1)
         if digest.decode() != hashlib.sha256(data).hexdigest():
             return None
-        shapes, *program = _Unpickler(data, functions).load()
-        return _Made(deserialize_and_load(*program), shapes)
+        return load(*_Unpickler(data, functions).load())
     except Exception:  # of another version, of any kind
         return None
 
 
-def _keep(path: Path, made: _Made) -> None:
+def keep(path: Path, parts: Callable[[], tuple[object, ...]]) -> None:
+    """Keep these parts, if it can be."""
     try:
-        data = _Pickled.of((made.shapes, *serialize(made.compiled))).data
+        data = _Pickled.of(parts()).data
         path.parent.mkdir(parents=True, exist_ok=True)
         with write_atomically(path) as temporary:
             temporary.write_bytes(hashlib.sha256(data).hexdigest().encode() + b"\n" + data)

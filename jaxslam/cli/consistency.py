@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+from tqdm.contrib.logging import logging_redirect_tqdm
 
 from jaxslam._runtime.files import write_json
 from jaxslam._runtime.progress import StudyBar
@@ -20,7 +22,7 @@ from jaxslam.consistency import (
     summarise,
     table,
 )
-from jaxslam.consistency.backends import check_backend
+from jaxslam.consistency.backends import AUTO, check_backend
 from jaxslam.consistency.montecarlo import check_sizes, divided
 from jaxslam.consistency.records import check_records, write_records
 from jaxslam.filters.registry import FILTERS, FROM_REST, MODIFIERS, RECOMMENDED, make_filters
@@ -78,8 +80,13 @@ class ConsistencyOptions:
     chunk: int = CHUNK
     """Runs that are computed and kept together; memory grows with it, results do not."""
     backend: Annotated[
-        str, tyro.conf.arg(help=f"What computes: {', '.join(BACKENDS)} (needs a C++ compiler).")
-    ] = "xla"
+        str,
+        tyro.conf.arg(
+            help=f"What computes: {', '.join(BACKENDS)} (a program in C++, for which there has to "
+            "be a compiler), or auto: native where a study is long enough, and with --resume what "
+            "computed before."
+        ),
+    ] = AUTO
     resume: bool = False
     """Go on from what an interrupted run left in --out."""
     reduce: bool = False
@@ -131,7 +138,9 @@ class ConsistencyOptions:
             chunks = divided(self.runs, self.chunk)
             return sum(len(c) for name in filters for c in chunks if store.has(name, c))
 
-        with StudyBar(total, kept()) as progress:
+        log = logging.getLogger("jaxslam")
+        log.setLevel(logging.INFO)
+        with StudyBar(total, kept()) as progress, logging_redirect_tqdm([log]):
             try:
                 return monte_carlo(
                     world,

@@ -2,32 +2,43 @@
 
 from __future__ import annotations
 
+import logging
 import math
-import threading
 import warnings
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import cache, partial
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Jaxpr
 from jaxtyping import Array, Int, PyTree
 
-from jaxslam._numerics.arrays import is_number
-from jaxslam._runtime.programs import BATCHED, Exact, Program
-from jaxslam._runtime.watchdog import lapack_calls
+from jaxslam._runtime.files import one_line
+from jaxslam._runtime.programs import BATCHED, QUICK, Program, in_background
+from jaxslam._runtime.watchdog import finished, lapack_calls
 from jaxslam.consistency.runs import filter_run, map_and_path
+from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation import Room, Run
+from jaxslam.statistics.bands import lost_threshold
 
+AUTO = "auto"
+"""The backend of a study for which none is asked: `chosen` says which it is."""
+WORTH = 100_000
+"""The steps of all runs of a filter from which on the native backend pays for its compilation."""
+FIRST_RUNS = 8
+"""The runs that XLA computes too before it is believed; two, where all are not 64 times as many."""
+AGREEMENT = {"float64": 1e-6, "float32": 3e-2}
+"""Of a record's largest value in these runs: the most by which the backends may differ."""
 CACHE = 3 * 2**19
 """The bytes of covariances that a processor works on: about what its second cache holds."""
 
 Records = dict[str, Array]
 BatchProgram = Callable[[np.integer], tuple[Records, Records]]
+Backend = Callable[[AbstractFilter, Room, AbstractSensor, Run], BatchProgram]
 """Computes the records of so many first runs of a batch, and the map and the path of its first."""
 
 
@@ -93,63 +104,86 @@ def _runs_in_cache(room: Room, runs: Run) -> int:
 
 
 def by_native(slam: AbstractFilter, room: Room, sensor: AbstractSensor, runs: Run) -> BatchProgram:
-    """Return the C++ program for a filter on a batch of runs; with a warning XLA's if none."""
-    numbers, structure = eqx.partition(slam, is_number)
-    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (numbers, sensor, runs))
-    with _compiling:  # two threads that ask for one program wait for it
-        program = _native_program(Exact((*_hashable(structure), room, *_hashable(shapes))))
-    if program is None:
-        return by_xla(slam, room, sensor, runs)
-    return partial(program, numbers, sensor, runs)
+    """Return the C++ program for a filter on a batch of runs.
 
-
-_compiling = threading.Lock()
-
-
-def _hashable(tree: PyTree) -> tuple[tuple[PyTree, ...], jax.tree_util.PyTreeDef]:
-    leaves, structure = jax.tree.flatten(tree)
-    return tuple(leaves), structure
-
-
-@lru_cache(maxsize=32)
-def _native_program(key: Exact) -> Callable[..., tuple[Records, Records]] | None:
-    """The program for a filter of this structure, whatever its numbers, and data of these shapes.
-
-    None, with a warning, where the native backend cannot compile it.
+    Raises ValueError, which says why, where there is none.
     """
-    from jaxslam.native import batched
+    program = native_programs()(room, (slam, sensor), runs)
 
-    leaves, structure, room, shapes, of_data = key.value
-    static = jax.tree.unflatten(structure, leaves)
-    numbers, sensor, runs = jax.tree.unflatten(of_data, shapes)
-
-    def one(shared, run):
-        numbers, sensor = shared
-        slam = eqx.combine(numbers, static)
-        records, path, state = filter_run(slam, room, sensor, run)
-        return records, map_and_path(slam, room, path, state, run)
-
-    try:
-        batch = batched(one, (numbers, sensor), runs)
-    except ValueError as error:
-        warnings.warn(f"{error}; {type(static).__name__} is computed by XLA", stacklevel=2)
-        return None
-
-    def computed(numbers, sensor, runs, wanted):
-        records, samples = batch((numbers, sensor), jax.tree.map(lambda x: x[:wanted], runs))
+    def computed(wanted):
+        records, samples = program(wanted)
         return records, {name: x[0] for name, x in samples.items()}
 
     return computed
 
 
-BACKENDS: dict[str, Callable[[AbstractFilter, Room, AbstractSensor, Run], BatchProgram]] = {
-    "xla": by_xla,
-    "native": by_native,
-}
+@cache
+def native_programs() -> Any:
+    """The `NativePrograms` of this process: without any, the compiler is not imported."""
+    from jaxslam.native import NativePrograms
+
+    return NativePrograms(_records_and_map)
+
+
+def _records_and_map(room, given, run):
+    slam, sensor = given
+    records, path, state = filter_run(slam, room, sensor, run)
+    return records, map_and_path(slam, room, path, state, run)
+
+
+@partial(Program, options=QUICK)
+def _first_runs(slam: AbstractFilter, room: Room, sensor: AbstractSensor, runs: Run) -> Records:
+    return jax.vmap(lambda run: filter_run(slam, room, sensor, run)[0])(runs)
+
+
+BACKENDS: dict[str, Backend] = {"xla": by_xla, "native": by_native}
 """The functions that compile a filter for a batch of runs."""
 
 
 def check_backend(backend: str) -> None:
     """Raise ValueError for a backend that is not known."""
-    if backend not in BACKENDS:
-        raise ValueError(f"unknown backend {backend!r}; known: {', '.join(BACKENDS)}")
+    if backend not in (*BACKENDS, AUTO):
+        raise ValueError(f"unknown backend {backend!r}; known: {', '.join((*BACKENDS, AUTO))}")
+
+
+def chosen(
+    backend: str, name: str, count: int, slam: AbstractFilter, room: Room, sensor: AbstractSensor,
+    runs: Run,
+) -> str:  # fmt: skip
+    """Return the backend that computes so many runs of a filter, of which these are the first.
+
+    `AUTO` is the native backend on a CPU with a C++ compiler for an `EkfSlam` without wrappers,
+    which it computes faster, where there are `WORTH` steps or the program is there; else XLA.
+    Where there can be no native program, or its records of the first runs are not XLA's, it is XLA
+    too, with a warning unless the choice was open.
+    """
+    from jaxslam.native import compiler, difference
+
+    able = backend != "xla" and jax.default_backend() == "cpu" and compiler() is not None
+    there = able and native_programs().is_there(room, (slam, sensor), runs)
+    long = isinstance(slam, EkfSlam) and count * (runs.visible.shape[1] - 1) >= WORTH
+    if backend == "xla" or (backend == AUTO and not (there or (able and long))):
+        return "xla"
+    few = min(len(runs.visible), FIRST_RUNS if count >= 64 * FIRST_RUNS else 2)
+    first = jax.tree.map(lambda x: x[:few], runs)
+    if able and not there:
+        in_background(partial(_first_runs.compile, slam, room, sensor, first))
+    try:
+        found, _ = by_native(slam, room, sensor, first)(np.int32(few))
+    except ValueError as error:
+        if backend != AUTO:
+            warnings.warn(f"{one_line(error)}; {name} is computed by XLA", stacklevel=2)
+        return "xla"
+    wanted = jax.device_get(finished(_first_runs(slam, room, sensor, first), f"{name}, by XLA"))
+    lost = ~(wanted["nees"] <= lost_threshold(runs.poses.tangent_dim, wanted["nees"].shape[1]))
+    sane = ~np.logical_or.accumulate(lost, axis=1)  # what is lost magnifies rounding
+    if told := difference(found, wanted, sane, AGREEMENT[wanted["nees"].dtype.name]):
+        told = f"{told} in the program in C++: please report this, with the command"
+        warnings.warn(f"{name} is computed by XLA, since {told}", stacklevel=2)
+        return "xla"
+    if backend == AUTO:
+        _log.info("%s is computed by a program in C++ (--backend xla: by XLA)", name)
+    return "native"
+
+
+_log = logging.getLogger(__name__)

@@ -20,11 +20,11 @@ import numpy as np
 
 from jaxslam._numerics.arrays import cast
 from jaxslam._runtime.watchdog import finished
-from jaxslam.consistency.backends import BACKENDS, BatchProgram, check_backend
+from jaxslam.consistency.backends import AUTO, BACKENDS, BatchProgram, check_backend, chosen
 from jaxslam.consistency.cluster import connected, on_cluster
 from jaxslam.consistency.manifest import described
 from jaxslam.consistency.simulator import MapChunks, Simulator
-from jaxslam.consistency.store import MemoryStore, Records, Store
+from jaxslam.consistency.store import NATIVE, MemoryStore, Records, Store
 from jaxslam.consistency.summary import Seconds, Study
 from jaxslam.consistency.sums import as_sums, keeps_records
 from jaxslam.filters.protocol import AbstractFilter
@@ -48,7 +48,7 @@ def monte_carlo(
     seed: int = 0,
     dtype: str = "float64",
     chunk: int = CHUNK,
-    backend: str = "xla",
+    backend: str = AUTO,
     store: Store | None = None,
     progress: Callable[[str, int], None] = lambda name, done: None,
     motion: AbstractMotion | RecordedMotion | None = None,
@@ -72,7 +72,8 @@ def monte_carlo(
 
     With the `backend` "native" filters are compiled by the system's C++ compiler
     (`jaxslam.native`), to the same numbers but for rounding; where that cannot be, a warning says
-    why, and XLA computes them.
+    why, and XLA ("xla") computes them. "auto" takes it where that is worth it (`backends.chosen`),
+    on a cluster never. Records that a store has are gone on with by the backend that made them.
 
     A `reduced` study keeps of every chunk but the first only sums over its runs, made where the
     chunk is computed: all of a summary but the medians, which are then the first chunk's.
@@ -90,15 +91,27 @@ def monte_carlo(
     with jax.enable_x64(dtype == "float64"), connected(cluster) as client:
         map_chunks = in_threads if client is None else partial(on_cluster, client)
         simulator = Simulator(scenario, seed, dtype, min(chunk, runs), motion, sensor)
-        made_by = {**simulator.made_by, "chunk": int(chunk), "backend": backend, "reduced": reduced}
+        made_by = {**simulator.made_by, "chunk": int(chunk), "reduced": reduced}
         store.begin(made_by, {name: described(slam) for name, slam in filters.items()})
         missing = {name: [c for c in chunks if not store.has(name, c)] for name in filters}
+        kept = {name: _kept_by(name, chunks, store, backend) for name in filters}
         room = simulator.room(chunks, map_chunks) if any(missing.values()) else None
-        for name, slam in filters.items():
-            task = ChunkTask(name, slam, simulator, room, backend, reduced)
-            seconds[name] = _run_filter(task, missing[name], store, progress, map_chunks)
+        open_choice = AUTO if client is None else "xla"
+        ahead = ThreadPoolExecutor(2)  # the next filter is compiled beside the one that runs
+        asked = {name: kept[name] or (open_choice if backend == AUTO else backend) for name in kept}
+        tasks = [ChunkTask(n, filters[n], simulator, room, asked[n], reduced) for n in filters]
+        settled = {t.name: ahead.submit(t.settled, missing[t.name], kept[t.name]) for t in tasks}
+        try:
+            for name in filters:
+                seconds[name], asked[name] = _run_filter(
+                    settled[name].result, missing[name], store, partial(progress, name), map_chunks
+                )
+        finally:
+            ahead.shutdown(wait=False, cancel_futures=True)
         device = jax.devices()[0].device_kind
-    return Study(scenario, filters, runs, seed, dtype, chunks, store, seconds, device, reduced)
+    return Study(
+        scenario, filters, runs, seed, dtype, chunks, store, seconds, device, reduced, asked
+    )
 
 
 def divided(runs: int, chunk: int) -> tuple[range, ...]:
@@ -137,9 +150,24 @@ class ChunkTask(NamedTuple):
             found = self.program(batch)(np.int32(len(chunk)))
             records, sample = jax.device_get(finished(found, where))
         records = {key: np.asarray(value)[: len(chunk)] for key, value in records.items()}
+        label = {NATIVE: np.array(self.backend == "native")}
         if keeps_records(chunk, self.reduced):
-            return {**records, **{f"sample_{k}": v for k, v in sample.items()}}
-        return as_sums(records, batch.poses.tangent_dim)
+            return {**records, **{f"sample_{k}": v for k, v in sample.items()}, **label}
+        return {**as_sums(records, batch.poses.tangent_dim), **label}
+
+    def settled(self, chunks: list[range], kept: str | None) -> ChunkTask:
+        """Return the task with the backend that is to compute these chunks, beside some kept.
+
+        Raises ValueError where that of the kept ones cannot.
+        """
+        if self.backend == "xla" or not chunks:
+            return self
+        with jax.enable_x64(self.simulator.dtype == "float64"):  # a thread's own
+            batch, count = self.simulator(chunks[0])[0], sum(map(len, chunks))
+            found = chosen(self.backend, self.name, count, *self._pieces(), batch)
+        if kept not in (None, found):
+            raise ValueError(f"cannot resume {self.name}, which the {kept} backend has begun")
+        return self._replace(backend=found)
 
     def compile(self, chunk: range) -> None:
         """Compile the program for chunks of this size."""
@@ -148,30 +176,47 @@ class ChunkTask(NamedTuple):
 
     def program(self, batch: Run) -> BatchProgram:
         """Return the program, compiled by the first thread that asks."""
+        return BACKENDS[self.backend](*self._pieces(), batch)
+
+    def _pieces(self) -> tuple[AbstractFilter, Room, AbstractSensor]:
         assert self.room is not None, "a chunk is computed after the room for it is known"
-        slam = cast(self.slam, self.simulator.dtype)
-        return BACKENDS[self.backend](slam, self.room, self.simulator.sensor, batch)
+        return cast(self.slam, self.simulator.dtype), self.room, self.simulator.sensor
+
+
+def _kept_by(name: str, chunks: tuple[range, ...], store: Store, backend: str) -> str | None:
+    """The backend of the records that a store has; ValueError where another is asked for."""
+    for chunk in chunks:
+        if store.has(name, chunk):
+            kept = "native" if store.load(name, chunk, [NATIVE])[NATIVE] else "xla"
+            if backend in (AUTO, kept):
+                return kept
+            raise ValueError(
+                f"cannot resume: {name} was made with another backend ({kept!r}, now {backend!r}); "
+                "leave the backend out, or use another store"
+            )
+    return None
 
 
 def _run_filter(
-    task: ChunkTask,
+    settled: Callable[[], ChunkTask],
     chunks: list[range],
     store: Store,
-    progress: Callable[[str, int], None],
+    progress: Callable[[int], None],
     map_chunks: MapChunks,
-) -> Seconds:
+) -> tuple[Seconds, str]:
     if not chunks:
-        return Seconds(0.0, 0.0)
-    progress(task.name, 0)
+        return Seconds(0.0, 0.0), settled().backend
+    progress(0)
     start = time.perf_counter()
+    task = settled()
     if map_chunks is in_threads:
         list(in_threads(task.compile, chunks[:1]))  # aside: XLA's compiler hears no interruption
-        progress(task.name, 0)
+        progress(0)
     compiled_at = time.perf_counter()
     for chunk, records in map_chunks(task, chunks):
         store.save(task.name, chunk, records)
-        progress(task.name, len(chunk))
-    return Seconds(compiled_at - start, time.perf_counter() - compiled_at)
+        progress(len(chunk))
+    return Seconds(compiled_at - start, time.perf_counter() - compiled_at), task.backend
 
 
 def in_threads(

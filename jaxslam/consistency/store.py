@@ -16,6 +16,8 @@ from jaxslam.consistency.manifest import Manifest, difference
 Records = dict[str, np.ndarray]
 SUM = "sum_"
 """The prefix of the names of sums over the runs of a chunk."""
+NATIVE = "sample_native"
+"""The name of whether a chunk is of the native backend; else it is XLA's."""
 
 
 @runtime_checkable

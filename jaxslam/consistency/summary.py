@@ -71,6 +71,8 @@ class Study:
     """The device on which it was computed."""
     reduced: bool = False
     """Whether of all chunks but the first only sums are kept."""
+    backends: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """The backend that computed each filter."""
 
     @property
     def whole(self) -> tuple[range, ...]:
@@ -219,6 +221,7 @@ def _summarise_filter(study: Study, name: str) -> Summary:
         "landmark_not_finite": [int(count) for count in sums["landmark_not_finite"]],
         "diverged": int(sums["diverged"]),
         "status": {s.name.lower(): int(sums[f"status_{s.name}"]) for s in Status if s != Status.OK},
+        "backend": study.backends.get(name),
         "seconds": {"compile": seconds.compile, "run": seconds.run},
     }
 

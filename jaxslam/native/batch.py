@@ -6,13 +6,16 @@ import ctypes
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
+from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxslam.native.build import built
+from jaxslam._runtime.programs import keep, place_of, read
+from jaxslam.native.build import built, described, trusted
 from jaxslam.native.emit import BYTES, source
 from jaxslam.native.plan import plan
 from jaxslam.native.trace import NotSupportedError, program
@@ -32,18 +35,28 @@ class Batch:
     """
 
     def __init__(
-        self, function: Callable[[PyTree, PyTree], PyTree], shared: PyTree, runs: PyTree
+        self,
+        function: Callable[[PyTree, PyTree], PyTree],
+        shared: PyTree,
+        runs: PyTree,
+        key: object = None,
     ) -> None:
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), runs)
         self._given, self._function = _kinds((shared, one)), function
-        traced, self._shapes = program(function, *jax.tree.map(_kind, (shared, one)))
-        inputs = [(x.dtype, own) for x, own in zip(*self._leaves(shared, one), strict=True)]
-        outputs = jax.tree.leaves(self._shapes)
-        self.source = source(plan(traced), (inputs, [x.dtype for x in outputs]))
-        library = built(self.source)
+        self._shapes, self._width, library = _kept(key) or self._made(shared, one, key)
         self._run, library.arena.restype = library.run, ctypes.c_long
         self._arena = library.arena()
-        self._width = BYTES // traced.elements.dtype.itemsize
+
+    def _made(self, shared: PyTree, one: PyTree, key: object) -> tuple[PyTree, int, ctypes.CDLL]:
+        """Trace, translate and compile, and keep what was made."""
+        traced, shapes = program(self._function, *jax.tree.map(_kind, (shared, one)))
+        inputs = [(x.dtype, own) for x, own in zip(*self._leaves(shared, one), strict=True)]
+        outputs = [x.dtype for x in jax.tree.leaves(shapes)]
+        path = built(source(plan(traced), (inputs, outputs)))
+        width = BYTES // traced.elements.dtype.itemsize
+        if place := _place(key):
+            keep(place[0], lambda: (shapes, width, path.name))
+        return shapes, width, ctypes.CDLL(str(path))
 
     def __call__(self, shared: PyTree, runs: PyTree, *, threads: int = 1) -> PyTree:
         """The results of all runs; the same whatever the number of threads."""
@@ -108,14 +121,41 @@ def _kinds(
     return structure, tuple((np.shape(x), np.dtype(x.dtype)) for x in leaves)
 
 
-def batched(function: Callable[[PyTree, PyTree], PyTree], shared: PyTree, runs: PyTree) -> Batch:
+def _place(key: object) -> tuple[Path, dict[str, FunctionType]] | None:
+    told = described()
+    return None if key is None or told is None else place_of("native", (key, told))
+
+
+def _kept(key: object) -> tuple[PyTree, int, ctypes.CDLL] | None:
+    """Shapes, width and library of the program for which a key stands; None where it is not there,
+    or not to be trusted."""
+    place = _place(key)
+    if place is None:
+        return None
+    return read(*place, lambda shapes, width, name: (shapes, width, ctypes.CDLL(trusted(name))))
+
+
+def is_kept(key: object) -> bool:
+    """Whether the program for which this key stands is there."""
+    return _kept(key) is not None
+
+
+def batched(
+    function: Callable[[PyTree, PyTree], PyTree],
+    shared: PyTree,
+    runs: PyTree,
+    key: object = None,
+) -> Batch:
     """A program for arguments of these shapes and types.
+
+    Where programs are kept (`jaxslam._runtime.programs`), one whose `key` stands for the function
+    and these shapes is not traced again.
 
     Raises `NotSupportedError` for a function that has something for which there is no rule, and
     ValueError without a C++ compiler, or where anything else goes wrong.
     """
     try:
-        return Batch(function, shared, runs)
+        return Batch(function, shared, runs, key)
     except ValueError:
         raise
     except Exception as error:  # of this backend, or the function's own, which XLA will tell

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import os
 import shlex
@@ -14,7 +13,7 @@ from pathlib import Path
 
 from jaxslam._runtime import programs
 from jaxslam._runtime.files import write_atomically
-from jaxslam.native.emit import CppSource
+from jaxslam.native.emit import PRELUDE, CppSource
 
 FLAGS = (
     *("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math"),
@@ -34,23 +33,46 @@ def compiler() -> list[str] | None:
     return None if found is None else [found, *told[1:]]
 
 
-def built(source: CppSource) -> ctypes.CDLL:
-    """The library of a program. Raises ValueError without a compiler, or where it fails."""
+def described() -> tuple[str, ...] | None:
+    """Return what decides a program beside its source; None without a compiler."""
     command = compiler()
     if command is None:
+        return None
+    return *command, *FLAGS, _version(tuple(command)), *programs.processor(), PRELUDE.read_text()
+
+
+def built(source: CppSource) -> Path:
+    """The library of a program. Raises ValueError without a compiler, or where it fails."""
+    command, told = compiler(), described()
+    if command is None or told is None:
         raise ValueError("the native backend needs a C++ compiler: none is found ($CXX, c++, g++)")
-    text = [source.text, *command, *FLAGS, _version(tuple(command)), *programs.processor()]
-    digest = hashlib.sha256("\n".join(text).encode() + source.tables).hexdigest()
-    folder = programs.kept_in() or _own_folder()
-    path = folder / f"native-{digest}.so"
+    text = "\n".join([source.text, *told])
+    name = f"native-{hashlib.sha256(text.encode() + source.tables).hexdigest()}.so"
+    for folder in filter(None, (programs.kept_in(), _own_folder())):
+        try:
+            if not _trusted(folder / name):
+                _build(command, source, folder / name)
+            return folder / name
+        except OSError as error:  # a full disk, a folder that may not be written
+            why = error
+    raise ValueError(f"the native backend cannot keep its program ({why})")
+
+
+def trusted(name: str) -> str:
+    """The library of this name. Raises ValueError where it is not there, whole and this user's."""
+    path = (programs.kept_in() or _own_folder()) / name
     if not _trusted(path):
-        folder.mkdir(parents=True, exist_ok=True)
-        with write_atomically(path) as temporary:
-            _compile(command, source, temporary)
-            whole = _digest(temporary)
-        with write_atomically(_told(path)) as temporary:
-            temporary.write_text(whole)
-    return ctypes.CDLL(str(path))
+        raise ValueError(f"{path} is not there, or is not to be trusted")
+    return str(path)
+
+
+def _build(command: list[str], source: CppSource, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with write_atomically(path) as temporary:
+        _compile(command, source, temporary)
+        whole = _digest(temporary)
+    with write_atomically(_told(path)) as temporary:
+        temporary.write_text(whole)
 
 
 def _trusted(path: Path) -> bool:

@@ -13,12 +13,13 @@ import pytest
 import jaxslam
 from jaxslam.consistency import FolderStore, MemoryStore, manifest, simulator
 from jaxslam.consistency.manifest import described, difference
+from jaxslam.consistency.store import NATIVE
 from jaxslam.io.tum import write_tum
 
 SCENARIO = jaxslam.scenario("matched-tight", steps=2, landmarks=3)
 SLAM: Any
 (SLAM,) = jaxslam.make_filters(SCENARIO, "robocentric", "inverse_scaling").values()
-RECORDS = {"nees": np.arange(4.0).reshape(2, 2)}
+RECORDS = {"nees": np.arange(4.0).reshape(2, 2), NATIVE: np.array(False)}
 CHUNK = range(2)
 
 

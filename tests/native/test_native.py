@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 import jaxslam
-from jaxslam import native
 from jaxslam._numerics import linalg
 from jaxslam._runtime import programs
-from jaxslam._runtime.programs import Exact
 from jaxslam.consistency import backends
-from jaxslam.native import NotSupportedError, batch, batched, build
+from jaxslam.consistency.store import NATIVE
+from jaxslam.native import NativePrograms, NotSupportedError, batch, batched, build
 from jaxslam.native.batch import Batch
 from jaxslam.native.build import compiler
 from jaxslam.native.elements import Elements
@@ -406,6 +405,8 @@ def test_a_study_has_the_same_records(name, landmark):
     for chunk in studies[0].chunks:
         found, wanted = (study.store.load(f"{name}/{landmark}", chunk) for study in studies)
         assert found.keys() == wanted.keys()
+        assert found.pop(NATIVE)
+        assert not wanted.pop(NATIVE)
         for key, value in wanted.items():
             scale = np.nanmax(np.abs(value), initial=1e-30)
             np.testing.assert_allclose(found[key], value, rtol=1e-9, atol=1e-9 * scale)
@@ -416,7 +417,7 @@ def test_a_study_falls_back_to_xla(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     scenario = jaxslam.scenario("matched", steps=6, landmarks=4)  # compiled above
     filters = jaxslam.make_filters(scenario, ["world"], ["inverse_depth"])
-    backends._native_program.cache_clear()
+    backends.native_programs().forget()
     with pytest.warns(UserWarning, match="is computed by XLA"):
         study = jaxslam.monte_carlo(scenario, filters, runs=10, backend="native")
     with warnings.catch_warnings():
@@ -443,11 +444,8 @@ class Powered(eqx.Module):
 def test_a_filters_fixed_parts_are_the_same_only_by_type_and_bits(monkeypatch):
     """`x ** 2.0` is not the program of `x ** 2`."""
     made = []
-    monkeypatch.setattr(native, "batched", lambda *given: made.append(given))
-    backends._native_program.cache_clear()
+    monkeypatch.setattr(batch, "batched", lambda *given: made.append(given))
+    programs_of_none = NativePrograms(lambda *given: None)
     for power in (2, 2.0, True, 1, 0.0, -0.0, float("nan"), float("nan"), 2, 2.0):
-        leaves, structure = jax.tree.flatten(Powered(None, power))
-        shapes = backends._hashable((None, None, None))
-        backends._native_program(Exact((tuple(leaves), structure, None, *shapes)))
-    backends._native_program.cache_clear()
+        programs_of_none(None, Powered(None, power), DRAWN)
     assert len(made) == 7
