@@ -23,6 +23,7 @@ _PIECE = 100
 """Positions in one piece of the path, the last of which is written anew with every frame."""
 _FRUSTUM = 0.3  # length of the camera's pyramid, map units
 _TRACKED, _LOST = (0, 114, 178), (150, 150, 150)  # of the path
+_LOOP = (213, 94, 0)
 
 
 class Viewer:
@@ -30,8 +31,9 @@ class Viewer:
 
     Along the timelines `frame` and `time` (s since the first frame): the picture with search
     ellipses of three standard deviations and matches by status, camera, path (grey where it was
-    lost), landmarks with their 1 σ ellipsoids, NIS by its degrees of freedom, the σ and the
-    `log_scale` of `frames.csv`, and the state where it changes. All of a map is in one unit.
+    lost), ends of submaps and loops to them, landmarks with their 1 σ ellipsoids, NIS by its
+    degrees of freedom, the σ and the `log_scale` of `frames.csv`, and the state where it changes.
+    All of a map is in one unit.
     Raises `ValueError` without rerun, or for a name that does not end in .rrd.
     """
 
@@ -44,6 +46,8 @@ class Viewer:
         self._began: float | None = None
         self._piece, self._positions = 0, np.zeros((0, 3))
         self._before: Tracked | None = None
+        self._ends: dict[int, np.ndarray] = {}
+        self._loops: list[list[np.ndarray]] = []
 
     def __enter__(self) -> Viewer:
         rr, c = self._rerun, self.calibration
@@ -65,6 +69,7 @@ class Viewer:
         self._record.set_time("time", duration=result.time - began)
         self._show_picture(frame, result)
         self._show_camera(result)
+        self._show_graph(result)
         self._show_numbers(result)
         self._before = result
 
@@ -117,6 +122,18 @@ class Viewer:
         colour = _LOST if result.lost else _TRACKED
         path = self._rerun.LineStrips3D([self._positions], colors=colour)
         self._record.log(f"world/path/{self._piece}", path)
+
+    def _show_graph(self, result: Tracked) -> None:
+        """Record where submaps ended, and from which camera a loop leads to which of them."""
+        rr, before = self._rerun, self._before
+        if before is not None and before.submap != result.submap:
+            self._ends[before.submap] = before.T_wc[:3, 3]
+            labels = [f"submap {number}" for number in self._ends]
+            ends = rr.Points3D([*self._ends.values()], colors=_TRACKED, labels=labels, radii=0.03)
+            self._record.log("world/graph/submaps", ends)
+        if result.loop in self._ends:
+            self._loops.append([result.T_wc[:3, 3], self._ends[result.loop]])
+            self._record.log("world/graph/loops", rr.LineStrips3D(self._loops, colors=_LOOP))
 
     def _show_numbers(self, result: Tracked) -> None:
         rr, camera = self._rerun, result.camera

@@ -8,9 +8,12 @@ import pytest
 
 pytest.importorskip("cv2")
 
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
+from jaxslam.tracking.report import Tracked
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.video import track
+from jaxslam.tracking.viewer import Viewer
 
 SETTINGS = TrackerSettings(filter="world", wanted=12, spare=4)
 FRAMES = 4
@@ -116,3 +119,24 @@ def test_a_recording_ends_in_rrd(tmp_path):
 def test_tracking_without_a_recording_does_not_import_rerun():
     code = "import sys, jaxslam.tracking.video; assert 'rerun' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+def test_ends_of_submaps_and_loops_to_them_are_recorded(tmp_path):
+    pytest.importorskip("rerun")
+    source = synthetic_source(frames=5, width=160, height=120)
+    frames, at = list(source), np.zeros((5, 3))
+    at[:, 0] = [0, 1, 2, 3, 0.5]
+    with Viewer(tmp_path / "graph.rrd", source.calibration) as viewer:
+        for frame, position, submap, loop in zip(
+            frames, at, (0, 0, 1, 2, 3), (None, None, None, None, 0), strict=True
+        ):
+            T_wc = np.eye(4)
+            T_wc[:3, 3] = position
+            camera = PoseWithCovariance(T_wc)
+            viewer.show(frame, Tracked(frame.index, frame.time, camera, submap=submap, loop=loop))
+    rows = read(tmp_path / "graph.rrd")
+    ends = of(rows["/world/graph/submaps"], "positions")
+    assert [len(some) for some in ends] == [1, 2, 3]
+    np.testing.assert_allclose(np.array(ends[-1]), at[1:4])
+    (loops,) = of(rows["/world/graph/loops"], "strips")
+    np.testing.assert_allclose(np.array(loops), [[at[4], at[1]]])
