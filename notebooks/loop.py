@@ -35,9 +35,9 @@ from jaxslam.statistics import chi2_quantile
 
 jax.config.update("jax_enable_x64", True)
 LAP = 218  # frames at 10 Hz, a little more than once round
-VIEW = 8
-NOISY = (0.02,) * 3 + (np.radians(0.5),) * 3  # odometry, m and rad a frame
-scenario = jaxslam.scenario("laps-6dof", steps=LAP, in_view=VIEW, odometry_sigma=NOISY)
+VIEW = 20
+LARGER = 15  # times as large as they are, errors and ellipses are drawn on the map
+scenario = jaxslam.scenario("laps-6dof", steps=LAP)
 (base,) = jaxslam.make_filters(scenario, "robocentric+oc", "inverse_scaling").values()
 slam = with_submaps(base, history=32)
 run = simulate(scenario, jax.random.key(3))
@@ -86,8 +86,9 @@ print(f"{len(pairs)} pairs, of which {int(believed.valid.sum())} are jointly com
 # ## Every earlier camera, before and after
 #
 # From above: the true path, and where the camera is at the end of each submap with its 95 % ellipse.
-# Before the loop the ellipses grow, as odometry and landmarks seen for a while add up. After it
-# they are largest half-way round: what is far from the start on *both* ways is known least.
+# Errors and ellipses are drawn 15 times as large as they are. Before the loop the ellipses grow all
+# the way round. After it the last ones are as small as the first, and the largest are half-way:
+# what is far from the start on *both* ways is known least.
 # %%
 def cameras(posterior):
     """Positions x, z with their covariances, and NEES by its degrees of freedom."""
@@ -117,10 +118,11 @@ for axes, colour, (name, (centres, covariances, _)) in zip(
 ):
     axes.plot(*path.T, "k", lw=1, label="true path")
     axes.plot(*path[frames].T, "k.", ms=5, label="true camera where a submap ends")
-    axes.plot(*centres.T, "+", color=colour, ms=9, label="estimated camera")
-    for i, (centre, covariance) in enumerate(zip(centres, covariances, strict=True)):
-        outline = (centre[:, None] + ellipse(covariance)).T
-        axes.plot(*outline.T, color=colour, lw=1, label=None if i else "95 % ellipse")
+    drawn = path[frames] + LARGER * (centres - path[frames])
+    axes.plot(*drawn.T, "+", color=colour, ms=9, label=f"estimated camera, error × {LARGER}")
+    for i, (centre, covariance) in enumerate(zip(drawn, covariances, strict=True)):
+        outline = centre[:, None] + LARGER * ellipse(covariance)
+        axes.plot(*outline, color=colour, lw=1, label=None if i else f"95 % ellipse × {LARGER}")
     axes.set(aspect="equal", xlabel="x, m", ylabel="z, m", title=name)
     axes.legend(fontsize=8, loc="center")
     axes.grid(alpha=0.25)
