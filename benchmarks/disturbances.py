@@ -266,7 +266,9 @@ def measure(disturbed: Disturbed, settings: TrackerSettings, seed: int) -> dict[
     lies[known] = chi2.sf(nees, dof) < LIE
     during, after = np.isin(index, disturbed.during), index >= disturbed.during.stop
     late = after & (index >= len(index) - RATE)
+    back = np.flatnonzero(believed & after)
     return {
+        "back_after": float(back[0] - disturbed.during.stop) if len(back) else -1.0,
         "tracked_during": float(tracked[during].mean()),
         "tracked_at_end": float(tracked[late].mean())
         if late.any()
@@ -279,7 +281,7 @@ def measure(disturbed: Disturbed, settings: TrackerSettings, seed: int) -> dict[
     }
 
 
-OLDER = ("black", "hand", "rotation", "standing")
+OLDER = ("rotation", "standing")
 """Last measured with an older tracker; to be emptied when they are measured again."""
 
 
