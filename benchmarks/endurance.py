@@ -3,8 +3,9 @@
     python benchmarks/endurance.py ../shared/data/monoslam_desk --frames 10000
 
 The frames of a sequence go to and fro at their own rate. Every thousand frames: the median and the
-99 % quantile of the CPU time of one, of all threads, the memory of the process, the landmarks that left the map.
-Writes `endurance.json`, and the table of `docs/stress.md`.
+99 % quantile of the CPU time of one, of all threads, the memory of the process, the landmarks that
+left the map, and the error of the path so far. Writes `endurance.json`, and the table of
+`docs/stress.md`.
 """
 
 from __future__ import annotations

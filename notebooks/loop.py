@@ -85,10 +85,10 @@ print(f"{len(pairs)} pairs, of which {int(believed.valid.sum())} are jointly com
 # %% [markdown]
 # ## Every earlier camera, before and after
 #
-# From above: the true path, and where the camera is at the end of each submap with its 95 % ellipse.
-# Errors and ellipses are drawn 15 times as large as they are. Before the loop the ellipses grow all
-# the way round. After it the last ones are as small as the first, and the largest are half-way:
-# what is far from the start on *both* ways is known least.
+# From above: the true path, and where the camera is at the end of each submap, with its 95 %
+# ellipse. Errors and ellipses are drawn 15 times as large as they are. Before the loop the
+# ellipses grow all the way round. After it the last ones are as small as the first, and the
+# largest are half-way: what is far from the start both ways is known least.
 # %%
 def cameras(posterior):
     """Positions x, z with their covariances, and NEES by its degrees of freedom."""
