@@ -14,7 +14,7 @@
 # %% [markdown]
 # # What one loop tells a map of submaps
 #
-# A camera with odometry goes round a circle of 4 m and comes back to where it set out. Its filter
+# A camera with odometry goes round a circle of 4 m and comes back to where it began. Its filter
 # keeps only what is in view: whenever the scene has changed, the joint Gaussian of everything is
 # frozen as a *submap*, and the filter goes on from there. When the camera is back, some landmarks
 # in view are the very first ones. That is one loop, and here is what it does to every earlier
