@@ -107,16 +107,6 @@ def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
             raise ValueError(f"{path}: {name} holds a number that is not from 0 to {count - 1}")
 
 
-def _check_real(what: str, x: np.ndarray) -> None:
-    """Raise ValueError unless an array that was read holds finite real numbers."""
-    if x.dtype.kind not in "fiu":
-        raise ValueError(f"{what} holds {x.dtype}; real numbers are accepted")
-    if not np.isfinite(x).all():
-        raise ValueError(f"{what} holds a number that is not finite")
-    if x.size and (most := float(np.abs(x).max())) > LARGEST:
-        raise ValueError(f"{what} holds {most:.2g}; up to {LARGEST:.0e} is accepted")
-
-
 def window(
     data: Tracks, start: int, steps: int, *, landmarks: int = 40, moving: bool = False
 ) -> Run:
