@@ -65,7 +65,8 @@ def measure(source) -> dict[str, Any]:
         summary = track(source, folder, TrackerSettings(), overlay=False)
         poses = beyond_scale(source, Path(folder))
     numbers = {
-        key: summary[key] for key in ("frames", "tracked", "maps", "loops", "matches_per_frame")
+        key: summary[key]
+        for key in ("frames", "tracked", "maps", "loops", "loops_refused", "matches_per_frame")
     }
     ate = summary.get("ate")
     if ate and ate["path_length"]:
