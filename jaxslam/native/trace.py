@@ -262,6 +262,7 @@ MOVES: dict[str, Callable[..., Any]] = {
     "split": _split,
     "concatenate": lambda p, *x: np.concatenate(x, p["dimension"]),
     "stack": lambda p, *x: np.stack(x, p["axis"]),
+    "unstack": lambda p, x: np.moveaxis(x, p["axis"], 0),
     "tile": lambda p, x: np.tile(x, p["reps"]),
     "pad": _pad,
     "copy": lambda p, x: x,
@@ -665,7 +666,11 @@ def _functions(parameters):
 
 def _scan(tracer, equation, arguments):
     p = equation.params
-    first, last = p["num_consts"], p["num_consts"] + p["num_carry"]
+    if "ft_in" in p:  # since JAX 0.11
+        first, carried, _ = map(len, p["ft_in"].unpack())
+    else:
+        first, carried = p["num_consts"], p["num_carry"]
+    last = first + carried
     constants, start, xs = arguments[:first], arguments[first:last], arguments[last:]
     body = functools.partial(tracer.closed, p["jaxpr"])
     if p["length"] * _size(p["jaxpr"].jaxpr) <= UNROLLED:
