@@ -37,7 +37,7 @@ from jax.extend.core import Jaxpr
 from jaxslam._runtime.files import write_atomically
 
 Options = Mapping[str, Mapping[str, Any]]
-"""Of the compiler, by platform; done without where it does not know them."""
+"""Of the compiler, by platform; one that it does not know is done without."""
 
 # Without emitters of fusions it takes two thirds of the time, to programs that are as fast.
 BATCHED: Options = {"cpu": {"xla_cpu_use_fusion_emitters": False}}
@@ -129,14 +129,13 @@ class Program:
         return future.result()
 
     def _make(self, call: _Call) -> _Made:
-        name = _name(self.function)
+        name = getattr(self.function, "__name__", type(self.function).__name__)
         place = place_of(name, (self.function, call.key, self.options))
         if place is None:
             return self._compile(call, name)
         made = read(*place, lambda shapes, *own: _Made(deserialize_and_load(*own), shapes))
         if made is None:
-            # What JAX has read from its own cache cannot be written again: a name that it
-            # has never seen is not there.
+            # What JAX's own cache gave cannot be written again, but no new name is there.
             made = self._compile(call, f"{name}_{secrets.token_hex(4)}")
             keep(place[0], lambda: (made.shapes, *serialize(made.compiled)))
         return made
@@ -151,7 +150,9 @@ class Program:
 
         flat.__name__ = name
         shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in call.arrays]
-        traced = jax.jit(flat).trace(shapes)
+        # A GPU would round the factors of products of float32 to 11 bits; a CPU is slower if asked.
+        with jax.default_matmul_precision(None if jax.default_backend() == "cpu" else "highest"):
+            traced = jax.jit(flat).trace(shapes)
         self.seen(traced.jaxpr.jaxpr, call.arguments(shapes))
         lowered = traced.lower()
         after = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in lowered.out_info]
@@ -209,7 +210,7 @@ def exactly(value: Any) -> Any:
         return value
     if is_dataclass(value):
         return kind, tuple(exactly(getattr(value, f.name, None)) for f in fields(value))
-    return kind, value, exactly(getattr(value, "__dict__", None))
+    return kind, value, exactly(getattr(value, "__dict__", ()))
 
 
 class Exact(NamedTuple):
@@ -229,10 +230,6 @@ def wide() -> bool:
     return bool(jnp.result_type(float) == jnp.float64)
 
 
-def _name(function: Callable[..., Any]) -> str:
-    return getattr(function, "__name__", type(function).__name__)
-
-
 def _is_array(leaf: object) -> bool:
     return hasattr(leaf, "shape") and hasattr(leaf, "dtype")
 
@@ -248,9 +245,12 @@ class _Made(NamedTuple):
 
 
 def _with_options(lowered: jax.stages.Lowered, options: Options) -> jax.stages.Compiled:
-    own = options.get(jax.default_backend())
-    with contextlib.suppress(RuntimeError):
-        return lowered.compile(compiler_options=None if own is None else dict(own))
+    own = dict(options.get(jax.default_backend(), {}))
+    for _ in range(len(own)):
+        try:
+            return lowered.compile(compiler_options=own)
+        except RuntimeError as error:  # which names one that it does not know
+            own = {name: x for name, x in own.items() if f"'{name}'" not in str(error)}
     return lowered.compile()
 
 

@@ -204,6 +204,34 @@ def test_options_that_the_compiler_does_not_know_are_done_without():
     check(Program(scaled, {"cpu": {"xla_no_such_option": True}}))
 
 
+def test_only_the_option_that_is_not_known_is_left_out(monkeypatch):
+    asked, given = [], {"xla_new": 1, "xla_old": 2}
+    compiled = jax.stages.Lowered.compile
+
+    def compile(self, compiler_options=None):
+        asked.append(compiler_options)
+        if "xla_old" in (compiler_options or {}):
+            raise RuntimeError("INVALID_ARGUMENT: No such compile option: 'xla_old'")
+        return compiled(self)
+
+    monkeypatch.setattr(jax.stages.Lowered, "compile", compile)
+    check(Program(scaled, {"cpu": given}))
+    assert asked == [given, {"xla_new": 1}]
+
+
+@pytest.mark.parametrize(
+    ("platform", "precision"), [("cpu", None), ("gpu", (jax.lax.Precision.HIGHEST,) * 2)]
+)
+def test_an_accelerator_rounds_no_factors(monkeypatch, platform, precision):
+    monkeypatch.setattr(jax, "default_backend", lambda: platform)
+    seen = []
+    program = Program(
+        lambda a, b: jax.lax.dot(a, b), {}, lambda jaxpr, args: seen.extend(jaxpr.eqns)
+    )
+    program.compile(*[jax.ShapeDtypeStruct((2, 2), np.float32)] * 2)
+    assert [x.params["precision"] for x in seen if x.primitive.name == "dot_general"] == [precision]
+
+
 @pytest.mark.parametrize("options", [programs.ALONE, programs.BATCHED])
 def test_the_compiler_knows_the_options(options):
     jax.jit(jnp.sin).lower(0.0).compile(compiler_options=options["cpu"])
