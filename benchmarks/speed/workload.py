@@ -150,7 +150,7 @@ def ours(inputs: Inputs) -> Callable[[], Records]:
     return call
 
 
-def by_native(inputs: Inputs, dtype: str = "float64") -> Callable[[], Records]:
+def by_native(inputs: Inputs, dtype: str = "float64", threads: int = 1) -> Callable[[], Records]:
     """The same by the native backend. Raises ValueError without a C++ compiler."""
     index = kept(inputs.slam, inputs.start)
     with jax.enable_x64(dtype == "float64"):
@@ -164,7 +164,7 @@ def by_native(inputs: Inputs, dtype: str = "float64") -> Callable[[], Records]:
         batch = batched(one, (numbers, seconds), tuple(runs))
 
     def call() -> Records:
-        nees, covariance = batch((numbers, seconds), tuple(runs))
+        nees, covariance = batch((numbers, seconds), tuple(runs), threads=threads)
         return nees, covariance[:, index[:, None], index]
 
     return call
