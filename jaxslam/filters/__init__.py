@@ -11,7 +11,6 @@ from jaxslam.filters.registry import MODIFIERS, RECOMMENDED, scenario_pieces
 from jaxslam.filters.submaps.chain import Chain, base_poses, chain
 from jaxslam.filters.submaps.closing import Loops, Posterior, agreeing, close, posterior
 from jaxslam.filters.submaps.handover import Submaps, with_submaps
-from jaxslam.filters.wrappers.adaptive_process_noise import AdaptiveProcessNoise
 from jaxslam.filters.wrappers.batch_initialisation import BatchInitialisation
 from jaxslam.filters.wrappers.fixed_lag import FixedLag
 from jaxslam.filters.wrappers.gated import Gated
@@ -20,8 +19,8 @@ from jaxslam.filters.wrappers.wrapper import AbstractWrapper
 
 __all__ = [
     "MODIFIERS", "RECOMMENDED", "AbstractCorrection", "AbstractFilter", "AbstractStaged",
-    "AbstractWrapper", "AdaptiveProcessNoise", "BatchInitialisation", "Chain", "Covariance",
-    "EkfSlam", "FirstEstimates", "FixedLag", "Gated", "GaussianSum", "Invariant", "Loops",
-    "ObservabilityConstrained", "Posterior", "Standard", "Submaps", "agreeing", "base_poses",
-    "chain", "close", "kalman_update", "posterior", "scenario_pieces", "with_submaps",
+    "AbstractWrapper", "BatchInitialisation", "Chain", "Covariance", "EkfSlam", "FirstEstimates",
+    "FixedLag", "Gated", "GaussianSum", "Invariant", "Loops", "ObservabilityConstrained",
+    "Posterior", "Standard", "Submaps", "agreeing", "base_poses", "chain", "close",
+    "kalman_update", "posterior", "scenario_pieces", "with_submaps",
 ]  # fmt: skip

@@ -161,11 +161,6 @@ class AbstractStaged(AbstractFilter):
         state, innovation = self.update(state, control, seen)
         return self.close(self.compose(state, control), new), innovation
 
-    def moving(self, state: Belief) -> Bool[Array, ""]:
-        """Whether the newest frame says anything of how the camera moves."""
-        del state
-        return jnp.ones((), bool)
-
     def gaussian(self, state: Belief, control: Control) -> tuple[AbstractStaged, Belief]:
         """A filter and a predicted state of it that is one Gaussian: what hypotheses are tried
         on. The filter itself, unless its state is more than that."""

@@ -27,7 +27,6 @@ from jaxslam.filters.initialisation.depth_particles import with_depth_particles
 from jaxslam.filters.initialisation.rays import with_rays
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.submaps.handover import SPARE, with_submaps
-from jaxslam.filters.wrappers.adaptive_process_noise import MEMORY, AdaptiveProcessNoise
 from jaxslam.filters.wrappers.batch_initialisation import from_rest
 from jaxslam.filters.wrappers.fixed_lag import LAG, FixedLag, to_maximum
 from jaxslam.filters.wrappers.gated import Gated
@@ -148,7 +147,6 @@ _AROUND_ANY_FILTER: dict[str, Callable[..., AbstractFilter]] = {
     ),
     "mixture": lambda slam, count: GaussianSum(slam, 9 if count is None else count),
     "rest": from_rest,
-    "noise": lambda slam, frames: AdaptiveProcessNoise(slam, MEMORY if frames is None else frames),
     "submaps": lambda slam, spare: with_submaps(slam, SPARE if spare is None else spare),
     "checked": lambda slam, percent: Gated(
         slam, tolerance=TOLERANCE if percent is None else percent / 100
@@ -162,12 +160,10 @@ MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
 greatest depth of a delayed initialisation, m (`particles`, `rays`); the correlation of depths in
 percent (`common`); σ of the scene's depth in percent of one landmark's (`scene`); frames (`lag`);
 steps of Gauss–Newton instead of convergence (`iterated`); members of a Gaussian sum (`scales`,
-`directions`, of a `mixture` at the most); frames of the longest window of a start (`rest`); frames
-of which the noise is remembered (`noise`); slots for landmarks out of view until their submap ends
-(`submaps`); by how much a match may be off beyond its noise, in
-percent of that (`checked`); by how much a landmark drifts between frames, in percent of the same
-(`drift`); steps of Gauss–Newton in an update (`oc`); none for the remedy
-`fej`."""
+`directions`, of a `mixture` at the most); frames of the longest window of a start (`rest`); slots
+for landmarks out of view until their submap ends (`submaps`); by how much a match may be off beyond
+its noise, in percent of that (`checked`); by how much a landmark drifts between frames, in percent
+of the same (`drift`); steps of Gauss–Newton in an update (`oc`); none for the remedy `fej`."""
 
 RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gauge+scene50+mixture9"}
 """The filter called `recommended`, by geometry, where the velocity is given."""

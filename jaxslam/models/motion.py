@@ -43,10 +43,6 @@ class AbstractMotion(eqx.Module):
         def noise_sigma(self) -> Float[AnyArray, " q"]:
             """σ of the white noise of one step (Q of P11)."""
 
-        @property
-        def noise_told(self) -> bool:
-            """Whether σ is known in metres, of a model with a velocity."""
-
     def start(self) -> tuple[Variables, Float[Array, "v v"]]:
         """The variables before the first step, and a root of their covariance, `P = R Rᵀ`."""
         return (), jnp.zeros((0, 0))
@@ -101,9 +97,6 @@ class ConstantVelocity(AbstractMotion):
     """Mean of the velocity before the first step, m/s and rad/s, in the camera's axes."""
     velocity_sigma: Float[AnyArray, " t"] | Float[AnyArray, "t t"] = number_field()
     """σ of each of its numbers, or a root R of its covariance `R Rᵀ`."""
-    noise_told: bool = eqx.field(static=True, default=True)
-    """Whether the size of the accelerations is known in metres, and so says something of the scale;
-    not where it is fitted to the motion."""
 
     def __check_init__(self) -> None:
         t = self.geometry.tangent_dim

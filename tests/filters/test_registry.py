@@ -79,8 +79,8 @@ def test_one_name_needs_no_list_and_a_scenario_goes_by_its_name():
         ("world+iterated", "inverse_scaling", "FixedLag takes a frame as a whole"),
         ("world+iterated3+checked", "inverse_scaling", None),
         ("world+scales", "inverse_scaling", None),
-        ("world+directions+noise", "inverse_scaling", None),
-        ("scale_gauge+mixture3+rest+noise+checked", "inverse_scaling", None),
+        ("world+directions", "inverse_scaling", None),
+        ("scale_gauge+mixture3+rest+checked", "inverse_scaling", None),
     ],
 )
 def test_what_takes_a_frame_in_stages_and_each_landmark_as_a_gaussian_can_track(

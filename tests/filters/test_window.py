@@ -466,7 +466,7 @@ def test_the_mean_is_shifted_by_the_volume_of_the_rest(of):
 
     expected = (half_log_det(-1e-4) - half_log_det(1e-4)) / 2e-4
     factor = cholesky(local.information)
-    slope = scale._slope_of_volume(slam, local, s, factor, jnp.zeros(at.x.size, bool))
+    slope = scale._slope_of_volume(slam, local, s, factor)
     assert abs(expected) > 1e-2
     np.testing.assert_allclose(slope, expected, rtol=1e-4)
     by_x, by_y = variances(local, factor.whitening)
@@ -480,44 +480,6 @@ def test_the_mean_is_shifted_by_the_volume_of_the_rest(of):
         return sum(np.sum(u**2) for u in rescaled(slam, record, at, log_scale)) / 2
 
     np.testing.assert_allclose((prior(shift + 1e-4) - prior(shift - 1e-4)) / 2e-4, slope, rtol=1e-4)
-
-
-def test_accelerations_whose_size_is_not_told_follow_the_scale():
-    """They draw as little to one as to another, and λ is the less certain."""
-    slam, record, x, y = case("standstill-6dof", White, None, 3)
-    at = started(x, y)
-    fitted = replace(slam, motion=replace(slam.motion, noise_told=False))
-    s = quick_jit(scaling)(slam, record, at)
-    layout = PathLayout.of(slam)
-    steps = at.x[layout.whole :].reshape(record.frames - 1, -1)[:, :3]
-    np.testing.assert_allclose(scale.told(slam, at, s), s.squared, rtol=1e-12)
-    rest = s.squared - jnp.sum(steps**2)
-    np.testing.assert_allclose(scale.told(fitted, at, s), rest, rtol=1e-9)
-    assert rest < s.squared - 1
-
-
-def test_the_mean_is_shifted_without_the_accelerations_whose_size_is_not_told():
-    """Neither their prior nor their volume has a part in where both balance."""
-    slam, record, *_ = case(*CASES[3])
-    at = minimum(*CASES[3])
-    fitted = replace(slam, motion=replace(slam.motion, noise_told=False))
-    local, s = quick_jit(reduced)(slam, record, at.x, at.y), quick_jit(scaling)(slam, record, at)
-    factor = cholesky(local.information)
-    layout, m = PathLayout.of(slam), record.frames - 1
-    free = np.zeros(at.x.size, bool)
-    free[layout.whole :].reshape(m, -1)[:, :3] = True
-    whole = scale._slope_of_volume(slam, local, s, factor, jnp.zeros_like(free))
-    told = scale._slope_of_volume(slam, local, s, factor, jnp.asarray(free))
-    by_x, _ = variances(local, factor.whitening)
-    np.testing.assert_allclose(whole - told, np.sum(1 - by_x[free]), rtol=1e-9)
-    shift = quick_jit(shift_of_scale)(fitted, record, at, local, factor)
-    assert 1e-3 < abs(shift) < scale.MOST_SHIFT
-
-    def prior(log_scale):
-        x, y = rescaled(slam, record, at, log_scale)
-        return (np.sum(x[~free] ** 2) + np.sum(y**2)) / 2
-
-    np.testing.assert_allclose((prior(shift + 1e-4) - prior(shift - 1e-4)) / 2e-4, told, rtol=1e-4)
 
 
 # What the filter goes on from

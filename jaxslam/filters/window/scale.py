@@ -88,22 +88,6 @@ def scaling(slam: EkfSlam, record: Record, at: Minimum) -> Direction:
     return Direction(x, y)
 
 
-def told(slam: EkfSlam, at: Minimum, s: Direction) -> Scalar:
-    """1/variance of λ: |s|², without the accelerations where their size is not given."""
-    return s.squared - jnp.sum(_untold(slam, at.x, s) ** 2)
-
-
-def _untold(slam: EkfSlam, x: X, s: Direction) -> X:
-    """The accelerations that scale and whose size is not given; zero elsewhere."""
-    layout = PathLayout.of(slam)
-    if slam.motion.noise_told:
-        return jnp.zeros_like(x)
-    own = slam.motion.noise_sigma.shape[-1]
-    place = jnp.arange(x.size) - layout.whole
-    own = (place >= 0) & (place % (layout.step + layout.each) < own)
-    return jnp.where(own & (s.x != 0), x, 0.0)
-
-
 def variances(local: Reduced, whitening: Float[Array, "N N"]) -> tuple[X, Y]:
     """Diagonals of A⁻¹: of x, and of y."""
     by_x = jnp.sum(whitening**2, axis=0)
@@ -116,14 +100,12 @@ def shift_of_scale(
     slam: EkfSlam, record: Record, at: Minimum, local: Reduced, factor: Cholesky
 ) -> Scalar:
     """λ of the mean, of a density that has its maximum at 0: where the prior and the volume of the
-    rest balance, all lengths enlarged alike. Accelerations whose size is not given follow."""
-    s = scaling(slam, record, at)
-    untold = _untold(slam, at.x, s) != 0
-    slope = _slope_of_volume(slam, local, s, factor, untold)
+    rest balance, all lengths enlarged alike."""
+    slope = _slope_of_volume(slam, local, scaling(slam, record, at), factor)
 
     def cost(log_scale):
         x, y = rescaled(slam, record, at, log_scale)
-        return (jnp.sum(jnp.where(untold, at.x, x) ** 2) + jnp.sum(y**2)) / 2 - slope * log_scale
+        return (jnp.sum(x**2) + jnp.sum(y**2)) / 2 - slope * log_scale
 
     def once(_, log_scale):
         one = jnp.ones_like(log_scale)
@@ -134,12 +116,12 @@ def shift_of_scale(
     return jax.lax.fori_loop(0, SHIFTS, once, jnp.zeros_like(slope))
 
 
-def _slope_of_volume(slam, local: Reduced, s: Direction, factor: Cholesky, untold) -> Scalar:
+def _slope_of_volume(slam, local: Reduced, s: Direction, factor: Cholesky) -> Scalar:
     """`−½ d log det A/dλ`."""
     of_x, of_y = variances(local, factor.whitening)
     layout, p = PathLayout.of(slam), slam.sensor.size
     place = jnp.arange(of_x.size) - layout.start
     of_depth = (place >= 0) & (place < layout.common)
-    sign = jnp.where((s.x == 0) | untold, 0.0, jnp.where(of_depth, -1.0, 1.0))
+    sign = jnp.where(s.x == 0, 0.0, jnp.where(of_depth, -1.0, 1.0))
     depths = jnp.where(s.y[:, p:] != 0, 1 - of_y[:, p:], 0.0)
     return jnp.sum(sign * (1 - of_x)) - jnp.sum(depths)

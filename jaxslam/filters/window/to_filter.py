@@ -27,7 +27,7 @@ from jaxslam.filters.window.problem import (
     reduced,
 )
 from jaxslam.filters.window.record import Record
-from jaxslam.filters.window.scale import Direction, rescaled, scaling, told
+from jaxslam.filters.window.scale import Direction, rescaled, scaling
 from jaxslam.geometry import Scalar, identity, jacobian, scaled
 from jaxslam.models.scale import ScaleGauge
 
@@ -51,7 +51,6 @@ def _state(slam, record, at, step, local, s: Direction, factor: Cholesky, like: 
     newest, by_x = _newest(slam, record, at, local)
     scale = _scale(slam, local, s)
     core, of_core = _core_rows(slam, newest, by_x, scale, like.core)
-    of_core = _less_told(of_core, like.core, jnp.sqrt(s.squared / told(slam, at, s)))
     values, of_landmarks, own = _landmark_rows(slam, record, at, local, (newest, by_x), scale)
     active = jnp.any(record.seen, axis=0)
     rows = _stacked(of_core, of_landmarks, active)
@@ -103,14 +102,6 @@ def _with_metre(covariance: Float[Array, "n n"], like: State) -> Float[Array, "n
     part = like.core.part("log_scale")
     metre = slice(part.start + 1, part.stop)
     return covariance.at[metre, metre].set(like.covariance[metre, metre])
-
-
-def _less_told(rows: Rows, core, factor: Scalar) -> Rows:
-    """The rows with σ of λ so many times as large; it is correlated with nothing."""
-    if core.log_scale is None:
-        return rows
-    place = core.part("log_scale").start
-    return Rows(*(row.at[place].multiply(factor) for row in rows))
 
 
 def _landmark_rows(

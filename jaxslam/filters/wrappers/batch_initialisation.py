@@ -138,10 +138,6 @@ class BatchInitialisation(AbstractWrapper):
         state = replace(state, sum=_likely(state.sum, anew & ready), open=state.open & ~ready)
         return cond(state.open & state.record.full, self._thinned, state)
 
-    def moving(self, state: RestState) -> Bool[Array, ""]:
-        """It says so unless the camera has stood."""
-        return ~state.record.standing
-
     def remove(self, state: RestState, gone: Bool[AnyArray, " capacity"]) -> RestState:
         modes = state.modes
         y = jnp.where(gone[:, None], 0.0, modes.minima.y)

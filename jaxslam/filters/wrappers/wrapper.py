@@ -81,9 +81,6 @@ class AbstractWrapper(AbstractStaged):
     def remove(self, state: Belief, gone: Bool[AnyArray, " capacity"]) -> Belief:
         return self.with_base_state(state, self.base.remove(self.base_state(state), gone))
 
-    def moving(self, state: Belief) -> Bool[Array, ""]:
-        return self.base.moving(self.base_state(state))
-
     def marginal(self, state: Belief, function: OfCamera) -> Moments:
         return self.base.marginal(self.base_state(state), function)
 
