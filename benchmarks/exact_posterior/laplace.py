@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import optimistix
 from jaxtyping import Array, Bool, Float
 
+from exact_posterior.least_squares import levenberg_marquardt
 from exact_posterior.problem import (
     Problem,
     last,
@@ -17,7 +18,6 @@ from exact_posterior.problem import (
     size,
     unknowns,
 )
-from jaxslam._numerics.least_squares import levenberg_marquardt
 from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.window.problem import PathLayout
 from jaxslam.geometry import Pose, difference

@@ -49,7 +49,7 @@ ALONE: Options = {"cpu": {**BATCHED["cpu"], "xla_cpu_experimental_ynn_fusion_typ
 
 MOST = 32
 """Structures of whose programs one keeps those that were used last."""
-PACKAGES = ("jax", "jaxlib", "equinox", "jaxlie", "lineax", "numpy", "optimistix")
+PACKAGES = ("jax", "jaxlib", "equinox", "jaxlie", "numpy")
 """Whose versions are known: a program of anything else but these, Python's and this package's
 functions is not kept, as they may change without notice."""
 

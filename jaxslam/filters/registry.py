@@ -28,7 +28,7 @@ from jaxslam.filters.initialisation.rays import with_rays
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.submaps.handover import SPARE, with_submaps
 from jaxslam.filters.wrappers.batch_initialisation import from_rest
-from jaxslam.filters.wrappers.fixed_lag import LAG, FixedLag, to_maximum
+from jaxslam.filters.wrappers.fixed_lag import LAG, FixedLag
 from jaxslam.filters.wrappers.gated import Gated
 from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
 from jaxslam.landmarks import LANDMARKS, Parametrization
@@ -56,16 +56,14 @@ FILTERS: dict[str, Callable[..., AbstractFilter]] = {
     "keyframe": partial(EkfSlam, coordinates=KEYFRAME),
     "scale_gauge": partial(EkfSlam, scale=ScaleGauge()),
     "world_gauge": partial(EkfSlam, coordinates=WORLD, scale=ScaleGauge()),
-    "iterated": lambda **pieces: to_maximum(EkfSlam(**pieces)),
     "invariant": partial(EkfSlam, coordinates=WORLD, form=Covariance(Invariant())),
 }
 """By name, of pieces: the paper's filter, with landmarks in the camera frame and composition after
 the update (`robocentric`); the classical one, in the base frame and composed first (`world`); one
 in the camera of the current keyframe (`keyframe`); the paper's in a unit of length of its own,
 whose size is estimated (`scale_gauge`), and the classical one so, whose covariance is too small
-where the camera turns (`world_gauge`); the paper's, linearised at the maximum of the posterior of
-every frame (`iterated`); the classical one with the right-invariant error: landmarks' errors move
-with the pose's (`invariant`)."""
+where the camera turns (`world_gauge`); the classical one with the right-invariant error: landmarks'
+errors move with the pose's (`invariant`)."""
 
 
 def with_common_depth(slam: EkfSlam, percent: int | None) -> EkfSlam:
@@ -118,13 +116,11 @@ def _with_correction(
     return corrected
 
 
-def iterated(base: EkfSlam | FixedLag, steps: int | None) -> EkfSlam | FixedLag:
-    """The filter, linearised at the maximum of the posterior of every frame, or of its window; or
-    after so many steps of Gauss–Newton, as the iterated EKF, which can track. Raises ValueError."""
-    if steps is None or isinstance(base, FixedLag):
-        return to_maximum(base, steps)
-    check_one_gaussian(base, "an iterated filter")
-    return replace(base, form=Covariance(Standard(steps)))
+def iterated(slam: EkfSlam, steps: int | None) -> EkfSlam:
+    """The iterated EKF, of so many steps of Gauss–Newton in an update; 5 by default. Raises
+    ValueError."""
+    check_one_gaussian(slam, "an iterated filter")
+    return replace(slam, form=Covariance(Standard(5 if steps is None else steps)))
 
 
 _OF_ONE_FILTER: dict[str, Callable[[EkfSlam, int | None], EkfSlam]] = {
@@ -134,11 +130,11 @@ _OF_ONE_FILTER: dict[str, Callable[[EkfSlam, int | None], EkfSlam]] = {
     "scene": with_scene_depth,
     "oc": with_observability_constraint,
     "fej": _with_correction("fej", FirstEstimates()),
+    "iterated": iterated,
     "drift": with_drift,
 }
 _AROUND_ANY_FILTER: dict[str, Callable[..., AbstractFilter]] = {
     "lag": lambda slam, frames: FixedLag(slam, LAG if frames is None else frames),
-    "iterated": iterated,
     "scales": lambda slam, count: GaussianSum(
         slam, 9 if count is None else count, "speed", split=False
     ),
@@ -159,11 +155,11 @@ MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
 """What `+name` behind a filter's name makes of it, with the number that may follow the name: the
 greatest depth of a delayed initialisation, m (`particles`, `rays`); the correlation of depths in
 percent (`common`); σ of the scene's depth in percent of one landmark's (`scene`); frames (`lag`);
-steps of Gauss–Newton instead of convergence (`iterated`); members of a Gaussian sum (`scales`,
+steps of Gauss–Newton in an update (`iterated`, `oc`); members of a Gaussian sum (`scales`,
 `directions`, of a `mixture` at the most); frames of the longest window of a start (`rest`); slots
 for landmarks out of view until their submap ends (`submaps`); by how much a match may be off beyond
 its noise, in percent of that (`checked`); by how much a landmark drifts between frames, in percent
-of the same (`drift`); steps of Gauss–Newton in an update (`oc`); none for the remedy `fej`."""
+of the same (`drift`); none for the remedy `fej`."""
 
 RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gauge+scene50+mixture9"}
 """The filter called `recommended`, by geometry, where the velocity is given."""

@@ -71,12 +71,11 @@ def test_one_name_needs_no_list_and_a_scenario_goes_by_its_name():
 @pytest.mark.parametrize(
     ("name", "landmark", "wrong"),
     [
-        ("iterated", "inverse_scaling", "FixedLag takes a frame as a whole"),
         ("world+lag", "inverse_scaling", "FixedLag takes a frame as a whole"),
         ("world+rays", "cartesian", "RaySum begins a landmark that is not one Gaussian"),
         ("world+particles+checked", "cartesian", "DepthParticles begins a landmark"),
-        *((name, "cartesian", None) for name in FILTERS if name != "iterated"),
-        ("world+iterated", "inverse_scaling", "FixedLag takes a frame as a whole"),
+        *((name, "cartesian", None) for name in FILTERS),
+        ("world+iterated", "inverse_scaling", None),
         ("world+iterated3+checked", "inverse_scaling", None),
         ("world+scales", "inverse_scaling", None),
         ("world+directions", "inverse_scaling", None),

@@ -88,7 +88,7 @@ FILTERS = [
     "keyframe",
     "scale_gauge",
     "invariant",
-    "iterated",
+    "robocentric+iterated3",
     "world+particles",
     "world+rays",
     "robocentric+common50",

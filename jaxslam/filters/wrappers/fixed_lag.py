@@ -5,8 +5,6 @@ With every new frame the variables of the window, y (see `sensitivity`), move by
 towards the maximum of their posterior, and the oldest frame is absorbed into the Gaussian, with
 its Jacobians taken at the smoothed point. Bell (SIAM J. Optim. 1994) shows that an iterated
 Kalman smoother is this Gauss–Newton; Dong-Si, Mourikis (ICRA 2011) discuss the marginalisation.
-
-With a lag of one frame, iterated, it is the iterated EKF: always on the original prior.
 """
 
 from __future__ import annotations
@@ -43,12 +41,10 @@ from jaxslam.filters.protocol import (
 )
 from jaxslam.geometry import Pose
 from jaxslam.models.motion import Control, check_control
-from jaxslam.models.observations import Capacity, Features, Innovation, Slots, Status, judged
+from jaxslam.models.observations import Capacity, Features, Innovation, Slots, judged
 
 LAG = 10
 """LagFrames of a lag whose number is not said."""
-MOST_STEPS = 30
-"""Of Levenberg–Marquardt in one frame."""
 
 
 class LagFrames(eqx.Module):
@@ -100,18 +96,11 @@ class FixedLag(AbstractFilter):
     base: EkfSlam
     frames: int = eqx.field(static=True, default=LAG)
     """L: frames that are linearised again with every new one."""
-    iterations: int = eqx.field(static=True, default=1)
-    """Gauss–Newton steps in a frame."""
-    converge: bool = eqx.field(static=True, default=False)
-    """Levenberg–Marquardt to the maximum of the posterior first."""
 
     def __check_init__(self) -> None:
         check_one_gaussian(self.base, "a fixed lag")
-        if self.frames < 1 or self.iterations < 1:
-            raise ValueError(
-                f"a fixed lag has at least 1 frame and 1 iteration, not {self.frames} and "
-                f"{self.iterations}"
-            )
+        if self.frames < 1:
+            raise ValueError(f"a fixed lag has at least 1 frame, not {self.frames}")
         if not self.base.calibration.corrected:
             raise ValueError("a fixed lag cannot consider a calibration: estimate it")
 
@@ -137,19 +126,12 @@ class FixedLag(AbstractFilter):
         """Absorb the oldest frame of the window, add this one, and smooth."""
         check_control(self.base.motion, control)
         before, variables = self._absorbed(state)
-        solved = jnp.asarray(True)
         frames = _appended(state.frames, LagFrames(jnp.ones((), bool), control, seen, new))
-        if self.converge:
-            variables, solved = self._maximum(before, variables, frames)
         window = self._normal_equations(before, variables, frames)
         innovation = _innovation(window, self.base.sensor.noise)
-        for _ in range(self.iterations - 1):
-            variables = variables + window.step()
-            window = self._normal_equations(before, variables, frames)
         state = LagState(before, variables + window.step(), frames, _estimate(window))
-        failed = jnp.where(solved, Status.OK, Status.SOLVER_FAILED)
         status = judged(window.information.positive, state.estimate.covariance, state.variables)
-        return state, replace(innovation, status=jnp.maximum(status, failed))
+        return state, replace(innovation, status=status)
 
     def remove(self, state: LagState, gone: Bool[AnyArray, " capacity"]) -> LagState:
         """Marginalise landmarks, with what the window measured of them, and free their slots."""
@@ -247,31 +229,6 @@ class FixedLag(AbstractFilter):
         root, whitening = semidefinite_root(V.T @ V)
         after = Distribution(point.core, point.landmarks, point.active, offset, root)
         return after, jnp.concatenate([-whitening @ offset, y[n + q :], jnp.zeros(q, y.dtype)])
-
-    def _maximum(self, before, variables, frames) -> tuple[Array, Bool[Array, ""]]:
-        """The maximum of the window's posterior, by Levenberg–Marquardt, and whether it is one."""
-        # Imported here: the solvers take as long to import as everything else.
-        import optimistix as optx
-
-        from jaxslam._numerics.least_squares import levenberg_marquardt
-
-        def residuals(variables, _):
-            _, compared = self._through(before, variables, frames)
-            return jnp.concatenate([variables, compared.residual.ravel()])
-
-        solution = optx.least_squares(
-            residuals, levenberg_marquardt(1e-6), variables, max_steps=MOST_STEPS, throw=False
-        )
-        return solution.value, solution.result == optx.RESULTS.successful
-
-
-def to_maximum(base: EkfSlam | FixedLag, steps: int | None = None) -> FixedLag:
-    """The filter, linearised at the maximum of the posterior; or after so many steps of
-    Gauss–Newton. With no lag it is the iterated EKF: one frame, always on the original prior."""
-    lagged = base if isinstance(base, FixedLag) else FixedLag(base, 1)
-    if steps is None:
-        return replace(lagged, converge=True)
-    return replace(lagged, iterations=steps)
 
 
 def _appended(frames: LagFrames, newest: LagFrames) -> LagFrames:
