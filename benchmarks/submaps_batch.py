@@ -142,8 +142,7 @@ def _prior(slam, poses, points):
 
     def residual(T_BC, both):
         inverse_depth = 1 / (T_BC.inverse() @ both[:-1])[-1:]
-        own = (inverse_depth - slam.depth.mean) / slam.depth.sigma - both[-1:]
-        return own / slam.depth.own
+        return (inverse_depth - slam.depth.mean) / slam.depth.sigma - both[-1:]
 
     return _differentiated(residual, (poses,), points)
 

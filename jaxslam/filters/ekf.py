@@ -448,7 +448,7 @@ def _considered(slam: EkfSlam, state: Belief) -> slice:
 def _depth_prior(slam: EkfSlam, state: Belief) -> Prior:
     """Mean and σ of what a measurement hides of a landmark, its own part alone."""
     hidden, depth = slam.sensor.hidden, slam.depth
-    mean, sigma = jnp.tile(depth.mean, hidden), jnp.tile(depth.sigma, hidden) * depth.own
+    mean, sigma = jnp.tile(depth.mean, hidden), jnp.tile(depth.sigma, hidden)
     if not isinstance(slam.scale, ScaleGauge):
         return mean, sigma
     _, variance = slam.form.core_covariance(lambda core: core.log_scale, state)

@@ -6,7 +6,6 @@ by the objects; here is only what each word makes.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
@@ -66,18 +65,6 @@ where the camera turns (`world_gauge`); the classical one with the right-invaria
 errors move with the pose's (`invariant`)."""
 
 
-def with_common_depth(slam: EkfSlam, percent: int | None) -> EkfSlam:
-    """The filter with priors on 1/z that are correlated, in percent; 50 by default.
-
-    Raises ValueError for a correlation of 1, with which all landmarks are as far away as the first.
-    """
-    correlation = 0.5 if percent is None else percent / 100
-    if correlation >= 1:
-        raise ValueError(f"a correlation of depths is from 0 to below 1, not {correlation}")
-    depth = replace(slam.depth, own=math.sqrt(1 - correlation), common=math.sqrt(correlation))
-    return replace(slam, depth=depth)
-
-
 def with_scene_depth(slam: EkfSlam, percent: int | None) -> EkfSlam:
     """The filter that does not know how far away its scene is.
 
@@ -126,7 +113,6 @@ def iterated(slam: EkfSlam, steps: int | None) -> EkfSlam:
 _OF_ONE_FILTER: dict[str, Callable[[EkfSlam, int | None], EkfSlam]] = {
     "particles": with_depth_particles,
     "rays": with_rays,
-    "common": with_common_depth,
     "scene": with_scene_depth,
     "oc": with_observability_constraint,
     "fej": _with_correction("fej", FirstEstimates()),
@@ -135,12 +121,7 @@ _OF_ONE_FILTER: dict[str, Callable[[EkfSlam, int | None], EkfSlam]] = {
 }
 _AROUND_ANY_FILTER: dict[str, Callable[..., AbstractFilter]] = {
     "lag": lambda slam, frames: FixedLag(slam, LAG if frames is None else frames),
-    "scales": lambda slam, count: GaussianSum(
-        slam, 9 if count is None else count, "speed", split=False
-    ),
-    "directions": lambda slam, count: GaussianSum(
-        slam, 5 if count is None else count, "direction", split=False
-    ),
+    "directions": lambda slam, count: GaussianSum(slam, 5 if count is None else count, split=False),
     "mixture": lambda slam, count: GaussianSum(slam, 9 if count is None else count),
     "rest": from_rest,
     "submaps": lambda slam, spare: with_submaps(slam, SPARE if spare is None else spare),
@@ -153,13 +134,12 @@ MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
     **_AROUND_ANY_FILTER,
 }
 """What `+name` behind a filter's name makes of it, with the number that may follow the name: the
-greatest depth of a delayed initialisation, m (`particles`, `rays`); the correlation of depths in
-percent (`common`); σ of the scene's depth in percent of one landmark's (`scene`); frames (`lag`);
-steps of Gauss–Newton in an update (`iterated`, `oc`); members of a Gaussian sum (`scales`,
-`directions`, of a `mixture` at the most); frames of the longest window of a start (`rest`); slots
-for landmarks out of view until their submap ends (`submaps`); by how much a match may be off beyond
-its noise, in percent of that (`checked`); by how much a landmark drifts between frames, in percent
-of the same (`drift`); none for the remedy `fej`."""
+greatest depth of a delayed initialisation, m (`particles`, `rays`); σ of the scene's depth in
+percent of one landmark's (`scene`); frames (`lag`); steps of Gauss–Newton in an update (`iterated`,
+`oc`); members of a Gaussian sum (`directions`, of a `mixture` at the most); frames of the longest
+window of a start (`rest`); slots for landmarks out of view until their submap ends (`submaps`); by
+how much a match may be off beyond its noise, in percent of that (`checked`); by how much a landmark
+drifts between frames, in percent of the same (`drift`); none for the remedy `fej`."""
 
 RECOMMENDED = {"planar": "scale_gauge+scene50+mixture17", "spatial": "scale_gauge+scene50+mixture9"}
 """The filter called `recommended`, by geometry, where the velocity is given."""

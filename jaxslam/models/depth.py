@@ -9,7 +9,7 @@ from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field
 
 
 class InverseDepth(eqx.Module):
-    """`1/z = mean + σ (own e_i + common c)`, with e_i of every landmark and one c, standard normal.
+    """`1/z = mean + σ (e_i + common c)`, with e_i of every landmark and one c, standard normal.
 
     c is estimated with everything else: the first landmarks inform those that follow how far away
     the scene is.
@@ -19,16 +19,15 @@ class InverseDepth(eqx.Module):
     """1/m; the paper's is 1/(2 d_min)."""
     sigma: Float[AnyArray, ""] = number_field()
     """1/m; the paper's is 1/(4 d_min)."""
-    own: Float[AnyArray, ""] = number_field(default=1.0)
     common: Float[AnyArray, ""] | None = eqx.field(converter=optional_numbers, default=None)
-    """None where landmarks have nothing in common."""
+    """σ of c, in σ of one landmark's own part; None where landmarks have nothing in common."""
     unit: Float[AnyArray, ""] | None = eqx.field(converter=optional_numbers, default=None)
     """σ of the log of the metre in which all of this was meant, and whatever else is given: a
     filter with a unit of its own (`ScaleGauge`) claims no more of the scale, whatever it sees. None
     where it was the metre."""
 
     def __check_init__(self) -> None:
-        for name in ("mean", "sigma", "own"):
+        for name in ("mean", "sigma"):
             check_shape(f"the {name} of the prior on 1/z", getattr(self, name), ())
 
     @staticmethod

@@ -231,11 +231,10 @@ def test_the_gauge_is_not_seen_by_a_camera():
 
 
 @pytest.mark.parametrize(
-    ("modifier", "own", "common"),
-    [("common40", 1.0, 0.4), ("scene", 2.0, 1.0), ("scene50", 1.25, 0.25)],
+    ("modifier", "own", "common"), [("scene", 2.0, 1.0), ("scene50", 1.25, 0.25)]
 )
 def test_depths_have_their_own_variance_and_what_is_common(modifier, own, common):
-    """In variances of one prior: `common` shares it, `scene` adds to it."""
+    """In variances of one prior, to which `scene` adds."""
     of = case("matched")
     slam = of.filter(f"robocentric+{modifier}")
     first, _, _ = of.frames(0)
@@ -255,17 +254,15 @@ def test_depths_have_their_own_variance_and_what_is_common(modifier, own, common
         ("robocentric+lag5", "inverse_scaling", "consider", "cannot consider"),
         ("world+lag5", "inverse_depth_to_cartesian", "known", "cannot switch the form"),
         ("world+particles+lag5", "cartesian", "known", "delayed"),
-        ("robocentric+common100", "inverse_scaling", "known", "below 1"),
-        ("world+particles+common50", "cartesian", "known", "delayed initialisation"),
-        ("robocentric+common50+particles", "cartesian", "known", "delayed initialisation"),
-        ("robocentric+common50+rays", "cartesian", "known", "delayed initialisation"),
-        ("robocentric+rays+common50", "cartesian", "known", "delayed initialisation"),
+        ("world+particles+scene50", "cartesian", "known", "delayed initialisation"),
+        ("robocentric+scene50+particles", "cartesian", "known", "delayed initialisation"),
+        ("robocentric+scene50+rays", "cartesian", "known", "delayed initialisation"),
+        ("robocentric+rays+scene50", "cartesian", "known", "delayed initialisation"),
         ("scale_gauge+particles", "cartesian", "known", "delayed initialisation"),
         ("scale_gauge+rays", "cartesian", "known", "delayed initialisation"),
-        ("scale_gauge+common50+rays", "cartesian", "known", "delayed initialisation"),
-        ("robocentric+scene+rays", "cartesian", "known", "delayed initialisation"),
+        ("scale_gauge+scene50+rays", "cartesian", "known", "delayed initialisation"),
         ("robocentric+lag5+lag5", "inverse_scaling", "known", "not around a FixedLag"),
-        ("robocentric+lag5+common50", "inverse_scaling", "known", "must stand before"),
+        ("robocentric+lag5+scene50", "inverse_scaling", "known", "must stand before"),
         ("robocentric+oc+lag5", "inverse_scaling", "known", "covariance form"),
         ("robocentric+lagg5", "inverse_scaling", "known", "lagg"),
     ],

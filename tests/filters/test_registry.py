@@ -77,7 +77,6 @@ def test_one_name_needs_no_list_and_a_scenario_goes_by_its_name():
         *((name, "cartesian", None) for name in FILTERS),
         ("world+iterated", "inverse_scaling", None),
         ("world+iterated3+checked", "inverse_scaling", None),
-        ("world+scales", "inverse_scaling", None),
         ("world+directions", "inverse_scaling", None),
         ("scale_gauge+mixture3+rest+checked", "inverse_scaling", None),
     ],

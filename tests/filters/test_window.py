@@ -53,7 +53,7 @@ def filter_of(name, treatment, common):
     made = pieces(name)
     p = made["sensor"].size
     sigma = np.array([3.0] * p + [2.0] * p)
-    depth = InverseDepth(0.25, 0.05, 0.8, common)
+    depth = InverseDepth(0.25, 0.04, common)
     calibration = Known() if treatment is Known else treatment(sigma)
     slam = EkfSlam(scale=ScaleGauge(), **made, landmark=INVERSE_SCALING)
     return replace(slam, depth=depth, calibration=calibration)
@@ -447,7 +447,7 @@ def test_of_common_errors_scaling_is_the_shortest():
     s = quick_jit(scaling)(slam, record, at)
     # What changes no depth: the common error up, and every own one down.
     p, start = slam.sensor.size, PathLayout.of(slam).start
-    free = s.x[start] - jnp.sum(s.y[:, p:]) * slam.depth.common / slam.depth.own
+    free = s.x[start] - jnp.sum(s.y[:, p:]) * slam.depth.common
     assert abs(free) < 1e-9
     assert abs(s.x[start]) > 1e-3
 
@@ -519,7 +519,7 @@ def test_the_filters_state_is_the_gaussian_of_the_mode(of, monkeypatch):
             sensor = slam.calibration.sensor(slam.sensor, begun.calibration)
             depth = slam.depth
             common = 0.0 if depth.common is None else depth.common * there.common[0]
-            omega = depth.mean + depth.sigma * (depth.own * y[p:] + common)
+            omega = depth.mean + depth.sigma * (y[p:] + common)
             X, omega = sensor.locate(measured + sensor.sigma * y[:p], omega)
             X = T.rotation() @ X + T.translation() * omega
             return jnp.append(X, omega) / X[-1]

@@ -147,10 +147,10 @@ def located(
 def hidden(
     slam: EkfSlam, common: Float[Array, " c"], own: Float[Array, "*m o"]
 ) -> Float[Array, "*m o"]:
-    """`1/z = mean + σ (own e_i + common c)`, 1/m: what a measurement hides."""
+    """`1/z = mean + σ (e_i + common c)`, 1/m: what a measurement hides."""
     depth = slam.depth
     shared = 0.0 if depth.common is None else jnp.sum(common) * depth.common
-    return depth.mean + depth.sigma * (depth.own * own + shared)
+    return depth.mean + depth.sigma * (own + shared)
 
 
 class Sight(NamedTuple):

@@ -59,10 +59,10 @@ def _shared(
 ) -> tuple[Float[Array, " c"], Float[Array, "m o"]]:
     """The likeliest common and own errors of inverse depths."""
     depth = slam.depth
-    own = (inverse_depths - depth.mean) / (depth.sigma * depth.own)
+    own = (inverse_depths - depth.mean) / depth.sigma
     if depth.common is None:
         return jnp.zeros(0, own.dtype), own
-    ratio = jnp.where(begun, depth.common / depth.own, 0.0)
+    ratio = jnp.where(begun, depth.common, 0.0)
     common = jnp.sum(ratio * own) / (1 + jnp.sum(ratio**2))
     return common[None], own - ratio * common
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -54,22 +53,19 @@ SPACING = 0.5
 """Within these, so many σ of the prior are between them."""
 OVERLAP = 0.5
 """σ of a member, in distances between neighbours."""
-ALONG = ("speed", "direction")
 
 
 class GaussianSum(AbstractWrapper):
-    """`members` filters `base` for each direction in which the velocity's prior is divided; split
-    and merged in every frame, at most `members` for one direction.
+    """`members` filters `base` for each direction, across its mean, in which the velocity's prior
+    is divided: one in a planar world, two, with `members²` members, in a spatial one. Split and
+    merged in every frame, at most `members` for one direction.
 
-    Raises ValueError for fewer than 3, another division, and a base that has no velocity, or, to be
-    split, is more than one Gaussian.
+    Raises ValueError for fewer than 3, and a base that has no velocity, or, to be split, is more
+    than one Gaussian.
     """
 
     base: AbstractStaged
     members: int = eqx.field(static=True)
-    along: Literal["speed", "direction"] = eqx.field(static=True, default="direction")
-    """`speed`: along the mean velocity, which is the scale. `direction`: across it, which is one
-    direction in a planar world and two, with `members²` members, in a spatial one."""
     split: bool = eqx.field(static=True, default=True)
     """Whether members are split and merged; only the first of two directions is then divided at the
     start, and `base` is an `EkfSlam`."""
@@ -80,8 +76,6 @@ class GaussianSum(AbstractWrapper):
             check_one_gaussian(self.base, "a mixture", corrected=True)
         if self.members < 3:
             raise ValueError(f"a Gaussian sum has at least 3 members, not {self.members}")
-        if self.along not in ALONG:
-            raise ValueError(f"unknown division {self.along!r}; known: {', '.join(ALONG)}")
         motion = self._ekf.motion
         if not motion.has_velocity:
             raise ValueError(f"a Gaussian sum divides a velocity: {type(motion).__name__} has none")
@@ -105,7 +99,7 @@ class GaussianSum(AbstractWrapper):
         base = cast(self.base, dtype)
         motion = cast(self._ekf.motion, dtype)
         velocity, D = motion.start()
-        A = _directions(velocity, D, motion.geometry.point_dim, self.along)
+        A = _directions(velocity, D, motion.geometry.point_dim)
         A = A[:, :1] if self.split else A
         grid, weights, sigma = _division(self.members, A.shape[1])
         root = D @ (jnp.eye(len(D), dtype=dtype) - (1 - sigma) * A @ A.T)
@@ -216,16 +210,14 @@ class GaussianSum(AbstractWrapper):
 
 
 def _directions(
-    velocity: Float[Array, " v"], D: Float[Array, "v v"], n: int, along: str
+    velocity: Float[Array, " v"], D: Float[Array, "v v"], n: int
 ) -> Float[Array, "v m"]:
-    """Orthonormal directions of e: the one that changes the speed most, or those that turn
-    the velocity, of n linear numbers, and do not change the speed."""
+    """Orthonormal directions of e that turn the velocity, of n linear numbers, and do not change
+    the speed."""
     linear = jnp.zeros_like(velocity).at[:n].set(velocity[:n])
     still = jnp.linalg.norm(linear) == 0
     speed = D.T @ jnp.where(still, jnp.eye(velocity.size)[0].astype(D.dtype), linear)
     speed = speed[:, None] / jnp.maximum(jnp.linalg.norm(speed), jnp.finfo(D.dtype).tiny)
-    if along == "speed":
-        return speed
     by_linear = D.T[:, :n]
     projected = by_linear - speed @ (speed.T @ by_linear)
     _, vectors = eigh(projected @ projected.T)
