@@ -98,10 +98,6 @@ class Map:
         """Return all landmarks, those gone included."""
         return joined([*self.finished, self._recorded(sorted(self.landmarks))])
 
-    def graph(self) -> Graph:
-        """Return the submaps and loops of this map."""
-        return self.now().graph(self.settings, self.estimator.slam)
-
     def described(self) -> dict[int, Landmark]:
         """Return the landmarks of all maps that are known, by their numbers."""
         latest = [one for known in self.known() for one in known.landmarks.values()]
@@ -154,7 +150,7 @@ class Map:
         self.earlier = (*self.earlier, self.now())
         self.charted |= {one.number: replace(one) for one in self.landmarks.values()}
         if len(self.submaps) == 1:
-            self.graph().compile()
+            self.now().graph(self.settings, estimator.slam).compile()
 
     def learn(self, loop: LoopClosure, compared: Compared) -> None:
         """Take over what a loop says, that ends at the camera."""

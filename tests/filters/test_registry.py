@@ -102,10 +102,6 @@ def test_a_study_prints_as_its_table_and_is_a_data_frame():
     summary = summarise(study)
     assert str(study) == repr(study) == table(summary)
     assert study.summary() == summary
-    with pytest.raises(AttributeError, match=r"'plot' \(jaxslam\.plots\.plot_consistency\(study\)"):
-        study.plot()
-    with pytest.raises(AttributeError, match=r"no attribute 'summarry' \(did you mean summary\?\)"):
-        study.summarry()
     frame = study.to_pandas()
     assert len(frame) == 2 * 3
     found = summary["filters"]["world/inverse_scaling"]

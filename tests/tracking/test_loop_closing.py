@@ -120,7 +120,8 @@ def test_another_video_may_begin_anywhere_in_a_saved_map(walk):
 def test_a_loop_that_cannot_be_is_refused(walk):
     """The same landmarks, as if they had been seen by a camera two metres away."""
     tracker, *_ = walk
-    loop, graph = tracker.map.loops[0], tracker.map.graph()
+    loop = tracker.map.loops[0]
+    graph = tracker.map.now().graph(tracker.settings, tracker.map.estimator.slam)
     known = replace(graph, loops=())
     with jax.enable_x64(True):
         assert float(known.with_loop(loop).nis) < closing.GATE

@@ -79,7 +79,7 @@ def close_loop(
             continue
         which = p, len(earlier)
         loop = loop_of(map.estimator.slam, map.submaps, which, *found, PIXEL, map.settings.wanted)
-        compared = map.graph().with_loop(loop)
+        compared = map.now().graph(map.settings, map.estimator.slam).with_loop(loop)
         closed = Closed(earlier[p].number, float(compared.nis))
         if closed.believed:
             map.learn(loop, compared)
