@@ -100,21 +100,6 @@ class Tracked:
         return self.camera.covariance
 
     @property
-    def predicted(self) -> np.ndarray:
-        """The pixels where the landmarks searched were expected, (k, 2)."""
-        return self.observations.predicted
-
-    @property
-    def search(self) -> np.ndarray:
-        """The innovation covariances of these landmarks, (k, 2, 2)."""
-        return self.observations.covariances
-
-    @property
-    def matched(self) -> np.ndarray:
-        """The pixels where they were found, (k, 2), NaN where they were not."""
-        return self.observations.pixels
-
-    @property
     def status(self) -> list[str]:
         """`matched`, `unmatched` or `outlier`, k of them."""
         return self.observations.labels.tolist()

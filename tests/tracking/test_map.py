@@ -235,7 +235,7 @@ def test_what_is_covered_makes_room_for_new_landmarks_elsewhere():
     for frame in source:
         frame.image[:, :160][frame.index >= 5] = 0
         tracked = tracker.track(frame)
-        right = tracked.predicted[:, 0] > 170
+        right = tracked.observations.predicted[:, 0] > 170
         found = np.array(tracked.status)[right] == "matched" if frame.index else right
         if frame.index == 5 + settings.absent_after:
             before = found.sum()

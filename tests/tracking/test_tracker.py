@@ -364,7 +364,7 @@ def test_a_filter_that_fails_in_the_dark_begins_anew_when_there_is_light(monkeyp
         image = np.zeros_like(frame.image) if dark else frame.image
         results.append(tracker.track(replace(frame, image=image)))
     assert [result.state for result in results] == ["start", "tracked", "lost", "lost", "start"]
-    assert len(results[3].predicted) == 0
+    assert len(results[3].observations.slots) == 0
     assert tracker.created == len(tracker.points().numbers)
 
 
@@ -562,8 +562,8 @@ def test_a_filter_of_ones_own_tracks_as_the_built_in_one_does():
         for one, other in (
             (found.T_wc, expected.T_wc),
             (found.covariance, expected.covariance),
-            (found.predicted, expected.predicted),
-            (found.search, expected.search),
+            (found.observations.predicted, expected.observations.predicted),
+            (found.observations.covariances, expected.observations.covariances),
             (found.nis, expected.nis),
         ):
             np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)
