@@ -20,7 +20,7 @@ from jaxslam.filters.readouts import (
     landmarks_in_camera,
     landmarks_in_world,
 )
-from jaxslam.filters.registry import FILTERS, make_filter, make_filters, recommended
+from jaxslam.filters.registry import FILTERS, make_filter, make_filters
 from jaxslam.filters.run import Frames, run
 from jaxslam.filters.wrappers.fixed_lag import FixedLag
 from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
@@ -102,7 +102,6 @@ __all__ = [
     "make_filters",
     "mean_band",
     "monte_carlo",
-    "recommended",
     "run",
     "scenario",
     "simulate",

@@ -92,21 +92,6 @@ class Study:
         """Return `summarise(study)`, the content of `consistency.json`."""
         return summarise(self)
 
-    def to_pandas(self) -> Any:
-        """Return a `pandas.DataFrame` with a row for every step of every filter.
-
-        Raises ValueError where pandas is not installed.
-        """
-        try:
-            import pandas
-        except ImportError:
-            raise ValueError("to_pandas needs pandas: pip install pandas") from None
-        summary = summarise(self)
-        parts = [_by_step(summary["filters"][name]) for name in self.filters]
-        steps = {"step": range(1, summary["steps"] + 1), "time": summary["time"]}
-        frames = [pandas.DataFrame({**steps, **part}, dtype=float) for part in parts]
-        return pandas.concat(frames, keys=list(self.filters), names=["filter", "row"])
-
 
 def as_summary(given: Study | Summary) -> Summary:
     """A summary, or that of a study. Raises ValueError for anything else."""
@@ -218,17 +203,6 @@ def _summarise_filter(study: Study, name: str) -> Summary:
         "backend": study.backends.get(name),
         "seconds": {"compile": seconds.compile, "run": seconds.run},
     }
-
-
-def _by_step(found: Summary) -> dict[str, list[float | None]]:
-    """The columns of a filter's numbers that have one value a step."""
-    alone = ("nees", "nees_median", "nees_not_lost", "lost", "lost_ever", "nis", "nis_dof")
-    parts = {
-        f"{kind}_{k}": v
-        for kind in ("rmse", "sigma", "outside3sigma")
-        for k, v in found[kind].items()
-    }
-    return {**{key: found[key] for key in alone}, **parts}
 
 
 def _drift(sums: Sums, dof: int) -> Summary:

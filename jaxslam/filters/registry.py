@@ -30,13 +30,11 @@ from jaxslam.filters.wrappers.batch_initialisation import from_rest
 from jaxslam.filters.wrappers.fixed_lag import LAG, FixedLag
 from jaxslam.filters.wrappers.gated import Gated
 from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
-from jaxslam.landmarks import LANDMARKS, Parametrization
-from jaxslam.models.calibration import TREATMENTS, AbstractCalibration
+from jaxslam.landmarks import LANDMARKS
+from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.coordinates import KEYFRAME, WORLD
-from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.scale import ScaleGauge
-from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation.pieces import (
     calibration_sigma_of,
     depth_of,
@@ -229,16 +227,3 @@ def scenario_pieces(scenario: Scenario, calibration: str | None = None) -> dict[
         "calibration": treatment(calibration_sigma_of(scenario)),
         "depth": depth_of(scenario),
     }
-
-
-def recommended(
-    motion: AbstractMotion,
-    sensor: AbstractSensor,
-    landmark: Parametrization = LANDMARKS["inverse_scaling"],
-    calibration: AbstractCalibration | None = None,
-    depth: InverseDepth | None = None,
-) -> AbstractFilter:
-    """The filter to take, of one's own pieces: `recommended_name`."""
-    given = {"calibration": calibration, "depth": depth}
-    given = {name: piece for name, piece in given.items() if piece is not None}
-    return make_filter("recommended", motion=motion, sensor=sensor, landmark=landmark, **given)

@@ -1,7 +1,6 @@
 """Tests of the names that users give: of filters, of parametrizations, and what is refused."""
 
 import re
-import sys
 
 import pytest
 
@@ -93,7 +92,7 @@ def test_what_takes_a_frame_in_stages_and_each_landmark_as_a_gaussian_can_track(
 
 
 @pytest.mark.slow
-def test_a_study_prints_as_its_table_and_is_a_data_frame():
+def test_a_study_prints_as_its_table():
     study = monte_carlo(
         scenario("matched-tight", steps=3),
         make_filters("matched-tight", ["robocentric", "world"], "inverse_scaling"),
@@ -102,19 +101,3 @@ def test_a_study_prints_as_its_table_and_is_a_data_frame():
     summary = summarise(study)
     assert str(study) == repr(study) == table(summary)
     assert study.summary() == summary
-    frame = study.to_pandas()
-    assert len(frame) == 2 * 3
-    found = summary["filters"]["world/inverse_scaling"]
-    rows = frame.loc["world/inverse_scaling"]
-    assert list(rows["nees"]) == found["nees"]
-    assert list(rows["sigma_position"]) == found["sigma"]["position"]
-    assert list(rows["step"]) == [1, 2, 3]
-
-
-def test_without_pandas_a_study_says_so(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    study = monte_carlo(
-        "matched-tight", make_filters("matched-tight", "world", "cartesian"), runs=1
-    )
-    with pytest.raises(ValueError, match="pip install pandas"):
-        study.to_pandas()
