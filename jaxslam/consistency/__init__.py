@@ -1,7 +1,7 @@
 """The consistency of filters: Monte Carlo runs, NEES and NIS with exact bounds, their summary."""
 
 from jaxslam.consistency.backends import BACKENDS
-from jaxslam.consistency.likelihood import log_likelihood, maximum_likelihood
+from jaxslam.consistency.likelihood import log_likelihood
 from jaxslam.consistency.montecarlo import CHUNK, DTYPES, check_sizes, draw, monte_carlo
 from jaxslam.consistency.records import write_records
 from jaxslam.consistency.runs import SimulatedFrame, filter_run, run_through, scale_records
@@ -10,7 +10,7 @@ from jaxslam.consistency.summary import Seconds, Study, summarise, table, tally,
 
 __all__ = [
     "BACKENDS", "CHUNK", "DTYPES", "FolderStore", "MemoryStore", "Seconds", "SimulatedFrame",
-    "Study", "check_sizes", "draw", "filter_run", "log_likelihood", "maximum_likelihood",
+    "Study", "check_sizes", "draw", "filter_run", "log_likelihood",
     "monte_carlo", "run_through", "scale_records", "summarise", "table", "tally", "treatment",
     "write_records",
 ]  # fmt: skip
