@@ -9,8 +9,24 @@ from jaxslam.consistency.store import FolderStore, MemoryStore
 from jaxslam.consistency.summary import Seconds, Study, summarise, table, tally, treatment
 
 __all__ = [
-    "BACKENDS", "CHUNK", "DTYPES", "FolderStore", "MemoryStore", "Seconds", "SimulatedFrame",
-    "Study", "check_sizes", "draw", "filter_run", "log_likelihood",
-    "monte_carlo", "run_through", "scale_records", "summarise", "table", "tally", "treatment",
+    "BACKENDS",
+    "CHUNK",
+    "DTYPES",
+    "FolderStore",
+    "MemoryStore",
+    "Seconds",
+    "SimulatedFrame",
+    "Study",
+    "check_sizes",
+    "draw",
+    "filter_run",
+    "log_likelihood",
+    "monte_carlo",
+    "run_through",
+    "scale_records",
+    "summarise",
+    "table",
+    "tally",
+    "treatment",
     "write_records",
-]  # fmt: skip
+]

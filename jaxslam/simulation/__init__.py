@@ -12,7 +12,22 @@ from jaxslam.simulation.trajectories import RecordedMotion
 from jaxslam.simulation.world import as_data, simulate, trajectory_of
 
 __all__ = [
-    "BUILT_IN", "RecordedMotion", "Room", "Run", "Scenario", "Sightings", "as_data",
-    "as_scenario", "calibration_sigma_of", "depth_of", "features", "gone", "motion_of",
-    "scenario", "sensor_of", "sightings", "simulate", "trajectory_of",
-]  # fmt: skip
+    "BUILT_IN",
+    "RecordedMotion",
+    "Room",
+    "Run",
+    "Scenario",
+    "Sightings",
+    "as_data",
+    "as_scenario",
+    "calibration_sigma_of",
+    "depth_of",
+    "features",
+    "gone",
+    "motion_of",
+    "scenario",
+    "sensor_of",
+    "sightings",
+    "simulate",
+    "trajectory_of",
+]

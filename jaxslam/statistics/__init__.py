@@ -18,6 +18,16 @@ from jaxslam.statistics.verdict import (
 )
 
 __all__ = [
-    "PowerSums", "Tally", "Verdict", "chi2_quantile", "innovation_verdict", "lost_threshold",
-    "mean_band", "normalised_squared", "not_disproved", "one_scale", "run_verdict", "sentences",
-]  # fmt: skip
+    "PowerSums",
+    "Tally",
+    "Verdict",
+    "chi2_quantile",
+    "innovation_verdict",
+    "lost_threshold",
+    "mean_band",
+    "normalised_squared",
+    "not_disproved",
+    "one_scale",
+    "run_verdict",
+    "sentences",
+]

@@ -10,7 +10,20 @@ from jaxslam.triangulation.truth import particles
 from jaxslam.triangulation.views import CALIBRATIONS, TwoViews, measure
 
 __all__ = [
-    "CALIBRATIONS", "ESTIMATES", "Comparison", "Samples", "TwoViews", "compare", "distance",
-    "estimate", "marginal", "measure", "particles", "push", "quantiles", "shares_up_to",
-    "summarise", "table",
-]  # fmt: skip
+    "CALIBRATIONS",
+    "ESTIMATES",
+    "Comparison",
+    "Samples",
+    "TwoViews",
+    "compare",
+    "distance",
+    "estimate",
+    "marginal",
+    "measure",
+    "particles",
+    "push",
+    "quantiles",
+    "shares_up_to",
+    "summarise",
+    "table",
+]
