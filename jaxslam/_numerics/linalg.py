@@ -20,6 +20,8 @@ from jaxslam._numerics.arrays import AnyArray
 
 LEAF = 32
 """Rows of what is factored column by column; of more, the halves are, and joined by products."""
+LARGE = 256
+"""Rows from which on the blocks are in a loop: more arithmetic, and a program that does not grow."""
 UNROLLED = 4
 """Rows up to which the loops over them are written out."""
 SWEEPS = 10
@@ -77,6 +79,8 @@ def _factored(A: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array,
         return A, A
     if n <= LEAF:
         return _factored_by_columns(A)
+    if n > LARGE:
+        return _factored_by_blocks(A)
     h = n // 2
     L, W = _factored(A[:h, :h])
     below = A[h:, :h] @ W.T
@@ -89,6 +93,34 @@ def _factored(A: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array,
         jnp.block([[L, none], [below, L_rest]]),
         jnp.block([[W, none], [-W_rest @ (below @ W), W_rest]]),
     )
+
+
+def _factored_by_blocks(A: Float[Array, "n n"]) -> tuple[Array, Array]:
+    """L by block columns of `LEAF`, each from all those before it, and L⁻¹ by block rows."""
+    n, b = A.shape[0], LEAF
+    more = -n % b
+    A = jnp.pad(A, (0, more)) + jnp.diag((jnp.arange(n + more) >= n).astype(A.dtype))
+    row = jnp.arange(n + more)[:, None]
+
+    def block(k, both):
+        L, W = both
+        start = k * b
+        before = jax.lax.dynamic_slice_in_dim(L, start, b)
+        left = jax.lax.dynamic_slice_in_dim(A, start, b, axis=1) - L @ before.T
+        own, inverse = _factored_by_columns(jax.lax.dynamic_slice_in_dim(left, start, b))
+        below = left @ inverse.T
+        below += (left - below @ own.T) @ inverse.T  # as in `_factored`
+        column = jnp.where(row < start, 0.0, below)
+        column = jax.lax.dynamic_update_slice_in_dim(column, own, start, axis=0)
+        rows = -inverse @ (before @ W)
+        rows = jax.lax.dynamic_update_slice_in_dim(rows, inverse, start, axis=1)
+        return (
+            jax.lax.dynamic_update_slice_in_dim(L, column, start, axis=1),
+            jax.lax.dynamic_update_slice_in_dim(W, rows, start, axis=0),
+        )
+
+    L, W = jax.lax.fori_loop(0, len(A) // b, block, (jnp.zeros_like(A), jnp.zeros_like(A)))
+    return L[:n, :n], W[:n, :n]
 
 
 def _factored_by_columns(A: Float[Array, "n n"]) -> tuple[Array, Array]:

@@ -54,6 +54,7 @@ PACKAGES = ("jax", "jaxlib", "equinox", "jaxlie", "numpy")
 functions is not kept, as they may change without notice."""
 
 T = TypeVar("T")
+_PLAIN = frozenset((bool, int, str, bytes, type(None), type, FunctionType))
 _kept_in: Path | None = None
 
 
@@ -170,9 +171,10 @@ class _Call(NamedTuple):
     @classmethod
     def of(cls, args: tuple[Any, ...]) -> _Call:
         leaves, structure = jax.tree.flatten(args)
-        kinds = tuple((x.shape, x.dtype.name) if _is_array(x) else x for x in leaves)
-        key = structure, tuple(map(_is_array, leaves)), kinds, wide()
-        return cls([x for x in leaves if _is_array(x)], key)
+        are_arrays = tuple(map(_is_array, leaves))
+        both = list(zip(leaves, are_arrays, strict=True))
+        kinds = tuple((x.shape, x.dtype.name) if is_array else x for x, is_array in both)
+        return cls([x for x, is_array in both if is_array], (structure, are_arrays, kinds, wide()))
 
     def arguments(self, arrays: list[Any]) -> tuple[Any, ...]:
         """Return the arguments, with these arrays in place of the call's own."""
@@ -190,23 +192,27 @@ def exactly(value: Any) -> Any:
     is compared so too.
     """
     kind = type(value)
-    if isinstance(value, jax.tree_util.PyTreeDef):
+    if kind in _PLAIN:
+        return kind, value
+    if kind is tuple:
+        return kind, tuple(map(exactly, value))
+    if kind is jax.tree_util.PyTreeDef:
         return kind, exactly(value.node_data()), tuple(map(exactly, value.children()))
-    if isinstance(value, float | complex):
+    if isinstance(value, (float, complex)):
         return kind, np.asarray(value, complex).tobytes()
-    if isinstance(value, np.generic | np.ndarray):
+    if isinstance(value, (np.generic, np.ndarray)):
         return kind, value.dtype, value.shape, value.tobytes()
     if isinstance(value, dict):
         return kind, tuple((exactly(k), exactly(x)) for k, x in value.items())
     if isinstance(value, frozenset):
         return kind, frozenset(map(exactly, value))
-    if isinstance(value, tuple | list):
+    if isinstance(value, (tuple, list)):
         return kind, tuple(map(exactly, value))
     if isinstance(value, partial):
         return kind, exactly((value.func, value.args, value.keywords))
     if isinstance(value, MethodType):
         return kind, value.__func__, exactly(value.__self__)
-    if kind.__eq__ is object.__eq__ or isinstance(value, type | FunctionType):
+    if kind.__eq__ is object.__eq__ or isinstance(value, (type, FunctionType)):
         return value
     if is_dataclass(value):
         return kind, tuple(exactly(getattr(value, f.name, None)) for f in fields(value))

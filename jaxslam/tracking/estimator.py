@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from jaxslam._numerics.arrays import cast
 from jaxslam._runtime.programs import Program, in_background
@@ -39,7 +40,7 @@ from jaxslam.models.observations import Features, Status
 from jaxslam.models.sensors import Pinhole
 from jaxslam.tracking.matching import PEAKS, Matches
 from jaxslam.tracking.observations import NOTHING, Observations, Prediction
-from jaxslam.tracking.places.submaps import left
+from jaxslam.tracking.places.submaps import compile_graph, in_submaps, left
 from jaxslam.tracking.settings import TrackerSettings
 
 _NOWHERE = np.zeros(0, int), np.zeros((0, 2))
@@ -51,7 +52,7 @@ Report = tuple[jax.Array, ...]
 class Predicted(NamedTuple):
     """A state of the filter before a frame's measurements, and what it expects of them."""
 
-    dt: jax.Array
+    dt: Float[np.ndarray, ""]
     """Since the frame before, s."""
     state: Belief
     gaussian: Belief
@@ -107,11 +108,11 @@ class Estimator:
         """Begin with a map without landmarks."""
         self.state = _empty(self.slam, self.settings.capacity)
 
-    def predict(self, seconds: float | jax.Array) -> Predicted:
+    def predict(self, seconds: float | np.ndarray) -> Predicted:
         """Return what the filter expects so many seconds after the frame before. Changes
         nothing."""
         # A number of Python's would be compiled into the program.
-        dt = jnp.asarray(seconds)
+        dt = np.asarray(seconds)
         (state, gaussian), joint, view = _predict(self.slam, self.state, dt)
         joint, view = jax.device_get((joint, view))
         return Predicted(dt, state, gaussian, joint, Prediction(*view))
@@ -156,7 +157,7 @@ class Estimator:
     def nis(self, predicted: Predicted, seen: Observations) -> tuple[float, int]:
         """Return the NIS `rᵀ S⁻¹ r` of what was seen, all together, and its degrees of freedom."""
         S, residual = self._innovations(predicted, seen)
-        return float(residual @ np.linalg.solve(S, residual)), len(residual)
+        return float(residual @ _solve(S, residual)), len(residual)
 
     def given(self, predicted: Predicted, seen: Observations) -> Prediction:
         """Return what the filter expects of the frame given that it shows what was seen, to first
@@ -165,7 +166,7 @@ class Estimator:
         S = predicted.joint.reshape(n * p, n * p)
         known = (p * seen.slots[:, None] + np.arange(p)).ravel()
         of_known, residual = self._innovations(predicted, seen)
-        gain = np.linalg.solve(of_known, S[known]).T
+        gain = _solve(of_known, S[known]).T
         # The noise of a pixel that is known is no part of what else is to be expected there.
         moved = (gain @ residual).reshape(n, p)
         left = np.einsum("npk,nqk->npq", gain.reshape(n, p, -1), S[:, known].reshape(n, p, -1))
@@ -194,8 +195,8 @@ class Estimator:
     ) -> Predicted:
         """Return what the filter expects of a camera that is at T from its latest one, in its own
         unit, known with this σ: it has moved there within so many seconds. Changes the state."""
-        dt = jnp.asarray(seconds)
-        self.state = _moving(self.slam, self.state, jnp.asarray(T), jnp.asarray(sigma), dt)
+        dt = np.asarray(seconds)
+        self.state = _moving(self.slam, self.state, T, sigma, dt)
         return self.predict(dt)
 
     def at_rest(self) -> None:
@@ -222,7 +223,7 @@ class Estimator:
     def remove(self, slots: list[int]) -> None:
         """Marginalise the landmarks in these slots."""
         gone = np.isin(np.arange(self.settings.capacity), slots)
-        self.state = _remove(self.slam, self.state, jnp.asarray(gone))
+        self.state = _remove(self.slam, self.state, gone)
 
     def points(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
         """Landmarks with their covariances, in the filter's own unit, from where the map begins."""
@@ -239,9 +240,9 @@ class Estimator:
 
     def compile(self, wide: list[Association]) -> list[threading.Thread]:
         """Start two threads that compile all programs in the order in which they are needed."""
-        slam, state, dt = self.slam, self.state, jnp.zeros(())
+        slam, state, dt = self.slam, self.state, np.zeros(())
         new = _padded(*_NOWHERE, self.settings.wanted)
-        gone = jnp.zeros(self.settings.capacity, bool)
+        gone = np.zeros(self.settings.capacity, bool)
 
         def predicted() -> Predicted:
             (ahead, gaussian), joint, view = _predict.compile(slam, state, dt)
@@ -255,17 +256,21 @@ class Estimator:
             if several:
                 _curved.compile(slam, *predicted()[1:3], dt)
 
+        graph = [compile_graph(slam, state, self.settings)] if in_submaps(slam) else []
         return [
             in_background(
                 lambda: _begin_map.compile(slam, state, new),
-                *(partial(believed, one) for one in (*wide, None)),
                 lambda: _renew_map.compile(slam, state, new),
                 self.camera,
+                *graph,
             ),
             in_background(
                 lambda: _correct.compile(slam, predicted().state, dt, _measured(new, np.zeros(0))),
+                *(partial(believed, one) for one in (*wide, None)),
                 lambda: _world_points.compile(slam, state, self.settings.capacity),
                 lambda: _remove.compile(slam, state, gone),
+                lambda: _moving.compile(slam, state, np.eye(4), np.zeros(6), dt),
+                lambda: _at_rest.compile(slam, state),
             ),
         ]
 
@@ -311,20 +316,27 @@ class Estimator:
         return CameraReport(*jax.device_get(report))
 
 
+def _solve(S: Float[np.ndarray, "m m"], b: Float[np.ndarray, "m ..."]) -> np.ndarray:
+    """S⁻¹ b of a covariance. LAPACK's general solver takes threads from a hundred rows on, and on a
+    busy machine those wait for one another: 50 ms in place of .1."""
+    try:
+        return cho_solve(cho_factor(S, lower=True, check_finite=False), b, check_finite=False)
+    except LinAlgError:
+        return np.linalg.solve(S, b)
+
+
 def _padded(slots: Int[np.ndarray, " k"], pixels: Float[np.ndarray, "k 2"], size: int) -> Features:
     """Features of fixed number; NaN pixels and padding are not valid."""
     missing = size - len(slots)
     valid = np.pad(np.isfinite(pixels).all(axis=1), (0, missing))
     pixels = np.pad(np.nan_to_num(pixels), ((0, missing), (0, 0)))
-    return Features(
-        jnp.asarray(np.pad(slots, (0, missing))), jnp.asarray(pixels), jnp.asarray(valid)
-    )
+    return Features(np.pad(slots, (0, missing)), pixels, valid)
 
 
 def _measured(features: Features, factors: Float[np.ndarray, " k"]) -> Features:
     """The features with these factors of their noise."""
     missing = len(features.slots) - len(factors)
-    more = jnp.asarray(np.pad(factors, (0, missing), constant_values=1.0))
+    more = np.pad(factors, (0, missing), constant_values=1.0)
     return replace(features, noise_factor=more)
 
 

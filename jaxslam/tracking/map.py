@@ -8,13 +8,21 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from jaxslam._runtime.programs import in_background
 from jaxslam.filters.protocol import AbstractStaged, Belief
 from jaxslam.tracking.estimator import Estimator, Predicted
 from jaxslam.tracking.landmarks import Landmark, Points, joined
 from jaxslam.tracking.observations import Observations
 from jaxslam.tracking.patches import Patch
 from jaxslam.tracking.places.descriptors import note_looks
-from jaxslam.tracking.places.submaps import Compared, Graph, LoopClosure, Submap, handed_over
+from jaxslam.tracking.places.submaps import (
+    Compared,
+    Graph,
+    LoopClosure,
+    Submap,
+    compile_graph,
+    handed_over,
+)
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.unit import MapInWorld, Nearness, nearness
 
@@ -149,8 +157,9 @@ class Map:
         self._begin_submap()
         self.earlier = (*self.earlier, self.now())
         self.charted |= {one.number: replace(one) for one in self.landmarks.values()}
-        if len(self.submaps) == 1:
-            self.now().graph(self.settings, estimator.slam).compile()
+        count = len(self.submaps)
+        soon = min(count + count // 3 + 2, MOST)
+        in_background(compile_graph(estimator.slam, state, self.settings, soon))
 
     def learn(self, loop: LoopClosure, compared: Compared) -> None:
         """Take over what a loop says, that ends at the camera."""

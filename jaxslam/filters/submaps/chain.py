@@ -151,28 +151,36 @@ def chain(slam: Submaps, state: SubmapsState, count: int) -> Chain:
 
 def chained(slam: EkfSlam, frozen: Frozen, there: Bool[Array, " N"]) -> Chain:
     """Return submaps as a chain, the oldest first, of which the first may be none (`there`)."""
-    nowhere = KeyframePose.at(identity(slam.motion.geometry, frozen.state.landmarks.dtype))
-
-    def link(frozen: Frozen, there: Bool[Array, ""], newest: Bool[Array, ""], first):
-        state = frozen.state
-        known = there & state.numbers(state.active)
-        state = replace(
-            state,
-            core=replace(
-                state.core,
-                pose=jax.tree.map(partial(jnp.where, there), state.core.pose, nowhere),
-            ),
-            active=state.active & there,
-            covariance=jnp.where(known[:, None] & known, state.covariance, 0.0),
-        )
-        separator = _separator(slam, frozen) & known & ~newest
-        order = jnp.argsort(~separator, stable=True)
-        factor = semidefinite_root(state.covariance[order][:, order])
-        return Link(state, frozen.numbers, first, order, ~separator[order], *factor)
-
     N = len(there)
     newest, first = jnp.arange(N) == N - 1, there & (jnp.cumsum(there) == 1)
-    return Chain(slam, jax.vmap(link)(frozen, there, newest, first))
+    return Chain(slam, jax.vmap(partial(link, slam))(frozen, there, newest, first))
+
+
+def link(
+    slam: EkfSlam,
+    frozen: Frozen,
+    there: Bool[Array, ""],
+    newest: Bool[Array, ""],
+    first: Bool[Array, ""],
+) -> Link:
+    """Return a submap as a link of a chain, which may stand for none, be the one that goes on, and
+    be the first."""
+    nowhere = KeyframePose.at(identity(slam.motion.geometry, frozen.state.landmarks.dtype))
+    state = frozen.state
+    known = there & state.numbers(state.active)
+    state = replace(
+        state,
+        core=replace(
+            state.core,
+            pose=jax.tree.map(partial(jnp.where, there), state.core.pose, nowhere),
+        ),
+        active=state.active & there,
+        covariance=jnp.where(known[:, None] & known, state.covariance, 0.0),
+    )
+    separator = _separator(slam, frozen) & known & ~newest
+    order = jnp.argsort(~separator, stable=True)
+    factor = semidefinite_root(state.covariance[order][:, order])
+    return Link(state, frozen.numbers, first, order, ~separator[order], *factor)
 
 
 def _separator(slam: EkfSlam, frozen: Frozen) -> Bool[Array, " n"]:

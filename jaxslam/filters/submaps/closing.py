@@ -116,24 +116,27 @@ def posterior(
 ) -> Posterior:
     """Return the chain in which a residual of all states is zero, but for an error of this σ."""
 
-    def linear(y: Float[Array, "N n"]):
+    def linear(y: Float[Array, "N n"]) -> tuple[Array, tuple[State, Array, Cholesky]]:
         states = chain.at(y)
         value, rows = chain.linearised(residual, states)
         J = rows.reshape(len(value), y.size)
-        return states, value, rows, J, cholesky(J @ J.T + sigma**2 * jnp.eye(len(value)))
+        factor = cholesky(J @ J.T + sigma**2 * jnp.eye(len(value)))
+        new = -(J.T @ factor.solve(value - J @ y.ravel())).reshape(y.shape)
+        return new, (states, rows, factor)
 
     def step(carry):
-        y, _, count = carry
-        _, value, _, J, factor = linear(y)
-        new = -(J.T @ factor.solve(value - J @ y.ravel())).reshape(y.shape)
-        return new, jnp.any(jnp.abs(new - y) > SMALLEST), count + 1
+        y, _, _, count = carry
+        new, at = linear(y)
+        return new, at, jnp.any(jnp.abs(new - y) > SMALLEST), count + 1
 
     def going_on(carry):
-        return carry[1] & (carry[2] < STEPS)
+        *_, moved, count = carry
+        return moved & (count < STEPS)
 
     zero = jnp.zeros(chain.shape, chain.links.root.dtype)
-    y, moved, _ = jax.lax.while_loop(going_on, step, (zero, jnp.asarray(True), 0))
-    states, _, rows, _, factor = linear(y)
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(linear, zero)[1])
+    start = zero, nothing, jnp.asarray(True), 0
+    _, (states, rows, factor), moved, _ = jax.lax.while_loop(going_on, step, start)
     return Posterior(chain, states, rows, factor, ~moved)
 
 

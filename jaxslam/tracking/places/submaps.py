@@ -7,8 +7,8 @@ the next submap says nothing of.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -20,17 +20,18 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam._numerics.linalg import cholesky
-from jaxslam._runtime.programs import Program, in_background
+from jaxslam._runtime.programs import Program
 from jaxslam.filters.ekf import EkfSlam, each_gaussian, ekf_inside, rebased
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.model import COMPOSED, CameraInMap
 from jaxslam.filters.protocol import AbstractStaged, Belief, LandmarkView
-from jaxslam.filters.submaps.chain import Chain, base_poses, chained
+from jaxslam.filters.submaps.chain import Chain, Link, base_poses, link
 from jaxslam.filters.submaps.closing import Posterior, posterior
 from jaxslam.filters.submaps.handover import PARALLAX, TURN, Frozen
 from jaxslam.geometry import difference, retract
 from jaxslam.models.coordinates import SUBMAP, KeyframePose, keyframe_due
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
+from jaxslam.tracking.settings import TrackerSettings
 
 SUPPOSED = 2
 """Loops that are as expected, before there is any."""
@@ -52,6 +53,19 @@ class Submap:
     """Its last camera in the world, as it was reported."""
     number: int
     """Its number among those of all maps."""
+    links: dict[tuple[object, ...], Link] = field(default_factory=dict, repr=False, compare=False)
+    """What it is in a chain, by what that depends on: the latest."""
+
+    def link(self, slam: EkfSlam, after: Int[np.ndarray, " slots"] | None, *, first: bool) -> Link:
+        """Return what it is in a chain, in which these are the numbers of the submap `after` it."""
+        key = (None if after is None else after.tobytes(), first)
+        if key not in self.links:
+            # A landmark goes on that is still there when the next submap ends.
+            same = False if after is None else self.numbers == after
+            frozen = replace(self.frozen, carried=np.asarray(self.frozen.carried) & same)
+            self.links.clear()
+            self.links[key] = _linked(slam, frozen, *map(np.asarray, (True, after is None, first)))
+        return self.links[key]
 
     @property
     def numbers(self) -> Int[np.ndarray, " slots"]:
@@ -121,8 +135,9 @@ def handed_over(
 ) -> tuple[Submap, Belief]:
     """The submap of this number that ends at this camera in the world, and the state of the next
     one; `numbers` are those of the landmarks in the slots, −1 for none."""
-    (frozen, *landmarks), state = _handed_over(slam, state, jnp.asarray(numbers))
-    return Submap(frozen, *jax.device_get(landmarks), camera, number), state
+    (frozen, *landmarks), state = _handed_over(slam, state, numbers)
+    points, covariances = jax.device_get(landmarks)
+    return Submap(frozen, points, covariances, camera, number), state
 
 
 def shapes(slam: AbstractStaged, state: Belief, capacity: int) -> PyTree:
@@ -193,44 +208,50 @@ class Graph:
         T_bc, P, points = (np.asarray(x)[more:] for x in _solved(known))
         return Solved(T_bc, _factor([one.nis for one in self.loops]) * P, points)
 
-    def compile(self) -> None:
-        """Compile what a graph of this size needs, aside."""
-        links, loops, _ = self._padded()
-        nothing = jax.tree.map(lambda x: x[0], loops)
-
-        def known() -> PyTree:
-            return _unlooped.compile(_chained.compile(*links))
-
-        in_background(
-            lambda: _solved.compile(known()),
-            lambda: _compared.compile(known(), nothing),
-            lambda: _given.compile(_chained.compile(*links), loops),
-        )
-
     def _known(self) -> tuple[Posterior, int]:
         """The chain given its loops, and how many submaps are in front that are none."""
-        links, loops, more = self._padded()
-        chain = _chained(*links)
+        chain, loops, more = self._padded()
         return (_given(chain, loops) if self.loops else _unlooped(chain)), more
 
-    def _padded(self) -> tuple[tuple[EkfSlam, Frozen, Array], LoopClosure, int]:
-        """What the chain of all submaps is made of, with some in front that are none; its loops,
-        with some behind them that say nothing; and how many are in front. Sizes are few, since each
-        has programs of its own."""
-        ended, last = [one.frozen for one in self.submaps], self.present.frozen
-        # A landmark goes on that is still there when the next submap ends.
+    def _padded(self) -> tuple[Chain, LoopClosure, int]:
+        """The chain of all submaps, with some in front that are none; its loops, with some behind
+        them that say nothing; and how many are in front. Sizes are few, since each has programs of
+        its own."""
+        slam, ended, last = ekf_inside(self.slam, "submaps are"), self.submaps, self.present
         later = [one.numbers for one in (*ended, last)[1:]]
-        ended = [
-            replace(one, carried=jnp.asarray(one.carried & (one.numbers == after)))
-            for one, after in zip(ended, later, strict=True)
+        links = [
+            one.link(slam, after, first=i == 0)
+            for i, (one, after) in enumerate(zip(ended, later, strict=True))
         ]
+        links.append(last.link(slam, None, first=not ended))
         more = _size(len(ended)) - len(ended)
-        there = jnp.arange(more + len(ended) + 1) >= more
-        frozen = _stacked([*[last] * more, *ended, last])
-        nothing = no_loop(self.most, last.state.landmarks.shape[1], len(there) - 1)
+        none = _linked(slam, last.frozen, *map(np.asarray, (False, False, False)))
         loops = [replace(one, submaps=one.submaps + more) for one in self.loops]
+        nothing = no_loop(self.most, last.frozen.state.landmarks.shape[1], more + len(ended))
         loops += [nothing] * (_size(len(loops)) - len(loops))
-        return (ekf_inside(self.slam, "submaps are"), frozen, there), _stacked(loops), more
+        return Chain(slam, _stacked([*[none] * more, *links])), _stacked(loops), more
+
+
+def compile_graph(
+    slam: AbstractStaged, state: Belief, settings: TrackerSettings, submaps: int = 1
+) -> Callable[[], None]:
+    """What compiles all that a graph of so many submaps needs."""
+    ekf, flag = ekf_inside(slam, "submaps are"), np.asarray(False)
+
+    def several(tree: PyTree, count: int) -> PyTree:
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape), x.dtype), tree)
+
+    def compile() -> None:
+        (frozen, *_), _ = _handed_over.compile(slam, state, np.zeros(settings.capacity, int))
+        link = _linked.compile(ekf, frozen, flag, flag, flag)
+        chain = Chain(ekf, several(link, _size(submaps) + 1))
+        nothing = no_loop(settings.wanted, frozen.state.landmarks.shape[1])
+        known = _unlooped.compile(chain)
+        _solved.compile(known)
+        _compared.compile(known, nothing)
+        _given.compile(chain, several(nothing, _size(0)))
+
+    return compile
 
 
 def _factor(nis: Sequence[AnyArray]) -> float:
@@ -247,7 +268,7 @@ def _size(count: int) -> int:
 
 
 def _stacked(trees: Sequence[PyTree]) -> PyTree:
-    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *trees)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
 def no_loop(most: int, d: int, submap: int = 0) -> LoopClosure:
@@ -278,8 +299,8 @@ def _handed_over(
 
 
 @Program
-def _chained(ekf: EkfSlam, frozen: Frozen, there: Bool[Array, " N"]) -> Chain:
-    return chained(ekf, frozen, there)
+def _linked(ekf: EkfSlam, frozen: Frozen, there: Array, newest: Array, first: Array) -> Link:
+    return link(ekf, frozen, there, newest, first)
 
 
 @Program
