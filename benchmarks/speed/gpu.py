@@ -453,13 +453,9 @@ def shown(results: dict[str, Any]) -> str:
         ),
         *studies_shown(results),
     ]
-    left = [*results["left_out"], *(
-        f"{name}, {int(runs):,} runs: {row}"
-        for name, of in columns
-        for runs, row in of.get("device", {}).items()
-        if isinstance(row, str)
-    )]  # fmt: skip
-    if left:
+    if any(isinstance(row, str) for _, of in columns for row in of.get("device", {}).values()):
+        parts.append("A dash stands where a batch needs more memory, or time, than there is.")
+    if left := results["left_out"]:
         parts.append("\n".join(["Left out:", "", *(f"- {why}" for why in left)]))
     return "\n\n".join(parts)
 
@@ -474,16 +470,18 @@ def answer(results: dict[str, Any]) -> str:
             continue
         runs = min(rows, key=lambda n: rows[n]["microseconds_per_step"])
         fastest = rows[runs]["microseconds_per_step"]
-        there = {"XLA": of["processors"]["xla"], "native": of["processors"].get("native")}
+        there = {
+            "XLA": of["processors"]["xla"],
+            "the native backend": of["processors"].get("native"),
+        }
         times = " and ".join(
             f"{x / fastest:.2g} times as long by {k}" for k, x in there.items() if x
         )
         said.append(
-            f"In float64 {name} takes {fastest:.3g} µs a step of a run in batches of {runs:,}; all "
-            f"processors take {times}."
+            f"{name} takes {fastest:.3g} µs a step of a run in batches of {runs:,} in float64; all "
+            f"{results['processors']} processors beside it take {times}."
         )
-    where = f"{results['device']} and {results['processors']} processors ({results['processor']})"
-    return " ".join([*said, f"Measured on {where}, JAX {results['jax']}."])
+    return " ".join([*said, f"Measured on an {results['device']}, JAX {results['jax']}."])
 
 
 def filter_rows(results: dict[str, Any], columns: list[tuple[str, Any]]) -> Iterator[list[str]]:
@@ -492,18 +490,16 @@ def filter_rows(results: dict[str, Any], columns: list[tuple[str, Any]]) -> Iter
         name = f"{results['processors']} processors, {'XLA' if key == 'xla' else key}"
         yield [name, *(digits(of.get("processors", {}).get(key)) for _, of in columns)]
     sizes = sorted({int(n) for _, of in columns for n in of.get("device", {})})
-    for what, key in (
-        ("{:,} runs at once", "microseconds_per_step"),
-        ("compilation for {:,}, s", "compile_seconds"),
-        ("KiB a run of {:,}", "bytes_per_run"),
-        ("difference from the CPU, {:,} runs", "largest_difference"),
-    ):
-        for runs in sizes if key != "bytes_per_run" else sizes[:1]:
-            rows = [of.get("device", {}).get(str(runs)) for _, of in columns]
-            found = [row[key] if isinstance(row, dict) else None for row in rows]
-            if key == "bytes_per_run":
-                found = [x and x / 1024 for x in found]
-            yield [what.format(runs), *map(digits, found)]
+
+    def row(what: str, key: str, runs: int) -> list[str]:
+        rows = [of.get("device", {}).get(str(runs)) for _, of in columns]
+        return [what, *(digits(row[key] if isinstance(row, dict) else None) for row in rows)]
+
+    for runs in sizes:
+        yield row(f"{runs:,} runs at once", "microseconds_per_step", runs)
+    for runs in sizes[:1]:
+        yield row(f"compilation for {runs:,}, s", "compile_seconds", runs)
+        yield row("largest difference from the CPU", "largest_difference", runs)
 
 
 def studies_shown(results: dict[str, Any]) -> Iterator[str]:
@@ -533,12 +529,13 @@ def studies_shown(results: dict[str, Any]) -> Iterator[str]:
             f"times as long as `robocentric`."
         )
     if of := results.get("float32_beside_float64"):
-        whole, short = of["whole_products"], of["short_products"]
+        both = of["whole_products"], of["short_products"]
+        off, off_short = (f"{100 * one['largest_difference']:.2g} %" for one in both)
+        mean, mean_short = (f"{one['mean_nees']:.4g}" for one in both)
         yield (
-            f"The mean NEES of the first workload is {of['mean_nees']:.4g} in float64, "
-            f"{whole['mean_nees']:.4g} in float32, and {short['mean_nees']:.4g} with the products "
-            f"that JAX takes on a GPU unasked. {short['nees_of_no_covariance']} NEES are "
-            f"then of no covariance, and {whole['nees_of_no_covariance']} with whole products."
+            f"In float32 the NEES of single steps differ by up to {off} from those in float64, and "
+            f"by {off_short} with the products that JAX takes on a GPU unasked; their mean is "
+            f"{of['mean_nees']:.4g} in float64, {mean} and {mean_short}."
         )
 
 

@@ -21,7 +21,7 @@ from jaxslam._numerics.arrays import AnyArray
 LEAF = 32
 """Rows of what is factored column by column; of more, the halves are, and joined by products."""
 LARGE = 256
-"""Rows from which on the blocks are in a loop: more arithmetic, and a program that does not grow."""
+"""Rows from which on blocks are in a loop: more arithmetic, and a program that does not grow."""
 UNROLLED = 4
 """Rows up to which the loops over them are written out."""
 SWEEPS = 10

@@ -56,10 +56,10 @@ class Frozen(eqx.Module):
 
     state: State
     """Landmarks are in the last camera of the submap, which is the next one's base K."""
-    carried: Bool[Array, " slots"]
+    carried: Bool[AnyArray, " slots"]
     """The landmarks that the next submap begins with: with the motion's variables and all that is
     constant of the core they are the separator."""
-    numbers: Int[Array, " slots"]
+    numbers: Int[AnyArray, " slots"]
     """Which landmark is in each slot, counted from 0 as they came; −1 where none is."""
 
 
