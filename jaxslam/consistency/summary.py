@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
 from jaxslam._runtime.files import json_numbers
+from jaxslam._runtime.lookup import suggestion
 from jaxslam.consistency.store import Records, Store
 from jaxslam.consistency.sums import (
     RECORDS,
@@ -91,6 +92,11 @@ class Study:
     def summary(self) -> Summary:
         """Return `summarise(study)`, the content of `consistency.json`."""
         return summarise(self)
+
+    def __getattr__(self, name: str) -> NoReturn:
+        drawn = " (jaxslam.plots.plot_consistency(study) draws it)"
+        meant = drawn if name.startswith("plot") else suggestion(name, dir(type(self)))
+        raise AttributeError(f"a Study has no attribute {name!r}{meant}")
 
 
 def as_summary(given: Study | Summary) -> Summary:

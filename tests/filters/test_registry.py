@@ -101,3 +101,7 @@ def test_a_study_prints_as_its_table():
     summary = summarise(study)
     assert str(study) == repr(study) == table(summary)
     assert study.summary() == summary
+    with pytest.raises(AttributeError, match=r"'plot' \(jaxslam\.plots\.plot_consistency\(study\)"):
+        study.plot()
+    with pytest.raises(AttributeError, match=r"no attribute 'summarry' \(did you mean summary\?\)"):
+        study.summarry()

@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.arrays import AnyArray
-from jaxslam._numerics.linalg import cholesky
 from jaxslam._runtime.programs import Program
 from jaxslam.filters.ekf import EkfSlam, each_gaussian, ekf_inside, rebased
 from jaxslam.filters.forms.state import State
@@ -211,7 +210,7 @@ class Graph:
     def _known(self) -> tuple[Posterior, int]:
         """The chain given its loops, and how many submaps are in front that are none."""
         chain, loops, more = self._padded()
-        return (_given(chain, loops) if self.loops else _unlooped(chain)), more
+        return _given(chain, loops), more
 
     def _padded(self) -> tuple[Chain, LoopClosure, int]:
         """The chain of all submaps, with some in front that are none; its loops, with some behind
@@ -246,10 +245,9 @@ def compile_graph(
         link = _linked.compile(ekf, frozen, flag, flag, flag)
         chain = Chain(ekf, several(link, _size(submaps) + 1))
         nothing = no_loop(settings.wanted, frozen.state.landmarks.shape[1])
-        known = _unlooped.compile(chain)
+        known = _given.compile(chain, several(nothing, _size(0)))
         _solved.compile(known)
         _compared.compile(known, nothing)
-        _given.compile(chain, several(nothing, _size(0)))
 
     return compile
 
@@ -327,15 +325,6 @@ def _error(chain: Chain, loop: LoopClosure, states: State) -> Float[Array, " 6"]
     moved = difference(T_BP.inverse() @ T_BQ, jaxlie.SE3.from_matrix(loop.T))
     X = states.landmarks[loop.submaps[0], loop.slots]
     return loop.by_pose @ moved + jnp.tensordot(loop.by_landmarks, X - loop.landmarks, 2)
-
-
-@Program
-def _unlooped(chain: Chain) -> Posterior:
-    """As `_given` has it of a chain without loops."""
-    count = 6 * LEAST
-    nothing = jnp.zeros((count, *chain.shape))
-    states, alone = chain.at(nothing[0]), cholesky(jnp.eye(count))
-    return Posterior(chain, states, nothing, alone, jnp.ones((), bool))
 
 
 @Program
