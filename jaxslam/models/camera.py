@@ -80,25 +80,37 @@ def distort(ideal: Pixel, distortion: Float[AnyArray, " 5"] | None) -> Pixel:
     """OpenCV's radial-tangential model on normalised coordinates (x/z, y/z)."""
     if distortion is None:
         return ideal
-    k1, k2, p1, p2, k3 = distortion
-    x, y = ideal
-    r2 = x * x + y * y
+    k1, k2, k3 = distortion[0], distortion[1], distortion[4]
+    swapped = distortion[3:1:-1]  # (p2, p1)
+    r2 = ideal @ ideal
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    tangential = jnp.stack(
-        [2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y]
-    )
-    return ideal * radial + tangential
+    return ideal * (radial + 2 * swapped @ ideal) + r2 * swapped
 
 
 def undistort(distorted: Pixel, distortion: Float[AnyArray, " 5"] | None) -> Pixel:
     """Inverse of `distort` by Newton's method; meaningless beyond the image that the model maps."""
-    if distortion is None:
-        return distorted
+    return distorted if distortion is None else _undistorted(distorted, distortion)
 
+
+@jax.custom_jvp
+def _undistorted(distorted: Pixel, distortion: Float[AnyArray, " 5"]) -> Pixel:
     def step(ideal, _):
-        error = distort(ideal, distortion) - distorted
-        (a, b), (c, d) = jax.jacfwd(distort)(ideal, distortion)
-        correction = jnp.stack([d * error[0] - b * error[1], a * error[1] - c * error[0]])
-        return ideal - correction / (a * d - b * c), None
+        return ideal - _undone(ideal, distortion, distort(ideal, distortion) - distorted), None
 
     return jax.lax.scan(step, distorted, length=UNDISTORT_ITERATIONS)[0]
+
+
+@_undistorted.defjvp
+def _(primals, tangents):
+    """Of an implicit function: its own Newton step, not the derivatives of all."""
+    (_, distortion), (moved, by_distortion) = primals, tangents
+    ideal = _undistorted(*primals)
+    _, lens = jax.jvp(lambda d: distort(ideal, d), (distortion,), (by_distortion,))
+    return ideal, _undone(ideal, distortion, moved - lens)
+
+
+def _undone(ideal: Pixel, distortion: Float[AnyArray, " 5"], change: Pixel) -> Pixel:
+    """By how much the ideal pixel changes where the distorted one does so: J⁻¹ of the change."""
+    (a, b), (c, d) = jax.jacfwd(distort)(ideal, distortion)
+    by = jnp.stack([d * change[0] - b * change[1], a * change[1] - c * change[0]])
+    return by / (a * d - b * c)
