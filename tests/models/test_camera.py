@@ -49,6 +49,26 @@ def test_bearing_is_the_inverse_of_project_over_the_whole_picture(camera):
     np.testing.assert_allclose(again, pixels, rtol=0, atol=1e-6)
 
 
+@each_camera
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_the_derivatives_of_bearing_are_those_of_central_differences(camera, mode):
+    pixel = jnp.array([120.0, 400.0])
+
+    def of_pixel(pixel):
+        return bearing(camera, pixel)
+
+    np.testing.assert_allclose(mode(of_pixel)(pixel), central(of_pixel, pixel, 1e-5), atol=1e-11)
+    twice = jax.jacfwd(jax.jacfwd(of_pixel))(pixel)
+    np.testing.assert_allclose(twice, central(jax.jacfwd(of_pixel), pixel, 1e-5), atol=1e-12)
+    if camera.distortion is not None:
+
+        def of_lens(distortion):
+            return bearing(Camera(camera.focal, camera.centre, distortion), pixel)
+
+        lens = jnp.asarray(camera.distortion)
+        np.testing.assert_allclose(mode(of_lens)(lens), central(of_lens, lens, 1e-5), atol=1e-9)
+
+
 def test_planar_camera_is_the_spatial_one_with_y_zero():
     camera = Camera(jnp.array([650.0, 600.0]), jnp.array([320.0, 240.0]))
     for x, z in [(0.3, 2.0), (-1.0, 1.5), (0.0, 7.0)]:
