@@ -161,7 +161,7 @@ class BatchInitialisation(AbstractWrapper):
         def solved(state, record):
             x = state.modes.minima.x
             modes = replace(state.modes, minima=replace(state.modes.minima, x=x[:, :size]))
-            due = self._due(record, range(least, frames))
+            due = self._due(record, range(least, frames), self._moved(state, MOVED))
             modes, explained = sought(ekf, record, modes, REFINEMENTS, due)
             like = state.sum.likeliest
             members = _members(ekf, record, modes, state.sum.members, like)
@@ -173,15 +173,19 @@ class BatchInitialisation(AbstractWrapper):
 
         return cond(wanted, solved, state, record)
 
-    def _due(self, record: Record, newest: range) -> Bool[Array, " starts"] | None:
+    def _due(
+        self, record: Record, newest: range, moved: Bool[Array, ""]
+    ) -> Bool[Array, " starts"] | None:
         """The starts from which minima are sought after this frame; None where there are none
-        after any that can be the newest one."""
+        after any that can be the newest one. Of a camera that has `moved` the reversal is always
+        one of those in turn: the window is about to end, and nothing is as like the truth."""
         name = self.ekf.motion.geometry.name
         searches, together = [k for k in SEARCHES[name] if k in newest], IN_TURN[name]
         if not searches and not together:
             return None
         count, steps = 2 + self.directions, record.steps.astype(int) - 4
         turn = (jnp.arange(count) - 1 - together * steps) % count < together
+        turn |= (jnp.arange(count) == 1) & moved & bool(together)
         whole = jnp.any(record.last == jnp.array(searches, int))
         return (whole | turn) & ~record.standing
 
@@ -192,18 +196,20 @@ class BatchInitialisation(AbstractWrapper):
     def _ready(self, state: RestState) -> Bool[Array, ""]:
         """Whether one mode is left whose translation is known; or, where there is no room, whether
         there is a translation, or its landmarks leave the view."""
+        enough = state.record.steps >= LEAST_STEPS
+        alone = state.sum.log_weights[0] > -1e-3
+        over = self._moved(state, MOVED) | ~state.record.tied
+        return (enough & alone & self._moved(state, KNOWN)) | (state.record.full & over)
+
+    def _moved(self, state: RestState, share: float) -> Bool[Array, ""]:
+        """Whether the σ of the translation is less than such a share of it."""
         ekf, member = self.ekf, state.sum.likeliest
         part = member.core.part("pose")
         n = ekf.motion.geometry.point_dim
         position = slice(part.start, part.start + n)
         variance = jnp.trace(member.covariance[position, position])
         squared = jnp.sum(ekf.model.camera_pose(member.core).translation() ** 2)
-        known = variance < KNOWN**2 * squared
-        enough = state.record.steps >= LEAST_STEPS
-        alone = state.sum.log_weights[0] > -1e-3
-        moved = variance < MOVED**2 * squared
-        over = moved | ~state.record.tied
-        return (enough & alone & known) | (state.record.full & over)
+        return variance < share**2 * squared
 
 
 def _likely(members: SumState, now: Bool[Array, ""]) -> SumState:
