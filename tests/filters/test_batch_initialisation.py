@@ -326,14 +326,14 @@ def test_measurements_that_nothing_explains_leave_the_sum_to_itself():
     np.testing.assert_array_equal(state.modes.minima.x, before.modes.minima.x)
 
 
-def due(slam, last, standing=False, steps=None, newest=range(1, 9)):
+def due(slam, last, standing=False, steps=None, newest=range(1, 9), moved=False):
     """From which starts is sought after frame `last`, `steps` frames since the first."""
     frames = newest.stop
     merged = jnp.ones(frames - 1).at[0].add((last if steps is None else steps) - last)
     record = empty(slam.base.base.motion, frames, 4, 2, jnp.float64)
     stood = jnp.asarray(standing)
     record = replace(record, last=jnp.asarray(last), merged=merged, standing=stood)
-    return slam._due(record, newest)
+    return slam._due(record, newest, jnp.asarray(moved))
 
 
 def test_a_search_is_from_all_starts_at_first_and_then_from_some_in_turn():
@@ -346,6 +346,11 @@ def test_a_search_is_from_all_starts_at_first_and_then_from_some_in_turn():
         assert not due(slam, last, standing=True).any()
     later = [np.asarray(due(slam, 8, steps=max(early) + 1 + k)) for k in range(starts)]
     assert {int(x.sum()) for x in later} == {together}
+    # A camera that has moved is asked in every frame whether the reversed world is likelier.
+    for k, quiet in enumerate(later):
+        asked = np.asarray(due(slam, 8, steps=max(early) + 1 + k, moved=True))
+        assert asked[1]
+        np.testing.assert_array_equal(np.delete(asked, 1), np.delete(quiet, 1))
     # The reversal of the likeliest first, and none twice before all had their turn.
     assert later[0][1]
     np.testing.assert_array_equal(np.sum(later, axis=0), together)
