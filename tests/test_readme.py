@@ -12,6 +12,7 @@ import pytest
 import tyro
 
 import jaxslam
+from jaxslam.cli import main
 from jaxslam.cli.commands import Command
 from jaxslam.evaluation import CHOICES, Convention, read_covariances
 from jaxslam.tracking.synthetic import synthetic_source
@@ -79,6 +80,22 @@ def test_errors_of_any_filter_have_a_verdict(capsys, tmp_path, monkeypatch):
     assert out.startswith(promised)
     assert json.loads(Path("results/evaluation.json").read_text())["runs"] == 50
     assert sum(line.startswith("axis ") for line in out.splitlines()) == 2  # two tables
+
+
+@pytest.mark.slow
+def test_the_filter_of_the_page_is_the_classical_one(tmp_path, monkeypatch):
+    """As the page says: its numbers are those of `world`, of the same runs."""
+    monkeypatch.chdir(tmp_path)
+    some = ["--scenario", "matched", "matched-loose", "--runs", "3"]
+    main(["evaluate", "--suite", "suite", *some])
+    run_example("docs/suite.md")
+    main(["evaluate", "mine", "--suite", "suite", "--error", "split", "--filters", "world"])
+    found = json.loads(Path("results/suite.json").read_text())["scenarios"]
+    assert set(found) == {"matched", "matched-loose"}
+    for filters in found.values():
+        yours, ours = filters["yours"], filters["world/inverse_scaling"]
+        np.testing.assert_allclose(yours["nees"], ours["nees"], rtol=0.02)
+        np.testing.assert_allclose(yours["rmse"]["position"], ours["rmse"]["position"], rtol=0.01)
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import struct
 import textwrap
 import tokenize
@@ -24,9 +25,9 @@ LARGEST = 1e100
 
 @contextmanager
 def write_atomically(path: str | Path) -> Generator[Path, None, None]:
-    """Yield a temporary name beside `path`; what was written there becomes `path` at the end.
+    """Yield a temporary name beside `path`; the file or folder there becomes `path` at the end.
 
-    After an exception the temporary file is removed and an older `path` stays as it was. The
+    After an exception what is temporary is removed and an older `path` stays as it was. The
     temporary name ends like `path`, since many writers choose the format by it.
     """
     path = Path(path)
@@ -35,6 +36,8 @@ def write_atomically(path: str | Path) -> Generator[Path, None, None]:
         yield temporary
         temporary.replace(path)
     finally:
+        if temporary.is_dir():
+            shutil.rmtree(temporary)
         temporary.unlink(missing_ok=True)
 
 

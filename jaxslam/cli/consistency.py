@@ -13,9 +13,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from jaxslam._runtime.files import write_json
 from jaxslam._runtime.progress import StudyBar
 from jaxslam.consistency import (
-    BACKENDS,
     CHUNK,
-    DTYPES,
     FolderStore,
     Study,
     monte_carlo,
@@ -29,7 +27,6 @@ from jaxslam.filters.registry import FILTERS, FROM_REST, MODIFIERS, RECOMMENDED,
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.simulation.scenario import (
     BUILT_IN,
-    CALIBRATIONS,
     Scenario,
     parse_override,
     scenario,
@@ -63,30 +60,21 @@ class ConsistencyOptions:
             f"{', '.join(MODIFIERS)}, with a number.",
         ),
     ] = ("robocentric",)
-    calibration: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar="NAME",
-            help=f"How filters treat it: {', '.join(CALIBRATIONS)}. The scenario's by default.",
-        ),
-    ] = None
+    calibration: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """How filters treat it: white, consider, estimated or known. The scenario's by default."""
     runs: int = 1000
     """Independent runs of every filter."""
     steps: int | None = None
     """Filter steps of a run. The scenario's by default."""
     seed: int = 0
     """Run i draws from this seed and i alone."""
-    dtype: Annotated[str, tyro.conf.arg(help=f"Precision: {', '.join(DTYPES)}.")] = "float64"
+    dtype: str = "float64"
+    """Precision: float64 or float32."""
     chunk: int = CHUNK
     """Runs that are computed and kept together; memory grows with it, results do not."""
-    backend: Annotated[
-        str,
-        tyro.conf.arg(
-            help=f"What computes: {', '.join(BACKENDS)} (a program in C++, for which there has to "
-            "be a compiler), or auto: native where a study is long enough, and with --resume what "
-            "computed before."
-        ),
-    ] = AUTO
+    backend: str = AUTO
+    """What computes: xla, native (a program in C++, for which there has to be a compiler), or auto:
+    native where a study is long enough, and with --resume what computed before."""
     resume: bool = False
     """Go on from what an interrupted run left in --out."""
     reduce: bool = False
@@ -115,7 +103,7 @@ class ConsistencyOptions:
             check_records(self.records)
             if self.reduce:
                 raise ValueError("--reduce keeps no records of every run: leave out --records")
-        study = self._study()
+        study = self.study()
         summary = summarise(study)
         write_json(self.out / "consistency.json", summary, allow_nan=False)
         plot_consistency(study, summary, self.out / "consistency.png")
@@ -126,10 +114,11 @@ class ConsistencyOptions:
         print(table(summary))
         print(f"wrote {self.out / 'consistency.json'} and {self.out / 'consistency.png'}")
 
-    def _study(self) -> Study:
+    def study(self, world: Scenario | None = None) -> Study:
+        """Run the study, of another world than the options name where one is given."""
         check_sizes(self.runs, self.seed, self.dtype, self.chunk)
         check_backend(self.backend)
-        world = self._scenario()
+        world = self._scenario() if world is None else world
         filters = make_filters(world, self.filters, self.landmarks, self.calibration)
         store = FolderStore(self.out / "runs", resume=self.resume)
         total = self.runs * len(filters)
@@ -157,7 +146,8 @@ class ConsistencyOptions:
                 )
             except KeyboardInterrupt:
                 told = f"{kept()} of {total} runs are kept in {self.out}"
-                told += "; the same command with --resume goes on from there"
+                again = "" if self.resume else " with --resume"
+                told += f"; the same command{again} goes on from there"
                 raise KeyboardInterrupt(told) from None
 
     def _scenario(self) -> Scenario:

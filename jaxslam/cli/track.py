@@ -12,7 +12,6 @@ from jaxslam.cli.extra import one_line_warnings, require_vision
 from jaxslam.filters.association import ASSOCIATIONS
 from jaxslam.filters.registry import FILTERS
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.models.calibration import TREATMENTS
 from jaxslam.tracking.settings import METRIC, TrackerSettings
 
 _COMPILING = "compiling …"
@@ -67,13 +66,9 @@ class TrackOptions:
     landmarks: Annotated[
         str, tyro.conf.arg(help=f"Landmark parametrization: {', '.join(LANDMARKS)}.")
     ] = TrackerSettings.landmarks
-    calibration_treatment: Annotated[
-        str | None,
-        tyro.conf.arg(
-            help=f"How the filter treats it: {', '.join(TREATMENTS)}. By default one that a "
-            "field of view tells, or that is guessed, is estimated, and any other is known."
-        ),
-    ] = TrackerSettings.calibration
+    calibration_treatment: str | None = TrackerSettings.calibration
+    """How the filter treats it: white, consider, estimated or known. By default one that a field
+    of view tells, or that is guessed, is estimated, and any other is known."""
     nearest_depth: float = TrackerSettings.nearest_depth
     """d_min, which sets the unit of the map: the prior on depth reaches from here to infinity."""
     pixel_sigma: float = TrackerSettings.pixel_sigma

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from jaxslam._runtime.files import write_json
-from jaxslam.triangulation import CALIBRATIONS, Comparison, TwoViews, compare, summarise, table
+from jaxslam.triangulation import Comparison, TwoViews, compare, summarise, table
 from jaxslam.triangulation.comparison import MEASUREMENTS, PARTICLES, check_sizes
 
 
@@ -25,14 +25,9 @@ class TriangulateOptions:
     """Where the first view sees the point; by default the principal point, on the axis."""
     nearest_depth: float = TwoViews.nearest_depth
     """d_min of the prior on inverse depth, m."""
-    calibration: Annotated[
-        str,
-        tyro.conf.arg(
-            metavar="NAME",
-            help=f"How the intrinsics err: {', '.join(CALIBRATIONS)} (drawn in each view, drawn "
-            "once for both, not at all).",
-        ),
-    ] = TwoViews.calibration
+    calibration: Annotated[str, tyro.conf.arg(metavar="NAME")] = TwoViews.calibration
+    """How the intrinsics err: white (drawn in each view), shared (drawn once for both), or known
+    (not at all)."""
     particles: int = PARTICLES
     """Samples of the truth, and of every estimate."""
     measurements: int = MEASUREMENTS

@@ -6,6 +6,7 @@ from jaxslam.consistency.montecarlo import CHUNK, DTYPES, check_sizes, draw, mon
 from jaxslam.consistency.records import write_records
 from jaxslam.consistency.runs import SimulatedFrame, filter_run, run_through, scale_records
 from jaxslam.consistency.store import FolderStore, MemoryStore
+from jaxslam.consistency.suite import read_suite, write_suite
 from jaxslam.consistency.summary import Seconds, Study, summarise, table, tally, treatment
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "filter_run",
     "log_likelihood",
     "monte_carlo",
+    "read_suite",
     "run_through",
     "scale_records",
     "summarise",
@@ -29,4 +31,5 @@ __all__ = [
     "tally",
     "treatment",
     "write_records",
+    "write_suite",
 ]

@@ -9,6 +9,7 @@ from jaxslam.evaluation.convention import (
     write_covariances,
 )
 from jaxslam.evaluation.convention_search import Identification
+from jaxslam.evaluation.inputs import read_pose_log
 from jaxslam.evaluation.log_files import evaluate_log
 from jaxslam.evaluation.poses import evaluate_poses
 from jaxslam.evaluation.result import Evaluation, advice, evaluate, evaluate_nees
@@ -28,5 +29,6 @@ __all__ = [
     "evaluate_poses",
     "pose_errors",
     "read_covariances",
+    "read_pose_log",
     "write_covariances",
 ]

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from jaxslam._runtime.files import LARGEST, read_arrays
 from jaxslam._runtime.lookup import suggestion
 from jaxslam.evaluation.convention import CHOICES, geometry_of
-from jaxslam.io.tum import check_seconds, not_rigid, read_table, words
+from jaxslam.io.tum import check_seconds, not_rigid, poses, read_table, words
 
 _KEYS = (
     "errors", "innovations", "covariances", "sigmas", "estimates", "truths", "nees", "nis", "dof",
@@ -280,7 +280,7 @@ def of_xytheta(poses: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batc
 
 def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLike) -> Poses:
     """Return the poses of arrays that belong together. Raises ValueError, naming run and step."""
-    matrices = "(runs, steps, 4, 4), or (runs, steps, 3, 3) or (runs, steps, 3) in the plane"
+    matrices = "(runs, steps, 4, 4) or (…, 6), in the plane (runs, steps, 3, 3) or (…, 3)"
     T, truth = (
         _matrices(what, x, matrices) for what, x in (("estimates", estimates), ("truths", truths))
     )
@@ -329,6 +329,12 @@ def _matrices(what: str, given: ArrayLike, accepted: str) -> np.ndarray:
     T = numbers(what, given, 3 if np.ndim(given) == 3 else 4, accepted)
     if T.ndim == 3 and T.shape[-1] == 3:
         T = of_xytheta(T)
+    if T.ndim == 3 and T.shape[-1] == 6:
+        from scipy.spatial.transform import Rotation  # slow to import
+
+        position, turn = np.split(T.reshape(-1, 6), 2, axis=1)
+        turn = Rotation.from_rotvec(turn).as_quat()
+        T = poses(position, turn).reshape(*T.shape[:2], 4, 4)
     if T.ndim != 4 or T.shape[-2:] not in ((3, 3), (4, 4)):
         raise ValueError(f"{what} must be matrices {accepted}, not {T.shape}")
     return T
@@ -407,6 +413,26 @@ def read_csv(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...], tuple[
         if named:
             arrays["names"] = np.array(titles[before : before + n])
     return arrays, tuple(f"run {x:g}" for x in runs), tuple(f"step {x:g}" for x in steps)
+
+
+def read_pose_log(
+    path: str | Path, runs: int, steps: int, names: Sequence[str]
+) -> tuple[Float[np.ndarray, "runs steps n"], Float[np.ndarray, "runs steps n n"]]:
+    """Read such lines with poses of these names in place of errors, and their covariances.
+
+    Raises ValueError, naming the file, unless they are all steps from 1 of all runs from 0.
+    """
+    arrays, *held = read_csv(Path(path))
+    logged = arrays.get("errors", np.empty((0, 0, 0)))
+    if logged.shape[-1] != len(names) or [*arrays.get("names", names)] != [*names]:
+        raise ValueError(f"{path}: run, step, {', '.join(names)} and their covariance are accepted")
+    every = [f"run {i}" for i in range(runs)], [f"step {i}" for i in range(1, steps + 1)]
+    wrong = [x for a, b in zip(every, held, strict=True) for x in (*a, *b) if (x in a) != (x in b)]
+    wrong += [at((i, k + 1)) for i, k in np.argwhere(np.isnan(logged[..., 0]))]
+    if wrong:
+        accepted = f"all steps from 1 to {steps} of runs 0 to {runs - 1} are accepted"
+        raise ValueError(f"{path}: {wrong[0]} is missing, or one too many; {accepted}")
+    return logged, arrays["covariances"]
 
 
 def _columns(titles: list[str], rows: Float[np.ndarray, "k c"]) -> _Columns | None:

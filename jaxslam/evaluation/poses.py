@@ -78,12 +78,13 @@ def evaluate_poses(
 ) -> Evaluation:
     """The verdict on a filter from its poses T_wc, m, and the true ones.
 
-    `estimates` and `truths` are (runs, steps, 4, 4), or (runs, steps, 3, 3) in the plane, `times`
-    (steps,) in seconds. A pose that is all NaN together with its covariance was not logged, and one
-    whose truth is all NaN is not compared. `covariances` are of every pose, (runs, steps, 6, 6), or
-    of all poses of a run together, (runs, 6 steps, 6 steps), of the errors that the `convention`
-    names. Where the estimate is of another world, `align` it by `se3` or `sim3`: by the first pose,
-    if that is exactly known, else to all positions. The covariance is transported with it. Given
+    `estimates` and `truths` are (runs, steps, 4, 4), or (runs, steps, 6) of x, y, z and a rotation
+    vector; in the plane (runs, steps, 3, 3). `times` (steps,) are seconds. A pose that is all NaN
+    together with its covariance was not logged, and one whose truth is all NaN is not compared.
+    `covariances` are of every pose, (runs, steps, 6, 6), or of all poses of a run together, (runs,
+    6 steps, 6 steps), of the errors that the `convention` names. Where the estimate is of another
+    world, `align` it by `se3` or `sim3`: by the first pose, if that is exactly known, else to all
+    positions. The covariance is transported with it. Given
     the scale of the world, or with `sim3`, NEES is at one scale a run, and the drift of scale is
     tested beside it. Of a robot that moves in a plane `axes_used` are those that it estimates, as
     ("x", "y", "rz"); by default all whose errors are not zero throughout. A truth that is measured

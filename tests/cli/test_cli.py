@@ -1,5 +1,6 @@
 """Tests of the command line: files and their keys, errors of one line, resuming."""
 
+import itertools
 import json
 import subprocess
 import sys
@@ -9,6 +10,14 @@ import pytest
 
 import jaxslam
 from jaxslam.cli import main
+from jaxslam.cli.evaluate import RIVALS
+from jaxslam.consistency import BACKENDS, DTYPES
+from jaxslam.consistency.suite import SUITE
+from jaxslam.evaluation import CHOICES
+from jaxslam.evaluation.alignment import ALIGNMENTS
+from jaxslam.models.calibration import TREATMENTS
+from jaxslam.simulation.scenario import CALIBRATIONS
+from jaxslam.triangulation import CALIBRATIONS as VIEWS
 
 SMALL = ["consistency", "--scenario", "matched-tight", "--steps", "6", "--runs", "6"]
 FILTER_KEYS = {
@@ -232,3 +241,20 @@ def test_commands_without_pictures_need_no_opencv():
     """And what OpenCV is to be silent about is set before it is imported."""
     code = "import sys, jaxslam.cli.commands; assert not {'cv2', 'evo'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize(
+    ("command", "accepted"),
+    [
+        ("consistency", [*CALIBRATIONS, *BACKENDS, *DTYPES]),
+        ("evaluate", [*itertools.chain(*CHOICES.values()), *ALIGNMENTS, *SUITE, *RIVALS]),
+        ("track", [*TREATMENTS]),
+        ("triangulate", [*VIEWS]),
+    ],
+)
+def test_help_names_what_is_accepted(command, accepted, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    assert stop.value.code == 0
+    told = capsys.readouterr().out
+    assert not [name for name in accepted if name not in told]
