@@ -281,7 +281,7 @@ def measure(disturbed: Disturbed, settings: TrackerSettings, seed: int) -> dict[
     }
 
 
-OLDER = ("rotation", "standing")
+OLDER = ("standing",)
 """Last measured with an older tracker; to be emptied when they are measured again."""
 
 
