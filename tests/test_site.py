@@ -4,6 +4,7 @@ import ast
 import re
 import sys
 import tomllib
+from datetime import date
 from pathlib import Path
 
 import pytest
@@ -68,12 +69,19 @@ def _name(assignment: ast.Assign) -> str | None:
 
 
 def test_the_version_is_one():
-    """It is in `_version.py`, where the build reads it; the citation has it too."""
+    """It is in `_version.py`, where the build reads it; the citation has it, with the day of the
+    release, and so has the changelog, whose first heading before that says *unreleased*."""
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
     assert pyproject["project"]["dynamic"] == ["version"]
     assert pyproject["tool"]["hatch"]["version"]["path"] == "jaxslam/_version.py"
-    citation = (ROOT / "CITATION.cff").read_text()
-    assert f"version: {jaxslam.__version__}\n" in citation
+    cited = dict(re.findall(r"^([\w-]+): (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE))
+    assert cited["version"] == jaxslam.__version__
+    number, _, prepared = jaxslam.__version__.partition(".dev")
+    assert ("date-released" in cited) == (not prepared)
+    day = "unreleased" if prepared else str(date.fromisoformat(cited["date-released"]))
+    headings = re.findall(r"^## (.+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert headings[0] == f"{number} ({day})"
+    assert not any("unreleased" in heading.lower() for heading in headings[1:])
 
 
 def test_every_public_name_is_documented():
