@@ -128,15 +128,13 @@ def test_titles_are_short_and_each_is_of_one_page():
     assert len(set(found) - {"jaxslam"}) == len([t for t in found if t != "jaxslam"])
 
 
-def test_commands_install_a_clone_or_a_release_by_extras_that_there_are():
-    """Blocks install a clone; the README names both."""
+def test_commands_install_from_a_clone_by_extras_that_there_are():
+    """As long as no index has a release; how one is made says what comes after it."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     for page in PAGES:
         text = page.read_text()
-        blocks = "".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL))
-        assert not re.search(r"pip install '?jaxslam", blocks), page.name
+        if page.name != "CONTRIBUTING.md":
+            assert not re.search(r"pip install '?jaxslam", text), page.name
         named = re.findall(r"pip\s+install\s+(?:-e )?'(\.|jaxslam)\[([\w,]+)\](?:==[\d.]+)?'", text)
         for _, extras in named:
             assert set(extras.split(",")) <= set(project["optional-dependencies"]), page.name
-        if page.name == "README.md":
-            assert {source for source, _ in named} == {".", "jaxslam"}
