@@ -114,7 +114,8 @@ def close(chain: Chain, loops: Loops) -> Posterior:
 def posterior(
     chain: Chain, residual: Callable[[State], Float[Array, " k"]], sigma: float
 ) -> Posterior:
-    """Return the chain in which a residual of all states is zero, but for an error of this σ."""
+    """Return the chain in which a residual of all states is zero, but for an error of this σ, at
+    the last point where it was linearised: the maximum but for `SMALLEST`."""
 
     def linear(y: Float[Array, "N n"]) -> tuple[Array, tuple[State, Array, Cholesky]]:
         states = chain.at(y)
