@@ -240,6 +240,8 @@ def _conclusion(summary: dict[str, Any]) -> str:
     best, costs = [], []
     for truth in summary["truths"]:
         worst = _worst(summary, truth)
+        if not worst:  # not yet measured
+            continue
         least = min(worst.values())
         # Within a tenth of one another: that is what 200 runs scatter.
         good = [t for t, value in worst.items() if value <= 1.1 * least]

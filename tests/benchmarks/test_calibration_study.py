@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import calibration
 import jax
@@ -12,6 +13,7 @@ from cases import quick_jit
 import jaxslam
 from jaxslam.simulation import simulate
 
+ROOT = Path(__file__).parents[2]
 OPTIONS = calibration.CalibrationStudy(
     scenarios=("matched",), truths=("constant",), treatments=("estimated",), runs=3, steps=3
 )
@@ -58,6 +60,16 @@ def test_the_study_is_that_of_the_library_and_writes_its_files(tmp_path):
     page = (options.docs / "calibration.md").read_text()
     assert "3 runs of 3 steps" in page
     assert "\n| constant | estimated |" in page
+
+
+def test_the_page_is_written_after_the_first_truth_of_all():
+    """As the command does, which keeps what it has after every one."""
+    results = json.loads((ROOT / "benchmarks/results/calibration.json").read_text())
+    truth, *others = results["truths"]
+    name, by_truth = next(iter(results["scenarios"].items()))
+    page = calibration.page({**results, "scenarios": {name: {truth: by_truth[truth]}}})
+    assert f"- **{calibration.TRUTH[truth].capitalize()}**: " in page
+    assert not any(calibration.TRUTH[other].capitalize() in page for other in others)
 
 
 def test_the_estimate_of_the_intrinsics_is_judged_by_its_covariance():
