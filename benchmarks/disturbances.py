@@ -281,12 +281,8 @@ def measure(disturbed: Disturbed, settings: TrackerSettings, seed: int) -> dict[
     }
 
 
-OLDER = ("standing",)
-"""Last measured with an older tracker; to be emptied when they are measured again."""
-
-
 def as_table(results: dict[str, list[dict[str, float]]]) -> str:
-    """As Markdown, a row for each disturbance; † beside those of an older tracker."""
+    """As Markdown, a row for each disturbance."""
     header = ("disturbance", "videos", "tracked meanwhile", "in the last second")
     rows = []
     for name, (_, words) in DISTURBANCES.items():
@@ -294,7 +290,7 @@ def as_table(results: dict[str, list[dict[str, float]]]) -> str:
             mean = {key: float(np.mean([row[key] for row in of])) for key in of[0]}
             shares = ("tracked_during", "tracked_at_end", "in_first_map_at_end")
             numbers = (f"{mean[key]:.2g}" for key in ("maps", "beyond_scale"))
-            row = (f"{words} †" if name in OLDER else words, len(of))
+            row = (words, len(of))
             row += (*(f"{mean[key]:.0%}" for key in shares), *numbers)
             rows.append((*row, f"{mean['lies']:.1%}"))
     return table((*header, "in the first map", "maps", "NEES/dof", "beyond 5 σ"), rows)

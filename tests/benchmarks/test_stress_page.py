@@ -1,4 +1,4 @@
-"""The page of stress has the numbers on disk, and says which of them are old."""
+"""The page of stress has the numbers on disk, and its answer is theirs."""
 
 import json
 from pathlib import Path
@@ -21,17 +21,10 @@ def test_the_tables_are_of_the_numbers_on_disk(benchmark):
     assert f"{benchmark.MARK}\n\n{table}\n\n" in PAGE
 
 
-def test_rows_of_an_older_tracker_have_a_dagger():
-    rows = [line for line in PAGE.splitlines() if line.startswith("| ") and " † |" in line]
-    words = [disturbances.DISTURBANCES[name][1] for name in disturbances.OLDER]
-    assert sorted(row.split(" † |")[0] for row in rows) == sorted(f"| {x}" for x in words)
-    assert "`python benchmarks/endurance.py` †" not in PAGE
-
-
 def test_the_answer_is_that_of_the_numbers():
     found = on_disk("disturbances")
     assert [row["maps"] for row in found["cut"]].count(1) == 1
-    assert [row["lies"] > 0.01 for row in found["rotation"]].count(True) == 1
+    assert all(row["lies"] < 0.02 for row in found["rotation"])
     assert all(row["lies"] > 0.05 for row in found["ghost"])
     sequences = on_disk("starts").values()
     of_starts = [one for sequence in sequences for one in sequence["starts"].values()]
