@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import checking  # noqa: F401 - before the package, whose functions it decorates
 import jax
 import jaxtyping
 import numpy as np

@@ -1,0 +1,91 @@
+"""Types and shapes are checked in the first call of every kind, and in no other of that kind.
+
+A check of the package takes longer than many of its functions, and looks at nothing of an array
+but its type, dtype and shape. Calls are of one kind if all that their checks look at is the same;
+what they return is looked at each time, and checked if it is of another kind than before.
+"""
+
+from collections.abc import Callable
+from functools import partial, wraps
+from types import FunctionType
+from typing import Any
+
+import jax
+import jaxtyping
+import numpy as np
+
+_each_call = jaxtyping.jaxtyped
+_ARRAYS = np.ndarray, jax.Array, jax.ShapeDtypeStruct
+_ITEMS = 32
+"""Of a list or table of more, each call is checked."""
+
+
+class _UnknownError(Exception):
+    """Of a value of which no kind tells all that a check might look at."""
+
+
+def _kind(x: Any) -> Any:
+    kind = type(x)
+    if isinstance(x, _ARRAYS):
+        return kind, x.shape, x.dtype
+    if isinstance(x, tuple):
+        return kind, *map(_kind, x)
+    if isinstance(x, type):
+        return kind, x
+    if isinstance(x, list | dict | set | frozenset):
+        if len(x) > _ITEMS:
+            raise _UnknownError
+        return kind, *map(_kind, x), *map(_kind, x.values() if isinstance(x, dict) else ())
+    return kind
+
+
+def _checked_result(function: FunctionType, typechecker: Any, result: Any) -> Callable[..., Any]:
+    """The check of the function's arguments and of this result, without its call."""
+
+    def given(*args: Any, **named: Any) -> Any:
+        return result
+
+    there = FunctionType(given.__code__, function.__globals__, closure=given.__closure__)
+    return _each_call(wraps(function)(there), typechecker=typechecker)
+
+
+def _decorated(function: Any, typechecker: Any) -> Any:
+    checked = _each_call(function, typechecker=typechecker)
+    if not isinstance(function, FunctionType):
+        return checked
+    seen: dict[Any, set[Any]] = {}
+
+    @wraps(function)
+    def call(*args: Any, **named: Any) -> Any:
+        __tracebackhide__ = True
+        try:
+            key = *map(_kind, args), *named, *map(_kind, named.values())
+        except _UnknownError:
+            return checked(*args, **named)
+        if jaxtyping.config.jaxtyping_disable:
+            return function(*args, **named)
+        results = seen.get(key)
+        result = (function if results else checked)(*args, **named)
+        try:
+            of_result = _kind(result)
+        except _UnknownError:
+            of_result = None
+        if results and of_result not in results:
+            _checked_result(function, typechecker, result)(*args, **named)
+        if of_result is None:
+            seen.pop(key, None)
+        else:
+            seen.setdefault(key, set()).add(of_result)
+        return result
+
+    return call
+
+
+def jaxtyped(*function: Any, typechecker: Any = None, **options: Any) -> Any:
+    """`jaxtyping.jaxtyped`, which the import hook of pytest's option puts above every function."""
+    if function or options or typechecker is None:
+        return _each_call(*function, typechecker=typechecker, **options)
+    return partial(_decorated, typechecker=typechecker)
+
+
+setattr(jaxtyping, "jaxtyped", jaxtyped)  # noqa: B010 - for its many overloads
