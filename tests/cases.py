@@ -61,6 +61,11 @@ def quick_jit(function):
     return jax.jit(function, compiler_options=quick_options())
 
 
+def simulated(chosen, seed=0):
+    """A run of a scenario, in one program: op by op it is hundreds of them."""
+    return quick_jit(partial(simulate, chosen))(jax.random.key(seed))
+
+
 def central(function, x, step=1e-6):
     """Jacobian by central differences: wrong by O(step²) and by rounding of about 1e-16/step.
 

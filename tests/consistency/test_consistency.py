@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import WithoutRemove, quick_jit
+from cases import WithoutRemove, quick_jit, simulated
 from scipy.special import gammainc
 from scipy.stats import chi2, norm
 
@@ -519,10 +519,10 @@ def in_slots_of_their_own(run):
     column = np.cumsum(new.ravel(order="F")).reshape(new.shape, order="F") - 1
     visible = np.zeros((frames, new.sum()), bool)
     measured, points = np.zeros((*visible.shape, 2)), np.zeros((new.sum(), 3))
+    given = np.asarray(run.measured), np.asarray(run.points)
     for k, slot in np.ndindex(frames, slots):
         visible[k, column[k, slot]] = True
-        measured[k, column[k, slot]] = run.measured[k, slot]
-        points[column[k, slot]] = run.points[k, slot]
+        measured[k, column[k, slot]], points[column[k, slot]] = (x[k, slot] for x in given)
     found = replace(
         run,
         points=jnp.asarray(points),
@@ -544,7 +544,7 @@ def test_a_slot_used_again_is_as_good_as_one_of_its_own(name):
     """What is not seen again says no more: without it a filter goes on as with it."""
     scenario = jaxslam.scenario("handheld", steps=25, landmarks=4, velocity_sigma=[0.3] * 6)
     slam = next(iter(jaxslam.make_filters(scenario, [name], ["inverse_scaling"]).values()))
-    run, sensor = jaxslam.simulate(scenario, jax.random.key(4)), sensor_of(scenario)
+    run, sensor = simulated(scenario, 4), sensor_of(scenario)
     apart = in_slots_of_their_own(run)
     assert apart.visible.shape[1] > 7
     found, expected = (records_of(slam, sensor, one) for one in (run, apart))
@@ -558,13 +558,13 @@ def test_a_filter_that_cannot_remove_landmarks_cannot_use_slots_again():
     for name, refused in (("handheld", True), ("matched-6dof", False)):
         scenario = jaxslam.scenario(name, steps=2, landmarks=3)
         slam = WithoutRemove(jaxslam.EkfSlam(**scenario_pieces(scenario)))
-        run = jaxslam.simulate(scenario, jax.random.key(0))
+        run = jax.eval_shape(partial(jaxslam.simulate, scenario), jax.random.key(0))
         through = partial(filter_run, slam, Room(3, 3, 3, 3), sensor_of(scenario))
         if not refused:
             assert jax.eval_shape(through, run)
             continue
         with pytest.raises(ValueError, match=r"WithoutRemove has no remove\(state, gone\)"):
-            through(run)
+            jax.eval_shape(through, run)
 
 
 def test_no_frame_has_room_for_more_features_than_there_are_landmarks():

@@ -5,7 +5,7 @@ their null space, and uncertainty added along it at the start changes no estimat
 """
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -140,7 +140,7 @@ def test_directions_are_the_derivative_of_the_action(landmark, frame):
         return H, N, unobservable_directions(model, half)
 
     H, N, half = map(np.asarray, quick_jit(products)())
-    d = truth(model).landmarks.shape[1]
+    d = jax.eval_shape(partial(truth, model)).landmarks.shape[1]
     start = len(N) - COUNT * d + 3 * d
     np.testing.assert_allclose(H @ N, 0, atol=1e-13 * np.abs(H).max() * np.abs(N).max())
     assert not half[start : start + d].any()
@@ -172,15 +172,19 @@ def steps(model, constrained):
     return quick_jit(step)
 
 
+def with_directions(model, state):
+    return state, unobservable_directions(model, state)
+
+
 def window(model, constrained):
     """∂(all measurements)/∂(start, noise of every step), corrections in between; and N at the
     start, which noise has no part in."""
     t = model.geometry.tangent_dim
-    state = truth(model)
+    state, N = quick_jit(lambda: with_directions(model, truth(model)))()
     n = state.core_dim + state.landmarks.size
     first = tangent_dim((state.core.pose, state.core.motion))
     kept = np.delete(np.arange(n), range(first, first + t))
-    N = np.asarray(unobservable_directions(model, state))[kept]
+    N = np.asarray(N)[kept]
     G = np.eye(n, kept.size + STEPS * t) * 0.0
     G[kept, np.arange(kept.size)] = 1.0
     rng, rows, step = np.random.default_rng(11), [], steps(model, constrained)

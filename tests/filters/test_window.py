@@ -1,7 +1,7 @@
 """Tests of jaxslam.filters.window: what is remembered, and least squares against dense algebra."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -9,11 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import close, quick_jit
+from cases import close, quick_jit, simulated
 from exact_posterior.laplace import minima
 from exact_posterior.problem import log_density, make_problem
 
-import jaxslam
 from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.registry import scenario_pieces
@@ -144,8 +143,13 @@ def features(slots, measured, valid=None):
     return Features(jnp.array(slots), jnp.array(measured)[:, None], jnp.array(valid))
 
 
+@cache
 def some_record():
     """Three frames, three slots: 0 and 1 begin in frame 0, slot 2 in frame 1."""
+    return quick_jit(_some_record)()
+
+
+def _some_record():
     record = empty(pieces("standstill")["motion"], 3, 3, 1, jnp.float64)
     record = begun(record, features([1, 0, 2], [11.0, 10.0, 99.0], [True, True, False]))
     record = stepped(record, jnp.asarray(0.1), features([0, 1], [20.0, 21.0]), jnp.eye(1))
@@ -175,8 +179,13 @@ def test_a_full_record_stays_as_it_is():
     jax.tree.map(np.testing.assert_array_equal, after, record)
 
 
+@cache
 def standing_then_moving():
     """Slots 0 and 1 since frame 0, slot 2 since the second frame in which nothing moved."""
+    return quick_jit(_standing_then_moving)()
+
+
+def _standing_then_moving():
     record = empty(pieces("standstill")["motion"], 4, 3, 1, jnp.float64)
     record = begun(record, features([0, 1], [10.0, 20.0]))
     records = []
@@ -376,15 +385,21 @@ def test_a_landmark_does_not_take_a_step_that_costs_more(monkeypatch):
 @pytest.mark.slow
 def test_the_window_is_the_exact_posterior_of_a_run_and_has_its_minimum():
     chosen = scenario("matched-loose", steps=3, landmarks=4)
-    run = jaxslam.simulate(chosen, jax.random.key(0))
+    run = simulated(chosen)
     problem = make_problem(chosen, run, truncated=False)
     slam = EkfSlam(scale=ScaleGauge(), **scenario_pieces(chosen), landmark=INVERSE_SCALING)
-    everywhere = jnp.arange(4)
-    record = empty(slam.motion, 4, 4, 1, jnp.float64)
-    record = begun(record, Features(everywhere, run.measured[0], run.visible[0]))
-    for k in range(3):
-        seen = Features(everywhere, run.measured[k + 1], run.visible[k + 1])
-        record = stepped(record, run.controls[k], seen, slam.sensor.noise)
+
+    @quick_jit
+    def remembered(run):
+        everywhere = jnp.arange(4)
+        record = empty(slam.motion, 4, 4, 1, jnp.float64)
+        record = begun(record, Features(everywhere, run.measured[0], run.visible[0]))
+        for k in range(3):
+            seen = Features(everywhere, run.measured[k + 1], run.visible[k + 1])
+            record = stepped(record, run.controls[k], seen, slam.sensor.noise)
+        return record
+
+    record = remembered(run)
 
     def joined(x, y):
         return jnp.concatenate([x, y[:, 0], y[:, 1]])
@@ -392,7 +407,7 @@ def test_the_window_is_the_exact_posterior_of_a_run_and_has_its_minimum():
     draw = np.random.default_rng(1)
     x, y = jnp.asarray(0.3 * draw.standard_normal(12)), jnp.asarray(draw.standard_normal((4, 2)))
     r, *_ = dense(slam, record, x, y)
-    np.testing.assert_allclose(-r @ r / 2, log_density(problem, joined(x, y)), rtol=1e-9)
+    np.testing.assert_allclose(-r @ r / 2, quick_jit(log_density)(problem, joined(x, y)), rtol=1e-9)
     found = precisely(slam, record, 0 * x, 0 * y)
     modes, values, _ = quick_jit(minima)(problem, jnp.zeros((1, 20)))
     np.testing.assert_allclose(-found.cost / 2, values[0], rtol=1e-6)
@@ -459,17 +474,18 @@ def test_the_mean_is_shifted_by_the_volume_of_the_rest(of):
     slam, record, *_ = case(*of)
     at = minimum(*of)
     local, s = quick_jit(reduced)(slam, record, at.x, at.y), quick_jit(scaling)(slam, record, at)
+    longer = quick_jit(partial(rescaled, slam, record, at))
 
     def half_log_det(log_scale):
-        _, A, _ = dense(slam, record, *rescaled(slam, record, at, jnp.asarray(log_scale)))
+        _, A, _ = dense(slam, record, *longer(log_scale))
         return np.linalg.slogdet(A)[1] / 2
 
     expected = (half_log_det(-1e-4) - half_log_det(1e-4)) / 2e-4
-    factor = cholesky(local.information)
-    slope = scale._slope_of_volume(slam, local, s, factor)
+    factor = quick_jit(cholesky)(local.information)
+    slope = quick_jit(partial(scale._slope_of_volume, slam))(local, s, factor)
     assert abs(expected) > 1e-2
     np.testing.assert_allclose(slope, expected, rtol=1e-4)
-    by_x, by_y = variances(local, factor.whitening)
+    by_x, by_y = quick_jit(variances)(local, factor.whitening)
     _, A, _ = dense(slam, record, at.x, at.y)
     inverse = np.diagonal(np.linalg.inv(A))
     np.testing.assert_allclose(np.append(by_x, by_y.ravel()), inverse, rtol=1e-7)
@@ -477,7 +493,7 @@ def test_the_mean_is_shifted_by_the_volume_of_the_rest(of):
     assert 1e-3 < abs(shift) < scale.MOST_SHIFT
 
     def prior(log_scale):
-        return sum(np.sum(u**2) for u in rescaled(slam, record, at, log_scale)) / 2
+        return sum(np.sum(np.square(u)) for u in longer(log_scale)) / 2
 
     np.testing.assert_allclose((prior(shift + 1e-4) - prior(shift - 1e-4)) / 2e-4, slope, rtol=1e-4)
 
@@ -540,7 +556,7 @@ def test_the_filters_state_is_the_gaussian_of_the_mode(of, monkeypatch):
     close(points, expected_points, 1e-6)
     close(spread, np.einsum("min,no,mjo->mij", J_points, Sigma, J_points), 1e-6)
     part = state.core.part("log_scale").start
-    s = scaling(slam, record, at)
+    s = quick_jit(scaling)(slam, record, at)
     np.testing.assert_allclose(state.covariance[part, part], 1 / s.squared, rtol=1e-9)
     assert np.linalg.eigvalsh(state.covariance).min() > -1e-12
 
@@ -584,7 +600,7 @@ def test_the_filters_state_stands_at_the_mean_of_the_scale():
         return jnp.log(jnp.linalg.norm(pose.translation())), covariance
 
     zero, shift = jnp.zeros(()), jnp.asarray(0.1)
-    x, y = rescaled(slam, record, at, shift)
+    x, y = quick_jit(rescaled)(slam, record, at, shift)
     found, expected = handed(at, shift), handed(replace(at, x=x, y=y), zero)
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-12)

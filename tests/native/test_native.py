@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import quick_jit
 
 import jaxslam
 from jaxslam._numerics import linalg
@@ -111,7 +112,7 @@ CASES = (
 @pytest.mark.parametrize("function", CASES, ids=lambda f: f.__name__)
 def test_a_function_is_what_vmap_makes_of_it(function):
     found = batched(function, SHARED, DRAWN)(SHARED, DRAWN, threads=2)
-    wanted = jax.vmap(function, (None, 0))(SHARED, DRAWN)
+    wanted = quick_jit(jax.vmap(function, (None, 0)))(SHARED, DRAWN)
     for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
         assert x.dtype == y.dtype
         np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-11)

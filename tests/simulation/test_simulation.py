@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import keys_used, quick_jit
+from cases import keys_used, quick_jit, simulated
 from scipy import stats
 
 from jaxslam._numerics.arrays import cast
@@ -789,8 +789,8 @@ def test_features_and_slots_of_landmarks_that_come_and_go():
     assert most.new == new[1:].sum(axis=1).max()
     assert most.known == (~new).sum(axis=1).max()
     room = Room(10, 8, 8, 8)  # with room for two more
-    first, known, fresh = features(run, room)
-    left = np.asarray(gone(run, room))
+    (first, known, fresh), left = quick_jit(lambda run: (features(run, room), gone(run, room)))(run)
+    left = np.asarray(left)
     assert left.shape == (40, 10)
     assert first.valid.all()
     for k in range(40):
@@ -888,7 +888,7 @@ def test_visible_means_inside_the_picture_and_in_front():
 
 def test_landmarks_that_share_slots_are_new_when_they_come_back():
     """A slot is one point's for as long as that is seen, and what it measures is that point's."""
-    run = simulate(scenario("laps", steps=900, in_view=6), jax.random.key(0))
+    run = simulated(scenario("laps", steps=900, in_view=6))
     who, new = np.asarray(run.identity), np.asarray(run.new)
     seen = np.asarray(run.visible)
     np.testing.assert_array_equal(seen, who >= 0)
@@ -909,7 +909,7 @@ def test_a_cloud_is_along_the_path_and_seen_near_it():
     chosen = scenario(
         "matched-6dof", placement="cloud", landmarks=200, in_view=20, steps=60, depth_range=[1, 4]
     )
-    run = simulate(chosen, jax.random.key(1))
+    run = simulated(chosen, 1)
     depths = []
     for k in (0, 30, 60):
         T_CB = jax.tree.map(lambda x, k=k: x[k], run.poses).inverse()

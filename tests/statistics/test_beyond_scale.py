@@ -153,9 +153,15 @@ def test_the_noise_of_the_truth_is_of_the_scale_of_the_estimate(geometry):
     low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], count)
     normalised = (found.log_scale - np.log(4.0)) / found.sigma
     assert 0.99 * low < np.sum(normalised**2) < 1.01 * high
+
     # Without the truth's noise it is far too large.
-    bare = beyond_scale(lambda T: (difference(T, estimate), P), retract(truth, noises[0]))
-    assert bare.nees > 2 * one(noises[0], 0 * own_noises[0]).nees
+    @quick_jit
+    def both(noise, no_noise):
+        of = lambda T: (difference(T, estimate), P)  # noqa: E731
+        return beyond_scale(of, retract(truth, noise)), one(noise, no_noise)
+
+    bare, told = both(noises[0], 0 * own_noises[0])
+    assert bare.nees > 2 * told.nees
 
 
 @pytest.mark.slow
@@ -174,18 +180,18 @@ def test_of_a_filter_it_is_the_least_nees_over_all_scales(name):
     metric = partial(slam.pose_error, state)
     in_unit = metric if name == "robocentric" else error_in_unit
     for error, own in ((metric, ""), (in_unit, "unit_")):
-        P = error(truth)[1]
+        P = quick_jit(error)(truth)[1]
 
         def nees(log_scale, error=error, P=P):
             return normalised_squared(error(scaled(truth, jnp.exp(log_scale)))[0], P)
 
         best, sigma = (records[f"{own}log_scale{end}"][-1] for end in ("", "_sigma"))
-        around = best + np.linspace(-3.0, 3.0, 121)
-        over_scales = np.asarray(quick_jit(jax.vmap(nees))(around))
-        assert over_scales.argmin() == 60
-        # σ by the curvature of what is minimised, 2/σ², by differences.
         h = 1e-3
-        curvature = (nees(best + h) - 2 * nees(best) + nees(best - h)) / h**2
+        around = best + np.append(np.linspace(-3.0, 3.0, 121), [h, 0, -h])
+        *over_scales, more, here, less = np.asarray(quick_jit(jax.vmap(nees))(around))
+        assert np.argmin(over_scales) == 60
+        # σ by the curvature of what is minimised, 2/σ², by differences.
+        curvature = (more - 2 * here + less) / h**2
         np.testing.assert_allclose(curvature, 2 / sigma**2, rtol=0.02)
     np.testing.assert_allclose(over_scales[60], records["beyond_scale"][-1], rtol=1e-6)
     assert records["nees"][-1] > 1.001 * over_scales[60]  # the scale is wrong by something
