@@ -29,8 +29,9 @@ if not jax.config.values["jax_compilation_cache_dir"]:  # commands would keep pr
     jax.config.update("jax_enable_compilation_cache", False)
     os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
 gc.disable()  # else a tenth of the time: tracing makes many objects. Collected after every file.
-# Tests compile much and compute little.
+# Tests compile much and compute little, and so do the processes that they start.
 jax.config.update("jax_disable_most_optimizations", True)
+os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"
 os.environ["XLA_FLAGS"] = _flags_that_are_known(
     "--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"
 )

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from functools import cache
 
 import jax
 import pytest
@@ -11,10 +12,13 @@ from benchmarks.speed import gpu
 from benchmarks.speed.gpu import BEGIN, OnGpu, shown
 from benchmarks.speed.workload import WORKLOADS
 
+drawn_once = cache(gpu.prepared)
+
 
 @pytest.fixture
 def small(tmp_path, monkeypatch):
     """The benchmark, so small that its programs are compiled soon."""
+    monkeypatch.setattr(gpu, "prepared", drawn_once)
     monkeypatch.setitem(WORKLOADS, "A", dataclasses.replace(WORKLOADS["A"], landmarks=3))
     (tmp_path / "speed.md").write_text(f"{BEGIN}\n\n{END}\n")
     return OnGpu(
@@ -45,6 +49,7 @@ def test_batches_are_timed_and_compared_with_the_processors(small):
 
 
 def test_other_numbers_than_the_cpu_s_end_in_an_error_when_all_is_measured(small, monkeypatch):
+    monkeypatch.setattr(gpu, "compiler", lambda: None)  # XLA alone
     monkeypatch.setattr(gpu, "AGREEMENT", 0.0)
     with pytest.raises(ValueError, match=r"not the same results.*'A, 6 runs'"):
         small()
@@ -55,6 +60,7 @@ def test_other_numbers_than_the_cpu_s_end_in_an_error_when_all_is_measured(small
     ("limits", "why"), [({"call_seconds": 1e-9}, "a call would take"), ({}, "needs about")]
 )
 def test_what_is_too_large_is_left_out_and_it_is_said_why(small, monkeypatch, limits, why):
+    monkeypatch.setattr(gpu, "compiler", lambda: None)  # XLA alone
     if not limits:
         monkeypatch.setattr(gpu, "memory_of", lambda device: 2**10)
     dataclasses.replace(small, **limits)()

@@ -1,9 +1,8 @@
 """Tests of the modes of a start from rest: what is told of them, which is which, their figure."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
-import jax
 import jax.numpy as jnp
 import modes as told
 import numpy as np
@@ -95,11 +94,12 @@ def test_every_mode_begins_at_the_origin_and_explains_the_pixels():
 def test_the_scale_given_is_conditioned_on():
     """The inverse of the information's other rows and columns."""
     slam, of = standstill().filter("scale_gauge"), standstill()
-    state = slam.init(of.capacity, jax.tree.map(lambda x: x[0], of.features[0]))
+    state = quick_jit(partial(slam.init, of.capacity))(of.frames(0)[0])
     n = len(state.covariance)
     root = np.random.default_rng(0).standard_normal((n, n))
     P = root @ root.T + np.eye(n)
-    left = np.asarray(given_scale(replace(state, covariance=jnp.asarray(P))).covariance)
+    given = quick_jit(given_scale)(replace(state, covariance=jnp.asarray(P)))
+    left = np.asarray(given.covariance)
     at = state.core.part("log_scale").start
     others = np.delete(np.arange(n), at)
     close(
