@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import close, each_geometry, named, pose, quick_jit
+from cases import close, each_geometry, named, pose, quick_jit, simulated
 from exact_posterior.conditional import (
     centre,
     conditional_log_density,
@@ -66,9 +66,10 @@ NEARLY_LINEAR = jaxslam.scenario(
 SMALL = Study(LOOSE, 3, HMC(chains=2, warmup=100, draws=150), starts=1)
 
 
+@cache
 def problem_of(scenario, *, seed=0, truncated=True):
-    run = jaxslam.simulate(scenario, jax.random.key(seed))
-    return make_problem(scenario, run, truncated=truncated), run
+    run = simulated(scenario, seed)
+    return quick_jit(partial(make_problem, scenario, truncated=truncated))(run), run
 
 
 residuals_of = quick_jit(residuals)
@@ -132,9 +133,9 @@ def test_the_truncated_normal_is_scipys_and_its_slope_is_a_ratio_of_densities(lo
     below = truncnorm.ppf(norm.cdf(y), lower, np.inf)
     above = truncnorm.isf(norm.sf(y), lower, np.inf)
     expected = np.where(y < 0, below, above)
-    got = truncated_normal(jnp.asarray(y), jnp.asarray(lower))
+    got = quick_jit(truncated_normal)(y, lower)
     np.testing.assert_allclose(got, expected, rtol=1e-7, atol=1e-9)
-    slope = jax.vmap(jax.grad(lambda y: truncated_normal(y, jnp.asarray(lower))))(jnp.asarray(y))
+    slope = quick_jit(jax.vmap(jax.grad(truncated_normal), (0, None)))(y, lower)
     ratio = norm.pdf(y) * norm.sf(lower) / norm.pdf(expected)
     np.testing.assert_allclose(slope, ratio, rtol=1e-6)
 
@@ -153,14 +154,14 @@ def test_residuals_and_their_jacobian_are_those_of_a_dense_computation(scenario)
     got = residuals_of(problem, y)
     expected = dense_residuals(scenario, problem, y)
     np.testing.assert_allclose(got, expected, rtol=1e-7, atol=1e-7)
-    J = jax.jacfwd(lambda y: residuals_of(problem, y))(y)
+    J = quick_jit(jax.jacfwd(partial(residuals, problem)))(y)
     for i in (0, y.size // 2, y.size - 1):
         step = np.zeros(y.size)
         step[i] = 1e-4
         central = dense_residuals(scenario, problem, y + step)
         central = (central - dense_residuals(scenario, problem, y - step)) / 2e-4
         np.testing.assert_allclose(J[:, i], central, rtol=1e-5, atol=1e-5)
-    assert log_density(problem, y) == pytest.approx(-expected @ expected / 2)
+    assert quick_jit(log_density)(problem, y) == pytest.approx(-expected @ expected / 2)
 
 
 def test_a_landmark_that_is_not_visible_tells_nothing_and_one_behind_is_impossible():
@@ -172,7 +173,7 @@ def test_a_landmark_that_is_not_visible_tells_nothing_and_one_behind_is_impossib
     assert np.flatnonzero(less).tolist() == [y.size + LOOSE.landmarks + 2]
     # A velocity ahead of 300 σ passes every landmark within a frame.
     past = y.at[1].set(300 / LOOSE.velocity_sigma[1])
-    assert log_density(problem, past) == -jnp.inf
+    assert quick_jit(log_density)(problem, past) == -jnp.inf
 
 
 @pytest.mark.slow
@@ -181,16 +182,12 @@ def test_the_conditional_variables_have_the_jacobian_that_they_claim(truncated):
     problem, _ = problem_of(LOOSE, truncated=truncated)
     mode = draw(problem)
 
-    @quick_jit
     def physical(w):
         return as_vector(conditional_unknowns(problem, mode, w)[0])
 
     a, b = mode + draw(problem, 2), mode + 5 * draw(problem, 3)
     if truncated:  # there is no density where an inverse depth is below the bound
         a, b = (w.at[-LOOSE.landmarks :].add(10.0) for w in (a, b))
-    claimed = [conditional_unknowns(problem, mode, w)[1] for w in (a, b)]
-    exact = [jnp.linalg.slogdet(jax.jacfwd(physical)(w))[1] for w in (a, b)]
-    assert claimed[1] - claimed[0] == pytest.approx(float(exact[1] - exact[0]), abs=1e-9)
 
     # So the density of w is that of y, by the rule for a change of variables.
     def whitened(w):
@@ -203,19 +200,24 @@ def test_the_conditional_variables_have_the_jacobian_that_they_claim(truncated):
     def slope(y):
         return jax.jvp(at, (y,), (jnp.ones_like(y),))[1]
 
-    values = [conditional_log_density(problem, mode, w) for w in (a, b)]
-    expected = [
-        log_density(problem, whitened(w)) + log_det - jnp.sum(jnp.log(slope(whitened(w))))
-        for w, log_det in zip((a, b), exact, strict=True)
-    ]
-    assert values[1] - values[0] == pytest.approx(float(expected[1] - expected[0]), rel=1e-9)
+    @quick_jit
+    def told(w):
+        log_det, y = jnp.linalg.slogdet(jax.jacfwd(physical)(w))[1], whitened(w)
+        expected = log_density(problem, y) + log_det - jnp.sum(jnp.log(slope(y)))
+        claimed = conditional_unknowns(problem, mode, w)[1]
+        return claimed, log_det, conditional_log_density(problem, mode, w), expected
+
+    claimed, exact, value, expected = (float(y - x) for x, y in zip(told(a), told(b), strict=True))
+    assert claimed == pytest.approx(exact, abs=1e-9)
+    assert value == pytest.approx(expected, rel=1e-9)
 
 
 @cache
 def nearly_linear():
     """A problem, its MAP and its chains, by the programs that `small_study` needs too."""
     runs = draw_runs(replace(SMALL, scenario=NEARLY_LINEAR), 0, range(40))
-    problems = jax.vmap(partial(make_problem, NEARLY_LINEAR, truncated=False))(runs)
+    make = jax.vmap(partial(make_problem, NEARLY_LINEAR, truncated=False))
+    problems = quick_jit(make)(runs)
     starts_keys, chains_keys = jax.random.split(jax.random.key(2), (2, 40))
     modes = _modes(SMALL.starts, problems, starts_keys)
     chains = _sample(SMALL.hmc, problems, modes.mode, chains_keys)
@@ -226,11 +228,12 @@ def nearly_linear():
 def test_on_a_nearly_linear_problem_map_hmc_and_the_filter_agree():
     problem, run, mode, chains = nearly_linear()
     assert bool(mode.converged)
-    gradient = jax.grad(lambda y: log_density(problem, y))(mode.mode)
+    gradient = quick_jit(jax.grad(partial(log_density, problem)))(mode.mode)
     assert np.abs(gradient @ mode.root).max() < 1e-3
-    mean, P = pose_gaussian(problem, mode)
+    mean, P = quick_jit(pose_gaussian)(problem, mode)
 
-    T_CB, S, tangents = pose_moments(pooled(chains).inverse())
+    of_chains = quick_jit(lambda chains: pose_moments(pooled(chains).inverse()))
+    T_CB, S, tangents = of_chains(chains)
     rhat, ess = diagnose(tangents.reshape(SMALL.hmc.chains, -1, 3))
     assert rhat.max() < 1.05
     assert ess.min() > 200
@@ -250,7 +253,7 @@ def test_on_a_nearly_linear_problem_map_hmc_and_the_filter_agree():
     base_sigma = np.sqrt(np.diagonal(P_base))
     difference_of = (records["covariance"] - P_base) / np.outer(base_sigma, base_sigma)
     assert np.abs(difference_of).max() < 0.02
-    base = in_base_axes(jax.tree.map(lambda x: x[None], truth), mean.inverse())[0]
+    base = quick_jit(in_base_axes)(jax.tree.map(lambda x: x[None], truth), mean.inverse())[0]
     assert np.all(np.abs(records["error"] - base) < 0.02 * np.sqrt(np.diagonal(P_base)))
     assert 0 <= records["kl"] < 0.05
 

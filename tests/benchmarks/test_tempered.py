@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import quick_jit
+from cases import quick_jit, simulated
 from exact_posterior.laplace import minima, starts
 from exact_posterior.marginal import (
     landmark_draws,
@@ -153,9 +153,10 @@ def test_particles_that_do_not_get_to_the_whole_likelihood_say_so():
     assert found.trace.power[-1] < 1
 
 
+@cache
 def problem_of(scenario, *, truncated=True):
-    run = jaxslam.simulate(scenario, jax.random.key(0))
-    return make_problem(scenario, run, truncated=truncated)
+    make = quick_jit(partial(make_problem, scenario, truncated=truncated))
+    return make(simulated(scenario))
 
 
 def of_landmark(problem, i):
@@ -199,7 +200,7 @@ def by_quadrature(problem, y):
 
 def true_path(scenario):
     """y of the path that `problem_of` was made with, as if its first step had no acceleration."""
-    run = jaxslam.simulate(scenario, jax.random.key(0))
+    run = simulated(scenario)
     steps = jax.tree.map(lambda x: x[:-1], run.poses).inverse() @ jax.tree.map(
         lambda x: x[1:], run.poses
     )
