@@ -181,14 +181,17 @@ def by_quadrature(problem, y):
     log_prior = norm.logpdf(omega, depth.mean, depth.sigma)
     log_prior = log_prior - norm.logsf(lower, depth.mean, depth.sigma)
     total, moments = 0.0, []
-    for i in range(problem.landmarks):
-        own = of_landmark(problem, i)
 
-        def value(e, w, own=own):
+    @quick_jit
+    def over_grid(own):
+        def value(e, w):
             numbers = jnp.stack([e, (w - depth.mean) / depth.sigma])[None]
             return log_likelihood(own, Unknowns(x.path, numbers))
 
-        grid = jax.jit(jax.vmap(jax.vmap(value, (None, 0)), (0, None)))(white, omega)
+        return jax.vmap(jax.vmap(value, (None, 0)), (0, None))(white, omega)
+
+    for i in range(problem.landmarks):
+        grid = over_grid(of_landmark(problem, i))
         steps = (white[1] - white[0]) * (omega[1] - omega[0])
         values = grid + norm.logpdf(white)[:, None] + log_prior + np.log(steps)
         total += logsumexp(values)
@@ -200,7 +203,10 @@ def by_quadrature(problem, y):
 
 def true_path(scenario):
     """y of the path that `problem_of` was made with, as if its first step had no acceleration."""
-    run = simulated(scenario)
+    return quick_jit(partial(_true_path, scenario))(simulated(scenario))
+
+
+def _true_path(scenario, run):
     steps = jax.tree.map(lambda x: x[:-1], run.poses).inverse() @ jax.tree.map(
         lambda x: x[1:], run.poses
     )
@@ -227,7 +233,7 @@ def bent():
     problem, y = problem_of(BENT), true_path(BENT)
     keys = jax.random.split(jax.random.key(0), 20000)
     draws = quick_jit(jax.vmap(lambda key: landmark_draws(problem, y, key, 8)))(keys)
-    return marginal_log_likelihood(problem, y), by_quadrature(problem, y), draws
+    return quick_jit(marginal_log_likelihood)(problem, y), by_quadrature(problem, y), draws
 
 
 @pytest.mark.slow
@@ -256,14 +262,15 @@ def test_weighted_landmarks_have_their_exact_moments():
 @pytest.mark.slow
 def test_a_path_with_a_landmark_behind_the_camera_is_impossible():
     problem = problem_of(REST)
-    y = jnp.zeros(path_size(problem))
-    assert np.isfinite(marginal_log_likelihood(problem, y))
+    y, likelihood = jnp.zeros(path_size(problem)), quick_jit(marginal_log_likelihood)
+    assert np.isfinite(likelihood(problem, y))
     past = y.at[1].set(1000 / REST.velocity_sigma[1])
-    assert marginal_log_likelihood(problem, past) == -jnp.inf
-    assert landmark_draws(problem, past, jax.random.key(0), 3)[1] == -jnp.inf
+    assert likelihood(problem, past) == -jnp.inf
+    drawn = quick_jit(lambda problem, y, key: landmark_draws(problem, y, key, 3))
+    assert drawn(problem, past, jax.random.key(0))[1] == -jnp.inf
     unseen = replace(problem.record, seen=jnp.zeros_like(problem.record.seen))
     hidden = replace(problem, record=unseen)
-    assert marginal_log_likelihood(hidden, past) == pytest.approx(0, abs=1e-12)
+    assert likelihood(hidden, past) == pytest.approx(0, abs=1e-12)
 
 
 @cache
