@@ -448,7 +448,7 @@ def a_sum():
     """A Gaussian sum of five members, each with a pose and a covariance of its own, its filter,
     and a true pose."""
     (slam,) = jaxslam.make_filters(LOOSE, ["scale_gauge+mixture5"], ["inverse_scaling"]).values()
-    state, rng = slam.init(4), np.random.default_rng(0)
+    state, rng = quick_jit(lambda: slam.init(4))(), np.random.default_rng(0)
     away = rng.normal([0.1, 0.05, 0.0], 0.03, (5, 3))
     roots = rng.normal(0.0, 0.03, state.members.covariance.shape)
 
@@ -456,16 +456,21 @@ def a_sum():
         core = replace(member.core, pose=retract(member.core.pose, away))
         return replace(member, core=core, covariance=root @ root.T)
 
-    members = jax.vmap(moved)(state.members, jnp.asarray(away), jnp.asarray(roots))
+    members = quick_jit(jax.vmap(moved))(state.members, away, roots)
     return slam, replace(state, members=members), SE2.from_xy_theta(-0.1, -0.1, 0.02)
 
 
 def test_the_gaussians_of_a_filter_have_its_moments():
     slam, state, _ = a_sum()
-    found = filter_mixture(slam, state)
+
+    @quick_jit
+    def told(state):
+        found = filter_mixture(slam, state)
+        return found, mixture_moments(found), camera_pose(slam, state)
+
+    found, (mean, P), (expected, S) = told(state)
     assert np.sum(found.weights) == pytest.approx(1)
     assert np.sum(np.asarray(found.weights) > 1e-3) > 1
-    (mean, P), (expected, S) = mixture_moments(found), camera_pose(slam, state)
     sigma = np.sqrt(np.diagonal(S))
     np.testing.assert_allclose(difference(mean, expected) / sigma, 0, atol=1e-2)
     np.testing.assert_allclose(P / np.outer(sigma, sigma), S / np.outer(sigma, sigma), atol=2e-2)
@@ -474,7 +479,7 @@ def test_the_gaussians_of_a_filter_have_its_moments():
 def test_a_start_from_rest_has_the_gaussians_of_its_sum_and_a_plain_filter_has_one():
     slam, state, _ = a_sum()
     start = from_rest(slam, 3)
-    begun = replace(start.init(4), sum=state)
+    begun = replace(quick_jit(lambda: start.init(4))(), sum=state)
     jax.tree.map(
         np.testing.assert_array_equal, filter_mixture(start, begun), filter_mixture(slam, state)
     )

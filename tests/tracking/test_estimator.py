@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import quick_jit
 
 pytest.importorskip("cv2")
 
@@ -48,7 +49,9 @@ def test_matches_are_tested_as_innovations_of_the_filter_with_their_own_noise(es
         factors = jnp.array([1.0, 1.0, 2.0, 3.0])
         features = Features(jnp.array(slots), jnp.array(matches.pixels), jnp.ones(4, bool), factors)
         tolerance = SMALL.tolerance * SMALL.pixel_sigma
-        direct = candidates(estimator.slam, predicted.gaussian, predicted.dt, features, tolerance)
+        direct = quick_jit(
+            lambda state, dt: candidates(estimator.slam, state, dt, features, tolerance)
+        )(predicted.gaussian, predicted.dt)
     np.testing.assert_allclose(residual, direct.residual, atol=1e-9)
     np.testing.assert_allclose(S, direct.covariance, rtol=1e-9, atol=1e-9)
     assert valid.all()
@@ -73,8 +76,13 @@ def test_what_is_expected_given_a_match_is_what_the_filter_expects_after_it(esti
         features = Features(
             jnp.array(slots), jnp.array(matches.pixels), jnp.ones(2, bool), jnp.array([1.0, 4.0])
         )
-        state, _ = estimator.slam.update(predicted.gaussian, predicted.dt, features)
-        after = estimator.slam.predict_features(state, predicted.dt, jnp.arange(SMALL.capacity))
+
+        @quick_jit
+        def expected_after(state, dt):
+            state, _ = estimator.slam.update(state, dt, features)
+            return estimator.slam.predict_features(state, dt, jnp.arange(SMALL.capacity))
+
+        after = expected_after(predicted.gaussian, predicted.dt)
     others = np.setdiff1d(np.flatnonzero(predicted.view.usable), slots)
     moved = given.pixels - predicted.view.pixels
     assert np.abs(moved[others]).max() > 1e-3
@@ -92,11 +100,11 @@ def test_noise_that_is_larger_by_a_factor_is_of_a_worse_sensor(estimator):
         predicted = estimator.predict(1 / 30)
         pixels = jnp.array(predicted.view.pixels[slots] + aside)
         features = Features(jnp.array(slots), pixels, jnp.ones(3, bool), jnp.full(3, 4.0))
-        state, _ = estimator.slam.update(predicted.gaussian, predicted.dt, features)
+        at = predicted.gaussian, predicted.dt
+        state, _ = quick_jit(lambda *at: estimator.slam.update(*at, features))(*at)
         sensor = replace(estimator.slam.sensor, sigma=2 * SMALL.pixel_sigma)
         worse = replace(estimator.slam, sensor=sensor)
-        other, _ = worse.update(
-            predicted.gaussian, predicted.dt, replace(features, noise_factor=None)
-        )
+        plain = replace(features, noise_factor=None)
+        other, _ = quick_jit(lambda *at: worse.update(*at, plain))(*at)
     np.testing.assert_allclose(state.covariance, other.covariance, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(state.landmarks, other.landmarks, rtol=1e-9)
