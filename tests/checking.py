@@ -6,8 +6,8 @@ what they return is looked at each time, and checked if it is of another kind th
 """
 
 from collections.abc import Callable
-from functools import partial, wraps
-from types import FunctionType
+from functools import cache, partial, wraps
+from types import CodeType, FunctionType
 from typing import Any
 
 import jax
@@ -49,23 +49,31 @@ def _checked_result(function: FunctionType, typechecker: Any, result: Any) -> Ca
     return _each_call(wraps(function)(there), typechecker=typechecker)
 
 
+_seen: dict[CodeType, dict[Any, set[Any]]] = {}
+"""Of every function the kinds of calls, and what those returned. A function within another is made
+anew in each call of that, with the same annotations."""
+
+
 def _decorated(function: Any, typechecker: Any) -> Any:
-    checked = _each_call(function, typechecker=typechecker)
     if not isinstance(function, FunctionType):
-        return checked
-    seen: dict[Any, set[Any]] = {}
+        return _each_call(function, typechecker=typechecker)
+    seen = _seen.setdefault(function.__code__, {})
+
+    @cache
+    def checked() -> Callable[..., Any]:  # made when it is needed first, as it takes a while
+        return _each_call(function, typechecker=typechecker)
 
     @wraps(function)
     def call(*args: Any, **named: Any) -> Any:
         __tracebackhide__ = True
+        if jaxtyping.config.jaxtyping_disable:
+            return function(*args, **named)
         try:
             key = *map(_kind, args), *named, *map(_kind, named.values())
         except _UnknownError:
-            return checked(*args, **named)
-        if jaxtyping.config.jaxtyping_disable:
-            return function(*args, **named)
+            return checked()(*args, **named)
         results = seen.get(key)
-        result = (function if results else checked)(*args, **named)
+        result = (function if results else checked())(*args, **named)
         try:
             of_result = _kind(result)
         except _UnknownError:

@@ -28,6 +28,13 @@ def both(two: tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]):
     return two[0] + two[1]
 
 
+def within(x: Float[np.ndarray, " n"], count: int) -> Float[np.ndarray, " n"]:
+    def added(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        return a + b
+
+    return added(x, x[:count])
+
+
 called = []
 '''
 
@@ -67,6 +74,8 @@ def test_arguments_and_results_of_other_kinds_are_checked(module):
     for count in (40, 1, 2, 50):
         assert len(module.many(count * x)) == count
     refused(module.many, 100 * x)
+    np.testing.assert_array_equal(module.within(x, 3), 2 * x)
+    refused(module.within, x, 1)
 
 
 def test_a_check_calls_the_function_once(module):
