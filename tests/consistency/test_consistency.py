@@ -115,54 +115,6 @@ def test_chunks_in_threads_are_those_one_after_another(monkeypatch):
         np.testing.assert_array_equal(values, together[key], err_msg=key)
 
 
-@pytest.mark.slow
-def test_a_batch_in_parts_that_fit_the_cache_is_the_same(monkeypatch):
-    """Seven runs, three at a time: the last part has two of them again."""
-
-    def computed():
-        programs.forget()
-        study = jaxslam.monte_carlo(SCENARIO, filters(), runs=7, chunk=7)
-        return [study.store.load(name, study.chunks[0]) for name in study.filters]
-
-    def at_once(bytes):
-        monkeypatch.setattr(backends, "CACHE", bytes)
-        return backends._runs_in_cache(room, batch)
-
-    room, batch = draw(SCENARIO, 7)
-    assert at_once(backends.CACHE) >= 7
-    whole = computed()
-    assert any(at_once(bytes) == 3 for bytes in range(0, 10**6, 100))
-    for parts, records in zip(computed(), whole, strict=True):
-        assert parts.keys() == records.keys()
-        for key, values in records.items():
-            np.testing.assert_allclose(parts[key], values, rtol=1e-6, atol=1e-12, err_msg=key)
-    programs.forget()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", ["xla", "native"])
-def test_of_the_last_chunk_only_what_is_wanted_is_computed(backend, monkeypatch):
-    """Three at a time by XLA, as soon as one of them is wanted; as many as are wanted natively."""
-    if backend == "native" and compiler() is None:
-        pytest.skip("no C++ compiler")
-    simulator = Simulator(SCENARIO, 0, "float64", 7)
-    room, batch = draw(SCENARIO, 7)
-    n = 6 + 3 * room.landmarks
-    monkeypatch.setattr(backends, "CACHE", 3 * 8 * n**2)
-    assert backends._runs_in_cache(room, batch) == 3
-    programs.forget()
-    slam = filters()["inverse_scaling"]
-    program = montecarlo.ChunkTask("", slam, simulator, room, backend).program(batch)
-    (all_of_them, sample), (some, same) = (program(np.int32(n)) for n in (7, 2))
-    programs.forget()
-    for key, values in all_of_them.items():
-        np.testing.assert_array_equal(some[key][:2], values[:2], err_msg=key)
-    jax.tree.map(np.testing.assert_array_equal, sample, same)
-    assert np.all(all_of_them["nees"] > 0)
-    assert len(some["nees"]) == {"xla": 7, "native": 2}[backend]
-    assert np.all(some["nees"][3:] == 0)
-
-
 def without(summary, *gone):
     """A summary without what is named so, at any depth."""
     if not isinstance(summary, dict):
@@ -621,3 +573,54 @@ def test_the_share_outside_three_sigma_is_counted_and_drawn():
     np.testing.assert_allclose(drawn[0], 100 * np.array(outside["position"]))
     np.testing.assert_allclose(drawn[1], 100 * np.array(outside["orientation"]))
     assert [text.get_text() for text in axes.texts] == ["IS"]
+
+
+# --- the last, as they forget the programs that others share -----------------------------------
+
+
+@pytest.mark.slow
+def test_a_batch_in_parts_that_fit_the_cache_is_the_same(monkeypatch):
+    """Seven runs, three at a time: the last part has two of them again."""
+
+    def computed():
+        programs.forget()
+        study = jaxslam.monte_carlo(SCENARIO, filters(), runs=7, chunk=7)
+        return [study.store.load(name, study.chunks[0]) for name in study.filters]
+
+    def at_once(bytes):
+        monkeypatch.setattr(backends, "CACHE", bytes)
+        return backends._runs_in_cache(room, batch)
+
+    room, batch = draw(SCENARIO, 7)
+    assert at_once(backends.CACHE) >= 7
+    whole = computed()
+    assert any(at_once(bytes) == 3 for bytes in range(0, 10**6, 100))
+    for parts, records in zip(computed(), whole, strict=True):
+        assert parts.keys() == records.keys()
+        for key, values in records.items():
+            np.testing.assert_allclose(parts[key], values, rtol=1e-6, atol=1e-12, err_msg=key)
+    programs.forget()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["xla", "native"])
+def test_of_the_last_chunk_only_what_is_wanted_is_computed(backend, monkeypatch):
+    """Three at a time by XLA, as soon as one of them is wanted; as many as are wanted natively."""
+    if backend == "native" and compiler() is None:
+        pytest.skip("no C++ compiler")
+    simulator = Simulator(SCENARIO, 0, "float64", 7)
+    room, batch = draw(SCENARIO, 7)
+    n = 6 + 3 * room.landmarks
+    monkeypatch.setattr(backends, "CACHE", 3 * 8 * n**2)
+    assert backends._runs_in_cache(room, batch) == 3
+    programs.forget()
+    slam = filters()["inverse_scaling"]
+    program = montecarlo.ChunkTask("", slam, simulator, room, backend).program(batch)
+    (all_of_them, sample), (some, same) = (program(np.int32(n)) for n in (7, 2))
+    programs.forget()
+    for key, values in all_of_them.items():
+        np.testing.assert_array_equal(some[key][:2], values[:2], err_msg=key)
+    jax.tree.map(np.testing.assert_array_equal, sample, same)
+    assert np.all(all_of_them["nees"] > 0)
+    assert len(some["nees"]) == {"xla": 7, "native": 2}[backend]
+    assert np.all(some["nees"][3:] == 0)
