@@ -1,8 +1,9 @@
 """How often mistakes of logging are recognised, and how often right logs are taken for mistaken.
 
 `python benchmarks/mistakes.py` draws studies of a robot in the plane, of 8 to 60 runs of 20 to 60
-steps that are correlated: right ones, ones whose σ is wrong by a factor from .1 to 10, and ones
-with each of the mistakes of logging. Of the last it counts those that are named, and named alone.
+steps that are correlated: right ones, ones whose σ is wrong by a factor from .1 to 10, ones with
+up to half of the runs losing their heading, and ones with each of the mistakes of logging. Of those
+with a mistake it counts the ones for which it is named, and named alone.
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ KINDS = {
     "errors in degrees": "degrees",
     "covariances in degrees": "degrees",
     "steps before runs": "interchanged",
+    "heading lost": "",
 }
-"""A word that names the mistake."""
+"""A word that names the mistake; none where there is none."""
 
 
 def study(kind: str, number: int) -> tuple[np.ndarray, np.ndarray]:
@@ -51,6 +53,9 @@ def study(kind: str, number: int) -> tuple[np.ndarray, np.ndarray]:
         P = P * UNITS * UNITS[:, None]
     if kind == "steps before runs":
         errors, P = np.swapaxes(errors, 0, 1), np.swapaxes(P, 0, 1)
+    if kind == "heading lost":
+        for run in rng.choice(runs, rng.integers(1, runs // 2 + 1), replace=False):
+            errors[run, rng.integers(steps) :, 2] *= 10 ** rng.uniform(1, 3)
     return errors, P
 
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxslam.statistics.bands import shortfall_limit
 from jaxslam.statistics.verdict import Verdict
 
 FALSE_ALARM = 1e-4
@@ -28,9 +29,16 @@ _WRONG = 5.0
 _LIKE = 2.0
 """A factor further from 57.3 than by so much is another one."""
 _SLACK = 1.25
-"""The factor by which a 99 % interval may miss it: one of few runs does more than once in 100."""
-_NARROW = 4.0
-"""The widest interval of a factor, upper by lower end, of an axis that may be an angle or not."""
+"""The factor by which the interval may miss it."""
+_LEVEL = 0.01
+"""The probability that the interval misses the factor that all covariances are wrong by."""
+_SHARE, _BELOW = 0.4, 5.0
+"""The share of the samples that may be lower by so much: of 8 from χ² no more are, but for 3 %."""
+_NARROW = 5.0
+"""The widest interval of a factor, upper by lower end, of an axis that may be an angle or not: that
+of 8 runs is narrower."""
+_ALIKE = 4.0
+"""The widest one of a verdict, which is of the runs' scatter too, where no other axis is right."""
 _CORRELATED = 0.3
 """Neighbours that correlate less may be strangers."""
 _MANY = 300
@@ -66,7 +74,7 @@ class Logged(NamedTuple):
     steps: Sequence[str]
     """The names of the steps, as `step 7`, from 0, or `0.3 s`."""
     factors: Sequence[Verdict]
-    """The verdict on every axis, with `sigma_factor` and `interval99`."""
+    """The verdict on every axis, with `interval99`, and `samples` of innovations."""
 
 
 def mistakes(logged: Logged) -> tuple[Mistake, ...]:
@@ -154,41 +162,72 @@ def _degrees(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake]:
     angles = [axis for axis, kind in enumerate(kinds) if kind]
     asked = angles or [axis for axis, kind in enumerate(kinds) if kind is None]
     lengths = [axis for axis, kind in enumerate(kinds) if kind is False]
+    wrong = {axis: _Factor.of(logged, axis) for axis in (*asked, *lengths)}
     for factor, errors, covariances in (
         (DEGREES, "degrees", "radians"), (1 / DEGREES, "radians", "degrees"),
     ):  # fmt: skip
-        found = [axis for axis in asked if _is_factor(logged.factors[axis], factor, bool(angles))]
+        found = [axis for axis in asked if wrong[axis].is_like(factor, known=bool(angles))]
+        if not angles and found == asked:  # σ as a whole may be wrong
+            found = [axis for axis in found if _runs_are_alike(logged.factors[axis])]
         if not found or (angles and found != angles):
             continue
-        if any(_is_factor(logged.factors[axis], factor, True) for axis in lengths):
+        if any(wrong[axis].is_like(factor, known=True) for axis in lengths):
             continue
         names = ", ".join(logged.names[axis] for axis in found)
-        by = logged.factors[found[0]]["sigma_factor"]
         yield Mistake(
             f"degrees where radians belong ({names})",
             f"errors of {names} look as if they were in {errors} and the covariances in "
-            f"{covariances}: σ should be {by:.3g} times as large, and {_told(factor)}; both in "
-            "radians are accepted",
+            f"{covariances}: σ should be {wrong[found[0]].by:.3g} times as large, and "
+            f"{_told(factor)}; both in radians are accepted",
         )
+
+
+def _runs_are_alike(found: Verdict) -> bool:
+    low, high = found["interval99"]
+    return bool(low) and high is not None and high < _ALIKE * low
 
 
 def _told(factor: float) -> str:
     return f"180/π is {DEGREES:.3g}" if factor > 1 else f"π/180 is {1 / DEGREES:.3g}"
 
 
-def _is_factor(found: Verdict, factor: float, known: bool) -> bool:
-    """Whether σ is wrong by just this factor.
+class _Factor(NamedTuple):
+    """The factor by which σ of an axis is wrong, if it is the same one in all runs, as of a unit.
 
-    Of one run, whose interval is wide, only for what is `known`, and only where σ is too small, as
-    one number can be small by chance.
+    The interval is that of χ²: how the runs scatter would say nothing more of one factor, and widen
+    it without bounds where runs are few. Where up to half of the runs are lost, the mean may be
+    like a unit's by chance, but not the other half.
     """
-    by, (low, high) = found["sigma_factor"], found["interval99"]
-    if not by or abs(np.log(by / factor)) > np.log(_LIKE):
-        return False
-    high = np.inf if high is None else high
-    apart = low > _WRONG if factor > 1 else high < 1 / _WRONG
-    near = low / _SLACK < factor < high * _SLACK
-    return bool(near and apart and (known or high < _NARROW * low))
+
+    by: float
+    low: float
+    high: float
+    of_share: float
+    """The factor that `_SHARE` of the samples are below."""
+
+    @staticmethod
+    def of(logged: Logged, axis: int) -> _Factor:
+        """Return the factor of the NEES of an axis; NaN where one is not finite."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            nees = (logged.errors[..., axis] / logged.sigmas[..., axis]) ** 2
+            there = ~np.isnan(logged.errors[..., axis])
+            white = logged.factors[axis].get("samples") == "steps"
+            samples = nees[there] if white else nees.mean(axis=1, where=there)
+            mean, n = np.mean(samples), len(samples)
+            most, least = (shortfall_limit(n, _LEVEL, above=above) / n for above in (True, False))
+            numbers = np.sqrt([mean, mean / most, mean / least, np.quantile(samples, _SHARE)])
+        return _Factor(*map(float, numbers))
+
+    def is_like(self, factor: float, *, known: bool) -> bool:
+        """Whether σ is wrong by just this factor.
+
+        Of few runs, whose interval is wide, only for what is `known` to be an angle.
+        """
+        if not factor / _LIKE <= self.by <= factor * _LIKE:
+            return False
+        apart = self.low > _WRONG if factor > 1 else self.high < 1 / _WRONG
+        near = self.low / _SLACK < factor < self.high * _SLACK and self.of_share > factor / _BELOW
+        return apart and near and (known or self.high < _NARROW * self.low)
 
 
 def _interchanged(logged: Logged) -> Iterator[Mistake]:

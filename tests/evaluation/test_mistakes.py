@@ -87,6 +87,24 @@ def test_degrees_for_radians_are_named(names, name, seed):
     assert "degrees" in said((e * DEGREES)[..., only], P[..., only, only], names[2:])
 
 
+def test_degrees_are_named_of_few_runs_whose_errors_hardly_change():
+    """Then the runs scatter so much that the interval of their scatter has no lower end."""
+    for seed in range(10):
+        e, P = right(runs=10, correlation=0.99, seed=seed)
+        for names, name in ((NAMES, "heading"), ((), "3")):
+            expected = f"no verdict: degrees where radians belong ({name})"
+            assert said(e * DEGREES, P, names) == expected
+            assert said(e, P * DEGREES * DEGREES[:, None], names) == expected
+
+
+def test_degrees_are_named_of_innovations():
+    """Every step of white ones is a sample: those of one run are enough."""
+    z, S = right(runs=1, steps=300, correlation=0.0)
+    for names in (NAMES, ()):
+        found = jaxslam.evaluate(z * DEGREES, S, names=names, quantity="NIS")
+        assert "degrees where radians belong" in found.headline
+
+
 def test_degrees_are_named_in_poses_too(tmp_path, capsys):
     """A covariance file in degrees that does not say so."""
     steps, rng = 60, np.random.default_rng(0)
@@ -150,6 +168,27 @@ def test_a_filter_whose_sigma_is_wrong_is_not_taken_for_a_log_that_is(factor):
         assert said(factor * e, P) == ""
         assert said(factor * e, P, ()) == ""
         assert said(e * [factor, factor, 1], P) == ""
+
+
+def test_lost_runs_are_not_taken_for_ones_in_degrees():
+    """Where the mean NEES of all runs is just what degrees would make it."""
+    for seed in range(10):
+        e, P = right(seed=seed)
+        lost = np.ones((20, 1, 3))
+        lost[:6, :, 2] = 180 / np.pi * np.sqrt(20 / 6)
+        assert 29 < jaxslam.evaluate(lost * e, P).axis_verdict(2)["sigma_factor"] < 115
+        assert said(lost * e, P) == ""
+        assert said(lost * e, P, ()) == ""
+
+
+def test_where_all_of_sigma_is_too_small_and_some_runs_are_lost_it_is_not_the_unit():
+    """Of axes without names, of which none is right."""
+    for seed in range(10):
+        e, P = right(runs=40, seed=seed, correlation=0.0)
+        e[[3, 17]] *= 12
+        e *= 30
+        assert 29 < jaxslam.evaluate(e, P).axis_verdict(2)["sigma_factor"] < 115
+        assert said(e, P, ()) == ""
 
 
 def test_positions_anywhere_are_no_angles():
