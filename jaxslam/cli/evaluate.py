@@ -126,7 +126,7 @@ class EvaluateOptions:
         print(f"wrote {self.out / 'suite.json'}")
 
     def _of_log(self, path: Path, suite: SuiteScenario) -> tuple[Evaluation, Summary]:
-        (_, _, _, *axes), rows = suite.tables()["truth.csv"]
+        (_, _, _, *axes), rows = suite.tables["truth.csv"]
         times, truths = np.split(rows.reshape(suite.runs, -1, 3 + len(axes))[:, 1:, 2:], [1], -1)
         poses, P = read_pose_log(path, *truths.shape[:2], axes)
         compare = partial(evaluate_poses, poses, P, truths, Convention(**self._stated()))

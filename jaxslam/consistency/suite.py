@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from collections.abc import Iterable
+from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -23,24 +24,32 @@ SUITE = ("matched", "matched-loose", "matched-forward-loose", "circle", "matched
 and landmarks that come and go, with depths that are not the prior's."""
 
 
-class SuiteScenario(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class SuiteScenario:
     """A scenario of a suite, and what draws its runs."""
 
     scenario: Scenario
     runs: int
     seed: int
 
+    @cached_property
     def tables(self) -> dict[str, tuple[tuple[str, ...], Float[np.ndarray, "rows columns"]]]:
-        """Return the names of columns and the rows of every file, by its name.
+        """The names of columns and the rows of every file, by its name; drawn once.
 
-        Raises ValueError for a scenario whose landmarks share slots, and so have no numbers.
+        Raises ValueError for another sensor than a camera, and for landmarks that share slots, and
+        so have no numbers.
         """
         s, axes = self.scenario, AXES[self.scenario.geometry]
+        if s.sensor != "camera":
+            raise ValueError(f"{s.name}: its sensor is {s.sensor}; for a suite camera is accepted")
         with jax.enable_x64(True):
             batch = jax.device_get(draw(s, self.runs, seed=self.seed)[1])
             turns = batch.poses.rotation().log()
-        if batch.new is not None or s.sensor != "camera":
-            raise ValueError(f"{s.name}: of a suite cameras that see landmarks again are accepted")
+        if batch.new is not None:
+            raise ValueError(
+                f"{s.name}: its landmarks share slots, so that none has a number of its own; for a "
+                "suite in_view=0 is accepted, and any placement but rays"
+            )
         seen, (run, step) = np.nonzero(batch.visible), np.indices(batch.visible.shape[:2])
         pose = np.dstack([run, step, step / s.rate, batch.poses.translation(), turns])
         pixel = ("run", "step", "landmark", "u", "v")[: 3 + s.world.pixel_dim]
@@ -64,16 +73,21 @@ def write_suite(
 ) -> None:
     """Write a folder with a sub-folder of plain files for every scenario, whole or not at all.
 
-    Without the `truth` the seed is left out too. Raises ValueError for a folder that is there.
+    Without the `truth` the seed is left out too. Raises ValueError for a folder that is there, and
+    without a scenario.
     """
     check_sizes(runs, seed, "float64", runs)
     folder, chosen = Path(folder), [as_scenario(name) for name in scenarios]
+    if not chosen:
+        raise ValueError(
+            f"a suite needs at least one scenario; by default it has {', '.join(SUITE)}"
+        )
     if folder.exists():
         raise ValueError(f"{folder} is there already; a new folder is accepted")
     with write_atomically(folder) as temporary:
         for one in chosen:
             (place := temporary / one.name).mkdir(parents=True)
-            tables, depth = SuiteScenario(one, runs, seed).tables(), depth_of(one)
+            tables, depth = SuiteScenario(one, runs, seed).tables, depth_of(one)
             for name, (columns, rows) in tables.items():
                 form = ["%d" if x in ("run", "step", "landmark") else "%.12g" for x in columns]
                 if truth or name != "truth.csv":
@@ -105,7 +119,7 @@ def read_suite(
             raise ValueError("its seed is hidden with the truth; --seed is needed")
         check_sizes(told["runs"], drawn, "float64", 1)
         found = SuiteScenario(scenario("matched", told["scenario"]), told["runs"], drawn)
-        rows = found.tables()["measurements.csv"][1]
+        rows = found.tables["measurements.csv"][1]
         if not np.isclose(rows.sum(), told.get("checksum", np.nan), rtol=1e-9):
             raise ValueError(f"seed {drawn} draws other runs; the one of the suite is accepted")
         return found

@@ -1,6 +1,7 @@
 """The suite: plain files that any filter can read, its logs, and the filters here beside them."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -14,7 +15,6 @@ from jaxslam.cli import main
 from jaxslam.consistency import read_suite, write_suite
 from jaxslam.consistency import suite as suite_module
 from jaxslam.evaluation import read_pose_log
-from jaxslam.simulation import BUILT_IN
 
 RUNS, STEPS = 6, 8
 SMALL = jaxslam.scenario("matched", {"name": "small"}, steps=STEPS, landmarks=5)
@@ -244,7 +244,7 @@ def test_a_pose_in_space_is_a_rotation_vector(tmp_path):
     np.savetxt(tmp_path / "logs" / "matched-6dof.csv", log, delimiter=",")
     one = read_suite(tmp_path / "suite", ["matched-6dof"])["matched-6dof"]
     poses, P = read_pose_log(tmp_path / "logs" / "matched-6dof.csv", 4, 3, axes)
-    truths = one.tables()["truth.csv"][1].reshape(4, 4, -1)[:, 1:, 3:]
+    truths = one.tables["truth.csv"][1].reshape(4, 4, -1)[:, 1:, 3:]
     found = jaxslam.evaluate_poses(poses, P, truths)
     expected = (100 * np.sum(errors**2, axis=1)).reshape(4, 3)
     np.testing.assert_allclose(found.nees, expected, rtol=1e-9)
@@ -295,24 +295,46 @@ def test_the_measurements_are_the_projections_of_fixed_points(tmp_path):
     assert checked > 200
 
 
-def test_landmarks_need_a_number_of_their_own(tmp_path):
-    with pytest.raises(ValueError, match=r"^drifting-patches: of a suite cameras that see"):
-        write_suite(tmp_path / "suite", ["drifting-patches"], runs=1)
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"placement": "rays", "depth_range": (1.0, 6.0)},
+            "share slots, .* any placement but rays",
+        ),
+        ({"in_view": 9}, "its landmarks share slots, .* for a suite in_view=0 is accepted"),
+        (
+            {"sensor": "position", "calibration": "known"},
+            "is position; for a suite camera is accep",
+        ),
+    ],
+)
+def test_a_scenario_that_no_suite_has_is_refused(changes, message, tmp_path):
+    """Landmarks need a number of their own, and measurements are pixels."""
+    with pytest.raises(ValueError, match=f"^small: .*{message}"):
+        write_suite(tmp_path / "suite", [replace(SMALL, **changes)], runs=1)
+
+
+def test_a_suite_has_a_scenario(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["evaluate", "--suite", str(tmp_path / "suite"), "--scenario"])
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(
+        "jaxslam: a suite needs at least one scenario; by default it has matched"
+    )
     assert not list(tmp_path.iterdir())
 
 
-def test_scenarios_of_the_suite_are_standard():
-    assert set(suite_module.SUITE) <= set(BUILT_IN)
+def test_runs_are_drawn_once(written, tmp_path, monkeypatch):
+    """Those that the log is compared with are those that were compared with the suite's."""
+    drawn = []
 
+    def counted(scenario, runs, *, seed):
+        drawn.append(scenario.name)
+        return draw(scenario, runs, seed=seed)
 
-def test_options_of_one_log_do_not_go_with_a_suite(tmp_path, capsys):
-    for options, message in (
-        (["--truth", "truth.txt"], "--truth is of one log"),
-        (["--nis"], "--nis is of one log"),
-    ):
-        with pytest.raises(SystemExit):
-            main(["evaluate", "--suite", str(tmp_path / "suite"), *options])
-        assert message in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(["evaluate"])
-    assert "SOURCE is missing" in capsys.readouterr().err
+    draw = suite_module.draw
+    monkeypatch.setattr(suite_module, "draw", counted)
+    judged(written, "open", tmp_path)
+    assert drawn == ["small"]
