@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -28,10 +29,15 @@ def bar(total: int | None, unit: str, desc: str | None = None, done: int = 0) ->
         raise missing("a bar of progress needs", "cli", error) from None
     if sys.stderr.isatty() or "ipykernel" in sys.modules:
         return tqdm(total=total, unit=unit, desc=desc, initial=done)
-    return tqdm(
+    shown = tqdm(
         total=total, unit=unit, desc=desc, initial=done, file=_Lines(sys.stderr), ncols=80,
-        ascii=True, delay=LINE_SECONDS, mininterval=LINE_SECONDS, maxinterval=LINE_SECONDS,
+        ascii=True, mininterval=LINE_SECONDS, maxinterval=LINE_SECONDS,
     )  # fmt: skip
+    # Nothing else calls while a program is compiled.
+    first = threading.Timer(LINE_SECONDS, lambda: shown.disable or shown.refresh())
+    first.daemon = True
+    first.start()
+    return shown
 
 
 def _begin_timing(shown, desc: str) -> None:
@@ -92,14 +98,14 @@ class StudyBar:
 
 
 class _Lines:
-    """A file to which what would be drawn anew is a line more."""
+    """A file to which what would be drawn anew is a line more, from `LINE_SECONDS` on."""
 
     def __init__(self, file: Any) -> None:
-        self._file = file
+        self._file, self._begin = file, time.monotonic() + LINE_SECONDS
 
     def write(self, text: str) -> None:
         told = text.replace("\r", "").strip()
-        if told:
+        if told and time.monotonic() >= self._begin:
             self._file.write(f"{told}\n")
 
     def flush(self) -> None:

@@ -2,6 +2,7 @@
 
 import io
 import sys
+import time
 
 import pytest
 
@@ -38,6 +39,35 @@ def test_a_log_has_lines_without_control_characters(monkeypatch):
 
 def test_what_is_short_leaves_no_line_in_a_log(monkeypatch):
     assert written(monkeypatch, io.StringIO(), patience=10.0) == ""
+
+
+def test_a_study_that_is_short_leaves_no_line_in_a_log(monkeypatch):
+    """Nor does what is compiled in it."""
+    log = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", log)
+    with progress.StudyBar(200) as move:
+        for name, runs in (("a", 0), ("a", 0), ("a", 100), ("b", 0), ("b", 0), ("b", 100)):
+            move(name, runs)
+    with progress.warming_bar(3, "frame", "compiling", 2, "tracking") as update:
+        for _ in range(3):
+            update(1)
+    assert log.getvalue() == ""
+
+
+def test_what_is_long_has_a_line_in_a_log_while_it_is_compiled(monkeypatch):
+    log = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", log)
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0.2)
+    with progress.StudyBar(200) as move:
+        move("a", 0)
+        patience = time.monotonic() + 60
+        while not log.getvalue() and time.monotonic() < patience:
+            time.sleep(0.05)
+        (line,) = log.getvalue().splitlines()
+        assert line.startswith("a, compiling: 0/200")
+        move("a", 0)
+        move("a", 200)
+    assert "200/200" in log.getvalue().splitlines()[-1]
 
 
 def test_no_time_is_left_to_tell_before_it_is_warm(monkeypatch):
