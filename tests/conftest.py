@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from jaxslam._runtime import programs
-from jaxslam.consistency import backends
 
 
 def _flags_that_are_known(*flags: str) -> str:
@@ -74,7 +73,6 @@ def _compiled_programs_are_freed():
     yield
     if _memory_maps() > MOST_MAPS:
         programs.forget()
-        backends.native_programs().forget()
         jax.clear_caches()
         gc.unfreeze()
     gc.collect()

@@ -26,7 +26,7 @@ from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from types import BuiltinFunctionType, FunctionType, MethodType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -42,8 +42,8 @@ Options = Mapping[str, Mapping[str, Any]]
 # Without emitters of fusions it takes two thirds of the time, to programs that are as fast.
 BATCHED: Options = {"cpu": {"xla_cpu_use_fusion_emitters": False}}
 # Slow programs, in half of that time again.
-_LEAST = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-QUICK: Options = {"cpu": {**BATCHED["cpu"], **_LEAST}}
+QUICK: Options = {"cpu": {**BATCHED["cpu"], "xla_backend_optimization_level": 0,
+                          "xla_llvm_disable_expensive_passes": True}}  # fmt: skip
 # Libraries of kernels whose threads wait for one another: matrices of one run are too small.
 ALONE: Options = {"cpu": {**BATCHED["cpu"], "xla_cpu_experimental_ynn_fusion_type": ""}}
 
@@ -69,14 +69,56 @@ def kept_in() -> Path | None:
     return _kept_in
 
 
-_all: weakref.WeakSet[Program] = weakref.WeakSet()
+_all: weakref.WeakSet[Made[Any]] = weakref.WeakSet()
 
 
 def forget() -> None:
     """Free all programs that were made, as `jax.clear_caches` does JAX's: each holds some of the
     memory maps of which a process may have only so many."""
-    for program in _all:
-        program.forget()
+    for made in _all:
+        made.forget()
+
+
+class Made(Generic[T]):
+    """Programs by their keys, each made by the first thread that asks; the last `MOST` are kept.
+
+    One that could not be made is tried again.
+    """
+
+    def __init__(self) -> None:
+        self._futures: dict[Any, Future[T]] = {}
+        self._lock = threading.Lock()
+        _all.add(self)
+
+    def of(self, key: Any, make: Callable[[], T]) -> T:
+        """Return the program of this key, or make it."""
+        with self._lock:
+            future = self._futures.pop(key, None)
+            if mine := future is None:
+                future = Future()
+            self._futures[key] = future  # the last
+            while len(self._futures) > MOST:
+                del self._futures[next(iter(self._futures))]
+        if mine:
+            try:
+                future.set_result(make())
+            except BaseException as error:
+                future.set_exception(error)
+                with self._lock:
+                    self._futures.pop(key, None)
+        return future.result()
+
+    def __contains__(self, key: Any) -> bool:
+        future = self._futures.get(key)
+        return future is not None and future.done() and future.exception() is None
+
+    def __len__(self) -> int:
+        return len(self._futures)
+
+    def forget(self) -> None:
+        """Free what was made."""
+        with self._lock:
+            self._futures.clear()
 
 
 class Program:
@@ -94,9 +136,7 @@ class Program:
         seen: Callable[[Jaxpr, tuple[Any, ...]], None] = lambda jaxpr, args: None,
     ) -> None:
         self.function, self.options, self.seen = function, options, seen
-        self._made: dict[Any, Future[_Made]] = {}
-        self._lock = threading.Lock()
-        _all.add(self)
+        self._made: Made[_Compiled] = Made()
 
     def __call__(self, *args: Any) -> Any:
         call = _Call.of(args)
@@ -106,42 +146,22 @@ class Program:
         """Compile for such arguments, or wait for who does; what it returns, as shapes."""
         return self._compiled(_Call.of(args)).shapes
 
-    def forget(self) -> None:
-        """Free what was made."""
-        with self._lock:
-            self._made.clear()
+    def _compiled(self, call: _Call) -> _Compiled:
+        return self._made.of(exactly(call.key), partial(self._make, call))
 
-    def _compiled(self, call: _Call) -> _Made:
-        key = exactly(call.key)
-        with self._lock:
-            future = self._made.pop(key, None)
-            if mine := future is None:
-                future = Future()
-            self._made[key] = future  # the last
-            while len(self._made) > MOST:
-                del self._made[next(iter(self._made))]
-        if mine:
-            try:
-                future.set_result(self._make(call))
-            except BaseException as error:
-                future.set_exception(error)
-                with self._lock:
-                    self._made.pop(key, None)
-        return future.result()
-
-    def _make(self, call: _Call) -> _Made:
+    def _make(self, call: _Call) -> _Compiled:
         name = getattr(self.function, "__name__", type(self.function).__name__)
         place = place_of(name, (self.function, call.key, self.options))
         if place is None:
             return self._compile(call, name)
-        made = read(*place, lambda shapes, *own: _Made(deserialize_and_load(*own), shapes))
+        made = read(*place, lambda shapes, *own: _Compiled(deserialize_and_load(*own), shapes))
         if made is None:
             # What JAX's own cache gave cannot be written again, but no new name is there.
             made = self._compile(call, f"{name}_{secrets.token_hex(4)}")
             keep(place[0], lambda: (made.shapes, *serialize(made.compiled)))
         return made
 
-    def _compile(self, call: _Call, name: str) -> _Made:
+    def _compile(self, call: _Call, name: str) -> _Compiled:
         structures = []
 
         def flat(arrays):
@@ -158,7 +178,7 @@ class Program:
         lowered = traced.lower()
         after = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in lowered.out_info]
         compiled = _with_options(lowered, self.options)
-        return _Made(compiled, jax.tree.unflatten(structures[-1], after))
+        return _Compiled(compiled, jax.tree.unflatten(structures[-1], after))
 
 
 class _Call(NamedTuple):
@@ -240,7 +260,7 @@ def _is_array(leaf: object) -> bool:
     return hasattr(leaf, "shape") and hasattr(leaf, "dtype")
 
 
-class _Made(NamedTuple):
+class _Compiled(NamedTuple):
     """A program of lists of arrays, and the structure of what it returns."""
 
     compiled: jax.stages.Compiled

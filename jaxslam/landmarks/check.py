@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxslam._runtime.programs import QUICK, Program
 from jaxslam.geometry import GEOMETRIES, Geometry, Point
 from jaxslam.landmarks.parametrization import Parameters, Parametrization
 
@@ -31,7 +32,6 @@ _WHAT = (
     "the derivative of homogeneous",
 )  # fmt: skip
 """What is compared, in the order of `_compared`."""
-_QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 _Pair = tuple[Float[Array, "..."], Float[Array, "..."]]
 
 
@@ -65,7 +65,7 @@ def _check(landmark: Parametrization, geometry: Geometry) -> None:
     if not isinstance(size, int) or size < 1:
         raise _Fault(f"size({n}) is {size!r}; a whole number of parameters is accepted")
     _check_shapes(landmark, geometry, size)
-    compared = jax.jit(lambda x: _compared(landmark, geometry, x), compiler_options=_QUICK)
+    compared = Program(partial(_compared, landmark, geometry), QUICK)
     for omega in _INVERSE_DEPTHS:
         found = compared(jnp.array([*_BEARING[: n - 1], omega]))
         for what, pair in zip(_WHAT, found, strict=True):

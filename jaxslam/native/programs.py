@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -12,7 +11,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, PyTree
 
 from jaxslam._numerics.arrays import is_number
-from jaxslam._runtime.programs import MOST, Exact
+from jaxslam._runtime.programs import Exact, Made
 from jaxslam.native import batch
 
 
@@ -25,8 +24,7 @@ class NativePrograms:
 
     def __init__(self, function: Callable[[PyTree, PyTree, PyTree], PyTree]) -> None:
         self._function = function
-        self._made: dict[Exact, Future[Callable[..., PyTree]]] = {}
-        self._lock = threading.Lock()
+        self._made: Made[Callable[..., PyTree]] = Made()
 
     def __call__(self, fixed: object, given: PyTree, runs: PyTree) -> Callable[[int], PyTree]:
         """Return what computes so many first runs, compiled by the first thread that asks.
@@ -34,33 +32,13 @@ class NativePrograms:
         Raises ValueError, which says why, where the native backend cannot.
         """
         key, numbers = self._key(fixed, given, runs)
-        with self._lock:
-            future = self._made.pop(key, None)
-            if mine := future is None:
-                future = Future()
-            self._made[key] = future  # the last
-            while len(self._made) > MOST:
-                del self._made[next(iter(self._made))]
-        if mine:
-            try:
-                future.set_result(self._compiled(key))
-            except BaseException as error:
-                future.set_exception(error)
-        program = future.result()
+        program = self._made.of(key, partial(self._compiled, key))
         return lambda count: program(numbers, jax.tree.map(lambda x: x[:count], runs))
 
     def is_there(self, fixed: object, given: PyTree, runs: PyTree) -> bool:
         """Whether a program need not be compiled any more."""
         key, _ = self._key(fixed, given, runs)
-        made = self._made.get(key)
-        if made is not None:
-            return made.done() and made.exception() is None
-        return batch.is_kept(key.value)
-
-    def forget(self) -> None:
-        """Free what was made."""
-        with self._lock:
-            self._made.clear()
+        return key in self._made or batch.is_kept(key.value)
 
     @staticmethod
     def _key(fixed, given, runs) -> tuple[Exact, PyTree]:

@@ -115,7 +115,7 @@ def failing_compiler(tmp_path):
 def test_without_a_compiler_that_works_it_is_xla_and_nothing_is_said(kind, tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler" if kind == "none" else failing_compiler(tmp_path))
     monkeypatch.setattr(backends, "WORTH", 1)
-    backends.native_programs().forget()
+    programs.forget()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert study().backends == {NAME: "xla"}
@@ -123,7 +123,7 @@ def test_without_a_compiler_that_works_it_is_xla_and_nothing_is_said(kind, tmp_p
     with pytest.warns(UserWarning, match=f"{said}.*; {NAME} is computed by XLA") as told:
         assert study(backend="native").backends == {NAME: "xla"}
     assert "\n" not in str(told[0].message)
-    backends.native_programs().forget()
+    programs.forget()
 
 
 def scaled(shared, run):

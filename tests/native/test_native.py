@@ -12,7 +12,6 @@ from cases import quick_jit
 import jaxslam
 from jaxslam._numerics import linalg
 from jaxslam._runtime import programs
-from jaxslam.consistency import backends
 from jaxslam.consistency.store import NATIVE
 from jaxslam.native import NativePrograms, NotSupportedError, batch, batched, build
 from jaxslam.native.batch import Batch
@@ -418,7 +417,7 @@ def test_a_study_falls_back_to_xla(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     scenario = jaxslam.scenario("matched", steps=6, landmarks=4)  # compiled above
     filters = jaxslam.make_filters(scenario, ["world"], ["inverse_depth"])
-    backends.native_programs().forget()
+    programs.forget()
     with pytest.warns(UserWarning, match="is computed by XLA"):
         study = jaxslam.monte_carlo(scenario, filters, runs=10, backend="native")
     with warnings.catch_warnings():
