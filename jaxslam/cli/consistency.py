@@ -12,25 +12,13 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from jaxslam._runtime.files import write_json
 from jaxslam._runtime.progress import StudyBar
-from jaxslam.consistency import (
-    CHUNK,
-    FolderStore,
-    Study,
-    monte_carlo,
-    summarise,
-    table,
-)
+from jaxslam.consistency import CHUNK, FolderStore, Study, monte_carlo, summarise, table
 from jaxslam.consistency.backends import AUTO, check_backend
 from jaxslam.consistency.montecarlo import check_sizes, divided
 from jaxslam.consistency.records import check_records, write_records
 from jaxslam.filters.registry import FILTERS, FROM_REST, MODIFIERS, RECOMMENDED, make_filters
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.simulation.scenario import (
-    BUILT_IN,
-    Scenario,
-    parse_override,
-    scenario,
-)
+from jaxslam.simulation.scenario import BUILT_IN, Scenario, parse_override, scenario
 
 
 @dataclass(frozen=True)

@@ -35,12 +35,7 @@ from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.coordinates import KEYFRAME, WORLD
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.scale import ScaleGauge
-from jaxslam.simulation.pieces import (
-    calibration_sigma_of,
-    depth_of,
-    motion_of,
-    sensor_of,
-)
+from jaxslam.simulation.pieces import calibration_sigma_of, depth_of, motion_of, sensor_of
 from jaxslam.simulation.scenario import Scenario, as_scenario
 
 Piece = Any

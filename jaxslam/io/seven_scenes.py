@@ -9,13 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.io.calibration import Calibration
-from jaxslam.io.recording import (
-    Layout,
-    Recording,
-    check_rigid,
-    fixed,
-    of_files,
-)
+from jaxslam.io.recording import Layout, Recording, check_rigid, fixed, of_files
 from jaxslam.io.source import Trajectory
 from jaxslam.io.tum import read_table
 

@@ -1,11 +1,6 @@
 """Simulation: scenarios as data, and runs drawn from them."""
 
-from jaxslam.simulation.pieces import (
-    calibration_sigma_of,
-    depth_of,
-    motion_of,
-    sensor_of,
-)
+from jaxslam.simulation.pieces import calibration_sigma_of, depth_of, motion_of, sensor_of
 from jaxslam.simulation.run import Room, Run, Sightings, features, gone, sightings
 from jaxslam.simulation.scenario import BUILT_IN, Scenario, as_scenario, scenario
 from jaxslam.simulation.trajectories import RecordedMotion

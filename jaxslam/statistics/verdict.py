@@ -8,11 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxslam.statistics.bands import (
-    PowerSums,
-    lost_threshold,
-    whiteness_p_value,
-)
+from jaxslam.statistics.bands import PowerSums, lost_threshold, whiteness_p_value
 from jaxslam.statistics.looks import VERDICT_CONFIDENCE, Look, Verdict
 
 LOST_BOUND = 0.01

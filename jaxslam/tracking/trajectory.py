@@ -10,12 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from jaxslam.evaluation import write_covariances as write_pose_covariances
-from jaxslam.evaluation.alignment import (
-    MAX_TIME_DIFFERENCE,
-    Similarity,
-    associated,
-    similarity,
-)
+from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, Similarity, associated, similarity
 from jaxslam.evaluation.convention import Convention
 from jaxslam.io.tum import write_tum
 

@@ -13,14 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxslam.triangulation.estimates import ESTIMATES, estimate, push
-from jaxslam.triangulation.samples import (
-    Distance,
-    Marginal,
-    Samples,
-    distance,
-    marginal,
-    quantiles,
-)
+from jaxslam.triangulation.samples import Distance, Marginal, Samples, distance, marginal, quantiles
 from jaxslam.triangulation.truth import particles as true_particles
 from jaxslam.triangulation.views import TwoViews, measure
 

@@ -19,13 +19,7 @@ from jaxtyping import Array, Bool, Int
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam._numerics.conditional import cond
-from jaxslam.filters.ekf import (
-    EkfSlam,
-    check_one_gaussian,
-    each_gaussian,
-    ekf_inside,
-    rebased,
-)
+from jaxslam.filters.ekf import EkfSlam, check_one_gaussian, each_gaussian, ekf_inside, rebased
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.protocol import (
     AbstractFilter,

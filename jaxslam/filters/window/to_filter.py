@@ -19,13 +19,7 @@ from jaxslam.filters.forms.blocks import shifted
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.model import Core
 from jaxslam.filters.window.minimise import LANDMARK_STEPS, Minimum, landmarks
-from jaxslam.filters.window.problem import (
-    PathLayout,
-    Reduced,
-    located,
-    path,
-    reduced,
-)
+from jaxslam.filters.window.problem import PathLayout, Reduced, located, path, reduced
 from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.scale import Direction, rescaled, scaling
 from jaxslam.geometry import Scalar, identity, jacobian, scaled

@@ -18,13 +18,7 @@ from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.map import Map
 from jaxslam.tracking.observations import Prediction
 from jaxslam.tracking.places.descriptors import candidates, described_corners
-from jaxslam.tracking.places.relocalisation import (
-    FEWEST,
-    MOST_OF,
-    TRIED,
-    pose_of,
-    well_known,
-)
+from jaxslam.tracking.places.relocalisation import FEWEST, MOST_OF, TRIED, pose_of, well_known
 from jaxslam.tracking.places.submaps import Submap, loop_of
 from jaxslam.tracking.pointcloud import seen_from
 from jaxslam.tracking.search import search
