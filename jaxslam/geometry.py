@@ -70,12 +70,10 @@ def _is_pose(leaf: PyTree) -> bool:
 
 
 def _sizes(leaves: list[PyTree]) -> list[int]:
-    return [_pose_size(leaf) if _is_pose(leaf) else leaf.size for leaf in leaves]
-
-
-def _pose_size(leaf: jaxlie.MatrixLieGroup) -> int:
     """A pose may be a batch of poses, whose tangents follow one another."""
-    return leaf.tangent_dim * math.prod(leaf.get_batch_axes())
+    return [
+        x.tangent_dim * math.prod(x.get_batch_axes()) if _is_pose(x) else x.size for x in leaves
+    ]
 
 
 def tangent_dim(tree: PyTree) -> int:

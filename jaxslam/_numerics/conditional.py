@@ -112,11 +112,8 @@ def repeated(
             value, going = call(value)
             return turn + 1, value, jnp.any(going)
 
-        def due(carry):
-            return carry[2] & (carry[0] < most)
-
         start = jnp.zeros((), int), value, jnp.ones((), bool)
-        return jax.lax.while_loop(due, again, start)[1]
+        return jax.lax.while_loop(lambda x: x[2] & (x[0] < most), again, start)[1]
 
     @custom_vmap
     def one(value, arrays):
@@ -144,10 +141,8 @@ def _once(
         turn, value = carry
         return turn + 1, function(value, *jax.tree.map(lambda x: x[turn], stacked))
 
-    def due(carry):
-        return wanted & (carry[0] < 1)
-
-    return jax.lax.while_loop(due, once, (jnp.zeros((), int), value))[1]
+    start = jnp.zeros((), int), value
+    return jax.lax.while_loop(lambda carry: wanted & (carry[0] < 1), once, start)[1]
 
 
 def _spread(size: int, batched: PyTree, values: PyTree) -> PyTree:

@@ -91,7 +91,8 @@ class Made(Generic[T]):
         _all.add(self)
 
     def of(self, key: Any, make: Callable[[], T]) -> T:
-        """Return the program of this key, or make it."""
+        """Return the program of this key, which is the same only `exactly`, or make it."""
+        key = exactly(key)
         with self._lock:
             future = self._futures.pop(key, None)
             if mine := future is None:
@@ -109,7 +110,7 @@ class Made(Generic[T]):
         return future.result()
 
     def __contains__(self, key: Any) -> bool:
-        future = self._futures.get(key)
+        future = self._futures.get(exactly(key))
         return future is not None and future.done() and future.exception() is None
 
     def __len__(self) -> int:
@@ -147,7 +148,7 @@ class Program:
         return self._compiled(_Call.of(args)).shapes
 
     def _compiled(self, call: _Call) -> _Compiled:
-        return self._made.of(exactly(call.key), partial(self._make, call))
+        return self._made.of(call.key, partial(self._make, call))
 
     def _make(self, call: _Call) -> _Compiled:
         name = getattr(self.function, "__name__", type(self.function).__name__)
@@ -237,18 +238,6 @@ def exactly(value: Any) -> Any:
     if is_dataclass(value):
         return kind, tuple(exactly(getattr(value, f.name, None)) for f in fields(value))
     return kind, value, exactly(getattr(value, "__dict__", ()))
-
-
-class Exact(NamedTuple):
-    """A value as an argument of a cache, which finds it by `exactly`."""
-
-    value: Any
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Exact) and exactly(self.value) == exactly(other.value)
-
-    def __hash__(self) -> int:
-        return hash(exactly(self.value))
 
 
 def wide() -> bool:

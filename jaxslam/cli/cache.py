@@ -27,7 +27,8 @@ def keep_programs() -> None:
         keep_in(None if "://" in told else Path(told))
         return
     try:
-        folder = _cache_home() / "jaxslam"
+        home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
+        folder = (Path(home) if home else Path.home() / ".cache") / "jaxslam"
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, RuntimeError):  # RuntimeError: nobody's home
         return
@@ -36,8 +37,3 @@ def keep_programs() -> None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
         if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
             jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH)
-
-
-def _cache_home() -> Path:
-    told = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
-    return Path(told) if told else Path.home() / ".cache"

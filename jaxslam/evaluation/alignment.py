@@ -10,6 +10,7 @@ onto the errors that the alignment leaves as they are, `Vᵀ e = 0`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -254,10 +255,7 @@ def aligned(
         raise ValueError(
             "covariances given the scale are aligned by sim3, or by se3 where the first is zero"
         )
-
-    def to_all(run: Poses, convention: Convention) -> Poses:
-        return _to_all(run, convention, scaled=align == "sim3")
-
+    to_all = partial(_to_all, scaled=align == "sim3")
     notes = (TO_ALL if poses.joint is not None else INDEPENDENT,)
     if any(_line(run, convention) is not None for run in _runs(poses)):
         notes += (STRAIGHT,)

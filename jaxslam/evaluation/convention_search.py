@@ -58,11 +58,8 @@ class Tried(NamedTuple):
 
     @property
     def finite(self) -> bool:
-        return not any(np.isinf(x).any() for x in self.nees_of_parts())
-
-    def nees_of_parts(self) -> list[Float[np.ndarray, "runs steps"]]:
-        """The NEES of all axes, of the position and of the rotation."""
-        return [x for x in (self.nees, self.position, self.rotation) if x is not None]
+        parts = (self.nees, self.position, self.rotation)
+        return not any(np.isinf(x).any() for x in parts if x is not None)
 
     @property
     def whole(self) -> bool:
@@ -176,17 +173,14 @@ def identify(
         fits = best_free is not None and best_free.consistent
         if not fits or (best is not None and not _scale_was_free(best, best_free)):
             equal = ()
-    return Identification(stated, _means(finite), equal, stands, whole)
+    means = {c: float(np.nanmean(x.nees)) for c, x in finite.items()}
+    return Identification(stated, means, equal, stands, whole)
 
 
 def _finite(tried: Mapping[Convention, Tried]) -> dict[Convention, Tried]:
     """The finite ones, over the steps that all have: one may know a first pose exactly."""
     steps = min((x.nees.shape[1] for x in tried.values()), default=0)
     return {c: last for c, x in tried.items() if (last := x.last(steps)).finite}
-
-
-def _means(tried: Mapping[Convention, Tried]) -> dict[Convention, float]:
-    return {c: float(np.nanmean(x.nees)) for c, x in tried.items()}
 
 
 def _best(tried: Mapping[Convention, Tried]) -> tuple[Tried | None, tuple[Convention, ...]]:

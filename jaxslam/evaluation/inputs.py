@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from jaxslam._runtime.files import LARGEST, read_arrays
 from jaxslam._runtime.lookup import suggestion
 from jaxslam.evaluation.convention import CHOICES, geometry_of
-from jaxslam.io.tum import check_seconds, not_rigid, poses, read_table, words
+from jaxslam.io.tum import check_seconds, not_rigid, of_xytheta, poses, read_table, words
 
 _KEYS = (
     "errors", "innovations", "covariances", "sigmas", "estimates", "truths", "nees", "nis", "dof",
@@ -267,15 +267,6 @@ def of_sigmas(sigmas: ArrayLike) -> Float[np.ndarray, "runs steps n n"]:
         squared = sigma[..., None] * sigma[..., None, :]
     there = all_nan(sigma)[..., None, None] | np.eye(sigma.shape[-1], dtype=bool)
     return np.where(there, squared, 0.0)
-
-
-def of_xytheta(poses: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """Matrices of poses x, y, θ in the plane; NaN of NaN."""
-    x, y, angle = np.moveaxis(poses, -1, 0)
-    with np.errstate(invalid="ignore"):
-        c, s, zero = np.cos(angle), np.sin(angle), 0 * angle
-    rows = (c, -s, x), (s, c, y), (zero, zero, zero + 1)
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLike) -> Poses:

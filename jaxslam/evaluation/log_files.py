@@ -286,13 +286,14 @@ def evaluate_runs(
     if len({one.estimates.shape[1:] for one in read}) > 1:
         raise ValueError(f"{source}: runs of the plane and of space; of one of them are accepted")
     names = tuple(run.name for run in runs)
+    truths = [np.where(x.evaluated.poses[:, None, None], x.truths.values, np.nan) for x in read]
     longest = max(read, key=lambda one: len(one.times))
     found = named(
         runs[0].estimate if len(runs) == 1 else source,
         lambda: evaluate_poses(
             _filled_up([one.estimates for one in read]),
             _filled_up([one.covariances.values for one in read]),
-            _filled_up([_evaluated_truths(one) for one in read]),
+            _filled_up(truths),
             convention,
             times=longest.times,
             **how,
@@ -316,11 +317,6 @@ def _convention_of(read: list[_RunLog], stated: dict[str, str]) -> Convention:
                 f"{read[0].run.covariance} ({Convention(**read[0].said)})"
             )
     return stated_before(read[0].said, stated)
-
-
-def _evaluated_truths(one: _RunLog) -> Float[np.ndarray, "n d d"]:
-    """The true poses, NaN for those that have no part in the verdict."""
-    return np.where(one.evaluated.poses[:, None, None], one.truths.values, np.nan)
 
 
 def _filled_up(runs: list[np.ndarray]) -> np.ndarray:

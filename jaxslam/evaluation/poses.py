@@ -157,7 +157,8 @@ def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseE
         normalised(errors, P)  # refuses what is not positive definite, by run and step
     if truth_sigma is not None:
         later = _with_truth(world, later, convention, axes, truth_sigma)
-        P, notes = later.covariances[..., axes[:, None], axes], (*notes, _truth_remark(truth_sigma))
+        P, (metres, degrees) = later.covariances[..., axes[:, None], axes], truth_sigma
+        notes += (f"σ of the truth, {metres:g} m and {degrees:g}°, is a part of every σ claimed",)
     if world.given:
         errors, P, fitted, axis_fitted, scale = at_one_scale(later, convention, axes)
         notes += (BEYOND,)
@@ -324,11 +325,6 @@ def checked_sigma(sigma: Sequence[float] | None) -> tuple[float, float] | None:
             f"truth_sigma must be two numbers, metres and degrees, not negative, not {sigma}"
         )
     return float(told[0]), float(told[1])
-
-
-def _truth_remark(sigma: tuple[float, float]) -> str:
-    """A remark on it beside the verdict."""
-    return f"σ of the truth, {sigma[0]:g} m and {sigma[1]:g}°, is a part of every σ claimed"
 
 
 def with_truth(

@@ -196,14 +196,12 @@ def joint_compatibility(found: Candidates) -> Bool[Array, " m"]:
         depth, taken = _next_branch(node.depth + 1, taken, within, jnp.sum(best))
         return _Node(depth, taken, W, squares, best, node.count + 1)
 
-    def going(node: _Node):
-        return (node.depth < m) & (node.count < MOST_NODES)
-
     none, zero = jnp.zeros(m, bool), jnp.zeros((), int)
     nothing = jnp.zeros_like(ordered.residual)
     W = jnp.zeros((m * p, m * p), nothing.dtype)
-    best = jax.lax.while_loop(going, step, _Node(zero, none, W, nothing[:, 0], none, zero)).best
-    return none.at[order].set(best)
+    start = _Node(zero, none, W, nothing[:, 0], none, zero)
+    last = jax.lax.while_loop(lambda x: (x.depth < m) & (x.count < MOST_NODES), step, start)
+    return none.at[order].set(last.best)
 
 
 ASSOCIATIONS: dict[str, Association] = {

@@ -271,7 +271,8 @@ def correct(
     if seen.noise_factor is not None:
         noise = noise * seen.noise_factor[:, None, None]
     context = context_of(slam, control)
-    return slam.form.update(slam.model, state, seen, noise, context, _considered(slam, state))
+    left = slice(0, 0) if slam.calibration.corrected else state.core.part("calibration")
+    return slam.form.update(slam.model, state, seen, noise, context, left)
 
 
 def init_with_depths(
@@ -438,11 +439,6 @@ def _forgotten(slam: EkfSlam, state: Belief) -> Belief:
     part = state.core.part("calibration")
     core = replace(state.core, calibration=jnp.zeros_like(state.core.calibration))
     return replace(slam.form.marginalise(state, part.start, part.stop - part.start), core=core)
-
-
-def _considered(slam: EkfSlam, state: Belief) -> slice:
-    """The part of the core that updates leave as it is."""
-    return slice(0, 0) if slam.calibration.corrected else state.core.part("calibration")
 
 
 def _depth_prior(slam: EkfSlam, state: Belief) -> Prior:

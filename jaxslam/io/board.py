@@ -60,10 +60,8 @@ class Board:
     def corners(self) -> Float32[np.ndarray, "n 3"]:
         """The points where four squares meet, row by row, m."""
         y, x = np.mgrid[1 : self.rows, 1 : self.columns]
-        return self._on_board(np.stack([x.ravel(), y.ravel()], 1))
-
-    def _on_board(self, squares: np.ndarray) -> Float32[np.ndarray, "n 3"]:
-        return np.pad(self.square * squares, ((0, 0), (0, 1))).astype(np.float32)
+        points = self.square * np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+        return points.astype(np.float32)
 
     @cached_property
     def _charuco(self) -> cv2.aruco.CharucoBoard:

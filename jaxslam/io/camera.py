@@ -87,13 +87,11 @@ class _Newest:
                 self._changed.notify()
 
 
-def _is_number(path: Path) -> bool:
-    return str(path).isdecimal() and not path.exists()
-
-
 def _open(path: Path, _rate: float) -> Recording:
     live = Live(int(str(path)))
     return Recording(f"camera {live.number}", np.zeros(0), live.images, clock=live.clock)
 
 
-CAMERA = Layout("the number of a camera (0)", _is_number, _open)
+CAMERA = Layout(
+    "the number of a camera (0)", lambda x: str(x).isdecimal() and not x.exists(), _open
+)

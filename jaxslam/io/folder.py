@@ -7,10 +7,6 @@ import numpy as np
 from jaxslam.io.recording import Layout, Recording, image_files, of_files, of_listing
 
 
-def _open_timestamped(path: Path, _rate: float) -> Recording:
-    return of_listing(path, path / "timestamps.txt", path / "images")
-
-
 def _open_plain(path: Path, rate: float) -> Recording:
     files = image_files(path)
     return of_files(path, files, np.arange(len(files)) / rate)
@@ -19,7 +15,7 @@ def _open_plain(path: Path, rate: float) -> Recording:
 TIMESTAMPED = Layout(
     "a folder with images/ and timestamps.txt",
     lambda path: (path / "timestamps.txt").is_file(),
-    _open_timestamped,
+    lambda path, _rate: of_listing(path, path / "timestamps.txt", path / "images"),
 )
 PLAIN = Layout(
     "a folder of images", lambda path: path.is_dir() and bool(image_files(path)), _open_plain

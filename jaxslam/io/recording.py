@@ -59,7 +59,8 @@ def of_files(
 
     Its `calibration.json`, where it has one, is better than what the layout says.
     """
-    calibration = calibration_beside(path) or calibration
+    if (own := path / "calibration.json").is_file():
+        calibration = fixed(read_calibration(own))
     name = path.resolve().name
     return Recording(name, times, lambda: map(read_image, files), calibration, reference)
 
@@ -117,12 +118,6 @@ def image_files(path: Path) -> list[Path]:
 def _natural(name: str) -> list[tuple[int, str]]:
     parts = re.split(r"(\d+)", name.lower())
     return [(int(part), "") if part.isdecimal() else (0, part) for part in parts]
-
-
-def calibration_beside(path: Path) -> Calibrator | None:
-    """The calibration in a folder's `calibration.json`; None where there is none."""
-    file = path / "calibration.json"
-    return fixed(read_calibration(file)) if file.is_file() else None
 
 
 def fixed(calibration: Calibration) -> Calibrator:

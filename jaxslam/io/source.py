@@ -56,16 +56,14 @@ class Source:
 
     def __iter__(self) -> Iterator[Frame]:
         # The picture first: a clock is asked after it.
+        times = iter(self.times) if self.clock is None else iter(self.clock, None)
         index = self.first
-        for image, time in zip(self.images(), self._clocked(), strict=False):
+        for image, time in zip(self.images(), times, strict=False):
             check_size(f"{self.name}: image {index}", image, self.calibration)
             yield Frame(index, float(time), image)
             index += self.every
         if index < self.first + self.every * len(self):
             raise ValueError(f"{self.name}: image {index} cannot be read: the pictures end there")
-
-    def _clocked(self) -> Iterator[float]:
-        return iter(self.times) if self.clock is None else iter(self.clock, None)
 
 
 def check_size(what: str, image: Image, calibration: Calibration) -> None:

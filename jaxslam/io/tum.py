@@ -253,11 +253,16 @@ def _planar(path: Path, rows: np.ndarray, lines: tuple[int, ...]) -> Float[np.nd
     far = np.flatnonzero(np.abs(rows).max(axis=1) > LARGEST)
     if far.size:
         raise ValueError(f"{path}, line {lines[far[0]]}: numbers up to {LARGEST:.0e} are accepted")
-    T = np.tile(np.eye(3), (len(rows), 1, 1))
-    c, s = np.cos(rows[:, 3]), np.sin(rows[:, 3])
-    T[:, :2, :2] = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
-    T[:, :2, 2] = rows[:, 1:3]
-    return T
+    return of_xytheta(rows[:, 1:])
+
+
+def of_xytheta(poses: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Matrices of poses x, y, θ in the plane; NaN of NaN."""
+    x, y, angle = np.moveaxis(poses, -1, 0)
+    with np.errstate(invalid="ignore"):
+        c, s, zero = np.cos(angle), np.sin(angle), 0 * angle
+    rows = (c, -s, x), (s, c, y), (zero, zero, zero + 1)
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _matrices(path: Path, rows: np.ndarray, lines: tuple[int, ...]) -> Float[np.ndarray, "n 4 4"]:

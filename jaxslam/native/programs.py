@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, PyTree
 
 from jaxslam._numerics.arrays import is_number
-from jaxslam._runtime.programs import Exact, Made
+from jaxslam._runtime.programs import Made
 from jaxslam.native import batch
 
 
@@ -38,25 +38,25 @@ class NativePrograms:
     def is_there(self, fixed: object, given: PyTree, runs: PyTree) -> bool:
         """Whether a program need not be compiled any more."""
         key, _ = self._key(fixed, given, runs)
-        return key in self._made or batch.is_kept(key.value)
+        return key in self._made or batch.is_kept(key)
 
     @staticmethod
-    def _key(fixed, given, runs) -> tuple[Exact, PyTree]:
+    def _key(fixed, given, runs) -> tuple[tuple, PyTree]:
         """Return all that decides a program, and the numbers that it is given."""
         numbers, rest = eqx.partition(given, is_number)
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct((1, *x.shape[1:]), x.dtype), runs)
         shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x), x.dtype), numbers)
-        return Exact((fixed, *_hashable(rest), *_hashable((shapes, one)))), numbers
+        return (fixed, *_hashable(rest), *_hashable((shapes, one))), numbers
 
-    def _compiled(self, key: Exact) -> PyTree:
-        fixed, leaves, structure, shapes, of_data = key.value
+    def _compiled(self, key: tuple) -> PyTree:
+        fixed, leaves, structure, shapes, of_data = key
         rest = jax.tree.unflatten(structure, leaves)
         numbers, runs = jax.tree.unflatten(of_data, shapes)
 
         def one(numbers, run):
             return self._function(fixed, eqx.combine(numbers, rest), run)
 
-        return batch.batched(one, numbers, runs, key.value)
+        return batch.batched(one, numbers, runs, key)
 
 
 def _hashable(tree: PyTree) -> tuple[tuple[PyTree, ...], jax.tree_util.PyTreeDef]:

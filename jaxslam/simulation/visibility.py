@@ -16,20 +16,14 @@ def in_image(scenario: Scenario, points, pixels) -> Bool[Array, " l"]:
     return inside & (points[:, -1] > scenario.visible_depth)
 
 
-def _in_range(scenario: Scenario, points, measured) -> Bool[Array, " l"]:
-    """Neither too near nor too far, in any direction."""
-    del measured
-    least, greatest = scenario.range
-    distance = jnp.linalg.norm(points, axis=-1)
-    return (distance >= least) & (distance <= greatest)
-
-
 def visible(s: Scenario, sensor: AbstractSensor, points, measured) -> Bool[Array, " l"]:
     """A camera sees what is in its picture; another sensor what is in its range."""
     if isinstance(sensor, Pinhole):
         near = points[:, -1] <= s.depth_range[-1] if s.placement == "cloud" else True
         return in_image(s, points, measured) & near
-    return _in_range(s, points, measured) & jax.vmap(sensor.possible)(points)
+    (least, greatest), distance = s.range, jnp.linalg.norm(points, axis=-1)
+    in_range = (distance >= least) & (distance <= greatest)
+    return in_range & jax.vmap(sensor.possible)(points)
 
 
 def limited(scenario: Scenario, key: Array, visible: Bool[Array, "frames l"]):

@@ -138,7 +138,8 @@ class Map:
         self._make_room(len(pixels), kept)
         slots = self._free(len(pixels))
         report = self.estimator.renew(slots, pixels)
-        self.place.follow(report, self._nearness(), self._found_again())
+        found = [one.number for one in self.landmarks.values() if one.found]
+        self.place.follow(report, self._nearness(), found)
         self._add(slots, image, pixels)
         more = self.place.unit_fixed and self.seen is None and len(self.submaps) < MOST
         if report.left and more:
@@ -264,7 +265,8 @@ class Map:
         """Go on without a measurement. Where that is broken too, the camera is as far from where it
         was last as the prior on a start's velocity lets it be."""
         if self.estimator.correct(predicted).failed:
-            self.place.restart_in_metres()
+            self.place.restart()
+            self.place.log_unit = -self.place.log_scale  # its state is empty: in metres
             self._begin_chain()
             self.estimator.correct(self.estimator.predict(predicted.dt))
 
@@ -312,9 +314,6 @@ class Map:
             return {}
         numbers = {slot: one.number for slot, one in self.landmarks.items()}
         return nearness(numbers, self.estimator.points()[0])
-
-    def _found_again(self) -> list[int]:
-        return [one.number for one in self.landmarks.values() if one.found]
 
     def _recorded(self, slots: list[int]) -> Points:
         points, covariances = (part[slots] for part in self.estimator.points())

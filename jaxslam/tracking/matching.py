@@ -100,7 +100,7 @@ def match_patches(
     pixels = chosen.pixels + _quadratic_peaks(chosen.around)
     variances = np.zeros(len(pixels))
     if len(pixels):
-        pixels, _, variances = refine(whole, templates[chosen.owner], pixels)
+        pixels, variances = refine(whole, templates[chosen.owner], pixels)
     return Matches(chosen.owner, pixels, chosen.scores, variances)
 
 
@@ -109,8 +109,6 @@ class Fit(NamedTuple):
 
     pixels: Float[np.ndarray, "n 2"]
     """Where, sub-pixel."""
-    maps: Float[np.ndarray, "n 2 2"]
-    """Offsets in the templates to those in the picture."""
     variances: Float[np.ndarray, " n"]
     """Of each pixel's u and v, pixels²."""
 
@@ -149,7 +147,7 @@ def refine(
     maps = np.where(gone[:, None, None], identity, maps)
     windows, likeness = known.compared(image, places, maps)
     s2 = 2 * np.maximum(1 - likeness, 0.0) / windows.shape[1]
-    return Fit(places, maps, s2 * np.trace(known.inverse[:, :2, :2], axis1=1, axis2=2) / 2)
+    return Fit(places, s2 * np.trace(known.inverse[:, :2, :2], axis1=1, axis2=2) / 2)
 
 
 class _Templates(NamedTuple):

@@ -242,7 +242,7 @@ def _explained(seen: Observations, given: Prediction) -> bool:
     squared = np.einsum(
         "ki,ki->k", off, np.linalg.solve(given.covariances[slots], off[..., None])[..., 0]
     )
-    return bool(np.mean(squared < GATE) > 0.8)
+    return bool(np.mean(squared < GATE) > EXPLAINED)
 
 
 def more_than_chance(searched: int, chance: float = CHANCE) -> int:

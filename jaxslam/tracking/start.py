@@ -22,7 +22,8 @@ def trackable(
     begin with the target."""
     check_can_track(made, name)
     assert isinstance(made, AbstractStaged)
-    if target is not None and not _keeps_metres(made):
+    plain = isinstance(made, EkfSlam) and made.depth.common is None
+    if target is not None and not (plain and isinstance(made.scale, Metre)):
         raise ValueError(
             f"filter {name} cannot begin with a target: one that is an EkfSlam, "
             "without a scale of its own, as `world` and `robocentric` are, is accepted"
@@ -45,11 +46,6 @@ def _handing_over(made: AbstractStaged) -> AbstractStaged:
     except ValueError:
         return made
     return made if inner.landmark.anchored else in_submaps(made)
-
-
-def _keeps_metres(slam: AbstractStaged) -> bool:
-    """Return whether depths in metres can be given to a filter, landmark by landmark."""
-    return isinstance(slam, EkfSlam) and isinstance(slam.scale, Metre) and slam.depth.common is None
 
 
 def with_target(

@@ -96,11 +96,6 @@ class MapInWorld:
         self.origin = self.camera
         self.told = self.known = PoseWithCovariance()
 
-    def restart_in_metres(self) -> None:
-        """The same of a filter whose state is empty, which is in metres."""
-        self.restart()
-        self.log_unit = -self.log_scale
-
     def expected(self, view: Prediction) -> Prediction:
         """Return what the filter expects, in the world and in the map's unit."""
         T_wc = view.T_wc.copy()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Generator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +25,15 @@ from jaxslam.tracking.summary import (
     known_points,
     reference_in_map,
     summarised,
-    trajectory_errors,
     trajectory_of,
 )
 from jaxslam.tracking.target import Target
 from jaxslam.tracking.tracker import Tracker
-from jaxslam.tracking.trajectory import write_covariances, write_trajectory
+from jaxslam.tracking.trajectory import (
+    absolute_trajectory_error,
+    write_covariances,
+    write_trajectory,
+)
 from jaxslam.tracking.viewer import Viewer
 
 _MAP_EVERY = 10
@@ -109,7 +112,7 @@ def _shown(
 
         def show(frame: Frame) -> None:
             if writer is not None:
-                aside.give(_film, writer, frame, history[-1])
+                aside.give(lambda *drawn: writer.write(overlay_of(*drawn)), frame, history[-1])
             if recording is not None:
                 aside.give(recording.show, frame, history[-1])
                 if len(history) % _MAP_EVERY == 0:
@@ -126,10 +129,6 @@ def _writer(source: Source, path: Path) -> OverlayWriter:
     times, calibration = source.times, source.calibration
     rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 30.0
     return OverlayWriter(path, overlay_size(calibration.width, calibration.height), rate)
-
-
-def _film(writer: OverlayWriter, frame: Frame, result: Tracked) -> None:
-    writer.write(overlay_of(frame, result))
 
 
 def _write(
@@ -155,7 +154,10 @@ def _write(
     write_frames(out / "frames.csv", history)
     summary = summarised(source, tracker, history, points, seconds)
     if "ate" in summary:
-        summary["ate_causal"] = trajectory_errors(source, before).get("ate")
+        assert source.reference is not None
+        with suppress(ValueError):
+            error = absolute_trajectory_error(*trajectory_of(before), *source.reference)
+            summary["ate_causal"] = error
     write_json(out / "summary.json", summary, allow_nan=False)
     tracker.save(out / "map.npz")
     known = known_points(points, history)

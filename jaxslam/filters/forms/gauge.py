@@ -35,11 +35,6 @@ def scale_is_free(model: SlamModel) -> bool:
     return model.motion.has_velocity and model.sensor.hidden > 0
 
 
-def gauge_dim(model: SlamModel) -> int:
-    """g: 3 or 6 for the base frame, and 1 for the scale where it is free."""
-    return model.geometry.tangent_dim + scale_is_free(model)
-
-
 def act(
     model: SlamModel, rigid: Pose, factor: Scalar, core: Core, landmarks: Float[Array, "capacity d"]
 ) -> tuple[Core, Float[Array, "capacity d"]]:
@@ -86,5 +81,6 @@ def unobservable_directions(model: SlamModel, state: State) -> Float[Array, "n g
         factor = 1 + jnp.sum(s[t:])
         return act(model, nudge(origin, s[:t]), factor, state.core, state.landmarks)
 
-    N = jacobian(moved, jnp.zeros(gauge_dim(model), dtype))
+    # The base frame, and the scale where it is free.
+    N = jacobian(moved, jnp.zeros(model.geometry.tangent_dim + scale_is_free(model), dtype))
     return jnp.where(state.numbers(state.active)[:, None], N, 0.0)

@@ -130,14 +130,12 @@ def posterior(
         new, at = linear(y)
         return new, at, jnp.any(jnp.abs(new - y) > SMALLEST), count + 1
 
-    def going_on(carry):
-        *_, moved, count = carry
-        return moved & (count < STEPS)
-
     zero = jnp.zeros(chain.shape, chain.links.root.dtype)
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(linear, zero)[1])
     start = zero, nothing, jnp.asarray(True), 0
-    _, (states, rows, factor), moved, _ = jax.lax.while_loop(going_on, step, start)
+    _, (states, rows, factor), moved, _ = jax.lax.while_loop(
+        lambda x: x[2] & (x[3] < STEPS), step, start
+    )
     return Posterior(chain, states, rows, factor, ~moved)
 
 

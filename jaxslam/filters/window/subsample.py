@@ -13,7 +13,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, Shaped
+from jaxtyping import Array, Int, Shaped
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam.filters.ekf import EkfSlam
@@ -43,7 +43,8 @@ def _fewer(record: Record) -> Record:
     measured, seen = _without_orphans(record)
     seen = _padded(seen[stay], frames)
     # Where the velocity is drawn anew, it stood before.
-    lasting = jax.tree.map(lambda x: jnp.where(_stood(record), 0.0, x), record.controls)
+    stood = jnp.append(record.restarted[1:], False)
+    lasting = jax.tree.map(lambda x: jnp.where(stood, 0.0, x), record.controls)
     return Record(
         jnp.asarray(len(stay) - 1, record.last.dtype),
         jax.tree.map(lambda x: _sums(x, frames), lasting),
@@ -65,11 +66,6 @@ def _without_orphans(record: Record) -> tuple[Array, Array]:
     slots, to = jnp.arange(last.size), jnp.where(orphan, last + 1, record.frames)
     measured = record.measured.at[to, slots].set(record.measured[last, slots], mode="drop")
     return measured, seen.at[to, slots].set(True, mode="drop")
-
-
-def _stood(record: Record) -> Bool[Array, " steps"]:
-    """Steps just before one in which the velocity is drawn anew."""
-    return jnp.append(record.restarted[1:], False)
 
 
 def _noises(slam: EkfSlam, record: Record, fewer: Record, x: X) -> X:

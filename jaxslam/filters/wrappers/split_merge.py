@@ -188,12 +188,8 @@ def _halves(parent: State, by_core: Float[Array, "n c"]) -> State:
     variance = jnp.maximum(values[-1], 0.0)
     sigma = jnp.sqrt(jnp.maximum(variance, jnp.finfo(variance.dtype).tiny))
     away = SPLIT * slopes @ vectors[:, -1] / sigma
-    smaller = parent.covariance - jnp.outer(away, away)
-
-    def half(sign):
-        return replace(shifted(parent, sign * away), covariance=smaller)
-
-    return jax.vmap(half)(jnp.array([-1.0, 1.0], away.dtype))
+    parent = replace(parent, covariance=parent.covariance - jnp.outer(away, away))
+    return jax.vmap(lambda sign: shifted(parent, sign * away))(jnp.array([-1.0, 1.0], away.dtype))
 
 
 def collapsed(members: State, log_weights: Float[Array, " k"]) -> State:

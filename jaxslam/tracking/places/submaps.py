@@ -353,10 +353,7 @@ def _solved(known: Posterior) -> tuple[Array, Array, Array]:
     chain = known.chain
 
     def one(k: Array) -> tuple[Array, Array]:
-        def camera(states: State) -> PyTree:
-            return _row(base_poses(chain, states), k)
-
-        T_BC, P = known.marginal(camera)
+        T_BC, P = known.marginal(lambda states: _row(base_poses(chain, states), k))
         return T_BC.as_matrix(), P
 
     X, omega = jax.vmap(jax.vmap(chain.slam.landmark.homogeneous))(known.states.landmarks)
