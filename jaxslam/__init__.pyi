@@ -26,13 +26,7 @@ from jaxslam.filters.wrappers.fixed_lag import FixedLag
 from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
 from jaxslam.geometry import PLANAR, SPATIAL
 from jaxslam.landmarks import LANDMARKS, Parametrization, check_landmark
-from jaxslam.models.calibration import (
-    AbstractCalibration,
-    Considered,
-    Estimated,
-    Known,
-    White,
-)
+from jaxslam.models.calibration import AbstractCalibration, Considered, Estimated, Known, White
 from jaxslam.models.camera import Camera
 from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.models.depth import InverseDepth

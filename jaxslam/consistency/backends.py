@@ -59,11 +59,7 @@ def _warn_of_lapack(jaxpr: Jaxpr, args: tuple[PyTree, ...]) -> None:
 
 @partial(Program, options=BATCHED, seen=_warn_of_lapack)
 def _filter_batch(
-    slam: AbstractFilter,
-    room: Room,
-    sensor: AbstractSensor,
-    runs: Run,
-    wanted: Int[Array, ""],
+    slam: AbstractFilter, room: Room, sensor: AbstractSensor, runs: Run, wanted: Int[Array, ""]
 ) -> tuple[Records, Records]:
     """Compute a batch in parts that fit the cache.
 

@@ -122,9 +122,7 @@ def step_times(times: ArrayLike | None, steps: int) -> Float[np.ndarray, " steps
     return array
 
 
-def exactly_known(
-    covariances: Float[np.ndarray, "*batch n n"],
-) -> Bool[np.ndarray, "*batch"]:
+def exactly_known(covariances: Float[np.ndarray, "*batch n n"]) -> Bool[np.ndarray, "*batch"]:
     """A mask of the covariances that are zero, of what is known by definition.
 
     A first camera at the origin is: it has no degree of freedom, and no part in a NEES.

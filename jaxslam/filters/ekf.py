@@ -261,10 +261,7 @@ def context_of(slam: EkfSlam, control: Control) -> Context:
 
 
 def correct(
-    slam: EkfSlam,
-    state: Belief,
-    control: Control,
-    seen: Features,
+    slam: EkfSlam, state: Belief, control: Control, seen: Features
 ) -> tuple[Belief, PyTree]:
     """The Kalman update by features of slots, and what the form says that it compared."""
     noise = slam.sensor.noise

@@ -122,10 +122,7 @@ _AROUND_ANY_FILTER: dict[str, Callable[..., AbstractFilter]] = {
         slam, tolerance=TOLERANCE if percent is None else percent / 100
     ),
 }
-MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
-    **_OF_ONE_FILTER,
-    **_AROUND_ANY_FILTER,
-}
+MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {**_OF_ONE_FILTER, **_AROUND_ANY_FILTER}
 """What `+name` behind a filter's name makes of it, with the number that may follow the name: the
 greatest depth of a delayed initialisation, m (`particles`, `rays`); σ of the scene's depth in
 percent of one landmark's (`scene`); frames (`lag`); steps of Gauss–Newton in an update (`iterated`,

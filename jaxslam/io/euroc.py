@@ -47,10 +47,7 @@ def _root(path: Path) -> Path:
 def read_sensor(path: Path) -> Calibration:
     """The calibration in a `sensor.yaml`: pinhole, radial-tangential. Raises ValueError."""
     text = "\n".join(text_lines(path).values())
-    for key, accepted in (
-        ("camera_model", "pinhole"),
-        ("distortion_model", "radial-tangential"),
-    ):
+    for key, accepted in (("camera_model", "pinhole"), ("distortion_model", "radial-tangential")):
         found = re.search(rf"^{key}:\s*([\w-]+)", text, re.MULTILINE)
         if found and found[1] != accepted:
             raise ValueError(f"{path}: {key} {found[1]!r} is unknown; {accepted!r} is accepted")
@@ -92,7 +89,5 @@ def _numbers(path: Path, text: str, key: str, count: int) -> Float[np.ndarray, "
 
 
 EUROC = Layout(
-    "EuRoC (mav0/cam0/data.csv)",
-    lambda path: (_root(path) / "cam0" / "data.csv").is_file(),
-    _open,
+    "EuRoC (mav0/cam0/data.csv)", lambda path: (_root(path) / "cam0" / "data.csv").is_file(), _open
 )

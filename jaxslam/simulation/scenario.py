@@ -397,10 +397,7 @@ _OUTDOOR_TRAJECTORIES = ("kitti_00",)
 def _family(family: str, noises: Mapping[str, tuple[Numbers, Numbers]], **fields: Any):
     for suffix, (acceleration, velocity) in noises.items():
         yield Scenario(
-            name=family + suffix,
-            acceleration_sigma=acceleration,
-            velocity_sigma=velocity,
-            **fields,
+            name=family + suffix, acceleration_sigma=acceleration, velocity_sigma=velocity, **fields
         )
 
 

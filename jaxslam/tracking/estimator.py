@@ -132,12 +132,7 @@ class Estimator:
         return np.asarray(believed)[: len(slots)]
 
     def candidates(
-        self,
-        predicted: Predicted,
-        slots: Int[np.ndarray, " m"],
-        matches: Matches,
-        *,
-        curved: bool,
+        self, predicted: Predicted, slots: Int[np.ndarray, " m"], matches: Matches, *, curved: bool
     ) -> tuple[np.ndarray, ...]:
         """Return the innovations of matches, as `Candidates` has them: residuals, covariance, and
         which are valid; and their slots."""

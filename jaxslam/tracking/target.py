@@ -128,10 +128,7 @@ def _numbers(what: str, value: Any, count: int) -> Float[np.ndarray, " n"]:
 
 
 def sighted(
-    target: Target,
-    image: UInt8[np.ndarray, "h w"],
-    calibration: Calibration,
-    pixel_sigma: float,
+    target: Target, image: UInt8[np.ndarray, "h w"], calibration: Calibration, pixel_sigma: float
 ) -> TargetObservation:
     """The target in a picture, its pixels measured with `pixel_sigma`.
 

@@ -76,10 +76,7 @@ def write_covariances(
 
 
 def absolute_trajectory_error(
-    estimate_times: ArrayLike,
-    estimate: ArrayLike,
-    reference_times: ArrayLike,
-    reference: ArrayLike,
+    estimate_times: ArrayLike, estimate: ArrayLike, reference_times: ArrayLike, reference: ArrayLike
 ) -> TrajectoryError:
     """The absolute trajectory error of the positions after a Sim(3) alignment.
 
@@ -113,10 +110,7 @@ def absolute_trajectory_error(
 
 
 def orientation_error(
-    estimate_times: ArrayLike,
-    estimate: ArrayLike,
-    reference_times: ArrayLike,
-    reference: ArrayLike,
+    estimate_times: ArrayLike, estimate: ArrayLike, reference_times: ArrayLike, reference: ArrayLike
 ) -> float:
     """The `orientation_rmse` of `absolute_trajectory_error`, of the same arguments, also of cameras
     that only turn. Raises ValueError where fewer than three poses pair up."""
@@ -156,10 +150,7 @@ def relative_pose_error(
 
 
 def alignment(
-    estimate_times: ArrayLike,
-    estimate: ArrayLike,
-    reference_times: ArrayLike,
-    reference: ArrayLike,
+    estimate_times: ArrayLike, estimate: ArrayLike, reference_times: ArrayLike, reference: ArrayLike
 ) -> Similarity:
     """Return the similarity from the estimate's world to the reference's: that of
     `absolute_trajectory_error`, of the same arguments; it raises the same."""
@@ -185,10 +176,7 @@ class _Pairs(NamedTuple):
 
 
 def _paired(
-    estimate_times: ArrayLike,
-    estimate: ArrayLike,
-    reference_times: ArrayLike,
-    reference: ArrayLike,
+    estimate_times: ArrayLike, estimate: ArrayLike, reference_times: ArrayLike, reference: ArrayLike
 ) -> _Pairs:
     """Poses of the same time. Raises ValueError for fewer than three."""
     times, T, true_times, true = (

@@ -216,8 +216,7 @@ def masked(J: Blocks, mask: Bool[Array, " m"]) -> Blocks:
     """The blocks where the mask holds, zero elsewhere."""
     mask = mask[:, None, None]
     return J._replace(
-        by_view=jnp.where(mask, J.by_view, 0.0),
-        by_landmark=jnp.where(mask, J.by_landmark, 0.0),
+        by_view=jnp.where(mask, J.by_view, 0.0), by_landmark=jnp.where(mask, J.by_landmark, 0.0)
     )
 
 

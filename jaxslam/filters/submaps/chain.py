@@ -171,8 +171,7 @@ def link(
     state = replace(
         state,
         core=replace(
-            state.core,
-            pose=jax.tree.map(partial(jnp.where, there), state.core.pose, nowhere),
+            state.core, pose=jax.tree.map(partial(jnp.where, there), state.core.pose, nowhere)
         ),
         active=state.active & there,
         covariance=jnp.where(known[:, None] & known, state.covariance, 0.0),

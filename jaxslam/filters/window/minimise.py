@@ -54,10 +54,7 @@ def started(x: X, y: Y) -> Minimum:
 
 
 def minimised(
-    slam: EkfSlam,
-    record: Record,
-    start: Minimum,
-    steps: int | Int[Array, ""],
+    slam: EkfSlam, record: Record, start: Minimum, steps: int | Int[Array, ""]
 ) -> Minimum:
     """The state of a minimisation after at most so many steps."""
 
