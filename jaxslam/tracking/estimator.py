@@ -90,6 +90,8 @@ class CameraReport(NamedTuple):
     unit_fixed: np.ndarray
     left: np.ndarray
     """Whether the camera has left the scene in which its submap began."""
+    in_map: np.ndarray
+    """Which slots hold a landmark: a filter gives up those that contradict a start."""
 
 
 @dataclass
@@ -444,7 +446,13 @@ def _renew_map(slam: AbstractStaged, state: Belief, new: Features) -> tuple[Beli
 
 def _reported(slam: AbstractStaged, state: Belief) -> Report:
     seen = camera_pose_in_unit(slam, state)
-    return seen.pose.as_matrix(), *seen[1:], slam.unit_fixed(state), left(slam, state)
+    return (
+        seen.pose.as_matrix(),
+        *seen[1:],
+        slam.unit_fixed(state),
+        left(slam, state),
+        slam.in_map(state),
+    )
 
 
 @Program

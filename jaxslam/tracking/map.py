@@ -138,6 +138,8 @@ class Map:
         self._make_room(len(pixels), kept)
         slots = self._free(len(pixels))
         report = self.estimator.renew(slots, pixels)
+        gone = [slot for slot in self.landmarks if not report.in_map[slot]]
+        self.give_up(gone, self._nowhere(gone))
         found = [one.number for one in self.landmarks.values() if one.found]
         self.place.follow(report, self._nearness(), found)
         self._add(slots, image, pixels)
@@ -315,8 +317,15 @@ class Map:
         numbers = {slot: one.number for slot, one in self.landmarks.items()}
         return nearness(numbers, self.estimator.points()[0])
 
+    def _nowhere(self, slots: list[int]) -> Points:
+        """Landmarks that the filter gave up, since no point of the world is seen there."""
+        n = len(slots)
+        return self._of(slots, np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan))
+
     def _recorded(self, slots: list[int]) -> Points:
-        points, covariances = (part[slots] for part in self.estimator.points())
+        return self._of(slots, *(part[slots] for part in self.estimator.points()))
+
+    def _of(self, slots: list[int], points: np.ndarray, covariances: np.ndarray) -> Points:
         numbers = np.array([self.landmarks[slot].number for slot in slots], int)
         maps = np.full_like(numbers, self.number)
         submaps = np.full_like(numbers, self.submap)

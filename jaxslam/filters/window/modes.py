@@ -21,7 +21,7 @@ from jaxslam._numerics.conditional import map_where
 from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.minimise import Minimum, minimised, started, turned
-from jaxslam.filters.window.problem import PathLayout, X, Y, reduced
+from jaxslam.filters.window.problem import PathLayout, X, Y, left_out, reduced
 from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.scale import enlarged, shift_of_scale
 from jaxslam.geometry import Scalar
@@ -45,6 +45,8 @@ class Modes(eqx.Module):
     """Normalised; −∞ of places without a mode."""
     shifts: Float[Array, " modes"]
     """λ of every mode's mean, of which the maximum has 0."""
+    doubts: Float[Array, "modes m"]
+    """By how many σ every landmark is not one point of the world, if the others are."""
 
 
 def at_rest(slam: EkfSlam, record: Record, count: int, dtype: DTypeLike) -> Modes:
@@ -53,7 +55,8 @@ def at_rest(slam: EkfSlam, record: Record, count: int, dtype: DTypeLike) -> Mode
     q = slam.sensor.size + slam.sensor.hidden
     x, y = jnp.zeros((count, size), dtype), jnp.zeros((count, m, q), dtype)
     alone = jnp.where(jnp.arange(count) == 0, 0.0, -jnp.inf).astype(dtype)
-    return Modes(jax.vmap(started)(x, y), alone, jnp.zeros(count, dtype))
+    none = jnp.zeros((count, m), dtype)
+    return Modes(jax.vmap(started)(x, y), alone, jnp.zeros(count, dtype), none)
 
 
 def directions(n: int, count: int) -> np.ndarray:
@@ -125,12 +128,13 @@ def sought(
 
 
 class Weighed(NamedTuple):
-    """A minimum, its log evidence `−½ |r|² − ½ log det A`, what λ its mean has, and the
-    information of its path."""
+    """A minimum, its log evidence `−½ |r|² − ½ log det A`, what λ its mean has, how doubtful its
+    landmarks are, and the information of its path."""
 
     minimum: Minimum
     evidence: Scalar
     shift: Scalar
+    doubts: Float[Array, " m"]
     information: Float[Array, "N N"]
 
 
@@ -141,17 +145,27 @@ def _weighed(slam: EkfSlam, weighed: Weighed, record: Record) -> Weighed:
     own = jnp.sum(jax.vmap(lambda factor: factor.log_det())(local.landmarks))
     value = -(at.cost + factor.log_det() + own) / 2
     shift = shift_of_scale(slam, record, at, local, factor)
-    return Weighed(at, jnp.where(jnp.isfinite(value), value, -jnp.inf), shift, local.information)
+    value = jnp.where(jnp.isfinite(value), value, -jnp.inf)
+    doubts = _doubts(record, left_out(slam, record, local, at.y, factor))
+    return Weighed(at, value, shift, doubts, local.information)
+
+
+def _doubts(record: Record, squared: Float[Array, " m"]) -> Float[Array, " m"]:
+    """The σ that a χ² of every landmark is above its mean (Wilson, Hilferty 1931)."""
+    dof = record.measured.shape[-1] * jnp.sum(record.compared, axis=0)
+    some = jnp.maximum(dof, 1)
+    variance = 2 / (9 * some)
+    sigmas = (jnp.cbrt(squared / some) - 1 + variance) / jnp.sqrt(variance)
+    return jnp.where((dof > 0) & jnp.isfinite(sigmas), sigmas, 0.0)
 
 
 def _likeliest(slam, record, minima: Minimum, alive: Bool[Array, " k"], count: int) -> Modes:
     """The likeliest of the minima that are distinct, weighed."""
     k, size = minima.x.shape
     none = jnp.full(k, -jnp.inf, minima.x.dtype)
-    begun = Weighed(
-        minima, none, jnp.zeros(k, none.dtype), jnp.zeros((k, size, size), minima.x.dtype)
-    )
-    _, value, shift, information = map_where(
+    doubts, square = (jnp.zeros((k, *of), none.dtype) for of in (minima.y.shape[1:2], (size, size)))
+    begun = Weighed(minima, none, jnp.zeros_like(none), doubts, square)
+    _, value, shift, doubts, information = map_where(
         lambda weighed, record: _weighed(slam, weighed, record), begun, alive, record
     )
     best_first = jnp.argsort(-value)
@@ -168,4 +182,5 @@ def _likeliest(slam, record, minima: Minimum, alive: Bool[Array, " k"], count: i
         jax.tree.map(lambda leaf: leaf[best_first][kept], minima),
         jax.nn.log_softmax(value[kept]),
         shift[best_first][kept],
+        doubts[best_first][kept],
     )

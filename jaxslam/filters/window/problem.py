@@ -421,6 +421,7 @@ class Reduced(NamedTuple):
 
     path: Path
     by_x: Sensitivities
+    linear: Linear
     information: Float[Array, "N N"]
     """Of x, the landmarks eliminated."""
     gradient: Float[Array, " N"]
@@ -446,7 +447,30 @@ def reduced(slam: EkfSlam, record: Record, x: X, y: Y) -> Reduced:
     by_x = (half.T @ to_x).reshape(*slope.shape, -1)
     coupling = jnp.einsum("moq,mon->mqn", own.whitening, by_x)
     eye = jnp.eye(x.size, dtype=x.dtype)
-    return Reduced(at, S, to_x.T @ (left @ to_x) + eye, gradient, own, coupling)
+    return Reduced(at, S, J, to_x.T @ (left @ to_x) + eye, gradient, own, coupling)
+
+
+def left_out(
+    slam: EkfSlam, record: Record, local: Reduced, y: Y, factor: Cholesky
+) -> Float[Array, " m"]:
+    """By how much `|x|² + |y|² + |r|²` falls at a minimum, to first order, where all that was seen
+    of one landmark is left out and the rest is minimised anew; `factor` is of x's information.
+
+    It is `rᵀ (1 − G Σ Gᵀ)⁻¹ r`, r being the landmark's own numbers, its y among them, and G their
+    Jacobian by x where y follows x (deletion of cases: Cook, Weisberg, Residuals and Influence in
+    Regression, 1982): a χ² with as many degrees of freedom as it has measurements beside the first.
+    """
+    J, S, C = local.linear, local.by_x, local.coupling
+    common = _to_x(slam, S)[record.frames * J.by_frame.shape[-1] :]
+    A = jnp.einsum("kmpa,kan->mkpn", J.by_frame, S.frame)
+    A += jnp.einsum("kmpa,man->mkpn", J.by_first, S.frame[record.first])
+    A += jnp.einsum("kmpc,cn->mkpn", J.by_common, common)
+    A -= jnp.einsum("kmpq,mqn->mkpn", J.by_y, C)
+    m, n = len(y), C.shape[-1]
+    G = jnp.concatenate([A.reshape(m, -1, n), -C], axis=1) @ factor.whitening.T
+    r = jnp.concatenate([jnp.swapaxes(J.residual, 0, 1).reshape(m, -1), y], axis=1)
+    own = cholesky_each(jnp.eye(r.shape[1], dtype=y.dtype) - G @ jnp.swapaxes(G, 1, 2))
+    return jnp.sum(jax.vmap(lambda L, r: L.whitening @ r)(own, r) ** 2, axis=1)
 
 
 def _to_x(slam: EkfSlam, S: Sensitivities) -> Float[Array, "z N"]:

@@ -15,7 +15,7 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.arrays import AnyArray, cast, precision
 from jaxslam._numerics.conditional import cond, map_where
@@ -56,6 +56,8 @@ KNOWN = 0.03
 """σ of the translation, in translations, given the scale: below it parallax is there."""
 MOVED = 0.1
 """The same, below which a camera has done more than turn."""
+DOUBTFUL = 4.0
+"""σ of a landmark that is given up: what is seen there is not one point of the world."""
 
 
 class RestState(eqx.Module):
@@ -129,12 +131,13 @@ class BatchInitialisation(AbstractWrapper):
         state = replace(state, sum=after, record=window.begun(state.record, new))
         # Where nothing was ever seen there is nothing to begin anew from.
         anew, least = state.open & jnp.any(state.record.seen), 1
+        agree = jnp.ones((), bool)
         for frames in self.sizes:
             count = state.record.last + 1
             wanted = anew & (count > least) & (count <= frames)
-            state = self._anew(state, frames, wanted, least)
+            state, agree = self._anew((state, agree), frames, wanted, least)
             least = frames
-        ready = self._ready(state)
+        ready = self._ready(state) & agree
         state = replace(state, sum=_likely(state.sum, anew & ready), open=state.open & ~ready)
         return cond(state.open & state.record.full, self._thinned, state)
 
@@ -152,13 +155,19 @@ class BatchInitialisation(AbstractWrapper):
         return ~state.open
 
     def _anew(
-        self, state: RestState, frames: int, wanted: Bool[Array, ""], least: int
-    ) -> RestState:
-        """The modes of a window of so many frames, more than `least`, and the sum of them."""
-        ekf, record = self.ekf, state.record.cut(frames)
+        self,
+        state: tuple[RestState, Bool[Array, ""]],
+        frames: int,
+        wanted: Bool[Array, ""],
+        least: int,
+    ) -> tuple[RestState, Bool[Array, ""]]:
+        """The modes of a window of so many frames, more than `least`, and the sum of them, without
+        the landmark that contradicts the likeliest mode most; and whether none does."""
+        ekf, record = self.ekf, state[0].record.cut(frames)
         size = PathLayout.of(ekf).size(frames)
 
-        def solved(state, record):
+        def solved(both, record):
+            state, _ = both
             x = state.modes.minima.x
             modes = replace(state.modes, minima=replace(state.modes.minima, x=x[:, :size]))
             due = self._due(record, range(least, frames), self._moved(state, MOVED))
@@ -167,9 +176,11 @@ class BatchInitialisation(AbstractWrapper):
             members = _members(ekf, record, modes, state.sum.members, like)
             begun = SumState(members, modes.log_weights)
             begun = jax.tree.map(lambda new, old: jnp.where(explained, new, old), begun, state.sum)
+            wrong = explained & _worst(modes.doubts[0])
             x = x.at[:, :size].set(modes.minima.x)
             modes = replace(modes, minima=replace(modes.minima, x=x))
-            return replace(state, sum=begun, modes=modes)
+            state = replace(state, sum=begun, modes=modes)
+            return self.remove(state, wrong), ~jnp.any(wrong)
 
         return cond(wanted, solved, state, record)
 
@@ -229,6 +240,11 @@ def _members(ekf: EkfSlam, record: Record, modes: Modes, members: State, like: S
 
     alive = jnp.isfinite(modes.log_weights)
     return map_where(begun, (modes.minima, modes.shifts, members), alive, record, like)[2]
+
+
+def _worst(doubts: Float[Array, " m"]) -> Bool[Array, " m"]:
+    """The most doubtful landmark, if it is too doubtful."""
+    return (jnp.arange(len(doubts)) == jnp.argmax(doubts)) & (doubts > DOUBTFUL)
 
 
 def _check_base(ekf: EkfSlam) -> None:
