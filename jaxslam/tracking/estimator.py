@@ -156,6 +156,18 @@ class Estimator:
         S, residual = self._innovations(predicted, seen)
         return float(residual @ _solve(S, residual)), len(residual)
 
+    def each_given_others(
+        self, predicted: Predicted, seen: Observations
+    ) -> Float[np.ndarray, "k 2"]:
+        """Return the innovation of each that was seen given those of all others, whitened:
+        `L⁻¹ (S⁻¹ r)_i` with `L Lᵀ = (S⁻¹)_ii`, of unit covariance."""
+        k = np.arange(len(seen.slots))
+        S, residual = self._innovations(predicted, seen)
+        inverse = _solve(S, np.column_stack([np.eye(len(S)), residual]))
+        blocks = inverse[:, :-1].reshape(len(k), 2, len(k), 2)[k, :, k]
+        of_each = inverse[:, -1].reshape(-1, 2, 1)
+        return np.linalg.solve(np.linalg.cholesky(blocks), of_each)[..., 0]
+
     def given(self, predicted: Predicted, seen: Observations) -> Prediction:
         """Return what the filter expects of the frame given that it shows what was seen, to first
         order and neglecting that landmarks drift. Changes nothing."""

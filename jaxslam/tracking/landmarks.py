@@ -11,6 +11,8 @@ import numpy as np
 from jaxslam.tracking.patches import STORED, Patch
 
 NO_LOOKS = np.zeros((0, 32), np.uint8)
+MEMORY = 0.95
+"""Weight of a landmark's surprise by that of a frame later: twenty frames count."""
 _COUNTS = ("number", "missed", "unseen", "found")
 
 
@@ -34,6 +36,21 @@ class Landmark:
     """Searches that found it."""
     looks: np.ndarray = field(default_factory=NO_LOOKS.copy)
     """Its latest descriptors, by which it is known again where nothing says where it is."""
+    surprise: tuple[float, float] = (0.0, 0.0)
+    """Sum of its innovations, given those of all others, whitened; older ones weigh ever less …"""
+    expected: float = 0.0
+    """… and the variance that the sum has where these are white."""
+
+    @property
+    def noise_factor(self) -> float:
+        """By how much its noise has more variance than white noise, if its innovations point one
+        way for long: a corner of two depths or a reflection slides over the world."""
+        return max(1.0, np.square(self.surprise).sum() / max(self.expected, 1.0))
+
+    def compared(self, innovation: np.ndarray) -> None:
+        """Note a whitened innovation (2,)."""
+        u, v = MEMORY * np.asarray(self.surprise) + innovation
+        self.surprise, self.expected = (float(u), float(v)), MEMORY**2 * self.expected + 1
 
     def searched(self, found: bool, pixel: np.ndarray, patience: float) -> None:
         """Count one search, that found it at this pixel or not; `success` is an average over about
@@ -84,6 +101,7 @@ def stacked(landmarks: Mapping[int, Landmark]) -> dict[str, np.ndarray]:
         "success": np.array([one.success for one in kept], float),
         "first_cameras": np.array([one.first_camera for one in kept]).reshape(count, 4, 4),
         "seen_at": np.array([one.seen_at for one in kept], float).reshape(count, 2),
+        "surprises": np.array([(*one.surprise, one.expected) for one in kept]).reshape(count, 3),
         "pixels": np.array([one.patch.pixel for one in kept], float).reshape(count, 2),
         "looks": np.concatenate([one.looks for one in kept] or [NO_LOOKS]),
         "look_counts": np.array([len(one.looks) for one in kept], int),
@@ -96,9 +114,10 @@ def stacked(landmarks: Mapping[int, Landmark]) -> dict[str, np.ndarray]:
 def unstacked(arrays: Mapping[str, np.ndarray]) -> dict[int, Landmark]:
     """Return what `stacked` was made of."""
     landmarks = {}
-    names = ("slots", "counts", "success", "first_cameras", "seen_at", "pixels", "stored")
+    names = ("slots", "counts", "success", "first_cameras", "seen_at", "surprises", "pixels")
+    names += ("stored",)
     looks = np.split(arrays["looks"], np.cumsum(arrays["look_counts"])[:-1])
-    for look, slot, counts, success, first_camera, seen_at, pixel, stored in zip(
+    for look, slot, counts, success, first_camera, seen_at, surprise, pixel, stored in zip(
         looks[: len(arrays["slots"])], *(arrays[name] for name in names), strict=True
     ):
         number, *others = counts.tolist()
@@ -106,4 +125,6 @@ def unstacked(arrays: Mapping[str, np.ndarray]) -> dict[int, Landmark]:
         landmarks[int(slot)] = Landmark(
             number, patch, first_camera, seen_at, float(success), *others, look
         )
+        *sums, landmarks[int(slot)].expected = surprise.tolist()
+        landmarks[int(slot)].surprise = tuple(sums)
     return landmarks

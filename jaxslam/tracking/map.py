@@ -111,8 +111,14 @@ class Map:
         latest = [one for known in self.known() for one in known.landmarks.values()]
         return self.charted | {one.number: one for one in latest}
 
-    def note(self, seen: Observations) -> None:
-        """Note what was found of the landmarks, and give up those that are searched in vain."""
+    def note(self, seen: Observations, predicted: Predicted | None = None) -> None:
+        """Note what was found of the landmarks, where that was `predicted` by how much it is off,
+        and give up those that are searched in vain."""
+        matched = seen.labelled("matched")
+        if predicted is not None and self.place.unit_fixed and len(matched.slots):
+            innovations = self.estimator.each_given_others(predicted, matched)
+            for slot, innovation in zip(matched.slots.tolist(), innovations, strict=True):
+                self.landmarks[slot].compared(innovation)
         note_found(self.landmarks, seen, self.settings)
         self.give_up(failing(self.landmarks, self.settings))
 

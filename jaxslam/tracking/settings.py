@@ -112,6 +112,13 @@ class TrackerSettings:
         tell these, pixels²."""
         return np.maximum(FIT * variances / self.pixel_sigma**2, 1.0)
 
+    def noisier(
+        self, variances: Float[np.ndarray, " k"], factors: Float[np.ndarray, " k"]
+    ) -> Float[np.ndarray, " k"]:
+        """Return the variances of windows whose noise has these factors beside those of
+        `noise_factors`."""
+        return np.maximum(variances, self.pixel_sigma**2 / FIT) * factors
+
     def make_filter(self, calibration: Calibration) -> AbstractFilter:
         """The filter that is named, with these numbers. Raises ValueError."""
         distorted = any(calibration.distortion)

@@ -260,7 +260,7 @@ class Tracker:
             self.map.fall_back(predicted)
             return self._lost(frame, Lost.NOT_POSITIVE)
         seen = seen.but_for(correction.used)
-        self.map.note(seen)
+        self.map.note(seen, predicted)
         if reason is None and not seen.matched.any():
             reason = Lost.REFUSED
         self.unmeasured = 0 if reason is None else self.unmeasured + 1

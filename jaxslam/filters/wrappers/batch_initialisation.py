@@ -57,7 +57,7 @@ KNOWN = 0.03
 MOVED = 0.1
 """The same, below which a camera has done more than turn."""
 DOUBTFUL = 4.0
-"""σ of a landmark that is given up: what is seen there is not one point of the world."""
+"""σ of a landmark that is given up, one a frame: what is seen there is no point of the world."""
 
 
 class RestState(eqx.Module):
@@ -131,13 +131,12 @@ class BatchInitialisation(AbstractWrapper):
         state = replace(state, sum=after, record=window.begun(state.record, new))
         # Where nothing was ever seen there is nothing to begin anew from.
         anew, least = state.open & jnp.any(state.record.seen), 1
-        agree = jnp.ones((), bool)
         for frames in self.sizes:
             count = state.record.last + 1
             wanted = anew & (count > least) & (count <= frames)
-            state, agree = self._anew((state, agree), frames, wanted, least)
+            state = self._anew(state, frames, wanted, least)
             least = frames
-        ready = self._ready(state) & agree
+        ready = self._ready(state)
         state = replace(state, sum=_likely(state.sum, anew & ready), open=state.open & ~ready)
         return cond(state.open & state.record.full, self._thinned, state)
 
@@ -155,19 +154,14 @@ class BatchInitialisation(AbstractWrapper):
         return ~state.open
 
     def _anew(
-        self,
-        state: tuple[RestState, Bool[Array, ""]],
-        frames: int,
-        wanted: Bool[Array, ""],
-        least: int,
-    ) -> tuple[RestState, Bool[Array, ""]]:
+        self, state: RestState, frames: int, wanted: Bool[Array, ""], least: int
+    ) -> RestState:
         """The modes of a window of so many frames, more than `least`, and the sum of them, without
-        the landmark that contradicts the likeliest mode most; and whether none does."""
-        ekf, record = self.ekf, state[0].record.cut(frames)
+        the landmark that contradicts the likeliest mode most."""
+        ekf, record = self.ekf, state.record.cut(frames)
         size = PathLayout.of(ekf).size(frames)
 
-        def solved(both, record):
-            state, _ = both
+        def solved(state, record):
             x = state.modes.minima.x
             modes = replace(state.modes, minima=replace(state.modes.minima, x=x[:, :size]))
             due = self._due(record, range(least, frames), self._moved(state, MOVED))
@@ -179,8 +173,7 @@ class BatchInitialisation(AbstractWrapper):
             wrong = explained & _worst(modes.doubts[0])
             x = x.at[:, :size].set(modes.minima.x)
             modes = replace(modes, minima=replace(modes.minima, x=x))
-            state = replace(state, sum=begun, modes=modes)
-            return self.remove(state, wrong), ~jnp.any(wrong)
+            return self.remove(replace(state, sum=begun, modes=modes), wrong)
 
         return cond(wanted, solved, state, record)
 
