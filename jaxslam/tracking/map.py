@@ -111,11 +111,17 @@ class Map:
         latest = [one for known in self.known() for one in known.landmarks.values()]
         return self.charted | {one.number: one for one in latest}
 
+    def weighed(self, seen: Observations) -> Observations:
+        """The table with the variances of landmarks that each have their own noise."""
+        factors = [self.landmarks[slot].noise_factor for slot in seen.slots.tolist()]
+        variances = self.settings.noisier(seen.variances, np.array(factors, float))
+        return seen._replace(variances=variances)
+
     def note(self, seen: Observations, predicted: Predicted | None = None) -> None:
         """Note what was found of the landmarks, where that was `predicted` by how much it is off,
         and give up those that are searched in vain."""
         matched = seen.labelled("matched")
-        if predicted is not None and self.place.unit_fixed and len(matched.slots):
+        if predicted is not None and len(matched.slots):
             innovations = self.estimator.each_given_others(predicted, matched)
             for slot, innovation in zip(matched.slots.tolist(), innovations, strict=True):
                 self.landmarks[slot].compared(innovation)

@@ -46,10 +46,7 @@ def search(
         landmarks[slot].patch.warped(affine) for slot, affine in zip(slots, affines, strict=True)
     ]
     templates = np.array(warped, np.float32).reshape(-1, WINDOW, WINDOW)
-    places = seen.predicted, seen.covariances
-    matches = match_patches(image, templates, *places, several=several)
-    more = np.array([landmarks[slot].noise_factor for slot in slots], float)[matches.owner]
-    return seen, matches._replace(variances=settings.noisier(matches.variances, more))
+    return seen, match_patches(image, templates, seen.predicted, seen.covariances, several=several)
 
 
 def to_search(

@@ -253,6 +253,7 @@ class Tracker:
             found = known_again(frame.image, self.map, self.policy)
             if found is not None:
                 return self._back(frame, *found)
+        seen = self.map.weighed(seen)
         correction = self.map.estimator.correct(predicted, seen)
         if correction.failed:
             self.map.remember()

@@ -24,7 +24,7 @@ from jaxslam.filters.wrappers.batch_initialisation import (
 from jaxslam.models.observations import Features
 from jaxslam.statistics.bands import lost_threshold
 
-RUNS, FEW, STEPS = 6, 3, 12
+RUNS, FEW, STEPS, SLIDING = 6, 3, 12, 4
 SUM = "scale_gauge+mixture3"
 STARTED = f"{SUM}+rest8"
 """Eight frames are one window, and are over within the run."""
@@ -248,6 +248,24 @@ def test_landmarks_are_removed_in_the_midst_of_a_window():
         np.linalg.slogdet(state.sum.members.covariance[:, 0, :6, :6])[1] for state in (after, every)
     ]
     assert (sizes[0] > sizes[1]).all()
+
+
+def test_a_landmark_that_slides_is_given_up_and_no_other_one():
+    """By two pixels more in every frame, which no point of the world does."""
+    slam = few().filter(STARTED)
+    init, step = stages(STARTED)
+    state = init(few().features[0])
+    for k in range(6):
+        control, known, new = frame(k)
+        there = jax.vmap(lambda state, slots: slam.in_map(state)[slots])(state, known.slots)
+        slides = (known.slots == SLIDING)[..., None] & (jnp.arange(2) == 1)
+        measured = known.measured + jnp.where(slides, (k + 1) ** 2, 0.0)
+        known = Features(known.slots, measured, known.valid & there)
+        state, _ = step(state, control, known, new)
+    kept = np.asarray(jax.vmap(slam.in_map)(state))
+    assert not kept[:, SLIDING].any()
+    assert np.delete(kept, SLIDING, axis=1).all()
+    assert not state.record.seen[..., SLIDING].any()
 
 
 def test_features_are_predicted_where_they_are_seen():

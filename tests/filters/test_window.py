@@ -12,13 +12,21 @@ import pytest
 from cases import close, quick_jit, simulated
 from exact_posterior.laplace import minima
 from exact_posterior.problem import log_density, make_problem
+from scipy.stats import chi2, norm
 
 from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.registry import scenario_pieces
 from jaxslam.filters.window import minimise, modes, scale
 from jaxslam.filters.window.minimise import minimised, started
-from jaxslam.filters.window.problem import PathLayout, path, reduced, residuals, sensitivities
+from jaxslam.filters.window.problem import (
+    PathLayout,
+    left_out,
+    path,
+    reduced,
+    residuals,
+    sensitivities,
+)
 from jaxslam.filters.window.record import Record, begun, empty, removed, stepped, whole
 from jaxslam.filters.window.scale import rescaled, scaling, shift_of_scale, variances
 from jaxslam.filters.window.to_filter import gauge_state
@@ -613,11 +621,39 @@ def test_the_evidence_of_a_mode_is_laplaces_with_every_unknown(of):
     slam, record, *_ = case(*of)
     at = minimum(*of)
     zero = jnp.zeros(())
-    given = modes.Weighed(at, zero, zero, jnp.zeros((at.x.size, at.x.size)))
+    doubts, information = jnp.zeros(FIRST.size), jnp.zeros((at.x.size, at.x.size))
+    given = modes.Weighed(at, zero, zero, doubts, information)
     found = quick_jit(lambda given, record: modes._weighed(slam, given, record))(given, record)
     r, A, _ = dense(slam, record, at.x, at.y)
     expected = -(r @ r + np.linalg.slogdet(A)[1]) / 2
     np.testing.assert_allclose(found.evidence, expected, rtol=1e-9)
+
+
+@pytest.mark.slow
+@each([CASES[1], CASES[4]])
+def test_what_a_minimum_gains_without_a_landmark_is_foretold(of):
+    """The other minimum is found, and its cost compared."""
+    slam, record, *_ = case(*of)
+    at = minimum(*of)
+
+    @quick_jit
+    def foretold(record, at):
+        local = reduced(slam, record, at.x, at.y)
+        factor = cholesky(local.information)
+        gains = left_out(slam, record, local, at.y, factor)
+        return gains, modes._doubts(record, gains)
+
+    gains, doubts = foretold(record, at)
+    for k in range(FIRST.size):
+        without = removed(record, jnp.arange(FIRST.size) == k)
+        y = at.y.at[k].set(0.0)
+        np.testing.assert_allclose(
+            gains[k], at.cost - precisely(slam, without, at.x, y).cost, rtol=0.1
+        )
+    dof = 2 * np.asarray(record.compared).sum(axis=0)
+    some = dof > 0
+    exact = norm.isf(chi2.sf(np.asarray(gains)[some], dof[some]))
+    np.testing.assert_allclose(np.asarray(doubts)[some], exact, atol=0.1)
 
 
 def test_a_mode_that_is_next_to_impossible_is_none(monkeypatch):

@@ -94,6 +94,24 @@ def test_what_is_expected_given_a_match_is_what_the_filter_expects_after_it(esti
     )
 
 
+def test_each_innovation_given_all_others_is_what_they_leave_of_it(estimator):
+    """By the conditional Gaussian, one after the other."""
+    slots, aside = np.array([1, 4, 6]), np.array([[1.0, 0.0], [-0.5, 1.0], [0.3, -0.2]])
+    variances = np.array([0.0, 4.0, 0.0]) * SMALL.pixel_sigma**2 / FIT
+    with jax.enable_x64(True):
+        predicted = estimator.predict(1 / 30)
+        pixels = predicted.view.pixels[slots] + aside
+        prior = predicted.view.pixels[slots], predicted.view.covariances[slots]
+        seen = Observations(slots, *prior, pixels, variances, np.full(3, "matched"))
+        whitened = estimator.each_given_others(predicted, seen)
+        S, r = estimator._innovations(predicted, seen)
+    for k, one in enumerate(whitened):
+        own, rest = np.arange(2 * k, 2 * k + 2), np.delete(np.arange(6), [2 * k, 2 * k + 1])
+        gain = S[np.ix_(own, rest)] @ np.linalg.inv(S[np.ix_(rest, rest)])
+        left, P = r[own] - gain @ r[rest], S[np.ix_(own, own)] - gain @ S[np.ix_(rest, own)]
+        np.testing.assert_allclose(one @ one, left @ np.linalg.solve(P, left), rtol=1e-8)
+
+
 def test_noise_that_is_larger_by_a_factor_is_of_a_worse_sensor(estimator):
     slots, aside = np.array([0, 2, 6]), np.array([[0.2, 0.1], [0.0, -0.3], [0.4, 0.0]])
     with jax.enable_x64(True):

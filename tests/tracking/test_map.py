@@ -8,12 +8,12 @@ pytest.importorskip("cv2")
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking import map as upkeep
 from jaxslam.tracking import search as searching
-from jaxslam.tracking.landmarks import Landmark, Points
+from jaxslam.tracking.landmarks import MEMORY, Landmark, Points
 from jaxslam.tracking.map import failing, in_view, note_found, worst_first
 from jaxslam.tracking.observations import Observations, Prediction
 from jaxslam.tracking.patches import Patch
 from jaxslam.tracking.search import to_search
-from jaxslam.tracking.settings import TrackerSettings
+from jaxslam.tracking.settings import FIT, TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
 
@@ -47,6 +47,29 @@ def test_a_landmark_at_the_least_success_is_kept():
     least = SETTINGS.least_success
     landmarks = {3: landmark(0, success=least), 4: landmark(1, success=np.nextafter(least, 0))}
     assert failing(landmarks, SETTINGS) == [4]
+
+
+def test_a_landmark_that_slides_is_less_sure_and_one_that_stays_is_not():
+    """White innovations of unit covariance have a factor of 2 in the mean; of one that is off by
+    one σ for long, every match says nearly the same."""
+    draw, slides, stays = np.random.default_rng(3), landmark(0), landmark(1)
+    assert slides.noise_factor == 1.0
+    factors = []
+    for _ in range(2000):
+        slides.compared(np.array([1.0, 0.0]))
+        stays.compared(draw.standard_normal(2))
+        factors.append(stays.noise_factor)
+    assert slides.noise_factor == pytest.approx((1 + MEMORY) / (1 - MEMORY))
+    # E max(1, z) of a χ² of two degrees of freedom, z = 2 in the mean.
+    assert np.mean(factors) == pytest.approx(1 + 2 * np.exp(-0.5), rel=0.15)
+
+
+def test_a_noise_factor_is_of_all_that_a_match_is_used_for():
+    """Of one whose window fits as of one whose does not."""
+    variances = np.array([0.0, 3.0]) * SETTINGS.pixel_sigma**2 / FIT
+    for factors in ([1.0, 1.0], [4.0, 2.5]):
+        more = SETTINGS.noise_factors(SETTINGS.noisier(variances, np.array(factors)))
+        np.testing.assert_allclose(more, SETTINGS.noise_factors(variances) * factors)
 
 
 def test_where_a_landmark_was_found_last_is_noted():

@@ -244,9 +244,8 @@ def test_the_unit_is_told_by_landmarks_that_were_found_again_until_it_is_fixed()
     """Landmark 8 was seen once: its depth is what the prior says, and says nothing."""
     place = MapInWorld(log_unit=0.3, unit_fixed=False, near={7: 1.0, 8: 1.0})
     for fixed, units in ((False, 1), (True, 2), (True, 2)):
-        report = CameraReport(
-            np.eye(4), np.zeros((6, 6)), *np.array([1.0, 0.0]), *np.array([fixed, False])
-        )
+        flags = *np.array([fixed, False]), np.ones(9, bool)
+        report = CameraReport(np.eye(4), np.zeros((6, 6)), *np.array([1.0, 0.0]), *flags)
         place.follow(report, {7: 2.0, 8: 50.0}, [7])
         assert place.log_unit == pytest.approx(0.3 + units * np.log(2.0), rel=1e-12)
         assert place.unit_fixed is fixed
@@ -304,7 +303,7 @@ def test_what_a_loop_says_of_the_camera_is_kept_and_grows_with_what_is_not_known
     then, since, known = (np.diag(rng.uniform(a, 2 * a, 6)) for a in (0.1, 0.01, 0.001))
 
     def report(T, P):
-        return CameraReport(T, P, *np.zeros(2), *np.array([True, False]))
+        return CameraReport(T, P, *np.zeros(2), *np.array([True, False]), np.ones(9, bool))
 
     place = MapInWorld(log_unit=np.log(unit))
     place.follow(report(T_then, then), {}, [])
