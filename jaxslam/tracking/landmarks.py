@@ -12,7 +12,7 @@ from jaxslam.tracking.patches import STORED, Patch
 
 NO_LOOKS = np.zeros((0, 32), np.uint8)
 MEMORY = 0.95
-"""Weight of a landmark's surprise by that of a frame later: twenty frames count."""
+"""Weight of an innovation by that of a frame later: twenty frames count."""
 _COUNTS = ("number", "missed", "unseen", "found")
 
 
@@ -36,21 +36,21 @@ class Landmark:
     """Searches that found it."""
     looks: np.ndarray = field(default_factory=NO_LOOKS.copy)
     """Its latest descriptors, by which it is known again where nothing says where it is."""
-    surprise: tuple[float, float] = (0.0, 0.0)
-    """Sum of its innovations, given those of all others, whitened; older ones weigh ever less …"""
-    expected: float = 0.0
-    """… and the variance that the sum has where these are white."""
+    innovations: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    """Sums over its matches, (3,): of the innovation (u, v) given all others, whitened, and of the
+    variance that this has; the older ones weigh ever less."""
 
     @property
     def noise_factor(self) -> float:
-        """By how much its noise has more variance than white noise, if its innovations point one
+        """By how much more variance its noise has than white noise, if its innovations point one
         way for long: a corner of two depths or a reflection slides over the world."""
-        return max(1.0, np.square(self.surprise).sum() / max(self.expected, 1.0))
+        *summed, variance = self.innovations
+        return max(1.0, float(np.square(summed).sum()) / max(variance, 1.0))
 
     def compared(self, innovation: np.ndarray) -> None:
         """Note a whitened innovation (2,)."""
-        u, v = MEMORY * np.asarray(self.surprise) + innovation
-        self.surprise, self.expected = (float(u), float(v)), MEMORY**2 * self.expected + 1
+        older = np.array([MEMORY, MEMORY, MEMORY**2])
+        self.innovations = older * self.innovations + np.append(innovation, 1.0)
 
     def searched(self, found: bool, pixel: np.ndarray, patience: float) -> None:
         """Count one search, that found it at this pixel or not; `success` is an average over about
@@ -101,7 +101,7 @@ def stacked(landmarks: Mapping[int, Landmark]) -> dict[str, np.ndarray]:
         "success": np.array([one.success for one in kept], float),
         "first_cameras": np.array([one.first_camera for one in kept]).reshape(count, 4, 4),
         "seen_at": np.array([one.seen_at for one in kept], float).reshape(count, 2),
-        "surprises": np.array([(*one.surprise, one.expected) for one in kept]).reshape(count, 3),
+        "innovations": np.array([one.innovations for one in kept], float).reshape(count, 3),
         "pixels": np.array([one.patch.pixel for one in kept], float).reshape(count, 2),
         "looks": np.concatenate([one.looks for one in kept] or [NO_LOOKS]),
         "look_counts": np.array([len(one.looks) for one in kept], int),
@@ -114,17 +114,15 @@ def stacked(landmarks: Mapping[int, Landmark]) -> dict[str, np.ndarray]:
 def unstacked(arrays: Mapping[str, np.ndarray]) -> dict[int, Landmark]:
     """Return what `stacked` was made of."""
     landmarks = {}
-    names = ("slots", "counts", "success", "first_cameras", "seen_at", "surprises", "pixels")
+    names = ("slots", "counts", "success", "first_cameras", "seen_at", "innovations", "pixels")
     names += ("stored",)
     looks = np.split(arrays["looks"], np.cumsum(arrays["look_counts"])[:-1])
-    for look, slot, counts, success, first_camera, seen_at, surprise, pixel, stored in zip(
+    for look, slot, counts, success, first_camera, seen_at, innovations, pixel, stored in zip(
         looks[: len(arrays["slots"])], *(arrays[name] for name in names), strict=True
     ):
         number, *others = counts.tolist()
         patch = Patch(pixel, stored)
         landmarks[int(slot)] = Landmark(
-            number, patch, first_camera, seen_at, float(success), *others, look
+            number, patch, first_camera, seen_at, float(success), *others, look, innovations
         )
-        *sums, landmarks[int(slot)].expected = surprise.tolist()
-        landmarks[int(slot)].surprise = tuple(sums)
     return landmarks

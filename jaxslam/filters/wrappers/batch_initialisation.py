@@ -15,7 +15,7 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from jaxslam._numerics.arrays import AnyArray, cast, precision
 from jaxslam._numerics.conditional import cond, map_where
@@ -157,7 +157,7 @@ class BatchInitialisation(AbstractWrapper):
         self, state: RestState, frames: int, wanted: Bool[Array, ""], least: int
     ) -> RestState:
         """The modes of a window of so many frames, more than `least`, and the sum of them, without
-        the landmark that contradicts the likeliest mode most."""
+        the landmark that contradicts all of them most."""
         ekf, record = self.ekf, state.record.cut(frames)
         size = PathLayout.of(ekf).size(frames)
 
@@ -170,7 +170,7 @@ class BatchInitialisation(AbstractWrapper):
             members = _members(ekf, record, modes, state.sum.members, like)
             begun = SumState(members, modes.log_weights)
             begun = jax.tree.map(lambda new, old: jnp.where(explained, new, old), begun, state.sum)
-            wrong = explained & _worst(modes.doubts[0])
+            wrong = explained & _doubted(modes)
             x = x.at[:, :size].set(modes.minima.x)
             modes = replace(modes, minima=replace(modes.minima, x=x))
             return self.remove(replace(state, sum=begun, modes=modes), wrong)
@@ -235,8 +235,10 @@ def _members(ekf: EkfSlam, record: Record, modes: Modes, members: State, like: S
     return map_where(begun, (modes.minima, modes.shifts, members), alive, record, like)[2]
 
 
-def _worst(doubts: Float[Array, " m"]) -> Bool[Array, " m"]:
-    """The most doubtful landmark, if it is too doubtful."""
+def _doubted(modes: Modes) -> Bool[Array, " m"]:
+    """The landmark that is most doubtful in all modes that count, if it is too doubtful."""
+    likely = modes.log_weights >= -GIVEN_UP
+    doubts = jnp.min(jnp.where(likely[:, None], modes.doubts, jnp.inf), axis=0)
     return (jnp.arange(len(doubts)) == jnp.argmax(doubts)) & (doubts > DOUBTFUL)
 
 
