@@ -45,7 +45,7 @@ class Landmark:
         """By how much more variance its noise has than white noise, if its innovations point one
         way for long: a corner of two depths or a reflection slides over the world."""
         *summed, variance = self.innovations
-        return max(1.0, float(np.square(summed).sum()) / max(variance, 1.0))
+        return max(1.0, float(np.square(summed).mean()) / max(variance, 1.0))
 
     def compared(self, innovation: np.ndarray) -> None:
         """Note a whitened innovation (2,)."""

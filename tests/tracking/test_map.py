@@ -50,8 +50,7 @@ def test_a_landmark_at_the_least_success_is_kept():
 
 
 def test_a_landmark_that_slides_is_less_sure_and_one_that_stays_is_not():
-    """White innovations of unit covariance have a factor of 2 in the mean; of one that is off by
-    one σ for long, every match says nearly the same."""
+    """Where one is off by one σ for long, every match says nearly the same."""
     draw, slides, stays = np.random.default_rng(3), landmark(0), landmark(1)
     assert slides.noise_factor == 1.0
     factors = []
@@ -59,9 +58,9 @@ def test_a_landmark_that_slides_is_less_sure_and_one_that_stays_is_not():
         slides.compared(np.array([1.0, 0.0]))
         stays.compared(draw.standard_normal(2))
         factors.append(stays.noise_factor)
-    assert slides.noise_factor == pytest.approx((1 + MEMORY) / (1 - MEMORY))
-    # E max(1, z) of a χ² of two degrees of freedom, z = 2 in the mean.
-    assert np.mean(factors) == pytest.approx(1 + 2 * np.exp(-0.5), rel=0.15)
+    assert slides.noise_factor == pytest.approx((1 + MEMORY) / (1 - MEMORY) / 2)
+    # Half a χ² of two degrees of freedom is x, of density exp(−x): E max(1, x) = 1 + 1/e.
+    assert np.mean(factors) == pytest.approx(1 + np.exp(-1), rel=0.1)
 
 
 def test_a_noise_factor_is_of_all_that_a_match_is_used_for():
