@@ -650,7 +650,7 @@ def test_what_a_minimum_gains_without_a_landmark_is_foretold(of):
         np.testing.assert_allclose(
             gains[k], at.cost - precisely(slam, without, at.x, y).cost, rtol=0.1
         )
-    dof = 2 * np.asarray(record.compared).sum(axis=0)
+    dof = slam.sensor.size * np.asarray(record.compared).sum(axis=0)
     some = dof > 0
     exact = norm.isf(chi2.sf(np.asarray(gains)[some], dof[some]))
     np.testing.assert_allclose(np.asarray(doubts)[some], exact, atol=0.1)
