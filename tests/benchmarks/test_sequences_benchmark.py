@@ -50,5 +50,5 @@ def test_the_sentences_on_covariances_are_of_the_numbers_on_disk():
     assert f"`world` has {others[0]:.2g} to {others[-1]:.2g}," in page
     assert f"is {drifts[0]:.2g} to {drifts[-1]:.2g} of its claimed σ" in page
     (drift, normalised), *_ = (r["drift"] for r in own)
-    assert 1 / 8 < normalised < 1 / 6
-    assert f"varies by {drift:.1%} (RMS), a seventh".replace("%", " %") in page
+    assert 1 / 3 < normalised < 1 / 2
+    assert f"varies by {drift:.1%} (RMS), less than half".replace("%", " %") in page
