@@ -17,6 +17,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg.lapack import dtrtri  # ty: ignore[missing-module-member]
 
 from jaxslam._numerics.arrays import cast
 from jaxslam._runtime.programs import Program, in_background
@@ -161,11 +162,15 @@ class Estimator:
     ) -> Float[np.ndarray, "k 2"]:
         """Return the innovation of each that was seen given those of all others, whitened:
         `L⁻¹ (S⁻¹ r)_i` with `L Lᵀ = (S⁻¹)_ii`, of unit covariance."""
-        k = np.arange(len(seen.slots))
         S, residual = self._innovations(predicted, seen)
-        inverse = _solve(S, np.column_stack([np.eye(len(S)), residual]))
-        blocks = inverse[:, :-1].reshape(len(k), 2, len(k), 2)[k, :, k]
-        of_each = inverse[:, -1].reshape(-1, 2, 1)
+        try:
+            root, _ = cho_factor(S, lower=True, check_finite=False)
+        except LinAlgError:  # nothing can be said
+            return np.zeros((len(seen.slots), 2))
+        of_each = cho_solve((root, True), residual, check_finite=False).reshape(-1, 2, 1)
+        # A solver for many right sides takes threads, as in `_solve`.
+        whitening = np.tril(dtrtri(root, lower=1)[0]).reshape(len(S), -1, 2)
+        blocks = np.einsum("nki,nkj->kij", whitening, whitening)
         return np.linalg.solve(np.linalg.cholesky(blocks), of_each)[..., 0]
 
     def given(self, predicted: Predicted, seen: Observations) -> Prediction:

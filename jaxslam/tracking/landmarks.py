@@ -13,6 +13,7 @@ from jaxslam.tracking.patches import STORED, Patch
 NO_LOOKS = np.zeros((0, 32), np.uint8)
 MEMORY = 0.95
 """Weight of an innovation by that of a frame later: twenty frames count."""
+_OLDER = np.array([MEMORY, MEMORY, MEMORY**2])
 _COUNTS = ("number", "missed", "unseen", "found")
 
 
@@ -44,13 +45,12 @@ class Landmark:
     def noise_factor(self) -> float:
         """By how much more variance its noise has than white noise, if its innovations point one
         way for long: a corner of two depths or a reflection slides over the world."""
-        *summed, variance = self.innovations
-        return max(1.0, float(np.square(summed).mean()) / max(variance, 1.0))
+        u, v, variance = self.innovations.tolist()
+        return max(1.0, (u * u + v * v) / (2 * max(variance, 1.0)))
 
     def compared(self, innovation: np.ndarray) -> None:
         """Note a whitened innovation (2,)."""
-        older = np.array([MEMORY, MEMORY, MEMORY**2])
-        self.innovations = older * self.innovations + np.append(innovation, 1.0)
+        self.innovations = _OLDER * self.innovations + (*innovation.tolist(), 1.0)
 
     def searched(self, found: bool, pixel: np.ndarray, patience: float) -> None:
         """Count one search, that found it at this pixel or not; `success` is an average over about
