@@ -150,8 +150,8 @@ class Map:
         self._make_room(len(pixels), kept)
         slots = self._free(len(pixels))
         report = self.estimator.renew(slots, pixels)
-        gone = [slot for slot in self.landmarks if not report.in_map[slot]]
-        self.give_up(gone, self._nowhere(gone))
+        if gone := [slot for slot in self.landmarks if not report.in_map[slot]]:
+            self.give_up(gone, self._nowhere(gone))
         found = [one.number for one in self.landmarks.values() if one.found]
         self.place.follow(report, self._nearness(), found)
         self._add(slots, image, pixels)
