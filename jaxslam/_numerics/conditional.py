@@ -79,7 +79,8 @@ def at_places(
     def work(values, places, wanted, shared):
         def one(values, data):
             place, wanted = data
-            new = _once(wanted, call, jax.tree.map(lambda x: x[place], values), shared)
+            rows = jax.tree.map(lambda x: x[place], values)
+            new = jax.lax.cond(wanted, call, lambda rows, _: rows, rows, shared)
             return jax.tree.map(lambda x, new: x.at[place].set(new), values, new), None
 
         return jax.lax.scan(one, values, (places, wanted))[0]
@@ -128,21 +129,6 @@ def repeated(
         return after, jax.tree.map(lambda _: True, after)
 
     return one(value, arrays)
-
-
-def _once(
-    wanted: Bool[Array, ""], function: Callable[..., Value], value: Value, *given: PyTree
-) -> Value:
-    """Apply the function once if wanted. What it needs is indexed by the loop's counter, or the
-    compiler would move the work out of a loop that does not change it."""
-    stacked = jax.tree.map(lambda x: jnp.stack([x, x]), given)
-
-    def once(carry):
-        turn, value = carry
-        return turn + 1, function(value, *jax.tree.map(lambda x: x[turn], stacked))
-
-    start = jnp.zeros((), int), value
-    return jax.lax.while_loop(lambda carry: wanted & (carry[0] < 1), once, start)[1]
 
 
 def _spread(size: int, batched: PyTree, values: PyTree) -> PyTree:

@@ -273,12 +273,12 @@ class Estimator:
         graph = [compile_graph(slam, state, self.settings)] if in_submaps(slam) else []
         return [
             in_background(
-                lambda: _begin_map.compile(slam, state, new),
                 lambda: _renew_map.compile(slam, state, new),
                 self.camera,
                 *graph,
             ),
             in_background(
+                lambda: _begin_map.compile(slam, state, new),
                 lambda: _correct.compile(slam, predicted().state, dt, _measured(new, np.zeros(0))),
                 *(partial(believed, one) for one in (*wide, None)),
                 lambda: _world_points.compile(slam, state, self.settings.capacity),

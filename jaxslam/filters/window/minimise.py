@@ -130,10 +130,11 @@ def turned(slam: EkfSlam, record: Record, x: X, y: Y) -> X:
 
     def wrong(turn):
         moved = x.at[n:t].add(turn)
-        return residuals(slam, record, path(slam, record, moved), y).ravel()
+        r = residuals(slam, record, path(slam, record, moved), y).ravel()
+        return r, r
 
     def once(turn, _):
-        J, r = jax.jacfwd(wrong)(turn), wrong(turn)
+        J, r = jax.jacfwd(wrong, has_aux=True)(turn)
         information = J.T @ J + 1e-6 * jnp.eye(t - n, dtype=x.dtype)
         return turn - cholesky(information).solve(J.T @ r), None
 
