@@ -26,8 +26,8 @@ LEAST_MATCHES = 4
 """Fewer do not count as having tracked a frame, and are not believed."""
 CHANCE = 0.05
 """Of a landmark that is not in the picture to have a match all the same that agrees …"""
-CHANCE_LOST = 0.1
-"""… where the camera was lost before, and is searched for widely …"""
+CHANCE_LOST = 0.25
+"""… of one that has any match, where the camera was lost before and is searched for widely …"""
 BY_CHANCE = 1e-3
 """… and of a frame to be believed although its landmarks are not there."""
 WIDE = 6.0
@@ -123,8 +123,9 @@ class Policy:
         labels = np.full(rows, "unmatched")
         labels[matches.owner] = "outlier"
         # A camera that was lost searches ever wider, and something always looks alike.
-        least = more_than_chance(rows, CHANCE_LOST if lost else CHANCE)
-        if len(matches.owner) > len(np.unique(matches.owner)):
+        least, found = more_than_chance(rows), len(np.unique(matches.owner))
+        least = max(least, more_than_chance(found, CHANCE_LOST)) if lost else least
+        if len(matches.owner) > found:
             chosen = self._of_several(seen.slots, matches, landmarks, agree, least)
         else:
             chosen = np.flatnonzero(agree(seen.slots[matches.owner], matches))

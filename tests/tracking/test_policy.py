@@ -57,11 +57,19 @@ def test_what_agrees_is_matched_and_the_rest_of_what_was_found_is_an_outlier():
 
 def test_fewer_than_chance_would_give_are_not_believed_and_a_lost_camera_needs_more():
     least, more = more_than_chance(COUNT), more_than_chance(COUNT, CHANCE_LOST)
-    assert least < more < COUNT // 2
+    assert least < more < COUNT
     for count, lost, believed in (
         (least, False, least), (least - 1, False, 0), (more - 1, True, 0), (more, True, more),
     ):  # fmt: skip
         assert agreeing(range(COUNT), range(count), lost).matched.sum() == believed
+
+
+def test_a_lost_camera_needs_the_more_the_more_landmarks_have_something_that_looks_alike():
+    """Few are found in a blurred picture, and nearly all of another room in wide ellipses."""
+    few = COUNT // 2
+    least = more_than_chance(few, CHANCE_LOST)
+    assert agreeing(range(few), range(least), lost=True).matched.sum() == least
+    assert agreeing(range(COUNT), range(least), lost=True).matched.sum() == 0
 
 
 def test_what_the_filter_did_not_use_is_an_outlier_and_new_landmarks_are_rows_below():
