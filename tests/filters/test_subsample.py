@@ -13,7 +13,7 @@ from jaxslam.filters.registry import scenario_pieces
 from jaxslam.filters.window.minimise import started
 from jaxslam.filters.window.problem import PathLayout, path
 from jaxslam.filters.window.record import whole
-from jaxslam.filters.window.subsample import kept, thinned
+from jaxslam.filters.window.subsample import kept, thinned, tied
 from jaxslam.landmarks import INVERSE_SCALING
 from jaxslam.models.calibration import Known, White
 from jaxslam.models.scale import ScaleGauge
@@ -111,18 +111,31 @@ def test_a_velocity_drawn_anew_stays_drawn_anew(restart):
 
 
 def test_landmarks_begin_in_the_first_frame_that_stays():
-    """One that only a dropped frame saw is kept, as of the frame after it."""
+    """One that only a dropped frame saw is forgotten."""
     slam, record = filter_of(), full()
     minima = unknowns(slam, record)
     fewer, starts = thinned(slam, record, minima)
     assert fewer.last == 3
-    assert fewer.first.tolist() == [0, 1, 2, 0]
+    assert fewer.first.tolist() == [0, 1, 0, 0]
     assert fewer.seen[:4, 0].all()
     assert fewer.seen[:, 1].tolist() == [False, True, True, True, False, False, False]
-    assert fewer.seen[:, 2].tolist() == [False, False, True, False, False, False, False]
-    assert not fewer.seen[:, 3].any()
-    np.testing.assert_array_equal(fewer.measured[2, 2], [300, 301])
+    assert not fewer.seen[:, 2:].any()
     np.testing.assert_array_equal(fewer.measured[:4, 0, 0], [0, 200, 400, 600])
     np.testing.assert_array_equal(starts.y[:, 0], minima.y[:, 0])
     np.testing.assert_array_equal(starts.y[:, 1, 2], minima.y[:, 1, 2])
     assert (starts.y[:, 1:3, :2] == 0).all()
+
+
+@pytest.mark.parametrize(("lives", "holds"), [(FRAMES, True), (4, True), (3, False), (1, False)])
+def test_a_window_is_tied_while_frames_that_stay_share_half_of_their_landmarks(lives, holds):
+    """One landmark enters in each frame, and is seen in so many: a frame sees them all."""
+    k, j = jnp.arange(FRAMES)[:, None], jnp.arange(2 * FRAMES) - FRAMES
+    seen = (j <= k) & (k < j + lives)
+    measured, first = jnp.zeros((*seen.shape, 2)), jnp.maximum(j, 0)
+    record = whole(jnp.full(FRAMES - 1, 0.1), measured, seen, first)
+    assert bool(tied(record)) == holds
+
+
+def test_a_frame_without_light_unties_nothing():
+    record = full()
+    assert tied(replace(record, seen=record.seen.at[4].set(False)))

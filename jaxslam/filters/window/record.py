@@ -21,8 +21,6 @@ from jaxslam.geometry import Scalar
 from jaxslam.models.motion import AbstractMotion, Control
 from jaxslam.models.observations import Features
 
-TIED = 0.8
-"""Share of the landmarks in view."""
 STILL = 5.0
 """σ of χ², above its mean, up to which pixels are where they were."""
 
@@ -59,13 +57,6 @@ class Record(eqx.Module):
     @property
     def full(self) -> Bool[Array, ""]:
         return self.last == self.frames - 1
-
-    @property
-    def tied(self) -> Bool[Array, ""]:
-        """Whether most of what the newest frame sees was seen in the first half of the frames."""
-        seen = self.seen[self.last]
-        long = seen & (2 * self.first <= self.last)
-        return jnp.sum(long) >= TIED * jnp.sum(seen)
 
     @property
     def compared(self) -> Bool[Array, "F m"]:

@@ -3,7 +3,8 @@
 While a camera only turns, parallax does not come, and what the first frames leave open stays open.
 So a window that is full keeps its first frame, its newest, and every other one between: two steps
 become one of their whole length, driven by the mean of both accelerations. The older a part of the
-window, the coarser it becomes, and it reaches back to frame 0 for ever.
+window, the coarser it becomes, and it reaches back to frame 0 for ever. What no frame that stays
+has seen is forgotten.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, Shaped
+from jaxtyping import Array, Bool, Int, Shaped
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam.filters.ekf import EkfSlam
@@ -21,10 +22,20 @@ from jaxslam.filters.window.minimise import Minimum
 from jaxslam.filters.window.problem import PathLayout, X
 from jaxslam.filters.window.record import Record
 
+TIED = 0.5
+"""Of a frame's landmarks: if those before saw fewer, it is hardly known how it stands to them."""
+
 
 def kept(frames: int) -> Int[AnyArray, " k"]:
     """Frames of a full window that stay: the first, and every other one back from the newest."""
     return np.unique([0, *range(frames - 1, 0, -2)])
+
+
+def tied(record: Record) -> Bool[Array, ""]:
+    """Whether of what each frame that stays sees, those before it saw a share of `TIED`."""
+    stay = record.seen[kept(record.frames)]
+    before, after = jnp.cumsum(stay[:-1], axis=0) > 0, stay[1:]
+    return jnp.all(jnp.sum(before & after, axis=1) >= TIED * jnp.sum(after, axis=1))
 
 
 def thinned(slam: EkfSlam, record: Record, minima: Minimum) -> tuple[Record, Minimum]:
@@ -40,8 +51,7 @@ def thinned(slam: EkfSlam, record: Record, minima: Minimum) -> tuple[Record, Min
 
 def _fewer(record: Record) -> Record:
     stay, frames = kept(record.frames), record.frames
-    measured, seen = _without_orphans(record)
-    seen = _padded(seen[stay], frames)
+    seen = _padded(record.seen[stay], frames)
     # Where the velocity is drawn anew, it stood before.
     stood = jnp.append(record.restarted[1:], False)
     lasting = jax.tree.map(lambda x: jnp.where(stood, 0.0, x), record.controls)
@@ -51,21 +61,10 @@ def _fewer(record: Record) -> Record:
         jnp.maximum(_sums(record.merged, frames), 1.0),
         _sums(record.restarted.astype(int), frames) > 0,
         record.standing,
-        _padded(measured[stay], frames),
+        _padded(record.measured[stay], frames),
         seen,
         jnp.argmax(seen, axis=0).astype(record.first.dtype),
     )
-
-
-def _without_orphans(record: Record) -> tuple[Array, Array]:
-    """Measurements, and where they are; a landmark that no frame that stays has seen keeps its last
-    sight, as of the frame after it."""
-    seen = record.seen
-    last = (record.frames - 1) - jnp.argmax(seen[::-1], axis=0)
-    orphan = jnp.any(seen, axis=0) & ~jnp.any(seen[kept(record.frames)], axis=0)
-    slots, to = jnp.arange(last.size), jnp.where(orphan, last + 1, record.frames)
-    measured = record.measured.at[to, slots].set(record.measured[last, slots], mode="drop")
-    return measured, seen.at[to, slots].set(True, mode="drop")
 
 
 def _noises(slam: EkfSlam, record: Record, fewer: Record, x: X) -> X:

@@ -26,7 +26,7 @@ from jaxslam.filters.window import record as window
 from jaxslam.filters.window.modes import Modes, at_rest, sought
 from jaxslam.filters.window.problem import PathLayout
 from jaxslam.filters.window.record import Record
-from jaxslam.filters.window.subsample import thinned
+from jaxslam.filters.window.subsample import thinned, tied
 from jaxslam.filters.window.to_filter import gauge_state
 from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
 from jaxslam.filters.wrappers.sum_state import SumState
@@ -199,10 +199,10 @@ class BatchInitialisation(AbstractWrapper):
 
     def _ready(self, state: RestState) -> Bool[Array, ""]:
         """Whether one mode is left whose translation is known; or, where there is no room, whether
-        there is a translation, or its landmarks leave the view."""
+        there is a translation, or with fewer frames too few landmarks would tie them."""
         enough = state.record.steps >= LEAST_STEPS
         alone = state.sum.log_weights[0] > -1e-3
-        over = self._moved(state, MOVED) | ~state.record.tied
+        over = self._moved(state, MOVED) | ~tied(state.record)
         return (enough & alone & self._moved(state, KNOWN)) | (state.record.full & over)
 
     def _moved(self, state: RestState, share: float) -> Bool[Array, ""]:
