@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
+from jaxslam.filters.protocol import AbstractStaged
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.filters.registry import make_filter, scenario_pieces
 from jaxslam.geometry import GEOMETRIES
@@ -198,24 +198,6 @@ def keys_used(monkeypatch, function):
         value = jax.block_until_ready(function())
         jax.effects_barrier()
     return value, found
-
-
-class WithoutRemove(AbstractFilter):
-    """A filter of four functions, which are those of another."""
-
-    base: EkfSlam
-
-    def init(self, capacity, first=None):
-        return self.base.init(capacity, first)
-
-    def step(self, state, control, seen, new):
-        return self.base.step(state, control, seen, new)
-
-    def marginal(self, state, function):
-        return self.base.marginal(state, function)
-
-    def landmark_marginal(self, state, function, slots):
-        return self.base.landmark_marginal(state, function, slots)
 
 
 class Around(AbstractStaged):

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import WithoutRemove, quick_jit, simulated
+from cases import quick_jit, simulated
 from scipy.special import gammainc
 from scipy.stats import chi2, norm
 
@@ -509,13 +509,13 @@ def test_a_slot_used_again_is_as_good_as_one_of_its_own(name):
 def test_a_filter_that_cannot_remove_landmarks_cannot_use_slots_again():
     for name, refused in (("handheld", True), ("matched-6dof", False)):
         scenario = jaxslam.scenario(name, steps=2, landmarks=3)
-        slam = WithoutRemove(jaxslam.EkfSlam(**scenario_pieces(scenario)))
+        slam = jaxslam.make_filter("world+lag2", **scenario_pieces(scenario))
         run = jax.eval_shape(partial(jaxslam.simulate, scenario), jax.random.key(0))
         through = partial(filter_run, slam, Room(3, 3, 3, 3), sensor_of(scenario))
         if not refused:
             assert jax.eval_shape(through, run)
             continue
-        with pytest.raises(ValueError, match=r"WithoutRemove has no remove\(state, gone\)"):
+        with pytest.raises(ValueError, match=r"FixedLag has no remove\(state, gone\)"):
             jax.eval_shape(through, run)
 
 

@@ -194,28 +194,6 @@ def test_absorbing_the_oldest_frame_keeps_its_point_and_all_that_is_known_of_the
     close(found.covariance, expected.covariance, 1e-6)
 
 
-@pytest.mark.slow
-def test_a_removed_landmark_leaves_nothing_behind():
-    of = case()
-    slam = of.filter("scale_gauge+lag3")
-    state, _ = pose_run(of, slam)
-    gone = jnp.arange(of.capacity) == 1
-    left = slam.remove(state, gone)
-    d, c = state.before.landmarks.shape[1], state.estimate.core_dim
-    rows = slice(c + d, c + 2 * d)
-    assert not left.estimate.active[1]
-    assert not np.any(left.before.root[rows])
-    assert not np.any(left.estimate.covariance[rows])
-    assert not np.any(left.frames.seen.valid & (left.frames.seen.slots == 1))
-    _, known, new = of.frames(0)
-    step = quick_jit(lambda *x: slam.step(*x))
-    frame = jax.tree.map(lambda x: x[-1], (known, new))
-    seen = replace(frame[0], valid=frame[0].valid & (frame[0].slots != 1))
-    after, _ = step(left, of.controls()[-1], seen, frame[1])
-    assert np.isfinite(np.asarray(after.estimate.covariance)).all()
-    assert not np.any(after.estimate.covariance[rows])
-
-
 def test_the_gauge_is_not_seen_by_a_camera():
     """Nothing that is measured depends on λ."""
     of = case()

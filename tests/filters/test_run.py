@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Case, WithoutRemove, quick_jit
+from cases import Case, quick_jit
 
 import jaxslam
 
@@ -53,8 +53,8 @@ def test_what_is_collected_is_ones_own():
 
 
 def test_slots_are_not_freed_of_a_filter_that_cannot_remove():
-    slam = WithoutRemove(case().filter("world"))
-    gone = jnp.zeros((4, 3), bool)
-    with pytest.raises(ValueError, match=r"WithoutRemove has no remove\(state, gone\)"):
-        jaxslam.run(slam, frames_of(gone), slam.init(3))
-    assert eqx.filter_eval_shape(jaxslam.run, slam, frames_of(), slam.init(3))
+    slam, frames = case().filter("world+lag2"), frames_of()
+    room = jaxslam.Capacity(3, *(x.slots.shape[1] for x in (frames.seen, frames.new)))
+    with pytest.raises(ValueError, match=r"FixedLag has no remove\(state, gone\)"):
+        jaxslam.run(slam, frames_of(jnp.zeros((4, 3), bool)), slam.init(room))
+    assert eqx.filter_eval_shape(jaxslam.run, slam, frames, slam.init(room))

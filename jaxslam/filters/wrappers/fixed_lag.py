@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxslam._numerics.arrays import AnyArray
 from jaxslam._numerics.linalg import Cholesky, cholesky, semidefinite_root
 from jaxslam.filters.ekf import EkfSlam, check_features, check_one_gaussian, correct
 from jaxslam.filters.forms.blocks import shifted
@@ -90,6 +89,9 @@ class NormalEquations(NamedTuple):
 class FixedLag(AbstractFilter):
     """The smoother around `base`, a filter in covariance form whose landmarks enter undelayed.
 
+    It cannot free slots: without the measurements that the window has of landmarks that left the
+    view, those that stayed would look too far away, as near ones leave first.
+
     Raises ValueError for another base, and for numbers out of range.
     """
 
@@ -132,27 +134,6 @@ class FixedLag(AbstractFilter):
         state = LagState(before, variables + window.step(), frames, _estimate(window))
         status = judged(window.information.positive, state.estimate.covariance, state.variables)
         return state, replace(innovation, status=status)
-
-    def remove(self, state: LagState, gone: Bool[AnyArray, " capacity"]) -> LagState:
-        """Marginalise landmarks, with what the window measured of them, and free their slots."""
-        before, frames = state.before, state.frames
-        n, kept = before.offset.size, before.numbers(~gone)
-        before = replace(
-            before,
-            active=before.active & ~gone,
-            offset=jnp.where(kept, before.offset, 0.0),
-            root=jnp.where(kept[:, None] & kept, before.root, 0.0),
-        )
-
-        def without(features):
-            return replace(features, valid=features.valid & ~gone[features.slots])
-
-        return LagState(
-            before,
-            state.variables.at[:n].set(jnp.where(kept, state.variables[:n], 0.0)),
-            replace(frames, seen=without(frames.seen), new=without(frames.new)),
-            self.base.remove(state.estimate, gone),
-        )
 
     def marginal(self, state: LagState, function: OfCamera) -> Moments:
         """The marginal of the newest state, as the base filter's; so are the following."""
