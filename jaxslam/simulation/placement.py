@@ -14,9 +14,8 @@ from jaxslam.simulation.scenario import Scenario
 from jaxslam.simulation.visibility import in_image
 
 
-def _from_prior(s: Scenario, key: Array, poses: Pose) -> Float[Array, "l n"]:
+def _from_prior(s: Scenario, key: Array) -> Float[Array, "l n"]:
     """Uniform pixels of frame 0, inverse depths from the prior, truncated."""
-    del poses
     pixel_key, depth_key = jax.random.split(key)
     depth, count = depth_of(s), s.landmarks
     pixels = _random_pixels(s, pixel_key)
@@ -37,10 +36,10 @@ def _on_rays(camera: Camera, pixels, inverse_depths) -> Float[Array, "l n"]:
     return jnp.column_stack([bearings, jnp.ones_like(inverse_depths)]) / inverse_depths[:, None]
 
 
-def _on_ring(s: Scenario, key: Array, poses: Pose) -> Float[Array, "l n"]:
+def _on_ring(s: Scenario, key: Array) -> Float[Array, "l n"]:
     """Evenly on a circle about the centre of the nominal path, at the camera's height; in space in
     turn below, at and above it."""
-    del key, poses
+    del key
     # In the plane from x towards z; about y, which points down, the other way round.
     turn = s.velocity[-1] if s.geometry == "planar" else -s.velocity[4]
     n = s.world.point_dim
@@ -55,19 +54,11 @@ def _on_ring(s: Scenario, key: Array, poses: Pose) -> Float[Array, "l n"]:
     return ring.astype(centre.dtype)
 
 
-def _along_path(s: Scenario, key: Array, poses: Pose) -> Float[Array, "l n"]:
-    """On random rays of the cameras of random frames, at depths that are uniform."""
-    frame_key, key = jax.random.split(key)
-    frames = jax.random.randint(frame_key, (s.landmarks,), 0, s.steps + 1)
-    points = _thrown(s, key, Camera(s.focal, s.centre))
-    return jax.vmap(type(poses).apply)(jax.tree.map(lambda x: x[frames], poses), points)
-
-
-def _in_room(s: Scenario, key: Array, poses: Pose) -> Float[Array, "72 3"]:
+def _in_room(s: Scenario, key: Array) -> Float[Array, "72 3"]:
     """The cloister of slamtb: nine points along each wall of a 12 m room, in two rows, 1 m apart
     in height; the camera starts 0.6 m above the lower ones, 5 m from the centre, looking along
     the wall."""
-    del key, poses
+    del key
     along = jnp.concatenate([jnp.arange(-4, 5, 2), jnp.arange(-4, 3, 2)])
     out = jnp.array([6] * 5 + [4] * 4)
     wall = jnp.column_stack([along, out])  # (east, north) of the northern wall
@@ -79,8 +70,8 @@ def _in_room(s: Scenario, key: Array, poses: Pose) -> Float[Array, "72 3"]:
     return jnp.column_stack([-(north + 5), 0.6 - up, east]).astype(jnp.result_type(s.rate))
 
 
-PLACEMENT = {"prior": _from_prior, "ring": _on_ring, "room": _in_room, "cloud": _along_path}
-"""Where landmarks are for a whole run, of a scenario, a key and the true poses."""
+PLACEMENT = {"prior": _from_prior, "ring": _on_ring, "room": _in_room}
+"""Where landmarks are for a whole run, of a scenario and a key."""
 
 
 def thrown(

@@ -27,7 +27,7 @@ CALIBRATIONS = ("white", "consider", "estimated", "known")
 """The paper's independent draw of every frame; constant and correlated but not corrected
 (Schmidt); constant and estimated; exact."""
 TRUE_CALIBRATIONS = ("nominal", "white", "constant")
-PLACEMENTS = ("prior", "ring", "room", "cloud", "rays")
+PLACEMENTS = ("prior", "ring", "room", "rays")
 ROOM_LANDMARKS = 72
 LARGEST_WHOLE = 2**31 - 1
 
@@ -69,8 +69,7 @@ class Scenario(eqx.Module):
     placement: str = _structural("prior")
     """`prior`: every landmark seen in frame 0, at a uniform pixel and an inverse depth from the
     filter's prior. `ring`: evenly on a horizontal circle around the centre of the nominal path.
-    `room`: 72 points along the walls of a square room, on two levels (slamtb). `cloud`: along the
-    true path, each on a random ray of a random frame; seen up to the greatest depth. `rays`: always
+    `room`: 72 points along the walls of a square room, on two levels (slamtb). `rays`: always
     as many in view; for one that leaves, which is gone for good, another is thrown along a random
     ray of the camera there."""
     landmarks: int = _structural(12)
@@ -80,7 +79,7 @@ class Scenario(eqx.Module):
     first_pixels: tuple[Numbers, ...] = ((20.0, 620.0),)
     """`prior`, `rays`: the interval of each pixel coordinate at first sight."""
     depth_range: Numbers = (1.0, 6.0)
-    """`rays`, `cloud`: least and greatest depth on the ray, m; uniform in between."""
+    """`rays`: least and greatest depth on the ray, m; uniform in between."""
     ring_radius: float = 8.0
     """`ring`: its radius, m."""
     nearest_depth: float = 3.0
@@ -298,8 +297,6 @@ def _check_placement(s: Scenario) -> None:
         )
     if s.placement == "rays":
         _check_rays(s)
-    if s.placement == "cloud" and s.sensor != "camera":
-        raise ValueError(f"placement cloud is for a camera, not for a {s.sensor} sensor")
     if s.in_view and (s.placement == "rays" or _limits(s)):
         raise ValueError(
             "scenario field in_view: not with placement rays, first_landmarks, new_landmarks or "

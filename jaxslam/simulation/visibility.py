@@ -19,8 +19,7 @@ def in_image(scenario: Scenario, points, pixels) -> Bool[Array, " l"]:
 def visible(s: Scenario, sensor: AbstractSensor, points, measured) -> Bool[Array, " l"]:
     """A camera sees what is in its picture; another sensor what is in its range."""
     if isinstance(sensor, Pinhole):
-        near = points[:, -1] <= s.depth_range[-1] if s.placement == "cloud" else True
-        return in_image(s, points, measured) & near
+        return in_image(s, points, measured)
     (least, greatest), distance = s.range, jnp.linalg.norm(points, axis=-1)
     in_range = (distance >= least) & (distance <= greatest)
     return in_range & jax.vmap(sensor.possible)(points)

@@ -57,7 +57,7 @@ def simulate(
             raise ValueError(f"placement rays is for a Pinhole, not for {type(sensor).__name__}")
         points, new = thrown(s, world_key, poses, sensors)
     else:
-        points, new = PLACEMENT[s.placement](s, world_key, poses), None
+        points, new = PLACEMENT[s.placement](s, world_key), None
     one = jnp.ones((), points.dtype)
 
     def frame(pose: Pose, sensor, points):

@@ -905,26 +905,12 @@ def test_landmarks_that_share_slots_are_new_when_they_come_back():
     assert abs(float(run.measured[frame, slot, 0]) - (650 * x / z + 320)) < 3
 
 
-def test_a_cloud_is_along_the_path_and_seen_near_it():
-    chosen = scenario(
-        "matched-6dof", placement="cloud", landmarks=200, in_view=20, steps=60, depth_range=[1, 4]
-    )
-    run = simulated(chosen, 1)
-    depths = []
-    for k in (0, 30, 60):
-        T_CB = jax.tree.map(lambda x, k=k: x[k], run.poses).inverse()
-        depths.append(np.asarray(jax.vmap(T_CB.apply)(run.points[k]))[run.visible[k], 2])
-    assert min(map(len, depths)) >= 10
-    assert np.concatenate(depths).max() <= 4
-
-
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
         ({"placement": "rays", "in_view": 5}, "in_view: not with placement rays"),
         ({"known_landmarks": 3, "in_view": 5}, "in_view: not with placement rays"),
         ({"in_view": -1}, "in_view must not be negative"),
-        ({"placement": "cloud", "sensor": "position"}, "cloud is for a camera"),
     ],
 )
 def test_worlds_that_are_seen_again_are_checked(fields, message):
