@@ -14,7 +14,7 @@ from jaxslam.models.motion import Odometry
 from jaxslam.simulation import Run
 
 STEPS = 10
-"""Of Levenberg–Marquardt, from the truth: the result is the best that there is."""
+"""Of Levenberg–Marquardt, at the most, from the truth: the result is the best that there is."""
 
 
 def batch_positions(slam: EkfSlam, run: Run, dt: float) -> np.ndarray:
@@ -24,6 +24,8 @@ def batch_positions(slam: EkfSlam, run: Run, dt: float) -> np.ndarray:
     for _ in range(STEPS):
         A, b = _system(slam, run, dt, *unknown)
         cost = float(b @ b)
+        if best - 1e-6 < cost <= best:
+            break
         if cost < best:
             kept, best, damping = (unknown, A, b), cost, damping / 10
         else:

@@ -70,6 +70,14 @@ class Candidates(NamedTuple):
         valid = self.valid & (self.landmark != self.landmark[match])
         return Candidates(residual, _eliminated(S, match), valid, self.landmark)
 
+    def widened(self, most: float) -> Candidates:
+        """The same with S as many times as large as half of the matches tell, up to `most` times:
+        of a filter that may be over-confident of what all matches have in common."""
+        half = jnp.nanmedian(jnp.where(self.valid, self.distances(), jnp.nan))
+        usual = _chi2_quantile(self.residual.shape[1], 0.5)
+        times = jnp.clip(jnp.nan_to_num(half / usual, nan=1.0), 1.0, most)
+        return self._replace(covariance=times * self.covariance)
+
     def best_of_each(self, distances: Float[Array, "*k m"]) -> Float[Array, "*k m"]:
         """The least of each landmark, infinite of a number that has none."""
         least = jax.vmap(lambda row: jax.ops.segment_min(row, self.landmark, len(self.landmark)))
@@ -352,6 +360,6 @@ def _squared(r: Float[Array, "m p"], S: Float[Array, "m p p"]) -> Float[Array, "
     return jnp.where(jnp.isnan(squared), jnp.inf, squared)
 
 
-def _chi2_quantile(dof: int | np.ndarray) -> np.ndarray | np.floating:
-    """The χ² value below which a true match is with probability `GATE`."""
-    return 2 * scipy.special.gammaincinv(np.asarray(dof) / 2, GATE)
+def _chi2_quantile(dof: int | np.ndarray, share: float = GATE) -> np.ndarray | np.floating:
+    """The χ² value below which a true match is with this probability."""
+    return 2 * scipy.special.gammaincinv(np.asarray(dof) / 2, share)

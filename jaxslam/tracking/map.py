@@ -178,7 +178,7 @@ class Map:
 
     def learn(self, loop: LoopClosure, compared: Compared) -> None:
         """Take over what a loop says, that ends at the camera."""
-        self.loops = (*self.loops, replace(loop, nis=compared.nis))
+        self.loops = (*self.loops, loop)
         moved = self.place.correct(compared.T_bc, compared.covariance)
         for one in self.landmarks.values():
             one.first_camera = moved @ one.first_camera

@@ -28,7 +28,7 @@ from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.unit import MapInWorld
 
-FORMAT = "jaxslam tracker 8"
+FORMAT = "jaxslam tracker 9"
 
 NUMBERS = {
     "restarts": "map.latest",

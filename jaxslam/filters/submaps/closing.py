@@ -6,7 +6,8 @@ problem with few residuals c(y) of many numbers. Gauss–Newton is then in the s
     y ← −Jᵀ S⁻¹ (c − J y),   S = J Jᵀ + R,
 
 (the dual form of Bell's step, SIAM J. Optim. 4, 1994), linear in the length of the chain; so is the
-covariance `I − Jᵀ S⁻¹ J`. The filter is told nothing of it: where the submaps are is learnt, and
+covariance `I − Jᵀ S⁻¹ J`. The cost of the maximum says whether the filter's covariances were right
+(`unit_variance`). The filter is told nothing of it: where the submaps are is learnt, and
 what is in them, and a loop that turned out wrong is one residual less.
 """
 
@@ -21,19 +22,26 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxslam._numerics.arrays import AnyArray
 from jaxslam._numerics.linalg import Cholesky, cholesky
 from jaxslam.filters.association import Candidates, joint_compatibility
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.submaps.chain import Chain, OfChain, base_poses
 from jaxslam.geometry import homogeneous_apply
 
-STEPS = 10
+STEPS = 20
 """Of Gauss–Newton, at the most …"""
 SMALLEST = 1e-4
-"""… until no white number moves by more than this share of its σ."""
+"""… until no white number moves by more than this share of its σ …"""
+LARGEST = 3.0
+"""… and none by more than so many σ in one step: a chain that is off by much is curved."""
 SAME = 1e-5
 """σ of the distance of a point from itself, as a share of its distance from the camera: none, but
 for rounding."""
+WIDEST = 9.0
+"""Times the variance that a pair's error may have, so three times its σ."""
+SUPPOSED = 12
+"""Residuals that are as expected, before there is any."""
 
 
 class Loops(eqx.Module):
@@ -57,14 +65,30 @@ class Posterior(eqx.Module):
     """J of the loops' residuals there."""
     factor: Cholesky
     """S of the residuals."""
+    cost: Float[Array, ""]
+    """Twice the negative logarithm of the posterior at the maximum: χ² of `told` numbers."""
+    told: Int[Array, ""]
+    """Residuals that say anything."""
     converged: Bool[Array, ""]
 
+    @property
+    def unit_variance(self) -> Float[Array, ""]:
+        """By how much more the chain's variances are than the filter says (`unit_variance`)."""
+        return unit_variance(self.cost, self.told)
+
     def marginal(self, function: OfChain) -> tuple[PyTree, Float[Array, "j j"]]:
-        """Return mean and covariance of a function of all submaps' states, to first order."""
+        """Return mean and covariance of a function of all submaps' states, to first order, the
+        covariance as much more as the loops tell."""
         value, rows = self.chain.linearised(function, self.states)
         rows, slope = (x.reshape(len(x), math.prod(self.chain.shape)) for x in (rows, self.slope))
         known = self.factor.whitening @ (slope @ rows.T)
-        return value, rows @ rows.T - known.T @ known
+        return value, self.unit_variance * (rows @ rows.T - known.T @ known)
+
+
+def unit_variance(cost: Float[AnyArray, ""], told: Int[AnyArray, ""]) -> Float[Array, ""]:
+    """The variance of unit weight of a least squares adjustment with this cost and so many
+    residuals more than unknowns: 1 before, as well known as by `SUPPOSED` of them, and no less."""
+    return jnp.maximum(1.0, (cost + SUPPOSED) / (told + SUPPOSED))
 
 
 def separation(chain: Chain, loops: Loops, states: State) -> Float[Array, "m n"]:
@@ -117,31 +141,40 @@ def posterior(
     """Return the chain in which a residual of all states is zero, but for an error of this σ, at
     the last point where it was linearised: the maximum but for `SMALLEST`."""
 
-    def linear(y: Float[Array, "N n"]) -> tuple[Array, tuple[State, Array, Cholesky]]:
+    def linear(y: Float[Array, "N n"]) -> tuple[Array, tuple[State, Array, Array, Cholesky]]:
         states = chain.at(y)
         value, rows = chain.linearised(residual, states)
         J = rows.reshape(len(value), y.size)
         factor = cholesky(J @ J.T + sigma**2 * jnp.eye(len(value)))
         new = -(J.T @ factor.solve(value - J @ y.ravel())).reshape(y.shape)
-        return new, (states, rows, factor)
+        return new, (states, value, rows, factor)
 
     def step(carry):
         y, _, _, count = carry
         new, at = linear(y)
-        return new, at, jnp.any(jnp.abs(new - y) > SMALLEST), count + 1
+        farthest = jnp.max(jnp.abs(new - y))
+        new = y + jnp.minimum(1.0, LARGEST / farthest) * (new - y)
+        return new, at, ~(farthest < SMALLEST), count + 1
 
     zero = jnp.zeros(chain.shape, chain.links.root.dtype)
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(linear, zero)[1])
     start = zero, nothing, jnp.asarray(True), 0
-    _, (states, rows, factor), moved, _ = jax.lax.while_loop(
+    y, (states, value, rows, factor), moved, _ = jax.lax.while_loop(
         lambda x: x[2] & (x[3] < STEPS), step, start
     )
-    return Posterior(chain, states, rows, factor, ~moved)
+    cost = jnp.sum(y**2) + jnp.sum((value / sigma) ** 2)
+    told = jnp.sum(jnp.any(rows != 0, axis=(1, 2)))
+    return Posterior(chain, states, rows, factor, cost, told, ~moved)
 
 
 def agreeing(known: Posterior, loops: Loops) -> Loops:
     """Return the loops of which those are valid that are jointly compatible with all that is known,
-    earlier loops included, and with one another."""
+    earlier loops included, and with one another.
+
+    A filter may be over-confident of the way round a loop, which is then off by more than it says
+    with all pairs alike. The covariance is taken to be as much more as half of the pairs tell, up
+    to `WIDEST`.
+    """
     m = len(loops.valid)
     value, S = known.marginal(lambda states: separation(known.chain, loops, states).ravel())
     S += SAME**2 * jnp.eye(value.size)
@@ -150,4 +183,4 @@ def agreeing(known: Posterior, loops: Loops) -> Loops:
     found = Candidates(
         value.reshape(m, -1), S.reshape(m, -1, m, value.size // m), loops.valid, first
     )
-    return replace(loops, valid=joint_compatibility(found))
+    return replace(loops, valid=joint_compatibility(found.widened(WIDEST)))

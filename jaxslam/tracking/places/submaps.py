@@ -25,15 +25,13 @@ from jaxslam.filters.forms.state import State
 from jaxslam.filters.model import COMPOSED, CameraInMap
 from jaxslam.filters.protocol import AbstractStaged, Belief, LandmarkView
 from jaxslam.filters.submaps.chain import Chain, Link, base_poses, link
-from jaxslam.filters.submaps.closing import Posterior, posterior
+from jaxslam.filters.submaps.closing import Posterior, posterior, unit_variance
 from jaxslam.filters.submaps.handover import PARALLAX, TURN, Frozen
 from jaxslam.geometry import difference, retract
 from jaxslam.models.coordinates import SUBMAP, KeyframePose, keyframe_due
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 from jaxslam.tracking.settings import TrackerSettings
 
-SUPPOSED = 2
-"""Loops that are as expected, before there is any."""
 LEAST = 8
 """Submaps, and loops, for which a program is compiled: twice as many where there are more."""
 
@@ -99,15 +97,13 @@ class LoopClosure(eqx.Module):
     """R/σ."""
     by_landmarks: Float[AnyArray, "*L 6 m d"]
     """Qᵀ B/σ; zero of a place that stands for no landmark."""
-    nis: Float[AnyArray, "*L"]
-    """Of the loop given those before it, with six degrees of freedom."""
 
 
 class Compared(NamedTuple):
     """A loop compared with what is known without it."""
 
     nis: np.ndarray
-    """Of six degrees of freedom."""
+    """Of six degrees of freedom, by what the filter says without any loop's `unit_variance`."""
     T_bc: Float[np.ndarray, "4 4"]
     """The present camera, given the loop to first order, from where the map begins …"""
     covariance: Float[np.ndarray, "6 6"]
@@ -178,7 +174,7 @@ def loop_of(
     X, there = submaps[p].frozen.state.landmarks[padded], np.arange(most) < k
     calibration = submaps[q].frozen.state.core.calibration
     by = _slopes(ekf_inside(slam, "loops are"), X, there, calibration, T, np.asarray(sigma))
-    return LoopClosure(np.array(which), padded, X, T, *by, np.zeros(()))
+    return LoopClosure(np.array(which), padded, X, T, *by)
 
 
 @dataclass(frozen=True)
@@ -197,15 +193,12 @@ class Graph:
         """A loop compared with all that is known, and what it says of the present camera."""
         known, more = self._known()
         new = replace(new, submaps=new.submaps + more)
-        found = Compared(*jax.device_get(_compared(known, new)))
-        factor = _factor([*(one.nis for one in self.loops), found.nis])
-        return found._replace(covariance=factor * found.covariance)
+        return Compared(*jax.device_get(_compared(known, new)))
 
     def solved(self) -> Solved:
         """All cameras."""
         known, more = self._known()
-        T_bc, P, points = (np.asarray(x)[more:] for x in _solved(known))
-        return Solved(T_bc, _factor([one.nis for one in self.loops]) * P, points)
+        return Solved(*(np.asarray(x)[more:] for x in _solved(known)))
 
     def _known(self) -> tuple[Posterior, int]:
         """The chain given its loops, and how many submaps are in front that are none."""
@@ -252,14 +245,6 @@ def compile_graph(
     return compile
 
 
-def _factor(nis: Sequence[AnyArray]) -> float:
-    """By how much more the chain's variances are than the filter says, where its loops tell: the
-    variance of unit weight of a least squares adjustment, which is 1 before, as well known as by
-    `SUPPOSED` loops."""
-    count = len(nis) + SUPPOSED
-    return max(1.0, (float(np.sum(nis)) / 6 + SUPPOSED) / count)
-
-
 def _size(count: int) -> int:
     """As many as there are, or more: a power of two."""
     return max(LEAST, 1 << max(count - 1, 0).bit_length())
@@ -272,7 +257,7 @@ def _stacked(trees: Sequence[PyTree]) -> PyTree:
 def no_loop(most: int, d: int, submap: int = 0) -> LoopClosure:
     """A loop that says nothing, of landmarks of d numbers each."""
     of_landmarks = np.zeros((most, d)), np.eye(4), np.zeros((6, 6)), np.zeros((6, most, d))
-    return LoopClosure(np.full(2, submap), np.zeros(most, int), *of_landmarks, np.zeros(()))
+    return LoopClosure(np.full(2, submap), np.zeros(most, int), *of_landmarks)
 
 
 def _row(tree: PyTree, k: int | Array) -> PyTree:
@@ -342,10 +327,12 @@ def _compared(known: Posterior, new: LoopClosure) -> tuple[Array, Array, Array]:
         return camera, _error(known.chain, new, states)
 
     (T_BC, error), P = known.marginal(both)
+    P = P / known.unit_variance
     S = P[6:, 6:] + jnp.eye(6)
     gain = jnp.linalg.solve(S, P[6:, :6]).T
     T_BC, left = retract(T_BC, -gain @ error), P[:6, :6] - gain @ P[6:, :6]
-    return error @ jnp.linalg.solve(S, error), T_BC.as_matrix(), left
+    nis = error @ jnp.linalg.solve(S, error)
+    return nis, T_BC.as_matrix(), unit_variance(known.cost + nis, known.told + 6) * left
 
 
 @Program

@@ -1,5 +1,7 @@
 """Loops: which pairs are believed, and what is learnt of the chain."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from jaxslam.consistency import run_through
 from jaxslam.filters import Loops, agreeing, base_poses, chain, close, with_submaps
 from jaxslam.filters.registry import make_filters
+from jaxslam.filters.submaps import closing
 from jaxslam.simulation import Room, scenario, simulate
 
 LAP = scenario("laps-6dof", steps=440, in_view=12, landmarks=96)
@@ -97,6 +100,17 @@ def test_wrong_pairs_are_refused_among_right_ones(lap):
     believed = np.asarray(agreeing(before, pairs).valid)
     assert not believed[wrong].any()
     assert believed[~wrong].mean() > 0.7
+
+
+def test_right_pairs_are_believed_of_an_overconfident_chain(lap, monkeypatch):
+    """It is off by more than its covariance says, with all pairs alike."""
+    chained, _, loops = lap
+    links = chained.links
+    links = replace(links, root=0.3 * links.root, whitening=links.whitening / 0.3)
+    before = close(replace(chained, links=links), none_of(loops))
+    assert np.asarray(agreeing(before, loops).valid).all()
+    monkeypatch.setattr(closing, "WIDEST", 1.0)
+    assert not np.asarray(agreeing(before, loops).valid).all()
 
 
 def test_a_batch_of_runs_has_chains_of_one_length(lap):
