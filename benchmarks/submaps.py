@@ -223,7 +223,7 @@ def of_run(options, scenario, slam, run: Run, state, told: Filtered, index: int)
         "seconds": seconds,
         "nees_submaps": float(told.nees[-1]),
         "converged": float(closed.converged),
-        "unit_variance": float(closed.unit_variance),
+        "unit_variance": float(closed.unit_variance()),
     }
     positions = np.asarray(truth.translation())[mine]
     for name, of in (("before", nothing), ("closed", closed)):

@@ -44,12 +44,12 @@ class Ros:
         pose = self.with_covariance(T, P)
         return self.make("geometry_msgs/PoseWithCovarianceStamped", self.header(t, frame), pose)
 
-    def odometry(self, t, T, P, frame="map"):
+    def odometry(self, t, T, P, frame="map", body="base_link"):
         zero = self.make("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
         twist = self.make("geometry_msgs/Twist", zero, zero)
         twist = self.make("geometry_msgs/TwistWithCovariance", twist, np.zeros(36))
         pose = self.with_covariance(T, P)
-        return self.make("nav_msgs/Odometry", self.header(t, frame), "base_link", pose, twist)
+        return self.make("nav_msgs/Odometry", self.header(t, frame), body, pose, twist)
 
     def pose_stamped(self, t, T, frame="map"):
         return self.make("geometry_msgs/PoseStamped", self.header(t, frame), self.pose(T))

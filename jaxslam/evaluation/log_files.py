@@ -301,7 +301,8 @@ def evaluate_runs(
         names,
     )
     told = (
-        *_left_out(read), *left_out([one.evaluated for one in read]), *_other_times(read, longest)
+        *_left_out(read), *left_out([one.evaluated for one in read]),
+        *_other_times(read, longest), *_other_body(runs[0]),
     )  # fmt: skip
     if not read[0].said and not stated:
         told += (f"the file does not say its convention; assumed: {convention}",)
@@ -382,6 +383,13 @@ def _other_times(read: list[_RunLog], longest: _RunLog) -> Iterator[str]:
                 f"runs, and are those of {longest.run.name}"
             )
             return
+
+
+def _other_body(run: RunFiles) -> Iterator[str]:
+    """That the topics say that they are poses of different frames."""
+    own, true = ros.body_of(run.estimate), ros.body_of(run.truth)
+    if own and true and own != true:
+        yield f"the estimate is of {own} and the truth of {true}: what is between counts as error"
 
 
 def _read(run: RunFiles) -> _RunLog:

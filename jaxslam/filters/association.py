@@ -74,9 +74,8 @@ class Candidates(NamedTuple):
         """The same with S as many times as large as half of the matches tell, up to `most` times:
         of a filter that may be over-confident of what all matches have in common."""
         half = jnp.nanmedian(jnp.where(self.valid, self.distances(), jnp.nan))
-        usual = _chi2_quantile(self.residual.shape[1], 0.5)
-        times = jnp.clip(jnp.nan_to_num(half / usual, nan=1.0), 1.0, most)
-        return self._replace(covariance=times * self.covariance)
+        times = jnp.nan_to_num(half / _chi2_quantile(self.residual.shape[1], 0.5), nan=1.0)
+        return self._replace(covariance=jnp.clip(times, 1.0, most) * self.covariance)
 
     def best_of_each(self, distances: Float[Array, "*k m"]) -> Float[Array, "*k m"]:
         """The least of each landmark, infinite of a number that has none."""

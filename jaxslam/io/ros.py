@@ -95,6 +95,12 @@ def _opened(path: Path) -> Generator[tuple[Message, Callable[[bytes, str], Messa
         raise ValueError(f"{path}: cannot be read ({told}); {BAG}, whole, is accepted") from None
 
 
+def body_of(place: Path | Topic) -> str:
+    """The frame whose poses these are, by the first message; "" where nothing says it."""
+    first = None if isinstance(place, Path) else next(messages(place), None)
+    return str(getattr(first, "child_frame_id", "")).strip("/")
+
+
 def seconds(message: Message) -> float:
     """The stamp of a message's header."""
     return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec

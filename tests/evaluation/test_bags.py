@@ -112,6 +112,16 @@ def test_one_command_evaluates_a_bag(tmp_path, capsys):
     assert a == b == c
 
 
+@pytest.mark.parametrize("body", ["base_link", "/base_link", "imu", ""])
+def test_poses_of_two_bodies_are_told(body, tmp_path):
+    r = ros_of("run.mcap")
+    truth = [r.odometry(t, T, 0 * P[0], body=body) for t, T in zip(STAMPS, TRUTH, strict=True)]
+    bag = write_bag(tmp_path / "run.mcap", {"/odometry": odometry(r), "/truth": truth})
+    found = jaxslam.evaluate_log(bag, estimate="/odometry", truth="/truth")
+    told = "the estimate is of base_link and the truth of imu: what is between counts as error"
+    assert (told in found.notes) == (body == "imu")
+
+
 @pytest.mark.parametrize("name", ["truth.bag", "truth.mcap", "truth"])
 def test_the_truth_may_be_of_another_bag_or_a_file(name, tmp_path):
     r = ros_of("run.bag")

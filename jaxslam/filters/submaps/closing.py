@@ -6,9 +6,9 @@ problem with few residuals c(y) of many numbers. Gauss–Newton is then in the s
     y ← −Jᵀ S⁻¹ (c − J y),   S = J Jᵀ + R,
 
 (the dual form of Bell's step, SIAM J. Optim. 4, 1994), linear in the length of the chain; so is the
-covariance `I − Jᵀ S⁻¹ J`. The cost of the maximum says whether the filter's covariances were right
-(`unit_variance`). The filter is told nothing of it: where the submaps are is learnt, and
-what is in them, and a loop that turned out wrong is one residual less.
+covariance `I − Jᵀ S⁻¹ J`. The cost of the maximum says whether the filter's covariances were right.
+The filter is told nothing of it: where the submaps are is learnt, and what is in them, and a loop
+that turned out wrong is one residual less.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam._numerics.arrays import AnyArray
+from jaxslam._numerics.arrays import Number
 from jaxslam._numerics.linalg import Cholesky, cholesky
 from jaxslam.filters.association import Candidates, joint_compatibility
 from jaxslam.filters.forms.state import State
@@ -71,10 +71,11 @@ class Posterior(eqx.Module):
     """Residuals that say anything."""
     converged: Bool[Array, ""]
 
-    @property
-    def unit_variance(self) -> Float[Array, ""]:
-        """By how much more the chain's variances are than the filter says (`unit_variance`)."""
-        return unit_variance(self.cost, self.told)
+    def unit_variance(self, cost: Number = 0.0, told: int = 0) -> Float[Array, ""]:
+        """By how much more the chain's variances are than the filter says, given so many further
+        residuals of this cost: the variance of unit weight of a least-squares adjustment, 1 before,
+        as well known as by `SUPPOSED` residuals, and no less."""
+        return jnp.maximum(1.0, (self.cost + cost + SUPPOSED) / (self.told + told + SUPPOSED))
 
     def marginal(self, function: OfChain) -> tuple[PyTree, Float[Array, "j j"]]:
         """Return mean and covariance of a function of all submaps' states, to first order, the
@@ -82,13 +83,7 @@ class Posterior(eqx.Module):
         value, rows = self.chain.linearised(function, self.states)
         rows, slope = (x.reshape(len(x), math.prod(self.chain.shape)) for x in (rows, self.slope))
         known = self.factor.whitening @ (slope @ rows.T)
-        return value, self.unit_variance * (rows @ rows.T - known.T @ known)
-
-
-def unit_variance(cost: Float[AnyArray, ""], told: Int[AnyArray, ""]) -> Float[Array, ""]:
-    """The variance of unit weight of a least squares adjustment with this cost and so many
-    residuals more than unknowns: 1 before, as well known as by `SUPPOSED` of them, and no less."""
-    return jnp.maximum(1.0, (cost + SUPPOSED) / (told + SUPPOSED))
+        return value, self.unit_variance() * (rows @ rows.T - known.T @ known)
 
 
 def separation(chain: Chain, loops: Loops, states: State) -> Float[Array, "m n"]:
@@ -169,12 +164,8 @@ def posterior(
 
 def agreeing(known: Posterior, loops: Loops) -> Loops:
     """Return the loops of which those are valid that are jointly compatible with all that is known,
-    earlier loops included, and with one another.
-
-    A filter may be over-confident of the way round a loop, which is then off by more than it says
-    with all pairs alike. The covariance is taken to be as much more as half of the pairs tell, up
-    to `WIDEST`.
-    """
+    earlier loops included, and with one another; as much further off as half of them are, as what
+    is over-confident is the way round, up to `WIDEST`."""
     m = len(loops.valid)
     value, S = known.marginal(lambda states: separation(known.chain, loops, states).ravel())
     S += SAME**2 * jnp.eye(value.size)

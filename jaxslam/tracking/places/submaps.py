@@ -25,7 +25,7 @@ from jaxslam.filters.forms.state import State
 from jaxslam.filters.model import COMPOSED, CameraInMap
 from jaxslam.filters.protocol import AbstractStaged, Belief, LandmarkView
 from jaxslam.filters.submaps.chain import Chain, Link, base_poses, link
-from jaxslam.filters.submaps.closing import Posterior, posterior, unit_variance
+from jaxslam.filters.submaps.closing import Posterior, posterior
 from jaxslam.filters.submaps.handover import PARALLAX, TURN, Frozen
 from jaxslam.geometry import difference, retract
 from jaxslam.models.coordinates import SUBMAP, KeyframePose, keyframe_due
@@ -103,7 +103,7 @@ class Compared(NamedTuple):
     """A loop compared with what is known without it."""
 
     nis: np.ndarray
-    """Of six degrees of freedom, by what the filter says without any loop's `unit_variance`."""
+    """Of six degrees of freedom, by what the filter says, without a `unit_variance`."""
     T_bc: Float[np.ndarray, "4 4"]
     """The present camera, given the loop to first order, from where the map begins …"""
     covariance: Float[np.ndarray, "6 6"]
@@ -327,12 +327,12 @@ def _compared(known: Posterior, new: LoopClosure) -> tuple[Array, Array, Array]:
         return camera, _error(known.chain, new, states)
 
     (T_BC, error), P = known.marginal(both)
-    P = P / known.unit_variance
+    P = P / known.unit_variance()
     S = P[6:, 6:] + jnp.eye(6)
     gain = jnp.linalg.solve(S, P[6:, :6]).T
     T_BC, left = retract(T_BC, -gain @ error), P[:6, :6] - gain @ P[6:, :6]
     nis = error @ jnp.linalg.solve(S, error)
-    return nis, T_BC.as_matrix(), unit_variance(known.cost + nis, known.told + 6) * left
+    return nis, T_BC.as_matrix(), known.unit_variance(nis, 6) * left
 
 
 @Program
