@@ -13,7 +13,7 @@ from jaxslam.filters.registry import scenario_pieces
 from jaxslam.filters.window.minimise import started
 from jaxslam.filters.window.problem import PathLayout, path
 from jaxslam.filters.window.record import whole
-from jaxslam.filters.window.subsample import kept, thinned, tied
+from jaxslam.filters.window.subsample import Coarse, every, thinned, tied
 from jaxslam.landmarks import INVERSE_SCALING
 from jaxslam.models.calibration import Known, White
 from jaxslam.models.scale import ScaleGauge
@@ -44,11 +44,25 @@ def unknowns(slam, record, count=2):
     return jax.vmap(started)(jnp.asarray(x), jnp.asarray(y))
 
 
+def kept(frames, stride=2):
+    """The frames of a full window that stay."""
+    stay = every(full(frames), stride, frames)
+    return np.asarray(stay.frames[: int(stay.count)])
+
+
 @pytest.mark.parametrize(
-    ("frames", "stay"), [(3, [0, 2]), (4, [0, 1, 3]), (7, [0, 2, 4, 6]), (8, [0, 1, 3, 5, 7])]
+    ("frames", "stride", "stay"),
+    [
+        (3, 2, [0, 2]),
+        (4, 2, [0, 2, 3]),
+        (7, 2, [0, 2, 4, 6]),
+        (8, 2, [0, 2, 4, 6, 7]),
+        (8, 3, [0, 3, 6, 7]),
+        (7, 1, range(7)),
+    ],
 )
-def test_the_first_and_the_newest_frame_stay(frames, stay):
-    assert kept(frames).tolist() == stay
+def test_the_first_and_the_newest_frame_stay(frames, stride, stay):
+    assert kept(frames, stride).tolist() == list(stay)
 
 
 @pytest.mark.parametrize("treatment", [Known, White])
@@ -139,3 +153,21 @@ def test_a_window_is_tied_while_frames_that_stay_share_half_of_their_landmarks(l
 def test_a_frame_without_light_unties_nothing():
     record = full()
     assert tied(replace(record, seen=record.seen.at[4].set(False)))
+
+
+@pytest.mark.parametrize("treatment", [Known, White])
+@pytest.mark.parametrize(("last", "stride"), [(6, 1), (6, 2), (5, 3), (4, 3)])
+def test_what_a_coarse_window_says_comes_back_as_the_likeliest_of_the_whole_one(
+    last, stride, treatment
+):
+    """It is coarse what it was, and of all such unknowns the shortest."""
+    slam, record = filter_of(treatment), replace(full(), last=jnp.asarray(last))
+    coarse = Coarse(slam, record, stride, FRAMES - 2 if stride > 1 else FRAMES)
+    size = PathLayout.of(slam).size(coarse.record.frames)
+    draw = np.random.default_rng(5)
+    x = coarse.of(*coarse.back(jnp.asarray(draw.standard_normal(size)), jnp.zeros((4, 3))))[0]
+    fine, _ = coarse.back(x, jnp.zeros((4, 3)))
+    np.testing.assert_allclose(coarse.of(fine, jnp.zeros((4, 3)))[0], x, atol=1e-12)
+    other = draw.standard_normal(PathLayout.of(slam).size(FRAMES))
+    off = jnp.asarray(other) - coarse.back(*coarse.of(jnp.asarray(other), jnp.zeros((4, 3))))[0]
+    np.testing.assert_allclose(fine @ off, 0.0, atol=1e-10)

@@ -17,6 +17,7 @@ from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.problem import (
     Path,
+    Reduced,
     X,
     Y,
     cholesky_each,
@@ -55,24 +56,25 @@ def started(x: X, y: Y) -> Minimum:
 
 def minimised(
     slam: EkfSlam, record: Record, start: Minimum, steps: int | Int[Array, ""]
-) -> Minimum:
-    """The state of a minimisation after at most so many steps."""
+) -> tuple[Minimum, Reduced]:
+    """The state of a minimisation after at most so many steps, and the quadratic there."""
+    shapes = jax.eval_shape(lambda at: reduced(slam, record, at.x, at.y), start)
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
     def going(carry):
-        step, now = carry
+        step, now, _ = carry
         return (step < steps) & ~now.converged
 
     def once(carry):
-        step, now = carry
-        return step + 1, _step(slam, record, now)
+        step, *now = carry
+        return step + 1, *_step(slam, record, *now)
 
-    return jax.lax.while_loop(going, once, (jnp.zeros((), int), start))[1]
+    return jax.lax.while_loop(going, once, (jnp.zeros((), int), start, nothing))[1:]
 
 
-def _step(slam: EkfSlam, record: Record, now: Minimum) -> Minimum:
+def _step(slam: EkfSlam, record: Record, now: Minimum, local: Reduced) -> tuple[Minimum, Reduced]:
     """One of Levenberg–Marquardt; the first only brings the landmarks to their best."""
     fresh = jnp.isinf(now.cost)
-    local = reduced(slam, record, now.x, now.y)
     H, g = local.information, local.gradient
     damped = H + jnp.diag(now.damping * jnp.diagonal(H))
     step = jnp.where(fresh, 0.0, cholesky(damped).solve(g))
@@ -86,13 +88,10 @@ def _step(slam: EkfSlam, record: Record, now: Minimum) -> Minimum:
     eased = now.damping * jnp.where(gained > promised / 2, 0.1, 0.5)
     eased = jnp.where(fresh, now.damping, eased)
     damping = jnp.where(better, eased, jnp.maximum(5 * now.damping, 1e-4))
-    return Minimum(
-        jnp.where(better, x, now.x),
-        jnp.where(better, y, now.y),
-        jnp.where(better, cost, now.cost),
-        damping,
-        settled | (damping > 1e8),
-    )
+    there = (x, y, cost), reduced(slam, record, x, y)
+    here = (now.x, now.y, now.cost), local
+    at, local = jax.tree.map(lambda new, old: jnp.where(better, new, old), there, here)
+    return Minimum(*at, damping, settled | (damping > 1e8)), local
 
 
 def landmarks(slam: EkfSlam, record: Record, at: Path, y: Y, steps: int) -> tuple[Y, Scalar]:

@@ -8,6 +8,8 @@ weighed by Laplace's `−½ |r|² − ½ log det A`, A the information of all un
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,12 +20,13 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.conditional import map_where
-from jaxslam._numerics.linalg import cholesky
+from jaxslam._numerics.linalg import Cholesky, cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.minimise import Minimum, minimised, started, turned
-from jaxslam.filters.window.problem import PathLayout, X, Y, left_out, reduced
+from jaxslam.filters.window.problem import PathLayout, Reduced, X, Y, left_out
 from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.scale import enlarged, shift_of_scale
+from jaxslam.filters.window.subsample import Coarse
 from jaxslam.geometry import Scalar
 
 SPEED = 1.2
@@ -96,33 +99,44 @@ def reversed_(slam: EkfSlam, at: Minimum) -> tuple[X, Y]:
     return x.at[common].multiply(-1), at.y.at[:, p:].multiply(-1)
 
 
+def searched(
+    slam: EkfSlam, record: Record, modes: Modes, search: Bool[Array, " starts"], frames: int
+) -> Modes:
+    """The modes that are found from those `starts`, in a window of at most so many frames, spread
+    over the whole one. They are where minima of the whole one are near, and neither shifts nor
+    doubts are told of them."""
+    coarse = Coarse(slam, record, jnp.maximum(-(-record.last // (frames - 1)), 1), frames)
+    likeliest = started(*coarse.of(modes.minima.x[0], modes.minima.y[0]))
+    minima = starts(slam, coarse.record, likeliest, search)
+
+    def weighed(begun, record):
+        return _weighed(slam, begun, record, SEARCH_STEPS)[0]
+
+    found = _likeliest(weighed, coarse.record, minima, search, len(modes.log_weights))
+    x, y = jax.vmap(coarse.back)(found.minima.x, found.minima.y)
+    return replace(found, minima=replace(found.minima, x=x, y=y))
+
+
 def sought(
-    slam: EkfSlam,
-    record: Record,
-    modes: Modes,
-    steps: int,
-    search: Bool[Array, " starts"] | None = None,
+    slam: EkfSlam, record: Record, modes: Modes, found: Modes, steps: int
 ) -> tuple[Modes, Bool[Array, ""]]:
-    """The modes with what has been measured since, each from where it is; and, of a search, what
-    is found beside them from those `starts` that it says.
+    """The modes with what has been measured since, each from where it is, and those that were
+    `found` beside them, after so many steps.
 
     Where nothing explains what was measured, the modes stay as they are, and the second is False.
     """
-    alive = jnp.isfinite(modes.log_weights)
-    minima = jax.vmap(lambda m: started(m.x, m.y))(modes.minima)
-    most = jnp.full(len(alive), steps)
-    if search is not None:
-        likeliest = jax.tree.map(lambda leaf: leaf[0], minima)
-        found = starts(slam, record, likeliest, search)
-        minima = jax.tree.map(lambda *x: jnp.concatenate(x), minima, found)
-        alive = jnp.append(alive, search)
-        most = jnp.append(most, jnp.full(search.size, SEARCH_STEPS))
+    both = jax.tree.map(lambda *x: jnp.concatenate(x), modes, found)
+    minima = jax.vmap(started)(both.minima.x, both.minima.y)
 
-    def further(both, record):
-        return minimised(slam, record, *both), both[1]
+    def weighed(begun, record):
+        weighed, local, factor = _weighed(slam, begun, record, steps)
+        at = weighed.minimum
+        shift = shift_of_scale(slam, record, at, local, factor)
+        doubts = _doubts(record, left_out(slam, record, local, at.y, factor))
+        return weighed._replace(shift=shift, doubts=doubts)
 
-    minima, _ = map_where(further, (minima, most), alive, record)
-    after = _likeliest(slam, record, minima, alive, len(modes.log_weights))
+    alive = jnp.isfinite(both.log_weights)
+    after = _likeliest(weighed, record, minima, alive, len(modes.log_weights))
     explained = jnp.isfinite(after.log_weights[0])
     return jax.tree.map(lambda new, old: jnp.where(explained, new, old), after, modes), explained
 
@@ -138,16 +152,17 @@ class Weighed(NamedTuple):
     information: Float[Array, "N N"]
 
 
-def _weighed(slam: EkfSlam, weighed: Weighed, record: Record) -> Weighed:
-    at = weighed.minimum
-    local = reduced(slam, record, at.x, at.y)
+def _weighed(
+    slam: EkfSlam, begun: Weighed, record: Record, steps: int
+) -> tuple[Weighed, Reduced, Cholesky]:
+    """What has become of a minimum after so many steps; the quadratic there, and its factor."""
+    at, local = minimised(slam, record, begun.minimum, steps)
     factor = cholesky(local.information)
     own = jnp.sum(jax.vmap(lambda factor: factor.log_det())(local.landmarks))
     value = -(at.cost + factor.log_det() + own) / 2
-    shift = shift_of_scale(slam, record, at, local, factor)
     value = jnp.where(jnp.isfinite(value), value, -jnp.inf)
-    doubts = _doubts(record, left_out(slam, record, local, at.y, factor))
-    return Weighed(at, value, shift, doubts, local.information)
+    known = begun._replace(minimum=at, evidence=value, information=local.information)
+    return known, local, factor
 
 
 def _doubts(record: Record, squared: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -159,15 +174,19 @@ def _doubts(record: Record, squared: Float[Array, " m"]) -> Float[Array, " m"]:
     return jnp.where((dof > 0) & jnp.isfinite(sigmas), sigmas, 0.0)
 
 
-def _likeliest(slam, record, minima: Minimum, alive: Bool[Array, " k"], count: int) -> Modes:
-    """The likeliest of the minima that are distinct, weighed."""
+def _likeliest(
+    weighed: Callable[[Weighed, Record], Weighed],
+    record: Record,
+    minima: Minimum,
+    alive: Bool[Array, " k"],
+    count: int,
+) -> Modes:
+    """The likeliest of the minima that are distinct when they are weighed."""
     k, size = minima.x.shape
     none = jnp.full(k, -jnp.inf, minima.x.dtype)
     doubts, square = (jnp.zeros((k, *of), none.dtype) for of in (minima.y.shape[1:2], (size, size)))
     begun = Weighed(minima, none, jnp.zeros_like(none), doubts, square)
-    _, value, shift, doubts, information = map_where(
-        lambda weighed, record: _weighed(slam, weighed, record), begun, alive, record
-    )
+    minima, value, shift, doubts, information = map_where(weighed, begun, alive, record)
     best_first = jnp.argsort(-value)
     value = value[best_first]
     x, information = minima.x[best_first], information[best_first]

@@ -1,4 +1,4 @@
-"""A full window goes on with every other frame.
+"""A window with fewer frames: a full one goes on with every other, and a search needs only some.
 
 While a camera only turns, parallax does not come, and what the first frames leave open stays open.
 So a window that is full keeps its first frame, its newest, and every other one between: two steps
@@ -10,83 +10,131 @@ has seen is forgotten.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Int, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from jaxslam._numerics.arrays import AnyArray
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.minimise import Minimum
-from jaxslam.filters.window.problem import PathLayout, X
+from jaxslam.filters.window.problem import PathLayout, X, Y
 from jaxslam.filters.window.record import Record
 
 TIED = 0.5
 """Of a frame's landmarks: if those before saw fewer, it is hardly known how it stands to them."""
 
 
-def kept(frames: int) -> Int[AnyArray, " k"]:
-    """Frames of a full window that stay: the first, and every other one back from the newest."""
-    return np.unique([0, *range(frames - 1, 0, -2)])
+class Kept(NamedTuple):
+    """The frames of a window that stay, and the steps between them."""
+
+    frames: Int[Array, " k"]
+    """The newest is repeated where there are fewer."""
+    count: Int[Array, ""]
+    part: Int[Array, " steps"]
+    """Of which step between frames that stay each step is a part; k − 1 behind the newest."""
+
+
+def every(record: Record, stride: int | Int[Array, ""], frames: int) -> Kept:
+    """Frame 0, every so manieth one after it, and the newest: at most so many frames."""
+    steps = jnp.arange(record.frames - 1)
+    part = jnp.where(steps < record.last, steps // stride, frames - 1)
+    count = 1 + (record.last + stride - 1) // stride
+    return Kept(jnp.minimum(stride * jnp.arange(frames), record.last), count, part)
 
 
 def tied(record: Record) -> Bool[Array, ""]:
     """Whether of what each frame that stays sees, those before it saw a share of `TIED`."""
-    stay = record.seen[kept(record.frames)]
+    stay = record.seen[every(record, 2, record.frames // 2 + 1).frames]
     before, after = jnp.cumsum(stay[:-1], axis=0) > 0, stay[1:]
     return jnp.all(jnp.sum(before & after, axis=1) >= TIED * jnp.sum(after, axis=1))
 
 
 def thinned(slam: EkfSlam, record: Record, minima: Minimum) -> tuple[Record, Minimum]:
     """A full window with every other frame, and a batch of minima as its starts."""
-    fewer = _fewer(record)
-    same = jnp.asarray(kept(record.frames))[fewer.first] == record.first
-    x = jax.vmap(lambda x: _noises(slam, record, fewer, x))(minima.x)
-    # What is first seen later than it was has its error of depth, and another pixel's error.
-    p = slam.sensor.size
-    y = minima.y.at[..., :p].set(jnp.where(same[:, None], minima.y[..., :p], 0.0))
-    return fewer, replace(minima, x=x, y=y)
+    coarse = Coarse(slam, record, 2, record.frames)
+    x, y = jax.vmap(coarse.of)(minima.x, minima.y)
+    return coarse.record, replace(minima, x=x, y=y)
 
 
-def _fewer(record: Record) -> Record:
-    stay, frames = kept(record.frames), record.frames
-    seen = _padded(record.seen[stay], frames)
-    # Where the velocity is drawn anew, it stood before.
-    stood = jnp.append(record.restarted[1:], False)
+class Coarse(eqx.Module):
+    """A window with fewer frames, in so many places."""
+
+    slam: EkfSlam
+    whole: Record
+    record: Record
+    kept: Kept
+
+    def __init__(self, slam: EkfSlam, whole: Record, stride: int | Int[Array, ""], frames: int):
+        self.slam, self.whole, self.kept = slam, whole, every(whole, stride, frames)
+        self.record = _fewer(whole, self.kept)
+
+    def of(self, x: X, y: Y) -> tuple[Float[Array, " n"], Y]:
+        """The same unknowns with fewer steps: `√(m₁ + m₂) n = √m₁ n₁ + √m₂ n₂` adds the same
+        velocity; a calibration that is drawn anew is that of the frame that stays, and so is a
+        velocity."""
+        begun, own, drawn = self._split(x)
+        kept, fewer = self.kept, self.record
+        added = _sums(self._root[:, None] * own, kept) / jnp.sqrt(fewer.merged)[:, None]
+        anew = _sums(jnp.where(self.whole.restarted[:, None], own, 0.0), kept)
+        own = jnp.where(fewer.restarted[:, None], anew, added)
+        there = (jnp.arange(1, len(kept.frames)) < kept.count)[:, None]
+        drawn = jnp.where(there, drawn[kept.frames[1:] - 1], 0.0)
+        return jnp.append(begun, jnp.concatenate([own, drawn], axis=1)), self._begun(y)
+
+    def back(self, x: X, y: Y) -> tuple[Float[Array, " n"], Y]:
+        """The likeliest unknowns of the whole window that have these when it is coarse."""
+        begun, own, drawn = self._split(x)
+        whole, fewer, part = self.whole, self.record, self.kept.part
+
+        def of_part(values):
+            return jnp.concatenate([values, jnp.zeros_like(values[:1])])[part]
+
+        shared = self._root[:, None] * of_part(own / jnp.sqrt(fewer.merged)[:, None])
+        anew = jnp.where(whole.restarted[:, None], of_part(own), 0.0)
+        own = jnp.where(of_part(fewer.restarted)[:, None], anew, shared)
+        last = self.kept.frames[1 + jnp.minimum(part, len(drawn) - 1)] - 1
+        ends = (jnp.arange(len(part)) == last)[:, None]
+        drawn = jnp.where(ends, of_part(drawn), 0.0)
+        return jnp.append(begun, jnp.concatenate([own, drawn], axis=1)), self._begun(y)
+
+    @property
+    def _root(self) -> Array:
+        return jnp.sqrt(self.whole.merged)
+
+    def _split(self, x: X) -> tuple[Array, Array, Array]:
+        """What is of no step; and of every step its own numbers, and what is drawn anew."""
+        layout = PathLayout.of(self.slam)
+        steps = x[layout.whole :].reshape(-1, layout.step + layout.each)
+        return x[: layout.whole], *jnp.split(steps, [layout.step], axis=1)
+
+    def _begun(self, y: Y) -> Y:
+        """A landmark that is first seen elsewhere has its error of depth, and no pixel's error."""
+        same = self.kept.frames[self.record.first] == self.whole.first
+        p = self.slam.sensor.size
+        return y.at[:, :p].set(jnp.where(same[:, None], y[:, :p], 0.0))
+
+
+def _fewer(record: Record, kept: Kept) -> Record:
+    there = (jnp.arange(len(kept.frames)) < kept.count)[:, None]
+    seen = record.seen[kept.frames] & there
+    # Where the velocity is drawn anew within a step, it stood before.
+    within = kept.part[1:] == kept.part[:-1]
+    stood = jnp.append(record.restarted[1:] & within, False)
     lasting = jax.tree.map(lambda x: jnp.where(stood, 0.0, x), record.controls)
     return Record(
-        jnp.asarray(len(stay) - 1, record.last.dtype),
-        jax.tree.map(lambda x: _sums(x, frames), lasting),
-        jnp.maximum(_sums(record.merged, frames), 1.0),
-        _sums(record.restarted.astype(int), frames) > 0,
+        kept.count - 1,
+        jax.tree.map(lambda x: _sums(x, kept), lasting),
+        jnp.maximum(_sums(record.merged, kept), 1.0),
+        _sums(record.restarted.astype(int), kept) > 0,
         record.standing,
-        _padded(record.measured[stay], frames),
+        record.measured[kept.frames],
         seen,
         jnp.argmax(seen, axis=0).astype(record.first.dtype),
     )
 
 
-def _noises(slam: EkfSlam, record: Record, fewer: Record, x: X) -> X:
-    """PathLayout of the merged steps: `√(m₁ + m₂) n = √m₁ n₁ + √m₂ n₂` adds the same velocity; a
-    calibration that is drawn anew is that of the frame that stays, and so is a velocity."""
-    layout, frames = PathLayout.of(slam), record.frames
-    steps = x[layout.whole :].reshape(frames - 1, -1)
-    own, drawn = jnp.split(steps, [layout.step], axis=1)
-    roots = jnp.sqrt(jnp.stack([record.merged, fewer.merged]))[..., None]
-    added = _sums(roots[0] * own, frames) / roots[1]
-    anew = _sums(jnp.where(record.restarted[:, None], own, 0.0), frames)
-    own = jnp.where(fewer.restarted[:, None], anew, added)
-    drawn = _padded(drawn[kept(frames)[1:] - 1], frames - 1)
-    return x.at[layout.whole :].set(jnp.concatenate([own, drawn], axis=1).ravel())
-
-
-def _sums(steps: Shaped[Array, "steps ..."], frames: int) -> Shaped[Array, "steps ..."]:
+def _sums(steps: Shaped[Array, "steps ..."], kept: Kept) -> Shaped[Array, "parts ..."]:
     """Over the steps between frames that stay; zero behind."""
-    segment = np.searchsorted(kept(frames), np.arange(frames - 1), side="right") - 1
-    return jax.ops.segment_sum(steps, segment, num_segments=frames - 1)
-
-
-def _padded(values: Array, frames: int) -> Array:
-    """The values, padded with zeros to so many frames."""
-    return jnp.zeros((frames, *values.shape[1:]), values.dtype).at[: len(values)].set(values)
+    return jax.ops.segment_sum(steps, kept.part, num_segments=len(kept.frames) - 1)

@@ -23,7 +23,7 @@ from jaxslam.filters.ekf import EkfSlam, ekf_inside
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.protocol import Corrected
 from jaxslam.filters.window import record as window
-from jaxslam.filters.window.modes import Modes, at_rest, sought
+from jaxslam.filters.window.modes import Modes, at_rest, searched, sought
 from jaxslam.filters.window.problem import PathLayout
 from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.subsample import thinned, tied
@@ -34,7 +34,7 @@ from jaxslam.filters.wrappers.wrapper import AbstractWrapper
 from jaxslam.models.motion import Control
 from jaxslam.models.observations import Capacity, Features
 
-SIZES = {"planar": (9, 25, 61), "spatial": (9, 31)}
+SIZES = {"planar": (25, 61), "spatial": (31,)}
 """Frames of the windows that are compiled; the smallest that holds all is computed."""
 DIRECTIONS = {"planar": 16, "spatial": 8}
 """The number of directions in which the search starts, besides the start from rest."""
@@ -42,6 +42,10 @@ SEARCHES = {"planar": (1, 2, 3, 4, 6, 8, 11, 15, 20, 26, 34), "spatial": (1, 2, 
 """Frames after which minima are sought anew, from all starts …"""
 IN_TURN = {"planar": 0, "spatial": 1}
 """… and from how many of them after every other frame, in turn: no frame waits for them all."""
+SEARCHED = {"planar": 13, "spatial": 9}
+"""Frames in which they are sought, spread over the window."""
+RENEWED = {"planar": (2, 4), "spatial": (1,)}
+"""In which frames the sum begins anew, by window: every so manieth."""
 DIVIDED = {"planar": True, "spatial": False}
 """Whether the sum is divided anew in every frame, or its members are the modes and what becomes of
 them: halves of a Gaussian, each linearised off its middle, can be worse than the whole."""
@@ -130,14 +134,19 @@ class BatchInitialisation(AbstractWrapper):
         after = self.base.close(state.sum, new)
         state = replace(state, sum=after, record=window.begun(state.record, new))
         # Where nothing was ever seen there is nothing to begin anew from.
-        anew, least = state.open & jnp.any(state.record.seen), 1
-        for frames in self.sizes:
-            count = state.record.last + 1
-            wanted = anew & (count > least) & (count <= frames)
-            state = self._anew(state, frames, wanted, least)
-            least = frames
-        ready = self._ready(state)
-        state = replace(state, sum=_likely(state.sum, anew & ready), open=state.open & ~ready)
+        anew = state.open & jnp.any(state.record.seen) & (state.record.last > 0)
+        due = self._due(state.record, self._moved(state, MOVED)) & anew
+        found = cond(jnp.any(due), self._searched, _nothing(state.modes), state, due)
+        periods, least, now = RENEWED[self.ekf.motion.geometry.name], 1, jnp.zeros((), bool)
+        for index, frames in enumerate(self.sizes):
+            last = state.record.last
+            wanted = anew & (last >= least) & (last < frames)
+            period = periods[min(index, len(periods) - 1)]
+            wanted &= (last % period == 0) | jnp.any(due) | state.record.full
+            state = self._anew(state, found, frames, wanted)
+            least, now = frames, now | wanted
+        ready = now & self._ready(state)
+        state = replace(state, sum=_likely(state.sum, ready), open=state.open & ~ready)
         return cond(state.open & state.record.full, self._thinned, state)
 
     def remove(self, state: RestState, gone: Bool[AnyArray, " capacity"]) -> RestState:
@@ -153,19 +162,24 @@ class BatchInitialisation(AbstractWrapper):
     def unit_fixed(self, state: RestState) -> Bool[Array, ""]:
         return ~state.open
 
+    def _searched(self, _: Modes, state: RestState, due: Bool[Array, " starts"]) -> Modes:
+        frames = min(SEARCHED[self.ekf.motion.geometry.name], self.sizes[-1])
+        return searched(self.ekf, state.record, state.modes, due, frames)
+
     def _anew(
-        self, state: RestState, frames: int, wanted: Bool[Array, ""], least: int
+        self, state: RestState, found: Modes, frames: int, wanted: Bool[Array, ""]
     ) -> RestState:
-        """The modes of a window of so many frames, more than `least`, and the sum of them, without
-        the landmark that contradicts all of them most."""
+        """The modes of a window of so many frames, those that were `found` among them, and the sum
+        of them, without the landmark that contradicts all of them most."""
         ekf, record = self.ekf, state.record.cut(frames)
         size = PathLayout.of(ekf).size(frames)
 
-        def solved(state, record):
+        def cut(modes):
+            return replace(modes, minima=replace(modes.minima, x=modes.minima.x[:, :size]))
+
+        def solved(state, record, found):
             x = state.modes.minima.x
-            modes = replace(state.modes, minima=replace(state.modes.minima, x=x[:, :size]))
-            due = self._due(record, range(least, frames), self._moved(state, MOVED))
-            modes, explained = sought(ekf, record, modes, REFINEMENTS, due)
+            modes, explained = sought(ekf, record, cut(state.modes), cut(found), REFINEMENTS)
             like = state.sum.likeliest
             members = _members(ekf, record, modes, state.sum.members, like)
             begun = SumState(members, modes.log_weights)
@@ -175,22 +189,18 @@ class BatchInitialisation(AbstractWrapper):
             modes = replace(modes, minima=replace(modes.minima, x=x))
             return self.remove(replace(state, sum=begun, modes=modes), wrong)
 
-        return cond(wanted, solved, state, record)
+        return cond(wanted, solved, state, record, found)
 
-    def _due(
-        self, record: Record, newest: range, moved: Bool[Array, ""]
-    ) -> Bool[Array, " starts"] | None:
-        """The starts from which minima are sought after this frame; None where there are none
-        after any that can be the newest one. Of a camera that has `moved` the reversal is always
-        one of those in turn: the window is about to end, and nothing is as like the truth."""
+    def _due(self, record: Record, moved: Bool[Array, ""]) -> Bool[Array, " starts"]:
+        """The starts from which minima are sought after this frame. Of a camera that has `moved`
+        the reversal is always one of those in turn: the window is about to end, and nothing is as
+        like the truth."""
         name = self.ekf.motion.geometry.name
-        searches, together = [k for k in SEARCHES[name] if k in newest], IN_TURN[name]
-        if not searches and not together:
-            return None
-        count, steps = 2 + self.directions, record.steps.astype(int) - 4
+        count, together = 2 + self.directions, IN_TURN[name]
+        steps = record.steps.astype(int) - 4
         turn = (jnp.arange(count) - 1 - together * steps) % count < together
         turn |= (jnp.arange(count) == 1) & moved & bool(together)
-        whole = jnp.any(record.last == jnp.array(searches, int))
+        whole = jnp.any(record.last == jnp.array(SEARCHES[name]))
         return (whole | turn) & ~record.standing
 
     def _thinned(self, state: RestState) -> RestState:
@@ -214,6 +224,11 @@ class BatchInitialisation(AbstractWrapper):
         variance = jnp.trace(member.covariance[position, position])
         squared = jnp.sum(ekf.model.camera_pose(member.core).translation() ** 2)
         return variance < share**2 * squared
+
+
+def _nothing(modes: Modes) -> Modes:
+    """As many modes, none of them."""
+    return replace(modes, log_weights=jnp.full_like(modes.log_weights, -jnp.inf))
 
 
 def _likely(members: SumState, now: Bool[Array, ""]) -> SumState:
