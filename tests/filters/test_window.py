@@ -129,6 +129,11 @@ def _precisely(slam, record, x, y):
     return minimised(slam, record, started(x, y), 60)[0]
 
 
+def mean(slam, record, at, shift=0.0):
+    """The mode with all lengths so much longer, and the quadratic there."""
+    return minimised(slam, record, started(*rescaled(slam, record, at, jnp.asarray(shift))), 1)
+
+
 def precisely(slam, record, x, y):
     """The minimum as well as numbers can say it."""
     with pytest.MonkeyPatch.context() as patch:
@@ -520,7 +525,7 @@ def test_the_filters_state_is_the_gaussian_of_the_mode(of, monkeypatch):
     @quick_jit
     def handed(at):
         first = Features(jnp.arange(m), record.measured[0], jnp.zeros(m, bool))
-        state = gauge_state(slam, record, at, jnp.zeros(()), slam.init(m, first))
+        state = gauge_state(slam, record, *mean(slam, record, at), slam.init(m, first))
         told = slam.marginal(state, lambda view: view.pose)
         points = slam.landmark_marginal(
             state, lambda view: jnp.append(view.point, view.omega) / view.point[-1], jnp.arange(m)
@@ -576,9 +581,9 @@ def test_a_calibration_that_is_considered_is_found_by_the_window_and_then_left()
 
     @quick_jit
     def handed(at, treated, measured):
-        every, shift = jnp.arange(m), jnp.zeros(())
+        every = jnp.arange(m)
         first = Features(every, record.measured[0], jnp.zeros(m, bool))
-        state = gauge_state(treated, record, at, shift, treated.init(m, first))
+        state = gauge_state(treated, record, *mean(treated, record, at), treated.init(m, first))
         seen = Features(every, measured, jnp.ones(m, bool))
         return state, treated.step(state, jnp.asarray(0.2), seen, first)[0]
 
@@ -602,7 +607,7 @@ def test_the_filters_state_stands_at_the_mean_of_the_scale():
     @quick_jit
     def handed(at, shift):
         first = Features(jnp.arange(m), record.measured[0], jnp.zeros(m, bool))
-        state = gauge_state(slam, record, at, shift, slam.init(m, first))
+        state = gauge_state(slam, record, *mean(slam, record, at, shift), slam.init(m, first))
         pose, covariance = slam.marginal(state, lambda view: view.pose)
         return jnp.log(jnp.linalg.norm(pose.translation())), covariance
 
@@ -619,10 +624,9 @@ def test_the_filters_state_stands_at_the_mean_of_the_scale():
 def test_the_evidence_of_a_mode_is_laplaces_with_every_unknown(of):
     slam, record, *_ = case(*of)
     at = minimum(*of)
-    zero, start = jnp.zeros(()), started(at.x, at.y)
-    doubts, information = jnp.zeros(FIRST.size), jnp.zeros((at.x.size, at.x.size))
-    given = modes.Weighed(start, zero, zero, doubts, information)
-    found, _, _ = quick_jit(lambda *of: modes._weighed(slam, *of, 1))(given, record)
+    start = jax.tree.map(lambda leaf: leaf[None], started(at.x, at.y))
+    given = jax.tree.map(lambda leaf: leaf[0], modes._candidates(start, jnp.ones(1, int)))
+    found = quick_jit(lambda *of: modes._minimum(slam, *of))(given, record)
     r, A, _ = dense(slam, record, at.x, at.y)
     expected = -(r @ r + np.linalg.slogdet(A)[1]) / 2
     np.testing.assert_allclose(found.evidence, expected, rtol=1e-9)
@@ -659,12 +663,12 @@ def test_a_mode_that_is_next_to_impossible_is_none():
     """Of distinct minima those remain, as modes, whose evidence is not too far below the best."""
     costs = 2 * jnp.array([7.0, 0.0, 2 * modes.NEGLIGIBLE, 0.9 * modes.NEGLIGIBLE])
     at = jax.vmap(started)(10.0 * jnp.eye(4), jnp.zeros((4, 1, 3)))
-    at = replace(at, cost=costs)
+    candidates = modes._candidates(replace(at, cost=costs), jnp.ones(4, int))
 
     def weighed(now, record):
         return now._replace(evidence=-now.minimum.cost / 2, information=jnp.eye(4))
 
-    found = modes._likeliest(weighed, case()[1], at, jnp.ones(4, bool), 4)
+    found, _ = modes._likeliest(weighed, case()[1], candidates, jnp.ones(4, bool), 4)
     weights = jax.nn.log_softmax(-costs / 2)[jnp.array([1, 0, 3])]
     np.testing.assert_allclose(found.log_weights, jnp.append(weights, -jnp.inf), rtol=1e-12)
     np.testing.assert_array_equal(found.minima.x[:3], at.x[jnp.array([1, 0, 3])])
@@ -674,13 +678,13 @@ def test_a_mode_that_is_next_to_impossible_is_none():
 def test_minima_are_one_by_the_information_of_the_better(better, worse, count):
     """Two at the distance 1: less than one σ of the better, or two."""
     at = jax.vmap(started)(jnp.array([[0.0, 0.0], [1.0, 0.0]]), jnp.zeros((2, 1, 3)))
-    at = replace(at, cost=jnp.array([2.0, 0.0]))
+    at = modes._candidates(replace(at, cost=jnp.array([2.0, 0.0])), jnp.ones(2, int))
 
     def weighed(now, record):
         told = jnp.where(now.minimum.cost == 0, better, worse) * jnp.eye(2)
         return now._replace(evidence=-now.minimum.cost / 2, information=told)
 
-    found = modes._likeliest(weighed, case()[1], at, jnp.ones(2, bool), 2)
+    found, _ = modes._likeliest(weighed, case()[1], at, jnp.ones(2, bool), 2)
     assert np.isfinite(found.log_weights).sum() == count
 
 
@@ -692,7 +696,7 @@ def test_a_metre_that_is_not_known_stays_so_and_changes_nothing_else():
     first = Features(jnp.arange(m), record.measured[0], jnp.zeros(m, bool))
 
     def covariance(slam):
-        state = gauge_state(slam, record, at, jnp.zeros(()), slam.init(m, first))
+        state = gauge_state(slam, record, *mean(slam, record, at), slam.init(m, first))
         return state.covariance, state.core.part("log_scale").stop - 1
 
     (P, _), (wide, place) = (

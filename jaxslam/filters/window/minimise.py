@@ -88,9 +88,11 @@ def _step(slam: EkfSlam, record: Record, now: Minimum, local: Reduced) -> tuple[
     eased = now.damping * jnp.where(gained > promised / 2, 0.1, 0.5)
     eased = jnp.where(fresh, now.damping, eased)
     damping = jnp.where(better, eased, jnp.maximum(5 * now.damping, 1e-4))
-    there = (x, y, cost), reduced(slam, record, x, y)
-    here = (now.x, now.y, now.cost), local
-    at, local = jax.tree.map(lambda new, old: jnp.where(better, new, old), there, here)
+    there, here = (x, y, cost), (now.x, now.y, now.cost)
+    at = jax.tree.map(lambda new, old: jnp.where(better, new, old), there, here)
+    local = jax.tree.map(
+        lambda new, old: jnp.where(fresh | better, new, old), reduced(slam, record, x, y), local
+    )
     return Minimum(*at, damping, settled | (damping > 1e8)), local
 
 

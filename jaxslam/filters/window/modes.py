@@ -9,7 +9,7 @@ weighed by Laplace's `−½ |r|² − ½ log det A`, A the information of all un
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -17,22 +17,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam._numerics.conditional import map_where
+from jaxslam._numerics.conditional import cond, map_where, zeros
 from jaxslam._numerics.linalg import Cholesky, cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.minimise import Minimum, minimised, started, turned
 from jaxslam.filters.window.problem import PathLayout, Reduced, X, Y, left_out
 from jaxslam.filters.window.record import Record
-from jaxslam.filters.window.scale import enlarged, shift_of_scale
+from jaxslam.filters.window.scale import enlarged, rescaled, shift_of_scale
 from jaxslam.filters.window.subsample import Coarse
 from jaxslam.geometry import Scalar
 
 SPEED = 1.2
 """Starts move with so many σ of the prior on the initial velocity."""
 SEARCH_STEPS = 16
-"""Of Levenberg–Marquardt, from every start."""
+"""Of Levenberg–Marquardt, from every start, at the most …"""
+REFINEMENTS = 4
+"""… and with every new frame."""
 APART = 1.0
 """Minima nearer than this in the better one's information, squared, are one."""
 
@@ -99,70 +101,135 @@ def reversed_(slam: EkfSlam, at: Minimum) -> tuple[X, Y]:
     return x.at[common].multiply(-1), at.y.at[:, p:].multiply(-1)
 
 
+class Found(NamedTuple):
+    """Where minima may be."""
+
+    minima: Minimum
+    alive: Bool[Array, " k"]
+    steps: Int[Array, " k"]
+    """From there to the minimum, at the most."""
+
+
 def searched(
     slam: EkfSlam, record: Record, modes: Modes, search: Bool[Array, " starts"], frames: int
-) -> Modes:
-    """The modes that are found from those `starts`, in a window of at most so many frames, spread
-    over the whole one. They are where minima of the whole one are near, and neither shifts nor
-    doubts are told of them."""
-    coarse = Coarse(slam, record, jnp.maximum(-(-record.last // (frames - 1)), 1), frames)
-    likeliest = started(*coarse.of(modes.minima.x[0], modes.minima.y[0]))
-    minima = starts(slam, coarse.record, likeliest, search)
+) -> Found:
+    """Those `starts`; of a window of more than so many frames, the minima that are found from them
+    in as many frames, spread over it: minima of the whole window are near."""
+    likeliest = jax.tree.map(lambda leaf: leaf[0], modes.minima)
+    directly = record.frames <= frames
+    most = search.size if directly else len(modes.log_weights)
+    nothing = at_rest(slam, record, most, likeliest.x.dtype).minima
+    steps = jnp.full(most, SEARCH_STEPS if directly else REFINEMENTS)
 
-    def weighed(begun, record):
-        return _weighed(slam, begun, record, SEARCH_STEPS)[0]
+    def begun(_, record, search, likeliest):
+        return Found(starts(slam, record, likeliest, search), search, steps)
 
-    found = _likeliest(weighed, coarse.record, minima, search, len(modes.log_weights))
-    x, y = jax.vmap(coarse.back)(found.minima.x, found.minima.y)
-    return replace(found, minima=replace(found.minima, x=x, y=y))
+    def found(_, record, search, likeliest):
+        coarse = Coarse(slam, record, jnp.maximum(-(-record.last // (frames - 1)), 1), frames)
+        there = started(*coarse.of(likeliest.x, likeliest.y))
+        minima = starts(slam, coarse.record, there, search)
+        candidates = _candidates(minima, jnp.full(search.size, SEARCH_STEPS))
+        modes, _ = _likeliest(partial(_minimum, slam), coarse.record, candidates, search, most)
+        minima = jax.vmap(started)(*jax.vmap(coarse.back)(modes.minima.x, modes.minima.y))
+        return Found(minima, jnp.isfinite(modes.log_weights), steps)
+
+    none = Found(nothing, jnp.zeros(most, bool), steps)
+    function = begun if directly else found
+    return cond(jnp.any(search), function, none, record, search, likeliest)
 
 
 def sought(
-    slam: EkfSlam, record: Record, modes: Modes, found: Modes, steps: int
-) -> tuple[Modes, Bool[Array, ""]]:
-    """The modes with what has been measured since, each from where it is, and those that were
-    `found` beside them, after so many steps.
+    slam: EkfSlam, record: Record, modes: Modes, found: Found
+) -> tuple[Modes, Mean, Bool[Array, ""]]:
+    """The modes with what has been measured since, each from where it is, and what there is beside
+    them where that was `found`.
 
-    Where nothing explains what was measured, the modes stay as they are, and the second is False.
+    Where nothing explains what was measured, the modes stay as they are, and the last is False.
     """
-    both = jax.tree.map(lambda *x: jnp.concatenate(x), modes, found)
-    minima = jax.vmap(started)(both.minima.x, both.minima.y)
-
-    def weighed(begun, record):
-        weighed, local, factor = _weighed(slam, begun, record, steps)
-        at = weighed.minimum
-        shift = shift_of_scale(slam, record, at, local, factor)
-        doubts = _doubts(record, left_out(slam, record, local, at.y, factor))
-        return weighed._replace(shift=shift, doubts=doubts)
-
-    alive = jnp.isfinite(both.log_weights)
-    after = _likeliest(weighed, record, minima, alive, len(modes.log_weights))
+    alive = jnp.append(jnp.isfinite(modes.log_weights), found.alive)
+    steps = jnp.append(jnp.full(len(modes.log_weights), REFINEMENTS), found.steps)
+    minima = jax.tree.map(lambda *x: jnp.concatenate(x), modes.minima, found.minima)
+    minima = jax.vmap(started)(minima.x, minima.y)
+    nothing = jax.eval_shape(
+        lambda at: minimised(slam, record, at, 1), jax.tree.map(lambda leaf: leaf[0], minima)
+    )
+    candidates = _candidates(minima, steps, Mean(*zeros(nothing, len(alive))))
+    after, means = _likeliest(
+        partial(_weighed, slam), record, candidates, alive, len(modes.log_weights)
+    )
     explained = jnp.isfinite(after.log_weights[0])
-    return jax.tree.map(lambda new, old: jnp.where(explained, new, old), after, modes), explained
+    after = jax.tree.map(lambda new, old: jnp.where(explained, new, old), after, modes)
+    return after, means, explained
 
 
-class Weighed(NamedTuple):
-    """A minimum, its log evidence `−½ |r|² − ½ log det A`, what λ its mean has, how doubtful its
-    landmarks are, and the information of its path."""
+class Mean(NamedTuple):
+    """A mode where its mean is, and the quadratic there."""
+
+    at: Minimum
+    local: Reduced
+
+
+class Candidate(NamedTuple):
+    """A minimum, or a batch of them, or places from which one is sought."""
 
     minimum: Minimum
+    steps: Int[Array, ""]
+    """At the most."""
     evidence: Scalar
-    shift: Scalar
-    doubts: Float[Array, " m"]
+    """`−½ |r|² − ½ log det A`."""
     information: Float[Array, "N N"]
+    """Of the path."""
+    shift: Scalar
+    """λ of its mean."""
+    doubts: Float[Array, " m"]
+    """How doubtful its landmarks are."""
+    mean: Mean | None
+    """None where nobody asks for it, nor for shift and doubts."""
 
 
-def _weighed(
-    slam: EkfSlam, begun: Weighed, record: Record, steps: int
-) -> tuple[Weighed, Reduced, Cholesky]:
-    """What has become of a minimum after so many steps; the quadratic there, and its factor."""
-    at, local = minimised(slam, record, begun.minimum, steps)
-    factor = cholesky(local.information)
+def _candidates(minima: Minimum, steps: Int[Array, " k"], means: Mean | None = None) -> Candidate:
+    """A batch of minima of which nothing is known."""
+    (k, size), m = minima.x.shape, minima.y.shape[1]
+    none = jnp.full(k, -jnp.inf, minima.x.dtype)
+    square, doubts = (jnp.zeros((k, *of), none.dtype) for of in ((size, size), (m,)))
+    return Candidate(minima, steps, none, square, jnp.zeros_like(none), doubts, means)
+
+
+def _minimum(slam: EkfSlam, begun: Candidate, record: Record) -> Candidate:
+    """The minimum near a start, and its evidence."""
+    at, local = minimised(slam, record, begun.minimum, begun.steps)
+    return _with_evidence(begun, at, local, cholesky(local.information))
+
+
+def _with_evidence(of: Candidate, at: Minimum, local: Reduced, factor: Cholesky) -> Candidate:
     own = jnp.sum(jax.vmap(lambda factor: factor.log_det())(local.landmarks))
     value = -(at.cost + factor.log_det() + own) / 2
     value = jnp.where(jnp.isfinite(value), value, -jnp.inf)
-    known = begun._replace(minimum=at, evidence=value, information=local.information)
-    return known, local, factor
+    return of._replace(minimum=at, evidence=value, information=local.information)
+
+
+def _weighed(slam: EkfSlam, begun: Candidate, record: Record) -> Candidate:
+    """The minimum near a start, weighed, and its mean.
+
+    Of the mean only the landmarks are sought. Both are one loop, so that they are one program.
+    """
+
+    def known(of, at, local):
+        factor = cholesky(local.information)
+        shift = shift_of_scale(slam, record, at, local, factor)
+        doubts = _doubts(record, left_out(slam, record, local, at.y, factor))
+        of = _with_evidence(of, at, local, factor)
+        return of._replace(shift=shift, doubts=doubts)
+
+    def turn(k, of):
+        first = k == 0
+        mean = started(*rescaled(slam, record, of.minimum, of.shift))
+        start = jax.tree.map(lambda *x: jnp.where(first, *x), of.minimum, mean)
+        there = minimised(slam, record, start, jnp.where(first, of.steps, 1))
+        of = jax.lax.cond(first, known, lambda of, *_: of, of, *there)
+        return of._replace(mean=Mean(*there))
+
+    return jax.lax.fori_loop(0, 2, turn, begun)
 
 
 def _doubts(record: Record, squared: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -175,31 +242,23 @@ def _doubts(record: Record, squared: Float[Array, " m"]) -> Float[Array, " m"]:
 
 
 def _likeliest(
-    weighed: Callable[[Weighed, Record], Weighed],
+    weighed: Callable[[Candidate, Record], Candidate],
     record: Record,
-    minima: Minimum,
+    candidates: Candidate,
     alive: Bool[Array, " k"],
     count: int,
-) -> Modes:
+) -> tuple[Modes, Mean | None]:
     """The likeliest of the minima that are distinct when they are weighed."""
-    k, size = minima.x.shape
-    none = jnp.full(k, -jnp.inf, minima.x.dtype)
-    doubts, square = (jnp.zeros((k, *of), none.dtype) for of in (minima.y.shape[1:2], (size, size)))
-    begun = Weighed(minima, none, jnp.zeros_like(none), doubts, square)
-    minima, value, shift, doubts, information = map_where(weighed, begun, alive, record)
-    best_first = jnp.argsort(-value)
-    value = value[best_first]
-    x, information = minima.x[best_first], information[best_first]
+    found = map_where(weighed, candidates, alive, record)
+    found = jax.tree.map(lambda leaf: leaf[jnp.argsort(-found.evidence)], found)
+    x, information, value = found.minimum.x, found.information, found.evidence
     away = x[:, None] - x[None]
     squared = jnp.einsum("ijn,jno,ijo->ij", away, information, away)
-    index = jnp.arange(k)
+    index = jnp.arange(len(x))
     again = jnp.any((squared < APART) & (index < index[:, None]), axis=1)
     value = jnp.where(again, -jnp.inf, value)
     value = jnp.where(value < jnp.max(value) - NEGLIGIBLE, -jnp.inf, value)
     kept = jnp.argsort(-value)[:count]
-    return Modes(
-        jax.tree.map(lambda leaf: leaf[best_first][kept], minima),
-        jax.nn.log_softmax(value[kept]),
-        shift[best_first][kept],
-        doubts[best_first][kept],
-    )
+    weights = jax.nn.log_softmax(value[kept])
+    found = jax.tree.map(lambda leaf: leaf[kept], found)
+    return Modes(found.minimum, weights, found.shift, found.doubts), found.mean

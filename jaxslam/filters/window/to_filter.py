@@ -18,21 +18,17 @@ from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.forms.blocks import shifted
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.model import Core
-from jaxslam.filters.window.minimise import LANDMARK_STEPS, Minimum, landmarks
-from jaxslam.filters.window.problem import PathLayout, Reduced, located, path, reduced
+from jaxslam.filters.window.minimise import Minimum
+from jaxslam.filters.window.problem import PathLayout, Reduced, located
 from jaxslam.filters.window.record import Record
-from jaxslam.filters.window.scale import Direction, rescaled, scaling
-from jaxslam.geometry import Scalar, identity, jacobian, scaled
+from jaxslam.filters.window.scale import Direction, scaling
+from jaxslam.geometry import identity, jacobian, scaled
 from jaxslam.models.scale import ScaleGauge
 
 
-def gauge_state(slam: EkfSlam, record: Record, mode: Minimum, shift: Scalar, like: State) -> State:
-    """The filter's state of one mode whose mean has such a λ, in a unit that is a metre there."""
-    x, y = rescaled(slam, record, mode, shift)
-    y, _ = landmarks(slam, record, path(slam, record, x), y, LANDMARK_STEPS)
-    at = replace(mode, x=x, y=y)
-    local, s = reduced(slam, record, x, y), scaling(slam, record, at)
-    factor = cholesky(local.information)
+def gauge_state(slam: EkfSlam, record: Record, at: Minimum, local: Reduced, like: State) -> State:
+    """The filter's state of one mode where its mean is, in a unit that is a metre there."""
+    s, factor = scaling(slam, record, at), cholesky(local.information)
     # The rest moves to where it is likeliest at this scale.
     step = factor.solve(local.gradient)
     step = step - s.x * (s.x @ local.gradient) / s.squared

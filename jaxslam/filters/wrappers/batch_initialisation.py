@@ -23,7 +23,7 @@ from jaxslam.filters.ekf import EkfSlam, ekf_inside
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.protocol import Corrected
 from jaxslam.filters.window import record as window
-from jaxslam.filters.window.modes import Modes, at_rest, searched, sought
+from jaxslam.filters.window.modes import Found, Mean, Modes, at_rest, searched, sought
 from jaxslam.filters.window.problem import PathLayout
 from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.subsample import thinned, tied
@@ -52,8 +52,6 @@ them: halves of a Gaussian, each linearised off its middle, can be worse than th
 GIVEN_UP = 10.0
 """Of log evidence: modes so much less likely than the likeliest end with the window. What has been
 weighed without a linearisation is not to be overturned by one."""
-REFINEMENTS = 4
-"""Steps of Levenberg–Marquardt with every new frame, at the most."""
 LEAST_STEPS = 8
 """Since frame 0 before the sum may go on alone."""
 KNOWN = 0.03
@@ -136,7 +134,8 @@ class BatchInitialisation(AbstractWrapper):
         # Where nothing was ever seen there is nothing to begin anew from.
         anew = state.open & jnp.any(state.record.seen) & (state.record.last > 0)
         due = self._due(state.record, self._moved(state, MOVED)) & anew
-        found = cond(jnp.any(due), self._searched, _nothing(state.modes), state, due)
+        frames = SEARCHED[self.ekf.motion.geometry.name]
+        found = searched(self.ekf, state.record, state.modes, due, frames)
         periods, least, now = RENEWED[self.ekf.motion.geometry.name], 1, jnp.zeros((), bool)
         for index, frames in enumerate(self.sizes):
             last = state.record.last
@@ -162,26 +161,24 @@ class BatchInitialisation(AbstractWrapper):
     def unit_fixed(self, state: RestState) -> Bool[Array, ""]:
         return ~state.open
 
-    def _searched(self, _: Modes, state: RestState, due: Bool[Array, " starts"]) -> Modes:
-        frames = min(SEARCHED[self.ekf.motion.geometry.name], self.sizes[-1])
-        return searched(self.ekf, state.record, state.modes, due, frames)
-
     def _anew(
-        self, state: RestState, found: Modes, frames: int, wanted: Bool[Array, ""]
+        self, state: RestState, found: Found, frames: int, wanted: Bool[Array, ""]
     ) -> RestState:
         """The modes of a window of so many frames, those that were `found` among them, and the sum
         of them, without the landmark that contradicts all of them most."""
         ekf, record = self.ekf, state.record.cut(frames)
         size = PathLayout.of(ekf).size(frames)
 
-        def cut(modes):
-            return replace(modes, minima=replace(modes.minima, x=modes.minima.x[:, :size]))
+        def cut(minima):
+            return replace(minima, x=minima.x[:, :size])
 
         def solved(state, record, found):
             x = state.modes.minima.x
-            modes, explained = sought(ekf, record, cut(state.modes), cut(found), REFINEMENTS)
+            modes = replace(state.modes, minima=cut(state.modes.minima))
+            found = found._replace(minima=cut(found.minima))
+            modes, means, explained = sought(ekf, record, modes, found)
             like = state.sum.likeliest
-            members = _members(ekf, record, modes, state.sum.members, like)
+            members = _members(ekf, record, modes, means, state.sum.members, like)
             begun = SumState(members, modes.log_weights)
             begun = jax.tree.map(lambda new, old: jnp.where(explained, new, old), begun, state.sum)
             wrong = explained & _doubted(modes)
@@ -226,11 +223,6 @@ class BatchInitialisation(AbstractWrapper):
         return variance < share**2 * squared
 
 
-def _nothing(modes: Modes) -> Modes:
-    """As many modes, none of them."""
-    return replace(modes, log_weights=jnp.full_like(modes.log_weights, -jnp.inf))
-
-
 def _likely(members: SumState, now: Bool[Array, ""]) -> SumState:
     """The members without those that are `GIVEN_UP`, if that is now."""
     unlikely = members.log_weights < jnp.max(members.log_weights) - GIVEN_UP
@@ -238,16 +230,18 @@ def _likely(members: SumState, now: Bool[Array, ""]) -> SumState:
     return replace(members, log_weights=weights)
 
 
-def _members(ekf: EkfSlam, record: Record, modes: Modes, members: State, like: State) -> State:
+def _members(
+    ekf: EkfSlam, record: Record, modes: Modes, means: Mean, members: State, like: State
+) -> State:
     """The Gaussians of the modes; of what a window leaves open, as in a state that is up to date,
     which members without weight are not."""
 
     def begun(data, record, like):
-        mode, shift, _ = data
-        return mode, shift, gauge_state(ekf, record, mode, shift, like)
+        mean, _ = data
+        return mean, gauge_state(ekf, record, *mean, like)
 
     alive = jnp.isfinite(modes.log_weights)
-    return map_where(begun, (modes.minima, modes.shifts, members), alive, record, like)[2]
+    return map_where(begun, (means, members), alive, record, like)[1]
 
 
 def _doubted(modes: Modes) -> Bool[Array, " m"]:
