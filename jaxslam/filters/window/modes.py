@@ -38,6 +38,8 @@ REFINEMENTS = 4
 APART = 1.0
 """Minima nearer than this in the better one's information, squared, are one."""
 
+UNLIKE = 5.0
+"""σ of all numbers but those of the worst landmark, from which on a minimum explains nothing."""
 NEGLIGIBLE = 100.0
 """Of log evidence: a mode so much less likely than the likeliest is none."""
 
@@ -198,13 +200,18 @@ def _candidates(minima: Minimum, steps: Int[Array, " k"], means: Mean | None = N
 def _minimum(slam: EkfSlam, begun: Candidate, record: Record) -> Candidate:
     """The minimum near a start, and its evidence."""
     at, local = minimised(slam, record, begun.minimum, begun.steps)
-    return _with_evidence(begun, at, local, cholesky(local.information))
+    return _with_evidence(begun, record, at, local, cholesky(local.information))
 
 
-def _with_evidence(of: Candidate, at: Minimum, local: Reduced, factor: Cholesky) -> Candidate:
+def _with_evidence(
+    of: Candidate, record: Record, at: Minimum, local: Reduced, factor: Cholesky
+) -> Candidate:
     own = jnp.sum(jax.vmap(lambda factor: factor.log_det())(local.landmarks))
     value = -(at.cost + factor.log_det() + own) / 2
-    value = jnp.where(jnp.isfinite(value), value, -jnp.inf)
+    squared = jnp.sum(local.linear.residual**2, axis=(0, 2)) + jnp.sum(at.y**2, axis=1)
+    dof = record.measured.shape[-1] * jnp.sum(record.compared)
+    like = at.cost - jnp.max(squared) <= UNLIKE**2 * dof
+    value = jnp.where(jnp.isfinite(value) & like, value, -jnp.inf)
     return of._replace(minimum=at, evidence=value, information=local.information)
 
 
@@ -218,7 +225,7 @@ def _weighed(slam: EkfSlam, begun: Candidate, record: Record) -> Candidate:
         factor = cholesky(local.information)
         shift = shift_of_scale(slam, record, at, local, factor)
         doubts = _doubts(record, left_out(slam, record, local, at.y, factor))
-        of = _with_evidence(of, at, local, factor)
+        of = _with_evidence(of, record, at, local, factor)
         return of._replace(shift=shift, doubts=doubts)
 
     def turn(k, of):
