@@ -330,14 +330,15 @@ def test_windows_grow_up_to_the_frames_that_are_named():
     assert from_rest(base, 40).sizes == (31, 41)
 
 
-def test_measurements_that_nothing_explains_leave_the_sum_to_itself():
-    """Pixels that are no numbers: the modes stay, and keep their weights."""
+@pytest.mark.parametrize("wrong", [lambda z: z * jnp.nan, lambda z: jnp.flip(z, axis=1)])
+def test_measurements_that_nothing_explains_leave_the_sum_to_itself(wrong):
+    """Pixels that are no numbers, or of other landmarks: the modes stay, and keep their weights."""
     init, step = stages(STARTED)
     state = init(few().features[0])
     for k in range(3):
         control, known, new = frame(k)
         if k == 2:
-            known = eqx.tree_at(lambda f: f.measured, known, known.measured * jnp.nan)
+            known = eqx.tree_at(lambda f: f.measured, known, wrong(known.measured))
         before = state
         state, _ = step(state, control, known, new)
     np.testing.assert_array_equal(state.modes.log_weights, before.modes.log_weights)
