@@ -15,7 +15,6 @@ from jaxslam._runtime.progress import StudyBar
 from jaxslam.consistency import CHUNK, FolderStore, Study, monte_carlo, summarise, table
 from jaxslam.consistency.backends import AUTO, check_backend
 from jaxslam.consistency.montecarlo import check_sizes, divided
-from jaxslam.consistency.records import check_records, write_records
 from jaxslam.filters.registry import FILTERS, FROM_REST, MODIFIERS, RECOMMENDED, make_filters
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.simulation.scenario import BUILT_IN, Scenario, parse_override, scenario
@@ -79,26 +78,17 @@ class ConsistencyOptions:
     """Folder for consistency.json, consistency.png and the records of all runs."""
     pdf: bool = False
     """Write consistency.pdf too: one column for print, 3.4 in wide, its letters embedded."""
-    records: Path | None = None
-    """Write every step of every run, a row each, as a Parquet file of this name. Needs the parquet
-    extra."""
 
     def run(self) -> None:
         """Run the study, print its table, write its files."""
         from jaxslam.plots.consistency import plot_consistency
 
-        if self.records is not None:
-            check_records(self.records)
-            if self.reduce:
-                raise ValueError("--reduce keeps no records of every run: leave out --records")
         study = self.study()
         summary = summarise(study)
         write_json(self.out / "consistency.json", summary, allow_nan=False)
         plot_consistency(study, summary, self.out / "consistency.png")
         if self.pdf:
             plot_consistency(study, summary, self.out / "consistency.pdf", column=True)
-        if self.records is not None:
-            write_records(study, self.records)
         print(table(summary))
         print(f"wrote {self.out / 'consistency.json'} and {self.out / 'consistency.png'}")
 

@@ -3,7 +3,6 @@
 from jaxslam.consistency.backends import BACKENDS
 from jaxslam.consistency.likelihood import log_likelihood
 from jaxslam.consistency.montecarlo import CHUNK, DTYPES, check_sizes, draw, monte_carlo
-from jaxslam.consistency.records import write_records
 from jaxslam.consistency.runs import SimulatedFrame, filter_run, run_through, scale_records
 from jaxslam.consistency.store import FolderStore, MemoryStore
 from jaxslam.consistency.suite import read_suite, write_suite
@@ -30,6 +29,5 @@ __all__ = [
     "table",
     "tally",
     "treatment",
-    "write_records",
     "write_suite",
 ]

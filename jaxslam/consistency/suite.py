@@ -16,12 +16,17 @@ from jaxtyping import Float
 from jaxslam._runtime.files import read_json, write_atomically, write_json
 from jaxslam._runtime.lookup import lookup
 from jaxslam.consistency.montecarlo import check_sizes, draw
-from jaxslam.consistency.records import AXES
 from jaxslam.simulation import Scenario, as_scenario, depth_of, scenario
 
 SUITE = ("matched", "matched-loose", "matched-forward-loose", "circle", "matched-6dof")
 """Little noise, where any right EKF is consistent, in the plane and in space; much, where few are;
 and landmarks that come and go, with depths that are not the prior's."""
+
+AXES = {
+    "planar": ("x", "z", "rotation"),
+    "spatial": ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z"),
+}
+"""The camera's position in its axes, m; orientation, rad."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -89,7 +89,6 @@ def test_consistency_resumes_to_more_runs(tmp_path, capsys):
         (["consistency", "--calibration", "maybe"], "unknown calibration 'maybe'"),
         (["consistency", "--set", "pixel_sigma=nan"], "pixel_sigma holds nan"),
         (["consistency", "--set", "pixel_sigma"], "not of the form field=value"),
-        (["consistency", "--reduce", "--records", "all.parquet"], "leave out --records"),
         (["consistency", "--dtype", "int8"], "unknown dtype 'int8'"),
         (["track", "/no/such/folder"], "/no/such/folder"),
         (["track", "--reference", "truth.txt"], "need a SOURCE"),

@@ -75,7 +75,7 @@ def calls():
 
 def test_every_extra_that_an_error_names_is_one_of_the_projects():
     named, extras = set(calls()), tomllib.loads(PROJECT.read_text())["project"]
-    assert named >= {"cli", "vision", "viewer", "parquet", "cluster"}
+    assert named >= {"cli", "vision", "viewer", "cluster"}
     assert named <= set(extras["optional-dependencies"])
 
 
