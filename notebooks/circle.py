@@ -31,7 +31,7 @@ from scipy.stats import binomtest
 
 import jaxslam
 from jaxslam.consistency import filter_run
-from jaxslam.plots import COLOURS, GREY, new_figure, plot_landmark_clouds
+from jaxslam.plots import COLOURS, GREY, draw_ellipses, new_figure
 from jaxslam.simulation import Room, sensor_of, sightings, simulate
 from jaxslam.statistics import chi2_quantile
 
@@ -83,7 +83,11 @@ figure = new_figure(12, 6.4)
 for axes, (name, (path, (means, covariances), draws)) in zip(
     figure.subplots(1, 2, sharex=True, sharey=True), maps.items(), strict=True
 ):
-    plot_landmark_clouds(draws, means, covariances, ax=axes, colour=COLOUR[name], label=NAME[name])
+    colour = COLOUR[name]
+    axes.plot(*draws.reshape(-1, 2).T, ",", color=colour, alpha=0.5, rasterized=True)
+    draw_ellipses(axes, means, covariances, np.sqrt(chi2_quantile(0.95, 2)), colour)
+    axes.plot([], [], ".", color=colour, label=f"{NAME[name]}: draws")
+    axes.plot([], [], color=colour, lw=1, label=f"{NAME[name]}: 95 % ellipse to first order")
     axes.plot(*true_points.T, "k+", ms=9, mew=1.5, label="true landmarks")
     axes.plot(*true_path.T, "k", lw=1, label="true path")
     axes.plot(*path.T, color=COLOURS[2], lw=1.5, ls="--", label="estimated path")

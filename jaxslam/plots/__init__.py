@@ -6,7 +6,7 @@ _MODULES = {
     "plot_consistency": "consistency",
     "plot_evaluation": "evaluation",
     "plot_triangulation": "triangulation",
-    "plot_landmark_clouds": "landmarks",
+    "draw_ellipses": "landmarks",
     "Laid": "frames",
     "plot_frames": "frames",
     "COLOURS": "style",

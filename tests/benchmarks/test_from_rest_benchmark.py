@@ -85,7 +85,7 @@ def test_other_pages_quote_the_numbers_on_disk():
     )
     for runs in above:
         assert f"above its band at {runs} of these 51 frames" in which
-    words = {3: "three", 5: "five"}
+    words = {5: "five", 7: "seven"}
     assert f"of {space['runs']} runs at most {words[lost[0]]} lost" in which
     page = (folder / "docs/results.md").read_text().replace("\n", " ")
     assert f"of {space['runs']} simulated runs at most {words[lost[0]]} are lost" in page
