@@ -29,6 +29,8 @@ AUTO = "auto"
 """The backend of a study for which none is asked: `chosen` says which it is."""
 WORTH = 100_000
 """The steps of all runs of a filter from which on the native backend pays for its compilation."""
+LARGEST = 200
+"""The numbers of a state up to which it is faster; its program grows with them."""
 FIRST_RUNS = 8
 """The runs that XLA computes too before it is believed; two, where all are not 64 times as many."""
 AGREEMENT = {"float64": 1e-6, "float32": 3e-2}
@@ -95,8 +97,12 @@ def _runs_in_cache(room: Room, runs: Run) -> int:
     """The number of runs whose covariances fit a processor's cache; all where there is none."""
     if jax.default_backend() != "cpu":
         return len(runs.visible)
-    n = 2 * runs.poses.tangent_dim + room.landmarks * (runs.points.shape[-1] + 1)
-    return max(1, CACHE // (n * n * runs.points.dtype.itemsize))
+    return max(1, CACHE // (_numbers(room, runs) ** 2 * runs.points.dtype.itemsize))
+
+
+def _numbers(room: Room, runs: Run) -> int:
+    """About how many a filter's state has."""
+    return 2 * runs.poses.tangent_dim + room.landmarks * (runs.points.shape[-1] + 1)
 
 
 def by_native(slam: AbstractFilter, room: Room, sensor: AbstractSensor, runs: Run) -> BatchProgram:
@@ -108,7 +114,7 @@ def by_native(slam: AbstractFilter, room: Room, sensor: AbstractSensor, runs: Ru
 
     def computed(wanted):
         records, samples = program(wanted)
-        return records, {name: x[0] for name, x in samples.items()}
+        return records, {name: x[0].copy() for name, x in samples.items()}
 
     return computed
 
@@ -149,7 +155,8 @@ def chosen(
     """Return the backend that computes so many runs of a filter, of which these are the first.
 
     `AUTO` is the native backend on a CPU with a C++ compiler for an `EkfSlam` without wrappers,
-    which it computes faster, where there are `WORTH` steps or the program is there; else XLA.
+    which it computes faster, where there are `WORTH` steps of a state no larger than `LARGEST`, or
+    the program is there; else XLA.
     Where there can be no native program, or its records of the first runs are not XLA's, it is XLA
     too, with a warning unless the choice was open.
     """
@@ -158,6 +165,7 @@ def chosen(
     able = backend != "xla" and jax.default_backend() == "cpu" and compiler() is not None
     there = able and native_programs().is_there(room, (slam, sensor), runs)
     long = isinstance(slam, EkfSlam) and count * (runs.visible.shape[1] - 1) >= WORTH
+    long = long and _numbers(room, runs) <= LARGEST
     if backend == "xla" or (backend == AUTO and not (there or (able and long))):
         return "xla"
     few = min(len(runs.visible), FIRST_RUNS if count >= 64 * FIRST_RUNS else 2)

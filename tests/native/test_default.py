@@ -60,9 +60,21 @@ def test_a_long_study_of_a_plain_filter_takes_the_native_backend(pretended, monk
     assert record.getMessage() == f"{NAME} is computed by a program in C++ (--backend xla: by XLA)"
     assert jaxslam.summarise(study())["filters"][NAME]["backend"] == "native"
     assert study(runs=11).backends == {NAME: "xla"}
+    with monkeypatch.context() as larger:
+        larger.setattr(backends, "LARGEST", 2 * 3 + 4 * 3 - 1)
+        assert study().backends == {NAME: "xla"}
     pretended.there = True  # what is compiled costs nothing
     assert study(runs=11).backends == {NAME: "native"}
     assert study(backend="xla").backends == {NAME: "xla"}
+
+
+@needs_compiler
+def test_what_is_kept_of_the_first_run_does_not_hold_the_others():
+    """A view would keep the map and the path of the whole batch in memory."""
+    (slam,) = jaxslam.make_filters(SCENARIO, "robocentric", "inverse_scaling").values()
+    room, runs = draw(SCENARIO, 3)
+    _, sample = backends.by_native(slam, room, sensor_of(SCENARIO), runs)(np.int32(3))
+    assert all(np.asarray(x).base is None for x in sample.values())
 
 
 def test_a_filter_with_wrappers_stays_with_xla(pretended):

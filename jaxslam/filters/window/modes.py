@@ -159,6 +159,7 @@ def sought(
     after, means = _likeliest(
         partial(_weighed, slam), record, candidates, alive, len(modes.log_weights)
     )
+    assert means is not None
     explained = jnp.isfinite(after.log_weights[0])
     after = jax.tree.map(lambda new, old: jnp.where(explained, new, old), after, modes)
     return after, means, explained

@@ -107,7 +107,8 @@ class Coarse(eqx.Module):
         """What is of no step; and of every step its own numbers, and what is drawn anew."""
         layout = PathLayout.of(self.slam)
         steps = x[layout.whole :].reshape(-1, layout.step + layout.each)
-        return x[: layout.whole], *jnp.split(steps, [layout.step], axis=1)
+        own, drawn = jnp.split(steps, [layout.step], axis=1)
+        return x[: layout.whole], own, drawn
 
     def _begun(self, y: Y) -> Y:
         """A landmark that is first seen elsewhere has its error of depth, and no pixel's error."""
