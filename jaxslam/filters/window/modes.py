@@ -258,7 +258,8 @@ def _likeliest(
 ) -> tuple[Modes, Mean | None]:
     """The likeliest of the minima that are distinct when they are weighed."""
     found = map_where(weighed, candidates, alive, record)
-    found = jax.tree.map(lambda leaf: leaf[jnp.argsort(-found.evidence)], found)
+    best_first = jnp.argsort(-found.evidence)
+    found = jax.tree.map(lambda leaf: leaf[best_first], found)
     x, information, value = found.minimum.x, found.information, found.evidence
     away = x[:, None] - x[None]
     squared = jnp.einsum("ijn,jno,ijo->ij", away, information, away)
