@@ -1,8 +1,9 @@
 """Bad input, many times: everything that reads is given files that something happened to.
 
-`PYTHONPATH=tests python tests/fuzz/fuzz.py --cases 100000`; `--first N --cases 1` repeats case N. Case i draws from
-(seed, i) alone. A case is good if it ends in a ValueError of one line, or in a result whose numbers
-are finite; a pickle in the data must not be run, and a command leaves whole files or none.
+`PYTHONPATH=tests python tests/fuzz/fuzz.py --cases 100000`; `--first N --cases 1` repeats case N.
+Case i draws from (seed, i) alone. A case is good if it ends in a ValueError of one line, or in a
+result whose numbers are finite; a pickle in the data must not be run, and a command leaves whole
+files or none.
 """
 
 from __future__ import annotations
