@@ -80,10 +80,15 @@ class Study:
         return tuple(chunk for chunk in self.chunks if keeps_records(chunk, self.reduced))
 
     def loaded(self, name: str) -> Iterator[Records]:
-        """Yield of every chunk the records of a filter that a summary reads."""
+        """Yield of every chunk the records of a filter that a summary reads. Raises ValueError."""
         for chunk in self.chunks:
             whole = keeps_records(chunk, self.reduced)
-            yield self.store.load(name, chunk, RECORDS if whole else None)
+            records = self.store.load(name, chunk, RECORDS if whole else None)
+            for key in RECORDS if whole else ():
+                if records[key].ndim != 2 + (key in ("error", "variance")):
+                    where = f"{name}, runs {chunk.start} to {chunk.stop - 1}"
+                    raise ValueError(f"{where}: the record {key} is damaged; run again")
+            yield records
 
     def __repr__(self) -> str:
         """Return its table, so that a study prints as its result."""

@@ -624,3 +624,12 @@ def test_of_the_last_chunk_only_what_is_wanted_is_computed(backend, monkeypatch)
     assert np.all(all_of_them["nees"] > 0)
     assert len(some["nees"]) == {"xla": 7, "native": 2}[backend]
     assert np.all(some["nees"][3:] == 0)
+
+
+def test_records_with_an_axis_too_many_are_damaged():
+    study = jaxslam.monte_carlo(SCENARIO, filters(), runs=2)
+    name, (chunk,) = "inverse_scaling", study.chunks
+    records = study.store.load(name, chunk)
+    study.store.save(name, chunk, {**records, "nis": records["nis"][..., None]})
+    with pytest.raises(ValueError, match=f"{name}, runs 0 to 1: the record nis is damaged"):
+        jaxslam.summarise(study)

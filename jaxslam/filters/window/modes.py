@@ -136,8 +136,7 @@ def searched(
         return Found(minima, jnp.isfinite(modes.log_weights), steps)
 
     none = Found(nothing, jnp.zeros(most, bool), steps)
-    function = begun if directly else found
-    return cond(jnp.any(search), function, none, record, search, likeliest)
+    return cond(jnp.any(search), begun if directly else found, none, record, search, likeliest)
 
 
 def sought(

@@ -76,7 +76,8 @@ class Coarse(eqx.Module):
         velocity."""
         begun, own, drawn = self._split(x)
         kept, fewer = self.kept, self.record
-        added = _sums(self._root[:, None] * own, kept) / jnp.sqrt(fewer.merged)[:, None]
+        root = jnp.sqrt(self.whole.merged)[:, None]
+        added = _sums(root * own, kept) / jnp.sqrt(fewer.merged)[:, None]
         anew = _sums(jnp.where(self.whole.restarted[:, None], own, 0.0), kept)
         own = jnp.where(fewer.restarted[:, None], anew, added)
         there = (jnp.arange(1, len(kept.frames)) < kept.count)[:, None]
@@ -91,17 +92,13 @@ class Coarse(eqx.Module):
         def of_part(values):
             return jnp.concatenate([values, jnp.zeros_like(values[:1])])[part]
 
-        shared = self._root[:, None] * of_part(own / jnp.sqrt(fewer.merged)[:, None])
+        shared = of_part(own / jnp.sqrt(fewer.merged)[:, None]) * jnp.sqrt(whole.merged)[:, None]
         anew = jnp.where(whole.restarted[:, None], of_part(own), 0.0)
         own = jnp.where(of_part(fewer.restarted)[:, None], anew, shared)
         last = self.kept.frames[1 + jnp.minimum(part, len(drawn) - 1)] - 1
         ends = (jnp.arange(len(part)) == last)[:, None]
         drawn = jnp.where(ends, of_part(drawn), 0.0)
         return jnp.append(begun, jnp.concatenate([own, drawn], axis=1)), self._begun(y)
-
-    @property
-    def _root(self) -> Array:
-        return jnp.sqrt(self.whole.merged)
 
     def _split(self, x: X) -> tuple[Array, Array, Array]:
         """What is of no step; and of every step its own numbers, and what is drawn anew."""
