@@ -7,8 +7,12 @@ With the Cholesky factor L of the covariance, s_h in front of the rest,
     z_h = m_h ⊞ L [W (g(z_{h+1}) − s̄_h); e_h],   W L_ss = 1,   e_h ~ N(0, I),
 
 so that the chain is a function of white numbers: those of the rests, e_h, and all of the newest
-z_N. Nothing is approximated beyond the linearisation of each submap's own filter. The Jacobian of
-anything by these numbers is one pass from the oldest submap to the newest.
+z_N. The Jacobian of anything by these numbers is one pass from the oldest submap to the newest.
+
+The filter linearised elsewhere than the chain does, so that what the next submap says of s_h has an
+error of second order. Some directions of s_h are known ten thousand times better than each of its
+numbers; there that error is many σ, and W would carry it on, from submap to submap. L is therefore
+that of the covariance with a variance of its own for every number, `LINEARISATION`.
 """
 
 from __future__ import annotations
@@ -29,6 +33,9 @@ from jaxslam.filters.forms.state import State
 from jaxslam.filters.submaps.handover import Frozen, Submaps, SubmapsState
 from jaxslam.geometry import Pose, difference, identity
 from jaxslam.models.coordinates import KeyframePose
+
+LINEARISATION = 1e-4
+"""Variance of the error of second order of each number of a submap, as a share of its variance."""
 
 OfChain = Callable[[State], PyTree]
 """A function of the states of all submaps, a batch: a vector, or a pytree of poses and vectors."""
@@ -133,8 +140,11 @@ class Chain(eqx.Module):
         return value, self.rows(states, jax.jacrev(moved)(jnp.zeros(self.shape)))
 
 
-def chain(slam: Submaps, state: SubmapsState, count: int) -> Chain:
-    """Return the chain of the latest `count` submaps of a filter and the one that goes on.
+def chain(
+    slam: Submaps, state: SubmapsState, count: int, linearisation: float = LINEARISATION
+) -> Chain:
+    """Return the chain of the latest `count` submaps of a filter and the one that goes on; of a
+    problem that is linear, with a `linearisation` of 0.
 
     In a batch of runs all have one length: what a run does not have are links that say nothing.
     Raises ValueError for more than the state keeps.
@@ -146,14 +156,17 @@ def chain(slam: Submaps, state: SubmapsState, count: int) -> Chain:
     frozen = jax.tree.map(lambda x: x[place % slam.history], state.frozen)
     last = Frozen(newest, jnp.zeros_like(state.numbers, bool), state.numbers)
     frozen = jax.tree.map(lambda all, one: jnp.concatenate([all, one[None]]), frozen, last)
-    return chained(slam.ekf, frozen, jnp.append(place >= 0, True))
+    return chained(slam.ekf, frozen, jnp.append(place >= 0, True), linearisation)
 
 
-def chained(slam: EkfSlam, frozen: Frozen, there: Bool[Array, " N"]) -> Chain:
+def chained(
+    slam: EkfSlam, frozen: Frozen, there: Bool[Array, " N"], linearisation: float = LINEARISATION
+) -> Chain:
     """Return submaps as a chain, the oldest first, of which the first may be none (`there`)."""
     N = len(there)
     newest, first = jnp.arange(N) == N - 1, there & (jnp.cumsum(there) == 1)
-    return Chain(slam, jax.vmap(partial(link, slam))(frozen, there, newest, first))
+    one = partial(link, slam, linearisation=linearisation)
+    return Chain(slam, jax.vmap(one)(frozen, there, newest, first))
 
 
 def link(
@@ -162,6 +175,7 @@ def link(
     there: Bool[Array, ""],
     newest: Bool[Array, ""],
     first: Bool[Array, ""],
+    linearisation: float = LINEARISATION,
 ) -> Link:
     """Return a submap as a link of a chain, which may stand for none, be the one that goes on, and
     be the first."""
@@ -178,7 +192,7 @@ def link(
     )
     separator = _separator(slam, frozen) & known & ~newest
     order = jnp.argsort(~separator, stable=True)
-    factor = semidefinite_root(state.covariance[order][:, order])
+    factor = semidefinite_root(state.covariance[order][:, order], linearisation)
     return Link(state, frozen.numbers, first, order, ~separator[order], *factor)
 
 

@@ -110,7 +110,7 @@ def smoothed(linear):
     state = slam.init(Capacity(SLOTS, SLOTS, 1), first)
     state, counts = run(slam, frames, state, lambda state, *_: state.count)
     ended = np.flatnonzero(np.diff(np.r_[0, counts])) + 1
-    return chain(slam, state, int(state.count)), [*ended, FRAMES - 1]
+    return chain(slam, state, int(state.count), linearisation=0.0), [*ended, FRAMES - 1]
 
 
 def everything(chain):
