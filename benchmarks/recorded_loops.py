@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -68,7 +68,7 @@ class RecordedLoops(Benchmark):
     seed: int = 11
     spare: int = 24
     """Slots for what is out of view."""
-    history: int = 640
+    history: int = 768
     """Submaps that are kept."""
     out: Path = RESULTS / "recorded_loops.json"
 

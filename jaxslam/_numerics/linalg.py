@@ -149,7 +149,9 @@ class SemidefiniteRoot(NamedTuple):
     """Solves `L y = b` for b in the range of L; zero for what has no variance."""
 
 
-def semidefinite_root(P: Float[Array, "n n"], jitter: float = 0.0) -> SemidefiniteRoot:
+def semidefinite_root(
+    P: Float[Array, "n n"], jitter: Float[Array, ""] | float = 0.0
+) -> SemidefiniteRoot:
     """Cholesky's L of a covariance without full rank, to the precision of rounding.
 
     Of the correlations with a jitter, at rounding's size at the least; what has no variance has a
@@ -159,7 +161,7 @@ def semidefinite_root(P: Float[Array, "n n"], jitter: float = 0.0) -> Semidefini
     none = variance <= 0
     sigma = jnp.sqrt(jnp.where(none, 0.0, variance))
     unit = jnp.where(none, 1.0, sigma)
-    jitter = max(jitter, 10 * sigma.size * float(jnp.finfo(P.dtype).eps))
+    jitter = jnp.maximum(jitter, 10 * sigma.size * jnp.finfo(P.dtype).eps).astype(P.dtype)
     correlation = P / (unit[:, None] * unit) + jnp.diag(jnp.where(none, 1.0, jitter))
     L, W = cholesky(correlation)
     return SemidefiniteRoot(sigma[:, None] * L, W / unit)

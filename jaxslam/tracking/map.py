@@ -31,7 +31,7 @@ NO_SLOTS = np.zeros(0, int)
 
 KEPT = 8
 """Maps that were left, and are known again."""
-MOST = 128
+MOST = 512
 """Submaps of a map: the last one does not end. Memory and the cost of a loop grow with them."""
 
 

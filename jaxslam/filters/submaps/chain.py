@@ -12,7 +12,7 @@ z_N. The Jacobian of anything by these numbers is one pass from the oldest subma
 The filter linearised elsewhere than the chain does, so that what the next submap says of s_h has an
 error of second order. Some directions of s_h are known ten thousand times better than each of its
 numbers; there that error is many σ, and W would carry it on, from submap to submap. L is therefore
-that of the covariance with a variance of its own for every number, `LINEARISATION`.
+that of the covariance with a further variance of every number, `LINEARISATION`.
 """
 
 from __future__ import annotations
@@ -29,22 +29,27 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jaxslam._numerics.linalg import semidefinite_root
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.forms.blocks import apart, shifted
-from jaxslam.filters.forms.state import State
+from jaxslam.filters.forms.state import AbstractState
 from jaxslam.filters.submaps.handover import Frozen, Submaps, SubmapsState
-from jaxslam.geometry import Pose, difference, identity
+from jaxslam.geometry import Pose, difference, identity, retract
 from jaxslam.models.coordinates import KeyframePose
 
-LINEARISATION = 1e-4
-"""Variance of the error of second order of each number of a submap, as a share of its variance."""
+LINEARISATION = 1e-3
+"""Variance of the error of second order of each number of a submap, as a share of its own."""
 
-OfChain = Callable[[State], PyTree]
-"""A function of the states of all submaps, a batch: a vector, or a pytree of poses and vectors."""
+
+class SubmapMean(AbstractState):
+    """The mean of a submap, or a batch of them."""
+
+
+OfChain = Callable[[SubmapMean], PyTree]
+"""A function of the means of all submaps, a batch: a vector, or a pytree of poses and vectors."""
 
 
 class Link(eqx.Module):
     """One submap of a chain, or a batch of all."""
 
-    state: State
+    state: SubmapMean
     """As it was frozen; nothing is known in one that stands for none."""
     numbers: Int[Array, "*N slots"]
     """As `Frozen` has them."""
@@ -59,14 +64,14 @@ class Link(eqx.Module):
     whitening: Float[Array, "*N n n"]
     """… and its inverse."""
 
-    def shifted(self, told: Float[Array, " n"], y: Float[Array, " n"]) -> State:
-        """Return the state for what is told of its separator, and for white numbers of its own."""
+    def shifted(self, told: Float[Array, " n"], y: Float[Array, " n"]) -> SubmapMean:
+        """Return the mean for what is told of its separator, and for white numbers of its own."""
         white = jnp.where(self.free, y, self.whitening @ told)
         delta = jnp.zeros_like(y).at[self.order].set(self.root @ white)
         return shifted(self.state, delta)
 
     def by_white(self) -> Float[Array, "n n"]:
-        """Return the Jacobian of the state's numbers by the white ones."""
+        """Return the Jacobian of the mean's numbers by the white ones."""
         return jnp.zeros_like(self.root).at[self.order].set(self.root)
 
 
@@ -82,12 +87,14 @@ class Chain(eqx.Module):
         N, n = self.links.order.shape
         return N, n
 
-    def at(self, y: Float[Array, "N n"]) -> State:
-        """Return the states of all submaps for white numbers y; as they were frozen for none."""
+    def at(self, y: Float[Array, "N n"]) -> SubmapMean:
+        """Return the means of all submaps for white numbers y; as they were frozen for none."""
 
-        def earlier(later: State, data: tuple[Link, Array, Array]) -> tuple[State, State]:
+        def earlier(
+            later: SubmapMean, data: tuple[Link, Array, Array]
+        ) -> tuple[SubmapMean, SubmapMean]:
             link, y, newest = data
-            state = link.shifted(jnp.where(newest, 0.0, self._told(later, link)), y)
+            state = link.shifted(jnp.where(newest, 0.0, self._told(link, later)), y)
             return state, state
 
         N, _ = self.shape
@@ -95,11 +102,10 @@ class Chain(eqx.Module):
         data = self.links, y, jnp.arange(N) == N - 1
         return jax.lax.scan(earlier, last, data, reverse=True)[1]
 
-    def _told(self, later: State, link: Link) -> Float[Array, " n"]:
+    def _told(self, link: Link, later: SubmapMean) -> Float[Array, " n"]:
         """`g(z_{h+1}) − s̄_h`, in order; zero of what is not the separator's."""
         frozen, core = link.state, later.core
-        T_KC = core.pose.keyframe_from_camera
-        back = jax.vmap(lambda landmark: self.slam.landmark.transform(T_KC, landmark))
+        back = jax.vmap(partial(self.slam.landmark.transform, core.pose.keyframe_from_camera))
         seen = replace(
             frozen.core,
             motion=core.base_motion,
@@ -110,27 +116,32 @@ class Chain(eqx.Module):
         now = replace(frozen, core=seen, landmarks=back(later.landmarks))
         return jnp.where(link.free, 0.0, apart(now, frozen)[link.order])
 
-    def rows(self, states: State, by_states: Float[Array, "k N n"]) -> Float[Array, "k N n"]:
+    def _onwards(
+        self, above: Float[Array, "k n"], link: Link, later: SubmapMean
+    ) -> tuple[Float[Array, "k n"], Float[Array, "k n"]]:
+        """Return the Jacobians by a submap's white numbers, and by the numbers of the one that is
+        `later`, of what has the one `above` by the submap's own."""
+        white = above @ link.by_white()
+        zero = jnp.zeros(above.shape[1], above.dtype)
+        _, pull = jax.vjp(lambda delta: self._told(link, shifted(later, delta)), zero)
+        (through,) = jax.vmap(pull)(jnp.where(link.free, 0.0, white) @ link.whitening)
+        return jnp.where(link.free, white, 0.0), through
+
+    def rows(self, states: SubmapMean, by_states: Float[Array, "k N n"]) -> Float[Array, "k N n"]:
         """Return the Jacobian by the white numbers of what has this one by the submaps' numbers."""
 
-        def later(above: Float[Array, "k n"], data) -> tuple[Array, Array]:
-            own, before, state, by_state = data
-            # `above` is by the numbers of the submap before: this one says of a part what it is.
-            _, pull = jax.vjp(lambda delta: self._told(shifted(state, delta), before), zero)
-            white = jnp.where(before.free, 0.0, above @ before.by_white())
-            (through,) = jax.vmap(pull)(white @ before.whitening)
-            total = by_state + through
-            return total, jnp.where(own.free, total @ own.by_white(), 0.0)
+        def onwards(older: Float[Array, "k n"], data) -> tuple[Array, Array]:
+            own, after, by_state = data
+            return self._onwards(older + by_state, own, after)[::-1]
 
-        k, _, n = by_states.shape
-        zero = jnp.zeros(n, by_states.dtype)
-        # Before the oldest there is none: nothing is `above` it.
-        before = jax.tree.map(lambda x: jnp.concatenate([x[:1], x[:-1]]), self.links)
-        data = self.links, before, states, jnp.swapaxes(by_states, 0, 1)
-        _, rows = jax.lax.scan(later, jnp.zeros((k, n), by_states.dtype), data)
+        by_states = jnp.swapaxes(by_states, 0, 1)
+        data = self.links, _next(states), by_states
+        _, rows = jax.lax.scan(onwards, jnp.zeros_like(by_states[0]), data)
         return jnp.swapaxes(rows, 0, 1)
 
-    def linearised(self, function: OfChain, states: State) -> tuple[PyTree, Float[Array, "k N n"]]:
+    def linearised(
+        self, function: OfChain, states: SubmapMean
+    ) -> tuple[PyTree, Float[Array, "k N n"]]:
         """Return the value of a function at these states, and its Jacobian by the white numbers."""
         value = function(states)
 
@@ -139,12 +150,64 @@ class Chain(eqx.Module):
 
         return value, self.rows(states, jax.jacrev(moved)(jnp.zeros(self.shape)))
 
+    def cameras(
+        self, states: SubmapMean, known: Float[Array, "k N n"]
+    ) -> tuple[Pose, Float[Array, "N t t"]]:
+        """Return `base_poses`, and the covariance of each, less what is `known`: k combinations of
+        the white numbers, of unit variance each.
 
-def chain(
-    slam: Submaps, state: SubmapsState, count: int, linearisation: float = LINEARISATION
-) -> Chain:
-    """Return the chain of the latest `count` submaps of a filter and the one that goes on; of a
-    problem that is linear, with a `linearisation` of 0.
+        A camera is `A` times the one before, and its own submap. From the oldest submap on, the
+        errors of older white numbers add up, and what is left is a matrix R times the numbers of
+        the submap; from the newest back, so does the covariance V of these.
+        """
+        known = jnp.swapaxes(known, 0, 1)
+        zero = jnp.zeros(self.shape[1], known.dtype)
+        start = identity(self.slam.motion.geometry, known.dtype)
+        t = start.tangent_dim
+
+        def onwards(carry, data):
+            T, R, C, X = carry
+            own, state, after, known = data
+            T_BC = _camera(T, state, own.first)
+
+            def moved(nudge, delta):
+                there = _camera(retract(T, nudge), shifted(state, delta), own.first)
+                return difference(there, T_BC)
+
+            A, E = jax.jacrev(moved, (0, 1))(jnp.zeros(t, known.dtype), zero)
+            R, C, X = A @ R + E, A @ C @ A.T, A @ X
+            free, through = self._onwards(R, own, after)
+            return (T_BC, through, C + free @ free.T, X + free @ known.T), (T_BC, R, C, X)
+
+        def back(carry, data):
+            V, Y = carry
+            own, after, known, R, C, X = data
+            B = own.by_white()
+            by_told = jnp.where(own.free, 0.0, B) @ own.whitening
+            F = by_told @ jax.jacfwd(lambda delta: self._told(own, shifted(after, delta)))(zero)
+            B = jnp.where(own.free, B, 0.0)
+            V, Y = B @ B.T + F @ V @ F.T, B @ known.T + F @ Y
+            less = X + R @ Y
+            return (V, Y), C + R @ V @ R.T - less @ less.T
+
+        _, k, n = known.shape
+        none = [jnp.zeros(shape, known.dtype) for shape in ((t, n), (t, t), (t, k))]
+        after = _next(states)
+        data = self.links, states, after, known
+        _, (poses, R, C, X) = jax.lax.scan(onwards, (start, *none), data)
+        none = [jnp.zeros(shape, known.dtype) for shape in ((n, n), (n, k))]
+        data = self.links, after, known, R, C, X
+        _, covariances = jax.lax.scan(back, tuple(none), data, reverse=True)
+        return poses, covariances
+
+
+def _next(states: PyTree) -> PyTree:
+    """The submap after each, and the newest after itself."""
+    return jax.tree.map(lambda x: jnp.concatenate([x[1:], x[-1:]]), states)
+
+
+def chain(slam: Submaps, state: SubmapsState, count: int) -> Chain:
+    """Return the chain of the latest `count` submaps of a filter and the one that goes on.
 
     In a batch of runs all have one length: what a run does not have are links that say nothing.
     Raises ValueError for more than the state keeps.
@@ -156,17 +219,14 @@ def chain(
     frozen = jax.tree.map(lambda x: x[place % slam.history], state.frozen)
     last = Frozen(newest, jnp.zeros_like(state.numbers, bool), state.numbers)
     frozen = jax.tree.map(lambda all, one: jnp.concatenate([all, one[None]]), frozen, last)
-    return chained(slam.ekf, frozen, jnp.append(place >= 0, True), linearisation)
+    return chained(slam.ekf, frozen, jnp.append(place >= 0, True))
 
 
-def chained(
-    slam: EkfSlam, frozen: Frozen, there: Bool[Array, " N"], linearisation: float = LINEARISATION
-) -> Chain:
+def chained(slam: EkfSlam, frozen: Frozen, there: Bool[Array, " N"]) -> Chain:
     """Return submaps as a chain, the oldest first, of which the first may be none (`there`)."""
     N = len(there)
     newest, first = jnp.arange(N) == N - 1, there & (jnp.cumsum(there) == 1)
-    one = partial(link, slam, linearisation=linearisation)
-    return Chain(slam, jax.vmap(one)(frozen, there, newest, first))
+    return Chain(slam, jax.vmap(partial(link, slam))(frozen, there, newest, first))
 
 
 def link(
@@ -175,25 +235,19 @@ def link(
     there: Bool[Array, ""],
     newest: Bool[Array, ""],
     first: Bool[Array, ""],
-    linearisation: float = LINEARISATION,
 ) -> Link:
     """Return a submap as a link of a chain, which may stand for none, be the one that goes on, and
     be the first."""
     nowhere = KeyframePose.at(identity(slam.motion.geometry, frozen.state.landmarks.dtype))
     state = frozen.state
     known = there & state.numbers(state.active)
-    state = replace(
-        state,
-        core=replace(
-            state.core, pose=jax.tree.map(partial(jnp.where, there), state.core.pose, nowhere)
-        ),
-        active=state.active & there,
-        covariance=jnp.where(known[:, None] & known, state.covariance, 0.0),
-    )
+    P = jnp.where(known[:, None] & known, state.covariance, 0.0)
+    pose = jax.tree.map(partial(jnp.where, there), state.core.pose, nowhere)
+    mean = SubmapMean(replace(state.core, pose=pose), state.landmarks, state.active & there)
     separator = _separator(slam, frozen) & known & ~newest
     order = jnp.argsort(~separator, stable=True)
-    factor = semidefinite_root(state.covariance[order][:, order], linearisation)
-    return Link(state, frozen.numbers, first, order, ~separator[order], *factor)
+    factor = semidefinite_root(P[order][:, order], LINEARISATION)
+    return Link(mean, frozen.numbers, first, order, ~separator[order], *factor)
 
 
 def _separator(slam: EkfSlam, frozen: Frozen) -> Bool[Array, " n"]:
@@ -209,15 +263,20 @@ def _separator(slam: EkfSlam, frozen: Frozen) -> Bool[Array, " n"]:
     return jnp.concatenate([own, carried])
 
 
-def base_poses(chain: Chain, states: State) -> Pose:
+def base_poses(chain: Chain, states: SubmapMean) -> Pose:
     """Return T_BC of the last camera of every submap, a batch, in the unit of the states: of all
     but the last the next one's base K, and of the last the camera's now."""
 
-    def onwards(T_BK: Pose, data: tuple[KeyframePose, Bool[Array, ""]]) -> tuple[Pose, Pose]:
-        held, first = data
-        start = jax.tree.map(partial(jnp.where, first), held.base_from_keyframe, T_BK)
-        T_BC = (start @ held.keyframe_from_camera).normalize()
+    def onwards(T: Pose, data: tuple[SubmapMean, Bool[Array, ""]]) -> tuple[Pose, Pose]:
+        T_BC = _camera(T, *data)
         return T_BC, T_BC
 
     start = identity(chain.slam.motion.geometry, states.landmarks.dtype)
-    return jax.lax.scan(onwards, start, (states.core.pose, chain.links.first))[1]
+    return jax.lax.scan(onwards, start, (states, chain.links.first))[1]
+
+
+def _camera(T_BK: Pose, state: SubmapMean, first: Bool[Array, ""]) -> Pose:
+    """The last camera of a submap whose base is K, unless it is the first and has its own."""
+    held: KeyframePose = state.core.pose
+    start = jax.tree.map(partial(jnp.where, first), held.base_from_keyframe, T_BK)
+    return (start @ held.keyframe_from_camera).normalize()

@@ -25,9 +25,8 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jaxslam._numerics.arrays import Number
 from jaxslam._numerics.linalg import Cholesky, cholesky
 from jaxslam.filters.association import Candidates, joint_compatibility
-from jaxslam.filters.forms.state import State
-from jaxslam.filters.submaps.chain import Chain, OfChain, base_poses
-from jaxslam.geometry import homogeneous_apply
+from jaxslam.filters.submaps.chain import Chain, OfChain, SubmapMean, base_poses
+from jaxslam.geometry import Pose, homogeneous_apply
 
 STEPS = 20
 """Of Gauss–Newton, at the most …"""
@@ -59,8 +58,8 @@ class Posterior(eqx.Module):
     """A chain with what loops say of it."""
 
     chain: Chain
-    states: State
-    """The submaps at the maximum, a batch; their covariances are those before."""
+    states: SubmapMean
+    """The submaps at the maximum, a batch."""
     slope: Float[Array, "k N n"]
     """J of the loops' residuals there."""
     factor: Cholesky
@@ -81,12 +80,25 @@ class Posterior(eqx.Module):
         """Return mean and covariance of a function of all submaps' states, to first order, the
         covariance as much more as the loops tell."""
         value, rows = self.chain.linearised(function, self.states)
-        rows, slope = (x.reshape(len(x), math.prod(self.chain.shape)) for x in (rows, self.slope))
-        known = self.factor.whitening @ (slope @ rows.T)
+        rows = rows.reshape(len(rows), math.prod(self.chain.shape))
+        known = self._known() @ rows.T
         return value, self.unit_variance() * (rows @ rows.T - known.T @ known)
 
+    def cameras(self) -> tuple[Pose, Float[Array, "N t t"]]:
+        """Return mean and covariance of all `base_poses`, at a cost that is linear in N."""
+        poses, covariances = self.chain.cameras(
+            self.states, self._known().reshape(self.slope.shape)
+        )
+        return poses, self.unit_variance() * covariances
 
-def separation(chain: Chain, loops: Loops, states: State) -> Float[Array, "m n"]:
+    def _known(self) -> Float[Array, "k Nn"]:
+        """What the loops tell, as combinations of the white numbers: `S^(−1/2) J`."""
+        return self.factor.whitening @ self.slope.reshape(
+            len(self.slope), math.prod(self.chain.shape)
+        )
+
+
+def separation(chain: Chain, loops: Loops, states: SubmapMean) -> Float[Array, "m n"]:
     """The distances of two landmarks each that should be none, as shares of their distance.
 
     Both are homogeneous points (X, ω) in the camera of the second, compared on the unit sphere
@@ -131,12 +143,12 @@ def close(chain: Chain, loops: Loops) -> Posterior:
 
 
 def posterior(
-    chain: Chain, residual: Callable[[State], Float[Array, " k"]], sigma: float
+    chain: Chain, residual: Callable[[SubmapMean], Float[Array, " k"]], sigma: float
 ) -> Posterior:
     """Return the chain in which a residual of all states is zero, but for an error of this σ, at
     the last point where it was linearised: the maximum but for `SMALLEST`."""
 
-    def linear(y: Float[Array, "N n"]) -> tuple[Array, tuple[State, Array, Array, Cholesky]]:
+    def linear(y: Float[Array, "N n"]) -> tuple[Array, tuple[SubmapMean, Array, Array, Cholesky]]:
         states = chain.at(y)
         value, rows = chain.linearised(residual, states)
         J = rows.reshape(len(value), y.size)

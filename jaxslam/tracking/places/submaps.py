@@ -21,10 +21,9 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam._runtime.programs import Program
 from jaxslam.filters.ekf import EkfSlam, each_gaussian, ekf_inside, rebased
-from jaxslam.filters.forms.state import State
 from jaxslam.filters.model import COMPOSED, CameraInMap
 from jaxslam.filters.protocol import AbstractStaged, Belief, LandmarkView
-from jaxslam.filters.submaps.chain import Chain, Link, base_poses, link
+from jaxslam.filters.submaps.chain import Chain, Link, SubmapMean, base_poses, link
 from jaxslam.filters.submaps.closing import Posterior, posterior
 from jaxslam.filters.submaps.handover import PARALLAX, TURN, Frozen
 from jaxslam.geometry import difference, retract
@@ -303,7 +302,7 @@ def _slopes(
     return R, jnp.tensordot(Q, by_landmarks, (0, 0))
 
 
-def _error(chain: Chain, loop: LoopClosure, states: State) -> Float[Array, " 6"]:
+def _error(chain: Chain, loop: LoopClosure, states: SubmapMean) -> Float[Array, " 6"]:
     """What a loop says is noise, of variance 1."""
     poses = base_poses(chain, states)
     T_BP, T_BQ = (_row(poses, submap) for submap in loop.submaps)
@@ -314,7 +313,7 @@ def _error(chain: Chain, loop: LoopClosure, states: State) -> Float[Array, " 6"]
 
 @Program
 def _given(chain: Chain, loops: LoopClosure) -> Posterior:
-    def errors(states: State) -> Array:
+    def errors(states: SubmapMean) -> Array:
         return jax.vmap(lambda loop: _error(chain, loop, states))(loops).ravel()
 
     return posterior(chain, errors, 1.0)
@@ -322,7 +321,7 @@ def _given(chain: Chain, loops: LoopClosure) -> Posterior:
 
 @Program
 def _compared(known: Posterior, new: LoopClosure) -> tuple[Array, Array, Array]:
-    def both(states: State) -> PyTree:
+    def both(states: SubmapMean) -> PyTree:
         camera = _row(base_poses(known.chain, states), -1)
         return camera, _error(known.chain, new, states)
 
@@ -337,11 +336,7 @@ def _compared(known: Posterior, new: LoopClosure) -> tuple[Array, Array, Array]:
 
 @Program
 def _solved(known: Posterior) -> tuple[Array, Array, Array]:
-    chain = known.chain
-
-    def one(k: Array) -> tuple[Array, Array]:
-        T_BC, P = known.marginal(lambda states: _row(base_poses(chain, states), k))
-        return T_BC.as_matrix(), P
-
-    X, omega = jax.vmap(jax.vmap(chain.slam.landmark.homogeneous))(known.states.landmarks)
-    return *jax.lax.map(one, jnp.arange(chain.shape[0])), X / omega[..., None]
+    poses, covariances = known.cameras()
+    landmarks = jax.vmap(jax.vmap(known.chain.slam.landmark.homogeneous))
+    X, omega = landmarks(known.states.landmarks)
+    return poses.as_matrix(), covariances, X / omega[..., None]

@@ -88,6 +88,18 @@ def test_a_loop_that_closes_makes_the_path_right_and_its_covariance_smaller(lap)
     np.testing.assert_array_equal(errors(close(chained, none_of(loops)), truth)[0], drift)
 
 
+def test_the_covariances_of_all_cameras_are_those_of_each(lap):
+    """In one pass, as `marginal` has them of all at once."""
+    chained, _, loops = lap
+    after = close(chained, loops)
+    poses, P = after.cameras()
+    expected, joint = after.marginal(lambda states: base_poses(chained, states))
+    np.testing.assert_allclose(poses.parameters(), expected.parameters(), atol=1e-12)
+    N, t = len(P), P.shape[1]
+    blocks = np.asarray(joint).reshape(N, t, N, t)[np.arange(N), :, np.arange(N)]
+    np.testing.assert_allclose(P, blocks, rtol=1e-6, atol=1e-9 * np.max(blocks))
+
+
 def test_wrong_pairs_are_refused_among_right_ones(lap):
     """Every third is with a neighbour of the true landmark."""
     chained, _, loops = lap
