@@ -154,14 +154,13 @@ def semidefinite_root(
 ) -> SemidefiniteRoot:
     """Cholesky's L of a covariance without full rank, to the precision of rounding.
 
-    Of the correlations with a jitter, at rounding's size at the least; what has no variance has a
-    row of zeros.
+    Of the correlations with a jitter, at least rounding's; what has no variance has zeros.
     """
     variance = jnp.diagonal(P)
     none = variance <= 0
     sigma = jnp.sqrt(jnp.where(none, 0.0, variance))
     unit = jnp.where(none, 1.0, sigma)
-    jitter = jnp.maximum(jitter, 10 * sigma.size * jnp.finfo(P.dtype).eps).astype(P.dtype)
+    jitter = max(jitter, 10 * sigma.size * float(jnp.finfo(P.dtype).eps))
     correlation = P / (unit[:, None] * unit) + jnp.diag(jnp.where(none, 1.0, jitter))
     L, W = cholesky(correlation)
     return SemidefiniteRoot(sigma[:, None] * L, W / unit)

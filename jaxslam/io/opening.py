@@ -15,9 +15,8 @@ from jaxslam.io.calibration import (
 from jaxslam.io.camera import CAMERA
 from jaxslam.io.euroc import EUROC
 from jaxslam.io.file import VIDEO
-from jaxslam.io.folder import PLAIN, TIMESTAMPED
 from jaxslam.io.kitti import KITTI
-from jaxslam.io.recording import Layout, Recording
+from jaxslam.io.recording import PLAIN, TIMESTAMPED, Layout, Recording
 from jaxslam.io.ros_images import ROS
 from jaxslam.io.seven_scenes import SEVEN_SCENES
 from jaxslam.io.source import Source, Trajectory, check_size, resized, selected

@@ -120,6 +120,11 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (0, part) for part in parts]
 
 
+def _open_plain(path: Path, rate: float) -> Recording:
+    files = image_files(path)
+    return of_files(path, files, np.arange(len(files)) / rate)
+
+
 def fixed(calibration: Calibration) -> Calibrator:
     """A calibration that states its size itself."""
     return lambda width, height: calibration
@@ -163,3 +168,13 @@ def _timestamp(place: str, line: str, separator: str | None) -> tuple[float, str
     if len(words) != 2 or time is None:
         raise ValueError(f"{place}: a finite time and a file are accepted, not {line!r}")
     return time[0], words[1].strip()
+
+
+TIMESTAMPED = Layout(
+    "a folder with images/ and timestamps.txt",
+    lambda path: (path / "timestamps.txt").is_file(),
+    lambda path, _rate: of_listing(path, path / "timestamps.txt", path / "images"),
+)
+PLAIN = Layout(
+    "a folder of images", lambda path: path.is_dir() and bool(image_files(path)), _open_plain
+)

@@ -7,8 +7,6 @@ _MODULES = {
     "plot_evaluation": "evaluation",
     "plot_triangulation": "triangulation",
     "draw_ellipses": "landmarks",
-    "Laid": "frames",
-    "plot_frames": "frames",
     "COLOURS": "style",
     "GREY": "style",
     "line_style": "style",

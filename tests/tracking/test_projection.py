@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-from matplotlib.collections import EllipseCollection
 from scipy.spatial.transform import Rotation
 
 from jaxslam.io.calibration import Calibration
-from jaxslam.plots.frames import Laid, plot_frames
 from jaxslam.tracking.pointcloud import Cloud, read_ply, seen_from, write_ply
 
 LENS = Calibration(320, 240, 300.0, 310.0, 160.0, 118.0, (-0.2, 0.05, 1e-3, -2e-3))
@@ -63,18 +61,3 @@ def test_another_file_is_no_map(tmp_path, text):
     (tmp_path / "map.ply").write_text(text)
     with pytest.raises(ValueError, match=r"map\.ply is not a map\.ply as jaxslam track writes it"):
         read_ply(tmp_path / "map.ply")
-
-
-def test_frames_show_crosses_and_ellipses_of_three_sigma(tmp_path):
-    pixels = np.array([[10.0, 20.0], [np.nan, np.nan], [30.0, 5.0]])
-    spread = np.tile(np.diag([4.0, 1.0]), (3, 1, 1))
-    frame = Laid("frame 3", np.full((24, 40), 90, np.uint8), pixels, spread)
-    figure = plot_frames([frame] * 4, tmp_path / "frames.png")
-    shown = [axes for axes in figure.axes if axes.lines]
-    assert [axes.get_title() for axes in shown] == ["frame 3"] * 4
-    np.testing.assert_array_equal(shown[0].lines[0].get_xydata(), pixels[[0, 2]])
-    (ellipses,) = (c for c in shown[0].collections if isinstance(c, EllipseCollection))
-    sizes = np.array([ellipses.get_widths(), ellipses.get_heights()], float)
-    np.testing.assert_allclose(sizes, [[12, 12], [6, 6]])
-    with pytest.raises(ValueError, match="no frame to draw"):
-        plot_frames([])

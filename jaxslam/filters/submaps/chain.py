@@ -9,10 +9,9 @@ With the Cholesky factor L of the covariance, s_h in front of the rest,
 so that the chain is a function of white numbers: those of the rests, e_h, and all of the newest
 z_N. The Jacobian of anything by these numbers is one pass from the oldest submap to the newest.
 
-The filter linearised elsewhere than the chain does, so that what the next submap says of s_h has an
-error of second order. Some directions of s_h are known ten thousand times better than each of its
-numbers; there that error is many σ, and W would carry it on, from submap to submap. L is therefore
-that of the covariance with a further variance of every number, `LINEARISATION`.
+The filter linearised elsewhere than the chain: what the next submap says of s_h has an error of
+second order, many σ in directions that are known far better than each number, and W would carry it
+on. L is therefore that of the covariance with a further variance of every number, `LINEARISATION`.
 """
 
 from __future__ import annotations
@@ -90,9 +89,7 @@ class Chain(eqx.Module):
     def at(self, y: Float[Array, "N n"]) -> SubmapMean:
         """Return the means of all submaps for white numbers y; as they were frozen for none."""
 
-        def earlier(
-            later: SubmapMean, data: tuple[Link, Array, Array]
-        ) -> tuple[SubmapMean, SubmapMean]:
+        def earlier(later: SubmapMean, data):
             link, y, newest = data
             state = link.shifted(jnp.where(newest, 0.0, self._told(link, later)), y)
             return state, state
@@ -135,8 +132,8 @@ class Chain(eqx.Module):
             return self._onwards(older + by_state, own, after)[::-1]
 
         by_states = jnp.swapaxes(by_states, 0, 1)
-        data = self.links, _next(states), by_states
-        _, rows = jax.lax.scan(onwards, jnp.zeros_like(by_states[0]), data)
+        none, data = jnp.zeros_like(by_states[0]), (self.links, _next(states), by_states)
+        _, rows = jax.lax.scan(onwards, none, data)
         return jnp.swapaxes(rows, 0, 1)
 
     def linearised(
@@ -153,12 +150,10 @@ class Chain(eqx.Module):
     def cameras(
         self, states: SubmapMean, known: Float[Array, "k N n"]
     ) -> tuple[Pose, Float[Array, "N t t"]]:
-        """Return `base_poses`, and the covariance of each, less what is `known`: k combinations of
-        the white numbers, of unit variance each.
+        """Return `base_poses` and the covariance of each, less that of the k white `known` numbers.
 
-        A camera is `A` times the one before, and its own submap. From the oldest submap on, the
-        errors of older white numbers add up, and what is left is a matrix R times the numbers of
-        the submap; from the newest back, so does the covariance V of these.
+        From the oldest submap on, a camera's error is one of older white numbers, of covariance C,
+        and R times the submap's numbers; from the newest back, these have the covariance V.
         """
         known = jnp.swapaxes(known, 0, 1)
         zero = jnp.zeros(self.shape[1], known.dtype)
@@ -190,15 +185,13 @@ class Chain(eqx.Module):
             less = X + R @ Y
             return (V, Y), C + R @ V @ R.T - less @ less.T
 
-        _, k, n = known.shape
-        none = [jnp.zeros(shape, known.dtype) for shape in ((t, n), (t, t), (t, k))]
-        after = _next(states)
+        (_, k, n), after = known.shape, _next(states)
+        nothing = (jnp.zeros(size, known.dtype) for size in ((t, n), (t, t), (t, k)))
         data = self.links, states, after, known
-        _, (poses, R, C, X) = jax.lax.scan(onwards, (start, *none), data)
-        none = [jnp.zeros(shape, known.dtype) for shape in ((n, n), (n, k))]
+        _, (poses, R, C, X) = jax.lax.scan(onwards, (start, *nothing), data)
+        nothing = jnp.zeros((n, n), known.dtype), jnp.zeros((n, k), known.dtype)
         data = self.links, after, known, R, C, X
-        _, covariances = jax.lax.scan(back, tuple(none), data, reverse=True)
-        return poses, covariances
+        return poses, jax.lax.scan(back, nothing, data, reverse=True)[1]
 
 
 def _next(states: PyTree) -> PyTree:

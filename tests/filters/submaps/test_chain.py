@@ -190,8 +190,8 @@ def test_a_chain_ends_where_the_filter_is_however_well_some_directions_are_known
     direction by half."""
     noise = {"velocity_sigma": [0.3] * 3 + [0.05] * 3, "acceleration_sigma": [1.0] * 3 + [0.3] * 3}
     road = scenario(
-        "handheld", rate=10.0, steps=150, landmarks=12, velocity=[0.0, 0.0, 8.0, 0.0, 0.0, 0.0],
-        depth_range=[5.0, 50.0], nearest_depth=5.0, **noise,
+        "handheld", noise, rate=10.0, steps=150, landmarks=12, depth_range=[5.0, 50.0],
+        velocity=[0.0, 0.0, 8.0, 0.0, 0.0, 0.0], nearest_depth=5.0,
     )  # fmt: skip
     (base,) = make_filters(road, "scale_gauge+oc+scene50", "inverse_scaling").values()
     slam, room = with_submaps(base, 12, 32), Room(12, 12, 12, 12)
