@@ -89,7 +89,7 @@ class RecordedLoops(Benchmark):
 
 
 def page(results: dict[str, Any]) -> str:
-    """The table of all trajectories: medians of what is of one run, and sums of the loops."""
+    """The table of all trajectories: means of what is of one run, and sums of the loops."""
     header = (
         "trajectory", "runs", "length, m; frames; submaps", "NEES now: before, after",
         "NEES of old cameras: before, after", "ATE, m: before, after", "loops: closed, refused",
