@@ -149,9 +149,7 @@ class SemidefiniteRoot(NamedTuple):
     """Solves `L y = b` for b in the range of L; zero for what has no variance."""
 
 
-def semidefinite_root(
-    P: Float[Array, "n n"], jitter: Float[Array, ""] | float = 0.0
-) -> SemidefiniteRoot:
+def semidefinite_root(P: Float[Array, "n n"], jitter: float = 0.0) -> SemidefiniteRoot:
     """Cholesky's L of a covariance without full rank, to the precision of rounding.
 
     Of the correlations with a jitter, at least rounding's; what has no variance has zeros.
