@@ -20,7 +20,8 @@ Value = TypeVar("Value")
 
 PARTS = 4
 """Of a batch, in a block, where each of the batch has one work at the most. Where it has many,
-a block is as large as the batch: in small ones the compiler's products of matrices are slow."""
+a block has as many places as the batch: in small ones the compiler's products of matrices are
+slow."""
 LEAST = 8
 """Works in a block."""
 
@@ -42,11 +43,25 @@ def map_where(
     `values` is a pytree of arrays whose first axis is k; the function returns what it is given.
     """
 
-    def alone(values, given):
+    def alone(values, _, given):
         one = jax.tree.map(lambda x: x[0], values)
         return jax.tree.map(lambda x: x[None], function(one, *given))
 
-    return at_places(alone, values, jnp.arange(alive.size)[:, None], alive, given)
+    return at_places(alone, values, None, jnp.arange(alive.size)[:, None], alive, given)
+
+
+def map_or_zero(
+    function: Callable[..., Value], sources: PyTree, alive: Bool[Array, " k"], *given: PyTree
+) -> Value:
+    """`function(source, *given)` of every source that is alive, and zeros for the others."""
+
+    def alone(_, sources, given):
+        one = jax.tree.map(lambda x: x[0], sources)
+        return jax.tree.map(lambda x: x[None], function(one, *given))
+
+    one = jax.tree.map(lambda x: x[0], sources)
+    none = zeros(jax.eval_shape(function, one, *given), alive.size)
+    return at_places(alone, none, sources, jnp.arange(alive.size)[:, None], alive, given)
 
 
 def zeros(shapes: PyTree, k: int) -> PyTree:
@@ -55,32 +70,35 @@ def zeros(shapes: PyTree, k: int) -> PyTree:
 
 
 def at_places(
-    function: Callable[[Value, PyTree], Value],
+    function: Callable[[Value, PyTree, PyTree], Value],
     values: Value,
+    sources: PyTree,
     places: Int[Array, "w r"],
     wanted: Bool[Array, " w"],
     given: PyTree,
 ) -> Value:
     """The values after each of w works that is wanted.
 
-    `values` is a pytree of arrays of one first axis. A work takes the r values in its places to
-    what is there afterwards, `function(those, given)`. No two works have one place.
+    `values` and `sources` are pytrees of arrays of one first axis. A work takes the r values in its
+    places to what is there afterwards, `function(those, the sources there, given)`. No two works
+    have one place.
     """
     r = places.shape[1]
-    rows = jax.tree.map(lambda x: jax.ShapeDtypeStruct((r, *x.shape[1:]), x.dtype), values)
-    closed = eqx.filter_closure_convert(function, rows, given)
+    both = values, sources
+    rows = jax.tree.map(lambda x: jax.ShapeDtypeStruct((r, *x.shape[1:]), x.dtype), both)
+    closed = eqx.filter_closure_convert(function, *rows, given)
     arrays, static = eqx.partition(closed, eqx.is_array)
 
     def call(rows, shared):
         arrays, given = shared
-        return eqx.combine(arrays, static)(rows, given)
+        return eqx.combine(arrays, static)(*rows, given)
 
     @custom_vmap
-    def work(values, places, wanted, shared):
+    def work(values, sources, places, wanted, shared):
         def one(values, data):
             place, wanted = data
-            rows = jax.tree.map(lambda x: x[place], values)
-            new = jax.lax.cond(wanted, call, lambda rows, _: rows, rows, shared)
+            rows = jax.tree.map(lambda x: x[place], (values, sources))
+            new = jax.lax.cond(wanted, call, lambda rows, _: rows[0], rows, shared)
             return jax.tree.map(lambda x, new: x.at[place].set(new), values, new), None
 
         return jax.lax.scan(one, values, (places, wanted))[0]
@@ -91,44 +109,7 @@ def at_places(
         after = _in_blocks(call, *spread, data[-1], batched[-1])
         return after, jax.tree.map(lambda _: True, after)
 
-    return work(values, places, wanted, (arrays, given))
-
-
-def repeated(
-    function: Callable[..., tuple[Value, Bool[Array, ""]]], value: Value, most: int
-) -> Value:
-    """The value after `function`, again as long as that says so, but no more than `most` times.
-
-    In a batch it is called for all until none says so: one that has ended it has to leave as it is.
-    """
-    closed = eqx.filter_closure_convert(function, value)
-    arrays, static = eqx.partition(closed, eqx.is_array)
-
-    def call(value, arrays):
-        return eqx.combine(arrays, static)(value)
-
-    def loop(call, value):
-        def again(carry):
-            turn, value, _ = carry
-            value, going = call(value)
-            return turn + 1, value, jnp.any(going)
-
-        start = jnp.zeros((), int), value, jnp.ones((), bool)
-        return jax.lax.while_loop(lambda x: x[2] & (x[0] < most), again, start)[1]
-
-    @custom_vmap
-    def one(value, arrays):
-        return loop(lambda value: call(value, arrays), value)
-
-    @one.def_vmap
-    def in_batch(size, batched, value, arrays):
-        value = _spread(size, batched[0], value)
-        axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched[1])
-        every = jax.vmap(call, in_axes=(0, axes))
-        after = loop(lambda value: every(value, arrays), value)
-        return after, jax.tree.map(lambda _: True, after)
-
-    return one(value, arrays)
+    return work(values, sources, places, wanted, (arrays, given))
 
 
 def _spread(size: int, batched: PyTree, values: PyTree) -> PyTree:
@@ -143,6 +124,7 @@ def _spread(size: int, batched: PyTree, values: PyTree) -> PyTree:
 def _in_blocks(
     call: Callable[..., PyTree],
     values: PyTree,
+    sources: PyTree,
     places: Int[Array, "b w r"],
     wanted: Bool[Array, "b w"],
     shared: PyTree,
@@ -151,18 +133,18 @@ def _in_blocks(
     """Compute what is wanted of a batch b, wherever it is, block by block."""
     b, w = wanted.shape
     k = jax.tree.leaves(values)[0].shape[1]
-    size = min(b * w, max(LEAST, b * min(w, PARTS) // PARTS))
+    size = min(b * w, max(LEAST, b * min(w, PARTS) // (PARTS * places.shape[-1])))
     count = jnp.sum(wanted)
     works = jnp.flatnonzero(wanted, size=b * w + size, fill_value=b * w)
     places = (places + k * jnp.arange(b)[:, None, None]).reshape(b * w, -1)
-    flat = jax.tree.map(lambda x: x.reshape(b * k, *x.shape[2:]), values)
+    flat, read = jax.tree.map(lambda x: x.reshape(b * k, *x.shape[2:]), (values, sources))
     axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
 
     def block(carry):
         done, flat = carry
         work = jax.lax.dynamic_slice(works, (done,), (size,))
         place = places[work]
-        rows = jax.tree.map(lambda x: x[place], flat)
+        rows = jax.tree.map(lambda x: x[place], (flat, read))
         own = jax.tree.map(lambda each, x: x[work // w] if each else x, batched, shared)
         after = jax.vmap(call, in_axes=(0, axes))(rows, own)
         place = jnp.where((work < b * w)[:, None], place, b * k)

@@ -208,7 +208,8 @@ def eigh(A: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"
         return A, V.at[:, both].set(V[:, both] @ turn)
 
     start = (A + A.T) / 2, jnp.eye(n, dtype=A.dtype)
-    A, V = jax.lax.fori_loop(0, SWEEPS * first.size, rotated, start)
+    turns = 1 if n == 2 else SWEEPS * first.size  # one rotation is exact
+    A, V = jax.lax.fori_loop(0, turns, rotated, start, unroll=n == 2)
     values = jnp.diagonal(A)
     order = jnp.argsort(values)
     return values[order], V[:, order]

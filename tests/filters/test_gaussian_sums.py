@@ -222,8 +222,8 @@ def test_a_sum_that_is_not_split_is_taken_in_stages_as_by_its_step(name):
 
 
 @cache
-def divided():
-    return quick_jit(lambda state: _split_and_merged(pixels, _parts(pixels, state))[0].sum)
+def divided(rounds=1):
+    return quick_jit(lambda state: _split_and_merged(_parts(pixels, state), rounds))
 
 
 def cost(state):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam._numerics import conditional as lazy
-from jaxslam._numerics.conditional import at_places, cond, map_where, repeated
+from jaxslam._numerics.conditional import at_places, cond, map_or_zero, map_where
 
 BATCH, PLACES = 20, 5
 
@@ -88,6 +88,22 @@ def test_a_batch_gives_what_each_gives_alone(least, monkeypatch):
     check(one_by_one(values, alive, by), values, alive, by)
 
 
+@pytest.mark.parametrize("in_batch", [False, True])
+def test_what_is_not_alive_is_zero(in_batch):
+    """And read by nobody: what is there may be anything."""
+    values, alive, by = drawn()
+    sources = jnp.where(alive[..., None], values["x"], jnp.nan)
+
+    def work(*given):
+        return map_or_zero(lambda x, by: {"sum": by * jnp.sum(x), "x": x}, *given)
+
+    each = jax.vmap(work) if in_batch else lambda *batch: jax.lax.map(lambda x: work(*x), batch)
+    after = jax.jit(each)(sources, alive, by)
+    x = jnp.where(alive[..., None], values["x"], 0)
+    np.testing.assert_array_equal(after["x"], x)
+    np.testing.assert_allclose(after["sum"], by[:, None] * x.sum(-1), rtol=1e-12)
+
+
 def test_what_a_function_is_closed_over_may_be_of_the_batch():
     def closed(values, alive, by):
         return map_where(lambda value: moved(value, by), values, alive)
@@ -105,16 +121,17 @@ def test_batches_of_batches():
 
 @pytest.mark.parametrize("in_batch", [False, True])
 def test_a_work_may_be_of_several_places(in_batch):
-    """Two values change places."""
+    """Two values change places, and what is added is read there."""
     values = jnp.arange(24.0).reshape(4, 6)
     places = jnp.array([[[0, 5], [1, 2]], [[3, 1], [4, 5]], [[0, 1], [2, 3]], [[5, 4], [3, 2]]])
     wanted = jnp.array([[True, False], [True, True], [False, False], [False, True]])
 
-    def swapped(two, added):
-        return two[::-1] + added
+    def swapped(two, added, factor):
+        return two[::-1] + factor * added
 
     def work(values, places, wanted):
-        return at_places(swapped, values, places, wanted, jnp.asarray(-100.0))
+        added = jnp.arange(6.0)
+        return at_places(swapped, values, added, places, wanted, jnp.asarray(-100.0))
 
     each = jax.vmap(work) if in_batch else lambda *x: jnp.stack(list(map(work, *x)))
     after = np.asarray(each(values, places, wanted))
@@ -122,17 +139,5 @@ def test_a_work_may_be_of_several_places(in_batch):
     for run in range(4):
         for place, due in zip(np.asarray(places[run]), wanted[run], strict=True):
             if due:
-                expected[run, place] = expected[run, place[::-1]] - 100
+                expected[run, place] = expected[run, place[::-1]] - 100 * place
     np.testing.assert_array_equal(after, expected)
-
-
-@pytest.mark.parametrize("in_batch", [False, True])
-def test_a_work_is_repeated_until_it_is_done_or_enough(in_batch):
-    def halved(value):
-        going = value > 1
-        return jnp.where(going, value / 2, value), going
-
-    start = jnp.array([8.0, 0.5, 1.0, 1024.0])
-    each = jax.vmap if in_batch else lambda one: lambda all: jnp.stack(list(map(one, all)))
-    after = each(lambda value: repeated(halved, value, 5))(start)
-    np.testing.assert_array_equal(after, [1, 0.5, 1, 32])

@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -20,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam._numerics.arrays import AnyArray, cast, precision
-from jaxslam._numerics.conditional import map_where, zeros
+from jaxslam._numerics.conditional import map_or_zero, map_where, zeros
 from jaxslam._numerics.linalg import eigh
 from jaxslam.filters.ekf import (
     EkfSlam,
@@ -90,7 +91,7 @@ class GaussianSum(AbstractWrapper):
 
     @property
     def rounds(self) -> int:
-        """Splits in a frame, at the most."""
+        """Splits in a frame, at the most: each takes up to three members."""
         return max(1, self.members // 3)
 
     def init(self, capacity: int | Capacity, first: Features | None = None) -> SumState:
@@ -166,8 +167,8 @@ class GaussianSum(AbstractWrapper):
 
     def marginal(self, state: SumState, function: OfCamera) -> Moments:
         """The sum's mean and covariance, in the tangent at the value of its likeliest member."""
-        each = jax.vmap(lambda one: self.base.marginal(one, function))
-        values, covariances = each(state.members)
+        each = partial(self.base.marginal, function=function)
+        values, covariances = map_or_zero(each, state.members, state.alive)
         likeliest = SumState(values, state.log_weights).likeliest
         away = jax.vmap(difference, in_axes=(0, None))(values, likeliest)
         mean, covariance = moments(state.log_weights, away, covariances)
@@ -175,8 +176,8 @@ class GaussianSum(AbstractWrapper):
 
     def landmark_marginal(self, state: SumState, function: OfLandmark, slots: Slots) -> EachMoments:
         """The sum's mean and covariance of every landmark."""
-        each = jax.vmap(lambda one: self.base.landmark_marginal(one, function, slots))
-        values, covariances = each(state.members)
+        each = partial(self.base.landmark_marginal, function=function, slots=slots)
+        values, covariances = map_or_zero(each, state.members, state.alive)
         of_landmark = jax.vmap(moments, in_axes=(None, 1, 1))
         return of_landmark(state.log_weights, values, covariances)
 

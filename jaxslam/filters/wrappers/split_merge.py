@@ -1,8 +1,8 @@
 """Splits and mergers of the members of a Gaussian sum.
 
-In every frame the member whose linearisation costs most is split, and the two whose merger costs
-least are merged (split and merge: Ueda et al. 2000; for filters Faubel et al. 2009). Where a split
-gains nothing there are fewer members, and only those that are there are computed.
+In every frame the members whose linearisation costs most are split, and the pairs whose merger
+costs least are merged (split and merge: Ueda et al. 2000; for filters Faubel et al. 2009). Where a
+split gains nothing there are fewer members, and only those that are there are computed.
 
 What costs is the product of the camera's displacement t with inverse depths. In a measurement
 h(X − ω t), with X and ω as they are at the estimate, errors of both neglect `−(∂h/∂X) δt δω`. So a
@@ -17,15 +17,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam._numerics.conditional import at_places, map_where, repeated, zeros
+from jaxslam._numerics.conditional import at_places, map_or_zero
 from jaxslam._numerics.linalg import cholesky, eigh
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.forms.blocks import apart, shifted
@@ -39,6 +38,9 @@ from jaxslam.models.observations import Features
 WORTH = 3e-5
 """What a split has to gain, in σ² of a measured pixel, summed over the landmarks; two members
 whose merger costs less than a quarter of it are one."""
+FEW = 7
+"""Members up to which that is so. Of k members it is `(k/FEW)⁴` times as much, as every one costs
+the same time."""
 SPLIT = 0.8
 """Halves of a split member are ± so many of its σ from its mean."""
 
@@ -46,7 +48,7 @@ SPLIT = 0.8
 def divided(
     ekf: EkfSlam, state: SumState, control: Control, seen: Features, rounds: int
 ) -> SumState:
-    """A predicted sum after at most so many splits and mergers."""
+    """A predicted sum after at most so many splits, and as many mergers of other members."""
     n = ekf.motion.geometry.point_dim
 
     def displacement(core):
@@ -58,7 +60,7 @@ def divided(
     def pixels(core):
         return cost @ displacement(core)
 
-    return repeated(partial(_split_and_merged, pixels), _parts(pixels, state), rounds).sum
+    return _split_and_merged(_parts(pixels, state), rounds)
 
 
 def _root_of_cost(ekf: EkfSlam, likeliest: State, seen: Features) -> Float[Array, "n n"]:
@@ -111,68 +113,83 @@ def _described(
 
 
 def _parts(pixels: Pixels, state: SumState) -> _Parts:
-    cores, c = state.members.core, state.likeliest.core_dim
-    covariances = state.members.covariance[:, :c, :c]
-    told = jax.eval_shape(partial(_described, pixels), state.likeliest.core, covariances[0])
-
-    def described(of):
-        return *of[:2], _described(pixels, *of[:2])
-
-    of = cores, covariances, zeros(told, len(covariances))
-    return _Parts(state, *map_where(described, of, state.alive)[2])
+    c = state.likeliest.core_dim
+    of = state.members.core, state.members.covariance[:, :c, :c]
+    return _Parts(state, *map_or_zero(lambda of: _described(pixels, *of), of, state.alive))
 
 
-def _split_and_merged(pixels: Pixels, parts: _Parts) -> tuple[_Parts, Bool[Array, ""]]:
-    """The member of the greatest cost split, and two of the others merged, if that is a gain; else
-    two merged, if that costs nothing; and whether any of it was done.
+def _split_and_merged(parts: _Parts, rounds: int) -> SumState:
+    """So many times, each of other members: the one of the greatest cost split, and two of the
+    others merged, if that is a gain; else two merged, if that costs nothing."""
+    places, due, divided = _planned(parts, rounds)
+    split = jnp.any(divided & (places[:, 2] == jnp.arange(parts.sum.alive.size)[:, None]), axis=1)
+    return at_places(_replaced, parts.sum, (parts.by_core, split), places, due, None)
 
-    The cost of the sum is `Σ w tr(P)` of the members' `pixels(core)`, in σ of a pixel. A split
+
+def _planned(
+    parts: _Parts, rounds: int
+) -> tuple[Int[Array, "w 3"], Bool[Array, " w"], Bool[Array, " w"]]:
+    """The places of two that are merged and of one that is split, so many times; whether that is
+    due, and whether the split is.
+
+    The cost of the sum is `Σ w tr(P)` of the members' `pixels(core)`, in σ² of a pixel. A split
     lessens it by `w δ² λ` with the greatest eigenvalue λ; a merger adds
     `wᵢ wⱼ/(wᵢ + wⱼ) |pᵢ − pⱼ|²`, and nothing with a member without weight, whose place it frees.
     """
-    weights = jnp.exp(parts.sum.log_weights)
-    costs = jnp.einsum("kii->k", parts.covariances)
-    split = jnp.argmax(jnp.where(weights > 0, weights * costs, 0.0))
-    gain = weights[split] * SPLIT**2 * eigh(parts.covariances[split])[0][-1]
+    weights, alive = jnp.exp(parts.sum.log_weights), parts.sum.alive
+    variances = jax.vmap(lambda P: eigh(P)[0][-1])(parts.covariances)
+    gains = jnp.where(alive, weights * SPLIT**2 * variances, 0.0)
 
     tiny, index = jnp.finfo(weights.dtype).tiny, jnp.arange(weights.size)
     shared = weights[:, None] * weights / jnp.maximum(weights[:, None] + weights, tiny)
     apart = jnp.sum((parts.values[:, None] - parts.values) ** 2, axis=-1)
     loss = jnp.where(shared > 0, shared * apart, 0.0)
-    pairs = index[:, None] < index
-    others, cost = _cheapest(loss, pairs & (index[:, None] != split) & (index != split))
-    alike, least = _cheapest(loss, pairs & (weights[:, None] > 0) & (weights > 0))
-    divided = (gain > cost) & (gain > WORTH)
-    due = divided | (least < WORTH / 4)
+    loss = jnp.where(index[:, None] < index, loss, jnp.inf)
+    both = alive[:, None] & alive
 
-    pair = jnp.where(divided, others, alike)
-    # A merger alone needs no third place, but places are different.
-    third = jnp.where(divided, split, jnp.argmax((index != pair[0]) & (index != pair[1])))
-    places = jnp.append(pair, third)[None]
-    return at_places(partial(_replaced, pixels), parts, places, due[None], divided), due
+    def turn(carry, _):
+        free, count = carry
+        left = jnp.where(free[:, None] & free, loss, jnp.inf)
+        split = jnp.argmax(jnp.where(free, gains, -jnp.inf))
+        gain, one = gains[split], index == split
+        others, cost = _cheapest(jnp.where(one[:, None] | one, jnp.inf, left))
+        alike, least = _cheapest(jnp.where(both, left, jnp.inf))
+        worth = WORTH * jnp.maximum(1.0, count / FEW) ** 4
+        divided = (gain > cost) & (gain > worth)
+        due = divided | (least < worth / 4)
+        pair = jnp.where(divided, others, alike)
+        # A merger alone needs no third place, but places are different.
+        third = jnp.argmax(free & (index != pair[0]) & (index != pair[1]))
+        places = jnp.append(pair, jnp.where(divided, split, third))
+        used = jnp.any(index[:, None] == places, axis=1)
+        merged = jnp.all(alive[pair])
+        count = count + jnp.where(due, divided.astype(int) - merged, 0)
+        return (free & ~(used & due), count), (places, due, divided)
+
+    start = jnp.ones_like(alive), jnp.sum(alive)
+    return jax.lax.scan(turn, start, length=rounds)[1]
 
 
-def _replaced(pixels: Pixels, three: _Parts, divided: Bool[Array, ""]) -> _Parts:
+def _replaced(
+    three: SumState, told: tuple[Float[Array, "3 n c"], Bool[Array, " 3"]], _: None
+) -> SumState:
     """The first two merged in the first place, and the third split into the others; if it is to be
     split, or else the second place is free."""
-    members, log_weights = three.sum.members, three.sum.log_weights
+    members, log_weights = three.members, three.log_weights
+    by_core, divided = (x[2] for x in told)
     merged = collapsed(member(members, np.s_[:2]), log_weights[:2])
-    by_core = three.by_core[2]
     halves = _halves(member(members, 2), by_core)
     old = member(members, np.s_[1:])
     two = jax.tree.map(lambda half, old: jnp.where(divided, half, old), halves, old)
     half = log_weights[2] - jnp.log(2.0)
     weights = jnp.where(divided, half, jnp.stack([-jnp.full_like(half, jnp.inf), log_weights[2]]))
     members = jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), merged, two)
-    state = SumState(members, jnp.append(jnp.logaddexp(*log_weights[:2]), weights))
-    c = by_core.shape[-1]
-    described = jax.vmap(partial(_described, pixels))
-    return _Parts(state, *described(members.core, members.covariance[:, :c, :c]))
+    weights = jnp.append(jnp.logaddexp(*log_weights[:2]), weights)
+    return SumState(members, weights)
 
 
-def _cheapest(loss: Float[Array, "k k"], pairs: Bool[Array, "k k"]) -> tuple[Array, Array]:
+def _cheapest(loss: Float[Array, "k k"]) -> tuple[Int[Array, " 2"], Float[Array, ""]]:
     """The pair that is merged at the least loss, and that; ∞ without a pair."""
-    loss = jnp.where(pairs, loss, jnp.inf)
     pair = jnp.stack(jnp.unravel_index(jnp.argmin(loss), loss.shape))
     return pair, loss[tuple(pair)]
 
