@@ -11,6 +11,7 @@ from cases import Case, each_geometry, named, pose_run, quick_jit
 
 import jaxslam
 from jaxslam.filters.registry import FROM_REST, RECOMMENDED, recommended_name
+from jaxslam.filters.wrappers import split_merge
 from jaxslam.filters.wrappers.split_merge import _parts, _split_and_merged
 from jaxslam.filters.wrappers.sum_state import BEHIND, SumState, log_likelihoods, mixed
 from jaxslam.filters.wrappers.wrapper import with_motion
@@ -116,10 +117,10 @@ def test_a_prior_is_divided_across_the_speed(name):
 
 
 @cache
-def some_sum():
-    """A sum after some steps, and the function that it is divided by."""
+def some_sum(members=5):
+    """A sum after some steps."""
     of = case()
-    slam = of.filter("scale_gauge+mixture5")
+    slam = of.filter(f"scale_gauge+mixture{members}")
     first, known, new = of.frames(0)
 
     def whole(first, *later):
@@ -231,15 +232,32 @@ def cost(state):
     return np.exp(np.asarray(state.log_weights)) @ np.trace(P, axis1=1, axis2=2)
 
 
-def test_to_split_and_to_merge_keeps_the_moments_and_lessens_the_cost():
-    state = some_sum()
-    after = divided()(state)
+@pytest.mark.parametrize(("members", "rounds"), [(5, 1), (9, 3)])
+def test_to_split_and_to_merge_keeps_the_moments_and_lessens_the_cost(members, rounds):
+    state = some_sum(members)
+    after = divided(rounds)(state)
     assert not np.allclose(after.log_weights, state.log_weights)
     np.testing.assert_allclose(np.exp(after.log_weights).sum(), 1, rtol=1e-12)
     for before, now in zip(moments(state), moments(after), strict=True):
         np.testing.assert_allclose(now, before, rtol=1e-9, atol=1e-12 * np.abs(before).max())
     assert cost(after) < cost(state)
     assert np.linalg.eigvalsh(after.members.covariance).min() > -1e-12
+
+
+def test_several_rounds_divide_more_than_one():
+    state = some_sum(9)
+    assert cost(divided(3)(state)) < cost(divided(1)(state)) < cost(state)
+
+
+def test_of_many_members_each_has_to_gain_more(monkeypatch):
+    state = some_sum(9)
+
+    def left(few):
+        monkeypatch.setattr(split_merge, "FEW", few)
+        after = quick_jit(lambda state: _split_and_merged(_parts(pixels, state), 3))(state)
+        return int(after.alive.sum())
+
+    assert left(0.1) < left(9)
 
 
 def test_what_gains_nothing_is_not_split():
