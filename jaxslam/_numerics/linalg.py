@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.arrays import AnyArray
 
-LEAF = 64
+LEAF = 32
 """Rows of what is factored column by column; of more, the halves are, and joined by products."""
 LARGE = 256
 """Rows from which on blocks are in a loop: more arithmetic, and a program that does not grow."""
