@@ -258,8 +258,8 @@ def _likeliest(
     """The likeliest of the minima that are distinct when they are weighed."""
     found = map_where(weighed, candidates, alive, record)
     best_first = jnp.argsort(-found.evidence)
-    found = jax.tree.map(lambda leaf: leaf[best_first], found)
-    x, information, value = found.minimum.x, found.information, found.evidence
+    x, information = found.minimum.x[best_first], found.information[best_first]
+    value = found.evidence[best_first]
     away = x[:, None] - x[None]
     squared = jnp.einsum("ijn,jno,ijo->ij", away, information, away)
     index = jnp.arange(len(x))
@@ -268,5 +268,5 @@ def _likeliest(
     value = jnp.where(value < jnp.max(value) - NEGLIGIBLE, -jnp.inf, value)
     kept = jnp.argsort(-value)[:count]
     weights = jax.nn.log_softmax(value[kept])
-    found = jax.tree.map(lambda leaf: leaf[kept], found)
+    found = jax.tree.map(lambda leaf: leaf[best_first[kept]], found)
     return Modes(found.minimum, weights, found.shift, found.doubts), found.mean
