@@ -154,9 +154,9 @@ def chosen(
 ) -> str:  # fmt: skip
     """Return the backend that computes so many runs of a filter, of which these are the first.
 
-    `AUTO` is the native backend on a CPU with a C++ compiler for an `EkfSlam` without wrappers,
-    which it computes faster, where there are `WORTH` steps of a state no larger than `LARGEST`, or
-    the program is there; else XLA.
+    `AUTO` is the native backend on a CPU with a C++ compiler for an `EkfSlam` without wrappers and
+    with a state no larger than `LARGEST`, which it computes faster, where there are `WORTH` steps
+    or the program is there; else XLA.
     Where there can be no native program, or its records of the first runs are not XLA's, it is XLA
     too, with a warning unless the choice was open.
     """
@@ -164,9 +164,9 @@ def chosen(
 
     able = backend != "xla" and jax.default_backend() == "cpu" and compiler() is not None
     there = able and native_programs().is_there(room, (slam, sensor), runs)
-    long = isinstance(slam, EkfSlam) and count * (runs.visible.shape[1] - 1) >= WORTH
-    long = long and _numbers(room, runs) <= LARGEST
-    if backend == "xla" or (backend == AUTO and not (there or (able and long))):
+    faster = isinstance(slam, EkfSlam) and _numbers(room, runs) <= LARGEST
+    long = count * (runs.visible.shape[1] - 1) >= WORTH
+    if backend == "xla" or (backend == AUTO and not (able and faster and (there or long))):
         return "xla"
     few = min(len(runs.visible), FIRST_RUNS if count >= 64 * FIRST_RUNS else 2)
     first = jax.tree.map(lambda x: x[:few], runs)
