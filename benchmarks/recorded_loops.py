@@ -1,6 +1,6 @@
 """Loops along recorded trajectories in full: is the whole path believable when they have closed?
 
-    python benchmarks/recorded_loops.py --trajectories udel_gore kitti_00 --runs 8
+    python benchmarks/recorded_loops.py --runs 8
 
 Simulates a camera along whole trajectories of $JAXSLAM_DATA/trajectories (../shared/data by
 default), from rest, through a filter with submaps. Landmarks that leave the view are gone for good.
