@@ -43,7 +43,7 @@ from jaxslam.models.motion import Control, check_control
 from jaxslam.models.observations import Capacity, Features, Innovation, Slots, judged
 
 LAG = 10
-"""LagFrames of a lag whose number is not said."""
+"""Frames of a lag whose number is not said."""
 
 
 class LagFrames(eqx.Module):
