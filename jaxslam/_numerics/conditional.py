@@ -25,6 +25,8 @@ a block has as many places as the batch: in small ones the compiler's products o
 slow."""
 LEAST = 8
 """Works in a block."""
+# A slice: a gather is a larger program, and slower.
+_row = partial(jax.lax.dynamic_index_in_dim, keepdims=False, allow_negative_indices=False)
 
 
 def cond(
@@ -43,26 +45,26 @@ def map_where(
 
     `values` is a pytree of arrays whose first axis is k; the function returns what it is given.
     """
-
-    def alone(values, _, given):
-        one = jax.tree.map(lambda x: x[0], values)
-        return jax.tree.map(lambda x: x[None], function(one, *given))
-
-    return at_places(alone, values, None, jnp.arange(alive.size)[:, None], alive, given)
+    return _at_each(function, 0, values, None, alive, given)
 
 
 def map_or_zero(
     function: Callable[..., Value], sources: PyTree, alive: Bool[Array, " k"], *given: PyTree
 ) -> Value:
     """`function(source, *given)` of every source that is alive, and zeros for the others."""
-
-    def alone(_, sources, given):
-        one = jax.tree.map(lambda x: x[0], sources)
-        return jax.tree.map(lambda x: x[None], function(one, *given))
-
     one = jax.tree.map(lambda x: x[0], sources)
     none = zeros(jax.eval_shape(function, one, *given), alive.size)
-    return at_places(alone, none, sources, jnp.arange(alive.size)[:, None], alive, given)
+    return _at_each(function, 1, none, sources, alive, given)
+
+
+def _at_each(function, which: int, values, sources, alive, given):
+    """The works of single places, each of its value (0) or of its source (1)."""
+
+    def alone(*data):
+        one = jax.tree.map(lambda x: x[0], data[which])
+        return jax.tree.map(lambda x: x[None], function(one, *data[2]))
+
+    return at_places(alone, values, sources, jnp.arange(alive.size)[:, None], alive, given)
 
 
 def zeros(shapes: PyTree, k: int) -> PyTree:
@@ -99,44 +101,28 @@ def at_places(
         first = jnp.argsort(~wanted) if wanted.size > 1 else jnp.zeros(1, int)
 
         def one(k, values):
-            place = places[first[k]]
-            rows = jax.tree.map(partial(_rows, place), (values, sources))
+            place = tuple(places[first[k]])
+            rows = jax.tree.map(lambda x: jnp.stack([_row(x, i) for i in place]), (values, sources))
             return jax.tree.map(partial(_with_rows, place), values, call(rows, shared))
 
         return jax.lax.fori_loop(0, jnp.sum(wanted), one, values)
 
     @work.def_vmap
     def in_batch(size, batched, *data):
-        spread = _spread(size, tuple(batched[:-1]), data[:-1])
+        def one(is_batched, x):
+            return x if is_batched else jnp.broadcast_to(x, (size, *jnp.shape(x)))
+
+        spread = jax.tree.map(one, tuple(batched[:-1]), data[:-1])
         after = _in_blocks(call, *spread, data[-1], batched[-1])
         return after, jax.tree.map(lambda _: True, after)
 
     return work(values, sources, places, wanted, (arrays, given))
 
 
-def _rows(place: Int[Array, " r"], x: Array) -> Array:
-    """Rows of an array; a single one as a slice, a much smaller program than a gather."""
-    if place.size == 1:
-        return jax.lax.dynamic_slice_in_dim(x, place[0], 1, allow_negative_indices=False)
-    return x[place]
-
-
-def _with_rows(place: Int[Array, " r"], x: Array, rows: Array) -> Array:
-    """The array with other rows."""
-    if place.size == 1:
-        return jax.lax.dynamic_update_slice_in_dim(
-            x, rows, place[0], 0, allow_negative_indices=False
-        )
-    return x.at[place].set(rows)
-
-
-def _spread(size: int, batched: PyTree, values: PyTree) -> PyTree:
-    """A batch of so many of all of them."""
-
-    def one(is_batched, x):
-        return x if is_batched else jnp.broadcast_to(x, (size, *jnp.shape(x)))
-
-    return jax.tree.map(one, batched, values)
+def _with_rows(places: tuple[Int[Array, ""], ...], x: Array, rows: Array) -> Array:
+    for i, row in zip(places, rows, strict=True):
+        x = jax.lax.dynamic_update_index_in_dim(x, row, i, 0, allow_negative_indices=False)
+    return x
 
 
 def _in_blocks(

@@ -154,9 +154,8 @@ def chosen(
 ) -> str:  # fmt: skip
     """Return the backend that computes so many runs of a filter, of which these are the first.
 
-    `AUTO` is the native backend on a CPU with a C++ compiler for an `EkfSlam` without wrappers and
-    with a state no larger than `LARGEST`, which it computes faster, where there are `WORTH` steps
-    or the program is there; else XLA.
+    `AUTO` is the native backend on a CPU with a C++ compiler for an `EkfSlam` without wrappers
+    whose state is at most `LARGEST`, if there are `WORTH` steps or its program exists; else XLA.
     Where there can be no native program, or its records of the first runs are not XLA's, it is XLA
     too, with a warning unless the choice was open.
     """

@@ -257,16 +257,14 @@ def _likeliest(
 ) -> tuple[Modes, Mean | None]:
     """The likeliest of the minima that are distinct when they are weighed."""
     found = map_where(weighed, candidates, alive, record)
-    best_first = jnp.argsort(-found.evidence)
-    x, information = found.minimum.x[best_first], found.information[best_first]
-    value = found.evidence[best_first]
+    order = jnp.argsort(-found.evidence)
+    x, information, value = (x[order] for x in (found.minimum.x, found.information, found.evidence))
     away = x[:, None] - x[None]
     squared = jnp.einsum("ijn,jno,ijo->ij", away, information, away)
-    index = jnp.arange(len(x))
-    again = jnp.any((squared < APART) & (index < index[:, None]), axis=1)
+    again = jnp.any(jnp.tril(squared < APART, -1), axis=1)
     value = jnp.where(again, -jnp.inf, value)
     value = jnp.where(value < jnp.max(value) - NEGLIGIBLE, -jnp.inf, value)
     kept = jnp.argsort(-value)[:count]
     weights = jax.nn.log_softmax(value[kept])
-    found = jax.tree.map(lambda leaf: leaf[best_first[kept]], found)
+    found = jax.tree.map(lambda leaf: leaf[order[kept]], found)
     return Modes(found.minimum, weights, found.shift, found.doubts), found.mean
