@@ -11,7 +11,6 @@ submaps. Results are added to `recorded_loops.json`, their table to `docs/submap
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -46,8 +45,8 @@ MARK = "<!-- by recorded_loops.py -->"
 RATES = {"kitti_00": 10.0, "tumvi_room1": 30.0}
 """Frames a second of recordings whose rate is not `RATE`, Hz."""
 RATE = 20.0
-FOCAL = {"tum_corridor1": 250.0}
-"""Focal lengths of recordings whose lens is wide, pixels: 104° in place of 52°."""
+LENSES: dict[str, dict[str, Any]] = {"tum_corridor1": {"focal": (250.0, 250.0)}}
+"""Of recordings whose lens is wide: 104° in place of 52°."""
 TURN = np.radians(30)
 """The greatest angle between two rays to a landmark from which it looks the same …"""
 NEARER = 2.0
@@ -116,9 +115,8 @@ def whole(trajectory: str, steps: int) -> Scenario:
     path, rate = data_folder() / "trajectories" / f"{trajectory}.txt", RATES.get(trajectory, RATE)
     times = np.loadtxt(path, usecols=0)
     every = int((times[-1] - times[0]) * rate + 1e-6)
-    scenario = jaxslam.scenario(f"handheld-{trajectory}", rate=rate, steps=steps or every)
-    focal = FOCAL.get(trajectory, scenario.focal[0])
-    return dataclasses.replace(scenario, focal=(focal, focal))
+    lens = LENSES.get(trajectory, {})
+    return jaxslam.scenario(f"handheld-{trajectory}", rate=rate, steps=steps or every, **lens)
 
 
 class Told(NamedTuple):
