@@ -151,7 +151,7 @@ def test_the_house_does_not_grow():
     }
     assert len({(above, below) for above, below in arrows if above != below}) <= 70
     ours = [path for path in FILES if "native" not in path.parts]
-    assert sum(len(path.read_text().splitlines()) for path in ours) <= 29_083
+    assert sum(len(path.read_text().splitlines()) for path in ours) <= 29_080
     for path in FILES:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ClassDef):

@@ -168,27 +168,20 @@ def _degrees(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake]:
     ):  # fmt: skip
         found = [axis for axis in asked if wrong[axis].is_like(factor, known=bool(angles))]
         if not angles and found == asked:  # σ as a whole may be wrong
-            found = [axis for axis in found if _runs_are_alike(logged.factors[axis])]
+            ends = {axis: logged.factors[axis]["interval99"] for axis in found}
+            found = [x for x, (low, high) in ends.items() if low and high and high < _ALIKE * low]
         if not found or (angles and found != angles):
             continue
         if any(wrong[axis].is_like(factor, known=True) for axis in lengths):
             continue
         names = ", ".join(logged.names[axis] for axis in found)
+        told = f"180/π is {DEGREES:.3g}" if factor > 1 else f"π/180 is {1 / DEGREES:.3g}"
         yield Mistake(
             f"degrees where radians belong ({names})",
             f"errors of {names} look as if they were in {errors} and the covariances in "
             f"{covariances}: σ should be {wrong[found[0]].by:.3g} times as large, and "
-            f"{_told(factor)}; both in radians are accepted",
+            f"{told}; both in radians are accepted",
         )
-
-
-def _runs_are_alike(found: Verdict) -> bool:
-    low, high = found["interval99"]
-    return bool(low) and high is not None and high < _ALIKE * low
-
-
-def _told(factor: float) -> str:
-    return f"180/π is {DEGREES:.3g}" if factor > 1 else f"π/180 is {1 / DEGREES:.3g}"
 
 
 class _Factor(NamedTuple):

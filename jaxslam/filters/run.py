@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.filters.protocol import AbstractFilter, Belief
@@ -71,4 +72,7 @@ def run(
         state, innovation = slam.step(state, frame.control, frame.seen, frame.new)
         return state, collect(state, innovation, frame)
 
+    # In a batch the whole state is the batch's at once: else `vmap` transforms all steps twice.
+    some = jnp.sum(frames.seen.measured) == 0
+    state = jax.tree.map(lambda x: jax.lax.select(some, x, x), state)
     return jax.lax.scan(step, state, frames)
