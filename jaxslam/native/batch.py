@@ -15,14 +15,16 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxslam._runtime.programs import keep, place_of, read
-from jaxslam.native.build import built, described, trusted
-from jaxslam.native.emit import BYTES, source
+from jaxslam.native.build import built, described, trusted, vector_bytes
+from jaxslam.native.emit import source
 from jaxslam.native.plan import plan
 from jaxslam.native.trace import NotSupportedError, program
 
 __all__ = ["Batch", "NotSupportedError", "batched"]
 
 
+_LINE = 64
+"""Bytes of a line of the cache, at which memory begins."""
 Kinds = tuple[jax.tree_util.PyTreeDef, tuple[tuple[tuple[int, ...], np.dtype], ...]]
 """The structure of a pytree, and the shapes and types of its leaves."""
 
@@ -52,8 +54,8 @@ class Batch:
         traced, shapes = program(self._function, *jax.tree.map(_kind, (shared, one)))
         inputs = [(x.dtype, own) for x, own in zip(*self._leaves(shared, one), strict=True)]
         outputs = [x.dtype for x in jax.tree.leaves(shapes)]
-        path = built(source(plan(traced), (inputs, outputs)))
-        width = BYTES // traced.elements.dtype.itemsize
+        path = built(source(plan(traced), (inputs, outputs), vector_bytes()))
+        width = vector_bytes() // traced.elements.dtype.itemsize
         if place := _place(key):
             keep(place[0], lambda: (shapes, width, path.name))
         return shapes, width, ctypes.CDLL(str(path))
@@ -72,8 +74,8 @@ class Batch:
         pointers = [(ctypes.c_void_p * len(x))(*(y.ctypes.data for y in x)) for x in (given, made)]
 
         def part(firsts) -> None:
-            arena = np.empty(self._arena + BYTES, np.uint8)
-            begin = ctypes.c_void_p(arena.ctypes.data + -arena.ctypes.data % BYTES)
+            arena = np.empty(self._arena + _LINE, np.uint8)
+            begin = ctypes.c_void_p(arena.ctypes.data + -arena.ctypes.data % _LINE)
             for first in firsts:
                 some = min(self._width, count - first)
                 self._run(begin, *pointers, doubts, ctypes.c_long(first), ctypes.c_long(some))

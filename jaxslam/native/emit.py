@@ -17,9 +17,11 @@ FEW = 4
 TOGETHER = 40
 """Steps in one function of the program: compilers are slow on long ones."""
 TILES = ((4, 6), (6, 4), (4, 4), (3, 8), (8, 3), (2, 10), (10, 2), (1, 14), (14, 1))
-"""Sums that a product keeps in registers."""
-BYTES = 64
-"""Of a vector."""
+"""Sums that a product keeps in registers, of which there are 32 with vectors of 64 bytes …"""
+TILES_OF_FEW = ((3, 4), (4, 3), (3, 3), (2, 6), (6, 2), (1, 10), (10, 1))
+"""… and 16 with shorter ones."""
+VECTOR_MATH = {64: ("e", "__AVX512F__"), 32: ("d", "__AVX2__")}
+"""The letter by which glibc calls its functions of vectors of so many bytes, and what they need."""
 
 
 class CppSource(NamedTuple):
@@ -29,18 +31,21 @@ class CppSource(NamedTuple):
     tables: bytes
 
 
-def source(plan: Plan, kinds: tuple[list[tuple[Any, bool]], list[Any]]) -> CppSource:
-    """The whole program; `kinds` are the types of what goes in, and whether every run has its
-    own, and the types of what comes out."""
-    writer = _Writer(plan)
+def source(plan: Plan, kinds: tuple[list[tuple[Any, bool]], list[Any]], vector: int) -> CppSource:
+    """The whole program, of vectors of so many bytes; `kinds` are the types of what goes in, and
+    whether every run has its own, and the types of what comes out."""
+    writer = _Writer(plan, vector)
     body = writer.function(plan.program.steps)
     entry = writer.entry(body, *kinds)
-    scalar = "double" if writer.elements.dtype == np.float64 else "float"
-    width = BYTES // writer.elements.dtype.itemsize
-    letter = "_ZGVeN8v_##x" if scalar == "double" else "_ZGVeN16v_##x##f"
-    head = [f"#define SCALAR {scalar}", f"#define WIDTH {width}"]
-    head += ["#if defined(__x86_64__) && defined(__gnu_linux__)"]
-    head += [f"#define VECTOR_MATH(x) {letter}", "#endif", PRELUDE.read_text()]
+    double = writer.elements.dtype == np.float64
+    width = vector // writer.elements.dtype.itemsize
+    head = [f"#define SCALAR {'double' if double else 'float'}", f"#define WIDTH {width}"]
+    if vector in VECTOR_MATH:
+        letter, needed = VECTOR_MATH[vector]
+        name = f"_ZGV{letter}N{width}v_##x{'' if double else '##f'}"
+        head += [f"#if defined({needed}) && defined(__x86_64__) && defined(__gnu_linux__)"]
+        head += [f"#define VECTOR_MATH(x) {name}", "#endif"]
+    head.append(PRELUDE.read_text())
     return CppSource("\n".join([*head, *writer.functions, entry]), writer.tables.data)
 
 
@@ -68,8 +73,8 @@ class _Tables:
 
 
 class _Writer:
-    def __init__(self, plan: Plan) -> None:
-        self.plan, self.elements = plan, plan.program.elements
+    def __init__(self, plan: Plan, vector: int) -> None:
+        self.plan, self.elements, self.bytes = plan, plan.program.elements, vector
         self.tables = _Tables(self.elements.dtype)
         self.functions: list[str] = []
         self.texts: dict[int, str] = {}
@@ -80,7 +85,7 @@ class _Writer:
         """Bytes."""
         slots = self.plan.slot[refs]
         assert np.all(slots >= 0), "a number is not in memory"
-        return slots * BYTES
+        return slots * self.bytes
 
     def function(self, steps: list[Step]) -> str:
         """Calls of functions that take these steps."""
@@ -239,7 +244,8 @@ class _Writer:
         addend = made if step.addend is None else step.addend[np.ix_(rows, columns)]
         left, right = step.left[rows], step.right[columns]
         there = [~self.elements.is_zero(x) for x in (left, right)]
-        tiled = [(_cost(*there, *tile), tile) for tile in TILES]
+        sizes = TILES if self.bytes == 64 else TILES_OF_FEW
+        tiled = [(_cost(*there, *tile), tile) for tile in sizes]
         _, (M, N) = min(tiled)
         tables, tiles = self.tiled(left, M), self.tiled(right, N)
         lists, starts, chosen, places, added = [], {}, [], [], []
@@ -268,7 +274,7 @@ class _Writer:
     def or_trash(self, refs: Refs) -> np.ndarray:
         """Bytes, of −1 where nothing is, and of what is not used."""
         slots = self.plan.slot[refs]
-        return np.where((refs < 0) | (slots < 0), self.trash, slots * BYTES)
+        return np.where((refs < 0) | (slots < 0), self.trash, slots * self.bytes)
 
     def tiled(self, refs: Refs, size: int) -> str:
         """Places of a tile's rows for every k."""
@@ -278,12 +284,12 @@ class _Writer:
     @property
     def trash(self) -> int:
         """The offset of memory that is written but never read."""
-        return self.plan.slots * BYTES
+        return self.plan.slots * self.bytes
 
     @property
     def doubt(self) -> int:
         """NaN in the runs that are not to be computed by this program, else 0."""
-        return self.trash + BYTES
+        return self.trash + self.bytes
 
     def loop(self, step: Loop) -> str:
         """A loop in C++."""
@@ -360,7 +366,7 @@ class _Writer:
         lines.append(
             f"for (long l = 0; l < count; ++l) doubted[first + l] = AT({self.doubt})[l] != 0;"
         )
-        size = (self.plan.slots + 2) * BYTES
+        size = (self.plan.slots + 2) * self.bytes
         return "\n".join([
             f'extern "C" long arena() {{ return {size}; }}',
             'extern "C" void run(char *m, const void *const *in, void *const *out, bool *doubted, '

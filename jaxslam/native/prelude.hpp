@@ -50,7 +50,7 @@ EACH(log1p, std::log1p)
 EACH_TWO(atan2, std::atan2)
 EACH_TWO(pow, std::pow)
 EACH_TWO(fmod, std::fmod)
-#if defined(VECTOR_MATH) && defined(__AVX512F__)
+#ifdef VECTOR_MATH
 extern "C" V VECTOR_MATH(sin)(V);
 extern "C" V VECTOR_MATH(cos)(V);
 extern "C" V VECTOR_MATH(exp)(V);

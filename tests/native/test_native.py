@@ -1,5 +1,6 @@
 """Tests of jaxslam/native: a program in C++ computes what the function says, run by run."""
 
+import platform
 import warnings
 
 import equinox as eqx
@@ -106,15 +107,34 @@ CASES = (
 )  # fmt: skip
 
 
-@pytest.mark.slow
-@needs_compiler
-@pytest.mark.parametrize("function", CASES, ids=lambda f: f.__name__)
-def test_a_function_is_what_vmap_makes_of_it(function):
+def assert_as_vmap_makes_it(function):
     found = batched(function, SHARED, DRAWN)(SHARED, DRAWN, threads=2)
     wanted = quick_jit(jax.vmap(function, (None, 0)))(SHARED, DRAWN)
     for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
         assert x.dtype == y.dtype
         np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.slow
+@needs_compiler
+@pytest.mark.parametrize("function", CASES, ids=lambda f: f.__name__)
+def test_a_function_is_what_vmap_makes_of_it(function):
+    assert_as_vmap_makes_it(function)
+
+
+@needs_compiler
+@pytest.mark.parametrize("length", [16, 32, 64])
+def test_vectors_of_any_length_give_the_same(length, monkeypatch):
+    monkeypatch.setattr(batch, "vector_bytes", lambda: length)
+    assert_as_vmap_makes_it(lambda shared, A: (products(shared, A)[0], jnp.exp(jnp.sin(A))))
+
+
+@needs_compiler
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="another processor")
+def test_vectors_are_no_longer_than_the_processors():
+    features = programs.processor()[-1].split()
+    longest = 64 if "avx512f" in features else 32 if "avx2" in features else 16
+    assert build.vector_bytes() == longest
 
 
 @jax.jit
