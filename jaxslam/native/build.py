@@ -107,13 +107,15 @@ def _compile(command: list[str], source: CppSource, path: Path) -> None:
         raise ValueError(f"the C++ compiler failed: {done.stderr[-2000:]}")
 
 
-@cache
 def vector_bytes() -> int:
     """The bytes of this processor's vectors: a program of longer ones is many times slower, and
     takes minutes to compile. Without a compiler, those of a processor with the longest."""
     command = compiler()
-    if command is None:
-        return 64
+    return 64 if command is None else _vector_bytes(tuple(command))
+
+
+@cache
+def _vector_bytes(command: tuple[str, ...]) -> int:
     asked = [*command, "-march=native", "-dM", "-E", "-x", "c++", os.devnull]
     defined = subprocess.run(asked, capture_output=True, text=True).stdout
     return 64 if "__AVX512F__" in defined else 32 if "__AVX2__" in defined else 16
