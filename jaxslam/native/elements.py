@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import contextmanager
+from itertools import repeat
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -176,9 +177,8 @@ class Elements:
         values = given.astype(self.dtype).astype(float)
         if np.issubdtype(given.dtype, np.integer) and np.any(values != given):
             raise ValueError("integers of so many digits are not supported by the native backend")
-        unique, inverse = np.unique(values.ravel().view(np.int64), return_inverse=True)
-        found = np.array([self._one_constant(int(bits)) for bits in unique], np.int32)
-        return found[inverse].reshape(values.shape) if values.size else np.zeros(values.shape, int)
+        found = [self._one_constant(bits) for bits in values.ravel().view(np.int64).tolist()]
+        return np.array(found, np.int32).reshape(values.shape)
 
     def _one_constant(self, bits: int) -> int:
         if bits not in self._constants:
@@ -243,11 +243,12 @@ class Elements:
         arrays = np.broadcast_arrays(*arguments)
         flat = [x.ravel() for x in arrays]
         result = np.full(flat[0].shape, -1, np.int32)
-        constant = np.logical_and.reduce([self.is_constant(x) for x in flat])
-        if constant.any():
+        constants = [self.is_constant(x) for x in flat]
+        some = name == "select" or any(x.any() for x in constants)
+        if some and (constant := np.logical_and.reduce(constants)).any():
             result[constant] = self._folded(name, [x[constant] for x in flat])
         before = self.size
-        for where, instead in self._shortcuts(name, flat):
+        for where, instead in self._shortcuts(name, flat) if some else ():
             where = where & (result < 0)
             np.copyto(result, instead, where=where)
             self._suspected(name, flat, where & (result == self.zero))
@@ -295,27 +296,24 @@ class Elements:
         keys[:, : len(arguments)] = np.stack(arguments, 1)
         if OPERATIONS[name].commutes:
             keys[:, :2].sort(axis=1)
-        joined = np.ascontiguousarray(keys).view(np.dtype((np.void, 12))).ravel()
-        _, first, inverse = np.unique(joined, return_index=True, return_inverse=True)
-        order = np.argsort(first)
-        keys, code = keys[first[order]], CODES[name]
-        found = np.array([self._lookup((code, *key)) for key in keys.tolist()], np.int32)
-        missing = found < 0
-        new = self._new(int(missing.sum()), code)
-        self._arguments[new] = keys[missing]
+        code, start = CODES[name], self.size
+        here, enclosing = self._known[-1], self._known[-2::-1]
+        found, missing = [], []
+        for place, key in enumerate(zip(repeat(code), *keys.T.tolist())):
+            ref = here.get(key)
+            for known in enclosing if ref is None else ():
+                if (ref := known.get(key)) is not None:
+                    break
+            if ref is None:
+                here[key] = ref = start + len(missing)
+                missing.append(place)
+            found.append(ref)
+        keys, new = keys[missing], self._new(len(missing), code)
+        self._arguments[new] = keys
         if name in TRUTHS:
             self._finite[new] = True
         elif name in BOUNDED:
-            self._finite[new] = self._finite[keys[missing][:, : len(arguments)]].all(1)
+            self._finite[new] = self._finite[keys[:, : len(arguments)]].all(1)
         elif name == "select":
-            self._finite[new] = self._finite[keys[missing][:, 1:]].all(1)
-        found[missing] = new
-        known = self._known[-1]
-        for key, ref in zip(keys[missing].tolist(), new.tolist(), strict=True):
-            known[code, *key] = ref
-        rank = np.empty(len(order), np.int64)
-        rank[order] = np.arange(len(order))
-        return found[rank[inverse]]
-
-    def _lookup(self, key: tuple[Any, ...]) -> int:
-        return next((known[key] for known in reversed(self._known) if key in known), -1)
+            self._finite[new] = self._finite[keys[:, 1:]].all(1)
+        return np.array(found, np.int32)

@@ -61,7 +61,7 @@ def plan(program: ElementProgram) -> Plan:
     inlined, uses = _inlined(program, live, needed)
     form, forms = _forms(program, live, inlined)
     result = Plan(program, live, inlined, form, forms, np.full(live.size, -1, np.int64))
-    result.program = replace(program, steps=_near(fused(result, uses)))
+    result.program = replace(program, steps=_near(fused(result, uses), live.size))
     _Places(result).assign()
     return result
 
@@ -122,31 +122,35 @@ def _through_product(elements, live, step, after) -> None:
             after[refs[same, k]] = of[same]
 
 
-def _near(steps: list[Step]) -> list[Step]:
-    """Checks right after what they check was computed."""
+def _near(steps: list[Step], size: int) -> list[Step]:
+    """Checks right after what they check, among so many elements, was computed."""
     checks = [step for step in steps if isinstance(step, Check)]
-    steps = [_near_within(step) for step in steps if not isinstance(step, Check)]
+    steps = [_near_within(step, size) for step in steps if not isinstance(step, Check)]
     if not checks:
         return steps
     (check,) = checks
     result = []
-    left = check.refs
+    left = np.zeros(size, bool)
+    left[check.refs] = True
     for step in steps:
         result.append(step)
         if isinstance(step, Apply | Product):
-            here = np.intersect1d(left, step.made)
+            made = step.made[step.made >= 0]
+            here = made[left[made]]
             if here.size:
-                result.append(replace(check, refs=here))
-                left = np.setdiff1d(left, here)
-    return [*result, replace(check, refs=left)] if left.size else result
+                result.append(replace(check, refs=np.sort(here)))
+                left[here] = False
+    return [*result, replace(check, refs=np.flatnonzero(left))] if left.any() else result
 
 
-def _near_within(step: Step) -> Step:
+def _near_within(step: Step, size: int) -> Step:
     match step:
         case Loop():
-            return replace(step, steps=_near(step.steps))
+            return replace(step, steps=_near(step.steps, size))
         case While():
-            return replace(step, condition=_near(step.condition), steps=_near(step.steps))
+            return replace(
+                step, condition=_near(step.condition, size), steps=_near(step.steps, size)
+            )
     return step
 
 
@@ -239,9 +243,7 @@ def _forms(program: ElementProgram, live, inlined) -> tuple[np.ndarray, list[tup
         keys = np.concatenate(
             [elements.code[made][:, None], np.where(within, form[arguments] + 1, 0)], axis=1
         )
-        unique, inverse = np.unique(keys, axis=0, return_inverse=True)
-        numbers = [forms.setdefault(tuple(key), len(forms)) for key in unique.tolist()]
-        form[made] = np.array(numbers, np.int64)[inverse.ravel()] if made.size else 0
+        form[made] = [forms.setdefault(tuple(key), len(forms)) for key in keys.tolist()]
 
     each(program.steps, visit)
     return form, list(forms)
