@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -48,6 +49,7 @@ def _main(given: list[str]) -> None:
 
 
 def _run(given: list[str]) -> None:
+    gc.set_threshold(50_000, 20, 100)  # by default a tenth of the time: tracing makes many objects
     with _interruptions():
         try:
             import tqdm  # noqa: F401

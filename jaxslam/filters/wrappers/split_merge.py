@@ -56,11 +56,8 @@ def divided(
         return log(ekf.model.displacement(core, Context(control)))[:n]
 
     cost = _root_of_cost(ekf, state.likeliest, seen)
-
-    def pixels(core):
-        return cost @ displacement(core)
-
-    return _split_and_merged(_parts(pixels, state), rounds)
+    parts = _parts(lambda core: cost @ displacement(core), state)
+    return _split_and_merged(parts, rounds)
 
 
 def _root_of_cost(ekf: EkfSlam, likeliest: State, seen: Features) -> Float[Array, "n n"]:
