@@ -135,7 +135,7 @@ def _records_and_map(room, given, run):
 
 @partial(Program, options=QUICK)
 def _first_runs(slam: AbstractFilter, room: Room, sensor: AbstractSensor, runs: Run) -> Records:
-    return jax.vmap(lambda run: filter_run(slam, room, sensor, run)[0])(runs)
+    return jax.vmap(lambda run: native_programs().one(room, (slam, sensor), run)[0])(runs)
 
 
 BACKENDS: dict[str, Backend] = {"xla": by_xla, "native": by_native}

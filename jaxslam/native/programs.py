@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping
 from functools import partial
 
@@ -11,6 +12,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, PyTree
 
 from jaxslam._numerics.arrays import is_number
+from jaxslam._numerics.tracing import free_gathers
 from jaxslam._runtime.programs import Made
 from jaxslam.native import batch
 
@@ -23,8 +25,9 @@ class NativePrograms:
     """
 
     def __init__(self, function: Callable[[PyTree, PyTree, PyTree], PyTree]) -> None:
-        self._function = function
+        self._function = eqx.filter_jit(function)
         self._made: Made[Callable[..., PyTree]] = Made()
+        self._tracing = threading.Lock()
 
     def __call__(self, fixed: object, given: PyTree, runs: PyTree) -> Callable[[int], PyTree]:
         """Return what computes so many first runs, compiled by the first thread that asks.
@@ -34,6 +37,11 @@ class NativePrograms:
         key, numbers = self._key(fixed, given, runs)
         program = self._made.of(key, partial(self._compiled, key))
         return lambda count: program(numbers, jax.tree.map(lambda x: x[:count], runs))
+
+    def one(self, fixed: object, given: PyTree, run: PyTree) -> PyTree:
+        """The function of one run, for a program of XLA's too: traced once for both."""
+        with self._tracing, free_gathers():
+            return self._function(fixed, given, run)
 
     def is_there(self, fixed: object, given: PyTree, runs: PyTree) -> bool:
         """Whether a program need not be compiled any more."""
@@ -54,7 +62,7 @@ class NativePrograms:
         numbers, runs = jax.tree.unflatten(of_data, shapes)
 
         def one(numbers, run):
-            return self._function(fixed, eqx.combine(numbers, rest), run)
+            return self.one(fixed, eqx.combine(numbers, rest), run)
 
         return batch.batched(one, numbers, runs, key)
 

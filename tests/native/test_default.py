@@ -6,6 +6,8 @@ import sys
 import warnings
 from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -47,8 +49,7 @@ def pretended(monkeypatch):
     monkeypatch.setattr(native, "compiler", lambda: ["c++"])
     monkeypatch.setattr(backends, "by_native", by_native)
     monkeypatch.setitem(backends.BACKENDS, "native", by_native)
-    is_there = SimpleNamespace(is_there=lambda *_: pretended.there)
-    monkeypatch.setattr(backends, "native_programs", lambda: is_there)
+    monkeypatch.setattr(NativePrograms, "is_there", lambda *_: pretended.there)
     return pretended
 
 
@@ -160,6 +161,21 @@ def test_what_was_compiled_is_not_traced_again(tmp_path, monkeypatch):
     library.unlink()
     assert not batch.is_kept(key)
     np.testing.assert_array_equal(batched(scaled, SHARED, RUNS, key)(SHARED, RUNS)["sum"], wanted)
+
+
+@needs_compiler
+def test_a_function_is_traced_once_for_both_backends():
+    traced = []
+
+    def function(fixed, given, run):
+        traced.append(fixed)
+        return scaled(given, run)
+
+    runs, given = jnp.asarray(RUNS), jnp.asarray(SHARED)
+    made = NativePrograms(function)
+    by_xla = jax.vmap(lambda run: made.one("fixed", given, run))(runs)
+    np.testing.assert_array_equal(made("fixed", given, RUNS)(3)["sum"], by_xla["sum"])
+    assert traced == ["fixed"]
 
 
 @needs_compiler
