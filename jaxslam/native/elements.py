@@ -134,7 +134,7 @@ class Elements:
         self._known: list[dict[tuple[Any, ...], Any]] = [{}]
         self._inside = [0]
         self._suspects: list[set[int]] = [set()]
-        self._constants: dict[Any, int] = {}
+        self._constants: dict[int, int] = {}
         self.zero, self.one = (int(self.constant(x)) for x in (0.0, 1.0))
 
     @property
@@ -177,15 +177,12 @@ class Elements:
         values = given.astype(self.dtype).astype(float)
         if np.issubdtype(given.dtype, np.integer) and np.any(values != given):
             raise ValueError("integers of so many digits are not supported by the native backend")
-        found = [self._one_constant(bits) for bits in values.ravel().view(np.int64).tolist()]
-        return np.array(found, np.int32).reshape(values.shape)
-
-    def _one_constant(self, bits: int) -> int:
-        if bits not in self._constants:
-            self._constants[bits] = int(self._new(1, CONSTANT)[0])
-            self._value[self._constants[bits]] = value = np.int64(bits).view(float)
-            self._finite[self._constants[bits]] = np.isfinite(value)
-        return self._constants[bits]
+        bits, places = values.ravel().view(np.int64).tolist(), self._constants
+        for one in sorted(set(bits).difference(places)):
+            places[one] = place = int(self._new(1, CONSTANT)[0])
+            self._value[place] = value = np.int64(one).view(float)
+            self._finite[place] = np.isfinite(value)
+        return np.array([places[one] for one in bits], np.int32).reshape(values.shape)
 
     def variables(self, shape: tuple[int, ...]) -> Refs:
         """Numbers that something else writes."""

@@ -407,7 +407,6 @@ def test_zeros_cost_nothing_and_nothing_is_computed_twice():
 FILTERS = (
     ("robocentric", "inverse_scaling"),
     ("world", "inverse_depth"),
-    ("scale_gauge", "inverse_scaling"),
     ("scale_gauge+mixture3", "inverse_scaling"),
 )
 
