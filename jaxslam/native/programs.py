@@ -25,8 +25,9 @@ class NativePrograms:
     """
 
     def __init__(self, function: Callable[[PyTree, PyTree, PyTree], PyTree]) -> None:
-        self._function = eqx.filter_jit(function)
+        self._function = function
         self._made: Made[Callable[..., PyTree]] = Made()
+        self._traced: Made[Callable[..., PyTree]] = Made()
         self._tracing = threading.Lock()
 
     def __call__(self, fixed: object, given: PyTree, runs: PyTree) -> Callable[[int], PyTree]:
@@ -40,8 +41,14 @@ class NativePrograms:
 
     def one(self, fixed: object, given: PyTree, run: PyTree) -> PyTree:
         """The function of one run, for a program of XLA's too: traced once for both."""
+        numbers, rest = eqx.partition(given, is_number)
+
+        def one(numbers, run):
+            return self._function(fixed, eqx.combine(numbers, rest), run)
+
+        traced = self._traced.of((fixed, *_hashable(rest)), lambda: jax.jit(one))
         with self._tracing, free_gathers():
-            return self._function(fixed, given, run)
+            return traced(numbers, run)
 
     def is_there(self, fixed: object, given: PyTree, runs: PyTree) -> bool:
         """Whether a program need not be compiled any more."""

@@ -7,7 +7,6 @@ import warnings
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -169,13 +168,13 @@ def test_a_function_is_traced_once_for_both_backends():
 
     def function(fixed, given, run):
         traced.append(fixed)
-        return scaled(given, run)
+        return {"sum": scaled(given, run)["sum"] / fixed}
 
-    runs, given = jnp.asarray(RUNS), jnp.asarray(SHARED)
     made = NativePrograms(function)
-    by_xla = jax.vmap(lambda run: made.one("fixed", given, run))(runs)
-    np.testing.assert_array_equal(made("fixed", given, RUNS)(3)["sum"], by_xla["sum"])
-    assert traced == ["fixed"]
+    for fixed in (1.0, 1, True):  # equal, and others
+        by_xla = jax.vmap(lambda run, fixed=fixed: made.one(fixed, SHARED, run))(RUNS)
+        np.testing.assert_array_equal(made(fixed, SHARED, RUNS)(3)["sum"], by_xla["sum"])
+    assert list(map(str, traced)) == ["1.0", "1", "True"]
 
 
 @needs_compiler
