@@ -67,12 +67,16 @@ Records = tuple[Float[np.ndarray, "runs steps"], Float[np.ndarray, "runs n n"]]
 
 
 def scenario_of(work: Workload) -> Scenario:
-    """Away from the landmarks, before a picture without edges: nothing is lost."""
+    """Away from the landmarks, before a picture without edges: nothing is lost.
+
+    A longer run is the same way in more frames: farther off, landmarks are not told from infinity.
+    """
     p = 1 if "6dof" not in work.scenario else 2
+    rate = 30 * max(1.0, work.steps / WORKLOADS[work.name].steps)
     return jaxslam.scenario(
         work.scenario, steps=work.steps, landmarks=work.landmarks, calibration="white",
         velocity=(*(0.0,) * p, -0.6, *(0.0,) * (2 * p - 1)), image=(1e4,) * p, centre=(5e3,) * p,
-        first_pixels=((4.7e3, 5.3e3),) * p,
+        first_pixels=((4.7e3, 5.3e3),) * p, rate=rate,
     )  # fmt: skip
 
 

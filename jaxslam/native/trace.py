@@ -31,6 +31,8 @@ from jaxslam.native.program import (
 
 UNROLLED = 3000
 """Operations up to which all turns of a loop are written out: their indices are then known."""
+TURNS = 64
+"""Of a loop that is written out, at the most: each is a few lines of the program."""
 FEW_TERMS = 3
 FEW_PRODUCTS = 400
 """A product of matrices with fewer is written out number by number."""
@@ -408,11 +410,15 @@ def _cumulative(name):
         (x,), p = arguments, equation.params
         x = np.moveaxis(x, p["axis"], 0)
         x = x[::-1] if p["reverse"] else x
-        sums = list(x[:1])
-        for row in x[1:]:
-            sums.append(tracer.apply(name, sums[-1], row))
-        result = np.array(sums[::-1] if p["reverse"] else sums, np.int32).reshape(x.shape)
-        return np.moveaxis(result, 0, p["axis"])
+
+        def turn(given):
+            return [tracer.apply(name, *given)] * 2
+
+        if len(x) > 1:
+            rest = {"length": len(x) - 1, "reverse": False}
+            _, sums = _repeated(tracer, rest, 1, turn, [], [x[0]], [x[1:]])
+            x = np.concatenate([x[:1], sums])
+        return np.moveaxis(x[::-1] if p["reverse"] else x, 0, p["axis"])
 
     return rule
 
@@ -673,9 +679,13 @@ def _scan(tracer, equation, arguments):
     last = first + carried
     constants, start, xs = arguments[:first], arguments[first:last], arguments[last:]
     body = functools.partial(tracer.closed, p["jaxpr"])
-    if p["length"] * _size(p["jaxpr"].jaxpr) <= UNROLLED:
-        return _unrolled(tracer, p, body, constants, start, xs)
-    return _loop(tracer, p, body, constants, start, xs)
+    return _repeated(tracer, p, _size(p["jaxpr"].jaxpr), body, constants, start, xs)
+
+
+def _repeated(tracer, p, size, body, constants, start, xs):
+    """So many turns, each of so many operations."""
+    written_out = p["length"] <= TURNS and p["length"] * size <= UNROLLED
+    return (_unrolled if written_out else _loop)(tracer, p, body, constants, start, xs)
 
 
 def _unrolled(tracer, p, body, constants, carry, xs):

@@ -22,6 +22,7 @@ from jax import lax
 
 from jaxslam.native import NotSupportedError
 from jaxslam.native.batch import Batch
+from jaxslam.native.trace import TURNS
 
 RUNS = 19
 """Two whole groups of eight and some of a third; one of sixteen and some of a second."""
@@ -154,7 +155,9 @@ class Program:
     def of_running(self):
         x = self.value(self.one_of("ffi"), self.one_of(((3,), (2, 3), (0,), (1, 4))))
         names = (lax.cumsum, lax.cumprod, lax.cummax, lax.cummin)
-        return self.one_of(names)(x, int(self.rng.integers(x.ndim)), bool(self.rng.integers(2)))
+        axis = int(self.rng.integers(x.ndim))
+        x = jnp.concatenate([x] * self.one_of((1, 1, TURNS)), axis)  # long ones are loops
+        return self.one_of(names)(x, axis, bool(self.rng.integers(2)))
 
     def of_order(self):
         shape = self.one_of(((4,), (3, 3), (2, 3), (1,)))

@@ -51,6 +51,7 @@ def numbers(shared, A):
         (jnp.sin(x), jnp.cos(x), jnp.exp(x), jnp.log(jnp.abs(x)), jnp.arctan2(x, x[::-1])),
         (x**3, x**-2, x % 0.3, (x * 9).astype(int) // 2, jnp.clip(x, -0.1, 0.1), jnp.sqrt(x)),
         (jnp.cumsum(x), jnp.argmax(x), jnp.max(x), jnp.all(x > 0), jnp.any(x > 0), jnp.prod(x)),
+        (jnp.cumsum(A.ravel() > 0), jax.lax.cummax(A.ravel(), reverse=True)),
     )
 
 
@@ -402,6 +403,20 @@ def test_zeros_cost_nothing_and_nothing_is_computed_twice():
     one_way, made = elements.apply("add", x, x[::-1])
     assert made.size == 2
     np.testing.assert_array_equal(elements.apply("add", x[::-1], x)[0], one_way)
+
+
+def test_longer_sums_and_loops_are_no_longer_programs(monkeypatch):
+    def lines(rows):
+        x = np.zeros((1, rows))
+        with pytest.raises(ValueError, match="not built") as told:
+            batched(lambda _, x: (jnp.cumsum(x), jax.lax.map(jnp.exp, x)), SHARED, x)
+        return str(told.value)
+
+    def built(source):
+        raise ValueError(f"{source.text.count(chr(10))} lines, not built")
+
+    monkeypatch.setattr(batch, "built", built)
+    assert lines(3000) == lines(100)
 
 
 FILTERS = (
