@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import os
 import shlex
@@ -130,9 +131,5 @@ def _version(command: tuple[str, ...]) -> str:
 def _own_folder() -> Path:
     """Make a temporary folder of this process, for when nothing is to be kept."""
     folder = tempfile.TemporaryDirectory(prefix="jaxslam-native-")
-    _folders.append(folder)
+    atexit.register(folder.cleanup)
     return Path(folder.name)
-
-
-_folders: list[tempfile.TemporaryDirectory[str]] = []
-"""Removed when the process ends."""
