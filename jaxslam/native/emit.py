@@ -129,7 +129,8 @@ class _Writer:
                 return f"take(m, {made}, {table}, {which}, {step.made.size});"
             case Put():
                 which, values = (self.tables(self.offset(x)) for x in (step.which, step.values))
-                put = f"put<{int(step.add)}>(m, {made}, {which}, {values}, {step.values.size});"
+                by = {None: "=", "add": "+", "min": "<", "max": ">"}[step.by]
+                put = f"put<'{by}'>(m, {made}, {which}, {values}, {step.values.size});"
                 return f"{self.copied(step.made, step.table)} {put}"
             case Sort():
                 sizes = ", ".join(map(str, step.made.shape))

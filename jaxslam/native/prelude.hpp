@@ -123,15 +123,19 @@ static void take(char *m, const int *made, const int *table, const int *which, i
   }
 }
 
-// made[which[e]] = or += values[e], by run, unless it is negative.
-template <bool ADD>
+// made[which[e]] = or += values[e], or the less or the greater of both, by run, unless it is negative.
+template <char BY>
 static void put(char *m, const int *made, const int *which, const int *values, int count) {
   for (int e = 0; e < count; ++e) {
     const V at = AT(which[e]), x = AT(values[e]);
     for (int l = 0; l < W; ++l) {
       if (at[l] < 0) continue;
       SCALAR *place = (SCALAR *)(m + made[(long)at[l]]) + l;
-      *place = ADD ? *place + x[l] : x[l];
+      const SCALAR old = *place;
+      if (BY == '=' || BY == '+')
+        *place = BY == '+' ? old + x[l] : x[l];
+      else if (old == old && !(BY == '<' ? old < x[l] : old > x[l]))
+        *place = x[l];
     }
   }
 }

@@ -41,13 +41,15 @@ class Take:
 
 @dataclass(frozen=True)
 class Put:
-    """A copy of `table` with `values[e]` at `which[e]`, or added there; dropped where −1."""
+    """A copy of `table` with `values[e]` at `which[e]`, or what an operation makes of both there;
+    dropped where −1."""
 
     made: Refs
     table: Refs
     which: Refs
     values: Refs
-    add: bool
+    by: str | None
+    """`add`, `min` or `max`."""
 
 
 @dataclass(frozen=True)

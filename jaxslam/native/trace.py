@@ -491,7 +491,7 @@ def _dynamic_update_slice(tracer, equation, arguments):
     starts = [
         _clipped(tracer, s, n - k) for s, n, k in zip(starts, x.shape, new.shape, strict=True)
     ]
-    return _written(tracer, x, _places(tracer, starts, new.shape), new, add=False)
+    return _written(tracer, x, _places(tracer, starts, new.shape), new, None)
 
 
 def _places(tracer, starts, sizes):
@@ -530,30 +530,30 @@ def _taken(tracer, x, places):
     return made
 
 
-def _written(tracer, x, places, values, add, inside=None):
-    """Return x with values at places; those that are not inside are dropped."""
+def _written(tracer, x, places, values, by, inside=None):
+    """Return x with values at places, or by an operation; those that are not inside are dropped."""
     which = _linear(tracer, x.shape, places)
     which = np.broadcast_to(which, values.shape)
     if inside is not None:
         which = tracer.apply("select", inside, tracer.constant(-1.0), which)
     known = tracer.elements.known(which)
     if known is not None:
-        return _moved(tracer, x, known.ravel().astype(int), values.ravel(), add)
+        return _moved(tracer, x, known.ravel().astype(int), values.ravel(), by)
     made = tracer.elements.variables(x.shape)
     given = (y.ravel() for y in (made, x, which, values))
-    tracer.steps.append(Put(*given, add))
+    tracer.steps.append(Put(*given, by))
     return made
 
 
-def _moved(tracer, x, which, values, add):
-    """Write or add values at places that are known."""
+def _moved(tracer, x, which, values, by):
+    """Write values at places that are known, or what an operation makes of both."""
     flat, there = x.ravel().copy(), which >= 0
     which, values = which[there], values[there]
-    if add and len(set(which)) < len(which):
+    if by and len(set(which)) < len(which):
         for place, value in zip(which, values, strict=True):
-            flat[place] = tracer.apply("add", flat[place], value)
+            flat[place] = tracer.apply(by, flat[place], value)
     else:
-        flat[which] = tracer.apply("add", flat[which], values) if add else values
+        flat[which] = tracer.apply(by, flat[which], values) if by else values
     return flat.reshape(x.shape)
 
 
@@ -611,7 +611,7 @@ def _window_places(tracer, shape, indices, here, sizes, starts, batching, window
     return places, inside
 
 
-def _scatter(add):
+def _scatter(by):
     def rule(tracer, equation, arguments):
         (x, indices, values), p = arguments, equation.params
         numbers = p["dimension_numbers"]
@@ -629,11 +629,11 @@ def _scatter(add):
             dict(batching), {axis: at[k] for axis, k in window.items()}, values.shape,
             "CLIP" not in str(p["mode"]),
         )  # fmt: skip
-        if add and equation.outvars[0].aval.dtype.kind != "f":
+        if by == "add" and equation.outvars[0].aval.dtype.kind != "f":
             most = tracer.exact // (values.size + 1)
             for refs in (x, values):
                 tracer.within(refs, -most, most)
-        return _written(tracer, x, places, values, add, inside)
+        return _written(tracer, x, places, values, by, inside)
 
     return rule
 
@@ -804,8 +804,10 @@ RULES: dict[str, Callable[..., Any]] = {
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,
     "gather": _gather,
-    "scatter": _scatter(add=False),
-    "scatter-add": _scatter(add=True),
+    "scatter": _scatter(None),
+    "scatter-add": _scatter("add"),
+    "scatter-min": _scatter("min"),
+    "scatter-max": _scatter("max"),
     "cond": _cond,
     "platform_index": _platform_index,
     "scan": _scan,

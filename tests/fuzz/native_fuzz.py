@@ -193,12 +193,13 @@ class Program:
         x, at = self.value(kind, self.one_of(((4,), (3, 2)))), self.value("i", (5,))
         values = self.value(kind, (5, *x.shape[1:])).astype(x.dtype)
         mode = self.one_of(("drop", "clip"))
-        return x.at[at].add(values, mode=mode), x.at[at].set(values, mode=mode)
+        best = x.at[at].min(values, mode=mode), x.at[at].max(values, mode=mode)
+        return x.at[at].add(values, mode=mode), x.at[at].set(values, mode=mode), *best
 
     def of_constant_places(self):
         x, at = self.value(shape=(4,)), self.rng.integers(0, 4, 5)
         values = self.value(shape=(5,))
-        return x.at[at].add(values), x.at[at[:1]].set(values[:1]), x[at]
+        return x.at[at].add(values), x.at[at].min(values), x.at[at[:1]].set(values[:1]), x[at]
 
     def of_loop(self):
         length = int(self.one_of((0, 1, 3, 700)))

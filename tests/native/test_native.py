@@ -198,11 +198,12 @@ def special_numbers(shared, x):
 
 
 def places_that_are_equal(shared, x):
-    """Numbers that are put to one place are all added there, or the last one stays."""
+    """Of numbers that are put to one place the last one, their sum, the least or the greatest."""
     at = jnp.clip(jnp.nan_to_num(x), -1, 1).astype(int) + 1
     known = jnp.ones(3).at[jnp.array([1, 1, 0])].add(x[3:])
     added = jnp.zeros(4).at[at].add(jnp.arange(6) + 0.5)
-    return known, added, jnp.ones(4).at[at].set(jnp.arange(6.0))
+    best = jnp.zeros(4).at[at].min(x), jnp.zeros(4).at[at].max(x)
+    return known, added, jnp.ones(4).at[at].set(jnp.arange(6.0)), *best
 
 
 def order_of_equals(shared, x):
