@@ -154,10 +154,10 @@ class Program:
 
     def of_running(self):
         x = self.value(self.one_of("ffi"), self.one_of(((3,), (2, 3), (0,), (1, 4))))
-        names = (lax.cumsum, lax.cumprod, lax.cummax, lax.cummin)
-        axis = int(self.rng.integers(x.ndim))
-        x = jnp.concatenate([x] * self.one_of((1, 1, TURNS)), axis)  # long ones are loops
-        return self.one_of(names)(x, axis, bool(self.rng.integers(2)))
+        axis, reverse = int(self.rng.integers(x.ndim)), bool(self.rng.integers(2))
+        names = (lax.cumprod, lax.cumsum, lax.cummax, lax.cummin)
+        long = jnp.concatenate([x] * TURNS, axis)  # a loop
+        return self.one_of(names)(x, axis, reverse), self.one_of(names[1:])(long, axis, reverse)
 
     def of_order(self):
         shape = self.one_of(((4,), (3, 3), (2, 3), (1,)))
