@@ -20,6 +20,8 @@ TILES = ((4, 6), (6, 4), (4, 4), (3, 8), (8, 3), (2, 10), (10, 2), (1, 14), (14,
 """Sums that a product keeps in registers, of which there are 32 with vectors of 64 bytes …"""
 TILES_OF_FEW = ((3, 4), (4, 3), (3, 3), (2, 6), (6, 2), (1, 10), (10, 1))
 """… and 16 with shorter ones."""
+PUTS = {None: "'='", "add": "'+'", "min": "'<'", "max": "'>'"}
+"""What `put` in the prelude makes of two numbers at one place."""
 VECTOR_MATH = {64: ("e", "__AVX512F__"), 32: ("d", "__AVX2__")}
 """The letter by which glibc calls its functions of vectors of so many bytes, and what they need."""
 
@@ -129,8 +131,7 @@ class _Writer:
                 return f"take(m, {made}, {table}, {which}, {step.made.size});"
             case Put():
                 which, values = (self.tables(self.offset(x)) for x in (step.which, step.values))
-                by = {None: "=", "add": "+", "min": "<", "max": ">"}[step.by]
-                put = f"put<'{by}'>(m, {made}, {which}, {values}, {step.values.size});"
+                put = f"put<{PUTS[step.by]}>(m, {made}, {which}, {values}, {step.values.size});"
                 return f"{self.copied(step.made, step.table)} {put}"
             case Sort():
                 sizes = ", ".join(map(str, step.made.shape))
