@@ -72,7 +72,8 @@ def scenario_of(work: Workload) -> Scenario:
     A longer run is the same way in more frames: farther off, landmarks are not told from infinity.
     """
     p = 1 if "6dof" not in work.scenario else 2
-    rate = 30 * max(1.0, work.steps / WORKLOADS[work.name].steps)
+    finer = max(1.0, work.steps / WORKLOADS[work.name].steps)
+    rate = finer * jaxslam.scenario(work.scenario).rate
     return jaxslam.scenario(
         work.scenario, steps=work.steps, landmarks=work.landmarks, calibration="white",
         velocity=(*(0.0,) * p, -0.6, *(0.0,) * (2 * p - 1)), image=(1e4,) * p, centre=(5e3,) * p,
