@@ -31,7 +31,7 @@ from jaxslam.models.camera import Camera
 from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import AbstractMotion, ConstantVelocity, Odometry
-from jaxslam.models.observations import Capacity, Features, Innovation, Status
+from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap, Status
 from jaxslam.models.scale import Metre, ScaleGauge
 from jaxslam.models.sensors import AbstractSensor, Pinhole, Position, RangeBearing
 from jaxslam.simulation import Scenario, scenario, simulate
@@ -75,6 +75,7 @@ __all__ = [
     "Parametrization",
     "Pinhole",
     "Position",
+    "PriorMap",
     "RangeBearing",
     "ScaleGauge",
     "Scenario",

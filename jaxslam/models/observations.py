@@ -57,6 +57,18 @@ class Features(eqx.Module):
         return jnp.where(self.valid, self.slots, count)
 
 
+class PriorMap(eqx.Module):
+    """Landmarks that are known before frame 0: surveyed beacons, or a map of yesterday.
+
+    `X ~ N(points, covariance)` in the base frame B, metres, in the slots that hold them.
+    """
+
+    slots: Int[AnyArray, " m"]
+    points: Float[AnyArray, "m n"]
+    covariance: Float[AnyArray, "m*n m*n"]
+    """Joint, as a map of yesterday has it; of points that are independent block-diagonal."""
+
+
 class Status(IntEnum):
     """The outcome of an update, the worse the greater."""
 
