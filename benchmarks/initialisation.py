@@ -24,7 +24,7 @@ from benchmark import RESULTS, Benchmark, number, table
 import jaxslam
 from jaxslam._numerics.linalg import cholesky
 from jaxslam.consistency.montecarlo import draw
-from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.slam import Slam
 from jaxslam.filters.readouts import camera_pose, landmarks_in_camera
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation import Room, Run, features, sensor_of
@@ -87,7 +87,7 @@ def measured(world: str, options: Initialisation) -> Iterator[tuple[str, dict]]:
     for pair in options.filters:
         name, landmark = pair.split("/")
         slam = jaxslam.make_filters(scenario, [name], [landmark])[pair]
-        assert isinstance(slam, EkfSlam)
+        assert isinstance(slam, Slam)
         run = jax.jit(jax.vmap(partial(filter_run, slam, room, sensor)))
         records = _concatenated(run(part) for part in _parts(runs, options.chunk))
         if reference is None:
@@ -95,7 +95,7 @@ def measured(world: str, options: Initialisation) -> Iterator[tuple[str, dict]]:
         yield pair, summarise(records, reference)
 
 
-def filter_run(slam: EkfSlam, room: Room, sensor: AbstractSensor, run: Run) -> dict:
+def filter_run(slam: Slam, room: Room, sensor: AbstractSensor, run: Run) -> dict:
     """One filter on one run: records of every step, and its landmarks at the last."""
     first, seen, new = features(run, room)
     state = slam.init(room.capacity, first)

@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxslam.consistency import SimulatedFrame, run_through
-from jaxslam.filters.forms.state import State
+from jaxslam.filters.linear.state import State
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import landmarks_from_above
 from jaxslam.filters.window.minimise import Minimum
 from jaxslam.filters.window.problem import path, residuals
-from jaxslam.filters.wrappers.batch_initialisation import BatchInitialisation, RestState
+from jaxslam.filters.window.start import BatchInitialisation, RestState
 from jaxslam.simulation import Room, Run
 from jaxslam.statistics.bands import normalised_squared
 

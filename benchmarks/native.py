@@ -25,7 +25,7 @@ import jaxslam
 from jaxslam._numerics.arrays import cast
 from jaxslam._runtime import programs
 from jaxslam.consistency import backends, draw
-from jaxslam.filters.registry import FILTERS
+from jaxslam.filters.words import FILTERS
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.native import difference
 from jaxslam.native.batch import Batch

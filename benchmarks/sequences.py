@@ -26,7 +26,7 @@ from typing import Annotated, Any
 import tyro
 from benchmark import RESULTS, Benchmark, data_folder, number, table, write_table
 
-from jaxslam.filters.registry import ON_VIDEO
+from jaxslam.filters.words import ON_VIDEO
 from jaxslam.tracking.settings import TrackerSettings
 
 FRAMES = (30, 149)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array, diags_array, vstack
 from scipy.sparse.linalg import splu
 
-from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.slam import Slam
 from jaxslam.geometry import Pose, log, retract
 from jaxslam.models.motion import Odometry
 from jaxslam.simulation import Run
@@ -20,7 +20,7 @@ SIZE = 8192
 """Residuals of one kind are padded to a multiple of this."""
 
 
-def batch_positions(slam: EkfSlam, run: Run, dt: float) -> np.ndarray:
+def batch_positions(slam: Slam, run: Run, dt: float) -> np.ndarray:
     """The positions of the camera in all frames, at the maximum of the posterior."""
     unknown = jax.tree.map(lambda x: x[1:], run.poses), _points(run), 0.0
     best, damping = np.inf, 1e-6
@@ -58,7 +58,7 @@ def _moved(poses, points, common: float, step) -> tuple[Pose, np.ndarray, float]
     return moved, points + of_points.reshape(points.shape), common + step[-1]
 
 
-def _system(slam: EkfSlam, run: Run, dt: float, poses: Pose, points, common: float):
+def _system(slam: Slam, run: Run, dt: float, poses: Pose, points, common: float):
     """The Jacobian of all whitened residuals, sparse, and the residuals.
 
     The unknowns are the poses, the points, and what the priors on 1/z have in common, in σ of one.

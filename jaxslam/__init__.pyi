@@ -4,8 +4,10 @@ from jaxslam._numerics.arrays import cast
 from jaxslam._version import __version__
 from jaxslam.consistency import monte_carlo, summarise, table
 from jaxslam.evaluation import Convention, Evaluation, evaluate, evaluate_log, evaluate_poses
-from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.forms.state import State
+from jaxslam.filters.gate import Gate
+from jaxslam.filters.linear.kalman import AbstractCorrection, Kalman
+from jaxslam.filters.linear.state import State
+from jaxslam.filters.mixture.mixture import Mixture
 from jaxslam.filters.protocol import (
     AbstractFilter,
     AbstractStaged,
@@ -20,19 +22,37 @@ from jaxslam.filters.readouts import (
     landmarks_in_camera,
     landmarks_in_world,
 )
-from jaxslam.filters.registry import FILTERS, make_filter, make_filters
+from jaxslam.filters.recommended import paper, recommended
+from jaxslam.filters.remedies.first_estimates import FirstEstimates
+from jaxslam.filters.remedies.invariant import Invariant
+from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
+from jaxslam.filters.remedies.random_walk import RandomWalk
 from jaxslam.filters.run import Frames, run
-from jaxslam.filters.wrappers.fixed_lag import FixedLag
-from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
+from jaxslam.filters.slam import Slam
+from jaxslam.filters.window.start import FromWindow, Schedule
+from jaxslam.filters.words import FILTERS, make_filter, make_filters
 from jaxslam.geometry import PLANAR, SPATIAL
-from jaxslam.landmarks import LANDMARKS, Parametrization, check_landmark
+from jaxslam.landmarks import (
+    LANDMARKS,
+    AbstractLandmark,
+    AnchoredHomogeneous,
+    Cartesian,
+    FramedHomogeneous,
+    ImagePlane,
+    InverseDepthToCartesian,
+    InverseScaling,
+    ParallaxAngle,
+    UnifiedInverseDepth,
+    UnitHomogeneous,
+    check_landmark,
+)
 from jaxslam.models.calibration import AbstractCalibration, Considered, Estimated, Known, White
 from jaxslam.models.camera import Camera
-from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
 from jaxslam.models.depth import InverseDepth
+from jaxslam.models.frame import AbstractFrame, Keyframe, Robocentric, Submaps, WorldCentric
 from jaxslam.models.motion import AbstractMotion, ConstantVelocity, Odometry
 from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap, Status
-from jaxslam.models.scale import Metre, ScaleGauge
+from jaxslam.models.scale import AbstractScale, Metre, ScaleGauge
 from jaxslam.models.sensors import AbstractSensor, Pinhole, Position, RangeBearing
 from jaxslam.simulation import Scenario, scenario, simulate
 from jaxslam.statistics import mean_band
@@ -41,47 +61,67 @@ from jaxslam.tracking.tracker import Tracker as Tracker
 
 __all__ = [
     "FILTERS",
-    "KEYFRAME",
     "LANDMARKS",
     "PLANAR",
-    "ROBOCENTRIC",
     "SPATIAL",
-    "WORLD",
     "AbstractCalibration",
+    "AbstractCorrection",
     "AbstractFilter",
+    "AbstractFrame",
+    "AbstractLandmark",
     "AbstractMotion",
+    "AbstractScale",
     "AbstractSensor",
     "AbstractStaged",
+    "AnchoredHomogeneous",
     "Camera",
     "CameraView",
     "Capacity",
+    "Cartesian",
     "Considered",
     "ConstantVelocity",
     "Convention",
-    "EkfSlam",
     "Estimated",
     "Evaluation",
     "Expected",
     "Features",
-    "FixedLag",
+    "FirstEstimates",
+    "FramedHomogeneous",
     "Frames",
-    "GaussianSum",
+    "FromWindow",
+    "Gate",
+    "ImagePlane",
     "Innovation",
+    "Invariant",
     "InverseDepth",
+    "InverseDepthToCartesian",
+    "InverseScaling",
+    "Kalman",
+    "Keyframe",
     "Known",
     "LandmarkView",
     "Metre",
+    "Mixture",
+    "ObservabilityConstrained",
     "Odometry",
-    "Parametrization",
+    "ParallaxAngle",
     "Pinhole",
     "Position",
     "PriorMap",
+    "RandomWalk",
     "RangeBearing",
+    "Robocentric",
     "ScaleGauge",
     "Scenario",
+    "Schedule",
+    "Slam",
     "State",
     "Status",
+    "Submaps",
+    "UnifiedInverseDepth",
+    "UnitHomogeneous",
     "White",
+    "WorldCentric",
     "__version__",
     "camera_pose",
     "cast",
@@ -97,6 +137,8 @@ __all__ = [
     "make_filters",
     "mean_band",
     "monte_carlo",
+    "paper",
+    "recommended",
     "run",
     "scenario",
     "simulate",

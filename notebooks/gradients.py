@@ -48,7 +48,7 @@ paper = jaxslam.cast(paper, jnp.float64)
 
 def filter_of(log_factors):
     acceleration, pixel = jnp.exp(log_factors)
-    return jaxslam.EkfSlam(
+    return jaxslam.Slam(
         motion=jaxslam.ConstantVelocity(
             paper.motion.noise_sigma * acceleration,
             paper.motion.velocity,

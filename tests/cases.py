@@ -13,14 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.slam import Slam
 from jaxslam.filters.protocol import AbstractStaged
 from jaxslam.filters.readouts import camera_pose
-from jaxslam.filters.registry import make_filter, scenario_pieces
+from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.geometry import GEOMETRIES
-from jaxslam.landmarks import INVERSE_SCALING, LANDMARKS
+from jaxslam.landmarks import InverseScaling, LANDMARKS
 from jaxslam.models.camera import Camera
-from jaxslam.models.coordinates import ROBOCENTRIC
+from jaxslam.models.frame import Robocentric
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Capacity
 from jaxslam.models.sensors import Pinhole
@@ -91,15 +91,15 @@ def close(actual, desired, relative):
     np.testing.assert_allclose(actual, desired, rtol=0, atol=relative * np.abs(desired).max())
 
 
-def a_filter(geometry, landmark=INVERSE_SCALING, coordinates=ROBOCENTRIC, **pieces):
+def a_filter(geometry, landmark=InverseScaling(), frame=Robocentric(), **pieces):
     """A filter for what its numbers do not matter to: no noise, and a unit camera, so that its
-    Jacobians are of the same size as the rest. `pieces` replaces what `EkfSlam` takes."""
+    Jacobians are of the same size as the rest. `pieces` replaces what `Slam` takes."""
     t, p = geometry.tangent_dim, geometry.pixel_dim
     unit: dict[str, Any] = {
         "motion": ConstantVelocity(*np.zeros((3, t))),
         "sensor": Pinhole(Camera(np.ones(p), np.zeros(p)), 0.0),
     }
-    return EkfSlam(landmark=landmark, coordinates=coordinates, **{**unit, **pieces})
+    return Slam(landmark=landmark, frame=coordinates, **{**unit, **pieces})
 
 
 def run_filter(capacity, slam, controls, first, known, new):
@@ -136,7 +136,7 @@ class Case:
         return jax.tree.map(lambda x: x[i], self.runs)
 
     def pieces(self, calibration=None):
-        """Motion, sensor, calibration and depth prior of the scenario, as `EkfSlam` takes them."""
+        """Motion, sensor, calibration and depth prior of the scenario, as `Slam` takes them."""
         return scenario_pieces(self.scenario, calibration)
 
     def controls(self, i=0):
@@ -203,7 +203,7 @@ def keys_used(monkeypatch, function):
 class Around(AbstractStaged):
     """A filter that the package does not know, with a state of its own: it asks another."""
 
-    estimator: EkfSlam
+    estimator: Slam
 
     def init(self, capacity, first=None):
         return {"inside": self.estimator.init(capacity, first), "frame": jnp.zeros((), int)}

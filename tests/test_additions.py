@@ -19,8 +19,8 @@ from additions import (
 from cases import quick_jit
 
 import jaxslam
-from jaxslam.filters.forms.covariance import Covariance
-from jaxslam.filters.registry import scenario_pieces
+from jaxslam.filters.linear.covariance import Covariance
+from jaxslam.filters.words import scenario_pieces
 from jaxslam.statistics import not_disproved
 
 
@@ -33,7 +33,7 @@ def verdict(scenario, slam, runs=40, **models):
 
 
 def paper(scenario, **pieces):
-    return jaxslam.EkfSlam(**{**scenario_pieces(scenario), **pieces})
+    return jaxslam.Slam(**{**scenario_pieces(scenario), **pieces})
 
 
 @pytest.mark.parametrize(
@@ -114,7 +114,7 @@ def test_a_treatment_of_ones_own_is_studied():
 @pytest.mark.slow
 def test_a_remedy_of_ones_own_resists_outliers():
     scenario = jaxslam.scenario("matched-tight", steps=8)
-    plain, robust = paper(scenario), paper(scenario, form=Covariance(Huber()))
+    plain, robust = paper(scenario), paper(scenario, correction=Huber())
     assert not_disproved(verdict(scenario, robust))
     new = jaxslam.Features(
         jnp.array([0, 1]), jnp.array([[300.0], [350.0]]), jnp.array([True, True])

@@ -21,7 +21,7 @@ PLANAR = jaxslam.ConstantVelocity([0.1] * 3, [1.2, 0.0, 0.0], [0.1] * 3)
 
 def a_filter(**pieces):
     own: dict[str, Any] = {"motion": PLANAR, "sensor": jaxslam.Pinhole(CAMERA, 0.3), **pieces}
-    return jaxslam.EkfSlam(**own)
+    return jaxslam.Slam(**own)
 
 
 def features(m, p=1):
@@ -106,7 +106,7 @@ def test_the_precision_is_that_of_the_filters_numbers():
 def test_single_precision_by_oversight_warns_once_and_by_choice_never():
     program = (
         "import warnings, jaxslam\n"
-        "slam = jaxslam.EkfSlam(motion=jaxslam.Odometry([.1] * 3),"
+        "slam = jaxslam.Slam(motion=jaxslam.Odometry([.1] * 3),"
         " sensor=jaxslam.Position(0.1))\n"
         "with warnings.catch_warnings(record=True) as seen:\n"
         "    for _ in range(3): slam.init(2)\n"
@@ -134,7 +134,7 @@ def test_a_guessed_name_is_told_the_right_one(name, meant):
 def test_one_filter_takes_its_landmark_by_name():
     pieces: dict[str, Any] = {"motion": PLANAR, "sensor": jaxslam.Pinhole(CAMERA, 0.3)}
     made = jaxslam.make_filter("robocentric", landmark="inverse_depth", **pieces)
-    assert isinstance(made, jaxslam.EkfSlam)
+    assert isinstance(made, jaxslam.Slam)
     assert made.landmark is jaxslam.LANDMARKS["inverse_depth"]
     with pytest.raises(ValueError, match=r"inverse_scale.* \(did you mean inverse_scaling\?\)"):
         jaxslam.make_filter("robocentric", landmark="inverse_scale", **pieces)

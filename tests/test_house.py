@@ -12,7 +12,7 @@ import equinox as eqx
 import pytest
 
 import jaxslam
-from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.slam import Slam
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
 from jaxslam.filters.wrappers.wrapper import AbstractWrapper
 
@@ -177,8 +177,8 @@ def test_a_filter_is_four_functions_and_one_that_tracks_six_more():
         "init", "marginal", "landmark_marginal", "predict", "predict_features", "update", "compose",
         "close", "remove",
     }  # fmt: skip
-    methods = {n for n in public(EkfSlam) if callable(getattr(EkfSlam, n, None))}
-    assert len(methods - set(EkfSlam.__dataclass_fields__)) <= 15
+    methods = {n for n in public(Slam) if callable(getattr(Slam, n, None))}
+    assert len(methods - set(Slam.__dataclass_fields__)) <= 15
 
 
 def modules(cls=eqx.Module):

@@ -18,11 +18,11 @@ from jaxtyping import Array, Float, Int
 
 from exact_posterior.moments import covariance, mean_pose, pose_moments
 from jaxslam._numerics.linalg import cholesky
-from jaxslam.filters.initialisation.alternatives import log_density
+from jaxslam.filters.mixture.density import log_density
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import camera_pose
-from jaxslam.filters.wrappers.batch_initialisation import BatchInitialisation
-from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
+from jaxslam.filters.window.start import BatchInitialisation
+from jaxslam.filters.mixture.mixture import GaussianSum
 from jaxslam.geometry import Pose, difference
 
 NEIGHBOUR = 8

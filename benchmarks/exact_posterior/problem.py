@@ -26,7 +26,7 @@ from jax.scipy.special import log_ndtr, ndtri
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import cast
-from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.slam import Slam
 from jaxslam.filters.window import problem as window
 from jaxslam.filters.window.problem import Path, PathLayout
 from jaxslam.filters.window.record import Record, whole
@@ -37,7 +37,7 @@ from jaxslam.simulation import Run, Scenario, depth_of, motion_of, sensor_of
 class Problem(eqx.Module):
     """What is known of one run: the prior and the measurements. Batched by `vmap`."""
 
-    slam: EkfSlam
+    slam: Slam
     """A filter that is told the scenario's motion, sensor and prior on 1/z; only these count."""
     record: Record
     """What was measured in all frames."""
@@ -115,7 +115,7 @@ def make_problem(scenario: Scenario, run: Run, *, truncated: bool = True) -> Pro
     another kind.
     """
     check_scenario(scenario)
-    slam = EkfSlam(motion=motion_of(scenario), sensor=sensor_of(scenario), depth=depth_of(scenario))
+    slam = Slam(motion=motion_of(scenario), sensor=sensor_of(scenario), depth=depth_of(scenario))
     record = whole(run.controls, run.measured, run.visible, jnp.zeros(run.visible.shape[1], int))
     least = jnp.asarray(scenario.least_inverse_depth if truncated else -jnp.inf)
     return Problem(cast(slam, run.measured.dtype), record, least)

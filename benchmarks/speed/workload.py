@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 
 import jaxslam
 from jaxslam._numerics.arrays import cast, is_number
-from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.forms.state import State
+from jaxslam.filters.slam import Slam
+from jaxslam.filters.linear.state import State
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.geometry import Pose
 from jaxslam.models.observations import Features
@@ -53,7 +53,7 @@ WORKLOADS = {
 class Inputs(NamedTuple):
     """The same for everybody: a batch of states after frame 0, and what follows."""
 
-    slam: EkfSlam
+    slam: Slam
     seconds: Float[np.ndarray, ""]
     """Of a step."""
     start: State
@@ -90,7 +90,7 @@ def prepared(work: Workload) -> Inputs:
     """Simulated runs, the first ones whose landmarks are all seen in every frame."""
     scenario = scenario_of(work)
     (slam,) = filters_of(scenario).values()
-    assert isinstance(slam, EkfSlam)
+    assert isinstance(slam, Slam)
     room = Room(work.landmarks, work.landmarks, work.landmarks, 1)
 
     def one(index):
@@ -107,7 +107,7 @@ def prepared(work: Workload) -> Inputs:
     return Inputs(slam, np.asarray(1 / scenario.rate), start, pixels, poses)
 
 
-def kept(slam: EkfSlam, start: State) -> np.ndarray:
+def kept(slam: Slam, start: State) -> np.ndarray:
     """Where pose, velocity and landmarks are in the state's error."""
     core = jax.tree.map(lambda x: x[0], start.core)
     c = core.part("calibration").stop
@@ -116,7 +116,7 @@ def kept(slam: EkfSlam, start: State) -> np.ndarray:
 
 
 def filtered_run(
-    slam: EkfSlam, seconds: Array, start: State, pixels: Array, poses: Pose
+    slam: Slam, seconds: Array, start: State, pixels: Array, poses: Pose
 ) -> tuple[Array, Array]:
     """NEES of every step, and the last covariance, of one run."""
     m = pixels.shape[1]
@@ -136,7 +136,7 @@ def filtered_run(
 
 @partial(eqx.filter_jit, donate="none")
 def filtered(
-    slam: EkfSlam, seconds: Array, start: State, pixels: Array, poses: Pose
+    slam: Slam, seconds: Array, start: State, pixels: Array, poses: Pose
 ) -> tuple[Array, Array]:
     """The same of a batch of runs."""
     return jax.vmap(partial(filtered_run, slam, seconds))(start, pixels, poses)

@@ -15,7 +15,7 @@ from jaxslam._runtime.progress import StudyBar
 from jaxslam.consistency import CHUNK, FolderStore, Study, monte_carlo, summarise, table
 from jaxslam.consistency.backends import AUTO, check_backend
 from jaxslam.consistency.montecarlo import check_sizes, divided
-from jaxslam.filters.registry import FILTERS, FROM_REST, MODIFIERS, RECOMMENDED, make_filters
+from jaxslam.filters.words import FILTERS, MODIFIERS, make_filters
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.simulation.scenario import BUILT_IN, Scenario, parse_override, scenario
 
@@ -41,10 +41,8 @@ class ConsistencyOptions:
         tuple[str, ...],
         tyro.conf.arg(
             metavar="NAME …",
-            help=f"Filters: {', '.join(FILTERS)}, or recommended (here "
-            f"{' or '.join(RECOMMENDED.values())}; from rest "
-            f"{' or '.join(FROM_REST.values())}); each may be modified, as in scale_gauge+lag10: "
-            f"{', '.join(MODIFIERS)}, with a number.",
+            help=f"Filters: {', '.join(FILTERS)}; each may be modified, as in scale_gauge+mixture9, "
+            f"in any order: {', '.join(MODIFIERS)}, with a number.",
         ),
     ] = ("robocentric",)
     calibration: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None

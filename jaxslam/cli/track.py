@@ -10,7 +10,7 @@ import tyro
 
 from jaxslam.cli.extra import one_line_warnings, require_vision
 from jaxslam.filters.association import ASSOCIATIONS
-from jaxslam.filters.registry import FILTERS
+from jaxslam.filters.words import FILTERS
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.tracking.settings import METRIC, TrackerSettings
 

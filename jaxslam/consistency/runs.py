@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.protocol import AbstractFilter, Belief
 from jaxslam.filters.readouts import (
     camera_pose,
@@ -23,7 +22,6 @@ from jaxslam.filters.run import run as run_filter
 from jaxslam.geometry import Pose, difference
 from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features, Innovation
-from jaxslam.models.scale import Metre
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation import Room, Run, features, gone
 from jaxslam.statistics.bands import normalised_squared
@@ -110,8 +108,7 @@ def scale_records(
     For a truth that is itself known with σ only see `beyond_scale`.
     """
     metric = in_unit = beyond_scale(partial(slam.pose_error, state), T_BC, truth_sigma)
-    inner = slam.unwrapped
-    if isinstance(inner, EkfSlam) and not isinstance(inner.scale, Metre):
+    if slam.model is not None and slam.model.scale.free:
         seen = camera_pose_in_unit(slam, state)
         in_unit = beyond_scale(
             lambda truth: (difference(truth, seen.pose), seen.covariance), T_BC, truth_sigma

@@ -21,7 +21,6 @@ from jaxslam.consistency.sums import (
     survived,
     tally_of,
 )
-from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.models.observations import Status
 from jaxslam.simulation import Scenario
@@ -252,8 +251,7 @@ def _ratio(sums: np.ndarray, counts: np.ndarray | int) -> np.ndarray:
 
 def treatment(slam: AbstractFilter) -> str | None:
     """The treatment of the sensor's calibration by a filter, where it says so."""
-    inner = slam.unwrapped
-    return inner.calibration.name if isinstance(inner, EkfSlam) else None
+    return None if slam.model is None else slam.model.calibration.name
 
 
 def tally(study: Study, name: str, record: str = "nees") -> Tally:

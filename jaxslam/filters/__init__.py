@@ -1,49 +1,49 @@
-"""Filters, and what they are made of: forms, corrections, wrappers; for filters of one's own."""
+"""Filters, and what they are made of: the record and its pieces; for filters of one's own."""
 
-from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.forms.correction import AbstractCorrection, Standard, kalman_update
-from jaxslam.filters.forms.covariance import Covariance
-from jaxslam.filters.forms.first_estimates import FirstEstimates
-from jaxslam.filters.forms.invariant import Invariant
-from jaxslam.filters.forms.observability_constrained import ObservabilityConstrained
+from jaxslam.filters.gate import Gate
+from jaxslam.filters.linear.kalman import AbstractCorrection, Kalman, kalman_update
+from jaxslam.filters.mixture.mixture import Mixture
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
-from jaxslam.filters.registry import MODIFIERS, RECOMMENDED, scenario_pieces
+from jaxslam.filters.recommended import paper, recommended
+from jaxslam.filters.remedies.first_estimates import FirstEstimates
+from jaxslam.filters.remedies.invariant import Invariant
+from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
+from jaxslam.filters.remedies.random_walk import RandomWalk
+from jaxslam.filters.slam import Slam, compatible
 from jaxslam.filters.submaps.chain import Chain, base_poses, chain
 from jaxslam.filters.submaps.closing import Loops, Posterior, agreeing, close, posterior
-from jaxslam.filters.submaps.handover import Submaps, with_submaps
-from jaxslam.filters.wrappers.batch_initialisation import BatchInitialisation
-from jaxslam.filters.wrappers.fixed_lag import FixedLag
-from jaxslam.filters.wrappers.gated import Gated
-from jaxslam.filters.wrappers.gaussian_sum import GaussianSum
-from jaxslam.filters.wrappers.wrapper import AbstractWrapper
+from jaxslam.filters.window.start import FromWindow, Schedule
+from jaxslam.filters.words import FILTERS, MODIFIERS, make_filter, make_filters, scenario_pieces
 
 __all__ = [
+    "FILTERS",
     "MODIFIERS",
-    "RECOMMENDED",
     "AbstractCorrection",
     "AbstractFilter",
     "AbstractStaged",
-    "AbstractWrapper",
-    "BatchInitialisation",
     "Chain",
-    "Covariance",
-    "EkfSlam",
     "FirstEstimates",
-    "FixedLag",
-    "Gated",
-    "GaussianSum",
+    "FromWindow",
+    "Gate",
     "Invariant",
+    "Kalman",
     "Loops",
+    "Mixture",
     "ObservabilityConstrained",
     "Posterior",
-    "Standard",
-    "Submaps",
+    "RandomWalk",
+    "Schedule",
+    "Slam",
     "agreeing",
     "base_poses",
     "chain",
     "close",
+    "compatible",
     "kalman_update",
+    "make_filter",
+    "make_filters",
+    "paper",
     "posterior",
+    "recommended",
     "scenario_pieces",
-    "with_submaps",
 ]

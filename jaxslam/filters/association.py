@@ -24,8 +24,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.arrays import Number
 from jaxslam._numerics.linalg import cholesky
-from jaxslam.filters.ekf import EkfSlam, context_of
-from jaxslam.filters.forms.covariance import curvature
+from jaxslam.filters.gaussian import context_of
+from jaxslam.filters.layer import AbstractSlam
+from jaxslam.filters.linear.covariance import curvature
 from jaxslam.filters.protocol import AbstractStaged, Belief
 from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features, Slots
@@ -100,7 +101,7 @@ def candidates(
 
     `tolerance` is a σ, in the unit of a measurement, by which each may be off beyond its noise.
     Of a `curved` measurement, the covariance has the terms of second order of each match by
-    itself, where an `EkfSlam` gives them: what depth does to it, of a camera that may have set
+    itself, where a `Slam` gives them: what depth does to it, of a camera that may have set
     out in any direction.
     Raises ValueError for a filter whose innovations have no covariance.
     """
@@ -113,7 +114,7 @@ def candidates(
     S = innovation.covariance
     S += tolerance**2 * jnp.eye(m * p, dtype=S.dtype)
     S = S.reshape(m, p, m, p)
-    if curved and isinstance(slam, EkfSlam):
+    if curved and isinstance(slam, AbstractSlam):
         i = jnp.arange(m)
         S = S.at[i, :, i].add(second_order(slam, state, control, features.slots))
     first_alike = jnp.argmax(features.slots == features.slots[:, None], axis=1)
@@ -121,12 +122,12 @@ def candidates(
 
 
 def second_order(
-    slam: EkfSlam, state: Belief, control: Control, slots: Slots
+    slam: AbstractSlam, state: Belief, control: Control, slots: Slots
 ) -> Float[Array, "m p p"]:
     """`½ tr(∂²h_a Q ∂²h_b Q)`, Q of what one measurement depends on (Bar-Shalom, Li, Kirubarajan,
     *Estimation with Applications to Tracking and Navigation*, 2001, §10.3.2)."""
     context = context_of(slam, control)
-    hessian, Q = curvature(slam.gaussian_form, slam.model, state, slots, context)
+    hessian, Q = curvature(slam.model, state, slots, context)
     HQ = jnp.einsum("mpij,mjk->mpik", hessian, Q)
     return jnp.einsum("mpij,mqji->mpq", HQ, HQ) / 2
 

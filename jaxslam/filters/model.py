@@ -1,4 +1,4 @@
-"""Monocular SLAM as a model for a form: coordinates × landmark × calibration × motion × sensor.
+"""Monocular SLAM as a model for a form: frame × landmark × calibration × motion × sensor.
 
 Everything is written once, as pure functions of the core, or of a view of it and one landmark.
 What the core holds is what the pieces declare.
@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.filters.forms.blocks import Change
-from jaxslam.filters.protocol import Belief
+from jaxslam.filters.linear.blocks import Change
+from jaxslam.filters.linear.state import State
 from jaxslam.geometry import (
     Geometry,
     Pose,
@@ -25,12 +25,12 @@ from jaxslam.geometry import (
     scaled,
     tangent_dim,
 )
-from jaxslam.landmarks.parametrization import Parametrization
+from jaxslam.landmarks import AbstractLandmark
 from jaxslam.models.calibration import AbstractCalibration
-from jaxslam.models.coordinates import Coordinates, KeyframePose, keyframe_due
 from jaxslam.models.depth import InverseDepth
+from jaxslam.models.frame import AbstractFrame, KeyframePose
 from jaxslam.models.motion import AbstractMotion, Control, Variables
-from jaxslam.models.scale import Metre, ScaleGauge, noise_in_gauge
+from jaxslam.models.scale import AbstractScale
 from jaxslam.models.sensors import AbstractSensor
 
 
@@ -39,7 +39,7 @@ class Core(eqx.Module):
 
     pose: Pose | SplitPose | KeyframePose
     """T_CB in a robocentric filter, T_BC in a world-centric one, T_BK and T_KC in one with
-    keyframes: what the `Coordinates` hold."""
+    keyframes: what the `AbstractFrame` hold."""
     motion: Variables
     """What the motion model keeps: a velocity in the camera's own frame, a bias, nothing."""
     log_scale: Float[Array, " u"] | None
@@ -76,6 +76,8 @@ class Context(NamedTuple):
     the odometry's reading; None once the motion is composed."""
     anchor: Int[Array, ""] | None = None
     """Number of the anchor of new landmarks, the current camera."""
+    log_scale: Scalar | None = None
+    """λ of the gauge, where a Jacobian is to take it as given."""
 
 
 COMPOSED = Context(None)
@@ -98,19 +100,24 @@ class SlamModel(eqx.Module):
 
     motion: AbstractMotion
     sensor: AbstractSensor
-    landmark: Parametrization = eqx.field(static=True)
-    coordinates: Coordinates = eqx.field(static=True)
+    landmark: AbstractLandmark
+    frame: AbstractFrame
     calibration: AbstractCalibration
     depth: InverseDepth
-    scale: Metre | ScaleGauge
+    scale: AbstractScale
 
     @property
     def geometry(self) -> Geometry:
         return self.motion.geometry
 
+    def given(self, core: Core, context: Context) -> Context:
+        """λ is data of a Jacobian: the amplitude of the noise says nothing about the scale, but its
+        derivative by λ would pretend so."""
+        return context if core.log_scale is None else context._replace(log_scale=core.log_scale[0])
+
     @property
     def moves_landmarks(self) -> bool:
-        return self.coordinates.moves_landmarks and not self.landmark.anchored
+        return self.frame.moves_landmarks and not self.landmark.anchored
 
     @property
     def noise_sigma(self) -> Float[Array, " q"]:
@@ -123,29 +130,32 @@ class SlamModel(eqx.Module):
         """The camera's motion in this step; the identity once it is composed."""
         if context.control is None:
             return identity(self.geometry, core.noise.dtype)
-        return self.motion.displacement(core.motion, self._noises(core)[0], context.control)
+        return self.motion.displacement(core.motion, self._noises(core, context)[0], context.control)
 
-    def _noises(self, core: Core) -> tuple[Float[Array, " q"], Float[Array, " w"]]:
+    def _noises(
+        self, core: Core, context: Context
+    ) -> tuple[Float[Array, " q"], Float[Array, " w"]]:
         """The motion's noise in the units of the state, and the calibration's."""
         own = self.motion.noise_sigma.shape[-1]
         noise, drift = core.noise[:own], core.noise[own:]
         if core.log_scale is not None:
-            noise = noise_in_gauge(self.motion, core.motion, noise, core.log_scale)
+            log_scale = core.log_scale[0] if context.log_scale is None else context.log_scale
+            noise = self.motion.enlarged(core.motion, noise, jnp.exp(-log_scale))[1]
         return noise, drift
 
     def view(self, core: Core, context: Context) -> CameraInMap:
         """All that a landmark depends on."""
         step = self.displacement(core, context)
-        T_AC = self.coordinates.map_from_camera(core.pose, step)
+        T_AC = self.frame.map_from_camera(core.pose, step)
         return CameraInMap(T_AC, core.calibration, core.anchors, core.log_scale, core.depth_error)
 
     def compose_core(self, core: Core, context: Context) -> Core:
         """P18, P19. The noise has been used: it is marginalised."""
-        step, (noise, drift) = self.displacement(core, context), self._noises(core)
-        moved = self.coordinates.moves_landmarks
+        step, (noise, drift) = self.displacement(core, context), self._noises(core, context)
+        moved = self.frame.moves_landmarks
         return replace(
             core,
-            pose=self.coordinates.compose(core.pose, step),
+            pose=self.frame.compose(core.pose, step),
             anchors=_seen_from(step, core.anchors) if moved else core.anchors,
             motion=self.motion.next(core.motion, noise, context.control),
             calibration=self.calibration.next(core.calibration, drift),
@@ -154,11 +164,11 @@ class SlamModel(eqx.Module):
 
     def camera_pose(self, core: Core) -> Pose:
         """T_BC, in metres."""
-        return self.coordinates.camera_pose(self._metric_pose(core))
+        return self.frame.camera_pose(self._metric_pose(core))
 
     def estimate(self, core: Core) -> Pose | SplitPose:
         """The one pose whose error is the filter's, in metres."""
-        return self.coordinates.estimate(self._metric_pose(core))
+        return self.frame.estimate(self._metric_pose(core))
 
     def _metric_pose(self, core: Core) -> Pose | SplitPose | KeyframePose:
         """The pose as the core holds it, in metres."""
@@ -171,27 +181,26 @@ class SlamModel(eqx.Module):
         del context
         return self.landmark.transform(view.map_from_camera.inverse(), landmark)
 
-    def reanchoring(self) -> Change | None:
-        """The current camera becomes the map frame, its motion composed; None if it never does."""
-        reanchor, transform = self.coordinates.reanchor, self.landmark.transform
-        if reanchor is None:
-            return None
+    def reanchoring(self) -> Change:
+        """The current camera becomes the map frame, its motion composed."""
 
         def core(core):
             anchors = _seen_from(self._map_from_camera(core), core.anchors)
-            return replace(core, pose=reanchor(core.pose), anchors=anchors)
+            return replace(core, pose=core.pose.reanchored(), anchors=anchors)
 
         def landmark(T_AC, landmark):
-            return transform(T_AC.inverse(), landmark)
+            return self.landmark.transform(T_AC.inverse(), landmark)
 
         moved = None if self.landmark.anchored else landmark
         return Change(core=core, view=self._map_from_camera, landmark=moved)
 
-    def reanchoring_due(self, state: Belief) -> Bool[Array, ""]:
-        """Whether the camera is far from the map frame, its motion composed."""
-        return keyframe_due(self._map_from_camera(state.core), self.inverse_distances(state))
+    def keyframe_left(self, state: State) -> Bool[Array, ""]:
+        """Whether the camera has left its keyframe, or the one in which its submap began; its
+        motion is composed."""
+        T_KC = state.core.pose.keyframe_from_camera
+        return self.frame.left(T_KC, self.inverse_distances(state))
 
-    def inverse_distances(self, state: Belief) -> Float[Array, " capacity"]:
+    def inverse_distances(self, state: State) -> Float[Array, " capacity"]:
         """Of the landmarks from the origin of the map frame; zero in empty slots."""
         points, omegas = jax.vmap(self.landmark.homogeneous)(state.landmarks)
         inverse_distances = jnp.abs(omegas) / jnp.linalg.norm(points, axis=1)
@@ -199,7 +208,7 @@ class SlamModel(eqx.Module):
 
     def _map_from_camera(self, core: Core) -> Pose:
         """T_AC, once the motion is composed."""
-        return self.coordinates.map_from_camera(
+        return self.frame.map_from_camera(
             core.pose, identity(self.geometry, core.noise.dtype)
         )
 
@@ -237,8 +246,6 @@ class SlamModel(eqx.Module):
     ) -> Array:
         """The same landmark in the form that its parametrization now prefers."""
         del context
-        if self.landmark.convert is None:
-            return landmark
         return self.landmark.convert(view.map_from_camera.translation(), landmark, covariance)
 
     def initialise(

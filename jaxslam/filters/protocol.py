@@ -16,9 +16,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam._numerics.arrays import AnyArray
+from jaxslam.filters.model import SlamModel
 from jaxslam.geometry import Pose, Scalar, difference
 from jaxslam.models.motion import Control
-from jaxslam.models.observations import Capacity, Features, Innovation, Slots
+from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap, Slots
 
 Belief = PyTree
 """Of a filter: a pytree of arrays that only the filter knows."""
@@ -83,9 +84,14 @@ class AbstractFilter(eqx.Module):
     """A recursive estimator of a camera's pose and of a map."""
 
     @abstractmethod
-    def init(self, capacity: int | Capacity, first: Features | None = None) -> Belief:
+    def init(
+        self,
+        capacity: int | Capacity,
+        first: Features | None = None,
+        known: PriorMap | None = None,
+    ) -> Belief:
         """The state before the first motion: at the origin of B. With the features of frame 0, in
-        which everything is new, the state after it."""
+        which everything is new, the state after it; with a prior map, landmarks are known."""
 
     @abstractmethod
     def step(self, state: Belief, control: Control, seen: Features, new: Features) -> Corrected:
@@ -100,10 +106,10 @@ class AbstractFilter(eqx.Module):
         """Mean and covariance of `function(view)` of the landmark in each of these slots."""
 
     @property
-    def unwrapped(self) -> AbstractFilter:
-        """The filter that this one is built around, at the end of all that stands around it; the
-        filter itself, unless it says otherwise."""
-        return self
+    def model(self) -> SlamModel | None:
+        """The models of motion, sensor and landmark that the filter is made of; None of a filter
+        that is made otherwise."""
+        return None
 
     def in_map(self, state: Belief) -> Bool[Array, " capacity"]:
         """Whether each slot holds a landmark."""

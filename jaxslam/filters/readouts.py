@@ -9,7 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxslam._numerics.linalg import semidefinite_root
-from jaxslam.filters.ekf import EkfSlam, composed, of_landmark
+from jaxslam.filters.gaussian import composed, of_landmark
+from jaxslam.filters.layer import AbstractSlam
+from jaxslam.filters.linear.covariance import joint_covariance
 from jaxslam.filters.protocol import (
     AbstractFilter,
     Belief,
@@ -116,7 +118,7 @@ def landmarks_in_world(slam: AbstractFilter, state: Belief, slots: Slots) -> Eac
 
 
 def landmark_samples(
-    slam: EkfSlam,
+    slam: AbstractSlam,
     state: Belief,
     slots: Slots,
     key: Array,
@@ -128,13 +130,12 @@ def landmark_samples(
     Nothing is linearised: this is the distribution that mean and covariance stand for. A draw
     beyond infinity (ω < 0) comes out on the other side of the camera.
     """
-    state = slam.entry.collapsed(state)
     value = of_landmark(slam, function or _point_in_world)
     c, size = state.core_dim, state.core_dim + state.landmarks.shape[1]
     normal = jax.random.normal(key, (slots.size, count, size), state.landmarks.dtype)
 
     def of_slot(slot, draws):
-        root = semidefinite_root(slam.gaussian_form.joint_covariance(state, slot)).root
+        root = semidefinite_root(joint_covariance(state, slot)).root
 
         def one(draw):
             delta = root @ draw

@@ -2,43 +2,40 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import Number
 from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
-from jaxslam.landmarks.parametrization import Parameters, Parametrization
+from jaxslam.landmarks.landmark import AbstractLandmark, Parameters
 
 
-def initialise(point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " n"]:
-    """`X/ω`. `focal` is not used."""
-    del focal
-    return point / omega
+class Cartesian(AbstractLandmark):
+    """A Cartesian point (X, Y, Z)."""
 
+    name: ClassVar[str] = "cartesian"
+    parameters: ClassVar[str] = "(X, Y, Z)"
+    point: ClassVar[str] = "(X, Y, Z)"
+    source: ClassVar[str] = "the classical Gaussian (the paper's Fig. 1)"
 
-def transform(T_ab: Pose, landmark: Parameters) -> Parameters:
-    """`X' = R X + t`."""
-    return T_ab @ landmark
+    def size(self, n: int) -> int:
+        return n
 
+    def initialise(self, point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " n"]:
+        """`X/ω`. `focal` is not used."""
+        del focal
+        return point / omega
 
-def homogeneous(landmark: Parameters) -> Homogeneous:
-    """`(X, 1)`: never at infinity."""
-    return landmark, jnp.ones((), landmark.dtype)
+    def transform(self, T_ab: Pose, landmark: Parameters) -> Parameters:
+        """`X' = R X + t`."""
+        return T_ab @ landmark
 
+    def homogeneous(self, landmark: Parameters) -> Homogeneous:
+        """`(X, 1)`: never at infinity."""
+        return landmark, jnp.ones((), landmark.dtype)
 
-def scale(factor: Number, landmark: Parameters) -> Parameters:
-    """`X' = s X`."""
-    return factor * landmark
-
-
-CARTESIAN = Parametrization(
-    name="cartesian",
-    parameters="(X, Y, Z)",
-    point="(X, Y, Z)",
-    source="the classical Gaussian (the paper's Fig. 1)",
-    size=lambda n: n,
-    initialise=initialise,
-    transform=transform,
-    homogeneous=homogeneous,
-    scale=scale,
-)
+    def scale(self, factor: Number, landmark: Parameters) -> Parameters:
+        """`X' = s X`."""
+        return factor * landmark

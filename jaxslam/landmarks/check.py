@@ -12,12 +12,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxslam._runtime.programs import QUICK, Program
-from jaxslam.geometry import GEOMETRIES, Geometry, Point
-from jaxslam.landmarks.parametrization import Parameters, Parametrization
+from jaxslam.geometry import GEOMETRIES, Geometry, Point, joined
+from jaxslam.landmarks.landmark import AbstractLandmark, Parameters
 
 _FOCAL = 650.0
 _BEARING = (0.31, -0.22)
 _INVERSE_DEPTHS = (0.02, 0.15, 1.3)
+_BEHIND = -3.0
+"""m along the axis: where a camera that has passed the point has it."""
 _LARGER = 1.7
 _CLOSE = 1e-6
 """Of the largest number: far above rounding, and what central differences are good to."""
@@ -29,24 +31,25 @@ _WHAT = (
     "transform by T and T⁻¹: the parameters", "homogeneous: x/z of the moved point",
     "scale: the enlarged point", "convert: the point", "the derivative of initialise",
     "the derivative of transform", "the derivative of transform by the pose",
-    "the derivative of homogeneous",
+    "the derivative of homogeneous", "transform: the point moved behind the camera",
+    "the derivative of that",
 )  # fmt: skip
 """What is compared, in the order of `_compared`."""
 _Pair = tuple[Float[Array, "..."], Float[Array, "..."]]
 
 
-def check_landmark(landmark: Parametrization, geometry: Geometry | None = None) -> None:
+def check_landmark(landmark: AbstractLandmark, geometry: Geometry | None = None) -> None:
     """Check that a parametrization's functions agree, for points at three depths.
 
     That is: shapes are (d,), (n,) and (); `initialise(X, ω, f)` puts the point at X/ω; `transform`
     moves it by T, back by T⁻¹ to the same parameters, and where it is then seen, x/z and y/z, is
     where a pinhole sees the moved point; `scale` enlarges the point and `convert` leaves it where
-    it is; all derivatives are finite, and those of central differences. Points are of the plane
+    it is; so is a point behind the camera; all derivatives are finite, and those of central differences. Points are of the plane
     and of space, or of the `geometry` alone (`jaxslam.PLANAR`, `jaxslam.SPATIAL`). Raises
     ValueError with the first that does not hold.
     """
-    if not isinstance(landmark, Parametrization):
-        raise ValueError(f"a jaxslam.Parametrization is accepted, not {type(landmark).__name__}")
+    if not isinstance(landmark, AbstractLandmark):
+        raise ValueError(f"a jaxslam.AbstractLandmark is accepted, not {type(landmark).__name__}")
     with jax.enable_x64(True):
         for one in GEOMETRIES.values() if geometry is None else (geometry,):
             try:
@@ -59,7 +62,7 @@ class _Fault(Exception):
     """What does not hold."""
 
 
-def _check(landmark: Parametrization, geometry: Geometry) -> None:
+def _check(landmark: AbstractLandmark, geometry: Geometry) -> None:
     n = geometry.point_dim
     size = _called("size", landmark.size, n)
     if not isinstance(size, int) or size < 1:
@@ -73,7 +76,7 @@ def _check(landmark: Parametrization, geometry: Geometry) -> None:
                 _check_close(f"{what} at 1/z = {omega:g}", *map(np.asarray, pair))
 
 
-def _check_shapes(landmark: Parametrization, geometry: Geometry, size: int) -> None:
+def _check_shapes(landmark: AbstractLandmark, geometry: Geometry, size: int) -> None:
     n, number = geometry.point_dim, jax.ShapeDtypeStruct((), jnp.float64)
     point, parameters = (jax.ShapeDtypeStruct((k,), jnp.float64) for k in (n, size))
     P, T = jax.ShapeDtypeStruct((size, size), jnp.float64), geometry.group.identity()
@@ -85,23 +88,23 @@ def _check_shapes(landmark: Parametrization, geometry: Geometry, size: int) -> N
         ("convert", landmark.convert, (point, parameters, P), (size,)),
     )
     for what, function, given, accepted in calls:
-        if function is not None:
-            made = _called(what, partial(jax.eval_shape, function), *given)
-            shape = jax.tree.map(jnp.shape, made)
-            if shape != accepted:
-                raise _Fault(f"{what} is of shape {shape}; {accepted} is accepted")
+        made = _called(what, partial(jax.eval_shape, function), *given)
+        shape = jax.tree.map(jnp.shape, made)
+        if shape != accepted:
+            raise _Fault(f"{what} is of shape {shape}; {accepted} is accepted")
 
 
 def _compared(
-    landmark: Parametrization, geometry: Geometry, seen: Float[Array, " n"]
+    landmark: AbstractLandmark, geometry: Geometry, seen: Float[Array, " n"]
 ) -> list[_Pair | None]:
     """What is to be equal, in the order of `_WHAT`."""
     T = geometry.group.exp(0.3 * jnp.linspace(-1.0, 1.0, geometry.tangent_dim))
     there = jnp.append(seen[:-1], 1.0) / seen[-1]
     first = _first(landmark, seen)
-    moved, other = landmark.transform(T, first), first
-    if landmark.convert is not None:
-        other = landmark.convert(T.translation(), first, 1e-6 * jnp.eye(first.size))
+    moved = landmark.transform(T, first)
+    other = landmark.convert(T.translation(), first, 1e-6 * jnp.eye(first.size))
+    behind = geometry.group.identity()
+    behind = joined(behind.rotation(), jnp.zeros(there.size).at[-1].set(_BEHIND - there[-1]))
     derivatives: tuple[tuple[Callable, Array], ...] = (
         (lambda x: _first(landmark, x), seen),
         (lambda p: landmark.transform(T, p), first),
@@ -111,6 +114,10 @@ def _compared(
         ),
         (lambda p: jnp.append(*landmark.homogeneous(p)), first),
     )
+
+    def seen_behind(parameters):
+        return _bearing(landmark.homogeneous(landmark.transform(behind, parameters))[0])
+
     return [
         (_point(landmark, first), there),
         (_point(landmark, moved), T @ there),
@@ -119,6 +126,8 @@ def _compared(
         (_point(landmark, landmark.scale(_LARGER, first)), _LARGER * there),
         (_point(landmark, other), there),
         *((jax.jacfwd(function)(at), _central(function, at)) for function, at in derivatives),
+        (_point(landmark, landmark.transform(behind, first)), behind @ there),
+        (jax.jacfwd(seen_behind)(first), _central(seen_behind, first)),
     ]
 
 
@@ -129,12 +138,12 @@ def _central(function: Callable, at: Float[Array, " k"]) -> Float[Array, "d k"]:
     return ends.T / (2 * jnp.diag(steps))
 
 
-def _first(landmark: Parametrization, seen: Float[Array, " n"]) -> Parameters:
+def _first(landmark: AbstractLandmark, seen: Float[Array, " n"]) -> Parameters:
     ray = jnp.append(seen[:-1], 1.0)
     return jnp.asarray(landmark.initialise(ray, seen[-1], jnp.asarray(_FOCAL)))
 
 
-def _point(landmark: Parametrization, parameters: Parameters) -> Point:
+def _point(landmark: AbstractLandmark, parameters: Parameters) -> Point:
     X, omega = landmark.homogeneous(parameters)
     return X / omega
 

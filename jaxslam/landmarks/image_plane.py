@@ -7,45 +7,42 @@ camera's image plane has no such coordinates.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import Number
 from jaxslam.geometry import Homogeneous, Point, Pose, Scalar, homogeneous_apply
-from jaxslam.landmarks.parametrization import Parameters, Parametrization
+from jaxslam.landmarks.landmark import AbstractLandmark, Parameters
 
 
-def initialise(point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " n"]:
-    """`(x/z, y/z, ω/z)`. `focal` is not used."""
-    del focal
-    return jnp.append(point[:-1], omega) / point[-1]
+class ImagePlane(AbstractLandmark):
+    """A point on the image plane of the map frame's camera: (x/z, y/z, 1/z)."""
 
+    name: ClassVar[str] = "image_plane"
+    parameters: ClassVar[str] = "(x/z, y/z, 1/z)"
+    point: ClassVar[str] = "(x/z, y/z, 1) z"
+    source: ClassVar[str] = "Eade, Drummond, CVPR 2006"
 
-def transform(T_ab: Pose, landmark: Parameters) -> Parameters:
-    """`X = R (x/z, y/z, 1) + (1/z) t`, and `(X_x/X_z, X_y/X_z, (1/z)/X_z)`."""
-    point, omega = homogeneous(landmark)
-    point = homogeneous_apply(T_ab, point, omega)
-    return jnp.append(point[:-1], omega) / point[-1]
+    def size(self, n: int) -> int:
+        return n
 
+    def initialise(self, point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " n"]:
+        """`(x/z, y/z, ω/z)`. `focal` is not used."""
+        del focal
+        return jnp.append(point[:-1], omega) / point[-1]
 
-def homogeneous(landmark: Parameters) -> Homogeneous:
-    """`((x/z, y/z, 1), 1/z)`."""
-    return landmark.at[-1].set(1.0), landmark[-1]
+    def transform(self, T_ab: Pose, landmark: Parameters) -> Parameters:
+        """`X = R (x/z, y/z, 1) + (1/z) t`, and `(X_x/X_z, X_y/X_z, (1/z)/X_z)`."""
+        point, omega = self.homogeneous(landmark)
+        point = homogeneous_apply(T_ab, point, omega)
+        return jnp.append(point[:-1], omega) / point[-1]
 
+    def homogeneous(self, landmark: Parameters) -> Homogeneous:
+        """`((x/z, y/z, 1), 1/z)`."""
+        return landmark.at[-1].set(1.0), landmark[-1]
 
-def scale(factor: Number, landmark: Parameters) -> Parameters:
-    """`1/z' = (1/z)/s`."""
-    return landmark.at[-1].divide(factor)
-
-
-IMAGE_PLANE = Parametrization(
-    name="image_plane",
-    parameters="(x/z, y/z, 1/z)",
-    point="(x/z, y/z, 1) z",
-    source="Eade, Drummond, CVPR 2006",
-    size=lambda n: n,
-    initialise=initialise,
-    transform=transform,
-    homogeneous=homogeneous,
-    scale=scale,
-)
+    def scale(self, factor: Number, landmark: Parameters) -> Parameters:
+        """`1/z' = (1/z)/s`."""
+        return landmark.at[-1].divide(factor)

@@ -7,45 +7,55 @@ the ray. The point is `C + m(θ, φ)/ρ`.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import Number
 from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
-from jaxslam.landmarks.parametrization import Parameters, Parametrization
+from jaxslam.landmarks.landmark import AbstractLandmark, Parameters
 
 Angles = Float[Array, " a"]
 """(θ, φ), or θ."""
 
 
-def initialise(point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " 2*n"]:
-    """C = 0, the ray of X, and `ρ = ω/|X|`.
+class UnifiedInverseDepth(AbstractLandmark):
+    """Unified Inverse Depth: a ray from its first camera and the inverse distance along it."""
 
-    The prior speaks of inverse depth 1/z, the same for every parametrization; ρ is the inverse
-    distance that belongs to it. `focal` is not used.
-    """
-    del focal
-    inverse_distance = omega / jnp.linalg.norm(point)
-    return pack(jnp.zeros_like(point), angles_of(point), inverse_distance)
+    name: ClassVar[str] = "inverse_depth"
+    parameters: ClassVar[str] = "(C, θ, φ, ρ)"
+    point: ClassVar[str] = "C + m(θ, φ)/ρ"
+    source: ClassVar[str] = "Montiel, Civera, Davison, RSS 2006 (P1–P4)"
 
+    def size(self, n: int) -> int:
+        return 2 * n
 
-def transform(T_ab: Pose, landmark: Parameters) -> Parameters:
-    """`C' = R C + t`, `m(θ', φ') = R m(θ, φ)`, `ρ' = ρ`. Singular where the ray is vertical."""
-    anchor, angles, inverse_distance = unpack(landmark)
-    ray = T_ab.rotation() @ ray_of(angles)
-    return pack(T_ab @ anchor, angles_of(ray), inverse_distance)
+    def initialise(self, point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " 2*n"]:
+        """C = 0, the ray of X, and `ρ = ω/|X|`.
 
+        The prior speaks of inverse depth 1/z, the same for every parametrization; ρ is the inverse
+        distance that belongs to it. `focal` is not used.
+        """
+        del focal
+        inverse_distance = omega / jnp.linalg.norm(point)
+        return pack(jnp.zeros_like(point), angles_of(point), inverse_distance)
 
-def homogeneous(landmark: Parameters) -> Homogeneous:
-    """`(ρ C + m(θ, φ), ρ)` (P4)."""
-    anchor, angles, inverse_distance = unpack(landmark)
-    return inverse_distance * anchor + ray_of(angles), inverse_distance
+    def transform(self, T_ab: Pose, landmark: Parameters) -> Parameters:
+        """`C' = R C + t`, `m(θ', φ') = R m(θ, φ)`, `ρ' = ρ`. Singular where the ray is vertical."""
+        anchor, angles, inverse_distance = unpack(landmark)
+        ray = T_ab.rotation() @ ray_of(angles)
+        return pack(T_ab @ anchor, angles_of(ray), inverse_distance)
 
+    def homogeneous(self, landmark: Parameters) -> Homogeneous:
+        """`(ρ C + m(θ, φ), ρ)` (P4)."""
+        anchor, angles, inverse_distance = unpack(landmark)
+        return inverse_distance * anchor + ray_of(angles), inverse_distance
 
-def scale(factor: Number, landmark: Parameters) -> Parameters:
-    """`C' = s C`, `ρ' = ρ/s`."""
-    anchor, angles, inverse_distance = unpack(landmark)
-    return pack(factor * anchor, angles, inverse_distance / factor)
+    def scale(self, factor: Number, landmark: Parameters) -> Parameters:
+        """`C' = s C`, `ρ' = ρ/s`."""
+        anchor, angles, inverse_distance = unpack(landmark)
+        return pack(factor * anchor, angles, inverse_distance / factor)
 
 
 def pack(anchor: Point, angles: Angles, inverse_distance: Scalar) -> Parameters:
@@ -73,16 +83,3 @@ def angles_of(ray: Point) -> Angles:
     if ray.size == 2:
         return theta[None]
     return jnp.stack([theta, jnp.atan2(-ray[1], jnp.hypot(ray[0], ray[-1]))])
-
-
-INVERSE_DEPTH = Parametrization(
-    name="inverse_depth",
-    parameters="(C, θ, φ, ρ)",
-    point="C + m(θ, φ)/ρ",
-    source="Montiel, Civera, Davison, RSS 2006 (P1–P4)",
-    size=lambda n: 2 * n,
-    initialise=initialise,
-    transform=transform,
-    homogeneous=homogeneous,
-    scale=scale,
-)

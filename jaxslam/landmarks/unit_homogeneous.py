@@ -6,28 +6,43 @@ vector: in the frame of a first camera m has unit length, where Inverse Scaling 
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.geometry import Point, Scalar
-from jaxslam.landmarks import inverse_scaling
-from jaxslam.landmarks.parametrization import Parametrization
+from jaxslam._numerics.arrays import Number
+from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
+from jaxslam.landmarks.inverse_scaling import InverseScaling
+from jaxslam.landmarks.landmark import AbstractLandmark, Parameters
+
+_SCALED = InverseScaling()
 
 
-def initialise(point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " n+1"]:
-    """`(m, ρ) = (X, ω)/|X|`. `focal` is not used."""
-    del focal
-    return jnp.append(point, omega) / jnp.linalg.norm(point)
+class UnitHomogeneous(AbstractLandmark):
+    """A homogeneous point (m, ρ) whose ray has unit length in its first camera."""
 
+    name: ClassVar[str] = "unit_homogeneous"
+    parameters: ClassVar[str] = "(m, ρ)"
+    point: ClassVar[str] = "m/ρ"
+    source: ClassVar[str] = "Solà et al., IJCV 2012, without an anchor"
 
-UNIT_HOMOGENEOUS = Parametrization(
-    name="unit_homogeneous",
-    parameters="(m, ρ)",
-    point="m/ρ",
-    source="Solà et al., IJCV 2012, without an anchor",
-    size=lambda n: n + 1,
-    initialise=initialise,
-    transform=inverse_scaling.transform,
-    homogeneous=inverse_scaling.homogeneous,
-    scale=inverse_scaling.scale,
-)
+    def size(self, n: int) -> int:
+        return n + 1
+
+    def initialise(self, point: Point, omega: Scalar, focal: Scalar) -> Float[Array, " n+1"]:
+        """`(m, ρ) = (X, ω)/|X|`. `focal` is not used."""
+        del focal
+        return jnp.append(point, omega) / jnp.linalg.norm(point)
+
+    def transform(self, T_ab: Pose, landmark: Parameters) -> Parameters:
+        """That of Inverse Scaling."""
+        return _SCALED.transform(T_ab, landmark)
+
+    def homogeneous(self, landmark: Parameters) -> Homogeneous:
+        """The parameters themselves."""
+        return _SCALED.homogeneous(landmark)
+
+    def scale(self, factor: Number, landmark: Parameters) -> Parameters:
+        """That of Inverse Scaling."""
+        return _SCALED.scale(factor, landmark)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from typing import ClassVar
+
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -11,53 +13,54 @@ from jaxslam.geometry import Scalar
 from jaxslam.models.motion import AbstractMotion, Variables
 
 
-class Metre(eqx.Module):
+class AbstractScale(eqx.Module):
+    """The unit of length in the state."""
+
+    free: ClassVar[bool] = False
+    """Whether its size is estimated, as λ."""
+
+    @abstractmethod
+    def start(
+        self, motion: AbstractMotion
+    ) -> tuple[Variables, Float[Array, " 1"] | None, Float[Array, "k k"]]:
+        """Means of the motion's variables and of λ, where it is `free`, and their covariance."""
+
+    def prior(
+        self, mean: Float[Array, " q"], sigma: Float[Array, " q"], variance: Scalar | None
+    ) -> tuple[Float[Array, " q"], Float[Array, " q"]]:
+        """Mean and σ of 1/z as `e^λ/z` is to have them, given the variance of λ, if there is one."""
+        del variance
+        return mean, sigma
+
+
+class Metre(AbstractScale):
     """Lengths in the state are metres: there is no λ."""
 
-    def start(self, motion: AbstractMotion) -> tuple[Variables, None, Float[Array, "v v"]]:
-        """Mean of the motion's variables, no λ, and their covariance."""
+    def start(self, motion):
         variables, root = motion.start()
         return variables, None, root @ root.T
 
 
-class ScaleGauge(eqx.Module):
+class ScaleGauge(AbstractScale):
     """Lengths in the state are in units of `e^λ` m: what no bearing observes, the scale, stays out
     of the products of velocity and inverse depth."""
 
-    def start(
-        self, motion: AbstractMotion
-    ) -> tuple[Float[Array, " v"], Float[Array, " 1"], Float[Array, "v+1 v+1"]]:
-        """Means of the velocity and of λ, and their joint covariance."""
+    free: ClassVar[bool] = True
+
+    def start(self, motion):
         velocity, root = motion.start()
         mean, covariance = velocity_in_gauge(velocity, root, motion.geometry.point_dim)
         return mean[:-1], mean[-1:], covariance
 
+    def prior(self, mean, sigma, variance):
+        """The exact first two moments of `e^λ/z`, linear in λ.
 
-def noise_in_gauge(
-    motion: AbstractMotion,
-    variables: Float[Array, " v"],
-    noise: Float[Array, " q"],
-    log_scale: Float[Array, " u"],
-) -> Float[Array, " q"]:
-    """The step's noise in the units of the state.
-
-    λ is frozen at its estimate: the noise's amplitude says nothing about scale, but its
-    derivative by λ would pretend so.
-    """
-    unit = jnp.exp(-jax.lax.stop_gradient(log_scale[0]))
-    return motion.enlarged(variables, noise, unit)[1]
-
-
-def prior_in_gauge(
-    mean: Float[Array, " q"], sigma: Float[Array, " q"], P: Scalar
-) -> tuple[Float[Array, " q"], Float[Array, " q"]]:
-    """Mean and σ of 1/z such that `e^λ/z`, linear in λ, has its exact first two moments.
-
-    `E e^λ ρ = ρ0 e^(λ + P/2)` for a ρ ~ N(ρ0, σ²) and λ of variance P; the slope by λ is the
-    mean, and the variance that it leaves is `e^2λ ((ρ0² + σ²) e^2P − ρ0² e^P (1 + P))`.
-    """
-    left = (mean**2 + sigma**2) * jnp.exp(2 * P) - mean**2 * jnp.exp(P) * (1 + P)
-    return mean * jnp.exp(P / 2), jnp.sqrt(left)
+        `E e^λ ρ = ρ0 e^(λ + P/2)` for a ρ ~ N(ρ0, σ²) and λ of variance P; the slope by λ is the
+        mean, and the variance that it leaves is `e^2λ ((ρ0² + σ²) e^2P − ρ0² e^P (1 + P))`.
+        """
+        P = variance
+        left = (mean**2 + sigma**2) * jnp.exp(2 * P) - mean**2 * jnp.exp(P) * (1 + P)
+        return mean * jnp.exp(P / 2), jnp.sqrt(left)
 
 
 def velocity_in_gauge(

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -180,3 +181,13 @@ class RangeBearing(AbstractSensor):
         difference = measured - predicted
         angle = difference[1]
         return difference.at[1].set(jnp.atan2(jnp.sin(angle), jnp.cos(angle)))
+
+
+def noises(
+    sensor: AbstractSensor, measured: Float[Array, "m p"]
+) -> Float[Array, "p p"] | Float[Array, "m p p"]:
+    """R of each measurement; one for all, which is factored once, where none depends on what is
+    measured."""
+    if type(sensor).noise_at is AbstractSensor.noise_at:
+        return sensor.noise
+    return jax.vmap(sensor.noise_at)(measured)

@@ -28,7 +28,10 @@ from jaxslam.filters.association import (
     candidates,
     second_order,
 )
-from jaxslam.filters.ekf import EkfSlam, each_gaussian, ekf_inside, init_with_depths
+from jaxslam.filters.gaussian import each_gaussian, init_with_depths
+from jaxslam.filters.layer import AbstractSlam
+from jaxslam.filters.linear.covariance import augmented, marginalised
+from jaxslam.filters.linear.state import State
 from jaxslam.filters.protocol import AbstractStaged, Belief, CameraView
 from jaxslam.filters.readouts import (
     camera_pose_in_unit,
@@ -201,8 +204,8 @@ class Estimator:
     @property
     def displaceable(self) -> bool:
         """Whether the filter has a velocity, by which a camera can be elsewhere at once."""
-        inner = self.slam.unwrapped
-        return isinstance(inner, EkfSlam) and inner.motion.has_velocity
+        model = self.slam.model
+        return model is not None and model.motion.has_velocity
 
     def displaced(
         self, T: Float[np.ndarray, "4 4"], sigma: Float[np.ndarray, " 6"], seconds: float
@@ -246,11 +249,11 @@ class Estimator:
     def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
         """Return how the calibration is treated, and fx, fy, cx, cy with their covariance, pixels.
         None of a filter without a pinhole camera."""
-        inner = self.slam.unwrapped
-        if not isinstance(inner, EkfSlam) or not isinstance(inner.sensor, Pinhole):
+        model = self.slam.model
+        if model is None or not isinstance(model.sensor, Pinhole):
             return None
-        mean, covariance = jax.device_get(_intrinsics(self.slam, inner, self.state))
-        return inner.calibration.name, mean, covariance
+        mean, covariance = jax.device_get(_intrinsics(self.slam, self.state))
+        return model.calibration.name, mean, covariance
 
     def compile(self, wide: list[Association]) -> list[threading.Thread]:
         """Start two threads that compile all programs in the order in which they are needed."""
@@ -369,26 +372,23 @@ def _moving(
     slam: AbstractStaged, state: Belief, T: jax.Array, sigma: jax.Array, dt: jax.Array
 ) -> Belief:
     velocity = log(jaxlie.SE3.from_matrix(T)) / dt
-    return _with_velocity(slam, state, velocity, jnp.diag((sigma / dt) ** 2))
+    return _with_velocity(state, velocity, jnp.diag((sigma / dt) ** 2))
 
 
 @Program
-def _at_rest(slam: AbstractStaged, state: Belief) -> Belief:
-    velocity, root = ekf_inside(slam, "a camera is at rest").motion.start()
-    return _with_velocity(slam, state, velocity, root @ root.T)
+def _at_rest(slam: AbstractSlam, state: Belief) -> Belief:
+    velocity, root = slam.motion.start()
+    return _with_velocity(state, velocity, root @ root.T)
 
 
-def _with_velocity(
-    slam: AbstractStaged, state: Belief, velocity: jax.Array, covariance: jax.Array
-) -> Belief:
+def _with_velocity(state: Belief, velocity: jax.Array, covariance: jax.Array) -> Belief:
     """Every Gaussian with another velocity, of which nothing was known."""
-    ekf = ekf_inside(slam, "a camera is elsewhere")
 
-    def one(state: Belief) -> Belief:
+    def one(state: State) -> State:
         part = state.core.part("motion")
-        state = ekf.form.marginalise(state, part.start, len(covariance))
+        state = marginalised(state, part.start, len(covariance))
         state = replace(state, core=replace(state.core, motion=velocity))
-        return ekf.form.augment(state, part.start, covariance)
+        return augmented(state, part.start, covariance)
 
     return each_gaussian(state, one)
 
@@ -427,7 +427,7 @@ def _believed(
 def _curved(slam: AbstractStaged, state: Belief, gaussian: Belief, dt: jax.Array) -> jax.Array:
     """The terms of second order of every slot's measurement, (n, 2, 2)."""
     one, _ = slam.gaussian(state, dt)
-    if not isinstance(one, EkfSlam):
+    if not isinstance(one, AbstractSlam):
         return jnp.zeros(())
     return second_order(one, gaussian, dt, jnp.arange(slam.in_map(state).size))
 
@@ -449,7 +449,7 @@ def _begin_map(slam: AbstractStaged, state: Belief, new: Features) -> tuple[Beli
 
 @Program
 def _begin_known(
-    depths: tuple[jax.Array, jax.Array], slam: EkfSlam, state: Belief, new: Features
+    depths: tuple[jax.Array, jax.Array], slam: AbstractSlam, state: Belief, new: Features
 ) -> tuple[Belief, Report]:
     state = init_with_depths(slam, slam.in_map(state).size, new, depths)
     return state, _reported(slam, state)
@@ -473,9 +473,12 @@ def _reported(slam: AbstractStaged, state: Belief) -> Report:
 
 
 @Program
-def _intrinsics(slam: AbstractStaged, inner: EkfSlam, state: Belief) -> tuple[jax.Array, jax.Array]:
+def _intrinsics(slam: AbstractStaged, state: Belief) -> tuple[jax.Array, jax.Array]:
+    model = slam.model
+    assert model is not None
+
     def intrinsics(view: CameraView) -> jax.Array:
-        sensor = inner.calibration.sensor(inner.sensor, view.core.calibration)
+        sensor = model.calibration.sensor(model.sensor, view.core.calibration)
         assert isinstance(sensor, Pinhole)
         return sensor.camera.intrinsics
 

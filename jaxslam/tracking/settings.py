@@ -10,7 +10,7 @@ from jaxtyping import Float
 from jaxslam._runtime.lookup import lookup
 from jaxslam.filters.association import ASSOCIATIONS, TOLERANCE
 from jaxslam.filters.protocol import AbstractFilter
-from jaxslam.filters.registry import FILTERS, ON_VIDEO, make_filter
+from jaxslam.filters.words import FILTERS, make_filter
 from jaxslam.io.calibration import Calibration
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.calibration import TREATMENTS, AbstractCalibration
@@ -34,7 +34,7 @@ class TrackerSettings:
     unit is whatever that prior makes it.
     """
 
-    filter: str = ON_VIDEO
+    filter: str = "recommended+drift"
     """Filter: a name of jaxslam.FILTERS, which may be modified, as in `robocentric+oc`.
     `recommended` is the default: it finds out by itself how the camera sets out, and what it claims
     is true most often (docs/sequences.md)."""

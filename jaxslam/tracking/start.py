@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxslam.filters.ekf import EkfSlam, check_can_track, check_one_gaussian
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
-from jaxslam.filters.submaps.handover import in_submaps
+from jaxslam.filters.slam import Slam
 from jaxslam.io.calibration import Calibration
-from jaxslam.models.coordinates import ROBOCENTRIC
-from jaxslam.models.scale import Metre
+from jaxslam.models.frame import Robocentric, Submaps
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.target import Target, TargetObservation, known_depths, sighted
 
@@ -20,13 +20,16 @@ def trackable(
 ) -> AbstractStaged:
     """The filter of this name that was `made`. Raises ValueError where it cannot track, or cannot
     begin with the target."""
-    check_can_track(made, name)
-    assert isinstance(made, AbstractStaged)
-    plain = isinstance(made, EkfSlam) and made.depth.common is None
-    if target is not None and not (plain and isinstance(made.scale, Metre)):
+    if not isinstance(made, AbstractStaged):
         raise ValueError(
-            f"filter {name} cannot begin with a target: one that is an EkfSlam, "
-            "without a scale of its own, as `world` and `robocentric` are, is accepted"
+            f"filter {name} cannot track: {type(made).__name__} takes a frame as a whole; accepted "
+            "is an `AbstractStaged`, whose frames are taken in stages"
+        )
+    plain = isinstance(made, Slam) and not made.layered and made.depth.common is None
+    if target is not None and not (plain and not made.scale.free):
+        raise ValueError(
+            f"filter {name} cannot begin with a target: a Slam of one Gaussian in metres, "
+            "as `world` and `robocentric` are, is accepted"
         )
     if target is not None and len(target.points) > settings.wanted:
         raise ValueError(
@@ -37,15 +40,14 @@ def trackable(
 
 
 def _handing_over(made: AbstractStaged) -> AbstractStaged:
-    """The filter with submaps where it is robocentric and one Gaussian, or a sum of them."""
-    inner = made.unwrapped
-    if not isinstance(inner, EkfSlam) or inner.coordinates is not ROBOCENTRIC:
+    """The filter with submaps, whose ends the tracker decides, where it is a robocentric `Slam`
+    that they go together with."""
+    if not isinstance(made, Slam) or made.frame != Robocentric():
         return made
     try:
-        check_one_gaussian(inner, "a map of submaps", corrected=True)
+        return replace(made, frame=Submaps(spare=None))
     except ValueError:
         return made
-    return made if inner.landmark.anchored else in_submaps(made)
 
 
 def with_target(

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.linalg import semidefinite_root
-from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.slam import Slam
 from jaxslam.geometry import Scalar
-from jaxslam.landmarks import LANDMARKS, Parametrization
+from jaxslam.landmarks import LANDMARKS, AbstractLandmark
 from jaxslam.models.observations import Features
 from jaxslam.triangulation.samples import Samples, draw
 from jaxslam.triangulation.truth import intersect
@@ -40,7 +40,7 @@ def estimate(name: str, views: TwoViews, pixels: Float[Array, " 2"]) -> Gaussian
 
 
 @eqx.filter_jit
-def filtered(slam: EkfSlam, pixels: Float[Array, " 2"]) -> Gaussian:
+def filtered(slam: Slam, pixels: Float[Array, " 2"]) -> Gaussian:
     """The landmark after a filter's first two frames, one second apart: seen new, seen again."""
 
     def seen(pixels):
@@ -70,7 +70,7 @@ def triangulated(calibration: str, given: Given) -> Gaussian:
 
 
 def pushed(
-    landmark: Parametrization, gaussian: Gaussian, normal: Float[Array, " k"]
+    landmark: AbstractLandmark, gaussian: Gaussian, normal: Float[Array, " k"]
 ) -> tuple[Float[Array, " 2"], Scalar, Scalar]:
     """One sample of a Gaussian of a landmark, as a homogeneous point, with weight 1.
 

@@ -19,9 +19,9 @@ from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import AnyArray, cast
 from jaxslam._runtime.lookup import suggestion
-from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.slam import Slam
 from jaxslam.geometry import PLANAR
-from jaxslam.landmarks import Parametrization
+from jaxslam.landmarks import AbstractLandmark
 from jaxslam.models.calibration import Estimated, Known, White
 from jaxslam.models.camera import Camera, project
 from jaxslam.models.depth import InverseDepth
@@ -96,10 +96,10 @@ class Given(eqx.Module):
     """m."""
     pixels: Float[AnyArray, " 2"]
 
-    def filter(self, calibration: str, landmark: Parametrization) -> EkfSlam:
+    def filter(self, calibration: str, landmark: AbstractLandmark) -> Slam:
         """The paper's filter; the motion has no acceleration, and one step takes a second."""
         still = jnp.zeros(PLANAR.tangent_dim)
-        return EkfSlam(
+        return Slam(
             motion=ConstantVelocity(still, still.at[0].set(self.baseline), still),
             sensor=self.sensor,
             landmark=landmark,

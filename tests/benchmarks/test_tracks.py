@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from tracks import read, window, windows
 
 from jaxslam.consistency import run_through
-from jaxslam.filters.registry import make_filters
+from jaxslam.filters.words import make_filters
 from jaxslam.simulation import Room, gone, scenario, sightings
 
 SIGHTS = {0: range(0, 4), 1: range(0, 6), 2: range(0, 2), 3: range(1, 6), 4: range(2, 6)}

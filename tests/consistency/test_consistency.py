@@ -32,7 +32,7 @@ from jaxslam.consistency import (
 from jaxslam.consistency.simulator import Simulator
 from jaxslam.consistency.store import NATIVE
 from jaxslam.consistency.sums import added
-from jaxslam.filters.registry import scenario_pieces
+from jaxslam.filters.words import scenario_pieces
 from jaxslam.native.build import compiler
 from jaxslam.plots.consistency import plot_consistency, plot_outside
 from jaxslam.plots.style import new_figure
@@ -254,7 +254,7 @@ def test_a_run_that_comes_back_was_lost_ever():
     assert result["verdict"]["lost_runs"] == []
 
 
-class OneLandmarkUnknown(jaxslam.EkfSlam):
+class OneLandmarkUnknown(jaxslam.Slam):
     """A filter that has no covariance for slot 0."""
 
     def landmark_marginal(self, state, function, slots):

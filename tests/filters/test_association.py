@@ -12,8 +12,8 @@ from scipy.stats import chi2
 
 from jaxslam.filters import association
 from jaxslam.filters.association import ASSOCIATIONS, GATE, Candidates, candidates
-from jaxslam.filters.ekf import context_of
-from jaxslam.filters.forms.covariance import curvature
+from jaxslam.filters.gaussian import context_of
+from jaxslam.filters.linear.covariance import curvature
 from jaxslam.filters.protocol import AbstractStaged
 from jaxslam.filters.wrappers.wrapper import AbstractWrapper
 from jaxslam.models.observations import Features

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from cases import Case, quick_jit
 
-from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.slam import Slam
 from jaxslam.filters.window.record import empty
-from jaxslam.filters.wrappers.batch_initialisation import (
+from jaxslam.filters.window.start import (
     GIVEN_UP,
     IN_TURN,
     SEARCHES,
@@ -191,7 +191,7 @@ def test_what_stands_around_a_start_from_rest_says_what_it_says(around):
     for is_open in (False, True):
         state = eqx.tree_at(lambda s: s.open, state, jnp.asarray(is_open))
         assert slam.unit_fixed(state) == (not is_open)
-    assert isinstance(slam.unwrapped, EkfSlam)
+    assert isinstance(slam.unwrapped, Slam)
     slam = standstill().filter(f"{SUM}{around}")
     assert not slam.ambiguous_start
 
@@ -294,7 +294,7 @@ def test_features_are_predicted_where_they_are_seen():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("scale_gauge+rest8", "Gaussian sum that is split .mixture., not of a EkfSlam"),
+        ("scale_gauge+rest8", "Gaussian sum that is split .mixture., not of a Slam"),
         ("robocentric+directions3+rest8", "is split .mixture., not of a GaussianSum that is not"),
         ("scale_gauge+mixture3+rest1", r"3 frames and more .* not \(2,\)"),
         ("scale_gauge+mixture3+rest0", r"3 frames and more .* not \(1,\)"),

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from cases import Case, quick_jit
 
-from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.forms.covariance import Covariance
-from jaxslam.filters.forms.drift import Drifting
-from jaxslam.filters.forms.observability_constrained import ObservabilityConstrained
-from jaxslam.filters.registry import make_filter, scenario_pieces
+from jaxslam.filters.slam import Slam
+from jaxslam.filters.linear.covariance import Covariance
+from jaxslam.filters.remedies.random_walk import Drifting
+from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
+from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.simulation import scenario
 
 
@@ -41,7 +41,7 @@ def test_a_feature_is_expected_by_so_much_less_surely(landmark):
 def test_it_is_a_piece_around_any_correction():
     pieces = scenario_pieces(scenario("matched-6dof"))
     slam = make_filter("scale_gauge+oc+drift", **pieces)
-    assert isinstance(slam, EkfSlam)
+    assert isinstance(slam, Slam)
     assert isinstance(slam.form, Covariance)
     assert isinstance(slam.form.correction, Drifting)
     assert isinstance(slam.form.correction.correction, ObservabilityConstrained)

@@ -1,4 +1,4 @@
-"""Tests of jaxslam.filters.forms.covariance: dense filters, Jacobians, and invariances."""
+"""Tests of jaxslam.filters.linear.covariance: dense filters, Jacobians, and invariances."""
 
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -21,17 +21,17 @@ from cases import (
 )
 
 from jaxslam._numerics.arrays import cast
-from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.forms import blocks
-from jaxslam.filters.forms.blocks import Blocks, observed, placed
-from jaxslam.filters.forms.covariance import Covariance
-from jaxslam.filters.forms.state import State
+from jaxslam.filters.slam import Slam
+from jaxslam.filters.linear import blocks
+from jaxslam.filters.linear.blocks import Blocks, observed, placed
+from jaxslam.filters.linear.covariance import Covariance
+from jaxslam.filters.linear.state import State
 from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.geometry import PLANAR, SPATIAL, difference, retract
-from jaxslam.landmarks import INVERSE_SCALING, LANDMARKS
+from jaxslam.landmarks import InverseScaling, LANDMARKS
 from jaxslam.models.calibration import Known, White
 from jaxslam.models.camera import Camera
-from jaxslam.models.coordinates import ROBOCENTRIC, WORLD
+from jaxslam.models.frame import Robocentric, WorldCentric
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Features, Status
@@ -348,7 +348,7 @@ def pieces(geometry) -> dict[str, Any]:
 
 
 def slam_model(geometry, landmark, coordinates):
-    return EkfSlam(landmark=landmark, coordinates=coordinates, **pieces(geometry)).model
+    return Slam(landmark=landmark, frame=coordinates, **pieces(geometry)).model
 
 
 def noise_of(geometry):
@@ -434,7 +434,7 @@ def middle_only(state, geometry, pixel):
 
 
 @pytest.mark.parametrize("landmark", few_landmarks, ids=named)
-@pytest.mark.parametrize("coordinates", [ROBOCENTRIC, WORLD], ids=named)
+@pytest.mark.parametrize("coordinates", [Robocentric(), WorldCentric()], ids=named)
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_blocks_are_the_dense_jacobians_with_only_the_middle_landmark_seen(
     geometry, coordinates, landmark
@@ -481,7 +481,7 @@ def test_blocks_are_the_dense_jacobians_with_only_the_middle_landmark_seen(
 
 
 def planar_case():
-    return slam_case(PLANAR, INVERSE_SCALING, ROBOCENTRIC)
+    return slam_case(PLANAR, InverseScaling(), Robocentric())
 
 
 def planar_pixels(state):
@@ -565,8 +565,8 @@ def test_a_feature_that_cannot_be_used_changes_nothing(change, valid):
 
 def test_search_ellipses_are_the_diagonal_blocks_of_the_innovation_covariance():
     for geometry, landmark, coordinates in (
-        (PLANAR, INVERSE_SCALING, ROBOCENTRIC),
-        (SPATIAL, LANDMARKS["inverse_depth"], WORLD),
+        (PLANAR, InverseScaling(), Robocentric()),
+        (SPATIAL, LANDMARKS["inverse_depth"], WorldCentric()),
     ):
         state, block_wise, dense, _ = slam_case(geometry, landmark, coordinates)
         p, model = geometry.pixel_dim, slam_model(geometry, landmark, coordinates)
@@ -587,7 +587,7 @@ def test_search_ellipses_are_the_diagonal_blocks_of_the_innovation_covariance():
 def test_considered_numbers_count_but_are_not_corrected():
     """Schmidt (1966): P_xx, P_xc and P_cc by the textbook's partitioned equations."""
     state, _, dense, jacobian = planar_case()
-    model = slam_model(PLANAR, INVERSE_SCALING, ROBOCENTRIC)
+    model = slam_model(PLANAR, InverseScaling(), Robocentric())
     context = Context(jnp.asarray(STEP))
     c, n = state.core_dim, len(state.covariance)
     calibration = slice(c - 2, c)
@@ -625,12 +625,12 @@ def test_considered_numbers_count_but_are_not_corrected():
 # --- initialisation -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("coordinates", [ROBOCENTRIC, WORLD], ids=named)
+@pytest.mark.parametrize("coordinates", [Robocentric(), WorldCentric()], ids=named)
 def test_landmarks_of_one_frame_share_its_pose_and_its_calibration(coordinates):
     """P ← J diag(P, R, σ², R, σ²) Jᵀ for two landmarks at once, the paper's P22–P26."""
-    model = slam_model(PLANAR, INVERSE_SCALING, coordinates)
+    model = slam_model(PLANAR, InverseScaling(), coordinates)
     depth = cast(model.depth, float)
-    everyone = slam_case(PLANAR, INVERSE_SCALING, coordinates)[0]
+    everyone = slam_case(PLANAR, InverseScaling(), coordinates)[0]
     state = EKF.remove(everyone, jnp.array([True, False, True]))
     c, d = state.core_dim, state.landmarks.shape[1]
     pixels, w = jnp.array([[100.0], [500.0]]), depth.mean
@@ -671,7 +671,7 @@ def test_landmarks_of_one_frame_share_its_pose_and_its_calibration(coordinates):
 
 def test_inverse_scaling_has_rank_three_when_the_focal_length_is_known():
     """Never invert a landmark block: (u − cx, v − cy, f, ω0) has a constant in it."""
-    slam = replace(EkfSlam(**pieces(SPATIAL)), calibration=Known())
+    slam = replace(Slam(**pieces(SPATIAL)), calibration=Known())
     new = Features(jnp.array([0]), jnp.array([[100.0, 300.0]]), jnp.array([True]))
     block = np.asarray(quick_jit(lambda new: slam.init(1, new).covariance)(new))[-4:, -4:]
     values = np.linalg.eigvalsh(block)

@@ -10,10 +10,10 @@ import pytest
 from cases import Case, each_geometry, named, pose_run, quick_jit
 
 import jaxslam
-from jaxslam.filters.registry import FROM_REST, RECOMMENDED, recommended_name
+from jaxslam.filters.words import FROM_REST, RECOMMENDED, recommended_name
 from jaxslam.filters.wrappers import split_merge
-from jaxslam.filters.wrappers.split_merge import _parts, _split_and_merged
-from jaxslam.filters.wrappers.sum_state import BEHIND, SumState, log_likelihoods, mixed
+from jaxslam.filters.mixture.split_merge import _parts, _split_and_merged
+from jaxslam.filters.mixture.sum_state import BEHIND, SumState, log_likelihoods, mixed
 from jaxslam.filters.wrappers.wrapper import with_motion
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Innovation, Status

@@ -10,14 +10,14 @@ import pytest
 from cases import Case, quick_jit
 
 from jaxslam.consistency import filter_run
-from jaxslam.filters.ekf import correct
-from jaxslam.filters.initialisation import rays
-from jaxslam.filters.initialisation.alternatives import log_density
-from jaxslam.filters.initialisation.depth_particles import DepthParticles
-from jaxslam.filters.initialisation.rays import RaySum
+from jaxslam.filters.gaussian import correct
+from jaxslam.filters.rivals import rays
+from jaxslam.filters.mixture.density import log_density
+from jaxslam.filters.rivals.depth_particles import DepthParticles
+from jaxslam.filters.rivals.rays import RaySum
 from jaxslam.filters.readouts import landmarks_in_camera
-from jaxslam.filters.registry import make_filter, scenario_pieces
-from jaxslam.landmarks import CARTESIAN, INVERSE_SCALING
+from jaxslam.filters.words import make_filter, scenario_pieces
+from jaxslam.landmarks import Cartesian, InverseScaling
 from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
@@ -44,7 +44,7 @@ def plain(base, motion_sigma=0.0, speed=SPEED, speed_sigma=0.0, depth=(0.2, 0.1)
     """A camera that moves along x, with a velocity that is known unless said."""
     return make_filter(
         base,
-        landmark=CARTESIAN,
+        landmark=Cartesian(),
         motion=ConstantVelocity([motion_sigma] * 3, [speed, 0.0, 0.0], [speed_sigma] * 3),
         sensor=Pinhole(Camera([FOCAL], [CENTRE]), SIGMA),
         depth=InverseDepth(*depth),
@@ -273,14 +273,14 @@ def test_a_batch_is_its_runs(name):
 @pytest.mark.parametrize(
     ("name", "landmark", "sensor", "message"),
     [
-        ("world+particle", CARTESIAN, "camera", "did you mean particles"),
-        ("word+particles", CARTESIAN, "camera", "did you mean world"),
-        ("world+", CARTESIAN, "camera", "unknown modifiers"),
-        ("world+rays0", CARTESIAN, "camera", "nearest"),
-        ("world+rays", INVERSE_SCALING, "camera", "cartesian"),
-        ("world+particles", INVERSE_SCALING, "camera", "cartesian"),
-        ("world+particles+rays", CARTESIAN, "camera", "cartesian"),
-        ("world+particles", CARTESIAN, "position", "hides none"),
+        ("world+particle", Cartesian(), "camera", "did you mean particles"),
+        ("word+particles", Cartesian(), "camera", "did you mean world"),
+        ("world+", Cartesian(), "camera", "unknown modifiers"),
+        ("world+rays0", Cartesian(), "camera", "nearest"),
+        ("world+rays", InverseScaling(), "camera", "cartesian"),
+        ("world+particles", InverseScaling(), "camera", "cartesian"),
+        ("world+particles+rays", Cartesian(), "camera", "cartesian"),
+        ("world+particles", Cartesian(), "position", "hides none"),
     ],
 )
 def test_bad_names_and_combinations(name, landmark, sensor, message):

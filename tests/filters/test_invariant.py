@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from cases import Case, close, named, pose, quick_jit
 
-from jaxslam.filters.forms.blocks import shifted
-from jaxslam.filters.forms.covariance import Covariance
-from jaxslam.filters.forms.gauge import act
+from jaxslam.filters.linear.blocks import shifted
+from jaxslam.filters.linear.covariance import Covariance
+from jaxslam.filters.remedies.gauge import act
 from jaxslam.filters.model import COMPOSED
 from jaxslam.geometry import PLANAR, SPATIAL, difference, exp, log
-from jaxslam.landmarks import CARTESIAN, INVERSE_DEPTH, INVERSE_SCALING
+from jaxslam.landmarks import Cartesian, UnifiedInverseDepth, InverseScaling
 
 NAMES = {PLANAR: "matched", SPATIAL: "matched-6dof"}
 
@@ -54,7 +54,7 @@ def seen_from_elsewhere(slam, state, rigid):
 @pytest.mark.parametrize(
     ("geometry", "landmark"),
     # Angles of a ray in space do not turn by addition.
-    [(PLANAR, INVERSE_SCALING), (PLANAR, INVERSE_DEPTH), (SPATIAL, CARTESIAN)],
+    [(PLANAR, InverseScaling()), (PLANAR, UnifiedInverseDepth()), (SPATIAL, Cartesian())],
     ids=named,
 )
 def test_an_update_is_the_same_in_every_base_frame(geometry, landmark):
@@ -77,7 +77,7 @@ def test_an_update_is_the_same_in_every_base_frame(geometry, landmark):
 @pytest.mark.parametrize("geometry", [PLANAR, SPATIAL], ids=lambda g: g.name)
 def test_cartesian_landmarks_are_corrected_as_published(geometry):
     """`p ← R p + V ξ`, V by `Exp(ξ, θ) = (R, V ξ)`, but for θ²/24 of a landmark's own ξ."""
-    slam = case(geometry).filter("invariant", CARTESIAN.name)
+    slam = case(geometry).filter("invariant", Cartesian().name)
     n = geometry.point_dim
 
     def corrected():

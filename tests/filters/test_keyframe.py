@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from cases import close, each_geometry, named, quick_jit
 
-from jaxslam.filters.ekf import reanchored
-from jaxslam.filters.forms.state import State
+from jaxslam.filters.gaussian import reanchored
+from jaxslam.filters.linear.state import State
 from jaxslam.filters.readouts import camera_pose, landmarks_in_camera, landmarks_in_world
-from jaxslam.filters.registry import FILTERS
+from jaxslam.filters.words import FILTERS
 from jaxslam.geometry import PLANAR, SPATIAL, difference, exp, identity, joined, tangent_dim
-from jaxslam.landmarks import IMAGE_PLANE, INVERSE_SCALING
+from jaxslam.landmarks import ImagePlane, InverseScaling
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.camera import Camera
-from jaxslam.models.coordinates import KEYFRAME_PARALLAX, KEYFRAME_TURN, keyframe_due
+from jaxslam.models.frame import KEYFRAME_PARALLAX, KEYFRAME_TURN, keyframe_due
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Features
@@ -37,7 +37,7 @@ def velocity(geometry):
     return axes(geometry, [0.3, 0.1, 0.14], [0.3, 0.0, 0.1, 0.0, -0.14, 0.02])
 
 
-def make(kind, geometry, calibration="white", scale=1.0, landmark=IMAGE_PLANE):
+def make(kind, geometry, calibration="white", scale=1.0, landmark=ImagePlane()):
     """A filter, every σ of which is times a scale."""
     p, t = geometry.pixel_dim, geometry.tangent_dim
     return FILTERS[kind](
@@ -187,7 +187,7 @@ def test_a_keyframe_is_due_after_a_turn_or_a_baseline():
     assert not keyframe_due(pose(0.8 * turned), near)
 
 
-@pytest.mark.parametrize("landmark", [INVERSE_SCALING, IMAGE_PLANE], ids=named)
+@pytest.mark.parametrize("landmark", [InverseScaling(), ImagePlane()], ids=named)
 def test_a_parallax_is_the_way_from_the_keyframe_by_the_distance_of_the_map(landmark):
     """Whatever length a parametrization gives to a ray, and of landmarks in the map alone."""
     slam = make("keyframe", PLANAR, "known", landmark=landmark)

@@ -16,7 +16,7 @@ from cases import a_filter, each_geometry, few_landmarks, named, pose, quick_jit
 
 from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.geometry import PLANAR, SPATIAL, difference, retract
-from jaxslam.models.coordinates import ROBOCENTRIC, WORLD
+from jaxslam.models.frame import Robocentric, WorldCentric
 
 STEPS, DT, COUNT = 8, 0.4, 7
 GAUGE = {PLANAR: 3, SPATIAL: 6}
@@ -124,7 +124,7 @@ def accelerations(geometry, linear):
 
 
 pytestmark = [
-    pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD], ids=named),
+    pytest.mark.parametrize("frame", [Robocentric(), WorldCentric()], ids=named),
     pytest.mark.parametrize("landmark", few_landmarks, ids=named),
     pytest.mark.parametrize("geometry", each_geometry, ids=named),
 ]

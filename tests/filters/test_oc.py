@@ -14,22 +14,22 @@ import pytest
 from cases import Case, a_filter, close, each_landmark, named, pose, quick_jit
 from test_observability import GAUGE, nullity
 
-from jaxslam.filters.forms.blocks import shifted
-from jaxslam.filters.forms.covariance import Covariance
-from jaxslam.filters.forms.gauge import act, unobservable_directions
-from jaxslam.filters.forms.observability_constrained import transport
+from jaxslam.filters.linear.blocks import shifted
+from jaxslam.filters.linear.covariance import Covariance
+from jaxslam.filters.remedies.gauge import act, unobservable_directions
+from jaxslam.filters.remedies.observability_constrained import transport
 from jaxslam.filters.model import COMPOSED, Context, Core
-from jaxslam.filters.registry import make_filter, scenario_pieces
+from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.geometry import PLANAR, SPATIAL, SplitPose, difference, tangent_dim
 from jaxslam.landmarks import (
-    CARTESIAN,
-    FRAMED_HOMOGENEOUS,
-    IMAGE_PLANE,
-    INVERSE_DEPTH,
-    INVERSE_SCALING,
+    Cartesian,
+    FramedHomogeneous,
+    ImagePlane,
+    UnifiedInverseDepth,
+    InverseScaling,
     LANDMARKS,
 )
-from jaxslam.models.coordinates import ROBOCENTRIC, WORLD
+from jaxslam.models.frame import Robocentric, WorldCentric
 from jaxslam.models.motion import Odometry
 from jaxslam.simulation import scenario
 
@@ -97,9 +97,9 @@ def moved(model, core, landmarks):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("geometry", "landmark", "frame"),
-    [(PLANAR, landmark, WORLD) for landmark in each_landmark]
-    + [(PLANAR, INVERSE_SCALING, ROBOCENTRIC), (PLANAR, FRAMED_HOMOGENEOUS, ROBOCENTRIC)]
-    + [(SPATIAL, INVERSE_DEPTH, WORLD)],
+    [(PLANAR, landmark, WorldCentric()) for landmark in each_landmark]
+    + [(PLANAR, InverseScaling(), Robocentric()), (PLANAR, FramedHomogeneous(), Robocentric())]
+    + [(SPATIAL, UnifiedInverseDepth(), WorldCentric())],
     ids=named,
 )
 def test_the_gauge_changes_no_measurement_now_or_after_a_motion(geometry, landmark, frame):
@@ -126,8 +126,8 @@ def test_the_gauge_changes_no_measurement_now_or_after_a_motion(geometry, landma
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD], ids=named)
-@pytest.mark.parametrize("landmark", [INVERSE_SCALING, FRAMED_HOMOGENEOUS], ids=named)
+@pytest.mark.parametrize("frame", [Robocentric(), WorldCentric()], ids=named)
+@pytest.mark.parametrize("landmark", [InverseScaling(), FramedHomogeneous()], ids=named)
 def test_directions_are_the_derivative_of_the_action(landmark, frame):
     """H N = 0, by other Jacobians than N's; empty slots do not move."""
     model = a_filter(PLANAR, landmark, frame).model
@@ -206,10 +206,10 @@ def window(model, constrained):
 @pytest.mark.parametrize(
     ("geometry", "landmark", "frame", "motion"),
     [
-        (PLANAR, CARTESIAN, ROBOCENTRIC, "velocity"),
-        (PLANAR, CARTESIAN, WORLD, "odometry"),
-        (SPATIAL, IMAGE_PLANE, ROBOCENTRIC, "velocity"),
-        (SPATIAL, CARTESIAN, WORLD, "odometry"),
+        (PLANAR, Cartesian(), Robocentric(), "velocity"),
+        (PLANAR, Cartesian(), WorldCentric(), "odometry"),
+        (SPATIAL, ImagePlane(), Robocentric(), "velocity"),
+        (SPATIAL, Cartesian(), WorldCentric(), "odometry"),
     ],
     ids=lambda value: getattr(value, "name", value),
 )
@@ -224,7 +224,7 @@ def test_corrections_leave_the_null_space_as_it_is(geometry, landmark, frame, mo
     assert np.linalg.norm(stacked[:, :count] @ N, 2) < 1e-12 * size
     plain, _ = window(model, False)
     unaware = np.linalg.norm(plain[:, :count] @ N, 2)
-    if frame is ROBOCENTRIC and motion == "odometry":
+    if frame is Robocentric() and motion == "odometry":
         # Its pose is perturbed on the side of B: N is constant.
         assert unaware < 1e-12 * size
     else:

@@ -16,7 +16,7 @@ from jaxslam.filters.readouts import (
     landmarks_in_world,
     landmarks_on_sides,
 )
-from jaxslam.filters.wrappers.sum_state import SumState
+from jaxslam.filters.mixture.sum_state import SumState
 
 STEPS, COUNT = 4, 6
 

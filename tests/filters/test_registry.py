@@ -6,8 +6,9 @@ import pytest
 
 from jaxslam._runtime.lookup import lookup
 from jaxslam.consistency import monte_carlo, summarise, table
-from jaxslam.filters.ekf import EkfSlam, check_can_track
-from jaxslam.filters.registry import FILTERS, make_filters
+from jaxslam.filters.gaussian import check_can_track
+from jaxslam.filters.slam import Slam
+from jaxslam.filters.words import FILTERS, make_filters
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.calibration import Known
 from jaxslam.simulation import scenario
@@ -38,7 +39,7 @@ def test_filters_are_made_of_every_pair_of_names():
     made = make_filters(scenario("matched"), frames, LANDMARKS, "known")
     assert list(made) == [f"{name}/{landmark}" for name in frames for landmark in LANDMARKS]
     for name, slam in made.items():
-        assert isinstance(slam, EkfSlam)
+        assert isinstance(slam, Slam)
         assert name == f"{slam.coordinates.name}/{slam.landmark.name}"
         assert isinstance(slam.calibration, Known)
         assert slam.compose_first == (slam.coordinates.name != "robocentric")

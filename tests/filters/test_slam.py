@@ -22,9 +22,10 @@ from cases import (
 )
 
 from jaxslam._numerics.arrays import cast
-from jaxslam.filters.ekf import EkfSlam, insert
-from jaxslam.filters.forms.covariance import Covariance
-from jaxslam.filters.forms.state import State
+from jaxslam.filters.gaussian import insert
+from jaxslam.filters.slam import Slam
+from jaxslam.filters.linear.covariance import Covariance
+from jaxslam.filters.linear.state import State
 from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.filters.readouts import (
     camera_pose,
@@ -32,15 +33,15 @@ from jaxslam.filters.readouts import (
     landmarks_in_camera,
     landmarks_in_world,
 )
-from jaxslam.filters.registry import make_filter, scenario_pieces
+from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.geometry import PLANAR, SPATIAL, joined, retract
 from jaxslam.landmarks import (
-    INVERSE_DEPTH_TO_CARTESIAN,
+    InverseDepthToCartesian,
     LANDMARKS,
-    PARALLAX_ANGLE,
+    ParallaxAngle,
 )
 from jaxslam.models.calibration import TREATMENTS, Estimated
-from jaxslam.models.coordinates import KEYFRAME, ROBOCENTRIC, WORLD
+from jaxslam.models.frame import Keyframe, Robocentric, WorldCentric
 from jaxslam.models.observations import Features
 from jaxslam.models.scale import ScaleGauge
 from jaxslam.simulation import scenario
@@ -80,7 +81,7 @@ def euclidean(landmark, parameters):
     return np.asarray(point / omega)
 
 
-@pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD], ids=named)
+@pytest.mark.parametrize("frame", [Robocentric(), WorldCentric()], ids=named)
 @pytest.mark.parametrize("landmark", few_landmarks, ids=named)
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_composition_with_no_motion_is_the_identity(geometry, landmark, frame):
@@ -92,7 +93,7 @@ def test_composition_with_no_motion_is_the_identity(geometry, landmark, frame):
     np.testing.assert_array_equal(velocity, zero)
 
 
-@pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD], ids=named)
+@pytest.mark.parametrize("frame", [Robocentric(), WorldCentric()], ids=named)
 @pytest.mark.parametrize("landmark", few_landmarks, ids=named)
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_composition_with_a_motion_and_its_inverse_is_the_identity(geometry, landmark, frame):
@@ -115,7 +116,7 @@ def test_both_frames_speak_of_the_same_camera_and_the_same_point(geometry, landm
     rng = np.random.default_rng(2)
     velocity, acceleration = rng.normal(size=(2, geometry.tangent_dim))
     X_C = landmark.transform(T_BC.inverse(), X_B)
-    robocentric, world = (composer(geometry, landmark, f) for f in (ROBOCENTRIC, WORLD))
+    robocentric, world = (composer(geometry, landmark, f) for f in (Robocentric(), WorldCentric()))
     by_camera, v, X_C = robocentric(T_BC, velocity, acceleration, X_C)
     T_BC, w, X_B = world(T_BC, velocity, acceleration, X_B)
     for found in (v, w):
@@ -134,7 +135,7 @@ def test_in_a_gauge_the_noise_is_scaled_but_says_nothing_of_the_scale(geometry):
     velocity, noise = jnp.asarray(rng.normal(size=(2, geometry.tangent_dim)))
 
     def moved(log_scale, noise):
-        held = ROBOCENTRIC.from_base_pose(pose(geometry, 2))
+        held = Robocentric().from_base_pose(pose(geometry, 2))
         core = Core(held, velocity, log_scale, noise, jnp.zeros(0))
         context = Context(jnp.asarray(DT))
         after = model.compose_core(core, context)
@@ -486,7 +487,7 @@ def convertible_state(model):
 
 @pytest.mark.parametrize(
     ("geometry", "frame", "landmark"),
-    [(PLANAR, ROBOCENTRIC, INVERSE_DEPTH_TO_CARTESIAN), (SPATIAL, WORLD, PARALLAX_ANGLE)],
+    [(PLANAR, Robocentric(), InverseDepthToCartesian()), (SPATIAL, WorldCentric(), ParallaxAngle())],
     ids=named,
 )
 def test_a_conversion_changes_neither_points_nor_what_is_known_of_them(geometry, frame, landmark):
@@ -589,7 +590,7 @@ def test_a_step_leaves_no_acceleration_and_no_white_calibration_behind(kind):
 def test_a_map_from_above_is_azimuth_and_inverse_distance_along_the_axes_of_the_world(kind):
     """Of a camera that is turned in every direction; azimuth from z towards x."""
     slam = make_filter(kind, **scenario_pieces(scenario("matched-6dof")))
-    assert isinstance(slam, EkfSlam)
+    assert isinstance(slam, Slam)
     seen = Features(jnp.arange(2), jnp.array([[100.0, 90.0], [500.0, 300.0]]), jnp.ones(2, bool))
     T_BC = pose(SPATIAL, 5, scale=1.0)
 
@@ -633,7 +634,7 @@ def test_an_unknown_calibration_is_refused_by_name():
         a_filter(PLANAR, scale="feet")
 
 
-@pytest.mark.parametrize("frame", [ROBOCENTRIC, WORLD, KEYFRAME], ids=named)
+@pytest.mark.parametrize("frame", [Robocentric(), WorldCentric(), Keyframe()], ids=named)
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_a_frame_holds_every_pose_and_gives_it_back(geometry, frame):
     T = pose(geometry, 3, scale=1.0)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from cases import quick_jit
 
-from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.registry import scenario_pieces
+from jaxslam.filters.slam import Slam
+from jaxslam.filters.words import scenario_pieces
 from jaxslam.filters.window.minimise import started
 from jaxslam.filters.window.problem import PathLayout, path
 from jaxslam.filters.window.record import whole
 from jaxslam.filters.window.subsample import Coarse, every, thinned, tied
-from jaxslam.landmarks import INVERSE_SCALING
+from jaxslam.landmarks import InverseScaling
 from jaxslam.models.calibration import Known, White
 from jaxslam.models.scale import ScaleGauge
 from jaxslam.simulation import scenario
@@ -25,7 +25,7 @@ FRAMES = 7
 def filter_of(treatment=Known):
     made = scenario_pieces(scenario("standstill-6dof"), "known")
     calibration = treatment() if treatment is Known else treatment(np.array([3.0] * 2 + [2.0] * 2))
-    slam = EkfSlam(scale=ScaleGauge(), **made, landmark=INVERSE_SCALING)
+    slam = Slam(scale=ScaleGauge(), **made, landmark=InverseScaling())
     return replace(slam, calibration=calibration)
 
 

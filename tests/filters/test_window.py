@@ -14,8 +14,8 @@ from exact_posterior.problem import log_density, make_problem
 from scipy.stats import chi2, norm
 
 from jaxslam._numerics.linalg import cholesky
-from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.registry import scenario_pieces
+from jaxslam.filters.slam import Slam
+from jaxslam.filters.words import scenario_pieces
 from jaxslam.filters.window import minimise, modes, scale
 from jaxslam.filters.window.minimise import minimised, started
 from jaxslam.filters.window.problem import (
@@ -30,7 +30,7 @@ from jaxslam.filters.window.record import Record, begun, empty, removed, stepped
 from jaxslam.filters.window.scale import rescaled, scaling, shift_of_scale, variances
 from jaxslam.filters.window.to_filter import gauge_state
 from jaxslam.geometry import jacobian
-from jaxslam.landmarks import INVERSE_SCALING
+from jaxslam.landmarks import InverseScaling
 from jaxslam.models.calibration import Considered, Estimated, Known, White
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.observations import Features
@@ -61,7 +61,7 @@ def filter_of(name, treatment, common):
     sigma = np.array([3.0] * p + [2.0] * p)
     depth = InverseDepth(0.25, 0.04, common)
     calibration = Known() if treatment is Known else treatment(sigma)
-    slam = EkfSlam(scale=ScaleGauge(), **made, landmark=INVERSE_SCALING)
+    slam = Slam(scale=ScaleGauge(), **made, landmark=InverseScaling())
     return replace(slam, depth=depth, calibration=calibration)
 
 
@@ -399,7 +399,7 @@ def test_the_window_is_the_exact_posterior_of_a_run_and_has_its_minimum():
     chosen = scenario("matched-loose", steps=3, landmarks=4)
     run = simulated(chosen)
     problem = make_problem(chosen, run, truncated=False)
-    slam = EkfSlam(scale=ScaleGauge(), **scenario_pieces(chosen), landmark=INVERSE_SCALING)
+    slam = Slam(scale=ScaleGauge(), **scenario_pieces(chosen), landmark=InverseScaling())
 
     @quick_jit
     def remembered(run):

@@ -8,7 +8,7 @@ import pytest
 from cases import each_landmark, named
 
 import jaxslam
-from jaxslam.landmarks import INVERSE_SCALING as IS
+from jaxslam.landmarks import InverseScaling as IS
 from jaxslam.landmarks import Parametrization
 
 pytestmark = pytest.mark.usefixtures("unchecked")

@@ -11,11 +11,11 @@ from cases import central, close, each_geometry, each_landmark, named, pose, qui
 
 from jaxslam.geometry import joined
 from jaxslam.landmarks import (
-    INVERSE_DEPTH,
-    INVERSE_DEPTH_TO_CARTESIAN,
-    INVERSE_SCALING,
+    UnifiedInverseDepth,
+    InverseDepthToCartesian,
+    InverseScaling,
     LANDMARKS,
-    PARALLAX_ANGLE,
+    ParallaxAngle,
 )
 from jaxslam.landmarks.inverse_depth import angles_of
 from jaxslam.models.camera import Camera, project
@@ -46,12 +46,12 @@ def anchored_at_once(point, omega, focal):
 
 
 CONVERTED = replace(
-    INVERSE_DEPTH_TO_CARTESIAN,
+    InverseDepthToCartesian(),
     name="inverse_depth_to_cartesian, converted",
     initialise=converted_at_once,
 )
 ANCHORED = replace(
-    PARALLAX_ANGLE, name="parallax_angle, with both anchors", initialise=anchored_at_once
+    ParallaxAngle(), name="parallax_angle, with both anchors", initialise=anchored_at_once
 )
 forms = [*each_landmark, CONVERTED, ANCHORED]
 
@@ -220,7 +220,7 @@ def test_a_negative_inverse_depth_is_legal_and_continuous(landmark, geometry):
 
 @with_geometry
 def test_inverse_scaling_is_linear_in_the_landmark(geometry):
-    _, transform, *_ = functions(INVERSE_SCALING)
+    _, transform, *_ = functions(InverseScaling())
     T, n = pose(geometry, 7), geometry.point_dim
     a, b = np.random.default_rng(0).normal(size=(2, n + 1))
     close(transform(T, 2 * a - 3 * b), 2 * transform(T, a) - 3 * transform(T, b), relative=1e-13)
@@ -229,7 +229,7 @@ def test_inverse_scaling_is_linear_in_the_landmark(geometry):
 @with_geometry
 def test_inverse_scaling_starts_in_pixels(geometry):
     """P22–P26: (u − cx, v − cy, f, f/d)."""
-    initialise, *_ = functions(INVERSE_SCALING)
+    initialise, *_ = functions(InverseScaling())
     expected = [*(FOCAL * bearing_of(geometry)), FOCAL, FOCAL * 0.2]
     np.testing.assert_allclose(initialise(bearing_of(geometry), 0.2), expected, rtol=1e-15)
 
@@ -269,30 +269,30 @@ def test_parallax_angle_is_the_triangle_of_two_anchors_and_a_point(geometry, see
     side = np.linalg.norm(baseline) * np.sin(np.pi - alpha - psi) / np.sin(alpha)
     np.testing.assert_allclose(np.linalg.norm(ray), side, rtol=1e-12)
     parameters = np.concatenate([main, associate, angles_of(jnp.asarray(ray)), [alpha, 1.0]])
-    euclidean = functions(PARALLAX_ANGLE)[-1]
+    euclidean = functions(ParallaxAngle())[-1]
     np.testing.assert_allclose(euclidean(parameters), point, rtol=1e-12)
 
 
 @pytest.mark.parametrize("moved", [0.0, 0.5, -0.5], ids=["not at all", "towards", "away"])
 @with_geometry
 def test_a_camera_that_moves_along_the_ray_has_no_parallax_and_finite_derivatives(geometry, moved):
-    parameters = generic(PARALLAX_ANGLE, geometry)
+    parameters = generic(ParallaxAngle(), geometry)
     main, ray = _main_and_ray(parameters, geometry)
     camera = jnp.asarray(main + moved * ray)
-    size = PARALLAX_ANGLE.size(geometry.point_dim)
-    value, J = value_and_jacobian(PARALLAX_ANGLE)(camera, parameters, jnp.eye(size))
+    size = ParallaxAngle().size(geometry.point_dim)
+    value, J = value_and_jacobian(ParallaxAngle())(camera, parameters, jnp.eye(size))
     np.testing.assert_array_equal(value, parameters)
     assert all(np.isfinite(part).all() for part in J)
     # And with such a second anchor, where no point is told, the formula is still finite.
     flat = jnp.concatenate([main, camera, parameters[2 * main.size : -2], jnp.array([0.1, 1.0])])
-    J = quick_jit(jax.jacfwd(PARALLAX_ANGLE.homogeneous))(flat)
+    J = quick_jit(jax.jacfwd(ParallaxAngle().homogeneous))(flat)
     assert all(np.isfinite(part).all() for part in J)
 
 
 def _main_and_ray(parameters, geometry):
     """The anchor, and the unit ray from there to the point."""
     main = np.asarray(parameters[: geometry.point_dim])
-    point = np.asarray(functions(PARALLAX_ANGLE)[-1](parameters))
+    point = np.asarray(functions(ParallaxAngle())[-1](parameters))
     return main, (point - main) / np.linalg.norm(point - main)
 
 
@@ -327,7 +327,7 @@ def with_last_sigma(size, sigma):
 @pytest.mark.parametrize("seed", range(3))
 @with_geometry
 def test_inverse_depth_becomes_cartesian_exactly_where_it_is_linear(geometry, seed):
-    landmark, n = INVERSE_DEPTH_TO_CARTESIAN, geometry.point_dim
+    landmark, n = InverseDepthToCartesian(), geometry.point_dim
     parameters = np.asarray(generic(landmark, geometry, INVERSE_DEPTHS[seed]))
     camera = np.random.default_rng(seed).uniform(-0.5, 0.5, n)
     point, rho = np.asarray(functions(landmark)[-1](parameters)), parameters[-2]
@@ -347,9 +347,9 @@ def test_inverse_depth_becomes_cartesian_exactly_where_it_is_linear(geometry, se
 @with_geometry
 def test_a_point_at_or_beyond_infinity_does_not_become_cartesian(geometry, rho):
     n = geometry.point_dim
-    parameters = generic(INVERSE_DEPTH_TO_CARTESIAN, geometry).at[-2].set(rho)
+    parameters = generic(InverseDepthToCartesian(), geometry).at[-2].set(rho)
     arguments = jnp.zeros(n), parameters, with_last_sigma(2 * n + 1, 1e-9)
-    value, J = value_and_jacobian(INVERSE_DEPTH_TO_CARTESIAN)(*arguments)
+    value, J = value_and_jacobian(InverseDepthToCartesian())(*arguments)
     np.testing.assert_array_equal(value, parameters)
     assert all(np.isfinite(part).all() for part in J)
 
@@ -357,7 +357,7 @@ def test_a_point_at_or_beyond_infinity_does_not_become_cartesian(geometry, rho):
 @pytest.mark.parametrize("seed", range(3))
 @with_geometry
 def test_a_camera_becomes_the_associate_anchor_exactly_at_the_least_parallax(geometry, seed):
-    landmark, n = PARALLAX_ANGLE, geometry.point_dim
+    landmark, n = ParallaxAngle(), geometry.point_dim
     parameters = np.asarray(generic(landmark, geometry, INVERSE_DEPTHS[seed]))
     main, ray = _main_and_ray(parameters, geometry)
     point = np.asarray(functions(landmark)[-1](parameters))
@@ -384,10 +384,10 @@ def test_a_camera_becomes_the_associate_anchor_exactly_at_the_least_parallax(geo
     np.testing.assert_array_equal(again, anchored)
 
 
-@pytest.mark.parametrize("landmark", [INVERSE_DEPTH_TO_CARTESIAN, PARALLAX_ANGLE], ids=named)
+@pytest.mark.parametrize("landmark", [InverseDepthToCartesian(), ParallaxAngle()], ids=named)
 @with_geometry
 def test_until_its_conversion_a_landmark_is_one_of_unified_inverse_depth(geometry, landmark):
-    parameters, plain = generic(landmark, geometry), generic(INVERSE_DEPTH, geometry)
-    ours, theirs = (functions(p)[2](x) for p, x in ((landmark, parameters), (INVERSE_DEPTH, plain)))
+    parameters, plain = generic(landmark, geometry), generic(UnifiedInverseDepth(), geometry)
+    ours, theirs = (functions(p)[2](x) for p, x in ((landmark, parameters), (UnifiedInverseDepth(), plain)))
     np.testing.assert_allclose(jnp.append(*ours), jnp.append(*theirs), rtol=1e-14)
     assert parameters[-1] == 0.0

@@ -17,8 +17,8 @@ from jaxslam._numerics.arrays import is_number
 from jaxslam._runtime import watchdog
 from jaxslam._runtime.watchdog import lapack_calls
 from jaxslam.consistency.backends import _filter_batch
-from jaxslam.filters.forms.correction import AbstractCorrection, kalman_update
-from jaxslam.filters.forms.covariance import Covariance
+from jaxslam.filters.linear.kalman import AbstractCorrection, kalman_update
+from jaxslam.filters.linear.covariance import Covariance
 from jaxslam.simulation import Room, sensor_of, simulate
 
 MATRICES = """
@@ -146,4 +146,4 @@ def test_a_filter_that_calls_lapack_is_warned_of():
     made = jaxslam.make_filters(chosen, ["robocentric"], ["inverse_scaling"], "known")
     (base,) = made.values()
     with pytest.warns(UserWarning, match="calls LAPACK in a batch \\(cholesky"):
-        jaxslam.monte_carlo(chosen, {"mine": replace(base, form=Covariance(ByLapack()))}, runs=2)
+        jaxslam.monte_carlo(chosen, {"mine": replace(base, correction=ByLapack())}, runs=2)

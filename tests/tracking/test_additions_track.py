@@ -9,7 +9,7 @@ pytest.importorskip("cv2")
 from additions import PLAIN_HOMOGENEOUS, BiasedVelocity, DriftingFocal, Huber, Pixels
 
 import jaxslam
-from jaxslam.filters.forms.covariance import Covariance
+from jaxslam.filters.linear.covariance import Covariance
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
@@ -36,10 +36,10 @@ def pieces_of(kind, calibration):
 @pytest.mark.parametrize("kind", ["sensor and motion", "landmark, calibration and remedy"])
 def test_additions_of_ones_own_track(kind):
     source = synthetic_source(frames=FRAMES)
-    slam = jaxslam.EkfSlam(
+    slam = jaxslam.Slam(
         **pieces_of(kind, source.calibration),
         depth=jaxslam.InverseDepth.beyond(1.0),
-        coordinates=jaxslam.WORLD,
+        frame=jaxslam.WorldCentric(),
     )
     tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=20, spare=4), slam)
     tracked = [tracker.track(frame) for frame in source]

@@ -459,7 +459,7 @@ def test_an_unknown_calibration_counts_in_the_first_frame_too():
         tracker.track(frame)
     slots = jnp.array(sorted(tracker.landmarks))
     slam = tracker.map.estimator.slam
-    assert isinstance(slam, jaxslam.EkfSlam)
+    assert isinstance(slam, jaxslam.Slam)
     charts, covariances = eqx.filter_jit(landmarks_in_camera)(
         slam, tracker.map.estimator.state, slots, slam.sensor
     )
@@ -547,7 +547,7 @@ def test_a_filter_of_ones_own_tracks_as_the_built_in_one_does():
     source = synthetic_source(frames=12)
     settings = TrackerSettings(wanted=12, spare=4, filter="robocentric")  # not the one that tracks
     world = replace(settings, filter="world").make_filter(source.calibration)
-    assert isinstance(world, jaxslam.EkfSlam)
+    assert isinstance(world, jaxslam.Slam)
     compiled = []
     own = Tracker(source.calibration, settings, Outside(world, lambda: compiled.append(1)))
     built_in = Tracker(source.calibration, replace(settings, filter="world"))

@@ -88,7 +88,7 @@ def half_hidden(frame):
 
 def wandering(calibration, opening, fixed_at):
     world = SETTINGS.make_filter(calibration)
-    assert isinstance(world, jaxslam.EkfSlam)
+    assert isinstance(world, jaxslam.Slam)
     opening = np.pad(opening, (0, FRAMES + 1 - len(opening)), "edge")  # one program for all
     return Wandering(world, *map(jnp.asarray, (WANDER, opening, fixed_at)))
 

@@ -26,12 +26,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.linalg import semidefinite_root
-from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.forms.blocks import apart, shifted
-from jaxslam.filters.forms.state import AbstractState
-from jaxslam.filters.submaps.handover import Frozen, Submaps, SubmapsState
+from jaxslam.filters.layer import AbstractSlam
+from jaxslam.filters.linear.blocks import minus, plus
+from jaxslam.filters.linear.state import AbstractState
+from jaxslam.filters.submaps.handover import Frozen, SubmapsState
 from jaxslam.geometry import Pose, difference, identity, retract
-from jaxslam.models.coordinates import KeyframePose
+from jaxslam.models.frame import KeyframePose
 
 LINEARISATION = 1e-3
 """Variance of the error of second order of each number of a submap, as a share of its own."""
@@ -63,11 +63,11 @@ class Link(eqx.Module):
     whitening: Float[Array, "*N n n"]
     """… and its inverse."""
 
-    def shifted(self, told: Float[Array, " n"], y: Float[Array, " n"]) -> SubmapMean:
+    def plus(self, told: Float[Array, " n"], y: Float[Array, " n"]) -> SubmapMean:
         """Return the mean for what is told of its separator, and for white numbers of its own."""
         white = jnp.where(self.free, y, self.whitening @ told)
         delta = jnp.zeros_like(y).at[self.order].set(self.root @ white)
-        return shifted(self.state, delta)
+        return plus(self.state, delta)
 
     def by_white(self) -> Float[Array, "n n"]:
         """Return the Jacobian of the mean's numbers by the white ones."""
@@ -77,7 +77,7 @@ class Link(eqx.Module):
 class Chain(eqx.Module):
     """N submaps, the oldest first; the last is the one that is going on."""
 
-    slam: EkfSlam
+    slam: AbstractSlam
     links: Link
 
     @property
@@ -91,7 +91,7 @@ class Chain(eqx.Module):
 
         def earlier(later: SubmapMean, data):
             link, y, newest = data
-            state = link.shifted(jnp.where(newest, 0.0, self._told(link, later)), y)
+            state = link.plus(jnp.where(newest, 0.0, self._told(link, later)), y)
             return state, state
 
         N, _ = self.shape
@@ -111,7 +111,7 @@ class Chain(eqx.Module):
             depth_error=core.depth_error,
         )
         now = replace(frozen, core=seen, landmarks=back(later.landmarks))
-        return jnp.where(link.free, 0.0, apart(now, frozen)[link.order])
+        return jnp.where(link.free, 0.0, minus(now, frozen)[link.order])
 
     def _onwards(
         self, above: Float[Array, "k n"], link: Link, later: SubmapMean
@@ -120,7 +120,7 @@ class Chain(eqx.Module):
         `later`, of what has the one `above` by the submap's own."""
         white = above @ link.by_white()
         zero = jnp.zeros(above.shape[1], above.dtype)
-        _, pull = jax.vjp(lambda delta: self._told(link, shifted(later, delta)), zero)
+        _, pull = jax.vjp(lambda delta: self._told(link, plus(later, delta)), zero)
         (through,) = jax.vmap(pull)(jnp.where(link.free, 0.0, white) @ link.whitening)
         return jnp.where(link.free, white, 0.0), through
 
@@ -143,7 +143,7 @@ class Chain(eqx.Module):
         value = function(states)
 
         def moved(delta: Float[Array, "N n"]) -> Float[Array, " k"]:
-            return difference(function(jax.vmap(shifted)(states, delta)), value)
+            return difference(function(jax.vmap(plus)(states, delta)), value)
 
         return value, self.rows(states, jax.jacrev(moved)(jnp.zeros(self.shape)))
 
@@ -166,7 +166,7 @@ class Chain(eqx.Module):
             T_BC = _camera(T, state, own.first)
 
             def moved(nudge, delta):
-                there = _camera(retract(T, nudge), shifted(state, delta), own.first)
+                there = _camera(retract(T, nudge), plus(state, delta), own.first)
                 return difference(there, T_BC)
 
             A, E = jax.jacrev(moved, (0, 1))(jnp.zeros(t, known.dtype), zero)
@@ -179,7 +179,7 @@ class Chain(eqx.Module):
             own, after, known, R, C, X = data
             B = own.by_white()
             by_told = jnp.where(own.free, 0.0, B) @ own.whitening
-            F = by_told @ jax.jacfwd(lambda delta: self._told(own, shifted(after, delta)))(zero)
+            F = by_told @ jax.jacfwd(lambda delta: self._told(own, plus(after, delta)))(zero)
             B = jnp.where(own.free, B, 0.0)
             V, Y = B @ B.T + F @ V @ F.T, B @ known.T + F @ Y
             less = X + R @ Y
@@ -199,23 +199,24 @@ def _next(states: PyTree) -> PyTree:
     return jax.tree.map(lambda x: jnp.concatenate([x[1:], x[-1:]]), states)
 
 
-def chain(slam: Submaps, state: SubmapsState, count: int) -> Chain:
+def chain(slam: AbstractSlam, state: SubmapsState, count: int) -> Chain:
     """Return the chain of the latest `count` submaps of a filter and the one that goes on.
 
     In a batch of runs all have one length: what a run does not have are links that say nothing.
     Raises ValueError for more than the state keeps.
     """
-    if not 0 <= count <= slam.history:
-        raise ValueError(f"the state keeps {slam.history} submaps, not {count}")
-    _, newest = slam.base.gaussian(state.inner, None)
+    history = slam.frame.history
+    if not 0 <= count <= history:
+        raise ValueError(f"the state keeps {history} submaps, not {count}")
+    _, newest = slam.inner.gaussian(state.inner, None)
     place = state.count - count + jnp.arange(count)
-    frozen = jax.tree.map(lambda x: x[place % slam.history], state.frozen)
+    frozen = jax.tree.map(lambda x: x[place % history], state.frozen)
     last = Frozen(newest, jnp.zeros_like(state.numbers, bool), state.numbers)
     frozen = jax.tree.map(lambda all, one: jnp.concatenate([all, one[None]]), frozen, last)
-    return chained(slam.ekf, frozen, jnp.append(place >= 0, True))
+    return chained(slam.one, frozen, jnp.append(place >= 0, True))
 
 
-def chained(slam: EkfSlam, frozen: Frozen, there: Bool[Array, " N"]) -> Chain:
+def chained(slam: AbstractSlam, frozen: Frozen, there: Bool[Array, " N"]) -> Chain:
     """Return submaps as a chain, the oldest first, of which the first may be none (`there`)."""
     N = len(there)
     newest, first = jnp.arange(N) == N - 1, there & (jnp.cumsum(there) == 1)
@@ -223,7 +224,7 @@ def chained(slam: EkfSlam, frozen: Frozen, there: Bool[Array, " N"]) -> Chain:
 
 
 def link(
-    slam: EkfSlam,
+    slam: AbstractSlam,
     frozen: Frozen,
     there: Bool[Array, ""],
     newest: Bool[Array, ""],
@@ -243,7 +244,7 @@ def link(
     return Link(mean, frozen.numbers, first, order, ~separator[order], *factor)
 
 
-def _separator(slam: EkfSlam, frozen: Frozen) -> Bool[Array, " n"]:
+def _separator(slam: AbstractSlam, frozen: Frozen) -> Bool[Array, " n"]:
     """Which numbers of a submap go on."""
     state = frozen.state
     constant = ["motion", "log_scale", "depth_error"]

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.linalg import cholesky
-from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.window.problem import (
     Path,
     Reduced,
@@ -55,7 +55,7 @@ def started(x: X, y: Y) -> Minimum:
 
 
 def minimised(
-    slam: EkfSlam, record: Record, start: Minimum, steps: int | Int[Array, ""]
+    slam: AbstractSlam, record: Record, start: Minimum, steps: int | Int[Array, ""]
 ) -> tuple[Minimum, Reduced]:
     """The state of a minimisation after at most so many steps, and the quadratic there."""
     shapes = jax.eval_shape(lambda at: reduced(slam, record, at.x, at.y), start)
@@ -72,7 +72,7 @@ def minimised(
     return jax.lax.while_loop(going, once, (jnp.zeros((), int), start, nothing))[1:]
 
 
-def _step(slam: EkfSlam, record: Record, now: Minimum, local: Reduced) -> tuple[Minimum, Reduced]:
+def _step(slam: AbstractSlam, record: Record, now: Minimum, local: Reduced) -> tuple[Minimum, Reduced]:
     """One of Levenberg–Marquardt; the first only brings the landmarks to their best."""
     fresh = jnp.isinf(now.cost)
     H, g = local.information, local.gradient
@@ -96,7 +96,7 @@ def _step(slam: EkfSlam, record: Record, now: Minimum, local: Reduced) -> tuple[
     return Minimum(*at, damping, settled | (damping > 1e8)), local
 
 
-def landmarks(slam: EkfSlam, record: Record, at: Path, y: Y, steps: int) -> tuple[Y, Scalar]:
+def landmarks(slam: AbstractSlam, record: Record, at: Path, y: Y, steps: int) -> tuple[Y, Scalar]:
     """Every landmark at its best given the path, by damped Gauss–Newton; and |y|² + |r|²."""
     eye = jnp.eye(y.shape[1], dtype=y.dtype)
 
@@ -122,7 +122,7 @@ def landmarks(slam: EkfSlam, record: Record, at: Path, y: Y, steps: int) -> tupl
     return y, jnp.sum(cost)
 
 
-def turned(slam: EkfSlam, record: Record, x: X, y: Y) -> X:
+def turned(slam: AbstractSlam, record: Record, x: X, y: Y) -> X:
     """The start of the motion with the rotation that fits its translation best.
 
     Only the initial angular velocity moves: it takes up the mean flow.

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.conditional import cond, map_where, zeros
 from jaxslam._numerics.linalg import Cholesky, cholesky
-from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.window.minimise import Minimum, minimised, started, turned
 from jaxslam.filters.window.problem import PathLayout, Reduced, X, Y, left_out
 from jaxslam.filters.window.record import Record
@@ -56,7 +56,7 @@ class Modes(eqx.Module):
     """By how many σ every landmark is not one point of the world, if the others are."""
 
 
-def at_rest(slam: EkfSlam, record: Record, count: int, dtype: DTypeLike) -> Modes:
+def at_rest(slam: AbstractSlam, record: Record, count: int, dtype: DTypeLike) -> Modes:
     """The modes before anything is known: one, the prior's mean."""
     size, m = PathLayout.of(slam).size(record.frames), record.first.size
     q = slam.sensor.size + slam.sensor.hidden
@@ -78,7 +78,7 @@ def directions(n: int, count: int) -> np.ndarray:
 
 
 def starts(
-    slam: EkfSlam, record: Record, likeliest: Minimum, wanted: Bool[Array, " starts"]
+    slam: AbstractSlam, record: Record, likeliest: Minimum, wanted: Bool[Array, " starts"]
 ) -> Minimum:
     """The prior's mean, the reversal of what is likeliest, and translations in all directions,
     those that are wanted with the rotations that fit them."""
@@ -95,7 +95,7 @@ def starts(
     return jax.vmap(started)(*map_where(fitted, (x, y), wanted, record))
 
 
-def reversed_(slam: EkfSlam, at: Minimum) -> tuple[X, Y]:
+def reversed_(slam: AbstractSlam, at: Minimum) -> tuple[X, Y]:
     """The other way, among points that are as much too near as they were too far."""
     layout, p = PathLayout.of(slam), slam.sensor.size
     x = enlarged(slam, at.x, jnp.asarray(-1.0, at.x.dtype))
@@ -113,7 +113,7 @@ class Found(NamedTuple):
 
 
 def searched(
-    slam: EkfSlam, record: Record, modes: Modes, search: Bool[Array, " starts"], frames: int
+    slam: AbstractSlam, record: Record, modes: Modes, search: Bool[Array, " starts"], frames: int
 ) -> Found:
     """Those `starts`; of a window of more than so many frames, the minima that are found from them
     in as many frames, spread over it: minima of the whole window are near."""
@@ -140,7 +140,7 @@ def searched(
 
 
 def sought(
-    slam: EkfSlam, record: Record, modes: Modes, found: Found
+    slam: AbstractSlam, record: Record, modes: Modes, found: Found
 ) -> tuple[Modes, Mean, Bool[Array, ""]]:
     """The modes with what has been measured since, each from where it is, and what there is beside
     them where that was `found`.
@@ -197,7 +197,7 @@ def _candidates(minima: Minimum, steps: Int[Array, " k"], means: Mean | None = N
     return Candidate(minima, steps, none, square, jnp.zeros_like(none), doubts, means)
 
 
-def _minimum(slam: EkfSlam, begun: Candidate, record: Record) -> Candidate:
+def _minimum(slam: AbstractSlam, begun: Candidate, record: Record) -> Candidate:
     """The minimum near a start, and its evidence."""
     at, local = minimised(slam, record, begun.minimum, begun.steps)
     return _with_evidence(begun, record, at, local, cholesky(local.information))
@@ -215,7 +215,7 @@ def _with_evidence(
     return of._replace(minimum=at, evidence=value, information=local.information)
 
 
-def _weighed(slam: EkfSlam, begun: Candidate, record: Record) -> Candidate:
+def _weighed(slam: AbstractSlam, begun: Candidate, record: Record) -> Candidate:
     """The minimum near a start, weighed, and its mean.
 
     Of the mean only the landmarks are sought. Both are one loop, so that they are one program.

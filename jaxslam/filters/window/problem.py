@@ -20,7 +20,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.linalg import Cholesky, cholesky
-from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.window.record import Record
 from jaxslam.geometry import Pose, Scalar, homogeneous_apply, identity, jacobian, nudge, retract
 from jaxslam.models.motion import Control
@@ -62,7 +62,7 @@ class PathLayout(NamedTuple):
     """Calibration drawn in every frame."""
 
     @staticmethod
-    def of(slam: EkfSlam) -> PathLayout:
+    def of(slam: AbstractSlam) -> PathLayout:
         _, root = slam.motion.start()
         own = slam.calibration.sigma.size
         each = own if slam.calibration.each_frame else 0
@@ -79,7 +79,7 @@ class PathLayout(NamedTuple):
         return self.whole + (frames - 1) * (self.step + self.each)
 
 
-def path(slam: EkfSlam, record: Record, x: X) -> Path:
+def path(slam: AbstractSlam, record: Record, x: X) -> Path:
     """Poses, velocities and calibrations of all frames. After the last, nothing moves."""
     layout, motion = PathLayout.of(slam), slam.motion
     mean, root = motion.start()
@@ -109,7 +109,7 @@ def _driven_by(record: Record) -> tuple[Control, Float[Array, " steps"], Bool[Ar
     return record.controls, record.merged, record.restarted
 
 
-def _moved(slam: EkfSlam, state, control, merged: Scalar, restarted: Bool[Array, ""], numbers):
+def _moved(slam: AbstractSlam, state, control, merged: Scalar, restarted: Bool[Array, ""], numbers):
     """Pose, motion's variables and calibration one step on.
 
     The mean of m white accelerations has σ/√m, the sum of m drifts √m σ. A velocity that is drawn
@@ -132,7 +132,7 @@ def _moved(slam: EkfSlam, state, control, merged: Scalar, restarted: Bool[Array,
 
 
 def located(
-    slam: EkfSlam,
+    slam: AbstractSlam,
     calibration: Float[Array, " k"],
     common: Float[Array, " c"],
     measured: Float[Array, " p"],
@@ -145,7 +145,7 @@ def located(
 
 
 def hidden(
-    slam: EkfSlam, common: Float[Array, " c"], own: Float[Array, "*m o"]
+    slam: AbstractSlam, common: Float[Array, " c"], own: Float[Array, "*m o"]
 ) -> Float[Array, "*m o"]:
     """`1/z = mean + σ (e_i + common c)`, 1/m: what a measurement hides."""
     depth = slam.depth
@@ -168,7 +168,7 @@ class Sight(NamedTuple):
     by_y: Float[Array, "h q"]
 
 
-def sights(slam: EkfSlam, record: Record, at: Path, y: Y) -> Sight:
+def sights(slam: AbstractSlam, record: Record, at: Path, y: Y) -> Sight:
     """The sights of all landmarks, from the frames in which they were first seen."""
     calibrations = at.frames.calibration[record.first]
 
@@ -184,7 +184,7 @@ def sights(slam: EkfSlam, record: Record, at: Path, y: Y) -> Sight:
     return jax.vmap(one)(record.first_measured, calibrations, y)
 
 
-def _by_motion(slam: EkfSlam, point: Float[Array, " n"], omega: Scalar) -> Array:
+def _by_motion(slam: AbstractSlam, point: Float[Array, " n"], omega: Scalar) -> Array:
     """Jacobian of the homogeneous point (Exp(δ) X, ω) by δ at 0."""
     still = identity(slam.motion.geometry, point.dtype)
 
@@ -218,7 +218,7 @@ class Seen(NamedTuple):
     """(X, ω) in the camera."""
 
 
-def _compared(slam: EkfSlam, record: Record, at: Path, y: Y) -> tuple[Sight, Seen, Array]:
+def _compared(slam: AbstractSlam, record: Record, at: Path, y: Y) -> tuple[Sight, Seen, Array]:
     """The sights, what is seen of them in every frame, and its Jacobian by (X, ω) in the camera of
     the first sight."""
     sight, relative = sights(slam, record, at, y), _relative(record, at)
@@ -228,7 +228,7 @@ def _compared(slam: EkfSlam, record: Record, at: Path, y: Y) -> tuple[Sight, See
     return sight, seen, by_sight.at[..., -1].add(by_omega)
 
 
-def _seen(slam: EkfSlam, record: Record, at: Path, relative, sight: Sight) -> Seen:
+def _seen(slam: AbstractSlam, record: Record, at: Path, relative, sight: Sight) -> Seen:
     whitening = cholesky(slam.sensor.noise).whitening
 
     def one(T, calibration, point, omega, measured):
@@ -260,7 +260,7 @@ def _seen(slam: EkfSlam, record: Record, at: Path, relative, sight: Sight) -> Se
 
 
 def landmark_slopes(
-    slam: EkfSlam, record: Record, at: Path, y: Y
+    slam: AbstractSlam, record: Record, at: Path, y: Y
 ) -> tuple[Float[Array, "m q q"], Y, Float[Array, " m"]]:
     """The information, gradient and |y|² + |r|² of every landmark given the path; the last is ∞
     if it is measured and cannot be seen."""
@@ -273,7 +273,7 @@ def landmark_slopes(
     return information, gradient, jnp.where(possible, cost, jnp.inf)
 
 
-def residuals(slam: EkfSlam, record: Record, at: Path, y: Y) -> Float[Array, "F m p"]:
+def residuals(slam: AbstractSlam, record: Record, at: Path, y: Y) -> Float[Array, "F m p"]:
     """`(z − h)/σ` of all measurements that are compared, zero elsewhere."""
     sight = sights(slam, record, at, y)
     return _seen(slam, record, at, _relative(record, at), sight).residual
@@ -287,7 +287,7 @@ class Sensitivities(NamedTuple):
     motion: Float[Array, "F v N"]
 
 
-def sensitivities(slam: EkfSlam, record: Record, x: X, at: Path) -> Sensitivities:
+def sensitivities(slam: AbstractSlam, record: Record, x: X, at: Path) -> Sensitivities:
     """Step by step, by the chain rule."""
     begun, driving = _driven(slam, record, x)
     states = len(begun)
@@ -305,7 +305,7 @@ def sensitivities(slam: EkfSlam, record: Record, x: X, at: Path) -> Sensitivitie
 
 
 def _driven(
-    slam: EkfSlam, record: Record, x: X
+    slam: AbstractSlam, record: Record, x: X
 ) -> tuple[Float[Array, "s N"], Float[Array, "steps w N"]]:
     """Jacobians by x of (pose, motion, calibration) in frame 0, and of what drives every step."""
     layout, eye = PathLayout.of(slam), jnp.eye(x.size, dtype=x.dtype)
@@ -318,7 +318,7 @@ def _driven(
     return begun, driving.reshape(record.frames - 1, -1, x.size)
 
 
-def _slopes(slam: EkfSlam, record: Record, x: X, at: Path) -> Float[Array, "steps s d"]:
+def _slopes(slam: AbstractSlam, record: Record, x: X, at: Path) -> Float[Array, "steps s d"]:
     """Jacobian of every step by the state before it and by what drives it, d = s + w numbers."""
     states = at.frames.pose, at.motion, at.frames.calibration
     before = jax.tree.map(lambda leaf: leaf[:-1], states)
@@ -344,7 +344,7 @@ class Linear(NamedTuple):
     by_y: Float[Array, "F m p q"]
 
 
-def linearised(slam: EkfSlam, record: Record, at: Path, y: Y) -> Linear:
+def linearised(slam: AbstractSlam, record: Record, at: Path, y: Y) -> Linear:
     """The residuals at a path and landmarks."""
     sight, seen, by_sight = _compared(slam, record, at, y)
     here = jax.vmap(jax.vmap(lambda X: _by_motion(slam, X[:-1], X[-1])))(seen.points)
@@ -431,7 +431,7 @@ class Reduced(NamedTuple):
     """C, so that y given x has the mean ŷ − C (x − x̂)."""
 
 
-def reduced(slam: EkfSlam, record: Record, x: X, y: Y) -> Reduced:
+def reduced(slam: AbstractSlam, record: Record, x: X, y: Y) -> Reduced:
     """One linearisation: normal equations by the frames' tangents, without the landmarks; then
     by x."""
     at = path(slam, record, x)
@@ -451,7 +451,7 @@ def reduced(slam: EkfSlam, record: Record, x: X, y: Y) -> Reduced:
 
 
 def left_out(
-    slam: EkfSlam, record: Record, local: Reduced, y: Y, factor: Cholesky
+    slam: AbstractSlam, record: Record, local: Reduced, y: Y, factor: Cholesky
 ) -> Float[Array, " m"]:
     """By how much `|x|² + |y|² + |r|²` falls at a minimum, to first order, where all that was seen
     of one landmark is left out and the rest is minimised anew; `factor` is of x's information.
@@ -473,7 +473,7 @@ def left_out(
     return jnp.sum(jax.vmap(lambda L, r: L.whitening @ r)(own, r) ** 2, axis=1)
 
 
-def _to_x(slam: EkfSlam, S: Sensitivities) -> Float[Array, "z N"]:
+def _to_x(slam: AbstractSlam, S: Sensitivities) -> Float[Array, "z N"]:
     """Jacobian by x of all frames' tangents and the common error."""
     layout, size = PathLayout.of(slam), S.frame.shape[-1]
     eye = jnp.eye(size, dtype=S.frame.dtype)

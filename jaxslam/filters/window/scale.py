@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.linalg import Cholesky, cholesky
-from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.window.minimise import Minimum
 from jaxslam.filters.window.problem import PathLayout, Reduced, X, Y, hidden
 from jaxslam.filters.window.record import Record
@@ -42,7 +42,7 @@ class Direction(NamedTuple):
         return jnp.sum(self.x**2) + jnp.sum(self.y**2)
 
 
-def rescaled(slam: EkfSlam, record: Record, at: Minimum, log_scale: Scalar) -> tuple[X, Y]:
+def rescaled(slam: AbstractSlam, record: Record, at: Minimum, log_scale: Scalar) -> tuple[X, Y]:
     """The likeliest unknowns with all lengths e^λ times as large: the same pixels."""
     factor, p = jnp.exp(log_scale), slam.sensor.size
     layout = PathLayout.of(slam)
@@ -55,7 +55,7 @@ def rescaled(slam: EkfSlam, record: Record, at: Minimum, log_scale: Scalar) -> t
 
 
 def _shared(
-    slam: EkfSlam, begun: Bool[Array, "m 1"], inverse_depths: Float[Array, "m o"]
+    slam: AbstractSlam, begun: Bool[Array, "m 1"], inverse_depths: Float[Array, "m o"]
 ) -> tuple[Float[Array, " c"], Float[Array, "m o"]]:
     """The likeliest common and own errors of inverse depths."""
     depth = slam.depth
@@ -67,7 +67,7 @@ def _shared(
     return common[None], own - ratio * common
 
 
-def enlarged(slam: EkfSlam, x: X, factor: Scalar) -> X:
+def enlarged(slam: AbstractSlam, x: X, factor: Scalar) -> X:
     """The path with all lengths so many times as large; −1 goes the other way."""
     layout, motion = PathLayout.of(slam), slam.motion
     mean, root = motion.start()
@@ -81,7 +81,7 @@ def enlarged(slam: EkfSlam, x: X, factor: Scalar) -> X:
     return x.at[layout.whole :].set(steps.at[:, :own].set(noises).ravel())
 
 
-def scaling(slam: EkfSlam, record: Record, at: Minimum) -> Direction:
+def scaling(slam: AbstractSlam, record: Record, at: Minimum) -> Direction:
     """s: of those that differ by what common and own errors of depth share, the shortest."""
     zero = jnp.zeros((), at.x.dtype)
     _, (x, y) = jax.jvp(lambda by: rescaled(slam, record, at, by), (zero,), (zero + 1,))
@@ -97,7 +97,7 @@ def variances(local: Reduced, whitening: Float[Array, "N N"]) -> tuple[X, Y]:
 
 
 def shift_of_scale(
-    slam: EkfSlam, record: Record, at: Minimum, local: Reduced, factor: Cholesky
+    slam: AbstractSlam, record: Record, at: Minimum, local: Reduced, factor: Cholesky
 ) -> Scalar:
     """λ of the mean, of a density that has its maximum at 0: where the prior and the volume of the
     rest balance, all lengths enlarged alike."""

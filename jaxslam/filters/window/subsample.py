@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.window.minimise import Minimum
 from jaxslam.filters.window.problem import PathLayout, X, Y
 from jaxslam.filters.window.record import Record
@@ -51,7 +51,7 @@ def tied(record: Record) -> Bool[Array, ""]:
     return jnp.all(jnp.sum(before & after, axis=1) >= TIED * jnp.sum(after, axis=1))
 
 
-def thinned(slam: EkfSlam, record: Record, minima: Minimum) -> tuple[Record, Minimum]:
+def thinned(slam: AbstractSlam, record: Record, minima: Minimum) -> tuple[Record, Minimum]:
     """A full window with every other frame, and a batch of minima as its starts."""
     coarse = Coarse(slam, record, 2, record.frames)
     x, y = jax.vmap(coarse.of)(minima.x, minima.y)
@@ -61,12 +61,12 @@ def thinned(slam: EkfSlam, record: Record, minima: Minimum) -> tuple[Record, Min
 class Coarse(eqx.Module):
     """A window with fewer frames, in so many places."""
 
-    slam: EkfSlam
+    slam: AbstractSlam
     whole: Record
     record: Record
     kept: Kept
 
-    def __init__(self, slam: EkfSlam, whole: Record, stride: int | Int[Array, ""], frames: int):
+    def __init__(self, slam: AbstractSlam, whole: Record, stride: int | Int[Array, ""], frames: int):
         self.slam, self.whole, self.kept = slam, whole, every(whole, stride, frames)
         self.record = _fewer(whole, self.kept)
 

@@ -14,19 +14,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.linalg import Cholesky, cholesky
-from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.forms.blocks import shifted
-from jaxslam.filters.forms.state import State
+from jaxslam.filters.layer import AbstractSlam
+from jaxslam.filters.linear.blocks import plus
+from jaxslam.filters.linear.state import State
 from jaxslam.filters.model import Core
 from jaxslam.filters.window.minimise import Minimum
 from jaxslam.filters.window.problem import PathLayout, Reduced, located
 from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.scale import Direction, scaling
 from jaxslam.geometry import identity, jacobian, scaled
-from jaxslam.models.scale import ScaleGauge
 
 
-def gauge_state(slam: EkfSlam, record: Record, at: Minimum, local: Reduced, like: State) -> State:
+def gauge_state(slam: AbstractSlam, record: Record, at: Minimum, local: Reduced, like: State) -> State:
     """The filter's state of one mode where its mean is, in a unit that is a metre there."""
     s, factor = scaling(slam, record, at), cholesky(local.information)
     # The rest moves to where it is likeliest at this scale.
@@ -47,7 +46,7 @@ def _state(slam, record, at, step, local, s: Direction, factor: Cholesky, like: 
     own = jnp.where(active[:, None, None], own, 0.0)
     landmarks = jnp.where(active[:, None], values, like.landmarks)
     covariance = _with_metre(_covariance(local, factor, rows, own, scale), like)
-    return shifted(State(core, landmarks, active, covariance, like.memory), -rows.x @ step)
+    return plus(State(core, landmarks, active, covariance), -rows.x @ step)
 
 
 class Rows(NamedTuple):
@@ -58,12 +57,12 @@ class Rows(NamedTuple):
     unit: Float[Array, "*n"]
 
 
-def _scale(slam: EkfSlam, local: Reduced, s: Direction) -> Direction:
+def _scale(slam: AbstractSlam, local: Reduced, s: Direction) -> Direction:
     """The derivative of λ by x and by e, what is left of every y; zero in a filter without.
 
     `y = ŷ − C (x − x̂) + e`.
     """
-    squared = s.squared if isinstance(slam.scale, ScaleGauge) else jnp.inf
+    squared = s.squared if slam.scale.free else jnp.inf
     by_x = s.x - jnp.einsum("mq,mqn->n", s.y, local.coupling)
     return Direction(by_x / squared, s.y / squared)
 
@@ -147,7 +146,7 @@ def _covariance(
     return covariance.at[place[:, :, None], place[:, None]].add(blocks)
 
 
-def _core(slam: EkfSlam, like, newest, log_scale):
+def _core(slam: AbstractSlam, like, newest, log_scale):
     """The filter's core, with lengths in units of e^λ m."""
     frame, variables, common = newest
     unit = jnp.exp(-log_scale[0])
@@ -155,7 +154,7 @@ def _core(slam: EkfSlam, like, newest, log_scale):
     kept = not slam.calibration.each_frame
     return replace(
         like,
-        pose=slam.coordinates.from_base_pose(scaled(frame.pose, unit)),
+        pose=slam.frame.from_base_pose(scaled(frame.pose, unit)),
         motion=variables,
         log_scale=None if like.log_scale is None else like.log_scale.at[:1].set(log_scale),
         calibration=frame.calibration if kept else like.calibration,
@@ -165,13 +164,13 @@ def _core(slam: EkfSlam, like, newest, log_scale):
     )
 
 
-def _landmark(slam: EkfSlam, newest, first, y, measured, log_scale):
+def _landmark(slam: AbstractSlam, newest, first, y, measured, log_scale):
     """The landmark in the map frame of the newest camera, in units of e^λ m."""
     frame, _, common = newest
     seen, omega = located(slam, first.calibration, common, measured, y)
     unit = jnp.exp(-log_scale[0])
-    held = slam.coordinates.from_base_pose(scaled(frame.pose, unit))
-    T_AC = slam.coordinates.map_from_camera(held, identity(slam.motion.geometry, y.dtype))
+    held = slam.frame.from_base_pose(scaled(frame.pose, unit))
+    T_AC = slam.frame.map_from_camera(held, identity(slam.motion.geometry, y.dtype))
     T_CF = frame.pose.inverse() @ first.pose
     landmark = slam.landmark.initialise(seen, omega / unit, jnp.asarray(slam.sensor.focal))
     return slam.landmark.transform(T_AC @ scaled(T_CF, unit), landmark)

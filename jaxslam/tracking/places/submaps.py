@@ -1,6 +1,6 @@
 """The submaps of a map as the tracker keeps them: what ends is frozen, and a loop corrects all.
 
-A filter in `SUBMAP` coordinates hands over when the camera has left the scene in which its submap
+A filter whose frame is `Submaps` hands over when the camera has left the scene in which its submap
 began (`jaxslam.filters.submaps`). A landmark that is given up before the next hand-over is one that
 the next submap says nothing of.
 """
@@ -20,14 +20,14 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam._runtime.programs import Program
-from jaxslam.filters.ekf import EkfSlam, each_gaussian, ekf_inside, rebased
+from jaxslam.filters.gaussian import each_gaussian, rebased
+from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.model import COMPOSED, CameraInMap
 from jaxslam.filters.protocol import AbstractStaged, Belief, LandmarkView
 from jaxslam.filters.submaps.chain import Chain, Link, SubmapMean, base_poses, link
 from jaxslam.filters.submaps.closing import Posterior, posterior
-from jaxslam.filters.submaps.handover import PARALLAX, TURN, Frozen
+from jaxslam.filters.submaps.handover import Frozen
 from jaxslam.geometry import difference, retract
-from jaxslam.models.coordinates import SUBMAP, KeyframePose, keyframe_due
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
 from jaxslam.tracking.settings import TrackerSettings
 
@@ -52,7 +52,7 @@ class Submap:
     links: dict[tuple[object, ...], Link] = field(default_factory=dict, repr=False, compare=False)
     """What it is in a chain, by what that depends on: the latest."""
 
-    def link(self, slam: EkfSlam, after: Int[np.ndarray, " slots"] | None, *, first: bool) -> Link:
+    def link(self, slam: AbstractSlam, after: Int[np.ndarray, " slots"] | None, *, first: bool) -> Link:
         """Return what it is in a chain, in which these are the numbers of the submap `after` it."""
         key = (None if after is None else after.tobytes(), first)
         if key not in self.links:
@@ -141,23 +141,18 @@ def shapes(slam: AbstractStaged, state: Belief, capacity: int) -> PyTree:
 
 def in_submaps(slam: AbstractStaged) -> bool:
     """Whether a filter has submaps."""
-    inner = slam.unwrapped
-    return isinstance(inner, EkfSlam) and inner.coordinates is SUBMAP
+    return slam.model is not None and slam.model.frame.begins_submaps
 
 
 def left(slam: AbstractStaged, state: Belief) -> Bool[Array, ""]:
     """Whether the camera has left the scene in which its submap began; never without submaps."""
-    inner = slam.unwrapped
-    if not isinstance(inner, EkfSlam) or not in_submaps(slam):
+    if slam.model is None or not in_submaps(slam):
         return jnp.zeros((), bool)
-    _, one = slam.gaussian(state, None)
-    assert isinstance(one.core.pose, KeyframePose)
-    T_KC = one.core.pose.keyframe_from_camera
-    return keyframe_due(T_KC, inner.model.inverse_distances(one), TURN, PARALLAX)
+    return slam.model.keyframe_left(slam.gaussian(state, None)[1])
 
 
 def loop_of(
-    slam: AbstractStaged,
+    slam: AbstractSlam,
     submaps: Sequence[Submap],
     which: tuple[int, int],
     slots: Int[np.ndarray, " k"],
@@ -172,7 +167,7 @@ def loop_of(
     padded = np.pad(slots[:k], (0, most - k))
     X, there = submaps[p].frozen.state.landmarks[padded], np.arange(most) < k
     calibration = submaps[q].frozen.state.core.calibration
-    by = _slopes(ekf_inside(slam, "loops are"), X, there, calibration, T, np.asarray(sigma))
+    by = _slopes(slam.one, X, there, calibration, T, np.asarray(sigma))
     return LoopClosure(np.array(which), padded, X, T, *by)
 
 
@@ -180,7 +175,7 @@ def loop_of(
 class Graph:
     """The submaps of a map, and the loops that join them."""
 
-    slam: AbstractStaged
+    slam: AbstractSlam
     submaps: Sequence[Submap]
     present: Submap
     """The one that goes on, as it would be if it ended now."""
@@ -208,7 +203,7 @@ class Graph:
         """The chain of all submaps, with some in front that are none; its loops, with some behind
         them that say nothing; and how many are in front. Sizes are few, since each has programs of
         its own."""
-        slam, ended, last = ekf_inside(self.slam, "submaps are"), self.submaps, self.present
+        slam, ended, last = self.slam.one, self.submaps, self.present
         later = [one.numbers for one in (*ended, last)[1:]]
         links = [
             one.link(slam, after, first=i == 0)
@@ -224,18 +219,18 @@ class Graph:
 
 
 def compile_graph(
-    slam: AbstractStaged, state: Belief, settings: TrackerSettings, submaps: int = 1
+    slam: AbstractSlam, state: Belief, settings: TrackerSettings, submaps: int = 1
 ) -> Callable[[], None]:
     """What compiles all that a graph of so many submaps needs."""
-    ekf, flag = ekf_inside(slam, "submaps are"), np.asarray(False)
+    one, flag = slam.one, np.asarray(False)
 
     def several(tree: PyTree, count: int) -> PyTree:
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape), x.dtype), tree)
 
     def compile() -> None:
         (frozen, *_), _ = _handed_over.compile(slam, state, np.zeros(settings.capacity, int))
-        link = _linked.compile(ekf, frozen, flag, flag, flag)
-        chain = Chain(ekf, several(link, _size(submaps) + 1))
+        link = _linked.compile(one, frozen, flag, flag, flag)
+        chain = Chain(one, several(link, _size(submaps) + 1))
         nothing = no_loop(settings.wanted, frozen.state.landmarks.shape[1])
         known = _given.compile(chain, several(nothing, _size(0)))
         _solved.compile(known)
@@ -267,7 +262,6 @@ def _row(tree: PyTree, k: int | Array) -> PyTree:
 def _handed_over(
     slam: AbstractStaged, state: Belief, numbers: Array
 ) -> tuple[tuple[Frozen, Array, Array], Belief]:
-    ekf = ekf_inside(slam, "submaps are")
     _, one = slam.gaussian(state, None)
 
     def point(view: LandmarkView) -> Array:
@@ -277,24 +271,24 @@ def _handed_over(
 
     there = one.active & (numbers >= 0)
     points = slam.landmark_marginal(state, point, jnp.arange(numbers.size))
-    return (Frozen(one, there, numbers), *points), each_gaussian(state, lambda x: rebased(ekf, x))
+    return (Frozen(one, there, numbers), *points), each_gaussian(state, rebased)
 
 
 @Program
-def _linked(ekf: EkfSlam, frozen: Frozen, there: Array, newest: Array, first: Array) -> Link:
-    return link(ekf, frozen, there, newest, first)
+def _linked(slam: AbstractSlam, frozen: Frozen, there: Array, newest: Array, first: Array) -> Link:
+    return link(slam, frozen, there, newest, first)
 
 
 @Program
 def _slopes(
-    ekf: EkfSlam, X: Array, there: Array, calibration: Array, T: Array, sigma: Array
+    slam: AbstractSlam, X: Array, there: Array, calibration: Array, T: Array, sigma: Array
 ) -> tuple[Float[Array, "6 6"], Float[Array, "6 m d"]]:
     """R/σ and Qᵀ B/σ of a loop."""
     T_PQ = jaxlie.SE3.from_matrix(T)
 
     def pixels(delta: Array, X: Array) -> Array:
         view = CameraInMap(T_PQ @ jaxlie.SE3.exp(delta), calibration)
-        seen = jax.vmap(lambda one: ekf.model.observe(view, one, COMPOSED)[0])(X)
+        seen = jax.vmap(lambda one: slam.model.observe(view, one, COMPOSED)[0])(X)
         return jnp.where(there[:, None], seen, 0.0).ravel() / sigma
 
     by_pose, by_landmarks = jax.jacfwd(pixels, (0, 1))(jnp.zeros(6), X)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from jaxslam.consistency import run_through
-from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.registry import make_filters
+from jaxslam.filters.slam import Slam
+from jaxslam.filters.words import make_filters
 from jaxslam.filters.run import Frames, run
 from jaxslam.filters.submaps import chain as chains
 from jaxslam.filters.submaps.chain import base_poses, chain
 from jaxslam.filters.submaps.closing import posterior
 from jaxslam.filters.submaps.handover import with_submaps
 from jaxslam.geometry import difference
-from jaxslam.landmarks import CARTESIAN
+from jaxslam.landmarks import Cartesian
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Capacity, Features
 from jaxslam.models.sensors import Position
@@ -33,10 +33,10 @@ class Linear:
         rng = np.random.default_rng(3)
         noise = np.array([ACCELERATION, ACCELERATION, 0.0])
         start = np.array([START, START, 0.0])
-        self.slam = EkfSlam(
+        self.slam = Slam(
             motion=ConstantVelocity(noise, np.array([0.0, 1.0, 0.0]), start),
             sensor=Position(SIGMA),
-            landmark=CARTESIAN,
+            landmark=Cartesian(),
         )
         v = np.array([0.0, 1.0]) + START * rng.normal(size=2)
         positions = [np.zeros(2)]

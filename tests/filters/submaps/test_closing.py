@@ -9,7 +9,7 @@ import pytest
 
 from jaxslam.consistency import run_through
 from jaxslam.filters import Loops, agreeing, base_poses, chain, close, with_submaps
-from jaxslam.filters.registry import make_filters
+from jaxslam.filters.words import make_filters
 from jaxslam.filters.submaps import closing
 from jaxslam.simulation import Room, scenario, simulate
 

@@ -7,9 +7,9 @@ import pytest
 
 from jaxslam.consistency import run_through
 from jaxslam.filters import Submaps, with_submaps
-from jaxslam.filters.ekf import EkfSlam
+from jaxslam.filters.slam import Slam
 from jaxslam.filters.readouts import camera_pose, landmarks_in_world
-from jaxslam.filters.registry import make_filters
+from jaxslam.filters.words import make_filters
 from jaxslam.geometry import difference
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.observations import Features
@@ -80,7 +80,7 @@ def test_a_slot_that_is_filled_again_without_being_freed_is_a_new_landmark():
         (lambda slam: Submaps(slam, 8), "in SUBMAP coordinates, .* not in robocentric ones"),
         (
             lambda slam: with_submaps(
-                EkfSlam(slam.motion, slam.sensor, LANDMARKS["framed_homogeneous"])
+                Slam(slam.motion, slam.sensor, LANDMARKS["framed_homogeneous"])
             ),
             "whose landmarks have no anchor",
         ),

@@ -21,32 +21,26 @@ same update, exactly where `transform` is affine in the landmark, else to first 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.forms.blocks import apart, shifted
-from jaxslam.filters.forms.correction import AbstractCorrection, kalman_update
-from jaxslam.filters.forms.gauge import act, unobservable_directions
-from jaxslam.filters.forms.state import State
-from jaxslam.filters.forms.transport import carried, check_metric, check_undelayed, read_from
+from jaxslam.filters.linear.blocks import minus, plus
+from jaxslam.filters.linear.kalman import AbstractCorrection, kalman_update
+from jaxslam.filters.linear.state import State
 from jaxslam.filters.model import SlamModel
+from jaxslam.filters.remedies.gauge import act, unobservable_directions
+from jaxslam.filters.remedies.transport import carried, read_from
 from jaxslam.geometry import exp, tangent_dim
-from jaxslam.models.coordinates import WORLD
 
 
 class Invariant(AbstractCorrection):
     """The EKF whose correction is read as a ξ."""
 
-    def check(self, slam: EkfSlam) -> None:
-        """Raise ValueError unless the filter is a plain world-centric one."""
-        check_metric(slam, "invariant")
-        check_undelayed(slam, "invariant")
-        if slam.coordinates is not WORLD:
-            raise ValueError(
-                f"the right-invariant error is of world filters, not {slam.coordinates.name} ones"
-            )
+    name: ClassVar[str] = "invariant"
+    world_centric: ClassVar[bool] = True
+    metric: ClassVar[bool] = True
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         added, innovation = kalman_update(model, state, None, features, noise, context, considered)
@@ -68,7 +62,7 @@ def _retracted(
     model: SlamModel, before: State, added: State, N: Float[Array, "n t"], L: Float[Array, "t n"]
 ) -> State:
     """`x ⊞ ξ` with `ξ = B(x)⁻¹ δ`, from the state `added` = x + δ."""
-    delta = apart(added, before)
+    delta = minus(added, before)
     rigid = L @ delta
     half, one = exp(model.geometry.group, rigid / 2), jnp.ones((), delta.dtype)
 
@@ -76,6 +70,6 @@ def _retracted(
         core, landmarks = act(model, half, one, state.core, state.landmarks)
         return replace(state, core=core, landmarks=landmarks)
 
-    after = turned(shifted(turned(before), delta - N @ rigid))
+    after = turned(plus(turned(before), delta - N @ rigid))
     landmarks = jnp.where(before.active[:, None], after.landmarks, before.landmarks)
     return replace(added, core=after.core, landmarks=landmarks)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.linalg import cholesky
-from jaxslam.filters.initialisation.alternatives import log_density
+from jaxslam.filters.mixture.density import log_density
 from jaxslam.filters.protocol import Belief, Corrected
 from jaxslam.models.observations import Innovation, Status
 

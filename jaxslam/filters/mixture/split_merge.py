@@ -26,11 +26,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.conditional import at_places, map_or_zero
 from jaxslam._numerics.linalg import cholesky, eigh
-from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.forms.blocks import apart, shifted
-from jaxslam.filters.forms.state import State
+from jaxslam.filters.layer import AbstractSlam
+from jaxslam.filters.linear.blocks import minus, plus
+from jaxslam.filters.linear.covariance import landmark_moments
+from jaxslam.filters.linear.state import State
+from jaxslam.filters.mixture.sum_state import SumState, member, moments
 from jaxslam.filters.model import COMPOSED, Context, Core
-from jaxslam.filters.wrappers.sum_state import SumState, member, moments
 from jaxslam.geometry import jacobian, log
 from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features
@@ -46,23 +47,25 @@ SPLIT = 0.8
 
 
 def divided(
-    ekf: EkfSlam, state: SumState, control: Control, seen: Features, rounds: int
+    slam: AbstractSlam, state: SumState, control: Control, seen: Features, rounds: int
 ) -> SumState:
     """A predicted sum after at most so many splits, and as many mergers of other members."""
-    n = ekf.motion.geometry.point_dim
+    n = slam.motion.geometry.point_dim
 
-    def displacement(core):
+    cost = _root_of_cost(slam, state.likeliest, seen)
+
+    def pixels_at(at: Core) -> Pixels:
+        context = slam.model.given(at, Context(control))
         # Of the logarithm: a turn is not to be split for what it does to the translation.
-        return log(ekf.model.displacement(core, Context(control)))[:n]
+        return lambda core: cost @ log(slam.model.displacement(core, context))[:n]
 
-    cost = _root_of_cost(ekf, state.likeliest, seen)
-    parts = _parts(lambda core: cost @ displacement(core), state)
+    parts = _parts(pixels_at, state)
     return _split_and_merged(parts, rounds)
 
 
-def _root_of_cost(ekf: EkfSlam, likeliest: State, seen: Features) -> Float[Array, "n n"]:
+def _root_of_cost(slam: AbstractSlam, likeliest: State, seen: Features) -> Float[Array, "n n"]:
     """C with `CᵀC = M` of the landmarks that are seen, at the likeliest member."""
-    model = ekf.model
+    model = slam.model
 
     def view_of(core):
         return model.view(core, COMPOSED)
@@ -70,7 +73,7 @@ def _root_of_cost(ekf: EkfSlam, likeliest: State, seen: Features) -> Float[Array
     def inverse_depth(view, landmark):
         return model.camera_point(view, landmark)[1][None]
 
-    _, variances = ekf.gaussian_form.landmark_covariance(
+    _, variances = landmark_moments(
         view_of, inverse_depth, likeliest, seen.slots
     )
     view = view_of(likeliest.core)
@@ -86,7 +89,7 @@ def _root_of_cost(ekf: EkfSlam, likeliest: State, seen: Features) -> Float[Array
     M = jnp.einsum("m,mpi,mpj->ij", counted, slopes, slopes)
     # Nearly singular where one landmark is seen, and zero where none is.
     total = jnp.maximum(jnp.trace(M), jnp.finfo(M.dtype).tiny)
-    eye = jnp.eye(ekf.motion.geometry.point_dim, dtype=M.dtype)
+    eye = jnp.eye(slam.motion.geometry.point_dim, dtype=M.dtype)
     return jnp.sqrt(total) * cholesky(M / total + 1e-6 * eye).root.T
 
 
@@ -103,16 +106,17 @@ Pixels = Callable[[Core], Float[Array, " n"]]
 
 
 def _described(
-    pixels: Pixels, core: Core, covariance: Float[Array, "c c"]
+    pixels_at: Callable[[Core], Pixels], core: Core, covariance: Float[Array, "c c"]
 ) -> tuple[Array, Array, Array]:
+    pixels = pixels_at(core)
     by_core = jacobian(pixels, core)
     return pixels(core), by_core, by_core @ covariance @ by_core.T
 
 
-def _parts(pixels: Pixels, state: SumState) -> _Parts:
+def _parts(pixels_at: Callable[[Core], Pixels], state: SumState) -> _Parts:
     c = state.likeliest.core_dim
     of = state.members.core, state.members.covariance[:, :c, :c]
-    return _Parts(state, *map_or_zero(lambda of: _described(pixels, *of), of, state.alive))
+    return _Parts(state, *map_or_zero(lambda of: _described(pixels_at, *of), of, state.alive))
 
 
 def _split_and_merged(parts: _Parts, rounds: int) -> SumState:
@@ -203,7 +207,7 @@ def _halves(parent: State, by_core: Float[Array, "n c"]) -> State:
     sigma = jnp.sqrt(jnp.maximum(variance, jnp.finfo(variance.dtype).tiny))
     away = SPLIT * slopes @ vectors[:, -1] / sigma
     parent = replace(parent, covariance=parent.covariance - jnp.outer(away, away))
-    return jax.vmap(lambda sign: shifted(parent, sign * away))(jnp.array([-1.0, 1.0], away.dtype))
+    return jax.vmap(lambda sign: plus(parent, sign * away))(jnp.array([-1.0, 1.0], away.dtype))
 
 
 def collapsed(members: State, log_weights: Float[Array, " k"]) -> State:
@@ -217,6 +221,6 @@ def collapsed(members: State, log_weights: Float[Array, " k"]) -> State:
     alone = jnp.where(jnp.arange(log_weights.size) == likeliest, 0.0, -jnp.inf)
     log_weights = jnp.where(jnp.isfinite(total), log_weights - total, alone)
 
-    away = jax.vmap(apart, in_axes=(0, None))(members, centre)
+    away = jax.vmap(minus, in_axes=(0, None))(members, centre)
     mean, covariance = moments(log_weights, away, members.covariance)
-    return replace(shifted(centre, mean), covariance=covariance)
+    return replace(plus(centre, mean), covariance=covariance)

@@ -10,33 +10,31 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.forms.correction import AbstractCorrection, check_steps, gauss_newton
-from jaxslam.filters.forms.gauge import check_gauge, scale_is_free, unobservable_directions
-from jaxslam.filters.forms.state import State
-from jaxslam.filters.forms.transport import carried, check_undelayed, read_from, read_scale_too
+from jaxslam.filters.linear.kalman import AbstractCorrection, check_steps, gauss_newton
+from jaxslam.filters.linear.state import State
 from jaxslam.filters.model import SlamModel
+from jaxslam.filters.remedies.gauge import scale_is_free, unobservable_directions
+from jaxslam.filters.remedies.transport import carried, read_from, read_scale_too
 from jaxslam.geometry import tangent_dim
 
 
 class ObservabilityConstrained(AbstractCorrection):
     """The covariance carried along the gauge after every update, and between the steps of one."""
 
+    name: ClassVar[str] = "oc"
+    knows_gauge: ClassVar[bool] = True
+
     steps: int = eqx.field(static=True, default=1)
     """Of Gauss–Newton in an update: an EKF has one. Where a second goes far from the first, as of
     a camera whose acceleration is large, the first would be wrong, and carried on."""
 
     def __check_init__(self) -> None:
-        check_steps(self.steps, "modifier oc")
-
-    def check(self, slam: EkfSlam) -> None:
-        """Raise ValueError where there is nothing to constrain, or N is not known."""
-        check_undelayed(slam, "oc")
-        check_gauge(slam.model)
+        check_steps(self.steps)
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         data = features, noise, context, considered

@@ -15,19 +15,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.filters.forms.state import State
+from jaxslam.filters.linear.state import State
 from jaxslam.filters.model import Core, SlamModel
 from jaxslam.geometry import Pose, Scalar, SplitPose, identity, jacobian, nudge, scaled
-from jaxslam.models.coordinates import ROBOCENTRIC, SUBMAP, WORLD, KeyframePose
-
-
-def check_gauge(model: SlamModel) -> None:
-    """Raise ValueError unless the gauge of the model's state is known."""
-    if model.coordinates not in (ROBOCENTRIC, SUBMAP, WORLD):
-        raise ValueError(
-            "unobservable directions are known of robocentric and world filters, "
-            f"not {model.coordinates.name}"
-        )
+from jaxslam.models.frame import KeyframePose
 
 
 def scale_is_free(model: SlamModel) -> bool:
@@ -42,7 +33,7 @@ def act(
 
     What drives the motion is enlarged with it: its variance is prior knowledge, no measurement.
     """
-    in_base = not model.coordinates.moves_landmarks
+    in_base = not model.frame.moves_landmarks
     variables, noise = model.motion.enlarged(core.motion, core.noise, factor)
 
     def anchor(T_AF: SplitPose) -> SplitPose:
@@ -58,7 +49,7 @@ def act(
         if isinstance(pose, KeyframePose):
             enlarged = scaled(pose, factor)
             return replace(enlarged, base_from_keyframe=rigid @ enlarged.base_from_keyframe)
-        return model.coordinates.from_base_pose(rigid @ scaled(model.camera_pose(core), factor))
+        return model.frame.from_base_pose(rigid @ scaled(model.camera_pose(core), factor))
 
     kept = core.base_motion
     core = replace(

@@ -23,13 +23,11 @@ from jaxtyping import Array, Bool, Float, PyTree
 from jaxslam._numerics.arrays import AnyArray, cast, precision
 from jaxslam._numerics.conditional import map_or_zero, map_where, zeros
 from jaxslam._numerics.linalg import eigh
-from jaxslam.filters.ekf import (
-    EkfSlam,
-    append_noise,
-    check_one_gaussian,
-    composed_first,
-    ekf_inside,
-)
+from jaxslam.filters.gaussian import append_noise, composed_first
+from jaxslam.filters.layer import AbstractLayer, AbstractSlam
+from jaxslam.filters.linear.state import State
+from jaxslam.filters.mixture.split_merge import collapsed, divided
+from jaxslam.filters.mixture.sum_state import SumState, member, moments, weighed
 from jaxslam.filters.protocol import (
     AbstractStaged,
     Belief,
@@ -41,12 +39,9 @@ from jaxslam.filters.protocol import (
     OfLandmark,
     PoseError,
 )
-from jaxslam.filters.wrappers.split_merge import collapsed, divided
-from jaxslam.filters.wrappers.sum_state import SumState, member, moments, weighed
-from jaxslam.filters.wrappers.wrapper import AbstractWrapper, with_motion
 from jaxslam.geometry import Pose, difference, retract
 from jaxslam.models.motion import Control, check_control
-from jaxslam.models.observations import Capacity, Features, Slots
+from jaxslam.models.observations import Capacity, Features, PriorMap, Slots
 
 REACH = (2.5, 4.0)
 """The members' means are spread over ± so many σ of the prior, at the least and at the most."""
@@ -56,36 +51,25 @@ OVERLAP = 0.5
 """σ of a member, in distances between neighbours."""
 
 
-class GaussianSum(AbstractWrapper):
-    """`members` filters `base` for each direction, across its mean, in which the velocity's prior
-    is divided: one in a planar world, two, with `members²` members, in a spatial one. Split and
-    merged in every frame, at most `members` for one direction.
+class Mixture(AbstractLayer):
+    """A sum of Gaussians: `members` of them for each direction, across its mean, in which the
+    velocity's prior is divided: one in a planar world, two, with `members²` members, in a spatial
+    one. Split and merged in every frame, at most `members` for one direction.
 
-    Raises ValueError for fewer than 3, and a base that has no velocity, or, to be split, is more
-    than one Gaussian.
+    Raises ValueError for fewer than 3.
     """
 
-    base: AbstractStaged
-    members: int = eqx.field(static=True)
+    members: int = eqx.field(static=True, default=9)
+    """The number of members for each direction; at the most, where they are split."""
     split: bool = eqx.field(static=True, default=True)
     """Whether members are split and merged; only the first of two directions is then divided at the
-    start, and `base` is an `EkfSlam`."""
+    start."""
 
     def __check_init__(self) -> None:
-        super().__check_init__()
-        if self.split:
-            check_one_gaussian(self.base, "a mixture", corrected=True)
         if self.members < 3:
-            raise ValueError(f"a Gaussian sum has at least 3 members, not {self.members}")
-        motion = self._ekf.motion
-        if not motion.has_velocity:
-            raise ValueError(f"a Gaussian sum divides a velocity: {type(motion).__name__} has none")
+            raise ValueError(f"a mixture has at least 3 members, not {self.members}")
 
-    @property
-    def _ekf(self) -> EkfSlam:
-        return ekf_inside(self.base, "a Gaussian sum is")
-
-    def base_state(self, state: SumState) -> Belief:
+    def inside(self, state: SumState) -> Belief:
         """The likeliest member's."""
         return state.likeliest
 
@@ -94,11 +78,17 @@ class GaussianSum(AbstractWrapper):
         """Splits in a frame, at the most: each takes up to three members."""
         return max(1, self.members // 3)
 
-    def init(self, capacity: int | Capacity, first: Features | None = None) -> SumState:
+    def init(
+        self,
+        slam: AbstractSlam,
+        capacity: int | Capacity,
+        first: Features | None,
+        known: PriorMap | None,
+    ) -> SumState:
         """`v = v̄ + D e`, e ~ N(0, I) = Σ w_i N(A s_i, I − (1 − σ²) A Aᵀ), for directions A."""
-        dtype = precision(self.base)
-        base = cast(self.base, dtype)
-        motion = cast(self._ekf.motion, dtype)
+        dtype = precision(slam)
+        inner = cast(slam.inner, dtype)
+        motion = inner.motion
         velocity, D = motion.start()
         A = _directions(velocity, D, motion.geometry.point_dim)
         A = A[:, :1] if self.split else A
@@ -108,91 +98,107 @@ class GaussianSum(AbstractWrapper):
         def begun(place):
             mean = velocity + D @ A @ place
             surer = replace(motion, velocity=mean, velocity_sigma=root)
-            return with_motion(base, surer).init(capacity, first)
+            begun = eqx.tree_at(lambda slam: slam.motion, inner, surer)
+            return begun.init(capacity, first, known)
 
         return SumState(jax.vmap(begun)(jnp.asarray(grid, dtype)), jnp.asarray(weights, dtype))
 
-    def step(self, state: SumState, control: Control, seen: Features, new: Features) -> Corrected:
+    def step(
+        self, slam: AbstractSlam, state: SumState, control: Control, seen: Features, new: Features
+    ) -> Corrected:
         """Every member's step; a sum that is split is divided once the frame's noise is there."""
+        inner = slam.inner
         if not self.split:
-            return self._measured(lambda one: self.base.step(one, control, seen, new), state)
-        state = self._divided(self.predict(state, control), control, seen)
+            return self._measured(lambda one: inner.step(one, control, seen, new), state)
+        state = self._divided(slam, self.predict(slam, state, control), control, seen)
 
         def stepped(one):
-            one, innovation = self._updated(one, control, seen)
-            return self.base.close(self.base.compose(one, control), new), innovation
+            one, innovation = self._updated(slam, one, control, seen)
+            return inner.close(inner.compose(one, control), new), innovation
 
         return self._measured(stepped, state)
 
-    def predict(self, state: SumState, control: Control) -> SumState:
+    def predict(self, slam: AbstractSlam, state: SumState, control: Control) -> SumState:
         """Predict each member; a split sum composes later, in `update`, where that is first."""
         if not self.split:
-            return self._each(lambda one: self.base.predict(one, control), state)
-        check_control(self._ekf.motion, control)
-        return self._each(lambda one: append_noise(self._ekf, one), state)
+            return self._each(lambda one: slam.inner.predict(one, control), state)
+        check_control(slam.motion, control)
+        return self._each(lambda one: append_noise(slam, one), state)
 
-    def gaussian(self, state: SumState, control: Control) -> tuple[AbstractStaged, Belief]:
-        """The base filter, and the predicted sum's mean and covariance."""
-        if self.split:
-            one = collapsed(state.members, state.log_weights)
-            return self.base, composed_first(self._ekf, one, control)
-        base, _ = self.base.gaussian(state.likeliest, control)
-        members = jax.vmap(lambda one: self.base.gaussian(one, control)[1])(state.members)
-        return base, collapsed(members, state.log_weights)
+    def gaussian(
+        self, slam: AbstractSlam, state: SumState, control: Control
+    ) -> tuple[AbstractStaged, State]:
+        """The filter of one Gaussian, and the predicted sum's mean and covariance."""
+        one = collapsed(state.members, state.log_weights)
+        return slam.inner, composed_first(slam, one, control) if self.split else one
 
-    def predict_features(self, state: SumState, control: Control, slots: Slots) -> Expected:
+    def predict_features(
+        self, slam: AbstractSlam, state: SumState, control: Control, slots: Slots
+    ) -> Expected:
         """The features that the sum as one Gaussian expects."""
-        base, one = self.gaussian(state, control)
-        return base.predict_features(one, control, slots)
+        inner, one = self.gaussian(slam, state, control)
+        return inner.predict_features(one, control, slots)
 
-    def update(self, state: SumState, control: Control, seen: Features) -> Corrected:
+    def update(
+        self, slam: AbstractSlam, state: SumState, control: Control, seen: Features
+    ) -> Corrected:
         """Split and merge, correct every member and weigh it."""
         if self.split:
-            state = self._divided(state, control, seen)
-        return self.update_members(state, control, seen)
+            state = self._divided(slam, state, control, seen)
+        return self.update_members(slam, state, control, seen)
 
-    def update_members(self, state: SumState, control: Control, seen: Features) -> Corrected:
+    def update_members(
+        self, slam: AbstractSlam, state: SumState, control: Control, seen: Features
+    ) -> Corrected:
         """Correct every member as it is, and weigh it."""
-        return self._measured(lambda one: self._updated(one, control, seen), state)
+        return self._measured(lambda one: self._updated(slam, one, control, seen), state)
 
-    def compose(self, state: SumState, control: Control) -> SumState:
+    def compose(self, slam: AbstractSlam, state: SumState, control: Control) -> SumState:
         """Every member's; so are the following."""
-        return self._each(lambda one: self.base.compose(one, control), state)
+        return self._each(lambda one: slam.inner.compose(one, control), state)
 
-    def close(self, state: SumState, new: Features) -> SumState:
-        return self._each(lambda one: self.base.close(one, new), state)
+    def close(self, slam: AbstractSlam, state: SumState, new: Features) -> SumState:
+        return self._each(lambda one: slam.inner.close(one, new), state)
 
-    def remove(self, state: SumState, gone: Bool[AnyArray, " capacity"]) -> SumState:
-        return self._each(lambda one: self.base.remove(one, gone), state)
+    def remove(
+        self, slam: AbstractSlam, state: SumState, gone: Bool[AnyArray, " capacity"]
+    ) -> SumState:
+        return self._each(lambda one: slam.inner.remove(one, gone), state)
 
-    def marginal(self, state: SumState, function: OfCamera) -> Moments:
+    def marginal(self, slam: AbstractSlam, state: SumState, function: OfCamera) -> Moments:
         """The sum's mean and covariance, in the tangent at the value of its likeliest member."""
-        each = partial(self.base.marginal, function=function)
+        each = partial(slam.inner.marginal, function=function)
         values, covariances = map_or_zero(each, state.members, state.alive)
         likeliest = SumState(values, state.log_weights).likeliest
         away = jax.vmap(difference, in_axes=(0, None))(values, likeliest)
         mean, covariance = moments(state.log_weights, away, covariances)
         return retract(likeliest, mean), covariance
 
-    def landmark_marginal(self, state: SumState, function: OfLandmark, slots: Slots) -> EachMoments:
+    def landmark_marginal(
+        self, slam: AbstractSlam, state: SumState, function: OfLandmark, slots: Slots
+    ) -> EachMoments:
         """The sum's mean and covariance of every landmark."""
-        each = partial(self.base.landmark_marginal, function=function, slots=slots)
+        each = partial(slam.inner.landmark_marginal, function=function, slots=slots)
         values, covariances = map_or_zero(each, state.members, state.alive)
         of_landmark = jax.vmap(moments, in_axes=(None, 1, 1))
         return of_landmark(state.log_weights, values, covariances)
 
-    def pose_error(self, state: SumState, T_BC: Pose) -> PoseError:
+    def pose_error(self, slam: AbstractSlam, state: SumState, T_BC: Pose) -> PoseError:
         """The error of the sum's mean, to first order in the members' distances; its covariance."""
-        errors, covariances = jax.vmap(self.base.pose_error, in_axes=(0, None))(state.members, T_BC)
-        return moments(state.log_weights, errors, covariances)
+        of_member = jax.vmap(slam.inner.pose_error, in_axes=(0, None))
+        return moments(state.log_weights, *of_member(state.members, T_BC))
 
-    def _divided(self, state: SumState, control: Control, seen: Features) -> SumState:
-        return divided(self._ekf, state, control, seen, self.rounds)
+    def _divided(
+        self, slam: AbstractSlam, state: SumState, control: Control, seen: Features
+    ) -> SumState:
+        return divided(slam, state, control, seen, self.rounds)
 
-    def _updated(self, one: Belief, control: Control, seen: Features) -> Corrected:
+    def _updated(
+        self, slam: AbstractSlam, one: State, control: Control, seen: Features
+    ) -> Corrected:
         if self.split:
-            one = composed_first(self._ekf, one, control)
-        return self.base.update(one, control, seen)
+            one = composed_first(slam, one, control)
+        return slam.inner.update(one, control, seen)
 
     def _each(self, function: Callable[[PyTree], PyTree], state: SumState) -> SumState:
         if self.split:
@@ -205,7 +211,7 @@ class GaussianSum(AbstractWrapper):
             members, innovations = jax.vmap(step)(state.members)
         else:
             told = jax.eval_shape(step, member(state.members, 0))[1]
-            both = state.members, zeros(told, self.members)
+            both = state.members, zeros(told, len(state.log_weights))
             members, innovations = map_where(lambda both: step(both[0]), both, state.alive)
         return weighed(members, state.log_weights, innovations)
 

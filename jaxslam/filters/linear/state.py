@@ -1,4 +1,4 @@
-"""The state of a form: a core on a manifold, landmarks of fixed capacity, an uncertainty."""
+"""The state of one Gaussian: a core on a manifold, landmarks of fixed capacity, a covariance."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxslam.geometry import tangent_dim
 
 
 class AbstractState(eqx.Module):
-    """A mean, to which a form adds its uncertainty, and `memory`. Everything has a fixed shape.
+    """A mean. Everything has a fixed shape.
 
     The error is ordered (core, landmark 0, landmark 1, …), n = c + capacity · d numbers.
     """
@@ -37,7 +37,5 @@ class State(AbstractState):
     """Mean and covariance; rows and columns of inactive slots are zero."""
 
     covariance: Float[Array, "n n"]
-    memory: PyTree = ()
-    """What an `AbstractEntry` remembers of landmarks beside the Gaussian: any pytree."""
     first: Float[Array, "capacity d"] | None = None
     """Landmarks as they were inserted; where a correction is by first estimates."""

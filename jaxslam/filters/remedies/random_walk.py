@@ -15,13 +15,12 @@ from jaxtyping import Float
 
 from jaxslam._numerics.arrays import AnyArray, number_field
 from jaxslam._numerics.linalg import inverse
-from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.forms.blocks import indices, residuals
-from jaxslam.filters.forms.correction import AbstractCorrection
+from jaxslam.filters.linear.blocks import indices, residuals
+from jaxslam.filters.linear.kalman import AbstractCorrection, Kalman
 
 
-class Drifting(AbstractCorrection):
-    """A correction, before which every landmark that is seen has moved at random since it was seen
+class RandomWalk(AbstractCorrection):
+    """An update before which every landmark that is seen has moved at random since it was seen
     last.
 
     In the picture with the covariance `share² R`, R being that of its measurement, by the least
@@ -29,18 +28,14 @@ class Drifting(AbstractCorrection):
     by the landmark, is added to their covariance.
     """
 
-    correction: AbstractCorrection
-    share: Float[AnyArray, ""] = number_field()
+    of: AbstractCorrection = Kalman()
+    """The correction that follows."""
+    share: Float[AnyArray, ""] = number_field(default=0.1)
     """σ of what a landmark drifts between two frames, in σ of its measurement."""
 
     @property
-    def divisible(self) -> bool:
-        """Whether that of the other correction is."""
-        return self.correction.divisible
-
-    def check(self, slam: EkfSlam) -> None:
-        """Raise ValueError for a filter that the other correction is not for."""
-        self.correction.check(slam)
+    def base(self) -> AbstractCorrection:
+        return self.of.base
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         _, _, used, H = residuals(model, state, features, context)
@@ -51,7 +46,7 @@ class Drifting(AbstractCorrection):
         index = indices(features.slots, state)
         P = state.covariance.at[index[:, :, None], index[:, None, :]].add(drift, mode="drop")
         moved = replace(state, covariance=P)
-        return self.correction.update(model, moved, features, noise, context, considered)
+        return self.of.update(model, moved, features, noise, context, considered)
 
     def remember(self, state, slots):
-        return self.correction.remember(state, slots)
+        return self.of.remember(state, slots)

@@ -10,41 +10,26 @@ of unknown depth is bad, and remains the linearisation point for good.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 import jax
 from jaxtyping import Array, Float
 
-from jaxslam.filters.ekf import EkfSlam
-from jaxslam.filters.forms.correction import AbstractCorrection, kalman_update
-from jaxslam.filters.forms.observability_constrained import follow
-from jaxslam.filters.forms.state import State
-from jaxslam.filters.forms.transport import check_metric, check_undelayed
+from jaxslam.filters.linear.kalman import AbstractCorrection, kalman_update
+from jaxslam.filters.linear.state import State
 from jaxslam.filters.model import Context, SlamModel
-from jaxslam.models.coordinates import WORLD
+from jaxslam.filters.remedies.observability_constrained import follow
 from jaxslam.models.observations import Features
 
 
 class FirstEstimates(AbstractCorrection):
     """Residuals of the estimate, H of the first estimates, and `transport` of the core."""
 
-    @property
-    def divisible(self) -> bool:
-        return False
-
-    def check(self, slam: EkfSlam) -> None:
-        """Raise ValueError for filters whose landmarks have no first estimate to keep."""
-        check_metric(slam, "fej")
-        check_undelayed(slam, "fej")
-        if slam.coordinates is not WORLD:
-            raise ValueError(
-                f"fej is for world filters: a {slam.coordinates.name} one moves its landmarks, "
-                "so that no first estimate stays"
-            )
-        if slam.landmark.anchored or slam.landmark.convert is not None:
-            raise ValueError(
-                f"fej needs landmarks that are written in one form, in themselves, not "
-                f"{slam.landmark.name}"
-            )
+    name: ClassVar[str] = "fej"
+    divisible: ClassVar[bool] = False
+    world_centric: ClassVar[bool] = True
+    metric: ClassVar[bool] = True
+    one_form: ClassVar[bool] = True
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         start, moved, predicted = _at_first(model, state, features, context)
@@ -71,7 +56,9 @@ def _at_first(
         return jax.vmap(lambda x: model.observe(view, x, context))(landmarks[features.slots])
 
     (predicted, in_front), (at_first, _) = observe(state.landmarks), observe(state.first)
-    moved = Features(
-        features.slots, features.measured - predicted + at_first, features.valid & in_front
+    moved = replace(
+        features,
+        measured=features.measured - predicted + at_first,
+        valid=features.valid & in_front,
     )
     return replace(state, landmarks=state.first), moved, predicted

@@ -1,4 +1,4 @@
-"""The base of every form of the filter: one-landmark models, and their Jacobians in blocks.
+"""The base of the filter: one-landmark models, and their Jacobians in blocks.
 
 Every model is a function of ONE landmark and of a *view*, the few quantities of the core that a
 landmark depends on (the relative pose of the camera, its calibration). `jax.jacfwd` sees v + d
@@ -13,7 +13,7 @@ import functools
 import operator
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.linalg import cholesky
 from jaxslam._numerics.tracing import gathers_are_free
-from jaxslam.filters.protocol import Belief
+from jaxslam.filters.linear.state import AbstractState, State
 from jaxslam.geometry import difference, jacobian, nudge, retract, zero_tangent
 from jaxslam.models.observations import Features, Slots
 
@@ -30,6 +30,8 @@ Noise = Float[Array, "p p"] | Float[Array, "m p p"]
 """R of one measurement, or one of each of m."""
 Prior = tuple[Float[Array, "*m q"], Float[Array, "*m q"]]
 """Mean and σ of what one measurement hides, for all landmarks or for each."""
+
+S = TypeVar("S", bound=AbstractState)
 
 DENSE = 200
 """Numbers up to which a product with all of J's zeros is faster than gathering what is not zero."""
@@ -49,6 +51,11 @@ class Blocks(NamedTuple):
 @runtime_checkable
 class Model(Protocol):
     """Pure functions on the core and one landmark; `context` is whatever data they need."""
+
+    def given(self, core: PyTree, context: PyTree) -> PyTree:
+        """The context in which functions of the core are differentiated at this one: with what
+        their Jacobians are to take as data."""
+        ...
 
     @property
     def moves_landmarks(self) -> bool:
@@ -111,8 +118,9 @@ class Change(NamedTuple):
     """`landmark(view, parameters)`; None where landmarks stay as they are."""
 
 
-def composition(model: Model, context: PyTree) -> Change:
+def composition(model: Model, state: State, context: PyTree) -> Change:
     """The motion as a change of variables: the core's (P18, P19), and a landmark's."""
+    context = model.given(state.core, context)
 
     def landmark(view, landmark):
         return model.compose_landmark(view, landmark, context)
@@ -125,7 +133,7 @@ def composition(model: Model, context: PyTree) -> Change:
 
 
 def residuals(
-    model: Model, state: Belief, features: Features, context: PyTree
+    model: Model, state: State, features: Features, context: PyTree
 ) -> tuple[Float[Array, "m p"], Float[Array, "m p"], Bool[Array, " m"], Blocks]:
     """Predictions, residuals, which features are used, and H; zero where one is not."""
     predicted, in_front, H = observe(model, state, features.slots, context)
@@ -136,9 +144,10 @@ def residuals(
 
 
 def observe(
-    model: Model, state: Belief, slots: Slots, context: PyTree
+    model: Model, state: State, slots: Slots, context: PyTree
 ) -> tuple[Float[Array, "m p"], Bool[Array, " m"], Blocks]:
     """Predicted measurements, whether they are possible, and H."""
+    context = model.given(state.core, context)
     return local_jacobians(
         lambda core: model.view(core, context),
         lambda view, landmark: model.observe(view, landmark, context),
@@ -148,14 +157,14 @@ def observe(
 
 
 def new_landmarks(
-    model: Model, state: Belief, features: Features, noise: Noise, prior: Prior, context: PyTree
+    model: Model, state: State, features: Features, noise: Noise, prior: Prior, context: PyTree
 ) -> NewLandmarks:
     """Landmarks of first measurements (P22–P26), with their errors."""
     mean, sigma = (jnp.broadcast_to(x, (features.slots.size, x.shape[-1])) for x in prior)
     view = model.view(state.core, context)
     view_by_core = jacobian(lambda core: model.view(core, context), state.core)
 
-    def one(measured, mean, sigma):
+    def one(measured, mean, sigma, root):
         def landmark(delta, measured, hidden):
             value = model.initialise(nudge(view, delta), measured, hidden, context)
             return value, value
@@ -165,15 +174,16 @@ def new_landmarks(
         )(zero_tangent(view), measured, mean)
         return value, J_view, jnp.concatenate([J_measured @ root, J_hidden * sigma], axis=1)
 
-    root = cholesky(noise).root
-    new, J_view, own = jax.vmap(one)(features.measured, mean, sigma)
+    each = None if noise.ndim == 2 else 0
+    root = (cholesky(noise) if each is None else jax.vmap(cholesky)(noise)).root
+    new, J_view, own = jax.vmap(one, in_axes=(0, 0, 0, each))(features.measured, mean, sigma, root)
     m, d = new.shape
     identity = jnp.broadcast_to(jnp.eye(d, dtype=new.dtype), (m, d, d))
     slots = features.places(state.active.size)
     return NewLandmarks(new, slots, Blocks(view_by_core, J_view, identity), own)
 
 
-def indices(slots: Slots, state: Belief) -> Int[Array, "m d"]:
+def indices(slots: Slots, state: State) -> Int[Array, "m d"]:
     """The places of the landmarks in these slots in the state's error; out of bounds stays so."""
     d = state.landmarks.shape[1]
     return state.core_dim + slots[:, None] * d + jnp.arange(d)
@@ -264,7 +274,7 @@ def small_products(A: Float[Array, "*m k j"], B: Float[Array, "*#m j r"]) -> Flo
     )
 
 
-def shifted(state: Belief, delta: Float[Array, " n"]) -> Belief:
+def plus(state: S, delta: Float[Array, " n"]) -> S:
     """`x ⊞ δ` for the core and all landmarks."""
     c = state.core_dim
     return replace(
@@ -274,7 +284,7 @@ def shifted(state: Belief, delta: Float[Array, " n"]) -> Belief:
     )
 
 
-def apart(state: Belief, origin: Belief) -> Float[Array, " n"]:
-    """`state ⊟ origin`, the inverse of `shifted`."""
+def minus(state: AbstractState, origin: AbstractState) -> Float[Array, " n"]:
+    """`state ⊟ origin`, the inverse of `plus`."""
     landmarks = (state.landmarks - origin.landmarks).ravel()
     return jnp.concatenate([difference(state.core, origin.core), landmarks])

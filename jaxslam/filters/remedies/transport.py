@@ -17,8 +17,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.linalg import eigh
-from jaxslam.filters.ekf import EkfSlam, Undelayed
-from jaxslam.models.scale import ScaleGauge
 
 _SINGULAR = 1e-12
 """Least eigenvalue of NᵀN, its columns of unit length, that counts."""
@@ -26,18 +24,6 @@ READINGS = 2
 """Of the scale from landmarks, after a first in which all count alike."""
 _SUREST = 1e-4
 """Relative error below which none is surer than another."""
-
-
-def check_metric(slam: EkfSlam, remedy: str) -> None:
-    """Raise ValueError unless metres are the unit of the filter's state."""
-    if isinstance(slam.scale, ScaleGauge):
-        raise ValueError(f"{remedy} is for filters without a scale gauge")
-
-
-def check_undelayed(slam: EkfSlam, remedy: str) -> None:
-    """Raise ValueError unless landmarks are in the state from their first measurement on."""
-    if not isinstance(slam.entry, Undelayed):
-        raise ValueError(f"{remedy} is for undelayed landmarks")
 
 
 def left_inverse(N: Float[Array, "n g"]) -> Float[Array, "g n"]:

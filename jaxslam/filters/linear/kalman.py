@@ -1,7 +1,7 @@
-"""The corrections of the covariance form by measurements: the Kalman update and its base class.
+"""The update by measurements: the Kalman update, its iterations, and their base class.
 
-A correction is a piece of `Covariance`. Each of the others is in a file of its own:
-`first_estimates`, `invariant`, `observability_constrained`.
+A correction is a piece of `Slam`. The remedies for an inconsistent filter are others
+(`jaxslam.filters.remedies`).
 """
 
 from __future__ import annotations
@@ -9,15 +9,15 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam._numerics.linalg import cholesky, symmetric_part
-from jaxslam.filters.forms.blocks import Model, Noise, apart, observed, residuals, shifted
-from jaxslam.filters.forms.state import State
+from jaxslam.filters.linear.blocks import Model, Noise, minus, observed, plus, residuals
+from jaxslam.filters.linear.state import State
 from jaxslam.models.observations import Features, Innovation, Slots, judged
 
 ROUNDING = 4.0
@@ -30,15 +30,30 @@ the correlations stay above `−n ε` however many there are (measured over 600 
 
 
 class AbstractCorrection(eqx.Module):
-    """A correction of the state by the features seen."""
+    """A correction of the state by the features seen.
+
+    A correction of your own is one class with `update`; what it cannot go with it says by its class
+    variables (`jaxslam.filters.compatible` reads them).
+    """
+
+    name: ClassVar[str] = "the correction"
+    """The correction as messages call it."""
+    divisible: ClassVar[bool] = True
+    """Whether the state then is mean and covariance of `x ⊞ δ`, to be divided and merged."""
+    world_centric: ClassVar[bool] = False
+    """Whether it is for landmarks held in the base frame only."""
+    metric: ClassVar[bool] = False
+    """Whether it is for a filter whose unit of length is the metre."""
+    one_form: ClassVar[bool] = False
+    """Whether it is for landmarks written in one form, in themselves: neither anchored nor
+    converted."""
+    knows_gauge: ClassVar[bool] = False
+    """Whether it reads the gauge of the frame, which is not known of keyframes."""
 
     @property
-    def divisible(self) -> bool:
-        """Whether the state then is mean and covariance of `x ⊞ δ`, to be divided and merged."""
-        return True
-
-    def check(self, slam: Any) -> None:
-        """Raise ValueError for a filter that cannot be corrected so; any can be, here."""
+    def base(self) -> AbstractCorrection:
+        """The correction that decides what this goes with: itself, unless it is around another."""
+        return self
 
     @abstractmethod
     def update(
@@ -50,7 +65,12 @@ class AbstractCorrection(eqx.Module):
         context: PyTree,
         considered: slice = slice(0, 0),
     ) -> tuple[State, Innovation]:
-        """Correct by all features at once, as `AbstractForm.update` says."""
+        """Correct by all features at once (P16, P17), and the innovation.
+
+        `noise` is the covariance R of one measurement, or one for each feature. A feature that is
+        not valid, not in the map or predicted behind the camera changes nothing. The `considered`
+        numbers of the core count with their covariance but have no gain (Schmidt, 1966).
+        """
 
     def remember(self, state: State, slots: Slots) -> State:
         """Keep what is needed of landmarks that were just written in these slots, of which those
@@ -59,25 +79,25 @@ class AbstractCorrection(eqx.Module):
         return state
 
 
-class Standard(AbstractCorrection):
+class Kalman(AbstractCorrection):
     """The extended Kalman filter's (P16, P17); of several steps, the iterated one's (Bell, Cathey:
     The Iterated Kalman Filter Update as a Gauss–Newton Method, IEEE TAC 1993)."""
 
     steps: int = eqx.field(static=True, default=1)
-    """Of Gauss–Newton to the maximum of the posterior, all on the prior of the frame."""
+    """Steps of Gauss–Newton to the maximum of the posterior, all on the prior of the frame."""
 
     def __check_init__(self) -> None:
-        check_steps(self.steps, "an update")
+        check_steps(self.steps)
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         data = features, noise, context, considered
         return gauss_newton(model, state, self.steps, lambda before, after: after, *data)
 
 
-def check_steps(steps: int, what: str) -> None:
+def check_steps(steps: int) -> None:
     """Raise ValueError for less than one step of Gauss–Newton."""
     if steps < 1:
-        raise ValueError(f"{what} takes a number of steps of at least 1, not {steps}")
+        raise ValueError(f"an update takes at least 1 step of Gauss–Newton, not {steps}")
 
 
 def gauss_newton(
@@ -93,7 +113,7 @@ def gauss_newton(
     for _ in range(steps - 1):
         after, _ = kalman_update(model, at, offset, *data)
         at = corrected(at, replace(after, covariance=at.covariance))
-        offset = apart(state, at)
+        offset = minus(state, at)
     after, innovation = kalman_update(model, at, offset, *data)
     return corrected(at, after), innovation
 
@@ -129,7 +149,7 @@ def kalman_update(
     covariance = left + (K @ R - observed(blocks, features.slots, left.T).T) @ K.T
     lost = ROUNDING * jnp.finfo(P.dtype).eps * jnp.diagonal(P).at[considered].set(0.0)
     delta = K @ residual.ravel()
-    state = shifted(state, delta if offset is None else offset + delta)
+    state = plus(state, delta if offset is None else offset + delta)
     state = replace(state, covariance=symmetric_part(covariance) + jnp.diag(lost))
     variances = jnp.diagonal(covariance) + lost
     status = judged(factor.positive & jnp.all(variances >= 0), variances, state.landmarks)

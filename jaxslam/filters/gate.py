@@ -1,0 +1,37 @@
+"""A filter that believes only what agrees: for measurements of which some are wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from jaxslam._runtime.lookup import lookup
+from jaxslam.filters.association import ASSOCIATIONS, TOLERANCE, candidates
+from jaxslam.filters.layer import AbstractLayer, AbstractSlam
+from jaxslam.filters.protocol import Belief, Corrected
+from jaxslam.models.motion import Control
+from jaxslam.models.observations import Features
+
+
+class Gate(AbstractLayer):
+    """A gate: updates are by the features that an `Association` believes; others count as not
+    seen."""
+
+    association: str = eqx.field(static=True, default="sequential")
+    """A name of ASSOCIATIONS."""
+    tolerance: float = eqx.field(static=True, default=TOLERANCE)
+    """σ by which a match may be off beyond its noise, in σ of a measurement."""
+
+    def __check_init__(self) -> None:
+        lookup("association", [self.association], ASSOCIATIONS)
+
+    def update(
+        self, slam: AbstractSlam, state: Belief, control: Control, seen: Features
+    ) -> Corrected:
+        one, gaussian = slam.inner.gaussian(state, control)
+        tolerance = self.tolerance * jnp.sqrt(slam.sensor.noise[0, 0])
+        found = candidates(one, gaussian, control, seen, tolerance)
+        agreed = ASSOCIATIONS[self.association](found)
+        return slam.inner.update(state, control, replace(seen, valid=agreed))

@@ -1,0 +1,64 @@
+"""The filters to begin with: the paper's, and the best that was measured."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from jaxslam.filters.mixture.mixture import Mixture
+from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
+from jaxslam.filters.slam import Slam
+from jaxslam.filters.window.start import FromWindow, Schedule
+from jaxslam.geometry import PLANAR
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import AbstractMotion
+from jaxslam.models.scale import ScaleGauge
+from jaxslam.models.sensors import AbstractSensor
+
+
+def paper(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Any) -> Slam:
+    """The filter of the paper: robocentric, composed after the update, of Inverse Scaling points
+    that are used without delay. Other `pieces` are those of `Slam`. Raises ValueError."""
+    return Slam(motion, sensor, **pieces)
+
+
+def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Any) -> Slam:
+    """The best filter that was measured for this motion and sensor (docs/which-filter.md).
+
+    For a camera whose motion is a velocity: robocentric, with a unit of length of its own, since no
+    pixel observes the metre; an error that is common to all depths, σ half of one landmark's; and
+    a Gaussian sum over the velocity's direction, of at most 17 members in a plane and 9 in space,
+    as one linearisation is not enough while the direction of travel is unknown.
+
+    Where the velocity's mean is less than √3 σ of it, the same with a start that looks for the
+    motion in a window of frames, of at most 5 and 3 members; in space its covariance is carried
+    along the gauge.
+
+    For odometry, and for a sensor that measures metres, one Gaussian is enough: robocentric, its
+    covariance carried along the gauge (`ObservabilityConstrained`).
+
+    Other `pieces` are those of `Slam`, and take the place of these. Raises ValueError.
+    """
+    planar = motion.geometry is PLANAR
+    depth = pieces.pop("depth", InverseDepth.beyond(1.0))
+    chosen: dict[str, Any]
+    if not (motion.has_velocity and sensor.hidden):
+        chosen = {"correction": ObservabilityConstrained()}
+    else:
+        depth = replace(depth, common=0.5) if depth.common is None else depth
+        chosen = {"scale": ScaleGauge(), "mixture": Mixture(17 if planar else 9)}
+        if not _velocity_is_known(motion):
+            chosen["mixture"] = Mixture(5 if planar else 3)
+            chosen["start"] = FromWindow(Schedule.of(motion.geometry, None if planar else 8))
+            if not planar:
+                chosen["correction"] = ObservabilityConstrained()
+    return Slam(motion, sensor, depth=depth, **{**chosen, **pieces})
+
+
+def _velocity_is_known(motion: AbstractMotion) -> bool:
+    """Whether the velocity's mean is more than √3 σ of it in its own direction."""
+    n = motion.geometry.point_dim
+    mean, root = (np.asarray(x)[:n] for x in motion.start())
+    return bool(mean @ mean > 3 * np.linalg.norm(mean @ root))

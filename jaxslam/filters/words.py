@@ -1,0 +1,167 @@
+"""Words for filters: what the command line, settings and tables of results call them.
+
+A name is a filter and its modifiers in any order, `scale_gauge+scene50+mixture17`. What goes
+together is decided by the record (`compatible`); here is only what each word makes of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from jaxslam._runtime.lookup import as_list, lookup
+from jaxslam.filters.gate import Gate
+from jaxslam.filters.mixture.mixture import Mixture
+from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.recommended import recommended
+from jaxslam.filters.remedies.first_estimates import FirstEstimates
+from jaxslam.filters.remedies.invariant import Invariant
+from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
+from jaxslam.filters.remedies.random_walk import RandomWalk
+from jaxslam.filters.rivals.depth_particles import with_depth_particles
+from jaxslam.filters.rivals.rays import with_rays
+from jaxslam.filters.slam import Slam
+from jaxslam.filters.window.start import FromWindow, Schedule
+from jaxslam.landmarks import LANDMARKS
+from jaxslam.models.calibration import TREATMENTS
+from jaxslam.models.frame import Keyframe, Submaps, WorldCentric
+from jaxslam.models.scale import ScaleGauge
+from jaxslam.simulation.pieces import calibration_sigma_of, depth_of, motion_of, sensor_of
+from jaxslam.simulation.scenario import Scenario, as_scenario
+
+Piece = Any
+"""A piece of a filter as `Slam` takes it: `motion`, `sensor`, `landmark`, `calibration`, …"""
+
+FILTERS: dict[str, Callable[..., Slam]] = {
+    "robocentric": Slam,
+    "world": partial(Slam, frame=WorldCentric()),
+    "keyframe": partial(Slam, frame=Keyframe()),
+    "scale_gauge": partial(Slam, scale=ScaleGauge()),
+    "world_gauge": partial(Slam, frame=WorldCentric(), scale=ScaleGauge()),
+    "invariant": partial(Slam, frame=WorldCentric(), correction=Invariant()),
+    "recommended": recommended,
+}
+"""By name, of pieces: the paper's filter, with landmarks in the camera frame and composition after
+the update (`robocentric`); the classical one, in the base frame and composed first (`world`); one
+in the camera of the current keyframe (`keyframe`); the paper's in a unit of length of its own,
+whose size is estimated (`scale_gauge`), and the classical one so, whose covariance is too small
+where the camera turns (`world_gauge`); the classical one with the right-invariant error: landmarks'
+errors move with the pose's (`invariant`); the best that was measured (`recommended`)."""
+
+
+def _with_scene_depth(slam: Slam, percent: int = 100) -> Slam:
+    return replace(slam, depth=replace(slam.depth, common=percent / 100))
+
+
+def _iterated(slam: Slam, steps: int = 5) -> Slam:
+    if not hasattr(slam.correction, "steps"):
+        raise ValueError(f"{slam.correction.name} takes one step of Gauss–Newton in an update")
+    return replace(slam, correction=replace(slam.correction, steps=steps))
+
+
+def _drifting(slam: Slam, percent: int = 10) -> Slam:
+    return replace(slam, correction=RandomWalk(slam.correction, percent / 100))
+
+
+def _from_window(slam: Slam, frames: int | None = None) -> Slam:
+    return replace(slam, start=FromWindow(Schedule.of(slam.motion.geometry, frames)))
+
+
+def _first_estimates(slam: Slam) -> Slam:
+    return replace(slam, correction=FirstEstimates())
+
+
+MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
+    "scene": _with_scene_depth,
+    "fej": _first_estimates,
+    "oc": lambda slam, steps=1: replace(slam, correction=ObservabilityConstrained(steps)),
+    "iterated": _iterated,
+    "drift": _drifting,
+    "directions": lambda slam, count=5: replace(slam, mixture=Mixture(count, split=False)),
+    "mixture": lambda slam, count=9: replace(slam, mixture=Mixture(count)),
+    "rest": _from_window,
+    "submaps": lambda slam, spare=24: replace(slam, frame=Submaps(spare)),
+    "checked": lambda slam, percent=150: replace(slam, gate=Gate(tolerance=percent / 100)),
+    "particles": with_depth_particles,
+    "rays": with_rays,
+}
+"""What `+name` behind a filter's name makes of it, with the number that may follow the name: σ of
+the scene's depth in percent of one landmark's, as an error that is common to all priors (`scene`);
+steps of Gauss–Newton in an update (`iterated`, `oc`); by how much a landmark drifts between frames,
+in percent of the σ of a measurement (`drift`); members of a Gaussian sum (`directions`, of a
+`mixture` at the most); frames of the longest window of a start (`rest`); slots for landmarks out of
+view until their submap ends (`submaps`); by how much a match may be off beyond its noise, in
+percent of that (`checked`); the greatest depth of a delayed initialisation, m (`particles`,
+`rays`); none for the remedy `fej`. Their order is that of this table, whatever that of the name."""
+_LEFT = {"lag": "a fixed-lag window, slower and less consistent than a mixture, left in 0.6"}
+
+
+def make_filter(name: str, **pieces: Piece) -> AbstractFilter:
+    """One filter by its name, with its modifiers, of pieces as `Slam` takes them.
+
+    The `landmark` may be named. Raises ValueError for a name that is not known, a piece that is
+    missing, and what does not go together.
+    """
+    if missing := [piece for piece in ("motion", "sensor") if piece not in pieces]:
+        raise ValueError(
+            f"make_filter lacks {', '.join(missing)}; the pieces of Slam are accepted, or "
+            "make_filters(scenario, filters, landmarks) makes them of a scenario"
+        )
+    if isinstance(named := pieces.get("landmark"), str):
+        pieces["landmark"] = lookup("landmark", named, LANDMARKS)[named]
+    base, *modifiers = name.split("+")
+    made: AbstractFilter = lookup("filters", [base], FILTERS)[base](**pieces)
+    for word, given in sorted(map(_parsed, modifiers), key=lambda one: _ORDER.index(one[0])):
+        made = MODIFIERS[word](made, *given)
+    return made
+
+
+_ORDER = list(MODIFIERS)
+
+
+def _parsed(modifier: str) -> tuple[str, list[int]]:
+    """The word of a modifier, and its number where there is one. Raises ValueError."""
+    word = modifier.rstrip("0123456789")
+    if word in _LEFT:
+        raise ValueError(f"modifier {word} is no more: {_LEFT[word]}; known: {', '.join(MODIFIERS)}")
+    lookup("modifiers", [word], MODIFIERS)
+    number = modifier[len(word) :]
+    if number and word == "fej":
+        raise ValueError(f"modifier {word} takes no number, not {number}")
+    return word, [int(number)] if number else []
+
+
+def make_filters(
+    scenario: Scenario | str,
+    filters: str | Iterable[str],
+    landmarks: str | Iterable[str] = "inverse_scaling",
+    calibration: str | None = None,
+) -> dict[str, AbstractFilter]:
+    """Every named filter on every named parametrization, keyed `filter/landmarks`.
+
+    Their numbers are the scenario's, which may be given by name; one name may be given without a
+    list. A filter may be modified: `world+oc`, `scale_gauge+mixture9`. The calibration is treated
+    as the scenario says, unless another treatment is named. Raises ValueError.
+    """
+    scenario, names = as_scenario(scenario), as_list(filters)
+    lookup("filters", [name.partition("+")[0] for name in names], FILTERS)
+    pieces = scenario_pieces(scenario, calibration)
+    return {
+        f"{name}/{landmark.name}": make_filter(name, landmark=landmark, **pieces)
+        for name in names
+        for landmark in lookup("landmarks", landmarks, LANDMARKS).values()
+    }
+
+
+def scenario_pieces(scenario: Scenario, calibration: str | None = None) -> dict[str, Piece]:
+    """The pieces of a filter that fits the scenario, as `Slam` takes them. Raises ValueError."""
+    word = scenario.calibration if calibration is None else calibration
+    treatment = lookup("calibration", [word], TREATMENTS)[word]
+    return {
+        "motion": motion_of(scenario),
+        "sensor": sensor_of(scenario),
+        "calibration": treatment(calibration_sigma_of(scenario)),
+        "depth": depth_of(scenario),
+    }
