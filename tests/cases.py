@@ -99,7 +99,7 @@ def a_filter(geometry, landmark=InverseScaling(), frame=Robocentric(), **pieces)
         "motion": ConstantVelocity(*np.zeros((3, t))),
         "sensor": Pinhole(Camera(np.ones(p), np.zeros(p)), 0.0),
     }
-    return Slam(landmark=landmark, frame=coordinates, **{**unit, **pieces})
+    return Slam(landmark=landmark, frame=frame, **{**unit, **pieces})
 
 
 def run_filter(capacity, slam, controls, first, known, new):
@@ -205,8 +205,9 @@ class Around(AbstractStaged):
 
     estimator: Slam
 
-    def init(self, capacity, first=None):
-        return {"inside": self.estimator.init(capacity, first), "frame": jnp.zeros((), int)}
+    def init(self, capacity, first=None, known=None):
+        inside = self.estimator.init(capacity, first, known)
+        return {"inside": inside, "frame": jnp.zeros((), int)}
 
     def predict(self, state, control):
         return state | {"inside": self.estimator.predict(state["inside"], control)}

@@ -1,6 +1,5 @@
 """Tests of jaxslam.landmarks: what every parametrization in the table owes its Euclidean point."""
 
-from dataclasses import replace
 from functools import cache
 
 import jax
@@ -11,11 +10,11 @@ from cases import central, close, each_geometry, each_landmark, named, pose, qui
 
 from jaxslam.geometry import joined
 from jaxslam.landmarks import (
-    UnifiedInverseDepth,
+    Cartesian,
     InverseDepthToCartesian,
     InverseScaling,
-    LANDMARKS,
     ParallaxAngle,
+    UnifiedInverseDepth,
 )
 from jaxslam.landmarks.inverse_depth import angles_of
 from jaxslam.models.camera import Camera, project
@@ -26,39 +25,37 @@ INVERSE_DEPTHS = (0.02, 0.15, 1.3)
 SECOND_CAMERA = np.array([0.5, -0.2, 0.3])
 
 
-def converted_at_once(point, omega, focal):
+class Converted(InverseDepthToCartesian):
     """Inverse depth to Cartesian, after its conversion."""
-    del focal
-    position = point / omega
-    return jnp.concatenate([position, jnp.zeros_like(position), jnp.ones(1)])
+
+    name = "inverse_depth_to_cartesian, converted"
+
+    def initialise(self, point, omega, focal):
+        position = point / omega
+        return jnp.concatenate([position, jnp.zeros_like(position), jnp.ones(1)])
 
 
-def anchored_at_once(point, omega, focal):
+class Anchored(ParallaxAngle):
     """Parallax angle with a second anchor: the angle at X/ω between the rays to both."""
-    del focal
-    second = jnp.asarray(SECOND_CAMERA[: point.size])
-    ray = point / jnp.linalg.norm(point)
-    along, rho = ray @ second, omega / jnp.linalg.norm(point)
-    across = jnp.sqrt(second @ second - along**2)
-    alpha = jnp.arctan2(rho * across, 1 - rho * along)
-    ends = jnp.stack([alpha, jnp.ones(())])
-    return jnp.concatenate([jnp.zeros_like(point), second, angles_of(point), ends])
+
+    name = "parallax_angle, with both anchors"
+
+    def initialise(self, point, omega, focal):
+        second = jnp.asarray(SECOND_CAMERA[: point.size])
+        ray = point / jnp.linalg.norm(point)
+        along, rho = ray @ second, omega / jnp.linalg.norm(point)
+        across = jnp.sqrt(second @ second - along**2)
+        alpha = jnp.arctan2(rho * across, 1 - rho * along)
+        ends = jnp.stack([alpha, jnp.ones(())])
+        return jnp.concatenate([jnp.zeros_like(point), second, angles_of(point), ends])
 
 
-CONVERTED = replace(
-    InverseDepthToCartesian(),
-    name="inverse_depth_to_cartesian, converted",
-    initialise=converted_at_once,
-)
-ANCHORED = replace(
-    ParallaxAngle(), name="parallax_angle, with both anchors", initialise=anchored_at_once
-)
-forms = [*each_landmark, CONVERTED, ANCHORED]
+forms = [*each_landmark, Converted(), Anchored()]
 
 with_geometry = pytest.mark.parametrize("geometry", each_geometry, ids=named)
 every_landmark = pytest.mark.parametrize("landmark", forms, ids=named)
 at_infinity = pytest.mark.parametrize(
-    "landmark", [p for p in forms if p.name != "cartesian" and p is not CONVERTED], ids=named
+    "landmark", [p for p in forms if not isinstance(p, Cartesian | Converted)], ids=named
 )
 
 
@@ -237,7 +234,7 @@ def test_inverse_scaling_starts_in_pixels(geometry):
 @with_geometry
 def test_inverse_depth_holds_anchor_angles_and_inverse_distance(geometry):
     """θ = atan2(nx, nz), φ = atan2(−ny, √(nx² + nz²)), ρ along the ray, not along the axis."""
-    initialise, transform, *_ = functions(LANDMARKS["inverse_depth"])
+    initialise, transform, *_ = functions(UnifiedInverseDepth())
     ray = np.append(bearing_of(geometry), 1.0)
     theta = np.arctan2(ray[0], ray[-1])
     phi = [np.arctan2(-ray[1], np.hypot(ray[0], ray[-1]))] if geometry.point_dim == 3 else []
