@@ -13,6 +13,7 @@ from typing import Any
 
 from jaxslam._runtime.lookup import as_list, lookup
 from jaxslam.filters.gate import Gate
+from jaxslam.filters.linear.kalman import AbstractCorrection, Kalman
 from jaxslam.filters.mixture.mixture import Mixture
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.recommended import recommended
@@ -61,6 +62,24 @@ def _iterated(slam: Slam, steps: int = 5) -> Slam:
     return replace(slam, correction=replace(slam.correction, steps=steps))
 
 
+def _corrected(slam: Slam, correction: AbstractCorrection) -> Slam:
+    if type(slam.correction) not in (Kalman, type(correction)):
+        raise ValueError(f"a filter has one correction: {slam.correction.name} or {correction.name}")
+    return replace(slam, correction=correction)
+
+
+def _mixed(slam: Slam, mixture: Mixture) -> Slam:
+    if slam.mixture is not None and slam.mixture.split != mixture.split:
+        raise ValueError("a filter has one mixture: members that are split, or directions")
+    return replace(slam, mixture=mixture)
+
+
+def _with_submaps(slam: Slam, spare: int = 24) -> Slam:
+    if not slam.frame.moves_landmarks:
+        raise ValueError(f"submaps are of robocentric filters, not of {slam.frame.name} ones")
+    return replace(slam, frame=Submaps(spare))
+
+
 def _drifting(slam: Slam, percent: int = 10) -> Slam:
     return replace(slam, correction=RandomWalk(slam.correction, percent / 100))
 
@@ -69,20 +88,16 @@ def _from_window(slam: Slam, frames: int | None = None) -> Slam:
     return replace(slam, start=FromWindow(Schedule.of(slam.motion.geometry, frames)))
 
 
-def _first_estimates(slam: Slam) -> Slam:
-    return replace(slam, correction=FirstEstimates())
-
-
 MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
     "scene": _with_scene_depth,
-    "fej": _first_estimates,
-    "oc": lambda slam, steps=1: replace(slam, correction=ObservabilityConstrained(steps)),
+    "fej": lambda slam: _corrected(slam, FirstEstimates()),
+    "oc": lambda slam, steps=1: _corrected(slam, ObservabilityConstrained(steps)),
     "iterated": _iterated,
     "drift": _drifting,
-    "directions": lambda slam, count=5: replace(slam, mixture=Mixture(count, split=False)),
-    "mixture": lambda slam, count=9: replace(slam, mixture=Mixture(count)),
+    "directions": lambda slam, count=5: _mixed(slam, Mixture(count, split=False)),
+    "mixture": lambda slam, count=9: _mixed(slam, Mixture(count)),
     "rest": _from_window,
-    "submaps": lambda slam, spare=24: replace(slam, frame=Submaps(spare)),
+    "submaps": _with_submaps,
     "checked": lambda slam, percent=150: replace(slam, gate=Gate(tolerance=percent / 100)),
     "particles": with_depth_particles,
     "rays": with_rays,
@@ -112,13 +127,13 @@ def make_filter(name: str, **pieces: Piece) -> AbstractFilter:
     if isinstance(named := pieces.get("landmark"), str):
         pieces["landmark"] = lookup("landmark", named, LANDMARKS)[named]
     base, *modifiers = name.split("+")
+    given = dict(map(_parsed, modifiers))
+    if len(given) < len(modifiers):
+        raise ValueError(f"every modifier is accepted once, not {name!r}")
     made: AbstractFilter = lookup("filters", [base], FILTERS)[base](**pieces)
-    for word, given in sorted(map(_parsed, modifiers), key=lambda one: _ORDER.index(one[0])):
-        made = MODIFIERS[word](made, *given)
+    for word in filter(given.__contains__, MODIFIERS):
+        made = MODIFIERS[word](made, *given[word])
     return made
-
-
-_ORDER = list(MODIFIERS)
 
 
 def _parsed(modifier: str) -> tuple[str, list[int]]:

@@ -10,6 +10,7 @@ import pytest
 from cases import close, each_geometry, named, quick_jit
 
 from jaxslam.filters.gaussian import reanchored
+from jaxslam.filters.linear.covariance import augmented
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.readouts import camera_pose, landmarks_in_camera, landmarks_in_world
 from jaxslam.filters.words import FILTERS
@@ -17,7 +18,7 @@ from jaxslam.geometry import PLANAR, SPATIAL, difference, exp, identity, joined,
 from jaxslam.landmarks import ImagePlane, InverseScaling
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.camera import Camera
-from jaxslam.models.frame import KEYFRAME_PARALLAX, KEYFRAME_TURN, keyframe_due
+from jaxslam.models.frame import Keyframe
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Features
@@ -85,10 +86,10 @@ def run(slam, pose_sigma, new, seen, gone):
     """States, covariances, NIS and camera poses of every step, from an uncertain pose."""
     state = slam.init(CAPACITY)
     size = tangent_dim(state.core.pose)
-    state = slam.form.augment(state, 0, pose_sigma**2 * jnp.eye(size))
+    state = augmented(state, 0, pose_sigma**2 * jnp.eye(size))
     if slam.calibration.each_frame:
         drawn = jnp.diag(slam.calibration.sigma**2)
-        state = slam.form.augment(state, state.core.part("calibration").start, drawn)
+        state = augmented(state, state.core.part("calibration").start, drawn)
     state = slam.close(state, jax.tree.map(lambda x: x[0], new))
 
     def step(state, frame):
@@ -177,14 +178,13 @@ def test_keyframe_and_world_filter_differ_to_second_order():
 
 def test_a_keyframe_is_due_after_a_turn_or_a_baseline():
     near, far = jnp.array([0.5, 0.0, 0.5]), jnp.array([0.01, 0.0, 0.0])
-    moved, turned = jnp.array([0.3, 0.4, 0.0]), jnp.array([0.0, 0.0, 1.1 * KEYFRAME_TURN])
-    pose = PLANAR.group.exp
-    assert KEYFRAME_PARALLAX < 0.5 * 0.5
-    assert keyframe_due(pose(moved), near)
-    assert not keyframe_due(pose(moved), far)
-    assert not keyframe_due(pose(moved), jnp.zeros(3))
-    assert keyframe_due(pose(turned), far)
-    assert not keyframe_due(pose(0.8 * turned), near)
+    frame, pose = Keyframe(turn=0.2, parallax=0.1), PLANAR.group.exp
+    moved, turned = jnp.array([0.3, 0.4, 0.0]), jnp.array([0.0, 0.0, 0.22])
+    assert frame.left(pose(moved), near)
+    assert not frame.left(pose(moved), far)
+    assert not frame.left(pose(moved), jnp.zeros(3))
+    assert frame.left(pose(turned), far)
+    assert not frame.left(pose(0.8 * turned), near)
 
 
 @pytest.mark.parametrize("landmark", [InverseScaling(), ImagePlane()], ids=named)
@@ -206,8 +206,8 @@ def test_a_parallax_is_the_way_from_the_keyframe_by_the_distance_of_the_map(land
             landmarks=jnp.stack([seen, seen, empty]),
             active=jnp.array([True, True, False]),
         )
-        return bool(slam.model.reanchoring_due(state))
+        return bool(slam.model.keyframe_left(state))
 
-    least = KEYFRAME_PARALLAX * distance
+    least = slam.frame.parallax * distance
     assert not due(0.99 * least, 100.0)
     assert due(1.01 * least, 100.0)

@@ -142,10 +142,8 @@ def check_delayed(slam: AbstractSlam) -> None:
 
 def around(slam: AbstractSlam) -> AbstractSlam:
     """The filter, which is to end in Cartesian landmarks. Raises ValueError for others."""
-    if slam.landmark != Cartesian():
-        raise ValueError(
-            f"a delayed initialisation ends in cartesian landmarks, not {slam.landmark.name}"
-        )
+    if (found := slam.model.landmark) != Cartesian():
+        raise ValueError(f"a delayed initialisation ends in cartesian landmarks, not {found.name}")
     return slam
 
 
