@@ -64,7 +64,9 @@ def _iterated(slam: Slam, steps: int = 5) -> Slam:
 
 def _corrected(slam: Slam, correction: AbstractCorrection) -> Slam:
     if type(slam.correction) not in (Kalman, type(correction)):
-        raise ValueError(f"a filter has one correction: {slam.correction.name} or {correction.name}")
+        raise ValueError(
+            f"a filter has one correction: {slam.correction.name} or {correction.name}"
+        )
     return replace(slam, correction=correction)
 
 
@@ -140,7 +142,9 @@ def _parsed(modifier: str) -> tuple[str, list[int]]:
     """The word of a modifier, and its number where there is one. Raises ValueError."""
     word = modifier.rstrip("0123456789")
     if word in _LEFT:
-        raise ValueError(f"modifier {word} is no more: {_LEFT[word]}; known: {', '.join(MODIFIERS)}")
+        raise ValueError(
+            f"modifier {word} is no more: {_LEFT[word]}; known: {', '.join(MODIFIERS)}"
+        )
     lookup("modifiers", [word], MODIFIERS)
     number = modifier[len(word) :]
     if number and word == "fej":

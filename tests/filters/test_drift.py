@@ -6,7 +6,6 @@ import pytest
 from cases import Case, quick_jit
 
 
-
 @pytest.mark.parametrize("landmark", ["inverse_scaling", "inverse_depth"])
 def test_a_feature_is_expected_by_so_much_less_surely(landmark):
     """`H (P + H⁺ share² R H⁺ᵀ) Hᵀ + R` is `S + share² R`."""

@@ -11,10 +11,10 @@ from cases import Case, close, named, pose, quick_jit
 
 from jaxslam.filters.linear.blocks import plus
 from jaxslam.filters.linear.kalman import Kalman
-from jaxslam.filters.remedies.gauge import act
 from jaxslam.filters.model import COMPOSED
+from jaxslam.filters.remedies.gauge import act
 from jaxslam.geometry import PLANAR, SPATIAL, difference, exp, log
-from jaxslam.landmarks import Cartesian, UnifiedInverseDepth, InverseScaling
+from jaxslam.landmarks import Cartesian, InverseScaling, UnifiedInverseDepth
 
 NAMES = {PLANAR: "matched", SPATIAL: "matched-6dof"}
 

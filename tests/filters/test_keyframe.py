@@ -18,12 +18,13 @@ from jaxslam.geometry import PLANAR, SPATIAL, difference, exp, identity, joined,
 from jaxslam.landmarks import ImagePlane, InverseScaling
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.camera import Camera
-from jaxslam.models.frame import Keyframe
 from jaxslam.models.depth import InverseDepth
+from jaxslam.models.frame import Keyframe
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Features
 from jaxslam.models.sensors import Pinhole
 
+IMAGE_PLANE = ImagePlane()
 CAPACITY, STEPS, DT = 5, 10, 0.1
 # Landmark of each slot: the frame in which it is new, and that after which it is removed.
 LIVES = ((0, None), (0, None), (3, None), (0, 5), (6, None))
@@ -38,7 +39,7 @@ def velocity(geometry):
     return axes(geometry, [0.3, 0.1, 0.14], [0.3, 0.0, 0.1, 0.0, -0.14, 0.02])
 
 
-def make(kind, geometry, calibration="white", scale=1.0, landmark=ImagePlane()):
+def make(kind, geometry, calibration="white", scale=1.0, landmark=IMAGE_PLANE):
     """A filter, every σ of which is times a scale."""
     p, t = geometry.pixel_dim, geometry.tangent_dim
     return FILTERS[kind](

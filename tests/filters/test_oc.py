@@ -16,16 +16,16 @@ from test_observability import GAUGE, nullity
 
 from jaxslam.filters.linear.blocks import plus
 from jaxslam.filters.linear.covariance import empty
+from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.filters.remedies.gauge import act, unobservable_directions
 from jaxslam.filters.remedies.observability_constrained import transport
-from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.geometry import PLANAR, SPATIAL, SplitPose, difference, tangent_dim
 from jaxslam.landmarks import (
     Cartesian,
     FramedHomogeneous,
     ImagePlane,
-    UnifiedInverseDepth,
     InverseScaling,
+    UnifiedInverseDepth,
 )
 from jaxslam.models.frame import Robocentric, WorldCentric
 from jaxslam.models.motion import Odometry

@@ -12,6 +12,7 @@ import pytest
 from cases import (
     Case,
     a_filter,
+    central,
     close,
     each_geometry,
     few_landmarks,
@@ -22,8 +23,8 @@ from cases import (
 )
 
 from jaxslam._numerics.arrays import cast
+from jaxslam.consistency.likelihood import log_likelihood
 from jaxslam.filters.gaussian import compose_first, insert
-from jaxslam.filters.slam import Slam
 from jaxslam.filters.linear import covariance as linear
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.model import COMPOSED, Context, Core
@@ -33,11 +34,12 @@ from jaxslam.filters.readouts import (
     landmarks_in_camera,
     landmarks_in_world,
 )
+from jaxslam.filters.slam import Slam
 from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.geometry import PLANAR, SPATIAL, joined, retract
 from jaxslam.landmarks import (
-    InverseDepthToCartesian,
     LANDMARKS,
+    InverseDepthToCartesian,
     ParallaxAngle,
 )
 from jaxslam.models.calibration import TREATMENTS, Estimated
@@ -47,6 +49,7 @@ from jaxslam.models.scale import ScaleGauge
 from jaxslam.simulation import scenario
 
 DT = 0.1
+HERE = Context(DT)
 
 
 @cache
@@ -134,16 +137,22 @@ def test_in_a_gauge_the_noise_is_scaled_but_says_nothing_of_the_scale(geometry):
     rng, n = np.random.default_rng(3), geometry.point_dim
     velocity, noise = jnp.asarray(rng.normal(size=(2, geometry.tangent_dim)))
 
-    def moved(log_scale, noise):
+    def core_of(log_scale, noise):
         held = Robocentric().from_base_pose(pose(geometry, 2))
-        core = Core(held, velocity, log_scale, noise, jnp.zeros(0))
-        context = Context(jnp.asarray(DT))
+        return Core(held, velocity, log_scale, noise, jnp.zeros(0))
+
+    def moved(log_scale, noise, context=HERE):
+        core = core_of(log_scale, noise)
         after = model.compose_core(core, context)
         return model.displacement(core, context).as_matrix(), after.motion
 
     log_scale = jnp.array([0.7])
-    derivatives = quick_jit(jax.jacfwd(moved))(log_scale, noise)
-    assert not any(np.any(part) for part in derivatives)
+    given = model.given(core_of(log_scale, noise), HERE)
+    assert not any(np.any(part) for part in quick_jit(jax.jacfwd(moved))(log_scale, noise, given))
+    # Only where it is given: a derivative of a whole run is the exact one, by e^−λ a.
+    less = noise.at[n:].set(0.0)
+    for by_scale, by_noise in quick_jit(jax.jacfwd(moved, argnums=(0, 1)))(log_scale, noise):
+        close(by_scale[..., 0], -by_noise @ less, 1e-12)
     smaller = noise.at[:n].multiply(np.exp(-0.7))
     scaled, plain = (quick_jit(moved)(*x) for x in ((log_scale, noise), (0 * log_scale, smaller)))
     for found, expected in zip(scaled, plain, strict=True):
@@ -448,6 +457,24 @@ def test_a_run_can_be_differentiated_by_its_noise():
     close(differences, gradient, 1e-4)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["scale_gauge", "scale_gauge+oc+scene50"])
+def test_a_likelihood_in_a_gauge_has_the_exact_derivative(name):
+    """Also of what a Jacobian of the filter takes as given, the scale that divides the noise."""
+    case = Case("matched-very-loose", steps=5, landmarks=4)
+    slam, run = cast(case.filter(name), jnp.float64), case.run(0)
+
+    def of(factor):
+        motion = replace(slam.motion, noise_sigma=factor * slam.motion.noise_sigma)
+        return log_likelihood(replace(slam, motion=motion), case.room, run)
+
+    one = jnp.ones(())
+    _, derivative = quick_jit(lambda at: jax.jvp(of, (at,), (one,)))(one)
+    difference = central(quick_jit(lambda x: of(x[0])), np.ones(1), 1e-5)[0]
+    np.testing.assert_allclose(derivative, difference, rtol=1e-6)
+    assert abs(derivative) > 0.1
+
+
 # --- conversions of landmarks -------------------------------------------------------------------
 
 
@@ -487,7 +514,10 @@ def convertible_state(model):
 
 @pytest.mark.parametrize(
     ("geometry", "frame", "landmark"),
-    [(PLANAR, Robocentric(), InverseDepthToCartesian()), (SPATIAL, WorldCentric(), ParallaxAngle())],
+    [
+        (PLANAR, Robocentric(), InverseDepthToCartesian()),
+        (SPATIAL, WorldCentric(), ParallaxAngle()),
+    ],
     ids=named,
 )
 def test_a_conversion_changes_neither_points_nor_what_is_known_of_them(geometry, frame, landmark):

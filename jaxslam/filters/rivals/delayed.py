@@ -140,10 +140,13 @@ def check_delayed(slam: AbstractSlam) -> None:
             raise ValueError(f"{what} {why}")
 
 
-def around(slam: AbstractSlam) -> AbstractSlam:
+def around(slam: AbstractFilter) -> AbstractSlam:
     """The filter, which is to end in Cartesian landmarks. Raises ValueError for others."""
-    if (found := slam.model.landmark) != Cartesian():
-        raise ValueError(f"a delayed initialisation ends in cartesian landmarks, not {found.name}")
+    what = "a delayed initialisation"
+    if not isinstance(slam, AbstractSlam):
+        raise ValueError(f"{what} is around a Slam, not around a {type(slam).__name__}")
+    if slam.landmark != Cartesian():
+        raise ValueError(f"{what} ends in cartesian landmarks, not {slam.landmark.name}")
     return slam
 
 

@@ -25,7 +25,7 @@ from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.linear.covariance import removed
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.mixture.density import log_density
-from jaxslam.filters.protocol import Corrected
+from jaxslam.filters.protocol import AbstractFilter, Corrected
 from jaxslam.filters.rivals.delayed import AbstractDelayed, Delayed, around, reweighted
 from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features
@@ -135,6 +135,6 @@ class RaySum(AbstractDelayed):
         )
 
 
-def with_rays(slam: AbstractSlam, farthest: int | None = None) -> RaySum:
+def with_rays(slam: AbstractFilter, farthest: int | None = None) -> RaySum:
     """The filter of Cartesian landmarks with rays of Gaussians up to `farthest`, m."""
     return RaySum(around(slam)) if farthest is None else RaySum(around(slam), farthest=farthest)

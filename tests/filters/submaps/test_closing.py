@@ -9,8 +9,8 @@ import pytest
 
 from jaxslam.consistency import run_through
 from jaxslam.filters import Loops, agreeing, base_poses, chain, close
-from jaxslam.filters.words import make_filters
 from jaxslam.filters.submaps import closing
+from jaxslam.filters.words import make_filters
 from jaxslam.models.frame import Submaps
 from jaxslam.simulation import Room, scenario, simulate
 
