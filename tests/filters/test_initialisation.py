@@ -143,7 +143,7 @@ def test_a_pending_ray_is_reported_with_the_moments_of_inverse_depth():
 
     @quick_jit
     def in_camera(state):
-        return landmarks_in_camera(slam, state, jnp.arange(1), slam.sensor)
+        return landmarks_in_camera(slam, state, jnp.arange(1), slam.model.sensor)
 
     chart, covariance = in_camera(state)
     inverse = 1 / np.linspace(0.5, 5.0, 40)
@@ -266,7 +266,7 @@ def two_runs():
 def test_a_batch_is_its_runs(name):
     case = two_runs()
     slam = case.filter(name, "cartesian")
-    run = partial(filter_run, slam, Room(landmarks=3, first=3, known=3, new=0), slam.sensor)
+    run = partial(filter_run, slam, Room(landmarks=3, first=3, known=3, new=0), slam.model.sensor)
     batch, _, _ = quick_jit(jax.vmap(run))(case.runs)
     alone, _, _ = quick_jit(run)(case.run(1))
     for key in ("nees", "landmark_nees", "nis"):
@@ -285,10 +285,8 @@ def test_every_member_has_the_noise_of_its_measurement():
 @pytest.mark.parametrize(
     ("name", "landmark", "sensor", "message"),
     [
-        ("world+rays0", Cartesian(), "camera", "nearest"),
         ("world+rays", InverseScaling(), "camera", "cartesian"),
         ("world+particles", InverseScaling(), "camera", "cartesian"),
-        ("world+particles+rays", Cartesian(), "camera", "cartesian"),
         ("world+particles", Cartesian(), "position", "finds a depth, which Position measures"),
     ],
 )
