@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -65,7 +66,7 @@ def test_a_filter_starts_with_a_prior_map(geometry, landmark, frame):
 
 def test_in_a_gauge_a_prior_map_is_in_metres_whatever_the_unit():
     """Points are known exactly, unit and metre are not: in metres nothing is left of that."""
-    slam = make_filter("scale_gauge", **scenario_pieces(scenario("matched")))
+    slam: Any = make_filter("scale_gauge", **scenario_pieces(scenario("matched")))
     slam, known = replace(slam, depth=replace(slam.depth, unit=0.4)), a_map(PLANAR, sigma=0.0)
     told = quick_jit(lambda: landmarks_in_world(slam, slam.init(4, known=known), SLOTS))
     points, covariances = told()

@@ -1,6 +1,7 @@
 """A chain of submaps against the one Gaussian of everything."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from jaxslam.filters.slam import Slam
 from jaxslam.filters.submaps import chain as chains
 from jaxslam.filters.submaps.chain import base_poses, chain
 from jaxslam.filters.submaps.closing import posterior
-from jaxslam.filters.words import make_filters
+from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.geometry import difference
 from jaxslam.landmarks import Cartesian
 from jaxslam.models.frame import Submaps
@@ -195,7 +196,7 @@ def test_a_chain_ends_where_the_filter_is_however_well_some_directions_are_known
         "handheld", noise, rate=10.0, steps=150, landmarks=12, depth_range=[5.0, 50.0],
         velocity=[0.0, 0.0, 8.0, 0.0, 0.0, 0.0], nearest_depth=5.0,
     )  # fmt: skip
-    (base,) = make_filters(road, "scale_gauge+oc+scene50", "inverse_scaling").values()
+    base: Any = make_filter("scale_gauge+oc+scene50", **scenario_pieces(road))
     slam, room = replace(base, frame=Submaps(12, 32)), Room(12, 12, 12, 12)
 
     def end():

@@ -1,6 +1,7 @@
 """A filter that hands its map over: the same estimates, and slots that are used again."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import pytest
 
 from jaxslam.consistency import run_through
 from jaxslam.filters.readouts import camera_pose, landmarks_in_world
-from jaxslam.filters.words import make_filters
+from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.geometry import difference
 from jaxslam.models.frame import Submaps
 from jaxslam.models.observations import Features
@@ -31,7 +32,7 @@ def through(slam, run):
 @pytest.mark.parametrize("name", ["robocentric", "robocentric+oc"])
 def test_a_filter_with_submaps_estimates_what_it_does_without(name):
     """Landmarks that left are marginalised in the one, and wait for that in the other."""
-    (base,) = make_filters(LAPS, name, "inverse_scaling").values()
+    base: Any = make_filter(name, **scenario_pieces(LAPS))
     slam, run = replace(base, frame=Submaps(8)), simulate(LAPS, jax.random.key(3))
     _, (pose, covariance, _) = jax.jit(lambda: through(base, run))()
     state, (mine, mine_covariance, count) = jax.jit(lambda: through(slam, run))()
@@ -47,7 +48,7 @@ def test_a_filter_with_submaps_estimates_what_it_does_without(name):
 
 def test_a_landmark_is_where_its_user_put_it():
     """By its own slot, whichever the base has for it; one that left is in the frozen submap."""
-    (base,) = make_filters(LAPS, "robocentric", "inverse_scaling").values()
+    base: Any = make_filter("robocentric", **scenario_pieces(LAPS))
     slam, run = replace(base, frame=Submaps(8)), simulate(LAPS, jax.random.key(3))
     state, _ = jax.jit(lambda: through(slam, run))()
     points, P = landmarks_in_world(slam, state, jnp.arange(6))
@@ -61,7 +62,7 @@ def test_a_landmark_is_where_its_user_put_it():
 
 
 def test_a_slot_that_is_filled_again_without_being_freed_is_a_new_landmark():
-    (base,) = make_filters(LAPS, "robocentric", "inverse_scaling").values()
+    base: Any = make_filter("robocentric", **scenario_pieces(LAPS))
     slam = replace(base, frame=Submaps(1))
     one = Features(np.array([0]), np.array([[300.0, 200.0]]), np.array([True]))
     state = slam.init(2, one)
