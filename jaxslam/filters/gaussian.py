@@ -25,7 +25,6 @@ from jaxslam.filters.protocol import (
     AbstractStaged,
     Belief,
     CameraView,
-    Corrected,
     EachMoments,
     Expected,
     LandmarkView,
@@ -35,6 +34,7 @@ from jaxslam.filters.protocol import (
     PoseError,
 )
 from jaxslam.geometry import Pose, SplitPose, difference, identity
+from jaxslam.models.frame import KeyframePose
 from jaxslam.models.motion import Control, check_control
 from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap, Slots
 from jaxslam.models.sensors import noises
@@ -236,6 +236,7 @@ def rebased(state: State) -> State:
     identity, and the motion's variables are kept as they are now."""
 
     def core(core: Core) -> Core:
+        assert isinstance(core.pose, KeyframePose)
         return replace(core, pose=core.pose.reanchored(), base_motion=core.motion)
 
     return linear.reparametrised(state, Change(core=core, view=lambda core: (), landmark=None))
@@ -305,7 +306,11 @@ def _with_prior_map(slam: AbstractSlam, state: State, known: PriorMap) -> State:
     """The state with the landmarks of a prior map: `X ~ N(points, covariance)` in B, which is the
     camera. Their length is the metre: what is not known of the filter's own unit is in them."""
     m, n = known.points.shape
-    wanted = {"slots": (m,), "points": (m, slam.motion.geometry.point_dim), "covariance": (m * n,) * 2}
+    wanted = {
+        "slots": (m,),
+        "points": (m, slam.motion.geometry.point_dim),
+        "covariance": (m * n,) * 2,
+    }
     for name, shape in wanted.items():
         if (found := getattr(known, name).shape) != shape:
             raise ValueError(f"a prior map's {name} has shape {found}; it needs {shape}")
@@ -316,9 +321,7 @@ def _with_prior_map(slam: AbstractSlam, state: State, known: PriorMap) -> State:
         return slam.landmark.initialise(point, omega, focal), None
 
     points = jnp.asarray(known.points, one.dtype)
-    values, _, J = linear.local_jacobians(
-        lambda core: core.log_scale, landmark, state.core, points
-    )
+    values, _, J = linear.local_jacobians(lambda core: core.log_scale, landmark, state.core, points)
     P = jnp.asarray(known.covariance, one.dtype).reshape(m, n, m, n)
     own = jnp.einsum("mdn,mnkl,kel->mdke", J.by_landmark, P, J.by_landmark)
     state = linear.with_landmarks(state, jnp.asarray(known.slots), values, J, own)

@@ -19,6 +19,7 @@ from jaxslam.filters.linear.state import State
 from jaxslam.geometry import (
     Geometry,
     Pose,
+    Scalar,
     SplitPose,
     homogeneous_apply,
     identity,
@@ -130,7 +131,9 @@ class SlamModel(eqx.Module):
         """The camera's motion in this step; the identity once it is composed."""
         if context.control is None:
             return identity(self.geometry, core.noise.dtype)
-        return self.motion.displacement(core.motion, self._noises(core, context)[0], context.control)
+        return self.motion.displacement(
+            core.motion, self._noises(core, context)[0], context.control
+        )
 
     def _noises(
         self, core: Core, context: Context
@@ -197,8 +200,7 @@ class SlamModel(eqx.Module):
     def keyframe_left(self, state: State) -> Bool[Array, ""]:
         """Whether the camera has left its keyframe, or the one in which its submap began; its
         motion is composed."""
-        T_KC = state.core.pose.keyframe_from_camera
-        return self.frame.left(T_KC, self.inverse_distances(state))
+        return self.frame.left(state.core.pose, self.inverse_distances(state))
 
     def inverse_distances(self, state: State) -> Float[Array, " capacity"]:
         """Of the landmarks from the origin of the map frame; zero in empty slots."""
@@ -208,9 +210,7 @@ class SlamModel(eqx.Module):
 
     def _map_from_camera(self, core: Core) -> Pose:
         """T_AC, once the motion is composed."""
-        return self.frame.map_from_camera(
-            core.pose, identity(self.geometry, core.noise.dtype)
-        )
+        return self.frame.map_from_camera(core.pose, identity(self.geometry, core.noise.dtype))
 
     def observe(self, view: CameraInMap, landmark: Array, context: Context) -> tuple[Array, Array]:
         """`h = proj(K T_AC⁻¹ X)` (P12, P14), and whether it is possible."""

@@ -125,7 +125,9 @@ def _parsed(modifier: str) -> tuple[str, list[int]]:
     """The word of a modifier, and its number where there is one. Raises ValueError."""
     word = modifier.rstrip("0123456789")
     if word in _LEFT:
-        raise ValueError(f"modifier {word} is no more: {_LEFT[word]}; known: {', '.join(MODIFIERS)}")
+        raise ValueError(
+            f"modifier {word} is no more: {_LEFT[word]}; known: {', '.join(MODIFIERS)}"
+        )
     lookup("modifiers", [word], MODIFIERS)
     number = modifier[len(word) :]
     if number and word == "fej":

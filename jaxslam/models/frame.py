@@ -60,6 +60,12 @@ class AbstractFrame(eqx.Module):
     def compose(self, held: Held, step: Pose) -> Held:
         """What is held at k, from that at k−1 and the displacement."""
 
+    def left(self, held: Held, inverse_distances: Float[Array, " capacity"]) -> Bool[Array, ""]:
+        """Whether the camera has left an earlier one from which its pose is held; there is none.
+        Distances (of landmarks from that) that are not to count are infinite."""
+        del held, inverse_distances
+        return jnp.zeros((), bool)
+
 
 class Robocentric(AbstractFrame):
     """The paper's: A = C, and the state holds T_CB."""
@@ -152,9 +158,10 @@ class AbstractKeyframed(AbstractFrame):
     def compose(self, held: KeyframePose, step: Pose) -> KeyframePose:
         return held.moved(step)
 
-    def left(self, T_KC: Pose, inverse_distances: Float[Array, " capacity"]) -> Bool[Array, ""]:
-        """Whether the camera has left K; distances (of landmarks from K) that are not to count are
-        infinite."""
+    def left(
+        self, held: KeyframePose, inverse_distances: Float[Array, " capacity"]
+    ) -> Bool[Array, ""]:
+        T_KC = held.keyframe_from_camera
         count = jnp.maximum(jnp.sum(inverse_distances != 0), 1)
         parallax = jnp.linalg.norm(T_KC.translation()) * jnp.sum(inverse_distances) / count
         turn = jnp.linalg.norm(log(T_KC.rotation()))

@@ -30,6 +30,7 @@ from jaxslam.filters.protocol import (
     Expected,
     OfLandmark,
 )
+from jaxslam.models.frame import Submaps
 from jaxslam.models.motion import Control
 from jaxslam.models.observations import Capacity, Features, PriorMap, Slots
 
@@ -65,6 +66,8 @@ class SubmapsState(eqx.Module):
 class Handover(AbstractLayer):
     """The layer of a filter whose frame is `Submaps`: slots, and what is frozen."""
 
+    frame: Submaps
+
     def init(
         self,
         slam: AbstractSlam,
@@ -73,13 +76,13 @@ class Handover(AbstractLayer):
         known: PriorMap | None,
     ) -> SubmapsState:
         room = Capacity.of(capacity)
-        own = room.landmarks + slam.frame.spare
+        own = room.landmarks + (self.frame.spare or 0)
         inner = slam.inner.init(room._replace(landmarks=own), first, known)
         none = jnp.full(room.landmarks, own)
         empty = jnp.full(own, -1)
         _, one = slam.inner.gaussian(inner, None)
         frozen = Frozen(one, jnp.zeros(own, bool), empty)
-        history = slam.frame.history
+        history = self.frame.history
         frozen = jax.tree.map(lambda x: jnp.zeros((history, *x.shape), x.dtype), frozen)
         zero = jnp.zeros((), int)
         state = SubmapsState(inner, none, empty, zero, frozen, zero)
@@ -101,7 +104,8 @@ class Handover(AbstractLayer):
         self, slam: AbstractSlam, state: SubmapsState, control: Control
     ) -> tuple[AbstractStaged, SubmapsState]:
         base, one = slam.inner.gaussian(state.inner, control)
-        return replace(base, frame=slam.frame), replace(state, inner=one)
+        assert isinstance(base, AbstractSlam)
+        return replace(base, frame=self.frame), replace(state, inner=one)
 
     def predict_features(
         self, slam: AbstractSlam, state: SubmapsState, control: Control, slots: Slots
@@ -162,7 +166,7 @@ class Handover(AbstractLayer):
             return each_gaussian(slam.inner.remove(inner, ~carried), rebased)
 
         # Apart from what is conditional: a batch would copy all that is kept in every frame.
-        place = state.count % slam.frame.history
+        place = state.count % self.frame.history
         before = jax.tree.map(lambda x: x[place], state.frozen)
         newest = cond(ended, frozen, before, state.inner)
         return replace(

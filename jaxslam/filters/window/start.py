@@ -22,6 +22,7 @@ from jaxslam._numerics.arrays import AnyArray, cast, precision
 from jaxslam._numerics.conditional import cond, map_where
 from jaxslam.filters.layer import AbstractLayer, AbstractSlam
 from jaxslam.filters.linear.state import State
+from jaxslam.filters.mixture.mixture import Mixture
 from jaxslam.filters.mixture.sum_state import SumState
 from jaxslam.filters.protocol import Corrected
 from jaxslam.filters.window import record as window
@@ -49,7 +50,7 @@ class Schedule(eqx.Module):
     searched: int = eqx.field(static=True)
     """Frames in which they are sought, spread over the window."""
     renewed: tuple[int, ...] = eqx.field(static=True)
-    """In which frames the sum begins anew, by window: in every frame whose number this divides."""
+    """By window: the sum begins anew in every frame whose number this divides."""
     divided: bool = eqx.field(static=True)
     """Whether the sum is divided anew in every frame, or its members are the modes and what becomes
     of them: halves of a Gaussian, each linearised off its middle, can be worse than the whole."""
@@ -63,7 +64,7 @@ class Schedule(eqx.Module):
     moved: float = eqx.field(static=True, default=0.1)
     """The same, below which a camera has done more than turn."""
     doubtful: float = eqx.field(static=True, default=4.0)
-    """σ of a landmark that is given up, one a frame: what is seen there is no point of the world."""
+    """σ of a landmark that is given up, one a frame: what is seen there is no point in space."""
 
     def __check_init__(self) -> None:
         if min(self.sizes, default=0) < 3 or list(self.sizes) != sorted(set(self.sizes)):
@@ -122,7 +123,7 @@ class FromWindow(AbstractLayer):
         if first is not None:
             begun = window.begun(begun, first)
         member = one.init(capacity, first)
-        modes = at_rest(cast(one, dtype), begun, slam.mixture.members, dtype)
+        modes = at_rest(cast(one, dtype), begun, _mixture(slam).members, dtype)
         count = len(modes.log_weights)
         members = jax.tree.map(lambda x: jnp.tile(x, (count, *(1,) * x.ndim)), member)
         return RestState(SumState(members, modes.log_weights), begun, modes, jnp.ones((), bool))
@@ -136,7 +137,7 @@ class FromWindow(AbstractLayer):
     def update(
         self, slam: AbstractSlam, state: RestState, control: Control, seen: Features
     ) -> Corrected:
-        mixture = slam.mixture
+        mixture = _mixture(slam)
         update = mixture.update if self.schedule.divided else mixture.update_members
         after, innovation = update(slam.inner, state.sum, control, seen)
         stepped = window.stepped(state.record, control, seen, slam.sensor.noise)
@@ -246,6 +247,13 @@ class FromWindow(AbstractLayer):
         variance = jnp.trace(member.covariance[position, position])
         squared = jnp.sum(slam.model.camera_pose(member.core).translation() ** 2)
         return variance < share**2 * squared
+
+
+def _mixture(slam: AbstractSlam) -> Mixture:
+    """The sum that begins so."""
+    mixture = slam.inner.layer
+    assert isinstance(mixture, Mixture)
+    return mixture
 
 
 def _likely(members: SumState, now: Bool[Array, ""], given_up: float) -> SumState:
