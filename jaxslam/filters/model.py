@@ -154,15 +154,31 @@ class SlamModel(eqx.Module):
 
     def compose_core(self, core: Core, context: Context) -> Core:
         """P18, P19. The noise has been used: it is marginalised."""
-        step, (noise, drift) = self.displacement(core, context), self._noises(core, context)
+        noises = self._noises(core, context)
+        step, variables, delta = self.moved(core.motion, core.calibration, *noises, context.control)
         moved = self.frame.moves_landmarks
         return replace(
             core,
             pose=self.frame.compose(core.pose, step),
             anchors=_seen_from(step, core.anchors) if moved else core.anchors,
-            motion=self.motion.next(core.motion, noise, context.control),
-            calibration=self.calibration.next(core.calibration, drift),
+            motion=variables,
+            calibration=delta,
             noise=jnp.zeros_like(core.noise),
+        )
+
+    def moved(
+        self,
+        variables: Variables,
+        delta: Float[Array, " k"],
+        noise: Float[Array, " q"],
+        drift: Float[Array, " w"],
+        control: Control,
+    ) -> tuple[Pose, Variables, Float[Array, " k"]]:
+        """The displacement of a step, and the motion's variables and the calibration after it."""
+        return (
+            self.motion.displacement(variables, noise, control),
+            self.motion.next(variables, noise, control),
+            self.calibration.next(delta, drift),
         )
 
     def camera_pose(self, core: Core) -> Pose:
@@ -216,12 +232,12 @@ class SlamModel(eqx.Module):
         """`h = proj(K T_AC⁻¹ X)` (P12, P14), and whether it is possible."""
         del context
         point, omega = self.camera_point(view, landmark)
-        sensor = self.sensor_of(view)
+        sensor = self.sensor_at(view.calibration)
         return sensor.measure(point, omega), sensor.possible(point)
 
-    def sensor_of(self, view: CameraInMap) -> AbstractSensor:
-        """The sensor with the calibration's error of this step."""
-        return self.calibration.sensor(self.sensor, view.calibration)
+    def sensor_at(self, delta: Float[Array, " k"]) -> AbstractSensor:
+        """The sensor whose calibration is off by δ."""
+        return self.calibration.sensor(self.sensor, delta)
 
     def residual(self, measured: Array, predicted: Array) -> Array:
         """The difference of a measurement from its prediction."""
@@ -252,7 +268,7 @@ class SlamModel(eqx.Module):
         self, view: CameraInMap, measured: Array, hidden: Array, context: Context
     ) -> Array:
         """P22–P26: a landmark in the map frame from its first measurement and the prior."""
-        sensor = self.sensor_of(view)
+        sensor = self.sensor_at(view.calibration)
         if view.depth_error is not None:
             hidden = hidden + self.depth.sigma * view.depth_error
         point, omega = sensor.locate(measured, hidden)

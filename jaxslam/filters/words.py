@@ -112,13 +112,30 @@ def make_filter(name: str, **pieces: Piece) -> AbstractFilter:
     if isinstance(named := pieces.get("landmark"), str):
         pieces["landmark"] = lookup("landmark", named, LANDMARKS)[named]
     base, *modifiers = name.split("+")
-    made: AbstractFilter = lookup("filters", [base], FILTERS)[base](**pieces)
-    for word, given in sorted(map(_parsed, modifiers), key=lambda one: _ORDER.index(one[0])):
+    make = lookup("filters", [base], FILTERS)[base]
+    parsed = sorted(map(_parsed, modifiers), key=lambda one: _ORDER.index(one[0]))
+    _check_one_of_each([base, *(word for word, _ in parsed)])
+    made: AbstractFilter = make(**pieces)
+    for word, given in parsed:
         made = MODIFIERS[word](made, *given)
     return made
 
 
 _ORDER = list(MODIFIERS)
+_ONE_OF = {
+    "correction": ("invariant", "fej", "oc"),
+    "sum of Gaussians": ("directions", "mixture"),
+    "delayed initialisation": ("particles", "rays"),
+}
+"""Words of which a name has one at the most, and what each of them is."""
+
+
+def _check_one_of_each(words: list[str]) -> None:
+    """Raise ValueError for a word that is there twice, or beside one that says the same piece."""
+    for what, those in (*_ONE_OF.items(), *((word, (word,)) for word in MODIFIERS)):
+        found = [word for word in words if word in those]
+        if len(found) > 1:
+            raise ValueError(f"a filter has one {what}, not {' and '.join(found)}")
 
 
 def _parsed(modifier: str) -> tuple[str, list[int]]:

@@ -75,7 +75,7 @@ def _root_of_cost(slam: AbstractSlam, likeliest: State, seen: Features) -> Float
 
     _, variances = landmark_moments(view_of, inverse_depth, likeliest, seen.slots)
     view = view_of(likeliest.core)
-    sensor = model.sensor_of(view)
+    sensor = model.sensor_at(view.calibration)
     whitening = cholesky(sensor.noise).whitening
 
     def by_point(landmark):

@@ -140,8 +140,10 @@ def check_delayed(slam: AbstractSlam) -> None:
             raise ValueError(f"{what} {why}")
 
 
-def around(slam: AbstractSlam) -> AbstractSlam:
+def around(slam: AbstractFilter) -> AbstractSlam:
     """The filter, which is to end in Cartesian landmarks. Raises ValueError for others."""
+    if not isinstance(slam, AbstractSlam):
+        raise ValueError(f"a delayed initialisation is around a Slam, not {type(slam).__name__}")
     if slam.landmark != Cartesian():
         raise ValueError(
             f"a delayed initialisation ends in cartesian landmarks, not {slam.landmark.name}"
