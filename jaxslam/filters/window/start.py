@@ -18,13 +18,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from jaxslam._numerics.arrays import AnyArray, cast, precision
+from jaxslam._numerics.arrays import cast, precision
 from jaxslam._numerics.conditional import cond, map_where
 from jaxslam.filters.layer import AbstractLayer, AbstractSlam
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.mixture.mixture import Mixture
 from jaxslam.filters.mixture.sum_state import SumState
-from jaxslam.filters.protocol import Corrected
 from jaxslam.filters.window import record as window
 from jaxslam.filters.window.modes import Found, Mean, Modes, at_rest, searched, sought
 from jaxslam.filters.window.problem import PathLayout
@@ -32,8 +31,7 @@ from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.subsample import thinned, tied
 from jaxslam.filters.window.to_filter import gauge_state
 from jaxslam.geometry import PLANAR, Geometry
-from jaxslam.models.motion import Control
-from jaxslam.models.observations import Capacity, Features, PriorMap
+from jaxslam.models.observations import Capacity
 
 
 class Schedule(eqx.Module):
@@ -104,16 +102,10 @@ class FromWindow(AbstractLayer):
 
     schedule: Schedule
 
-    def ambiguous_start(self, slam: AbstractSlam) -> bool:
+    def ambiguous_start(self, slam):
         return True
 
-    def init(
-        self,
-        slam: AbstractSlam,
-        capacity: int | Capacity,
-        first: Features | None,
-        known: PriorMap | None,
-    ) -> RestState:
+    def init(self, slam, capacity, first, known):
         """Raises ValueError for a prior map, of which a window knows nothing."""
         if known is not None:
             raise ValueError("a start from a window takes no prior map; leave out start, or known")
@@ -134,16 +126,14 @@ class FromWindow(AbstractLayer):
     def around(self, state: RestState, inner: SumState) -> RestState:
         return replace(state, sum=inner)
 
-    def update(
-        self, slam: AbstractSlam, state: RestState, control: Control, seen: Features
-    ) -> Corrected:
+    def update(self, slam, state, control, seen):
         mixture = _mixture(slam)
         update = mixture.update if self.schedule.divided else mixture.update_members
         after, innovation = update(slam.inner, state.sum, control, seen)
         stepped = window.stepped(state.record, control, seen, slam.sensor.noise)
         return replace(state, sum=after, record=stepped), innovation
 
-    def close(self, slam: AbstractSlam, state: RestState, new: Features) -> RestState:
+    def close(self, slam, state, new):
         """End the frame, and begin the sum anew from the window's modes while that is open."""
         schedule = self.schedule
         after = slam.inner.close(state.sum, new)
@@ -166,9 +156,7 @@ class FromWindow(AbstractLayer):
         thinned = partial(self._thinned, slam)
         return cond(state.open & state.record.full, thinned, state)
 
-    def remove(
-        self, slam: AbstractSlam, state: RestState, gone: Bool[AnyArray, " capacity"]
-    ) -> RestState:
+    def remove(self, slam, state, gone):
         modes = state.modes
         y = jnp.where(gone[:, None], 0.0, modes.minima.y)
         return RestState(
@@ -178,7 +166,7 @@ class FromWindow(AbstractLayer):
             state.open,
         )
 
-    def unit_fixed(self, slam: AbstractSlam, state: RestState) -> Bool[Array, ""]:
+    def unit_fixed(self, slam, state):
         return ~state.open
 
     def _anew(
