@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxslam.geometry import Pose, SplitPose, log
+from jaxslam.geometry import Pose, Scalar, SplitPose, log, scaled
 
 Held = PyTree
 """What a state holds of the pose."""
@@ -59,6 +59,10 @@ class AbstractFrame(eqx.Module):
     @abstractmethod
     def compose(self, held: Held, step: Pose) -> Held:
         """What is held at k, from that at k−1 and the displacement."""
+
+    def acted(self, held: Held, rigid: Pose, factor: Scalar) -> Held:
+        """What is held once everything is enlarged by a factor, then moved in B."""
+        return self.from_base_pose(rigid @ scaled(self.camera_pose(held), factor))
 
     def left(self, held: Held, inverse_distances: Float[Array, " capacity"]) -> Bool[Array, ""]:
         """Whether the camera has left an earlier one from which its pose is held; there is none.
@@ -157,6 +161,10 @@ class AbstractKeyframed(AbstractFrame):
 
     def compose(self, held: KeyframePose, step: Pose) -> KeyframePose:
         return held.moved(step)
+
+    def acted(self, held: KeyframePose, rigid: Pose, factor: Scalar) -> KeyframePose:
+        enlarged = scaled(held, factor)
+        return KeyframePose(rigid @ enlarged.base_from_keyframe, enlarged.keyframe_from_camera)
 
     def left(
         self, held: KeyframePose, inverse_distances: Float[Array, " capacity"]
