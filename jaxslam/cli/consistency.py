@@ -41,8 +41,8 @@ class ConsistencyOptions:
         tuple[str, ...],
         tyro.conf.arg(
             metavar="NAME …",
-            help=f"Filters: {', '.join(FILTERS)}; each may be modified, as in scale_gauge+mixture9, "
-            f"in any order: {', '.join(MODIFIERS)}, with a number.",
+            help=f"Filters: {', '.join(FILTERS)}; each may be modified, in any order, as in "
+            f"scale_gauge+mixture9: {', '.join(MODIFIERS)}, with a number.",
         ),
     ] = ("robocentric",)
     calibration: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None

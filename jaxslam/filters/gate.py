@@ -9,10 +9,7 @@ import jax.numpy as jnp
 
 from jaxslam._runtime.lookup import lookup
 from jaxslam.filters.association import ASSOCIATIONS, TOLERANCE, candidates
-from jaxslam.filters.layer import AbstractLayer, AbstractSlam
-from jaxslam.filters.protocol import Belief, Corrected
-from jaxslam.models.motion import Control
-from jaxslam.models.observations import Features
+from jaxslam.filters.layer import AbstractLayer
 
 
 class Gate(AbstractLayer):
@@ -27,9 +24,7 @@ class Gate(AbstractLayer):
     def __check_init__(self) -> None:
         lookup("association", [self.association], ASSOCIATIONS)
 
-    def update(
-        self, slam: AbstractSlam, state: Belief, control: Control, seen: Features
-    ) -> Corrected:
+    def update(self, slam, state, control, seen):
         one, gaussian = slam.inner.gaussian(state, control)
         tolerance = self.tolerance * jnp.sqrt(slam.sensor.noise[0, 0])
         found = candidates(one, gaussian, control, seen, tolerance)

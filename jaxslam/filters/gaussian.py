@@ -13,46 +13,35 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
-from jaxslam._numerics.arrays import AnyArray, cast, precision
+from jaxslam._numerics.arrays import cast, precision
 from jaxslam.filters.layer import AbstractLayer, AbstractSlam
 from jaxslam.filters.linear import covariance as linear
 from jaxslam.filters.linear.blocks import Change, Landmark, Noise, Prior
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.filters.protocol import (
-    AbstractStaged,
     Belief,
     CameraView,
-    Corrected,
-    EachMoments,
     Expected,
     LandmarkView,
-    Moments,
-    OfCamera,
     OfLandmark,
-    PoseError,
 )
-from jaxslam.geometry import Pose, SplitPose, difference, identity
+from jaxslam.geometry import SplitPose, difference, identity
+from jaxslam.models.frame import KeyframePose
 from jaxslam.models.motion import Control, check_control
-from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap, Slots
+from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap
 from jaxslam.models.sensors import noises
 
 
 class OneGaussian(AbstractLayer):
     """The innermost layer: the stages of an extended Kalman filter."""
 
-    def ambiguous_start(self, slam: AbstractSlam) -> bool:
+    def ambiguous_start(self, slam):
         return False
 
-    def init(
-        self,
-        slam: AbstractSlam,
-        capacity: int | Capacity,
-        first: Features | None,
-        known: PriorMap | None,
-    ) -> State:
+    def init(self, slam, capacity, first, known):
         """An exactly known pose at the origin of B, the motion's start, an empty map.
 
         Raises ValueError for a capacity that is none, and for features of another shape.
@@ -65,14 +54,12 @@ class OneGaussian(AbstractLayer):
         check_features(slam, first)
         return slam.close(with_frames_calibration(slam, state), first)
 
-    def predict(self, slam: AbstractSlam, state: State, control: Control) -> State:
+    def predict(self, slam, state, control):
         """Append this step's noise; move already where the motion is composed first."""
         check_control(slam.motion, control)
         return composed_first(slam, append_noise(slam, state), control)
 
-    def predict_features(
-        self, slam: AbstractSlam, state: State, control: Control, slots: Slots
-    ) -> Expected:
+    def predict_features(self, slam, state, control, slots):
         context = context_of(slam, control)
         model, core = slam.model, state.core
         measured, covariance, possible = linear.expected(model, state, slots, context)
@@ -86,19 +73,15 @@ class OneGaussian(AbstractLayer):
         covariance = covariance + noises(slam.sensor, measured)
         return Expected(measured, covariance, possible, model.camera_pose(core), points, omegas)
 
-    def gaussian(
-        self, slam: AbstractSlam, state: State, control: Control
-    ) -> tuple[AbstractStaged, State]:
+    def gaussian(self, slam, state, control):
         del control
         return slam, state
 
-    def update(
-        self, slam: AbstractSlam, state: State, control: Control, seen: Features
-    ) -> tuple[State, Innovation]:
+    def update(self, slam, state, control, seen):
         check_features(slam, seen)
         return correct(slam, state, control, seen)
 
-    def compose(self, slam: AbstractSlam, state: State, control: Control) -> State:
+    def compose(self, slam, state, control):
         """Move into the new camera frame, after the update (P18–P21); convert landmarks; make the
         camera a keyframe where one is due."""
         if not compose_first(slam):
@@ -110,14 +93,14 @@ class OneGaussian(AbstractLayer):
             return state
         return linear.converted(slam.model, state, COMPOSED)
 
-    def close(self, slam: AbstractSlam, state: State, new: Features) -> State:
+    def close(self, slam, state, new):
         check_features(slam, new)
         return forgotten(slam, insert(slam, state, new))
 
-    def remove(self, slam: AbstractSlam, state: State, gone: Bool[AnyArray, " capacity"]) -> State:
+    def remove(self, slam, state, gone):
         return linear.removed(state, gone)
 
-    def marginal(self, slam: AbstractSlam, state: State, function: OfCamera) -> Moments:
+    def marginal(self, slam, state, function):
         """The marginal of the state at the end of a frame, to first order: `J P Jᵀ`."""
 
         def of_core(core: Core) -> PyTree:
@@ -125,21 +108,19 @@ class OneGaussian(AbstractLayer):
 
         return linear.core_moments(of_core, state)
 
-    def landmark_marginal(
-        self, slam: AbstractSlam, state: State, function: OfLandmark, slots: Slots
-    ) -> EachMoments:
+    def landmark_marginal(self, slam, state, function, slots):
         return linear.landmark_moments(composed, of_landmark(slam, function), state, slots)
 
-    def in_map(self, slam: AbstractSlam, state: State) -> Bool[Array, " capacity"]:
+    def in_map(self, slam, state):
         return state.active
 
-    def pose_error(self, slam: AbstractSlam, state: State, T_BC: Pose) -> PoseError:
+    def pose_error(self, slam, state, T_BC):
         """`T_true ⊟ T_est` of the pose that the frame holds, and its covariance."""
         frame = slam.frame
         estimate, covariance = linear.core_moments(slam.model.estimate, state)
         return difference(frame.estimate(frame.from_base_pose(T_BC)), estimate), covariance
 
-    def unit_fixed(self, slam: AbstractSlam, state: State) -> Bool[Array, ""]:
+    def unit_fixed(self, slam, state):
         del state
         return jnp.ones((), bool)
 
@@ -236,6 +217,7 @@ def rebased(state: State) -> State:
     identity, and the motion's variables are kept as they are now."""
 
     def core(core: Core) -> Core:
+        assert isinstance(core.pose, KeyframePose)
         return replace(core, pose=core.pose.reanchored(), base_motion=core.motion)
 
     return linear.reparametrised(state, Change(core=core, view=lambda core: (), landmark=None))
@@ -305,7 +287,11 @@ def _with_prior_map(slam: AbstractSlam, state: State, known: PriorMap) -> State:
     """The state with the landmarks of a prior map: `X ~ N(points, covariance)` in B, which is the
     camera. Their length is the metre: what is not known of the filter's own unit is in them."""
     m, n = known.points.shape
-    wanted = {"slots": (m,), "points": (m, slam.motion.geometry.point_dim), "covariance": (m * n,) * 2}
+    wanted = {
+        "slots": (m,),
+        "points": (m, slam.motion.geometry.point_dim),
+        "covariance": (m * n,) * 2,
+    }
     for name, shape in wanted.items():
         if (found := getattr(known, name).shape) != shape:
             raise ValueError(f"a prior map's {name} has shape {found}; it needs {shape}")

@@ -57,6 +57,11 @@ class AbstractSlam(AbstractStaged):
 
     @property
     @abstractmethod
+    def layer(self) -> AbstractLayer:
+        """The outermost layer."""
+
+    @property
+    @abstractmethod
     def layered(self) -> bool:
         """Whether anything stands around the Gaussian."""
 

@@ -19,6 +19,7 @@ from jaxslam.filters.linear.state import State
 from jaxslam.geometry import (
     Geometry,
     Pose,
+    Scalar,
     SplitPose,
     homogeneous_apply,
     identity,
@@ -130,7 +131,9 @@ class SlamModel(eqx.Module):
         """The camera's motion in this step; the identity once it is composed."""
         if context.control is None:
             return identity(self.geometry, core.noise.dtype)
-        return self.motion.displacement(core.motion, self._noises(core, context)[0], context.control)
+        return self.motion.displacement(
+            core.motion, self._noises(core, context)[0], context.control
+        )
 
     def _noises(
         self, core: Core, context: Context
@@ -151,15 +154,31 @@ class SlamModel(eqx.Module):
 
     def compose_core(self, core: Core, context: Context) -> Core:
         """P18, P19. The noise has been used: it is marginalised."""
-        step, (noise, drift) = self.displacement(core, context), self._noises(core, context)
+        noises = self._noises(core, context)
+        step, variables, delta = self.moved(core.motion, core.calibration, *noises, context.control)
         moved = self.frame.moves_landmarks
         return replace(
             core,
             pose=self.frame.compose(core.pose, step),
             anchors=_seen_from(step, core.anchors) if moved else core.anchors,
-            motion=self.motion.next(core.motion, noise, context.control),
-            calibration=self.calibration.next(core.calibration, drift),
+            motion=variables,
+            calibration=delta,
             noise=jnp.zeros_like(core.noise),
+        )
+
+    def moved(
+        self,
+        variables: Variables,
+        delta: Float[Array, " k"],
+        noise: Float[Array, " q"],
+        drift: Float[Array, " w"],
+        control: Control,
+    ) -> tuple[Pose, Variables, Float[Array, " k"]]:
+        """The displacement of a step, and the motion's variables and the calibration after it."""
+        return (
+            self.motion.displacement(variables, noise, control),
+            self.motion.next(variables, noise, control),
+            self.calibration.next(delta, drift),
         )
 
     def camera_pose(self, core: Core) -> Pose:
@@ -197,8 +216,7 @@ class SlamModel(eqx.Module):
     def keyframe_left(self, state: State) -> Bool[Array, ""]:
         """Whether the camera has left its keyframe, or the one in which its submap began; its
         motion is composed."""
-        T_KC = state.core.pose.keyframe_from_camera
-        return self.frame.left(T_KC, self.inverse_distances(state))
+        return self.frame.left(state.core.pose, self.inverse_distances(state))
 
     def inverse_distances(self, state: State) -> Float[Array, " capacity"]:
         """Of the landmarks from the origin of the map frame; zero in empty slots."""
@@ -208,20 +226,18 @@ class SlamModel(eqx.Module):
 
     def _map_from_camera(self, core: Core) -> Pose:
         """T_AC, once the motion is composed."""
-        return self.frame.map_from_camera(
-            core.pose, identity(self.geometry, core.noise.dtype)
-        )
+        return self.frame.map_from_camera(core.pose, identity(self.geometry, core.noise.dtype))
 
     def observe(self, view: CameraInMap, landmark: Array, context: Context) -> tuple[Array, Array]:
         """`h = proj(K T_AC⁻¹ X)` (P12, P14), and whether it is possible."""
         del context
         point, omega = self.camera_point(view, landmark)
-        sensor = self.sensor_of(view)
+        sensor = self.sensor_at(view.calibration)
         return sensor.measure(point, omega), sensor.possible(point)
 
-    def sensor_of(self, view: CameraInMap) -> AbstractSensor:
-        """The sensor with the calibration's error of this step."""
-        return self.calibration.sensor(self.sensor, view.calibration)
+    def sensor_at(self, delta: Float[Array, " k"]) -> AbstractSensor:
+        """The sensor whose calibration is off by δ."""
+        return self.calibration.sensor(self.sensor, delta)
 
     def residual(self, measured: Array, predicted: Array) -> Array:
         """The difference of a measurement from its prediction."""
@@ -252,7 +268,7 @@ class SlamModel(eqx.Module):
         self, view: CameraInMap, measured: Array, hidden: Array, context: Context
     ) -> Array:
         """P22–P26: a landmark in the map frame from its first measurement and the prior."""
-        sensor = self.sensor_of(view)
+        sensor = self.sensor_at(view.calibration)
         if view.depth_error is not None:
             hidden = hidden + self.depth.sigma * view.depth_error
         point, omega = sensor.locate(measured, hidden)

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import fields, replace
 from typing import get_type_hints
 
-import equinox as eqx
 from jaxtyping import Array, Bool
 
 from jaxslam._numerics.arrays import AnyArray
@@ -38,7 +37,7 @@ from jaxslam.models.observations import Capacity, Features, PriorMap, Slots
 from jaxslam.models.scale import AbstractScale, Metre
 from jaxslam.models.sensors import AbstractSensor
 
-_ONE, _HANDOVER = OneGaussian(), Handover()
+_ONE = OneGaussian()
 
 
 class Slam(AbstractSlam):
@@ -79,15 +78,16 @@ class Slam(AbstractSlam):
         compatible(self)
 
     @property
-    def _layer(self) -> AbstractLayer:
+    def layer(self) -> AbstractLayer:
         """The outermost of the layers, which stand in this order."""
-        submaps = _HANDOVER if self.frame.hands_over else None
-        around = (self.gate, submaps, self.start, self.mixture)
+        frame = self.frame
+        ends = isinstance(frame, Submaps) and frame.hands_over
+        around = (self.gate, Handover(frame) if ends else None, self.start, self.mixture)
         return next((layer for layer in around if layer is not None), _ONE)
 
     @property
     def layered(self) -> bool:
-        return self._layer is not _ONE
+        return self.layer is not _ONE
 
     @property
     def inner(self) -> Slam:
@@ -106,7 +106,7 @@ class Slam(AbstractSlam):
 
     @property
     def ambiguous_start(self) -> bool:
-        return self._layer.ambiguous_start(self)
+        return self.layer.ambiguous_start(self)
 
     def init(
         self,
@@ -114,46 +114,46 @@ class Slam(AbstractSlam):
         first: Features | None = None,
         known: PriorMap | None = None,
     ) -> Belief:
-        return self._layer.init(self, capacity, first, known)
+        return self.layer.init(self, capacity, first, known)
 
     def step(self, state: Belief, control: Control, seen: Features, new: Features) -> Corrected:
-        return self._layer.step(self, state, control, seen, new)
+        return self.layer.step(self, state, control, seen, new)
 
     def predict(self, state: Belief, control: Control) -> Belief:
-        return self._layer.predict(self, state, control)
+        return self.layer.predict(self, state, control)
 
     def predict_features(self, state: Belief, control: Control, slots: Slots) -> Expected:
-        return self._layer.predict_features(self, state, control, slots)
+        return self.layer.predict_features(self, state, control, slots)
 
     def gaussian(self, state: Belief, control: Control) -> tuple[AbstractStaged, Belief]:
-        return self._layer.gaussian(self, state, control)
+        return self.layer.gaussian(self, state, control)
 
     def update(self, state: Belief, control: Control, seen: Features) -> Corrected:
-        return self._layer.update(self, state, control, seen)
+        return self.layer.update(self, state, control, seen)
 
     def compose(self, state: Belief, control: Control) -> Belief:
-        return self._layer.compose(self, state, control)
+        return self.layer.compose(self, state, control)
 
     def close(self, state: Belief, new: Features) -> Belief:
-        return self._layer.close(self, state, new)
+        return self.layer.close(self, state, new)
 
     def remove(self, state: Belief, gone: Bool[AnyArray, " capacity"]) -> Belief:
-        return self._layer.remove(self, state, gone)
+        return self.layer.remove(self, state, gone)
 
     def marginal(self, state: Belief, function: OfCamera) -> Moments:
-        return self._layer.marginal(self, state, function)
+        return self.layer.marginal(self, state, function)
 
     def landmark_marginal(self, state: Belief, function: OfLandmark, slots: Slots) -> EachMoments:
-        return self._layer.landmark_marginal(self, state, function, slots)
+        return self.layer.landmark_marginal(self, state, function, slots)
 
     def in_map(self, state: Belief) -> Bool[Array, " capacity"]:
-        return self._layer.in_map(self, state)
+        return self.layer.in_map(self, state)
 
     def pose_error(self, state: Belief, T_BC: Pose) -> PoseError:
-        return self._layer.pose_error(self, state, T_BC)
+        return self.layer.pose_error(self, state, T_BC)
 
     def unit_fixed(self, state: Belief) -> Bool[Array, ""]:
-        return self._layer.unit_fixed(self, state)
+        return self.layer.unit_fixed(self, state)
 
 
 def _without(slam: Slam, **changed) -> Slam:

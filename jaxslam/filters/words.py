@@ -13,7 +13,6 @@ from typing import Any
 
 from jaxslam._runtime.lookup import as_list, lookup
 from jaxslam.filters.gate import Gate
-from jaxslam.filters.linear.kalman import AbstractCorrection, Kalman
 from jaxslam.filters.mixture.mixture import Mixture
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.recommended import recommended
@@ -62,20 +61,6 @@ def _iterated(slam: Slam, steps: int = 5) -> Slam:
     return replace(slam, correction=replace(slam.correction, steps=steps))
 
 
-def _corrected(slam: Slam, correction: AbstractCorrection) -> Slam:
-    if type(slam.correction) not in (Kalman, type(correction)):
-        raise ValueError(
-            f"a filter has one correction: {slam.correction.name} or {correction.name}"
-        )
-    return replace(slam, correction=correction)
-
-
-def _mixed(slam: Slam, mixture: Mixture) -> Slam:
-    if slam.mixture is not None and slam.mixture.split != mixture.split:
-        raise ValueError("a filter has one mixture: members that are split, or directions")
-    return replace(slam, mixture=mixture)
-
-
 def _with_submaps(slam: Slam, spare: int = 24) -> Slam:
     if not slam.frame.moves_landmarks:
         raise ValueError(f"submaps are of robocentric filters, not of {slam.frame.name} ones")
@@ -90,14 +75,18 @@ def _from_window(slam: Slam, frames: int | None = None) -> Slam:
     return replace(slam, start=FromWindow(Schedule.of(slam.motion.geometry, frames)))
 
 
+def _first_estimates(slam: Slam) -> Slam:
+    return replace(slam, correction=FirstEstimates())
+
+
 MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
     "scene": _with_scene_depth,
-    "fej": lambda slam: _corrected(slam, FirstEstimates()),
-    "oc": lambda slam, steps=1: _corrected(slam, ObservabilityConstrained(steps)),
+    "fej": _first_estimates,
+    "oc": lambda slam, steps=1: replace(slam, correction=ObservabilityConstrained(steps)),
     "iterated": _iterated,
     "drift": _drifting,
-    "directions": lambda slam, count=5: _mixed(slam, Mixture(count, split=False)),
-    "mixture": lambda slam, count=9: _mixed(slam, Mixture(count)),
+    "directions": lambda slam, count=5: replace(slam, mixture=Mixture(count, split=False)),
+    "mixture": lambda slam, count=9: replace(slam, mixture=Mixture(count)),
     "rest": _from_window,
     "submaps": _with_submaps,
     "checked": lambda slam, percent=150: replace(slam, gate=Gate(tolerance=percent / 100)),
@@ -129,13 +118,30 @@ def make_filter(name: str, **pieces: Piece) -> AbstractFilter:
     if isinstance(named := pieces.get("landmark"), str):
         pieces["landmark"] = lookup("landmark", named, LANDMARKS)[named]
     base, *modifiers = name.split("+")
-    given = dict(map(_parsed, modifiers))
-    if len(given) < len(modifiers):
-        raise ValueError(f"every modifier is accepted once, not {name!r}")
-    made: AbstractFilter = lookup("filters", [base], FILTERS)[base](**pieces)
-    for word in filter(given.__contains__, MODIFIERS):
-        made = MODIFIERS[word](made, *given[word])
+    make = lookup("filters", [base], FILTERS)[base]
+    parsed = sorted(map(_parsed, modifiers), key=lambda one: _ORDER.index(one[0]))
+    _check_one_of_each([base, *(word for word, _ in parsed)])
+    made: AbstractFilter = make(**pieces)
+    for word, given in parsed:
+        made = MODIFIERS[word](made, *given)
     return made
+
+
+_ORDER = list(MODIFIERS)
+_ONE_OF = {
+    "correction": ("invariant", "fej", "oc"),
+    "sum of Gaussians": ("directions", "mixture"),
+    "delayed initialisation": ("particles", "rays"),
+}
+"""Words of which a name has one at the most, and what each of them is."""
+
+
+def _check_one_of_each(words: list[str]) -> None:
+    """Raise ValueError for a word that is there twice, or beside one that says the same piece."""
+    for what, those in (*_ONE_OF.items(), *((word, (word,)) for word in MODIFIERS)):
+        found = [word for word in words if word in those]
+        if len(found) > 1:
+            raise ValueError(f"a filter has one {what}, not {' and '.join(found)}")
 
 
 def _parsed(modifier: str) -> tuple[str, list[int]]:

@@ -43,10 +43,10 @@ def check_landmark(landmark: AbstractLandmark, geometry: Geometry | None = None)
 
     That is: shapes are (d,), (n,) and (); `initialise(X, ω, f)` puts the point at X/ω; `transform`
     moves it by T, back by T⁻¹ to the same parameters, and where it is then seen, x/z and y/z, is
-    where a pinhole sees the moved point; `scale` enlarges the point and `convert` leaves it where
-    it is; so is a point behind the camera; all derivatives are finite, and those of central differences. Points are of the plane
-    and of space, or of the `geometry` alone (`jaxslam.PLANAR`, `jaxslam.SPATIAL`). Raises
-    ValueError with the first that does not hold.
+    where a pinhole sees the moved point, behind the camera too; `scale` enlarges the point and
+    `convert` leaves it where it is; all derivatives are finite, and those of central differences.
+    Points are of the plane and of space, or of the `geometry` alone (`jaxslam.PLANAR`,
+    `jaxslam.SPATIAL`). Raises ValueError with the first that does not hold.
     """
     if not isinstance(landmark, AbstractLandmark):
         raise ValueError(f"a jaxslam.AbstractLandmark is accepted, not {type(landmark).__name__}")

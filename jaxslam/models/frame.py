@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxslam.geometry import Pose, SplitPose, log
+from jaxslam.geometry import Pose, Scalar, SplitPose, log, scaled
 
 Held = PyTree
 """What a state holds of the pose."""
@@ -59,6 +59,16 @@ class AbstractFrame(eqx.Module):
     @abstractmethod
     def compose(self, held: Held, step: Pose) -> Held:
         """What is held at k, from that at k−1 and the displacement."""
+
+    def acted(self, held: Held, rigid: Pose, factor: Scalar) -> Held:
+        """What is held once everything is enlarged by a factor, then moved in B."""
+        return self.from_base_pose(rigid @ scaled(self.camera_pose(held), factor))
+
+    def left(self, held: Held, inverse_distances: Float[Array, " capacity"]) -> Bool[Array, ""]:
+        """Whether the camera has left an earlier one from which its pose is held; there is none.
+        Distances (of landmarks from that) that are not to count are infinite."""
+        del held, inverse_distances
+        return jnp.zeros((), bool)
 
 
 class Robocentric(AbstractFrame):
@@ -152,9 +162,14 @@ class AbstractKeyframed(AbstractFrame):
     def compose(self, held: KeyframePose, step: Pose) -> KeyframePose:
         return held.moved(step)
 
-    def left(self, T_KC: Pose, inverse_distances: Float[Array, " capacity"]) -> Bool[Array, ""]:
-        """Whether the camera has left K; distances (of landmarks from K) that are not to count are
-        infinite."""
+    def acted(self, held: KeyframePose, rigid: Pose, factor: Scalar) -> KeyframePose:
+        enlarged = scaled(held, factor)
+        return KeyframePose(rigid @ enlarged.base_from_keyframe, enlarged.keyframe_from_camera)
+
+    def left(
+        self, held: KeyframePose, inverse_distances: Float[Array, " capacity"]
+    ) -> Bool[Array, ""]:
+        T_KC = held.keyframe_from_camera
         count = jnp.maximum(jnp.sum(inverse_distances != 0), 1)
         parallax = jnp.linalg.norm(T_KC.translation()) * jnp.sum(inverse_distances) / count
         turn = jnp.linalg.norm(log(T_KC.rotation()))

@@ -28,7 +28,7 @@ class AbstractScale(eqx.Module):
     def prior(
         self, mean: Float[Array, " q"], sigma: Float[Array, " q"], variance: Scalar | None
     ) -> tuple[Float[Array, " q"], Float[Array, " q"]]:
-        """Mean and σ of 1/z as `e^λ/z` is to have them, given the variance of λ, if there is one."""
+        """Mean and σ of 1/z as `e^λ/z` is to have them, given the variance of λ."""
         del variance
         return mean, sigma
 

@@ -478,7 +478,7 @@ def _intrinsics(slam: AbstractStaged, state: Belief) -> tuple[jax.Array, jax.Arr
     assert model is not None
 
     def intrinsics(view: CameraView) -> jax.Array:
-        sensor = model.calibration.sensor(model.sensor, view.core.calibration)
+        sensor = model.sensor_at(view.core.calibration)
         assert isinstance(sensor, Pinhole)
         return sensor.camera.intrinsics
 

@@ -56,7 +56,7 @@ class Tracker:
     """One's own, in place of the filter that the settings name."""
     target: Target | None = None
     """Points of known positions, m, that the first frame sees: then the first map is in metres, the
-    unit of `nearest_depth`. For a `Slam` of one Gaussian in metres, whose depths have nothing in common."""
+    unit of `nearest_depth`. For a `Slam` of one Gaussian, in metres, of no common depth."""
     sighting: TargetObservation | None = field(default=None, init=False)
     """Where the first frame saw the target."""
     filter_name: str = field(init=False)

@@ -81,13 +81,13 @@ def test_filters_are_made_of_every_pair_of_names():
         ("world+oc0", "cartesian", None, "at least 1 step of Gauss–Newton, not 0"),
         ("world+directions2", "cartesian", None, "at least 3 members, not 2"),
         ("world+rays0", "cartesian", None, "depths need 0 < nearest < farthest"),
-        ("world+scene+scene50", "cartesian", None, "every modifier is accepted once, not 'world"),
+        ("world+scene+scene50", "cartesian", None, "a filter has one scene, not scene and scene"),
         ("world+fej", "framed_homogeneous", None, "written in one form, in themselves"),
         ("world+fej", "parallax_angle", None, "written in one form, in themselves"),
         ("world_gauge+fej", "cartesian", None, "fej is for filters in metres, without a scale"),
         ("robocentric+fej", "cartesian", None, "fej is for world-centric filters: a robocentric"),
         ("keyframe+oc", "cartesian", None, "oc is not for keyframe filters, whose unobservable"),
-        ("invariant+oc", "cartesian", None, "one correction: invariant or oc"),
+        ("invariant+oc", "cartesian", None, "one correction, not invariant and oc"),
         ("world+mixture", "parallax_angle", None, "is split cannot switch the form of parallax"),
         ("robocentric+submaps", "framed_homogeneous", None, "submaps are of landmarks without an"),
         ("world+mixture+rest", "framed_homogeneous", None, "start from a window is without anch"),
@@ -117,15 +117,15 @@ def test_what_the_motion_or_the_sensor_excludes_is_refused(scenario_fields, name
         make_filters(scenario("matched", scenario_fields), name, "cartesian")
 
 
-DELAYED = "a delayed initialisation|switch the form of ray|fej needs landmarks that are written"
+DELAYED = "delayed initialisation|switch the form of ray|fej needs landmarks that are written"
     "a delayed initialisation|cannot switch the form of ray|fej needs landmarks that are written"
 )
 IN_WORLD = (
     ({"submaps"}, "submaps are of robocentric filters, not of world ones"),
-    ({"fej", "oc"}, "a filter has one correction: fej or oc"),
+    ({"fej", "oc"}, "a filter has one correction, not fej and oc"),
     ({"fej", "iterated"}, "fej takes one step of Gauss–Newton in an update"),
     ({"fej", "mixture"}, "a mixture that is split does not go with fej"),
-    ({"directions", "mixture"}, "a filter has one mixture: members that are split, or directions"),
+    ({"directions", "mixture"}, "a filter has one sum of Gaussians, not directions and mixture"),
     *(
         ({word, late}, DELAYED)
         for late in ("particles", "rays")

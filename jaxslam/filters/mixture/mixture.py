@@ -18,9 +18,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
-from jaxslam._numerics.arrays import AnyArray, cast, precision
+from jaxslam._numerics.arrays import cast, precision
 from jaxslam._numerics.conditional import map_or_zero, map_where, zeros
 from jaxslam._numerics.linalg import eigh
 from jaxslam.filters.gaussian import append_noise, composed_first
@@ -29,19 +29,12 @@ from jaxslam.filters.linear.state import State
 from jaxslam.filters.mixture.split_merge import collapsed, divided
 from jaxslam.filters.mixture.sum_state import SumState, member, moments, weighed
 from jaxslam.filters.protocol import (
-    AbstractStaged,
     Belief,
     Corrected,
-    EachMoments,
-    Expected,
-    Moments,
-    OfCamera,
-    OfLandmark,
-    PoseError,
 )
-from jaxslam.geometry import Pose, difference, retract
+from jaxslam.geometry import difference, retract
 from jaxslam.models.motion import Control, check_control
-from jaxslam.models.observations import Capacity, Features, PriorMap, Slots
+from jaxslam.models.observations import Features
 
 REACH = (2.5, 4.0)
 """The members' means are spread over ± so many σ of the prior, at the least and at the most."""
@@ -78,13 +71,7 @@ class Mixture(AbstractLayer):
         """Splits in a frame, at the most: each takes up to three members."""
         return max(1, self.members // 3)
 
-    def init(
-        self,
-        slam: AbstractSlam,
-        capacity: int | Capacity,
-        first: Features | None,
-        known: PriorMap | None,
-    ) -> SumState:
+    def init(self, slam, capacity, first, known):
         """`v = v̄ + D e`, e ~ N(0, I) = Σ w_i N(A s_i, I − (1 − σ²) A Aᵀ), for directions A."""
         dtype = precision(slam)
         inner = cast(slam.inner, dtype)
@@ -103,9 +90,7 @@ class Mixture(AbstractLayer):
 
         return SumState(jax.vmap(begun)(jnp.asarray(grid, dtype)), jnp.asarray(weights, dtype))
 
-    def step(
-        self, slam: AbstractSlam, state: SumState, control: Control, seen: Features, new: Features
-    ) -> Corrected:
+    def step(self, slam, state, control, seen, new):
         """Every member's step; a sum that is split is divided once the frame's noise is there."""
         inner = slam.inner
         if not self.split:
@@ -118,30 +103,24 @@ class Mixture(AbstractLayer):
 
         return self._measured(stepped, state)
 
-    def predict(self, slam: AbstractSlam, state: SumState, control: Control) -> SumState:
+    def predict(self, slam, state, control):
         """Predict each member; a split sum composes later, in `update`, where that is first."""
         if not self.split:
             return self._each(lambda one: slam.inner.predict(one, control), state)
         check_control(slam.motion, control)
         return self._each(lambda one: append_noise(slam, one), state)
 
-    def gaussian(
-        self, slam: AbstractSlam, state: SumState, control: Control
-    ) -> tuple[AbstractStaged, State]:
+    def gaussian(self, slam, state, control):
         """The filter of one Gaussian, and the predicted sum's mean and covariance."""
         one = collapsed(state.members, state.log_weights)
         return slam.inner, composed_first(slam, one, control) if self.split else one
 
-    def predict_features(
-        self, slam: AbstractSlam, state: SumState, control: Control, slots: Slots
-    ) -> Expected:
+    def predict_features(self, slam, state, control, slots):
         """The features that the sum as one Gaussian expects."""
         inner, one = self.gaussian(slam, state, control)
         return inner.predict_features(one, control, slots)
 
-    def update(
-        self, slam: AbstractSlam, state: SumState, control: Control, seen: Features
-    ) -> Corrected:
+    def update(self, slam, state, control, seen):
         """Split and merge, correct every member and weigh it."""
         if self.split:
             state = self._divided(slam, state, control, seen)
@@ -153,19 +132,17 @@ class Mixture(AbstractLayer):
         """Correct every member as it is, and weigh it."""
         return self._measured(lambda one: self._updated(slam, one, control, seen), state)
 
-    def compose(self, slam: AbstractSlam, state: SumState, control: Control) -> SumState:
+    def compose(self, slam, state, control):
         """Every member's; so are the following."""
         return self._each(lambda one: slam.inner.compose(one, control), state)
 
-    def close(self, slam: AbstractSlam, state: SumState, new: Features) -> SumState:
+    def close(self, slam, state, new):
         return self._each(lambda one: slam.inner.close(one, new), state)
 
-    def remove(
-        self, slam: AbstractSlam, state: SumState, gone: Bool[AnyArray, " capacity"]
-    ) -> SumState:
+    def remove(self, slam, state, gone):
         return self._each(lambda one: slam.inner.remove(one, gone), state)
 
-    def marginal(self, slam: AbstractSlam, state: SumState, function: OfCamera) -> Moments:
+    def marginal(self, slam, state, function):
         """The sum's mean and covariance, in the tangent at the value of its likeliest member."""
         each = partial(slam.inner.marginal, function=function)
         values, covariances = map_or_zero(each, state.members, state.alive)
@@ -174,16 +151,14 @@ class Mixture(AbstractLayer):
         mean, covariance = moments(state.log_weights, away, covariances)
         return retract(likeliest, mean), covariance
 
-    def landmark_marginal(
-        self, slam: AbstractSlam, state: SumState, function: OfLandmark, slots: Slots
-    ) -> EachMoments:
+    def landmark_marginal(self, slam, state, function, slots):
         """The sum's mean and covariance of every landmark."""
         each = partial(slam.inner.landmark_marginal, function=function, slots=slots)
         values, covariances = map_or_zero(each, state.members, state.alive)
         of_landmark = jax.vmap(moments, in_axes=(None, 1, 1))
         return of_landmark(state.log_weights, values, covariances)
 
-    def pose_error(self, slam: AbstractSlam, state: SumState, T_BC: Pose) -> PoseError:
+    def pose_error(self, slam, state, T_BC):
         """The error of the sum's mean, to first order in the members' distances; its covariance."""
         of_member = jax.vmap(slam.inner.pose_error, in_axes=(0, None))
         return moments(state.log_weights, *of_member(state.members, T_BC))

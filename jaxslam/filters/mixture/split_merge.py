@@ -73,11 +73,9 @@ def _root_of_cost(slam: AbstractSlam, likeliest: State, seen: Features) -> Float
     def inverse_depth(view, landmark):
         return model.camera_point(view, landmark)[1][None]
 
-    _, variances = landmark_moments(
-        view_of, inverse_depth, likeliest, seen.slots
-    )
+    _, variances = landmark_moments(view_of, inverse_depth, likeliest, seen.slots)
     view = view_of(likeliest.core)
-    sensor = model.sensor_of(view)
+    sensor = model.sensor_at(view.calibration)
     whitening = cholesky(sensor.noise).whitening
 
     def by_point(landmark):

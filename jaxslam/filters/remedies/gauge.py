@@ -18,7 +18,6 @@ from jaxtyping import Array, Float
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.model import Core, SlamModel
 from jaxslam.geometry import Pose, Scalar, SplitPose, identity, jacobian, nudge, scaled
-from jaxslam.models.frame import KeyframePose
 
 
 def scale_is_free(model: SlamModel) -> bool:
@@ -29,7 +28,8 @@ def scale_is_free(model: SlamModel) -> bool:
 def act(
     model: SlamModel, rigid: Pose, factor: Scalar, core: Core, landmarks: Float[Array, "capacity d"]
 ) -> tuple[Core, Float[Array, "capacity d"]]:
-    """The same camera among the same points: all enlarged by a factor, then moved in B.
+    """The same camera among the same points: all enlarged by a factor, then moved in B. Lengths,
+    those of the rigid motion too, are in the unit of the state.
 
     What drives the motion is enlarged with it: its variance is prior knowledge, no measurement.
     """
@@ -45,16 +45,10 @@ def act(
         moved = in_base and not model.landmark.anchored
         return model.landmark.transform(rigid, parameters) if moved else parameters
 
-    def held(pose):
-        if isinstance(pose, KeyframePose):
-            enlarged = scaled(pose, factor)
-            return replace(enlarged, base_from_keyframe=rigid @ enlarged.base_from_keyframe)
-        return model.frame.from_base_pose(rigid @ scaled(model.camera_pose(core), factor))
-
     kept = core.base_motion
     core = replace(
         core,
-        pose=held(core.pose),
+        pose=model.frame.acted(core.pose, rigid, factor),
         motion=variables,
         base_motion=None if kept is None else model.motion.enlarged(kept, core.noise, factor)[0],
         noise=noise,

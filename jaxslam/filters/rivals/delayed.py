@@ -142,11 +142,12 @@ def check_delayed(slam: AbstractSlam) -> None:
 
 def around(slam: AbstractFilter) -> AbstractSlam:
     """The filter, which is to end in Cartesian landmarks. Raises ValueError for others."""
-    what = "a delayed initialisation"
     if not isinstance(slam, AbstractSlam):
-        raise ValueError(f"{what} is around a Slam, not around a {type(slam).__name__}")
+        raise ValueError(f"a delayed initialisation is around a Slam, not {type(slam).__name__}")
     if slam.landmark != Cartesian():
-        raise ValueError(f"{what} ends in cartesian landmarks, not {slam.landmark.name}")
+        raise ValueError(
+            f"a delayed initialisation ends in cartesian landmarks, not {slam.landmark.name}"
+        )
     return slam
 
 

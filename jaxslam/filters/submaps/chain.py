@@ -31,7 +31,7 @@ from jaxslam.filters.linear.blocks import minus, plus
 from jaxslam.filters.linear.state import AbstractState
 from jaxslam.filters.submaps.handover import Frozen, SubmapsState
 from jaxslam.geometry import Pose, difference, identity, retract
-from jaxslam.models.frame import KeyframePose
+from jaxslam.models.frame import KeyframePose, Submaps
 
 LINEARISATION = 1e-3
 """Variance of the error of second order of each number of a submap, as a share of its own."""
@@ -205,6 +205,8 @@ def chain(slam: AbstractSlam, state: SubmapsState, count: int) -> Chain:
     In a batch of runs all have one length: what a run does not have are links that say nothing.
     Raises ValueError for more than the state keeps.
     """
+    if not isinstance(slam.frame, Submaps):
+        raise ValueError(f"a filter with frame=Submaps(…) has a chain, not a {slam.frame.name} one")
     history = slam.frame.history
     if not 0 <= count <= history:
         raise ValueError(f"the state keeps {history} submaps, not {count}")

@@ -23,15 +23,10 @@ from jaxslam.filters.gaussian import each_gaussian, rebased
 from jaxslam.filters.layer import AbstractLayer, AbstractSlam
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.protocol import (
-    AbstractStaged,
     Belief,
-    Corrected,
-    EachMoments,
-    Expected,
-    OfLandmark,
 )
-from jaxslam.models.motion import Control
-from jaxslam.models.observations import Capacity, Features, PriorMap, Slots
+from jaxslam.models.frame import Submaps
+from jaxslam.models.observations import Capacity, Features, Slots
 
 
 class Frozen(eqx.Module):
@@ -65,21 +60,17 @@ class SubmapsState(eqx.Module):
 class Handover(AbstractLayer):
     """The layer of a filter whose frame is `Submaps`: slots, and what is frozen."""
 
-    def init(
-        self,
-        slam: AbstractSlam,
-        capacity: int | Capacity,
-        first: Features | None,
-        known: PriorMap | None,
-    ) -> SubmapsState:
+    frame: Submaps
+
+    def init(self, slam, capacity, first, known):
         room = Capacity.of(capacity)
-        own = room.landmarks + slam.frame.spare
+        own = room.landmarks + (self.frame.spare or 0)
         inner = slam.inner.init(room._replace(landmarks=own), first, known)
         none = jnp.full(room.landmarks, own)
         empty = jnp.full(own, -1)
         _, one = slam.inner.gaussian(inner, None)
         frozen = Frozen(one, jnp.zeros(own, bool), empty)
-        history = slam.frame.history
+        history = self.frame.history
         frozen = jax.tree.map(lambda x: jnp.zeros((history, *x.shape), x.dtype), frozen)
         zero = jnp.zeros((), int)
         state = SubmapsState(inner, none, empty, zero, frozen, zero)
@@ -97,25 +88,20 @@ class Handover(AbstractLayer):
     def around(self, state: SubmapsState, inner: Belief) -> SubmapsState:
         return replace(state, inner=inner)
 
-    def gaussian(
-        self, slam: AbstractSlam, state: SubmapsState, control: Control
-    ) -> tuple[AbstractStaged, SubmapsState]:
+    def gaussian(self, slam, state, control):
         base, one = slam.inner.gaussian(state.inner, control)
-        return replace(base, frame=slam.frame), replace(state, inner=one)
+        assert isinstance(base, AbstractSlam)
+        return replace(base, frame=self.frame), replace(state, inner=one)
 
-    def predict_features(
-        self, slam: AbstractSlam, state: SubmapsState, control: Control, slots: Slots
-    ) -> Expected:
+    def predict_features(self, slam, state, control, slots):
         own = state.slots[slots]
         seen = slam.inner.predict_features(state.inner, control, own)
         return seen._replace(possible=seen.possible & (own < state.numbers.size))
 
-    def update(
-        self, slam: AbstractSlam, state: SubmapsState, control: Control, seen: Features
-    ) -> Corrected:
+    def update(self, slam, state, control, seen):
         return super().update(slam, state, control, _of_inner(state, seen))
 
-    def close(self, slam: AbstractSlam, state: SubmapsState, new: Features) -> SubmapsState:
+    def close(self, slam, state, new):
         """End the submap where that is due, and insert new landmarks into slots that are free."""
         capacity = state.slots.size
         # A landmark in whose place another comes is seen no more.
@@ -128,18 +114,14 @@ class Handover(AbstractLayer):
         state = _placed(state, new.slots, new.valid, own)
         return replace(state, inner=slam.inner.close(state.inner, _of_inner(state, new)))
 
-    def remove(
-        self, slam: AbstractSlam, state: SubmapsState, gone: Bool[AnyArray, " capacity"]
-    ) -> SubmapsState:
+    def remove(self, slam, state, gone):
         """Free slots. The inner filter keeps their landmarks until the submap ends."""
         return replace(state, slots=jnp.where(gone, state.numbers.size, state.slots))
 
-    def landmark_marginal(
-        self, slam: AbstractSlam, state: SubmapsState, function: OfLandmark, slots: Slots
-    ) -> EachMoments:
+    def landmark_marginal(self, slam, state, function, slots):
         return slam.inner.landmark_marginal(state.inner, function, state.slots[slots])
 
-    def in_map(self, slam: AbstractSlam, state: SubmapsState) -> Bool[Array, " capacity"]:
+    def in_map(self, slam, state):
         return state.slots < state.numbers.size
 
     def _due(self, slam: AbstractSlam, state: SubmapsState, new: Features) -> Bool[Array, ""]:
@@ -162,7 +144,7 @@ class Handover(AbstractLayer):
             return each_gaussian(slam.inner.remove(inner, ~carried), rebased)
 
         # Apart from what is conditional: a batch would copy all that is kept in every frame.
-        place = state.count % slam.frame.history
+        place = state.count % self.frame.history
         before = jax.tree.map(lambda x: x[place], state.frozen)
         newest = cond(ended, frozen, before, state.inner)
         return replace(

@@ -72,7 +72,9 @@ def minimised(
     return jax.lax.while_loop(going, once, (jnp.zeros((), int), start, nothing))[1:]
 
 
-def _step(slam: AbstractSlam, record: Record, now: Minimum, local: Reduced) -> tuple[Minimum, Reduced]:
+def _step(
+    slam: AbstractSlam, record: Record, now: Minimum, local: Reduced
+) -> tuple[Minimum, Reduced]:
     """One of Levenberg–Marquardt; the first only brings the landmarks to their best."""
     fresh = jnp.isinf(now.cost)
     H, g = local.information, local.gradient

@@ -123,12 +123,10 @@ def _moved(slam: AbstractSlam, state, control, merged: Scalar, restarted: Bool[A
     anew = retract(mean, root @ numbers[: layout.start])
     variables = jax.tree.map(lambda new, old: jnp.where(restarted, new, old), anew, variables)
     noise = jnp.where(restarted, 0.0, noise)
-    sigma = jnp.asarray(slam.calibration.sigma)
-    return (
-        pose @ motion.displacement(variables, noise, control),
-        motion.next(variables, noise, control),
-        sigma * numbers[layout.step :] if layout.each else slam.calibration.next(delta, drift),
-    )
+    step, variables, delta = slam.model.moved(variables, delta, noise, drift, control)
+    if layout.each:
+        delta = jnp.asarray(slam.calibration.sigma) * numbers[layout.step :]
+    return pose @ step, variables, delta
 
 
 def located(
@@ -139,7 +137,7 @@ def located(
     y: Float[Array, " q"],
 ) -> tuple[Float[Array, " n"], Scalar]:
     """The homogeneous point of a landmark, in the camera of the frame that first measured it."""
-    sensor, p = slam.calibration.sensor(slam.sensor, calibration), measured.size
+    sensor, p = slam.model.sensor_at(calibration), measured.size
     pixel = measured + cholesky(sensor.noise).root @ y[:p]
     return sensor.locate(pixel, hidden(slam, common, y[p:]))
 
@@ -235,13 +233,12 @@ def _seen(slam: AbstractSlam, record: Record, at: Path, relative, sight: Sight) 
         here = jnp.append(T @ jnp.append(point, omega), omega)
 
         def wrong(here, calibration):
-            sensor = slam.calibration.sensor(slam.sensor, calibration)
+            sensor = slam.model.sensor_at(calibration)
             predicted = sensor.measure(here[:-1], here[-1])
             return whitening @ sensor.residual(measured, predicted)
 
         slopes = jax.jacfwd(wrong, argnums=(0, 1))(here, calibration)
-        sensor = slam.calibration.sensor(slam.sensor, calibration)
-        impossible = ~sensor.possible(here[:-1])
+        impossible = ~slam.model.sensor_at(calibration).possible(here[:-1])
         return Seen(wrong(here, calibration), impossible, *slopes, here)
 
     of_frame = jax.vmap(one, in_axes=(0, None, 0, 0, 0))

@@ -18,12 +18,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from jaxslam._numerics.arrays import AnyArray, cast, precision
+from jaxslam._numerics.arrays import cast, precision
 from jaxslam._numerics.conditional import cond, map_where
 from jaxslam.filters.layer import AbstractLayer, AbstractSlam
 from jaxslam.filters.linear.state import State
+from jaxslam.filters.mixture.mixture import Mixture
 from jaxslam.filters.mixture.sum_state import SumState
-from jaxslam.filters.protocol import Corrected
 from jaxslam.filters.window import record as window
 from jaxslam.filters.window.modes import Found, Mean, Modes, at_rest, searched, sought
 from jaxslam.filters.window.problem import PathLayout
@@ -31,8 +31,7 @@ from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.subsample import thinned, tied
 from jaxslam.filters.window.to_filter import gauge_state
 from jaxslam.geometry import PLANAR, Geometry
-from jaxslam.models.motion import Control
-from jaxslam.models.observations import Capacity, Features, PriorMap
+from jaxslam.models.observations import Capacity
 
 
 class Schedule(eqx.Module):
@@ -49,7 +48,7 @@ class Schedule(eqx.Module):
     searched: int = eqx.field(static=True)
     """Frames in which they are sought, spread over the window."""
     renewed: tuple[int, ...] = eqx.field(static=True)
-    """In which frames the sum begins anew, by window: in every frame whose number this divides."""
+    """By window: the sum begins anew in every frame whose number this divides."""
     divided: bool = eqx.field(static=True)
     """Whether the sum is divided anew in every frame, or its members are the modes and what becomes
     of them: halves of a Gaussian, each linearised off its middle, can be worse than the whole."""
@@ -63,7 +62,7 @@ class Schedule(eqx.Module):
     moved: float = eqx.field(static=True, default=0.1)
     """The same, below which a camera has done more than turn."""
     doubtful: float = eqx.field(static=True, default=4.0)
-    """σ of a landmark that is given up, one a frame: what is seen there is no point of the world."""
+    """σ of a landmark that is given up, one a frame: what is seen there is no point in space."""
 
     def __check_init__(self) -> None:
         if min(self.sizes, default=0) < 3 or list(self.sizes) != sorted(set(self.sizes)):
@@ -103,16 +102,10 @@ class FromWindow(AbstractLayer):
 
     schedule: Schedule
 
-    def ambiguous_start(self, slam: AbstractSlam) -> bool:
+    def ambiguous_start(self, slam):
         return True
 
-    def init(
-        self,
-        slam: AbstractSlam,
-        capacity: int | Capacity,
-        first: Features | None,
-        known: PriorMap | None,
-    ) -> RestState:
+    def init(self, slam, capacity, first, known):
         """Raises ValueError for a prior map, of which a window knows nothing."""
         if known is not None:
             raise ValueError("a start from a window takes no prior map; leave out start, or known")
@@ -122,7 +115,7 @@ class FromWindow(AbstractLayer):
         if first is not None:
             begun = window.begun(begun, first)
         member = one.init(capacity, first)
-        modes = at_rest(cast(one, dtype), begun, slam.mixture.members, dtype)
+        modes = at_rest(cast(one, dtype), begun, _mixture(slam).members, dtype)
         count = len(modes.log_weights)
         members = jax.tree.map(lambda x: jnp.tile(x, (count, *(1,) * x.ndim)), member)
         return RestState(SumState(members, modes.log_weights), begun, modes, jnp.ones((), bool))
@@ -133,16 +126,14 @@ class FromWindow(AbstractLayer):
     def around(self, state: RestState, inner: SumState) -> RestState:
         return replace(state, sum=inner)
 
-    def update(
-        self, slam: AbstractSlam, state: RestState, control: Control, seen: Features
-    ) -> Corrected:
-        mixture = slam.mixture
+    def update(self, slam, state, control, seen):
+        mixture = _mixture(slam)
         update = mixture.update if self.schedule.divided else mixture.update_members
         after, innovation = update(slam.inner, state.sum, control, seen)
         stepped = window.stepped(state.record, control, seen, slam.sensor.noise)
         return replace(state, sum=after, record=stepped), innovation
 
-    def close(self, slam: AbstractSlam, state: RestState, new: Features) -> RestState:
+    def close(self, slam, state, new):
         """End the frame, and begin the sum anew from the window's modes while that is open."""
         schedule = self.schedule
         after = slam.inner.close(state.sum, new)
@@ -165,9 +156,7 @@ class FromWindow(AbstractLayer):
         thinned = partial(self._thinned, slam)
         return cond(state.open & state.record.full, thinned, state)
 
-    def remove(
-        self, slam: AbstractSlam, state: RestState, gone: Bool[AnyArray, " capacity"]
-    ) -> RestState:
+    def remove(self, slam, state, gone):
         modes = state.modes
         y = jnp.where(gone[:, None], 0.0, modes.minima.y)
         return RestState(
@@ -177,7 +166,7 @@ class FromWindow(AbstractLayer):
             state.open,
         )
 
-    def unit_fixed(self, slam: AbstractSlam, state: RestState) -> Bool[Array, ""]:
+    def unit_fixed(self, slam, state):
         return ~state.open
 
     def _anew(
@@ -246,6 +235,13 @@ class FromWindow(AbstractLayer):
         variance = jnp.trace(member.covariance[position, position])
         squared = jnp.sum(slam.model.camera_pose(member.core).translation() ** 2)
         return variance < share**2 * squared
+
+
+def _mixture(slam: AbstractSlam) -> Mixture:
+    """The sum that begins so."""
+    mixture = slam.inner.layer
+    assert isinstance(mixture, Mixture)
+    return mixture
 
 
 def _likely(members: SumState, now: Bool[Array, ""], given_up: float) -> SumState:

@@ -66,7 +66,9 @@ class Coarse(eqx.Module):
     record: Record
     kept: Kept
 
-    def __init__(self, slam: AbstractSlam, whole: Record, stride: int | Int[Array, ""], frames: int):
+    def __init__(
+        self, slam: AbstractSlam, whole: Record, stride: int | Int[Array, ""], frames: int
+    ):
         self.slam, self.whole, self.kept = slam, whole, every(whole, stride, frames)
         self.record = _fewer(whole, self.kept)
 

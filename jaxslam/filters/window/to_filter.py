@@ -25,7 +25,9 @@ from jaxslam.filters.window.scale import Direction, scaling
 from jaxslam.geometry import identity, jacobian, scaled
 
 
-def gauge_state(slam: AbstractSlam, record: Record, at: Minimum, local: Reduced, like: State) -> State:
+def gauge_state(
+    slam: AbstractSlam, record: Record, at: Minimum, local: Reduced, like: State
+) -> State:
     """The filter's state of one mode where its mean is, in a unit that is a metre there."""
     s, factor = scaling(slam, record, at), cholesky(local.information)
     # The rest moves to where it is likeliest at this scale.

@@ -52,7 +52,9 @@ class Submap:
     links: dict[tuple[object, ...], Link] = field(default_factory=dict, repr=False, compare=False)
     """What it is in a chain, by what that depends on: the latest."""
 
-    def link(self, slam: AbstractSlam, after: Int[np.ndarray, " slots"] | None, *, first: bool) -> Link:
+    def link(
+        self, slam: AbstractSlam, after: Int[np.ndarray, " slots"] | None, *, first: bool
+    ) -> Link:
         """Return what it is in a chain, in which these are the numbers of the submap `after` it."""
         key = (None if after is None else after.tobytes(), first)
         if key not in self.links:
@@ -151,8 +153,14 @@ def left(slam: AbstractStaged, state: Belief) -> Bool[Array, ""]:
     return slam.model.keyframe_left(slam.gaussian(state, None)[1])
 
 
+def _one(slam: AbstractStaged) -> AbstractSlam:
+    """The Gaussian of a filter that has submaps."""
+    assert isinstance(slam, AbstractSlam)
+    return slam.one
+
+
 def loop_of(
-    slam: AbstractSlam,
+    slam: AbstractStaged,
     submaps: Sequence[Submap],
     which: tuple[int, int],
     slots: Int[np.ndarray, " k"],
@@ -167,7 +175,7 @@ def loop_of(
     padded = np.pad(slots[:k], (0, most - k))
     X, there = submaps[p].frozen.state.landmarks[padded], np.arange(most) < k
     calibration = submaps[q].frozen.state.core.calibration
-    by = _slopes(slam.one, X, there, calibration, T, np.asarray(sigma))
+    by = _slopes(_one(slam), X, there, calibration, T, np.asarray(sigma))
     return LoopClosure(np.array(which), padded, X, T, *by)
 
 
@@ -175,7 +183,7 @@ def loop_of(
 class Graph:
     """The submaps of a map, and the loops that join them."""
 
-    slam: AbstractSlam
+    slam: AbstractStaged
     submaps: Sequence[Submap]
     present: Submap
     """The one that goes on, as it would be if it ended now."""
@@ -203,7 +211,7 @@ class Graph:
         """The chain of all submaps, with some in front that are none; its loops, with some behind
         them that say nothing; and how many are in front. Sizes are few, since each has programs of
         its own."""
-        slam, ended, last = self.slam.one, self.submaps, self.present
+        slam, ended, last = _one(self.slam), self.submaps, self.present
         later = [one.numbers for one in (*ended, last)[1:]]
         links = [
             one.link(slam, after, first=i == 0)
@@ -219,10 +227,10 @@ class Graph:
 
 
 def compile_graph(
-    slam: AbstractSlam, state: Belief, settings: TrackerSettings, submaps: int = 1
+    slam: AbstractStaged, state: Belief, settings: TrackerSettings, submaps: int = 1
 ) -> Callable[[], None]:
     """What compiles all that a graph of so many submaps needs."""
-    one, flag = slam.one, np.asarray(False)
+    one, flag = _one(slam), np.asarray(False)
 
     def several(tree: PyTree, count: int) -> PyTree:
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape), x.dtype), tree)
