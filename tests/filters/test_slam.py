@@ -660,7 +660,7 @@ def test_an_unknown_calibration_is_refused_by_name():
     assert all(name in str(error.value) for name in TREATMENTS)
     with pytest.raises(ValueError, match="calibration is a AbstractCalibration, not 'black'"):
         a_filter(PLANAR, calibration="black")
-    with pytest.raises(ValueError, match="scale is a Metre or a ScaleGauge, not 'feet'"):
+    with pytest.raises(ValueError, match="scale is a AbstractScale, not 'feet'"):
         a_filter(PLANAR, scale="feet")
 
 

@@ -118,8 +118,6 @@ def test_what_the_motion_or_the_sensor_excludes_is_refused(scenario_fields, name
 
 
 DELAYED = "delayed initialisation|switch the form of ray|fej needs landmarks that are written"
-    "a delayed initialisation|cannot switch the form of ray|fej needs landmarks that are written"
-)
 IN_WORLD = (
     ({"submaps"}, "submaps are of robocentric filters, not of world ones"),
     ({"fej", "oc"}, "a filter has one correction, not fej and oc"),
