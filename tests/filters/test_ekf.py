@@ -251,93 +251,9 @@ def test_on_a_linear_problem_the_filter_is_the_kalman_filter(robocentric):
     assert largest == CAPACITY  # the schedule fills the map, so that every slot is tried
 
 
-def test_removal_zeroes_and_a_freed_slot_is_as_good_as_a_fresh_one():
-    *_, state = linear_run(True, steps=6)
-    used, unused = LIVES[0][0], LIVES[5][0]
-    assert state.active[used]
-    assert not state.active[unused]
-    freed = quick_jit(linear.removed)(state, np.arange(CAPACITY) == used)
-    rows = np.r_[6 + 3 * used : 9 + 3 * used]
-    assert np.abs(state.covariance[rows]).max() > 0.01
-    assert not np.any(freed.covariance[rows])
-    assert not np.any(freed.covariance[:, rows])
-    assert not freed.active[used]
-    others = np.setdiff1d(np.arange(len(state.covariance)), rows)
-    kept = np.ix_(others, others)
-    np.testing.assert_array_equal(freed.covariance[kept], state.covariance[kept])
-
-    def inserted(slot):
-        new = Features(jnp.array([slot]), jnp.array([[1.0, 2.0]]), jnp.array([True]))
-        here = Frame(jnp.zeros(()), jnp.array([0.3, 0.4]))
-        prior = jnp.array(PRIOR[:1]), jnp.array(PRIOR[1:])
-        return insert(freed, new, prior, here)
-
-    insert = quick_jit(
-        lambda state, new, prior, here: linear.initialised(
-            Linear(True), state, new, jnp.asarray(NOISE), prior, here
-        )
-    )
-
-    again, fresh = inserted(used), inserted(unused)
-    assert again.active[used]
-    # The same sums, in other places of a vectorised loop.
-    close(again.landmarks[used], fresh.landmarks[unused], 1e-14)
-    order = np.arange(CAPACITY)
-    order[[used, unused]] = unused, used
-    numbers = rows_of(6, order, 3)
-    close(again.covariance, np.asarray(fresh.covariance)[np.ix_(numbers, numbers)], 1e-14)
-
-
 def rows_of(c, order, d):
     """Places in the state of the core and of the slots in another order."""
     return np.concatenate([np.arange(c), (c + d * order[:, None] + np.arange(d)).ravel()])
-
-
-@dataclass(frozen=True)
-class Scalar:
-    """A core of one number and landmarks of one number; a landmark is measured directly."""
-
-    moves_landmarks: bool = False
-
-    def given(self, core, context):
-        return context
-
-    def compose_core(self, core, context):
-        return core
-
-    def view(self, core, context):
-        return core
-
-    def compose_landmark(self, view, landmark, context):
-        return landmark
-
-    def observe(self, view, landmark, context):
-        return landmark, jnp.array(True)
-
-    def residual(self, measured, predicted):
-        return measured - predicted
-
-    def initialise(self, view, measured, hidden, context):
-        return measured
-
-    def convert(self, view, landmark, covariance, context):
-        return landmark
-
-
-def test_prior_one_and_noise_one_end_with_one_half():
-    """Counting a measurement twice, as an iterated filter may, would give 1/3."""
-    state = State(
-        core=jnp.zeros(1),
-        landmarks=jnp.zeros((1, 1)),
-        active=jnp.array([True]),
-        covariance=jnp.diag(jnp.array([0.0, 1.0])),
-    )
-    seen = Features(jnp.array([0]), jnp.array([[3.0]]), jnp.array([True]))
-    state, innovation = quick_jit(partial(update, Scalar()))(state, seen, jnp.eye(1), None)
-    # √2 and its inverse are rounded.
-    np.testing.assert_allclose(state.covariance, np.diag([0.0, 0.5]), rtol=0, atol=1e-14)
-    np.testing.assert_allclose(state.landmarks, [[1.5]], rtol=1e-14)
-    np.testing.assert_allclose(innovation.nis, 9 / 2, rtol=1e-14)
 
 
 # --- the real models, against dense Jacobians of the whole state --------------------------------
