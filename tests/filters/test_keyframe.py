@@ -19,7 +19,7 @@ from jaxslam.landmarks import ImagePlane, InverseScaling
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
-from jaxslam.models.frame import Keyframe
+from jaxslam.models.frame import Keyframe, KeyframePose
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Features
 from jaxslam.models.sensors import Pinhole
@@ -180,13 +180,18 @@ def test_filters_of_two_frames_differ_to_second_order(kind):
 
 def test_a_keyframe_is_due_after_a_turn_or_a_baseline():
     near, far = jnp.array([0.5, 0.0, 0.5]), jnp.array([0.01, 0.0, 0.0])
-    frame, pose = Keyframe(turn=0.2, parallax=0.1), PLANAR.group.exp
+    frame, origin = Keyframe(turn=0.2, parallax=0.1), identity(PLANAR, jnp.float64)
     moved, turned = jnp.array([0.3, 0.4, 0.0]), jnp.array([0.0, 0.0, 0.22])
-    assert frame.left(pose(moved), near)
-    assert not frame.left(pose(moved), far)
-    assert not frame.left(pose(moved), jnp.zeros(3))
-    assert frame.left(pose(turned), far)
-    assert not frame.left(pose(0.8 * turned), near)
+
+    def left(displacement, inverse_distances):
+        held = KeyframePose.at(origin).moved(PLANAR.group.exp(displacement))
+        return frame.left(held, inverse_distances)
+
+    assert left(moved, near)
+    assert not left(moved, far)
+    assert not left(moved, jnp.zeros(3))
+    assert left(turned, far)
+    assert not left(0.8 * turned, near)
 
 
 @pytest.mark.parametrize("landmark", [InverseScaling(), ImagePlane()], ids=named)
