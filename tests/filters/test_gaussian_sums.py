@@ -212,7 +212,7 @@ def test_a_sum_that_is_not_split_is_taken_in_stages_as_by_its_step():
 
 @cache
 def divided(rounds=1):
-    return quick_jit(lambda state: _split_and_merged(_parts(pixels, state), rounds))
+    return quick_jit(lambda state: _split_and_merged(_parts(lambda core: pixels, state), rounds))
 
 
 def cost(state):
@@ -242,7 +242,9 @@ def test_of_many_members_each_has_to_gain_more(monkeypatch):
 
     def left(few):
         monkeypatch.setattr(split_merge, "FEW", few)
-        after = quick_jit(lambda state: _split_and_merged(_parts(pixels, state), 3))(state)
+        after = quick_jit(lambda state: _split_and_merged(_parts(lambda core: pixels, state), 3))(
+            state
+        )
         return int(after.alive.sum())
 
     assert left(0.1) < left(9)
