@@ -34,7 +34,17 @@ from jaxslam.models.motion import AbstractMotion, ConstantVelocity, Odometry
 from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap, Status
 from jaxslam.models.scale import Metre, ScaleGauge
 from jaxslam.models.sensors import AbstractSensor, Pinhole, Position, RangeBearing
-from jaxslam.simulation import Scenario, scenario, simulate
+from jaxslam.simulation import (
+    AbstractPlacement,
+    FromPrior,
+    GivenPoints,
+    Rays,
+    Ring,
+    Scenario,
+    World,
+    scenario,
+    simulate,
+)
 from jaxslam.statistics import mean_band
 from jaxslam.tracking.settings import TrackerSettings as TrackerSettings
 from jaxslam.tracking.tracker import Tracker as Tracker
@@ -50,6 +60,7 @@ __all__ = [
     "AbstractCalibration",
     "AbstractFilter",
     "AbstractMotion",
+    "AbstractPlacement",
     "AbstractSensor",
     "AbstractStaged",
     "Camera",
@@ -65,7 +76,9 @@ __all__ = [
     "Features",
     "FixedLag",
     "Frames",
+    "FromPrior",
     "GaussianSum",
+    "GivenPoints",
     "Innovation",
     "InverseDepth",
     "Known",
@@ -77,11 +90,14 @@ __all__ = [
     "Position",
     "PriorMap",
     "RangeBearing",
+    "Rays",
+    "Ring",
     "ScaleGauge",
     "Scenario",
     "State",
     "Status",
     "White",
+    "World",
     "__version__",
     "camera_pose",
     "cast",

@@ -35,8 +35,7 @@ from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.coordinates import KEYFRAME, WORLD
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.scale import ScaleGauge
-from jaxslam.simulation.pieces import calibration_sigma_of, depth_of, motion_of, sensor_of
-from jaxslam.simulation.scenario import Scenario, as_scenario
+from jaxslam.simulation import World, as_scenario
 
 Piece = Any
 """Of a filter, as `EkfSlam` takes it: `motion`, `sensor`, `landmark`, `calibration`, `depth`."""
@@ -185,7 +184,7 @@ def _spelt_out(name: str, motion: AbstractMotion) -> str:
 
 
 def make_filters(
-    scenario: Scenario | str,
+    scenario: World | str,
     filters: str | Iterable[str],
     landmarks: str | Iterable[str],
     calibration: str | None = None,
@@ -198,7 +197,7 @@ def make_filters(
     unless another treatment is named. Raises ValueError.
     """
     scenario = as_scenario(scenario)
-    names = [_spelt_out(name, motion_of(scenario)) for name in as_list(filters)]
+    names = [_spelt_out(name, scenario.motion) for name in as_list(filters)]
     lookup("filters", [name.partition("+")[0] for name in names], FILTERS)
     return {
         f"{name}/{landmark.name}": make_filter(
@@ -209,13 +208,13 @@ def make_filters(
     }
 
 
-def scenario_pieces(scenario: Scenario, calibration: str | None = None) -> dict[str, Piece]:
+def scenario_pieces(scenario: World, calibration: str | None = None) -> dict[str, Piece]:
     """The pieces of a filter that fits the scenario, as `EkfSlam` takes them. Raises ValueError."""
-    word = scenario.calibration if calibration is None else calibration
+    word = scenario.treatment if calibration is None else calibration
     treatment = lookup("calibration", [word], TREATMENTS)[word]
     return {
-        "motion": motion_of(scenario),
-        "sensor": sensor_of(scenario),
-        "calibration": treatment(calibration_sigma_of(scenario)),
-        "depth": depth_of(scenario),
+        "motion": scenario.motion,
+        "sensor": scenario.sensor,
+        "calibration": treatment(scenario.calibration.sigma),
+        "depth": scenario.depth,
     }
