@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,105 +25,13 @@ class Field(NamedTuple):
     """`POSITIVE`, `NOT_NEGATIVE`, or nothing."""
 
 
-FIELDS: dict[str, Field] = {
-    "name": Field("", "what tables call it"),
-    "geometry": Field("planar", "planar (x, z, θ) or spatial (x, y, z, rotation about them)"),
-    "rate": Field(30.0, "frames per second", POSITIVE),
-    "steps": Field(60, "steps after frame 0", POSITIVE),
-    "velocity": Field(
-        (1.2, 0.0, 0.0), "nominal velocity in the camera's axes, m/s and rad/s: the filter's mean"
-    ),
-    "velocity_sigma": Field(
-        (0.01, 0.01, 0.01), "σ of the true initial velocity around it, m/s and rad/s",
-        NOT_NEGATIVE,
-    ),
-    "trajectory": Field(
-        "", "what the camera truly moves along, from a random start: a TUM file, or the name of "
-        "one in $JAXSLAM_DATA/trajectories; empty: it moves as the motion model says",
-    ),
-    "still_frames": Field(
-        0, "velocity: steps in which the camera first stands still; no filter is told",
-        NOT_NEGATIVE,
-    ),
-    "motion": Field(
-        "velocity", "velocity (constant, with white accelerations), odometry (the nominal motion, "
-        "read with noise), or one of your own, module:Class",
-    ),
-    "acceleration_sigma": Field(
-        (0.1, 0.1, 0.1), "velocity: σ of the white acceleration, m/s² and rad/s²", POSITIVE
-    ),
-    "odometry_sigma": Field(
-        (0.01, 0.01, 0.01), "odometry: σ of the reading of one step, m and rad", NOT_NEGATIVE
-    ),
-    "placement": Field(
-        "prior", "prior (pixels of frame 0, 1/z of the filter's prior), ring (around the path's "
-        "centre), room (72 points along the walls of a square), rays (whenever one leaves the "
-        "picture, another comes), points, or one of your own",
-    ),
-    "landmarks": Field(12, "how many", POSITIVE),
-    "in_view": Field(
-        0, "the most that are measured at once, where one that comes back is a new one; 0: every "
-        "landmark has a slot of its own", NOT_NEGATIVE,
-    ),
-    "first_pixels": Field(
-        ((20.0, 620.0),), "prior, rays: interval of each pixel coordinate at first sight, pixels"
-    ),
-    "depth_range": Field((1.0, 6.0), "rays: least and greatest depth z of new ones, m", POSITIVE),
-    "ring_radius": Field(8.0, "ring: its radius, m", POSITIVE),
-    "nearest_depth": Field(
-        3.0, "d_min, m: the prior on 1/z is N(1/(2 d_min), (1/(4 d_min))²)", POSITIVE
-    ),
-    "inverse_depth": Field((), "mean and σ of the prior on 1/z, 1/m, where not those of d_min"),
-    "scale_sigma": Field(
-        0.0, "σ of the log of the metre in which all is given; 0 where it is a metre",
-        NOT_NEGATIVE,
-    ),
-    "least_inverse_depth": Field(
-        0.001, "prior: truth is of the prior truncated above this, 1/m", POSITIVE
-    ),
-    "first_frame": Field(0, "frame before which nothing is measured", NOT_NEGATIVE),
-    "first_landmarks": Field(0, "the most that are new in frame 0; 0: all", NOT_NEGATIVE),
-    "new_landmarks": Field(0, "the most that are new in a later frame; 0: all", NOT_NEGATIVE),
-    "known_landmarks": Field(
-        0, "the most that are measured again in a frame, drawn at random; 0: all", NOT_NEGATIVE
-    ),
-    "sensor": Field(
-        "camera", "camera (a pixel), position (the point relative to the sensor), range_bearing "
-        "(in the plane), or one of your own, module:Class",
-    ),
-    "visible_depth": Field(0.1, "camera: least depth z of what is seen, m", POSITIVE),
-    "range": Field(
-        (0.5, 5.0), "other sensors: least and greatest distance of what is seen, m", NOT_NEGATIVE
-    ),
-    "position_sigma": Field(0.1, "position: σ of each coordinate, m", POSITIVE),
-    "range_bearing_sigma": Field((0.1, 0.02), "range_bearing: σ of each, m and rad", POSITIVE),
-    "image": Field((640.0,), "camera: size of the picture, pixels", POSITIVE),
-    "focal": Field((650.0,), "camera: focal length of each coordinate, pixels", POSITIVE),
-    "centre": Field((320.0,), "camera: principal point, pixels"),
-    "focal_sigma": Field(3.0, "camera: σ of each focal length, pixels", NOT_NEGATIVE),
-    "centre_sigma": Field(
-        2.0, "camera: σ of each coordinate of the principal point, pixels", NOT_NEGATIVE
-    ),
-    "pixel_sigma": Field(0.3, "camera: σ of each pixel coordinate", POSITIVE),
-    "drift_sigma": Field(
-        0.0, "σ of an error of each landmark that stays from frame to frame, pixels, m or rad, as "
-        "of a patch that turns; no filter is told", NOT_NEGATIVE,
-    ),
-    "drift_frames": Field(20.0, "frames after which 1/e of it is left", POSITIVE),
-    "drift_wrong": Field(0.0, "share of landmarks of which it is ten times as large", NOT_NEGATIVE),
-    "calibration": Field("known", "how filters treat it: white, consider, estimated or known"),
-    "true_calibration": Field(
-        "nominal", "the true one: nominal, or drawn white (every frame) or constant (every run)"
-    ),
-    "points": Field((), "points: where they are in the first camera, m, a list of lists"),
-    "beacons": Field(
-        0, "how many landmarks, spread evenly, are surveyed: the filter knows where they are",
-        NOT_NEGATIVE,
-    ),
-    "beacon_sigma": Field(0.1, "σ of each of their coordinates, m", POSITIVE),
-}  # fmt: skip
+def _tuples(value: Value) -> Value:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
+_TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
+FIELDS = {name: Field(**{k: _tuples(v) for k, v in x.items()}) for name, x in _TABLES.items()}
+"""The fields by their names, of `fields.toml`."""
 OWN = ("motion", "sensor", "placement")
 """Fields that may be a piece of one's own: a word `module:Class`, or a table of `type` and what
 that takes, or from Python the piece."""
