@@ -32,6 +32,7 @@ from jaxslam.simulation.world import (
     Limits,
     Names,
     World,
+    check_kind,
 )
 
 HANDHELD = "handheld-"
@@ -249,9 +250,11 @@ def own_piece(kind: str, given: Value) -> Any:
         )
     where, _, name = word.partition(":")
     try:
-        return getattr(_module(where), name)(**options)
+        piece = getattr(_module(where), name)(**options)
     except (ImportError, OSError, AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"scenario field {kind}: {word}: {error}") from error
+    check_kind(kind, piece)
+    return piece
 
 
 def _module(where: str) -> Any:

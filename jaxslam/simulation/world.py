@@ -213,6 +213,16 @@ class Drift(eqx.Module):
         return self.sigma * jnp.where(wrong, 10.0, 1.0)[:, None] * drifts
 
 
+KINDS = {"motion": AbstractMotion, "sensor": AbstractSensor, "placement": AbstractPlacement}
+"""What may be of one's own."""
+
+
+def check_kind(name: str, piece: Any) -> None:
+    """Raise ValueError unless a piece is one of its kind."""
+    if not isinstance(piece, KINDS[name]):
+        raise ValueError(f"a world's {name} is an {KINDS[name].__name__}, not {piece!r}")
+
+
 class World(eqx.Module):
     """What is true: the pieces of a filter, which draw here what a filter has to estimate.
 
@@ -267,6 +277,8 @@ class World(eqx.Module):
     name: str = eqx.field(static=True, default="world")
 
     def __post_init__(self) -> None:
+        for name in KINDS:
+            check_kind(name, getattr(self, name))
         if self.view is None:
             self.view = self.sensor.view
         if self.velocity is None:
@@ -362,11 +374,12 @@ class World(eqx.Module):
 
     def __getattr__(self, name: str) -> Value:
         """A flat field by its name. Raises AttributeError for another."""
-        if name in FIELDS:
+        if name in FIELDS and not hasattr(type(self), name) and name not in _PIECES:
             return self.fields[name]
         raise AttributeError(f"a {type(self).__name__} has no {name!r}{suggestion(name, FIELDS)}")
 
 
+_PIECES = {field.name for field in dataclasses.fields(World)}
 _SIZED = {
     "tangent_dim": ("acceleration_sigma", "odometry_sigma"),
     "pixel_dim": ("first_pixels", "image", "focal", "centre"),
