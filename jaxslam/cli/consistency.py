@@ -17,7 +17,8 @@ from jaxslam.consistency.backends import AUTO, check_backend
 from jaxslam.consistency.montecarlo import check_sizes, divided
 from jaxslam.filters.words import FILTERS, MODIFIERS, make_filters
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.simulation.scenario import BUILT_IN, Scenario, parse_override, scenario
+from jaxslam.simulation import BUILT_IN, World, scenario
+from jaxslam.simulation.scenario import parse_override
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class ConsistencyOptions:
         print(table(summary))
         print(f"wrote {self.out / 'consistency.json'} and {self.out / 'consistency.png'}")
 
-    def study(self, world: Scenario | None = None) -> Study:
+    def study(self, world: World | None = None) -> Study:
         """Run the study, of another world than the options name where one is given."""
         check_sizes(self.runs, self.seed, self.dtype, self.chunk)
         check_backend(self.backend)
@@ -126,7 +127,7 @@ class ConsistencyOptions:
                 told += f"; the same command{again} goes on from there"
                 raise KeyboardInterrupt(told) from None
 
-    def _scenario(self) -> Scenario:
+    def _scenario(self) -> World:
         overrides: dict[str, object] = dict(parse_override(text) for text in self.set)
         if self.steps is not None:
             overrides["steps"] = self.steps

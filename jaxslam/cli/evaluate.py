@@ -132,7 +132,7 @@ class EvaluateOptions:
         compare = partial(evaluate_poses, poses, P, truths, Convention(**self._stated()))
         compare = partial(compare, align=self.align, axes_used=self.axes_used, times=times[0, :, 0])
         found = named(path, compare, steps=[f"step {k + 1}" for k in range(len(times[0]))])
-        off = (poses - truths)[..., : suite.scenario.world.point_dim]
+        off = (poses - truths)[..., : suite.scenario.geometry.point_dim]
         rmse = json_numbers(np.sqrt(np.mean(np.sum(off**2, axis=-1), axis=0)))
         return found, found.asdict() | {"rmse": {"position": rmse}}
 

@@ -142,7 +142,7 @@ def summarise(study: Study) -> Summary:
     return {
         "schema": SCHEMA,
         "version": __version__,
-        "scenario": dataclasses.asdict(study.scenario),
+        "scenario": study.scenario.to_dict(),
         "runs": study.runs,
         "medians_of": sum(map(len, study.whole)),
         "scale_free": study.scenario.scale_free,
@@ -156,7 +156,7 @@ def summarise(study: Study) -> Summary:
 
 
 def _summarise_filter(study: Study, name: str) -> Summary:
-    geometry = study.scenario.world
+    geometry = study.scenario.geometry
     dof, n = geometry.tangent_dim, geometry.point_dim
     (sums, lost), medians = _sums_and_lost(study, name), _medians(study, name)
     healthy = study.runs - int(sums["diverged"])
@@ -260,7 +260,7 @@ def tally(study: Study, name: str, record: str = "nees") -> Tally:
     It is of the `nees` of its poses, of the part that is `beyond_scale`, or of the `drift` of the
     scale.
     """
-    return tally_of(_sums(study, name), record, study.scenario.world.tangent_dim)
+    return tally_of(_sums(study, name), record, study.scenario.geometry.tangent_dim)
 
 
 def _sums(study: Study, name: str) -> Sums:
@@ -270,7 +270,7 @@ def _sums(study: Study, name: str) -> Sums:
 
 def _sums_and_lost(study: Study, name: str) -> tuple[Sums, list[int] | None]:
     """The sums of all chunks, and the numbers of lost runs, None where not all records are kept."""
-    dof, lost = study.scenario.world.tangent_dim, []
+    dof, lost = study.scenario.geometry.tangent_dim, []
 
     def each() -> Iterator[Sums]:
         for chunk, kept in zip(study.chunks, study.loaded(name), strict=True):

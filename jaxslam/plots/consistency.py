@@ -76,7 +76,7 @@ def _column(summary: Summary) -> Figure:
 
 
 def _page(study: Study, summary: Summary) -> Figure:
-    geometry = study.scenario.world
+    geometry = study.scenario.geometry
     rows, free = geometry.tangent_dim // 3, summary["scale_free"]
     heights = [2.1, *[1.3] * free, *[1.1] * rows]
     figure = new_figure(12.5, 1.0 + 0.2 * len(study.filters) + 2.1 * sum(heights))

@@ -16,7 +16,6 @@ from jaxslam.consistency.suite import SUITE
 from jaxslam.evaluation import CHOICES
 from jaxslam.evaluation.alignment import ALIGNMENTS
 from jaxslam.models.calibration import TREATMENTS
-from jaxslam.simulation.scenario import CALIBRATIONS
 from jaxslam.triangulation import CALIBRATIONS as VIEWS
 
 SMALL = ["consistency", "--scenario", "matched-tight", "--steps", "6", "--runs", "6"]
@@ -247,7 +246,7 @@ def test_commands_without_pictures_need_no_opencv():
 @pytest.mark.parametrize(
     ("command", "accepted"),
     [
-        ("consistency", [*CALIBRATIONS, *BACKENDS, *DTYPES]),
+        ("consistency", [*TREATMENTS, *BACKENDS, *DTYPES]),
         ("evaluate", [*itertools.chain(*CHOICES.values()), *ALIGNMENTS, *SUITE, *RIVALS]),
         ("track", [*TREATMENTS]),
         ("triangulate", [*VIEWS]),
