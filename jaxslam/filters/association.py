@@ -23,10 +23,10 @@ import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.arrays import Number
-from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.ekf import EkfSlam, context_of
 from jaxslam.filters.forms.covariance import curvature
 from jaxslam.filters.protocol import AbstractStaged, Belief
+from jaxslam.linalg import cholesky
 from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features, Slots
 

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxslam._numerics.linalg import semidefinite_root
 from jaxslam.filters.ekf import EkfSlam, composed, of_landmark
 from jaxslam.filters.protocol import (
     AbstractFilter,
@@ -19,6 +18,7 @@ from jaxslam.filters.protocol import (
     OfLandmark,
 )
 from jaxslam.geometry import Pose, Scalar, retract, scaled
+from jaxslam.linalg import semidefinite_root
 from jaxslam.models.observations import Slots
 from jaxslam.models.sensors import AbstractSensor
 

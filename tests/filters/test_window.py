@@ -13,7 +13,6 @@ from exact_posterior.laplace import minima
 from exact_posterior.problem import log_density, make_problem
 from scipy.stats import chi2, norm
 
-from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.registry import scenario_pieces
 from jaxslam.filters.window import minimise, modes, scale
@@ -31,6 +30,7 @@ from jaxslam.filters.window.scale import rescaled, scaling, shift_of_scale, vari
 from jaxslam.filters.window.to_filter import gauge_state
 from jaxslam.geometry import jacobian
 from jaxslam.landmarks import INVERSE_SCALING
+from jaxslam.linalg import cholesky
 from jaxslam.models.calibration import Considered, Estimated, Known, White
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.observations import Features

@@ -15,9 +15,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxslam._numerics.linalg import cholesky, symmetric_part
 from jaxslam.filters.forms.blocks import Model, Noise, apart, observed, residuals, shifted
 from jaxslam.filters.forms.state import State
+from jaxslam.linalg import cholesky, symmetric_part
 from jaxslam.models.observations import Features, Innovation, Slots, judged
 
 ROUNDING = 4.0

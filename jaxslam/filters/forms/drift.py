@@ -14,10 +14,10 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxslam._numerics.arrays import AnyArray, number_field
-from jaxslam._numerics.linalg import inverse
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.forms.blocks import indices, residuals
 from jaxslam.filters.forms.correction import AbstractCorrection
+from jaxslam.linalg import inverse
 
 
 class Drifting(AbstractCorrection):

@@ -22,7 +22,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.forms.blocks import (
     Blocks,
     NewLandmarks,
@@ -36,6 +35,7 @@ from jaxslam.filters.forms.form import AbstractForm, OfCore
 from jaxslam.filters.forms.state import AbstractState
 from jaxslam.filters.protocol import Moments
 from jaxslam.geometry import difference, jacobian, retract
+from jaxslam.linalg import cholesky
 from jaxslam.models.observations import Slots
 
 

@@ -16,8 +16,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam._numerics.linalg import eigh
 from jaxslam.filters.ekf import EkfSlam, Undelayed
+from jaxslam.linalg import eigh
 from jaxslam.models.scale import ScaleGauge
 
 _SINGULAR = 1e-12

@@ -25,12 +25,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam._numerics.linalg import semidefinite_root
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.forms.blocks import apart, shifted
 from jaxslam.filters.forms.state import AbstractState
 from jaxslam.filters.submaps.handover import Frozen, Submaps, SubmapsState
 from jaxslam.geometry import Pose, difference, identity, retract
+from jaxslam.linalg import semidefinite_root
 from jaxslam.models.coordinates import KeyframePose
 
 LINEARISATION = 1e-3

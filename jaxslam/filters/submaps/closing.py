@@ -24,10 +24,10 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.arrays import Number
 from jaxslam._numerics.conditional import while_loop
-from jaxslam._numerics.linalg import Cholesky, cholesky
 from jaxslam.filters.association import Candidates, joint_compatibility
 from jaxslam.filters.submaps.chain import Chain, OfChain, SubmapMean, base_poses
 from jaxslam.geometry import Pose, homogeneous_apply
+from jaxslam.linalg import Cholesky, cholesky
 
 STEPS = 20
 """Of Gauss–Newton, at the most …"""

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.conditional import while_loop
-from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.problem import (
     Path,
@@ -29,6 +28,7 @@ from jaxslam.filters.window.problem import (
 )
 from jaxslam.filters.window.record import Record
 from jaxslam.geometry import Scalar
+from jaxslam.linalg import cholesky
 
 TOLERANCE = 1e-3
 """Of half the sum of squares: a minimum is found when a step gains less."""

@@ -20,7 +20,6 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.conditional import cond, map_where, zeros
-from jaxslam._numerics.linalg import Cholesky, cholesky
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.window.minimise import MOST_STEPS, Minimum, minimised, started, turned
 from jaxslam.filters.window.problem import PathLayout, Reduced, X, Y, left_out
@@ -28,6 +27,7 @@ from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.scale import enlarged, rescaled, shift_of_scale
 from jaxslam.filters.window.subsample import Coarse
 from jaxslam.geometry import Scalar
+from jaxslam.linalg import Cholesky, cholesky
 
 SPEED = 1.2
 """Starts move with so many σ of the prior on the initial velocity."""

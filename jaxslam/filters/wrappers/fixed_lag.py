@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxslam._numerics.linalg import Cholesky, cholesky, semidefinite_root
 from jaxslam.filters.ekf import EkfSlam, check_features, check_one_gaussian, correct
 from jaxslam.filters.forms.blocks import shifted
 from jaxslam.filters.forms.sensitivity import (
@@ -39,6 +38,7 @@ from jaxslam.filters.protocol import (
     PoseError,
 )
 from jaxslam.geometry import Pose
+from jaxslam.linalg import Cholesky, cholesky, semidefinite_root
 from jaxslam.models.motion import Control, check_control
 from jaxslam.models.observations import Capacity, Features, Innovation, Slots, judged
 

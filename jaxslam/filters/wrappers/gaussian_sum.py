@@ -22,7 +22,6 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam._numerics.arrays import AnyArray, cast, precision
 from jaxslam._numerics.conditional import map_or_zero, map_where, zeros
-from jaxslam._numerics.linalg import eigh
 from jaxslam.filters.ekf import (
     EkfSlam,
     append_noise,
@@ -45,6 +44,7 @@ from jaxslam.filters.wrappers.split_merge import collapsed, divided
 from jaxslam.filters.wrappers.sum_state import SumState, member, moments, weighed
 from jaxslam.filters.wrappers.wrapper import AbstractWrapper, with_motion
 from jaxslam.geometry import Pose, difference, retract
+from jaxslam.linalg import eigh
 from jaxslam.models.motion import Control, check_control
 from jaxslam.models.observations import Capacity, Features, Slots
 

@@ -25,13 +25,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.conditional import at_places, map_or_zero
-from jaxslam._numerics.linalg import cholesky, eigh
 from jaxslam.filters.ekf import EkfSlam
 from jaxslam.filters.forms.blocks import apart, shifted
 from jaxslam.filters.forms.state import State
 from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.filters.wrappers.sum_state import SumState, member, moments
 from jaxslam.geometry import jacobian, log
+from jaxslam.linalg import cholesky, eigh
 from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features
 
