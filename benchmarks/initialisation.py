@@ -22,10 +22,10 @@ import numpy as np
 from benchmark import RESULTS, Benchmark, number, table
 
 import jaxslam
-from jaxslam._numerics.linalg import cholesky
 from jaxslam.consistency.montecarlo import draw
-from jaxslam.filters.slam import Slam
 from jaxslam.filters.readouts import camera_pose, landmarks_in_camera
+from jaxslam.filters.slam import Slam
+from jaxslam.linalg import cholesky
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation import Room, Run, features
 from jaxslam.statistics.bands import lost_threshold, normalised_squared

@@ -11,8 +11,8 @@ import numpy as np
 import jaxslam
 from jaxslam._numerics.arrays import AnyArray, number_field
 from jaxslam.filters.linear.blocks import residuals
-from jaxslam.filters.linear.kalman import AbstractCorrection, kalman_update
 from jaxslam.filters.linear.covariance import Covariance
+from jaxslam.filters.linear.kalman import AbstractCorrection, kalman_update
 from jaxslam.geometry import exp, homogeneous_apply
 from jaxslam.landmarks import Parametrization
 

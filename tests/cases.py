@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.filters.slam import Slam
 from jaxslam.filters.protocol import AbstractStaged
 from jaxslam.filters.readouts import camera_pose
+from jaxslam.filters.slam import Slam
 from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.geometry import GEOMETRIES
-from jaxslam.landmarks import InverseScaling, LANDMARKS
+from jaxslam.landmarks import LANDMARKS, InverseScaling
 from jaxslam.models.camera import Camera
 from jaxslam.models.frame import Robocentric
 from jaxslam.models.motion import ConstantVelocity

@@ -19,7 +19,6 @@ from additions import (
 from cases import quick_jit
 
 import jaxslam
-from jaxslam.filters.linear.covariance import Covariance
 from jaxslam.filters.words import scenario_pieces
 from jaxslam.statistics import not_disproved
 

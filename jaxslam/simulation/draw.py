@@ -13,8 +13,8 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import cast
-from jaxslam._numerics.linalg import semidefinite_root
 from jaxslam.geometry import Pose, identity, retract
+from jaxslam.linalg import semidefinite_root
 from jaxslam.models.motion import AbstractMotion, Control
 from jaxslam.models.observations import PriorMap
 from jaxslam.models.sensors import AbstractSensor

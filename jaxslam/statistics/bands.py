@@ -14,7 +14,7 @@ import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import AnyArray
-from jaxslam._numerics.linalg import cholesky
+from jaxslam.linalg import cholesky
 
 CONFIDENCE = 0.95
 _LAGS = 10

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import Case, quick_jit
+from jaxslam.filters.wrappers.wrapper import AbstractWrapper
 from scipy.stats import chi2
 
 from jaxslam.filters import association
@@ -15,7 +16,6 @@ from jaxslam.filters.association import ASSOCIATIONS, GATE, Candidates, candidat
 from jaxslam.filters.gaussian import context_of
 from jaxslam.filters.linear.covariance import curvature
 from jaxslam.filters.protocol import AbstractStaged
-from jaxslam.filters.wrappers.wrapper import AbstractWrapper
 from jaxslam.models.observations import Features
 
 SIGMA = 0.3

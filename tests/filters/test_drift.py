@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from cases import Case, quick_jit
 
-from jaxslam.filters.slam import Slam
 from jaxslam.filters.linear.covariance import Covariance
-from jaxslam.filters.remedies.random_walk import Drifting
 from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
+from jaxslam.filters.remedies.random_walk import Drifting
+from jaxslam.filters.slam import Slam
 from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.simulation import scenario
 

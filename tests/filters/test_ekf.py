@@ -21,18 +21,18 @@ from cases import (
 )
 
 from jaxslam._numerics.arrays import cast
-from jaxslam.filters.slam import Slam
 from jaxslam.filters.linear import blocks
 from jaxslam.filters.linear.blocks import Blocks, observed, placed
 from jaxslam.filters.linear.covariance import Covariance
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.model import COMPOSED, Context, Core
+from jaxslam.filters.slam import Slam
 from jaxslam.geometry import PLANAR, SPATIAL, difference, retract
-from jaxslam.landmarks import InverseScaling, LANDMARKS
+from jaxslam.landmarks import LANDMARKS, InverseScaling
 from jaxslam.models.calibration import Known, White
 from jaxslam.models.camera import Camera
-from jaxslam.models.frame import Robocentric, WorldCentric
 from jaxslam.models.depth import InverseDepth
+from jaxslam.models.frame import Robocentric, WorldCentric
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Features, Status
 from jaxslam.models.sensors import Pinhole

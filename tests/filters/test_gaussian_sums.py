@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import Case, each_geometry, named, pose_run, quick_jit
+from jaxslam.filters.wrappers import split_merge
+from jaxslam.filters.wrappers.wrapper import with_motion
 
 import jaxslam
-from jaxslam.filters.words import FROM_REST, RECOMMENDED, recommended_name
-from jaxslam.filters.wrappers import split_merge
 from jaxslam.filters.mixture.split_merge import _parts, _split_and_merged
 from jaxslam.filters.mixture.sum_state import BEHIND, SumState, log_likelihoods, mixed
-from jaxslam.filters.wrappers.wrapper import with_motion
+from jaxslam.filters.words import FROM_REST, RECOMMENDED, recommended_name
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Innovation, Status
 

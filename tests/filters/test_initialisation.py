@@ -11,11 +11,11 @@ from cases import Case, quick_jit
 
 from jaxslam.consistency import filter_run
 from jaxslam.filters.gaussian import correct
-from jaxslam.filters.rivals import rays
 from jaxslam.filters.mixture.density import log_density
+from jaxslam.filters.readouts import landmarks_in_camera
+from jaxslam.filters.rivals import rays
 from jaxslam.filters.rivals.depth_particles import DepthParticles
 from jaxslam.filters.rivals.rays import RaySum
-from jaxslam.filters.readouts import landmarks_in_camera
 from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.landmarks import Cartesian, InverseScaling
 from jaxslam.models.camera import Camera

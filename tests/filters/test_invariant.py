@@ -11,10 +11,10 @@ from cases import Case, close, named, pose, quick_jit
 
 from jaxslam.filters.linear.blocks import shifted
 from jaxslam.filters.linear.covariance import Covariance
-from jaxslam.filters.remedies.gauge import act
 from jaxslam.filters.model import COMPOSED
+from jaxslam.filters.remedies.gauge import act
 from jaxslam.geometry import PLANAR, SPATIAL, difference, exp, log
-from jaxslam.landmarks import Cartesian, UnifiedInverseDepth, InverseScaling
+from jaxslam.landmarks import Cartesian, InverseScaling, UnifiedInverseDepth
 
 NAMES = {PLANAR: "matched", SPATIAL: "matched-6dof"}
 

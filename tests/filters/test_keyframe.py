@@ -17,8 +17,8 @@ from jaxslam.geometry import PLANAR, SPATIAL, difference, exp, identity, joined,
 from jaxslam.landmarks import ImagePlane, InverseScaling
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.camera import Camera
-from jaxslam.models.frame import KEYFRAME_PARALLAX, KEYFRAME_TURN, keyframe_due
 from jaxslam.models.depth import InverseDepth
+from jaxslam.models.frame import KEYFRAME_PARALLAX, KEYFRAME_TURN, keyframe_due
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Features
 from jaxslam.models.sensors import Pinhole

@@ -16,18 +16,18 @@ from test_observability import GAUGE, nullity
 
 from jaxslam.filters.linear.blocks import shifted
 from jaxslam.filters.linear.covariance import Covariance
+from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.filters.remedies.gauge import act, unobservable_directions
 from jaxslam.filters.remedies.observability_constrained import transport
-from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.geometry import PLANAR, SPATIAL, SplitPose, difference, tangent_dim
 from jaxslam.landmarks import (
+    LANDMARKS,
     Cartesian,
     FramedHomogeneous,
     ImagePlane,
-    UnifiedInverseDepth,
     InverseScaling,
-    LANDMARKS,
+    UnifiedInverseDepth,
 )
 from jaxslam.models.frame import Robocentric, WorldCentric
 from jaxslam.models.motion import Odometry

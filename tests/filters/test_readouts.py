@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from cases import Case, quick_jit
 
+from jaxslam.filters.mixture.sum_state import SumState
 from jaxslam.filters.readouts import (
     camera_pose,
     camera_pose_in_unit,
@@ -16,7 +17,6 @@ from jaxslam.filters.readouts import (
     landmarks_in_world,
     landmarks_on_sides,
 )
-from jaxslam.filters.mixture.sum_state import SumState
 
 STEPS, COUNT = 4, 6
 

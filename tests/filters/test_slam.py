@@ -23,7 +23,6 @@ from cases import (
 
 from jaxslam._numerics.arrays import cast
 from jaxslam.filters.gaussian import insert
-from jaxslam.filters.slam import Slam
 from jaxslam.filters.linear.covariance import Covariance
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.model import COMPOSED, Context, Core
@@ -33,11 +32,12 @@ from jaxslam.filters.readouts import (
     landmarks_in_camera,
     landmarks_in_world,
 )
+from jaxslam.filters.slam import Slam
 from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.geometry import PLANAR, SPATIAL, joined, retract
 from jaxslam.landmarks import (
-    InverseDepthToCartesian,
     LANDMARKS,
+    InverseDepthToCartesian,
     ParallaxAngle,
 )
 from jaxslam.models.calibration import TREATMENTS, Estimated
@@ -487,7 +487,10 @@ def convertible_state(model):
 
 @pytest.mark.parametrize(
     ("geometry", "frame", "landmark"),
-    [(PLANAR, Robocentric(), InverseDepthToCartesian()), (SPATIAL, WorldCentric(), ParallaxAngle())],
+    [
+        (PLANAR, Robocentric(), InverseDepthToCartesian()),
+        (SPATIAL, WorldCentric(), ParallaxAngle()),
+    ],
     ids=named,
 )
 def test_a_conversion_changes_neither_points_nor_what_is_known_of_them(geometry, frame, landmark):

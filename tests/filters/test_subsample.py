@@ -9,11 +9,11 @@ import pytest
 from cases import quick_jit
 
 from jaxslam.filters.slam import Slam
-from jaxslam.filters.words import scenario_pieces
 from jaxslam.filters.window.minimise import started
 from jaxslam.filters.window.problem import PathLayout, path
 from jaxslam.filters.window.record import whole
 from jaxslam.filters.window.subsample import Coarse, every, thinned, tied
+from jaxslam.filters.words import scenario_pieces
 from jaxslam.landmarks import InverseScaling
 from jaxslam.models.calibration import Known, White
 from jaxslam.models.scale import ScaleGauge

@@ -11,11 +11,11 @@ from cases import central, close, each_geometry, each_landmark, named, pose, qui
 
 from jaxslam.geometry import joined
 from jaxslam.landmarks import (
-    UnifiedInverseDepth,
+    LANDMARKS,
     InverseDepthToCartesian,
     InverseScaling,
-    LANDMARKS,
     ParallaxAngle,
+    UnifiedInverseDepth,
 )
 from jaxslam.landmarks.inverse_depth import angles_of
 from jaxslam.models.camera import Camera, project
@@ -388,6 +388,8 @@ def test_a_camera_becomes_the_associate_anchor_exactly_at_the_least_parallax(geo
 @with_geometry
 def test_until_its_conversion_a_landmark_is_one_of_unified_inverse_depth(geometry, landmark):
     parameters, plain = generic(landmark, geometry), generic(UnifiedInverseDepth(), geometry)
-    ours, theirs = (functions(p)[2](x) for p, x in ((landmark, parameters), (UnifiedInverseDepth(), plain)))
+    ours, theirs = (
+        functions(p)[2](x) for p, x in ((landmark, parameters), (UnifiedInverseDepth(), plain))
+    )
     np.testing.assert_allclose(jnp.append(*ours), jnp.append(*theirs), rtol=1e-14)
     assert parameters[-1] == 0.0

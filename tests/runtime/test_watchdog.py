@@ -23,7 +23,7 @@ from jaxslam.simulation import Room, simulate
 MATRICES = """
 import jax, jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
-from jaxslam._numerics import linalg
+from jaxslam import linalg
 from jaxslam._runtime import watchdog
 
 def lapack(A):

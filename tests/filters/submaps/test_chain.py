@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from jaxslam.consistency import run_through
-from jaxslam.filters.slam import Slam
-from jaxslam.filters.words import make_filters
 from jaxslam.filters.run import Frames, run
+from jaxslam.filters.slam import Slam
 from jaxslam.filters.submaps import chain as chains
 from jaxslam.filters.submaps.chain import base_poses, chain
 from jaxslam.filters.submaps.closing import posterior
 from jaxslam.filters.submaps.handover import with_submaps
+from jaxslam.filters.words import make_filters
 from jaxslam.geometry import difference
 from jaxslam.landmarks import Cartesian
 from jaxslam.models.motion import ConstantVelocity

@@ -9,8 +9,8 @@ import pytest
 
 from jaxslam.consistency import run_through
 from jaxslam.filters import Loops, agreeing, base_poses, chain, close, with_submaps
-from jaxslam.filters.words import make_filters
 from jaxslam.filters.submaps import closing
+from jaxslam.filters.words import make_filters
 from jaxslam.simulation import Room, scenario, simulate
 
 LAP = scenario("laps-6dof", steps=440, in_view=12, landmarks=96)

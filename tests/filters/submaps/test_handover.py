@@ -7,8 +7,8 @@ import pytest
 
 from jaxslam.consistency import run_through
 from jaxslam.filters import Submaps, with_submaps
-from jaxslam.filters.slam import Slam
 from jaxslam.filters.readouts import camera_pose, landmarks_in_world
+from jaxslam.filters.slam import Slam
 from jaxslam.filters.words import make_filters
 from jaxslam.geometry import difference
 from jaxslam.landmarks import LANDMARKS
