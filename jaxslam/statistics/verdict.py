@@ -169,28 +169,24 @@ class Tally:
         """
         right = self.dof - self.fitted, float(self.dof)
         kept = Look("never lost", self.never_lost, right, 1 - VERDICT_CONFIDENCE)
-        return {
-            **self._judged(),
+        never_lost = kept.asdict() if kept.sums.count else _NONE
+        return self._judged() | {
             "runs": self.runs,
             "lost": self.lost / self.runs,
             "lost_runs": None,
             "diverged": self.diverged,
-            "never_lost": {
-                **(kept.asdict() if kept.sums.count else _NONE),
-                "runs": self.runs - self.lost,
-            },
+            "never_lost": never_lost | {"runs": self.runs - self.lost},
         }
 
     def _judged(self) -> Verdict:
         """The look that decides, and all of them."""
         if self.diverged or not self.average.count:
-            return {**_NONE, "of": "all steps", "enough": None, "mean": _NONE, "end": _NONE,
-                    "thirds": []}  # fmt: skip
+            parts = {"mean": _NONE, "end": _NONE, "thirds": []}
+            return _NONE | {"of": "all steps", "enough": None, **parts}
         looks, name = self.looks(), self.decisive().name
         told = {look.name: look.asdict() for look in looks}
         mean = told["all steps"]
-        return {
-            **told[name],
+        return told[name] | {
             "p": min(found["p"] for found in told.values()),
             "of": name,
             "enough": looks[0].enough() if told[name]["word"] == "cannot tell" else None,
@@ -200,7 +196,7 @@ class Tally:
         }
 
 
-_NONE = {"nees": None, "sigma_factor": None, "interval99": [None, None], "p": 0.0, "word": "lost"}
+_NONE = Verdict(nees=None, sigma_factor=None, interval99=[None, None], p=0.0, word="lost")
 """The verdict where there is no mean."""
 
 
@@ -335,6 +331,14 @@ def headline(found: Verdict, quantity: str = "NEES") -> str:
     return f"{said}; about {found['enough']} {found.get('samples', 'runs')} would tell"
 
 
+def brief(found: Verdict) -> str:
+    """The word of a verdict with the factor of σ, for where there is little room."""
+    if found["nees"] is None:
+        return found["word"]
+    factor, low, high = _factors(found["word"], found["sigma_factor"], *found["interval99"])
+    return f"{found['word']}, σ × {factor} [{low}, {high}]"
+
+
 def _part(found: Verdict) -> str:
     """The part that decided; older files, from before there were parts, have none."""
     return found.get("of", "all steps")
@@ -347,10 +351,23 @@ def _said(found: Verdict, quantity: str) -> str:
         told = "too small by"
     if word == "under-confident":
         told, factors = "too large by", [_inverse(factors[i]) for i in (0, 2, 1)]
-    factor, low, high = ("–" if f is None else _digits(f) for f in factors)
+    factor, low, high = _factors(word, *factors)
     p = f"p = {found['p']:.2g}" if found["p"] >= 1e-4 else "p < 0.0001"
     said = f"{quantity} {_digits(found['nees'])}, σ {told} {factor} [{low}, {high}]"
     return f"{said}: {word} ({p})"
+
+
+def _factors(word: str, factor: float | None, *bounds: float | None) -> tuple[str, ...]:
+    """A factor and its interval, in which a bound next to 1 is not 1 where σ is disproved."""
+    wrong = word in ("over-confident", "under-confident")
+
+    def bound(value: float | None) -> str:
+        if value is None:
+            return "∞"
+        near = wrong and value != 1 and _digits(value) == "1.00"
+        return f"{'>' if value > 1 else '<'}1" if near else _digits(value)
+
+    return "–" if factor is None else _digits(factor), *map(bound, bounds)
 
 
 def _inverse(factor: float | None) -> float | None:
