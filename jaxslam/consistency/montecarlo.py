@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import time
+import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -24,7 +25,7 @@ from jaxslam._runtime.progress import StudyBar
 from jaxslam._runtime.watchdog import finished
 from jaxslam.consistency.backends import AUTO, BACKENDS, BatchProgram, check_backend, chosen
 from jaxslam.consistency.cluster import connected, on_cluster
-from jaxslam.consistency.manifest import described
+from jaxslam.consistency.manifest import described, unseen
 from jaxslam.consistency.results import Seconds
 from jaxslam.consistency.simulator import MapChunks, Simulator
 from jaxslam.consistency.store import NATIVE, MemoryStore, Records, Store
@@ -104,7 +105,14 @@ def monte_carlo(
         chunks = divided(runs, chunk)
         simulator = Simulator(scenario, seed, dtype, min(chunk, runs), motion, sensor)
         made_by = {**simulator.made_by, "chunk": int(chunk), "reduced": reduced}
-        store.begin(made_by, {name: described(slam) for name, slam in filters.items()})
+        descriptions = {name: described(slam) for name, slam in filters.items()}
+        store.begin(made_by, descriptions)
+        if kept_in is not None and (hidden := unseen([made_by, descriptions])):
+            warnings.warn(
+                f"not seen: {', '.join(sorted(hidden))}; a study that is resumed does not notice "
+                "when the code behind changes",
+                stacklevel=2,
+            )
         missing = {name: [c for c in chunks if not store.has(name, c)] for name in filters}
         kept = {name: _kept_by(name, chunks, store, backend) for name in filters}
         open_choice = AUTO if client is None else "xla"

@@ -9,7 +9,7 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxslam._runtime.files import json_numbers
 from jaxslam._runtime.lookup import suggestion
@@ -74,7 +74,7 @@ class ScaleDrift:
     """The root mean square of the σ that the filter claims of it."""
     normalised_rms: Steps
     """The root mean square of the drift over its σ."""
-    runs: Steps
+    runs: Int[np.ndarray, " steps"]
     """The number of runs whose unit of length is fixed by then."""
     verdict: Verdict | None
     """The verdict on the drift; None without any run to judge."""
@@ -104,7 +104,7 @@ class LandmarkNees:
     """The mean over the landmarks whose NEES is finite."""
     dof: int
     """The degrees of freedom of one landmark."""
-    not_finite: Steps
+    not_finite: Int[np.ndarray, " steps"]
     """The number of runs with a landmark whose NEES is not finite."""
 
 
@@ -313,7 +313,7 @@ class Summary(dict[str, Any]):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Results(Mapping[str, FilterResult]):
+class Results(Mapping):
     """The results of a study by filter, without its records: what `consistency.json` holds."""
 
     version: str

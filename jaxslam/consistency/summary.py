@@ -57,7 +57,7 @@ _FILES = {"consistency.json", "consistency.png", "consistency.pdf", "runs"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Study(Mapping[str, FilterResult]):
+class Study(Mapping):
     """The finished runs of a study, and what it found of each filter: `study[name].nees.mean`.
 
     A filter's name may be a part that only one has, as `study["recommended"]`. It prints as its
