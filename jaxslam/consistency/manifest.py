@@ -39,7 +39,7 @@ UNSEEN = "code that cannot be seen"
 """The mark, in a description, of what decides a result and cannot be described."""
 
 
-def described(value: Any) -> Any:
+def described(value: object) -> Any:
     """Describe a filter, a model, or any value of numbers, names and functions as JSON.
 
     Descriptions of equal values are equal, in every process, in a script and in a notebook. Of
@@ -51,7 +51,7 @@ def described(value: Any) -> Any:
     return _Description().of(value)
 
 
-def unseen(description: Any) -> set[str]:
+def unseen(description: object) -> set[str]:
     """The names, in a description, of code that could not be seen."""
     if isinstance(description, dict):
         own = {description[UNSEEN]} if UNSEEN in description else set()
@@ -66,7 +66,7 @@ class _Description:
         self._seen: dict[int, Any] = {}
         """What was described, kept alive so that nothing else gets the same id."""
 
-    def of(self, value: Any) -> Any:
+    def of(self, value: object) -> Any:
         if isinstance(value, str | bool | int | float | None):
             return value
         if isinstance(value, os.PathLike):
@@ -96,12 +96,12 @@ class _Description:
             return self._function(value)
         return self._instance(value)
 
-    def _first_time(self, value: Any) -> bool:
+    def _first_time(self, value: object) -> bool:
         first = id(value) not in self._seen
         self._seen[id(value)] = value
         return first
 
-    def _instance(self, value: Any) -> Any:
+    def _instance(self, value: object) -> Any:
         kind = type(value)
         if dataclasses.is_dataclass(value):
             fields = {f.name: getattr(value, f.name, None) for f in dataclasses.fields(value)}
@@ -130,7 +130,7 @@ class _Description:
             },
         }
 
-    def _function(self, given: Any) -> Any:
+    def _function(self, given: object) -> Any:
         rules = [getattr(given, name, None) for name in ("jvp", "fwd", "bwd")]  # of `custom_jvp`
         function = inspect.unwrap(given)
         package, name = _package(function.__module__), _name(function)
@@ -178,7 +178,7 @@ _DYNAMIC = (getattr, eval, exec, globals, __import__, compile)
 _OPERATORS = ("__call__", "__add__", "__sub__", "__mul__", "__matmul__", "__getitem__", "__neg__")
 
 
-def _wraps_function(value: Any) -> bool:
+def _wraps_function(value: object) -> bool:
     """Whether it is a function that a decorator made, as `jax.jit`."""
     wrapped = getattr(value, "__wrapped__", None)
     return callable(value) and isinstance(wrapped, FunctionType) and not isinstance(value, type)
@@ -189,7 +189,7 @@ def _called_by_class(kind: type) -> bool:
     return isinstance(kind.__call__, FunctionType)
 
 
-def _function_of(member: Any) -> Any:
+def _function_of(member: object) -> Any:
     """The function behind a member of a class."""
     if isinstance(member, property):
         return [member.fget, member.fset]
@@ -198,14 +198,14 @@ def _function_of(member: Any) -> Any:
     return member.__func__ if isinstance(member, staticmethod | classmethod) else member
 
 
-def _content(cell: Any) -> Any:
+def _content(cell: object) -> Any:
     try:
         return cell.cell_contents
     except ValueError:  # it is not filled yet
         return None
 
 
-def _in_c(function: Any) -> Any:
+def _in_c(function: object) -> Any:
     """The name of a function in C, and the version of its package, if it is of any."""
     owner = getattr(function, "__self__", None)
     module = getattr(function, "__module__", None) or getattr(type(owner), "__module__", "numpy")
@@ -236,12 +236,12 @@ def _package(module: str | None) -> str | None:
         return f"{top} {version(names[0])}" if names else top
 
 
-def difference(then: Any, now: Any) -> str | None:
+def difference(then: object, now: Any) -> str | None:
     """The first part in which two manifests differ, then and now; None where they are the same."""
     return next(_differences("", then, now), None)
 
 
-def _differences(where: str, then: Any, now: Any) -> Iterator[str]:
+def _differences(where: str, then: object, now: Any) -> Iterator[str]:
     if isinstance(then, dict) and isinstance(now, dict):
         for key in {**now, **then}:
             yield from _differences(f"{where}.{key}", then.get(key), now.get(key))
@@ -249,12 +249,12 @@ def _differences(where: str, then: Any, now: Any) -> Iterator[str]:
         yield f"{where[1:]} ({_short(then)}, now {_short(now)})"
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:77]}…"
 
 
-def _name(value: Any) -> str:
+def _name(value: object) -> str:
     return f"{value.__module__}.{value.__qualname__}"
 
 

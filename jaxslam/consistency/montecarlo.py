@@ -71,8 +71,8 @@ def monte_carlo(
     The runs are the scenario's, which may be given by name; with a `motion` (or a `RecordedMotion`)
     or a `sensor` of one's own the truth moves, or is measured, as that says, in the scenario's
     world. Filters are given by name, as `make_filters` returns them; a list of words makes those of
-    the scenario, with Inverse Scaling. Filters that differ in numbers only share a program: compare
-    noises by one filter for each.
+    the scenario, as `robocentric`, which has Inverse Scaling, or `robocentric/inverse_depth`. One
+    filter has one set of numbers; several that differ in numbers alone share a program.
 
     With `progress=True` a bar shows how far it is. Or `progress(filter name, finished runs)` is
     called after every chunk, and with no runs twice: when the filter is to be compiled, and when it
@@ -182,7 +182,9 @@ def _as_filters(scenario: Scenario, filters: Any) -> Mapping[str, AbstractFilter
     if isinstance(filters, Iterable) and not isinstance(filters, Mapping):
         filters = list(filters)
         if filters and all(isinstance(word, str) for word in filters):
-            return make_filters(scenario, filters, _LANDMARK)
+            words = (word.partition("/") for word in filters)
+            made = [make_filters(scenario, name, of or _LANDMARK) for name, _, of in words]
+            return {name: slam for each in made for name, slam in each.items()}
     if not filters or not isinstance(filters, Mapping):
         raise ValueError(
             "no filters by name: a dict is accepted, as make_filters gives it, or a list of words "

@@ -187,7 +187,7 @@ class FilterResult:
         """Return the results of which `to_json` made this; what an older version lacks is None."""
         found: dict[str, Any] = {"name": name}
         for key, path in _PATH_OF_KEY.items():
-            value: Any = told
+            value: object = told
             for part in key.split("."):
                 value = value.get(part) if isinstance(value, Mapping) else None
             *outer, last = path.split(".")
@@ -196,6 +196,8 @@ class FilterResult:
                 place = place.setdefault(part, {})
             place[last] = _read(value)
         del found["nees"]["inside"]
+        for part in ("nees", "beyond_scale"):
+            found[part]["band"] = tuple(found[part]["band"])
         parts = {part: kind(**found[part]) for part, kind in _KIND_OF_PART.items()}
         return FilterResult(**{**found, **parts})
 
@@ -249,13 +251,13 @@ _PATH_OF_KEY = {
 """The attribute of a `FilterResult` for every key of JSON."""
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     if not isinstance(value, np.ndarray):
         return list(value) if isinstance(value, tuple) else value
     return value.tolist() if value.dtype.kind == "i" else json_numbers(value)
 
 
-def _read(value: Any) -> Any:
+def _read(value: object) -> Any:
     if isinstance(value, dict) and "word" in value:
         return as_verdict(value)
     if isinstance(value, list):
@@ -266,7 +268,7 @@ def _read(value: Any) -> Any:
 def as_verdict(told: Mapping[str, Any]) -> Verdict:
     """Return the verdict that JSON has, its parts as verdicts too."""
 
-    def part(value: Any) -> Any:
+    def part(value: object) -> Any:
         if isinstance(value, list):
             return [part(x) for x in value]
         return as_verdict(value) if isinstance(value, dict) else value

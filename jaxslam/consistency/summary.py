@@ -315,7 +315,7 @@ def results_of(given: Study | Results | Mapping[str, Any]) -> Results:
     raise ValueError(f"a study is summarised, as monte_carlo gives it, not {type(given).__name__}")
 
 
-def summarise(study: Study) -> Summary:
+def summarise(study: Study | Results) -> Summary:
     """The content of `consistency.json`, ready for `json.dumps`; `study[filter]` has it typed.
 
     A run diverges when its NEES is not finite, or its covariance not positive definite, at any
@@ -341,7 +341,7 @@ def summarise(study: Study) -> Summary:
     return results_of(study).to_json()
 
 
-def table(summary: Summary | Study) -> str:
+def table(summary: Study | Results | Mapping[str, Any]) -> str:
     """The verdict on every filter, then the numbers of the last step, one filter a line.
 
     It is that of a `summary`, or of a study, which is summarised here. Raises ValueError for
@@ -357,10 +357,10 @@ def _result(study: Study, name: str) -> FilterResult:
     healthy = study.runs - int(sums["diverged"])
     low, high = mean_band(dof, max(healthy, 1))
 
-    def mean(key: str, count: Any = healthy) -> np.ndarray:
+    def mean(key: str, count: np.ndarray | int = healthy) -> np.ndarray:
         return _ratio(sums[key], count)
 
-    def rms(key: str, count: Any = healthy) -> np.ndarray:
+    def rms(key: str, count: np.ndarray | int = healthy) -> np.ndarray:
         return np.sqrt(mean(key, count))
 
     def by_part(key: str) -> Parts:

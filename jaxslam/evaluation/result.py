@@ -31,7 +31,7 @@ from jaxslam.evaluation.inputs import (
 )
 from jaxslam.evaluation.sanity_checks import Logged, Mistake, mistakes, withheld
 from jaxslam.evaluation.scale import Scale
-from jaxslam.statistics.bands import mean_band
+from jaxslam.statistics.bands import exact_band
 from jaxslam.statistics.verdict import (
     Verdict,
     headline,
@@ -190,8 +190,8 @@ class Evaluation:
 
     def _band(self, runs: int) -> tuple[float, float]:
         """The band, its low end with all that may be fitted, its high end with nothing fitted."""
-        left, high = int(self.dof - self.fitted), mean_band(self.dof, runs)[1]
-        return (mean_band(left, runs)[0] if left >= 1 else 0.0), high
+        left, high = int(self.dof - self.fitted), exact_band(self.dof, runs)[1]
+        return (exact_band(left, runs)[0] if left >= 1 else 0.0), high
 
     @property
     def inside(self) -> float:

@@ -207,10 +207,9 @@ def described_in(run, folder, offset="x"):
     (folder / "helper.py").write_text(f"def offset(x):\n    return {offset}\n")
     (folder / "mine.py").write_text(USERS)
     (folder / "script.py").write_text(f"{USERS}\n{TOLD}\n")
-    told = subprocess.run(
-        [sys.executable, "-B", *run, "script.py"], check=True, capture_output=True, text=True, cwd=folder,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *sys.path])},
-    )  # fmt: skip
+    command = [sys.executable, "-B", *run, "script.py"]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *sys.path])}
+    told = subprocess.run(command, check=True, capture_output=True, text=True, cwd=folder, env=env)
     return json.loads(told.stdout.splitlines()[-1])
 
 
