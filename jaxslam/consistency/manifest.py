@@ -15,10 +15,11 @@ from functools import cache, cached_property, partial
 from importlib.metadata import PackageNotFoundError, packages_distributions, version
 from importlib.util import find_spec
 from pathlib import Path
-from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
+from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 Manifest = dict[str, Any]
@@ -72,8 +73,9 @@ class _Description:
         if isinstance(value, os.PathLike):
             return os.fspath(value)
         if isinstance(value, np.ndarray | np.generic | jax.Array):
-            keys = jax.dtypes.issubdtype(value.dtype, jax.dtypes.prng_key)
-            return _array(np.asarray(jax.random.key_data(value) if keys else value))
+            if jax.dtypes.issubdtype(value.dtype, jax.dtypes.prng_key):
+                value = jax.random.key_data(jnp.asarray(value))
+            return _array(np.asarray(value))
         if isinstance(value, Mapping):
             return {str(key): self.of(x) for key, x in value.items()}
         if isinstance(value, tuple | list | range):
@@ -130,7 +132,7 @@ class _Description:
             },
         }
 
-    def _function(self, given: object) -> Any:
+    def _function(self, given: Any) -> Any:
         rules = [getattr(given, name, None) for name in ("jvp", "fwd", "bwd")]  # of `custom_jvp`
         function = inspect.unwrap(given)
         package, name = _package(function.__module__), _name(function)
@@ -198,14 +200,14 @@ def _function_of(member: object) -> Any:
     return member.__func__ if isinstance(member, staticmethod | classmethod) else member
 
 
-def _content(cell: object) -> Any:
+def _content(cell: CellType) -> Any:
     try:
         return cell.cell_contents
     except ValueError:  # it is not filled yet
         return None
 
 
-def _in_c(function: object) -> Any:
+def _in_c(function: BuiltinFunctionType | np.ufunc) -> Any:
     """The name of a function in C, and the version of its package, if it is of any."""
     owner = getattr(function, "__self__", None)
     module = getattr(function, "__module__", None) or getattr(type(owner), "__module__", "numpy")
@@ -254,7 +256,7 @@ def _short(value: object) -> str:
     return text if len(text) <= 80 else f"{text[:77]}…"
 
 
-def _name(value: object) -> str:
+def _name(value: Any) -> str:
     return f"{value.__module__}.{value.__qualname__}"
 
 

@@ -365,7 +365,7 @@ class Results(Mapping):
     def from_json(told: Mapping[str, Any]) -> Results:
         """Return the results of which `to_json` made this."""
         own: dict[str, Any] = {f.name: told.get(f.name) for f in dataclasses.fields(Results)}
-        filters = {n: FilterResult.from_json(n, f) for n, f in told["filters"].items()}
-        medians_of = told.get("medians_of", told["runs"])  # not in earlier versions
-        time = np.array(told["time"], float)
-        return Results(**{**own, "filters": filters, "medians_of": medians_of, "time": time})
+        own["filters"] = {n: FilterResult.from_json(n, f) for n, f in told["filters"].items()}
+        own["medians_of"] = told.get("medians_of", told["runs"])  # not in earlier versions
+        own["time"] = np.array(told["time"], float)
+        return Results(**own)

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
@@ -189,33 +190,25 @@ class Study(Mapping):
         Its columns are called as in `consistency.json`, as `rmse_position`. Raises ValueError
         without pandas.
         """
-        try:
-            from pandas import DataFrame
-        except ImportError:
-            raise ValueError("to_dataframe needs pandas: pip install pandas") from None
-        rows = []
+        pandas, rows = _library("pandas"), []
         for name, told in self.to_json()["filters"].items():
             columns = dict(_series(told, self.scenario.steps))
             rows += [
                 {"filter": name, "time": time, **{key: x[i] for key, x in columns.items()}}
                 for i, time in enumerate(self.results.time)
             ]
-        return DataFrame(rows)
+        return pandas.DataFrame(rows)
 
     def to_xarray(self) -> Any:
         """Return the records of every filter, run and step as an `xarray.Dataset`.
 
         Of a study of sums they are those of the first chunk. Raises ValueError without xarray.
         """
-        try:
-            from xarray import Dataset
-        except ImportError:
-            raise ValueError("to_xarray needs xarray: pip install xarray") from None
-        records = [self.records(name) for name in self.filters]
+        xarray, records = _library("xarray"), [self.records(name) for name in self.filters]
         axes = ("filter", "run", "step", "axis")
         joined = {key: np.stack([x[key] for x in records]) for key in RECORDS}
         coords = {"filter": list(self.filters), "time": ("step", self.results.time)}
-        return Dataset({key: (axes[: x.ndim], x) for key, x in joined.items()}, coords)
+        return xarray.Dataset({key: (axes[: x.ndim], x) for key, x in joined.items()}, coords)
 
     def save(self, folder: str | Path) -> Path:
         """Write the study into a folder, whole or not at all; return its path.
@@ -288,6 +281,14 @@ class Study(Mapping):
         else:
             meant = suggestion(name, dir(type(self)))
         raise AttributeError(f"a Study has no attribute {name!r}{meant}")
+
+
+def _library(name: str) -> Any:
+    """A library that is no requirement. Raises ValueError without it."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise ValueError(f"this needs {name}: pip install {name}") from None
 
 
 def divided(runs: int, chunk: int) -> tuple[range, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
@@ -258,12 +259,12 @@ def run_verdict(
     return found | {"lost_runs": lost_runs(nees, dof, logged)}
 
 
-def not_disproved(found: Verdict) -> bool:
+def not_disproved(found: Mapping[str, Any]) -> bool:
     """Whether a verdict lets a filter be consistent, be that shown or not."""
     return found["word"] in ("consistent", "cannot tell")
 
 
-def sentences(found: Verdict, quantity: str = "NEES") -> list[str]:
+def sentences(found: Mapping[str, Any], quantity: str = "NEES") -> list[str]:
     """A verdict in words, and that at the last step; of the runs never lost, where some were.
 
     Where more than a few were, the others are chosen by their NEES: no verdict is said of them.
@@ -281,7 +282,7 @@ def sentences(found: Verdict, quantity: str = "NEES") -> list[str]:
     return told
 
 
-def _of_lost(found: Verdict, quantity: str) -> str:
+def _of_lost(found: Mapping[str, Any], quantity: str) -> str:
     """A sentence on the runs that were lost, and on the others."""
     kept, runs = found["never_lost"], found["runs"]
     lost = runs - kept["runs"]
@@ -307,7 +308,7 @@ _TOLD = 8
 """The most lost runs that are named."""
 
 
-def _of_whiteness(found: Verdict) -> list[str]:
+def _of_whiteness(found: Mapping[str, Any]) -> list[str]:
     if found["samples"] == "steps":
         return [f"innovations seem white (p = {found['white']:.2g}): every step is a sample"]
     if found["white"] is None:
@@ -318,7 +319,7 @@ def _of_whiteness(found: Verdict) -> list[str]:
     ]
 
 
-def headline(found: Verdict, quantity: str = "NEES") -> str:
+def headline(found: Mapping[str, Any], quantity: str = "NEES") -> str:
     """The verdict on all runs: `NEES 4.72, σ too small by 1.25 [1.24, 1.27]: over-confident`."""
     if found["nees"] is None:
         word = found["word"]
@@ -331,7 +332,7 @@ def headline(found: Verdict, quantity: str = "NEES") -> str:
     return f"{said}; about {found['enough']} {found.get('samples', 'runs')} would tell"
 
 
-def brief(found: Verdict) -> str:
+def brief(found: Mapping[str, Any]) -> str:
     """The word of a verdict with the factor of σ, for where there is little room."""
     if found["nees"] is None:
         return found["word"]
@@ -339,12 +340,12 @@ def brief(found: Verdict) -> str:
     return f"{found['word']}, σ × {factor} [{low}, {high}]"
 
 
-def _part(found: Verdict) -> str:
+def _part(found: Mapping[str, Any]) -> str:
     """The part that decided; older files, from before there were parts, have none."""
     return found.get("of", "all steps")
 
 
-def _said(found: Verdict, quantity: str) -> str:
+def _said(found: Mapping[str, Any], quantity: str) -> str:
     factors, word = [found["sigma_factor"], *found["interval99"]], found["word"]
     told = "right up to a factor" if word == "consistent" else "should be ×"
     if word == "over-confident":

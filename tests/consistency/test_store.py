@@ -266,17 +266,17 @@ def own_filter(function):
     class Mine(jaxslam.AbstractFilter):
         base: jaxslam.AbstractFilter
 
-        def init(self, *given):
-            return self.base.init(*given)
+        def init(self, capacity, first=None):
+            return self.base.init(capacity, first)
 
-        def step(self, *given):
-            return function(self.base.step(*given))
+        def step(self, state, control, seen, new):
+            return function(self.base.step(state, control, seen, new))
 
-        def marginal(self, *given):
-            return self.base.marginal(*given)
+        def marginal(self, state, function):
+            return self.base.marginal(state, function)
 
-        def landmark_marginal(self, *given):
-            return self.base.landmark_marginal(*given)
+        def landmark_marginal(self, state, function, slots):
+            return self.base.landmark_marginal(state, function, slots)
 
     return Mine(SLAM)
 
