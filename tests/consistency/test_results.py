@@ -202,8 +202,8 @@ def test_filters_are_made_of_words_and_what_they_cannot_be_is_said():
     assert list(made) == list(montecarlo._as_filters(WORLD, dict(made))) == [PAPER, BEST]
     for word in ("robocentric", PAPER):
         assert list(montecarlo._as_filters(WORLD, word)) == [PAPER]
-    wrong: Any
-    for wrong in ([], None, 3, [made[PAPER]]):
+    wrongs: list[Any] = [[], None, 3, [made[PAPER]]]
+    for wrong in wrongs:
         with pytest.raises(ValueError, match=r"a dict is accepted, .* or a list of words"):
             jaxslam.monte_carlo(WORLD, wrong)
     with pytest.raises(ValueError, match="mine is no AbstractFilter but str"):
