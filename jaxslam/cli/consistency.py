@@ -12,7 +12,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from jaxslam.consistency import FolderStore, Study, check_sizes, monte_carlo
 from jaxslam.consistency.backends import AUTO, check_backend
-from jaxslam.consistency.montecarlo import check_sizes, divided
+from jaxslam.consistency.montecarlo import CHUNK, Interruption
 from jaxslam.filters.words import FILTERS, MODIFIERS, make_filters
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.simulation import BUILT_IN, World, scenario

@@ -32,7 +32,7 @@ from jaxslam.consistency.store import NATIVE, MemoryStore, Records, Store
 from jaxslam.consistency.summary import Study, divided, treatment
 from jaxslam.consistency.sums import as_sums, keeps_records
 from jaxslam.filters.protocol import AbstractFilter
-from jaxslam.filters.registry import make_filters
+from jaxslam.filters.words import make_filters
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation import RecordedMotion, Room, Run, Scenario, as_scenario

@@ -28,7 +28,6 @@ from jaxslam.consistency.results import (
     ScaleDrift,
     Seconds,
     Summary,
-    UnknownFilterError,
     named,
 )
 from jaxslam.consistency.store import FolderStore, Records, Store
@@ -41,10 +40,10 @@ from jaxslam.consistency.sums import (
     survived,
     tally_of,
 )
+from jaxslam.consistency.table import as_html, as_text
 from jaxslam.filters.protocol import AbstractFilter
-from jaxslam.filters.registry import recommended_name
 from jaxslam.models.observations import Status
-from jaxslam.simulation import Scenario, motion_of, scenario
+from jaxslam.simulation import Scenario, scenario
 from jaxslam.statistics import Tally, lost_runs, mean_band
 from jaxslam.statistics.beyond_scale import SCALE, one_scale_of
 
@@ -94,7 +93,7 @@ class Study(Mapping):
     __eq__, __hash__ = object.__eq__, object.__hash__
 
     def __getitem__(self, name: str) -> FilterResult:
-        name = self._named(name)
+        name = named(name, self.filters)
         if name not in self._found:
             self._found[name] = _result(self, name)
         return self._found[name]
@@ -104,17 +103,6 @@ class Study(Mapping):
 
     def __len__(self) -> int:
         return len(self.filters)
-
-    def _named(self, name: str) -> str:
-        try:
-            return named(name, self.filters)
-        except UnknownFilterError:
-            base, slash, rest = str(name).partition("/")
-            word, plus, modifiers = base.partition("+")
-            if word != "recommended":
-                raise
-        meant = recommended_name(motion_of(self.scenario)) + plus + modifiers
-        return named(f"{meant}{slash}{rest}", self.filters)
 
     @cached_property
     def _found(self) -> dict[str, FilterResult]:
@@ -134,7 +122,7 @@ class Study(Mapping):
         steps = self.scenario.steps
         return Results(
             version=__version__,
-            scenario=dataclasses.asdict(self.scenario),
+            scenario=self.scenario.to_dict(),
             runs=self.runs,
             medians_of=sum(map(len, self.whole)),
             scale_free=self.scenario.scale_free,
@@ -337,29 +325,19 @@ def summarise(study: Study | Results) -> Summary:
     Medians are over the first `medians_of` runs, all but where a study keeps sums alone.
     Raises ValueError for what is no study.
     """
-    if not isinstance(study, Study):
-        raise ValueError(
-            f"a study is summarised, as monte_carlo gives it, not {type(study).__name__}"
-        )
-    from jaxslam._version import __version__
-
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
-        "scenario": study.scenario.to_dict(),
-        "runs": study.runs,
-        "medians_of": sum(map(len, study.whole)),
-        "scale_free": study.scenario.scale_free,
-        "steps": study.scenario.steps,
-        "seed": study.seed,
-        "dtype": study.dtype,
-        "device": study.device,
-        "time": [round((i + 1) / study.scenario.rate, 6) for i in range(study.scenario.steps)],
-        "filters": {name: _summarise_filter(study, name) for name in study.filters},
-    }
+    return results_of(study).to_json()
 
 
-def _summarise_filter(study: Study, name: str) -> Summary:
+def table(summary: Study | Results | Mapping[str, Any]) -> str:
+    """The verdict on every filter, then the numbers of the last step, one filter a line.
+
+    It is that of a `summary`, or of a study, which is summarised here. Raises ValueError for
+    anything else.
+    """
+    return as_text(results_of(summary))
+
+
+def _result(study: Study, name: str) -> FilterResult:
     geometry = study.scenario.geometry
     dof, n = geometry.tangent_dim, geometry.point_dim
     (sums, lost), medians = _sums_and_lost(study, name), _medians(study, name)

@@ -82,9 +82,9 @@ def _column(results: Results) -> Figure:
     return figure
 
 
-def _page(study: Study, summary: Summary) -> Figure:
+def _page(study: Study, results: Results) -> Figure:
     geometry = study.scenario.geometry
-    rows, free = geometry.tangent_dim // 3, summary["scale_free"]
+    rows, free = geometry.tangent_dim // 3, results.scale_free
     heights = [2.1, *[1.3] * free, *[1.1] * rows]
     figure = new_figure(12.5, 1.0 + 0.2 * len(study.filters) + 2.1 * sum(heights))
     # Over the whole width, as the verdicts are longer than the axes that they are on.
