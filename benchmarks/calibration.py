@@ -25,9 +25,10 @@ from benchmark import RESULTS, Benchmark, number, table, write_page
 import jaxslam
 from jaxslam.consistency import CHUNK, MemoryStore, Seconds, Study, check_sizes, filter_run
 from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.sensors import Pinhole
-from jaxslam.simulation import Room, Run, Scenario, Sightings, sensor_of, sightings, simulate
-from jaxslam.simulation.scenario import CALIBRATIONS, TRUE_CALIBRATIONS
+from jaxslam.simulation import Room, Run, Scenario, Sightings, sightings, simulate
+from jaxslam.simulation.world import CALIBRATIONS
 from jaxslam.statistics import mean_band, normalised_squared
 from jaxslam.statistics.verdict import LOST_BOUND
 
@@ -46,7 +47,7 @@ class CalibrationStudy(Benchmark):
     """Worlds: by default one in which the camera turns, and one in which it only moves sideways."""
     truths: tuple[str, ...] = ("white", "constant", "nominal")
     """How the true intrinsics come about."""
-    treatments: tuple[str, ...] = CALIBRATIONS
+    treatments: tuple[str, ...] = tuple(TREATMENTS)
     """What the filter makes of them."""
     filters: tuple[str, ...] = ("robocentric",)
     landmarks: tuple[str, ...] = ("inverse_scaling",)
@@ -57,8 +58,8 @@ class CalibrationStudy(Benchmark):
 
     def __post_init__(self) -> None:
         for kind, names, known in (
-            ("truths", self.truths, TRUE_CALIBRATIONS),
-            ("treatments", self.treatments, CALIBRATIONS),
+            ("truths", self.truths, tuple(CALIBRATIONS)),
+            ("treatments", self.treatments, tuple(TREATMENTS)),
         ):
             if not names or set(names) - set(known):
                 raise ValueError(f"{kind} must be some of {', '.join(known)}, not {names}")
@@ -120,7 +121,7 @@ def _measure(
             numbers["intrinsics"] = _intrinsics(intrinsics) if treatment == "estimated" else None
             results.setdefault(name, {})[treatment] = numbers
             seconds = time.perf_counter() - start
-            print(scenario.name, scenario.true_calibration, name, treatment, f"{seconds:.0f} s")
+            print(scenario.name, scenario.calibration.word, name, treatment, f"{seconds:.0f} s")
             print(json.dumps(numbers), flush=True)
     return results
 
@@ -129,7 +130,7 @@ def _run(
     name, slam, scenario, runs: list[Run], room: Room, options: CalibrationStudy
 ) -> tuple[Study, Mapping[str, np.ndarray]]:
     """The study of one filter, and the last error of its intrinsics with their covariance."""
-    store, chunks, sensor = MemoryStore(), _chunks(options.runs), sensor_of(scenario)
+    store, chunks, sensor = MemoryStore(), _chunks(options.runs), scenario.sensor
     assert isinstance(sensor, Pinhole)
     intrinsics = []
     for part, chunk in zip(chunks, runs, strict=True):
@@ -149,7 +150,8 @@ def _batch(slam: AbstractFilter, room: Room, sensor: Pinhole, runs: Run):
     def one(run: Run):
         records, _, state = filter_run(slam, room, sensor, run)
         estimate, covariance = slam.marginal(state, lambda view: view.core.calibration)
-        true = jax.tree.map(lambda x: x[-1], run.cameras).intrinsics
+        assert isinstance(run.sensors, Pinhole)
+        true = jax.tree.map(lambda x: x[-1], run.sensors.camera).intrinsics
         error = true - sensor.camera.intrinsics
         if estimate.size:  # a known calibration has no estimate
             error = error - estimate

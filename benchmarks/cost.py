@@ -21,7 +21,7 @@ from benchmark import RESULTS, Benchmark
 
 import jaxslam
 from jaxslam.consistency import draw, filter_run
-from jaxslam.simulation import Room, sensor_of
+from jaxslam.simulation import Room
 
 
 @eqx.filter_jit
@@ -57,7 +57,7 @@ class Cost(Benchmark):
     def measure(self) -> Iterator[dict[str, Any]]:
         scenario = jaxslam.scenario(self.scenario)
         room, runs = draw(scenario, self.batch)
-        sensor = sensor_of(scenario)
+        sensor = scenario.sensor
 
         compiled, compile_seconds = {}, {}
         for name in self.filters:

@@ -27,7 +27,6 @@ from modes_figure import plot_modes, worlds_of
 
 import jaxslam
 from jaxslam.consistency import draw, filter_run
-from jaxslam.simulation import sensor_of
 from jaxslam.statistics.verdict import headline
 
 STEPS = (1, 3, 10, 60)
@@ -183,7 +182,7 @@ def draw_figure(options: FromRest) -> None:
         run = jax.tree.map(lambda x: x[TOLD["run"]], runs)
         made = jaxslam.make_filters(scenario, [SUM, EKF], ["inverse_scaling"])
         rest, ekf = (jaxslam.cast(slam, jnp.float64) for slam in made.values())
-        _, path, _ = eqx.filter_jit(filter_run)(ekf, room, sensor_of(scenario), run)
+        _, path, _ = eqx.filter_jit(filter_run)(ekf, room, scenario.sensor, run)
         modes = modes_of_run(rest, room, run)
     worlds = worlds_of(run, modes, path.translation(), "the EKF", scenario.rate)
     plot_modes(worlds, path=options.docs / "from-rest.png")

@@ -190,7 +190,7 @@ def beside(
     """Records of a filter on the same runs, beside parameters of the drawn T_BC, axes run, draw."""
     (slam,) = jaxslam.make_filters(study.scenario, [name], ["inverse_scaling"]).values()
     runs = draw_runs(study, options.seed, indices)
-    T_BC = study.scenario.world.group(jnp.asarray(poses))
+    T_BC = study.scenario.geometry.group(jnp.asarray(poses))
     found = against_filter(study, slam, runs, T_BC, gaussian_sum)
     found = finished(found, f"{name} beside the posterior of runs {indices}")
     return {key: np.asarray(value) for key, value in found.items()}

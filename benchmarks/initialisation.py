@@ -22,12 +22,12 @@ import numpy as np
 from benchmark import RESULTS, Benchmark, number, table
 
 import jaxslam
-from jaxslam._numerics.linalg import cholesky
 from jaxslam.consistency.montecarlo import draw
-from jaxslam.filters.slam import Slam
 from jaxslam.filters.readouts import camera_pose, landmarks_in_camera
+from jaxslam.filters.slam import Slam
+from jaxslam.linalg import cholesky
 from jaxslam.models.sensors import AbstractSensor
-from jaxslam.simulation import Room, Run, features, sensor_of
+from jaxslam.simulation import Room, Run, features
 from jaxslam.statistics.bands import lost_threshold, normalised_squared
 
 NEAR = {"inverse_depth": (1.1, 0.45), "least_inverse_depth": 0.225, "velocity": (0.4, 0.0, 0.0)}
@@ -83,7 +83,7 @@ def measured(world: str, options: Initialisation) -> Iterator[tuple[str, dict]]:
     base, fields = ("matched", {**NEAR, **fields}) if world == "near" else (world, fields)
     scenario = jaxslam.scenario(base, fields)
     room, runs = draw(scenario, options.runs, seed=options.seed)
-    sensor, reference = sensor_of(scenario), None
+    sensor, reference = scenario.sensor, None
     for pair in options.filters:
         name, landmark = pair.split("/")
         slam = jaxslam.make_filters(scenario, [name], [landmark])[pair]

@@ -29,8 +29,7 @@ from jaxslam.filters.words import FILTERS
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.native import difference
 from jaxslam.native.batch import Batch
-from jaxslam.simulation import sensor_of
-from jaxslam.simulation.scenario import BUILT_IN
+from jaxslam.simulation import BUILT_IN
 
 ALONE = ("handheld", "room")
 """Scenarios that need a recording."""
@@ -85,7 +84,7 @@ class Native(Benchmark):
             room, runs = draw(world, self.runs)
         except ValueError as error:
             return {"outcome": "no such filter", "why": str(error)[:200]}
-        pieces = cast(slam, "float64"), room, cast(sensor_of(world), "float64"), runs
+        pieces = cast(slam, "float64"), room, cast(world.sensor, "float64"), runs
         with again() as counted:
             try:
                 records, _ = backends.by_native(*pieces)(np.int32(self.runs))

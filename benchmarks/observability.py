@@ -89,7 +89,7 @@ def _measure(name: str, scenario_name: str, options: Observability) -> dict[str,
 def _along(study: Study, name: str) -> dict[str, float]:
     """Median over the runs of the last step's |error| and σ along the nominal direction of
     motion, m: with a single camera both are those of the scale."""
-    axis = int(np.argmax(np.abs(study.scenario.velocity[: study.scenario.world.point_dim])))
+    axis = int(np.argmax(np.abs(study.scenario.velocity[: study.scenario.geometry.point_dim])))
     records = [study.store.load(name, chunk, ("error", "variance")) for chunk in study.chunks]
     error, variance = (
         np.concatenate([record[key][:, -1, axis] for record in records])

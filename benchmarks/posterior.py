@@ -120,7 +120,7 @@ def _store(study: Study, options: ExactPosterior) -> FolderStore | MemoryStore:
     if options.cache is None:
         return MemoryStore()
     manifest = {
-        "scenario": dataclasses.asdict(study.scenario),
+        "scenario": study.scenario.to_dict(),
         "steps": study.steps,
         "hmc": dataclasses.asdict(study.hmc),
         "starts": study.starts,
@@ -155,7 +155,9 @@ def _filter(
         runs = draw_runs(study, options.seed, padded)
         draws = reference["exact_T_BC"][chunk.start : chunk.stop]
         draws = np.concatenate([draws, draws[: len(padded) - len(chunk)]])
-        records = against_filter(study, slam, runs, study.scenario.world.group(jnp.asarray(draws)))
+        records = against_filter(
+            study, slam, runs, study.scenario.geometry.group(jnp.asarray(draws))
+        )
         parts.append({k: np.asarray(v)[: len(chunk)] for k, v in records.items()})
     return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 

@@ -103,7 +103,7 @@ class Comparisons(Benchmark):
         """`{scenario: {"filters": {"filter/landmarks": numbers}, …}}`, after every filter."""
         results = self.found()
         for theirs in (t for t in TABLES if t.scenario in self.scenarios):
-            dof = jaxslam.scenario(theirs.scenario).world.tangent_dim
+            dof = jaxslam.scenario(theirs.scenario).geometry.tangent_dim
             kept = results.get(theirs.scenario, {}).get("filters", {}) if self.filters else {}
             results[theirs.scenario] = {
                 "seed": self.seed,
@@ -139,7 +139,7 @@ def _measure(theirs: Published, name: str, options: Comparisons) -> dict[str, An
     error = np.concatenate([record["error"] for record in records])
     return _compared(theirs, nees, theirs.nees[name]) | {
         "runs": options.runs,
-        "rmse": _rmse(error, scenario.world.point_dim),
+        "rmse": _rmse(error, scenario.geometry.point_dim),
         "published_rmse": theirs.rmse.get(name),
         "diverged": int(np.sum(~np.isfinite(nees).all(axis=1))),
         "seconds_per_run": round(study.seconds[name].run / options.runs, 4),

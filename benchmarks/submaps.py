@@ -102,12 +102,12 @@ def page(results: dict[str, Any]) -> str:
 def measured(options: Submaps, name: str) -> dict[str, Any]:
     """The numbers of one scenario."""
     scenario = jaxslam.scenario(name, {"steps": options.steps} if options.steps else {})
-    word = "robocentric+oc" if scenario.motion == "odometry" else FILTER
+    word = "robocentric+oc" if scenario.reads else FILTER
     (slam,) = jaxslam.make_filters(scenario, [word], ["inverse_scaling"]).values()
     found, size = [], min(options.chunk, options.runs)
     for start in range(0, options.runs, size):
         found += of_chunk(options, scenario, slam, range(start, min(start + size, options.runs)))
-    return {"filter": word, **averages(found, scenario.world.tangent_dim)}
+    return {"filter": word, **averages(found, scenario.geometry.tangent_dim)}
 
 
 def averages(found: list[dict[str, Any]], t: int) -> dict[str, Any]:
@@ -228,7 +228,7 @@ def of_run(options, scenario, slam, run: Run, state, told: Filtered, index: int)
     positions = np.asarray(truth.translation())[mine]
     for name, of in (("before", nothing), ("closed", closed)):
         poses, *scales = jax.tree.map(lambda x: np.asarray(x)[mine], _judged(of, truth))
-        nees = one_scale(*scales).nees / scenario.world.tangent_dim
+        nees = one_scale(*scales).nees / scenario.geometry.tangent_dim
         row[f"nees_{name}"] = float(nees[-1])
         row[f"old_{name}"] = float(nees[:-1].mean())
         row[f"rmse_{name}"] = _rmse(poses, positions)

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from jaxslam._runtime.files import LARGEST, read_arrays
 from jaxslam.io.tum import read_tum
 from jaxslam.models.camera import Camera
+from jaxslam.models.sensors import Pinhole
 from jaxslam.simulation import Run
 
 MOVING = 1
@@ -113,8 +114,9 @@ def window(
     """Frames `start` to `start + steps` as a run whose base B is the camera of its first frame.
 
     It has at most so many tracks at a time, spread over the picture; where one ends, another takes
-    its slot. Tracks known to be `moving` are left out unless they are asked for. Where the points
-    are is not known: NaN. Raises ValueError for a window that is not in the drive.
+    its slot. Tracks known to be `moving` are left out unless they are asked for. What is not known,
+    where points are and the σ of a pixel, is NaN. Raises ValueError for a window that is not in
+    the drive.
     """
     if steps < 1 or start < 0 or start + steps >= data.frames or landmarks < 1:
         raise ValueError(
@@ -124,13 +126,17 @@ def window(
     frames = slice(start, start + steps + 1)
     measured, visible, new = _in_slots(_observations(data, frames, moving), landmarks)
     T_BC = np.linalg.inv(data.poses[start]) @ data.poses[frames]
+
+    def every(x):
+        return jnp.broadcast_to(x, (steps + 1, *np.shape(x)))
+
     return Run(
         poses=jaxlie.SE3.from_matrix(jnp.asarray(T_BC)),
         points=jnp.full((*visible.shape, 3), jnp.nan),
         measured=jnp.asarray(measured),
         visible=jnp.asarray(visible),
         controls=jnp.asarray(np.diff(data.times[frames])),
-        cameras=jax.tree.map(lambda x: jnp.tile(x, (steps + 1, 1)), data.camera),
+        sensors=jax.tree.map(every, Pinhole(data.camera, np.nan)),
         new=jnp.asarray(new),
     )
 

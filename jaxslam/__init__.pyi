@@ -54,7 +54,17 @@ from jaxslam.models.motion import AbstractMotion, ConstantVelocity, Odometry
 from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap, Status
 from jaxslam.models.scale import AbstractScale, Metre, ScaleGauge
 from jaxslam.models.sensors import AbstractSensor, Pinhole, Position, RangeBearing
-from jaxslam.simulation import Scenario, scenario, simulate
+from jaxslam.simulation import (
+    AbstractPlacement,
+    FromPrior,
+    GivenPoints,
+    Rays,
+    Ring,
+    Scenario,
+    World,
+    scenario,
+    simulate,
+)
 from jaxslam.statistics import mean_band
 from jaxslam.tracking.settings import TrackerSettings as TrackerSettings
 from jaxslam.tracking.tracker import Tracker as Tracker
@@ -70,6 +80,7 @@ __all__ = [
     "AbstractFrame",
     "AbstractLandmark",
     "AbstractMotion",
+    "AbstractPlacement",
     "AbstractScale",
     "AbstractSensor",
     "AbstractStaged",
@@ -88,8 +99,10 @@ __all__ = [
     "FirstEstimates",
     "FramedHomogeneous",
     "Frames",
+    "FromPrior",
     "FromWindow",
     "Gate",
+    "GivenPoints",
     "ImagePlane",
     "Innovation",
     "Invariant",
@@ -110,6 +123,8 @@ __all__ = [
     "PriorMap",
     "RandomWalk",
     "RangeBearing",
+    "Rays",
+    "Ring",
     "Robocentric",
     "ScaleGauge",
     "Scenario",
@@ -121,6 +136,7 @@ __all__ = [
     "UnifiedInverseDepth",
     "UnitHomogeneous",
     "White",
+    "World",
     "WorldCentric",
     "__version__",
     "camera_pose",

@@ -32,7 +32,7 @@ from scipy.stats import binomtest
 import jaxslam
 from jaxslam.consistency import filter_run
 from jaxslam.plots import COLOURS, GREY, draw_ellipses, new_figure
-from jaxslam.simulation import Room, sensor_of, sightings, simulate
+from jaxslam.simulation import Room, sightings, simulate
 from jaxslam.statistics import chi2_quantile
 
 REDUCED = bool(os.environ.get("JAXSLAM_REDUCED"))
@@ -67,7 +67,7 @@ def one_run(steps, seed=1):
 
             @jax.jit
             def finished(run, key):
-                _, path, state = filter_run(slam, room, sensor_of(scenario), run)
+                _, path, state = filter_run(slam, room, scenario.sensor, run)
                 points = jaxslam.landmarks_in_world(slam, state, slots)
                 draws = jaxslam.landmark_samples(slam, state, slots, key, 2000)
                 return path.translation(), points, draws

@@ -35,7 +35,6 @@ from scipy.optimize import least_squares
 
 import jaxslam
 from jaxslam.consistency import draw
-from jaxslam.simulation import sensor_of
 from jaxslam.statistics import lost_threshold
 
 sys.path.append("../benchmarks")  # of the repository, beside this folder
@@ -60,7 +59,7 @@ ekf, rest = (jaxslam.cast(slam, jnp.float64) for slam in made.values())
 # $(t, X) \to -(t, X)$, with the same orientations. No pixel changes.
 
 # %%
-sensor = sensor_of(scenario)
+sensor = scenario.sensor
 translations = np.asarray(run.poses.translation())
 rotations = np.asarray(run.poses.rotation().as_matrix())
 points = np.asarray(run.points)

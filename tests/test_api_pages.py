@@ -12,7 +12,9 @@ from pathlib import Path
 import jaxslam
 
 ROOT = Path(__file__).parents[1]
-ROOMS = ("consistency", "evaluation", "simulation", "landmarks", "tracking", "triangulation")
+ROOMS = (
+    "consistency", "evaluation", "simulation", "landmarks", "linalg", "tracking", "triangulation"
+)  # fmt: skip
 """Those that say what they export."""
 NO_SHAPE = re.compile(r"\bArrayLike\b|\bArray$|ndarray'?>?$")
 """Annotations of arrays that do not say of which shape."""

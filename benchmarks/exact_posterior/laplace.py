@@ -18,9 +18,9 @@ from exact_posterior.problem import (
     size,
     unknowns,
 )
-from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.window.problem import PathLayout
 from jaxslam.geometry import Pose, difference
+from jaxslam.linalg import cholesky
 
 SOLVER = levenberg_marquardt(1e-9)
 MOST_STEPS = 200

@@ -7,7 +7,7 @@ import optimistix
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from jaxslam._numerics.linalg import Cholesky, cholesky
+from jaxslam.linalg import Cholesky, cholesky
 
 
 class NormalCholesky(lineax.AbstractLinearSolver):

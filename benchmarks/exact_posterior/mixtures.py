@@ -17,13 +17,13 @@ from jax.scipy.special import digamma, gammaln, logsumexp
 from jaxtyping import Array, Float, Int
 
 from exact_posterior.moments import covariance, mean_pose, pose_moments
-from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.mixture.density import log_density
+from jaxslam.filters.mixture.mixture import GaussianSum
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.filters.window.start import BatchInitialisation
-from jaxslam.filters.mixture.mixture import GaussianSum
 from jaxslam.geometry import Pose, difference
+from jaxslam.linalg import cholesky
 
 NEIGHBOUR = 8
 """Whose distance the entropy is estimated by; more than the copies that draws may have."""

@@ -9,8 +9,8 @@ from jaxtyping import Array, Bool, Float
 
 from exact_posterior.mixtures import PoseMixture
 from exact_posterior.moments import covariance
-from jaxslam._numerics.linalg import cholesky, eigh
 from jaxslam.geometry import Pose
+from jaxslam.linalg import cholesky, eigh
 
 LEAST_SHARE = 0.05
 """Of the draws, that make a mode one to speak of."""

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam._numerics.linalg import cholesky
 from jaxslam.geometry import Pose, difference, retract
+from jaxslam.linalg import cholesky
 
 MEAN_ITERATIONS = 4
 

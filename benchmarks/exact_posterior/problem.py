@@ -31,7 +31,7 @@ from jaxslam.filters.window import problem as window
 from jaxslam.filters.window.problem import Path, PathLayout
 from jaxslam.filters.window.record import Record, whole
 from jaxslam.geometry import Pose
-from jaxslam.simulation import Run, Scenario, depth_of, motion_of, sensor_of
+from jaxslam.simulation import Run, Scenario
 
 
 class Problem(eqx.Module):
@@ -78,12 +78,14 @@ def check_scenario(scenario: Scenario) -> None:
         "first_frame": 0,
         "first_landmarks": 0,
         "known_landmarks": 0,
+        "beacons": 0,
     }
+    found = scenario.fields
     for field, value in wanted.items():
-        if getattr(scenario, field) != value:
+        if found[field] != value:
             raise ValueError(
                 f"the exact posterior needs a scenario whose {field} is {value!r}, as in matched; "
-                f"{scenario.name} has {getattr(scenario, field)!r}"
+                f"{scenario.name} has {found[field]!r}"
             )
     for (low, high), size in zip(scenario.first_pixels, scenario.image, strict=True):
         if low < 0 or high > size:
@@ -115,7 +117,7 @@ def make_problem(scenario: Scenario, run: Run, *, truncated: bool = True) -> Pro
     another kind.
     """
     check_scenario(scenario)
-    slam = Slam(motion=motion_of(scenario), sensor=sensor_of(scenario), depth=depth_of(scenario))
+    slam = Slam(motion=scenario.motion, sensor=scenario.sensor, depth=scenario.depth)
     record = whole(run.controls, run.measured, run.visible, jnp.zeros(run.visible.shape[1], int))
     least = jnp.asarray(scenario.least_inverse_depth if truncated else -jnp.inf)
     return Problem(cast(slam, run.measured.dtype), record, least)

@@ -43,7 +43,7 @@ from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.geometry import Pose, difference, log
 from jaxslam.models.sensors import AbstractSensor
-from jaxslam.simulation import Room, Run, Scenario, as_data, sensor_of, simulate
+from jaxslam.simulation import Room, Run, Scenario, as_data, simulate
 from jaxslam.statistics.bands import normalised_squared
 
 Records = dict[str, Array]
@@ -247,7 +247,7 @@ def against_filter(
     comparison: Comparison = one_gaussian,
 ) -> Records:
     """A filter on the same runs, beside draws of the exact posterior: T_BC, axes run and draw."""
-    slam, sensor = cast((slam, sensor_of(study.scenario)), runs.measured.dtype)
+    slam, sensor = cast((slam, study.scenario.sensor), runs.measured.dtype)
     landmarks = study.scenario.landmarks
     room = Room(landmarks, landmarks, landmarks, 1)
     return _compared(comparison, room, slam, sensor, runs, exact)

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from blackjax.smc.resampling import systematic
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam._numerics.linalg import Cholesky, cholesky
+from jaxslam.linalg import Cholesky, cholesky
 
 LogLikelihood = Callable[[Float[Array, " n"]], Float[Array, ""]]
 

@@ -3,6 +3,9 @@
 In a batch `lax.cond` computes both sides for every member, and a `lax.while_loop` goes on for all
 until the last has ended. Here those that want it are gathered from the whole batch and computed in
 blocks, so that the work is that of those who want it.
+
+A loop whose end is known only when it runs has no reverse mode. Where one differentiates, in either
+mode, works and steps are therefore counted out, and those that nobody wants are of no effect.
 """
 
 from __future__ import annotations
@@ -96,6 +99,21 @@ def at_places(
         arrays, given = shared
         return eqx.combine(arrays, static)(*rows, given)
 
+    def each(values, sources, places, wanted, shared):
+        @jax.checkpoint
+        def one(work):
+            place, wanted = work
+            rows = jax.tree.map(lambda x: x[place], (values, sources))
+            return _where(wanted, call, rows[0], rows, shared)
+
+        after = jax.lax.map(one, (places, wanted))
+        due = jnp.where(wanted[:, None], places, jnp.iinfo(places.dtype).max)
+        return jax.tree.map(lambda x, new: x.at[due].set(new, mode="drop"), values, after)
+
+    @jax.custom_jvp
+    def done(*data):
+        return work(*data)
+
     @custom_vmap
     def work(values, sources, places, wanted, shared):
         first = jnp.argsort(~wanted) if wanted.size > 1 else jnp.zeros(1, int)
@@ -116,7 +134,49 @@ def at_places(
         after = _in_blocks(call, *spread, data[-1], batched[-1])
         return after, jax.tree.map(lambda _: True, after)
 
-    return work(values, sources, places, wanted, (arrays, given))
+    done.defjvp(partial(jax.jvp, each))
+    return done(values, sources, places, wanted, (arrays, given))
+
+
+def while_loop(
+    going: Callable[[Value], Bool[Array, ""]],
+    once: Callable[[Value], Value],
+    start: Value,
+    most: int,
+) -> Value:
+    """`lax.while_loop` of at most so many steps, with derivatives in both modes."""
+    closed = [eqx.filter_closure_convert(function, start) for function in (going, once)]
+    arrays, static = eqx.partition(closed, eqx.is_array)
+
+    def call(which, arrays, value):
+        return eqx.combine(arrays, static)[which](value)
+
+    def counted(arrays, value):
+        @jax.checkpoint
+        def step(value, _):
+            return _where(call(0, arrays, value), partial(call, 1), value, arrays, value), None
+
+        return jax.lax.scan(step, value, length=most)[0]
+
+    @jax.custom_jvp
+    def last(arrays, value):
+        return jax.lax.while_loop(partial(call, 0, arrays), partial(call, 1, arrays), value)
+
+    last.defjvp(partial(jax.jvp, counted))
+    return last(arrays, start)
+
+
+def _where(wanted: Bool[Array, ""], function: Callable[..., Value], value: Value, *given) -> Value:
+    """`function(*given)` if it is wanted, else the value: both are computed, as in a batch.
+
+    The function's derivative may be NaN where it is not wanted: there it is of nothing.
+    """
+
+    def chosen(x, other):
+        return jnp.where(wanted, x, other)
+
+    held = jax.tree.map(lambda x: chosen(x, jnp.zeros_like(x)), given)
+    return jax.tree.map(chosen, function(*held), value)
 
 
 def _with_rows(places: tuple[Int[Array, ""], ...], x: Array, rows: Array) -> Array:

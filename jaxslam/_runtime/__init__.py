@@ -16,3 +16,11 @@ def exported(room: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
         return getattr(import_module(f"{room}.{modules[name]}"), name)
 
     return attribute
+
+
+def plotted(name: str) -> Callable[..., Any]:
+    """Return a function of `jaxslam.plots`, for an object that draws itself.
+
+    Figures are made above what they show, so that matplotlib is imported with the first one.
+    """
+    return getattr(import_module("jaxslam.plots"), name)

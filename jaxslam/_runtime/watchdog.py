@@ -61,7 +61,7 @@ def finished(values: Values, where: str, patience: float = DEADLOCK_SECONDS) -> 
             raise DeadlockError(
                 f"{where} stands still: no thread has worked for {idle:.0f} s. Batched LAPACK "
                 "calls do this on few processors: where they are in code of your own, use "
-                "jaxslam._numerics.linalg, or set NPROC=8 in the environment"
+                "jaxslam.linalg, or set NPROC=8 in the environment"
             )
     return values
 

@@ -10,14 +10,13 @@ from typing import Annotated
 import tyro
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from jaxslam._runtime.files import write_json
-from jaxslam._runtime.progress import StudyBar
-from jaxslam.consistency import CHUNK, FolderStore, Study, monte_carlo, summarise, table
+from jaxslam.consistency import FolderStore, Study, check_sizes, monte_carlo
 from jaxslam.consistency.backends import AUTO, check_backend
-from jaxslam.consistency.montecarlo import check_sizes, divided
+from jaxslam.consistency.montecarlo import CHUNK, Interruption
 from jaxslam.filters.words import FILTERS, MODIFIERS, make_filters
 from jaxslam.landmarks import LANDMARKS
-from jaxslam.simulation.scenario import BUILT_IN, Scenario, parse_override, scenario
+from jaxslam.simulation import BUILT_IN, World, scenario
+from jaxslam.simulation.scenario import parse_override
 
 
 @dataclass(frozen=True)
@@ -55,8 +54,9 @@ class ConsistencyOptions:
     """Run i draws from this seed and i alone."""
     dtype: str = "float64"
     """Precision: float64 or float32."""
-    chunk: int = CHUNK
-    """Runs that are computed and kept together; memory grows with it, results do not."""
+    chunk: int | None = None
+    """Runs that are computed and kept together; memory grows with it, results do not. By default
+    so many that every processor has several chunks, 100 at the most."""
     backend: str = AUTO
     """What computes: xla, native (a program in C++, for which there has to be a compiler), or auto:
     native where a study is long enough, and with --resume what computed before."""
@@ -79,33 +79,24 @@ class ConsistencyOptions:
 
     def run(self) -> None:
         """Run the study, print its table, write its files."""
-        from jaxslam.plots.consistency import plot_consistency
-
         study = self.study()
-        summary = summarise(study)
-        write_json(self.out / "consistency.json", summary, allow_nan=False)
-        plot_consistency(study, summary, self.out / "consistency.png")
+        study.save(self.out)
+        study.plot(self.out / "consistency.png")
         if self.pdf:
-            plot_consistency(study, summary, self.out / "consistency.pdf", column=True)
-        print(table(summary))
+            study.plot(self.out / "consistency.pdf", column=True)
+        print(study.table())
         print(f"wrote {self.out / 'consistency.json'} and {self.out / 'consistency.png'}")
 
-    def study(self, world: Scenario | None = None) -> Study:
+    def study(self, world: World | None = None) -> Study:
         """Run the study, of another world than the options name where one is given."""
-        check_sizes(self.runs, self.seed, self.dtype, self.chunk)
+        check_sizes(self.runs, self.seed, self.dtype, CHUNK if self.chunk is None else self.chunk)
         check_backend(self.backend)
         world = self._scenario() if world is None else world
         filters = make_filters(world, self.filters, self.landmarks, self.calibration)
         store = FolderStore(self.out / "runs", resume=self.resume)
-        total = self.runs * len(filters)
-
-        def kept() -> int:
-            chunks = divided(self.runs, self.chunk)
-            return sum(len(c) for name in filters for c in chunks if store.has(name, c))
-
         log = logging.getLogger("jaxslam")
         log.setLevel(logging.INFO)
-        with StudyBar(total, kept()) as progress, logging_redirect_tqdm([log]):
+        with logging_redirect_tqdm([log]):
             try:
                 return monte_carlo(
                     world,
@@ -116,17 +107,16 @@ class ConsistencyOptions:
                     chunk=self.chunk,
                     backend=self.backend,
                     store=store,
-                    progress=progress,
+                    progress=True,
                     cluster=self.cluster,
                     reduced=self.reduce,
                 )
-            except KeyboardInterrupt:
-                told = f"{kept()} of {total} runs are kept in {self.out}"
-                again = "" if self.resume else " with --resume"
-                told += f"; the same command{again} goes on from there"
+            except Interruption as end:
+                again = "the same command" + ("" if self.resume else " with --resume")
+                told = end.told(f"{self.out}", f"{again} goes on from there", "a smaller --chunk")
                 raise KeyboardInterrupt(told) from None
 
-    def _scenario(self) -> Scenario:
+    def _scenario(self) -> World:
         overrides: dict[str, object] = dict(parse_override(text) for text in self.set)
         if self.steps is not None:
             overrides["steps"] = self.steps

@@ -54,7 +54,7 @@ def _warn_of_lapack(jaxpr: Jaxpr, args: tuple[PyTree, ...]) -> None:
     if calls := lapack_calls(jaxpr):
         warnings.warn(
             f"{type(args[0]).__name__} calls LAPACK in a batch ({', '.join(sorted(calls))}), "
-            "which can stand still on few processors: jaxslam._numerics.linalg has what does not",
+            "which can stand still on few processors: jaxslam.linalg has what does not",
             stacklevel=2,
         )
 

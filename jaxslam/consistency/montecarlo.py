@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+import warnings
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
 from functools import partial
 from numbers import Integral
 from typing import Any, NamedTuple, TypeVar
@@ -19,22 +21,30 @@ import jax
 import numpy as np
 
 from jaxslam._numerics.arrays import cast
+from jaxslam._runtime.progress import StudyBar
 from jaxslam._runtime.watchdog import finished
 from jaxslam.consistency.backends import AUTO, BACKENDS, BatchProgram, check_backend, chosen
 from jaxslam.consistency.cluster import connected, on_cluster
-from jaxslam.consistency.manifest import described
+from jaxslam.consistency.manifest import described, unseen
+from jaxslam.consistency.results import Seconds
 from jaxslam.consistency.simulator import MapChunks, Simulator
 from jaxslam.consistency.store import NATIVE, MemoryStore, Records, Store
-from jaxslam.consistency.summary import Seconds, Study
+from jaxslam.consistency.summary import Study, divided, treatment
 from jaxslam.consistency.sums import as_sums, keeps_records
 from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.words import make_filters
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation import RecordedMotion, Room, Run, Scenario, as_scenario
 
 DTYPES = ("float64", "float32")
 CHUNK = 100
-"""The runs that are drawn, handed out and kept together."""
+"""The most runs that are drawn, handed out and kept together where no chunk is given."""
+LEAST_CHUNK = 12
+"""The fewest of them: a batch of fewer runs costs twice as much a run, or more."""
+CHUNKS = 4
+"""The chunks of every processor, down to `LEAST_CHUNK` runs: the time left is known from the first,
+and processors end at about the same time."""
 MOST_RUNS = 10**8
 """The most runs of a study."""
 Result = TypeVar("Result")
@@ -42,15 +52,15 @@ Result = TypeVar("Result")
 
 def monte_carlo(
     scenario: Scenario | str,
-    filters: Mapping[str, AbstractFilter],
+    filters: Mapping[str, AbstractFilter] | str | Iterable[str],
     *,
     runs: int = 1000,
     seed: int = 0,
     dtype: str = "float64",
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     backend: str = AUTO,
     store: Store | None = None,
-    progress: Callable[[str, int], None] = lambda name, done: None,
+    progress: Callable[[str, int], None] | bool = False,
     motion: AbstractMotion | RecordedMotion | None = None,
     sensor: AbstractSensor | None = None,
     cluster: Any = None,
@@ -60,63 +70,161 @@ def monte_carlo(
 
     The runs are the scenario's, which may be given by name; with a `motion` (or a `RecordedMotion`)
     or a `sensor` of one's own the truth moves, or is measured, as that says, in the scenario's
-    world.
+    world. Filters are given by name, as `make_filters` returns them; a list of words makes those of
+    the scenario, as `robocentric`, which has Inverse Scaling, or `robocentric/inverse_depth`. One
+    filter has one set of numbers; several that differ in numbers alone share a program.
 
-    `progress(filter name, finished runs)` is called after every chunk, and with no runs twice: when
-    the filter is to be compiled, and when it is (not with a `cluster`). An interruption is raised
-    at once, and leaves in `store` the chunks that are finished. Chunks that `store` already has are
-    not run again; it is given what decides them, and refuses what differs.
+    With `progress=True` a bar shows how far it is. Or `progress(filter name, finished runs)` is
+    called after every chunk, and with no runs twice: when the filter is to be compiled, and when it
+    is (not with a `cluster`). An `Interruption` is raised at once, and leaves in `store` the chunks
+    that are finished. Chunks that `store` already has are not run again; it is given what decides
+    them, and refuses what differs. A `chunk` is the runs that are computed and kept together: by
+    default those of the store, or so many that every processor has several, `CHUNK` at the most.
 
     With a `cluster`, the address of a Dask scheduler or a `distributed.Client`, the chunks are
     computed there and kept here; their seconds are of all together, compilation among them.
 
     With the `backend` "native" filters are compiled by the system's C++ compiler
-    (`jaxslam.native`), to the same numbers but for rounding; where that cannot be, a warning says
+    (`jaxslam.native`), to the same numbers but for rounding; if that is impossible, a warning says
     why, and XLA ("xla") computes them. "auto" takes it where that is worth it (`backends.chosen`),
-    on a cluster never. Records that a store has are gone on with by the backend that made them.
+    on a cluster never. A resumed study keeps its backend.
 
     A `reduced` study keeps of every chunk but the first only sums over its runs, made where the
     chunk is computed: all of a summary but the medians, which are then the first chunk's.
 
     Raises ValueError for sizes that make no sense, and for a store of another study.
     """
-    if not filters or not isinstance(filters, Mapping):
-        raise ValueError("no filters by name: a dict is accepted, as make_filters gives it")
-    check_sizes(runs, seed, dtype, chunk)
+    check_sizes(runs, seed, dtype, CHUNK if chunk is None else chunk)
     check_backend(backend)
     scenario = as_scenario(scenario)
-    store = MemoryStore() if store is None else store
-    chunks = divided(runs, chunk)
-    seconds = {}
+    filters = _as_filters(scenario, filters)
+    kept_in, store = store, MemoryStore() if store is None else store
     with jax.enable_x64(dtype == "float64"), connected(cluster) as client:
         map_chunks = in_threads if client is None else partial(on_cluster, client)
+        chunk = _chunk(runs, store, client) if chunk is None else chunk
+        chunks = divided(runs, chunk)
         simulator = Simulator(scenario, seed, dtype, min(chunk, runs), motion, sensor)
         made_by = {**simulator.made_by, "chunk": int(chunk), "reduced": reduced}
-        store.begin(made_by, {name: described(slam) for name, slam in filters.items()})
+        descriptions = {name: described(slam) for name, slam in filters.items()}
+        store.begin(made_by, descriptions)
+        if kept_in is not None and (hidden := unseen([made_by, descriptions])):
+            warnings.warn(
+                f"not seen: {', '.join(sorted(hidden))}; a study that is resumed does not notice "
+                "when the code behind changes",
+                stacklevel=2,
+            )
         missing = {name: [c for c in chunks if not store.has(name, c)] for name in filters}
         kept = {name: _kept_by(name, chunks, store, backend) for name in filters}
-        room = simulator.room(chunks, map_chunks) if any(missing.values()) else None
         open_choice = AUTO if client is None else "xla"
-        ahead = ThreadPoolExecutor(2)  # the next filter is compiled beside the one that runs
         asked = {name: kept[name] or (open_choice if backend == AUTO else backend) for name in kept}
-        tasks = [ChunkTask(n, filters[n], simulator, room, asked[n], reduced) for n in filters]
-        settled = {t.name: ahead.submit(t.settled, missing[t.name], kept[t.name]) for t in tasks}
-        try:
-            for name in filters:
-                seconds[name], asked[name] = _run_filter(
-                    settled[name].result, missing[name], store, partial(progress, name), map_chunks
-                )
-        finally:
-            ahead.shutdown(wait=False, cancel_futures=True)
+        left, total = sum(len(c) for x in missing.values() for c in x), runs * len(filters)
+        seconds = {}
+        with _reporting(progress, total, total - left) as report:
+            ahead = ThreadPoolExecutor(2)  # the next filter is compiled beside the one that runs
+            try:
+                room = simulator.room(chunks, map_chunks) if left else None
+                tasks = [
+                    ChunkTask(n, s, simulator, room, asked[n], reduced) for n, s in filters.items()
+                ]
+                settled = {
+                    t.name: ahead.submit(t.settled, missing[t.name], kept[t.name]) for t in tasks
+                }
+                for name in filters:
+                    told = partial(report, name)
+                    seconds[name], asked[name] = _run_filter(
+                        settled[name].result, missing[name], store, told, map_chunks
+                    )
+            except KeyboardInterrupt:
+                done = sum(len(c) for name in filters for c in chunks if store.has(name, c))
+                raise Interruption(done, total, chunk, kept_in) from None
+            finally:
+                ahead.shutdown(wait=False, cancel_futures=True)
         device = jax.devices()[0].device_kind
     return Study(
-        scenario, filters, runs, seed, dtype, chunks, store, seconds, device, reduced, asked
-    )
+        scenario, filters, runs, seed, dtype, chunks, store, seconds, device, reduced, asked,
+        made_by, {name: treatment(slam) for name, slam in filters.items()},
+    )  # fmt: skip
 
 
-def divided(runs: int, chunk: int) -> tuple[range, ...]:
-    """Divide so many runs into chunks."""
-    return tuple(range(i, min(i + chunk, runs)) for i in range(0, runs, chunk))
+class Interruption(KeyboardInterrupt):
+    """The interruption of a study; its text says what is kept, and what to do."""
+
+    def __init__(self, kept: int, total: int, chunk: int, store: Store | None) -> None:
+        super().__init__(kept, total, chunk, store)
+        self.kept, self.total, self.chunk, self.store = kept, total, chunk, store
+
+    def told(self, where: str, again: str, smaller: str) -> str:
+        """Return what is kept `where`, and what to do: run `again`, or with `smaller` chunks."""
+        if self.kept:
+            return f"{self.kept} of {self.total} runs are kept in {where}; {again}"
+        if self.chunk == 1:
+            return f"no run was finished, so that nothing of {self.total} is kept in {where}"
+        return (
+            f"no chunk of {self.chunk} runs was finished, so that nothing of {self.total} is kept "
+            f"in {where}; with {smaller} the first runs are kept sooner"
+        )
+
+    def __str__(self) -> str:
+        smaller = f"a chunk smaller than {self.chunk}"
+        if self.store is None:
+            return (
+                f"{self.kept} of {self.total} runs were finished, and are not kept; with a "
+                f"FolderStore they would be"
+            )
+        where = getattr(self.store, "folder", "the store")
+        return self.told(f"{where}", "the same study with this store goes on from there", smaller)
+
+
+def _as_filters(scenario: Scenario, filters: Any) -> Mapping[str, AbstractFilter]:
+    """The filters by name, made of words where these are given. Raises ValueError."""
+    if isinstance(filters, str) and filters:
+        filters = [filters]
+    if isinstance(filters, Iterable) and not isinstance(filters, Mapping):
+        filters = list(filters)
+        if filters and all(isinstance(word, str) for word in filters):
+            words = (word.partition("/") for word in filters)
+            made = [make_filters(scenario, name, of or _LANDMARK) for name, _, of in words]
+            return {name: slam for each in made for name, slam in each.items()}
+    if not filters or not isinstance(filters, Mapping):
+        raise ValueError(
+            "no filters by name: a dict is accepted, as make_filters gives it, or a list of words "
+            "as ['robocentric', 'recommended']"
+        )
+    if wrong := [n for n, slam in filters.items() if not isinstance(slam, AbstractFilter)]:
+        raise ValueError(f"{wrong[0]} is no AbstractFilter but {type(filters[wrong[0]]).__name__}")
+    return filters
+
+
+_LANDMARK = "inverse_scaling"
+"""The landmarks of filters that are given by words."""
+
+
+def _chunk(runs: int, store: Store, client: Any) -> int:
+    """The chunk of a store that has one; else halves of `CHUNK`, so that programs are shared."""
+    if kept := getattr(store, "manifest", {}).get("made_by", {}).get("chunk"):
+        return kept
+    if jax.default_backend() != "cpu":
+        return CHUNK
+    workers = processors() if client is None else sum(client.nthreads().values())
+    chunk = CHUNK
+    while chunk > max(LEAST_CHUNK, runs / (CHUNKS * max(workers, 1))) and runs > LEAST_CHUNK:
+        chunk //= 2
+    return max(chunk, LEAST_CHUNK)
+
+
+@contextmanager
+def _reporting(
+    progress: Callable[[str, int], None] | bool, total: int, done: int
+) -> Generator[Callable[[str, int], None]]:
+    """What is to be called with a filter's name and its finished runs: a bar, for True."""
+    if not isinstance(progress, bool):
+        yield progress
+        return
+    if not progress:
+        yield lambda name, runs: None
+        return
+    with StudyBar(total, done) as bar:
+        yield bar
 
 
 def draw(

@@ -61,7 +61,8 @@ def run_through(
     first, seen, new = features(run, room)
     poses, points = jax.tree.map(lambda x: x[1:], (run.poses, run.points_by_frame))
     frames = SimulatedFrame(run.controls, seen, new, gone(run, room), poses, points)
-    return run_filter(slam, frames, slam.init(room.capacity, first), output)
+    known = {} if run.known is None else {"known": run.known}
+    return run_filter(slam, frames, slam.init(room.capacity, first, **known), output)
 
 
 def filter_run(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -21,13 +22,13 @@ from jaxslam.simulation import (
     RecordedMotion,
     Room,
     Run,
-    Scenario,
     Sightings,
+    World,
     as_data,
-    sensor_of,
     sightings,
     simulate,
     trajectory_of,
+    with_own,
 )
 
 MapChunks = Callable[[Callable[[range], Any], list[range]], Iterator[tuple[range, Any]]]
@@ -42,30 +43,28 @@ class Simulator:
 
     def __init__(
         self,
-        scenario: Scenario,
+        scenario: World,
         seed: int,
         dtype: str,
         size: int,
         motion: AbstractMotion | RecordedMotion | None = None,
         sensor: AbstractSensor | None = None,
     ) -> None:
-        motion = trajectory_of(scenario, dtype) if motion is None else motion
-        self._given = scenario, seed, dtype, size, motion, sensor
+        world = with_own(scenario, motion, sensor)
+        world = replace(world, trajectory=trajectory_of(world))
+        self._given = world, seed, dtype, size
         self.dtype, self.size = jnp.dtype(dtype), size
-        self.sensor = cast(sensor_of(scenario) if sensor is None else sensor, dtype)
-        self._own = cast((motion, sensor), dtype)
-        self._scenario, self._key = as_data(scenario, dtype), jax.random.key(seed)
+        self.sensor = cast(world.sensor, dtype)
+        self._world, self._key = as_data(world, dtype), jax.random.key(seed)
 
     @property
     def made_by(self) -> Manifest:
         """The manifest of the runs that are drawn, the layout of records, and the versions."""
-        scenario, seed, dtype, _, motion, sensor = self._given
+        world, seed, dtype, _ = self._given
         return {
             "layout": LAYOUT,
             "version": versions(),
-            "scenario": described(scenario),
-            "motion": described(motion),
-            "sensor": described(sensor),
+            "scenario": described(world),
             "seed": int(seed),
             "dtype": dtype,
         }
@@ -77,7 +76,7 @@ class Simulator:
     def __call__(self, chunk: range) -> tuple[Run, Sightings]:
         """Return the chunk's runs, padded to `size` by the runs that follow."""
         indices = chunk.start + jnp.arange(self.size)
-        return _draw(self._scenario, self._own, self._key, indices)
+        return _draw(self._world, self._key, indices)
 
     def max_sightings(self, chunk: range) -> Sightings:
         """Return the most that any of the chunk's runs sees."""
@@ -101,16 +100,9 @@ def _rounded_up(count: int) -> int:
 
 
 @partial(Program, options=BATCHED)
-def _draw(
-    scenario: Scenario,
-    own: tuple[AbstractMotion | RecordedMotion | None, AbstractSensor | None],
-    key: Array,
-    indices: Int[Array, " runs"],
-) -> tuple[Run, Sightings]:
-    motion, sensor = own
-
+def _draw(world: World, key: Array, indices: Int[Array, " runs"]) -> tuple[Run, Sightings]:
     def one(index):
-        run = simulate(scenario, jax.random.fold_in(key, index), motion=motion, sensor=sensor)
+        run = simulate(world, jax.random.fold_in(key, index))
         return run, sightings(run)
 
     return jax.vmap(one)(indices)

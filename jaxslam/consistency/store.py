@@ -47,11 +47,11 @@ class MemoryStore:
 
     def __init__(self) -> None:
         self._records: dict[tuple[str, range], Records] = {}
-        self._manifest: Manifest = {"made_by": {}, "filters": {}}
+        self.manifest: Manifest = {"made_by": {}, "filters": {}}
 
     def begin(self, made_by: Manifest, filters: Manifest) -> None:
         what = "this store's records were"
-        self._manifest = _joined(what, self._manifest, made_by, filters, "use another store")
+        self.manifest = _joined(what, self.manifest, made_by, filters, "use another store")
 
     def has(self, filter_name: str, chunk: range) -> bool:
         return (filter_name, chunk) in self._records
@@ -78,32 +78,43 @@ class FolderStore:
         self, folder: Path, manifest: Manifest | None = None, *, resume: bool = False
     ) -> None:
         self.folder, self._path = folder, folder / "manifest.json"
-        self._manifest: Manifest = {"given": _as_json(manifest or {}), "made_by": {}, "filters": {}}
+        self.manifest: Manifest = {"given": _as_json(manifest or {}), "made_by": {}, "filters": {}}
         if self._path.exists():
             found = read_json(self._path, "manifest", _as_manifest)
             if resume:
-                given = self._manifest["given"]
+                given = self.manifest["given"]
                 _check_same(self._made, found["given"], given, _ANOTHER_FOLDER)
-                self._manifest = found
+                self.manifest = found
             for path in self._own(found, unfinished=resume):
                 path.unlink(missing_ok=True)
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(self._path, self._manifest)
+        write_json(self._path, self.manifest)
+
+    @staticmethod
+    def reading(folder: Path) -> FolderStore:
+        """Return the store of a study that is there, in which nothing is changed.
+
+        Raises ValueError without a manifest.
+        """
+        store = object.__new__(FolderStore)
+        store.folder, store._path = folder, folder / "manifest.json"
+        store.manifest = read_json(store._path, "manifest", _as_manifest)
+        return store
 
     def begin(self, made_by: Manifest, filters: Manifest) -> None:
-        joined = _joined(self._made, self._manifest, made_by, filters, _ANOTHER_FOLDER)
-        for name in filters.keys() - self._manifest["filters"].keys():
+        joined = _joined(self._made, self.manifest, made_by, filters, _ANOTHER_FOLDER)
+        for name in filters.keys() - self.manifest["filters"].keys():
             self._check_free(name)
         self._keep(joined)
 
     def has(self, filter_name: str, chunk: range) -> bool:
-        return filter_name in self._manifest["filters"] and self._chunk(filter_name, chunk).exists()
+        return filter_name in self.manifest["filters"] and self._chunk(filter_name, chunk).exists()
 
     def save(self, filter_name: str, chunk: range, records: Records) -> None:
-        if filter_name not in self._manifest["filters"]:
+        if filter_name not in self.manifest["filters"]:
             self._check_free(filter_name)
-            named = {**self._manifest["filters"], filter_name: None}
-            self._keep({**self._manifest, "filters": named})
+            named = {**self.manifest["filters"], filter_name: None}
+            self._keep({**self.manifest, "filters": named})
         path = self._chunk(filter_name, chunk)
         path.parent.mkdir(parents=True, exist_ok=True)
         with write_atomically(path) as temporary, temporary.open("wb") as file:
@@ -129,9 +140,9 @@ class FolderStore:
 
     def _keep(self, manifest: Manifest) -> None:
         """Keep a manifest before the chunks it names: what it does not name is not its study's."""
-        if manifest != self._manifest:
+        if manifest != self.manifest:
             write_json(self._path, manifest)
-            self._manifest = manifest
+            self.manifest = manifest
 
     def _own(self, manifest: Manifest, *, unfinished: bool) -> list[Path]:
         """The files of a manifest's chunks, or only those that a killed process left unfinished."""

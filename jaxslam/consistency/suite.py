@@ -16,7 +16,8 @@ from jaxtyping import Float
 from jaxslam._runtime.files import read_json, write_atomically, write_json
 from jaxslam._runtime.lookup import lookup
 from jaxslam.consistency.montecarlo import check_sizes, draw
-from jaxslam.simulation import Scenario, as_scenario, depth_of, scenario
+from jaxslam.models.sensors import Pinhole
+from jaxslam.simulation import World, as_scenario, scenario
 
 SUITE = ("matched", "matched-loose", "matched-forward-loose", "circle", "matched-6dof")
 """Little noise, where any right EKF is consistent, in the plane and in space; much, where few are;
@@ -33,7 +34,7 @@ AXES = {
 class SuiteScenario:
     """A scenario of a suite, and what draws its runs."""
 
-    scenario: Scenario
+    scenario: World
     runs: int
     seed: int
 
@@ -44,9 +45,10 @@ class SuiteScenario:
         Raises ValueError for another sensor than a camera, and for landmarks that share slots, and
         so have no numbers.
         """
-        s, axes = self.scenario, AXES[self.scenario.geometry]
-        if s.sensor != "camera":
-            raise ValueError(f"{s.name}: its sensor is {s.sensor}; for a suite camera is accepted")
+        s, axes = self.scenario, AXES[self.scenario.geometry.name]
+        if not isinstance(s.sensor, Pinhole) or s.beacons:
+            told = "it has beacons" if s.beacons else f"its sensor is {type(s.sensor).__name__}"
+            raise ValueError(f"{s.name}: {told}; for a suite camera is accepted, without beacons")
         with jax.enable_x64(True):
             batch = jax.device_get(draw(s, self.runs, seed=self.seed)[1])
             turns = batch.poses.rotation().log()
@@ -57,12 +59,12 @@ class SuiteScenario:
             )
         seen, (run, step) = np.nonzero(batch.visible), np.indices(batch.visible.shape[:2])
         pose = np.dstack([run, step, step / s.rate, batch.poses.translation(), turns])
-        pixel = ("run", "step", "landmark", "u", "v")[: 3 + s.world.pixel_dim]
+        pixel = ("run", "step", "landmark", "u", "v")[: 3 + s.geometry.pixel_dim]
         tables = {
             "measurements.csv": (pixel, np.column_stack([*seen, batch.measured[seen]])),
             "truth.csv": (("run", "step", "time", *axes), pose.reshape(-1, pose.shape[-1])),
         }
-        if s.motion == "odometry":
+        if s.reads:
             rows = np.dstack([run[:, 1:], step[:, 1:], batch.controls]).reshape(-1, 2 + len(axes))
             tables["controls.csv"] = ("run", "step", *axes), rows
         return tables
@@ -70,7 +72,7 @@ class SuiteScenario:
 
 def write_suite(
     folder: str | Path,
-    scenarios: Iterable[str | Scenario] = SUITE,
+    scenarios: Iterable[str | World] = SUITE,
     *,
     runs: int = 100,
     seed: int = 0,
@@ -92,7 +94,7 @@ def write_suite(
     with write_atomically(folder) as temporary:
         for one in chosen:
             (place := temporary / one.name).mkdir(parents=True)
-            tables, depth = SuiteScenario(one, runs, seed).tables, depth_of(one)
+            tables, depth = SuiteScenario(one, runs, seed).tables, one.depth
             for name, (columns, rows) in tables.items():
                 form = ["%d" if x in ("run", "step", "landmark") else "%.12g" for x in columns]
                 if truth or name != "truth.csv":
@@ -102,7 +104,7 @@ def write_suite(
                 "seed": seed if truth else None,
                 "depth_prior": {"mean": float(depth.mean), "sigma": float(depth.sigma)},
                 "checksum": tables["measurements.csv"][1].sum(),
-                "scenario": dataclasses.asdict(one),
+                "scenario": one.to_dict(),
             }
             write_json(place / "scenario.json", told)
         shutil.copy(Path(__file__).with_suffix(".md"), temporary / "README.md")

@@ -1,17 +1,36 @@
-"""The summary of a study: per step and filter, the numbers of `consistency.json` and its table."""
+"""A study: its runs, and the results that are computed from their records, filter by filter."""
 
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
-from jaxslam._runtime.files import json_numbers
+from jaxslam._runtime import plotted
+from jaxslam._runtime.files import read_json, write_atomically, write_json
 from jaxslam._runtime.lookup import suggestion
-from jaxslam.consistency.store import Records, Store
+from jaxslam.consistency.manifest import Manifest, described
+from jaxslam.consistency.results import (
+    FilterResult,
+    LandmarkNees,
+    LogScale,
+    Nees,
+    Nis,
+    Parts,
+    Results,
+    ScaleDrift,
+    Seconds,
+    Summary,
+    named,
+)
+from jaxslam.consistency.store import FolderStore, Records, Store
 from jaxslam.consistency.sums import (
     RECORDS,
     Sums,
@@ -21,39 +40,33 @@ from jaxslam.consistency.sums import (
     survived,
     tally_of,
 )
+from jaxslam.consistency.table import as_html, as_text
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.models.observations import Status
-from jaxslam.simulation import Scenario
-from jaxslam.statistics.bands import mean_band
+from jaxslam.simulation import Scenario, scenario
+from jaxslam.statistics import Tally, lost_runs, mean_band
 from jaxslam.statistics.beyond_scale import SCALE, one_scale_of
-from jaxslam.statistics.verdict import Tally, lost_runs, sentences
 
-Summary = dict[str, Any]
-"""The content of `consistency.json`, or what it says of one filter."""
-SCHEMA = 1
 _VALUES_AT_ONCE = 10**7
 """The most values of a record in memory for medians: all runs, and as many steps as fit."""
 _OF_MEDIANS = ("nees", "log_scale", "log_scale_sigma", *SCALE)
+_FILES = {"consistency.json", "consistency.png", "consistency.pdf", "runs"}
+"""The names in the folder of a study that is saved, which may be written over."""
 
 
-@dataclass(frozen=True)
-class Seconds:
-    """The wall time of one filter over all its runs, in seconds."""
+@dataclass(frozen=True, eq=False, repr=False)
+class Study(Mapping):
+    """The finished runs of a study, and what it found of each filter: `study[name].nees.mean`.
 
-    compile: float
-    """Seconds until its program was there."""
-    run: float
-    """Seconds from then on."""
-
-
-@dataclass(frozen=True, repr=False)
-class Study:
-    """The finished runs of a study: the store of their records, and what is needed to read them."""
+    A filter's name may be a part that only one has, as `study["recommended"]`. It prints as its
+    table.
+    """
 
     scenario: Scenario
     """The world that was simulated."""
-    filters: Mapping[str, AbstractFilter]
-    """The filters by the names under which their records are kept."""
+    filters: Mapping[str, Any]
+    """The filters by the names under which their records are kept; of a study that was loaded,
+    their descriptions."""
     runs: int
     """The number of runs of every filter, on the same worlds."""
     seed: int
@@ -72,11 +85,54 @@ class Study:
     """Whether of all chunks but the first only sums are kept."""
     backends: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """The backend that computed each filter."""
+    made_by: Manifest = dataclasses.field(default_factory=dict)
+    """All that decides the runs, as JSON."""
+    calibrations: Mapping[str, str | None] = dataclasses.field(default_factory=dict)
+    """Each filter's treatment of the calibration, where it says so."""
+
+    __eq__, __hash__ = object.__eq__, object.__hash__
+
+    def __getitem__(self, name: str) -> FilterResult:
+        name = named(name, self.filters)
+        if name not in self._found:
+            self._found[name] = _result(self, name)
+        return self._found[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.filters)
+
+    def __len__(self) -> int:
+        return len(self.filters)
+
+    @cached_property
+    def _found(self) -> dict[str, FilterResult]:
+        """The results that were asked for; runs that are finished do not change."""
+        return {}
 
     @property
     def whole(self) -> tuple[range, ...]:
         """The chunks whose records are kept."""
         return tuple(chunk for chunk in self.chunks if keeps_records(chunk, self.reduced))
+
+    @property
+    def results(self) -> Results:
+        """The results of all filters, which need no records any more."""
+        from jaxslam._version import __version__
+
+        steps = self.scenario.steps
+        return Results(
+            version=__version__,
+            scenario=self.scenario.to_dict(),
+            runs=self.runs,
+            medians_of=sum(map(len, self.whole)),
+            scale_free=self.scenario.scale_free,
+            steps=steps,
+            seed=self.seed,
+            dtype=self.dtype,
+            device=self.device,
+            time=np.array([round((i + 1) / self.scenario.rate, 6) for i in range(steps)]),
+            filters={name: self[name] for name in self.filters},
+        )
 
     def loaded(self, name: str) -> Iterator[Records]:
         """Yield of every chunk the records of a filter that a summary reads. Raises ValueError."""
@@ -89,29 +145,165 @@ class Study:
                     raise ValueError(f"{where}: the record {key} is damaged; run again")
             yield records
 
-    def __repr__(self) -> str:
-        """Return its table, so that a study prints as its result."""
-        return table(summarise(self))
+    def records(self, name: str) -> Records:
+        """Return the records (runs, steps, …) of a filter's runs, see `consistency.filter_run`.
+
+        Of a study of sums they are those of the first chunk.
+        """
+        name = self._named(name)
+        parts = [self.store.load(name, chunk, RECORDS) for chunk in self.whole]
+        return {key: np.concatenate([part[key] for part in parts]) for key in RECORDS}
 
     def summary(self) -> Summary:
         """Return `summarise(study)`, the content of `consistency.json`."""
-        return summarise(self)
+        return self.to_json()
+
+    def to_json(self) -> Summary:
+        """Return `summarise(study)`, the content of `consistency.json`."""
+        return self.results.to_json()
+
+    def table(self) -> str:
+        """Return the verdicts and the numbers of the last step as text."""
+        return as_text(self.results)
+
+    def plot(self, path: str | Path | None = None, *, column: bool = False) -> Any:
+        """Return the figure of the study, see `jaxslam.plots.plot_consistency`."""
+        return plotted("plot_consistency")(self, path=path, column=column)
+
+    def to_dataframe(self) -> Any:
+        """Return the numbers of every filter and step as a `pandas.DataFrame`.
+
+        Its columns are called as in `consistency.json`, as `rmse_position`. Raises ValueError
+        without pandas.
+        """
+        pandas, rows = _library("pandas"), []
+        for name, told in self.to_json()["filters"].items():
+            columns = dict(_series(told, self.scenario.steps))
+            rows += [
+                {"filter": name, "time": time, **{key: x[i] for key, x in columns.items()}}
+                for i, time in enumerate(self.results.time)
+            ]
+        return pandas.DataFrame(rows)
+
+    def to_xarray(self) -> Any:
+        """Return the records of every filter, run and step as an `xarray.Dataset`.
+
+        Of a study of sums they are those of the first chunk. Raises ValueError without xarray.
+        """
+        xarray, records = _library("xarray"), [self.records(name) for name in self.filters]
+        axes = ("filter", "run", "step", "axis")
+        joined = {key: np.stack([x[key] for x in records]) for key in RECORDS}
+        coords = {"filter": list(self.filters), "time": ("step", self.results.time)}
+        return xarray.Dataset({key: (axes[: x.ndim], x) for key, x in joined.items()}, coords)
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the study into a folder, whole or not at all; return its path.
+
+        The folder is as `jaxslam consistency --out` writes it: `consistency.json`, and the records
+        in `runs`. `Study.load` reads both. A study that is there is written over. Raises ValueError
+        for a folder with anything else in it.
+        """
+        folder = Path(folder)
+        if isinstance(self.store, FolderStore) and self.store.folder == folder / "runs":
+            write_json(folder / "consistency.json", self.to_json(), allow_nan=False)
+            return folder
+        if folder.exists() and (others := {path.name for path in folder.iterdir()} - _FILES):
+            raise ValueError(f"{folder} has other files ({min(others)}); name a new folder")
+        with write_atomically(folder) as temporary:
+            store = FolderStore(temporary / "runs")
+            sizes = {"chunk": len(self.chunks[0]), "reduced": self.reduced}
+            filters = {name: described(slam) for name, slam in self.filters.items()}
+            store.begin({**self.made_by, **sizes}, filters)
+            for name in self.filters:
+                for chunk in self.chunks:
+                    store.save(name, chunk, self.store.load(name, chunk))
+            write_json(temporary / "consistency.json", self.to_json(), allow_nan=False)
+            if folder.exists():
+                shutil.rmtree(folder)
+        return folder
+
+    @staticmethod
+    def load(folder: str | Path) -> Study:
+        """Return the study that `save`, or `jaxslam consistency --out`, wrote into a folder.
+
+        Raises ValueError, naming the file, for what is missing or damaged.
+        """
+        folder = Path(folder)
+        told = read_json(folder / "consistency.json", "study", Results.from_json)
+        store = FolderStore.reading(folder / "runs")
+        made_by, filters = store.manifest["made_by"], store.manifest["filters"]
+        study = Study(
+            scenario=scenario("matched", dict(told.scenario)),
+            filters={name: filters.get(name) for name in told},
+            runs=told.runs,
+            seed=told.seed,
+            dtype=told.dtype,
+            chunks=divided(told.runs, made_by["chunk"]),
+            store=store,
+            seconds={name: result.seconds for name, result in told.items()},
+            device=told.device,
+            reduced=made_by["reduced"],
+            backends={name: result.backend for name, result in told.items()},
+            made_by=made_by,
+            calibrations={name: result.calibration for name, result in told.items()},
+        )
+        for name in study.filters:
+            for chunk in study.chunks:
+                if not store.has(name, chunk):
+                    runs = f"runs {chunk.start} to {chunk.stop - 1} of {name}"
+                    raise ValueError(f"{store.folder} lacks {runs}; run it again with --resume")
+        return study
+
+    def __repr__(self) -> str:
+        return self.table()
+
+    def _repr_html_(self) -> str:
+        return as_html(self.results)
 
     def __getattr__(self, name: str) -> NoReturn:
-        drawn = " (jaxslam.plots.plot_consistency(study) draws it)"
-        meant = drawn if name.startswith("plot") else suggestion(name, dir(type(self)))
+        known = {field.name for field in dataclasses.fields(FilterResult)} | {"verdict", "lost"}
+        if name in known:
+            meant = f"; each filter has one: study[{next(iter(self.filters))!r}].{name}"
+        else:
+            meant = suggestion(name, dir(type(self)))
         raise AttributeError(f"a Study has no attribute {name!r}{meant}")
 
 
-def as_summary(given: Study | Summary) -> Summary:
-    """A summary, or that of a study. Raises ValueError for anything else."""
-    if isinstance(given, dict) and "filters" in given:
+def _library(name: str) -> Any:
+    """A library that is no requirement. Raises ValueError without it."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise ValueError(f"this needs {name}: pip install {name}") from None
+
+
+def divided(runs: int, chunk: int) -> tuple[range, ...]:
+    """Divide so many runs into chunks."""
+    return tuple(range(i, min(i + chunk, runs)) for i in range(0, runs, chunk))
+
+
+def _series(told: Mapping[str, Any], steps: int, prefix: str = "") -> Iterator[tuple[str, list]]:
+    """The lists of JSON that have a number for every step, and their names."""
+    for key, value in told.items():
+        if isinstance(value, dict) and "word" not in value:
+            yield from _series(value, steps, f"{prefix}{key}_")
+        if isinstance(value, list) and len(value) == steps and key != "band95":
+            yield f"{prefix}{key}", value
+
+
+def results_of(given: Study | Results | Mapping[str, Any]) -> Results:
+    """The results of a study, or those of which a summary was made. Raises ValueError."""
+    if isinstance(given, Study):
+        return given.results
+    if isinstance(given, Results):
         return given
-    return summarise(given)  # ty: ignore[invalid-argument-type]
+    if isinstance(given, dict) and "filters" in given:
+        return Results.from_json(given)
+    raise ValueError(f"a study is summarised, as monte_carlo gives it, not {type(given).__name__}")
 
 
-def summarise(study: Study) -> Summary:
-    """The content of `consistency.json`, ready for `json.dumps`.
+def summarise(study: Study | Results) -> Summary:
+    """The content of `consistency.json`, ready for `json.dumps`; `study[filter]` has it typed.
 
     A run diverges when its NEES is not finite, or its covariance not positive definite, at any
     step. With such a run the verdict has no mean; the means of every step are over the
@@ -133,114 +325,93 @@ def summarise(study: Study) -> Summary:
     Medians are over the first `medians_of` runs, all but where a study keeps sums alone.
     Raises ValueError for what is no study.
     """
-    if not isinstance(study, Study):
-        raise ValueError(
-            f"a study is summarised, as monte_carlo gives it, not {type(study).__name__}"
-        )
-    from jaxslam._version import __version__
-
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
-        "scenario": dataclasses.asdict(study.scenario),
-        "runs": study.runs,
-        "medians_of": sum(map(len, study.whole)),
-        "scale_free": study.scenario.scale_free,
-        "steps": study.scenario.steps,
-        "seed": study.seed,
-        "dtype": study.dtype,
-        "device": study.device,
-        "time": [round((i + 1) / study.scenario.rate, 6) for i in range(study.scenario.steps)],
-        "filters": {name: _summarise_filter(study, name) for name in study.filters},
-    }
+    return results_of(study).to_json()
 
 
-def _summarise_filter(study: Study, name: str) -> Summary:
-    geometry = study.scenario.world
+def table(summary: Study | Results | Mapping[str, Any]) -> str:
+    """The verdict on every filter, then the numbers of the last step, one filter a line.
+
+    It is that of a `summary`, or of a study, which is summarised here. Raises ValueError for
+    anything else.
+    """
+    return as_text(results_of(summary))
+
+
+def _result(study: Study, name: str) -> FilterResult:
+    geometry = study.scenario.geometry
     dof, n = geometry.tangent_dim, geometry.point_dim
     (sums, lost), medians = _sums_and_lost(study, name), _medians(study, name)
     healthy = study.runs - int(sums["diverged"])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = sums["nees"] / healthy
-        kept = sums["kept_nees"] / sums["kept"]
-        error, variance = sums["squared_error"] / healthy, sums["variance"] / healthy
-        landmark = sums["landmark_nees"] / sums["landmark_count"]
-        nis, nis_dof = sums["nis"] / healthy, sums["nis_dof"] / healthy
     low, high = mean_band(dof, max(healthy, 1))
 
-    def by_part(per_axis):
+    def mean(key: str, count: np.ndarray | int = healthy) -> np.ndarray:
+        return _ratio(sums[key], count)
+
+    def rms(key: str, count: np.ndarray | int = healthy) -> np.ndarray:
+        return np.sqrt(mean(key, count))
+
+    def by_part(key: str) -> Parts:
         with np.errstate(invalid="ignore"):  # of a variance that is negative
-            parts = np.sqrt(per_axis[:, :n].sum(axis=1)), np.sqrt(per_axis[:, n:].sum(axis=1))
-        return dict(zip(("position", "orientation"), map(json_numbers, parts), strict=True))
+            per_axis = mean(key)
+            parts = per_axis[:, :n].sum(axis=1), per_axis[:, n:].sum(axis=1)
+            return Parts(*map(np.sqrt, parts))
 
-    seconds = study.seconds[name]
-    return {
-        "verdict": {**tally_of(sums, "nees", dof).verdict(), "lost_runs": lost},
-        "dof": dof,
-        "calibration": treatment(study.filters[name]),
-        "survivors": healthy,
-        "band95": [low, high],
-        "nees": json_numbers(mean),
-        "nees_median": json_numbers(medians.nees),
-        "nees_not_lost": json_numbers(kept),
-        "lost": json_numbers((sums["lost"] + sums["diverged"]) / study.runs),
-        "lost_ever": json_numbers((sums["lost_ever"] + sums["diverged"]) / study.runs),
-        "inside": float(np.mean((mean >= low) & (mean <= high))),
-        "nis": json_numbers(nis),
-        "nis_dof": json_numbers(nis_dof),
-        "rmse": by_part(error),
-        "sigma": by_part(variance),
-        "outside3sigma": {
-            "position": json_numbers(_ratio(sums["outside"][:, :n].mean(axis=1), healthy)),
-            "orientation": json_numbers(_ratio(sums["outside"][:, n:].mean(axis=1), healthy)),
-        },
-        "beyond_scale": {
-            "dof": dof,
-            "band95": [mean_band(dof - 1, max(healthy, 1))[0], high],
-            "nees": json_numbers(sums["beyond_scale"] / max(healthy, 1)),
-            "nees_median": json_numbers(medians.at_one_scale),
-            "lost": json_numbers((sums["beyond_lost"] + sums["diverged"]) / study.runs),
-            "verdict": tally_of(sums, "beyond_scale", dof).verdict(),
-        },
-        "scale_drift": _drift(sums, dof),
-        "log_scale": _log_scale(sums, medians, healthy),
-        "reversed": json_numbers(_ratio(sums["reversed"], sums["displaced"])),
-        "landmark_nees": json_numbers(landmark),
-        "landmark_dof": n,
-        "landmark_not_finite": [int(count) for count in sums["landmark_not_finite"]],
-        "diverged": int(sums["diverged"]),
-        "status": {s.name.lower(): int(sums[f"status_{s.name}"]) for s in Status if s != Status.OK},
-        "backend": study.backends.get(name),
-        "seconds": {"compile": seconds.compile, "run": seconds.run},
-    }
-
-
-def _drift(sums: Sums, dof: int) -> Summary:
-    """The root mean squares over the surviving runs whose unit is fixed; no verdict without any."""
-    count = sums["drift_count"]
+    outside, count = sums["outside"], sums["drift_count"]
     of_drift = tally_of(sums, "drift", dof)
-    return {
-        "rms": _rms(sums["squared_drift"], count),
-        "sigma": _rms(sums["drift_variance"], count),
-        "normalised_rms": _rms(sums["normalised_drift"], count),
-        "runs": [int(n) for n in count],
-        "verdict": of_drift.verdict() if of_drift.runs else None,
-    }
-
-
-def _log_scale(sums: Sums, medians: _Medians, healthy: int) -> Summary:
-    """The root mean squares over the surviving runs; medians over all."""
-    return {
-        "error_rms": _rms(sums["squared_log_scale"], healthy),
-        "error_median": json_numbers(medians.log_scale),
-        "sigma": _rms(sums["log_scale_variance"], healthy),
-        "sigma_median": json_numbers(medians.log_scale_sigma),
-        "normalised_rms": _rms(sums["normalised_log_scale"], healthy),
-    }
-
-
-def _rms(squares: np.ndarray, counts: np.ndarray | int) -> list[float | None]:
-    return json_numbers(np.sqrt(_ratio(squares, counts)))
+    return FilterResult(
+        name=name,
+        nees=Nees(
+            verdict=tally_of(sums, "nees", dof).verdict() | {"lost_runs": lost},
+            dof=dof,
+            band=(low, high),
+            mean=mean("nees"),
+            median=medians.nees,
+            lost=(sums["lost"] + sums["diverged"]) / study.runs,
+        ),
+        not_lost=mean("kept_nees", sums["kept"]),
+        lost_ever=(sums["lost_ever"] + sums["diverged"]) / study.runs,
+        nis=Nis(mean("nis"), mean("nis_dof")),
+        rmse=by_part("squared_error"),
+        sigma=by_part("variance"),
+        outside3sigma=Parts(
+            _ratio(outside[:, :n].mean(axis=1), healthy),
+            _ratio(outside[:, n:].mean(axis=1), healthy),
+        ),
+        beyond_scale=Nees(
+            verdict=tally_of(sums, "beyond_scale", dof).verdict(),
+            dof=dof,
+            band=(mean_band(dof - 1, max(healthy, 1))[0], high),
+            mean=mean("beyond_scale"),
+            median=medians.at_one_scale,
+            lost=(sums["beyond_lost"] + sums["diverged"]) / study.runs,
+        ),
+        scale_drift=ScaleDrift(
+            rms=rms("squared_drift", count),
+            sigma=rms("drift_variance", count),
+            normalised_rms=rms("normalised_drift", count),
+            runs=count,
+            verdict=of_drift.verdict() if of_drift.runs and healthy else None,
+        ),
+        log_scale=LogScale(
+            error_rms=rms("squared_log_scale"),
+            error_median=medians.log_scale,
+            sigma=rms("log_scale_variance"),
+            sigma_median=medians.log_scale_sigma,
+            normalised_rms=rms("normalised_log_scale"),
+        ),
+        reversed=mean("reversed", sums["displaced"]),
+        landmark_nees=LandmarkNees(
+            mean("landmark_nees", sums["landmark_count"]),
+            n,
+            sums["landmark_not_finite"].astype(int),
+        ),
+        survivors=healthy,
+        diverged=int(sums["diverged"]),
+        status={s.name.lower(): int(sums[f"status_{s.name}"]) for s in Status if s != Status.OK},
+        calibration=study.calibrations.get(name),
+        backend=study.backends.get(name),
+        seconds=study.seconds[name],
+    )
 
 
 def _ratio(sums: np.ndarray, counts: np.ndarray | int) -> np.ndarray:
@@ -260,7 +431,7 @@ def tally(study: Study, name: str, record: str = "nees") -> Tally:
     It is of the `nees` of its poses, of the part that is `beyond_scale`, or of the `drift` of the
     scale.
     """
-    return tally_of(_sums(study, name), record, study.scenario.world.tangent_dim)
+    return tally_of(_sums(study, name), record, study.scenario.geometry.tangent_dim)
 
 
 def _sums(study: Study, name: str) -> Sums:
@@ -270,7 +441,7 @@ def _sums(study: Study, name: str) -> Sums:
 
 def _sums_and_lost(study: Study, name: str) -> tuple[Sums, list[int] | None]:
     """The sums of all chunks, and the numbers of lost runs, None where not all records are kept."""
-    dof, lost = study.scenario.world.tangent_dim, []
+    dof, lost = study.scenario.geometry.tangent_dim, []
 
     def each() -> Iterator[Sums]:
         for chunk, kept in zip(study.chunks, study.loaded(name), strict=True):
@@ -306,93 +477,3 @@ def _medians(study: Study, name: str) -> _Medians:
             columns.append([np.where(survivors, x, np.inf)[:, part] for x in values])
         medians.append([np.median(np.concatenate(x), axis=0) for x in zip(*columns, strict=True)])
     return _Medians(*(np.concatenate(x) for x in zip(*medians, strict=True)))
-
-
-def table(summary: Summary | Study) -> str:
-    """The verdict on every filter, then the numbers of the last step, one filter a line.
-
-    It is that of a `summary`, or of a study, which is summarised here.
-    """
-    summary = as_summary(summary)
-    filters = summary["filters"]
-    wide = max(31, *map(len, filters)) + 1
-    header = (
-        f"{'filter/landmarks':<{wide}}{'NEES mean':>10}{'95 % band':>14}{'median':>8}{'others':>8}"
-        f"{'lost':>7}{'ever':>7}{'diverged':>9}{'NIS/dof':>8}{'RMSE m':>8}{'σ m':>8}{'seconds':>9}"
-    )
-    return "\n".join(
-        [
-            *("\n    ".join([f"{name}:", *sentences(f["verdict"])]) for name, f in filters.items()),
-            "",
-            header,
-            *(_row(f"{name:<{wide}}", f) for name, f in filters.items()),
-            f"last of {summary['steps']} steps, {summary['runs']} runs of seed {summary['seed']}; "
-            f"a consistent filter has mean NEES {next(iter(filters.values()))['dof']}; verdicts: "
-            "of all steps, the last and each third together, [99 % interval]",
-            "lost: NEES above the 99.99 % quantile of χ² now; ever: at any step above the higher "
-            "quantile for so many, so that ever may be less; others: mean of those not lost now",
-            *(_scale_table(filters, wide) if summary["scale_free"] else ()),
-            *_notes(filters),
-        ]
-    )
-
-
-def _row(name: str, f: Summary) -> str:
-    with np.errstate(invalid="ignore"):  # a filter that compares nothing has no NIS
-        nis = np.nansum(np.array(f["nis"], float)) / np.nansum(np.array(f["nis_dof"], float))
-    band = f"{f['band95'][0]:.3f}–{f['band95'][1]:.3f}"
-    return (
-        f"{name}{_last(f['nees'], 10, 3)}{band:>14}{_last(f['nees_median'], 8, 2)}"
-        f"{_last(f['nees_not_lost'], 8, 3)}{_share(f['lost'][-1]):>7}"
-        f"{_share(f['lost_ever'][-1]):>7}{f['diverged']:>9d}{nis:>8.3f}"
-        f"{_last(f['rmse']['position'], 8, 3)}{_last(f['sigma']['position'], 8, 3)}"
-        f"{f['seconds']['compile'] + f['seconds']['run']:>9.1f}"
-    )
-
-
-def _scale_table(filters: Summary, wide: int) -> Iterator[str]:
-    """The table of errors that are not of scale, and of those of the scale, at the last step."""
-    yield ""
-    yield (
-        f"{'at one scale a run':<{wide}}{'NEES mean':>10}{'95 % band':>14}{'median':>8}{'lost':>7}"
-        f"{'reversed':>10}{'drift':>8}{'drift/σ':>9}{'log-scale error':>17}{'claimed σ':>11}"
-        f"{'error/σ':>9}  verdict; on the drift"
-    )
-    for name, f in filters.items():
-        word = (f["scale_drift"]["verdict"] or {"word": "–"})["word"]
-        beyond, scale, drift = f["beyond_scale"], f["log_scale"], f["scale_drift"]
-        low, high = beyond["band95"]
-        yield (
-            f"{name:<{wide}}{_last(beyond['nees'], 10, 3)}{f'{low:.3f}–{high:.3f}':>14}"
-            f"{_last(beyond['nees_median'], 8, 2)}{_share(beyond['lost'][-1]):>7}"
-            f"{_share(f['reversed'][-1]):>10}{_last(drift['rms'], 8, 3)}"
-            f"{_last(drift['normalised_rms'], 9, 2)}{_last(scale['error_rms'], 17, 3)}"
-            f"{_last(scale['sigma_median'], 11, 3)}{_last(scale['normalised_rms'], 9, 2)}"
-            f"  {beyond['verdict']['word']}; {word}"
-        )
-    dof = next(iter(filters.values()))["beyond_scale"]["dof"]
-    yield (
-        f"at the one scale of the truth that explains all poses of a run best: a right NEES is "
-        f"{dof - 1} to {dof}; reversed: displaced away from the truth; drift of log-scale along a "
-        "run, and its error in metres: rms, claimed σ: median"
-    )
-
-
-def _notes(filters: Summary) -> Iterator[str]:
-    """Remarks on what the means of the table leave out."""
-    for name, f in filters.items():
-        if f["diverged"]:
-            yield f"{name}: means and band are of the {f['survivors']} runs that did not diverge"
-        if count := sum(f["landmark_not_finite"]):
-            yield f"{name}: {count} NEES of landmarks are not finite, and not in their mean"
-
-
-def _last(values: list[float | None], width: int, digits: int) -> str:
-    value = values[-1]
-    if value is None:
-        return f"{'–':>{width}}"
-    return f"{value:>{width}.{digits}f}" if abs(value) < 1e4 else f"{value:>{width}.2g}"
-
-
-def _share(value: float | None) -> str:
-    return "–" if value is None else f"{value:.1%}"

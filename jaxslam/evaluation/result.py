@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from jaxslam._runtime import plotted
 from jaxslam._runtime.files import json_numbers, write_json
-from jaxslam._runtime.lookup import lookup
+from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.evaluation.convention import Convention
 from jaxslam.evaluation.convention_search import Identification
 from jaxslam.evaluation.inputs import (
@@ -29,7 +31,7 @@ from jaxslam.evaluation.inputs import (
 )
 from jaxslam.evaluation.sanity_checks import Logged, Mistake, mistakes, withheld
 from jaxslam.evaluation.scale import Scale
-from jaxslam.statistics.bands import mean_band
+from jaxslam.statistics.bands import exact_band
 from jaxslam.statistics.verdict import (
     Verdict,
     headline,
@@ -50,9 +52,12 @@ OUTSIDE = 0.0027
 """The share of a Gaussian beyond ±3σ."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Evaluation:
-    """The evaluation of a filter by its errors and covariances; prints as verdict and table."""
+    """The evaluation of a filter by its errors and covariances; prints as verdict and table.
+
+    It shows itself in a notebook, draws itself by `plot`, and is written by `save`.
+    """
 
     quantity: str
     """`NEES`, or `NIS` of innovations."""
@@ -61,9 +66,11 @@ class Evaluation:
     nees: Float[np.ndarray, "runs steps"]
     """The NEES of every run and step; infinite if diverged, NaN where nothing was logged."""
     errors: Float[np.ndarray, "runs steps n"]
+    """The error of every run, step and axis; NaN where nothing was logged."""
     sigmas: Float[np.ndarray, "runs steps n"]
     """The σ that the filter claims of every error."""
     times: Float[np.ndarray, " steps"]
+    """The time of every step, s, or its number."""
     timed: bool
     """Whether they are seconds, or numbers of steps as times are unknown."""
     names: tuple[str, ...]
@@ -89,10 +96,12 @@ class Evaluation:
 
     @property
     def runs(self) -> int:
+        """The number of runs."""
         return len(self.nees)
 
     @property
     def steps(self) -> int:
+        """The number of steps of the longest run."""
         return self.nees.shape[1]
 
     @cached_property
@@ -181,8 +190,8 @@ class Evaluation:
 
     def _band(self, runs: int) -> tuple[float, float]:
         """The band, its low end with all that may be fitted, its high end with nothing fitted."""
-        left, high = int(self.dof - self.fitted), mean_band(self.dof, runs)[1]
-        return (mean_band(left, runs)[0] if left >= 1 else 0.0), high
+        left, high = int(self.dof - self.fitted), exact_band(self.dof, runs)[1]
+        return (exact_band(left, runs)[0] if left >= 1 else 0.0), high
 
     @property
     def inside(self) -> float:
@@ -220,6 +229,10 @@ class Evaluation:
             fitted = self.axis_fitted[axis] if self.axis_fitted else 0.0
             return self._verdict(nees, normalised, 1, fitted)
 
+    def plot(self, path: str | Path | None = None, *, column: bool = False) -> Any:
+        """Return the figure of the evaluation, see `jaxslam.plots.plot_evaluation`."""
+        return plotted("plot_evaluation")(self, path, column=column)
+
     def asdict(self) -> dict[str, Any]:
         """The content of `evaluation.json`."""
         from jaxslam._version import __version__
@@ -256,6 +269,8 @@ class Evaluation:
             "notes": self.remarks,
         }
 
+    to_dict = asdict
+
     def save(self, folder: str | Path) -> Path:
         """Write `evaluation.json` into a folder, made if missing; return its path.
 
@@ -269,7 +284,26 @@ class Evaluation:
             raise ValueError(f"{folder}: cannot write there ({error.strerror})") from None
         return path
 
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        told, rows = html.escape(self._told()).replace("\n", "<br>"), self._rows()
+        cells = ("".join(f"<td>{html.escape(x)}</td>" for x in row) for row in rows)
+        table = f"<table><tr>{'</tr><tr>'.join(cells)}</tr></table>"
+        notes = "<br>".join(map(html.escape, [self._counted(), *self.remarks]))
+        return f"<p>{told}</p>{table if self.names else ''}<p>{notes}</p>"
+
+    def __getattr__(self, name: str) -> NoReturn:
+        meant = suggestion(name, dir(type(self)))
+        raise AttributeError(f"an Evaluation has no attribute {name!r}{meant}")
+
     def __str__(self) -> str:
+        table = _in_columns(*self._rows()) if self.names else []
+        return "\n".join([self._told(), "", self._counted(), *table, *self.remarks])
+
+    def _told(self) -> str:
+        """The verdict in lines, or the mistakes of the log in its place."""
         # Lost runs are named below, by their names here.
         more = sentences(self._of_nees | {"lost_runs": None}, self.quantity)[1:]
         told = [self.headline, *more]
@@ -282,7 +316,7 @@ class Evaluation:
             told.append(f"{'lost' if self.quantity == 'NEES' else 'outlying'}: {which}")
         if self.mistakes:
             told, doubt = [self.headline, *(mistake.told for mistake in self.mistakes)], []
-        return "\n".join([*told, *doubt, "", *self._table(), *self.remarks])
+        return "\n".join([*told, *doubt])
 
     @property
     def remarks(self) -> list[str]:
@@ -306,19 +340,21 @@ class Evaluation:
     def _run(self, run: int) -> str:
         return self.run_names[run] if self.run_names else f"run {run}"
 
-    def _table(self) -> list[str]:
+    def _counted(self) -> str:
         low, high = self.band95
         runs = f"{self.runs} run{'s' if self.runs > 1 else ''}"
         steps = f"{self.steps} step{'s' if self.steps > 1 else ''}"
-        return [
+        return (
             f"{runs} of {steps}; mean {self.quantity} of a consistent filter "
             f"{self.expected}, at one step in {low:.3f}–{high:.3f} with 95 %; "
-            f"{self.inside:.0%} of the steps are inside",
-            *_in_columns(
-                ("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
-                *(self._row(i) for i in range(len(self.names))),
-                ("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}"),
-            )[: None if self.names else 0],
+            f"{self.inside:.0%} of the steps are inside"
+        )
+
+    def _rows(self) -> list[tuple[str, ...]]:
+        return [
+            ("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
+            *(self._row(i) for i in range(len(self.names))),
+            ("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}"),
         ]
 
     @property

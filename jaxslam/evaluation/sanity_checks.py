@@ -91,7 +91,7 @@ def withheld(found: Verdict) -> Verdict:
             return [silent(x) for x in part]
         return withheld(part) if isinstance(part, dict) else part
 
-    parts = {key: silent(x) for key, x in found.items()}
+    parts = Verdict({key: silent(x) for key, x in found.items()})
     return parts | {"word": "cannot tell"} if "word" in found else parts
 
 

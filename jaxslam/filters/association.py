@@ -23,11 +23,11 @@ import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.arrays import Number
-from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.gaussian import context_of
 from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.linear.covariance import curvature
 from jaxslam.filters.protocol import AbstractStaged, Belief
+from jaxslam.linalg import cholesky
 from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features, Slots
 

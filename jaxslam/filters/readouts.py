@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxslam._numerics.linalg import semidefinite_root
 from jaxslam.filters.gaussian import composed, of_landmark
 from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.linear.covariance import joint_covariance
@@ -21,6 +20,7 @@ from jaxslam.filters.protocol import (
     OfLandmark,
 )
 from jaxslam.geometry import Pose, Scalar, retract, scaled
+from jaxslam.linalg import semidefinite_root
 from jaxslam.models.observations import Slots
 from jaxslam.models.sensors import AbstractSensor
 

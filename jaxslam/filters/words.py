@@ -28,8 +28,7 @@ from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.frame import Keyframe, Submaps, WorldCentric
 from jaxslam.models.scale import ScaleGauge
-from jaxslam.simulation.pieces import calibration_sigma_of, depth_of, motion_of, sensor_of
-from jaxslam.simulation.scenario import Scenario, as_scenario
+from jaxslam.simulation import World, as_scenario
 
 Piece = Any
 """A piece of a filter as `Slam` takes it: `motion`, `sensor`, `landmark`, `calibration`, …"""
@@ -159,7 +158,7 @@ def _parsed(modifier: str) -> tuple[str, list[int]]:
 
 
 def make_filters(
-    scenario: Scenario | str,
+    scenario: World | str,
     filters: str | Iterable[str],
     landmarks: str | Iterable[str] = "inverse_scaling",
     calibration: str | None = None,
@@ -180,13 +179,13 @@ def make_filters(
     }
 
 
-def scenario_pieces(scenario: Scenario, calibration: str | None = None) -> dict[str, Piece]:
+def scenario_pieces(scenario: World, calibration: str | None = None) -> dict[str, Piece]:
     """The pieces of a filter that fits the scenario, as `Slam` takes them. Raises ValueError."""
-    word = scenario.calibration if calibration is None else calibration
+    word = scenario.treatment if calibration is None else calibration
     treatment = lookup("calibration", [word], TREATMENTS)[word]
     return {
-        "motion": motion_of(scenario),
-        "sensor": sensor_of(scenario),
-        "calibration": treatment(calibration_sigma_of(scenario)),
-        "depth": depth_of(scenario),
+        "motion": scenario.motion,
+        "sensor": scenario.sensor,
+        "calibration": treatment(scenario.calibration.sigma),
+        "depth": scenario.depth,
     }

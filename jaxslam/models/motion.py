@@ -3,6 +3,11 @@
 A model says what a *control* makes of the variables that it keeps in the state and of this step's
 noise. The control is data: the seconds of the step, or the odometry's reading. A model of your own
 is one class with the functions of `AbstractMotion`.
+
+Velocities and displacements are in the camera's axes, x right, y down, z ahead: (x, z, θ) in the
+plane, with θ turning from x towards z, that is to the left; (x, y, z, about x, about y, about z) in
+space. A cart that drives ahead at v and turns left at ω has the velocity (0, v, ω). Where a log has
+x ahead and y left, as ROS does, a planar velocity (vx, vy, ω) is (−vy, vx, ω) here.
 """
 
 from abc import abstractmethod
@@ -65,6 +70,12 @@ class AbstractMotion(eqx.Module):
     def nominal_control(self, velocity: Float[Array, " t"], seconds: Number) -> Control:
         """The control of a step at a constant velocity: what a simulation gives the model."""
         raise NotImplementedError(f"{type(self).__name__} does not say how to simulate it")
+
+    def reading(self, control: Control, noise: Float[Array, " q"]) -> Control:
+        """What a simulation tells a filter of this control. Of a model that says so the noise is of
+        the reading, and the truth moves by the control exactly; of others it moves the truth."""
+        del noise
+        return control
 
     def enlarged(
         self, variables: Variables, noise: Float[Array, " q"], factor: Scalar
@@ -158,7 +169,11 @@ class Odometry(AbstractMotion):
         return jnp.zeros(self.geometry.tangent_dim, dtype)
 
     def nominal_control(self, velocity: Tangent, seconds: Number) -> Tangent:
-        return velocity * seconds
+        return velocity / (1 / seconds)  # at 10 Hz 0.8 m/s is 0.08 m, and no rounding more
+
+    def reading(self, control: Tangent, noise: Tangent) -> Tangent:
+        """`u = (ρ, θ) − w`."""
+        return control - noise
 
 
 def check_control(motion: AbstractMotion, control: Control) -> None:

@@ -1,5 +1,9 @@
 """Measurement models of a point: its pixel, its position, or range and bearing from the sensor.
 
+A sensor has the camera's axes: x right, y down, z ahead; a planar point is (x, z). A bearing is
+atan2(x, z), zero ahead and positive to the right. σ is in the unit of the measurement: pixels, m,
+or (m, rad).
+
 A sensor is data: its numbers can be batched, perturbed by the uncertainty of its calibration and
 differentiated. One of your own is one class with the functions of `AbstractSensor`.
 """
@@ -14,11 +18,29 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field
+from jaxslam._numerics.arrays import AnyArray, Number, check_shape, number_field, optional_numbers
 from jaxslam.geometry import Homogeneous, Point
 from jaxslam.models.camera import Camera, bearing, project
 
 Measurement = Float[Array, " p"]
+
+
+class FieldOfView(eqx.Module):
+    """The part of a simulated world that a sensor sees."""
+
+    names: ClassVar[dict[str, str]] = {x: x for x in ("range", "visible_depth", "image")}
+    """Its flat fields in scenarios."""
+    range: Float[AnyArray, " 2"] = number_field(default=(0.0, np.inf))
+    """Least and greatest distance, m; not of a camera."""
+    visible_depth: Number = 0.1
+    """Least depth z, m, of a camera."""
+    image: Float[AnyArray, " p"] | None = eqx.field(converter=optional_numbers, default=None)
+    """Size of the picture of a camera, pixels."""
+
+    def __check_init__(self) -> None:
+        check_shape("range", self.range, (2,))
+        if isinstance(self.range, np.ndarray) and self.range[0] >= self.range[1]:
+            raise ValueError(f"range needs a least and a greatest one, not {self.range}")
 
 
 class AbstractSensor(eqx.Module):
@@ -53,6 +75,19 @@ class AbstractSensor(eqx.Module):
         """Whether the point can be measured at all; any can, unless a sensor says otherwise."""
         del point
         return jnp.ones((), bool)
+
+    def visible(self, point: Point, measured: Measurement, view: FieldOfView) -> Bool[Array, ""]:
+        """Whether a simulation measures the point, whose noise-free measurement is this: what is
+        possible and in range, unless a sensor says otherwise."""
+        del measured
+        distance = jnp.linalg.norm(point)
+        in_range = (distance >= view.range[0]) & (distance <= view.range[1])
+        return in_range & self.possible(point)
+
+    @property
+    def view(self) -> FieldOfView:
+        """What a simulation takes it to see where nothing else is said: all that is possible."""
+        return FieldOfView()
 
     def chart(self, point: Point, omega: Number) -> Point:
         """Coordinates in which every parametrization is nearly Gaussian; the point's own here."""
@@ -120,6 +155,17 @@ class Pinhole(AbstractSensor):
 
     def possible(self, point: Point) -> Bool[Array, ""]:
         return point[-1] > 0
+
+    def visible(self, point: Point, measured: Measurement, view: FieldOfView) -> Bool[Array, ""]:
+        """In front of the camera and inside the picture."""
+        image = 2 * self.camera.centre if view.image is None else view.image
+        inside = jnp.all((measured >= 0) & (measured < image))
+        return inside & (point[-1] > view.visible_depth)
+
+    @property
+    def view(self) -> FieldOfView:
+        """A picture of twice the principal point."""
+        return FieldOfView(image=2 * self.camera.centre)
 
     def chart(self, point: Point, omega: Number) -> Point:
         return jnp.append(point[:-1], omega) / point[-1]

@@ -13,8 +13,8 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from jax.interpreters import partial_eval
 
-from jaxslam._numerics.linalg import symmetric_part_p
 from jaxslam._numerics.tracing import free_gathers
+from jaxslam.linalg import symmetric_part_p
 from jaxslam.native.elements import OPERATIONS, Elements, Refs
 from jaxslam.native.program import (
     Apply,

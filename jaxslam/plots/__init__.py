@@ -6,6 +6,7 @@ _MODULES = {
     "plot_consistency": "consistency",
     "plot_evaluation": "evaluation",
     "plot_triangulation": "triangulation",
+    "plot_world": "world",
     "draw_ellipses": "landmarks",
     "COLOURS": "style",
     "GREY": "style",

@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from jaxslam._runtime.lookup import lookup
-from jaxslam.consistency import Study, summarise
-from jaxslam.consistency.summary import Summary, as_summary
+from jaxslam.consistency import Results, Study
+from jaxslam.consistency.results import Nees
+from jaxslam.consistency.summary import results_of
 from jaxslam.evaluation.result import OUTSIDE
 from jaxslam.plots.landmarks import region_from_above
 from jaxslam.plots.style import (
@@ -31,20 +32,24 @@ from jaxslam.plots.style import (
     set_title,
     short_names,
 )
-from jaxslam.statistics.verdict import headline
+from jaxslam.statistics.verdict import brief, headline
 
 _MEDIAN_OF_NORMAL = 0.6745
 """Median of |x| for a standard normal x."""
 
 
+Drawn = Study | Results | Mapping[str, Any]
+"""What is drawn: a study, its results, or the summary that `consistency.json` holds."""
+
+
 def plot_consistency(
     study: Study,
-    summary: Summary | None = None,
+    summary: Drawn | None = None,
     path: str | Path | None = None,
     *,
     column: bool = False,
 ) -> Figure:
-    """Draw a study; `summary` is `summarise(study)`, made here if it is not given.
+    """Draw a study; `summary` is that of the study, made here if it is not given.
 
     Above: the mean NEES of every filter with its exact 95 % band, and the share of errors outside
     ±3σ. Where the scale is free, below that: NEES at one scale a run, and the scale's own error.
@@ -52,21 +57,23 @@ def plot_consistency(
     print, 3.4 in wide with letters of 8 pt, it is without run 0. Written to `path` where one is
     given.
     """
-    summary = summarise(study) if summary is None else summary
-    return save(_column(summary) if column else _page(study, summary), path)
+    results = results_of(study if summary is None else summary)
+    return save(_column(results) if column else _page(study, results), path)
 
 
-def _column(summary: Summary) -> Figure:
+def _column(results: Results) -> Figure:
     drawn = [plot_nees, plot_outside]
-    if summary["scale_free"]:
+    if results.scale_free:
         drawn += [plot_beyond_scale, plot_log_scale]
-    title = column_title(_title(summary))
-    lines = len(title.splitlines()) + len(summary["filters"]) + 2
+    called = short_names(list(results))
+    verdicts = [f"{called[name]}: {brief(result.verdict)}" for name, result in results.items()]
+    title = column_title("\n".join([*verdicts, _world(results)]))
+    lines = len(title.splitlines()) + len(results) + 2
     figure = new_figure(COLUMN, 0.14 * lines + 1.25 * len(drawn))
     figure.suptitle(title, x=0.02, ha="left")
     axes = figure.subplots(len(drawn), 1, sharex=True)
     for plot, ax in zip(drawn, axes, strict=True):
-        plot(summary, ax=ax)
+        plot(results, ax=ax)
     for ax in axes[:-1]:  # time, and a legend, stand below all
         ax.set_xlabel("")
         if (legend := ax.get_legend()) is not None:
@@ -75,13 +82,13 @@ def _column(summary: Summary) -> Figure:
     return figure
 
 
-def _page(study: Study, summary: Summary) -> Figure:
-    geometry = study.scenario.world
-    rows, free = geometry.tangent_dim // 3, summary["scale_free"]
+def _page(study: Study, results: Results) -> Figure:
+    geometry = study.scenario.geometry
+    rows, free = geometry.tangent_dim // 3, results.scale_free
     heights = [2.1, *[1.3] * free, *[1.1] * rows]
     figure = new_figure(12.5, 1.0 + 0.2 * len(study.filters) + 2.1 * sum(heights))
     # Over the whole width, as the verdicts are longer than the axes that they are on.
-    figure.suptitle(_title(summary), x=0.01, ha="left", fontsize=11)
+    figure.suptitle(_title(results), x=0.01, ha="left", fontsize=11)
     # Each row by itself, as the room that names take is of its own; those of run 0 are one.
     ratios = [*heights[:-rows], sum(heights[-rows:])]
     grid = figure.add_gridspec(len(heights) - rows + 1, 1, height_ratios=ratios)
@@ -89,11 +96,11 @@ def _page(study: Study, summary: Summary) -> Figure:
     plots = [(plot_nees, plot_outside), *[(plot_beyond_scale, plot_log_scale)] * free]
     for place, pair in zip(places, plots, strict=False):
         for plot, ax in zip(pair, place.subplots(1, 2, width_ratios=[4, 3]), strict=True):
-            plot(summary, ax=ax)
+            plot(results, ax=ax)
     samples = {name: study.store.load(name, study.chunks[0]) for name in study.filters}
     grid = places[-1].add_gridspec(rows, 4)
     axes = [places[-1].add_subplot(grid[r, c]) for r in range(rows) for c in range(3)]
-    _plot_errors(axes, samples, np.array(summary["time"]), geometry.point_dim)
+    _plot_errors(axes, samples, results.time, geometry.point_dim)
     _plot_map(places[-1].add_subplot(grid[:, 3]), samples)
     return figure
 
@@ -102,47 +109,47 @@ Labels = Mapping[str, str]
 """What filters are called at the ends of their lines: `{"robocentric/inverse_depth": "UID"}`."""
 
 
-def plot_nees(summary: Summary | Study, *, ax: Axes, label: Labels | None = None) -> Axes:
+def plot_nees(summary: Drawn, *, ax: Axes, label: Labels | None = None) -> Axes:
     """Mean NEES of every filter over time with its exact 95 % band, and the medians, dotted.
 
     `summary` is of `summarise`, or a study. Names stand at the ends of the lines; a filter may be
     called otherwise by `label`.
     """
-    summary = as_summary(summary)
-    first = next(iter(summary["filters"].values()))
-    ideal = f"ideal {first['dof']}"
-    _plot_means(summary["filters"], summary, ax, label)
-    ax.set_ylabel(f"pose NEES ({ideal})")
-    band = f"grey: exact 95 % band of {first['survivors']} runs"
-    set_title(ax, f"mean NEES; dotted: median{_of_some(summary)}\n{band}")
+    results = results_of(summary)
+    shown = results.reference
+    _plot_means({name: r.nees for name, r in results.items()}, results, ax, label)
+    ax.set_ylabel(f"pose NEES (ideal {shown.nees.dof})")
+    band = f"grey: exact 95 % band of {shown.survivors} runs"
+    if not shown.survivors:
+        band = "every run diverged, so that there is no mean"
+    set_title(ax, f"mean NEES; dotted: median{_of_some(results)}\n{band}")
     return ax
 
 
-def _of_some(summary: Summary) -> str:
+def _of_some(results: Results) -> str:
     """The text that says of which runs the medians are, where it is not all."""
-    some = summary.get("medians_of", summary["runs"])  # not in earlier versions
-    return "" if some == summary["runs"] else f" of the first {some} runs"
+    some = results.medians_of
+    return "" if some == results.runs else f" of the first {some} runs"
 
 
-def _plot_means(
-    numbers: dict[str, Summary], summary: Summary, ax: Axes, label: Labels | None
-) -> None:
-    """Means with the band of the first, and medians, over time."""
-    first = next(iter(numbers.values()))
-    ax.axhspan(*first["band95"], color=GREY, alpha=0.25, lw=0)
-    ax.axhline(first["dof"], color=GREY, lw=0.8)
-    pairs = {name: (f["nees"], f["nees_median"]) for name, f in numbers.items()}
-    lines = _plot_pairs(pairs, summary, ax, label, lw=0.9, ls=MEDIAN_DASH)
+def _plot_means(each: dict[str, Nees], results: Results, ax: Axes, label: Labels | None) -> None:
+    """Means with the band of the filter with most surviving runs, and medians, over time."""
+    shown = each[results.reference.name]
+    if results.reference.survivors:
+        ax.axhspan(*shown.band, color=GREY, alpha=0.25, lw=0)
+    ax.axhline(shown.dof, color=GREY, lw=0.8)
+    pairs = {name: (nees.mean, nees.median) for name, nees in each.items()}
+    lines = _plot_pairs(pairs, results, ax, label, lw=0.9, ls=MEDIAN_DASH)
     ax.set_yscale("log")
     bottom, top = ax.get_ylim()
-    ax.set_ylim(min(bottom, first["dof"] / 2), max(top, first["dof"] * 1.5))
+    ax.set_ylim(min(bottom, shown.dof / 2), max(top, shown.dof * 1.5))
     name_numbers(ax.yaxis)
     label_ends(ax, lines)
 
 
 def _plot_pairs(
     pairs: Mapping[str, Sequence[ArrayLike]],
-    summary: Summary,
+    results: Results,
     ax: Axes,
     label: Labels | None,
     **second: Any,
@@ -153,10 +160,10 @@ def _plot_pairs(
     """
     lookup("label", label or pairs, dict.fromkeys(pairs))
     called = {**short_names(list(pairs)), **(label or {})}
-    time, lines = np.array(summary["time"]), []
+    time, lines = results.time, []
     for i, (name, pair) in enumerate(pairs.items()):
         style = line_style(i)
-        values, others = (np.array(x, float) for x in pair)
+        values, others = (np.where(np.isfinite(x), x, np.nan) for x in pair)
         ax.plot(time, values, lw=1.8, **style)
         ax.plot(time, others, color=style["color"], **{"ls": style["linestyle"], **second})
         lines.append(End(called[name], time, values, style["color"]))
@@ -166,19 +173,17 @@ def _plot_pairs(
     return lines
 
 
-def plot_outside(summary: Summary | Study, *, ax: Axes, label: Labels | None = None) -> Axes:
+def plot_outside(summary: Drawn, *, ax: Axes, label: Labels | None = None) -> Axes:
     """Share of errors outside ±3σ over time, of the position (solid) and the orientation (thin).
 
     Names stand at the ends of the position's lines; a filter may be called otherwise by `label`.
     """
-    summary = as_summary(summary)
-    percent = {}
-    for name, f in summary["filters"].items():
-        outside = f["outside3sigma"]
-        percent[name] = [
-            100 * np.array(outside[part], float) for part in ("position", "orientation")
-        ]
-    lines = _plot_pairs(percent, summary, ax, label, lw=0.8)
+    results = results_of(summary)
+    percent = {
+        name: [100 * r.outside3sigma.position, 100 * r.outside3sigma.orientation]
+        for name, r in results.items()
+    }
+    lines = _plot_pairs(percent, results, ax, label, lw=0.8)
     ax.axhline(100 * OUTSIDE, color=GREY, lw=0.8)
     ax.set_ylim(0, max(1.0, ax.get_ylim()[1]))
     ax.set_ylabel("% of errors")
@@ -187,58 +192,60 @@ def plot_outside(summary: Summary | Study, *, ax: Axes, label: Labels | None = N
     return ax
 
 
-def _with_scale(given: Summary | Study) -> Summary:
-    """A summary that has the scale's error. Raises ValueError where the scale is no unknown."""
-    summary = as_summary(given)
-    if not summary["scale_free"]:
+def _with_scale(given: Drawn) -> Results:
+    """Results that have the scale's error. Raises ValueError where the scale is no unknown."""
+    results = results_of(given)
+    if not results.scale_free:
         raise ValueError("the scale of this scenario is measured: there is no error of it to draw")
-    return summary
+    return results
 
 
-def plot_beyond_scale(summary: Summary | Study, *, ax: Axes, label: Labels | None = None) -> Axes:
+def plot_beyond_scale(summary: Drawn, *, ax: Axes, label: Labels | None = None) -> Axes:
     """Mean and median NEES at the one scale of a run that explains all of its poses best.
 
     Where the scale is free; names at the ends of the lines, or those of `label`.
     """
-    summary = _with_scale(summary)
-    numbers = {name: f["beyond_scale"] for name, f in summary["filters"].items()}
-    _plot_means(numbers, summary, ax, label)
-    dof = next(iter(numbers.values()))["dof"]
+    results = _with_scale(summary)
+    _plot_means({name: r.beyond_scale for name, r in results.items()}, results, ax, label)
+    dof = results.reference.beyond_scale.dof
     ax.set_ylabel(f"NEES (ideal {dof - 1} to {dof})")
-    set_title(ax, f"NEES at one scale a run; dotted: median{_of_some(summary)}")
+    set_title(ax, f"NEES at one scale a run; dotted: median{_of_some(results)}")
     return ax
 
 
-def plot_log_scale(summary: Summary | Study, *, ax: Axes, label: Labels | None = None) -> Axes:
+def plot_log_scale(summary: Drawn, *, ax: Axes, label: Labels | None = None) -> Axes:
     """The error of log-scale and what it should be by the σ claimed: medians, as one reversed run,
     which no scale explains, has an error and a σ beyond all others.
 
     Where the scale is free; names at the ends of the lines, or those of `label`.
     """
-    summary = _with_scale(summary)
-    pairs = {}
-    for name, f in summary["filters"].items():
-        sigma = np.array(f["log_scale"]["sigma_median"], float)
-        pairs[name] = f["log_scale"]["error_median"], _MEDIAN_OF_NORMAL * sigma
-    lines = _plot_pairs(pairs, summary, ax, label, lw=0.9, ls=(0, (4, 2)))
+    results = _with_scale(summary)
+    pairs = {
+        name: (r.log_scale.error_median, _MEDIAN_OF_NORMAL * r.log_scale.sigma_median)
+        for name, r in results.items()
+    }
+    lines = _plot_pairs(pairs, results, ax, label, lw=0.9, ls=(0, (4, 2)))
     ax.set_yscale("log")
     name_numbers(ax.yaxis)
     ax.set_ylabel("error of ln(scale)")
-    of = _of_some(summary) or " of the runs"
+    of = _of_some(results) or " of the runs"
     set_title(ax, f"scale: median error{of}\ndashed: by the σ claimed, 0.67 of its median")
     label_ends(ax, lines)
     return ax
 
 
-def _title(summary: Summary) -> str:
+def _title(results: Results) -> str:
     """The verdict on every filter, how many of its runs were lost, and what was run."""
     verdicts = []
-    for name, f in summary["filters"].items():
-        ever = f["lost_ever"][-1]
+    for name, result in results.items():
+        ever = result.lost_ever[-1]
         lost = f"; {ever:.1%} of the runs lost" if ever else ""
-        verdicts.append(f"{name}: {headline(f['verdict'])}{lost}")
-    told = f"{summary['runs']} runs, seed {summary['seed']}; over all steps, [99 % interval]"
-    return "\n".join([*verdicts, f"{summary['scenario']['name']}, {told}"])
+        verdicts.append(f"{name}: {headline(result.verdict)}{lost}")
+    return "\n".join([*verdicts, f"{_world(results)}; over all steps, [99 % interval]"])
+
+
+def _world(results: Results) -> str:
+    return f"{results.scenario['name']}, {results.runs} runs, seed {results.seed}"
 
 
 def _plot_errors(

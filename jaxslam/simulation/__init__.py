@@ -1,28 +1,51 @@
-"""Simulation: scenarios as data, and runs drawn from them."""
+"""Simulation: worlds of pieces, scenarios by name, and runs drawn from them."""
 
-from jaxslam.simulation.pieces import calibration_sigma_of, depth_of, motion_of, sensor_of
+from jaxslam.simulation.draw import as_data, simulate, trajectory_of, with_own
+from jaxslam.simulation.placement import Cloister, FromPrior, GivenPoints, Rays, Ring
 from jaxslam.simulation.run import Room, Run, Sightings, features, gone, sightings
-from jaxslam.simulation.scenario import BUILT_IN, Scenario, as_scenario, scenario
+from jaxslam.simulation.scenario import BUILT_IN, as_scenario, scenario
 from jaxslam.simulation.trajectories import RecordedMotion
-from jaxslam.simulation.world import as_data, simulate, trajectory_of
+from jaxslam.simulation.world import (
+    AbstractPlacement,
+    AbstractTrueCalibration,
+    ConstantCalibration,
+    Drift,
+    Limits,
+    NominalCalibration,
+    WhiteCalibration,
+    World,
+)
+
+Scenario = World
+"""The name of a world in versions before 0.6."""
 
 __all__ = [
     "BUILT_IN",
+    "AbstractPlacement",
+    "AbstractTrueCalibration",
+    "Cloister",
+    "ConstantCalibration",
+    "Drift",
+    "FromPrior",
+    "GivenPoints",
+    "Limits",
+    "NominalCalibration",
+    "Rays",
     "RecordedMotion",
+    "Ring",
     "Room",
     "Run",
     "Scenario",
     "Sightings",
+    "WhiteCalibration",
+    "World",
     "as_data",
     "as_scenario",
-    "calibration_sigma_of",
-    "depth_of",
     "features",
     "gone",
-    "motion_of",
     "scenario",
-    "sensor_of",
     "sightings",
     "simulate",
     "trajectory_of",
+    "with_own",
 ]

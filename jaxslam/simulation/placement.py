@@ -1,108 +1,250 @@
-"""Placement of the landmarks of a simulated world: all at once, or thrown as the camera moves."""
+"""Placement of the landmarks of a simulated world: all at once, or as the camera moves."""
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.geometry import Pose
-from jaxslam.models.camera import Camera, bearing
-from jaxslam.models.sensors import Pinhole
-from jaxslam.simulation.pieces import depth_of
-from jaxslam.simulation.scenario import Scenario
-from jaxslam.simulation.visibility import in_image
+from jaxslam._numerics.arrays import AnyArray, Number, number_field
+from jaxslam.geometry import PLANAR, SPATIAL, Pose
+from jaxslam.models.sensors import AbstractSensor
+from jaxslam.simulation.fields import check_numbers, check_signs
+from jaxslam.simulation.world import LENS, AbstractPlacement, Names, World
 
 
-def _from_prior(s: Scenario, key: Array) -> Float[Array, "l n"]:
-    """Uniform pixels of frame 0, inverse depths from the prior, truncated."""
-    pixel_key, depth_key = jax.random.split(key)
-    depth, count = depth_of(s), s.landmarks
-    pixels = _random_pixels(s, pixel_key)
-    lower = (s.least_inverse_depth - depth.mean) / depth.sigma
-    draws = jax.random.truncated_normal(depth_key, lower, jnp.inf, (count,), pixels.dtype)
-    return _on_rays(Camera(s.focal, s.centre), pixels, depth.mean + depth.sigma * draws)
+def _intervals(intervals: Any) -> AnyArray:
+    pairs = np.asarray(intervals, np.float64)
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or not (pairs[:, 0] < pairs[:, 1]).all():
+        raise ValueError(f"first_pixels needs [low, high] pairs, not {pairs.tolist()}")
+    return pairs
 
 
-def _random_pixels(s: Scenario, key: Array) -> Float[Array, "l p"]:
-    low, high = (jnp.stack(ends) for ends in zip(*s.first_pixels, strict=True))
-    size = (s.landmarks, low.size)
-    return jax.random.uniform(key, size, low.dtype, minval=low, maxval=high)
+def _count() -> Any:
+    return eqx.field(static=True, default=12)
 
 
-def _on_rays(camera: Camera, pixels, inverse_depths) -> Float[Array, "l n"]:
-    """The points of these pixels and 1/z, in the camera."""
-    bearings = jax.vmap(bearing, in_axes=(None, 0))(camera, pixels)
-    return jnp.column_stack([bearings, jnp.ones_like(inverse_depths)]) / inverse_depths[:, None]
+class FromPrior(AbstractPlacement):
+    """Measurements of frame 0 that are uniform, and what they hide (1/z of a camera) drawn from the
+    world's prior, truncated."""
+
+    word: ClassVar[str] = "prior"
+    names: ClassVar[Names] = {
+        "landmarks": "landmarks",
+        "first_pixels": "first",
+        "least_inverse_depth": "least_inverse_depth",
+        **{field: f"through.{place}" for field, place in LENS.items()},
+    }
+    landmarks: int = _count()
+    first: Float[AnyArray, "p 2"] = eqx.field(converter=_intervals, default=((20.0, 620.0),))
+    """Interval of each number of a measurement, pixels of a camera."""
+    least_inverse_depth: Number = 0.001
+    """Of the truth, 1/m."""
+    through: AbstractSensor | None = None
+    """Of whose measurements they are; by default the world's sensor."""
+
+    def __check_init__(self) -> None:
+        check_signs(self, ("landmarks", "least_inverse_depth"))
+
+    def check(self, world: World) -> None:
+        _check_intervals(self.first, self.through or world.sensor)
+
+    def points(self, world: World, key: Array) -> Float[Array, "l n"]:
+        pixel_key, depth_key = jax.random.split(key)
+        sensor = world.sensor if self.through is None else self.through
+        measured, depth = _uniform(self.first, self.landmarks, pixel_key), world.depth
+        lower = (self.least_inverse_depth - depth.mean) / depth.sigma
+        size = (self.landmarks, sensor.hidden)
+        draws = jax.random.truncated_normal(depth_key, lower, jnp.inf, size, measured.dtype)
+        return _located(sensor, measured, depth.mean + depth.sigma * draws)
 
 
-def _on_ring(s: Scenario, key: Array) -> Float[Array, "l n"]:
+def _check_intervals(first: Float[AnyArray, "p 2"], sensor: AbstractSensor) -> None:
+    if len(first) != sensor.size:
+        raise ValueError(
+            f"first_pixels needs {sensor.size} values in a {_world_of(sensor)} world, "
+            f"not {len(first)}"
+        )
+
+
+def _world_of(sensor: AbstractSensor) -> str:
+    return (PLANAR if sensor.point_dim == PLANAR.point_dim else SPATIAL).name
+
+
+def _uniform(intervals: Float[AnyArray, "p 2"], count: int, key: Array) -> Float[Array, "l p"]:
+    low, high = jnp.asarray(intervals).T
+    return jax.random.uniform(key, (count, low.size), low.dtype, minval=low, maxval=high)
+
+
+def _located(
+    sensor: AbstractSensor, measured: Float[Array, "l p"], hidden: Float[Array, "l q"]
+) -> Float[Array, "l n"]:
+    """The points of these measurements, in the sensor's frame."""
+    points, omegas = jax.vmap(sensor.locate)(measured, hidden)
+    return points / omegas[:, None]
+
+
+class Ring(AbstractPlacement):
     """Evenly on a circle about the centre of the nominal path, at the camera's height; in space in
-    turn below, at and above it."""
-    del key
-    # In the plane from x towards z; about y, which points down, the other way round.
-    turn = s.velocity[-1] if s.geometry == "planar" else -s.velocity[4]
-    n = s.world.point_dim
-    # x' = v + ω J x has its fixed point, the centre, at J v / ω: left of a camera that turns
-    # from x towards z.
-    centre = jnp.stack([-s.velocity[n - 1] / turn, s.velocity[0] / turn])
-    angles = 2 * jnp.pi * jnp.arange(s.landmarks, dtype=centre.dtype) / s.landmarks
-    ring = centre + s.ring_radius * jnp.column_stack([jnp.cos(angles), jnp.sin(angles)])
-    if s.geometry == "spatial":
-        level = jnp.arange(s.landmarks, dtype=centre.dtype) % 3 - 1
-        ring = jnp.column_stack([ring[:, 0], level, ring[:, 1]])
-    return ring.astype(centre.dtype)
+    turn below, at and above it by a metre."""
+
+    word: ClassVar[str] = "ring"
+    names: ClassVar[Names] = {"landmarks": "landmarks", "ring_radius": "radius"}
+    landmarks: int = _count()
+    radius: Number = 8.0
+    """m."""
+
+    def __check_init__(self) -> None:
+        check_signs(self, ("landmarks", "radius"))
+
+    def check(self, world: World) -> None:
+        turn = world.velocity[-1 if world.geometry is PLANAR else 4]
+        if isinstance(world.velocity, np.ndarray) and turn == 0:
+            raise ValueError(
+                "placement ring needs a nominal path that turns: velocity[-1], in space "
+                "velocity[4], is 0"
+            )
+
+    def points(self, world: World, key: Array) -> Float[Array, "l n"]:
+        del key
+        velocity, n = jnp.asarray(world.velocity), world.geometry.point_dim
+        # In the plane from x towards z; about y, which points down, the other way round.
+        turn = velocity[-1] if world.geometry is PLANAR else -velocity[4]
+        # x' = v + ω J x has its fixed point, the centre, at J v / ω: left of a camera that turns
+        # from x towards z.
+        centre = jnp.stack([-velocity[n - 1] / turn, velocity[0] / turn])
+        angles = 2 * jnp.pi * jnp.arange(self.landmarks, dtype=centre.dtype) / self.landmarks
+        ring = centre + self.radius * jnp.column_stack([jnp.cos(angles), jnp.sin(angles)])
+        if world.geometry is SPATIAL:
+            level = jnp.arange(self.landmarks, dtype=centre.dtype) % 3 - 1
+            ring = jnp.column_stack([ring[:, 0], level, ring[:, 1]])
+        return ring.astype(centre.dtype)
 
 
-def _in_room(s: Scenario, key: Array) -> Float[Array, "72 3"]:
+class Cloister(AbstractPlacement):
     """The cloister of slamtb: nine points along each wall of a 12 m room, in two rows, 1 m apart
     in height; the camera starts 0.6 m above the lower ones, 5 m from the centre, looking along
     the wall."""
-    del key
-    along = jnp.concatenate([jnp.arange(-4, 5, 2), jnp.arange(-4, 3, 2)])
-    out = jnp.array([6] * 5 + [4] * 4)
-    wall = jnp.column_stack([along, out])  # (east, north) of the northern wall
-    walls = jnp.concatenate([wall, wall[:, ::-1] * jnp.array([-1, 1])])
-    plane = jnp.concatenate([walls, -walls])
-    east, north, up = jnp.concatenate(
-        [jnp.column_stack([plane, jnp.full(len(plane), height)]) for height in (0, 1)]
-    ).T
-    return jnp.column_stack([-(north + 5), 0.6 - up, east]).astype(jnp.result_type(s.rate))
+
+    word: ClassVar[str] = "room"
+    landmarks: ClassVar[int] = 72
+
+    def check(self, world: World) -> None:
+        if world.geometry is not SPATIAL:
+            raise ValueError(
+                f"placement room is for a spatial geometry and {self.landmarks} landmarks, "
+                f"not {world.geometry.name}"
+            )
+
+    def points(self, world: World, key: Array) -> Float[Array, "72 3"]:
+        del key
+        along = jnp.concatenate([jnp.arange(-4, 5, 2), jnp.arange(-4, 3, 2)])
+        out = jnp.array([6] * 5 + [4] * 4)
+        wall = jnp.column_stack([along, out])  # (east, north) of the northern wall
+        walls = jnp.concatenate([wall, wall[:, ::-1] * jnp.array([-1, 1])])
+        plane = jnp.concatenate([walls, -walls])
+        east, north, up = jnp.concatenate(
+            [jnp.column_stack([plane, jnp.full(len(plane), height)]) for height in (0, 1)]
+        ).T
+        return jnp.column_stack([-(north + 5), 0.6 - up, east]).astype(jnp.result_type(world.rate))
 
 
-PLACEMENT = {"prior": _from_prior, "ring": _on_ring, "room": _in_room}
-"""Where landmarks are for a whole run, of a scenario and a key."""
+class GivenPoints(AbstractPlacement):
+    """GivenPoints of your own."""
+
+    word: ClassVar[str] = "points"
+    names: ClassVar[Names] = {"points": "positions"}
+    positions: Float[AnyArray, "l n"] = number_field()
+    """In the camera of frame 0, (x, z) or (x, y, z), m."""
+
+    @property
+    def landmarks(self) -> int:
+        return len(self.positions)
+
+    def check(self, world: World) -> None:
+        check_numbers("points", self.positions)
+        if np.ndim(self.positions) != 2 or np.shape(self.positions)[1] != world.geometry.point_dim:
+            raise ValueError(
+                f"points need {world.geometry.point_dim} numbers each in a {world.geometry.name} "
+                f"world; their shape is {np.shape(self.positions)}"
+            )
+
+    def points(self, world: World, key: Array) -> Float[Array, "l n"]:
+        del world, key
+        return jnp.asarray(self.positions)
 
 
-def thrown(
-    s: Scenario, key: Array, poses: Pose, sensors: Pinhole
-) -> tuple[Float[Array, "frames l n"], Bool[Array, "frames l"]]:
-    """Landmarks that come as others go: of every frame and slot the point, and whether it is new.
+class Rays(AbstractPlacement):
+    """Landmarks that come as others go, which are gone for good: always as many are in view.
 
     Whenever one leaves the picture, another is thrown along a random ray of the camera there, at
     a depth that is uniform in an interval, as OpenVINS' simulator does (Geneva et al., ICRA 2020).
     """
 
-    def frame(points, data):
-        key, pose, sensor, is_first = data
-        seen_from = jax.vmap(pose.inverse().apply)(points)
-        measured = jax.vmap(sensor.measure, in_axes=(0, None))(seen_from, one)
-        new = is_first | ~in_image(s, seen_from, measured)
-        fresh = jax.vmap(pose.apply)(_thrown(s, key, sensor.camera))
-        points = jnp.where(new[:, None], fresh, points)
-        return points, (points, new)
+    word: ClassVar[str] = "rays"
+    names: ClassVar[Names] = {
+        "landmarks": "landmarks",
+        "first_pixels": "first",
+        "depth_range": "depth_range",
+    }
+    landmarks: int = _count()
+    first: Float[AnyArray, "p 2"] = eqx.field(converter=_intervals, default=((20.0, 620.0),))
+    """Interval of each pixel coordinate at first sight."""
+    depth_range: Float[AnyArray, " 2"] = number_field(default=(1.0, 6.0))
+    """Least and greatest depth z, m."""
 
-    frames = s.steps + 1
-    keys, is_first = jax.random.split(key, frames), jnp.arange(frames) == 0
-    one = jnp.ones((), jnp.result_type(s.rate))
-    nowhere = jnp.ones((s.landmarks, s.world.point_dim), one.dtype)
-    return jax.lax.scan(frame, nowhere, (keys, poses, sensors, is_first))[1]
+    def __check_init__(self) -> None:
+        check_signs(self, ("landmarks", "depth_range"))
+        given = self.depth_range
+        if np.shape(given) != (2,) or (isinstance(given, np.ndarray) and given[0] >= given[1]):
+            raise ValueError(
+                f"depth_range needs a least and a greatest depth, not {self.depth_range}"
+            )
+
+    def check(self, world: World) -> None:
+        if world.sensor.hidden != 1:
+            raise ValueError(
+                f"placement rays is for a camera, not for a {type(world.sensor).__name__}"
+            )
+        _check_intervals(self.first, world.sensor)
+        if world.limits.in_view:
+            raise ValueError("in_view: not with placement rays")
+        for field in ("first_frame", *world.limits.of_a_frame):
+            if getattr(world.limits, field):
+                raise ValueError(f"{field}: placement rays has no limits; use 0")
+        if world.beacons:
+            raise ValueError("beacons: not with placement rays, whose landmarks go")
+
+    def along(
+        self, world: World, key: Array, poses: Pose, sensors: AbstractSensor
+    ) -> tuple[Float[Array, "frames l n"], Bool[Array, "frames l"]]:
+        def frame(points, data):
+            key, pose, sensor, is_first = data
+            seen_from = jax.vmap(pose.inverse().apply)(points)
+            measured = jax.vmap(sensor.measure, in_axes=(0, None))(seen_from, one)
+            seen = jax.vmap(sensor.visible, in_axes=(0, 0, None))(seen_from, measured, world.view)
+            new = is_first | ~seen
+            fresh = jax.vmap(pose.apply)(self._thrown(key, sensor))
+            points = jnp.where(new[:, None], fresh, points)
+            return points, (points, new)
+
+        frames = world.steps + 1
+        keys, is_first = jax.random.split(key, frames), jnp.arange(frames) == 0
+        one = jnp.ones((), jnp.result_type(world.rate))
+        nowhere = jnp.ones((self.landmarks, world.geometry.point_dim), one.dtype)
+        return jax.lax.scan(frame, nowhere, (keys, poses, sensors, is_first))[1]
+
+    def _thrown(self, key: Array, sensor: AbstractSensor) -> Float[Array, "l n"]:
+        """GivenPoints along random rays of a camera, in that."""
+        pixel_key, depth_key = jax.random.split(key)
+        pixels = _uniform(self.first, self.landmarks, pixel_key)
+        least, greatest = self.depth_range
+        share = jax.random.uniform(depth_key, (self.landmarks, 1), pixels.dtype)
+        return _located(sensor, pixels, 1 / (least + (greatest - least) * share))
 
 
-def _thrown(s: Scenario, key: Array, camera: Camera) -> Float[Array, "l n"]:
-    """Points along random rays of a camera, in that."""
-    pixel_key, depth_key = jax.random.split(key)
-    pixels, (least, greatest) = _random_pixels(s, pixel_key), s.depth_range
-    share = jax.random.uniform(depth_key, (s.landmarks,), pixels.dtype)
-    depths = least + (greatest - least) * share
-    return _on_rays(camera, pixels, 1 / depths)
+PLACEMENTS = {kind.word: kind for kind in (FromPrior, Ring, Cloister, Rays, GivenPoints)}

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.geometry import Pose
-from jaxslam.models.camera import Camera
 from jaxslam.models.motion import Control
-from jaxslam.models.observations import Capacity, Features
+from jaxslam.models.observations import Capacity, Features, PriorMap
+from jaxslam.models.sensors import AbstractSensor
 
 
 class Run(eqx.Module):
@@ -34,12 +34,20 @@ class Run(eqx.Module):
     """Which points are measured."""
     controls: Control
     """The motion model's input of every step: seconds, or a reading."""
-    cameras: Camera
-    """The true camera of every frame."""
+    sensors: AbstractSensor
+    """The true sensor of every frame."""
     new: Bool[Array, "frames landmarks"] | None = None
     """Which of the visible are seen for the first time, where slots are used again."""
     identity: Int[Array, "frames landmarks"] | None = None
     """Which point each slot stands for, where one that comes back is a new landmark."""
+    known: PriorMap | None = None
+    """What is known of landmarks before frame 0: of surveyed beacons."""
+
+    @property
+    def beacons(self) -> Bool[Array, " landmarks"]:
+        """Which landmarks are known before frame 0."""
+        none = jnp.zeros(self.visible.shape[-1], bool)
+        return none if self.known is None else none.at[self.known.slots].set(True)
 
     @property
     def points_by_frame(self) -> Float[Array, "frames landmarks n"]:
@@ -78,7 +86,7 @@ def sightings(run: Run) -> Sightings:
     """Capacities that hold this run exactly."""
     known, new = _known_and_new(run)
     return Sightings(
-        landmarks=jnp.sum(jnp.any(run.visible, axis=0)),
+        landmarks=jnp.sum(jnp.any(run.visible, axis=0) | run.beacons),
         first=jnp.sum(run.visible[0]),
         known=jnp.max(jnp.sum(known, axis=1), initial=0),
         new=jnp.max(jnp.sum(new[1:], axis=1), initial=0),
@@ -88,7 +96,7 @@ def sightings(run: Run) -> Sightings:
 def features(run: Run, capacity: Room) -> tuple[Features, Features, Features]:
     """A run's measurements for the filter: new in frame 0; known and new of every later frame.
 
-    Slot i of the filter is point i of the run.
+    Slot i of the filter is point i of the run. Of what is known before frame 0, frame 0 has none.
     """
     known, new = _known_and_new(run)
     first = _picked(new[0], run.measured[0], capacity.first)
@@ -113,7 +121,7 @@ def gone(run: Run, capacity: Room) -> Bool[Array, "steps slots"] | None:
 def _known_and_new(run: Run):
     if run.new is not None:
         return run.visible & ~run.new, run.visible & run.new
-    before = jnp.cumsum(run.visible, axis=0) - run.visible > 0
+    before = (jnp.cumsum(run.visible, axis=0) - run.visible > 0) | run.beacons
     return run.visible & before, run.visible & ~before
 
 
@@ -124,12 +132,18 @@ def _picked(mask, measured, count: int) -> Features:
 
 
 def in_order_of_appearance(run: Run) -> Run:
-    """Landmarks that are never seen come last, so that a filter needs no slots for them."""
+    """Landmarks that are never seen come last, so that a filter needs no slots for them, and those
+    that are known before frame 0 first."""
     never = run.visible.shape[0]
     seen = jnp.any(run.visible, axis=0)
-    order = jnp.argsort(jnp.where(seen, jnp.argmax(run.visible, axis=0), never), stable=True)
+    first = jnp.where(seen, jnp.argmax(run.visible, axis=0), never)
+    order = jnp.argsort(jnp.where(run.beacons, -1, first), stable=True)
+    known = run.known
+    if known is not None:
+        known = replace(known, slots=jnp.argsort(order)[known.slots])
     return replace(
         run,
+        known=known,
         points=run.points[order],
         measured=run.measured[:, order],
         visible=run.visible[:, order],

@@ -1,4 +1,4 @@
-"""The part of a world that is measured: what a sensor sees, up to a limit."""
+"""The part of what is visible that is measured, where a world limits it."""
 
 from __future__ import annotations
 
@@ -6,30 +6,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from jaxslam.models.sensors import AbstractSensor, Pinhole
-from jaxslam.simulation.scenario import Scenario
+from jaxslam.simulation.world import Limits
 
 
-def in_image(scenario: Scenario, points, pixels) -> Bool[Array, " l"]:
-    """Whether a point is in front of the camera and inside the picture."""
-    inside = jnp.all((pixels >= 0) & (pixels < jnp.stack(scenario.image)), axis=-1)
-    return inside & (points[:, -1] > scenario.visible_depth)
-
-
-def visible(s: Scenario, sensor: AbstractSensor, points, measured) -> Bool[Array, " l"]:
-    """A camera sees what is in its picture; another sensor what is in its range."""
-    if isinstance(sensor, Pinhole):
-        return in_image(s, points, measured)
-    (least, greatest), distance = s.range, jnp.linalg.norm(points, axis=-1)
-    in_range = (distance >= least) & (distance <= greatest)
-    return in_range & jax.vmap(sensor.possible)(points)
-
-
-def limited(scenario: Scenario, key: Array, visible: Bool[Array, "frames l"]):
-    """No more landmarks in a frame than the scenario allows, drawn at random."""
+def limited(limits: Limits, key: Array, visible: Bool[Array, "frames l"]):
+    """No more landmarks in a frame than the limits allow, drawn at random."""
     frames, count = visible.shape
-    first, new = scenario.first_landmarks or count, scenario.new_landmarks or count
-    known = scenario.known_landmarks or count
+    first, new = limits.first_landmarks or count, limits.new_landmarks or count
+    known = limits.known_landmarks or count
     if min(first, new, known) >= count:
         return visible
 

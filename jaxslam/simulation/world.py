@@ -1,195 +1,423 @@
-"""One simulated run: a true trajectory, true landmarks, and the noisy pixels of every frame."""
+"""A simulated world: its pieces, which are the truth of what filters have models of.
+
+Angles, axes and controls are those of `jaxslam.geometry` and `jaxslam.models.motion`.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import dataclasses
+from importlib import import_module
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.typing import DTypeLike
-from jaxtyping import Array
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float
 
-from jaxslam._numerics.arrays import cast
-from jaxslam.geometry import Pose, identity, retract
-from jaxslam.models.camera import Camera
-from jaxslam.models.motion import AbstractMotion, Control
-from jaxslam.models.sensors import AbstractSensor, Pinhole
-from jaxslam.simulation.pieces import calibration_sigma_of, motion_of, sensor_of
-from jaxslam.simulation.placement import PLACEMENT, thrown
-from jaxslam.simulation.run import Run, in_order_of_appearance, in_shared_slots
-from jaxslam.simulation.scenario import Scenario, as_scenario
-from jaxslam.simulation.trajectories import RecordedMotion, find, sampled
-from jaxslam.simulation.visibility import limited, visible
+from jaxslam._numerics.arrays import (
+    AnyArray,
+    Number,
+    check_shape,
+    number_field,
+    numbers,
+    optional_numbers,
+)
+from jaxslam._runtime.lookup import suggestion
+from jaxslam.geometry import SPATIAL, Geometry, Pose
+from jaxslam.models.calibration import TREATMENTS
+from jaxslam.models.depth import InverseDepth
+from jaxslam.models.motion import AbstractMotion, ConstantVelocity, Odometry
+from jaxslam.models.sensors import AbstractSensor, FieldOfView, Pinhole, Position, RangeBearing
+from jaxslam.simulation.fields import FIELDS, Value, check_signs
+from jaxslam.simulation.run import Run
+from jaxslam.simulation.trajectories import RecordedMotion
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Names = dict[str, str]
+"""Flat fields of a scenario, and where in a piece they are."""
+MOTIONS: dict[str, tuple[type[AbstractMotion], Names]] = {
+    "velocity": (
+        ConstantVelocity,
+        {
+            "acceleration_sigma": "noise_sigma",
+            "velocity": "velocity",
+            "velocity_sigma": "velocity_sigma",
+        },
+    ),
+    "odometry": (Odometry, {"odometry_sigma": "noise_sigma"}),
+}
+LENS = {"focal": "camera.focal", "centre": "camera.centre", "pixel_sigma": "sigma"}
+SENSORS: dict[str, tuple[type[AbstractSensor], Names]] = {
+    "camera": (Pinhole, LENS),
+    "position": (Position, {"position_sigma": "sigma", "point_dim": "point_dim"}),
+    "range_bearing": (RangeBearing, {"range_bearing_sigma": "sigma"}),
+}
 
 
-def as_data(scenario: Scenario, dtype: DTypeLike | None = None) -> Scenario:
-    """The scenario with its numbers as arrays and without its name: what a program is made for."""
-    if any(isinstance(number, jax.Array) for number in jax.tree.leaves(scenario)):
-        return scenario
-    dtype = dtype or jnp.result_type(float)
-    unnamed = replace(scenario, name="", calibration="known")
-    return jax.tree.map(lambda number: jnp.asarray(number, dtype), unnamed)
+class AbstractPlacement(eqx.Module):
+    """Where landmarks are. One of your own is a class with `landmarks` and `points`."""
+
+    word: ClassVar[str] = ""
+    """Its name in scenarios."""
+    names: ClassVar[Names] = {}
+    """Its flat fields there, and where they are in it."""
+
+    if TYPE_CHECKING:  # a field or a property of each placement
+
+        @property
+        def landmarks(self) -> int:
+            """How many there are."""
+
+    def check(self, world: World) -> None:
+        """Raise ValueError for a world in which landmarks cannot be placed so."""
+
+    def points(self, world: World, key: Array) -> Float[Array, "l n"]:
+        """Where they are for a whole run, in the camera of frame 0, m."""
+        raise NotImplementedError(f"{type(self).__name__} does not say where its points are")
+
+    def along(
+        self, world: World, key: Array, poses: Pose, sensors: AbstractSensor
+    ) -> tuple[Float[Array, "*frames l n"], Bool[Array, "frames l"] | None]:
+        """The points, and None; or, where others come along a path, the points in each slot in
+        every frame, and which are new."""
+        del poses, sensors
+        return self.points(world, key), None
 
 
-def simulate(
-    scenario: Scenario | str,
-    key: Array,
-    dtype: DTypeLike | None = None,
-    *,
-    motion: AbstractMotion | RecordedMotion | None = None,
-    sensor: AbstractSensor | None = None,
-) -> Run:
-    """Draw one run: a pure function of the scenario's numbers and of the key (`jax.random.key`).
+class AbstractTrueCalibration(eqx.Module):
+    """How far the true calibration is off the nominal one: δ, of which filters are told σ."""
 
-    The truth is drawn from the prior of the filters of `make_filters`, or moves along the
-    scenario's trajectory; or it moves and is measured as models of one's own say, in the world of
-    the scenario. Raises ValueError for a sensor that landmarks of this placement cannot have.
+    word: ClassVar[str] = ""
+    sigma: eqx.AbstractVar[Float[AnyArray, " k"]]
+
+    def deltas(self, key: Array, frames: int) -> Float[Array, "frames k"]:
+        """δ of every frame, in σ."""
+        raise NotImplementedError(f"{type(self).__name__} does not say how it is drawn")
+
+    def sensors(self, nominal: AbstractSensor, key: Array, frames: int) -> AbstractSensor:
+        """The true sensor of every frame. Raises ValueError for one without a calibration."""
+        return jax.vmap(nominal.perturbed)(self.deltas(key, frames) * jnp.asarray(self.sigma))
+
+
+class NominalCalibration(AbstractTrueCalibration):
+    """The true calibration is the nominal one."""
+
+    word: ClassVar[str] = "nominal"
+    sigma: Float[AnyArray, " k"] = number_field(default=())
+    """What filters are told: of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
+
+    def sensors(self, nominal: AbstractSensor, key: Array, frames: int) -> AbstractSensor:
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (frames, *jnp.shape(x))), nominal)
+
+
+class WhiteCalibration(AbstractTrueCalibration):
+    """Drawn anew in every frame (P15)."""
+
+    word: ClassVar[str] = "white"
+    sigma: Float[AnyArray, " k"] = number_field()
+    """Of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
+
+    def deltas(self, key: Array, frames: int) -> Float[Array, "frames k"]:
+        sigma = jnp.asarray(self.sigma)
+        return jax.random.normal(key, (frames, sigma.size), sigma.dtype)
+
+
+class ConstantCalibration(AbstractTrueCalibration):
+    """Drawn once a run."""
+
+    word: ClassVar[str] = "constant"
+    sigma: Float[AnyArray, " k"] = number_field()
+    """Of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
+
+    def deltas(self, key: Array, frames: int) -> Float[Array, "frames k"]:
+        sigma = jnp.asarray(self.sigma)
+        return jnp.tile(jax.random.normal(key, (sigma.size,), sigma.dtype), (frames, 1))
+
+
+CALIBRATIONS = {
+    kind.word: kind for kind in (NominalCalibration, WhiteCalibration, ConstantCalibration)
+}
+
+
+def _count() -> Any:
+    return eqx.field(static=True, default=0)
+
+
+class Limits(eqx.Module):
+    """How many of the visible landmarks are measured; 0 is no limit."""
+
+    names: ClassVar[Names] = {
+        x: x
+        for x in (
+            "first_frame", "first_landmarks", "new_landmarks", "known_landmarks", "in_view"
+        )
+    }  # fmt: skip
+    first_frame: int = _count()
+    """Before it nothing is measured."""
+    first_landmarks: int = _count()
+    """The most that are new in frame 0."""
+    new_landmarks: int = _count()
+    """The most that are new in a later frame."""
+    known_landmarks: int = _count()
+    """The most that are measured again in a frame, drawn at random."""
+    in_view: int = _count()
+    """The most that are measured at once, where one that leaves the view is a new one when it is
+    seen again: a filter needs slots for no more."""
+
+    def __check_init__(self) -> None:
+        check_signs(self, (), self.names)
+        if self.in_view and self.of_a_frame:
+            raise ValueError(f"in_view: not with {', '.join(self.of_a_frame)}")
+
+    @property
+    def of_a_frame(self) -> list[str]:
+        """The fields that limit single frames."""
+        fields = ("first_landmarks", "new_landmarks", "known_landmarks")
+        return [field for field in fields if getattr(self, field)]
+
+
+class Drift(eqx.Module):
+    """Errors of a landmark's measurements that stay from frame to frame, of which no filter is
+    told: `b ← ρ b + √(1 − ρ²) σ n` with ρ = exp(−1/frames)."""
+
+    names: ClassVar[Names] = {
+        "drift_sigma": "sigma",
+        "drift_frames": "frames",
+        "drift_wrong": "wrong",
+    }
+    sigma: Number
+    """In the unit of the measurement: pixels, m, rad."""
+    frames: Number = 20.0
+    """After which 1/e is left."""
+    wrong: Number = 0.0
+    """Share of the landmarks of which σ is ten times as large."""
+
+    def errors(self, key: Array, measured: Float[Array, "f l p"]) -> Float[Array, "f l p"]:
+        """Of every measurement."""
+        first_key, key, share_key = jax.random.split(key, 3)
+        stays = jnp.exp(-1 / jnp.asarray(self.frames, measured.dtype))
+        noises = jax.random.normal(key, measured.shape, measured.dtype)
+
+        def later(drift, noise):
+            return stays * drift + jnp.sqrt(1 - stays**2) * noise, drift
+
+        start = jax.random.normal(first_key, measured.shape[1:], measured.dtype)
+        _, drifts = jax.lax.scan(later, start, noises)
+        wrong = jax.random.uniform(share_key, measured.shape[1:2]) < self.wrong
+        return self.sigma * jnp.where(wrong, 10.0, 1.0)[:, None] * drifts
+
+
+KINDS = {"motion": AbstractMotion, "sensor": AbstractSensor, "placement": AbstractPlacement}
+"""What may be of one's own."""
+
+
+def check_kind(name: str, piece: Any) -> None:
+    """Raise ValueError unless a piece is one of its kind."""
+    if not isinstance(piece, KINDS[name]):
+        raise ValueError(f"a world's {name} is an {KINDS[name].__name__}, not {piece!r}")
+
+
+class World(eqx.Module):
+    """What is true: the pieces of a filter, which draw here what a filter has to estimate.
+
+    Lengths are metres, angles radians, times seconds, pixels pixels. Camera axes are x right,
+    y down, z ahead; the plane has x and z, and its angle θ turns from x towards z. A point is
+    (x, z) or (x, y, z), a velocity or the reading of an odometry (x, z, θ) or
+    (x, y, z, about x, about y, about z). The base frame B is the camera of frame 0.
+
+    - `motion`: how the camera moves and what a filter is told of it (`AbstractMotion`);
+    - `sensor`: what is measured, of nominal calibration, with its noise (`AbstractSensor`);
+    - `placement`: where landmarks are (`FromPrior`, `Ring`, `Cloister`, `Rays`, `GivenPoints`);
+    - `calibration`: how far the true one is off, pixels (`NominalCalibration`,
+      `WhiteCalibration`, `ConstantCalibration`);
+    - `depth`: the prior on 1/z, 1/m;
+    - `steps`: steps of a run after frame 0; `rate`: frames per second;
+    - `velocity`: the nominal one in the camera's axes, m/s and rad/s; by default the motion's mean
+      or, for a motion without one, 1.2 m/s ahead in a circle of 4 m;
+    - `trajectory`: a recorded path, or the name of its file; `still_frames`: steps in which the
+      camera first stands still;
+    - `view`: what the sensor sees (least depth and distances, m; picture, pixels); `limits`: how
+      much of that is measured;
+    - `drift`: errors of landmarks that stay; `beacons`: how many landmarks are surveyed, with
+      `beacon_sigma`, m, of each coordinate;
+    - `treatment`: how filters treat the calibration by default (`known`, `white`, `consider`,
+      `estimated`); `name`: for tables.
+
+    The flat fields of `jaxslam.scenario` are attributes too: `world.pixel_sigma`. Numbers are
+    leaves: worlds that differ in nothing else share their compiled programs. Raises ValueError for
+    pieces that do not fit one another.
     """
-    scenario = as_scenario(scenario)
-    motion = trajectory_of(scenario, dtype) if motion is None else motion
-    s = as_data(scenario, dtype)
-    motion_key, world_key, camera_key, pixel_key = jax.random.split(key, 4)
-    poses, controls = _path(s, motion, motion_key)
-    sensor = sensor_of(s) if sensor is None else sensor
-    cameras, sensors = _sensors(s, sensor, camera_key)
-    if s.placement == "rays":
-        if not isinstance(sensors, Pinhole):
-            raise ValueError(f"placement rays is for a Pinhole, not for {type(sensor).__name__}")
-        points, new = thrown(s, world_key, poses, sensors)
-    else:
-        points, new = PLACEMENT[s.placement](s, world_key), None
-    one = jnp.ones((), points.dtype)
 
-    def frame(pose: Pose, sensor, points):
-        seen_from = jax.vmap(pose.inverse().apply)(points)
-        measured = jax.vmap(sensor.measure, in_axes=(0, None))(seen_from, one)
-        return measured, visible(s, sensor, seen_from, measured)
+    names: ClassVar[tuple[str, ...]] = (
+        "name", "rate", "steps", "velocity", "still_frames", "beacons", "beacon_sigma"
+    )  # fmt: skip
+    """Flat fields that it has by the same name."""
+    motion: AbstractMotion
+    sensor: AbstractSensor
+    placement: AbstractPlacement
+    calibration: AbstractTrueCalibration = NominalCalibration()
+    depth: InverseDepth = InverseDepth.beyond(3.0)
+    steps: int = eqx.field(static=True, default=100)
+    rate: Number = 10.0
+    velocity: Float[AnyArray, " t"] = eqx.field(default=None, converter=optional_numbers)
+    trajectory: str | RecordedMotion | None = None
+    still_frames: int = _count()
+    view: FieldOfView = eqx.field(default=None)
+    limits: Limits = Limits()
+    drift: Drift | None = None
+    beacons: int = _count()
+    beacon_sigma: Number = 0.1
+    treatment: str = eqx.field(static=True, default="known")
+    name: str = eqx.field(static=True, default="world")
 
-    every = jax.vmap(frame, in_axes=(0, 0, None if new is None else 0))
-    measured, seen = every(poses, sensors, points)
-    seen &= jnp.arange(s.steps + 1)[:, None] >= s.first_frame
-    # A key of its own, so that a limit changes nothing else of a run.
-    seen = limited(s, jax.random.fold_in(pixel_key, 1), seen)
-    noise = jax.random.normal(pixel_key, measured.shape, measured.dtype)
-    measured += sensor.sigma * noise + _drift(s, jax.random.fold_in(pixel_key, 2), measured)
-    run = Run(poses, points, measured, seen, controls, cameras, new)
-    if s.in_view:
-        return in_shared_slots(run, s.in_view)
-    return in_order_of_appearance(run) if new is None else run
+    def __post_init__(self) -> None:
+        for name in KINDS:
+            check_kind(name, getattr(self, name))
+        if self.view is None:
+            self.view = self.sensor.view
+        if self.velocity is None:
+            ahead = {3: (0.0, 1.2, 0.3), 6: (0.0, 0.0, 1.2, 0.0, -0.3, 0.0)}
+            known = self.motion.start()[0] if self.motion.has_velocity else None
+            self.velocity = numbers(ahead[self.geometry.tangent_dim] if known is None else known)
 
+    def __check_init__(self) -> None:
+        check_signs(self, ("steps", "rate", "beacon_sigma"), ("still_frames", "beacons"))
+        geometry, sensor = self.geometry, type(self.sensor).__name__
+        check_shape("the velocity of a world", self.velocity, (geometry.tangent_dim,))
+        if self.sensor.point_dim != geometry.point_dim:
+            raise ValueError(
+                f"the sensor {sensor} is not for a {geometry.name} world, in which "
+                f"{type(self.motion).__name__} moves"
+            )
+        if self.treatment not in TREATMENTS:
+            raise ValueError(f"calibration is {self.treatment!r}; known: {', '.join(TREATMENTS)}")
+        if self.treatment != "known" and not np.size(self.calibration.sigma):
+            raise ValueError(f"calibration: a {sensor} sensor has none; use known")
+        if self.reads and (self.still_frames or self.trajectory):
+            field = "still_frames" if self.still_frames else "trajectory"
+            raise ValueError(f"{field}: odometry has the nominal motion; leave it out")
+        if self.trajectory and geometry is not SPATIAL:
+            raise ValueError(f"trajectory is for a spatial world, not a {geometry.name} one")
+        if self.beacons > self.placement.landmarks or (self.beacons and self.limits.in_view):
+            raise ValueError(
+                f"beacons: at most the {self.placement.landmarks} landmarks are accepted, and "
+                "none with in_view"
+            )
+        self.placement.check(self)
 
-def _drift(s: Scenario, key: Array, measured: Array) -> Array | float:
-    """What stays of the errors of a landmark from frame to frame, `b ← ρ b + √(1 − ρ²) σ n`; a
-    share of the landmarks has ten times as much."""
-    if not s.drift_sigma:
-        return 0.0
-    first_key, key, share_key = jax.random.split(key, 3)
-    stays = jnp.exp(-1 / jnp.asarray(s.drift_frames, measured.dtype))
-    noises = jax.random.normal(key, measured.shape, measured.dtype)
+    @property
+    def geometry(self) -> Geometry:
+        """Planar or spatial."""
+        return self.motion.geometry
 
-    def later(drift, noise):
-        return stays * drift + jnp.sqrt(1 - stays**2) * noise, drift
+    @property
+    def landmarks(self) -> int:
+        """How many there are, or are at once."""
+        return self.placement.landmarks
 
-    start = jax.random.normal(first_key, measured.shape[1:], measured.dtype)
-    _, drifts = jax.lax.scan(later, start, noises)
-    wrong = jax.random.uniform(share_key, measured.shape[1:2]) < s.drift_wrong
-    return s.drift_sigma * jnp.where(wrong, 10.0, 1.0)[:, None] * drifts
+    @property
+    def reads(self) -> bool:
+        """Whether the truth is the nominal motion, which filters are given as it is read."""
+        return type(self.motion).reading is not AbstractMotion.reading
 
+    @property
+    def scale_free(self) -> bool:
+        """Whether nothing is measured or given in metres: only priors know the scale."""
+        return self.motion.has_velocity and self.sensor.hidden == 1 and not self.beacons
 
-def trajectory_of(scenario: Scenario, dtype: DTypeLike | None = None) -> RecordedMotion | None:
-    """Along what the scenario's camera moves, where that is recorded.
+    def plot(self, run: Run | int = 0, path: str | Path | None = None) -> Figure:
+        """The world from above: the true path of a run, or of that of a seed, its landmarks, and
+        which of them are measured in the last frame; written to `path` where one is given."""
+        return import_module("jaxslam.plots").plot_world(self, run, path)
 
-    Raises ValueError where its file is none, or has no piece that is long enough.
-    """
-    if not scenario.trajectory:
-        return None
-    moving = scenario.steps - min(scenario.still_frames, scenario.steps)
-    path = find(scenario.trajectory)
-    return cast(sampled(path, float(scenario.rate), moving), dtype or jnp.result_type(float))
+    def to_dict(self) -> dict[str, Value]:
+        """The flat fields of a scenario, as files have them: words, numbers and lists.
 
+        A piece of one's own is a table of its `type` and its numbers.
+        """
+        return {field: _plain(value) for field, value in self.fields.items()}
 
-def _path(
-    s: Scenario, motion: AbstractMotion | RecordedMotion | None, key: Array
-) -> tuple[Pose, Control]:
-    """The true poses, and what the filter is given at every step."""
-    if isinstance(motion, RecordedMotion):
-        return _recorded(s, motion, key)
-    if motion is None and s.motion == "odometry":
-        return _by_odometry(s, key)
-    return _by_noise(s, motion_of(s) if motion is None else motion, key)
+    @property
+    def fields(self) -> dict[str, Value]:
+        """The flat fields with which `jaxslam.scenario` makes this world; those that it has no use
+        for are their defaults."""
+        found: dict[str, Value] = {name: field.default for name, field in FIELDS.items()}
+        for size, names in _SIZED.items():
+            found |= {name: found[name][:1] * getattr(self.geometry, size) for name in names}
+        own = {
+            "velocity_sigma": (0.0,) * self.geometry.tangent_dim,
+            "geometry": self.geometry.name,
+            "calibration": self.treatment,
+            "true_calibration": self.calibration.word,
+            "landmarks": self.landmarks,
+        }
+        found |= own | _of(self, {name: name for name in self.names})
+        for kind, table in (("motion", MOTIONS), ("sensor", SENSORS)):
+            piece = getattr(self, kind)
+            words = [word for word, (made, _) in table.items() if type(piece) is made]
+            found[kind] = words[0] if words else piece
+            found |= _of(piece, table[words[0]][1]) if words else {}
+        found["placement"] = self.placement.word or self.placement
+        for piece in (self.placement, self.view, self.limits, self.drift):
+            found |= {} if piece is None else _of(piece, piece.names)
+        found["trajectory"] = self.trajectory or ""
+        sigma = _plain(self.calibration.sigma)
+        if sigma:
+            found |= {"focal_sigma": sigma[0], "centre_sigma": sigma[-1]}
+        return found | _of_depth(self.depth)
 
-
-def _by_noise(s: Scenario, motion: AbstractMotion, key: Array) -> tuple[Pose, Control]:
-    """The start and the noises of a motion model from the filter's prior (P8, P9).
-
-    In frames in which the camera stands still, neither pose nor variables move.
-    """
-    start_key, noise_key = jax.random.split(key)
-    sigma, dtype = jnp.asarray(motion.noise_sigma), jnp.result_type(s.rate)
-    mean, root = motion.start()
-    start = retract(mean, root @ jax.random.normal(start_key, root.shape[:1], dtype))
-    still = min(s.still_frames, s.steps)
-    noises = sigma * jax.random.normal(noise_key, (s.steps - still, sigma.size), dtype)
-    control = motion.nominal_control(jnp.stack(s.velocity), 1 / s.rate)
-
-    def move(carry, noise):
-        pose, variables = carry
-        pose = (pose @ motion.displacement(variables, noise, control)).normalize()
-        return (pose, motion.next(variables, noise, control)), pose
-
-    origin = identity(motion.geometry, dtype)
-    _, poses = jax.lax.scan(move, (origin, start), noises)
-    return _with_start(origin, poses, still), _every_step(s, control)
-
-
-def _recorded(s: Scenario, trajectory: RecordedMotion, key: Array) -> tuple[Pose, Control]:
-    """A recorded path from a random start, after the frames in which the camera stands still."""
-    still = min(s.still_frames, s.steps)
-    if trajectory.steps != s.steps - still:
-        raise ValueError(f"a trajectory for {trajectory.steps} steps, not {s.steps - still}")
-    poses = jax.tree.map(lambda x: x[1:], trajectory.run(key))
-    control = motion_of(s).nominal_control(jnp.stack(s.velocity), 1 / s.rate)
-    origin = identity(s.world, jnp.result_type(s.rate))
-    return _with_start(origin, poses, still), _every_step(s, control)
-
-
-def _every_step(s: Scenario, control: Control) -> Control:
-    return jax.tree.map(lambda x: jnp.full((s.steps, *x.shape), x), control)
-
-
-def _by_odometry(s: Scenario, key: Array) -> tuple[Pose, Array]:
-    """The nominal motion exactly; each step is read with an error, `u` = truth − w."""
-    motion = motion_of(s)
-    geometry, sigma = motion.geometry, motion.noise_sigma
-    nominal = jnp.stack(s.velocity) / s.rate
-    step = motion.displacement((), jnp.zeros_like(nominal), nominal)
-    noise = jax.random.normal(key, (s.steps, geometry.tangent_dim), sigma.dtype)
-
-    def move(pose, _):
-        pose = (pose @ step).normalize()
-        return pose, pose
-
-    start = identity(geometry, sigma.dtype)
-    _, poses = jax.lax.scan(move, start, length=s.steps)
-    return _with_start(start, poses), nominal - sigma * noise
+    def __getattr__(self, name: str) -> Value:
+        """A flat field by its name. Raises AttributeError for another."""
+        if name in FIELDS and not hasattr(type(self), name) and name not in _PIECES:
+            return self.fields[name]
+        raise AttributeError(f"a {type(self).__name__} has no {name!r}{suggestion(name, FIELDS)}")
 
 
-def _with_start(start: Pose, poses: Pose, still: int = 0) -> Pose:
-    """The start, the same again for so many frames, and the poses."""
-    starts = jax.tree.map(lambda x: jnp.broadcast_to(x, (1 + still, *x.shape)), start)
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), starts, poses)
+_PIECES = {field.name for field in dataclasses.fields(World)}
+_SIZED = {
+    "tangent_dim": ("acceleration_sigma", "odometry_sigma"),
+    "pixel_dim": ("first_pixels", "image", "focal", "centre"),
+}
+"""Fields whose defaults are as many in every world, the number of which depends on it."""
 
 
-def _sensors(s: Scenario, sensor: AbstractSensor, key: Array) -> tuple[Camera, AbstractSensor]:
-    """The true camera and the true sensor of every frame."""
-    frames, sigma = s.steps + 1, calibration_sigma_of(s)
-    if s.true_calibration == "nominal":
-        deltas = jnp.zeros((frames, sigma.size), sigma.dtype)
-    elif s.true_calibration == "constant":
-        deltas = jnp.tile(jax.random.normal(key, (sigma.size,), sigma.dtype), (frames, 1))
-    else:
-        deltas = jax.random.normal(key, (frames, sigma.size), sigma.dtype)
-    cameras = jax.vmap(Camera(s.focal, s.centre).perturbed)(deltas * sigma)
-    if isinstance(sensor, Pinhole):
-        return cameras, jax.vmap(lambda camera: replace(sensor, camera=camera))(cameras)
-    return cameras, jax.tree.map(lambda x: jnp.broadcast_to(x, (frames, *x.shape)), sensor)
+def _of(piece: Any, names: Names) -> dict[str, Value]:
+    """The flat fields of a piece, of those that it has."""
+    found = {x: attrgetter(place)(piece) for x, place in names.items() if x in FIELDS}
+    return {field: _numbers_of(value) for field, value in found.items() if value is not None}
+
+
+def _numbers_of(value: Any) -> Value:
+    """Arrays of known numbers as tuples, which compare and print."""
+    if isinstance(value, np.ndarray) or (eqx.is_array(value) and not isinstance(value, Tracer)):
+        value = np.asarray(value).tolist()
+    return tuple(map(_numbers_of, value)) if isinstance(value, list) else value
+
+
+def _of_depth(depth: InverseDepth) -> dict[str, Value]:
+    """The prior on 1/z, of d_min where it is that of one to within rounding."""
+    mean, sigma, unit = (_numbers_of(x) for x in (depth.mean, depth.sigma, depth.unit))
+    found: dict[str, Value] = {"scale_sigma": unit or 0.0, "inverse_depth": (mean, sigma)}
+    if isinstance(mean, float) and np.isclose(mean, 2 * sigma, rtol=1e-15, atol=0):
+        found |= {"nearest_depth": float(f"{1 / (2 * mean):.15g}"), "inverse_depth": ()}
+    return found
+
+
+def _plain(value: Value) -> Value:
+    """A value as JSON has it."""
+    value = _numbers_of(value)
+    if isinstance(value, tuple):
+        return [_plain(x) for x in value]
+    if isinstance(value, eqx.Module):
+        kind = type(value)
+        told = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        return {"type": f"{kind.__module__}:{kind.__qualname__}"} | {
+            name: _plain(x) for name, x in told.items()
+        }
+    return value

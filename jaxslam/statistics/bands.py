@@ -14,9 +14,11 @@ import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Array, Float
 
 from jaxslam._numerics.arrays import AnyArray
-from jaxslam._numerics.linalg import cholesky
+from jaxslam.linalg import cholesky
 
 CONFIDENCE = 0.95
+MOST_DOF = 100
+"""More degrees of freedom than a pose, or a state that is tested as a whole, usually has."""
 _LAGS = 10
 _LEAST_PAIRS = 20
 """The fewest pairs of steps from which a correlation is estimated."""
@@ -41,8 +43,20 @@ def mean_band(dof: int, runs: int, confidence: float = CONFIDENCE) -> tuple[floa
     """The two-sided bounds of the mean NEES of `runs` independent runs at ONE time step.
 
     `N · mean ~ χ²(N n)` exactly. The steps of a run are correlated: never pool them. Raises
-    ValueError without a run or a degree of freedom, and for no confidence between 0 and 1.
+    ValueError without a run or a degree of freedom, for no confidence between 0 and 1, and where
+    dof and runs seem to be the wrong way round.
     """
+    if dof > MOST_DOF and dof > runs:
+        raise ValueError(
+            f"mean_band(dof, runs) of {dof} degrees of freedom and {runs} runs: mean_band(3, 300) "
+            f"is the band of 3 degrees of freedom and 300 runs; for a NEES of more than {MOST_DOF} "
+            "degrees of freedom jaxslam.evaluation.evaluate_nees(nees, dof) has the band"
+        )
+    return exact_band(dof, runs, confidence)
+
+
+def exact_band(dof: int, runs: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """The bounds of `mean_band`, for any degrees of freedom. Raises ValueError as that does."""
     if dof < 1 or runs < 1:
         raise ValueError(f"a band needs at least one run and one dof, not {runs} and {dof}")
     if not 0 < confidence < 1:

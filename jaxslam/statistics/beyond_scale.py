@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.arrays import AnyArray
-from jaxslam._numerics.linalg import cholesky
 from jaxslam.geometry import Pose, Scalar, retract, scaled, zero_tangent
+from jaxslam.linalg import cholesky
 
 STEPS = 3
 """Steps of Gauss–Newton in s: an error that is affine in s, as those of the package, needs one."""

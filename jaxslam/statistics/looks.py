@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, TypeAlias
+from typing import Any
 
 import scipy  # of which `special` is imported when it is first used
 
@@ -23,8 +23,6 @@ from jaxslam.statistics.bands import (
     skewed_limit,
 )
 
-Verdict: TypeAlias = dict[str, Any]
-"""A verdict as JSON has it, with the keys that `Tally.verdict` lists."""
 VERDICT_CONFIDENCE = 0.99
 """The confidence with which all intervals of a study hold together: a consistent filter is called
 inconsistent in less than one of 100 studies."""
@@ -35,6 +33,57 @@ UNSEEN = 3
 Lippman-Hand, JAMA 1983)."""
 _FEWEST = 3
 """The fewest numbers whose scatter says anything."""
+
+
+class Verdict(dict[str, Any]):
+    """A verdict: the dict that JSON has, whose keys are attributes too, as `Tally.verdict` says."""
+
+    word: str
+    """`consistent`, `over-confident`, `under-confident`, `cannot tell` or `lost`; of innovations
+    `outlying` in place of `lost`."""
+    nees: float | None
+    """The mean NEES that decided; None where a run diverged."""
+    sigma_factor: float | None
+    """The factor by which every σ should be larger."""
+    interval99: list[float | None]
+    """The 99 % interval of that factor; None for an end that is not bounded."""
+    p: float
+    """The probability of such numbers, or more extreme ones, if the filter is consistent."""
+    of: str
+    """The steps that decided: `all steps`, `last step`, `first third` …"""
+    enough: int | None
+    """About how many runs would tell, where the word is `cannot tell`."""
+    runs: int
+    """The number of runs."""
+    lost: float
+    """The share of runs that are lost at any step, diverged ones too."""
+    lost_runs: list[int] | None
+    """The numbers of these runs, where all records are kept."""
+    diverged: int
+    """The number of runs with a NEES that is not finite, or with a P that is not positive."""
+    mean: Verdict
+    """The verdict on the mean over all steps alone."""
+    end: Verdict
+    """The verdict on the last step alone."""
+    thirds: list[Verdict]
+    """The verdicts on each third of the steps."""
+    never_lost: Verdict
+    """The verdict on the runs that are never lost."""
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self[name]
+        except KeyError:
+            told = f"this verdict has no {name!r}; known: {', '.join(self)}"
+            raise AttributeError(told) from None
+
+    def __or__(self, other: dict[str, Any]) -> Verdict:
+        return Verdict({**self, **other})
+
+    def __repr__(self) -> str:
+        shown = ("word", "nees", "sigma_factor", "interval99", "p")
+        told = (f"{name}={self[name]!r}" for name in shown if name in self)
+        return f"Verdict({', '.join(told)})"
 
 
 @dataclass(frozen=True)
@@ -154,13 +203,13 @@ class Look:
     def asdict(self) -> Verdict:
         """Return the numbers as a verdict has them, of σ."""
         low, high = self.interval
-        return {
-            "nees": self.sums.mean,
-            "sigma_factor": math.sqrt(self.factor),
-            "interval99": [_root(low, upwards=low > 1), _root(high, upwards=high > 1)],
-            "p": self.p,
-            "word": self.word,
-        }
+        return Verdict(
+            nees=self.sums.mean,
+            sigma_factor=math.sqrt(self.factor),
+            interval99=[_root(low, upwards=low > 1), _root(high, upwards=high > 1)],
+            p=self.p,
+            word=self.word,
+        )
 
     def enough(self) -> int:
         """Estimate how many runs would show whether σ is right within `TOLERANCE`."""

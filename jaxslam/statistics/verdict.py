@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
@@ -169,28 +170,24 @@ class Tally:
         """
         right = self.dof - self.fitted, float(self.dof)
         kept = Look("never lost", self.never_lost, right, 1 - VERDICT_CONFIDENCE)
-        return {
-            **self._judged(),
+        never_lost = kept.asdict() if kept.sums.count else _NONE
+        return self._judged() | {
             "runs": self.runs,
             "lost": self.lost / self.runs,
             "lost_runs": None,
             "diverged": self.diverged,
-            "never_lost": {
-                **(kept.asdict() if kept.sums.count else _NONE),
-                "runs": self.runs - self.lost,
-            },
+            "never_lost": never_lost | {"runs": self.runs - self.lost},
         }
 
     def _judged(self) -> Verdict:
         """The look that decides, and all of them."""
         if self.diverged or not self.average.count:
-            return {**_NONE, "of": "all steps", "enough": None, "mean": _NONE, "end": _NONE,
-                    "thirds": []}  # fmt: skip
+            parts = {"mean": _NONE, "end": _NONE, "thirds": []}
+            return _NONE | {"of": "all steps", "enough": None, **parts}
         looks, name = self.looks(), self.decisive().name
         told = {look.name: look.asdict() for look in looks}
         mean = told["all steps"]
-        return {
-            **told[name],
+        return told[name] | {
             "p": min(found["p"] for found in told.values()),
             "of": name,
             "enough": looks[0].enough() if told[name]["word"] == "cannot tell" else None,
@@ -200,7 +197,7 @@ class Tally:
         }
 
 
-_NONE = {"nees": None, "sigma_factor": None, "interval99": [None, None], "p": 0.0, "word": "lost"}
+_NONE = Verdict(nees=None, sigma_factor=None, interval99=[None, None], p=0.0, word="lost")
 """The verdict where there is no mean."""
 
 
@@ -262,12 +259,12 @@ def run_verdict(
     return found | {"lost_runs": lost_runs(nees, dof, logged)}
 
 
-def not_disproved(found: Verdict) -> bool:
+def not_disproved(found: Mapping[str, Any]) -> bool:
     """Whether a verdict lets a filter be consistent, be that shown or not."""
     return found["word"] in ("consistent", "cannot tell")
 
 
-def sentences(found: Verdict, quantity: str = "NEES") -> list[str]:
+def sentences(found: Mapping[str, Any], quantity: str = "NEES") -> list[str]:
     """A verdict in words, and that at the last step; of the runs never lost, where some were.
 
     Where more than a few were, the others are chosen by their NEES: no verdict is said of them.
@@ -285,7 +282,7 @@ def sentences(found: Verdict, quantity: str = "NEES") -> list[str]:
     return told
 
 
-def _of_lost(found: Verdict, quantity: str) -> str:
+def _of_lost(found: Mapping[str, Any], quantity: str) -> str:
     """A sentence on the runs that were lost, and on the others."""
     kept, runs = found["never_lost"], found["runs"]
     lost = runs - kept["runs"]
@@ -311,7 +308,7 @@ _TOLD = 8
 """The most lost runs that are named."""
 
 
-def _of_whiteness(found: Verdict) -> list[str]:
+def _of_whiteness(found: Mapping[str, Any]) -> list[str]:
     if found["samples"] == "steps":
         return [f"innovations seem white (p = {found['white']:.2g}): every step is a sample"]
     if found["white"] is None:
@@ -322,7 +319,7 @@ def _of_whiteness(found: Verdict) -> list[str]:
     ]
 
 
-def headline(found: Verdict, quantity: str = "NEES") -> str:
+def headline(found: Mapping[str, Any], quantity: str = "NEES") -> str:
     """The verdict on all runs: `NEES 4.72, σ too small by 1.25 [1.24, 1.27]: over-confident`."""
     if found["nees"] is None:
         word = found["word"]
@@ -335,22 +332,43 @@ def headline(found: Verdict, quantity: str = "NEES") -> str:
     return f"{said}; about {found['enough']} {found.get('samples', 'runs')} would tell"
 
 
-def _part(found: Verdict) -> str:
+def brief(found: Mapping[str, Any]) -> str:
+    """The word of a verdict with the factor of σ, for where there is little room."""
+    if found["nees"] is None:
+        return found["word"]
+    factor, low, high = _factors(found["word"], found["sigma_factor"], *found["interval99"])
+    return f"{found['word']}, σ × {factor} [{low}, {high}]"
+
+
+def _part(found: Mapping[str, Any]) -> str:
     """The part that decided; older files, from before there were parts, have none."""
     return found.get("of", "all steps")
 
 
-def _said(found: Verdict, quantity: str) -> str:
+def _said(found: Mapping[str, Any], quantity: str) -> str:
     factors, word = [found["sigma_factor"], *found["interval99"]], found["word"]
     told = "right up to a factor" if word == "consistent" else "should be ×"
     if word == "over-confident":
         told = "too small by"
     if word == "under-confident":
         told, factors = "too large by", [_inverse(factors[i]) for i in (0, 2, 1)]
-    factor, low, high = ("–" if f is None else _digits(f) for f in factors)
+    factor, low, high = _factors(word, *factors)
     p = f"p = {found['p']:.2g}" if found["p"] >= 1e-4 else "p < 0.0001"
     said = f"{quantity} {_digits(found['nees'])}, σ {told} {factor} [{low}, {high}]"
     return f"{said}: {word} ({p})"
+
+
+def _factors(word: str, factor: float | None, *bounds: float | None) -> tuple[str, ...]:
+    """A factor and its interval, in which a bound next to 1 is not 1 where σ is disproved."""
+    wrong = word in ("over-confident", "under-confident")
+
+    def bound(value: float | None) -> str:
+        if value is None:
+            return "∞"
+        near = wrong and value != 1 and _digits(value) == "1.00"
+        return f"{'>' if value > 1 else '<'}1" if near else _digits(value)
+
+    return "–" if factor is None else _digits(factor), *map(bound, bounds)
 
 
 def _inverse(factor: float | None) -> float | None:

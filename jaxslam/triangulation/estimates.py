@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam._numerics.linalg import semidefinite_root
 from jaxslam.filters.slam import Slam
 from jaxslam.geometry import Scalar
 from jaxslam.landmarks import LANDMARKS, AbstractLandmark
+from jaxslam.linalg import semidefinite_root
 from jaxslam.models.observations import Features
 from jaxslam.triangulation.samples import Samples, draw
 from jaxslam.triangulation.truth import intersect

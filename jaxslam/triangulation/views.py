@@ -27,8 +27,9 @@ from jaxslam.models.camera import Camera, project
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.sensors import Pinhole
-from jaxslam.simulation import Scenario
+from jaxslam.simulation import BUILT_IN
 
+_MATCHED = BUILT_IN["matched"].fields
 CALIBRATIONS = {"white": White, "shared": Estimated, "known": lambda sigma: Known()}
 """What the true intrinsics are, and how a filter that knows this treats them: drawn anew in each
 view, drawn once for both views, or exactly known."""
@@ -44,23 +45,23 @@ class TwoViews:
     """True z of the point, m."""
     baseline: float = 0.6
     """Sideways motion between the views, exactly known, m."""
-    pixel: float = Scenario.centre[0]
+    pixel: float = _MATCHED["centre"][0]
     """Where the first view sees the point: the principal point is on the axis."""
     nearest_depth: float = 1.0
     """d_min, m: the filters' prior on 1/z is N(1/(2 d_min), (1/(4 d_min))²)."""
     calibration: str = "white"
     """`white`: intrinsics drawn in each view; `shared`: once for both; `known`: exact."""
-    width: float = Scenario.image[0]
+    width: float = _MATCHED["image"][0]
     """Of the picture, pixels."""
-    focal: float = Scenario.focal[0]
+    focal: float = _MATCHED["focal"][0]
     """Length, pixels."""
-    centre: float = Scenario.centre[0]
+    centre: float = _MATCHED["centre"][0]
     """The principal point, pixels."""
-    focal_sigma: float = Scenario.focal_sigma
+    focal_sigma: float = _MATCHED["focal_sigma"]
     """σ of the focal length, pixels."""
-    centre_sigma: float = Scenario.centre_sigma
+    centre_sigma: float = _MATCHED["centre_sigma"]
     """σ of the principal point, pixels."""
-    pixel_sigma: float = Scenario.pixel_sigma
+    pixel_sigma: float = _MATCHED["pixel_sigma"]
     """σ of a measured pixel."""
 
     def __post_init__(self) -> None:

@@ -27,7 +27,9 @@ def test_a_run_says_which_camera_was_the_true_one():
     for truth in ("white", "constant", "nominal"):
         scenario = jaxslam.scenario("matched", steps=3, true_calibration=truth)
         run = quick_jit(lambda key, s=scenario: simulate(s, key))(jax.random.key(0))
-        intrinsics[truth] = np.asarray(jax.vmap(lambda camera: camera.intrinsics)(run.cameras))
+        intrinsics[truth] = np.asarray(
+            jax.vmap(lambda camera: camera.intrinsics)(run.sensors.camera)
+        )
         assert intrinsics[truth].shape == (4, 2)
         # The pixels are that camera's: 0.3 px of noise.
         seen = in_cameras(run)

@@ -113,7 +113,7 @@ def test_what_was_drawn_is_not_drawn_again_but_filters_are_measured_anew(tmp_pat
     def drawn(study, options, indices):
         asked.append(indices)
         found = records() | {"pooled_kl_of_two_gaussians": np.zeros(RUNS)}
-        poses = study.scenario.world.group.identity((RUNS, 128)).parameters()
+        poses = study.scenario.geometry.group.identity((RUNS, 128)).parameters()
         return {k: v[list(indices)] for k, v in (found | {"poses": np.asarray(poses)}).items()}
 
     def beside(study, name, options, indices, poses):

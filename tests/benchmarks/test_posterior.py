@@ -87,7 +87,7 @@ def draw(problem, seed=1):
 
 def dense_residuals(scenario, problem, y):
     """`residuals` by homogeneous matrices and matrix exponentials, one number at a time."""
-    y, n = np.asarray(y), scenario.world.point_dim
+    y, n = np.asarray(y), scenario.geometry.point_dim
     t, p, landmarks = len(scenario.velocity), n - 1, scenario.landmarks
     mean, sigma = 1 / (2 * scenario.nearest_depth), 1 / (4 * scenario.nearest_depth)
     velocity = np.add(scenario.velocity, np.multiply(scenario.velocity_sigma, y[:t]))

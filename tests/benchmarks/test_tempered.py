@@ -48,9 +48,9 @@ from scipy.stats import norm
 
 import jaxslam
 from jaxslam._runtime.watchdog import lapack_calls
+from jaxslam.filters.mixture.sum_state import moments
 from jaxslam.filters.readouts import camera_pose
 from jaxslam.filters.window.start import from_rest
-from jaxslam.filters.mixture.sum_state import moments
 from jaxslam.geometry import difference, log, retract
 
 FEW = SMC(particles=800, moves=3)

@@ -11,6 +11,7 @@ from tracks import read, window, windows
 
 from jaxslam.consistency import run_through
 from jaxslam.filters.words import make_filters
+from jaxslam.models.sensors import Pinhole
 from jaxslam.simulation import Room, gone, scenario, sightings
 
 SIGHTS = {0: range(0, 4), 1: range(0, 6), 2: range(0, 2), 3: range(1, 6), 4: range(2, 6)}
@@ -94,8 +95,9 @@ def test_a_window_begins_anew_and_its_poses_are_relative(drive):
     expected = [np.linalg.inv(T[2]) @ T[k] for k in range(2, 6)]
     np.testing.assert_allclose(run.poses.as_matrix(), expected, rtol=0, atol=1e-9)
     np.testing.assert_allclose(run.controls, np.diff(drive.times)[2:])
-    np.testing.assert_array_equal(run.cameras.focal, np.tile([700.0, 710.0], (4, 1)))
-    np.testing.assert_array_equal(run.cameras.centre, np.tile([600.0, 170.0], (4, 1)))
+    assert isinstance(run.sensors, Pinhole)
+    intrinsics = np.column_stack([run.sensors.camera.focal, run.sensors.camera.centre])
+    np.testing.assert_array_equal(intrinsics, np.tile([700.0, 710.0, 600.0, 170.0], (4, 1)))
     assert np.isnan(run.points).all()
     batch = windows(drive, 3, 3, landmarks=2)
     assert batch.visible.shape == (3, 4, 2)

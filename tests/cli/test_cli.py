@@ -12,11 +12,11 @@ import jaxslam
 from jaxslam.cli import main
 from jaxslam.cli.evaluate import RIVALS
 from jaxslam.consistency import BACKENDS, DTYPES
+from jaxslam.consistency.montecarlo import Interruption
 from jaxslam.consistency.suite import SUITE
 from jaxslam.evaluation import CHOICES
 from jaxslam.evaluation.alignment import ALIGNMENTS
 from jaxslam.models.calibration import TREATMENTS
-from jaxslam.simulation.scenario import CALIBRATIONS
 from jaxslam.triangulation import CALIBRATIONS as VIEWS
 
 SMALL = ["consistency", "--scenario", "matched-tight", "--steps", "6", "--runs", "6"]
@@ -191,17 +191,24 @@ jaxslam.cli.main()
     assert (ended.returncode, ended.stderr) == (130, "jaxslam: interrupted\n")
 
 
-def test_an_interrupted_study_says_what_is_kept_and_how_to_go_on(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("kept", [0, 2])
+def test_an_interrupted_study_says_what_is_kept_and_how_to_go_on(
+    kept, tmp_path, monkeypatch, capsys
+):
     def interrupted(world, filters, *, store, chunk, **more):
-        store.save(next(iter(filters)), range(chunk), {})
-        raise KeyboardInterrupt
+        raise Interruption(kept, 12, chunk, store)
 
     monkeypatch.setattr("jaxslam.cli.consistency.monte_carlo", interrupted)
     with pytest.raises(SystemExit) as ended:
         main([*SMALL, "--chunk", "2", "--out", str(tmp_path)])
     assert ended.value.code == 130
-    told = f"jaxslam: interrupted: 2 of 12 runs are kept in {tmp_path}; the same command with "
-    assert capsys.readouterr().err.splitlines()[-1] == f"{told}--resume goes on from there"
+    told = (
+        f"2 of 12 runs are kept in {tmp_path}; the same command with --resume goes on from there"
+        if kept
+        else f"no chunk of 2 runs was finished, so that nothing of 12 is kept in {tmp_path}; with "
+        "a smaller --chunk the first runs are kept sooner"
+    )
+    assert capsys.readouterr().err.splitlines()[-1] == f"jaxslam: interrupted: {told}"
 
 
 def test_a_command_within_a_program_does_not_end_it(capsys):
@@ -247,7 +254,7 @@ def test_commands_without_pictures_need_no_opencv():
 @pytest.mark.parametrize(
     ("command", "accepted"),
     [
-        ("consistency", [*CALIBRATIONS, *BACKENDS, *DTYPES]),
+        ("consistency", [*TREATMENTS, *BACKENDS, *DTYPES]),
         ("evaluate", [*itertools.chain(*CHOICES.values()), *ALIGNMENTS, *SUITE, *RIVALS]),
         ("track", [*TREATMENTS]),
         ("triangulate", [*VIEWS]),

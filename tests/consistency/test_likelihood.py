@@ -61,3 +61,29 @@ def test_every_number_of_a_filter_has_a_derivative(case):
     assert all(np.isfinite(x).all() for x in leaves)
     for number in (found.motion.velocity_sigma, found.calibration.sigma, found.depth.mean):
         assert np.abs(number).max() > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "scenario", "options"),
+    [
+        ("world+scene50+mixture3", "matched-very-loose", {"steps": 8, "landmarks": 4}),
+        ("robocentric+submaps", "laps", {"steps": 40, "landmarks": 12}),
+    ],
+)
+def test_reverse_mode_through_work_that_is_done_only_where_it_is_wanted(name, scenario, options):
+    """Members of a sum, splits, mergers, and submaps that end; alone and in a batch of runs."""
+    case = Case(scenario, runs=2, **options)
+    slam = jaxslam.cast(case.filter(name), jnp.float64)
+
+    def value(factor, run):
+        def sigma(slam):
+            return slam.unwrapped.motion.noise_sigma
+
+        return log_likelihood(eqx.tree_at(sigma, slam, factor * sigma(slam)), case.room, run)
+
+    by_run = jax.vmap(value, (None, 0))
+    found = quick_jit(jax.grad(lambda factor: jnp.sum(by_run(factor, case.runs))))(1.0)
+    of_runs, h = quick_jit(by_run), 1e-4
+    central = np.sum(of_runs(1 + h, case.runs) - of_runs(1 - h, case.runs)) / (2 * h)
+    np.testing.assert_allclose(found, central, rtol=1e-6)

@@ -1,6 +1,7 @@
 """Tests of what is kept of studies: never two mixed, and nobody else's files touched."""
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -183,3 +184,108 @@ def test_a_description_is_the_same_in_every_process_and_tells_functions_apart():
     texts = {json.dumps(described(x)) for x in told_apart}
     assert len(texts) == len(told_apart)
     assert difference({"a": float("nan")}, {"a": float("nan")}) is None
+
+
+USERS = """
+import ctypes, math
+import equinox as eqx
+import helper
+FACTOR = 2
+def bent(x):
+    return math.sin(x) + FACTOR
+class Sonar(eqx.Module):
+    sigma: float = 0.1
+    def measure(self, x):
+        return [bent(y) + helper.offset(y) for y in x]
+"""
+TOLD = "import json, mine; from jaxslam.consistency.manifest import described; "
+TOLD += "print(json.dumps([described(x()) for x in (Sonar, mine.Sonar)]))"
+
+
+def described_in(run, folder, offset="x"):
+    """The descriptions of a class of the user's, as it is in what is run, and in a module."""
+    (folder / "helper.py").write_text(f"def offset(x):\n    return {offset}\n")
+    (folder / "mine.py").write_text(USERS)
+    (folder / "script.py").write_text(f"{USERS}\n{TOLD}\n")
+    command = [sys.executable, "-B", *run, "script.py"]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *sys.path])}
+    told = subprocess.run(command, check=True, capture_output=True, text=True, cwd=folder, env=env)
+    return json.loads(told.stdout.splitlines()[-1])
+
+
+def test_a_piece_of_the_users_is_the_same_wherever_it_is_written_and_another_with_what_it_calls(
+    tmp_path,
+):
+    first, of_module = described_in([], tmp_path)
+    assert difference(first, of_module) is None
+    assert difference(first, described_in([], tmp_path, offset="2 * x")[0])
+    pytest.importorskip("IPython")
+    in_notebook, _ = described_in(["-m", "IPython", "--no-banner", "--quick"], tmp_path)
+    assert difference(first, in_notebook) is None
+
+
+def of_source(source):
+    space: dict[str, Any] = {"__name__": "users"}
+    exec(source, space)
+    return space["f"]
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("def f(x): return g(x)\ndef g(x): return x", "def f(x): return g(x)\ndef g(x): return -x"),
+        ("a = 1\nf = lambda x: x + a", "a = 2\nf = lambda x: x + a"),
+        ("def f(x, y=1): return y", "def f(x, y=2): return y"),
+        (
+            "import jax\ng = jax.jit(lambda x: x)\ndef f(x): return [g(y) for y in x]",
+            "import jax\ng = jax.jit(lambda x: -x)\ndef f(x): return [g(y) for y in x]",
+        ),
+        (
+            "class A:\n  def g(self): return 1\na = A()\ndef f(x): return a.g()",
+            "class A:\n  def g(self): return 2\na = A()\ndef f(x): return a.g()",
+        ),
+        ("def f(x): return f(x - 1)", "def f(x): return f(x - 2)"),
+    ],
+)
+def test_what_a_function_calls_is_a_part_of_it(before, after):
+    assert described(of_source(before)) == described(of_source(before))
+    assert difference(*map(described, map(of_source, (before, after))))
+
+
+def test_code_that_cannot_be_seen_is_named(tmp_path, monkeypatch):
+    source = "import ctypes\nfast = ctypes.CDLL(None).abs\ndef f(x): return fast(getattr(x, 'y'))"
+    function: Any = of_source(source)
+    assert manifest.unseen(described(function)) == {"abs(…)", "getattr(…) in f"}
+    assert not manifest.unseen(described(SLAM))
+
+    with pytest.warns(UserWarning, match=r"not seen: abs\(…\), getattr\(…\) in f; .* resumed"):
+        begin(FolderStore(tmp_path), monkeypatch, slam=own_filter(function))
+
+
+def own_filter(function):
+    class Mine(jaxslam.AbstractFilter):
+        base: jaxslam.AbstractFilter
+
+        def init(self, capacity, first=None):
+            return self.base.init(capacity, first)
+
+        def step(self, state, control, seen, new):
+            return function(self.base.step(state, control, seen, new))
+
+        def marginal(self, state, function):
+            return self.base.marginal(state, function)
+
+        def landmark_marginal(self, state, function, slots):
+            return self.base.landmark_marginal(state, function, slots)
+
+    return Mine(SLAM)
+
+
+def test_a_mended_helper_does_not_resume_the_old_numbers(tmp_path, monkeypatch):
+    def mine(sign):
+        return own_filter(of_source(f"def helper(x): return {sign}x\ndef f(x): return helper(x)"))
+
+    begin(FolderStore(tmp_path), monkeypatch, slam=mine(""))
+    study(FolderStore(tmp_path, resume=True), slam=mine(""))
+    with pytest.raises(ValueError, match=r"cannot resume: .* another filter mine"):
+        study(FolderStore(tmp_path, resume=True), slam=mine("-"))

@@ -1,7 +1,6 @@
 """The suite: plain files that any filter can read, its logs, and the filters here beside them."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -305,14 +304,14 @@ def test_the_measurements_are_the_projections_of_fixed_points(tmp_path):
         ({"in_view": 9}, "its landmarks share slots, .* for a suite in_view=0 is accepted"),
         (
             {"sensor": "position", "calibration": "known"},
-            "is position; for a suite camera is accep",
+            "its sensor is Position; for a suite camera is accep",
         ),
     ],
 )
 def test_a_scenario_that_no_suite_has_is_refused(changes, message, tmp_path):
     """Landmarks need a number of their own, and measurements are pixels."""
     with pytest.raises(ValueError, match=f"^small: .*{message}"):
-        write_suite(tmp_path / "suite", [replace(SMALL, **changes)], runs=1)
+        write_suite(tmp_path / "suite", [jaxslam.scenario(SMALL, **changes)], runs=1)
 
 
 def test_a_suite_has_a_scenario(tmp_path, capsys):

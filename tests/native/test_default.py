@@ -16,7 +16,6 @@ from jaxslam._runtime import programs
 from jaxslam.consistency import MemoryStore, backends, draw
 from jaxslam.native import NativePrograms, batch, batched, build
 from jaxslam.native.build import compiler
-from jaxslam.simulation import sensor_of
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C++ compiler")
 SCENARIO = jaxslam.scenario("matched", steps=6, landmarks=4)
@@ -73,7 +72,7 @@ def test_what_is_kept_of_the_first_run_does_not_hold_the_others():
     """A view would keep the map and the path of the whole batch in memory."""
     (slam,) = jaxslam.make_filters(SCENARIO, "robocentric", "inverse_scaling").values()
     room, runs = draw(SCENARIO, 3)
-    _, sample = backends.by_native(slam, room, sensor_of(SCENARIO), runs)(np.int32(3))
+    _, sample = backends.by_native(slam, room, SCENARIO.sensor, runs)(np.int32(3))
     assert all(np.asarray(x).base is None for x in sample.values())
 
 
@@ -82,7 +81,7 @@ def test_a_filter_with_a_mixture_stays_with_xla(pretended):
     room, runs = draw(SCENARIO, 2)
     for there in (False, True):  # by a program in C++ a sum takes twice as long
         pretended.there = there
-        assert backends.chosen("auto", NAME, 10**6, slam, room, sensor_of(SCENARIO), runs) == "xla"
+        assert backends.chosen("auto", NAME, 10**6, slam, room, SCENARIO.sensor, runs) == "xla"
     assert pretended.asked == 0
 
 

@@ -11,7 +11,7 @@ import pytest
 from cases import quick_jit
 
 import jaxslam
-from jaxslam._numerics import linalg
+from jaxslam import linalg
 from jaxslam._runtime import programs
 from jaxslam.consistency.store import NATIVE
 from jaxslam.native import NativePrograms, NotSupportedError, batch, batched, build

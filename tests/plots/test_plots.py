@@ -198,7 +198,7 @@ def test_wrong_names_and_kinds_are_told_what_is_accepted(study):
     with pytest.raises(ValueError, match=r"a study is summarised, .* not list"):
         jaxslam.summarise([study])  # ty: ignore[invalid-argument-type]
     with pytest.raises(ValueError, match="a dict is accepted, as make_filters gives it"):
-        jaxslam.monte_carlo("matched", list(study.filters))  # ty: ignore[invalid-argument-type]
+        jaxslam.monte_carlo("matched", [*study.filters, None])  # ty: ignore[invalid-argument-type]
     with pytest.raises(ValueError, match="unknown dtype 'float17'; known: float64, float32"):
         jaxslam.cast(study.filters, "float17")
     with pytest.raises(ValueError, match="confidence must be between 0 and 1, not 95"):

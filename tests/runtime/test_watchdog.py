@@ -18,13 +18,12 @@ from jaxslam._runtime import watchdog
 from jaxslam._runtime.watchdog import lapack_calls
 from jaxslam.consistency.backends import _filter_batch
 from jaxslam.filters.linear.kalman import AbstractCorrection, kalman_update
-from jaxslam.filters.linear.covariance import Covariance
-from jaxslam.simulation import Room, sensor_of, simulate
+from jaxslam.simulation import Room, simulate
 
 MATRICES = """
 import jax, jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
-from jaxslam._numerics import linalg
+from jaxslam import linalg
 from jaxslam._runtime import watchdog
 
 def lapack(A):
@@ -117,7 +116,7 @@ def test_no_study_of_a_filter_calls_lapack(name, scenario):
     def batch(numbers, *args):
         return _filter_batch.function(eqx.combine(numbers, structure), Room(4, 4, 4, 4), *args)
 
-    traced = jax.make_jaxpr(batch)(numbers, sensor_of(chosen), runs, 2)
+    traced = jax.make_jaxpr(batch)(numbers, chosen.sensor, runs, 2)
     assert lapack_calls(traced.jaxpr) == set()
 
 

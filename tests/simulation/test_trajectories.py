@@ -1,7 +1,5 @@
 """Tests of recorded trajectories as truths: smoothed, without gaps, from starts drawn at random."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxslam
 from jaxslam.io.tum import poses
-from jaxslam.simulation import BUILT_IN, RecordedMotion, scenario, simulate, trajectory_of
+from jaxslam.simulation import RecordedMotion, scenario, simulate, trajectory_of
 from jaxslam.simulation.trajectories import CUTOFF, GAP, find, sampled
 
 FALSE_ALARM = 1e-6
@@ -103,9 +101,7 @@ def test_no_folder_of_data_is_looked_into_unless_it_is_said(data, tmp_path, monk
 
 def test_a_scenario_is_named_after_its_trajectory(data, tmp_path):
     chosen = scenario("handheld-walk", steps=30)
-    assert chosen == dataclasses.replace(
-        BUILT_IN["handheld"], name="handheld-walk", trajectory="walk", steps=30
-    )
+    assert chosen == scenario("handheld", name="handheld-walk", trajectory="walk", steps=30)
     by_file = scenario("handheld", trajectory=str(data), steps=30)
     for other in (chosen, by_file):
         found = trajectory_of(other)
@@ -127,7 +123,7 @@ def test_a_car_sees_far(data):
 def test_the_truth_moves_along_it_and_the_filter_is_told_the_seconds_only():
     chosen = scenario("handheld-walk", steps=20, landmarks=4)
     run = quick_jit(lambda key: simulate(chosen, key))(jax.random.key(2))
-    still = quick_jit(lambda key: simulate(dataclasses.replace(chosen, still_frames=5), key))
+    still = quick_jit(lambda key: simulate(scenario(chosen, still_frames=5), key))
     np.testing.assert_allclose(run.controls, np.full(20, 1 / 30), rtol=1e-12)
     T = np.asarray(run.poses.as_matrix())
     speed = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1) * 30
@@ -155,7 +151,7 @@ def test_a_study_may_go_along_a_trajectory_of_ones_own(tmp_path):
         paths.append(study.store.load(name, study.chunks[0])["sample_true_path"])
     assert np.abs(paths[0] - paths[1]).max() > 1e-4
     with pytest.raises(ValueError, match="a trajectory for 4 steps, not 5"):
-        simulate(dataclasses.replace(chosen, steps=5), jax.random.key(0), motion=own)
+        simulate(scenario(chosen, steps=5), jax.random.key(0), motion=own)
 
 
 def test_what_is_no_trajectory_is_refused(data, tmp_path):

@@ -12,7 +12,6 @@ from scipy import stats
 from jaxslam.consistency import filter_run, sums
 from jaxslam.filters.readouts import camera_pose_in_unit
 from jaxslam.geometry import PLANAR, difference, identity, joined, retract, scaled
-from jaxslam.simulation import sensor_of
 from jaxslam.statistics.bands import normalised_squared
 from jaxslam.statistics.beyond_scale import (
     NOTICEABLE,
@@ -168,7 +167,7 @@ def test_the_noise_of_the_truth_is_of_the_scale_of_the_estimate(geometry):
 @pytest.mark.parametrize("name", ["robocentric", "scale_gauge+mixture3"])
 def test_of_a_filter_it_is_the_least_nees_over_all_scales(name):
     case = Case("standstill", steps=8)
-    slam, sensor = case.filter(name), sensor_of(case.scenario)
+    slam, sensor = case.filter(name), case.scenario.sensor
     run = case.run(0)
     records, path, state = quick_jit(partial(filter_run, slam, case.room, sensor))(run)
     truth = jax.tree.map(lambda x: x[-1], run.poses)

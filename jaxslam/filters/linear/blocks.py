@@ -19,10 +19,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam._numerics.linalg import cholesky
 from jaxslam._numerics.tracing import gathers_are_free
 from jaxslam.filters.linear.state import AbstractState, State
 from jaxslam.geometry import difference, jacobian, nudge, retract, zero_tangent
+from jaxslam.linalg import cholesky
 from jaxslam.models.observations import Features, Slots
 
 Landmark = Callable[[PyTree, Array], Array]

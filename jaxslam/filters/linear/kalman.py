@@ -15,9 +15,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxslam._numerics.linalg import cholesky, symmetric_part
 from jaxslam.filters.linear.blocks import Model, Noise, minus, observed, plus, residuals
 from jaxslam.filters.linear.state import State
+from jaxslam.linalg import cholesky, symmetric_part
 from jaxslam.models.observations import Features, Innovation, Slots, judged
 
 ROUNDING = 4.0

@@ -22,7 +22,6 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxslam._numerics.arrays import cast, precision
 from jaxslam._numerics.conditional import map_or_zero, map_where, zeros
-from jaxslam._numerics.linalg import eigh
 from jaxslam.filters.gaussian import append_noise, composed_first
 from jaxslam.filters.layer import AbstractLayer, AbstractSlam
 from jaxslam.filters.linear.state import State
@@ -33,6 +32,7 @@ from jaxslam.filters.protocol import (
     Corrected,
 )
 from jaxslam.geometry import difference, retract
+from jaxslam.linalg import eigh
 from jaxslam.models.motion import Control, check_control
 from jaxslam.models.observations import Features
 

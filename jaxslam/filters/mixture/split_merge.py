@@ -25,7 +25,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.conditional import at_places, map_or_zero
-from jaxslam._numerics.linalg import cholesky, eigh
 from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.linear.blocks import minus, plus
 from jaxslam.filters.linear.covariance import landmark_moments
@@ -33,6 +32,7 @@ from jaxslam.filters.linear.state import State
 from jaxslam.filters.mixture.sum_state import SumState, member, moments
 from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.geometry import jacobian, log
+from jaxslam.linalg import cholesky, eigh
 from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features
 

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam._numerics.linalg import cholesky
 from jaxslam.filters.mixture.density import log_density
 from jaxslam.filters.protocol import Belief, Corrected
+from jaxslam.linalg import cholesky
 from jaxslam.models.observations import Innovation, Status
 
 BEHIND = 1e-4

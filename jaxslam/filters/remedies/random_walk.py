@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxslam._numerics.arrays import AnyArray, number_field
-from jaxslam._numerics.linalg import inverse
 from jaxslam.filters.linear.blocks import indices, residuals
 from jaxslam.filters.linear.kalman import AbstractCorrection, Kalman
+from jaxslam.linalg import inverse
 
 
 class RandomWalk(AbstractCorrection):

@@ -16,7 +16,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam._numerics.linalg import eigh
+from jaxslam.linalg import eigh
 
 _SINGULAR = 1e-12
 """Least eigenvalue of NᵀN, its columns of unit length, that counts."""

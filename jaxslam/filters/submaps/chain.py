@@ -25,12 +25,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam._numerics.linalg import semidefinite_root
 from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.linear.blocks import minus, plus
 from jaxslam.filters.linear.state import AbstractState
 from jaxslam.filters.submaps.handover import Frozen, SubmapsState
 from jaxslam.geometry import Pose, difference, identity, retract
+from jaxslam.linalg import semidefinite_root
 from jaxslam.models.frame import KeyframePose, Submaps
 
 LINEARISATION = 1e-3

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam._numerics.linalg import cholesky
+from jaxslam._numerics.conditional import while_loop
 from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.window.problem import (
     Path,
@@ -28,9 +28,12 @@ from jaxslam.filters.window.problem import (
 )
 from jaxslam.filters.window.record import Record
 from jaxslam.geometry import Scalar
+from jaxslam.linalg import cholesky
 
 TOLERANCE = 1e-3
 """Of half the sum of squares: a minimum is found when a step gains less."""
+MOST_STEPS = 16
+"""Of a path."""
 LANDMARK_STEPS = 3
 """Of the landmarks, for every step of the path."""
 TURN_STEPS = 4
@@ -57,7 +60,8 @@ def started(x: X, y: Y) -> Minimum:
 def minimised(
     slam: AbstractSlam, record: Record, start: Minimum, steps: int | Int[Array, ""]
 ) -> tuple[Minimum, Reduced]:
-    """The state of a minimisation after at most so many steps, and the quadratic there."""
+    """The state of a minimisation after so many steps, `MOST_STEPS` at the most, and the quadratic
+    there."""
     shapes = jax.eval_shape(lambda at: reduced(slam, record, at.x, at.y), start)
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
@@ -69,7 +73,7 @@ def minimised(
         step, *now = carry
         return step + 1, *_step(slam, record, *now)
 
-    return jax.lax.while_loop(going, once, (jnp.zeros((), int), start, nothing))[1:]
+    return while_loop(going, once, (jnp.zeros((), int), start, nothing), MOST_STEPS)[1:]
 
 
 def _step(

@@ -20,18 +20,18 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.conditional import cond, map_where, zeros
-from jaxslam._numerics.linalg import Cholesky, cholesky
 from jaxslam.filters.layer import AbstractSlam
-from jaxslam.filters.window.minimise import Minimum, minimised, started, turned
+from jaxslam.filters.window.minimise import MOST_STEPS, Minimum, minimised, started, turned
 from jaxslam.filters.window.problem import PathLayout, Reduced, X, Y, left_out
 from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.scale import enlarged, rescaled, shift_of_scale
 from jaxslam.filters.window.subsample import Coarse
 from jaxslam.geometry import Scalar
+from jaxslam.linalg import Cholesky, cholesky
 
 SPEED = 1.2
 """Starts move with so many σ of the prior on the initial velocity."""
-SEARCH_STEPS = 16
+SEARCH_STEPS = MOST_STEPS
 """Of Levenberg–Marquardt, from every start, at the most …"""
 REFINEMENTS = 4
 """… and with every new frame."""

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
-from jaxslam._numerics.linalg import Cholesky, cholesky
 from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.window.record import Record
 from jaxslam.geometry import Pose, Scalar, homogeneous_apply, identity, jacobian, nudge, retract
+from jaxslam.linalg import Cholesky, cholesky
 from jaxslam.models.motion import Control
 
 X = Float[Array, " N"]

@@ -16,8 +16,8 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.arrays import AnyArray
-from jaxslam._numerics.linalg import cholesky
 from jaxslam.geometry import Scalar
+from jaxslam.linalg import cholesky
 from jaxslam.models.motion import AbstractMotion, Control
 from jaxslam.models.observations import Features
 

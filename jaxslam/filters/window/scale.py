@@ -18,12 +18,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxslam._numerics.linalg import Cholesky, cholesky
 from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.window.minimise import Minimum
 from jaxslam.filters.window.problem import PathLayout, Reduced, X, Y, hidden
 from jaxslam.filters.window.record import Record
 from jaxslam.geometry import Scalar
+from jaxslam.linalg import Cholesky, cholesky
 
 MOST_SHIFT = 2.0
 """Of λ, from the maximum to the mean."""

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxslam._numerics.linalg import Cholesky, cholesky
 from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.linear.blocks import plus
 from jaxslam.filters.linear.state import State
@@ -23,6 +22,7 @@ from jaxslam.filters.window.problem import PathLayout, Reduced, located
 from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.scale import Direction, scaling
 from jaxslam.geometry import identity, jacobian, scaled
+from jaxslam.linalg import Cholesky, cholesky
 
 
 def gauge_state(

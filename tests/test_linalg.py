@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam._numerics.linalg import (
+from jaxslam.linalg import (
     LEAF,
     cholesky,
     eigh,

@@ -1,7 +1,8 @@
 """Factorisations of small matrices, written in JAX: batched by `vmap`, differentiable, no LAPACK.
 
 jaxlib's batched LAPACK kernels wait inside XLA's thread pool for pieces of work that only the same
-pool can do: two at once stand still for ever on two cores (docs/faq.md).
+pool can do: two at once stand still for ever on two cores (docs/faq.md). These functions take one
+real matrix, in float32 or float64, and raise nothing: what has no solution is NaN.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.arrays import AnyArray
 
+__all__ = ("Cholesky", "SemidefiniteRoot", "cholesky", "eigh", "inverse", "semidefinite_root")
+
 LEAF = 32
 """Rows of what is factored column by column; of more, the halves are, and joined by products."""
 LARGE = 256
@@ -29,7 +32,7 @@ SWEEPS = 10
 
 
 class Cholesky(NamedTuple):
-    """`A = L Lᵀ`; all NaN unless A is positive definite."""
+    """The factorisation `A = L Lᵀ`, which is all NaN unless A is positive definite."""
 
     root: Float[Array, "n n"]
     """L, lower triangular."""
@@ -42,21 +45,26 @@ class Cholesky(NamedTuple):
         return jnp.all(~jnp.isnan(jnp.diagonal(self.root)))
 
     def solve(self, b: Float[AnyArray, "n ..."]) -> Float[Array, "n ..."]:
-        """A⁻¹ b."""
+        """Return `A⁻¹ b` for one right-hand side, or for several as columns."""
         return self.whitening.T @ (self.whitening @ b)
 
     def inverse(self) -> Float[Array, "n n"]:
-        """A⁻¹, symmetric."""
+        """Return A⁻¹, which is symmetric."""
         return self.whitening.T @ self.whitening
 
     def log_det(self) -> Float[Array, ""]:
-        """The logarithm log det A."""
+        """Return the natural logarithm of det A."""
         return 2 * jnp.sum(jnp.log(jnp.diagonal(self.root)))
 
 
 @jax.custom_jvp
 def cholesky(A: Float[AnyArray, "n n"]) -> Cholesky:
-    """Both L and L⁻¹ of a symmetric A, of which the lower triangle is read."""
+    """Return Cholesky's L, with `A = L Lᵀ`, and L⁻¹.
+
+    A is symmetric, and its lower triangle alone is read. L⁻¹ costs a third more than L alone, and
+    turns what would be substitutions into products of matrices. The derivative, of any order and in
+    both modes, is Murray's (arXiv 1602.07527, eq. 8).
+    """
     root, whitening = _factored(jnp.asarray(A))
     positive = jnp.all(jnp.diagonal(root) > 0)
     return Cholesky(*(jnp.where(positive, x, jnp.nan) for x in (root, whitening)))
@@ -142,7 +150,7 @@ def _factored_by_columns(A: Float[Array, "n n"]) -> tuple[Array, Array]:
 
 
 class SemidefiniteRoot(NamedTuple):
-    """`P = L Lᵀ` of any rank."""
+    """The factorisation `P = L Lᵀ` of a covariance of any rank."""
 
     root: Float[Array, "n n"]
     whitening: Float[Array, "n n"]
@@ -150,9 +158,10 @@ class SemidefiniteRoot(NamedTuple):
 
 
 def semidefinite_root(P: Float[Array, "n n"], jitter: float = 0.0) -> SemidefiniteRoot:
-    """Cholesky's L of a covariance without full rank, to the precision of rounding.
+    """Return Cholesky's L of a covariance of any rank, to the precision of rounding.
 
-    Of the correlations with a jitter, at least rounding's; what has no variance has zeros.
+    What is factored are the correlations, with `jitter` added to their diagonal, or rounding's
+    where that is more. What has no variance has zeros in L and in its inverse.
     """
     variance = jnp.diagonal(P)
     none = variance <= 0
@@ -189,9 +198,11 @@ batching.primitive_batchers[symmetric_part_p] = _batched
 
 
 def eigh(A: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """Eigenvalues, the least first, and eigenvectors as columns, by Jacobi's rotations.
+    """Return the eigenvalues of a symmetric A, the least first, and its eigenvectors as columns.
 
-    For a few rows: n²/2 rotations a sweep, one after the other.
+    Jacobi's method (Golub, Van Loan, Matrix Computations, §8.5) needs n²/2 rotations a sweep, one
+    after the other: it is for a few rows. Derivatives are those of the rotations; they are not
+    defined where two eigenvalues are equal.
     """
     n = A.shape[0]
     if n == 1:
@@ -226,7 +237,10 @@ def _annihilating(a, b, c) -> Float[Array, "2 2"]:
 
 
 def inverse(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """A⁻¹ of any regular matrix, by Gauss–Jordan with row pivoting; not finite otherwise."""
+    """Return A⁻¹ of any regular matrix, by Gauss–Jordan elimination with row pivoting.
+
+    It is not finite where A is singular. What is positive definite has its `Cholesky.inverse`.
+    """
     n = A.shape[0]
     index = jnp.arange(n)
 

@@ -1,0 +1,101 @@
+"""The flat fields of a scenario: what a TOML file and `--set field=value` may say, with units."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Value = Any
+"""A field's: a word, a number, a list of them, or a piece of one's own."""
+LARGEST_WHOLE = 2**31 - 1
+POSITIVE, NOT_NEGATIVE = "positive", "not negative"
+
+
+class Field(NamedTuple):
+    """A field: its default, in whose type it is read, what its numbers have to be, what it is."""
+
+    default: Value
+    told: str
+    least: str = ""
+    """`POSITIVE`, `NOT_NEGATIVE`, or nothing."""
+
+
+def _tuples(value: Value) -> Value:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+_TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
+FIELDS = {name: Field(**{k: _tuples(v) for k, v in x.items()}) for name, x in _TABLES.items()}
+"""The fields by their names, of `fields.toml`."""
+OWN = ("motion", "sensor", "placement")
+"""Fields that may be a piece of one's own: a word `module:Class`, or a table of `type` and what
+that takes, or from Python the piece."""
+ROWS = ("first_pixels", "points")
+"""Fields that are lists of lists."""
+
+
+def coerced(field: str, value: Value, like: Value) -> Value:
+    """`value` in the type of the field; a single number stands for a list of one.
+
+    Raises ValueError, naming the field.
+    """
+
+    def wrong(wanted: str) -> ValueError:
+        return ValueError(f"scenario field {field} must be {wanted}, not {value!r}")
+
+    value = value.tolist() if isinstance(value, np.ndarray) else value
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if field in OWN and not isinstance(value, int | float | list | tuple):
+        return value
+    if isinstance(like, str):
+        if not isinstance(value, str):
+            raise wrong("a word")
+        return value
+    if field in ROWS and isinstance(like, tuple):
+        if not isinstance(value, list | tuple) or any(is_alone(row) for row in value):
+            raise wrong("a list of " + ("points" if field == "points" else "[low, high] pairs"))
+        return tuple(tuple(coerced(field, x, 0.0) for x in row) for row in value)
+    if isinstance(like, tuple):
+        values = [value] if is_alone(value) else value
+        return tuple(coerced(field, number, 0.0) for number in values)
+    if not is_number:
+        raise wrong("a number")
+    if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
+        raise wrong(f"a number up to {LARGEST_WHOLE}")
+    if isinstance(like, int) and value != int(value if math.isfinite(value) else 0):
+        raise wrong("a whole number")
+    return type(like)(value)
+
+
+def is_alone(value: Value) -> bool:
+    """Whether it is no list."""
+    return not isinstance(value, list | tuple)
+
+
+def check_numbers(what: str, value: Value, least: str = "") -> None:
+    """Raise ValueError, naming what it is, unless its numbers are finite and of this sign.
+
+    Words, pieces, and numbers that are being traced are let through.
+    """
+    if isinstance(value, tuple):
+        for element in value:
+            check_numbers(what, element, least)
+    elif isinstance(value, int | float | np.ndarray):
+        for number in np.ravel(value).tolist():
+            if not math.isfinite(number):
+                raise ValueError(f"{what} holds {number}; it must be finite")
+            if (least == POSITIVE and number <= 0) or (least == NOT_NEGATIVE and number < 0):
+                wanted = "be positive" if least == POSITIVE else "not be negative"
+                raise ValueError(f"{what} must {wanted}, not {number}")
+
+
+def check_signs(piece: Any, positive: Iterable[str], not_negative: Iterable[str] = ()) -> None:
+    """Raise ValueError unless these fields of a piece are finite and of these signs."""
+    for least, names in ((POSITIVE, positive), (NOT_NEGATIVE, not_negative)):
+        for name in names:
+            check_numbers(f"{name} of {type(piece).__name__}", getattr(piece, name), least)
