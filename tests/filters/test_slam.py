@@ -218,7 +218,7 @@ def exact_run(chosen, points):
     step = np.array([[c, -s, nominal[0]], [s, c, nominal[1]], [0, 0, 1]])
     T = np.array([np.linalg.matrix_power(step, k) for k in range(chosen.steps + 1)])
     seen = np.einsum("kji,klj->kli", T[:, :2, :2], points - T[:, None, :2, 2])
-    measured = seen if chosen.sensor == "position" else 650 * seen[..., :1] / seen[..., 1:] + 320
+    measured = seen if chosen.sensor.hidden == 0 else 650 * seen[..., :1] / seen[..., 1:] + 320
     slots = np.tile(np.arange(len(points)), (len(T), 1))
     everything = Features(slots, measured, np.ones(slots.shape, bool))
     first, later = (jax.tree.map(lambda x, at=at: x[at], everything) for at in (0, slice(1, None)))
