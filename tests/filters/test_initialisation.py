@@ -192,7 +192,7 @@ def test_members_share_a_measurement_by_their_weights_to_the_privilege(privilege
 
     monkeypatch.setattr(rays, "correct", recorded)
     after, _ = slam.step(state, DT, pixels(seen_at(4.0, 0.2, 1)), NONE)
-    powers = np.asarray(after.memory[0]) ** privilege
+    powers = np.asarray(after.weights[0]) ** privilege
     np.testing.assert_allclose(shares[0], powers / powers.sum(), rtol=1e-12)
 
 
