@@ -73,7 +73,7 @@ def monte_carlo(
     With the `backend` "native" filters are compiled by the system's C++ compiler
     (`jaxslam.native`), to the same numbers but for rounding; where that cannot be, a warning says
     why, and XLA ("xla") computes them. "auto" takes it where that is worth it (`backends.chosen`),
-    on a cluster never. Records that a store has are gone on with by the backend that made them.
+    on a cluster never. A resumed study keeps its backend.
 
     A `reduced` study keeps of every chunk but the first only sums over its runs, made where the
     chunk is computed: all of a summary but the medians, which are then the first chunk's.

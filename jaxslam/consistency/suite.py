@@ -46,14 +46,14 @@ class SuiteScenario:
         """
         s, axes = self.scenario, AXES[self.scenario.geometry]
         if s.sensor != "camera":
-            raise ValueError(f"{s.name}: its sensor is {s.sensor}; for a suite camera is accepted")
+            raise ValueError(f"{s.name} has a {s.sensor} sensor; --suite supports cameras only")
         with jax.enable_x64(True):
             batch = jax.device_get(draw(s, self.runs, seed=self.seed)[1])
             turns = batch.poses.rotation().log()
         if batch.new is not None:
             raise ValueError(
-                f"{s.name}: its landmarks share slots, so that none has a number of its own; for a "
-                "suite in_view=0 is accepted, and any placement but rays"
+                f"{s.name}: its landmarks share slots, so they have no numbers of their own; "
+                "--suite needs in_view=0 and a placement other than rays"
             )
         seen, (run, step) = np.nonzero(batch.visible), np.indices(batch.visible.shape[:2])
         pose = np.dstack([run, step, step / s.rate, batch.poses.translation(), turns])
@@ -88,7 +88,7 @@ def write_suite(
             f"a suite needs at least one scenario; by default it has {', '.join(SUITE)}"
         )
     if folder.exists():
-        raise ValueError(f"{folder} is there already; a new folder is accepted")
+        raise ValueError(f"{folder} already exists; name a new folder")
     with write_atomically(folder) as temporary:
         for one in chosen:
             (place := temporary / one.name).mkdir(parents=True)

@@ -331,8 +331,9 @@ def table(summary: Summary | Study) -> str:
             f"last of {summary['steps']} steps, {summary['runs']} runs of seed {summary['seed']}; "
             f"a consistent filter has mean NEES {next(iter(filters.values()))['dof']}; verdicts: "
             "of all steps, the last and each third together, [99 % interval]",
-            "lost: NEES above the 99.99 % quantile of χ² now; ever: at any step above the higher "
-            "quantile for so many, so that ever may be less; others: mean of those not lost now",
+            "lost: NEES above the 99.99 % quantile of χ² at the last step; ever: NEES above a "
+            "stricter limit at some step (so `ever` can be smaller than `lost`); others: mean "
+            "NEES of the runs not lost at the last step",
             *(_scale_table(filters, wide) if summary["scale_free"] else ()),
             *_notes(filters),
         ]

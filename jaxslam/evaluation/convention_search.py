@@ -116,7 +116,7 @@ class Identification:
     def sentence(self) -> str:
         """The result in a line."""
         if not self.consistent and self.whole:
-            return "of position or rotation alone σ is wrong under every convention that was tried"
+            return "σ of position or rotation alone is wrong under every convention tried"
         if not self.consistent:
             return "no other convention of the covariance would make the data consistent"
         alike = _ALIKE if self.consistent[0].error in ("right", "split") else ""
@@ -127,9 +127,11 @@ class Identification:
         if len(apart) > _TOLD:
             others += f"; and {len(apart) - _TOLD} more"
         if self.doubtful:
-            return f"the convention ({self.stated}) is doubtful, but these cannot be told: {others}"
+            return (
+                f"the convention ({self.stated}) is doubtful, but these fit equally well: {others}"
+            )
         if others:
-            return f"the convention ({self.stated}) cannot be told from: {others}"
+            return f"the convention ({self.stated}) cannot be distinguished from: {others}"
         return f"of {len(self.nees)} conventions the stated one ({self.stated}) fits best{alike}"
 
     def _other(self, other: Convention) -> str:

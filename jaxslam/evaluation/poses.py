@@ -37,8 +37,8 @@ from jaxslam.evaluation.scale import Scale, at_one_scale, of_aligned
 from jaxslam.geometry import Geometry
 
 BEYOND = (
-    "NEES is given the scale, at the one of each run that explains all of its poses best; "
-    "positions are in the estimate's unit"
+    "NEES is computed at the scale of each run that explains all of its poses best; positions are "
+    "in the estimate's unit"
 )
 
 
@@ -95,7 +95,7 @@ def evaluate_poses(
     stated = convention or Convention()
     if not isinstance(stated, Convention):
         raise ValueError(
-            f"a convention is a jaxslam.Convention, as Convention('right'), not {stated}"
+            f"convention must be a jaxslam.Convention, such as Convention('right'), not {stated}"
         )
     lookup("align", [align], dict.fromkeys(ALIGNMENTS))
     poses = checked_poses(estimates, covariances, truths)
@@ -158,7 +158,7 @@ def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseE
     if truth_sigma is not None:
         later = _with_truth(world, later, convention, axes, truth_sigma)
         P, (metres, degrees) = later.covariances[..., axes[:, None], axes], truth_sigma
-        notes += (f"σ of the truth, {metres:g} m and {degrees:g}°, is a part of every σ claimed",)
+        notes += (f"every stated σ includes that of the truth, {metres:g} m and {degrees:g}°",)
     if world.given:
         errors, P, fitted, axis_fitted, scale = at_one_scale(later, convention, axes)
         notes += (BEYOND,)
@@ -293,7 +293,7 @@ def estimated(
         for which in (True, False)
     )
     return used, (
-        f"{', '.join(left)}: errors are zero throughout, so that nothing was estimated; left out, "
+        f"{', '.join(left)}: errors are always zero, so these axes were not estimated; left out, "
         f"as with --axes-used {','.join(used)}",
     )
 

@@ -121,7 +121,7 @@ def _unwrapped(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake
             others += f" in {run.sum()} runs" if run.sum() > 1 else ""
             yield Mistake(
                 f"an angle is not wrapped ({logged.names[axis]})",
-                f"errors of {logged.names[axis]} are off by full turns, near multiples of {turn} "
+                f"errors of {logged.names[axis]} are near multiples of {turn} "
                 f"and nowhere between: {e[first, step]:.4g} at {logged.steps[step]} of "
                 f"{logged.runs[first]}{others}; wrap them to {wrapped}",
             )
@@ -177,10 +177,10 @@ def _degrees(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake]:
         names = ", ".join(logged.names[axis] for axis in found)
         told = f"180/π is {DEGREES:.3g}" if factor > 1 else f"π/180 is {1 / DEGREES:.3g}"
         yield Mistake(
-            f"degrees where radians belong ({names})",
-            f"errors of {names} look as if they were in {errors} and the covariances in "
+            f"degrees instead of radians ({names})",
+            f"errors of {names} appear to be in {errors} and the covariances in "
             f"{covariances}: σ should be {wrong[found[0]].by:.3g} times as large, and "
-            f"{told}; both in radians are accepted",
+            f"{told}; give both in radians",
         )
 
 
@@ -238,10 +238,10 @@ def _interchanged(logged: Logged) -> Iterator[Mistake]:
     if ours < _CORRELATED or theirs > ours / 2 or not _by_order(runs):
         return
     yield Mistake(
-        "runs and steps look interchanged",
+        "runs and steps appear to be swapped",
         f"errors of neighbouring runs correlate by {ours:.2f} and those of neighbouring steps by "
-        f"{theirs:.2f}, as if steps came first and runs second; (runs, steps, …) is accepted, of "
-        "runs that are independent of each other",
+        f"{theirs:.2f}, as if steps came first and runs second; expected (runs, steps, …) of "
+        "independent runs",
     )
 
 

@@ -89,12 +89,12 @@ class Scale:
     def sentence(self) -> str:
         """A sentence: `the scale drifts by 12 % (RMS) along a run, 5 times what σ allows …`."""
         if self.verdict is None:
-            return "no pose tells a scale"
+            return "no pose determines a scale"
         size = f"{100 * np.expm1(min(self.rms, 700.0)):.2g}"
         told = f"the scale drifts by {size} % (RMS) along a run, {self.factor:.2g} times "
         if self.disproved:
-            return told + "what σ allows: over-confident"
-        return told + "its σ: not more than σ allows"
+            return told + "its σ: over-confident"
+        return told + "its σ: no more than σ allows"
 
     @property
     def over_runs(self) -> tuple[Float[np.ndarray, "2 steps"], np.ndarray, np.ndarray]:
@@ -249,7 +249,7 @@ def _fitted(
     except np.linalg.LinAlgError:
         raise ValueError(
             f"the joint covariance of run {run} is not positive definite; NEES at one scale needs "
-            "one, or the covariances of the poses alone"
+            "one that is, or only the covariances of single poses"
         ) from None
     residual, slope = np.linalg.solve(L, np.stack([e, G], axis=1) * scaling[:, None]).T
     information = float(slope @ slope)

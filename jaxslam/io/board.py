@@ -49,12 +49,15 @@ class Board:
             raise ValueError(f"unknown board {self.kind!r}; known: {', '.join(KINDS)}")
         if min(self.columns, self.rows) < 4:
             raise ValueError(
-                f"a board of {self.columns}x{self.rows} squares; at least 4x4 are accepted"
+                f"a board must have at least 4x4 squares, not {self.columns}x{self.rows}"
             )
         if not 0 < self.square < np.inf:
-            raise ValueError(f"square is {self.square} m; a positive length is accepted")
+            raise ValueError(f"square must be a positive length, not {self.square} m")
         if not hasattr(cv2.aruco, f"DICT_{self.dictionary}"):
-            raise ValueError(f"unknown dictionary {self.dictionary!r}; as 4X4_50, 5X5_100, 6X6_250")
+            raise ValueError(
+                f"unknown dictionary {self.dictionary!r}; known: 4X4_50, 5X5_100, 6X6_250 and "
+                "OpenCV's others"
+            )
 
     @property
     def corners(self) -> Float32[np.ndarray, "n 3"]:

@@ -53,14 +53,14 @@ def calibrate(
     """
     recording = open_recording(source)
     if recording.clock is not None:
-        raise ValueError(f"{recording.name}: is live; a video of a board is accepted")
+        raise ValueError(f"{recording.name} is a live camera; expected a video of a board")
     size, views = _views(recording, board, progress)
     chosen = different(views, size)
     if len(chosen) < LEAST_VIEWS:
         raise ValueError(
             f"{source}: {len(views)} pictures show the whole board of {board.columns}x{board.rows} "
-            f"squares (counted on the paper), of which {len(chosen)} are sharp and differ; at "
-            f"least {LEAST_VIEWS} are needed"
+            f"squares, of which {len(chosen)} are sharp and different; at least {LEAST_VIEWS} are "
+            "needed"
         )
     return fitted(chosen, size)
 
@@ -74,7 +74,7 @@ def _views(
     for index, image in enumerate(recording.images()):
         progress(1)
         if index and image.shape[::-1] != size:
-            raise ValueError(f"{recording.name}: picture {index} is of another size than the first")
+            raise ValueError(f"{recording.name}: picture {index} differs in size from the first")
         size = image.shape[::-1]
         view = board.find(image) if index % every == 0 else None
         views += [] if view is None else [view]

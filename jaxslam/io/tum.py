@@ -58,12 +58,12 @@ def rows_as_poses(place: Callable[[int], str], rows: np.ndarray) -> Float[np.nda
     """Poses from rows `t tx ty tz qx qy qz qw …`. Raises ValueError, naming the place."""
     size = np.abs(rows[:, 4:8]).max(axis=1)
     if (zero := np.flatnonzero(size == 0)).size:
-        raise ValueError(f"{place(zero[0])}: the quaternion is zero; a rotation's is accepted")
+        raise ValueError(f"{place(zero[0])}: the quaternion is zero, so it is not a rotation")
     far = ~((np.abs(rows).max(axis=1) <= LARGEST) & (size >= 1 / LARGEST))  # or not finite
     if (wrong := np.flatnonzero(far)).size:
         raise ValueError(
-            f"{place(wrong[0])}: finite numbers up to {LARGEST:.0e}, and a quaternion "
-            f"longer than {1 / LARGEST:.0e}, are accepted"
+            f"{place(wrong[0])}: expected finite numbers up to {LARGEST:.0e} and a quaternion "
+            f"longer than {1 / LARGEST:.0e}"
         )
     return poses(rows[:, 1:4], rows[:, 4:8])
 
@@ -85,7 +85,7 @@ def check_seconds(what: str, times: Float[np.ndarray, " n"]) -> None:
     size, units = (last, by_size) if last > _LATEST else (step, by_step)
     unit = next(unit for least, unit in units if size >= least)
     told = f"up to {last:.3g}" if last > _LATEST else f"{step:.3g} from one to the next"
-    raise ValueError(f"{what}: times {told} look like {unit}; seconds are accepted")
+    raise ValueError(f"{what}: times {told} look like {unit}; expected seconds")
 
 
 def not_rigid(T: Float[np.ndarray, "*k d d"], tolerance: float) -> Bool[np.ndarray, "*k"]:
@@ -142,12 +142,12 @@ def read_table(
             comments = {first: rows.pop(first)} | comments
         columns = len(words(rows[min(rows)])) if rows else 0
     if not rows:
-        raise ValueError(f"{path}: holds no {holds}; lines of {row} are accepted")
+        raise ValueError(f"{path} has no {holds}; expected lines of {row}")
     table = []
     for place, line in rows.items():
         found = numbers(words(line)[: columns if spare else None], columns or 0, finite=finite)
         if found is None:
-            raise ValueError(f"{path}, line {place}: {row} are accepted")
+            raise ValueError(f"{path}, line {place}: expected {row}")
         table.append(found)
     return Table(tuple(comments.values()), np.array(table), tuple(rows))
 
@@ -191,9 +191,7 @@ def write_table(
     """A line of each time and row, under a comment that names the columns after the time."""
     times = np.asarray(times, dtype=float)
     if times.shape != (len(table),):
-        raise ValueError(
-            f"{len(times)} times for {len(table)} {what}; as many of each are accepted"
-        )
+        raise ValueError(f"{len(times)} times for {len(table)} {what}; their numbers must be equal")
     with write_atomically(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(f"# t {header}\n")
         for time, row in zip(times, table, strict=True):
@@ -207,8 +205,8 @@ _STATE, _CAMERA = 19, 15
 _TUM = 8
 _ROWS = {
     4: "four finite numbers t x y θ (s, m, rad)",
-    12: "12 finite numbers, the rows of a 3x4 T_wc (KITTI),",
-    WITH_COVARIANCE: "20 finite numbers t tx ty tz qx qy qz qw, 6 of Pr and 6 of Pp (OpenVINS),",
+    12: "12 finite numbers, the rows of a 3x4 T_wc (KITTI)",
+    WITH_COVARIANCE: "20 finite numbers t tx ty tz qx qy qz qw, 6 of Pr and 6 of Pp (OpenVINS)",
 }
 
 
@@ -252,7 +250,7 @@ def read_log(
 def _planar(path: Path, rows: np.ndarray, lines: tuple[int, ...]) -> Float[np.ndarray, "n 3 3"]:
     far = np.flatnonzero(np.abs(rows).max(axis=1) > LARGEST)
     if far.size:
-        raise ValueError(f"{path}, line {lines[far[0]]}: numbers up to {LARGEST:.0e} are accepted")
+        raise ValueError(f"{path}, line {lines[far[0]]}: expected numbers up to {LARGEST:.0e}")
     return of_xytheta(rows[:, 1:])
 
 
@@ -272,7 +270,7 @@ def _matrices(path: Path, rows: np.ndarray, lines: tuple[int, ...]) -> Float[np.
     if wrong.size:
         place = f"{path}, line {lines[wrong[0]]}"
         raise ValueError(
-            f"{place}: no rigid motion [R t] with R a rotation; {_ROWS[12]} are accepted"
+            f"{place}: not a rigid motion [R t] with a rotation R; expected {_ROWS[12]}"
         )
     left, _, right = np.linalg.svd(T[:, :3, :3])  # rounding to six digits, taken away
     T[:, :3, :3] = left @ right
@@ -283,9 +281,9 @@ def _times(path: Path, poses: int) -> Float[np.ndarray, " n"]:
     beside = path.parent / "times.txt"
     if not beside.is_file():
         return np.arange(float(poses))
-    times = read_table(beside, "times", "times", "finite times, s,", 1).rows[:, 0]
+    times = read_table(beside, "times", "times", "finite times in seconds", 1).rows[:, 0]
     if len(times) != poses:
-        raise ValueError(f"{beside}: holds {len(times)} times for {poses} poses of {path}")
+        raise ValueError(f"{beside} has {len(times)} times for the {poses} poses of {path}")
     return times
 
 

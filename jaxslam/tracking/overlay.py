@@ -82,7 +82,7 @@ def draw_overlay(
     """
     unknown = sorted(set(table.labels.tolist()) - set(COLOURS))
     if unknown:
-        raise ValueError(f"label {unknown[0]!r} is unknown; {', '.join(COLOURS)} are accepted")
+        raise ValueError(f"unknown label {unknown[0]!r}; known: {', '.join(COLOURS)}")
     # Less contrast, so that the lines stand out.
     canvas = cv2.cvtColor(cv2.convertScaleAbs(image, alpha=0.75, beta=20), cv2.COLOR_GRAY2BGR)
     for label in COLOURS:

@@ -119,18 +119,18 @@ def load(
     """
     header, arrays = read_record(path)
     if header.get("filter") is not None and not own_filter:
-        raise ValueError(f"{path}: was saved with a filter {header['filter']}; give that")
+        raise ValueError(f"{path} was saved with the filter {header['filter']}; pass that filter")
     try:
         settings = TrackerSettings(**header["settings"])
     except TypeError:
-        raise ValueError(f"{path}: was saved by another version, with other settings") from None
+        raise ValueError(f"{path} was saved by another version, with different settings") from None
     except KeyError:
-        raise ValueError(f"{path}: is damaged: it has no settings") from None
+        raise ValueError(f"{path} is damaged: it has no settings") from None
     try:
         tracker = make(from_fields(header["calibration"]), settings)
         _restore(tracker, header, arrays)
     except (KeyError, TypeError, IndexError, AttributeError) as error:
-        raise ValueError(f"{path}: is damaged ({one_line(error)})") from None
+        raise ValueError(f"{path} is damaged ({one_line(error)})") from None
     return tracker
 
 
@@ -228,7 +228,7 @@ def read_record(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]
     if not isinstance(header, dict):
         header = {}
     if header.get("format") != FORMAT:
-        raise ValueError(f"{path}: is no tracker's file ({FORMAT})")
+        raise ValueError(f"{path} is not a saved tracker ({FORMAT})")
     return header, arrays
 
 
@@ -248,5 +248,5 @@ def grown(like: Any, arrays: Mapping[str, np.ndarray], name: str) -> Any:
         for new, leaf in zip(found, old, strict=True)
     ]
     if count != len(old) or not all(same):
-        raise ValueError("the state in the file is of another filter than the one that goes on")
+        raise ValueError("the saved state belongs to a different filter")
     return jax.tree.unflatten(structure, [jnp.asarray(new) for new in found])

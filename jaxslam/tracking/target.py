@@ -45,7 +45,7 @@ class KnownPoint:
     def __post_init__(self) -> None:
         if (self.pixel is None) == (self.patch is None):
             raise ValueError(
-                f"point {self.name} needs a `pixel` [u, v] or a `patch`, an image file; one of them"
+                f"point {self.name} needs either a `pixel` [u, v] or a `patch`, an image file"
             )
 
 
@@ -57,11 +57,11 @@ class Target:
 
     def __post_init__(self) -> None:
         if len(self.points) < LEAST_POINTS:
-            raise ValueError(f"has {len(self.points)} points; at least {LEAST_POINTS} are accepted")
+            raise ValueError(f"has {len(self.points)} points; at least {LEAST_POINTS} are needed")
         from_middle = self.positions - self.positions.mean(axis=0)
         extent = np.linalg.svd(from_middle, compute_uv=False)
         if extent[1] < 1e-3 * extent[0] or not extent[0]:
-            raise ValueError("its points are on one line; at least a plane of them is accepted")
+            raise ValueError("its points are on one line; they must span a plane")
 
     @property
     def positions(self) -> Float[np.ndarray, "n 3"]:
@@ -96,16 +96,16 @@ def read_target(path: str | Path) -> Target:
 def _from_fields(fields: Any, folder: Path) -> Target:
     points = fields.get("points") if isinstance(fields, dict) else None
     if not isinstance(points, list):
-        raise ValueError("holds no list of points; an object with `points` is accepted")
+        raise ValueError("has no list of points; expected an object with `points`")
     unit = fields.get("unit", "metre")
     if unit not in _METRES:
-        raise ValueError(f"unit is {unit!r}; metre is accepted")
+        raise ValueError(f"unit must be metre, not {unit!r}")
     return Target(tuple(_point(index, point, folder) for index, point in enumerate(points)))
 
 
 def _point(index: int, fields: Any, folder: Path) -> KnownPoint:
     if not isinstance(fields, dict):
-        raise ValueError(f"point {index} is {fields!r}; an object is accepted")
+        raise ValueError(f"point {index} must be an object, not {fields!r}")
     name = str(fields.get("name", index))
     position = _numbers(f"position of point {name}", fields.get("position"), 3)
     pixel, patch = fields.get("pixel"), fields.get("patch")
@@ -123,7 +123,7 @@ def _numbers(what: str, value: Any, count: int) -> Float[np.ndarray, " n"]:
     except (TypeError, ValueError, OverflowError):
         numbers = np.zeros(0)
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
-        raise ValueError(f"{what} is {value!r}; {count} finite numbers are accepted")
+        raise ValueError(f"{what} must be {count} finite numbers, not {value!r}")
     return numbers
 
 
@@ -146,7 +146,7 @@ def sighted(
     if not pose.rms <= largest:
         raise ValueError(
             f"the first picture does not show the target: its points are off by {pose.rms:.2f} px "
-            f"(RMS); {largest:g} px are accepted"
+            f"(RMS); the limit is {largest:g} px"
         )
     return _sighting(positions, pixels, lens, pose, pixel_sigma)
 

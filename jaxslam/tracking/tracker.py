@@ -87,8 +87,8 @@ class Tracker:
     def __post_init__(self) -> None:
         if not isinstance(self.calibration, Calibration):
             raise ValueError(
-                f"calibration is a {type(self.calibration).__name__}; a Calibration is accepted, "
-                "which `jaxslam.io.calibration.read_calibration` reads from a file"
+                f"calibration must be a Calibration, not a {type(self.calibration).__name__}; "
+                "jaxslam.io.calibration.read_calibration reads one from a file"
             )
         settings, own = self.settings, self.filter
         self.filter_name = settings.filter if own is None else type(own).__name__
@@ -125,8 +125,8 @@ class Tracker:
         before = -np.inf if self.time is None else self.time
         if not before < frame.time < np.inf:
             raise ValueError(
-                f"frame {frame.index}: its time, {frame.time} s, is not later than the one before, "
-                f"{before} s"
+                f"frame {frame.index}: its time, {frame.time} s, is not later than that of the "
+                f"previous frame, {before} s"
             )
         with jax.enable_x64(True):
             tracked = self._first(frame) if self.time is None else self._next(frame, self.time)
@@ -168,7 +168,7 @@ class Tracker:
         Raises ValueError before the first frame, when there is nothing to go on from.
         """
         if self.time is None:
-            raise ValueError("a tracker that was given no frame yet has nothing to save")
+            raise ValueError("a tracker without any frame has nothing to save")
         persistence.save(path, self, None if self.filter is None else self.filter_name)
 
     @classmethod
@@ -193,7 +193,9 @@ class Tracker:
                 f"{one.width} × {one.height}, fx {one.fx:g}"
                 for one in (tracker.calibration, calibration)
             )
-            raise ValueError(f"{path}: is a map of another camera ({theirs}) than this ({ours})")
+            raise ValueError(
+                f"{path} is a map of another camera ({theirs}), not of this one ({ours})"
+            )
         with jax.enable_x64(True):
             tracker.map.leave()
         tracker.time, tracker.steps, tracker.unmeasured = None, 0, 1

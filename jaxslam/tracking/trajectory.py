@@ -17,11 +17,12 @@ from jaxslam.io.tum import write_tum
 TRACKED = Convention("split", "body")
 """The error whose covariances are written: position in the camera's axes, rotation vector."""
 
-_UNITS = "one unit of length a map, another in every map of frames.csv"
+_UNITS = "in the unit of each map (frames.csv)"
 _GIVEN_SCALE = (
-    "of poses in that unit, of which sigma_log_scale of frames.csv is in doubt; "
-    "where unit_fixed is 0 there, it is nearly the same unit"
+    "in the unit of each map; the unit itself is uncertain by sigma_log_scale (frames.csv) and "
+    "approximate where unit_fixed is 0"
 )
+_KNOWN_SCALE = "in the unit of each map, which the filter takes as exactly known"
 
 
 class TrajectoryError(TypedDict):
@@ -70,8 +71,8 @@ def write_covariances(
     takes for exactly known; and the caveat, if there is one.
     """
     convention = replace(TRACKED, scale="given" if given_scale else "marginal")
-    scale = _GIVEN_SCALE if given_scale else "the filter has no doubt of its scale"
-    remark = "; ".join(filter(None, [f"{_UNITS}, taken as one", scale, caveat]))
+    scale = _GIVEN_SCALE if given_scale else _KNOWN_SCALE
+    remark = "; ".join(filter(None, [scale, caveat]))
     write_pose_covariances(path, times, covariances, convention, length="map", remark=remark)
 
 
@@ -185,8 +186,8 @@ def _paired(
     theirs, ours = associated(true_times, times)
     if len(ours) < 3:
         raise ValueError(
-            f"{len(ours)} poses of the trajectory are within {MAX_TIME_DIFFERENCE} s of one of the "
-            "reference's; at least three are needed"
+            f"{len(ours)} poses of the trajectory are within {MAX_TIME_DIFFERENCE} s of a "
+            "reference pose; at least three are needed"
         )
     return _Pairs(true_times[theirs], T[ours], true[theirs])
 

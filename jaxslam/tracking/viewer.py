@@ -42,7 +42,7 @@ class Viewer:
         self.calibration = calibration
         self._rerun = _rerun()
         if self.path.suffix.lower() != ".rrd":
-            raise ValueError(f"{self.path}: a name ending in .rrd is accepted")
+            raise ValueError(f"{self.path}: the name must end in .rrd")
         self._began: float | None = None
         self._piece, self._positions = 0, np.zeros((0, 3))
         self._before: Tracked | None = None

@@ -94,9 +94,9 @@ def test_consistency_resumes_to_more_runs(tmp_path, capsys):
         (["track", "--reference", "truth.txt"], "need a SOURCE"),
         (["track", "--frames", "0"], "frames"),
         (["track", "--fov", "60"], "need a SOURCE"),
-        (["track", "--every", "0"], "every is 0"),
+        (["track", "--every", "0"], "every must be a positive whole number, not 0"),
         (["track", "--frames", "5", "--start", "2"], "start is 2.0 s; synthetic (seed 0) has"),
-        (["track", "--scale", "-1"], "scale is -1.0"),
+        (["track", "--scale", "-1"], "scale must be a positive factor"),
         (["track", "--calibration-treatment", "maybe"], "unknown calibration 'maybe'"),
         (["calibrate", "/no/such/film"], "/no/such/film: no such file or folder"),
         (["track", "--filter", "nothing"], "unknown filter 'nothing'"),
@@ -200,8 +200,8 @@ def test_an_interrupted_study_says_what_is_kept_and_how_to_go_on(tmp_path, monke
     with pytest.raises(SystemExit) as ended:
         main([*SMALL, "--chunk", "2", "--out", str(tmp_path)])
     assert ended.value.code == 130
-    told = f"jaxslam: interrupted: 2 of 12 runs are kept in {tmp_path}; the same command with "
-    assert capsys.readouterr().err.splitlines()[-1] == f"{told}--resume goes on from there"
+    told = f"jaxslam: interrupted: 2 of 12 runs are in {tmp_path}; the same command with "
+    assert capsys.readouterr().err.splitlines()[-1] == f"{told}--resume continues from there"
 
 
 def test_a_command_within_a_program_does_not_end_it(capsys):
