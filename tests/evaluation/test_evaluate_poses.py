@@ -233,7 +233,7 @@ def test_a_covariance_given_the_scale_is_found_where_the_truth_has_another():
     assert given.dof == 6
     # The scale of small displacements is not affine, nor are errors exactly Gaussian.
     assert not_disproved(given.verdict)
-    assert "given the scale" in str(given)
+    assert "NEES is computed at the scale of each run" in str(given)
     for axis in range(6):
         assert given.axis_verdict(axis)["word"] != "lost"
 
@@ -707,8 +707,8 @@ def test_a_covariance_file_by_others_may_be_in_degrees_and_say_little(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("0 1 2 3\n", "line 1: 22 finite numbers"),
-        ("# a\n" + "nan " * 22, "line 2: 22 finite numbers"),
+        ("0 1 2 3\n", "line 1: expected 22 finite numbers"),
+        ("# a\n" + "nan " * 22, "line 2: expected 22 finite numbers"),
         ("# error=lfet\n" + "1 " * 22, r"unknown error 'lfet' \(did you mean left\?\)"),
         ("# eror=left\n" + "1 " * 22, r"unknown key 'eror' in the header \(did you mean error\?\)"),
         ("# angle=grad\n" + "1 " * 22, "unknown angle 'grad'"),
@@ -829,7 +829,10 @@ FILES = ("estimate.txt", "covariance.txt", "truth.txt")
     ("given", "message"),
     [
         ({"offset": 0.05}, "truth.txt have no time stamps in common"),
-        ({"shown": dict.fromkeys(FILES, nanoseconds)}, "1.4e.18 look like nanoseconds; seconds"),
+        (
+            {"shown": dict.fromkeys(FILES, nanoseconds)},
+            "1.4e.18 look like nanoseconds; expected seconds",
+        ),
         ({"shown": {"covariance.txt": nanoseconds}}, "covariance.txt: times .* like nanoseconds"),
         ({"shown": {"truth.txt": lambda t: f"{t * 1e3:.0f}"}}, "truth.txt: .* like milliseconds"),
         (
@@ -1107,7 +1110,7 @@ def test_files_of_that_name_by_others_and_of_older_versions_say_nothing(text, tm
     ("old", "new", "message"),
     [
         (",1\n", ",yes\n", r"frames\.csv, line 2: expected a finite time.* unit_fixed 0 or 1"),
-        ("9,0.3", "9,nan0.3", r"frames\.csv, line 11: a finite time"),
+        ("9,0.3", "9,nan0.3", r"frames\.csv, line 11: expected a finite time"),
         (",1\n", ",0\n", "every frame with a pose is lost or has no fixed unit"),
         ("\n0,0", "\n0,-9", "pose at 0.000 s; it must list the frames of the trajectory"),
         ("tracked,0", "tracked,-1", "line 2: .* the number of a map"),
@@ -1211,7 +1214,7 @@ def test_the_command_takes_the_sigma_of_the_truth(tmp_path, capsys):
     run, out = one_run(tmp_path / "run"), tmp_path / "out"
     main(["evaluate", str(run), "--truth-sigma", "0.05", "1", "--out", str(out)])
     assert json.loads((out / "evaluation.json").read_text())["truth_sigma"] == [0.05, 1.0]
-    assert "σ of the truth, 0.05 m and 1°" in capsys.readouterr().out
+    assert "includes that of the truth, 0.05 m and 1°" in capsys.readouterr().out
     for wrong in ((-1, 0), (1,), (np.nan, 1), (1, 2, 3)):
         with pytest.raises(ValueError, match="truth_sigma must be two numbers, metres and degrees"):
             jaxslam.evaluate_log(run, truth_sigma=wrong)

@@ -171,7 +171,9 @@ def test_deviations_in_place_of_covariances(tmp_path):
     found = same(evaluate_log(lines(tmp_path / "runs.csv", *columns, header=header)), wanted)
     assert found.names == ("a", "b", "c", "d")
     np.savez(tmp_path / "runs.npz", errors=ERRORS, sigmas=-sigma)
-    with pytest.raises(ValueError, match=r"sigmas of run 0, step 0 hold -1\.22; 0 or more"):
+    with pytest.raises(
+        ValueError, match=r"sigmas of run 0, step 0 must not be negative, not -1\.22"
+    ):
         evaluate_log(tmp_path / "runs.npz")
 
 

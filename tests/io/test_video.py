@@ -96,7 +96,9 @@ class Told:
 
 def test_times_that_do_not_increase_are_those_of_the_frame_rate(monkeypatch, tmp_path):
     monkeypatch.setattr(cv2, "VideoCapture", lambda path: Told([0.0, 0.1, 0.1, 0.3], []))
-    with pytest.warns(UserWarning, match=r"picture 2 is at 0\.100 s, after one at 0\.100 s; 30 frames per second are assumed"):
+    with pytest.warns(
+        UserWarning, match=r"picture 2 is at 0\.100 s, after one .* per second are assumed"
+    ):
         times = file.read_times(tmp_path / "v.mp4")
     np.testing.assert_allclose(times, np.arange(4) / RATE, rtol=0, atol=1e-12)
     monkeypatch.setattr(cv2, "VideoCapture", lambda path: Told([0.0, 0.0], [], rate=0.0))
