@@ -3,7 +3,7 @@
     python benchmarks/pages.py
 
 writes all of them anew. In `σ × 1.02 [0.96, 1.11]<!-- =sigma('circle', 'recommended') -->` they are
-three of `consistency.json`; a file of the results is a name, as in `1.1<!-- =cost['filters'] … -->`.
+three of `consistency.json`; a file of results is a name, as in `1.1<!-- =cost['filters'] … -->`.
 A number keeps its decimals, and small whole ones may be words. `tests/benchmarks/test_pages.py`
 fails where a page is older than its results.
 """

@@ -341,7 +341,7 @@ class Comparison(NamedTuple):
     estimates: Mapping[str, Samples]
     """The estimates by parametrization."""
     distances: list[dict[tuple[str, str, str], Distance]]
-    """By estimate, truth and coordinate: from the exact pixels, then from each measured pair."""
+    """The distances by estimate, truth and coordinate: at the exact pixels, then at each pair."""
 
 
 def compare(

@@ -27,12 +27,12 @@ class EvaluateOptions:
     """Options of the command; every field is an option."""
 
     source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
-    """Arrays (FILE.npz with errors and covariances, innovations and covariances, or estimates,
-    covariances and truths; FILE.csv with lines of run, step, errors, upper triangle); a trajectory
-    (t tx ty tz qx qy qz qw in s and m; t x y θ; OpenVINS; KITTI); a folder with estimate.txt,
-    covariance.txt and truth.txt, or OpenVINS's state_estimate.txt, state_deviation.txt and
-    state_groundtruth.txt, or with one sub-folder of these per run; or ROS bags. Runs may differ in
-    length."""
+    """Arrays, a trajectory, a folder or ROS bags. Arrays: FILE.npz with errors and covariances,
+    innovations and covariances, or estimates, covariances and truths; FILE.csv with lines of run,
+    step, errors, upper triangle. Trajectory: t tx ty tz qx qy qz qw in s and m; t x y θ; OpenVINS;
+    KITTI. Folder: estimate.txt, covariance.txt and truth.txt, or OpenVINS's state_estimate.txt,
+    state_deviation.txt and state_groundtruth.txt, or one sub-folder of these per run. Runs may
+    differ in length."""
     covariance: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Covariances of the trajectory's poses (docs/covariance-format.md)."""
     truth: Annotated[str | None, tyro.conf.arg(metavar="FILE|TOPIC")] = None

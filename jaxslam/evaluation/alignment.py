@@ -2,7 +2,7 @@
 
 A trajectory that nothing ties to the world is known up to a rigid motion, and from images alone up
 to a similarity: a gauge. A covariance is of errors in one gauge, and aligning the trajectory to
-the truth is a change of gauge (Zhang, Gallego, Scaramuzza, RA-L 2018): to first order the errors e
+the truth is a change of gauge (Zhang, Gallego, Scaramuzza, RA-L 2018). To first order the errors e
 of all poses become `e − U (Vᵀ U)⁻¹ Vᵀ e`, the oblique projection along the gauge's directions U
 onto the errors that the alignment leaves as they are, `Vᵀ e = 0`.
 """
@@ -84,8 +84,8 @@ def similarity(
     """Umeyama's least squares of positions (TPAMI 1991), without the test that the rank is two.
 
     On a straight line the rotation about it is arbitrary, but no position depends on it where
-    the reference is the line, so that the error is the smallest one all the same. Raises
-    ValueError where all positions of one are in one place.
+    the reference is the line, so the error is nevertheless the smallest one. Raises ValueError
+    where all positions of one coincide.
     """
     mean_estimate, mean_reference = estimate.mean(0), reference.mean(0)
     centred, target = estimate - mean_estimate, reference - mean_reference

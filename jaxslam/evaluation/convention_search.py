@@ -8,7 +8,7 @@ another where the runs' averages of NEES differ by more than they scatter, pair 
 rotation alone.
 
 A scale that is fitted lowers NEES whatever the convention, of a right covariance that of the
-position from n to n − 1 at the least. Only where it lowers it further, so that no σ explains it, is
+position at least from n to n − 1. Only where it lowers it further, so that no σ explains it, is
 the covariance one given the scale.
 """
 

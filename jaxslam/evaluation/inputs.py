@@ -150,7 +150,7 @@ def without_known(
 ) -> EvaluatedSteps:
     """The steps that were logged, but for those that a run knows by definition at its beginning.
 
-    Raises ValueError where one is wrong all the same, or where of a run nothing else is left.
+    Raises ValueError where one of those is nevertheless wrong, or where a run has no other step.
     """
     known = exactly_known(covariances) & logged
     if (known == logged).all():

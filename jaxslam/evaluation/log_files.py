@@ -57,9 +57,9 @@ def evaluate_log(
     """The verdict on what a file or a folder holds.
 
     `source` is an npz file of arrays, a CSV file of `run, step, errors, upper triangle` lines, a
-    trajectory in TUM format with its `covariance` and `truth`, or a folder: one run, or one a
-    sub-folder, of `estimate.txt`, `covariance.txt` and `truth.txt`; or a ROS bag, or a folder of
-    them, whose topics `estimate` and `truth` name where several fit. Where the tracker's
+    trajectory in TUM format with its `covariance` and `truth`, or a folder. A folder has a run of
+    `estimate.txt`, `covariance.txt` and `truth.txt`, or one per sub-folder, or ROS bags. The topics
+    of a bag are named by `estimate` and `truth` where several fit. Where the tracker's
     `frames.csv` is beside a trajectory, its longest map is evaluated, without frames that are lost
     or whose unit was not fixed yet. What is `stated` of the convention (`error`, `axes`, `order`,
     `scale`) comes before what the files say. For the alignment of poses, the axes used and the

@@ -25,7 +25,7 @@ from jaxslam.statistics.verdict import Verdict, run_verdict
 
 DRIFT_CONFIDENCE = 0.999
 """The confidence of the verdict on drift: with that on NEES, which is one-sided where a fit took a
-degree of freedom, a right filter is called inconsistent once in a hundred studies all the same."""
+degree of freedom, a right filter is called inconsistent in one of a hundred studies."""
 QUANTILES = (0.025, 0.5, 0.975)
 """The quantiles of the runs' drifts, per step."""
 _LEFT = 1e-9
@@ -77,7 +77,7 @@ class Scale:
 
     @property
     def disproved(self) -> bool:
-        """Whether the scale drifts more than σ allows, beyond doubt."""
+        """Whether the scale certainly drifts more than σ allows."""
         found = self.verdict
         return bool(
             found is not None

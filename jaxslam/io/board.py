@@ -32,7 +32,7 @@ class View(NamedTuple):
 
 @dataclass(frozen=True)
 class Board:
-    """So many squares across and down, of side `square`, m, counted on the paper.
+    """A board of squares across and down, counted on the paper, of side `square`, m.
 
     A `charuco` board has a marker of `dictionary` in every white square, so that part of it is
     enough. Raises ValueError for what is no board.

@@ -16,7 +16,7 @@ from jaxslam.io.opening import open_recording
 from jaxslam.io.recording import Recording
 
 LOOKED_AT = 300
-"""Pictures of a video in which the board is sought, at the most, spread over all of it."""
+"""The most pictures of a video in which the board is sought, spread over all of it."""
 VIEWS = 30
 LEAST_VIEWS = 6
 _SHARP = 0.7
@@ -35,7 +35,7 @@ class Calibrated:
     calibration: Calibration
     distortion_sigma: tuple[float, ...]
     rms: float
-    """Of the reprojection error, pixels."""
+    """The RMS reprojection error, pixels."""
     views: tuple[View, ...]
 
     @property

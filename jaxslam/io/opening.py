@@ -46,9 +46,9 @@ def open_source(
     `calibration` (JSON), `fov` (horizontal field of view, degrees) and `reference` (TUM
     trajectory) override what the layout holds; where nothing is known of the camera, its
     calibration is guessed, with a warning. `rate` is the frame rate in 1/s of a plain folder of
-    images. Taken is every `every`-th frame, from `start` seconds after the first on, `frames` of
-    them at the most, pictures and calibration `scale` times as large: by default those of more than
-    `WIDEST` pixels are made a half as large, or a third and so on, with a warning. Raises
+    images. Every `every`-th frame is taken, from `start` seconds after the first on, at most
+    `frames` of them. Pictures and calibration are resized by the factor `scale`; by default those
+    of more than `WIDEST` pixels are reduced to a half, a third and so on, with a warning. Raises
     `ValueError`, naming the file and line, for anything missing, unreadable or contradictory; the
     first image is read here, later ones as the source is iterated over.
     """

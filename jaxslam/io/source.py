@@ -79,7 +79,7 @@ def check_size(what: str, image: Image, calibration: Calibration) -> None:
 def selected(
     source: Source, *, start: float = 0.0, every: int = 1, frames: int | None = None
 ) -> Source:
-    """Every `every`-th frame from the one that is nearest to `start` on, `frames` at the most.
+    """Every `every`-th frame from the one that is nearest to `start` on, at most `frames`.
 
     `start` is in seconds after the first frame. Raises ValueError for numbers that select none.
     """
@@ -109,7 +109,7 @@ def _check_selection(source: Source, start: float, every: int, frames: int | Non
 
 
 def resized(source: Source, factor: float) -> Source:
-    """The source with pictures and calibration so many times as large, in whole pixels.
+    """The source with pictures and calibration resized by a factor, in whole pixels.
 
     Raises ValueError for a factor that leaves no picture.
     """

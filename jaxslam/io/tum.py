@@ -158,7 +158,7 @@ def words(line: str) -> list[str]:
 
 
 def numbers(told: Sequence[str], count: int, *, finite: bool = True) -> list[float] | None:
-    """So many words as numbers, finite unless that is not asked for; None where they are not."""
+    """Read words as `count` numbers, finite unless that is not asked for; None if they are not."""
     try:
         found = [float(word) for word in told]
     except ValueError:
@@ -222,10 +222,11 @@ def read_log(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n d d"], Float[np.ndarray, "m t t"]]:
     """Times (n,) in s, poses (n, 4, 4), or (n, 3, 3) in the plane, in m, and their covariances.
 
-    A line is `t tx ty tz qx qy qz qw` (TUM), `t x y θ`, the rows of a 3x4 T_wc (KITTI; times are
-    those of `times.txt` beside it, else the number of the line, from 0), `t p q` with the upper
-    triangles of the covariances of orientation and position (OpenVINS's `pose_to_file`), or `t q p`
-    and more (its states). Its quaternions of JPL have the numbers of Hamilton's, of the body in the
+    A line is `t tx ty tz qx qy qz qw` (TUM), `t x y θ`, or the rows of a 3x4 T_wc (KITTI; times are
+    those of `times.txt` beside it, else the number of the line, from 0). It may also be `t p q`
+    with the upper triangles of the covariances of orientation and position (OpenVINS's
+    `pose_to_file`), or `t q p` and more (its states). Its quaternions of JPL have the numbers of
+    Hamilton's, of the body in the
     world. Covariances (n, 6, 6), of the error `split` along `mixed` axes, position first, are those
     of `pose_to_file`; other files have none, (0, 6, 6). Raises ValueError, naming file and line.
     """

@@ -32,7 +32,7 @@ COLUMN = 3.4
 LETTERS = 8.0
 """Points: of labels at lines, and of everything in print."""
 MEDIAN_DASH = (0, (1, 2))
-"""Of the medians, where a line is a mean."""
+"""The dashes of medians, where a line is a mean."""
 _FITTING = 50
 """Characters in a line of a column."""
 _POWERS = range(-9, 13)

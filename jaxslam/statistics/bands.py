@@ -67,7 +67,7 @@ def shortfall_limit(dof: float, level: float, *, above: bool) -> float:
     A sum of time averages of χ² does not, by Jensen `E f(Σ xₜ/T) ≤ E f(x)` for every convex f,
     however the steps are correlated. Half of `level` is at most on each side, beyond χ²'s expected
     shortfall `E[χ² | χ² in its tail]` (Meilijson and Nádas, Journal of Applied Probability 1979,
-    "Convex majorization with an application to the length of critical paths").
+    *Convex majorization with an application to the length of critical paths*).
     """
     special, shape, tail = scipy.special, dof / 2, level / 2
     if above:

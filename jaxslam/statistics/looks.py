@@ -42,7 +42,7 @@ class Look:
     """A test of the mean of one number a run; factors are of σ², 1 where it is right."""
 
     name: str
-    """The steps that it is of: `all steps`, `last step`, `first third` …"""
+    """The steps that are looked at: `all steps`, `last step` or a third, such as `first third`."""
     sums: PowerSums
     right: tuple[float, float]
     """The mean of a right filter is anywhere from the one to the other."""
@@ -136,7 +136,7 @@ class Look:
 
     @property
     def disproved(self) -> bool:
-        """Whether σ is wrong beyond doubt."""
+        """Whether σ is certainly wrong."""
         low, high = self.interval
         return low > 1 or high < 1
 

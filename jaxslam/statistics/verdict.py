@@ -166,8 +166,8 @@ class Tally:
         and the word is lost. `never_lost` is the verdict on the runs never lost: robust, and low
         by construction. `lost_runs` are their numbers, where they are known.
 
-        With `fitted` a NEES above dof is compared with dof, one below dof − fitted with that, and
-        one between them is right: its σ factor is 1, and the interval is from √(low/dof) to
+        With `fitted` a NEES above dof is compared with dof, one below dof − fitted with that. One
+        between them is right: its σ factor is 1, and the interval is from √(low/dof) to
         √(high/(dof − fitted)), without an upper end where all may be fitted.
         """
         right = self.dof - self.fitted, float(self.dof)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 WAITING = 8
-"""So many frames may wait to be drawn: a slower picture makes the tracker wait, not memory grow."""
+"""The most frames that may wait to be drawn; beyond it the tracker waits, so memory is bounded."""
 
 
 class Aside:

@@ -26,7 +26,7 @@ _COARSE_MARGIN = 0.25  # of score: peaks so far below the highest are not
 _NEARBY = 3  # pixels around such a peak
 _COARSE_LOSS = 0.1  # of score: what a match loses at half the size, where pixels fall otherwise
 PEAKS = 3
-"""Places in a wide ellipse that may be a patch's, at the most …"""
+"""The most places in a wide ellipse that may be a patch's."""
 _PEAKS_MARGIN = 0.12  # … with scores so far below the best one's
 _APART = 2  # pixels: nearer peaks are one place
 
@@ -41,7 +41,7 @@ class Matches(NamedTuple):
     scores: Float32[np.ndarray, " m"]
     """Correlations, up to 1."""
     variances: Float[np.ndarray, " m"]
-    """Of each pixel's u and v, pixels², as the difference of the two windows tells
+    """The variance of each pixel's u and v, pixels², as the difference of the two windows tells
     (`refine`)."""
 
     def only(self, which: np.ndarray) -> "Matches":
@@ -71,13 +71,13 @@ def match_patches(
 ) -> Matches:
     """Active search: the places most like each template within the ellipse of its prediction.
 
-    Looks where (x - centre)' covariance^-1 (x - centre) <= `GATE` (a quantile of chi2 with two
-    degrees of freedom), at most `max_radius` pixels from the centre along each axis (by default
-    a quarter of the image's width: a wider ellipse is cut there), for peaks of the zero-mean
-    normalised cross-correlation, and refines them to sub-pixel. In a narrow ellipse that is the
+    The ellipse is (x - centre)' covariance^-1 (x - centre) <= `GATE` (a quantile of chi2 with two
+    degrees of freedom), cut at `max_radius` pixels from the centre along each axis (by default a
+    quarter of the image's width). Peaks of the zero-mean normalised cross-correlation in it are
+    refined to sub-pixel accuracy. In a narrow ellipse that is the
     best peak; none where it does not reach `THRESHOLD`, or where a second one comes within
     `ambiguity` of its score (0: never ambiguous). A wide ellipse is searched in the image of half
-    the size, and around the highest peaks there again in the whole one; as the best of many peaks
+    the size, and around the highest peaks there again in the whole one. As the best of many peaks
     often is another place, `several` are given, up to `PEAKS`, best first, for who knows what else
     was found to choose from. None where the ellipse is outside the image.
     """
@@ -110,7 +110,7 @@ class Fit(NamedTuple):
     pixels: Float[np.ndarray, "n 2"]
     """Where, sub-pixel."""
     variances: Float[np.ndarray, " n"]
-    """Of each pixel's u and v, pixels²."""
+    """The variance of each pixel's u and v, pixels²."""
 
 
 def refine(
@@ -121,10 +121,10 @@ def refine(
     """The places near `pixels` and the affine maps with which templates fit best, by Gauss-Newton.
 
     Minimises the squared difference of the two windows, each made zero-mean with unit norm (so
-    gain and offset do not matter), with a prior of the map, the identity with a σ of `_MAP_SIGMA`;
-    inverse compositional (Baker & Matthews 2004), so that the gradient J is the template's. One
+    gain and offset do not matter), with a prior on the map: the identity, with a σ of `_MAP_SIGMA`.
+    It is inverse compositional (Baker & Matthews 2004), so the gradient J is the template's. One
     that does not converge stays where it is. A patch that was warped as if it faced its first
-    camera is found where it is all the same.
+    camera is nevertheless found where it is.
 
     Of windows of m pixels with a correlation ρ, the residual has the variance `s² = 2 (1 − ρ)/m` a
     pixel and least squares the covariance `s² (Jᵀ J + Λ)⁻¹`, whatever the map; half the trace of

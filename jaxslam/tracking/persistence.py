@@ -46,7 +46,7 @@ NUMBERS = {
 
 
 _OF_PLACE = ("log_unit", "log_scale", "sigma_log_scale", "unit_fixed")
-"""Numbers of a `MapInWorld` …"""
+"""The numbers of a `MapInWorld`."""
 _POSES = ("origin", "camera", "here", "told", "known")
 """… and its poses."""
 
@@ -66,7 +66,7 @@ T = TypeVar("T", bound=Resumable)
 
 
 def save(path: str | Path, tracker: Resumable, filter_name: str | None) -> None:
-    """Write a tracker, whole or not at all, with the name of a filter of one's own."""
+    """Write a tracker, whole or not at all, with the name of a filter beyond the settings."""
     kept = tracker.map
     numbers = {name: attrgetter(where)(tracker) for name, where in NUMBERS.items()}
     header = {
@@ -113,7 +113,7 @@ def save(path: str | Path, tracker: Resumable, filter_name: str | None) -> None:
 def load(
     path: str | Path, make: Callable[[Calibration, TrackerSettings], T], *, own_filter: bool
 ) -> T:
-    """The tracker in a file, of those that one can `make`, with a filter of one's own or without.
+    """Read the tracker in a file by `make`; `own_filter` if its filter is not in the settings.
 
     Raises ValueError for a file that is none, or of another filter.
     """

@@ -25,29 +25,30 @@ from jaxslam.tracking.settings import TrackerSettings
 LEAST_MATCHES = 4
 """Fewer do not count as having tracked a frame, and are not believed."""
 CHANCE = 0.05
-"""Of a landmark that is not in the picture to have a match all the same that agrees …"""
+"""The probability that a landmark that is not in the picture has a match that agrees."""
 CHANCE_LOST = 0.25
-"""… of one that has any match, where the camera was lost before and is searched for widely …"""
+"""The probability of such a match where the camera was lost and is searched for widely."""
 BY_CHANCE = 1e-3
-"""… and of a frame to be believed although its landmarks are not there."""
+"""The probability that a frame is believed although its landmarks are not there."""
 WIDE = 6.0
-"""σ of the places where most landmarks are expected, pixels, from which on they are searched twice:
-the second time given what agreed …"""
+"""σ of the predicted pixels of most landmarks from which on they are searched twice, the second
+time given what agreed, pixels."""
 NARROW = 1.5
-"""… with this σ beside what is still unknown then, pixels, …"""
+"""σ of that second search beside what is still unknown then, pixels."""
 EXPLAINED = 0.8
-"""… where a linear prediction explains this share of it."""
+"""The share that a linear prediction must explain for that second search."""
 PROVEN = 10
-"""A landmark that was found so often is where the map says: the others are believed only if all
-together they are likely, given the proven ones, …"""
+"""The number of matches after which a landmark is proven. The others are believed only if together
+they are likely, given the proven ones."""
 TOGETHER = 0.01
-"""… more than so much; and no frame is where the proven ones are less likely than `BY_CHANCE`, …"""
+"""The least likelihood of all landmarks together. No frame is believed where the proven ones are
+less likely than `BY_CHANCE`."""
 ANOTHER = 1 / 3
-"""… or as many of them as this share of those that agree do so with another motion: half of the
-picture may be a lorry's, or the map is wrong …"""
+"""The share of those that agree from which on as many that agree with another motion refute a
+frame: half of the picture may be a lorry's, or the map is wrong."""
 MOST = 2 / 3
-"""… nor are those after such a frame, until of the proven landmarks searched more than this share
-agree."""
+"""The share of the proven landmarks searched that must agree before a frame after such a one is
+believed."""
 
 
 Agreement = Callable[..., Bool[np.ndarray, " m"]]

@@ -41,7 +41,7 @@ _KNOWN_DEPTH = 0.3
 """A point is put into the map where its σ is below this share of its distance."""
 
 Summary = dict[str, Any]
-"""As JSON has it."""
+"""A summary as JSON has it."""
 
 
 def summarised(
@@ -51,7 +51,7 @@ def summarised(
     points: Points,
     seconds: list[float],
 ) -> Summary:
-    """Of frames and landmarks as they are known at the end."""
+    """Summarise the frames, and the landmarks as they are known at the end."""
     lost = sum(result.lost for result in history)
     updates = history[1:]
     dof = sum(result.nis_dof for result in updates)

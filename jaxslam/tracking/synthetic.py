@@ -1,4 +1,4 @@
-"""A synthetic handheld video of a textured room, rendered on the spot with its exact trajectory.
+"""A synthetic handheld video of a textured room, rendered with its exact trajectory.
 
 The room is made of textured planar quads painted from the back to the front. Each is warped by
 its exact homography onto a canvas of twice the size, which is then averaged down: that is the

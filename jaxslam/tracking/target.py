@@ -37,7 +37,7 @@ class KnownPoint:
 
     name: str
     position: Float[np.ndarray, " 3"]
-    """In the target's own frame, m."""
+    """The position in the target's own frame, m."""
     pixel: Float[np.ndarray, " 2"] | None = None
     patch: UInt8[np.ndarray, "h w"] | None = None
     """The picture around it, about as large as it is seen; its corner is in the middle."""
@@ -79,7 +79,7 @@ class TargetObservation(NamedTuple):
     sigma: Float[np.ndarray, " n"]
     """σ of each; taken for independent, they cover the errors that all have in common."""
     rms: float
-    """Of the reprojection error, pixels."""
+    """The RMS reprojection error, pixels."""
 
 
 def read_target(path: str | Path) -> Target:

@@ -50,7 +50,7 @@ class Tracker:
     """
 
     calibration: Calibration
-    """Of the camera, for the size of its pictures."""
+    """The calibration of the camera, for the size of its pictures."""
     settings: TrackerSettings = field(default_factory=TrackerSettings)
     filter: AbstractStaged | None = None
     """One's own, in place of the filter that the settings name."""
@@ -60,9 +60,9 @@ class Tracker:
     sighting: TargetObservation | None = field(default=None, init=False)
     """Where the first frame saw the target."""
     filter_name: str = field(init=False)
-    """As in the settings, or of the class of one's own."""
+    """The name in the settings, or the class of your own filter."""
     time: float | None = field(default=None, init=False)
-    """Of the latest frame, s."""
+    """The time of the latest frame, s."""
     steps: int = field(default=0, init=False)
     """Frames given so far."""
     unmeasured: int = field(default=0, init=False)
@@ -70,7 +70,7 @@ class Tracker:
     elsewhere: bool = field(default=False, init=False)
     """Whether the map was out of view in one of them."""
     searching: bool = field(default=False, init=False)
-    """Whether no map has begun, as one that is known may be found."""
+    """Whether no map has started because a known one may be found."""
     failed: Counter[str] = field(default_factory=Counter, init=False)
     """How many updates ended in which `Status` that says that their result means nothing."""
     refused: int = field(default=0, init=False)
@@ -158,7 +158,7 @@ class Tracker:
 
     def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
         """Return how the calibration is treated, and fx, fy, cx, cy with their covariance, pixels,
-        as far as this map tells. None of a filter of one's own without a pinhole camera."""
+        as far as this map tells; None for a filter without a pinhole camera."""
         with jax.enable_x64(True):
             return self.map.estimator.camera()
 
@@ -175,7 +175,7 @@ class Tracker:
     def load(cls, path: str | Path, filter: AbstractStaged | None = None) -> Tracker:
         """The tracker that was saved, which goes on as that would have: digit by digit.
 
-        One with a filter of one's own is to be given that again. Raises ValueError for a file
+        If it had a `filter` of your own, pass that again. Raises ValueError for a file
         that is none, or of another filter.
         """
         return persistence.load(path, partial(cls, filter=filter), own_filter=filter is not None)

@@ -65,10 +65,9 @@ def write_covariances(
 ) -> None:
     """Write times (n,) and covariances (n, 6, 6) of the `TRACKED` error, whole or not at all.
 
-    They are of poses in the one unit of their map; that maps which follow one another have others
-    is not in them. The header says whether these are covariances `given_scale`, of a filter with a
-    unit of its own, of whose size in metres it is in doubt, or of poses in a unit that the filter
-    takes for exactly known; and the caveat, if there is one.
+    They are of poses in the unit of their map; different units of different maps are not in them.
+    With `given_scale` the filter has a unit of its own whose size in metres is uncertain. Otherwise
+    it takes its unit for exactly known. The header says which, and the caveat if there is one.
     """
     convention = replace(TRACKED, scale="given" if given_scale else "marginal")
     scale = _GIVEN_SCALE if given_scale else _KNOWN_SCALE

@@ -58,7 +58,7 @@ def track(
 
     An interruption (KeyboardInterrupt) or an unreadable frame (ValueError) leaves all of them for
     the frames so far, and is raised again; an interruption of the first frame or the second leaves
-    none. `slam` is a filter of one's own, in place of the one that the settings name. `target`,
+    none. `slam` is a filter of your own, in place of the one that the settings name. `target`,
     known points that the first frame sees, makes the map metric. `known` is the `map.npz` of
     another video by the same camera: this one goes on with that map where it is known again, by its
     settings. `viewer` is a file for the rerun viewer, FILE.rrd, written beside the others.

@@ -29,11 +29,11 @@ _LOOP = (213, 94, 0)
 class Viewer:
     """A file for rerun (`rerun FILE.rrd`), of the frames so far at any end; nothing is sent.
 
-    Along the timelines `frame` and `time` (s since the first frame): the picture with search
-    ellipses of three standard deviations and matches by status, camera, path (grey where it was
-    lost), ends of submaps and loops to them, landmarks with their 1 σ ellipsoids, NIS by its
-    degrees of freedom, the σ and the `log_scale` of `frames.csv`, and the state where it changes.
-    All of a map is in one unit.
+    Its timelines are `frame` and `time` (s since the first frame). It shows the picture with search
+    ellipses of three standard deviations and matches by status, the camera and its path (grey where
+    it was lost), and ends of submaps with the loops to them. Landmarks have 1 σ ellipsoids. Curves
+    are of NIS over its degrees of freedom, and of σ and `log_scale` of `frames.csv`. A change of
+    state is logged. All of a map is in one unit.
     Raises `ValueError` without rerun, or for a name that does not end in .rrd.
     """
 

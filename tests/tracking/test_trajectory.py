@@ -66,9 +66,9 @@ def test_quaternion_order_is_w_last_and_need_not_be_normalised(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("0 0 0 0 0 0 0 1\n1 2 3\n", "line 2: eight finite"),
-        ("0 0 0 nan 0 0 0 1\n", "line 1: eight finite"),
-        ("0 0 0 zero 0 0 0 1\n", "line 1: eight finite"),
+        ("0 0 0 0 0 0 0 1\n1 2 3\n", "line 2: expected eight finite"),
+        ("0 0 0 nan 0 0 0 1\n", "line 1: expected eight finite"),
+        ("0 0 0 zero 0 0 0 1\n", "line 1: expected eight finite"),
         ("0 0 0 0 0 0 0 0\n", "line 1: the quaternion is zero"),
         ("# nothing\n", "has no poses"),
     ],

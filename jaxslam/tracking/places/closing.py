@@ -24,8 +24,8 @@ from jaxslam.tracking.pointcloud import seen_from
 from jaxslam.tracking.search import search
 
 APART = 3
-"""Submaps from the end of one loop to that of the next, at the least, and an eighth of all: what a
-loop costs grows with their number."""
+"""The fewest submaps from the end of one loop to that of the next, besides an eighth of all: the
+cost of a loop grows with their number."""
 WITHIN = 3.0
 """σ of the place of a landmark seen from the pose that its descriptors tell, pixels."""
 PIXEL = 1.0
@@ -41,7 +41,7 @@ class Closed(NamedTuple):
     submap: int
     """The number of the submap that it is of, among those of all maps."""
     nis: float
-    """Of where it is, with six degrees of freedom."""
+    """The NIS of the place, with six degrees of freedom."""
 
     @property
     def believed(self) -> bool:

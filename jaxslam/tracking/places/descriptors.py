@@ -11,14 +11,14 @@ from jaxtyping import Bool, Float, UInt8
 from jaxslam.tracking.landmarks import Landmark
 
 CORNERS = 600
-"""Of a picture, which are compared."""
+"""The number of corners of a picture that are compared."""
 RATIO = 0.85
-"""The distance of the likest descriptor by that of the next, at the most."""
+"""The largest ratio of the distance of the most similar descriptor to that of the next."""
 LOOKS = 3
 """Descriptors of a landmark that are kept, of different frames."""
 
 Corners = tuple[Float[np.ndarray, "n 2"], UInt8[np.ndarray, "n 32"]]
-"""Of a picture: pixels and descriptors."""
+"""The corners of a picture: pixels and descriptors."""
 
 
 def describe(

@@ -23,17 +23,17 @@ from jaxslam.tracking.places.descriptors import candidates, described_corners
 from jaxslam.tracking.policy import Policy
 
 FEWEST = 12
-"""Matches of one pose, and landmarks found again, with which a camera is where it seems to be …"""
+"""The fewest matches of one pose, and landmarks found again, for which a camera is relocalised."""
 MOST_OF = 0.4
-"""… and the share of the landmarks expected in the picture that are then found."""
+"""The share of the landmarks expected in the picture that must then be found."""
 PIXELS = 4.0
-"""By how much a match of the pose may be off."""
+"""The largest error of a match of the pose."""
 TURN, SHIFT = 0.01, 0.02
 """σ of that pose: rad, and shares of the landmarks' median depth."""
 SURE = 0.3
 """σ of a point by its distance, of those from which a pose is found."""
 SECONDS = 1 / 30
-"""In which a camera moves there: between two frames, so that no acceleration matters."""
+"""The seconds in which a camera moves there: so few that no acceleration matters."""
 TRIED = 3
 """Places that are looked at in a frame, those of the most candidates."""
 NOTED_EVERY = 5
