@@ -14,9 +14,6 @@ from jaxslam.filters.registry import FILTERS
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.tracking.settings import METRIC, TrackerSettings
 
-_COMPILING = "compiling …"
-"""What the bar says while the first frames wait for their programs."""
-
 
 @dataclass(frozen=True)
 class TrackOptions:
@@ -103,7 +100,8 @@ class TrackOptions:
             raise ValueError("give --map or --target, not both: a saved map already has a unit")
         target = None if self.target is None else read_target(self.target)
         total = len(source) or self.frames
-        with warming_bar(total, "frame", _COMPILING, WARM_UP, "tracking") as progress:
+        # What the bar says while the first frames wait for their programs.
+        with warming_bar(total, "frame", "compiling …", WARM_UP, "tracking") as progress:
             summary = track(
                 source,
                 self.out,

@@ -27,8 +27,6 @@ from jaxslam.statistics.verdict import VERDICT_CONFIDENCE, Verdict, not_disprove
 
 NOTICEABLE = 0.05
 """NEES that differ by less than this share say the same of σ, to 2.5 %."""
-_PART_CONFIDENCE = 0.999
-"""The confidence of what is said against position or rotation alone, after all axes together."""
 _TOLD = 3
 """The most indistinguishable conventions that a sentence names."""
 _ALIKE = " (right and split errors are the same to first order)"
@@ -73,8 +71,10 @@ class Tried(NamedTuple):
             (self.position, self.dof - self.turns, self.fitted),
             (self.rotation, self.turns, 0.0),
         )
+        # The confidence of what is said against position or rotation alone, after all axes
+        # together.
         return self.whole and all(
-            nees is None or _verdict(nees, dof, fitted)["p"] >= 1 - _PART_CONFIDENCE
+            nees is None or _verdict(nees, dof, fitted)["p"] >= 1 - 0.999
             for nees, dof, fitted in parts
         )
 

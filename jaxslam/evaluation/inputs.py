@@ -237,10 +237,6 @@ def _refuse(place: Sequence[int | np.integer] | np.ndarray, fault: str) -> NoRet
     )
 
 
-_RIGID = 1e-4
-"""The tolerance of a rotation's orthonormality: rounding to six digits makes less."""
-
-
 class Poses(NamedTuple):
     """Runs of estimated poses T_wc, their covariances, and the truth."""
 
@@ -332,7 +328,8 @@ def _matrices(what: str, given: ArrayLike, expected: str) -> np.ndarray:
 
 
 def _check_rigid(what: str, T: np.ndarray) -> None:
-    wrong = not_rigid(T, _RIGID)
+    # The tolerance of a rotation's orthonormality: rounding to six digits makes less.
+    wrong = not_rigid(T, 1e-4)
     if wrong.any():
         place = at(np.argwhere(wrong)[0])
         raise ValueError(f"{what} of {place} is not a rigid motion [R t; 0 1] with a rotation R")

@@ -472,7 +472,6 @@ def _span(times: Float[np.ndarray, " n"]) -> float:
 
 
 FRAMES = "frames.csv"
-_MOST_MAPS = 1_000_000
 
 
 class FrameLog(NamedTuple):
@@ -556,7 +555,7 @@ def _frame(place: str, told: dict[str, str]) -> tuple[float, bool, int, bool]:
     """The numbers of a frame, in the order of `FrameLog`. Raises ValueError for what is none."""
     try:
         time, number, fixed = float(told["time"]), int(told["map"]), told["unit_fixed"]
-        if np.isfinite(time) and 0 <= number <= _MOST_MAPS and fixed in ("0", "1"):
+        if np.isfinite(time) and 0 <= number <= 1_000_000 and fixed in ("0", "1"):
             return time, told["state"] == "lost", number, fixed == "1"
     except (ValueError, KeyError):
         pass

@@ -254,7 +254,6 @@ def _tried(
 
 _NOTHING = 1e-3
 """Errors that are less of σ at every pose are no errors."""
-_UNCORRELATED = 1e-6
 
 
 def axes_named(
@@ -302,7 +301,7 @@ def _alone(P: np.ndarray, sigma: np.ndarray) -> Bool[np.ndarray, " t"]:
     """A mask of the axes that have no correlation with any other."""
     scale = np.where(sigma > 0, sigma, 1.0)
     correlation = np.abs(P) / scale[:, :, None] / scale[:, None] * (1 - np.eye(P.shape[-1]))
-    return (correlation <= _UNCORRELATED).all(axis=(0, 1))
+    return (correlation <= 1e-6).all(axis=(0, 1))
 
 
 def _constant(poses: Poses) -> Bool[np.ndarray, " t"]:

@@ -30,8 +30,6 @@ _LIKE = 2.0
 """A factor further from 57.3 than by so much is another one."""
 _SLACK = 1.25
 """The factor by which the interval may miss it."""
-_LEVEL = 0.01
-"""The probability that the interval misses the factor that all covariances are wrong by."""
 _SHARE, _BELOW = 0.4, 5.0
 """The share of the samples that may be lower by so much: of 8 from χ² no more are, but for 3 %."""
 _NARROW = 5.0
@@ -39,8 +37,6 @@ _NARROW = 5.0
 of 8 runs is narrower."""
 _ALIKE = 4.0
 """The widest one of a verdict, which is of the runs' scatter too, where no other axis is right."""
-_CORRELATED = 0.3
-"""Neighbours that correlate less may be strangers."""
 _MANY = 300
 """The most runs and steps whose correlations are tested."""
 _ANGLES = re.compile(
@@ -207,7 +203,8 @@ class _Factor(NamedTuple):
             white = logged.factors[axis].get("samples") == "steps"
             samples = nees[there] if white else nees.mean(axis=1, where=there)
             mean, n = np.mean(samples), len(samples)
-            most, least = (shortfall_limit(n, _LEVEL, above=above) / n for above in (True, False))
+            # The probability that the interval misses the factor that all covariances are wrong by.
+            most, least = (shortfall_limit(n, 0.01, above=above) / n for above in (True, False))
             numbers = np.sqrt([mean, mean / most, mean / least, np.quantile(samples, _SHARE)])
         return _Factor(*map(float, numbers))
 
@@ -235,7 +232,8 @@ def _interchanged(logged: Logged) -> Iterator[Mistake]:
     x = x / np.hypot(1.0, x)  # an error that is far off counts as one that is somewhat so
     runs, steps = (_products(np.swapaxes(x, 0, axis)) for axis in (0, 1))
     ours, theirs = _alike(runs), _alike(steps)
-    if ours < _CORRELATED or theirs > ours / 2 or not _by_order(runs):
+    # Neighbours that correlate less may be strangers.
+    if ours < 0.3 or theirs > ours / 2 or not _by_order(runs):
         return
     yield Mistake(
         "runs and steps appear to be swapped",

@@ -23,13 +23,8 @@ from jaxslam.evaluation.inputs import Poses, correlations, sigmas
 from jaxslam.statistics.beyond_scale import SCALES, BeyondScale, one_scale
 from jaxslam.statistics.verdict import Verdict, run_verdict
 
-DRIFT_CONFIDENCE = 0.999
-"""The confidence of the verdict on drift: with that on NEES, which is one-sided where a fit took a
-degree of freedom, a right filter is called inconsistent in one of a hundred studies."""
 QUANTILES = (0.025, 0.5, 0.975)
 """The quantiles of the runs' drifts, per step."""
-_LEFT = 1e-9
-"""The share of a covariance that is left where one pose alone determines the scale."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,10 +74,13 @@ class Scale:
     def disproved(self) -> bool:
         """Whether the scale certainly drifts more than σ allows."""
         found = self.verdict
+        # The confidence of the verdict on drift: with that on NEES, which is one-sided where a fit
+        # took a degree of freedom, a right filter is called inconsistent in one of a hundred
+        # studies.
         return bool(
             found is not None
             and (found["nees"] is None or found["nees"] > 1)
-            and found["p"] < 1 - DRIFT_CONFIDENCE
+            and found["p"] < 1 - 0.999
         )
 
     @property
@@ -225,7 +223,8 @@ def _jointly(
         log_scale[run] = np.log(s)
         e[run] += G[run] * (s - 1)
         left[run] -= (G[run, :, :, None] * G[run, :, None]) / information
-    left += _LEFT * own
+    # The share of a covariance that is left where one pose alone determines the scale.
+    left += 1e-9 * own
     told = poses.logged & np.isfinite(log_scale)[:, None] & (np.abs(G).max(axis=-1) > 0)
     h = np.linalg.solve(own[told], G[told][..., None])[..., 0]
     h /= np.sum(h * G[told], axis=-1)[:, None]

@@ -9,11 +9,6 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 KINDS = ("checkerboard", "charuco")
-MARKER_SHARE = 0.75
-"""Side of a ChArUco marker, in squares."""
-_LEAST_CORNERS = 8
-_REACH = 0.3
-"""To each side of a corner, in the least distance of two, in which it is refined."""
 _AROUND = 9
 """Side of the neighbourhood of a corner, pixels, in which its edges are looked at."""
 
@@ -72,7 +67,8 @@ class Board:
             getattr(cv2.aruco, f"DICT_{self.dictionary}")
         )
         size = (self.columns, self.rows)
-        return cv2.aruco.CharucoBoard(size, self.square, MARKER_SHARE * self.square, dictionary)
+        # Side of a ChArUco marker, in squares.
+        return cv2.aruco.CharucoBoard(size, self.square, 0.75 * self.square, dictionary)
 
     @cached_property
     def _detector(self) -> cv2.aruco.CharucoDetector:
@@ -92,7 +88,7 @@ class Board:
         """The board in a picture; None where too little of it is seen."""
         find = self._find_charuco if self.kind == "charuco" else self._find_checkerboard
         pixels, points = find(image)
-        if len(pixels) < _LEAST_CORNERS or np.linalg.matrix_rank(points - points[0]) < 2:
+        if len(pixels) < 8 or np.linalg.matrix_rank(points - points[0]) < 2:
             return None
         outline = self._outline(pixels, points)
         if outline is None:
@@ -113,7 +109,8 @@ class Board:
         """The saddles of the grey levels: three times as exact as where they were detected."""
         grid = pixels.reshape(self.rows - 1, self.columns - 1, 2)
         apart = min(np.linalg.norm(np.diff(grid, axis=a), axis=2).min() for a in (0, 1))
-        reach = int(np.clip(_REACH * apart, 2, 10))
+        # To each side of a corner, in the least distance of two, in which it is refined.
+        reach = int(np.clip(0.3 * apart, 2, 10))
         end = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
         return cv2.cornerSubPix(image, pixels, (reach, reach), (-1, -1), end).reshape(-1, 2)
 

@@ -70,15 +70,14 @@ def rows_as_poses(place: Callable[[int], str], rows: np.ndarray) -> Float[np.nda
 
 _LATEST = 1e11
 """Seconds since 1970 of the year 5138."""
-_SLOWEST = 1e3
-"""Seconds between two poses, more than a moving thing has."""
 
 
 def check_seconds(what: str, times: Float[np.ndarray, " n"]) -> None:
     """Raise ValueError where times are too large to be seconds, since 1970 or from pose to pose."""
     last = float(np.abs(times).max())
     step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
-    if last <= _LATEST and step <= _SLOWEST:
+    # Seconds between two poses, more than a moving thing has.
+    if last <= _LATEST and step <= 1e3:
         return
     by_size = ((1e17, "nanoseconds"), (1e14, "microseconds"), (0.0, "milliseconds"))
     by_step = ((1e6, "nanoseconds"), (0.0, "microseconds"))

@@ -17,11 +17,6 @@ from jaxslam._numerics.arrays import AnyArray
 from jaxslam._numerics.linalg import cholesky
 
 CONFIDENCE = 0.95
-_LAGS = 10
-_LEAST_PAIRS = 20
-"""The fewest pairs of steps from which a correlation is estimated."""
-LOST_QUANTILE = 0.9999
-"""A run whose NEES is above this quantile of χ² is lost: one in 10 000 of a consistent filter."""
 
 
 def normalised_squared(
@@ -57,7 +52,8 @@ def lost_threshold(dof: float, steps: int = 1) -> float:
 
     With so many `steps` one run in 10 000 exceeds it at any step, fewer if they are correlated.
     """
-    return 2 * float(scipy.special.gammainccinv(dof / 2, (1 - LOST_QUANTILE) / steps))
+    # A run whose NEES is above this quantile of χ² is lost: one in 10 000 of a consistent filter.
+    return 2 * float(scipy.special.gammainccinv(dof / 2, (1 - 0.9999) / steps))
 
 
 def shortfall_limit(dof: float, level: float, *, above: bool) -> float:
@@ -181,9 +177,10 @@ def whiteness_p_value(
     the correlation rₗ, is χ² (Ljung and Box, Biometrika 1978; of all runs); the least p of them by
     Bonferroni. The mean of innovations is not taken away: one with a bias is not white.
     """
-    lags = min(_LAGS, nis.shape[1] // 4)
+    lags = min(10, nis.shape[1] // 4)
     there = ~np.isnan(nis)
-    if not lags or np.sum(there[:, 1:] & there[:, :-1]) < _LEAST_PAIRS:
+    # The fewest pairs of steps from which a correlation is estimated.
+    if not lags or np.sum(there[:, 1:] & there[:, :-1]) < 20:
         return None
     series = [*np.moveaxis(normalised, -1, 0), nis - np.mean(nis, where=there)]
     with np.errstate(over="ignore", invalid="ignore"):

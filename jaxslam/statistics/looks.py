@@ -33,8 +33,6 @@ TOLERANCE = 1.3
 UNSEEN = 3
 """The runs in N that may be of a kind that none among N is (the rule of three: Hanley,
 Lippman-Hand, JAMA 1983)."""
-_FEWEST = 3
-"""The fewest numbers whose scatter says anything."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +109,8 @@ class Look:
 
     def _relative_error(self) -> float | None:
         """The relative standard error of the mean; None where the runs are too few."""
-        if self.sums.count < _FEWEST or self.sums.mean <= 0:
+        # The fewest numbers whose scatter says anything.
+        if self.sums.count < 3 or self.sums.mean <= 0:
             return None
         relative = self.sums.deviation / self.sums.mean / math.sqrt(self.sums.count)
         return relative if math.isfinite(relative) else None

@@ -14,20 +14,15 @@ GATE = 9.21
 """The 99 % quantile of χ² with two degrees of freedom."""
 THRESHOLD = 0.8
 """Least correlation of a match."""
-_ITERATIONS = 3
 _MAP_SIGMA = 0.2  # of a map's elements: a patch does not face its first camera
 _PRECISION = 2.4e-4 / _MAP_SIGMA**2  # by s² of ρ = .98
 _MOST_MAPPED = 0.5  # by which elements of a map differ from the identity's
 _MAX_SHIFT = 1.5  # pixels: a refinement that moves further than this has left its peak
 _WIDEST = 0.25  # of the picture's width: an ellipse is searched no further from its centre
 _NARROW = 91**2  # pixels: boxes of more are searched in the picture of half the size first
-_COARSE = 6  # peaks of half the size that are looked at in full, for each patch
-_COARSE_MARGIN = 0.25  # of score: peaks so far below the highest are not
 _NEARBY = 3  # pixels around such a peak
-_COARSE_LOSS = 0.1  # of score: what a match loses at half the size, where pixels fall otherwise
 PEAKS = 3
 """The most places in a wide ellipse that may be a patch's."""
-_PEAKS_MARGIN = 0.12  # … with scores so far below the best one's
 _APART = 2  # pixels: nearer peaks are one place
 
 
@@ -133,7 +128,7 @@ def refine(
     """
     known = _Templates.of(templates)
     places, maps, identity = pixels, np.tile(np.eye(2), (len(pixels), 1, 1)), np.eye(2)
-    for _ in range(_ITERATIONS):
+    for _ in range(3):
         windows, _ = known.compared(image, places, maps)
         slope = np.einsum("nkm,nm->nk", known.jacobian, windows)
         slope[:, 2:] += _PRECISION * (maps - identity).reshape(-1, 4)
@@ -336,9 +331,10 @@ def _several(peaks: _Peaks) -> _Peaks:
     kept: list[int] = []
     for i, (owner, pixel, score) in enumerate(zip(*peaks[:3], strict=True)):
         better = [j for j in kept[-PEAKS:] if peaks.owner[j] == owner]
+        # … with scores so far below the best one's
         if not better or (
             len(better) < PEAKS
-            and score >= peaks.scores[better[0]] - _PEAKS_MARGIN
+            and score >= peaks.scores[better[0]] - 0.12
             and np.abs(peaks.pixels[better] - pixel).max(axis=1).min() > _APART
         ):
             kept.append(i)
@@ -358,8 +354,9 @@ def _narrowed(
         return boxes
     side = (templates.shape[1] + 1) // 2
     halved = _Halved.of(image, side)
+    # Of score: what a match loses at half the size, where pixels fall otherwise
     small = [
-        halved.places(templates[box.owner[0]], box, ellipses, least - _COARSE_LOSS)
+        halved.places(templates[box.owner[0]], box, ellipses, least - 0.1)
         for box in (boxes.only(index) for index in np.flatnonzero(large)[:, None])
     ]
     parts = [boxes.only(~large), *small]
@@ -401,8 +398,10 @@ class _Halved(NamedTuple):
         near = (pixels[:, None] + around).reshape(-1, 2)
         inside = ellipses.hold(np.repeat(owner, 9), near).reshape(-1, 9).any(axis=1)
         height = np.where(inside, scores.ravel()[places], -1)
-        best = np.argsort(-height)[:_COARSE]
-        best = best[height[best] >= np.maximum(height[best[:1]] - _COARSE_MARGIN, least)]
+        # Peaks of half the size that are looked at in full, for each patch
+        best = np.argsort(-height)[:6]
+        # Of score: peaks so far below the highest are not
+        best = best[height[best] >= np.maximum(height[best[:1]] - 0.25, least)]
         low = np.maximum(pixels[best] - _NEARBY - 1, box.low)
         high = np.minimum(pixels[best] + _NEARBY + 1, box.high)
         return _Boxes(owner[best], low, high).large_enough()

@@ -33,19 +33,12 @@ BY_CHANCE = 1e-3
 WIDE = 6.0
 """σ of the predicted pixels of most landmarks from which on they are searched twice, the second
 time given what agreed, pixels."""
-NARROW = 1.5
-"""σ of that second search beside what is still unknown then, pixels."""
-EXPLAINED = 0.8
-"""The share that a linear prediction must explain for that second search."""
 PROVEN = 10
 """The number of matches after which a landmark is proven. The others are believed only if together
 they are likely, given the proven ones."""
 TOGETHER = 0.01
 """The least likelihood of all landmarks together. No frame is believed where the proven ones are
 less likely than `BY_CHANCE`."""
-ANOTHER = 1 / 3
-"""The share of those that agree from which on as many that agree with another motion refute a
-frame: half of the picture may be a lorry's, or the map is wrong."""
 MOST = 2 / 3
 """The share of the proven landmarks searched that must agree before a frame after such a one is
 believed."""
@@ -146,7 +139,8 @@ class Policy:
         """Return the prediction given what is matched, as far as it is to be trusted."""
         # To first order a turn moves all pixels alike; to second, by its square / 2f more.
         turned = np.median(seen.pixels[seen.matched] - seen.predicted[seen.matched], axis=0)
-        sigma = NARROW + turned @ turned / (2 * self.calibration.fx)
+        # σ of that second search beside what is still unknown then, pixels.
+        sigma = 1.5 + turned @ turned / (2 * self.calibration.fx)
         return given._replace(covariances=given.covariances + sigma**2 * np.eye(2))
 
     def _likely_given_proven(
@@ -181,7 +175,9 @@ class Policy:
         """Return whether most of these, and many beside those that `agreed`, do so with another
         motion of the camera: then it cannot be told which is the world's."""
         rows = np.arange(len(others.slots))
-        least = max(MOST * len(rows), ANOTHER * agreed, LEAST_MATCHES)
+        # The share of those that agree from which on as many that agree with another motion refute
+        # a frame: half of the picture may be a lorry's, or the map is wrong.
+        least = max(MOST * len(rows), (1 / 3) * agreed, LEAST_MATCHES)
         if len(rows) < least:
             return False
         matches = Matches(rows, others.pixels, np.ones(len(rows), np.float32), others.variances)
@@ -244,7 +240,8 @@ def _explained(seen: Observations, given: Prediction) -> bool:
     squared = np.einsum(
         "ki,ki->k", off, np.linalg.solve(given.covariances[slots], off[..., None])[..., 0]
     )
-    return bool(np.mean(squared < GATE) > EXPLAINED)
+    # The share that a linear prediction must explain for that second search.
+    return bool(np.mean(squared < GATE) > 0.8)
 
 
 def more_than_chance(searched: int, chance: float = CHANCE) -> int:

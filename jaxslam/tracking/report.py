@@ -126,10 +126,10 @@ def write_frames(path: str | Path, history: list[Tracked]) -> None:
 
     `state` is `start` of a map (lost too, unless it is the first), `tracked` or `lost`. `map` is
     the number of the map, from 0. σ of position (map units) and orientation (rad) are roots of the
-    summed variances of the three axes. They are zero in the first frame, which defines the world. `log_scale` is the log of that unit in metres as
-    the filter estimates it at this frame, and `sigma_log_scale` its σ. Both are empty where the
-    filter takes the unit for known. `unit_fixed` is 0 during the start of a map, when the filter
-    changes its unit with every frame, else 1.
+    summed variances of the three axes. They are zero in the first frame, which defines the world.
+    `log_scale` is the log of that unit in metres as the filter estimates it at this frame, and
+    `sigma_log_scale` its σ. Both are empty where the filter takes the unit for known. `unit_fixed`
+    is 0 during the start of a map, when the filter changes its unit with every frame, else 1.
     `reason` is why the camera is lost (`Lost`), empty where it is not; `relocalised` is 1 where a
     camera that was lost is known to be back in a map that it had seen, whose number it then is.
     `submap` is the number of the submap, from 0 through all maps, and `loop` that of an earlier one

@@ -37,8 +37,6 @@ TOO_SURE = (
     "The lens was estimated, so its σ, and that of the poses, is too small: see docs/own-video.md"
 )
 """The caveat on an estimated calibration."""
-_KNOWN_DEPTH = 0.3
-"""A point is put into the map where its σ is below this share of its distance."""
 
 Summary = dict[str, Any]
 """A summary as JSON has it."""
@@ -170,7 +168,8 @@ def known_points(landmarks: Points, history: Sequence[Tracked]) -> Points:
     """The landmarks whose depth became known in their maps."""
     with np.errstate(invalid="ignore"):  # of unknown depth, a variance can be anything
         sigma = np.sqrt(np.trace(landmarks.in_map, axis1=1, axis2=2))
-        known = np.isfinite(sigma) & (sigma < _KNOWN_DEPTH * _distances(landmarks, history))
+        # A point is put into the map where its σ is below this share of its distance.
+        known = np.isfinite(sigma) & (sigma < 0.3 * _distances(landmarks, history))
     return landmarks.only(known)
 
 

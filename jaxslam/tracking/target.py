@@ -21,12 +21,8 @@ LEAST_POINTS = 4
 _METRES = ("metre", "metres", "meter", "meters", "m")
 _ALIKE = 0.8
 """Least correlation of a patch with the picture."""
-_COMBINATIONS = 2000
-"""Of places that the patches may be at; as many are tried, at the most."""
 _CORNER_REACH = 3
 """Pixels to each side in which the corner that a patch shows is measured."""
-_NEAR_AND_FAR = 1.5
-"""Ratio of the points' greatest to their least depth: seen steeper, no patch would look like it."""
 _LARGEST_RMS, _LARGEST_FOUND = 2.0, 0.75
 """Pixels: what is further off is no picture of the target; of patches, which corners make exact."""
 
@@ -153,7 +149,8 @@ def sighted(
 
 def _places(target: Target, image: np.ndarray) -> list[list[Float[np.ndarray, " 2"]]]:
     """Return where each point may be: its pixel, or where the picture is most like its patch."""
-    count = max(1, int(_COMBINATIONS ** (1 / len(target.points))))
+    # Of places that the patches may be at; as many are tried, at the most.
+    count = max(1, int(2000 ** (1 / len(target.points))))
     return [_places_of(point, image, count) for point in target.points]
 
 
@@ -208,7 +205,8 @@ def _pose(
         return _Pose(np.zeros(3), np.zeros(3), np.inf)
     seen, _ = cv2.projectPoints(positions, turn, shift, *lens)
     depths = _in_camera(positions, turn, shift)[:, 2]
-    if not 0 < depths.max() <= _NEAR_AND_FAR * depths.min():
+    # Ratio of the points' greatest to their least depth: seen steeper, no patch would look like it.
+    if not 0 < depths.max() <= 1.5 * depths.min():
         return _Pose(turn, shift, np.inf)
     return _Pose(turn, shift, float(np.sqrt(np.mean(np.sum((seen[:, 0] - pixels) ** 2, axis=1)))))
 

@@ -17,7 +17,6 @@ from jaxslam.io.tum import write_tum
 TRACKED = Convention("split", "body")
 """The error whose covariances are written: position in the camera's axes, rotation vector."""
 
-_UNITS = "in the unit of each map (frames.csv)"
 _GIVEN_SCALE = (
     "in the unit of each map; the unit itself is uncertain by sigma_log_scale (frames.csv) and "
     "approximate where unit_fixed is 0"
@@ -52,7 +51,7 @@ def write_trajectory(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> Non
 
     All poses of a map are in one unit of length (docs/gauge.md), and the header says so.
     """
-    write_tum(path, times, T_wc, _UNITS)
+    write_tum(path, times, T_wc, "in the unit of each map (frames.csv)")
 
 
 def write_covariances(

@@ -36,9 +36,6 @@ from jaxslam.tracking.trajectory import (
 )
 from jaxslam.tracking.viewer import Viewer
 
-_MAP_EVERY = 10
-"""Frames from one map of a recording to the next."""
-
 
 def track(
     source: Source,
@@ -115,7 +112,8 @@ def _shown(
                 aside.give(lambda *drawn: writer.write(overlay_of(*drawn)), frame, history[-1])
             if recording is not None:
                 aside.give(recording.show, frame, history[-1])
-                if len(history) % _MAP_EVERY == 0:
+                # Frames from one map of a recording to the next.
+                if len(history) % 10 == 0:
                     aside.give(recording.show_map, known_points(tracker.points(), history))
 
         try:

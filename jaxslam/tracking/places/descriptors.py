@@ -12,8 +12,6 @@ from jaxslam.tracking.landmarks import Landmark
 
 CORNERS = 600
 """The number of corners of a picture that are compared."""
-RATIO = 0.85
-"""The largest ratio of the distance of the most similar descriptor to that of the next."""
 LOOKS = 3
 """Descriptors of a landmark that are kept, of different frames."""
 
@@ -65,6 +63,7 @@ def candidates(
     best: dict[int, tuple[float, int]] = {}
     for first, second in (pair for pair in two if len(pair) == 2):
         slot = int(owner[first.queryIdx])
-        if first.distance < RATIO * second.distance:
+        # The largest ratio of the distance of the most similar descriptor to that of the next.
+        if first.distance < 0.85 * second.distance:
             best[slot] = min(best.get(slot, (np.inf, 0)), (first.distance, first.trainIdx))
     return np.array(list(best), int), pixels[[corner for _, corner in best.values()]]

@@ -28,8 +28,6 @@ LOOKED_EVERY = 15
 """Frames between two in which another map is looked for."""
 NEAR = 2.0
 """The most pixels between two landmarks, one of each map, that are the same point."""
-PAIRS = 6
-"""The fewest such pairs that join two maps."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,8 @@ def join_of(before: Remembered, map: Map, step: int, last: Float[np.ndarray, "4 
     apart = np.linalg.norm(pixels[:, None] - others, axis=2)
     i, j = np.arange(len(pixels)), np.argmin(apart, axis=1)
     same = (apart[i, j] < NEAR) & (np.argmin(apart, axis=0)[j] == i)
-    if same.sum() < PAIRS:
+    # The fewest such pairs that join two maps.
+    if same.sum() < 6:
         return None
     i, j = i[same], j[same]
     ratios = np.log(depths[j] / z[i])
