@@ -398,7 +398,7 @@ def test_the_table_begins_with_the_verdicts_and_shows_the_plain_mean_beside_the_
     title, verdict, _, others, _, header, row, *_ = jaxslam.table(summary).splitlines()
     assert title == "inverse_scaling:"
     assert verdict.strip() == sentences(result["verdict"])[0]
-    assert others.strip().startswith("1 of 20 runs were lost (numbers 7), the 19 never lost: NEES")
+    assert others.strip().startswith("1 of 20 runs was lost (run 7), the 19 never lost: NEES")
     assert header.split()[:3] == ["filter/landmarks", "NEES", "mean"]
     assert f"{result['nees'][-1]:.3f}" in row
     assert f"{result['nees_not_lost'][-1]:.3f}" in row
