@@ -18,9 +18,8 @@ from jaxslam.filters.readouts import camera_pose
 from jaxslam.filters.slam import Slam
 from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.geometry import GEOMETRIES
-from jaxslam.landmarks import LANDMARKS, InverseScaling
+from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.camera import Camera
-from jaxslam.models.frame import Robocentric
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Capacity
 from jaxslam.models.sensors import Pinhole
@@ -91,15 +90,17 @@ def close(actual, desired, relative):
     np.testing.assert_allclose(actual, desired, rtol=0, atol=relative * np.abs(desired).max())
 
 
-def a_filter(geometry, landmark=InverseScaling(), frame=Robocentric(), **pieces):
+def a_filter(geometry, landmark=None, frame=None, **pieces):
     """A filter for what its numbers do not matter to: no noise, and a unit camera, so that its
-    Jacobians are of the same size as the rest. `pieces` replaces what `Slam` takes."""
+    Jacobians are of the same size as the rest; the paper's, or of other pieces."""
     t, p = geometry.tangent_dim, geometry.pixel_dim
     unit: dict[str, Any] = {
         "motion": ConstantVelocity(*np.zeros((3, t))),
         "sensor": Pinhole(Camera(np.ones(p), np.zeros(p)), 0.0),
     }
-    return Slam(landmark=landmark, frame=coordinates, **{**unit, **pieces})
+    given = {"landmark": landmark, "frame": frame}
+    given = {name: piece for name, piece in given.items() if piece is not None}
+    return Slam(**{**unit, **given, **pieces})
 
 
 def run_filter(capacity, slam, controls, first, known, new):
@@ -205,8 +206,9 @@ class Around(AbstractStaged):
 
     estimator: Slam
 
-    def init(self, capacity, first=None):
-        return {"inside": self.estimator.init(capacity, first), "frame": jnp.zeros((), int)}
+    def init(self, capacity, first=None, known=None):
+        inside = self.estimator.init(capacity, first, known)
+        return {"inside": inside, "frame": jnp.zeros((), int)}
 
     def predict(self, state, control):
         return state | {"inside": self.estimator.predict(state["inside"], control)}

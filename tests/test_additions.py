@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from additions import (
-    PLAIN_HOMOGENEOUS,
     Bearing,
     BiasedVelocity,
     DriftingFocal,
@@ -46,7 +45,7 @@ def test_an_addition_is_one_short_class(addition, most):
 
 def test_a_landmark_of_ones_own_is_studied():
     scenario = jaxslam.scenario("matched-tight", steps=8)
-    found = verdict(scenario, paper(scenario, landmark=PLAIN_HOMOGENEOUS))
+    found = verdict(scenario, paper(scenario, landmark=PlainHomogeneous()))
     assert not_disproved(found), found
 
 
@@ -75,7 +74,7 @@ def test_range_and_bearing_is_studied():
     scenario = jaxslam.scenario("positions", steps=25, landmarks=8)
     sensor = jaxslam.RangeBearing((0.1, 0.02))
     slam = paper(
-        scenario, sensor=sensor, landmark=jaxslam.LANDMARKS["cartesian"],
+        scenario, sensor=sensor, landmark=jaxslam.Cartesian(),
         calibration=jaxslam.Known(),
     )  # fmt: skip
     found = verdict(scenario, slam, sensor=sensor)

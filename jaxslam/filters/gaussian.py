@@ -297,12 +297,15 @@ def _with_prior_map(slam: AbstractSlam, state: State, known: PriorMap) -> State:
             raise ValueError(f"a prior map's {name} has shape {found}; it needs {shape}")
     one, focal = jnp.ones((), state.landmarks.dtype), jnp.asarray(slam.sensor.focal)
 
+    def log_scale(core):
+        return core.noise[:0] if core.log_scale is None else core.log_scale
+
     def landmark(log_scale, point):
-        omega = one if log_scale is None else one * jnp.exp(log_scale[0])
+        omega = one * jnp.exp(jnp.sum(log_scale))
         return slam.landmark.initialise(point, omega, focal), None
 
     points = jnp.asarray(known.points, one.dtype)
-    values, _, J = linear.local_jacobians(lambda core: core.log_scale, landmark, state.core, points)
+    values, _, J = linear.local_jacobians(log_scale, landmark, state.core, points)
     P = jnp.asarray(known.covariance, one.dtype).reshape(m, n, m, n)
     own = jnp.einsum("mdn,mnkl,kel->mdke", J.by_landmark, P, J.by_landmark)
     state = linear.with_landmarks(state, jnp.asarray(known.slots), values, J, own)

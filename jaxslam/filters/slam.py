@@ -225,6 +225,10 @@ def _excluded(slam: Slam) -> Iterator[tuple[bool, str]]:
         yield not moves, f"a start from a window is of a velocity, which {motion} lacks"
         yield not hides, f"a start from a window is for a camera; {sensor} measures metres"
         yield landmark.anchored, f"a start from a window is without anchors ({landmark.name})"
+        yield (
+            type(slam.sensor).noise_at is not AbstractSensor.noise_at,
+            f"a start from a window has one noise for all measurements, {sensor} one for each",
+        )
     if frame.begins_submaps:
         yield landmark.anchored, f"submaps are of landmarks without an anchor, not {landmark.name}"
     for what, piece in (

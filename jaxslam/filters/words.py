@@ -60,6 +60,12 @@ def _iterated(slam: Slam, steps: int = 5) -> Slam:
     return replace(slam, correction=replace(slam.correction, steps=steps))
 
 
+def _with_submaps(slam: Slam, spare: int = 24) -> Slam:
+    if not slam.frame.moves_landmarks:
+        raise ValueError(f"submaps are of robocentric filters, not of {slam.frame.name} ones")
+    return replace(slam, frame=Submaps(spare))
+
+
 def _drifting(slam: Slam, percent: int = 10) -> Slam:
     return replace(slam, correction=RandomWalk(slam.correction, percent / 100))
 
@@ -81,7 +87,7 @@ MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
     "directions": lambda slam, count=5: replace(slam, mixture=Mixture(count, split=False)),
     "mixture": lambda slam, count=9: replace(slam, mixture=Mixture(count)),
     "rest": _from_window,
-    "submaps": lambda slam, spare=24: replace(slam, frame=Submaps(spare)),
+    "submaps": _with_submaps,
     "checked": lambda slam, percent=150: replace(slam, gate=Gate(tolerance=percent / 100)),
     "particles": with_depth_particles,
     "rays": with_rays,

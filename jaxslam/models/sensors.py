@@ -230,7 +230,7 @@ class RangeBearing(AbstractSensor):
 
 
 def noises(
-    sensor: AbstractSensor, measured: Float[Array, "m p"]
+    sensor: AbstractSensor, measured: Float[AnyArray, "m p"]
 ) -> Float[Array, "p p"] | Float[Array, "m p p"]:
     """R of each measurement; one for all, which is factored once, where none depends on what is
     measured."""

@@ -11,16 +11,9 @@ import numpy as np
 import pytest
 from cases import Case, quick_jit
 
-from jaxslam.filters.slam import Slam
 from jaxslam.filters.window.record import empty
-from jaxslam.filters.window.start import (
-    GIVEN_UP,
-    IN_TURN,
-    SEARCHES,
-    SIZES,
-    BatchInitialisation,
-    from_rest,
-)
+from jaxslam.filters.window.start import FromWindow, Schedule
+from jaxslam.geometry import PLANAR, SPATIAL
 from jaxslam.models.observations import Features
 from jaxslam.statistics.bands import lost_threshold
 
@@ -158,8 +151,8 @@ def test_a_window_may_close_where_one_translation_is_known_to_three_hundredths(
     merged = jnp.full_like(state.record.merged, 2.0)
     record = replace(state.record, last=jnp.full_like(state.record.last, 4), merged=merged)
     state = replace(state, sum=replace(state.sum, log_weights=weights))
-    assert slam._ready(replace(state, record=record)) == ready
-    assert not slam._ready(state)  # of no frame yet
+    assert slam.start._ready(slam, replace(state, record=record)) == ready
+    assert not slam.start._ready(slam, state)  # of no frame yet
 
 
 @pytest.mark.slow
@@ -183,7 +176,7 @@ def test_standing_teaches_nothing_and_then_the_motion_is_found():
     assert (along > 0).all()
 
 
-@pytest.mark.parametrize("around", ["", "+checked", "+checked+checked"])
+@pytest.mark.parametrize("around", ["", "+checked"])
 def test_what_stands_around_a_start_from_rest_says_what_it_says(around):
     slam: Any = standstill().filter(f"{STARTED}{around}")
     assert slam.ambiguous_start
@@ -191,7 +184,6 @@ def test_what_stands_around_a_start_from_rest_says_what_it_says(around):
     for is_open in (False, True):
         state = eqx.tree_at(lambda s: s.open, state, jnp.asarray(is_open))
         assert slam.unit_fixed(state) == (not is_open)
-    assert isinstance(slam.unwrapped, Slam)
     slam = standstill().filter(f"{SUM}{around}")
     assert not slam.ambiguous_start
 
@@ -215,7 +207,7 @@ def test_without_landmarks_the_camera_is_known_less_with_every_frame():
 def test_the_members_are_the_modes_as_long_as_the_window_is_open():
     for state in followed(STARTED)[1:9]:
         weights = np.asarray(state.modes.log_weights)
-        likely = weights >= weights.max(axis=1, keepdims=True) - GIVEN_UP
+        likely = weights >= weights.max(axis=1, keepdims=True) - Schedule.of(SPATIAL).given_up
         kept = np.asarray(state.open)[:, None] | likely
         np.testing.assert_array_equal(state.sum.log_weights, np.where(kept, weights, -np.inf))
         np.testing.assert_allclose(np.exp(state.modes.log_weights).sum(axis=1), 1, rtol=1e-9)
@@ -288,46 +280,20 @@ def test_features_are_predicted_where_they_are_seen():
     assert squared.mean() < 6  # of two pixels: 2, of all whose covariance is right
 
 
-# What is refused
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("scale_gauge+rest8", "Gaussian sum that is split .mixture., not of a Slam"),
-        ("robocentric+directions3+rest8", "is split .mixture., not of a GaussianSum that is not"),
-        ("scale_gauge+mixture3+rest1", r"3 frames and more .* not \(2,\)"),
-        ("scale_gauge+mixture3+rest0", r"3 frames and more .* not \(1,\)"),
-    ],
-)
-@pytest.mark.usefixtures("unchecked")
-def test_what_cannot_start_from_rest_is_refused(name, message):
-    with pytest.raises(ValueError, match=message):
-        standstill().filter(name)
-
-
-def test_a_landmark_with_an_anchor_is_refused():
-    with pytest.raises(ValueError, match="without anchors, which framed_homogeneous has"):
-        standstill().filter(STARTED, "framed_homogeneous")
-
-
 @pytest.mark.parametrize("sizes", [(9, 9), (17, 9), ()])
 def test_windows_that_do_not_grow_are_refused(sizes):
     with pytest.raises(ValueError, match="each larger than the one before"):
-        BatchInitialisation(standstill().filter(SUM), sizes, 4)
+        replace(Schedule.of(SPATIAL), sizes=sizes)
 
 
 def test_a_search_in_no_direction_is_refused():
     with pytest.raises(ValueError, match="1 direction at least, not 0"):
-        BatchInitialisation(standstill().filter(SUM), (9,), 0)
+        replace(Schedule.of(SPATIAL), directions=0)
 
 
 def test_windows_grow_up_to_the_frames_that_are_named():
-    base = standstill().filter(SUM)
-    assert from_rest(base).sizes == SIZES["spatial"] == (31,)
-    assert from_rest(base, 8).sizes == (9,)
-    assert from_rest(base, 20).sizes == (21,)
-    assert from_rest(base, 40).sizes == (31, 41)
+    frames = (None, 8, 20, 40)
+    assert [Schedule.of(SPATIAL, n).sizes for n in frames] == [(31,), (9,), (21,), (31, 41)]
 
 
 @pytest.mark.parametrize("wrong", [lambda z: z * jnp.nan, lambda z: jnp.flip(z, axis=1)])
@@ -345,29 +311,29 @@ def test_measurements_that_nothing_explains_leave_the_sum_to_itself(wrong):
     np.testing.assert_array_equal(state.modes.minima.x, before.modes.minima.x)
 
 
-def due(slam, last, standing=False, steps=None, moved=False):
+def due(start, motion, last, standing=False, steps=None, moved=False):
     """From which starts is sought after frame `last`, `steps` frames since the first."""
     frames = max(last, 8) + 1
     merged = jnp.ones(frames - 1).at[0].add((last if steps is None else steps) - last)
-    record = empty(slam.base.base.motion, frames, 4, 2, jnp.float64)
+    record = empty(motion, frames, 4, 2, jnp.float64)
     stood = jnp.asarray(standing)
     record = replace(record, last=jnp.asarray(last), merged=merged, standing=stood)
-    return slam._due(record, jnp.asarray(moved))
+    return start._due(record, jnp.asarray(moved))
 
 
 def test_a_search_is_from_all_starts_at_first_and_then_from_some_in_turn():
-    slam = from_rest(standstill().filter(SUM), 8)
-    starts, together = 2 + slam.directions, IN_TURN["spatial"]
-    early = SEARCHES["spatial"]
+    schedule = Schedule.of(SPATIAL, 8)
+    starts, together, early = 2 + schedule.directions, schedule.in_turn, schedule.searches
+    slam = FromWindow(schedule), standstill().pieces()["motion"]
     for last in early:
-        assert due(slam, last).shape == (starts,)
-        assert due(slam, last).all()
-        assert not due(slam, last, standing=True).any()
-    later = [np.asarray(due(slam, 8, steps=max(early) + 1 + k)) for k in range(starts)]
+        assert due(*slam, last).shape == (starts,)
+        assert due(*slam, last).all()
+        assert not due(*slam, last, standing=True).any()
+    later = [np.asarray(due(*slam, 8, steps=max(early) + 1 + k)) for k in range(starts)]
     assert {int(x.sum()) for x in later} == {together}
     # A camera that has moved is asked in every frame whether the reversed world is likelier.
     for k, quiet in enumerate(later):
-        asked = np.asarray(due(slam, 8, steps=max(early) + 1 + k, moved=True))
+        asked = np.asarray(due(*slam, 8, steps=max(early) + 1 + k, moved=True))
         assert asked[1]
         np.testing.assert_array_equal(np.delete(asked, 1), np.delete(quiet, 1))
     # The reversal of the likeliest first, and none twice before all had their turn.
@@ -377,8 +343,9 @@ def test_a_search_is_from_all_starts_at_first_and_then_from_some_in_turn():
 
 
 def test_in_the_plane_a_search_is_from_all_starts_or_from_none():
-    slam = from_rest(Case("standstill", 1, landmarks=4, steps=2).filter(SUM))
-    assert IN_TURN["planar"] == 0
+    schedule = Schedule.of(PLANAR)
+    slam = FromWindow(schedule), Case("standstill", 1, landmarks=4, steps=2).pieces()["motion"]
+    assert schedule.in_turn == 0
     for last in (*range(1, 9), 40):
-        found = due(slam, last)
-        assert found.all() if last in SEARCHES["planar"] else not found.any()
+        found = due(*slam, last)
+        assert found.all() if last in schedule.searches else not found.any()

@@ -5,13 +5,6 @@ import numpy as np
 import pytest
 from cases import Case, quick_jit
 
-from jaxslam.filters.linear.covariance import Covariance
-from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
-from jaxslam.filters.remedies.random_walk import Drifting
-from jaxslam.filters.slam import Slam
-from jaxslam.filters.words import make_filter, scenario_pieces
-from jaxslam.simulation import scenario
-
 
 @pytest.mark.parametrize("landmark", ["inverse_scaling", "inverse_depth"])
 def test_a_feature_is_expected_by_so_much_less_surely(landmark):
@@ -36,13 +29,3 @@ def test_a_feature_is_expected_by_so_much_less_surely(landmark):
     expected = np.einsum("ij,kl->ikjl", np.eye(m), 0.3**2 * R)
     np.testing.assert_allclose(more, expected, atol=1e-9)
     assert drifting.nis < fixed.nis
-
-
-def test_it_is_a_piece_around_any_correction():
-    pieces = scenario_pieces(scenario("matched-6dof"))
-    slam = make_filter("scale_gauge+oc+drift", **pieces)
-    assert isinstance(slam, Slam)
-    assert isinstance(slam.form, Covariance)
-    assert isinstance(slam.form.correction, Drifting)
-    assert isinstance(slam.form.correction.correction, ObservabilityConstrained)
-    assert slam.form.correction.share == 0.1

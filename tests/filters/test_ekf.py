@@ -22,8 +22,9 @@ from cases import (
 
 from jaxslam._numerics.arrays import cast
 from jaxslam.filters.linear import blocks
+from jaxslam.filters.linear import covariance as linear
 from jaxslam.filters.linear.blocks import Blocks, observed, placed
-from jaxslam.filters.linear.covariance import Covariance
+from jaxslam.filters.linear.kalman import Kalman
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.filters.slam import Slam
@@ -37,7 +38,7 @@ from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Features, Status
 from jaxslam.models.sensors import Pinhole
 
-EKF = Covariance()
+update = Kalman().update
 
 # --- a linear Gaussian problem, where the EKF must be the Kalman filter -------------------------
 
@@ -63,6 +64,9 @@ class Linear:
     """
 
     moves_landmarks: bool
+
+    def given(self, core, context):
+        return context
 
     def compose_core(self, core, context):
         velocity = core.velocity + core.acceleration * context.dt
@@ -178,7 +182,7 @@ def linear_start():
         active=jnp.zeros(CAPACITY, bool),
         covariance=jnp.zeros((n, n)),
     )
-    return EKF.augment(state, 0, P)
+    return linear.augmented(state, 0, P)
 
 
 @cache
@@ -189,16 +193,16 @@ def linear_step(moves_landmarks, first=False):
     def step(state, slant, known, new, gone):
         here, motion = Frame(jnp.zeros(()), slant), Frame(jnp.asarray(DT), slant)
         if not first:
-            state = EKF.augment(state, 4, ACCELERATION_SIGMA**2 * jnp.eye(2))
+            state = linear.augmented(state, 4, ACCELERATION_SIGMA**2 * jnp.eye(2))
             if moves_landmarks:
-                state, _ = EKF.update(model, state, known, noise, motion)
-                state = EKF.compose(model, state, motion)
+                state, _ = update(model, state, known, noise, motion)
+                state = linear.composed(model, state, motion)
             else:
-                state = EKF.compose(model, state, motion)
-                state, _ = EKF.update(model, state, known, noise, here)
+                state = linear.composed(model, state, motion)
+                state, _ = update(model, state, known, noise, here)
         prior = jnp.array(PRIOR[:1]), jnp.array(PRIOR[1:])
-        state = EKF.initialise(model, state, new, noise, prior, here)
-        return EKF.remove(state, gone)
+        state = linear.initialised(model, state, new, noise, prior, here)
+        return linear.removed(state, gone)
 
     return quick_jit(step)
 
@@ -247,91 +251,9 @@ def test_on_a_linear_problem_the_filter_is_the_kalman_filter(robocentric):
     assert largest == CAPACITY  # the schedule fills the map, so that every slot is tried
 
 
-def test_removal_zeroes_and_a_freed_slot_is_as_good_as_a_fresh_one():
-    *_, state = linear_run(True, steps=6)
-    used, unused = LIVES[0][0], LIVES[5][0]
-    assert state.active[used]
-    assert not state.active[unused]
-    freed = quick_jit(EKF.remove)(state, np.arange(CAPACITY) == used)
-    rows = np.r_[6 + 3 * used : 9 + 3 * used]
-    assert np.abs(state.covariance[rows]).max() > 0.01
-    assert not np.any(freed.covariance[rows])
-    assert not np.any(freed.covariance[:, rows])
-    assert not freed.active[used]
-    others = np.setdiff1d(np.arange(len(state.covariance)), rows)
-    kept = np.ix_(others, others)
-    np.testing.assert_array_equal(freed.covariance[kept], state.covariance[kept])
-
-    def inserted(slot):
-        new = Features(jnp.array([slot]), jnp.array([[1.0, 2.0]]), jnp.array([True]))
-        here = Frame(jnp.zeros(()), jnp.array([0.3, 0.4]))
-        prior = jnp.array(PRIOR[:1]), jnp.array(PRIOR[1:])
-        return insert(freed, new, prior, here)
-
-    insert = quick_jit(
-        lambda state, new, prior, here: EKF.initialise(
-            Linear(True), state, new, jnp.asarray(NOISE), prior, here
-        )
-    )
-
-    again, fresh = inserted(used), inserted(unused)
-    assert again.active[used]
-    # The same sums, in other places of a vectorised loop.
-    close(again.landmarks[used], fresh.landmarks[unused], 1e-14)
-    order = np.arange(CAPACITY)
-    order[[used, unused]] = unused, used
-    numbers = rows_of(6, order, 3)
-    close(again.covariance, np.asarray(fresh.covariance)[np.ix_(numbers, numbers)], 1e-14)
-
-
 def rows_of(c, order, d):
     """Places in the state of the core and of the slots in another order."""
     return np.concatenate([np.arange(c), (c + d * order[:, None] + np.arange(d)).ravel()])
-
-
-@dataclass(frozen=True)
-class Scalar:
-    """A core of one number and landmarks of one number; a landmark is measured directly."""
-
-    moves_landmarks: bool = False
-
-    def compose_core(self, core, context):
-        return core
-
-    def view(self, core, context):
-        return core
-
-    def compose_landmark(self, view, landmark, context):
-        return landmark
-
-    def observe(self, view, landmark, context):
-        return landmark, jnp.array(True)
-
-    def residual(self, measured, predicted):
-        return measured - predicted
-
-    def initialise(self, view, measured, hidden, context):
-        return measured
-
-    def convert(self, view, landmark, covariance, context):
-        return landmark
-
-
-def test_prior_one_and_noise_one_end_with_one_half():
-    """Counting a measurement twice, as an iterated filter may, would give 1/3."""
-    state = State(
-        core=jnp.zeros(1),
-        landmarks=jnp.zeros((1, 1)),
-        active=jnp.array([True]),
-        covariance=jnp.diag(jnp.array([0.0, 1.0])),
-    )
-    seen = Features(jnp.array([0]), jnp.array([[3.0]]), jnp.array([True]))
-    update = quick_jit(lambda state, seen: EKF.update(Scalar(), state, seen, jnp.eye(1), None))
-    state, innovation = update(state, seen)
-    # √2 and its inverse are rounded.
-    np.testing.assert_allclose(state.covariance, np.diag([0.0, 0.5]), rtol=0, atol=1e-14)
-    np.testing.assert_allclose(state.landmarks, [[1.5]], rtol=1e-14)
-    np.testing.assert_allclose(innovation.nis, 9 / 2, rtol=1e-14)
 
 
 # --- the real models, against dense Jacobians of the whole state --------------------------------
@@ -347,8 +269,8 @@ def pieces(geometry) -> dict[str, Any]:
     }
 
 
-def slam_model(geometry, landmark, coordinates):
-    return Slam(landmark=landmark, frame=coordinates, **pieces(geometry)).model
+def slam_model(geometry, landmark, frame):
+    return Slam(landmark=landmark, frame=frame, **pieces(geometry)).model
 
 
 def noise_of(geometry):
@@ -366,7 +288,7 @@ def generic_state(model, capacity=3):
     geometry, rng = model.geometry, np.random.default_rng(8)
     t, p = geometry.tangent_dim, geometry.pixel_dim
     core = Core(
-        pose=model.coordinates.from_base_pose(pose(geometry, 11)),
+        pose=model.frame.from_base_pose(pose(geometry, 11)),
         motion=jnp.asarray(rng.normal(0, 0.5, t)),
         log_scale=None,
         noise=jnp.asarray(rng.normal(0, 0.5, t)),
@@ -404,15 +326,15 @@ def whole_state_function(model, state, context):
 
 
 @cache
-def slam_case(geometry, landmark, coordinates):
+def slam_case(geometry, landmark, frame):
     """A generic state; compiled: update with composition, the dense function, its Jacobian."""
-    model = slam_model(geometry, landmark, coordinates)
+    model = slam_model(geometry, landmark, frame)
     context = Context(jnp.asarray(STEP))
     state = quick_jit(lambda: generic_state(model))()
 
     def block_wise(state, features):
-        updated, innovation = EKF.update(model, state, features, noise_of(geometry), context)
-        return updated, innovation, EKF.compose(model, state, context)
+        updated, innovation = update(model, state, features, noise_of(geometry), context)
+        return updated, innovation, linear.composed(model, state, context)
 
     def dense(state, delta):
         return whole_state_function(model, state, context)(delta)
@@ -434,12 +356,12 @@ def middle_only(state, geometry, pixel):
 
 
 @pytest.mark.parametrize("landmark", few_landmarks, ids=named)
-@pytest.mark.parametrize("coordinates", [Robocentric(), WorldCentric()], ids=named)
+@pytest.mark.parametrize("frame", [Robocentric(), WorldCentric()], ids=named)
 @pytest.mark.parametrize("geometry", each_geometry, ids=named)
 def test_blocks_are_the_dense_jacobians_with_only_the_middle_landmark_seen(
-    geometry, coordinates, landmark
+    geometry, frame, landmark
 ):
-    state, block_wise, dense, jacobian = slam_case(geometry, landmark, coordinates)
+    state, block_wise, dense, jacobian = slam_case(geometry, landmark, frame)
     p, c, zero = geometry.pixel_dim, state.core_dim, np.zeros(len(state.covariance))
     pixels, composed = np.split(dense(state, zero), [3 * p])
     both = np.asarray(jacobian(state, zero))
@@ -529,7 +451,7 @@ def behind(state):
 
 def removed(state):
     """The state without landmark 0."""
-    return EKF.remove(state, np.arange(3) == 0)
+    return linear.removed(state, np.arange(3) == 0)
 
 
 @pytest.mark.parametrize(
@@ -564,16 +486,16 @@ def test_a_feature_that_cannot_be_used_changes_nothing(change, valid):
 
 
 def test_search_ellipses_are_the_diagonal_blocks_of_the_innovation_covariance():
-    for geometry, landmark, coordinates in (
+    for geometry, landmark, frame in (
         (PLANAR, InverseScaling(), Robocentric()),
         (SPATIAL, LANDMARKS["inverse_depth"], WorldCentric()),
     ):
-        state, block_wise, dense, _ = slam_case(geometry, landmark, coordinates)
-        p, model = geometry.pixel_dim, slam_model(geometry, landmark, coordinates)
+        state, block_wise, dense, _ = slam_case(geometry, landmark, frame)
+        p, model = geometry.pixel_dim, slam_model(geometry, landmark, frame)
         slots = jnp.array([2, 0])
         pixels, covariances, in_front = quick_jit(
-            lambda state, model=model, slots=slots: EKF.predict_features(
-                model, state, slots, noise_of(model.geometry), Context(jnp.asarray(STEP))
+            lambda state, model=model, slots=slots: linear.expected(
+                model, state, slots, Context(jnp.asarray(STEP))
             )
         )(state)
         expected = dense(state, np.zeros(len(state.covariance)))[: 3 * p].reshape(3, p)
@@ -581,7 +503,7 @@ def test_search_ellipses_are_the_diagonal_blocks_of_the_innovation_covariance():
         S = block_wise(state, seen)[1].covariance.reshape(3, p, 3, p)
         assert in_front.all()
         close(pixels, expected[slots], 1e-14)
-        close(covariances, np.stack([S[i, :, i] for i in (2, 0)]), 1e-12)
+        close(covariances + noise_of(geometry), np.stack([S[i, :, i] for i in (2, 0)]), 1e-12)
 
 
 def test_considered_numbers_count_but_are_not_corrected():
@@ -593,7 +515,7 @@ def test_considered_numbers_count_but_are_not_corrected():
     calibration = slice(c - 2, c)
     seen = Features(jnp.arange(3), planar_pixels(state), jnp.ones(3, bool))
     updated, innovation = quick_jit(
-        lambda state: EKF.update(model, state, seen, noise_of(PLANAR), context, calibration)
+        lambda state: update(model, state, seen, noise_of(PLANAR), context, calibration)
     )(state)
 
     zero = np.zeros(n)
@@ -625,20 +547,20 @@ def test_considered_numbers_count_but_are_not_corrected():
 # --- initialisation -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("coordinates", [Robocentric(), WorldCentric()], ids=named)
-def test_landmarks_of_one_frame_share_its_pose_and_its_calibration(coordinates):
+@pytest.mark.parametrize("frame", [Robocentric(), WorldCentric()], ids=named)
+def test_landmarks_of_one_frame_share_its_pose_and_its_calibration(frame):
     """P ← J diag(P, R, σ², R, σ²) Jᵀ for two landmarks at once, the paper's P22–P26."""
-    model = slam_model(PLANAR, InverseScaling(), coordinates)
+    model = slam_model(PLANAR, InverseScaling(), frame)
     depth = cast(model.depth, float)
-    everyone = slam_case(PLANAR, InverseScaling(), coordinates)[0]
-    state = EKF.remove(everyone, jnp.array([True, False, True]))
+    everyone = slam_case(PLANAR, InverseScaling(), frame)[0]
+    state = linear.removed(everyone, jnp.array([True, False, True]))
     c, d = state.core_dim, state.landmarks.shape[1]
     pixels, w = jnp.array([[100.0], [500.0]]), depth.mean
     prior = (w[None], depth.sigma[None])
     new = Features(jnp.array([2, 0]), pixels, jnp.ones(2, bool))
 
     def block_wise(state):
-        return EKF.initialise(model, state, new, noise_of(PLANAR), prior, COMPOSED)
+        return linear.initialised(model, state, new, noise_of(PLANAR), prior, COMPOSED)
 
     def both(x):
         view = model.view(retract(state.core, x[:c]), COMPOSED)

@@ -68,5 +68,5 @@ def test_the_states_are_those_of_the_filter_inside():
     of = case()
     slam = of.filter("robocentric+checked")
     first = of.frames(0)[0]
-    inside, around = (quick_jit(partial(f.init, of.capacity))(first) for f in (slam.base, slam))
+    inside, around = (quick_jit(partial(f.init, of.capacity))(first) for f in (slam.inner, slam))
     jax.tree.map(np.testing.assert_array_equal, around, inside)

@@ -1,6 +1,6 @@
 """Tests of delayed initialisations: depth particles and Gaussian-sum rays, in a planar world."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache, partial
 
 import jax
@@ -51,9 +51,13 @@ def plain(base, motion_sigma=0.0, speed=SPEED, speed_sigma=0.0, depth=(0.2, 0.1)
     )
 
 
-def the_filter(base, method, **numbers):
-    word = {DepthParticles: "particles", RaySum: "rays"}[type(method)]
-    return replace(plain(f"{base}+{word}", **numbers), entry=method)
+def the_filter(base, word, **numbers):
+    """With a delayed initialisation of that word, which has these numbers; others are `plain`'s."""
+    own = {name: numbers.pop(name) for name in list(numbers) if name in RIVALS}
+    return replace(plain(f"{base}+{word}", **numbers), **own)
+
+
+RIVALS = {piece.name for rival in (DepthParticles, RaySum) for piece in fields(rival)}
 
 
 def begun(slam, first):
@@ -70,10 +74,10 @@ def seen_at(depth, bearing, step):
 
 @pytest.mark.parametrize("base", BASES)
 def test_particles_are_the_posterior_of_depth_when_camera_and_ray_are_known(base):
-    method = DepthParticles(count=40, agreement=1e-6)
-    slam, bearing = the_filter(base, method), 0.2
+    slam, bearing = the_filter(base, "particles", count=40, agreement=1e-6), 0.2
     state, step = begun(slam, pixels(FOCAL * bearing + CENTRE))
-    state = replace(state, covariance=jnp.zeros_like(state.covariance))
+    known = jnp.zeros_like(state.gaussian.covariance)
+    state = replace(state, gaussian=replace(state.gaussian, covariance=known))
     noise = np.array([0.4, -0.7, 0.1])
     measured = np.array([seen_at(2.1, bearing, k + 1) for k in range(3)]) + noise
 
@@ -85,61 +89,61 @@ def test_particles_are_the_posterior_of_depth_when_camera_and_ray_are_known(base
     predicted = np.array([seen_at(depths, bearing, k + 1) for k in range(3)])
     likelihood = np.exp(-(((measured[:, None] - predicted) / SIGMA) ** 2).sum(axis=0) / 2)
     np.testing.assert_allclose(
-        state.memory[0], likelihood / likelihood.sum(), rtol=1e-6, atol=1e-12
+        state.weights[0], likelihood / likelihood.sum(), rtol=1e-6, atol=1e-12
     )
 
 
 @pytest.mark.parametrize("base", BASES)
 def test_a_pending_ray_does_not_change_the_camera(base):
-    method = DepthParticles(agreement=1e-6)
-    slam = the_filter(base, method, motion_sigma=0.1, speed_sigma=0.02)
+    slam = the_filter(base, "particles", agreement=1e-6, motion_sigma=0.1, speed_sigma=0.02)
     state, step = begun(slam, pixels(400.0))
-    c = state.core_dim
+    c = state.gaussian.core_dim
     seen = pixels(395.0)
     with_ray, innovation = step(state, DT, seen, NONE)
     without, _ = step(state, DT, replace(seen, valid=~seen.valid), NONE)
-    assert not np.allclose(with_ray.memory, without.memory)
+    assert not np.allclose(with_ray.weights, without.weights)
     assert innovation.nis == 0
-    for one, other in zip(
-        jax.tree.leaves(with_ray.core), jax.tree.leaves(without.core), strict=True
-    ):
-        np.testing.assert_array_equal(one, other)
-    np.testing.assert_array_equal(with_ray.covariance[:c, :c], without.covariance[:c, :c])
+    one, other = with_ray.gaussian, without.gaussian
+    jax.tree.map(np.testing.assert_array_equal, one.core, other.core)
+    np.testing.assert_array_equal(one.covariance[:c, :c], other.covariance[:c, :c])
+
+
+def is_point(state):
+    return state.gaussian.landmarks[:, -1] == 1
 
 
 def test_a_ray_becomes_a_point_with_the_mean_and_variance_of_its_particles():
-    method = DepthParticles(count=40)
-    slam, bearing = the_filter("robocentric", method, speed=0.0), 0.2
+    slam, bearing = the_filter("robocentric", "particles", count=40, speed=0.0), 0.2
     state, step = begun(slam, pixels(FOCAL * bearing + CENTRE))
-    assert not method.initialised(step(state, DT, NONE, NONE)[0]).any()
+    assert not is_point(step(state, DT, NONE, NONE)[0]).any()
 
     distances = np.linspace(0.5, 5.0, 40)
     weights = np.exp(-(((distances - 2.0) / 0.3) ** 2) / 2)
     weights /= weights.sum()
-    state = replace(state, memory=jnp.asarray(weights)[None])
+    state = replace(state, weights=jnp.asarray(weights)[None])
     state, _ = step(state, DT, NONE, NONE)
-    assert method.initialised(state).all()
+    assert is_point(state).all()
 
     mean = weights @ distances
     variance = weights @ (distances - mean) ** 2 + (distances[1] - distances[0]) ** 2 / 12
     ray = np.array([bearing, 1.0]) / np.hypot(1.0, bearing)
     across = mean * SIGMA / FOCAL / (1 + bearing**2) * np.array([ray[1], -ray[0]])
     wanted = variance * np.outer(ray, ray) + np.outer(across, across)
-    start, d = state.core_dim, state.landmarks.shape[1]
-    np.testing.assert_allclose(state.landmarks[0, :2], mean * ray, rtol=1e-12)
-    own = state.covariance[start:, start:]
+    one = state.gaussian
+    start, d = one.core_dim, one.landmarks.shape[1]
+    np.testing.assert_allclose(one.landmarks[0, :2], mean * ray, rtol=1e-12)
+    own = one.covariance[start:, start:]
     np.testing.assert_allclose(own[:2, :2], wanted, rtol=1e-9, atol=1e-15)
     assert not np.any(own[2:d]), "the numbers of the other form are constants"
 
 
 def test_a_pending_ray_is_reported_with_the_moments_of_inverse_depth():
-    method = DepthParticles(count=40)
-    slam = the_filter("world", method)
+    slam = the_filter("world", "particles", count=40)
     state, _ = begun(slam, pixels(CENTRE))
 
     @quick_jit
     def in_camera(state):
-        return landmarks_in_camera(slam, state, jnp.arange(1), slam.sensor)
+        return landmarks_in_camera(slam, state, jnp.arange(1), slam.model.sensor)
 
     chart, covariance = in_camera(state)
     inverse = 1 / np.linspace(0.5, 5.0, 40)
@@ -148,16 +152,19 @@ def test_a_pending_ray_is_reported_with_the_moments_of_inverse_depth():
 
 
 def test_a_ray_that_no_particle_explains_is_dropped():
-    slam = the_filter("world", DepthParticles(count=40))
+    slam = the_filter("world", "particles", count=40)
     state, step = begun(slam, pixels(CENTRE))
     state, _ = step(state, DT, pixels(CENTRE + 60), NONE)
-    assert not state.active.any()
-    assert not state.covariance.any()
+    assert not state.gaussian.active.any()
+    assert not state.gaussian.covariance.any()
+
+
+THREE = {"nearest": 1.0, "farthest": 15.0}
+"""The range of a ray of three members."""
 
 
 def test_members_are_weighed_by_bayes_rule():
-    method = RaySum(nearest=1.0, farthest=15.0, threshold=0.0)
-    slam, bearing = the_filter("robocentric", method), 0.2
+    slam, bearing = the_filter("robocentric", "rays", **THREE, threshold=0.0), 0.2
     state, step = begun(slam, pixels(FOCAL * bearing + CENTRE))
     measured = seen_at(4.0, bearing, 1) + 0.3
     state, _ = step(state, DT, pixels(measured), NONE)
@@ -168,15 +175,14 @@ def test_members_are_weighed_by_bayes_rule():
     by_pixel, by_depth = 1.0, FOCAL * SPEED * DT / s**2
     variance = by_pixel * SIGMA**2 + (by_depth * 0.3 * s) ** 2 + SIGMA**2
     likelihood = np.exp(-((measured - predicted) ** 2) / variance / 2) / np.sqrt(variance)
-    np.testing.assert_allclose(state.memory[0], likelihood / likelihood.sum(), rtol=1e-9)
+    np.testing.assert_allclose(state.weights[0], likelihood / likelihood.sum(), rtol=1e-9)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("privilege", [0.0, 0.5, 1.0])
 def test_members_share_a_measurement_by_their_weights_to_the_privilege(privilege, monkeypatch):
     """ρ_i = Λ_i^μ / Σ Λ_j^μ (Solà et al. 2005): all shares together are one measurement."""
-    method = RaySum(nearest=1.0, farthest=15.0, threshold=0.0, privilege=privilege)
-    slam = the_filter("robocentric", method)
+    slam = the_filter("robocentric", "rays", **THREE, threshold=0.0, privilege=privilege)
     state, _ = begun(slam, pixels(FOCAL * 0.2 + CENTRE))
     shares = []
 
@@ -191,36 +197,34 @@ def test_members_share_a_measurement_by_their_weights_to_the_privilege(privilege
 
 
 def test_unlikely_members_are_pruned_until_one_is_left():
-    method = RaySum(nearest=1.0, farthest=15.0)
-    slam = the_filter("world", method)
+    slam = the_filter("world", "rays", **THREE)
     state, step = begun(slam, pixels(CENTRE))
-    assert state.active.sum() == method.members == 3
+    assert state.gaussian.active.sum() == slam.slots_each == 3
     for k in range(1, 5):
         measured = seen_at(3 / 0.7, 0.0, k)
         state, _ = step(state, DT, pixels(measured), NONE)
-    np.testing.assert_array_equal(state.active, [False, True, False])
-    np.testing.assert_array_equal(state.memory[0], [0.0, 1.0, 0.0])
-    assert method.initialised(state).all()
-    first, left, last = np.split(np.asarray(state.covariance)[state.core_dim :], 3)
+    one = state.gaussian
+    np.testing.assert_array_equal(one.active, [False, True, False])
+    np.testing.assert_array_equal(state.weights[0], [0.0, 1.0, 0.0])
+    first, left, last = np.split(np.asarray(one.covariance)[one.core_dim :], 3)
     assert left.any()
     assert not first.any(), "a pruned member leaves nothing"
     assert not last.any(), "a pruned member leaves nothing"
-    reported = slam.entry.collapsed(state)
-    np.testing.assert_array_equal(reported.landmarks[0], state.landmarks[1])
+    reported = slam.collapsed(state)
+    np.testing.assert_array_equal(reported.landmarks[0], one.landmarks[1])
     np.testing.assert_array_equal(reported.covariance[-2:, -2:], left[:, -4:-2])
 
 
 def test_one_member_is_the_plain_filter():
-    method = RaySum(nearest=1.4, farthest=1.5)
-    assert method.members == 1
     depth = 1.4 / 0.7
     numbers = dict(motion_sigma=0.1, speed_sigma=0.05, depth=(1 / depth, 0.3 / depth))
-    states = []
-    for slam in (plain("robocentric", **numbers), the_filter("robocentric", method, **numbers)):
+    single, states = the_filter("robocentric", "rays", nearest=1.4, farthest=1.5, **numbers), []
+    assert single.slots_each == 1
+    for slam in (plain("robocentric", **numbers), single):
         state, step = begun(slam, pixels(330.0, 250.0))
         for u in (320.0, 309.0):
             state, _ = step(state, DT, pixels(u, u - 80), NONE)
-        states.append(replace(state, memory=()))
+        states.append(getattr(state, "gaussian", state))
     for one, other in zip(*map(jax.tree.leaves, states), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-14)
 
@@ -262,7 +266,7 @@ def two_runs():
 def test_a_batch_is_its_runs(name):
     case = two_runs()
     slam = case.filter(name, "cartesian")
-    run = partial(filter_run, slam, Room(landmarks=3, first=3, known=3, new=0), slam.sensor)
+    run = partial(filter_run, slam, Room(landmarks=3, first=3, known=3, new=0), slam.model.sensor)
     batch, _, _ = quick_jit(jax.vmap(run))(case.runs)
     alone, _, _ = quick_jit(run)(case.run(1))
     for key in ("nees", "landmark_nees", "nis"):
@@ -270,24 +274,27 @@ def test_a_batch_is_its_runs(name):
         np.testing.assert_allclose(batch[key][1], alone[key], rtol=1e-6, atol=1e-12)
 
 
+def test_every_member_has_the_noise_of_its_measurement():
+    """A noise factor of the sensor's is one of each member's share too."""
+    twice = replace(pixels(330.0), noise_factor=jnp.array([4.0]))
+    slam = the_filter("world", "rays", **THREE)
+    factors = slam._of_members(twice, jnp.array([[0.5, 0.25, 0.25]])).noise_factor
+    np.testing.assert_allclose(factors, [8.0, 16.0, 16.0])
+
+
 @pytest.mark.parametrize(
     ("name", "landmark", "sensor", "message"),
     [
-        ("world+particle", Cartesian(), "camera", "did you mean particles"),
-        ("word+particles", Cartesian(), "camera", "did you mean world"),
-        ("world+", Cartesian(), "camera", "unknown modifiers"),
-        ("world+rays0", Cartesian(), "camera", "nearest"),
         ("world+rays", InverseScaling(), "camera", "cartesian"),
         ("world+particles", InverseScaling(), "camera", "cartesian"),
-        ("world+particles+rays", Cartesian(), "camera", "cartesian"),
-        ("world+particles", Cartesian(), "position", "hides none"),
+        ("world+particles", Cartesian(), "position", "finds a depth, which Position measures"),
     ],
 )
-def test_bad_names_and_combinations(name, landmark, sensor, message):
+def test_what_cannot_be_delayed_is_refused(name, landmark, sensor, message):
     pieces = scenario_pieces(scenario("matched", sensor=sensor))
     with pytest.raises(ValueError, match=message):
         make_filter(name, landmark=landmark, **pieces)
 
 
 def test_numbers_after_a_modifier_are_the_greatest_depth():
-    assert plain("world+particles20").entry == DepthParticles(farthest=20)
+    assert plain("world+particles20").farthest == 20

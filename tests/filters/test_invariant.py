@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from cases import Case, close, named, pose, quick_jit
 
-from jaxslam.filters.linear.blocks import shifted
-from jaxslam.filters.linear.covariance import Covariance
+from jaxslam.filters.linear.blocks import plus
+from jaxslam.filters.linear.kalman import Kalman
 from jaxslam.filters.model import COMPOSED
 from jaxslam.filters.remedies.gauge import act
 from jaxslam.geometry import PLANAR, SPATIAL, difference, exp, log
@@ -43,7 +43,7 @@ def seen_from_elsewhere(slam, state, rigid):
     core, landmarks = act(slam.model, rigid, one, state.core, state.landmarks)
 
     def error(delta):
-        x = shifted(state, delta)
+        x = plus(state, delta)
         moved = act(slam.model, rigid, one, x.core, x.landmarks)
         return jnp.append(difference(moved[0], core), (moved[1] - landmarks).ravel())
 
@@ -82,7 +82,7 @@ def test_cartesian_landmarks_are_corrected_as_published(geometry):
 
     def corrected():
         state, features = predicted(slam, geometry)
-        added, _ = Covariance().update(slam.model, state, features, slam.sensor.noise, COMPOSED)
+        added, _ = Kalman().update(slam.model, state, features, slam.sensor.noise, COMPOSED)
         after, _ = slam.update(state, None, features)
         return state, added, after
 

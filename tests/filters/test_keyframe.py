@@ -10,6 +10,7 @@ import pytest
 from cases import close, each_geometry, named, quick_jit
 
 from jaxslam.filters.gaussian import reanchored
+from jaxslam.filters.linear.covariance import augmented
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.readouts import camera_pose, landmarks_in_camera, landmarks_in_world
 from jaxslam.filters.words import FILTERS
@@ -18,11 +19,12 @@ from jaxslam.landmarks import ImagePlane, InverseScaling
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
-from jaxslam.models.frame import KEYFRAME_PARALLAX, KEYFRAME_TURN, keyframe_due
+from jaxslam.models.frame import Keyframe, KeyframePose
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Features
 from jaxslam.models.sensors import Pinhole
 
+IMAGE_PLANE = ImagePlane()
 CAPACITY, STEPS, DT = 5, 10, 0.1
 # Landmark of each slot: the frame in which it is new, and that after which it is removed.
 LIVES = ((0, None), (0, None), (3, None), (0, 5), (6, None))
@@ -37,7 +39,7 @@ def velocity(geometry):
     return axes(geometry, [0.3, 0.1, 0.14], [0.3, 0.0, 0.1, 0.0, -0.14, 0.02])
 
 
-def make(kind, geometry, calibration="white", scale=1.0, landmark=ImagePlane()):
+def make(kind, geometry, calibration="white", scale=1.0, landmark=IMAGE_PLANE):
     """A filter, every σ of which is times a scale."""
     p, t = geometry.pixel_dim, geometry.tangent_dim
     return FILTERS[kind](
@@ -85,10 +87,10 @@ def run(slam, pose_sigma, new, seen, gone):
     """States, covariances, NIS and camera poses of every step, from an uncertain pose."""
     state = slam.init(CAPACITY)
     size = tangent_dim(state.core.pose)
-    state = slam.form.augment(state, 0, pose_sigma**2 * jnp.eye(size))
+    state = augmented(state, 0, pose_sigma**2 * jnp.eye(size))
     if slam.calibration.each_frame:
         drawn = jnp.diag(slam.calibration.sigma**2)
-        state = slam.form.augment(state, state.core.part("calibration").start, drawn)
+        state = augmented(state, state.core.part("calibration").start, drawn)
     state = slam.close(state, jax.tree.map(lambda x: x[0], new))
 
     def step(state, frame):
@@ -162,11 +164,12 @@ def test_reanchoring_changes_neither_the_camera_nor_the_points(geometry):
     assert np.abs(after.landmarks - state.landmarks)[slots].min(axis=1).max() > 0.01
 
 
-def test_keyframe_and_world_filter_differ_to_second_order():
+@pytest.mark.parametrize("kind", ["keyframe", "robocentric"])
+def test_filters_of_two_frames_differ_to_second_order(kind):
     apart = []
     for scale in (0.1, 0.01):
         data = (jnp.array(0.0), *world(PLANAR, scale))
-        runs = [compiled(kind, PLANAR, "known", scale)(*data) for kind in ("keyframe", "world")]
+        runs = [compiled(name, PLANAR, "known", scale)(*data) for name in (kind, "world")]
         (ours, P), (theirs, _) = (run[3] for run in runs)
         shift = jax.vmap(difference)(ours, theirs)
         apart.append(np.abs(shift / np.sqrt(np.diagonal(P, axis1=1, axis2=2)))[-1].max())
@@ -177,14 +180,18 @@ def test_keyframe_and_world_filter_differ_to_second_order():
 
 def test_a_keyframe_is_due_after_a_turn_or_a_baseline():
     near, far = jnp.array([0.5, 0.0, 0.5]), jnp.array([0.01, 0.0, 0.0])
-    moved, turned = jnp.array([0.3, 0.4, 0.0]), jnp.array([0.0, 0.0, 1.1 * KEYFRAME_TURN])
-    pose = PLANAR.group.exp
-    assert KEYFRAME_PARALLAX < 0.5 * 0.5
-    assert keyframe_due(pose(moved), near)
-    assert not keyframe_due(pose(moved), far)
-    assert not keyframe_due(pose(moved), jnp.zeros(3))
-    assert keyframe_due(pose(turned), far)
-    assert not keyframe_due(pose(0.8 * turned), near)
+    frame, origin = Keyframe(turn=0.2, parallax=0.1), identity(PLANAR, jnp.float64)
+    moved, turned = jnp.array([0.3, 0.4, 0.0]), jnp.array([0.0, 0.0, 0.22])
+
+    def left(displacement, inverse_distances):
+        held = KeyframePose.at(origin).moved(PLANAR.group.exp(displacement))
+        return frame.left(held, inverse_distances)
+
+    assert left(moved, near)
+    assert not left(moved, far)
+    assert not left(moved, jnp.zeros(3))
+    assert left(turned, far)
+    assert not left(0.8 * turned, near)
 
 
 @pytest.mark.parametrize("landmark", [InverseScaling(), ImagePlane()], ids=named)
@@ -206,8 +213,8 @@ def test_a_parallax_is_the_way_from_the_keyframe_by_the_distance_of_the_map(land
             landmarks=jnp.stack([seen, seen, empty]),
             active=jnp.array([True, True, False]),
         )
-        return bool(slam.model.reanchoring_due(state))
+        return bool(slam.model.keyframe_left(state))
 
-    least = KEYFRAME_PARALLAX * distance
+    least = slam.frame.parallax * distance
     assert not due(0.99 * least, 100.0)
     assert due(1.01 * least, 100.0)

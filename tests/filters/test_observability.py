@@ -33,7 +33,7 @@ def truth(model):
     rng = np.random.default_rng(5)
     t, n = geometry.tangent_dim, geometry.point_dim
     velocity = np.concatenate([rng.uniform(0.3, 0.8, n), rng.uniform(0.1, 0.2, t - n)])
-    held = model.coordinates.from_base_pose(pose(geometry, 1))
+    held = model.frame.from_base_pose(pose(geometry, 1))
     core = Core(held, jnp.asarray(velocity), None, jnp.zeros(t), jnp.zeros(0))
     T_AC = model.view(core, COMPOSED).map_from_camera
 

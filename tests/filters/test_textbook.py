@@ -58,8 +58,8 @@ def extended(x, P, z, R):
 
 def textbook(run, scenario):
     """Landmarks in the order of their places, mean, covariance and NIS after every step."""
-    Q = np.diag(np.square(scenario.odometry_sigma))
-    R = scenario.position_sigma**2 * np.eye(2)
+    Q = np.diag(np.square(scenario.motion.noise_sigma))
+    R = scenario.sensor.sigma**2 * np.eye(2)
     x, P, order = np.zeros(3), np.zeros((3, 3)), []
     for k in range(1, scenario.steps + 1):
         x, P = predicted(x, P, run.controls[k - 1], Q)

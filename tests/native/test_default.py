@@ -76,7 +76,7 @@ def test_what_is_kept_of_the_first_run_does_not_hold_the_others():
     assert all(np.asarray(x).base is None for x in sample.values())
 
 
-def test_a_filter_with_wrappers_stays_with_xla(pretended):
+def test_a_filter_with_a_mixture_stays_with_xla(pretended):
     (slam,) = jaxslam.make_filters(SCENARIO, "scale_gauge+mixture3", "inverse_scaling").values()
     room, runs = draw(SCENARIO, 2)
     for there in (False, True):  # by a program in C++ a sum takes twice as long

@@ -25,7 +25,7 @@ from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.linear.covariance import removed
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.mixture.density import log_density
-from jaxslam.filters.protocol import Corrected
+from jaxslam.filters.protocol import AbstractFilter, Corrected
 from jaxslam.filters.rivals.delayed import AbstractDelayed, Delayed, around, reweighted
 from jaxslam.geometry import Homogeneous, Point, Pose, Scalar
 from jaxslam.landmarks import AbstractLandmark, InverseDepthToCartesian
@@ -154,7 +154,7 @@ class DepthParticles(AbstractDelayed):
         return replace(state, gaussian=known)
 
 
-def with_depth_particles(slam: AbstractSlam, farthest: int | None = None) -> DepthParticles:
+def with_depth_particles(slam: AbstractFilter, farthest: int | None = None) -> DepthParticles:
     """The filter of Cartesian landmarks with depth particles up to `farthest`, m."""
     rays = replace(around(slam), landmark=RayToCartesian())
     return DepthParticles(rays) if farthest is None else DepthParticles(rays, farthest=farthest)

@@ -25,7 +25,7 @@ from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.linear.covariance import removed
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.mixture.density import log_density
-from jaxslam.filters.protocol import Corrected
+from jaxslam.filters.protocol import AbstractFilter, Corrected
 from jaxslam.filters.rivals.delayed import AbstractDelayed, Delayed, around, reweighted
 from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features
@@ -126,14 +126,15 @@ class RaySum(AbstractDelayed):
 
     def _of_members(self, features: Features, share: Float[Array, "m members"]) -> Features:
         """The same measurement for each of a landmark's members, for a share ρ with noise R/ρ."""
+        own = 1.0 if features.noise_factor is None else features.noise_factor[:, None]
         return Features(
             self._slots_of(features).ravel(),
             jnp.repeat(features.measured, self.slots_each, axis=0),
             (features.valid[:, None] & (share > 0)).ravel(),
-            1 / jnp.where(share > 0, share, 1.0).ravel(),
+            (own / jnp.where(share > 0, share, 1.0)).ravel(),
         )
 
 
-def with_rays(slam: AbstractSlam, farthest: int | None = None) -> RaySum:
+def with_rays(slam: AbstractFilter, farthest: int | None = None) -> RaySum:
     """The filter of Cartesian landmarks with rays of Gaussians up to `farthest`, m."""
     return RaySum(around(slam)) if farthest is None else RaySum(around(slam), farthest=farthest)

@@ -76,7 +76,7 @@ class Handover(AbstractLayer):
         state = SubmapsState(inner, none, empty, zero, frozen, zero)
         if known is not None:
             slots = jnp.asarray(known.slots)
-            state = _placed(state, slots, jnp.ones(slots.shape, bool), slots)
+            state = _placed(state, slots, jnp.ones_like(slots, bool), slots)
         if first is None:
             return state
         own = jnp.where(first.valid, first.slots, own)
@@ -164,7 +164,7 @@ def _of_inner(state: SubmapsState, features: Features) -> Features:
 
 
 def _placed(
-    state: SubmapsState, slots: Slots, valid: Bool[Array, " m"], own: Slots
+    state: SubmapsState, slots: Int[AnyArray, " m"], valid: Bool[AnyArray, " m"], own: Slots
 ) -> SubmapsState:
     """The state with new landmarks of these slots in slots of the inner filter's own."""
     number = state.created + jnp.cumsum(valid) - 1

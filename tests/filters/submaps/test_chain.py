@@ -1,5 +1,8 @@
 """A chain of submaps against the one Gaussian of everything."""
 
+from dataclasses import replace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,10 +14,10 @@ from jaxslam.filters.slam import Slam
 from jaxslam.filters.submaps import chain as chains
 from jaxslam.filters.submaps.chain import base_poses, chain
 from jaxslam.filters.submaps.closing import posterior
-from jaxslam.filters.submaps.handover import with_submaps
-from jaxslam.filters.words import make_filters
+from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.geometry import difference
 from jaxslam.landmarks import Cartesian
+from jaxslam.models.frame import Submaps
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Capacity, Features
 from jaxslam.models.sensors import Position
@@ -111,7 +114,7 @@ def linear():
 def smoothed(linear):
     """The filter with submaps at the end, its chain, and in which frames submaps ended."""
     frames, first = linear.frames()
-    slam = with_submaps(linear.slam, spare=3, history=40)
+    slam = replace(linear.slam, frame=Submaps(spare=3, history=40))
     state = slam.init(Capacity(SLOTS, SLOTS, 1), first)
     state, counts = run(slam, frames, state, lambda state, *_: state.count)
     ended = np.flatnonzero(np.diff(np.r_[0, counts])) + 1
@@ -193,17 +196,17 @@ def test_a_chain_ends_where_the_filter_is_however_well_some_directions_are_known
         "handheld", noise, rate=10.0, steps=150, landmarks=12, depth_range=[5.0, 50.0],
         velocity=[0.0, 0.0, 8.0, 0.0, 0.0, 0.0], nearest_depth=5.0,
     )  # fmt: skip
-    (base,) = make_filters(road, "scale_gauge+oc+scene50", "inverse_scaling").values()
-    slam, room = with_submaps(base, 12, 32), Room(12, 12, 12, 12)
+    base: Any = make_filter("scale_gauge+oc+scene50", **scenario_pieces(road))
+    slam, room = replace(base, frame=Submaps(12, 32)), Room(12, 12, 12, 12)
 
     def end():
         state, _ = run_through(slam, room, simulate(road, jax.random.key(2)), lambda *_: None)
-        chained = chain(slam, state, slam.history)
+        chained = chain(slam, state, slam.frame.history)
         nothing = jnp.zeros((1, *chained.shape))
         return state, chained.cameras(chained.at(nothing[0]), nothing)
 
     state, (poses, covariances) = jax.jit(end)()
-    _, newest = slam.base.gaussian(state.inner, None)
+    _, newest = slam.inner.gaussian(state.inner, None)
     last = jax.tree.map(lambda x: x[-1], poses)
     away = np.asarray(difference(last, newest.core.pose.camera_pose()))
     assert int(state.count) > 15

@@ -1,6 +1,7 @@
 """Loops: which pairs are believed, and what is learnt of the chain."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,9 +9,10 @@ import numpy as np
 import pytest
 
 from jaxslam.consistency import run_through
-from jaxslam.filters import Loops, agreeing, base_poses, chain, close, with_submaps
+from jaxslam.filters import Loops, agreeing, base_poses, chain, close
 from jaxslam.filters.submaps import closing
-from jaxslam.filters.words import make_filters
+from jaxslam.filters.words import make_filter, scenario_pieces
+from jaxslam.models.frame import Submaps
 from jaxslam.simulation import Room, scenario, simulate
 
 LAP = scenario("laps-6dof", steps=440, in_view=12, landmarks=96)
@@ -21,8 +23,8 @@ LAP = scenario("laps-6dof", steps=440, in_view=12, landmarks=96)
 def lap():
     """The chain of a run, its truth where its submaps ended, and the pairs of landmarks that are
     one point: the newest in view with the first of that point."""
-    (base,) = make_filters(LAP, "robocentric+oc", "inverse_scaling").values()
-    slam, run = with_submaps(base, 12, 48), simulate(LAP, jax.random.key(1))
+    base: Any = make_filter("robocentric+oc", **scenario_pieces(LAP))
+    slam, run = replace(base, frame=Submaps(12, 48)), simulate(LAP, jax.random.key(1))
     room = Room(12, 12, 12, 12)
 
     def output(state, *_):
@@ -128,8 +130,8 @@ def test_right_pairs_are_believed_of_an_overconfident_chain(lap, monkeypatch):
 def test_a_batch_of_runs_has_chains_of_one_length(lap):
     """Links that stand for none change nothing."""
     chained, *_ = lap
-    (base,) = make_filters(LAP, "robocentric+oc", "inverse_scaling").values()
-    slam = with_submaps(base, 12, 48)
+    base: Any = make_filter("robocentric+oc", **scenario_pieces(LAP))
+    slam = replace(base, frame=Submaps(12, 48))
     room, run = Room(12, 12, 12, 12), simulate(LAP, jax.random.key(1))
     state, _ = jax.jit(lambda: run_through(slam, room, run, lambda state, *_: state.count))()
     longer = chain(slam, state, 40)

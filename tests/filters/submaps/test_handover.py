@@ -1,17 +1,18 @@
 """A filter that hands its map over: the same estimates, and slots that are used again."""
 
+from dataclasses import replace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxslam.consistency import run_through
-from jaxslam.filters import Submaps, with_submaps
 from jaxslam.filters.readouts import camera_pose, landmarks_in_world
-from jaxslam.filters.slam import Slam
-from jaxslam.filters.words import make_filters
+from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.geometry import difference
-from jaxslam.landmarks import LANDMARKS
+from jaxslam.models.frame import Submaps
 from jaxslam.models.observations import Features
 from jaxslam.simulation import Room, scenario, simulate
 
@@ -31,8 +32,8 @@ def through(slam, run):
 @pytest.mark.parametrize("name", ["robocentric", "robocentric+oc"])
 def test_a_filter_with_submaps_estimates_what_it_does_without(name):
     """Landmarks that left are marginalised in the one, and wait for that in the other."""
-    (base,) = make_filters(LAPS, name, "inverse_scaling").values()
-    slam, run = with_submaps(base, spare=8), simulate(LAPS, jax.random.key(3))
+    base: Any = make_filter(name, **scenario_pieces(LAPS))
+    slam, run = replace(base, frame=Submaps(8)), simulate(LAPS, jax.random.key(3))
     _, (pose, covariance, _) = jax.jit(lambda: through(base, run))()
     state, (mine, mine_covariance, count) = jax.jit(lambda: through(slam, run))()
     assert int(count[-1]) >= 3
@@ -47,8 +48,8 @@ def test_a_filter_with_submaps_estimates_what_it_does_without(name):
 
 def test_a_landmark_is_where_its_user_put_it():
     """By its own slot, whichever the base has for it; one that left is in the frozen submap."""
-    (base,) = make_filters(LAPS, "robocentric", "inverse_scaling").values()
-    slam, run = with_submaps(base, spare=8), simulate(LAPS, jax.random.key(3))
+    base: Any = make_filter("robocentric", **scenario_pieces(LAPS))
+    slam, run = replace(base, frame=Submaps(8)), simulate(LAPS, jax.random.key(3))
     state, _ = jax.jit(lambda: through(slam, run))()
     points, P = landmarks_in_world(slam, state, jnp.arange(6))
     seen = np.asarray(run.visible[-1] & slam.in_map(state))
@@ -61,8 +62,8 @@ def test_a_landmark_is_where_its_user_put_it():
 
 
 def test_a_slot_that_is_filled_again_without_being_freed_is_a_new_landmark():
-    (base,) = make_filters(LAPS, "robocentric", "inverse_scaling").values()
-    slam = with_submaps(base, spare=1)
+    base: Any = make_filter("robocentric", **scenario_pieces(LAPS))
+    slam = replace(base, frame=Submaps(1))
     one = Features(np.array([0]), np.array([[300.0, 200.0]]), np.array([True]))
     state = slam.init(2, one)
     for k in range(1, 5):
@@ -72,25 +73,7 @@ def test_a_slot_that_is_filled_again_without_being_freed_is_a_new_landmark():
     assert not bool(slam.in_map(state)[1])
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda slam: with_submaps(slam, -1), "submaps have 0 spare slots and a history of 1"),
-        (lambda slam: with_submaps(slam, 1, 0), "submaps have 0 spare slots and a history of 1"),
-        (lambda slam: Submaps(slam, 8), "in SUBMAP coordinates, .* not in robocentric ones"),
-        (
-            lambda slam: with_submaps(
-                Slam(slam.motion, slam.sensor, LANDMARKS["framed_homogeneous"])
-            ),
-            "whose landmarks have no anchor",
-        ),
-        (
-            lambda slam: make_filters("laps", "robocentric+lag3+submaps", "inverse_scaling"),
-            "FixedLag has no submaps",
-        ),
-    ],
-)
-def test_what_cannot_have_submaps_is_refused(make, message):
-    (base,) = make_filters(LAPS, "robocentric", "inverse_scaling").values()
-    with pytest.raises(ValueError, match=message):
-        make(base)
+@pytest.mark.parametrize("numbers", [{"spare": -1}, {"history": 0}])
+def test_submaps_without_room_are_refused(numbers):
+    with pytest.raises(ValueError, match="submaps have 0 spare slots and a history of 1"):
+        Submaps(**numbers)

@@ -1,0 +1,181 @@
+"""Tests of what a filter is told of its landmarks: a map from before, and each one's own noise."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import a_filter, close, each_geometry, named, quick_jit
+
+import jaxslam
+from jaxslam.filters.readouts import camera_pose, landmarks_in_world
+from jaxslam.filters.words import make_filter, scenario_pieces
+from jaxslam.geometry import PLANAR
+from jaxslam.landmarks import LANDMARKS, Cartesian, InverseScaling
+from jaxslam.models.frame import Keyframe, Robocentric, Submaps, WorldCentric
+from jaxslam.models.motion import ConstantVelocity
+from jaxslam.models.observations import Capacity, Features, PriorMap
+from jaxslam.models.sensors import Position
+from jaxslam.simulation import scenario
+
+SLOTS = jnp.array([3, 0, 2])
+
+
+def a_map(geometry, seed=0, sigma=0.1):
+    """Three points ahead, in slots out of order, that are uncertain together."""
+    rng, n = np.random.default_rng(seed), geometry.point_dim
+    points = rng.uniform(-1, 1, (3, n)) + 4.0 * np.eye(n)[-1]
+    root = sigma * rng.normal(size=(3 * n, 3 * n))
+    return PriorMap(SLOTS, points, root @ root.T)
+
+
+@pytest.mark.parametrize("frame", [Robocentric(), WorldCentric(), Keyframe()], ids=named)
+@pytest.mark.parametrize("landmark", [Cartesian(), InverseScaling()], ids=named)
+@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+def test_a_filter_starts_with_a_prior_map(geometry, landmark, frame):
+    """Its points in the map, and `J C Jᵀ` of them jointly; the camera is still known."""
+    slam, known = a_filter(geometry, landmark, frame), a_map(geometry)
+    focal, n = jnp.asarray(slam.sensor.focal), geometry.point_dim
+
+    @quick_jit
+    def begun(known):
+        def parameters(points):
+            one = jax.vmap(lambda point: landmark.initialise(point, jnp.ones(()), focal))
+            return one(points.reshape(-1, n))
+
+        state = slam.init(5, known=known)
+        J = jax.jacfwd(parameters)(known.points.ravel())
+        return state, landmarks_in_world(slam, state, known.slots), parameters(known.points), J
+
+    state, (points, covariances), parameters, J = begun(known)
+    assert np.flatnonzero(state.active).tolist() == sorted(SLOTS)
+    np.testing.assert_allclose(points, known.points, rtol=1e-14)
+    np.testing.assert_array_equal(state.landmarks[SLOTS], parameters)
+    blocks = known.covariance.reshape(3, n, 3, n)[np.arange(3), :, np.arange(3)]
+    close(covariances, blocks, 1e-13)
+    c, d = state.core_dim, landmark.size(n)
+    rows = (c + d * SLOTS[:, None] + np.arange(d)).ravel()
+    J = np.asarray(J).reshape(3 * d, 3 * n)
+    expected = np.zeros_like(state.covariance)
+    expected[np.ix_(rows, rows)] = J @ known.covariance @ J.T
+    close(state.covariance, expected, 1e-13)
+
+
+def test_in_a_gauge_a_prior_map_is_in_metres_whatever_the_unit():
+    """Points are known exactly, unit and metre are not: in metres nothing is left of that."""
+    slam: Any = make_filter("scale_gauge", **scenario_pieces(scenario("matched")))
+    slam, known = replace(slam, depth=replace(slam.depth, unit=0.4)), a_map(PLANAR, sigma=0.0)
+    told = quick_jit(lambda: landmarks_in_world(slam, slam.init(4, known=known), SLOTS))
+    points, covariances = told()
+    np.testing.assert_allclose(points, known.points, rtol=1e-13)
+    np.testing.assert_allclose(covariances, 0, atol=1e-13)
+
+
+DT, SIGMA, ACCELERATION, SPEED = 0.2, 0.1, 1e-3, 0.3
+
+
+def kalman(known, measured):
+    """The textbook filter of positions, velocities and points, dense and in the base frame."""
+    m = len(known.points)
+    x = np.concatenate([[0, 0, 0, 1.0], known.points.ravel()])
+    P = np.zeros((len(x), len(x)))
+    P[2:4, 2:4], P[4:, 4:] = SPEED**2 * np.eye(2), known.covariance
+    F, G = np.eye(len(x)), np.zeros((len(x), 2))
+    F[:2, 2:4], G[:2], G[2:4] = DT * np.eye(2), DT**2 * np.eye(2), DT * np.eye(2)
+    H = np.zeros((2 * m, len(x)))
+    H[:, :2], H[:, 4:] = np.tile(-np.eye(2), (m, 1)), np.eye(2 * m)
+    for z in measured:
+        x, P = F @ x, F @ P @ F.T + ACCELERATION**2 * G @ G.T
+        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + SIGMA**2 * np.eye(2 * m))
+        x, P = x + K @ (z.ravel() - H @ x), P - K @ H @ P
+    return x, P
+
+
+@pytest.mark.parametrize("frame", [Robocentric(), WorldCentric(), Submaps(2)], ids=named)
+def test_on_a_linear_problem_a_filter_with_a_prior_map_is_the_kalman_filter(frame):
+    known, rng = a_map(PLANAR, 1), np.random.default_rng(2)
+    slam = jaxslam.Slam(
+        ConstantVelocity([ACCELERATION] * 2 + [0.0], [0.0, 1.0, 0.0], [SPEED] * 2 + [0.0]),
+        Position(SIGMA), Cartesian(), frame,
+    )  # fmt: skip
+    measured = known.points - DT * np.arange(1, 7)[:, None, None] * [0.1, 0.9]
+    measured += SIGMA * rng.normal(size=measured.shape)
+    seen = Features(*map(jnp.asarray, (np.tile(SLOTS, (6, 1)), measured, np.ones((6, 3), bool))))
+    nothing = jax.tree.map(lambda x: x[0, :0], seen)
+
+    @quick_jit
+    def run(seen):
+        state = slam.init(Capacity(4, 3, 0), known=known)
+        step = lambda state, one: (slam.step(state, jnp.asarray(DT), one, nothing)[0], None)  # noqa: E731
+        state, _ = jax.lax.scan(step, state, seen)
+        return camera_pose(slam, state), landmarks_in_world(slam, state, SLOTS)
+
+    (pose, covariance), (points, covariances) = run(seen)
+    x, P = kalman(known, measured)
+    np.testing.assert_allclose(pose.translation(), x[:2], rtol=0, atol=1e-11)
+    np.testing.assert_allclose(points.ravel(), x[4:], rtol=0, atol=1e-11)
+    np.testing.assert_allclose(covariance[:2, :2], P[:2, :2], rtol=0, atol=1e-11)
+    blocks = P[4:, 4:].reshape(3, 2, 3, 2)[np.arange(3), :, np.arange(3)]
+    np.testing.assert_allclose(covariances, blocks, rtol=0, atol=1e-11)
+    # The map says where the camera is.
+    assert np.trace(P[:2, :2]) < 0.5 * (6 * DT * SPEED) ** 2
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_prior_map_of_another_shape_or_of_no_use_is_refused():
+    pieces, known = scenario_pieces(scenario("matched")), a_map(PLANAR)
+    for name, landmark, message in (
+        ("world+particles", "cartesian", "a delayed initialisation takes no prior map"),
+        ("robocentric+mixture3+rest", "cartesian", "start from a window takes no prior map"),
+    ):
+        slam = make_filter(name, landmark=LANDMARKS[landmark], **pieces)
+        with pytest.raises(ValueError, match=message):
+            slam.init(4, known=known)
+    wrong = replace(known, covariance=known.covariance[:4, :4])
+    with pytest.raises(ValueError, match=r"map's covariance has shape \(4, 4\); it needs \(6, 6\)"):
+        make_filter("world", **pieces).init(4, known=wrong)
+
+
+# --- the noise of each measurement --------------------------------------------------------------
+
+
+class FarIsWorse(Position):
+    """A position whose σ is a share of its distance."""
+
+    def noise_at(self, measured):
+        return self.sigma**2 * (measured @ measured) * jnp.eye(measured.size)
+
+
+@pytest.mark.parametrize("frame", [Robocentric(), WorldCentric()], ids=named)
+def test_every_measurement_has_its_own_noise(frame):
+    """In insertion, in what is expected, and in the update: of its factor, and of the sensor."""
+    factor = np.array([4.0, 0.25])
+    measured = np.array([[0.5, 2.0], [1.0, 6.0]])
+    slots, valid = jnp.arange(2), jnp.ones(2, bool)
+    still = {"motion": ConstantVelocity(*np.zeros((3, 3))), "landmark": Cartesian(), "frame": frame}
+
+    def run(sensor, factor):
+        slam = a_filter(PLANAR, sensor=sensor, **still)
+        seen = Features(slots, jnp.asarray(measured), valid, factor)
+        state = slam.predict(slam.init(2, seen), jnp.asarray(DT))
+        expected = slam.predict_features(state, jnp.asarray(DT), slots).covariance
+        after, innovation = slam.update(state, jnp.asarray(DT), seen)
+        told = partial(landmarks_in_world, slam)
+        S = innovation.covariance.reshape(2, 2, 2, 2)[slots, :, slots]
+        return told(state, slots)[1], expected, S, told(after, slots)[1]
+
+    eye = np.eye(2)
+    for sensor, factors, R, of_sensor in (
+        (Position(0.1), factor, 0.01 * factor, [0.01, 0.01]),
+        (FarIsWorse(0.1), None, 0.01 * np.sum(measured**2, axis=1), None),
+        (FarIsWorse(0.1), factor, 0.01 * np.sum(measured**2, axis=1) * factor, None),
+    ):
+        of_sensor = 0.01 * np.sum(measured**2, axis=1) if of_sensor is None else of_sensor
+        inserted, expected, S, after = quick_jit(partial(run, sensor))(factors)
+        close(inserted, R[:, None, None] * eye, 1e-12)
+        close(expected, (R + of_sensor)[:, None, None] * eye, 1e-12)
+        close(S, 2 * R[:, None, None] * eye, 1e-12)
+        close(after, R[:, None, None] / 2 * eye, 1e-12)
