@@ -11,41 +11,32 @@ import numpy as np
 import jaxslam
 from jaxslam._numerics.arrays import AnyArray, number_field
 from jaxslam.filters.linear.blocks import residuals
+from jaxslam.filters.linear.covariance import expected
 from jaxslam.filters.linear.kalman import AbstractCorrection, kalman_update
-from jaxslam.filters.linear.covariance import Covariance
 from jaxslam.geometry import exp, homogeneous_apply
-from jaxslam.landmarks import Parametrization
 
 
-class PlainHomogeneous:
+class PlainHomogeneous(jaxslam.AbstractLandmark):
     """A homogeneous point (x, y, z, ω), z = 1 where it is first seen: no pixels in it."""
 
-    @staticmethod
-    def initialise(point, omega, focal):
+    name: ClassVar[str] = "plain_homogeneous"
+
+    def size(self, n):
+        return n + 1
+
+    def initialise(self, point, omega, focal):
         del focal
         return jnp.append(point, omega)
 
-    @staticmethod
-    def homogeneous(landmark):
+    def homogeneous(self, landmark):
         return landmark[:-1], landmark[-1]
 
-    @staticmethod
-    def transform(T_ab, landmark):
-        point, omega = landmark[:-1], landmark[-1]
+    def transform(self, T_ab, landmark):
+        point, omega = self.homogeneous(landmark)
         return jnp.append(homogeneous_apply(T_ab, point, omega), omega)
 
-
-PLAIN_HOMOGENEOUS = Parametrization(
-    name="plain_homogeneous",
-    parameters="(x, y, z, ω)",
-    point="(x, y, z)/ω",
-    source="a test",
-    size=lambda n: n + 1,
-    initialise=PlainHomogeneous.initialise,
-    transform=PlainHomogeneous.transform,
-    homogeneous=PlainHomogeneous.homogeneous,
-    scale=lambda factor, landmark: landmark.at[-1].divide(factor),
-)
+    def scale(self, factor, landmark):
+        return landmark.at[-1].divide(factor)
 
 
 class Bearing(jaxslam.AbstractSensor):
@@ -168,8 +159,8 @@ class Huber(AbstractCorrection):
 
     def update(self, model, state, features, noise, context, considered=slice(0, 0)):
         _, residual, _, _ = residuals(model, state, features, context)
-        expected = Covariance().predict_features(model, state, features.slots, noise, context)[1]
-        sigma = jnp.sqrt(jnp.trace(expected, axis1=1, axis2=2) / residual.shape[1])
+        innovation = expected(model, state, features.slots, context)[1] + noise
+        sigma = jnp.sqrt(jnp.trace(innovation, axis1=1, axis2=2) / residual.shape[1])
         off = jnp.linalg.norm(residual, axis=1) / sigma / self.k
         weighted = noise * jnp.maximum(off, 1.0)[:, None, None]
         return kalman_update(model, state, None, features, weighted, context, considered)

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.filters.slam import Slam
 from jaxslam.filters.protocol import AbstractStaged
 from jaxslam.filters.readouts import camera_pose
+from jaxslam.filters.slam import Slam
 from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.geometry import GEOMETRIES
-from jaxslam.landmarks import InverseScaling, LANDMARKS
+from jaxslam.landmarks import LANDMARKS, InverseScaling
 from jaxslam.models.camera import Camera
 from jaxslam.models.frame import Robocentric
 from jaxslam.models.motion import ConstantVelocity
@@ -99,7 +99,7 @@ def a_filter(geometry, landmark=InverseScaling(), frame=Robocentric(), **pieces)
         "motion": ConstantVelocity(*np.zeros((3, t))),
         "sensor": Pinhole(Camera(np.ones(p), np.zeros(p)), 0.0),
     }
-    return Slam(landmark=landmark, frame=coordinates, **{**unit, **pieces})
+    return Slam(landmark=landmark, frame=frame, **{**unit, **pieces})
 
 
 def run_filter(capacity, slam, controls, first, known, new):

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from additions import (
-    PLAIN_HOMOGENEOUS,
     Bearing,
     BiasedVelocity,
     DriftingFocal,
@@ -19,7 +18,6 @@ from additions import (
 from cases import quick_jit
 
 import jaxslam
-from jaxslam.filters.linear.covariance import Covariance
 from jaxslam.filters.words import scenario_pieces
 from jaxslam.statistics import not_disproved
 
@@ -47,7 +45,7 @@ def test_an_addition_is_one_short_class(addition, most):
 
 def test_a_landmark_of_ones_own_is_studied():
     scenario = jaxslam.scenario("matched-tight", steps=8)
-    found = verdict(scenario, paper(scenario, landmark=PLAIN_HOMOGENEOUS))
+    found = verdict(scenario, paper(scenario, landmark=PlainHomogeneous()))
     assert not_disproved(found), found
 
 

@@ -15,9 +15,9 @@ from jaxtyping import Array, Float
 
 import jaxslam
 from jaxslam._numerics.arrays import cast, is_number
-from jaxslam.filters.slam import Slam
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.protocol import AbstractFilter
+from jaxslam.filters.slam import Slam
 from jaxslam.geometry import Pose
 from jaxslam.models.observations import Features
 from jaxslam.native import batched

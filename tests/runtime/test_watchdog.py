@@ -18,7 +18,6 @@ from jaxslam._runtime import watchdog
 from jaxslam._runtime.watchdog import lapack_calls
 from jaxslam.consistency.backends import _filter_batch
 from jaxslam.filters.linear.kalman import AbstractCorrection, kalman_update
-from jaxslam.filters.linear.covariance import Covariance
 from jaxslam.simulation import Room, sensor_of, simulate
 
 MATRICES = """
@@ -88,11 +87,11 @@ FILTERS = [
     "keyframe",
     "scale_gauge",
     "invariant",
+    "recommended",
     "robocentric+iterated3",
     "world+particles",
     "world+rays",
     "robocentric+scene50",
-    "scale_gauge+lag3",
     "scale_gauge+directions3",
     "scale_gauge+mixture3",
     "robocentric+oc",
