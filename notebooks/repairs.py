@@ -126,9 +126,7 @@ assert ratio(sideways["robocentric"]) < 0.75 < ratio(sideways["scale_gauge"])
 # add has made them wide again. The sum that is divided anew in every frame (`+mixture17`) stays.
 
 # %%
-ahead = study(
-    "matched-forward-loose", ["robocentric", "scale_gauge+directions9", SUM, RECOMMENDED]
-)
+ahead = study("matched-forward-loose", ["robocentric", "scale_gauge+directions9", SUM, RECOMMENDED])
 display(plot(ahead))
 table(ahead)
 
