@@ -52,7 +52,7 @@ class Consistency(Benchmark):
     )  # fmt: skip
     """Built-in scenarios."""
     filters: tuple[str, ...] = (
-        "robocentric", "scale_gauge", "scale_gauge+lag20", "scale_gauge+mixture17",
+        "robocentric", "scale_gauge", "scale_gauge+mixture17",
     )  # fmt: skip
     """Filters."""
     landmarks: tuple[str, ...] = ("inverse_scaling",)

@@ -101,10 +101,10 @@ def test_consistency_resumes_to_more_runs(tmp_path, capsys):
         (["calibrate", "/no/such/film"], "/no/such/film: no such file or folder"),
         (["track", "--filter", "nothing"], "unknown filter 'nothing'"),
         (["track", "--filter", "world+nothing"], "unknown modifiers 'nothing'"),
-        (["track", "--filter", "scale_gauge+lag5"], "FixedLag takes a frame as a whole"),
+        (["track", "--filter", "scale_gauge+lag5"], "modifier lag is no more: a fixed-lag window"),
         (
             ["track", "--filter", "world+rays", "--landmarks", "cartesian"],
-            "RaySum begins a landmark",
+            "RaySum takes a frame as a whole",
         ),
     ],
 )
