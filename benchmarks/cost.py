@@ -39,8 +39,6 @@ class Cost(Benchmark):
         "robocentric",
         "scale_gauge",
         "robocentric+oc",
-        "scale_gauge+lag10",
-        "scale_gauge+lag20",
         "scale_gauge+directions9",
         "scale_gauge+mixture9",
         "scale_gauge+mixture17",

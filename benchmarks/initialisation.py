@@ -20,11 +20,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from benchmark import RESULTS, Benchmark, number, table
+from jaxtyping import Array, Bool
 
 import jaxslam
 from jaxslam.consistency.montecarlo import draw
+from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import camera_pose, landmarks_in_camera
-from jaxslam.filters.slam import Slam
+from jaxslam.filters.rivals.depth_particles import DepthParticles
+from jaxslam.filters.rivals.rays import RaySum
 from jaxslam.linalg import cholesky
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation import Room, Run, features
@@ -87,7 +90,6 @@ def measured(world: str, options: Initialisation) -> Iterator[tuple[str, dict]]:
     for pair in options.filters:
         name, landmark = pair.split("/")
         slam = jaxslam.make_filters(scenario, [name], [landmark])[pair]
-        assert isinstance(slam, Slam)
         run = jax.jit(jax.vmap(partial(filter_run, slam, room, sensor)))
         records = _concatenated(run(part) for part in _parts(runs, options.chunk))
         if reference is None:
@@ -95,11 +97,11 @@ def measured(world: str, options: Initialisation) -> Iterator[tuple[str, dict]]:
         yield pair, summarise(records, reference)
 
 
-def filter_run(slam: Slam, room: Room, sensor: AbstractSensor, run: Run) -> dict:
+def filter_run(slam: AbstractFilter, room: Room, sensor: AbstractSensor, run: Run) -> dict:
     """One filter on one run: records of every step, and its landmarks at the last."""
     first, seen, new = features(run, room)
     state = slam.init(room.capacity, first)
-    settled = slam.entry.initialised
+    settled = partial(initialised, slam)
 
     def step(state, frame):
         seen, new, control, T_BC = frame
@@ -118,6 +120,15 @@ def filter_run(slam: Slam, room: Room, sensor: AbstractSensor, run: Run) -> dict
     last, records = jax.lax.scan(step, state, (seen, new, run.controls, later))
     records["settled"] = jnp.concatenate([settled(state)[None], records["settled"]])
     return records | _landmarks(slam, room.landmarks, sensor, run, last)
+
+
+def initialised(slam: AbstractFilter, state: Any) -> Bool[Array, " landmarks"]:
+    """Which landmarks are in the map as points, no longer as alternatives."""
+    if isinstance(slam, DepthParticles):  # the last number of a ray is 0, that of a point 1
+        return state.gaussian.active & (state.gaussian.landmarks[:, -1] > 0.5)
+    if isinstance(slam, RaySum):
+        return jnp.sum(state.gaussian.active.reshape(-1, slam.slots_each), axis=1) == 1
+    return slam.in_map(state)
 
 
 def _landmarks(slam, count, sensor, run, state) -> dict:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,9 +15,10 @@ from jaxslam.consistency import SimulatedFrame, run_through
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import landmarks_from_above
+from jaxslam.filters.slam import Slam
 from jaxslam.filters.window.minimise import Minimum
 from jaxslam.filters.window.problem import path, residuals
-from jaxslam.filters.window.start import BatchInitialisation, RestState
+from jaxslam.filters.window.start import RestState
 from jaxslam.simulation import Room, Run
 from jaxslam.statistics.bands import normalised_squared
 
@@ -48,16 +50,14 @@ def modes_of_run(slam: AbstractFilter, room: Room, run: Run) -> Modes:
     It ends where the sum goes on alone, or where frames of the window are merged. Raises
     ValueError for a filter without such a start.
     """
-    if not isinstance(slam, BatchInitialisation):
-        raise ValueError(
-            f"modes are those of a start from rest (+rest), not of {type(slam).__name__}"
-        )
+    if not isinstance(slam, Slam) or slam.start is None:
+        raise ValueError("modes are those of a start from rest (+rest), and this filter has none")
     told, nees, newest, is_open = jax.device_get(_compiled(slam, room, run))
     whole = (newest == 1 + np.arange(len(newest))) & np.append(True, is_open[:-1])
     return Modes(*(numbers[: whole.sum()] for numbers in told), nees)
 
 
-def _through(slam: BatchInitialisation, room: Room, run: Run) -> tuple[Any, Array, Array, Array]:
+def _through(slam: Slam, room: Room, run: Run) -> tuple[Any, Array, Array, Array]:
     def told(state: RestState, _, frame: SimulatedFrame):
         nees = normalised_squared(*slam.pose_error(state, frame.pose))
         return _told(slam, state), nees, state.record.last, state.open
@@ -69,9 +69,9 @@ _compiled = eqx.filter_jit(_through)
 """Once for all runs of a shape."""
 
 
-def _told(slam: BatchInitialisation, state: RestState) -> tuple[Array, ...]:
+def _told(slam: Slam, state: RestState) -> tuple[Array, ...]:
     """The fields of `Modes` that are each mode's, of one frame."""
-    ekf, record, modes = slam.ekf, state.record, state.modes
+    ekf, record, modes = slam.one, state.record, state.modes
 
     def one(minimum: Minimum, member: State) -> tuple[Array, ...]:
         at = path(ekf, record, minimum.x)
@@ -89,7 +89,7 @@ def given_scale(state: State) -> State:
     part, P = core.part("log_scale"), state.covariance
     across = P[:, part]
     left = P - across @ across.T / P[part, part]
-    return State(core, state.landmarks, state.active, left, state.memory)
+    return replace(state, covariance=left)
 
 
 def followed(modes: Modes) -> Int[np.ndarray, "frames modes"]:

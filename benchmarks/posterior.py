@@ -47,7 +47,6 @@ class ExactPosterior(Benchmark):
         "robocentric/inverse_depth",
         "robocentric/inverse_scaling",
         "scale_gauge/inverse_scaling",
-        "scale_gauge+lag20/inverse_scaling",
         "scale_gauge+directions9/inverse_scaling",
         "scale_gauge+mixture17/inverse_scaling",
         "scale_gauge+scene50+mixture17/inverse_scaling",

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,9 +28,9 @@ from benchmark import RESULTS, Benchmark, data_folder, number, table, write_tabl
 import jaxslam
 from jaxslam.consistency import run_through
 from jaxslam.evaluation.alignment import similarity
-from jaxslam.filters import with_submaps
 from jaxslam.filters.protocol import LandmarkView
-from jaxslam.filters.submaps.handover import Frozen, Submaps, SubmapsState
+from jaxslam.filters.slam import Slam
+from jaxslam.filters.submaps.handover import Frozen, SubmapsState
 from jaxslam.geometry import difference
 from jaxslam.io.calibration import Calibration
 from jaxslam.simulation import Room, Run, Scenario, simulate
@@ -131,7 +131,8 @@ class Told(NamedTuple):
 def of_scenario(options: RecordedLoops, scenario: Scenario) -> Iterator[dict[str, Any]]:
     """The numbers of every run."""
     (base,) = jaxslam.make_filters(scenario, [options.filter], ["inverse_scaling"]).values()
-    slam = with_submaps(base, options.spare, options.history)
+    assert isinstance(base, Slam)
+    slam = replace(base, frame=jaxslam.Submaps(options.spare, options.history))
     simulated = jax.jit(jax.vmap(lambda key: simulate(scenario, key)))
     for start in range(0, options.runs, options.chunk):
         indices = jnp.arange(start, min(start + options.chunk, options.runs))
@@ -155,7 +156,7 @@ def _room(runs: Run) -> Room:
 
 
 @eqx.filter_jit
-def _filtered(slam: Submaps, room: Room, runs: Run) -> tuple[SubmapsState, Told]:
+def _filtered(slam: Slam, room: Room, runs: Run) -> tuple[SubmapsState, Told]:
     def told(state: SubmapsState, innovation: Any, frame: Any) -> Told:
         del innovation, frame
         return Told(state.count, jnp.append(state.numbers, -1)[state.slots])
@@ -169,14 +170,15 @@ class Closing:
     def __init__(
         self,
         scenario: Scenario,
-        slam: Submaps,
+        slam: Slam,
         run: Run,
         state: SubmapsState,
         told: Told,
         noise: np.random.Generator,
     ) -> None:
-        if int(state.count) > slam.history:
-            raise ValueError(f"{int(state.count)} submaps, and a history of {slam.history}")
+        history = slam.frame.history
+        if int(state.count) > history:
+            raise ValueError(f"{int(state.count)} submaps, and a history of {history}")
         self.scenario, self.slam, self.noise = scenario, slam, noise
         ended = np.flatnonzero(np.diff(np.r_[0, told.count])) + 1
         self.truth = np.asarray(run.poses.as_matrix())[np.r_[ended, scenario.steps]]
@@ -184,9 +186,9 @@ class Closing:
         fx, fy, cx, cy = (float(x) for x in (*scenario.focal, *scenario.centre))
         width, height = (int(x) for x in scenario.image)
         self.camera = Calibration(width, height, fx, fy, cx, cy)
-        _, newest = slam.base.gaussian(state.inner, None)
+        _, newest = slam.inner.gaussian(state.inner, None)
         last = Frozen(newest, np.zeros_like(state.numbers, bool), state.numbers)
-        place = np.arange(int(state.count)) % slam.history
+        place = np.arange(int(state.count)) % history
         frozen = jax.tree.map(lambda all, one: np.stack([*all[place], one]), state.frozen, last)
         points, covariances = jax.device_get(_points(slam, frozen.state))
         *self.submaps, self.present = (
@@ -212,7 +214,7 @@ class Closing:
 
     def graph(self, loops: list[LoopClosure]) -> Graph:
         most = self.scenario.landmarks
-        return Graph(self.slam.base, self.submaps, self.present, loops, most)
+        return Graph(self.slam.one, self.submaps, self.present, loops, most)
 
     def closed(self) -> tuple[list[LoopClosure], int, float]:
         """The loops that are believed, the number of those refused, and the time of the last."""
@@ -246,7 +248,7 @@ class Closing:
             return None
         T, which = posed
         sigma, most = self.scenario.pixel_sigma, self.scenario.landmarks
-        return loop_of(self.slam.base, self.submaps, (p, q), slots[which], T, sigma, most)
+        return loop_of(self.slam.one, self.submaps, (p, q), slots[which], T, sigma, most)
 
     def seen(self, p: int, q: int) -> tuple[np.ndarray, np.ndarray]:
         """The slots of submap p whose landmarks the last camera of q shows so that they would be
@@ -298,7 +300,7 @@ def _judged(T: jax.Array, P: jax.Array, truth: jax.Array) -> Any:
 
 
 @eqx.filter_jit
-def _points(slam: Submaps, states: Any) -> tuple[jax.Array, jax.Array]:
+def _points(slam: Slam, states: Any) -> tuple[jax.Array, jax.Array]:
     """The landmarks of all submaps in their last cameras, in the filter's unit."""
 
     def point(view: LandmarkView) -> jax.Array:
@@ -306,7 +308,7 @@ def _points(slam: Submaps, states: Any) -> tuple[jax.Array, jax.Array]:
         return jnp.exp(-metres) * view.point / view.omega
 
     slots = jnp.arange(states.active.shape[1])
-    return jax.vmap(lambda state: slam.ekf.landmark_marginal(state, point, slots))(states)
+    return jax.vmap(lambda state: slam.one.landmark_marginal(state, point, slots))(states)
 
 
 if __name__ == "__main__":

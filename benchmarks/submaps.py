@@ -28,7 +28,7 @@ from submaps_batch import batch_positions
 
 import jaxslam
 from jaxslam.consistency import run_through
-from jaxslam.filters import Chain, Loops, agreeing, base_poses, chain, close, with_submaps
+from jaxslam.filters import Chain, Loops, agreeing, base_poses, chain, close
 from jaxslam.filters.submaps.handover import SubmapsState
 from jaxslam.geometry import difference, scaled
 from jaxslam.simulation import Room, Run, Scenario, simulate
@@ -159,7 +159,7 @@ def of_chunk(options, scenario: Scenario, slam, indices: range) -> list[dict[str
     runs = _simulated(scenario, keys(jnp.arange(indices.start, indices.stop)))
     slots = scenario.in_view
     room = Room(slots, slots, slots, slots)
-    around = with_submaps(slam, options.spare, options.history)
+    around = replace(slam, frame=jaxslam.Submaps(options.spare, options.history))
     plain, _ = _filtered(slam, room, runs)
     ours, states = _filtered(around, room, runs)
     rows = []
@@ -233,7 +233,7 @@ def of_run(options, scenario, slam, run: Run, state, told: Filtered, index: int)
         row[f"old_{name}"] = float(nees[:-1].mean())
         row[f"rmse_{name}"] = _rmse(poses, positions)
     who = merged(run, told, loops, trusted & ~wrong, chained)
-    best = batch_positions(slam.ekf, replace(run, identity=who), 1 / scenario.rate)[ended]
+    best = batch_positions(slam.one, replace(run, identity=who), 1 / scenario.rate)[ended]
     row["rmse_batch"] = _rmse(best, positions)
     return row
 

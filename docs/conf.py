@@ -40,5 +40,4 @@ site_sources.write_api(HERE / "api")
 def setup(app):
     app.connect("source-read", site_sources.with_links_of_the_site)
     app.connect("autodoc-process-docstring", site_sources.docstring_as_rst)
-    app.connect("autodoc-process-signature", site_sources.short_signature)
     app.connect("autodoc-skip-member", site_sources.skipped)

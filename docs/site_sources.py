@@ -115,13 +115,6 @@ def skipped(app, what: str, name: str, obj, skip: bool, options) -> bool | None:
     return True if on_own_page or not ours else None
 
 
-def short_signature(app, what: str, name: str, obj, options, signature, returns):
-    """Pieces that are tables of functions are shown by their name."""
-    whole = r"(?:Parametrization|Coordinates)\(name='(\w+)'.*?\)(?=, \w+: |\)$)"
-    short = signature and re.sub(whole, lambda m: m[1].upper(), signature)
-    return short, returns
-
-
 def docstring_as_rst(app, what: str, name: str, obj, options, lines: list[str]) -> None:
     """Markdown's code, lists and indented formulas in reStructuredText."""
     paragraphs = re.split(r"\n\s*\n", "\n".join(lines).strip("\n"))

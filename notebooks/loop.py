@@ -21,6 +21,8 @@
 # camera and to its covariance. [The page on submaps](../docs/submaps.md) has the equations.
 
 # %%
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +30,7 @@ from IPython.display import display
 
 import jaxslam
 from jaxslam.consistency import run_through
-from jaxslam.filters import Loops, agreeing, base_poses, chain, close, with_submaps
+from jaxslam.filters import Loops, agreeing, base_poses, chain, close
 from jaxslam.plots import COLOURS, new_figure
 from jaxslam.simulation import Room, simulate
 from jaxslam.statistics import chi2_quantile
@@ -39,7 +41,7 @@ VIEW = 20
 LARGER = 15  # times as large as they are, errors and ellipses are drawn on the map
 scenario = jaxslam.scenario("laps-6dof", steps=LAP)
 (base,) = jaxslam.make_filters(scenario, "robocentric+oc", "inverse_scaling").values()
-slam = with_submaps(base, history=32)
+slam = replace(base, frame=jaxslam.Submaps(history=32))
 run = simulate(scenario, jax.random.key(3))
 
 

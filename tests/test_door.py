@@ -122,7 +122,7 @@ def test_single_precision_by_oversight_warns_once_and_by_choice_never():
     ("name", "meant"),
     [
         ("scenarios", "scenario"),
-        ("Paramterization", "Parametrization"),
+        ("AbstractLandmarks", "AbstractLandmark"),
         ("montecarlo", "monte_carlo"),
     ],
 )

@@ -49,6 +49,11 @@ def test_a_filter_of_ones_own_takes_part_in_a_study(capsys):
     assert ": consistent (p = " in lines[lines.index("mine:") + 1]
 
 
+def test_axes_angles_and_controls_are_as_their_page_says():
+    assert len(examples("docs/axes.md")) == 1
+    run_example("docs/axes.md")
+
+
 @pytest.mark.slow
 def test_a_log_of_ones_own_goes_through_the_filter(capsys):
     """And a sensor and a motion of one's own, with consistent numbers."""

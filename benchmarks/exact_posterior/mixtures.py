@@ -18,10 +18,9 @@ from jaxtyping import Array, Float, Int
 
 from exact_posterior.moments import covariance, mean_pose, pose_moments
 from jaxslam.filters.mixture.density import log_density
-from jaxslam.filters.mixture.mixture import GaussianSum
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.filters.readouts import camera_pose
-from jaxslam.filters.window.start import BatchInitialisation
+from jaxslam.filters.slam import Slam
 from jaxslam.geometry import Pose, difference
 from jaxslam.linalg import cholesky
 
@@ -42,11 +41,10 @@ class PoseMixture(eqx.Module):
 
 def filter_mixture(slam: AbstractFilter, state: Any) -> PoseMixture:
     """T_BC as a filter has it: a Gaussian of every member of its sum; of another filter, one."""
-    if isinstance(slam, BatchInitialisation):
-        return filter_mixture(slam.base, state.sum)
-    if isinstance(slam, GaussianSum):
-        of_member = jax.vmap(partial(camera_pose, slam.base))
-        return PoseMixture(*of_member(state.members), jnp.exp(state.log_weights))
+    if isinstance(slam, Slam) and slam.mixture is not None:
+        members = state if slam.start is None else state.sum
+        of_member = jax.vmap(partial(camera_pose, slam.one))
+        return PoseMixture(*of_member(members.members), jnp.exp(members.log_weights))
     mean, P = jax.tree.map(lambda x: x[None], camera_pose(slam, state))
     return PoseMixture(mean, P, jnp.ones(1, P.dtype))
 

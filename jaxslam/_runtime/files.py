@@ -79,11 +79,11 @@ def read_arrays(path: str | Path, names: Iterable[str] | None = None) -> dict[st
         raise ValueError(f"{path}: cannot read the arrays ({error.strerror or error})") from None
     except _NOT_ARRAYS as error:
         pickled = "pickle" in str(error)  # NumPy's advice then is to trust the file
-        why = "another kind of file, or objects in it" if pickled else one_line(error)
+        why = "it is another kind of file, or contains objects" if pickled else one_line(error)
         raise ValueError(f"{path}: not an npz file of numbers ({why})") from None
     for name, x in arrays.items():
         if not isinstance(x, np.ndarray):  # a member that is no array comes as its bytes
-            raise ValueError(f"{path}: not an npz file of numbers ({name} is no array)")
+            raise ValueError(f"{path}: not an npz file of numbers ({name} is not an array)")
     return arrays
 
 

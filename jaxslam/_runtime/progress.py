@@ -26,7 +26,7 @@ def bar(total: int | None, unit: str, desc: str | None = None, done: int = 0) ->
     try:
         from tqdm.auto import tqdm
     except ImportError as error:
-        raise missing("a bar of progress needs", "cli", error) from None
+        raise missing("a progress bar needs", "cli", error) from None
     if sys.stderr.isatty() or "ipykernel" in sys.modules:
         return tqdm(total=total, unit=unit, desc=desc, initial=done)
     shown = tqdm(

@@ -68,8 +68,6 @@ def _run(given: list[str]) -> None:
 
 
 _interrupted = threading.Event()
-_AGAIN = 0.01
-"""Seconds after which an interruption comes once more, then to somebody."""
 
 
 @contextmanager
@@ -88,7 +86,8 @@ def _interruptions() -> Generator[None]:
     def swallowed(told) -> None:
         if not isinstance(told.exc_value, KeyboardInterrupt):
             return before(told)
-        return threading.Timer(_AGAIN, os.kill, (os.getpid(), signal.SIGINT)).start()
+        # Seconds after which an interruption comes once more, then to somebody.
+        return threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
 
     sys.unraisablehook = swallowed
     try:

@@ -19,20 +19,20 @@ class CalibrateOptions:
     board_video: Annotated[
         Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="BOARD_VIDEO")
     ] = None
-    """Video or folder of images of a board that is held still and tilted all ways. Without it: the
-    board is drawn, to be printed."""
+    """Video or folder of images of a board held still and tilted in all directions. Default: draw
+    the board, for printing."""
     board: str = "checkerboard"
-    """Checkerboard or charuco."""
+    """Kind of board: checkerboard or charuco."""
     columns: int = 10
-    """Squares across, counted on the paper (9 corners inside)."""
+    """Number of squares across; 10 squares have 9 inner corners."""
     rows: int = 7
-    """Squares down."""
+    """Number of squares down."""
     square: float = 0.025
-    """Side of a square, metres; the intrinsics do not depend on it."""
+    """Side of a square in metres; the intrinsics do not depend on it."""
     dictionary: str = "5X5_100"
-    """Of a charuco board's markers, whose sides are 3/4 of a square."""
+    """Marker dictionary of a charuco board; a marker's side is 3/4 of a square."""
     out: Path = Path("results")
-    """Folder for calibration.json and coverage.png, or for board.png."""
+    """Output folder for calibration.json and coverage.png, or for board.png."""
 
     def run(self) -> None:
         """Calibrate, print the numbers, write the files."""
@@ -51,7 +51,7 @@ class CalibrateOptions:
         self.out.mkdir(parents=True, exist_ok=True)
         with write_atomically(self.out / "board.png") as path:
             cv2.imwrite(str(path), board.drawn())
-        print(f"wrote {self.out / 'board.png'}: print it, and measure a square")
+        print(f"wrote {self.out / 'board.png'}: print it and measure a square")
 
     def _calibrate(self, board, video: Path) -> None:
         from jaxslam._runtime.progress import bar
@@ -61,4 +61,4 @@ class CalibrateOptions:
             calibrated = calibrate(video, board, shown.update)
         write(calibrated, board, self.out)
         print(describe(calibrated))
-        print(f"wrote calibration.json, coverage.png in {self.out}")
+        print(f"wrote calibration.json and coverage.png to {self.out}")

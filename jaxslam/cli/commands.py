@@ -13,16 +13,19 @@ from jaxslam.cli.track import TrackOptions
 from jaxslam.cli.triangulate import TriangulateOptions
 
 _COMMANDS = {
-    "consistency": (ConsistencyOptions, "Simulate many runs of filters: are they consistent?"),
+    "consistency": (
+        ConsistencyOptions, "Simulate many runs of filters: are they consistent?",
+    ),
     "evaluate": (
-        EvaluateOptions, "Errors and covariances of your own filter: is it consistent?",
+        EvaluateOptions, "Test the consistency of your own filter from its errors.",
     ),
     "track": (TrackOptions, "Track a camera through a video: trajectory, map, overlay."),
     "calibrate": (
-        CalibrateOptions, "Film a board: the camera's calibration, and how sure it is.",
+        CalibrateOptions, "Calibrate a camera, with uncertainty, from a video of a board.",
     ),
     "triangulate": (
-        TriangulateOptions, "A point seen twice: what is known of its depth, and is it?",
+        TriangulateOptions,
+        "How well do two views determine a depth, and is the estimate consistent?",
     ),
 }  # fmt: skip
 Command: Any = Union[  # noqa: UP007 (of a table)
@@ -39,6 +42,6 @@ def parse(arguments: list[str]) -> Any:
         Command,
         args=arguments,
         prog="jaxslam",
-        description="Monocular EKF-SLAM whose uncertainty can be believed. --version says which.",
+        description="Monocular EKF-SLAM with consistent uncertainty. --version prints the version.",
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.HelptextFromCommentsOff),
     )

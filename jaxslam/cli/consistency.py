@@ -27,9 +27,9 @@ class ConsistencyOptions:
         str,
         tyro.conf.arg(
             metavar="NAME",
-            help="A TOML file with the fields of a scenario, handheld-NAME of a trajectory in "
-            "$JAXSLAM_DATA/trajectories (any TUM file by --set "
-            f"trajectory=FILE), or one of: {', '.join(BUILT_IN)}.",
+            help="A TOML file with the fields of a scenario; handheld-NAME for a trajectory in "
+            "$JAXSLAM_DATA/trajectories (or any TUM file with --set "
+            f"trajectory=FILE); or one of: {', '.join(BUILT_IN)}.",
         ),
     ] = "circle"
     landmarks: Annotated[
@@ -40,42 +40,43 @@ class ConsistencyOptions:
         tuple[str, ...],
         tyro.conf.arg(
             metavar="NAME …",
-            help=f"Filters: {', '.join(FILTERS)}; each may be modified, in any order, as in "
-            f"scale_gauge+mixture9: {', '.join(MODIFIERS)}, with a number.",
+            help=f"Filters: {', '.join(FILTERS)}. Modifiers can be added in any order, as in "
+            f"scale_gauge+mixture9: {', '.join(MODIFIERS)}, some with a number.",
         ),
     ] = ("robocentric",)
     calibration: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """How filters treat it: white, consider, estimated or known. The scenario's by default."""
+    """How filters treat the calibration: white, consider, estimated or known. Default: that of the
+    scenario."""
     runs: int = 1000
-    """Independent runs of every filter."""
+    """Number of independent runs of every filter."""
     steps: int | None = None
-    """Filter steps of a run. The scenario's by default."""
+    """Filter steps per run. Default: that of the scenario."""
     seed: int = 0
-    """Run i draws from this seed and i alone."""
+    """Random seed; run i depends on the seed and i alone."""
     dtype: str = "float64"
     """Precision: float64 or float32."""
     chunk: int | None = None
-    """Runs that are computed and kept together; memory grows with it, results do not. By default
-    so many that every processor has several chunks, 100 at the most."""
+    """Runs computed and stored together. Memory grows with it; results do not depend on it. By
+    default so many that every processor has several chunks, 100 at the most."""
     backend: str = AUTO
-    """What computes: xla, native (a program in C++, for which there has to be a compiler), or auto:
-    native where a study is long enough, and with --resume what computed before."""
+    """Backend: xla, native (a C++ program, which needs a compiler), or auto: native if the study is
+    long enough, and with --resume the backend of the interrupted run."""
     resume: bool = False
-    """Go on from what an interrupted run left in --out."""
+    """Continue an interrupted run from what it left in --out."""
     reduce: bool = False
-    """Keep sums over the runs of each chunk instead of their records: files and traffic do not
-    grow with --runs in a chunk. Medians are then of the first chunk."""
+    """Store sums over the runs of each chunk instead of every run, so that files do not grow with
+    the number of runs in a chunk. Medians are then those of the first chunk."""
     cluster: str | None = None
-    """Address of a Dask scheduler that runs, as in tcp://127.0.0.1:8786, to whose workers the
-    chunks are handed. Needs the cluster extra."""
+    """Address of a running Dask scheduler, such as tcp://127.0.0.1:8786, whose workers compute the
+    chunks. Needs the cluster extra."""
     set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FIELD=VALUE …")] = field(
         default_factory=tuple
     )
-    """Override scenario fields, for instance pixel_sigma=1 or velocity=[1.2,0,0]."""
+    """Override scenario fields, for example pixel_sigma=1 or velocity=[1.2,0,0]."""
     out: Path = Path("results")
-    """Folder for consistency.json, consistency.png and the records of all runs."""
+    """Output folder for consistency.json, consistency.png and the records of all runs."""
     pdf: bool = False
-    """Write consistency.pdf too: one column for print, 3.4 in wide, its letters embedded."""
+    """Also write consistency.pdf, one column (3.4 in) wide for print, with embedded fonts."""
 
     def run(self) -> None:
         """Run the study, print its table, write its files."""

@@ -27,61 +27,65 @@ class EvaluateOptions:
     """Options of the command; every field is an option."""
 
     source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
-    """Arrays (FILE.npz with errors and covariances, innovations and covariances, or estimates,
-    covariances and truths; FILE.csv with lines of run, step, errors, upper triangle), a trajectory
-    (t tx ty tz qx qy qz qw, s and m; t x y θ; OpenVINS; KITTI), or a folder: one run, or one a
-    sub-folder, of estimate.txt, covariance.txt and truth.txt, or of OpenVINS's state_estimate.txt,
-    state_deviation.txt and state_groundtruth.txt; or ROS bags. Runs need not be equally long."""
+    """Arrays, a trajectory, a folder or ROS bags. Arrays: FILE.npz with errors and covariances,
+    innovations and covariances, or estimates, covariances and truths; FILE.csv with lines of run,
+    step, errors, upper triangle. Trajectory: t tx ty tz qx qy qz qw in s and m; t x y θ; OpenVINS;
+    KITTI. Folder: estimate.txt, covariance.txt and truth.txt, or OpenVINS's state_estimate.txt,
+    state_deviation.txt and state_groundtruth.txt, or one sub-folder of these per run. Runs may
+    differ in length."""
     covariance: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Covariances of the trajectory's poses, docs/covariance-format.md."""
+    """Covariances of the trajectory's poses (docs/covariance-format.md)."""
     truth: Annotated[str | None, tyro.conf.arg(metavar="FILE|TOPIC")] = None
-    """True trajectory in TUM format; of a folder, that of all runs. Of a bag its topic, or
-    BAG:TOPIC of another; by default the only one that fits."""
+    """True trajectory in TUM format; for a folder, the truth of all runs. For a bag: its topic, or
+    BAG:TOPIC of another bag; default: the only topic that fits."""
     estimate: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
-    """Of a bag: the topic of poses with covariance; by default the only one that fits."""
+    """Topic of a bag with the estimated poses and covariances. Default: the only one that fits."""
     error: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Of which error the covariance is: right (T = est Exp(e)), left (T = Exp(e) est) or split
-    (position and rotation apart). By default what the file says, else right."""
+    """Which error the covariance describes: right (T = est Exp(e)), left (T = Exp(e) est) or split
+    (position and rotation separately). Default: what the file says, otherwise right."""
     axes: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Along which it is written: body, world, or mixed (position along the world's, rotation about
-    the body's). By default the error's own: right body, left and split world."""
+    """Axes of that error: body, world, or mixed (position along the world's axes, rotation about
+    the body's). Default: body for right, world for left and split."""
     order: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """position-first, the default if no file says it, or rotation-first."""
+    """Order of its components: position-first or rotation-first. Default: what the file says,
+    otherwise position-first."""
     scale: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Whether the covariance is marginal (the default) or given the scale of the world, at which
-    NEES then is."""
+    """Whether the covariance is marginal (the default) or given the scale of the world; with given,
+    NEES is computed at that scale."""
     align: Annotated[str, tyro.conf.arg(metavar="NAME")] = "none"
-    """How the estimate is laid on the truth: none, se3 or sim3; by the first pose where its
-    covariance is zero, else to all positions."""
+    """How the estimate is aligned with the truth: none, se3 or sim3. The first pose is used where
+    its covariance is zero, otherwise all positions."""
     axes_used: Annotated[str, tyro.conf.arg(metavar="NAMES")] = ""
-    """Axes of the poses that the filter estimates, as x,y,rz of a robot in the plane. By default
-    all whose errors are not zero throughout."""
+    """Axes that the filter estimates, such as x,y,rz for a robot in the plane. Default: all axes
+    whose errors are not always zero."""
     truth_sigma: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="METRES DEG")] = None
-    """σ of the true poses themselves, of a measured truth, along the axes of the body. It is added
-    to the covariances. By default the truth is exact."""
+    """σ of the true poses, if the truth was measured, along the body's axes; it is added to the
+    covariances. Default: the truth is exact."""
     innovations: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Innovations of the same filter and their covariances (npz or CSV): NEES and NIS together say
+    """Innovations of the same filter and their covariances (npz or CSV): NEES and NIS together show
     whether Q or R is wrong."""
     nis: bool = False
-    """The errors of a CSV or npz file are innovations, and the covariances theirs."""
+    """Treat the errors in a CSV or npz file as innovations, and the covariances as theirs."""
     out: Path = Path("results")
-    """Folder for evaluation.json and evaluation.png."""
+    """Output folder for evaluation.json and evaluation.png."""
     pdf: bool = False
-    """Write evaluation.pdf too: one column for print, 3.4 in wide, its letters embedded."""
+    """Also write evaluation.pdf, one column (3.4 in) wide for print, with embedded fonts."""
 
     suite: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Compare with filters here, docs/suite.md: first write measurements of simulated runs into
-    FOLDER, then read the poses that your filter makes of them, NAME.csv of each in SOURCE."""
+    """Compare your filter with those of jaxslam (docs/suite.md). Without SOURCE: write measurements
+    of simulated runs to FOLDER. With it: evaluate the poses your filter estimated from them,
+    SOURCE/NAME.csv for each scenario."""
     scenario: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME …")] = SUITE
-    """Of --suite: scenarios to write, as of jaxslam consistency."""
+    """With --suite: scenarios to write, as for jaxslam consistency."""
     runs: int = 100
-    """Of --suite: runs of each scenario to write."""
+    """With --suite: number of runs to write for each scenario."""
     seed: int | None = None
-    """Of --suite: what draws the runs, by default 0; needed again after --hide-truth."""
+    """With --suite: random seed of the runs, by default 0; must be given again after
+    --hide-truth."""
     hide_truth: bool = False
-    """Of --suite: write neither the true poses nor the seed."""
+    """With --suite: write neither the true poses nor the seed."""
     filters: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME …")] = RIVALS
-    """Of --suite: filters here to compare with, as of jaxslam consistency."""
+    """With --suite: filters to compare with, as for jaxslam consistency."""
 
     def run(self) -> None:
         """Evaluate, print the verdict and the table, write the files."""
@@ -96,7 +100,8 @@ class EvaluateOptions:
             plot_evaluation(found, self.out / "evaluation.pdf", column=True)
         print(found)
         print(
-            f"wrote {written}, evaluation.png{' and evaluation.pdf' if self.pdf else ''} beside it"
+            f"wrote {written} and, beside it, evaluation.png"
+            f"{' and evaluation.pdf' if self.pdf else ''}"
         )
 
     def _stated(self) -> dict[str, str]:
@@ -106,15 +111,19 @@ class EvaluateOptions:
     def _run_suite(self, folder: Path) -> None:
         for name in _OF_ONE_LOG:
             if getattr(self, name) not in (None, False):
-                raise ValueError(f"--{name.replace('_', '-')} is of one log; --suite goes without")
+                raise ValueError(
+                    f"--{name.replace('_', '-')} applies to one log; it cannot be used with --suite"
+                )
         if self.source is None:
             seed, truth = self.seed or 0, not self.hide_truth
             write_suite(folder, self.scenario, runs=self.runs, seed=seed, truth=truth)
-            print(f"wrote {folder}: {self.runs} runs of each scenario, drawn by --seed {seed}")
+            print(f"wrote {folder}: {self.runs} runs of each scenario, seed {seed}")
             return
         paths = {path.stem: path for path in sorted(self.source.glob("*.csv"))}
         if not paths:
-            raise ValueError(f"{self.source}: holds no NAME.csv of a scenario; some are accepted")
+            names = sorted(path.parent.name for path in folder.glob("*/scenario.json")) or ["NAME"]
+            expected = ", ".join(f"{name}.csv" for name in names)
+            raise ValueError(f"{self.source} has no log: expected {expected}")
         suite, told = read_suite(folder, paths, self.seed), {}
         found = {name: self._of_log(paths[name], one) for name, one in suite.items()}
         for name, (yours, numbers) in found.items():
@@ -146,7 +155,7 @@ class EvaluateOptions:
 
     def _evaluation(self) -> Evaluation:
         if self.source is None:
-            raise ValueError("SOURCE is missing; a log is accepted, or --suite FOLDER")
+            raise ValueError("no SOURCE given; expected a log, or --suite FOLDER")
         of_log = {name: getattr(self, name) for name in (*_OF_ONE_LOG, "align", "axes_used")}
         return evaluate_log(self.source, stated=self._stated(), **of_log)
 

@@ -14,9 +14,6 @@ from jaxslam.filters.words import FILTERS
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.tracking.settings import METRIC, TrackerSettings
 
-_COMPILING = "compiling …"
-"""What the bar says while the first frames wait for their programs."""
-
 
 @dataclass(frozen=True)
 class TrackOptions:
@@ -24,53 +21,55 @@ class TrackOptions:
 
     source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
     """Video file, folder of images, data set folder (TUM RGB-D, EuRoC, KITTI odometry, 7-Scenes),
-    bag of ROS 1 or 2, or the number of a camera, 0. Without it: a synthetic video."""
+    ROS 1 or ROS 2 bag, or the number of a live camera, such as 0. Default: a synthetic video."""
     topic: str | None = None
-    """Of a bag: the topic of its pictures; by default the only one that has any."""
+    """Image topic of a bag. Default: its only image topic."""
     calibration: Path | None = None
-    """Camera's JSON file: model, width, height, fx, fy, cx, cy, distortion (OpenCV's order)."""
+    """Camera calibration, a JSON file with model, width, height, fx, fy, cx, cy and distortion (in
+    OpenCV's order)."""
     fov: float | None = None
-    """Horizontal field of view in place of a calibration, degrees; it is estimated then. With
-    neither, a usual one is guessed."""
+    """Horizontal field of view in degrees, in place of a calibration; the lens is then estimated.
+    With neither, a typical field of view is assumed."""
     reference: Path | None = None
-    """Reference trajectory in TUM format, to report the absolute trajectory error; by default the
-    data set's own."""
+    """Reference trajectory in TUM format, for the absolute trajectory error. Default: that of the
+    data set, if it has one."""
     target: Path | None = None
-    """JSON file of known points that the first frame sees: the map is in metres."""
+    """JSON file of known points visible in the first frame; the map is then in metres."""
     map: Path | None = None
-    """The map.npz of another video by the same camera: this one is localised in its map, and goes
-    on with it, by its settings."""
+    """map.npz of an earlier video by the same camera: localise in that map, with the settings saved
+    in it, and continue it."""
     out: Path = Path("results")
-    """Folder for trajectory.txt, covariance.txt, frames.csv, summary.json, map.ply, map.npz,
+    """Output folder for trajectory.txt, covariance.txt, frames.csv, summary.json, map.ply, map.npz,
     map.png and overlay.mp4."""
     frames: int | None = None
-    """Frames to track, at the most; of the synthetic video 150 by default."""
+    """Maximum number of frames to track. Default: all; 150 for the synthetic video."""
     start: float = 0.0
-    """Where to begin, seconds after the first frame: at the frame that is nearest."""
+    """Where to start, in seconds after the first frame; the nearest frame is used."""
     every: int = 1
     """Track every n-th frame only."""
     scale: float | None = None
-    """Make pictures, and their calibration, so many times as large: 0.5 for half the size. By
-    default, and without a target, those above 1280 pixels are halved, or a third and so on."""
+    """Resize pictures and calibration by this factor. Default: without a target, pictures larger
+    than 1280 pixels are reduced to a half, a third and so on."""
     seed: int = 0
     """Seed of the synthetic video; nothing else is random."""
     rate: float = 30.0
-    """Frames per second of a folder of images without timestamps."""
+    """Frame rate of a folder of images without timestamps, frames per second."""
     filter: Annotated[
         str,
         tyro.conf.arg(
-            help=f"Filter: {', '.join(FILTERS)}; may be modified, as in robocentric+oc. "
-            f"recommended stands for {TrackerSettings.filter}, with a target for {METRIC}."
+            help=f"Filter: {', '.join(FILTERS)}; modifiers can be added, as in robocentric+oc. "
+            f"recommended means {TrackerSettings.filter}, or {METRIC} with a target."
         ),
     ] = "recommended"
     landmarks: Annotated[
         str, tyro.conf.arg(help=f"Landmark parametrization: {', '.join(LANDMARKS)}.")
     ] = TrackerSettings.landmarks
     calibration_treatment: str | None = TrackerSettings.calibration
-    """How the filter treats it: white, consider, estimated or known. By default one that a field
-    of view tells, or that is guessed, is estimated, and any other is known."""
+    """How the filter treats the calibration: white, consider, estimated or known. Default:
+    estimated for a guessed lens or --fov, otherwise known."""
     nearest_depth: float = TrackerSettings.nearest_depth
-    """d_min, which sets the unit of the map: the prior on depth reaches from here to infinity."""
+    """Smallest expected depth, d_min, which sets the map unit: the prior on depth extends from here
+    to infinity."""
     pixel_sigma: float = TrackerSettings.pixel_sigma
     """Standard deviation of a match, pixels."""
     acceleration_sigma: float = TrackerSettings.acceleration_sigma
@@ -78,14 +77,14 @@ class TrackOptions:
     angular_acceleration_sigma: float = TrackerSettings.angular_acceleration_sigma
     """Standard deviation of the angular acceleration, rad/s²."""
     association: Annotated[
-        str, tyro.conf.arg(help=f"Which matches are believed: {', '.join(ASSOCIATIONS)}.")
+        str, tyro.conf.arg(help=f"How wrong matches are rejected: {', '.join(ASSOCIATIONS)}.")
     ] = TrackerSettings.association
     wanted: int = TrackerSettings.wanted
-    """Landmarks to keep in view."""
+    """Number of landmarks to keep in view."""
     overlay: bool = True
     """Whether to write overlay.mp4."""
     viewer: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
-    """Recording for the rerun viewer, written as the frames come."""
+    """Recording for the Rerun viewer, written during tracking."""
 
     def run(self) -> None:
         """Track the video, print the summary, write its files."""
@@ -98,10 +97,11 @@ class TrackOptions:
         with one_line_warnings():
             source = self._source()
         if self.map is not None and self.target is not None:
-            raise ValueError("give --map or --target, not both: a saved map has its unit")
+            raise ValueError("give --map or --target, not both: a saved map already has a unit")
         target = None if self.target is None else read_target(self.target)
         total = len(source) or self.frames
-        with warming_bar(total, "frame", _COMPILING, WARM_UP, "tracking") as progress:
+        # What the bar says while the first frames wait for their programs.
+        with warming_bar(total, "frame", "compiling …", WARM_UP, "tracking") as progress:
             summary = track(
                 source,
                 self.out,
@@ -116,9 +116,9 @@ class TrackOptions:
         written = (
             "trajectory.txt, covariance.txt, frames.csv, summary.json, map.ply, map.npz, map.png"
         )
-        print(f"wrote {written}{', overlay.mp4' if self.overlay else ''} in {self.out}")
+        print(f"wrote {written}{', overlay.mp4' if self.overlay else ''} to {self.out}")
         if self.viewer is not None:
-            print(f"wrote {self.viewer}: rerun {self.viewer} shows it")
+            print(f"wrote {self.viewer}; view it with: rerun {self.viewer}")
 
     def _source(self):
         from jaxslam.io.opening import open_source
@@ -141,7 +141,7 @@ class TrackOptions:
         if self.calibration or self.fov is not None or self.reference or self.target or self.topic:
             raise ValueError(
                 "--calibration, --fov, --reference, --target and --topic need a SOURCE: the "
-                "synthetic video has its own"
+                "synthetic video has its own calibration and reference"
             )
         source = synthetic_source(
             frames=150 if self.frames is None else self.frames, seed=self.seed

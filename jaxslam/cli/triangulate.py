@@ -9,8 +9,16 @@ from typing import Annotated
 import tyro
 
 from jaxslam._runtime.files import write_json
-from jaxslam.triangulation import Comparison, TwoViews, compare, summarise, table
-from jaxslam.triangulation.comparison import MEASUREMENTS, PARTICLES, check_sizes
+from jaxslam._runtime.progress import bar
+from jaxslam.triangulation import (
+    MEASUREMENTS,
+    PARTICLES,
+    TwoViews,
+    check_sizes,
+    compare,
+    summarise,
+    table,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -22,49 +30,33 @@ class TriangulateOptions:
     baseline: float = TwoViews.baseline
     """Sideways motion between the two views, exactly known, m."""
     pixel: float = TwoViews.pixel
-    """Where the first view sees the point; by default the principal point, on the axis."""
+    """Pixel of the point in the first view. Default: the principal point, on the axis."""
     nearest_depth: float = TwoViews.nearest_depth
     """d_min of the prior on inverse depth, m."""
-    calibration: Annotated[str, tyro.conf.arg(metavar="NAME")] = TwoViews.calibration
-    """How the intrinsics err: white (drawn in each view), shared (drawn once for both), or known
-    (not at all)."""
+    calibration: Annotated[str, tyro.conf.arg(metavar="NAME")] = "white"
+    """How the intrinsics err: white (drawn in each view), shared (once for both), known (exact)."""
     particles: int = PARTICLES
-    """Samples of the truth, and of every estimate."""
+    """Number of samples of the truth and of every estimate."""
     measurements: int = MEASUREMENTS
-    """Noisy measurements that distances are averaged over; 0 for the exact pixels only."""
+    """Number of noisy measurements over which distances are averaged; 0 for exact pixels only."""
     seed: int = 0
-    """Of the noise, and of the samples."""
+    """Random seed of the noise and of the samples."""
     out: Path = Path("results")
-    """Folder for triangulation.json and triangulation.png."""
+    """Output folder for triangulation.json and triangulation.png."""
 
     def run(self) -> None:
         """Compare, print the table, write the files."""
         from jaxslam.plots.triangulation import plot_triangulation
 
-        comparison = self._comparison()
+        five = self.depth, self.baseline, self.pixel, self.nearest_depth, self.calibration
+        sizes = {"particles": self.particles, "measurements": self.measurements, "seed": self.seed}
+        views = TwoViews(*five)
+        check_sizes(**sizes)
+        self.out.mkdir(parents=True, exist_ok=True)
+        with bar(self.measurements, "measurement") as shown:
+            comparison = compare(views, **sizes, progress=shown.update)
         summary = summarise(comparison)
         write_json(self.out / "triangulation.json", summary, allow_nan=False)
         plot_triangulation(comparison, self.out / "triangulation.png")
         print(table(summary))
         print(f"wrote {self.out / 'triangulation.json'} and {self.out / 'triangulation.png'}")
-
-    def _comparison(self) -> Comparison:
-        from jaxslam._runtime.progress import bar
-
-        views = TwoViews(
-            depth=self.depth,
-            baseline=self.baseline,
-            pixel=self.pixel,
-            nearest_depth=self.nearest_depth,
-            calibration=self.calibration,
-        )
-        check_sizes(self.particles, self.measurements, self.seed)
-        self.out.mkdir(parents=True, exist_ok=True)
-        with bar(self.measurements, "measurement") as shown:
-            return compare(
-                views,
-                particles=self.particles,
-                measurements=self.measurements,
-                seed=self.seed,
-                progress=shown.update,
-            )

@@ -47,15 +47,15 @@ class SuiteScenario:
         """
         s, axes = self.scenario, AXES[self.scenario.geometry.name]
         if not isinstance(s.sensor, Pinhole) or s.beacons:
-            told = "it has beacons" if s.beacons else f"its sensor is {type(s.sensor).__name__}"
-            raise ValueError(f"{s.name}: {told}; for a suite camera is accepted, without beacons")
+            has = "beacons" if s.beacons else f"a {type(s.sensor).__name__} sensor"
+            raise ValueError(f"{s.name} has {has}; --suite supports cameras only, without beacons")
         with jax.enable_x64(True):
             batch = jax.device_get(draw(s, self.runs, seed=self.seed)[1])
             turns = batch.poses.rotation().log()
         if batch.new is not None:
             raise ValueError(
-                f"{s.name}: its landmarks share slots, so that none has a number of its own; for a "
-                "suite in_view=0 is accepted, and any placement but rays"
+                f"{s.name}: its landmarks share slots, so they have no numbers of their own; "
+                "--suite needs in_view=0 and a placement other than rays"
             )
         seen, (run, step) = np.nonzero(batch.visible), np.indices(batch.visible.shape[:2])
         pose = np.dstack([run, step, step / s.rate, batch.poses.translation(), turns])
@@ -90,7 +90,7 @@ def write_suite(
             f"a suite needs at least one scenario; by default it has {', '.join(SUITE)}"
         )
     if folder.exists():
-        raise ValueError(f"{folder} is there already; a new folder is accepted")
+        raise ValueError(f"{folder} already exists; name a new folder")
     with write_atomically(folder) as temporary:
         for one in chosen:
             (place := temporary / one.name).mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Anybody's filter: errors and covariances, from arrays or files, to a verdict."""
+"""The evaluation of any filter: from errors and covariances, in arrays or files, to a verdict."""
 
 from jaxslam.evaluation.convention import (
     CHOICES,

@@ -2,7 +2,7 @@
 
 A trajectory that nothing ties to the world is known up to a rigid motion, and from images alone up
 to a similarity: a gauge. A covariance is of errors in one gauge, and aligning the trajectory to
-the truth is a change of gauge (Zhang, Gallego, Scaramuzza, RA-L 2018): to first order the errors e
+the truth is a change of gauge (Zhang, Gallego, Scaramuzza, RA-L 2018). To first order the errors e
 of all poses become `e − U (Vᵀ U)⁻¹ Vᵀ e`, the oblique projection along the gauge's directions U
 onto the errors that the alignment leaves as they are, `Vᵀ e = 0`.
 """
@@ -84,15 +84,17 @@ def similarity(
     """Umeyama's least squares of positions (TPAMI 1991), without the test that the rank is two.
 
     On a straight line the rotation about it is arbitrary, but no position depends on it where
-    the reference is the line, so that the error is the smallest one all the same. Raises
-    ValueError where all positions of one are in one place.
+    the reference is the line, so the error is nevertheless the smallest one. Raises ValueError
+    where all positions of one coincide.
     """
     mean_estimate, mean_reference = estimate.mean(0), reference.mean(0)
     centred, target = estimate - mean_estimate, reference - mean_reference
     left, singular, right = np.linalg.svd(target.T @ centred)
     if singular[0] <= 1e-12 * np.sum(target**2) or not np.any(target):
         name = "Sim(3)" if scaled else "SE(3)"
-        raise ValueError(f"all poses of a trajectory are in one place; a {name} needs a motion")
+        raise ValueError(
+            f"all positions of a trajectory coincide; an alignment by {name} needs motion"
+        )
     signs = np.ones(len(singular))
     signs[-1] = np.sign(np.linalg.det(left @ right))
     rotation = left @ np.diag(signs) @ right
@@ -211,15 +213,15 @@ def gauge_directions(
     return U
 
 
-BY_FIRST = "aligned by the first pose, which the covariances take for known"
-TO_ALL = "aligned to all positions, and the joint covariance projected to that gauge"
+BY_FIRST = "aligned at the first pose, which the covariances treat as known"
+TO_ALL = "aligned with all positions; the joint covariance is projected to that gauge"
 INDEPENDENT = (
-    "aligned to all positions; the covariances are projected to that gauge as if the errors of "
-    "different poses were independent, as there is no joint covariance"
+    "aligned with all positions; the covariances are projected to that gauge as if the errors of "
+    "different poses were independent, because there is no joint covariance"
 )
 STRAIGHT = (
-    "positions are on a straight line, as far as their σ tells: the rotation about it is aligned "
-    "by the orientations"
+    "within their σ, the positions lie on a straight line: the rotation about it is aligned by the "
+    "orientations"
 )
 
 
@@ -253,7 +255,7 @@ def aligned(
         )
     if given and align == "se3":
         raise ValueError(
-            "covariances given the scale are aligned by sim3, or by se3 where the first is zero"
+            "covariances given the scale need --align sim3, or se3 if the first covariance is zero"
         )
     to_all = partial(_to_all, scaled=align == "sim3")
     notes = (TO_ALL if poses.joint is not None else INDEPENDENT,)

@@ -299,13 +299,13 @@ def read_covariances(path: str | Path, t: int = 6) -> CovarianceText:
     rows_of, columns_of = np.triu_indices(t)
     triangle, columns = len(rows_of), width(Path(path))
     kinds = {
-        1 + triangle: f"{1 + triangle} finite numbers, the time and the upper triangle row by row,",
-        1 + t * t: f"{1 + t * t} finite numbers, the time and the covariance row by row,",
-        1 + t: f"{1 + t} finite numbers, the time and a σ of each axis,",
+        1 + triangle: f"{1 + triangle} finite numbers, the time and the upper triangle row by row",
+        1 + t * t: f"{1 + t * t} finite numbers, the time and the covariance row by row",
+        1 + t: f"{1 + t} finite numbers, the time and a σ for each axis",
     }
     deviations = t == 6 and columns >= _DEVIATIONS and (columns - _DEVIATIONS) % _OF_CAMERA == 0
     if deviations:
-        kinds[columns] = f"{columns} finite numbers, OpenVINS's time and deviations,"
+        kinds[columns] = f"{columns} finite numbers, OpenVINS's time and deviations"
     columns = columns if columns in kinds else 1 + triangle
     comments, rows, _ = read_table(path, "covariances", "covariances", kinds[columns], columns)
     try:
@@ -330,7 +330,7 @@ def read_covariances(path: str | Path, t: int = 6) -> CovarianceText:
 def _squared(path: str | Path, sigma: Float[np.ndarray, "n t"]) -> Float[np.ndarray, "n t"]:
     wrong = ~((sigma >= 0) & (sigma <= LARGEST))
     if wrong.any():
-        raise ValueError(f"{path}: a σ is {sigma[wrong][0]:.3g}; 0 to {LARGEST:.0e} is accepted")
+        raise ValueError(f"{path}: a σ is {sigma[wrong][0]:.3g}; expected 0 to {LARGEST:.0e}")
     return sigma**2
 
 

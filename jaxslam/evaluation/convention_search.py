@@ -8,7 +8,7 @@ another where the runs' averages of NEES differ by more than they scatter, pair 
 rotation alone.
 
 A scale that is fitted lowers NEES whatever the convention, of a right covariance that of the
-position from n to n − 1 at the least. Only where it lowers it further, so that no σ explains it, is
+position at least from n to n − 1. Only where it lowers it further, so that no σ explains it, is
 the covariance one given the scale.
 """
 
@@ -27,8 +27,6 @@ from jaxslam.statistics.verdict import VERDICT_CONFIDENCE, Verdict, not_disprove
 
 NOTICEABLE = 0.05
 """NEES that differ by less than this share say the same of σ, to 2.5 %."""
-_PART_CONFIDENCE = 0.999
-"""The confidence of what is said against position or rotation alone, after all axes together."""
 _TOLD = 3
 """The most indistinguishable conventions that a sentence names."""
 _ALIKE = " (right and split errors are the same to first order)"
@@ -73,8 +71,10 @@ class Tried(NamedTuple):
             (self.position, self.dof - self.turns, self.fitted),
             (self.rotation, self.turns, 0.0),
         )
+        # The confidence of what is said against position or rotation alone, after all axes
+        # together.
         return self.whole and all(
-            nees is None or _verdict(nees, dof, fitted)["p"] >= 1 - _PART_CONFIDENCE
+            nees is None or _verdict(nees, dof, fitted)["p"] >= 1 - 0.999
             for nees, dof, fitted in parts
         )
 
@@ -116,7 +116,7 @@ class Identification:
     def sentence(self) -> str:
         """The result in a line."""
         if not self.consistent and self.whole:
-            return "of position or rotation alone σ is wrong under every convention that was tried"
+            return "σ of position or rotation alone is wrong under every convention tried"
         if not self.consistent:
             return "no other convention of the covariance would make the data consistent"
         alike = _ALIKE if self.consistent[0].error in ("right", "split") else ""
@@ -127,9 +127,11 @@ class Identification:
         if len(apart) > _TOLD:
             others += f"; and {len(apart) - _TOLD} more"
         if self.doubtful:
-            return f"the convention ({self.stated}) is doubtful, but these cannot be told: {others}"
+            return (
+                f"the convention ({self.stated}) is doubtful, but these fit equally well: {others}"
+            )
         if others:
-            return f"the convention ({self.stated}) cannot be told from: {others}"
+            return f"the convention ({self.stated}) cannot be distinguished from: {others}"
         return f"of {len(self.nees)} conventions the stated one ({self.stated}) fits best{alike}"
 
     def _other(self, other: Convention) -> str:

@@ -72,7 +72,7 @@ def check_every_run(logged: Bool[np.ndarray, "runs steps"]) -> None:
     """Raise ValueError for a run of which no step was logged."""
     if not logged.any(axis=1).all():
         run = int(np.argmin(logged.any(axis=1)))
-        raise ValueError(f"run {run} has no step: all of it is NaN; runs with a step are accepted")
+        raise ValueError(f"run {run} is all NaN; every run needs at least one step")
 
 
 def at(place: Sequence[int | np.integer] | np.ndarray) -> str:
@@ -117,7 +117,9 @@ def step_times(times: ArrayLike | None, steps: int) -> Float[np.ndarray, " steps
     except (ValueError, TypeError):
         array = np.empty(0)
     if array.shape != (steps,) or not np.isfinite(array).all() or (np.diff(array) < 0).any():
-        raise ValueError(f"times must be {steps} finite seconds, one a step, that do not decrease")
+        raise ValueError(
+            f"times must be {steps} finite, non-decreasing values in seconds, one per step"
+        )
     check_seconds("times", array)
     return array
 
@@ -148,25 +150,23 @@ def without_known(
 ) -> EvaluatedSteps:
     """The steps that were logged, but for those that a run knows by definition at its beginning.
 
-    Raises ValueError where one is wrong all the same, or where of a run nothing else is left.
+    Raises ValueError where one of those is nevertheless wrong, or where a run has no other step.
     """
     known = exactly_known(covariances) & logged
     if (known == logged).all():
-        raise ValueError("all covariances are zero; positive definite ones are accepted")
+        raise ValueError("all covariances are zero; they must be positive definite")
     wrong = known & (np.abs(errors).max(axis=-1) > ROUNDING)
     if wrong.any():
         run, step = np.argwhere(wrong)[0]
         raise ValueError(
             f"the covariance of {at((run, step))} is zero, and its error is not: "
-            f"{np.abs(errors[run, step]).max():.3g}; a positive definite one is accepted, and "
+            f"{np.abs(errors[run, step]).max():.3g}; it must be positive definite, and "
             "poses in another frame or unit than the truth's need an alignment (--align se3, sim3)"
         )
     before = np.logical_and.accumulate(known | ~logged, axis=1)
     if before.all(axis=1).any():
         run = int(np.argmax(before.all(axis=1)))
-        raise ValueError(
-            f"all covariances of run {run} are zero; positive definite ones are accepted"
-        )
+        raise ValueError(f"all covariances of run {run} are zero; they must be positive definite")
     left = logged & ~before
     start = int(np.argmax(left.any(axis=0)))
     return EvaluatedSteps(start, left, _left_out(known & before, start))
@@ -233,12 +233,8 @@ def _factors(correlation: Float[np.ndarray, "runs steps n n"]) -> np.ndarray:
 
 def _refuse(place: Sequence[int | np.integer] | np.ndarray, fault: str) -> NoReturn:
     raise ValueError(
-        f"the covariance of {at(place)} {fault}; a symmetric, positive definite one is accepted"
+        f"the covariance of {at(place)} {fault}; it must be symmetric and positive definite"
     )
-
-
-_RIGID = 1e-4
-"""The tolerance of a rotation's orthonormality: rounding to six digits makes less."""
 
 
 class Poses(NamedTuple):
@@ -259,7 +255,7 @@ def of_sigmas(sigmas: ArrayLike) -> Float[np.ndarray, "runs steps n n"]:
     if (sigma < 0).any():
         place = np.argwhere(sigma < 0)[0]
         raise ValueError(
-            f"sigmas of {at(place)} hold {sigma[tuple(place)]:.3g}; 0 or more is accepted"
+            f"sigmas of {at(place)} must not be negative, not {sigma[tuple(place)]:.3g}"
         )
     with np.errstate(over="ignore"):
         squared = sigma[..., None] * sigma[..., None, :]
@@ -274,7 +270,9 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
         _matrices(what, x, matrices) for what, x in (("estimates", estimates), ("truths", truths))
     )
     if T.shape != truth.shape:
-        raise ValueError(f"estimates are {T.shape}, so truths must be too, not {truth.shape}")
+        raise ValueError(
+            f"estimates are {T.shape}, so truths must have the same shape, not {truth.shape}"
+        )
     runs, steps, t = *T.shape[:2], geometry_of(T).tangent_dim
     each, joint = (runs, steps, t, t), (runs, steps * t, steps * t)
     P = numbers("covariances", covariances, 3 if np.ndim(covariances) == 3 else 4, str(each))
@@ -294,7 +292,7 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
     for what, x in (("estimates", T), ("truths", truth), ("covariances", P)):
         check_finite(what, x, logged)
         if (largest := np.abs(x[logged]).max()) > LARGEST:
-            raise ValueError(f"{what} hold {largest:.2g}; up to {LARGEST:.0e} is accepted")
+            raise ValueError(f"{what} contain {largest:.2g}; the limit is {LARGEST:.0e}")
     T, truth = (filled(x, logged, np.eye(x.shape[-1])) for x in (T, truth))
     _check_rigid("estimates", T)
     _check_rigid("truths", truth)
@@ -314,8 +312,8 @@ def _joint(
     return P
 
 
-def _matrices(what: str, given: ArrayLike, accepted: str) -> np.ndarray:
-    T = numbers(what, given, 3 if np.ndim(given) == 3 else 4, accepted)
+def _matrices(what: str, given: ArrayLike, expected: str) -> np.ndarray:
+    T = numbers(what, given, 3 if np.ndim(given) == 3 else 4, expected)
     if T.ndim == 3 and T.shape[-1] == 3:
         T = of_xytheta(T)
     if T.ndim == 3 and T.shape[-1] == 6:
@@ -325,15 +323,16 @@ def _matrices(what: str, given: ArrayLike, accepted: str) -> np.ndarray:
         turn = Rotation.from_rotvec(turn).as_quat()
         T = poses(position, turn).reshape(*T.shape[:2], 4, 4)
     if T.ndim != 4 or T.shape[-2:] not in ((3, 3), (4, 4)):
-        raise ValueError(f"{what} must be matrices {accepted}, not {T.shape}")
+        raise ValueError(f"{what} must be matrices {expected}, not {T.shape}")
     return T
 
 
 def _check_rigid(what: str, T: np.ndarray) -> None:
-    wrong = not_rigid(T, _RIGID)
+    # The tolerance of a rotation's orthonormality: rounding to six digits makes less.
+    wrong = not_rigid(T, 1e-4)
     if wrong.any():
         place = at(np.argwhere(wrong)[0])
-        raise ValueError(f"{what} of {place} is no rigid motion [R t; 0 1] with R a rotation")
+        raise ValueError(f"{what} of {place} is not a rigid motion [R t; 0 1] with a rotation R")
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
@@ -379,7 +378,7 @@ def read_csv(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...], tuple[
     found = _columns(titles, rows)
     if found is None:
         raise ValueError(
-            f"{path}: {rows.shape[1]} columns; {row} are accepted: {_COLUMNS} columns; or all n² "
+            f"{path}: {rows.shape[1]} columns; expected {row}: {_COLUMNS} columns; or all n² "
             "numbers, n σ named sigma…, or nees and dof by these names"
         )
     before, n, kind = found
@@ -394,7 +393,7 @@ def read_csv(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...], tuple[
     if kind in ("nees", "nis"):
         dof = np.unique(rows[:, before + 1])
         if len(dof) > 1 or dof[0] != round(dof[0]):
-            raise ValueError(f"{path}: dof is {dof[0]:g} and others; one whole number is accepted")
+            raise ValueError(f"{path}: dof must be the same whole number on every line, not {dof}")
         arrays = {kind: placed(rows[:, before]), "dof": dof[:1].astype(int)}
     else:
         P = _matrices_of(rows[:, before + n :], n, kind)
@@ -414,13 +413,13 @@ def read_pose_log(
     arrays, *held = read_csv(Path(path))
     logged = arrays.get("errors", np.empty((0, 0, 0)))
     if logged.shape[-1] != len(names) or [*arrays.get("names", names)] != [*names]:
-        raise ValueError(f"{path}: run, step, {', '.join(names)} and their covariance are accepted")
+        raise ValueError(f"{path}: expected run, step, {', '.join(names)} and their covariance")
     every = [f"run {i}" for i in range(runs)], [f"step {i}" for i in range(1, steps + 1)]
     wrong = [x for a, b in zip(every, held, strict=True) for x in (*a, *b) if (x in a) != (x in b)]
     wrong += [at((i, k + 1)) for i, k in np.argwhere(np.isnan(logged[..., 0]))]
     if wrong:
-        accepted = f"all steps from 1 to {steps} of runs 0 to {runs - 1} are accepted"
-        raise ValueError(f"{path}: {wrong[0]} is missing, or one too many; {accepted}")
+        expected = f"expected all steps from 1 to {steps} of runs 0 to {runs - 1}"
+        raise ValueError(f"{path}: {wrong[0]} is missing or duplicated; {expected}")
     return logged, arrays["covariances"]
 
 
@@ -465,11 +464,12 @@ def _rectangle(
     if len(pairs) < len(places):
         twice = np.setdiff1d(np.arange(len(places)), first)[0]
         r, s = places[twice]
-        raise ValueError(f"{path}, line {lines[twice]}: run {r:g}, step {s:g} comes twice")
+        raise ValueError(f"{path}, line {lines[twice]}: run {r:g}, step {s:g} appears twice")
     longest = int(np.bincount(run).max())
     if len(steps) > _APART * longest:
         raise ValueError(
-            f"{path}: the runs have {len(steps)} different steps, and none more than {longest}; "
-            "steps that are counted alike in all runs are accepted, as from the start of each"
+            f"{path}: the runs have {len(steps)} different steps, but none has more than "
+            f"{longest}; steps must be counted alike in all runs, for example from the start of "
+            "each"
         )
     return (run, step), runs, steps

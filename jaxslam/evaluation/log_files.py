@@ -28,7 +28,7 @@ from jaxslam.io.tum import WITH_COVARIANCE, check_seconds, width
 
 _CONTENTS = (
     "errors and covariances, innovations and covariances, or estimates, covariances and truths "
-    "(σ in place of covariances), or nees or nis, and dof,"
+    "(or σ instead of covariances), or nees or nis with dof"
 )
 _ALONE = ("nees", "nis")
 
@@ -57,9 +57,9 @@ def evaluate_log(
     """The verdict on what a file or a folder holds.
 
     `source` is an npz file of arrays, a CSV file of `run, step, errors, upper triangle` lines, a
-    trajectory in TUM format with its `covariance` and `truth`, or a folder: one run, or one a
-    sub-folder, of `estimate.txt`, `covariance.txt` and `truth.txt`; or a ROS bag, or a folder of
-    them, whose topics `estimate` and `truth` name where several fit. Where the tracker's
+    trajectory in TUM format with its `covariance` and `truth`, or a folder. A folder has a run of
+    `estimate.txt`, `covariance.txt` and `truth.txt`, or one per sub-folder, or ROS bags. The topics
+    of a bag are named by `estimate` and `truth` where several fit. Where the tracker's
     `frames.csv` is beside a trajectory, its longest map is evaluated, without frames that are lost
     or whose unit was not fixed yet. What is `stated` of the convention (`error`, `axes`, `order`,
     `scale`) comes before what the files say. For the alignment of poses, the axes used and the
@@ -70,9 +70,7 @@ def evaluate_log(
     """
     if innovations is not None:
         if nis:
-            raise ValueError(
-                "--nis says that errors are innovations; --innovations FILE goes without"
-            )
+            raise ValueError("give --nis or --innovations FILE, not both")
         beside = evaluate_log(innovations, nis=True)
         own = evaluate_log(
             source, covariance=covariance, truth=truth, estimate=estimate, stated=stated,
@@ -96,7 +94,9 @@ def evaluate_log(
         told = (advice(found),) if found.quantity == "NIS" and found.names else ()
         return replace(found, run_names=runs, notes=(*found.notes, *told))
     if nis:
-        raise ValueError(f"{source}: innovations come in an npz or CSV file, not in a trajectory")
+        raise ValueError(
+            f"{source}: innovations must be in an npz or CSV file, not in a trajectory"
+        )
     return evaluate_runs(source, runs_of(source, covariance, truth, estimate), stated, how)
 
 
@@ -110,7 +110,7 @@ def _evaluate_arrays(
     of_poses = ["truths"] if held == ["estimates"] else []
     needed = {"dof"} if held and held[0] in _ALONE else {"covariances", *of_poses}
     if len(held) != 1 or not needed <= arrays.keys():
-        raise ValueError(f"holds {', '.join(arrays)}; {_CONTENTS} are accepted")
+        raise ValueError(f"contains {', '.join(arrays)}; expected {_CONTENTS}")
     times = arrays.get("times")
     if held[0] in _ALONE:
         _refuse_options(stated, how)
@@ -137,8 +137,8 @@ def _whole(number: np.ndarray) -> int:
 def _refuse_options(stated: dict[str, str], how: PoseOptions) -> None:
     if stated or how["align"] != "none" or how["axes_used"] or how["truth_sigma"] is not None:
         raise ValueError(
-            "conventions, alignments, axes used are of poses, and so is σ of a truth; here are "
-            "errors, which are what they are; estimates, covariances and truths are accepted"
+            "a convention, an alignment, axes used and σ of the truth apply to poses, but the "
+            "file has errors; give estimates, covariances and truths instead"
         )
 
 
@@ -200,33 +200,33 @@ def runs_of(
     texts = (*source.glob("*.txt"), *source.glob("*/*.txt"))
     if bags and not any(path.name in ESTIMATES for path in texts):
         if covariance is not None:
-            raise ValueError(f"{source}: a bag has its own covariances; none beside it is accepted")
+            raise ValueError(f"{source}: a bag has its own covariances; leave out --covariance")
         own, true = estimate or "", str(truth or "")
         told = [ros.chosen(bag, own, ros.WITH_COVARIANCE, "--estimate", true) for bag in bags]
         return tuple(RunFiles(x.parent.stem, x, x, _truth_of(true, x.parent, x.name)) for x in told)
     if estimate is not None:
-        raise ValueError(f"{source}: an estimate's topic is of {ros.BAG}; this is none")
+        raise ValueError(f"{source}: --estimate is for {ros.BAG}, which this is not")
     if not source.is_dir():
         covariance = covariance or _own_covariances(source)
         for name, value in (("covariance", covariance), ("truth", truth)):
             if value is None:
                 raise ValueError(
                     f"{source}: a trajectory needs a {name} file beside it (--{name} FILE); "
-                    "arrays come as .npz or .csv"
+                    "arrays need a .npz or .csv file"
                 )
         return (RunFiles(source.stem, source, Path(str(covariance)), _truth_of(str(truth))),)
     folders = sorted(x for x in source.iterdir() if x.is_dir() and x.name[0] != ".")
     if _only(source, ESTIMATES) is not None:
         if runs := [folder.name for folder in folders if _only(folder, ESTIMATES) is not None]:
             raise ValueError(
-                f"{source}: holds a run, and others in sub-folders ({', '.join(runs[:3])}); a "
-                "folder of one run, or one of sub-folders, is accepted"
+                f"{source} has a run and sub-folders with runs ({', '.join(runs[:3])}); expected "
+                "one run, or one sub-folder per run"
             )
         return (_run(source, covariance, truth),)
     if covariance is not None:
-        raise ValueError(f"{source}: with many runs each needs a covariance.txt of its own")
+        raise ValueError(f"{source}: each of several runs needs its own covariance.txt")
     if not folders:
-        raise ValueError(f"{source}: holds neither {ESTIMATES[0]} nor sub-folders, one a run")
+        raise ValueError(f"{source} has neither {ESTIMATES[0]} nor sub-folders, one per run")
     return tuple(_run(folder, None, truth) for folder in folders)
 
 
@@ -249,7 +249,7 @@ def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) 
     def found(given: str | Path | None, names: tuple[str, ...]) -> Path:
         path = _only(folder, names) if given is None else Path(given)
         if path is None:
-            raise ValueError(f"{folder}: holds no {' or '.join(names)}")
+            raise ValueError(f"{folder} has no {' or '.join(names)}")
         return path
 
     true = found(None, TRUTHS) if truth is None else _truth_of(str(truth))
@@ -262,9 +262,7 @@ def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
     """The one file of these names. Raises ValueError where there are two, maybe of two runs."""
     there = [folder / name for name in names if (folder / name).is_file()]
     if len(there) > 1:
-        raise ValueError(
-            f"{folder}: holds {' and '.join(path.name for path in there)}; one of them is accepted"
-        )
+        raise ValueError(f"{folder} has both {' and '.join(path.name for path in there)}; keep one")
     return there[0] if there else None
 
 
@@ -281,10 +279,10 @@ def evaluate_runs(
         if one.evaluated.map and convention.scale == "given" and how["align"] != "sim3":
             raise ValueError(
                 f"{one.run.estimate}: its longest map is map {one.evaluated.map}, in a unit of its "
-                "own; align sim3 is accepted"
+                "own; use --align sim3"
             )
     if len({one.estimates.shape[1:] for one in read}) > 1:
-        raise ValueError(f"{source}: runs of the plane and of space; of one of them are accepted")
+        raise ValueError(f"{source}: planar and spatial runs cannot be mixed")
     names = tuple(run.name for run in runs)
     truths = [np.where(x.evaluated.poses[:, None, None], x.truths.values, np.nan) for x in read]
     longest = max(read, key=lambda one: len(one.times))
@@ -305,7 +303,7 @@ def evaluate_runs(
         *_other_times(read, longest), *_other_body(runs[0]),
     )  # fmt: skip
     if not read[0].said and not stated:
-        told += (f"the file does not say its convention; assumed: {convention}",)
+        told += (f"the file does not state its convention; assumed: {convention}",)
     return replace(found, notes=(*found.notes, *told), run_names=names)
 
 
@@ -314,8 +312,8 @@ def _convention_of(read: list[_RunLog], stated: dict[str, str]) -> Convention:
     for one in read:
         if one.said != read[0].said:
             raise ValueError(
-                f"{one.run.covariance}: says another convention ({Convention(**one.said)}) than "
-                f"{read[0].run.covariance} ({Convention(**read[0].said)})"
+                f"{one.run.covariance} states a different convention ({Convention(**one.said)}) "
+                f"from {read[0].run.covariance} ({Convention(**read[0].said)})"
             )
     return stated_before(read[0].said, stated)
 
@@ -397,9 +395,7 @@ def _read(run: RunFiles) -> _RunLog:
     at, (times, estimates, P) = run.covariance, ros.read_poses(run.estimate)
     true_times, truths, _ = ros.read_poses(run.truth)
     if geometry_of(truths) is not geometry_of(estimates):
-        raise ValueError(
-            f"{run.truth}: poses of the plane and of space; of one of them is accepted"
-        )
+        raise ValueError(f"{run.truth}: estimate and truth must both be planar or both be spatial")
     if at == run.estimate:
         text = CovarianceText(times, P, MIXED if isinstance(at, Path) else ROS)
     else:
@@ -422,14 +418,14 @@ def _check_times(path: Place, times: Float[np.ndarray, " n"]) -> None:
     back = np.flatnonzero(np.diff(times) < 0)
     if back.size:
         raise ValueError(
-            f"{path}: times go back from {times[back[0]]:.3f} to {times[back[0] + 1]:.3f} s; one "
-            "run, in order of time, is accepted"
+            f"{path}: times decrease from {times[back[0]]:.3f} to {times[back[0] + 1]:.3f} s; "
+            "expected one run in temporal order"
         )
     different = len(np.unique(times))
     if different < LEAST_SHARE * len(times):
         raise ValueError(
-            f"{path}: its {len(times)} poses have {different} different times, as if printed with "
-            "too few digits, or never stamped; a time of its own for each is accepted"
+            f"{path}: its {len(times)} poses have only {different} different times, perhaps "
+            "printed with too few digits or never stamped; every pose needs its own time"
         )
 
 
@@ -461,9 +457,9 @@ def _check_share(read: _RunLog) -> None:
     raise ValueError(
         f"{read.run.estimate}: of its {_held(read.times)} only {np.sum(there)} can be compared: "
         f"{np.sum(read.covariances.there)} have a covariance {_WITHIN}, and "
-        f"{np.sum(read.truths.there)} a truth. {path} holds {_held(worse.times)}, of which the "
-        f"nearest is {away:.3g} s away (median). A verdict needs half of the lines of the shortest "
-        "file, over half of the estimate's time"
+        f"{np.sum(read.truths.there)} a truth. {path} has {_held(worse.times)}; the nearest one "
+        f"is {away:.3g} s away (median). A verdict needs half the lines of the shortest file, "
+        "covering half the duration of the estimate"
     )
 
 
@@ -476,7 +472,6 @@ def _span(times: Float[np.ndarray, " n"]) -> float:
 
 
 FRAMES = "frames.csv"
-_MOST_MAPS = 1_000_000
 
 
 class FrameLog(NamedTuple):
@@ -521,12 +516,12 @@ def evaluated_poses(
     if away.max() > MAX_TIME_DIFFERENCE:
         raise ValueError(
             f"{path}: no frame is within {MAX_TIME_DIFFERENCE} s of the pose at "
-            f"{times[np.argmax(away)]:.3f} s; the frames of the trajectory beside it are accepted"
+            f"{times[np.argmax(away)]:.3f} s; it must list the frames of the trajectory beside it"
         )
     _, lost, maps, fixed = (x[nearest] for x in frames)
     usable = fixed & ~lost
     if not usable.any():
-        raise ValueError(f"{path}: no pose is of a frame that is not lost and whose unit is fixed")
+        raise ValueError(f"{path}: every frame with a pose is lost or has no fixed unit yet")
     number = int(np.argmax(np.bincount(maps[usable])))
     own = maps == number
     opening = own & ~lost & ~fixed & ~known
@@ -552,7 +547,7 @@ def read_frames(path: Path) -> FrameLog | None:
         if row != [""]
     ]
     if not table:
-        raise ValueError(f"{path}: holds no frames")
+        raise ValueError(f"{path} has no frames")
     return FrameLog(*(np.array(column) for column in zip(*table, strict=True)))
 
 
@@ -560,25 +555,25 @@ def _frame(place: str, told: dict[str, str]) -> tuple[float, bool, int, bool]:
     """The numbers of a frame, in the order of `FrameLog`. Raises ValueError for what is none."""
     try:
         time, number, fixed = float(told["time"]), int(told["map"]), told["unit_fixed"]
-        if np.isfinite(time) and 0 <= number <= _MOST_MAPS and fixed in ("0", "1"):
+        if np.isfinite(time) and 0 <= number <= 1_000_000 and fixed in ("0", "1"):
             return time, told["state"] == "lost", number, fixed == "1"
     except (ValueError, KeyError):
         pass
     raise ValueError(
-        f"{place}: a finite time, a state, the number of a map and unit_fixed, 0 or 1, are accepted"
+        f"{place}: expected a finite time, a state, the number of a map, and unit_fixed 0 or 1"
     )
 
 
 def left_out(runs: Sequence[EvaluatedPoses]) -> Iterator[str]:
     """A sentence for every reason why poses of the runs are not evaluated."""
     logged = sum(len(one.poses) for one in runs)
-    which = f"map {runs[0].map}, the longest," if len(runs) == 1 else "of each run the longest map"
+    which = f"map {runs[0].map}, the longest," if len(runs) == 1 else "the longest map of each run"
     reasons = (
-        (f"{which} is evaluated: ", "of other maps, each in a unit of its own"),
+        (f"{which} is evaluated: ", "of other maps, each with its own unit"),
         ("", "of frames that are lost"),
         ("", "from before the unit of their map was fixed"),
     )
     counts = np.sum([one.others for one in runs], axis=0)
     for (first, reason), count in zip(reasons, counts, strict=True):
         if count:
-            yield f"{first}{count} of {logged} poses are {reason}, and are left out"
+            yield f"{first}{count} of {logged} poses are {reason} and left out"

@@ -37,8 +37,8 @@ from jaxslam.evaluation.scale import Scale, at_one_scale, of_aligned
 from jaxslam.geometry import Geometry
 
 BEYOND = (
-    "NEES is given the scale, at the one of each run that explains all of its poses best; "
-    "positions are in the estimate's unit"
+    "NEES is computed at the scale of each run that explains all of its poses best; positions are "
+    "in the estimate's unit"
 )
 
 
@@ -95,7 +95,7 @@ def evaluate_poses(
     stated = convention or Convention()
     if not isinstance(stated, Convention):
         raise ValueError(
-            f"a convention is a jaxslam.Convention, as Convention('right'), not {stated}"
+            f"convention must be a jaxslam.Convention, such as Convention('right'), not {stated}"
         )
     lookup("align", [align], dict.fromkeys(ALIGNMENTS))
     poses = checked_poses(estimates, covariances, truths)
@@ -158,7 +158,7 @@ def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseE
     if truth_sigma is not None:
         later = _with_truth(world, later, convention, axes, truth_sigma)
         P, (metres, degrees) = later.covariances[..., axes[:, None], axes], truth_sigma
-        notes += (f"σ of the truth, {metres:g} m and {degrees:g}°, is a part of every σ claimed",)
+        notes += (f"every stated σ includes that of the truth, {metres:g} m and {degrees:g}°",)
     if world.given:
         errors, P, fitted, axis_fitted, scale = at_one_scale(later, convention, axes)
         notes += (BEYOND,)
@@ -254,7 +254,6 @@ def _tried(
 
 _NOTHING = 1e-3
 """Errors that are less of σ at every pose are no errors."""
-_UNCORRELATED = 1e-6
 
 
 def axes_named(
@@ -293,7 +292,7 @@ def estimated(
         for which in (True, False)
     )
     return used, (
-        f"{', '.join(left)}: errors are zero throughout, so that nothing was estimated; left out, "
+        f"{', '.join(left)}: errors are always zero, so these axes were not estimated; left out, "
         f"as with --axes-used {','.join(used)}",
     )
 
@@ -302,7 +301,7 @@ def _alone(P: np.ndarray, sigma: np.ndarray) -> Bool[np.ndarray, " t"]:
     """A mask of the axes that have no correlation with any other."""
     scale = np.where(sigma > 0, sigma, 1.0)
     correlation = np.abs(P) / scale[:, :, None] / scale[:, None] * (1 - np.eye(P.shape[-1]))
-    return (correlation <= _UNCORRELATED).all(axis=(0, 1))
+    return (correlation <= 1e-6).all(axis=(0, 1))
 
 
 def _constant(poses: Poses) -> Bool[np.ndarray, " t"]:

@@ -30,8 +30,6 @@ _LIKE = 2.0
 """A factor further from 57.3 than by so much is another one."""
 _SLACK = 1.25
 """The factor by which the interval may miss it."""
-_LEVEL = 0.01
-"""The probability that the interval misses the factor that all covariances are wrong by."""
 _SHARE, _BELOW = 0.4, 5.0
 """The share of the samples that may be lower by so much: of 8 from χ² no more are, but for 3 %."""
 _NARROW = 5.0
@@ -39,8 +37,6 @@ _NARROW = 5.0
 of 8 runs is narrower."""
 _ALIKE = 4.0
 """The widest one of a verdict, which is of the runs' scatter too, where no other axis is right."""
-_CORRELATED = 0.3
-"""Neighbours that correlate less may be strangers."""
 _MANY = 300
 """The most runs and steps whose correlations are tested."""
 _ANGLES = re.compile(
@@ -121,7 +117,7 @@ def _unwrapped(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake
             others += f" in {run.sum()} runs" if run.sum() > 1 else ""
             yield Mistake(
                 f"an angle is not wrapped ({logged.names[axis]})",
-                f"errors of {logged.names[axis]} are off by full turns, near multiples of {turn} "
+                f"errors of {logged.names[axis]} are near multiples of {turn} "
                 f"and nowhere between: {e[first, step]:.4g} at {logged.steps[step]} of "
                 f"{logged.runs[first]}{others}; wrap them to {wrapped}",
             )
@@ -177,10 +173,10 @@ def _degrees(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake]:
         names = ", ".join(logged.names[axis] for axis in found)
         told = f"180/π is {DEGREES:.3g}" if factor > 1 else f"π/180 is {1 / DEGREES:.3g}"
         yield Mistake(
-            f"degrees where radians belong ({names})",
-            f"errors of {names} look as if they were in {errors} and the covariances in "
+            f"degrees instead of radians ({names})",
+            f"errors of {names} appear to be in {errors} and the covariances in "
             f"{covariances}: σ should be {wrong[found[0]].by:.3g} times as large, and "
-            f"{told}; both in radians are accepted",
+            f"{told}; give both in radians",
         )
 
 
@@ -207,7 +203,8 @@ class _Factor(NamedTuple):
             white = logged.factors[axis].get("samples") == "steps"
             samples = nees[there] if white else nees.mean(axis=1, where=there)
             mean, n = np.mean(samples), len(samples)
-            most, least = (shortfall_limit(n, _LEVEL, above=above) / n for above in (True, False))
+            # The probability that the interval misses the factor that all covariances are wrong by.
+            most, least = (shortfall_limit(n, 0.01, above=above) / n for above in (True, False))
             numbers = np.sqrt([mean, mean / most, mean / least, np.quantile(samples, _SHARE)])
         return _Factor(*map(float, numbers))
 
@@ -235,13 +232,14 @@ def _interchanged(logged: Logged) -> Iterator[Mistake]:
     x = x / np.hypot(1.0, x)  # an error that is far off counts as one that is somewhat so
     runs, steps = (_products(np.swapaxes(x, 0, axis)) for axis in (0, 1))
     ours, theirs = _alike(runs), _alike(steps)
-    if ours < _CORRELATED or theirs > ours / 2 or not _by_order(runs):
+    # Neighbours that correlate less may be strangers.
+    if ours < 0.3 or theirs > ours / 2 or not _by_order(runs):
         return
     yield Mistake(
-        "runs and steps look interchanged",
+        "runs and steps appear to be swapped",
         f"errors of neighbouring runs correlate by {ours:.2f} and those of neighbouring steps by "
-        f"{theirs:.2f}, as if steps came first and runs second; (runs, steps, …) is accepted, of "
-        "runs that are independent of each other",
+        f"{theirs:.2f}, as if steps came first and runs second; expected (runs, steps, …) of "
+        "independent runs",
     )
 
 

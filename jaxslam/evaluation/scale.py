@@ -23,13 +23,8 @@ from jaxslam.evaluation.inputs import Poses, correlations, sigmas
 from jaxslam.statistics.beyond_scale import SCALES, BeyondScale, one_scale
 from jaxslam.statistics.verdict import Verdict, run_verdict
 
-DRIFT_CONFIDENCE = 0.999
-"""The confidence of the verdict on drift: with that on NEES, which is one-sided where a fit took a
-degree of freedom, a right filter is called inconsistent once in a hundred studies all the same."""
 QUANTILES = (0.025, 0.5, 0.975)
 """The quantiles of the runs' drifts, per step."""
-_LEFT = 1e-9
-"""The share of a covariance that is left where one pose alone determines the scale."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,24 +72,27 @@ class Scale:
 
     @property
     def disproved(self) -> bool:
-        """Whether the scale drifts more than σ allows, beyond doubt."""
+        """Whether the scale certainly drifts more than σ allows."""
         found = self.verdict
+        # The confidence of the verdict on drift: with that on NEES, which is one-sided where a fit
+        # took a degree of freedom, a right filter is called inconsistent in one of a hundred
+        # studies.
         return bool(
             found is not None
             and (found["nees"] is None or found["nees"] > 1)
-            and found["p"] < 1 - DRIFT_CONFIDENCE
+            and found["p"] < 1 - 0.999
         )
 
     @property
     def sentence(self) -> str:
         """A sentence: `the scale drifts by 12 % (RMS) along a run, 5 times what σ allows …`."""
         if self.verdict is None:
-            return "no pose tells a scale"
+            return "no pose determines a scale"
         size = f"{100 * np.expm1(min(self.rms, 700.0)):.2g}"
         told = f"the scale drifts by {size} % (RMS) along a run, {self.factor:.2g} times "
         if self.disproved:
-            return told + "what σ allows: over-confident"
-        return told + "its σ: not more than σ allows"
+            return told + "its σ: over-confident"
+        return told + "its σ: no more than σ allows"
 
     @property
     def over_runs(self) -> tuple[Float[np.ndarray, "2 steps"], np.ndarray, np.ndarray]:
@@ -225,7 +223,8 @@ def _jointly(
         log_scale[run] = np.log(s)
         e[run] += G[run] * (s - 1)
         left[run] -= (G[run, :, :, None] * G[run, :, None]) / information
-    left += _LEFT * own
+    # The share of a covariance that is left where one pose alone determines the scale.
+    left += 1e-9 * own
     told = poses.logged & np.isfinite(log_scale)[:, None] & (np.abs(G).max(axis=-1) > 0)
     h = np.linalg.solve(own[told], G[told][..., None])[..., 0]
     h /= np.sum(h * G[told], axis=-1)[:, None]
@@ -249,7 +248,7 @@ def _fitted(
     except np.linalg.LinAlgError:
         raise ValueError(
             f"the joint covariance of run {run} is not positive definite; NEES at one scale needs "
-            "one, or the covariances of the poses alone"
+            "one that is, or only the covariances of single poses"
         ) from None
     residual, slope = np.linalg.solve(L, np.stack([e, G], axis=1) * scaling[:, None]).T
     information = float(slope @ slope)

@@ -92,6 +92,7 @@ class AbstractLayer(eqx.Module):
         return inner
 
     def ambiguous_start(self, slam: AbstractSlam) -> bool:
+        """As `AbstractStaged` has it."""
         return slam.inner.ambiguous_start
 
     def init(
@@ -125,6 +126,7 @@ class AbstractLayer(eqx.Module):
     def update(
         self, slam: AbstractSlam, state: Belief, control: Control, seen: Features
     ) -> Corrected:
+        """As `AbstractStaged` has it."""
         inner, innovation = slam.inner.update(self.inside(state), control, seen)
         return self.around(state, inner), innovation
 
@@ -132,11 +134,13 @@ class AbstractLayer(eqx.Module):
         return self.around(state, slam.inner.compose(self.inside(state), control))
 
     def close(self, slam: AbstractSlam, state: Belief, new: Features) -> Belief:
+        """As `AbstractStaged` has it."""
         return self.around(state, slam.inner.close(self.inside(state), new))
 
     def remove(
         self, slam: AbstractSlam, state: Belief, gone: Bool[AnyArray, " capacity"]
     ) -> Belief:
+        """As `AbstractStaged` has it."""
         return self.around(state, slam.inner.remove(self.inside(state), gone))
 
     def marginal(self, slam: AbstractSlam, state: Belief, function: OfCamera) -> Moments:
@@ -154,4 +158,5 @@ class AbstractLayer(eqx.Module):
         return slam.inner.pose_error(self.inside(state), T_BC)
 
     def unit_fixed(self, slam: AbstractSlam, state: Belief) -> Bool[Array, ""]:
+        """As `AbstractStaged` has it."""
         return slam.inner.unit_fixed(self.inside(state))

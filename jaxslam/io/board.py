@@ -9,11 +9,6 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 KINDS = ("checkerboard", "charuco")
-MARKER_SHARE = 0.75
-"""Side of a ChArUco marker, in squares."""
-_LEAST_CORNERS = 8
-_REACH = 0.3
-"""To each side of a corner, in the least distance of two, in which it is refined."""
 _AROUND = 9
 """Side of the neighbourhood of a corner, pixels, in which its edges are looked at."""
 
@@ -32,7 +27,7 @@ class View(NamedTuple):
 
 @dataclass(frozen=True)
 class Board:
-    """So many squares across and down, of side `square`, m, counted on the paper.
+    """A board of squares across and down, counted on the paper, of side `square`, m.
 
     A `charuco` board has a marker of `dictionary` in every white square, so that part of it is
     enough. Raises ValueError for what is no board.
@@ -49,12 +44,15 @@ class Board:
             raise ValueError(f"unknown board {self.kind!r}; known: {', '.join(KINDS)}")
         if min(self.columns, self.rows) < 4:
             raise ValueError(
-                f"a board of {self.columns}x{self.rows} squares; at least 4x4 are accepted"
+                f"a board must have at least 4x4 squares, not {self.columns}x{self.rows}"
             )
         if not 0 < self.square < np.inf:
-            raise ValueError(f"square is {self.square} m; a positive length is accepted")
+            raise ValueError(f"square must be a positive length, not {self.square} m")
         if not hasattr(cv2.aruco, f"DICT_{self.dictionary}"):
-            raise ValueError(f"unknown dictionary {self.dictionary!r}; as 4X4_50, 5X5_100, 6X6_250")
+            raise ValueError(
+                f"unknown dictionary {self.dictionary!r}; known: 4X4_50, 5X5_100, 6X6_250 and "
+                "OpenCV's others"
+            )
 
     @property
     def corners(self) -> Float32[np.ndarray, "n 3"]:
@@ -69,7 +67,8 @@ class Board:
             getattr(cv2.aruco, f"DICT_{self.dictionary}")
         )
         size = (self.columns, self.rows)
-        return cv2.aruco.CharucoBoard(size, self.square, MARKER_SHARE * self.square, dictionary)
+        # Side of a ChArUco marker, in squares.
+        return cv2.aruco.CharucoBoard(size, self.square, 0.75 * self.square, dictionary)
 
     @cached_property
     def _detector(self) -> cv2.aruco.CharucoDetector:
@@ -89,7 +88,7 @@ class Board:
         """The board in a picture; None where too little of it is seen."""
         find = self._find_charuco if self.kind == "charuco" else self._find_checkerboard
         pixels, points = find(image)
-        if len(pixels) < _LEAST_CORNERS or np.linalg.matrix_rank(points - points[0]) < 2:
+        if len(pixels) < 8 or np.linalg.matrix_rank(points - points[0]) < 2:
             return None
         outline = self._outline(pixels, points)
         if outline is None:
@@ -110,7 +109,8 @@ class Board:
         """The saddles of the grey levels: three times as exact as where they were detected."""
         grid = pixels.reshape(self.rows - 1, self.columns - 1, 2)
         apart = min(np.linalg.norm(np.diff(grid, axis=a), axis=2).min() for a in (0, 1))
-        reach = int(np.clip(_REACH * apart, 2, 10))
+        # To each side of a corner, in the least distance of two, in which it is refined.
+        reach = int(np.clip(0.3 * apart, 2, 10))
         end = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
         return cv2.cornerSubPix(image, pixels, (reach, reach), (-1, -1), end).reshape(-1, 2)
 

@@ -15,16 +15,8 @@ from jaxslam.io.calibration import Calibration, write_calibration
 from jaxslam.io.opening import open_recording
 from jaxslam.io.recording import Recording
 
-LOOKED_AT = 300
-"""Pictures of a video in which the board is sought, at the most, spread over all of it."""
 VIEWS = 30
 LEAST_VIEWS = 6
-_SHARP = 0.7
-"""A view is sharp whose sharpness reaches this share of the median."""
-_DIFFERENT = 0.02
-"""Views differ whose outlines are this share of the picture's diagonal apart (RMS)."""
-_OUTLIER = 3.0
-"""A view is left out whose error is so many times the median's."""
 _CELLS = (10, 8)
 
 
@@ -35,7 +27,7 @@ class Calibrated:
     calibration: Calibration
     distortion_sigma: tuple[float, ...]
     rms: float
-    """Of the reprojection error, pixels."""
+    """The RMS reprojection error, pixels."""
     views: tuple[View, ...]
 
     @property
@@ -53,14 +45,14 @@ def calibrate(
     """
     recording = open_recording(source)
     if recording.clock is not None:
-        raise ValueError(f"{recording.name}: is live; a video of a board is accepted")
+        raise ValueError(f"{recording.name} is a live camera; expected a video of a board")
     size, views = _views(recording, board, progress)
     chosen = different(views, size)
     if len(chosen) < LEAST_VIEWS:
         raise ValueError(
             f"{source}: {len(views)} pictures show the whole board of {board.columns}x{board.rows} "
-            f"squares (counted on the paper), of which {len(chosen)} are sharp and differ; at "
-            f"least {LEAST_VIEWS} are needed"
+            f"squares, of which {len(chosen)} are sharp and different; at least {LEAST_VIEWS} are "
+            "needed"
         )
     return fitted(chosen, size)
 
@@ -69,12 +61,13 @@ def _views(
     recording: Recording, board: Board, progress: Callable[[int], None]
 ) -> tuple[tuple[int, int], list[View]]:
     """Width and height of the pictures, and the views of the board in them."""
-    every = -(-len(recording.times) // LOOKED_AT)
+    # The most pictures of a video in which the board is sought, spread over all of it.
+    every = -(-len(recording.times) // 300)
     size, views = (0, 0), []
     for index, image in enumerate(recording.images()):
         progress(1)
         if index and image.shape[::-1] != size:
-            raise ValueError(f"{recording.name}: picture {index} is of another size than the first")
+            raise ValueError(f"{recording.name}: picture {index} differs in size from the first")
         size = image.shape[::-1]
         view = board.find(image) if index % every == 0 else None
         views += [] if view is None else [view]
@@ -85,12 +78,14 @@ def different(views: Sequence[View], size: tuple[int, int], count: int = VIEWS) 
     """The sharp views, the sharpest first, then always the one that differs most from those."""
     if not views:
         return []
-    enough = _SHARP * np.median([view.sharpness for view in views])
+    # A view is sharp whose sharpness reaches this share of the median.
+    enough = 0.7 * np.median([view.sharpness for view in views])
     rest = sorted((v for v in views if v.sharpness >= enough), key=lambda v: -v.sharpness)
     outlines = np.array([view.outline for view in rest]) / np.hypot(*size)
     chosen = [0]
     apart = _distance(outlines, outlines[0])
-    while len(chosen) < count and apart.max() > _DIFFERENT:
+    # Views differ whose outlines are this share of the picture's diagonal apart (RMS).
+    while len(chosen) < count and apart.max() > 0.02:
         chosen.append(int(np.argmax(apart)))
         apart = np.minimum(apart, _distance(outlines, outlines[chosen[-1]]))
     return [rest[place] for place in chosen]
@@ -109,7 +104,8 @@ def fitted(views: Sequence[View], size: tuple[int, int]) -> Calibrated:
     fit far worse than the others are left out, once.
     """
     errors = _least_squares(views, size)[-1].ravel()
-    kept = [v for v, e in zip(views, errors, strict=True) if e <= _OUTLIER * np.median(errors)]
+    # A view is left out whose error is so many times the median's.
+    kept = [v for v, e in zip(views, errors, strict=True) if e <= 3.0 * np.median(errors)]
     rms, K, distortion, _, _, sigma, _, _ = _least_squares(kept, size)
     sigma = sigma.ravel().tolist()
     calibration = Calibration(

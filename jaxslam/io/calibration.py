@@ -49,13 +49,13 @@ class Calibration:
         for key in ("width", "height"):
             value = getattr(self, key)
             if value != int(value):
-                raise ValueError(f"{key} is {value}; a whole number of pixels is accepted")
+                raise ValueError(f"{key} must be a whole number of pixels, not {value}")
             object.__setattr__(self, key, int(value))
         for key in ("fx", "fy", "cx", "cy"):
             object.__setattr__(self, key, float(getattr(self, key)))
         for key in ("width", "height", "fx", "fy"):
             if getattr(self, key) <= 0:
-                raise ValueError(f"{key} is {getattr(self, key)}; a positive number is accepted")
+                raise ValueError(f"{key} must be positive, not {getattr(self, key)}")
         object.__setattr__(self, "distortion", _padded(self.distortion))
         object.__setattr__(self, "sigma", _checked_sigma(self.sigma))
 
@@ -71,7 +71,7 @@ class Calibration:
         """
         for name, pixels in (("width", width), ("height", height)):
             if pixels < 1:
-                raise ValueError(f"{name} would be {pixels}; at least one pixel is accepted")
+                raise ValueError(f"{name} would be {pixels}; it must be at least one pixel")
         x, y = width / self.width, height / self.height
         return replace(
             self,
@@ -91,7 +91,7 @@ def from_field_of_view(width: int, height: int, degrees: float | None = None) ->
     `f = (w/2) / tan(fov/2)`; the pixels are square, the axis goes through the middle.
     """
     if degrees is not None and not 0 < degrees < 180:
-        raise ValueError(f"fov is {degrees}°; more than 0 and less than 180 are accepted")
+        raise ValueError(f"fov must be between 0° and 180°, not {degrees}°")
     side, fov = (max(width, height), GUESSED_FIELD_OF_VIEW) if degrees is None else (width, degrees)
     focal = side / 2 / math.tan(math.radians(fov) / 2)
     of_focal = focal * (_GUESSED_SHARE if degrees is None else _TOLD_SHARE)
@@ -138,16 +138,16 @@ def from_fields(fields: object) -> Calibration:
     Raises ValueError for what is no pinhole camera's.
     """
     if not isinstance(fields, dict):
-        raise ValueError(f"holds a {type(fields).__name__}; a JSON object is accepted")
+        raise ValueError(f"expected a JSON object, not a {type(fields).__name__}")
     model = fields.get("model", MODEL)
     if model != MODEL:
-        raise ValueError(f"camera model {model!r} is unknown; {MODEL!r} is accepted")
+        raise ValueError(f"unknown camera model {model!r}; expected {MODEL!r}")
     missing = [key for key in _KEYS if key not in fields]
     if missing:
-        raise ValueError(f"{', '.join(missing)} missing; {', '.join(_KEYS)} are needed")
+        raise ValueError(f"missing {', '.join(missing)}; {', '.join(_KEYS)} are needed")
     distortion = fields.get("distortion", [])
     if not isinstance(distortion, list):
-        raise ValueError("distortion is not a list; OpenCV's k1, k2, p1, p2, k3 are accepted")
+        raise ValueError("distortion must be a list of OpenCV's k1, k2, p1, p2, k3")
     return Calibration(
         **{key: fields[key] for key in _KEYS},
         distortion=tuple(distortion),
@@ -158,32 +158,32 @@ def from_fields(fields: object) -> Calibration:
 
 def _sigma_from(sigma: object) -> tuple[float, ...]:
     if not isinstance(sigma, dict) or (sigma and not sigma.keys() >= set(INTRINSICS)):
-        raise ValueError(f"sigma is {sigma!r}; one with {', '.join(INTRINSICS)} is accepted")
+        raise ValueError(f"sigma must be an object with {', '.join(INTRINSICS)}, not {sigma!r}")
     return tuple(sigma[key] for key in INTRINSICS) if sigma else ()
 
 
 def _require_number(name: str, value: object) -> None:
     # bool is an int to Python, but `true` in the file is a mistake.
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-        raise ValueError(f"{name} is {value!r}; a number is accepted")
+        raise ValueError(f"{name} must be a number, not {value!r}")
     if not abs(value) < math.inf or (isinstance(value, int) and abs(value) > 2**63):
-        raise ValueError(f"{name} is {value}; a finite number is accepted")
+        raise ValueError(f"{name} must be finite, not {value}")
 
 
 def _checked_sigma(sigma: Sequence[float]) -> tuple[float, ...]:
     if len(sigma) not in (0, 4):
-        raise ValueError(f"sigma has {len(sigma)} entries; of fx, fy, cx, cy are accepted")
+        raise ValueError(f"sigma has {len(sigma)} entries; expected those of fx, fy, cx, cy")
     for key, value in zip(INTRINSICS, sigma, strict=False):
         _require_number(f"sigma of {key}", value)
         if value < 0:
-            raise ValueError(f"sigma of {key} is {value}; at least zero is accepted")
+            raise ValueError(f"sigma of {key} must not be negative, not {value}")
     return tuple(float(value) for value in sigma)
 
 
 def _padded(distortion: Sequence[float]) -> tuple[float, ...]:
     if len(distortion) > 5:
         raise ValueError(
-            f"distortion has {len(distortion)} entries; k1, k2, p1, p2, k3 at most are accepted"
+            f"distortion has {len(distortion)} entries; expected at most k1, k2, p1, p2, k3"
         )
     for index, value in enumerate(distortion):
         _require_number(f"distortion[{index}]", value)

@@ -69,7 +69,7 @@ class _Newest:
             self._changed.wait_for(lambda: self._picture or not self._running, PATIENCE)
             picture, self._picture = self._picture, None
         if picture is None:
-            raise ValueError(f"camera {number} delivers no picture")
+            raise ValueError(f"camera {number} delivers no pictures")
         return picture
 
     def stop(self) -> None:

@@ -47,10 +47,10 @@ def _root(path: Path) -> Path:
 def read_sensor(path: Path) -> Calibration:
     """The calibration in a `sensor.yaml`: pinhole, radial-tangential. Raises ValueError."""
     text = "\n".join(text_lines(path).values())
-    for key, accepted in (("camera_model", "pinhole"), ("distortion_model", "radial-tangential")):
+    for key, expected in (("camera_model", "pinhole"), ("distortion_model", "radial-tangential")):
         found = re.search(rf"^{key}:\s*([\w-]+)", text, re.MULTILINE)
-        if found and found[1] != accepted:
-            raise ValueError(f"{path}: {key} {found[1]!r} is unknown; {accepted!r} is accepted")
+        if found and found[1] != expected:
+            raise ValueError(f"{path}: unknown {key} {found[1]!r}; expected {expected!r}")
     width, height = _numbers(path, text, "resolution", 2)
     try:
         return Calibration(

@@ -37,7 +37,7 @@ def read_times(path: Path) -> Float[np.ndarray, " n"]:
         raise ValueError(f"{path}: cannot be read as a video")
     if len(times) < stated:
         warnings.warn(
-            f"{path}: says that it has {stated:.0f} pictures, of which {len(times)} can be read",
+            f"{path}: only {len(times)} of the {stated:.0f} pictures it claims to have can be read",
             stacklevel=2,
         )
     wrong = np.flatnonzero(~(np.diff(times) > 0))
@@ -47,8 +47,8 @@ def read_times(path: Path) -> Float[np.ndarray, " n"]:
 def _at_rate(path: Path, times: list[float], wrong: int, rate: float) -> Float[np.ndarray, " n"]:
     place = f"picture {wrong} is at {times[wrong]:.3f} s, after one at {times[wrong - 1]:.3f} s"
     if not (math.isfinite(rate) and rate > 0):
-        raise ValueError(f"{path}: {place}, and no frame rate is stated")
-    warnings.warn(f"{path}: {place}; taken at {rate:g} frames a second instead", stacklevel=2)
+        raise ValueError(f"{path}: {place}, and its frame rate is unknown")
+    warnings.warn(f"{path}: {place}; {rate:g} frames per second are assumed instead", stacklevel=2)
     return np.arange(len(times)) / rate
 
 

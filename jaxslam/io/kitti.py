@@ -40,7 +40,7 @@ def _open(path: Path, _rate: float) -> Recording:
 
 
 def _read_times(path: Path) -> Float[np.ndarray, " n"]:
-    _, rows, lines = read_table(path, "times", "times", "finite times, s,", 1, spare=True)
+    _, rows, lines = read_table(path, "times", "times", "finite times in seconds", 1, spare=True)
     check_increasing(f"{path}, line", lines, rows[:, 0])
     return rows[:, 0]
 
@@ -52,12 +52,12 @@ def _projection(path: Path, camera: str) -> Float[np.ndarray, "3 4"]:
         if name.strip() == f"P{camera}":
             told, place = numbers(rest.split(), 12), f"{path}, line {number}"
             if told is None:
-                raise ValueError(f"{place}: P{camera}: and twelve numbers are accepted")
+                raise ValueError(f"{place}: expected P{camera}: and twelve numbers")
             P = np.array(told).reshape(3, 4)
             if not (np.abs(P).max() <= LARGEST and (np.diagonal(P) != 0).all()):
-                raise ValueError(f"{place}: no projection of a camera with a focal length")
+                raise ValueError(f"{place}: not a projection matrix with a positive focal length")
             return P
-    raise ValueError(f"{path}: has no line P{camera}: of the images image_{camera}")
+    raise ValueError(f"{path} has no line P{camera}: for the images in image_{camera}")
 
 
 def _calibrator(P: Float[np.ndarray, "3 4"]) -> Calibrator:
@@ -76,7 +76,7 @@ def _camera_truth(
     path: Path, times: Float[np.ndarray, " n"], P: Float[np.ndarray, "3 4"] | None
 ) -> Trajectory:
     """Rows of a 3x4 T_wc; camera c is at `-K⁻¹ P₄` in the left grey one, unturned."""
-    row = "12 finite numbers, the rows of a 3x4 T_wc,"
+    row = "12 finite numbers, the rows of a 3x4 T_wc"
     rows = read_table(path, "poses", "poses", row, 12, spare=True).rows.reshape(-1, 3, 4)
     _check_count(path, len(rows), len(times))
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -89,7 +89,7 @@ def _camera_truth(
 
 def _check_count(path: Path, found: int, images: int) -> None:
     if found != images:
-        raise ValueError(f"{path}: holds {found} lines for {images} images")
+        raise ValueError(f"{path} has {found} lines for {images} images")
 
 
 KITTI = Layout(

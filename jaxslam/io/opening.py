@@ -46,18 +46,18 @@ def open_source(
     `calibration` (JSON), `fov` (horizontal field of view, degrees) and `reference` (TUM
     trajectory) override what the layout holds; where nothing is known of the camera, its
     calibration is guessed, with a warning. `rate` is the frame rate in 1/s of a plain folder of
-    images. Taken is every `every`-th frame, from `start` seconds after the first on, `frames` of
-    them at the most, pictures and calibration `scale` times as large: by default those of more than
-    `WIDEST` pixels are made a half as large, or a third and so on, with a warning. Raises
+    images. Every `every`-th frame is taken, from `start` seconds after the first on, at most
+    `frames` of them. Pictures and calibration are resized by the factor `scale`; by default those
+    of more than `WIDEST` pixels are reduced to a half, a third and so on, with a warning. Raises
     `ValueError`, naming the file and line, for anything missing, unreadable or contradictory; the
     first image is read here, later ones as the source is iterated over.
     """
     if calibration and fov is not None:
-        raise ValueError("a calibration and a field of view are given; one of them is accepted")
+        raise ValueError("give a calibration or a field of view, not both")
     recording = open_recording(path, rate)
     image = next(recording.images(), None)
     if image is None:
-        raise ValueError(f"{path}: not a single frame can be read")
+        raise ValueError(f"{path}: no frame can be read")
     height, width = image.shape
     camera = _calibration(recording, width, height, calibration, fov)
     check_size(f"{recording.name}: image 0", image, camera)
@@ -76,7 +76,7 @@ def open_recording(path: str | Path, rate: float = 30.0) -> Recording:
     """The recording at `path`, before an image is read. Raises ValueError."""
     path = Path(path)
     if not (math.isfinite(rate) and rate > 0):
-        raise ValueError(f"rate is {rate}; a positive number of frames a second is accepted")
+        raise ValueError(f"rate must be a positive number of frames per second, not {rate}")
     return _layout_of(path).open(path, rate)
 
 
@@ -87,13 +87,13 @@ def _layout_of(path: Path) -> Layout:
     if not path.exists():
         raise ValueError(f"{path}: no such file or folder")
     names = "; ".join(layout.name for layout in LAYOUTS)
-    raise ValueError(f"{path}: {_found(path)}, an unknown kind of source; accepted: {names}")
+    raise ValueError(f"{path}: {_found(path)}, not a known kind of source; known: {names}")
 
 
 def _found(path: Path) -> str:
     """A few words on what was found."""
     if not path.is_dir():
-        return f"a file {path.suffix or 'without an ending'}"
+        return f"a file {path.suffix or 'without a suffix'}"
     names = [file.name + "/" * file.is_dir() for file in itertools.islice(path.iterdir(), 5)]
     return f"a folder with {', '.join(sorted(names)) + ', …' if names else 'nothing in it'}"
 
@@ -103,8 +103,8 @@ def _scale_for(name: str, width: int, height: int) -> float:
     part = math.ceil(max(width, height) / WIDEST)
     if part > 1:
         warnings.warn(
-            f"{name}: pictures of {width}x{height} are tracked at 1/{part} of their size, which is "
-            "faster, and better for patches of so many pixels; a scale of 1 keeps them",
+            f"{name}: pictures of {width}x{height} are reduced to 1/{part} of their size, which is "
+            "faster and suits the size of the patches; --scale 1 keeps their size",
             stacklevel=3,
         )
     return 1 / part
@@ -121,9 +121,9 @@ def _calibration(
     if recording.calibration is not None:
         return recording.calibration(width, height)
     warnings.warn(
-        f"{recording.name}: comes without a calibration; a horizontal field of view of "
-        f"{GUESSED_FIELD_OF_VIEW:g}° is guessed, and estimated. Better: a calibration (docs/"
-        "own-video.md), or the camera's field of view",
+        f"{recording.name} has no calibration: a horizontal field of view of "
+        f"{GUESSED_FIELD_OF_VIEW:g}° is guessed, and the lens estimated. Better: give a "
+        "calibration (docs/own-video.md) or the camera's field of view",
         stacklevel=3,
     )
     return from_field_of_view(width, height)

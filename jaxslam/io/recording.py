@@ -81,7 +81,7 @@ def listed(listing: Path, folder: Path, names: list[str]) -> list[Path]:
     files = [folder / name for name in names]
     for name, file in zip(names, files, strict=True):
         if not os.path.isfile(file):  # which a name that no file can have is not either
-            raise ValueError(f"{listing}: names {name}, but {file} is missing")
+            raise ValueError(f"{listing} names {name}, but {file} is missing")
     return files
 
 
@@ -140,7 +140,7 @@ def read_timestamps(
     """
     lines = text_lines(path)
     if not lines:
-        raise ValueError(f"{path}: holds no lines of a time and a file")
+        raise ValueError(f"{path} has no lines with a time and a file")
     told = [_timestamp(f"{path}, line {n}", line, separator) for n, line in lines.items()]
     times = np.array([time for time, _ in told]) / ticks
     check_increasing(f"{path}, line", list(lines), times)
@@ -159,14 +159,14 @@ def check_rigid(path: Path, T: Float[np.ndarray, "n 4 4"]) -> None:
     wrong = not_rigid(T, 0.01) | ~(np.abs(T[:, :3, 3]).max(axis=1) <= LARGEST)
     if wrong.any():
         pose = int(np.argmax(wrong))
-        raise ValueError(f"{path}: pose {pose} is no rigid motion [R t] with R a rotation")
+        raise ValueError(f"{path}: pose {pose} is not a rigid motion [R t] with a rotation R")
 
 
 def _timestamp(place: str, line: str, separator: str | None) -> tuple[float, str]:
     words = line.split(separator, maxsplit=1)
     time = numbers(words[:1], 1)
     if len(words) != 2 or time is None:
-        raise ValueError(f"{place}: a finite time and a file are accepted, not {line!r}")
+        raise ValueError(f"{place}: expected a finite time and a file, not {line!r}")
     return time[0], words[1].strip()
 
 

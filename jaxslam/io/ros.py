@@ -92,7 +92,7 @@ def _opened(path: Path) -> Generator[tuple[Message, Callable[[bytes, str], Messa
             yield reader, store.deserialize_ros1 if first else store.deserialize_cdr
     except Exception as error:  # of many kinds, as the library trusts its bytes
         told = one_line(error) or type(error).__name__
-        raise ValueError(f"{path}: cannot be read ({told}); {BAG}, whole, is accepted") from None
+        raise ValueError(f"{path}: cannot be read ({told}); expected {BAG}, complete") from None
 
 
 def body_of(place: Path | Topic) -> str:
@@ -119,7 +119,7 @@ def read_poses(place: Path | Topic) -> tuple[np.ndarray, np.ndarray, np.ndarray]
         stamped = (pose for path in deque(stamped, 1) for pose in path.poses)
     rows = np.array([_row(message) for message in stamped], float)
     if not len(rows):
-        raise ValueError(f"{place}: holds no poses; a topic with poses is accepted")
+        raise ValueError(f"{place} has no poses; choose a topic with poses")
     T_wc = rows_as_poses(lambda i: f"{place}, pose {i}", rows)
     return rows[:, 0], T_wc, rows[:, 8:].reshape(-1, 6, 6)
 

@@ -41,14 +41,14 @@ def as_image(place: str, message: Message) -> Image:
     encoding = {"8UC1": "mono8", "8UC3": "bgr8"}.get(message.encoding, message.encoding)
     name, size = encoding.removesuffix("8").removesuffix("16"), 2 if encoding.endswith("16") else 1
     if name not in _GREY or name == encoding:
-        raise ValueError(f"{place}: encoding {encoding!r} is unknown; {_ACCEPTED} are accepted")
+        raise ValueError(f"{place}: unknown encoding {encoding!r}; known: {_ACCEPTED}")
     channels, how = _GREY[name]
     height, width, step = message.height, message.width, message.step
     used = width * channels * size
     if not (0 < used <= step and 0 < height * step <= len(message.data)):
         raise ValueError(
-            f"{place}: {len(message.data)} bytes in rows of {step} are no {width}x{height} picture "
-            f"in {encoding}; a whole one is accepted"
+            f"{place}: {len(message.data)} bytes in rows of {step} are not a complete "
+            f"{width}x{height} picture in {encoding}"
         )
     rows = message.data[: height * step].reshape(height, step)[:, :used]
     rows = rows[:, 0 if message.is_bigendian else size - 1 :: size]
@@ -72,7 +72,7 @@ def _calibrator(topic: Topic) -> Calibrator | None:
         rectified, model = "rect" in last, info.distortion_model
         if not rectified and model != "plumb_bob":
             raise ValueError(
-                f"{beside}: distortion {model!r} is unknown; plumb_bob or --calibration is accepted"
+                f"{beside}: unknown distortion {model!r}; expected plumb_bob, or give --calibration"
             )
         distortion = () if rectified else tuple(D)
         matrix = (P if rectified else K).reshape(3, -1)[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()

@@ -28,7 +28,7 @@ def _number(file: Path) -> int:
     """The XXXXXX of a frame's name: a picture left out leaves a gap in time."""
     number = file.name.removeprefix("frame-").removesuffix(PICTURE)
     if not number.isdecimal():
-        raise ValueError(f"{file}: frame-NUMBER{PICTURE} is accepted")
+        raise ValueError(f"{file}: expected the name frame-NUMBER{PICTURE}")
     return int(number)
 
 
@@ -47,7 +47,7 @@ def _pose(path: Path) -> np.ndarray:
     row = "four numbers, a row of a 4x4 matrix,"
     matrix = read_table(path, "pose", "pose", row, 4, finite=False, spare=True).rows
     if matrix.shape != (4, 4):
-        raise ValueError(f"{path}: holds {len(matrix)} rows; a 4x4 matrix is accepted")
+        raise ValueError(f"{path} has {len(matrix)} rows; expected a 4x4 matrix")
     return matrix
 
 

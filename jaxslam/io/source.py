@@ -63,7 +63,7 @@ class Source:
             yield Frame(index, float(time), image)
             index += self.every
         if index < self.first + self.every * len(self):
-            raise ValueError(f"{self.name}: image {index} cannot be read: the pictures end there")
+            raise ValueError(f"{self.name}: image {index} cannot be read; the sequence ends there")
 
 
 def check_size(what: str, image: Image, calibration: Calibration) -> None:
@@ -71,7 +71,7 @@ def check_size(what: str, image: Image, calibration: Calibration) -> None:
     height, width = image.shape
     if (width, height) != (calibration.width, calibration.height):
         raise ValueError(
-            f"{what} is {width}x{height}, the calibration is for "
+            f"{what} is {width}x{height}, but the calibration is for "
             f"{calibration.width}x{calibration.height}"
         )
 
@@ -79,7 +79,7 @@ def check_size(what: str, image: Image, calibration: Calibration) -> None:
 def selected(
     source: Source, *, start: float = 0.0, every: int = 1, frames: int | None = None
 ) -> Source:
-    """Every `every`-th frame from the one that is nearest to `start` on, `frames` at the most.
+    """Every `every`-th frame from the one that is nearest to `start` on, at most `frames`.
 
     `start` is in seconds after the first frame. Raises ValueError for numbers that select none.
     """
@@ -100,7 +100,7 @@ def selected(
 def _check_selection(source: Source, start: float, every: int, frames: int | None) -> None:
     for name, count in (("every", every), ("frames", frames)):
         if count is not None and count < 1:
-            raise ValueError(f"{name} is {count}; a positive whole number is accepted")
+            raise ValueError(f"{name} must be a positive whole number, not {count}")
     if source.clock is not None and start:
         raise ValueError(f"start is {start} s; a live camera starts when it is opened")
     end = float(np.ptp(source.times)) if len(source) else 0.0
@@ -109,12 +109,12 @@ def _check_selection(source: Source, start: float, every: int, frames: int | Non
 
 
 def resized(source: Source, factor: float) -> Source:
-    """The source with pictures and calibration so many times as large, in whole pixels.
+    """The source with pictures and calibration resized by a factor, in whole pixels.
 
     Raises ValueError for a factor that leaves no picture.
     """
     if not (math.isfinite(factor) and factor > 0):
-        raise ValueError(f"scale is {factor}; a positive factor is accepted, 0.5 for half the size")
+        raise ValueError(f"scale must be a positive factor (0.5 for half the size), not {factor}")
     if factor == 1:
         return source
     old, images = source.calibration, source.images

@@ -58,34 +58,33 @@ def rows_as_poses(place: Callable[[int], str], rows: np.ndarray) -> Float[np.nda
     """Poses from rows `t tx ty tz qx qy qz qw …`. Raises ValueError, naming the place."""
     size = np.abs(rows[:, 4:8]).max(axis=1)
     if (zero := np.flatnonzero(size == 0)).size:
-        raise ValueError(f"{place(zero[0])}: the quaternion is zero; a rotation's is accepted")
+        raise ValueError(f"{place(zero[0])}: the quaternion is zero, so it is not a rotation")
     far = ~((np.abs(rows).max(axis=1) <= LARGEST) & (size >= 1 / LARGEST))  # or not finite
     if (wrong := np.flatnonzero(far)).size:
         raise ValueError(
-            f"{place(wrong[0])}: finite numbers up to {LARGEST:.0e}, and a quaternion "
-            f"longer than {1 / LARGEST:.0e}, are accepted"
+            f"{place(wrong[0])}: expected finite numbers up to {LARGEST:.0e} and a quaternion "
+            f"longer than {1 / LARGEST:.0e}"
         )
     return poses(rows[:, 1:4], rows[:, 4:8])
 
 
 _LATEST = 1e11
 """Seconds since 1970 of the year 5138."""
-_SLOWEST = 1e3
-"""Seconds between two poses, more than a moving thing has."""
 
 
 def check_seconds(what: str, times: Float[np.ndarray, " n"]) -> None:
     """Raise ValueError where times are too large to be seconds, since 1970 or from pose to pose."""
     last = float(np.abs(times).max())
     step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
-    if last <= _LATEST and step <= _SLOWEST:
+    # Seconds between two poses, more than a moving thing has.
+    if last <= _LATEST and step <= 1e3:
         return
     by_size = ((1e17, "nanoseconds"), (1e14, "microseconds"), (0.0, "milliseconds"))
     by_step = ((1e6, "nanoseconds"), (0.0, "microseconds"))
     size, units = (last, by_size) if last > _LATEST else (step, by_step)
     unit = next(unit for least, unit in units if size >= least)
     told = f"up to {last:.3g}" if last > _LATEST else f"{step:.3g} from one to the next"
-    raise ValueError(f"{what}: times {told} look like {unit}; seconds are accepted")
+    raise ValueError(f"{what}: times {told} look like {unit}; expected seconds")
 
 
 def not_rigid(T: Float[np.ndarray, "*k d d"], tolerance: float) -> Bool[np.ndarray, "*k"]:
@@ -142,12 +141,12 @@ def read_table(
             comments = {first: rows.pop(first)} | comments
         columns = len(words(rows[min(rows)])) if rows else 0
     if not rows:
-        raise ValueError(f"{path}: holds no {holds}; lines of {row} are accepted")
+        raise ValueError(f"{path} has no {holds}; expected lines of {row}")
     table = []
     for place, line in rows.items():
         found = numbers(words(line)[: columns if spare else None], columns or 0, finite=finite)
         if found is None:
-            raise ValueError(f"{path}, line {place}: {row} are accepted")
+            raise ValueError(f"{path}, line {place}: expected {row}")
         table.append(found)
     return Table(tuple(comments.values()), np.array(table), tuple(rows))
 
@@ -158,7 +157,7 @@ def words(line: str) -> list[str]:
 
 
 def numbers(told: Sequence[str], count: int, *, finite: bool = True) -> list[float] | None:
-    """So many words as numbers, finite unless that is not asked for; None where they are not."""
+    """Read words as `count` numbers, finite unless that is not asked for; None if they are not."""
     try:
         found = [float(word) for word in told]
     except ValueError:
@@ -191,9 +190,7 @@ def write_table(
     """A line of each time and row, under a comment that names the columns after the time."""
     times = np.asarray(times, dtype=float)
     if times.shape != (len(table),):
-        raise ValueError(
-            f"{len(times)} times for {len(table)} {what}; as many of each are accepted"
-        )
+        raise ValueError(f"{len(times)} times for {len(table)} {what}; their numbers must be equal")
     with write_atomically(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(f"# t {header}\n")
         for time, row in zip(times, table, strict=True):
@@ -207,8 +204,8 @@ _STATE, _CAMERA = 19, 15
 _TUM = 8
 _ROWS = {
     4: "four finite numbers t x y θ (s, m, rad)",
-    12: "12 finite numbers, the rows of a 3x4 T_wc (KITTI),",
-    WITH_COVARIANCE: "20 finite numbers t tx ty tz qx qy qz qw, 6 of Pr and 6 of Pp (OpenVINS),",
+    12: "12 finite numbers, the rows of a 3x4 T_wc (KITTI)",
+    WITH_COVARIANCE: "20 finite numbers t tx ty tz qx qy qz qw, 6 of Pr and 6 of Pp (OpenVINS)",
 }
 
 
@@ -224,10 +221,11 @@ def read_log(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n d d"], Float[np.ndarray, "m t t"]]:
     """Times (n,) in s, poses (n, 4, 4), or (n, 3, 3) in the plane, in m, and their covariances.
 
-    A line is `t tx ty tz qx qy qz qw` (TUM), `t x y θ`, the rows of a 3x4 T_wc (KITTI; times are
-    those of `times.txt` beside it, else the number of the line, from 0), `t p q` with the upper
-    triangles of the covariances of orientation and position (OpenVINS's `pose_to_file`), or `t q p`
-    and more (its states). Its quaternions of JPL have the numbers of Hamilton's, of the body in the
+    A line is `t tx ty tz qx qy qz qw` (TUM), `t x y θ`, or the rows of a 3x4 T_wc (KITTI; times are
+    those of `times.txt` beside it, else the number of the line, from 0). It may also be `t p q`
+    with the upper triangles of the covariances of orientation and position (OpenVINS's
+    `pose_to_file`), or `t q p` and more (its states). Its quaternions of JPL have the numbers of
+    Hamilton's, of the body in the
     world. Covariances (n, 6, 6), of the error `split` along `mixed` axes, position first, are those
     of `pose_to_file`; other files have none, (0, 6, 6). Raises ValueError, naming file and line.
     """
@@ -252,7 +250,7 @@ def read_log(
 def _planar(path: Path, rows: np.ndarray, lines: tuple[int, ...]) -> Float[np.ndarray, "n 3 3"]:
     far = np.flatnonzero(np.abs(rows).max(axis=1) > LARGEST)
     if far.size:
-        raise ValueError(f"{path}, line {lines[far[0]]}: numbers up to {LARGEST:.0e} are accepted")
+        raise ValueError(f"{path}, line {lines[far[0]]}: expected numbers up to {LARGEST:.0e}")
     return of_xytheta(rows[:, 1:])
 
 
@@ -272,7 +270,7 @@ def _matrices(path: Path, rows: np.ndarray, lines: tuple[int, ...]) -> Float[np.
     if wrong.size:
         place = f"{path}, line {lines[wrong[0]]}"
         raise ValueError(
-            f"{place}: no rigid motion [R t] with R a rotation; {_ROWS[12]} are accepted"
+            f"{place}: not a rigid motion [R t] with a rotation R; expected {_ROWS[12]}"
         )
     left, _, right = np.linalg.svd(T[:, :3, :3])  # rounding to six digits, taken away
     T[:, :3, :3] = left @ right
@@ -283,9 +281,9 @@ def _times(path: Path, poses: int) -> Float[np.ndarray, " n"]:
     beside = path.parent / "times.txt"
     if not beside.is_file():
         return np.arange(float(poses))
-    times = read_table(beside, "times", "times", "finite times, s,", 1).rows[:, 0]
+    times = read_table(beside, "times", "times", "finite times in seconds", 1).rows[:, 0]
     if len(times) != poses:
-        raise ValueError(f"{beside}: holds {len(times)} times for {poses} poses of {path}")
+        raise ValueError(f"{beside} has {len(times)} times for the {poses} poses of {path}")
     return times
 
 

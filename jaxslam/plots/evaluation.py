@@ -161,7 +161,7 @@ def plot_scale(evaluation: Evaluation, *, ax: Axes, label: str | None = None) ->
     Raises ValueError where the evaluation has none.
     """
     if evaluation.scale is None:
-        raise ValueError("no scale: the poses are neither given it nor aligned by Sim(3)")
+        raise ValueError("no scale to draw: poses are neither given it nor aligned by Sim(3)")
     (low, high), median, sigma = evaluation.scale.over_runs
     percent = 100 * np.expm1(np.clip([low, median, high], -_MOST_LOG, _MOST_LOG))
     ax.fill_between(evaluation.times, percent[0], percent[2], color=COLOURS[0], alpha=0.25, lw=0)

@@ -9,9 +9,6 @@ from matplotlib.collections import EllipseCollection
 
 from jaxslam.statistics.bands import chi2_quantile
 
-_FARTHEST = 1 / 60
-"""Least inverse distance that is drawn, 1/m."""
-
 
 def region_from_above(
     mean: Float[np.ndarray, " 2"], covariance: Float[np.ndarray, "2 2"], share: float = 0.95
@@ -25,7 +22,8 @@ def region_from_above(
     circle = np.sqrt(chi2_quantile(share, 2)) * np.stack([np.cos(angle), np.sin(angle)])
     roots = np.sqrt(np.maximum(values, 0))[:, None]
     azimuth, inverse = mean[:, None] + vectors @ (roots * circle)
-    distance = 1 / np.maximum(inverse, _FARTHEST)
+    # Least inverse distance that is drawn, 1/m.
+    distance = 1 / np.maximum(inverse, (1 / 60))
     return distance * np.stack([np.sin(azimuth), np.cos(azimuth)])
 
 

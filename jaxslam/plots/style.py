@@ -32,20 +32,12 @@ COLUMN = 3.4
 LETTERS = 8.0
 """Points: of labels at lines, and of everything in print."""
 MEDIAN_DASH = (0, (1, 2))
-"""Of the medians, where a line is a mean."""
-_FITTING = 50
-"""Characters in a line of a column."""
+"""The dashes of medians, where a line is a mean."""
 _POWERS = range(-9, 13)
 _DIGITS = ((4, (1, 1.5, 2, 3, 4, 5, 7)), (20, (1, 2, 3, 5)), (500, (1, 2, 5)), (np.inf, (1,)))
 """Of the numbers named on an axis whose ends differ by a factor of so much at the most."""
-_LETTER_WIDTH = 0.55
-"""In sizes of the letters, about."""
-_MOST_FOR_NAMES = 0.3
-"""The share of a figure's width that names at lines may take."""
 _BELOW = -0.42
 """Inches from the axes to what stands below the numbers and the name of x."""
-_SPACED = 1.25
-"""Height of a line of text, in sizes of its letters."""
 
 
 class _Shown(Figure):
@@ -81,7 +73,8 @@ def save(figure: Figure, path: str | Path | None) -> Figure:
 
 def column_title(text: str) -> str:
     """Lines that fit on a figure of `COLUMN` width."""
-    return "\n".join(part for line in text.splitlines() for part in textwrap.wrap(line, _FITTING))
+    # Characters in a line of a column.
+    return "\n".join(part for line in text.splitlines() for part in textwrap.wrap(line, 50))
 
 
 def for_print(figure: Figure) -> None:
@@ -135,7 +128,9 @@ def label_ends(axes: Axes, ends: Sequence[End]) -> None:
     ends = [end for end in ends if np.isfinite(end.y).any()]
     longest = max((len(end.label) for end in ends), default=0)
     room = axes.figure.bbox.width / axes.figure.dpi
-    if longest * _LETTER_WIDTH * LETTERS / 72 > _MOST_FOR_NAMES * room:
+    # In sizes of the letters, about.
+    # The share of a figure's width that names at lines may take.
+    if longest * 0.55 * LETTERS / 72 > 0.3 * room:
         lines = [Line2D([], [], color=end.colour, lw=1.8) for end in ends]
         below = offset_copy(axes.transAxes, axes.get_figure(root=True), y=_BELOW, units="inches")
         axes.legend(
@@ -150,7 +145,8 @@ def label_ends(axes: Axes, ends: Sequence[End]) -> None:
         return
     pixels = axes.transData.transform(points)
     heights = np.clip(axes.transAxes.inverted().transform(pixels)[:, 1], 0, 1)
-    apart = _SPACED * LETTERS / 72 / _height(axes)
+    # Height of a line of text, in sizes of its letters.
+    apart = 1.25 * LETTERS / 72 / _height(axes)
     for end, point, height in zip(ends, points, _apart(heights, apart), strict=True):
         axes.annotate(
             end.label, tuple(point), (1.02, height), textcoords=axes.transAxes, color=end.colour,

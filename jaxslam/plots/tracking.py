@@ -15,9 +15,8 @@ from jaxslam.plots.landmarks import draw_ellipses
 from jaxslam.plots.style import COLOURS, GREY, new_figure, save
 
 _TRAJECTORY, _REFERENCE, _LANDMARKS, _BEGUN, _LOOPS = COLOURS[:5]
-_CHI2_95 = 5.991  # 95 % quantile of chi-squared with two degrees of freedom
-_SIGMAS_95 = math.sqrt(_CHI2_95)
-_MARGIN = 0.06  # around what is shown, as a share of its size
+# 95 % quantile of chi-squared with two degrees of freedom
+_SIGMAS_95 = math.sqrt(5.991)
 _WIDTH, _LEAST_HEIGHT, _HEIGHT = 5.0, 0.9, 3.5  # of a panel, inches
 _WORDS, _LEGEND = 0.7, 1.2  # height of a panel's title and label, and of the legend, inches
 _TICKS, _TICK = 15, 0.05  # how many viewing directions, and how long: a share of the view's size
@@ -201,7 +200,8 @@ def _view(lines: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m 3"]) -> 
     if not len(lines):
         lines = np.zeros((1, 3))
     low, high = lines.min(axis=0), lines.max(axis=0)
-    margin = _MARGIN * max(float((high - low).max()), 1e-3)
+    # Around what is shown, as a share of its size
+    margin = 0.06 * max(float((high - low).max()), 1e-3)
     return low - margin, high + margin
 
 

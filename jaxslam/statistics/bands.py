@@ -19,11 +19,6 @@ from jaxslam.linalg import cholesky
 CONFIDENCE = 0.95
 MOST_DOF = 100
 """More degrees of freedom than a pose, or a state that is tested as a whole, usually has."""
-_LAGS = 10
-_LEAST_PAIRS = 20
-"""The fewest pairs of steps from which a correlation is estimated."""
-LOST_QUANTILE = 0.9999
-"""A run whose NEES is above this quantile of χ² is lost: one in 10 000 of a consistent filter."""
 
 
 def normalised_squared(
@@ -71,7 +66,8 @@ def lost_threshold(dof: float, steps: int = 1) -> float:
 
     With so many `steps` one run in 10 000 exceeds it at any step, fewer if they are correlated.
     """
-    return 2 * float(scipy.special.gammainccinv(dof / 2, (1 - LOST_QUANTILE) / steps))
+    # A run whose NEES is above this quantile of χ² is lost: one in 10 000 of a consistent filter.
+    return 2 * float(scipy.special.gammainccinv(dof / 2, (1 - 0.9999) / steps))
 
 
 def shortfall_limit(dof: float, level: float, *, above: bool) -> float:
@@ -81,7 +77,7 @@ def shortfall_limit(dof: float, level: float, *, above: bool) -> float:
     A sum of time averages of χ² does not, by Jensen `E f(Σ xₜ/T) ≤ E f(x)` for every convex f,
     however the steps are correlated. Half of `level` is at most on each side, beyond χ²'s expected
     shortfall `E[χ² | χ² in its tail]` (Meilijson and Nádas, Journal of Applied Probability 1979,
-    "Convex majorization with an application to the length of critical paths").
+    *Convex majorization with an application to the length of critical paths*).
     """
     special, shape, tail = scipy.special, dof / 2, level / 2
     if above:
@@ -195,9 +191,10 @@ def whiteness_p_value(
     the correlation rₗ, is χ² (Ljung and Box, Biometrika 1978; of all runs); the least p of them by
     Bonferroni. The mean of innovations is not taken away: one with a bias is not white.
     """
-    lags = min(_LAGS, nis.shape[1] // 4)
+    lags = min(10, nis.shape[1] // 4)
     there = ~np.isnan(nis)
-    if not lags or np.sum(there[:, 1:] & there[:, :-1]) < _LEAST_PAIRS:
+    # The fewest pairs of steps from which a correlation is estimated.
+    if not lags or np.sum(there[:, 1:] & there[:, :-1]) < 20:
         return None
     series = [*np.moveaxis(normalised, -1, 0), nis - np.mean(nis, where=there)]
     with np.errstate(over="ignore", invalid="ignore"):

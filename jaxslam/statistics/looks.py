@@ -31,8 +31,6 @@ TOLERANCE = 1.3
 UNSEEN = 3
 """The runs in N that may be of a kind that none among N is (the rule of three: Hanley,
 Lippman-Hand, JAMA 1983)."""
-_FEWEST = 3
-"""The fewest numbers whose scatter says anything."""
 
 
 class Verdict(dict[str, Any]):
@@ -91,7 +89,7 @@ class Look:
     """A test of the mean of one number a run; factors are of σ², 1 where it is right."""
 
     name: str
-    """The steps that it is of: `all steps`, `last step`, `first third` …"""
+    """The steps that are looked at: `all steps`, `last step` or a third, such as `first third`."""
     sums: PowerSums
     right: tuple[float, float]
     """The mean of a right filter is anywhere from the one to the other."""
@@ -160,7 +158,8 @@ class Look:
 
     def _relative_error(self) -> float | None:
         """The relative standard error of the mean; None where the runs are too few."""
-        if self.sums.count < _FEWEST or self.sums.mean <= 0:
+        # The fewest numbers whose scatter says anything.
+        if self.sums.count < 3 or self.sums.mean <= 0:
             return None
         relative = self.sums.deviation / self.sums.mean / math.sqrt(self.sums.count)
         return relative if math.isfinite(relative) else None
@@ -185,7 +184,7 @@ class Look:
 
     @property
     def disproved(self) -> bool:
-        """Whether σ is wrong beyond doubt."""
+        """Whether σ is certainly wrong."""
         low, high = self.interval
         return low > 1 or high < 1
 

@@ -114,10 +114,13 @@ class Tally:
 
     def __add__(self, other: Tally) -> Tally:
         if self.dof != other.dof:
-            raise ValueError(f"runs of {self.dof} and of {other.dof} dof are not one study")
+            raise ValueError(
+                f"runs with {self.dof} and {other.dof} degrees of freedom cannot be pooled"
+            )
         if self.fitted != other.fitted:
             raise ValueError(
-                f"runs with {self.fitted} and {other.fitted} dof fitted are not one study"
+                f"runs with {self.fitted} and {other.fitted} fitted degrees of freedom cannot be "
+                "pooled"
             )
         both = self.numbers() + other.numbers()
         return Tally.of_numbers(both, self.dof, self.fitted)
@@ -144,7 +147,7 @@ class Tally:
         Raises ValueError where no run is left to look at.
         """
         if not self.average.count:
-            raise ValueError("every run diverged, so that there is no mean to look at")
+            raise ValueError("every run diverged, so there is no mean")
         looks = self.looks()
         wrong = [look for look in looks if look.disproved]
         if len(wrong) < 2 or wrong[0] is looks[0]:
@@ -164,8 +167,8 @@ class Tally:
         and the word is lost. `never_lost` is the verdict on the runs never lost: robust, and low
         by construction. `lost_runs` are their numbers, where they are known.
 
-        With `fitted` a NEES above dof is compared with dof, one below dof − fitted with that, and
-        one between them is right: its σ factor is 1, and the interval is from √(low/dof) to
+        With `fitted` a NEES above dof is compared with dof, one below dof − fitted with that. One
+        between them is right: its σ factor is 1, and the interval is from √(low/dof) to
         √(high/(dof − fitted)), without an upper end where all may be fitted.
         """
         right = self.dof - self.fitted, float(self.dof)
@@ -207,7 +210,7 @@ def _logged(
     """A mask of the steps that are there. Raises ValueError unless every run has one."""
     there = np.ones(nees.shape, bool) if logged is None else np.asarray(logged, bool)
     if there.shape != nees.shape or not there.any(axis=1).all():
-        raise ValueError(f"logged must be {nees.shape}, with a step of every run")
+        raise ValueError(f"logged must have the shape {nees.shape} and at least one step per run")
     return there
 
 
@@ -286,13 +289,13 @@ def _of_lost(found: Mapping[str, Any], quantity: str) -> str:
     """A sentence on the runs that were lost, and on the others."""
     kept, runs = found["never_lost"], found["runs"]
     lost = runs - kept["runs"]
-    word, others = "were lost", "never lost"
+    word, others = "was lost" if lost == 1 else "were lost", "never lost"
     if quantity != "NEES":
-        word, others = f"have an outlying {quantity}", "others"
+        word, others = f"{'has' if lost == 1 else 'have'} an outlying {quantity}", "others"
     numbers = found.get("lost_runs")
     which = f" ({_listed(numbers)})" if numbers else ""
     if not kept["runs"]:
-        return f"{lost} of {runs} runs {word}, all of them"
+        return f"the only run {word}" if runs == 1 else f"all {runs} runs {word}"
     few = lost / runs <= LOST_BOUND
     said = _said(kept, quantity) if few else f"{quantity} {_digits(kept['nees'])}"
     return f"{lost} of {runs} runs {word}{which}, the {kept['runs']} {others}: {said}"
@@ -301,7 +304,7 @@ def _of_lost(found: Mapping[str, Any], quantity: str) -> str:
 def _listed(numbers: list[int]) -> str:
     told = ", ".join(map(str, numbers[:_TOLD]))
     more = len(numbers) - _TOLD
-    return f"numbers {told} and {more} more" if more > 0 else f"numbers {told}"
+    return f"run{'s' if len(numbers) > 1 else ''} {told}{f' and {more} more' if more > 0 else ''}"
 
 
 _TOLD = 8
@@ -310,12 +313,12 @@ _TOLD = 8
 
 def _of_whiteness(found: Mapping[str, Any]) -> list[str]:
     if found["samples"] == "steps":
-        return [f"innovations seem white (p = {found['white']:.2g}): every step is a sample"]
+        return [f"innovations appear white (p = {found['white']:.2g}): each step is one sample"]
     if found["white"] is None:
-        return ["steps are too few to tell whether innovations are white: every run is a sample"]
+        return ["too few steps to tell whether innovations are white: each run is one sample"]
     return [
-        f"innovations are not white (p = {found['white']:.2g}), as a right filter's are: steps are "
-        "no independent samples, so that every run is one"
+        f"innovations are not white (p = {found['white']:.2g}), as those of a correct filter are: "
+        "steps are not independent, so each run is one sample"
     ]
 
 

@@ -8,8 +8,6 @@ from jaxslam.tracking.settings import TrackerSettings
 
 _CELLS = (8, 6)  # columns and rows of the grid that corners are spread over
 _BLOCK = 5  # side of the window that a corner's strength is summed over, in pixels
-_QUALITY = 0.01  # weakest corner, as a share of the strongest one's least eigenvalue
-_MIN_EIGENVALUE = 2e-5  # weakest corner at all, where the strongest one is only noise
 
 
 def bare_corners(
@@ -66,7 +64,9 @@ def _candidates(image: UInt8[np.ndarray, "h w"], border: int) -> Float32[np.ndar
     """Whole pixels (n, 2) of corners at least `border` pixels inside, the strongest first."""
     strength = cv2.cornerMinEigenVal(image, _BLOCK)
     peaks = strength == cv2.dilate(strength, np.ones((5, 5), np.uint8))
-    peaks &= strength > max(_QUALITY * float(strength.max()), _MIN_EIGENVALUE)
+    # Weakest corner, as a share of the strongest one's least eigenvalue
+    # Weakest corner at all, where the strongest one is only noise
+    peaks &= strength > max(0.01 * float(strength.max()), 2e-5)
     places = np.flatnonzero(peaks)
     order = np.argsort(-strength.ravel()[places], kind="stable")
     row, column = np.divmod(places[order], image.shape[1])

@@ -64,7 +64,7 @@ class Predicted(NamedTuple):
     joint: np.ndarray
     """The covariance of the innovations of all slots, (n, 2, n, 2)."""
     view: Prediction
-    """In the filter's own unit, from where the map begins."""
+    """The camera in the filter's own unit, from where the map begins."""
 
 
 class Correction(NamedTuple):

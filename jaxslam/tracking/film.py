@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 WAITING = 8
-"""So many frames may wait to be drawn: a slower picture makes the tracker wait, not memory grow."""
+"""The most frames that may wait to be drawn; beyond it the tracker waits, so memory is bounded."""
 
 
 class Aside:
@@ -56,7 +56,7 @@ class OverlayWriter:
         self.rate = rate
         self.frames = 0
         if self.path.suffix.lower() != ".mp4":
-            raise ValueError(f"{self.path}: a name ending in .mp4 is accepted")
+            raise ValueError(f"{self.path}: the name must end in .mp4")
         self._temporary = self.path.with_name(f".{os.getpid()}.{self.path.name}")
 
     def __enter__(self) -> "OverlayWriter":

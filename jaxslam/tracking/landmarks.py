@@ -67,9 +67,9 @@ class Points(NamedTuple):
 
     numbers: np.ndarray
     maps: np.ndarray
-    """Numbers of their maps …"""
+    """The numbers of their maps."""
     submaps: np.ndarray
-    """… and of the submaps in which they were then."""
+    """The numbers of the submaps in which they were then."""
     points: np.ndarray
     """(n, 3); not finite for one at infinity."""
     covariances: np.ndarray

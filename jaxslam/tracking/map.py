@@ -46,11 +46,11 @@ class Remembered:
     landmarks: dict[int, Landmark]
     place: MapInWorld
     submaps: tuple[Submap, ...] = ()
-    """Those that ended …"""
+    """The submaps that ended."""
     loops: tuple[LoopClosure, ...] = ()
-    """… the loops that join them …"""
+    """The loops that join the submaps."""
     earlier: tuple[Remembered, ...] = ()
-    """… and the map as it was when each of them had just ended."""
+    """The map as it was when each submap had just ended."""
 
     def graph(self, settings: TrackerSettings, slam: AbstractStaged) -> Graph:
         """Return its submaps and loops, of this filter."""
@@ -72,23 +72,23 @@ class Map:
     finished: list[Points] = field(default_factory=list)
     """Those that left it."""
     number: int = 0
-    """Of the map, the first of which is 0."""
+    """The number of the map, from 0."""
     latest: int = 0
     """The greatest number so far."""
     seen: Remembered | None = None
-    """The map as it was last seen, while the camera is lost and its unit is fixed …"""
+    """The map as it was last seen, while the camera is lost and its unit is fixed."""
     left: list[Remembered] = field(default_factory=list)
-    """… and others, the latest last."""
+    """The other maps that were left, the latest last."""
     submap: int = 0
-    """The number of the submap, the first of all maps being 0 …"""
+    """The number of the submap, counted from 0 through all maps."""
     latest_submap: int = 0
-    """… and the greatest so far."""
+    """The greatest number of a submap so far."""
     submaps: tuple[Submap, ...] = ()
-    """Of this map, those that ended, …"""
+    """The submaps of this map that ended."""
     loops: tuple[LoopClosure, ...] = ()
-    """… the loops that join them, …"""
+    """The loops that join these submaps."""
     earlier: tuple[Remembered, ...] = ()
-    """… and the map as it was when each had just ended."""
+    """The map as it was when each of these submaps had just ended."""
     charted: dict[int, Landmark] = field(default_factory=dict)
     """The landmarks of all submaps that ended, by their numbers, as they were last."""
 
@@ -386,9 +386,9 @@ def worst_first(
 ) -> Int[np.ndarray, " k"]:
     """The order in which to give up landmarks that are not in view; `points` are theirs.
 
-    First those that are searched in vain, then by the time since they were seen, times the σ of
-    their place as a share of their distance from where they were first seen: known ones are
-    worth more, as they say where the camera is when it returns.
+    First those that are searched in vain, then the others by the time since they were seen, times
+    the σ of their place relative to their distance from where they were first seen. Known ones
+    are worth more, as they determine the camera when it returns.
     """
     away = np.array([one.missed <= settings.absent_after for one in landmarks], bool)
     unseen = np.array([one.unseen for one in landmarks])

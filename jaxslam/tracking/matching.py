@@ -14,20 +14,15 @@ GATE = 9.21
 """The 99 % quantile of χ² with two degrees of freedom."""
 THRESHOLD = 0.8
 """Least correlation of a match."""
-_ITERATIONS = 3
 _MAP_SIGMA = 0.2  # of a map's elements: a patch does not face its first camera
 _PRECISION = 2.4e-4 / _MAP_SIGMA**2  # by s² of ρ = .98
 _MOST_MAPPED = 0.5  # by which elements of a map differ from the identity's
 _MAX_SHIFT = 1.5  # pixels: a refinement that moves further than this has left its peak
 _WIDEST = 0.25  # of the picture's width: an ellipse is searched no further from its centre
 _NARROW = 91**2  # pixels: boxes of more are searched in the picture of half the size first
-_COARSE = 6  # peaks of half the size that are looked at in full, for each patch
-_COARSE_MARGIN = 0.25  # of score: peaks so far below the highest are not
 _NEARBY = 3  # pixels around such a peak
-_COARSE_LOSS = 0.1  # of score: what a match loses at half the size, where pixels fall otherwise
 PEAKS = 3
-"""Places in a wide ellipse that may be a patch's, at the most …"""
-_PEAKS_MARGIN = 0.12  # … with scores so far below the best one's
+"""The most places in a wide ellipse that may be a patch's."""
 _APART = 2  # pixels: nearer peaks are one place
 
 
@@ -41,7 +36,7 @@ class Matches(NamedTuple):
     scores: Float32[np.ndarray, " m"]
     """Correlations, up to 1."""
     variances: Float[np.ndarray, " m"]
-    """Of each pixel's u and v, pixels², as the difference of the two windows tells
+    """The variance of each pixel's u and v, pixels², as the difference of the two windows tells
     (`refine`)."""
 
     def only(self, which: np.ndarray) -> "Matches":
@@ -71,13 +66,13 @@ def match_patches(
 ) -> Matches:
     """Active search: the places most like each template within the ellipse of its prediction.
 
-    Looks where (x - centre)' covariance^-1 (x - centre) <= `GATE` (a quantile of chi2 with two
-    degrees of freedom), at most `max_radius` pixels from the centre along each axis (by default
-    a quarter of the image's width: a wider ellipse is cut there), for peaks of the zero-mean
-    normalised cross-correlation, and refines them to sub-pixel. In a narrow ellipse that is the
+    The ellipse is (x - centre)' covariance^-1 (x - centre) <= `GATE` (a quantile of chi2 with two
+    degrees of freedom), cut at `max_radius` pixels from the centre along each axis (by default a
+    quarter of the image's width). Peaks of the zero-mean normalised cross-correlation in it are
+    refined to sub-pixel accuracy. In a narrow ellipse that is the
     best peak; none where it does not reach `THRESHOLD`, or where a second one comes within
     `ambiguity` of its score (0: never ambiguous). A wide ellipse is searched in the image of half
-    the size, and around the highest peaks there again in the whole one; as the best of many peaks
+    the size, and around the highest peaks there again in the whole one. As the best of many peaks
     often is another place, `several` are given, up to `PEAKS`, best first, for who knows what else
     was found to choose from. None where the ellipse is outside the image.
     """
@@ -110,7 +105,7 @@ class Fit(NamedTuple):
     pixels: Float[np.ndarray, "n 2"]
     """Where, sub-pixel."""
     variances: Float[np.ndarray, " n"]
-    """Of each pixel's u and v, pixels²."""
+    """The variance of each pixel's u and v, pixels²."""
 
 
 def refine(
@@ -121,10 +116,10 @@ def refine(
     """The places near `pixels` and the affine maps with which templates fit best, by Gauss-Newton.
 
     Minimises the squared difference of the two windows, each made zero-mean with unit norm (so
-    gain and offset do not matter), with a prior of the map, the identity with a σ of `_MAP_SIGMA`;
-    inverse compositional (Baker & Matthews 2004), so that the gradient J is the template's. One
+    gain and offset do not matter), with a prior on the map: the identity, with a σ of `_MAP_SIGMA`.
+    It is inverse compositional (Baker & Matthews 2004), so the gradient J is the template's. One
     that does not converge stays where it is. A patch that was warped as if it faced its first
-    camera is found where it is all the same.
+    camera is nevertheless found where it is.
 
     Of windows of m pixels with a correlation ρ, the residual has the variance `s² = 2 (1 − ρ)/m` a
     pixel and least squares the covariance `s² (Jᵀ J + Λ)⁻¹`, whatever the map; half the trace of
@@ -133,7 +128,7 @@ def refine(
     """
     known = _Templates.of(templates)
     places, maps, identity = pixels, np.tile(np.eye(2), (len(pixels), 1, 1)), np.eye(2)
-    for _ in range(_ITERATIONS):
+    for _ in range(3):
         windows, _ = known.compared(image, places, maps)
         slope = np.einsum("nkm,nm->nk", known.jacobian, windows)
         slope[:, 2:] += _PRECISION * (maps - identity).reshape(-1, 4)
@@ -336,9 +331,10 @@ def _several(peaks: _Peaks) -> _Peaks:
     kept: list[int] = []
     for i, (owner, pixel, score) in enumerate(zip(*peaks[:3], strict=True)):
         better = [j for j in kept[-PEAKS:] if peaks.owner[j] == owner]
+        # … with scores so far below the best one's
         if not better or (
             len(better) < PEAKS
-            and score >= peaks.scores[better[0]] - _PEAKS_MARGIN
+            and score >= peaks.scores[better[0]] - 0.12
             and np.abs(peaks.pixels[better] - pixel).max(axis=1).min() > _APART
         ):
             kept.append(i)
@@ -358,8 +354,9 @@ def _narrowed(
         return boxes
     side = (templates.shape[1] + 1) // 2
     halved = _Halved.of(image, side)
+    # Of score: what a match loses at half the size, where pixels fall otherwise
     small = [
-        halved.places(templates[box.owner[0]], box, ellipses, least - _COARSE_LOSS)
+        halved.places(templates[box.owner[0]], box, ellipses, least - 0.1)
         for box in (boxes.only(index) for index in np.flatnonzero(large)[:, None])
     ]
     parts = [boxes.only(~large), *small]
@@ -401,8 +398,10 @@ class _Halved(NamedTuple):
         near = (pixels[:, None] + around).reshape(-1, 2)
         inside = ellipses.hold(np.repeat(owner, 9), near).reshape(-1, 9).any(axis=1)
         height = np.where(inside, scores.ravel()[places], -1)
-        best = np.argsort(-height)[:_COARSE]
-        best = best[height[best] >= np.maximum(height[best[:1]] - _COARSE_MARGIN, least)]
+        # Peaks of half the size that are looked at in full, for each patch
+        best = np.argsort(-height)[:6]
+        # Of score: peaks so far below the highest are not
+        best = best[height[best] >= np.maximum(height[best[:1]] - 0.25, least)]
         low = np.maximum(pixels[best] - _NEARBY - 1, box.low)
         high = np.minimum(pixels[best] + _NEARBY + 1, box.high)
         return _Boxes(owner[best], low, high).large_enough()

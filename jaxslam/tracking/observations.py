@@ -32,7 +32,7 @@ class Prediction(NamedTuple):
     pixels: np.ndarray
     """(n, 2)."""
     covariances: np.ndarray
-    """Of the innovations, (n, 2, 2)."""
+    """The covariances of the innovations, (n, 2, 2)."""
     usable: np.ndarray
     """Whether the slot holds a landmark in front of the camera, (n,)."""
     T_wc: np.ndarray
@@ -48,15 +48,15 @@ class Observations(NamedTuple):
     """The k landmarks that were searched in one frame, a row each."""
 
     slots: np.ndarray = np.zeros(0, int)
-    """Of the filter's map, (k,)."""
+    """Their slots in the filter's map, (k,)."""
     predicted: np.ndarray = np.zeros((0, 2))
     """Pixels where they were expected, (k, 2)."""
     covariances: np.ndarray = np.zeros((0, 2, 2))
-    """Of the innovations, (k, 2, 2)."""
+    """The covariances of the innovations, (k, 2, 2)."""
     pixels: np.ndarray = np.zeros((0, 2))
     """Where they were found, (k, 2); NaN where they were not."""
     variances: np.ndarray = np.zeros(0)
-    """Of u and v of these, pixels², as `Matches` has them, (k,); zero where none was found."""
+    """The variances of these pixels' u and v, pixels², (k,); zero where none was found."""
     labels: np.ndarray = np.zeros(0, "U9")
     """`matched`, `unmatched` or `outlier`, (k,): an outlier was found, and is not believed."""
 
@@ -99,4 +99,4 @@ class Observations(NamedTuple):
 
 
 NOTHING = Observations()
-"""Of a frame that was not searched."""
+"""The observations of a frame that was not searched."""

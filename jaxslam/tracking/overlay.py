@@ -73,16 +73,16 @@ def draw_overlay(
 ) -> UInt8[np.ndarray, "h2 w 3"]:
     """The frame in blue, green, red with what the filter predicted and what was found there.
 
-    For each landmark the ellipse of three standard deviations around the pixel where it was
-    predicted, at least of `LEAST_RADIUS`, and what was found, as its label, one of `COLOURS`, says:
-    a dot ('matched') or a cross ('outlier') with a line from the prediction, a square ('new');
-    'unmatched', the ellipse is dashed, and empty. What is not finite is not drawn. `banner` stands
+    Each landmark has the ellipse of three standard deviations around its predicted pixel, at least
+    of `LEAST_RADIUS`. Its label, one of `COLOURS`, says what was found: a dot ('matched') or a
+    cross ('outlier') with a line from the prediction, or a square ('new'). If it is 'unmatched',
+    the ellipse is dashed and empty. What is not finite is not drawn. `banner` stands
     in large letters over the picture. Below it are two `notes`, ASCII, and a legend that counts the
     labels, in as many rows as the width asks for. Raises `ValueError` for another label.
     """
     unknown = sorted(set(table.labels.tolist()) - set(COLOURS))
     if unknown:
-        raise ValueError(f"label {unknown[0]!r} is unknown; {', '.join(COLOURS)} are accepted")
+        raise ValueError(f"unknown label {unknown[0]!r}; known: {', '.join(COLOURS)}")
     # Less contrast, so that the lines stand out.
     canvas = cv2.cvtColor(cv2.convertScaleAbs(image, alpha=0.75, beta=20), cv2.COLOR_GRAY2BGR)
     for label in COLOURS:

@@ -50,7 +50,7 @@ class Patch:
         """
         inverse = _inverse(affine)
         if inverse is None:
-            raise ValueError("the affine map is singular; an invertible 2x2 matrix is accepted")
+            raise ValueError("the affine map is singular; expected an invertible 2x2 matrix")
         a, b, c, d = inverse
         centre, middle = STORED // 2, WINDOW // 2
         stored = self.stored

@@ -46,7 +46,7 @@ NUMBERS = {
 
 
 _OF_PLACE = ("log_unit", "log_scale", "sigma_log_scale", "unit_fixed")
-"""Numbers of a `MapInWorld` …"""
+"""The numbers of a `MapInWorld`."""
 _POSES = ("origin", "camera", "here", "told", "known")
 """… and its poses."""
 
@@ -66,7 +66,7 @@ T = TypeVar("T", bound=Resumable)
 
 
 def save(path: str | Path, tracker: Resumable, filter_name: str | None) -> None:
-    """Write a tracker, whole or not at all, with the name of a filter of one's own."""
+    """Write a tracker, whole or not at all, with the name of a filter beyond the settings."""
     kept = tracker.map
     numbers = {name: attrgetter(where)(tracker) for name, where in NUMBERS.items()}
     header = {
@@ -113,24 +113,24 @@ def save(path: str | Path, tracker: Resumable, filter_name: str | None) -> None:
 def load(
     path: str | Path, make: Callable[[Calibration, TrackerSettings], T], *, own_filter: bool
 ) -> T:
-    """The tracker in a file, of those that one can `make`, with a filter of one's own or without.
+    """Read the tracker in a file by `make`; `own_filter` if its filter is not in the settings.
 
     Raises ValueError for a file that is none, or of another filter.
     """
     header, arrays = read_record(path)
     if header.get("filter") is not None and not own_filter:
-        raise ValueError(f"{path}: was saved with a filter {header['filter']}; give that")
+        raise ValueError(f"{path} was saved with the filter {header['filter']}; pass that filter")
     try:
         settings = TrackerSettings(**header["settings"])
     except TypeError:
-        raise ValueError(f"{path}: was saved by another version, with other settings") from None
+        raise ValueError(f"{path} was saved by another version, with different settings") from None
     except KeyError:
-        raise ValueError(f"{path}: is damaged: it has no settings") from None
+        raise ValueError(f"{path} is damaged: it has no settings") from None
     try:
         tracker = make(from_fields(header["calibration"]), settings)
         _restore(tracker, header, arrays)
     except (KeyError, TypeError, IndexError, AttributeError) as error:
-        raise ValueError(f"{path}: is damaged ({one_line(error)})") from None
+        raise ValueError(f"{path} is damaged ({one_line(error)})") from None
     return tracker
 
 
@@ -228,7 +228,7 @@ def read_record(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]
     if not isinstance(header, dict):
         header = {}
     if header.get("format") != FORMAT:
-        raise ValueError(f"{path}: is no tracker's file ({FORMAT})")
+        raise ValueError(f"{path} is not a saved tracker ({FORMAT})")
     return header, arrays
 
 
@@ -248,5 +248,5 @@ def grown(like: Any, arrays: Mapping[str, np.ndarray], name: str) -> Any:
         for new, leaf in zip(found, old, strict=True)
     ]
     if count != len(old) or not all(same):
-        raise ValueError("the state in the file is of another filter than the one that goes on")
+        raise ValueError("the saved state belongs to a different filter")
     return jax.tree.unflatten(structure, [jnp.asarray(new) for new in found])

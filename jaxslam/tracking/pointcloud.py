@@ -34,7 +34,7 @@ def write_ply(
     if not len(points) == len(covariances) == len(ids) == len(maps):
         raise ValueError(
             f"{len(points)} points, {len(covariances)} covariances, {len(ids)} ids and "
-            f"{len(maps)} maps; as many of each are accepted"
+            f"{len(maps)} maps; their numbers must be equal"
         )
     table = np.column_stack([points, covariances[:, *np.triu_indices(3)]])
     if not np.all(np.isfinite(table)):
@@ -42,8 +42,8 @@ def write_ply(
     header = [
         "ply",
         "format ascii 1.0",
-        "comment landmarks in the world frame; one unit of length a map, another in every map, as",
-        "comment in trajectory.txt, and covariances are of positions in that unit",
+        "comment landmarks in the world frame, positions and covariances in the unit of each map,",
+        "comment as in trajectory.txt",
         f"element vertex {len(points)}",
         *(f"property float {name}" for name in _PROPERTIES),
         "property int id",

@@ -25,29 +25,23 @@ from jaxslam.tracking.settings import TrackerSettings
 LEAST_MATCHES = 4
 """Fewer do not count as having tracked a frame, and are not believed."""
 CHANCE = 0.05
-"""Of a landmark that is not in the picture to have a match all the same that agrees …"""
+"""The probability that a landmark that is not in the picture has a match that agrees."""
 CHANCE_LOST = 0.25
-"""… of one that has any match, where the camera was lost before and is searched for widely …"""
+"""The probability of such a match where the camera was lost and is searched for widely."""
 BY_CHANCE = 1e-3
-"""… and of a frame to be believed although its landmarks are not there."""
+"""The probability that a frame is believed although its landmarks are not there."""
 WIDE = 6.0
-"""σ of the places where most landmarks are expected, pixels, from which on they are searched twice:
-the second time given what agreed …"""
-NARROW = 1.5
-"""… with this σ beside what is still unknown then, pixels, …"""
-EXPLAINED = 0.8
-"""… where a linear prediction explains this share of it."""
+"""σ of the predicted pixels of most landmarks from which on they are searched twice, the second
+time given what agreed, pixels."""
 PROVEN = 10
-"""A landmark that was found so often is where the map says: the others are believed only if all
-together they are likely, given the proven ones, …"""
+"""The number of matches after which a landmark is proven. The others are believed only if together
+they are likely, given the proven ones."""
 TOGETHER = 0.01
-"""… more than so much; and no frame is where the proven ones are less likely than `BY_CHANCE`, …"""
-ANOTHER = 1 / 3
-"""… or as many of them as this share of those that agree do so with another motion: half of the
-picture may be a lorry's, or the map is wrong …"""
+"""The least likelihood of all landmarks together. No frame is believed where the proven ones are
+less likely than `BY_CHANCE`."""
 MOST = 2 / 3
-"""… nor are those after such a frame, until of the proven landmarks searched more than this share
-agree."""
+"""The share of the proven landmarks searched that must agree before a frame after such a one is
+believed."""
 
 
 Agreement = Callable[..., Bool[np.ndarray, " m"]]
@@ -145,7 +139,8 @@ class Policy:
         """Return the prediction given what is matched, as far as it is to be trusted."""
         # To first order a turn moves all pixels alike; to second, by its square / 2f more.
         turned = np.median(seen.pixels[seen.matched] - seen.predicted[seen.matched], axis=0)
-        sigma = NARROW + turned @ turned / (2 * self.calibration.fx)
+        # σ of that second search beside what is still unknown then, pixels.
+        sigma = 1.5 + turned @ turned / (2 * self.calibration.fx)
         return given._replace(covariances=given.covariances + sigma**2 * np.eye(2))
 
     def _likely_given_proven(
@@ -180,7 +175,9 @@ class Policy:
         """Return whether most of these, and many beside those that `agreed`, do so with another
         motion of the camera: then it cannot be told which is the world's."""
         rows = np.arange(len(others.slots))
-        least = max(MOST * len(rows), ANOTHER * agreed, LEAST_MATCHES)
+        # The share of those that agree from which on as many that agree with another motion refute
+        # a frame: half of the picture may be a lorry's, or the map is wrong.
+        least = max(MOST * len(rows), (1 / 3) * agreed, LEAST_MATCHES)
         if len(rows) < least:
             return False
         matches = Matches(rows, others.pixels, np.ones(len(rows), np.float32), others.variances)
@@ -243,7 +240,8 @@ def _explained(seen: Observations, given: Prediction) -> bool:
     squared = np.einsum(
         "ki,ki->k", off, np.linalg.solve(given.covariances[slots], off[..., None])[..., 0]
     )
-    return bool(np.mean(squared < GATE) > EXPLAINED)
+    # The share that a linear prediction must explain for that second search.
+    return bool(np.mean(squared < GATE) > 0.8)
 
 
 def more_than_chance(searched: int, chance: float = CHANCE) -> int:

@@ -28,20 +28,20 @@ class Tracked:
     """The result of one frame; k landmarks were searched, j created."""
 
     index: int
-    """Of the frame in its video."""
+    """The number of the frame in its video."""
     time: float
-    """Of the frame, s."""
+    """The time of the frame, s."""
     camera: PoseWithCovariance
     """The camera in the world, which is the first camera; of a later map, by way of its start. All
     of a map in one unit (docs/gauge.md), and the covariance is of the pose in that unit."""
     observations: Observations = NOTHING
-    """Of the landmarks searched."""
+    """The observations of the landmarks searched."""
     created: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     """Pixels of new landmarks, (j, 2)."""
     nis: float = 0.0
-    """The normalised innovation squared of all matches …"""
+    """The normalised innovation squared of all matches."""
     nis_dof: int = 0
-    """… and its degrees of freedom: two for each match."""
+    """The degrees of freedom of NIS: two for each match."""
     reason: Lost | None = None
     """Why the camera is lost, if it is."""
     starts: bool = False
@@ -124,13 +124,12 @@ class Tracked:
 def write_frames(path: str | Path, history: list[Tracked]) -> None:
     """Write what became of every frame as CSV, whole or not at all.
 
-    `state` is `start` (of a map; where it is not the first, the camera is lost too), `tracked` or
-    `lost`, `map` the number of the map, from 0. σ of position (map units) and orientation (rad)
-    are roots of the summed variances of the three axes, zero in the first frame alone, which is
-    the world's, and of poses in the map's one unit. `log_scale` is the log of that unit in metres
-    as the filter believes it to be at this frame, and `sigma_log_scale` its σ; both empty where
-    the filter is in no doubt of it: there it has not been measured. `unit_fixed` is 0 while the
-    map's start is being found out, when the filter changes its unit with every frame, else 1.
+    `state` is `start` of a map (lost too, unless it is the first), `tracked` or `lost`. `map` is
+    the number of the map, from 0. σ of position (map units) and orientation (rad) are roots of the
+    summed variances of the three axes. They are zero in the first frame, which defines the world.
+    `log_scale` is the log of that unit in metres as the filter estimates it at this frame, and
+    `sigma_log_scale` its σ. Both are empty where the filter takes the unit for known. `unit_fixed`
+    is 0 during the start of a map, when the filter changes its unit with every frame, else 1.
     `reason` is why the camera is lost (`Lost`), empty where it is not; `relocalised` is 1 where a
     camera that was lost is known to be back in a map that it had seen, whose number it then is.
     `submap` is the number of the submap, from 0 through all maps, and `loop` that of an earlier one

@@ -15,9 +15,6 @@ from jaxslam.tracking.observations import Observations, Prediction
 from jaxslam.tracking.patches import WINDOW
 from jaxslam.tracking.settings import TrackerSettings
 
-_MOST_SCALED = 2.0
-"""A patch that looks larger or smaller than at first by more is not like itself any more."""
-
 
 def search(
     image: UInt8[np.ndarray, "h w"],
@@ -67,9 +64,10 @@ def to_search(
     slots = np.flatnonzero(prediction.usable & inside)
     affines = changes_of_view(landmarks, prediction, slots, calibration)
     zoomed = np.abs(np.log(np.clip(np.linalg.det(affines), 1e-6, 1e6)))
+    # A patch that looks larger or smaller than at first by more is not like itself any more.
     alike = [
         i
-        for i in np.flatnonzero(zoomed < 2 * np.log(_MOST_SCALED))
+        for i in np.flatnonzero(zoomed < 2 * np.log(2.0))
         if landmarks[slots[i]].patch.covers(affines[i])
     ]
     absent = ~in_view(landmarks, slots, s)

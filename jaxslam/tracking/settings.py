@@ -36,13 +36,13 @@ class TrackerSettings:
 
     filter: str = "recommended+drift"
     """Filter: a name of jaxslam.FILTERS, which may be modified, as in `robocentric+oc`.
-    `recommended` is the default: it finds out by itself how the camera sets out, and what it claims
-    is true most often (docs/sequences.md)."""
+    `recommended` is the default: it finds by itself how the camera starts, and its claims are true
+    most often (docs/sequences.md)."""
     landmarks: str = "inverse_scaling"
     """Landmark parametrization: a name of jaxslam.LANDMARKS."""
     calibration: str | None = None
-    """Treatment of the calibration: a name of TREATMENTS. By default one that is guessed, from a
-    field of view, is estimated, and any other is known."""
+    """The treatment of the calibration: a name of TREATMENTS. By default, estimated for a guessed
+    lens or one from a field of view, otherwise known."""
     association: str = "sequential"
     """Which matches are believed: a name of jaxslam.filters.association.ASSOCIATIONS."""
     tolerance: float = TOLERANCE
@@ -54,7 +54,7 @@ class TrackerSettings:
     """Slots for landmarks that are out of view. They stay until new ones need the slots: then
     those searched in vain go first, then the longest unseen and least known."""
     new_per_frame: int = 8
-    """Landmarks created in one frame, at the most."""
+    """The most landmarks created in one frame."""
     nearest_depth: float = 1.0
     """d_min: the prior on depth reaches from here to infinity (96 %)."""
     unit_sigma: float = 1.0
@@ -82,9 +82,9 @@ class TrackerSettings:
     """A landmark that so many searches in a row did not find counts as in view no more, and
     keeps no new one away."""
     patience: int = 10
-    """A landmark is evaluated by an average over about so many of its latest searches …"""
+    """The number of latest searches, about, over which a landmark's success is averaged."""
     least_success: float = 0.35
-    """… and removed when fewer of them than this share found it; at first, all count as found."""
+    """The share of them that must find a landmark for it to stay; at first, all count as found."""
     lost_for: int = 15
     """Frames in a row without tracking after which a new map is initialised."""
 

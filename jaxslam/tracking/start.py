@@ -33,7 +33,7 @@ def trackable(
         )
     if target is not None and len(target.points) > settings.wanted:
         raise ValueError(
-            f"the target has {len(target.points)} points, and {settings.wanted} "
+            f"the target has {len(target.points)} points, but only {settings.wanted} "
             "landmarks are wanted"
         )
     return _handing_over(made)

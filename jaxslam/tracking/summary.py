@@ -34,14 +34,12 @@ SCHEMA = 1
 WARM_UP = 3
 """Frames in which functions are compiled; they count in `seconds.start`, not in the quantiles."""
 TOO_SURE = (
-    "the intrinsics are estimated: sigma of them, and of poses with them, is known to be too small"
+    "The lens was estimated, so its σ, and that of the poses, is too small: see docs/own-video.md"
 )
-"""What is to be said wherever it stands."""
-_KNOWN_DEPTH = 0.3
-"""A point is put into the map where its σ is below this share of its distance."""
+"""The caveat on an estimated calibration."""
 
 Summary = dict[str, Any]
-"""As JSON has it."""
+"""A summary as JSON has it."""
 
 
 def summarised(
@@ -51,7 +49,7 @@ def summarised(
     points: Points,
     seconds: list[float],
 ) -> Summary:
-    """Of frames and landmarks as they are known at the end."""
+    """Summarise the frames, and the landmarks as they are known at the end."""
     lost = sum(result.lost for result in history)
     updates = history[1:]
     dof = sum(result.nis_dof for result in updates)
@@ -108,32 +106,34 @@ def describe(summary: Summary) -> str:
     nis, seconds = summary["nis"], summary["seconds"]
     if not summary["landmarks"]["created"]:
         return (
-            f"{summary['source']}: no map was begun, as nothing was seen: in none of its "
-            f"{summary['frames']} frames were there corners enough. Are they dark, or of one grey?"
+            f"{summary['source']}: no map could be started: none of its {summary['frames']} "
+            "frames has enough corners. Are the pictures dark or featureless?"
         )
     per_dof = f", NIS per dof {nis['mean'] / nis['dof']:.2f}" if nis["dof"] else ""
     lines = [
         f"{summary['source']}: {summary['tracked']} of {summary['frames']} frames tracked, "
-        f"{summary['matches_per_frame']:.1f} matches a frame{per_dof}",
-        f"{seconds['per_frame_median'] * 1e3:.0f} ms a frame (median), "
-        f"{seconds['total']:.1f} s in all, {seconds['start']:.1f} s of them to start",
+        f"{summary['matches_per_frame']:.1f} matches per frame{per_dof}",
+        f"{seconds['per_frame_median'] * 1e3:.0f} ms per frame (median), "
+        f"{seconds['total']:.1f} s in total, including {seconds['start']:.1f} s to start",
     ]
     if summary["lost"]:
         reasons = (f"{count} {reason}" for reason, count in summary["lost_reasons"].items())
-        lines.append(f"{summary['lost']} frames lost: {', '.join(reasons)}")
+        frames = "1 frame" if summary["lost"] == 1 else f"{summary['lost']} frames"
+        lines.append(f"{frames} lost: {', '.join(reasons)}")
     if summary["relocalised"]:
         times = "once" if summary["relocalised"] == 1 else f"{summary['relocalised']} times"
-        lines.append(f"known again {times}, after it was lost, in a map that it had seen")
+        lines.append(f"relocalised {times} in an earlier map")
     if summary["loops"]:
-        times = "one place" if summary["loops"] == 1 else f"{summary['loops']} places"
-        lines.append(f"{times} known again: a loop is closed, and all cameras are corrected by it")
+        loops = "1 loop" if summary["loops"] == 1 else f"{summary['loops']} loops"
+        lines.append(f"{loops} closed; all poses were corrected")
     for one in summary["joined"]:
         lines.append(
-            f"map {one['map']} is part of map {one['to']}, its unit known to {one['sigma']:.1%}"
+            f"map {one['map']} was joined to map {one['to']}; the ratio of their units is known to "
+            f"{one['sigma']:.1%}"
         )
     if summary["maps"] > 1:
         lines.append(
-            f"{summary['maps']} maps, each in a unit of its own: frames.csv says where they begin"
+            f"{summary['maps']} maps, each with its own unit; frames.csv shows where each begins"
         )
     lines += [_unit_line(unit) for unit in summary["units"] if unit["sigma_log_scale"] is not None]
     camera = summary["calibration"]
@@ -145,21 +145,21 @@ def describe(summary: Summary) -> str:
         better, fx = camera["better_focal"], camera["given"]["fx"]
         lines.append(
             f"a focal length fx of {fx * better['factor']:.0f} fits the matches better than the "
-            f"{fx:.0f} given, and leaves {1 - better['squares_left']:.0%} less of their squared "
-            "errors. Is the calibration that of this camera, zoom and size?"
+            f"given {fx:.0f}: it reduces their squared errors by {1 - better['squares_left']:.0%}. "
+            "Is this the calibration of this camera, at this zoom and image size?"
         )
     if "ate" in summary:
         ate = summary["ate"]
         share = ate["rmse"] / ate["path_length"] if ate["path_length"] else float("nan")
         lines.append(
             f"absolute trajectory error after {ate['alignment']} alignment: {ate['rmse']:.4f} on "
-            f"a path of {ate['path_length']:.2f}, {share:.2%} (a straight line's "
-            f"{ate['straight_line']:.4f}); sign {ate['sign']:.2f}, "
-            f"orientation {ate['orientation_rmse']:.2f}°"
+            f"a path of {ate['path_length']:.2f}, {share:.2%} (that of a straight line: "
+            f"{ate['straight_line']:.4f}); sign {ate['sign']:.2f}; "
+            f"orientation error {ate['orientation_rmse']:.2f}°"
         )
     if "no_ate" in summary:
         turned = summary.get("orientation_rmse")
-        angle = "" if turned is None else f"; orientation {turned:.2f}°"
+        angle = "" if turned is None else f"; orientation error {turned:.2f}°"
         lines.append(f"no trajectory error: {summary['no_ate']}{angle}")
     return "\n".join(lines)
 
@@ -168,7 +168,8 @@ def known_points(landmarks: Points, history: Sequence[Tracked]) -> Points:
     """The landmarks whose depth became known in their maps."""
     with np.errstate(invalid="ignore"):  # of unknown depth, a variance can be anything
         sigma = np.sqrt(np.trace(landmarks.in_map, axis1=1, axis2=2))
-        known = np.isfinite(sigma) & (sigma < _KNOWN_DEPTH * _distances(landmarks, history))
+        # A point is put into the map where its σ is below this share of its distance.
+        known = np.isfinite(sigma) & (sigma < 0.3 * _distances(landmarks, history))
     return landmarks.only(known)
 
 
@@ -237,8 +238,8 @@ def _unit_line(unit: Summary) -> str:
     """Return what is known of a map's unit."""
     length, times = math.exp(unit["log_scale"]), math.exp(unit["sigma_log_scale"])
     return (
-        f"map {unit['map']}: one unit of length throughout, by the prior on depth {length:.2f} m, "
-        f"give or take a factor of {times:.2g} (1 sigma)"
+        f"map {unit['map']}: positions are in map units; one unit is roughly {length:.2f} m "
+        f"(within a factor of {times:.2g}, 1σ)"
     )
 
 
@@ -257,7 +258,7 @@ def _calibration(tracker: Tracker, history: Sequence[Tracked], points: Points) -
         result["estimated"] = dict(zip(INTRINSICS, mean.tolist(), strict=True))
         result["sigma"] = dict(zip(INTRINSICS, sigma.tolist(), strict=True))
     if treatment == "estimated":
-        result["caveat"] = f"{TOO_SURE}; docs/own-video.md says how much"
+        result["caveat"] = TOO_SURE
     if treatment == "known":
         factor, left = better_focal(history, points, tracker.calibration)
         if left < CLEAR:

@@ -1,4 +1,4 @@
-"""A synthetic handheld video of a textured room, rendered on the spot with its exact trajectory.
+"""A synthetic handheld video of a textured room, rendered with its exact trajectory.
 
 The room is made of textured planar quads painted from the back to the front. Each is warped by
 its exact homography onto a canvas of twice the size, which is then averaged down: that is the
@@ -54,7 +54,7 @@ def synthetic_source(
     """
     for name, value in [("frames", frames), ("width", width), ("height", height), ("rate", rate)]:
         if not value > 0:
-            raise ValueError(f"{name} is {value}; a positive number is accepted")
+            raise ValueError(f"{name} must be positive, not {value}")
     focal = 0.82 * max(width, height * 4 / 3)  # 63 degrees across, which the scene fills
     calibration = Calibration(
         width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, distortion=()
@@ -267,7 +267,7 @@ def _paint(
         return
     ends = plane @ np.array([[0, 1, 1, 0], [0, 0, 1, 1], [1, 1, 1, 1]])
     if ends[2].min() < _NEAREST:
-        raise ValueError(f"a quad comes nearer than {_NEAREST} m to the camera's plane")
+        raise ValueError(f"a quad comes closer than {_NEAREST} m to the camera's plane")
     ends = camera @ ends
     box = ends[:2] / ends[2]
     low = np.maximum(np.floor(box.min(axis=1)), 0).astype(int)

@@ -21,12 +21,8 @@ LEAST_POINTS = 4
 _METRES = ("metre", "metres", "meter", "meters", "m")
 _ALIKE = 0.8
 """Least correlation of a patch with the picture."""
-_COMBINATIONS = 2000
-"""Of places that the patches may be at; as many are tried, at the most."""
 _CORNER_REACH = 3
 """Pixels to each side in which the corner that a patch shows is measured."""
-_NEAR_AND_FAR = 1.5
-"""Ratio of the points' greatest to their least depth: seen steeper, no patch would look like it."""
 _LARGEST_RMS, _LARGEST_FOUND = 2.0, 0.75
 """Pixels: what is further off is no picture of the target; of patches, which corners make exact."""
 
@@ -37,7 +33,7 @@ class KnownPoint:
 
     name: str
     position: Float[np.ndarray, " 3"]
-    """In the target's own frame, m."""
+    """The position in the target's own frame, m."""
     pixel: Float[np.ndarray, " 2"] | None = None
     patch: UInt8[np.ndarray, "h w"] | None = None
     """The picture around it, about as large as it is seen; its corner is in the middle."""
@@ -45,7 +41,7 @@ class KnownPoint:
     def __post_init__(self) -> None:
         if (self.pixel is None) == (self.patch is None):
             raise ValueError(
-                f"point {self.name} needs a `pixel` [u, v] or a `patch`, an image file; one of them"
+                f"point {self.name} needs either a `pixel` [u, v] or a `patch`, an image file"
             )
 
 
@@ -57,11 +53,11 @@ class Target:
 
     def __post_init__(self) -> None:
         if len(self.points) < LEAST_POINTS:
-            raise ValueError(f"has {len(self.points)} points; at least {LEAST_POINTS} are accepted")
+            raise ValueError(f"has {len(self.points)} points; at least {LEAST_POINTS} are needed")
         from_middle = self.positions - self.positions.mean(axis=0)
         extent = np.linalg.svd(from_middle, compute_uv=False)
         if extent[1] < 1e-3 * extent[0] or not extent[0]:
-            raise ValueError("its points are on one line; at least a plane of them is accepted")
+            raise ValueError("its points are on one line; they must span a plane")
 
     @property
     def positions(self) -> Float[np.ndarray, "n 3"]:
@@ -79,7 +75,7 @@ class TargetObservation(NamedTuple):
     sigma: Float[np.ndarray, " n"]
     """σ of each; taken for independent, they cover the errors that all have in common."""
     rms: float
-    """Of the reprojection error, pixels."""
+    """The RMS reprojection error, pixels."""
 
 
 def read_target(path: str | Path) -> Target:
@@ -96,16 +92,16 @@ def read_target(path: str | Path) -> Target:
 def _from_fields(fields: Any, folder: Path) -> Target:
     points = fields.get("points") if isinstance(fields, dict) else None
     if not isinstance(points, list):
-        raise ValueError("holds no list of points; an object with `points` is accepted")
+        raise ValueError("has no list of points; expected an object with `points`")
     unit = fields.get("unit", "metre")
     if unit not in _METRES:
-        raise ValueError(f"unit is {unit!r}; metre is accepted")
+        raise ValueError(f"unit must be metre, not {unit!r}")
     return Target(tuple(_point(index, point, folder) for index, point in enumerate(points)))
 
 
 def _point(index: int, fields: Any, folder: Path) -> KnownPoint:
     if not isinstance(fields, dict):
-        raise ValueError(f"point {index} is {fields!r}; an object is accepted")
+        raise ValueError(f"point {index} must be an object, not {fields!r}")
     name = str(fields.get("name", index))
     position = _numbers(f"position of point {name}", fields.get("position"), 3)
     pixel, patch = fields.get("pixel"), fields.get("patch")
@@ -123,7 +119,7 @@ def _numbers(what: str, value: Any, count: int) -> Float[np.ndarray, " n"]:
     except (TypeError, ValueError, OverflowError):
         numbers = np.zeros(0)
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
-        raise ValueError(f"{what} is {value!r}; {count} finite numbers are accepted")
+        raise ValueError(f"{what} must be {count} finite numbers, not {value!r}")
     return numbers
 
 
@@ -146,14 +142,15 @@ def sighted(
     if not pose.rms <= largest:
         raise ValueError(
             f"the first picture does not show the target: its points are off by {pose.rms:.2f} px "
-            f"(RMS); {largest:g} px are accepted"
+            f"(RMS); the limit is {largest:g} px"
         )
     return _sighting(positions, pixels, lens, pose, pixel_sigma)
 
 
 def _places(target: Target, image: np.ndarray) -> list[list[Float[np.ndarray, " 2"]]]:
     """Return where each point may be: its pixel, or where the picture is most like its patch."""
-    count = max(1, int(_COMBINATIONS ** (1 / len(target.points))))
+    # Of places that the patches may be at; as many are tried, at the most.
+    count = max(1, int(2000 ** (1 / len(target.points))))
     return [_places_of(point, image, count) for point in target.points]
 
 
@@ -208,7 +205,8 @@ def _pose(
         return _Pose(np.zeros(3), np.zeros(3), np.inf)
     seen, _ = cv2.projectPoints(positions, turn, shift, *lens)
     depths = _in_camera(positions, turn, shift)[:, 2]
-    if not 0 < depths.max() <= _NEAR_AND_FAR * depths.min():
+    # Ratio of the points' greatest to their least depth: seen steeper, no patch would look like it.
+    if not 0 < depths.max() <= 1.5 * depths.min():
         return _Pose(turn, shift, np.inf)
     return _Pose(turn, shift, float(np.sqrt(np.mean(np.sum((seen[:, 0] - pixels) ** 2, axis=1)))))
 

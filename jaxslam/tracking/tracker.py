@@ -50,7 +50,7 @@ class Tracker:
     """
 
     calibration: Calibration
-    """Of the camera, for the size of its pictures."""
+    """The calibration of the camera, for the size of its pictures."""
     settings: TrackerSettings = field(default_factory=TrackerSettings)
     filter: AbstractStaged | None = None
     """One's own, in place of the filter that the settings name."""
@@ -60,9 +60,9 @@ class Tracker:
     sighting: TargetObservation | None = field(default=None, init=False)
     """Where the first frame saw the target."""
     filter_name: str = field(init=False)
-    """As in the settings, or of the class of one's own."""
+    """The name in the settings, or the class of your own filter."""
     time: float | None = field(default=None, init=False)
-    """Of the latest frame, s."""
+    """The time of the latest frame, s."""
     steps: int = field(default=0, init=False)
     """Frames given so far."""
     unmeasured: int = field(default=0, init=False)
@@ -70,7 +70,7 @@ class Tracker:
     elsewhere: bool = field(default=False, init=False)
     """Whether the map was out of view in one of them."""
     searching: bool = field(default=False, init=False)
-    """Whether no map has begun, as one that is known may be found."""
+    """Whether no map has started because a known one may be found."""
     failed: Counter[str] = field(default_factory=Counter, init=False)
     """How many updates ended in which `Status` that says that their result means nothing."""
     refused: int = field(default=0, init=False)
@@ -87,8 +87,8 @@ class Tracker:
     def __post_init__(self) -> None:
         if not isinstance(self.calibration, Calibration):
             raise ValueError(
-                f"calibration is a {type(self.calibration).__name__}; a Calibration is accepted, "
-                "which `jaxslam.io.calibration.read_calibration` reads from a file"
+                f"calibration must be a Calibration, not a {type(self.calibration).__name__}; "
+                "jaxslam.io.calibration.read_calibration reads one from a file"
             )
         settings, own = self.settings, self.filter
         self.filter_name = settings.filter if own is None else type(own).__name__
@@ -125,8 +125,8 @@ class Tracker:
         before = -np.inf if self.time is None else self.time
         if not before < frame.time < np.inf:
             raise ValueError(
-                f"frame {frame.index}: its time, {frame.time} s, is not later than the one before, "
-                f"{before} s"
+                f"frame {frame.index}: its time, {frame.time} s, is not later than that of the "
+                f"previous frame, {before} s"
             )
         with jax.enable_x64(True):
             tracked = self._first(frame) if self.time is None else self._next(frame, self.time)
@@ -158,7 +158,7 @@ class Tracker:
 
     def camera(self) -> tuple[str, np.ndarray, np.ndarray] | None:
         """Return how the calibration is treated, and fx, fy, cx, cy with their covariance, pixels,
-        as far as this map tells. None of a filter of one's own without a pinhole camera."""
+        as far as this map tells; None for a filter without a pinhole camera."""
         with jax.enable_x64(True):
             return self.map.estimator.camera()
 
@@ -168,14 +168,14 @@ class Tracker:
         Raises ValueError before the first frame, when there is nothing to go on from.
         """
         if self.time is None:
-            raise ValueError("a tracker that was given no frame yet has nothing to save")
+            raise ValueError("a tracker without any frame has nothing to save")
         persistence.save(path, self, None if self.filter is None else self.filter_name)
 
     @classmethod
     def load(cls, path: str | Path, filter: AbstractStaged | None = None) -> Tracker:
         """The tracker that was saved, which goes on as that would have: digit by digit.
 
-        One with a filter of one's own is to be given that again. Raises ValueError for a file
+        If it had a `filter` of your own, pass that again. Raises ValueError for a file
         that is none, or of another filter.
         """
         return persistence.load(path, partial(cls, filter=filter), own_filter=filter is not None)
@@ -193,7 +193,9 @@ class Tracker:
                 f"{one.width} × {one.height}, fx {one.fx:g}"
                 for one in (tracker.calibration, calibration)
             )
-            raise ValueError(f"{path}: is a map of another camera ({theirs}) than this ({ours})")
+            raise ValueError(
+                f"{path} is a map of another camera ({theirs}), not of this one ({ours})"
+            )
         with jax.enable_x64(True):
             tracker.map.leave()
         tracker.time, tracker.steps, tracker.unmeasured = None, 0, 1

@@ -17,11 +17,11 @@ from jaxslam.io.tum import write_tum
 TRACKED = Convention("split", "body")
 """The error whose covariances are written: position in the camera's axes, rotation vector."""
 
-_UNITS = "one unit of length a map, another in every map of frames.csv"
 _GIVEN_SCALE = (
-    "of poses in that unit, of which sigma_log_scale of frames.csv is in doubt; "
-    "where unit_fixed is 0 there, it is nearly the same unit"
+    "in the unit of each map; the unit itself is uncertain by sigma_log_scale (frames.csv) and "
+    "approximate where unit_fixed is 0"
 )
+_KNOWN_SCALE = "in the unit of each map, which the filter takes as exactly known"
 
 
 class TrajectoryError(TypedDict):
@@ -51,7 +51,7 @@ def write_trajectory(path: str | Path, times: ArrayLike, T_wc: ArrayLike) -> Non
 
     All poses of a map are in one unit of length (docs/gauge.md), and the header says so.
     """
-    write_tum(path, times, T_wc, _UNITS)
+    write_tum(path, times, T_wc, "in the unit of each map (frames.csv)")
 
 
 def write_covariances(
@@ -64,14 +64,13 @@ def write_covariances(
 ) -> None:
     """Write times (n,) and covariances (n, 6, 6) of the `TRACKED` error, whole or not at all.
 
-    They are of poses in the one unit of their map; that maps which follow one another have others
-    is not in them. The header says whether these are covariances `given_scale`, of a filter with a
-    unit of its own, of whose size in metres it is in doubt, or of poses in a unit that the filter
-    takes for exactly known; and the caveat, if there is one.
+    They are of poses in the unit of their map; different units of different maps are not in them.
+    With `given_scale` the filter has a unit of its own whose size in metres is uncertain. Otherwise
+    it takes its unit for exactly known. The header says which, and the caveat if there is one.
     """
     convention = replace(TRACKED, scale="given" if given_scale else "marginal")
-    scale = _GIVEN_SCALE if given_scale else "the filter has no doubt of its scale"
-    remark = "; ".join(filter(None, [f"{_UNITS}, taken as one", scale, caveat]))
+    scale = _GIVEN_SCALE if given_scale else _KNOWN_SCALE
+    remark = "; ".join(filter(None, [scale, caveat]))
     write_pose_covariances(path, times, covariances, convention, length="map", remark=remark)
 
 
@@ -185,8 +184,8 @@ def _paired(
     theirs, ours = associated(true_times, times)
     if len(ours) < 3:
         raise ValueError(
-            f"{len(ours)} poses of the trajectory are within {MAX_TIME_DIFFERENCE} s of one of the "
-            "reference's; at least three are needed"
+            f"{len(ours)} poses of the trajectory are within {MAX_TIME_DIFFERENCE} s of a "
+            "reference pose; at least three are needed"
         )
     return _Pairs(true_times[theirs], T[ours], true[theirs])
 

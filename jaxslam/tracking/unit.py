@@ -31,9 +31,9 @@ def nearness(numbers: Mapping[int, int], points: Float[np.ndarray, "n 3"]) -> Ne
 def lengthened(before: Nearness, now: Nearness, among: Iterable[int]) -> float:
     """Log of by how much longer the filter's unit is now than it was before.
 
-    What pixels tell of a camera that sets out are the products t ω, and it is the mean of the ω
-    that is taken to be the same, of those landmarks `among` these that are known both times. Zero
-    where nothing tells.
+    Pixels of a camera that starts to move determine the products t ω. The mean of the ω is taken to
+    be the same, over the landmarks `among` these that are known both times. Zero where there is
+    none.
     """
     pairs = np.array([(before[n], now[n]) for n in among if n in before and n in now])
     old, new = pairs[np.isfinite(pairs).all(axis=1)].sum(axis=0) if len(pairs) else (0.0, 0.0)
@@ -50,17 +50,17 @@ class MapInWorld:
     log_unit: float = 0.0
     """Log of the filter's unit in the map's."""
     log_scale: float = 0.0
-    """Log of the map's unit in metres, as the filter believes it to be …"""
+    """The log of the map's unit in metres, as the filter believes it to be."""
     sigma_log_scale: float | None = None
-    """… and its σ, where the filter is in doubt of it."""
+    """σ of that log, where the filter is uncertain of it."""
     unit_fixed: bool = True
     """Whether the filter keeps its unit from here on."""
     near: Nearness = field(default_factory=dict)
-    """Of all landmarks, as long as the filter's unit is not fixed."""
+    """The nearness of all landmarks, as long as the filter's unit is not fixed."""
     told: PoseWithCovariance = field(default_factory=PoseWithCovariance)
-    """A camera from where the map begins, as the filter had it when a loop closed …"""
+    """A camera from where the map begins, as the filter had it when a loop closed."""
     known: PoseWithCovariance = field(default_factory=PoseWithCovariance)
-    """… and as it was known then."""
+    """The same camera as it was known then."""
     here: PoseWithCovariance = field(default_factory=PoseWithCovariance)
     """The camera from where the map begins, as the filter has it now."""
 

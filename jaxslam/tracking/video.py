@@ -36,9 +36,6 @@ from jaxslam.tracking.trajectory import (
 )
 from jaxslam.tracking.viewer import Viewer
 
-_MAP_EVERY = 10
-"""Frames from one map of a recording to the next."""
-
 
 def track(
     source: Source,
@@ -58,7 +55,7 @@ def track(
 
     An interruption (KeyboardInterrupt) or an unreadable frame (ValueError) leaves all of them for
     the frames so far, and is raised again; an interruption of the first frame or the second leaves
-    none. `slam` is a filter of one's own, in place of the one that the settings name. `target`,
+    none. `slam` is a filter of your own, in place of the one that the settings name. `target`,
     known points that the first frame sees, makes the map metric. `known` is the `map.npz` of
     another video by the same camera: this one goes on with that map where it is known again, by its
     settings. `viewer` is a file for the rerun viewer, FILE.rrd, written beside the others.
@@ -115,7 +112,8 @@ def _shown(
                 aside.give(lambda *drawn: writer.write(overlay_of(*drawn)), frame, history[-1])
             if recording is not None:
                 aside.give(recording.show, frame, history[-1])
-                if len(history) % _MAP_EVERY == 0:
+                # Frames from one map of a recording to the next.
+                if len(history) % 10 == 0:
                     aside.give(recording.show_map, known_points(tracker.points(), history))
 
         try:

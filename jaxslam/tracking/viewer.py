@@ -19,9 +19,6 @@ from jaxslam.tracking.report import Tracked
 
 _IMAGE = "world/camera/image"
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
-_PIECE = 100
-"""Positions in one piece of the path, the last of which is written anew with every frame."""
-_FRUSTUM = 0.3  # length of the camera's pyramid, map units
 _TRACKED, _LOST = (0, 114, 178), (150, 150, 150)  # of the path
 _LOOP = (213, 94, 0)
 
@@ -29,11 +26,11 @@ _LOOP = (213, 94, 0)
 class Viewer:
     """A file for rerun (`rerun FILE.rrd`), of the frames so far at any end; nothing is sent.
 
-    Along the timelines `frame` and `time` (s since the first frame): the picture with search
-    ellipses of three standard deviations and matches by status, camera, path (grey where it was
-    lost), ends of submaps and loops to them, landmarks with their 1 σ ellipsoids, NIS by its
-    degrees of freedom, the σ and the `log_scale` of `frames.csv`, and the state where it changes.
-    All of a map is in one unit.
+    Its timelines are `frame` and `time` (s since the first frame). It shows the picture with search
+    ellipses of three standard deviations and matches by status, the camera and its path (grey where
+    it was lost), and ends of submaps with the loops to them. Landmarks have 1 σ ellipsoids. Curves
+    are of NIS over its degrees of freedom, and of σ and `log_scale` of `frames.csv`. A change of
+    state is logged. All of a map is in one unit.
     Raises `ValueError` without rerun, or for a name that does not end in .rrd.
     """
 
@@ -42,7 +39,7 @@ class Viewer:
         self.calibration = calibration
         self._rerun = _rerun()
         if self.path.suffix.lower() != ".rrd":
-            raise ValueError(f"{self.path}: a name ending in .rrd is accepted")
+            raise ValueError(f"{self.path}: the name must end in .rrd")
         self._began: float | None = None
         self._piece, self._positions = 0, np.zeros((0, 3))
         self._before: Tracked | None = None
@@ -55,9 +52,10 @@ class Viewer:
         self._record = rr.RecordingStream("jaxslam", recording_id=uuid4())
         self._record.save(self.path, default_blueprint=_layout())
         self._record.log("world", rr.ViewCoordinates.RDF, static=True)
+        # Length of the camera's pyramid, map units
         camera = rr.Pinhole(
             image_from_camera=c.matrix, width=c.width, height=c.height,
-            camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=_FRUSTUM,
+            camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.3,
         )  # fmt: skip
         self._record.log(_IMAGE, camera, static=True)
         return self
@@ -115,7 +113,8 @@ class Viewer:
         self._record.log("world/camera", pose)
         before = self._before
         joined = before is not None and before.map == result.map
-        if not joined or before.lost != result.lost or len(self._positions) >= _PIECE:
+        # Positions in one piece of the path, the last of which is written anew with every frame.
+        if not joined or before.lost != result.lost or len(self._positions) >= 100:
             self._piece += 1
             self._positions = self._positions[-1:] if joined else self._positions[:0]
         self._positions = np.vstack([self._positions, position])

@@ -112,7 +112,7 @@ def test_the_scale_given_is_conditioned_on():
 
 def test_a_filter_without_a_start_from_rest_is_refused():
     of = standstill()
-    with pytest.raises(ValueError, match=r"start from rest \(\+rest\), not of Slam"):
+    with pytest.raises(ValueError, match=r"start from rest \(\+rest\), and this filter has none"):
         modes_of_run(of.filter("scale_gauge"), of.room, of.run(0))
 
 

@@ -50,7 +50,7 @@ import jaxslam
 from jaxslam._runtime.watchdog import lapack_calls
 from jaxslam.filters.mixture.sum_state import moments
 from jaxslam.filters.readouts import camera_pose
-from jaxslam.filters.window.start import from_rest
+from jaxslam.filters.window.start import FromWindow, Schedule
 from jaxslam.geometry import difference, log, retract
 
 FEW = SMC(particles=800, moves=3)
@@ -478,14 +478,14 @@ def test_the_gaussians_of_a_filter_have_its_moments():
 
 def test_a_start_from_rest_has_the_gaussians_of_its_sum_and_a_plain_filter_has_one():
     slam, state, _ = a_sum()
-    start = from_rest(slam, 3)
+    start = replace(slam, start=FromWindow(Schedule.of(slam.motion.geometry, 3)))
     begun = replace(quick_jit(lambda: start.init(4))(), sum=state)
     jax.tree.map(
         np.testing.assert_array_equal, filter_mixture(start, begun), filter_mixture(slam, state)
     )
     member = state.likeliest
-    mean, P = camera_pose(slam.base, member)
-    one = filter_mixture(slam.base, member)
+    mean, P = camera_pose(slam.one, member)
+    one = filter_mixture(slam.one, member)
     assert one.weights.tolist() == [1.0]
     np.testing.assert_array_equal(one.means.parameters()[0], mean.parameters())
     np.testing.assert_array_equal(one.covariances[0], P)

@@ -60,6 +60,35 @@ def processes():
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_filters_of_every_kind_are_the_same_on_a_cluster(processes):
+    """A worker has other objects for their frames, landmarks and corrections, equal by value."""
+    address, _ = processes
+    from distributed import Client
+
+    worlds = {
+        "laps": ["recommended+submaps", "robocentric+oc+submaps"],
+        "matched-tight": ["invariant", "keyframe", "world+drift+iterated2", "recommended+checked"],
+        "standstill": ["recommended"],
+    }
+    few = {"steps": 4, "landmarks": 12}
+    with Client(address, timeout=60, set_as_default=False) as client:
+        client.wait_for_workers(2, timeout=90)
+        for name, words in worlds.items():
+            scenario = jaxslam.scenario(name, few | ({"in_view": 4} if name == "laps" else {}))
+            made = jaxslam.make_filters(scenario, words)
+            sizes: dict[str, Any] = {"runs": 4, "chunk": 2, "backend": "xla"}
+            found = jaxslam.monte_carlo(scenario, made, **sizes, cluster=client)
+            wanted = jaxslam.monte_carlo(scenario, made, **sizes)
+            for filter_name in made:
+                ours, theirs = (
+                    [study.store.load(filter_name, chunk) for chunk in study.chunks]
+                    for study in (found, wanted)
+                )
+                assert_same(ours, theirs)
+
+
+@pytest.mark.slow
 @pytest.mark.timeout(180)
 def test_a_study_on_a_cluster_is_the_same_although_a_worker_is_killed(processes, tmp_path):
     address, workers = processes

@@ -133,7 +133,7 @@ def test_one_run_of_white_innovations_is_as_many_samples_as_it_has_steps(factor,
     assert (found.verdict["word"], found.verdict["samples"]) == (word, "steps")
     assert found.verdict["white"] > 0.01
     assert found.axis_verdict(0)["word"] == word
-    assert "every step is a sample" in str(found)
+    assert "each step is one sample" in str(found)
     # The same numbers as errors are one run, whose steps may be all but one.
     assert jaxslam.evaluate(factor * e, P).verdict["word"] == "cannot tell"
 
@@ -146,7 +146,7 @@ def test_innovations_that_are_not_white_tell_no_more_than_their_runs_do(factor):
     assert "innovations are not white (p = " in str(found)
     short = jaxslam.evaluate(e[:, :6], P[:, :6], quantity="NIS")
     assert short.verdict["white"] is None
-    assert "too few to tell whether innovations are white" in str(short)
+    assert "too few steps to tell whether innovations are white" in str(short)
 
 
 def test_white_innovations_are_called_otherwise_once_in_a_hundred():
@@ -173,7 +173,7 @@ def test_a_step_of_an_innovation_is_outlying_and_nothing_is_lost():
     e[0, 400] = 9.0
     found = jaxslam.evaluate(e, P, quantity="NIS")
     assert found.verdict["lost_runs"] == [0]
-    assert "1 of 1 runs have an outlying NIS, all of them" in str(found)
+    assert "the only run has an outlying NIS" in str(found)
     assert "lost" not in str(found)
     e[0, 400] = 1e300
     found = jaxslam.evaluate(e, P * 1e-100, quantity="NIS")
@@ -257,7 +257,7 @@ def changed(values, place, value):
         ),
         (
             lambda e, P: (e, changed(P, (3, 4, 0, 1), 9.0)),
-            r"run 3, step 4 is not symmetric .*a symmetric, positive definite one is accepted",
+            r"run 3, step 4 is not symmetric .*it must be symmetric and positive definite",
         ),
         (
             lambda e, P: (e, changed(P, (6, 5), np.ones((3, 3)) + 1e-3 * np.eye(3) - 5e-3)),
@@ -291,7 +291,7 @@ def test_rounding_of_a_text_is_no_asymmetry():
 
 @pytest.mark.parametrize("times", [[1, 2, 3], np.full(7, np.nan), [0, 1, 2, 3, 2, 5, 6], "soon"])
 def test_times_are_one_a_step_and_do_not_decrease(times):
-    with pytest.raises(ValueError, match="times must be 7 finite seconds"):
+    with pytest.raises(ValueError, match="times must be 7 finite, non-decreasing"):
         jaxslam.evaluate(*drawn(), times=times)
 
 
@@ -378,7 +378,7 @@ def test_a_step_of_which_only_a_part_is_missing_is_refused():
     with pytest.raises(ValueError, match="covariances of run 2, step 4 holds nan"):
         jaxslam.evaluate(e, P)
     e[2], P[2] = np.nan, np.nan
-    with pytest.raises(ValueError, match="run 2 has no step"):
+    with pytest.raises(ValueError, match="run 2 is all NaN"):
         jaxslam.evaluate(e, P)
 
 
@@ -458,17 +458,21 @@ def lines(*rows):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.csv", lines((0, 0, 1.0, 1.0), (0, 1, 1.0)), "line 2: numbers run, step, n errors"),
-        ("a.csv", lines((0, 0, 1.0, 1.0, 3.0)), "5 columns; numbers run, step"),
+        (
+            "a.csv",
+            lines((0, 0, 1.0, 1.0), (0, 1, 1.0)),
+            "line 2: expected numbers run, step, n errors",
+        ),
+        ("a.csv", lines((0, 0, 1.0, 1.0, 3.0)), "5 columns; expected numbers run, step"),
         ("a.csv", lines((0, 0, 1.0, 1.0, 3.0)), "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"),
-        ("a.csv", "0;0;1,0;1,0\n", "line 1: numbers run, step"),
-        ("a.csv", lines((0, 0, 1.0, 1.0), (0, 0, 2.0, 1.0)), "line 2: run 0, step 0 comes twice"),
+        ("a.csv", "0;0;1,0;1,0\n", "line 1: expected numbers run, step"),
+        ("a.csv", lines((0, 0, 1.0, 1.0), (0, 0, 2.0, 1.0)), "line 2: run 0, step 0 appears twice"),
         ("a.csv", lines(*((r, 9 * r + s, 1, 1) for r in range(3) for s in (0, 1))), "6 different"),
-        ("a.csv", lines((0, 0, "nan", 1.0)), "line 1: numbers run"),
+        ("a.csv", lines((0, 0, "nan", 1.0)), "line 1: expected numbers run"),
         ("a.csv", lines((0, 0, 1.0, -1.0)), "run 0, step 0 has variance -1"),
         ("a.csv", lines((1, 1, 1, 1), (1, 2, 1, 1), (3, 2, 1, -1)), "run 3, step 2 has variance"),
-        ("a.csv", "", "holds no errors"),
-        ("a.csv", "run,step,e,P\n", "holds no errors"),
+        ("a.csv", "", "has no errors"),
+        ("a.csv", "run,step,e,P\n", "has no errors"),
         ("a.npz", "nonsense", "not an npz file"),
         ("a.npz", "", "not an npz file"),
         ("missing.npz", None, "no such file or folder"),
@@ -500,7 +504,7 @@ def refused(arguments, message, tmp_path, capsys):
         ({"eror": np.ones((1, 1, 1))}, "unknown array 'eror' (did you mean error?)"),
         ({"errors": np.array([None])}, "not an npz file of numbers"),
         ({"errors": np.ones((1, 1, 1)), "covariances": np.array("many")}, "must be numbers"),
-        ({"errors": 1, "innovations": 1, "covariances": 1}, "holds errors, innovations"),
+        ({"errors": 1, "innovations": 1, "covariances": 1}, "contains errors, innovations"),
         ({"estimates": np.ones((1, 1, 4, 4)), "covariances": 1.0}, "covariances and truths"),
     ],
 )
@@ -515,14 +519,14 @@ def test_options_that_do_not_go_together_are_refused(tmp_path, capsys):
     arrays = str(tmp_path / "a.npz")
     refused(
         [arrays, "--error", "left"],
-        "conventions, alignments, axes used are of poses",
+        "axes used and σ of the truth apply to poses",
         tmp_path,
         capsys,
     )
     refused([arrays, "--truth", arrays], "--truth goes with a trajectory", tmp_path, capsys)
     write_tum(tmp_path / "t.txt", [0.0], np.eye(4)[None])
     for_poses = [str(tmp_path / "t.txt"), "--nis"]
-    refused(for_poses, "innovations come in an npz or CSV file", tmp_path, capsys)
+    refused(for_poses, "innovations must be in an npz or CSV file", tmp_path, capsys)
 
 
 def test_a_folder_that_cannot_be_made_is_a_mistake_of_one_line(tmp_path, capsys):

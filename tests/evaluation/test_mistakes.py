@@ -80,7 +80,7 @@ def test_an_angle_in_degrees_is_wrapped_at_360():
 @pytest.mark.parametrize(("names", "name"), [(NAMES, "heading"), ((), "3")])
 def test_degrees_for_radians_are_named(names, name, seed):
     e, P = right(runs=60, seed=seed)
-    expected = f"no verdict: degrees where radians belong ({name})"
+    expected = f"no verdict: degrees instead of radians ({name})"
     assert said(e * DEGREES, P, names) == expected
     assert said(e, P * DEGREES * DEGREES[:, None], names) == expected
     only = slice(2, 3)
@@ -92,7 +92,7 @@ def test_degrees_are_named_of_few_runs_whose_errors_hardly_change():
     for seed in range(10):
         e, P = right(runs=10, correlation=0.99, seed=seed)
         for names, name in ((NAMES, "heading"), ((), "3")):
-            expected = f"no verdict: degrees where radians belong ({name})"
+            expected = f"no verdict: degrees instead of radians ({name})"
             assert said(e * DEGREES, P, names) == expected
             assert said(e, P * DEGREES * DEGREES[:, None], names) == expected
 
@@ -102,7 +102,7 @@ def test_degrees_are_named_of_innovations():
     z, S = right(runs=1, steps=300, correlation=0.0)
     for names in (NAMES, ()):
         found = jaxslam.evaluate(z * DEGREES, S, names=names, quantity="NIS")
-        assert "degrees where radians belong" in found.headline
+        assert "degrees instead of radians" in found.headline
 
 
 def test_degrees_are_named_in_poses_too(tmp_path, capsys):
@@ -126,7 +126,7 @@ def test_degrees_are_named_in_poses_too(tmp_path, capsys):
         write_covariances(folder / "covariance.txt", times, P, Convention("split", "mixed"))
     main(["evaluate", str(tmp_path / "runs"), "--out", str(tmp_path / "out")])
     out = capsys.readouterr().out
-    assert out.startswith("no verdict: degrees where radians belong (rx, ry, rz)\n")
+    assert out.startswith("no verdict: degrees instead of radians (rx, ry, rz)\n")
     assert "covariances in degrees" in out
     written = json.loads((tmp_path / "out" / "evaluation.json").read_text())
     assert written["verdict"]["word"] == "cannot tell"
@@ -136,7 +136,7 @@ def test_degrees_are_named_in_poses_too(tmp_path, capsys):
 @pytest.mark.parametrize("names", [NAMES, ()])
 def test_arrays_of_steps_and_runs_are_named(runs, names):
     e, P = (np.swapaxes(x, 0, 1) for x in right(runs=runs, steps=60))
-    assert said(e, P, names) == "no verdict: runs and steps look interchanged"
+    assert said(e, P, names) == "no verdict: runs and steps appear to be swapped"
 
 
 # --- and nothing else is ------------------------------------------------------------------------

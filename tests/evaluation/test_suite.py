@@ -146,7 +146,7 @@ BAD = {
     "the last step is missing": (lambda log: log[log[:, 1] < STEPS], f"step {STEPS} is missing"),
     "a run too many": (lambda log: np.vstack([log, [RUNS, *log[-1, 1:]]]), f"run {RUNS} is missi"),
     "steps from 0": (lambda log: log - [0, 1, *[0] * 9], "step 8 is missing"),
-    "a row twice": (lambda log: np.vstack([log, log[:1]]), "run 0, step 1 comes twice"),
+    "a row twice": (lambda log: np.vstack([log, log[:1]]), "run 0, step 1 appears twice"),
     "too few columns": (lambda log: log[:, :-2], "9 columns"),
     "too few numbers": (lambda log: log[:, :7], "run, step, x, z, rotation and their covariance"),
     "not a number": (lambda log: nan_at(log, 7), "line 8"),
@@ -192,7 +192,7 @@ def test_columns_are_those_of_the_truth_and_rows_in_any_order(written, tmp_path)
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("log.txt", "holds no NAME.csv of a scenario"), ("circle.csv", "'circle'; known: small")],
+    [("log.txt", "has no log: expected small.csv"), ("circle.csv", "'circle'; known: small")],
 )
 def test_logs_are_of_scenarios_of_the_suite(name, message, written, tmp_path, capsys):
     (tmp_path / "logs").mkdir()
@@ -218,7 +218,7 @@ def test_a_suite_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
     (tmp_path / "suite").mkdir()
     (tmp_path / "suite" / "mine.csv").touch()
-    with pytest.raises(ValueError, match="is there already"):
+    with pytest.raises(ValueError, match="already exists; name a new folder"):
         write_suite(tmp_path / "suite", [SMALL], runs=2)
     assert [path.name for path in (tmp_path / "suite").iterdir()] == ["mine.csv"]
 
@@ -299,18 +299,18 @@ def test_the_measurements_are_the_projections_of_fixed_points(tmp_path):
     [
         (
             {"placement": "rays", "depth_range": (1.0, 6.0)},
-            "share slots, .* any placement but rays",
+            "share slots, .* a placement other than rays",
         ),
-        ({"in_view": 9}, "its landmarks share slots, .* for a suite in_view=0 is accepted"),
+        ({"in_view": 9}, "its landmarks share slots, .* --suite needs in_view=0"),
         (
             {"sensor": "position", "calibration": "known"},
-            "its sensor is Position; for a suite camera is accep",
+            "has a Position sensor; --suite supports cameras only",
         ),
     ],
 )
 def test_a_scenario_that_no_suite_has_is_refused(changes, message, tmp_path):
     """Landmarks need a number of their own, and measurements are pixels."""
-    with pytest.raises(ValueError, match=f"^small: .*{message}"):
+    with pytest.raises(ValueError, match=f"^small:? .*{message}"):
         write_suite(tmp_path / "suite", [jaxslam.scenario(SMALL, **changes)], runs=1)
 
 

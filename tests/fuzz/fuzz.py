@@ -115,7 +115,13 @@ def read_source(name: str = "") -> Callable[[Path, np.random.Generator], Any]:
 
 
 OVERRIDES = ("pixel_sigma=0.5", "velocity=[1,2,3]", "steps=7", "calibration=white", "rate=30")
-NAMES = ("world", "robocentric+oc", "scale_gauge+scene50+mixture3+rest8", "world+lag10", "nothing")
+NAMES = (
+    "world",
+    "robocentric+oc",
+    "scale_gauge+scene50+mixture3+rest8",
+    "recommended+submaps",
+    "nothing",
+)
 
 
 def read_override(folder: Path, draw: np.random.Generator) -> Any:

@@ -170,8 +170,8 @@ def test_without_a_video_the_board_is_drawn_to_be_printed(kind, tmp_path):
     ("options", "message"),
     [
         (["--board", "dots"], "unknown board 'dots'; known: checkerboard, charuco"),
-        (["--columns", "3"], "a board of 3x7 squares; at least 4x4"),
-        (["--square", "0"], "square is 0.0 m"),
+        (["--columns", "3"], "at least 4x4 squares, not 3x7"),
+        (["--square", "0"], "square must be a positive length, not 0.0 m"),
         (["--dictionary", "7Y7"], "unknown dictionary '7Y7'"),
         (["--columns", "13"], "0 pictures show the whole board of 13x7 squares"),
     ],

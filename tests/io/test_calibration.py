@@ -81,7 +81,7 @@ def test_a_guess_is_of_the_longer_side_and_less_sure():
 
 @pytest.mark.parametrize("degrees", [0.0, 180.0, -60.0, float("nan")])
 def test_a_field_of_view_that_no_pinhole_has_is_refused(degrees):
-    with pytest.raises(ValueError, match="more than 0 and less than 180"):
+    with pytest.raises(ValueError, match="between 0° and 180°"):
         from_field_of_view(640, 480, degrees)
 
 
@@ -112,22 +112,28 @@ def test_short_distortion_is_padded(tmp_path, given):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"fx": None, "cy": None}, "fx, cy missing"),
-        ({"model": "fisheye"}, "'fisheye' is unknown"),
-        ({"fx": -525.0}, "fx is -525.0; a positive"),
-        ({"fy": float("nan")}, "fy is nan; a finite"),
-        ({"cx": float("inf")}, "cx is inf; a finite"),
-        ({"width": 0}, "width is 0; a positive"),
-        ({"width": 640.5}, "width is 640.5; a whole"),
-        ({"fx": "525"}, "fx is '525'; a number"),
-        ({"height": True}, "height is True; a number"),
+        ({"fx": None, "cy": None}, "missing fx, cy"),
+        ({"model": "fisheye"}, "unknown camera model 'fisheye'"),
+        ({"fx": -525.0}, "fx must be positive, not -525.0"),
+        ({"fy": float("nan")}, "fy must be finite, not nan"),
+        ({"cx": float("inf")}, "cx must be finite, not inf"),
+        ({"width": 0}, "width must be positive, not 0"),
+        ({"width": 640.5}, "width must be a whole number of pixels, not 640.5"),
+        ({"fx": "525"}, "fx must be a number, not '525'"),
+        ({"height": True}, "height must be a number, not True"),
         ({"distortion": [0.0] * 6}, "has 6 entries"),
-        ({"distortion": 0.1}, "distortion is not a list"),
-        ({"distortion": [0.1, "x"]}, r"distortion\[1\] is 'x'"),
-        ({"sigma": {"fx": 1.0}}, "one with fx, fy, cx, cy is accepted"),
-        ({"sigma": [1.0, 1.0, 1.0, 1.0]}, "one with fx, fy, cx, cy is accepted"),
-        ({"sigma": {"fx": -1.0, "fy": 1.0, "cx": 1.0, "cy": 1.0}}, "sigma of fx is -1.0"),
-        ({"sigma": {"fx": "1", "fy": 1.0, "cx": 1.0, "cy": 1.0}}, "sigma of fx is '1'"),
+        ({"distortion": 0.1}, "distortion must be a list"),
+        ({"distortion": [0.1, "x"]}, r"distortion\[1\] must be a number, not 'x'"),
+        ({"sigma": {"fx": 1.0}}, "an object with fx, fy, cx, cy"),
+        ({"sigma": [1.0, 1.0, 1.0, 1.0]}, "an object with fx, fy, cx, cy"),
+        (
+            {"sigma": {"fx": -1.0, "fy": 1.0, "cx": 1.0, "cy": 1.0}},
+            "sigma of fx must not be negative, not -1.0",
+        ),
+        (
+            {"sigma": {"fx": "1", "fy": 1.0, "cx": 1.0, "cy": 1.0}},
+            "sigma of fx must be a number, not '1'",
+        ),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
@@ -140,7 +146,12 @@ def test_bad_fields_are_refused_naming_file_and_field(tmp_path, changes, words):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"), [("{", "not a JSON file"), ("[1]", "holds a list"), (None, "cannot read")]
+    ("text", "words"),
+    [
+        ("{", "not a JSON file"),
+        ("[1]", "expected a JSON object, not a list"),
+        (None, "cannot read"),
+    ],
 )
 def test_other_files_are_refused(tmp_path, text, words):
     path = tmp_path / "c.json"

@@ -54,7 +54,7 @@ def test_the_command_line_without_its_libraries_names_the_cli_extra(library, mon
 
 def test_a_bar_without_tqdm_names_the_cli_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "tqdm.auto", None)
-    with pytest.raises(ValueError, match=r"a bar of progress needs the cli extra \(tqdm"):
+    with pytest.raises(ValueError, match=r"a progress bar needs the cli extra \(tqdm"):
         bar(3, "run")
 
 

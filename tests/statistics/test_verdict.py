@@ -267,14 +267,14 @@ def test_a_few_lost_runs_are_named_and_judged_apart():
     assert verdict["lost_runs"] == [0, 1, 2]
     others = sentences(verdict)[2]
     assert others.startswith(
-        "3 of 1000 runs were lost (numbers 0, 1, 2), the 997 never lost: NEES 2.98, σ right"
+        "3 of 1000 runs were lost (runs 0, 1, 2), the 997 never lost: NEES 2.98, σ right"
     )
 
 
 def test_of_runs_that_are_chosen_by_their_nees_no_verdict_is_said():
     nees = consistent()
     nees[:11, 5] = 1e3
-    named = "numbers 0, 1, 2, 3, 4, 5, 6, 7 and 3 more"
+    named = "runs 0, 1, 2, 3, 4, 5, 6, 7 and 3 more"
     rest = f"the 989 never lost: NEES {nees[11:].mean():.2f}"
     expected = f"11 of 1000 runs were lost ({named}), {rest}"
     assert sentences(run_verdict(nees, 3))[2] == expected
@@ -330,7 +330,7 @@ def test_a_study_of_lost_runs_only_has_a_verdict(value):
     json.dumps(verdict, allow_nan=False)
     assert verdict["word"] == ("lost" if np.isnan(value) else "over-confident")
     assert verdict["never_lost"]["runs"] == 0
-    assert sentences(verdict)[-1] == "4 of 4 runs were lost, all of them"
+    assert sentences(verdict)[-1] == "all 4 runs were lost"
 
 
 # --- degrees of freedom that a fit may have taken -------------------------------------------------
@@ -380,7 +380,7 @@ def test_tallies_with_a_fit_add_up_and_no_others_are_of_one_study():
     one, other = Tally.of(nees[:5], 3, 0.5), Tally.of(nees[5:], 3, 0.5)
     assert Tally.from_dict(json.loads(json.dumps(one.asdict()))) == one
     assert Tally.of_numbers(one.numbers() + other.numbers(), 3, 0.5) == one + other
-    with pytest.raises(ValueError, match=r"with 0\.5 and 0\.0 dof fitted"):
+    with pytest.raises(ValueError, match=r"with 0\.5 and 0\.0 fitted degrees"):
         one + Tally.of(nees, 3)
     for fitted in (-0.1, 3.1, np.nan):
         with pytest.raises(ValueError, match="fitted must be from 0 to the 3 degrees of freedom"):
@@ -399,7 +399,7 @@ def test_tallies_of_parts_and_from_a_file_are_that_of_the_whole():
     together, whole = (parts[0] + parts[1]).verdict(), Tally.of(nees, 3).verdict()
     assert (together["lost"], together["diverged"]) == (whole["lost"], whole["diverged"])
     assert together["never_lost"]["interval99"] == pytest.approx(whole["never_lost"]["interval99"])
-    with pytest.raises(ValueError, match="runs of 3 and of 6 dof are not one study"):
+    with pytest.raises(ValueError, match="runs with 3 and 6 degrees of freedom cannot be pooled"):
         parts[0] + Tally.of(nees, 6)
 
 
@@ -497,7 +497,7 @@ def test_a_nees_that_is_logged_and_not_finite_is_of_a_run_that_diverged():
 def test_a_run_without_a_step_is_refused():
     logged = np.ones((4, 5), bool)
     logged[2] = False
-    with pytest.raises(ValueError, match="with a step of every run"):
+    with pytest.raises(ValueError, match="at least one step per run"):
         run_verdict(np.ones((4, 5)), 3, logged=logged)
 
 

@@ -6,10 +6,9 @@ import pytest
 
 pytest.importorskip("cv2")
 
-from additions import PLAIN_HOMOGENEOUS, BiasedVelocity, DriftingFocal, Huber, Pixels
+from additions import BiasedVelocity, DriftingFocal, Huber, Pixels, PlainHomogeneous
 
 import jaxslam
-from jaxslam.filters.linear.covariance import Covariance
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
@@ -28,8 +27,8 @@ def pieces_of(kind, calibration):
         "motion": jaxslam.ConstantVelocity(linear + angular, [0.0] * 6, [0.5] * 6),
         "sensor": jaxslam.Pinhole(camera, 0.3),
         "calibration": DriftingFocal([0.01], [0.001]),
-        "landmark": PLAIN_HOMOGENEOUS,
-        "form": Covariance(Huber(3.0)),
+        "landmark": PlainHomogeneous(),
+        "correction": Huber(3.0),
     }
 
 

@@ -137,7 +137,7 @@ def test_the_legend_fits_its_width(width):
 
 
 def test_unknown_statuses_are_refused():
-    with pytest.raises(ValueError, match="'seen' is unknown; matched, unmatched"):
+    with pytest.raises(ValueError, match="unknown label 'seen'; known: matched, unmatched"):
         draw([200.0, 60.0], np.eye(2), NOTHING, "seen")
 
 
@@ -252,7 +252,7 @@ def test_video_without_frames_leaves_nothing(tmp_path):
 
 
 def test_video_that_cannot_be_written_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"ending in \.mp4"):
+    with pytest.raises(ValueError, match=r"must end in \.mp4"):
         OverlayWriter(tmp_path / "overlay.gif", (64, 48), 30.0)
     with (
         pytest.raises(ValueError, match="cannot be opened"),

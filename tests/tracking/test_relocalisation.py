@@ -125,7 +125,9 @@ def test_a_map_of_another_camera_is_refused(tmp_path):
     tracker.track(source_frame(source))
     tracker.save(tmp_path / "map.npz")
     wrong = replace(source.calibration, fx=source.calibration.fx * 1.1)
-    with pytest.raises(ValueError, match=r"a map of another camera \(640 × 480, fx .* than this"):
+    with pytest.raises(
+        ValueError, match=r"a map of another camera \(640 × 480, fx .* not of this one"
+    ):
         Tracker.localising(tmp_path / "map.npz", wrong)
 
 

@@ -122,19 +122,19 @@ def test_a_filter_of_ones_own_is_given_again(video, tmp_path):
     tracker = Tracker(calibration, SETTINGS, own)
     tracker.track(frames[0])
     tracker.save(tmp_path / "t.npz")
-    with pytest.raises(ValueError, match=r"t\.npz: was saved with a filter Slam; give that"):
+    with pytest.raises(ValueError, match=r"t\.npz was saved with the filter Slam; pass that"):
         Tracker.load(tmp_path / "t.npz")
     loaded = Tracker.load(tmp_path / "t.npz", own)
     same(tracker.track(frames[1]), loaded.track(frames[1]))
     longer = TrackerSettings(filter="world", landmarks="inverse_depth")
     other = longer.make_filter(calibration)
     assert isinstance(other, jaxslam.Slam)
-    with pytest.raises(ValueError, match="the state in the file is of another filter"):
+    with pytest.raises(ValueError, match="the saved state belongs to a different filter"):
         Tracker.load(tmp_path / "t.npz", other)
 
 
 def test_there_is_nothing_to_save_before_the_first_frame(video, tmp_path):
-    with pytest.raises(ValueError, match="was given no frame yet"):
+    with pytest.raises(ValueError, match="without any frame"):
         Tracker(video[0], SETTINGS).save(tmp_path / "t.npz")
     assert not list(tmp_path.iterdir())
 
@@ -144,7 +144,7 @@ def test_there_is_nothing_to_save_before_the_first_frame(video, tmp_path):
     [
         ("missing", r"t\.npz does not exist"),
         ("text", r"t\.npz: not an npz file of numbers \(another kind of file"),
-        ("other archive", r"t\.npz: is no tracker's file"),
+        ("other archive", r"t\.npz is not a saved tracker"),
     ],
 )
 def test_a_file_that_is_no_trackers_is_refused(tmp_path, kind, message):
@@ -160,7 +160,11 @@ def test_a_file_that_is_no_trackers_is_refused(tmp_path, kind, message):
 @pytest.mark.parametrize(
     ("image", "time", "message"),
     [
-        (np.zeros((240, 321), np.uint8), 1.0, "frame 1 is 321x240, the calibration is for 320x240"),
+        (
+            np.zeros((240, 321), np.uint8),
+            1.0,
+            "frame 1 is 321x240, but the calibration is for 320x240",
+        ),
         (np.zeros((240, 320, 4), np.uint8), 1.0, r"not of shape \(240, 320, 4\)"),
         (np.zeros(240, np.uint8), 1.0, r"not of shape \(240,\)"),
         (np.zeros((0, 0), np.uint8), 1.0, r"not of shape \(0, 0\)"),

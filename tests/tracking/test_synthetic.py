@@ -66,7 +66,7 @@ def test_nearer_quads_hide_farther_ones_and_backs_are_not_drawn():
 def test_quad_behind_the_camera_is_refused():
     forward = np.eye(4)
     forward[2, 3] = 2.0
-    with pytest.raises(ValueError, match="nearer than"):
+    with pytest.raises(ValueError, match="closer than"):
         render(room(0, 131.2), forward, SMALL)
 
 

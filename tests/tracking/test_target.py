@@ -140,7 +140,9 @@ def test_a_filter_whose_unit_is_not_the_metre_cannot_begin_with_a_target(video, 
 
 
 def test_a_target_has_room_in_the_map(video, card):
-    with pytest.raises(ValueError, match="the target has 4 points, and 3 landmarks are wanted"):
+    with pytest.raises(
+        ValueError, match="the target has 4 points, but only 3 landmarks are wanted"
+    ):
         Tracker(
             video[0].calibration, TrackerSettings(filter="world", wanted=3), target=target(card)
         )
@@ -186,15 +188,18 @@ def test_a_target_is_read_with_patches_beside_it(tmp_path):
     ("fields", "message"),
     [
         ("{", "not a JSON file"),
-        ([1], "holds no list of points"),
-        ({"points": 4}, "holds no list of points"),
+        ([1], "has no list of points"),
+        ({"points": 4}, "has no list of points"),
         ({"points": SQUARE[:3]}, "has 3 points; at least 4"),
-        ({"points": SQUARE, "unit": "inch"}, "unit is 'inch'; metre"),
-        ({"points": [*SQUARE[:3], 5]}, "point 3 is 5; an object"),
+        ({"points": SQUARE, "unit": "inch"}, "unit must be metre, not 'inch'"),
+        ({"points": [*SQUARE[:3], 5]}, "point 3 must be an object, not 5"),
         ({"points": [*SQUARE[:3], point(name="d", position=[0, 1])]}, r"position of point d is \["),
-        ({"points": [*SQUARE[:3], point(position="x")]}, "position of point 3 is 'x'"),
-        ({"points": [*SQUARE[:3], point(pixel=[1])]}, r"pixel of point 3 is \[1\]; 2 finite"),
-        ({"points": [*SQUARE[:3], point(pixel=None)]}, "point 3 needs a `pixel` .* one of them"),
+        ({"points": [*SQUARE[:3], point(position="x")]}, "position of point 3 must be .* not .x."),
+        ({"points": [*SQUARE[:3], point(pixel=[1])]}, r"pixel of point 3 must be 2 finite"),
+        (
+            {"points": [*SQUARE[:3], point(pixel=None)]},
+            "point 3 needs either a `pixel` .* or a `patch`",
+        ),
         ({"points": [*SQUARE[:3], point(patch="no.png")]}, r"no\.png: cannot be read as an image"),
         (
             {"points": [point(position=[x, 2 * x, 0]) for x in range(4)]},

@@ -48,7 +48,7 @@ def fail(*_, **__):
 def test_a_filter_with_a_unit_of_its_own_says_so_beside_its_covariances(tmp_path, name, in_doubt):
     tracking.track(small(3), tmp_path, replace(SETTINGS, filter=name), overlay=False)
     header = (tmp_path / "covariance.txt").read_text().splitlines()[0]
-    assert ("of which sigma_log_scale of frames.csv is in doubt" in header) == in_doubt
+    assert ("uncertain by sigma_log_scale (frames.csv)" in header) == in_doubt
     titles, *_, last = (tmp_path / "frames.csv").read_text().splitlines()
     last = dict(zip(titles.split(","), last.split(","), strict=True))
     assert (last["sigma_log_scale"] != "") == in_doubt
@@ -111,7 +111,7 @@ def test_a_video_in_which_nothing_is_seen_is_told_so(tmp_path):
 
     written = tracking.track(replace(source, images=black), tmp_path, SETTINGS, overlay=False)
     told = summary.describe(written)
-    assert "no map was begun, as nothing was seen: in none of its 4 frames" in told
+    assert "no map could be started: none of its 4 frames" in told
     assert "nan" not in told
 
 
@@ -136,9 +136,8 @@ def test_what_ends_before_a_frame_is_timed_leaves_the_files_all_the_same(tmp_pat
 def test_a_focal_length_that_does_not_fit_is_told(tmp_path, monkeypatch, left, said):
     monkeypatch.setattr(summary, "better_focal", lambda *_: (1 / 1.2, left))
     written = tracking.track(small(3), tmp_path, SETTINGS, overlay=False)
-    told = (
-        "a focal length fx of 109 fits the matches better than the 131 given, and leaves 50% less"
-    )
+    told = "a focal length fx of 109 fits the matches better than the given 131: "
+    told += "it reduces their squared errors by 50%"
     assert (told in summary.describe(written)) == said
     assert ("better_focal" in written["calibration"]) == said
 
@@ -159,7 +158,8 @@ def test_a_camera_that_turned_on_the_spot_is_told_its_orientation_error(tmp_path
         replace(source, reference=reference), tmp_path, SETTINGS, overlay=False
     )
     assert 0 < written["orientation_rmse"] < 1
-    told = f"in one place; a Sim(3) needs a motion; orientation {written['orientation_rmse']:.2f}°"
+    told = "coincide; an alignment by Sim(3) needs motion; orientation "
+    told += f"error {written['orientation_rmse']:.2f}°"
     assert told in summary.describe(written)
 
 

@@ -262,7 +262,7 @@ def test_a_camera_that_was_lost_for_long_begins_a_new_map(restarted):
     assert "7 frames lost: 7 few agree" in describe(summary)
     # σ/ρ of the prior on an inverse depth is ½, in each of the two maps.
     assert summary["log_scale_sigma_between_maps"] == pytest.approx(np.sqrt(0.5), rel=1e-12)
-    assert "2 maps, each in a unit of its own" in describe(summary)
+    assert "2 maps, each with its own unit" in describe(summary)
     rows = (out / "map.ply").read_text().split("end_header\n")[1].splitlines()
     assert {row.split()[-1] for row in rows} == {"0", "1"}
 

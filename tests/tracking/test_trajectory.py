@@ -66,11 +66,11 @@ def test_quaternion_order_is_w_last_and_need_not_be_normalised(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("0 0 0 0 0 0 0 1\n1 2 3\n", "line 2: eight finite"),
-        ("0 0 0 nan 0 0 0 1\n", "line 1: eight finite"),
-        ("0 0 0 zero 0 0 0 1\n", "line 1: eight finite"),
+        ("0 0 0 0 0 0 0 1\n1 2 3\n", "line 2: expected eight finite"),
+        ("0 0 0 nan 0 0 0 1\n", "line 1: expected eight finite"),
+        ("0 0 0 zero 0 0 0 1\n", "line 1: expected eight finite"),
         ("0 0 0 0 0 0 0 0\n", "line 1: the quaternion is zero"),
-        ("# nothing\n", "holds no poses"),
+        ("# nothing\n", "has no poses"),
     ],
 )
 def test_bad_trajectories_are_refused_naming_file_and_line(tmp_path, text, words):
@@ -192,7 +192,7 @@ def test_a_camera_that_only_turns_has_an_orientation_error_too():
     estimate = reference.copy()
     estimate[::2, :3, :3] = reference[::2, :3, :3] @ turn
     estimate[1::2, :3, :3] = reference[1::2, :3, :3] @ turn.T
-    with pytest.raises(ValueError, match="in one place"):
+    with pytest.raises(ValueError, match="coincide"):
         absolute_trajectory_error(times, estimate, times, reference)
     assert 4.5 < orientation_error(times, estimate, times, reference) <= 5
 
@@ -297,7 +297,7 @@ def test_trajectories_that_cannot_be_compared_are_refused():
     with pytest.raises(ValueError, match="2 poses"):
         absolute_trajectory_error(times[:2], reference[:2], times, reference)
     still = np.tile(np.eye(4), (len(times), 1, 1))
-    with pytest.raises(ValueError, match="in one place"):
+    with pytest.raises(ValueError, match="coincide"):
         absolute_trajectory_error(times, still, times, reference)
 
 
@@ -319,7 +319,7 @@ def test_covariances_are_read_as_they_were_written_and_are_the_errors(tmp_path):
 
 @pytest.mark.parametrize(
     ("given", "words"),
-    [(True, "of poses in that unit, of which sigma_log_scale"), (False, "no doubt of its")],
+    [(True, "the unit itself is uncertain by sigma_log_scale"), (False, "takes as exactly known")],
 )
 def test_the_header_says_whether_scale_is_in_a_covariance(tmp_path, given, words):
     path = tmp_path / "covariance.txt"
@@ -327,14 +327,14 @@ def test_the_header_says_whether_scale_is_in_a_covariance(tmp_path, given, words
     header, _ = path.read_text().splitlines()
     assert header.startswith("# t xx xy")
     assert words in header
-    assert "one unit of length a map, another in every map" in header
+    assert "in the unit of each map" in header
     assert f"scale={'given' if given else 'marginal'}" in header
     assert "length=map" in header
     write_covariances(path, [0.0], np.eye(6)[None], given_scale=given, caveat="with care")
     assert path.read_text().splitlines()[0] == header.removesuffix(")") + "; with care)"
     assert read_covariances(path).said["scale"] == ("given" if given else "marginal")
     write_trajectory(path, [0.0], np.eye(4)[None])
-    assert "one unit of length a map, another in every map" in path.read_text()
+    assert "in the unit of each map" in path.read_text()
 
 
 def test_a_pose_that_is_known_exactly_is_so_in_the_file(tmp_path):

@@ -111,7 +111,7 @@ def test_without_rerun_it_says_what_to_install(tmp_path, monkeypatch):
 def test_a_recording_ends_in_rrd(tmp_path):
     pytest.importorskip("rerun")
     source = synthetic_source(frames=FRAMES)
-    with pytest.raises(ValueError, match=r"seen\.mp4: a name ending in \.rrd is accepted"):
+    with pytest.raises(ValueError, match=r"seen\.mp4: the name must end in \.rrd"):
         track(source, tmp_path / "out", SETTINGS, viewer=tmp_path / "seen.mp4")
     assert not list(tmp_path.iterdir())
 

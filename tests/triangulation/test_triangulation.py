@@ -183,7 +183,7 @@ def test_single_precision_is_as_evenly_spread():
 def test_samples_do_not_depend_on_the_chunk(monkeypatch):
     views = TwoViews()
     whole = particles(views, jnp.array(views.pixels), 5000, 3)["posterior"]
-    monkeypatch.setattr("jaxslam.triangulation.samples._CHUNK", 2048)
+    monkeypatch.setattr("jaxslam.triangulation._CHUNK", 2048)
     parts = particles(views, jnp.array(views.pixels), 5000, 3)["posterior"]
     for a, b in zip(whole, parts, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12)
@@ -194,7 +194,7 @@ def test_samples_do_not_depend_on_the_chunk(monkeypatch):
     [
         ({"depth": -1.0}, "depth must be positive, not -1.0"),
         ({"baseline": 0.0}, "baseline must be positive"),
-        ({"nearest_depth": float("nan")}, "nearest_depth is nan"),
+        ({"nearest_depth": float("nan")}, "nearest_depth must be finite, not nan"),
         ({"pixel": 640.0}, "pixel must be in the image, from 0 to 640"),
         ({"depth": 1.0}, "depth must be at least 1.219"),
         ({"calibration": "wite"}, "did you mean white"),

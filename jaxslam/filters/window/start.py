@@ -35,7 +35,10 @@ from jaxslam.models.observations import Capacity
 
 
 class Schedule(eqx.Module):
-    """When a start seeks minima, in how many frames, and when the sum goes on alone."""
+    """When a start seeks minima, in how many frames, and when the sum goes on alone.
+
+    Raises ValueError for windows that are too short or not in order, and for no direction.
+    """
 
     sizes: tuple[int, ...] = eqx.field(static=True)
     """Frames of the windows that are compiled; the smallest that holds all is computed."""
@@ -101,6 +104,7 @@ class FromWindow(AbstractLayer):
     """The start of a mixture that looks for itself how the camera moves."""
 
     schedule: Schedule
+    """When minima are sought, and when the sum goes on alone."""
 
     def ambiguous_start(self, slam):
         return True

@@ -24,12 +24,8 @@ from jaxslam.tracking.pointcloud import seen_from
 from jaxslam.tracking.search import search
 
 APART = 3
-"""Submaps from the end of one loop to that of the next, at the least, and an eighth of all: what a
-loop costs grows with their number."""
-WITHIN = 3.0
-"""σ of the place of a landmark seen from the pose that its descriptors tell, pixels."""
-PIXEL = 1.0
-"""σ of a landmark where its patch is found, pixels: it is seen from elsewhere, or later."""
+"""The fewest submaps from the end of one loop to that of the next, besides an eighth of all: the
+cost of a loop grows with their number."""
 GATE = 9 * float(chi2.ppf(0.999, 6))
 """NIS beyond which a loop is not believed: that of three times the σ of the way round it. On real
 pictures a drift is up to 2.5 times what its σ says; another place is off by ten times that."""
@@ -41,7 +37,7 @@ class Closed(NamedTuple):
     submap: int
     """The number of the submap that it is of, among those of all maps."""
     nis: float
-    """Of where it is, with six degrees of freedom."""
+    """The NIS of the place, with six degrees of freedom."""
 
     @property
     def believed(self) -> bool:
@@ -72,7 +68,8 @@ def close_loop(
         if found is None:
             continue
         which = p, len(earlier)
-        loop = loop_of(map.estimator.slam, map.submaps, which, *found, PIXEL, map.settings.wanted)
+        # σ of a landmark where its patch is found, pixels: it is seen from elsewhere, or later.
+        loop = loop_of(map.estimator.slam, map.submaps, which, *found, 1.0, map.settings.wanted)
         compared = map.now().graph(map.settings, map.estimator.slam).with_loop(loop)
         closed = Closed(earlier[p].number, float(compared.nis))
         if closed.believed:
@@ -125,9 +122,10 @@ def _expected(
     in_unit = T.copy()
     in_unit[:3, 3] *= unit
     X = (submap.points - T[:3, 3]) @ T[:3, :3] * unit
+    # σ of the place of a landmark seen from the pose that its descriptors tell, pixels.
     return Prediction(
         pixels,
-        spread + WITHIN**2 * np.eye(2),
+        spread + 3.0**2 * np.eye(2),
         sure & np.isfinite(pixels[:, 0]),
         submap.camera.T_wc @ in_unit,
         X,

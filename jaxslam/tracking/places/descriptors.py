@@ -11,14 +11,12 @@ from jaxtyping import Bool, Float, UInt8
 from jaxslam.tracking.landmarks import Landmark
 
 CORNERS = 600
-"""Of a picture, which are compared."""
-RATIO = 0.85
-"""The distance of the likest descriptor by that of the next, at the most."""
+"""The number of corners of a picture that are compared."""
 LOOKS = 3
 """Descriptors of a landmark that are kept, of different frames."""
 
 Corners = tuple[Float[np.ndarray, "n 2"], UInt8[np.ndarray, "n 32"]]
-"""Of a picture: pixels and descriptors."""
+"""The corners of a picture: pixels and descriptors."""
 
 
 def describe(
@@ -65,6 +63,7 @@ def candidates(
     best: dict[int, tuple[float, int]] = {}
     for first, second in (pair for pair in two if len(pair) == 2):
         slot = int(owner[first.queryIdx])
-        if first.distance < RATIO * second.distance:
+        # The largest ratio of the distance of the most similar descriptor to that of the next.
+        if first.distance < 0.85 * second.distance:
             best[slot] = min(best.get(slot, (np.inf, 0)), (first.distance, first.trainIdx))
     return np.array(list(best), int), pixels[[corner for _, corner in best.values()]]

@@ -27,9 +27,7 @@ from jaxslam.tracking.report import Tracked
 LOOKED_EVERY = 15
 """Frames between two in which another map is looked for."""
 NEAR = 2.0
-"""Pixels between two landmarks, one of each map, that are the same point, at the most."""
-PAIRS = 6
-"""Such pairs, at the least."""
+"""The most pixels between two landmarks, one of each map, that are the same point."""
 
 
 @dataclass(frozen=True)
@@ -37,23 +35,23 @@ class Join:
     """A map in the world and in the unit of another, in which its camera was known again."""
 
     map: int
-    """Its number, and that …"""
+    """The number of the map that is joined."""
     to: int
-    """… of the other."""
+    """The number of the other map."""
     step: int
-    """The frame, counted from 0, of which the camera is in the other map …"""
+    """The frame, counted from 0, whose camera is in the other map."""
     moved: Float[np.ndarray, "4 4"]
-    """… and how it had moved since the frame before, in the map's own unit."""
+    """The motion of that camera since the frame before, in the map's own unit."""
     log_ratio: float
-    """Log of the map's unit in the other's …"""
+    """The log of the map's unit in that of the other."""
     sigma: float
-    """… and its σ."""
+    """σ of the log of the unit."""
 
 
 def known_elsewhere(
     image: UInt8[np.ndarray, "h w"], map: Map, policy: Policy, joins: Sequence[Join]
 ) -> tuple[Observations, Correction] | None:
-    """As `known_again`, of a camera that is not lost, and of maps that are not joined to its
+    """Do what `known_again` does for a camera that is not lost and maps that are not joined to its
     own."""
     own = _world(map.number, joins)
     same = {one.number for one in map.left if _world(one.number, joins) == own}
@@ -86,7 +84,8 @@ def join_of(before: Remembered, map: Map, step: int, last: Float[np.ndarray, "4 
     apart = np.linalg.norm(pixels[:, None] - others, axis=2)
     i, j = np.arange(len(pixels)), np.argmin(apart, axis=1)
     same = (apart[i, j] < NEAR) & (np.argmin(apart, axis=0)[j] == i)
-    if same.sum() < PAIRS:
+    # The fewest such pairs that join two maps.
+    if same.sum() < 6:
         return None
     i, j = i[same], j[same]
     ratios = np.log(depths[j] / z[i])

@@ -21,8 +21,8 @@ from jaxslam.tracking.report import Tracked
 
 
 def smoothed(map: Map, history: Sequence[Tracked]) -> tuple[list[Tracked], Points]:
-    """Return the frames and landmarks as they are known now; those of maps of one submap, and of
-    those that nobody can come back to, as they are."""
+    """Return the frames and landmarks as they are known now; those of maps with one submap, and of
+    maps that no camera can come back to, stay as they are."""
     before = map.points()
     frames, points = list(history), before
     # What branches off is of two: the way from there on, and what led there as the latest has it.
@@ -43,7 +43,7 @@ class _Part:
     number: int
     """Among those of all maps."""
     reported: np.ndarray
-    """T of the camera with which it began, as it was reported …"""
+    """T of the camera with which it began, as it was reported."""
     begins: PoseWithCovariance
     """… and as it is known now."""
     way: PoseWithCovariance

@@ -42,9 +42,9 @@ class Submap:
     frozen: Frozen
     """Landmarks, and the covariance of all, in the filter's unit; their numbers are the map's."""
     points: Float[np.ndarray, "slots 3"]
-    """The landmarks in its last camera …"""
+    """The landmarks in its last camera."""
     covariances: Float[np.ndarray, "slots 3 3"]
-    """… given where that is."""
+    """The covariances of the landmarks, given where that camera is."""
     camera: PoseWithCovariance
     """Its last camera in the world, as it was reported."""
     number: int
@@ -67,7 +67,7 @@ class Submap:
 
     @property
     def numbers(self) -> Int[np.ndarray, " slots"]:
-        """Of the landmarks in the slots; −1 where none is."""
+        """The numbers of the landmarks in the slots; −1 where none is."""
         return np.asarray(self.frozen.numbers)
 
     @property
@@ -90,9 +90,9 @@ class LoopClosure(eqx.Module):
     submaps: Int[AnyArray, "*L 2"]
     """p and q."""
     slots: Int[AnyArray, "*L m"]
-    """The landmarks of p …"""
+    """The slots of the landmarks of p."""
     landmarks: Float[AnyArray, "*L m d"]
-    """… as they were then, X̄."""
+    """The landmarks as they were then, X̄."""
     T: Float[AnyArray, "*L 4 4"]
     by_pose: Float[AnyArray, "*L 6 6"]
     """R/σ."""
@@ -104,18 +104,18 @@ class Compared(NamedTuple):
     """A loop compared with what is known without it."""
 
     nis: np.ndarray
-    """Of six degrees of freedom, by what the filter says, without a `unit_variance`."""
+    """The NIS by the filter's covariance, with six degrees of freedom and no `unit_variance`."""
     T_bc: Float[np.ndarray, "4 4"]
-    """The present camera, given the loop to first order, from where the map begins …"""
+    """The present camera from where the map begins, given the loop to first order."""
     covariance: Float[np.ndarray, "6 6"]
-    """… in the filter's unit."""
+    """The covariance of that camera, in the filter's unit."""
 
 
 class Solved(NamedTuple):
     """The cameras at the ends of submaps, and the present one behind them, given all loops."""
 
     T_bc: Float[np.ndarray, "n 4 4"]
-    """From where the map begins, in the filter's unit."""
+    """The camera from where the map begins, in the filter's unit."""
     covariances: Float[np.ndarray, "n 6 6"]
     points: Float[np.ndarray, "n slots 3"]
     """Landmarks in these cameras."""
@@ -137,7 +137,7 @@ def handed_over(
 
 
 def shapes(slam: AbstractStaged, state: Belief, capacity: int) -> PyTree:
-    """Of the arrays of a submap that ended: `frozen`, `points` and `covariances`."""
+    """The shapes of the arrays of a submap that ended: `frozen`, `points` and `covariances`."""
     return jax.eval_shape(_handed_over.function, slam, state, jnp.zeros(capacity, int))[0]
 
 
@@ -168,7 +168,7 @@ def loop_of(
     sigma: float,
     most: int,
 ) -> LoopClosure:
-    """The loop that k landmarks of submap p close, `most` of them at the most, seen from a camera
+    """The loop that at most `most` of k landmarks of submap p close, seen from a camera
     at T from p's last one: that is the last one of submap q. σ of a pixel."""
     p, q = which
     k = min(len(slots), most)

@@ -1,0 +1,104 @@
+"""Numbers in the sentences of pages: a mark behind them says which result they show.
+
+    python benchmarks/pages.py
+
+writes all of them anew. In `σ × 1.02 [0.96, 1.11]<!-- =sigma('circle', 'recommended') -->` they are
+three of `consistency.json`; a file of results is a name, as in `1.1<!-- =cost['filters'] … -->`.
+A number keeps its decimals, and small whole ones may be words. `tests/benchmarks/test_pages.py`
+fails where a page is older than its results.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmark import RESULTS, write_page
+from consistency import label, verdicts_of
+
+MARK = re.compile(r"<!-- =(.+?) -->", re.DOTALL)
+WORDS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten",
+         "eleven", "twelve")  # fmt: skip
+NUMBER = re.compile(rf"\d[\d,]*(?:\.\d+)?|\b(?:{'|'.join(WORDS)})\b", re.IGNORECASE)
+FUNCTIONS = {f.__name__: f for f in (abs, len, max, min, round, sum)} | {
+    "count": lambda values: sum(1 for _ in values)
+}
+
+
+def read(folder: Path = RESULTS) -> dict[str, Any]:
+    """The names of a mark: the files of results, and what is computed from `consistency.json`."""
+    files = {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))}
+
+    def row(scenario: str, name: str) -> dict[str, Any]:
+        """Its row of a filter, by the name in the tables."""
+        return {label(key): x for key, x in files["consistency"][scenario].items()}[name]
+
+    def mean(scenario: str, name: str) -> dict[str, Any]:
+        """The verdict over all steps."""
+        return verdicts_of(row(scenario, name))["tally"]["mean"]
+
+    def sigma(scenario: str, name: str) -> list[float]:
+        """The factor of σ over all steps, and the ends of its 99 % interval."""
+        return [mean(scenario, name)["sigma_factor"], *mean(scenario, name)["interval99"]]
+
+    def lost(scenario: str, name: str) -> float:
+        """The share of runs that are lost at the last step."""
+        return row(scenario, name)["lost"] / row(scenario, name)["runs"]
+
+    def step(scenario: str, name: str) -> float:
+        """The time of a step relative to that of `robocentric` in the same scenario."""
+        own, paper = (row(scenario, x)["microseconds_per_step"] for x in (name, "robocentric"))
+        return own / paper
+
+    return {**files, "row": row, "mean": mean, "sigma": sigma, "lost": lost, "step": step}
+
+
+def value_of(expression: str, results: Mapping[str, Any]) -> list[float]:
+    """The numbers that a mark names. Raises KeyError where the results have no such thing."""
+    names = {"__builtins__": FUNCTIONS, **results}
+    found = eval(" ".join(expression.split()), names)
+    return list(found) if isinstance(found, Sequence) else [found]
+
+
+def shown_as(old: str, value: float, percent: bool = False) -> str:
+    """The value in the form of the number in whose place it is; a share in percent as in tables."""
+    if old[0].isalpha() and not percent and value == round(value) and value < len(WORDS):
+        word = WORDS[round(value)]
+        return word.capitalize() if old[0].isupper() else word
+    decimals = len(old.partition(".")[2])
+    form = f"{',' if ',' in old else ''}.{decimals}{'%' if percent else 'f'}"
+    return format(value, form).removesuffix("%")
+
+
+def rewritten(text: str, results: Mapping[str, Any]) -> str:
+    """A page with the numbers of the results. Raises ValueError where a mark finds too few."""
+    parts, end = [], 0
+    for mark in MARK.finditer(text):
+        before = text[end : mark.start()]
+        values = value_of(mark[1], results)
+        numbers = list(NUMBER.finditer(before))[-len(values) :]
+        if len(numbers) < len(values):
+            raise ValueError(f"{len(values)} numbers are needed before {mark[0]}")
+        for number, value in reversed(list(zip(numbers, values, strict=True))):
+            percent = before[number.end() :].lstrip()[:1] == "%"
+            new = shown_as(number[0], value, percent)
+            before = before[: number.start()] + new + before[number.end() :]
+        parts += [before, mark[0]]
+        end = mark.end()
+    return "".join([*parts, text[end:]])
+
+
+def pages(root: Path = Path()) -> list[Path]:
+    """The pages that may show results."""
+    return [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+
+
+if __name__ == "__main__":
+    results = read()
+    for page in pages():
+        if (new := rewritten(page.read_text(), results)) != page.read_text():
+            write_page(page, new)
+            print(f"wrote {page}")
