@@ -9,7 +9,7 @@ of the current camera in the map frame; they differ in what composition does.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax
@@ -144,11 +144,16 @@ class KeyframePose(eqx.Module):
 class AbstractKeyframed(AbstractFrame):
     """A frame whose state holds T_BK and T_KC, K an earlier camera that the camera leaves."""
 
-    turn: eqx.AbstractVar[float]
-    """The turn from K at which the camera has left it, rad."""
-    parallax: eqx.AbstractVar[float]
-    """The same of its distance from K, as a share of the landmarks' harmonic mean distance: about
-    the angle by which a landmark at that distance is seen from another side, rad."""
+    if TYPE_CHECKING:  # fields of each frame, after those of its own
+
+        @property
+        def turn(self) -> float:
+            """The turn from K at which the camera has left it, rad."""
+
+        @property
+        def parallax(self) -> float:
+            """The same of its distance from K, as a share of the landmarks' harmonic mean distance:
+            about the angle by which a landmark at that distance is seen from another side, rad."""
 
     def from_base_pose(self, T_BC: Pose) -> KeyframePose:
         return KeyframePose.at(T_BC)

@@ -1,6 +1,7 @@
 """Tests of jaxslam.filters.remedies.gauge: the motion takes N to N, in any unit of length."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +23,8 @@ MATCHED = jaxslam.scenario("matched-loose", landmarks=3)
 @pytest.mark.parametrize("log_scale", [0.0, 0.3])
 def test_a_motion_takes_unobservable_directions_to_those_after_it(name, log_scale):
     """`Φ N_k = N_{k+1}`, whatever the filter's unit of length is (noise is not enlarged here)."""
-    slam = make_filter(name, **scenario_pieces(MATCHED)).one
+    made: Any = make_filter(name, **scenario_pieces(MATCHED))
+    slam = made.one
     pixels = jnp.array([[100.0], [300.0], [500.0]])
     first = jaxslam.Features(jnp.arange(3), pixels, jnp.ones(3, bool))
     control = jnp.asarray(1 / 30)

@@ -28,7 +28,7 @@ from jaxslam.filters.words import FILTERS, MODIFIERS, make_filter, make_filters,
 from jaxslam.geometry import PLANAR
 from jaxslam.landmarks import LANDMARKS, InverseScaling
 from jaxslam.models.calibration import Known
-from jaxslam.models.frame import WorldCentric
+from jaxslam.models.frame import Submaps, WorldCentric
 from jaxslam.models.motion import ConstantVelocity
 from jaxslam.models.observations import Capacity
 from jaxslam.models.scale import ScaleGauge
@@ -163,6 +163,9 @@ def test_words_are_pieces():
     slam = Slam(**pieces, frame=WorldCentric(), correction=ObservabilityConstrained(3))
     assert made_or_told("world+oc+iterated3", InverseScaling()) == slam
     assert made_or_told("world+iterated3+oc", InverseScaling()) == slam
+    submaps = Slam(**pieces, frame=Submaps(spare=8, history=1, turn=0.5, parallax=0.5))
+    assert made_or_told("robocentric+submaps8", InverseScaling()) == submaps
+    assert submaps.frame == Submaps(8, 1)
     drifting = RandomWalk(ObservabilityConstrained(), 0.3)
     names = ["scale_gauge", "drift30", "mixture3", "oc", "checked", "rest8", "scene50"]
     slam = Slam(
