@@ -205,8 +205,8 @@ class Around(AbstractStaged):
 
     estimator: Slam
 
-    def init(self, capacity, first=None):
-        return {"inside": self.estimator.init(capacity, first), "frame": jnp.zeros((), int)}
+    def init(self, capacity, first=None, known=None):
+        return {"inside": self.estimator.init(capacity, first, known), "frame": jnp.zeros((), int)}
 
     def predict(self, state, control):
         return state | {"inside": self.estimator.predict(state["inside"], control)}
