@@ -198,6 +198,9 @@ class Drift(eqx.Module):
     wrong: Number = 0.0
     """Share of the landmarks of which σ is ten times as large."""
 
+    def __check_init__(self) -> None:
+        check_signs(self, ("frames",), ("sigma", "wrong"))
+
     def errors(self, key: Array, measured: Float[Array, "f l p"]) -> Float[Array, "f l p"]:
         """Of every measurement."""
         first_key, key, share_key = jax.random.split(key, 3)

@@ -66,7 +66,10 @@ def test_a_store_of_another_study_is_refused(kind, tmp_path, monkeypatch):
         (r"another reduced \(False, now True\)", {"reduced": True}),
         (r"another backend \('xla', now 'native'\)", {"backend": "native"}),
         (r"another filter mine: sensor\.sigma \(.*, now 0\.7\)", {"slam": noisy}),
-        (r"another motion \(None, now ", {"motion": SLAM.motion}),
+        (
+            r"another scenario\.motion\.noise_sigma",
+            {"motion": replace(SLAM.motion, noise_sigma=np.ones(3))},
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             study(store(), **changed)
@@ -93,7 +96,7 @@ def test_another_file_of_the_same_trajectory_is_refused(tmp_path, monkeypatch):
 
     store = MemoryStore()
     begin(store, monkeypatch, scenario=written(1.0))
-    with pytest.raises(ValueError, match=r"another motion\.poses"):
+    with pytest.raises(ValueError, match=r"another scenario\.trajectory\.poses"):
         study(store, scenario=written(1.1))
     study(store, scenario=written(1.0))
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -59,7 +60,7 @@ class Row(jaxslam.AbstractPlacement):
 
 
 def a_world(**pieces):
-    usual = {
+    usual: dict[str, Any] = {
         "motion": jaxslam.Odometry([0.02, 0.02, 0.01]),
         "sensor": jaxslam.RangeBearing([0.1, 0.02]),
         "placement": jaxslam.Ring(landmarks=6, radius=6.0),
@@ -125,7 +126,7 @@ def test_pieces_of_ones_own_are_named_in_files(mine):
     given = scenario("positions", {name: value}, placement=jaxslam.GivenPoints([[1.0, 2.0]]))
     assert (given.sensor.sigma, given.landmarks) == (0.3, 1)
     by_field = scenario("positions", placement="points", points=[[1, 2], [3, 4]])
-    np.testing.assert_array_equal(by_field.placement.positions, [[1, 2], [3, 4]])
+    np.testing.assert_array_equal(simulated(by_field).points, [[1, 2], [3, 4]])
 
 
 @pytest.mark.usefixtures("mine")
@@ -249,7 +250,7 @@ def test_a_world_is_shown(tmp_path):
     figure = scenario("circle", steps=3, beacons=3).plot(path=tmp_path / "world.png")
     assert (tmp_path / "world.png").stat().st_size > 10_000
     (ax,) = figure.axes
-    lines = {line.get_label(): line.get_xydata() for line in ax.get_lines()}
+    lines = {line.get_label(): np.asarray(line.get_xydata()) for line in ax.get_lines()}
     assert len(lines["beacon, as surveyed"]) == 3
     assert len(lines["measured"]) + len(lines["never measured"]) == 36
     run = simulated(scenario("handheld", steps=2, landmarks=5))
