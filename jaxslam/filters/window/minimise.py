@@ -3,7 +3,8 @@
 Jointly, path and inverse depths are bilinear, and Levenberg–Marquardt creeps along the bent valleys
 of that. With every landmark minimised anew for each path (variable projection: Golub, Pereyra
 1973; Hong, Fitzgibbon 2015 for bundle adjustment) the valley of scale is a straight line through
-the origin, and most starts of most windows converge in ten steps.
+the origin, and most starts of most windows converge in ten steps. optimistix has no variable
+projection: its solvers take the unknowns jointly.
 """
 
 from __future__ import annotations
