@@ -5,19 +5,21 @@ until the last has ended. Here those that want it are gathered from the whole ba
 blocks, so that the work is that of those who want it.
 
 A loop whose end is known only when it runs has no reverse mode. Where one differentiates, in either
-mode, works and steps are therefore counted out, and those that nobody wants are of no effect.
+mode, all works are therefore done, and those that nobody wants are of no effect.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool, Int, PyTree
 
 Value = TypeVar("Value")
@@ -138,32 +140,25 @@ def at_places(
     return done(values, sources, places, wanted, (arrays, given))
 
 
-def while_loop(
-    going: Callable[[Value], Bool[Array, ""]],
-    once: Callable[[Value], Value],
-    start: Value,
-    most: int,
-) -> Value:
-    """`lax.while_loop` of at most so many steps, with derivatives in both modes."""
-    closed = [eqx.filter_closure_convert(function, start) for function in (going, once)]
-    arrays, static = eqx.partition(closed, eqx.is_array)
+def forward_only(value: Value, why: str) -> Value:
+    """The value itself, of which reverse mode raises NotImplementedError with this reason."""
 
-    def call(which, arrays, value):
-        return eqx.combine(arrays, static)[which](value)
+    def one(x):
+        return forward_only_p.bind(x, why=why) if jnp.issubdtype(x.dtype, jnp.inexact) else x
 
-    def counted(arrays, value):
-        @jax.checkpoint
-        def step(value, _):
-            return _where(call(0, arrays, value), partial(call, 1), value, arrays, value), None
+    return jax.tree.map(one, value)
 
-        return jax.lax.scan(step, value, length=most)[0]
 
-    @jax.custom_jvp
-    def last(arrays, value):
-        return jax.lax.while_loop(partial(call, 0, arrays), partial(call, 1, arrays), value)
+def _refused(_, __, why: str) -> NoReturn:
+    raise NotImplementedError(why)
 
-    last.defjvp(partial(jax.jvp, counted))
-    return last(arrays, start)
+
+forward_only_p = Primitive("forward_only")
+forward_only_p.def_impl(lambda x, why: x)
+forward_only_p.def_abstract_eval(lambda x, why: x)
+mlir.register_lowering(forward_only_p, lambda ctx, x, why: [x])
+batching.defvectorized(forward_only_p)
+ad.deflinear2(forward_only_p, _refused)
 
 
 def _where(wanted: Bool[Array, ""], function: Callable[..., Value], value: Value, *given) -> Value:

@@ -1,10 +1,11 @@
 """Programs that are compiled before they are needed, and kept from one process to the next.
 
 JAX's cache of compiled programs spares the compiler; a program of ten thousand operations is still
-traced and lowered by Python, for seconds. Here the whole is kept, if a folder is given (`keep_in`):
-a file for each program, by all that it depends on. One that is damaged, or another user's, is
-compiled anew. Such a file is code, and what is around it a pickle: as for JAX's own cache, the
-folder is to be its user's alone.
+traced and lowered by Python, for seconds: with that cache alone the README's first command, run
+again, takes 32 s of processor time, and with this one 22 s. Here the whole is kept, if a folder is
+given (`keep_in`): a file for each program, by all that it depends on. One that is damaged, or
+another user's, is compiled anew. Such a file is code, and what is around it a pickle: as for JAX's
+own cache, the folder is to be its user's alone.
 """
 
 from __future__ import annotations

@@ -3,7 +3,8 @@
 A filter's innovations are independent if it is right, so that the measurements of a run have the
 log likelihood `−½ Σ (rᵀ S⁻¹ r + log det S)`, up to a constant (Schweppe 1965). A filter is a pytree
 of its numbers: this differentiates by any of them, through the whole run, and so finds its maximum
-(`notebooks/gradients.py`).
+(`notebooks/gradients.py`). Both modes go through sums and submaps; a start from rest has forward
+mode alone, and says so.
 """
 
 from __future__ import annotations

@@ -270,6 +270,7 @@ MOVES: dict[str, Callable[..., Any]] = {
     "copy": lambda p, x: x,
     "copy_p": lambda p, x: x,
     "stop_gradient": lambda p, x: x,
+    "forward_only": lambda p, x: x,
     "optimization_barrier": lambda p, *x: x,
     symmetric_part_p.name: _symmetric_part,
 }

@@ -87,3 +87,10 @@ def test_reverse_mode_through_work_that_is_done_only_where_it_is_wanted(name, sc
     of_runs, h = quick_jit(by_run), 1e-4
     central = np.sum(of_runs(1 + h, case.runs) - of_runs(1 - h, case.runs)) / (2 * h)
     np.testing.assert_allclose(found, central, rtol=1e-6)
+
+
+def test_a_start_has_forward_mode_only_and_says_so():
+    case = Case("matched-very-loose", steps=4, landmarks=3)
+    slam = jaxslam.cast(case.filter("world+mixture3+rest2"), jnp.float64)
+    with pytest.raises(NotImplementedError, match="forward mode"):
+        eqx.filter_eval_shape(eqx.filter_grad(log_likelihood), slam, case.room, case.run(0))

@@ -23,7 +23,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam._numerics.arrays import Number
-from jaxslam._numerics.conditional import while_loop
 from jaxslam.filters.association import Candidates, joint_compatibility
 from jaxslam.filters.submaps.chain import Chain, OfChain, SubmapMean, base_poses
 from jaxslam.geometry import Pose, homogeneous_apply
@@ -166,9 +165,9 @@ def posterior(
 
     zero = jnp.zeros(chain.shape, chain.links.root.dtype)
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(linear, zero)[1])
-    start = zero, nothing, jnp.asarray(True), jnp.zeros((), int)
-    y, (states, value, rows, factor), moved, _ = while_loop(
-        lambda x: x[2] & (x[3] < STEPS), step, start, STEPS
+    start = zero, nothing, jnp.asarray(True), 0
+    y, (states, value, rows, factor), moved, _ = jax.lax.while_loop(
+        lambda x: x[2] & (x[3] < STEPS), step, start
     )
     cost = jnp.sum(y**2) + jnp.sum((value / sigma) ** 2)
     told = jnp.sum(jnp.any(rows != 0, axis=(1, 2)))

@@ -3,7 +3,8 @@
 Jointly, path and inverse depths are bilinear, and Levenberg–Marquardt creeps along the bent valleys
 of that. With every landmark minimised anew for each path (variable projection: Golub, Pereyra
 1973; Hong, Fitzgibbon 2015 for bundle adjustment) the valley of scale is a straight line through
-the origin, and most starts of most windows converge in ten steps.
+the origin, and most starts of most windows converge in ten steps. optimistix has no variable
+projection: its solvers take the unknowns jointly.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam._numerics.conditional import while_loop
+from jaxslam._numerics.conditional import forward_only
 from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.window.problem import (
     Path,
@@ -32,8 +33,10 @@ from jaxslam.linalg import cholesky
 
 TOLERANCE = 1e-3
 """Of half the sum of squares: a minimum is found when a step gains less."""
-MOST_STEPS = 16
-"""Of a path."""
+NO_REVERSE = (
+    "a start from rest has no derivatives in reverse mode, since its search ends when it "
+    "converges: use forward mode (jax.jvp, jax.jacfwd), or a filter without +rest"
+)
 LANDMARK_STEPS = 3
 """Of the landmarks, for every step of the path."""
 TURN_STEPS = 4
@@ -60,8 +63,7 @@ def started(x: X, y: Y) -> Minimum:
 def minimised(
     slam: AbstractSlam, record: Record, start: Minimum, steps: int | Int[Array, ""]
 ) -> tuple[Minimum, Reduced]:
-    """The state of a minimisation after so many steps, `MOST_STEPS` at the most, and the quadratic
-    there."""
+    """The state of a minimisation after at most so many steps, and the quadratic there."""
     shapes = jax.eval_shape(lambda at: reduced(slam, record, at.x, at.y), start)
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
@@ -73,7 +75,8 @@ def minimised(
         step, *now = carry
         return step + 1, *_step(slam, record, *now)
 
-    return while_loop(going, once, (jnp.zeros((), int), start, nothing), MOST_STEPS)[1:]
+    last = jax.lax.while_loop(going, once, (jnp.zeros((), int), start, nothing))[1:]
+    return forward_only(last, NO_REVERSE)
 
 
 def _step(

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam._numerics.conditional import cond, map_where, zeros
 from jaxslam.filters.layer import AbstractSlam
-from jaxslam.filters.window.minimise import MOST_STEPS, Minimum, minimised, started, turned
+from jaxslam.filters.window.minimise import Minimum, minimised, started, turned
 from jaxslam.filters.window.problem import PathLayout, Reduced, X, Y, left_out
 from jaxslam.filters.window.record import Record
 from jaxslam.filters.window.scale import enlarged, rescaled, shift_of_scale
@@ -31,7 +31,7 @@ from jaxslam.linalg import Cholesky, cholesky
 
 SPEED = 1.2
 """Starts move with so many σ of the prior on the initial velocity."""
-SEARCH_STEPS = MOST_STEPS
+SEARCH_STEPS = 16
 """Of Levenberg–Marquardt, from every start, at the most …"""
 REFINEMENTS = 4
 """… and with every new frame."""
