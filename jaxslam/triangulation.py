@@ -404,7 +404,7 @@ def summarise(comparison: Comparison) -> Summary:
     """Return the content of `triangulation.json`; what is infinite is None."""
     views = comparison.views
 
-    def distances(*of: str) -> Summary:
+    def distances(of: tuple[str, str, str]) -> Summary:
         exact, *measured = np.array([each[of] for each in comparison.distances])
         mean, error = (None, None), (None, None)
         if measured:
@@ -433,7 +433,7 @@ def summarise(comparison: Comparison) -> Summary:
         "truth": {name: spread(of) for name, of in comparison.truth.items()},
         "estimates": {
             name: spread(of) | {"distance": {
-                kind: {c: distances(name, kind, c) for c in "xz"} for kind in comparison.truth
+                kind: {c: distances((name, kind, c)) for c in "xz"} for kind in comparison.truth
             }}
             for name, of in comparison.estimates.items()
         },

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -64,11 +65,19 @@ def new_figure(width: float, height: float) -> Figure:
 
 def save(figure: Figure, path: str | Path | None) -> Figure:
     """Return the figure, written where a path is given, whole or not at all; a PDF with TrueType
-    letters, as publishers ask."""
+    letters, as publishers ask, a PNG with what is `drawn`."""
     if path is not None:
+        metadata = {"Drawn": drawn(figure)} if Path(path).suffix == ".png" else None
         with write_atomically(path) as temporary, mpl.rc_context({"pdf.fonttype": 42}):
-            figure.savefig(temporary, dpi=150)
+            figure.savefig(temporary, dpi=150, metadata=metadata)
     return figure
+
+
+def drawn(figure: Figure) -> str:
+    """The size, the title and the labels of a figure as JSON, by which an older one is found."""
+    labels = [[ax.get_title(), ax.get_xlabel(), ax.get_ylabel()] for ax in figure.axes]
+    size = np.round(figure.get_size_inches(), 6).tolist()
+    return json.dumps({"inches": size, "title": figure.get_suptitle(), "axes": labels})
 
 
 def column_title(text: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -36,7 +37,7 @@ def plot_triangulation(comparison: Comparison, path: str | Path | None = None) -
     z = {name: of.z for name, of in distributions.items()}
     low, high = _limits(distributions, z)
     depths = max(low, -views.depth), min(high, 4 * views.depth)
-    styles = {
+    styles: dict[str, dict[str, Any]] = {
         _TRUTH: {"color": GREY, "linestyle": "-"},
         "posterior": {"color": "black", "linestyle": (0, (1, 1.5))},
     }
@@ -87,7 +88,11 @@ def _limits(of: dict[str, Samples], values: dict[str, Float[np.ndarray, " n"]]) 
 
 
 def _plot_plane(
-    axes: Axes, distributions: dict[str, Samples], point: Limits, depths: Limits, styles
+    axes: Axes,
+    distributions: dict[str, Samples],
+    point: Limits,
+    depths: Limits,
+    styles: dict[str, dict[str, Any]],
 ) -> None:
     """Regions of 50 % and 95 % in the second camera."""
     offsets = {}
