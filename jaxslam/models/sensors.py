@@ -63,8 +63,16 @@ class AbstractSensor(eqx.Module):
 
     @property
     def noise(self) -> Float[Array, "p p"]:
-        """R of one measurement."""
+        """R of one measurement, where it depends on nothing."""
         return jnp.diag(jnp.broadcast_to(jnp.asarray(self.sigma), self.size) ** 2)
+
+    def noise_at(self, measured: Float[Array, " p"]) -> Float[Array, "p p"]:
+        """R of this measurement; the constant `noise`, unless a sensor says otherwise.
+
+        A filter asks for it where the measurement is, a simulation where the noise-free one is.
+        """
+        del measured
+        return self.noise
 
     @property
     def focal(self) -> Float[AnyArray, ""]:
