@@ -104,7 +104,8 @@ def _row(result: FilterResult) -> list[str]:
 
 def _of_nees(nees: Nees) -> list[str]:
     low, high = nees.band
-    return [_last(nees.mean, 3), f"{low:.3f}–{high:.3f}", _last(nees.median, 2)]
+    band = f"{low:.3f}–{high:.3f}" if np.isfinite(nees.mean).any() else "–"
+    return [_last(nees.mean, 3), band, _last(nees.median, 2)]
 
 
 def _rows_of_scale(results: Results) -> dict[str, list[str]]:

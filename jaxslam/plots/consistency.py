@@ -225,8 +225,9 @@ def plot_log_scale(summary: Drawn, *, ax: Axes, label: Labels | None = None) -> 
         for name, r in results.items()
     }
     lines = _plot_pairs(pairs, results, ax, label, lw=0.9, ls=(0, (4, 2)))
-    ax.set_yscale("log")
-    name_numbers(ax.yaxis)
+    if results.reference.survivors:
+        ax.set_yscale("log")
+        name_numbers(ax.yaxis)
     ax.set_ylabel("error of ln(scale)")
     of = _of_some(results) or " of the runs"
     set_title(ax, f"scale: median error{of}\ndashed: by the σ claimed, 0.67 of its median")

@@ -443,6 +443,28 @@ def test_a_study_resumes_from_its_folder_and_refuses_another(tmp_path):
     assert not list(tmp_path.glob("*/*.npz"))
 
 
+def test_an_interrupted_study_of_words_says_what_is_kept_and_goes_on(tmp_path, monkeypatch):
+    store = FolderStore(tmp_path)
+    save = store.save
+
+    def interrupted(name, chunk, records):
+        if chunk.start:
+            raise KeyboardInterrupt
+        save(name, chunk, records)
+
+    monkeypatch.setattr(montecarlo, "processors", lambda: 1)
+    monkeypatch.setattr(store, "save", interrupted)
+    with pytest.raises(KeyboardInterrupt, match=r"2 of 6 runs are kept in .*; the same study with"):
+        jaxslam.monte_carlo(SCENARIO, "robocentric", runs=6, chunk=2, store=store, progress=True)
+    store, done = FolderStore(tmp_path, resume=True), []
+    again = jaxslam.monte_carlo(
+        SCENARIO, "robocentric", runs=6, store=store, progress=lambda *told: done.append(told[1])
+    )
+    assert [len(chunk) for chunk in again.chunks] == [2] * 3  # those of the store
+    assert done == [0, 0, 2, 2]
+    assert np.isfinite(again["robocentric"].nees.mean).all()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

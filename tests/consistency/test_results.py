@@ -129,7 +129,7 @@ def test_a_filter_that_always_diverges_spoils_neither_table_nor_figure(tmp_path)
     assert f"{PAPER}: every run diverged, so that there is no mean" in table
     rows = [line for line in table.splitlines() if line.startswith(PAPER) and "–" in line]
     assert len(rows) == 2
-    assert rows[1].split()[1] == "–"
+    assert [row.split()[1:4] for row in rows] == [["–"] * 3] * 2
     assert rows[1].endswith("  lost; –")
     assert lost["robocentric"].verdict.word == "lost"
     for plot in (plot_nees, plot_beyond_scale):
@@ -137,7 +137,8 @@ def test_a_filter_that_always_diverges_spoils_neither_table_nor_figure(tmp_path)
         assert axes.get_ylim()[1] < 2 * others.get_ylim()[1]
         band, wanted = (x.patches[0].get_extents() for x in (axes, others))
         assert (band.y0, band.y1) == pytest.approx((wanted.y0, wanted.y1), rel=0.2)
-    assert plot_consistency(lost, path=tmp_path / "figure.png").axes
+    for shown in (lost, study((math.nan, math.nan))):
+        assert plot_consistency(shown, path=tmp_path / "figure.png").axes
     assert (tmp_path / "figure.png").stat().st_size > 10_000
 
 
@@ -183,15 +184,33 @@ def test_a_notebook_shows_html_and_tables_are_made_where_their_libraries_are(mon
 
 
 @pytest.mark.parametrize(
-    ("runs", "number", "chunk"),
-    [(1000, 2, 100), (100, 2, 12), (200, 2, 25), (100, 1, 25), (5, 2, 100), (10**6, 64, 100)],
+    ("runs", "number", "seconds", "chunk"),
+    [
+        (1000, 2, 0.01, 100),
+        (100, 2, 0.01, 12),
+        (200, 2, 0.01, 25),
+        (100, 1, 0.01, 25),
+        (5, 2, 9.0, 100),
+        (1000, 2, 0.3, 50),
+        (1000, 2, 10.0, 12),
+        (10**6, 64, 0.01, 100),
+    ],
 )
-def test_chunks_keep_every_processor_busy(runs, number, chunk, monkeypatch):
+def test_chunks_keep_every_processor_busy_and_a_bar_moving(
+    runs, number, seconds, chunk, monkeypatch
+):
     monkeypatch.setattr(montecarlo, "processors", lambda: number)
-    assert montecarlo._chunk(runs, MemoryStore(), None) == chunk
+    assert montecarlo._chunk(runs, MemoryStore(), None, seconds) == chunk
     kept = MemoryStore()
     kept.begin({"chunk": 7}, {})
-    assert montecarlo._chunk(runs, kept, None) == 7
+    assert montecarlo._chunk(runs, kept, None, seconds) == 7
+
+
+def test_the_time_of_a_step_grows_with_the_state_of_a_filter():
+    """Of the five members of a sum, and of one."""
+    made = jaxslam.make_filters(WORLD, ["scale_gauge", "scale_gauge+mixture5"], "inverse_scaling")
+    one, five = map(montecarlo._step_seconds, made.values())
+    assert 1e-5 < 4 * one < five < 12 * one < 1e-2
 
 
 @pytest.mark.usefixtures("unchecked")

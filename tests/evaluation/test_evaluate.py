@@ -583,3 +583,25 @@ def test_nothing_is_left_on_in_jax():
     before = dict(jax.config.values)
     jaxslam.evaluate(*drawn())
     assert dict(jax.config.values) == before
+
+
+def test_an_evaluation_shows_and_draws_itself(tmp_path):
+    errors = np.random.default_rng(0).normal(size=(20, 10, 3))
+    found = jaxslam.evaluate(
+        errors, np.broadcast_to(np.eye(3), (20, 10, 3, 3)), names=("<", "b", "c")
+    )
+    assert repr(found) == str(found)
+    assert len(repr(found).splitlines()) < 12
+    shown = found._repr_html_()
+    assert "<td>&lt;</td>" in shown
+    assert shown.count("<tr>") == shown.count("</tr>") == 5
+    assert found.to_dict() == found.asdict()
+    assert found.verdict.word == found.verdict["word"]
+    assert found.verdict.end.p == found.verdict["end"]["p"]
+    with pytest.raises(AttributeError, match="has no 'wrod'; known: nees"):
+        found.verdict.wrod  # noqa: B018
+    with pytest.raises(AttributeError, match=r"no attribute 'plott' \(did you mean plot\?\)"):
+        found.plott  # noqa: B018
+    figure = found.plot(tmp_path / "figure.png", column=True)
+    assert figure.get_figwidth() == 3.4
+    assert (tmp_path / "figure.png").exists()
