@@ -31,6 +31,7 @@ from jaxslam.evaluation.alignment import similarity
 from jaxslam.filters.protocol import LandmarkView
 from jaxslam.filters.slam import Slam
 from jaxslam.filters.submaps.handover import Frozen, SubmapsState
+from jaxslam.models.frame import Submaps
 from jaxslam.geometry import difference
 from jaxslam.io.calibration import Calibration
 from jaxslam.simulation import Room, Run, Scenario, simulate
@@ -176,6 +177,7 @@ class Closing:
         told: Told,
         noise: np.random.Generator,
     ) -> None:
+        assert isinstance(slam.frame, Submaps)
         history = slam.frame.history
         if int(state.count) > history:
             raise ValueError(f"{int(state.count)} submaps, and a history of {history}")

@@ -75,7 +75,7 @@ def code_lines(path):
         if isinstance(node, ast.Import | ast.ImportFrom) or (
             told and isinstance(node.value.value, str)
         ):
-            beside |= set(range(node.lineno, node.end_lineno + 1))
+            beside |= set(range(node.lineno, (node.end_lineno or 0) + 1))
     lines = {
         line
         for token in tokenize.generate_tokens(io.StringIO(text).readline)

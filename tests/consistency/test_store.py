@@ -269,8 +269,8 @@ def own_filter(function):
     class Mine(jaxslam.AbstractFilter):
         base: jaxslam.AbstractFilter
 
-        def init(self, capacity, first=None):
-            return self.base.init(capacity, first)
+        def init(self, capacity, first=None, known=None):
+            return self.base.init(capacity, first, known)
 
         def step(self, state, control, seen, new):
             return function(self.base.step(state, control, seen, new))

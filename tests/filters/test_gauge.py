@@ -43,9 +43,9 @@ def test_a_motion_takes_unobservable_directions_to_those_after_it(name, log_scal
 
         def after(both):
             core, landmarks = both
-            if change.landmark is not None:
+            if (moved := change.landmark) is not None:
                 view = change.view(core)
-                landmarks = jax.vmap(lambda one: change.landmark(view, one))(landmarks)
+                landmarks = jax.vmap(lambda one: moved(view, one))(landmarks)
             return change.core(core), landmarks
 
         Phi = jacobian(after, (state.core, state.landmarks))
