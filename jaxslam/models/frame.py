@@ -186,7 +186,8 @@ class Keyframe(AbstractKeyframed):
 
     A robocentric filter is one whose every frame is a keyframe; here landmarks are moved, and
     linearised in a new frame, only when the camera has left the old one. The limits `turn` and
-    `parallax` are small because a landmark's depth is nearly linear only in a camera near the keyframe.
+    `parallax` are small because a landmark's depth is nearly linear only in a camera near the
+    keyframe.
     """
 
     name: ClassVar[str] = "keyframe"
@@ -204,8 +205,8 @@ class Submaps(AbstractKeyframed):
     """A = C, as in a robocentric filter, and K is the camera in which the current submap began.
 
     When the state is full, or the camera has left the scene in which its submap began (by `turn` or
-    `parallax`), what is out of view is frozen and leaves the state (`jaxslam.filters.submaps`). Raises ValueError for
-    numbers out of range.
+    `parallax`), what is out of view is frozen and leaves the state (`jaxslam.filters.submaps`).
+    Raises ValueError for numbers out of range.
     """
 
     name: ClassVar[str] = "submap"
