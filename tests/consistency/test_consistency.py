@@ -530,7 +530,7 @@ def test_a_slot_used_again_is_as_good_as_one_of_its_own(name):
 class KeepsAll(jaxslam.AbstractFilter):
     """A filter of four functions, which cannot remove landmarks."""
 
-    slam: jaxslam.Slam
+    slam: jaxslam.AbstractFilter
 
     def init(self, capacity, first=None, known=None):
         return self.slam.init(capacity, first, known)

@@ -43,9 +43,9 @@ def test_a_motion_takes_unobservable_directions_to_those_after_it(name, log_scal
 
         def after(both):
             core, landmarks = both
-            if (moved := change.landmark) is not None:
-                view = change.view(core)
-                landmarks = jax.vmap(lambda one: moved(view, one))(landmarks)
+            if change.landmark is not None:
+                one = jax.vmap(change.landmark, in_axes=(None, 0))
+                landmarks = one(change.view(core), landmarks)
             return change.core(core), landmarks
 
         Phi = jacobian(after, (state.core, state.landmarks))
