@@ -31,9 +31,9 @@ from jaxslam.evaluation.alignment import similarity
 from jaxslam.filters.protocol import LandmarkView
 from jaxslam.filters.slam import Slam
 from jaxslam.filters.submaps.handover import Frozen, SubmapsState
-from jaxslam.models.frame import Submaps
 from jaxslam.geometry import difference
 from jaxslam.io.calibration import Calibration
+from jaxslam.models.frame import Submaps
 from jaxslam.simulation import Room, Run, Scenario, simulate
 from jaxslam.statistics import one_scale
 from jaxslam.statistics.beyond_scale import beyond_scale
