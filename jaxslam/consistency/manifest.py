@@ -256,7 +256,7 @@ def _short(value: object) -> str:
     return text if len(text) <= 80 else f"{text[:77]}…"
 
 
-def _name(value: Any) -> str:
+def _name(value: type | FunctionType) -> str:
     return f"{value.__module__}.{value.__qualname__}"
 
 

@@ -112,7 +112,7 @@ def monte_carlo(
         map_chunks = in_threads if client is None else partial(on_cluster, client)
         if chunk is None:
             seconds = [scenario.steps * _step_seconds(slam) for slam in filters.values()]
-            chunk = _chunk(runs, store, client, max(seconds))
+            chunk = _chunk(runs, store, client, max(seconds), reduced=reduced)
             if (total := runs * sum(seconds) / _workers(client)) > CHUNK_SECONDS * CHUNKS:
                 _log.info("by a rule of thumb it takes %.0f min, within a factor of 3", total / 60)
         chunks = divided(runs, chunk)
@@ -223,14 +223,14 @@ def _workers(client: Any) -> int:
     return max(1, processors() if client is None else sum(client.nthreads().values()))
 
 
-def _chunk(runs: int, store: Store, client: Any, seconds: float) -> int:
+def _chunk(runs: int, store: Store, client: Any, seconds: float, *, reduced: bool = False) -> int:
     """The chunk of a store that has one; else halves of `CHUNK`, so that programs are shared.
 
-    A run takes about so many seconds.
+    A run takes about so many seconds. Of a reduced study the medians are of the first chunk.
     """
     if kept := getattr(store, "manifest", {}).get("made_by", {}).get("chunk"):
         return kept
-    if jax.default_backend() != "cpu":
+    if reduced or jax.default_backend() != "cpu":
         return CHUNK
     most = min(runs / (CHUNKS * _workers(client)), CHUNK_SECONDS / seconds)
     chunk = CHUNK

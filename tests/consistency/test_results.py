@@ -201,6 +201,7 @@ def test_chunks_keep_every_processor_busy_and_a_bar_moving(
 ):
     monkeypatch.setattr(montecarlo, "processors", lambda: number)
     assert montecarlo._chunk(runs, MemoryStore(), None, seconds) == chunk
+    assert montecarlo._chunk(runs, MemoryStore(), None, seconds, reduced=True) == 100
     kept = MemoryStore()
     kept.begin({"chunk": 7}, {})
     assert montecarlo._chunk(runs, kept, None, seconds) == 7
