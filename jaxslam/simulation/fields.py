@@ -94,7 +94,7 @@ def check_numbers(what: str, value: Value, least: str = "") -> None:
                 raise ValueError(f"{what} must {wanted}, not {number}")
 
 
-def check_signs(piece: Any, positive: Iterable[str], not_negative: Iterable[str] = ()) -> None:
+def check_signs(piece: object, positive: Iterable[str], not_negative: Iterable[str] = ()) -> None:
     """Raise ValueError unless these fields of a piece are finite and of these signs."""
     for least, names in ((POSITIVE, positive), (NOT_NEGATIVE, not_negative)):
         for name in names:

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import equinox as eqx
@@ -176,7 +177,7 @@ def _world(f: dict[str, Value]) -> World:
             )
         return f[field]
 
-    def piece(kind: str, table: Mapping[str, tuple[type, Names]]) -> Any:
+    def piece(kind: str, table: Mapping[str, tuple[type, Names]]) -> Value:
         if isinstance(f[kind], str) and f[kind] in table:
             made, names = table[f[kind]]
             return _made(made, {place: numbers(field) for field, place in names.items()})
@@ -220,7 +221,7 @@ def _world(f: dict[str, Value]) -> World:
     return made
 
 
-def _made(kind: type, values: Mapping[str, Value]) -> Any:
+def _made(kind: type, values: Mapping[str, Value]) -> Value:
     """A piece of values by their places in it, `camera.focal`."""
     inside: dict[str, dict[str, Value]] = {}
     flat = {}
@@ -234,7 +235,7 @@ def _made(kind: type, values: Mapping[str, Value]) -> Any:
     return kind(**flat, **made)
 
 
-def own_piece(kind: str, given: Value) -> Any:
+def own_piece(kind: str, given: Value) -> Value:
     """A piece of one's own: itself, `module:Class`, or a table of `type` and what that takes.
 
     Raises ValueError, naming the field, for what cannot be found or made.
@@ -257,7 +258,7 @@ def own_piece(kind: str, given: Value) -> Any:
     return piece
 
 
-def _module(where: str) -> Any:
+def _module(where: str) -> ModuleType:
     """A module by its name, of the current folder too, or by its file."""
     if where.endswith(".py"):
         path = Path(where)

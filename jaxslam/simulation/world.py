@@ -6,10 +6,11 @@ Angles, axes and controls are those of `jaxslam.geometry` and `jaxslam.models.mo
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import equinox as eqx
 import jax
@@ -220,7 +221,7 @@ KINDS = {"motion": AbstractMotion, "sensor": AbstractSensor, "placement": Abstra
 """What may be of one's own."""
 
 
-def check_kind(name: str, piece: Any) -> None:
+def check_kind(name: str, piece: Value) -> None:
     """Raise ValueError unless a piece is one of its kind."""
     if not isinstance(piece, KINDS[name]):
         raise ValueError(f"a world's {name} is an {KINDS[name].__name__}, not {piece!r}")
@@ -335,9 +336,24 @@ class World(eqx.Module):
         return self.motion.has_velocity and self.sensor.hidden == 1 and not self.beacons
 
     def plot(self, run: Run | int = 0, path: str | Path | None = None) -> Figure:
-        """The world from above: the true path of a run, or of that of a seed, its landmarks, and
-        which of them are measured in the last frame; written to `path` where one is given."""
-        return import_module("jaxslam.plots").plot_world(self, run, path)
+        """The world from above: the true path of a run, its landmarks, and which are measured.
+
+        `run` is a run, or i of run i of a study with seed 0. The figure is written to `path` where
+        one is given.
+        """
+        if not isinstance(run, Run):
+            simulate = import_module("jaxslam.simulation").simulate
+            key = jax.random.fold_in(jax.random.key(0), run)
+            run = cast(Run, jax.jit(partial(simulate, self))(key))
+        points = np.asarray(run.points_by_frame)
+        return import_module("jaxslam.plots").plot_world(
+            f"{self.name} from above, {self.steps} steps at {float(self.rate):g} Hz",
+            np.asarray(run.poses.as_matrix()),
+            points,
+            np.asarray(run.visible),
+            points[0, :0] if run.known is None else np.asarray(run.known.points),
+            path,
+        )
 
     def to_dict(self) -> dict[str, Value]:
         """The flat fields of a scenario, as files have them: words, numbers and lists.
@@ -390,13 +406,13 @@ _SIZED = {
 """Fields whose defaults are as many in every world, the number of which depends on it."""
 
 
-def _of(piece: Any, names: Names) -> dict[str, Value]:
+def _of(piece: eqx.Module, names: Names) -> dict[str, Value]:
     """The flat fields of a piece, of those that it has."""
     found = {x: attrgetter(place)(piece) for x, place in names.items() if x in FIELDS}
     return {field: _numbers_of(value) for field, value in found.items() if value is not None}
 
 
-def _numbers_of(value: Any) -> Value:
+def _numbers_of(value: Value) -> Value:
     """Arrays of known numbers as tuples, which compare and print."""
     if isinstance(value, np.ndarray) or (eqx.is_array(value) and not isinstance(value, Tracer)):
         value = np.asarray(value).tolist()
