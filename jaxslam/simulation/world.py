@@ -391,6 +391,11 @@ class World(eqx.Module):
             found |= {"focal_sigma": sigma[0], "centre_sigma": sigma[-1]}
         return found | _of_depth(self.depth)
 
+    def __hash__(self) -> int:
+        """Of its words and numbers, so that a world may be a key."""
+        leaves, kind = jax.tree.flatten(self)
+        return hash((kind, *(np.asarray(leaf).tobytes() for leaf in leaves)))
+
     def __getattr__(self, name: str) -> Value:
         """A flat field by its name. Raises AttributeError for another."""
         if name in FIELDS and not hasattr(type(self), name) and name not in _PIECES:

@@ -227,6 +227,8 @@ def test_worlds_that_differ_in_numbers_share_their_programs():
         assert jax.tree.structure(one) == jax.tree.structure(other)
         assert [x.dtype for x in jax.tree.leaves(one)] == [x.dtype for x in jax.tree.leaves(other)]
     assert jax.tree.structure(as_data(BUILT_IN["laps"])) != jax.tree.structure(one)
+    kept = {scenario("circle"): 1, scenario("circle", focal=400.0): 2}
+    assert (kept[BUILT_IN["circle"]], len(kept)) == (1, 2)
 
 
 def test_help_tells_units_and_axes():
