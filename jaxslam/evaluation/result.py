@@ -299,7 +299,7 @@ class Evaluation:
         raise AttributeError(f"an Evaluation has no attribute {name!r}{meant}")
 
     def __str__(self) -> str:
-        table = _in_columns(*self._rows()) if self.names else []
+        table = _in_columns(*_rows(self)) if self.names else []
         return "\n".join([self._told(), "", self._counted(), *table, *self.remarks])
 
     def _told(self) -> str:
@@ -321,24 +321,7 @@ class Evaluation:
     @property
     def remarks(self) -> list[str]:
         """All remarks: what is missing, what was left out, what was assumed."""
-        return [*self._missing(), *self.notes]
-
-    def _missing(self) -> list[str]:
-        """A sentence on the steps of runs that are not there."""
-        missing = np.sum(~self.logged, axis=1)
-        if not missing.any():
-            return []
-        most = np.argsort(-missing, kind="stable")[: min(_TOLD, np.count_nonzero(missing))]
-        told = ", ".join(f"{self._run(int(run))}: {missing[run]}" for run in most)
-        more = np.count_nonzero(missing) - len(most)
-        told += f", and {more} more run{'s' if more > 1 else ''}" if more else ""
-        return [
-            f"{missing.sum()} of {self.nees.size} steps are not compared ({told}); each run is "
-            "averaged over the steps that it has, each step over the runs that have it"
-        ]
-
-    def _run(self, run: int) -> str:
-        return self.run_names[run] if self.run_names else f"run {run}"
+        return [*_missing(self), *self.notes]
 
     def _counted(self) -> str:
         low, high = self.band95
@@ -350,28 +333,49 @@ class Evaluation:
             f"{self.inside:.0%} of the steps are inside"
         )
 
-    def _rows(self) -> list[tuple[str, ...]]:
-        return [
-            ("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
-            *(self._row(i) for i in range(len(self.names))),
-            ("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}"),
-        ]
-
     @property
     def expected(self) -> str:
         """The mean NEES of a consistent filter: `6`, or `5–6` where a scale was fitted."""
         return f"{self.dof - self.fitted:g}–{self.dof}" if self.fitted else str(self.dof)
 
-    def _row(self, axis: int) -> tuple[str, ...]:
-        found = self.axis_verdict(axis)
-        there = self.logged.any(axis=0)
-        rmse, sigma = (f"{_rms(x[there, axis]):.4g}" for x in (self.rmse, self.sigma))
-        factor, low, high = (
-            "–" if x is None else f"{x:.3f}" if x < 10 else f"{x:.3g}"
-            for x in (found["sigma_factor"], *found["interval99"])
-        )
-        outside = f"{self.outside3sigma[axis]:.2%}"
-        return self.names[axis], rmse, sigma, factor, f"[{low}, {high}]", outside
+
+def _missing(evaluation: Evaluation) -> list[str]:
+    """A sentence on the steps of runs that are not there."""
+    missing = np.sum(~evaluation.logged, axis=1)
+    if not missing.any():
+        return []
+    most = np.argsort(-missing, kind="stable")[: min(_TOLD, np.count_nonzero(missing))]
+    told = ", ".join(f"{_run(evaluation, int(run))}: {missing[run]}" for run in most)
+    more = np.count_nonzero(missing) - len(most)
+    told += f", and {more} more run{'s' if more > 1 else ''}" if more else ""
+    return [
+        f"{missing.sum()} of {evaluation.nees.size} steps are not compared ({told}); each run is "
+        "averaged over the steps that it has, each step over the runs that have it"
+    ]
+
+
+def _run(evaluation: Evaluation, run: int) -> str:
+    return evaluation.run_names[run] if evaluation.run_names else f"run {run}"
+
+
+def _rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+    return [
+        ("axis", "RMSE", "σ claimed", "σ should be ×", "99 % interval", "outside ±3σ"),
+        *(_row(evaluation, i) for i in range(len(evaluation.names))),
+        ("consistent:", "", "", "1", "", f"{OUTSIDE:.2%}"),
+    ]
+
+
+def _row(evaluation: Evaluation, axis: int) -> tuple[str, ...]:
+    found = evaluation.axis_verdict(axis)
+    there = evaluation.logged.any(axis=0)
+    rmse, sigma = (f"{_rms(x[there, axis]):.4g}" for x in (evaluation.rmse, evaluation.sigma))
+    factor, low, high = (
+        "–" if x is None else f"{x:.3f}" if x < 10 else f"{x:.3g}"
+        for x in (found["sigma_factor"], *found["interval99"])
+    )
+    outside = f"{evaluation.outside3sigma[axis]:.2%}"
+    return evaluation.names[axis], rmse, sigma, factor, f"[{low}, {high}]", outside
 
 
 def _in_columns(*rows: tuple[str, ...]) -> list[str]:
