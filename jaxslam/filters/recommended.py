@@ -12,6 +12,7 @@ from jaxslam.filters.remedies.observability_constrained import ObservabilityCons
 from jaxslam.filters.slam import Slam
 from jaxslam.filters.window.start import FromWindow, Schedule
 from jaxslam.geometry import PLANAR
+from jaxslam.landmarks import Cartesian
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import AbstractMotion
 from jaxslam.models.scale import ScaleGauge
@@ -36,17 +37,17 @@ def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Any) -
     motion in a window of frames, of at most 5 and 3 members; in space its covariance is carried
     along the gauge.
 
-    For odometry, and for a sensor that measures metres, one Gaussian is enough: robocentric, its
-    covariance carried along the gauge (`ObservabilityConstrained`).
+    For odometry, and for a sensor that measures metres (then of Cartesian points): the paper's
+    filter. What nothing observes
+    is the base frame alone, whose directions do not move with a robocentric estimate: a remedy has
+    nothing to repair, and world-centric filters with one were more over-confident.
 
     Other `pieces` are those of `Slam`, and take the place of these. Raises ValueError.
     """
     planar = motion.geometry is PLANAR
     depth = pieces.pop("depth", InverseDepth.beyond(1.0))
-    chosen: dict[str, Any]
-    if not (motion.has_velocity and sensor.hidden):
-        chosen = {"correction": ObservabilityConstrained()}
-    else:
+    chosen: dict[str, Any] = {} if sensor.hidden else {"landmark": Cartesian()}
+    if motion.has_velocity and sensor.hidden:
         depth = replace(depth, common=0.5) if depth.common is None else depth
         chosen = {"scale": ScaleGauge(), "mixture": Mixture(17 if planar else 9)}
         if not _velocity_is_known(motion):
