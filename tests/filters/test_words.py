@@ -195,13 +195,12 @@ def test_recommended_is_a_record(geometry, told):
     assert operator.eq(*drifting)
 
 
-@pytest.mark.parametrize("scenario", ["room", "laps-6dof", "positions"])
-def test_recommended_is_the_papers_filter_where_metres_are_known(scenario):
-    landmark = "cartesian" if scenario == "positions" else "inverse_scaling"
-    one, other = make_filters(scenario, ["recommended", "robocentric"], landmark).values()
+@pytest.mark.parametrize("name", ["room", "laps-6dof", "positions"])
+def test_recommended_is_the_papers_filter_where_metres_are_known(name):
+    landmark = "cartesian" if name == "positions" else "inverse_scaling"
+    one, other = make_filters(name, ["recommended", "robocentric"], landmark).values()
     assert one == other
-    pieces = scenario_pieces(jaxslam.scenario(scenario))
-    assert recommended(**pieces).landmark.name == landmark
+    assert recommended(**scenario_pieces(scenario(name))).landmark.name == landmark
 
 
 def test_a_velocity_is_told_that_is_3_sigma_from_rest():
