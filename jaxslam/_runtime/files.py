@@ -20,7 +20,7 @@ import numpy as np
 
 T = TypeVar("T")
 LARGEST = 1e100
-"""Of the numbers of poses and pictures, whose squares are finite then."""
+"""The largest number of a pose or a picture that is read: its square is finite."""
 
 
 @contextmanager

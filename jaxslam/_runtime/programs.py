@@ -38,7 +38,7 @@ from jax.extend.core import Jaxpr
 from jaxslam._runtime.files import write_atomically
 
 Options = Mapping[str, Mapping[str, Any]]
-"""Of the compiler, by platform; one that it does not know is done without."""
+"""Options of the compiler, by platform; one that it does not know is left out."""
 
 # Without emitters of fusions it takes two thirds of the time, to programs that are as fast.
 BATCHED: Options = {"cpu": {"xla_cpu_use_fusion_emitters": False}}

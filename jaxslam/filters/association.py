@@ -36,11 +36,12 @@ GATE = 0.99
 TOLERANCE = 1.5
 """σ of what cameras and trackers of features do beyond their noise, in that."""
 STARTS = 8
-"""Of `sequential`, at the most …"""
+"""The most first matches that `sequential` tries."""
 ENOUGH = 0.8
-"""… and the share of matches that agree with which the first is the last."""
+"""The share of matches that agree with a first one after which it tries no other."""
 MOST_NODES = 1000
-"""Of the tree of `joint_compatibility`, which grows exponentially with wrong matches."""
+"""The most nodes of the tree of `joint_compatibility`, which grows exponentially with wrong
+matches."""
 
 
 class Candidates(NamedTuple):
@@ -51,7 +52,7 @@ class Candidates(NamedTuple):
     """S of all."""
     valid: Bool[Array, " m"]
     landmark: Int[Array, " m"]
-    """Of which each is a match: a number below m."""
+    """The landmark of which each is a match: a number below m."""
 
     @property
     def gate(self) -> float:
@@ -101,8 +102,8 @@ def candidates(
 
     `tolerance` is a σ, in the unit of a measurement, by which each may be off beyond its noise.
     Of a `curved` measurement, the covariance has the terms of second order of each match by
-    itself, where a `Slam` gives them: what depth does to it, of a camera that may have set
-    out in any direction.
+    itself, where a `Slam` gives them: what depth does to it, of a camera that may have started
+    in any direction.
     Raises ValueError for a filter whose innovations have no covariance.
     """
     _, innovation = slam.update(state, control, features)

@@ -27,10 +27,10 @@ def paper(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Any) -> Slam
 def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Any) -> Slam:
     """The best filter that was measured for this motion and sensor (docs/which-filter.md).
 
-    For a camera whose motion is a velocity: robocentric, with a unit of length of its own, since no
-    pixel observes the metre; an error that is common to all depths, σ half of one landmark's; and
-    a Gaussian sum over the velocity's direction, of at most 17 members in a plane and 9 in space,
-    as one linearisation is not enough while the direction of travel is unknown.
+    For a camera whose motion is a velocity it is robocentric, with a unit of length of its own,
+    since no pixel observes the metre, and an error that is common to all depths, σ half of one
+    landmark's. One linearisation is not enough while the direction of travel is unknown: so it is a
+    Gaussian sum over the velocity's direction, of at most 17 members in a plane and 9 in space.
 
     Where the velocity's mean is less than √3 σ of it, the same with a start that looks for the
     motion in a window of frames, of at most 5 and 3 members; in space its covariance is carried

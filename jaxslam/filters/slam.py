@@ -70,7 +70,7 @@ class Slam(AbstractSlam):
     mixture: Mixture | None = None
     """A sum of Gaussians in place of one."""
     start: FromWindow | None = None
-    """The search for a velocity that nobody knows; None where the motion's prior is one."""
+    """The search for an unknown velocity; None where the motion's prior is one."""
     gate: Gate | None = None
     """The test that measurements pass which are believed; None where all are."""
 

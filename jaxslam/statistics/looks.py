@@ -48,7 +48,7 @@ class Verdict(dict[str, Any]):
     p: float
     """The probability of such numbers, or more extreme ones, if the filter is consistent."""
     of: str
-    """The steps that decided: `all steps`, `last step`, `first third` …"""
+    """The steps that decided: `all steps`, `last step`, or a third of them (`first third`)."""
     enough: int | None
     """About how many runs would tell, where the word is `cannot tell`."""
     runs: int

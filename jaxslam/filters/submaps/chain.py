@@ -57,14 +57,14 @@ class Link(eqx.Module):
     order: Int[Array, "*N n"]
     """The numbers of the state, those of the separator in front."""
     free: Bool[Array, "*N n"]
-    """Of these which are not the separator's."""
+    """Whether each of these is not the separator's."""
     root: Float[Array, "*N n n"]
-    """L of the covariance in that order …"""
+    """L, with `L Lᵀ` the covariance in that order."""
     whitening: Float[Array, "*N n n"]
-    """… and its inverse."""
+    """L⁻¹."""
 
     def plus(self, told: Float[Array, " n"], y: Float[Array, " n"]) -> SubmapMean:
-        """Return the mean for what is told of its separator, and for white numbers of its own."""
+        """Return the mean for the correction of its separator, and white numbers of its own."""
         white = jnp.where(self.free, y, self.whitening @ told)
         delta = jnp.zeros_like(y).at[self.order].set(self.root @ white)
         return plus(self.state, delta)

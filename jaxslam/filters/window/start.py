@@ -45,9 +45,9 @@ class Schedule(eqx.Module):
     directions: int = eqx.field(static=True)
     """The number of directions in which the search starts, besides the start from rest."""
     searches: tuple[int, ...] = eqx.field(static=True)
-    """Frames after which minima are sought anew, from all starts …"""
+    """Frames after which minima are sought anew, from all starts."""
     in_turn: int = eqx.field(static=True)
-    """… and from how many of them after every other frame, in turn: no frame waits for them all."""
+    """The number of starts, in turn, after every other frame: no frame waits for them all."""
     searched: int = eqx.field(static=True)
     """Frames in which they are sought, spread over the window."""
     renewed: tuple[int, ...] = eqx.field(static=True)
@@ -65,7 +65,7 @@ class Schedule(eqx.Module):
     moved: float = eqx.field(static=True, default=0.1)
     """The same, below which a camera has done more than turn."""
     doubtful: float = eqx.field(static=True, default=4.0)
-    """σ of a landmark that is given up, one a frame: what is seen there is no point in space."""
+    """σ of a landmark that is given up, one in a frame: what is seen there is no point in space."""
 
     def __check_init__(self) -> None:
         if min(self.sizes, default=0) < 3 or list(self.sizes) != sorted(set(self.sizes)):
@@ -78,8 +78,8 @@ class Schedule(eqx.Module):
 
     @staticmethod
     def of(geometry: Geometry, frames: int | None = None) -> Schedule:
-        """The schedule for a planar or a spatial world, of windows of so many frames after frame 0
-        at the most."""
+        """The schedule for a planar or a spatial world, of windows of at most so many frames after
+        frame 0."""
         made = _PLANAR if geometry is PLANAR else _SPATIAL
         if frames is None:
             return made
