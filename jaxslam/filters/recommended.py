@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from jaxslam.filters.mixture.mixture import Mixture
 from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
-from jaxslam.filters.slam import Slam
+from jaxslam.filters.slam import Piece, Slam
 from jaxslam.filters.window.start import FromWindow, Schedule
 from jaxslam.geometry import PLANAR
 from jaxslam.models.depth import InverseDepth
@@ -18,13 +17,13 @@ from jaxslam.models.scale import ScaleGauge
 from jaxslam.models.sensors import AbstractSensor
 
 
-def paper(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Any) -> Slam:
+def paper(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Piece) -> Slam:
     """The filter of the paper: robocentric, composed after the update, of Inverse Scaling points
     that are used without delay. Other `pieces` are those of `Slam`. Raises ValueError."""
     return Slam(motion, sensor, **pieces)
 
 
-def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Any) -> Slam:
+def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Piece) -> Slam:
     """The best filter that was measured for this motion and sensor (docs/which-filter.md).
 
     For a camera whose motion is a velocity it is robocentric, with a unit of length of its own,
@@ -43,7 +42,7 @@ def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Any) -
     """
     planar = motion.geometry is PLANAR
     depth = pieces.pop("depth", InverseDepth.beyond(1.0))
-    chosen: dict[str, Any]
+    chosen: dict[str, Piece]
     if not (motion.has_velocity and sensor.hidden):
         chosen = {"correction": ObservabilityConstrained()}
     else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import fields, replace
-from typing import get_type_hints
+from typing import Any, get_type_hints
 
 from jaxtyping import Array, Bool
 
@@ -37,6 +37,8 @@ from jaxslam.models.observations import Capacity, Features, PriorMap, Slots
 from jaxslam.models.scale import AbstractScale, Metre
 from jaxslam.models.sensors import AbstractSensor
 
+Piece = Any
+"""A piece of a filter as `Slam` takes it: a motion, a sensor, a landmark, a calibration."""
 _ONE = OneGaussian()
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 from jaxslam._runtime.lookup import as_list, lookup
 from jaxslam.filters.gate import Gate
@@ -22,16 +21,13 @@ from jaxslam.filters.remedies.observability_constrained import ObservabilityCons
 from jaxslam.filters.remedies.random_walk import RandomWalk
 from jaxslam.filters.rivals.depth_particles import with_depth_particles
 from jaxslam.filters.rivals.rays import with_rays
-from jaxslam.filters.slam import Slam
+from jaxslam.filters.slam import Piece, Slam
 from jaxslam.filters.window.start import FromWindow, Schedule
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.frame import Keyframe, Submaps, WorldCentric
 from jaxslam.models.scale import ScaleGauge
 from jaxslam.simulation import World, as_scenario
-
-Piece = Any
-"""A piece of a filter as `Slam` takes it: a motion, a sensor, a landmark, a calibration."""
 
 FILTERS: dict[str, Callable[..., Slam]] = {
     "robocentric": Slam,
