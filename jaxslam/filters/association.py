@@ -22,7 +22,7 @@ import numpy as np
 import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam._numerics.arrays import Number
+from jaxslam._numerics.arrays import AnyArray, Number
 from jaxslam.filters.gaussian import context_of
 from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.linear.covariance import curvature
@@ -94,13 +94,14 @@ def candidates(
     state: Belief,
     control: Control,
     features: Features,
-    tolerance: Number = 0.0,
+    tolerance: Number | Float[AnyArray, " m"] = 0.0,
     *,
     curved: bool = False,
 ) -> Candidates:
     """The innovations of features of a predicted state that is one Gaussian.
 
-    `tolerance` is a σ, in the unit of a measurement, by which each may be off beyond its noise.
+    `tolerance` is a σ, in the unit of a measurement, by which each may be off beyond its noise:
+    one for all, or one for each.
     Of a `curved` measurement, the covariance has the terms of second order of each match by
     itself, where a `Slam` gives them: what depth does to it, of a camera that may have started
     in any direction.
@@ -113,7 +114,8 @@ def candidates(
         )
     m, p = innovation.residual.shape
     S = innovation.covariance
-    S += tolerance**2 * jnp.eye(m * p, dtype=S.dtype)
+    variances = tolerance**2 if jnp.ndim(tolerance) == 0 else jnp.repeat(tolerance**2, p)
+    S += variances * jnp.eye(m * p, dtype=S.dtype)
     S = S.reshape(m, p, m, p)
     if curved and isinstance(slam, AbstractSlam):
         i = jnp.arange(m)

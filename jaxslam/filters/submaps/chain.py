@@ -31,7 +31,7 @@ from jaxslam.filters.linear.state import AbstractState
 from jaxslam.filters.submaps.handover import Frozen, SubmapsState
 from jaxslam.geometry import Pose, difference, identity, retract
 from jaxslam.linalg import semidefinite_root
-from jaxslam.models.frame import KeyframePose, Submaps
+from jaxslam.models.frame import KeyframePose
 
 LINEARISATION = 1e-3
 """Variance of the error of second order of each number of a submap, as a share of its own."""
@@ -205,9 +205,9 @@ def chain(slam: AbstractSlam, state: SubmapsState, count: int) -> Chain:
     In a batch of runs all have one length: what a run does not have are links that say nothing.
     Raises ValueError for more than the state keeps.
     """
-    if not isinstance(slam.frame, Submaps):
+    if (submaps := slam.frame.handed_over) is None:
         raise ValueError(f"a filter with frame=Submaps(…) has a chain, not a {slam.frame.name} one")
-    history = slam.frame.history
+    history = submaps.history
     if not 0 <= count <= history:
         raise ValueError(f"the state keeps {history} submaps, not {count}")
     _, newest = slam.inner.gaussian(state.inner, None)

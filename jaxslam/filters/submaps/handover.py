@@ -90,7 +90,6 @@ class Handover(AbstractLayer):
 
     def gaussian(self, slam, state, control):
         base, one = slam.inner.gaussian(state.inner, control)
-        assert isinstance(base, AbstractSlam)
         return replace(base, frame=self.frame), replace(state, inner=one)
 
     def predict_features(self, slam, state, control, slots):

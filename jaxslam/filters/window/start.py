@@ -119,7 +119,7 @@ class FromWindow(AbstractLayer):
         if first is not None:
             begun = window.begun(begun, first)
         member = one.init(capacity, first)
-        modes = at_rest(cast(one, dtype), begun, _mixture(slam).members, dtype)
+        modes = at_rest(cast(one, dtype), begun, slam.mixture.members, dtype)
         count = len(modes.log_weights)
         members = jax.tree.map(lambda x: jnp.tile(x, (count, *(1,) * x.ndim)), member)
         return RestState(SumState(members, modes.log_weights), begun, modes, jnp.ones((), bool))
@@ -131,7 +131,7 @@ class FromWindow(AbstractLayer):
         return replace(state, sum=inner)
 
     def update(self, slam, state, control, seen):
-        mixture = _mixture(slam)
+        mixture: Mixture = slam.mixture
         update = mixture.update if self.schedule.divided else mixture.update_members
         after, innovation = update(slam.inner, state.sum, control, seen)
         stepped = window.stepped(state.record, control, seen, slam.sensor.noise)
@@ -239,13 +239,6 @@ class FromWindow(AbstractLayer):
         variance = jnp.trace(member.covariance[position, position])
         squared = jnp.sum(slam.model.camera_pose(member.core).translation() ** 2)
         return variance < share**2 * squared
-
-
-def _mixture(slam: AbstractSlam) -> Mixture:
-    """The sum that begins so."""
-    mixture = slam.inner.layer
-    assert isinstance(mixture, Mixture)
-    return mixture
 
 
 def _likely(members: SumState, now: Bool[Array, ""], given_up: float) -> SumState:
