@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from typing import Any, TextIO
+from typing import Any
 
 from jaxslam._runtime.extras import missing
 
@@ -100,7 +100,7 @@ class StudyBar:
 class _Lines:
     """A file to which what would be drawn anew is a line more, from `LINE_SECONDS` on."""
 
-    def __init__(self, file: TextIO) -> None:
+    def __init__(self, file: Any) -> None:
         self._file, self._begin = file, time.monotonic() + LINE_SECONDS
 
     def write(self, text: str) -> None:

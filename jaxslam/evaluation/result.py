@@ -449,7 +449,7 @@ def evaluate_nees(
     )
 
 
-def _rms(values: np.ndarray, there: np.ndarray | None = None) -> np.ndarray:
+def _rms(values: np.ndarray, there: np.ndarray | None = None) -> Any:
     """The root of the mean square over the first axis; infinite where it overflows."""
     with np.errstate(over="ignore"):
         return np.sqrt(np.mean(values**2, axis=0) if there is None else _mean(values**2, there))
