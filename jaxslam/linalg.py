@@ -1,7 +1,7 @@
 """Factorisations of small matrices, written in JAX: batched by `vmap`, differentiable, no LAPACK.
 
 jaxlib's batched LAPACK kernels wait inside XLA's thread pool for pieces of work that only the same
-pool can do: two at once stand still for ever on two cores (docs/faq.md). These functions take one
+pool can do: two at once hang for ever on two cores (docs/faq.md). These functions take one
 real matrix, in float32 or float64, and raise nothing: what has no solution is NaN.
 """
 
@@ -28,7 +28,8 @@ LARGE = 256
 UNROLLED = 4
 """Rows up to which the loops over them are written out."""
 SWEEPS = 10
-"""Of Jacobi's method over all pairs; it converges quadratically, from about the fourth on."""
+"""Sweeps of Jacobi's method over all pairs, which converges quadratically from about the fourth
+on."""
 
 
 class Cholesky(NamedTuple):

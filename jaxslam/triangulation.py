@@ -17,7 +17,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,6 +26,7 @@ import numpy as np
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, Int, PyTree, UInt32
 
+from jaxslam._runtime.files import Json
 from jaxslam._runtime.lookup import lookup
 from jaxslam._version import __version__
 from jaxslam.filters.slam import Slam
@@ -61,7 +62,7 @@ Values = Float[np.ndarray, " n"]
 Gaussian = tuple[Float[Array, " d"], Float[Array, "d d"]]
 Point = tuple[Float[Array, " 2"], Scalar, Scalar]
 """A homogeneous point (X, ω) and the logarithm of its weight."""
-Summary = dict[str, Any]
+Summary = dict[str, Json]
 
 
 class TwoViews(eqx.Module):

@@ -5,7 +5,7 @@ until the last has ended. Here those that want it are gathered from the whole ba
 blocks, so that the work is that of those who want it.
 
 A loop whose end is known only when it runs has no reverse mode. Where one differentiates, in either
-mode, all works are therefore done, and those that nobody wants are of no effect.
+mode, all works are therefore done, and those that are not wanted are of no effect.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from jaxtyping import Array, Bool, Int, PyTree
 Value = TypeVar("Value")
 
 PARTS = 4
-"""Of a batch, in a block, where each of the batch has one work at the most. Where it has many,
-a block has as many places as the batch: in small ones the compiler's products of matrices are
-slow."""
+"""The number of blocks that a batch would fill, where each of it has at most one work. Where it
+has many, a block has as many places as the batch: in small ones the compiler's products of matrices
+are slow."""
 LEAST = 8
 """Works in a block."""
 # A slice: a gather is a larger program, and slower.
@@ -73,7 +73,7 @@ def _at_each(function, which: int, values, sources, alive, given):
 
 
 def zeros(shapes: PyTree, k: int) -> PyTree:
-    """So many of what has these shapes."""
+    """A batch of k zeros of these shapes."""
     return jax.tree.map(lambda x: jnp.zeros((k, *x.shape), x.dtype), shapes)
 
 

@@ -19,8 +19,10 @@ from typing import Any, BinaryIO, TypeVar
 import numpy as np
 
 T = TypeVar("T")
+Json = Any
+"""A value as JSON has it: a number, a word, a list, an object, or null."""
 LARGEST = 1e100
-"""Of the numbers of poses and pictures, whose squares are finite then."""
+"""The largest number of a pose or a picture that is read: its square is finite."""
 
 
 @contextmanager
@@ -41,7 +43,7 @@ def write_atomically(path: str | Path) -> Generator[Path, None, None]:
         temporary.unlink(missing_ok=True)
 
 
-def read_json(path: str | Path, what: str, parse: Callable[[Any], T]) -> T:
+def read_json(path: str | Path, what: str, parse: Callable[[Json], T]) -> T:
     """Return what `parse` makes of a JSON file. Raises ValueError, naming the file, where it cannot
     be read (`what` says of what), is not JSON, or is refused by `parse`."""
     path = Path(path)
@@ -57,7 +59,7 @@ def read_json(path: str | Path, what: str, parse: Callable[[Any], T]) -> T:
         raise ValueError(f"{path}: {error}") from None
 
 
-def write_json(path: str | Path, value: Any, **options: Any) -> None:
+def write_json(path: str | Path, value: Json, **options: Any) -> None:
     """Write a value as JSON, whole or not at all; `options` are `json.dumps`'s."""
     text = json.dumps(value, indent=1, **options) + "\n"
     with write_atomically(path) as temporary:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TypeVar
+
+T = TypeVar("T")
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:
@@ -18,7 +20,7 @@ def as_list(names: str | Iterable[str]) -> list[str]:
     return [names] if isinstance(names, str) else list(names)
 
 
-def lookup(kind: str, names: str | Iterable[str], known: Mapping[str, Any]) -> dict[str, Any]:
+def lookup(kind: str, names: str | Iterable[str], known: Mapping[str, T]) -> dict[str, T]:
     """The named entries of a table, in the order of the names. Raises ValueError."""
     names = as_list(names)
     if not names:

@@ -34,11 +34,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 from jax.extend.core import Jaxpr
+from jax.tree_util import PyTreeDef
+from jaxtyping import PyTree
 
 from jaxslam._runtime.files import write_atomically
 
-Options = Mapping[str, Mapping[str, Any]]
-"""Of the compiler, by platform; one that it does not know is done without."""
+Options = Mapping[str, Mapping[str, str | int | bool]]
+"""Options of the compiler, by platform; one that it does not know is left out."""
 
 # Without emitters of fusions it takes two thirds of the time, to programs that are as fast.
 BATCHED: Options = {"cpu": {"xla_cpu_use_fusion_emitters": False}}
@@ -89,11 +91,11 @@ class Made(Generic[T]):
     """
 
     def __init__(self) -> None:
-        self._futures: dict[Any, Future[T]] = {}
+        self._futures: dict[object, Future[T]] = {}
         self._lock = threading.Lock()
         _all.add(self)
 
-    def of(self, key: Any, make: Callable[[], T]) -> T:
+    def of(self, key: object, make: Callable[[], T]) -> T:
         """Return the program of this key, which is the same only `exactly`, or make it."""
         key = exactly(key)
         with self._lock:
@@ -112,7 +114,7 @@ class Made(Generic[T]):
                     self._futures.pop(key, None)
         return future.result()
 
-    def __contains__(self, key: Any) -> bool:
+    def __contains__(self, key: object) -> bool:
         future = self._futures.get(exactly(key))
         return future is not None and future.done() and future.exception() is None
 
@@ -135,18 +137,18 @@ class Program:
 
     def __init__(
         self,
-        function: Callable[..., Any],
+        function: Callable[..., PyTree],
         options: Options = ALONE,
-        seen: Callable[[Jaxpr, tuple[Any, ...]], None] = lambda jaxpr, args: None,
+        seen: Callable[[Jaxpr, tuple[PyTree, ...]], None] = lambda jaxpr, args: None,
     ) -> None:
         self.function, self.options, self.seen = function, options, seen
         self._made: Made[_Compiled] = Made()
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: PyTree) -> PyTree:
         call = _Call.of(args)
         return self._compiled(call)(call.arrays)
 
-    def compile(self, *args: Any) -> Any:
+    def compile(self, *args: PyTree) -> PyTree:
         """Compile for such arguments, or wait for who does; what it returns, as shapes."""
         return self._compiled(_Call.of(args)).shapes
 
@@ -188,19 +190,19 @@ class Program:
 class _Call(NamedTuple):
     """The arguments with which a program is called."""
 
-    arrays: list[Any]
-    key: Any
+    arrays: list[jax.Array | jax.ShapeDtypeStruct]
+    key: tuple[PyTreeDef, tuple[bool, ...], tuple[object, ...], bool]
     """Structure, and of every leaf its shape and type or, where it is no array, itself."""
 
     @classmethod
-    def of(cls, args: tuple[Any, ...]) -> _Call:
+    def of(cls, args: tuple[PyTree, ...]) -> _Call:
         leaves, structure = jax.tree.flatten(args)
         are_arrays = tuple(map(_is_array, leaves))
         both = list(zip(leaves, are_arrays, strict=True))
         kinds = tuple((x.shape, x.dtype.name) if is_array else x for x, is_array in both)
         return cls([x for x, is_array in both if is_array], (structure, are_arrays, kinds, wide()))
 
-    def arguments(self, arrays: list[Any]) -> tuple[Any, ...]:
+    def arguments(self, arrays: list[PyTree]) -> tuple[PyTree, ...]:
         """Return the arguments, with these arrays in place of the call's own."""
         structure, are_arrays, kinds, _ = self.key
         rest = iter(arrays)
@@ -208,7 +210,7 @@ class _Call(NamedTuple):
         return jax.tree.unflatten(structure, leaves)
 
 
-def exactly(value: Any) -> Any:
+def exactly(value: Any) -> object:
     """A key that equals another's where both values are of one type and have the same bits.
 
     `==` takes 2 for 2.0, True for 1 and −0.0 for 0.0, which programs do not, and NaN for nothing.
@@ -220,7 +222,7 @@ def exactly(value: Any) -> Any:
         return kind, value
     if kind is tuple:
         return kind, tuple(map(exactly, value))
-    if kind is jax.tree_util.PyTreeDef:
+    if kind is PyTreeDef:
         return kind, exactly(value.node_data()), tuple(map(exactly, value.children()))
     if isinstance(value, (float, complex)):
         return kind, np.asarray(value, complex).tobytes()
@@ -256,9 +258,9 @@ class _Compiled(NamedTuple):
     """A program of lists of arrays, and the structure of what it returns."""
 
     compiled: jax.stages.Compiled
-    shapes: Any
+    shapes: PyTree
 
-    def __call__(self, arrays: list[Any]) -> Any:
+    def __call__(self, arrays: list[PyTree]) -> PyTree:
         return jax.tree.unflatten(jax.tree.structure(self.shapes), self.compiled(arrays))
 
 
@@ -272,7 +274,7 @@ def _with_options(lowered: jax.stages.Lowered, options: Options) -> jax.stages.C
     return lowered.compile()
 
 
-def in_background(*steps: Callable[[], Any]) -> threading.Thread:
+def in_background(*steps: Callable[[], object]) -> threading.Thread:
     """Take the steps one after the other, aside; those not started when the process ends are left
     out. What goes wrong will do so again where it is needed."""
 
@@ -309,7 +311,7 @@ class _Pickler(pickle.Pickler):
         self.fast = True
         self.functions: dict[str, FunctionType] = {}
 
-    def persistent_id(self, obj: Any) -> str | None:
+    def persistent_id(self, obj: object) -> str | None:
         if isinstance(obj, type | FunctionType | BuiltinFunctionType) and not _known(obj):
             raise pickle.PicklingError(f"{obj.__qualname__} may change without notice")
         if not isinstance(obj, FunctionType):
@@ -373,7 +375,7 @@ def keep(path: Path, parts: Callable[[], tuple[object, ...]]) -> None:
         return
 
 
-def _surroundings() -> tuple[Any, ...]:
+def _surroundings() -> tuple[object, ...]:
     """All that a program depends on beside its function's arguments."""
     device = jax.devices()[0]
     config = jax.config.values

@@ -82,8 +82,8 @@ class StudyBar:
         self._bar.close()
 
     def __call__(self, name: str, runs: int) -> None:
-        """So many more runs of this filter are done; none: it is now compiled, and at the next
-        call, whatever that says, it has been."""
+        """Show that so many more runs of this filter are done. None means that it is now being
+        compiled, until the next call, whatever that says."""
         if not runs and name != self._compiling:
             self._compiling, self._bar.bar_format = name, _UNTIMED
             self._bar.set_description_str(f"{name}, compiling")

@@ -1,4 +1,4 @@
-"""Computations that stand still end with an error that says where, instead of waiting for ever."""
+"""Computations that hang end with an error that says where, instead of waiting for ever."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def finished(values: Values, where: str, patience: float = DEADLOCK_SECONDS) -> 
     """The arrays once they are computed; raises `DeadlockError` if nothing works on them any more.
 
     What is watched is the processor time of this process, not the clock: a long computation is no
-    dead-lock. On an accelerator the work is elsewhere, and nothing is watched. Threads that stand
-    still cannot be stopped, and the interpreter would wait for them at its end: after this error
-    the process exits with status 1.
+    dead-lock. On an accelerator the work is elsewhere, and nothing is watched. Threads that hang
+    cannot be stopped, and the interpreter would wait for them at its end: after this error the
+    process exits with status 1.
     """
     if jax.default_backend() != "cpu":
         return jax.block_until_ready(values)

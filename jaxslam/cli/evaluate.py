@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import tyro
 
-from jaxslam._runtime.files import json_numbers, write_json
+from jaxslam._runtime.files import Json, json_numbers, write_json
 from jaxslam.cli.consistency import ConsistencyOptions
 from jaxslam.consistency.suite import SUITE, SuiteScenario, read_suite, write_suite
 from jaxslam.consistency.summary import summarise
@@ -134,7 +134,7 @@ class EvaluateOptions:
         write_json(self.out / "suite.json", {"schema": 1, "scenarios": told}, allow_nan=False)
         print(f"wrote {self.out / 'suite.json'}")
 
-    def _of_log(self, path: Path, suite: SuiteScenario) -> tuple[Evaluation, dict[str, Any]]:
+    def _of_log(self, path: Path, suite: SuiteScenario) -> tuple[Evaluation, dict[str, Json]]:
         (_, _, _, *axes), rows = suite.tables["truth.csv"]
         times, truths = np.split(rows.reshape(suite.runs, -1, 3 + len(axes))[:, 1:, 2:], [1], -1)
         poses, P = read_pose_log(path, *truths.shape[:2], axes)
@@ -145,7 +145,7 @@ class EvaluateOptions:
         rmse = json_numbers(np.sqrt(np.mean(np.sum(off**2, axis=-1), axis=0)))
         return found, found.asdict() | {"rmse": {"position": rmse}}
 
-    def _of_filters(self, name: str, suite: SuiteScenario) -> dict[str, Any]:
+    def _of_filters(self, name: str, suite: SuiteScenario) -> dict[str, Json]:
         """The numbers of the filters here, by a study that is kept, and gone on with."""
         options = ConsistencyOptions(
             filters=self.filters, landmarks=("inverse_scaling",), out=self.out / name,
@@ -160,7 +160,7 @@ class EvaluateOptions:
         return evaluate_log(self.source, stated=self._stated(), **of_log)
 
 
-def _comparison(title: str, filters: dict[str, Any]) -> list[str]:
+def _comparison(title: str, filters: dict[str, Json]) -> list[str]:
     """A line of each filter: NEES and error at the last step, the factor of σ as in its verdict."""
     lines = [f"{title:<32}NEES/dof  95 % band     σ ×    lost  RMSE m  verdict"]
     for name, x in filters.items():

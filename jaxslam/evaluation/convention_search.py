@@ -16,11 +16,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam._runtime.files import Json
 from jaxslam.evaluation.convention import Convention
 from jaxslam.statistics.bands import PowerSums, mean_p_value
 from jaxslam.statistics.verdict import VERDICT_CONFIDENCE, Verdict, not_disproved, run_verdict
@@ -145,7 +146,7 @@ class Identification:
             f"the data be consistent, NEES {self.nees[other]:.2f}"
         )
 
-    def asdict(self) -> dict[str, Any]:
+    def asdict(self) -> dict[str, Json]:
         """Return the content for `evaluation.json`."""
         return {
             "stated": asdict(self.stated),

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam._runtime import plotted
-from jaxslam._runtime.files import json_numbers, write_json
+from jaxslam._runtime.files import Json, json_numbers, write_json
 from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.evaluation.convention import Convention
 from jaxslam.evaluation.convention_search import Identification
@@ -233,7 +233,7 @@ class Evaluation:
         """Return the figure of the evaluation, see `jaxslam.plots.plot_evaluation`."""
         return plotted("plot_evaluation")(self, path, column=column)
 
-    def asdict(self) -> dict[str, Any]:
+    def asdict(self) -> dict[str, Json]:
         """The content of `evaluation.json`."""
         from jaxslam._version import __version__
 

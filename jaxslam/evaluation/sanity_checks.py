@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxslam._runtime.files import Json
 from jaxslam.statistics.bands import shortfall_limit
 from jaxslam.statistics.verdict import Verdict
 
@@ -82,7 +83,7 @@ def mistakes(logged: Logged) -> tuple[Mistake, ...]:
 def withheld(found: Verdict) -> Verdict:
     """Return a verdict with every word withheld, as the data are not what they are said to be."""
 
-    def silent(part: Any) -> Any:
+    def silent(part: Json) -> Json:
         if isinstance(part, list):
             return [silent(x) for x in part]
         return withheld(part) if isinstance(part, dict) else part

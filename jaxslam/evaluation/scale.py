@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam._runtime.files import json_numbers
+from jaxslam._runtime.files import Json, json_numbers
 from jaxslam.evaluation.alignment import about
 from jaxslam.evaluation.convention import Convention, pose_errors
 from jaxslam.evaluation.inputs import Poses, correlations, sigmas
@@ -106,7 +106,7 @@ class Scale:
             sigma[there] = np.nanmedian(np.where(self.told, self.sigma, np.nan)[:, there], axis=0)
         return np.stack([low, high]), median, sigma
 
-    def asdict(self) -> dict[str, Any]:
+    def asdict(self) -> dict[str, Json]:
         """Return the content for `evaluation.json`."""
         (low, high), median, sigma = self.over_runs
         return {

@@ -1,4 +1,4 @@
-"""Filters, and what they are made of: the record and its pieces; for filters of one's own."""
+"""Filters, and what they are made of: the record and its pieces, for filters of your own."""
 
 from jaxslam.filters.gate import Gate
 from jaxslam.filters.linear.kalman import AbstractCorrection, Kalman, kalman_update

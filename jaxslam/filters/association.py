@@ -22,7 +22,7 @@ import numpy as np
 import scipy  # of which `special` is imported when it is first used
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam._numerics.arrays import Number
+from jaxslam._numerics.arrays import AnyArray, Number
 from jaxslam.filters.gaussian import context_of
 from jaxslam.filters.layer import AbstractSlam
 from jaxslam.filters.linear.covariance import curvature
@@ -36,11 +36,12 @@ GATE = 0.99
 TOLERANCE = 1.5
 """σ of what cameras and trackers of features do beyond their noise, in that."""
 STARTS = 8
-"""Of `sequential`, at the most …"""
+"""The most first matches that `sequential` tries."""
 ENOUGH = 0.8
-"""… and the share of matches that agree with which the first is the last."""
+"""The share of matches that agree with a first one after which it tries no other."""
 MOST_NODES = 1000
-"""Of the tree of `joint_compatibility`, which grows exponentially with wrong matches."""
+"""The most nodes of the tree of `joint_compatibility`, which grows exponentially with wrong
+matches."""
 
 
 class Candidates(NamedTuple):
@@ -51,7 +52,7 @@ class Candidates(NamedTuple):
     """S of all."""
     valid: Bool[Array, " m"]
     landmark: Int[Array, " m"]
-    """Of which each is a match: a number below m."""
+    """The landmark of which each is a match: a number below m."""
 
     @property
     def gate(self) -> float:
@@ -93,16 +94,17 @@ def candidates(
     state: Belief,
     control: Control,
     features: Features,
-    tolerance: Number = 0.0,
+    tolerance: Number | Float[AnyArray, " m"] = 0.0,
     *,
     curved: bool = False,
 ) -> Candidates:
     """The innovations of features of a predicted state that is one Gaussian.
 
-    `tolerance` is a σ, in the unit of a measurement, by which each may be off beyond its noise.
+    `tolerance` is a σ, in the unit of a measurement, by which each may be off beyond its noise:
+    one for all, or one for each.
     Of a `curved` measurement, the covariance has the terms of second order of each match by
-    itself, where a `Slam` gives them: what depth does to it, of a camera that may have set
-    out in any direction.
+    itself, where a `Slam` gives them: what depth does to it, of a camera that may have started
+    in any direction.
     Raises ValueError for a filter whose innovations have no covariance.
     """
     _, innovation = slam.update(state, control, features)
@@ -112,7 +114,8 @@ def candidates(
         )
     m, p = innovation.residual.shape
     S = innovation.covariance
-    S += tolerance**2 * jnp.eye(m * p, dtype=S.dtype)
+    variances = tolerance**2 if jnp.ndim(tolerance) == 0 else jnp.repeat(tolerance**2, p)
+    S += variances * jnp.eye(m * p, dtype=S.dtype)
     S = S.reshape(m, p, m, p)
     if curved and isinstance(slam, AbstractSlam):
         i = jnp.arange(m)

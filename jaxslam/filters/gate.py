@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxslam._runtime.lookup import lookup
 from jaxslam.filters.association import ASSOCIATIONS, TOLERANCE, candidates
 from jaxslam.filters.layer import AbstractLayer
+from jaxslam.models.sensors import noises
 
 
 class Gate(AbstractLayer):
@@ -26,7 +27,7 @@ class Gate(AbstractLayer):
 
     def update(self, slam, state, control, seen):
         one, gaussian = slam.inner.gaussian(state, control)
-        tolerance = self.tolerance * jnp.sqrt(slam.sensor.noise[0, 0])
+        tolerance = self.tolerance * jnp.sqrt(noises(slam.sensor, seen.measured)[..., 0, 0])
         found = candidates(one, gaussian, control, seen, tolerance)
         agreed = ASSOCIATIONS[self.association](found)
         return slam.inner.update(state, control, replace(seen, valid=agreed))

@@ -29,7 +29,6 @@ from jaxslam.filters.protocol import (
     OfLandmark,
 )
 from jaxslam.geometry import SplitPose, difference, identity
-from jaxslam.models.frame import KeyframePose
 from jaxslam.models.motion import Control, check_control
 from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap
 from jaxslam.models.sensors import noises
@@ -216,8 +215,7 @@ def rebased(state: State) -> State:
     """The current camera as the one in which a submap begins: `T_BK ← T_BK T_KC`, T_KC is the
     identity, and the motion's variables are kept as they are now."""
 
-    def core(core: Core) -> Core:
-        assert isinstance(core.pose, KeyframePose)
+    def core(core):
         return replace(core, pose=core.pose.reanchored(), base_motion=core.motion)
 
     return linear.reparametrised(state, Change(core=core, view=lambda core: (), landmark=None))
@@ -226,12 +224,15 @@ def rebased(state: State) -> State:
 def each_gaussian(belief: Belief, function: Callable[[State], State]) -> Belief:
     """The belief with a function of every Gaussian in it, of which sums have batches."""
 
+    def is_gaussian(node: PyTree) -> bool:
+        return isinstance(node, State)
+
     def one(node: PyTree) -> PyTree:
-        if not isinstance(node, State):
+        if not is_gaussian(node):
             return node
         return jax.vmap(function)(node) if node.covariance.ndim == 3 else function(node)
 
-    return jax.tree.map(one, belief, is_leaf=lambda node: isinstance(node, State))
+    return jax.tree.map(one, belief, is_leaf=is_gaussian)
 
 
 def check_features(slam: AbstractSlam, features: Features) -> None:

@@ -219,7 +219,7 @@ class SlamModel(eqx.Module):
         return self.frame.left(state.core.pose, self.inverse_distances(state))
 
     def inverse_distances(self, state: State) -> Float[Array, " capacity"]:
-        """Of the landmarks from the origin of the map frame; zero in empty slots."""
+        """Each landmark's 1/distance from the origin of the map frame; zero in empty slots."""
         points, omegas = jax.vmap(self.landmark.homogeneous)(state.landmarks)
         inverse_distances = jnp.abs(omegas) / jnp.linalg.norm(points, axis=1)
         return jnp.where(state.active, inverse_distances, 0.0)

@@ -1,4 +1,4 @@
-"""The interface of a filter to its users: Monte Carlo studies, trackers, a loop of one's own.
+"""The interface of a filter to its users: Monte Carlo studies, trackers, a loop of your own.
 
 A filter is a module (a pytree that holds its numbers) with four functions, pure and on a state
 that is any pytree of arrays: `init`, `step`, `marginal`, `landmark_marginal`. One that can also
@@ -22,7 +22,7 @@ from jaxslam.models.motion import Control
 from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap, Slots
 
 Belief = PyTree
-"""Of a filter: a pytree of arrays that only the filter knows."""
+"""The state of a filter: a pytree of arrays that only the filter knows."""
 Moments = tuple[PyTree, Float[Array, "k k"]]
 """Mean and covariance of a vector, or of a pytree of poses and vectors, whose covariance is of its
 tangent."""

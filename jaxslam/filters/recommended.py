@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from jaxslam.filters.mixture.mixture import Mixture
 from jaxslam.filters.remedies.observability_constrained import ObservabilityConstrained
-from jaxslam.filters.slam import Slam
+from jaxslam.filters.slam import Piece, Slam
 from jaxslam.filters.window.start import FromWindow, Schedule
 from jaxslam.geometry import PLANAR
 from jaxslam.landmarks import Cartesian
@@ -19,19 +18,19 @@ from jaxslam.models.scale import ScaleGauge
 from jaxslam.models.sensors import AbstractSensor
 
 
-def paper(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Any) -> Slam:
+def paper(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Piece) -> Slam:
     """The filter of the paper: robocentric, composed after the update, of Inverse Scaling points
     that are used without delay. Other `pieces` are those of `Slam`. Raises ValueError."""
     return Slam(motion, sensor, **pieces)
 
 
-def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Any) -> Slam:
+def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Piece) -> Slam:
     """The best filter that was measured for this motion and sensor (docs/which-filter.md).
 
-    For a camera whose motion is a velocity: robocentric, with a unit of length of its own, since no
-    pixel observes the metre; an error that is common to all depths, σ half of one landmark's; and
-    a Gaussian sum over the velocity's direction, of at most 17 members in a plane and 9 in space,
-    as one linearisation is not enough while the direction of travel is unknown.
+    For a camera whose motion is a velocity it is robocentric, with a unit of length of its own,
+    since no pixel observes the metre, and an error that is common to all depths, σ half of one
+    landmark's. One linearisation is not enough while the direction of travel is unknown: so it is a
+    Gaussian sum over the velocity's direction, of at most 17 members in a plane and 9 in space.
 
     Where the velocity's mean is less than √3 σ of it, the same with a start that looks for the
     motion in a window of frames, of at most 5 and 3 members; in space its covariance is carried
@@ -46,7 +45,7 @@ def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Any) -
     """
     planar = motion.geometry is PLANAR
     depth = pieces.pop("depth", InverseDepth.beyond(1.0))
-    chosen: dict[str, Any] = {} if sensor.hidden else {"landmark": Cartesian()}
+    chosen: dict[str, Piece] = {} if sensor.hidden else {"landmark": Cartesian()}
     if motion.has_velocity and sensor.hidden:
         depth = replace(depth, common=0.5) if depth.common is None else depth
         chosen = {"scale": ScaleGauge(), "mixture": Mixture(17 if planar else 9)}

@@ -20,11 +20,11 @@ class Frames(NamedTuple):
     """The inputs of a filter in the frames after frame 0: every array begins with their axis."""
 
     control: Control
-    """The motion model's: seconds, the odometry's reading, …"""
+    """The motion model's inputs, such as seconds or the odometry's readings."""
     seen: Features
-    """Of landmarks in the map."""
+    """Measurements of landmarks in the map."""
     new: Features
-    """Of landmarks to insert."""
+    """Measurements of landmarks to insert."""
     gone: Bool[Array, "*frames slots"] | None = None
     """Slots whose landmark is removed before the frame; None where all stay."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import fields, replace
-from typing import get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from jaxtyping import Array, Bool
 
@@ -31,12 +31,14 @@ from jaxslam.geometry import Pose
 from jaxslam.landmarks import AbstractLandmark, InverseScaling
 from jaxslam.models.calibration import AbstractCalibration, Known, check_calibration
 from jaxslam.models.depth import InverseDepth
-from jaxslam.models.frame import AbstractFrame, Robocentric, Submaps
+from jaxslam.models.frame import AbstractFrame, Robocentric
 from jaxslam.models.motion import AbstractMotion, Control
 from jaxslam.models.observations import Capacity, Features, PriorMap, Slots
 from jaxslam.models.scale import AbstractScale, Metre
 from jaxslam.models.sensors import AbstractSensor
 
+Piece = Any
+"""A piece of a filter as `Slam` takes it: a motion, a sensor, a landmark, a calibration."""
 _ONE = OneGaussian()
 
 
@@ -70,7 +72,7 @@ class Slam(AbstractSlam):
     mixture: Mixture | None = None
     """A sum of Gaussians in place of one."""
     start: FromWindow | None = None
-    """The search for a velocity that nobody knows; None where the motion's prior is one."""
+    """The search for an unknown velocity; None where the motion's prior is one."""
     gate: Gate | None = None
     """The test that measurements pass which are believed; None where all are."""
 
@@ -80,9 +82,9 @@ class Slam(AbstractSlam):
     @property
     def layer(self) -> AbstractLayer:
         """The outermost of the layers, which stand in this order."""
-        frame = self.frame
-        ends = isinstance(frame, Submaps) and frame.hands_over
-        around = (self.gate, Handover(frame) if ends else None, self.start, self.mixture)
+        submaps = self.frame.handed_over
+        handover = None if submaps is None else Handover(submaps)
+        around = (self.gate, handover, self.start, self.mixture)
         return next((layer for layer in around if layer is not None), _ONE)
 
     @property
@@ -93,7 +95,7 @@ class Slam(AbstractSlam):
     def inner(self) -> Slam:
         if self.gate is not None:
             return _without(self, gate=None)
-        if self.frame.hands_over:
+        if self.frame.handed_over is not None:
             return _without(self, frame=_unending(self.frame))
         if self.start is not None:
             return _without(self, start=None)
@@ -166,15 +168,16 @@ def _without(slam: Slam, **changed) -> Slam:
 
 def _unending(frame: AbstractFrame) -> AbstractFrame:
     """The frame without what ends a submap."""
-    return replace(frame, spare=None) if frame.hands_over else frame
+    submaps = frame.handed_over
+    return frame if submaps is None else replace(submaps, spare=None)
 
 
 def compatible(slam: Slam) -> None:
     """Raise ValueError, naming both and why, for pieces of which one excludes the other."""
     for name, kind in get_type_hints(Slam).items():
         if not isinstance(getattr(slam, name), kind):
-            wanted = getattr(kind, "__name__", str(kind)).replace(" | None", "")
-            raise ValueError(f"{name} is a {wanted}, not {getattr(slam, name)!r}")
+            wanted = (get_args(kind) or (kind,))[0].__name__
+            raise ValueError(f"{name} is an instance of {wanted}, not {getattr(slam, name)!r}")
     n, found = slam.motion.geometry.point_dim, slam.sensor.point_dim
     if found != n:
         raise ValueError(

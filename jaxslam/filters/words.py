@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 from jaxslam._runtime.lookup import as_list, lookup
 from jaxslam.filters.gate import Gate
@@ -22,16 +21,13 @@ from jaxslam.filters.remedies.observability_constrained import ObservabilityCons
 from jaxslam.filters.remedies.random_walk import RandomWalk
 from jaxslam.filters.rivals.depth_particles import with_depth_particles
 from jaxslam.filters.rivals.rays import with_rays
-from jaxslam.filters.slam import Slam
+from jaxslam.filters.slam import Piece, Slam
 from jaxslam.filters.window.start import FromWindow, Schedule
 from jaxslam.landmarks import LANDMARKS
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.frame import Keyframe, Submaps, WorldCentric
 from jaxslam.models.scale import ScaleGauge
 from jaxslam.simulation import World, as_scenario
-
-Piece = Any
-"""A piece of a filter as `Slam` takes it: `motion`, `sensor`, `landmark`, `calibration`, …"""
 
 FILTERS: dict[str, Callable[..., Slam]] = {
     "robocentric": Slam,
@@ -42,12 +38,17 @@ FILTERS: dict[str, Callable[..., Slam]] = {
     "invariant": partial(Slam, frame=WorldCentric(), correction=Invariant()),
     "recommended": recommended,
 }
-"""By name, of pieces: the paper's filter, with landmarks in the camera frame and composition after
-the update (`robocentric`); the classical one, in the base frame and composed first (`world`); one
-in the camera of the current keyframe (`keyframe`); the paper's in a unit of length of its own,
-whose size is estimated (`scale_gauge`), and the classical one so, whose covariance is too small
-where the camera turns (`world_gauge`); the classical one with the right-invariant error: landmarks'
-errors move with the pose's (`invariant`); the best that was measured (`recommended`)."""
+"""Filters by name, made of pieces.
+
+- `robocentric`: the paper's, with landmarks in the camera frame and composition after the update.
+- `world`: the classical one, in the base frame and composed first.
+- `keyframe`: one whose landmarks are in the camera of the current keyframe.
+- `scale_gauge`: the paper's in a unit of length of its own, whose size is estimated.
+- `world_gauge`: the classical one in such a unit; its covariance is too small in turns.
+- `invariant`: the classical one with the right-invariant error, which moves landmarks' with the
+  pose's.
+- `recommended`: the best that was measured.
+"""
 
 
 def _with_scene_depth(slam: Slam, percent: int = 100) -> Slam:
@@ -92,14 +93,20 @@ MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
     "particles": with_depth_particles,
     "rays": with_rays,
 }
-"""What `+name` behind a filter's name makes of it, with the number that may follow the name: σ of
-the scene's depth in percent of one landmark's, as an error that is common to all priors (`scene`);
-steps of Gauss–Newton in an update (`iterated`, `oc`); by how much a landmark drifts between frames,
-in percent of the σ of a measurement (`drift`); members of a Gaussian sum (`directions`, of a
-`mixture` at the most); frames of the longest window of a start (`rest`); slots for landmarks out of
-view until their submap ends (`submaps`); by how much a match may be off beyond its noise, in
-percent of that (`checked`); the greatest depth of a delayed initialisation, m (`particles`,
-`rays`); none for the remedy `fej`. Their order is that of this table, whatever that of the name."""
+"""What `+name` behind a filter's name makes of it, in the order of this table, whatever the order
+of the name. Its piece takes the place of the filter's own: in `recommended+directions` that of the
+recommended mixture. The number that may follow the name is
+
+- `scene`: σ of an error that is common to all priors on depth, in percent of one landmark's;
+- `fej`: none;
+- `oc`, `iterated`: the steps of Gauss–Newton in an update;
+- `drift`: by how much a landmark drifts between frames, in percent of a measurement's σ;
+- `directions`: the members of a Gaussian sum; `mixture`: the most members of one that is split;
+- `rest`: the frames of the longest window of a start;
+- `submaps`: the slots for landmarks out of view until their submap ends;
+- `checked`: by how much a match may be off beyond its noise, in percent of that;
+- `particles`, `rays`: the greatest depth of a delayed initialisation, m.
+"""
 _LEFT = {"lag": "a fixed-lag window, slower and less consistent than a mixture, left in 0.6"}
 
 
@@ -132,7 +139,7 @@ _ONE_OF = {
     "sum of Gaussians": ("directions", "mixture"),
     "delayed initialisation": ("particles", "rays"),
 }
-"""Words of which a name has one at the most, and what each of them is."""
+"""Words of which a name has at most one, and what each of them is."""
 
 
 def _check_one_of_each(words: list[str]) -> None:

@@ -5,12 +5,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam._runtime.files import read_json, write_atomically
+from jaxslam._runtime.files import Json, read_json, write_atomically
 
 MODEL = "pinhole"
 INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -112,7 +111,7 @@ def read_calibration(path: str | Path) -> Calibration:
     return read_json(path, "calibration", from_fields)
 
 
-def write_calibration(path: str | Path, calibration: Calibration, **further: Any) -> None:
+def write_calibration(path: str | Path, calibration: Calibration, **further: Json) -> None:
     """Write the JSON file that `read_calibration` reads, whole or not at all.
 
     `further` keys are for people; one that is there already is merged into it.
@@ -125,7 +124,7 @@ def write_calibration(path: str | Path, calibration: Calibration, **further: Any
         temporary.write_text(text, encoding="utf-8")
 
 
-def as_fields(calibration: Calibration) -> dict[str, Any]:
+def as_fields(calibration: Calibration) -> dict[str, Json]:
     """The fields of the file; those not stated are left out."""
     fields = {"model": MODEL, **asdict(calibration)}
     fields["sigma"] = dict(zip(INTRINSICS, calibration.sigma, strict=False))

@@ -1,4 +1,4 @@
-"""The check of a landmark of one's own: what every parametrization owes its Euclidean point."""
+"""The check of a landmark of your own: what every parametrization owes its Euclidean point."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ _Pair = tuple[Float[Array, "..."], Float[Array, "..."]]
 def check_landmark(landmark: AbstractLandmark, geometry: Geometry | None = None) -> None:
     """Check that a parametrization's functions agree, for points at three depths.
 
-    That is: shapes are (d,), (n,) and (); `initialise(X, ω, f)` puts the point at X/ω; `transform`
-    moves it by T, back by T⁻¹ to the same parameters, and where it is then seen, x/z and y/z, is
-    where a pinhole sees the moved point, behind the camera too; `scale` enlarges the point and
-    `convert` leaves it where it is; all derivatives are finite, and those of central differences.
+    Shapes are (d,), (n,) and (). `initialise(X, ω, f)` puts the point at X/ω. `transform` moves it
+    by T, back by T⁻¹ to the same parameters; its x/z and y/z are then where a pinhole sees the
+    moved point, behind the camera too. `scale` enlarges the point and `convert` leaves it where it
+    is. All derivatives are finite, and those of central differences.
     Points are of the plane and of space, or of the `geometry` alone (`jaxslam.PLANAR`,
     `jaxslam.SPATIAL`). Raises ValueError with the first that does not hold.
     """

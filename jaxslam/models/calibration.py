@@ -64,7 +64,7 @@ class White(AbstractCalibration):
     each_frame: ClassVar[bool] = True
 
     sigma: Float[AnyArray, " k"] = number_field()
-    """Of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels (D of P15)."""
+    """σ of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels (D of P15)."""
 
 
 class Considered(AbstractCalibration):
@@ -74,7 +74,7 @@ class Considered(AbstractCalibration):
     corrected: ClassVar[bool] = False
 
     sigma: Float[AnyArray, " k"] = number_field()
-    """Of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
+    """σ of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
 
 
 class Estimated(AbstractCalibration):
@@ -83,7 +83,7 @@ class Estimated(AbstractCalibration):
     name: ClassVar[str] = "estimated"
 
     sigma: Float[AnyArray, " k"] = number_field()
-    """Of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
+    """σ of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
 
 
 def check_calibration(treatment: AbstractCalibration, sensor: AbstractSensor) -> None:

@@ -36,9 +36,9 @@ class AbstractFrame(eqx.Module):
     """Whether the state keeps what a submap began with: the motion's variables there."""
 
     @property
-    def hands_over(self) -> bool:
-        """Whether what leaves the map is kept as a submap."""
-        return False
+    def handed_over(self) -> Submaps | None:
+        """This frame, where what leaves the map is kept as a submap; None where it is not."""
+        return None
 
     @abstractmethod
     def from_base_pose(self, T_BC: Pose) -> Held:
@@ -228,8 +228,8 @@ class Submaps(AbstractKeyframed):
             )
 
     @property
-    def hands_over(self) -> bool:
-        return self.spare is not None
+    def handed_over(self) -> Submaps | None:
+        return None if self.spare is None else self
 
     def map_from_camera(self, held: KeyframePose, step: Pose) -> Pose:
         return step

@@ -26,7 +26,7 @@ from jaxslam.geometry import GEOMETRIES, Geometry, Pose, Scalar, exp, joined
 Tangent = Float[Array, " t"]
 """A velocity, or a displacement: linear, then angular."""
 Variables = PyTree
-"""Of a model in the state: poses and vectors."""
+"""The variables of a model in the state: poses and vectors."""
 Control = PyTree
 """A model's input for one step, or for each of some."""
 

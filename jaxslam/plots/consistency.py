@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from jaxslam._runtime.files import Json
 from jaxslam._runtime.lookup import lookup
 from jaxslam.consistency import Results, Study
 from jaxslam.consistency.results import Nees
@@ -38,7 +39,7 @@ _MEDIAN_OF_NORMAL = 0.6745
 """Median of |x| for a standard normal x."""
 
 
-Drawn = Study | Results | Mapping[str, Any]
+Drawn = Study | Results | Mapping[str, Json]
 """What is drawn: a study, its results, or the summary that `consistency.json` holds."""
 
 

@@ -50,7 +50,11 @@ class _Shown(Figure):
         return picture.getvalue()
 
 
-def line_style(index: int) -> dict[str, Any]:
+LineStyle = dict[str, Any]
+"""Properties of a line, as matplotlib calls them."""
+
+
+def line_style(index: int) -> LineStyle:
     """Colour and dash of the i-th line: all colours, then the next dash."""
     dash = DASHES[index // len(COLOURS) % len(DASHES)]
     return {"color": COLOURS[index % len(COLOURS)], "linestyle": dash}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
-from jaxslam.plots.style import GREY, line_style, new_figure, save
+from jaxslam.plots.style import GREY, LineStyle, line_style, new_figure, save
 from jaxslam.triangulation import Comparison, Samples, marginal, quantiles, shares_up_to
 
 _TRUTH = "triangulation"
@@ -37,7 +36,7 @@ def plot_triangulation(comparison: Comparison, path: str | Path | None = None) -
     z = {name: of.z for name, of in distributions.items()}
     low, high = _limits(distributions, z)
     depths = max(low, -views.depth), min(high, 4 * views.depth)
-    styles: dict[str, dict[str, Any]] = {
+    styles: dict[str, LineStyle] = {
         _TRUTH: {"color": GREY, "linestyle": "-"},
         "posterior": {"color": "black", "linestyle": (0, (1, 1.5))},
     }
@@ -92,7 +91,7 @@ def _plot_plane(
     distributions: dict[str, Samples],
     point: Limits,
     depths: Limits,
-    styles: dict[str, dict[str, Any]],
+    styles: dict[str, LineStyle],
 ) -> None:
     """Regions of 50 % and 95 % in the second camera."""
     offsets = {}

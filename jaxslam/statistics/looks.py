@@ -8,6 +8,7 @@ of the scatter is as wide as the runs themselves scatter, whatever they are draw
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -48,7 +49,7 @@ class Verdict(dict[str, Any]):
     p: float
     """The probability of such numbers, or more extreme ones, if the filter is consistent."""
     of: str
-    """The steps that decided: `all steps`, `last step`, `first third` …"""
+    """The steps that decided: `all steps`, `last step`, or a third of them (`first third`)."""
     enough: int | None
     """About how many runs would tell, where the word is `cannot tell`."""
     runs: int
@@ -75,13 +76,17 @@ class Verdict(dict[str, Any]):
             told = f"this verdict has no {name!r}; known: {', '.join(self)}"
             raise AttributeError(told) from None
 
-    def __or__(self, other: dict[str, Any]) -> Verdict:
+    def __or__(self, other: Mapping[str, object]) -> Verdict:
         return Verdict({**self, **other})
 
     def __repr__(self) -> str:
         shown = ("word", "nees", "sigma_factor", "interval99", "p")
         told = (f"{name}={self[name]!r}" for name in shown if name in self)
         return f"Verdict({', '.join(told)})"
+
+
+Found = Mapping[str, Any]
+"""A verdict, or one as JSON has it."""
 
 
 @dataclass(frozen=True)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, astuple, dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxslam.statistics.bands import PowerSums, lost_threshold, whiteness_p_value
-from jaxslam.statistics.looks import VERDICT_CONFIDENCE, Look, Verdict
+from jaxslam.statistics.looks import VERDICT_CONFIDENCE, Found, Look, Verdict
 
 LOST_BOUND = 0.01
 """More lost runs than this share make a filter lost: 100 times what a consistent one loses."""
@@ -84,7 +82,7 @@ class Tally:
         )
 
     @staticmethod
-    def from_dict(numbers: dict[str, Any]) -> Tally:
+    def from_dict(numbers: Found) -> Tally:
         """Return the tally that `asdict` wrote; one written without thirds has none."""
         counts = (numbers[name] for name in ("dof", "runs", "diverged", "lost"))
         sums = (PowerSums(**numbers[name]) for name in ("average", "end", "never_lost"))
@@ -108,7 +106,7 @@ class Tally:
         sums = (x for part in each for x in astuple(part))
         return np.array([self.runs, self.diverged, self.lost, *sums], np.float64)
 
-    def asdict(self) -> dict[str, Any]:
+    def asdict(self) -> dict[str, object]:
         """Return the numbers as JSON has them, for `from_dict`."""
         return asdict(self) | {"thirds": [asdict(third) for third in self.thirds]}
 
@@ -262,12 +260,12 @@ def run_verdict(
     return found | {"lost_runs": lost_runs(nees, dof, logged)}
 
 
-def not_disproved(found: Mapping[str, Any]) -> bool:
+def not_disproved(found: Found) -> bool:
     """Whether a verdict lets a filter be consistent, be that shown or not."""
     return found["word"] in ("consistent", "cannot tell")
 
 
-def sentences(found: Mapping[str, Any], quantity: str = "NEES") -> list[str]:
+def sentences(found: Found, quantity: str = "NEES") -> list[str]:
     """A verdict in words, and that at the last step; of the runs never lost, where some were.
 
     Where more than a few were, the others are chosen by their NEES: no verdict is said of them.
@@ -285,7 +283,7 @@ def sentences(found: Mapping[str, Any], quantity: str = "NEES") -> list[str]:
     return told
 
 
-def _of_lost(found: Mapping[str, Any], quantity: str) -> str:
+def _of_lost(found: Found, quantity: str) -> str:
     """A sentence on the runs that were lost, and on the others."""
     kept, runs = found["never_lost"], found["runs"]
     lost = runs - kept["runs"]
@@ -311,7 +309,7 @@ _TOLD = 8
 """The most lost runs that are named."""
 
 
-def _of_whiteness(found: Mapping[str, Any]) -> list[str]:
+def _of_whiteness(found: Found) -> list[str]:
     if found["samples"] == "steps":
         return [f"innovations appear white (p = {found['white']:.2g}): each step is one sample"]
     if found["white"] is None:
@@ -322,7 +320,7 @@ def _of_whiteness(found: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def headline(found: Mapping[str, Any], quantity: str = "NEES") -> str:
+def headline(found: Found, quantity: str = "NEES") -> str:
     """The verdict on all runs: `NEES 4.72, σ too small by 1.25 [1.24, 1.27]: over-confident`."""
     if found["nees"] is None:
         word = found["word"]
@@ -335,7 +333,7 @@ def headline(found: Mapping[str, Any], quantity: str = "NEES") -> str:
     return f"{said}; about {found['enough']} {found.get('samples', 'runs')} would tell"
 
 
-def brief(found: Mapping[str, Any]) -> str:
+def brief(found: Found) -> str:
     """The word of a verdict with the factor of σ, for where there is little room."""
     if found["nees"] is None:
         return found["word"]
@@ -343,12 +341,12 @@ def brief(found: Mapping[str, Any]) -> str:
     return f"{found['word']}, σ × {factor} [{low}, {high}]"
 
 
-def _part(found: Mapping[str, Any]) -> str:
+def _part(found: Found) -> str:
     """The part that decided; older files, from before there were parts, have none."""
     return found.get("of", "all steps")
 
 
-def _said(found: Mapping[str, Any], quantity: str) -> str:
+def _said(found: Found, quantity: str) -> str:
     factors, word = [found["sigma_factor"], *found["interval99"]], found["word"]
     told = "right up to a factor" if word == "consistent" else "should be ×"
     if word == "over-confident":

@@ -5,7 +5,6 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -24,10 +23,10 @@ class Aside:
 
     def __enter__(self) -> "Aside":
         self._thread = ThreadPoolExecutor(1, "aside")
-        self._waiting: deque[Future[Any]] = deque()
+        self._waiting: deque[Future[object]] = deque()
         return self
 
-    def give(self, function: Callable[..., Any], *arguments: Any) -> None:
+    def give(self, function: Callable[..., object], *arguments: object) -> None:
         """Queue `function(*arguments)`."""
         while self._waiting and (len(self._waiting) >= WAITING or self._waiting[0].done()):
             self._waiting.popleft().result()

@@ -12,13 +12,14 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
-from jaxslam._runtime.files import one_line, read_arrays, write_atomically
+from jaxslam._runtime.files import Json, one_line, read_arrays, write_atomically
 from jaxslam.io.calibration import Calibration, as_fields, from_fields
 from jaxslam.tracking.landmarks import NO_POINTS, Points, joined, stacked, unstacked
 from jaxslam.tracking.map import Map, Remembered
@@ -135,7 +136,7 @@ def load(
 
 
 def _restore(
-    tracker: Resumable, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    tracker: Resumable, header: Mapping[str, Json], arrays: Mapping[str, np.ndarray]
 ) -> None:
     """Make of a new tracker what was saved."""
     kept, numbers = tracker.map, header["numbers"]
@@ -157,13 +158,16 @@ def _restore(
     kept.left = known[::-1]
 
 
-class _Once:
+Kept = TypeVar("Kept")
+
+
+class _Once(Generic[Kept]):
     """Objects, of which several maps may have the same, each once."""
 
-    def __init__(self, some: Iterable[Any]) -> None:
+    def __init__(self, some: Iterable[Kept]) -> None:
         self.all = list({id(one): one for one in some}.values())
 
-    def places(self, some: Iterable[Any]) -> list[int]:
+    def places(self, some: Iterable[Kept]) -> list[int]:
         """Return where these are."""
         place = {id(one): i for i, one in enumerate(self.all)}
         return [place[id(one)] for one in some]
@@ -180,7 +184,7 @@ def _of(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
 
 
 def _remembered(
-    header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], kept: Map
+    header: Mapping[str, Json], arrays: Mapping[str, np.ndarray], kept: Map
 ) -> list[Remembered]:
     """All maps in the file, of a tracker that keeps such maps."""
     like, slam, settings = kept.estimator.state, kept.estimator.slam, kept.settings
@@ -210,7 +214,7 @@ def _remembered(
 
 
 def write_record(
-    path: str | Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    path: str | Path, header: Mapping[str, Json], arrays: Mapping[str, np.ndarray]
 ) -> None:
     """Write both as one .npz archive, whole or not at all. Numbers keep their last digit."""
     text = json.dumps({"format": FORMAT, **header}, allow_nan=False)
@@ -218,7 +222,7 @@ def write_record(
         np.savez(file, allow_pickle=False, header=np.array(text), **arrays)
 
 
-def read_record(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def read_record(path: str | Path) -> tuple[dict[str, Json], dict[str, np.ndarray]]:
     """Header and arrays. Raises ValueError, naming the file, for one of another kind."""
     arrays = read_arrays(path)
     try:
@@ -232,12 +236,12 @@ def read_record(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]
     return header, arrays
 
 
-def leaves(tree: Any, name: str) -> dict[str, np.ndarray]:
+def leaves(tree: PyTree, name: str) -> dict[str, np.ndarray]:
     """The arrays of a pytree by `name` and their places."""
     return {f"{name}/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
 
 
-def grown(like: Any, arrays: Mapping[str, np.ndarray], name: str) -> Any:
+def grown(like: PyTree, arrays: Mapping[str, np.ndarray], name: str) -> PyTree:
     """The pytree that `leaves` were of, built as `like`. Raises ValueError where that differs."""
     old, structure = jax.tree.flatten(like)
     prefix = f"{name}/"

@@ -7,13 +7,13 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 from scipy.stats import chi2
 
+from jaxslam._runtime.files import Json
 from jaxslam._version import __version__
 from jaxslam.io.calibration import INTRINSICS, as_fields
 from jaxslam.io.source import Source, Trajectory
@@ -38,7 +38,7 @@ TOO_SURE = (
 )
 """The caveat on an estimated calibration."""
 
-Summary = dict[str, Any]
+Summary = dict[str, Json]
 """A summary as JSON has it."""
 
 

@@ -7,13 +7,13 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxslam._runtime.files import read_json
+from jaxslam._runtime.files import Json, read_json
 from jaxslam.io.calibration import Calibration
 from jaxslam.io.recording import read_image
 
@@ -89,7 +89,7 @@ def read_target(path: str | Path) -> Target:
     return read_json(path, "target", lambda fields: _from_fields(fields, folder))
 
 
-def _from_fields(fields: Any, folder: Path) -> Target:
+def _from_fields(fields: Json, folder: Path) -> Target:
     points = fields.get("points") if isinstance(fields, dict) else None
     if not isinstance(points, list):
         raise ValueError("has no list of points; expected an object with `points`")
@@ -99,7 +99,7 @@ def _from_fields(fields: Any, folder: Path) -> Target:
     return Target(tuple(_point(index, point, folder) for index, point in enumerate(points)))
 
 
-def _point(index: int, fields: Any, folder: Path) -> KnownPoint:
+def _point(index: int, fields: Json, folder: Path) -> KnownPoint:
     if not isinstance(fields, dict):
         raise ValueError(f"point {index} must be an object, not {fields!r}")
     name = str(fields.get("name", index))
@@ -113,7 +113,7 @@ def _point(index: int, fields: Any, folder: Path) -> KnownPoint:
     )
 
 
-def _numbers(what: str, value: Any, count: int) -> Float[np.ndarray, " n"]:
+def _numbers(what: str, value: Json, count: int) -> Float[np.ndarray, " n"]:
     try:
         numbers = np.array(value, float)
     except (TypeError, ValueError, OverflowError):
@@ -254,7 +254,7 @@ def known_depths(
     return means[:, None], np.append(sighting.sigma, np.full(others, sigma))[:, None]
 
 
-def as_summary(target: Target, sighting: TargetObservation) -> dict[str, Any]:
+def as_summary(target: Target, sighting: TargetObservation) -> dict[str, Json]:
     """Return an entry of summary.json: lengths in metres, the target's frame in the first
     camera."""
     names: Sequence[str] = [point.name for point in target.points]

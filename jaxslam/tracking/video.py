@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from jaxslam.tracking.report import Tracked, write_frames
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.summary import (
     TOO_SURE,
+    Summary,
     known_points,
     reference_in_map,
     summarised,
@@ -48,7 +48,7 @@ def track(
     overlay: bool = True,
     viewer: str | Path | None = None,
     progress: Callable[[int], None] = lambda frames: None,
-) -> dict[str, Any]:
+) -> Summary:
     """Track `source`, write `trajectory.txt`, `covariance.txt`, `frames.csv`, `summary.json`,
     `map.ply`, `map.npz`, `map.png` and, if wanted, `overlay.mp4` into the folder `out`, and
     return the summary.
@@ -137,7 +137,7 @@ def _write(
     out: Path,
     *,
     smooth: bool,
-) -> dict[str, Any]:
+) -> Summary:
     """Of frames as they are known at the end, if `smooth`: whoever interrupts does not wait."""
     before, points = history, tracker.points()
     if smooth:

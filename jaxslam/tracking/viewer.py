@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 from uuid import uuid4
 
 import cv2
@@ -152,7 +152,7 @@ class Viewer:
             self._record.log("state", rr.TextLog(text, level=level))
 
 
-def _rerun() -> Any:
+def _rerun() -> ModuleType:
     try:
         import rerun
     except ImportError as error:
@@ -160,7 +160,7 @@ def _rerun() -> Any:
     return rerun
 
 
-def _layout() -> Any:
+def _layout() -> object:
     """The world beside the picture, the numbers and the states."""
     from rerun import blueprint as b
 

@@ -14,7 +14,10 @@ from jaxslam.filters import association
 from jaxslam.filters.association import ASSOCIATIONS, GATE, Candidates, candidates
 from jaxslam.filters.gaussian import context_of
 from jaxslam.filters.linear.covariance import curvature
+from jaxslam.filters.mixture.split_merge import _root_of_cost
+from jaxslam.filters.model import COMPOSED
 from jaxslam.models.observations import Features
+from jaxslam.models.sensors import Pinhole
 
 SIGMA = 0.3
 M = 20
@@ -248,6 +251,31 @@ def test_a_tolerance_is_noise_of_each_match_by_itself():
     added = (some.covariance - none.covariance).reshape(12, 12)
     np.testing.assert_allclose(added, 0.49 * np.eye(12), atol=1e-9)
     np.testing.assert_array_equal(some.residual, none.residual)
+    each = seek(state, control, seen, jnp.arange(6.0))
+    added = (each.covariance - none.covariance).reshape(12, 12)
+    np.testing.assert_allclose(added, np.diag(np.repeat(np.arange(6.0), 2) ** 2), atol=1e-9)
+
+
+class Share(Pinhole):
+    """A pixel whose σ is its first coordinate, of which the constant σ is the unit."""
+
+    def noise_at(self, measured):
+        return measured[0] ** 2 * self.noise
+
+
+def test_a_split_counts_what_it_costs_in_the_noise_that_is_predicted():
+    """Of the one landmark that is seen; the others' measurements are of no account."""
+    slam, state, control, pixels = matched()
+    state = quick_jit(lambda state: slam.compose(state, control))(state)
+    seen = Features(jnp.arange(6), jnp.full_like(pixels, jnp.nan), jnp.arange(6) == 2)
+    other = replace(slam, sensor=Share(slam.sensor.camera, slam.sensor.sigma))
+
+    def run(state):
+        return [_root_of_cost(one, state, seen) for one in (slam, other)]
+
+    (constant, own), view = quick_jit(run)(state), slam.model.view(state.core, COMPOSED)
+    there = slam.sensor.measure(*slam.model.camera_point(view, state.landmarks[2]))
+    np.testing.assert_allclose(constant, own * there[0], rtol=1e-9)
 
 
 @pytest.mark.slow

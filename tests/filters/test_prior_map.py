@@ -11,6 +11,7 @@ import pytest
 from cases import a_filter, close, each_geometry, named, quick_jit
 
 import jaxslam
+from jaxslam.filters.gate import Gate
 from jaxslam.filters.readouts import camera_pose, landmarks_in_world
 from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.geometry import PLANAR
@@ -147,6 +148,23 @@ class FarIsWorse(Position):
 
     def noise_at(self, measured):
         return self.sigma**2 * (measured @ measured) * jnp.eye(measured.size)
+
+
+def test_a_gate_tolerates_shares_of_the_noise_of_each_measurement():
+    """Matches off by 7 of their own σ, which are 30 or more of the constant one, and one by 50."""
+    measured = jnp.array([[0.0, 6.0], [4.0, 0.0], [0.0, 2.0]])
+    features = Features(jnp.arange(3), measured, jnp.ones(3, bool))
+    motion, dt = ConstantVelocity(*np.zeros((3, 3))), jnp.asarray(DT)
+    gate = Gate("individual", tolerance=5.0)
+    slam = a_filter(PLANAR, sensor=FarIsWorse(0.01), motion=motion, landmark=Cartesian(), gate=gate)
+
+    def run(off):
+        state = slam.predict(slam.init(3, features), dt)
+        seen = replace(features, measured=measured + off)
+        return slam.update(state, dt, seen)[1].used
+
+    off = jnp.array([[0.4, 0.0], [0.0, 0.3], [1.0, 0.0]])
+    assert quick_jit(run)(off).tolist() == [True, True, False]
 
 
 @pytest.mark.parametrize("frame", [Robocentric(), WorldCentric()], ids=named)

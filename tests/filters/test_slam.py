@@ -590,10 +590,11 @@ def test_an_unknown_calibration_is_refused_by_name():
     with pytest.raises(ValueError, match="'black'") as error:
         scenario_pieces(scenario("matched"), "black")
     assert all(name in str(error.value) for name in TREATMENTS)
-    with pytest.raises(ValueError, match="calibration is a AbstractCalibration, not 'black'"):
-        a_filter(PLANAR, calibration="black")
-    with pytest.raises(ValueError, match="scale is a AbstractScale, not 'feet'"):
-        a_filter(PLANAR, scale="feet")
+    for piece, wanted in (
+        ("calibration", "AbstractCalibration"), ("scale", "AbstractScale"), ("gate", "Gate"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=f"{piece} is an instance of {wanted}, not 'feet'"):
+            a_filter(PLANAR, **{piece: "feet"})
 
 
 @pytest.mark.parametrize("frame", [Robocentric(), WorldCentric(), Keyframe()], ids=named)

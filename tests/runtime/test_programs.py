@@ -179,7 +179,7 @@ def test_what_was_made_elsewhere_is_not_taken(folder, monkeypatch, what):
 def test_every_file_of_the_package_is_among_its_sources():
     whole = Path(jaxslam.__file__).parent
     assert programs.source_files() == sorted(whole.rglob("*.py"))
-    assert whole / "filters" / "ekf.py" in programs.source_files()
+    assert whole / "filters" / "slam.py" in programs.source_files()
 
 
 def test_a_function_with_values_of_its_own_is_not_kept(folder):

@@ -107,8 +107,8 @@ def gauss_newton(
     corrected: Callable[[State, State], State],
     *data: PyTree,
 ) -> tuple[State, Innovation]:
-    """So many steps to the maximum of the posterior. Every step, from `before` to `after`, is what
-    is `corrected(before, after)` of it. `data` are what `kalman_update` asks for.
+    """Take so many steps to the maximum of the posterior. Every step, from `before` to `after`,
+    is then `corrected(before, after)`. `data` are what `kalman_update` asks for.
 
     Gauss–Newton on whitened states, as optimistix has it, knows no blocks: three steps then take
     three times as long (64 runs of `matched` with `robocentric+iterated3`), and compile for longer.

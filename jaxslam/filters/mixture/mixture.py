@@ -37,7 +37,7 @@ from jaxslam.models.motion import Control, check_control
 from jaxslam.models.observations import Features
 
 REACH = (2.5, 4.0)
-"""The members' means are spread over ± so many σ of the prior, at the least and at the most."""
+"""The members' means are spread over at least and at most ± so many σ of the prior."""
 SPACING = 0.5
 """Within these, so many σ of the prior are between them."""
 OVERLAP = 0.5
@@ -53,7 +53,7 @@ class Mixture(AbstractLayer):
     """
 
     members: int = eqx.field(static=True, default=9)
-    """The number of members for each direction; at the most, where they are split."""
+    """The number of members for each direction; where they are split, the greatest number."""
     split: bool = eqx.field(static=True, default=True)
     """Whether members are split and merged; only the first of two directions is then divided at the
     start."""
@@ -68,7 +68,7 @@ class Mixture(AbstractLayer):
 
     @property
     def rounds(self) -> int:
-        """Splits in a frame, at the most: each takes up to three members."""
+        """The most splits in a frame: each takes up to three members."""
         return max(1, self.members // 3)
 
     def init(self, slam, capacity, first, known):

@@ -35,6 +35,7 @@ from jaxslam.geometry import jacobian, log
 from jaxslam.linalg import cholesky, eigh
 from jaxslam.models.motion import Control
 from jaxslam.models.observations import Features
+from jaxslam.models.sensors import AbstractSensor, noises
 
 WORTH = 3e-5
 """What a split has to gain, in σ² of a measured pixel, summed over the landmarks; two members
@@ -76,19 +77,31 @@ def _root_of_cost(slam: AbstractSlam, likeliest: State, seen: Features) -> Float
     _, variances = landmark_moments(view_of, inverse_depth, likeliest, seen.slots)
     view = view_of(likeliest.core)
     sensor = model.sensor_at(view.calibration)
-    whitening = cholesky(sensor.noise).whitening
 
     def by_point(landmark):
         point, omega = model.camera_point(view, landmark)
-        return jax.jacfwd(lambda point: sensor.measure(point, omega))(point)
+        # With the measurement that is predicted.
+        return jax.jacfwd(lambda point: (sensor.measure(point, omega),) * 2, has_aux=True)(point)
 
-    slopes = whitening @ jax.vmap(by_point)(likeliest.landmarks[seen.slots])
+    slopes, predicted = jax.vmap(by_point)(likeliest.landmarks[seen.slots])
+    slopes = _whitening(sensor, predicted, seen.valid) @ slopes
     counted = jnp.where(seen.valid, variances[:, 0, 0], 0.0)
     M = jnp.einsum("m,mpi,mpj->ij", counted, slopes, slopes)
     # Nearly singular where one landmark is seen, and zero where none is.
     total = jnp.maximum(jnp.trace(M), jnp.finfo(M.dtype).tiny)
     eye = jnp.eye(slam.motion.geometry.point_dim, dtype=M.dtype)
     return jnp.sqrt(total) * cholesky(M / total + 1e-6 * eye).root.T
+
+
+def _whitening(
+    sensor: AbstractSensor, measured: Float[Array, "m p"], valid: Bool[Array, " m"]
+) -> Float[Array, "p p"] | Float[Array, "m p p"]:
+    """L⁻¹ of the noise `L Lᵀ` of all measurements, or of each that is valid."""
+    noise = noises(sensor, measured)
+    if noise.ndim == 2:
+        return cholesky(noise).whitening
+    noise = jnp.where(valid[:, None, None], noise, jnp.eye(sensor.size, dtype=noise.dtype))
+    return jax.vmap(cholesky)(noise).whitening
 
 
 class _Parts(NamedTuple):

@@ -30,8 +30,8 @@ class ObservabilityConstrained(AbstractCorrection):
     knows_gauge: ClassVar[bool] = True
 
     steps: int = eqx.field(static=True, default=1)
-    """Of Gauss–Newton in an update: an EKF has one. Where a second goes far from the first, as of
-    a camera whose acceleration is large, the first would be wrong, and carried on."""
+    """Steps of Gauss–Newton in an update: an EKF has one. Where a second goes far from the first,
+    as it does for a large acceleration, the first would be wrong, and carried on."""
 
     def __check_init__(self) -> None:
         check_steps(self.steps)

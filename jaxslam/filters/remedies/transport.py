@@ -21,7 +21,7 @@ from jaxslam.linalg import eigh
 _SINGULAR = 1e-12
 """Least eigenvalue of NᵀN, its columns of unit length, that counts."""
 READINGS = 2
-"""Of the scale from landmarks, after a first in which all count alike."""
+"""Estimates of the scale from landmarks, after a first one in which all count alike."""
 _SUREST = 1e-4
 """Relative error below which none is surer than another."""
 

@@ -74,7 +74,7 @@ class DepthParticles(AbstractDelayed):
     a landmark."""
 
     slam: AbstractSlam
-    """Of `RayToCartesian` landmarks (`with_depth_particles`)."""
+    """The filter around one Gaussian, of `RayToCartesian` landmarks (`with_depth_particles`)."""
     nearest: float = eqx.field(static=True, default=0.5)
     farthest: float = eqx.field(static=True, default=5.0)
     """The range of distances along a ray, m."""

@@ -39,7 +39,7 @@ class RaySum(AbstractDelayed):
     """
 
     slam: AbstractSlam
-    """Of Cartesian landmarks (`with_rays`)."""
+    """The filter around one Gaussian, of Cartesian landmarks (`with_rays`)."""
     nearest: float = eqx.field(static=True, default=0.5)
     farthest: float = eqx.field(static=True, default=50.0)
     """The range of depths that the members cover, m: from s_1 − σ_1 to s_G + σ_G at least."""

@@ -31,7 +31,7 @@ from jaxslam.filters.linear.state import AbstractState
 from jaxslam.filters.submaps.handover import Frozen, SubmapsState
 from jaxslam.geometry import Pose, difference, identity, retract
 from jaxslam.linalg import semidefinite_root
-from jaxslam.models.frame import KeyframePose, Submaps
+from jaxslam.models.frame import KeyframePose
 
 LINEARISATION = 1e-3
 """Variance of the error of second order of each number of a submap, as a share of its own."""
@@ -57,14 +57,14 @@ class Link(eqx.Module):
     order: Int[Array, "*N n"]
     """The numbers of the state, those of the separator in front."""
     free: Bool[Array, "*N n"]
-    """Of these which are not the separator's."""
+    """Whether each of these is not the separator's."""
     root: Float[Array, "*N n n"]
-    """L of the covariance in that order …"""
+    """L, with `L Lᵀ` the covariance in that order."""
     whitening: Float[Array, "*N n n"]
-    """… and its inverse."""
+    """L⁻¹."""
 
     def plus(self, told: Float[Array, " n"], y: Float[Array, " n"]) -> SubmapMean:
-        """Return the mean for what is told of its separator, and for white numbers of its own."""
+        """Return the mean for the correction of its separator, and white numbers of its own."""
         white = jnp.where(self.free, y, self.whitening @ told)
         delta = jnp.zeros_like(y).at[self.order].set(self.root @ white)
         return plus(self.state, delta)
@@ -205,9 +205,9 @@ def chain(slam: AbstractSlam, state: SubmapsState, count: int) -> Chain:
     In a batch of runs all have one length: what a run does not have are links that say nothing.
     Raises ValueError for more than the state keeps.
     """
-    if not isinstance(slam.frame, Submaps):
+    if (submaps := slam.frame.handed_over) is None:
         raise ValueError(f"a filter with frame=Submaps(…) has a chain, not a {slam.frame.name} one")
-    history = slam.frame.history
+    history = submaps.history
     if not 0 <= count <= history:
         raise ValueError(f"the state keeps {history} submaps, not {count}")
     _, newest = slam.inner.gaussian(state.inner, None)

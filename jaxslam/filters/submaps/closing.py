@@ -7,8 +7,8 @@ problem with few residuals c(y) of many numbers. Gauss–Newton is then in the s
 
 (the dual form of Bell's step, SIAM J. Optim. 4, 1994), linear in the length of the chain; so is the
 covariance `I − Jᵀ S⁻¹ J`. The cost of the maximum says whether the filter's covariances were right.
-The filter is told nothing of it: where the submaps are is learnt, and what is in them, and a loop
-that turned out wrong is one residual less.
+The filter itself does not change: only where the submaps are, and what is in them, is learnt, and a
+loop that turned out wrong is one residual less.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from jaxslam.geometry import Pose, homogeneous_apply
 from jaxslam.linalg import Cholesky, cholesky
 
 STEPS = 20
-"""Of Gauss–Newton, at the most …"""
+"""The most steps of Gauss–Newton."""
 SMALLEST = 1e-4
-"""… until no white number moves by more than this share of its σ …"""
+"""They end when no white number moves by more than this share of its σ."""
 LARGEST = 3.0
-"""… and none by more than so many σ in one step: a chain that is off by much is curved."""
+"""No white number moves by more σ in one step: a chain that is off by much is curved."""
 SAME = 1e-5
 """σ of the distance of a point from itself, as a share of its distance from the camera: none, but
 for rounding."""
@@ -49,7 +49,7 @@ class Loops(eqx.Module):
     submaps: Int[Array, "m 2"]
     """Places in the chain, counted from the oldest submap."""
     slots: Int[Array, "m 2"]
-    """Of each landmark in the state of its submap."""
+    """The slot of each landmark in the state of its submap."""
     valid: Bool[Array, " m"]
     """A pair that is not says nothing."""
 

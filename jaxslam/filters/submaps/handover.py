@@ -1,7 +1,7 @@
 """A filter that hands its map over: what leaves it is kept, and costs a frame nothing.
 
 When the state is full, or the camera has left the scene in which its submap began, the joint
-Gaussian of everything is frozen, and the filter goes on with what it sees: the camera becomes the
+Gaussian of everything is frozen. The filter goes on with what it sees: the camera becomes the
 new base K, and landmarks that are out of view leave. Given what goes on, the *separator*, the
 frozen rest is independent of all that is measured later (Piniés, Tardós, IEEE T-RO 24 (5), 2008:
 conditionally independent submaps). Therefore the separator is whole: the velocity at K stays in
@@ -90,7 +90,6 @@ class Handover(AbstractLayer):
 
     def gaussian(self, slam, state, control):
         base, one = slam.inner.gaussian(state.inner, control)
-        assert isinstance(base, AbstractSlam)
         return replace(base, frame=self.frame), replace(state, inner=one)
 
     def predict_features(self, slam, state, control, slots):

@@ -1,10 +1,10 @@
 """The least squares of a window by variable projection: the landmarks always at their best.
 
 Jointly, path and inverse depths are bilinear, and Levenberg–Marquardt creeps along the bent valleys
-of that. With every landmark minimised anew for each path (variable projection: Golub, Pereyra
-1973; Hong, Fitzgibbon 2015 for bundle adjustment) the valley of scale is a straight line through
-the origin, and most starts of most windows converge in ten steps. optimistix has no variable
-projection: its solvers take the unknowns jointly.
+of that. Here every landmark is minimised anew for each path (variable projection: Golub, Pereyra
+1973; Hong, Fitzgibbon 2015 for bundle adjustment). The valley of scale is then a straight line
+through the origin, and most starts of most windows converge in ten steps. optimistix has no
+variable projection: its solvers take the unknowns jointly.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from jaxslam.geometry import Scalar
 from jaxslam.linalg import cholesky
 
 TOLERANCE = 1e-3
-"""Of half the sum of squares: a minimum is found when a step gains less."""
+"""A minimum is found when a step lessens half the sum of squares by less than this."""
 NO_REVERSE = (
     "a start from rest has no derivatives in reverse mode, since its search ends when it "
     "converges: use forward mode (jax.jvp, jax.jacfwd), or a filter without +rest"
 )
 LANDMARK_STEPS = 3
-"""Of the landmarks, for every step of the path."""
+"""Steps of the landmarks for every step of the path."""
 TURN_STEPS = 4
-"""Of the rotation that fits a start."""
+"""Steps of the rotation that fits a start."""
 
 
 class Minimum(eqx.Module):

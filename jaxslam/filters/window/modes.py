@@ -32,16 +32,16 @@ from jaxslam.linalg import Cholesky, cholesky
 SPEED = 1.2
 """Starts move with so many σ of the prior on the initial velocity."""
 SEARCH_STEPS = 16
-"""Of Levenberg–Marquardt, from every start, at the most …"""
+"""The most steps of Levenberg–Marquardt from every start."""
 REFINEMENTS = 4
-"""… and with every new frame."""
+"""The most steps with every new frame."""
 APART = 1.0
 """Minima nearer than this in the better one's information, squared, are one."""
 
 UNLIKE = 5.0
 """σ of all numbers but those of the worst landmark, from which on a minimum explains nothing."""
 NEGLIGIBLE = 100.0
-"""Of log evidence: a mode so much less likely than the likeliest is none."""
+"""A mode whose log evidence is so much less than that of the likeliest is none."""
 
 
 class Modes(eqx.Module):
@@ -109,7 +109,7 @@ class Found(NamedTuple):
     minima: Minimum
     alive: Bool[Array, " k"]
     steps: Int[Array, " k"]
-    """From there to the minimum, at the most."""
+    """The most steps from there to the minimum."""
 
 
 def searched(
@@ -176,17 +176,17 @@ class Candidate(NamedTuple):
 
     minimum: Minimum
     steps: Int[Array, ""]
-    """At the most."""
+    """The most steps to the minimum."""
     evidence: Scalar
     """`−½ |r|² − ½ log det A`."""
     information: Float[Array, "N N"]
-    """Of the path."""
+    """The information A of the path."""
     shift: Scalar
     """λ of its mean."""
     doubts: Float[Array, " m"]
     """How doubtful its landmarks are."""
     mean: Mean | None
-    """None where nobody asks for it, nor for shift and doubts."""
+    """None where it is not asked for, nor are shift and doubts."""
 
 
 def _candidates(minima: Minimum, steps: Int[Array, " k"], means: Mean | None = None) -> Candidate:

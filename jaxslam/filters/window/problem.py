@@ -1,9 +1,9 @@
 """All frames of a window at once: unknowns, residuals, and the least squares of them.
 
-Everything random since frame 0 is written as standard normal numbers: x of what all landmarks
-have in common (the motion's start, the common error of the depths, the calibration, and the noise
-of every step), and y of each landmark (its true first measurement, and what that hides). With the
-measurements z, `−log p(x, y | z) = ½ (|x|² + |y|² + |r(x, y)|²)` up to a constant.
+Everything random since frame 0 is written as standard normal numbers, x and y. What all landmarks
+have in common is x: the motion's start, the common error of the depths, the calibration, and the
+noise of every step. Each landmark's own is y: its true first measurement, and what that hides. With
+the measurements z, `−log p(x, y | z) = ½ (|x|² + |y|² + |r(x, y)|²)` up to a constant.
 
 A landmark depends on x and on its own y alone: given x the landmarks are eliminated one by one
 (Schur), so that a step costs what the path costs.
@@ -57,7 +57,7 @@ class PathLayout(NamedTuple):
     calibration: int
     """Drawn once."""
     step: int
-    """Of every step."""
+    """The motion's noise in every step."""
     each: int
     """Calibration drawn in every frame."""
 
@@ -160,7 +160,7 @@ class Sight(NamedTuple):
     point: Float[Array, " n"]
     omega: Scalar
     by_pose: Float[Array, "h t"]
-    """Of (X, ω), by the tangent of that camera's pose."""
+    """The derivative of (X, ω) by the tangent of that camera's pose."""
     by_calibration: Float[Array, "h k"]
     by_common: Float[Array, "h c"]
     by_y: Float[Array, "h q"]
@@ -420,7 +420,7 @@ class Reduced(NamedTuple):
     by_x: Sensitivities
     linear: Linear
     information: Float[Array, "N N"]
-    """Of x, the landmarks eliminated."""
+    """The information of x, the landmarks eliminated."""
     gradient: Float[Array, " N"]
     landmarks: Cholesky
     """Information of every landmark given x."""
@@ -454,8 +454,8 @@ def left_out(
     of one landmark is left out and the rest is minimised anew; `factor` is of x's information.
 
     It is `rᵀ (1 − G Σ Gᵀ)⁻¹ r`, r being the landmark's own numbers, its y among them, and G their
-    Jacobian by x where y follows x (deletion of cases: Cook, Weisberg, Residuals and Influence in
-    Regression, 1982): a χ² with as many degrees of freedom as it has measurements beside the first.
+    Jacobian by x where y follows x (deletion of cases: Cook, Weisberg, *Residuals and Influence in
+    Regression*, 1982). It is a χ² with a degree of freedom for each measurement after the first.
     """
     J, S, C = local.linear, local.by_x, local.coupling
     common = _to_x(slam, S)[record.frames * J.by_frame.shape[-1] :]

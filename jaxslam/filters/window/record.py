@@ -30,9 +30,9 @@ class Record(eqx.Module):
 
     last: Int[Array, ""]
     controls: Control
-    """Of F − 1 steps."""
+    """The controls of F − 1 steps."""
     merged: Float[Array, " steps"]
-    """Of how many steps of the process each is made; 1 until the window was thinned."""
+    """The number of steps of the process in each; 1 until the window was thinned."""
     restarted: Bool[Array, " steps"]
     """In which the velocity is drawn anew: it stood before."""
     standing: Bool[Array, ""]

@@ -26,7 +26,7 @@ from jaxslam.geometry import Scalar
 from jaxslam.linalg import Cholesky, cholesky
 
 MOST_SHIFT = 2.0
-"""Of λ, from the maximum to the mean."""
+"""The greatest change of λ from the maximum to the mean."""
 SHIFTS = 8
 """Steps of Newton's method from the one to the other."""
 

@@ -45,9 +45,9 @@ class Schedule(eqx.Module):
     directions: int = eqx.field(static=True)
     """The number of directions in which the search starts, besides the start from rest."""
     searches: tuple[int, ...] = eqx.field(static=True)
-    """Frames after which minima are sought anew, from all starts …"""
+    """Frames after which minima are sought anew, from all starts."""
     in_turn: int = eqx.field(static=True)
-    """… and from how many of them after every other frame, in turn: no frame waits for them all."""
+    """The number of starts, in turn, after every other frame: no frame waits for them all."""
     searched: int = eqx.field(static=True)
     """Frames in which they are sought, spread over the window."""
     renewed: tuple[int, ...] = eqx.field(static=True)
@@ -65,7 +65,7 @@ class Schedule(eqx.Module):
     moved: float = eqx.field(static=True, default=0.1)
     """The same, below which a camera has done more than turn."""
     doubtful: float = eqx.field(static=True, default=4.0)
-    """σ of a landmark that is given up, one a frame: what is seen there is no point in space."""
+    """σ of a landmark that is given up, one in a frame: what is seen there is no point in space."""
 
     def __check_init__(self) -> None:
         if min(self.sizes, default=0) < 3 or list(self.sizes) != sorted(set(self.sizes)):
@@ -78,8 +78,8 @@ class Schedule(eqx.Module):
 
     @staticmethod
     def of(geometry: Geometry, frames: int | None = None) -> Schedule:
-        """The schedule for a planar or a spatial world, of windows of so many frames after frame 0
-        at the most."""
+        """The schedule for a planar or a spatial world, of windows of at most so many frames after
+        frame 0."""
         made = _PLANAR if geometry is PLANAR else _SPATIAL
         if frames is None:
             return made
@@ -119,7 +119,7 @@ class FromWindow(AbstractLayer):
         if first is not None:
             begun = window.begun(begun, first)
         member = one.init(capacity, first)
-        modes = at_rest(cast(one, dtype), begun, _mixture(slam).members, dtype)
+        modes = at_rest(cast(one, dtype), begun, slam.mixture.members, dtype)
         count = len(modes.log_weights)
         members = jax.tree.map(lambda x: jnp.tile(x, (count, *(1,) * x.ndim)), member)
         return RestState(SumState(members, modes.log_weights), begun, modes, jnp.ones((), bool))
@@ -131,7 +131,7 @@ class FromWindow(AbstractLayer):
         return replace(state, sum=inner)
 
     def update(self, slam, state, control, seen):
-        mixture = _mixture(slam)
+        mixture: Mixture = slam.mixture
         update = mixture.update if self.schedule.divided else mixture.update_members
         after, innovation = update(slam.inner, state.sum, control, seen)
         stepped = window.stepped(state.record, control, seen, slam.sensor.noise)
@@ -239,13 +239,6 @@ class FromWindow(AbstractLayer):
         variance = jnp.trace(member.covariance[position, position])
         squared = jnp.sum(slam.model.camera_pose(member.core).translation() ** 2)
         return variance < share**2 * squared
-
-
-def _mixture(slam: AbstractSlam) -> Mixture:
-    """The sum that begins so."""
-    mixture = slam.inner.layer
-    assert isinstance(mixture, Mixture)
-    return mixture
 
 
 def _likely(members: SumState, now: Bool[Array, ""], given_up: float) -> SumState:

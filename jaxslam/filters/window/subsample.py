@@ -23,7 +23,7 @@ from jaxslam.filters.window.problem import PathLayout, X, Y
 from jaxslam.filters.window.record import Record
 
 TIED = 0.5
-"""Of a frame's landmarks: if those before saw fewer, it is hardly known how it stands to them."""
+"""A frame is tied to those before it where they saw at least this share of its landmarks."""
 
 
 class Kept(NamedTuple):
@@ -33,7 +33,7 @@ class Kept(NamedTuple):
     """The newest is repeated where there are fewer."""
     count: Int[Array, ""]
     part: Int[Array, " steps"]
-    """Of which step between frames that stay each step is a part; k − 1 behind the newest."""
+    """The step between frames that stay of which each is a part; k − 1 behind the newest."""
 
 
 def every(record: Record, stride: int | Int[Array, ""], frames: int) -> Kept:
