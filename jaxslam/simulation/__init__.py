@@ -2,7 +2,7 @@
 
 from jaxslam.simulation.draw import as_data, simulate, trajectory_of, with_own
 from jaxslam.simulation.placement import Cloister, FromPrior, GivenPoints, Rays, Ring
-from jaxslam.simulation.run import Room, Run, Sightings, features, gone, sightings
+from jaxslam.simulation.run import Room, Run, features, gone, sightings
 from jaxslam.simulation.scenario import BUILT_IN, as_scenario, scenario
 from jaxslam.simulation.trajectories import RecordedMotion
 from jaxslam.simulation.world import (
@@ -36,7 +36,6 @@ __all__ = [
     "Room",
     "Run",
     "Scenario",
-    "Sightings",
     "WhiteCalibration",
     "World",
     "as_data",

@@ -55,26 +55,17 @@ class Run(eqx.Module):
         return jnp.broadcast_to(self.points, (*self.visible.shape, self.points.shape[-1]))
 
 
-class Sightings(eqx.Module):
-    """The largest numbers of landmarks that a run sees: the capacities that a filter needs."""
-
-    landmarks: Int[Array, ""]
-    """Ever; or the slots that they share."""
-    first: Int[Array, ""]
-    """In frame 0."""
-    known: Int[Array, ""]
-    """In one frame, seen before."""
-    new: Int[Array, ""]
-    """In one frame after 0, for the first time."""
-
-
 class Room(NamedTuple):
-    """Capacities that hold every run of a study."""
+    """The capacities of a filter that hold a run, or every run of a study."""
 
-    landmarks: int
-    first: int
-    known: int
-    new: int
+    landmarks: int | Int[Array, ""]
+    """The landmarks that are ever seen, or the slots that they share."""
+    first: int | Int[Array, ""]
+    """The landmarks of frame 0."""
+    known: int | Int[Array, ""]
+    """The most landmarks of one frame that were seen before."""
+    new: int | Int[Array, ""]
+    """The most landmarks of a later frame that are seen for the first time."""
 
     @property
     def capacity(self) -> Capacity:
@@ -82,10 +73,10 @@ class Room(NamedTuple):
         return Capacity(self.landmarks, self.known, self.new)
 
 
-def sightings(run: Run) -> Sightings:
-    """Capacities that hold this run exactly."""
+def sightings(run: Run) -> Room:
+    """Return the least room that holds this run."""
     known, new = _known_and_new(run)
-    return Sightings(
+    return Room(
         landmarks=jnp.sum(jnp.any(run.visible, axis=0) | run.beacons),
         first=jnp.sum(run.visible[0]),
         known=jnp.max(jnp.sum(known, axis=1), initial=0),

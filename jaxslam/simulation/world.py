@@ -6,6 +6,8 @@ Angles, axes and controls are those of `jaxslam.geometry` and `jaxslam.models.mo
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from contextlib import suppress
 from functools import partial
 from importlib import import_module
 from operator import attrgetter
@@ -27,38 +29,22 @@ from jaxslam._numerics.arrays import (
     numbers,
     optional_numbers,
 )
+from jaxslam._runtime import plotted
 from jaxslam._runtime.lookup import suggestion
 from jaxslam.geometry import SPATIAL, Geometry, Pose
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import AbstractMotion, ConstantVelocity, Odometry
 from jaxslam.models.sensors import AbstractSensor, FieldOfView, Pinhole, Position, RangeBearing
-from jaxslam.simulation.fields import FIELDS, Value, check_signs
+from jaxslam.simulation.fields import FIELDS, PLACES, Value, check_signs
 from jaxslam.simulation.run import Run
 from jaxslam.simulation.trajectories import RecordedMotion
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Names = dict[str, str]
-"""Flat fields of a scenario, and where in a piece they are."""
-MOTIONS: dict[str, tuple[type[AbstractMotion], Names]] = {
-    "velocity": (
-        ConstantVelocity,
-        {
-            "acceleration_sigma": "noise_sigma",
-            "velocity": "velocity",
-            "velocity_sigma": "velocity_sigma",
-        },
-    ),
-    "odometry": (Odometry, {"odometry_sigma": "noise_sigma"}),
-}
-LENS = {"focal": "camera.focal", "centre": "camera.centre", "pixel_sigma": "sigma"}
-SENSORS: dict[str, tuple[type[AbstractSensor], Names]] = {
-    "camera": (Pinhole, LENS),
-    "position": (Position, {"position_sigma": "sigma", "point_dim": "point_dim"}),
-    "range_bearing": (RangeBearing, {"range_bearing_sigma": "sigma"}),
-}
+MOTIONS = {"velocity": ConstantVelocity, "odometry": Odometry}
+SENSORS = {"camera": Pinhole, "position": Position, "range_bearing": RangeBearing}
 
 
 class AbstractPlacement(eqx.Module):
@@ -66,8 +52,6 @@ class AbstractPlacement(eqx.Module):
 
     word: ClassVar[str] = ""
     """Its name in scenarios."""
-    names: ClassVar[Names] = {}
-    """Its flat fields there, and where they are in it."""
 
     if TYPE_CHECKING:  # a field or a property of each placement
 
@@ -153,12 +137,6 @@ def _count() -> Any:
 class Limits(eqx.Module):
     """How many of the visible landmarks are measured; 0 is no limit."""
 
-    names: ClassVar[Names] = {
-        x: x
-        for x in (
-            "first_frame", "first_landmarks", "new_landmarks", "known_landmarks", "in_view"
-        )
-    }  # fmt: skip
     first_frame: int = _count()
     """Before it nothing is measured."""
     first_landmarks: int = _count()
@@ -172,7 +150,7 @@ class Limits(eqx.Module):
     seen again: a filter needs slots for no more."""
 
     def __check_init__(self) -> None:
-        check_signs(self, (), self.names)
+        check_signs(self, "limits")
         if self.in_view and self.of_a_frame:
             raise ValueError(f"in_view: not with {', '.join(self.of_a_frame)}")
 
@@ -187,11 +165,6 @@ class Drift(eqx.Module):
     """Errors of a landmark's measurements that stay from frame to frame, of which no filter is
     told: `b ← ρ b + √(1 − ρ²) σ n` with ρ = exp(−1/frames)."""
 
-    names: ClassVar[Names] = {
-        "drift_sigma": "sigma",
-        "drift_frames": "frames",
-        "drift_wrong": "wrong",
-    }
     sigma: Number
     """In the unit of the measurement: pixels, m, rad."""
     frames: Number = 20.0
@@ -200,7 +173,7 @@ class Drift(eqx.Module):
     """Share of the landmarks of which σ is ten times as large."""
 
     def __check_init__(self) -> None:
-        check_signs(self, ("frames",), ("sigma", "wrong"))
+        check_signs(self, "drift")
 
     def errors(self, key: Array, measured: Float[Array, "f l p"]) -> Float[Array, "f l p"]:
         """Of every measurement."""
@@ -258,10 +231,6 @@ class World(eqx.Module):
     pieces that do not fit one another.
     """
 
-    names: ClassVar[tuple[str, ...]] = (
-        "name", "rate", "steps", "velocity", "still_frames", "beacons", "beacon_sigma"
-    )  # fmt: skip
-    """Flat fields that it has by the same name."""
     motion: AbstractMotion
     sensor: AbstractSensor
     placement: AbstractPlacement
@@ -291,7 +260,7 @@ class World(eqx.Module):
             self.velocity = numbers(ahead[self.geometry.tangent_dim] if known is None else known)
 
     def __check_init__(self) -> None:
-        check_signs(self, ("steps", "rate", "beacon_sigma"), ("still_frames", "beacons"))
+        check_signs(self, "world")
         geometry, sensor = self.geometry, type(self.sensor).__name__
         check_shape("the velocity of a world", self.velocity, (geometry.tangent_dim,))
         if self.sensor.point_dim != geometry.point_dim:
@@ -335,6 +304,16 @@ class World(eqx.Module):
         """Whether nothing is measured or given in metres: only priors know the scale."""
         return self.motion.has_velocity and self.sensor.hidden == 1 and not self.beacons
 
+    def measured(
+        self, pose: Pose, sensor: AbstractSensor, points: Float[Array, "l n"]
+    ) -> tuple[Float[Array, "l p"], Bool[Array, " l"]]:
+        """Return what a sensor in a pose measures without noise, and what it sees of that."""
+        seen_from = jax.vmap(pose.inverse().apply)(points)
+        one = jnp.ones((), points.dtype)
+        measured = jax.vmap(sensor.measure, in_axes=(0, None))(seen_from, one)
+        visible = jax.vmap(sensor.visible, in_axes=(0, 0, None))(seen_from, measured, self.view)
+        return measured, visible
+
     def plot(self, run: Run | int = 0, path: str | Path | None = None) -> Figure:
         """The world from above: the true path of a run, its landmarks, and which are measured.
 
@@ -346,7 +325,7 @@ class World(eqx.Module):
             key = jax.random.fold_in(jax.random.key(0), run)
             run = cast(Run, jax.jit(partial(simulate, self))(key))
         points = np.asarray(run.points_by_frame)
-        return import_module("jaxslam.plots").plot_world(
+        return plotted("plot_world")(
             f"{self.name} from above, {self.steps} steps at {float(self.rate):g} Hz",
             np.asarray(run.poses.as_matrix()),
             points,
@@ -366,28 +345,26 @@ class World(eqx.Module):
     def fields(self) -> dict[str, Value]:
         """The flat fields with which `jaxslam.scenario` makes this world; those that it has no use
         for are their defaults."""
-        found: dict[str, Value] = {name: field.default for name, field in FIELDS.items()}
-        for size, names in _SIZED.items():
-            found |= {name: found[name][:1] * getattr(self.geometry, size) for name in names}
-        own = {
+        found = {name: field.within(self.geometry) for name, field in FIELDS.items()} | {
             "velocity_sigma": (0.0,) * self.geometry.tangent_dim,
             "geometry": self.geometry.name,
-            "calibration": self.treatment,
             "true_calibration": self.calibration.word,
             "landmarks": self.landmarks,
+            "placement": self.placement.word or self.placement,
+            "trajectory": self.trajectory or "",
         }
-        found |= own | _of(self, {name: name for name in self.names})
-        for kind, table in (("motion", MOTIONS), ("sensor", SENSORS)):
+        pieces = {
+            "world": self, "view": self.view, "picture": self.view, "limits": self.limits,
+            "drift": self.drift, self.placement.word: self.placement,
+        }  # fmt: skip
+        for kind, known in (("motion", MOTIONS), ("sensor", SENSORS)):
             piece = getattr(self, kind)
-            words = [word for word, (made, _) in table.items() if type(piece) is made]
-            found[kind] = words[0] if words else piece
-            found |= _of(piece, table[words[0]][1]) if words else {}
-        found["placement"] = self.placement.word or self.placement
-        for piece in (self.placement, self.view, self.limits, self.drift):
-            found |= {} if piece is None else _of(piece, piece.names)
-        found["trajectory"] = self.trajectory or ""
-        sigma = _plain(self.calibration.sigma)
-        if sigma:
+            word = {made: word for word, made in known.items()}.get(type(piece), "")
+            found[kind] = word or piece
+            pieces[word] = piece
+        for word, piece in pieces.items():
+            found |= _flat(piece, PLACES.get(word, {}))
+        if sigma := _numbers_of(self.calibration.sigma):
             found |= {"focal_sigma": sigma[0], "centre_sigma": sigma[-1]}
         return found | _of_depth(self.depth)
 
@@ -404,17 +381,15 @@ class World(eqx.Module):
 
 
 _PIECES = {field.name for field in dataclasses.fields(World)}
-_SIZED = {
-    "tangent_dim": ("acceleration_sigma", "odometry_sigma"),
-    "pixel_dim": ("first_pixels", "image", "focal", "centre"),
-}
-"""Fields whose defaults are as many in every world, the number of which depends on it."""
 
 
-def _of(piece: eqx.Module, names: Names) -> dict[str, Value]:
+def _flat(piece: eqx.Module | None, places: Mapping[str, str]) -> dict[str, Value]:
     """The flat fields of a piece, of those that it has."""
-    found = {x: attrgetter(place)(piece) for x, place in names.items() if x in FIELDS}
-    return {field: _numbers_of(value) for field, value in found.items() if value is not None}
+    found = {}
+    for field, place in places.items():
+        with suppress(AttributeError):  # a lens, where there is none
+            found[field] = _numbers_of(attrgetter(place)(piece))
+    return {field: value for field, value in found.items() if value is not None}
 
 
 def _numbers_of(value: Value) -> Value:
