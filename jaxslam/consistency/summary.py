@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -19,13 +19,7 @@ from jaxslam._runtime.lookup import suggestion
 from jaxslam.consistency.manifest import Manifest, described
 from jaxslam.consistency.results import (
     FilterResult,
-    LandmarkNees,
-    LogScale,
-    Nees,
-    Nis,
-    Parts,
     Results,
-    ScaleDrift,
     Seconds,
     Summary,
     named,
@@ -337,87 +331,68 @@ def table(summary: Study | Results | Mapping[str, Any]) -> str:
     return as_text(results_of(summary))
 
 
+_MEANS = {
+    "nees.mean": ("nees", "survivors"),
+    "nees.lost": ("lost", "runs"),
+    "not_lost": ("kept_nees", "kept"),
+    "lost_ever": ("lost_ever", "runs"),
+    "nis.mean": ("nis", "survivors"),
+    "nis.dof": ("nis_dof", "survivors"),
+    "beyond_scale.mean": ("beyond_scale", "survivors"),
+    "beyond_scale.lost": ("beyond_lost", "runs"),
+    "reversed": ("reversed", "displaced"),
+    "landmark_nees.mean": ("landmark_nees", "landmark_count"),
+}
+"""The sums and counts of which results are means."""
+_ROOTS = {
+    "scale_drift.rms": ("squared_drift", "drift_count"),
+    "scale_drift.sigma": ("drift_variance", "drift_count"),
+    "scale_drift.normalised_rms": ("normalised_drift", "drift_count"),
+    "log_scale.error_rms": ("squared_log_scale", "survivors"),
+    "log_scale.sigma": ("log_scale_variance", "survivors"),
+    "log_scale.normalised_rms": ("normalised_log_scale", "survivors"),
+}
+"""The same of roots of means."""
+
+
+@np.errstate(invalid="ignore", divide="ignore")  # NaN where nothing was counted
 def _result(study: Study, name: str) -> FilterResult:
-    geometry = study.scenario.geometry
-    dof, n = geometry.tangent_dim, geometry.point_dim
-    (sums, lost), medians = _sums_and_lost(study, name), _medians(study, name)
-    healthy = study.runs - int(sums["diverged"])
-    low, high = mean_band(dof, max(healthy, 1))
-
-    def mean(key: str, count: np.ndarray | int = healthy) -> np.ndarray:
-        return _ratio(sums[key], count)
-
-    def rms(key: str, count: np.ndarray | int = healthy) -> np.ndarray:
-        return np.sqrt(mean(key, count))
-
-    def by_part(key: str) -> Parts:
-        with np.errstate(invalid="ignore"):  # of a variance that is negative
-            per_axis = mean(key)
-            parts = per_axis[:, :n].sum(axis=1), per_axis[:, n:].sum(axis=1)
-            return Parts(*map(np.sqrt, parts))
-
-    outside, count = sums["outside"], sums["drift_count"]
-    of_drift = tally_of(sums, "drift", dof)
-    return FilterResult(
-        name=name,
-        nees=Nees(
-            verdict=tally_of(sums, "nees", dof).verdict() | {"lost_runs": lost},
-            dof=dof,
-            band=(low, high),
-            mean=mean("nees"),
-            median=medians.nees,
-            lost=(sums["lost"] + sums["diverged"]) / study.runs,
-        ),
-        not_lost=mean("kept_nees", sums["kept"]),
-        lost_ever=(sums["lost_ever"] + sums["diverged"]) / study.runs,
-        nis=Nis(mean("nis"), mean("nis_dof")),
-        rmse=by_part("squared_error"),
-        sigma=by_part("variance"),
-        outside3sigma=Parts(
-            _ratio(outside[:, :n].mean(axis=1), healthy),
-            _ratio(outside[:, n:].mean(axis=1), healthy),
-        ),
-        beyond_scale=Nees(
-            verdict=tally_of(sums, "beyond_scale", dof).verdict(),
-            dof=dof,
-            band=(mean_band(dof - 1, max(healthy, 1))[0], high),
-            mean=mean("beyond_scale"),
-            median=medians.at_one_scale,
-            lost=(sums["beyond_lost"] + sums["diverged"]) / study.runs,
-        ),
-        scale_drift=ScaleDrift(
-            rms=rms("squared_drift", count),
-            sigma=rms("drift_variance", count),
-            normalised_rms=rms("normalised_drift", count),
-            runs=count,
-            verdict=of_drift.verdict() if of_drift.runs and healthy else None,
-        ),
-        log_scale=LogScale(
-            error_rms=rms("squared_log_scale"),
-            error_median=medians.log_scale,
-            sigma=rms("log_scale_variance"),
-            sigma_median=medians.log_scale_sigma,
-            normalised_rms=rms("normalised_log_scale"),
-        ),
-        reversed=mean("reversed", sums["displaced"]),
-        landmark_nees=LandmarkNees(
-            mean("landmark_nees", sums["landmark_count"]),
-            n,
-            sums["landmark_not_finite"].astype(int),
-        ),
-        survivors=healthy,
-        diverged=int(sums["diverged"]),
-        status={s.name.lower(): int(sums[f"status_{s.name}"]) for s in Status if s != Status.OK},
-        calibration=study.calibrations.get(name),
-        backend=study.backends.get(name),
-        seconds=study.seconds[name],
-    )
-
-
-def _ratio(sums: np.ndarray, counts: np.ndarray | int) -> np.ndarray:
-    """Divide sums by counts, NaN where nothing was counted."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return sums / counts
+    dof, n = study.scenario.geometry.tangent_dim, study.scenario.geometry.point_dim
+    sums, lost = _sums_and_lost(study, name)
+    diverged = int(sums["diverged"])
+    healthy = study.runs - diverged
+    sums |= {key: sums[key] + diverged for key in ("lost", "lost_ever", "beyond_lost")}
+    sums |= {"survivors": healthy, "runs": study.runs}
+    bands = [mean_band(degrees, max(healthy, 1)) for degrees in (dof, dof - 1)]
+    drift = tally_of(sums, "drift", dof)
+    found = {path: sums[key] / sums[count] for path, (key, count) in _MEANS.items()}
+    found |= {path: np.sqrt(sums[key] / sums[count]) for path, (key, count) in _ROOTS.items()}
+    for part, axes in (("position", slice(n)), ("orientation", slice(n, None))):
+        for path, key in (("rmse", "squared_error"), ("sigma", "variance")):
+            found[f"{path}.{part}"] = np.sqrt((sums[key] / healthy)[:, axes].sum(axis=1))
+        found[f"outside3sigma.{part}"] = sums["outside"][:, axes].mean(axis=1) / healthy
+    return FilterResult.of({
+        **found,
+        **_medians(study, name),
+        "name": name,
+        "nees.verdict": tally_of(sums, "nees", dof).verdict() | {"lost_runs": lost},
+        "nees.dof": dof,
+        "nees.band": bands[0],
+        "beyond_scale.verdict": tally_of(sums, "beyond_scale", dof).verdict(),
+        "beyond_scale.dof": dof,
+        "beyond_scale.band": (bands[1][0], bands[0][1]),
+        "scale_drift.runs": sums["drift_count"],
+        "scale_drift.verdict": drift.verdict() if drift.runs and healthy else None,
+        "landmark_nees.dof": n,
+        "landmark_nees.not_finite": sums["landmark_not_finite"].astype(int),
+        "survivors": healthy,
+        "diverged": diverged,
+        "status": {s.name.lower(): int(sums[f"status_{s.name}"]) for s in Status if s != Status.OK},
+        "calibration": study.calibrations.get(name),
+        "backend": study.backends.get(name),
+        "seconds.compile": study.seconds[name].compile,
+        "seconds.run": study.seconds[name].run,
+    })  # fmt: skip
 
 
 def treatment(slam: AbstractFilter) -> str | None:
@@ -452,28 +427,23 @@ def _sums_and_lost(study: Study, name: str) -> tuple[Sums, list[int] | None]:
     return added(each()), None if study.reduced else lost
 
 
-class _Medians(NamedTuple):
-    """The medians of every step, over all runs whose records are kept, diverged ones infinite."""
+def _medians(study: Study, name: str) -> dict[str, np.ndarray]:
+    """The medians of every step, over all runs whose records are kept, diverged ones infinite.
 
-    nees: np.ndarray
-    at_one_scale: np.ndarray
-    log_scale: np.ndarray
-    """The median of its error's size."""
-    log_scale_sigma: np.ndarray
-
-
-def _medians(study: Study, name: str) -> _Medians:
-    """Compute the medians, reading every chunk once for as many steps as are held in memory."""
+    Every chunk is read once for as many steps as are held in memory.
+    """
     medians, at_once = [], max(1, _VALUES_AT_ONCE // study.runs)
     for start in range(0, study.scenario.steps, at_once):
         part, columns = slice(start, start + at_once), []
         for chunk in study.whole:
             kept = study.store.load(name, chunk, _OF_MEDIANS)
             survivors = survived(kept)[:, None]
-            values = (
-                kept["nees"], one_scale_of(kept).nees, np.abs(kept["log_scale"]),
-                kept["log_scale_sigma"],
-            )  # fmt: skip
-            columns.append([np.where(survivors, x, np.inf)[:, part] for x in values])
-        medians.append([np.median(np.concatenate(x), axis=0) for x in zip(*columns, strict=True)])
-    return _Medians(*(np.concatenate(x) for x in zip(*medians, strict=True)))
+            values = {
+                "nees.median": kept["nees"],
+                "beyond_scale.median": one_scale_of(kept).nees,
+                "log_scale.error_median": np.abs(kept["log_scale"]),
+                "log_scale.sigma_median": kept["log_scale_sigma"],
+            }
+            columns.append({k: np.where(survivors, x, np.inf)[:, part] for k, x in values.items()})
+        medians.append({k: np.median(np.concatenate([x[k] for x in columns]), 0) for k in values})
+    return {key: np.concatenate([x[key] for x in medians]) for key in medians[0]}
