@@ -162,6 +162,12 @@ class FilterResult:
     """The time that it took."""
 
     @property
+    def series(self) -> dict[str, Steps]:
+        """The numbers of every step, called as in JSON but with _ between parts."""
+        values = {key: attrgetter(path)(self) for key, path in _PATH_OF_KEY.items()}
+        return {k.replace(".", "_"): x for k, x in values.items() if isinstance(x, np.ndarray)}
+
+    @property
     def verdict(self) -> Verdict:
         """The verdict on the NEES of the pose."""
         return self.nees.verdict

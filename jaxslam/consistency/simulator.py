@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -79,8 +80,12 @@ class Simulator:
 
     def max_sightings(self, chunk: range) -> Room:
         """Return the most that any of the chunk's runs sees."""
-        with jax.enable_x64(self.dtype == "float64"):  # a thread's own
+        with self.precision():
             return jax.tree.map(np.max, jax.device_get(self(chunk)[1]))
+
+    def precision(self) -> AbstractContextManager[None]:
+        """Return a context in which JAX has the precision of the runs, which is a thread's own."""
+        return jax.enable_x64(self.dtype == "float64")
 
     def room(self, chunks: tuple[range, ...], map_chunks: MapChunks) -> Room:
         """Return the room that holds every run of the study.

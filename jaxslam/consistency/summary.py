@@ -144,17 +144,15 @@ class Study(Mapping):
 
         Of a study of sums they are those of the first chunk.
         """
-        name = self._named(name)
+        name = named(name, self.filters)
         parts = [self.store.load(name, chunk, RECORDS) for chunk in self.whole]
         return {key: np.concatenate([part[key] for part in parts]) for key in RECORDS}
 
     def summary(self) -> Summary:
         """Return `summarise(study)`, the content of `consistency.json`."""
-        return self.to_json()
-
-    def to_json(self) -> Summary:
-        """Return `summarise(study)`, the content of `consistency.json`."""
         return self.results.to_json()
+
+    to_json = summary
 
     def table(self) -> str:
         """Return the verdicts and the numbers of the last step as text."""
@@ -170,14 +168,9 @@ class Study(Mapping):
         Its columns are called as in `consistency.json`, as `rmse_position`. Raises ValueError
         without pandas.
         """
-        pandas, rows = _library("pandas"), []
-        for name, told in self.to_json()["filters"].items():
-            columns = dict(_series(told, self.scenario.steps))
-            rows += [
-                {"filter": name, "time": time, **{key: x[i] for key, x in columns.items()}}
-                for i, time in enumerate(self.results.time)
-            ]
-        return pandas.DataFrame(rows)
+        pandas, time = _library("pandas"), self.results.time
+        frames = [{"filter": name, "time": time} | self[name].series for name in self]
+        return pandas.concat([pandas.DataFrame(x) for x in frames], ignore_index=True)
 
     def to_xarray(self) -> Any:
         """Return the records of every filter, run and step as an `xarray.Dataset`.
@@ -274,15 +267,6 @@ def _library(name: str) -> Any:
 def divided(runs: int, chunk: int) -> tuple[range, ...]:
     """Divide so many runs into chunks."""
     return tuple(range(i, min(i + chunk, runs)) for i in range(0, runs, chunk))
-
-
-def _series(told: Mapping[str, Any], steps: int, prefix: str = "") -> Iterator[tuple[str, list]]:
-    """The lists of JSON that have a number for every step, and their names."""
-    for key, value in told.items():
-        if isinstance(value, dict) and "word" not in value:
-            yield from _series(value, steps, f"{prefix}{key}_")
-        if isinstance(value, list) and len(value) == steps and key != "band95":
-            yield f"{prefix}{key}", value
 
 
 def results_of(given: Study | Results | Mapping[str, Any]) -> Results:
