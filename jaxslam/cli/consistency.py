@@ -57,7 +57,7 @@ class ConsistencyOptions:
     """Precision: float64 or float32."""
     chunk: int | None = None
     """Runs computed and stored together. Memory grows with it; results do not depend on it. By
-    default so many that every processor has several chunks, 100 at the most."""
+    default so many that every processor has several chunks, at most 100."""
     backend: str = AUTO
     """Backend: xla, native (a C++ program, which needs a compiler), or auto: native if the study is
     long enough, and with --resume the backend of the interrupted run."""

@@ -77,18 +77,18 @@ def monte_carlo(
 ) -> Study:
     """Run every filter on the same simulated runs.
 
-    The runs are the scenario's, which may be given by name; with a `motion` (or a `RecordedMotion`)
-    or a `sensor` of one's own the truth moves, or is measured, as that says, in the scenario's
+    The runs are the scenario's, which may be given by name. With a `motion` (or a `RecordedMotion`)
+    or a `sensor` of your own the truth moves, or is measured, as that says, in the scenario's
     world. Filters are given by name, as `make_filters` returns them; a list of words makes those of
     the scenario, as `robocentric`, which has Inverse Scaling, or `robocentric/inverse_depth`. One
     filter has one set of numbers; several that differ in numbers alone share a program.
 
     With `progress=True` a bar shows how far it is. Or `progress(filter name, finished runs)` is
-    called after every chunk, and with no runs twice: when the filter is to be compiled, and when it
-    is (not with a `cluster`). An `Interruption` is raised at once, and leaves in `store` the chunks
+    called after every chunk, and with no runs twice: before the filter is compiled and after it
+    (not with a `cluster`). An `Interruption` is raised at once, and leaves in `store` the chunks
     that are finished. Chunks that `store` already has are not run again; it is given what decides
     them, and refuses what differs. A `chunk` is the runs that are computed and kept together: by
-    default those of the store, or so many that every processor has several, `CHUNK` at the most.
+    default those of the store, or so many that every processor has several, at most `CHUNK`.
 
     With a `cluster`, the address of a Dask scheduler or a `distributed.Client`, the chunks are
     computed there and kept here; their seconds are of all together, compilation among them.

@@ -291,12 +291,13 @@ def summarise(study: Study | Results) -> Summary:
     runs in which an update said that something was wrong (`jaxslam.Status`).
 
     `beyond_scale` is NEES at the one scale of every run that explains all of its poses best
-    (`beyond_scale.one_scale`), in the filter's own unit, with the same numbers: that scale takes
-    from one degree of freedom a run to one a pose, and band and verdict allow for both.
-    `scale_drift` is how far the scale of a pose is from that of its run, with the σ claimed of it;
-    `log_scale` the error of the scale in metres, the σ claimed (root mean squares and medians)
-    and the error in σ; `reversed` the share of the displaced runs whose estimate points away from
-    the truth. Where the sensor measures metres, or the motion is given in metres, they say little.
+    (`beyond_scale.one_scale`), in the filter's own unit, with the same numbers. That scale takes
+    from one degree of freedom per run to one per pose; band and verdict allow for both.
+    `scale_drift` is how far the scale of a pose is from that of its run, with the σ claimed of it.
+    `log_scale` is the error of the scale in metres, the σ claimed (root mean squares and medians)
+    and the error in σ. `reversed` is the share of the displaced runs whose estimate points away
+    from the truth. Where the sensor measures metres, or the motion is given in metres, they say
+    little.
 
     `outside3sigma` is the share of errors beyond three of the claimed σ, axis by axis and then the
     mean of the axes: 0.27 % of Gaussian errors.

@@ -12,7 +12,7 @@ import numpy as np
 from jaxslam.geometry import Geometry
 
 Value = Any
-"""A field's: a word, a number, a list of them, or a piece of one's own."""
+"""The value of a field: a word, a number, a list of them, or a piece of your own."""
 LARGEST_WHOLE = 2**31 - 1
 POSITIVE, NOT_NEGATIVE = "positive", "not negative"
 
@@ -54,7 +54,7 @@ for _name, _field in FIELDS.items():
     for _word, _, _place in (at.partition(".") for at in _field.at):
         PLACES.setdefault(_word, {})[_name] = _place
 OWN = ("motion", "sensor", "placement")
-"""Fields that may be a piece of one's own: a word `module:Class`, or a table of `type` and what
+"""Fields that may be a piece of your own: a word `module:Class`, or a table of `type` and what
 that takes, or from Python the piece."""
 ROWS = ("first_pixels", "points")
 """Fields that are lists of lists."""

@@ -37,9 +37,9 @@ class FromPrior(AbstractPlacement):
     first: Float[AnyArray, "p 2"] = eqx.field(converter=_intervals, default=((20.0, 620.0),))
     """Interval of each number of a measurement, pixels of a camera."""
     least_inverse_depth: Number = 0.001
-    """Of the truth, 1/m."""
+    """The least 1/z of the truth, 1/m."""
     through: AbstractSensor | None = None
-    """Of whose measurements they are; by default the world's sensor."""
+    """The sensor of whose measurements they are; by default that of the world."""
 
     def __check_init__(self) -> None:
         check_signs(self, self.word)
@@ -147,7 +147,7 @@ class Cloister(AbstractPlacement):
 
 
 class GivenPoints(AbstractPlacement):
-    """GivenPoints of your own."""
+    """The points that are given."""
 
     word: ClassVar[str] = "points"
     positions: Float[AnyArray, "l n"] = number_field()
@@ -223,7 +223,7 @@ class Rays(AbstractPlacement):
         return jax.lax.scan(frame, nowhere, (keys, poses, sensors, is_first))[1]
 
     def _thrown(self, key: Array, sensor: AbstractSensor) -> Float[Array, "l n"]:
-        """GivenPoints along random rays of a camera, in that."""
+        """Points along random rays of a camera, in its frame."""
         pixel_key, depth_key = jax.random.split(key)
         pixels = _uniform(self.first, self.landmarks, pixel_key)
         least, greatest = self.depth_range

@@ -65,7 +65,7 @@ def scenario(
     """The world of a built-in scenario, of a TOML file, or one given, with flat fields replaced.
 
     A TOML file may name a built-in scenario to start from: `base = "circle"`. A motion, a sensor or
-    a placement of one's own is `module:Class` or `file.py:Class`, in the current folder too, or a
+    a placement of your own is `module:Class` or `file.py:Class`, in the current folder too, or a
     table of `type` and what it takes, `{type = "mine:Sonar", sigma = 0.1}`, or from Python the
     piece. Raises ValueError for an unknown name or field and for a value that makes no sense.
     """
@@ -223,7 +223,7 @@ def _made(kind: type, values: Mapping[str, Value]) -> Value:
 
 
 def own_piece(kind: str, given: Value) -> Value:
-    """A piece of one's own: itself, `module:Class`, or a table of `type` and what that takes.
+    """A piece of your own: itself, `module:Class`, or a table of `type` and what that takes.
 
     Raises ValueError, naming the field, for what cannot be found or made.
     """

@@ -76,7 +76,7 @@ class AbstractPlacement(eqx.Module):
 
 
 class AbstractTrueCalibration(eqx.Module):
-    """How far the true calibration is off the nominal one: δ, of which filters are told σ."""
+    """How far the true calibration is off the nominal one: δ, of which filters know σ."""
 
     word: ClassVar[str] = ""
     sigma: eqx.AbstractVar[Float[AnyArray, " k"]]
@@ -95,7 +95,7 @@ class NominalCalibration(AbstractTrueCalibration):
 
     word: ClassVar[str] = "nominal"
     sigma: Float[AnyArray, " k"] = number_field(default=())
-    """What filters are told: of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
+    """The σ that filters are given, of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
 
     def sensors(self, nominal: AbstractSensor, key: Array, frames: int) -> AbstractSensor:
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (frames, *jnp.shape(x))), nominal)
@@ -106,7 +106,7 @@ class WhiteCalibration(AbstractTrueCalibration):
 
     word: ClassVar[str] = "white"
     sigma: Float[AnyArray, " k"] = number_field()
-    """Of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
+    """The σ of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
 
     def deltas(self, key: Array, frames: int) -> Float[Array, "frames k"]:
         sigma = jnp.asarray(self.sigma)
@@ -114,11 +114,11 @@ class WhiteCalibration(AbstractTrueCalibration):
 
 
 class ConstantCalibration(AbstractTrueCalibration):
-    """Drawn once a run."""
+    """Drawn once per run."""
 
     word: ClassVar[str] = "constant"
     sigma: Float[AnyArray, " k"] = number_field()
-    """Of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
+    """The σ of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
 
     def deltas(self, key: Array, frames: int) -> Float[Array, "frames k"]:
         sigma = jnp.asarray(self.sigma)
@@ -162,8 +162,8 @@ class Limits(eqx.Module):
 
 
 class Drift(eqx.Module):
-    """Errors of a landmark's measurements that stay from frame to frame, of which no filter is
-    told: `b ← ρ b + √(1 − ρ²) σ n` with ρ = exp(−1/frames)."""
+    """Errors of a landmark's measurements that stay from frame to frame, and that no filter
+    knows: `b ← ρ b + √(1 − ρ²) σ n` with ρ = exp(−1/frames)."""
 
     sigma: Number
     """In the unit of the measurement: pixels, m, rad."""
@@ -176,7 +176,7 @@ class Drift(eqx.Module):
         check_signs(self, "drift")
 
     def errors(self, key: Array, measured: Float[Array, "f l p"]) -> Float[Array, "f l p"]:
-        """Of every measurement."""
+        """The errors of every measurement."""
         first_key, key, share_key = jax.random.split(key, 3)
         stays = jnp.exp(-1 / jnp.asarray(self.frames, measured.dtype))
         noises = jax.random.normal(key, measured.shape, measured.dtype)
@@ -191,7 +191,7 @@ class Drift(eqx.Module):
 
 
 KINDS = {"motion": AbstractMotion, "sensor": AbstractSensor, "placement": AbstractPlacement}
-"""What may be of one's own."""
+"""Pieces that may be your own."""
 
 
 def check_kind(name: str, piece: Value) -> None:
@@ -203,12 +203,12 @@ def check_kind(name: str, piece: Value) -> None:
 class World(eqx.Module):
     """What is true: the pieces of a filter, which draw here what a filter has to estimate.
 
-    Lengths are metres, angles radians, times seconds, pixels pixels. Camera axes are x right,
+    Lengths are metres, angles radians, times seconds. Camera axes are x right,
     y down, z ahead; the plane has x and z, and its angle θ turns from x towards z. A point is
     (x, z) or (x, y, z), a velocity or the reading of an odometry (x, z, θ) or
     (x, y, z, about x, about y, about z). The base frame B is the camera of frame 0.
 
-    - `motion`: how the camera moves and what a filter is told of it (`AbstractMotion`);
+    - `motion`: how the camera moves and what a filter knows of it (`AbstractMotion`);
     - `sensor`: what is measured, of nominal calibration, with its noise (`AbstractSensor`);
     - `placement`: where landmarks are (`FromPrior`, `Ring`, `Cloister`, `Rays`, `GivenPoints`);
     - `calibration`: how far the true one is off, pixels (`NominalCalibration`,
@@ -218,7 +218,7 @@ class World(eqx.Module):
     - `velocity`: the nominal one in the camera's axes, m/s and rad/s; by default the motion's mean
       or, for a motion without one, 1.2 m/s ahead in a circle of 4 m;
     - `trajectory`: a recorded path, or the name of its file; `still_frames`: steps in which the
-      camera first stands still;
+      camera is first at rest;
     - `view`: what the sensor sees (least depth and distances, m; picture, pixels); `limits`: how
       much of that is measured;
     - `drift`: errors of landmarks that stay; `beacons`: how many landmarks are surveyed, with
@@ -337,7 +337,7 @@ class World(eqx.Module):
     def to_dict(self) -> dict[str, Value]:
         """The flat fields of a scenario, as files have them: words, numbers and lists.
 
-        A piece of one's own is a table of its `type` and its numbers.
+        A piece of your own is a table of its `type` and its numbers.
         """
         return {field: _plain(value) for field, value in self.fields.items()}
 
@@ -369,7 +369,7 @@ class World(eqx.Module):
         return found | _of_depth(self.depth)
 
     def __hash__(self) -> int:
-        """Of its words and numbers, so that a world may be a key."""
+        """Return the hash of its words and numbers, so that a world may be a key."""
         leaves, kind = jax.tree.flatten(self)
         return hash((kind, *(np.asarray(leaf).tobytes() for leaf in leaves)))
 
