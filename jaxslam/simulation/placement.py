@@ -14,7 +14,7 @@ from jaxslam._numerics.arrays import AnyArray, Number, number_field
 from jaxslam.geometry import PLANAR, SPATIAL, Pose
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation.fields import check_numbers, check_signs
-from jaxslam.simulation.world import AbstractPlacement, World
+from jaxslam.simulation.world import AbstractPlacement, World, count
 
 
 def _intervals(intervals: Any) -> AnyArray:
@@ -24,16 +24,12 @@ def _intervals(intervals: Any) -> AnyArray:
     return pairs
 
 
-def _count() -> Any:
-    return eqx.field(static=True, default=12)
-
-
 class FromPrior(AbstractPlacement):
     """Measurements of frame 0 that are uniform, and what they hide (1/z of a camera) drawn from the
     world's prior, truncated."""
 
     word: ClassVar[str] = "prior"
-    landmarks: int = _count()
+    landmarks: int = count(12)
     first: Float[AnyArray, "p 2"] = eqx.field(converter=_intervals, default=((20.0, 620.0),))
     """Interval of each number of a measurement, pixels of a camera."""
     least_inverse_depth: Number = 0.001
@@ -87,7 +83,7 @@ class Ring(AbstractPlacement):
     turn below, at and above it by a metre."""
 
     word: ClassVar[str] = "ring"
-    landmarks: int = _count()
+    landmarks: int = count(12)
     radius: Number = 8.0
     """m."""
 
@@ -124,13 +120,13 @@ class Cloister(AbstractPlacement):
     the wall."""
 
     word: ClassVar[str] = "room"
-    landmarks: ClassVar[int] = 72
+    landmarks: int = count(72)
 
     def check(self, world: World) -> None:
-        if world.geometry is not SPATIAL:
+        if world.geometry is not SPATIAL or self.landmarks != 72:
             raise ValueError(
-                f"placement room is for a spatial geometry and {self.landmarks} landmarks, "
-                f"not {world.geometry.name}"
+                "placement room is for a spatial geometry and 72 landmarks, "
+                f"not {world.geometry.name} and {self.landmarks}"
             )
 
     def points(self, world: World, key: Array) -> Float[Array, "72 3"]:
@@ -178,7 +174,7 @@ class Rays(AbstractPlacement):
     """
 
     word: ClassVar[str] = "rays"
-    landmarks: int = _count()
+    landmarks: int = count(12)
     first: Float[AnyArray, "p 2"] = eqx.field(converter=_intervals, default=((20.0, 620.0),))
     """Interval of each pixel coordinate at first sight."""
     depth_range: Float[AnyArray, " 2"] = number_field(default=(1.0, 6.0))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 import tomllib
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -23,7 +24,7 @@ from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.sensors import FieldOfView, Pinhole
 from jaxslam.simulation.fields import FIELDS, OWN, PLACES, Value, check_numbers, coerced
-from jaxslam.simulation.placement import PLACEMENTS, Cloister, Rays
+from jaxslam.simulation.placement import PLACEMENTS, Rays
 from jaxslam.simulation.trajectories import find
 from jaxslam.simulation.world import (
     CALIBRATIONS,
@@ -71,7 +72,9 @@ def scenario(
     """
     changes = {**(overrides or {}), **fields}
     if isinstance(name, World):
-        return _replaced(name.fields, changes)
+        return _replaced(name.fields, changes) if changes else name
+    if not isinstance(name, str | Path):
+        raise ValueError(f"a scenario is a World or the name of one, not {name!r}")
     chosen = _read(Path(name)) if str(name).endswith(".toml") else _named(str(name))
     if chosen is None:
         raise ValueError(
@@ -86,13 +89,8 @@ scenario.__doc__ = f"{scenario.__doc__}\n    Fields, each with its default:\n\n"
 )
 
 
-def as_scenario(given: World | str) -> World:
-    """A world, or the scenario of this name. Raises ValueError."""
-    if isinstance(given, World):
-        return given
-    if isinstance(given, str | Path):
-        return scenario(given)
-    raise ValueError(f"a scenario is a World or the name of one, not {given!r}")
+as_scenario = scenario
+"""The same function, where an argument is called `scenario`."""
 
 
 def parse_override(text: str) -> tuple[str, Any]:
@@ -181,15 +179,10 @@ def _world(f: dict[str, Value]) -> World:
         return own_piece(kind, word)
 
     is_camera = f["sensor"] == "camera"
-    if f["placement"] == "room" and f["landmarks"] != Cloister.landmarks:
-        raise ValueError(
-            f"placement room is for a spatial geometry and {Cloister.landmarks} landmarks, "
-            f"not {geometry.name} and {f['landmarks']}"
-        )
     prior = f["inverse_depth"]
     if prior and (len(prior) != 2 or prior[1] <= 0):
         raise ValueError(f"scenario field inverse_depth needs a mean and a σ: {prior}")
-    mean, sigma = prior or (1 / (2 * f["nearest_depth"]), 1 / (4 * f["nearest_depth"]))
+    depth = InverseDepth(*prior) if prior else InverseDepth.beyond(f["nearest_depth"])
     sigmas = (f["focal_sigma"],) * p + (f["centre_sigma"],) * p
     Rays(depth_range=f["depth_range"])  # checked where it is not used, too
     made = World(
@@ -197,7 +190,7 @@ def _world(f: dict[str, Value]) -> World:
         sensor=piece("sensor"),
         placement=piece("placement"),
         calibration=CALIBRATIONS[f["true_calibration"]](sigmas if is_camera else ()),
-        depth=InverseDepth(mean, sigma, unit=f["scale_sigma"] or None),
+        depth=replace(depth, unit=f["scale_sigma"] or None),
         trajectory=f["trajectory"] or None,
         view=FieldOfView(**values("view"), **(values("picture") if is_camera else {})),
         limits=Limits(**values("limits")),

@@ -130,22 +130,23 @@ CALIBRATIONS = {
 }
 
 
-def _count() -> Any:
-    return eqx.field(static=True, default=0)
+def count(default: int) -> Any:
+    """Return a field of a whole number, which is no data: another one makes another program."""
+    return eqx.field(static=True, default=default)
 
 
 class Limits(eqx.Module):
     """How many of the visible landmarks are measured; 0 is no limit."""
 
-    first_frame: int = _count()
+    first_frame: int = count(0)
     """Before it nothing is measured."""
-    first_landmarks: int = _count()
+    first_landmarks: int = count(0)
     """The most that are new in frame 0."""
-    new_landmarks: int = _count()
+    new_landmarks: int = count(0)
     """The most that are new in a later frame."""
-    known_landmarks: int = _count()
+    known_landmarks: int = count(0)
     """The most that are measured again in a frame, drawn at random."""
-    in_view: int = _count()
+    in_view: int = count(0)
     """The most that are measured at once, where one that leaves the view is a new one when it is
     seen again: a filter needs slots for no more."""
 
@@ -240,11 +241,11 @@ class World(eqx.Module):
     rate: Number = 10.0
     velocity: Float[AnyArray, " t"] = eqx.field(default=None, converter=optional_numbers)
     trajectory: str | RecordedMotion | None = None
-    still_frames: int = _count()
+    still_frames: int = count(0)
     view: FieldOfView = eqx.field(default=None)
     limits: Limits = Limits()
     drift: Drift | None = None
-    beacons: int = _count()
+    beacons: int = count(0)
     beacon_sigma: Number = 0.1
     treatment: str = eqx.field(static=True, default="known")
     name: str = eqx.field(static=True, default="world")
@@ -414,9 +415,7 @@ def _plain(value: Value) -> Value:
     if isinstance(value, tuple):
         return [_plain(x) for x in value]
     if isinstance(value, eqx.Module):
-        kind = type(value)
-        told = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-        return {"type": f"{kind.__module__}:{kind.__qualname__}"} | {
-            name: _plain(x) for name, x in told.items()
-        }
+        kind, fields = type(value), dataclasses.fields(value)
+        told = {field.name: _plain(getattr(value, field.name)) for field in fields}
+        return {"type": f"{kind.__module__}:{kind.__qualname__}"} | told
     return value
