@@ -132,9 +132,9 @@ def monte_carlo(
         asked = {name: kept[name] or (open_choice if backend == AUTO else backend) for name in kept}
         left, total = sum(len(c) for x in missing.values() for c in x), runs * len(filters)
         seconds = {}
-        bar = StudyBar(total, total - left) if progress is True else nullcontext(progress)
-        with bar as shown:
-            report = shown or (lambda name, runs: None)
+        told = (lambda name, runs: None) if isinstance(progress, bool) else progress
+        bar = StudyBar(total, total - left) if progress is True else nullcontext(told)
+        with bar as report:
             ahead = ThreadPoolExecutor(2)  # the next filter is compiled beside the one that runs
             try:
                 room = simulator.room(chunks, map_chunks) if left else None
@@ -145,10 +145,10 @@ def monte_carlo(
                     t.name: ahead.submit(t.settled, missing[t.name], kept[t.name]) for t in tasks
                 }
                 for name in filters:
-                    told = partial(report, name)
                     seconds[name], asked[name] = _run_filter(
-                        settled[name].result, missing[name], store, told, map_chunks
-                    )
+                        settled[name].result, missing[name], store, partial(report, name),
+                        map_chunks,
+                    )  # fmt: skip
             except KeyboardInterrupt:
                 done = sum(len(c) for name in filters for c in chunks if store.has(name, c))
                 raise Interruption(done, total, chunk, kept_in) from None

@@ -195,7 +195,7 @@ class FilterResult:
             found: Any = told
             for part in key.split("."):
                 found = found.get(part) if isinstance(found, Mapping) else None
-            return tuple(found) if key.endswith("band95") else _read(found)
+            return tuple(found or ()) if key.endswith("band95") else _read(found)
 
         paths = {path: key for key, path in _PATH_OF_KEY.items() if key != "inside"}
         return FilterResult.of({"name": name} | {path: value(paths[path]) for path in paths})

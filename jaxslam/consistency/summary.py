@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -43,6 +44,8 @@ from jaxslam.statistics.beyond_scale import SCALE, one_scale_of
 
 _VALUES_AT_ONCE = 10**7
 """The most values of a record in memory for medians: all runs, and as many steps as fit."""
+_IN_BOTH = ("runs", "seed", "dtype", "device")
+"""The attributes of a study that its results have too."""
 _OF_MEDIANS = ("nees", "log_scale", "log_scale_sigma", *SCALE)
 _FILES = {"consistency.json", "consistency.png", "consistency.pdf", "runs"}
 """The names in the folder of a study that is saved, which may be written over."""
@@ -117,15 +120,12 @@ class Study(Mapping):
         return Results(
             version=__version__,
             scenario=self.scenario.to_dict(),
-            runs=self.runs,
             medians_of=sum(map(len, self.whole)),
             scale_free=self.scenario.scale_free,
             steps=steps,
-            seed=self.seed,
-            dtype=self.dtype,
-            device=self.device,
             time=np.array([round((i + 1) / self.scenario.rate, 6) for i in range(steps)]),
-            filters={name: self[name] for name in self.filters},
+            filters=dict(self),
+            **{name: getattr(self, name) for name in _IN_BOTH},
         )
 
     def loaded(self, name: str) -> Iterator[Records]:
@@ -201,9 +201,8 @@ class Study(Mapping):
             sizes = {"chunk": len(self.chunks[0]), "reduced": self.reduced}
             filters = {name: described(slam) for name, slam in self.filters.items()}
             store.begin({**self.made_by, **sizes}, filters)
-            for name in self.filters:
-                for chunk in self.chunks:
-                    store.save(name, chunk, self.store.load(name, chunk))
+            for name, chunk in product(self.filters, self.chunks):
+                store.save(name, chunk, self.store.load(name, chunk))
             write_json(temporary / "consistency.json", self.to_json(), allow_nan=False)
             if folder.exists():
                 shutil.rmtree(folder)
@@ -222,23 +221,19 @@ class Study(Mapping):
         study = Study(
             scenario=scenario("matched", dict(told.scenario)),
             filters={name: filters.get(name) for name in told},
-            runs=told.runs,
-            seed=told.seed,
-            dtype=told.dtype,
             chunks=divided(told.runs, made_by["chunk"]),
             store=store,
             seconds={name: result.seconds for name, result in told.items()},
-            device=told.device,
             reduced=made_by["reduced"],
             backends={name: result.backend for name, result in told.items()},
             made_by=made_by,
             calibrations={name: result.calibration for name, result in told.items()},
+            **{name: getattr(told, name) for name in _IN_BOTH},
         )
-        for name in study.filters:
-            for chunk in study.chunks:
-                if not store.has(name, chunk):
-                    runs = f"runs {chunk.start} to {chunk.stop - 1} of {name}"
-                    raise ValueError(f"{store.folder} lacks {runs}; run it again with --resume")
+        for name, chunk in product(study.filters, study.chunks):
+            if not store.has(name, chunk):
+                runs = f"runs {chunk.start} to {chunk.stop - 1} of {name}"
+                raise ValueError(f"{store.folder} lacks {runs}; run it again with --resume")
         return study
 
     def __repr__(self) -> str:

@@ -13,7 +13,7 @@ from jaxslam.consistency.results import FilterResult, Nees, Results, Steps
 from jaxslam.statistics import sentences
 
 
-class Table(NamedTuple):
+class FilterTable(NamedTuple):
     """A table with a filter a row."""
 
     title: str
@@ -32,7 +32,7 @@ def as_text(results: Results) -> str:
     """Return the verdict on every filter, then the numbers of the last step, a filter a line."""
     told, wide = [], max(31, *map(len, results)) + 1
     for block in _blocks(results):
-        if isinstance(block, Table):
+        if isinstance(block, FilterTable):
             widths = [-wide, *(width for width, _ in block.columns.values())]
             rows = [zip(row, widths, strict=True) for row in block.rows(results)]
             told += ["", *("".join(map(_aligned, row)) for row in rows)]
@@ -49,7 +49,7 @@ def as_html(results: Results) -> str:
 
     told = []
     for block in _blocks(results):
-        if isinstance(block, Table):
+        if isinstance(block, FilterTable):
             head, *body = block.rows(results)
             rows = [row(head, "th"), *(row(cells, "td") for cells in body)]
             told.append(f"<table><tr>{'</tr><tr>'.join(rows)}</tr></table>")
@@ -63,7 +63,7 @@ def _aligned(cell: tuple[str, int]) -> str:
     return text.ljust(-width) if width < 0 else text.rjust(width)
 
 
-def _blocks(results: Results) -> Iterator[list[str] | Table]:
+def _blocks(results: Results) -> Iterator[list[str] | FilterTable]:
     """The paragraphs, as lines, and the tables between them."""
     for name, result in results.items():
         yield [f"{name}:", *(f"    {line}" for line in sentences(result.verdict))]
@@ -122,7 +122,7 @@ def _share(values: Steps) -> str:
     return f"{values[-1]:.1%}" if math.isfinite(values[-1]) else "–"
 
 
-_MAIN = Table("filter/landmarks", {
+_MAIN = FilterTable("filter/landmarks", {
     "NEES mean": (10, lambda r: _last(r.nees.mean, 3)),
     "95 % band": (14, lambda r: _band(r.nees)),
     "median": (8, lambda r: _last(r.nees.median, 2)),
@@ -135,7 +135,7 @@ _MAIN = Table("filter/landmarks", {
     "σ m": (8, lambda r: _last(r.sigma.position, 3)),
     "seconds": (9, lambda r: f"{r.seconds.compile + r.seconds.run:.1f}"),
 })  # fmt: skip
-_AT_ONE_SCALE = Table("at one scale a run", {
+_AT_ONE_SCALE = FilterTable("at one scale a run", {
     "NEES mean": (10, lambda r: _last(r.beyond_scale.mean, 3)),
     "95 % band": (14, lambda r: _band(r.beyond_scale)),
     "median": (8, lambda r: _last(r.beyond_scale.median, 2)),

@@ -33,7 +33,8 @@ class Field(NamedTuple):
 
     def length(self, geometry: Geometry) -> int:
         """Return how many numbers it has in a world of this geometry; 0 where any is right."""
-        return getattr(geometry, str(self.count), self.count)
+        count = self.count
+        return count if isinstance(count, int) else getattr(geometry, count)
 
     def within(self, geometry: Geometry) -> Value:
         """Return the default in a world of this geometry."""

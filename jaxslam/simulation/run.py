@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -55,16 +55,20 @@ class Run(eqx.Module):
         return jnp.broadcast_to(self.points, (*self.visible.shape, self.points.shape[-1]))
 
 
+Count = Any
+"""The type of a count: a whole number, or in a program an array of one."""
+
+
 class Room(NamedTuple):
     """The capacities of a filter that hold a run, or every run of a study."""
 
-    landmarks: int | Int[Array, ""]
+    landmarks: Count
     """The landmarks that are ever seen, or the slots that they share."""
-    first: int | Int[Array, ""]
+    first: Count
     """The landmarks of frame 0."""
-    known: int | Int[Array, ""]
+    known: Count
     """The most landmarks of one frame that were seen before."""
-    new: int | Int[Array, ""]
+    new: Count
     """The most landmarks of a later frame that are seen for the first time."""
 
     @property
