@@ -38,13 +38,6 @@ from jaxslam.simulation.world import (
 
 HANDHELD = "handheld-"
 """What a trajectory's name follows in the name of its scenario."""
-_OUTDOORS = {
-    "depth_range": (5.0, 50.0),
-    "nearest_depth": 5.0,
-    "velocity_sigma": (10.0,) * 3 + (1.0,) * 3,
-}
-_OUTDOOR_TRAJECTORIES = ("kitti_00",)
-"""Of a car on a road."""
 _WORDS: dict[str, Mapping[str, Any]] = {
     "geometry": GEOMETRIES,
     "motion": MOTIONS,
@@ -109,8 +102,8 @@ def _named(name: str) -> dict[str, Value] | None:
     if name.startswith(HANDHELD):
         trajectory = name.removeprefix(HANDHELD)
         find(trajectory)  # or say now what is known
-        numbers = _OUTDOORS if trajectory in _OUTDOOR_TRAJECTORIES else {}
-        return _FIELDS["handheld"] | {"name": name, "trajectory": trajectory} | numbers
+        fields = _FIELDS.get(name, _FIELDS["handheld"])
+        return fields | {"name": name, "trajectory": trajectory}
     return _FIELDS.get(name)
 
 
@@ -267,4 +260,6 @@ def _built_in() -> dict[str, dict[str, Value]]:
 
 
 _FIELDS = _built_in()
-BUILT_IN: dict[str, World] = {name: _world(dict(fields)) for name, fields in _FIELDS.items()}
+BUILT_IN: dict[str, World] = {
+    name: _world(dict(fields)) for name, fields in _FIELDS.items() if not name.startswith(HANDHELD)
+}
