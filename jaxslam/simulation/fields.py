@@ -67,30 +67,28 @@ def coerced(field: str, value: Value, like: Value) -> Value:
     Raises ValueError, naming the field.
     """
 
-    def wrong(wanted: str) -> ValueError:
-        return ValueError(f"scenario field {field} must be {wanted}, not {value!r}")
+    def check(right: bool, wanted: str) -> None:
+        if not right:
+            raise ValueError(f"scenario field {field} must be {wanted}, not {value!r}")
 
     value = value.tolist() if isinstance(value, np.ndarray) else value
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if field in OWN and not isinstance(value, int | float | list | tuple):
         return value
     if isinstance(like, str):
-        if not isinstance(value, str):
-            raise wrong("a word")
+        check(isinstance(value, str), "a word")
         return value
     if field in ROWS and isinstance(like, tuple):
-        if not isinstance(value, list | tuple) or any(is_alone(row) for row in value):
-            raise wrong("a list of " + ("points" if field == "points" else "[low, high] pairs"))
+        rows = "a list of " + ("points" if field == "points" else "[low, high] pairs")
+        check(not is_alone(value) and not any(map(is_alone, value)), rows)
         return tuple(tuple(coerced(field, x, 0.0) for x in row) for row in value)
     if isinstance(like, tuple):
-        values = [value] if is_alone(value) else value
-        return tuple(coerced(field, number, 0.0) for number in values)
-    if not is_number:
-        raise wrong("a number")
-    if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
-        raise wrong(f"a number up to {LARGEST_WHOLE}")
-    if isinstance(like, int) and value != int(value if math.isfinite(value) else 0):
-        raise wrong("a whole number")
+        return tuple(coerced(field, x, 0.0) for x in ([value] if is_alone(value) else value))
+    check(isinstance(value, int | float) and not isinstance(value, bool), "a number")
+    whole = f"a number up to {LARGEST_WHOLE}"
+    check(isinstance(value, float) or abs(value) <= LARGEST_WHOLE, whole)
+    check(
+        isinstance(like, float) or (math.isfinite(value) and value == int(value)), "a whole number"
+    )
     return type(like)(value)
 
 
