@@ -10,7 +10,7 @@ import inspect
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache, cached_property, partial
 from importlib.metadata import PackageNotFoundError, packages_distributions, version
 from importlib.util import find_spec
@@ -244,7 +244,7 @@ def _digest(code: CodeType) -> str:
     return digest.hexdigest()
 
 
-_RULES: tuple[tuple[Any, Callable[[Callable[[object], Any], Any], Any]], ...] = (
+_RULES: tuple[tuple, ...] = (
     (str | bool | int | float | None, lambda of, x: x),
     (os.PathLike, lambda of, x: os.fspath(x)),
     (np.ndarray | np.generic | jax.Array, lambda of, x: _array(x)),

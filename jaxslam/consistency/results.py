@@ -178,7 +178,7 @@ class FilterResult:
         return self.nees.lost
 
     @staticmethod
-    def of(values: Mapping[str, Any]) -> FilterResult:
+    def of(values: Mapping[str, object]) -> FilterResult:
         """Return the results with these values at their paths, such as `nees.mean`."""
         found = _nested(values)
         return FilterResult(**found | {x: kind(**found[x]) for x, kind in _PARTS.items()})
@@ -192,7 +192,7 @@ class FilterResult:
         """Return the results of which `to_json` made this; what an older version lacks is None."""
 
         def value(key: str) -> Any:
-            found: Any = told
+            found: object = told
             for part in key.split("."):
                 found = found.get(part) if isinstance(found, Mapping) else None
             return tuple(found or ()) if key.endswith("band95") else _read(found)
@@ -228,9 +228,9 @@ _PATH_OF_KEY = {key: path or key for key, _, path in (x.partition("=") for x in 
 """The path in a `FilterResult` of every key of JSON."""
 
 
-def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
+def _nested(values: Mapping[str, object]) -> dict:
     """Dictionaries in dictionaries, of names with dots."""
-    found: dict[str, Any] = {}
+    found: dict = {}
     for name, value in values.items():
         *outer, last = name.split(".")
         place = found

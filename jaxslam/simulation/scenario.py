@@ -38,7 +38,7 @@ from jaxslam.simulation.world import (
 
 HANDHELD = "handheld-"
 """What a trajectory's name follows in the name of its scenario."""
-_WORDS: dict[str, Mapping[str, Any]] = {
+_WORDS: dict[str, Mapping] = {
     "geometry": GEOMETRIES,
     "motion": MOTIONS,
     "sensor": SENSORS,
