@@ -27,7 +27,7 @@ from jaxslam.consistency import CHUNK, MemoryStore, Seconds, Study, check_sizes,
 from jaxslam.filters.protocol import AbstractFilter
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.sensors import Pinhole
-from jaxslam.simulation import Room, Run, Scenario, Sightings, sightings, simulate
+from jaxslam.simulation import Room, Run, Scenario, sightings, simulate
 from jaxslam.simulation.world import CALIBRATIONS
 from jaxslam.statistics import mean_band, normalised_squared
 from jaxslam.statistics.verdict import LOST_BOUND
@@ -91,7 +91,7 @@ class CalibrationStudy(Benchmark):
         write_page(self.docs / "calibration.md", page(results))
 
 
-def draw(scenario: Scenario, options: CalibrationStudy) -> list[tuple[Run, Sightings]]:
+def draw(scenario: Scenario, options: CalibrationStudy) -> list[tuple[Run, Room]]:
     """Chunks of runs, and what they see at the most."""
     key = jax.random.key(options.seed)
 

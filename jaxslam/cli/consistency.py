@@ -100,18 +100,10 @@ class ConsistencyOptions:
         with logging_redirect_tqdm([log]):
             try:
                 return monte_carlo(
-                    world,
-                    filters,
-                    runs=self.runs,
-                    seed=self.seed,
-                    dtype=self.dtype,
-                    chunk=self.chunk,
-                    backend=self.backend,
-                    store=store,
-                    progress=True,
-                    cluster=self.cluster,
-                    reduced=self.reduce,
-                )
+                    world, filters, runs=self.runs, seed=self.seed, dtype=self.dtype,
+                    chunk=self.chunk, backend=self.backend, store=store, progress=True,
+                    cluster=self.cluster, reduced=self.reduce,
+                )  # fmt: skip
             except Interruption as end:
                 again = "the same command" + ("" if self.resume else " with --resume")
                 told = end.told(f"{self.out}", f"{again} goes on from there", "a smaller --chunk")

@@ -10,28 +10,8 @@ from jaxslam.consistency.suite import read_suite, write_suite
 from jaxslam.consistency.summary import Study, summarise, table, tally, treatment
 
 __all__ = [
-    "BACKENDS",
-    "CHUNK",
-    "DTYPES",
-    "FilterResult",
-    "FolderStore",
-    "MemoryStore",
-    "Results",
-    "Seconds",
-    "SimulatedFrame",
-    "Study",
-    "Summary",
-    "check_sizes",
-    "draw",
-    "filter_run",
-    "log_likelihood",
-    "monte_carlo",
-    "read_suite",
-    "run_through",
-    "scale_records",
-    "summarise",
-    "table",
-    "tally",
-    "treatment",
-    "write_suite",
-]
+    "BACKENDS", "CHUNK", "DTYPES", "FilterResult", "FolderStore", "MemoryStore", "Results",
+    "Seconds", "SimulatedFrame", "Study", "Summary", "check_sizes", "draw", "filter_run",
+    "log_likelihood", "monte_carlo", "read_suite", "run_through", "scale_records", "summarise",
+    "table", "tally", "treatment", "write_suite",
+]  # fmt: skip

@@ -34,7 +34,7 @@ LARGEST = 200
 FIRST_RUNS = 8
 """The runs that XLA computes too before it is believed; two, where all are not 64 times as many."""
 AGREEMENT = {"float64": 1e-6, "float32": 3e-2}
-"""Of a record's largest value in these runs: the most by which the backends may differ."""
+"""The most by which the backends may differ, as a share of a record's largest value."""
 CACHE = 3 * 2**19
 """The bytes of covariances that a processor works on: about what its second cache holds."""
 

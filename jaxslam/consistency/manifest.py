@@ -68,30 +68,9 @@ class _Description:
         """What was described, kept alive so that nothing else gets the same id."""
 
     def of(self, value: object) -> Any:
-        if isinstance(value, str | bool | int | float | None):
-            return value
-        if isinstance(value, os.PathLike):
-            return os.fspath(value)
-        if isinstance(value, np.ndarray | np.generic | jax.Array):
-            if jax.dtypes.issubdtype(value.dtype, jax.dtypes.prng_key):
-                value = jax.random.key_data(jnp.asarray(value))
-            return _array(np.asarray(value))
-        if isinstance(value, Mapping):
-            return {str(key): self.of(x) for key, x in value.items()}
-        if isinstance(value, tuple | list | range):
-            return [self.of(x) for x in value]
-        if isinstance(value, bytes | complex | slice | np.dtype):
-            return repr(value)
-        if isinstance(value, set | frozenset):
-            return sorted(map(repr, value))
-        if isinstance(value, partial):
-            return [self.of(x) for x in (value.func, value.args, value.keywords)]
-        if isinstance(value, ModuleType):
-            return value.__name__
-        if isinstance(value, MethodType):
-            return [self.of(value.__self__), self.of(value.__func__)]
-        if isinstance(value, BuiltinFunctionType | np.ufunc):
-            return _in_c(value)
+        for kinds, told in _RULES:
+            if isinstance(value, kinds):
+                return told(self.of, value)
         if isinstance(value, type):
             return self._class(value)
         if isinstance(value, FunctionType) or _wraps_function(value):
@@ -109,7 +88,7 @@ class _Description:
             fields = {f.name: getattr(value, f.name, None) for f in dataclasses.fields(value)}
             return {"type": self._class(kind), **self.of(fields)}
         fields = {} if _package(kind.__module__) == PYTHON else getattr(value, "__dict__", {})
-        if not fields and callable(value) and not _called_by_class(kind):
+        if not fields and callable(value) and not isinstance(kind.__call__, FunctionType):
             return {"type": _name(kind), UNSEEN: f"{getattr(value, '__name__', _name(kind))}(…)"}
         first = self._first_time(value)
         return {"type": self._class(kind), **(self.of(fields) if first else {})}
@@ -126,7 +105,7 @@ class _Description:
         return {
             "name": kind.__qualname__,
             "members": {
-                name: self.of(_function_of(member))
+                name: self.of(member)
                 for name, member in members.items()
                 if name != "_abc_impl" and (not name.startswith("__") or name in _OPERATORS)
             },
@@ -136,7 +115,7 @@ class _Description:
         rules = [getattr(given, name, None) for name in ("jvp", "fwd", "bwd")]  # of `custom_jvp`
         function = inspect.unwrap(given)
         package, name = _package(function.__module__), _name(function)
-        closed = [self.of(_content(cell)) for cell in function.__closure__ or ()]
+        closed = self.of(function.__closure__ or ())
         told: dict[str, Any] = {"name": name, "code": _digest(function.__code__), "closed": closed}
         if package is not None:
             versioned = name if package in _NAMED else [name, package]
@@ -184,20 +163,6 @@ def _wraps_function(value: object) -> bool:
     """Whether it is a function that a decorator made, as `jax.jit`."""
     wrapped = getattr(value, "__wrapped__", None)
     return callable(value) and isinstance(wrapped, FunctionType) and not isinstance(value, type)
-
-
-def _called_by_class(kind: type) -> bool:
-    """Whether the call of its instances is code in Python, which is described with the class."""
-    return isinstance(kind.__call__, FunctionType)
-
-
-def _function_of(member: object) -> Any:
-    """The function behind a member of a class."""
-    if isinstance(member, property):
-        return [member.fget, member.fset]
-    if isinstance(member, cached_property):
-        return member.func
-    return member.__func__ if isinstance(member, staticmethod | classmethod) else member
 
 
 def _content(cell: CellType) -> Any:
@@ -260,7 +225,9 @@ def _name(value: type | FunctionType) -> str:
     return f"{value.__module__}.{value.__qualname__}"
 
 
-def _array(x: np.ndarray) -> Any:
+def _array(value: Any) -> Any:
+    is_key = jax.dtypes.issubdtype(value.dtype, jax.dtypes.prng_key)
+    x = np.asarray(jax.random.key_data(jnp.asarray(value)) if is_key else value)
     if x.size <= MOST_NUMBERS and x.dtype.kind in "fiub":
         return x.tolist()
     told = hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest()
@@ -275,3 +242,23 @@ def _digest(code: CodeType) -> str:
         told = _digest(constant) if isinstance(constant, CodeType) else repr(constant)
         digest.update(told.encode())
     return digest.hexdigest()
+
+
+_RULES: tuple[tuple, ...] = (
+    (str | bool | int | float | None, lambda of, x: x),
+    (os.PathLike, lambda of, x: os.fspath(x)),
+    (np.ndarray | np.generic | jax.Array, lambda of, x: _array(x)),
+    (Mapping, lambda of, x: {str(key): of(y) for key, y in x.items()}),
+    (tuple | list | range, lambda of, x: [of(y) for y in x]),
+    (bytes | complex | slice | np.dtype, lambda of, x: repr(x)),
+    (set | frozenset, lambda of, x: sorted(map(repr, x))),
+    (partial, lambda of, x: of([x.func, x.args, x.keywords])),
+    (ModuleType, lambda of, x: x.__name__),
+    (MethodType, lambda of, x: of([x.__self__, x.__func__])),
+    (BuiltinFunctionType | np.ufunc, lambda of, x: _in_c(x)),
+    (CellType, lambda of, x: of(_content(x))),
+    (property, lambda of, x: of([x.fget, x.fset])),
+    (cached_property, lambda of, x: of(x.func)),
+    (staticmethod | classmethod, lambda of, x: of(x.__func__)),
+)
+"""What is said of values that are neither classes nor functions of the user's nor instances."""

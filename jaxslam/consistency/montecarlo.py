@@ -11,9 +11,9 @@ import logging
 import os
 import time
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import nullcontext
 from functools import partial
 from numbers import Integral
 from typing import Any, NamedTuple, TypeVar
@@ -77,18 +77,18 @@ def monte_carlo(
 ) -> Study:
     """Run every filter on the same simulated runs.
 
-    The runs are the scenario's, which may be given by name; with a `motion` (or a `RecordedMotion`)
-    or a `sensor` of one's own the truth moves, or is measured, as that says, in the scenario's
+    The runs are the scenario's, which may be given by name. With a `motion` (or a `RecordedMotion`)
+    or a `sensor` of your own the truth moves, or is measured, as that says, in the scenario's
     world. Filters are given by name, as `make_filters` returns them; a list of words makes those of
     the scenario, as `robocentric`, which has Inverse Scaling, or `robocentric/inverse_depth`. One
     filter has one set of numbers; several that differ in numbers alone share a program.
 
     With `progress=True` a bar shows how far it is. Or `progress(filter name, finished runs)` is
-    called after every chunk, and with no runs twice: when the filter is to be compiled, and when it
-    is (not with a `cluster`). An `Interruption` is raised at once, and leaves in `store` the chunks
+    called after every chunk, and with no runs twice: before the filter is compiled and after it
+    (not with a `cluster`). An `Interruption` is raised at once, and leaves in `store` the chunks
     that are finished. Chunks that `store` already has are not run again; it is given what decides
     them, and refuses what differs. A `chunk` is the runs that are computed and kept together: by
-    default those of the store, or so many that every processor has several, `CHUNK` at the most.
+    default those of the store, or so many that every processor has several, at most `CHUNK`.
 
     With a `cluster`, the address of a Dask scheduler or a `distributed.Client`, the chunks are
     computed there and kept here; their seconds are of all together, compilation among them.
@@ -132,7 +132,9 @@ def monte_carlo(
         asked = {name: kept[name] or (open_choice if backend == AUTO else backend) for name in kept}
         left, total = sum(len(c) for x in missing.values() for c in x), runs * len(filters)
         seconds = {}
-        with _reporting(progress, total, total - left) as report:
+        told = (lambda name, runs: None) if isinstance(progress, bool) else progress
+        bar = StudyBar(total, total - left) if progress is True else nullcontext(told)
+        with bar as report:
             ahead = ThreadPoolExecutor(2)  # the next filter is compiled beside the one that runs
             try:
                 room = simulator.room(chunks, map_chunks) if left else None
@@ -143,10 +145,10 @@ def monte_carlo(
                     t.name: ahead.submit(t.settled, missing[t.name], kept[t.name]) for t in tasks
                 }
                 for name in filters:
-                    told = partial(report, name)
                     seconds[name], asked[name] = _run_filter(
-                        settled[name].result, missing[name], store, told, map_chunks
-                    )
+                        settled[name].result, missing[name], store, partial(report, name),
+                        map_chunks,
+                    )  # fmt: skip
             except KeyboardInterrupt:
                 done = sum(len(c) for name in filters for c in chunks if store.has(name, c))
                 raise Interruption(done, total, chunk, kept_in) from None
@@ -166,26 +168,23 @@ class Interruption(KeyboardInterrupt):
         super().__init__(kept, total, chunk, store)
         self.kept, self.total, self.chunk, self.store = kept, total, chunk, store
 
-    def told(self, where: str, again: str, smaller: str) -> str:
+    def told(self, where: object, again: str, smaller: str) -> str:
         """Return what is kept `where`, and what to do: run `again`, or with `smaller` chunks."""
         if self.kept:
             return f"{self.kept} of {self.total} runs are kept in {where}; {again}"
+        nothing = f"nothing of {self.total} is kept in {where}"
         if self.chunk == 1:
-            return f"no run was finished, so that nothing of {self.total} is kept in {where}"
-        return (
-            f"no chunk of {self.chunk} runs was finished, so that nothing of {self.total} is kept "
-            f"in {where}; with {smaller} the first runs are kept sooner"
-        )
+            return f"no run was finished, so that {nothing}"
+        none = f"no chunk of {self.chunk} runs was finished, so that {nothing}"
+        return f"{none}; with {smaller} the first runs are kept sooner"
 
     def __str__(self) -> str:
-        smaller = f"a chunk smaller than {self.chunk}"
         if self.store is None:
-            return (
-                f"{self.kept} of {self.total} runs were finished, and are not kept; with a "
-                f"FolderStore they would be"
-            )
+            done = f"{self.kept} of {self.total} runs were finished"
+            return f"{done}, and are not kept; with a FolderStore they would be"
+        again = "the same study with this store goes on from there"
         where = getattr(self.store, "folder", "the store")
-        return self.told(f"{where}", "the same study with this store goes on from there", smaller)
+        return self.told(where, again, f"a chunk smaller than {self.chunk}")
 
 
 def _as_filters(scenario: Scenario, filters: Any) -> Mapping[str, AbstractFilter]:
@@ -239,21 +238,6 @@ def _chunk(runs: int, store: Store, client: Any, seconds: float, *, reduced: boo
     return chunk
 
 
-@contextmanager
-def _reporting(
-    progress: Callable[[str, int], None] | bool, total: int, done: int
-) -> Generator[Callable[[str, int], None]]:
-    """What is to be called with a filter's name and its finished runs: a bar, for True."""
-    if not isinstance(progress, bool):
-        yield progress
-        return
-    if not progress:
-        yield lambda name, runs: None
-        return
-    with StudyBar(total, done) as bar:
-        yield bar
-
-
 def draw(
     scenario: Scenario, runs: int, *, seed: int = 0, dtype: str = "float64"
 ) -> tuple[Room, Run]:
@@ -279,16 +263,17 @@ class ChunkTask(NamedTuple):
     reduced: bool = False
 
     def __call__(self, chunk: range) -> Records:
-        with jax.enable_x64(self.simulator.dtype == "float64"):  # a thread's own
+        with self.simulator.precision():
             batch, _ = self.simulator(chunk)
             where = f"{self.name}, runs {chunk.start} to {chunk.stop - 1}"
             found = self.program(batch)(np.int32(len(chunk)))
             records, sample = jax.device_get(finished(found, where))
         records = {key: np.asarray(value)[: len(chunk)] for key, value in records.items()}
-        label = {NATIVE: np.array(self.backend == "native")}
         if keeps_records(chunk, self.reduced):
-            return {**records, **{f"sample_{k}": v for k, v in sample.items()}, **label}
-        return {**as_sums(records, batch.poses.tangent_dim), **label}
+            records |= {f"sample_{k}": v for k, v in sample.items()}
+        else:
+            records = as_sums(records, batch.poses.tangent_dim)
+        return {**records, NATIVE: np.array(self.backend == "native")}
 
     def settled(self, chunks: list[range], kept: str | None) -> ChunkTask:
         """Return the task with the backend that is to compute these chunks, beside some kept.
@@ -297,7 +282,7 @@ class ChunkTask(NamedTuple):
         """
         if self.backend == "xla" or not chunks:
             return self
-        with jax.enable_x64(self.simulator.dtype == "float64"):  # a thread's own
+        with self.simulator.precision():
             batch, count = self.simulator(chunks[0])[0], sum(map(len, chunks))
             found = chosen(self.backend, self.name, count, *self._pieces(), batch)
         if kept not in (None, found):
@@ -306,7 +291,7 @@ class ChunkTask(NamedTuple):
 
     def compile(self, chunk: range) -> None:
         """Compile the program for chunks of this size."""
-        with jax.enable_x64(self.simulator.dtype == "float64"):
+        with self.simulator.precision():
             self.program(self.simulator(chunk)[0])
 
     def program(self, batch: Run) -> BatchProgram:
@@ -381,10 +366,11 @@ def processors() -> int:
 
 def check_sizes(runs: Any, seed: Any, dtype: str, chunk: Any) -> None:
     """Raise ValueError for sizes that are no whole numbers or make no sense."""
-    for name, value in (("runs", runs), ("chunk", chunk), ("seed", seed)):
+    sizes = (("runs", runs), ("chunk", chunk), ("seed", seed))
+    for name, value in sizes:
         if not isinstance(value, Integral):
             raise ValueError(f"{name} must be a whole number, not {value!r}")
-    for name, value in (("runs", runs), ("chunk", chunk)):
+    for name, value in sizes[:2]:
         if not 1 <= value <= MOST_RUNS:
             least = "at least 1" if value < 1 else f"at most {MOST_RUNS}"
             raise ValueError(f"{name} must be {least}, not {value}")

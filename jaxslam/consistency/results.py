@@ -162,6 +162,12 @@ class FilterResult:
     """The time that it took."""
 
     @property
+    def series(self) -> dict[str, Steps]:
+        """The numbers of every step, called as in JSON but with _ between parts."""
+        values = {key: attrgetter(path)(self) for key, path in _PATH_OF_KEY.items()}
+        return {k.replace(".", "_"): x for k, x in values.items() if isinstance(x, np.ndarray)}
+
+    @property
     def verdict(self) -> Verdict:
         """The verdict on the NEES of the pose."""
         return self.nees.verdict
@@ -171,84 +177,67 @@ class FilterResult:
         """The share of runs that are lost at each step, diverged ones too."""
         return self.nees.lost
 
+    @staticmethod
+    def of(values: Mapping[str, object]) -> FilterResult:
+        """Return the results with these values at their paths, such as `nees.mean`."""
+        found = _nested(values)
+        return FilterResult(**found | {x: kind(**found[x]) for x, kind in _PARTS.items()})
+
     def to_json(self) -> dict[str, Any]:
         """Return what `consistency.json` says of the filter."""
-        told: dict[str, Any] = {}
-        for key, path in _PATH_OF_KEY.items():
-            *outer, last = key.split(".")
-            place = told
-            for name in outer:
-                place = place.setdefault(name, {})
-            place[last] = _plain(attrgetter(path)(self))
-        return told
+        return _nested({key: _plain(attrgetter(path)(self)) for key, path in _PATH_OF_KEY.items()})
 
     @staticmethod
     def from_json(name: str, told: Mapping[str, Any]) -> FilterResult:
         """Return the results of which `to_json` made this; what an older version lacks is None."""
-        found: dict[str, Any] = {"name": name}
-        for key, path in _PATH_OF_KEY.items():
-            value: object = told
+
+        def value(key: str) -> Any:
+            found: object = told
             for part in key.split("."):
-                value = value.get(part) if isinstance(value, Mapping) else None
-            *outer, last = path.split(".")
-            place = found
-            for part in outer:
-                place = place.setdefault(part, {})
-            place[last] = _read(value)
-        del found["nees"]["inside"]
-        for part in ("nees", "beyond_scale"):
-            found[part]["band"] = tuple(found[part]["band"])
-        parts = {part: kind(**found[part]) for part, kind in _KIND_OF_PART.items()}
-        return FilterResult(**{**found, **parts})
+                found = found.get(part) if isinstance(found, Mapping) else None
+            return tuple(found or ()) if key.endswith("band95") else _read(found)
+
+        paths = {path: key for key, path in _PATH_OF_KEY.items() if key != "inside"}
+        return FilterResult.of({"name": name} | {path: value(paths[path]) for path in paths})
 
     def __repr__(self) -> str:
         last = f"NEES {self.nees.mean[-1]:.4g}, RMSE {self.rmse.position[-1]:.3g} m"
         return f"<{self.name}: {self.verdict.word}; {last} at the last step>"
 
 
-_KIND_OF_PART: dict[str, Callable[..., Any]] = {
+_PARTS: dict[str, Callable[..., Any]] = {
     "nees": Nees, "nis": Nis, "rmse": Parts, "sigma": Parts, "outside3sigma": Parts,
     "beyond_scale": Nees, "scale_drift": ScaleDrift, "log_scale": LogScale,
     "landmark_nees": LandmarkNees, "seconds": Seconds,
 }  # fmt: skip
+_KEYS = (
+    "verdict=nees.verdict", "dof=nees.dof", "calibration", "survivors", "band95=nees.band",
+    "nees=nees.mean", "nees_median=nees.median", "nees_not_lost=not_lost", "lost=nees.lost",
+    "lost_ever", "inside=nees.inside", "nis=nis.mean", "nis_dof=nis.dof", "rmse.position",
+    "rmse.orientation", "sigma.position", "sigma.orientation", "outside3sigma.position",
+    "outside3sigma.orientation", "beyond_scale.dof", "beyond_scale.band95=beyond_scale.band",
+    "beyond_scale.nees=beyond_scale.mean", "beyond_scale.nees_median=beyond_scale.median",
+    "beyond_scale.lost", "beyond_scale.verdict", "scale_drift.rms", "scale_drift.sigma",
+    "scale_drift.normalised_rms", "scale_drift.runs", "scale_drift.verdict", "log_scale.error_rms",
+    "log_scale.error_median", "log_scale.sigma", "log_scale.sigma_median",
+    "log_scale.normalised_rms", "reversed", "landmark_nees=landmark_nees.mean",
+    "landmark_dof=landmark_nees.dof", "landmark_not_finite=landmark_nees.not_finite", "diverged",
+    "status", "backend", "seconds.compile", "seconds.run",
+)  # fmt: skip
+_PATH_OF_KEY = {key: path or key for key, _, path in (x.partition("=") for x in _KEYS)}
+"""The path in a `FilterResult` of every key of JSON."""
 
 
-def _same(part: str, *names: str) -> dict[str, str]:
-    return {f"{part}.{name}": f"{part}.{name}" for name in names}
-
-
-_OF_NEES = {"dof": "dof", "band95": "band", "nees": "mean", "nees_median": "median", "lost": "lost"}
-_PATH_OF_KEY = {
-    "verdict": "nees.verdict",
-    "dof": "nees.dof",
-    "calibration": "calibration",
-    "survivors": "survivors",
-    "band95": "nees.band",
-    "nees": "nees.mean",
-    "nees_median": "nees.median",
-    "nees_not_lost": "not_lost",
-    "lost": "nees.lost",
-    "lost_ever": "lost_ever",
-    "inside": "nees.inside",
-    "nis": "nis.mean",
-    "nis_dof": "nis.dof",
-    **_same("rmse", "position", "orientation"),
-    **_same("sigma", "position", "orientation"),
-    **_same("outside3sigma", "position", "orientation"),
-    **{f"beyond_scale.{key}": f"beyond_scale.{name}" for key, name in _OF_NEES.items()},
-    "beyond_scale.verdict": "beyond_scale.verdict",
-    **_same("scale_drift", "rms", "sigma", "normalised_rms", "runs", "verdict"),
-    **_same("log_scale", "error_rms", "error_median", "sigma", "sigma_median", "normalised_rms"),
-    "reversed": "reversed",
-    "landmark_nees": "landmark_nees.mean",
-    "landmark_dof": "landmark_nees.dof",
-    "landmark_not_finite": "landmark_nees.not_finite",
-    "diverged": "diverged",
-    "status": "status",
-    "backend": "backend",
-    **_same("seconds", "compile", "run"),
-}
-"""The attribute of a `FilterResult` for every key of JSON."""
+def _nested(values: Mapping[str, object]) -> dict:
+    """Dictionaries in dictionaries, of names with dots."""
+    found: dict = {}
+    for name, value in values.items():
+        *outer, last = name.split(".")
+        place = found
+        for part in outer:
+            place = place.setdefault(part, {})
+        place[last] = value
+    return found
 
 
 def _plain(value: object) -> Any:

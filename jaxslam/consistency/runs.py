@@ -34,7 +34,7 @@ class SimulatedFrame(NamedTuple):
     """The data that a filter is given of a frame after frame 0, and the truth; or of all frames."""
 
     control: Control
-    """The motion model's: seconds, the odometry's reading, …"""
+    """The control of the motion model, such as seconds or the reading of an odometry."""
     seen: Features
     """The features of landmarks in the map."""
     new: Features
@@ -70,14 +70,18 @@ def filter_run(
 ) -> tuple[dict[str, Array], Pose, Belief]:
     """Return the records of every step of a simulated run, the estimated path, the last state.
 
-    The records hold, per step: `nees` of the pose; the `log_scale` of the truth at which it is the
-    least, and the `log_scale_sigma` that the filter claims of it, with the metre in doubt; the same
-    of the pose in the filter's own unit, `beyond_scale`, `unit_log_scale`, `unit_log_scale_sigma`,
-    from which `one_scale` makes NEES at one scale a run, and whether that unit is fixed yet;
-    whether the displacement is `reversed`, NaN without one; `nis` and `nis_dof`; the update's
-    `status`; `error` and `variance` of the camera's position (in camera axes) and orientation; the
-    mean `landmark_nees` of the landmarks seen, in the sensor's chart, where it is finite, their
-    number, and of how many it is not.
+    The records of every step are:
+
+    - `nees`: the NEES of the pose;
+    - `log_scale`: the scale of the truth at which it is least; `log_scale_sigma`: the σ that the
+      filter claims of it, with the metre in doubt;
+    - `beyond_scale`, `unit_log_scale`, `unit_log_scale_sigma`: the same in the filter's own unit,
+      from which `one_scale` makes NEES at one scale per run; `unit_fixed`: whether it has a unit;
+    - `reversed`: whether the displacement points away from the truth, NaN without one;
+    - `nis`, `nis_dof`, `status`: what the update reports;
+    - `error`, `variance`: those of the camera's position, in camera axes, and orientation;
+    - `landmark_nees`: the mean of the landmarks seen, in the sensor's chart, where it is finite;
+      `landmark_count`: their number; `landmark_not_finite`: of how many it is not.
     """
 
     def records_and_pose(state, innovation, frame: SimulatedFrame):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -22,7 +23,6 @@ from jaxslam.simulation import (
     RecordedMotion,
     Room,
     Run,
-    Sightings,
     World,
     as_data,
     sightings,
@@ -73,15 +73,19 @@ class Simulator:
         """Pickle for another machine, which has no file of a trajectory, and makes its own key."""
         return Simulator, self._given
 
-    def __call__(self, chunk: range) -> tuple[Run, Sightings]:
+    def __call__(self, chunk: range) -> tuple[Run, Room]:
         """Return the chunk's runs, padded to `size` by the runs that follow."""
         indices = chunk.start + jnp.arange(self.size)
         return _draw(self._world, self._key, indices)
 
-    def max_sightings(self, chunk: range) -> Sightings:
+    def max_sightings(self, chunk: range) -> Room:
         """Return the most that any of the chunk's runs sees."""
-        with jax.enable_x64(self.dtype == "float64"):  # a thread's own
+        with self.precision():
             return jax.tree.map(np.max, jax.device_get(self(chunk)[1]))
+
+    def precision(self) -> AbstractContextManager[None]:
+        """Return a context in which JAX has the precision of the runs, which is a thread's own."""
+        return jax.enable_x64(self.dtype == "float64")
 
     def room(self, chunks: tuple[range, ...], map_chunks: MapChunks) -> Room:
         """Return the room that holds every run of the study.
@@ -100,7 +104,7 @@ def _rounded_up(count: int) -> int:
 
 
 @partial(Program, options=BATCHED)
-def _draw(world: World, key: Array, indices: Int[Array, " runs"]) -> tuple[Run, Sightings]:
+def _draw(world: World, key: Array, indices: Int[Array, " runs"]) -> tuple[Run, Room]:
     def one(index):
         run = simulate(world, jax.random.fold_in(key, index))
         return run, sightings(run)

@@ -82,8 +82,8 @@ class FolderStore:
         if self._path.exists():
             found = read_json(self._path, "manifest", _as_manifest)
             if resume:
-                given = self.manifest["given"]
-                _check_same(self._made, found["given"], given, _ANOTHER_FOLDER)
+                if told := difference(found["given"], self.manifest["given"]):
+                    raise ValueError(f"{self._made} made with another {told}; {_ANOTHER_FOLDER}")
                 self.manifest = found
             for path in self._own(found, unfinished=resume):
                 path.unlink(missing_ok=True)
@@ -104,17 +104,18 @@ class FolderStore:
     def begin(self, made_by: Manifest, filters: Manifest) -> None:
         joined = _joined(self._made, self.manifest, made_by, filters, _ANOTHER_FOLDER)
         for name in filters.keys() - self.manifest["filters"].keys():
-            self._check_free(name)
-        self._keep(joined)
+            for path in _chunks(self.folder / _folder_of(name)):
+                raise ValueError(f"{path} is of no study that is kept here; use another folder")
+        if joined != self.manifest:  # before the chunks it names: others are not its study's
+            write_json(self._path, joined)
+            self.manifest = joined
 
     def has(self, filter_name: str, chunk: range) -> bool:
         return filter_name in self.manifest["filters"] and self._chunk(filter_name, chunk).exists()
 
     def save(self, filter_name: str, chunk: range, records: Records) -> None:
         if filter_name not in self.manifest["filters"]:
-            self._check_free(filter_name)
-            named = {**self.manifest["filters"], filter_name: None}
-            self._keep({**self.manifest, "filters": named})
+            self.begin(self.manifest["made_by"], {filter_name: None})
         path = self._chunk(filter_name, chunk)
         path.parent.mkdir(parents=True, exist_ok=True)
         with write_atomically(path) as temporary, temporary.open("wb") as file:
@@ -132,17 +133,6 @@ class FolderStore:
     @property
     def _made(self) -> str:
         return f"cannot resume: {self._path} was"
-
-    def _check_free(self, filter_name: str) -> None:
-        """Raise ValueError for files in the places of a filter's chunks that no manifest names."""
-        for path in _chunks(self.folder / _folder_of(filter_name)):
-            raise ValueError(f"{path} is of no study that is kept here; use another folder")
-
-    def _keep(self, manifest: Manifest) -> None:
-        """Keep a manifest before the chunks it names: what it does not name is not its study's."""
-        if manifest != self.manifest:
-            write_json(self._path, manifest)
-            self.manifest = manifest
 
     def _own(self, manifest: Manifest, *, unfinished: bool) -> list[Path]:
         """The files of a manifest's chunks, or only those that a killed process left unfinished."""
@@ -202,20 +192,17 @@ def _as_manifest(found: Any) -> Manifest:
     return found
 
 
-def _check_same(what: str, then: Manifest, now: Manifest, advice: str) -> None:
-    if told := difference(then, now):
-        raise ValueError(f"{what} made with another {told}; {advice}")
-
-
 def _joined(
     what: str, kept: Manifest, made_by: Manifest, filters: Manifest, advice: str
 ) -> Manifest:
     """What is kept with a study joined to it. Raises ValueError for one that is made otherwise, or
     a filter that has the name of another one."""
     made_by, filters = _as_json(made_by), _as_json(filters)
-    if kept["made_by"]:
-        _check_same(what, kept["made_by"], made_by, advice)
-    for name in kept["filters"].keys() & filters.keys():
-        if told := difference(kept["filters"][name], filters[name]):
-            raise ValueError(f"{what} made with another filter {name}: {told}; {advice}")
+    pairs = [("", kept["made_by"] or made_by, made_by)] + [
+        (f"filter {name}: ", kept["filters"][name], filters[name])
+        for name in kept["filters"].keys() & filters.keys()
+    ]
+    for where, then, now in pairs:
+        if told := difference(then, now):
+            raise ValueError(f"{what} made with another {where}{told}; {advice}")
     return {**kept, "made_by": made_by, "filters": {**kept["filters"], **filters}}

@@ -8,8 +8,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
+from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -19,13 +20,7 @@ from jaxslam._runtime.lookup import suggestion
 from jaxslam.consistency.manifest import Manifest, described
 from jaxslam.consistency.results import (
     FilterResult,
-    LandmarkNees,
-    LogScale,
-    Nees,
-    Nis,
-    Parts,
     Results,
-    ScaleDrift,
     Seconds,
     Summary,
     named,
@@ -49,6 +44,8 @@ from jaxslam.statistics.beyond_scale import SCALE, one_scale_of
 
 _VALUES_AT_ONCE = 10**7
 """The most values of a record in memory for medians: all runs, and as many steps as fit."""
+_IN_BOTH = ("runs", "seed", "dtype", "device")
+"""The attributes of a study that its results have too."""
 _OF_MEDIANS = ("nees", "log_scale", "log_scale_sigma", *SCALE)
 _FILES = {"consistency.json", "consistency.png", "consistency.pdf", "runs"}
 """The names in the folder of a study that is saved, which may be written over."""
@@ -123,15 +120,12 @@ class Study(Mapping):
         return Results(
             version=__version__,
             scenario=self.scenario.to_dict(),
-            runs=self.runs,
             medians_of=sum(map(len, self.whole)),
             scale_free=self.scenario.scale_free,
             steps=steps,
-            seed=self.seed,
-            dtype=self.dtype,
-            device=self.device,
             time=np.array([round((i + 1) / self.scenario.rate, 6) for i in range(steps)]),
-            filters={name: self[name] for name in self.filters},
+            filters=dict(self),
+            **{name: getattr(self, name) for name in _IN_BOTH},
         )
 
     def loaded(self, name: str) -> Iterator[Records]:
@@ -150,17 +144,15 @@ class Study(Mapping):
 
         Of a study of sums they are those of the first chunk.
         """
-        name = self._named(name)
+        name = named(name, self.filters)
         parts = [self.store.load(name, chunk, RECORDS) for chunk in self.whole]
         return {key: np.concatenate([part[key] for part in parts]) for key in RECORDS}
 
     def summary(self) -> Summary:
         """Return `summarise(study)`, the content of `consistency.json`."""
-        return self.to_json()
-
-    def to_json(self) -> Summary:
-        """Return `summarise(study)`, the content of `consistency.json`."""
         return self.results.to_json()
+
+    to_json = summary
 
     def table(self) -> str:
         """Return the verdicts and the numbers of the last step as text."""
@@ -176,14 +168,9 @@ class Study(Mapping):
         Its columns are called as in `consistency.json`, as `rmse_position`. Raises ValueError
         without pandas.
         """
-        pandas, rows = _library("pandas"), []
-        for name, told in self.to_json()["filters"].items():
-            columns = dict(_series(told, self.scenario.steps))
-            rows += [
-                {"filter": name, "time": time, **{key: x[i] for key, x in columns.items()}}
-                for i, time in enumerate(self.results.time)
-            ]
-        return pandas.DataFrame(rows)
+        pandas, time = _library("pandas"), self.results.time
+        frames = [{"filter": name, "time": time} | self[name].series for name in self]
+        return pandas.concat([pandas.DataFrame(x) for x in frames], ignore_index=True)
 
     def to_xarray(self) -> Any:
         """Return the records of every filter, run and step as an `xarray.Dataset`.
@@ -214,9 +201,8 @@ class Study(Mapping):
             sizes = {"chunk": len(self.chunks[0]), "reduced": self.reduced}
             filters = {name: described(slam) for name, slam in self.filters.items()}
             store.begin({**self.made_by, **sizes}, filters)
-            for name in self.filters:
-                for chunk in self.chunks:
-                    store.save(name, chunk, self.store.load(name, chunk))
+            for name, chunk in product(self.filters, self.chunks):
+                store.save(name, chunk, self.store.load(name, chunk))
             write_json(temporary / "consistency.json", self.to_json(), allow_nan=False)
             if folder.exists():
                 shutil.rmtree(folder)
@@ -235,23 +221,19 @@ class Study(Mapping):
         study = Study(
             scenario=scenario("matched", dict(told.scenario)),
             filters={name: filters.get(name) for name in told},
-            runs=told.runs,
-            seed=told.seed,
-            dtype=told.dtype,
             chunks=divided(told.runs, made_by["chunk"]),
             store=store,
             seconds={name: result.seconds for name, result in told.items()},
-            device=told.device,
             reduced=made_by["reduced"],
             backends={name: result.backend for name, result in told.items()},
             made_by=made_by,
             calibrations={name: result.calibration for name, result in told.items()},
+            **{name: getattr(told, name) for name in _IN_BOTH},
         )
-        for name in study.filters:
-            for chunk in study.chunks:
-                if not store.has(name, chunk):
-                    runs = f"runs {chunk.start} to {chunk.stop - 1} of {name}"
-                    raise ValueError(f"{store.folder} lacks {runs}; run it again with --resume")
+        for name, chunk in product(study.filters, study.chunks):
+            if not store.has(name, chunk):
+                runs = f"runs {chunk.start} to {chunk.stop - 1} of {name}"
+                raise ValueError(f"{store.folder} lacks {runs}; run it again with --resume")
         return study
 
     def __repr__(self) -> str:
@@ -282,15 +264,6 @@ def divided(runs: int, chunk: int) -> tuple[range, ...]:
     return tuple(range(i, min(i + chunk, runs)) for i in range(0, runs, chunk))
 
 
-def _series(told: Mapping[str, Any], steps: int, prefix: str = "") -> Iterator[tuple[str, list]]:
-    """The lists of JSON that have a number for every step, and their names."""
-    for key, value in told.items():
-        if isinstance(value, dict) and "word" not in value:
-            yield from _series(value, steps, f"{prefix}{key}_")
-        if isinstance(value, list) and len(value) == steps and key != "band95":
-            yield f"{prefix}{key}", value
-
-
 def results_of(given: Study | Results | Mapping[str, Any]) -> Results:
     """The results of a study, or those of which a summary was made. Raises ValueError."""
     if isinstance(given, Study):
@@ -313,12 +286,13 @@ def summarise(study: Study | Results) -> Summary:
     runs in which an update said that something was wrong (`jaxslam.Status`).
 
     `beyond_scale` is NEES at the one scale of every run that explains all of its poses best
-    (`beyond_scale.one_scale`), in the filter's own unit, with the same numbers: that scale takes
-    from one degree of freedom a run to one a pose, and band and verdict allow for both.
-    `scale_drift` is how far the scale of a pose is from that of its run, with the σ claimed of it;
-    `log_scale` the error of the scale in metres, the σ claimed (root mean squares and medians)
-    and the error in σ; `reversed` the share of the displaced runs whose estimate points away from
-    the truth. Where the sensor measures metres, or the motion is given in metres, they say little.
+    (`beyond_scale.one_scale`), in the filter's own unit, with the same numbers. That scale takes
+    from one degree of freedom per run to one per pose; band and verdict allow for both.
+    `scale_drift` is how far the scale of a pose is from that of its run, with the σ claimed of it.
+    `log_scale` is the error of the scale in metres, the σ claimed (root mean squares and medians)
+    and the error in σ. `reversed` is the share of the displaced runs whose estimate points away
+    from the truth. Where the sensor measures metres, or the motion is given in metres, they say
+    little.
 
     `outside3sigma` is the share of errors beyond three of the claimed σ, axis by axis and then the
     mean of the axes: 0.27 % of Gaussian errors.
@@ -337,87 +311,68 @@ def table(summary: Study | Results | Mapping[str, Any]) -> str:
     return as_text(results_of(summary))
 
 
+_MEANS = {
+    "nees.mean": ("nees", "survivors"),
+    "nees.lost": ("lost", "runs"),
+    "not_lost": ("kept_nees", "kept"),
+    "lost_ever": ("lost_ever", "runs"),
+    "nis.mean": ("nis", "survivors"),
+    "nis.dof": ("nis_dof", "survivors"),
+    "beyond_scale.mean": ("beyond_scale", "survivors"),
+    "beyond_scale.lost": ("beyond_lost", "runs"),
+    "reversed": ("reversed", "displaced"),
+    "landmark_nees.mean": ("landmark_nees", "landmark_count"),
+}
+"""The sums and counts of which results are means."""
+_ROOTS = {
+    "scale_drift.rms": ("squared_drift", "drift_count"),
+    "scale_drift.sigma": ("drift_variance", "drift_count"),
+    "scale_drift.normalised_rms": ("normalised_drift", "drift_count"),
+    "log_scale.error_rms": ("squared_log_scale", "survivors"),
+    "log_scale.sigma": ("log_scale_variance", "survivors"),
+    "log_scale.normalised_rms": ("normalised_log_scale", "survivors"),
+}
+"""The same of roots of means."""
+
+
+@np.errstate(invalid="ignore", divide="ignore")  # NaN where nothing was counted
 def _result(study: Study, name: str) -> FilterResult:
-    geometry = study.scenario.geometry
-    dof, n = geometry.tangent_dim, geometry.point_dim
-    (sums, lost), medians = _sums_and_lost(study, name), _medians(study, name)
-    healthy = study.runs - int(sums["diverged"])
-    low, high = mean_band(dof, max(healthy, 1))
-
-    def mean(key: str, count: np.ndarray | int = healthy) -> np.ndarray:
-        return _ratio(sums[key], count)
-
-    def rms(key: str, count: np.ndarray | int = healthy) -> np.ndarray:
-        return np.sqrt(mean(key, count))
-
-    def by_part(key: str) -> Parts:
-        with np.errstate(invalid="ignore"):  # of a variance that is negative
-            per_axis = mean(key)
-            parts = per_axis[:, :n].sum(axis=1), per_axis[:, n:].sum(axis=1)
-            return Parts(*map(np.sqrt, parts))
-
-    outside, count = sums["outside"], sums["drift_count"]
-    of_drift = tally_of(sums, "drift", dof)
-    return FilterResult(
-        name=name,
-        nees=Nees(
-            verdict=tally_of(sums, "nees", dof).verdict() | {"lost_runs": lost},
-            dof=dof,
-            band=(low, high),
-            mean=mean("nees"),
-            median=medians.nees,
-            lost=(sums["lost"] + sums["diverged"]) / study.runs,
-        ),
-        not_lost=mean("kept_nees", sums["kept"]),
-        lost_ever=(sums["lost_ever"] + sums["diverged"]) / study.runs,
-        nis=Nis(mean("nis"), mean("nis_dof")),
-        rmse=by_part("squared_error"),
-        sigma=by_part("variance"),
-        outside3sigma=Parts(
-            _ratio(outside[:, :n].mean(axis=1), healthy),
-            _ratio(outside[:, n:].mean(axis=1), healthy),
-        ),
-        beyond_scale=Nees(
-            verdict=tally_of(sums, "beyond_scale", dof).verdict(),
-            dof=dof,
-            band=(mean_band(dof - 1, max(healthy, 1))[0], high),
-            mean=mean("beyond_scale"),
-            median=medians.at_one_scale,
-            lost=(sums["beyond_lost"] + sums["diverged"]) / study.runs,
-        ),
-        scale_drift=ScaleDrift(
-            rms=rms("squared_drift", count),
-            sigma=rms("drift_variance", count),
-            normalised_rms=rms("normalised_drift", count),
-            runs=count,
-            verdict=of_drift.verdict() if of_drift.runs and healthy else None,
-        ),
-        log_scale=LogScale(
-            error_rms=rms("squared_log_scale"),
-            error_median=medians.log_scale,
-            sigma=rms("log_scale_variance"),
-            sigma_median=medians.log_scale_sigma,
-            normalised_rms=rms("normalised_log_scale"),
-        ),
-        reversed=mean("reversed", sums["displaced"]),
-        landmark_nees=LandmarkNees(
-            mean("landmark_nees", sums["landmark_count"]),
-            n,
-            sums["landmark_not_finite"].astype(int),
-        ),
-        survivors=healthy,
-        diverged=int(sums["diverged"]),
-        status={s.name.lower(): int(sums[f"status_{s.name}"]) for s in Status if s != Status.OK},
-        calibration=study.calibrations.get(name),
-        backend=study.backends.get(name),
-        seconds=study.seconds[name],
-    )
-
-
-def _ratio(sums: np.ndarray, counts: np.ndarray | int) -> np.ndarray:
-    """Divide sums by counts, NaN where nothing was counted."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return sums / counts
+    dof, n = study.scenario.geometry.tangent_dim, study.scenario.geometry.point_dim
+    sums, lost = _sums_and_lost(study, name)
+    diverged = int(sums["diverged"])
+    healthy = study.runs - diverged
+    sums |= {key: sums[key] + diverged for key in ("lost", "lost_ever", "beyond_lost")}
+    sums |= {"survivors": healthy, "runs": study.runs}
+    bands = [mean_band(degrees, max(healthy, 1)) for degrees in (dof, dof - 1)]
+    drift = tally_of(sums, "drift", dof)
+    found = {path: sums[key] / sums[count] for path, (key, count) in _MEANS.items()}
+    found |= {path: np.sqrt(sums[key] / sums[count]) for path, (key, count) in _ROOTS.items()}
+    for part, axes in (("position", slice(n)), ("orientation", slice(n, None))):
+        for path, key in (("rmse", "squared_error"), ("sigma", "variance")):
+            found[f"{path}.{part}"] = np.sqrt((sums[key] / healthy)[:, axes].sum(axis=1))
+        found[f"outside3sigma.{part}"] = sums["outside"][:, axes].mean(axis=1) / healthy
+    return FilterResult.of({
+        **found,
+        **_medians(study, name),
+        "name": name,
+        "nees.verdict": tally_of(sums, "nees", dof).verdict() | {"lost_runs": lost},
+        "nees.dof": dof,
+        "nees.band": bands[0],
+        "beyond_scale.verdict": tally_of(sums, "beyond_scale", dof).verdict(),
+        "beyond_scale.dof": dof,
+        "beyond_scale.band": (bands[1][0], bands[0][1]),
+        "scale_drift.runs": sums["drift_count"],
+        "scale_drift.verdict": drift.verdict() if drift.runs and healthy else None,
+        "landmark_nees.dof": n,
+        "landmark_nees.not_finite": sums["landmark_not_finite"].astype(int),
+        "survivors": healthy,
+        "diverged": diverged,
+        "status": {s.name.lower(): int(sums[f"status_{s.name}"]) for s in Status if s != Status.OK},
+        "calibration": study.calibrations.get(name),
+        "backend": study.backends.get(name),
+        "seconds.compile": study.seconds[name].compile,
+        "seconds.run": study.seconds[name].run,
+    })  # fmt: skip
 
 
 def treatment(slam: AbstractFilter) -> str | None:
@@ -452,28 +407,23 @@ def _sums_and_lost(study: Study, name: str) -> tuple[Sums, list[int] | None]:
     return added(each()), None if study.reduced else lost
 
 
-class _Medians(NamedTuple):
-    """The medians of every step, over all runs whose records are kept, diverged ones infinite."""
+def _medians(study: Study, name: str) -> dict[str, np.ndarray]:
+    """The medians of every step, over all runs whose records are kept, diverged ones infinite.
 
-    nees: np.ndarray
-    at_one_scale: np.ndarray
-    log_scale: np.ndarray
-    """The median of its error's size."""
-    log_scale_sigma: np.ndarray
-
-
-def _medians(study: Study, name: str) -> _Medians:
-    """Compute the medians, reading every chunk once for as many steps as are held in memory."""
+    Every chunk is read once for as many steps as are held in memory.
+    """
     medians, at_once = [], max(1, _VALUES_AT_ONCE // study.runs)
     for start in range(0, study.scenario.steps, at_once):
         part, columns = slice(start, start + at_once), []
         for chunk in study.whole:
             kept = study.store.load(name, chunk, _OF_MEDIANS)
             survivors = survived(kept)[:, None]
-            values = (
-                kept["nees"], one_scale_of(kept).nees, np.abs(kept["log_scale"]),
-                kept["log_scale_sigma"],
-            )  # fmt: skip
-            columns.append([np.where(survivors, x, np.inf)[:, part] for x in values])
-        medians.append([np.median(np.concatenate(x), axis=0) for x in zip(*columns, strict=True)])
-    return _Medians(*(np.concatenate(x) for x in zip(*medians, strict=True)))
+            values = {
+                "nees.median": kept["nees"],
+                "beyond_scale.median": one_scale_of(kept).nees,
+                "log_scale.error_median": np.abs(kept["log_scale"]),
+                "log_scale.sigma_median": kept["log_scale_sigma"],
+            }
+            columns.append({k: np.where(survivors, x, np.inf)[:, part] for k, x in values.items()})
+        medians.append({k: np.median(np.concatenate([x[k] for x in columns]), 0) for k in values})
+    return {key: np.concatenate([x[key] for x in medians]) for key in medians[0]}

@@ -78,27 +78,40 @@ def _sums(records: Records, dof: int) -> Sums:
     good = {name: records[name][healthy] for name in RECORDS}
     kept = good["nees"] <= lost_threshold(dof)
     ever = ~(good["nees"] <= lost_threshold(dof, good["nees"].shape[1]))
-    scale = one_scale_of(records)
+    of_all = one_scale_of(records)
+    one = OneScale(*(x[healthy] for x in of_all))
+    drifts, displaced = np.isfinite(one.drift), np.isfinite(good["reversed"])
     finite = good["landmark_count"] - good["landmark_not_finite"]
+    sigma = good["log_scale_sigma"]
+    of_runs = {
+        **{name: good[name] for name in ("nees", "nis", "nis_dof", "variance")},
+        "kept": kept,
+        "kept_nees": np.where(kept, good["nees"], 0.0),
+        "lost": ~kept,
+        "lost_ever": np.logical_or.accumulate(ever, axis=1),
+        "squared_error": good["error"] ** 2,
+        "outside": good["error"] ** 2 > 9 * good["variance"],
+        "landmark_nees": good["landmark_nees"] * finite,
+        "landmark_count": finite,
+        "landmark_not_finite": good["landmark_not_finite"],
+        "beyond_scale": one.nees,
+        "beyond_lost": one.nees > lost_threshold(dof),
+        "squared_drift": _or_zero(one.drift) ** 2,
+        "normalised_drift": _or_zero(one.normalised),
+        "drift_variance": np.where(drifts, good["unit_log_scale_sigma"] ** 2, 0.0),
+        "drift_count": drifts,
+        "squared_log_scale": good["log_scale"] ** 2,
+        "log_scale_variance": sigma**2,  # infinite of a scale that nothing depends on
+        "normalised_log_scale": (good["log_scale"] / sigma) ** 2,
+        "reversed": _or_zero(good["reversed"]),
+        "displaced": displaced,
+    }
     return {
         "tally_nees": Tally.of(records["nees"], dof).numbers(),
-        "tally_beyond_scale": Tally.of(scale.nees, dof, 1.0).numbers(),
-        "tally_drift": _of_drift(scale.normalised).numbers(),
+        "tally_beyond_scale": Tally.of(of_all.nees, dof, 1.0).numbers(),
+        "tally_drift": _of_drift(of_all.normalised).numbers(),
         "diverged": np.sum(~healthy),
-        "nees": good["nees"].sum(axis=0),
-        "kept": kept.sum(axis=0),
-        "kept_nees": np.where(kept, good["nees"], 0.0).sum(axis=0),
-        "lost": (~kept).sum(axis=0),
-        "lost_ever": np.logical_or.accumulate(ever, axis=1).sum(axis=0),
-        **_of_scale(good, OneScale(*(x[healthy] for x in scale)), lost_threshold(dof)),
-        "nis": good["nis"].sum(axis=0),
-        "nis_dof": good["nis_dof"].sum(axis=0),
-        "squared_error": (good["error"] ** 2).sum(axis=0),
-        "outside": (good["error"] ** 2 > 9 * good["variance"]).sum(axis=0),
-        "variance": good["variance"].sum(axis=0),
-        "landmark_nees": (good["landmark_nees"] * finite).sum(axis=0),
-        "landmark_count": finite.sum(axis=0),
-        "landmark_not_finite": good["landmark_not_finite"].sum(axis=0),
+        **{name: value.sum(axis=0) for name, value in of_runs.items()},
         **{
             f"status_{s.name}": np.any(records["status"] == s, axis=1).sum()
             for s in Status
@@ -107,29 +120,13 @@ def _sums(records: Records, dof: int) -> Sums:
     }
 
 
+def _or_zero(x: np.ndarray) -> np.ndarray:
+    """The numbers, and 0 where there is none."""
+    return np.where(np.isnan(x), 0.0, x)
+
+
 def _of_drift(normalised: Float[np.ndarray, "runs steps"]) -> Tally:
     """The tally of drift of the runs whose unit was ever fixed, from then on."""
     told = np.isfinite(normalised)
     ever = told.any(axis=1)
     return Tally.of(normalised[ever], 1, 1.0, told[ever])
-
-
-def _of_scale(good: Records, one: OneScale, threshold: float) -> Sums:
-    """The sums of NEES at one scale a run and its drift, of the metric scale, and of reversals."""
-    error, sigma, own = good["log_scale"], good["log_scale_sigma"], good["unit_log_scale_sigma"]
-    drifts = np.isfinite(one.drift)
-    with np.errstate(over="ignore"):  # no σ of a scale that nothing depends on
-        variance, claimed = sigma**2, own**2
-    return {
-        "beyond_scale": one.nees.sum(axis=0),
-        "beyond_lost": (one.nees > threshold).sum(axis=0),
-        "squared_drift": np.nansum(one.drift**2, axis=0),
-        "normalised_drift": np.nansum(one.normalised, axis=0),
-        "drift_variance": np.where(drifts, claimed, 0.0).sum(axis=0),
-        "drift_count": drifts.sum(axis=0),
-        "squared_log_scale": (error**2).sum(axis=0),
-        "log_scale_variance": variance.sum(axis=0),
-        "normalised_log_scale": ((error / sigma) ** 2).sum(axis=0),
-        "reversed": np.nansum(good["reversed"], axis=0),
-        "displaced": np.isfinite(good["reversed"]).sum(axis=0),
-    }

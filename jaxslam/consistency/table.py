@@ -4,66 +4,71 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxslam.consistency.results import FilterResult, Nees, Results, Steps
 from jaxslam.statistics import sentences
 
-_COLUMNS = {
-    "NEES mean": 10, "95 % band": 14, "median": 8, "others": 8, "lost": 7, "ever": 7,
-    "diverged": 9, "NIS/dof": 8, "RMSE m": 8, "σ m": 8, "seconds": 9,
-}  # fmt: skip
-_OF_SCALE = {
-    "NEES mean": 10, "95 % band": 14, "median": 8, "lost": 7, "reversed": 10, "drift": 8,
-    "drift/σ": 9, "log-scale error": 17, "claimed σ": 11, "error/σ": 9,
-    "  verdict; on the drift": 0,
-}  # fmt: skip
-"""The columns of the two tables, and their widths in characters."""
+
+class FilterTable(NamedTuple):
+    """A table with a filter a row."""
+
+    title: str
+    """The title of the column of filters."""
+    columns: Mapping[str, tuple[int, Callable[[FilterResult], str]]]
+    """The width in characters of every other column, and its cell for a filter."""
+
+    def rows(self, results: Results) -> Iterator[list[str]]:
+        """Yield the titles, and the cells of every filter."""
+        yield [self.title, *self.columns]
+        for name, result in results.items():
+            yield [name, *(cell(result) for _, cell in self.columns.values())]
 
 
 def as_text(results: Results) -> str:
     """Return the verdict on every filter, then the numbers of the last step, a filter a line."""
-    wide = max(31, *map(len, results)) + 1
-
-    def lines(title: str, columns: dict[str, int], rows: dict[str, list[str]]) -> Iterator[str]:
-        for name, cells in {title: [*columns], **rows}.items():
-            pairs = zip(cells, columns.values(), strict=True)
-            yield f"{name:<{wide}}" + "".join(f"{cell:>{width}}" for cell, width in pairs)
-
-    told = ["\n    ".join([f"{n}:", *sentences(r.verdict)]) for n, r in results.items()]
-    told += ["", *lines("filter/landmarks", _COLUMNS, _rows(results)), *_explained(results)]
-    if results.scale_free:
-        told += ["", *lines("at one scale a run", _OF_SCALE, _rows_of_scale(results))]
-        told.append(_explained_scale(results))
-    return "\n".join([*told, *_notes(results)])
+    told, wide = [], max(31, *map(len, results)) + 1
+    for block in _blocks(results):
+        if isinstance(block, FilterTable):
+            widths = [-wide, *(width for width, _ in block.columns.values())]
+            rows = [zip(row, widths, strict=True) for row in block.rows(results)]
+            told += ["", *("".join(map(_aligned, row)) for row in rows)]
+        else:
+            told += block
+    return "\n".join(told)
 
 
 def as_html(results: Results) -> str:
     """Return the same as HTML."""
 
-    def rows(title: str, columns: dict[str, int], rows: dict[str, list[str]]) -> str:
-        head = "".join(f"<th>{html.escape(x)}</th>" for x in (title, *columns))
-        body = (
-            "".join(f"<td>{html.escape(x.strip())}</td>" for x in (name, *cells))
-            for name, cells in rows.items()
-        )
-        return f"<table><tr>{head}</tr><tr>{'</tr><tr>'.join(body)}</tr></table>"
+    def row(cells: list[str], tag: str) -> str:
+        return "".join(f"<{tag}>{html.escape(x.strip())}</{tag}>" for x in cells)
 
-    def text(lines: Sequence[str]) -> str:
-        return f"<p>{'<br>'.join(map(html.escape, lines))}</p>"
-
-    told = [text([f"{name}:", *sentences(result.verdict)]) for name, result in results.items()]
-    told += [rows("filter/landmarks", _COLUMNS, _rows(results)), text(_explained(results))]
-    if results.scale_free:
-        told.append(rows("at one scale a run", _OF_SCALE, _rows_of_scale(results)))
-        told.append(text([_explained_scale(results)]))
-    return "".join([*told, *(text([note]) for note in _notes(results))])
+    told = []
+    for block in _blocks(results):
+        if isinstance(block, FilterTable):
+            head, *body = block.rows(results)
+            rows = [row(head, "th"), *(row(cells, "td") for cells in body)]
+            told.append(f"<table><tr>{'</tr><tr>'.join(rows)}</tr></table>")
+        else:
+            told.append(f"<p>{'<br>'.join(html.escape(line.strip()) for line in block)}</p>")
+    return "".join(told)
 
 
-def _explained(results: Results) -> list[str]:
-    return [
+def _aligned(cell: tuple[str, int]) -> str:
+    text, width = cell
+    return text.ljust(-width) if width < 0 else text.rjust(width)
+
+
+def _blocks(results: Results) -> Iterator[list[str] | FilterTable]:
+    """The paragraphs, as lines, and the tables between them."""
+    for name, result in results.items():
+        yield [f"{name}:", *(f"    {line}" for line in sentences(result.verdict))]
+    yield _MAIN
+    yield [
         f"last of {results.steps} steps, {results.runs} runs of seed {results.seed}; "
         f"a consistent filter has mean NEES {results.reference.nees.dof}; verdicts: "
         "of all steps, the last and each third together, [99 % interval]",
@@ -71,72 +76,39 @@ def _explained(results: Results) -> list[str]:
         "some step (so `ever` can be smaller than `lost`); others: mean NEES of the runs not lost "
         "now",
     ]
-
-
-def _explained_scale(results: Results) -> str:
-    dof = results.reference.beyond_scale.dof
-    return (
-        f"at the one scale of the truth that explains all poses of a run best: a right NEES is "
-        f"{dof - 1} to {dof}; reversed: displaced away from the truth; drift of log-scale along a "
-        "run, and its error in metres: rms, claimed σ: median"
-    )
-
-
-def _rows(results: Results) -> dict[str, list[str]]:
-    return {name: _row(result) for name, result in results.items()}
-
-
-def _row(result: FilterResult) -> list[str]:
-    dof = np.nansum(result.nis.dof)  # a filter that compares nothing has none
-    nis = np.nansum(result.nis.mean) / dof if dof else math.nan
-    return [
-        *_of_nees(result.nees),
-        _last(result.not_lost, 3),
-        _share(result.lost),
-        _share(result.lost_ever),
-        str(result.diverged),
-        "–" if math.isnan(nis) else f"{nis:.3f}",
-        _last(result.rmse.position, 3),
-        _last(result.sigma.position, 3),
-        f"{result.seconds.compile + result.seconds.run:.1f}",
-    ]
-
-
-def _of_nees(nees: Nees) -> list[str]:
-    low, high = nees.band
-    band = f"{low:.3f}–{high:.3f}" if np.isfinite(nees.mean).any() else "–"
-    return [_last(nees.mean, 3), band, _last(nees.median, 2)]
-
-
-def _rows_of_scale(results: Results) -> dict[str, list[str]]:
-    """The errors that are not of scale, and those of the scale, at the last step."""
-    rows = {}
-    for name, result in results.items():
-        drift, scale = result.scale_drift, result.log_scale
-        word = "–" if drift.verdict is None else drift.verdict.word
-        rows[name] = [
-            *_of_nees(result.beyond_scale),
-            _share(result.beyond_scale.lost),
-            _share(result.reversed),
-            _last(drift.rms, 3),
-            _last(drift.normalised_rms, 2),
-            _last(scale.error_rms, 3),
-            _last(scale.sigma_median, 3),
-            _last(scale.normalised_rms, 2),
-            f"  {result.beyond_scale.verdict.word}; {word}",
+    if results.scale_free:
+        dof = results.reference.beyond_scale.dof
+        yield _AT_ONE_SCALE
+        yield [
+            f"at the one scale of the truth that explains all poses of a run best: a right NEES is "
+            f"{dof - 1} to {dof}; reversed: displaced away from the truth; drift of log-scale "
+            "along a run, and its error in metres: rms, claimed σ: median"
         ]
-    return rows
-
-
-def _notes(results: Results) -> Iterator[str]:
-    """Remarks on what the means of the table leave out."""
+    # Remarks on what the means of the table leave out.
     for name, result in results.items():
         if result.diverged and result.survivors:
-            yield f"{name}: means and band are of the {result.survivors} runs that did not diverge"
+            runs = result.survivors
+            yield [f"{name}: means and band are of the {runs} runs that did not diverge"]
         if result.diverged and not result.survivors:
-            yield f"{name}: every run diverged, so that there is no mean"
+            yield [f"{name}: every run diverged, so that there is no mean"]
         if count := int(np.sum(result.landmark_nees.not_finite)):
-            yield f"{name}: {count} NEES of landmarks are not finite, and not in their mean"
+            yield [f"{name}: {count} NEES of landmarks are not finite, and not in their mean"]
+
+
+def _nis(result: FilterResult) -> str:
+    dof = np.nansum(result.nis.dof)  # a filter that compares nothing has none
+    nis = np.nansum(result.nis.mean) / dof if dof else math.nan
+    return "–" if math.isnan(nis) else f"{nis:.3f}"
+
+
+def _band(nees: Nees) -> str:
+    low, high = nees.band
+    return f"{low:.3f}–{high:.3f}" if np.isfinite(nees.mean).any() else "–"
+
+
+def _words(result: FilterResult) -> str:
+    drift = result.scale_drift.verdict
+    return f"  {result.beyond_scale.verdict.word}; {'–' if drift is None else drift.word}"
 
 
 def _last(values: Steps, digits: int) -> str:
@@ -148,3 +120,31 @@ def _last(values: Steps, digits: int) -> str:
 
 def _share(values: Steps) -> str:
     return f"{values[-1]:.1%}" if math.isfinite(values[-1]) else "–"
+
+
+_MAIN = FilterTable("filter/landmarks", {
+    "NEES mean": (10, lambda r: _last(r.nees.mean, 3)),
+    "95 % band": (14, lambda r: _band(r.nees)),
+    "median": (8, lambda r: _last(r.nees.median, 2)),
+    "others": (8, lambda r: _last(r.not_lost, 3)),
+    "lost": (7, lambda r: _share(r.lost)),
+    "ever": (7, lambda r: _share(r.lost_ever)),
+    "diverged": (9, lambda r: str(r.diverged)),
+    "NIS/dof": (8, _nis),
+    "RMSE m": (8, lambda r: _last(r.rmse.position, 3)),
+    "σ m": (8, lambda r: _last(r.sigma.position, 3)),
+    "seconds": (9, lambda r: f"{r.seconds.compile + r.seconds.run:.1f}"),
+})  # fmt: skip
+_AT_ONE_SCALE = FilterTable("at one scale a run", {
+    "NEES mean": (10, lambda r: _last(r.beyond_scale.mean, 3)),
+    "95 % band": (14, lambda r: _band(r.beyond_scale)),
+    "median": (8, lambda r: _last(r.beyond_scale.median, 2)),
+    "lost": (7, lambda r: _share(r.beyond_scale.lost)),
+    "reversed": (10, lambda r: _share(r.reversed)),
+    "drift": (8, lambda r: _last(r.scale_drift.rms, 3)),
+    "drift/σ": (9, lambda r: _last(r.scale_drift.normalised_rms, 2)),
+    "log-scale error": (17, lambda r: _last(r.log_scale.error_rms, 3)),
+    "claimed σ": (11, lambda r: _last(r.log_scale.sigma_median, 3)),
+    "error/σ": (9, lambda r: _last(r.log_scale.normalised_rms, 2)),
+    "  verdict; on the drift": (0, _words),
+})  # fmt: skip

@@ -28,8 +28,6 @@ Measurement = Float[Array, " p"]
 class FieldOfView(eqx.Module):
     """The part of a simulated world that a sensor sees."""
 
-    names: ClassVar[dict[str, str]] = {x: x for x in ("range", "visible_depth", "image")}
-    """Its flat fields in scenarios."""
     range: Float[AnyArray, " 2"] = number_field(default=(0.0, np.inf))
     """Least and greatest distance, m; not of a camera."""
     visible_depth: Number = 0.1

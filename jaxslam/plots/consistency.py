@@ -253,9 +253,9 @@ def _world(results: Results) -> str:
 def _plot_errors(
     axes: list[Axes], samples: Mapping[str, Mapping[str, np.ndarray]], time: np.ndarray, n: int
 ) -> None:
-    positions = ["x", "z"] if n == 2 else ["x", "y", "z"]
-    rotations = ["θ"] if n == 2 else ["rotation about x", "rotation about y", "rotation about z"]
-    for axis, ax in enumerate(axes):
+    turns = [f"rotation about {x}" for x in "xyz"]
+    labels = ["x", "z", "θ"] if n == 2 else ["x", "y", "z", *turns]
+    for axis, (label, ax) in enumerate(zip(labels, axes, strict=True)):
         position = axis < n
         scale = 1.0 if position else 180 / np.pi
         for i, records in enumerate(samples.values()):
@@ -265,7 +265,6 @@ def _plot_errors(
             ax.fill_between(time, -bound, bound, color=style["color"], alpha=0.12, lw=0)
             ax.plot(time, bound, time, -bound, lw=0.8, alpha=0.8, **style)
             ax.plot(time, error, lw=1.5, **style)
-        label = positions[axis] if position else rotations[axis - n]
         set_title(ax, f"run 0: {label} with ±3σ")
         ax.set_ylabel("m" if position else "degrees")
         ax.set_xlim(0, time[-1])

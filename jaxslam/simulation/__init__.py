@@ -2,7 +2,7 @@
 
 from jaxslam.simulation.draw import as_data, simulate, trajectory_of, with_own
 from jaxslam.simulation.placement import Cloister, FromPrior, GivenPoints, Rays, Ring
-from jaxslam.simulation.run import Room, Run, Sightings, features, gone, sightings
+from jaxslam.simulation.run import Room, Run, features, gone, sightings
 from jaxslam.simulation.scenario import BUILT_IN, as_scenario, scenario
 from jaxslam.simulation.trajectories import RecordedMotion
 from jaxslam.simulation.world import (
@@ -20,32 +20,9 @@ Scenario = World
 """The name of a world in versions before 0.6."""
 
 __all__ = [
-    "BUILT_IN",
-    "AbstractPlacement",
-    "AbstractTrueCalibration",
-    "Cloister",
-    "ConstantCalibration",
-    "Drift",
-    "FromPrior",
-    "GivenPoints",
-    "Limits",
-    "NominalCalibration",
-    "Rays",
-    "RecordedMotion",
-    "Ring",
-    "Room",
-    "Run",
-    "Scenario",
-    "Sightings",
-    "WhiteCalibration",
-    "World",
-    "as_data",
-    "as_scenario",
-    "features",
-    "gone",
-    "scenario",
-    "sightings",
-    "simulate",
-    "trajectory_of",
-    "with_own",
-]
+    "BUILT_IN", "AbstractPlacement", "AbstractTrueCalibration", "Cloister",
+    "ConstantCalibration", "Drift", "FromPrior", "GivenPoints", "Limits", "NominalCalibration",
+    "Rays", "RecordedMotion", "Ring", "Room", "Run", "Scenario", "WhiteCalibration", "World",
+    "as_data", "as_scenario", "features", "gone", "scenario", "sightings", "simulate",
+    "trajectory_of", "with_own",
+]  # fmt: skip

@@ -80,15 +80,7 @@ def simulate(
     poses, controls = _path(world, motion_key)
     sensors = world.calibration.sensors(world.sensor, camera_key, world.steps + 1)
     points, new = world.placement.along(world, world_key, poses, sensors)
-    one = jnp.ones((), points.dtype)
-
-    def frame(pose: Pose, sensor, points):
-        seen_from = jax.vmap(pose.inverse().apply)(points)
-        measured = jax.vmap(sensor.measure, in_axes=(0, None))(seen_from, one)
-        seen = jax.vmap(sensor.visible, in_axes=(0, 0, None))(seen_from, measured, world.view)
-        return measured, seen
-
-    every = jax.vmap(frame, in_axes=(0, 0, None if new is None else 0))
+    every = jax.vmap(world.measured, in_axes=(0, 0, None if new is None else 0))
     measured, seen = every(poses, sensors, points)
     seen &= jnp.arange(world.steps + 1)[:, None] >= world.limits.first_frame
     # A key of its own, so that a limit changes nothing else of a run.

@@ -4,25 +4,42 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxslam.geometry import Geometry
+
 Value = Any
-"""A field's: a word, a number, a list of them, or a piece of one's own."""
+"""The value of a field: a word, a number, a list of them, or a piece of your own."""
 LARGEST_WHOLE = 2**31 - 1
 POSITIVE, NOT_NEGATIVE = "positive", "not negative"
 
 
 class Field(NamedTuple):
-    """A field: its default, in whose type it is read, what its numbers have to be, what it is."""
+    """A field of a scenario, as `fields.toml` says it."""
 
     default: Value
+    """The default, in whose type it is read."""
     told: str
+    """The sentence that says what it is."""
     least: str = ""
-    """`POSITIVE`, `NOT_NEGATIVE`, or nothing."""
+    """`POSITIVE`, `NOT_NEGATIVE`, or nothing: what its numbers have to be."""
+    at: tuple[str, ...] = ()
+    """The places of a world that it says: the word of a piece, and an attribute of that."""
+    count: str | int = 0
+    """The count of its numbers, or the attribute of a geometry that is it; 0 where any is right."""
+
+    def length(self, geometry: Geometry) -> int:
+        """Return how many numbers it has in a world of this geometry; 0 where any is right."""
+        count = self.count
+        return count if isinstance(count, int) else getattr(geometry, count)
+
+    def within(self, geometry: Geometry) -> Value:
+        """Return the default in a world of this geometry."""
+        in_each = isinstance(self.count, str)
+        return self.default[:1] * self.length(geometry) if in_each else self.default
 
 
 def _tuples(value: Value) -> Value:
@@ -32,8 +49,13 @@ def _tuples(value: Value) -> Value:
 _TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
 FIELDS = {name: Field(**{k: _tuples(v) for k, v in x.items()}) for name, x in _TABLES.items()}
 """The fields by their names, of `fields.toml`."""
+PLACES: dict[str, dict[str, str]] = {}
+"""The attribute of every field in a piece, by the word for the piece."""
+for _name, _field in FIELDS.items():
+    for _word, _, _place in (at.partition(".") for at in _field.at):
+        PLACES.setdefault(_word, {})[_name] = _place
 OWN = ("motion", "sensor", "placement")
-"""Fields that may be a piece of one's own: a word `module:Class`, or a table of `type` and what
+"""Fields that may be a piece of your own: a word `module:Class`, or a table of `type` and what
 that takes, or from Python the piece."""
 ROWS = ("first_pixels", "points")
 """Fields that are lists of lists."""
@@ -45,30 +67,28 @@ def coerced(field: str, value: Value, like: Value) -> Value:
     Raises ValueError, naming the field.
     """
 
-    def wrong(wanted: str) -> ValueError:
-        return ValueError(f"scenario field {field} must be {wanted}, not {value!r}")
+    def check(right: bool, wanted: str) -> None:
+        if not right:
+            raise ValueError(f"scenario field {field} must be {wanted}, not {value!r}")
 
     value = value.tolist() if isinstance(value, np.ndarray) else value
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if field in OWN and not isinstance(value, int | float | list | tuple):
         return value
     if isinstance(like, str):
-        if not isinstance(value, str):
-            raise wrong("a word")
+        check(isinstance(value, str), "a word")
         return value
     if field in ROWS and isinstance(like, tuple):
-        if not isinstance(value, list | tuple) or any(is_alone(row) for row in value):
-            raise wrong("a list of " + ("points" if field == "points" else "[low, high] pairs"))
+        rows = "a list of " + ("points" if field == "points" else "[low, high] pairs")
+        check(not is_alone(value) and not any(map(is_alone, value)), rows)
         return tuple(tuple(coerced(field, x, 0.0) for x in row) for row in value)
     if isinstance(like, tuple):
-        values = [value] if is_alone(value) else value
-        return tuple(coerced(field, number, 0.0) for number in values)
-    if not is_number:
-        raise wrong("a number")
-    if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
-        raise wrong(f"a number up to {LARGEST_WHOLE}")
-    if isinstance(like, int) and value != int(value if math.isfinite(value) else 0):
-        raise wrong("a whole number")
+        return tuple(coerced(field, x, 0.0) for x in ([value] if is_alone(value) else value))
+    check(isinstance(value, int | float) and not isinstance(value, bool), "a number")
+    whole = f"a number up to {LARGEST_WHOLE}"
+    check(isinstance(value, float) or abs(value) <= LARGEST_WHOLE, whole)
+    check(
+        isinstance(like, float) or (math.isfinite(value) and value == int(value)), "a whole number"
+    )
     return type(like)(value)
 
 
@@ -94,8 +114,10 @@ def check_numbers(what: str, value: Value, least: str = "") -> None:
                 raise ValueError(f"{what} must {wanted}, not {number}")
 
 
-def check_signs(piece: object, positive: Iterable[str], not_negative: Iterable[str] = ()) -> None:
-    """Raise ValueError unless these fields of a piece are finite and of these signs."""
-    for least, names in ((POSITIVE, positive), (NOT_NEGATIVE, not_negative)):
-        for name in names:
-            check_numbers(f"{name} of {type(piece).__name__}", getattr(piece, name), least)
+def check_signs(piece: object, word: str) -> None:
+    """Raise ValueError unless the fields of a piece are finite and of the signs of the table."""
+    for field, place in PLACES[word].items():
+        if "." not in place:
+            check_numbers(
+                f"{place} of {type(piece).__name__}", getattr(piece, place), FIELDS[field].least
+            )

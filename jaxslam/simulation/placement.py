@@ -14,7 +14,7 @@ from jaxslam._numerics.arrays import AnyArray, Number, number_field
 from jaxslam.geometry import PLANAR, SPATIAL, Pose
 from jaxslam.models.sensors import AbstractSensor
 from jaxslam.simulation.fields import check_numbers, check_signs
-from jaxslam.simulation.world import LENS, AbstractPlacement, Names, World
+from jaxslam.simulation.world import AbstractPlacement, World, count
 
 
 def _intervals(intervals: Any) -> AnyArray:
@@ -24,31 +24,21 @@ def _intervals(intervals: Any) -> AnyArray:
     return pairs
 
 
-def _count() -> Any:
-    return eqx.field(static=True, default=12)
-
-
 class FromPrior(AbstractPlacement):
     """Measurements of frame 0 that are uniform, and what they hide (1/z of a camera) drawn from the
     world's prior, truncated."""
 
     word: ClassVar[str] = "prior"
-    names: ClassVar[Names] = {
-        "landmarks": "landmarks",
-        "first_pixels": "first",
-        "least_inverse_depth": "least_inverse_depth",
-        **{field: f"through.{place}" for field, place in LENS.items()},
-    }
-    landmarks: int = _count()
+    landmarks: int = count(12)
     first: Float[AnyArray, "p 2"] = eqx.field(converter=_intervals, default=((20.0, 620.0),))
     """Interval of each number of a measurement, pixels of a camera."""
     least_inverse_depth: Number = 0.001
-    """Of the truth, 1/m."""
+    """The least 1/z of the truth, 1/m."""
     through: AbstractSensor | None = None
-    """Of whose measurements they are; by default the world's sensor."""
+    """The sensor of whose measurements they are; by default that of the world."""
 
     def __check_init__(self) -> None:
-        check_signs(self, ("landmarks", "least_inverse_depth"))
+        check_signs(self, self.word)
 
     def check(self, world: World) -> None:
         _check_intervals(self.first, self.through or world.sensor)
@@ -93,13 +83,12 @@ class Ring(AbstractPlacement):
     turn below, at and above it by a metre."""
 
     word: ClassVar[str] = "ring"
-    names: ClassVar[Names] = {"landmarks": "landmarks", "ring_radius": "radius"}
-    landmarks: int = _count()
+    landmarks: int = count(12)
     radius: Number = 8.0
     """m."""
 
     def __check_init__(self) -> None:
-        check_signs(self, ("landmarks", "radius"))
+        check_signs(self, self.word)
 
     def check(self, world: World) -> None:
         turn = world.velocity[-1 if world.geometry is PLANAR else 4]
@@ -131,13 +120,13 @@ class Cloister(AbstractPlacement):
     the wall."""
 
     word: ClassVar[str] = "room"
-    landmarks: ClassVar[int] = 72
+    landmarks: int = count(72)
 
     def check(self, world: World) -> None:
-        if world.geometry is not SPATIAL:
+        if world.geometry is not SPATIAL or self.landmarks != 72:
             raise ValueError(
-                f"placement room is for a spatial geometry and {self.landmarks} landmarks, "
-                f"not {world.geometry.name}"
+                "placement room is for a spatial geometry and 72 landmarks, "
+                f"not {world.geometry.name} and {self.landmarks}"
             )
 
     def points(self, world: World, key: Array) -> Float[Array, "72 3"]:
@@ -154,10 +143,9 @@ class Cloister(AbstractPlacement):
 
 
 class GivenPoints(AbstractPlacement):
-    """GivenPoints of your own."""
+    """The points that are given."""
 
     word: ClassVar[str] = "points"
-    names: ClassVar[Names] = {"points": "positions"}
     positions: Float[AnyArray, "l n"] = number_field()
     """In the camera of frame 0, (x, z) or (x, y, z), m."""
 
@@ -186,19 +174,14 @@ class Rays(AbstractPlacement):
     """
 
     word: ClassVar[str] = "rays"
-    names: ClassVar[Names] = {
-        "landmarks": "landmarks",
-        "first_pixels": "first",
-        "depth_range": "depth_range",
-    }
-    landmarks: int = _count()
+    landmarks: int = count(12)
     first: Float[AnyArray, "p 2"] = eqx.field(converter=_intervals, default=((20.0, 620.0),))
     """Interval of each pixel coordinate at first sight."""
     depth_range: Float[AnyArray, " 2"] = number_field(default=(1.0, 6.0))
     """Least and greatest depth z, m."""
 
     def __check_init__(self) -> None:
-        check_signs(self, ("landmarks", "depth_range"))
+        check_signs(self, self.word)
         given = self.depth_range
         if np.shape(given) != (2,) or (isinstance(given, np.ndarray) and given[0] >= given[1]):
             raise ValueError(
@@ -224,22 +207,19 @@ class Rays(AbstractPlacement):
     ) -> tuple[Float[Array, "frames l n"], Bool[Array, "frames l"]]:
         def frame(points, data):
             key, pose, sensor, is_first = data
-            seen_from = jax.vmap(pose.inverse().apply)(points)
-            measured = jax.vmap(sensor.measure, in_axes=(0, None))(seen_from, one)
-            seen = jax.vmap(sensor.visible, in_axes=(0, 0, None))(seen_from, measured, world.view)
-            new = is_first | ~seen
+            new = is_first | ~world.measured(pose, sensor, points)[1]
             fresh = jax.vmap(pose.apply)(self._thrown(key, sensor))
             points = jnp.where(new[:, None], fresh, points)
             return points, (points, new)
 
         frames = world.steps + 1
         keys, is_first = jax.random.split(key, frames), jnp.arange(frames) == 0
-        one = jnp.ones((), jnp.result_type(world.rate))
-        nowhere = jnp.ones((self.landmarks, world.geometry.point_dim), one.dtype)
+        dtype = jnp.result_type(world.rate)
+        nowhere = jnp.ones((self.landmarks, world.geometry.point_dim), dtype)
         return jax.lax.scan(frame, nowhere, (keys, poses, sensors, is_first))[1]
 
     def _thrown(self, key: Array, sensor: AbstractSensor) -> Float[Array, "l n"]:
-        """GivenPoints along random rays of a camera, in that."""
+        """Points along random rays of a camera, in its frame."""
         pixel_key, depth_key = jax.random.split(key)
         pixels = _uniform(self.first, self.landmarks, pixel_key)
         least, greatest = self.depth_range

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -55,26 +55,21 @@ class Run(eqx.Module):
         return jnp.broadcast_to(self.points, (*self.visible.shape, self.points.shape[-1]))
 
 
-class Sightings(eqx.Module):
-    """The largest numbers of landmarks that a run sees: the capacities that a filter needs."""
-
-    landmarks: Int[Array, ""]
-    """Ever; or the slots that they share."""
-    first: Int[Array, ""]
-    """In frame 0."""
-    known: Int[Array, ""]
-    """In one frame, seen before."""
-    new: Int[Array, ""]
-    """In one frame after 0, for the first time."""
+Count = Any
+"""The type of a count: a whole number, or in a program an array of one."""
 
 
 class Room(NamedTuple):
-    """Capacities that hold every run of a study."""
+    """The capacities of a filter that hold a run, or every run of a study."""
 
-    landmarks: int
-    first: int
-    known: int
-    new: int
+    landmarks: Count
+    """The landmarks that are ever seen, or the slots that they share."""
+    first: Count
+    """The landmarks of frame 0."""
+    known: Count
+    """The most landmarks of one frame that were seen before."""
+    new: Count
+    """The most landmarks of a later frame that are seen for the first time."""
 
     @property
     def capacity(self) -> Capacity:
@@ -82,10 +77,10 @@ class Room(NamedTuple):
         return Capacity(self.landmarks, self.known, self.new)
 
 
-def sightings(run: Run) -> Sightings:
-    """Capacities that hold this run exactly."""
+def sightings(run: Run) -> Room:
+    """Return the least room that holds this run."""
     known, new = _known_and_new(run)
-    return Sightings(
+    return Room(
         landmarks=jnp.sum(jnp.any(run.visible, axis=0) | run.beacons),
         first=jnp.sum(run.visible[0]),
         known=jnp.max(jnp.sum(known, axis=1), initial=0),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 import tomllib
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -22,8 +23,8 @@ from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.camera import Camera
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.sensors import FieldOfView, Pinhole
-from jaxslam.simulation.fields import FIELDS, OWN, Value, check_numbers, coerced
-from jaxslam.simulation.placement import PLACEMENTS, Cloister, Rays
+from jaxslam.simulation.fields import FIELDS, OWN, PLACES, Value, check_numbers, coerced
+from jaxslam.simulation.placement import PLACEMENTS, Rays
 from jaxslam.simulation.trajectories import find
 from jaxslam.simulation.world import (
     CALIBRATIONS,
@@ -31,21 +32,13 @@ from jaxslam.simulation.world import (
     SENSORS,
     Drift,
     Limits,
-    Names,
     World,
     check_kind,
 )
 
 HANDHELD = "handheld-"
 """What a trajectory's name follows in the name of its scenario."""
-_OUTDOORS = {
-    "depth_range": (5.0, 50.0),
-    "nearest_depth": 5.0,
-    "velocity_sigma": (10.0,) * 3 + (1.0,) * 3,
-}
-_OUTDOOR_TRAJECTORIES = ("kitti_00",)
-"""Of a car on a road."""
-_WORDS = {
+_WORDS: dict[str, Mapping] = {
     "geometry": GEOMETRIES,
     "motion": MOTIONS,
     "sensor": SENSORS,
@@ -66,13 +59,15 @@ def scenario(
     """The world of a built-in scenario, of a TOML file, or one given, with flat fields replaced.
 
     A TOML file may name a built-in scenario to start from: `base = "circle"`. A motion, a sensor or
-    a placement of one's own is `module:Class` or `file.py:Class`, in the current folder too, or a
+    a placement of your own is `module:Class` or `file.py:Class`, in the current folder too, or a
     table of `type` and what it takes, `{type = "mine:Sonar", sigma = 0.1}`, or from Python the
     piece. Raises ValueError for an unknown name or field and for a value that makes no sense.
     """
     changes = {**(overrides or {}), **fields}
     if isinstance(name, World):
-        return _replaced(name.fields, changes)
+        return _replaced(name.fields, changes) if changes else name
+    if not isinstance(name, str | Path):
+        raise ValueError(f"a scenario is a World or the name of one, not {name!r}")
     chosen = _read(Path(name)) if str(name).endswith(".toml") else _named(str(name))
     if chosen is None:
         raise ValueError(
@@ -87,13 +82,8 @@ scenario.__doc__ = f"{scenario.__doc__}\n    Fields, each with its default:\n\n"
 )
 
 
-def as_scenario(given: World | str) -> World:
-    """A world, or the scenario of this name. Raises ValueError."""
-    if isinstance(given, World):
-        return given
-    if isinstance(given, str | Path):
-        return scenario(given)
-    raise ValueError(f"a scenario is a World or the name of one, not {given!r}")
+as_scenario = scenario
+"""The same function, where an argument is called `scenario`."""
 
 
 def parse_override(text: str) -> tuple[str, Any]:
@@ -112,8 +102,8 @@ def _named(name: str) -> dict[str, Value] | None:
     if name.startswith(HANDHELD):
         trajectory = name.removeprefix(HANDHELD)
         find(trajectory)  # or say now what is known
-        numbers = _OUTDOORS if trajectory in _OUTDOOR_TRAJECTORIES else {}
-        return _FIELDS["handheld"] | {"name": name, "trajectory": trajectory} | numbers
+        fields = _FIELDS.get(name, _FIELDS["handheld"])
+        return fields | {"name": name, "trajectory": trajectory}
     return _FIELDS.get(name)
 
 
@@ -161,57 +151,44 @@ def _checked(changes: Mapping[str, Any]) -> dict[str, Value]:
 def _world(f: dict[str, Value]) -> World:
     """The world of all flat fields. Raises ValueError, naming the field."""
     geometry = GEOMETRIES[f["geometry"]]
-    t, p = geometry.tangent_dim, geometry.pixel_dim
-    lengths = {
-        "velocity": t, "velocity_sigma": t, "acceleration_sigma": t, "odometry_sigma": t,
-        "range": 2, "depth_range": 2, "range_bearing_sigma": 2,
-        "image": p, "focal": p, "centre": p, "first_pixels": p,
-    }  # fmt: skip
+    p = geometry.pixel_dim
 
-    def numbers(field: str) -> Value:
-        """A field that is used, of the right length."""
-        if field in lengths and len(f[field]) != lengths[field]:
-            raise ValueError(
-                f"scenario field {field} needs {lengths[field]} values in a {geometry.name} world, "
-                f"not {len(f[field])}"
-            )
-        return f[field]
+    def values(word: str) -> dict[str, Value]:
+        """The fields of a piece by their places in it, each of the right length."""
+        for field in PLACES.get(word, {}):
+            length = FIELDS[field].length(geometry)
+            if length and len(f[field]) != length:
+                raise ValueError(
+                    f"scenario field {field} needs {length} values in a {geometry.name} world, "
+                    f"not {len(f[field])}"
+                )
+        found = {place: f[field] for field, place in PLACES.get(word, {}).items()}
+        return found | ({"point_dim": geometry.point_dim} if word == "position" else {})
 
-    def piece(kind: str, table: Mapping[str, tuple[type, Names]]) -> Value:
-        if isinstance(f[kind], str) and f[kind] in table:
-            made, names = table[f[kind]]
-            return _made(made, {place: numbers(field) for field, place in names.items()})
-        return own_piece(kind, f[kind])
+    def piece(kind: str) -> Value:
+        word = f[kind]
+        if isinstance(word, str) and word in _WORDS[kind]:
+            return _made(_WORDS[kind][word], values(word))
+        return own_piece(kind, word)
 
-    f["point_dim"] = geometry.point_dim
     is_camera = f["sensor"] == "camera"
-    if f["placement"] == "room" and f["landmarks"] != Cloister.landmarks:
-        raise ValueError(
-            f"placement room is for a spatial geometry and {Cloister.landmarks} landmarks, "
-            f"not {geometry.name} and {f['landmarks']}"
-        )
     prior = f["inverse_depth"]
     if prior and (len(prior) != 2 or prior[1] <= 0):
         raise ValueError(f"scenario field inverse_depth needs a mean and a σ: {prior}")
-    mean, sigma = prior or (1 / (2 * f["nearest_depth"]), 1 / (4 * f["nearest_depth"]))
+    depth = InverseDepth(*prior) if prior else InverseDepth.beyond(f["nearest_depth"])
     sigmas = (f["focal_sigma"],) * p + (f["centre_sigma"],) * p
-    view = {name: numbers(name) for name in ("range", "visible_depth")}
-    drift = {place: f[name] for name, place in Drift.names.items()}
-    numbers("velocity")
     Rays(depth_range=f["depth_range"])  # checked where it is not used, too
-    placements = {word: (kind, kind.names) for word, kind in PLACEMENTS.items()}
     made = World(
-        motion=piece("motion", MOTIONS),
-        sensor=piece("sensor", SENSORS),
-        placement=piece("placement", placements),
+        motion=piece("motion"),
+        sensor=piece("sensor"),
+        placement=piece("placement"),
         calibration=CALIBRATIONS[f["true_calibration"]](sigmas if is_camera else ()),
-        depth=InverseDepth(mean, sigma, unit=f["scale_sigma"] or None),
+        depth=replace(depth, unit=f["scale_sigma"] or None),
         trajectory=f["trajectory"] or None,
-        view=FieldOfView(**view, image=numbers("image") if is_camera else None),
-        limits=Limits(**{name: f[name] for name in Limits.names}),
-        drift=Drift(**drift) if f["drift_sigma"] else None,
-        treatment=f["calibration"],
-        **{name: f[name] for name in World.names},
+        view=FieldOfView(**values("view"), **(values("picture") if is_camera else {})),
+        limits=Limits(**values("limits")),
+        drift=Drift(**values("drift")) if f["drift_sigma"] else None,
+        **values("world"),
     )
     if made.geometry is not geometry:
         raise ValueError(
@@ -223,20 +200,16 @@ def _world(f: dict[str, Value]) -> World:
 
 def _made(kind: type, values: Mapping[str, Value]) -> Value:
     """A piece of values by their places in it, `camera.focal`."""
-    inside: dict[str, dict[str, Value]] = {}
-    flat = {}
-    for place, value in values.items():
-        head, dot, rest = place.partition(".")
-        if dot:
-            inside.setdefault(head, {})[rest] = value
-        else:
-            flat[head] = value
-    made = {name: _made(_NESTED[name], parts) for name, parts in inside.items()}
-    return kind(**flat, **made)
+    flat = {place: value for place, value in values.items() if "." not in place}
+    for head, nested in _NESTED.items():
+        start = f"{head}."
+        inside = {x.removeprefix(start): values[x] for x in values if x.startswith(start)}
+        flat |= {head: _made(nested, inside)} if inside else {}
+    return kind(**flat)
 
 
 def own_piece(kind: str, given: Value) -> Value:
-    """A piece of one's own: itself, `module:Class`, or a table of `type` and what that takes.
+    """A piece of your own: itself, `module:Class`, or a table of `type` and what that takes.
 
     Raises ValueError, naming the field, for what cannot be found or made.
     """
@@ -287,4 +260,6 @@ def _built_in() -> dict[str, dict[str, Value]]:
 
 
 _FIELDS = _built_in()
-BUILT_IN: dict[str, World] = {name: _world(dict(fields)) for name, fields in _FIELDS.items()}
+BUILT_IN: dict[str, World] = {
+    name: _world(dict(fields)) for name, fields in _FIELDS.items() if not name.startswith(HANDHELD)
+}

@@ -6,6 +6,8 @@ Angles, axes and controls are those of `jaxslam.geometry` and `jaxslam.models.mo
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from contextlib import suppress
 from functools import partial
 from importlib import import_module
 from operator import attrgetter
@@ -27,38 +29,22 @@ from jaxslam._numerics.arrays import (
     numbers,
     optional_numbers,
 )
+from jaxslam._runtime import plotted
 from jaxslam._runtime.lookup import suggestion
 from jaxslam.geometry import SPATIAL, Geometry, Pose
 from jaxslam.models.calibration import TREATMENTS
 from jaxslam.models.depth import InverseDepth
 from jaxslam.models.motion import AbstractMotion, ConstantVelocity, Odometry
 from jaxslam.models.sensors import AbstractSensor, FieldOfView, Pinhole, Position, RangeBearing
-from jaxslam.simulation.fields import FIELDS, Value, check_signs
+from jaxslam.simulation.fields import FIELDS, PLACES, Value, check_signs
 from jaxslam.simulation.run import Run
 from jaxslam.simulation.trajectories import RecordedMotion
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Names = dict[str, str]
-"""Flat fields of a scenario, and where in a piece they are."""
-MOTIONS: dict[str, tuple[type[AbstractMotion], Names]] = {
-    "velocity": (
-        ConstantVelocity,
-        {
-            "acceleration_sigma": "noise_sigma",
-            "velocity": "velocity",
-            "velocity_sigma": "velocity_sigma",
-        },
-    ),
-    "odometry": (Odometry, {"odometry_sigma": "noise_sigma"}),
-}
-LENS = {"focal": "camera.focal", "centre": "camera.centre", "pixel_sigma": "sigma"}
-SENSORS: dict[str, tuple[type[AbstractSensor], Names]] = {
-    "camera": (Pinhole, LENS),
-    "position": (Position, {"position_sigma": "sigma", "point_dim": "point_dim"}),
-    "range_bearing": (RangeBearing, {"range_bearing_sigma": "sigma"}),
-}
+MOTIONS = {"velocity": ConstantVelocity, "odometry": Odometry}
+SENSORS = {"camera": Pinhole, "position": Position, "range_bearing": RangeBearing}
 
 
 class AbstractPlacement(eqx.Module):
@@ -66,8 +52,6 @@ class AbstractPlacement(eqx.Module):
 
     word: ClassVar[str] = ""
     """Its name in scenarios."""
-    names: ClassVar[Names] = {}
-    """Its flat fields there, and where they are in it."""
 
     if TYPE_CHECKING:  # a field or a property of each placement
 
@@ -92,7 +76,7 @@ class AbstractPlacement(eqx.Module):
 
 
 class AbstractTrueCalibration(eqx.Module):
-    """How far the true calibration is off the nominal one: δ, of which filters are told σ."""
+    """How far the true calibration is off the nominal one: δ, of which filters know σ."""
 
     word: ClassVar[str] = ""
     sigma: eqx.AbstractVar[Float[AnyArray, " k"]]
@@ -111,7 +95,7 @@ class NominalCalibration(AbstractTrueCalibration):
 
     word: ClassVar[str] = "nominal"
     sigma: Float[AnyArray, " k"] = number_field(default=())
-    """What filters are told: of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
+    """The σ that filters are given, of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
 
     def sensors(self, nominal: AbstractSensor, key: Array, frames: int) -> AbstractSensor:
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (frames, *jnp.shape(x))), nominal)
@@ -122,7 +106,7 @@ class WhiteCalibration(AbstractTrueCalibration):
 
     word: ClassVar[str] = "white"
     sigma: Float[AnyArray, " k"] = number_field()
-    """Of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
+    """The σ of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
 
     def deltas(self, key: Array, frames: int) -> Float[Array, "frames k"]:
         sigma = jnp.asarray(self.sigma)
@@ -130,11 +114,11 @@ class WhiteCalibration(AbstractTrueCalibration):
 
 
 class ConstantCalibration(AbstractTrueCalibration):
-    """Drawn once a run."""
+    """Drawn once per run."""
 
     word: ClassVar[str] = "constant"
     sigma: Float[AnyArray, " k"] = number_field()
-    """Of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
+    """The σ of (f, c), (fx, fy, cx, cy) or (f, cx, cy), pixels."""
 
     def deltas(self, key: Array, frames: int) -> Float[Array, "frames k"]:
         sigma = jnp.asarray(self.sigma)
@@ -146,33 +130,28 @@ CALIBRATIONS = {
 }
 
 
-def _count() -> Any:
-    return eqx.field(static=True, default=0)
+def count(default: int) -> Any:
+    """Return a field of a whole number, which is no data: another one makes another program."""
+    return eqx.field(static=True, default=default)
 
 
 class Limits(eqx.Module):
     """How many of the visible landmarks are measured; 0 is no limit."""
 
-    names: ClassVar[Names] = {
-        x: x
-        for x in (
-            "first_frame", "first_landmarks", "new_landmarks", "known_landmarks", "in_view"
-        )
-    }  # fmt: skip
-    first_frame: int = _count()
+    first_frame: int = count(0)
     """Before it nothing is measured."""
-    first_landmarks: int = _count()
+    first_landmarks: int = count(0)
     """The most that are new in frame 0."""
-    new_landmarks: int = _count()
+    new_landmarks: int = count(0)
     """The most that are new in a later frame."""
-    known_landmarks: int = _count()
+    known_landmarks: int = count(0)
     """The most that are measured again in a frame, drawn at random."""
-    in_view: int = _count()
+    in_view: int = count(0)
     """The most that are measured at once, where one that leaves the view is a new one when it is
     seen again: a filter needs slots for no more."""
 
     def __check_init__(self) -> None:
-        check_signs(self, (), self.names)
+        check_signs(self, "limits")
         if self.in_view and self.of_a_frame:
             raise ValueError(f"in_view: not with {', '.join(self.of_a_frame)}")
 
@@ -184,14 +163,9 @@ class Limits(eqx.Module):
 
 
 class Drift(eqx.Module):
-    """Errors of a landmark's measurements that stay from frame to frame, of which no filter is
-    told: `b ← ρ b + √(1 − ρ²) σ n` with ρ = exp(−1/frames)."""
+    """Errors of a landmark's measurements that stay from frame to frame, and that no filter
+    knows: `b ← ρ b + √(1 − ρ²) σ n` with ρ = exp(−1/frames)."""
 
-    names: ClassVar[Names] = {
-        "drift_sigma": "sigma",
-        "drift_frames": "frames",
-        "drift_wrong": "wrong",
-    }
     sigma: Number
     """In the unit of the measurement: pixels, m, rad."""
     frames: Number = 20.0
@@ -200,10 +174,10 @@ class Drift(eqx.Module):
     """Share of the landmarks of which σ is ten times as large."""
 
     def __check_init__(self) -> None:
-        check_signs(self, ("frames",), ("sigma", "wrong"))
+        check_signs(self, "drift")
 
     def errors(self, key: Array, measured: Float[Array, "f l p"]) -> Float[Array, "f l p"]:
-        """Of every measurement."""
+        """The errors of every measurement."""
         first_key, key, share_key = jax.random.split(key, 3)
         stays = jnp.exp(-1 / jnp.asarray(self.frames, measured.dtype))
         noises = jax.random.normal(key, measured.shape, measured.dtype)
@@ -218,7 +192,7 @@ class Drift(eqx.Module):
 
 
 KINDS = {"motion": AbstractMotion, "sensor": AbstractSensor, "placement": AbstractPlacement}
-"""What may be of one's own."""
+"""Pieces that may be your own."""
 
 
 def check_kind(name: str, piece: Value) -> None:
@@ -230,12 +204,12 @@ def check_kind(name: str, piece: Value) -> None:
 class World(eqx.Module):
     """What is true: the pieces of a filter, which draw here what a filter has to estimate.
 
-    Lengths are metres, angles radians, times seconds, pixels pixels. Camera axes are x right,
+    Lengths are metres, angles radians, times seconds. Camera axes are x right,
     y down, z ahead; the plane has x and z, and its angle θ turns from x towards z. A point is
     (x, z) or (x, y, z), a velocity or the reading of an odometry (x, z, θ) or
     (x, y, z, about x, about y, about z). The base frame B is the camera of frame 0.
 
-    - `motion`: how the camera moves and what a filter is told of it (`AbstractMotion`);
+    - `motion`: how the camera moves and what a filter knows of it (`AbstractMotion`);
     - `sensor`: what is measured, of nominal calibration, with its noise (`AbstractSensor`);
     - `placement`: where landmarks are (`FromPrior`, `Ring`, `Cloister`, `Rays`, `GivenPoints`);
     - `calibration`: how far the true one is off, pixels (`NominalCalibration`,
@@ -245,7 +219,7 @@ class World(eqx.Module):
     - `velocity`: the nominal one in the camera's axes, m/s and rad/s; by default the motion's mean
       or, for a motion without one, 1.2 m/s ahead in a circle of 4 m;
     - `trajectory`: a recorded path, or the name of its file; `still_frames`: steps in which the
-      camera first stands still;
+      camera is first at rest;
     - `view`: what the sensor sees (least depth and distances, m; picture, pixels); `limits`: how
       much of that is measured;
     - `drift`: errors of landmarks that stay; `beacons`: how many landmarks are surveyed, with
@@ -258,10 +232,6 @@ class World(eqx.Module):
     pieces that do not fit one another.
     """
 
-    names: ClassVar[tuple[str, ...]] = (
-        "name", "rate", "steps", "velocity", "still_frames", "beacons", "beacon_sigma"
-    )  # fmt: skip
-    """Flat fields that it has by the same name."""
     motion: AbstractMotion
     sensor: AbstractSensor
     placement: AbstractPlacement
@@ -271,11 +241,11 @@ class World(eqx.Module):
     rate: Number = 10.0
     velocity: Float[AnyArray, " t"] = eqx.field(default=None, converter=optional_numbers)
     trajectory: str | RecordedMotion | None = None
-    still_frames: int = _count()
+    still_frames: int = count(0)
     view: FieldOfView = eqx.field(default=None)
     limits: Limits = Limits()
     drift: Drift | None = None
-    beacons: int = _count()
+    beacons: int = count(0)
     beacon_sigma: Number = 0.1
     treatment: str = eqx.field(static=True, default="known")
     name: str = eqx.field(static=True, default="world")
@@ -291,7 +261,7 @@ class World(eqx.Module):
             self.velocity = numbers(ahead[self.geometry.tangent_dim] if known is None else known)
 
     def __check_init__(self) -> None:
-        check_signs(self, ("steps", "rate", "beacon_sigma"), ("still_frames", "beacons"))
+        check_signs(self, "world")
         geometry, sensor = self.geometry, type(self.sensor).__name__
         check_shape("the velocity of a world", self.velocity, (geometry.tangent_dim,))
         if self.sensor.point_dim != geometry.point_dim:
@@ -335,6 +305,16 @@ class World(eqx.Module):
         """Whether nothing is measured or given in metres: only priors know the scale."""
         return self.motion.has_velocity and self.sensor.hidden == 1 and not self.beacons
 
+    def measured(
+        self, pose: Pose, sensor: AbstractSensor, points: Float[Array, "l n"]
+    ) -> tuple[Float[Array, "l p"], Bool[Array, " l"]]:
+        """Return what a sensor in a pose measures without noise, and what it sees of that."""
+        seen_from = jax.vmap(pose.inverse().apply)(points)
+        one = jnp.ones((), points.dtype)
+        measured = jax.vmap(sensor.measure, in_axes=(0, None))(seen_from, one)
+        visible = jax.vmap(sensor.visible, in_axes=(0, 0, None))(seen_from, measured, self.view)
+        return measured, visible
+
     def plot(self, run: Run | int = 0, path: str | Path | None = None) -> Figure:
         """The world from above: the true path of a run, its landmarks, and which are measured.
 
@@ -346,7 +326,7 @@ class World(eqx.Module):
             key = jax.random.fold_in(jax.random.key(0), run)
             run = cast(Run, jax.jit(partial(simulate, self))(key))
         points = np.asarray(run.points_by_frame)
-        return import_module("jaxslam.plots").plot_world(
+        return plotted("plot_world")(
             f"{self.name} from above, {self.steps} steps at {float(self.rate):g} Hz",
             np.asarray(run.poses.as_matrix()),
             points,
@@ -358,7 +338,7 @@ class World(eqx.Module):
     def to_dict(self) -> dict[str, Value]:
         """The flat fields of a scenario, as files have them: words, numbers and lists.
 
-        A piece of one's own is a table of its `type` and its numbers.
+        A piece of your own is a table of its `type` and its numbers.
         """
         return {field: _plain(value) for field, value in self.fields.items()}
 
@@ -366,33 +346,31 @@ class World(eqx.Module):
     def fields(self) -> dict[str, Value]:
         """The flat fields with which `jaxslam.scenario` makes this world; those that it has no use
         for are their defaults."""
-        found: dict[str, Value] = {name: field.default for name, field in FIELDS.items()}
-        for size, names in _SIZED.items():
-            found |= {name: found[name][:1] * getattr(self.geometry, size) for name in names}
-        own = {
+        found = {name: field.within(self.geometry) for name, field in FIELDS.items()} | {
             "velocity_sigma": (0.0,) * self.geometry.tangent_dim,
             "geometry": self.geometry.name,
-            "calibration": self.treatment,
             "true_calibration": self.calibration.word,
             "landmarks": self.landmarks,
+            "placement": self.placement.word or self.placement,
+            "trajectory": self.trajectory or "",
         }
-        found |= own | _of(self, {name: name for name in self.names})
-        for kind, table in (("motion", MOTIONS), ("sensor", SENSORS)):
+        pieces = {
+            "world": self, "view": self.view, "picture": self.view, "limits": self.limits,
+            "drift": self.drift, self.placement.word: self.placement,
+        }  # fmt: skip
+        for kind, known in (("motion", MOTIONS), ("sensor", SENSORS)):
             piece = getattr(self, kind)
-            words = [word for word, (made, _) in table.items() if type(piece) is made]
-            found[kind] = words[0] if words else piece
-            found |= _of(piece, table[words[0]][1]) if words else {}
-        found["placement"] = self.placement.word or self.placement
-        for piece in (self.placement, self.view, self.limits, self.drift):
-            found |= {} if piece is None else _of(piece, piece.names)
-        found["trajectory"] = self.trajectory or ""
-        sigma = _plain(self.calibration.sigma)
-        if sigma:
+            word = {made: word for word, made in known.items()}.get(type(piece), "")
+            found[kind] = word or piece
+            pieces[word] = piece
+        for word, piece in pieces.items():
+            found |= _flat(piece, PLACES.get(word, {}))
+        if sigma := _numbers_of(self.calibration.sigma):
             found |= {"focal_sigma": sigma[0], "centre_sigma": sigma[-1]}
         return found | _of_depth(self.depth)
 
     def __hash__(self) -> int:
-        """Of its words and numbers, so that a world may be a key."""
+        """Return the hash of its words and numbers, so that a world may be a key."""
         leaves, kind = jax.tree.flatten(self)
         return hash((kind, *(np.asarray(leaf).tobytes() for leaf in leaves)))
 
@@ -404,17 +382,15 @@ class World(eqx.Module):
 
 
 _PIECES = {field.name for field in dataclasses.fields(World)}
-_SIZED = {
-    "tangent_dim": ("acceleration_sigma", "odometry_sigma"),
-    "pixel_dim": ("first_pixels", "image", "focal", "centre"),
-}
-"""Fields whose defaults are as many in every world, the number of which depends on it."""
 
 
-def _of(piece: eqx.Module, names: Names) -> dict[str, Value]:
+def _flat(piece: eqx.Module | None, places: Mapping[str, str]) -> dict[str, Value]:
     """The flat fields of a piece, of those that it has."""
-    found = {x: attrgetter(place)(piece) for x, place in names.items() if x in FIELDS}
-    return {field: _numbers_of(value) for field, value in found.items() if value is not None}
+    found = {}
+    for field, place in places.items():
+        with suppress(AttributeError):  # a lens, where there is none
+            found[field] = _numbers_of(attrgetter(place)(piece))
+    return {field: value for field, value in found.items() if value is not None}
 
 
 def _numbers_of(value: Value) -> Value:
@@ -439,9 +415,7 @@ def _plain(value: Value) -> Value:
     if isinstance(value, tuple):
         return [_plain(x) for x in value]
     if isinstance(value, eqx.Module):
-        kind = type(value)
-        told = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-        return {"type": f"{kind.__module__}:{kind.__qualname__}"} | {
-            name: _plain(x) for name, x in told.items()
-        }
+        kind, fields = type(value), dataclasses.fields(value)
+        told = {field.name: _plain(getattr(value, field.name)) for field in fields}
+        return {"type": f"{kind.__module__}:{kind.__qualname__}"} | told
     return value

@@ -280,9 +280,13 @@ def test_what_is_claimed_of_drifts_is_summed_over_poses_that_have_one():
     nees, log_scale, sigma = constructed(20, 0.0)
     sigma = sigma * np.linspace(1, 2, 20)
     fixed = np.broadcast_to(np.arange(20) >= 5, nees.shape)
-    one = one_scale(nees, log_scale, sigma, fixed)
     ones = np.ones_like(nees)
-    records = {"log_scale": 0 * ones, "log_scale_sigma": ones, "reversed": np.nan * ones}
-    found = sums._of_scale({**records, "unit_log_scale_sigma": sigma}, one, 10.0)
-    np.testing.assert_array_equal(found["drift_count"], fixed.sum(axis=0))
-    np.testing.assert_allclose(found["drift_variance"], (fixed * sigma**2).sum(axis=0))
+    records = dict.fromkeys(sums.RECORDS, ones) | {
+        "nees": nees, "beyond_scale": nees, "unit_log_scale": log_scale, "reversed": np.nan * ones,
+        "unit_log_scale_sigma": sigma, "unit_fixed": fixed, "status": np.zeros(nees.shape, int),
+        "error": ones[..., None], "variance": ones[..., None],
+    }  # fmt: skip
+    found = sums.as_sums(records, 3)
+    np.testing.assert_array_equal(found["sum_drift_count"], fixed.sum(axis=0))
+    np.testing.assert_allclose(found["sum_drift_variance"], (fixed * sigma**2).sum(axis=0))
+    np.testing.assert_array_equal(found["sum_displaced"], np.zeros(20))
