@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxslam.plots.style import COLOURS, GREY, new_figure, save, set_title
@@ -18,14 +19,15 @@ def plot_world(
     visible: Bool[np.ndarray, "frames l"],
     beacons: Float[np.ndarray, "b n"],
     path: str | Path | None = None,
+    *,
+    ax: Axes | None = None,
 ) -> Figure:
     """A world from above: true poses T_BC, landmarks in B, which of them are measured in a frame,
-    and beacons as surveyed, m. The figure is written to `path` where one is given."""
+    and beacons as surveyed, m; in axes of your own, or in a figure that is written to `path`."""
     track, ahead = poses[:, [0, -2], -1], poses[-1, [0, -2], -2]
     points, beacons = points[..., [0, -1]], beacons[:, [0, -1]]
     seen, now = np.unique(points[visible], axis=0), points[-1][visible[-1]]
-    figure = new_figure(5.5, 5.5)
-    ax = figure.subplots()
+    ax = new_figure(5.5, 5.5).subplots() if ax is None else ax
     ax.plot(*track.T, color="black", lw=1.2, label="true path")
     ax.plot(*track[0], "o", color="black", ms=4)
     never = points[0][~visible.any(axis=0)]
@@ -41,6 +43,8 @@ def plot_world(
     ax.annotate("", tuple(tip), tuple(track[-1]), arrowprops={"arrowstyle": "->", "lw": 1.5})
     ax.set(aspect="equal", xlabel="x, m", ylabel="z, m")
     ax.grid(alpha=0.25)
+    figure = ax.get_figure(root=True)
+    assert figure is not None
     figure.legend(loc="outside lower center", ncols=2, fontsize=8, frameon=False)
     set_title(ax, f"{title}\ndot: start, arrow: last camera")
     return save(figure, path)

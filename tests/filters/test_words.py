@@ -269,16 +269,3 @@ def test_a_filter_after_its_journey_runs_to_the_last_bit_as_before(name, chosen)
 
 
 @pytest.mark.slow
-def test_a_study_prints_as_its_table():
-    study = monte_carlo(
-        scenario("matched-tight", steps=3),
-        make_filters("matched-tight", ["robocentric", "world"], "inverse_scaling"),
-        runs=4,
-    )
-    summary = summarise(study)
-    assert str(study) == repr(study) == table(summary)
-    assert study.summary() == summary
-    with pytest.raises(AttributeError, match=r"'plot' \(jaxslam\.plots\.plot_consistency\(study\)"):
-        study.plot()
-    with pytest.raises(AttributeError, match=r"no attribute 'summarry' \(did you mean summary\?\)"):
-        study.summarry()

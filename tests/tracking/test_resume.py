@@ -171,7 +171,11 @@ def test_a_file_that_is_no_trackers_is_refused(tmp_path, kind, message):
         (np.zeros((240, 320), np.uint16), 1.0, "not uint16"),
         (np.full((240, 320), 255.0), 1.0, "not floats from 255 to 255"),
         (np.full((240, 320), np.nan), 1.0, "not floats from nan to nan"),
-        (np.zeros((240, 320), np.uint8), 0.0, "its time, 0.0 s, is not later than the one before"),
+        (
+            np.zeros((240, 320), np.uint8),
+            0.0,
+            "its time, 0.0 s, is not later than that of the previous",
+        ),
         (np.zeros((240, 320), np.uint8), np.nan, "its time, nan s, is not later"),
         (np.zeros((240, 320), np.uint8), np.inf, "its time, inf s, is not later"),
     ],

@@ -504,7 +504,7 @@ def test_a_frame_must_be_later_than_the_one_before():
     tracker = Tracker(source.calibration, SMALL)
     frame = next(iter(source))
     tracker.track(frame)
-    with pytest.raises(ValueError, match="not later than the one before"):
+    with pytest.raises(ValueError, match="is not later than that of the previous frame"):
         tracker.track(frame)
 
 
