@@ -15,7 +15,6 @@ import pytest
 from cases import Case, each_geometry, named
 
 from jaxslam._runtime.lookup import lookup
-from jaxslam.consistency import monte_carlo, summarise, table
 from jaxslam.filters.gate import Gate
 from jaxslam.filters.mixture.mixture import Mixture
 from jaxslam.filters.protocol import AbstractFilter
@@ -266,6 +265,3 @@ def test_a_filter_after_its_journey_runs_to_the_last_bit_as_before(name, chosen)
             assert replace(again, gate=Gate(tolerance=2.0)) == replace(
                 slam, gate=Gate(tolerance=2.0)
             )
-
-
-@pytest.mark.slow
