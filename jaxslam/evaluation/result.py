@@ -137,7 +137,7 @@ class Evaluation:
         """The mistakes of logging that are recognised; with any there is no verdict."""
         numbers = [f"{time:g} s" if self.timed else f"step {time - 1:g}" for time in self.times]
         factors = [self.axis_verdict(axis) for axis in range(len(self.names))]
-        runs = [self._run(run) for run in range(self.runs)]
+        runs = [_run(self, run) for run in range(self.runs)]
         return mistakes(Logged(self.errors, self.sigmas, self.names, runs, numbers, factors))
 
     @property
@@ -170,7 +170,7 @@ class Evaluation:
     @property
     def lost_runs(self) -> list[str]:
         """The names of the runs that are lost at any step."""
-        return [self._run(run) for run in lost_runs(self.nees, self.dof, self.logged)]
+        return [_run(self, run) for run in lost_runs(self.nees, self.dof, self.logged)]
 
     @property
     def mean(self) -> Float[np.ndarray, " steps"]:
@@ -288,7 +288,7 @@ class Evaluation:
         return str(self)
 
     def _repr_html_(self) -> str:
-        told, rows = html.escape(self._told()).replace("\n", "<br>"), self._rows()
+        told, rows = html.escape(self._told()).replace("\n", "<br>"), _rows(self)
         cells = ("".join(f"<td>{html.escape(x)}</td>" for x in row) for row in rows)
         table = f"<table><tr>{'</tr><tr>'.join(cells)}</tr></table>"
         notes = "<br>".join(map(html.escape, [self._counted(), *self.remarks]))
