@@ -49,11 +49,8 @@ and processors end at about the same time."""
 CHUNK_SECONDS = 20.0
 """The longest that a chunk should take, down to `LEAST_CHUNK` runs, so that a bar moves."""
 NUMBER_SECONDS = 35e-9
-"""About what a step takes for each number of a filter's state, s, by XLA on one processor: 29 for
-`robocentric` on `matched`, 45 for `recommended` on `matched-loose`, 13 with `+submaps` on `laps`,
-in 10⁻⁹ s."""
-LANDMARKS = 12
-"""The landmarks of that state."""
+"""About what a step takes for each number of a filter's state, s, by XLA on one processor: a rule
+of thumb, right within a factor of 3 for the filters of the package."""
 MOST_RUNS = 10**8
 """The most runs of a study."""
 Result = TypeVar("Result")
@@ -213,7 +210,7 @@ _LANDMARK = "inverse_scaling"
 
 def _step_seconds(slam: AbstractFilter) -> float:
     """About how long a step of a filter takes."""
-    state = jax.eval_shape(lambda: slam.init(LANDMARKS))
+    state = jax.eval_shape(lambda: slam.init(12))
     return NUMBER_SECONDS * sum(x.size for x in jax.tree.leaves(state))
 
 
