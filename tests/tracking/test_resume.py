@@ -143,7 +143,7 @@ def test_there_is_nothing_to_save_before_the_first_frame(video, tmp_path):
     ("kind", "message"),
     [
         ("missing", r"t\.npz does not exist"),
-        ("text", r"t\.npz: not an npz file of numbers \(another kind of file"),
+        ("text", r"t\.npz: not an npz file of numbers \(it is another kind"),
         ("other archive", r"t\.npz is not a saved tracker"),
     ],
 )
