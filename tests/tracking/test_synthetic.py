@@ -113,5 +113,5 @@ def test_noise_has_its_standard_deviation():
 
 @pytest.mark.parametrize("wrong", [{"frames": 0}, {"width": -1}, {"rate": 0.0}])
 def test_sizes_that_are_not_positive_are_refused(wrong):
-    with pytest.raises(ValueError, match=f"{next(iter(wrong))} is"):
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))} must be positive"):
         synthetic_source(**wrong)
