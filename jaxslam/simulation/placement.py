@@ -30,6 +30,7 @@ class FromPrior(AbstractPlacement):
 
     word: ClassVar[str] = "prior"
     landmarks: int = count(12)
+    """The number of landmarks."""
     first: Float[AnyArray, "p 2"] = eqx.field(converter=_intervals, default=((20.0, 620.0),))
     """Interval of each number of a measurement, pixels of a camera."""
     least_inverse_depth: Number = 0.001
@@ -80,10 +81,11 @@ def _located(
 
 class Ring(AbstractPlacement):
     """Evenly on a circle about the centre of the nominal path, at the camera's height; in space in
-    turn below, at and above it by a metre."""
+    turn below, at and above it by a metre. Raises ValueError for a path that does not turn."""
 
     word: ClassVar[str] = "ring"
     landmarks: int = count(12)
+    """The number of landmarks."""
     radius: Number = 8.0
     """m."""
 
@@ -117,10 +119,11 @@ class Ring(AbstractPlacement):
 class Cloister(AbstractPlacement):
     """The cloister of slamtb: nine points along each wall of a 12 m room, in two rows, 1 m apart
     in height; the camera starts 0.6 m above the lower ones, 5 m from the centre, looking along
-    the wall."""
+    the wall. Raises ValueError for another world than a spatial one of 72 landmarks."""
 
     word: ClassVar[str] = "room"
     landmarks: int = count(72)
+    """The number of landmarks."""
 
     def check(self, world: World) -> None:
         if world.geometry is not SPATIAL or self.landmarks != 72:
@@ -143,7 +146,7 @@ class Cloister(AbstractPlacement):
 
 
 class GivenPoints(AbstractPlacement):
-    """The points that are given."""
+    """The points that are given. Raises ValueError for points of another world."""
 
     word: ClassVar[str] = "points"
     positions: Float[AnyArray, "l n"] = number_field()
@@ -171,10 +174,12 @@ class Rays(AbstractPlacement):
 
     Whenever one leaves the picture, another is thrown along a random ray of the camera there, at
     a depth that is uniform in an interval, as OpenVINS' simulator does (Geneva et al., ICRA 2020).
+    Raises ValueError for a sensor that is no camera, and for an interval that is none.
     """
 
     word: ClassVar[str] = "rays"
     landmarks: int = count(12)
+    """The number of landmarks."""
     first: Float[AnyArray, "p 2"] = eqx.field(converter=_intervals, default=((20.0, 620.0),))
     """Interval of each pixel coordinate at first sight."""
     depth_range: Float[AnyArray, " 2"] = number_field(default=(1.0, 6.0))

@@ -80,6 +80,7 @@ class AbstractTrueCalibration(eqx.Module):
 
     word: ClassVar[str] = ""
     sigma: eqx.AbstractVar[Float[AnyArray, " k"]]
+    """σ of δ, pixels."""
 
     def deltas(self, key: Array, frames: int) -> Float[Array, "frames k"]:
         """δ of every frame, in σ."""
@@ -136,7 +137,8 @@ def count(default: int) -> Any:
 
 
 class Limits(eqx.Module):
-    """How many of the visible landmarks are measured; 0 is no limit."""
+    """How many of the visible landmarks are measured; 0 is no limit. Raises ValueError for limits
+    of single frames beside `in_view`."""
 
     first_frame: int = count(0)
     """Before it nothing is measured."""
