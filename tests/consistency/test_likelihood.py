@@ -78,7 +78,7 @@ def test_reverse_mode_through_work_that_is_done_only_where_it_is_wanted(name, sc
 
     def value(factor, run):
         def sigma(slam):
-            return slam.unwrapped.motion.noise_sigma
+            return slam.motion.noise_sigma
 
         return log_likelihood(eqx.tree_at(sigma, slam, factor * sigma(slam)), case.room, run)
 

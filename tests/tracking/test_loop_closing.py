@@ -1,6 +1,7 @@
 """A camera that is back at the start knows it, and where it has been is corrected by that."""
 
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import jax
@@ -10,8 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxslam.io.source import Source, Trajectory
+from jaxslam.models.frame import Submaps
 from jaxslam.tracking import map as maps
-from jaxslam.tracking.places import closing, submaps
+from jaxslam.tracking import start
+from jaxslam.tracking.places import closing
 from jaxslam.tracking.places.closing import close_loop
 from jaxslam.tracking.places.submaps import loop_of
 from jaxslam.tracking.settings import TrackerSettings
@@ -42,7 +45,8 @@ def to_and_fro(seed=2):
 def walk(tmp_path_factory):
     """A tracker that has been there and back, its frames, and its file before the last ten."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(submaps, "PARALLAX", 0.15)  # several submaps in a short video
+        # Several submaps in a short video.
+        patch.setattr(start, "Submaps", partial(Submaps, parallax=0.15))
         patch.setattr(closing, "APART", 1)
         source, path = to_and_fro(), tmp_path_factory.mktemp("walk") / "map.npz"
         tracker = Tracker(source.calibration, SETTINGS)
@@ -216,7 +220,7 @@ def test_a_map_has_so_many_submaps_and_goes_on_in_the_last(walk, monkeypatch):
 
 def test_a_lost_camera_is_back_in_an_earlier_submap(monkeypatch, tmp_path):
     """At the far end of its walk the camera is covered, and uncovered where it began."""
-    monkeypatch.setattr(submaps, "PARALLAX", 0.15)
+    monkeypatch.setattr(start, "Submaps", partial(Submaps, parallax=0.15))
     source = to_and_fro()
     frames, tracker = list(source), Tracker(source.calibration, SETTINGS)
     out, black = frames[: FRAMES // 2], np.zeros((480, 640), np.uint8)
@@ -264,7 +268,7 @@ def test_a_lost_camera_is_back_in_an_earlier_submap(monkeypatch, tmp_path):
 
 def test_two_maps_are_joined_where_the_second_sees_the_first(monkeypatch, tmp_path):
     """The camera is covered, uncovered at the far end, and comes back from there."""
-    monkeypatch.setattr(submaps, "PARALLAX", 0.15)
+    monkeypatch.setattr(start, "Submaps", partial(Submaps, parallax=0.15))
     source = to_and_fro()
     frames, black = list(source), np.zeros((480, 640), np.uint8)
     tracker = Tracker(source.calibration, replace(SETTINGS, lost_for=5))
