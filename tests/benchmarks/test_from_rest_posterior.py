@@ -146,8 +146,8 @@ def test_runs_that_did_not_reach_the_whole_likelihood_are_counted_and_left_out()
 def test_the_camera_is_at_rest_but_for_what_is_not_known():
     study = benchmark.standstill(benchmark.FromRestPosterior(steps=6))
     assert study.steps == 6
-    assert study.scenario.velocity == (0.0, 0.0, 0.0)
-    assert study.scenario.velocity_sigma == (0.5, 0.5, 0.2)
+    assert [*study.scenario.velocity] == [0.0, 0.0, 0.0]
+    assert [*study.scenario.velocity_sigma] == [0.5, 0.5, 0.2]
     assert study.scenario.landmarks == 12
 
 
