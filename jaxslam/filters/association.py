@@ -94,14 +94,14 @@ def candidates(
     state: Belief,
     control: Control,
     features: Features,
-    tolerance: Number | Float[AnyArray, " m"] = 0.0,
+    tolerance: Number | Float[AnyArray, " p"] | Float[AnyArray, "m p"] = 0.0,
     *,
     curved: bool = False,
 ) -> Candidates:
     """The innovations of features of a predicted state that is one Gaussian.
 
-    `tolerance` is a σ, in the unit of a measurement, by which each may be off beyond its noise:
-    one for all, or one for each.
+    `tolerance` is a σ by which each may be off beyond its noise, in the units of a measurement: one
+    for all numbers, one for each of p, or those of each of m measurements.
     Of a `curved` measurement, the covariance has the terms of second order of each match by
     itself, where a `Slam` gives them: what depth does to it, of a camera that may have started
     in any direction.
@@ -114,7 +114,7 @@ def candidates(
         )
     m, p = innovation.residual.shape
     S = innovation.covariance
-    variances = tolerance**2 if jnp.ndim(tolerance) == 0 else jnp.repeat(tolerance**2, p)
+    variances = jnp.broadcast_to(jnp.asarray(tolerance, S.dtype) ** 2, (m, p)).ravel()
     S += variances * jnp.eye(m * p, dtype=S.dtype)
     S = S.reshape(m, p, m, p)
     if curved and isinstance(slam, AbstractSlam):

@@ -20,14 +20,15 @@ class Gate(AbstractLayer):
     association: str = eqx.field(static=True, default="sequential")
     """A name of ASSOCIATIONS."""
     tolerance: float = eqx.field(static=True, default=TOLERANCE)
-    """σ by which a match may be off beyond its noise, in σ of a measurement."""
+    """σ by which a match may be off beyond its noise, in σ of each of its numbers."""
 
     def __check_init__(self) -> None:
         lookup("association", [self.association], ASSOCIATIONS)
 
     def update(self, slam, state, control, seen):
         one, gaussian = slam.inner.gaussian(state, control)
-        tolerance = self.tolerance * jnp.sqrt(noises(slam.sensor, seen.measured)[..., 0, 0])
-        found = candidates(one, gaussian, control, seen, tolerance)
+        R = noises(slam.sensor, seen.measured)
+        sigmas = jnp.sqrt(jnp.diagonal(R, axis1=-2, axis2=-1))
+        found = candidates(one, gaussian, control, seen, self.tolerance * sigmas)
         agreed = ASSOCIATIONS[self.association](found)
         return slam.inner.update(state, control, replace(seen, valid=agreed))

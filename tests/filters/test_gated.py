@@ -7,8 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Case, quick_jit
+from cases import Case, a_filter, quick_jit
 
+from jaxslam.filters.gate import Gate
+from jaxslam.geometry import PLANAR
+from jaxslam.landmarks import Cartesian
+from jaxslam.models.observations import Features
+from jaxslam.models.sensors import RangeBearing
 from jaxslam.statistics.bands import lost_threshold
 
 RUNS = 8
@@ -70,3 +75,19 @@ def test_the_states_are_those_of_the_filter_inside():
     first = of.frames(0)[0]
     inside, around = (quick_jit(partial(f.init, of.capacity))(first) for f in (slam.inner, slam))
     jax.tree.map(np.testing.assert_array_equal, around, inside)
+
+
+def test_a_tolerance_is_in_the_unit_of_each_number():
+    """A bearing that is 20 of its σ off is no right match, whatever the σ of a range in metres."""
+    slam = a_filter(PLANAR, Cartesian(), sensor=RangeBearing((0.5, 0.01)), gate=Gate())
+    at = jnp.array([[4.0, 0.3], [5.0, -0.2], [6.0, 0.1], [3.0, 0.6]])
+    first = Features(jnp.arange(4), at, jnp.ones(4, bool))
+    seen = replace(first, measured=at.at[0, 1].add(0.2))
+
+    def used(first, seen):
+        state = slam.init(4, first)
+        control = jnp.asarray(1.0)
+        return slam.update(slam.predict(state, control), control, seen)[1].used
+
+    assert quick_jit(used)(first, first).all()
+    assert quick_jit(used)(first, seen).tolist() == [False, True, True, True]
