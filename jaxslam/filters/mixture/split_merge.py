@@ -196,8 +196,10 @@ def _replaced(
     half = log_weights[2] - jnp.log(2.0)
     weights = jnp.where(divided, half, jnp.stack([-jnp.full_like(half, jnp.inf), log_weights[2]]))
     members = jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), merged, two)
-    weights = jnp.append(jnp.logaddexp(*log_weights[:2]), weights)
-    return SumState(members, weights)
+    # Two that weigh nothing weigh nothing together; log 0 has no derivative.
+    weigh = jnp.any(jnp.isfinite(log_weights[:2]))
+    together = jnp.logaddexp(*jnp.where(weigh, log_weights[:2], 0.0))
+    return SumState(members, jnp.append(jnp.where(weigh, together, -jnp.inf), weights))
 
 
 def _cheapest(loss: Float[Array, "k k"]) -> tuple[Int[Array, " 2"], Float[Array, ""]]:
