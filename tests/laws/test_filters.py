@@ -10,9 +10,20 @@ from jaxslam.testing import LAWS, FilterCase
 
 FIELDS = {"steps": 5, "landmarks": 4, "calibration": "white"}
 ROWS = [
-    "robocentric", "world", "keyframe", "robocentric+oc", "scale_gauge+oc+scene50", "invariant",
-    "world+fej", "robocentric+iterated3", "scale_gauge+mixture5", "robocentric+submaps",
-    "robocentric+checked", "robocentric+rest4", "world+particles", "robocentric+rays",
+    "robocentric",
+    "world",
+    "keyframe",
+    "robocentric+oc",
+    "scale_gauge+oc+scene50",
+    "invariant",
+    "world+fej",
+    "robocentric+iterated3",
+    "scale_gauge+mixture5",
+    "robocentric+submaps",
+    "robocentric+checked",
+    "robocentric+rest4",
+    "world+particles",
+    "robocentric+rays",
     "recommended",
 ]
 
