@@ -43,10 +43,10 @@ def test_a_mutant_is_caught_by_a_test_that_fails(tmp_path, body, told):
     path = tmp_path / "jaxslam" / "linalg.py"
     path.parent.mkdir()
     path.write_text("x = 2 + 1\n")
+    (path.parent / "__init__.py").touch()
     (tmp_path / "tests").mkdir()
     test = f"from jaxslam.linalg import x\ndef test_it():\n    {body}\n"
     (tmp_path / "tests" / "test_linalg.py").write_text(test)
-    (tmp_path / "conftest.py").touch()
     (site, *_) = mutations.sites(path.read_text(), "jaxslam/linalg.py")
     assert mutations.outcome(site, tmp_path, [], 1).startswith(told)
     assert path.read_text() == "x = 2 + 1\n"
