@@ -23,13 +23,15 @@ from jaxslam._numerics.arrays import cast, is_number
 from jaxslam._runtime.programs import QUICK, Program
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged, Belief
 from jaxslam.filters.readouts import camera_pose, landmarks_in_camera
-from jaxslam.filters.run import Frames, run
+from jaxslam.filters.run import Frames
 from jaxslam.landmarks import check_landmark
-from jaxslam.models.observations import Capacity, Features, Innovation
-from jaxslam.simulation import FromPrior, World, simulate
+from jaxslam.models.observations import Capacity, Features
+from jaxslam.simulation import World, simulate
 
 __all__ = ["LAWS", "FilterCase", "check_filter", "check_landmark"]
 
+Told = dict[str, np.ndarray]
+"""What a filter says after every frame, by name."""
 _SLOTS, _STEPS = 3, 5
 _BORN = np.array([[0, 0, 2], [-1, 4, -1]])
 """Frames in which each slot gets a landmark: its first, and the one that comes after."""
@@ -41,13 +43,13 @@ _STEP = 1e-5
 """By how much the numbers of a filter are changed, relative, for central differences."""
 
 
-def check_filter(slam: AbstractFilter, world: World | None = None, *, seed: int = 0) -> None:
-    """Check that a filter keeps the `LAWS`, on a run of a world of its own motion and sensor.
+def check_filter(slam: AbstractFilter, world: World, *, seed: int = 0) -> None:
+    """Check that a filter keeps the `LAWS`, on five steps and four landmarks of a world.
 
-    For a filter without a `motion` and a `sensor`, or a motion that does not say how to simulate
-    it, give a `world`, of which five steps and four landmarks are used.
     Raises ValueError with the first law that does not hold, and by how much.
     """
+    if not isinstance(slam, AbstractFilter):
+        raise ValueError(f"a jaxslam.AbstractFilter is accepted, not {type(slam).__name__}")
     case = FilterCase(slam, world, seed)
     for name, law in LAWS.items():
         try:
@@ -60,80 +62,54 @@ def check_filter(slam: AbstractFilter, world: World | None = None, *, seed: int 
 class FilterCase:
     """A filter, frames for it, and what it makes of them, computed when a law first asks."""
 
-    def __init__(self, slam: AbstractFilter, world: World | None = None, seed: int = 0) -> None:
-        if not isinstance(slam, AbstractFilter):
-            raise ValueError(f"a jaxslam.AbstractFilter is accepted, not {type(slam).__name__}")
-        if world is None and not (hasattr(slam, "motion") and hasattr(slam, "sensor")):
-            raise ValueError(f"{type(slam).__name__} has no motion and sensor; give a world")
+    def __init__(self, slam: AbstractFilter, world: World, seed: int = 0) -> None:
+        self.slam = cast(slam, np.float64)
         with jax.enable_x64(True):
-            if world is None:
-                world = _world_of(slam)
-            self.slam = cast(slam, "float64")
-            self.first, self.frames = Program(partial(_frames_of, world, seed), QUICK)()
+            given = Program(partial(_frames_of, world, seed), QUICK)()
+        self.first, self.frames = self.given = jax.tree.map(np.asarray, given)
 
     @cached_property
-    def lanes(self) -> dict[str, dict[str, np.ndarray]]:
+    def lanes(self) -> dict[str, Told]:
         """What it says of the run, and of changed frames and numbers: one batch, one program."""
-        given = self.first, self.frames
         lanes = {
-            "run": (self.slam, *given),
-            "invalid": (self.slam, *_of_features(_with_other_invalid, given)),
-            "order": (self.slam, *_of_features(_in_another_order, given)),
-            "slots": (self.slam, *_in_other_slots(given)),
+            "run": (self.slam, *self.given),
+            "invalid": (self.slam, *_of_features(_with_other_invalid, self.given)),
+            "order": (self.slam, *_of_features(_in_another_order, self.given)),
+            "slots": (self.slam, *_in_other_slots(self.given)),
             "blind": (self.slam, self.first, _blind(self.frames)),
-            "more": (_changed(self.slam, _STEP), *given),
-            "less": (_changed(self.slam, -_STEP), *given),
+            "more": (_changed(self.slam, _STEP), *self.given),
+            "less": (_changed(self.slam, -_STEP), *self.given),
         }
-        with jax.enable_x64(True):
-            batch = jax.tree.map(
-                lambda *x: jnp.stack(x) if is_number(x[0]) else x[0], *lanes.values()
-            )
-            found = jax.tree.map(np.asarray, Program(_batched, QUICK)(batch))
+        batch = jax.tree.map(lambda *x: np.stack(x) if is_number(x[0]) else x[0], *lanes.values())
+        found = _computed(_batched, batch)
         return {name: jax.tree.map(lambda x, i=i: x[i], found) for i, name in enumerate(lanes)}
 
     @cached_property
-    def alone(self) -> dict[str, np.ndarray]:
-        """The run, not in a batch and taken in stages where the filter has them."""
-        with jax.enable_x64(True):
-            found = Program(partial(_run, staged=True), QUICK)(self.slam, self.first, self.frames)
-        return jax.tree.map(np.asarray, found)
+    def alone(self) -> Told:
+        """The run, not in a batch, and taken in stages where the filter has them."""
+        return _computed(partial(_run, staged=True), self.slam, *self.given)
 
     @cached_property
-    def single(self) -> dict[str, np.ndarray]:
+    def single(self) -> Told:
         """The run in single precision."""
-        given = jax.tree.map(np.asarray, (self.first, self.frames))
-        with jax.enable_x64(False):
-            found = Program(_run, QUICK)(cast(self.slam, "float32"), *cast(given, "float32"))
-        return jax.tree.map(np.asarray, found)
+        return _computed(_run, *cast((self.slam, *self.given), np.float32), double=False)
 
     @cached_property
     def derivative(self) -> float:
         """The derivative of the `score` in the direction of `_changed`, by JAX."""
 
         def score(slam, by):
-            found = _run(_changed(slam, by), self.first, self.frames)
-            return jnp.sum(found["score"])
+            return jnp.sum(_run(_changed(slam, by), *self.given)["score"])
 
         def along(slam):
             return jax.jvp(partial(score, slam), (jnp.zeros(()),), (jnp.ones(()),))[1]
 
-        with jax.enable_x64(True):
-            return float(Program(along, QUICK)(self.slam))
+        return float(_computed(along, self.slam))
 
 
-def _world_of(slam: AbstractFilter) -> World:
-    """A world of a filter's own motion and sensor, with what it is told of depth."""
-    pieces: Any = slam
-    sensor, depth = pieces.sensor, getattr(pieces, "depth", None)
-    prior = {} if depth is None else {"depth": depth}
-    middle = getattr(sensor, "camera", None)
-    if middle is not None:
-        placed = {"first": np.outer(np.asarray(middle.centre, float), [0.6, 1.4])}
-    else:
-        placed = {"first": [[2.0, 5.0]] + [[-0.5, 0.5]] * (sensor.size - 1)}
-    return World(
-        pieces.motion, sensor, FromPrior(landmarks=_SLOTS + 1, **placed), steps=_STEPS, **prior
-    )
+def _computed(function: Callable, *given: PyTree, double: bool = True) -> Any:
+    with jax.enable_x64(double):
+        return jax.tree.map(np.asarray, Program(function, QUICK)(*given))
 
 
 def _frames_of(world: World, seed: int) -> tuple[Features, Frames]:
@@ -166,60 +142,38 @@ def _run(
     slam: AbstractFilter, first: Features, frames: Frames, staged: bool = False
 ) -> dict[str, Array]:
     """What a filter says after every frame."""
-    slots = jnp.arange(_SLOTS)
+    slots, sensor = jnp.arange(_SLOTS), getattr(slam, "sensor", None)
 
-    def told(state: Belief, innovation: Innovation, frame: Frames) -> dict[str, Array]:
+    def step(state: Belief, frame: Frames) -> tuple[Belief, dict[str, Array]]:
+        if isinstance(slam, AbstractStaged):
+            state = slam.remove(state, frame.gone)
+        if staged and isinstance(slam, AbstractStaged):
+            state = slam.predict(state, frame.control)
+            state, innovation = slam.update(state, frame.control, frame.seen)
+            state = slam.close(slam.compose(state, frame.control), frame.new)
+        else:
+            state, innovation = slam.step(state, *frame[:3])
         pose, P = camera_pose(slam, state)
         log_det = 0.0 if innovation.log_det is None else innovation.log_det
+        here = slam.in_map(state)
         found = {
-            "pose": pose.parameters(),
-            "covariance": P,
-            "nis": innovation.nis,
-            "nis_dof": innovation.nis_dof,
-            "status": innovation.status,
-            "in_map": slam.in_map(state),
-            "error": jnp.append(*slam.pose_error(state, pose)[:1], 0.0),
-            "score": -(innovation.nis + log_det) / 2,
-        }
-        sensor = getattr(slam, "sensor", None)
+            "pose": pose.parameters(), "covariance": P, "nis": innovation.nis,
+            "nis_dof": innovation.nis_dof, "status": innovation.status, "in_map": here,
+            "error": slam.pose_error(state, pose)[0], "score": -(innovation.nis + log_det) / 2,
+        }  # fmt: skip
         if sensor is not None:
             chart, own = landmarks_in_camera(slam, state, slots, sensor)
-            here = slam.in_map(state)
             found["landmarks"] = jnp.where(here[:, None], chart, 0.0)
             found["landmarks_covariance"] = jnp.where(here[:, None, None], own, 0.0)
-        return found
+        return state, found
 
-    capacity = Capacity(_SLOTS, _SLOTS, _SLOTS)
-    stepped = _Staged(slam) if staged and isinstance(slam, AbstractStaged) else slam
-    return run(stepped, frames, slam.init(capacity, first), told)[1]
+    state = slam.init(Capacity(_SLOTS, _SLOTS, _SLOTS), first)
+    return jax.lax.scan(step, state, frames)[1]
 
 
 def _batched(lanes: PyTree) -> dict[str, Array]:
     arrays, rest = eqx.partition(lanes, is_number)
     return jax.vmap(lambda one: _run(*eqx.combine(one, rest)))(arrays)
-
-
-class _Staged(AbstractFilter):
-    """A filter whose `step` is its stages, written out."""
-
-    inside: AbstractStaged
-
-    def init(self, capacity, first=None, known=None):
-        return self.inside.init(capacity, first, known)
-
-    def step(self, state, control, seen, new):
-        state = self.inside.predict(state, control)
-        state, innovation = self.inside.update(state, control, seen)
-        return self.inside.close(self.inside.compose(state, control), new), innovation
-
-    def remove(self, state, gone):
-        return self.inside.remove(state, gone)
-
-    def marginal(self, state, function):
-        return self.inside.marginal(state, function)
-
-    def landmark_marginal(self, state, function, slots):
-        return self.inside.landmark_marginal(state, function, slots)
 
 
 def _of_features(change: Callable[[Features], Features], given: PyTree) -> PyTree:
@@ -228,27 +182,26 @@ def _of_features(change: Callable[[Features], Features], given: PyTree) -> PyTre
     return change(first), frames._replace(seen=change(frames.seen), new=change(frames.new))
 
 
-def _with_other_invalid(features: Features) -> Features:
-    """What is not valid has other numbers, none at all, and another's slot."""
-    other = jnp.where(features.valid[..., None], features.measured, jnp.nan)
-    slots = jnp.where(features.valid, features.slots, (features.slots + 1) % _SLOTS)
-    return Features(slots, other, features.valid)
+def _with_other_invalid(of: Features) -> Features:
+    """What is not valid has no number and another's slot."""
+    slots = np.where(of.valid, of.slots, (of.slots + 1) % _SLOTS)
+    return replace(of, slots=slots, measured=np.where(of.valid[..., None], of.measured, np.nan))
 
 
-def _in_another_order(features: Features) -> Features:
-    turned = jax.tree.map(lambda x: jnp.roll(x, 1, axis=-1), (features.slots, features.valid))
-    return Features(turned[0], jnp.roll(features.measured, 1, axis=-2), turned[1])
+def _in_another_order(of: Features) -> Features:
+    slots, valid = (np.roll(x, 1, axis=-1) for x in (of.slots, of.valid))
+    return Features(slots, np.roll(of.measured, 1, axis=-2), valid)
 
 
 def _in_other_slots(given: PyTree) -> PyTree:
     """The landmark of each slot in the one before."""
-    first, frames = _of_features(lambda x: replace(x, slots=(x.slots - 1) % _SLOTS), given)
-    return first, frames._replace(gone=jnp.roll(frames.gone, -1, axis=-1))
+    first, frames = _of_features(lambda of: replace(of, slots=(of.slots - 1) % _SLOTS), given)
+    return first, frames._replace(gone=np.roll(frames.gone, -1, axis=-1))
 
 
 def _blind(frames: Frames) -> Frames:
     """Nothing is seen again after frame 0."""
-    return frames._replace(seen=replace(frames.seen, valid=jnp.zeros_like(frames.seen.valid)))
+    return frames._replace(seen=replace(frames.seen, valid=np.zeros_like(frames.seen.valid)))
 
 
 def _changed(slam: AbstractFilter, by: Array | float) -> AbstractFilter:

@@ -77,3 +77,10 @@ def _compiled_programs_are_freed():
         gc.unfreeze()
     gc.collect()
     gc.freeze()  # what is kept is not looked through after every file
+
+
+def pytest_unconfigure(config):
+    """The last line says what was left out."""
+    left_out = config.getoption("markexpr", "")
+    if left_out == "not slow and not laboratory" and not hasattr(config, "workerinput"):
+        print("Tests marked slow or laboratory were left out: `python -m pytest -m ''` runs all.")  # noqa: T201

@@ -8,7 +8,7 @@ from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.simulation import scenario
 from jaxslam.testing import LAWS, FilterCase
 
-FIELDS = {"steps": 5, "landmarks": 4, "calibration": "white"}
+
 ROWS = [
     "robocentric",
     "world",
