@@ -145,8 +145,8 @@ def _run(
     slots, sensor = jnp.arange(_SLOTS), getattr(slam, "sensor", None)
 
     def step(state: Belief, frame: Frames) -> tuple[Belief, dict[str, Array]]:
-        if isinstance(slam, AbstractStaged):
-            state = slam.remove(state, frame.gone)
+        if callable(remove := getattr(slam, "remove", None)):
+            state = remove(state, frame.gone)
         if staged and isinstance(slam, AbstractStaged):
             state = slam.predict(state, frame.control)
             state, innovation = slam.update(state, frame.control, frame.seen)
@@ -217,89 +217,77 @@ def _changed(slam: AbstractFilter, by: Array | float) -> AbstractFilter:
     return jax.tree.unflatten(structure, changed)
 
 
-def _close(found: dict, wanted: dict, tolerance: float, *keys: str, order=slice(None)) -> None:
+def _close(found: Told, wanted: Told, tolerance: float, slots: Any = slice(None)) -> None:
     """Every number within a tolerance of the largest of its kind, in every frame."""
-    for key in keys or wanted:
-        if key in wanted:
-            a, b = np.asarray(found[key], float), np.asarray(wanted[key], float)
-            if key in ("in_map", "landmarks", "landmarks_covariance"):
-                a = a[:, order]
-            off = np.abs(a - b).max(initial=0.0)
-            most = tolerance * max(1.0, np.abs(b).max(initial=0.0))
-            assert off <= most, f"{key} differs by {off:.3g}, where {most:.3g} is accepted"
+    for key in wanted:
+        a, b = (np.asarray(x[key], float) for x in (found, wanted))
+        if key in ("in_map", "landmarks", "landmarks_covariance"):
+            a = a[:, slots]
+        off, most = np.abs(a - b).max(), tolerance * max(1e-6, np.abs(b).max())
+        assert off <= most, f"{key} differs by {off:.3g}, where {most:.3g} is accepted"
 
 
 def _finite(case: FilterCase) -> None:
-    for name in ("run", "blind"):
-        for key, value in case.lanes[name].items():
-            assert np.isfinite(value).all(), f"{key} is not finite in frames {_where(value)}"
-        P = case.lanes[name]["covariance"]
-        assert (case.lanes[name]["status"] == 0).all(), case.lanes[name]["status"]
-        np.testing.assert_allclose(P, P.swapaxes(1, 2), rtol=0, atol=1e-12 * np.abs(P).max())
-        least = np.linalg.eigvalsh(P).min()
-        assert least >= -1e-12 * np.abs(P).max(), f"a variance of a pose is {least:.3g}"
-
-
-def _where(value: np.ndarray) -> list[int]:
-    finite = np.isfinite(value).reshape(len(value), -1).all(axis=1)
-    return (np.flatnonzero(~finite) + 1).tolist()
+    for told in (case.lanes["run"], case.lanes["blind"]):
+        for key, value in told.items():
+            assert np.isfinite(value).all(), f"{key} is {value.tolist()}"
+        assert not told["status"].any(), f"an update has the status {told['status'].tolist()}"
+        P = told["covariance"]
+        rounding = 1e-12 * np.abs(P).max()
+        np.testing.assert_allclose(P, P.swapaxes(1, 2), rtol=0, atol=rounding)
+        assert (least := np.linalg.eigvalsh(P).min()) >= -rounding, f"a variance is {least:.3g}"
 
 
 def _counted(case: FilterCase) -> None:
-    used = np.asarray(case.frames.seen.valid).sum(axis=1) * case.frames.seen.measured.shape[-1]
-    found = case.lanes["run"]["nis_dof"]
+    seen, found = case.frames.seen, case.lanes["run"]["nis_dof"]
+    used = seen.valid.sum(axis=1) * seen.measured.shape[-1]
     assert (found <= used).all(), f"{found.tolist()} numbers were used of {used.tolist()}"
-    blind = case.lanes["blind"]
     for key in ("nis", "nis_dof"):
-        assert not blind[key].any(), f"{key} of nothing is {blind[key].tolist()}"
+        value = case.lanes["blind"][key]
+        assert not value.any(), f"{key} of nothing is {value.tolist()}"
 
 
 def _slots_are_used_again(case: FilterCase) -> None:
-    new = np.asarray(case.frames.new.valid) | np.asarray(case.frames.seen.valid)
     found = case.lanes["run"]["in_map"]
-    gone = np.asarray(case.frames.gone) & ~np.asarray(case.frames.new.valid)
-    assert not found[gone].any(), "a landmark that was removed is in the map"
-    assert found[-1].tolist() == [True] * _SLOTS or not new[-1].all(), found.tolist()
+    if hasattr(case.slam, "remove"):
+        assert not found[case.frames.gone].any(), "a landmark that was removed is in the map"
+    assert found[-1].all(), f"of the landmarks that came last {found[-1].tolist()} are in the map"
 
 
 def _invalid(case: FilterCase) -> None:
-    _close(case.lanes["invalid"], case.lanes["run"], 1e-11)
+    _close(case.lanes["invalid"], case.lanes["run"], 1e-10)
 
 
 def _order(case: FilterCase) -> None:
-    _close(case.lanes["order"], case.lanes["run"], 1e-8)
+    _close(case.lanes["order"], case.lanes["run"], 1e-6)
 
 
 def _numbers_of_slots(case: FilterCase) -> None:
-    moved = (np.arange(_SLOTS) - 1) % _SLOTS
-    _close(case.lanes["slots"], case.lanes["run"], 1e-8, order=moved)
+    _close(case.lanes["slots"], case.lanes["run"], 1e-6, (np.arange(_SLOTS) - 1) % _SLOTS)
 
 
 def _batch(case: FilterCase) -> None:
-    _close(case.lanes["run"], case.alone, 1e-8)
+    _close(case.lanes["run"], case.alone, 1e-6)
 
 
 def _error(case: FilterCase) -> None:
-    found = case.lanes["run"]["error"]
-    assert np.abs(found).max() < 1e-9, f"the error of the estimate itself is {found.max():.3g}"
+    largest = np.abs(case.lanes["run"]["error"]).max()
+    assert largest < 1e-9, f"the error of the estimate itself is {largest:.3g}"
 
 
 def _single(case: FilterCase) -> None:
     wanted, found = case.lanes["run"], case.single
     sigma = np.sqrt(np.diagonal(wanted["covariance"], axis1=1, axis2=2))
-    t = sigma.shape[1]
-    n = 2 if t == 3 else 3
-    off = np.abs(found["pose"] - wanted["pose"])[:, -n:] / sigma[:, :n]
-    assert found["covariance"].dtype == np.float32, found["covariance"].dtype
-    assert off.max() < 0.1, f"a position is off by {off.max():.3g} of its σ"
+    n = 2 if sigma.shape[1] == 3 else 3
+    off = (np.abs(found["pose"] - wanted["pose"])[:, -n:] / sigma[:, :n]).max()
+    assert found["covariance"].dtype == np.float32, f"it computes in {found['covariance'].dtype}"
+    assert off < 0.1, f"a position is off by {off:.3g} of its σ"
 
 
 def _pickles(case: FilterCase) -> None:
     again = pickle.loads(pickle.dumps(case.slam))
-    here, there = jax.tree.structure(case.slam), jax.tree.structure(again)
-    assert here == there, f"{there} is not {here}"
-    for a, b in zip(jax.tree.leaves(case.slam), jax.tree.leaves(again), strict=True):
-        np.testing.assert_array_equal(a, b)
+    assert jax.tree.structure(again) == jax.tree.structure(case.slam), f"{again} comes back"
+    jax.tree.map(np.testing.assert_array_equal, again, case.slam)
 
 
 def _differentiates(case: FilterCase) -> None:
