@@ -6,12 +6,14 @@ two programs (one may contract `a b + c`, or vectorise), has a bound, and never 
 alone where zero is expected.
 """
 
+import itertools
 from functools import cache, partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxslam.filters.protocol import AbstractStaged
 from jaxslam.filters.readouts import camera_pose
@@ -29,6 +31,15 @@ each_geometry = list(GEOMETRIES.values())
 each_landmark = list(LANDMARKS.values())
 few_landmarks = [LANDMARKS[name] for name in ("inverse_scaling", "inverse_depth", "cartesian")]
 """Where every parametrization would cost minutes: homogeneous, anchored with angles, plain."""
+
+
+def crossed(names, *axes, quick):
+    """The cross of some axes as a parametrization of which all but the rows in `quick`, which have
+    every value at least once, are slow: the others would find a fault of one combination alone."""
+    rows = list(itertools.product(*axes))
+    assert all(any(row[i] == x for row in quick) for i, axis in enumerate(axes) for x in axis)
+    given = [pytest.param(*row, marks=() if row in quick else pytest.mark.slow) for row in rows]
+    return pytest.mark.parametrize(names, given, ids=named)
 
 
 def named(value):

@@ -83,4 +83,4 @@ def pytest_unconfigure(config):
     """The last line says what was left out."""
     left_out = config.getoption("markexpr", "")
     if left_out == "not slow and not laboratory" and not hasattr(config, "workerinput"):
-        print("Tests marked slow or laboratory were left out: `python -m pytest -m ''` runs all.")  # noqa: T201
+        print("Tests marked slow or laboratory were left out: `python -m pytest -m ''` runs all.")

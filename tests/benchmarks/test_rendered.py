@@ -77,6 +77,7 @@ def test_a_sphere_and_a_room_from_inside_hide_what_is_behind():
     assert_allclose(np.sum(picture > 75), np.pi * radius**2, rtol=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["boxes", "turn+blur+exposure", "orbit"])
 def test_a_video_is_the_same_again_and_from_its_pictures(name, tmp_path):
     source = benchmark.rendered_source(name, 3, 2)

@@ -54,6 +54,7 @@ def test_consistency_writes_what_others_read(tmp_path, capsys):
     assert left == {"consistency.json", "consistency.png", "runs"}
 
 
+@pytest.mark.slow
 def test_consistency_resumes_to_more_runs(tmp_path, capsys):
     few = [*SMALL, "--chunk", "2", "--landmarks", "inverse_scaling", "--set", "landmarks=5"]
     chunked = [*few, "--out", str(tmp_path)]

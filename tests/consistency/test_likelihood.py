@@ -89,6 +89,7 @@ def test_reverse_mode_through_work_that_is_done_only_where_it_is_wanted(name, sc
     np.testing.assert_allclose(found, central, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_start_has_forward_mode_only_and_says_so():
     case = Case("matched-very-loose", steps=4, landmarks=3)
     slam = jaxslam.cast(case.filter("world+mixture3+rest2"), jnp.float64)

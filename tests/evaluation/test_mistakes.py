@@ -144,6 +144,7 @@ def test_arrays_of_steps_and_runs_are_named(runs, names):
 SIZES = [(1, 1), (1, 50), (2, 50), (3, 3), (5, 30), (8, 1), (10, 10), (20, 2), (30, 1), (30, 30)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "correlation"), [
     (1.0, 0.97),
     *(

@@ -88,6 +88,7 @@ def judged(place, suite, out, *more):
     return json.loads((out / "suite.json").read_text())["scenarios"]["small"]
 
 
+@pytest.mark.slow
 def test_a_filter_that_reads_the_files_has_the_numbers_of_its_study(written, tmp_path, capsys):
     found = judged(written, "open", tmp_path)
     yours, ours = found["yours"], found[ROBOCENTRIC]

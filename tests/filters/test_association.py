@@ -230,6 +230,7 @@ def matched():
     return slam, state, control, pixels
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", AGREEING)
 def test_what_the_filter_does_not_know_is_no_outlier(name):
     """All are off by one turn of the camera: each explains the others, but not the stranger."""

@@ -188,6 +188,7 @@ def test_what_stands_around_a_start_from_rest_says_what_it_says(around):
     assert not slam.ambiguous_start
 
 
+@pytest.mark.slow
 def test_without_landmarks_the_camera_is_known_less_with_every_frame():
     of, (init, step) = few(), stages(STARTED)
     slam, state = of.filter(STARTED), init(of.features[0])
@@ -242,6 +243,7 @@ def test_landmarks_are_removed_in_the_midst_of_a_window():
     assert (sizes[0] > sizes[1]).all()
 
 
+@pytest.mark.slow
 def test_a_landmark_that_slides_is_given_up_and_no_other_one():
     """By two pixels more in every frame, which no point of the world does."""
     slam = few().filter(STARTED)

@@ -12,6 +12,7 @@ from cases import (
     Case,
     central,
     close,
+    crossed,
     each_geometry,
     few_landmarks,
     named,
@@ -355,9 +356,17 @@ def middle_only(state, geometry, pixel):
     return Features(jnp.arange(3), jnp.asarray(pixels), jnp.array([False, True, False]))
 
 
-@pytest.mark.parametrize("landmark", few_landmarks, ids=named)
-@pytest.mark.parametrize("frame", [Robocentric(), WorldCentric()], ids=named)
-@pytest.mark.parametrize("geometry", each_geometry, ids=named)
+@crossed(
+    ("geometry", "frame", "landmark"),
+    each_geometry,
+    [Robocentric(), WorldCentric()],
+    few_landmarks,
+    quick=[
+        (SPATIAL, Robocentric(), LANDMARKS["inverse_scaling"]),
+        (PLANAR, WorldCentric(), LANDMARKS["inverse_depth"]),
+        (PLANAR, Robocentric(), LANDMARKS["cartesian"]),
+    ],
+)
 def test_blocks_are_the_dense_jacobians_with_only_the_middle_landmark_seen(
     geometry, frame, landmark
 ):

@@ -164,6 +164,7 @@ def test_reanchoring_changes_neither_the_camera_nor_the_points(geometry):
     assert np.abs(after.landmarks - state.landmarks)[slots].min(axis=1).max() > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["keyframe", "robocentric"])
 def test_filters_of_two_frames_differ_to_second_order(kind):
     apart = []

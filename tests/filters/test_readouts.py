@@ -101,6 +101,7 @@ def test_members_that_differ_about_the_metre_agree_about_the_path_in_their_unit(
     assert float(spread) == pytest.approx(0.18, rel=1e-9)  # (0.6² + 0.6²)/4
 
 
+@pytest.mark.slow
 def test_of_a_filter_in_metres_the_scale_takes_nothing_away():
     metric, (given, variance), points, points_given, _ = said("robocentric")
     np.testing.assert_allclose(given, metric, rtol=0, atol=1e-15)

@@ -116,6 +116,7 @@ def test_a_new_landmark_has_the_moments_of_its_prior(name):
     assert_moments(omega, [rho, rho], np.diag([sigma_rho**2] * 2), also=5 * P)
 
 
+@pytest.mark.slow
 def test_a_metre_that_is_not_known_is_in_the_metric_covariance_and_nowhere_else():
     """Nothing that is seen tells of it, and it tells nothing of what is seen."""
     of = Case("matched-turn", 1, steps=8)

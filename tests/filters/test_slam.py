@@ -325,6 +325,7 @@ def leaves_close(actual, expected, relative):
         np.testing.assert_allclose(a, b, rtol=0, atol=relative * max(1e-3, np.abs(b).max()))
 
 
+@pytest.mark.slow
 def test_a_batch_of_runs_is_the_runs_one_by_one():
     case = tight()
     run = partial(run_filter, case.capacity, case.filter("robocentric"))
@@ -339,6 +340,7 @@ def test_a_batch_of_runs_is_the_runs_one_by_one():
         leaves_close(batch, (one, covariance, one_nis), 1e-8)
 
 
+@pytest.mark.slow
 def test_single_precision_is_near_double():
     case = tight()
 

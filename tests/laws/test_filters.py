@@ -8,7 +8,6 @@ from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.simulation import scenario
 from jaxslam.testing import LAWS, FilterCase
 
-
 ROWS = [
     "robocentric",
     "world",

@@ -51,6 +51,7 @@ def pretended(monkeypatch):
     return pretended
 
 
+@pytest.mark.slow
 def test_a_long_study_of_a_plain_filter_takes_the_native_backend(pretended, monkeypatch, caplog):
     monkeypatch.setattr(backends, "WORTH", 12 * 6)
     with caplog.at_level(logging.INFO, "jaxslam"):
@@ -124,6 +125,7 @@ def failing_compiler(tmp_path):
     return str(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["none", "fails"])
 def test_without_a_compiler_that_works_it_is_xla_and_nothing_is_said(kind, tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler" if kind == "none" else failing_compiler(tmp_path))

@@ -56,6 +56,7 @@ def run(function: str, processors: int) -> subprocess.CompletedProcess:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("processors", [1, 2, 5])
 def test_factorisations_in_jax_end_with_any_number_of_processors(processors):
     done = run("own", processors)

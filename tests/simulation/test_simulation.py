@@ -378,6 +378,7 @@ def test_a_wrong_file_is_refused(tmp_path, text, message):
 # --- what is drawn ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_does_not_depend_on_its_batch():
     """Run i is drawn from fold_in(key, i)."""
     chosen = scenario("circle", steps=20)

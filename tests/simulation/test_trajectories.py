@@ -173,6 +173,7 @@ def test_what_is_no_trajectory_is_refused(data, tmp_path):
     assert isinstance(trajectory_of(scenario("handheld-walk", steps=5)), RecordedMotion)
 
 
+@pytest.mark.slow
 def test_every_trajectory_of_the_shared_data_is_one(shared_data, monkeypatch):
     monkeypatch.setenv("JAXSLAM_DATA", str(shared_data))
     names = [path.stem for path in sorted((shared_data / "trajectories").glob("*.txt"))]

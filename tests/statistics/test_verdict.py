@@ -501,6 +501,7 @@ def test_a_run_without_a_step_is_refused():
         run_verdict(np.ones((4, 5)), 3, logged=logged)
 
 
+@pytest.mark.slow
 def test_runs_of_unlike_length_keep_the_rate_of_false_alarms():
     """Of 600 studies of 30 runs, cut anywhere: 6 expected, 19 or more once in 10 000."""
     rng, words = np.random.default_rng(9), []

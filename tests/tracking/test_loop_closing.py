@@ -62,6 +62,7 @@ def error(source, history):
     return absolute_trajectory_error(source.times, T_wc, source.times, source.reference.T_wc)
 
 
+@pytest.mark.slow
 def test_a_camera_that_returns_closes_loops_which_correct_its_way(walk):
     tracker, history, source, _ = walk
     closed = [one for one in history if one.loop is not None]
@@ -218,6 +219,7 @@ def test_a_map_has_so_many_submaps_and_goes_on_in_the_last(walk, monkeypatch):
         assert (len(again.map.submaps) > before) == (most is not None)
 
 
+@pytest.mark.slow
 def test_a_lost_camera_is_back_in_an_earlier_submap(monkeypatch, tmp_path):
     """At the far end of its walk the camera is covered, and uncovered where it began."""
     monkeypatch.setattr(start, "Submaps", partial(Submaps, parallax=0.15))

@@ -227,6 +227,7 @@ def test_a_landmark_out_of_view_is_kept_while_there_are_slots_and_found_again(mo
     assert [unseen[number] < 5 for number in range(4)] == [True] * 4
 
 
+@pytest.mark.slow
 def test_slots_are_given_to_new_landmarks_when_none_is_free(monkeypatch):
     source = synthetic_source(frames=12, **SMALL)
     tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=4))

@@ -35,6 +35,7 @@ def interrupted(source, during, image):
         yield replace(frame, image=image(frame)) if frame.index in during else frame
 
 
+@pytest.mark.slow
 def test_after_black_frames_the_camera_is_back_in_its_map():
     source = synthetic_source(frames=70, seed=3)
     tracker = Tracker(source.calibration, SETTINGS)
@@ -86,6 +87,7 @@ def source_frame(source):
     return next(iter(source))
 
 
+@pytest.mark.slow
 def test_a_saved_map_is_gone_on_with_in_another_video(tmp_path):
     source = synthetic_source(frames=60, seed=4)
     frames, tracker = list(source), Tracker(source.calibration, SETTINGS)

@@ -101,6 +101,7 @@ def test_landmarks_are_the_same_after_their_arrays():
     assert unstacked(stacked({})) == {}
 
 
+@pytest.mark.slow
 def test_a_calibration_that_is_estimated_is_saved_with_it(video, tmp_path):
     _, frames = video
     tracker = Tracker(from_field_of_view(320, 240), SETTINGS)

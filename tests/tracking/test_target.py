@@ -220,6 +220,7 @@ def test_bad_targets_are_refused_naming_file_and_point(tmp_path, fields, message
         read_target(tmp_path / "nowhere.json")
 
 
+@pytest.mark.slow
 def test_the_command_takes_a_target(video, card, tmp_path, capsys):
     _, frames = video
     film = tmp_path / "film"

@@ -542,6 +542,7 @@ class Outside(Around):
         return super().predict(state, control)
 
 
+@pytest.mark.slow
 def test_a_filter_of_ones_own_tracks_as_the_built_in_one_does():
     """And its programs can be compiled before the first frame."""
     source = synthetic_source(frames=12)

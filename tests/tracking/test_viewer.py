@@ -45,6 +45,7 @@ def recorded(tmp_path_factory):
     return out, read(path), summary
 
 
+@pytest.mark.slow
 def test_every_frame_is_recorded_with_its_picture_and_camera(recorded):
     out, rows, _ = recorded
     pose, image = rows["/world/camera"], rows["/world/camera/image"]

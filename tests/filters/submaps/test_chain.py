@@ -187,6 +187,7 @@ def test_a_chain_is_the_one_gaussian_of_everything(linear, smoothed, closed):
     assert after.converged
 
 
+@pytest.mark.slow
 def test_a_chain_ends_where_the_filter_is_however_well_some_directions_are_known():
     """A car drives straight on. The chain, of one linearisation, does not carry on what the filter
     has of others: without `LINEARISATION` its end is off by .1 in squared σ, and its σ of the

@@ -67,6 +67,7 @@ def none_of(loops):
     return Loops(loops.submaps, loops.slots, jnp.zeros_like(loops.valid))
 
 
+@pytest.mark.slow
 def test_a_loop_that_closes_makes_the_path_right_and_its_covariance_smaller(lap):
     chained, truth, loops = lap
     assert len(loops.valid) >= 5
@@ -116,6 +117,7 @@ def test_wrong_pairs_are_refused_among_right_ones(lap):
     assert believed[~wrong].mean() > 0.7
 
 
+@pytest.mark.slow
 def test_right_pairs_are_believed_of_an_overconfident_chain(lap, monkeypatch):
     """It is off by more than its covariance says, with all pairs alike."""
     chained, _, loops = lap
@@ -127,6 +129,7 @@ def test_right_pairs_are_believed_of_an_overconfident_chain(lap, monkeypatch):
     assert not np.asarray(agreeing(before, loops).valid).all()
 
 
+@pytest.mark.slow
 def test_a_batch_of_runs_has_chains_of_one_length(lap):
     """Links that stand for none change nothing."""
     chained, *_ = lap

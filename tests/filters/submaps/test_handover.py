@@ -61,6 +61,7 @@ def test_a_landmark_is_where_its_user_put_it():
     assert set(np.asarray(frozen.numbers[0])) - set(np.asarray(state.numbers)) - {-1}
 
 
+@pytest.mark.slow
 def test_a_slot_that_is_filled_again_without_being_freed_is_a_new_landmark():
     base: Any = make_filter("robocentric", **scenario_pieces(LAPS))
     slam = replace(base, frame=Submaps(1))
