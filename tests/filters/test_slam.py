@@ -326,41 +326,6 @@ def leaves_close(actual, expected, relative):
 
 
 @pytest.mark.slow
-def test_a_batch_of_runs_is_the_runs_one_by_one():
-    case = tight()
-    run = partial(run_filter, case.capacity, case.filter("robocentric"))
-    mapped = jax.vmap(run, in_axes=(None, 0, 0, 0))
-    _, (poses, pose_covariances, _, nis) = quick_jit(mapped)(case.controls(), *case.features)
-    for i in range(5):
-        _, (one, covariance, _, one_nis) = case.compiled("robocentric")(
-            case.controls(), *case.frames(i)
-        )
-        # The same sums in another order, over 60 steps.
-        batch = jax.tree.map(lambda x, i=i: x[i], (poses, pose_covariances, nis))
-        leaves_close(batch, (one, covariance, one_nis), 1e-8)
-
-
-@pytest.mark.slow
-def test_single_precision_is_near_double():
-    case = tight()
-
-    def result(dtype):
-        data = jax.tree.map(np.asarray, (case.controls(), *case.frames(0)))
-        with jax.enable_x64(dtype == "float64"):
-            slam = cast(case.filter("robocentric"), dtype)
-            _, (T, P, _, nis) = quick_jit(partial(run_filter, case.capacity, slam))(*data)
-        assert nis.dtype == dtype
-        sigma = np.sqrt(np.einsum("kii->ki", np.asarray(P, float)))
-        return np.asarray(T.parameters(), float), sigma, np.asarray(nis, float)
-
-    (T, sigma, nis), (U, single_sigma, single_nis) = result("float64"), result("float32")
-    # Measured 0.014 σ, 0.4 % of σ, and 0.017 of a NIS of about 12.
-    assert np.abs((U - T)[:, 2:] / sigma[:, :2]).max() < 0.05
-    assert np.abs(single_sigma / sigma - 1).max() < 0.015
-    assert np.abs(single_nis - nis).max() < 0.06
-
-
-@pytest.mark.slow
 def test_a_run_can_be_differentiated_by_its_noise():
     """d(position, σ and NIS)/d(acceleration σ), backwards through every step."""
     case = Case("matched-tight", steps=4, landmarks=4)
