@@ -10,11 +10,11 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from jaxslam.consistency.store import SUM, Records
 from jaxslam.models.observations import Status
-from jaxslam.statistics.bands import lost_threshold
+from jaxslam.statistics.bands import PerStep, lost_threshold
 from jaxslam.statistics.beyond_scale import SCALE, OneScale, one_scale_of
 from jaxslam.statistics.verdict import Tally
 
@@ -125,7 +125,7 @@ def _or_zero(x: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(x), 0.0, x)
 
 
-def _of_drift(normalised: Float[np.ndarray, "runs steps"]) -> Tally:
+def _of_drift(normalised: PerStep) -> Tally:
     """The tally of drift of the runs whose unit was ever fixed, from then on."""
     told = np.isfinite(normalised)
     ever = told.any(axis=1)

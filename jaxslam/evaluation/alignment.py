@@ -16,7 +16,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.evaluation.convention import Convention, change, converted, geometry_of, lever
+from jaxslam.evaluation.convention import (
+    Axes,
+    Convention,
+    Matrices,
+    change,
+    converted,
+    geometry_of,
+    lever,
+)
 from jaxslam.evaluation.inputs import Poses, exactly_known
 
 ALIGNMENTS = ("none", "se3", "sim3")
@@ -41,7 +49,7 @@ class Similarity(NamedTuple):
         back = self.rotation.T
         return Similarity(back, -back @ self.translation / self.scale, 1 / self.scale)
 
-    def moved(self, T_wc: Float[np.ndarray, "*batch d d"]) -> Float[np.ndarray, "*batch d d"]:
+    def moved(self, T_wc: Matrices) -> Matrices:
         """Return the poses in the other world."""
         n, result = T_wc.shape[-1] - 1, T_wc.copy()
         result[..., :n, :n] = self.rotation @ T_wc[..., :n, :n]
@@ -235,10 +243,7 @@ class Aligned(NamedTuple):
 
 
 def aligned(
-    poses: Poses,
-    convention: Convention,
-    align: str,
-    axes: Int[np.ndarray, " m"] | Bool[np.ndarray, " t"],
+    poses: Poses, convention: Convention, align: str, axes: Axes | Bool[np.ndarray, " t"]
 ) -> Aligned:
     """The estimates aligned by `none`, `se3` or `sim3`.
 

@@ -15,6 +15,7 @@ from jaxslam._runtime.files import LARGEST, read_arrays
 from jaxslam._runtime.lookup import suggestion
 from jaxslam.evaluation.convention import CHOICES, geometry_of
 from jaxslam.io.tum import check_seconds, not_rigid, of_xytheta, poses, read_table, words
+from jaxslam.statistics.bands import Mask, PerAxis, PerStep
 
 _KEYS = (
     "errors", "innovations", "covariances", "sigmas", "estimates", "truths", "nees", "nis", "dof",
@@ -42,9 +43,7 @@ def numbers(what: str, values: ArrayLike, ndim: int, shape: str) -> Float[np.nda
     return array
 
 
-def check_finite(
-    what: str, array: Float[np.ndarray, ...], logged: Bool[np.ndarray, "runs steps"] | None = None
-) -> None:
+def check_finite(what: str, array: Float[np.ndarray, ...], logged: Mask | None = None) -> None:
     """Raise ValueError, naming run and step, for what is not finite at a step that was logged."""
     wrong = ~np.isfinite(array)
     if logged is not None:
@@ -54,21 +53,19 @@ def check_finite(
         raise ValueError(f"{what} of {at(place)} holds {array[tuple(place)]}; only finite numbers")
 
 
-def all_nan(array: Float[np.ndarray, "runs steps ..."]) -> Bool[np.ndarray, "runs steps"]:
+def all_nan(array: Float[np.ndarray, "runs steps ..."]) -> Mask:
     """A mask of the steps whose every number is NaN, so that nothing was logged."""
     return np.asarray(np.isnan(array).all(axis=tuple(range(2, array.ndim))))
 
 
 def filled(
-    array: Float[np.ndarray, "runs steps ..."],
-    logged: Bool[np.ndarray, "runs steps"],
-    value: ArrayLike,
+    array: Float[np.ndarray, "runs steps ..."], logged: Mask, value: ArrayLike
 ) -> Float[np.ndarray, "runs steps ..."]:
     """Return the array with a value at every step that was not logged."""
     return np.where(logged.reshape(*logged.shape, *[1] * (array.ndim - 2)), array, value)
 
 
-def check_every_run(logged: Bool[np.ndarray, "runs steps"]) -> None:
+def check_every_run(logged: Mask) -> None:
     """Raise ValueError for a run of which no step was logged."""
     if not logged.any(axis=1).all():
         run = int(np.argmin(logged.any(axis=1)))
@@ -83,9 +80,9 @@ def at(place: Sequence[int | np.integer] | np.ndarray) -> str:
 class Paired(NamedTuple):
     """The errors and covariances that belong together."""
 
-    errors: Float[np.ndarray, "runs steps n"]
+    errors: PerAxis
     covariances: Float[np.ndarray, "runs steps n n"]
-    logged: Bool[np.ndarray, "runs steps"]
+    logged: Mask
     """A mask of the steps of every run that are there; the others are zeros, of unit covariance."""
 
 
@@ -137,16 +134,14 @@ class EvaluatedSteps(NamedTuple):
 
     start: int
     """The first step at which any run has one."""
-    logged: Bool[np.ndarray, "runs steps"]
+    logged: Mask
     """A mask of them, among all steps."""
     notes: tuple[str, ...]
     """A word on those that are known by definition."""
 
 
 def without_known(
-    errors: Float[np.ndarray, "runs steps n"],
-    covariances: Float[np.ndarray, "runs steps n n"],
-    logged: Bool[np.ndarray, "runs steps"],
+    errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"], logged: Mask
 ) -> EvaluatedSteps:
     """The steps that were logged, but for those that a run knows by definition at its beginning.
 
@@ -172,7 +167,7 @@ def without_known(
     return EvaluatedSteps(start, left, _left_out(known & before, start))
 
 
-def _left_out(known: Bool[np.ndarray, "runs steps"], start: int) -> tuple[str, ...]:
+def _left_out(known: Mask, start: int) -> tuple[str, ...]:
     """A word on the steps at the beginning that are known by definition."""
     if not known.any():
         return ()
@@ -194,9 +189,7 @@ def correlations(covariances: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarr
     return covariances / sigma[..., :, None] / sigma[..., None, :]
 
 
-def normalised(
-    errors: Float[np.ndarray, "runs steps n"], covariances: Float[np.ndarray, "runs steps n n"]
-) -> Float[np.ndarray, "runs steps"]:
+def normalised(errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"]) -> PerStep:
     """Return `eᵀ P⁻¹ e`, by a Cholesky factor of the correlations.
 
     Raises ValueError, naming run and step, unless every P is symmetric and positive definite.
@@ -243,7 +236,7 @@ class Poses(NamedTuple):
     estimates: Float[np.ndarray, "runs steps d d"]
     covariances: Float[np.ndarray, "runs steps t t"]
     truths: Float[np.ndarray, "runs steps d d"]
-    logged: Bool[np.ndarray, "runs steps"]
+    logged: Mask
     """A mask of the steps that are there; the others are identities, of unit covariance."""
     joint: Float[np.ndarray, "runs steps*t steps*t"] | None = None
     """The covariance of all poses of a run, where it is known."""

@@ -8,13 +8,14 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup
 from jaxslam.evaluation.alignment import ALIGNMENTS, BY_FIRST, Aligned, aligned
 from jaxslam.evaluation.convention import (
+    Axes,
     Convention,
     alternatives,
     geometry_of,
@@ -35,6 +36,7 @@ from jaxslam.evaluation.inputs import (
 from jaxslam.evaluation.result import Evaluation
 from jaxslam.evaluation.scale import Scale, at_one_scale, of_aligned
 from jaxslam.geometry import Geometry
+from jaxslam.statistics.bands import Mask, PerStep
 
 BEYOND = (
     "NEES is computed at the scale of each run that explains all of its poses best; positions are "
@@ -56,9 +58,9 @@ class _PoseErrors(NamedTuple):
 
     errors: Float[np.ndarray, "runs steps m"]
     covariances: Float[np.ndarray, "runs steps m m"]
-    nees: Float[np.ndarray, "runs steps"]
+    nees: PerStep
     start: int
-    logged: Bool[np.ndarray, "runs steps"]
+    logged: Mask
     fitted: float
     axis_fitted: Float[np.ndarray, " m"]
     scale: Scale | None
@@ -168,7 +170,7 @@ def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseE
     return _PoseErrors(errors, P, nees, start, later.logged, fitted, axis_fitted, scale, notes)
 
 
-def _later(poses: Poses, start: int, logged: Bool[np.ndarray, "runs steps"]) -> Poses:
+def _later(poses: Poses, start: int, logged: Mask) -> Poses:
     """The poses from a step on that have a part in the verdict."""
     t, there = poses.covariances.shape[-1], logged[:, start:]
     P = filled(poses.covariances[:, start:], there, np.eye(t))
@@ -180,7 +182,7 @@ def _with_truth(
     world: Aligned,
     later: Poses,
     convention: Convention,
-    axes: Int[np.ndarray, " m"],
+    axes: Axes,
     truth_sigma: tuple[float, float],
 ) -> Poses:
     """Add the σ of the truth, in the unit of the estimate where their ratio is free."""

@@ -31,7 +31,7 @@ from jaxslam.evaluation.inputs import (
 )
 from jaxslam.evaluation.sanity_checks import Logged, Mistake, mistakes, withheld
 from jaxslam.evaluation.scale import Scale
-from jaxslam.statistics.bands import exact_band
+from jaxslam.statistics.bands import Mask, PerAxis, PerStep, exact_band
 from jaxslam.statistics.verdict import (
     Verdict,
     headline,
@@ -63,11 +63,11 @@ class Evaluation:
     """`NEES`, or `NIS` of innovations."""
     dof: int
     """The degrees of freedom: the NEES that a consistent filter has on average."""
-    nees: Float[np.ndarray, "runs steps"]
+    nees: PerStep
     """The NEES of every run and step; infinite if diverged, NaN where nothing was logged."""
-    errors: Float[np.ndarray, "runs steps n"]
+    errors: PerAxis
     """The error of every run, step and axis; NaN where nothing was logged."""
-    sigmas: Float[np.ndarray, "runs steps n"]
+    sigmas: PerAxis
     """The σ that the filter claims of every error."""
     times: Float[np.ndarray, " steps"]
     """The time of every step, s, or its number."""
@@ -150,7 +150,7 @@ class Evaluation:
         return f"{told}; {self.scale.sentence}" if drifts and self.scale else told
 
     @cached_property
-    def logged(self) -> Bool[np.ndarray, "runs steps"]:
+    def logged(self) -> Mask:
         """A mask of the steps of every run that are there."""
         return ~np.isnan(self.nees)
 
@@ -460,7 +460,7 @@ def _rms(values: np.ndarray, there: np.ndarray | None = None) -> Any:
 
 
 def _mean(
-    values: Float[np.ndarray, "runs steps ..."], there: Bool[np.ndarray, "runs steps"]
+    values: Float[np.ndarray, "runs steps ..."], there: Mask
 ) -> Float[np.ndarray, "steps ..."]:
     """The mean over the runs that have a step; NaN where none has it."""
     count = np.sum(there, axis=0).reshape(-1, *[1] * (values.ndim - 2))

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxslam._runtime.files import Json
-from jaxslam.statistics.bands import shortfall_limit
+from jaxslam.statistics.bands import PerAxis, PerStep, shortfall_limit
 from jaxslam.statistics.verdict import Verdict
 
 FALSE_ALARM = 1e-4
@@ -62,8 +62,8 @@ class Mistake(NamedTuple):
 class Logged(NamedTuple):
     """The data that are checked, NaN where nothing was logged."""
 
-    errors: Float[np.ndarray, "runs steps n"]
-    sigmas: Float[np.ndarray, "runs steps n"]
+    errors: PerAxis
+    sigmas: PerAxis
     names: Sequence[str]
     """The names of the axes."""
     runs: Sequence[str]
@@ -125,12 +125,7 @@ def _unwrapped(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake
             break
 
 
-def _turned(
-    e: Float[np.ndarray, "runs steps"],
-    sigma: Float[np.ndarray, "runs steps"],
-    period: float,
-    widest: float,
-) -> Bool[np.ndarray, " runs"]:
+def _turned(e: PerStep, sigma: PerStep, period: float, widest: float) -> Bool[np.ndarray, " runs"]:
     """A mask of the runs with an error near a full turn, and no other far from none or a full one.
 
     None where most runs with errors as large have them anywhere.

@@ -14,12 +14,13 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from jaxslam._runtime.files import Json, json_numbers
 from jaxslam.evaluation.alignment import about
-from jaxslam.evaluation.convention import Convention, pose_errors
+from jaxslam.evaluation.convention import Axes, Convention, Matrices, Tangents, pose_errors
 from jaxslam.evaluation.inputs import Poses, correlations, sigmas
+from jaxslam.statistics.bands import Mask, PerStep
 from jaxslam.statistics.beyond_scale import SCALES, BeyondScale, one_scale
 from jaxslam.statistics.verdict import Verdict, run_verdict
 
@@ -33,17 +34,17 @@ class Scale:
 
     log_scale: Float[np.ndarray, " runs"]
     """The log scale of the estimate relative to the truth; NaN where no pose determines it."""
-    drift: Float[np.ndarray, "runs steps"]
+    drift: PerStep
     """The log of a pose's own scale relative to its run's; NaN where it determines none."""
-    sigma: Float[np.ndarray, "runs steps"]
+    sigma: PerStep
     """The σ that the filter claims of log ŝ_k, or of the drift where all covariances are known."""
-    nees: Float[np.ndarray, "runs steps"]
+    nees: PerStep
     """The NEES of the drift; NaN where a pose determines no scale."""
     fitted: float
     """The most degrees of freedom that the fit of the run's scale took from every drift."""
 
     @property
-    def told(self) -> Bool[np.ndarray, "runs steps"]:
+    def told(self) -> Mask:
         """A mask of the poses that have a drift."""
         return ~np.isnan(self.nees)
 
@@ -135,7 +136,7 @@ class AtScale(NamedTuple):
     scale: Scale
 
 
-def at_one_scale(poses: Poses, convention: Convention, axes: Int[np.ndarray, " m"]) -> AtScale:
+def at_one_scale(poses: Poses, convention: Convention, axes: Axes) -> AtScale:
     """Return errors along some axes at the true scale that explains all poses of a run best."""
     if poses.joint is not None:
         return _jointly(poses, poses.joint, convention, axes)
@@ -171,10 +172,8 @@ def errors_beyond_scale(
 
 
 def _affine(
-    convention: Convention,
-    estimates: Float[np.ndarray, "*batch d d"],
-    truths: Float[np.ndarray, "*batch d d"],
-) -> tuple[Float[np.ndarray, "*batch t"], Float[np.ndarray, "*batch t"]]:
+    convention: Convention, estimates: Matrices, truths: Matrices
+) -> tuple[Tangents, Tangents]:
     """Return e and g = de/ds of the truth times s: every error is `e + g (s − 1)`."""
     twice = truths.copy()
     twice[..., :-1, -1] *= 2.0
@@ -200,10 +199,7 @@ def _own_scales(
 
 
 def _jointly(
-    poses: Poses,
-    joints: Float[np.ndarray, "runs k k"],
-    convention: Convention,
-    axes: Int[np.ndarray, " m"],
+    poses: Poses, joints: Float[np.ndarray, "runs k k"], convention: Convention, axes: Axes
 ) -> AtScale:
     """Fit one scale by the joint covariance: exact, each NEES has all its degrees of freedom.
 
@@ -256,10 +252,7 @@ def _fitted(
 
 
 def of_aligned(
-    poses: Poses,
-    convention: Convention,
-    axes: Int[np.ndarray, " m"],
-    log_scale: Float[np.ndarray, " runs"],
+    poses: Poses, convention: Convention, axes: Axes, log_scale: Float[np.ndarray, " runs"]
 ) -> Scale:
     """The drift of poses that a Sim(n) has aligned to the truth, about the middle of each run."""
     T, P, truth = (x.copy() for x in poses[:3])

@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Int
 
 from jaxslam._runtime.programs import in_background
 from jaxslam.filters.protocol import AbstractStaged, Belief
 from jaxslam.tracking.estimator import Estimator, Predicted
 from jaxslam.tracking.landmarks import Landmark, Points, joined
 from jaxslam.tracking.observations import Observations
-from jaxslam.tracking.patches import Patch
+from jaxslam.tracking.patches import Patch, Picture, Pixels
 from jaxslam.tracking.places.descriptors import note_looks
 from jaxslam.tracking.places.submaps import (
     Compared,
@@ -129,22 +129,14 @@ class Map:
         self.give_up(failing(self.landmarks, self.settings))
 
     def begin(
-        self,
-        image: UInt8[np.ndarray, "h w"],
-        pixels: Float[np.ndarray, "k 2"],
-        depths: tuple[np.ndarray, np.ndarray] | None = None,
+        self, image: Picture, pixels: Pixels, depths: tuple[np.ndarray, np.ndarray] | None = None
     ) -> None:
         """Begin with landmarks at these pixels, a map that has none; `depths` as `Estimator`'s."""
         slots = self._free(len(pixels))
         self.place.begin(self.estimator.begin(slots, pixels, depths))
         self._add(slots, image, pixels)
 
-    def renew(
-        self,
-        image: UInt8[np.ndarray, "h w"],
-        pixels: Float[np.ndarray, "k 2"],
-        kept: Int[np.ndarray, " n"] = NO_SLOTS,
-    ) -> None:
+    def renew(self, image: Picture, pixels: Pixels, kept: Int[np.ndarray, " n"] = NO_SLOTS) -> None:
         """New landmarks at these pixels, for which others than those in the slots `kept` make room.
         Ends the filter's frame."""
         self._make_room(len(pixels), kept)
@@ -159,7 +151,7 @@ class Map:
         if report.left and more:
             self._hand_over(image)
 
-    def _hand_over(self, image: UInt8[np.ndarray, "h w"]) -> None:
+    def _hand_over(self, image: Picture) -> None:
         """End the submap at the camera, where this picture was taken."""
         note_looks(self.landmarks.values(), image)
         estimator, numbers = self.estimator, slot_numbers(self.landmarks, self.settings.capacity)
@@ -311,12 +303,7 @@ class Map:
         free = [slot for slot in range(self.settings.capacity) if slot not in self.landmarks]
         return np.array(free[:count], int)
 
-    def _add(
-        self,
-        slots: Int[np.ndarray, " k"],
-        image: UInt8[np.ndarray, "h w"],
-        pixels: Float[np.ndarray, "k 2"],
-    ) -> None:
+    def _add(self, slots: Int[np.ndarray, " k"], image: Picture, pixels: Pixels) -> None:
         first, camera = self.created, self.place.camera.T_wc
         for number, (slot, pixel) in enumerate(zip(slots.tolist(), pixels, strict=True), first):
             self.landmarks[slot] = Landmark(number, Patch.take(image, pixel), camera, pixel)

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxslam.tracking.patches import Pixels
+
 
 class Lost(StrEnum):
     """The reasons why a camera is lost in a frame (docs/own-video.md)."""
@@ -66,12 +68,12 @@ class Observations(NamedTuple):
         return self.labels == "matched"
 
     @property
-    def believed(self) -> Float[np.ndarray, "k 2"]:
+    def believed(self) -> Pixels:
         """The pixels of what is matched, NaN of the others."""
         return np.where(self.matched[:, None], self.pixels, np.nan)
 
     @property
-    def places(self) -> Float[np.ndarray, "k 2"]:
+    def places(self) -> Pixels:
         """The place of each, as far as is known: where it was matched, or else expected."""
         return np.where(self.matched[:, None], self.pixels, self.predicted)
 

@@ -10,6 +10,16 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+Picture = UInt8[np.ndarray, "h w"]
+"""A grey picture."""
+Pixels = Float[np.ndarray, "k 2"]
+"""Pixels (u, v) of k landmarks."""
+Window = Float32[np.ndarray, "window window"]
+"""The picture of a landmark as it should look now."""
+Places = Float[np.ndarray, "n 2"]
+"""Pixels (u, v) of n points."""
+
+
 WINDOW = 15  # side of the matched window in pixels, odd
 STORED = 41  # side of the stored patch: room to warp the window by up to 41/15
 
@@ -26,7 +36,7 @@ class Patch:
     stored: Float32[np.ndarray, "stored stored"] = field(repr=False)
 
     @classmethod
-    def take(cls, image: UInt8[np.ndarray, "h w"], pixel: Float[np.ndarray, " 2"]) -> "Patch":
+    def take(cls, image: Picture, pixel: Float[np.ndarray, " 2"]) -> "Patch":
         """Cut out the patch around `pixel`; beyond the image's edge its last row or column
         repeats."""
         u, v = pixel.tolist()
@@ -41,7 +51,7 @@ class Patch:
         reach = max(abs(inverse[0]) + abs(inverse[1]), abs(inverse[2]) + abs(inverse[3]))
         return reach * (WINDOW // 2) <= STORED // 2
 
-    def warped(self, affine: Float[np.ndarray, "2 2"]) -> Float32[np.ndarray, "window window"]:
+    def warped(self, affine: Float[np.ndarray, "2 2"]) -> Window:
         """Return how the window looks after the image around the patch was mapped by `affine`.
 
         `affine` takes pixel offsets in the first image to those in the present one, so the

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from scipy.stats import binom, chi2
 
 from jaxslam.filters.association import ASSOCIATIONS, Association, one_point_ransac
@@ -19,6 +19,7 @@ from jaxslam.tracking.landmarks import Landmark
 from jaxslam.tracking.map import Map
 from jaxslam.tracking.matching import GATE, Matches
 from jaxslam.tracking.observations import Lost, Observations, Prediction
+from jaxslam.tracking.patches import Picture
 from jaxslam.tracking.search import search
 from jaxslam.tracking.settings import TrackerSettings
 
@@ -73,7 +74,7 @@ class Policy:
         return list(dict.fromkeys((one_point_ransac, ASSOCIATIONS[self.settings.association])))
 
     def observed(
-        self, image: UInt8[np.ndarray, "h w"], map: Map, predicted: Predicted, *, lost: bool
+        self, image: Picture, map: Map, predicted: Predicted, *, lost: bool
     ) -> tuple[Observations, Lost | None]:
         """The landmarks that a picture is searched for, and which matches of them are believed; or
         why none are. What was known before the search is what the table says of each."""

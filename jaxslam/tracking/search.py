@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.landmarks import Landmark
 from jaxslam.tracking.map import in_view
 from jaxslam.tracking.matching import Matches, match_patches
 from jaxslam.tracking.observations import Observations, Prediction
-from jaxslam.tracking.patches import WINDOW
+from jaxslam.tracking.patches import WINDOW, Picture
 from jaxslam.tracking.settings import TrackerSettings
 
 
 def search(
-    image: UInt8[np.ndarray, "h w"],
+    image: Picture,
     landmarks: Mapping[int, Landmark],
     prediction: Prediction,
     calibration: Calibration,

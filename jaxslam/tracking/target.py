@@ -11,11 +11,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from jaxslam._runtime.files import Json, read_json
 from jaxslam.io.calibration import Calibration
 from jaxslam.io.recording import read_image
+from jaxslam.tracking.patches import Picture, Places
+from jaxslam.tracking.pose_with_covariance import Positions, Transform
 
 LEAST_POINTS = 4
 _METRES = ("metre", "metres", "meter", "meters", "m")
@@ -35,7 +37,7 @@ class KnownPoint:
     position: Float[np.ndarray, " 3"]
     """The position in the target's own frame, m."""
     pixel: Float[np.ndarray, " 2"] | None = None
-    patch: UInt8[np.ndarray, "h w"] | None = None
+    patch: Picture | None = None
     """The picture around it, about as large as it is seen; its corner is in the middle."""
 
     def __post_init__(self) -> None:
@@ -60,15 +62,15 @@ class Target:
             raise ValueError("its points are on one line; they must span a plane")
 
     @property
-    def positions(self) -> Float[np.ndarray, "n 3"]:
+    def positions(self) -> Positions:
         return np.array([point.position for point in self.points])
 
 
 class TargetObservation(NamedTuple):
     """The place of a target in a picture, and how far away its points are."""
 
-    pixels: Float[np.ndarray, "n 2"]
-    T_ct: Float[np.ndarray, "4 4"]
+    pixels: Places
+    T_ct: Transform
     """The target's frame in the camera, m."""
     inverse_depths: Float[np.ndarray, " n"]
     """1/z, 1/m."""
@@ -124,7 +126,7 @@ def _numbers(what: str, value: Json, count: int) -> Float[np.ndarray, " n"]:
 
 
 def sighted(
-    target: Target, image: UInt8[np.ndarray, "h w"], calibration: Calibration, pixel_sigma: float
+    target: Target, image: Picture, calibration: Calibration, pixel_sigma: float
 ) -> TargetObservation:
     """The target in a picture, its pixels measured with `pixel_sigma`.
 
@@ -170,9 +172,7 @@ def _places_of(point: KnownPoint, image: np.ndarray, count: int) -> list[Float[n
     return list(np.stack([columns, rows], 1)[order] + middle)
 
 
-def _on_corners(
-    target: Target, image: np.ndarray, pixels: Float[np.ndarray, "n 2"]
-) -> Float[np.ndarray, "n 2"]:
+def _on_corners(target: Target, image: np.ndarray, pixels: Places) -> Places:
     """The corners beside where patches were found; pixels that were given stay."""
     found = np.array([point.patch is not None for point in target.points])
     reach = (_CORNER_REACH, _CORNER_REACH)
@@ -195,9 +195,7 @@ class _Pose(NamedTuple):
     rms: float
 
 
-def _pose(
-    positions: Float[np.ndarray, "n 3"], pixels: Float[np.ndarray, "n 2"], lens: _Lens
-) -> _Pose:
+def _pose(positions: Positions, pixels: Places, lens: _Lens) -> _Pose:
     """Return the pose from which the points are seen there (PnP); an infinite RMS where there is
     none."""
     found, turn, shift = cv2.solvePnP(positions, pixels, *lens, flags=cv2.SOLVEPNP_SQPNP)
@@ -211,18 +209,12 @@ def _pose(
     return _Pose(turn, shift, float(np.sqrt(np.mean(np.sum((seen[:, 0] - pixels) ** 2, axis=1)))))
 
 
-def _in_camera(
-    positions: Float[np.ndarray, "n 3"], turn: np.ndarray, shift: np.ndarray
-) -> Float[np.ndarray, "n 3"]:
+def _in_camera(positions: Positions, turn: np.ndarray, shift: np.ndarray) -> Positions:
     return positions @ cv2.Rodrigues(turn)[0].T + shift.ravel()
 
 
 def _sighting(
-    positions: Float[np.ndarray, "n 3"],
-    pixels: Float[np.ndarray, "n 2"],
-    lens: _Lens,
-    pose: _Pose,
-    pixel_sigma: float,
+    positions: Positions, pixels: Places, lens: _Lens, pose: _Pose, pixel_sigma: float
 ) -> TargetObservation:
     turn, shift = cv2.solvePnPRefineLM(positions, pixels, *lens, pose.turn, pose.shift)
     J = cv2.projectPoints(positions, turn, shift, *lens)[1][:, :6]
@@ -236,7 +228,7 @@ def _sighting(
 
 
 def _depth_sigma(
-    positions: Float[np.ndarray, "n 3"], turn: np.ndarray, covariance: Float[np.ndarray, "6 6"]
+    positions: Positions, turn: np.ndarray, covariance: Float[np.ndarray, "6 6"]
 ) -> Float[np.ndarray, " n"]:
     """σ of `z = (R(turn) p + shift)_z`, given the covariance of turn and shift."""
     _, of_turn = cv2.Rodrigues(turn)

@@ -13,6 +13,7 @@ from jaxslam.evaluation import write_covariances as write_pose_covariances
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, Similarity, associated, similarity
 from jaxslam.evaluation.convention import Convention
 from jaxslam.io.tum import write_tum
+from jaxslam.tracking.pose_with_covariance import Positions
 
 TRACKED = Convention("split", "body")
 """The error whose covariances are written: position in the camera's axes, rotation vector."""
@@ -205,16 +206,14 @@ def _by_orientation(
     return turn, float(np.degrees(np.sqrt(np.mean(angles**2))))
 
 
-def _sign(
-    turn: Rotation, estimate: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "n 3"]
-) -> float:
+def _sign(turn: Rotation, estimate: Positions, reference: Positions) -> float:
     """Return the correlation of the positions after that rotation."""
     turned = turn.apply(estimate)
     a, b = reference - reference.mean(0), turned - turned.mean(0)
     return float(np.sum(a * b) / np.sqrt(np.sum(a**2) * np.sum(b**2)))
 
 
-def _straight_line(times: Float[np.ndarray, " n"], positions: Float[np.ndarray, "n 3"]) -> float:
+def _straight_line(times: Float[np.ndarray, " n"], positions: Positions) -> float:
     """RMS distance to the least squares line `a + b t`: any line can be aligned to any other."""
     centred, t = positions - positions.mean(0), times - times.mean()
     rest = centred - np.outer(t, t @ centred / (t @ t))

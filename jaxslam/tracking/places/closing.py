@@ -11,16 +11,18 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.map import Map
 from jaxslam.tracking.observations import Prediction
+from jaxslam.tracking.patches import Picture
 from jaxslam.tracking.places.descriptors import candidates, described_corners
 from jaxslam.tracking.places.relocalisation import FEWEST, MOST_OF, TRIED, pose_of, well_known
 from jaxslam.tracking.places.submaps import Submap, loop_of
 from jaxslam.tracking.pointcloud import seen_from
+from jaxslam.tracking.pose_with_covariance import Transform
 from jaxslam.tracking.search import search
 
 APART = 3
@@ -45,9 +47,7 @@ class Closed(NamedTuple):
         return self.nis < GATE
 
 
-def close_loop(
-    image: UInt8[np.ndarray, "h w"], map: Map, calibration: Calibration
-) -> Closed | None:
+def close_loop(image: Picture, map: Map, calibration: Calibration) -> Closed | None:
     """Return which earlier submap the picture at the end of the latest one shows: if that is
     believed, the `map` has learnt of it."""
     *earlier, latest = map.submaps
@@ -79,12 +79,12 @@ def close_loop(
 
 
 def _seen_in(
-    image: UInt8[np.ndarray, "h w"],
+    image: Picture,
     submap: Submap,
     by_number: Mapping[int, Float[np.ndarray, " 2"]],
     map: Map,
     calibration: Calibration,
-) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "4 4"]] | None:
+) -> tuple[Int[np.ndarray, " k"], Transform] | None:
     """The slots of the landmarks of a submap in a picture, and where its camera is from the last of
     the submap."""
     sure = well_known(submap.points, submap.covariances) & np.asarray(submap.frozen.carried)
@@ -112,7 +112,7 @@ def _seen_in(
 
 def _expected(
     submap: Submap,
-    T: Float[np.ndarray, "4 4"],
+    T: Transform,
     sure: Bool[np.ndarray, " slots"],
     unit: float,
     calibration: Calibration,

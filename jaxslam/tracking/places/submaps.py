@@ -28,7 +28,7 @@ from jaxslam.filters.submaps.chain import Chain, Link, SubmapMean, base_poses, l
 from jaxslam.filters.submaps.closing import Posterior, posterior
 from jaxslam.filters.submaps.handover import Frozen
 from jaxslam.geometry import difference, retract
-from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, Transform
 from jaxslam.tracking.settings import TrackerSettings
 
 LEAST = 8
@@ -105,7 +105,7 @@ class Compared(NamedTuple):
 
     nis: np.ndarray
     """The NIS by the filter's covariance, with six degrees of freedom and no `unit_variance`."""
-    T_bc: Float[np.ndarray, "4 4"]
+    T_bc: Transform
     """The present camera from where the map begins, given the loop to first order."""
     covariance: Float[np.ndarray, "6 6"]
     """The covariance of that camera, in the filter's unit."""
@@ -164,7 +164,7 @@ def loop_of(
     submaps: Sequence[Submap],
     which: tuple[int, int],
     slots: Int[np.ndarray, " k"],
-    T: Float[np.ndarray, "4 4"],
+    T: Transform,
     sigma: float,
     most: int,
 ) -> LoopClosure:
