@@ -22,8 +22,6 @@ from jaxslam._runtime.extras import missing
 from jaxslam._runtime.files import one_line
 from jaxslam._runtime.programs import wide
 
-AHEAD = 3
-"""The tasks given out for every thread of the cluster: one at work, the others on their way."""
 AT_LEAST = 64
 """The tasks given out however few threads there are, so that a cluster that adapts sees work."""
 ANSWER_SECONDS = 10.0
@@ -69,7 +67,9 @@ def on_cluster(
     try:
         while waiting or doing:
             if waiting and len(doing) < AT_LEAST:
-                room = max(AT_LEAST, AHEAD * sum(client.nthreads().values()))
+                # The tasks given out for every thread of the cluster: one at work, the others on
+                # their way
+                room = max(AT_LEAST, 3 * sum(client.nthreads().values()))
                 for chunk in [waiting.popleft() for _ in range(min(room, len(waiting)))]:
                     future = client.submit(_computed, whole, wide(), chunk, pure=False)
                     doing[future] = chunk

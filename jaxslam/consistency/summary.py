@@ -46,7 +46,6 @@ _VALUES_AT_ONCE = 10**7
 """The most values of a record in memory for medians: all runs, and as many steps as fit."""
 _IN_BOTH = ("runs", "seed", "dtype", "device")
 """The attributes of a study that its results have too."""
-_OF_MEDIANS = ("nees", "log_scale", "log_scale_sigma", *SCALE)
 _FILES = {"consistency.json", "consistency.png", "consistency.pdf", "runs"}
 """The names in the folder of a study that is saved, which may be written over."""
 
@@ -416,7 +415,7 @@ def _medians(study: Study, name: str) -> dict[str, np.ndarray]:
     for start in range(0, study.scenario.steps, at_once):
         part, columns = slice(start, start + at_once), []
         for chunk in study.whole:
-            kept = study.store.load(name, chunk, _OF_MEDIANS)
+            kept = study.store.load(name, chunk, ("nees", "log_scale", "log_scale_sigma", *SCALE))
             survivors = survived(kept)[:, None]
             values = {
                 "nees.median": kept["nees"],

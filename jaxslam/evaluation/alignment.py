@@ -32,9 +32,6 @@ MAX_TIME_DIFFERENCE = 0.01
 """The largest time difference of poses that are compared, s; evo's default."""
 _SPLIT = Convention("split", "world")
 """The error in which gauge directions are written."""
-_CLEAR = 10
-"""A rotation about a line is fixed by positions so many σ off it, root of the mean squares:
-of four it has 6 % more σ than to first order, of ten 1 %."""
 
 
 class Similarity(NamedTuple):
@@ -118,7 +115,9 @@ def straight_line(
     A fit of positions then does not determine the rotation about it, and would fit that to noise.
     """
     _, singular, right = np.linalg.svd(positions - positions.mean(0))
-    if len(right) == 2 or singular[1] > _CLEAR * np.linalg.norm(sigma):
+    # A rotation about a line is fixed by positions so many σ off it, root of the mean squares: of
+    # four it has 6 % more σ than to first order, of ten 1 %
+    if len(right) == 2 or singular[1] > 10 * np.linalg.norm(sigma):
         return None
     return right[0]
 

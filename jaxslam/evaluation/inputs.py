@@ -338,8 +338,6 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
     return arrays
 
 
-_APART = 2
-"""The most different steps of all runs, relative to those of the longest, that runs may share."""
 _COLUMNS = "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"
 _STEP_FIRST = ("step", "steps", "time", "t", "k", "frame", "timestamp")
 """First words of a table without a column of runs."""
@@ -459,7 +457,8 @@ def _rectangle(
         r, s = places[twice]
         raise ValueError(f"{path}, line {lines[twice]}: run {r:g}, step {s:g} appears twice")
     longest = int(np.bincount(run).max())
-    if len(steps) > _APART * longest:
+    # The most different steps of all runs, relative to those of the longest, that runs may share
+    if len(steps) > 2 * longest:
         raise ValueError(
             f"{path}: the runs have {len(steps)} different steps, but none has more than "
             f"{longest}; steps must be counted alike in all runs, for example from the start of "

@@ -41,10 +41,6 @@ from jaxslam.statistics.verdict import (
     sentences,
 )
 
-SCHEMA = 1
-SIGMAS = 3
-_TOLD = 3
-"""The most runs that a sentence names as examples."""
 _MOST_DOF = 1_000_000
 _LISTED = 20
 """The most lost runs that are named in the text; the file names all."""
@@ -213,7 +209,7 @@ class Evaluation:
     @property
     def outside3sigma(self) -> Float[np.ndarray, " n"]:
         """The share of the errors of every axis beyond ±3σ; .27 % of Gaussian ones are."""
-        beyond = np.abs(self.errors) > SIGMAS * self.sigmas
+        beyond = np.abs(self.errors) > 3 * self.sigmas
         return np.sum(beyond, axis=(0, 1)) / np.sum(self.logged)
 
     @property
@@ -239,7 +235,7 @@ class Evaluation:
 
         by_axis = {name: i for i, name in enumerate(self.names)}
         return {
-            "schema": SCHEMA,
+            "schema": 1,
             "version": __version__,
             "quantity": self.quantity,
             "runs": self.runs,
@@ -344,7 +340,8 @@ def _missing(evaluation: Evaluation) -> list[str]:
     missing = np.sum(~evaluation.logged, axis=1)
     if not missing.any():
         return []
-    most = np.argsort(-missing, kind="stable")[: min(_TOLD, np.count_nonzero(missing))]
+    # The most runs that a sentence names as examples
+    most = np.argsort(-missing, kind="stable")[: min(3, np.count_nonzero(missing))]
     told = ", ".join(f"{_run(evaluation, int(run))}: {missing[run]}" for run in most)
     more = np.count_nonzero(missing) - len(most)
     told += f", and {more} more run{'s' if more > 1 else ''}" if more else ""
@@ -475,12 +472,6 @@ def _names(names: Sequence[str], n: int) -> tuple[str, ...]:
     return told
 
 
-_CLEAR = 3.0
-"""Of a correlation, in σ of white innovations: one in 370 of a right filter."""
-_LEAST = 0.02
-"""A correlation that is smaller says nothing of the gain, however many steps show it."""
-
-
 def neighbours_correlate(nis: Evaluation) -> float | None:
     """The correlation of innovations, over their σ, with those of the next step; None if unclear.
 
@@ -493,7 +484,9 @@ def neighbours_correlate(nis: Evaluation) -> float | None:
     if not np.isfinite(squared) or squared == 0 or not pairs:
         return None
     rho = float(np.sum(z[:, 1:] * z[:, :-1]) / squared)
-    return rho if abs(rho) > max(_LEAST, _CLEAR / np.sqrt(pairs)) else None
+    # Of a correlation, in σ of white innovations: one in 370 of a right filter
+    # A correlation that is smaller says nothing of the gain, however many steps show it
+    return rho if abs(rho) > max(0.02, 3.0 / np.sqrt(pairs)) else None
 
 
 def advice(nis: Evaluation, nees: Evaluation | None = None) -> str:

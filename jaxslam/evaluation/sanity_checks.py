@@ -23,8 +23,6 @@ DEGREES = 180 / np.pi
 _PERIODS = ((2 * np.pi, "2π", "(−π, π]"), (360.0, "360°", "(−180°, 180°]"))
 _FAR, _NEAR = 8.0, 5.0
 """An error beyond so many σ is not one of its axis; within so many of a full turn it is."""
-_WIDEST = {True: 1.0, None: 0.5}
-"""The distance from a full turn, rad, for an axis known to be an angle and one that may be."""
 _WRONG = 5.0
 """An axis whose σ may be right up to this factor is in its unit."""
 _LIKE = 2.0
@@ -36,8 +34,6 @@ _SHARE, _BELOW = 0.4, 5.0
 _NARROW = 5.0
 """The widest interval of a factor, upper by lower end, of an axis that may be an angle or not: that
 of 8 runs is narrower."""
-_ALIKE = 4.0
-"""The widest one of a verdict, which is of the runs' scatter too, where no other axis is right."""
 _MANY = 300
 """The most runs and steps whose correlations are tested."""
 _ANGLES = re.compile(
@@ -108,7 +104,9 @@ def _unwrapped(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake
             continue
         e, sigma = logged.errors[..., axis], logged.sigmas[..., axis]
         for period, turn, wrapped in _PERIODS:
-            run = _turned(e, sigma, period, _WIDEST[angle] * period / (2 * np.pi))
+            # The distance from a full turn, rad, for an axis known to be an angle and one that may
+            # be
+            run = _turned(e, sigma, period, {True: 1.0, None: 0.5}[angle] * period / (2 * np.pi))
             if not run.any():
                 continue
             where = run[:, None] & (np.abs(e) > period / 2)
@@ -161,7 +159,9 @@ def _degrees(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake]:
         found = [axis for axis in asked if wrong[axis].is_like(factor, known=bool(angles))]
         if not angles and found == asked:  # σ as a whole may be wrong
             ends = {axis: logged.factors[axis]["interval99"] for axis in found}
-            found = [x for x, (low, high) in ends.items() if low and high and high < _ALIKE * low]
+            # The widest one of a verdict, which is of the runs' scatter too, where no other axis is
+            # right
+            found = [x for x, (low, high) in ends.items() if low and high and high < 4.0 * low]
         if not found or (angles and found != angles):
             continue
         if any(wrong[axis].is_like(factor, known=True) for axis in lengths):

@@ -35,10 +35,6 @@ from jaxslam.plots.style import (
 )
 from jaxslam.statistics.verdict import brief, headline
 
-_MEDIAN_OF_NORMAL = 0.6745
-"""Median of |x| for a standard normal x."""
-
-
 Drawn = Study | Results | Mapping[str, Json]
 """What is drawn: a study, its results, or the summary that `consistency.json` holds."""
 
@@ -221,8 +217,9 @@ def plot_log_scale(summary: Drawn, *, ax: Axes, label: Labels | None = None) -> 
     Where the scale is free; names at the ends of the lines, or those of `label`.
     """
     results = _with_scale(summary)
+    # Median of |x| for a standard normal x
     pairs = {
-        name: (r.log_scale.error_median, _MEDIAN_OF_NORMAL * r.log_scale.sigma_median)
+        name: (r.log_scale.error_median, 0.6745 * r.log_scale.sigma_median)
         for name, r in results.items()
     }
     lines = _plot_pairs(pairs, results, ax, label, lw=0.9, ls=(0, (4, 2)))

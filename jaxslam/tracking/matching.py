@@ -26,7 +26,6 @@ _MAP_SIGMA = 0.2  # of a map's elements: a patch does not face its first camera
 _PRECISION = 2.4e-4 / _MAP_SIGMA**2  # by s² of ρ = .98
 _MOST_MAPPED = 0.5  # by which elements of a map differ from the identity's
 _MAX_SHIFT = 1.5  # pixels: a refinement that moves further than this has left its peak
-_WIDEST = 0.25  # of the picture's width: an ellipse is searched no further from its centre
 _NARROW = 91**2  # pixels: boxes of more are searched in the picture of half the size first
 _NEARBY = 3  # pixels around such a peak
 PEAKS = 3
@@ -88,7 +87,8 @@ def match_patches(
         return Matches(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, np.float32), np.zeros(0))
     whole, half = image.astype(np.float32), templates.shape[1] // 2
     ellipses = _Ellipses.of(centres, covariances)
-    reach = _WIDEST * image.shape[1] if max_radius is None else max_radius
+    # of the picture's width: an ellipse is searched no further from its centre
+    reach = 0.25 * image.shape[1] if max_radius is None else max_radius
     boxes = _boxes_around(ellipses, reach, half, image.shape)
     least = THRESHOLD - ambiguity
     wide = boxes.owner[boxes.large()]

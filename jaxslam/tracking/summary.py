@@ -30,7 +30,6 @@ from jaxslam.tracking.trajectory import (
     relative_pose_error,
 )
 
-SCHEMA = 1
 WARM_UP = 3
 """Frames in which functions are compiled; they count in `seconds.start`, not in the quantiles."""
 TOO_SURE = (
@@ -56,7 +55,7 @@ def summarised(
     count = max(len(updates), 1)
     later = seconds[WARM_UP:] or seconds or [0.0]
     summary = {
-        "schema": SCHEMA,
+        "schema": 1,
         "version": __version__,
         "source": source.name,
         "filter": tracker.filter_name,

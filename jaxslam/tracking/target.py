@@ -20,9 +20,6 @@ from jaxslam.tracking.patches import Picture, Places
 from jaxslam.tracking.pose_with_covariance import Positions, Transform
 
 LEAST_POINTS = 4
-_METRES = ("metre", "metres", "meter", "meters", "m")
-_ALIKE = 0.8
-"""Least correlation of a patch with the picture."""
 _CORNER_REACH = 3
 """Pixels to each side in which the corner that a patch shows is measured."""
 _LARGEST_RMS, _LARGEST_FOUND = 2.0, 0.75
@@ -96,7 +93,7 @@ def _from_fields(fields: Json, folder: Path) -> Target:
     if not isinstance(points, list):
         raise ValueError("has no list of points; expected an object with `points`")
     unit = fields.get("unit", "metre")
-    if unit not in _METRES:
+    if unit not in ("metre", "metres", "meter", "meters", "m"):
         raise ValueError(f"unit must be metre, not {unit!r}")
     return Target(tuple(_point(index, point, folder) for index, point in enumerate(points)))
 
@@ -164,7 +161,8 @@ def _places_of(point: KnownPoint, image: np.ndarray, count: int) -> list[Float[n
         raise ValueError(f"the patch of point {name} is larger than the picture")
     alike = cv2.matchTemplate(image, patch, cv2.TM_CCOEFF_NORMED)
     highest = alike >= cv2.dilate(alike, np.ones((7, 7), np.uint8))
-    rows, columns = np.nonzero(highest & (alike > _ALIKE))
+    # Least correlation of a patch with the picture
+    rows, columns = np.nonzero(highest & (alike > 0.8))
     if not len(rows):
         raise ValueError(f"the first picture shows nothing like the patch of point {name}")
     order = np.argsort(-alike[rows, columns])[:count]

@@ -18,9 +18,7 @@ from jaxslam.tracking.overlay import COLOURS, search_ellipses
 from jaxslam.tracking.report import Tracked
 
 _IMAGE = "world/camera/image"
-_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
 _TRACKED, _LOST = (0, 114, 178), (150, 150, 150)  # of the path
-_LOOP = (213, 94, 0)
 
 
 class Viewer:
@@ -94,7 +92,7 @@ class Viewer:
 
     def _show_picture(self, frame: Frame, result: Tracked) -> None:
         rr = self._rerun
-        jpeg = cv2.imencode(".jpg", frame.image, _JPEG)[1].tobytes()
+        jpeg = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
         self._record.log(_IMAGE, rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
         table = result.observations.with_new(result.created)
         for label in COLOURS:
@@ -132,7 +130,7 @@ class Viewer:
             self._record.log("world/graph/submaps", ends)
         if result.loop in self._ends:
             self._loops.append([result.T_wc[:3, 3], self._ends[result.loop]])
-            self._record.log("world/graph/loops", rr.LineStrips3D(self._loops, colors=_LOOP))
+            self._record.log("world/graph/loops", rr.LineStrips3D(self._loops, colors=(213, 94, 0)))
 
     def _show_numbers(self, result: Tracked) -> None:
         rr, camera = self._rerun, result.camera
