@@ -87,7 +87,6 @@ def filter_run(
     def records_and_pose(state, innovation, frame: SimulatedFrame):
         T_BC = frame.pose
         estimate, covariance = camera_pose(slam, state)
-        landmarks = _landmark_records(slam, sensor, state, frame)
         records = {
             "nees": normalised_squared(*slam.pose_error(state, T_BC)),
             **scale_records(slam, state, T_BC),
@@ -97,7 +96,7 @@ def filter_run(
             "status": innovation.status,
             "error": _camera_error(estimate, T_BC),
             "variance": jnp.diagonal(covariance),
-            **landmarks,
+            **_landmark_records(slam, sensor, state, frame),
         }
         return records, estimate
 

@@ -75,8 +75,7 @@ class Simulator:
 
     def __call__(self, chunk: range) -> tuple[Run, Room]:
         """Return the chunk's runs, padded to `size` by the runs that follow."""
-        indices = chunk.start + jnp.arange(self.size)
-        return _draw(self._world, self._key, indices)
+        return _draw(self._world, self._key, chunk.start + jnp.arange(self.size))
 
     def max_sightings(self, chunk: range) -> Room:
         """Return the most that any of the chunk's runs sees."""

@@ -242,8 +242,7 @@ class Study(Mapping):
         return as_html(self.results)
 
     def __getattr__(self, name: str) -> NoReturn:
-        known = {field.name for field in dataclasses.fields(FilterResult)} | {"verdict", "lost"}
-        if name in known:
+        if name in {field.name for field in dataclasses.fields(FilterResult)} | {"verdict", "lost"}:
             meant = f"; each filter has one: study[{next(iter(self.filters))!r}].{name}"
         else:
             meant = suggestion(name, dir(type(self)))

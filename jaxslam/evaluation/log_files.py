@@ -405,8 +405,7 @@ def _read(run: RunFiles) -> _RunLog:
         _check_times(path, told)
     covariances = _at_times(files[0], files[1], text.covariances)
     true = _at_times(files[0], files[2], truths)
-    known = exactly_known(covariances.values)
-    those = evaluated_poses(run.estimate.parent, times, known)
+    those = evaluated_poses(run.estimate.parent, times, exactly_known(covariances.values))
     read = _RunLog(run, times, estimates, covariances, true, text.said, those)
     _check_share(read)
     return read

@@ -103,10 +103,9 @@ def evaluate_poses(
     poses = checked_poses(estimates, covariances, truths)
     at, sigma = step_times(times, poses.estimates.shape[1]), checked_sigma(truth_sigma)
     found = as_stated(poses, stated, align, axes_named(axes_used, poses.estimates, stated), sigma)
-    start = len(at) - found.steps
     return replace(
         found,
-        times=at[start:],
+        times=at[len(at) - found.steps :],
         timed=times is not None,
         identified=_identified(poses, stated, _Options(align, found.names, sigma)),
     )
@@ -242,12 +241,11 @@ def _tried(
         e, P = found.errors[..., block], found.covariances[..., block, :][..., block]
         return filled(normalised(e, P), found.logged, np.nan)
 
-    determinant = np.linalg.slogdet(found.covariances[found.logged])[1].mean()
     return Tried(
         filled(found.nees, found.logged, np.nan),
         len(names),
         found.fitted,
-        float(determinant),
+        float(np.linalg.slogdet(found.covariances[found.logged])[1].mean()),
         of(~turns) if (~turns).any() else None,
         of(turns) if turns.any() else None,
         int(turns.sum()),

@@ -209,8 +209,7 @@ class Evaluation:
     @property
     def outside3sigma(self) -> Float[np.ndarray, " n"]:
         """The share of the errors of every axis beyond ±3σ; .27 % of Gaussian ones are."""
-        beyond = np.abs(self.errors) > 3 * self.sigmas
-        return np.sum(beyond, axis=(0, 1)) / np.sum(self.logged)
+        return np.sum(np.abs(self.errors) > 3 * self.sigmas, axis=(0, 1)) / np.sum(self.logged)
 
     @property
     def suggested(self) -> Convention | None:

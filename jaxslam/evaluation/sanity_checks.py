@@ -135,8 +135,7 @@ def _turned(e: PerStep, sigma: PerStep, period: float, widest: float) -> Bool[np
     scale = float(np.median(sigma[there]))
     if small.any():
         scale = max(scale, float(np.sqrt(np.mean(e[small] ** 2))))
-    left = np.abs(e - period * np.round(e / period))
-    near = ~there | (left <= min(_NEAR * scale, widest))
+    near = ~there | (np.abs(e - period * np.round(e / period)) <= min(_NEAR * scale, widest))
     far = ~turned | (np.abs(e) > _FAR * np.maximum(sigma, scale))
     found = turned.any(axis=1) & near.all(axis=1) & far.all(axis=1)
     return found & (found.sum() > turned.any(axis=1).sum() / 2)

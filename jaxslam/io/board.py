@@ -140,5 +140,4 @@ def sharpness(image: UInt8[np.ndarray, "h w"], pixels: Float32[np.ndarray, "k 2"
     window = np.ones((_AROUND, _AROUND), np.uint8)
     contrast = cv2.dilate(image, window).astype(np.float32) - cv2.erode(image, window)
     x, y = np.clip(np.rint(pixels).astype(int), 0, np.array(image.shape[::-1]) - 1).T
-    steepest = cv2.dilate(slope, window)[y, x]
-    return float(np.median(steepest / np.maximum(contrast[y, x], 1.0)))
+    return float(np.median(cv2.dilate(slope, window)[y, x] / np.maximum(contrast[y, x], 1.0)))

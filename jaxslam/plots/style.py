@@ -121,8 +121,7 @@ class End(NamedTuple):
 
 def label_end(axes: Axes, end: End) -> None:
     """Write a line's name where it ends, whatever the limits of the axes become."""
-    last = np.flatnonzero(np.isfinite(end.y))[-1:]
-    for i in last:
+    for i in np.flatnonzero(np.isfinite(end.y))[-1:]:
         axes.annotate(
             end.label, (end.x[i], end.y[i]), (4, 0), textcoords="offset points", va="center",
             color=end.colour, fontsize=LETTERS, annotation_clip=False,

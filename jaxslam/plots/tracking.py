@@ -127,8 +127,7 @@ def _lines(
     positions = poses[:, :3, 3]
 
     def broken(hidden: np.ndarray) -> np.ndarray:
-        shown = np.where(hidden[:, None], np.nan, positions)
-        return np.insert(shown, begun, np.nan, axis=0)
+        return np.insert(np.where(hidden[:, None], np.nan, positions), begun, np.nan, axis=0)
 
     lines = [("estimate", broken(lost), _TRAJECTORY, "-")]
     if lost.any():
@@ -237,5 +236,4 @@ def _draw_begun(
     """Mark where maps begin, and where in the world that can be."""
     places, covariances = panel.seen(places, covariances)
     draw_ellipses(axis, places, covariances, _SIGMAS_95, _BEGUN)
-    label = "a map begins, 95 % of where"
-    axis.plot(*places.T, "D", color=_BEGUN, ms=6, mfc="white", label=label)
+    axis.plot(*places.T, "D", color=_BEGUN, ms=6, mfc="white", label="a map begins, 95 % of where")

@@ -219,8 +219,7 @@ class Rays(AbstractPlacement):
 
         frames = world.steps + 1
         keys, is_first = jax.random.split(key, frames), jnp.arange(frames) == 0
-        dtype = jnp.result_type(world.rate)
-        nowhere = jnp.ones((self.landmarks, world.geometry.point_dim), dtype)
+        nowhere = jnp.ones((self.landmarks, world.geometry.point_dim), jnp.result_type(world.rate))
         return jax.lax.scan(frame, nowhere, (keys, poses, sensors, is_first))[1]
 
     def _thrown(self, key: Array, sensor: AbstractSensor) -> Float[Array, "l n"]:

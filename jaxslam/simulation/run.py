@@ -130,8 +130,7 @@ def in_order_of_appearance(run: Run) -> Run:
     """Landmarks that are never seen come last, so that a filter needs no slots for them, and those
     that are known before frame 0 first."""
     never = run.visible.shape[0]
-    seen = jnp.any(run.visible, axis=0)
-    first = jnp.where(seen, jnp.argmax(run.visible, axis=0), never)
+    first = jnp.where(jnp.any(run.visible, axis=0), jnp.argmax(run.visible, axis=0), never)
     order = jnp.argsort(jnp.where(run.beacons, -1, first), stable=True)
     known = run.known
     if known is not None:
@@ -162,11 +161,10 @@ def in_shared_slots(run: Run, count: int) -> Run:
         return held, (held, comes)
 
     _, (held, new) = jax.lax.scan(frame, none, run.visible)
-    pick = jax.vmap(lambda values, held: values[held])
     return replace(
         run,
         points=run.points[held],
-        measured=pick(run.measured, held),
+        measured=jax.vmap(lambda values, held: values[held])(run.measured, held),
         visible=held >= 0,
         new=new,
         identity=held,

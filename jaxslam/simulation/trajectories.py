@@ -39,8 +39,7 @@ class RecordedMotion(eqx.Module):
     def run(self, key: Array) -> Pose:
         """`T_C0,Ck` of frames 0 to `steps`, from a start drawn at random."""
         start = jnp.asarray(self.starts)[jax.random.randint(key, (), 0, self.starts.size)]
-        frames = start + jnp.arange(self.steps + 1)
-        T_WC = jaxlie.SE3(jnp.asarray(self.poses)[frames])
+        T_WC = jaxlie.SE3(jnp.asarray(self.poses)[start + jnp.arange(self.steps + 1)])
         origin = jaxlie.SE3(T_WC.wxyz_xyz[0]).inverse()
         return jax.vmap(lambda T: (origin @ T).normalize())(T_WC)
 
@@ -102,8 +101,7 @@ def _without_gaps(times: Float[np.ndarray, " n"], T: Float[np.ndarray, "n 4 4"])
         if part.size >= LEAST:
             # Neighbours have quaternions of one sign, of the two that say the same.
             turns = quaternions(T[part, :3, :3])
-            flips = np.cumprod(np.sign(np.sum(turns[1:] * turns[:-1], axis=1)))
-            turns[1:] *= flips[:, None]
+            turns[1:] *= np.cumprod(np.sign(np.sum(turns[1:] * turns[:-1], axis=1)))[:, None]
             yield times[part], np.hstack([T[part, :3, 3], turns])
 
 

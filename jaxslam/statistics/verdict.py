@@ -115,8 +115,7 @@ class Tally:
                 f"runs with {self.fitted} and {other.fitted} fitted degrees of freedom cannot be "
                 "pooled"
             )
-        both = self.numbers() + other.numbers()
-        return Tally.of_numbers(both, self.dof, self.fitted)
+        return Tally.of_numbers(self.numbers() + other.numbers(), self.dof, self.fitted)
 
     def looks(self) -> list[Look]:
         """The looks at all steps, the last one and each third, which hold together with 99 %.
@@ -218,8 +217,7 @@ def lost_runs(
     there = _logged(nees, logged)
     steps, which = np.unique(there.sum(axis=1), return_inverse=True)
     limits = np.array([lost_threshold(dof, int(n)) for n in steps])[which]
-    lost = (~(nees <= limits[:, None]) & there).any(axis=1)
-    return [int(run) for run in np.flatnonzero(lost)]
+    return [int(run) for run in np.flatnonzero((~(nees <= limits[:, None]) & there).any(axis=1))]
 
 
 def _thirds(nees: PerStep, there: Mask) -> tuple[PowerSums, PowerSums, PowerSums]:
@@ -398,8 +396,7 @@ def innovation_verdict(
 def _of_steps(nis: PerStep, dof: int, outlying: list[int]) -> Tally:
     """A tally to which every step is a run, but for the counts of runs."""
     there = ~np.isnan(nis)
-    steps = there.sum(axis=1, keepdims=True)
-    third = len(THIRDS) * (np.cumsum(there, axis=1) - 1) // steps
+    third = len(THIRDS) * (np.cumsum(there, axis=1) - 1) // there.sum(axis=1, keepdims=True)
     first, second, last = (PowerSums.of(nis[there & (third == i)]) for i in range(len(THIRDS)))
     kept = np.ones(len(nis), bool)
     kept[outlying] = False

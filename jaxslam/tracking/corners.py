@@ -46,8 +46,7 @@ def detect_corners(
         best = int(np.argmin(np.where(free, held[cell], np.iinfo(held.dtype).max)))
         free[best] = False
         corner = _refined(image, candidates[best : best + 1], max(border, 1))
-        others = np.concatenate([points, chosen])
-        if len(corner) and _farther(corner, others, min_distance).all():
+        if len(corner) and _farther(corner, np.concatenate([points, chosen]), min_distance).all():
             chosen = np.concatenate([chosen, corner])
             held[cell[best]] += 1
             free &= _farther(candidates, corner, min_distance)
@@ -80,8 +79,7 @@ def _refined(
 
 
 def _within(points: Float32[np.ndarray, "n 2"], shape: tuple[int, ...], border: int) -> np.ndarray:
-    high = np.array(shape[1::-1]) - 1 - border
-    return np.all((points >= border) & (points <= high), axis=1)
+    return np.all((points >= border) & (points <= np.array(shape[1::-1]) - 1 - border), axis=1)
 
 
 def _farther(

@@ -346,8 +346,7 @@ def _padded(slots: Int[np.ndarray, " k"], pixels: Pixels, size: int) -> Features
 
 def _measured(features: Features, factors: Float[np.ndarray, " k"]) -> Features:
     """The features with these factors of their noise."""
-    missing = len(features.slots) - len(factors)
-    more = np.pad(factors, (0, missing), constant_values=1.0)
+    more = np.pad(factors, (0, len(features.slots) - len(factors)), constant_values=1.0)
     return replace(features, noise_factor=more)
 
 
@@ -365,8 +364,7 @@ def _remove(slam: AbstractStaged, state: Belief, gone: jax.Array) -> Belief:
 def _moving(
     slam: AbstractStaged, state: Belief, T: jax.Array, sigma: jax.Array, dt: jax.Array
 ) -> Belief:
-    velocity = log(jaxlie.SE3.from_matrix(T)) / dt
-    return _with_velocity(state, velocity, jnp.diag((sigma / dt) ** 2))
+    return _with_velocity(state, log(jaxlie.SE3.from_matrix(T)) / dt, jnp.diag((sigma / dt) ** 2))
 
 
 @Program

@@ -43,8 +43,7 @@ def better_focal(
         # A camera that turned away shares nothing with the others.
         sharing = [i for i, (which, _) in enumerate(views) if len(which)]
         seen, views = [seen[i] for i in sharing], [views[i] for i in sharing]
-        unknown = 6 * len(views) + places.size
-        if 2 * sum(len(which) for which, _ in views) > 1.2 * unknown:
+        if 2 * sum(len(which) for which, _ in views) > 1.2 * (6 * len(views) + places.size):
             T_wc = np.array([one.T_wc for one in seen])
             factors = (1 / FACTOR, 1.0, FACTOR)
             left += [_left(T_wc, views, places, calibration, factor) for factor in factors]

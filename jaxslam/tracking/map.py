@@ -55,8 +55,7 @@ class Remembered:
     def graph(self, settings: TrackerSettings, slam: AbstractStaged) -> Graph:
         """Return its submaps and loops, of this filter."""
         numbers = slot_numbers(self.landmarks, settings.capacity)
-        camera = self.place.camera
-        present, _ = handed_over(slam, self.state, numbers, camera, number=self.submap)
+        present, _ = handed_over(slam, self.state, numbers, self.place.camera, number=self.submap)
         return Graph(slam, self.submaps, present, self.loops, settings.wanted)
 
 
@@ -155,9 +154,8 @@ class Map:
         """End the submap at the camera, where this picture was taken."""
         note_looks(self.landmarks.values(), image)
         estimator, numbers = self.estimator, slot_numbers(self.landmarks, self.settings.capacity)
-        camera = self.place.camera
         ended, state = handed_over(
-            estimator.slam, estimator.state, numbers, camera, number=self.submap
+            estimator.slam, estimator.state, numbers, self.place.camera, number=self.submap
         )
         estimator.state = state
         self.submaps = (*self.submaps, ended)
@@ -383,5 +381,4 @@ def worst_first(
     distances = np.linalg.norm(points.points - starts, axis=1)
     with np.errstate(invalid="ignore"):  # at infinity, or of unknown depth
         shares = np.sqrt(np.trace(points.in_map, axis1=1, axis2=2)) / distances
-    unknown = np.minimum(np.nan_to_num(shares, nan=1.0), 1.0)
-    return np.lexsort((-unseen * unknown, away))
+    return np.lexsort((-unseen * np.minimum(np.nan_to_num(shares, nan=1.0), 1.0), away))

@@ -97,8 +97,7 @@ def match_patches(
     peaks = peaks.only(ellipses.hold(peaks.owner, peaks.pixels))
     peaks = peaks.only(np.lexsort((-peaks.scores, peaks.owner)))
     in_wide = several & np.isin(peaks.owner, wide)
-    alone = _alone(peaks.only(~in_wide), ambiguity)
-    chosen = alone.joined(_several(peaks.only(in_wide)))
+    chosen = _alone(peaks.only(~in_wide), ambiguity).joined(_several(peaks.only(in_wide)))
     chosen = chosen.only(np.argsort(chosen.owner, kind="stable"))
     pixels = chosen.pixels + _quadratic_peaks(chosen.around)
     variances = np.zeros(len(pixels))
@@ -221,8 +220,7 @@ class _Ellipses(NamedTuple):
 
     def reach(self) -> Places:
         """Return how far each goes from its centre along u and v, pixels."""
-        variances = np.stack([self.uu, self.vv], axis=1)
-        return np.sqrt(GATE * np.maximum(variances, 0.0))
+        return np.sqrt(GATE * np.maximum(np.stack([self.uu, self.vv], axis=1), 0.0))
 
     def hold(
         self, which: Int[np.ndarray, " m"], pixels: Int[np.ndarray, "m 2"]
@@ -339,8 +337,7 @@ def _narrowed(
     large = boxes.large()
     if not large.any():
         return boxes
-    side = (templates.shape[1] + 1) // 2
-    halved = _Halved.of(image, side)
+    halved = _Halved.of(image, (templates.shape[1] + 1) // 2)
     # Of score: what a match loses at half the size, where pixels fall otherwise
     small = [
         halved.places(templates[box.owner[0]], box, ellipses, least - 0.1)
@@ -396,8 +393,7 @@ class _Halved(NamedTuple):
         region = self.image[top - before : bottom + after, left - before : right + after]
         kernel = cv2.pyrDown(template)
         kernel -= kernel.mean()
-        norm = np.sqrt(np.sum(kernel**2)) + 1e-6
-        scores = cv2.filter2D(region, -1, kernel / norm)
+        scores = cv2.filter2D(region, -1, kernel / (np.sqrt(np.sum(kernel**2)) + 1e-6))
         scores = scores[before : scores.shape[0] - after, before : scores.shape[1] - after]
         return scores / self.spread[top:bottom, left:right]
 

@@ -96,8 +96,7 @@ class Observations(NamedTuple):
 
     def but_for(self, used: Bool[np.ndarray, " k"]) -> Observations:
         """The table in which matches that the filter did not use are outliers."""
-        refused = self.matched & ~used
-        return self._replace(labels=np.where(refused, "outlier", self.labels))
+        return self._replace(labels=np.where(self.matched & ~used, "outlier", self.labels))
 
 
 NOTHING = Observations()

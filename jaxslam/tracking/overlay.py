@@ -123,8 +123,7 @@ def _draw_marks(canvas: UInt8[np.ndarray, "h w 3"], pixels: Pixels, status: str)
     """Mark where landmarks were found."""
     if status in ("outlier", "new"):
         shape = _CROSS if status == "outlier" else _SQUARE
-        lines = pixels[:, None, None] + shape
-        _draw_lines(canvas, lines.reshape(-1, *shape.shape[1:]), status)
+        _draw_lines(canvas, (pixels[:, None, None] + shape).reshape(-1, *shape.shape[1:]), status)
     else:
         for pixel in _fixed(pixels).tolist():
             cv2.circle(canvas, pixel, 2 << _SHIFT, COLOURS[status], -1, cv2.LINE_AA, _SHIFT)
@@ -141,8 +140,7 @@ def search_ellipses(centres: Pixels, covariances: Float[np.ndarray, "k 2 2"]) ->
 
 def _dashes(lines: Lines) -> Float[np.ndarray, "d q 2"]:
     """Every other piece of each."""
-    pieces = lines[:, :_TURN].reshape(-1, _TURN // _DASH, _DASH, 2)
-    return pieces[:, ::2].reshape(-1, _DASH, 2)
+    return lines[:, :_TURN].reshape(-1, _TURN // _DASH, _DASH, 2)[:, ::2].reshape(-1, _DASH, 2)
 
 
 def _draw_lines(canvas: UInt8[np.ndarray, "h w 3"], lines: Lines, status: str) -> None:
@@ -200,8 +198,7 @@ def _draw_symbol(strip: UInt8[np.ndarray, "strip w 3"], status: str, x: int, y: 
 
 def _write(strip: UInt8[np.ndarray, "strip w 3"], text: str, x: int, y: int) -> None:
     scale = _letters(strip.shape[1])
-    place = (x, y + round(11 * scale))
-    cv2.putText(strip, text, place, _FONT, scale, _LIGHT, 1, cv2.LINE_AA)
+    cv2.putText(strip, text, (x, y + round(11 * scale)), _FONT, scale, _LIGHT, 1, cv2.LINE_AA)
 
 
 def _letters(width: int) -> float:

@@ -40,8 +40,7 @@ class Patch:
         """Cut out the patch around `pixel`; beyond the image's edge its last row or column
         repeats."""
         u, v = pixel.tolist()
-        size = (STORED, STORED)
-        return cls(pixel, cv2.getRectSubPix(image, size, (u, v), patchType=cv2.CV_32F))
+        return cls(pixel, cv2.getRectSubPix(image, (STORED, STORED), (u, v), patchType=cv2.CV_32F))
 
     def covers(self, affine: Float[np.ndarray, "2 2"]) -> bool:
         """Return whether `warped` finds all it needs within the stored patch."""

@@ -194,8 +194,7 @@ def _remembered(
         for k, number in enumerate(header["submaps"]):
             frozen, *rest = grown(ended, arrays, f"submap {k}")
             points, covariances, *pose = map(np.asarray, rest)
-            camera = PoseWithCovariance(*pose)
-            submaps.append(Submap(frozen, points, covariances, camera, number))
+            submaps.append(Submap(frozen, points, covariances, PoseWithCovariance(*pose), number))
         nothing = no_loop(settings.wanted, submaps[0].frozen.state.landmarks.shape[1])
         loops += [grown(nothing, arrays, f"loop {k}") for k in range(header["loops"])]
     for i, told in enumerate(header["maps"]):

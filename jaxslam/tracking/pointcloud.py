@@ -109,8 +109,7 @@ def seen_from(
     J = jacobian[:, 3:6].reshape(-1, 2, 3) @ T_cw[:3, :3]
     size = np.array([calibration.width, calibration.height])
     inside = np.all((pixels >= 0) & (pixels <= size - 1), axis=1) & ~behind
-    spread = J @ covariances @ np.swapaxes(J, 1, 2)
     return (
         np.where(inside[:, None], pixels, np.nan),
-        np.where(inside[:, None, None], spread, np.nan),
+        np.where(inside[:, None, None], J @ covariances @ np.swapaxes(J, 1, 2), np.nan),
     )

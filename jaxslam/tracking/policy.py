@@ -81,8 +81,7 @@ class Policy:
         expected = map.place.expected(predicted.view)
         look = partial(search, image, map.landmarks)
         # One linear update from matches that no linear prediction expects would be wrong, and sure.
-        several = self.ambiguous_start
-        searched = look(expected, self.calibration, self.settings, several=several)
+        searched = look(expected, self.calibration, self.settings, several=self.ambiguous_start)
         agree = partial(map.estimator.believes, predicted)
         seen = self.agreeing(*searched, map.landmarks, agree, lost=lost)
         if seen.matched.any() and _sigma(seen.covariances) > WIDE:
@@ -98,8 +97,7 @@ class Policy:
             seen = self.agreeing(*searched, map.landmarks, of_proven, lost=lost)
         reason = self.reason(seen, map.landmarks, agree, nis)
         if reason is not None:
-            labels = np.where(seen.matched, "outlier", seen.labels)
-            seen = seen._replace(labels=labels)
+            seen = seen._replace(labels=np.where(seen.matched, "outlier", seen.labels))
         prior = expected.pixels[seen.slots], expected.covariances[seen.slots]
         return seen._replace(predicted=prior[0], covariances=prior[1]), reason
 
@@ -169,8 +167,7 @@ class Policy:
         few = len(agreed.slots) <= MOST * len(known.slots)
         another = self._another(known.labelled("outlier"), len(agreed.slots), agree)
         self.doubtful = another or (self.doubtful and few)
-        unlikely = chi2.sf(*nis(agreed)) < BY_CHANCE
-        return Lost.CONTRADICTED if self.doubtful or unlikely else None
+        return Lost.CONTRADICTED if self.doubtful or (chi2.sf(*nis(agreed)) < BY_CHANCE) else None
 
     def _another(self, others: Observations, agreed: int, agree: Agreement) -> bool:
         """Return whether most of these, and many beside those that `agreed`, do so with another

@@ -121,11 +121,10 @@ class TrackerSettings:
 
     def make_filter(self, calibration: Calibration) -> AbstractFilter:
         """The filter that is named, with these numbers. Raises ValueError."""
-        distorted = any(calibration.distortion)
         camera = Camera(
             (calibration.fx, calibration.fy),
             (calibration.cx, calibration.cy),
-            calibration.distortion if distorted else None,
+            calibration.distortion if any(calibration.distortion) else None,
         )
         return make_filter(
             self.filter,
@@ -144,6 +143,5 @@ class TrackerSettings:
         """Return what the filter makes of a calibration, with the σ that it states or else with
         these."""
         name = self.calibration or ("estimated" if calibration.guessed else "known")
-        stated = [self.focal_sigma] * 2 + [self.centre_sigma] * 2
-        sigma = list(calibration.sigma) or stated
+        sigma = list(calibration.sigma) or ([self.focal_sigma] * 2 + [self.centre_sigma] * 2)
         return TREATMENTS[name](sigma[1:] if calibration.guessed else sigma)

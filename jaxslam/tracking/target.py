@@ -53,8 +53,7 @@ class Target:
     def __post_init__(self) -> None:
         if len(self.points) < LEAST_POINTS:
             raise ValueError(f"has {len(self.points)} points; at least {LEAST_POINTS} are needed")
-        from_middle = self.positions - self.positions.mean(axis=0)
-        extent = np.linalg.svd(from_middle, compute_uv=False)
+        extent = np.linalg.svd(self.positions - self.positions.mean(axis=0), compute_uv=False)
         if extent[1] < 1e-3 * extent[0] or not extent[0]:
             raise ValueError("its points are on one line; they must span a plane")
 
@@ -166,8 +165,7 @@ def _places_of(point: KnownPoint, image: np.ndarray, count: int) -> list[Float[n
     if not len(rows):
         raise ValueError(f"the first picture shows nothing like the patch of point {name}")
     order = np.argsort(-alike[rows, columns])[:count]
-    middle = (np.array(patch.shape[::-1]) - 1) / 2
-    return list(np.stack([columns, rows], 1)[order] + middle)
+    return list(np.stack([columns, rows], 1)[order] + (np.array(patch.shape[::-1]) - 1) / 2)
 
 
 def _on_corners(target: Target, image: np.ndarray, pixels: Places) -> Places:

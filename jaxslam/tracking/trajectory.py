@@ -70,8 +70,7 @@ def write_covariances(
     it takes its unit for exactly known. The header says which, and the caveat if there is one.
     """
     convention = replace(TRACKED, scale="given" if given_scale else "marginal")
-    scale = _GIVEN_SCALE if given_scale else _KNOWN_SCALE
-    remark = "; ".join(filter(None, [scale, caveat]))
+    remark = "; ".join(filter(None, [_GIVEN_SCALE if given_scale else _KNOWN_SCALE, caveat]))
     write_pose_covariances(path, times, covariances, convention, length="map", remark=remark)
 
 
@@ -140,11 +139,10 @@ def relative_pose_error(
         np.linalg.inv(T[:-apart]) @ T[apart:] for T in (pairs.aligned(), pairs.reference)
     )
     error = np.linalg.inv(true) @ moved
-    angles = np.degrees(Rotation.from_matrix(error[:, :3, :3]).magnitude())
     return {
         "seconds": seconds,
         "translation": _rms(error[:, :3, 3]),
-        "rotation": _rms(angles[:, None]),
+        "rotation": _rms(np.degrees(Rotation.from_matrix(error[:, :3, :3]).magnitude())[:, None]),
         "way": _rms(true[:, :3, 3]),
     }
 
@@ -167,8 +165,7 @@ class _Pairs(NamedTuple):
 
     def alignment(self) -> Similarity:
         """The Sim(3) that takes the estimate to where it fits best."""
-        positions = (T[:, :3, 3] for T in (self.estimate, self.reference))
-        return similarity(*positions, scaled=True)
+        return similarity(*(T[:, :3, 3] for T in (self.estimate, self.reference)), scaled=True)
 
     def aligned(self) -> Float[np.ndarray, "k 4 4"]:
         """The estimate in the reference's world."""
@@ -216,5 +213,4 @@ def _sign(turn: Rotation, estimate: Positions, reference: Positions) -> float:
 def _straight_line(times: Float[np.ndarray, " n"], positions: Positions) -> float:
     """RMS distance to the least squares line `a + b t`: any line can be aligned to any other."""
     centred, t = positions - positions.mean(0), times - times.mean()
-    rest = centred - np.outer(t, t @ centred / (t @ t))
-    return _rms(rest)
+    return _rms(centred - np.outer(t, t @ centred / (t @ t)))

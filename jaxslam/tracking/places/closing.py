@@ -51,8 +51,7 @@ def close_loop(image: Picture, map: Map, calibration: Calibration) -> Closed | N
     """Return which earlier submap the picture at the end of the latest one shows: if that is
     believed, the `map` has learnt of it."""
     *earlier, latest = map.submaps
-    apart = max(APART, len(earlier) // 8)
-    if map.loops and len(earlier) - int(map.loops[-1].submaps[1]) < apart:
+    if map.loops and len(earlier) - int(map.loops[-1].submaps[1]) < max(APART, len(earlier) // 8):
         return None
     kept = map.charted.keys() - set(latest.numbers.tolist())
     if not kept:
@@ -94,10 +93,9 @@ def _seen_in(
     posed = pose_of(submap.points[known], at, calibration)
     if posed is None:
         return None
-    landmarks = {s: map.charted[numbers[s]] for s in np.flatnonzero(sure).tolist()}
     seen, matches = search(
         image,
-        landmarks,
+        {s: map.charted[numbers[s]] for s in np.flatnonzero(sure).tolist()},
         _expected(submap, posed[0], sure, map.place.unit, calibration),
         calibration,
         map.settings,

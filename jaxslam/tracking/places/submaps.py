@@ -324,8 +324,7 @@ def _given(chain: Chain, loops: LoopClosure) -> Posterior:
 @Program
 def _compared(known: Posterior, new: LoopClosure) -> tuple[Array, Array, Array]:
     def both(states: SubmapMean) -> PyTree:
-        camera = _row(base_poses(known.chain, states), -1)
-        return camera, _error(known.chain, new, states)
+        return _row(base_poses(known.chain, states), -1), _error(known.chain, new, states)
 
     (T_BC, error), P = known.marginal(both)
     P = P / known.unit_variance()
