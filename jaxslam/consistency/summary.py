@@ -384,12 +384,7 @@ def tally(study: Study, name: str, record: str = "nees") -> Tally:
     It is of the `nees` of its poses, of the part that is `beyond_scale`, or of the `drift` of the
     scale.
     """
-    return tally_of(_sums(study, name), record, study.scenario.geometry.tangent_dim)
-
-
-def _sums(study: Study, name: str) -> Sums:
-    """The sums of all chunks."""
-    return _sums_and_lost(study, name)[0]
+    return tally_of(_sums_and_lost(study, name)[0], record, study.scenario.geometry.tangent_dim)
 
 
 def _sums_and_lost(study: Study, name: str) -> tuple[Sums, list[int] | None]:

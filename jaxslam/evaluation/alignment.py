@@ -78,9 +78,8 @@ def associated(
     after = np.clip(np.searchsorted(first[order], second), 1, max(len(first) - 1, 1))
     beside = order[np.stack([after - 1, np.minimum(after, len(first) - 1)])]
     away = np.abs(first[beside] - second)
-    nearest = np.where(away[1] < away[0], beside[1], beside[0])
     close = np.flatnonzero(away.min(axis=0) <= MAX_TIME_DIFFERENCE)
-    return nearest[close], close
+    return np.where(away[1] < away[0], beside[1], beside[0])[close], close
 
 
 def similarity(
@@ -319,7 +318,7 @@ def _to_all(run: Poses, convention: Convention, *, scaled: bool) -> Poses:
 def _line(run: Poses, convention: Convention) -> Float[np.ndarray, " n"] | None:
     """The direction of an estimate on a straight line, by the largest σ of every position."""
     n = run.estimates.shape[-1] - 1
-    split = converted(run.covariances, run.estimates, convention, Convention("split", "world"))
+    split = converted(run.covariances, run.estimates, convention, _SPLIT)
     variance = np.linalg.eigvalsh(split[:, :n, :n])[:, -1]
     return straight_line(run.estimates[:, :n, n], np.sqrt(np.maximum(variance, 0.0)))
 

@@ -109,8 +109,7 @@ def step_times(times: ArrayLike | None, steps: int) -> Float[np.ndarray, " steps
     if times is None:
         return np.arange(1.0, steps + 1)
     try:
-        real = not np.iscomplexobj(times)
-        array = np.asarray(times, np.float64) if real else np.empty(0)
+        array = np.empty(0) if np.iscomplexobj(times) else np.asarray(times, np.float64)
     except (ValueError, TypeError):
         array = np.empty(0)
     if array.shape != (steps,) or not np.isfinite(array).all() or (np.diff(array) < 0).any():
@@ -197,8 +196,7 @@ def normalised(errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"]
     variance = np.diagonal(covariances, axis1=-2, axis2=-1)
     if (variance <= 0).any():
         run, step, axis = np.argwhere(variance <= 0)[0]
-        told = f"variance {variance[run, step, axis]:.3g} at place {axis}"
-        _refuse((run, step), f"has {told}")
+        _refuse((run, step), f"has variance {variance[run, step, axis]:.3g} at place {axis}")
     sigma = sigmas(covariances)
     with np.errstate(over="ignore"):
         correlation = correlations(covariances)
@@ -259,9 +257,7 @@ def of_sigmas(sigmas: ArrayLike) -> Float[np.ndarray, "runs steps n n"]:
 def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLike) -> Poses:
     """Return the poses of arrays that belong together. Raises ValueError, naming run and step."""
     matrices = "(runs, steps, 4, 4) or (…, 6), in the plane (runs, steps, 3, 3) or (…, 3)"
-    T, truth = (
-        _matrices(what, x, matrices) for what, x in (("estimates", estimates), ("truths", truths))
-    )
+    T, truth = _matrices("estimates", estimates, matrices), _matrices("truths", truths, matrices)
     if T.shape != truth.shape:
         raise ValueError(
             f"estimates are {T.shape}, so truths must have the same shape, not {truth.shape}"

@@ -214,20 +214,14 @@ def _identified(poses: Poses, stated: Convention, options: _Options) -> Identifi
                 result[convention] = _tried(convention, geometry, found, used)
         return result
 
-    same = _alternatives(stated, geometry, used)
+    # With one axis of rotation mixed is world, as in the plane.
+    flat = sum(name.startswith("r") for name in used) < 2
+    other = "world" if stated.axes == "mixed" else "mixed"
+    same = [c for c in alternatives(stated, geometry) if not flat or c.axes != other]
     if stated.scale == "given" or options.align != "none":
         return identify(stated, tried(same))
     given = [replace(convention, scale="given") for convention in same]
     return identify(stated, tried(same), lambda: tried(given))
-
-
-def _alternatives(
-    stated: Convention, geometry: Geometry, used: tuple[str, ...]
-) -> list[Convention]:
-    """The conventions that differ: with one axis of rotation mixed is world, as in the plane."""
-    flat = sum(name.startswith("r") for name in used) < 2
-    other = "world" if stated.axes == "mixed" else "mixed"
-    return [c for c in alternatives(stated, geometry) if not flat or c.axes != other]
 
 
 def _tried(

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxslam._runtime.files import write_atomically
 from jaxslam.io.board import Board, View
-from jaxslam.io.calibration import Calibration, write_calibration
+from jaxslam.io.calibration import INTRINSICS, Calibration, write_calibration
 from jaxslam.io.opening import open_recording
 from jaxslam.io.recording import Recording
 
@@ -174,11 +174,9 @@ def write(calibrated: Calibrated, board: Board, out: str | Path) -> None:
 def describe(calibrated: Calibrated) -> str:
     """The calibration in a few lines."""
     camera = calibrated.calibration
-    numbers = zip(("fx", "fy", "cx", "cy"), camera.sigma, strict=True)
-    return "\n".join(
-        [
-            ", ".join(f"{key} {getattr(camera, key):.2f} ± {sigma:.2f}" for key, sigma in numbers),
-            f"{len(calibrated.views)} views, reprojection error {calibrated.rms:.3f} px (RMS), "
-            f"corners in {calibrated.coverage:.0%} of the picture",
-        ]
+    numbers = zip(INTRINSICS, camera.sigma, strict=True)
+    told = ", ".join(f"{key} {getattr(camera, key):.2f} ± {sigma:.2f}" for key, sigma in numbers)
+    return (
+        f"{told}\n{len(calibrated.views)} views, reprojection error {calibrated.rms:.3f} px (RMS), "
+        f"corners in {calibrated.coverage:.0%} of the picture"
     )

@@ -201,8 +201,7 @@ class Look:
             return "over-confident" if low > 1 else "under-confident"
         if not self.right[0]:  # only over-confidence can be proven, and only it is to be excluded
             low, high = 1.0, replace(self, right=(self.right[1], self.right[1])).interval[1]
-        told = low >= TOLERANCE**-2 and high <= TOLERANCE**2
-        return "consistent" if told else "cannot tell"
+        return "consistent" if low >= TOLERANCE**-2 and high <= TOLERANCE**2 else "cannot tell"
 
     def asdict(self) -> Verdict:
         """Return the numbers as a verdict has them, of σ."""

@@ -410,7 +410,6 @@ def _quadratic_peaks(around: Float32[np.ndarray, "k 9"]) -> Pixels:
     """Return where paraboloids fitted to 3x3 scores peak, from the middle one, within one pixel."""
     _, bx, by, cxx, cxy, cyy = _QUADRATIC @ around.T
     determinant = 4 * cxx * cyy - cxy**2
-    peaked = (cxx < 0) & (determinant > 0)
     shift = np.stack([cxy * by - 2 * cyy * bx, cxy * bx - 2 * cxx * by], axis=1)
-    shift /= np.where(peaked, determinant, np.inf)[:, None]
+    shift /= np.where((cxx < 0) & (determinant > 0), determinant, np.inf)[:, None]
     return np.clip(shift, -1.0, 1.0)

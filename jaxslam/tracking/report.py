@@ -111,9 +111,8 @@ class Tracked:
         seen = self.observations
         found = np.isfinite(seen.pixels[:, 0])
         off = (seen.pixels - seen.predicted)[found]
-        return np.einsum(
-            "ki,ki->k", off, np.linalg.solve(seen.covariances[found], off[..., None])[..., 0]
-        )
+        weighted = np.linalg.solve(seen.covariances[found], off[..., None])[..., 0]
+        return np.einsum("ki,ki->k", off, weighted)
 
     @property
     def state(self) -> str:

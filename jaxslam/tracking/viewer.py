@@ -80,9 +80,7 @@ class Viewer:
         ellipsoids = rr.Ellipsoids3D(
             half_sizes=sigmas, centers=known.points, quaternions=quaternions, colors=colour
         )
-        labels = [
-            f"{number}, map {of}" for number, of in zip(known.numbers, known.maps, strict=True)
-        ]
+        labels = [f"{one}, map {of}" for one, of in zip(known.numbers, known.maps, strict=True)]
         points = rr.Points3D(known.points, colors=colour, labels=labels, show_labels=False)
         self._record.log("world/landmarks/sigma", ellipsoids)
         self._record.log("world/landmarks", points)
@@ -145,9 +143,8 @@ class Viewer:
             if number is not None:
                 self._record.log(name, rr.Scalars(number))
         if self._before is None or self._before.state != result.state:
-            level = "WARN" if result.lost else "INFO"
             text = f"frame {result.index}: {result.state}, map {result.map}"
-            self._record.log("state", rr.TextLog(text, level=level))
+            self._record.log("state", rr.TextLog(text, level="WARN" if result.lost else "INFO"))
 
 
 def _rerun() -> ModuleType:
