@@ -37,6 +37,12 @@ from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, exp, log
 from jaxslam.io.tum import read_table, width, write_table
 
+Joints = Float[np.ndarray, "runs k k"]
+"""Covariances of all poses of a run together."""
+Values = Float[np.ndarray, "runs steps ..."]
+"""Numbers, of any shape, for every step of every run."""
+
+
 Matrices = Float[np.ndarray, "*batch d d"]
 """Poses, in space d = 4 and in the plane 3."""
 Squares = Float[np.ndarray, "*batch t t"]

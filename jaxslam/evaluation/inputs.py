@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import LARGEST, read_arrays
 from jaxslam._runtime.lookup import suggestion
-from jaxslam.evaluation.convention import CHOICES, geometry_of
+from jaxslam.evaluation.convention import CHOICES, Joints, Values, geometry_of
 from jaxslam.io.tum import check_seconds, not_rigid, of_xytheta, poses, read_table, words
 from jaxslam.statistics.bands import Mask, PerAxis, PerStep
 
@@ -53,14 +53,12 @@ def check_finite(what: str, array: Float[np.ndarray, ...], logged: Mask | None =
         raise ValueError(f"{what} of {at(place)} holds {array[tuple(place)]}; only finite numbers")
 
 
-def all_nan(array: Float[np.ndarray, "runs steps ..."]) -> Mask:
+def all_nan(array: Values) -> Mask:
     """A mask of the steps whose every number is NaN, so that nothing was logged."""
     return np.asarray(np.isnan(array).all(axis=tuple(range(2, array.ndim))))
 
 
-def filled(
-    array: Float[np.ndarray, "runs steps ..."], logged: Mask, value: ArrayLike
-) -> Float[np.ndarray, "runs steps ..."]:
+def filled(array: Values, logged: Mask, value: ArrayLike) -> Values:
     """Return the array with a value at every step that was not logged."""
     return np.where(logged.reshape(*logged.shape, *[1] * (array.ndim - 2)), array, value)
 
@@ -288,9 +286,7 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
     return Poses(T, filled(P, logged, np.eye(t)), truth, logged, joints)
 
 
-def _joint(
-    P: Float[np.ndarray, "runs k k"], logged: Bool[np.ndarray, "runs k"]
-) -> Float[np.ndarray, "runs k k"]:
+def _joint(P: Joints, logged: Bool[np.ndarray, "runs k"]) -> Joints:
     """Zero the covariance of steps not logged. Raises ValueError for non-finite or huge numbers."""
     P = np.where(logged[:, :, None] & logged[:, None], P, 0.0)
     if not (np.abs(P) <= LARGEST).all():

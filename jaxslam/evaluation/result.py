@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from jaxslam._runtime import plotted
 from jaxslam._runtime.files import Json, json_numbers, write_json
 from jaxslam._runtime.lookup import lookup, suggestion
-from jaxslam.evaluation.convention import Convention
+from jaxslam.evaluation.convention import Convention, Values
 from jaxslam.evaluation.convention_search import Identification
 from jaxslam.evaluation.inputs import (
     at,
@@ -455,9 +455,7 @@ def _rms(values: np.ndarray, there: np.ndarray | None = None) -> Any:
         return np.sqrt(np.mean(values**2, axis=0) if there is None else _mean(values**2, there))
 
 
-def _mean(
-    values: Float[np.ndarray, "runs steps ..."], there: Mask
-) -> Float[np.ndarray, "steps ..."]:
+def _mean(values: Values, there: Mask) -> Float[np.ndarray, "steps ..."]:
     """The mean over the runs that have a step; NaN where none has it."""
     count = np.sum(there, axis=0).reshape(-1, *[1] * (values.ndim - 2))
     total = np.sum(filled(values, there, 0.0), axis=0)

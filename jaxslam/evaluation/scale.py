@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from jaxslam._runtime.files import Json, json_numbers
 from jaxslam.evaluation.alignment import about
-from jaxslam.evaluation.convention import Axes, Convention, Matrices, Tangents, pose_errors
+from jaxslam.evaluation.convention import Axes, Convention, Joints, Matrices, Tangents, pose_errors
 from jaxslam.evaluation.inputs import Poses, correlations, sigmas
 from jaxslam.statistics.bands import Mask, PerStep
 from jaxslam.statistics.beyond_scale import SCALES, BeyondScale, one_scale
@@ -198,9 +198,7 @@ def _own_scales(
         return BeyondScale(nees, np.log(s), 1 / (s * np.sqrt(curvature)))
 
 
-def _jointly(
-    poses: Poses, joints: Float[np.ndarray, "runs k k"], convention: Convention, axes: Axes
-) -> AtScale:
+def _jointly(poses: Poses, joints: Joints, convention: Convention, axes: Axes) -> AtScale:
     """Fit one scale by the joint covariance: exact, each NEES has all its degrees of freedom.
 
     What is left of a run at its ŝ has the covariance `Σ − G Gᵀ/(Gᵀ Σ⁻¹ G)`.

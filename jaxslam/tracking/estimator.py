@@ -43,7 +43,7 @@ from jaxslam.geometry import log, scaled
 from jaxslam.models.observations import Features, Status
 from jaxslam.models.sensors import Pinhole
 from jaxslam.tracking.matching import PEAKS, Matches
-from jaxslam.tracking.observations import NOTHING, Observations, Prediction
+from jaxslam.tracking.observations import NOTHING, Observations, Prediction, Slots
 from jaxslam.tracking.patches import Pixels
 from jaxslam.tracking.places.submaps import compile_graph, in_submaps, left
 from jaxslam.tracking.pose_with_covariance import Positions, Spreads, Transform
@@ -219,10 +219,7 @@ class Estimator:
         self.state = _at_rest(self.slam, self.state)
 
     def begin(
-        self,
-        slots: Int[np.ndarray, " k"],
-        pixels: Pixels,
-        depths: tuple[np.ndarray, np.ndarray] | None = None,
+        self, slots: Slots, pixels: Pixels, depths: tuple[np.ndarray, np.ndarray] | None = None
     ) -> CameraReport:
         """Begin a map with landmarks at these pixels; `depths` are means and σ of 1/z of all
         features, where they are known."""
@@ -231,7 +228,7 @@ class Estimator:
         known = jax.tree.map(jnp.asarray, depths)
         return self._created(partial(_begin_known, known), slots, pixels)
 
-    def renew(self, slots: Int[np.ndarray, " k"], pixels: Pixels) -> CameraReport:
+    def renew(self, slots: Slots, pixels: Pixels) -> CameraReport:
         """End the frame with new landmarks at these pixels."""
         return self._created(_renew_map, slots, pixels)
 
@@ -317,10 +314,7 @@ class Estimator:
         return S + np.diag(np.repeat(more, 2)), residual.ravel()
 
     def _created(
-        self,
-        create: Callable[..., tuple[Belief, Report]],
-        slots: Int[np.ndarray, " k"],
-        pixels: Pixels,
+        self, create: Callable[..., tuple[Belief, Report]], slots: Slots, pixels: Pixels
     ) -> CameraReport:
         new = _padded(slots, pixels, self.settings.wanted)
         self.state, report = create(self.slam, self.state, new)
@@ -336,7 +330,7 @@ def _solve(S: Float[np.ndarray, "m m"], b: Float[np.ndarray, "m ..."]) -> np.nda
         return np.linalg.solve(S, b)
 
 
-def _padded(slots: Int[np.ndarray, " k"], pixels: Pixels, size: int) -> Features:
+def _padded(slots: Slots, pixels: Pixels, size: int) -> Features:
     """Features of fixed number; NaN pixels and padding are not valid."""
     missing = size - len(slots)
     valid = np.pad(np.isfinite(pixels).all(axis=1), (0, missing))

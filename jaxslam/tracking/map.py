@@ -12,7 +12,7 @@ from jaxslam._runtime.programs import in_background
 from jaxslam.filters.protocol import AbstractStaged, Belief
 from jaxslam.tracking.estimator import Estimator, Predicted
 from jaxslam.tracking.landmarks import Landmark, Points, joined
-from jaxslam.tracking.observations import Observations
+from jaxslam.tracking.observations import Observations, Slots
 from jaxslam.tracking.patches import Patch, Picture, Pixels
 from jaxslam.tracking.places.descriptors import note_looks
 from jaxslam.tracking.places.submaps import (
@@ -301,7 +301,7 @@ class Map:
         free = [slot for slot in range(self.settings.capacity) if slot not in self.landmarks]
         return np.array(free[:count], int)
 
-    def _add(self, slots: Int[np.ndarray, " k"], image: Picture, pixels: Pixels) -> None:
+    def _add(self, slots: Slots, image: Picture, pixels: Pixels) -> None:
         first, camera = self.created, self.place.camera.T_wc
         for number, (slot, pixel) in enumerate(zip(slots.tolist(), pixels, strict=True), first):
             self.landmarks[slot] = Landmark(number, Patch.take(image, pixel), camera, pixel)
@@ -366,9 +366,7 @@ def failing(landmarks: Mapping[int, Landmark], settings: TrackerSettings) -> lis
     return [slot for slot, one in landmarks.items() if one.success < settings.least_success]
 
 
-def worst_first(
-    landmarks: Sequence[Landmark], points: Points, settings: TrackerSettings
-) -> Int[np.ndarray, " k"]:
+def worst_first(landmarks: Sequence[Landmark], points: Points, settings: TrackerSettings) -> Slots:
     """The order in which to give up landmarks that are not in view; `points` are theirs.
 
     First those that are searched in vain, then the others by the time since they were seen, times

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
+from jaxslam.tracking.observations import Slots
 from jaxslam.tracking.patches import Picture, Pixels, Places, Window
 
 Windows = Float32[np.ndarray, "n window window"]
@@ -272,7 +273,7 @@ def _boxes_around(
 class _Peaks(NamedTuple):
     """k local maxima of the score of patches `owner`, each with its neighbourhood of 3x3."""
 
-    owner: Int[np.ndarray, " k"]
+    owner: Slots
     pixels: Int[np.ndarray, "k 2"]
     scores: Float32[np.ndarray, " k"]
     around: Float32[np.ndarray, "k 9"]

@@ -6,9 +6,12 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.tracking.patches import Pixels
+
+Slots = Int[np.ndarray, " k"]
+"""The slots of k landmarks in the filter's map."""
 
 
 class Lost(StrEnum):

@@ -18,7 +18,7 @@ from jaxslam.tracking.estimator import Predicted
 from jaxslam.tracking.landmarks import Landmark
 from jaxslam.tracking.map import Map
 from jaxslam.tracking.matching import GATE, Matches
-from jaxslam.tracking.observations import Lost, Observations, Prediction
+from jaxslam.tracking.observations import Lost, Observations, Prediction, Slots
 from jaxslam.tracking.patches import Picture
 from jaxslam.tracking.search import search
 from jaxslam.tracking.settings import TrackerSettings
@@ -183,7 +183,7 @@ class Policy:
 
     def _of_several(
         self,
-        slots: Int[np.ndarray, " k"],
+        slots: Slots,
         matches: Matches,
         landmarks: Mapping[int, Landmark],
         agree: Agreement,
@@ -254,9 +254,7 @@ def _alone(owner: Int[np.ndarray, " m"], among: Bool[np.ndarray, " m"]) -> Int[n
     return some[count[of] == 1]
 
 
-def proven(
-    slots: Int[np.ndarray, " k"], landmarks: Mapping[int, Landmark]
-) -> Bool[np.ndarray, " k"]:
+def proven(slots: Slots, landmarks: Mapping[int, Landmark]) -> Bool[np.ndarray, " k"]:
     """Return which of the slots hold landmarks that are proven."""
     return np.array([landmarks[slot].found >= PROVEN for slot in slots], bool)
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.landmarks import Landmark
 from jaxslam.tracking.map import in_view
 from jaxslam.tracking.matching import Matches, match_patches
-from jaxslam.tracking.observations import Observations, Prediction
+from jaxslam.tracking.observations import Observations, Prediction, Slots
 from jaxslam.tracking.patches import WINDOW, Picture
 from jaxslam.tracking.settings import TrackerSettings
 
@@ -51,7 +51,7 @@ def to_search(
     prediction: Prediction,
     calibration: Calibration,
     settings: TrackerSettings,
-) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k 2 2"]]:
+) -> tuple[Slots, Float[np.ndarray, "k 2 2"]]:
     """Slots to search, and how the picture around each changed since its first view.
 
     In front, in the picture, with a bearing that the lens can see, from where they still look
@@ -79,7 +79,7 @@ def to_search(
 def changes_of_view(
     landmarks: Mapping[int, Landmark],
     prediction: Prediction,
-    slots: Int[np.ndarray, " k"],
+    slots: Slots,
     calibration: Calibration,
 ) -> Float[np.ndarray, "k 2 2"]:
     """Return how the picture around each landmark changed since its first view; zero where it

@@ -11,12 +11,12 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.stats import chi2
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.map import Map
-from jaxslam.tracking.observations import Prediction
+from jaxslam.tracking.observations import Prediction, Slots
 from jaxslam.tracking.patches import Picture
 from jaxslam.tracking.places.descriptors import candidates, described_corners
 from jaxslam.tracking.places.relocalisation import FEWEST, MOST_OF, TRIED, pose_of, well_known
@@ -83,7 +83,7 @@ def _seen_in(
     by_number: Mapping[int, Float[np.ndarray, " 2"]],
     map: Map,
     calibration: Calibration,
-) -> tuple[Int[np.ndarray, " k"], Transform] | None:
+) -> tuple[Slots, Transform] | None:
     """The slots of the landmarks of a submap in a picture, and where its camera is from the last of
     the submap."""
     sure = well_known(submap.points, submap.covariances) & np.asarray(submap.frozen.carried)

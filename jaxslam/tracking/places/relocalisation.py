@@ -13,12 +13,12 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.estimator import Correction
 from jaxslam.tracking.map import Map
-from jaxslam.tracking.observations import Observations
+from jaxslam.tracking.observations import Observations, Slots
 from jaxslam.tracking.patches import Picture
 from jaxslam.tracking.places.descriptors import candidates, described_corners
 from jaxslam.tracking.policy import Policy
@@ -48,7 +48,7 @@ def well_known(points: Positions, covariances: Spreads) -> Bool[np.ndarray, " n"
 
 def pose_of(
     points: Float[np.ndarray, "m 3"], pixels: Float[np.ndarray, "m 2"], calibration: Calibration
-) -> tuple[Transform, Int[np.ndarray, " k"]] | None:
+) -> tuple[Transform, Slots] | None:
     """Return T_wc of a picture that shows most of these points at these pixels, and which of them;
     None if `FEWEST` of them cannot be seen at once."""
     if len(points) < FEWEST:

@@ -28,6 +28,7 @@ from jaxslam.filters.submaps.chain import Chain, Link, SubmapMean, base_poses, l
 from jaxslam.filters.submaps.closing import Posterior, posterior
 from jaxslam.filters.submaps.handover import Frozen
 from jaxslam.geometry import difference, retract
+from jaxslam.tracking.observations import Slots
 from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, Transform
 from jaxslam.tracking.settings import TrackerSettings
 
@@ -163,7 +164,7 @@ def loop_of(
     slam: AbstractStaged,
     submaps: Sequence[Submap],
     which: tuple[int, int],
-    slots: Int[np.ndarray, " k"],
+    slots: Slots,
     T: Transform,
     sigma: float,
     most: int,
