@@ -60,9 +60,10 @@ def on_cluster(
 
     Raises OSError where the scheduler is lost; what the function raises comes through.
     """
+    import cloudpickle  # Dask's: classes of a notebook go along
     from distributed import as_completed
 
-    whole, waiting, doing = _pickled(function), deque(chunks), {}
+    whole, waiting, doing = cloudpickle.dumps(function), deque(chunks), {}
     finished = as_completed(loop=client.loop)
     try:
         while waiting or doing:
@@ -85,12 +86,6 @@ def _result(client: Any, future: Any) -> Any:
         return future.result()  # computed again where its worker is lost before it was fetched
     except CancelledError:
         raise OSError(errno.ECONNRESET, "the cluster is lost", client.scheduler.address) from None
-
-
-def _pickled(function: Callable[[range], Any]) -> bytes:
-    import cloudpickle  # Dask's: classes of a notebook go along
-
-    return cloudpickle.dumps(function)
 
 
 def _computed(whole: bytes, as_wide: bool, chunk: range) -> Any:

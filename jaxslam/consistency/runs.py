@@ -128,12 +128,8 @@ def scale_records(
 def _camera_error(estimate: Pose, truth: Pose) -> Array:
     """The position error in the estimated camera's axes, then `Log(R_est⁻¹ R_true)`."""
     rotation = estimate.rotation().inverse()
-    return jnp.concatenate(
-        [
-            rotation @ (truth.translation() - estimate.translation()),
-            (rotation @ truth.rotation()).log(),
-        ]
-    )
+    moved = rotation @ (truth.translation() - estimate.translation())
+    return jnp.concatenate([moved, (rotation @ truth.rotation()).log()])
 
 
 def _landmark_records(

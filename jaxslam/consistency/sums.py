@@ -14,7 +14,7 @@ from jaxtyping import Bool
 
 from jaxslam.consistency.store import SUM, Records
 from jaxslam.models.observations import Status
-from jaxslam.statistics.bands import PerStep, lost_threshold
+from jaxslam.statistics.bands import lost_threshold
 from jaxslam.statistics.beyond_scale import SCALE, OneScale, one_scale_of
 from jaxslam.statistics.verdict import Tally
 
@@ -80,6 +80,8 @@ def _sums(records: Records, dof: int) -> Sums:
     ever = ~(good["nees"] <= lost_threshold(dof, good["nees"].shape[1]))
     of_all = one_scale_of(records)
     one = OneScale(*(x[healthy] for x in of_all))
+    told = np.isfinite(of_all.normalised)
+    fixed = told.any(axis=1)  # the runs whose unit ever was: drift is tallied from then on
     drifts, displaced = np.isfinite(one.drift), np.isfinite(good["reversed"])
     finite = good["landmark_count"] - good["landmark_not_finite"]
     sigma = good["log_scale_sigma"]
@@ -109,7 +111,7 @@ def _sums(records: Records, dof: int) -> Sums:
     return {
         "tally_nees": Tally.of(records["nees"], dof).numbers(),
         "tally_beyond_scale": Tally.of(of_all.nees, dof, 1.0).numbers(),
-        "tally_drift": _of_drift(of_all.normalised).numbers(),
+        "tally_drift": Tally.of(of_all.normalised[fixed], 1, 1.0, told[fixed]).numbers(),
         "diverged": np.sum(~healthy),
         **{name: value.sum(axis=0) for name, value in of_runs.items()},
         **{
@@ -123,10 +125,3 @@ def _sums(records: Records, dof: int) -> Sums:
 def _or_zero(x: np.ndarray) -> np.ndarray:
     """The numbers, and 0 where there is none."""
     return np.where(np.isnan(x), 0.0, x)
-
-
-def _of_drift(normalised: PerStep) -> Tally:
-    """The tally of drift of the runs whose unit was ever fixed, from then on."""
-    told = np.isfinite(normalised)
-    ever = told.any(axis=1)
-    return Tally.of(normalised[ever], 1, 1.0, told[ever])

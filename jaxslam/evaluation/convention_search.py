@@ -67,10 +67,8 @@ class Tried(NamedTuple):
     @property
     def consistent(self) -> bool:
         """Whether nothing is proven against it."""
-        parts = (
-            (self.position, self.dof - self.turns, self.fitted),
-            (self.rotation, self.turns, 0.0),
-        )
+        position = (self.position, self.dof - self.turns, self.fitted)
+        parts = position, (self.rotation, self.turns, 0.0)
         # The confidence of what is said against position or rotation alone, after all axes
         # together.
         return self.whole and all(

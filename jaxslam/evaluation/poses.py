@@ -103,12 +103,9 @@ def evaluate_poses(
     poses = checked_poses(estimates, covariances, truths)
     at, sigma = step_times(times, poses.estimates.shape[1]), checked_sigma(truth_sigma)
     found = as_stated(poses, stated, align, axes_named(axes_used, poses.estimates, stated), sigma)
-    return replace(
-        found,
-        times=at[len(at) - found.steps :],
-        timed=times is not None,
-        identified=_identified(poses, stated, _Options(align, found.names, sigma)),
-    )
+    identified = _identified(poses, stated, _Options(align, found.names, sigma))
+    at = at[len(at) - found.steps :]
+    return replace(found, times=at, timed=times is not None, identified=identified)
 
 
 def as_stated(
@@ -235,15 +232,10 @@ def _tried(
         e, P = found.errors[..., block], found.covariances[..., block, :][..., block]
         return filled(normalised(e, P), found.logged, np.nan)
 
-    return Tried(
-        filled(found.nees, found.logged, np.nan),
-        len(names),
-        found.fitted,
-        float(np.linalg.slogdet(found.covariances[found.logged])[1].mean()),
-        of(~turns) if (~turns).any() else None,
-        of(turns) if turns.any() else None,
-        int(turns.sum()),
-    )
+    nees = filled(found.nees, found.logged, np.nan)
+    log_determinant = float(np.linalg.slogdet(found.covariances[found.logged])[1].mean())
+    parts = (of(block) if block.any() else None for block in (~turns, turns))
+    return Tried(nees, len(names), found.fitted, log_determinant, *parts, int(turns.sum()))
 
 
 def axes_named(

@@ -148,13 +148,9 @@ def at_one_scale(poses: Poses, convention: Convention, axes: Axes) -> AtScale:
     sigma = own.sigma
     known = np.where(np.isfinite(sigma), np.exp(own.log_scale) * sigma, 0.0)
     share = (known[..., None] * slope) ** 2 / np.diagonal(P, axis1=-2, axis2=-1)
-    return AtScale(
-        errors + slope * (s - 1)[:, None, None],
-        P,
-        1.0,
-        np.clip(share[poses.logged].mean(axis=0), 0.0, 1.0),
-        Scale(found.log_scale, found.drift, sigma, found.normalised, 1.0),
-    )
+    fitted = np.clip(share[poses.logged].mean(axis=0), 0.0, 1.0)
+    scale = Scale(found.log_scale, found.drift, sigma, found.normalised, 1.0)
+    return AtScale(errors + slope * (s - 1)[:, None, None], P, 1.0, fitted, scale)
 
 
 def errors_beyond_scale(

@@ -53,12 +53,9 @@ def read_sensor(path: Path) -> Calibration:
             raise ValueError(f"{path}: unknown {key} {found[1]!r}; expected {expected!r}")
     width, height = _numbers(path, text, "resolution", 2)
     try:
-        return Calibration(
-            int(width),
-            int(height),
-            *_numbers(path, text, "intrinsics", 4),
-            distortion=tuple(_numbers(path, text, "distortion_coefficients", 4)),
-        )
+        size, lens = (int(width), int(height)), _numbers(path, text, "intrinsics", 4)
+        distortion = tuple(_numbers(path, text, "distortion_coefficients", 4))
+        return Calibration(*size, *lens, distortion=distortion)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 

@@ -175,10 +175,8 @@ def plot_outside(summary: Drawn, *, ax: Axes, label: Labels | None = None) -> Ax
     Names stand at the ends of the position's lines; a filter may be called otherwise by `label`.
     """
     results = results_of(summary)
-    percent = {
-        name: [100 * r.outside3sigma.position, 100 * r.outside3sigma.orientation]
-        for name, r in results.items()
-    }
+    outside = {name: result.outside3sigma for name, result in results.items()}
+    percent = {name: [100 * x.position, 100 * x.orientation] for name, x in outside.items()}
     lines = _plot_pairs(percent, results, ax, label, lw=0.8)
     ax.axhline(100 * OUTSIDE, color=GREY, lw=0.8)
     ax.set(ylim=(0, max(1.0, ax.get_ylim()[1])), ylabel="% of errors")
@@ -216,10 +214,8 @@ def plot_log_scale(summary: Drawn, *, ax: Axes, label: Labels | None = None) -> 
     """
     results = _with_scale(summary)
     # Median of |x| for a standard normal x
-    pairs = {
-        name: (r.log_scale.error_median, 0.6745 * r.log_scale.sigma_median)
-        for name, r in results.items()
-    }
+    scales = {name: result.log_scale for name, result in results.items()}
+    pairs = {name: (x.error_median, 0.6745 * x.sigma_median) for name, x in scales.items()}
     lines = _plot_pairs(pairs, results, ax, label, lw=0.9, ls=(0, (4, 2)))
     if results.reference.survivors:
         ax.set_yscale("log")

@@ -56,14 +56,10 @@ class FromPrior(AbstractPlacement):
 
 def _check_intervals(first: Float[AnyArray, "p 2"], sensor: AbstractSensor) -> None:
     if len(first) != sensor.size:
+        world = (PLANAR if sensor.point_dim == PLANAR.point_dim else SPATIAL).name
         raise ValueError(
-            f"first_pixels needs {sensor.size} values in a {_world_of(sensor)} world, "
-            f"not {len(first)}"
+            f"first_pixels needs {sensor.size} values in a {world} world, not {len(first)}"
         )
-
-
-def _world_of(sensor: AbstractSensor) -> str:
-    return (PLANAR if sensor.point_dim == PLANAR.point_dim else SPATIAL).name
 
 
 def _uniform(intervals: Float[AnyArray, "p 2"], count: int, key: Array) -> Float[Array, "l p"]:

@@ -296,12 +296,8 @@ class Estimator:
         padded[:m, :, :m] = covariance
         landmark = np.argmax(slots == slots[:, None], axis=1) if m else slots
         more = (0, size - m)
-        return (
-            np.pad(residual, (more, (0, 0))),
-            padded,
-            np.pad(valid, more),
-            np.pad(landmark, more, mode="constant", constant_values=size - 1),
-        )
+        landmark = np.pad(landmark, more, constant_values=size - 1)
+        return np.pad(residual, (more, (0, 0))), padded, np.pad(valid, more), landmark
 
     def _innovations(
         self, predicted: Predicted, seen: Observations
@@ -449,13 +445,8 @@ def _renew_map(slam: AbstractStaged, state: Belief, new: Features) -> tuple[Beli
 
 def _reported(slam: AbstractStaged, state: Belief) -> Report:
     seen = camera_pose_in_unit(slam, state)
-    return (
-        seen.pose.as_matrix(),
-        *seen[1:],
-        slam.unit_fixed(state),
-        left(slam, state),
-        slam.in_map(state),
-    )
+    fixed, gone = slam.unit_fixed(state), left(slam, state)
+    return seen.pose.as_matrix(), *seen[1:], fixed, gone, slam.in_map(state)
 
 
 @Program

@@ -68,15 +68,10 @@ class Patch:
         shrink = 0.5 * (squares + math.sqrt(max(squares**2 - 4 * determinant**2, 0.0)))
         if shrink > 1.3**2:  # else too little to alias
             stored = cv2.GaussianBlur(stored, (0, 0), 0.5 * math.sqrt(shrink - 1.0))
-        return cv2.warpAffine(
-            stored,
-            np.array(
-                [[a, b, centre - (a + b) * middle], [c, d, centre - (c + d) * middle]], np.float64
-            ),
-            (WINDOW, WINDOW),
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+        rows = [a, b, centre - (a + b) * middle], [c, d, centre - (c + d) * middle]
+        size, flags = (WINDOW, WINDOW), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        map, border = np.array(rows, np.float64), cv2.BORDER_REPLICATE
+        return cv2.warpAffine(stored, map, size, flags=flags, borderMode=border)
 
 
 def _inverse(affine: Float[np.ndarray, "2 2"]) -> tuple[float, float, float, float] | None:

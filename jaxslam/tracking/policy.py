@@ -128,11 +128,9 @@ class Policy:
             believed[:] = False
         labels[believed] = "matched"
         first, others = matches.first_of_each(rows)
-        return seen._replace(
-            pixels=np.where(believed[:, None], agreed, first),
-            variances=np.where(believed, variances, others),
-            labels=labels,
-        )
+        pixels = np.where(believed[:, None], agreed, first)
+        variances = np.where(believed, variances, others)
+        return seen._replace(pixels=pixels, variances=variances, labels=labels)
 
     def _closer(self, seen: Observations, given: Prediction) -> Prediction:
         """Return the prediction given what is matched, as far as it is to be trusted."""

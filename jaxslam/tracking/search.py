@@ -31,17 +31,11 @@ def search(
     that is asked.
     """
     slots, affines = to_search(landmarks, prediction, calibration, settings)
-    seen = Observations(
-        slots,
-        prediction.pixels[slots],
-        prediction.covariances[slots],
-        np.full((len(slots), 2), np.nan),
-        np.zeros(len(slots)),
-        np.full(len(slots), "unmatched"),
-    )
-    warped = [
-        landmarks[slot].patch.warped(affine) for slot, affine in zip(slots, affines, strict=True)
-    ]
+    expected, count = (prediction.pixels[slots], prediction.covariances[slots]), len(slots)
+    nowhere, labels = np.full((count, 2), np.nan), np.full(count, "unmatched")
+    seen = Observations(slots, *expected, nowhere, np.zeros(count), labels)
+    pairs = zip(slots, affines, strict=True)
+    warped = [landmarks[slot].patch.warped(affine) for slot, affine in pairs]
     templates = np.array(warped, np.float32).reshape(-1, WINDOW, WINDOW)
     return seen, match_patches(image, templates, seen.predicted, seen.covariances, several=several)
 
@@ -65,11 +59,8 @@ def to_search(
     affines = changes_of_view(landmarks, prediction, slots, calibration)
     zoomed = np.abs(np.log(np.clip(np.linalg.det(affines), 1e-6, 1e6)))
     # A patch that looks larger or smaller than at first by more is not like itself any more.
-    alike = [
-        i
-        for i in np.flatnonzero(zoomed < 2 * np.log(2.0))
-        if landmarks[slots[i]].patch.covers(affines[i])
-    ]
+    near = np.flatnonzero(zoomed < 2 * np.log(2.0))
+    alike = [i for i in near if landmarks[slots[i]].patch.covers(affines[i])]
     absent = ~in_view(landmarks, slots, s)
     alike.sort(key=lambda i: (absent[i], landmarks[slots[i]].number))
     order = np.array(alike[: s.wanted], int)

@@ -93,14 +93,9 @@ def _seen_in(
     posed = pose_of(submap.points[known], at, calibration)
     if posed is None:
         return None
-    seen, matches = search(
-        image,
-        {s: map.charted[numbers[s]] for s in np.flatnonzero(sure).tolist()},
-        _expected(submap, posed[0], sure, map.place.unit, calibration),
-        calibration,
-        map.settings,
-        several=False,
-    )
+    landmarks = {s: map.charted[numbers[s]] for s in np.flatnonzero(sure).tolist()}
+    expected = _expected(submap, posed[0], sure, map.place.unit, calibration)
+    seen, matches = search(image, landmarks, expected, calibration, map.settings, several=False)
     if len(matches.owner) < max(FEWEST, MOST_OF * len(seen.slots)):
         return None
     slots = seen.slots[matches.owner]
@@ -121,11 +116,6 @@ def _expected(
     in_unit[:3, 3] *= unit
     X = (submap.points - T[:3, 3]) @ T[:3, :3] * unit
     # σ of the place of a landmark seen from the pose that its descriptors tell, pixels.
-    return Prediction(
-        pixels,
-        spread + 3.0**2 * np.eye(2),
-        sure & np.isfinite(pixels[:, 0]),
-        submap.camera.T_wc @ in_unit,
-        X,
-        np.ones(len(X)),
-    )
+    spread = spread + 3.0**2 * np.eye(2)
+    usable, T_wc = sure & np.isfinite(pixels[:, 0]), submap.camera.T_wc @ in_unit
+    return Prediction(pixels, spread, usable, T_wc, X, np.ones(len(X)))
