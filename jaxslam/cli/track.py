@@ -136,9 +136,8 @@ class TrackOptions:
                 "--calibration, --fov, --reference, --target and --topic need a SOURCE: the "
                 "synthetic video has its own calibration and reference"
             )
-        source = synthetic_source(
-            frames=150 if self.frames is None else self.frames, seed=self.seed
-        )
+        frames = 150 if self.frames is None else self.frames
+        source = synthetic_source(frames=frames, seed=self.seed)
         part = selected(source, start=self.start, every=self.every)
         return part if self.scale is None else resized(part, self.scale)
 

@@ -117,12 +117,8 @@ def scale_records(
         in_unit = beyond_scale(
             lambda truth: (difference(truth, seen.pose), seen.covariance), T_BC, truth_sigma
         )
-    own = (*in_unit, slam.unit_fixed(state).astype(metric.nees.dtype))
-    return {
-        "log_scale": metric.log_scale,
-        "log_scale_sigma": metric.sigma,
-        **dict(zip(SCALE, own, strict=True)),
-    }
+    own = zip(SCALE, (*in_unit, slam.unit_fixed(state).astype(metric.nees.dtype)), strict=True)
+    return {"log_scale": metric.log_scale, "log_scale_sigma": metric.sigma, **dict(own)}
 
 
 def _camera_error(estimate: Pose, truth: Pose) -> Array:

@@ -108,17 +108,14 @@ def _sums(records: Records, dof: int) -> Sums:
         "reversed": _or_zero(good["reversed"]),
         "displaced": displaced,
     }
+    faults = [status for status in Status if status != Status.OK]
     return {
         "tally_nees": Tally.of(records["nees"], dof).numbers(),
         "tally_beyond_scale": Tally.of(of_all.nees, dof, 1.0).numbers(),
         "tally_drift": Tally.of(of_all.normalised[fixed], 1, 1.0, told[fixed]).numbers(),
         "diverged": np.sum(~healthy),
         **{name: value.sum(axis=0) for name, value in of_runs.items()},
-        **{
-            f"status_{s.name}": np.any(records["status"] == s, axis=1).sum()
-            for s in Status
-            if s != Status.OK
-        },
+        **{f"status_{s.name}": np.any(records["status"] == s, axis=1).sum() for s in faults},
     }
 
 

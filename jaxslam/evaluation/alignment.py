@@ -253,9 +253,8 @@ def aligned(
         return Aligned(poses, given)
     first = poses.covariances[range(len(poses.logged)), np.argmax(poses.logged, axis=1)]
     if exactly_known(first[:, axes][:, :, axes]).all():
-        return Aligned(
-            _each_run(poses, convention, _by_first), given or align == "sim3", (BY_FIRST,)
-        )
+        by_first = _each_run(poses, convention, _by_first)
+        return Aligned(by_first, given or align == "sim3", (BY_FIRST,))
     if given and align == "se3":
         raise ValueError(
             "covariances given the scale need --align sim3, or se3 if the first covariance is zero"

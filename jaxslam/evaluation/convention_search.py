@@ -49,9 +49,8 @@ class Tried(NamedTuple):
 
     def last(self, steps: int) -> Tried:
         """Return the same of the last steps alone."""
-        position, rotation = (
-            None if x is None else x[:, -steps:] for x in (self.position, self.rotation)
-        )
+        parts = (self.position, self.rotation)
+        position, rotation = (None if x is None else x[:, -steps:] for x in parts)
         return self._replace(nees=self.nees[:, -steps:], position=position, rotation=rotation)
 
     @property

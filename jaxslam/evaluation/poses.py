@@ -270,10 +270,8 @@ def estimated(
     none |= alone & (np.abs(e) <= 1e-3 * sigma).all(axis=0)
     if none.all() or not none.any():
         return names, ()
-    left, used = (
-        tuple(name for name, out in zip(names, none, strict=True) if out == which)
-        for which in (True, False)
-    )
+    told = list(zip(names, none, strict=True))
+    left, used = (tuple(name for name, out in told if out == which) for which in (True, False))
     return used, (
         f"{', '.join(left)}: errors are always zero, so these axes were not estimated; left out, "
         f"as with --axes-used {','.join(used)}",

@@ -75,14 +75,12 @@ class Scale:
     def disproved(self) -> bool:
         """Whether the scale certainly drifts more than σ allows."""
         found = self.verdict
+        if found is None or (found["nees"] is not None and found["nees"] <= 1):
+            return False
         # The confidence of the verdict on drift: with that on NEES, which is one-sided where a fit
         # took a degree of freedom, a right filter is called inconsistent in one of a hundred
         # studies.
-        return bool(
-            found is not None
-            and (found["nees"] is None or found["nees"] > 1)
-            and found["p"] < 1 - 0.999
-        )
+        return bool(found["p"] < 1 - 0.999)
 
     @property
     def sentence(self) -> str:

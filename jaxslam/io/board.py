@@ -63,9 +63,8 @@ class Board:
 
     @cached_property
     def _charuco(self) -> cv2.aruco.CharucoBoard:
-        dictionary = cv2.aruco.getPredefinedDictionary(
-            getattr(cv2.aruco, f"DICT_{self.dictionary}")
-        )
+        number = getattr(cv2.aruco, f"DICT_{self.dictionary}")
+        dictionary = cv2.aruco.getPredefinedDictionary(number)
         size = (self.columns, self.rows)
         # Side of a ChArUco marker, in squares.
         return cv2.aruco.CharucoBoard(size, self.square, 0.75 * self.square, dictionary)
@@ -96,11 +95,9 @@ class Board:
         return View(pixels, points, outline, sharpness(image, pixels))
 
     def _find_checkerboard(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        found, pixels = cv2.findChessboardCornersSB(
-            image,
-            (self.columns - 1, self.rows - 1),
-            flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY,
-        )
+        size = (self.columns - 1, self.rows - 1)
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
+        found, pixels = cv2.findChessboardCornersSB(image, size, flags=flags)
         if not found:
             return _NOTHING
         return self._refined(image, pixels), self.corners

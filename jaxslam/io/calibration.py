@@ -71,16 +71,10 @@ class Calibration:
             if pixels < 1:
                 raise ValueError(f"{name} would be {pixels}; it must be at least one pixel")
         x, y = width / self.width, height / self.height
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fx=x * self.fx,
-            fy=y * self.fy,
-            cx=x * (self.cx + 0.5) - 0.5,
-            cy=y * (self.cy + 0.5) - 0.5,
-            sigma=tuple(s * sigma for s, sigma in zip((x, y, x, y), self.sigma, strict=False)),
-        )
+        fx, fy = x * self.fx, y * self.fy
+        cx, cy = x * (self.cx + 0.5) - 0.5, y * (self.cy + 0.5) - 0.5
+        sigma = tuple(s * sigma for s, sigma in zip((x, y, x, y), self.sigma, strict=False))
+        return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, sigma=sigma)
 
 
 def from_field_of_view(width: int, height: int, degrees: float | None = None) -> Calibration:
@@ -142,12 +136,9 @@ def from_fields(fields: object) -> Calibration:
     distortion = fields.get("distortion", [])
     if not isinstance(distortion, list):
         raise ValueError("distortion must be a list of OpenCV's k1, k2, p1, p2, k3")
-    return Calibration(
-        **{key: fields[key] for key in _KEYS},
-        distortion=tuple(distortion),
-        sigma=_sigma_from(fields.get("sigma", {})),
-        guessed=fields.get("guessed") is True,
-    )
+    numbers, sigma = {key: fields[key] for key in _KEYS}, _sigma_from(fields.get("sigma", {}))
+    guessed = fields.get("guessed") is True
+    return Calibration(**numbers, distortion=tuple(distortion), sigma=sigma, guessed=guessed)
 
 
 def _sigma_from(sigma: object) -> tuple[float, ...]:

@@ -274,9 +274,8 @@ def _plot_map(axes: Axes, samples: Mapping[str, Mapping[str, np.ndarray]]) -> No
         path = records["sample_path"][:, :-1, -1]
         axes.plot(path[:, 0], path[:, -1], lw=1.5, **style)
         for slot in records["sample_active"].nonzero()[0]:
-            region = region_from_above(
-                records["sample_landmarks"][slot], records["sample_landmarks_covariance"][slot]
-            )
+            covariance = records["sample_landmarks_covariance"][slot]
+            region = region_from_above(records["sample_landmarks"][slot], covariance)
             axes.plot(*(path[-1, [0, -1], None] + region), lw=0.8, alpha=0.8, **style)
     _set_view(axes, truth[:, [0, -1]], points[seen][:, [0, -1]])
     axes.set(xlabel="x, m", ylabel="z, m")

@@ -61,9 +61,8 @@ def _page(evaluation: Evaluation) -> Figure:
     panels = axes + (evaluation.scale is not None)
     rows = -(-panels // _PER_ROW)
     figure = new_figure(11.5, 3.9 + 1.9 * rows)
-    figure.suptitle(
-        evaluation.headline.replace("; ", "\n"), x=0.01, ha="left", fontsize=12, weight="bold"
-    )
+    title = evaluation.headline.replace("; ", "\n")
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12, weight="bold")
     grid = figure.add_gridspec(1 + rows, _PER_ROW, height_ratios=[1.6, *[1] * rows])
     plot_nees(evaluation, ax=figure.add_subplot(grid[0, :2]))
     plot_outside(evaluation, ax=figure.add_subplot(grid[0, 2]))

@@ -79,9 +79,8 @@ def _sampled(path: Path, rate: float, steps: int, version: tuple[int, ...]) -> R
     del version
     pieces = [_evenly(*piece, rate) for piece in _without_gaps(*read_tum(path))]
     ends = np.cumsum([len(piece) for piece in pieces])
-    starts = [
-        np.arange(end - len(piece), end - steps) for piece, end in zip(pieces, ends, strict=True)
-    ]
+    pairs = zip(pieces, ends, strict=True)
+    starts = [np.arange(end - len(piece), end - steps) for piece, end in pairs]
     starts = np.concatenate([np.zeros(0, int), *starts])
     if not starts.size:
         longest = max((len(piece) for piece in pieces), default=0) / rate

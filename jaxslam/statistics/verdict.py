@@ -386,9 +386,8 @@ def innovation_verdict(
     p = None if found["diverged"] else whiteness_p_value(nis, normalised)
     white = p is not None and p >= 1 - VERDICT_CONFIDENCE
     if white:
-        found |= _of_steps(nis, dof, found["lost_runs"]).verdict() | {
-            "lost_runs": found["lost_runs"]
-        }
+        lost = found["lost_runs"]
+        found |= _of_steps(nis, dof, lost).verdict() | {"lost_runs": lost}
     word = "outlying" if found["word"] == "lost" else found["word"]
     return found | {"word": word, "samples": "steps" if white else "runs", "white": p}
 

@@ -115,11 +115,10 @@ class _Linear(NamedTuple):
     ) -> _Linear:
         v, p = len(poses), len(places)
         shapes = (v, 6), (p, 3), (v, 6, 6), (p, 3, 3), (v, p, 6, 3)
+        distortion = np.array(calibration.distortion)
         left, parts = 0.0, tuple(np.zeros(shape) for shape in shapes)
         for i, (pose, (which, pixels)) in enumerate(zip(poses, views, strict=True)):
-            seen, by = cv2.projectPoints(
-                places[which], pose[:3], pose[3:], K, np.array(calibration.distortion)
-            )
+            seen, by = cv2.projectPoints(places[which], pose[:3], pose[3:], K, distortion)
             off = seen[:, 0] - pixels
             far = np.sum(off**2, axis=1) / _LOOSE**2
             left += _LOOSE**2 * float(np.log1p(far).sum())

@@ -217,9 +217,8 @@ class Policy:
         before = np.array([one.seen_at for one in landmarks]).reshape(-1, 2)
         lately = unseen == unseen.min(initial=unseen.max(initial=0))
         rigid = np.zeros_like(lately)
-        rigid[lately] = of_one_motion(
-            before[lately], pixels[lately], self.calibration, s.tolerance * s.pixel_sigma
-        )
+        sigma, pairs = s.tolerance * s.pixel_sigma, (before[lately], pixels[lately])
+        rigid[lately] = of_one_motion(*pairs, self.calibration, sigma)
         return lately, rigid
 
 
@@ -233,9 +232,8 @@ def _explained(seen: Observations, given: Prediction) -> bool:
     """Return whether a linear prediction given what is believed explains most of that."""
     slots = seen.slots[seen.matched]
     off = seen.pixels[seen.matched] - given.pixels[slots]
-    squared = np.einsum(
-        "ki,ki->k", off, np.linalg.solve(given.covariances[slots], off[..., None])[..., 0]
-    )
+    weighted = np.linalg.solve(given.covariances[slots], off[..., None])[..., 0]
+    squared = np.einsum("ki,ki->k", off, weighted)
     # The share that a linear prediction must explain for that second search.
     return bool(np.mean(squared < GATE) > 0.8)
 

@@ -50,9 +50,8 @@ class PoseWithCovariance:
         """
         A = adjoint(np.linalg.inv(step.T_wc))
         carried = A @ self.covariance @ A.T
-        return PoseWithCovariance(
-            self.T_wc @ step.T_wc, (carried + carried.T) / 2 + step.covariance
-        )
+        covariance = (carried + carried.T) / 2 + step.covariance
+        return PoseWithCovariance(self.T_wc @ step.T_wc, covariance)
 
     def scaled(self, scale: float) -> PoseWithCovariance:
         """Return the pose in a unit of length that is 1/scale as long."""

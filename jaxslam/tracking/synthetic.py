@@ -58,9 +58,8 @@ def synthetic_source(
         if not value > 0:
             raise ValueError(f"{name} must be positive, not {value}")
     focal = 0.82 * max(width, height * 4 / 3)  # 63 degrees across, which the scene fills
-    calibration = Calibration(
-        width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, distortion=()
-    )
+    centre = (width - 1) / 2, (height - 1) / 2
+    calibration = Calibration(width, height, focal, focal, *centre)
     times = np.arange(frames) / rate
     T_wc = handheld_trajectory(times, seed)
 
@@ -177,9 +176,8 @@ def _shape(
     turn = rng.uniform(0, 2 * np.pi)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     points = centre + points @ rotation * (1.0, squash)
-    cv2.fillConvexPoly(
-        image, np.rint(points * 16).astype(np.int32), grey, lineType=cv2.LINE_AA, shift=4
-    )
+    sixteenths = np.rint(points * 16).astype(np.int32)
+    cv2.fillConvexPoly(image, sixteenths, grey, lineType=cv2.LINE_AA, shift=4)
 
 
 def _upright(

@@ -103,12 +103,9 @@ def _point(index: int, fields: Json, folder: Path) -> KnownPoint:
     name = str(fields.get("name", index))
     position = _numbers(f"position of point {name}", fields.get("position"), 3)
     pixel, patch = fields.get("pixel"), fields.get("patch")
-    return KnownPoint(
-        name,
-        position,
-        None if pixel is None else _numbers(f"pixel of point {name}", pixel, 2),
-        None if patch is None else read_image(folder / str(patch)),
-    )
+    at = None if pixel is None else _numbers(f"pixel of point {name}", pixel, 2)
+    image = None if patch is None else read_image(folder / str(patch))
+    return KnownPoint(name, position, at, image)
 
 
 def _numbers(what: str, value: Json, count: int) -> Float[np.ndarray, " n"]:

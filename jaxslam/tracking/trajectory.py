@@ -135,9 +135,8 @@ def relative_pose_error(
     apart = max(1, round(seconds / float(np.median(np.diff(pairs.times)))))
     if apart >= len(pairs.times):
         raise ValueError(f"no two poses of the trajectory are {seconds:g} s apart")
-    moved, true = (
-        np.linalg.inv(T[:-apart]) @ T[apart:] for T in (pairs.aligned(), pairs.reference)
-    )
+    both = (pairs.aligned(), pairs.reference)
+    moved, true = (np.linalg.inv(T[:-apart]) @ T[apart:] for T in both)
     error = np.linalg.inv(true) @ moved
     return {
         "seconds": seconds,

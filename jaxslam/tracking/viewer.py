@@ -77,9 +77,8 @@ class Viewer:
         quaternions = Rotation.from_matrix(axes).as_quat() if len(axes) else np.zeros((0, 4))
         sigmas = np.sqrt(np.maximum(variances, 0.0))
         colour = _rgb("matched")
-        ellipsoids = rr.Ellipsoids3D(
-            half_sizes=sigmas, centers=known.points, quaternions=quaternions, colors=colour
-        )
+        shapes = {"half_sizes": sigmas, "centers": known.points, "quaternions": quaternions}
+        ellipsoids = rr.Ellipsoids3D(**shapes, colors=colour)
         labels = [f"{one}, map {of}" for one, of in zip(known.numbers, known.maps, strict=True)]
         points = rr.Points3D(known.points, colors=colour, labels=labels, show_labels=False)
         self._record.log("world/landmarks/sigma", ellipsoids)

@@ -90,10 +90,8 @@ def _parts(one: Remembered, graph: Graph, solved: Solved) -> list[_Part]:
     place, unit = one.place, one.place.unit
     submaps = [*graph.submaps, graph.present]
     told = [PoseWithCovariance(), *(submap.told.scaled(unit) for submap in submaps)]
-    known = [
-        place.origin.then(PoseWithCovariance(T, P).scaled(unit))
-        for T, P in zip(solved.T_bc, solved.covariances, strict=True)
-    ]
+    pairs = zip(solved.T_bc, solved.covariances, strict=True)
+    known = [place.origin.then(PoseWithCovariance(T, P).scaled(unit)) for T, P in pairs]
     begins = [place.origin, *known[:-1]]
     reported = [place.origin.T_wc, *(submap.camera.T_wc for submap in one.submaps)]
     return [
