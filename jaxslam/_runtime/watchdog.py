@@ -50,7 +50,7 @@ def finished(values: Values, where: str, patience: float = DEADLOCK_SECONDS) -> 
         if now - looked < LOOK_SECONDS:
             continue
         # Share of one processor below which a process does not work. One that computes has far more
-        # on however loaded a machine, and one whose threads wait for one another has none
+        # on however loaded a machine, and one whose threads wait for one another has none.
         busy = time.process_time() - worked > 0.01 * (now - looked)
         # A process that was stopped and goes on has one long pause, which counts as one look.
         idle = 0.0 if busy else idle + min(now - looked, 2 * LOOK_SECONDS)

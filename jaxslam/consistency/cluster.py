@@ -68,8 +68,7 @@ def on_cluster(
     try:
         while waiting or doing:
             if waiting and len(doing) < AT_LEAST:
-                # The tasks given out for every thread of the cluster: one at work, the others on
-                # their way
+                # Three for every thread of the cluster: one at work, the others on their way.
                 room = max(AT_LEAST, 3 * sum(client.nthreads().values()))
                 for chunk in [waiting.popleft() for _ in range(min(room, len(waiting)))]:
                     future = client.submit(_computed, whole, wide(), chunk, pure=False)

@@ -135,7 +135,7 @@ class _Description:
                 value = getattr(module, name, _NOTHING)
             elif step.opname == "IMPORT_NAME" and _package(name) is None:
                 found[name] = {UNSEEN: f"import {name} in {function.__qualname__}"}
-            # Functions behind which there may be code that is not named
+            # Functions behind which there may be code that is not named.
             if any(value is x for x in (getattr, eval, exec, globals, __import__, compile)):
                 found[name] = {UNSEEN: f"{name}(…) in {function.__qualname__}"}
             elif value is not _NOTHING and not isinstance(value, ModuleType):
@@ -224,7 +224,7 @@ def _name(value: type | FunctionType) -> str:
 def _array(value: Any) -> Any:
     is_key = jax.dtypes.issubdtype(value.dtype, jax.dtypes.prng_key)
     x = np.asarray(jax.random.key_data(jnp.asarray(value)) if is_key else value)
-    # The largest array that is written whole; of a larger one there is a digest
+    # So large an array is written whole; of a larger one there is a digest.
     if x.size <= 64 and x.dtype.kind in "fiub":
         return x.tolist()
     told = hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest()

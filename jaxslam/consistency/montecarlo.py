@@ -189,7 +189,6 @@ def _as_filters(scenario: Scenario, filters: Any) -> Mapping[str, AbstractFilter
         filters = list(filters)
         if filters and all(isinstance(word, str) for word in filters):
             words = (word.partition("/") for word in filters)
-            # The landmarks of filters that are given by words
             made = [make_filters(scenario, name, of or "inverse_scaling") for name, _, of in words]
             return {name: slam for each in made for name, slam in each.items()}
     if not filters or not isinstance(filters, Mapping):
@@ -205,8 +204,8 @@ def _as_filters(scenario: Scenario, filters: Any) -> Mapping[str, AbstractFilter
 def _step_seconds(slam: AbstractFilter) -> float:
     """About how long a step of a filter takes."""
     state = jax.eval_shape(lambda: slam.init(12))
-    # About what a step takes for each number of a filter's state, s, by XLA on one processor: a
-    # rule of thumb, right within a factor of 3 for the filters of the package
+    # So many seconds for each number of its state, by XLA on one processor: a rule of thumb, right
+    # within a factor of 3 for the filters of the package.
     return 35e-9 * sum(x.size for x in jax.tree.leaves(state))
 
 

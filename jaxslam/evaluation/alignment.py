@@ -115,7 +115,7 @@ def straight_line(
     """
     _, singular, right = np.linalg.svd(positions - positions.mean(0))
     # A rotation about a line is fixed by positions so many σ off it, root of the mean squares: of
-    # four it has 6 % more σ than to first order, of ten 1 %
+    # four it has 6 % more σ than to first order, of ten 1 %.
     if len(right) == 2 or singular[1] > 10 * np.linalg.norm(sigma):
         return None
     return right[0]

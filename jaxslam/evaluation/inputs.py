@@ -449,7 +449,7 @@ def _rectangle(
         r, s = places[twice]
         raise ValueError(f"{path}, line {lines[twice]}: run {r:g}, step {s:g} appears twice")
     longest = int(np.bincount(run).max())
-    # The most different steps of all runs, relative to those of the longest, that runs may share
+    # All runs have at most twice as many different steps as the longest.
     if len(steps) > 2 * longest:
         raise ValueError(
             f"{path}: the runs have {len(steps)} different steps, but none has more than "

@@ -266,7 +266,7 @@ def estimated(
     sigma = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
     alone = _alone(P, sigma)
     none = (np.abs(e) <= ROUNDING).all(axis=0)
-    # Errors that are less of σ at every pose are no errors
+    # Errors that are less of σ at every pose are no errors.
     none |= alone & (np.abs(e) <= 1e-3 * sigma).all(axis=0)
     if none.all() or not none.any():
         return names, ()

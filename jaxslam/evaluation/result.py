@@ -339,7 +339,7 @@ def _missing(evaluation: Evaluation) -> list[str]:
     missing = np.sum(~evaluation.logged, axis=1)
     if not missing.any():
         return []
-    # The most runs that a sentence names as examples
+    # Three runs are named as examples.
     most = np.argsort(-missing, kind="stable")[: min(3, np.count_nonzero(missing))]
     told = ", ".join(f"{_run(evaluation, int(run))}: {missing[run]}" for run in most)
     more = np.count_nonzero(missing) - len(most)
@@ -481,8 +481,8 @@ def neighbours_correlate(nis: Evaluation) -> float | None:
     if not np.isfinite(squared) or squared == 0 or not pairs:
         return None
     rho = float(np.sum(z[:, 1:] * z[:, :-1]) / squared)
-    # Of a correlation, in σ of white innovations: one in 370 of a right filter
-    # A correlation that is smaller says nothing of the gain, however many steps show it
+    # Beyond three σ of white innovations is one in 370 of a right filter; and a correlation below
+    # 0.02 says nothing of the gain, however many steps show it.
     return rho if abs(rho) > max(0.02, 3.0 / np.sqrt(pairs)) else None
 
 

@@ -104,8 +104,7 @@ def _unwrapped(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake
             continue
         e, sigma = logged.errors[..., axis], logged.sigmas[..., axis]
         for period, turn, wrapped in _PERIODS:
-            # The distance from a full turn, rad, for an axis known to be an angle and one that may
-            # be
+            # The distance from a full turn, rad, of what is known to be an angle and what may be.
             run = _turned(e, sigma, period, {True: 1.0, None: 0.5}[angle] * period / (2 * np.pi))
             if not run.any():
                 continue
@@ -158,8 +157,7 @@ def _degrees(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake]:
         found = [axis for axis in asked if wrong[axis].is_like(factor, known=bool(angles))]
         if not angles and found == asked:  # σ as a whole may be wrong
             ends = {axis: logged.factors[axis]["interval99"] for axis in found}
-            # The widest one of a verdict, which is of the runs' scatter too, where no other axis is
-            # right
+            # An interval of a verdict, which is of the runs' scatter too, must not be wider.
             found = [x for x, (low, high) in ends.items() if low and high and high < 4.0 * low]
         if not found or (angles and found != angles):
             continue

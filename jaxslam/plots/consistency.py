@@ -213,7 +213,7 @@ def plot_log_scale(summary: Drawn, *, ax: Axes, label: Labels | None = None) -> 
     Where the scale is free; names at the ends of the lines, or those of `label`.
     """
     results = _with_scale(summary)
-    # Median of |x| for a standard normal x
+    # 0.6745 is the median of |x| for a standard normal x.
     scales = {name: result.log_scale for name, result in results.items()}
     pairs = {name: (x.error_median, 0.6745 * x.sigma_median) for name, x in scales.items()}
     lines = _plot_pairs(pairs, results, ax, label, lw=0.9, ls=(0, (4, 2)))

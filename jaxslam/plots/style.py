@@ -142,7 +142,7 @@ def label_ends(axes: Axes, ends: Sequence[End]) -> None:
     # The share of a figure's width that names at lines may take.
     if longest * 0.55 * LETTERS / 72 > 0.3 * room:
         lines = [Line2D([], [], color=end.colour, lw=1.8) for end in ends]
-        # Inches from the axes to what stands below the numbers and the name of x
+        # Inches from the axes to what stands below the numbers and the name of x.
         below = offset_copy(axes.transAxes, axes.get_figure(root=True), y=-0.42, units="inches")
         axes.legend(
             lines, [end.label for end in ends], loc="upper left", bbox_to_anchor=(0, 0),

@@ -88,7 +88,7 @@ def match_patches(
         return Matches(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, np.float32), np.zeros(0))
     whole, half = image.astype(np.float32), templates.shape[1] // 2
     ellipses = _Ellipses.of(centres, covariances)
-    # of the picture's width: an ellipse is searched no further from its centre
+    # An ellipse is searched no further from its centre than a quarter of the picture's width.
     reach = 0.25 * image.shape[1] if max_radius is None else max_radius
     boxes = _boxes_around(ellipses, reach, half, image.shape)
     least = THRESHOLD - ambiguity

@@ -157,7 +157,7 @@ def _places_of(point: KnownPoint, image: np.ndarray, count: int) -> list[Float[n
         raise ValueError(f"the patch of point {name} is larger than the picture")
     alike = cv2.matchTemplate(image, patch, cv2.TM_CCOEFF_NORMED)
     highest = alike >= cv2.dilate(alike, np.ones((7, 7), np.uint8))
-    # Least correlation of a patch with the picture
+    # The least correlation of a patch with the picture.
     rows, columns = np.nonzero(highest & (alike > 0.8))
     if not len(rows):
         raise ValueError(f"the first picture shows nothing like the patch of point {name}")

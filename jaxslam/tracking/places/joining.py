@@ -82,7 +82,7 @@ def join_of(before: Remembered, map: Map, step: int, last: Transform) -> Join | 
         return None
     apart = np.linalg.norm(pixels[:, None] - others, axis=2)
     i, j = np.arange(len(pixels)), np.argmin(apart, axis=1)
-    # The most pixels between two landmarks, one of each map, that are the same point
+    # The most pixels between two landmarks, one of each map, that are the same point.
     same = (apart[i, j] < 2.0) & (np.argmin(apart, axis=0)[j] == i)
     # The fewest such pairs that join two maps.
     if same.sum() < 6:
