@@ -88,7 +88,8 @@ class _Description:
         fields = {} if _package(kind.__module__) == PYTHON else getattr(value, "__dict__", {})
         if not fields and callable(value) and not isinstance(kind.__call__, FunctionType):
             return {"type": _name(kind), UNSEEN: f"{getattr(value, '__name__', _name(kind))}(…)"}
-        return {"type": self._class(kind), **(self.of(fields) if self._first_time(value) else {})}
+        first = self._first_time(value)  # before its class, which may have it as a member
+        return {"type": self._class(kind), **(self.of(fields) if first else {})}
 
     def _class(self, kind: type) -> Any:
         """The name of a class, and the members of one that is the user's."""
