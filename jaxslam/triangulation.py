@@ -223,10 +223,8 @@ def _intersect(_: str, given: tuple[TwoViews, Array], normal: Float[Array, " n"]
     views, pixels = given
     errors, cameras = views.errors(normal)
     first, second = jax.vmap(bearing)(cameras, (pixels + errors)[:, None])[:, 0]
-    inverse_depth, prior = (
-        (first - second) / views.baseline,
-        InverseDepth.beyond(views.nearest_depth),
-    )
+    inverse_depth = (first - second) / views.baseline
+    prior = InverseDepth.beyond(views.nearest_depth)
     log_weight = -(((inverse_depth - prior.mean) / prior.sigma) ** 2) / 2
     log_weight -= jnp.log(cameras.focal[1, 0])
     return jnp.stack([second, jnp.ones_like(second)]), inverse_depth, log_weight

@@ -23,7 +23,7 @@ PACKAGE = Path(jaxslam.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 ORDER = (
     "_version", "_numerics", "linalg", "_runtime", "geometry", "native", "landmarks", "models",
-    "io", "simulation", "statistics", "filters", "consistency", "evaluation",
+    "io", "simulation", "statistics", "filters", "testing", "consistency", "evaluation",
     "triangulation", "plots", "tracking", "cli",
 )  # fmt: skip
 """Rooms, each of which imports only those before it."""
@@ -168,14 +168,14 @@ def test_rooms_and_functions_are_small():
 def test_the_house_does_not_grow():
     """What was reached is kept: whoever needs more room makes it (CONTRIBUTING.md)."""
     rooms = {path.relative_to(PACKAGE).with_suffix("").parts[0] for path in FILES} - {"__init__"}
-    assert len(rooms - {"_version"}) <= 17, rooms
+    assert len(rooms - {"_version"}) <= 18, rooms
     arrows = {
         (path.relative_to(PACKAGE).with_suffix("").parts[0], room(module))
         for path in FILES
         for module in imports(path)
     }
-    assert len({(above, below) for above, below in arrows if above != below}) <= 75
-    assert sum(code_lines(path) for path in FILES if "native" not in path.parts) <= 17_380
+    assert len({(above, below) for above, below in arrows if above != below}) <= 81
+    assert sum(code_lines(path) for path in FILES if "native" not in path.parts) <= 17_092
     for path in FILES:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ClassDef):

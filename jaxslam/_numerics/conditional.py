@@ -39,8 +39,7 @@ def cond(
 ) -> Value:
     """`function(value, *given)` if it is wanted, else the value."""
     one = jax.tree.map(lambda x: jnp.asarray(x)[None], value)
-    after = map_where(function, one, wanted[None], *given)
-    return jax.tree.map(lambda x: x[0], after)
+    return jax.tree.map(lambda x: x[0], map_where(function, one, wanted[None], *given))
 
 
 def map_where(

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
 
-def exported(room: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return the `__getattr__` of a room, given the module in it of each name."""
+def exported(room: str, names: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
+    """Return the `__getattr__` of a room, given the names that it has of each module in it."""
+    module_of = {name: module for module, own in names.items() for name in own}
 
     def attribute(name: str) -> Any:
-        if name not in modules:
+        if name not in module_of:
             raise AttributeError(f"module {room!r} has no attribute {name!r}")
-        return getattr(import_module(f"{room}.{modules[name]}"), name)
+        return getattr(import_module(f"{room}.{module_of[name]}"), name)
 
     return attribute
 

@@ -197,7 +197,7 @@ class _Call(NamedTuple):
     @classmethod
     def of(cls, args: tuple[PyTree, ...]) -> _Call:
         leaves, structure = jax.tree.flatten(args)
-        are_arrays = tuple(map(_is_array, leaves))
+        are_arrays = tuple(hasattr(x, "shape") and hasattr(x, "dtype") for x in leaves)
         both = list(zip(leaves, are_arrays, strict=True))
         kinds = tuple((x.shape, x.dtype.name) if is_array else x for x, is_array in both)
         return cls([x for x, is_array in both if is_array], (structure, are_arrays, kinds, wide()))
@@ -248,10 +248,6 @@ def exactly(value: Any) -> object:
 def wide() -> bool:
     """Whether numbers are of 64 bits where this is asked."""
     return bool(jnp.result_type(float) == jnp.float64)
-
-
-def _is_array(leaf: object) -> bool:
-    return hasattr(leaf, "shape") and hasattr(leaf, "dtype")
 
 
 class _Compiled(NamedTuple):

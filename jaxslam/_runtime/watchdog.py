@@ -18,9 +18,6 @@ DEADLOCK_SECONDS = 120.0
 """Seconds without any work after which a computation counts as standing still."""
 LOOK_SECONDS = 1.0
 """Seconds between two looks at the processor time."""
-BUSY_SHARE = 0.01
-"""Share of one processor below which a process does not work. One that computes has far more on
-however loaded a machine, and one whose threads wait for one another has none."""
 
 
 LAPACK = {"cholesky", "triangular_solve", "eigh", "eig", "svd", "qr", "geqrf", "lu", "lu_solve"} | {
@@ -52,7 +49,9 @@ def finished(values: Values, where: str, patience: float = DEADLOCK_SECONDS) -> 
         time.sleep(min(0.05, (now - began) / 50 + 1e-4))
         if now - looked < LOOK_SECONDS:
             continue
-        busy = time.process_time() - worked > BUSY_SHARE * (now - looked)
+        # Share of one processor below which a process does not work. One that computes has far more
+        # on however loaded a machine, and one whose threads wait for one another has none.
+        busy = time.process_time() - worked > 0.01 * (now - looked)
         # A process that was stopped and goes on has one long pause, which counts as one look.
         idle = 0.0 if busy else idle + min(now - looked, 2 * LOOK_SECONDS)
         looked, worked = now, time.process_time()

@@ -9,9 +9,6 @@ import jax
 
 from jaxslam._runtime.programs import keep_in
 
-_WORTH = 0.2
-"""Programs that compile for so many seconds are kept; by default JAX keeps those of one second."""
-
 
 def keep_programs() -> None:
     """Keep programs in the user's cache folder, or where JAX is set to keep them.
@@ -36,4 +33,5 @@ def keep_programs() -> None:
         keep_in(folder)
         jax.config.update("jax_compilation_cache_dir", str(folder))
         if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
-            jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH)
+            # In seconds of compiling; by default JAX keeps programs from one second on.
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)

@@ -13,21 +13,18 @@ from jaxslam.cli.track import TrackOptions
 from jaxslam.cli.triangulate import TriangulateOptions
 
 _COMMANDS = {
-    "consistency": (
-        ConsistencyOptions, "Simulate many runs of filters: are they consistent?",
-    ),
-    "evaluate": (
-        EvaluateOptions, "Test the consistency of your own filter from its errors.",
-    ),
+    "consistency": (ConsistencyOptions, "Simulate many runs of filters: are they consistent?"),
+    "evaluate": (EvaluateOptions, "Test the consistency of your own filter from its errors."),
     "track": (TrackOptions, "Track a camera through a video: trajectory, map, overlay."),
     "calibrate": (
-        CalibrateOptions, "Calibrate a camera, with uncertainty, from a video of a board.",
+        CalibrateOptions,
+        "Calibrate a camera, with uncertainty, from a video of a board.",
     ),
     "triangulate": (
         TriangulateOptions,
         "How well do two views determine a depth, and is the estimate consistent?",
     ),
-}  # fmt: skip
+}
 Command: Any = Union[  # noqa: UP007 (of a table)
     tuple(
         Annotated[options, tyro.conf.subcommand(name, description=told)]

@@ -99,10 +99,8 @@ class EvaluateOptions:
         if self.pdf:
             plot_evaluation(found, self.out / "evaluation.pdf", column=True)
         print(found)
-        print(
-            f"wrote {written} and, beside it, evaluation.png"
-            f"{' and evaluation.pdf' if self.pdf else ''}"
-        )
+        too = " and evaluation.pdf" if self.pdf else ""
+        print(f"wrote {written} and, beside it, evaluation.png{too}")
 
     def _stated(self) -> dict[str, str]:
         told = {name: getattr(self, name) for name in CHOICES}

@@ -22,8 +22,6 @@ from jaxslam._runtime.extras import missing
 from jaxslam._runtime.files import one_line
 from jaxslam._runtime.programs import wide
 
-AHEAD = 3
-"""The tasks given out for every thread of the cluster: one at work, the others on their way."""
 AT_LEAST = 64
 """The tasks given out however few threads there are, so that a cluster that adapts sees work."""
 ANSWER_SECONDS = 10.0
@@ -62,14 +60,16 @@ def on_cluster(
 
     Raises OSError where the scheduler is lost; what the function raises comes through.
     """
+    import cloudpickle  # Dask's: classes of a notebook go along
     from distributed import as_completed
 
-    whole, waiting, doing = _pickled(function), deque(chunks), {}
+    whole, waiting, doing = cloudpickle.dumps(function), deque(chunks), {}
     finished = as_completed(loop=client.loop)
     try:
         while waiting or doing:
             if waiting and len(doing) < AT_LEAST:
-                room = max(AT_LEAST, AHEAD * sum(client.nthreads().values()))
+                # Three for every thread of the cluster: one at work, the others on their way.
+                room = max(AT_LEAST, 3 * sum(client.nthreads().values()))
                 for chunk in [waiting.popleft() for _ in range(min(room, len(waiting)))]:
                     future = client.submit(_computed, whole, wide(), chunk, pure=False)
                     doing[future] = chunk
@@ -85,12 +85,6 @@ def _result(client: Any, future: Any) -> Any:
         return future.result()  # computed again where its worker is lost before it was fetched
     except CancelledError:
         raise OSError(errno.ECONNRESET, "the cluster is lost", client.scheduler.address) from None
-
-
-def _pickled(function: Callable[[range], Any]) -> bytes:
-    import cloudpickle  # Dask's: classes of a notebook go along
-
-    return cloudpickle.dumps(function)
 
 
 def _computed(whole: bytes, as_wide: bool, chunk: range) -> Any:

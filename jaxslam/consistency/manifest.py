@@ -25,8 +25,6 @@ import numpy as np
 Manifest = dict[str, Any]
 LAYOUT = 8
 """The version of the records that are kept, which are never mixed with those of another."""
-MOST_NUMBERS = 64
-"""The largest array that is written whole; of a larger one there is a digest."""
 
 
 def versions() -> dict[str, str]:
@@ -90,7 +88,7 @@ class _Description:
         fields = {} if _package(kind.__module__) == PYTHON else getattr(value, "__dict__", {})
         if not fields and callable(value) and not isinstance(kind.__call__, FunctionType):
             return {"type": _name(kind), UNSEEN: f"{getattr(value, '__name__', _name(kind))}(…)"}
-        first = self._first_time(value)
+        first = self._first_time(value)  # before its class, which may have it as a member
         return {"type": self._class(kind), **(self.of(fields) if first else {})}
 
     def _class(self, kind: type) -> Any:
@@ -138,7 +136,8 @@ class _Description:
                 value = getattr(module, name, _NOTHING)
             elif step.opname == "IMPORT_NAME" and _package(name) is None:
                 found[name] = {UNSEEN: f"import {name} in {function.__qualname__}"}
-            if any(value is x for x in _DYNAMIC):
+            # Functions behind which there may be code that is not named.
+            if any(value is x for x in (getattr, eval, exec, globals, __import__, compile)):
                 found[name] = {UNSEEN: f"{name}(…) in {function.__qualname__}"}
             elif value is not _NOTHING and not isinstance(value, ModuleType):
                 found[name] = self.of(value)
@@ -154,8 +153,6 @@ JAXSLAM, PYTHON = "jaxslam", "python"
 _NAMED = (JAXSLAM, PYTHON)
 """Of whose functions there is the name alone: the manifest has the version of the package, and no
 result depends on that of Python."""
-_DYNAMIC = (getattr, eval, exec, globals, __import__, compile)
-"""Functions behind which there may be code that is not named."""
 _OPERATORS = ("__call__", "__add__", "__sub__", "__mul__", "__matmul__", "__getitem__", "__neg__")
 
 
@@ -228,7 +225,8 @@ def _name(value: type | FunctionType) -> str:
 def _array(value: Any) -> Any:
     is_key = jax.dtypes.issubdtype(value.dtype, jax.dtypes.prng_key)
     x = np.asarray(jax.random.key_data(jnp.asarray(value)) if is_key else value)
-    if x.size <= MOST_NUMBERS and x.dtype.kind in "fiub":
+    # So large an array is written whole; of a larger one there is a digest.
+    if x.size <= 64 and x.dtype.kind in "fiub":
         return x.tolist()
     told = hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest()
     return {"shape": list(x.shape), "dtype": x.dtype.name, "sha256": told}

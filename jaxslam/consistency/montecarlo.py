@@ -48,9 +48,6 @@ CHUNKS = 4
 and processors end at about the same time."""
 CHUNK_SECONDS = 20.0
 """The longest that a chunk should take, down to `LEAST_CHUNK` runs, so that a bar moves."""
-NUMBER_SECONDS = 35e-9
-"""About what a step takes for each number of a filter's state, s, by XLA on one processor: a rule
-of thumb, right within a factor of 3 for the filters of the package."""
 MOST_RUNS = 10**8
 """The most runs of a study."""
 Result = TypeVar("Result")
@@ -192,7 +189,7 @@ def _as_filters(scenario: Scenario, filters: Any) -> Mapping[str, AbstractFilter
         filters = list(filters)
         if filters and all(isinstance(word, str) for word in filters):
             words = (word.partition("/") for word in filters)
-            made = [make_filters(scenario, name, of or _LANDMARK) for name, _, of in words]
+            made = [make_filters(scenario, name, of or "inverse_scaling") for name, _, of in words]
             return {name: slam for each in made for name, slam in each.items()}
     if not filters or not isinstance(filters, Mapping):
         raise ValueError(
@@ -204,14 +201,12 @@ def _as_filters(scenario: Scenario, filters: Any) -> Mapping[str, AbstractFilter
     return filters
 
 
-_LANDMARK = "inverse_scaling"
-"""The landmarks of filters that are given by words."""
-
-
 def _step_seconds(slam: AbstractFilter) -> float:
     """About how long a step of a filter takes."""
     state = jax.eval_shape(lambda: slam.init(12))
-    return NUMBER_SECONDS * sum(x.size for x in jax.tree.leaves(state))
+    # So many seconds for each number of its state, by XLA on one processor: a rule of thumb, right
+    # within a factor of 3 for the filters of the package.
+    return 35e-9 * sum(x.size for x in jax.tree.leaves(state))
 
 
 def _workers(client: Any) -> int:

@@ -15,7 +15,6 @@ from jaxslam._runtime.files import json_numbers
 from jaxslam._runtime.lookup import suggestion
 from jaxslam.statistics import Verdict
 
-SCHEMA = 1
 Steps = Float[np.ndarray, " steps"]
 """One number for every step; NaN where there is none."""
 
@@ -348,7 +347,7 @@ class Results(Mapping):
         """Return the content of `consistency.json`."""
         own = {f.name: _plain(getattr(self, f.name)) for f in dataclasses.fields(self)}
         own["filters"] = {name: result.to_json() for name, result in self.filters.items()}
-        return Summary(schema=SCHEMA, **own)
+        return Summary(schema=1, **own)
 
     @staticmethod
     def from_json(told: Mapping[str, Any]) -> Results:

@@ -87,7 +87,6 @@ def filter_run(
     def records_and_pose(state, innovation, frame: SimulatedFrame):
         T_BC = frame.pose
         estimate, covariance = camera_pose(slam, state)
-        landmarks = _landmark_records(slam, sensor, state, frame)
         records = {
             "nees": normalised_squared(*slam.pose_error(state, T_BC)),
             **scale_records(slam, state, T_BC),
@@ -97,7 +96,7 @@ def filter_run(
             "status": innovation.status,
             "error": _camera_error(estimate, T_BC),
             "variance": jnp.diagonal(covariance),
-            **landmarks,
+            **_landmark_records(slam, sensor, state, frame),
         }
         return records, estimate
 
@@ -118,23 +117,15 @@ def scale_records(
         in_unit = beyond_scale(
             lambda truth: (difference(truth, seen.pose), seen.covariance), T_BC, truth_sigma
         )
-    own = (*in_unit, slam.unit_fixed(state).astype(metric.nees.dtype))
-    return {
-        "log_scale": metric.log_scale,
-        "log_scale_sigma": metric.sigma,
-        **dict(zip(SCALE, own, strict=True)),
-    }
+    own = zip(SCALE, (*in_unit, slam.unit_fixed(state).astype(metric.nees.dtype)), strict=True)
+    return {"log_scale": metric.log_scale, "log_scale_sigma": metric.sigma, **dict(own)}
 
 
 def _camera_error(estimate: Pose, truth: Pose) -> Array:
     """The position error in the estimated camera's axes, then `Log(R_est⁻¹ R_true)`."""
     rotation = estimate.rotation().inverse()
-    return jnp.concatenate(
-        [
-            rotation @ (truth.translation() - estimate.translation()),
-            (rotation @ truth.rotation()).log(),
-        ]
-    )
+    moved = rotation @ (truth.translation() - estimate.translation())
+    return jnp.concatenate([moved, (rotation @ truth.rotation()).log()])
 
 
 def _landmark_records(

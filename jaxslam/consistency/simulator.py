@@ -61,13 +61,8 @@ class Simulator:
     def made_by(self) -> Manifest:
         """The manifest of the runs that are drawn, the layout of records, and the versions."""
         world, seed, dtype, _ = self._given
-        return {
-            "layout": LAYOUT,
-            "version": versions(),
-            "scenario": described(world),
-            "seed": int(seed),
-            "dtype": dtype,
-        }
+        drawn = {"scenario": described(world), "seed": int(seed), "dtype": dtype}
+        return {"layout": LAYOUT, "version": versions(), **drawn}
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle for another machine, which has no file of a trajectory, and makes its own key."""
@@ -75,8 +70,7 @@ class Simulator:
 
     def __call__(self, chunk: range) -> tuple[Run, Room]:
         """Return the chunk's runs, padded to `size` by the runs that follow."""
-        indices = chunk.start + jnp.arange(self.size)
-        return _draw(self._world, self._key, indices)
+        return _draw(self._world, self._key, chunk.start + jnp.arange(self.size))
 
     def max_sightings(self, chunk: range) -> Room:
         """Return the most that any of the chunk's runs sees."""

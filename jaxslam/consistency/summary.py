@@ -46,7 +46,6 @@ _VALUES_AT_ONCE = 10**7
 """The most values of a record in memory for medians: all runs, and as many steps as fit."""
 _IN_BOTH = ("runs", "seed", "dtype", "device")
 """The attributes of a study that its results have too."""
-_OF_MEDIANS = ("nees", "log_scale", "log_scale_sigma", *SCALE)
 _FILES = {"consistency.json", "consistency.png", "consistency.pdf", "runs"}
 """The names in the folder of a study that is saved, which may be written over."""
 
@@ -243,8 +242,7 @@ class Study(Mapping):
         return as_html(self.results)
 
     def __getattr__(self, name: str) -> NoReturn:
-        known = {field.name for field in dataclasses.fields(FilterResult)} | {"verdict", "lost"}
-        if name in known:
+        if name in {field.name for field in dataclasses.fields(FilterResult)} | {"verdict", "lost"}:
             meant = f"; each filter has one: study[{next(iter(self.filters))!r}].{name}"
         else:
             meant = suggestion(name, dir(type(self)))
@@ -386,12 +384,7 @@ def tally(study: Study, name: str, record: str = "nees") -> Tally:
     It is of the `nees` of its poses, of the part that is `beyond_scale`, or of the `drift` of the
     scale.
     """
-    return tally_of(_sums(study, name), record, study.scenario.geometry.tangent_dim)
-
-
-def _sums(study: Study, name: str) -> Sums:
-    """The sums of all chunks."""
-    return _sums_and_lost(study, name)[0]
+    return tally_of(_sums_and_lost(study, name)[0], record, study.scenario.geometry.tangent_dim)
 
 
 def _sums_and_lost(study: Study, name: str) -> tuple[Sums, list[int] | None]:
@@ -416,7 +409,7 @@ def _medians(study: Study, name: str) -> dict[str, np.ndarray]:
     for start in range(0, study.scenario.steps, at_once):
         part, columns = slice(start, start + at_once), []
         for chunk in study.whole:
-            kept = study.store.load(name, chunk, _OF_MEDIANS)
+            kept = study.store.load(name, chunk, ("nees", "log_scale", "log_scale_sigma", *SCALE))
             survivors = survived(kept)[:, None]
             values = {
                 "nees.median": kept["nees"],

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from jaxslam.consistency.store import SUM, Records
 from jaxslam.models.observations import Status
@@ -80,6 +80,8 @@ def _sums(records: Records, dof: int) -> Sums:
     ever = ~(good["nees"] <= lost_threshold(dof, good["nees"].shape[1]))
     of_all = one_scale_of(records)
     one = OneScale(*(x[healthy] for x in of_all))
+    told = np.isfinite(of_all.normalised)
+    fixed = told.any(axis=1)  # the runs whose unit ever was: drift is tallied from then on
     drifts, displaced = np.isfinite(one.drift), np.isfinite(good["reversed"])
     finite = good["landmark_count"] - good["landmark_not_finite"]
     sigma = good["log_scale_sigma"]
@@ -106,27 +108,17 @@ def _sums(records: Records, dof: int) -> Sums:
         "reversed": _or_zero(good["reversed"]),
         "displaced": displaced,
     }
+    faults = [status for status in Status if status != Status.OK]
     return {
         "tally_nees": Tally.of(records["nees"], dof).numbers(),
         "tally_beyond_scale": Tally.of(of_all.nees, dof, 1.0).numbers(),
-        "tally_drift": _of_drift(of_all.normalised).numbers(),
+        "tally_drift": Tally.of(of_all.normalised[fixed], 1, 1.0, told[fixed]).numbers(),
         "diverged": np.sum(~healthy),
         **{name: value.sum(axis=0) for name, value in of_runs.items()},
-        **{
-            f"status_{s.name}": np.any(records["status"] == s, axis=1).sum()
-            for s in Status
-            if s != Status.OK
-        },
+        **{f"status_{s.name}": np.any(records["status"] == s, axis=1).sum() for s in faults},
     }
 
 
 def _or_zero(x: np.ndarray) -> np.ndarray:
     """The numbers, and 0 where there is none."""
     return np.where(np.isnan(x), 0.0, x)
-
-
-def _of_drift(normalised: Float[np.ndarray, "runs steps"]) -> Tally:
-    """The tally of drift of the runs whose unit was ever fixed, from then on."""
-    told = np.isfinite(normalised)
-    ever = told.any(axis=1)
-    return Tally.of(normalised[ever], 1, 1.0, told[ever])

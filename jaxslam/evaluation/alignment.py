@@ -16,7 +16,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.evaluation.convention import Convention, change, converted, geometry_of, lever
+from jaxslam.evaluation.convention import (
+    Axes,
+    Convention,
+    Matrices,
+    change,
+    converted,
+    geometry_of,
+    lever,
+)
 from jaxslam.evaluation.inputs import Poses, exactly_known
 
 ALIGNMENTS = ("none", "se3", "sim3")
@@ -24,9 +32,6 @@ MAX_TIME_DIFFERENCE = 0.01
 """The largest time difference of poses that are compared, s; evo's default."""
 _SPLIT = Convention("split", "world")
 """The error in which gauge directions are written."""
-_CLEAR = 10
-"""A rotation about a line is fixed by positions so many σ off it, root of the mean squares:
-of four it has 6 % more σ than to first order, of ten 1 %."""
 
 
 class Similarity(NamedTuple):
@@ -41,7 +46,7 @@ class Similarity(NamedTuple):
         back = self.rotation.T
         return Similarity(back, -back @ self.translation / self.scale, 1 / self.scale)
 
-    def moved(self, T_wc: Float[np.ndarray, "*batch d d"]) -> Float[np.ndarray, "*batch d d"]:
+    def moved(self, T_wc: Matrices) -> Matrices:
         """Return the poses in the other world."""
         n, result = T_wc.shape[-1] - 1, T_wc.copy()
         result[..., :n, :n] = self.rotation @ T_wc[..., :n, :n]
@@ -73,9 +78,8 @@ def associated(
     after = np.clip(np.searchsorted(first[order], second), 1, max(len(first) - 1, 1))
     beside = order[np.stack([after - 1, np.minimum(after, len(first) - 1)])]
     away = np.abs(first[beside] - second)
-    nearest = np.where(away[1] < away[0], beside[1], beside[0])
     close = np.flatnonzero(away.min(axis=0) <= MAX_TIME_DIFFERENCE)
-    return nearest[close], close
+    return np.where(away[1] < away[0], beside[1], beside[0])[close], close
 
 
 def similarity(
@@ -110,7 +114,9 @@ def straight_line(
     A fit of positions then does not determine the rotation about it, and would fit that to noise.
     """
     _, singular, right = np.linalg.svd(positions - positions.mean(0))
-    if len(right) == 2 or singular[1] > _CLEAR * np.linalg.norm(sigma):
+    # A rotation about a line is fixed by positions so many σ off it, root of the mean squares: of
+    # four it has 6 % more σ than to first order, of ten 1 %.
+    if len(right) == 2 or singular[1] > 10 * np.linalg.norm(sigma):
         return None
     return right[0]
 
@@ -235,10 +241,7 @@ class Aligned(NamedTuple):
 
 
 def aligned(
-    poses: Poses,
-    convention: Convention,
-    align: str,
-    axes: Int[np.ndarray, " m"] | Bool[np.ndarray, " t"],
+    poses: Poses, convention: Convention, align: str, axes: Axes | Bool[np.ndarray, " t"]
 ) -> Aligned:
     """The estimates aligned by `none`, `se3` or `sim3`.
 
@@ -250,9 +253,8 @@ def aligned(
         return Aligned(poses, given)
     first = poses.covariances[range(len(poses.logged)), np.argmax(poses.logged, axis=1)]
     if exactly_known(first[:, axes][:, :, axes]).all():
-        return Aligned(
-            _each_run(poses, convention, _by_first), given or align == "sim3", (BY_FIRST,)
-        )
+        by_first = _each_run(poses, convention, _by_first)
+        return Aligned(by_first, given or align == "sim3", (BY_FIRST,))
     if given and align == "se3":
         raise ValueError(
             "covariances given the scale need --align sim3, or se3 if the first covariance is zero"
@@ -315,7 +317,7 @@ def _to_all(run: Poses, convention: Convention, *, scaled: bool) -> Poses:
 def _line(run: Poses, convention: Convention) -> Float[np.ndarray, " n"] | None:
     """The direction of an estimate on a straight line, by the largest σ of every position."""
     n = run.estimates.shape[-1] - 1
-    split = converted(run.covariances, run.estimates, convention, Convention("split", "world"))
+    split = converted(run.covariances, run.estimates, convention, _SPLIT)
     variance = np.linalg.eigvalsh(split[:, :n, :n])[:, -1]
     return straight_line(run.estimates[:, :n, n], np.sqrt(np.maximum(variance, 0.0)))
 

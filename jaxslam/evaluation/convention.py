@@ -29,13 +29,29 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, exp, log
 from jaxslam.io.tum import read_table, width, write_table
+
+Joints = Float[np.ndarray, "runs k k"]
+"""Covariances of all poses of a run together."""
+Values = Float[np.ndarray, "runs steps ..."]
+"""Numbers, of any shape, for every step of every run."""
+
+
+Matrices = Float[np.ndarray, "*batch d d"]
+"""Poses, in space d = 4 and in the plane 3."""
+Squares = Float[np.ndarray, "*batch t t"]
+"""Covariances, or derivatives, of their errors."""
+Tangents = Float[np.ndarray, "*batch t"]
+"""Errors of poses."""
+Axes = Int[np.ndarray, " m"]
+"""The numbers of the axes used."""
+
 
 Result = TypeVar("Result")
 CHOICES = {
@@ -94,7 +110,7 @@ def alternatives(convention: Convention, geometry: Geometry) -> tuple[Convention
     return tuple(Convention(*choice, convention.scale) for choice in choices)
 
 
-def geometry_of(poses: Float[np.ndarray, "*batch d d"]) -> Geometry:
+def geometry_of(poses: Matrices) -> Geometry:
     """The geometry of matrices (…, 3, 3) or (…, 4, 4)."""
     return SPATIAL if poses.shape[-1] == 4 else PLANAR
 
@@ -110,11 +126,8 @@ def pose_errors(
 
 
 def truth_derivatives(
-    convention: Convention,
-    estimates: Float[np.ndarray, "*batch d d"],
-    truths: Float[np.ndarray, "*batch d d"],
-    firsts: Float[np.ndarray, "*batch d d"],
-) -> tuple[Float[np.ndarray, "*batch t t"], Float[np.ndarray, "*batch t t"]]:
+    convention: Convention, estimates: Matrices, truths: Matrices, firsts: Matrices
+) -> tuple[Squares, Squares]:
     """Return J of `ξ → ξ + J η` where the truth is T Exp(η) instead, and M.
 
     M is that where instead the estimate is aligned to a pose F Exp(η) instead of F, one of
@@ -125,9 +138,7 @@ def truth_derivatives(
     return turn @ both[0], turn @ both[1]
 
 
-def from_right(
-    convention: Convention, estimates: Float[np.ndarray, "*batch d d"]
-) -> Float[np.ndarray, "*batch t t"]:
+def from_right(convention: Convention, estimates: Matrices) -> Squares:
     """Return M of `ξ = M ξ_right` to first order: `P = M P_right Mᵀ` is the covariance's."""
     n = estimates.shape[-1] - 1
     R, p = estimates[..., :n, :n], estimates[..., :n, n]
@@ -150,16 +161,12 @@ def converted(
     return J @ covariances @ np.swapaxes(J, -1, -2)
 
 
-def change(
-    poses: Float[np.ndarray, "*batch d d"], old: Convention, new: Convention
-) -> Float[np.ndarray, "*batch t t"]:
+def change(poses: Matrices, old: Convention, new: Convention) -> Squares:
     """Return J of `ξ_new = J ξ_old`, to first order."""
     return from_right(new, poses) @ np.linalg.inv(from_right(old, poses))
 
 
-def turning(
-    convention: Convention, estimates: Float[np.ndarray, "*batch d d"]
-) -> Float[np.ndarray, "*batch t t"]:
+def turning(convention: Convention, estimates: Matrices) -> Squares:
     """The matrix that turns an error as computed to the axes and the order of the convention."""
     n, t = estimates.shape[-1] - 1, geometry_of(estimates).tangent_dim
     R = estimates[..., :n, :n]

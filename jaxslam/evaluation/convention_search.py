@@ -19,11 +19,10 @@ from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxslam._runtime.files import Json
 from jaxslam.evaluation.convention import Convention
-from jaxslam.statistics.bands import PowerSums, mean_p_value
+from jaxslam.statistics.bands import PerStep, PowerSums, mean_p_value
 from jaxslam.statistics.verdict import VERDICT_CONFIDENCE, Verdict, not_disproved, run_verdict
 
 NOTICEABLE = 0.05
@@ -36,23 +35,22 @@ _ALIKE = " (right and split errors are the same to first order)"
 class Tried(NamedTuple):
     """The NEES of the data under a convention; NaN where nothing was logged."""
 
-    nees: Float[np.ndarray, "runs steps"]
+    nees: PerStep
     dof: int
     fitted: float = 0.0
     """The most degrees of freedom that a fit took from every NEES."""
     log_determinant: float = 0.0
     """The log determinant of the covariances, on average."""
-    position: Float[np.ndarray, "runs steps"] | None = None
+    position: PerStep | None = None
     """The NEES of the position alone, where there is one."""
-    rotation: Float[np.ndarray, "runs steps"] | None = None
+    rotation: PerStep | None = None
     turns: int = 0
     """The number of axes of the rotation."""
 
     def last(self, steps: int) -> Tried:
         """Return the same of the last steps alone."""
-        position, rotation = (
-            None if x is None else x[:, -steps:] for x in (self.position, self.rotation)
-        )
+        parts = (self.position, self.rotation)
+        position, rotation = (None if x is None else x[:, -steps:] for x in parts)
         return self._replace(nees=self.nees[:, -steps:], position=position, rotation=rotation)
 
     @property
@@ -68,10 +66,8 @@ class Tried(NamedTuple):
     @property
     def consistent(self) -> bool:
         """Whether nothing is proven against it."""
-        parts = (
-            (self.position, self.dof - self.turns, self.fitted),
-            (self.rotation, self.turns, 0.0),
-        )
+        position = (self.position, self.dof - self.turns, self.fitted)
+        parts = position, (self.rotation, self.turns, 0.0)
         # The confidence of what is said against position or rotation alone, after all axes
         # together.
         return self.whole and all(
@@ -80,7 +76,7 @@ class Tried(NamedTuple):
         )
 
 
-def _verdict(nees: Float[np.ndarray, "runs steps"], dof: int, fitted: float) -> Verdict:
+def _verdict(nees: PerStep, dof: int, fitted: float) -> Verdict:
     return run_verdict(nees, dof, fitted, ~np.isnan(nees))
 
 
@@ -208,7 +204,7 @@ def _scale_was_free(marginal: Tried, given: Tried) -> bool:
     return _worse(marginal.position, n / (n - 1) * given.position)
 
 
-def _worse(nees: Float[np.ndarray, "runs steps"], least: Float[np.ndarray, "runs steps"]) -> bool:
+def _worse(nees: PerStep, least: PerStep) -> bool:
     """Whether the one NEES is larger than the other beyond doubt, and noticeably."""
     if np.nanmean(nees) < (1 + NOTICEABLE) * np.nanmean(least):
         return False

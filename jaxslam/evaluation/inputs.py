@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import LARGEST, read_arrays
 from jaxslam._runtime.lookup import suggestion
-from jaxslam.evaluation.convention import CHOICES, geometry_of
+from jaxslam.evaluation.convention import CHOICES, Joints, Values, geometry_of
 from jaxslam.io.tum import check_seconds, not_rigid, of_xytheta, poses, read_table, words
+from jaxslam.statistics.bands import Mask, PerAxis, PerStep
 
 _KEYS = (
     "errors", "innovations", "covariances", "sigmas", "estimates", "truths", "nees", "nis", "dof",
@@ -42,9 +43,7 @@ def numbers(what: str, values: ArrayLike, ndim: int, shape: str) -> Float[np.nda
     return array
 
 
-def check_finite(
-    what: str, array: Float[np.ndarray, ...], logged: Bool[np.ndarray, "runs steps"] | None = None
-) -> None:
+def check_finite(what: str, array: Float[np.ndarray, ...], logged: Mask | None = None) -> None:
     """Raise ValueError, naming run and step, for what is not finite at a step that was logged."""
     wrong = ~np.isfinite(array)
     if logged is not None:
@@ -54,21 +53,17 @@ def check_finite(
         raise ValueError(f"{what} of {at(place)} holds {array[tuple(place)]}; only finite numbers")
 
 
-def all_nan(array: Float[np.ndarray, "runs steps ..."]) -> Bool[np.ndarray, "runs steps"]:
+def all_nan(array: Values) -> Mask:
     """A mask of the steps whose every number is NaN, so that nothing was logged."""
     return np.asarray(np.isnan(array).all(axis=tuple(range(2, array.ndim))))
 
 
-def filled(
-    array: Float[np.ndarray, "runs steps ..."],
-    logged: Bool[np.ndarray, "runs steps"],
-    value: ArrayLike,
-) -> Float[np.ndarray, "runs steps ..."]:
+def filled(array: Values, logged: Mask, value: ArrayLike) -> Values:
     """Return the array with a value at every step that was not logged."""
     return np.where(logged.reshape(*logged.shape, *[1] * (array.ndim - 2)), array, value)
 
 
-def check_every_run(logged: Bool[np.ndarray, "runs steps"]) -> None:
+def check_every_run(logged: Mask) -> None:
     """Raise ValueError for a run of which no step was logged."""
     if not logged.any(axis=1).all():
         run = int(np.argmin(logged.any(axis=1)))
@@ -83,9 +78,9 @@ def at(place: Sequence[int | np.integer] | np.ndarray) -> str:
 class Paired(NamedTuple):
     """The errors and covariances that belong together."""
 
-    errors: Float[np.ndarray, "runs steps n"]
+    errors: PerAxis
     covariances: Float[np.ndarray, "runs steps n n"]
-    logged: Bool[np.ndarray, "runs steps"]
+    logged: Mask
     """A mask of the steps of every run that are there; the others are zeros, of unit covariance."""
 
 
@@ -112,8 +107,7 @@ def step_times(times: ArrayLike | None, steps: int) -> Float[np.ndarray, " steps
     if times is None:
         return np.arange(1.0, steps + 1)
     try:
-        real = not np.iscomplexobj(times)
-        array = np.asarray(times, np.float64) if real else np.empty(0)
+        array = np.empty(0) if np.iscomplexobj(times) else np.asarray(times, np.float64)
     except (ValueError, TypeError):
         array = np.empty(0)
     if array.shape != (steps,) or not np.isfinite(array).all() or (np.diff(array) < 0).any():
@@ -137,16 +131,14 @@ class EvaluatedSteps(NamedTuple):
 
     start: int
     """The first step at which any run has one."""
-    logged: Bool[np.ndarray, "runs steps"]
+    logged: Mask
     """A mask of them, among all steps."""
     notes: tuple[str, ...]
     """A word on those that are known by definition."""
 
 
 def without_known(
-    errors: Float[np.ndarray, "runs steps n"],
-    covariances: Float[np.ndarray, "runs steps n n"],
-    logged: Bool[np.ndarray, "runs steps"],
+    errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"], logged: Mask
 ) -> EvaluatedSteps:
     """The steps that were logged, but for those that a run knows by definition at its beginning.
 
@@ -172,7 +164,7 @@ def without_known(
     return EvaluatedSteps(start, left, _left_out(known & before, start))
 
 
-def _left_out(known: Bool[np.ndarray, "runs steps"], start: int) -> tuple[str, ...]:
+def _left_out(known: Mask, start: int) -> tuple[str, ...]:
     """A word on the steps at the beginning that are known by definition."""
     if not known.any():
         return ()
@@ -194,9 +186,7 @@ def correlations(covariances: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarr
     return covariances / sigma[..., :, None] / sigma[..., None, :]
 
 
-def normalised(
-    errors: Float[np.ndarray, "runs steps n"], covariances: Float[np.ndarray, "runs steps n n"]
-) -> Float[np.ndarray, "runs steps"]:
+def normalised(errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"]) -> PerStep:
     """Return `eᵀ P⁻¹ e`, by a Cholesky factor of the correlations.
 
     Raises ValueError, naming run and step, unless every P is symmetric and positive definite.
@@ -204,8 +194,7 @@ def normalised(
     variance = np.diagonal(covariances, axis1=-2, axis2=-1)
     if (variance <= 0).any():
         run, step, axis = np.argwhere(variance <= 0)[0]
-        told = f"variance {variance[run, step, axis]:.3g} at place {axis}"
-        _refuse((run, step), f"has {told}")
+        _refuse((run, step), f"has variance {variance[run, step, axis]:.3g} at place {axis}")
     sigma = sigmas(covariances)
     with np.errstate(over="ignore"):
         correlation = correlations(covariances)
@@ -243,7 +232,7 @@ class Poses(NamedTuple):
     estimates: Float[np.ndarray, "runs steps d d"]
     covariances: Float[np.ndarray, "runs steps t t"]
     truths: Float[np.ndarray, "runs steps d d"]
-    logged: Bool[np.ndarray, "runs steps"]
+    logged: Mask
     """A mask of the steps that are there; the others are identities, of unit covariance."""
     joint: Float[np.ndarray, "runs steps*t steps*t"] | None = None
     """The covariance of all poses of a run, where it is known."""
@@ -266,9 +255,7 @@ def of_sigmas(sigmas: ArrayLike) -> Float[np.ndarray, "runs steps n n"]:
 def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLike) -> Poses:
     """Return the poses of arrays that belong together. Raises ValueError, naming run and step."""
     matrices = "(runs, steps, 4, 4) or (…, 6), in the plane (runs, steps, 3, 3) or (…, 3)"
-    T, truth = (
-        _matrices(what, x, matrices) for what, x in (("estimates", estimates), ("truths", truths))
-    )
+    T, truth = _matrices("estimates", estimates, matrices), _matrices("truths", truths, matrices)
     if T.shape != truth.shape:
         raise ValueError(
             f"estimates are {T.shape}, so truths must have the same shape, not {truth.shape}"
@@ -299,9 +286,7 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
     return Poses(T, filled(P, logged, np.eye(t)), truth, logged, joints)
 
 
-def _joint(
-    P: Float[np.ndarray, "runs k k"], logged: Bool[np.ndarray, "runs k"]
-) -> Float[np.ndarray, "runs k k"]:
+def _joint(P: Joints, logged: Bool[np.ndarray, "runs k"]) -> Joints:
     """Zero the covariance of steps not logged. Raises ValueError for non-finite or huge numbers."""
     P = np.where(logged[:, :, None] & logged[:, None], P, 0.0)
     if not (np.abs(P) <= LARGEST).all():
@@ -345,8 +330,6 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
     return arrays
 
 
-_APART = 2
-"""The most different steps of all runs, relative to those of the longest, that runs may share."""
 _COLUMNS = "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"
 _STEP_FIRST = ("step", "steps", "time", "t", "k", "frame", "timestamp")
 """First words of a table without a column of runs."""
@@ -466,7 +449,8 @@ def _rectangle(
         r, s = places[twice]
         raise ValueError(f"{path}, line {lines[twice]}: run {r:g}, step {s:g} appears twice")
     longest = int(np.bincount(run).max())
-    if len(steps) > _APART * longest:
+    # All runs have at most twice as many different steps as the longest.
+    if len(steps) > 2 * longest:
         raise ValueError(
             f"{path}: the runs have {len(steps)} different steps, but none has more than "
             f"{longest}; steps must be counted alike in all runs, for example from the start of "

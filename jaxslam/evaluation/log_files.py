@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple, TypeAlias, TypedDict
 
@@ -87,9 +88,8 @@ def evaluate_log(
         for name, value in (("covariance", covariance), ("truth", truth), ("estimate", estimate)):
             if value is not None:
                 raise ValueError(f"{source}: --{name} goes with a trajectory, not with arrays")
-        arrays, runs, steps = (
-            (read_npz(source), (), ()) if source.suffix == ".npz" else read_csv(source)
-        )
+        is_npz = source.suffix == ".npz"
+        arrays, runs, steps = (read_npz(source), (), ()) if is_npz else read_csv(source)
         found = named(source, lambda: _evaluate_arrays(arrays, stated, how, nis), runs, steps)
         told = (advice(found),) if found.quantity == "NIS" and found.names else ()
         return replace(found, run_names=runs, notes=(*found.notes, *told))
@@ -286,18 +286,10 @@ def evaluate_runs(
     names = tuple(run.name for run in runs)
     truths = [np.where(x.evaluated.poses[:, None, None], x.truths.values, np.nan) for x in read]
     longest = max(read, key=lambda one: len(one.times))
-    found = named(
-        runs[0].estimate if len(runs) == 1 else source,
-        lambda: evaluate_poses(
-            _filled_up([one.estimates for one in read]),
-            _filled_up([one.covariances.values for one in read]),
-            _filled_up(truths),
-            convention,
-            times=longest.times,
-            **how,
-        ),
-        names,
-    )
+    poses = [[one.estimates for one in read], [one.covariances.values for one in read], truths]
+    verdict = partial(evaluate_poses, *map(_filled_up, poses), convention, **how)
+    place = runs[0].estimate if len(runs) == 1 else source
+    found = named(place, partial(verdict, times=longest.times), names)
     told = (
         *_left_out(read), *left_out([one.evaluated for one in read]),
         *_other_times(read, longest), *_other_body(runs[0]),
@@ -405,8 +397,7 @@ def _read(run: RunFiles) -> _RunLog:
         _check_times(path, told)
     covariances = _at_times(files[0], files[1], text.covariances)
     true = _at_times(files[0], files[2], truths)
-    known = exactly_known(covariances.values)
-    those = evaluated_poses(run.estimate.parent, times, known)
+    those = evaluated_poses(run.estimate.parent, times, exactly_known(covariances.values))
     read = _RunLog(run, times, estimates, covariances, true, text.said, those)
     _check_share(read)
     return read
@@ -541,11 +532,8 @@ def read_frames(path: Path) -> FrameLog | None:
     titles, *rows = [[word.strip() for word in line.split(",")] for line in lines] or [[]]
     if not {"time", "state", "map", "unit_fixed"} <= set(titles):
         return None
-    table = [
-        _frame(f"{path}, line {number}", dict(zip(titles, row, strict=False)))
-        for number, row in enumerate(rows, start=2)
-        if row != [""]
-    ]
+    held = [(n, dict(zip(titles, x, strict=False))) for n, x in enumerate(rows, 2) if x != [""]]
+    table = [_frame(f"{path}, line {number}", row) for number, row in held]
     if not table:
         raise ValueError(f"{path} has no frames")
     return FrameLog(*(np.array(column) for column in zip(*table, strict=True)))

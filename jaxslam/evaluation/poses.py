@@ -8,13 +8,14 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup
 from jaxslam.evaluation.alignment import ALIGNMENTS, BY_FIRST, Aligned, aligned
 from jaxslam.evaluation.convention import (
+    Axes,
     Convention,
     alternatives,
     geometry_of,
@@ -35,6 +36,7 @@ from jaxslam.evaluation.inputs import (
 from jaxslam.evaluation.result import Evaluation
 from jaxslam.evaluation.scale import Scale, at_one_scale, of_aligned
 from jaxslam.geometry import Geometry
+from jaxslam.statistics.bands import Mask, PerStep
 
 BEYOND = (
     "NEES is computed at the scale of each run that explains all of its poses best; positions are "
@@ -56,9 +58,9 @@ class _PoseErrors(NamedTuple):
 
     errors: Float[np.ndarray, "runs steps m"]
     covariances: Float[np.ndarray, "runs steps m m"]
-    nees: Float[np.ndarray, "runs steps"]
+    nees: PerStep
     start: int
-    logged: Bool[np.ndarray, "runs steps"]
+    logged: Mask
     fitted: float
     axis_fitted: Float[np.ndarray, " m"]
     scale: Scale | None
@@ -101,13 +103,9 @@ def evaluate_poses(
     poses = checked_poses(estimates, covariances, truths)
     at, sigma = step_times(times, poses.estimates.shape[1]), checked_sigma(truth_sigma)
     found = as_stated(poses, stated, align, axes_named(axes_used, poses.estimates, stated), sigma)
-    start = len(at) - found.steps
-    return replace(
-        found,
-        times=at[start:],
-        timed=times is not None,
-        identified=_identified(poses, stated, _Options(align, found.names, sigma)),
-    )
+    identified = _identified(poses, stated, _Options(align, found.names, sigma))
+    at = at[len(at) - found.steps :]
+    return replace(found, times=at, timed=times is not None, identified=identified)
 
 
 def as_stated(
@@ -168,7 +166,7 @@ def _compared(poses: Poses, convention: Convention, options: _Options) -> _PoseE
     return _PoseErrors(errors, P, nees, start, later.logged, fitted, axis_fitted, scale, notes)
 
 
-def _later(poses: Poses, start: int, logged: Bool[np.ndarray, "runs steps"]) -> Poses:
+def _later(poses: Poses, start: int, logged: Mask) -> Poses:
     """The poses from a step on that have a part in the verdict."""
     t, there = poses.covariances.shape[-1], logged[:, start:]
     P = filled(poses.covariances[:, start:], there, np.eye(t))
@@ -180,7 +178,7 @@ def _with_truth(
     world: Aligned,
     later: Poses,
     convention: Convention,
-    axes: Int[np.ndarray, " m"],
+    axes: Axes,
     truth_sigma: tuple[float, float],
 ) -> Poses:
     """Add the σ of the truth, in the unit of the estimate where their ratio is free."""
@@ -213,20 +211,14 @@ def _identified(poses: Poses, stated: Convention, options: _Options) -> Identifi
                 result[convention] = _tried(convention, geometry, found, used)
         return result
 
-    same = _alternatives(stated, geometry, used)
+    # With one axis of rotation mixed is world, as in the plane.
+    flat = sum(name.startswith("r") for name in used) < 2
+    other = "world" if stated.axes == "mixed" else "mixed"
+    same = [c for c in alternatives(stated, geometry) if not flat or c.axes != other]
     if stated.scale == "given" or options.align != "none":
         return identify(stated, tried(same))
     given = [replace(convention, scale="given") for convention in same]
     return identify(stated, tried(same), lambda: tried(given))
-
-
-def _alternatives(
-    stated: Convention, geometry: Geometry, used: tuple[str, ...]
-) -> list[Convention]:
-    """The conventions that differ: with one axis of rotation mixed is world, as in the plane."""
-    flat = sum(name.startswith("r") for name in used) < 2
-    other = "world" if stated.axes == "mixed" else "mixed"
-    return [c for c in alternatives(stated, geometry) if not flat or c.axes != other]
 
 
 def _tried(
@@ -240,20 +232,10 @@ def _tried(
         e, P = found.errors[..., block], found.covariances[..., block, :][..., block]
         return filled(normalised(e, P), found.logged, np.nan)
 
-    determinant = np.linalg.slogdet(found.covariances[found.logged])[1].mean()
-    return Tried(
-        filled(found.nees, found.logged, np.nan),
-        len(names),
-        found.fitted,
-        float(determinant),
-        of(~turns) if (~turns).any() else None,
-        of(turns) if turns.any() else None,
-        int(turns.sum()),
-    )
-
-
-_NOTHING = 1e-3
-"""Errors that are less of σ at every pose are no errors."""
+    nees = filled(found.nees, found.logged, np.nan)
+    log_determinant = float(np.linalg.slogdet(found.covariances[found.logged])[1].mean())
+    parts = (of(block) if block.any() else None for block in (~turns, turns))
+    return Tried(nees, len(names), found.fitted, log_determinant, *parts, int(turns.sum()))
 
 
 def axes_named(
@@ -284,13 +266,12 @@ def estimated(
     sigma = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
     alone = _alone(P, sigma)
     none = (np.abs(e) <= ROUNDING).all(axis=0)
-    none |= alone & (np.abs(e) <= _NOTHING * sigma).all(axis=0)
+    # Errors that are less of σ at every pose are no errors.
+    none |= alone & (np.abs(e) <= 1e-3 * sigma).all(axis=0)
     if none.all() or not none.any():
         return names, ()
-    left, used = (
-        tuple(name for name, out in zip(names, none, strict=True) if out == which)
-        for which in (True, False)
-    )
+    told = list(zip(names, none, strict=True))
+    left, used = (tuple(name for name, out in told if out == which) for which in (True, False))
     return used, (
         f"{', '.join(left)}: errors are always zero, so these axes were not estimated; left out, "
         f"as with --axes-used {','.join(used)}",

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from jaxslam._runtime import plotted
 from jaxslam._runtime.files import Json, json_numbers, write_json
 from jaxslam._runtime.lookup import lookup, suggestion
-from jaxslam.evaluation.convention import Convention
+from jaxslam.evaluation.convention import Convention, Values
 from jaxslam.evaluation.convention_search import Identification
 from jaxslam.evaluation.inputs import (
     at,
@@ -31,7 +31,7 @@ from jaxslam.evaluation.inputs import (
 )
 from jaxslam.evaluation.sanity_checks import Logged, Mistake, mistakes, withheld
 from jaxslam.evaluation.scale import Scale
-from jaxslam.statistics.bands import exact_band
+from jaxslam.statistics.bands import Mask, PerAxis, PerStep, exact_band
 from jaxslam.statistics.verdict import (
     Verdict,
     headline,
@@ -41,10 +41,6 @@ from jaxslam.statistics.verdict import (
     sentences,
 )
 
-SCHEMA = 1
-SIGMAS = 3
-_TOLD = 3
-"""The most runs that a sentence names as examples."""
 _MOST_DOF = 1_000_000
 _LISTED = 20
 """The most lost runs that are named in the text; the file names all."""
@@ -63,11 +59,11 @@ class Evaluation:
     """`NEES`, or `NIS` of innovations."""
     dof: int
     """The degrees of freedom: the NEES that a consistent filter has on average."""
-    nees: Float[np.ndarray, "runs steps"]
+    nees: PerStep
     """The NEES of every run and step; infinite if diverged, NaN where nothing was logged."""
-    errors: Float[np.ndarray, "runs steps n"]
+    errors: PerAxis
     """The error of every run, step and axis; NaN where nothing was logged."""
-    sigmas: Float[np.ndarray, "runs steps n"]
+    sigmas: PerAxis
     """The σ that the filter claims of every error."""
     times: Float[np.ndarray, " steps"]
     """The time of every step, s, or its number."""
@@ -150,7 +146,7 @@ class Evaluation:
         return f"{told}; {self.scale.sentence}" if drifts and self.scale else told
 
     @cached_property
-    def logged(self) -> Bool[np.ndarray, "runs steps"]:
+    def logged(self) -> Mask:
         """A mask of the steps of every run that are there."""
         return ~np.isnan(self.nees)
 
@@ -213,8 +209,7 @@ class Evaluation:
     @property
     def outside3sigma(self) -> Float[np.ndarray, " n"]:
         """The share of the errors of every axis beyond ±3σ; .27 % of Gaussian ones are."""
-        beyond = np.abs(self.errors) > SIGMAS * self.sigmas
-        return np.sum(beyond, axis=(0, 1)) / np.sum(self.logged)
+        return np.sum(np.abs(self.errors) > 3 * self.sigmas, axis=(0, 1)) / np.sum(self.logged)
 
     @property
     def suggested(self) -> Convention | None:
@@ -239,7 +234,7 @@ class Evaluation:
 
         by_axis = {name: i for i, name in enumerate(self.names)}
         return {
-            "schema": SCHEMA,
+            "schema": 1,
             "version": __version__,
             "quantity": self.quantity,
             "runs": self.runs,
@@ -344,7 +339,8 @@ def _missing(evaluation: Evaluation) -> list[str]:
     missing = np.sum(~evaluation.logged, axis=1)
     if not missing.any():
         return []
-    most = np.argsort(-missing, kind="stable")[: min(_TOLD, np.count_nonzero(missing))]
+    # Three runs are named as examples.
+    most = np.argsort(-missing, kind="stable")[: min(3, np.count_nonzero(missing))]
     told = ", ".join(f"{_run(evaluation, int(run))}: {missing[run]}" for run in most)
     more = np.count_nonzero(missing) - len(most)
     told += f", and {more} more run{'s' if more > 1 else ''}" if more else ""
@@ -459,9 +455,7 @@ def _rms(values: np.ndarray, there: np.ndarray | None = None) -> Any:
         return np.sqrt(np.mean(values**2, axis=0) if there is None else _mean(values**2, there))
 
 
-def _mean(
-    values: Float[np.ndarray, "runs steps ..."], there: Bool[np.ndarray, "runs steps"]
-) -> Float[np.ndarray, "steps ..."]:
+def _mean(values: Values, there: Mask) -> Float[np.ndarray, "steps ..."]:
     """The mean over the runs that have a step; NaN where none has it."""
     count = np.sum(there, axis=0).reshape(-1, *[1] * (values.ndim - 2))
     total = np.sum(filled(values, there, 0.0), axis=0)
@@ -473,12 +467,6 @@ def _names(names: Sequence[str], n: int) -> tuple[str, ...]:
     if len(told) != n or len(set(told)) != n:
         raise ValueError(f"names must be {n} different ones, one an axis, not {list(told)}")
     return told
-
-
-_CLEAR = 3.0
-"""Of a correlation, in σ of white innovations: one in 370 of a right filter."""
-_LEAST = 0.02
-"""A correlation that is smaller says nothing of the gain, however many steps show it."""
 
 
 def neighbours_correlate(nis: Evaluation) -> float | None:
@@ -493,7 +481,9 @@ def neighbours_correlate(nis: Evaluation) -> float | None:
     if not np.isfinite(squared) or squared == 0 or not pairs:
         return None
     rho = float(np.sum(z[:, 1:] * z[:, :-1]) / squared)
-    return rho if abs(rho) > max(_LEAST, _CLEAR / np.sqrt(pairs)) else None
+    # Beyond three σ of white innovations is one in 370 of a right filter; and a correlation below
+    # 0.02 says nothing of the gain, however many steps show it.
+    return rho if abs(rho) > max(0.02, 3.0 / np.sqrt(pairs)) else None
 
 
 def advice(nis: Evaluation, nees: Evaluation | None = None) -> str:

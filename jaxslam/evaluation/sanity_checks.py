@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxslam._runtime.files import Json
-from jaxslam.statistics.bands import shortfall_limit
+from jaxslam.statistics.bands import PerAxis, PerStep, shortfall_limit
 from jaxslam.statistics.verdict import Verdict
 
 FALSE_ALARM = 1e-4
@@ -23,8 +23,6 @@ DEGREES = 180 / np.pi
 _PERIODS = ((2 * np.pi, "2π", "(−π, π]"), (360.0, "360°", "(−180°, 180°]"))
 _FAR, _NEAR = 8.0, 5.0
 """An error beyond so many σ is not one of its axis; within so many of a full turn it is."""
-_WIDEST = {True: 1.0, None: 0.5}
-"""The distance from a full turn, rad, for an axis known to be an angle and one that may be."""
 _WRONG = 5.0
 """An axis whose σ may be right up to this factor is in its unit."""
 _LIKE = 2.0
@@ -36,8 +34,6 @@ _SHARE, _BELOW = 0.4, 5.0
 _NARROW = 5.0
 """The widest interval of a factor, upper by lower end, of an axis that may be an angle or not: that
 of 8 runs is narrower."""
-_ALIKE = 4.0
-"""The widest one of a verdict, which is of the runs' scatter too, where no other axis is right."""
 _MANY = 300
 """The most runs and steps whose correlations are tested."""
 _ANGLES = re.compile(
@@ -62,8 +58,8 @@ class Mistake(NamedTuple):
 class Logged(NamedTuple):
     """The data that are checked, NaN where nothing was logged."""
 
-    errors: Float[np.ndarray, "runs steps n"]
-    sigmas: Float[np.ndarray, "runs steps n"]
+    errors: PerAxis
+    sigmas: PerAxis
     names: Sequence[str]
     """The names of the axes."""
     runs: Sequence[str]
@@ -108,7 +104,8 @@ def _unwrapped(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake
             continue
         e, sigma = logged.errors[..., axis], logged.sigmas[..., axis]
         for period, turn, wrapped in _PERIODS:
-            run = _turned(e, sigma, period, _WIDEST[angle] * period / (2 * np.pi))
+            # The distance from a full turn, rad, of what is known to be an angle and what may be.
+            run = _turned(e, sigma, period, {True: 1.0, None: 0.5}[angle] * period / (2 * np.pi))
             if not run.any():
                 continue
             where = run[:, None] & (np.abs(e) > period / 2)
@@ -125,12 +122,7 @@ def _unwrapped(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake
             break
 
 
-def _turned(
-    e: Float[np.ndarray, "runs steps"],
-    sigma: Float[np.ndarray, "runs steps"],
-    period: float,
-    widest: float,
-) -> Bool[np.ndarray, " runs"]:
+def _turned(e: PerStep, sigma: PerStep, period: float, widest: float) -> Bool[np.ndarray, " runs"]:
     """A mask of the runs with an error near a full turn, and no other far from none or a full one.
 
     None where most runs with errors as large have them anywhere.
@@ -142,8 +134,7 @@ def _turned(
     scale = float(np.median(sigma[there]))
     if small.any():
         scale = max(scale, float(np.sqrt(np.mean(e[small] ** 2))))
-    left = np.abs(e - period * np.round(e / period))
-    near = ~there | (left <= min(_NEAR * scale, widest))
+    near = ~there | (np.abs(e - period * np.round(e / period)) <= min(_NEAR * scale, widest))
     far = ~turned | (np.abs(e) > _FAR * np.maximum(sigma, scale))
     found = turned.any(axis=1) & near.all(axis=1) & far.all(axis=1)
     return found & (found.sum() > turned.any(axis=1).sum() / 2)
@@ -166,7 +157,8 @@ def _degrees(logged: Logged, kinds: Sequence[bool | None]) -> Iterator[Mistake]:
         found = [axis for axis in asked if wrong[axis].is_like(factor, known=bool(angles))]
         if not angles and found == asked:  # σ as a whole may be wrong
             ends = {axis: logged.factors[axis]["interval99"] for axis in found}
-            found = [x for x, (low, high) in ends.items() if low and high and high < _ALIKE * low]
+            # An interval of a verdict, which is of the runs' scatter too, must not be wider.
+            found = [x for x, (low, high) in ends.items() if low and high and high < 4.0 * low]
         if not found or (angles and found != angles):
             continue
         if any(wrong[axis].is_like(factor, known=True) for axis in lengths):

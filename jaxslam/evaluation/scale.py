@@ -14,12 +14,13 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from jaxslam._runtime.files import Json, json_numbers
 from jaxslam.evaluation.alignment import about
-from jaxslam.evaluation.convention import Convention, pose_errors
+from jaxslam.evaluation.convention import Axes, Convention, Joints, Matrices, Tangents, pose_errors
 from jaxslam.evaluation.inputs import Poses, correlations, sigmas
+from jaxslam.statistics.bands import Mask, PerStep
 from jaxslam.statistics.beyond_scale import SCALES, BeyondScale, one_scale
 from jaxslam.statistics.verdict import Verdict, run_verdict
 
@@ -33,17 +34,17 @@ class Scale:
 
     log_scale: Float[np.ndarray, " runs"]
     """The log scale of the estimate relative to the truth; NaN where no pose determines it."""
-    drift: Float[np.ndarray, "runs steps"]
+    drift: PerStep
     """The log of a pose's own scale relative to its run's; NaN where it determines none."""
-    sigma: Float[np.ndarray, "runs steps"]
+    sigma: PerStep
     """The σ that the filter claims of log ŝ_k, or of the drift where all covariances are known."""
-    nees: Float[np.ndarray, "runs steps"]
+    nees: PerStep
     """The NEES of the drift; NaN where a pose determines no scale."""
     fitted: float
     """The most degrees of freedom that the fit of the run's scale took from every drift."""
 
     @property
-    def told(self) -> Bool[np.ndarray, "runs steps"]:
+    def told(self) -> Mask:
         """A mask of the poses that have a drift."""
         return ~np.isnan(self.nees)
 
@@ -74,14 +75,12 @@ class Scale:
     def disproved(self) -> bool:
         """Whether the scale certainly drifts more than σ allows."""
         found = self.verdict
+        if found is None or (found["nees"] is not None and found["nees"] <= 1):
+            return False
         # The confidence of the verdict on drift: with that on NEES, which is one-sided where a fit
         # took a degree of freedom, a right filter is called inconsistent in one of a hundred
         # studies.
-        return bool(
-            found is not None
-            and (found["nees"] is None or found["nees"] > 1)
-            and found["p"] < 1 - 0.999
-        )
+        return bool(found["p"] < 1 - 0.999)
 
     @property
     def sentence(self) -> str:
@@ -135,7 +134,7 @@ class AtScale(NamedTuple):
     scale: Scale
 
 
-def at_one_scale(poses: Poses, convention: Convention, axes: Int[np.ndarray, " m"]) -> AtScale:
+def at_one_scale(poses: Poses, convention: Convention, axes: Axes) -> AtScale:
     """Return errors along some axes at the true scale that explains all poses of a run best."""
     if poses.joint is not None:
         return _jointly(poses, poses.joint, convention, axes)
@@ -147,13 +146,9 @@ def at_one_scale(poses: Poses, convention: Convention, axes: Int[np.ndarray, " m
     sigma = own.sigma
     known = np.where(np.isfinite(sigma), np.exp(own.log_scale) * sigma, 0.0)
     share = (known[..., None] * slope) ** 2 / np.diagonal(P, axis1=-2, axis2=-1)
-    return AtScale(
-        errors + slope * (s - 1)[:, None, None],
-        P,
-        1.0,
-        np.clip(share[poses.logged].mean(axis=0), 0.0, 1.0),
-        Scale(found.log_scale, found.drift, sigma, found.normalised, 1.0),
-    )
+    fitted = np.clip(share[poses.logged].mean(axis=0), 0.0, 1.0)
+    scale = Scale(found.log_scale, found.drift, sigma, found.normalised, 1.0)
+    return AtScale(errors + slope * (s - 1)[:, None, None], P, 1.0, fitted, scale)
 
 
 def errors_beyond_scale(
@@ -171,10 +166,8 @@ def errors_beyond_scale(
 
 
 def _affine(
-    convention: Convention,
-    estimates: Float[np.ndarray, "*batch d d"],
-    truths: Float[np.ndarray, "*batch d d"],
-) -> tuple[Float[np.ndarray, "*batch t"], Float[np.ndarray, "*batch t"]]:
+    convention: Convention, estimates: Matrices, truths: Matrices
+) -> tuple[Tangents, Tangents]:
     """Return e and g = de/ds of the truth times s: every error is `e + g (s − 1)`."""
     twice = truths.copy()
     twice[..., :-1, -1] *= 2.0
@@ -199,12 +192,7 @@ def _own_scales(
         return BeyondScale(nees, np.log(s), 1 / (s * np.sqrt(curvature)))
 
 
-def _jointly(
-    poses: Poses,
-    joints: Float[np.ndarray, "runs k k"],
-    convention: Convention,
-    axes: Int[np.ndarray, " m"],
-) -> AtScale:
+def _jointly(poses: Poses, joints: Joints, convention: Convention, axes: Axes) -> AtScale:
     """Fit one scale by the joint covariance: exact, each NEES has all its degrees of freedom.
 
     What is left of a run at its ŝ has the covariance `Σ − G Gᵀ/(Gᵀ Σ⁻¹ G)`.
@@ -256,10 +244,7 @@ def _fitted(
 
 
 def of_aligned(
-    poses: Poses,
-    convention: Convention,
-    axes: Int[np.ndarray, " m"],
-    log_scale: Float[np.ndarray, " runs"],
+    poses: Poses, convention: Convention, axes: Axes, log_scale: Float[np.ndarray, " runs"]
 ) -> Scale:
     """The drift of poses that a Sim(n) has aligned to the truth, about the middle of each run."""
     T, P, truth = (x.copy() for x in poses[:3])

@@ -3,19 +3,16 @@
 What looks at pictures needs the extra `vision`, and is imported when it is asked for.
 """
 
+from itertools import chain
+
 from jaxslam._runtime import exported
 from jaxslam.io.tum import read_tum, write_tum
 
-_MODULES = {
-    "Frame": "source",
-    "Source": "source",
-    "Trajectory": "source",
-    "open_source": "opening",
-    "open_recording": "opening",
-    "Calibration": "calibration",
-    "read_calibration": "calibration",
-    "write_calibration": "calibration",
+_NAMES = {
+    "source": ("Frame", "Source", "Trajectory"),
+    "opening": ("open_source", "open_recording"),
+    "calibration": ("Calibration", "read_calibration", "write_calibration"),
 }
 """Where each name is that is imported only when it is asked for."""
-__all__ = ["read_tum", "write_tum", *_MODULES]
-__getattr__ = exported(__name__, _MODULES)
+__all__ = ["read_tum", "write_tum", *chain(*_NAMES.values())]
+__getattr__ = exported(__name__, _NAMES)

@@ -63,9 +63,8 @@ class Board:
 
     @cached_property
     def _charuco(self) -> cv2.aruco.CharucoBoard:
-        dictionary = cv2.aruco.getPredefinedDictionary(
-            getattr(cv2.aruco, f"DICT_{self.dictionary}")
-        )
+        number = getattr(cv2.aruco, f"DICT_{self.dictionary}")
+        dictionary = cv2.aruco.getPredefinedDictionary(number)
         size = (self.columns, self.rows)
         # Side of a ChArUco marker, in squares.
         return cv2.aruco.CharucoBoard(size, self.square, 0.75 * self.square, dictionary)
@@ -96,11 +95,9 @@ class Board:
         return View(pixels, points, outline, sharpness(image, pixels))
 
     def _find_checkerboard(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        found, pixels = cv2.findChessboardCornersSB(
-            image,
-            (self.columns - 1, self.rows - 1),
-            flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY,
-        )
+        size = (self.columns - 1, self.rows - 1)
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
+        found, pixels = cv2.findChessboardCornersSB(image, size, flags=flags)
         if not found:
             return _NOTHING
         return self._refined(image, pixels), self.corners
@@ -140,5 +137,4 @@ def sharpness(image: UInt8[np.ndarray, "h w"], pixels: Float32[np.ndarray, "k 2"
     window = np.ones((_AROUND, _AROUND), np.uint8)
     contrast = cv2.dilate(image, window).astype(np.float32) - cv2.erode(image, window)
     x, y = np.clip(np.rint(pixels).astype(int), 0, np.array(image.shape[::-1]) - 1).T
-    steepest = cv2.dilate(slope, window)[y, x]
-    return float(np.median(steepest / np.maximum(contrast[y, x], 1.0)))
+    return float(np.median(cv2.dilate(slope, window)[y, x] / np.maximum(contrast[y, x], 1.0)))

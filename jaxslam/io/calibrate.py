@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from jaxslam._runtime.files import write_atomically
+from jaxslam._runtime.files import Json, write_atomically
 from jaxslam.io.board import Board, View
-from jaxslam.io.calibration import Calibration, write_calibration
+from jaxslam.io.calibration import INTRINSICS, Calibration, write_calibration
 from jaxslam.io.opening import open_recording
 from jaxslam.io.recording import Recording
 
@@ -140,14 +140,11 @@ def drawn_coverage(calibrated: Calibrated) -> UInt8[np.ndarray, "h w 3"]:
     camera = calibrated.calibration
     cells = np.where(covered(calibrated.views, camera), 255, 150).astype(np.uint8)
     size = (camera.width, camera.height)
-    image = cv2.cvtColor(
-        cv2.resize(cells, size, interpolation=cv2.INTER_NEAREST), cv2.COLOR_GRAY2BGR
-    )
+    grey = cv2.resize(cells, size, interpolation=cv2.INTER_NEAREST)
+    image = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
     hues = np.linspace(0, 179, len(calibrated.views), endpoint=False)
-    colours = cv2.cvtColor(
-        np.stack([hues, 0 * hues + 255, 0 * hues + 170], 1).astype(np.uint8)[None],
-        cv2.COLOR_HSV2BGR,
-    )[0]
+    hsv = np.stack([hues, 0 * hues + 255, 0 * hues + 170], 1).astype(np.uint8)
+    colours = cv2.cvtColor(hsv[None], cv2.COLOR_HSV2BGR)[0]
     for view, colour in zip(calibrated.views, colours.tolist(), strict=True):
         for x, y in np.rint(view.pixels).astype(int).tolist():
             cv2.circle(image, (x, y), max(2, camera.width // 320), colour, -1, cv2.LINE_AA)
@@ -158,15 +155,10 @@ def write(calibrated: Calibrated, board: Board, out: str | Path) -> None:
     """`calibration.json`, with σ and reprojection error, and `coverage.png`, into a folder."""
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    write_calibration(
-        out / "calibration.json",
-        calibrated.calibration,
-        sigma={"distortion": list(calibrated.distortion_sigma)},
-        reprojection_rms=calibrated.rms,
-        views=len(calibrated.views),
-        coverage=calibrated.coverage,
-        board=asdict(board),
-    )
+    told: dict[str, Json] = {"sigma": {"distortion": list(calibrated.distortion_sigma)}}
+    told |= {"reprojection_rms": calibrated.rms, "views": len(calibrated.views)}
+    told |= {"coverage": calibrated.coverage, "board": asdict(board)}
+    write_calibration(out / "calibration.json", calibrated.calibration, **told)
     with write_atomically(out / "coverage.png") as path:
         cv2.imwrite(str(path), drawn_coverage(calibrated))
 
@@ -174,11 +166,9 @@ def write(calibrated: Calibrated, board: Board, out: str | Path) -> None:
 def describe(calibrated: Calibrated) -> str:
     """The calibration in a few lines."""
     camera = calibrated.calibration
-    numbers = zip(("fx", "fy", "cx", "cy"), camera.sigma, strict=True)
-    return "\n".join(
-        [
-            ", ".join(f"{key} {getattr(camera, key):.2f} ± {sigma:.2f}" for key, sigma in numbers),
-            f"{len(calibrated.views)} views, reprojection error {calibrated.rms:.3f} px (RMS), "
-            f"corners in {calibrated.coverage:.0%} of the picture",
-        ]
+    numbers = zip(INTRINSICS, camera.sigma, strict=True)
+    told = ", ".join(f"{key} {getattr(camera, key):.2f} ± {sigma:.2f}" for key, sigma in numbers)
+    return (
+        f"{told}\n{len(calibrated.views)} views, reprojection error {calibrated.rms:.3f} px (RMS), "
+        f"corners in {calibrated.coverage:.0%} of the picture"
     )

@@ -1,6 +1,5 @@
 """A camera's calibration: pinhole with OpenCV's distortion, and the JSON file that holds it."""
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -9,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam._runtime.files import Json, read_json, write_atomically
+from jaxslam._runtime.files import Json, read_json, write_json
 
 MODEL = "pinhole"
 INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -50,7 +49,7 @@ class Calibration:
             if value != int(value):
                 raise ValueError(f"{key} must be a whole number of pixels, not {value}")
             object.__setattr__(self, key, int(value))
-        for key in ("fx", "fy", "cx", "cy"):
+        for key in INTRINSICS:
             object.__setattr__(self, key, float(getattr(self, key)))
         for key in ("width", "height", "fx", "fy"):
             if getattr(self, key) <= 0:
@@ -72,16 +71,10 @@ class Calibration:
             if pixels < 1:
                 raise ValueError(f"{name} would be {pixels}; it must be at least one pixel")
         x, y = width / self.width, height / self.height
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fx=x * self.fx,
-            fy=y * self.fy,
-            cx=x * (self.cx + 0.5) - 0.5,
-            cy=y * (self.cy + 0.5) - 0.5,
-            sigma=tuple(s * sigma for s, sigma in zip((x, y, x, y), self.sigma, strict=False)),
-        )
+        fx, fy = x * self.fx, y * self.fy
+        cx, cy = x * (self.cx + 0.5) - 0.5, y * (self.cy + 0.5) - 0.5
+        sigma = tuple(s * sigma for s, sigma in zip((x, y, x, y), self.sigma, strict=False))
+        return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, sigma=sigma)
 
 
 def from_field_of_view(width: int, height: int, degrees: float | None = None) -> Calibration:
@@ -119,9 +112,7 @@ def write_calibration(path: str | Path, calibration: Calibration, **further: Jso
     fields = as_fields(calibration)
     for key, value in further.items():
         fields[key] = {**fields[key], **value} if key in fields else value
-    text = json.dumps(fields, indent=1, allow_nan=False) + "\n"
-    with write_atomically(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_json(path, fields, allow_nan=False)
 
 
 def as_fields(calibration: Calibration) -> dict[str, Json]:
@@ -138,21 +129,16 @@ def from_fields(fields: object) -> Calibration:
     """
     if not isinstance(fields, dict):
         raise ValueError(f"expected a JSON object, not a {type(fields).__name__}")
-    model = fields.get("model", MODEL)
-    if model != MODEL:
+    if (model := fields.get("model", MODEL)) != MODEL:
         raise ValueError(f"unknown camera model {model!r}; expected {MODEL!r}")
-    missing = [key for key in _KEYS if key not in fields]
-    if missing:
+    if missing := [key for key in _KEYS if key not in fields]:
         raise ValueError(f"missing {', '.join(missing)}; {', '.join(_KEYS)} are needed")
     distortion = fields.get("distortion", [])
     if not isinstance(distortion, list):
         raise ValueError("distortion must be a list of OpenCV's k1, k2, p1, p2, k3")
-    return Calibration(
-        **{key: fields[key] for key in _KEYS},
-        distortion=tuple(distortion),
-        sigma=_sigma_from(fields.get("sigma", {})),
-        guessed=fields.get("guessed") is True,
-    )
+    numbers, sigma = {key: fields[key] for key in _KEYS}, _sigma_from(fields.get("sigma", {}))
+    guessed = fields.get("guessed") is True
+    return Calibration(**numbers, distortion=tuple(distortion), sigma=sigma, guessed=guessed)
 
 
 def _sigma_from(sigma: object) -> tuple[float, ...]:

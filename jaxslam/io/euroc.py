@@ -53,20 +53,16 @@ def read_sensor(path: Path) -> Calibration:
             raise ValueError(f"{path}: unknown {key} {found[1]!r}; expected {expected!r}")
     width, height = _numbers(path, text, "resolution", 2)
     try:
-        return Calibration(
-            int(width),
-            int(height),
-            *_numbers(path, text, "intrinsics", 4),
-            distortion=tuple(_numbers(path, text, "distortion_coefficients", 4)),
-        )
+        size, lens = (int(width), int(height)), _numbers(path, text, "intrinsics", 4)
+        distortion = tuple(_numbers(path, text, "distortion_coefficients", 4))
+        return Calibration(*size, *lens, distortion=distortion)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
 def _camera_truth(truth: Path, yaml: Path) -> Trajectory:
     """`T_WS = T_WB T_BS`, of rows `ns, px, py, pz, qw, qx, qy, qz`."""
-    text = "\n".join(text_lines(yaml).values())
-    T_BS = np.reshape(_numbers(yaml, text, "data", 16), (4, 4))
+    T_BS = np.reshape(_numbers(yaml, "\n".join(text_lines(yaml).values()), "data", 16), (4, 4))
     check_rigid(yaml, T_BS[None])
     columns = "eight finite numbers ns px py pz qw qx qy qz"
     table = read_table(truth, "truth", "poses", columns, 8, spare=True).rows
@@ -81,8 +77,7 @@ def _camera_truth(truth: Path, yaml: Path) -> Trajectory:
 def _numbers(path: Path, text: str, key: str, count: int) -> Float[np.ndarray, " n"]:
     """The list of numbers `key: [1, 2, …]`, over as many lines as it takes."""
     found = re.search(rf"^{key}:\s*\[([^\]]*)\]", text, re.MULTILINE)
-    words = found[1].split(",") if found else []
-    told = numbers(words, count)
+    told = numbers(found[1].split(",") if found else [], count)
     if told is None:
         raise ValueError(f"{path}: {key}: [{count} finite numbers] is missing")
     return np.array(told)

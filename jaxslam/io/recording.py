@@ -107,11 +107,7 @@ def decoded(place: Path | str, data: np.ndarray) -> Image:
 
 def image_files(path: Path) -> list[Path]:
     """The images in a folder, numbers in their names compared as numbers (2 before 10)."""
-    files = [
-        file
-        for file in path.iterdir()
-        if file.suffix.lower() in IMAGE_TYPES and not file.name.startswith(".")
-    ]
+    files = [x for x in path.iterdir() if x.suffix.lower() in IMAGE_TYPES and x.name[0] != "."]
     return sorted(files, key=lambda file: _natural(file.name))
 
 

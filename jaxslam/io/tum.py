@@ -94,8 +94,7 @@ def not_rigid(T: Float[np.ndarray, "*k d d"], tolerance: float) -> Bool[np.ndarr
     with np.errstate(over="ignore", invalid="ignore"):
         skewed = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(n)).max(axis=(-2, -1))
         turned_over = ~(np.linalg.det(R) > 0)
-    last = (T[..., n, :] != np.eye(n + 1)[n]).any(axis=-1)
-    return ~(skewed <= tolerance) | turned_over | last
+    return ~(skewed <= tolerance) | turned_over | (T[..., n, :] != np.eye(n + 1)[n]).any(axis=-1)
 
 
 def text_lines(path: str | Path, what: str = "file", *, comments: bool = False) -> dict[int, str]:

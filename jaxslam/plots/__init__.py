@@ -1,18 +1,17 @@
 """Figures, drawn by matplotlib without its global state."""
 
+from itertools import chain
+
 from jaxslam._runtime import exported
 
-_MODULES = {
-    "plot_consistency": "consistency",
-    "plot_evaluation": "evaluation",
-    "plot_triangulation": "triangulation",
-    "plot_world": "world",
-    "draw_ellipses": "landmarks",
-    "COLOURS": "style",
-    "GREY": "style",
-    "line_style": "style",
-    "new_figure": "style",
+_NAMES = {
+    "consistency": ("plot_consistency",),
+    "evaluation": ("plot_evaluation",),
+    "triangulation": ("plot_triangulation",),
+    "world": ("plot_world",),
+    "landmarks": ("draw_ellipses",),
+    "style": ("COLOURS", "GREY", "line_style", "new_figure"),
 }
 """Where each name is that is imported only when it is asked for."""
-__all__ = [*_MODULES]
-__getattr__ = exported(__name__, _MODULES)
+__all__ = [*chain(*_NAMES.values())]
+__getattr__ = exported(__name__, _NAMES)

@@ -35,10 +35,6 @@ from jaxslam.plots.style import (
 )
 from jaxslam.statistics.verdict import brief, headline
 
-_MEDIAN_OF_NORMAL = 0.6745
-"""Median of |x| for a standard normal x."""
-
-
 Drawn = Study | Results | Mapping[str, Json]
 """What is drawn: a study, its results, or the summary that `consistency.json` holds."""
 
@@ -168,8 +164,7 @@ def _plot_pairs(
         ax.plot(time, values, lw=1.8, **style)
         ax.plot(time, others, color=style["color"], **{"ls": style["linestyle"], **second})
         lines.append(End(called[name], time, values, style["color"]))
-    ax.set_xlim(0, time[-1])
-    ax.set_xlabel("time, s")
+    ax.set(xlim=(0, time[-1]), xlabel="time, s")
     ax.grid(alpha=0.25, which="major")
     return lines
 
@@ -180,14 +175,11 @@ def plot_outside(summary: Drawn, *, ax: Axes, label: Labels | None = None) -> Ax
     Names stand at the ends of the position's lines; a filter may be called otherwise by `label`.
     """
     results = results_of(summary)
-    percent = {
-        name: [100 * r.outside3sigma.position, 100 * r.outside3sigma.orientation]
-        for name, r in results.items()
-    }
+    outside = {name: result.outside3sigma for name, result in results.items()}
+    percent = {name: [100 * x.position, 100 * x.orientation] for name, x in outside.items()}
     lines = _plot_pairs(percent, results, ax, label, lw=0.8)
     ax.axhline(100 * OUTSIDE, color=GREY, lw=0.8)
-    ax.set_ylim(0, max(1.0, ax.get_ylim()[1]))
-    ax.set_ylabel("% of errors")
+    ax.set(ylim=(0, max(1.0, ax.get_ylim()[1])), ylabel="% of errors")
     set_title(ax, "outside ±3σ: position, orientation (thin)\ngrey: 0.27 % of Gaussian errors")
     label_ends(ax, lines)
     return ax
@@ -221,10 +213,9 @@ def plot_log_scale(summary: Drawn, *, ax: Axes, label: Labels | None = None) -> 
     Where the scale is free; names at the ends of the lines, or those of `label`.
     """
     results = _with_scale(summary)
-    pairs = {
-        name: (r.log_scale.error_median, _MEDIAN_OF_NORMAL * r.log_scale.sigma_median)
-        for name, r in results.items()
-    }
+    # 0.6745 is the median of |x| for a standard normal x.
+    scales = {name: result.log_scale for name, result in results.items()}
+    pairs = {name: (x.error_median, 0.6745 * x.sigma_median) for name, x in scales.items()}
     lines = _plot_pairs(pairs, results, ax, label, lw=0.9, ls=(0, (4, 2)))
     if results.reference.survivors:
         ax.set_yscale("log")
@@ -260,14 +251,12 @@ def _plot_errors(
         scale = 1.0 if position else 180 / np.pi
         for i, records in enumerate(samples.values()):
             style = line_style(i)
-            error = records["error"][0, :, axis] * scale
             bound = 3 * np.sqrt(records["variance"][0, :, axis]) * scale
             ax.fill_between(time, -bound, bound, color=style["color"], alpha=0.12, lw=0)
             ax.plot(time, bound, time, -bound, lw=0.8, alpha=0.8, **style)
-            ax.plot(time, error, lw=1.5, **style)
+            ax.plot(time, records["error"][0, :, axis] * scale, lw=1.5, **style)
         set_title(ax, f"run 0: {label} with ±3σ")
-        ax.set_ylabel("m" if position else "degrees")
-        ax.set_xlim(0, time[-1])
+        ax.set(ylabel="m" if position else "degrees", xlim=(0, time[-1]))
         ax.grid(alpha=0.25)
         if axis >= len(axes) - 3:
             ax.set_xlabel("time, s")
@@ -285,13 +274,11 @@ def _plot_map(axes: Axes, samples: Mapping[str, Mapping[str, np.ndarray]]) -> No
         path = records["sample_path"][:, :-1, -1]
         axes.plot(path[:, 0], path[:, -1], lw=1.5, **style)
         for slot in records["sample_active"].nonzero()[0]:
-            region = region_from_above(
-                records["sample_landmarks"][slot], records["sample_landmarks_covariance"][slot]
-            )
+            covariance = records["sample_landmarks_covariance"][slot]
+            region = region_from_above(records["sample_landmarks"][slot], covariance)
             axes.plot(*(path[-1, [0, -1], None] + region), lw=0.8, alpha=0.8, **style)
     _set_view(axes, truth[:, [0, -1]], points[seen][:, [0, -1]])
-    axes.set_xlabel("x, m")
-    axes.set_ylabel("z, m")
+    axes.set(xlabel="x, m", ylabel="z, m")
     # Said in the title: a legend would hide landmarks and ticks of a narrow map.
     axes.set_title("run 0 from above,\n95 % regions\nblack: the truth", fontsize=9)
     axes.grid(alpha=0.25)
@@ -301,8 +288,7 @@ def _set_view(axes: Axes, path: np.ndarray, points: np.ndarray) -> None:
     """Show the path and the landmarks, but none of the very far ones."""
     distance = np.linalg.norm(points - path.mean(axis=0), axis=1)
     near = np.concatenate([path, points[distance <= 2.5 * np.median(distance)]])
-    low, high = near.min(axis=0), near.max(axis=0)
-    margin = 0.12 * (high - low).max()
-    axes.set_xlim(low[0] - margin, high[0] + margin)
-    axes.set_ylim(low[1] - margin, high[1] + margin)
+    margin = 0.12 * np.ptp(near, axis=0).max()
+    x, y = np.stack([near.min(axis=0) - margin, near.max(axis=0) + margin], axis=1)
+    axes.set(xlim=x, ylim=y)
     axes.set_aspect("equal", adjustable="box")

@@ -61,18 +61,17 @@ def _page(evaluation: Evaluation) -> Figure:
     panels = axes + (evaluation.scale is not None)
     rows = -(-panels // _PER_ROW)
     figure = new_figure(11.5, 3.9 + 1.9 * rows)
-    figure.suptitle(
-        evaluation.headline.replace("; ", "\n"), x=0.01, ha="left", fontsize=12, weight="bold"
-    )
+    title = evaluation.headline.replace("; ", "\n")
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12, weight="bold")
     grid = figure.add_gridspec(1 + rows, _PER_ROW, height_ratios=[1.6, *[1] * rows])
     plot_nees(evaluation, ax=figure.add_subplot(grid[0, :2]))
     plot_outside(evaluation, ax=figure.add_subplot(grid[0, 2]))
-    for axis in range(axes):
-        place = grid[1 + axis // _PER_ROW, axis % _PER_ROW]
-        plot_axis(evaluation, axis, ax=figure.add_subplot(place))
-    if evaluation.scale is not None:
-        place = grid[1 + axes // _PER_ROW, axes % _PER_ROW]
-        plot_scale(evaluation, ax=figure.add_subplot(place))
+    for panel in range(panels):
+        ax = figure.add_subplot(grid[1 + panel // _PER_ROW, panel % _PER_ROW])
+        if panel < axes:
+            plot_axis(evaluation, panel, ax=ax)
+        else:
+            plot_scale(evaluation, ax=ax)
     return figure
 
 
@@ -95,8 +94,8 @@ def plot_nees(
     ax.set_ylim(min(bottom, evaluation.dof / 2), max(top, evaluation.dof * 2))
     name_numbers(ax.yaxis)
     ax.set_ylabel(f"mean {evaluation.quantity} (ideal {evaluation.expected})")
-    told = f"{evaluation.quantity} of {_runs(evaluation)}\ngrey: exact 95 % band of one step"
-    set_title(ax, told)
+    runs = _runs(evaluation)
+    set_title(ax, f"{evaluation.quantity} of {runs}\ngrey: exact 95 % band of one step")
     return _over_time(evaluation, ax)
 
 
@@ -131,8 +130,7 @@ def plot_outside(evaluation: Evaluation, *, ax: Axes, label: str | None = None) 
     ax.axvline(100 * OUTSIDE, color=GREY, lw=1.2)
     ax.set_yticks(places, evaluation.names[:_WIDEST])
     ax.invert_yaxis()
-    ax.set_xlim(0, max(1.25 * shares.max(), 1.0))
-    ax.set_xlabel("% of errors")
+    ax.set(xlim=(0, max(1.25 * shares.max(), 1.0)), xlabel="% of errors")
     set_title(ax, "outside ±3σ\ngrey line: 0.27 % of Gaussian errors")
     return ax
 

@@ -9,6 +9,13 @@ from matplotlib.collections import EllipseCollection
 
 from jaxslam.statistics.bands import chi2_quantile
 
+Positions = Float[np.ndarray, "n 3"]
+"""Points of the world."""
+Spreads = Float[np.ndarray, "n 3 3"]
+"""Their covariances."""
+Ellipses = Float[np.ndarray, "n 2 2"]
+"""Covariances of points of a plane."""
+
 
 def region_from_above(
     mean: Float[np.ndarray, " 2"], covariance: Float[np.ndarray, "2 2"], share: float = 0.95
@@ -28,11 +35,7 @@ def region_from_above(
 
 
 def draw_ellipses(
-    axes: Axes,
-    centres: Float[np.ndarray, "n 2"],
-    covariances: Float[np.ndarray, "n 2 2"],
-    sigmas: float,
-    colour: str,
+    axes: Axes, centres: Float[np.ndarray, "n 2"], covariances: Ellipses, sigmas: float, colour: str
 ) -> None:
     """The ellipses of Gaussians in the plane, so many standard deviations from their centres."""
     variances, vectors = np.linalg.eigh(covariances)

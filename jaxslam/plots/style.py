@@ -37,8 +37,6 @@ MEDIAN_DASH = (0, (1, 2))
 _POWERS = range(-9, 13)
 _DIGITS = ((4, (1, 1.5, 2, 3, 4, 5, 7)), (20, (1, 2, 3, 5)), (500, (1, 2, 5)), (np.inf, (1,)))
 """Of the numbers named on an axis whose ends differ by a factor of so much at the most."""
-_BELOW = -0.42
-"""Inches from the axes to what stands below the numbers and the name of x."""
 
 
 class _Shown(Figure):
@@ -123,8 +121,7 @@ class End(NamedTuple):
 
 def label_end(axes: Axes, end: End) -> None:
     """Write a line's name where it ends, whatever the limits of the axes become."""
-    last = np.flatnonzero(np.isfinite(end.y))[-1:]
-    for i in last:
+    for i in np.flatnonzero(np.isfinite(end.y))[-1:]:
         axes.annotate(
             end.label, (end.x[i], end.y[i]), (4, 0), textcoords="offset points", va="center",
             color=end.colour, fontsize=LETTERS, annotation_clip=False,
@@ -145,7 +142,8 @@ def label_ends(axes: Axes, ends: Sequence[End]) -> None:
     # The share of a figure's width that names at lines may take.
     if longest * 0.55 * LETTERS / 72 > 0.3 * room:
         lines = [Line2D([], [], color=end.colour, lw=1.8) for end in ends]
-        below = offset_copy(axes.transAxes, axes.get_figure(root=True), y=_BELOW, units="inches")
+        # Inches from the axes to what stands below the numbers and the name of x.
+        below = offset_copy(axes.transAxes, axes.get_figure(root=True), y=-0.42, units="inches")
         axes.legend(
             lines, [end.label for end in ends], loc="upper left", bbox_to_anchor=(0, 0),
             bbox_transform=below, labelcolor="linecolor", fontsize=LETTERS, frameon=False,

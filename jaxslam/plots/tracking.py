@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from jaxslam.plots.landmarks import draw_ellipses
+from jaxslam.plots.landmarks import Ellipses, Positions, Spreads, draw_ellipses
 from jaxslam.plots.style import COLOURS, GREY, new_figure, save
 
 _TRAJECTORY, _REFERENCE, _LANDMARKS, _BEGUN, _LOOPS = COLOURS[:5]
@@ -47,8 +47,8 @@ class _Panel:
         return min(max(_WIDTH * up / across, _LEAST_HEIGHT), _HEIGHT)
 
     def seen(
-        self, points: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
-    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
+        self, points: Positions, covariances: Spreads
+    ) -> tuple[Float[np.ndarray, "n 2"], Ellipses]:
         """The points that are seen from here."""
         return points[:, self.plane], covariances[:, self.plane][:, :, self.plane]
 
@@ -127,8 +127,7 @@ def _lines(
     positions = poses[:, :3, 3]
 
     def broken(hidden: np.ndarray) -> np.ndarray:
-        shown = np.where(hidden[:, None], np.nan, positions)
-        return np.insert(shown, begun, np.nan, axis=0)
+        return np.insert(np.where(hidden[:, None], np.nan, positions), begun, np.nan, axis=0)
 
     lines = [("estimate", broken(lost), _TRAJECTORY, "-")]
     if lost.any():
@@ -185,7 +184,7 @@ def _counts(inside: np.ndarray, hidden: int) -> str:
     return text + (f", {hidden} without ellipse" if hidden else "")
 
 
-def _view(lines: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m 3"]) -> _Box:
+def _view(lines: Positions, points: Float[np.ndarray, "m 3"]) -> _Box:
     """The box around the trajectories and the landmarks that are not absurdly far, with margin.
 
     Far: beyond five times the interquartile range from the quartiles, along any axis.
@@ -205,12 +204,7 @@ def _view(lines: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m 3"]) -> 
     return low - margin, high + margin
 
 
-def _draw_landmarks(
-    axis: Axes,
-    panel: _Panel,
-    points: Float[np.ndarray, "n 3"],
-    covariances: Float[np.ndarray, "n 3 3"],
-) -> int:
+def _draw_landmarks(axis: Axes, panel: _Panel, points: Positions, covariances: Spreads) -> int:
     """Draw points and their 95 % ellipses; return how many ellipses were too large to draw."""
     if not len(points):
         return 0
@@ -228,14 +222,8 @@ def _draw_loops(axis: Axes, panel: _Panel, loops: Float[np.ndarray, "l 2 3"]) ->
         axis.plot(*ends.T, "s-", color=_LOOPS, ms=2.5, lw=1.0, label=label, zorder=3)
 
 
-def _draw_begun(
-    axis: Axes,
-    panel: _Panel,
-    places: Float[np.ndarray, "k 3"],
-    covariances: Float[np.ndarray, "k 3 3"],
-) -> None:
+def _draw_begun(axis: Axes, panel: _Panel, places: Positions, covariances: Spreads) -> None:
     """Mark where maps begin, and where in the world that can be."""
     places, covariances = panel.seen(places, covariances)
     draw_ellipses(axis, places, covariances, _SIGMAS_95, _BEGUN)
-    label = "a map begins, 95 % of where"
-    axis.plot(*places.T, "D", color=_BEGUN, ms=6, mfc="white", label=label)
+    axis.plot(*places.T, "D", color=_BEGUN, ms=6, mfc="white", label="a map begins, 95 % of where")

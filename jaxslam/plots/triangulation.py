@@ -33,8 +33,7 @@ def plot_triangulation(comparison: Comparison, path: str | Path | None = None) -
     """
     views = comparison.views
     distributions = {**comparison.truth, **comparison.estimates}
-    z = {name: of.z for name, of in distributions.items()}
-    low, high = _limits(distributions, z)
+    low, high = _limits(distributions, {name: of.z for name, of in distributions.items()})
     depths = max(low, -views.depth), min(high, 4 * views.depth)
     styles: dict[str, LineStyle] = {
         _TRUTH: {"color": GREY, "linestyle": "-"},

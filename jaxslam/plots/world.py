@@ -30,9 +30,8 @@ def plot_world(
     ax = new_figure(5.5, 5.5).subplots() if ax is None else ax
     ax.plot(*track.T, color="black", lw=1.2, label="true path")
     ax.plot(*track[0], "o", color="black", ms=4)
-    never = points[0][~visible.any(axis=0)]
     for places, label, marker, colour, fill in (
-        (never, "never measured", "x", GREY, GREY),
+        (points[0][~visible.any(axis=0)], "never measured", "x", GREY, GREY),
         (seen, "measured", "o", COLOURS[0], "none"),
         (now, "measured in the last frame", "o", COLOURS[0], COLOURS[0]),
         (beacons, "beacon, as surveyed", "s", COLOURS[1], "none"),

@@ -31,8 +31,7 @@ def as_data(world: World, dtype: DTypeLike | None = None) -> World:
     if isinstance(world.rate, jax.Array):
         return world
     dtype = dtype or jnp.result_type(float)
-    trajectory = trajectory_of(world)
-    unnamed = replace(world, name="", treatment="known", trajectory=trajectory)
+    unnamed = replace(world, name="", treatment="known", trajectory=trajectory_of(world))
 
     def number(leaf: Any) -> Any:
         return jnp.asarray(leaf, dtype) if isinstance(leaf, float | int) else leaf

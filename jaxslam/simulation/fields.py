@@ -86,9 +86,8 @@ def coerced(field: str, value: Value, like: Value) -> Value:
     check(isinstance(value, int | float) and not isinstance(value, bool), "a number")
     whole = f"a number up to {LARGEST_WHOLE}"
     check(isinstance(value, float) or abs(value) <= LARGEST_WHOLE, whole)
-    check(
-        isinstance(like, float) or (math.isfinite(value) and value == int(value)), "a whole number"
-    )
+    right = isinstance(like, float) or (math.isfinite(value) and value == int(value))
+    check(right, "a whole number")
     return type(like)(value)
 
 
@@ -118,6 +117,5 @@ def check_signs(piece: object, word: str) -> None:
     """Raise ValueError unless the fields of a piece are finite and of the signs of the table."""
     for field, place in PLACES[word].items():
         if "." not in place:
-            check_numbers(
-                f"{place} of {type(piece).__name__}", getattr(piece, place), FIELDS[field].least
-            )
+            what = f"{place} of {type(piece).__name__}"
+            check_numbers(what, getattr(piece, place), FIELDS[field].least)

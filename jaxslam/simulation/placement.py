@@ -56,14 +56,10 @@ class FromPrior(AbstractPlacement):
 
 def _check_intervals(first: Float[AnyArray, "p 2"], sensor: AbstractSensor) -> None:
     if len(first) != sensor.size:
+        world = (PLANAR if sensor.point_dim == PLANAR.point_dim else SPATIAL).name
         raise ValueError(
-            f"first_pixels needs {sensor.size} values in a {_world_of(sensor)} world, "
-            f"not {len(first)}"
+            f"first_pixels needs {sensor.size} values in a {world} world, not {len(first)}"
         )
-
-
-def _world_of(sensor: AbstractSensor) -> str:
-    return (PLANAR if sensor.point_dim == PLANAR.point_dim else SPATIAL).name
 
 
 def _uniform(intervals: Float[AnyArray, "p 2"], count: int, key: Array) -> Float[Array, "l p"]:
@@ -219,8 +215,7 @@ class Rays(AbstractPlacement):
 
         frames = world.steps + 1
         keys, is_first = jax.random.split(key, frames), jnp.arange(frames) == 0
-        dtype = jnp.result_type(world.rate)
-        nowhere = jnp.ones((self.landmarks, world.geometry.point_dim), dtype)
+        nowhere = jnp.ones((self.landmarks, world.geometry.point_dim), jnp.result_type(world.rate))
         return jax.lax.scan(frame, nowhere, (keys, poses, sensors, is_first))[1]
 
     def _thrown(self, key: Array, sensor: AbstractSensor) -> Float[Array, "l n"]:

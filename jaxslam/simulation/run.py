@@ -96,11 +96,8 @@ def features(run: Run, capacity: Room) -> tuple[Features, Features, Features]:
     known, new = _known_and_new(run)
     first = _picked(new[0], run.measured[0], capacity.first)
     pick = jax.vmap(_picked, in_axes=(0, 0, None))
-    return (
-        first,
-        pick(known[1:], run.measured[1:], capacity.known),
-        pick(new[1:], run.measured[1:], capacity.new),
-    )
+    again = pick(known[1:], run.measured[1:], capacity.known)
+    return first, again, pick(new[1:], run.measured[1:], capacity.new)
 
 
 def gone(run: Run, capacity: Room) -> Bool[Array, "steps slots"] | None:
@@ -130,19 +127,14 @@ def in_order_of_appearance(run: Run) -> Run:
     """Landmarks that are never seen come last, so that a filter needs no slots for them, and those
     that are known before frame 0 first."""
     never = run.visible.shape[0]
-    seen = jnp.any(run.visible, axis=0)
-    first = jnp.where(seen, jnp.argmax(run.visible, axis=0), never)
+    first = jnp.where(jnp.any(run.visible, axis=0), jnp.argmax(run.visible, axis=0), never)
     order = jnp.argsort(jnp.where(run.beacons, -1, first), stable=True)
     known = run.known
     if known is not None:
         known = replace(known, slots=jnp.argsort(order)[known.slots])
-    return replace(
-        run,
-        known=known,
-        points=run.points[order],
-        measured=run.measured[:, order],
-        visible=run.visible[:, order],
-    )
+    measured, visible = run.measured[:, order], run.visible[:, order]
+    points = run.points[order]
+    return replace(run, known=known, points=points, measured=measured, visible=visible)
 
 
 def in_shared_slots(run: Run, count: int) -> Run:
@@ -162,12 +154,6 @@ def in_shared_slots(run: Run, count: int) -> Run:
         return held, (held, comes)
 
     _, (held, new) = jax.lax.scan(frame, none, run.visible)
-    pick = jax.vmap(lambda values, held: values[held])
-    return replace(
-        run,
-        points=run.points[held],
-        measured=pick(run.measured, held),
-        visible=held >= 0,
-        new=new,
-        identity=held,
-    )
+    measured = jax.vmap(lambda values, held: values[held])(run.measured, held)
+    run = replace(run, points=run.points[held], measured=measured, visible=held >= 0)
+    return replace(run, new=new, identity=held)

@@ -102,8 +102,7 @@ def _named(name: str) -> dict[str, Value] | None:
     if name.startswith(HANDHELD):
         trajectory = name.removeprefix(HANDHELD)
         find(trajectory)  # or say now what is known
-        fields = _FIELDS.get(name, _FIELDS["handheld"])
-        return fields | {"name": name, "trajectory": trajectory}
+        return _FIELDS.get(name, _FIELDS["handheld"]) | {"name": name, "trajectory": trajectory}
     return _FIELDS.get(name)
 
 

@@ -39,8 +39,7 @@ class RecordedMotion(eqx.Module):
     def run(self, key: Array) -> Pose:
         """`T_C0,Ck` of frames 0 to `steps`, from a start drawn at random."""
         start = jnp.asarray(self.starts)[jax.random.randint(key, (), 0, self.starts.size)]
-        frames = start + jnp.arange(self.steps + 1)
-        T_WC = jaxlie.SE3(jnp.asarray(self.poses)[frames])
+        T_WC = jaxlie.SE3(jnp.asarray(self.poses)[start + jnp.arange(self.steps + 1)])
         origin = jaxlie.SE3(T_WC.wxyz_xyz[0]).inverse()
         return jax.vmap(lambda T: (origin @ T).normalize())(T_WC)
 
@@ -80,9 +79,8 @@ def _sampled(path: Path, rate: float, steps: int, version: tuple[int, ...]) -> R
     del version
     pieces = [_evenly(*piece, rate) for piece in _without_gaps(*read_tum(path))]
     ends = np.cumsum([len(piece) for piece in pieces])
-    starts = [
-        np.arange(end - len(piece), end - steps) for piece, end in zip(pieces, ends, strict=True)
-    ]
+    pairs = zip(pieces, ends, strict=True)
+    starts = [np.arange(end - len(piece), end - steps) for piece, end in pairs]
     starts = np.concatenate([np.zeros(0, int), *starts])
     if not starts.size:
         longest = max((len(piece) for piece in pieces), default=0) / rate
@@ -102,8 +100,7 @@ def _without_gaps(times: Float[np.ndarray, " n"], T: Float[np.ndarray, "n 4 4"])
         if part.size >= LEAST:
             # Neighbours have quaternions of one sign, of the two that say the same.
             turns = quaternions(T[part, :3, :3])
-            flips = np.cumprod(np.sign(np.sum(turns[1:] * turns[:-1], axis=1)))
-            turns[1:] *= flips[:, None]
+            turns[1:] *= np.cumprod(np.sign(np.sum(turns[1:] * turns[:-1], axis=1)))[:, None]
             yield times[part], np.hstack([T[part, :3, 3], turns])
 
 

@@ -11,10 +11,18 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 import scipy  # of which `special` is imported when it is first used
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxslam._numerics.arrays import AnyArray
 from jaxslam.linalg import cholesky
+
+PerStep = Float[np.ndarray, "runs steps"]
+"""One number for every step of every run."""
+Mask = Bool[np.ndarray, "runs steps"]
+"""Which steps of the runs are there."""
+PerAxis = Float[np.ndarray, "runs steps n"]
+"""A number for every axis of every step."""
+
 
 CONFIDENCE = 0.95
 MOST_DOF = 100
@@ -182,9 +190,7 @@ def _symmetric(t: float, k: float) -> float:
     return t + k / 6 + k * t**2 / 3 + k**2 * t**3 / 27
 
 
-def whiteness_p_value(
-    nis: Float[np.ndarray, "runs steps"], normalised: Float[np.ndarray, "runs steps n"]
-) -> float | None:
+def whiteness_p_value(nis: PerStep, normalised: PerAxis) -> float | None:
     """The p of white innovations, by their autocorrelations and those of NIS; None of too few.
 
     Of each axis, and of NIS about its mean, `Q = Σₗ rₗ² Nₗ`, the Nₗ pairs of steps l apart having

@@ -120,12 +120,8 @@ def one_scale(
         away = w * (s - best[..., None]) ** 2
         drift = np.where(there, np.log(s) - np.log(best)[..., None], np.nan)
         told = w > 0
-    return OneScale(
-        own + np.where(told, away, 0.0),
-        np.log(best),
-        np.where(there & told, drift, np.nan),
-        np.where(there & told, away, np.nan),
-    )
+    drift, normalised = (np.where(there & told, x, np.nan) for x in (drift, away))
+    return OneScale(own + np.where(told, away, 0.0), np.log(best), drift, normalised)
 
 
 def one_scale_of(records: Mapping[str, np.ndarray]) -> OneScale:

@@ -201,19 +201,15 @@ class Look:
             return "over-confident" if low > 1 else "under-confident"
         if not self.right[0]:  # only over-confidence can be proven, and only it is to be excluded
             low, high = 1.0, replace(self, right=(self.right[1], self.right[1])).interval[1]
-        told = low >= TOLERANCE**-2 and high <= TOLERANCE**2
-        return "consistent" if told else "cannot tell"
+        return "consistent" if low >= TOLERANCE**-2 and high <= TOLERANCE**2 else "cannot tell"
 
     def asdict(self) -> Verdict:
         """Return the numbers as a verdict has them, of σ."""
         low, high = self.interval
-        return Verdict(
-            nees=self.sums.mean,
-            sigma_factor=math.sqrt(self.factor),
-            interval99=[_root(low, upwards=low > 1), _root(high, upwards=high > 1)],
-            p=self.p,
-            word=self.word,
-        )
+        factor = math.sqrt(self.factor)
+        ends = [_root(low, upwards=low > 1), _root(high, upwards=high > 1)]
+        own = {"nees": self.sums.mean, "sigma_factor": factor, "interval99": ends}
+        return Verdict(**own, p=self.p, word=self.word)
 
     def enough(self) -> int:
         """Estimate how many runs would show whether σ is right within `TOLERANCE`."""

@@ -7,7 +7,7 @@ from dataclasses import asdict, astuple, dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxslam.statistics.bands import PowerSums, lost_threshold, whiteness_p_value
+from jaxslam.statistics.bands import Mask, PerStep, PowerSums, lost_threshold, whiteness_p_value
 from jaxslam.statistics.looks import VERDICT_CONFIDENCE, Found, Look, Verdict
 
 LOST_BOUND = 0.01
@@ -43,12 +43,7 @@ class Tally:
     """Averages over each third of the steps, of the runs that did not diverge and have three."""
 
     @staticmethod
-    def of(
-        nees: Float[np.ndarray, "runs steps"],
-        dof: int,
-        fitted: float = 0.0,
-        logged: Bool[np.ndarray, "runs steps"] | None = None,
-    ) -> Tally:
+    def of(nees: PerStep, dof: int, fitted: float = 0.0, logged: Mask | None = None) -> Tally:
         """Return the tally of the NEES of runs, with so many degrees of freedom.
 
         Where runs are not equally long, or have gaps, `logged` says which steps of each are there:
@@ -120,8 +115,7 @@ class Tally:
                 f"runs with {self.fitted} and {other.fitted} fitted degrees of freedom cannot be "
                 "pooled"
             )
-        both = self.numbers() + other.numbers()
-        return Tally.of_numbers(both, self.dof, self.fitted)
+        return Tally.of_numbers(self.numbers() + other.numbers(), self.dof, self.fitted)
 
     def looks(self) -> list[Look]:
         """The looks at all steps, the last one and each third, which hold together with 99 %.
@@ -202,9 +196,7 @@ _NONE = Verdict(nees=None, sigma_factor=None, interval99=[None, None], p=0.0, wo
 """The verdict where there is no mean."""
 
 
-def _logged(
-    nees: Float[np.ndarray, "runs steps"], logged: Bool[np.ndarray, "runs steps"] | None
-) -> Bool[np.ndarray, "runs steps"]:
+def _logged(nees: PerStep, logged: Mask | None) -> Mask:
     """A mask of the steps that are there. Raises ValueError unless every run has one."""
     there = np.ones(nees.shape, bool) if logged is None else np.asarray(logged, bool)
     if there.shape != nees.shape or not there.any(axis=1).all():
@@ -225,13 +217,10 @@ def lost_runs(
     there = _logged(nees, logged)
     steps, which = np.unique(there.sum(axis=1), return_inverse=True)
     limits = np.array([lost_threshold(dof, int(n)) for n in steps])[which]
-    lost = (~(nees <= limits[:, None]) & there).any(axis=1)
-    return [int(run) for run in np.flatnonzero(lost)]
+    return [int(run) for run in np.flatnonzero((~(nees <= limits[:, None]) & there).any(axis=1))]
 
 
-def _thirds(
-    nees: Float[np.ndarray, "runs steps"], there: Bool[np.ndarray, "runs steps"]
-) -> tuple[PowerSums, PowerSums, PowerSums]:
+def _thirds(nees: PerStep, there: Mask) -> tuple[PowerSums, PowerSums, PowerSums]:
     """The power sums of the averages over each third of the steps that are there."""
     steps = there.sum(axis=1)
     long, place = steps >= len(THIRDS), np.cumsum(there, axis=1) - 1
@@ -397,18 +386,16 @@ def innovation_verdict(
     p = None if found["diverged"] else whiteness_p_value(nis, normalised)
     white = p is not None and p >= 1 - VERDICT_CONFIDENCE
     if white:
-        found |= _of_steps(nis, dof, found["lost_runs"]).verdict() | {
-            "lost_runs": found["lost_runs"]
-        }
+        lost = found["lost_runs"]
+        found |= _of_steps(nis, dof, lost).verdict() | {"lost_runs": lost}
     word = "outlying" if found["word"] == "lost" else found["word"]
     return found | {"word": word, "samples": "steps" if white else "runs", "white": p}
 
 
-def _of_steps(nis: Float[np.ndarray, "runs steps"], dof: int, outlying: list[int]) -> Tally:
+def _of_steps(nis: PerStep, dof: int, outlying: list[int]) -> Tally:
     """A tally to which every step is a run, but for the counts of runs."""
     there = ~np.isnan(nis)
-    steps = there.sum(axis=1, keepdims=True)
-    third = len(THIRDS) * (np.cumsum(there, axis=1) - 1) // steps
+    third = len(THIRDS) * (np.cumsum(there, axis=1) - 1) // there.sum(axis=1, keepdims=True)
     first, second, last = (PowerSums.of(nis[there & (third == i)]) for i in range(len(THIRDS)))
     kept = np.ones(len(nis), bool)
     kept[outlying] = False

@@ -1,20 +1,20 @@
 """A camera tracked through a video, and what is written of it; needs the extra `vision`."""
 
+from itertools import chain
+
 from jaxslam._runtime import exported
 
-_MODULES = {
-    "Tracked": "report",
-    "Tracker": "tracker",
-    "TrackerSettings": "settings",
-    "track": "video",
-    "describe": "summary",
-    "synthetic_source": "synthetic",
-    "read_ply": "pointcloud",
-    "read_target": "target",
-    "seen_from": "pointcloud",
-    "absolute_trajectory_error": "trajectory",
-    "relative_pose_error": "trajectory",
+_NAMES = {
+    "report": ("Tracked",),
+    "tracker": ("Tracker",),
+    "settings": ("TrackerSettings",),
+    "video": ("track",),
+    "summary": ("describe",),
+    "synthetic": ("synthetic_source",),
+    "pointcloud": ("read_ply", "seen_from"),
+    "target": ("read_target",),
+    "trajectory": ("absolute_trajectory_error", "relative_pose_error"),
 }
 """Where each name is that is imported only when it is asked for."""
-__all__ = [*_MODULES]
-__getattr__ = exported(__name__, _MODULES)
+__all__ = [*chain(*_NAMES.values())]
+__getattr__ = exported(__name__, _NAMES)

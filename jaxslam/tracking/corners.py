@@ -2,8 +2,9 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32
 
+from jaxslam.tracking.patches import Picture, Pixels, Places
 from jaxslam.tracking.settings import TrackerSettings
 
 _CELLS = (8, 6)  # columns and rows of the grid that corners are spread over
@@ -11,10 +12,8 @@ _BLOCK = 5  # side of the window that a corner's strength is summed over, in pix
 
 
 def bare_corners(
-    image: UInt8[np.ndarray, "h w"],
-    settings: TrackerSettings,
-    occupied: Float[np.ndarray, "k 2"] | None = None,
-) -> Float[np.ndarray, "n 2"]:
+    image: Picture, settings: TrackerSettings, occupied: Pixels | None = None
+) -> Places:
     """Corners where the picture is bare; for a whole map where nothing says what is `occupied`."""
     s, wanted = settings, settings.wanted
     if occupied is None:
@@ -27,12 +26,7 @@ def bare_corners(
 
 
 def detect_corners(
-    image: UInt8[np.ndarray, "h w"],
-    count: int,
-    *,
-    occupied: Float[np.ndarray, "k 2"],
-    min_distance: float,
-    border: int,
+    image: Picture, count: int, *, occupied: Pixels, min_distance: float, border: int
 ) -> Float32[np.ndarray, "n 2"]:
     """Return up to `count` new Shi-Tomasi corners (n, 2), sub-pixel, spread over the image.
 
@@ -52,15 +46,14 @@ def detect_corners(
         best = int(np.argmin(np.where(free, held[cell], np.iinfo(held.dtype).max)))
         free[best] = False
         corner = _refined(image, candidates[best : best + 1], max(border, 1))
-        others = np.concatenate([points, chosen])
-        if len(corner) and _farther(corner, others, min_distance).all():
+        if len(corner) and _farther(corner, np.concatenate([points, chosen]), min_distance).all():
             chosen = np.concatenate([chosen, corner])
             held[cell[best]] += 1
             free &= _farther(candidates, corner, min_distance)
     return chosen
 
 
-def _candidates(image: UInt8[np.ndarray, "h w"], border: int) -> Float32[np.ndarray, "n 2"]:
+def _candidates(image: Picture, border: int) -> Float32[np.ndarray, "n 2"]:
     """Whole pixels (n, 2) of corners at least `border` pixels inside, the strongest first."""
     strength = cv2.cornerMinEigenVal(image, _BLOCK)
     peaks = strength == cv2.dilate(strength, np.ones((5, 5), np.uint8))
@@ -75,7 +68,7 @@ def _candidates(image: UInt8[np.ndarray, "h w"], border: int) -> Float32[np.ndar
 
 
 def _refined(
-    image: UInt8[np.ndarray, "h w"], corners: Float32[np.ndarray, "n 2"], border: int
+    image: Picture, corners: Float32[np.ndarray, "n 2"], border: int
 ) -> Float32[np.ndarray, "m 2"]:
     """The corners sub-pixel, but for those that then are within `border` pixels of the edge."""
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 15, 0.01)
@@ -86,8 +79,7 @@ def _refined(
 
 
 def _within(points: Float32[np.ndarray, "n 2"], shape: tuple[int, ...], border: int) -> np.ndarray:
-    high = np.array(shape[1::-1]) - 1 - border
-    return np.all((points >= border) & (points <= high), axis=1)
+    return np.all((points >= border) & (points <= np.array(shape[1::-1]) - 1 - border), axis=1)
 
 
 def _farther(

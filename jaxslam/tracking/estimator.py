@@ -43,8 +43,10 @@ from jaxslam.geometry import log, scaled
 from jaxslam.models.observations import Features, Status
 from jaxslam.models.sensors import Pinhole
 from jaxslam.tracking.matching import PEAKS, Matches
-from jaxslam.tracking.observations import NOTHING, Observations, Prediction
+from jaxslam.tracking.observations import NOTHING, Observations, Prediction, Slots
+from jaxslam.tracking.patches import Pixels
 from jaxslam.tracking.places.submaps import compile_graph, in_submaps, left
+from jaxslam.tracking.pose_with_covariance import Positions, Spreads, Transform
 from jaxslam.tracking.settings import TrackerSettings
 
 _NOWHERE = np.zeros(0, int), np.zeros((0, 2))
@@ -160,9 +162,7 @@ class Estimator:
         S, residual = self._innovations(predicted, seen)
         return float(residual @ _solve(S, residual)), len(residual)
 
-    def each_given_others(
-        self, predicted: Predicted, seen: Observations
-    ) -> Float[np.ndarray, "k 2"]:
+    def each_given_others(self, predicted: Predicted, seen: Observations) -> Pixels:
         """Return the innovation of each that was seen given those of all others, whitened:
         `L⁻¹ (S⁻¹ r)_i` with `L Lᵀ = (S⁻¹)_ii`, of unit covariance."""
         S, residual = self._innovations(predicted, seen)
@@ -207,9 +207,7 @@ class Estimator:
         model = self.slam.model
         return model is not None and model.motion.has_velocity
 
-    def displaced(
-        self, T: Float[np.ndarray, "4 4"], sigma: Float[np.ndarray, " 6"], seconds: float
-    ) -> Predicted:
+    def displaced(self, T: Transform, sigma: Float[np.ndarray, " 6"], seconds: float) -> Predicted:
         """Return what the filter expects of a camera that is at T from its latest one, in its own
         unit, known with this σ: it has moved there within so many seconds. Changes the state."""
         dt = np.asarray(seconds)
@@ -221,10 +219,7 @@ class Estimator:
         self.state = _at_rest(self.slam, self.state)
 
     def begin(
-        self,
-        slots: Int[np.ndarray, " k"],
-        pixels: Float[np.ndarray, "k 2"],
-        depths: tuple[np.ndarray, np.ndarray] | None = None,
+        self, slots: Slots, pixels: Pixels, depths: tuple[np.ndarray, np.ndarray] | None = None
     ) -> CameraReport:
         """Begin a map with landmarks at these pixels; `depths` are means and σ of 1/z of all
         features, where they are known."""
@@ -233,7 +228,7 @@ class Estimator:
         known = jax.tree.map(jnp.asarray, depths)
         return self._created(partial(_begin_known, known), slots, pixels)
 
-    def renew(self, slots: Int[np.ndarray, " k"], pixels: Float[np.ndarray, "k 2"]) -> CameraReport:
+    def renew(self, slots: Slots, pixels: Pixels) -> CameraReport:
         """End the frame with new landmarks at these pixels."""
         return self._created(_renew_map, slots, pixels)
 
@@ -242,7 +237,7 @@ class Estimator:
         gone = np.isin(np.arange(self.settings.capacity), slots)
         self.state = _remove(self.slam, self.state, gone)
 
-    def points(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
+    def points(self) -> tuple[Positions, Spreads]:
         """Landmarks with their covariances, in the filter's own unit, from where the map begins."""
         return jax.device_get(_world_points(self.slam, self.state, self.settings.capacity))
 
@@ -275,11 +270,7 @@ class Estimator:
 
         graph = [compile_graph(slam, state, self.settings)] if in_submaps(slam) else []
         return [
-            in_background(
-                lambda: _renew_map.compile(slam, state, new),
-                self.camera,
-                *graph,
-            ),
+            in_background(lambda: _renew_map.compile(slam, state, new), self.camera, *graph),
             in_background(
                 lambda: _begin_map.compile(slam, state, new),
                 lambda: _correct.compile(slam, predicted().state, dt, _measured(new, np.zeros(0))),
@@ -305,12 +296,8 @@ class Estimator:
         padded[:m, :, :m] = covariance
         landmark = np.argmax(slots == slots[:, None], axis=1) if m else slots
         more = (0, size - m)
-        return (
-            np.pad(residual, (more, (0, 0))),
-            padded,
-            np.pad(valid, more),
-            np.pad(landmark, more, mode="constant", constant_values=size - 1),
-        )
+        landmark = np.pad(landmark, more, constant_values=size - 1)
+        return np.pad(residual, (more, (0, 0))), padded, np.pad(valid, more), landmark
 
     def _innovations(
         self, predicted: Predicted, seen: Observations
@@ -323,10 +310,7 @@ class Estimator:
         return S + np.diag(np.repeat(more, 2)), residual.ravel()
 
     def _created(
-        self,
-        create: Callable[..., tuple[Belief, Report]],
-        slots: Int[np.ndarray, " k"],
-        pixels: Float[np.ndarray, "k 2"],
+        self, create: Callable[..., tuple[Belief, Report]], slots: Slots, pixels: Pixels
     ) -> CameraReport:
         new = _padded(slots, pixels, self.settings.wanted)
         self.state, report = create(self.slam, self.state, new)
@@ -342,7 +326,7 @@ def _solve(S: Float[np.ndarray, "m m"], b: Float[np.ndarray, "m ..."]) -> np.nda
         return np.linalg.solve(S, b)
 
 
-def _padded(slots: Int[np.ndarray, " k"], pixels: Float[np.ndarray, "k 2"], size: int) -> Features:
+def _padded(slots: Slots, pixels: Pixels, size: int) -> Features:
     """Features of fixed number; NaN pixels and padding are not valid."""
     missing = size - len(slots)
     valid = np.pad(np.isfinite(pixels).all(axis=1), (0, missing))
@@ -352,8 +336,7 @@ def _padded(slots: Int[np.ndarray, " k"], pixels: Float[np.ndarray, "k 2"], size
 
 def _measured(features: Features, factors: Float[np.ndarray, " k"]) -> Features:
     """The features with these factors of their noise."""
-    missing = len(features.slots) - len(factors)
-    more = np.pad(factors, (0, missing), constant_values=1.0)
+    more = np.pad(factors, (0, len(features.slots) - len(factors)), constant_values=1.0)
     return replace(features, noise_factor=more)
 
 
@@ -371,8 +354,7 @@ def _remove(slam: AbstractStaged, state: Belief, gone: jax.Array) -> Belief:
 def _moving(
     slam: AbstractStaged, state: Belief, T: jax.Array, sigma: jax.Array, dt: jax.Array
 ) -> Belief:
-    velocity = log(jaxlie.SE3.from_matrix(T)) / dt
-    return _with_velocity(state, velocity, jnp.diag((sigma / dt) ** 2))
+    return _with_velocity(state, log(jaxlie.SE3.from_matrix(T)) / dt, jnp.diag((sigma / dt) ** 2))
 
 
 @Program
@@ -463,13 +445,8 @@ def _renew_map(slam: AbstractStaged, state: Belief, new: Features) -> tuple[Beli
 
 def _reported(slam: AbstractStaged, state: Belief) -> Report:
     seen = camera_pose_in_unit(slam, state)
-    return (
-        seen.pose.as_matrix(),
-        *seen[1:],
-        slam.unit_fixed(state),
-        left(slam, state),
-        slam.in_map(state),
-    )
+    fixed, gone = slam.unit_fixed(state), left(slam, state)
+    return seen.pose.as_matrix(), *seen[1:], fixed, gone, slam.in_map(state)
 
 
 @Program

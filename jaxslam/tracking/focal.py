@@ -43,8 +43,7 @@ def better_focal(
         # A camera that turned away shares nothing with the others.
         sharing = [i for i, (which, _) in enumerate(views) if len(which)]
         seen, views = [seen[i] for i in sharing], [views[i] for i in sharing]
-        unknown = 6 * len(views) + places.size
-        if 2 * sum(len(which) for which, _ in views) > 1.2 * unknown:
+        if 2 * sum(len(which) for which, _ in views) > 1.2 * (6 * len(views) + places.size):
             T_wc = np.array([one.T_wc for one in seen])
             factors = (1 / FACTOR, 1.0, FACTOR)
             left += [_left(T_wc, views, places, calibration, factor) for factor in factors]
@@ -116,11 +115,10 @@ class _Linear(NamedTuple):
     ) -> _Linear:
         v, p = len(poses), len(places)
         shapes = (v, 6), (p, 3), (v, 6, 6), (p, 3, 3), (v, p, 6, 3)
+        distortion = np.array(calibration.distortion)
         left, parts = 0.0, tuple(np.zeros(shape) for shape in shapes)
         for i, (pose, (which, pixels)) in enumerate(zip(poses, views, strict=True)):
-            seen, by = cv2.projectPoints(
-                places[which], pose[:3], pose[3:], K, np.array(calibration.distortion)
-            )
+            seen, by = cv2.projectPoints(places[which], pose[:3], pose[3:], K, distortion)
             off = seen[:, 0] - pixels
             far = np.sum(off**2, axis=1) / _LOOSE**2
             left += _LOOSE**2 * float(np.log1p(far).sum())

@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Int
 
 from jaxslam._runtime.programs import in_background
 from jaxslam.filters.protocol import AbstractStaged, Belief
 from jaxslam.tracking.estimator import Estimator, Predicted
 from jaxslam.tracking.landmarks import Landmark, Points, joined
-from jaxslam.tracking.observations import Observations
-from jaxslam.tracking.patches import Patch
+from jaxslam.tracking.observations import Observations, Slots
+from jaxslam.tracking.patches import Patch, Picture, Pixels
 from jaxslam.tracking.places.descriptors import note_looks
 from jaxslam.tracking.places.submaps import (
     Compared,
@@ -55,8 +55,7 @@ class Remembered:
     def graph(self, settings: TrackerSettings, slam: AbstractStaged) -> Graph:
         """Return its submaps and loops, of this filter."""
         numbers = slot_numbers(self.landmarks, settings.capacity)
-        camera = self.place.camera
-        present, _ = handed_over(slam, self.state, numbers, camera, number=self.submap)
+        present, _ = handed_over(slam, self.state, numbers, self.place.camera, number=self.submap)
         return Graph(slam, self.submaps, present, self.loops, settings.wanted)
 
 
@@ -129,22 +128,14 @@ class Map:
         self.give_up(failing(self.landmarks, self.settings))
 
     def begin(
-        self,
-        image: UInt8[np.ndarray, "h w"],
-        pixels: Float[np.ndarray, "k 2"],
-        depths: tuple[np.ndarray, np.ndarray] | None = None,
+        self, image: Picture, pixels: Pixels, depths: tuple[np.ndarray, np.ndarray] | None = None
     ) -> None:
         """Begin with landmarks at these pixels, a map that has none; `depths` as `Estimator`'s."""
         slots = self._free(len(pixels))
         self.place.begin(self.estimator.begin(slots, pixels, depths))
         self._add(slots, image, pixels)
 
-    def renew(
-        self,
-        image: UInt8[np.ndarray, "h w"],
-        pixels: Float[np.ndarray, "k 2"],
-        kept: Int[np.ndarray, " n"] = NO_SLOTS,
-    ) -> None:
+    def renew(self, image: Picture, pixels: Pixels, kept: Int[np.ndarray, " n"] = NO_SLOTS) -> None:
         """New landmarks at these pixels, for which others than those in the slots `kept` make room.
         Ends the filter's frame."""
         self._make_room(len(pixels), kept)
@@ -159,13 +150,12 @@ class Map:
         if report.left and more:
             self._hand_over(image)
 
-    def _hand_over(self, image: UInt8[np.ndarray, "h w"]) -> None:
+    def _hand_over(self, image: Picture) -> None:
         """End the submap at the camera, where this picture was taken."""
         note_looks(self.landmarks.values(), image)
         estimator, numbers = self.estimator, slot_numbers(self.landmarks, self.settings.capacity)
-        camera = self.place.camera
         ended, state = handed_over(
-            estimator.slam, estimator.state, numbers, camera, number=self.submap
+            estimator.slam, estimator.state, numbers, self.place.camera, number=self.submap
         )
         estimator.state = state
         self.submaps = (*self.submaps, ended)
@@ -311,12 +301,7 @@ class Map:
         free = [slot for slot in range(self.settings.capacity) if slot not in self.landmarks]
         return np.array(free[:count], int)
 
-    def _add(
-        self,
-        slots: Int[np.ndarray, " k"],
-        image: UInt8[np.ndarray, "h w"],
-        pixels: Float[np.ndarray, "k 2"],
-    ) -> None:
+    def _add(self, slots: Slots, image: Picture, pixels: Pixels) -> None:
         first, camera = self.created, self.place.camera.T_wc
         for number, (slot, pixel) in enumerate(zip(slots.tolist(), pixels, strict=True), first):
             self.landmarks[slot] = Landmark(number, Patch.take(image, pixel), camera, pixel)
@@ -381,9 +366,7 @@ def failing(landmarks: Mapping[int, Landmark], settings: TrackerSettings) -> lis
     return [slot for slot, one in landmarks.items() if one.success < settings.least_success]
 
 
-def worst_first(
-    landmarks: Sequence[Landmark], points: Points, settings: TrackerSettings
-) -> Int[np.ndarray, " k"]:
+def worst_first(landmarks: Sequence[Landmark], points: Points, settings: TrackerSettings) -> Slots:
     """The order in which to give up landmarks that are not in view; `points` are theirs.
 
     First those that are searched in vain, then the others by the time since they were seen, times
@@ -396,5 +379,4 @@ def worst_first(
     distances = np.linalg.norm(points.points - starts, axis=1)
     with np.errstate(invalid="ignore"):  # at infinity, or of unknown depth
         shares = np.sqrt(np.trace(points.in_map, axis1=1, axis2=2)) / distances
-    unknown = np.minimum(np.nan_to_num(shares, nan=1.0), 1.0)
-    return np.lexsort((-unseen * unknown, away))
+    return np.lexsort((-unseen * np.minimum(np.nan_to_num(shares, nan=1.0), 1.0), away))

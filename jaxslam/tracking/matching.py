@@ -8,7 +8,16 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int
+
+from jaxslam.tracking.observations import Slots
+from jaxslam.tracking.patches import Picture, Pixels, Places, Window
+
+Windows = Float32[np.ndarray, "n window window"]
+"""Pictures of n landmarks as they should look now."""
+Grey = Float32[np.ndarray, "h w"]
+"""A picture in which windows are compared."""
+
 
 GATE = 9.21
 """The 99 % quantile of χ² with two degrees of freedom."""
@@ -18,7 +27,6 @@ _MAP_SIGMA = 0.2  # of a map's elements: a patch does not face its first camera
 _PRECISION = 2.4e-4 / _MAP_SIGMA**2  # by s² of ρ = .98
 _MOST_MAPPED = 0.5  # by which elements of a map differ from the identity's
 _MAX_SHIFT = 1.5  # pixels: a refinement that moves further than this has left its peak
-_WIDEST = 0.25  # of the picture's width: an ellipse is searched no further from its centre
 _NARROW = 91**2  # pixels: boxes of more are searched in the picture of half the size first
 _NEARBY = 3  # pixels around such a peak
 PEAKS = 3
@@ -55,9 +63,9 @@ class Matches(NamedTuple):
 
 
 def match_patches(
-    image: UInt8[np.ndarray, "h w"],
-    templates: Float32[np.ndarray, "n window window"],
-    centres: Float[np.ndarray, "n 2"],
+    image: Picture,
+    templates: Windows,
+    centres: Places,
     covariances: Float[np.ndarray, "n 2 2"],
     *,
     max_radius: float | None = None,
@@ -80,7 +88,8 @@ def match_patches(
         return Matches(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, np.float32), np.zeros(0))
     whole, half = image.astype(np.float32), templates.shape[1] // 2
     ellipses = _Ellipses.of(centres, covariances)
-    reach = _WIDEST * image.shape[1] if max_radius is None else max_radius
+    # An ellipse is searched no further from its centre than a quarter of the picture's width.
+    reach = 0.25 * image.shape[1] if max_radius is None else max_radius
     boxes = _boxes_around(ellipses, reach, half, image.shape)
     least = THRESHOLD - ambiguity
     wide = boxes.owner[boxes.large()]
@@ -89,8 +98,7 @@ def match_patches(
     peaks = peaks.only(ellipses.hold(peaks.owner, peaks.pixels))
     peaks = peaks.only(np.lexsort((-peaks.scores, peaks.owner)))
     in_wide = several & np.isin(peaks.owner, wide)
-    alone = _alone(peaks.only(~in_wide), ambiguity)
-    chosen = alone.joined(_several(peaks.only(in_wide)))
+    chosen = _alone(peaks.only(~in_wide), ambiguity).joined(_several(peaks.only(in_wide)))
     chosen = chosen.only(np.argsort(chosen.owner, kind="stable"))
     pixels = chosen.pixels + _quadratic_peaks(chosen.around)
     variances = np.zeros(len(pixels))
@@ -102,17 +110,13 @@ def match_patches(
 class Fit(NamedTuple):
     """How n templates fit a picture."""
 
-    pixels: Float[np.ndarray, "n 2"]
+    pixels: Places
     """Where, sub-pixel."""
     variances: Float[np.ndarray, " n"]
     """The variance of each pixel's u and v, pixels²."""
 
 
-def refine(
-    image: Float32[np.ndarray, "h w"],
-    templates: Float32[np.ndarray, "n window window"],
-    pixels: Float[np.ndarray, "n 2"],
-) -> Fit:
+def refine(image: Grey, templates: Windows, pixels: Places) -> Fit:
     """The places near `pixels` and the affine maps with which templates fit best, by Gauss-Newton.
 
     Minimises the squared difference of the two windows, each made zero-mean with unit norm (so
@@ -156,7 +160,7 @@ class _Templates(NamedTuple):
     """Of the square of it with the prior. Zero of a template without texture in two directions."""
 
     @classmethod
-    def of(cls, templates: Float32[np.ndarray, "n window window"]) -> "_Templates":
+    def of(cls, templates: Windows) -> "_Templates":
         n, side = len(templates), templates.shape[1] - 2
         inside = templates[:, 1:-1, 1:-1].reshape(n, 1, -1)
         inside = inside - inside.mean(axis=2, keepdims=True)
@@ -175,10 +179,7 @@ class _Templates(NamedTuple):
         return cls(inside[:, 0], jacobian, np.linalg.inv(square) * textured[:, None, None])
 
     def compared(
-        self,
-        image: Float32[np.ndarray, "h w"],
-        pixels: Float[np.ndarray, "n 2"],
-        maps: Float[np.ndarray, "n 2 2"],
+        self, image: Grey, pixels: Places, maps: Float[np.ndarray, "n 2 2"]
     ) -> tuple[Float32[np.ndarray, "n m"], Float32[np.ndarray, " n"]]:
         """Return the picture's windows at these places, and their correlations ρ."""
         windows = _windows(image, pixels, maps, math.isqrt(self.inside.shape[1]))
@@ -188,10 +189,7 @@ class _Templates(NamedTuple):
 
 
 def _windows(
-    image: Float32[np.ndarray, "h w"],
-    pixels: Float[np.ndarray, "n 2"],
-    maps: Float[np.ndarray, "n 2 2"],
-    side: int,
+    image: Grey, pixels: Places, maps: Float[np.ndarray, "n 2 2"], side: int
 ) -> Float32[np.ndarray, "n m"]:
     """The squares of `side` pixels, mapped, around sub-pixel places, row by row (m = side²)."""
     u, v = (pixels.T[:, :, None] + np.moveaxis(maps @ _offsets(side), 1, 0)).astype(np.float32)
@@ -207,15 +205,13 @@ def _offsets(side: int) -> Int[np.ndarray, "2 m"]:
 class _Ellipses(NamedTuple):
     """n ellipses (x - centre)' covariance^-1 (x - centre) <= GATE; NaN for one that is none."""
 
-    centres: Float[np.ndarray, "n 2"]
+    centres: Places
     uu: Float[np.ndarray, " n"]
     uv: Float[np.ndarray, " n"]
     vv: Float[np.ndarray, " n"]
 
     @classmethod
-    def of(
-        cls, centres: Float[np.ndarray, "n 2"], covariances: Float[np.ndarray, "n 2 2"]
-    ) -> "_Ellipses":
+    def of(cls, centres: Places, covariances: Float[np.ndarray, "n 2 2"]) -> "_Ellipses":
         # Half a pixel's diagonal wider, else a tiny ellipse could hold no whole pixel.
         uu, vv = covariances[:, 0, 0] + 0.5 / GATE, covariances[:, 1, 1] + 0.5 / GATE
         uv = covariances[:, 0, 1]
@@ -223,10 +219,9 @@ class _Ellipses(NamedTuple):
         centres = np.where((some & np.isfinite(centres).all(axis=1))[:, None], centres, np.nan)
         return cls(centres, uu, uv, vv)
 
-    def reach(self) -> Float[np.ndarray, "n 2"]:
+    def reach(self) -> Places:
         """Return how far each goes from its centre along u and v, pixels."""
-        variances = np.stack([self.uu, self.vv], axis=1)
-        return np.sqrt(GATE * np.maximum(variances, 0.0))
+        return np.sqrt(GATE * np.maximum(np.stack([self.uu, self.vv], axis=1), 0.0))
 
     def hold(
         self, which: Int[np.ndarray, " m"], pixels: Int[np.ndarray, "m 2"]
@@ -278,7 +273,7 @@ def _boxes_around(
 class _Peaks(NamedTuple):
     """k local maxima of the score of patches `owner`, each with its neighbourhood of 3x3."""
 
-    owner: Int[np.ndarray, " k"]
+    owner: Slots
     pixels: Int[np.ndarray, "k 2"]
     scores: Float32[np.ndarray, " k"]
     around: Float32[np.ndarray, "k 9"]
@@ -290,12 +285,7 @@ class _Peaks(NamedTuple):
         return _Peaks(*map(np.concatenate, zip(self, others, strict=True)))
 
 
-def _peaks(
-    image: Float32[np.ndarray, "h w"],
-    templates: Float32[np.ndarray, "n window window"],
-    boxes: _Boxes,
-    least: float,
-) -> _Peaks:
+def _peaks(image: Grey, templates: Windows, boxes: _Boxes, least: float) -> _Peaks:
     """The local maxima within each box, its rim excluded, that reach `least`."""
     (width, _), half = boxes.sizes.max(axis=0, initial=3), templates.shape[1] // 2
     tops = np.concatenate([[0], np.cumsum(boxes.sizes[:, 1])])
@@ -342,18 +332,13 @@ def _several(peaks: _Peaks) -> _Peaks:
 
 
 def _narrowed(
-    image: UInt8[np.ndarray, "h w"],
-    templates: Float32[np.ndarray, "n window window"],
-    ellipses: _Ellipses,
-    boxes: _Boxes,
-    least: float,
+    image: Picture, templates: Windows, ellipses: _Ellipses, boxes: _Boxes, least: float
 ) -> _Boxes:
     """The boxes, in place of each large one those around its peaks in the picture's half."""
     large = boxes.large()
     if not large.any():
         return boxes
-    side = (templates.shape[1] + 1) // 2
-    halved = _Halved.of(image, side)
+    halved = _Halved.of(image, (templates.shape[1] + 1) // 2)
     # Of score: what a match loses at half the size, where pixels fall otherwise
     small = [
         halved.places(templates[box.owner[0]], box, ellipses, least - 0.1)
@@ -372,19 +357,13 @@ class _Halved(NamedTuple):
     side: int
 
     @classmethod
-    def of(cls, image: UInt8[np.ndarray, "h w"], side: int) -> "_Halved":
+    def of(cls, image: Picture, side: int) -> "_Halved":
         half, size = cv2.pyrDown(image).astype(np.float32), (side, side)
         squares = cv2.sqrBoxFilter(half, cv2.CV_32F, size) - cv2.boxFilter(half, -1, size) ** 2
         # One grey level at the least, so that a bare wall is like nothing.
         return cls(half, side * np.sqrt(np.maximum(squares, 1.0)), side)
 
-    def places(
-        self,
-        template: Float32[np.ndarray, "window window"],
-        box: _Boxes,
-        ellipses: _Ellipses,
-        least: float,
-    ) -> _Boxes:
+    def places(self, template: Window, box: _Boxes, ellipses: _Ellipses, least: float) -> _Boxes:
         """Boxes of the whole picture around the highest peaks within one box and its ellipse."""
         # The window at x covers the whole picture's pixels about 2 x + offset.
         offset = template.shape[0] // 2 - 2 * (self.side // 2)
@@ -407,10 +386,7 @@ class _Halved(NamedTuple):
         return _Boxes(owner[best], low, high).large_enough()
 
     def _scores(
-        self,
-        template: Float32[np.ndarray, "window window"],
-        first: Int[np.ndarray, " 2"],
-        last: Int[np.ndarray, " 2"],
+        self, template: Window, first: Int[np.ndarray, " 2"], last: Int[np.ndarray, " 2"]
     ) -> Float32[np.ndarray, "r c"]:
         """Normalised cross-correlations of the windows at the pixels from `first` to `last`."""
         before, after = self.side // 2, (self.side - 1) // 2
@@ -418,8 +394,7 @@ class _Halved(NamedTuple):
         region = self.image[top - before : bottom + after, left - before : right + after]
         kernel = cv2.pyrDown(template)
         kernel -= kernel.mean()
-        norm = np.sqrt(np.sum(kernel**2)) + 1e-6
-        scores = cv2.filter2D(region, -1, kernel / norm)
+        scores = cv2.filter2D(region, -1, kernel / (np.sqrt(np.sum(kernel**2)) + 1e-6))
         scores = scores[before : scores.shape[0] - after, before : scores.shape[1] - after]
         return scores / self.spread[top:bottom, left:right]
 
@@ -432,11 +407,10 @@ _QUADRATIC = np.linalg.pinv(
 )
 
 
-def _quadratic_peaks(around: Float32[np.ndarray, "k 9"]) -> Float[np.ndarray, "k 2"]:
+def _quadratic_peaks(around: Float32[np.ndarray, "k 9"]) -> Pixels:
     """Return where paraboloids fitted to 3x3 scores peak, from the middle one, within one pixel."""
     _, bx, by, cxx, cxy, cyy = _QUADRATIC @ around.T
     determinant = 4 * cxx * cyy - cxy**2
-    peaked = (cxx < 0) & (determinant > 0)
     shift = np.stack([cxy * by - 2 * cyy * bx, cxy * bx - 2 * cxx * by], axis=1)
-    shift /= np.where(peaked, determinant, np.inf)[:, None]
+    shift /= np.where((cxx < 0) & (determinant > 0), determinant, np.inf)[:, None]
     return np.clip(shift, -1.0, 1.0)

@@ -6,7 +6,12 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+
+from jaxslam.tracking.patches import Pixels
+
+Slots = Int[np.ndarray, " k"]
+"""The slots of k landmarks in the filter's map."""
 
 
 class Lost(StrEnum):
@@ -66,12 +71,12 @@ class Observations(NamedTuple):
         return self.labels == "matched"
 
     @property
-    def believed(self) -> Float[np.ndarray, "k 2"]:
+    def believed(self) -> Pixels:
         """The pixels of what is matched, NaN of the others."""
         return np.where(self.matched[:, None], self.pixels, np.nan)
 
     @property
-    def places(self) -> Float[np.ndarray, "k 2"]:
+    def places(self) -> Pixels:
         """The place of each, as far as is known: where it was matched, or else expected."""
         return np.where(self.matched[:, None], self.pixels, self.predicted)
 
@@ -94,8 +99,7 @@ class Observations(NamedTuple):
 
     def but_for(self, used: Bool[np.ndarray, " k"]) -> Observations:
         """The table in which matches that the filter did not use are outliers."""
-        refused = self.matched & ~used
-        return self._replace(labels=np.where(refused, "outlier", self.labels))
+        return self._replace(labels=np.where(self.matched & ~used, "outlier", self.labels))
 
 
 NOTHING = Observations()

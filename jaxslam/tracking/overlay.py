@@ -9,7 +9,12 @@ from jaxtyping import Float, Int32, UInt8
 
 from jaxslam.io.source import Frame
 from jaxslam.tracking.observations import Observations
+from jaxslam.tracking.patches import Picture, Pixels
 from jaxslam.tracking.report import Tracked
+
+Lines = Float[np.ndarray, "k p 2"]
+"""k lines of p pixels."""
+
 
 # Okabe and Ito's colours, distinct to the colour-blind, as OpenCV's blue, green, red; and yet each
 # status has a shape of its own.
@@ -66,10 +71,7 @@ def _banner(result: Tracked) -> str:
 
 
 def draw_overlay(
-    image: UInt8[np.ndarray, "h w"],
-    table: Observations,
-    notes: tuple[str, str] = ("", ""),
-    banner: str = "",
+    image: Picture, table: Observations, notes: tuple[str, str] = ("", ""), banner: str = ""
 ) -> UInt8[np.ndarray, "h2 w 3"]:
     """The frame in blue, green, red with what the filter predicted and what was found there.
 
@@ -101,9 +103,9 @@ def overlay_size(width: int, height: int) -> tuple[int, int]:
 def _draw(
     canvas: UInt8[np.ndarray, "h w 3"],
     status: str,
-    predicted: Float[np.ndarray, "k 2"],
+    predicted: Pixels,
     covariances: Float[np.ndarray, "k 2 2"],
-    matched: Float[np.ndarray, "k 2"],
+    matched: Pixels,
 ) -> None:
     """Draw k landmarks of one label."""
     expected, found = np.isfinite(predicted).all(axis=1), np.isfinite(matched).all(axis=1)
@@ -117,22 +119,17 @@ def _draw(
     _draw_marks(canvas, matched[found], status)
 
 
-def _draw_marks(
-    canvas: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "k 2"], status: str
-) -> None:
+def _draw_marks(canvas: UInt8[np.ndarray, "h w 3"], pixels: Pixels, status: str) -> None:
     """Mark where landmarks were found."""
     if status in ("outlier", "new"):
         shape = _CROSS if status == "outlier" else _SQUARE
-        lines = pixels[:, None, None] + shape
-        _draw_lines(canvas, lines.reshape(-1, *shape.shape[1:]), status)
+        _draw_lines(canvas, (pixels[:, None, None] + shape).reshape(-1, *shape.shape[1:]), status)
     else:
         for pixel in _fixed(pixels).tolist():
             cv2.circle(canvas, pixel, 2 << _SHIFT, COLOURS[status], -1, cv2.LINE_AA, _SHIFT)
 
 
-def search_ellipses(
-    centres: Float[np.ndarray, "k 2"], covariances: Float[np.ndarray, "k 2 2"]
-) -> Float[np.ndarray, "k p 2"]:
+def search_ellipses(centres: Pixels, covariances: Float[np.ndarray, "k 2 2"]) -> Lines:
     """Closed lines of p points around the centres, three standard deviations away."""
     variances, axes = np.linalg.eigh(covariances)
     radii = np.clip(SIGMAS * np.sqrt(np.maximum(variances, 0.0)), LEAST_RADIUS, 2000.0)
@@ -141,24 +138,19 @@ def search_ellipses(
     return centres[:, None] + np.swapaxes((axes * radii[:, None]) @ circle, 1, 2)
 
 
-def _dashes(lines: Float[np.ndarray, "k p 2"]) -> Float[np.ndarray, "d q 2"]:
+def _dashes(lines: Lines) -> Float[np.ndarray, "d q 2"]:
     """Every other piece of each."""
-    pieces = lines[:, :_TURN].reshape(-1, _TURN // _DASH, _DASH, 2)
-    return pieces[:, ::2].reshape(-1, _DASH, 2)
+    return lines[:, :_TURN].reshape(-1, _TURN // _DASH, _DASH, 2)[:, ::2].reshape(-1, _DASH, 2)
 
 
-def _draw_lines(
-    canvas: UInt8[np.ndarray, "h w 3"], lines: Float[np.ndarray, "k p 2"], status: str
-) -> None:
+def _draw_lines(canvas: UInt8[np.ndarray, "h w 3"], lines: Lines, status: str) -> None:
     """Draw lines with a dark seam, so that they stand out on what is bright too."""
     fixed = list(_fixed(lines))
     cv2.polylines(canvas, fixed, False, (0, 0, 0), 3, cv2.LINE_8, _SHIFT)
     cv2.polylines(canvas, fixed, False, COLOURS[status], 1, cv2.LINE_AA, _SHIFT)
 
 
-def _draw_faintly(
-    canvas: UInt8[np.ndarray, "h w 3"], lines: Float[np.ndarray, "k p 2"], status: str
-) -> None:
+def _draw_faintly(canvas: UInt8[np.ndarray, "h w 3"], lines: Lines, status: str) -> None:
     """Draw thin lines through which the picture is seen."""
     if not len(lines):
         return
@@ -206,8 +198,7 @@ def _draw_symbol(strip: UInt8[np.ndarray, "strip w 3"], status: str, x: int, y: 
 
 def _write(strip: UInt8[np.ndarray, "strip w 3"], text: str, x: int, y: int) -> None:
     scale = _letters(strip.shape[1])
-    place = (x, y + round(11 * scale))
-    cv2.putText(strip, text, place, _FONT, scale, _LIGHT, 1, cv2.LINE_AA)
+    cv2.putText(strip, text, (x, y + round(11 * scale)), _FONT, scale, _LIGHT, 1, cv2.LINE_AA)
 
 
 def _letters(width: int) -> float:

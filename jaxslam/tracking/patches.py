@@ -10,6 +10,16 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+Picture = UInt8[np.ndarray, "h w"]
+"""A grey picture."""
+Pixels = Float[np.ndarray, "k 2"]
+"""Pixels (u, v) of k landmarks."""
+Window = Float32[np.ndarray, "window window"]
+"""The picture of a landmark as it should look now."""
+Places = Float[np.ndarray, "n 2"]
+"""Pixels (u, v) of n points."""
+
+
 WINDOW = 15  # side of the matched window in pixels, odd
 STORED = 41  # side of the stored patch: room to warp the window by up to 41/15
 
@@ -26,12 +36,11 @@ class Patch:
     stored: Float32[np.ndarray, "stored stored"] = field(repr=False)
 
     @classmethod
-    def take(cls, image: UInt8[np.ndarray, "h w"], pixel: Float[np.ndarray, " 2"]) -> "Patch":
+    def take(cls, image: Picture, pixel: Float[np.ndarray, " 2"]) -> "Patch":
         """Cut out the patch around `pixel`; beyond the image's edge its last row or column
         repeats."""
         u, v = pixel.tolist()
-        size = (STORED, STORED)
-        return cls(pixel, cv2.getRectSubPix(image, size, (u, v), patchType=cv2.CV_32F))
+        return cls(pixel, cv2.getRectSubPix(image, (STORED, STORED), (u, v), patchType=cv2.CV_32F))
 
     def covers(self, affine: Float[np.ndarray, "2 2"]) -> bool:
         """Return whether `warped` finds all it needs within the stored patch."""
@@ -41,7 +50,7 @@ class Patch:
         reach = max(abs(inverse[0]) + abs(inverse[1]), abs(inverse[2]) + abs(inverse[3]))
         return reach * (WINDOW // 2) <= STORED // 2
 
-    def warped(self, affine: Float[np.ndarray, "2 2"]) -> Float32[np.ndarray, "window window"]:
+    def warped(self, affine: Float[np.ndarray, "2 2"]) -> Window:
         """Return how the window looks after the image around the patch was mapped by `affine`.
 
         `affine` takes pixel offsets in the first image to those in the present one, so the
@@ -59,15 +68,10 @@ class Patch:
         shrink = 0.5 * (squares + math.sqrt(max(squares**2 - 4 * determinant**2, 0.0)))
         if shrink > 1.3**2:  # else too little to alias
             stored = cv2.GaussianBlur(stored, (0, 0), 0.5 * math.sqrt(shrink - 1.0))
-        return cv2.warpAffine(
-            stored,
-            np.array(
-                [[a, b, centre - (a + b) * middle], [c, d, centre - (c + d) * middle]], np.float64
-            ),
-            (WINDOW, WINDOW),
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+        rows = [a, b, centre - (a + b) * middle], [c, d, centre - (c + d) * middle]
+        size, flags = (WINDOW, WINDOW), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        map, border = np.array(rows, np.float64), cv2.BORDER_REPLICATE
+        return cv2.warpAffine(stored, map, size, flags=flags, borderMode=border)
 
 
 def _inverse(affine: Float[np.ndarray, "2 2"]) -> tuple[float, float, float, float] | None:

@@ -144,9 +144,8 @@ def _restore(
         piece, _, attribute = where.rpartition(".")
         setattr(attrgetter(piece)(tracker) if piece else tracker, attribute, numbers[name])
     tracker.failed.update(header["failed"])
-    tracker.joins = tuple(
-        Join(**one | {"moved": np.array(one["moved"])}) for one in header["joins"]
-    )
+    joins = header["joins"]
+    tracker.joins = tuple(Join(**one | {"moved": np.array(one["moved"])}) for one in joins)
     kept.finished.append(Points(*(arrays[name] for name in Points._fields)))
     with jax.enable_x64(True):
         kept.charted = unstacked(_of(arrays, "charted"))
@@ -194,8 +193,7 @@ def _remembered(
         for k, number in enumerate(header["submaps"]):
             frozen, *rest = grown(ended, arrays, f"submap {k}")
             points, covariances, *pose = map(np.asarray, rest)
-            camera = PoseWithCovariance(*pose)
-            submaps.append(Submap(frozen, points, covariances, camera, number))
+            submaps.append(Submap(frozen, points, covariances, PoseWithCovariance(*pose), number))
         nothing = no_loop(settings.wanted, submaps[0].frozen.state.landmarks.shape[1])
         loops += [grown(nothing, arrays, f"loop {k}") for k in range(header["loops"])]
     for i, told in enumerate(header["maps"]):
@@ -247,10 +245,8 @@ def grown(like: PyTree, arrays: Mapping[str, np.ndarray], name: str) -> PyTree:
     prefix = f"{name}/"
     found = [arrays.get(f"{prefix}{i}") for i in range(len(old))]
     count = sum(key.startswith(prefix) for key in arrays)
-    same = [
-        new is not None and (new.shape, new.dtype) == (leaf.shape, leaf.dtype)
-        for new, leaf in zip(found, old, strict=True)
-    ]
+    pairs = zip(found, old, strict=True)
+    same = [x is not None and (x.shape, x.dtype) == (leaf.shape, leaf.dtype) for x, leaf in pairs]
     if count != len(old) or not all(same):
         raise ValueError("the saved state belongs to a different filter")
     return jax.tree.unflatten(structure, [jnp.asarray(new) for new in found])

@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import write_atomically
 from jaxslam.io.calibration import Calibration
+from jaxslam.tracking.patches import Places
+from jaxslam.tracking.pose_with_covariance import Positions, Spreads, Transform
 
 _PROPERTIES = ("x", "y", "z", "cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
 
@@ -61,9 +63,9 @@ def write_ply(
 class Cloud(NamedTuple):
     """The content of a file of `write_ply`."""
 
-    points: Float[np.ndarray, "n 3"]
+    points: Positions
     """Map units, in the world frame."""
-    covariances: Float[np.ndarray, "n 3 3"]
+    covariances: Spreads
     ids: Int[np.ndarray, " n"]
     maps: Int[np.ndarray, " n"]
 
@@ -87,11 +89,8 @@ def read_ply(path: str | Path) -> Cloud:
 
 
 def seen_from(
-    T_wc: Float[np.ndarray, "4 4"],
-    points: Float[np.ndarray, "n 3"],
-    covariances: Float[np.ndarray, "n 3 3"],
-    calibration: Calibration,
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
+    T_wc: Transform, points: Positions, covariances: Spreads, calibration: Calibration
+) -> tuple[Places, Float[np.ndarray, "n 2 2"]]:
     """Pixels (u, v) of landmarks in the world frame, and their covariances to first order, px².
 
     u = π(R_cw X + t), P_u = J P_X Jᵀ with J = ∂π/∂t R_cw: the camera is taken to be where T_wc
@@ -110,8 +109,7 @@ def seen_from(
     J = jacobian[:, 3:6].reshape(-1, 2, 3) @ T_cw[:3, :3]
     size = np.array([calibration.width, calibration.height])
     inside = np.all((pixels >= 0) & (pixels <= size - 1), axis=1) & ~behind
-    spread = J @ covariances @ np.swapaxes(J, 1, 2)
     return (
         np.where(inside[:, None], pixels, np.nan),
-        np.where(inside[:, None, None], spread, np.nan),
+        np.where(inside[:, None, None], J @ covariances @ np.swapaxes(J, 1, 2), np.nan),
     )

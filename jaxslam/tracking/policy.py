@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from scipy.stats import binom, chi2
 
 from jaxslam.filters.association import ASSOCIATIONS, Association, one_point_ransac
@@ -18,7 +18,8 @@ from jaxslam.tracking.estimator import Predicted
 from jaxslam.tracking.landmarks import Landmark
 from jaxslam.tracking.map import Map
 from jaxslam.tracking.matching import GATE, Matches
-from jaxslam.tracking.observations import Lost, Observations, Prediction
+from jaxslam.tracking.observations import Lost, Observations, Prediction, Slots
+from jaxslam.tracking.patches import Picture
 from jaxslam.tracking.search import search
 from jaxslam.tracking.settings import TrackerSettings
 
@@ -73,15 +74,14 @@ class Policy:
         return list(dict.fromkeys((one_point_ransac, ASSOCIATIONS[self.settings.association])))
 
     def observed(
-        self, image: UInt8[np.ndarray, "h w"], map: Map, predicted: Predicted, *, lost: bool
+        self, image: Picture, map: Map, predicted: Predicted, *, lost: bool
     ) -> tuple[Observations, Lost | None]:
         """The landmarks that a picture is searched for, and which matches of them are believed; or
         why none are. What was known before the search is what the table says of each."""
         expected = map.place.expected(predicted.view)
         look = partial(search, image, map.landmarks)
         # One linear update from matches that no linear prediction expects would be wrong, and sure.
-        several = self.ambiguous_start
-        searched = look(expected, self.calibration, self.settings, several=several)
+        searched = look(expected, self.calibration, self.settings, several=self.ambiguous_start)
         agree = partial(map.estimator.believes, predicted)
         seen = self.agreeing(*searched, map.landmarks, agree, lost=lost)
         if seen.matched.any() and _sigma(seen.covariances) > WIDE:
@@ -97,8 +97,7 @@ class Policy:
             seen = self.agreeing(*searched, map.landmarks, of_proven, lost=lost)
         reason = self.reason(seen, map.landmarks, agree, nis)
         if reason is not None:
-            labels = np.where(seen.matched, "outlier", seen.labels)
-            seen = seen._replace(labels=labels)
+            seen = seen._replace(labels=np.where(seen.matched, "outlier", seen.labels))
         prior = expected.pixels[seen.slots], expected.covariances[seen.slots]
         return seen._replace(predicted=prior[0], covariances=prior[1]), reason
 
@@ -129,11 +128,9 @@ class Policy:
             believed[:] = False
         labels[believed] = "matched"
         first, others = matches.first_of_each(rows)
-        return seen._replace(
-            pixels=np.where(believed[:, None], agreed, first),
-            variances=np.where(believed, variances, others),
-            labels=labels,
-        )
+        pixels = np.where(believed[:, None], agreed, first)
+        variances = np.where(believed, variances, others)
+        return seen._replace(pixels=pixels, variances=variances, labels=labels)
 
     def _closer(self, seen: Observations, given: Prediction) -> Prediction:
         """Return the prediction given what is matched, as far as it is to be trusted."""
@@ -168,8 +165,7 @@ class Policy:
         few = len(agreed.slots) <= MOST * len(known.slots)
         another = self._another(known.labelled("outlier"), len(agreed.slots), agree)
         self.doubtful = another or (self.doubtful and few)
-        unlikely = chi2.sf(*nis(agreed)) < BY_CHANCE
-        return Lost.CONTRADICTED if self.doubtful or unlikely else None
+        return Lost.CONTRADICTED if self.doubtful or (chi2.sf(*nis(agreed)) < BY_CHANCE) else None
 
     def _another(self, others: Observations, agreed: int, agree: Agreement) -> bool:
         """Return whether most of these, and many beside those that `agreed`, do so with another
@@ -185,7 +181,7 @@ class Policy:
 
     def _of_several(
         self,
-        slots: Int[np.ndarray, " k"],
+        slots: Slots,
         matches: Matches,
         landmarks: Mapping[int, Landmark],
         agree: Agreement,
@@ -221,9 +217,8 @@ class Policy:
         before = np.array([one.seen_at for one in landmarks]).reshape(-1, 2)
         lately = unseen == unseen.min(initial=unseen.max(initial=0))
         rigid = np.zeros_like(lately)
-        rigid[lately] = of_one_motion(
-            before[lately], pixels[lately], self.calibration, s.tolerance * s.pixel_sigma
-        )
+        sigma, pairs = s.tolerance * s.pixel_sigma, (before[lately], pixels[lately])
+        rigid[lately] = of_one_motion(*pairs, self.calibration, sigma)
         return lately, rigid
 
 
@@ -237,9 +232,8 @@ def _explained(seen: Observations, given: Prediction) -> bool:
     """Return whether a linear prediction given what is believed explains most of that."""
     slots = seen.slots[seen.matched]
     off = seen.pixels[seen.matched] - given.pixels[slots]
-    squared = np.einsum(
-        "ki,ki->k", off, np.linalg.solve(given.covariances[slots], off[..., None])[..., 0]
-    )
+    weighted = np.linalg.solve(given.covariances[slots], off[..., None])[..., 0]
+    squared = np.einsum("ki,ki->k", off, weighted)
     # The share that a linear prediction must explain for that second search.
     return bool(np.mean(squared < GATE) > 0.8)
 
@@ -256,9 +250,7 @@ def _alone(owner: Int[np.ndarray, " m"], among: Bool[np.ndarray, " m"]) -> Int[n
     return some[count[of] == 1]
 
 
-def proven(
-    slots: Int[np.ndarray, " k"], landmarks: Mapping[int, Landmark]
-) -> Bool[np.ndarray, " k"]:
+def proven(slots: Slots, landmarks: Mapping[int, Landmark]) -> Bool[np.ndarray, " k"]:
     """Return which of the slots hold landmarks that are proven."""
     return np.array([landmarks[slot].found >= PROVEN for slot in slots], bool)
 

@@ -11,12 +11,19 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+Transform = Float[np.ndarray, "4 4"]
+"""A pose as a matrix."""
+Positions = Float[np.ndarray, "n 3"]
+"""n points."""
+Spreads = Float[np.ndarray, "n 3 3"]
+"""Their covariances."""
+
 
 @dataclass(frozen=True)
 class PoseWithCovariance:
     """A pose and the covariance P of its error; by default the origin, known exactly."""
 
-    T_wc: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    T_wc: Transform = field(default_factory=lambda: np.eye(4))
     covariance: Float[np.ndarray, "6 6"] = field(default_factory=lambda: np.zeros((6, 6)))
 
     @property
@@ -43,9 +50,8 @@ class PoseWithCovariance:
         """
         A = adjoint(np.linalg.inv(step.T_wc))
         carried = A @ self.covariance @ A.T
-        return PoseWithCovariance(
-            self.T_wc @ step.T_wc, (carried + carried.T) / 2 + step.covariance
-        )
+        covariance = (carried + carried.T) / 2 + step.covariance
+        return PoseWithCovariance(self.T_wc @ step.T_wc, covariance)
 
     def scaled(self, scale: float) -> PoseWithCovariance:
         """Return the pose in a unit of length that is 1/scale as long."""
@@ -53,9 +59,7 @@ class PoseWithCovariance:
         T_wc[:3, 3] *= scale
         return PoseWithCovariance(T_wc, lengths[:, None] * self.covariance * lengths)
 
-    def points(
-        self, points: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
+    def points(self, points: Positions, covariances: Spreads) -> tuple[Positions, Spreads]:
         """Points seen from here, with their covariances, in the world.
 
         `R ((I + [θ]×) p + δ) + t`, so that to `p`'s covariance comes `J P Jᵀ`, `J = [I, −[p]×]`.
@@ -67,7 +71,7 @@ class PoseWithCovariance:
             return points @ R.T + t, R @ total @ R.T
 
 
-def adjoint(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
+def adjoint(T: Transform) -> Float[np.ndarray, "6 6"]:
     """`Ad(T)`, with `T Exp(e) = Exp(Ad(T) e) T`: `[[R, [t]× R], [0, R]]`, position first."""
     R = T[:3, :3]
     return np.block([[R, _cross(T[:3, 3]) @ R], [np.zeros((3, 3)), R]])

@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.landmarks import Landmark
 from jaxslam.tracking.map import in_view
 from jaxslam.tracking.matching import Matches, match_patches
-from jaxslam.tracking.observations import Observations, Prediction
-from jaxslam.tracking.patches import WINDOW
+from jaxslam.tracking.observations import Observations, Prediction, Slots
+from jaxslam.tracking.patches import WINDOW, Picture
 from jaxslam.tracking.settings import TrackerSettings
 
 
 def search(
-    image: UInt8[np.ndarray, "h w"],
+    image: Picture,
     landmarks: Mapping[int, Landmark],
     prediction: Prediction,
     calibration: Calibration,
@@ -31,17 +31,11 @@ def search(
     that is asked.
     """
     slots, affines = to_search(landmarks, prediction, calibration, settings)
-    seen = Observations(
-        slots,
-        prediction.pixels[slots],
-        prediction.covariances[slots],
-        np.full((len(slots), 2), np.nan),
-        np.zeros(len(slots)),
-        np.full(len(slots), "unmatched"),
-    )
-    warped = [
-        landmarks[slot].patch.warped(affine) for slot, affine in zip(slots, affines, strict=True)
-    ]
+    expected, count = (prediction.pixels[slots], prediction.covariances[slots]), len(slots)
+    nowhere, labels = np.full((count, 2), np.nan), np.full(count, "unmatched")
+    seen = Observations(slots, *expected, nowhere, np.zeros(count), labels)
+    pairs = zip(slots, affines, strict=True)
+    warped = [landmarks[slot].patch.warped(affine) for slot, affine in pairs]
     templates = np.array(warped, np.float32).reshape(-1, WINDOW, WINDOW)
     return seen, match_patches(image, templates, seen.predicted, seen.covariances, several=several)
 
@@ -51,7 +45,7 @@ def to_search(
     prediction: Prediction,
     calibration: Calibration,
     settings: TrackerSettings,
-) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k 2 2"]]:
+) -> tuple[Slots, Float[np.ndarray, "k 2 2"]]:
     """Slots to search, and how the picture around each changed since its first view.
 
     In front, in the picture, with a bearing that the lens can see, from where they still look
@@ -65,11 +59,8 @@ def to_search(
     affines = changes_of_view(landmarks, prediction, slots, calibration)
     zoomed = np.abs(np.log(np.clip(np.linalg.det(affines), 1e-6, 1e6)))
     # A patch that looks larger or smaller than at first by more is not like itself any more.
-    alike = [
-        i
-        for i in np.flatnonzero(zoomed < 2 * np.log(2.0))
-        if landmarks[slots[i]].patch.covers(affines[i])
-    ]
+    near = np.flatnonzero(zoomed < 2 * np.log(2.0))
+    alike = [i for i in near if landmarks[slots[i]].patch.covers(affines[i])]
     absent = ~in_view(landmarks, slots, s)
     alike.sort(key=lambda i: (absent[i], landmarks[slots[i]].number))
     order = np.array(alike[: s.wanted], int)
@@ -79,7 +70,7 @@ def to_search(
 def changes_of_view(
     landmarks: Mapping[int, Landmark],
     prediction: Prediction,
-    slots: Int[np.ndarray, " k"],
+    slots: Slots,
     calibration: Calibration,
 ) -> Float[np.ndarray, "k 2 2"]:
     """Return how the picture around each landmark changed since its first view; zero where it

@@ -121,19 +121,14 @@ class TrackerSettings:
 
     def make_filter(self, calibration: Calibration) -> AbstractFilter:
         """The filter that is named, with these numbers. Raises ValueError."""
-        distorted = any(calibration.distortion)
-        camera = Camera(
-            (calibration.fx, calibration.fy),
-            (calibration.cx, calibration.cy),
-            calibration.distortion if distorted else None,
-        )
+        distortion = calibration.distortion if any(calibration.distortion) else None
+        focal, centre = (calibration.fx, calibration.fy), (calibration.cx, calibration.cy)
+        camera = Camera(focal, centre, distortion)
+        accelerations = [self.acceleration_sigma] * 3 + [self.angular_acceleration_sigma] * 3
+        velocities = [self.velocity_sigma] * 3 + [self.angular_velocity_sigma] * 3
         return make_filter(
             self.filter,
-            motion=ConstantVelocity(
-                [self.acceleration_sigma] * 3 + [self.angular_acceleration_sigma] * 3,
-                [0.0] * 6,
-                [self.velocity_sigma] * 3 + [self.angular_velocity_sigma] * 3,
-            ),
+            motion=ConstantVelocity(accelerations, [0.0] * 6, velocities),
             sensor=Pinhole(camera, self.pixel_sigma),
             landmark=LANDMARKS[self.landmarks],
             calibration=self.treatment(calibration),
@@ -144,6 +139,5 @@ class TrackerSettings:
         """Return what the filter makes of a calibration, with the σ that it states or else with
         these."""
         name = self.calibration or ("estimated" if calibration.guessed else "known")
-        stated = [self.focal_sigma] * 2 + [self.centre_sigma] * 2
-        sigma = list(calibration.sigma) or stated
+        sigma = list(calibration.sigma) or ([self.focal_sigma] * 2 + [self.centre_sigma] * 2)
         return TREATMENTS[name](sigma[1:] if calibration.guessed else sigma)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, UInt8
 
 from jaxslam.filters.protocol import AbstractFilter, AbstractStaged
 from jaxslam.filters.slam import Slam
 from jaxslam.io.calibration import Calibration
 from jaxslam.models.frame import Robocentric, Submaps
+from jaxslam.tracking.patches import Picture, Places
 from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.target import Target, TargetObservation, known_depths, sighted
 
@@ -52,8 +52,8 @@ def _handing_over(made: AbstractStaged) -> AbstractStaged:
 
 def with_target(
     target: Target,
-    image: UInt8[np.ndarray, "h w"],
-    corners: Float[np.ndarray, "n 2"],
+    image: Picture,
+    corners: Places,
     calibration: Calibration,
     settings: TrackerSettings,
 ) -> tuple[TargetObservation, np.ndarray, tuple[np.ndarray, np.ndarray]]:

@@ -30,7 +30,6 @@ from jaxslam.tracking.trajectory import (
     relative_pose_error,
 )
 
-SCHEMA = 1
 WARM_UP = 3
 """Frames in which functions are compiled; they count in `seconds.start`, not in the quantiles."""
 TOO_SURE = (
@@ -56,7 +55,7 @@ def summarised(
     count = max(len(updates), 1)
     later = seconds[WARM_UP:] or seconds or [0.0]
     summary = {
-        "schema": SCHEMA,
+        "schema": 1,
         "version": __version__,
         "source": source.name,
         "filter": tracker.filter_name,
@@ -211,8 +210,7 @@ def _scale_between_maps(settings: TrackerSettings) -> float:
     A unit is known as well as what all depths of a scene have in common: at the worst as one of
     them, σ/ρ of its inverse depth, in each of the two maps.
     """
-    depth = settings.depth
-    return math.sqrt(2) * float(depth.sigma / depth.mean)
+    return math.sqrt(2) * float(settings.depth.sigma / settings.depth.mean)
 
 
 def _units(history: Sequence[Tracked]) -> list[Summary]:
@@ -221,16 +219,9 @@ def _units(history: Sequence[Tracked]) -> list[Summary]:
     units = []
     for number in range(history[-1].map + 1):
         of_map = [result for result in history if result.map == number]
-        fixed = (result.index for result in of_map if result.unit_fixed)
-        last = of_map[-1]
-        units.append(
-            {
-                "map": number,
-                "fixed_at": next(fixed, None),
-                "log_scale": last.log_scale,
-                "sigma_log_scale": last.sigma_log_scale,
-            }
-        )
+        fixed = next((result.index for result in of_map if result.unit_fixed), None)
+        told = {name: getattr(of_map[-1], name) for name in ("log_scale", "sigma_log_scale")}
+        units.append({"map": number, "fixed_at": fixed, **told})
     return units
 
 

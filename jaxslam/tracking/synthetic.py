@@ -11,11 +11,13 @@ from functools import cache
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.io.source import Image, Source, Trajectory
+from jaxslam.tracking.patches import Picture, Places
+from jaxslam.tracking.pose_with_covariance import Positions, Transform
 
 NOISE = 2.0  # standard deviation of the sensor noise, in grey levels
 SUPERSAMPLING = 2
@@ -35,9 +37,9 @@ class Quad:
     corner: Float[np.ndarray, " 3"]
     right: Float[np.ndarray, " 3"]
     down: Float[np.ndarray, " 3"]
-    texture: UInt8[np.ndarray, "h w"]
+    texture: Picture
 
-    def point(self, pixel: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    def point(self, pixel: Places) -> Positions:
         """World points (n, 3) in metres of texture positions x, y (n, 2) in texture pixels."""
         h, w = self.texture.shape
         x, y = (np.asarray(pixel, dtype=float) + 0.5).T[..., None] / np.array([w, h])[:, None, None]
@@ -56,9 +58,8 @@ def synthetic_source(
         if not value > 0:
             raise ValueError(f"{name} must be positive, not {value}")
     focal = 0.82 * max(width, height * 4 / 3)  # 63 degrees across, which the scene fills
-    calibration = Calibration(
-        width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, distortion=()
-    )
+    centre = (width - 1) / 2, (height - 1) / 2
+    calibration = Calibration(width, height, focal, focal, *centre)
     times = np.arange(frames) / rate
     T_wc = handheld_trajectory(times, seed)
 
@@ -93,9 +94,7 @@ def handheld_trajectory(
     return T_wc
 
 
-def render(
-    quads: Sequence[Quad], T_wc: Float[np.ndarray, "4 4"], calibration: Calibration
-) -> Image:
+def render(quads: Sequence[Quad], T_wc: Transform, calibration: Calibration) -> Image:
     """The noise-free picture of quads, painted in the order given, seen from the pose `T_wc`.
 
     Raises `ValueError` where a quad reaches behind the camera; distortion is not rendered.
@@ -146,7 +145,7 @@ def texture(
     density: tuple[float, float],
     base: float = 130.0,
     contrast: float = 90.0,
-) -> UInt8[np.ndarray, "h w"]:
+) -> Picture:
     """Random rectangles, discs and triangles of many sizes over soft noise, uint8 (h, w).
 
     `size` in metres and `density` in texture pixels a metre, both across and down; grey levels
@@ -166,11 +165,7 @@ def texture(
 
 
 def _shape(
-    image: UInt8[np.ndarray, "h w"],
-    rng: np.random.Generator,
-    radius: float,
-    squash: float,
-    grey: float,
+    image: Picture, rng: np.random.Generator, radius: float, squash: float, grey: float
 ) -> None:
     centre = rng.uniform((0, 0), image.shape[::-1])
     corners = int(rng.choice([3, 4, 4, 4, 24]))
@@ -181,9 +176,8 @@ def _shape(
     turn = rng.uniform(0, 2 * np.pi)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     points = centre + points @ rotation * (1.0, squash)
-    cv2.fillConvexPoly(
-        image, np.rint(points * 16).astype(np.int32), grey, lineType=cv2.LINE_AA, shift=4
-    )
+    sixteenths = np.rint(points * 16).astype(np.int32)
+    cv2.fillConvexPoly(image, sixteenths, grey, lineType=cv2.LINE_AA, shift=4)
 
 
 def _upright(
@@ -252,12 +246,7 @@ def _floor(rng: np.random.Generator, focal: float) -> list[Quad]:
     return strips
 
 
-def _paint(
-    canvas: UInt8[np.ndarray, "h w"],
-    quad: Quad,
-    T_wc: Float[np.ndarray, "4 4"],
-    camera: Float[np.ndarray, "3 3"],
-) -> None:
+def _paint(canvas: Picture, quad: Quad, T_wc: Transform, camera: Float[np.ndarray, "3 3"]) -> None:
     """Warp a quad onto the part of the canvas that it covers; nothing if it shows its back."""
     R_cw = T_wc[:3, :3].T
     corner = R_cw @ (quad.corner - T_wc[:3, 3])

@@ -11,16 +11,15 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from jaxslam._runtime.files import Json, read_json
 from jaxslam.io.calibration import Calibration
 from jaxslam.io.recording import read_image
+from jaxslam.tracking.patches import Picture, Places
+from jaxslam.tracking.pose_with_covariance import Positions, Transform
 
 LEAST_POINTS = 4
-_METRES = ("metre", "metres", "meter", "meters", "m")
-_ALIKE = 0.8
-"""Least correlation of a patch with the picture."""
 _CORNER_REACH = 3
 """Pixels to each side in which the corner that a patch shows is measured."""
 _LARGEST_RMS, _LARGEST_FOUND = 2.0, 0.75
@@ -35,7 +34,7 @@ class KnownPoint:
     position: Float[np.ndarray, " 3"]
     """The position in the target's own frame, m."""
     pixel: Float[np.ndarray, " 2"] | None = None
-    patch: UInt8[np.ndarray, "h w"] | None = None
+    patch: Picture | None = None
     """The picture around it, about as large as it is seen; its corner is in the middle."""
 
     def __post_init__(self) -> None:
@@ -54,21 +53,20 @@ class Target:
     def __post_init__(self) -> None:
         if len(self.points) < LEAST_POINTS:
             raise ValueError(f"has {len(self.points)} points; at least {LEAST_POINTS} are needed")
-        from_middle = self.positions - self.positions.mean(axis=0)
-        extent = np.linalg.svd(from_middle, compute_uv=False)
+        extent = np.linalg.svd(self.positions - self.positions.mean(axis=0), compute_uv=False)
         if extent[1] < 1e-3 * extent[0] or not extent[0]:
             raise ValueError("its points are on one line; they must span a plane")
 
     @property
-    def positions(self) -> Float[np.ndarray, "n 3"]:
+    def positions(self) -> Positions:
         return np.array([point.position for point in self.points])
 
 
 class TargetObservation(NamedTuple):
     """The place of a target in a picture, and how far away its points are."""
 
-    pixels: Float[np.ndarray, "n 2"]
-    T_ct: Float[np.ndarray, "4 4"]
+    pixels: Places
+    T_ct: Transform
     """The target's frame in the camera, m."""
     inverse_depths: Float[np.ndarray, " n"]
     """1/z, 1/m."""
@@ -94,7 +92,7 @@ def _from_fields(fields: Json, folder: Path) -> Target:
     if not isinstance(points, list):
         raise ValueError("has no list of points; expected an object with `points`")
     unit = fields.get("unit", "metre")
-    if unit not in _METRES:
+    if unit not in ("metre", "metres", "meter", "meters", "m"):
         raise ValueError(f"unit must be metre, not {unit!r}")
     return Target(tuple(_point(index, point, folder) for index, point in enumerate(points)))
 
@@ -105,12 +103,9 @@ def _point(index: int, fields: Json, folder: Path) -> KnownPoint:
     name = str(fields.get("name", index))
     position = _numbers(f"position of point {name}", fields.get("position"), 3)
     pixel, patch = fields.get("pixel"), fields.get("patch")
-    return KnownPoint(
-        name,
-        position,
-        None if pixel is None else _numbers(f"pixel of point {name}", pixel, 2),
-        None if patch is None else read_image(folder / str(patch)),
-    )
+    at = None if pixel is None else _numbers(f"pixel of point {name}", pixel, 2)
+    image = None if patch is None else read_image(folder / str(patch))
+    return KnownPoint(name, position, at, image)
 
 
 def _numbers(what: str, value: Json, count: int) -> Float[np.ndarray, " n"]:
@@ -124,7 +119,7 @@ def _numbers(what: str, value: Json, count: int) -> Float[np.ndarray, " n"]:
 
 
 def sighted(
-    target: Target, image: UInt8[np.ndarray, "h w"], calibration: Calibration, pixel_sigma: float
+    target: Target, image: Picture, calibration: Calibration, pixel_sigma: float
 ) -> TargetObservation:
     """The target in a picture, its pixels measured with `pixel_sigma`.
 
@@ -162,17 +157,15 @@ def _places_of(point: KnownPoint, image: np.ndarray, count: int) -> list[Float[n
         raise ValueError(f"the patch of point {name} is larger than the picture")
     alike = cv2.matchTemplate(image, patch, cv2.TM_CCOEFF_NORMED)
     highest = alike >= cv2.dilate(alike, np.ones((7, 7), np.uint8))
-    rows, columns = np.nonzero(highest & (alike > _ALIKE))
+    # The least correlation of a patch with the picture.
+    rows, columns = np.nonzero(highest & (alike > 0.8))
     if not len(rows):
         raise ValueError(f"the first picture shows nothing like the patch of point {name}")
     order = np.argsort(-alike[rows, columns])[:count]
-    middle = (np.array(patch.shape[::-1]) - 1) / 2
-    return list(np.stack([columns, rows], 1)[order] + middle)
+    return list(np.stack([columns, rows], 1)[order] + (np.array(patch.shape[::-1]) - 1) / 2)
 
 
-def _on_corners(
-    target: Target, image: np.ndarray, pixels: Float[np.ndarray, "n 2"]
-) -> Float[np.ndarray, "n 2"]:
+def _on_corners(target: Target, image: np.ndarray, pixels: Places) -> Places:
     """The corners beside where patches were found; pixels that were given stay."""
     found = np.array([point.patch is not None for point in target.points])
     reach = (_CORNER_REACH, _CORNER_REACH)
@@ -195,9 +188,7 @@ class _Pose(NamedTuple):
     rms: float
 
 
-def _pose(
-    positions: Float[np.ndarray, "n 3"], pixels: Float[np.ndarray, "n 2"], lens: _Lens
-) -> _Pose:
+def _pose(positions: Positions, pixels: Places, lens: _Lens) -> _Pose:
     """Return the pose from which the points are seen there (PnP); an infinite RMS where there is
     none."""
     found, turn, shift = cv2.solvePnP(positions, pixels, *lens, flags=cv2.SOLVEPNP_SQPNP)
@@ -211,18 +202,12 @@ def _pose(
     return _Pose(turn, shift, float(np.sqrt(np.mean(np.sum((seen[:, 0] - pixels) ** 2, axis=1)))))
 
 
-def _in_camera(
-    positions: Float[np.ndarray, "n 3"], turn: np.ndarray, shift: np.ndarray
-) -> Float[np.ndarray, "n 3"]:
+def _in_camera(positions: Positions, turn: np.ndarray, shift: np.ndarray) -> Positions:
     return positions @ cv2.Rodrigues(turn)[0].T + shift.ravel()
 
 
 def _sighting(
-    positions: Float[np.ndarray, "n 3"],
-    pixels: Float[np.ndarray, "n 2"],
-    lens: _Lens,
-    pose: _Pose,
-    pixel_sigma: float,
+    positions: Positions, pixels: Places, lens: _Lens, pose: _Pose, pixel_sigma: float
 ) -> TargetObservation:
     turn, shift = cv2.solvePnPRefineLM(positions, pixels, *lens, pose.turn, pose.shift)
     J = cv2.projectPoints(positions, turn, shift, *lens)[1][:, :6]
@@ -236,7 +221,7 @@ def _sighting(
 
 
 def _depth_sigma(
-    positions: Float[np.ndarray, "n 3"], turn: np.ndarray, covariance: Float[np.ndarray, "6 6"]
+    positions: Positions, turn: np.ndarray, covariance: Float[np.ndarray, "6 6"]
 ) -> Float[np.ndarray, " n"]:
     """σ of `z = (R(turn) p + shift)_z`, given the covariance of turn and shift."""
     _, of_turn = cv2.Rodrigues(turn)

@@ -189,10 +189,8 @@ class Tracker:
         begins its own. Raises ValueError as `load`, and for a map of another camera."""
         tracker = cls.load(path, filter)
         if tracker.calibration != calibration:
-            theirs, ours = (
-                f"{one.width} × {one.height}, fx {one.fx:g}"
-                for one in (tracker.calibration, calibration)
-            )
+            both = (tracker.calibration, calibration)
+            theirs, ours = (f"{one.width} × {one.height}, fx {one.fx:g}" for one in both)
             raise ValueError(
                 f"{path} is a map of another camera ({theirs}), not of this one ({ours})"
             )
@@ -242,9 +240,8 @@ class Tracker:
             self.map.seen = None  # nobody is to come back to it
             self.map.coast(predicted)
             return self._lost(frame, Lost.REVERSED)
-        seen, reason = self.policy.observed(
-            frame.image, self.map, predicted, lost=self.unmeasured > 0
-        )
+        lost = self.unmeasured > 0
+        seen, reason = self.policy.observed(frame.image, self.map, predicted, lost=lost)
         if reason is not None:
             self.map.remember()
         # Of two motions that contradict each other a place that is known says no more: it is one of

@@ -13,6 +13,7 @@ from jaxslam.evaluation import write_covariances as write_pose_covariances
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, Similarity, associated, similarity
 from jaxslam.evaluation.convention import Convention
 from jaxslam.io.tum import write_tum
+from jaxslam.tracking.pose_with_covariance import Positions
 
 TRACKED = Convention("split", "body")
 """The error whose covariances are written: position in the camera's axes, rotation vector."""
@@ -69,8 +70,7 @@ def write_covariances(
     it takes its unit for exactly known. The header says which, and the caveat if there is one.
     """
     convention = replace(TRACKED, scale="given" if given_scale else "marginal")
-    scale = _GIVEN_SCALE if given_scale else _KNOWN_SCALE
-    remark = "; ".join(filter(None, [scale, caveat]))
+    remark = "; ".join(filter(None, [_GIVEN_SCALE if given_scale else _KNOWN_SCALE, caveat]))
     write_pose_covariances(path, times, covariances, convention, length="map", remark=remark)
 
 
@@ -135,15 +135,13 @@ def relative_pose_error(
     apart = max(1, round(seconds / float(np.median(np.diff(pairs.times)))))
     if apart >= len(pairs.times):
         raise ValueError(f"no two poses of the trajectory are {seconds:g} s apart")
-    moved, true = (
-        np.linalg.inv(T[:-apart]) @ T[apart:] for T in (pairs.aligned(), pairs.reference)
-    )
+    both = (pairs.aligned(), pairs.reference)
+    moved, true = (np.linalg.inv(T[:-apart]) @ T[apart:] for T in both)
     error = np.linalg.inv(true) @ moved
-    angles = np.degrees(Rotation.from_matrix(error[:, :3, :3]).magnitude())
     return {
         "seconds": seconds,
         "translation": _rms(error[:, :3, 3]),
-        "rotation": _rms(angles[:, None]),
+        "rotation": _rms(np.degrees(Rotation.from_matrix(error[:, :3, :3]).magnitude())[:, None]),
         "way": _rms(true[:, :3, 3]),
     }
 
@@ -166,8 +164,7 @@ class _Pairs(NamedTuple):
 
     def alignment(self) -> Similarity:
         """The Sim(3) that takes the estimate to where it fits best."""
-        positions = (T[:, :3, 3] for T in (self.estimate, self.reference))
-        return similarity(*positions, scaled=True)
+        return similarity(*(T[:, :3, 3] for T in (self.estimate, self.reference)), scaled=True)
 
     def aligned(self) -> Float[np.ndarray, "k 4 4"]:
         """The estimate in the reference's world."""
@@ -205,17 +202,14 @@ def _by_orientation(
     return turn, float(np.degrees(np.sqrt(np.mean(angles**2))))
 
 
-def _sign(
-    turn: Rotation, estimate: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "n 3"]
-) -> float:
+def _sign(turn: Rotation, estimate: Positions, reference: Positions) -> float:
     """Return the correlation of the positions after that rotation."""
     turned = turn.apply(estimate)
     a, b = reference - reference.mean(0), turned - turned.mean(0)
     return float(np.sum(a * b) / np.sqrt(np.sum(a**2) * np.sum(b**2)))
 
 
-def _straight_line(times: Float[np.ndarray, " n"], positions: Float[np.ndarray, "n 3"]) -> float:
+def _straight_line(times: Float[np.ndarray, " n"], positions: Positions) -> float:
     """RMS distance to the least squares line `a + b t`: any line can be aligned to any other."""
     centred, t = positions - positions.mean(0), times - times.mean()
-    rest = centred - np.outer(t, t @ centred / (t @ t))
-    return _rms(rest)
+    return _rms(centred - np.outer(t, t @ centred / (t @ t)))

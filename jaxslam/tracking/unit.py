@@ -14,13 +14,20 @@ from jaxtyping import Float
 
 from jaxslam.tracking.estimator import CameraReport
 from jaxslam.tracking.observations import Prediction
-from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, adjoint, positive
+from jaxslam.tracking.pose_with_covariance import (
+    PoseWithCovariance,
+    Positions,
+    Spreads,
+    Transform,
+    adjoint,
+    positive,
+)
 
 Nearness = Mapping[int, float]
 """By a landmark's number: one by its distance from where the map begins, in the filter's unit."""
 
 
-def nearness(numbers: Mapping[int, int], points: Float[np.ndarray, "n 3"]) -> Nearness:
+def nearness(numbers: Mapping[int, int], points: Positions) -> Nearness:
     """Return the nearness of landmarks, whose numbers are given by their slots, at points in the
     frame in which the map begins."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # at infinity, or nowhere
@@ -81,9 +88,7 @@ class MapInWorld:
             self.log_unit += lengthened(self.near, near, found)
         self._take(report)
 
-    def correct(
-        self, T_bc: Float[np.ndarray, "4 4"], covariance: Float[np.ndarray, "6 6"]
-    ) -> Float[np.ndarray, "4 4"]:
+    def correct(self, T_bc: Transform, covariance: Float[np.ndarray, "6 6"]) -> Transform:
         """Take over what a loop says of the present camera, in the filter's unit: T from the world
         as it was to the world as it is now."""
         before = self.camera.T_wc
@@ -104,7 +109,7 @@ class MapInWorld:
         return view._replace(T_wc=T_wc, omegas=view.omegas / self.unit)
 
     def points(
-        self, points: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
+        self, points: Positions, covariances: Spreads
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The filter's points in the world with their covariances, and with those that are given
         where the map begins."""
@@ -121,7 +126,7 @@ class MapInWorld:
         self.sigma_log_scale = float(np.sqrt(variance)) if variance > 0 else None
 
     @property
-    def _moved(self) -> Float[np.ndarray, "4 4"]:
+    def _moved(self) -> Transform:
         """By how much a loop moved what is here, from where the map begins."""
         return self.known.T_wc @ np.linalg.inv(self.told.T_wc)
 

@@ -18,9 +18,7 @@ from jaxslam.tracking.overlay import COLOURS, search_ellipses
 from jaxslam.tracking.report import Tracked
 
 _IMAGE = "world/camera/image"
-_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
 _TRACKED, _LOST = (0, 114, 178), (150, 150, 150)  # of the path
-_LOOP = (213, 94, 0)
 
 
 class Viewer:
@@ -79,12 +77,9 @@ class Viewer:
         quaternions = Rotation.from_matrix(axes).as_quat() if len(axes) else np.zeros((0, 4))
         sigmas = np.sqrt(np.maximum(variances, 0.0))
         colour = _rgb("matched")
-        ellipsoids = rr.Ellipsoids3D(
-            half_sizes=sigmas, centers=known.points, quaternions=quaternions, colors=colour
-        )
-        labels = [
-            f"{number}, map {of}" for number, of in zip(known.numbers, known.maps, strict=True)
-        ]
+        shapes = {"half_sizes": sigmas, "centers": known.points, "quaternions": quaternions}
+        ellipsoids = rr.Ellipsoids3D(**shapes, colors=colour)
+        labels = [f"{one}, map {of}" for one, of in zip(known.numbers, known.maps, strict=True)]
         points = rr.Points3D(known.points, colors=colour, labels=labels, show_labels=False)
         self._record.log("world/landmarks/sigma", ellipsoids)
         self._record.log("world/landmarks", points)
@@ -94,7 +89,7 @@ class Viewer:
 
     def _show_picture(self, frame: Frame, result: Tracked) -> None:
         rr = self._rerun
-        jpeg = cv2.imencode(".jpg", frame.image, _JPEG)[1].tobytes()
+        jpeg = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
         self._record.log(_IMAGE, rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
         table = result.observations.with_new(result.created)
         for label in COLOURS:
@@ -132,7 +127,7 @@ class Viewer:
             self._record.log("world/graph/submaps", ends)
         if result.loop in self._ends:
             self._loops.append([result.T_wc[:3, 3], self._ends[result.loop]])
-            self._record.log("world/graph/loops", rr.LineStrips3D(self._loops, colors=_LOOP))
+            self._record.log("world/graph/loops", rr.LineStrips3D(self._loops, colors=(213, 94, 0)))
 
     def _show_numbers(self, result: Tracked) -> None:
         rr, camera = self._rerun, result.camera
@@ -147,9 +142,8 @@ class Viewer:
             if number is not None:
                 self._record.log(name, rr.Scalars(number))
         if self._before is None or self._before.state != result.state:
-            level = "WARN" if result.lost else "INFO"
             text = f"frame {result.index}: {result.state}, map {result.map}"
-            self._record.log("state", rr.TextLog(text, level=level))
+            self._record.log("state", rr.TextLog(text, level="WARN" if result.lost else "INFO"))
 
 
 def _rerun() -> ModuleType:

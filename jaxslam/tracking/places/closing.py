@@ -11,16 +11,18 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float
 from scipy.stats import chi2
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.map import Map
-from jaxslam.tracking.observations import Prediction
+from jaxslam.tracking.observations import Prediction, Slots
+from jaxslam.tracking.patches import Picture
 from jaxslam.tracking.places.descriptors import candidates, described_corners
 from jaxslam.tracking.places.relocalisation import FEWEST, MOST_OF, TRIED, pose_of, well_known
 from jaxslam.tracking.places.submaps import Submap, loop_of
 from jaxslam.tracking.pointcloud import seen_from
+from jaxslam.tracking.pose_with_covariance import Transform
 from jaxslam.tracking.search import search
 
 APART = 3
@@ -45,14 +47,11 @@ class Closed(NamedTuple):
         return self.nis < GATE
 
 
-def close_loop(
-    image: UInt8[np.ndarray, "h w"], map: Map, calibration: Calibration
-) -> Closed | None:
+def close_loop(image: Picture, map: Map, calibration: Calibration) -> Closed | None:
     """Return which earlier submap the picture at the end of the latest one shows: if that is
     believed, the `map` has learnt of it."""
     *earlier, latest = map.submaps
-    apart = max(APART, len(earlier) // 8)
-    if map.loops and len(earlier) - int(map.loops[-1].submaps[1]) < apart:
+    if map.loops and len(earlier) - int(map.loops[-1].submaps[1]) < max(APART, len(earlier) // 8):
         return None
     kept = map.charted.keys() - set(latest.numbers.tolist())
     if not kept:
@@ -79,12 +78,12 @@ def close_loop(
 
 
 def _seen_in(
-    image: UInt8[np.ndarray, "h w"],
+    image: Picture,
     submap: Submap,
     by_number: Mapping[int, Float[np.ndarray, " 2"]],
     map: Map,
     calibration: Calibration,
-) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "4 4"]] | None:
+) -> tuple[Slots, Transform] | None:
     """The slots of the landmarks of a submap in a picture, and where its camera is from the last of
     the submap."""
     sure = well_known(submap.points, submap.covariances) & np.asarray(submap.frozen.carried)
@@ -95,14 +94,8 @@ def _seen_in(
     if posed is None:
         return None
     landmarks = {s: map.charted[numbers[s]] for s in np.flatnonzero(sure).tolist()}
-    seen, matches = search(
-        image,
-        landmarks,
-        _expected(submap, posed[0], sure, map.place.unit, calibration),
-        calibration,
-        map.settings,
-        several=False,
-    )
+    expected = _expected(submap, posed[0], sure, map.place.unit, calibration)
+    seen, matches = search(image, landmarks, expected, calibration, map.settings, several=False)
     if len(matches.owner) < max(FEWEST, MOST_OF * len(seen.slots)):
         return None
     slots = seen.slots[matches.owner]
@@ -112,7 +105,7 @@ def _seen_in(
 
 def _expected(
     submap: Submap,
-    T: Float[np.ndarray, "4 4"],
+    T: Transform,
     sure: Bool[np.ndarray, " slots"],
     unit: float,
     calibration: Calibration,
@@ -123,11 +116,6 @@ def _expected(
     in_unit[:3, 3] *= unit
     X = (submap.points - T[:3, 3]) @ T[:3, :3] * unit
     # σ of the place of a landmark seen from the pose that its descriptors tell, pixels.
-    return Prediction(
-        pixels,
-        spread + 3.0**2 * np.eye(2),
-        sure & np.isfinite(pixels[:, 0]),
-        submap.camera.T_wc @ in_unit,
-        X,
-        np.ones(len(X)),
-    )
+    spread = spread + 3.0**2 * np.eye(2)
+    usable, T_wc = sure & np.isfinite(pixels[:, 0]), submap.camera.T_wc @ in_unit
+    return Prediction(pixels, spread, usable, T_wc, X, np.ones(len(X)))

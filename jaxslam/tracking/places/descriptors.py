@@ -9,18 +9,19 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jaxslam.tracking.landmarks import Landmark
+from jaxslam.tracking.patches import Picture, Places
 
 CORNERS = 600
 """The number of corners of a picture that are compared."""
 LOOKS = 3
 """Descriptors of a landmark that are kept, of different frames."""
 
-Corners = tuple[Float[np.ndarray, "n 2"], UInt8[np.ndarray, "n 32"]]
+Corners = tuple[Places, UInt8[np.ndarray, "n 32"]]
 """The corners of a picture: pixels and descriptors."""
 
 
 def describe(
-    image: UInt8[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"]
+    image: Picture, pixels: Places
 ) -> tuple[UInt8[np.ndarray, "n 32"], Bool[np.ndarray, " n"]]:
     """Return upright ORB descriptors of these pixels, and which have one: not those at the edge."""
     places = enumerate(pixels.astype(float).tolist())
@@ -33,7 +34,7 @@ def describe(
     return descriptors, there
 
 
-def note_looks(landmarks: Iterable[Landmark], image: UInt8[np.ndarray, "h w"]) -> None:
+def note_looks(landmarks: Iterable[Landmark], image: Picture) -> None:
     """Note what landmarks look like in the latest picture, those that it shows."""
     shown = [one for one in landmarks if not one.unseen]
     pixels = np.array([one.seen_at for one in shown]).reshape(-1, 2)
@@ -42,7 +43,7 @@ def note_looks(landmarks: Iterable[Landmark], image: UInt8[np.ndarray, "h w"]) -
             one.looks = np.concatenate([one.looks, descriptor[None]])[-LOOKS:]
 
 
-def described_corners(image: UInt8[np.ndarray, "h w"]) -> Corners:
+def described_corners(image: Picture) -> Corners:
     """Return the corners of a picture, (n, 2), and their descriptors."""
     found = cv2.goodFeaturesToTrack(image, CORNERS, 0.01, 7)
     corners = np.zeros((0, 2)) if found is None else found[:, 0].astype(float)

@@ -11,23 +11,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from scipy.stats import median_abs_deviation
 
 from jaxslam.tracking.estimator import Correction
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.map import Map, Remembered
 from jaxslam.tracking.observations import Observations
+from jaxslam.tracking.patches import Picture, Places
 from jaxslam.tracking.places.relocalisation import known_again, well_known
 from jaxslam.tracking.places.submaps import Submap, in_submaps
 from jaxslam.tracking.policy import Policy
-from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, adjoint, positive
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, Transform, adjoint, positive
 from jaxslam.tracking.report import Tracked
 
 LOOKED_EVERY = 15
 """Frames between two in which another map is looked for."""
-NEAR = 2.0
-"""The most pixels between two landmarks, one of each map, that are the same point."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class Join:
     """The number of the other map."""
     step: int
     """The frame, counted from 0, whose camera is in the other map."""
-    moved: Float[np.ndarray, "4 4"]
+    moved: Transform
     """The motion of that camera since the frame before, in the map's own unit."""
     log_ratio: float
     """The log of the map's unit in that of the other."""
@@ -49,7 +48,7 @@ class Join:
 
 
 def known_elsewhere(
-    image: UInt8[np.ndarray, "h w"], map: Map, policy: Policy, joins: Sequence[Join]
+    image: Picture, map: Map, policy: Policy, joins: Sequence[Join]
 ) -> tuple[Observations, Correction] | None:
     """Do what `known_again` does for a camera that is not lost and maps that are not joined to its
     own."""
@@ -72,7 +71,7 @@ def _world(number: int, joins: Sequence[Join]) -> int:
     return number
 
 
-def join_of(before: Remembered, map: Map, step: int, last: Float[np.ndarray, "4 4"]) -> Join | None:
+def join_of(before: Remembered, map: Map, step: int, last: Transform) -> Join | None:
     """The map as it was `before` joined to that in which the camera was known again in this frame;
     `last` is T of the camera in the frame before. None where too few landmarks are of both."""
     now, settings, slam = map.now(), map.settings, map.estimator.slam
@@ -83,7 +82,8 @@ def join_of(before: Remembered, map: Map, step: int, last: Float[np.ndarray, "4 
         return None
     apart = np.linalg.norm(pixels[:, None] - others, axis=2)
     i, j = np.arange(len(pixels)), np.argmin(apart, axis=1)
-    same = (apart[i, j] < NEAR) & (np.argmin(apart, axis=0)[j] == i)
+    # The most pixels between two landmarks, one of each map, that are the same point.
+    same = (apart[i, j] < 2.0) & (np.argmin(apart, axis=0)[j] == i)
     # The fewest such pairs that join two maps.
     if same.sum() < 6:
         return None
@@ -154,7 +154,7 @@ def _joined_points(
 
 def _depths(
     one: Remembered, present: Submap
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+) -> tuple[Places, Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Of the landmarks that the latest frame shows: pixels, depths in the map's unit, and the
     variances of their logs."""
     slots = np.array([slot for slot, x in one.landmarks.items() if not x.unseen], int)

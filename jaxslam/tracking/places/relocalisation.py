@@ -13,14 +13,16 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float
 
 from jaxslam.io.calibration import Calibration
 from jaxslam.tracking.estimator import Correction
 from jaxslam.tracking.map import Map
-from jaxslam.tracking.observations import Observations
+from jaxslam.tracking.observations import Observations, Slots
+from jaxslam.tracking.patches import Picture
 from jaxslam.tracking.places.descriptors import candidates, described_corners
 from jaxslam.tracking.policy import Policy
+from jaxslam.tracking.pose_with_covariance import Positions, Spreads, Transform
 
 FEWEST = 12
 """The fewest matches of one pose, and landmarks found again, for which a camera is relocalised."""
@@ -36,9 +38,7 @@ NOTED_EVERY = 5
 """Frames between two in which landmarks are described."""
 
 
-def well_known(
-    points: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
-) -> Bool[np.ndarray, " n"]:
+def well_known(points: Positions, covariances: Spreads) -> Bool[np.ndarray, " n"]:
     """Return which points a pose may be found from."""
     with np.errstate(invalid="ignore"):  # at infinity
         sigma = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
@@ -48,7 +48,7 @@ def well_known(
 
 def pose_of(
     points: Float[np.ndarray, "m 3"], pixels: Float[np.ndarray, "m 2"], calibration: Calibration
-) -> tuple[Float[np.ndarray, "4 4"], Int[np.ndarray, " k"]] | None:
+) -> tuple[Transform, Slots] | None:
     """Return T_wc of a picture that shows most of these points at these pixels, and which of them;
     None if `FEWEST` of them cannot be seen at once."""
     if len(points) < FEWEST:
@@ -74,7 +74,7 @@ def pose_of(
 
 
 def known_again(
-    image: UInt8[np.ndarray, "h w"], map: Map, policy: Policy, but: Container[int] = ()
+    image: Picture, map: Map, policy: Policy, but: Container[int] = ()
 ) -> tuple[Observations, Correction] | None:
     """Return what is found of the landmarks in the first place that the picture shows, of those of
     which it shows the most candidates, and of all maps `but` some: that is then the `map`,
@@ -100,10 +100,7 @@ def known_again(
 
 
 def _found(
-    image: UInt8[np.ndarray, "h w"],
-    by_number: Mapping[int, Float[np.ndarray, " 2"]],
-    map: Map,
-    policy: Policy,
+    image: Picture, by_number: Mapping[int, Float[np.ndarray, " 2"]], map: Map, policy: Policy
 ) -> tuple[Observations, Correction] | None:
     """The landmarks of this map in a picture that shows some at these pixels, and what they make of
     it."""

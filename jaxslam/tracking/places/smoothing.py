@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from jaxslam.tracking.landmarks import Points
 from jaxslam.tracking.map import Map, Remembered
 from jaxslam.tracking.places.submaps import Graph, Solved
-from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, adjoint
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, Transform, adjoint
 from jaxslam.tracking.report import Tracked
 
 
@@ -71,13 +71,13 @@ class _Part:
         return PoseWithCovariance(T, (1 - share) * first + share * last + between)
 
 
-def _carried(P: Float[np.ndarray, "6 6"], T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
+def _carried(P: Float[np.ndarray, "6 6"], T: Transform) -> Float[np.ndarray, "6 6"]:
     """Return the covariance of a camera from which the one of this covariance is at T."""
     A = adjoint(T)
     return A @ P @ A.T
 
 
-def _part_of(T: Float[np.ndarray, "4 4"], share: float) -> Float[np.ndarray, "4 4"]:
+def _part_of(T: Transform, share: float) -> Transform:
     part = np.eye(4)
     turn = Rotation.from_matrix(T[:3, :3]).as_rotvec()
     part[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix()
@@ -90,10 +90,8 @@ def _parts(one: Remembered, graph: Graph, solved: Solved) -> list[_Part]:
     place, unit = one.place, one.place.unit
     submaps = [*graph.submaps, graph.present]
     told = [PoseWithCovariance(), *(submap.told.scaled(unit) for submap in submaps)]
-    known = [
-        place.origin.then(PoseWithCovariance(T, P).scaled(unit))
-        for T, P in zip(solved.T_bc, solved.covariances, strict=True)
-    ]
+    pairs = zip(solved.T_bc, solved.covariances, strict=True)
+    known = [place.origin.then(PoseWithCovariance(T, P).scaled(unit)) for T, P in pairs]
     begins = [place.origin, *known[:-1]]
     reported = [place.origin.T_wc, *(submap.camera.T_wc for submap in one.submaps)]
     return [

@@ -28,7 +28,8 @@ from jaxslam.filters.submaps.chain import Chain, Link, SubmapMean, base_poses, l
 from jaxslam.filters.submaps.closing import Posterior, posterior
 from jaxslam.filters.submaps.handover import Frozen
 from jaxslam.geometry import difference, retract
-from jaxslam.tracking.pose_with_covariance import PoseWithCovariance
+from jaxslam.tracking.observations import Slots
+from jaxslam.tracking.pose_with_covariance import PoseWithCovariance, Transform
 from jaxslam.tracking.settings import TrackerSettings
 
 LEAST = 8
@@ -105,7 +106,7 @@ class Compared(NamedTuple):
 
     nis: np.ndarray
     """The NIS by the filter's covariance, with six degrees of freedom and no `unit_variance`."""
-    T_bc: Float[np.ndarray, "4 4"]
+    T_bc: Transform
     """The present camera from where the map begins, given the loop to first order."""
     covariance: Float[np.ndarray, "6 6"]
     """The covariance of that camera, in the filter's unit."""
@@ -163,8 +164,8 @@ def loop_of(
     slam: AbstractStaged,
     submaps: Sequence[Submap],
     which: tuple[int, int],
-    slots: Int[np.ndarray, " k"],
-    T: Float[np.ndarray, "4 4"],
+    slots: Slots,
+    T: Transform,
     sigma: float,
     most: int,
 ) -> LoopClosure:
@@ -324,8 +325,7 @@ def _given(chain: Chain, loops: LoopClosure) -> Posterior:
 @Program
 def _compared(known: Posterior, new: LoopClosure) -> tuple[Array, Array, Array]:
     def both(states: SubmapMean) -> PyTree:
-        camera = _row(base_poses(known.chain, states), -1)
-        return camera, _error(known.chain, new, states)
+        return _row(base_poses(known.chain, states), -1), _error(known.chain, new, states)
 
     (T_BC, error), P = known.marginal(both)
     P = P / known.unit_variance()
