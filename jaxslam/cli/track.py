@@ -126,29 +126,39 @@ class TrackOptions:
         from jaxslam.tracking.synthetic import synthetic_source
 
         if self.source is not None:
-            place = self.source if self.topic is None else f"{self.source}:{self.topic}"
-            # A target's pixels are those of the pictures as they are.
-            scale = 1.0 if self.scale is None and self.target else self.scale
-            same = ("calibration", "fov", "reference", "rate", "start", "every", "frames")
-            return open_source(place, scale=scale, **{name: getattr(self, name) for name in same})
+            return open_source(
+                self.source if self.topic is None else f"{self.source}:{self.topic}",
+                calibration=self.calibration,
+                fov=self.fov,
+                reference=self.reference,
+                rate=self.rate,
+                start=self.start,
+                every=self.every,
+                frames=self.frames,
+                # A target's pixels are those of the pictures as they are.
+                scale=1.0 if self.scale is None and self.target else self.scale,
+            )
         if self.calibration or self.fov is not None or self.reference or self.target or self.topic:
             raise ValueError(
                 "--calibration, --fov, --reference, --target and --topic need a SOURCE: the "
                 "synthetic video has its own calibration and reference"
             )
-        frames = 150 if self.frames is None else self.frames
-        source = synthetic_source(frames=frames, seed=self.seed)
+        source = synthetic_source(
+            frames=150 if self.frames is None else self.frames, seed=self.seed
+        )
         part = selected(source, start=self.start, every=self.every)
         return part if self.scale is None else resized(part, self.scale)
 
     def _settings(self):
         metric = self.filter == "recommended" and self.target is not None
-        same = (
-            "landmarks", "nearest_depth", "pixel_sigma", "acceleration_sigma",
-            "angular_acceleration_sigma", "association", "wanted",
-        )  # fmt: skip
         return TrackerSettings(
             filter=METRIC if metric else self.filter,
+            landmarks=self.landmarks,
             calibration=self.calibration_treatment,
-            **{name: getattr(self, name) for name in same},
+            nearest_depth=self.nearest_depth,
+            pixel_sigma=self.pixel_sigma,
+            acceleration_sigma=self.acceleration_sigma,
+            angular_acceleration_sigma=self.angular_acceleration_sigma,
+            association=self.association,
+            wanted=self.wanted,
         )
