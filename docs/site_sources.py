@@ -13,7 +13,7 @@ import jaxslam
 
 ROOMS = (
     "evaluation", "consistency", "statistics", "simulation", "filters", "models", "landmarks",
-    "triangulation", "plots", "io", "tracking", "cli", "geometry", "linalg",
+    "testing", "triangulation", "plots", "io", "tracking", "cli", "geometry", "linalg",
     "_numerics", "_runtime", "native",
 )  # fmt: skip
 """Rooms and files of the package in the order of the site: what users meet first comes first."""
