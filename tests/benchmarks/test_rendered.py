@@ -1,4 +1,4 @@
-"""Tests of benchmarks/ray_caster.py and its videos: the truth is that of the pixels."""
+"""Tests of benchmarks/rendered_videos.py: the truth is that of the pixels."""
 
 import json
 from pathlib import Path
@@ -9,7 +9,7 @@ import pytest
 import rendered
 import rendered_videos as benchmark
 from numpy.testing import assert_allclose
-from ray_caster import Body, Paint, render
+from rendered_videos import Body, Paint, render
 from scipy.spatial.transform import Rotation
 
 CAMERA = benchmark.CALIBRATION
