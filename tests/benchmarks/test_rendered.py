@@ -49,7 +49,7 @@ def test_a_box_is_seen_where_its_corners_are_projected(yaw):
     assert_allclose(mass / 100, moments["m00"], rtol=2e-3)
 
 
-@pytest.mark.parametrize("material", range(4))
+@pytest.mark.parametrize("material", [0, 3])
 def test_textures_stay_where_they_are_on_a_wall(material):
     wall = Body((0, 0, 4), (6, 6, 1), Paint(material, 130.0, 90.0, 110.0))
     first, second = np.eye(4), pose(0.02, 0.05, 0.03, position=(0.25, -0.1, 0.2))
@@ -77,20 +77,20 @@ def test_a_sphere_and_a_room_from_inside_hide_what_is_behind():
     assert_allclose(np.sum(picture > 75), np.pi * radius**2, rtol=0.01)
 
 
-@pytest.mark.parametrize("name", ["boxes", "turn+blur+exposure", "orbit"])
+@pytest.mark.parametrize("name", ["turn+blur+exposure", "orbit"])
 def test_a_video_is_the_same_again_and_from_its_pictures(name, tmp_path):
-    source = benchmark.rendered_source(name, 3, 2)
+    source = benchmark.rendered_source(name, 3, 1)
     fresh, written, read = (
         [frame.image for frame in of]
-        for of in (source, *2 * (benchmark.rendered_source(name, 3, 2, tmp_path),))
+        for of in (source, *2 * (benchmark.rendered_source(name, 3, 1, tmp_path),))
     )
-    assert len(list(tmp_path.glob(f"{name}-3/*.png"))) == 2
+    assert len(list(tmp_path.glob(f"{name}-3/*.png"))) == 1
     assert_allclose(written, fresh)
     assert_allclose(read, fresh)
 
 
 def test_the_truth_of_a_video_is_that_of_its_pictures():
-    source = benchmark.rendered_source("boxes", 0, 3)
+    source = benchmark.rendered_source("boxes", 0, 2)
     bodies = benchmark.KINDS["boxes"].scene(np.random.default_rng([0, 0]))
     for frame, T_wc in zip(source, truth(source).T_wc, strict=True):
         difference = frame.image - render(bodies, T_wc, CAMERA, 110.0)
