@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Union
 
 import jax
 import tyro
@@ -79,8 +79,14 @@ class Benchmark(ABC):
     @classmethod
     def run(cls) -> None:
         """The command line, which a file's first lines describe."""
-        jax.config.update("jax_enable_x64", cls.double)
-        tyro.cli(cls, description=sys.modules[cls.__module__].__doc__)()
+        run_one(cls)
+
+
+def run_one(*benchmarks: type[Benchmark]) -> None:
+    """The command line of a file of several benchmarks: the name of one, and its options."""
+    first, *_ = benchmarks
+    jax.config.update("jax_enable_x64", first.double)
+    tyro.cli(Union[benchmarks], description=sys.modules[first.__module__].__doc__)()  # noqa: UP007
 
 
 def write_page(path: Path, text: str) -> None:

@@ -43,12 +43,15 @@ def test_an_addition_is_one_short_class(addition, most):
     assert len(inspect.getsource(addition).splitlines()) <= most
 
 
+@pytest.mark.slow
 def test_a_landmark_of_ones_own_is_studied():
+    """What a landmark outside the package would lack: a quick test has range and bearing."""
     scenario = jaxslam.scenario("matched-tight", steps=8)
     found = verdict(scenario, paper(scenario, landmark=PlainHomogeneous()))
     assert not_disproved(found), found
 
 
+@pytest.mark.slow
 def test_a_sensor_of_ones_own_is_simulated_and_studied():
     """All directions: a point behind is seen, and an angle that jumps by 2π is no error."""
     scenario = jaxslam.scenario("positions", steps=25, landmarks=8)

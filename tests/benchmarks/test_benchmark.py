@@ -7,7 +7,8 @@ from pathlib import Path
 
 import jax
 import pytest
-from benchmark import END, Benchmark, number, table, write_table
+import verdicts
+from benchmark import END, Benchmark, number, run_one, table, write_table
 
 MARK = "<!-- counted -->"
 
@@ -78,3 +79,12 @@ def test_a_page_without_a_place_and_a_broken_file_are_refused(folder):
 )
 def test_numbers_of_a_table_are_short(value, said):
     assert number(value) == said
+
+
+def test_of_several_benchmarks_in_a_file_the_command_names_one(monkeypatch, tmp_path):
+    out = tmp_path / "x.json"
+    told = ["verdicts.py", "mistakes", "--studies", "2", "--out", str(out), "--docs", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", told)
+    monkeypatch.setattr(verdicts.Mistakes, "measure", lambda self: iter([{"of": self.studies}]))
+    run_one(verdicts.Verdicts, verdicts.Mistakes)
+    assert json.loads(out.read_text()) == {"of": 2}

@@ -11,6 +11,8 @@ from cases import Case, close, quick_jit
 from modes import Modes, followed, given_scale, modes_of_run
 from modes_figure import Worlds, plot_modes, worlds_of
 
+pytestmark = pytest.mark.laboratory
+
 STEPS, WINDOW = 6, 4
 LEFT, RIGHT = np.array([-0.1, 0.0]), np.array([0.1, 0.01])
 
@@ -67,7 +69,6 @@ def through():
         return modes_of_run(slam, of.room, of.run(0))
 
 
-@pytest.mark.slow
 def test_the_modes_of_a_run_end_where_frames_are_merged():
     """The window of four frames after frame 0 is full in the fourth."""
     modes = through()

@@ -28,7 +28,9 @@ def test_a_mutant_is_the_source_with_one_line_changed():
         assert [i for i, (a, b) in enumerate(lines, 1) if a != b] == [site.line]
 
 
+@pytest.mark.slow
 def test_they_are_drawn_of_every_room_by_a_seed():
+    """A room that is left out; the whole package is read three times."""
     chosen = mutations.drawn(60, 1)
     assert chosen == mutations.drawn(60, 1) != mutations.drawn(60, 2)
     assert len(chosen) == len(set(chosen)) == 60
@@ -37,7 +39,10 @@ def test_they_are_drawn_of_every_room_by_a_seed():
 
 @pytest.mark.parametrize(
     ("body", "told"),
-    [("assert x > 0", "survived"), ("assert x == 3", "FAILED")],
+    [
+        pytest.param("assert x > 0", "survived", marks=pytest.mark.slow),
+        ("assert x == 3", "FAILED"),
+    ],
 )
 def test_a_mutant_is_caught_by_a_test_that_fails(tmp_path, body, told):
     path = tmp_path / "jaxslam" / "linalg.py"

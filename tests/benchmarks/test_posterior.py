@@ -52,6 +52,8 @@ import jaxslam
 from jaxslam._runtime.watchdog import lapack_calls
 from jaxslam.geometry import difference, retract
 
+pytestmark = pytest.mark.laboratory
+
 LOOSE = jaxslam.scenario("matched-loose", steps=3, landmarks=4)
 SPATIAL = jaxslam.scenario("matched-6dof-loose", steps=2, landmarks=3)
 NEARLY_LINEAR = jaxslam.scenario(
@@ -145,7 +147,6 @@ def test_without_a_bound_the_truncated_normal_is_the_normal():
     np.testing.assert_allclose(truncated_normal(y, jnp.asarray(-jnp.inf)), y, atol=1e-12)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("scenario", [LOOSE, SPATIAL], ids=["planar", "spatial"])
 def test_residuals_and_their_jacobian_are_those_of_a_dense_computation(scenario):
     problem, _ = problem_of(scenario)
@@ -176,7 +177,6 @@ def test_a_landmark_that_is_not_visible_tells_nothing_and_one_behind_is_impossib
     assert quick_jit(log_density)(problem, past) == -jnp.inf
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("truncated", [True, False])
 def test_the_conditional_variables_have_the_jacobian_that_they_claim(truncated):
     problem, _ = problem_of(LOOSE, truncated=truncated)
@@ -224,7 +224,6 @@ def nearly_linear():
     return jax.tree.map(lambda x: x[0], (problems, runs, modes, chains))
 
 
-@pytest.mark.slow
 def test_on_a_nearly_linear_problem_map_hmc_and_the_filter_agree():
     problem, run, mode, chains = nearly_linear()
     assert bool(mode.converged)
@@ -346,7 +345,6 @@ def test_chains_and_starts_use_no_key_of_the_simulator_and_none_twice():
     assert not found[0] & found[1]
 
 
-@pytest.mark.slow
 @pytest.mark.statistics
 def test_the_posterior_is_calibrated():
     """Ranks and NEES over 40 problems; false alarms: 0.4 % by six ranks, 0.1 % by the NEES."""
@@ -441,7 +439,6 @@ def test_sizes_that_make_no_sense_are_refused():
         uniformity(np.zeros((2, 1), int), 98)
 
 
-@pytest.mark.slow
 def test_no_posterior_calls_lapack():
     chosen = jaxslam.scenario("matched", landmarks=3)
     study = Study(chosen, steps=2, hmc=HMC(chains=2))

@@ -53,6 +53,8 @@ from jaxslam.filters.readouts import camera_pose
 from jaxslam.filters.window.start import FromWindow, Schedule
 from jaxslam.geometry import difference, log, retract
 
+pytestmark = pytest.mark.laboratory
+
 FEW = SMC(particles=800, moves=3)
 LOOSE = jaxslam.scenario("matched-loose", steps=3, landmarks=4)
 BENT = jaxslam.scenario(
@@ -97,7 +99,6 @@ def test_of_a_linear_problem_evidence_and_moments_are_exact():
     np.testing.assert_allclose(np.cov(white), np.eye(3), atol=5 * np.sqrt(2 / 800))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("first", "expected"), [(0.5, 0.5), (0.1, 0.1)])
 def test_modes_have_their_weights(first, expected):
     """Two modes of σ 0.05 at ±1 in three dimensions: no chain would ever cross. The particles part
@@ -217,7 +218,6 @@ def _true_path(scenario, run):
     return jnp.concatenate([first, accelerations.ravel()])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("truncated", [True, False])
 def test_the_likelihood_of_a_path_is_the_integral_over_its_landmarks(truncated):
     problem, y = problem_of(REST, truncated=truncated), true_path(REST)
@@ -236,7 +236,6 @@ def bent():
     return quick_jit(marginal_log_likelihood)(problem, y), by_quadrature(problem, y), draws
 
 
-@pytest.mark.slow
 def test_the_weight_of_a_path_makes_its_likelihood_exact_where_pixels_are_bent():
     """Bounds: 5 standard errors of 20 000 draws."""
     value, (expected, _), (_, log_weights) = bent()
@@ -259,7 +258,6 @@ def test_weighted_landmarks_have_their_exact_moments():
     assert omega.min() > BENT.least_inverse_depth
 
 
-@pytest.mark.slow
 def test_a_path_with_a_landmark_behind_the_camera_is_impossible():
     problem = problem_of(REST)
     y, likelihood = jnp.zeros(path_size(problem)), quick_jit(marginal_log_likelihood)
@@ -295,7 +293,6 @@ def depths_of(draws):
     return jax.vmap(partial(inverse_depths, problem_of(LOOSE)))(draws.unknowns)
 
 
-@pytest.mark.slow
 def test_on_a_problem_of_one_mode_particles_and_chains_agree():
     """In the last pose, the velocity and the depths; bounds are 5 of what 400 draws would err."""
     draws, chains = on_one_mode()

@@ -4,12 +4,11 @@ import json
 from dataclasses import replace
 from itertools import product
 
-import conventions as benchmark
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scale_drift
+import verdicts as benchmark
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
@@ -377,11 +376,11 @@ def test_axes_whose_variance_never_changes_stand_out_only_beside_others():
 # --- one scale a run ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", scale_drift.RIGHT)
+@pytest.mark.parametrize("kind", benchmark.RIGHT)
 def test_a_right_filter_is_consistent_at_one_scale_however_its_errors_are_common(kind):
-    options = scale_drift.ScaleDrift(runs=30, steps=40)
+    options = benchmark.ScaleDrift(runs=30, steps=40)
     for seed in range(3):
-        word, named = scale_drift.judged(kind, 0.0, options, seed)
+        word, named = benchmark.judged_drift(kind, 0.0, options, seed)
         assert word in ("consistent", "cannot tell")
         assert not named
 
@@ -389,12 +388,12 @@ def test_a_right_filter_is_consistent_at_one_scale_however_its_errors_are_common
 @pytest.mark.slow
 def test_a_drift_of_scale_is_over_confident_and_named(tmp_path):
     """Each pose at a scale of its own had hidden it, be it fourfold."""
-    options = scale_drift.ScaleDrift(runs=30, steps=40)
+    options = benchmark.ScaleDrift(runs=30, steps=40)
     for drift in (0.05, float(np.log(4))):
         for seed in range(3):
-            assert scale_drift.judged("drift", drift, options, seed) == ("over-confident", True)
-    arrays = scale_drift.constructed("drift", float(np.log(4)), options, 0)
-    found = jaxslam.evaluate_poses(*arrays, scale_drift.SPLIT, align="sim3")
+            assert benchmark.judged_drift("drift", drift, options, seed) == ("over-confident", True)
+    arrays = benchmark.drifting("drift", float(np.log(4)), options, 0)
+    found = jaxslam.evaluate_poses(*arrays, benchmark.SPLIT, align="sim3")
     assert "the scale drifts by" in found.headline
     assert "times its σ: over-confident" in found.headline
     scale = found.asdict()["scale"]

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("unchecked")
 
 CASES = 800
 OFTEN = settings(
-    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 ANY_ARRAY = arrays.arrays(
     dtype=st.one_of(
@@ -35,17 +35,20 @@ def test_broken_files_end_in_one_line_or_in_a_result(tmp_path):
     assert not findings, "\n".join(f"case {f.case}, {f.target}: {f.what}" for f in findings)
 
 
-def test_every_target_reads_its_whole_files(tmp_path):
+COMPILES = {"resume", "Tracker.load"}
+"""Targets that run a tracker on what they read; tests of its files do so too."""
+WRITTEN = [name for name, target in fuzz.TARGETS.items() if target.write is not fuzz.given.nothing]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=pytest.mark.slow if x in COMPILES else ()) for x in WRITTEN],
+)
+def test_every_target_reads_its_whole_files(name, tmp_path, monkeypatch):
     """Else the fuzz would only see how files that were never whole are refused."""
-    for name, target in fuzz.TARGETS.items():
-        if target.write is fuzz.given.nothing:
-            continue
-        folder = tmp_path / name.replace(" ", "-")
-        folder.mkdir()
-        target.write(folder)
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setattr("warnings.warn", lambda *_, **__: None)
-            target.read(folder, np.random.default_rng(0))
+    monkeypatch.setattr("warnings.warn", lambda *_, **__: None)
+    fuzz.TARGETS[name].write(tmp_path)
+    fuzz.TARGETS[name].read(tmp_path, np.random.default_rng(0))
 
 
 def one_line_or_result(call, *given_to_it):

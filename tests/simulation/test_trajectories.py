@@ -175,6 +175,7 @@ def test_what_is_no_trajectory_is_refused(data, tmp_path):
 
 @pytest.mark.slow
 def test_every_trajectory_of_the_shared_data_is_one(shared_data, monkeypatch):
+    """Gaps and rates of recordings that no made-up path has."""
     monkeypatch.setenv("JAXSLAM_DATA", str(shared_data))
     names = [path.stem for path in sorted((shared_data / "trajectories").glob("*.txt"))]
     for name in set(names) - {"kitti_00_kitti_format"}:

@@ -192,7 +192,9 @@ def test_noise_is_that_of_the_measurement():
 
 def test_beacons_are_known_before_the_first_frame():
     world = scenario("circle", steps=30, beacons=9, beacon_sigma=0.2)
-    run, plain = simulated(world), simulated(scenario(world, beacons=0))
+    drawn = quick_jit(jax.vmap(lambda key: jaxslam.simulate(world, key)))
+    runs = drawn(jax.vmap(jax.random.key)(jnp.arange(50)))
+    run, plain = jax.tree.map(lambda x: x[0], runs), simulated(scenario(world, beacons=0))
     assert run.known is not None
     np.testing.assert_array_equal(run.known.slots, np.arange(9))
     every = np.asarray(plain.points)[:, None] - np.asarray(run.points[:9])
@@ -206,8 +208,6 @@ def test_beacons_are_known_before_the_first_frame():
     for part, beacons in ((first, False), (known, True), (new, False)):
         assert bool(np.any(part.valid & (part.slots < 9))) == beacons
     assert seen.landmarks == np.sum(run.visible.any(axis=0)[9:]) + 9
-    drawn = quick_jit(jax.vmap(lambda key: jaxslam.simulate(world, key)))
-    runs = drawn(jax.random.split(jax.random.key(0), 50))
     errors = (runs.known.points - runs.points[:, :9]) / 0.2
     low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], errors.size)
     assert low < np.sum(np.square(errors)) < high
