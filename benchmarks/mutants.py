@@ -1,6 +1,6 @@
 """What the tests are worth: faults of one line each, put into the package, and who notices.
 
-    python -m benchmarks.mutations --out benchmarks/results/mutations.json
+    python -m benchmarks.mutants --out benchmarks/results/mutants.json
 
 A mutant is the package with one operator, sign, transpose, bound, constant or term changed, drawn
 with a seed over all rooms by their size. The tests of its room are run first, then the others,
@@ -118,7 +118,7 @@ def _is_type_or_text(node: ast.AST) -> bool:
 
 
 def drawn(count: int, seed: int) -> list[Site]:
-    """Mutations over all rooms: in each as many as its share of places, at least one.
+    """Mutants over all rooms: in each as many as its share of places, at least one.
 
     None of the lengths in a figure, which only eyes can judge.
     """
@@ -181,7 +181,7 @@ def outcome(site: Site, tree: Path, options: list[str], minutes: float) -> str:
 
 
 @dataclass(frozen=True)
-class Mutations:
+class Mutants:
     """How many mutants, and the tests that they are shown."""
 
     count: int = 60
@@ -192,10 +192,10 @@ class Mutations:
     """After which a run of tests is taken not to end."""
     only: tuple[int, ...] = ()
     """Numbers of mutants, to run these alone."""
-    out: Path = ROOT / "benchmarks" / "results" / "mutations.json"
+    out: Path = ROOT / "benchmarks" / "results" / "mutants.json"
 
 
-def main(options: Mutations) -> None:
+def main(options: Mutants) -> None:
     """Run the tests on every mutant; results are written after each."""
     chosen, found = drawn(options.count, options.seed), []
     with tempfile.TemporaryDirectory() as folder:
@@ -219,4 +219,4 @@ def main(options: Mutations) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Mutations, description=__doc__))
+    main(tyro.cli(Mutants, description=__doc__))

@@ -1,8 +1,8 @@
-"""Tests of benchmarks/mutations.py: what is mutated, and what is left alone."""
+"""Tests of benchmarks/mutants.py: what is mutated, and what is left alone."""
 
 import ast
 
-import mutations
+import mutants
 import pytest
 
 SOURCE = '''
@@ -15,7 +15,7 @@ def f(P: Float[Array, "n n"], k: int | None, limit=0.25) -> float | None:
 
 
 def test_a_mutant_is_the_source_with_one_line_changed():
-    found = list(mutations.sites(SOURCE, "jaxslam/x.py"))
+    found = list(mutants.sites(SOURCE, "jaxslam/x.py"))
     assert {(site.kind, site.text) for site in found} == {
         ("constant", "0.5"), ("constant", "3"), ("constant", "7.0"), ("comparison", "(k <= 2)"),
         ("logic", "(k < 2 or limit)"), ("sign", "(P @ P.T)[k + 1]"), ("transpose", "P"),
@@ -23,7 +23,7 @@ def test_a_mutant_is_the_source_with_one_line_changed():
         ("operator", "(-(P @ P.T)[k + 1] / jnp.minimum(k, 3.5))"),
     }  # fmt: skip
     for site in found:
-        ast.parse(changed := mutations.applied(site, SOURCE))
+        ast.parse(changed := mutants.applied(site, SOURCE))
         lines = zip(SOURCE.splitlines(), changed.splitlines(), strict=True)
         assert [i for i, (a, b) in enumerate(lines, 1) if a != b] == [site.line]
 
@@ -31,10 +31,10 @@ def test_a_mutant_is_the_source_with_one_line_changed():
 @pytest.mark.slow
 def test_they_are_drawn_of_every_room_by_a_seed():
     """A room that is left out; the whole package is read three times."""
-    chosen = mutations.drawn(60, 1)
-    assert chosen == mutations.drawn(60, 1) != mutations.drawn(60, 2)
+    chosen = mutants.drawn(60, 1)
+    assert chosen == mutants.drawn(60, 1) != mutants.drawn(60, 2)
     assert len(chosen) == len(set(chosen)) == 60
-    assert {"filters", "tracking", "evaluation"} <= {mutations._room(site.path) for site in chosen}
+    assert {"filters", "tracking", "evaluation"} <= {mutants._room(site.path) for site in chosen}
 
 
 @pytest.mark.parametrize(
@@ -52,6 +52,6 @@ def test_a_mutant_is_caught_by_a_test_that_fails(tmp_path, body, told):
     (tmp_path / "tests").mkdir()
     test = f"from jaxslam.linalg import x\ndef test_it():\n    {body}\n"
     (tmp_path / "tests" / "test_linalg.py").write_text(test)
-    (site, *_) = mutations.sites(path.read_text(), "jaxslam/linalg.py")
-    assert mutations.outcome(site, tmp_path, [], 1).startswith(told)
+    (site, *_) = mutants.sites(path.read_text(), "jaxslam/linalg.py")
+    assert mutants.outcome(site, tmp_path, [], 1).startswith(told)
     assert path.read_text() == "x = 2 + 1\n"
