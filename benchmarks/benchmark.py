@@ -86,7 +86,7 @@ def run_one(*benchmarks: type[Benchmark]) -> None:
     """The command line of a file of several benchmarks: the name of one, and its options."""
     first, *_ = benchmarks
     jax.config.update("jax_enable_x64", first.double)
-    tyro.cli(Union[benchmarks], description=sys.modules[first.__module__].__doc__)()  # noqa: UP007
+    tyro.cli(Union[benchmarks], description=sys.modules[first.__module__].__doc__)()  # noqa: UP007  # ty: ignore[invalid-type-form]
 
 
 def write_page(path: Path, text: str) -> None:
