@@ -175,7 +175,7 @@ def test_a_second_search_is_wider_by_the_square_of_the_turn_over_twice_the_focal
     policy = Policy(CAMERA, TrackerSettings(), ambiguous_start=False)
     seen = found(COUNT, 0)._replace(pixels=PLACES + np.array([60.0, 80.0]))
     covariances, ones = table().covariances, np.ones(COUNT)
-    fields = PLACES, covariances, ones > 0, np.eye(4), np.ones((COUNT, 3)), ones, ones
+    fields = PLACES, covariances, ones > 0, np.eye(4), np.ones((COUNT, 3)), ones
     given = Prediction(*fields)
     added = policy._closer(seen, given).covariances - covariances
     sigma = 1.5 + 100**2 / (2 * CAMERA.fx)
