@@ -12,9 +12,17 @@ pytest.importorskip("cv2")
 from jaxslam.io.calibration import from_field_of_view
 from jaxslam.tracking.landmarks import Landmark
 from jaxslam.tracking.matching import Matches
-from jaxslam.tracking.observations import NOTHING, Lost, Observations
+from jaxslam.tracking.observations import NOTHING, Lost, Observations, Prediction
 from jaxslam.tracking.patches import STORED, Patch
-from jaxslam.tracking.policy import BY_CHANCE, CHANCE_LOST, PROVEN, Policy, more_than_chance
+from jaxslam.tracking.policy import (
+    BY_CHANCE,
+    CHANCE_LOST,
+    LEAST_MATCHES,
+    PROVEN,
+    TOGETHER,
+    Policy,
+    more_than_chance,
+)
 from jaxslam.tracking.settings import TrackerSettings
 
 COUNT = 20
@@ -161,3 +169,33 @@ def test_a_frame_without_expected_landmarks_and_one_without_matches_say_so():
     assert judged(table(), LANDMARKS) is Lost.FEW_AGREE
     seen = table()._replace(pixels=PLACES, labels=np.full(COUNT, "matched"))
     assert judged(seen, LANDMARKS) is None
+
+
+def test_a_second_search_is_wider_by_the_square_of_the_turn_over_twice_the_focal_length():
+    policy = Policy(CAMERA, TrackerSettings(), ambiguous_start=False)
+    seen = found(COUNT, 0)._replace(pixels=PLACES + np.array([60.0, 80.0]))
+    covariances, ones = table().covariances, np.ones(COUNT)
+    fields = PLACES, covariances, ones > 0, np.eye(4), np.ones((COUNT, 3)), ones
+    given = Prediction(*fields)
+    added = policy._closer(seen, given).covariances - covariances
+    sigma = 1.5 + 100**2 / (2 * CAMERA.fx)
+    np.testing.assert_allclose(added, np.tile(sigma**2 * np.eye(2), (COUNT, 1, 1)))
+
+
+def test_matches_that_are_not_proven_must_be_likely_given_those_that_are():
+    """Where there are some of both: those that are all proven, or hardly any, are not asked."""
+    policy = Policy(CAMERA, TrackerSettings(), ambiguous_start=False)
+
+    def judged(count, beyond):
+        more = chi2.isf(TOGETHER, 2 * (COUNT - count)) if count < COUNT else 1.0
+
+        def nis(seen):
+            return 5.0 + beyond * more * (len(seen.slots) > count), 2 * len(seen.slots)
+
+        return policy._likely_given_proven(found(COUNT, 0), proven_landmarks(count), nis)
+
+    for count in (LEAST_MATCHES, COUNT - 1):
+        assert judged(count, 0.99)
+        assert not judged(count, 1.01)
+    assert judged(LEAST_MATCHES - 1, 1.01)
+    assert judged(COUNT, 1.01)
