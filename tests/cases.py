@@ -42,6 +42,19 @@ def crossed(names, *axes, quick):
     return pytest.mark.parametrize(names, given, ids=named)
 
 
+def first(count, rows):
+    """So many of the rows of a parametrization; the others are slow, as they would find a fault of
+    theirs alone."""
+    return [
+        *rows[:count],
+        *(pytest.param(*as_row(x), marks=pytest.mark.slow) for x in rows[count:]),
+    ]
+
+
+def as_row(values):
+    return values if type(values) is tuple else (values,)
+
+
 def named(value):
     """Test ids for geometries, parametrizations and frames."""
     return getattr(value, "name", None)

@@ -252,9 +252,10 @@ def test_a_tolerance_is_noise_of_each_match_by_itself():
     added = (some.covariance - none.covariance).reshape(12, 12)
     np.testing.assert_allclose(added, 0.49 * np.eye(12), atol=1e-9)
     np.testing.assert_array_equal(some.residual, none.residual)
-    each = seek(state, control, seen, jnp.arange(6.0))
+    tolerances = jnp.arange(12.0).reshape(6, 2)
+    each = seek(state, control, seen, tolerances)
     added = (each.covariance - none.covariance).reshape(12, 12)
-    np.testing.assert_allclose(added, np.diag(np.repeat(np.arange(6.0), 2) ** 2), atol=1e-9)
+    np.testing.assert_allclose(added, np.diag(np.arange(12.0) ** 2), atol=1e-9)
 
 
 class Share(Pinhole):

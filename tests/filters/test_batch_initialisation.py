@@ -131,6 +131,7 @@ def covariances_of(state):
     return state.sum.members.covariance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sigma", "weight", "ready"), [
     (0.029, 0.0, True), (0.031, 0.0, False), (0.029, np.log(0.99), False),
 ])  # fmt: skip
@@ -205,6 +206,7 @@ def test_without_landmarks_the_camera_is_known_less_with_every_frame():
     assert (np.diff(sigmas, axis=0) > 0.5 * sigmas[0]).all()
 
 
+@pytest.mark.slow
 def test_the_members_are_the_modes_as_long_as_the_window_is_open():
     for state in followed(STARTED)[1:9]:
         weights = np.asarray(state.modes.log_weights)
@@ -298,6 +300,7 @@ def test_windows_grow_up_to_the_frames_that_are_named():
     assert [Schedule.of(SPATIAL, n).sizes for n in frames] == [(31,), (9,), (21,), (31, 41)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [lambda z: z * jnp.nan, lambda z: jnp.flip(z, axis=1)])
 def test_measurements_that_nothing_explains_leave_the_sum_to_itself(wrong):
     """Pixels that are no numbers, or of other landmarks: the modes stay, and keep their weights."""

@@ -614,8 +614,14 @@ def test_inverse_scaling_has_rank_three_when_the_focal_length_is_known():
 # --- many steps ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["robocentric", "world", "scale_gauge"])
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@crossed(
+    ("kind", "dtype"),
+    ["robocentric", "world", "scale_gauge"],
+    [jnp.float32, jnp.float64],
+    quick=[
+        ("robocentric", jnp.float32), ("world", jnp.float64), ("scale_gauge", jnp.float32),
+    ],
+)  # fmt: skip
 def test_covariance_stays_symmetric_and_positive_over_a_long_run(kind, dtype):
     """In any precision, with landmarks whose covariance is singular: see `ROUNDING`."""
     case = Case("matched-very-loose", steps=600)

@@ -6,8 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
-from cases import quick_jit
+from cases import crossed, quick_jit
 
 import jaxslam
 from jaxslam.filters.linear.blocks import composition
@@ -19,8 +18,12 @@ from jaxslam.geometry import exp, jacobian
 MATCHED = jaxslam.scenario("matched-loose", landmarks=3)
 
 
-@pytest.mark.parametrize("name", ["scale_gauge", "world_gauge", "scale_gauge+submaps"])
-@pytest.mark.parametrize("log_scale", [0.0, 0.3])
+@crossed(
+    ("name", "log_scale"),
+    ["scale_gauge", "world_gauge", "scale_gauge+submaps"],
+    [0.0, 0.3],
+    quick=[("scale_gauge", 0.3), ("world_gauge", 0.0), ("scale_gauge+submaps", 0.3)],
+)
 def test_a_motion_takes_unobservable_directions_to_those_after_it(name, log_scale):
     """`Φ N_k = N_{k+1}`, whatever the filter's unit of length is (noise is not enlarged here)."""
     made: Any = make_filter(name, **scenario_pieces(MATCHED))

@@ -11,8 +11,7 @@ from functools import cache
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
-from cases import a_filter, each_geometry, few_landmarks, named, pose, quick_jit
+from cases import a_filter, crossed, each_geometry, few_landmarks, pose, quick_jit
 
 from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.geometry import PLANAR, SPATIAL, difference, retract
@@ -123,11 +122,17 @@ def accelerations(geometry, linear):
     return a
 
 
-pytestmark = [
-    pytest.mark.parametrize("frame", [Robocentric(), WorldCentric()], ids=named),
-    pytest.mark.parametrize("landmark", few_landmarks, ids=named),
-    pytest.mark.parametrize("geometry", each_geometry, ids=named),
-]
+pytestmark = crossed(
+    ("geometry", "landmark", "frame"),
+    each_geometry,
+    few_landmarks,
+    [Robocentric(), WorldCentric()],
+    quick=[
+        (PLANAR, few_landmarks[0], Robocentric()),
+        (SPATIAL, few_landmarks[1], WorldCentric()),
+        (PLANAR, few_landmarks[2], WorldCentric()),
+    ],
+)
 
 
 def redundancy(geometry, landmark):

@@ -347,6 +347,7 @@ def test_a_frame_without_measurements_changes_nothing(name):
         np.testing.assert_allclose(x, y, rtol=1e-14, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_scale_is_read_from_what_is_known_of_it():
     """`L N = I`; an old landmark says more than a new one, and a camera at rest says nothing."""
     model = a_filter(SPATIAL).model

@@ -74,6 +74,7 @@ def in_unit(state):
     return camera_pose_in_unit(slam, state), landmarks_in_unit(slam, state, slots), metric
 
 
+@pytest.mark.slow
 def test_what_the_filter_makes_of_the_metre_changes_nothing_in_its_unit():
     state = said("scale_gauge")[4]
     (before, points, metric), (after, same, larger) = in_unit(state), in_unit(wandered(state, 0.7))

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import quick_jit
+from cases import crossed, quick_jit
 
 from jaxslam.filters.slam import Slam
 from jaxslam.filters.window.minimise import started
@@ -65,8 +65,12 @@ def test_the_first_and_the_newest_frame_stay(frames, stride, stay):
     assert kept(frames, stride).tolist() == list(stay)
 
 
-@pytest.mark.parametrize("treatment", [Known, White])
-@pytest.mark.parametrize("frames", [FRAMES, FRAMES + 1])
+@crossed(
+    ("frames", "treatment"),
+    [FRAMES, FRAMES + 1],
+    [Known, White],
+    quick=[(FRAMES, Known), (FRAMES + 1, White)],
+)
 def test_velocities_and_calibrations_of_the_frames_that_stay_are_the_same(frames, treatment):
     """Twice over, so that steps of different lengths are merged too."""
     slam, record = filter_of(treatment), full(frames)

@@ -93,14 +93,17 @@ CASES = [
 ]
 
 
-def each(cases):
+def each(cases, quick=CASES):
+    """A test of each of these cases, of which others than the `quick` ones are slow."""
+
     def name(of):
         return "-".join(getattr(part, "__name__", str(part)) for part in of)
 
-    return pytest.mark.parametrize("of", cases, ids=name)
+    given = [pytest.param(of, marks=() if of in quick else pytest.mark.slow) for of in cases]
+    return pytest.mark.parametrize("of", given, ids=name)
 
 
-each_case = each(CASES)
+each_case = each(CASES, quick=[CASES[1], CASES[4]])
 
 
 def all_residuals(slam, record, u, shape):
@@ -347,7 +350,7 @@ def test_a_minimum_costs_less_than_the_truth_and_has_no_gradient(of):
     assert g @ np.linalg.solve(A, g) < 1e-9
 
 
-@each(CASES[1:3])
+@each(CASES[1:3], quick=CASES[2:3])
 def test_a_minimum_is_found_within_the_tolerance(of):
     """Of half the sum of squares, and in far fewer steps than are allowed."""
     slam, record, x, y = case(*of)

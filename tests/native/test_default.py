@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from cases import first
 
 import jaxslam
 from jaxslam import native
@@ -68,6 +69,7 @@ def test_a_long_study_of_a_plain_filter_takes_the_native_backend(pretended, monk
     assert study(backend="xla").backends == {NAME: "xla"}
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_what_is_kept_of_the_first_run_does_not_hold_the_others():
     """A view would keep the map and the path of the whole batch in memory."""
@@ -86,7 +88,7 @@ def test_a_filter_with_a_mixture_stays_with_xla(pretended):
     assert pretended.asked == 0
 
 
-@pytest.mark.parametrize("backend", ["auto", "native"])
+@pytest.mark.parametrize("backend", first(1, ["native", "auto"]))
 def test_a_program_whose_first_runs_are_others_is_not_believed(backend, pretended, monkeypatch):
     monkeypatch.setattr(backends, "WORTH", 1)
     pretended.factor = 1 + 1e-5

@@ -141,6 +141,7 @@ class ByLapack(AbstractCorrection):
         return kalman_update(model, state, None, features, noise, context, considered)
 
 
+@pytest.mark.slow
 def test_a_filter_that_calls_lapack_is_warned_of():
     chosen = jaxslam.scenario("matched", steps=2, landmarks=4)
     made = jaxslam.make_filters(chosen, ["robocentric"], ["inverse_scaling"], "known")

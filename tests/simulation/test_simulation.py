@@ -444,6 +444,7 @@ def test_pixel_noise_has_the_stated_sigma():
     centred(noise)
 
 
+@pytest.mark.slow
 def test_errors_of_patches_stay_as_long_as_they_should():
     chosen = scenario("matched-6dof", pixel_sigma=1e-9, drift_sigma=0.2, drift_frames=5.0)
     runs = batch(chosen, 10)

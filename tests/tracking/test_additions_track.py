@@ -32,6 +32,7 @@ def pieces_of(kind, calibration):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sensor and motion", "landmark, calibration and remedy"])
 def test_additions_of_ones_own_track(kind):
     source = synthetic_source(frames=FRAMES)

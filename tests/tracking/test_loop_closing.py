@@ -94,6 +94,7 @@ def test_a_camera_that_returns_closes_loops_which_correct_its_way(walk):
     assert 0 < np.median(moved) < 0.1
 
 
+@pytest.mark.slow
 def test_submaps_and_loops_are_saved_and_go_on(walk):
     tracker, history, source, path = walk
     again = Tracker.load(path)
@@ -108,6 +109,7 @@ def test_submaps_and_loops_are_saved_and_go_on(walk):
     assert np.array_equal([one.T_wc for one in ours], [one.T_wc for one in theirs])
 
 
+@pytest.mark.slow
 def test_another_video_may_begin_anywhere_in_a_saved_map(walk):
     """Near the far end of the walk, which the latest submap does not show."""
     *_, source, path = walk
@@ -206,6 +208,7 @@ def small(i, size):
     return T
 
 
+@pytest.mark.slow
 def test_a_map_has_so_many_submaps_and_goes_on_in_the_last(walk, monkeypatch):
     *_, source, path = walk
     frames = list(source)[-11:-60:-1]
@@ -268,6 +271,7 @@ def test_a_lost_camera_is_back_in_an_earlier_submap(monkeypatch, tmp_path):
     assert np.array_equal([one.T_wc for one in later], [one.T_wc for one in smooth])
 
 
+@pytest.mark.slow
 def test_two_maps_are_joined_where_the_second_sees_the_first(monkeypatch, tmp_path):
     """The camera is covered, uncovered at the far end, and comes back from there."""
     monkeypatch.setattr(start, "Submaps", partial(Submaps, parallax=0.15))

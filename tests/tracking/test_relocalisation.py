@@ -56,6 +56,7 @@ def test_after_black_frames_the_camera_is_back_in_its_map():
     assert away[35:].max() < 3 * away[:35].max()
 
 
+@pytest.mark.slow
 def test_another_room_is_another_map_and_the_first_is_known_again():
     source, other = (
         synthetic_source(frames=85, seed=3),
@@ -108,6 +109,7 @@ def test_a_saved_map_is_gone_on_with_in_another_video(tmp_path):
     assert found[-1].camera.sigma_position < 3 * tracked[-1].camera.sigma_position
 
 
+@pytest.mark.slow
 def test_where_no_map_is_known_another_begins(tmp_path):
     source, other = synthetic_source(frames=40, seed=4), synthetic_source(frames=12, seed=77)
     tracker = Tracker(source.calibration, SETTINGS)

@@ -91,6 +91,7 @@ def test_a_loop_that_closes_makes_the_path_right_and_its_covariance_smaller(lap)
     np.testing.assert_array_equal(errors(close(chained, none_of(loops)), truth)[0], drift)
 
 
+@pytest.mark.slow
 def test_the_covariances_of_all_cameras_are_those_of_each(lap):
     """In one pass, as `marginal` has them of all at once."""
     chained, _, loops = lap
