@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -116,12 +117,17 @@ def smoothed(linear):
     """The filter with submaps at the end, its chain, and in which frames submaps ended."""
     frames, first = linear.frames()
     slam = replace(linear.slam, frame=Submaps(spare=3, history=40))
-    state = slam.init(Capacity(SLOTS, SLOTS, 1), first)
-    state, counts = run(slam, frames, state, lambda state, *_: state.count)
+
+    @jax.jit
+    def whole():
+        state = slam.init(Capacity(SLOTS, SLOTS, 1), first)
+        return run(slam, frames, state, lambda state, *_: state.count)
+
+    state, counts = whole()
     ended = np.flatnonzero(np.diff(np.r_[0, counts])) + 1
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(chains, "LINEARISATION", 0.0)
-        return chain(slam, state, int(state.count)), [*ended, FRAMES - 1]
+        return eqx.filter_jit(chain)(slam, state, int(state.count)), [*ended, FRAMES - 1]
 
 
 def everything(chain):

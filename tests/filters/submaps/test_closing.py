@@ -1,20 +1,25 @@
 """Loops: which pairs are believed, and what is learnt of the chain."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxslam import filters
 from jaxslam.consistency import run_through
-from jaxslam.filters import Loops, agreeing, base_poses, chain, close
+from jaxslam.filters import Loops, base_poses
 from jaxslam.filters.submaps import closing
 from jaxslam.filters.words import make_filter, scenario_pieces
 from jaxslam.models.frame import Submaps
 from jaxslam.simulation import Room, scenario, simulate
 
+# Op by op they are hundreds of programs.
+agreeing, chain, close = map(eqx.filter_jit, (filters.agreeing, filters.chain, filters.close))
 LAP = scenario("laps-6dof", steps=440, in_view=12, landmarks=96)
 """Twice round, and a little more."""
 
@@ -24,7 +29,10 @@ def lap():
     """The chain of a run, its truth where its submaps ended, and the pairs of landmarks that are
     one point: the newest in view with the first of that point."""
     base: Any = make_filter("robocentric+oc", **scenario_pieces(LAP))
-    slam, run = replace(base, frame=Submaps(12, 48)), simulate(LAP, jax.random.key(1))
+    slam, run = (
+        replace(base, frame=Submaps(12, 48)),
+        jax.jit(partial(simulate, LAP))(jax.random.key(1)),
+    )
     room = Room(12, 12, 12, 12)
 
     def output(state, *_):
@@ -127,7 +135,7 @@ def test_right_pairs_are_believed_of_an_overconfident_chain(lap, monkeypatch):
     before = close(replace(chained, links=links), none_of(loops))
     assert np.asarray(agreeing(before, loops).valid).all()
     monkeypatch.setattr(closing, "WIDEST", 1.0)
-    assert not np.asarray(agreeing(before, loops).valid).all()
+    assert not np.asarray(filters.agreeing(before, loops).valid).all()
 
 
 @pytest.mark.slow
