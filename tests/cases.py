@@ -42,7 +42,7 @@ def crossed(names, *axes, quick):
     return pytest.mark.parametrize(names, given, ids=named)
 
 
-def first(count, rows):
+def quick_rows(count, rows):
     """So many of the rows of a parametrization; the others are slow, as they would find a fault of
     theirs alone."""
     return [

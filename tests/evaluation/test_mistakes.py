@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from cases import first
+from cases import quick_rows
 from scipy.spatial.transform import Rotation
 
 import jaxslam
@@ -163,7 +163,7 @@ def test_right_data_raise_no_false_alarm(size, correlation):
             assert said(e, P, NAMES[3 - n :] if seed % 2 else ()) == "", (runs, steps, seed)
 
 
-@pytest.mark.parametrize("factor", first(2, [0.3, 10.0, 0.1, 3.0, 20.0]))
+@pytest.mark.parametrize("factor", quick_rows(2, [0.3, 10.0, 0.1, 3.0, 20.0]))
 def test_a_filter_whose_sigma_is_wrong_is_not_taken_for_a_log_that_is(factor):
     for seed in range(30):
         e, P = right(seed=seed)

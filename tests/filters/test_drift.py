@@ -3,10 +3,10 @@
 import jax
 import numpy as np
 import pytest
-from cases import Case, first, quick_jit
+from cases import Case, quick_jit, quick_rows
 
 
-@pytest.mark.parametrize("landmark", first(1, ["inverse_scaling", "inverse_depth"]))
+@pytest.mark.parametrize("landmark", quick_rows(1, ["inverse_scaling", "inverse_depth"]))
 def test_a_feature_is_expected_by_so_much_less_surely(landmark):
     """`H (P + H⁺ share² R H⁺ᵀ) Hᵀ + R` is `S + share² R`."""
     of = Case("matched-6dof", 1, steps=1, landmarks=4)

@@ -69,6 +69,7 @@ def test_right_matches_are():
     )
 
 
+@pytest.mark.slow
 def test_the_states_are_those_of_the_filter_inside():
     of = case()
     slam = of.filter("robocentric+checked")

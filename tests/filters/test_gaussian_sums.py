@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Case, each_geometry, first, named, pose_run, quick_jit
+from cases import Case, each_geometry, named, pose_run, quick_jit, quick_rows
 
 import jaxslam
 from jaxslam.filters.mixture import split_merge
@@ -39,7 +39,7 @@ def poses(of, name):
 
 
 @pytest.mark.parametrize(
-    ("modifier", "tolerance"), first(1, [("mixture9", 0.15), ("directions5", 0.05)])
+    ("modifier", "tolerance"), quick_rows(1, [("mixture9", 0.15), ("directions5", 0.05)])
 )
 def test_a_sum_for_a_linear_problem_is_its_filter(modifier, tolerance):
     """To the error of the sum's shape: halves of a Gaussian have its moments, not its tails."""
@@ -219,7 +219,7 @@ def cost(state):
     return np.exp(np.asarray(state.log_weights)) @ np.trace(P, axis1=1, axis2=2)
 
 
-@pytest.mark.parametrize(("members", "rounds"), first(1, [(5, 1), (9, 3)]))
+@pytest.mark.parametrize(("members", "rounds"), quick_rows(1, [(5, 1), (9, 3)]))
 def test_to_split_and_to_merge_keeps_the_moments_and_lessens_the_cost(members, rounds):
     state = some_sum(members)
     after = divided(rounds)(state)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import Case, close, first, named, pose, quick_jit
+from cases import Case, close, named, pose, quick_jit, quick_rows
 
 from jaxslam.filters.linear.blocks import plus
 from jaxslam.filters.linear.kalman import Kalman
@@ -54,7 +54,9 @@ def seen_from_elsewhere(slam, state, rigid):
 @pytest.mark.parametrize(
     ("geometry", "landmark"),
     # Angles of a ray in space do not turn by addition.
-    first(1, [(PLANAR, InverseScaling()), (PLANAR, UnifiedInverseDepth()), (SPATIAL, Cartesian())]),
+    quick_rows(
+        1, [(PLANAR, InverseScaling()), (PLANAR, UnifiedInverseDepth()), (SPATIAL, Cartesian())]
+    ),
     ids=named,
 )
 def test_an_update_is_the_same_in_every_base_frame(geometry, landmark):
@@ -74,7 +76,7 @@ def test_an_update_is_the_same_in_every_base_frame(geometry, landmark):
     assert np.abs(difference(actual.core, before.core)).max() > 1e-3
 
 
-@pytest.mark.parametrize("geometry", first(1, [PLANAR, SPATIAL]), ids=lambda g: g.name)
+@pytest.mark.parametrize("geometry", quick_rows(1, [PLANAR, SPATIAL]), ids=lambda g: g.name)
 def test_cartesian_landmarks_are_corrected_as_published(geometry):
     """`p ← R p + V ξ`, V by `Exp(ξ, θ) = (R, V ξ)`, but for θ²/24 of a landmark's own ξ."""
     slam = case(geometry).filter("invariant", Cartesian().name)

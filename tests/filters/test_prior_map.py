@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import a_filter, close, each_geometry, first, named, quick_jit
+from cases import a_filter, close, each_geometry, named, quick_jit, quick_rows
 
 import jaxslam
 from jaxslam.filters.gate import Gate
@@ -167,7 +167,7 @@ def test_a_gate_tolerates_shares_of_the_noise_of_each_measurement():
     assert quick_jit(run)(off).tolist() == [True, True, False]
 
 
-@pytest.mark.parametrize("frame", first(1, [Robocentric(), WorldCentric()]), ids=named)
+@pytest.mark.parametrize("frame", quick_rows(1, [Robocentric(), WorldCentric()]), ids=named)
 def test_every_measurement_has_its_own_noise(frame):
     """In insertion, in what is expected, and in the update: of its factor, and of the sensor."""
     factor = np.array([4.0, 0.25])

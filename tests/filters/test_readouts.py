@@ -88,6 +88,7 @@ def test_what_the_filter_makes_of_the_metre_changes_nothing_in_its_unit():
     np.testing.assert_allclose(unit, metric, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_members_that_differ_about_the_metre_agree_about_the_path_in_their_unit():
     """A Gaussian sum: moments are of the pose in the unit, not of the pose in metres."""
     state, bank = said("scale_gauge")[4], case().filter("scale_gauge+mixture3")

@@ -16,10 +16,10 @@ from cases import (
     close,
     each_geometry,
     few_landmarks,
-    first,
     named,
     pose,
     quick_jit,
+    quick_rows,
     run_filter,
 )
 
@@ -414,7 +414,7 @@ def convertible_state(model):
 
 @pytest.mark.parametrize(
     ("geometry", "frame", "landmark"),
-    first(
+    quick_rows(
         1,
         [
             (PLANAR, Robocentric(), InverseDepthToCartesian()),

@@ -124,6 +124,7 @@ def test_another_video_may_begin_anywhere_in_a_saved_map(walk):
     assert np.linalg.norm(way, axis=1).max() < 0.05  # it goes on and does not jump
 
 
+@pytest.mark.slow
 def test_a_loop_that_cannot_be_is_refused(walk):
     """The same landmarks, as if they had been seen by a camera two metres away."""
     tracker, *_ = walk

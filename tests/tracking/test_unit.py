@@ -146,6 +146,7 @@ def test_a_path_is_in_one_unit_whatever_the_filter_takes_it_for(plain, wanders):
     assert wanders.tracker.map.place.log_scale == pytest.approx(WANDER[FRAMES - 1] - 0.3, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_map_is_in_that_unit_too_with_what_left_it(plain, wanders):
     assert plain.tracker.deleted > 0
     found, expected = wanders.tracker.points(), plain.tracker.points()

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import first
+from cases import quick_rows
 
 from jaxslam.consistency import run_through
 from jaxslam.filters.run import Frames, run
@@ -172,7 +172,7 @@ def place_of(chain, number):
     return submaps[0], slots[0]
 
 
-@pytest.mark.parametrize("closed", first(1, [True, False]))
+@pytest.mark.parametrize("closed", quick_rows(1, [True, False]))
 def test_a_chain_is_the_one_gaussian_of_everything(linear, smoothed, closed):
     """Cameras and landmarks of long ago, what was measured since then included."""
     chained, ended = smoothed

@@ -19,7 +19,9 @@ from jaxslam.models.frame import Submaps
 from jaxslam.simulation import Room, scenario, simulate
 
 # Op by op they are hundreds of programs.
-agreeing, chain, close = map(eqx.filter_jit, (filters.agreeing, filters.chain, filters.close))
+agreeing = eqx.filter_jit(filters.agreeing)
+chain = eqx.filter_jit(filters.chain)
+close = eqx.filter_jit(filters.close)
 LAP = scenario("laps-6dof", steps=440, in_view=12, landmarks=96)
 """Twice round, and a little more."""
 
@@ -112,6 +114,7 @@ def test_the_covariances_of_all_cameras_are_those_of_each(lap):
     np.testing.assert_allclose(P, blocks, rtol=1e-6, atol=1e-9 * np.max(blocks))
 
 
+@pytest.mark.slow
 def test_wrong_pairs_are_refused_among_right_ones(lap):
     """Every third is with a neighbour of the true landmark."""
     chained, _, loops = lap
