@@ -225,7 +225,7 @@ def _name(value: type | FunctionType) -> str:
 def _array(value: Any) -> Any:
     is_key = jax.dtypes.issubdtype(value.dtype, jax.dtypes.prng_key)
     x = np.asarray(jax.random.key_data(jnp.asarray(value)) if is_key else value)
-    # So large an array is written whole; of a larger one there is a digest.
+    # An array of at most so many numbers is written whole; of a larger one there is a digest.
     if x.size <= 64 and x.dtype.kind in "fiub":
         return x.tolist()
     told = hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest()

@@ -61,8 +61,13 @@ class Simulator:
     def made_by(self) -> Manifest:
         """The manifest of the runs that are drawn, the layout of records, and the versions."""
         world, seed, dtype, _ = self._given
-        drawn = {"scenario": described(world), "seed": int(seed), "dtype": dtype}
-        return {"layout": LAYOUT, "version": versions(), **drawn}
+        return {
+            "layout": LAYOUT,
+            "version": versions(),
+            "scenario": described(world),
+            "seed": int(seed),
+            "dtype": dtype,
+        }
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle for another machine, which has no file of a trajectory, and makes its own key."""

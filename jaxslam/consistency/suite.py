@@ -99,9 +99,13 @@ def write_suite(
                 form = ["%d" if x in ("run", "step", "landmark") else "%.12g" for x in columns]
                 if truth or name != "truth.csv":
                     np.savetxt(place / name, rows, form, ",", header=",".join(columns), comments="")
-            prior = {"mean": float(depth.mean), "sigma": float(depth.sigma)}
-            told = {"runs": runs, "seed": seed if truth else None, "depth_prior": prior}
-            told |= {"checksum": tables["measurements.csv"][1].sum(), "scenario": one.to_dict()}
+            told = {
+                "runs": runs,
+                "seed": seed if truth else None,
+                "depth_prior": {"mean": float(depth.mean), "sigma": float(depth.sigma)},
+                "checksum": tables["measurements.csv"][1].sum(),
+                "scenario": one.to_dict(),
+            }
             write_json(place / "scenario.json", told)
         shutil.copy(Path(__file__).with_suffix(".md"), temporary / "README.md")
 

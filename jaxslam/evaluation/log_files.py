@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple, TypeAlias, TypedDict
 
@@ -286,10 +285,18 @@ def evaluate_runs(
     names = tuple(run.name for run in runs)
     truths = [np.where(x.evaluated.poses[:, None, None], x.truths.values, np.nan) for x in read]
     longest = max(read, key=lambda one: len(one.times))
-    poses = [[one.estimates for one in read], [one.covariances.values for one in read], truths]
-    verdict = partial(evaluate_poses, *map(_filled_up, poses), convention, **how)
-    place = runs[0].estimate if len(runs) == 1 else source
-    found = named(place, partial(verdict, times=longest.times), names)
+    found = named(
+        runs[0].estimate if len(runs) == 1 else source,
+        lambda: evaluate_poses(
+            _filled_up([one.estimates for one in read]),
+            _filled_up([one.covariances.values for one in read]),
+            _filled_up(truths),
+            convention,
+            times=longest.times,
+            **how,
+        ),
+        names,
+    )
     told = (
         *_left_out(read), *left_out([one.evaluated for one in read]),
         *_other_times(read, longest), *_other_body(runs[0]),
@@ -532,8 +539,11 @@ def read_frames(path: Path) -> FrameLog | None:
     titles, *rows = [[word.strip() for word in line.split(",")] for line in lines] or [[]]
     if not {"time", "state", "map", "unit_fixed"} <= set(titles):
         return None
-    held = [(n, dict(zip(titles, x, strict=False))) for n, x in enumerate(rows, 2) if x != [""]]
-    table = [_frame(f"{path}, line {number}", row) for number, row in held]
+    table = [
+        _frame(f"{path}, line {number}", dict(zip(titles, row, strict=False)))
+        for number, row in enumerate(rows, start=2)
+        if row != [""]
+    ]
     if not table:
         raise ValueError(f"{path} has no frames")
     return FrameLog(*(np.array(column) for column in zip(*table, strict=True)))

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from jaxslam._runtime.files import Json, write_atomically
+from jaxslam._runtime.files import write_atomically
 from jaxslam.io.board import Board, View
 from jaxslam.io.calibration import INTRINSICS, Calibration, write_calibration
 from jaxslam.io.opening import open_recording
@@ -155,10 +155,15 @@ def write(calibrated: Calibrated, board: Board, out: str | Path) -> None:
     """`calibration.json`, with σ and reprojection error, and `coverage.png`, into a folder."""
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    told: dict[str, Json] = {"sigma": {"distortion": list(calibrated.distortion_sigma)}}
-    told |= {"reprojection_rms": calibrated.rms, "views": len(calibrated.views)}
-    told |= {"coverage": calibrated.coverage, "board": asdict(board)}
-    write_calibration(out / "calibration.json", calibrated.calibration, **told)
+    write_calibration(
+        out / "calibration.json",
+        calibrated.calibration,
+        sigma={"distortion": list(calibrated.distortion_sigma)},
+        reprojection_rms=calibrated.rms,
+        views=len(calibrated.views),
+        coverage=calibrated.coverage,
+        board=asdict(board),
+    )
     with write_atomically(out / "coverage.png") as path:
         cv2.imwrite(str(path), drawn_coverage(calibrated))
 

@@ -87,13 +87,14 @@ def selected(
     since = source.times - source.times[:1]
     first = int(np.argmin(np.abs(since - start))) if len(since) else 0
     stop = None if frames is None else first + every * frames
-    whole, times = source.images, source.times[first:stop:every]
-    begun, apart = source.first + first * source.every, source.every * every
-
-    def images() -> Iterator[Image]:
-        return itertools.islice(whole(), first, stop, every)
-
-    return replace(source, times=times, images=images, first=begun, every=apart)
+    images = source.images
+    return replace(
+        source,
+        times=source.times[first:stop:every],
+        images=lambda: itertools.islice(images(), first, stop, every),
+        first=source.first + first * source.every,
+        every=source.every * every,
+    )
 
 
 def _check_selection(source: Source, start: float, every: int, frames: int | None) -> None:

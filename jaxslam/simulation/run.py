@@ -132,9 +132,13 @@ def in_order_of_appearance(run: Run) -> Run:
     known = run.known
     if known is not None:
         known = replace(known, slots=jnp.argsort(order)[known.slots])
-    measured, visible = run.measured[:, order], run.visible[:, order]
-    points = run.points[order]
-    return replace(run, known=known, points=points, measured=measured, visible=visible)
+    return replace(
+        run,
+        known=known,
+        points=run.points[order],
+        measured=run.measured[:, order],
+        visible=run.visible[:, order],
+    )
 
 
 def in_shared_slots(run: Run, count: int) -> Run:
@@ -154,6 +158,12 @@ def in_shared_slots(run: Run, count: int) -> Run:
         return held, (held, comes)
 
     _, (held, new) = jax.lax.scan(frame, none, run.visible)
-    measured = jax.vmap(lambda values, held: values[held])(run.measured, held)
-    run = replace(run, points=run.points[held], measured=measured, visible=held >= 0)
-    return replace(run, new=new, identity=held)
+    pick = jax.vmap(lambda values, held: values[held])
+    return replace(
+        run,
+        points=run.points[held],
+        measured=pick(run.measured, held),
+        visible=held >= 0,
+        new=new,
+        identity=held,
+    )

@@ -328,10 +328,14 @@ class World(eqx.Module):
             key = jax.random.fold_in(jax.random.key(0), run)
             run = cast(Run, jax.jit(partial(simulate, self))(key))
         points = np.asarray(run.points_by_frame)
-        title = f"{self.name} from above, {self.steps} steps at {float(self.rate):g} Hz"
-        poses, visible = np.asarray(run.poses.as_matrix()), np.asarray(run.visible)
-        known = points[0, :0] if run.known is None else np.asarray(run.known.points)
-        return plotted("plot_world")(title, poses, points, visible, known, path)
+        return plotted("plot_world")(
+            f"{self.name} from above, {self.steps} steps at {float(self.rate):g} Hz",
+            np.asarray(run.poses.as_matrix()),
+            points,
+            np.asarray(run.visible),
+            points[0, :0] if run.known is None else np.asarray(run.known.points),
+            path,
+        )
 
     def to_dict(self) -> dict[str, Value]:
         """The flat fields of a scenario, as files have them: words, numbers and lists.

@@ -206,10 +206,13 @@ class Look:
     def asdict(self) -> Verdict:
         """Return the numbers as a verdict has them, of σ."""
         low, high = self.interval
-        factor = math.sqrt(self.factor)
-        ends = [_root(low, upwards=low > 1), _root(high, upwards=high > 1)]
-        own = {"nees": self.sums.mean, "sigma_factor": factor, "interval99": ends}
-        return Verdict(**own, p=self.p, word=self.word)
+        return Verdict(
+            nees=self.sums.mean,
+            sigma_factor=math.sqrt(self.factor),
+            interval99=[_root(low, upwards=low > 1), _root(high, upwards=high > 1)],
+            p=self.p,
+            word=self.word,
+        )
 
     def enough(self) -> int:
         """Estimate how many runs would show whether σ is right within `TOLERANCE`."""

@@ -217,8 +217,9 @@ class Policy:
         before = np.array([one.seen_at for one in landmarks]).reshape(-1, 2)
         lately = unseen == unseen.min(initial=unseen.max(initial=0))
         rigid = np.zeros_like(lately)
-        sigma, pairs = s.tolerance * s.pixel_sigma, (before[lately], pixels[lately])
-        rigid[lately] = of_one_motion(*pairs, self.calibration, sigma)
+        rigid[lately] = of_one_motion(
+            before[lately], pixels[lately], self.calibration, s.tolerance * s.pixel_sigma
+        )
         return lately, rigid
 
 

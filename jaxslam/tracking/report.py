@@ -70,11 +70,19 @@ class Tracked:
         """Return what became of a frame, after which the map is this one; `found` are other
         fields."""
         place, doubt = map.place, map.place.sigma_log_scale
-        log_scale = None if doubt is None else place.log_scale
-        sights = {one.number: one.seen_at for one in map.landmarks.values() if not one.unseen}
-        unit = {"log_scale": log_scale, "sigma_log_scale": doubt, "unit_fixed": place.unit_fixed}
-        found |= {"map": map.number, "submap": map.submap, "sights": sights, **unit}
-        return cls(frame.index, frame.time, place.camera, observations, **found)
+        return cls(
+            frame.index,
+            frame.time,
+            place.camera,
+            observations,
+            map=map.number,
+            submap=map.submap,
+            log_scale=None if doubt is None else place.log_scale,
+            sigma_log_scale=doubt,
+            sights={one.number: one.seen_at for one in map.landmarks.values() if not one.unseen},
+            unit_fixed=place.unit_fixed,
+            **found,
+        )
 
     @property
     def lost(self) -> bool:

@@ -31,11 +31,17 @@ def search(
     that is asked.
     """
     slots, affines = to_search(landmarks, prediction, calibration, settings)
-    expected, count = (prediction.pixels[slots], prediction.covariances[slots]), len(slots)
-    nowhere, labels = np.full((count, 2), np.nan), np.full(count, "unmatched")
-    seen = Observations(slots, *expected, nowhere, np.zeros(count), labels)
-    pairs = zip(slots, affines, strict=True)
-    warped = [landmarks[slot].patch.warped(affine) for slot, affine in pairs]
+    seen = Observations(
+        slots,
+        prediction.pixels[slots],
+        prediction.covariances[slots],
+        np.full((len(slots), 2), np.nan),
+        np.zeros(len(slots)),
+        np.full(len(slots), "unmatched"),
+    )
+    warped = [
+        landmarks[slot].patch.warped(affine) for slot, affine in zip(slots, affines, strict=True)
+    ]
     templates = np.array(warped, np.float32).reshape(-1, WINDOW, WINDOW)
     return seen, match_patches(image, templates, seen.predicted, seen.covariances, several=several)
 

@@ -219,9 +219,16 @@ def _units(history: Sequence[Tracked]) -> list[Summary]:
     units = []
     for number in range(history[-1].map + 1):
         of_map = [result for result in history if result.map == number]
-        fixed = next((result.index for result in of_map if result.unit_fixed), None)
-        told = {name: getattr(of_map[-1], name) for name in ("log_scale", "sigma_log_scale")}
-        units.append({"map": number, "fixed_at": fixed, **told})
+        fixed = (result.index for result in of_map if result.unit_fixed)
+        last = of_map[-1]
+        units.append(
+            {
+                "map": number,
+                "fixed_at": next(fixed, None),
+                "log_scale": last.log_scale,
+                "sigma_log_scale": last.sigma_log_scale,
+            }
+        )
     return units
 
 
