@@ -16,7 +16,7 @@ from jaxslam.linalg import (
     symmetric_part,
 )
 
-SIZES = (1, 3, LEAF, LEAF + 1, 105)
+SIZES = (1, 2, 3, 5, 12, LEAF, LEAF + 1, 2 * LEAF + 3, 105)
 
 
 def _positive(n, seed=0):
@@ -41,9 +41,10 @@ def test_cholesky_solves_and_has_the_determinant():
     np.testing.assert_allclose(factor.log_det(), np.linalg.slogdet(A)[1], rtol=1e-12)
 
 
-def test_what_is_nearly_singular_has_a_factor():
+@pytest.mark.parametrize("n", [45, 75])
+def test_what_is_nearly_singular_has_a_factor(n):
     """As the information of a window is: ten directions are known 10⁷ times as well as others."""
-    rng, n = np.random.default_rng(1), 75
+    rng = np.random.default_rng(1)
     A = rng.normal(size=(100, 10, n)) * 10.0 ** (7 - 2 * rng.uniform(size=(100, 10, 1)))
     information = np.eye(n) + np.swapaxes(A, 1, 2) @ A
     np.linalg.cholesky(information)  # raises where there is none
@@ -60,8 +61,9 @@ def test_cholesky_of_what_is_not_positive_is_nan_throughout(n, least):
     assert np.isnan(factor.log_det())
 
 
-def test_cholesky_has_the_derivatives_of_central_differences():
-    A, dA = _positive(4), _positive(4, seed=1)
+@pytest.mark.parametrize("n", [1, 4, 9])
+def test_cholesky_has_the_derivatives_of_central_differences(n):
+    A, dA = _positive(n), _positive(n, seed=1)
     _, tangent = jax.jvp(cholesky, (A,), (dA,))
     step = 1e-6
     above, below = cholesky(A + step * dA), cholesky(A - step * dA)
@@ -95,9 +97,10 @@ def test_semidefinite_root_has_any_rank_and_solves_in_its_range():
     np.testing.assert_allclose(root @ (whitening @ b), b, rtol=0, atol=1e-6)
 
 
-def test_large_semidefinite_matrices_have_roots_too():
+@pytest.mark.parametrize("n", [LEAF, 105])
+def test_large_semidefinite_matrices_have_roots_too(n):
     """Of a fifth of their rows, and of scales far apart: the jitter is only rounding's size."""
-    rng, n = np.random.default_rng(0), 105
+    rng = np.random.default_rng(0)
     half = rng.normal(size=(100, n, n // 5)) * 10.0 ** rng.uniform(-4, 2, size=(100, n, 1))
     P = half @ np.swapaxes(half, 1, 2)
     root = np.asarray(jax.jit(jax.vmap(semidefinite_root))(P).root)
@@ -106,7 +109,7 @@ def test_large_semidefinite_matrices_have_roots_too():
     np.testing.assert_allclose(away, 0, atol=1e-11)
 
 
-@pytest.mark.parametrize("n", [1, 2, 7])
+@pytest.mark.parametrize("n", [1, 2, 3, 7])
 def test_eigh_is_numpys(n):
     A = _positive(n) - 3 * np.eye(n)
     values, vectors = jax.jit(eigh)(A)
@@ -132,7 +135,7 @@ def test_eigenvectors_turn_with_a_perturbation_of_a_diagonal():
     np.testing.assert_allclose(turn, expected, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("n", [1, 13])
+@pytest.mark.parametrize("n", [1, 2, 6, 13])
 def test_inverse_is_numpys_and_needs_no_good_pivots(n):
     A = np.random.default_rng(n).normal(size=(n, n))
     A[0, 0] = 0 if n > 1 else 2.0

@@ -12,8 +12,6 @@ from benchmarks.speed import gpu
 from benchmarks.speed.gpu import BEGIN, OnGpu, shown
 from benchmarks.speed.workload import WORKLOADS
 
-pytestmark = pytest.mark.slow  # compiles each filter twice: a page of one machine
-
 drawn_once = cache(gpu.prepared)
 
 

@@ -12,8 +12,6 @@ from benchmarks.speed.loop import by_loop
 from benchmarks.speed.study import study_of
 from benchmarks.speed.workload import WORKLOADS, ours, prepared
 
-pytestmark = pytest.mark.slow  # compiles four programs of others: a page of one machine
-
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory):

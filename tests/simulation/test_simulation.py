@@ -526,7 +526,7 @@ def test_the_camera_circles_around_the_centre_of_the_ring():
 
 def test_true_intrinsics_are_drawn_as_stated():
     """A pixel's deviation from the nominal camera is bearing · δf + δc."""
-    for drawing in ("constant", "white"):
+    for drawing in ("nominal", "constant", "white"):
         chosen = scenario(
             "matched",
             true_calibration=drawing,
@@ -541,7 +541,9 @@ def test_true_intrinsics_are_drawn_as_stated():
         ones = np.ones_like(bearings)
         A = np.stack([bearings, ones], axis=-1)
         deltas = np.einsum("rfip,rfp->rfi", np.linalg.pinv(A), deviation) / np.array([3.0, 2.0])
-        if drawing == "constant":
+        if drawing == "nominal":
+            assert np.abs(deltas).max() < 1e-6
+        elif drawing == "constant":
             assert np.ptp(deltas, axis=1).max() < 1e-6
             two_sided(np.sum(deltas[:, 0] ** 2), deltas[:, 0].size)
         else:
