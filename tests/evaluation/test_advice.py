@@ -91,5 +91,3 @@ def test_a_log_beside_its_innovations_is_told_what_to_turn(tmp_path):
     )
     alone = evaluate_log(tmp_path / "nis.npz")
     assert alone.remarks[-1].endswith("most likely Q too small")
-    with pytest.raises(ValueError, match="--innovations FILE, not both"):
-        evaluate_log(tmp_path / "nis.npz", nis=True, innovations=tmp_path / "nis.npz")

@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 from itertools import product
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,11 +11,23 @@ import verdicts as benchmark
 from cases import quick_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
+from logs import (
+    FIXED,
+    LOST,
+    TRACKED,
+    UNFIXED,
+    consistent,
+    covariance,
+    logged,
+    one_run,
+    planar,
+    some,
+    tracked_run,
+    write_runs,
+)  # fmt: skip
 from scipy.spatial.transform import Rotation
 
 import jaxslam
-from jaxslam.cli import main
 from jaxslam.evaluation import Convention, converted, pose_errors
 from jaxslam.evaluation.alignment import (
     Similarity,
@@ -45,42 +56,13 @@ from jaxslam.statistics import Tally, not_disproved
 from jaxslam.statistics.beyond_scale import one_scale
 
 EVERY = [Convention(*c) for c in product(*list(CHOICES.values())[:3])]
-FALSE_ALARM = 1e-4
-
-
-def some(geometry, shape, seed=0, spread=1.0):
-    """Poses (…, d, d)."""
-    rng = np.random.default_rng(seed)
-    size = int(np.prod(shape))
-    group, t = geometry.group, geometry.tangent_dim
-    T = jax.vmap(lambda x: group.exp(x).as_matrix())(
-        jnp.asarray(spread * rng.normal(size=(size, t)))
-    )
-    return np.asarray(T).reshape(*shape, *T.shape[1:])
-
-
-def covariance(t, seed=0, size=0.05):
-    root = np.diag(size * 10 ** np.linspace(-1, 0, t)) @ (
-        np.eye(t) + 0.3 * np.random.default_rng(seed).normal(size=(t, t))
-    )
-    return root @ root.T
-
-
-def logged(convention, geometry=SPATIAL, runs=40, steps=6, seed=0, spread=1.0, factor=1.0):
-    """Poses, covariances and truths whose errors in the convention are drawn from them."""
-    T, t = some(geometry, (runs, steps), seed, spread), geometry.tangent_dim
-    P = np.broadcast_to(covariance(t), (runs, steps, t, t))
-    noise = np.random.default_rng(seed + 1).normal(size=(runs, steps, t))
-    errors = factor * noise @ np.linalg.cholesky(covariance(t)).T
-    return T, P, benchmark.displaced(T, errors, convention)
-
-
-def consistent(nees, dof):
-    """Whether a sum of independent NEES is χ², up to a false alarm in 10 000."""
-    low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], nees.size * dof)
-    return low < nees.sum() < high
-
-
+"""Orders are the fastest to change: every second is of another, and they only permute axes."""
+EACH = [*EVERY[::4], *EVERY[3::4]]
+each_convention = pytest.mark.parametrize(
+    "convention",
+    [pytest.param(c, marks=[pytest.mark.slow] * (c not in EACH), id=str(c)) for c in EVERY],
+)
+"""Errors and axes in one of their two orders; in the other one they are slow."""
 # --- conventions --------------------------------------------------------------------------------
 
 
@@ -113,7 +95,7 @@ def test_the_split_error_is_what_ros_and_error_state_filters_have():
 
 
 @pytest.mark.parametrize("geometry", [PLANAR, SPATIAL])
-@pytest.mark.parametrize("convention", EVERY, ids=str)
+@each_convention
 def test_the_change_of_a_convention_is_the_derivative_of_its_error(convention, geometry):
     T, t, step = some(geometry, (2,)), geometry.tangent_dim, 1e-6
     J = np.stack(
@@ -127,7 +109,7 @@ def test_the_change_of_a_convention_is_the_derivative_of_its_error(convention, g
     np.testing.assert_allclose(abs(np.linalg.det(from_right(convention, T))), 1, rtol=1e-9)
 
 
-@pytest.mark.parametrize("convention", EVERY, ids=str)
+@each_convention
 def test_a_filter_that_is_right_is_consistent_in_its_own_convention(convention):
     """Exactly, by construction, whatever the size of the errors."""
     T, P, truth = logged(convention)
@@ -145,20 +127,6 @@ def test_conversion_to_another_convention_and_back_changes_nothing():
         np.testing.assert_allclose(converted(there, T, new, EVERY[0]), P, atol=1e-12)
         J = change(T, EVERY[0], new)
         np.testing.assert_allclose(there, J @ P @ np.swapaxes(J, 1, 2), atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("word", "message"),
-    [
-        ({"error": "lfet"}, "unknown error 'lfet' .did you mean left"),
-        ({"axes": "camera"}, "unknown axes 'camera'; known: body, world, mixed"),
-        ({"order": "xyz"}, "unknown order"),
-        ({"scale": "free"}, "unknown scale"),
-    ],
-)
-def test_words_of_a_convention_that_are_not_known_are_refused(word, message):
-    with pytest.raises(ValueError, match=message):
-        Convention(**word)
 
 
 # --- the checker --------------------------------------------------------------------------------
@@ -279,27 +247,6 @@ def test_of_one_file_only_one_convention_is_said_to_be_the_only_one():
 # --- axes that are not estimated ----------------------------------------------------------------
 
 
-def planar(runs=50, steps=12, factor=1.0, other=1e-6, vertical=2, seed=0):
-    """A robot in a plane as people write it in six axes, and its NEES in three; errors split."""
-    rng = np.random.default_rng(seed)
-    flat = [axis for axis in range(3) if axis != vertical]
-    used = [*flat, 3 + vertical]
-    root = np.diag([0.05, 0.03, 0.01]) @ np.array([[1, 0, 0], [0.3, 1, 0], [0.4, -0.3, 1]])
-    e = np.zeros((runs, steps, 6))
-    e[..., used] = rng.normal(size=(runs, steps, 3)) @ root.T
-    P = other * np.eye(6)
-    P[np.ix_(used, used)] = factor**2 * root @ root.T
-    angle = np.zeros((runs * steps, 3))
-    angle[:, vertical] = np.tile(np.linspace(0, 3, steps), runs)
-    T = np.tile(np.eye(4), (runs, steps, 1, 1))
-    T[..., :3, :3] = Rotation.from_rotvec(angle).as_matrix().reshape(runs, steps, 3, 3)
-    T[..., flat, 3] = 5 * np.stack([np.sin(angle[:steps, vertical]), np.linspace(0, 1, steps)], 1)
-    truth = benchmark.displaced(T, e, Convention("split"))
-    inverse = np.linalg.inv(P[np.ix_(used, used)])
-    nees = np.einsum("rki,ij,rkj->rk", e[..., used], inverse, e[..., used])
-    return T, np.broadcast_to(P, (runs, steps, 6, 6)), truth, nees
-
-
 @pytest.mark.parametrize("other", [0.0, 1e-6, 1e6])
 @pytest.mark.parametrize("vertical", [1, 2])
 def test_axes_that_are_not_estimated_have_no_degree_of_freedom(other, vertical):
@@ -328,8 +275,6 @@ def test_axes_used_may_be_said_and_the_first_pose_known_on_them():
     found = jaxslam.evaluate_poses(T, P, truth, Convention("split"), axes_used="rz,x")
     assert found.names == ("x", "rz")
     assert found.notes == ()
-    with pytest.raises(ValueError, match="unknown axes used 'yaw'; known: x, y, z, rx, ry, rz"):
-        jaxslam.evaluate_poses(T, P, truth, Convention("split"), axes_used=["x", "yaw"])
     P = P.copy()
     P[:, 0, [0, 1, 5]], T[:, 0] = 0, truth[:, 0]
     P[:, 0, :, [0, 1, 5]] = 0
@@ -344,14 +289,10 @@ def test_axes_used_may_be_said_and_the_first_pose_known_on_them():
         np.testing.assert_allclose(there.nees, nees[:, 1:], rtol=1e-4)
 
 
-def test_the_command_takes_axes_used(tmp_path, capsys):
+def test_of_the_axes_used_alone_a_folder_is_evaluated(tmp_path):
     *poses, _ = planar(runs=3)
-    write_runs(tmp_path / "runs", *poses, Convention("split"))
-    main(["evaluate", str(tmp_path / "runs"), "--axes-used", "x,y,rz", "--out", str(tmp_path)])
-    assert "a consistent filter 3," in capsys.readouterr().out
-    np.savez(tmp_path / "e.npz", errors=np.zeros((2, 3, 1)), covariances=np.ones((2, 3, 1, 1)))
-    with pytest.raises(ValueError, match="axes used and σ of the truth apply to poses"):
-        jaxslam.evaluate_log(tmp_path / "e.npz", axes_used="x")
+    write_runs(tmp_path, *poses, Convention("split"))
+    assert jaxslam.evaluate_log(tmp_path, axes_used="x,y,rz").names == ("x", "y", "rz")
 
 
 @pytest.mark.parametrize(("correlation", "left_out"), [(0.0, True), (0.3, False)])
@@ -572,13 +513,6 @@ def test_an_estimate_that_begins_at_a_known_pose_is_aligned_there(convention):
     assert not_disproved(free.verdict)
 
 
-def test_given_the_scale_and_se3_go_together_only_where_the_first_pose_is_known():
-    with pytest.raises(ValueError, match="--align sim3, or se3 if the first covariance is zero"):
-        jaxslam.evaluate_poses(*logged(Convention()), Convention(scale="given"), align="se3")
-    with pytest.raises(ValueError, match="unknown align 'rigid'; known: none, se3, sim3"):
-        jaxslam.evaluate_poses(*logged(Convention()), align="rigid")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("align", ["se3", "sim3"])
 def test_the_rotation_about_a_straight_line_is_not_fitted_to_noise(align):
@@ -603,12 +537,6 @@ def test_the_rotation_about_a_straight_line_is_not_fitted_to_noise(align):
     curve = jaxslam.evaluate_poses(T, P, bent, convention, align=align)
     assert not_disproved(curve.verdict)
     assert "straight line" not in str(curve)
-
-
-def test_positions_in_one_place_cannot_be_aligned():
-    T, P, _ = logged(Convention(), spread=0.0)
-    with pytest.raises(ValueError, match="coincide"):
-        jaxslam.evaluate_poses(T, P, np.tile(np.eye(4), (*T.shape[:2], 1, 1)), align="sim3")
 
 
 def test_pairs_and_fits_are_those_of_evo():
@@ -676,7 +604,7 @@ def test_conventions_are_told_from_runs_of_unlike_length_too():
     assert jaxslam.evaluate_poses(T, P, truth).suggested == true
 
 
-# --- text and folders ---------------------------------------------------------------------------
+# --- text and folders; that each format is its arrays is a law of logs ----------------------------
 
 
 @pytest.mark.parametrize("convention", [*EVERY[::3], Convention(scale="given")], ids=str)
@@ -705,63 +633,21 @@ def test_a_covariance_file_by_others_may_be_in_degrees_and_say_little(tmp_path):
     assert read_covariances(path).convention == Convention()
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("0 1 2 3\n", "line 1: expected 22 finite numbers"),
-        ("# a\n" + "nan " * 22, "line 2: expected 22 finite numbers"),
-        ("# error=lfet\n" + "1 " * 22, r"unknown error 'lfet' \(did you mean left\?\)"),
-        ("# eror=left\n" + "1 " * 22, r"unknown key 'eror' in the header \(did you mean error\?\)"),
-        ("# angle=grad\n" + "1 " * 22, "unknown angle 'grad'"),
-        ("#\n", "has no covariances"),
-    ],
-)
-def test_bad_covariance_files_are_refused_by_name(tmp_path, text, message):
-    (tmp_path / "c.txt").write_text(text)
-    with pytest.raises(ValueError, match=message) as caught:
-        read_covariances(tmp_path / "c.txt")
-    assert str(tmp_path / "c.txt") in str(caught.value)
-
-
-def write_runs(folder, T, P, truth, convention, times=None):
-    times = np.arange(T.shape[1]) / 10 if times is None else times
-    for run in range(len(T)):
-        own = folder / f"run{run:02}"
-        own.mkdir(parents=True)
-        write_tum(own / "estimate.txt", times, T[run])
-        write_covariances(own / "covariance.txt", times, P[run], convention)
-        write_tum(own / "truth.txt", times + 0.004, truth[run])
-
-
-@pytest.mark.slow
-def test_a_folder_of_runs_is_its_arrays(tmp_path, capsys):
+def test_a_folder_of_runs_is_its_arrays_and_what_is_stated_comes_before_what_files_say(tmp_path):
     convention = Convention("split", "mixed", "rotation-first")
-    T, P, truth = logged(convention, runs=12)
-    write_runs(tmp_path / "runs", T, P, truth, convention)
-    main(["evaluate", str(tmp_path / "runs"), "--out", str(tmp_path)])
-    written = json.loads((tmp_path / "evaluation.json").read_text())
-    arrays = jaxslam.evaluate_poses(T, P, truth, convention)
+    T, P, truth = logged(convention, runs=3)
+    write_runs(tmp_path, T, P, truth, convention)
+    found, arrays = jaxslam.evaluate_log(tmp_path), jaxslam.evaluate_poses(T, P, truth, convention)
     # Nine decimals of poses whose least σ is 5e-3.
-    np.testing.assert_allclose(written["nees"], arrays.mean, rtol=1e-4)
+    np.testing.assert_allclose(found.nees, arrays.nees, rtol=1e-4)
+    written = found.asdict()
     assert written["convention"] == {
         "error": "split", "axes": "mixed", "order": "rotation-first", "scale": "marginal",
     }  # fmt: skip
     assert written["time"] == pytest.approx(np.arange(6) / 10)
     assert list(written["rmse"]) == ["rx", "ry", "rz", "x", "y", "z"]
-    capsys.readouterr()
-    one = tmp_path / "runs" / "run03"
-    arguments = [str(one / "estimate.txt"), "--covariance", str(one / "covariance.txt")]
-    arguments += ["--truth", str(one / "truth.txt"), "--out", str(tmp_path / "one")]
-    main(["evaluate", *arguments])
-    single = json.loads((tmp_path / "one" / "evaluation.json").read_text())
-    np.testing.assert_allclose(single["nees"], arrays.nees[3], rtol=1e-4)
-    # What is stated comes before what the file says.
-    main(["evaluate", *arguments, "--error", "left", "--order", "position-first"])
-    assert capsys.readouterr().out.startswith("NEES ")
-    stated = json.loads((tmp_path / "one" / "evaluation.json").read_text())["convention"]
-    assert stated == {
-        "error": "left", "axes": "world", "order": "position-first", "scale": "marginal",
-    }  # fmt: skip
+    stated = {"error": "left", "order": "position-first"}
+    assert jaxslam.evaluate_log(tmp_path, stated=stated).convention == Convention("left", "world")
 
 
 def test_lost_runs_have_the_names_of_their_folders(tmp_path):
@@ -772,16 +658,6 @@ def test_lost_runs_have_the_names_of_their_folders(tmp_path):
     assert found.asdict()["lost_runs"] == ["run02"]
     assert found.asdict()["run_names"] == ["run00", "run01", "run02", "run03"]
     assert "lost: run02" in str(found).splitlines()
-
-
-def test_poses_in_arrays_are_those_in_files(tmp_path):
-    T, P, truth = logged(Convention("left"), runs=3)
-    np.savez(tmp_path / "a.npz", estimates=T, covariances=P, truths=truth, error="left")
-    found = jaxslam.evaluate_log(tmp_path / "a.npz")
-    assert found.convention == Convention("left")
-    np.testing.assert_array_equal(
-        found.nees, jaxslam.evaluate_poses(T, P, truth, Convention("left")).nees
-    )
 
 
 def test_runs_of_unlike_length_in_folders_are_compared_as_far_as_each_goes(tmp_path):
@@ -804,65 +680,6 @@ def test_runs_of_unlike_length_in_folders_are_compared_as_far_as_each_goes(tmp_p
     assert "runs have 5 to 6 poses" in str(found)
 
 
-def one_run(folder, steps=40, offset=0.0, shown=None):
-    """Files of one run of ten poses a second; the truth is later, and times are as they are shown
-    in the files that are named."""
-    T, P, truth = (x[0] for x in logged(Convention(), runs=1, steps=steps))
-    folder.mkdir(parents=True, exist_ok=True)
-    times = 1.4e9 + np.arange(steps) / 10
-    write_tum(folder / "estimate.txt", times, T)
-    write_covariances(folder / "covariance.txt", times, P, Convention())
-    write_tum(folder / "truth.txt", times + offset, truth)
-    for name, of in (shown or {}).items():
-        rows = [line.split(maxsplit=1) for line in (folder / name).read_text().splitlines()[1:]]
-        (folder / name).write_text("".join(f"{of(float(t))} {rest}\n" for t, rest in rows))
-    return folder
-
-
-def nanoseconds(t):
-    return f"{round(t * 1e9)}"
-
-
-FILES = ("estimate.txt", "covariance.txt", "truth.txt")
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"offset": 0.05}, "truth.txt have no time stamps in common"),
-        (
-            {"shown": dict.fromkeys(FILES, nanoseconds)},
-            "1.4e.18 look like nanoseconds; expected seconds",
-        ),
-        ({"shown": {"covariance.txt": nanoseconds}}, "covariance.txt: times .* like nanoseconds"),
-        ({"shown": {"truth.txt": lambda t: f"{t * 1e3:.0f}"}}, "truth.txt: .* like milliseconds"),
-        (
-            {"shown": dict.fromkeys(FILES, lambda t: f"{(t - 1.4e9) * 1e9:.0f}")},
-            r"times 1e\+08 from one to the next look like nanoseconds",
-        ),
-        (
-            {"shown": dict.fromkeys(FILES, lambda t: f"{t:g}")},
-            "its 40 poses have only 1 different times, perhaps printed with too few digits",
-        ),
-        (
-            {"shown": {"truth.txt": lambda t: f"{t + (t > 1.4e9 + 0.7) * 0.03:.9f}"}},
-            r"of its 40 times .* only 8 can be compared: 40 have a covariance .* 8 a truth\. "
-            r".*truth\.txt has 40 times .* nearest one is 0\.03 s away",
-        ),
-        (
-            {"shown": {"truth.txt": lambda t: f"{1.4e9 + (t - 1.4e9) % 2:.9f}"}},
-            "times decrease from 1400000001.900 to 1400000000.000 s; expected one run",
-        ),
-    ],
-)
-def test_a_log_of_which_most_would_not_be_compared_is_refused_with_the_reason(
-    given, message, tmp_path
-):
-    with pytest.raises(ValueError, match=message) as caught:
-        jaxslam.evaluate_log(one_run(tmp_path / "run", **given))
-    assert "\n" not in str(caught.value)
-
-
 def test_files_of_other_rates_are_compared_where_they_meet(tmp_path):
     """A truth of every third pose is compared whole, as one of ten times as many is."""
     run = one_run(tmp_path / "run", shown=None)
@@ -871,20 +688,6 @@ def test_files_of_other_rates_are_compared_where_they_meet(tmp_path):
     found = jaxslam.evaluate_log(run)
     assert found.logged.sum() == 14
     assert "26 of 40 poses have no truth" in str(found)
-
-
-def test_a_truth_of_a_small_part_of_the_time_is_refused(tmp_path):
-    run = one_run(tmp_path / "run")
-    lines = (run / "truth.txt").read_text().splitlines()
-    (run / "truth.txt").write_text("\n".join(lines[:16]))
-    with pytest.raises(ValueError, match=r"only 15 can be compared.* half the lines"):
-        jaxslam.evaluate_log(run)
-
-
-def test_times_of_arrays_are_seconds_too():
-    T, P, truth = logged(Convention(), runs=1)
-    with pytest.raises(ValueError, match=r"times 1e.08 from one to the next look like nanoseconds"):
-        jaxslam.evaluate_poses(T, P, truth, times=np.arange(6) * 100_000_000)
 
 
 def test_steps_at_other_times_in_other_runs_are_counted_and_it_is_said(tmp_path):
@@ -897,87 +700,6 @@ def test_steps_at_other_times_in_other_runs_are_counted_and_it_is_said(tmp_path)
     write_tum(tmp_path / "run01" / "truth.txt", slower, truth[1])
     told = str(jaxslam.evaluate_log(tmp_path))
     assert "their times differ between runs, and are those of run00" in told
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        ("run00/trajectory.txt", r"run00 has both estimate\.txt and trajectory\.txt; keep one"),
-        ("run00/groundtruth.txt", r"run00 has both truth\.txt and groundtruth\.txt; keep one"),
-        ("estimate.txt", r"has a run and sub-folders with runs \(run00, run01\)"),
-    ],
-)
-def test_files_of_two_runs_are_not_mixed(more, message, tmp_path):
-    write_runs(tmp_path, *logged(Convention(), runs=2), Convention())
-    (tmp_path / more).write_text((tmp_path / "run01" / "estimate.txt").read_text())
-    with pytest.raises(ValueError, match=message):
-        jaxslam.evaluate_log(tmp_path)
-
-
-STAMPS, LEFT = np.arange(6) / 10, Convention("left")
-
-
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (lambda f: (f / "run01" / "truth.txt").unlink(), "run01 has no truth.txt"),
-        (lambda f: (f / "run00" / "estimate.txt").unlink(), "run00 has no estimate.txt"),
-        (
-            lambda f: write_tum(f / "run01" / "truth.txt", [99.0], np.eye(4)[None]),
-            "no time stamps in common within 0.01 s",
-        ),
-        (
-            lambda f: write_covariances(
-                f / "run01" / "covariance.txt", STAMPS, np.tile(np.eye(6), (6, 1, 1)), LEFT
-            ),
-            "states a different convention",
-        ),
-        (
-            lambda f: (f / "run01" / "covariance.txt").write_bytes(b"\xff\xfe"),
-            "cannot be read as text",
-        ),
-        (
-            lambda f: write_covariances(
-                f / "run01" / "covariance.txt", STAMPS, np.tile(-np.eye(6), (6, 1, 1)), Convention()
-            ),
-            "runs: the covariance of run01, step 0 has variance -1",
-        ),
-    ],
-)
-def test_a_folder_with_a_fault_ends_with_status_2_and_one_line(spoil, message, tmp_path, capsys):
-    T, P, truth = logged(Convention(), runs=2)
-    write_runs(tmp_path / "runs", T, P, truth, Convention())
-    spoil(tmp_path / "runs")
-    with pytest.raises(SystemExit) as stop:
-        main(["evaluate", str(tmp_path / "runs"), "--out", str(tmp_path / "out")])
-    error = capsys.readouterr().err
-    assert stop.value.code == 2
-    assert message in error
-    assert error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
-def test_an_empty_folder_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"has neither estimate\.txt nor sub-folders"):
-        jaxslam.evaluate_log(tmp_path)
-
-
-def test_poses_that_are_none_are_refused_by_run_and_step():
-    T, P, truth = logged(Convention(), runs=3)
-    bent = T.copy()
-    bent[1, 2, 0, 0] += 0.1
-    with pytest.raises(ValueError, match="estimates of run 1, step 2 is not a rigid motion"):
-        jaxslam.evaluate_poses(bent, P, truth)
-    with pytest.raises(ValueError, match=r"truths must have the same shape, not \(2, 6, 4, 4\)"):
-        jaxslam.evaluate_poses(T, P, truth[:2])
-    with pytest.raises(ValueError, match=r"must be \(3, 6, 6, 6\), or the joint ones"):
-        jaxslam.evaluate_poses(T, P[..., :3, :3], truth)
-    far = truth.copy()
-    far[0, 0, 0, 3] = 1e300
-    with pytest.raises(ValueError, match=r"truths contain 1e\+300; the limit is 1e\+100"):
-        jaxslam.evaluate_poses(T, P, far, align="se3")
-    with pytest.raises(ValueError, match="estimates must be matrices"):
-        jaxslam.evaluate_poses(T[..., :2, :2], P, truth)
 
 
 WORDS = [
@@ -1035,30 +757,6 @@ def test_of_the_trackers_files_nees_is_given_the_scale(tmp_path):
     assert Tally.of(found.nees, 6, 1.0).average.mean == pytest.approx(found.verdict["nees"])
 
 
-TRACKED = Convention("split", "body", scale="given")
-UNFIXED, FIXED, LOST = ("tracked", 0, 1.5), ("tracked", 1, 1.0), ("lost", 1, 4.0)
-"""State, unit_fixed, and the length of the unit in which the pose is written."""
-
-
-def tracked_run(folder, maps):
-    """Files of a folder as the tracker writes them: of each map its frames. Poses and truths."""
-    told = [(number, *frame) for number, frames in enumerate(maps) for frame in frames]
-    T, P, truth = (x[0].copy() for x in logged(TRACKED, runs=1, steps=len(told), spread=0.5))
-    T[0], truth[0], P[0] = np.eye(4), np.eye(4), 0  # known exactly
-    truth[:, :3, 3] *= np.array([unit for *_, unit in told])[:, None]
-    times = np.arange(len(told)) / 30
-    write_tum(folder / "trajectory.txt", times, T)
-    write_covariances(folder / "covariance.txt", times, P, TRACKED)
-    write_tum(folder / "groundtruth.txt", times, truth)
-    rows = [
-        f"{i},{times[i]:.9f},{state},{number},9,1.5,18,0.1,,,{fixed}"
-        for i, (number, state, fixed, _) in enumerate(told)
-    ]
-    header = "frame,time,state,map,matches,nis,nis_dof,sigma_position,log_scale,more,unit_fixed"
-    (folder / "frames.csv").write_text("\n".join([header, *rows]) + "\n")
-    return T[None], P[None], truth[None]
-
-
 def test_frames_that_the_tracker_says_nothing_of_the_unit_of_are_left_out(tmp_path):
     first = [("start", 0, 1.5), *9 * [UNFIXED], *60 * [FIXED], *5 * [LOST]]
     second = [("start", 0, 7.0), *20 * [("tracked", 1, 7.0)]]
@@ -1105,25 +803,6 @@ def test_files_of_that_name_by_others_and_of_older_versions_say_nothing(text, tm
     tracked_run(tmp_path, [20 * [FIXED]])
     (tmp_path / "frames.csv").write_bytes(text.encode(errors="surrogateescape"))
     assert jaxslam.evaluate_log(tmp_path).logged.all()
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        (",1\n", ",yes\n", r"frames\.csv, line 2: expected a finite time.* unit_fixed 0 or 1"),
-        ("9,0.3", "9,nan0.3", r"frames\.csv, line 11: expected a finite time"),
-        (",1\n", ",0\n", "every frame with a pose is lost or has no fixed unit"),
-        ("\n0,0", "\n0,-9", "pose at 0.000 s; it must list the frames of the trajectory"),
-        ("tracked,0", "tracked,-1", "line 2: .* the number of a map"),
-    ],
-)
-def test_faults_in_the_trackers_file_are_named(old, new, message, tmp_path):
-    tracked_run(tmp_path, [20 * [FIXED]])
-    file = tmp_path / "frames.csv"
-    file.write_text(file.read_text().replace(old, new))
-    with pytest.raises(ValueError, match=message) as caught:
-        jaxslam.evaluate_log(tmp_path)
-    assert "\n" not in str(caught.value)
 
 
 # --- a truth that is measured -------------------------------------------------------------------
@@ -1211,14 +890,7 @@ def test_with_a_joint_covariance_the_first_true_poses_noise_is_common():
     assert joint[0, 0, 0] == P[0, 0, 0, 0]
 
 
-def test_the_command_takes_the_sigma_of_the_truth(tmp_path, capsys):
-    run, out = one_run(tmp_path / "run"), tmp_path / "out"
-    main(["evaluate", str(run), "--truth-sigma", "0.05", "1", "--out", str(out)])
-    assert json.loads((out / "evaluation.json").read_text())["truth_sigma"] == [0.05, 1.0]
-    assert "includes that of the truth, 0.05 m and 1°" in capsys.readouterr().out
-    for wrong in ((-1, 0), (1,), (np.nan, 1), (1, 2, 3)):
-        with pytest.raises(ValueError, match="truth_sigma must be two numbers, metres and degrees"):
-            jaxslam.evaluate_log(run, truth_sigma=wrong)
-    np.savez(tmp_path / "errors.npz", errors=np.ones((2, 3, 1)), covariances=np.ones((2, 3, 1, 1)))
-    with pytest.raises(ValueError, match="σ of the truth apply to poses"):
-        jaxslam.evaluate_log(tmp_path / "errors.npz", truth_sigma=(1, 1))
+def test_the_sigma_of_the_truth_is_said_where_it_was_added(tmp_path):
+    found = jaxslam.evaluate_log(one_run(tmp_path / "run"), truth_sigma=(0.05, 1))
+    assert found.asdict()["truth_sigma"] == [0.05, 1.0]
+    assert "includes that of the truth, 0.05 m and 1°" in str(found)

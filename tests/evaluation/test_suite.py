@@ -135,60 +135,63 @@ def test_a_hidden_truth_comes_of_its_seed(written, tmp_path, capsys):
         assert message in capsys.readouterr().err
 
 
-def nan_at(log, place):
+def changed(log, place, value):
     log = log.copy()
-    log[place, 4] = np.nan
+    log[place] = value
     return log
 
 
-BAD = {
-    "a run is missing": (lambda log: log[log[:, 0] != 2], "run 2 is missing"),
-    "a step is missing": (lambda log: np.delete(log, STEPS + 3, 0), "run 1, step 4 is missing"),
-    "the last step is missing": (lambda log: log[log[:, 1] < STEPS], f"step {STEPS} is missing"),
-    "a run too many": (lambda log: np.vstack([log, [RUNS, *log[-1, 1:]]]), f"run {RUNS} is missi"),
-    "steps from 0": (lambda log: log - [0, 1, *[0] * 9], "step 8 is missing"),
-    "a row twice": (lambda log: np.vstack([log, log[:1]]), "run 0, step 1 appears twice"),
-    "too few columns": (lambda log: log[:, :-2], "9 columns"),
-    "too few numbers": (lambda log: log[:, :7], "run, step, x, z, rotation and their covariance"),
-    "not a number": (lambda log: nan_at(log, 7), "line 8"),
-    "a negative variance": (lambda log: log * [*[1] * 5, -1, *[1] * 5], "run 0, step 1 has vari"),
-}
+NAMES = ("x", "z", "rotation")
 
 
-@pytest.mark.parametrize("bad", BAD)
-def test_a_bad_log_ends_in_one_line(bad, written, tmp_path, capsys):
-    spoil, message = BAD[bad]
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda log: log[log[:, 0] != 2], "run 2 is missing"),
+        (lambda log: np.delete(log, STEPS + 3, 0), "run 1, step 4 is missing"),
+        (lambda log: log[log[:, 1] < STEPS], f"step {STEPS} is missing"),
+        (lambda log: np.vstack([log, [RUNS, *log[-1, 1:]]]), f"run {RUNS} is missing"),
+        (lambda log: log - [0, 1, *[0] * 9], "step 8 is missing"),
+        (lambda log: np.vstack([log, log[:1]]), "run 0, step 1 appears twice"),
+        (lambda log: log[:, :-2], "9 columns"),
+        (lambda log: log[:, :7], "run, step, x, z, rotation and their covariance"),
+        (lambda log: changed(log, (7, 4), np.nan), "line 8"),
+    ],
+)
+def test_a_bad_log_is_named(spoil, message, written, tmp_path):
+    log = np.loadtxt(written / "logs" / "small.csv", delimiter=",")
+    np.savetxt(tmp_path / "small.csv", spoil(log), delimiter=",")
+    with pytest.raises(ValueError, match=rf"small\.csv.*{message}"):
+        read_pose_log(tmp_path / "small.csv", RUNS, STEPS, NAMES)
+
+
+def test_a_bad_log_ends_the_command_in_one_line(written, tmp_path, capsys):
     log = np.loadtxt(written / "logs" / "small.csv", delimiter=",")
     (tmp_path / "logs").mkdir()
-    np.savetxt(tmp_path / "logs" / "small.csv", spoil(log), delimiter=",")
+    np.savetxt(tmp_path / "logs" / "small.csv", changed(log, np.s_[:, 5], -1), delimiter=",")
     (tmp_path / "open").symlink_to(written / "open")
     with pytest.raises(SystemExit) as stop:
         judged(tmp_path, "open", tmp_path / "out")
     assert stop.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "small.csv" in line
-    assert message in line
+    assert "run 0, step 1 has vari" in line
     assert not (tmp_path / "out").exists()
 
 
 def test_columns_are_those_of_the_truth_and_rows_in_any_order(written, tmp_path):
     log = np.loadtxt(written / "logs" / "small.csv", delimiter=",")
-    names, P = ("x", "z", "rotation"), [f"p{i}" for i in range(6)]
-    plain = read_pose_log(written / "logs" / "small.csv", RUNS, STEPS, names)
-    for titles, rows, right in (
-        (names, log[::-1], True),
-        (("z", "x", "rotation"), log, False),
-    ):
-        header = ",".join(["run", "step", *titles, *P])
+    plain = read_pose_log(written / "logs" / "small.csv", RUNS, STEPS, NAMES)
+
+    def read(titles, rows):
+        header = ",".join(["run", "step", *titles, *(f"p{i}" for i in range(6))])
         np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header=header, comments="")
-        if right:
-            for x, y in zip(
-                read_pose_log(tmp_path / "log.csv", RUNS, STEPS, names), plain, strict=True
-            ):
-                np.testing.assert_array_equal(x, y)
-        else:
-            with pytest.raises(ValueError, match="run, step, x, z, rotation and their"):
-                read_pose_log(tmp_path / "log.csv", RUNS, STEPS, names)
+        return read_pose_log(tmp_path / "log.csv", RUNS, STEPS, NAMES)
+
+    for x, y in zip(read(NAMES, log[::-1]), plain, strict=True):
+        np.testing.assert_array_equal(x, y)
+    with pytest.raises(ValueError, match="run, step, x, z, rotation and their"):
+        read(("z", "x", "rotation"), log)
 
 
 @pytest.mark.parametrize(
