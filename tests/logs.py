@@ -1,18 +1,31 @@
-"""Logs of filters that tests make up: errors and poses, with the covariances that are theirs."""
+"""Logs of filters that tests make up: errors and poses with the covariances that are theirs, and
+every format in which they are written."""
 
-from functools import cache
+from collections.abc import Callable, Mapping
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import verdicts as benchmark
+from bags import EPOCH, KINDS, ros_of, write_bag
 from cases import quick_jit
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from jaxslam.evaluation import Convention
-from jaxslam.evaluation.convention import write_covariances
+import jaxslam
+from jaxslam.evaluation import (
+    Convention,
+    Evaluation,
+    evaluate_log,
+    evaluate_nees,
+    evaluate_poses,
+    write_covariances,
+)  # fmt: skip
+from jaxslam.evaluation.convention import MIXED
 from jaxslam.geometry import SPATIAL
-from jaxslam.io.tum import write_tum
+from jaxslam.io.tum import quaternions, write_tum
 
 FALSE_ALARM = 1e-4
 
@@ -130,3 +143,294 @@ def tracked_run(folder, maps):
     header = "frame,time,state,map,matches,nis,nis_dof,sigma_position,log_scale,more,unit_fixed"
     (folder / "frames.csv").write_text("\n".join([header, *rows]) + "\n")
     return T[None], P[None], truth[None]
+
+
+# --- formats -----------------------------------------------------------------------------------
+
+STEPS = 24
+TIMES = EPOCH + np.arange(STEPS) / 10
+UPPER, UPPER3, UPPER4 = (np.triu_indices(n) for n in (6, 3, 4))
+RNG = np.random.default_rng(0)
+HEADER = "# error=split axes=mixed\n"
+
+
+def in_space():
+    """Estimates, covariances (split, mixed; σ differ by axis, and correlate), truths."""
+    truth = np.tile(np.eye(4), (STEPS, 1, 1))
+    turned = np.outer(np.arange(STEPS), [0.1, 0.2, -0.05])
+    truth[:, :3, :3] = Rotation.from_rotvec(turned).as_matrix()
+    truth[:, 0, 3] = np.arange(STEPS)
+    root = 0.2 * np.diag([0.1, 0.3, 0.05, 0.01, 0.03, 0.02])
+    root[:3, :3] @= np.eye(3) + 0.3 * RNG.normal(size=(3, 3))
+    root[3:, 3:] @= np.eye(3) + 0.3 * RNG.normal(size=(3, 3))
+    noise = RNG.normal(size=(STEPS, 6)) @ root.T
+    estimate = truth.copy()
+    estimate[:, :3, 3] -= noise[:, :3]
+    turn = Rotation.from_rotvec(-noise[:, 3:]).as_matrix()
+    estimate[:, :3, :3] = truth[:, :3, :3] @ turn
+    return estimate, np.tile(root @ root.T, (STEPS, 1, 1)), truth
+
+
+ESTIMATE, P, TRUTH = in_space()
+SIGMA = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+R = ESTIMATE[:, :3, :3]
+FLAT_TRUTH = np.column_stack([np.arange(STEPS), np.zeros(STEPS), 0.1 * np.arange(STEPS)])
+FLAT_SIGMA = np.tile([0.2, 0.1, 0.03], (STEPS, 1))
+FLAT = FLAT_TRUTH - FLAT_SIGMA * RNG.normal(size=(STEPS, 3))
+FLAT_P = FLAT_SIGMA[:, :, None] * np.eye(3) * FLAT_SIGMA[:, None]
+RUNS = (4, 5)
+ERRORS = RNG.normal(size=(*RUNS, 4)) @ np.linalg.cholesky(np.eye(4) + 0.5)
+COVARIANCES = np.tile(np.eye(4) + 0.5, (*RUNS, 1, 1))
+PLACES = np.argwhere(np.ones(RUNS))
+
+
+def of_sigmas(sigma):
+    return sigma[..., None] * np.eye(sigma.shape[-1]) * sigma[..., None, :]
+
+
+def right_rotation_first(cov):
+    """The covariance (split, mixed) as GTSAM has it: right, along the body, rotation first."""
+    right = cov.copy()
+    right[:, :3, :3] = np.swapaxes(R, 1, 2) @ cov[:, :3, :3] @ R
+    return np.roll(right, 3, axis=(1, 2))
+
+
+def in_the_world(cov):
+    """The covariance (split, mixed) as ROS has it: about the axes of the world."""
+    A = np.tile(np.eye(6), (STEPS, 1, 1))
+    A[:, 3:, 3:] = R
+    return A @ cov @ np.swapaxes(A, 1, 2)
+
+
+MIXED_BLOCKS = P[:, 3:, 3:][:, *UPPER3], P[:, :3, :3][:, *UPPER3]
+SPLIT = Convention("split", "world")
+IN_SPACE, OF_SIGMAS = (
+    partial(evaluate_poses, ESTIMATE[None], cov[None], TRUTH[None], Convention(**MIXED))
+    for cov in (P, of_sigmas(SIGMA))
+)
+IN_THE_PLANE = partial(evaluate_poses, FLAT[None], FLAT_P[None], FLAT_TRUTH[None], SPLIT)
+OF_ERRORS = partial(jaxslam.evaluate, ERRORS, COVARIANCES)
+DEVIATIONS = np.sqrt(np.diagonal(COVARIANCES, axis1=2, axis2=3))
+
+
+def lines(path, *columns, header="", between=" "):
+    rows = np.column_stack([np.asarray(x, float).reshape(len(columns[0]), -1) for x in columns])
+    text = "\n".join(between.join(f"{x:.17g}" for x in row) for row in rows)
+    path.write_text(f"{header}{text}\n")
+    return path
+
+
+def tum(folder, estimate="estimate.txt", covariance="covariance.txt", truth="truth.txt"):
+    write_tum(folder / estimate, TIMES, ESTIMATE)
+    write_covariances(folder / covariance, TIMES, P, Convention(**MIXED))
+    write_tum(folder / truth, TIMES, TRUTH)
+
+
+def tum_and(values):
+    def write(folder):
+        tum(folder)
+        lines(folder / "covariance.txt", TIMES, values, header=HEADER)
+
+    return write
+
+
+def states(cameras):
+    """OpenVINS's `t q p v bg ba dt cameras …`."""
+
+    def write(folder):
+        more = np.zeros((STEPS, 9 + 1 + 1 + 15 * cameras))
+        header = "# timestamp(s) q p v bg ba cam_imu_dt num_cam cam0_k cam0_d cam0_rot ...\n"
+        for name, T in (("estimate", ESTIMATE), ("groundtruth", TRUTH)):
+            state = TIMES, quaternions(T[:, :3, :3]), T[:, :3, 3], more
+            lines(folder / f"state_{name}.txt", *state, header=header)
+        sigma = SIGMA[:, 3:], SIGMA[:, :3], np.zeros((STEPS, 9 + 1 + 1 + 14 * cameras))
+        lines(folder / "state_deviation.txt", TIMES, *sigma, header="# timestamp(s) q p v …\n")
+
+    return write
+
+
+def poses_with_covariances(folder):
+    """OpenVINS's `pose_to_file`."""
+    write_tum(folder / "truth.txt", TIMES, TRUTH)
+    lines(folder / "estimate.txt", TIMES, ESTIMATE[:, :3, 3], quaternions(R), *MIXED_BLOCKS)
+
+
+def kitti(timed):
+    """Times are beside the poses, or are the numbers of their lines."""
+
+    def write(folder):
+        times = TIMES - TIMES[0] if timed else np.arange(STEPS)
+        if timed:
+            lines(folder / "times.txt", times)
+        lines(folder / "estimate.txt", ESTIMATE[:, :3])
+        lines(folder / "truth.txt", TRUTH[:, :3])
+        lines(folder / "covariance.txt", times, P[:, *UPPER], header=HEADER)
+
+    return write
+
+
+def of_planes(values):
+    def write(folder):
+        lines(folder / "estimate.txt", TIMES, FLAT)
+        lines(folder / "truth.txt", TIMES, FLAT_TRUTH)
+        lines(folder / "covariance.txt", TIMES, values, header="# error=split axes=world\n")
+
+    return write
+
+
+def npz(**arrays: Any):
+    def write(folder):
+        np.savez(folder / "runs.npz", **arrays)
+
+    return write
+
+
+def csv(*columns, header="", between=","):
+    def write(folder):
+        lines(folder / "runs.csv", *columns, header=header, between=between)
+
+    return write
+
+
+def bag(name, estimate="odometry", truth="pose_stamped"):
+    """The estimate among other topics, in messages of these kinds."""
+
+    def write(folder):
+        r, covariances = ros_of(name), in_the_world(P)
+        told = [getattr(r, estimate)(*x) for x in zip(TIMES, ESTIMATE, covariances, strict=True)]
+        if truth == "path":  # published as it grows: the last one is the whole
+            true = [r.path(TIMES[:n], TRUTH[:n]) for n in (1, 10, STEPS)]
+        else:
+            zero = [np.zeros((6, 6))] * (truth not in ("pose_stamped", "transform_stamped"))
+            true = [getattr(r, truth)(*x, *zero) for x in zip(TIMES, TRUTH, strict=True)]
+        write_bag(folder / name, {"/filter/pose": told, "/mocap": true})
+
+    return write
+
+
+class Log(NamedTuple):
+    """How a log is written into a folder, and the verdict of its arrays."""
+
+    write: Callable[[Path], object]
+    wanted: Callable[[], Evaluation] = IN_SPACE
+    source: str = ""
+    beside: Mapping[str, str] = {}
+    """Files and topics (/…) that are named with it."""
+    rtol: float = 1e-4
+    convention: Convention | None = None
+    """Where it is not that of the arrays."""
+
+    def evaluated(self, folder: Path, *_) -> Evaluation:
+        options: dict[str, Any] = {
+            name: value if value.startswith("/") else str(folder / value)
+            for name, value in self.beside.items()
+        }
+        return evaluate_log(folder / self.source, **options)
+
+
+def npz_log(wanted, **arrays: Any):
+    return Log(npz(**arrays), wanted, "runs.npz")
+
+
+def csv_log(wanted, *columns, header="", between=","):
+    return Log(csv(*columns, header=header, between=between), wanted, "runs.csv")
+
+
+def of_n(n, header=""):
+    """A table of errors of n axes, and of the upper triangles of their covariances."""
+    rng = np.random.default_rng(n)
+    root = rng.normal(size=(*RUNS, n, n)) + 2 * np.eye(n)
+    e, cov = rng.normal(size=(*RUNS, n)), root @ np.swapaxes(root, -1, -2)
+    triangles = cov[..., *np.triu_indices(n)].reshape(len(PLACES), -1)
+    names = [f"e{i}" for i in range(n)] if header else ()
+    wanted = partial(jaxslam.evaluate, e, cov, names=names)
+    return csv_log(wanted, PLACES, e.reshape(len(PLACES), -1), triangles, header=header)
+
+
+def of_bag(name, *kinds, **truth):
+    topics = {"estimate": "/filter/pose", "truth": "/mocap"}
+    write = bag(name, *kinds, **truth)
+    return Log(write, source=name, beside=topics, rtol=1e-9, convention=SPLIT)
+
+
+FLAT_ERRORS = ERRORS.reshape(-1, 4)
+TRIANGLES = COVARIANCES[..., *UPPER4].reshape(-1, 10)
+NAMED = "run,step,e0,e1,P0,P1,P2\n"
+SIGMAS_NAMED = "run,step,a,b,c,d,sigma_a,sigma_b,sigma_c,sigma_d\n"
+ONE_RUN = "step,a,b,c,d,aa,ab,ac,ad,bb,bc,bd,cc,cd,dd\n"
+NEES = RNG.chisquare(4, RUNS)
+NEES_ALONE = NEES.reshape(-1, 1), np.full(NEES.size, 4)
+OF_DEVIATIONS = partial(jaxslam.evaluate, ERRORS, of_sigmas(DEVIATIONS))
+NEES_OF, NIS_OF = (partial(evaluate_nees, NEES, 4, quantity=x) for x in ("NEES", "NIS"))
+MARGINALS: dict[str, Any] = {
+    "estimates": ESTIMATE[None], "covariances": right_rotation_first(P)[None],
+    "truths": TRUTH[None], "error": "right", "order": "rotation-first",
+}  # fmt: skip
+POSES: dict[str, Any] = {**MARGINALS, "covariances": P[None], **MIXED}
+POSES["order"] = "position-first"
+LOGS = {
+    "TUM": Log(tum),
+    "TUM, of the tracker": Log(lambda x: tum(x, "trajectory.txt", truth="groundtruth.txt")),
+    "TUM, named by options": Log(
+        lambda x: tum(x, "mine.tum", "sigma.txt", "mocap.csv"),
+        source="mine.tum",
+        beside={"covariance": "sigma.txt", "truth": "mocap.csv"},
+    ),
+    "TUM, all of a covariance": Log(tum_and(P)),
+    "TUM, σ": Log(tum_and(SIGMA), OF_SIGMAS),
+    **{f"states of OpenVINS, {n} cameras": Log(states(n), OF_SIGMAS) for n in (0, 1, 2)},
+    "poses of OpenVINS": Log(poses_with_covariances),
+    "poses of OpenVINS, one file": Log(
+        poses_with_covariances, source="estimate.txt", beside={"truth": "truth.txt"}
+    ),
+    "KITTI": Log(kitti(timed=False)),
+    "KITTI, timed": Log(kitti(timed=True)),
+    "plane, triangle": Log(of_planes(FLAT_P[:, *UPPER3]), IN_THE_PLANE),
+    "plane, all of a covariance": Log(of_planes(FLAT_P), IN_THE_PLANE),
+    "plane, σ": Log(of_planes(FLAT_SIGMA), IN_THE_PLANE),
+    "npz of poses": npz_log(IN_SPACE, **POSES),
+    # To the first order of the errors.
+    "npz of GTSAM's marginals": npz_log(IN_SPACE, **MARGINALS)._replace(
+        rtol=0.02, convention=Convention("right", order="rotation-first")
+    ),
+    "npz of errors": npz_log(OF_ERRORS, errors=ERRORS, covariances=COVARIANCES),
+    "npz of σ": npz_log(OF_DEVIATIONS, errors=ERRORS, sigmas=DEVIATIONS),
+    "npz of innovations": npz_log(
+        partial(OF_ERRORS, quantity="NIS"), innovations=ERRORS, covariances=COVARIANCES
+    ),
+    "npz of NEES": npz_log(NEES_OF, nees=NEES, dof=4),
+    "npz of NIS": npz_log(NIS_OF, nis=NEES, dof=4),
+    **{f"CSV, n = {n}": of_n(n) for n in (1, 3, 6)},
+    "CSV, n = 2, with names": of_n(2, NAMED),
+    # Of n = 4 a full covariance is as many numbers as of n = 5 and a triangle.
+    "CSV, n = 4": csv_log(OF_ERRORS, PLACES, FLAT_ERRORS, TRIANGLES),
+    "CSV, all of a covariance": csv_log(
+        OF_ERRORS, PLACES, FLAT_ERRORS, COVARIANCES.reshape(-1, 16)
+    ),
+    "CSV, semicolons": csv_log(OF_ERRORS, PLACES, FLAT_ERRORS, TRIANGLES, between=";"),
+    "CSV, σ": csv_log(
+        partial(OF_DEVIATIONS, names="abcd"),
+        *(PLACES, FLAT_ERRORS, DEVIATIONS.reshape(-1, 4)),
+        header=SIGMAS_NAMED,
+    ),
+    "CSV, one run": csv_log(
+        partial(jaxslam.evaluate, ERRORS[:1], COVARIANCES[:1], names="abcd"),
+        *(np.arange(5), ERRORS[0], TRIANGLES[:5]),
+        header=ONE_RUN,
+    ),
+    "CSV of NEES": csv_log(NEES_OF, PLACES, *NEES_ALONE, header="run,step,nees,dof\n"),
+    "CSV of NIS": csv_log(NIS_OF, PLACES, *NEES_ALONE, header="run,step,nis,dof\n"),
+    **{f"bag {name}": of_bag(name) for name in KINDS},
+    "bag: PoseWithCovarianceStamped, Path, of ROS 1": of_bag(
+        "run.bag", "pose_with_covariance_stamped", "path"
+    ),
+    "bag: PoseWithCovarianceStamped, Odometry, of ROS 2": of_bag(
+        "run.mcap", "pose_with_covariance_stamped", "odometry"
+    ),
+    "bag: TransformStamped, of ROS 1": of_bag("run.bag", truth="transform_stamped"),
+    "bag: TransformStamped, of ROS 2": of_bag("run.mcap", truth="transform_stamped"),
+    "bag: Path, of ROS 2": of_bag("run.mcap", truth="path"),
+    "bag: PoseWithCovarianceStamped as truth": of_bag(
+        "run.bag", truth="pose_with_covariance_stamped"
+    ),
+}

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 import verdicts as benchmark
 from cases import quick_rows
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from logs import (
     FIXED,
     LOST,
@@ -700,43 +698,6 @@ def test_steps_at_other_times_in_other_runs_are_counted_and_it_is_said(tmp_path)
     write_tum(tmp_path / "run01" / "truth.txt", slower, truth[1])
     told = str(jaxslam.evaluate_log(tmp_path))
     assert "their times differ between runs, and are those of run00" in told
-
-
-WORDS = [
-    "# error=left",
-    "# x=",
-    "nan",
-    "1",
-    "-1",
-    "0",
-    "1e400",
-    "1e300",
-    "abc",
-    "\t",
-    "0 0 0 0 0 0 0 1",
-    "\0",
-]
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.lists(st.lists(st.sampled_from(WORDS), max_size=24).map(" ".join), max_size=4), st.data())
-def test_whatever_is_in_a_file_there_is_a_result_or_one_line(tmp_path_factory, text, data):
-    folder = tmp_path_factory.mktemp("fuzz")
-    T, P, truth = logged(Convention(), runs=1, steps=2)
-    write_runs(folder, T, P, truth, Convention())
-    which = data.draw(st.sampled_from(["estimate.txt", "covariance.txt", "truth.txt"]))
-    path = folder / "run00" / which
-    kept = path.read_text() if data.draw(st.booleans()) else ""
-    path.write_text(kept + "\n".join(text))
-    try:
-        found = jaxslam.evaluate_log(folder)
-    except ValueError as error:
-        told = str(error)
-    else:
-        told = str(found.headline)
-        np.testing.assert_array_equal(np.isnan(found.nees), np.isnan(found.errors).all(axis=-1))
-    assert told
-    assert "\n" not in told
 
 
 def test_of_the_trackers_files_nees_is_given_the_scale(tmp_path):

@@ -30,7 +30,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import tyro
+import videos
 import whole_files as given
+from bags import KINDS
+from logs import LOGS
 from mutations import MARK, mutate_folder, mutated_array, mutated_text
 
 import jaxslam
@@ -62,7 +65,7 @@ LONGEST = 2000
 class Target(NamedTuple):
     """Something that reads: whole files for it, and how it is asked to read them."""
 
-    write: Callable[[Path], None]
+    write: Callable[[Path], object]
     read: Callable[[Path, np.random.Generator], Any]
     weight: float = 1.0
 
@@ -226,26 +229,9 @@ def _file(name: str, read: Callable[[Path], Any]) -> Callable[[Path, np.random.G
 TARGETS: dict[str, Target] = {
     "evaluate": Target(given.nothing, read_errors),
     "evaluate_poses": Target(given.nothing, read_poses),
-    "evaluate_log npz": Target(given.write_errors, _file("runs.npz", evaluate_log)),
-    "evaluate_log poses": Target(given.write_pose_arrays, _file("runs.npz", evaluate_log)),
-    "evaluate_log csv": Target(given.write_csv, _file("runs.csv", evaluate_log)),
     "evaluate_log folder": Target(given.write_run, read_trajectories),
-    "evaluate_log openvins": Target(given.write_run_of(34), read_trajectories),
-    "evaluate_log with covariances": Target(given.write_run_of(20), read_trajectories),
-    "evaluate_log kitti": Target(given.write_run_of(12), read_trajectories),
-    "evaluate_log planar": Target(given.write_run_of(4), read_trajectories),
-    "evaluate_log sigmas": Target(given.write_sigmas, _file("runs.npz", evaluate_log)),
-    "evaluate_log nees": Target(given.write_nees, _file("runs.npz", evaluate_log)),
-    "evaluate_log csv nees": Target(
-        given.write_csv_of("run,step,nees,dof", 2), _file("runs.csv", evaluate_log)
-    ),
-    "evaluate_log csv sigmas": Target(
-        given.write_csv_of("run,step,x,y,sigma_x,sigma_y", 4), _file("runs.csv", evaluate_log)
-    ),
-    "evaluate_log bag": Target(given.write_bag("run.bag"), _file("run.bag", evaluate_log)),
-    "evaluate_log mcap": Target(given.write_bag("run.mcap"), _file("run.mcap", evaluate_log)),
-    "evaluate_log ros2": Target(given.write_bag("run"), _file("run", evaluate_log)),
-    "jaxslam evaluate": Target(given.write_errors, run_evaluate, 0.05),
+    **{f"evaluate_log {name}": Target(log.write, log.evaluated, 0.3) for name, log in LOGS.items()},
+    "jaxslam evaluate": Target(LOGS["npz of errors"].write, run_evaluate, 0.05),
     "jaxslam evaluate folder": Target(given.write_run, run_evaluate, 0.05),
     "jaxslam, wrong": Target(given.nothing, run_wrong_command, 0.3),
     "read_covariances": Target(given.write_run, _file("run0/covariance.txt", read_covariances)),
@@ -257,16 +243,14 @@ TARGETS: dict[str, Target] = {
     "pieces": Target(given.nothing, read_pieces),
     "read_calibration": Target(given.write_camera, _file("camera.json", read_calibration)),
     "read_target": Target(given.write_target, _file("target.json", read_target)),
-    "open_source timestamps": Target(given.write_timestamped, read_source()),
-    "open_source tum": Target(given.write_tum_rgbd, read_source()),
-    "open_source euroc": Target(given.write_euroc, read_source()),
-    "open_source kitti": Target(given.write_kitti, read_source()),
-    "open_source 7scenes": Target(given.write_seven_scenes, read_source()),
-    "open_source pictures": Target(given.write_pictures, read_source()),
+    "open_source timestamps": Target(videos.timestamped, read_source()),
+    "open_source tum": Target(videos.tum_rgbd, read_source("rgbd_dataset_freiburg2_desk")),
+    "open_source euroc": Target(videos.euroc, read_source("MH_01_easy")),
+    "open_source kitti": Target(videos.kitti, read_source("sequences/06")),
+    "open_source 7scenes": Target(videos.seven_scenes, read_source("seq-01")),
+    "open_source pictures": Target(videos.plain, read_source()),
     "open_source film": Target(given.write_film, read_source("film.mp4"), 0.5),
-    "open_source bag": Target(given.write_bag("run.bag"), read_source("run.bag")),
-    "open_source mcap": Target(given.write_bag("run.mcap"), read_source("run.mcap")),
-    "open_source ros2": Target(given.write_bag("run"), read_source("run")),
+    **{f"open_source {name}": Target(videos.bag(name), read_source(name)) for name in KINDS},
     "read_record": Target(given.write_record_of_two, _file("tracker.npz", read_header)),
     "Tracker.load": Target(given.write_tracker, _file("tracker.npz", read_tracker), 0.05),
     "resume": Target(lambda folder: given.small_study(folder) and None, read_resumed, 0.2),

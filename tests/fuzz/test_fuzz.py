@@ -35,6 +35,16 @@ def test_broken_files_end_in_one_line_or_in_a_result(tmp_path):
     assert not findings, "\n".join(f"case {f.case}, {f.target}: {f.what}" for f in findings)
 
 
+@pytest.mark.parametrize(
+    ("only", "cases"), [("evaluate_log", 80), ("evaluate_poses", 30), ("open_source", 80)]
+)
+def test_broken_logs_and_videos_end_in_one_line_or_in_a_result(only, cases, tmp_path):
+    """The first of those that the whole fuzz has of every reader."""
+    cases_of = fuzz.Fuzz(tmp_path, only=only)
+    findings = [finding for i in range(cases) if (finding := cases_of.case(i))]
+    assert not findings, "\n".join(f"case {f.case}, {f.target}: {f.what}" for f in findings)
+
+
 COMPILES = {"resume", "Tracker.load"}
 """Targets that run a tracker on what they read; tests of its files do so too."""
 WRITTEN = [name for name, target in fuzz.TARGETS.items() if target.write is not fuzz.given.nothing]

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from bags import EPOCH, ros_of
-from bags import write_bag as written
 from scipy.spatial.transform import Rotation
 
 import jaxslam
@@ -44,49 +41,6 @@ def pose_arrays() -> dict[str, np.ndarray]:
     return {"estimates": estimates, "covariances": P, "truths": truth}
 
 
-def write_errors(folder: Path) -> None:
-    errors, P = errors_and_covariances()
-    np.savez(folder / "runs.npz", errors=errors, covariances=P, times=np.arange(5.0))
-
-
-def write_pose_arrays(folder: Path) -> None:
-    said: dict[str, Any] = {"error": "right", "axes": "body"}
-    np.savez(folder / "runs.npz", allow_pickle=False, **pose_arrays(), **said)
-
-
-def write_bag(name: str) -> Callable[[Path], None]:
-    """A bag of estimates, truths, pictures and their lens."""
-
-    def write(folder: Path) -> None:
-        r, held = ros_of(name), pose_arrays()
-        told = list(
-            zip(EPOCH + np.arange(5) / 10, held["estimates"][0], held["truths"][0], strict=True)
-        )
-        K = np.diag([60.0, 60.0, 1.0])
-        topics = {
-            "/odom": [r.odometry(t, T, 1e-4 * np.eye(6)) for t, T, _ in told],
-            "/gt": [r.pose_stamped(t, T) for t, _, T in told],
-            "/camera/image": [
-                r.image(t, np.zeros((48, 64), np.uint8), "mono8") for t, _, _ in told
-            ],
-            "/camera/camera_info": [r.camera_info(told[0][0], (48, 64), K, np.zeros(5))],
-        }
-        written(folder / name, topics)
-
-    return write
-
-
-def write_csv(folder: Path) -> None:
-    errors, P = errors_and_covariances()
-    upper = np.triu_indices(3)
-    rows = [
-        ",".join(map(str, [run, step, *errors[run, step], *P[run, step][upper]]))
-        for run in range(4)
-        for step in range(5)
-    ]
-    (folder / "runs.csv").write_text("run,step,x,y,z,a,b,c,d,e,f\n" + "\n".join(rows) + "\n")
-
-
 def write_run(folder: Path) -> None:
     arrays, times = pose_arrays(), np.arange(5) / 10
     for run in range(2):
@@ -96,57 +50,6 @@ def write_run(folder: Path) -> None:
         write_tum(place / "truth.txt", times, arrays["truths"][run])
         P = arrays["covariances"][run]
         write_covariances(place / "covariance.txt", times, P, Convention("right"))
-
-
-def write_run_of(columns: int) -> Callable[[Path], None]:
-    """A run whose poses, and covariances, are of so many numbers a line: other programs' files."""
-
-    def write(folder: Path) -> None:
-        arrays, times = pose_arrays(), np.arange(5) / 10
-        P = arrays["covariances"][0]
-        names = ("state_estimate", "state_deviation", "state_groundtruth")
-        names = names if columns == 34 else ("estimate", "covariance", "truth")
-        for name, T in zip(names[::2], (arrays["estimates"][0], arrays["truths"][0]), strict=True):
-            q, p = Rotation.from_matrix(T[:, :3, :3]).as_quat(), T[:, :3, 3]
-            rows = {
-                4: [times, p[:, :2], 0.1 * times],
-                12: [T[:, :3].reshape(5, 12)],
-                20: [times, p, q, P[:, :3, :3][:, *np.triu_indices(3)], P[:, 0, :6] + 1e-4],
-                34: [times, q, p, np.zeros((5, 26))],
-            }[columns]
-            np.savetxt(folder / f"{name}.txt", np.column_stack(rows))
-        deviations = {4: 3, 12: 6, 34: 31}.get(columns)
-        if columns == 20:
-            write_tum(folder / "truth.txt", times, arrays["truths"][0])
-        if columns == 12:
-            np.savetxt(folder / "times.txt", times)
-        if deviations is not None:
-            rows = [times, 0.01 * np.ones((5, deviations))]
-            np.savetxt(folder / f"{names[1]}.txt", np.column_stack(rows))
-
-    return write
-
-
-def write_csv_of(header: str, columns: int) -> Callable[[Path], None]:
-    def write(folder: Path) -> None:
-        draw = np.random.default_rng(0)
-        rows = [[run, step, *draw.uniform(0.5, 1.5, columns)] for run in (0, 1) for step in (0, 1)]
-        if "dof" in header:
-            rows = [[*row[:-1], 3] for row in rows]
-        text = "\n".join(",".join(map(str, row)) for row in rows)
-        (folder / "runs.csv").write_text(f"{header}\n{text}\n")
-
-    return write
-
-
-def write_nees(folder: Path) -> None:
-    np.savez(folder / "runs.npz", nees=np.random.default_rng(0).chisquare(3, (4, 5)), dof=3)
-
-
-def write_sigmas(folder: Path) -> None:
-    errors, P = errors_and_covariances()
-    sigmas = np.sqrt(np.diagonal(P, axis1=2, axis2=3))
-    np.savez(folder / "runs.npz", errors=errors, sigmas=sigmas)
 
 
 def write_trajectory(folder: Path) -> None:
@@ -180,62 +83,6 @@ def _calibration() -> Calibration:
 
 def _picture(index: int) -> np.ndarray:
     return np.full((HEIGHT, WIDTH), 10 * index + 5, np.uint8)
-
-
-def _pictures(folder: Path, names: list[str]) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    for index, name in enumerate(names):
-        cv2.imwrite(str(folder / name), _picture(index))
-
-
-def write_timestamped(folder: Path) -> None:
-    names = [f"{i}.png" for i in range(3)]
-    _pictures(folder / "images", names)
-    lines = [f"{0.1 * i} {name}" for i, name in enumerate(names)]
-    (folder / "timestamps.txt").write_text("\n".join(lines) + "\n")
-    write_calibration(folder / "calibration.json", _calibration())
-    write_tum(folder / "groundtruth.txt", np.arange(3) / 10, _poses(3))
-
-
-def write_tum_rgbd(folder: Path) -> None:
-    _pictures(folder / "rgb", ["5.25.png", "5.5.png"])
-    (folder / "rgb.txt").write_text("# color images\n5.25 rgb/5.25.png\n5.5 rgb/5.5.png\n")
-    write_tum(folder / "groundtruth.txt", [5.2, 5.5], _poses(2))
-
-
-def write_euroc(folder: Path) -> None:
-    camera, truth = folder / "mav0" / "cam0", folder / "mav0" / "state_groundtruth_estimate0"
-    truth.mkdir(parents=True)
-    times = [1403636579763555584, 1403636579813555456]
-    _pictures(camera / "data", [f"{time}.png" for time in times])
-    (camera / "data.csv").write_text("#t\r\n" + "".join(f"{t},{t}.png\r\n" for t in times))
-    (camera / "sensor.yaml").write_text(
-        "sensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n  data: [1,0,0,0, 0,1,0,0, 0,0,1,0, "
-        f"0,0,0,1]\nresolution: [{WIDTH}, {HEIGHT}]\ncamera_model: pinhole\n"
-        "intrinsics: [60.5, 61.5, 31.0, 23.0]\ndistortion_model: radial-tangential\n"
-        "distortion_coefficients: [-0.28, 0.07, 0.0002, 1.7e-05]\n"
-    )
-    (truth / "data.csv").write_text(
-        "#t\r\n" + "".join(f"{t},0,0,0,1,0,0,0,0.1,0.2,0.3\r\n" for t in times)
-    )
-
-
-def write_kitti(folder: Path) -> None:
-    _pictures(folder / "image_0", [f"{i:06d}.png" for i in range(3)])
-    (folder / "times.txt").write_text("0.0e+00\n1.04e-01\n2.07e-01\n")
-    (folder / "calib.txt").write_text("P0: 70 0 30 0 0 71 20 0 0 0 1 0\n")
-    (folder / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
-
-
-def write_seven_scenes(folder: Path) -> None:
-    _pictures(folder, [f"frame-{i:06d}.color.png" for i in range(2)])
-    for i in range(2):
-        (folder / f"frame-{i:06d}.pose.txt").write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
-    write_calibration(folder / "calibration.json", _calibration())
-
-
-def write_pictures(folder: Path) -> None:
-    _pictures(folder, ["a.png", "b.png", "c.jpg"])
 
 
 def write_film(folder: Path) -> None:

@@ -138,6 +138,7 @@ def test_coverage_is_the_share_of_cells_with_a_corner(calibrated):
     assert np.argwhere(covered([one], CAMERA)).tolist() == [[0, 9]]
 
 
+@pytest.mark.parametrize("filmed", BOARDS[1:], indirect=True, ids=["charuco"])
 def test_the_command_writes_what_the_tracker_reads(filmed, calibrated, tmp_path, capsys):
     board, path = filmed
     size = ["--columns", str(board.columns), "--rows", str(board.rows)]

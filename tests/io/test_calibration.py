@@ -24,6 +24,9 @@ GOOD = {
 }
 
 
+SIGMAS = dict.fromkeys(("fx", "fy", "cx", "cy"), 1.0)
+
+
 def write(path, **changes):
     fields = {**GOOD, **changes}
     path.write_text(json.dumps({key: value for key, value in fields.items() if value is not None}))
@@ -126,14 +129,8 @@ def test_short_distortion_is_padded(tmp_path, given):
         ({"distortion": [0.1, "x"]}, r"distortion\[1\] must be a number, not 'x'"),
         ({"sigma": {"fx": 1.0}}, "an object with fx, fy, cx, cy"),
         ({"sigma": [1.0, 1.0, 1.0, 1.0]}, "an object with fx, fy, cx, cy"),
-        (
-            {"sigma": {"fx": -1.0, "fy": 1.0, "cx": 1.0, "cy": 1.0}},
-            "sigma of fx must not be negative, not -1.0",
-        ),
-        (
-            {"sigma": {"fx": "1", "fy": 1.0, "cx": 1.0, "cy": 1.0}},
-            "sigma of fx must be a number, not '1'",
-        ),
+        ({"sigma": SIGMAS | {"fx": -1.0}}, "sigma of fx must not be negative, not -1.0"),
+        ({"sigma": SIGMAS | {"fx": "1"}}, "sigma of fx must be a number, not '1'"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
