@@ -157,7 +157,7 @@ def test_what_is_given_takes_the_place_of_a_videos_own(written, tmp_path):
 def test_a_picture_that_is_broken_or_of_another_size_is_named_when_it_is_reached(written):
     of, path = written
     before, images = len(of.times) - 1, {x: cv2.imread(str(x), 0) for x in path.rglob("*.png")}
-    last = [x for x, image in images.items() if image[0, 0] == of.shown[-1]]
+    last = [x for x, image in images.items() if image is not None and image[0, 0] == of.shown[-1]]
     for content, message in (
         (b"broken", rf"{last[0].name}: cannot be read as an image"),
         (cv2.imencode(".png", picture(0)[:-2])[1].tobytes(), rf"image {before} is 64x46, but the"),
