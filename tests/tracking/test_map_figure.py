@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from cases import quick_rows
 from matplotlib.collections import EllipseCollection, LineCollection
 
 from jaxslam.io.tum import poses
@@ -129,7 +130,9 @@ def test_a_camera_that_stands_still_without_landmarks_is_drawn(drawn):
     ]
 
 
-@pytest.mark.parametrize(("length", "width"), [(100.0, 20.0), (3.0, 1.0), (0.2, 1.0), (5.0, 9.0)])
+@pytest.mark.parametrize(
+    ("length", "width"), quick_rows(2, [(100.0, 20.0), (0.2, 1.0), (3.0, 1.0), (5.0, 9.0)])
+)
 def test_titles_labels_and_legend_have_room(drawn, length, width):
     """None is cut off or drawn over another."""
     figure = drawn(

@@ -52,12 +52,3 @@ def test_a_point_cloud_is_read_as_it_was_written(tmp_path):
         np.testing.assert_allclose(found, expected, rtol=1e-7)
     write_ply(tmp_path / "map.ply", *(part[:0] for part in there))
     assert read_ply(tmp_path / "map.ply").covariances.shape == (0, 3, 3)
-
-
-@pytest.mark.parametrize(
-    "text", ["", "ply\nend_header\n1 2 3\n", "property float x\nend_header\na"]
-)
-def test_another_file_is_no_map(tmp_path, text):
-    (tmp_path / "map.ply").write_text(text)
-    with pytest.raises(ValueError, match=r"map\.ply is not a map\.ply as jaxslam track writes it"):
-        read_ply(tmp_path / "map.ply")

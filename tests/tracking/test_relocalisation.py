@@ -124,13 +124,13 @@ def test_where_no_map_is_known_another_begins(tmp_path):
 
 
 def test_a_map_of_another_camera_is_refused(tmp_path):
-    source = synthetic_source(frames=2, seed=4)
-    tracker = Tracker(source.calibration, SETTINGS)
+    source = synthetic_source(frames=2, width=320, height=240)
+    tracker = Tracker(source.calibration, TrackerSettings(filter="world", wanted=12, spare=4))
     tracker.track(source_frame(source))
     tracker.save(tmp_path / "map.npz")
     wrong = replace(source.calibration, fx=source.calibration.fx * 1.1)
     with pytest.raises(
-        ValueError, match=r"a map of another camera \(640 × 480, fx .* not of this one"
+        ValueError, match=r"a map of another camera \(320 × 240, fx .* not of this one"
     ):
         Tracker.localising(tmp_path / "map.npz", wrong)
 

@@ -6,7 +6,6 @@ import pytest
 import jaxslam
 from jaxslam.io.calibration import from_field_of_view
 from jaxslam.io.pictures import as_grey
-from jaxslam.io.source import Frame
 from jaxslam.tracking.landmarks import Landmark, stacked, unstacked
 from jaxslam.tracking.patches import Patch
 from jaxslam.tracking.settings import TrackerSettings
@@ -132,69 +131,6 @@ def test_a_filter_of_ones_own_is_given_again(video, tmp_path):
     assert isinstance(other, jaxslam.Slam)
     with pytest.raises(ValueError, match="the saved state belongs to a different filter"):
         Tracker.load(tmp_path / "t.npz", other)
-
-
-def test_there_is_nothing_to_save_before_the_first_frame(video, tmp_path):
-    with pytest.raises(ValueError, match="without any frame"):
-        Tracker(video[0], SETTINGS).save(tmp_path / "t.npz")
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("kind", "message"),
-    [
-        ("missing", r"t\.npz does not exist"),
-        ("text", r"t\.npz: not an npz file of numbers \(it is another kind"),
-        ("other archive", r"t\.npz is not a saved tracker"),
-    ],
-)
-def test_a_file_that_is_no_trackers_is_refused(tmp_path, kind, message):
-    path = tmp_path / "t.npz"
-    if kind == "text":
-        path.write_text("nothing")
-    if kind == "other archive":
-        np.savez(path, header=np.array("{}"), a=np.zeros(3))
-    with pytest.raises(ValueError, match=message):
-        Tracker.load(path)
-
-
-@pytest.mark.parametrize(
-    ("image", "time", "message"),
-    [
-        (
-            np.zeros((240, 321), np.uint8),
-            1.0,
-            "frame 1 is 321x240, but the calibration is for 320x240",
-        ),
-        (np.zeros((240, 320, 4), np.uint8), 1.0, r"not of shape \(240, 320, 4\)"),
-        (np.zeros(240, np.uint8), 1.0, r"not of shape \(240,\)"),
-        (np.zeros((0, 0), np.uint8), 1.0, r"not of shape \(0, 0\)"),
-        (np.zeros((240, 320), np.uint16), 1.0, "not uint16"),
-        (np.full((240, 320), 255.0), 1.0, "not floats from 255 to 255"),
-        (np.full((240, 320), np.nan), 1.0, "not floats from nan to nan"),
-        (
-            np.zeros((240, 320), np.uint8),
-            0.0,
-            "its time, 0.0 s, is not later",
-        ),
-        (np.zeros((240, 320), np.uint8), np.nan, "its time, nan s, is not later"),
-        (np.zeros((240, 320), np.uint8), np.inf, "its time, inf s, is not later"),
-    ],
-)
-def test_a_picture_that_cannot_be_is_refused_and_changes_nothing(video, image, time, message):
-    calibration, frames = video
-    touched, untouched = Tracker(calibration, SETTINGS), Tracker(calibration, SETTINGS)
-    for tracker in (touched, untouched):
-        tracker.track(frames[0])
-    with pytest.raises(ValueError, match=message):
-        touched.step(image, time)
-    same(touched.track(frames[1]), untouched.track(frames[1]))
-
-
-def test_the_first_time_is_finite_too(video):
-    calibration, frames = video
-    with pytest.raises(ValueError, match="its time, nan s"):
-        Tracker(calibration, SETTINGS).track(Frame(0, float("nan"), frames[0].image))
 
 
 def test_a_picture_becomes_grey_bytes():

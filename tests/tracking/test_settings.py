@@ -36,11 +36,6 @@ def test_a_guess_is_estimated_and_stated_sigmas_are_used(name, calibration, kind
     np.testing.assert_allclose(treatment.sigma, sigma, rtol=1e-12)
 
 
-def test_an_unknown_treatment_is_refused():
-    with pytest.raises(ValueError, match="unknown calibration 'maybe'; known: white, consider"):
-        TrackerSettings(calibration="maybe")
-
-
 @pytest.mark.slow
 def test_a_guessed_focal_length_is_estimated_while_the_camera_moves():
     source = synthetic_source(frames=45, width=320, height=240)

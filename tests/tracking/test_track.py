@@ -54,11 +54,6 @@ def test_a_filter_with_a_unit_of_its_own_says_so_beside_its_covariances(tmp_path
     assert (last["sigma_log_scale"] != "") == in_doubt
 
 
-def test_the_overlay_can_be_left_out(tmp_path):
-    tracking.track(small(3), tmp_path, SETTINGS, overlay=False)
-    assert names(tmp_path) == NUMBERS | FIGURES
-
-
 def test_numbers_are_there_before_a_figure_is_drawn(tmp_path, monkeypatch):
     monkeypatch.setattr(tracking, "plot_map", fail)
     with pytest.raises(ValueError, match="cannot draw"):

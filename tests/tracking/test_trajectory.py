@@ -63,31 +63,6 @@ def test_quaternion_order_is_w_last_and_need_not_be_normalised(tmp_path):
     np.testing.assert_allclose(T_wc[0], quarter_turn, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("0 0 0 0 0 0 0 1\n1 2 3\n", "line 2: expected eight finite"),
-        ("0 0 0 nan 0 0 0 1\n", "line 1: expected eight finite"),
-        ("0 0 0 zero 0 0 0 1\n", "line 1: expected eight finite"),
-        ("0 0 0 0 0 0 0 0\n", "line 1: the quaternion is zero"),
-        ("# nothing\n", "has no poses"),
-    ],
-)
-def test_bad_trajectories_are_refused_naming_file_and_line(tmp_path, text, words):
-    path = tmp_path / "bad.txt"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=words) as caught:
-        read_tum(path)
-    assert str(path) in str(caught.value)
-
-
-def test_missing_trajectory_and_unequal_lengths_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="cannot read the trajectory"):
-        read_tum(tmp_path / "none.txt")
-    with pytest.raises(ValueError, match="2 times for 1 poses"):
-        write_tum(tmp_path / "t.txt", [0, 1], np.eye(4)[None])
-
-
 def test_interrupted_write_keeps_the_old_file(tmp_path):
     path = tmp_path / "t.txt"
     path.write_text("old")
@@ -215,8 +190,6 @@ def test_relative_error_is_that_of_a_second_in_the_references_unit():
     estimate[::2, 0, 3] += 0.01  # half of them, against the other half
     error = relative_pose_error(times, estimate, times, reference, seconds=np.diff(times)[0])
     assert error["translation"] == pytest.approx(0.01, rel=1e-3)
-    with pytest.raises(ValueError, match="no two poses"):
-        relative_pose_error(times, estimate, times, reference, seconds=1e4)
 
 
 def test_errors_are_those_of_evo():
@@ -290,17 +263,6 @@ def test_straight_reference_is_aligned_though_its_roll_is_open():
     assert bent["rmse"] == pytest.approx(0.1, rel=0.02)
 
 
-def test_trajectories_that_cannot_be_compared_are_refused():
-    times, reference = wave()
-    with pytest.raises(ValueError, match="0 poses"):
-        absolute_trajectory_error(times + 100, reference, times, reference)
-    with pytest.raises(ValueError, match="2 poses"):
-        absolute_trajectory_error(times[:2], reference[:2], times, reference)
-    still = np.tile(np.eye(4), (len(times), 1, 1))
-    with pytest.raises(ValueError, match="coincide"):
-        absolute_trajectory_error(times, still, times, reference)
-
-
 def test_covariances_are_read_as_they_were_written_and_are_the_errors(tmp_path):
     """Errors drawn from them, in the camera's axes, have a mean NEES of 6."""
     rng = np.random.default_rng(0)
@@ -345,12 +307,6 @@ def test_a_pose_that_is_known_exactly_is_so_in_the_file(tmp_path):
     write_covariances(tmp_path / "covariance.txt", times, covariances)
     P = read_covariances(tmp_path / "covariance.txt").covariances
     assert exactly_known(P).tolist() == [True, False, False, False]
-
-
-def test_as_many_covariances_as_times(tmp_path):
-    with pytest.raises(ValueError, match="2 times for 1 covariances"):
-        write_covariances(tmp_path / "covariance.txt", [0, 1], np.eye(6)[None])
-    assert not list(tmp_path.iterdir())
 
 
 def nees_beyond_scale(T_wc, covariances, reference, fixed=None):

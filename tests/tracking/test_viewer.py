@@ -101,22 +101,6 @@ def test_an_interruption_leaves_what_was_seen(tmp_path):
     assert [row["frame"] for row in rows["/world/landmarks"]] == [1]
 
 
-def test_without_rerun_it_says_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    source = synthetic_source(frames=FRAMES)
-    with pytest.raises(ValueError, match=r"needs the viewer extra \(rerun is missing\)"):
-        track(source, tmp_path / "out", SETTINGS, viewer=tmp_path / "seen.rrd")
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_recording_ends_in_rrd(tmp_path):
-    pytest.importorskip("rerun")
-    source = synthetic_source(frames=FRAMES)
-    with pytest.raises(ValueError, match=r"seen\.mp4: the name must end in \.rrd"):
-        track(source, tmp_path / "out", SETTINGS, viewer=tmp_path / "seen.mp4")
-    assert not list(tmp_path.iterdir())
-
-
 def test_tracking_without_a_recording_does_not_import_rerun():
     code = "import sys, jaxslam.tracking.video; assert 'rerun' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
