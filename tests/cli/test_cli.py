@@ -20,6 +20,8 @@ from jaxslam.models.calibration import TREATMENTS
 from jaxslam.triangulation import CALIBRATIONS as VIEWS
 
 SMALL = ["consistency", "--scenario", "matched-tight", "--steps", "6", "--runs", "6"]
+OPTIONS = ["--seed", "7", "--dtype", "float32", "--backend", "native", "--reduce"]
+OPTIONS += ["--cluster", "tcp://127.0.0.1:9"]
 FILTER_KEYS = {
     "dof", "band95", "nees", "nees_median", "lost", "inside", "nis", "nis_dof", "rmse", "sigma",
     "landmark_nees", "landmark_dof", "landmark_not_finite", "diverged", "seconds", "lost_ever",
@@ -121,6 +123,12 @@ def test_a_mistake_ends_with_status_2_and_one_line(arguments, message, tmp_path,
     assert not (tmp_path / "out").exists()
 
 
+def ended_of(code):
+    """What a process of its own leaves, in which a warning is an error."""
+    command = [sys.executable, "-W", "error", "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, timeout=50, check=False)
+
+
 def test_a_reader_that_has_enough_ends_a_command_quietly():
     """As `jaxslam evaluate … | head -1`, whatever is still in the buffer."""
     code = """
@@ -150,9 +158,7 @@ def interrupted(given):
 jaxslam.cli._run = interrupted
 jaxslam.cli.main()
 """
-    ended = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
-    )
+    ended = ended_of(code)
     assert (ended.returncode, ended.stderr) == (130, "jaxslam: interrupted\n")
 
 
@@ -186,9 +192,7 @@ def run():
 commands.parse = parse
 jaxslam.cli.main()
 """
-    ended = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=50, check=False
-    )
+    ended = ended_of(code)
     assert (ended.returncode, ended.stderr) == (130, "jaxslam: interrupted\n")
 
 
@@ -196,13 +200,20 @@ jaxslam.cli.main()
 def test_an_interrupted_study_says_what_is_kept_and_how_to_go_on(
     kept, tmp_path, monkeypatch, capsys
 ):
+    asked = {}
+
     def interrupted(world, filters, *, store, chunk, **more):
+        asked.update(more, steps=world.steps)
         raise Interruption(kept, 12, chunk, store)
 
     monkeypatch.setattr("jaxslam.cli.consistency.monte_carlo", interrupted)
     with pytest.raises(SystemExit) as ended:
-        main([*SMALL, "--chunk", "2", "--out", str(tmp_path)])
+        main([*SMALL, *OPTIONS, "--chunk", "2", "--out", str(tmp_path)])
     assert ended.value.code == 130
+    assert asked == {
+        "runs": 6, "steps": 6, "seed": 7, "dtype": "float32", "backend": "native", "reduced": True,
+        "cluster": "tcp://127.0.0.1:9", "progress": True,
+    }  # fmt: skip
     told = (
         f"2 of 12 runs are kept in {tmp_path}; the same command with --resume goes on from there"
         if kept
@@ -233,6 +244,7 @@ def test_the_version_is_told(capsys):
 
 
 def test_the_library_imports_light_and_sets_nothing():
+    """Nor do commands without pictures import OpenCV: what it is to be silent about comes first."""
     code = """
 import sys, jax
 before = dict(jax.config.values)
@@ -242,14 +254,11 @@ assert not heavy & set(sys.modules), heavy & set(sys.modules)
 assert dict(jax.config.values) == before
 from jax._src import xla_bridge
 assert not xla_bridge.backends_are_initialized()
+import jaxslam.cli.commands
+assert not {"cv2", "evo"} & set(sys.modules)
 """
-    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
-
-
-def test_commands_without_pictures_need_no_opencv():
-    """And what OpenCV is to be silent about is set before it is imported."""
-    code = "import sys, jaxslam.cli.commands; assert not {'cv2', 'evo'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)
+    ended = ended_of(code)
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import jaxslam
-from jaxslam.cli import main
 from jaxslam.consistency.montecarlo import ChunkTask, divided, in_threads
 from jaxslam.consistency.simulator import Simulator
 
@@ -115,16 +114,13 @@ def test_a_study_on_a_cluster_is_the_same_although_a_worker_is_killed(processes,
     assert_same(records(sums), records(wanted))  # which the worker has added up
 
 
-def test_nobody_at_an_address_is_said_in_one_line(tmp_path, capsys, monkeypatch):
+def test_nobody_at_an_address_is_said_in_one_line(monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr("jaxslam.consistency.cluster.ANSWER_SECONDS", 0.5)
-    command = ["consistency", "--scenario", "matched-tight", "--out", str(tmp_path / "out")]
-    with pytest.raises(SystemExit) as stop:
-        main([*command, "--cluster", "tcp://127.0.0.1:9"])
-    error = capsys.readouterr().err
-    assert stop.value.code == 2
-    assert "no Dask scheduler answers at 'tcp://127.0.0.1:9'" in error
-    assert error.count("\n") == 1
+    told = "no Dask scheduler answers at 'tcp://127.0.0.1:9'"
+    with pytest.raises(ValueError, match=told) as caught:
+        jaxslam.monte_carlo(SCENARIO, filters(), runs=2, cluster="tcp://127.0.0.1:9")
+    assert "\n" not in str(caught.value)
 
 
 def test_without_the_extra_a_study_says_what_to_install(monkeypatch):
