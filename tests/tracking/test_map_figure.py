@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from cases import quick_rows
 from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.colors import to_rgb
 
 from jaxslam.io.tum import poses
+from jaxslam.plots.style import COLOURS
 from jaxslam.plots.tracking import plot_map
 
 
@@ -124,10 +126,27 @@ def test_titles_count_what_is_not_shown(drawn):
 
 def test_a_camera_that_stands_still_without_landmarks_is_drawn(drawn):
     still = np.tile(np.eye(4), (5, 1, 1))
-    assert list(drawn(still, np.zeros((0, 3)), np.zeros((0, 3, 3)))) == [
-        "from above",
-        "from behind",
-    ]
+    axes = drawn(still, np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    assert list(axes) == ["from above", "from behind"]
+    assert not landmarks_of(axes["from above"])
+
+
+def landmarks_of(axis):
+    """Widths and heights of the ellipses, and the points drawn, that are of landmarks."""
+    colours = to_rgb(COLOURS[2])
+    ellipses = [c for c in axis.collections if isinstance(c, EllipseCollection)]
+    own = [c for c in ellipses if np.allclose(c.get_edgecolor()[:, :3], colours)]
+    return [c.get_widths() for c in own if len(c.get_widths())]
+
+
+def test_landmarks_have_their_ellipses_in_the_figure_and_in_its_file(drawn, tmp_path):
+    points, covariances = wall()
+    covariances *= np.arange(1, 41)[:, None, None]
+    axis = drawn(path_along_x(length=3.0), points, covariances, path=tmp_path / "map.png")
+    (widths,) = landmarks_of(axis["from above"])
+    # As long as 95 % of the two coordinates, σ of 0.1 and more.
+    np.testing.assert_allclose(widths, 0.2 * np.sqrt(5.991 * np.arange(1, 41)))
+    assert [path.name for path in tmp_path.iterdir()] == ["map.png"]
 
 
 @pytest.mark.parametrize(

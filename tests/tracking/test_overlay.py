@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxslam.plots.tracking import plot_map
 from jaxslam.tracking import overlay
 from jaxslam.tracking.film import WAITING, Aside, OverlayWriter
 from jaxslam.tracking.observations import NOTHING as EMPTY
@@ -267,42 +266,6 @@ def test_point_cloud_holds_points_and_covariances(tmp_path):
     np.testing.assert_array_equal(table[:, :3], points)
     np.testing.assert_array_equal(table[1, 3:9], [4, 1, 2, 5, 3, 6])
     assert table[:, 9:].tolist() == [[7, 0], [9, 1]]
-
-
-def test_map_is_drawn_with_and_without_landmarks_and_reference(tmp_path):
-    T_wc = np.tile(np.eye(4), (20, 1, 1))
-    T_wc[:, 0, 3] = np.linspace(0, 1, 20)
-    points = np.random.default_rng(0).normal((0, 0, 4), 1, (30, 3))
-    points[0] = (0, 0, 1e6)
-    covariances = np.tile(0.01 * np.eye(3), (30, 1, 1))
-    plot_map(T_wc, points, covariances, reference=T_wc, path=tmp_path / "full.png")
-    plot_map(T_wc, np.empty((0, 3)), np.empty((0, 3, 3)), path=tmp_path / "bare.png")
-    full = cv2.imread(str(tmp_path / "full.png"))
-    bare = cv2.imread(str(tmp_path / "bare.png"))
-    green = np.array([115, 158, 0])  # the landmarks' colour, blue first
-
-    def landmarks(image):
-        return int(np.sum(np.abs(image.astype(int) - green).max(axis=2) < 10))
-
-    plot_map(
-        T_wc,
-        points,
-        covariances,
-        path=tmp_path / "two.png",
-        begun=[10],
-        begun_covariances=[0.3 * np.eye(3)],
-    )
-    two = cv2.imread(str(tmp_path / "two.png"))
-
-    def of_new_maps(image):
-        return int(np.sum(np.abs(image.astype(int) - [167, 121, 204]).max(axis=2) < 10))
-
-    # The two marks and the legend's, and the ellipses around them.
-    assert of_new_maps(two) > 100
-    assert of_new_maps(full) == 0
-    assert landmarks(full) > 200
-    assert landmarks(bare) == 0
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["bare.png", "full.png", "two.png"]
 
 
 def test_a_place_that_is_known_again_is_said_in_the_picture():
