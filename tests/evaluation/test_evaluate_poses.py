@@ -49,7 +49,8 @@ from jaxslam.evaluation.poses import _constant, estimated, with_truth
 from jaxslam.evaluation.scale import Scale, errors_beyond_scale
 from jaxslam.geometry import PLANAR, SPATIAL, difference
 from jaxslam.io.tum import write_tum
-from jaxslam.plots.evaluation import plot_evaluation
+from jaxslam.plots.evaluation import plot_axis, plot_evaluation
+from jaxslam.plots.style import new_figure
 from jaxslam.statistics import Tally, not_disproved
 from jaxslam.statistics.beyond_scale import one_scale
 
@@ -287,10 +288,14 @@ def test_axes_used_may_be_said_and_the_first_pose_known_on_them():
         np.testing.assert_allclose(there.nees, nees[:, 1:], rtol=1e-4)
 
 
-def test_of_the_axes_used_alone_a_folder_is_evaluated(tmp_path):
+def test_of_the_axes_used_alone_a_folder_is_evaluated_and_drawn(tmp_path):
     *poses, _ = planar(runs=3)
     write_runs(tmp_path, *poses, Convention("split"))
-    assert jaxslam.evaluate_log(tmp_path, axes_used="x,y,rz").names == ("x", "y", "rz")
+    found = jaxslam.evaluate_log(tmp_path, axes_used="x,y,rz")
+    assert found.names == ("x", "y", "rz")
+    axes = new_figure(4, 3).subplots()
+    labels = [plot_axis(found, axis, ax=axes).get_ylabel() for axis in (0, 2)]
+    assert labels == ["m, or map units", "rad"]
 
 
 @pytest.mark.parametrize(("correlation", "left_out"), [(0.0, True), (0.3, False)])

@@ -72,6 +72,7 @@ OF_NUMBERS = [
         r"run 3, step 0 is zero.* is not: 0\.2.*--align",
     ),
     (arrays(0 * E, 0 * P), "all covariances are zero"),
+    (arrays(changed(E, 3, 0.0), changed(P, 3, 0.0)), "all covariances of run 3 are zero"),
     (lambda: evaluate_nees([[1.0, -1.0]], 3), "NEES of run 0, step 1 is -1; 0 or more"),
     *[
         (lambda dof=dof: evaluate_nees([[1.0]], dof), "dof must be one whole number")
