@@ -48,6 +48,11 @@ def read(folder: Path = RESULTS) -> dict[str, Any]:
         """The share of runs that are lost at the last step."""
         return row(scenario, name)["lost"] / row(scenario, name)["runs"]
 
+    def end(scenario: str, name: str) -> list[float]:
+        """At the last step: NEES, the share of lost runs, and NEES of the others."""
+        one = row(scenario, name)
+        return [one["nees"][-1], lost(scenario, name), one["nees_not_lost"]]
+
     def step(scenario: str, name: str) -> float:
         """The time of a step relative to that of `robocentric` in the same scenario."""
         own, paper = (row(scenario, x)["microseconds_per_step"] for x in (name, "robocentric"))
@@ -88,7 +93,9 @@ def read(folder: Path = RESULTS) -> dict[str, Any]:
         found = files["gpu"]["filters"][name][dtype]["device"]["10000"]
         return found["microseconds_per_step"]
 
-    functions = (row, mean, sigma, lost, step, theirs, observed, initialised, walked, on_gpu)
+    functions = (
+        row, mean, sigma, lost, end, step, theirs, observed, initialised, walked, on_gpu,
+    )  # fmt: skip
     return files | {function.__name__: function for function in functions}
 
 

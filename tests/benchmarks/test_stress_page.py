@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import disturbances
+import endurance
 import numpy as np
 import pytest
 import starts
@@ -21,6 +22,14 @@ def on_disk(name):
 def test_the_tables_are_of_the_numbers_on_disk(benchmark):
     table = benchmark.as_table(on_disk(benchmark.__name__))
     assert f"{benchmark.MARK}\n\n{table}\n\n" in PAGE
+
+
+def test_the_table_of_the_long_run_is_of_the_numbers_on_disk(tmp_path):
+    """The command that only writes its page leaves that as it is."""
+    (tmp_path / "stress.md").write_text(PAGE)
+    results = FOLDER / "benchmarks/results/endurance.json"
+    endurance.Endurance(out=results, docs=tmp_path, page=True)()
+    assert (tmp_path / "stress.md").read_text() == PAGE
 
 
 def test_the_answer_is_that_of_the_numbers():
