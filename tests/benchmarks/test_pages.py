@@ -17,8 +17,11 @@ def test_the_numbers_of_a_page_are_those_of_the_results(page):
     assert not stale, "\n".join(["`python benchmarks/pages.py` writes:", *stale])
 
 
-def test_the_page_that_recommends_speaks_of_results():
-    assert {"which-filter.md", "results.md", "from-rest.md"} <= {page.name for page in OF_RESULTS}
+def test_pages_of_measurements_speak_of_results():
+    """Or are written by a benchmark as a whole: comparison, consistency and calibration."""
+    marked = {page.stem for page in OF_RESULTS}
+    assert {"README", "which-filter", "results", "rivals", "repairs", "speed"} <= marked
+    assert {"from-rest", "handheld", "stress", "submaps", "faq"} <= marked
 
 
 def test_a_number_is_written_anew_in_its_form():
