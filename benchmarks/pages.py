@@ -22,7 +22,7 @@ from consistency import label, verdicts_of
 MARK = re.compile(r"<!-- =(.+?) -->", re.DOTALL)
 WORDS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten",
          "eleven", "twelve")  # fmt: skip
-NUMBER = re.compile(rf"\d[\d,]*(?:\.\d+)?|\b(?:{'|'.join(WORDS)})\b", re.IGNORECASE)
+NUMBER = re.compile(rf"\d(?:[\d,]*\d)?(?:\.\d+)?|\b(?:{'|'.join(WORDS)})\b", re.IGNORECASE)
 FUNCTIONS = {f.__name__: f for f in (abs, len, max, min, round, sum)} | {
     "count": lambda values: sum(1 for _ in values)
 }
@@ -48,12 +48,55 @@ def read(folder: Path = RESULTS) -> dict[str, Any]:
         """The share of runs that are lost at the last step."""
         return row(scenario, name)["lost"] / row(scenario, name)["runs"]
 
+    def end(scenario: str, name: str) -> list[float]:
+        """At the last step: NEES, the share of lost runs, and NEES of the others."""
+        one = row(scenario, name)
+        return [one["nees"][-1], lost(scenario, name), one["nees_not_lost"]]
+
     def step(scenario: str, name: str) -> float:
         """The time of a step relative to that of `robocentric` in the same scenario."""
         own, paper = (row(scenario, x)["microseconds_per_step"] for x in (name, "robocentric"))
         return own / paper
 
-    return {**files, "row": row, "mean": mean, "sigma": sigma, "lost": lost, "step": step}
+    def theirs(scenario: str, name: str) -> list[float]:
+        """Of each window of steps NEES and its interval, and the published value if there is one;
+        then the RMSE, and theirs."""
+        one = files["published"][scenario]["filters"][name]
+        found = [
+            x
+            for window in one["nees"].values()
+            for x in (window["ours"], *window["interval95"], window.get("published"))
+        ]
+        return [x for x in (*found, one["rmse"], one["published_rmse"]) if x is not None]
+
+    def observed(scenario: str, name: str) -> list[float]:
+        """The numbers of a row of the table about observability."""
+        one = files["observability"]["scenarios"][scenario][f"{name}/inverse_scaling"]
+        along = one["along"]
+        told = (one[key] for key in ("nees", "nees_median", "lost", "inside"))
+        return [*told, along["error"], along["sigma"]]
+
+    def initialised(scenario: str, name: str) -> list[float]:
+        """The numbers of a row of the table about delayed initialisation, the bias unsigned."""
+        one = files["initialisation"][scenario]["filters"][name]
+        landmarks = one["landmarks"]["all"]
+        told = (one[key] for key in ("nees", "nees_median", "lost", "delay_mean"))
+        return [*told, landmarks["dropped"], abs(landmarks["bias"])]
+
+    def walked(key: str) -> list[float]:
+        """Of `handheld.json`, at the ends of the runs along simulated trajectories, sorted."""
+        found = {name: next(iter(x.values())) for name, x in files["handheld"].items()}
+        return sorted(x[key][-1] for name, x in found.items() if name.startswith("handheld"))
+
+    def on_gpu(name: str, dtype: str = "float64") -> float:
+        """µs a step of a run in batches of 10,000."""
+        found = files["gpu"]["filters"][name][dtype]["device"]["10000"]
+        return found["microseconds_per_step"]
+
+    functions = (
+        row, mean, sigma, lost, end, step, theirs, observed, initialised, walked, on_gpu,
+    )  # fmt: skip
+    return files | {function.__name__: function for function in functions}
 
 
 def value_of(expression: str, results: Mapping[str, Any]) -> list[float]:

@@ -42,6 +42,14 @@ def test_the_library_example_runs_and_prints_a_table(capsys):
     assert "robocentric/inverse_scaling" in capsys.readouterr().out
 
 
+def test_the_study_of_the_readme_prints_what_is_stored_of_it():
+    """`python benchmarks/circle.py` stores the verdicts of its command."""
+    stored = json.loads((ROOT / "benchmarks/results/circle.json").read_text())
+    page = (ROOT / "README.md").read_text()
+    block = "".join(f"    {name}:\n        {said}\n" for name, said in stored["printed"].items())
+    assert f"\n{block}\n" in page
+
+
 @pytest.mark.slow
 def test_a_filter_of_ones_own_takes_part_in_a_study(capsys):
     run_example("docs/own-filter.md")

@@ -101,3 +101,8 @@ def test_the_estimate_of_the_intrinsics_is_judged_by_its_covariance():
 def test_options_that_make_no_sense_are_refused(fields, message):
     with pytest.raises(ValueError, match=message):
         calibration.CalibrationStudy(**fields)
+
+
+def test_the_page_has_the_numbers_on_disk():
+    results = json.loads((ROOT / "benchmarks/results/calibration.json").read_text())
+    assert (ROOT / "docs/calibration.md").read_text() == calibration.page(results)

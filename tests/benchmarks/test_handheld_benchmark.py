@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,8 @@ def test_the_table_has_a_row_for_every_path():
 def test_the_page_has_the_numbers_on_disk():
     folder = Path(__file__).resolve().parents[2]
     results = json.loads((folder / "benchmarks/results/handheld.json").read_text())
-    page = " ".join((folder / "docs/handheld.md").read_text().split())
+    page = (folder / "docs/handheld.md").read_text()
+    page = " ".join(re.sub("<!-- =.*?-->", "", page).split())
     assert " ".join(benchmark.as_table(results).split()) in page
     found = {where: next(iter(filters.values())) for where, filters in results.items()}
     own = sorted(f["one_scale_median"][-1] for w, f in found.items() if w.startswith("handheld"))

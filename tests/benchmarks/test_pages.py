@@ -17,8 +17,11 @@ def test_the_numbers_of_a_page_are_those_of_the_results(page):
     assert not stale, "\n".join(["`python benchmarks/pages.py` writes:", *stale])
 
 
-def test_the_page_that_recommends_speaks_of_results():
-    assert {"which-filter.md", "results.md", "from-rest.md"} <= {page.name for page in OF_RESULTS}
+def test_pages_of_measurements_speak_of_results():
+    """Or are written by a benchmark as a whole: comparison, consistency and calibration."""
+    marked = {page.stem for page in OF_RESULTS}
+    assert {"README", "which-filter", "results", "rivals", "repairs", "speed"} <= marked
+    assert {"from-rest", "handheld", "stress", "submaps", "faq"} <= marked
 
 
 def test_a_number_is_written_anew_in_its_form():
@@ -27,6 +30,7 @@ def test_a_number_is_written_anew_in_its_form():
         ("1.0 and 2<!-- =x['a'] -->", "0.5 and 0<!-- =x['a'] -->"),
         ("9 %, 2.0 %<!-- =x['a'] -->!", "50 %, 0.4 %<!-- =x['a'] -->!"),  # as tables round it
         ("1,000 runs<!-- =x['n'] -->", "12,345 runs<!-- =x['n'] -->"),
+        ("[98, 317]<!-- =[x['few'], x['n']] -->", "[3, 12345]<!-- =[x['few'], x['n']] -->"),
         ("Five and 2<!-- =[x['few'], 7] -->", "Three and 7<!-- =[x['few'], 7] -->"),
         ("1<!-- =x['n'] --> 2<!-- =x['few'] -->", "12345<!-- =x['n'] --> 3<!-- =x['few'] -->"),
         ("no mark 1", "no mark 1"),

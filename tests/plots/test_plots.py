@@ -3,10 +3,13 @@
 import importlib
 import inspect
 import itertools
+import json
 import pkgutil
+from pathlib import Path
 
 import jax
 import numpy as np
+import PIL.Image
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -25,6 +28,7 @@ from jaxslam.plots.evaluation import plot_evaluation
 from jaxslam.plots.style import (
     COLUMN,
     End,
+    drawn,
     label_ends,
     name_numbers,
     new_figure,
@@ -186,6 +190,15 @@ def test_a_study_is_drawn_and_tabled_as_its_summary_is(study):
         lines = [plot(of, ax=new_figure(3, 3).subplots()).lines for of in (study, summary)]
         for one, other in zip(*lines, strict=True):
             np.testing.assert_array_equal(one.get_xydata(), other.get_xydata())
+
+
+def test_the_first_picture_of_the_site_is_as_the_program_draws_it_now(study):
+    """But for its own title and number of runs: a study of as many filters in the plane."""
+    path = Path(__file__).parents[2] / "docs/consistency.png"
+    with PIL.Image.open(path) as picture:
+        shown = json.loads(picture.info["Drawn"])
+    now = json.loads(drawn(plot_consistency(study)).replace(f"{study.runs} runs", "1000 runs"))
+    assert shown | {"title": ""} == now | {"title": ""}
 
 
 @pytest.mark.usefixtures("unchecked")
