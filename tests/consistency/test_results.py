@@ -239,8 +239,12 @@ def test_an_interruption_says_what_is_kept_and_what_to_do(tmp_path, monkeypatch)
 
 
 def test_degrees_of_freedom_and_runs_the_wrong_way_round_are_told():
-    with pytest.raises(ValueError, match="300 degrees of freedom and 3 runs: mean_band"):
-        jaxslam.mean_band(300, 3)
+    for dof, runs in ((300, 3), (101, 100)):
+        with pytest.raises(ValueError, match=f"{dof} degrees of freedom and {runs} runs: mean_b"):
+            jaxslam.mean_band(dof, runs)
+    for dof, runs in ((100, 3), (101, 101)):  # a pose's, and of as many runs as a state has
+        low, high = jaxslam.mean_band(dof, runs)
+        assert low < dof < high
     nees = np.random.default_rng(0).chisquare(300, (3, 2))
     low, high = jaxslam.evaluation.evaluate_nees(nees, 300).band95
     assert 200 < low < 300 < high < 400

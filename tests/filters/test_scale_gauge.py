@@ -90,7 +90,7 @@ def test_from_standstill_the_scale_is_known_and_the_velocity_has_its_prior(veloc
 
 @pytest.mark.parametrize("variance", [0.0, 0.02, 0.3])
 def test_an_inverse_depth_has_its_exact_moments_in_the_unit_of_the_state(variance):
-    """Those of `e^λ ρ` by quadrature, λ ~ N(0, P): its mean, the slope by λ, and what that leaves."""
+    """Those of `e^λ ρ` by quadrature, λ ~ N(0, P): the mean, the slope by λ, and what is left."""
     rho, sigma = np.array([0.1, 0.4]), np.array([0.05, 0.3])
     node, weight = np.polynomial.hermite_e.hermegauss(30)
     weight = weight / weight.sum()

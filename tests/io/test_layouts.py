@@ -39,12 +39,20 @@ def tum_rgbd(tmp_path):
     return path
 
 
-def test_tum_rgbd_has_the_lens_of_its_kinect(tum_rgbd):
-    source = open_source(tum_rgbd)
+@pytest.mark.parametrize(
+    ("name", "pinhole", "distortion"),
+    [
+        ("fr1_xyz", (517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+        ("freiburg2", (520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+        ("freiburg3_office", (535.4, 539.2, 320.1, 247.6), ()),
+    ],
+)
+def test_tum_rgbd_has_the_lens_of_its_kinect(tum_rgbd, name, pinhole, distortion):
+    """As the benchmark's page has them, in pixels."""
+    source = open_source(tum_rgbd.rename(tum_rgbd.with_name(name)))
     assert brightness(source) == [5, 15]
     assert source.times.tolist() == [5.25, 5.5]
-    assert (source.calibration.fx, source.calibration.cy) == (520.9, 249.7)
-    assert source.calibration.distortion[0] == 0.2312
+    assert source.calibration == Calibration(640, 480, *pinhole, distortion)
     assert source.reference is not None
     assert source.reference.times.tolist() == [5.3]
     np.testing.assert_allclose(source.reference.T_wc[0], pose(0), atol=1e-12)
