@@ -87,6 +87,7 @@ def test_json_is_made_of_the_results_and_read_back_to_them():
     assert part["beyond_scale"]["lost"] == result.beyond_scale.lost.tolist()
     assert part["verdict"]["word"] == result.verdict.word
     assert part["seconds"] == {"compile": 1.0, "run": 2.0}
+    np.testing.assert_allclose(told["time"], np.arange(1, STEPS + 1) / WORLD.rate, atol=1e-6)
     again = Results.from_json(told)
     assert json.loads(json.dumps(again.to_json())) == told
     assert again[PAPER].verdict.end.p == result.verdict.end.p
