@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxslam.linalg import (
+    LARGE,
     LEAF,
     cholesky,
     eigh,
@@ -16,7 +17,7 @@ from jaxslam.linalg import (
     symmetric_part,
 )
 
-SIZES = (1, 2, 3, 5, 12, LEAF, LEAF + 1, 2 * LEAF + 3, 105)
+SIZES = (1, 2, 3, 5, 12, LEAF, LEAF + 1, 2 * LEAF + 3, 105, LARGE + 9)
 
 
 def _positive(n, seed=0):

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import runpy
 import subprocess
 import sys
 import threading
@@ -238,8 +239,16 @@ def test_a_command_within_a_program_does_not_end_it(capsys):
         other.join()
 
 
-def test_the_version_is_told(capsys):
-    main(["--version"])
+def as_a_module(arguments):
+    """As `python -m jaxslam.cli` starts it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["jaxslam", *arguments])
+        runpy.run_module("jaxslam.cli", run_name="__main__")
+
+
+@pytest.mark.parametrize("start", [main, as_a_module])
+def test_the_version_is_told(start, capsys):
+    start(["--version"])
     assert capsys.readouterr().out == f"jaxslam {jaxslam.__version__}\n"
 
 

@@ -87,6 +87,7 @@ def test_json_is_made_of_the_results_and_read_back_to_them():
     assert part["beyond_scale"]["lost"] == result.beyond_scale.lost.tolist()
     assert part["verdict"]["word"] == result.verdict.word
     assert part["seconds"] == {"compile": 1.0, "run": 2.0}
+    np.testing.assert_allclose(told["time"], np.arange(1, STEPS + 1) / WORLD.rate, atol=1e-6)
     again = Results.from_json(told)
     assert json.loads(json.dumps(again.to_json())) == told
     assert again[PAPER].verdict.end.p == result.verdict.end.p
@@ -239,8 +240,12 @@ def test_an_interruption_says_what_is_kept_and_what_to_do(tmp_path, monkeypatch)
 
 
 def test_degrees_of_freedom_and_runs_the_wrong_way_round_are_told():
-    with pytest.raises(ValueError, match="300 degrees of freedom and 3 runs: mean_band"):
-        jaxslam.mean_band(300, 3)
+    for dof, runs in ((300, 3), (101, 100)):
+        with pytest.raises(ValueError, match=f"{dof} degrees of freedom and {runs} runs: mean_b"):
+            jaxslam.mean_band(dof, runs)
+    for dof, runs in ((100, 3), (101, 101)):  # a pose's, and of as many runs as a state has
+        low, high = jaxslam.mean_band(dof, runs)
+        assert low < dof < high
     nees = np.random.default_rng(0).chisquare(300, (3, 2))
     low, high = jaxslam.evaluation.evaluate_nees(nees, 300).band95
     assert 200 < low < 300 < high < 400

@@ -365,9 +365,11 @@ def test_a_drift_smaller_than_its_sigma_is_no_fault(factor, disproved):
 
 
 def test_the_size_of_a_drift_is_that_of_the_poses_that_tell_it():
-    """A pose of σ = 1 tells a hundredth of what one of σ = 0.1 does."""
-    drift, sigma = np.array([[0.2, 1.0, np.nan]]), np.array([[0.1, 1.0, np.inf]])
-    found = Scale(np.zeros(1), drift, sigma, (drift / sigma) ** 2, 1.0)
+    """A pose of σ = 1 tells a hundredth of what one of σ = 0.1 does, and one of σ = 0 has no size
+    that may be compared."""
+    drift, sigma = np.array([[0.2, 1.0, np.nan, 0.3]]), np.array([[0.1, 1.0, np.inf, 0.0]])
+    nees = np.array([[4.0, 1.0, np.nan, np.inf]])
+    found = Scale(np.zeros(1), drift, sigma, nees, 1.0)
     assert found.rms == pytest.approx(np.sqrt((100 * 0.2**2 + 1) / 101), rel=1e-12)
 
 

@@ -301,6 +301,32 @@ def test_of_a_curved_measurement_the_spread_of_a_moving_camera_is_told():
         np.testing.assert_allclose(np.cov(bent.T), extra, atol=0.05 * np.trace(extra))
 
 
+def test_the_second_derivatives_of_a_measurement_are_those_of_differences():
+    """By a landmark's own numbers, whose covariance is the state's."""
+    slam, state, control, _ = matched()
+    at, k = context_of(slam, control), 2
+
+    def run(state, steps):
+        context = slam.model.given(state.core, at)
+        view, landmark = slam.model.view(state.core, context), state.landmarks[k]
+        measured = jax.vmap(lambda step: slam.model.observe(view, landmark + step, context)[0])
+        return *curvature(slam.model, state, jnp.arange(6), at), measured(steps)
+
+    d, c = state.landmarks.shape[1], state.core_dim
+    sizes = 1e-3 * np.maximum(1.0, np.abs(np.asarray(state.landmarks[k])))
+    steps = np.diag(sizes)
+    pairs = np.concatenate(
+        [one * steps[:, None] + other * steps for one in (1, -1) for other in (1, -1)]
+    ).reshape(4 * d * d, d)
+    hessian, Q, values = quick_jit(run)(state, pairs)
+    both, more, less, neither = np.asarray(values).reshape(4, d, d, -1)
+    expected = (both - more - less + neither) / (4 * sizes[:, None, None] * sizes[:, None])
+    found = np.moveaxis(hessian[k][:, -d:, -d:], 0, -1)
+    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+    own = slice(c + k * d, c + (k + 1) * d)
+    np.testing.assert_allclose(Q[k][-d:, -d:], state.covariance[own, own], rtol=1e-9, atol=1e-15)
+
+
 class WithoutCovariance(Around):
     """A filter that does not say how its innovations are correlated."""
 

@@ -11,6 +11,7 @@ from cases import Case, each_geometry, named, pose_run, quick_jit, quick_rows
 
 import jaxslam
 from jaxslam.filters.mixture import split_merge
+from jaxslam.filters.mixture.mixture import _division
 from jaxslam.filters.mixture.split_merge import _parts, _split_and_merged
 from jaxslam.filters.mixture.sum_state import BEHIND, SumState, log_likelihoods, mixed
 from jaxslam.models.observations import Innovation, Status
@@ -343,3 +344,14 @@ def test_a_member_that_has_diverged_has_no_likelihood_and_spoils_no_other():
     found = log_likelihoods(sums)
     assert np.isfinite(found[0])
     assert found[1] == -np.inf
+
+
+@pytest.mark.parametrize(
+    ("members", "farthest"), [(3, 2.5), (11, 2.5), (13, 3.0), (15, 3.5), (17, 4.0), (25, 4.0)]
+)
+def test_members_are_half_a_sigma_apart_between_the_least_and_the_greatest_reach(members, farthest):
+    grid, log_weights, sigma = _division(members, 1)
+    np.testing.assert_allclose(grid[:, 0], np.linspace(-farthest, farthest, members), atol=1e-12)
+    weights = np.exp(log_weights)
+    assert weights.sum() == pytest.approx(1)
+    assert weights @ grid[:, 0] ** 2 + sigma**2 == pytest.approx(1)

@@ -19,6 +19,7 @@ from jaxslam.filters.linear.covariance import empty
 from jaxslam.filters.model import COMPOSED, Context, Core
 from jaxslam.filters.remedies.gauge import act, unobservable_directions
 from jaxslam.filters.remedies.observability_constrained import transport
+from jaxslam.filters.remedies.transport import read_from, read_scale_too
 from jaxslam.geometry import PLANAR, SPATIAL, SplitPose, difference, tangent_dim
 from jaxslam.landmarks import (
     Cartesian,
@@ -89,6 +90,19 @@ def moved(model, core, landmarks):
     if model.moves_landmarks:
         landmarks = jax.vmap(lambda x: model.compose_landmark(view, x, here))(landmarks)
     return model.compose_core(core, here), landmarks
+
+
+def test_the_scale_is_read_from_pose_velocity_and_landmarks_and_from_nothing_else():
+    """Of any gauge of three directions and a scale, and any covariance."""
+    draw = np.random.default_rng(0)
+    N, half = draw.normal(size=(12, 4)), draw.normal(size=(12, 12))
+
+    def read(N, P):
+        return read_scale_too(N, read_from(N[:, :3], 3), P, slice(3, 5), slice(7, 11))
+
+    L = quick_jit(read)(N, half @ half.T)
+    np.testing.assert_allclose(L @ N, np.eye(4), atol=1e-10)
+    np.testing.assert_array_equal(np.flatnonzero(~np.any(np.abs(L) > 1e-12, axis=0)), [5, 6, 11])
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from cases import Case, pose_run, quick_jit
 
-from jaxslam.models.scale import velocity_in_gauge
+from jaxslam.models.scale import ScaleGauge, velocity_in_gauge
 
 DRAWS = 400_000
 ERRORS = 5.0
@@ -86,6 +86,20 @@ def test_from_standstill_the_scale_is_known_and_the_velocity_has_its_prior(veloc
     mean, covariance = velocity_in_gauge(jnp.asarray(velocity), jnp.asarray(root), 2)
     np.testing.assert_array_equal(mean, [*velocity, 0])
     np.testing.assert_array_equal(covariance, np.pad(root**2, ((0, 1), (0, 1))))
+
+
+@pytest.mark.parametrize("variance", [0.0, 0.02, 0.3])
+def test_an_inverse_depth_has_its_exact_moments_in_the_unit_of_the_state(variance):
+    """Those of `e^λ ρ` by quadrature, λ ~ N(0, P): the mean, the slope by λ, and what is left."""
+    rho, sigma = np.array([0.1, 0.4]), np.array([0.05, 0.3])
+    node, weight = np.polynomial.hermite_e.hermegauss(30)
+    weight = weight / weight.sum()
+    unit = np.exp(np.sqrt(variance) * node)
+    mean = weight @ unit * rho
+    square = weight @ unit**2 * (rho**2 + sigma**2)
+    found, left = ScaleGauge().prior(rho, sigma, jnp.asarray(variance))
+    np.testing.assert_allclose(found, mean, rtol=1e-12)
+    np.testing.assert_allclose(left, np.sqrt(square - mean**2 * (1 + variance)), rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["matched-loose", "matched-turn-loose", "matched-6dof-loose"])

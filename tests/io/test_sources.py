@@ -219,3 +219,17 @@ def test_shared_videos_open(name, frames):
     np.testing.assert_allclose(
         turns @ turns.transpose(0, 2, 1), np.tile(np.eye(3), (len(turns), 1, 1)), atol=1e-9
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "pinhole", "distortion"),
+    [
+        ("fr1_xyz", (517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+        ("freiburg3_office", (535.4, 539.2, 320.1, 247.6), ()),
+    ],
+)
+def test_the_kinects_of_tum_have_their_own_lenses(tmp_path, name, pinhole, distortion):
+    """As the benchmark's page has them, in pixels; the second one is a row of the laws."""
+    path = tum_rgbd(tmp_path)
+    source = open_source(path.rename(path.with_name(name)))
+    assert source.calibration == Calibration(640, 480, *pinhole, distortion)

@@ -100,6 +100,14 @@ def test_first_observation_puts_the_point_on_its_ray_at_its_depth(
 
 @with_geometry
 @every_landmark
+def test_size_is_the_number_of_parameters(landmark, geometry):
+    initialise, *_ = functions(landmark)
+    parameters = jax.eval_shape(initialise, bearing_of(geometry), 0.15)
+    assert parameters.shape == (landmark.size(geometry.point_dim),)
+
+
+@with_geometry
+@every_landmark
 def test_transform_moves_the_euclidean_point(landmark, geometry):
     _, transform, _, euclidean = functions(landmark)
     parameters, T = generic(landmark, geometry), pose(geometry, 2, scale=1.0)

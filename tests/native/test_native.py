@@ -18,6 +18,7 @@ from jaxslam.native import NativePrograms, NotSupportedError, batch, batched, bu
 from jaxslam.native.batch import Batch
 from jaxslam.native.build import compiler
 from jaxslam.native.elements import Elements
+from jaxslam.native.trace import MOVES
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C++ compiler")
 RUNS = 11
@@ -121,6 +122,31 @@ def assert_as_vmap_makes_it(function):
 @pytest.mark.parametrize("function", CASES, ids=lambda f: f.__name__)
 def test_a_function_is_what_vmap_makes_of_it(function):
     assert_as_vmap_makes_it(function)
+
+
+@pytest.mark.parametrize(
+    "move",
+    [
+        lambda A: jax.lax.pad(A, 9.0, ((1, -1, 0), (0, 2, 2))),
+        lambda A: jax.lax.pad(A, 9.0, ((-1, 3, 1), (2, -2, 0))),
+        lambda A: jax.lax.broadcast_in_dim(A, (3, 2, 4), (0, 2)),
+        lambda A: jax.lax.slice(A, (1, 0), (3, 4), (1, 3)),
+        lambda A: jax.lax.rev(A, (1,)),
+        lambda A: jax.lax.split(A, (1, 3), 1),
+        lambda A: jax.lax.concatenate([A, A], 1),
+        lambda A: jax.lax.transpose(A, (1, 0)),
+        lambda A: jax.lax.expand_dims(A, (1,)),
+        lambda A: jax.lax.reshape(A, (2, 6)),
+    ],
+)
+def test_numbers_are_moved_as_jax_moves_them(move):
+    A = np.arange(12.0).reshape(3, 4)
+    (equation,) = jax.make_jaxpr(move)(A).eqns
+    given = [getattr(variable, "val", A) for variable in equation.invars]
+    found = MOVES[equation.primitive.name](equation.params, *given)
+    wanted = move(A)
+    for x, y in zip(*map(jax.tree.leaves, (found, wanted)), strict=True):
+        np.testing.assert_array_equal(x, y)
 
 
 @needs_compiler

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxslam.tracking.corners import detect_corners
+from jaxslam.tracking.corners import bare_corners, detect_corners
+from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 
 NOWHERE = np.empty((0, 2))
@@ -34,6 +35,15 @@ def test_new_corners_go_where_there_are_none(frame):
     )
     assert len(corners) == 10
     assert np.all(corners[:, 0] > 300)
+
+
+@pytest.mark.parametrize(
+    ("seen", "corners"), [(None, 20), (0, 5), (15, 5), (17, 3), (20, 0), (24, 0)]
+)
+def test_a_map_is_filled_up_by_a_few_corners_a_frame_to_as_many_as_are_wanted(frame, seen, corners):
+    settings = TrackerSettings(wanted=20, new_per_frame=5)
+    occupied = None if seen is None else np.full((seen, 2), 100.0)
+    assert len(bare_corners(frame, settings, occupied)) == corners
 
 
 def test_corner_of_a_square_is_found_with_its_fraction():

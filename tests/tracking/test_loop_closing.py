@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import jax
@@ -21,6 +23,7 @@ from jaxslam.tracking.settings import TrackerSettings
 from jaxslam.tracking.synthetic import add_noise, render, room, synthetic_source
 from jaxslam.tracking.tracker import Tracker
 from jaxslam.tracking.trajectory import absolute_trajectory_error, alignment
+from jaxslam.tracking.unit import MapInWorld
 
 SETTINGS = TrackerSettings(filter="scale_gauge+oc", wanted=24, spare=2)
 FRAMES = 110
@@ -221,6 +224,37 @@ def test_a_map_has_so_many_submaps_and_goes_on_in_the_last(walk, monkeypatch):
             again.step(frame.image, FRAMES / 30 + i / 30)
         assert not again.unmeasured
         assert (len(again.map.submaps) > before) == (most is not None)
+
+
+@pytest.mark.parametrize(("expected", "least"), [(20, 12), (40, 16)])
+@pytest.mark.usefixtures("unchecked")
+def test_a_place_is_known_again_by_twelve_landmarks_that_are_two_fifths(
+    expected, least, monkeypatch
+):
+    """Of those that are looked for where descriptors say that the camera is."""
+    numbers, here = np.arange(expected), np.eye(4)
+    anything: Any = SimpleNamespace()
+    submap: Any = SimpleNamespace(
+        points=np.ones((expected, 3)), covariances=None, numbers=numbers,
+        frozen=SimpleNamespace(carried=numbers >= 0),
+    )  # fmt: skip
+    pixels = {number: np.zeros(2) for number in numbers.tolist()}
+    map: Any = SimpleNamespace(charted=pixels, place=MapInWorld(), settings=SETTINGS)
+    found = 0
+
+    def searched(*_, several):
+        matches = SimpleNamespace(owner=numbers[:found], pixels=np.zeros((found, 2)))
+        return SimpleNamespace(slots=numbers), matches
+
+    monkeypatch.setattr(closing, "well_known", lambda *_: numbers >= 0)
+    monkeypatch.setattr(closing, "pose_of", lambda points, *_: (here, np.ones(len(points), bool)))
+    monkeypatch.setattr(closing, "_expected", lambda *_: anything)
+    monkeypatch.setattr(closing, "search", searched)
+    for found in (least - 1, least):
+        place = closing._seen_in(anything, submap, pixels, map, anything)
+        assert (place is None) == (found < least)
+    assert place is not None
+    np.testing.assert_array_equal(place[0], numbers[:least])
 
 
 @pytest.mark.slow

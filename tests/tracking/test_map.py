@@ -6,16 +6,19 @@ import pytest
 pytest.importorskip("cv2")
 
 from jaxslam.io.calibration import Calibration
+from jaxslam.models.observations import Status
 from jaxslam.tracking import map as upkeep
 from jaxslam.tracking import search as searching
+from jaxslam.tracking.estimator import Correction, Estimator, Predicted
 from jaxslam.tracking.landmarks import MEMORY, Landmark, Points
-from jaxslam.tracking.map import failing, in_view, note_found, worst_first
+from jaxslam.tracking.map import Map, failing, in_view, note_found, worst_first
 from jaxslam.tracking.observations import Observations, Prediction
 from jaxslam.tracking.patches import Patch
 from jaxslam.tracking.search import to_search
 from jaxslam.tracking.settings import FIT, TrackerSettings
 from jaxslam.tracking.synthetic import synthetic_source
 from jaxslam.tracking.tracker import Tracker
+from jaxslam.tracking.unit import MapInWorld
 
 CAMERA = Calibration(640, 480, 500.0, 500.0, 319.5, 239.5)
 SETTINGS = TrackerSettings(filter="world", wanted=5)
@@ -225,6 +228,34 @@ def test_a_landmark_out_of_view_is_kept_while_there_are_slots_and_found_again(mo
         if index == away[-1]:
             assert [unseen[number] for number in range(4)] == [len(away)] * 4
     assert [unseen[number] < 5 for number in range(4)] == [True] * 4
+
+
+class Broken(Estimator):
+    """Its covariance is not positive, whatever it is given."""
+
+    def __init__(self):
+        self.cleared = 0
+
+    def clear(self):
+        self.cleared += 1
+
+    def predict(self, seconds):
+        nothing = np.zeros(0)
+        view = Prediction(nothing, nothing, nothing, nothing, nothing, nothing)
+        return Predicted(np.asarray(seconds), nothing, nothing, nothing, view)
+
+    def correct(self, predicted, seen=None):
+        nothing = np.zeros(0)
+        return Correction(nothing, nothing, nothing, np.asarray(Status.NOT_POSITIVE))
+
+
+def test_a_filter_that_is_begun_anew_in_metres_goes_on_in_the_unit_of_its_map():
+    """Of which it had believed that it is 2 m."""
+    broken = Broken()
+    map = Map(SETTINGS, broken, MapInWorld(log_unit=0.3, log_scale=np.log(2.0)))
+    map.coast(broken.predict(0.1))
+    assert broken.cleared == 1
+    assert map.place.unit == pytest.approx(0.5)
 
 
 @pytest.mark.slow

@@ -80,6 +80,28 @@ def test_a_lost_camera_needs_the_more_the_more_landmarks_have_something_that_loo
     assert agreeing(range(COUNT), range(least), lost=True).matched.sum() == 0
 
 
+def test_three_matches_agree_with_some_pose_and_a_fourth_is_a_check():
+    """However few landmarks are searched: a pose has six degrees of freedom, a pixel two."""
+    assert [more_than_chance(searched) for searched in (1, 4, 8)] == [4, 4, 4]
+
+
+def test_where_a_linear_test_puts_out_most_of_what_moved_together_that_is_believed():
+    """Of a start that no linear prediction expects; half of it is not most."""
+    policy = Policy(CAMERA, TrackerSettings(), ambiguous_start=True)
+    landmarks = {
+        slot: replace(LANDMARKS[slot], seen_at=place)
+        for slot, place in zip(SLOTS.tolist(), PLACES, strict=True)
+    }
+    matches = Matches(np.arange(COUNT), PLACES + ASIDE, np.ones(COUNT, np.float32), np.zeros(COUNT))
+    for linear, believed in ((COUNT // 2, COUNT // 2), (COUNT // 2 - 1, COUNT)):
+
+        def agree(slots, matches, association=None, linear=linear):
+            return np.isin(slots, SLOTS[:linear]) | (association is not None)
+
+        chosen = policy._of_several(SLOTS, matches, landmarks, agree, LEAST_MATCHES)
+        np.testing.assert_array_equal(chosen, np.arange(believed))
+
+
 def test_what_the_filter_did_not_use_is_an_outlier_and_new_landmarks_are_rows_below():
     seen = agreeing(range(6), range(6)).but_for(np.arange(COUNT) < 4)
     assert seen.labels.tolist() == ["matched"] * 4 + ["outlier"] * 2 + ["unmatched"] * 14

@@ -75,6 +75,9 @@ def test_trajectory_starts_at_the_origin_moving_sideways_and_is_smooth():
         assert np.abs(np.diff(velocity, axis=0) * 30).max() < 2.0
         assert np.all(np.ptp(position, axis=0) > 0.1)
         assert np.all(np.ptp(T_wc[:, [2, 0, 1], [1, 2, 0]], axis=0) > 0.02)
+        swaying = handheld_trajectory(np.arange(600) / 10, seed)[:, :3, 3]
+        sideways, *others = np.ptp(swaying, axis=0)
+        assert sideways > 2 * max(others)
 
 
 def test_room_fills_the_view_for_long():
@@ -94,6 +97,7 @@ def test_source_is_reproducible_and_lazy():
         # The same operations on the same numbers, on one machine: exact.
         np.testing.assert_array_equal(one.image, other.image)
     assert first[0].image.shape == (120, 160)
+    assert np.mean((first[0].image < 5) | (first[0].image > 250)) < 0.02  # well exposed
     assert np.mean(first[0].image != next(iter(synthetic_source(4, 3, 160, 120))).image) > 0.9
 
 

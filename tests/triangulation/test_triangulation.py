@@ -160,6 +160,7 @@ def test_a_ray_beyond_infinity_counts_as_infinitely_far():
     assert np.all(truth.z > 0)
     assert quantiles(marginal(truth.z, truth.weight), np.array([0.9]))[0] == np.inf
     summary = summarise(compare(views, particles=5000, measurements=0))
+    assert summary["farthest"] == pytest.approx(10 * views.depth)
     assert summary["truth"]["triangulation"]["z"][-1] is None
     assert "∞" in table(summary)
 
