@@ -776,6 +776,14 @@ def test_lost_runs_have_the_names_of_their_folders(tmp_path):
     assert "lost: run02" in str(found).splitlines()
 
 
+def test_poses_may_be_positions_and_rotation_vectors():
+    T, P, truth = logged(Convention(), runs=2)
+    turns = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_rotvec()
+    written = np.concatenate([T[..., :3, 3], turns.reshape(*T.shape[:2], 3)], axis=-1)
+    found, wanted = (jaxslam.evaluate_poses(x, P, truth) for x in (written, T))
+    np.testing.assert_allclose(found.nees, wanted.nees, rtol=1e-9)
+
+
 def test_poses_in_arrays_are_those_in_files(tmp_path):
     T, P, truth = logged(Convention("left"), runs=3)
     np.savez(tmp_path / "a.npz", estimates=T, covariances=P, truths=truth, error="left")

@@ -203,6 +203,7 @@ def test_nees_alone(tmp_path, quantity):
         evaluate_log(lines(tmp_path / "runs.csv", *columns, header=header))
     with pytest.raises(ValueError, match="NEES of run 0, step 1 is -1; 0 or more"):
         evaluate_nees([[1.0, -1.0]], 3)
-    for dof in (0, -1, 10**7):
+    assert evaluate_nees([[1e6]], 10**6).dof == 10**6  # of a state that is tested as a whole
+    for dof in (0, -1, 10**6 + 1):
         with pytest.raises(ValueError, match="dof must be one whole number"):
             evaluate_nees([[1.0]], dof)
