@@ -365,9 +365,7 @@ def test_what_a_loop_corrects_grows_along_each_submap():
         return share
 
     parts: Any = [SimpleNamespace(number=number, at=share) for number in (4, 5)]
-    frames = [
-        {"submap": number, "relocalised": False, "T_wc": None} for number in (4, 4, 4, 5, 5, 5)
-    ]
+    like = {"relocalised": False, "T_wc": None}
     history: Any = [SimpleNamespace(submap=number, **like) for number in (4, 4, 4, 5, 5, 5)]
     shares = smoothing._cameras(parts, history)
     np.testing.assert_allclose([shares[i] for i in range(6)], [0, 1 / 3, 2 / 3, 0, 0.5, 1])
