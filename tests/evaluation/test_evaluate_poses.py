@@ -24,6 +24,7 @@ from jaxslam.evaluation.alignment import (
     gauge_directions,
     projected,
     similarity,
+    turned_about,
 )
 from jaxslam.evaluation.convention import (
     CHOICES,
@@ -605,6 +606,17 @@ def test_the_rotation_about_a_straight_line_is_not_fitted_to_noise(align):
     curve = jaxslam.evaluate_poses(T, P, bent, convention, align=align)
     assert not_disproved(curve.verdict)
     assert "straight line" not in str(curve)
+
+
+def test_a_rotation_about_a_line_is_that_of_the_orientations():
+    """However far it is to turn, where the positions are on the line and say nothing of it."""
+    line = np.array([2.0, -1.0, 2.0]) / 3
+    T = some(SPATIAL, (5,)).copy()
+    T[:, :3, 3] = np.outer(np.arange(5.0), line)
+    turned = Similarity(Rotation.from_rotvec(2.2 * line).as_matrix(), np.ones(3), 1.0)
+    found = turned_about(Similarity(np.eye(3), np.zeros(3), 1.0), line, T, turned.moved(T))
+    np.testing.assert_allclose(found.rotation, turned.rotation, atol=1e-12)
+    np.testing.assert_allclose(found.translation, turned.translation, atol=1e-12)
 
 
 def test_positions_in_one_place_cannot_be_aligned():
