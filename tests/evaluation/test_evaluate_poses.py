@@ -33,6 +33,7 @@ from jaxslam.evaluation.alignment import (
     gauge_directions,
     projected,
     similarity,
+    turned_about,
 )
 from jaxslam.evaluation.convention import (
     CHOICES,
@@ -544,6 +545,17 @@ def test_the_rotation_about_a_straight_line_is_not_fitted_to_noise(align):
     assert "straight line" not in str(curve)
 
 
+def test_a_rotation_about_a_line_is_that_of_the_orientations():
+    """However far it is to turn, where the positions are on the line and say nothing of it."""
+    line = np.array([2.0, -1.0, 2.0]) / 3
+    T = some(SPATIAL, (5,)).copy()
+    T[:, :3, 3] = np.outer(np.arange(5.0), line)
+    turned = Similarity(Rotation.from_rotvec(2.2 * line).as_matrix(), np.ones(3), 1.0)
+    found = turned_about(Similarity(np.eye(3), np.zeros(3), 1.0), line, T, turned.moved(T))
+    np.testing.assert_allclose(found.rotation, turned.rotation, atol=1e-12)
+    np.testing.assert_allclose(found.translation, turned.translation, atol=1e-12)
+
+
 def test_pairs_and_fits_are_those_of_evo():
     core = pytest.importorskip("evo.core.geometry")
     sync = pytest.importorskip("evo.core.sync")
@@ -663,6 +675,14 @@ def test_lost_runs_have_the_names_of_their_folders(tmp_path):
     assert found.asdict()["lost_runs"] == ["run02"]
     assert found.asdict()["run_names"] == ["run00", "run01", "run02", "run03"]
     assert "lost: run02" in str(found).splitlines()
+
+
+def test_poses_may_be_positions_and_rotation_vectors():
+    T, P, truth = logged(Convention(), runs=2)
+    turns = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_rotvec()
+    written = np.concatenate([T[..., :3, 3], turns.reshape(*T.shape[:2], 3)], axis=-1)
+    found, wanted = (jaxslam.evaluate_poses(x, P, truth) for x in (written, T))
+    np.testing.assert_allclose(found.nees, wanted.nees, rtol=1e-9)
 
 
 def test_runs_of_unlike_length_in_folders_are_compared_as_far_as_each_goes(tmp_path):
@@ -862,3 +882,7 @@ def test_the_sigma_of_the_truth_is_said_where_it_was_added(tmp_path):
     found = jaxslam.evaluate_log(one_run(tmp_path / "run"), truth_sigma=(0.05, 1))
     assert found.asdict()["truth_sigma"] == [0.05, 1.0]
     assert "includes that of the truth, 0.05 m and 1°" in str(found)
+
+
+def test_a_state_that_is_tested_as_a_whole_may_have_a_million_numbers():
+    assert evaluate_nees([[1e6]], 10**6).dof == 10**6

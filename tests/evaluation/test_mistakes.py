@@ -9,7 +9,7 @@ from logs import write_runs
 from scipy.spatial.transform import Rotation
 
 import jaxslam
-from jaxslam.evaluation import Convention
+from jaxslam.evaluation import Convention, sanity_checks
 
 NAMES = ("x", "y", "heading")
 SIGMA = np.array([0.1, 0.1, 0.02])
@@ -210,3 +210,12 @@ def test_a_bias_that_all_runs_share_does_not_make_them_steps(seeds):
 def test_runs_that_are_ordered_by_their_scatter_are_still_runs():
     e, P = right()
     assert said(e * np.linspace(0.5, 2, 20)[:, None, None], P) == ""
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-4, 1e4])
+def test_an_order_is_told_whatever_the_unit_of_what_is_ordered(unit):
+    walk = unit * np.cumsum(np.random.default_rng(0).normal(size=(12, 5)), axis=0)
+    products = sanity_checks._products(walk - walk.mean(axis=0))
+    assert sanity_checks._by_order(products)
+    shuffled = np.random.default_rng(1).permutation(12)
+    assert not sanity_checks._by_order(products[np.ix_(shuffled, shuffled)])

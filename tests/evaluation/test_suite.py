@@ -341,3 +341,11 @@ def test_runs_are_drawn_once(written, tmp_path, monkeypatch):
     monkeypatch.setattr(suite_module, "draw", counted)
     judged(written, "open", tmp_path)
     assert drawn == ["small"]
+
+
+@pytest.mark.parametrize("told", [[1], {"scenario": {}, "runs": 3}])
+def test_a_file_that_tells_no_scenario_of_a_suite_is_named(told, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "scenario.json").write_text(json.dumps(told))
+    with pytest.raises(ValueError, match=r"mine.scenario\.json.*no scenario of a suite, with its"):
+        read_suite(tmp_path, ["mine"])

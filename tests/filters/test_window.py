@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache, partial
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -26,7 +27,7 @@ from jaxslam.filters.window.problem import (
 )
 from jaxslam.filters.window.record import Record, begun, empty, removed, stepped, whole
 from jaxslam.filters.window.scale import rescaled, scaling, shift_of_scale, variances
-from jaxslam.filters.window.to_filter import gauge_state
+from jaxslam.filters.window.to_filter import _with_metre, gauge_state
 from jaxslam.filters.words import scenario_pieces
 from jaxslam.geometry import jacobian
 from jaxslam.landmarks import InverseScaling
@@ -709,3 +710,15 @@ def test_a_metre_that_is_not_known_stays_so_and_changes_nothing_else():
     assert not np.delete(wide[place], place).any()
     rest = np.delete(np.delete(wide, place, 0), place, 1)
     np.testing.assert_allclose(rest, P, atol=1e-12)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_the_covariance_of_the_metre_is_as_it_was():
+    """It is behind that of λ, the first number of its part."""
+    after, before = np.random.default_rng(0).normal(size=(2, 7, 7))
+    like: Any = SimpleNamespace(
+        core=SimpleNamespace(part=lambda name: {"log_scale": slice(3, 5)}[name]), covariance=before
+    )
+    expected = after.copy()
+    expected[4, 4] = before[4, 4]
+    np.testing.assert_array_equal(_with_metre(jnp.asarray(after), like), expected)

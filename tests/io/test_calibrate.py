@@ -56,6 +56,17 @@ def filmed(request, tmp_path_factory):
     return board, path
 
 
+@pytest.mark.parametrize(("seen", "enough"), [(8, True), (7, False)])
+def test_eight_corners_of_a_board_are_enough(seen, enough, monkeypatch):
+    board, (turn, shift) = BOARDS[1], next(poses(BOARDS[1], 1))
+    points = board.corners[:seen]  # of two rows
+    there = (points @ turn.T + shift) @ CAMERA.matrix.T
+    pixels = (there[:, :2] / there[:, 2:]).astype(np.float32)
+    monkeypatch.setattr(Board, "_find_charuco", lambda *_: (pixels, points))
+    image = rendered(board, turn, shift, np.random.default_rng(0))
+    assert (board.find(image) is not None) == enough
+
+
 @pytest.fixture(scope="module")
 def calibrated(filmed):
     board, path = filmed

@@ -16,7 +16,7 @@ from jaxslam.io.source import Source, Trajectory
 from jaxslam.models.frame import Submaps
 from jaxslam.tracking import map as maps
 from jaxslam.tracking import start
-from jaxslam.tracking.places import closing
+from jaxslam.tracking.places import closing, smoothing
 from jaxslam.tracking.places.closing import close_loop
 from jaxslam.tracking.places.submaps import loop_of
 from jaxslam.tracking.settings import TrackerSettings
@@ -347,3 +347,25 @@ def test_two_maps_are_joined_where_the_second_sees_the_first(monkeypatch, tmp_pa
     assert np.array_equal(
         [one.T_wc for one in again.smoothed(history)[0]], [one.T_wc for one in smooth]
     )
+
+
+def test_a_part_of_a_motion_is_as_much_of_its_turn_and_of_its_way():
+    T = small(0, 0.8) @ small(4, 1.2)
+    third, rest = smoothing._part_of(T, 1 / 3), smoothing._part_of(T, 2 / 3)
+    np.testing.assert_allclose(third[:3, :3] @ rest[:3, :3], T[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(third[:3, 3] + rest[:3, 3], T[:3, 3], atol=1e-12)
+    np.testing.assert_allclose(smoothing._part_of(T, 1.0), T, atol=1e-12)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_what_a_loop_corrects_grows_along_each_submap():
+    """Up to its last camera, which is the first of the submap after it."""
+
+    def share(T_wc, share, *, elsewhere):
+        return share
+
+    parts: Any = [SimpleNamespace(number=number, at=share) for number in (4, 5)]
+    like = {"relocalised": False, "T_wc": None}
+    history: Any = [SimpleNamespace(submap=number, **like) for number in (4, 4, 4, 5, 5, 5)]
+    shares = smoothing._cameras(parts, history)
+    np.testing.assert_allclose([shares[i] for i in range(6)], [0, 1 / 3, 2 / 3, 0, 0.5, 1])
