@@ -122,10 +122,12 @@ class SlamModel(eqx.Module):
 
     @property
     def noise_sigma(self) -> Float[Array, " q"]:
-        """σ of what one step appends: the motion's noise, and the calibration's drift."""
-        drift = self.calibration.drift_sigma
+        """σ of what one step appends: the motion's noise, the calibration's drift, and the walk of
+        what depths have in common."""
+        drift, walk = self.calibration.drift_sigma, self.depth.walk
         own = jnp.asarray(self.motion.noise_sigma)
-        return jnp.concatenate([own, drift]) if drift.size else own
+        own = jnp.concatenate([own, drift]) if drift.size else own
+        return own if walk is None else jnp.append(own, walk)
 
     def displacement(self, core: Core, context: Context) -> Pose:
         """The camera's motion in this step; the identity once it is composed."""
@@ -140,7 +142,7 @@ class SlamModel(eqx.Module):
     ) -> tuple[Float[Array, " q"], Float[Array, " w"]]:
         """The motion's noise in the units of the state, and the calibration's."""
         own = self.motion.noise_sigma.shape[-1]
-        noise, drift = core.noise[:own], core.noise[own:]
+        noise, drift = core.noise[:own], core.noise[own : own + self.calibration.drift_sigma.size]
         if core.log_scale is not None:
             log_scale = core.log_scale[0] if context.log_scale is None else context.log_scale
             noise = self.motion.enlarged(core.motion, noise, jnp.exp(-log_scale))[1]
@@ -156,11 +158,12 @@ class SlamModel(eqx.Module):
         """P18, P19. The noise has been used: it is marginalised."""
         noises = self._noises(core, context)
         step, variables, delta = self.moved(core.motion, core.calibration, *noises, context.control)
-        moved = self.frame.moves_landmarks
+        moved, common = self.frame.moves_landmarks, core.depth_error
         return replace(
             core,
             pose=self.frame.compose(core.pose, step),
             anchors=_seen_from(step, core.anchors) if moved else core.anchors,
+            depth_error=common if self.depth.walk is None else common + core.noise[-1:],
             motion=variables,
             calibration=delta,
             noise=jnp.zeros_like(core.noise),

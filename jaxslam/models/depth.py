@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import equinox as eqx
 from jaxtyping import Float
 
@@ -25,8 +27,13 @@ class InverseDepth(eqx.Module):
     """σ of the log of the metre in which all of this was meant, and whatever else is given: a
     filter with a unit of its own (`ScaleGauge`) claims no more of the scale, whatever it sees. None
     where it was the metre."""
+    walk: Float[AnyArray, ""] | None = eqx.field(converter=optional_numbers, default=None)
+    """σ by which `common c` changes from frame to frame, in σ of one landmark's own part: scenes
+    change. None where it stays."""
 
     def __check_init__(self) -> None:
+        if self.walk is not None and self.common is None:
+            raise ValueError("walk is that of a common error of depths: give its σ, common, too")
         for name in ("mean", "sigma"):
             check_shape(f"the {name} of the prior on 1/z", getattr(self, name), ())
 
@@ -34,3 +41,14 @@ class InverseDepth(eqx.Module):
     def beyond(nearest: Number) -> InverseDepth:
         """The paper's: 96 % from `nearest` (d_min, metres) to infinity."""
         return InverseDepth(1 / (2 * nearest), 1 / (4 * nearest))
+
+    @staticmethod
+    def from_depths(near: Number, far: Number) -> InverseDepth:
+        """Mean and σ of 1/z for depths that are uniform between `near` and `far`, metres.
+
+        `E 1/z = log(f/n)/(f − n)` and `E 1/z² = 1/(n f)`. Raises ValueError unless 0 < near < far.
+        """
+        if not 0 < near < far < math.inf:
+            raise ValueError(f"depths are between 0 < near < far < ∞, not {near} and {far}")
+        mean = math.log(far / near) / (far - near)
+        return InverseDepth(mean, math.sqrt(1 / (near * far) - mean**2))

@@ -178,15 +178,17 @@ class Rays(AbstractPlacement):
     """The number of landmarks."""
     first: Float[AnyArray, "p 2"] = eqx.field(converter=_intervals, default=((20.0, 620.0),))
     """Interval of each pixel coordinate at first sight."""
-    depth_range: Float[AnyArray, " 2"] = number_field(default=(1.0, 6.0))
-    """Least and greatest depth z, m."""
+    depth_range: Float[AnyArray, " 2*parts"] = number_field(default=(1.0, 6.0))
+    """Least and greatest depth z, m; of several pairs each holds in an equal part of the run."""
 
     def __check_init__(self) -> None:
         check_signs(self, self.word)
         given = self.depth_range
-        if np.shape(given) != (2,) or (isinstance(given, np.ndarray) and given[0] >= given[1]):
+        pairs = np.ndim(given) == 1 and np.size(given) and np.size(given) % 2 == 0
+        if not pairs or (isinstance(given, np.ndarray) and not (given[::2] < given[1::2]).all()):
             raise ValueError(
-                f"depth_range needs a least and a greatest depth, not {self.depth_range}"
+                "depth_range needs a least and a greatest depth, or several such pairs, not "
+                f"{self.depth_range}"
             )
 
     def check(self, world: World) -> None:
@@ -207,22 +209,25 @@ class Rays(AbstractPlacement):
         self, world: World, key: Array, poses: Pose, sensors: AbstractSensor
     ) -> tuple[Float[Array, "frames l n"], Bool[Array, "frames l"]]:
         def frame(points, data):
-            key, pose, sensor, is_first = data
+            key, pose, sensor, depths, is_first = data
             new = is_first | ~world.measured(pose, sensor, points)[1]
-            fresh = jax.vmap(pose.apply)(self._thrown(key, sensor))
+            fresh = jax.vmap(pose.apply)(self._thrown(key, sensor, depths))
             points = jnp.where(new[:, None], fresh, points)
             return points, (points, new)
 
         frames = world.steps + 1
-        keys, is_first = jax.random.split(key, frames), jnp.arange(frames) == 0
+        number, pairs = jnp.arange(frames), jnp.reshape(self.depth_range, (-1, 2))
+        keys, depths = jax.random.split(key, frames), pairs[number * len(pairs) // frames]
         nowhere = jnp.ones((self.landmarks, world.geometry.point_dim), jnp.result_type(world.rate))
-        return jax.lax.scan(frame, nowhere, (keys, poses, sensors, is_first))[1]
+        return jax.lax.scan(frame, nowhere, (keys, poses, sensors, depths, number == 0))[1]
 
-    def _thrown(self, key: Array, sensor: AbstractSensor) -> Float[Array, "l n"]:
+    def _thrown(
+        self, key: Array, sensor: AbstractSensor, depths: Float[Array, " 2"]
+    ) -> Float[Array, "l n"]:
         """Points along random rays of a camera, in its frame."""
         pixel_key, depth_key = jax.random.split(key)
         pixels = _uniform(self.first, self.landmarks, pixel_key)
-        least, greatest = self.depth_range
+        least, greatest = depths
         share = jax.random.uniform(depth_key, (self.landmarks, 1), pixels.dtype)
         return _located(sensor, pixels, 1 / (least + (greatest - least) * share))
 

@@ -297,7 +297,9 @@ def test_a_malformed_override_is_refused(text):
         ({"inverse_depth": [float("inf"), 0.1]}, "inverse_depth holds inf"),
         ({"still_frames": -1}, "still_frames must not be negative"),
         ({"still_frames": 2, "motion": "odometry"}, "still_frames: odometry has the nominal"),
-        ({"depth_range": [5.0]}, "depth_range needs a least and a greatest depth"),
+        ({"depth_range": [5.0]}, "depth_range needs a least and a greatest depth, or several"),
+        ({"depth_range": [1.0, 6.0, 5.0]}, "depth_range needs a least and a greatest depth"),
+        ({"depth_range": [1.0, 6.0, 5.0, 4.0]}, "depth_range needs a least and a greatest depth"),
         ({"depth_range": [5.0, 2.0]}, "depth_range needs a least and a greatest depth"),
         ({"depth_range": [0.0, 2.0]}, "depth_range must be positive"),
         ({"placement": "rays", "known_landmarks": 3}, "known_landmarks: placement rays has no"),
@@ -777,6 +779,18 @@ def test_it_is_thrown_along_a_random_ray_at_a_random_depth():
             assert stats.kstest(pixels, uniform.cdf).pvalue > FALSE_ALARM
     # Neither slots nor frames repeat one another.
     assert len(np.unique(depth[new])) == new.sum()
+
+
+def test_depths_change_in_the_middle_of_a_run():
+    chosen = scenario("laps-change", steps=40)
+    run = quick_jit(lambda key: simulate(chosen, key))(jax.random.key(0))
+    seen = jax.vmap(lambda pose, points: jax.vmap(pose.inverse().apply)(points))
+    depth = np.asarray(seen(run.poses, run.points))[..., 1]
+    new = np.asarray(run.new)
+    early, late = depth[:20][new[:20]], depth[21:][new[21:]]
+    assert min(early.size, late.size) > 5
+    assert (early > 1).all() and (early < 6).all()
+    assert (late > 5).all() and (late < 50).all() and late.max() > 10
 
 
 def test_features_and_slots_of_landmarks_that_come_and_go():

@@ -67,7 +67,9 @@ class PathLayout(NamedTuple):
         own = slam.calibration.sigma.size
         each = own if slam.calibration.each_frame else 0
         common = 0 if slam.depth.common is None else 1
-        return PathLayout(len(root), common, own - each, slam.model.noise_sigma.size, each)
+        # What depths have in common stays within a window.
+        step = slam.motion.noise_sigma.shape[-1] + slam.calibration.drift_sigma.size
+        return PathLayout(len(root), common, own - each, step, each)
 
     @property
     def whole(self) -> int:
@@ -117,7 +119,7 @@ def _moved(slam: AbstractSlam, state, control, merged: Scalar, restarted: Bool[A
     """
     (pose, variables, delta), layout, motion = state, PathLayout.of(slam), slam.motion
     own = motion.noise_sigma.shape[-1]
-    noise, drift = jnp.split(slam.model.noise_sigma * numbers[: layout.step], [own])
+    noise, drift = jnp.split(slam.model.noise_sigma[: layout.step] * numbers[: layout.step], [own])
     noise, drift = noise / jnp.sqrt(merged), drift * jnp.sqrt(merged)
     mean, root = motion.start()
     anew = retract(mean, root @ numbers[: layout.start])
