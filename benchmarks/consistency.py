@@ -175,7 +175,7 @@ def page(results: Results, verdicts: Path = VERDICTS) -> str:
         "",
         *in_words(results),
         "",
-        "All filters use Inverse Scaling. `recommended` is `scale_gauge+scene50+mixture17`, in",
+        "All filters use Inverse Scaling. `recommended` is `scale_gauge+oc+scene50+mixture17`, in",
         "space `mixture9`; a name that begins with `+` continues `scale_gauge`. What the filters",
         "do is on [another page](repairs.md). Written by `python benchmarks/consistency.py`; a row",
         f"is one study of {counts[0]} to {counts[-1]} runs of {seeds}.",

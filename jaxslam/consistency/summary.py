@@ -18,13 +18,7 @@ from jaxslam._runtime import plotted
 from jaxslam._runtime.files import read_json, write_atomically, write_json
 from jaxslam._runtime.lookup import suggestion
 from jaxslam.consistency.manifest import Manifest, described
-from jaxslam.consistency.results import (
-    FilterResult,
-    Results,
-    Seconds,
-    Summary,
-    named,
-)
+from jaxslam.consistency.results import FilterResult, Results, Seconds, Summary, named
 from jaxslam.consistency.store import FolderStore, Records, Store
 from jaxslam.consistency.sums import (
     RECORDS,

@@ -21,13 +21,7 @@ from jaxslam.filters.linear import covariance as linear
 from jaxslam.filters.linear.blocks import Change, Landmark, Noise, Prior
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.model import COMPOSED, Context, Core
-from jaxslam.filters.protocol import (
-    Belief,
-    CameraView,
-    Expected,
-    LandmarkView,
-    OfLandmark,
-)
+from jaxslam.filters.protocol import Belief, CameraView, Expected, LandmarkView, OfLandmark
 from jaxslam.geometry import SplitPose, difference, identity
 from jaxslam.models.motion import Control, check_control
 from jaxslam.models.observations import Capacity, Features, Innovation, PriorMap

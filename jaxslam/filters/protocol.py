@@ -85,10 +85,7 @@ class AbstractFilter(eqx.Module):
 
     @abstractmethod
     def init(
-        self,
-        capacity: int | Capacity,
-        first: Features | None = None,
-        known: PriorMap | None = None,
+        self, capacity: int | Capacity, first: Features | None = None, known: PriorMap | None = None
     ) -> Belief:
         """The state before the first motion: at the origin of B. With the features of frame 0, in
         which everything is new, the state after it; with a prior map, landmarks are known."""

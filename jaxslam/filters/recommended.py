@@ -30,11 +30,12 @@ def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Piece)
     For a camera whose motion is a velocity it is robocentric, with a unit of length of its own,
     since no pixel observes the metre, and an error that is common to all depths, σ half of one
     landmark's. One linearisation is not enough while the direction of travel is unknown: so it is a
-    Gaussian sum over the velocity's direction, of at most 17 members in a plane and 9 in space.
+    Gaussian sum over the velocity's direction, of at most 17 members in a plane and 9 in space,
+    which ends in one Gaussian. Its covariance is carried along the gauge (`+oc`): without that,
+    thousands of frames make the scale seem known.
 
     Where the velocity's mean is less than √3 σ of it, the same with a start that looks for the
-    motion in a window of frames, of at most 5 and 3 members; in space its covariance is carried
-    along the gauge.
+    motion in a window of frames, of at most 5 and 3 members.
 
     For odometry, and for a sensor that measures metres (then of Cartesian points): the paper's
     filter. What nothing observes
@@ -49,11 +50,10 @@ def recommended(motion: AbstractMotion, sensor: AbstractSensor, **pieces: Piece)
     if motion.has_velocity and sensor.hidden:
         depth = replace(depth, common=0.5) if depth.common is None else depth
         chosen = {"scale": ScaleGauge(), "mixture": Mixture(17 if planar else 9)}
+        chosen["correction"] = ObservabilityConstrained()
         if not _velocity_is_known(motion):
             chosen["mixture"] = Mixture(5 if planar else 3)
             chosen["start"] = FromWindow(Schedule.of(motion.geometry, None if planar else 8))
-            if not planar:
-                chosen["correction"] = ObservabilityConstrained()
     return Slam(motion, sensor, depth=depth, **{**chosen, **pieces})
 
 

@@ -111,10 +111,7 @@ class Slam(AbstractSlam):
         return self.layer.ambiguous_start(self)
 
     def init(
-        self,
-        capacity: int | Capacity,
-        first: Features | None = None,
-        known: PriorMap | None = None,
+        self, capacity: int | Capacity, first: Features | None = None, known: PriorMap | None = None
     ) -> Belief:
         return self.layer.init(self, capacity, first, known)
 
@@ -239,7 +236,4 @@ def _excluded(slam: Slam) -> Iterator[tuple[bool, str]]:
         ("a filter with submaps", frame.begins_submaps),
     ):
         yield piece and not correction.divisible, f"{what} does not go with {update}"
-        yield (
-            piece and landmark.converts,
-            f"{what} cannot switch the form of {landmark.name}",
-        )
+        yield (piece and landmark.converts, f"{what} cannot switch the form of {landmark.name}")

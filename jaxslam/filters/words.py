@@ -67,24 +67,18 @@ def _with_submaps(slam: Slam, spare: int = 24) -> Slam:
     return replace(slam, frame=Submaps(spare))
 
 
-def _drifting(slam: Slam, percent: int = 10) -> Slam:
-    return replace(slam, correction=RandomWalk(slam.correction, percent / 100))
-
-
 def _from_window(slam: Slam, frames: int | None = None) -> Slam:
     return replace(slam, start=FromWindow(Schedule.of(slam.motion.geometry, frames)))
 
 
-def _first_estimates(slam: Slam) -> Slam:
-    return replace(slam, correction=FirstEstimates())
-
-
 MODIFIERS: dict[str, Callable[..., AbstractFilter]] = {
     "scene": _with_scene_depth,
-    "fej": _first_estimates,
+    "fej": lambda slam: replace(slam, correction=FirstEstimates()),
     "oc": lambda slam, steps=1: replace(slam, correction=ObservabilityConstrained(steps)),
     "iterated": _iterated,
-    "drift": _drifting,
+    "drift": lambda slam, percent=10: replace(
+        slam, correction=RandomWalk(slam.correction, percent / 100)
+    ),
     "directions": lambda slam, count=5: replace(slam, mixture=Mixture(count, split=False)),
     "mixture": lambda slam, count=9: replace(slam, mixture=Mixture(count)),
     "rest": _from_window,

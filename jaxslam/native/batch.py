@@ -143,10 +143,7 @@ def is_kept(key: object) -> bool:
 
 
 def batched(
-    function: Callable[[PyTree, PyTree], PyTree],
-    shared: PyTree,
-    runs: PyTree,
-    key: object = None,
+    function: Callable[[PyTree, PyTree], PyTree], shared: PyTree, runs: PyTree, key: object = None
 ) -> Batch:
     """A program for arguments of these shapes and types.
 

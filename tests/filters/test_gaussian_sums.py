@@ -12,7 +12,7 @@ from cases import Case, each_geometry, named, pose_run, quick_jit, quick_rows
 import jaxslam
 from jaxslam.filters.mixture import split_merge
 from jaxslam.filters.mixture.mixture import _division
-from jaxslam.filters.mixture.split_merge import _parts, _split_and_merged
+from jaxslam.filters.mixture.split_merge import _as_late, _parts, _split_and_merged
 from jaxslam.filters.mixture.sum_state import BEHIND, SumState, log_likelihoods, mixed
 from jaxslam.models.observations import Innovation, Status
 
@@ -248,6 +248,39 @@ def test_of_many_members_each_has_to_gain_more(monkeypatch):
         return int(after.alive.sum())
 
     assert left(0.1) < left(9)
+
+
+def cost_as_one(state):
+    """Of the whole sum, in pixels²."""
+    weights, motion = np.exp(state.log_weights), np.asarray(state.members.core.motion)[:, :2]
+    return 100**2 * (cost(state) + weights @ np.sum((motion - weights @ motion) ** 2, axis=1))
+
+
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_a_sum_ends_where_one_gaussian_costs_little(monkeypatch, share):
+    """Pairs are merged, three in a frame, as soon as the cost of the whole is below the bound."""
+    state = some_sum(9)
+    monkeypatch.setattr(split_merge, "ENOUGH", float(share * cost_as_one(state)))
+    after = quick_jit(lambda state: _split_and_merged(_parts(lambda core: pixels, state), 3))(state)
+    merged = int(state.alive.sum()) - int(after.alive.sum())
+    assert (merged == 3) == (share > 1)
+    for before, now in zip(moments(state), moments(after), strict=True):
+        np.testing.assert_allclose(now, before, rtol=1e-9, atol=1e-12 * np.abs(before).max())
+
+
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_late_splits_are_across_the_displacement(monkeypatch, share):
+    """What is along it stays as uncertain in every member as it was."""
+    state = some_sum(9)
+    monkeypatch.setattr(split_merge, "ACROSS", float(share * cost_as_one(state)))
+    parts, _ = quick_jit(lambda state: _as_late(_parts(lambda core: pixels, state)))(state)
+    along = parts.values / np.linalg.norm(parts.values, axis=1)[:, None]
+    reached = np.einsum("ki,kic->kc", along, parts.by_core)
+    left = np.einsum("ki,kij,kj->k", along, parts.covariances, along)
+    alive = np.asarray(state.alive)
+    assert np.allclose(reached[alive], 0, atol=1e-12) == (share > 1)
+    assert np.allclose(left[alive], 0, atol=1e-12) == (share > 1)
+    assert np.abs(parts.by_core[alive]).max() > 1  # of what is across
 
 
 def test_what_gains_nothing_is_not_split():

@@ -183,9 +183,9 @@ def test_recommended_is_a_record(geometry, told):
     planar = geometry is PLANAR
     chosen = ("matched" if told else "standstill") + ("" if planar else "-6dof")
     spelt = {
-        (True, True): "scale_gauge+scene50+mixture17",
-        (True, False): "scale_gauge+scene50+mixture9",
-        (False, True): "scale_gauge+scene50+mixture5+rest",
+        (True, True): "scale_gauge+oc+scene50+mixture17",
+        (True, False): "scale_gauge+oc+scene50+mixture9",
+        (False, True): "scale_gauge+oc+scene50+mixture5+rest",
         (False, False): "scale_gauge+oc+scene50+mixture3+rest8",
     }[told, planar]
     one, other = make_filters(chosen, ["recommended", spelt]).values()

@@ -27,10 +27,7 @@ from jaxslam.filters.layer import AbstractLayer, AbstractSlam
 from jaxslam.filters.linear.state import State
 from jaxslam.filters.mixture.split_merge import collapsed, divided
 from jaxslam.filters.mixture.sum_state import SumState, member, moments, weighed
-from jaxslam.filters.protocol import (
-    Belief,
-    Corrected,
-)
+from jaxslam.filters.protocol import Belief, Corrected
 from jaxslam.geometry import difference, retract
 from jaxslam.linalg import eigh
 from jaxslam.models.motion import Control, check_control
@@ -95,7 +92,7 @@ class Mixture(AbstractLayer):
         inner = slam.inner
         if not self.split:
             return self._measured(lambda one: inner.step(one, control, seen, new), state)
-        state = self._divided(slam, self.predict(slam, state, control), control, seen)
+        state = divided(slam, self.predict(slam, state, control), control, seen, self.rounds)
 
         def stepped(one):
             one, innovation = self._updated(slam, one, control, seen)
@@ -123,7 +120,7 @@ class Mixture(AbstractLayer):
     def update(self, slam, state, control, seen):
         """Split and merge, correct every member and weigh it."""
         if self.split:
-            state = self._divided(slam, state, control, seen)
+            state = divided(slam, state, control, seen, self.rounds)
         return self.update_members(slam, state, control, seen)
 
     def update_members(
@@ -162,11 +159,6 @@ class Mixture(AbstractLayer):
         """The error of the sum's mean, to first order in the members' distances; its covariance."""
         of_member = jax.vmap(slam.inner.pose_error, in_axes=(0, None))
         return moments(state.log_weights, *of_member(state.members, T_BC))
-
-    def _divided(
-        self, slam: AbstractSlam, state: SumState, control: Control, seen: Features
-    ) -> SumState:
-        return divided(slam, state, control, seen, self.rounds)
 
     def _updated(
         self, slam: AbstractSlam, one: State, control: Control, seen: Features

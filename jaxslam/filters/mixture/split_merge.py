@@ -10,7 +10,10 @@ member's cost is the squared pixels `tr(M P_t)`, with its own variance P_t of th
 
     M = Σᵢ σ_ωᵢ² (∂h/∂X)ᵀ (∂h/∂X),   over the landmarks i in view.
 
-Splits and mergers keep the sum's mean and covariance.
+Splits and mergers keep the sum's mean and covariance. Members that differ along t differ in scale,
+of which the amplitude of innovations says something, wrongly where the prior on depth is wrong: so
+once the cost is small they are split across t alone (`ACROSS`). As soon as one linearisation
+serves, the sum ends in one Gaussian (`ENOUGH`), which costs the time of one.
 """
 
 from __future__ import annotations
@@ -43,6 +46,10 @@ whose merger costs less than a quarter of it are one."""
 FEW = 7
 """Members up to which that is so. Of k members it is `(k/FEW)⁴` times as much, as every one costs
 the same time."""
+ACROSS, ENOUGH = 1e-2, 1e-3
+"""Costs of a sum as one Gaussian, σ² of a pixel for all landmarks together. Below the first, splits
+are across the displacement alone; below the second the sum ends: pairs are merged whatever it
+costs, and no member is split."""
 SPLIT = 0.8
 """Halves of a split member are ± so many of its σ from its mean."""
 
@@ -133,16 +140,31 @@ def _parts(pixels_at: Callable[[Core], Pixels], state: SumState) -> _Parts:
 def _split_and_merged(parts: _Parts, rounds: int) -> SumState:
     """So many times, each of other members: the one of the greatest cost split, and two of the
     others merged, if that is a gain; else two merged, if that costs nothing."""
-    places, due, divided = _planned(parts, rounds)
+    parts, one_serves = _as_late(parts)
+    places, due, divided = _planned(parts, rounds, one_serves)
     split = jnp.any(divided & (places[:, 2] == jnp.arange(parts.sum.alive.size)[:, None]), axis=1)
     return at_places(_replaced, parts.sum, (parts.by_core, split), places, due, None)
 
 
+def _as_late(parts: _Parts) -> tuple[_Parts, Bool[Array, ""]]:
+    """What a split may reach: near the end only what is across the values, the displacement; and
+    whether one Gaussian serves."""
+    cost = jnp.trace(moments(parts.sum.log_weights, parts.values, parts.covariances)[1])
+
+    def across(value, by_core, P):
+        squared = value @ value
+        share = jnp.where(cost < ACROSS, 1.0, 0.0) / jnp.where(squared > 0, squared, 1.0)
+        left = jnp.eye(value.size, dtype=value.dtype) - share * jnp.outer(value, value)
+        return value, left @ by_core, left @ P @ left
+
+    return _Parts(parts.sum, *jax.vmap(across)(*parts[1:])), cost < ENOUGH
+
+
 def _planned(
-    parts: _Parts, rounds: int
+    parts: _Parts, rounds: int, one_serves: Bool[Array, ""]
 ) -> tuple[Int[Array, "w 3"], Bool[Array, " w"], Bool[Array, " w"]]:
     """The places of two that are merged and of one that is split, so many times; whether that is
-    due, and whether the split is.
+    due, and whether the split is. Where one Gaussian serves, pairs are merged alone.
 
     The cost of the sum is `Σ w tr(P)` of the members' `pixels(core)`, in σ² of a pixel. A split
     lessens it by `w δ² λ` with the greatest eigenvalue λ; a merger adds
@@ -167,6 +189,7 @@ def _planned(
         others, cost = _cheapest(jnp.where(one[:, None] | one, jnp.inf, left))
         alike, least = _cheapest(jnp.where(both, left, jnp.inf))
         worth = WORTH * jnp.maximum(1.0, count / FEW) ** 4
+        worth = jnp.where(one_serves, jnp.inf, worth)
         divided = (gain > cost) & (gain > worth)
         due = divided | (least < worth / 4)
         pair = jnp.where(divided, others, alike)

@@ -57,8 +57,6 @@ def _at_first(
 
     (predicted, in_front), (at_first, _) = observe(state.landmarks), observe(state.first)
     moved = replace(
-        features,
-        measured=features.measured - predicted + at_first,
-        valid=features.valid & in_front,
+        features, measured=features.measured - predicted + at_first, valid=features.valid & in_front
     )
     return replace(state, landmarks=state.first), moved, predicted

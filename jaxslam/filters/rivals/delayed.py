@@ -84,10 +84,7 @@ class AbstractDelayed(AbstractFilter):
         return self.slam.model
 
     def init(
-        self,
-        capacity: int | Capacity,
-        first: Features | None = None,
-        known: PriorMap | None = None,
+        self, capacity: int | Capacity, first: Features | None = None, known: PriorMap | None = None
     ) -> Delayed:
         """Raises ValueError for a prior map, whose landmarks are no rays."""
         if known is not None:

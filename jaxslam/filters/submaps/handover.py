@@ -22,9 +22,7 @@ from jaxslam._numerics.conditional import cond
 from jaxslam.filters.gaussian import each_gaussian, rebased
 from jaxslam.filters.layer import AbstractLayer, AbstractSlam
 from jaxslam.filters.linear.state import State
-from jaxslam.filters.protocol import (
-    Belief,
-)
+from jaxslam.filters.protocol import Belief
 from jaxslam.models.frame import Submaps
 from jaxslam.models.observations import Capacity, Features, Slots
 
