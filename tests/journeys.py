@@ -1,6 +1,7 @@
 """What a filter computes in this process, or in another one to which it was sent."""
 
 from functools import cache
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,7 +20,11 @@ def case(world, runs):
     return Case(world, runs=runs, **WORLDS[world])
 
 
-@eqx.filter_jit(compiler_options=quick_options())
+OPTIONS: Any = {"compiler_options": quick_options()}
+"""Of `jax.jit`, to which they are handed on."""
+
+
+@eqx.filter_jit(**OPTIONS)
 def _run(slam, room, first, known, new, controls):
     def of_one(first, known, new, controls):
         def step(state, frame):

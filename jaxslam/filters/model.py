@@ -159,11 +159,13 @@ class SlamModel(eqx.Module):
         noises = self._noises(core, context)
         step, variables, delta = self.moved(core.motion, core.calibration, *noises, context.control)
         moved, common = self.frame.moves_landmarks, core.depth_error
+        if common is not None and self.depth.walk is not None:
+            common += core.noise[-1:]
         return replace(
             core,
             pose=self.frame.compose(core.pose, step),
             anchors=_seen_from(step, core.anchors) if moved else core.anchors,
-            depth_error=common if self.depth.walk is None else common + core.noise[-1:],
+            depth_error=common,
             motion=variables,
             calibration=delta,
             noise=jnp.zeros_like(core.noise),

@@ -885,4 +885,4 @@ def test_the_sigma_of_the_truth_is_said_where_it_was_added(tmp_path):
 
 
 def test_a_state_that_is_tested_as_a_whole_may_have_a_million_numbers():
-    assert evaluate_nees([[1e6]], 10**6).dof == 10**6
+    assert jaxslam.evaluation.evaluate_nees([[1e6]], 10**6).dof == 10**6

@@ -789,8 +789,11 @@ def test_depths_change_in_the_middle_of_a_run():
     new = np.asarray(run.new)
     early, late = depth[:20][new[:20]], depth[21:][new[21:]]
     assert min(early.size, late.size) > 5
-    assert (early > 1).all() and (early < 6).all()
-    assert (late > 5).all() and (late < 50).all() and late.max() > 10
+    assert (early > 1).all()
+    assert (early < 6).all()
+    assert (late > 5).all()
+    assert (late < 50).all()
+    assert late.max() > 10
 
 
 def test_features_and_slots_of_landmarks_that_come_and_go():

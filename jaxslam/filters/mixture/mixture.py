@@ -63,11 +63,6 @@ class Mixture(AbstractLayer):
         """The likeliest member's."""
         return state.likeliest
 
-    @property
-    def rounds(self) -> int:
-        """The most splits in a frame: each takes up to three members."""
-        return max(1, self.members // 3)
-
     def init(self, slam, capacity, first, known):
         """`v = v̄ + D e`, e ~ N(0, I) = Σ w_i N(A s_i, I − (1 − σ²) A Aᵀ), for directions A."""
         dtype = precision(slam)
@@ -92,7 +87,7 @@ class Mixture(AbstractLayer):
         inner = slam.inner
         if not self.split:
             return self._measured(lambda one: inner.step(one, control, seen, new), state)
-        state = divided(slam, self.predict(slam, state, control), control, seen, self.rounds)
+        state = divided(slam, self.predict(slam, state, control), control, seen)
 
         def stepped(one):
             one, innovation = self._updated(slam, one, control, seen)
@@ -120,7 +115,7 @@ class Mixture(AbstractLayer):
     def update(self, slam, state, control, seen):
         """Split and merge, correct every member and weigh it."""
         if self.split:
-            state = divided(slam, state, control, seen, self.rounds)
+            state = divided(slam, state, control, seen)
         return self.update_members(slam, state, control, seen)
 
     def update_members(

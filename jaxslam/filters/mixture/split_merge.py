@@ -54,10 +54,8 @@ SPLIT = 0.8
 """Halves of a split member are ± so many of its σ from its mean."""
 
 
-def divided(
-    slam: AbstractSlam, state: SumState, control: Control, seen: Features, rounds: int
-) -> SumState:
-    """A predicted sum after at most so many splits, and as many mergers of other members."""
+def divided(slam: AbstractSlam, state: SumState, control: Control, seen: Features) -> SumState:
+    """A predicted sum after splits, and as many mergers of other members: each takes three."""
     n = slam.motion.geometry.point_dim
 
     cost = _root_of_cost(slam, state.likeliest, seen)
@@ -68,7 +66,7 @@ def divided(
         return lambda core: cost @ log(slam.model.displacement(core, context))[:n]
 
     parts = _parts(pixels_at, state)
-    return _split_and_merged(parts, rounds)
+    return _split_and_merged(parts, max(1, state.log_weights.size // 3))
 
 
 def _root_of_cost(slam: AbstractSlam, likeliest: State, seen: Features) -> Float[Array, "n n"]:
