@@ -14,7 +14,7 @@ class InverseDepth(eqx.Module):
     """`1/z = mean + σ (e_i + common c)`, with e_i of every landmark and one c, standard normal.
 
     c is estimated with everything else: the first landmarks inform those that follow how far away
-    the scene is.
+    the scene is. Raises ValueError for numbers that are none, and for a walk of nothing in common.
     """
 
     mean: Float[AnyArray, ""] = number_field()
@@ -39,7 +39,7 @@ class InverseDepth(eqx.Module):
 
     @staticmethod
     def beyond(nearest: Number) -> InverseDepth:
-        """The paper's: 96 % from `nearest` (d_min, metres) to infinity."""
+        """The paper's: 96 % from `nearest` (d_min, metres) to infinity. Raises ValueError."""
         return InverseDepth(1 / (2 * nearest), 1 / (4 * nearest))
 
     @staticmethod
