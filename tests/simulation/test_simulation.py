@@ -181,6 +181,24 @@ EXPECTED["laps-6dof"] = {
 }  # fmt: skip
 
 
+MOMENTS = np.log(6) / 5, np.sqrt(1 / 6 - (np.log(6) / 5) ** 2)  # of 1/z, z uniform in 1–6 m
+for space, moving in (
+    ("", {"geometry": "planar", "landmarks": 12, "velocity": (0.0, 1.2, 0.3)}),
+    ("-6dof", SPATIAL | {"landmarks": 20, "velocity": (0.0, 0.0, 1.2, 0.0, -0.3, 0.0)}),
+):
+    thrown = moving | {
+        "rate": 30.0, "steps": 3000, "placement": "rays", "in_view": 0, "inverse_depth": (),
+        "nearest_depth": 3.0, "depth_range": (1.0, 6.0),
+        "acceleration_sigma": (0.02,) * len(moving["velocity"]),
+    }  # fmt: skip
+    prior = thrown | {"inverse_depth": pytest.approx(MOMENTS)}
+    EXPECTED |= {
+        f"laps-thrown{space}": thrown,
+        f"laps-prior{space}": prior,
+        f"laps-change{space}": prior | {"depth_range": (1.0, 6.0, 5.0, 50.0)},
+    }
+
+
 @pytest.mark.parametrize("name", EXPECTED)
 def test_built_in_scenarios_hold_the_published_numbers(name):
     chosen = scenario(name)
