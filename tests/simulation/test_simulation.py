@@ -182,14 +182,14 @@ EXPECTED["laps-6dof"] = {
 
 
 MOMENTS = np.log(6) / 5, np.sqrt(1 / 6 - (np.log(6) / 5) ** 2)  # of 1/z, z uniform in 1–6 m
-for space, moving in (
-    ("", {"geometry": "planar", "landmarks": 12, "velocity": (0.0, 1.2, 0.3)}),
-    ("-6dof", SPATIAL | {"landmarks": 20, "velocity": (0.0, 0.0, 1.2, 0.0, -0.3, 0.0)}),
+for space, moving, axes in (
+    ("", {"geometry": "planar", "landmarks": 12, "velocity": (0.0, 1.2, 0.3)}, 3),
+    ("-6dof", SPATIAL | {"landmarks": 20, "velocity": (0.0, 0.0, 1.2, 0.0, -0.3, 0.0)}, 6),
 ):
     thrown = moving | {
         "rate": 30.0, "steps": 3000, "placement": "rays", "in_view": 0, "inverse_depth": (),
         "nearest_depth": 3.0, "depth_range": (1.0, 6.0),
-        "acceleration_sigma": (0.02,) * len(moving["velocity"]),
+        "acceleration_sigma": (0.02,) * axes,
     }  # fmt: skip
     prior = thrown | {"inverse_depth": pytest.approx(MOMENTS)}
     EXPECTED |= {
