@@ -27,10 +27,10 @@ class EvaluateOptions:
     """Options of the command; every field is an option."""
 
     source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
-    """Arrays, a trajectory, a folder or ROS bags. Arrays: FILE.npz with errors and covariances,
-    innovations and covariances, or estimates, covariances and truths; FILE.csv with lines of run,
-    step, errors, upper triangle. Trajectory: t tx ty tz qx qy qz qw in s and m; t x y θ; OpenVINS;
-    KITTI. Folder: estimate.txt, covariance.txt and truth.txt, or OpenVINS's state_estimate.txt,
+    """Arrays, a trajectory, a folder or ROS bags. Arrays: FILE.npz (or .mat) with errors and
+    covariances, innovations and covariances, or estimates, covariances and truths; FILE.csv with
+    lines of run, step, errors, upper triangle. Trajectory: any text whose titles name t, x, y, z,
+    qx … qw; TUM; t x y θ; OpenVINS; EuRoC; VINS-Mono; KITTI; g2o; RTKLIB; SQUARE. Folder: estimate.txt, covariance.txt and truth.txt, or OpenVINS's state_estimate.txt,
     state_deviation.txt and state_groundtruth.txt, or one sub-folder of these per run. Runs may
     differ in length."""
     covariance: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -53,8 +53,10 @@ class EvaluateOptions:
     """Whether the covariance is marginal (the default) or given the scale of the world; with given,
     NEES is computed at that scale."""
     align: Annotated[str, tyro.conf.arg(metavar="NAME")] = "none"
-    """How the estimate is aligned with the truth: none, se3 or sim3. The first pose is used where
-    its covariance is zero, otherwise all positions."""
+    """How the estimate is aligned with the truth: none, yaw (position and yaw, which no camera with
+    an IMU knows), se3 or sim3. The first pose is used where its σ is small, otherwise all poses."""
+    time_offset: Annotated[str, tyro.conf.arg(metavar="SECONDS|auto")] = "0"
+    """By how much the estimate's stamps are late; auto finds it by the rotations of both."""
     axes_used: Annotated[str, tyro.conf.arg(metavar="NAMES")] = ""
     """Axes that the filter estimates, such as x,y,rz for a robot in the plane. Default: all axes
     whose errors are not always zero."""
@@ -155,7 +157,18 @@ class EvaluateOptions:
         if self.source is None:
             raise ValueError("no SOURCE given; expected a log, or --suite FOLDER")
         of_log = {name: getattr(self, name) for name in (*_OF_ONE_LOG, "align", "axes_used")}
+        of_log["time_offset"] = _seconds(self.time_offset)
         return evaluate_log(self.source, stated=self._stated(), **of_log)
+
+
+def _seconds(told: str) -> float | str:
+    try:
+        offset = 0.0 if told == "auto" else float(told)
+    except ValueError:
+        offset = np.nan
+    if not np.isfinite(offset):
+        raise ValueError(f"--time-offset must be seconds, or auto, not {told}")
+    return "auto" if told == "auto" else offset
 
 
 def _comparison(title: str, filters: dict[str, Json]) -> list[str]:

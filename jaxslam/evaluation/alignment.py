@@ -27,11 +27,13 @@ from jaxslam.evaluation.convention import (
 )
 from jaxslam.evaluation.inputs import Poses, exactly_known
 
-ALIGNMENTS = ("none", "se3", "sim3")
+ALIGNMENTS = ("none", "yaw", "se3", "sim3")
 MAX_TIME_DIFFERENCE = 0.01
 """The largest time difference of poses that are compared, s; evo's default."""
 _SPLIT = Convention("split", "world")
 """The error in which gauge directions are written."""
+SMALL = 0.5
+"""The largest σ of a first pose, of the median of all, at which runs are aligned."""
 
 
 class Similarity(NamedTuple):
@@ -82,10 +84,23 @@ def associated(
     return np.where(away[1] < away[0], beside[1], beside[0])[close], close
 
 
+def yaw_alone(M: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """The rotation about the vertical that is nearest to M: it makes `tr Rᵀ M` the greatest."""
+    angle = np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1])
+    R = np.eye(len(M))
+    R[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    return R
+
+
 def similarity(
-    estimate: Float[np.ndarray, "k n"], reference: Float[np.ndarray, "k n"], *, scaled: bool
+    estimate: Float[np.ndarray, "k n"],
+    reference: Float[np.ndarray, "k n"],
+    *,
+    scaled: bool,
+    yaw: bool = False,
 ) -> Similarity:
-    """Umeyama's least squares of positions (TPAMI 1991), without the test that the rank is two.
+    """Umeyama's least squares of positions (TPAMI 1991), without the test that the rank is two; or
+    by a rotation about the vertical alone, `yaw`.
 
     On a straight line the rotation about it is arbitrary, but no position depends on it where
     the reference is the line, so the error is nevertheless the smallest one. Raises ValueError
@@ -93,6 +108,9 @@ def similarity(
     """
     mean_estimate, mean_reference = estimate.mean(0), reference.mean(0)
     centred, target = estimate - mean_estimate, reference - mean_reference
+    if yaw:
+        rotation = yaw_alone(target.T @ centred)
+        return Similarity(rotation, mean_reference - rotation @ mean_estimate, 1.0)
     left, singular, right = np.linalg.svd(target.T @ centred)
     if singular[0] <= 1e-12 * np.sum(target**2) or not np.any(target):
         name = "Sim(3)" if scaled else "SE(3)"
@@ -113,7 +131,7 @@ def straight_line(
 
     A fit of positions then does not determine the rotation about it, and would fit that to noise.
     """
-    _, singular, right = np.linalg.svd(positions - positions.mean(0))
+    _, singular, right = np.linalg.svd(positions - positions.mean(0), full_matrices=False)
     # A rotation about a line is fixed by positions so many σ off it, root of the mean squares: of
     # four it has 6 % more σ than to first order, of ten 1 %.
     if len(right) == 2 or singular[1] > 10 * np.linalg.norm(sigma):
@@ -142,20 +160,20 @@ def turned_about(
 
 
 def at_first_pose(
-    estimate: Float[np.ndarray, "d d"], truth: Float[np.ndarray, "d d"]
+    estimate: Float[np.ndarray, "d d"], truth: Float[np.ndarray, "d d"], *, yaw: bool = False
 ) -> Similarity:
-    """The rigid motion that takes one pose to another."""
+    """The rigid motion that takes one pose to another, or its position and `yaw`."""
     n = len(estimate) - 1
     motion = truth @ np.linalg.inv(estimate)
-    return Similarity(motion[:n, :n], motion[:n, n], 1.0)
+    rotation = yaw_alone(motion[:n, :n]) if yaw else motion[:n, :n]
+    return Similarity(rotation, truth[:n, n] - rotation @ estimate[:n, n], 1.0)
 
 
 def projected(
     T_wc: Float[np.ndarray, "k d d"],
     covariances: Float[np.ndarray, "k t t"] | Float[np.ndarray, "kt kt"],
     convention: Convention,
-    *,
-    scaled: bool,
+    align: str,
     line: Float[np.ndarray, " 3"] | None = None,
 ) -> Float[np.ndarray, "k t t"]:
     """The covariances of aligned poses in the gauge of `similarity`, `Σ U_posᵀ e_pos = 0`.
@@ -164,7 +182,7 @@ def projected(
     are then taken as independent of each other's, or the joint one of all. With W = (VᵀU)⁻¹ the
     k-th block of `Q P Qᵀ` is `P_kk − U_k W (VᵀP)_k − (…)ᵀ + U_k W VᵀPV Wᵀ U_kᵀ`.
     """
-    U = gauge_directions(T_wc, scaled=scaled)
+    U = gauge_directions(T_wc, align)
     V = _fitted(U, line)
     P, VP, VPV = _in_split(T_wc, covariances, convention, V)
     UW = U @ np.linalg.pinv(np.einsum("kta,ktb->ab", V, U))
@@ -202,13 +220,13 @@ def _in_split(
     return blocks[range(count), range(count)], VP, np.sum(VP @ V, axis=0)
 
 
-def gauge_directions(
-    T_wc: Float[np.ndarray, "k d d"], *, scaled: bool
-) -> Float[np.ndarray, "k t g"]:
+def gauge_directions(T_wc: Float[np.ndarray, "k d d"], align: str) -> Float[np.ndarray, "k t g"]:
     """The errors (split, world) of the poses by a change of gauge, which no measurement determines.
 
-    They are a translation, a rotation about the origin and, if wanted, the log of a scale.
+    They are a translation, a rotation about the origin (`yaw`: about the vertical) and, of `sim3`,
+    the log of a scale.
     """
+    scaled = align == "sim3"
     n, t = T_wc.shape[-1] - 1, geometry_of(T_wc).tangent_dim
     positions = T_wc[:, :n, n]
     U = np.zeros((len(T_wc), t, t + scaled))
@@ -216,10 +234,11 @@ def gauge_directions(
     U[:, :n, n:t] = lever(positions)
     if scaled:
         U[:, :n, t] = positions
-    return U
+    return U[:, :, [0, 1, 2, 5]] if align == "yaw" and n == 3 else U
 
 
 BY_FIRST = "aligned at the first pose, which the covariances treat as known"
+BY_SMALL = "aligned at the first pose, whose σ is small beside the others'"
 TO_ALL = "aligned with all positions; the joint covariance is projected to that gauge"
 INDEPENDENT = (
     "aligned with all positions; the covariances are projected to that gauge as if the errors of "
@@ -243,25 +262,27 @@ class Aligned(NamedTuple):
 def aligned(
     poses: Poses, convention: Convention, align: str, axes: Axes | Bool[np.ndarray, " t"]
 ) -> Aligned:
-    """The estimates aligned by `none`, `se3` or `sim3`.
+    """The estimates aligned by `none`, `yaw` (and position), `se3` or `sim3`.
 
-    The first pose is known where it has no variance on these `axes` of the covariances. Raises
-    ValueError for what does not go together.
+    Where the first pose is known, with no variance on these `axes` of the covariances, or a small
+    one, it is by the first pose; else to all positions. Raises ValueError for what does not go
+    together.
     """
     given = convention.scale == "given"
     if align == "none":
         return Aligned(poses, given)
     first = poses.covariances[range(len(poses.logged)), np.argmax(poses.logged, axis=1)]
-    if exactly_known(first[:, axes][:, :, axes]).all():
-        by_first = _each_run(poses, convention, _by_first)
-        return Aligned(by_first, given or align == "sim3", (BY_FIRST,))
-    if given and align == "se3":
+    known = exactly_known(first[:, axes][:, :, axes]).all()
+    if known or (not given and align != "sim3" and _small_at_first(poses, convention, align)):
+        by_first = _each_run(poses, convention, partial(_by_first, yaw=align == "yaw"))
+        return Aligned(by_first, given or align == "sim3", (BY_FIRST if known else BY_SMALL,))
+    if given and align != "sim3":
         raise ValueError(
             "covariances given the scale need --align sim3, or se3 if the first covariance is zero"
         )
-    to_all = partial(_to_all, scaled=align == "sim3")
+    to_all = partial(_to_all, align=align)
     notes = (TO_ALL if poses.joint is not None else INDEPENDENT,)
-    if any(_line(run, convention) is not None for run in _runs(poses)):
+    if align != "yaw" and any(_line(run, convention) is not None for run in _runs(poses)):
         notes += (STRAIGHT,)
     return Aligned(_each_run(poses, convention, to_all)._replace(joint=None), False, notes)
 
@@ -291,9 +312,20 @@ def _each_run(
     return Poses(*result, poses.logged, joint)
 
 
-def _by_first(run: Poses, convention: Convention) -> Poses:
+def _small_at_first(poses: Poses, convention: Convention, align: str) -> bool:
+    """Whether σ at the first pose of every run is small, along the gauge's directions."""
+    n, there = poses.estimates.shape[-1] - 1, poses.logged
+    split = converted(poses.covariances, poses.estimates, convention, _SPLIT)
+    sigma = np.sqrt(np.maximum(np.diagonal(split, axis1=2, axis2=3), 0.0))
+    first = sigma[range(len(there)), np.argmax(there, axis=1)].max(axis=0)
+    parts = [slice(0, n), slice(n, None) if align != "yaw" or n == 2 else slice(5, 6)]
+    median = [np.median(sigma[there][:, part].max(axis=1)) for part in parts]
+    return all(first[part].max() <= SMALL * x for part, x in zip(parts, median, strict=True))
+
+
+def _by_first(run: Poses, convention: Convention, *, yaw: bool) -> Poses:
     """Align the first pose to its truth; its position becomes the origin, also of scaling."""
-    moved = _moved(run, convention, at_first_pose(run.estimates[0], run.truths[0]))
+    moved = _moved(run, convention, at_first_pose(run.estimates[0], run.truths[0], yaw=yaw))
     return about(moved, convention, run.truths[0, :-1, -1])
 
 
@@ -303,14 +335,15 @@ def about(run: Poses, convention: Convention, centre: Float[np.ndarray, " n"]) -
     return _moved(run, convention, away)._replace(truths=away.moved(run.truths))
 
 
-def _to_all(run: Poses, convention: Convention, *, scaled: bool) -> Poses:
-    n = run.truths.shape[-1] - 1
-    fit = similarity(run.estimates[:, :n, n], run.truths[:, :n, n], scaled=scaled)
-    line = _line(run, convention)
+def _to_all(run: Poses, convention: Convention, *, align: str) -> Poses:
+    n, yaw = run.truths.shape[-1] - 1, align == "yaw"
+    positions = run.estimates[:, :n, n], run.truths[:, :n, n]
+    fit = similarity(*positions, scaled=align == "sim3", yaw=yaw)
+    line = None if yaw else _line(run, convention)
     if line is not None:
         fit = turned_about(fit, line, run.estimates, run.truths)
     P = run.covariances if run.joint is None else run.joint
-    P = projected(run.estimates, P, convention, scaled=scaled, line=line)
+    P = projected(run.estimates, P, convention, align, line)
     return _moved(run._replace(covariances=P, joint=None), convention, fit)
 
 

@@ -9,7 +9,8 @@ An estimate T̂ = (R̂, p̂) maps body coordinates to the world, T = (R, p) is t
 are the errors. To first order right and split are the same but for the axes; left differs by the
 adjoint of T̂. Every error may then be written along other axes, turned by R̂: `body`, `world` (ROS:
 split, world) or `mixed`, the position along the world's and the rotation about the body's (MSCKF,
-error-state filters: split, mixed; GTSAM: right, body, rotation-first). A covariance is `marginal`,
+error-state filters: split, mixed; GTSAM: right, body, rotation-first). With `rpy` the rotation is
+of roll, pitch and yaw, `R = Rz(yaw) Ry(pitch) Rx(roll)` (robot_localization: split, rpy). A covariance is `marginal`,
 or `given` the scale of the world, of which its filter then knows nothing.
 
 All matrices that change one into another have determinant one: a wrong convention keeps
@@ -35,7 +36,11 @@ from numpy.typing import ArrayLike
 from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup, suggestion
 from jaxslam.geometry import PLANAR, SPATIAL, Geometry, Pose, exp, log
-from jaxslam.io.tum import read_table, width, write_table
+from jaxslam.io.logs import named
+from jaxslam.io.logs.log import MIXED
+from jaxslam.io.logs.unnamed import is_deviations, without_values
+from jaxslam.io.text import read_table
+from jaxslam.io.tum import write_table
 
 Joints = Float[np.ndarray, "runs k k"]
 """Covariances of all poses of a run together."""
@@ -56,7 +61,7 @@ Axes = Int[np.ndarray, " m"]
 Result = TypeVar("Result")
 CHOICES = {
     "error": ("right", "left", "split"),
-    "axes": ("body", "world", "mixed"),
+    "axes": ("body", "world", "mixed", "rpy"),
     "order": ("position-first", "rotation-first"),
     "scale": ("marginal", "given"),
 }
@@ -64,7 +69,10 @@ NATURAL_AXES = {"right": "body", "left": "world", "split": "world"}
 """The default axes of an error; of `split` those of ROS."""
 _OWN_AXES = {"right": ("body", "body"), "left": ("world", "world"), "split": ("world", "body")}
 """The axes along which position and rotation of the errors come out, before they are turned."""
-_PARTS = {"body": ("body", "body"), "world": ("world", "world"), "mixed": ("world", "body")}
+_PARTS = {
+    "body": ("body", "body"), "world": ("world", "world"), "mixed": ("world", "body"),
+    "rpy": ("world", "rpy"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -74,7 +82,7 @@ class Convention:
     error: str = "right"
     """`right`, `left` or `split`."""
     axes: str = ""
-    """`body`, `world` or `mixed`; by default the error's own (`NATURAL_AXES`)."""
+    """`body`, `world`, `mixed` or `rpy`; by default the error's own (`NATURAL_AXES`)."""
     order: str = "position-first"
     """The order of the rows of a covariance: this, or `rotation-first`."""
     scale: str = "marginal"
@@ -106,6 +114,8 @@ def alternatives(convention: Convention, geometry: Geometry) -> tuple[Convention
     ours = convention.error if convention.error != "left" else "right"
     turned = convention.axes if convention.axes != "body" else "world"
     axes = ("body", turned) if geometry is PLANAR else CHOICES["axes"]
+    if ours != "split" and turned != "rpy":
+        axes = tuple(x for x in axes if x != "rpy")
     choices = product((ours, "left"), axes, CHOICES["order"])
     return tuple(Convention(*choice, convention.scale) for choice in choices)
 
@@ -173,7 +183,10 @@ def turning(convention: Convention, estimates: Matrices) -> Squares:
     N = np.zeros((*R.shape[:-2], t, t))
     position, rotation = zip(_OWN_AXES[convention.error], _PARTS[convention.axes], strict=True)
     N[..., :n, :n] = _turned(R, *position)
-    N[..., n:, n:] = _turned(_rotation_matrix(R), *rotation)
+    if rotation[1] == "rpy" and n == 3:
+        N[..., n:, n:] = _by_angles(R) @ _turned(R, rotation[0], "world")
+    else:
+        N[..., n:, n:] = _turned(_rotation_matrix(R), *rotation)
     return N if convention.order == "position-first" else np.roll(N, t - n, axis=-2)
 
 
@@ -181,6 +194,18 @@ def _turned(R: np.ndarray, old: str, new: str) -> np.ndarray:
     if old == new:
         return np.broadcast_to(np.eye(R.shape[-1]), R.shape)
     return R if new == "world" else np.swapaxes(R, -1, -2)
+
+
+def _by_angles(R: np.ndarray) -> np.ndarray:
+    """The derivative of roll, pitch and yaw by a rotation along the axes of the world.
+
+    The inverse of the axes of those turns, `Rz Ry e_x`, `Rz e_y` and `e_z`.
+    """
+    yaw, flat = np.arctan2(R[..., 1, 0], R[..., 0, 0]), np.hypot(R[..., 0, 0], R[..., 1, 0])
+    c, s, zero = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)
+    flat, sine = np.maximum(flat, 1e-9), -R[..., 2, 0]
+    rows = (c / flat, s / flat, zero), (-s, c, zero), (c * sine / flat, s * sine / flat, zero + 1)
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _rotation_matrix(R: np.ndarray) -> np.ndarray:
@@ -250,14 +275,12 @@ def _truth_derivatives(
     return jax.vmap(one)(estimates, truths, firsts)
 
 
-ANGLES = {"rad": 1.0, "deg": np.pi / 180}
-"""Units of angles, in radians."""
+ANGLES = {"rad": 1.0, "deg": np.pi / 180, "half": 2.0}
+"""Units of angles, in radians: `half` is the vector part of a quaternion, as in g2o."""
 _WORDS = (*CHOICES, "angle", "length")
+ROUNDED = 1e-6
+"""The least eigenvalue, of the greatest number, of a covariance that was rounded."""
 _ROWS, _COLUMNS = np.triu_indices(6)
-MIXED = {"error": "split", "axes": "mixed"}
-"""The convention of OpenVINS: the position in the world's axes, the rotation in the body's."""
-_DEVIATIONS, _OF_CAMERA = 18, 14
-"""Numbers of a line of OpenVINS's deviations, and more for each camera."""
 
 
 class CovarianceText(NamedTuple):
@@ -267,6 +290,7 @@ class CovarianceText(NamedTuple):
     covariances: Float[np.ndarray, "n t t"]
     said: dict[str, str]
     """The words of its header that are of a `Convention`."""
+    notes: tuple[str, ...] = ()
 
     @property
     def convention(self) -> Convention:
@@ -303,35 +327,66 @@ def read_covariances(path: str | Path, t: int = 6) -> CovarianceText:
     `ValueError`, naming the file, for a line of other numbers, or that are not finite, and for a
     word of the header that is not known.
     """
-    rows_of, columns_of = np.triu_indices(t)
-    triangle, columns = len(rows_of), width(Path(path))
+    triangle = t * (t + 1) // 2
     kinds = {
         1 + triangle: f"{1 + triangle} finite numbers, the time and the upper triangle row by row",
         1 + t * t: f"{1 + t * t} finite numbers, the time and the covariance row by row",
         1 + t: f"{1 + t} finite numbers, the time and a σ for each axis",
     }
-    deviations = t == 6 and columns >= _DEVIATIONS and (columns - _DEVIATIONS) % _OF_CAMERA == 0
+    table = read_table(path, "covariances", "covariances", kinds[1 + triangle])
+    count, of_names, rows = table.rows.shape[1], named.read(table), table.rows
+    if of_names is not None and len(of_names.covariances):
+        return CovarianceText(of_names.times, of_names.covariances, dict(of_names.said))
+    deviations = t == 6 and is_deviations(rows)
+    expected = kinds.get(count, kinds[1 + triangle])
     if deviations:
-        kinds[columns] = f"{columns} finite numbers, OpenVINS's time and deviations"
-    columns = columns if columns in kinds else 1 + triangle
-    comments, rows, _ = read_table(path, "covariances", "covariances", kinds[columns], columns)
+        expected = f"{count} finite numbers, OpenVINS's time and deviations"
+    there = ~without_values(rows)
+    wrong = np.flatnonzero(~np.isfinite(rows[:, 0]) | there & ~np.isfinite(rows).all(axis=1))
+    if wrong.size or not (deviations or count in kinds):
+        raise ValueError(f"{table.place(wrong[0] if wrong.size else 0)}: expected {expected}")
     try:
-        said = {**(MIXED if deviations else {}), **_said(" ".join(comments))}
+        said = {**(MIXED if deviations else {}), **_said(" ".join(table.comments))}
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    P = np.zeros((len(rows), t, t))
-    if deviations:
-        P[:, range(6), range(6)] = _squared(path, rows[:, [4, 5, 6, 1, 2, 3]])
-    elif columns == 1 + t:
-        P[:, range(t), range(t)] = _squared(path, rows[:, 1:])
-    elif columns == 1 + t * t:
-        P = rows[:, 1:].reshape(-1, t, t)
+    P, notes = np.full((len(rows), t, t), np.nan), ()
+    if deviations or count == 1 + t:
+        sigma = rows[there][:, [4, 5, 6, 1, 2, 3] if deviations else range(1, 1 + t)]
+        P[there] = _squared(path, sigma)[:, :, None] * np.eye(t)
+    elif count == 1 + t * t:
+        P[there] = rows[there, 1:].reshape(-1, t, t)
     else:
-        P[:, rows_of, columns_of] = P[:, columns_of, rows_of] = rows[:, 1:]
+        P[there], notes = _of_triangle(path, rows[there, 1:], t)
     unit, said = ANGLES[said.pop("angle", "rad")], {k: v for k, v in said.items() if k in CHOICES}
     names = Convention(**said).names(SPATIAL if t == 6 else PLANAR)
     scale = np.array([unit if name.startswith("r") else 1.0 for name in names])
-    return CovarianceText(rows[:, 0], scale[:, None] * P * scale, said)
+    return CovarianceText(rows[:, 0], scale[:, None] * P * scale, said, notes)
+
+
+def _of_triangle(
+    path: str | Path, values: Float[np.ndarray, "n k"], t: int
+) -> tuple[Float[np.ndarray, "n t t"], tuple[str, ...]]:
+    """Covariances of upper triangles row by row; or column by column, where only so they are any.
+
+    Column by column is also a lower triangle row by row.
+    """
+    rows, columns = np.triu_indices(t)
+    by_row, by_column = np.zeros((2, len(values), t, t))
+    by_row[:, rows, columns] = by_row[:, columns, rows] = values
+    rows, columns = np.tril_indices(t)
+    by_column[:, rows, columns] = by_column[:, columns, rows] = values
+
+    def least(P):
+        return np.linalg.eigvalsh(P)[:, 0] / np.maximum(np.abs(P).max(axis=(1, 2)), 1e-300)
+
+    finite = np.abs(values).max(initial=0.0) <= LARGEST
+    if not finite or not (least(by_row) < -ROUNDED).any() or (least(by_column) < 0).any():
+        return by_row, ()
+    note = (
+        f"{path}: its numbers make no covariance as an upper triangle row by row, but do column by "
+        "column; taken as that"
+    )
+    return by_column, (note,)
 
 
 def _squared(path: str | Path, sigma: Float[np.ndarray, "n t"]) -> Float[np.ndarray, "n t"]:

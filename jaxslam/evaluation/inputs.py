@@ -8,13 +8,16 @@ from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
+from scipy.special import chdtr, chdtrc, chdtri, gammaincinv
 
-from jaxslam._runtime.files import LARGEST, read_arrays
+from jaxslam._runtime.files import LARGEST, one_line, read_arrays
 from jaxslam._runtime.lookup import suggestion
 from jaxslam.evaluation.convention import CHOICES, Joints, Values, geometry_of
-from jaxslam.io.tum import check_seconds, not_rigid, of_xytheta, poses, read_table, words
+from jaxslam.io.logs.log import check_seconds
+from jaxslam.io.text import read_table
+from jaxslam.io.tum import not_rigid, of_xytheta, poses
 from jaxslam.statistics.bands import Mask, PerAxis, PerStep
 
 _KEYS = (
@@ -23,8 +26,11 @@ _KEYS = (
 )  # fmt: skip
 
 
-ASYMMETRY = 1e-5
-"""The largest asymmetry of a covariance, in σ of its axes: rounding to six digits makes less."""
+ASYMMETRY = 0.1
+"""The largest asymmetry of a covariance, in σ of its axes: a filter in float32 makes less. What is
+evaluated is its symmetric part."""
+UNKNOWN = 1e12
+"""A variance of what is not known, m² or rad²."""
 ROUNDING = 1e-8
 """Nine decimals of two files: their poses can differ by 4e-9 (map units, rad), and be the same."""
 
@@ -87,7 +93,7 @@ class Paired(NamedTuple):
 def paired(errors: ArrayLike, covariances: ArrayLike) -> Paired:
     """Return errors and covariances, and a mask of the steps that have them.
 
-    A step whose error and covariance are both all NaN was not logged. Raises ValueError, naming
+    A step whose error or covariance is all NaN was not logged. Raises ValueError, naming
     run and step, for any other number that is not finite, and for a run without a step.
     """
     e = numbers("errors", errors, 3, "(runs, steps, n), with one run errors[None]")
@@ -95,11 +101,52 @@ def paired(errors: ArrayLike, covariances: ArrayLike) -> Paired:
     if P.shape != (*e.shape, e.shape[-1]):
         wanted = (*e.shape, e.shape[-1])
         raise ValueError(f"errors are {e.shape}, so covariances must be {wanted}, not {P.shape}")
-    logged = ~(all_nan(e) & all_nan(P))
+    logged = ~(all_nan(e) | all_nan(P))
     check_finite("errors", e, logged)
     check_finite("covariances", P, logged)
     check_every_run(logged)
     return Paired(filled(e, logged, 0.0), filled(P, logged, np.eye(e.shape[-1])), logged)
+
+
+def padded(
+    errors: ArrayLike, covariances: ArrayLike
+) -> tuple[Float[np.ndarray, ...], Float[np.ndarray, ...], Int[np.ndarray, "runs steps"]]:
+    """Innovations and their covariances without the NaN of what was not measured, and the numbers
+    of those that were: of one that is NaN the innovation is 0, of variance 1, and independent."""
+    e, P = np.array(errors, np.float64), np.array(covariances, np.float64)
+    if e.ndim != 3 or P.shape != (*e.shape, e.shape[-1]):
+        return e, P, np.zeros(e.shape[:2], int)
+    there = ~(np.isnan(e) & np.isnan(np.diagonal(P, axis1=-2, axis2=-1)))
+    some = there.any(axis=-1, keepdims=True)
+    without = ~there & some
+    e[without] = 0.0
+    P[without] = 0.0
+    np.swapaxes(P, -1, -2)[without] = 0.0
+    P[..., range(e.shape[-1]), range(e.shape[-1])] += without
+    return e, P, there.sum(axis=-1)
+
+
+def of_one_dof(
+    values: PerStep, dof: Float[np.ndarray, "runs steps"]
+) -> tuple[PerStep, int, tuple[str, ...]]:
+    """NIS of many degrees of freedom as those of one, the median, of the same probability.
+
+    Where they are so improbable that it cannot be told, they grow in proportion.
+    """
+    there = ~np.isnan(values) & (dof > 0)
+    if np.ptp(dof[there]) == 0:
+        return np.where(there, values, np.nan), int(dof[there][0]), ()
+    one = int(np.median(dof[there]))
+    result = np.full_like(values, np.nan)
+    above, below = chdtrc(dof[there], values[there]), chdtr(dof[there], values[there])
+    alike = np.where(above < 0.5, chdtri(one, above), 2 * gammaincinv(one / 2, below))
+    in_proportion = values[there] * one / dof[there]
+    result[there] = np.where(above > 1e-300, alike, in_proportion)
+    note = (
+        f"degrees of freedom are {dof[there].min():g} to {dof[there].max():g}: each value is that "
+        f"of {one} with the same probability"
+    )
+    return result, one, (note,)
 
 
 def step_times(times: ArrayLike | None, steps: int) -> Float[np.ndarray, " steps"]:
@@ -155,13 +202,17 @@ def without_known(
             f"{np.abs(errors[run, step]).max():.3g}; it must be positive definite, and "
             "poses in another frame or unit than the truth's need an alignment (--align se3, sim3)"
         )
-    before = np.logical_and.accumulate(known | ~logged, axis=1)
+    # In part: what such a pose knows exactly has no degree of freedom.
+    variance = np.diagonal(covariances, axis1=-2, axis2=-1)
+    in_part = (variance == 0) & (np.abs(errors) <= ROUNDING)
+    in_part = in_part.any(axis=-1) & (in_part == (variance == 0)).all(axis=-1)
+    before = np.logical_and.accumulate(known | in_part | ~logged, axis=1)
     if before.all(axis=1).any():
         run = int(np.argmax(before.all(axis=1)))
         raise ValueError(f"all covariances of run {run} are zero; they must be positive definite")
     left = logged & ~before
     start = int(np.argmax(left.any(axis=0)))
-    return EvaluatedSteps(start, left, _left_out(known & before, start))
+    return EvaluatedSteps(start, left, _left_out(logged & before, start))
 
 
 def _left_out(known: Mask, start: int) -> tuple[str, ...]:
@@ -205,6 +256,7 @@ def normalised(errors: PerAxis, covariances: Float[np.ndarray, "runs steps n n"]
     if (skewed > ASYMMETRY).any():
         place = np.argwhere(skewed > ASYMMETRY)[0]
         _refuse(place, f"is not symmetric (by {skewed[tuple(place)]:.2g} in σ)")
+    correlation = (correlation + np.swapaxes(correlation, -1, -2)) / 2
     with np.errstate(over="ignore", invalid="ignore"):  # infinite: of a run that diverged
         whitened = np.linalg.solve(_factors(correlation), (errors / sigma)[..., None])[..., 0]
         nees = np.sum(whitened**2, axis=-1)
@@ -269,10 +321,11 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
             f"{joint}, not {P.shape}"
         )
     joints = P if P.shape == joint else None
+    P = P if joints is not None else without_unknown(P)
     if joints is not None:
         blocks = joints.reshape(runs, steps, t, steps, t)
         P = np.moveaxis(blocks[:, range(steps), :, range(steps)], 0, 1)
-    logged = ~(all_nan(T[..., :-1, :]) & all_nan(P) | all_nan(truth[..., :-1, :]))
+    logged = ~(all_nan(T[..., :-1, :]) | all_nan(P) | all_nan(truth[..., :-1, :]))
     check_every_run(logged)
     if joints is not None:
         joints = _joint(joints, np.repeat(logged, t, axis=1))
@@ -284,6 +337,21 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
     _check_rigid("estimates", T)
     _check_rigid("truths", truth)
     return Poses(T, filled(P, logged, np.eye(t)), truth, logged, joints)
+
+
+def without_unknown(P: Float[np.ndarray, "runs steps t t"]) -> Float[np.ndarray, "runs steps t t"]:
+    """The covariances, with a variance of `UNKNOWN`, and none with others, on the axes where that
+    of every pose is −1 or larger: what programs write of what they do not estimate."""
+    variance = np.diagonal(P, axis1=2, axis2=3)
+    there = ~np.isnan(variance)
+    unknown = (((variance == -1) | (variance >= UNKNOWN)) | ~there).all(axis=(0, 1))
+    if not unknown.any() or not there.any():
+        return P
+    P, axes = P.copy(), np.flatnonzero(unknown)
+    P[..., axes, :] = np.where(np.isnan(P[..., axes, :]), np.nan, 0.0)
+    P[..., :, axes] = np.where(np.isnan(P[..., :, axes]), np.nan, 0.0)
+    P[..., axes, axes] = np.where(np.isnan(P[..., axes, axes]), np.nan, UNKNOWN)
+    return P
 
 
 def _joint(P: Joints, logged: Bool[np.ndarray, "runs k"]) -> Joints:
@@ -320,9 +388,12 @@ def _check_rigid(what: str, T: np.ndarray) -> None:
         raise ValueError(f"{what} of {place} is not a rigid motion [R t; 0 1] with a rotation R")
 
 
-def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a file; nothing in it is run."""
-    arrays = read_arrays(path)
+ARRAYS = (".npz", ".mat")
+
+
+def read_arrays_of(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an npz file, or a mat file of MATLAB up to version 7; nothing in it is run."""
+    arrays = _read_mat(path) if path.suffix == ".mat" else read_arrays(path)
     for name in arrays:
         if name not in _KEYS:
             meant = suggestion(name, _KEYS)
@@ -330,8 +401,25 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
     return arrays
 
 
+def _read_mat(path: Path) -> dict[str, np.ndarray]:
+    from scipy.io import loadmat  # slow to import
+
+    try:
+        found = loadmat(path)
+    except NotImplementedError:
+        raise ValueError(f"{path}: is of MATLAB 7.3; save it with -v7") from None
+    except Exception as error:  # of many kinds, as the library trusts its bytes
+        raise ValueError(
+            f"{path}: cannot be read ({one_line(error)}); expected a mat file"
+        ) from None
+    arrays = {name: value for name, value in found.items() if not name.startswith("__")}
+    if "dof" in arrays and arrays["dof"].size == 1:
+        arrays["dof"] = arrays["dof"].ravel()
+    return {name: value.ravel() if name == "times" else value for name, value in arrays.items()}
+
+
 _COLUMNS = "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"
-_STEP_FIRST = ("step", "steps", "time", "t", "k", "frame", "timestamp")
+STEP_FIRST = ("step", "steps", "time", "t", "k", "frame", "timestamp")
 """First words of a table without a column of runs."""
 _SIGMA = re.compile(r"(σ|sigma|std|sd)", re.IGNORECASE)
 
@@ -354,16 +442,16 @@ def read_csv(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...], tuple[
     runs and steps in the file.
     """
     row = "numbers run, step, n errors and the n (n + 1)/2 of the upper triangle row by row"
-    comments, rows, lines = read_table(path, "log", "errors", row, None)
-    titles = words(comments[0]) if comments else []
-    named = len(titles) == rows.shape[1] and not comments[0].lstrip().startswith("#")
-    titles = titles if named else []
+    table = read_table(path, "log", "errors", row)
+    titles, rows, lines = [*table.titles], table.rows, table.lines
     found = _columns(titles, rows)
     if found is None:
+        told = f" ({', '.join(titles)})" if titles else ""
         raise ValueError(
-            f"{path}: {rows.shape[1]} columns; expected {row}: {_COLUMNS} columns; or all n² "
-            "numbers, n σ named sigma…, or nees and dof by these names"
+            f"{path}: {rows.shape[1]} columns{told}; expected {row}: {_COLUMNS} columns; or all n² "
+            "numbers, n σ named sigma…, or nees and dof by these names. A trajectory needs --truth"
         )
+    table.numbers(row, range(found.before))
     before, n, kind = found
     told = rows[:, :2] if before == 2 else np.column_stack([np.zeros(len(rows)), rows[:, 0]])
     places, runs, steps = _rectangle(path, told, lines)
@@ -374,14 +462,11 @@ def read_csv(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...], tuple[
         return result
 
     if kind in ("nees", "nis"):
-        dof = np.unique(rows[:, before + 1])
-        if len(dof) > 1 or dof[0] != round(dof[0]):
-            raise ValueError(f"{path}: dof must be the same whole number on every line, not {dof}")
-        arrays = {kind: placed(rows[:, before]), "dof": dof[:1].astype(int)}
+        arrays = {kind: placed(rows[:, before]), "dof": placed(rows[:, before + 1])}
     else:
         P = _matrices_of(rows[:, before + n :], n, kind)
         arrays = {"errors": placed(rows[:, before : before + n]), "covariances": placed(P)}
-        if named:
+        if titles:
             arrays["names"] = np.array(titles[before : before + n])
     return arrays, tuple(f"run {x:g}" for x in runs), tuple(f"step {x:g}" for x in steps)
 
@@ -408,7 +493,7 @@ def read_pose_log(
 
 def _columns(titles: list[str], rows: Float[np.ndarray, "k c"]) -> _Columns | None:
     low = [title.lower() for title in titles]
-    before = 1 if low and low[0] in _STEP_FIRST and "run" not in low[1:2] else 2
+    before = 1 if low and low[0] in STEP_FIRST and "run" not in low[1:2] else 2
     left = rows.shape[1] - before
     if low[before:] in (["nees", "dof"], ["nis", "dof"]):
         return _Columns(before, 0, low[before])

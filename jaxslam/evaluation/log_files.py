@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, TypeAlias, TypedDict
+from typing import TypedDict
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
-from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, associated
-from jaxslam.evaluation.convention import (
-    CHOICES,
-    MIXED,
-    Convention,
-    CovarianceText,
-    geometry_of,
-    read_covariances,
-)
-from jaxslam.evaluation.inputs import exactly_known, of_sigmas, read_csv, read_npz
+from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE
+from jaxslam.evaluation.convention import CHOICES, Convention
+from jaxslam.evaluation.inputs import ARRAYS, STEP_FIRST, of_sigmas, read_arrays_of, read_csv
+from jaxslam.evaluation.pairing import Place, RunFiles, RunLog, read_run
 from jaxslam.evaluation.poses import evaluate_poses
 from jaxslam.evaluation.result import Evaluation, advice, evaluate, evaluate_nees
+from jaxslam.evaluation.tracked_frames import left_out
 from jaxslam.io import ros
-from jaxslam.io.tum import WITH_COVARIANCE, check_seconds, width
+from jaxslam.io.logs import read_log
+from jaxslam.io.text import read_table
 
 _CONTENTS = (
     "errors and covariances, innovations and covariances, or estimates, covariances and truths "
@@ -53,20 +49,22 @@ def evaluate_log(
     nis: bool = False,
     truth_sigma: Sequence[float] | None = None,
     innovations: str | Path | None = None,
+    time_offset: float | str = 0.0,
 ) -> Evaluation:
     """The verdict on what a file or a folder holds.
 
-    `source` is an npz file of arrays, a CSV file of `run, step, errors, upper triangle` lines, a
-    trajectory in TUM format with its `covariance` and `truth`, or a folder. A folder has a run of
-    `estimate.txt`, `covariance.txt` and `truth.txt`, or one per sub-folder, or ROS bags. The topics
-    of a bag are named by `estimate` and `truth` where several fit. Where the tracker's
+    `source` is a file of arrays (npz, mat), a table of `run, step, errors, upper triangle` lines, a
+    trajectory of any format that `jaxslam.io.logs` knows, with its `covariance`, unless it has one
+    itself, and `truth`, or a folder. A folder has a run of `estimate.txt`, `covariance.txt` and
+    `truth.txt`, or one per sub-folder, or trajectories with their covariances beside one truth, or
+    ROS bags. The topics of a bag are named by `estimate` and `truth` where several fit. The stamps
+    of the estimate are late by the `time_offset`, s, or by what its rotations say (`auto`). Where the tracker's
     `frames.csv` is beside a trajectory, its longest map is evaluated, without frames that are lost
     or whose unit was not fixed yet. What is `stated` of the convention (`error`, `axes`, `order`,
     `scale`) comes before what the files say. For the alignment of poses, the axes used and the
     σ of the truth see `evaluate_poses`. With `nis` errors are innovations. The
     `innovations` of the same filter, in an npz or CSV file, say what to turn (`advice`), and so do
-    those alone. Text files may be of other programs (`jaxslam.io.tum.read_log`,
-    `read_covariances`). Raises ValueError, naming the file.
+    those alone. Raises ValueError, naming the file.
     """
     if innovations is not None:
         if nis:
@@ -74,7 +72,7 @@ def evaluate_log(
         beside = evaluate_log(innovations, nis=True)
         own = evaluate_log(
             source, covariance=covariance, truth=truth, estimate=estimate, stated=stated,
-            align=align, axes_used=axes_used, truth_sigma=truth_sigma,
+            align=align, axes_used=axes_used, truth_sigma=truth_sigma, time_offset=time_offset,
         )  # fmt: skip
         told = f"{beside.headline.partition(':')[0]} (of innovations); {advice(beside, own)}"
         return replace(own, notes=(*own.notes, told))
@@ -83,12 +81,13 @@ def evaluate_log(
     how: PoseOptions = {"align": align, "axes_used": axes_used, "truth_sigma": truth_sigma}
     if not source.exists():
         raise ValueError(f"{source}: no such file or folder")
-    if source.suffix in (".npz", ".csv"):
-        for name, value in (("covariance", covariance), ("truth", truth), ("estimate", estimate)):
+    beside = {"covariance": covariance, "truth": truth, "estimate": estimate}
+    binary = source.suffix in ARRAYS
+    if binary or (source.is_file() and _is_table(source, beside)):
+        for name, value in beside.items():
             if value is not None:
                 raise ValueError(f"{source}: --{name} goes with a trajectory, not with arrays")
-        is_npz = source.suffix == ".npz"
-        arrays, runs, steps = (read_npz(source), (), ()) if is_npz else read_csv(source)
+        arrays, runs, steps = (read_arrays_of(source), (), ()) if binary else read_csv(source)
         found = named(source, lambda: _evaluate_arrays(arrays, stated, how, nis), runs, steps)
         told = (advice(found),) if found.quantity == "NIS" and found.names else ()
         return replace(found, run_names=runs, notes=(*found.notes, *told))
@@ -96,7 +95,18 @@ def evaluate_log(
         raise ValueError(
             f"{source}: innovations must be in an npz or CSV file, not in a trajectory"
         )
-    return evaluate_runs(source, runs_of(source, covariance, truth, estimate), stated, how)
+    runs = runs_of(source, covariance, truth, estimate)
+    return evaluate_runs(source, runs, stated, how, time_offset)
+
+
+def _is_table(source: Path, beside: Mapping[str, object]) -> bool:
+    """Whether a file is a table of errors: one without a truth beside it, or with such titles."""
+    if ros.is_bag(source) or any(value is not None for value in beside.values()):
+        return False
+    if source.suffix == ".csv":
+        return True
+    table = read_table(source, "log", "errors", "numbers")
+    return bool(table.titles) and table.titles[0].lower() in ("run", *STEP_FIRST[:2])
 
 
 def _evaluate_arrays(
@@ -114,7 +124,7 @@ def _evaluate_arrays(
     if held[0] in _ALONE:
         _refuse_options(stated, how)
         quantity = "NIS" if nis else held[0].upper()
-        return evaluate_nees(arrays[held[0]], _whole(arrays["dof"]), times=times, quantity=quantity)
+        return evaluate_nees(arrays[held[0]], arrays["dof"], times=times, quantity=quantity)
     P = arrays["covariances"]
     if held == ["estimates"]:
         said = {name: str(arrays[name]) for name in CHOICES if name in arrays}
@@ -127,12 +137,6 @@ def _evaluate_arrays(
     return evaluate(arrays[held[0]], P, times=times, names=names, quantity=quantity)
 
 
-def _whole(number: np.ndarray) -> int:
-    """The whole number that an array holds, or 0."""
-    told = number.ravel()[0] if number.size == 1 and number.dtype.kind in "iuf" else 0.5
-    return int(told) if np.isfinite(told) and told % 1 == 0 else 0
-
-
 def _refuse_options(stated: dict[str, str], how: PoseOptions) -> None:
     if stated or how["align"] != "none" or how["axes_used"] or how["truth_sigma"] is not None:
         raise ValueError(
@@ -143,52 +147,9 @@ def _refuse_options(stated: dict[str, str], how: PoseOptions) -> None:
 
 ESTIMATES = ("estimate.txt", "trajectory.txt", "state_estimate.txt")
 COVARIANCES = ("covariance.txt", "state_deviation.txt")
-TRUTHS = ("truth.txt", "groundtruth.txt", "state_groundtruth.txt")
-LEAST_SHARE = 0.5
-"""The share of the comparable poses, and of the estimate's time, that must be compared."""
-_WITHIN = f"within {MAX_TIME_DIFFERENCE} s"
-ROS = {"error": "split", "axes": "world"}  # as PoseWithCovariance is documented
-Place: TypeAlias = Path | ros.Topic
-
-
-class RunFiles(NamedTuple):
-    """The name of one trajectory, and the paths of its files, or topics of bags."""
-
-    name: str
-    estimate: Place
-    covariance: Place
-    truth: Place
-
-
-_File: TypeAlias = tuple[Place, np.ndarray]
-"""A path or topic, and the times in it."""
-
-
-class _AtTimes(NamedTuple):
-    """The content of a file at the times of the estimate; NaN where it holds nothing."""
-
-    times: Float[np.ndarray, " m"]
-    """The file's own times."""
-    values: Float[np.ndarray, "n d d"]
-    used: int
-    """The number of its own times that are times of the estimate."""
-
-    @property
-    def there(self) -> Bool[np.ndarray, " n"]:
-        return ~np.isnan(self.values[:, 0, 0])
-
-
-class _RunLog(NamedTuple):
-    """A run, pose by pose of its estimate."""
-
-    run: RunFiles
-    times: Float[np.ndarray, " n"]
-    estimates: Float[np.ndarray, "n d d"]
-    covariances: _AtTimes
-    truths: _AtTimes
-    said: dict[str, str]
-    evaluated: EvaluatedPoses
-    """The poses that have a part in the verdict, by the tracker's own record of its frames."""
+TRUTHS = ("truth.txt", "groundtruth.txt", "state_groundtruth.txt", "reference.txt", "ref.txt")
+TEXTS = (".txt", ".csv", ".tum", ".pos", ".smfeval", ".dat", ".g2o")
+"""Endings of a file of these names; what it is says its content."""
 
 
 def runs_of(
@@ -196,8 +157,8 @@ def runs_of(
 ) -> tuple[RunFiles, ...]:
     """The files of every run. Raises ValueError where one is not there, or two could be meant."""
     bags = [source] if ros.is_bag(source) else sorted(filter(ros.is_bag, source.glob("*")))
-    texts = (*source.glob("*.txt"), *source.glob("*/*.txt"))
-    if bags and not any(path.name in ESTIMATES for path in texts):
+    folders = sorted(x for x in source.glob("*/") if x.name[0] != ".")
+    if bags and not any(_only(folder, ESTIMATES) for folder in (source, *folders)):
         if covariance is not None:
             raise ValueError(f"{source}: a bag has its own covariances; leave out --covariance")
         own, true = estimate or "", str(truth or "")
@@ -214,7 +175,6 @@ def runs_of(
                     "arrays need a .npz or .csv file"
                 )
         return (RunFiles(source.stem, source, Path(str(covariance)), _truth_of(str(truth))),)
-    folders = sorted(x for x in source.iterdir() if x.is_dir() and x.name[0] != ".")
     if _only(source, ESTIMATES) is not None:
         if runs := [folder.name for folder in folders if _only(folder, ESTIMATES) is not None]:
             raise ValueError(
@@ -225,13 +185,25 @@ def runs_of(
     if covariance is not None:
         raise ValueError(f"{source}: each of several runs needs its own covariance.txt")
     if not folders:
-        raise ValueError(f"{source} has neither {ESTIMATES[0]} nor sub-folders, one per run")
+        return _beside_one_truth(source, truth)
     return tuple(_run(folder, None, truth) for folder in folders)
 
 
 def _own_covariances(estimate: Path) -> Path | None:
     """The file itself, where its lines have the covariances of their poses too."""
-    return estimate if width(estimate) == WITH_COVARIANCE else None
+    return estimate if len(read_log(estimate).covariances) else None
+
+
+def _beside_one_truth(source: Path, truth: str | Path | None) -> tuple[RunFiles, ...]:
+    """Every other trajectory of a folder as a run, with its covariances, against one truth."""
+    true = _only(source, TRUTHS) if truth is None else Path(truth)
+    files = sorted(x for x in source.glob("*") if x.suffix in TEXTS and x.is_file() and x != true)
+    if true is None or not files:
+        raise ValueError(
+            f"{source} has neither {ESTIMATES[0]} nor sub-folders, one per run, nor trajectories "
+            f"beside one {TRUTHS[0]}"
+        )
+    return tuple(RunFiles(path.stem, path, path, _truth_of(str(true))) for path in files)
 
 
 def _truth_of(given: str, bag: Path | None = None, estimate: str = "") -> Place:
@@ -258,21 +230,28 @@ def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) 
 
 
 def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
-    """The one file of these names. Raises ValueError where there are two, maybe of two runs."""
-    there = [folder / name for name in names if (folder / name).is_file()]
+    """The one file of these names, of any ending of a text. Raises ValueError where there are two,
+    maybe of two runs."""
+    stems = {Path(name).stem for name in names}
+    files = sorted(x for x in folder.glob("*") if x.stem in stems and x.suffix in TEXTS)
+    there = [path for path in files if path.is_file()]
     if len(there) > 1:
         raise ValueError(f"{folder} has both {' and '.join(path.name for path in there)}; keep one")
     return there[0] if there else None
 
 
 def evaluate_runs(
-    source: Path, runs: tuple[RunFiles, ...], stated: dict[str, str], how: PoseOptions
+    source: Path,
+    runs: tuple[RunFiles, ...],
+    stated: dict[str, str],
+    how: PoseOptions,
+    time_offset: float | str = 0.0,
 ) -> Evaluation:
     """The verdict on the runs of a source, in the convention that is stated, or said in the files.
 
-    `how` are the options of `evaluate_poses`.
+    `how` are the options of `evaluate_poses`; for the `time_offset` see `evaluate_log`.
     """
-    read = [_read(run) for run in runs]
+    read = [read_run(run, time_offset) for run in runs]
     convention = _convention_of(read, stated)
     for one in read:
         if one.evaluated.map and convention.scale == "given" and how["align"] != "sim3":
@@ -283,13 +262,17 @@ def evaluate_runs(
     if len({one.estimates.shape[1:] for one in read}) > 1:
         raise ValueError(f"{source}: planar and spatial runs cannot be mixed")
     names = tuple(run.name for run in runs)
-    truths = [np.where(x.evaluated.poses[:, None, None], x.truths.values, np.nan) for x in read]
+    truths = [np.where(x.evaluated.poses[:, None, None], x.truths, np.nan) for x in read]
     longest = max(read, key=lambda one: len(one.times))
+    told: tuple[str, ...] = ()
+    if not all(one.oriented for one in read) and not how["axes_used"]:
+        how = {**how, "axes_used": ("x", "y", "z")}
+        told = ("without orientations: positions alone are compared (--axes-used x,y,z)",)
     found = named(
         runs[0].estimate if len(runs) == 1 else source,
         lambda: evaluate_poses(
             _filled_up([one.estimates for one in read]),
-            _filled_up([one.covariances.values for one in read]),
+            _filled_up([one.covariances for one in read]),
             _filled_up(truths),
             convention,
             times=longest.times,
@@ -297,16 +280,30 @@ def evaluate_runs(
         ),
         names,
     )
-    told = (
-        *_left_out(read), *left_out([one.evaluated for one in read]),
-        *_other_times(read, longest), *_other_body(runs[0]),
+    told += (
+        *left_out([one.evaluated for one in read]), *_remarks(read), *_other_times(read, longest),
     )  # fmt: skip
     if not read[0].said and not stated:
         told += (f"the file does not state its convention; assumed: {convention}",)
     return replace(found, notes=(*found.notes, *told), run_names=names)
 
 
-def _convention_of(read: list[_RunLog], stated: dict[str, str]) -> Convention:
+def _remarks(read: list[RunLog]) -> Iterator[str]:
+    """The remarks of all runs, with their counts added where they differ in those alone."""
+    logged = sum(len(one.times) for one in read)
+    counts: Counter[str] = Counter()
+    for one in read:
+        counts.update(one.left_out)
+    for what, count in counts.items():
+        yield what.format(count=count, logged=logged)
+    said = dict.fromkeys(note for one in read for note in one.notes)
+    yield from said if len(said) <= 3 else [*list(said)[:2], f"and {len(said) - 2} more such"]
+    shortest, longest = (f(len(one.times) for one in read) for f in (min, max))
+    if shortest < longest:
+        yield f"runs have {shortest} to {longest} poses"
+
+
+def _convention_of(read: list[RunLog], stated: dict[str, str]) -> Convention:
     """The convention of all runs. Raises ValueError where their files say different ones."""
     for one in read:
         if one.said != read[0].said:
@@ -349,27 +346,10 @@ def named(
         raise ValueError(f"{source}: {told}") from None
 
 
-def _left_out(read: list[_RunLog]) -> Iterator[str]:
-    """A sentence for everything in the files that has no part in the verdict."""
-    logged = sum(len(one.times) for one in read)
-    kinds = ("covariance", [x.covariances for x in read]), ("truth", [x.truths for x in read])
-    for what, found in kinds:
-        if without := logged - sum(int(np.sum(x.there)) for x in found):
-            yield f"{without} of {logged} poses have no {what} {_WITHIN}, and are left out"
-    for what, found in kinds:
-        held = sum(len(x.times) for x in found)
-        if unused := held - sum(x.used for x in found):
-            many = {"covariance": "covariances", "truth": "true poses"}[what]
-            yield f"{unused} of {held} {many} are at no time of the estimate, and are left out"
-    shortest, longest = (f(len(one.times) for one in read) for f in (min, max))
-    if shortest < longest:
-        yield f"runs have {shortest} to {longest} poses"
-
-
-def _other_times(read: list[_RunLog], longest: _RunLog) -> Iterator[str]:
+def _other_times(read: list[RunLog], longest: RunLog) -> Iterator[str]:
     """A remark where steps, which are counted, are not at the same times after the first pose."""
 
-    def since(one: _RunLog, steps: int) -> np.ndarray:
+    def since(one: RunLog, steps: int) -> np.ndarray:
         return one.times[:steps] - one.times[0]
 
     for one in read:
@@ -380,198 +360,3 @@ def _other_times(read: list[_RunLog], longest: _RunLog) -> Iterator[str]:
                 f"runs, and are those of {longest.run.name}"
             )
             return
-
-
-def _other_body(run: RunFiles) -> Iterator[str]:
-    """That the topics say that they are poses of different frames."""
-    own, true = ros.body_of(run.estimate), ros.body_of(run.truth)
-    if own and true and own != true:
-        yield f"the estimate is of {own} and the truth of {true}: what is between counts as error"
-
-
-def _read(run: RunFiles) -> _RunLog:
-    """Read one run, pose by pose of its estimate. Raises ValueError where few can be compared."""
-    at, (times, estimates, P) = run.covariance, ros.read_poses(run.estimate)
-    true_times, truths, _ = ros.read_poses(run.truth)
-    if geometry_of(truths) is not geometry_of(estimates):
-        raise ValueError(f"{run.truth}: estimate and truth must both be planar or both be spatial")
-    if at == run.estimate:
-        text = CovarianceText(times, P, MIXED if isinstance(at, Path) else ROS)
-    else:
-        text = read_covariances(Path(str(at)), geometry_of(estimates).tangent_dim)
-    files = (run.estimate, times), (run.covariance, text.times), (run.truth, true_times)
-    for path, told in files:
-        _check_times(path, told)
-    covariances = _at_times(files[0], files[1], text.covariances)
-    true = _at_times(files[0], files[2], truths)
-    those = evaluated_poses(run.estimate.parent, times, exactly_known(covariances.values))
-    read = _RunLog(run, times, estimates, covariances, true, text.said, those)
-    _check_share(read)
-    return read
-
-
-def _check_times(path: Place, times: Float[np.ndarray, " n"]) -> None:
-    """Raise ValueError unless times are seconds, of one run, and of their own each."""
-    check_seconds(str(path), times)
-    back = np.flatnonzero(np.diff(times) < 0)
-    if back.size:
-        raise ValueError(
-            f"{path}: times decrease from {times[back[0]]:.3f} to {times[back[0] + 1]:.3f} s; "
-            "expected one run in temporal order"
-        )
-    different = len(np.unique(times))
-    if different < LEAST_SHARE * len(times):
-        raise ValueError(
-            f"{path}: its {len(times)} poses have only {different} different times, perhaps "
-            "printed with too few digits or never stamped; every pose needs its own time"
-        )
-
-
-def _at_times(ours: _File, theirs: _File, values: Float[np.ndarray, "m ..."]) -> _AtTimes:
-    """The values at our times. Raises ValueError where there is none."""
-    (path, times), (other, other_times) = ours, theirs
-    at, of = associated(times, other_times)
-    if not len(at):
-        spans = " and ".join(f"{x.min():.3f}–{x.max():.3f} s" for x in (times, other_times))
-        raise ValueError(f"{path} and {other} have no time stamps in common {_WITHIN}: {spans}")
-    result = np.full((len(times), *values.shape[1:]), np.nan)
-    nearest_last = np.argsort(-np.abs(times[at] - other_times[of]), kind="stable")
-    result[at[nearest_last]] = values[of[nearest_last]]
-    return _AtTimes(other_times, result, len(np.unique(of)))
-
-
-def _check_share(read: _RunLog) -> None:
-    """Raise ValueError where most of a run would not be compared."""
-    others = (read.run.covariance, read.covariances), (read.run.truth, read.truths)
-    there = read.covariances.there & read.truths.there
-    fewest = min(len(x) for x in (read.times, read.covariances.times, read.truths.times))
-    enough = np.sum(there) >= LEAST_SHARE * fewest
-    if enough and _span(read.times[there]) >= LEAST_SHARE * _span(read.times):
-        return
-    path, worse = min(others, key=lambda other: int(np.sum(other[1].there)))
-    after = np.clip(np.searchsorted(worse.times, read.times), 1, max(len(worse.times) - 1, 1))
-    beside = worse.times[np.minimum([after - 1, after], len(worse.times) - 1)]
-    away = float(np.median(np.abs(beside - read.times).min(axis=0)))
-    raise ValueError(
-        f"{read.run.estimate}: of its {_held(read.times)} only {np.sum(there)} can be compared: "
-        f"{np.sum(read.covariances.there)} have a covariance {_WITHIN}, and "
-        f"{np.sum(read.truths.there)} a truth. {path} has {_held(worse.times)}; the nearest one "
-        f"is {away:.3g} s away (median). A verdict needs half the lines of the shortest file, "
-        "covering half the duration of the estimate"
-    )
-
-
-def _held(times: Float[np.ndarray, " n"]) -> str:
-    return f"{len(times)} times from {times[0]:.3f} to {times[-1]:.3f} s"
-
-
-def _span(times: Float[np.ndarray, " n"]) -> float:
-    return float(times[-1] - times[0]) if len(times) else 0.0
-
-
-FRAMES = "frames.csv"
-
-
-class FrameLog(NamedTuple):
-    """The log of all frames of a video, docs/gauge.md."""
-
-    times: Float[np.ndarray, " k"]
-    lost: Bool[np.ndarray, " k"]
-    maps: Int[np.ndarray, " k"]
-    """The number of the map. Each has a unit of length of its own."""
-    fixed: Bool[np.ndarray, " k"]
-    """Whether the unit of the map is fixed; before that it changes with the frames."""
-
-
-class EvaluatedPoses(NamedTuple):
-    """A mask of the poses of a run that have a part in the verdict, and counts of the others."""
-
-    poses: Bool[np.ndarray, " n"]
-    map: int = 0
-    """The map that is evaluated."""
-    others: tuple[int, int, int] = (0, 0, 0)
-    """The poses of other maps, those that are lost, and those from before the unit was fixed."""
-
-
-def evaluated_poses(
-    folder: Path, times: Float[np.ndarray, " n"], known: Bool[np.ndarray, " n"]
-) -> EvaluatedPoses:
-    """The poses at these times that the tracker's file in the folder leaves to be evaluated.
-
-    They are of the longest map, without frames that are lost or whose unit is not fixed. A pose
-    that is `known` exactly stays: it is where the map begins, and has a place in any unit. All
-    poses where there is no such file. Raises ValueError where it is of other times, or nothing is
-    left.
-    """
-    path = folder / FRAMES
-    frames = read_frames(path)
-    if frames is None:
-        return EvaluatedPoses(np.ones(len(times), bool))
-    order = np.argsort(frames.times, kind="stable")
-    place = np.interp(times, frames.times[order], np.arange(len(order)))
-    nearest = order[np.rint(place).astype(int)]
-    away = np.abs(frames.times[nearest] - times)
-    if away.max() > MAX_TIME_DIFFERENCE:
-        raise ValueError(
-            f"{path}: no frame is within {MAX_TIME_DIFFERENCE} s of the pose at "
-            f"{times[np.argmax(away)]:.3f} s; it must list the frames of the trajectory beside it"
-        )
-    _, lost, maps, fixed = (x[nearest] for x in frames)
-    usable = fixed & ~lost
-    if not usable.any():
-        raise ValueError(f"{path}: every frame with a pose is lost or has no fixed unit yet")
-    number = int(np.argmax(np.bincount(maps[usable])))
-    own = maps == number
-    opening = own & ~lost & ~fixed & ~known
-    others = int(np.sum(~own)), int(np.sum(own & lost)), int(np.sum(opening))
-    return EvaluatedPoses(own & ~lost & ~opening, number, others)
-
-
-def read_frames(path: Path) -> FrameLog | None:
-    """Read the file of a tracker; None where there is none, or another one of its name.
-
-    Raises ValueError, naming the line, for what a tracker does not write.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        return None
-    titles, *rows = [[word.strip() for word in line.split(",")] for line in lines] or [[]]
-    if not {"time", "state", "map", "unit_fixed"} <= set(titles):
-        return None
-    table = [
-        _frame(f"{path}, line {number}", dict(zip(titles, row, strict=False)))
-        for number, row in enumerate(rows, start=2)
-        if row != [""]
-    ]
-    if not table:
-        raise ValueError(f"{path} has no frames")
-    return FrameLog(*(np.array(column) for column in zip(*table, strict=True)))
-
-
-def _frame(place: str, told: dict[str, str]) -> tuple[float, bool, int, bool]:
-    """The numbers of a frame, in the order of `FrameLog`. Raises ValueError for what is none."""
-    try:
-        time, number, fixed = float(told["time"]), int(told["map"]), told["unit_fixed"]
-        if np.isfinite(time) and 0 <= number <= 1_000_000 and fixed in ("0", "1"):
-            return time, told["state"] == "lost", number, fixed == "1"
-    except (ValueError, KeyError):
-        pass
-    raise ValueError(
-        f"{place}: expected a finite time, a state, the number of a map, and unit_fixed 0 or 1"
-    )
-
-
-def left_out(runs: Sequence[EvaluatedPoses]) -> Iterator[str]:
-    """A sentence for every reason why poses of the runs are not evaluated."""
-    logged = sum(len(one.poses) for one in runs)
-    which = f"map {runs[0].map}, the longest," if len(runs) == 1 else "the longest map of each run"
-    reasons = (
-        (f"{which} is evaluated: ", "of other maps, each with its own unit"),
-        ("", "of frames that are lost"),
-        ("", "from before the unit of their map was fixed"),
-    )
-    counts = np.sum([one.others for one in runs], axis=0)
-    for (first, reason), count in zip(reasons, counts, strict=True):
-        if count:
-            yield f"{first}{count} of {logged} poses are {reason} and left out"

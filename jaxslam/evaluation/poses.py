@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 
 from jaxslam._runtime.files import LARGEST
 from jaxslam._runtime.lookup import lookup
-from jaxslam.evaluation.alignment import ALIGNMENTS, BY_FIRST, Aligned, aligned
+from jaxslam.evaluation.alignment import ALIGNMENTS, BY_FIRST, BY_SMALL, Aligned, aligned
+from jaxslam.evaluation.causes import causes
 from jaxslam.evaluation.convention import (
     Axes,
     Convention,
@@ -85,8 +86,8 @@ def evaluate_poses(
     together with its covariance was not logged, and one whose truth is all NaN is not compared.
     `covariances` are of every pose, (runs, steps, 6, 6), or of all poses of a run together, (runs,
     6 steps, 6 steps), of the errors that the `convention` names. Where the estimate is of another
-    world, `align` it by `se3` or `sim3`: by the first pose, if that is exactly known, else to all
-    positions. The covariance is transported with it. Given
+    world, `align` it by `yaw` (and position), `se3` or `sim3`: at the first pose, if its σ is small,
+    else to all positions. The covariance is transported with it. Given
     the scale of the world, or with `sim3`, NEES is at one scale a run, and the drift of scale is
     tested beside it. Of a robot that moves in a plane `axes_used` are those that it estimates, as
     ("x", "y", "rz"); by default all whose errors are not zero throughout. A truth that is measured
@@ -105,7 +106,13 @@ def evaluate_poses(
     found = as_stated(poses, stated, align, axes_named(axes_used, poses.estimates, stated), sigma)
     identified = _identified(poses, stated, _Options(align, found.names, sigma))
     at = at[len(at) - found.steps :]
-    return replace(found, times=at, timed=times is not None, identified=identified)
+
+    def compared(poses: Poses, align: str, axes: Sequence[str]) -> Evaluation:
+        return as_stated(poses, stated, align, tuple(axes) or found.names, sigma)
+
+    told = tuple(causes(poses, stated, align, found, compared))
+    how = {"times": at, "timed": times is not None, "identified": identified}
+    return replace(found, causes=told, **how)
 
 
 def as_stated(
@@ -183,7 +190,8 @@ def _with_truth(
 ) -> Poses:
     """Add the σ of the truth, in the unit of the estimate where their ratio is free."""
     first, log_scale = np.argmax(world.poses.logged, axis=1), np.zeros(len(later.logged))
-    firsts = world.poses.truths[range(len(first)), first] if BY_FIRST in world.notes else None
+    by_first = {BY_FIRST, BY_SMALL} & {*world.notes}
+    firsts = world.poses.truths[range(len(first)), first] if by_first else None
     if world.given:
         log_scale = np.nan_to_num(at_one_scale(later, convention, axes).scale.log_scale)
     return with_truth(later, convention, truth_sigma, np.exp(log_scale), firsts)

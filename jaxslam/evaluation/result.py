@@ -24,6 +24,8 @@ from jaxslam.evaluation.inputs import (
     filled,
     normalised,
     numbers,
+    of_one_dof,
+    padded,
     paired,
     sigmas,
     step_times,
@@ -89,6 +91,8 @@ class Evaluation:
     """The σ of the truth that the covariances hold too, m and degrees; None of an exact one."""
     run_names: tuple[str, ...] = ()
     """The names of the runs, where they have any."""
+    causes: tuple[Mistake, ...] = ()
+    """What lies between the logs and makes NEES wrong (`jaxslam.evaluation.causes`)."""
 
     @property
     def runs(self) -> int:
@@ -131,6 +135,8 @@ class Evaluation:
     @cached_property
     def mistakes(self) -> tuple[Mistake, ...]:
         """The mistakes of logging that are recognised; with any there is no verdict."""
+        if self.causes:
+            return self.causes
         numbers = [f"{time:g} s" if self.timed else f"step {time - 1:g}" for time in self.times]
         factors = [self.axis_verdict(axis) for axis in range(len(self.names))]
         runs = [_run(self, run) for run in range(self.runs)]
@@ -403,12 +409,18 @@ def evaluate(
     ValueError, naming run and step, for what else is not finite, not symmetric or not positive
     definite.
     """
+    quantity = next(iter(lookup("quantity", quantity, dict.fromkeys(("NEES", "NIS")))))
+    if quantity == "NIS":
+        errors, covariances, dof = padded(errors, covariances)
     e, P, logged = paired(errors, covariances)
+    if quantity == "NIS" and len(np.unique(dof[logged])) > 1:
+        nis = normalised(e, P)
+        return evaluate_nees(np.where(logged, nis, np.nan), dof, times=times, quantity="NIS")
     start, logged, notes = without_known(e, P, logged)
     seconds = step_times(times, e.shape[1])
     e, P, logged = e[:, start:], P[:, start:], logged[:, start:]
     return Evaluation(
-        quantity=next(iter(lookup("quantity", quantity, dict.fromkeys(("NEES", "NIS"))))),
+        quantity=quantity,
         dof=e.shape[-1],
         nees=filled(normalised(e, filled(P, logged, np.eye(e.shape[-1]))), logged, np.nan),
         errors=filled(e, logged, np.nan),
@@ -421,31 +433,42 @@ def evaluate(
 
 
 def evaluate_nees(
-    nees: ArrayLike, dof: int, *, times: ArrayLike | None = None, quantity: str = "NEES"
+    nees: ArrayLike, dof: ArrayLike, *, times: ArrayLike | None = None, quantity: str = "NEES"
 ) -> Evaluation:
-    """The verdict on a filter from its `nees` (runs, steps) alone, of `dof` degrees of freedom.
+    """The verdict on a filter from its `nees` (runs, steps) alone, of `dof` degrees of freedom: one
+    whole number, or one for every step, (runs, steps) or (steps,).
 
     With `quantity="NIS"` it is that of innovations, whose runs are the samples. `times` (steps,)
     are seconds. A step that is NaN was not logged. Raises ValueError, naming run and step, for a
     NEES that is negative.
     """
     values = numbers(quantity, nees, 2, "(runs, steps), with one run nees[None]")
-    if dof not in range(1, _MOST_DOF + 1):
-        raise ValueError(f"dof must be one whole number from 1 to {_MOST_DOF}")
+    try:
+        each = np.broadcast_to(np.asarray(dof, np.float64), values.shape)
+    except (ValueError, TypeError):
+        each = np.zeros(values.shape)
+    told = each[~np.isnan(values)]
+    if not ((told >= 1) & (told <= _MOST_DOF) & (told == np.round(told))).all():
+        raise ValueError(
+            f"dof must be one whole number from 1 to {_MOST_DOF}, or one for every step, "
+            f"{values.shape}"
+        )
     check_every_run(~np.isnan(values))
     if (values < 0).any():
         run, step = np.argwhere(values < 0)[0]
         raise ValueError(f"{quantity} of {at((run, step))} is {values[run, step]:.3g}; 0 or more")
     none = np.empty((*values.shape, 0))
+    values, one, notes = of_one_dof(values, each)
     return Evaluation(
         quantity=next(iter(lookup("quantity", quantity, dict.fromkeys(("NEES", "NIS"))))),
-        dof=int(dof),
+        dof=one,
         nees=values,
         errors=none,
         sigmas=none,
         times=step_times(times, values.shape[1]),
         timed=times is not None,
         names=(),
+        notes=notes,
     )
 
 

@@ -21,7 +21,8 @@ from jaxslam.io.recording import (
     read_timestamps,
 )
 from jaxslam.io.source import Trajectory
-from jaxslam.io.tum import numbers, poses, read_table, text_lines
+from jaxslam.io.text import numbers, read_table, text_lines
+from jaxslam.io.tum import poses
 
 NANOSECONDS = 1e9
 TRUTH = "state_groundtruth_estimate0"
@@ -65,7 +66,7 @@ def _camera_truth(truth: Path, yaml: Path) -> Trajectory:
     T_BS = np.reshape(_numbers(yaml, "\n".join(text_lines(yaml).values()), "data", 16), (4, 4))
     check_rigid(yaml, T_BS[None])
     columns = "eight finite numbers ns px py pz qw qx qy qz"
-    table = read_table(truth, "truth", "poses", columns, 8, spare=True).rows
+    table = read_table(truth, "truth", "poses", columns).numbers(columns, range(8))
     try:
         T_WB = poses(table[:, 1:4], table[:, [5, 6, 7, 4]])
     except ValueError as error:

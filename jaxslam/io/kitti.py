@@ -21,7 +21,7 @@ from jaxslam.io.recording import (
     of_files,
 )
 from jaxslam.io.source import Trajectory
-from jaxslam.io.tum import numbers, read_table, text_lines
+from jaxslam.io.text import numbers, read_table, text_lines
 
 CAMERAS = ("0", "2")
 
@@ -40,9 +40,11 @@ def _open(path: Path, _rate: float) -> Recording:
 
 
 def _read_times(path: Path) -> Float[np.ndarray, " n"]:
-    _, rows, lines = read_table(path, "times", "times", "finite times in seconds", 1, spare=True)
-    check_increasing(f"{path}, line", lines, rows[:, 0])
-    return rows[:, 0]
+    expected = "finite times in seconds"
+    table = read_table(path, "times", "times", expected)
+    times = table.numbers(expected, [0])[:, 0]
+    check_increasing(f"{path}, line", table.lines, times)
+    return times
 
 
 def _projection(path: Path, camera: str) -> Float[np.ndarray, "3 4"]:
@@ -77,7 +79,7 @@ def _camera_truth(
 ) -> Trajectory:
     """Rows of a 3x4 T_wc; camera c is at `-K⁻¹ P₄` in the left grey one, unturned."""
     row = "12 finite numbers, the rows of a 3x4 T_wc"
-    rows = read_table(path, "poses", "poses", row, 12, spare=True).rows.reshape(-1, 3, 4)
+    rows = read_table(path, "poses", "poses", row).numbers(row, range(12)).reshape(-1, 3, 4)
     _check_count(path, len(rows), len(times))
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
     T_wc[:, :3] = rows

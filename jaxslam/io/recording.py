@@ -14,7 +14,8 @@ from jaxtyping import Float
 from jaxslam._runtime.files import LARGEST
 from jaxslam.io.calibration import Calibration, read_calibration
 from jaxslam.io.source import Image, Trajectory
-from jaxslam.io.tum import not_rigid, numbers, read_tum, text_lines
+from jaxslam.io.text import numbers, text_lines
+from jaxslam.io.tum import not_rigid, read_tum
 
 IMAGE_TYPES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
 

@@ -13,16 +13,20 @@ import numpy as np
 
 from jaxslam._runtime.extras import missing
 from jaxslam._runtime.files import one_line
-from jaxslam.io.tum import read_log, rows_as_poses
+from jaxslam.io.logs.log import Log, interpolated
+from jaxslam.io.tum import rows_as_poses
 
 Message: TypeAlias = Any
 """A message, with the fields of its ROS type as attributes."""
 BAG = "a ROS bag (.bag; .mcap, .db3, or the folder with metadata.yaml)"
 WITH_COVARIANCE = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseWithCovarianceStamped")
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 POSES = (
     *WITH_COVARIANCE, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped",
     "nav_msgs/msg/Path",
 )  # fmt: skip
+ROS = {"error": "split", "axes": "world"}
+"""The convention of PoseWithCovariance, as ROS documents it."""
 
 
 class Topic(NamedTuple):
@@ -59,12 +63,19 @@ def chosen(bag: Path, named: str, types: Sequence[str], option: str, other: str 
         for x in reader.connections:
             held[Topic(bag, str(x.topic), str(x.msgtype))] += int(x.msgcount)  # of YAML: anything
     own, other = named.strip("/"), other.strip("/")
+    name, _, frames = own.partition(":")
+    for x in held:
+        if x.type == TRANSFORMS and x.name.strip("/") == name and types == POSES:
+            return x._replace(name=f"{x.name}:{frames}")
     fit = [x for x in held if x.type in types and held[x] and x.name.strip("/") != other]
     fit = [x for x in fit if not own or x.name.strip("/") == own]
     if len(fit) == 1:
         return fit[0]
     told = ", ".join(f"{x.name} ({x.type}, {held[x]} messages)" for x in sorted(fit or held))
     told = f"messages of {', '.join(types)}; there are {told or 'none'}".replace("/msg/", "/")
+    if any(x.type == TRANSFORMS for x in held):
+        without = "have no covariance; they can be the truth, as --truth /tf:PARENT.CHILD"
+        told += f". Transforms of /tf {without}"
     which = f"{len(fit) or 'no'}{' other' * bool(other)} topics fit {option} {named}".strip()
     raise ValueError(f"{bag}: {which}; name one with {' '.join(told.split())}")
 
@@ -95,33 +106,65 @@ def _opened(path: Path) -> Generator[tuple[Message, Callable[[bytes, str], Messa
         raise ValueError(f"{path}: cannot be read ({told}); expected {BAG}, complete") from None
 
 
-def body_of(place: Path | Topic) -> str:
-    """The frame whose poses these are, by the first message; "" where nothing says it."""
-    first = None if isinstance(place, Path) else next(messages(place), None)
-    return str(getattr(first, "child_frame_id", "")).strip("/")
-
-
 def seconds(message: Message) -> float:
     """The stamp of a message's header."""
     return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
 
 
-def read_poses(place: Path | Topic) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times (n,) in s, poses (n, 4, 4) in m of a text file (`read_log`) or a topic, and the
-    covariances that are with them, if any.
+def read_poses(topic: Topic) -> Log:
+    """The poses of a topic, and the covariances that are with them, if any.
 
-    Of paths the last one is read. Raises ValueError, naming the place of what is no pose.
+    Of paths the last one is read, and of transforms those from `PARENT` to `CHILD`, named with the
+    topic as `/tf:PARENT.CHILD`. Raises ValueError, naming the place of what is no pose.
     """
-    if isinstance(place, Path):
-        return read_log(place)
-    stamped = messages(place)
-    if place.type == "nav_msgs/msg/Path":
+    if topic.type == TRANSFORMS:
+        return _joined(topic)
+    stamped = messages(topic)
+    if topic.type == "nav_msgs/msg/Path":
         stamped = (pose for path in deque(stamped, 1) for pose in path.poses)
-    rows = np.array([_row(message) for message in stamped], float)
-    if not len(rows):
-        raise ValueError(f"{place} has no poses; choose a topic with poses")
-    T_wc = rows_as_poses(lambda i: f"{place}, pose {i}", rows)
-    return rows[:, 0], T_wc, rows[:, 8:].reshape(-1, 6, 6)
+    told = list(stamped)
+    if not told:
+        raise ValueError(f"{topic} has no poses; choose a topic with poses")
+    rows = np.array([_row(message) for message in told], float)
+    T_wc = rows_as_poses(lambda i: f"{topic}, pose {i}", rows[:, :8])
+    P = rows[:, 8:].reshape(-1, 6, 6)
+    body = str(getattr(told[0], "child_frame_id", "")).strip("/")
+    world = str(told[0].header.frame_id).strip("/")
+    return Log(rows[:, 0], T_wc, P, ROS if len(P) else {}, world=world, body=body)
+
+
+def _joined(topic: Topic) -> Log:
+    """The transform from one frame to another, along the tree, at the stamps of its fastest part.
+
+    Raises ValueError, naming the frames that there are.
+    """
+    name, _, frames = topic.name.partition(":")
+    edges: dict[str, tuple[str, list[list[float]]]] = {}
+    for own in (topic._replace(name=name), topic._replace(name=f"{name}_static")):
+        for message in messages(own):
+            for x in message.transforms:
+                child = x.child_frame_id.strip("/")
+                edges.setdefault(child, (x.header.frame_id.strip("/"), []))[1].append(_row(x))
+    parent, _, child = frames.partition(".")
+    chain = [child]
+    while chain[-1] in edges and chain[-1] != parent and len(chain) <= len(edges):
+        chain.append(edges[chain[-1]][0])
+    if not parent or chain[-1] != parent:
+        known = ", ".join(f"{above} → {child}" for child, (above, _) in sorted(edges.items()))
+        raise ValueError(
+            f"{topic}: name the pose as {name}:PARENT.CHILD, of frames that are joined; there are "
+            f"{known or 'none'}"
+        )
+    parts = []
+    for frame in reversed(chain[:-1]):
+        rows = np.array(edges[frame][1])
+        rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
+        parts.append((rows[:, 0], rows_as_poses(lambda i: f"{topic}, transform {i}", rows)))
+    times = max((times for times, _ in parts), key=len)
+    T = np.tile(np.eye(4), (len(times), 1, 1))
+    for own, poses in parts:
+        T = T @ interpolated(own, poses, times, beyond=True)
+    return Log(times, T, np.empty((0, 6, 6)), world=parent, body=child)
 
 
 def _row(message: Message) -> list[float]:

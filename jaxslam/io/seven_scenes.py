@@ -11,7 +11,7 @@ import numpy as np
 from jaxslam.io.calibration import Calibration
 from jaxslam.io.recording import Layout, Recording, check_rigid, fixed, of_files
 from jaxslam.io.source import Trajectory
-from jaxslam.io.tum import read_table
+from jaxslam.io.text import read_table
 
 RATE = 30.0
 CAMERA = Calibration(640, 480, 585.0, 585.0, 320.0, 240.0)
@@ -45,7 +45,7 @@ def _truth(files: list[Path], times: np.ndarray) -> Trajectory | None:
 
 def _pose(path: Path) -> np.ndarray:
     row = "four numbers, a row of a 4x4 matrix,"
-    matrix = read_table(path, "pose", "pose", row, 4, finite=False, spare=True).rows
+    matrix = read_table(path, "pose", "pose", row).rows[:, :4]
     if matrix.shape != (4, 4):
         raise ValueError(f"{path} has {len(matrix)} rows; expected a 4x4 matrix")
     return matrix

@@ -1,0 +1,373 @@
+"""The estimates, covariances and true poses of a run, at the same times.
+
+Of stamps that are doubled the last is used. A covariance belongs to the estimate nearest in time.
+A true pose is interpolated where the truth is dense enough for that; else it is the nearest in
+time; and where it is much rarer than the estimate, the estimate is moved to its stamp.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, associated
+from jaxslam.evaluation.clock import clock_offset
+from jaxslam.evaluation.convention import (
+    Convention,
+    CovarianceText,
+    converted,
+    geometry_of,
+    read_covariances,
+)
+from jaxslam.evaluation.inputs import exactly_known, without_unknown
+from jaxslam.evaluation.tracked_frames import EvaluatedPoses, evaluated_poses
+from jaxslam.io import ros
+from jaxslam.io.logs import read_log
+from jaxslam.io.logs.log import Log, check_seconds, interpolated
+
+Place: TypeAlias = Path | ros.Topic
+LEAST_SHARE = 0.5
+"""The share of the comparable poses, and of the estimate's time, that must be compared."""
+DENSE = 0.3
+"""The largest error of interpolation, in σ of the estimate, of a truth that is interpolated."""
+SPARSE = 3.0
+"""The number of poses to every true one from which the estimate is taken at the truth's stamps."""
+_WITHIN = f"within {MAX_TIME_DIFFERENCE} s"
+_SAME = Convention("split", "mixed")
+
+
+class RunFiles(NamedTuple):
+    """The name of one trajectory, and the paths of its files, or topics of bags."""
+
+    name: str
+    estimate: Place
+    covariance: Place
+    truth: Place
+
+
+class RunLog(NamedTuple):
+    """A run, pose by pose of its estimate; NaN where a file holds nothing."""
+
+    run: RunFiles
+    times: Float[np.ndarray, " n"]
+    estimates: Float[np.ndarray, "n d d"]
+    covariances: Float[np.ndarray, "n t t"]
+    truths: Float[np.ndarray, "n d d"]
+    said: dict[str, str]
+    evaluated: EvaluatedPoses
+    """The poses that have a part in the verdict, by the tracker's own record of its frames."""
+    oriented: bool
+    left_out: dict[str, int]
+    """Sentences with a `{count}` of the poses of all runs, and theirs of this one."""
+    notes: tuple[str, ...]
+
+
+def read(place: Place) -> Log:
+    """The poses of a file or a topic, in the order of their times, each stamp once.
+
+    Raises ValueError, naming the place.
+    """
+    log = ros.read_poses(place) if isinstance(place, ros.Topic) else read_log(place)
+    _check_times(place, log.times)
+    last = np.flatnonzero(np.append(np.diff(log.times) > 0, True))
+    if len(last) == len(log.times):
+        return log
+    note = f"{len(log.times) - len(last)} stamps are doubled; of each the last pose is used"
+    P = log.covariances[last] if len(log.covariances) else log.covariances
+    notes = (*log.notes, note)
+    return log._replace(times=log.times[last], poses=log.poses[last], covariances=P, notes=notes)
+
+
+def read_run(run: RunFiles, time_offset: float | str = 0.0) -> RunLog:
+    """Read one run, whose clock is behind the truth's by an offset in seconds, or `auto`.
+
+    Raises ValueError where few poses can be compared.
+    """
+    log, truth = read(run.estimate), read(run.truth)
+    if geometry_of(truth.poses) is not geometry_of(log.poses):
+        raise ValueError(f"{run.truth}: estimate and truth must both be planar or both be spatial")
+    if log.stamped != truth.stamped or (not log.stamped and len(log.times) != len(truth.times)):
+        raise ValueError(
+            f"{run.estimate} has {len(log.times)} poses and {run.truth} {len(truth.times)}, and "
+            "not both have stamps: lines would be paired by their numbers; give times (times.txt "
+            "beside them, or lines of TUM)"
+        )
+    if run.covariance == run.estimate:
+        text = CovarianceText(log.times, log.covariances, dict(log.said))
+    else:
+        text = read_covariances(Path(str(run.covariance)), geometry_of(log.poses).tangent_dim)
+        text = _stamped_by(log.times, text)
+        _check_times(run.covariance, text.times)
+    P, used = _nearest(run, log.times, text)
+    if isinstance(run.covariance, ros.Topic):
+        P = _filled_in(run.covariance, P)
+    log, P, left_out = _with_covariances(log, P)
+    notes = [*log.notes, *truth.notes, *text.notes, *_other_frames(log, truth)]
+    oriented, told = _oriented(log, truth)
+    notes += told
+    times = log.times
+    if time_offset == "auto":
+        found = clock_offset(times, log.poses, truth.times, truth.poses) if oriented else None
+        time_offset = 0.0 if found is None else found.seconds
+        notes.append(f"the estimate is taken to be {1e3 * time_offset:.1f} ms late, as found")
+    times = times - float(time_offset)
+    log = log._replace(times=times)
+    true, estimates, more = _truths(run, log, truth, P, Convention(**text.said), oriented=oriented)
+    notes += more
+    there = ~np.isnan(P[:, 0, 0])
+    if missing := int(np.sum(~there)):
+        left_out[
+            f"{{count}} of {{logged}} poses have no covariance {_WITHIN}, and are left out"
+        ] = missing
+    if missing := int(np.sum(np.isnan(true[:, 0, 0]))):
+        left_out["{count} of {logged} poses have no truth, and are left out"] = missing
+    if unused := len(text.times) - used:
+        left_out["{count} covariances are at no time of the estimate, and are left out"] = unused
+    those = evaluated_poses(_folder(run.estimate), log.times, exactly_known(P))
+    result = RunLog(
+        run, times, estimates, P, true, text.said, those, oriented, left_out, tuple(notes)
+    )
+    _check_share(result, text.times, truth.times)
+    return result
+
+
+def _folder(place: Place) -> Path:
+    return place.parent
+
+
+def _check_times(path: Place, times: Float[np.ndarray, " n"]) -> None:
+    """Raise ValueError unless times are seconds, of one run, and most of their own each."""
+    check_seconds(str(path), times)
+    back = np.flatnonzero(np.diff(times) < 0)
+    if back.size:
+        raise ValueError(
+            f"{path}: times decrease from {times[back[0]]:.3f} to {times[back[0] + 1]:.3f} s; "
+            "expected one run in temporal order"
+        )
+    different = len(np.unique(times))
+    if different < LEAST_SHARE * len(times):
+        raise ValueError(
+            f"{path}: its {len(times)} poses have only {different} different times, perhaps "
+            "printed with too few digits or never stamped; every pose needs its own time"
+        )
+
+
+def _stamped_by(times: Float[np.ndarray, " n"], text: CovarianceText) -> CovarianceText:
+    """With the stamps of the estimate, line by line, where its own are those rounded."""
+    if len(times) != len(text.times) or len(np.unique(text.times)) == len(times):
+        return text
+    digits = np.diff(np.unique(text.times)).min(initial=np.inf)
+    if not np.isfinite(digits) or np.abs(times - text.times).max() > digits:
+        return text
+    note = f"times of covariances are rounded to {digits:.3g} s: they are taken line by line"
+    return text._replace(times=times, notes=(*text.notes, note))
+
+
+def _nearest(
+    run: RunFiles, times: Float[np.ndarray, " n"], text: CovarianceText
+) -> tuple[Float[np.ndarray, "n t t"], int]:
+    """The covariances at our times, and how many are. Raises ValueError where there is none."""
+    at, of = associated(times, text.times)
+    if not len(at):
+        raise ValueError(_nothing_in_common(run.estimate, run.covariance, times, text.times))
+    result = np.full((len(times), *text.covariances.shape[1:]), np.nan)
+    nearest_last = np.argsort(-np.abs(times[at] - text.times[of]), kind="stable")
+    result[at[nearest_last]] = text.covariances[of[nearest_last]]
+    return without_unknown(result[None])[0], len(np.unique(of))
+
+
+def _nothing_in_common(one: Place, other: Place, times: np.ndarray, others: np.ndarray) -> str:
+    spans = " and ".join(f"{x.min():.3f}–{x.max():.3f} s" for x in (times, others))
+    return f"{one} and {other} have no time stamps in common {_WITHIN}: {spans}"
+
+
+def _filled_in(topic: ros.Topic, P: Float[np.ndarray, "n t t"]) -> Float[np.ndarray, "n t t"]:
+    """Without those that a program does not fill in: NaN, or zeros but of the first pose alone.
+
+    Raises ValueError where it fills in none.
+    """
+    without, zero = np.isnan(P).any(axis=(1, 2)), exactly_known(P)
+    if zero[1:].any():
+        without |= zero
+    if without.all():
+        raise ValueError(
+            f"{topic}: has no covariances, all {len(P)} are NaN or zero; a verdict needs them"
+        )
+    return np.where(without[:, None, None], np.nan, P)
+
+
+def _with_covariances(log: Log, P: np.ndarray) -> tuple[Log, np.ndarray, dict[str, int]]:
+    """Take away the poses that are NaN."""
+    there = ~np.isnan(log.poses[:, 0, 0])
+    left_out = {}
+    if missing := int(np.sum(~there)):
+        left_out["{count} poses of the estimate are NaN, and are left out"] = missing
+    log, P = log._replace(times=log.times[there], poses=log.poses[there]), P[there].copy()
+    return log, P, left_out
+
+
+def _other_frames(log: Log, truth: Log) -> list[str]:
+    """That the logs say that they are of different frames."""
+    notes = []
+    if log.body and truth.body and log.body != truth.body:
+        notes.append(
+            f"the estimate is of {log.body} and the truth of {truth.body}: what is between counts "
+            "as error"
+        )
+    if log.world and truth.world and log.world != truth.world:
+        notes.append(
+            f"the estimate is in {log.world} and the truth in {truth.world}: if these are "
+            "different worlds, align them (--align yaw or se3)"
+        )
+    return notes
+
+
+def _oriented(log: Log, truth: Log) -> tuple[bool, list[str]]:
+    """Whether both have orientations; a truth whose rotation is always 1 has none, where the
+    estimate turns by more than 3°."""
+    if not (log.oriented and truth.oriented) or log.poses.shape[-1] == 3:
+        return log.oriented and truth.oriented, []
+    R, fixed = log.poses[:, :3, :3], truth.poses[~np.isnan(truth.poses[:, 0, 0]), :3, :3]
+    turned = np.trace(R[0].T @ R, axis1=1, axis2=2).min() < 1 + 2 * np.cos(np.radians(3.0))
+    if len(fixed) and turned and (fixed == np.eye(3)).all():
+        return False, ["every orientation of the truth is 0 0 0 1: it has none"]
+    return True, []
+
+
+def _truths(
+    run: RunFiles,
+    log: Log,
+    truth: Log,
+    P: Float[np.ndarray, "n t t"],
+    convention: Convention,
+    *,
+    oriented: bool,
+) -> tuple[Float[np.ndarray, "n d d"], Float[np.ndarray, "n d d"], list[str]]:
+    """The true poses of every estimate, NaN where there is none, the estimates, and remarks.
+
+    Raises ValueError where there is none.
+    """
+    known = ~np.isnan(truth.poses[:, 0, 0])
+    times, poses = truth.times[known], truth.poses[known]
+    gap = np.median(np.diff(times)) if len(times) > 1 else 0.0
+    step = np.median(np.diff(log.times)) if len(log.times) > 1 else 0.0
+    nearest = np.full_like(log.poses, np.nan)
+    at, of = associated(log.times, times)
+    order = np.argsort(-np.abs(log.times[at] - times[of]), kind="stable")
+    nearest[at[order]] = poses[of[order]]
+    if len(times) < 3 or not log.stamped:
+        return _some(run, log, truth, nearest), log.poses, []
+    off = np.abs(log.times[at] - times[of]).max(initial=0.0)
+    wrong = _interpolation_error(times, poses)
+    sigma = _sigmas(log, P, convention)
+    most = (wrong / sigma)[: 2 if oriented else 1].max()
+    if off > 1e-6 * max(gap, step) and (most <= DENSE or not len(at)) and gap <= SPARSE * step:
+        whole = interpolated(times, poses, log.times)
+        # Not across a hole.
+        after = np.clip(np.searchsorted(times, log.times), 1, len(times) - 1)
+        whole[times[after] - times[after - 1] > 3 * gap] = np.nan
+        note = (
+            f"the truth is interpolated to the stamps of the estimate, to {1e3 * wrong[0]:.2g} mm "
+            f"and {np.degrees(wrong[1]):.2g}° (median), {most:.2g} σ"
+        )
+        return _some(run, log, truth, whole), log.poses, [note] if most > 0.01 else []
+    if gap > SPARSE * step and len(np.unique(of)) < LEAST_SHARE * len(times):
+        rough = (_interpolation_error(log.times, log.poses) / sigma)[: 2 if oriented else 1].max()
+        told = f"the truth has a pose every {gap:.3g} s and the estimate every {step:.3g} s"
+        if rough > DENSE:
+            raise ValueError(
+                f"{run.truth}: {told}, at other stamps, and between them the estimate is known to "
+                f"{rough:.2g} of its σ only; log it at the stamps of the truth, or take a truth "
+                "that is dense enough to be interpolated"
+            )
+        note = f"{told}: compared at the stamps of the truth, to {rough:.2g} σ of the estimate"
+        moved, true = _at_stamps_of_truth(log, times, poses)
+        return _some(run, log, truth, true), moved, [note]
+    return _some(run, log, truth, nearest), log.poses, []
+
+
+def _some(run: RunFiles, log: Log, truth: Log, poses: np.ndarray) -> np.ndarray:
+    if np.isnan(poses[:, 0, 0]).all():
+        raise ValueError(_nothing_in_common(run.estimate, run.truth, log.times, truth.times))
+    return poses
+
+
+def _interpolation_error(
+    times: Float[np.ndarray, " m"], poses: Float[np.ndarray, "m d d"]
+) -> Float[np.ndarray, " 2"]:
+    """The median error of a pose in the middle of two: m, rad.
+
+    A pose that is interpolated over its neighbours, twice as far apart, is off by four times that.
+    """
+    between = interpolated(times[::2], poses[::2], times[1:-1:2])
+    true = poses[1:-1:2]
+    n = poses.shape[-1] - 1
+    there = ~np.isnan(between[:, 0, 0])
+    if not there.any():
+        return np.full(2, np.inf)
+    off = np.linalg.norm((between - true)[there, :n, n], axis=1)
+    chord = np.linalg.norm((between - true)[there, :n, :n], axis=(1, 2)) / np.sqrt(2)
+    return np.array([np.median(off), np.median(2 * np.arcsin(np.clip(chord / 2, 0, 1)))]) / 4
+
+
+def _sigmas(log: Log, P: Float[np.ndarray, "n t t"], convention: Convention) -> np.ndarray:
+    """The median of the least σ of position and of rotation."""
+    there = ~np.isnan(P).any(axis=(1, 2)) & np.any(P, axis=(1, 2))
+    if not there.any():
+        return np.full(2, np.nan)
+    split = converted(P[there], log.poses[there], convention, _SAME)
+    n = log.poses.shape[-1] - 1
+    variance = np.maximum(np.diagonal(split, axis1=1, axis2=2), 0.0)
+    least = [np.sqrt(np.median(x.min(axis=1))) for x in (variance[:, :n], variance[:, n:])]
+    return np.maximum(least, 1e-12)
+
+
+def _at_stamps_of_truth(
+    log: Log, times: Float[np.ndarray, " m"], poses: Float[np.ndarray, "m d d"]
+) -> tuple[Float[np.ndarray, "n d d"], Float[np.ndarray, "n d d"]]:
+    """The estimates nearest to true poses, interpolated to their stamps, and those truths."""
+    between = (times >= log.times[0]) & (times <= log.times[-1])
+    times, poses = times[between], poses[between]
+    after = np.clip(np.searchsorted(log.times, times), 1, len(log.times) - 1)
+    earlier = times - log.times[after - 1] < log.times[after] - times
+    nearest = after - earlier
+    moved, true = log.poses.copy(), np.full_like(log.poses, np.nan)
+    moved[nearest], true[nearest] = interpolated(log.times, log.poses, times), poses
+    return moved, true
+
+
+def _check_share(read: RunLog, covariance_times: np.ndarray, true_times: np.ndarray) -> None:
+    """Raise ValueError where most of a run would not be compared."""
+    others = (
+        (read.run.covariance, covariance_times, ~np.isnan(read.covariances[:, 0, 0])),
+        (read.run.truth, true_times, ~np.isnan(read.truths[:, 0, 0])),
+    )
+    there: Bool[np.ndarray, " n"] = others[0][2] & others[1][2]
+    fewest = min(len(read.times), *(len(times) for _, times, _ in others))
+    enough = np.sum(there) >= LEAST_SHARE * fewest
+    if enough and _span(read.times[there]) >= LEAST_SHARE * _span(read.times):
+        return
+    path, times, _ = min(others, key=lambda other: int(np.sum(other[2])))
+    after: Int[np.ndarray, " n"] = np.clip(
+        np.searchsorted(times, read.times), 1, max(len(times) - 1, 1)
+    )
+    beside = times[np.minimum([after - 1, after], len(times) - 1)]
+    away = float(np.median(np.abs(beside - read.times).min(axis=0)))
+    raise ValueError(
+        f"{read.run.estimate}: of its {_held(read.times)} only {np.sum(there)} can be compared: "
+        f"{np.sum(others[0][2])} have a covariance {_WITHIN}, and "
+        f"{np.sum(others[1][2])} a truth. {path} has {_held(times)}; the nearest one "
+        f"is {away:.3g} s away (median). A verdict needs half the lines of the shortest file, "
+        "covering half the duration of the estimate"
+    )
+
+
+def _held(times: Float[np.ndarray, " n"]) -> str:
+    return f"{len(times)} times from {times[0]:.3f} to {times[-1]:.3f} s"
+
+
+def _span(times: Float[np.ndarray, " n"]) -> float:
+    return float(times[-1] - times[0]) if len(times) else 0.0

@@ -1,0 +1,119 @@
+"""The poses of the tracker's own log that are evaluated, by its record of all frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE
+
+FRAMES = "frames.csv"
+
+
+class FrameLog(NamedTuple):
+    """The log of all frames of a video, docs/gauge.md."""
+
+    times: Float[np.ndarray, " k"]
+    lost: Bool[np.ndarray, " k"]
+    maps: Int[np.ndarray, " k"]
+    """The number of the map. Each has a unit of length of its own."""
+    fixed: Bool[np.ndarray, " k"]
+    """Whether the unit of the map is fixed; before that it changes with the frames."""
+
+
+class EvaluatedPoses(NamedTuple):
+    """A mask of the poses of a run that have a part in the verdict, and counts of the others."""
+
+    poses: Bool[np.ndarray, " n"]
+    map: int = 0
+    """The map that is evaluated."""
+    others: tuple[int, int, int] = (0, 0, 0)
+    """The poses of other maps, those that are lost, and those from before the unit was fixed."""
+
+
+def evaluated_poses(
+    folder: Path, times: Float[np.ndarray, " n"], known: Bool[np.ndarray, " n"]
+) -> EvaluatedPoses:
+    """The poses at these times that the tracker's file in the folder leaves to be evaluated.
+
+    They are of the longest map, without frames that are lost or whose unit is not fixed. A pose
+    that is `known` exactly stays: it is where the map begins, and has a place in any unit. All
+    poses where there is no such file. Raises ValueError where it is of other times, or nothing is
+    left.
+    """
+    path = folder / FRAMES
+    frames = read_frames(path)
+    if frames is None:
+        return EvaluatedPoses(np.ones(len(times), bool))
+    order = np.argsort(frames.times, kind="stable")
+    place = np.interp(times, frames.times[order], np.arange(len(order)))
+    nearest = order[np.rint(place).astype(int)]
+    away = np.abs(frames.times[nearest] - times)
+    if away.max() > MAX_TIME_DIFFERENCE:
+        raise ValueError(
+            f"{path}: no frame is within {MAX_TIME_DIFFERENCE} s of the pose at "
+            f"{times[np.argmax(away)]:.3f} s; it must list the frames of the trajectory beside it"
+        )
+    _, lost, maps, fixed = (x[nearest] for x in frames)
+    usable = fixed & ~lost
+    if not usable.any():
+        raise ValueError(f"{path}: every frame with a pose is lost or has no fixed unit yet")
+    number = int(np.argmax(np.bincount(maps[usable])))
+    own = maps == number
+    opening = own & ~lost & ~fixed & ~known
+    others = int(np.sum(~own)), int(np.sum(own & lost)), int(np.sum(opening))
+    return EvaluatedPoses(own & ~lost & ~opening, number, others)
+
+
+def read_frames(path: Path) -> FrameLog | None:
+    """Read the file of a tracker; None where there is none, or another one of its name.
+
+    Raises ValueError, naming the line, for what a tracker does not write.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return None
+    titles, *rows = [[word.strip() for word in line.split(",")] for line in lines] or [[]]
+    if not {"time", "state", "map", "unit_fixed"} <= set(titles):
+        return None
+    table = [
+        _frame(f"{path}, line {number}", dict(zip(titles, row, strict=False)))
+        for number, row in enumerate(rows, start=2)
+        if row != [""]
+    ]
+    if not table:
+        raise ValueError(f"{path} has no frames")
+    return FrameLog(*(np.array(column) for column in zip(*table, strict=True)))
+
+
+def _frame(place: str, told: dict[str, str]) -> tuple[float, bool, int, bool]:
+    """The numbers of a frame, in the order of `FrameLog`. Raises ValueError for what is none."""
+    try:
+        time, number, fixed = float(told["time"]), int(told["map"]), told["unit_fixed"]
+        if np.isfinite(time) and 0 <= number <= 1_000_000 and fixed in ("0", "1"):
+            return time, told["state"] == "lost", number, fixed == "1"
+    except (ValueError, KeyError):
+        pass
+    raise ValueError(
+        f"{place}: expected a finite time, a state, the number of a map, and unit_fixed 0 or 1"
+    )
+
+
+def left_out(runs: Sequence[EvaluatedPoses]) -> Iterator[str]:
+    """A sentence for every reason why poses of the runs are not evaluated."""
+    logged = sum(len(one.poses) for one in runs)
+    which = f"map {runs[0].map}, the longest," if len(runs) == 1 else "the longest map of each run"
+    reasons = (
+        (f"{which} is evaluated: ", "of other maps, each with its own unit"),
+        ("", "of frames that are lost"),
+        ("", "from before the unit of their map was fixed"),
+    )
+    counts = np.sum([one.others for one in runs], axis=0)
+    for (first, reason), count in zip(reasons, counts, strict=True):
+        if count:
+            yield f"{first}{count} of {logged} poses are {reason} and left out"

@@ -1,0 +1,45 @@
+"""The vertices of g2o's graphs: poses without stamps, by their numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxslam.io.logs.log import Log, log
+from jaxslam.io.text import Table, numbers, text_lines
+from jaxslam.io.tum import of_xytheta
+
+_SPATIAL, _PLANAR = "VERTEX_SE3:QUAT", "VERTEX_SE2"
+NOTE = (
+    "of a graph of g2o vertices alone are read; the covariances of its library are of the vector "
+    "part of a quaternion, half the angle (angle=half, error=right)"
+)
+
+
+def read(path: Path) -> Log | None:
+    """The poses of a g2o file; None of another. Raises ValueError, naming the line."""
+    lines = text_lines(path, "trajectory")
+    kinds = {line.split(maxsplit=1)[0] for line in lines.values()}
+    kind = next((kind for kind in (_SPATIAL, _PLANAR) if kind in kinds), None)
+    if kind is None:
+        return None
+    count = 8 if kind == _SPATIAL else 4
+    rows, places = [], []
+    for number, line in lines.items():
+        first, *told = line.split()
+        if first == kind:
+            row = numbers(told, count)
+            if row is None:
+                expected = f"{kind}, a number, and {count - 1} finite numbers"
+                raise ValueError(f"{path}, line {number}: expected {expected}")
+            rows.append(row)
+            places.append(number)
+    order = np.argsort([row[0] for row in rows], kind="stable")
+    values = np.array(rows)[order]
+    table = Table(path, (), (), values, tuple(np.array(places)[order].tolist()), {})
+    if kind == _PLANAR:
+        T = of_xytheta(values[:, 1:])
+        return Log(values[:, 0], T, np.empty((0, 3, 3)), notes=(NOTE,), stamped=False)
+    found = log(table, values[:, 0], values[:, 1:4], values[:, 4:])
+    return found._replace(notes=(NOTE,), stamped=False)

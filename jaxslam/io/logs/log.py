@@ -1,0 +1,155 @@
+"""What is read of a log, whatever its format."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam.io.text import Table
+from jaxslam.io.tum import of_xytheta, rows_as_poses
+
+UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
+STEPS = (1e-3, 10.0)
+"""The time from a pose to the next, s, by which the unit of times is told."""
+MIXED = {"error": "split", "axes": "mixed"}
+"""The convention of OpenVINS: the position in the world's axes, the rotation in the body's."""
+_LATEST = 1e11
+"""Seconds since 1970 of the year 5138."""
+
+
+NOTHING: Mapping[str, str] = MappingProxyType({})
+
+
+class Log(NamedTuple):
+    """Poses of a body in its world, in m, and their covariances."""
+
+    times: Float[np.ndarray, " n"]
+    """Seconds, or the numbers of the lines where poses have no stamps."""
+    poses: Float[np.ndarray, "n d d"]
+    """Matrices (n, 4, 4), or (n, 3, 3) in the plane; NaN where the log has none."""
+    covariances: Float[np.ndarray, "m t t"]
+    """One a pose, NaN where the log has none; or none at all."""
+    said: Mapping[str, str] = NOTHING
+    """The words of a `Convention` that the format, or the log, is known by."""
+    notes: tuple[str, ...] = ()
+    """What was made of the file, where that is a choice."""
+    stamped: bool = True
+    oriented: bool = True
+    """Whether it has orientations, or positions alone; those are then identities."""
+    world: str = ""
+    """The frame in which poses are, by its name; "" where it has none."""
+    body: str = ""
+
+
+def log(
+    table: Table,
+    times: Float[np.ndarray, " n"],
+    positions: Float[np.ndarray, "n 3"],
+    turns: Float[np.ndarray, "n 4"] | None,
+    covariances: Float[np.ndarray, "n 6 6"] | None = None,
+    said: Mapping[str, str] = NOTHING,
+    unit: str = "",
+) -> Log:
+    """A log of positions and quaternions x, y, z, w, or positions alone. Rows that are all NaN have
+    no pose.
+
+    Raises ValueError, naming file and line.
+    """
+    oriented = turns is not None
+    if turns is None:
+        turns = np.where(np.isnan(positions[:, :1]), np.nan, [0.0, 0.0, 0.0, 1.0])
+    rows = np.column_stack([times, positions, turns])
+    there = np.flatnonzero(~np.isnan(rows[:, 1:]).all(axis=1))
+    T = np.full((len(rows), 4, 4), np.nan)
+    T[there] = rows_as_poses(lambda i: table.place(there[i]), rows[there])
+    P = np.empty((0, 6, 6)) if covariances is None else covariances
+    times, notes = in_seconds(table, times, unit)
+    return Log(times, T, P, said, notes, oriented=oriented)
+
+
+def in_seconds(
+    table: Table, times: Float[np.ndarray, " n"], unit: str = ""
+) -> tuple[Float[np.ndarray, " n"], tuple[str, ...]]:
+    """Times in seconds, of the `unit` that is said; or of the only one in which they are `STEPS` apart.
+
+    Raises ValueError, naming the line, for a time that is none.
+    """
+    wrong = np.flatnonzero(~np.isfinite(times))
+    if wrong.size:
+        raise ValueError(f"{table.place(wrong[0])}: expected a finite time")
+    if unit:
+        return times * UNITS[unit], ()
+    try:
+        check_seconds(str(table.path), times)
+    except ValueError:
+        step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
+        fit = [x for x, scale in UNITS.items() if STEPS[0] <= step * scale <= STEPS[1]]
+        if len(fit) != 1:
+            raise
+        note = f"{table.path}: times are taken as {fit[0]}, {step * UNITS[fit[0]]:.3g} s apart"
+        return times * UNITS[fit[0]], (note,)
+    return times, ()
+
+
+def check_seconds(what: str, times: Float[np.ndarray, " n"]) -> None:
+    """Raise ValueError where times are too large to be seconds, since 1970 or from pose to pose."""
+    last = float(np.abs(times).max())
+    step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
+    # Seconds between two poses, more than a moving thing has.
+    if last <= _LATEST and step <= 1e3:
+        return
+    by_size = ((1e17, "nanoseconds"), (1e14, "microseconds"), (0.0, "milliseconds"))
+    by_step = ((1e6, "nanoseconds"), (0.0, "microseconds"))
+    size, units = (last, by_size) if last > _LATEST else (step, by_step)
+    unit = next(unit for least, unit in units if size >= least)
+    told = f"up to {last:.3g}" if last > _LATEST else f"{step:.3g} from one to the next"
+    raise ValueError(f"{what}: times {told} look like {unit}; expected seconds")
+
+
+def symmetric(
+    values: Float[np.ndarray, "n k"], places: Sequence[tuple[int, int]], t: int = 6
+) -> Float[np.ndarray, "n t t"]:
+    """Symmetric matrices with the columns of `values` at these places, and zeros elsewhere."""
+    P = np.zeros((len(values), t, t))
+    rows, columns = np.transpose(places)
+    P[:, rows, columns] = P[:, columns, rows] = values
+    return P
+
+
+def interpolated(
+    times: Float[np.ndarray, " m"],
+    poses: Float[np.ndarray, "m d d"],
+    at: Float[np.ndarray, " n"],
+    *,
+    beyond: bool = False,
+) -> Float[np.ndarray, "n d d"]:
+    """Poses between those of increasing `times`: positions linearly, rotations along the shortest.
+
+    NaN outside of their times, where poses `beyond` the ends are not those of the ends.
+    """
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    n = poses.shape[-1] - 1
+    after = np.clip(np.searchsorted(times, at), 1, max(len(times) - 1, 1))
+    first, second = poses[after - 1], poses[np.minimum(after, len(times) - 1)]
+    span = times[np.minimum(after, len(times) - 1)] - times[after - 1]
+    share = (at - times[after - 1]) / np.where(span > 0, span, 1.0)
+    share = np.clip(share, 0, 1) if beyond else np.where((share < 0) | (share > 1), np.nan, share)
+    result = np.tile(np.eye(n + 1), (len(at), 1, 1))
+    result[:, :n, n] = first[:, :n, n] + share[:, None] * (second - first)[:, :n, n]
+    turn = np.swapaxes(first[:, :n, :n], 1, 2) @ second[:, :n, :n]
+    if n == 2:
+        angle = share * np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
+        part = of_xytheta(np.column_stack([0 * angle, 0 * angle, angle]))[:, :2, :2]
+    else:
+        there = np.isfinite(share) & np.isfinite(turn).all(axis=(1, 2))
+        part = np.full((len(at), 3, 3), np.nan)
+        vector = Rotation.from_matrix(turn[there]).as_rotvec()
+        part[there] = Rotation.from_rotvec(share[there, None] * vector).as_matrix()
+    result[:, :n, :n] = first[:, :n, :n] @ part
+    result[np.isnan(result).any(axis=(1, 2))] = np.nan
+    return result

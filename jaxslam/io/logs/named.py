@@ -1,0 +1,100 @@
+"""Tables whose titles name their columns, in any order, whatever else they hold."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam.io.logs.log import MIXED, Log, in_seconds, log, symmetric
+from jaxslam.io.text import Table
+from jaxslam.io.tum import of_xytheta
+
+_BEFORE = r"(?:(?:field|msg|pose|transform|position|translation|pos|trans)[._ ]?)*"
+_TURN = (
+    r"(?:(?:field|msg|pose|transform|orientation|rotation|rot|quaternion|quat|att|attitude|q_rs|q)"
+    r"[._ ]?)+"
+)
+_MEANINGS = {
+    "time": re.compile(
+        r"t|(?:field\.)?(?:header\.)?(?:time_?stamps?|stamp|time|secs?|seconds)(_?s)?"
+    ),
+    "position": re.compile(rf"{_BEFORE}(?:t|p|p_rs_r)?[._ ]?([xyz])(?:_m)?"),
+    "turn": re.compile(rf"{_TURN}([xyzw])"),
+    "angle": re.compile(r"θ|theta|yaw|heading|th|psi"),
+    "variance": re.compile(r"p([xyz]{2})|q([rpy]{2})"),
+}
+_POSITION, _TURNS = "xyz", "rpy"
+_ERRORS = {
+    "type1": {"error": "right", "axes": "body"},
+    "type2": {"error": "left", "axes": "world"},
+    "type5": {"error": "split", "axes": "mixed"},
+}
+"""What cnspy calls the error of a covariance, in its column `est_err_type`."""
+
+
+def read(table: Table) -> Log | None:
+    """The poses of a table whose titles name time, position and, if any, orientation; None of
+    others. Variances are `pxx, pxy …` and `qrr, qrp …` of cnspy, with its kind of error."""
+    named = meanings(table.titles)
+    if not {"t", "x", "y"} <= named.keys() or not (named.keys() & {"z", "θ"}):
+        return None
+    time = named["t"]
+    unit = re.search(r"\[(?:ns|us|ms|s)\]|_(?:ns|us|ms)$", table.titles[time])
+    unit = unit[0].strip("[]_") if unit else ""
+    expected = f"finite numbers of {', '.join(table.titles[i] for i in sorted(named.values()))}"
+    times = table.numbers(expected, [time])[:, 0]
+    if "z" not in named:
+        return _planar(table, times, unit, table.numbers(expected, [named[x] for x in "xyθ"]))
+    turned = all(f"q{axis}" in named for axis in "xyzw")
+    turns = table.rows[:, [named[f"q{axis}"] for axis in "xyzw"]] if turned else None
+    P, said = _covariances(table, named)
+    note = "its titles do not say of which error its covariances are: taken as split, mixed"
+    notes = (note,) if said is MIXED else ()
+    positions = table.rows[:, [named[x] for x in "xyz"]]
+    found = log(table, times, positions, turns, P, said, unit)
+    return found._replace(notes=(*found.notes, *notes))
+
+
+def meanings(titles: tuple[str, ...]) -> dict[str, int]:
+    """The columns of `t`, `x`, `y`, `z`, `qx` … `qw`, `θ`, and of variances as `p` or `q` and two
+    axes; the first of each."""
+    named: dict[str, int] = {}
+    for column, title in enumerate(titles):
+        base = re.sub(r"[\[(].*", "", title.lower()).strip(" #%.")
+        for what, pattern in _MEANINGS.items():
+            if found := pattern.fullmatch(base):
+                axis = found[found.lastindex] if found.lastindex else ""
+                name = {"time": "t", "position": axis, "turn": f"q{axis}", "angle": "θ"}
+                named.setdefault(name.get(what, base), column)
+                break
+    return named
+
+
+def _planar(table: Table, times: np.ndarray, unit: str, rows: Float[np.ndarray, "n 3"]) -> Log:
+    degrees = any("deg" in title.lower() for title in table.titles)
+    seconds, notes = in_seconds(table, times, unit)
+    turned = np.column_stack([rows[:, :2], np.radians(rows[:, 2]) if degrees else rows[:, 2]])
+    return Log(seconds, of_xytheta(turned), np.empty((0, 3, 3)), notes=notes)
+
+
+def _covariances(table: Table, named: dict[str, int]) -> tuple[np.ndarray | None, dict[str, str]]:
+    places, columns = [], []
+    for name, column in named.items():
+        axes = _POSITION if name[0] == "p" else _TURNS
+        if len(name) == 3 and name[0] in "pq":
+            places.append(tuple(axes.index(x) + 3 * (axes == _TURNS) for x in name[1:]))
+            columns.append(column)
+    if not {(0, 0), (1, 1), (2, 2)} <= set(places):
+        return None, {}
+    P = symmetric(table.rows[:, columns], places)
+    kinds = {
+        x for i, column in table.words.items() if table.titles[i] == "est_err_type" for x in column
+    }
+    if len(kinds) > 1 or not kinds <= _ERRORS.keys():
+        raise ValueError(
+            f"{table.path}: est_err_type is {', '.join(sorted(kinds))}; expected one of "
+            f"{', '.join(_ERRORS)} in all lines"
+        )
+    return P, _ERRORS[kinds.pop()] if kinds else MIXED

@@ -1,0 +1,141 @@
+"""Tables without titles, told by the number of their columns and what is in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxslam._runtime.files import LARGEST
+from jaxslam.io.logs.log import MIXED, Log, in_seconds, log, symmetric
+from jaxslam.io.text import Table, read_table
+from jaxslam.io.tum import not_rigid, of_xytheta
+
+Reader = Callable[[Table], Log | None]
+EXPECTED = "eight finite numbers t tx ty tz qx qy qz qw (TUM)"
+UPPER = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+"""An upper triangle of three axes, row by row."""
+_LENGTH = 1e-2
+"""A quaternion is as long as one, to so much."""
+
+
+def _of(columns: int, read: Callable[[Table], Log]) -> Reader:
+    return lambda table: read(table) if table.rows.shape[1] == columns else None
+
+
+def _tum(table: Table) -> Log:
+    _finite_or_none(table, EXPECTED)
+    return log(table, table.rows[:, 0], table.rows[:, 1:4], table.rows[:, 4:8])
+
+
+def _planar(table: Table) -> Log:
+    rows = table.numbers("four finite numbers t x y θ (s, m, rad)")
+    far = np.flatnonzero(np.abs(rows).max(axis=1) > LARGEST)
+    if far.size:
+        raise ValueError(f"{table.place(far[0])}: expected numbers up to {LARGEST:.0e}")
+    times, notes = in_seconds(table, rows[:, 0])
+    return Log(times, of_xytheta(rows[:, 1:]), np.empty((0, 3, 3)), notes=notes)
+
+
+_KITTI = "12 finite numbers, the rows of a 3x4 T_wc (KITTI)"
+
+
+def _kitti(table: Table) -> Log:
+    """Times are those of `times.txt` beside it, else the number of the line, from 0."""
+    rows = table.numbers(_KITTI)
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, :3] = rows.reshape(-1, 3, 4)
+    wrong = np.flatnonzero(not_rigid(T, 1e-3) | ~(np.abs(rows).max(axis=1) <= LARGEST))
+    if wrong.size:
+        place = table.place(wrong[0])
+        raise ValueError(f"{place}: not a rigid motion [R t] with a rotation R; expected {_KITTI}")
+    left, _, right = np.linalg.svd(T[:, :3, :3])  # rounding to six digits, taken away
+    T[:, :3, :3] = left @ right
+    beside = table.path.parent / "times.txt"
+    if not beside.is_file():
+        return Log(np.arange(float(len(T))), T, np.empty((0, 6, 6)), stamped=False)
+    times = read_table(beside, "times", "times", "finite times in seconds")
+    seconds = times.numbers("finite times in seconds", [0])[:, 0]
+    if len(seconds) != len(T):
+        raise ValueError(
+            f"{beside} has {len(seconds)} times for the {len(T)} poses of {table.path}"
+        )
+    return Log(seconds, T, np.empty((0, 6, 6)))
+
+
+def _pose_to_file(table: Table) -> Log:
+    expected = "20 finite numbers t tx ty tz qx qy qz qw, 6 of Pr and 6 of Pp (OpenVINS)"
+    rows = _finite_or_none(table, expected)
+    places = [(3 + i, 3 + j) for i, j in UPPER] + UPPER
+    P = symmetric(rows[:, 8:], places)
+    return log(table, rows[:, 0], rows[:, 1:4], rows[:, 4:8], P, MIXED)
+
+
+def _state(table: Table) -> Log | None:
+    """A line of OpenVINS's states: `t q p …`, whose quaternions of JPL have the numbers of
+    Hamilton's, of the body in the world; for each of n cameras 15 numbers more, and 30 of the IMU.
+    """
+    columns = table.rows.shape[1]
+    if columns < 19 or columns - 19 not in (*_of_cameras(table.rows[:, 18], 15, (0, 30)),):
+        return None
+    rows = table.numbers(f"{columns} finite numbers t, q, p and the rest of OpenVINS's state")
+    return log(table, rows[:, 0], rows[:, 5:8], rows[:, 1:5])
+
+
+def is_deviations(rows: Float[np.ndarray, "n k"]) -> bool:
+    """Whether these are lines of OpenVINS's deviations, `t σ_q σ_p …`: 14 numbers more for each of
+    n cameras, and 28 or 29 of the IMU."""
+    columns = rows.shape[1]
+    return columns >= 18 and columns - 18 in _of_cameras(rows[:, 17], 14, (0, 28, 29))
+
+
+def _of_cameras(count: np.ndarray, each: int, more: tuple[int, ...]) -> tuple[int, ...]:
+    """The numbers that are behind the `count` of the cameras."""
+    n = count[0]
+    if not (np.isfinite(n) and n == round(n) and n >= 0 and (count == n).all()):
+        return ()
+    return tuple(each * int(n) + x for x in more)
+
+
+def _w_first(table: Table) -> Log | None:
+    """Lines `t p q …` with w first, of EuRoC (17 numbers) and of VINS-Mono (11)."""
+    count = table.rows.shape[1]
+    unit = np.abs(np.linalg.norm(table.rows[:, 4:8], axis=1) - 1) < _LENGTH
+    if count not in (8, 11, 17) or not unit.all() or (count == 8 and table.rows[0, 0] < 1e17):
+        return None
+    found = log(table, table.rows[:, 0], table.rows[:, 1:4], table.rows[:, [5, 6, 7, 4]])
+    note = f"{table.path}: {count} columns are taken as t p q …, with w first (EuRoC, VINS-Mono)"
+    return found._replace(notes=(*found.notes, note))
+
+
+def _positions(table: Table) -> Log:
+    """Positions alone, with the triangle of their covariance: no orientation."""
+    rows = table.numbers("10 finite numbers t x y z and the upper triangle of their covariance")
+    return log(table, rows[:, 0], rows[:, 1:4], None, symmetric(rows[:, 4:], UPPER), MIXED)
+
+
+def _finite_or_none(table: Table, expected: str) -> Float[np.ndarray, "n k"]:
+    """The rows, finite or without a pose: all NaN but for the time. Raises ValueError."""
+    rows = table.rows
+    none = without_values(rows)
+    wrong = np.flatnonzero(~np.isfinite(rows[:, 0]) | ~(none | np.isfinite(rows).all(axis=1)))
+    if wrong.size:
+        raise ValueError(f"{table.place(wrong[0])}: expected {expected}")
+    return rows
+
+
+def without_values(rows: Float[np.ndarray, "n k"]) -> Bool[np.ndarray, " n"]:
+    """A mask of the rows that have a time and NaN."""
+    return np.isnan(rows[:, 1:]).all(axis=1)
+
+
+FORMATS: tuple[tuple[str, Reader], ...] = (
+    ("EuRoC's data.csv and VINS-Mono's result, w first", _w_first),
+    ("TUM, 8 numbers", _of(8, _tum)),
+    ("t x y θ", _of(4, _planar)),
+    ("KITTI, 12 numbers", _of(12, _kitti)),
+    ("t x y z and a triangle, 10 numbers", _of(10, _positions)),
+    ("OpenVINS's states", _state),
+    ("OpenVINS's pose_to_file, 20 numbers", _of(20, _pose_to_file)),
+)

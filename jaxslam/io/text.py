@@ -1,0 +1,190 @@
+"""Tables as text, as programs and people write them: read by what is in them.
+
+Encodings with a byte order mark (UTF-8, UTF-16), comments (# or %), a line of titles; cells apart
+by commas, semicolons, tabs or spaces, quoted or not; decimal commas where a comma separates
+nothing; a separator behind the last cell.
+"""
+
+import codecs
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+_MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
+          (codecs.BOM_UTF16_BE, "utf-16"))  # fmt: skip
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
+
+
+class Table(NamedTuple):
+    """Numbers as text: what its comments say, its rows and the lines that they stand on."""
+
+    path: Path
+    comments: tuple[str, ...]
+    titles: tuple[str, ...]
+    """The names of the columns; none where no line names as many as there are."""
+    rows: Float[np.ndarray, "n k"]
+    """NaN where a cell is empty, `nan`, or in a column of `words`."""
+    lines: tuple[int, ...]
+    words: dict[int, tuple[str, ...]]
+    """The cells of the columns whose first is no number."""
+
+    def place(self, row: int | np.integer) -> str:
+        """Name a row by file and line."""
+        return f"{self.path}, line {self.lines[row]}"
+
+    def numbers(
+        self, expected: str, columns: Sequence[int] = (), *, spare: bool = True
+    ) -> Float[np.ndarray, "n m"]:
+        """Columns of finite numbers, by default all, and maybe `spare` ones.
+
+        `expected` is said in the ValueError for others.
+        """
+        count = self.rows.shape[1]
+        columns = columns or range(count)
+        if max(columns) >= count or not (spare or len(columns) == count):
+            raise ValueError(f"{self.place(0)}: expected {expected}")
+        found = self.rows[:, columns]
+        wrong = np.flatnonzero(~np.isfinite(found).all(axis=1))
+        if wrong.size:
+            raise ValueError(f"{self.place(wrong[0])}: expected {expected}")
+        return found
+
+
+def text_lines(path: str | Path, what: str = "file", *, comments: bool = False) -> dict[int, str]:
+    """The lines of a text file that are not empty, by their numbers, from 1; with the `comments`
+    (#), or without. Raises ValueError for a file, called `what`, that is no text."""
+    path = Path(path)
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{path}: cannot read the {what} ({error.strerror})") from None
+    encoding = next((name for mark, name in _MARKS if content.startswith(mark)), "utf-8")
+    try:
+        lines = content.decode(encoding).splitlines()
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: cannot be read as text") from None
+    return {
+        number: line.strip()
+        for number, line in enumerate(lines, start=1)
+        if line.strip() and (comments or not _is_comment(line))
+    }
+
+
+def read_table(path: str | Path, what: str, holds: str, row: str) -> Table:
+    """Read a file of lines with as many cells each, but for empty lines and comments.
+
+    Raises `ValueError`, naming the file and the line: it is a `what` that holds `holds`, and a
+    `row` of it is what is accepted.
+    """
+    told = text_lines(path, what, comments=True)
+    comments = [line.lstrip("#%").strip() for line in told.values() if _is_comment(line)]
+    lines = {number: line for number, line in told.items() if not _is_comment(line)}
+    named = []
+    while lines and not any(_number(cell) is not None for cell in cells(lines[min(lines)])):
+        named.append(lines.pop(min(lines)))
+    if not lines:
+        raise ValueError(f"{path} has no {holds}; expected lines of {row}")
+    first = lines[min(lines)]
+    separator = _separator(first)
+    count = len(cells(first, separator))
+    titles = _titles([*reversed(named), *reversed(comments)], count)
+    # A last cell may be empty, if there is a title for it.
+    last = len(titles) - count if titles else 0
+    rows, words = [], {}
+    for number, line in lines.items():
+        found = cells(line, separator, len(titles))
+        if len(found) != count + last:
+            raise ValueError(f"{path}, line {number}: expected {row}")
+        if not rows:
+            words = {i: [] for i, x in enumerate(found) if x and _number(x) is None}
+        values = []
+        for i, cell in enumerate(found):
+            value = math.nan if not cell else _number(cell)
+            if i in words:
+                words[i].append(cell)
+                value = math.nan
+            elif value is None:
+                raise ValueError(f"{path}, line {number}: expected {row}")
+            values.append(value)
+        rows.append(values)
+    told_words = {i: tuple(column) for i, column in words.items()}
+    table = Table(Path(path), (*comments, *named), titles, np.array(rows), tuple(lines), told_words)
+    return _without_index(table)
+
+
+def cells(line: str, separator: str | None = "?", titles: int = 0) -> list[str]:
+    """The cells of a line, of the separator that is seen in it, or of this; None are spaces.
+
+    A separator behind the last cell is none, but where there are as many `titles`.
+    """
+    if separator == "?":
+        separator = _separator(line)
+    if separator != ",":
+        line = line.replace(",", ".") if _has_decimal_commas(line, separator) else line
+        line = line.replace(",", " ") if separator is None else line
+    found = line.split(separator)
+    if separator == ",":  # and spaces, as people mix them
+        found = [part for cell in found for part in (cell.split() or [""])]
+    found = [cell.strip().strip("\"'").strip() for cell in found]
+    return found[:-1] if len(found) > 1 and not found[-1] and len(found) != titles else found
+
+
+def _separator(line: str) -> str | None:
+    for separator in (";", "\t"):
+        if separator in line:
+            return separator
+    return None if "," not in line or _has_decimal_commas(line, None) else ","
+
+
+def _has_decimal_commas(line: str, separator: str | None) -> bool:
+    found = [cell for cell in line.split(separator) if "," in cell]
+    whole = all(_DECIMAL_COMMA.fullmatch(cell.strip().strip("\"'")) for cell in found)
+    # Two numbers in a cell of a line of one cell are two cells.
+    return bool(found) and whole and len(line.split(separator)) > 1
+
+
+def _titles(lines: Sequence[str], count: int) -> tuple[str, ...]:
+    """The nearest line above the numbers that names each column."""
+    for line in lines:
+        for separator in (_separator(line), None):
+            found = line.split(separator)
+            if len(found) in (count, count + 1) and (len(found) == count or separator):
+                titles = [cell.strip().strip("\"'").strip() for cell in found]
+                if len(titles) > count and not titles[-1]:
+                    titles.pop()
+                if len(titles) > count and titles[0]:
+                    continue
+                return tuple(titles)
+    return ()
+
+
+def _without_index(table: Table) -> Table:
+    """Leave out a first column without a title, as of pandas."""
+    if not table.titles or table.titles[0]:
+        return table
+    words = {i - 1: column for i, column in table.words.items()}
+    return table._replace(titles=table.titles[1:], rows=table.rows[:, 1:], words=words)
+
+
+def numbers(told: Sequence[str], count: int, *, finite: bool = True) -> list[float] | None:
+    """Read words as `count` numbers, finite unless that is not asked for; None if they are not."""
+    found = [_number(word) for word in told]
+    if len(found) != count or any(x is None or (finite and not math.isfinite(x)) for x in found):
+        return None
+    return [x for x in found if x is not None]
+
+
+def _number(cell: str) -> float | None:
+    try:
+        return float(cell)
+    except ValueError:
+        return None
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith(("#", "%"))
