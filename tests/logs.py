@@ -239,11 +239,14 @@ def states(cameras):
 
     def write(folder):
         more = np.zeros((STEPS, 9 + 1 + 1 + 15 * cameras))
+        more[:, 10] = cameras
         header = "# timestamp(s) q p v bg ba cam_imu_dt num_cam cam0_k cam0_d cam0_rot ...\n"
         for name, T in (("estimate", ESTIMATE), ("groundtruth", TRUTH)):
             state = TIMES, quaternions(T[:, :3, :3]), T[:, :3, 3], more
             lines(folder / f"state_{name}.txt", *state, header=header)
-        sigma = SIGMA[:, 3:], SIGMA[:, :3], np.zeros((STEPS, 9 + 1 + 1 + 14 * cameras))
+        spread = np.zeros((STEPS, 9 + 1 + 1 + 14 * cameras))
+        spread[:, 10] = cameras
+        sigma = SIGMA[:, 3:], SIGMA[:, :3], spread
         lines(folder / "state_deviation.txt", TIMES, *sigma, header="# timestamp(s) q p v …\n")
 
     return write

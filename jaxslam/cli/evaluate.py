@@ -30,9 +30,10 @@ class EvaluateOptions:
     """Arrays, a trajectory, a folder or ROS bags. Arrays: FILE.npz (or .mat) with errors and
     covariances, innovations and covariances, or estimates, covariances and truths; FILE.csv with
     lines of run, step, errors, upper triangle. Trajectory: any text whose titles name t, x, y, z,
-    qx … qw; TUM; t x y θ; OpenVINS; EuRoC; VINS-Mono; KITTI; g2o; RTKLIB; SQUARE. Folder: estimate.txt, covariance.txt and truth.txt, or OpenVINS's state_estimate.txt,
-    state_deviation.txt and state_groundtruth.txt, or one sub-folder of these per run. Runs may
-    differ in length."""
+    qx … qw; TUM; t x y θ; OpenVINS; EuRoC; VINS-Mono; KITTI; g2o; RTKLIB; SQUARE. Folder:
+    estimate.txt, covariance.txt and truth.txt, or OpenVINS's state_estimate.txt,
+    state_deviation.txt and state_groundtruth.txt, or one sub-folder of these per run, or
+    trajectories with their covariances beside one truth.txt. Runs may differ in length."""
     covariance: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Covariances of the trajectory's poses (docs/covariance-format.md)."""
     truth: Annotated[str | None, tyro.conf.arg(metavar="FILE|TOPIC")] = None

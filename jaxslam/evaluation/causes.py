@@ -1,7 +1,6 @@
 """The causes of a wrong NEES that lie between the logs, not in the filter.
 
-Quaternions with w first, a constant rotation and lever arm between the bodies of estimate and truth,
-two worlds, an alignment that takes what the filter observes, half angles, runs with the same rows.
+Quaternions with w first, a constant rotation and lever arm between the bodies, two worlds, an alignment that takes what the filter observes, half angles, runs with the same rows.
 Each is found only beyond doubt, with a number and the NEES without it; then there is no verdict.
 """
 
@@ -27,6 +26,8 @@ ROUNDS = 8
 """Alignments, and fits of the mounting, in turn."""
 LESS = 3.0
 """The factor by which a constant that is fitted lessens the errors that it explains."""
+MANY = 10
+"""Poses that are equal by chance are fewer."""
 WORSE = ("over-confident", "lost")
 
 
@@ -59,7 +60,7 @@ def _instead(found: Evaluation, fixed: Evaluation) -> str:
 def _angles(R: Float[np.ndarray, "*k n n"]) -> Float[np.ndarray, "*k"]:
     n = R.shape[-1]
     chord = np.linalg.norm(R - np.eye(n), axis=(-2, -1)) / np.sqrt(2)
-    return 2 * np.arcsin(np.clip(chord / 2, 0.0, 1.0))
+    return np.asarray(2 * np.arcsin(np.clip(chord / 2, 0.0, 1.0)))
 
 
 def _mean_rotation(R: Float[np.ndarray, "k n n"]) -> Float[np.ndarray, "n n"]:
@@ -86,7 +87,7 @@ def _repeated(poses: Poses) -> Iterator[Mistake]:
         for first in range(second):
             fewest = min(len(rows[first]), len(rows[second]))
             same = len(rows[first] & rows[second])
-            if fewest > 2 and same > 0.5 * fewest:
+            if same >= MANY and same > 0.5 * fewest:
                 yield Mistake(
                     "the same run twice",
                     f"run {first} and run {second} share {same} of {fewest} estimates to the last "

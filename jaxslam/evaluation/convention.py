@@ -10,8 +10,8 @@ are the errors. To first order right and split are the same but for the axes; le
 adjoint of T̂. Every error may then be written along other axes, turned by R̂: `body`, `world` (ROS:
 split, world) or `mixed`, the position along the world's and the rotation about the body's (MSCKF,
 error-state filters: split, mixed; GTSAM: right, body, rotation-first). With `rpy` the rotation is
-of roll, pitch and yaw, `R = Rz(yaw) Ry(pitch) Rx(roll)` (robot_localization: split, rpy). A covariance is `marginal`,
-or `given` the scale of the world, of which its filter then knows nothing.
+of roll, pitch and yaw, `R = Rz(yaw) Ry(pitch) Rx(roll)` (robot_localization: split, rpy). A
+covariance is `marginal`, or `given` the scale of the world, of which its filter then knows nothing.
 
 All matrices that change one into another have determinant one: a wrong convention keeps
 `log det P` and raises the expected NEES, to `tr(P_wrong⁻¹ P)`.
@@ -114,10 +114,12 @@ def alternatives(convention: Convention, geometry: Geometry) -> tuple[Convention
     ours = convention.error if convention.error != "left" else "right"
     turned = convention.axes if convention.axes != "body" else "world"
     axes = ("body", turned) if geometry is PLANAR else CHOICES["axes"]
-    if ours != "split" and turned != "rpy":
-        axes = tuple(x for x in axes if x != "rpy")
     choices = product((ours, "left"), axes, CHOICES["order"])
-    return tuple(Convention(*choice, convention.scale) for choice in choices)
+    return tuple(
+        Convention(error, axes, order, convention.scale)
+        for error, axes, order in choices
+        if axes != "rpy" or error == ours or convention.axes == "rpy"
+    )
 
 
 def geometry_of(poses: Matrices) -> Geometry:

@@ -93,6 +93,9 @@ class Identification:
     """Whether the data are consistent with the stated one too, be another the better."""
     whole: bool = False
     """Whether all axes together are: position or rotation alone may not be."""
+    better: tuple[Convention, int, int] | None = None
+    """Where none makes the data consistent, the one that fits better than the stated one beyond
+    doubt, in how many runs, and of how many."""
 
     @property
     def convention(self) -> Convention | None:
@@ -114,6 +117,13 @@ class Identification:
         """The result in a line."""
         if not self.consistent and self.whole:
             return "σ of position or rotation alone is wrong under every convention tried"
+        if self.better is not None:
+            other, count, runs = self.better
+            return (
+                f"no convention of the covariance makes the data consistent, but {other} fits "
+                f"better than {self.stated} in {count} of {runs} runs, NEES "
+                f"{self.nees[other]:.4g} instead of {self.nees[self.stated]:.4g}"
+            )
         if not self.consistent:
             return "no other convention of the covariance would make the data consistent"
         alike = _ALIKE if self.consistent[0].error in ("right", "split") else ""
@@ -148,6 +158,7 @@ class Identification:
             "stated": asdict(self.stated),
             "convention": None if self.convention is None else asdict(self.convention),
             "consistent": [asdict(c) for c in self.consistent],
+            "better": None if self.better is None else asdict(self.better[0]),
             "nees": [asdict(c) | {"nees": nees} for c, nees in self.nees.items()],
         }
 
@@ -173,7 +184,25 @@ def identify(
         if not fits or (best is not None and not _scale_was_free(best, best_free)):
             equal = ()
     means = {c: float(np.nanmean(x.nees)) for c, x in finite.items()}
-    return Identification(stated, means, equal, stands, whole)
+    better = None if equal or own is None else _better(stated, own, _finite(tried))
+    return Identification(stated, means, equal, stands, whole, better)
+
+
+def _better(
+    stated: Convention, own: Tried, tried: Mapping[Convention, Tried]
+) -> tuple[Convention, int, int] | None:
+    """The one that fits best, if better than the stated one beyond doubt, run by run."""
+    best = min(
+        tried, key=lambda c: tried[c].log_determinant / tried[c].dof + np.log(_mean(tried[c]))
+    )
+    if best == stated or not _worse(own.nees, tried[best].nees):
+        return None
+    lower = np.nanmean(tried[best].nees, axis=1) < np.nanmean(own.nees, axis=1)
+    return best, int(lower.sum()), len(lower)
+
+
+def _mean(tried: Tried) -> float:
+    return max(float(np.nanmean(tried.nees)), 1e-300)
 
 
 def _finite(tried: Mapping[Convention, Tried]) -> dict[Convention, Tried]:

@@ -16,7 +16,7 @@ from jaxslam._runtime.files import LARGEST, one_line, read_arrays
 from jaxslam._runtime.lookup import suggestion
 from jaxslam.evaluation.convention import CHOICES, Joints, Values, geometry_of
 from jaxslam.io.logs.log import check_seconds
-from jaxslam.io.text import read_table
+from jaxslam.io.text import Table, read_table
 from jaxslam.io.tum import not_rigid, of_xytheta, poses
 from jaxslam.statistics.bands import Mask, PerAxis, PerStep
 
@@ -321,7 +321,6 @@ def checked_poses(estimates: ArrayLike, covariances: ArrayLike, truths: ArrayLik
             f"{joint}, not {P.shape}"
         )
     joints = P if P.shape == joint else None
-    P = P if joints is not None else without_unknown(P)
     if joints is not None:
         blocks = joints.reshape(runs, steps, t, steps, t)
         P = np.moveaxis(blocks[:, range(steps), :, range(steps)], 0, 1)
@@ -345,7 +344,7 @@ def without_unknown(P: Float[np.ndarray, "runs steps t t"]) -> Float[np.ndarray,
     variance = np.diagonal(P, axis1=2, axis2=3)
     there = ~np.isnan(variance)
     unknown = (((variance == -1) | (variance >= UNKNOWN)) | ~there).all(axis=(0, 1))
-    if not unknown.any() or not there.any():
+    if not unknown.any() or unknown.all():
         return P
     P, axes = P.copy(), np.flatnonzero(unknown)
     P[..., axes, :] = np.where(np.isnan(P[..., axes, :]), np.nan, 0.0)
@@ -451,7 +450,7 @@ def read_csv(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...], tuple[
             f"{path}: {rows.shape[1]} columns{told}; expected {row}: {_COLUMNS} columns; or all n² "
             "numbers, n σ named sigma…, or nees and dof by these names. A trajectory needs --truth"
         )
-    table.numbers(row, range(found.before))
+    _check_rows(table, found, row)
     before, n, kind = found
     told = rows[:, :2] if before == 2 else np.column_stack([np.zeros(len(rows)), rows[:, 0]])
     places, runs, steps = _rectangle(path, told, lines)
@@ -489,6 +488,18 @@ def read_pose_log(
         expected = f"expected all steps from 1 to {steps} of runs 0 to {runs - 1}"
         raise ValueError(f"{path}: {wrong[0]} is missing or duplicated; {expected}")
     return logged, arrays["covariances"]
+
+
+def _check_rows(table: Table, found: _Columns, row: str) -> None:
+    """Raise ValueError, naming the line, unless numbers are finite, or errors or covariances, or
+    NEES, all NaN."""
+    before, n = found.before, max(found.n, 1)
+    errors, P = (np.isnan(x) for x in np.split(table.rows[:, before:], [n], axis=1))
+    without = errors.all(axis=1) | (P.all(axis=1) & (found.n > 0))
+    finite = np.isfinite(table.rows)
+    wrong = ~finite[:, :before].all(axis=1) | ~(without | finite.all(axis=1))
+    if wrong.any():
+        raise ValueError(f"{table.place(np.argmax(wrong))}: expected {row}")
 
 
 def _columns(titles: list[str], rows: Float[np.ndarray, "k c"]) -> _Columns | None:

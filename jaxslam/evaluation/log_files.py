@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +11,13 @@ from typing import TypedDict
 import numpy as np
 
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE
+from jaxslam.evaluation.clock import Offset
 from jaxslam.evaluation.convention import CHOICES, Convention
 from jaxslam.evaluation.inputs import ARRAYS, STEP_FIRST, of_sigmas, read_arrays_of, read_csv
 from jaxslam.evaluation.pairing import Place, RunFiles, RunLog, read_run
 from jaxslam.evaluation.poses import evaluate_poses
 from jaxslam.evaluation.result import Evaluation, advice, evaluate, evaluate_nees
+from jaxslam.evaluation.sanity_checks import Mistake
 from jaxslam.evaluation.tracked_frames import left_out
 from jaxslam.io import ros
 from jaxslam.io.logs import read_log
@@ -58,9 +59,10 @@ def evaluate_log(
     itself, and `truth`, or a folder. A folder has a run of `estimate.txt`, `covariance.txt` and
     `truth.txt`, or one per sub-folder, or trajectories with their covariances beside one truth, or
     ROS bags. The topics of a bag are named by `estimate` and `truth` where several fit. The stamps
-    of the estimate are late by the `time_offset`, s, or by what its rotations say (`auto`). Where the tracker's
-    `frames.csv` is beside a trajectory, its longest map is evaluated, without frames that are lost
-    or whose unit was not fixed yet. What is `stated` of the convention (`error`, `axes`, `order`,
+    of the estimate are late by the `time_offset`, s, or by what its rotations say (`auto`). Where
+    the tracker's `frames.csv` is beside a trajectory, its longest map is evaluated, without frames
+    that are lost or whose unit was not fixed yet. What is `stated` of the convention (`error`,
+    `axes`, `order`,
     `scale`) comes before what the files say. For the alignment of poses, the axes used and the
     σ of the truth see `evaluate_poses`. With `nis` errors are innovations. The
     `innovations` of the same filter, in an npz or CSV file, say what to turn (`advice`), and so do
@@ -148,6 +150,10 @@ def _refuse_options(stated: dict[str, str], how: PoseOptions) -> None:
 ESTIMATES = ("estimate.txt", "trajectory.txt", "state_estimate.txt")
 COVARIANCES = ("covariance.txt", "state_deviation.txt")
 TRUTHS = ("truth.txt", "groundtruth.txt", "state_groundtruth.txt", "reference.txt", "ref.txt")
+LOOKED_AT = 10
+"""The most runs whose clocks are looked at."""
+CLEARLY = 1.2
+"""The factor by which a NEES falls without its cause."""
 TEXTS = (".txt", ".csv", ".tum", ".pos", ".smfeval", ".dat", ".g2o")
 """Endings of a file of these names; what it is says its content."""
 
@@ -198,7 +204,7 @@ def _beside_one_truth(source: Path, truth: str | Path | None) -> tuple[RunFiles,
     """Every other trajectory of a folder as a run, with its covariances, against one truth."""
     true = _only(source, TRUTHS) if truth is None else Path(truth)
     files = sorted(x for x in source.glob("*") if x.suffix in TEXTS and x.is_file() and x != true)
-    if true is None or not files:
+    if true is None or not files or _only(source, COVARIANCES) is not None:
         raise ValueError(
             f"{source} has neither {ESTIMATES[0]} nor sub-folders, one per run, nor trajectories "
             f"beside one {TRUTHS[0]}"
@@ -232,9 +238,9 @@ def _run(folder: Path, covariance: str | Path | None, truth: str | Path | None) 
 def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
     """The one file of these names, of any ending of a text. Raises ValueError where there are two,
     maybe of two runs."""
-    stems = {Path(name).stem for name in names}
-    files = sorted(x for x in folder.glob("*") if x.stem in stems and x.suffix in TEXTS)
-    there = [path for path in files if path.is_file()]
+    stems = [Path(name).stem for name in names]
+    files = (x for x in folder.glob("*") if x.stem in stems and x.suffix in TEXTS and x.is_file())
+    there = sorted(files, key=lambda path: (stems.index(path.stem), path.suffix))
     if len(there) > 1:
         raise ValueError(f"{folder} has both {' and '.join(path.name for path in there)}; keep one")
     return there[0] if there else None
@@ -262,24 +268,26 @@ def evaluate_runs(
     if len({one.estimates.shape[1:] for one in read}) > 1:
         raise ValueError(f"{source}: planar and spatial runs cannot be mixed")
     names = tuple(run.name for run in runs)
-    truths = [np.where(x.evaluated.poses[:, None, None], x.truths, np.nan) for x in read]
     longest = max(read, key=lambda one: len(one.times))
     told: tuple[str, ...] = ()
     if not all(one.oriented for one in read) and not how["axes_used"]:
         how = {**how, "axes_used": ("x", "y", "z")}
         told = ("without orientations: positions alone are compared (--axes-used x,y,z)",)
-    found = named(
-        runs[0].estimate if len(runs) == 1 else source,
-        lambda: evaluate_poses(
-            _filled_up([one.estimates for one in read]),
-            _filled_up([one.covariances for one in read]),
-            _filled_up(truths),
-            convention,
-            times=longest.times,
-            **how,
-        ),
-        names,
-    )
+    place = runs[0].estimate if len(runs) == 1 else source
+    found = named(place, lambda: _compared(read, convention, how), names)
+    if late := _clocks(read, found):
+        offset, sigma = late
+        again = [read_run(run, offset) for run in runs]
+        fixed = _compared(again, convention, how)
+        before, after = (float(np.mean(x.nees[x.logged])) for x in (found, fixed))
+        if after < before / CLEARLY:
+            clock = Mistake(
+                "the clocks of estimate and truth differ",
+                f"the stamps of the estimate are {1e3 * offset:.1f} ± {1e3 * sigma:.1g} ms late, by "
+                f"its rotations: with --time-offset {offset:.4f} (or auto) NEES is {after:.4g} "
+                f"instead of {before:.4g}",
+            )
+            found = replace(found, causes=(clock,))
     told += (
         *left_out([one.evaluated for one in read]), *_remarks(read), *_other_times(read, longest),
     )  # fmt: skip
@@ -288,14 +296,39 @@ def evaluate_runs(
     return replace(found, notes=(*found.notes, *told), run_names=names)
 
 
+def _compared(read: list[RunLog], convention: Convention, how: PoseOptions) -> Evaluation:
+    truths = [np.where(x.evaluated.poses[:, None, None], x.truths, np.nan) for x in read]
+    return evaluate_poses(
+        _filled_up([one.estimates for one in read]),
+        _filled_up([one.covariances for one in read]),
+        _filled_up(truths),
+        convention,
+        times=max((one.times for one in read), key=len),
+        **how,
+    )
+
+
+def _clocks(read: list[RunLog], found: Evaluation) -> tuple[float, float] | None:
+    """By how much the estimates are late and its σ, by the rotations of all runs; None where that
+    is not beyond doubt, or the filter is not over-confident, or another cause is named."""
+    if found.causes or found.verdict["word"] not in ("over-confident", "lost"):
+        return None
+    offsets = [one.offset for one in read[:LOOKED_AT]]
+    late, sigma = (
+        np.array([(x.seconds, x.sigma) for x in offsets if x is not None]).reshape(-1, 2).T
+    )
+    if not len(late):
+        return None
+    weight = 1 / np.maximum(sigma, 1e-9) ** 2
+    all_runs = Offset(float(late @ weight / weight.sum()), float(weight.sum() ** -0.5))
+    return (all_runs.seconds, all_runs.sigma) if all_runs.found else None
+
+
 def _remarks(read: list[RunLog]) -> Iterator[str]:
     """The remarks of all runs, with their counts added where they differ in those alone."""
-    logged = sum(len(one.times) for one in read)
-    counts: Counter[str] = Counter()
-    for one in read:
-        counts.update(one.left_out)
-    for what, count in counts.items():
-        yield what.format(count=count, logged=logged)
+    for what in dict.fromkeys(what for one in read for what in one.left_out):
+        counts = np.array([one.left_out.get(what, (0, len(one.times))) for one in read]).sum(axis=0)
+        yield f"{counts[0]} of {counts[1]} {what}, and are left out"
     said = dict.fromkeys(note for one in read for note in one.notes)
     yield from said if len(said) <= 3 else [*list(said)[:2], f"and {len(said) - 2} more such"]
     shortest, longest = (f(len(one.times) for one in read) for f in (min, max))
@@ -336,14 +369,18 @@ def named(
     steps: Sequence[str] = (),
 ) -> Evaluation:
     """Evaluate, with the names of file, runs and steps in every error."""
-    try:
-        return evaluation()
-    except ValueError as error:
-        told = str(error)
+
+    def renamed(told: str) -> str:
         for place, names in ((r"\brun (\d+)", runs), (r"\bstep (\d+)", steps)):
             if names:
                 told = re.sub(place, lambda found, names=names: names[int(found[1])], told)
-        raise ValueError(f"{source}: {told}") from None
+        return told
+
+    try:
+        found = evaluation()
+        return replace(found, causes=tuple(x._replace(told=renamed(x.told)) for x in found.causes))
+    except ValueError as error:
+        raise ValueError(f"{source}: {renamed(str(error))}") from None
 
 
 def _other_times(read: list[RunLog], longest: RunLog) -> Iterator[str]:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.evaluation.alignment import MAX_TIME_DIFFERENCE, associated
-from jaxslam.evaluation.clock import clock_offset
+from jaxslam.evaluation.clock import Offset, clock_offset
 from jaxslam.evaluation.convention import (
     Convention,
     CovarianceText,
@@ -60,9 +60,19 @@ class RunLog(NamedTuple):
     evaluated: EvaluatedPoses
     """The poses that have a part in the verdict, by the tracker's own record of its frames."""
     oriented: bool
-    left_out: dict[str, int]
-    """Sentences with a `{count}` of the poses of all runs, and theirs of this one."""
+    left_out: dict[str, tuple[int, int]]
+    """What is left out: how many, and of how many."""
     notes: tuple[str, ...]
+    raw: tuple[Log, Log]
+    """The estimate as it is stamped, and the truth."""
+
+    @property
+    def offset(self) -> Offset | None:
+        """By how much the estimate is late, by its rotations."""
+        own, true = self.raw
+        if not self.oriented or not own.stamped:
+            return None
+        return clock_offset(own.times, own.poses, true.times, true.poses)
 
 
 def read(place: Place) -> Log:
@@ -96,6 +106,8 @@ def read_run(run: RunFiles, time_offset: float | str = 0.0) -> RunLog:
             "beside them, or lines of TUM)"
         )
     if run.covariance == run.estimate:
+        if not len(log.covariances):
+            raise ValueError(f"{run.estimate} has no covariances; give them by --covariance FILE")
         text = CovarianceText(log.times, log.covariances, dict(log.said))
     else:
         text = read_covariances(Path(str(run.covariance)), geometry_of(log.poses).tangent_dim)
@@ -104,11 +116,13 @@ def read_run(run: RunFiles, time_offset: float | str = 0.0) -> RunLog:
     P, used = _nearest(run, log.times, text)
     if isinstance(run.covariance, ros.Topic):
         P = _filled_in(run.covariance, P)
-    log, P, left_out = _with_covariances(log, P)
+    there = ~np.isnan(log.poses[:, 0, 0])
+    left_out = _counted("poses of the estimate are NaN", ~there)
+    log, P = log._replace(times=log.times[there], poses=log.poses[there]), P[there]
     notes = [*log.notes, *truth.notes, *text.notes, *_other_frames(log, truth)]
     oriented, told = _oriented(log, truth)
     notes += told
-    times = log.times
+    raw, times = log, log.times
     if time_offset == "auto":
         found = clock_offset(times, log.poses, truth.times, truth.poses) if oriented else None
         time_offset = 0.0 if found is None else found.seconds
@@ -117,18 +131,23 @@ def read_run(run: RunFiles, time_offset: float | str = 0.0) -> RunLog:
     log = log._replace(times=times)
     true, estimates, more = _truths(run, log, truth, P, Convention(**text.said), oriented=oriented)
     notes += more
-    there = ~np.isnan(P[:, 0, 0])
-    if missing := int(np.sum(~there)):
-        left_out[
-            f"{{count}} of {{logged}} poses have no covariance {_WITHIN}, and are left out"
-        ] = missing
-    if missing := int(np.sum(np.isnan(true[:, 0, 0]))):
-        left_out["{count} of {logged} poses have no truth, and are left out"] = missing
+    left_out |= _counted(f"poses have no covariance {_WITHIN}", np.isnan(P[:, 0, 0]))
+    left_out |= _counted("poses have no truth", np.isnan(true[:, 0, 0]))
     if unused := len(text.times) - used:
-        left_out["{count} covariances are at no time of the estimate, and are left out"] = unused
+        left_out["covariances are at no time of the estimate"] = unused, len(text.times)
     those = evaluated_poses(_folder(run.estimate), log.times, exactly_known(P))
     result = RunLog(
-        run, times, estimates, P, true, text.said, those, oriented, left_out, tuple(notes)
+        run,
+        times,
+        estimates,
+        P,
+        true,
+        text.said,
+        those,
+        oriented,
+        left_out,
+        tuple(notes),
+        (raw, truth),
     )
     _check_share(result, text.times, truth.times)
     return result
@@ -199,14 +218,8 @@ def _filled_in(topic: ros.Topic, P: Float[np.ndarray, "n t t"]) -> Float[np.ndar
     return np.where(without[:, None, None], np.nan, P)
 
 
-def _with_covariances(log: Log, P: np.ndarray) -> tuple[Log, np.ndarray, dict[str, int]]:
-    """Take away the poses that are NaN."""
-    there = ~np.isnan(log.poses[:, 0, 0])
-    left_out = {}
-    if missing := int(np.sum(~there)):
-        left_out["{count} poses of the estimate are NaN, and are left out"] = missing
-    log, P = log._replace(times=log.times[there], poses=log.poses[there]), P[there].copy()
-    return log, P, left_out
+def _counted(what: str, missing: Bool[np.ndarray, " n"]) -> dict[str, tuple[int, int]]:
+    return {what: (int(missing.sum()), len(missing))} if missing.any() else {}
 
 
 def _other_frames(log: Log, truth: Log) -> list[str]:
@@ -227,11 +240,11 @@ def _other_frames(log: Log, truth: Log) -> list[str]:
 
 def _oriented(log: Log, truth: Log) -> tuple[bool, list[str]]:
     """Whether both have orientations; a truth whose rotation is always 1 has none, where the
-    estimate turns by more than 3°."""
+    estimate turns by more than 10°."""
     if not (log.oriented and truth.oriented) or log.poses.shape[-1] == 3:
         return log.oriented and truth.oriented, []
     R, fixed = log.poses[:, :3, :3], truth.poses[~np.isnan(truth.poses[:, 0, 0]), :3, :3]
-    turned = np.trace(R[0].T @ R, axis1=1, axis2=2).min() < 1 + 2 * np.cos(np.radians(3.0))
+    turned = np.trace(R[0].T @ R, axis1=1, axis2=2).min() < 1 + 2 * np.cos(np.radians(10.0))
     if len(fixed) and turned and (fixed == np.eye(3)).all():
         return False, ["every orientation of the truth is 0 0 0 1: it has none"]
     return True, []

@@ -22,6 +22,7 @@ from jaxslam.evaluation.convention import (
     geometry_of,
     pose_errors,
     truth_derivatives,
+    turning,
 )
 from jaxslam.evaluation.convention_search import Identification, Tried, identify
 from jaxslam.evaluation.inputs import (
@@ -35,6 +36,7 @@ from jaxslam.evaluation.inputs import (
     without_known,
 )
 from jaxslam.evaluation.result import Evaluation
+from jaxslam.evaluation.sanity_checks import Mistake
 from jaxslam.evaluation.scale import Scale, at_one_scale, of_aligned
 from jaxslam.geometry import Geometry
 from jaxslam.statistics.bands import Mask, PerStep
@@ -111,6 +113,8 @@ def evaluate_poses(
         return as_stated(poses, stated, align, tuple(axes) or found.names, sigma)
 
     told = tuple(causes(poses, stated, align, found, compared))
+    if not told and identified.doubtful and not identified.stands:
+        told = (Mistake("the convention of the covariances is another", identified.sentence),)
     how = {"times": at, "timed": times is not None, "identified": identified}
     return replace(found, causes=told, **how)
 
@@ -216,17 +220,29 @@ def _identified(poses: Poses, stated: Convention, options: _Options) -> Identifi
         for convention in conventions:
             with suppress(ValueError):  # a wrong one may make no covariance of its numbers
                 found = _compared(poses, convention, options)
-                result[convention] = _tried(convention, geometry, found, used)
+                one = _tried(convention, geometry, found, used)
+                result[convention] = one._replace(
+                    log_determinant=one.log_determinant - _log_volume(convention, poses)
+                )
         return result
 
-    # With one axis of rotation mixed is world, as in the plane.
+    # With one axis of rotation mixed and rpy are world, as in the plane.
     flat = sum(name.startswith("r") for name in used) < 2
-    other = "world" if stated.axes == "mixed" else "mixed"
-    same = [c for c in alternatives(stated, geometry) if not flat or c.axes != other]
+    turned = stated.axes if stated.axes != "body" else "world"
+    same = [c for c in alternatives(stated, geometry) if not flat or c.axes in ("body", turned)]
     if stated.scale == "given" or options.align != "none":
         return identify(stated, tried(same))
     given = [replace(convention, scale="given") for convention in same]
     return identify(stated, tried(same), lambda: tried(given))
+
+
+def _log_volume(convention: Convention, poses: Poses) -> float:
+    """The log determinant of a covariance along the convention's axes over that of orthogonal ones:
+    angles that follow one another are not."""
+    if convention.axes != "rpy":
+        return 0.0
+    volume = np.linalg.slogdet(turning(convention, poses.estimates[poses.logged]))[1]
+    return 2 * float(volume.mean())
 
 
 def _tried(

@@ -8,7 +8,6 @@ import jaxslam
 from jaxslam.cli import main
 from jaxslam.evaluation import Convention, evaluate_log, evaluate_nees, read_covariances
 from jaxslam.evaluation.convention import write_covariances
-from jaxslam.evaluation.inputs import ASYMMETRY
 from jaxslam.io.tum import write_tum
 
 E, P = drawn()
@@ -48,9 +47,8 @@ OF_NUMBERS = [
     (arrays(E, P[:, :3]), r"covariances must be \(60, 7, 3, 3\), not \(60, 3, 3, 3\)"),
     (arrays(E, P[..., 0]), r"covariances must be an array \(runs, steps, n, n\)"),
     (arrays(changed(E, (4, 2, 1), np.nan), P), "errors of run 4, step 2 holds nan"),
-    (arrays(changed(E, (2, 4), np.nan), P), "errors of run 2, step 4 holds nan"),
     (spoilt_P((5, 1, 0, 0), np.inf), "covariances of run 5, step 1 holds inf"),
-    (spoilt_P((2, 4), np.nan), "covariances of run 2, step 4 holds nan"),
+    (spoilt_P((2, 4, 0, 1), np.nan), "covariances of run 2, step 4 holds nan"),
     (all_nan, "run 2 is all NaN"),
     (spoilt_P((3, 4), -np.eye(3)), "run 3, step 4 has variance -1 at place 0"),
     (
@@ -105,7 +103,7 @@ OF_POSES = [
         poses(T, POSE_P, TRUTH, Convention(scale="given"), align="se3"),
         "--align sim3, or se3 if the first covariance is zero",
     ),
-    (poses(align="rigid"), "unknown align 'rigid'; known: none, se3, sim3"),
+    (poses(align="rigid"), "unknown align 'rigid'; known: none, yaw, se3, sim3"),
     (poses(*STILL, np.tile(np.eye(4), (40, 6, 1, 1)), align="sim3"), "coincide"),
 ]
 
@@ -174,17 +172,15 @@ OF_FILES = [
     (csv((0, 0, 1.0, 1.0), (0, 1, 1.0)), "line 2: expected numbers run, step, n errors"),
     (csv((0, 0, 1.0, 1.0, 3.0)), "5 columns; expected numbers run, step"),
     (csv((0, 0, 1.0, 1.0, 3.0)), "4 for n = 1, 7 for 2, 11 for 3, 29 for 6"),
-    (csv(text="0;0;1,0;1,0\n"), "line 1: expected numbers run, step"),
     (csv((0, 0, 1.0, 1.0), (0, 0, 2.0, 1.0)), "line 2: run 0, step 0 appears twice"),
     (csv(*SIX_STEPS), "6 different"),
-    (csv((0, 0, "nan", 1.0)), "line 1: expected numbers run"),
+    (csv((0, 0, "nan", 1.0)), "run 0 is all NaN"),
+    (csv((0, 0, 1.0, 2.0, 1.0, "nan", 1.0)), "line 1: expected numbers run"),
     (csv((0, 0, 1.0, -1.0)), "run 0, step 0 has variance -1"),
     (csv((1, 1, 1, 1), (1, 2, 1, 1), (3, 2, 1, -1)), "run 3, step 2 has variance"),
     (csv(text="run,step,e,P\n"), "has no errors"),
-    (
-        csv(text="run,step,nees,dof\n0,0,1,3\n0,1,1,4\n"),
-        "dof must be the same whole number on every line",
-    ),
+    (csv(text="run,step,nees,dof\n0,0,1,3\n0,1,1,4.5\n"), "dof must be one whole number from 1"),
+    (csv(text="run,step,nees,dof\n0,0,1,3\n0,1,1,nan\n"), "line 3: expected numbers run, step"),
     (npz(errors=np.ones((1, 1, 1))), "errors and covariances"),
     (npz(eror=np.ones((1, 1, 1))), r"unknown array 'eror' \(did you mean error\?\)"),
     (npz(errors=np.array([None])), "not an npz file of numbers"),
@@ -294,13 +290,7 @@ OF_FOLDERS = [
     (stated(np.eye(6)), "states a different convention"),
     (stated(-np.eye(6), Convention()), ": the covariance of run01, step 0 has variance -1"),
     (times(offset=0.05), r"truth\.txt have no time stamps in common"),
-    (shown(nanoseconds), "1.4e.18 look like nanoseconds; expected seconds"),
-    (shown(nanoseconds, "covariance.txt"), r"covariance\.txt: times .* like nanoseconds"),
-    (shown(lambda t: f"{t * 1e3:.0f}", "truth.txt"), r"truth\.txt: .* like milliseconds"),
-    (
-        shown(lambda t: f"{(t - 1.4e9) * 1e9:.0f}"),
-        r"times 1e\+08 from one to the next look like nanoseconds",
-    ),
+    (shown(lambda t: f"{t * 1e8:.0f}"), r"1\.4e.17 look like nanoseconds; expected seconds"),
     (
         shown(lambda t: f"{t:g}"),
         "its 40 poses have only 1 different times, perhaps printed with too few digits",
@@ -351,5 +341,5 @@ def test_what_is_nearly_singular_or_rounded_is_no_fault():
     nearly = changed(P, (6, 5), np.ones((3, 3)) + 1e-3 * np.eye(3) - 5e-3)
     assert jaxslam.evaluate(E, nearly).runs == 60
     rounded = P.copy()
-    rounded[..., 0, 1] *= 1 + ASYMMETRY / 100
+    rounded[..., 0, 1] *= 1 + 1e-7
     jaxslam.evaluate(E, rounded)

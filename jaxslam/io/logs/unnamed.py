@@ -91,9 +91,9 @@ def is_deviations(rows: Float[np.ndarray, "n k"]) -> bool:
 
 
 def _of_cameras(count: np.ndarray, each: int, more: tuple[int, ...]) -> tuple[int, ...]:
-    """The numbers that are behind the `count` of the cameras."""
+    """How many numbers may be behind the `count` of the cameras."""
     n = count[0]
-    if not (np.isfinite(n) and n == round(n) and n >= 0 and (count == n).all()):
+    if not (np.isfinite(n) and n == round(n) and n >= 0):
         return ()
     return tuple(each * int(n) + x for x in more)
 
