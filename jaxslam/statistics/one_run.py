@@ -30,6 +30,13 @@ mechanics*, 1997, takes 5): more make the number of independent steps too small,
 SELF_NORMALISED = 10.0173
 """The 99.5 % quantile of W(1)/√I, the root of `_self_normalised_p(t) = .01`. Its square is 100.3;
 Lobato (Journal of the American Statistical Association 2001) simulates 99.8."""
+EARLY = 0.25
+"""The square of a correlation from which on it is, for what chance adds to squares, that of lags
+which correlate."""
+MOST_CHANCE = 0.05
+"""The most that is taken for chance, as of the squared correlations of 20 independent steps."""
+HIDDEN = 0.1
+"""The share of the variance that may stay the same all along a run, where only NEES is known."""
 _TAIL = (1 - VERDICT_CONFIDENCE) / 2
 _LEAST = 1e-150
 """In place of zero below a fraction bar: errors that are all zero, or that never change."""
@@ -73,29 +80,31 @@ def one_run_of_nees(nees: Float[np.ndarray, " steps"], dof: int) -> OneRun:
 
     `√T log(mean/n)` over the root of `Σₜ sₜ²/T²`, sₜ being the partial sums of `NEES/mean − 1`,
     is W(1)/√I of a Wiener process W, with I the integral of the square of its bridge (Shao, JRSS B
-    2010), whatever the correlation. A NEES that varies by less than half of what χ² does, `2 n`
-    for a mean of n, has not shown its range yet, as that of an error that hardly changes: one
-    sample. NaN is not logged. Raises ValueError unless a step was logged.
+    2010), whatever the correlation. What never changes NEES does not show: n is enlarged to what it
+    is, where `HIDDEN` of the variance does not, in one of 200 runs. A NEES that varies by less than
+    half of what χ² does, `2 n` for a mean of n, has not shown its range yet: one sample. NaN is not
+    logged. Raises ValueError unless a step was logged.
     """
     there = _logged(nees[:, None])
-    relative = nees[there] / max(float(np.mean(nees, where=there)), _LEAST)
-    varies = np.var(relative) > 1 / dof
-    factor = math.sqrt(max(float(np.mean(nees, where=there)), _LEAST) / dof)
+    mean = max(float(np.mean(nees, where=there)), _LEAST)
+    relative = nees[there] / mean
     error = math.sqrt(float(np.sum(np.cumsum(relative - 1) ** 2)) / len(relative) ** 3)
-    p = _self_normalised_p(2 * math.log(factor) / max(error, _LEAST))
-    low, high = (factor * math.exp(side * SELF_NORMALISED * error / 2) for side in (-1, 1))
-    samples = _samples_of_nees(nees, dof, there) if varies else 1.0
-    return OneRun(samples >= FEWEST and p < 2 * _TAIL, p, factor, (low, high), samples)
+    right = 1 - HIDDEN + HIDDEN * chi2_quantile(1 - _TAIL, dof) / dof
+    p = _self_normalised_p(math.log(mean / dof / right) / max(error, _LEAST))
+    samples = _samples_of_nees(nees, dof, there) if np.var(relative) > 1 / dof else 1.0
+    low, high = (math.exp(side * SELF_NORMALISED * error) * mean / dof for side in (-1, 1))
+    interval = math.sqrt(low / right), math.sqrt(high)
+    return OneRun(samples >= FEWEST and p < 2 * _TAIL, p, math.sqrt(mean / dof), interval, samples)
 
 
 def effective_samples(whitened: Float[np.ndarray, "steps n"]) -> float:
     """The number of independent steps whose mean NEES would scatter as that of this run does.
 
     It is the least of three: of every axis' own correlation, `τ = Σₖ rₖ²`; of those of all pairs of
-    axes, less what chance adds to the squares; and of the variance and correlation of NEES itself,
-    which tails that are heavier than a Gaussian's enlarge. A lag counts by the pairs of steps that
-    were logged, so that a gap neither breaks a correlation nor adds to it. At least 1. Raises
-    ValueError unless a step was logged.
+    axes; and of the variance and correlation of NEES itself, which tails that are heavier than a
+    Gaussian's enlarge. What chance adds to squares is taken away. A lag counts by the pairs of
+    steps that were logged, so that a gap neither breaks a correlation nor adds to it. At least 1.
+    Raises ValueError unless a step was logged.
     """
     there = _logged(whitened)
     kept, n = int(np.sum(there)), whitened.shape[1]
@@ -104,11 +113,14 @@ def effective_samples(whitened: Float[np.ndarray, "steps n"]) -> float:
     pairs = np.maximum(np.round(_products(_transform(there.astype(float)))), 1)
     own = _products(_transform(z.T))
     own = np.mean((own / np.maximum(own[:, :1], _LEAST)) ** 2, axis=0) * kept / pairs
-    time = _correlation_time(own, 0.0)
+    early = own[: np.argmax(np.append(own, 0.0) < EARLY)]
+    # The square of a correlation that is zero is that of its noise, τ/T; a part of the error that
+    # never changes makes it larger too, and must not be taken for noise.
+    chance = float(np.clip((2 * np.sum(early) - 1) / kept, 0.0, MOST_CHANCE))
     covariance = z.T @ z / kept + 1e-12 * np.eye(n)
     u = _transform(np.linalg.solve(np.linalg.cholesky(covariance), z.T))
     both = sum(np.sum(_products(x, u) ** 2, axis=0) for x in u) / (n * kept * pairs)
-    time = max(time, _correlation_time(both, (n - 1) * min(time / kept, 0.25)))
+    time = max(_correlation_time(own, chance), _correlation_time(both, n * chance))
     return max(min(kept / time, _samples_of_nees(np.sum(z**2, axis=1), n, there)), 1.0)
 
 
