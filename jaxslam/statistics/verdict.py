@@ -313,7 +313,7 @@ def _of_effective(found: Found) -> str:
     """A sentence on what the correlated steps of one run are worth."""
     number = max(round(found["effective"]), 1)
     said = f"its steps are worth {number} independent one{'s' if number > 1 else ''}"
-    if found.get("samples") == "effective":
+    if found["word"] != "cannot tell":
         return said
     few = found["effective"] < FEWEST
     return f"{said}, {'too few to tell' if few else 'which do not show that σ is too small'}"
