@@ -49,7 +49,7 @@ class OneRun(NamedTuple):
     """
 
     over_confident: bool
-    """Whether σ is certainly too small: p < .01, of at least `FEWEST` samples."""
+    """Whether σ is certainly too small: p < .01, of `FEWEST` samples or more."""
     p: float
     """Twice the probability of so large a mean NEES, or a larger one, of a right filter."""
     sigma_factor: float
@@ -127,14 +127,14 @@ def effective_samples(whitened: Float[np.ndarray, "steps n"]) -> float:
 def _samples_of_nees(
     nees: Float[np.ndarray, " steps"], n: int, there: Bool[np.ndarray, " steps"]
 ) -> float:
-    """The number by the variance of NEES and its correlation, for a mean that is χ² over it."""
-    mean = max(float(np.mean(nees, where=there)), _LEAST)
+    """The number by the variance of NEES and its correlation, at most that of the steps."""
+    steps, mean = float(np.sum(there)), max(float(np.mean(nees, where=there)), _LEAST)
     c = _products(_transform(np.where(there, nees / mean - 1, 0.0)))
     # The initial positive sequence of pairs, made monotone (Geyer, Statistical Science 1992).
     two = c[: len(c) // 2 * 2].reshape(-1, 2).sum(axis=1)
     two = np.minimum.accumulate(two[: np.argmax(np.append(two, 0) <= 0)])
-    variance = max(2 * np.sum(two) - c[0], c[0]) / np.sum(there) ** 2
-    return 2 / n / max(float(variance), _LEAST)
+    variance = max(2 * float(np.sum(two)) - float(c[0]), float(c[0])) / steps**2
+    return min(2 / n / max(variance, _LEAST), steps)
 
 
 def _correlation_time(squares: Float[np.ndarray, " lags"], chance: float) -> float:
