@@ -22,11 +22,12 @@ from jaxslam.evaluation.inputs import (
     at,
     check_every_run,
     filled,
-    normalised,
     numbers,
     paired,
     sigmas,
+    squared,
     step_times,
+    whitened,
     without_known,
 )
 from jaxslam.evaluation.sanity_checks import Logged, Mistake, mistakes, withheld
@@ -89,6 +90,8 @@ class Evaluation:
     """The σ of the truth that the covariances hold too, m and degrees; None of an exact one."""
     run_names: tuple[str, ...] = ()
     """The names of the runs, where they have any."""
+    whitened: PerAxis | None = None
+    """The whitened errors `L⁻¹ e`, `P = L Lᵀ`; without axes where NEES alone is known."""
 
     @property
     def runs(self) -> int:
@@ -117,16 +120,22 @@ class Evaluation:
     @cached_property
     def _of_nees(self) -> Verdict:
         with np.errstate(over="ignore"):
-            return self._verdict(self.nees, self.errors / self.sigmas, self.dof, self.fitted)
+            normalised = self.errors / self.sigmas
+            return self._verdict(self.nees, normalised, self.dof, self.fitted, self.whitened)
 
     def _verdict(
-        self, nees: np.ndarray, normalised: np.ndarray, dof: int, fitted: float
+        self,
+        nees: np.ndarray,
+        normalised: np.ndarray,
+        dof: int,
+        fitted: float,
+        whitened: np.ndarray | None,
     ) -> Verdict:
         if self.quantity == "NIS" and not normalised.shape[-1]:
             return run_verdict(nees, dof, logged=self.logged) | {"samples": "runs"}
         if self.quantity == "NIS":
             return innovation_verdict(nees, normalised, dof)
-        return run_verdict(nees, dof, fitted, self.logged)
+        return run_verdict(nees, dof, fitted, self.logged, whitened)
 
     @cached_property
     def mistakes(self) -> tuple[Mistake, ...]:
@@ -222,7 +231,8 @@ class Evaluation:
             normalised = self.errors[..., [axis]] / self.sigmas[..., [axis]]
             nees = np.where(self.logged, normalised[..., 0] ** 2, np.nan)
             fitted = self.axis_fitted[axis] if self.axis_fitted else 0.0
-            return self._verdict(nees, normalised, 1, fitted)
+            whitened = None if self.whitened is None else normalised
+            return self._verdict(nees, normalised, 1, fitted, whitened)
 
     def plot(self, path: str | Path | None = None, *, column: bool = False) -> Any:
         """Return the figure of the evaluation, see `jaxslam.plots.plot_evaluation`."""
@@ -407,16 +417,18 @@ def evaluate(
     start, logged, notes = without_known(e, P, logged)
     seconds = step_times(times, e.shape[1])
     e, P, logged = e[:, start:], P[:, start:], logged[:, start:]
+    z = whitened(e, filled(P, logged, np.eye(e.shape[-1])))
     return Evaluation(
         quantity=next(iter(lookup("quantity", quantity, dict.fromkeys(("NEES", "NIS"))))),
         dof=e.shape[-1],
-        nees=filled(normalised(e, filled(P, logged, np.eye(e.shape[-1]))), logged, np.nan),
+        nees=filled(squared(z), logged, np.nan),
         errors=filled(e, logged, np.nan),
         sigmas=filled(sigmas(P), logged, np.nan),
         times=seconds[start:],
         timed=times is not None,
         names=_names(names, e.shape[-1]),
         notes=notes,
+        whitened=filled(z, logged, np.nan),
     )
 
 
@@ -446,6 +458,7 @@ def evaluate_nees(
         times=step_times(times, values.shape[1]),
         timed=times is not None,
         names=(),
+        whitened=none,
     )
 
 

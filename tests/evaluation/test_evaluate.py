@@ -126,8 +126,12 @@ def test_one_run_of_white_innovations_is_as_many_samples_as_it_has_steps(factor,
     assert found.verdict["white"] > 0.01
     assert found.axis_verdict(0)["word"] == word
     assert "each step is one sample" in str(found)
-    # The same numbers as errors are one run, whose steps may be all but one.
-    assert jaxslam.evaluate(factor * e, P).verdict["word"] == "cannot tell"
+    # The same numbers as errors are one run, which shows only that σ is too small.
+    of_errors = jaxslam.evaluate(factor * e, P)
+    assert of_errors.verdict["word"] == (word if word == "over-confident" else "cannot tell")
+    steps = of_errors.verdict["effective"]
+    assert 600 < steps <= 800
+    assert f"its steps are worth {steps:.0f} independent ones" in str(of_errors)
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.3])
@@ -179,6 +183,22 @@ def test_one_run_has_a_wide_interval():
     assert verdict["word"] == "over-confident"
     low, high = verdict["interval99"]
     assert 1 < low < 6 < high
+
+
+@pytest.mark.parametrize("correlation", [0.5, 0.9])
+def test_one_run_shows_that_sigma_is_too_small_by_all_its_steps(correlation):
+    """Of all axes, of each of them, and where NEES alone is known."""
+    e, P = autoregressive(2000, correlation)
+    root = np.array([[2.0, 0.0], [3.0, 0.5]])
+    found = jaxslam.evaluate(2 * e @ root.T, P @ (root @ root.T))
+    np.testing.assert_allclose(found.whitened, 2 * e, rtol=1e-9)
+    alone = evaluate_nees(found.nees, 2)
+    for verdict in (found.verdict, found.axis_verdict(0), found.axis_verdict(1), alone.verdict):
+        assert (verdict["word"], verdict["samples"]) == ("over-confident", "effective")
+        low, high = verdict["interval99"]
+        assert 1 < low < 2 < high < 3
+    json.dumps(found.asdict(), allow_nan=False)
+    assert jaxslam.evaluate(e, P).verdict["word"] == "cannot tell"
 
 
 def test_steps_that_are_known_by_definition_are_left_out():
